@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -13,7 +13,7 @@ from arrays.io.errors import InputError, naming
 from arrays.io.outputs import refuse_file
 from arrays.io.text import write_netcdf
 from magloc.cli.framework import CommonOptions, print_result, progress
-from magloc.cli.options import Grid, naming_scheduler, print_note
+from magloc.cli.options import Grid, naming_options, naming_scheduler, print_note
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -36,6 +36,7 @@ def map_(
     method: str | None = None,
     grid: Grid | None = None,
     noise: Flag = False,
+    body_length_m: float | None = None,
     scheduler: str | None = None,
     out: Path | None = None,
     netcdf: Flag = False,
@@ -61,6 +62,9 @@ def map_(
         Points along every axis; by default 41 starts, 21 sources.
     noise : bool
         Over starts: add one realisation of the sensors' noise, drawn with --seed, to the noise-free readings.
+    body_length_m : float
+        Over sources: length of every one, in place of the scenario's; what a dipole leaves out of its field counts as
+        noise. By default a quarter of its distance near the array; 0 for points.
     scheduler : str
         Address of a dask scheduler (tcp://HOST:PORT) whose workers compute the map.
     out : Path
@@ -77,9 +81,13 @@ def map_(
     n = (41 if over == "starts" else 21) if grid is None else grid
     scenario = scenario or ("paper" if over == "starts" else "wide")
     if over == "starts":
+        if body_length_m is not None:
+            raise InputError(
+                f"--body-length-m: found {body_length_m:g}, expected none over starts: they are no bodies."
+            )
         name, compute = _over_starts(scenario, method, common.seed if noise else None)
     else:
-        name, compute = over, _over_sources(scenario, method, common.seed)
+        name, compute = over, _over_sources(scenario, method, common.seed, body_length_m)
     drawn = f"-seed{common.seed}" if noise or (over == "sources" and common.seed) else ""
     folder = Path(f"map-{Path(scenario).stem}-{name}-{n}{drawn}") if out is None else out
     store = folder / "map.zarr"
@@ -134,12 +142,17 @@ def _over_starts(scenario: str, method: str | None, noise_seed: int | None) -> t
     return task.method.name, partial(magloc.convergence_map, task.array, source, **options)
 
 
-def _over_sources(scenario: str, method: str | None, seed: int) -> Callable[..., xr.Dataset]:
+def _over_sources(
+    scenario: str, method: str | None, seed: int, body_length_m: float | None
+) -> Callable[..., xr.Dataset]:
     from magloc.convergence.scenario_files import read_sources_scenario
 
     if method not in (None, "global"):
         raise InputError(f"--method: found {method!r}, expected global or none: sources are fixed without a start.")
     task = read_sources_scenario(scenario, seed=seed)
+    if body_length_m is not None:
+        with naming_options("body_length_m"):
+            task = replace(task, body_length_m=body_length_m)
     return partial(
         magloc.source_map,
         task.array,
@@ -148,6 +161,8 @@ def _over_sources(scenario: str, method: str | None, seed: int) -> Callable[...,
         nearest_m=task.nearest_m,
         farthest_m=task.farthest_m,
         seed=seed,
+        known_moment_sigma_Am2=task.known_moment_sigma_Am2,
+        body_length_m=task.body_length_m,
     )
 
 

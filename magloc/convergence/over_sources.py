@@ -1,8 +1,9 @@
 """Maps over sources: where around an array does one start-free fix find the source?
 
-A cube of positions; at each a dipole whose moment has a given size and a random direction, one set of readings with the
-array's noise, and one fix. It succeeds if no better solution than the fix's best one is found by searching from the
-truth. Whether that solution is any good is physics, not search: the Cramér-Rao bound is part of the map.
+A cube of positions; at each a source whose moment has a given size and a random direction, one set of readings with the
+array's noise and with errors of all that is stated to be uncertain, and one fix. It succeeds if no better solution than
+the fix's best one is found by searching from the truth. Whether that solution is any good is physics, not search: the
+Cramér-Rao bound is part of the map.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ from arrays.noise import reading_errors
 from arrays.typing import BoolArray, FloatArray
 from arrays.whitening import whitening
 from magloc.bounds.crlb import check_uncertainty, cramer_rao_bounds
+from magloc.chi_square import normalised_square
+from magloc.fields.multipole import N_BODY_ERRORS, check_body_length, finite_body_errors
 from magloc.grids.computed import computed_map
 from magloc.grids.cube import (
     Box,
@@ -37,13 +40,15 @@ from magloc.grids.cube import (
     tallied,
 )
 from magloc.localization.fit.fixes import Fixes
-from magloc.localization.fit.gauss_newton import JointFits, fit_moments, refine
+from magloc.localization.fit.gauss_newton import JointFits, refine
+from magloc.localization.fit.model_errors import assumed_lengths, with_model_errors
+from magloc.localization.fit.optima import Optima
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import is_observable, spans
 from magloc.localization.fit.variable_projection_compiled import SAME_CHI2, SAME_COS
 from magloc.localization.locator import Locator
 from magloc.localization.search.single_source import N_UNKNOWNS
-from magloc.measurement.differences import predicted_channels
+from magloc.measurement.differences import fields_at_sensors
 from magloc.measurement.rows import check_magnitudes, whitened_rows
 from magloc.measurement.whitened import WhitenedModel
 
@@ -52,7 +57,10 @@ if TYPE_CHECKING:
 
 # χ² above that of the optimum searched from the truth within which a fix has found it.
 CHI2_FOUND = 0.05
-_MAX_ITERATIONS = 200
+# From the truth: valleys of far sources take some hundred.
+_MAX_ITERATIONS = 1000
+# Seconds of one core that a fix takes, roughly: by vector sensors, of bodies, by moduli.
+_FIX_S, _BODY_S, _SCALAR_S = 5e-5, 5e-4, 5e-3
 
 
 class SourceStatus(IntEnum):
@@ -71,7 +79,7 @@ class SourcesScenario:
     Attributes
     ----------
     array : SensorArray
-        Vector sensors.
+        With six independent differences at least. Its ambient field errs by what it states.
     half_width_m : float
         The cube reaches from -half_width to +half_width along every axis, around the array's centroid.
     nearest_m, farthest_m : float
@@ -81,8 +89,11 @@ class SourcesScenario:
     known_moment_sigma_Am2 : float
         1 σ of that, by which moments differ from it and which the fixes know; infinite: all are alike, and nothing is
         known.
+    body_length_m : float, optional
+        Length of every source: its moments of rank 2 and 4 are drawn, and count as noise in fixes and bounds. As in
+        :class:`magloc.Locator` a quarter of its distance near the array by default, 0 of points.
     seed : int
-        Of the moments' directions and the noise. Those of a source depend on the seed and its place in the cube alone.
+        Of the moments' directions and all errors. Those of a source depend on the seed and its place in the cube alone.
     """
 
     array: SensorArray = field(default_factory=lambda: tetrahedron(1.5, noise_T=1e-9))
@@ -92,6 +103,7 @@ class SourcesScenario:
     moment_Am2: float = 300.0
     seed: int = 0
     known_moment_sigma_Am2: float = np.inf
+    body_length_m: float | None = None
 
     def __post_init__(self) -> None:
         check_magnitudes(self.array)  # before a store is made for it
@@ -99,6 +111,7 @@ class SourcesScenario:
             raise ValueError(f"Input nearest_m must be between 0 and farthest_m; instead received {self.nearest_m}.")
         check_positive(moment_Am2=self.moment_Am2)
         check_uncertainty(0.0, self.known_moment_sigma_Am2)
+        check_body_length(self.body_length_m or 0.0)
 
     @property
     def prior(self) -> SourcePrior:
@@ -129,9 +142,12 @@ _VARIABLES = {
         np.float64, {"long_name": "chi-square of the best solution and of what is known of it", "units": "1"}
     ),
     "chi2_from_truth": Variable(
-        np.float64, {"long_name": "chi-square of the optimum searched from the truth", "units": "1"}
+        np.float64, {"long_name": "chi-square of the optimum searched from the truth, if it converged", "units": "1"}
     ),
     "distance": Variable(np.float64, {"long_name": "distance of the best solution from the truth", "units": "m"}),
+    "nees": Variable(
+        np.float64, {"long_name": "squared error of the best solution in its covariance, per dimension", "units": "1"}
+    ),
     "solutions": Variable(np.int32, {"long_name": "distinct solutions within 20 of the best chi-square", "units": "1"}),
     "truth_listed": Variable(
         np.int8, {"long_name": "whether the optimum searched from the truth is among the solutions", **_NO_YES}
@@ -159,8 +175,6 @@ class SourcesMap(CubeMap):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.scenario.array.channel_is_scalar.any():
-            raise ValueError("Input array must have vector sensors only; instead received one with scalar sensors.")
         n_differences = whitening(self.scenario.array).n_differences
         if n_differences < N_UNKNOWNS:
             raise ValueError(f"The array gives {n_differences} independent differences, {N_UNKNOWNS} are needed.")
@@ -170,7 +184,8 @@ class SourcesMap(CubeMap):
 
     @cached_property
     def _locator(self) -> Locator:
-        return Locator(self.scenario.array, body_length_m=0.0, exclude_faulty=False, prior=self.scenario.prior)
+        of = self.scenario
+        return Locator(of.array, body_length_m=of.body_length_m, exclude_faulty=False, prior=of.prior)
 
     @cached_property
     def _model(self) -> WhitenedModel:
@@ -180,7 +195,8 @@ class SourcesMap(CubeMap):
     @property
     def point_s(self) -> float:
         """Seconds of one core that a fix takes, roughly."""
-        return 5e-5
+        scalar = self.scenario.array.channel_is_scalar.any()
+        return _SCALAR_S if scalar else _BODY_S if self.scenario.body_length_m else _FIX_S
 
     @property
     def settings(self) -> Mapping[str, Any]:
@@ -193,6 +209,7 @@ class SourcesMap(CubeMap):
             "moment_magnitude_Am2": scenario.moment_Am2,
             "seed": str(scenario.seed),  # of any size
             **({"known_moment_sigma_Am2": known} if (known := scenario.known_moment_sigma_Am2) < np.inf else {}),
+            **({"body_length_m": length} if (length := scenario.body_length_m) is not None else {}),
         }
 
     def warm_up(self) -> None:
@@ -200,16 +217,19 @@ class SourcesMap(CubeMap):
         array = self.scenario.array
         position = array.centroid + 3.0 * array.circumradius * np.eye(3)[:1]
         moment = self.scenario.moment_Am2 * np.eye(3)[:1]
-        readings = self._readings(position, moment, np.zeros((1, array.n_channels)))
-        self._listed(self._locator.fit_rows(readings), self._searched_from(position, readings))
+        readings = self._readings(position, moment, np.zeros((1, array.n_channels)), np.zeros((1, N_BODY_ERRORS + 3)))
+        self._values_of(position, moment, readings)
 
     def values_at(self, box: Box) -> Mapping[str, Any]:
         """Fixes of the sources of a box."""
         relative = box.points(self.axis)
         distance = np.linalg.norm(relative, axis=1)
         used = (distance >= self.scenario.nearest_m) & (distance <= self.scenario.farthest_m)
-        moment, noise = (part[used] for part in self._random(box))
-        of_used = self._values_of(self.scenario.array.centroid + relative[used], moment, noise) if used.any() else {}
+        of_used: Mapping[str, Any] = {}
+        if used.any():
+            position = self.scenario.array.centroid + relative[used]
+            moment, noise, errors = (part[used] for part in self._random(box))
+            of_used = self._values_of(position, moment, self._readings(position, moment, noise, errors))
         values = {}
         for name, variable in _VARIABLES.items():
             of_all = np.full(box.size, _LEFT_OUT.get(name, np.nan), variable.dtype)
@@ -217,11 +237,10 @@ class SourcesMap(CubeMap):
             values[name] = of_all
         return values
 
-    def _values_of(self, position: FloatArray, moment: FloatArray, noise: FloatArray) -> Mapping[str, Any]:
-        """Fixes of sources (n, 3), noise as standard normal numbers."""
-        readings = self._readings(position, moment, noise)
+    def _values_of(self, position: FloatArray, moment: FloatArray, readings: FloatArray) -> Mapping[str, Any]:
+        """Fixes of sources (n, 3) by raw readings (n, C) of them."""
         fixes = self._locator.fit_rows(readings)
-        from_truth = self._searched_from(position, readings)
+        from_truth = self._searched_from(position, moment, readings)
         solved, every = fixes.solved, fixes.solutions
         first = fixes.first[solved]
 
@@ -232,14 +251,23 @@ class SourcesMap(CubeMap):
 
         chi2 = of_first((every.chi2 + every.known_chi2)[first], np.nan)
         found = np.where(chi2 <= from_truth.chi2 + CHI2_FOUND, SourceStatus.FOUND, SourceStatus.MISSED)
-        known = self.scenario.known_moment_sigma_Am2
-        bounds = cramer_rao_bounds(self.scenario.array, position, moment, known_moment_sigma_Am2=known)
+        bounds = cramer_rao_bounds(
+            self.scenario.array,
+            position,
+            moment,
+            known_moment_sigma_Am2=self.scenario.known_moment_sigma_Am2,
+            body_length_m=self._lengths(position),
+        )
+        estimate = np.concatenate([every.position_m[first, 0], every.moment_Am2[first, 0]], axis=1)
+        error = estimate - np.concatenate([position[solved], moment[solved]], axis=1)
+        nees = np.where(every.gaussian[first, 0], normalised_square(error, every.covariance[first]), np.nan)
         return {
             "status": np.where(np.isnan(chi2), SourceStatus.UNSOLVED, found),
             "iterations": of_first(every.iterations[first], 0),
             "chi2": chi2,
-            "chi2_from_truth": from_truth.chi2,
-            "distance": of_first(np.linalg.norm(every.position_m[first, 0] - position[solved], axis=1), np.nan),
+            "chi2_from_truth": np.where(from_truth.converged, from_truth.chi2, np.nan),
+            "distance": of_first(np.linalg.norm(error[:, :3], axis=1), np.nan),
+            "nees": of_first(nees / N_UNKNOWNS, np.nan),
             "solutions": np.bincount(every.of_row, minlength=len(fixes)),
             "truth_listed": self._listed(fixes, from_truth),
             "range_observable": of_first(is_observable(*spans(every.ranges[first, 0]).T), False),
@@ -247,33 +275,55 @@ class SourcesMap(CubeMap):
             "sigma_position": bounds.sigma_position_m,
         }
 
-    def _random(self, box: Box) -> tuple[FloatArray, FloatArray]:
-        """Moments (n, 3) [A·m²] and standard normal noise (n, C) of a box, the same in whatever boxes."""
+    def _random(self, box: Box) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Moments (n, 3) [A·m²] of a box, noise (n, C) and model errors (n, 17) as standard normal numbers."""
+        known = self.scenario.known_moment_sigma_Am2 < np.inf
+        normal = self._normal(box, 3 + self.scenario.array.n_channels + known, 0)
+        direction = normal[:, :3] / np.linalg.norm(normal[:, :3], axis=1, keepdims=True)
+        size = self.scenario.moment_Am2 + (self.scenario.known_moment_sigma_Am2 * normal[:, -1:] if known else 0.0)
+        noise = normal[:, 3 : 3 + self.scenario.array.n_channels]
+        return size * direction, noise, self._normal(box, N_BODY_ERRORS + 3, 1)
+
+    def _normal(self, box: Box, n_numbers: int, stream: int) -> FloatArray:
+        """Standard normal numbers (n, n_numbers) of a box, the same in whatever boxes, of independent streams."""
         key = np.random.SeedSequence(self.scenario.seed).generate_state(2, np.uint64)
         x, y, z = box.region
-        known = self.scenario.known_moment_sigma_Am2 < np.inf
-        n_numbers = 3 + self.scenario.array.n_channels + known
         lines = []
         for i in range(x.start, x.stop):
             for j in range(y.start, y.stop):
-                generator = np.random.Generator(np.random.Philox(key=key, counter=[0, 0, i, j]))
+                generator = np.random.Generator(np.random.Philox(key=key, counter=[0, stream, i, j]))
                 lines.append(generator.standard_normal((z.stop, n_numbers))[z])
-        normal = np.concatenate(lines)
-        direction = normal[:, :3] / np.linalg.norm(normal[:, :3], axis=1, keepdims=True)
-        size = self.scenario.moment_Am2 + (self.scenario.known_moment_sigma_Am2 * normal[:, -1:] if known else 0.0)
-        return size * direction, normal[:, 3 : 3 + self.scenario.array.n_channels]
+        return np.concatenate(lines)
 
-    def _readings(self, position: FloatArray, moment: FloatArray, noise: FloatArray) -> FloatArray:
-        """Raw readings (n, C) [T]; noise as standard normal numbers."""
+    def _lengths(self, position: FloatArray) -> FloatArray:
+        """Lengths (n,) of the bodies at some places (n, 3) [m]."""
+        q = self._model.homogeneous(position)[:, None]
+        return assumed_lengths(self._model, q, self.scenario.body_length_m)[:, 0]
+
+    def _readings(self, position: FloatArray, moment: FloatArray, noise: FloatArray, errors: FloatArray) -> FloatArray:
+        """Raw readings (n, C) [T]; noise and errors of the model as standard normal numbers."""
         array = self.scenario.array
-        exact = predicted_channels(array, position, moment) + array.channel_offset_T
+        of_body, of_ambient = np.split(errors[:, None], [N_BODY_ERRORS], axis=-1)
+        fields = fields_at_sensors(array, position, moment) + array.row_ambient_uncertainty_T * of_ambient
+        length_m = self._lengths(position)[:, None, None, None]
+        if length_m.any():
+            beyond = finite_body_errors(array.positions - position[:, None], moment[:, None], length_m)
+            fields += (beyond @ of_body[..., None])[..., 0]
+        exact = array.readings_of(fields)
         return exact + reading_errors(array, exact, noise)
 
-    def _searched_from(self, truth: FloatArray, readings: FloatArray) -> JointFits:
+    def _searched_from(self, position: FloatArray, moment: FloatArray, readings: FloatArray) -> JointFits:
         """Ends of the refinements that start at the truth (n, 3); χ² is infinite where one has not converged."""
-        (rows,) = whitened_rows(self.scenario.array, readings, None, len(readings))
-        rows, q = rows.knowing(self.scenario.prior.known_moment), rows.model.homogeneous(truth)[:, None]
-        return refine(rows.model, rows.y, q, fit_moments(rows.model, rows.y, q), max_iterations=_MAX_ITERATIONS)
+        scenario = self.scenario
+        (rows,) = whitened_rows(scenario.array, readings, None, len(readings))
+        rows, q = rows.knowing(scenario.prior.known_moment), rows.model.homogeneous(position)[:, None]
+        mu = rows.model.scaled_moment(q, moment[:, None])
+        fits = refine(rows.model, rows.y, q, mu, max_iterations=_MAX_ITERATIONS)
+        of_row = np.flatnonzero(fits.converged)
+        optima = Optima(rows, fits.rows(of_row), of_row, [""] * len(rows))
+        for of_some, _ in with_model_errors(optima, scenario.body_length_m, scenario.array.row_ambient_uncertainty_T):
+            fits.put(of_some.rows.index[of_some.of_row], of_some.fits)
+        return fits
 
     def _listed(self, fixes: Fixes, ends: JointFits) -> BoolArray:
         """Whether the optima (n,) that the search from the truth ended at are among the solutions."""
@@ -286,22 +336,34 @@ class SourcesMap(CubeMap):
 
 @dataclass(frozen=True)
 class SourcesSummary(Summary):
-    """Counts of a map over sources, with the fraction whose solutions have the end of the search from the truth."""
+    """Counts of a map over sources, and fractions of these.
+
+    Attributes
+    ----------
+    truth_listed : float
+        Those whose solutions have the end of the search from the truth.
+    not_converged : float
+        Those whose search from the truth has no end: no better solution than the fix's is known of them.
+    """
 
     truth_listed: float
+    not_converged: float
 
     def lines(self) -> list[str]:
         """The counts in words."""
         return [
             f"{self.converged} of {self.starts} sources found ({self.fraction:.2%}), "
             f"truth listed {self.truth_listed:.2%}, median {self.median_iterations:.0f} iterations"
+            + (f"; from the truth {self.not_converged:.2%} did not converge" if self.not_converged > 0.0 else "")
         ]
 
 
 def _tally(values: Values) -> Tally:
-    """Counts of ``status``, ``truth_listed`` and ``iterations`` of a part of a map over sources."""
+    """Counts of ``status``, ``truth_listed`` and so on of a part of a map over sources."""
+    used = values["status"] != SourceStatus.LEFT_OUT
     points = {
-        "starts": values["status"] != SourceStatus.LEFT_OUT,
+        "starts": used,
+        "not converged": used & np.isnan(values["chi2_from_truth"]),
         "converged": values["status"] == SourceStatus.FOUND,
         "truth listed": values["truth_listed"] == 1,
     }
@@ -318,6 +380,7 @@ def source_map(
     farthest_m: float = SourcesScenario.farthest_m,
     seed: int = 0,
     known_moment_sigma_Am2: float = np.inf,
+    body_length_m: float | None = None,
     out: str | PathLike[str] | None = None,
     scheduler: str | None = None,
     progress: Callable[[int], None] | None = None,
@@ -327,7 +390,7 @@ def source_map(
     Parameters
     ----------
     array : SensorArray
-        Vector sensors.
+        With six independent differences at least. Its ambient field errs by what it states, once for every source.
     moment_Am2 : float
         Size of every source's moment [A·m²].
     edge_m : float
@@ -337,10 +400,13 @@ def source_map(
     nearest_m, farthest_m : float
         Sources nearer to the centroid, or farther from it, are left out [m].
     seed : int
-        Of the moments' directions and the noise.
+        Of the moments' directions and all errors.
     known_moment_sigma_Am2 : float
         1 σ of the moments' modulus [A·m²]: they are drawn with it, and fixes and bounds know it. Infinite: all are
         alike, and nothing is known.
+    body_length_m : float, optional
+        Length of every source [m]: how its field differs from a dipole's is drawn, and counts as noise in fixes and
+        bounds. A quarter of its distance near the array by default, as in :func:`magloc.locate`; 0 of points.
     out, scheduler, progress
         See :func:`magloc.grids.computed.computed_map`: a zarr folder that streams and resumes, the address of a dask
         scheduler, and a call with the number of sources finished.
@@ -349,15 +415,16 @@ def source_map(
     -------
     xarray.Dataset
         Over the source's (x, y, z) relative to the centroid [m]: ``status`` (found: the best solution's χ² is at most
-        0.05 above that of the optimum searched from the truth), ``iterations``, ``chi2``, ``chi2_from_truth``,
-        ``distance`` of the best solution from the truth [m], number of ``solutions``, ``truth_listed``,
+        0.05 above that of the optimum searched from the truth), ``iterations``, ``chi2``, ``chi2_from_truth`` (NaN
+        where that search did not converge), ``distance`` of the best solution from the truth [m], its ``nees`` per
+        dimension (NaN where it is not Gaussian), number of ``solutions``, ``truth_listed``,
         ``range_observable``, and the Cramér-Rao bounds of the range and the position, ``sigma_range``
         :math:`\sqrt{u^T C_{pp} u}` and ``sigma_position`` :math:`\sqrt{\mathrm{tr}\, C_{pp}}` [m].
 
     Raises
     ------
     ValueError
-        The array has scalar sensors or too few of them, or an input is out of range.
+        The array has too few sensors, or an input is out of range.
 
     Examples
     --------
@@ -368,12 +435,16 @@ def source_map(
     ['x', 'y', 'z']
     """
     scenario = SourcesScenario(
-        array, check_half_width(edge_m), nearest_m, farthest_m, moment_Am2, seed, known_moment_sigma_Am2
+        array, check_half_width(edge_m), nearest_m, farthest_m, moment_Am2, seed, known_moment_sigma_Am2, body_length_m
     )
     return computed_map(SourcesMap(scenario, n), out, scheduler, progress)
 
 
 def summary(dataset: xr.Dataset) -> SourcesSummary:
     """Counts of a map made by :func:`source_map`, which need not fit into memory."""
-    tally = tallied(dataset, ("status", "truth_listed", "iterations"), _tally)
-    return SourcesSummary(**common_counts(dataset, tally), truth_listed=tally.fraction("truth listed", "starts"))
+    tally = tallied(dataset, ("status", "truth_listed", "iterations", "chi2_from_truth"), _tally)
+    return SourcesSummary(
+        **common_counts(dataset, tally),
+        truth_listed=tally.fraction("truth listed", "starts"),
+        not_converged=tally.fraction("not converged", "starts"),
+    )

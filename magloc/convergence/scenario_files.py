@@ -11,7 +11,7 @@ import msgspec
 from arrays.array import SensorArray
 from arrays.array_file import array_of_table, read_array
 from arrays.io.errors import InputError, naming
-from arrays.io.toml import POSITIVE, BuiltIn, File, RefusalError, Rule, Table, in_si, one_of, section_of
+from arrays.io.toml import POSITIVE, BuiltIn, File, NotNegative, RefusalError, Rule, Table, in_si, one_of, section_of
 from arrays.typing import Vector
 from magloc.convergence.filters import FILTERS, Filter
 from magloc.convergence.over_sources import SourcesScenario
@@ -48,6 +48,7 @@ class _Sources(Table, kw_only=True):
     farthest_m: _Positive = SourcesScenario.farthest_m
     moment_Am2: _Positive = SourcesScenario.moment_Am2
     known_moment_sigma_Am2: _Positive | None = None
+    body_length_m: NotNegative | None = None
 
     def check(self) -> None:
         if not 0.0 <= self.nearest_m < self.farthest_m:

@@ -16,6 +16,9 @@ from magloc.fields.dipole import MU0_OVER_4PI
 
 # Standard deviations of a component of a body's moments of rank 2 and 4, over L² and L⁴.
 _SIGMA = {2: 0.025, 4: 0.0015}
+_LONGEST_BODY_M = 1e4
+N_BODY_ERRORS = sum(2 * rank + 1 for rank in _SIGMA)
+"""Independent errors of a body that counts as a dipole."""
 
 
 def multipole_field_matrix(points_m: ArrayLike, source_m: ArrayLike, order: int) -> FloatArray:
@@ -93,6 +96,14 @@ def finite_body_errors(separation_m: FloatArray, moment_Am2: FloatArray, length_
     """
     parts = [s * length_m**rank * finite_body_fields(separation_m, moment_Am2, rank) for rank, s in _SIGMA.items()]
     return np.concatenate(parts, axis=-1)
+
+
+def check_body_length(body_length_m: ArrayLike) -> None:
+    """Raise ValueError for lengths of bodies that are none."""
+    length_m = np.ravel(body_length_m)
+    wrong = length_m[~((length_m >= 0.0) & (length_m <= _LONGEST_BODY_M))]
+    if wrong.size:
+        raise ValueError(f"Input body_length_m must be from 0 to {_LONGEST_BODY_M:g} m; instead received {wrong[0]:g}.")
 
 
 @cache

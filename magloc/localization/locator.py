@@ -21,6 +21,7 @@ from magloc.averages import average as averaged
 from magloc.averages import averaging_array, complete_rows
 from magloc.blas_threads import one_blas_thread
 from magloc.conditioning import NO_BACKGROUND
+from magloc.fields.multipole import check_body_length
 from magloc.localization.dipole_validity import too_near
 from magloc.localization.fault_exclusion import without_faulty_sensors
 from magloc.localization.fit.columns import Solutions, in_stable_order
@@ -45,7 +46,6 @@ if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
 _LOG = logging.getLogger(__name__)
-_LONGEST_BODY_M = 1e4
 # A search for several sources, or with known moments, takes its rows in smaller blocks.
 _ROWS_AT_ONCE, _ROWS_OF_SEVERAL = 1024, 64
 # Numbers of the whitenings of a block, where each row has its own.
@@ -100,10 +100,7 @@ class Locator:
         exclude_faulty: bool = True,
         seed: int = 0,
     ) -> None:
-        if body_length_m is not None and not 0.0 <= body_length_m <= _LONGEST_BODY_M:
-            raise ValueError(
-                f"Input body_length_m must be from 0 to {_LONGEST_BODY_M:g} m; instead received {body_length_m:g}."
-            )
+        check_body_length(body_length_m or 0.0)
         if position_m is not None and sources != 1:
             raise ValueError(f"Input sources must be 1 where position_m is known; instead received {sources}.")
         self.array = array

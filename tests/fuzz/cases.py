@@ -65,7 +65,7 @@ LINES: dict[str, tuple[str, ...]] = {
     "magloc map": (
         "paper --grid 3 --out out --json",
         "map.toml --method iekf --grid 3 --out out",
-        "map.toml --over sources --grid 3 --out out --json",
+        "map.toml --over sources --grid 3 --body-length-m 0.1 --out out --json",
     ),
     "magloc bounds": ("map.toml --grid 3 --moments 4 --out out --json", "--array array.toml --grid 3 --moments 4"),
     "magloc design": ("task.toml --out out.toml --json",),

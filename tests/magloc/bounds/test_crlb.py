@@ -36,6 +36,7 @@ from magloc.bounds.over_moments import (
     table_and_spreads,
 )
 from magloc.directions import moments_on_sphere, sphere_directions
+from magloc.fields.multipole import finite_body_errors
 from magloc.measurement.differences import DifferenceMeasurement, predicted_channels
 from tests import oracles
 from tests.arrays.test_differences import random_array
@@ -142,6 +143,28 @@ class TestLikelihood:
         array = replace(array, ambient_T=AMBIENT)
         sensors = tuple(replace(s, offset_uncertainty_T=5e-10) for s in array.sensors)
         self.check(replace(array, sensors=sensors), *random_source(5), 20e-9)
+
+
+class TestBodies:
+    def test_what_a_dipole_leaves_out_is_noise(self):
+        """The information of differences whose covariance has it, written out."""
+        position, moment = random_source(6, distance_m=2.0)
+        array, length_m = random_array(6, 5), np.array([0.0, 0.5])
+        columns = finite_body_errors(array.positions - position, np.broadcast_to(moment, (5, 3)), 0.5)
+        beyond = np.einsum("ci,cij->cj", array.channel_gain, columns[array.channel_sensor])
+        measurement = DifferenceMeasurement.of(array)
+        root, H = measurement.differences.transform @ beyond, measurement.jacobian(position, moment)
+        found = cramer_rao_bounds(array, position, moment, body_length_m=length_m).covariance
+        for covariance, share in zip(found, (0.0, 1.0), strict=True):
+            noise = np.diag(measurement.variance) + share * root @ root.T
+            unit = np.sqrt(np.diagonal(covariance))
+            information = H.T @ np.linalg.solve(noise, H) * unit * unit[:, None]
+            assert_allclose(information @ (covariance / unit / unit[:, None]), np.eye(6), atol=1e-6)
+
+    @pytest.mark.parametrize("length_m", [-0.1, np.nan, 1e5])
+    def test_is_refused(self, length_m):
+        with pytest.raises(ValueError, match="Input body_length_m must be from 0 to 10000 m"):
+            cramer_rao_bounds(TETRAHEDRON, SOURCE, [0.0, 0.0, 1.0], body_length_m=length_m)
 
 
 class TestInvariance:

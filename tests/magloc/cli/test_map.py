@@ -120,7 +120,7 @@ class TestOverSources:
     def test_json(self, tmp_path, capsys):
         assert main(["map", "--over", "sources", "--grid", "5", "--out", str(tmp_path / "out"), "--json"]) == 0
         result = json.loads(capsys.readouterr().out)
-        assert list(result) == [*STARTS_KEYS[:-1], "truth_listed", "out"]
+        assert list(result) == [*STARTS_KEYS[:-1], "truth_listed", "not_converged", "out"]
         with open_map(tmp_path / "out/map.zarr") as dataset:
             assert result["starts"] == (dataset.status != 3).sum()
             assert result["converged"] == (dataset.status == 0).sum()
@@ -149,6 +149,23 @@ class TestOverSources:
         assert main(["map", str(path), "--over", "sources", "--grid", "3", "--out", str(tmp_path / "out")]) == 0
         assert "of 6 sources found" in capsys.readouterr().out
 
+    @with_plain_pictures
+    def test_what_is_known_of_sources(self, tmp_path):
+        """The file says it, an option stands in its place."""
+        path = tmp_path / "mine.toml"
+        path.write_text(ARRAY + "[sources]\nknown_moment_sigma_Am2 = 30\nbody_length_m = 0.2\n")
+        for name, options, length_m in (("file", [], 0.2), ("option", ["--body-length-m", "0"], 0.0)):
+            out = tmp_path / name
+            command = ["map", str(path), "--over", "sources", "--grid", "3", "--out", str(out), "--quiet"]
+            assert main([*command, *options]) == 0
+            with open_map(out / "map.zarr") as dataset:
+                assert dataset.attrs["known_moment_sigma_Am2"] == 30.0
+                assert dataset.attrs["body_length_m"] == length_m
+
+    def test_starts_are_no_bodies(self, tmp_path, capsys):
+        assert main(["map", "--grid", "3", "--body-length-m", "1", "--out", str(tmp_path / "out")]) == 2
+        assert "--body-length-m: found 1, expected none over starts" in capsys.readouterr().err
+
     def test_the_paper_file_has_the_defaults(self):
         default = SourcesScenario()
         paper = read_sources_scenario("paper")
@@ -160,7 +177,9 @@ class TestOverSources:
             (ARRAY + "[sources]\nnearest_m = 13\n", [], "key sources.nearest_m: found 13"),
             (ARRAY + "[sources]\nmoment_Am2 = 0\n", [], "key sources.moment_Am2: found 0, expected a positive number"),
             (ARRAY + "[sources]\nradius = 1\n", [], "key sources.radius: found an unknown key"),
-            (ARRAY.replace("vector", "scalar"), [], "vector sensors only"),
+            (ARRAY.replace("vector", "scalar"), [], "3 independent differences, 6 are needed"),
+            (ARRAY + "[sources]\nbody_length_m = -1\n", [], "key sources.body_length_m: found -1"),
+            (ARRAY, ["--body-length-m", "-1"], "--body-length-m must be from 0 to 10000 m; instead received -1"),
             (ARRAY.replace("= 1.0", "= 1e-30"), [], "must have a noise between 1e-11 and 1e12 nT"),
             (ARRAY, ["--method", "iekf"], "--method: found 'iekf', expected global"),
             (ARRAY, ["--over", "moments"], "--over"),
