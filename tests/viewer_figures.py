@@ -12,16 +12,19 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 import arrays
 import magloc
 from magloc.measurement.differences import predicted_channels
 from magloc.readings import Readings
-from magloc.tracking.results import TrackPoint, TrackResult
+from magloc.tracking.files import json_of_track, read_track
+from magloc.tracking.results import TrackPoint
 from magloc.viewer.live_view import LiveView
+from magloc.viewer.scene.glyphs import DIPOLE_COLOUR
 from tests.browser.browser import Browser
-from tests.browser.screen import Screen
+from tests.browser.screen import Screen, Sight, hue_of
 
 # Notes when the words of a panel change, and how long frames and tasks of the main thread take.
 WATCH = """(() => {
@@ -118,21 +121,28 @@ def long_track(screen: Screen, n: int = 100_000, steps: int = 60) -> None:
     array = arrays.tetrahedron(1.5)
     time_s = 0.01 * np.arange(n)
     angle = 0.02 * time_s
-    places = np.stack([3.0 * np.cos(angle), 3.0 * np.sin(3.1 * angle), 1.0 + np.sin(7.3 * angle)], axis=1)
+    positions = np.stack([3.0 * np.cos(angle), 3.0 * np.sin(3.1 * angle), 1.0 + np.sin(7.3 * angle)], axis=1)
     moment, covariance = np.array([0.0, 0.0, 80.0]), np.diag([1e-2] * 3 + [1.0] * 3)
     points = tuple(
         TrackPoint(float(t), place, moment, covariance, nis=9.0, nis_dof=9, status="tracked")
-        for t, place in zip(time_s, places, strict=True)
+        for t, place in zip(time_s, positions, strict=True)
     )
     rows = Readings(np.random.default_rng(0).normal(size=(n, 12)) * 1e-9, time_s=time_s)
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "track.json"
+        file.write_bytes(msgspec.json.encode(json_of_track(points, None), enc_hook=np.ndarray.tolist))
+        begin = time.monotonic()
+        result = read_track(file)
+        print(f"{n:,} rows: {file.stat().st_size / 1e6:.0f} MB of JSON read in {time.monotonic() - begin:.2f} s")
     begin = time.monotonic()
-    with magloc.view(array, TrackResult(points, is_truth=False), readings=rows, port=0, open=False) as view:
+    with magloc.view(array, result, readings=rows, port=0, open=False) as view:
         served_s = time.monotonic() - begin
-        screen.open(view.address)
-        screen.browser.wait_for("/row [0-9]+ of/.test(document.body.innerText)")
-        print(f"{n:,} rows: served after {served_s:.2f} s, said in the page after {time.monotonic() - begin:.2f} s")
         screen.open_server(view._server)
-        print(f"  drawn after {time.monotonic() - begin:.2f} s, the page having been opened twice")
+        screen.browser.wait_for("/row [0-9]+ of/.test(document.body.innerText)")
+        print(f"  served after {served_s:.2f} s, said in the page after {time.monotonic() - begin:.2f} s")
+        places = screen.live_camera(view._server).pixels(positions[-1:])
+        screen.until_seen(Sight("the source", places, hue_of(DIPOLE_COLOUR), radius=9))
+        print(f"  drawn after {time.monotonic() - begin:.2f} s")
         time.sleep(3.0)
         watch = Watch(screen.browser)
         track, thumb = (screen.input("Time [s]", f".mantine-Slider-{part}") for part in ("track", "thumb"))

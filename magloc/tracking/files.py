@@ -12,18 +12,19 @@ import msgspec
 import numpy as np
 from scipy.special import chdtri
 
+from arrays.io.closing import garbage_waits
 from arrays.io.errors import LARGEST, InputError
 from arrays.io.text import read_text
 from arrays.io.world_maps import feature, feature_collection, kml, placemark, world_place
 from arrays.typing import FloatArray, Vector
 from magloc.levels import FALSE_ALARM
 from magloc.localization.fit.table import cells_of_strength
-from magloc.tracking.consistency import Consistency
 from magloc.tracking.results import TrackPoint, TrackResult, on_track, stacked
 
 if TYPE_CHECKING:
     import xarray as xr
 
+    from magloc.tracking.consistency import Consistency
     from magloc.tracking.track import TrackColumns
 
 _SAME_PLACE_M = 1e-9
@@ -212,11 +213,14 @@ def dataset_of_track(track: TrackColumns) -> xr.Dataset:
     return dataset
 
 
-def _read_track(path: Path) -> TrackResult:
+@garbage_waits()
+def read_track(path: Path) -> TrackResult:
+    """A track as `magloc track --json` or --jsonl prints it; InputError where the file is none."""
     text = read_text(path, "a track")
     try:
+        entries: Any
         if path.suffix.lower() == ".jsonl":
-            entries: Any = [msgspec.json.decode(line) for line in text.splitlines() if line.strip()]
+            entries = [msgspec.json.decode(line) for line in text.splitlines() if line.strip()]
         else:
             entries = msgspec.json.decode(text)
             entries = entries.get("results") if isinstance(entries, dict) else entries
@@ -237,6 +241,8 @@ def _read_track(path: Path) -> TrackResult:
 
 def _tracks(path: Path, entries: Sequence[dict[str, Any]]) -> dict[int, tuple[TrackPoint, ...]]:
     """Points of every source by its id; one without an id where the rows have no key tracks."""
+    if not any("tracks" in entry for entry in entries):
+        return {0: _points(path, entries)}
     own: list[dict[int, dict[str, Any]]] = []
     for i, entry in enumerate(entries, start=1):
         tracks = entry.get("tracks", [entry | {"id": 0}])
@@ -245,51 +251,59 @@ def _tracks(path: Path, entries: Sequence[dict[str, Any]]) -> dict[int, tuple[Tr
         own.append({track["id"]: track for track in tracks})
     ids = sorted({id for of_id in own for id in of_id}) or [0]
     rows = [{"time_s": entry.get("time_s"), "status": entry.get("status", "")} for entry in entries]
-    return {
-        id: tuple(
-            _track_point(f"{path}, result {i}", row | of_id.get(id, {}))
-            for i, (row, of_id) in enumerate(zip(rows, own, strict=True), start=1)
-        )
-        for id in ids
-    }
+    return {id: _points(path, [row | of_id.get(id, {}) for row, of_id in zip(rows, own, strict=True)]) for id in ids}
 
 
-def _track_point(place: str, entry: dict[str, Any]) -> TrackPoint:
-    time_s, nis, nis_dof = (_number(place, entry, key) for key in ("time_s", "nis", "nis_dof"))
-    if time_s is None:
-        raise InputError(f"{place}, key time_s: found None, expected a number.")
-    covariance = _numbers(place, entry, "covariance", (6, 6))
-    if covariance is not None and (np.diagonal(covariance) < 0.0).any():
-        raise InputError(f"{place}, key covariance: found a variance below zero, expected none.")
-    return TrackPoint(
-        time_s,
-        _numbers(place, entry, "position_m", (3,)),
-        _numbers(place, entry, "moment_Am2", (3,)),
-        covariance,
-        nis=math.nan if nis is None else nis,
-        nis_dof=int(nis_dof or 0),
-        status=str(entry.get("status", "")),
+def _points(path: Path, rows: Sequence[dict[str, Any]]) -> tuple[TrackPoint, ...]:
+    """Points of a source. Numbers become arrays a column at once: by rows it takes five times as long."""
+    times, nis, nis_dof = (_numbers(path, rows, key) for key in ("time_s", "nis", "nis_dof"))
+    if None in times:
+        raise InputError(f"{path}, result {times.index(None) + 1}, key time_s: found None, expected a number.")
+    positions, moments = (_vectors(path, rows, key, 3) for key in ("position_m", "moment_Am2"))
+    covariances = _vectors(path, rows, "covariance", 6, 6)
+    for i, covariance in enumerate(covariances, start=1):
+        if covariance is not None and covariance.diagonal().min() < 0.0:
+            raise InputError(f"{path}, result {i}, key covariance: found a variance below zero, expected none.")
+    statuses = [str(row.get("status", "")) for row in rows]
+    nis = [math.nan if value is None else value for value in nis]
+    columns = zip(times, positions, moments, covariances, nis, nis_dof, statuses, strict=True)
+    return tuple(
+        TrackPoint(float(t), place, moment, C, nis=float(value), nis_dof=int(dof or 0), status=status)
+        for t, place, moment, C, value, dof, status in columns
     )
 
 
-def _number(place: str, entry: dict[str, Any], key: str) -> float | None:
-    """A number of an entry; None where the key is missing or null."""
-    value = entry.get(key)
-    if value is not None and not (isinstance(value, int | float) and abs(value) <= LARGEST):
-        raise InputError(f"{place}, key {key}: found {value!r:.40}, expected a number.")
-    return None if value is None else float(value)
+def _numbers(path: Path, rows: Sequence[dict[str, Any]], key: str) -> list[Any]:
+    """A number of every row; None where the key is missing or null."""
+    values = [row.get(key) for row in rows]
+    for i, value in enumerate(values, start=1):
+        if value is not None and not (type(value) in (int, float) and abs(value) <= LARGEST):
+            raise InputError(f"{path}, result {i}, key {key}: found {value!r:.40}, expected a number.")
+    return values
 
 
-def _numbers(place: str, entry: dict[str, Any], key: str, shape: tuple[int, ...]) -> FloatArray | None:
-    """Numbers of an entry; None where the key is missing or null."""
-    value = entry.get(key)
-    if value is None:
-        return None
+def _vectors(path: Path, rows: Sequence[dict[str, Any]], key: str, *shape: int) -> list[FloatArray | None]:
+    """Numbers of every row; None where the key is missing or null."""
+    values = [row.get(key) for row in rows]
+    known = [i for i, value in enumerate(values) if value is not None]
+    if not known:
+        return values
+    numbers = _array([values[i] for i in known], len(known), *shape)
+    if numbers is None:
+        wrong = next(i for i in known if _array(values[i], *shape) is None)
+        size = "×".join(map(str, shape))
+        raise InputError(
+            f"{path}, result {wrong + 1}, key {key}: found something else, expected {size} numbers or null."
+        )
+    for i, own in zip(known, numbers, strict=True):
+        values[i] = own
+    return values
+
+
+def _array(value: object, *shape: int) -> FloatArray | None:
+    """What a file holds as an array of a shape; None if it is none."""
     try:
         numbers = np.array(value, dtype=np.float64)
     except (OverflowError, TypeError, ValueError):
-        numbers = np.zeros(0)
-    if numbers.shape != shape or not (np.abs(numbers) <= LARGEST).all():
-        size = "×".join(map(str, shape))
-        raise InputError(f"{place}, key {key}: found something else, expected {size} numbers or null.")
-    return numbers
+        return None
+    return numbers if numbers.shape == shape and (np.abs(numbers) <= LARGEST).all() else None

@@ -22,7 +22,7 @@ from arrays.io.csv import read_table
 from arrays.io.errors import InputError
 from arrays.typing import FloatArray
 from magloc.readings import Readings, read_readings
-from magloc.tracking.files import _read_track
+from magloc.tracking.files import read_track
 from magloc.tracking.results import TrackPoint, TrackResult
 from magloc.truth import Truth, read_truth
 
@@ -98,7 +98,7 @@ def read_result(path: Path, array_path: Path | None = None) -> Result:
     if suffix == ".csv":
         return _read_csv(path, array_path)
     if suffix in (".json", ".jsonl"):
-        return _read_track(path)
+        return read_track(path)
     raise InputError(f"{path}: found a file of an unknown kind, expected {KINDS}.")
 
 

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
+import trimesh
 import viser
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from arrays.typing import ByteArray, FloatArray
 from magloc.viewer.scene.glyphs import TRACK_COLOUR, Colour, SurfaceGlyph, screen_lines
-from magloc.viewer.scene.shapes import CHI2_95, ellipsoid, ellipsoid_axes
+from magloc.viewer.scene.shapes import ellipsoid, ellipsoid_axes, surface_of
 
 _MOST_ELLIPSOIDS = 40
-_MOST_SEGMENTS = 1000
+_MOST_SEGMENTS = 500
+_FINENESS = 2  # of an ellipsoid among many: a browser without a graphics card draws twice as fast as with 3
 
 
 class TrackGlyph:
@@ -88,7 +90,7 @@ class TrackGlyph:
             return
         self._chosen = tracked[:: int(np.ceil(len(tracked) / _MOST_ELLIPSOIDS))]
         rotations, self._semi_axes = ellipsoid_axes(covariances_m2[self._chosen])
-        sphere = ellipsoid(np.zeros(3), np.eye(3) / CHI2_95[3])
+        sphere = surface_of(trimesh.creation.icosphere(subdivisions=_FINENESS))
         self.regions = self._scene.add_batched_meshes_simple(
             f"{self._name}/regions",
             sphere.vertices,
@@ -112,7 +114,7 @@ def linear(colours: ByteArray) -> ByteArray:
 
 
 def track_segments(positions_m: FloatArray, first: int, last: int) -> NDArray[np.intp]:
-    """Ends (k, 2) of the segments of a track from one of its points (n, 3) to another: 1000 segments at most, evenly.
+    """Ends (k, 2) of the segments of a track from one of its points (n, 3) to another: 500 segments at most, evenly.
 
     None leads over a point that is not finite.
     """
