@@ -86,7 +86,7 @@ class WhitenedRows:
         """Sums of squared differences (b,), as they are without a source."""
         without = self.y
         if self.model.channel_is_scalar.any():
-            without = without - self.model.predicted(np.zeros_like(self.model.ambient))
+            without = without - self.model.of_ambient
         return np.einsum("bc,bc->b", without, without)
 
 

@@ -118,6 +118,17 @@ class WhitenedModel(ScaledSensors):
         """Whether all rows have one whitening, kept once."""
         return len(self) == 1 or self.gain.strides[0] == self.basis.strides[0] == 0
 
+    @property
+    def shares_ambient(self) -> bool:
+        """Whether all rows have one ambient field, kept once."""
+        return len(self) == 1 or self.ambient.strides[0] == 0
+
+    @cached_property
+    def of_ambient(self) -> FloatArray:
+        """Whitened readings without a source: (b, C), or (1, C) where all rows have the same."""
+        alone = self.rows(np.arange(min(1, len(self)))) if self.shares_whitening and self.shares_ambient else self
+        return alone.predicted(np.zeros(alone.ambient.shape))
+
     @cached_property
     def of_kernels(self) -> ModelRows:
         """The model for compiled kernels."""
@@ -243,11 +254,6 @@ class WhitenedModel(ScaledSensors):
         with np.errstate(divide="ignore", invalid="ignore"):
             gain[:, scalar] = self.gain[:, scalar, :1] * np.where(modulus > 0.0, total / modulus, 0.0)
         return gain
-
-    def linearised(self, source_fields: FloatArray) -> WhitenedModel:
-        """The same where moduli read components, along the sum with the ambient field of some fields (b, N, 3)."""
-        components = np.zeros_like(self.channel_is_scalar)
-        return replace(self, gain=self.linear_gain(source_fields), channel_is_scalar=components)
 
     def moment_jacobian(self, q: FloatArray, gain: FloatArray) -> FloatArray:
         """Derivative of the predictions with respect to μ: (b, C, 3 K)."""

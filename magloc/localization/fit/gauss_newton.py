@@ -18,14 +18,13 @@ from arrays.typing import FloatArray
 from magloc.compilation import over_rows, own
 from magloc.fields.dipole import MU0_OVER_4PI
 from magloc.localization.fit.joint_compiled import LARGEST_DAMPING, LARGEST_STEP_RAD, JointEnds, refine_rows
+from magloc.localization.fit.moduli_compiled import refined_by_moduli
 from magloc.localization.fit.variable_projection_compiled import refined
 from magloc.measurement.whitened import WhitenedModel
 
 # A refinement has converged where the linearised model promises to lower χ² by less than this, absolute and relative.
 PROMISE_ABSOLUTE = 1e-8
 PROMISE_RELATIVE = 1e-11
-# Linearisations of moduli at most before steps are damped.
-_MOST_ROUNDS = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +115,7 @@ def tangents(q: FloatArray) -> FloatArray:
 def fit_moments(problem: WhitenedModel, y: FloatArray, q: FloatArray) -> FloatArray:
     """Scaled moments (b, K, 3) that fit y (b, C) best at q, the channels linearised about the ambient field alone."""
     gain = problem.linear_gain(np.zeros_like(problem.ambient))
-    return _moment_step(problem.moment_jacobian(q, gain), y - problem.predicted(np.zeros_like(problem.ambient)))
+    return _moment_step(problem.moment_jacobian(q, gain), y - problem.of_ambient)
 
 
 def _by_position(
@@ -196,31 +195,13 @@ def refine(
     vector sensors, which begin with the moments that fit best, and of one source by any sensors.
     """
     free = np.ones((q.shape[1], 3), dtype=bool) if free is None else free
-    fits = most_refined(problem, y, q, mu, free=free, max_iterations=max_iterations, promise=promise)
-    lost = np.flatnonzero(~fits.converged)
-    if lost.size and _is_relinearised(problem, free):
-        at, left = problem.rows(lost), fits.rows(lost)
-        fits.put(lost, damped_gauss_newton(at, y[lost], left.q, left.mu, free, max_iterations, promise))
-    return fits
-
-
-def most_refined(
-    problem: WhitenedModel,
-    y: FloatArray,
-    q: FloatArray,
-    mu: FloatArray,
-    *,
-    free: NDArray[np.bool_] | None = None,
-    max_iterations: int = 60,
-    promise: float = PROMISE_ABSOLUTE,
-) -> JointFits:
-    """:func:`refine`, but one source by moduli that are far from linear may be left where it stands."""
-    free = np.ones((q.shape[1], 3), dtype=bool) if free is None else free
-    if _is_relinearised(problem, free):
-        return _relinearised(problem, y, q, mu, float(free[0, 2]), max_iterations, promise)
     linear = problem.known is None and not problem.channel_is_scalar.any()
-    if linear and q.shape[1] == 1 and free.all():
-        found = refined(problem, y, q[:, 0], max_iterations)
+    by_moduli = _is_by_moduli(problem, free)
+    if by_moduli or (linear and q.shape[1] == 1 and free.all()):
+        if by_moduli:
+            found = refined_by_moduli(problem, y, q[:, 0], mu[:, 0], max_iterations, float(free[0, 2]), promise)
+        else:
+            found = refined(problem, y, q[:, 0], max_iterations)
         chi2 = np.where(found.converged, found.chi2, np.inf)
         return JointFits(found.q[:, None], found.mu[:, None], chi2, found.iterations)
     if linear and free.any():
@@ -231,51 +212,9 @@ def most_refined(
     return damped_gauss_newton(problem, y, q, mu, free, max_iterations, promise)
 
 
-def _is_relinearised(problem: WhitenedModel, free: NDArray[np.bool_]) -> bool:
-    """Whether :func:`_relinearised` refines: one source of free direction and moment, by scalar sensors too."""
+def _is_by_moduli(problem: WhitenedModel, free: NDArray[np.bool_]) -> bool:
+    """Whether :func:`refined_by_moduli` refines: one source of free direction and moment, by scalar sensors too."""
     return bool(problem.known is None and problem.channel_is_scalar.any() and len(free) == 1 and free[0, :2].all())
-
-
-def _relinearised(
-    problem: WhitenedModel,
-    y: FloatArray,
-    q: FloatArray,
-    mu: FloatArray,
-    free_range: float,
-    max_iterations: int,
-    promise: float,
-) -> JointFits:
-    """:func:`most_refined` of one source: moduli are linear about where it stands, and where these lead it stands next.
-
-    The error of a modulus is of second order in the change of the field, so that a few rounds do. A fit has not
-    converged where one raises χ²: :func:`damped_gauss_newton` goes on from there.
-    """
-    q, mu = q.copy(), mu.copy()
-    fields = problem.source_fields(q, mu)
-    left = y - problem.predicted(fields)
-    current = _squares(left)
-    chi2, iterations = np.full(len(q), np.inf), np.zeros(len(q), dtype=np.int64)
-    live, at = np.arange(len(q)), problem
-    for _ in range(_MOST_ROUNDS):
-        if not live.size:
-            break
-        linear = at.linearised(fields)
-        left += linear.predicted(fields)
-        found = refined(linear, left, q[live, 0], max_iterations, free_range, 0.01 * promise)
-        new_q, new_mu = found.q[:, None], found.mu[:, None]
-        fields = at.source_fields(new_q, new_mu)
-        left = y[live] - at.predicted(fields)
-        new = _squares(left)
-        iterations[live] += found.iterations
-        with np.errstate(invalid="ignore"):
-            gained = np.where(found.converged, current[live] - new, -np.inf)
-        better = gained > 0.0
-        q[live[better]], mu[live[better]], current[live[better]] = new_q[better], new_mu[better], new[better]
-        settled = np.abs(gained) < promise + PROMISE_RELATIVE * new
-        chi2[live[settled]] = current[live[settled]]
-        stay = np.flatnonzero(better & ~settled)
-        live, at, fields, left = live[stay], at.rows(stay), fields[stay], left[stay]
-    return JointFits(q, mu, chi2, iterations)
 
 
 def damped_gauss_newton(

@@ -29,18 +29,19 @@ SENSOR_ROWS = 37 * LANES
 # Rows of the workspace: the state with its moment, χ² and linearisation, and the same at the trial state.
 STATE = 0 * LANES
 NORMAL = 8 * LANES  # JᵀJ (00, 01, 02, 11, 12, 22), Jᵀr
-TRIAL = 17 * LANES
+LEFT = 17 * LANES  # by how much another moment alone promises to lower χ²: of moduli, which are not linear in it
+TRIAL = 18 * LANES
 MOMENT = 4 * LANES  # from either
 CHI2 = 7 * LANES
-DAMPING = 34 * LANES
-PROMISED = 35 * LANES
-TANGENT = 36 * LANES  # (tangent, component of q)
-SQUARE = 48 * LANES  # of the basis's columns (3), and one over those of their parts that are free of the earlier ones
-PRODUCT = 54 * LANES  # of the basis's columns (01, 02, 12), then with the signal (3)
-ALONG = 60 * LANES  # of the basis's columns with the Jacobian's (3 × 3)
-ITERATIONS = 69 * LANES
-END = 70 * LANES
-WORKSPACE = 71 * LANES
+DAMPING = 36 * LANES
+PROMISED = 37 * LANES
+TANGENT = 38 * LANES  # (tangent, component of q)
+SQUARE = 50 * LANES  # of the basis's columns (3), and one over those of their parts that are free of the earlier ones
+PRODUCT = 56 * LANES  # of the basis's columns (01, 02, 12), then with the signal (3)
+ALONG = 62 * LANES  # of the basis's columns with the Jacobian's (3 × 3)
+ITERATIONS = 71 * LANES
+END = 72 * LANES
+WORKSPACE = 73 * LANES
 
 
 @compiled
@@ -48,9 +49,24 @@ def linearise(
     sensors: FloatArray, w: FloatArray, rows: FloatArray, common: FloatArray, dots: FloatArray, free_range: float
 ) -> None:
     """Scaled moment, χ² and normal equations of the trial states."""
-    _fill_basis(sensors, w, rows)
+    fill_directions(sensors, w, rows)
+    fit_moment(w, rows, common, dots)
+    fill_normal(sensors, w, rows, common, dots, free_range)
+
+
+@compiled
+def fit_moment(w: FloatArray, rows: FloatArray, common: FloatArray, dots: FloatArray) -> None:
+    """Scaled moment, residual and χ² of the trial states."""
+    _fill_basis(rows)
     _project(BASIS, rows, common, dots)
     _orthogonalise(w, rows)
+
+
+@compiled
+def fill_normal(
+    sensors: FloatArray, w: FloatArray, rows: FloatArray, common: FloatArray, dots: FloatArray, free_range: float
+) -> None:
+    """Normal equations of the trial states with their moments."""
     _fill_tangents(w, free_range)
     _fill_jacobian(sensors, w, rows)
     _project(JACOBIAN, rows, common, dots)
@@ -66,8 +82,8 @@ def _unit_readings(r: FloatArray, at: int, i: int, n: tuple[float, float, float]
 
 
 @compiled
-def _fill_basis(sensors: FloatArray, w: FloatArray, rows: FloatArray) -> None:
-    """Readings of the three unit moments at the trial state."""
+def fill_directions(sensors: FloatArray, w: FloatArray, rows: FloatArray) -> None:
+    """Directions from the source at the trial state to the sensors, and one over their distances."""
     for s in range(len(sensors)):
         x0, x1, x2 = sensors[s, 0], sensors[s, 1], sensors[s, 2]
         r = rows[s]
@@ -79,10 +95,18 @@ def _fill_basis(sensors: FloatArray, w: FloatArray, rows: FloatArray) -> None:
                 scale * x2 - w[TRIAL + 2 * LANES + i],
             )
             inverse = 1.0 / math.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
-            n = (v0 * inverse, v1 * inverse, v2 * inverse)
+            r[DIRECTION + i], r[DIRECTION + LANES + i] = v0 * inverse, v1 * inverse
+            r[DIRECTION + 2 * LANES + i], r[DIRECTION + 3 * LANES + i] = v2 * inverse, inverse
+
+
+@compiled
+def _fill_basis(rows: FloatArray) -> None:
+    """Readings of the three unit moments at the trial state."""
+    for s in range(len(rows)):
+        r = rows[s]
+        for i in range(LANES):
+            n, inverse = three(r, DIRECTION, i), r[DIRECTION + 3 * LANES + i]
             cube = inverse * inverse * inverse
-            r[DIRECTION + i], r[DIRECTION + LANES + i], r[DIRECTION + 2 * LANES + i] = n
-            r[DIRECTION + 3 * LANES + i] = inverse
             b0, b1, b2 = _unit_readings(r, GAIN, i, n, cube)
             r[BASIS + i], r[BASIS + LANES + i], r[BASIS + 2 * LANES + i] = b0, b1, b2
             b0, b1, b2 = _unit_readings(r, GAIN + 3 * LANES, i, n, cube)
@@ -100,34 +124,35 @@ def _project(at: int, rows: FloatArray, common: FloatArray, dots: FloatArray) ->
         for s in range(len(rows)):
             r, c = rows[s, at : at + 9 * LANES], common[s, k]
             for i in range(LANES):
-                c0, c1, c2 = _column(c, 0, i), _column(c, LANES, i), _column(c, 2 * LANES, i)
-                r0, r1, r2 = _column(r, 0, i), _column(r, LANES, i), _column(r, 2 * LANES, i)
-                d[i] += _dot(c0, r0)
-                d[LANES + i] += _dot(c0, r1)
-                d[2 * LANES + i] += _dot(c0, r2)
-                d[3 * LANES + i] += _dot(c1, r0)
-                d[4 * LANES + i] += _dot(c1, r1)
-                d[5 * LANES + i] += _dot(c1, r2)
-                d[6 * LANES + i] += _dot(c2, r0)
-                d[7 * LANES + i] += _dot(c2, r1)
-                d[8 * LANES + i] += _dot(c2, r2)
+                c0, c1, c2 = column(c, 0, i), column(c, LANES, i), column(c, 2 * LANES, i)
+                r0, r1, r2 = column(r, 0, i), column(r, LANES, i), column(r, 2 * LANES, i)
+                d[i] += dot(c0, r0)
+                d[LANES + i] += dot(c0, r1)
+                d[2 * LANES + i] += dot(c0, r2)
+                d[3 * LANES + i] += dot(c1, r0)
+                d[4 * LANES + i] += dot(c1, r1)
+                d[5 * LANES + i] += dot(c1, r2)
+                d[6 * LANES + i] += dot(c2, r0)
+                d[7 * LANES + i] += dot(c2, r1)
+                d[8 * LANES + i] += dot(c2, r2)
         for s in range(len(rows)):
             r, c = rows[s, at : at + 9 * LANES], common[s, k]
             for i in range(LANES):
-                c0, c1, c2 = _column(c, 0, i), _column(c, LANES, i), _column(c, 2 * LANES, i)
-                for_0 = _less(_column(r, 0, i), d[i], c0)
-                for_1 = _less(_column(r, LANES, i), d[LANES + i], c0)
-                for_2 = _less(_column(r, 2 * LANES, i), d[2 * LANES + i], c0)
-                for_0 = _less(_less(for_0, d[3 * LANES + i], c1), d[6 * LANES + i], c2)
-                for_1 = _less(_less(for_1, d[4 * LANES + i], c1), d[7 * LANES + i], c2)
-                for_2 = _less(_less(for_2, d[5 * LANES + i], c1), d[8 * LANES + i], c2)
+                c0, c1, c2 = column(c, 0, i), column(c, LANES, i), column(c, 2 * LANES, i)
+                for_0 = less(column(r, 0, i), d[i], c0)
+                for_1 = less(column(r, LANES, i), d[LANES + i], c0)
+                for_2 = less(column(r, 2 * LANES, i), d[2 * LANES + i], c0)
+                for_0 = less(less(for_0, d[3 * LANES + i], c1), d[6 * LANES + i], c2)
+                for_1 = less(less(for_1, d[4 * LANES + i], c1), d[7 * LANES + i], c2)
+                for_2 = less(less(for_2, d[5 * LANES + i], c1), d[8 * LANES + i], c2)
                 _put_column(r, 0, i, for_0)
                 _put_column(r, LANES, i, for_1)
                 _put_column(r, 2 * LANES, i, for_2)
 
 
 @inlined
-def _column(r: FloatArray, at: int, i: int) -> tuple[float, float, float]:
+def column(r: FloatArray, at: int, i: int) -> tuple[float, float, float]:
+    """A column of three at an offset, of the three channels of a sensor."""
     return r[at + i], r[at + 3 * LANES + i], r[at + 6 * LANES + i]
 
 
@@ -137,12 +162,14 @@ def _put_column(r: FloatArray, at: int, i: int, c: tuple[float, float, float]) -
 
 
 @inlined
-def _dot(a: tuple[float, float, float], b: tuple[float, float, float]) -> float:
+def dot(a: tuple[float, float, float], b: tuple[float, float, float]) -> float:
+    """Product of two vectors."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @inlined
-def _less(a: tuple[float, float, float], t: float, b: tuple[float, float, float]) -> tuple[float, float, float]:
+def less(a: tuple[float, float, float], t: float, b: tuple[float, float, float]) -> tuple[float, float, float]:
+    """A vector without a multiple of another."""
     return a[0] - t * b[0], a[1] - t * b[1], a[2] - t * b[2]
 
 
@@ -154,14 +181,14 @@ def _orthogonalise(w: FloatArray, rows: FloatArray) -> None:
     for s in range(len(rows)):
         r = rows[s]
         for i in range(LANES):
-            c0, c1, c2 = _column(r, BASIS, i), _column(r, BASIS + LANES, i), _column(r, BASIS + 2 * LANES, i)
+            c0, c1, c2 = column(r, BASIS, i), column(r, BASIS + LANES, i), column(r, BASIS + 2 * LANES, i)
             y = (r[SIGNAL + i], r[SIGNAL + LANES + i], r[SIGNAL + 2 * LANES + i])
-            w[SQUARE + i] += _dot(c0, c0)
-            w[SQUARE + LANES + i] += _dot(c1, c1)
-            w[SQUARE + 2 * LANES + i] += _dot(c2, c2)
-            w[PRODUCT + i] += _dot(c0, c1)
-            w[PRODUCT + LANES + i] += _dot(c0, c2)
-            w[PRODUCT + 3 * LANES + i] += _dot(c0, y)
+            w[SQUARE + i] += dot(c0, c0)
+            w[SQUARE + LANES + i] += dot(c1, c1)
+            w[SQUARE + 2 * LANES + i] += dot(c2, c2)
+            w[PRODUCT + i] += dot(c0, c1)
+            w[PRODUCT + LANES + i] += dot(c0, c2)
+            w[PRODUCT + 3 * LANES + i] += dot(c0, y)
     for i in range(LANES):
         square = w[SQUARE + i]
         inverse = 1.0 / square if square > 0.0 else 0.0
@@ -172,17 +199,17 @@ def _orthogonalise(w: FloatArray, rows: FloatArray) -> None:
     for s in range(len(rows)):
         r = rows[s]
         for i in range(LANES):
-            c0 = _column(r, BASIS, i)
-            c1 = _less(_column(r, BASIS + LANES, i), w[PRODUCT + i], c0)
-            c2 = _less(_column(r, BASIS + 2 * LANES, i), w[PRODUCT + LANES + i], c0)
+            c0 = column(r, BASIS, i)
+            c1 = less(column(r, BASIS + LANES, i), w[PRODUCT + i], c0)
+            c2 = less(column(r, BASIS + 2 * LANES, i), w[PRODUCT + LANES + i], c0)
             y = (r[SIGNAL + i], r[SIGNAL + LANES + i], r[SIGNAL + 2 * LANES + i])
-            y = _less(y, w[PRODUCT + 3 * LANES + i], c0)
+            y = less(y, w[PRODUCT + 3 * LANES + i], c0)
             _put_column(r, BASIS + LANES, i, c1)
             _put_column(r, BASIS + 2 * LANES, i, c2)
             r[RESIDUAL + i], r[RESIDUAL + LANES + i], r[RESIDUAL + 2 * LANES + i] = y
-            w[SQUARE + 4 * LANES + i] += _dot(c1, c1)
-            w[PRODUCT + 2 * LANES + i] += _dot(c1, c2)
-            w[PRODUCT + 4 * LANES + i] += _dot(c1, y)
+            w[SQUARE + 4 * LANES + i] += dot(c1, c1)
+            w[PRODUCT + 2 * LANES + i] += dot(c1, c2)
+            w[PRODUCT + 4 * LANES + i] += dot(c1, y)
     for i in range(LANES):
         square = w[SQUARE + 4 * LANES + i]
         inverse = 1.0 / square if square > _LOST * w[SQUARE + LANES + i] else 0.0
@@ -192,14 +219,14 @@ def _orthogonalise(w: FloatArray, rows: FloatArray) -> None:
     for s in range(len(rows)):
         r = rows[s]
         for i in range(LANES):
-            c1 = _column(r, BASIS + LANES, i)
-            c2 = _less(_column(r, BASIS + 2 * LANES, i), w[PRODUCT + 2 * LANES + i], c1)
+            c1 = column(r, BASIS + LANES, i)
+            c2 = less(column(r, BASIS + 2 * LANES, i), w[PRODUCT + 2 * LANES + i], c1)
             y = (r[RESIDUAL + i], r[RESIDUAL + LANES + i], r[RESIDUAL + 2 * LANES + i])
-            y = _less(y, w[PRODUCT + 4 * LANES + i], c1)
+            y = less(y, w[PRODUCT + 4 * LANES + i], c1)
             _put_column(r, BASIS + 2 * LANES, i, c2)
             r[RESIDUAL + i], r[RESIDUAL + LANES + i], r[RESIDUAL + 2 * LANES + i] = y
-            w[SQUARE + 5 * LANES + i] += _dot(c2, c2)
-            w[PRODUCT + 5 * LANES + i] += _dot(c2, y)
+            w[SQUARE + 5 * LANES + i] += dot(c2, c2)
+            w[PRODUCT + 5 * LANES + i] += dot(c2, y)
     for i in range(LANES):
         square = w[SQUARE + 5 * LANES + i]
         inverse = 1.0 / square if square > _LOST * w[SQUARE + 2 * LANES + i] else 0.0
@@ -213,9 +240,9 @@ def _orthogonalise(w: FloatArray, rows: FloatArray) -> None:
         r = rows[s]
         for i in range(LANES):
             y = (r[RESIDUAL + i], r[RESIDUAL + LANES + i], r[RESIDUAL + 2 * LANES + i])
-            y = _less(y, w[PRODUCT + 5 * LANES + i], _column(r, BASIS + 2 * LANES, i))
+            y = less(y, w[PRODUCT + 5 * LANES + i], column(r, BASIS + 2 * LANES, i))
             r[RESIDUAL + i], r[RESIDUAL + LANES + i], r[RESIDUAL + 2 * LANES + i] = y
-            w[TRIAL + CHI2 + i] += _dot(y, y)
+            w[TRIAL + CHI2 + i] += dot(y, y)
 
 
 @inlined
@@ -251,7 +278,7 @@ def _change(
     d: tuple[float, float, float], n: tuple[float, float, float], m: tuple[float, float, float], quartic: float
 ) -> tuple[float, float, float]:
     """Change of the field of a moment with a displacement d; quartic is three over the distance to the fourth power."""
-    along, of_moment, of_direction = _dot(n, m), _dot(d, m), _dot(n, d)
+    along, of_moment, of_direction = dot(n, m), dot(d, m), dot(n, d)
     by_n, by_d, by_m = quartic * (of_moment - 5.0 * along * of_direction), quartic * along, quartic * of_direction
     return (
         by_d * d[0] + by_n * n[0] + by_m * m[0],
@@ -261,7 +288,8 @@ def _change(
 
 
 @inlined
-def _row(r: FloatArray, at: int, i: int) -> tuple[float, float, float]:
+def three(r: FloatArray, at: int, i: int) -> tuple[float, float, float]:
+    """Three successive rows at an offset."""
     return r[at + i], r[at + LANES + i], r[at + 2 * LANES + i]
 
 
@@ -272,18 +300,18 @@ def _fill_jacobian(sensors: FloatArray, w: FloatArray, rows: FloatArray) -> None
         x0, x1, x2 = sensors[s, 0], sensors[s, 1], sensors[s, 2]
         r = rows[s]
         for i in range(LANES):
-            n, m = _row(r, DIRECTION, i), _row(w, TRIAL + MOMENT, i)
+            n, m = three(r, DIRECTION, i), three(w, TRIAL + MOMENT, i)
             inverse2 = r[DIRECTION + 3 * LANES + i] * r[DIRECTION + 3 * LANES + i]
             quartic = 3.0 * inverse2 * inverse2
-            t0, t1, t2 = _row(w, TANGENT, i), _row(w, TANGENT + 3 * LANES, i), _row(w, TANGENT + 6 * LANES, i)
+            t0, t1, t2 = three(w, TANGENT, i), three(w, TANGENT + 3 * LANES, i), three(w, TANGENT + 6 * LANES, i)
             t23 = w[TANGENT + 9 * LANES + i]
             # What moves the source moves a sensor the other way.
             b0, b1 = _change((-t0[0], -t0[1], -t0[2]), n, m, quartic), _change((-t1[0], -t1[1], -t1[2]), n, m, quartic)
             b2 = _change((t23 * x0 - t2[0], t23 * x1 - t2[1], t23 * x2 - t2[2]), n, m, quartic)
-            g0, g1, g2 = _row(r, GAIN, i), _row(r, GAIN + 3 * LANES, i), _row(r, GAIN + 6 * LANES, i)
-            _put_column(r, JACOBIAN, i, (_dot(g0, b0), _dot(g1, b0), _dot(g2, b0)))
-            _put_column(r, JACOBIAN + LANES, i, (_dot(g0, b1), _dot(g1, b1), _dot(g2, b1)))
-            _put_column(r, JACOBIAN + 2 * LANES, i, (_dot(g0, b2), _dot(g1, b2), _dot(g2, b2)))
+            g0, g1, g2 = three(r, GAIN, i), three(r, GAIN + 3 * LANES, i), three(r, GAIN + 6 * LANES, i)
+            _put_column(r, JACOBIAN, i, (dot(g0, b0), dot(g1, b0), dot(g2, b0)))
+            _put_column(r, JACOBIAN + LANES, i, (dot(g0, b1), dot(g1, b1), dot(g2, b1)))
+            _put_column(r, JACOBIAN + 2 * LANES, i, (dot(g0, b2), dot(g1, b2), dot(g2, b2)))
 
 
 @compiled
@@ -294,19 +322,19 @@ def _fill_normal(w: FloatArray, rows: FloatArray) -> None:
     for s in range(len(rows)):
         r = rows[s]
         for i in range(LANES):
-            c0, c1, c2 = _column(r, BASIS, i), _column(r, BASIS + LANES, i), _column(r, BASIS + 2 * LANES, i)
-            j0, j1, j2 = _column(r, JACOBIAN, i), _column(r, JACOBIAN + LANES, i), _column(r, JACOBIAN + 2 * LANES, i)
-            w[ALONG + i] += _dot(c0, j0)
-            w[ALONG + LANES + i] += _dot(c0, j1)
-            w[ALONG + 2 * LANES + i] += _dot(c0, j2)
-            w[ALONG + 3 * LANES + i] += _dot(c1, j0)
-            w[ALONG + 4 * LANES + i] += _dot(c1, j1)
-            w[ALONG + 5 * LANES + i] += _dot(c1, j2)
-            w[ALONG + 6 * LANES + i] += _dot(c2, j0)
-            w[ALONG + 7 * LANES + i] += _dot(c2, j1)
-            w[ALONG + 8 * LANES + i] += _dot(c2, j2)
+            c0, c1, c2 = column(r, BASIS, i), column(r, BASIS + LANES, i), column(r, BASIS + 2 * LANES, i)
+            j0, j1, j2 = column(r, JACOBIAN, i), column(r, JACOBIAN + LANES, i), column(r, JACOBIAN + 2 * LANES, i)
+            w[ALONG + i] += dot(c0, j0)
+            w[ALONG + LANES + i] += dot(c0, j1)
+            w[ALONG + 2 * LANES + i] += dot(c0, j2)
+            w[ALONG + 3 * LANES + i] += dot(c1, j0)
+            w[ALONG + 4 * LANES + i] += dot(c1, j1)
+            w[ALONG + 5 * LANES + i] += dot(c1, j2)
+            w[ALONG + 6 * LANES + i] += dot(c2, j0)
+            w[ALONG + 7 * LANES + i] += dot(c2, j1)
+            w[ALONG + 8 * LANES + i] += dot(c2, j2)
     for i in range(LANES):
-        for_0, for_1, for_2 = _row(w, SQUARE + 3 * LANES, i)
+        for_0, for_1, for_2 = three(w, SQUARE + 3 * LANES, i)
         w[ALONG + i] *= for_0
         w[ALONG + LANES + i] *= for_0
         w[ALONG + 2 * LANES + i] *= for_0
@@ -319,19 +347,19 @@ def _fill_normal(w: FloatArray, rows: FloatArray) -> None:
     for s in range(len(rows)):
         r = rows[s]
         for i in range(LANES):
-            c0, c1, c2 = _column(r, BASIS, i), _column(r, BASIS + LANES, i), _column(r, BASIS + 2 * LANES, i)
-            a0, a1, a2 = _column(w, ALONG, i), _column(w, ALONG + LANES, i), _column(w, ALONG + 2 * LANES, i)
-            j0, j1, j2 = _column(r, JACOBIAN, i), _column(r, JACOBIAN + LANES, i), _column(r, JACOBIAN + 2 * LANES, i)
-            j0 = _less(_less(_less(j0, a0[0], c0), a0[1], c1), a0[2], c2)
-            j1 = _less(_less(_less(j1, a1[0], c0), a1[1], c1), a1[2], c2)
-            j2 = _less(_less(_less(j2, a2[0], c0), a2[1], c1), a2[2], c2)
-            y = _row(r, RESIDUAL, i)
-            w[TRIAL + NORMAL + i] += _dot(j0, j0)
-            w[TRIAL + NORMAL + LANES + i] += _dot(j0, j1)
-            w[TRIAL + NORMAL + 2 * LANES + i] += _dot(j0, j2)
-            w[TRIAL + NORMAL + 3 * LANES + i] += _dot(j1, j1)
-            w[TRIAL + NORMAL + 4 * LANES + i] += _dot(j1, j2)
-            w[TRIAL + NORMAL + 5 * LANES + i] += _dot(j2, j2)
-            w[TRIAL + NORMAL + 6 * LANES + i] += _dot(j0, y)
-            w[TRIAL + NORMAL + 7 * LANES + i] += _dot(j1, y)
-            w[TRIAL + NORMAL + 8 * LANES + i] += _dot(j2, y)
+            c0, c1, c2 = column(r, BASIS, i), column(r, BASIS + LANES, i), column(r, BASIS + 2 * LANES, i)
+            a0, a1, a2 = column(w, ALONG, i), column(w, ALONG + LANES, i), column(w, ALONG + 2 * LANES, i)
+            j0, j1, j2 = column(r, JACOBIAN, i), column(r, JACOBIAN + LANES, i), column(r, JACOBIAN + 2 * LANES, i)
+            j0 = less(less(less(j0, a0[0], c0), a0[1], c1), a0[2], c2)
+            j1 = less(less(less(j1, a1[0], c0), a1[1], c1), a1[2], c2)
+            j2 = less(less(less(j2, a2[0], c0), a2[1], c1), a2[2], c2)
+            y = three(r, RESIDUAL, i)
+            w[TRIAL + NORMAL + i] += dot(j0, j0)
+            w[TRIAL + NORMAL + LANES + i] += dot(j0, j1)
+            w[TRIAL + NORMAL + 2 * LANES + i] += dot(j0, j2)
+            w[TRIAL + NORMAL + 3 * LANES + i] += dot(j1, j1)
+            w[TRIAL + NORMAL + 4 * LANES + i] += dot(j1, j2)
+            w[TRIAL + NORMAL + 5 * LANES + i] += dot(j2, j2)
+            w[TRIAL + NORMAL + 6 * LANES + i] += dot(j0, y)
+            w[TRIAL + NORMAL + 7 * LANES + i] += dot(j1, y)
+            w[TRIAL + NORMAL + 8 * LANES + i] += dot(j2, y)

@@ -20,6 +20,7 @@ from magloc.localization.fit.linearisation_compiled import (
     GAIN,
     ITERATIONS,
     LANES,
+    LEFT,
     MOMENT,
     NORMAL,
     PROMISED,
@@ -108,41 +109,59 @@ def refine(
     common, dots = np.zeros((n_sensors, n_triples, 9 * LANES)), np.empty((n_triples, 9 * LANES))
     start_of_lane, set_of_lane = np.full(LANES, -1), np.full(LANES, -1)
     w[END : END + LANES] = FAILED
-    next_start, active = 0, 0
-    while True:
-        for i in range(LANES):
-            if w[END + i] == RUNNING:
-                continue
-            k = start_of_lane[i]
-            if k >= 0:
-                active -= 1
-                for d in range(4):
-                    out.q[k, d] = w[STATE + d * LANES + i]
-                for d in range(3):
-                    out.mu[k, d] = w[STATE + MOMENT + d * LANES + i]
-                out.chi2[k] = w[CHI2 + i]
-                out.iterations[k] = int(w[ITERATIONS + i])
-                out.converged[k] = w[END + i] == CONVERGED
-            start_of_lane[i] = next_start if next_start < n else -1
-            active += next_start < n
-            k = min(next_start, n - 1)  # an idle lane computes something, too
-            next_start += 1
-            _load(i, starts[k], signal[reading[k]], w, rows)
-            of_row = model.set_of_row[reading[k]]
-            if set_of_lane[i] != of_row:
-                set_of_lane[i] = of_row
-                _load_model(i, model.gain[of_row], model.common[of_row], rows, common)
-        if active == 0:
-            return
+    next_start = fill_lanes(0, start_of_lane, set_of_lane, signal, reading, starts, model, w, rows, common, out)
+    while start_of_lane.max() >= 0:
         linearise(model.sensors, w, rows, common, dots, free_range)
-        _judge(w, tolerance, max_iterations)
-        _step(w, free_range)
+        judge(w, tolerance, max_iterations)
+        step(w, free_range)
+        next_start = fill_lanes(
+            next_start, start_of_lane, set_of_lane, signal, reading, starts, model, w, rows, common, out
+        )
+
+
+@compiled
+def fill_lanes(
+    next_start: int,
+    start_of_lane: IntArray,
+    set_of_lane: IntArray,
+    signal: FloatArray,
+    reading: IntArray,
+    starts: FloatArray,
+    model: LaneModel,
+    w: FloatArray,
+    rows: FloatArray,
+    common: FloatArray,
+    out: Refined,
+) -> int:
+    """Put out the starts that have ended, and begin others in their lanes: the start that comes next."""
+    n = len(starts)
+    for i in range(LANES):
+        if w[END + i] == RUNNING:
+            continue
+        k = start_of_lane[i]
+        if k >= 0:
+            for d in range(4):
+                out.q[k, d] = w[STATE + d * LANES + i]
+            for d in range(3):
+                out.mu[k, d] = w[STATE + MOMENT + d * LANES + i]
+            out.chi2[k] = w[CHI2 + i]
+            out.iterations[k] = int(w[ITERATIONS + i])
+            out.converged[k] = w[END + i] == CONVERGED
+        start_of_lane[i] = next_start if next_start < n else -1
+        k = min(next_start, n - 1)  # an idle lane computes something, too
+        next_start += 1
+        _load(i, starts[k], signal[reading[k]], w, rows)
+        of_row = model.set_of_row[reading[k]]
+        if set_of_lane[i] != of_row:
+            set_of_lane[i] = of_row
+            _load_model(i, model.gain[of_row], model.common[of_row], rows, common)
+    return next_start
 
 
 @compiled
 def _load(i: int, start: FloatArray, signal: FloatArray, w: FloatArray, rows: FloatArray) -> None:
-    """Begin a start in lane i."""
-    for d in range(4):
+    """Begin a start in lane i: a place, where moduli count with a moment behind it."""
+    for d in range(len(start)):
         w[TRIAL + d * LANES + i] = start[d]
     for d in range(9):
         w[NORMAL + d * LANES + i] = 0.0
@@ -200,7 +219,7 @@ def _take(w: FloatArray, at: int, i: int, taken: bool) -> None:
 
 
 @compiled
-def _judge(w: FloatArray, tolerance: float, max_iterations: float) -> None:
+def judge(w: FloatArray, tolerance: float, max_iterations: float) -> None:
     """Take the trial state where its χ² is lower, adapt the damping, and see which lanes have ended."""
     for i in range(LANES):
         before, promised, damping = w[CHI2 + i], w[PROMISED + i], w[DAMPING + i]
@@ -235,10 +254,11 @@ def _judge(w: FloatArray, tolerance: float, max_iterations: float) -> None:
         _take(w, NORMAL + 6 * LANES, i, taken)
         _take(w, NORMAL + 7 * LANES, i, taken)
         _take(w, NORMAL + 8 * LANES, i, taken)
+        _take(w, LEFT, i, taken)
     for i in range(LANES):
         n = _normal(w, i)
         x0, x1, x2 = _solved(n, 0.0)
-        decrement = n[6] * x0 + n[7] * x1 + n[8] * x2
+        decrement = n[6] * x0 + n[7] * x1 + n[8] * x2 + w[LEFT + i]
         chi2 = w[CHI2 + i]
         # No representable step decreases χ²: an optimum to rounding if the model promised next to nothing.
         stuck = w[DAMPING + i] > 1e12
@@ -250,7 +270,7 @@ def _judge(w: FloatArray, tolerance: float, max_iterations: float) -> None:
 
 
 @compiled
-def _step(w: FloatArray, free_range: float) -> None:
+def step(w: FloatArray, free_range: float) -> None:
     """A damped step of every lane, half a radian at most."""
     for i in range(LANES):
         a00, a01, a02, a11, a12, a22, b0, b1, b2 = _normal(w, i)
@@ -262,6 +282,7 @@ def _step(w: FloatArray, free_range: float) -> None:
             x0 * (2.0 * b0 - a00 * x0 - a01 * x1 - a02 * x2)
             + x1 * (2.0 * b1 - a01 * x0 - a11 * x1 - a12 * x2)
             + x2 * (2.0 * b2 - a02 * x0 - a12 * x1 - a22 * x2)
+            + w[LEFT + i]
         )
         t00, t01, t02, t10, t11, t12, t20, t21, t22, t23 = tangents(w, STATE, i)
         x2 *= free_range

@@ -111,9 +111,8 @@ class Search:
 
     def _first(self, problem: WhitenedModel, y: FloatArray, templates: bool) -> JointFits:
         """:meth:`first` of rows all of which start from templates too, or none."""
-        silent = np.zeros_like(problem.ambient)
-        gain = problem.linear_gain(silent)
-        residual = y - problem.predicted(silent)
+        gain = problem.linear_gain(np.zeros_like(problem.ambient))
+        residual = y - problem.of_ambient
         starts: list[tuple[FloatArray, FloatArray]] = []
         if np.any(gain):
             n_starts = 3 * self.n_starts // 2
@@ -123,8 +122,11 @@ class Search:
                 chosen[rows] = chosen_candidates(bases, residual[rows], self.candidates, n_starts, self.apart_rad)
             q = self.candidates[chosen]
             row = np.repeat(np.arange(len(y)), n_starts)
-            mu = fit_moments(problem.rows(row), y[row], q.reshape(-1, 1, 4))
-            starts.append((q, mu.reshape(len(y), n_starts, 3)))
+            # From none the first step leads to the moments that fit best, but by steps to what is known of them.
+            mu = np.zeros((len(y), n_starts, 3))
+            if problem.known is not None:
+                mu = fit_moments(problem.rows(row), y[row], q.reshape(-1, 1, 4)).reshape(mu.shape)
+            starts.append((q, mu))
             if problem.known is not None:
                 starts.append(
                     starts_of_known_moment(

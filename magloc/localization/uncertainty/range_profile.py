@@ -6,14 +6,12 @@ beyond it, on the other side.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from numpy.typing import NDArray
 
-from arrays.typing import FloatArray, IntArray
+from arrays.typing import FloatArray
 from magloc.levels import DELTA_CHI2_95
-from magloc.localization.fit.gauss_newton import JointFits, most_refined, refine
+from magloc.localization.fit.gauss_newton import JointFits, refine
 from magloc.localization.uncertainty.range_interval import ranges_of, relative_range_sigma
 from magloc.measurement.whitened import WhitenedModel
 
@@ -53,20 +51,14 @@ def profile_stretches(
     grid = at_optimum[:, None] + (sign * step[rows])[:, None] * np.append(_STEPS, np.inf)
     grid = np.clip(grid, _SMALLEST_ALPHA - 0.5 * np.pi, 0.5 * np.pi - _SMALLEST_ALPHA)
     grid = np.where(np.abs(grid) < _SMALLEST_ALPHA, _SMALLEST_ALPHA, grid)
-    quick = most_refined if problem.ambient.any() else refine
     f_grid, left = np.full(grid.shape, -np.inf), np.arange(2 * n)
     for k in range(grid.shape[1]):
-        f_grid[left, k] = _rises(problem, y, fits, source, rows[left], grid[left, k], quick)
+        f_grid[left, k] = _rises(problem, y, fits, source, rows[left], grid[left, k])
         left = left[f_grid[left, k] <= allowed[left]]
         if not left.size:
             break
-    # Of the points that were not reached those matter that are between the last one within and the first beyond.
-    last, first = _bracket(f_grid, allowed)
-    column = np.arange(grid.shape[1])
-    bounding = np.nonzero((last[:, None] < column) & (column < first[:, None]))
-    if bounding[0].size and quick is not refine:
-        f_grid[bounding] = _rises(problem, y, fits, source, rows[bounding[0]], grid[bounding], refine)
-        last, first = _bracket(f_grid, allowed)
+    beyond = f_grid > allowed[:, None]
+    first = np.where(beyond.any(axis=1), np.argmax(beyond, axis=1), grid.shape[1])
     found = np.flatnonzero(first < grid.shape[1])
     rows, allowed, first = rows[found], allowed[found], first[found]
     outside, f_outside = grid[found, first], f_grid[found, first]
@@ -78,7 +70,7 @@ def profile_stretches(
         with np.errstate(divide="ignore", invalid="ignore"):
             share = np.clip((np.sqrt(allowed) - a) / (b - a), 0.05, 0.95)
         middle = inside + np.nan_to_num(share, nan=0.5) * (outside - inside)
-        f = _rises(problem, y, fits, source, rows, middle, refine)
+        f = _rises(problem, y, fits, source, rows, middle)
         higher = f > allowed
         outside, f_outside = np.where(higher, middle, outside), np.where(higher, f, f_outside)
         inside, f_inside = np.where(higher, inside, middle), np.where(higher, f_inside, f)
@@ -102,14 +94,6 @@ def ranges_within(
     return ranges_of(profile_stretches(problem, y, fits, source, sigma, np.broadcast_to(rise, len(y))), problem.radius)
 
 
-def _bracket(rise: FloatArray, allowed: FloatArray) -> tuple[IntArray, IntArray]:
-    """Columns of the last point (s, k) known to be within what is allowed (s,), or -1, and the first beyond, or k."""
-    n = rise.shape[1]
-    within, beyond = np.isfinite(rise) & (rise <= allowed[:, None]), rise > allowed[:, None]
-    last = np.where(within.any(axis=1), n - 1 - np.argmax(within[:, ::-1], axis=1), -1)
-    return last, np.where(beyond.any(axis=1), np.argmax(beyond, axis=1), n)
-
-
 def _rises(
     problem: WhitenedModel,
     y: FloatArray,
@@ -117,7 +101,6 @@ def _rises(
     source: int,
     row: NDArray[np.intp],
     alpha: FloatArray,
-    refined: Callable[..., JointFits],
 ) -> FloatArray:
     """Rise of χ² above the optima of rows (r,) at ranges (r,), everything else fitted anew from the optimum."""
     q, mu = fits.q[row].copy(), fits.mu[row].copy()
@@ -131,7 +114,7 @@ def _rises(
     q[:, source] = np.concatenate([direction * np.cos(at), sign * np.sin(at)], axis=-1)
     free = np.ones((q.shape[1], 3), dtype=bool)
     free[source, 2] = False
-    profile = refined(problem.rows(row), y[row], q, mu, free=free, max_iterations=100, promise=_PROMISE)
+    profile = refine(problem.rows(row), y[row], q, mu, free=free, max_iterations=100, promise=_PROMISE)
     # A refinement that did not end says nothing of the profile: the points beyond it decide.
     chi2 = np.where(profile.converged, profile.chi2, -np.inf)
     return np.asarray(chi2 - fits.chi2[row])

@@ -11,6 +11,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ from arrays.sensor import Sensor
 from arrays.whitening import whitening
 from magloc.directions import fibonacci_directions
 from magloc.levels import DELTA_CHI2_95
-from magloc.localization.fit.gauss_newton import refine
+from magloc.localization.fit.gauss_newton import JointFits, damped_gauss_newton, refine
 from magloc.localization.fit.results import (
     EVERYWHERE,
     Fix,
@@ -391,7 +392,7 @@ class TestRise:
 
 
 class TestProfileOfModuli:
-    """In an ambient field points of the profile are reached in lanes, damped steps go on to those that bound it."""
+    """Points of the profile of moduli are refined in lanes: its ends are those of the readable damped steps."""
 
     N = 60
 
@@ -414,13 +415,22 @@ class TestProfileOfModuli:
             np.full(len(solved), rise),
         )
 
-    def test_ends_are_those_of_damped_steps_throughout(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        found = self.stretches(DELTA_CHI2_95)
-        monkeypatch.setattr(range_profile, "most_refined", refine)
-        damped = self.stretches(DELTA_CHI2_95)
-        assert np.all(np.isclose(found, damped, atol=2e-3).mean(axis=0) >= 0.95)
-        # What is still not reached is left within.
-        assert np.all((found - damped) * [1.0, -1.0] <= 2e-3)
+    def test_points_are_as_low_as_those_of_damped_steps(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Valleys are curved: either may stand in another one, the readable twin more often."""
+        ours, twin = [], []
+
+        def both(*start: Any, **options: Any) -> JointFits:
+            found = refine(*start, **options)
+            ours.append(found.chi2)
+            twin.append(damped_gauss_newton(*start, **options).chi2)
+            return found
+
+        monkeypatch.setattr(range_profile, "refine", both)
+        self.stretches(DELTA_CHI2_95)
+        above = np.concatenate(ours) - np.concatenate(twin)
+        assert len(above) > 500
+        assert np.mean(above <= 1e-3) >= 0.97
+        assert np.sum(above > 1e-3) <= np.sum(above < -1e-3)
 
     def test_no_end_where_nothing_rises_so_much(self) -> None:
         assert_allclose(self.stretches(1e12), np.tile([-0.5 * np.pi, 0.5 * np.pi], (self.N, 1)))
