@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -12,6 +14,7 @@ from arrays.typing import FloatArray
 from magloc.plots import style
 
 _NAMED = 20
+_NEAR_THE_EDGE = 0.94  # of width and height: a number is 0.06 of the width
 
 
 def picture_figure(
@@ -31,8 +34,11 @@ def picture_figure(
         ax.scatter(x, y, s=40.0, facecolor="none", edgecolor=style.ORANGE, lw=0.8)
         # Lights are brightest first.
         for light, row in stars[:_NAMED]:
-            place = lights.points_px[light] + [0.008 * width, 0.008 * width]
-            ax.annotate(f"{catalogue.numbers[row]}", place, color=style.ORANGE, fontsize=style.SMALL_LETTERS)
+            # Inwards where the picture ends.
+            right, top = lights.points_px[light] > _NEAR_THE_EDGE * np.array([width, height])
+            place = lights.points_px[light] + 0.008 * width * np.where([right, top], -1.0, 1.0)
+            sides: dict[str, Any] = {"ha": "right" if right else "left", "va": "top" if top else "baseline"}
+            ax.annotate(f"{catalogue.numbers[row]}", place, color=style.ORANGE, fontsize=style.SMALL_LETTERS, **sides)
         text = f"{len(stars)} stars, {np.degrees(found.pose.camera.rad_per_px) * 3600.0:.2f} arc seconds per pixel"
     ax.set(xlim=(0, width), ylim=(0, height), aspect="equal")
     style.dress(ax, "x [px]", "y [px]")

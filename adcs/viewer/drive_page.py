@@ -1,8 +1,6 @@
-"""The page of a drive: scene, player and legend; and the same as a file that plays."""
+"""The page of a drive: scene, player and legend."""
 
 from __future__ import annotations
-
-from pathlib import Path
 
 import numpy as np
 import viser
@@ -10,10 +8,9 @@ import viser
 from adcs.viewer.drive import Drive
 from adcs.viewer.drive_player import DrivePlayer
 from adcs.viewer.table_scene import TableScene, scene_entries, scene_extent
-from magloc.viewer.pages.pages import Page
+from magloc.viewer.pages.pages import Page, Playing
 from magloc.viewer.scene.framing import prepare
-from magloc.viewer.scene.legend import ABOVE_THE_PLAYER, legend_html, with_legend
-from magloc.viewer.server import write_page
+from magloc.viewer.scene.legend import legend_html
 
 _STEP_S = 0.2
 _MOST_STEPS = 1500
@@ -34,16 +31,7 @@ def drive_page(server: viser.ViserServer, drive: Drive, at_s: float) -> tuple[Pa
     with server.gui.add_folder("Legend"):
         server.gui.add_html(legend_html(entries, notes))
     player.move_to(at_s)
-    return Page(drive.title, entries, notes, player.pause), player
-
-
-def write_playing_page(server: viser.ViserServer, page: Page, player: DrivePlayer, drive: Drive, path: Path) -> None:
-    """Write the whole drive as one HTML file that plays and needs nothing else."""
-    player.move_to(0.0)
-    recording = server.get_scene_serializer()
-    step_s = max(_STEP_S, drive.duration_s / _MOST_STEPS)
-    for time_s in np.arange(step_s, drive.duration_s, step_s):
-        recording.insert_sleep(step_s)
-        player.move_to(float(time_s))
-    html = with_legend(recording.as_html(), page.title, page.entries, page.notes, bottom=ABOVE_THE_PLAYER)
-    write_page(html, path)
+    steps_s = np.arange(0.0, drive.duration_s, max(_STEP_S, drive.duration_s / _MOST_STEPS))
+    rows = tuple(drive.row_at(float(time_s)) for time_s in steps_s)
+    playing = Playing(rows, player.show_row, drive.duration_s, player.row)
+    return Page(drive.title, entries, notes, player.pause, playing), player

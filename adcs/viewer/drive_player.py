@@ -55,6 +55,10 @@ class DrivePlayer(PlayedTime):
         self._add_panels(server.gui)
         self.move_to(0.0)
 
+    def show_row(self, row: int) -> None:
+        """Show the drive at the time of a row."""
+        self.move_to(float(self._drive.truth.time_s[row]))
+
     def _add_panels(self, gui: viser.GuiApi) -> None:
         with gui.add_folder("Time"):
             super().__init__(gui, self._drive.duration_s, self._show, "adcs-drive-player")

@@ -186,7 +186,8 @@ def shown(
             view.write_png(Path(png))
         if movie is not None:
             view.write_movie(Path(movie))
-        _ = view.html  # taken while there is a server
+        if _in_notebook():
+            _ = view.html  # taken while there is a server; of a long record it takes seconds
     return view
 
 

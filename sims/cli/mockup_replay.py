@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cyclopts import Parameter
 
-from adcs.cli.options import tell
+from adcs.cli.options import print_note
 from arrays.io.arguments import Flag
 from arrays.io.errors import InputError
 from magloc.cli.framework import QuietOptions
@@ -33,30 +32,22 @@ def check_places(replay: ReplayOptions) -> None:
 
 def show_replay(runs: FusionRuns, camera: TableCamera, replay: ReplayOptions, common: QuietOptions) -> None:
     """Show the first drive until Ctrl-C, or write it."""
-    from adcs.viewer.drive_page import drive_page, write_playing_page
-    from magloc.viewer.server import address, free_port, opened, wait_for_interruption, write_picture
+    from adcs.viewer.drive_page import drive_page
+    from magloc.cli.view import written_or_served
+    from magloc.viewer.view import View, shown
 
     drive = drive_of(runs.results[0], runs.method, camera)
     at_s = 0.5 * drive.duration_s if replay.at is None else replay.at
-    with naming_outputs():
-        used = free_port(replay.port) if replay.view else 0
-    if used not in (0, replay.port) and replay.port:
-        tell(common, f"port {replay.port} is in use, {used} is taken")
-    with opened(used, f"adcs · mockup {runs.method}") as server:
-        page, player = drive_page(server, drive, at_s)
-        with naming_outputs():
-            if replay.png is not None:
-                write_picture(server, replay.png)
-            if replay.html is not None:
-                write_playing_page(server, page, player, drive, replay.html)
-        if not replay.view:
-            tell(common, f"wrote {', '.join(str(file) for file in (replay.html, replay.png) if file is not None)}")
-            return
-        with suppress(KeyboardInterrupt):  # who has the address may press Ctrl-C before the waiting begins
-            tell(common, "open this address in a browser; Ctrl-C ends the viewer")
-            print(address(server), flush=True)
-            wait_for_interruption()
-        page.close()
+    files = {"html": replay.html, "png": replay.png}
+
+    def scene(port: int) -> View:
+        title = f"adcs · mockup {runs.method}"
+        return shown(
+            title, lambda server: drive_page(server, drive, at_s)[0], **files, movie=None, open=False, port=port
+        )
+
+    written = [str(file) for file in files.values() if file is not None]
+    written_or_served(scene, written, replay.port, quiet=common.quiet, note=print_note)
 
 
 def drive_of(result: FusionResult, method: str, camera: TableCamera) -> Drive:

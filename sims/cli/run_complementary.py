@@ -137,8 +137,10 @@ class ComplementaryOptions:
 
     @property
     def gains_text(self) -> str:
-        """K_P and K_I as text."""
-        return f"K_P {self.gains.kp_per_s:g} 1/s, K_I {self.gains.ki_per_s2:g} 1/s²"
+        """K_P and K_I as the time constants that they stand for; none of one that is zero."""
+        K_P, K_I = self.gains.kp_per_s, self.gains.ki_per_s2
+        first = f"K_P 1/({1.0 / K_P:.4g} s)" if K_P else "K_P 0"
+        return f"{first}, K_I " + (f"1/({1.0 / math.sqrt(K_I):.4g} s)²" if K_I else "0")
 
 
 def run_complementary(

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from adcs.mockup.vision.camera import footprint
 from adcs.viewer.drive import Drive
-from adcs.viewer.drive_page import drive_page, write_playing_page
+from adcs.viewer.drive_page import drive_page
 from adcs.viewer.drive_player import DrivePlayer
 from adcs.viewer.frame_image import IDENTIFIED_COLOUR
 from adcs.viewer.table_scene import CEILING_M, ESTIMATE_COLOUR, FIX_COLOUR, VIEW_COLOUR
 from magloc.viewer.pages.pages import Page
-from magloc.viewer.server import opened
+from magloc.viewer.server import opened, page_html, write_page
 from sims.cli.mockup_options import MockupOptions
 from sims.cli.mockup_replay import drive_of
 from sims.experiments.mockup_navigation import fused_runs
@@ -109,7 +109,7 @@ class TestDrive:
 
     def test_the_file_that_plays(self, screen: Screen, replay: Open, tmp_path: Path) -> None:
         path = tmp_path / "drive.html"
-        write_playing_page(replay.server, replay.page, replay.player, replay.drive, path)
+        write_page(page_html(replay.server, replay.page), path)
         screen.open(path.as_uri())
         camera = screen.camera(replay.server.initial_camera)
         # Anywhere along the drive: it plays while one looks.

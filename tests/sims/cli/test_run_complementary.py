@@ -84,7 +84,7 @@ class TestCommand:
 
     def test_text_and_files(self, capsys, tmp_path):
         out, err = self.run(capsys, "--duration", "3000", "--out", str(tmp_path))
-        assert out.startswith("explicit filter, K_P 0.02 1/s, K_I 0.0001 1/s²\nmagnetometer 1000 nT")
+        assert out.startswith("explicit filter, K_P 1/(50 s), K_I 1/(100 s)²\nmagnetometer 1000 nT")
         assert "wrote complementary.png" in err
         assert self.run(capsys, "--duration", "3000", "--out", str(tmp_path), "--quiet").err == ""
 

@@ -25,13 +25,13 @@ from adcs.mockup.navigation.fixes import Outcome
 from adcs.mockup.vision.paper_matcher import CameraFix
 from adcs.stars.identification import NoFix
 from adcs.viewer.drive import Drive, SeenFrame
-from adcs.viewer.drive_page import drive_page, write_playing_page
+from adcs.viewer.drive_page import drive_page
 from adcs.viewer.drive_player import DrivePlayer
 from adcs.viewer.error_dial import ErrorDial, words_of
 from adcs.viewer.frame_image import IDENTIFIED_COLOUR, OTHER_STAR_COLOUR, ceiling_sheet, marked_image
 from adcs.viewer.table_scene import CEILING_M, LIGHT_COLOUR, suitable_enlargement
 from magloc.viewer.panels.inputs import set_value
-from magloc.viewer.server import opened
+from magloc.viewer.server import opened, page_html
 from sims.cli.mockup_options import MockupOptions
 from sims.cli.mockup_replay import drive_of
 from sims.experiments.mockup_navigation import fused_runs
@@ -271,12 +271,11 @@ class TestPages:
         assert "fix that was rejected" not in str(page.entries)
         page.close()
 
-    def test_a_page_that_plays(self, server, player, drive, tmp_path):
+    def test_a_page_that_plays(self, server, player, drive):
         page, second = drive_page(server, drive, 3.0)
-        path = tmp_path / "drive.html"
-        write_playing_page(server, page, second, drive, path)
-        text = path.read_text(encoding="utf-8")
+        text = page_html(server, page)
         assert "__VISER_EMBED_DATA__" in text
         assert "late fix: where it was" in text
         assert len(text) < 8_000_000
+        assert second.row == drive.row_at(3.0)  # where it was
         page.close()
