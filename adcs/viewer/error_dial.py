@@ -73,7 +73,7 @@ class ErrorDial:
                 'stroke="#0072b2"/>'
             )
         parts += [
-            '<path d="M -6 0 H 6 M 0 -6 V 6" stroke="#222" stroke-width="2"/>',
+            '<path d="M -6 0 H 6 M 0 -6 V 6" stroke="currentColor" stroke-width="2"/>',
             f'<circle cx="{x:.1f}" cy="{-y:.1f}" r="5" fill="{"#d55e00" if outside else "#0072b2"}"/>',
             _text(_HALF - 2, 12, f"{length_text(self.reach_m)} X", "end"),
             _text(5, -_HALF + 11, "Y", "start"),
@@ -90,7 +90,7 @@ def _points(values: FloatArray) -> str:
 
 
 def _text(x: float, y: float, text: str, anchor: str) -> str:
-    return f'<text x="{x}" y="{y}" font-size="10" fill="#444" text-anchor="{anchor}">{text}</text>'
+    return f'<text x="{x}" y="{y}" font-size="10" fill="currentColor" text-anchor="{anchor}">{text}</text>'
 
 
 def words_of(drive: Drive, row: int) -> Sequence[str]:

@@ -22,6 +22,8 @@ from websockets.asyncio.server import ServerConnection
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
+from magloc.viewer.scene.legend import FOLLOWS_THE_SCHEME
+
 NAMES = ("127.0.0.1", "localhost")
 MOST_BYTES = 2**20  # of a message: a page sends what was typed, dragged or clicked
 _one_at_a_time = threading.Lock()
@@ -53,7 +55,7 @@ setTimeout(() => clearInterval(waiting), 60000);
 
 
 def _say_what_it_waits_for(page: Response) -> None:
-    """Let a page of viser say that it is connecting, and fold its panel on a phone."""
+    """Let a page of viser say that it is connecting, fold its panel on a phone, and be dark where the browser is."""
     page.body = _with_words(bytes(page.body), page.headers.get("Content-Encoding") == "gzip")
     del page.headers["Content-Length"]
     page.headers["Content-Length"] = str(len(page.body))
@@ -61,7 +63,9 @@ def _say_what_it_waits_for(page: Response) -> None:
 
 @lru_cache(maxsize=4)
 def _with_words(body: bytes, compressed: bool) -> bytes:
-    return gzip.compress(gzip.decompress(body) + _ADDED) if compressed else body + _ADDED
+    page = gzip.decompress(body) if compressed else body
+    page = page.replace(b"<head>", b"<head>" + FOLLOWS_THE_SCHEME.encode(), 1) + _ADDED
+    return gzip.compress(page) if compressed else page
 
 
 def guarded_server(**options: Any) -> viser.ViserServer:

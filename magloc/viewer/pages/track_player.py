@@ -47,7 +47,7 @@ from magloc.viewer.scene.ruler import DropLines
 from magloc.viewer.scene.track_glyph import TrackGlyph, track_segments
 
 Poses = tuple[FloatArray, FloatArray]
-_BRIGHTEST = 0.88
+_DARKEST, _BRIGHTEST = 0.12, 0.88  # what is seen on a dark page, and on white
 _WHOLE_COLOUR = (190, 196, 203)
 _SOURCE_COLOURS: tuple[Colour, ...] = (TRACK_COLOUR, FIELD_LINE_COLOUR, ARROW_COLOUR, OTHER_COLOUR, REGION_COLOUR)
 
@@ -220,8 +220,9 @@ def time_colours(time_s: FloatArray) -> ByteArray:
     """Colours (n, 3) of times (n,), evenly from the first to the last."""
     span = float(time_s[-1] - time_s[0])
     share = (time_s - time_s[0]) / span if span > 0.0 else np.zeros_like(time_s)
-    # To where it is still seen on white.
-    return np.asarray(colormaps["viridis"](_BRIGHTEST * share, bytes=True)[:, :3], dtype=np.uint8)
+    return np.asarray(
+        colormaps["viridis"](_DARKEST + (_BRIGHTEST - _DARKEST) * share, bytes=True)[:, :3], dtype=np.uint8
+    )
 
 
 def source_colours(result: TrackResult) -> list[Colour | None]:

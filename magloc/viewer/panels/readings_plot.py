@@ -24,7 +24,7 @@ RAW = "readings"
 DIFFERENCES = "differences from the mean"
 RESIDUALS = "residuals of the differences"
 TICKED, ALL = "those ticked", "all"
-# Okabe and Ito, without yellow, which is not seen on white.
+# Okabe and Ito, without yellow, which is not seen on white; all are seen on a dark page.
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#666666")
 # Opacities of the axes. Dashes of noise take a browser without a graphics card a second a picture, and cannot be told.
 _SHADES = {"x": "", "y": "a6", "z": "59", "": ""}
@@ -197,7 +197,7 @@ class ReadingsPlot:
             colour = _COLOURS[self._ids.index(channel.sensor) % len(_COLOURS)] + _SHADES[channel.axis]
             broken = bool(np.isnan(values[:, column]).any())
             series.append(_series(channel, colour, broken=broken))
-        series.append(uplot.Series(label="now", scale="mark", stroke="#000000", width=1.5, points={"show": False}))
+        series.append(uplot.Series(label="now", scale="mark", stroke="#808080", width=1.5, points={"show": False}))
         return tuple(series), *thinned(self._time_s, values, _MOST_POINTS), span_of(values)
 
 

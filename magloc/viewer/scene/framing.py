@@ -23,6 +23,8 @@ _MARGIN = 1.12
 _CELLS_PER_RADIUS = 4.0
 _FLOOR_RADII = 3.0
 _BELOW_RADII = 0.05
+# Seen on white, and not too much on a dark page.
+_FLOOR_COLOUR, _FLOOR_LINE = (150, 155, 160), 0.45
 # Strengths of the lights beside the one from above, which has 3: from everywhere, and from each of four sides.
 _AMBIENT = 1.6
 _SIDE = 1.3
@@ -96,8 +98,10 @@ def prepare(server: viser.ViserServer, extent: Extent) -> Floor:
         height=side,
         cell_size=cell,
         section_size=5.0 * cell,
-        cell_color=(222, 226, 230),
-        section_color=(196, 202, 208),
+        cell_thickness=_FLOOR_LINE,
+        section_thickness=2.0 * _FLOOR_LINE,
+        cell_color=_FLOOR_COLOUR,
+        section_color=_FLOOR_COLOUR,
         shadow_opacity=0.0,
         fade_distance=20.0 * radius,
         position=(middle[0], middle[1], height),

@@ -16,6 +16,17 @@ ABOVE_THE_PLAYER = "4em"
 NARROW_PX = 600
 """Of a page whose legend or panel is folded at first, for it would hide the scene."""
 _TO_ONE_SIDE = SIDES_OF_A_PHONE * np.tan(0.5 * FIELD_OF_VIEW_RAD)
+FOLLOWS_THE_SCHEME = """<script>
+if (matchMedia('(prefers-color-scheme: dark)').matches) {
+  const asked = URLSearchParams.prototype.get;
+  URLSearchParams.prototype.get = function (name) { return name === 'darkMode' ? '' : asked.call(this, name); };
+}
+</script>"""
+"""Of the head of viser's page, which asks its address whether it is to be dark: as the browser is, light or dark."""
+_BOX = """<style>
+#legend { background: rgba(255,255,255,.9); color: #222 }
+@media (prefers-color-scheme: dark) { #legend { background: rgba(30,32,36,.9); color: #ddd } }
+</style>"""
 # viser's page takes its first camera from its address, which a page of a file must not change.
 _SEES_AS_WIDE = f"""<script>
 if (innerWidth < {NARROW_PX}) {{
@@ -91,14 +102,15 @@ def with_legend(
     """
     box = (
         f'<details id="legend" open style="position:fixed;bottom:{bottom};left:.8em;z-index:1000;max-width:19rem;'
-        "background:rgba(255,255,255,.9);"
-        "color:#222;border-radius:.4em;box-shadow:0 1px 4px rgba(0,0,0,.25);font-family:sans-serif;"
+        "border-radius:.4em;box-shadow:0 1px 4px rgba(0,0,0,.25);font-family:sans-serif;"
         'pointer-events:none">'
         '<summary style="font-weight:600;padding:.5em .6em .2em;pointer-events:auto;cursor:pointer">'
         f"{escape(title)}</summary>{legend_html(entries, notes)}</details>"
         f"<script>document.getElementById('legend').open = innerWidth > {NARROW_PX}</script>"
     )
-    before, end, after = page.replace("<head>", f"<head>{_SEES_AS_WIDE}", 1).rpartition("</body>")
+    before, end, after = page.replace("<head>", f"<head>{FOLLOWS_THE_SCHEME}{_SEES_AS_WIDE}{_BOX}", 1).rpartition(
+        "</body>"
+    )
     if script:
         box += f"<script>{script}</script>"
     return f"{before}{box}{end}{after}"
