@@ -19,7 +19,7 @@ from magloc.viewer.pages.pages import track_page
 from magloc.viewer.pages.track_player import time_colours
 from magloc.viewer.scene.glyphs import DIPOLE_COLOUR
 from magloc.viewer.server import opened
-from tests.browser.screen import Screen, Sight, dark_grey, hue_of
+from tests.browser.screen import Screen, Sight, close_to, dark_grey, hue_of
 
 FloatArray = NDArray[np.float64]
 ARRAY = tetrahedron(1.5)
@@ -140,6 +140,16 @@ class TestTrack:
         screen.until_seen(Sight("moment", camera.pixels(arrow_in(10, arrow_m)), ORANGE, radius=4))
         assert row_of(screen) == 10
 
+    def test_keys_step_from_row_to_row(self, screen: Screen, server: viser.ViserServer) -> None:
+        def press(key: str) -> None:
+            for kind in ("keyDown", "keyUp"):
+                screen.browser.call("Input.dispatchKeyEvent", type=kind, key=key, code=key)
+
+        begin = row_of(screen)
+        for key, row in (("PageDown", begin + 1), ("PageUp", begin)):
+            press(key)
+            screen.until(lambda row=row: row_of(screen) == row, f"the row after {key}")  # type: ignore[misc]
+
     def test_the_plot_marks_the_time(self, screen: Screen, server: viser.ViserServer) -> None:
         slid(screen, "Time [s]", 0.5, lambda: abs(row_of(screen) - 20) <= 2)
         share = row_of(screen) / 40.0
@@ -151,11 +161,9 @@ class TestTrack:
         mark = np.column_stack([np.full(8, box["x"] + share * box["width"]), rows])
         elsewhere = mark + np.array([0.2 * box["width"], 0.0])
 
-        def black(picture: FloatArray) -> NDArray[np.bool_]:
-            return picture.max(axis=-1) < 0.25
-
+        grey = close_to((128, 128, 128), 30.0)
         screen.until_seen(
-            Sight("mark of the time", mark, black, radius=2),
-            Sight("mark of the time", elsewhere, black, radius=2, absent=True),
+            Sight("mark of the time", mark, grey, radius=2),
+            Sight("mark of the time", elsewhere, grey, radius=2, absent=True),
         )
         screen.keep("track-plot")

@@ -220,3 +220,13 @@ def best_positions(fixes: Sequence[Fix]) -> tuple[IntArray, FloatArray]:
     found = [(row, source) for row, fix in enumerate(fixes) if fix.solutions for source in fix.best.sources]
     positions = np.array([source.position_m for _, source in found]).reshape(-1, 3)
     return np.array([row for row, _ in found], dtype=np.intp), positions
+
+
+def single_sources(fixes: Sequence[Fix]) -> tuple[FloatArray, FloatArray] | None:
+    """Position and moment of every row's source (n, 3), NaN without one; None where a row has several."""
+    if any(fix.solutions and len(fix.best.sources) > 1 for fix in fixes):
+        return None
+    nowhere = np.full(3, np.nan)
+    sources = [fix.best.sources[0] if fix.solutions else None for fix in fixes]
+    positions = [nowhere if source is None else source.position_m for source in sources]
+    return np.array(positions), np.array([nowhere if source is None else source.moment_Am2 for source in sources])

@@ -13,17 +13,17 @@ from typing import Protocol
 
 import numpy as np
 import viser
+from scipy.spatial.transform import Rotation
 
 from arrays.array import SensorArray
 from arrays.io.errors import InputError
 from arrays.typing import FloatArray
 from magloc.live.tally import Tally
-from magloc.measurement.differences import predicted_channels
 from magloc.readings import Readings
 from magloc.tracking.results import Row, TrackPoint, stacked
 from magloc.viewer.pages import words
 from magloc.viewer.pages.track_player import point_words
-from magloc.viewer.panels.readings_plot import ReadingsPlot
+from magloc.viewer.panels.readings_plot import ReadingsPlot, residuals_of
 from magloc.viewer.scene.glyphs import (
     DIPOLE_COLOUR,
     REGION_COLOUR,
@@ -221,15 +221,12 @@ class LivePage:
         values = np.array([row.readings_T for row in rows])
         origins, R = np.array([row.origin_m for row in rows]), np.array([row.R_world_from_array for row in rows])
         points = [point for point, _ in shown]
-        position = np.einsum("nji,nj->ni", R, stacked(points, "position_m", 3) - origins)
-        moment = np.einsum("nji,nj->ni", R, stacked(points, "moment_Am2", 3))
         time_s = np.array([point.time_s for point in points]) - last_s
-        residuals = values - predicted_channels(self._array, position, moment)
-        self._plot.take(Readings(values, time_s=time_s), residuals)
+        readings = Readings(values, time_s=time_s, array_position_m=origins, array_rotation=Rotation.from_matrix(R))
+        source = stacked(points, "position_m", 3), stacked(points, "moment_Am2", 3)
+        self._plot.take(readings, residuals_of(self._array, readings, *source))
 
 
 def _quaternion(R: FloatArray) -> FloatArray:
     """The unit quaternion xyzw of a rotation matrix (3, 3)."""
-    from scipy.spatial.transform import Rotation
-
     return Rotation.from_matrix(R).as_quat()

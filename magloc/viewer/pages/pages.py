@@ -19,13 +19,13 @@ from magloc.tracking.results import TrackPoint, TrackResult, on_track, stacked
 from magloc.truth import nearest_rows
 from magloc.viewer.pages import words
 from magloc.viewer.pages.field_panel import FieldPanel
-from magloc.viewer.pages.fixes import FixView, best_positions
+from magloc.viewer.pages.fixes import FixView, best_positions, single_sources
 from magloc.viewer.pages.live import LivePage
 from magloc.viewer.pages.map import MapControls, MapView
 from magloc.viewer.pages.open_result import MapResult
 from magloc.viewer.pages.survey import add_survey
 from magloc.viewer.pages.track_player import TrackPlayer, source_colours, time_colours
-from magloc.viewer.panels.readings_plot import ReadingsPlot
+from magloc.viewer.panels.readings_plot import ReadingsPlot, residuals_of
 from magloc.viewer.scene.framing import Extent, aim, corners_of, extent_of, prepare
 from magloc.viewer.scene.glyphs import (
     DIPOLE_COLOUR,
@@ -160,7 +160,9 @@ def readings_page(server: viser.ViserServer, array: SensorArray, fixes: Sequence
     view.add_controls(followers)
     followers.append(FieldPanel(server, array, view, rows, size).show_row)
     if rows is not None and len(rows) > 1:
-        plot = ReadingsPlot(server, rows, array)
+        sources = single_sources(fixes)
+        left = None if sources is None else residuals_of(array, rows, *sources)
+        plot = ReadingsPlot(server, rows, array, left)
         plot.show_row(view.row)
         followers.append(plot.show_row)
     if view.region.mesh is not None and view.region.visible:
@@ -200,8 +202,11 @@ def track_page(
     followers: list[Callable[[int], None]] = []
     player = TrackPlayer(server, result, 0.2 * ball.radius_m, array_poses=poses, on_pose=on_pose, on_row=followers)
     if array is not None and rows is not None:
-        plot = ReadingsPlot(server, rows, array)
         of_point = _nearest_rows(rows, points)
+        left = None if result.ids else np.full_like(rows.values_T, np.nan)
+        if left is not None:
+            left[of_point] = residuals_of(array, rows[of_point], positions, stacked(points, "moment_Am2", 3))
+        plot = ReadingsPlot(server, rows, array, left)
         plot.show_row(int(of_point[player.index]))
         followers.append(lambda index: plot.show_row(int(of_point[index])))
     nodes = [f"/times/of-{id}" for id in result.ids] or ["/times"]

@@ -186,13 +186,15 @@ class TrackPlayer(PlayedTime):
             self.whole_checkbox = gui.add_checkbox("Whole track", True, hint="a thin line, of all times")
         with gui.add_folder("At this time"):
             self.row_panel = gui.add_html("")
-        self.row_buttons.on_click(lambda _: self._step_row(self.row_buttons.value))
+        self.row_buttons.on_click(lambda _: self._step_row(1 if self.row_buttons.value == "next" else -1))
+        gui.add_command("Next row", hotkey="pagedown").on_trigger(lambda _: self._step_row(1))
+        gui.add_command("Previous row", hotkey="pageup").on_trigger(lambda _: self._step_row(-1))
         self.tail_slider.on_update(self._follow)
         self.whole_checkbox.on_update(self._follow)
 
-    def _step_row(self, direction: str) -> None:
+    def _step_row(self, step: int) -> None:
         self.pause()
-        self.show_row(self.index + (1 if direction == "next" else -1))
+        self.show_row(self.index + step)
 
     def _label(self, source: int) -> str:
         """What stands beside a source: its id, or of a single one the time, but where that stands already."""

@@ -71,8 +71,16 @@ class PlayedTime:
         self.speed_dropdown = gui.add_dropdown(
             "Speed", [f"{speed:g} ×" for speed in _SPEEDS], initial_value=f"{suitable:g} ×"
         )
+        self.loop_checkbox = gui.add_checkbox("Loop", False, disabled=still, hint="from the end to the beginning")
         self._time = SharedInput(self.time_slider, self._slid)
-        self.play_button.on_click(lambda _: self.pause() if self.is_playing else self.play())
+        self.play_button.on_click(self._switch)
+        gui.add_command("Play or pause", hotkey="P", disabled=still).on_trigger(self._switch)
+
+    def _switch(self, _: object) -> None:
+        if self.is_playing:
+            self.pause()
+        else:
+            self.play()
 
     def _slid(self) -> None:
         # The slider rounds: a row at its time is not to be missed by that.
@@ -116,6 +124,8 @@ class PlayedTime:
             while self.now_s < self._duration_s and not stop.wait(1.0 / _FRAMES_PER_SECOND):
                 now = perf_counter()
                 self.now_s += (now - last) * float(self.speed_dropdown.value.split()[0])
+                if self.loop_checkbox.value and self.now_s >= self._duration_s:
+                    self.now_s = 0.0
                 last = now
                 self._follow()
         finally:

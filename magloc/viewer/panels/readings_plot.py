@@ -17,6 +17,7 @@ from viser import uplot
 
 from arrays.array import SensorArray
 from arrays.typing import FloatArray
+from magloc.measurement.differences import predicted_channels
 from magloc.readings import Readings
 from magloc.viewer.panels.latest import Latest
 
@@ -199,6 +200,14 @@ class ReadingsPlot:
             series.append(_series(channel, colour, broken=broken))
         series.append(uplot.Series(label="now", scale="mark", stroke="#808080", width=1.5, points={"show": False}))
         return tuple(series), *thinned(self._time_s, values, _MOST_POINTS), span_of(values)
+
+
+def residuals_of(array: SensorArray, rows: Readings, positions_m: FloatArray, moments_Am2: FloatArray) -> FloatArray:
+    """Readings (n, C) less those of a source that is at (n, 3), in the world where the rows have poses [T]."""
+    if rows.pose is not None:
+        origins_m, back = rows.pose[0], rows.pose[1].inv()
+        positions_m, moments_Am2 = back.apply(positions_m - origins_m), back.apply(moments_Am2)
+    return rows.values_T - predicted_channels(array, positions_m, moments_Am2)
 
 
 def channels_of(array: SensorArray) -> list[Channel]:

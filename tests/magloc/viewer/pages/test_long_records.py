@@ -7,13 +7,15 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 import viser
+from scipy.spatial.transform import Rotation
 
 from arrays.geometries import tetrahedron
+from magloc.measurement.differences import predicted_channels
 from magloc.readings import Readings
 from magloc.tracking.results import TrackPoint
 from magloc.viewer.pages.pages import _nearest_rows
 from magloc.viewer.panels.inputs import set_value
-from magloc.viewer.panels.readings_plot import ALL, ReadingsPlot
+from magloc.viewer.panels.readings_plot import ALL, ReadingsPlot, residuals_of
 from magloc.viewer.scene.track_glyph import linear, track_segments
 from magloc.viewer.server import opened
 from tests.waiting import wait_for
@@ -76,3 +78,17 @@ class TestPlot:
         assert [series["label"] for series in plot.plot.series[1:-1]] == list(ARRAY.sensors[2].channel_names)
         set_value(plot.sensors_dropdown, ALL)
         wait_for(lambda: len(plot.plot.series) == 1 + ARRAY.n_channels + 1)
+
+
+def test_a_source_leaves_the_noise_of_an_array_that_moves() -> None:
+    """Readings are simulated in the array's frame, sources are stated in the world."""
+    rng = np.random.default_rng(3)
+    places, moments = rng.uniform(4.0, 6.0, (20, 3)), rng.normal(size=(20, 3))
+    origins, R = rng.normal(size=(20, 3)), Rotation.random(20, random_state=4)
+    noise = rng.normal(0.0, 1e-9, (20, ARRAY.n_channels))
+    seen = predicted_channels(ARRAY, R.inv().apply(places - origins), R.inv().apply(moments))
+    rows = Readings(seen + noise, time_s=np.arange(20.0), array_position_m=origins, array_rotation=R)
+    places[7] = np.nan
+    left = residuals_of(ARRAY, rows, places, moments)
+    np.testing.assert_allclose(np.delete(left, 7, axis=0), np.delete(noise, 7, axis=0), atol=1e-18)
+    assert np.isnan(left[7]).all()

@@ -167,6 +167,18 @@ class TestTrackPlayer:
         set_value(player.row_buttons, "previous")
         assert player.index == 9
 
+    def test_a_loop_begins_again(self, player, monkeypatch):
+        tenths = itertools.count()
+        monkeypatch.setattr("magloc.viewer.panels.played_time.perf_counter", lambda: 0.1 * next(tenths))
+        seen: list[int] = []
+        player._on_row = [seen.append]
+        set_value(player.speed_dropdown, "10 ×")
+        set_value(player.loop_checkbox, True)
+        set_value(player.play_button, True)
+        wait_for(lambda: seen.count(0) > 2)
+        player.pause()
+        assert max(seen) > N // 2
+
     def test_array_and_followers_get_pose_and_row(self, server):
         glyphs = ArrayGlyphs(server.scene, ARRAY)
         place = RNG.standard_normal((N, 3))
