@@ -14,7 +14,7 @@ from magloc.viewer.scene.shapes import ellipsoid, ellipsoid_axes, surface_of
 
 _MOST_ELLIPSOIDS = 40
 _MOST_SEGMENTS = 500
-_FINENESS = 2  # of an ellipsoid among many: a browser without a graphics card draws twice as fast as with 3
+_FINENESS = 2  # of an ellipsoid among many: with 3 a picture takes half as long again without a graphics card
 
 
 class TrackGlyph:
