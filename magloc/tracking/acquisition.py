@@ -41,7 +41,7 @@ class Start:
     solution : Solution
         In the world frame; its weight is that among all solutions.
     rows : sequence of Row
-        The readings that it was found from, in the order of time.
+        All that were kept, in the order of time: a few of them found it, what they leave open the others tell.
     rivals : tuple of Solution
         The other solutions that explain these readings.
     """
@@ -94,7 +94,7 @@ class Acquisition:
         before, self._proposed = self._proposed, _certain_solution(fix, centroid)
         if self._proposed is None or not _agree(before, self._proposed):
             return None
-        return Start(self._proposed, chosen[::-1], fix.solutions[1:])
+        return Start(self._proposed, recent, fix.solutions[1:])
 
 
 def _certain_solution(fix: Fix, centroid: FloatArray) -> Solution | None:
