@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arrays.typing import FloatArray
-from magloc.compilation import compiled, own
+from magloc.compilation import compiled, internal, own
 from magloc.linalg_compiled import orthonormalise
 
 if TYPE_CHECKING:
@@ -122,7 +122,7 @@ def row_at(rows: ModelRows, i: int) -> ModelRow:
     return ModelRow(rows.sensors, rows.channel_sensor, rows.gain[w], rows.common[w], rows.shrinkage[w])
 
 
-@compiled
+@internal
 def project_common(rows: FloatArray, n_rows: int, row: ModelRow) -> None:
     """Remove the common field from whitened rows (k, c) in place."""
     common, shrinkage = row.common, row.shrinkage
@@ -147,7 +147,7 @@ def unit_basis(
     project_common(basis, 3, row)
 
 
-@compiled
+@internal
 def unit_readings(
     q: FloatArray,
     row: ModelRow,

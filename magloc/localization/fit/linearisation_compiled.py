@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from arrays.typing import FloatArray
-from magloc.compilation import compiled, inlined
+from magloc.compilation import inlined, internal
 
 # No int, here and in all that follows from it: numba compiles a function anew for each literal that it is given.
 LANES: int = np.int64(16)  # type: ignore[assignment]
@@ -44,33 +44,19 @@ END = 72 * LANES
 WORKSPACE = 73 * LANES
 
 
-@compiled
+@internal
 def linearise(
     sensors: FloatArray, w: FloatArray, rows: FloatArray, common: FloatArray, dots: FloatArray, free_range: float
 ) -> None:
     """Scaled moment, χ² and normal equations of the trial states."""
     fill_directions(sensors, w, rows)
-    fit_moment(w, rows, common, dots)
-    fill_normal(sensors, w, rows, common, dots, free_range)
-
-
-@compiled
-def fit_moment(w: FloatArray, rows: FloatArray, common: FloatArray, dots: FloatArray) -> None:
-    """Scaled moment, residual and χ² of the trial states."""
-    _fill_basis(rows)
-    _project(BASIS, rows, common, dots)
-    _orthogonalise(w, rows)
-
-
-@compiled
-def fill_normal(
-    sensors: FloatArray, w: FloatArray, rows: FloatArray, common: FloatArray, dots: FloatArray, free_range: float
-) -> None:
-    """Normal equations of the trial states with their moments."""
-    _fill_tangents(w, free_range)
-    _fill_jacobian(sensors, w, rows)
-    _project(JACOBIAN, rows, common, dots)
-    _fill_normal(w, rows)
+    fill_basis(rows)
+    project(BASIS, rows, common, dots)
+    orthogonalise(w, rows)
+    fill_tangents(w, free_range)
+    fill_jacobian(sensors, w, rows)
+    project(JACOBIAN, rows, common, dots)
+    fill_normal(w, rows)
 
 
 @inlined
@@ -81,7 +67,7 @@ def _unit_readings(r: FloatArray, at: int, i: int, n: tuple[float, float, float]
     return (t * n[0] - g0) * cube, (t * n[1] - g1) * cube, (t * n[2] - g2) * cube
 
 
-@compiled
+@internal
 def fill_directions(sensors: FloatArray, w: FloatArray, rows: FloatArray) -> None:
     """Directions from the source at the trial state to the sensors, and one over their distances."""
     for s in range(len(sensors)):
@@ -99,8 +85,8 @@ def fill_directions(sensors: FloatArray, w: FloatArray, rows: FloatArray) -> Non
             r[DIRECTION + 2 * LANES + i], r[DIRECTION + 3 * LANES + i] = v2 * inverse, inverse
 
 
-@compiled
-def _fill_basis(rows: FloatArray) -> None:
+@internal
+def fill_basis(rows: FloatArray) -> None:
     """Readings of the three unit moments at the trial state."""
     for s in range(len(rows)):
         r = rows[s]
@@ -115,8 +101,8 @@ def _fill_basis(rows: FloatArray) -> None:
             r[BASIS + 6 * LANES + i], r[BASIS + 7 * LANES + i], r[BASIS + 8 * LANES + i] = b0, b1, b2
 
 
-@compiled
-def _project(at: int, rows: FloatArray, common: FloatArray, dots: FloatArray) -> None:
+@internal
+def project(at: int, rows: FloatArray, common: FloatArray, dots: FloatArray) -> None:
     """Remove the common field, three components at a time, from three columns of every sensor's rows."""
     for k in range(len(dots)):
         d = dots[k]
@@ -173,8 +159,8 @@ def less(a: tuple[float, float, float], t: float, b: tuple[float, float, float])
     return a[0] - t * b[0], a[1] - t * b[1], a[2] - t * b[2]
 
 
-@compiled
-def _orthogonalise(w: FloatArray, rows: FloatArray) -> None:
+@internal
+def orthogonalise(w: FloatArray, rows: FloatArray) -> None:
     """Modified Gram-Schmidt of the basis and the signal: scaled moment, residual and χ² of the trial state."""
     w[SQUARE:ALONG] = 0.0
     w[TRIAL + CHI2 : TRIAL + CHI2 + LANES] = 0.0
@@ -262,8 +248,8 @@ def tangents(w: FloatArray, at: int, i: int) -> tuple[float, ...]:
     return 1.0 + sign * x * x * a, sign * b, -sign * x, b, sign + y * y * a, -y, x * s, y * s, z * s, -length
 
 
-@compiled
-def _fill_tangents(w: FloatArray, free_range: float) -> None:
+@internal
+def fill_tangents(w: FloatArray, free_range: float) -> None:
     """Tangents at the trial state, of which the third one counts where the range is free."""
     for i in range(LANES):
         t00, t01, t02, t10, t11, t12, t20, t21, t22, t23 = tangents(w, TRIAL, i)
@@ -293,8 +279,8 @@ def three(r: FloatArray, at: int, i: int) -> tuple[float, float, float]:
     return r[at + i], r[at + LANES + i], r[at + 2 * LANES + i]
 
 
-@compiled
-def _fill_jacobian(sensors: FloatArray, w: FloatArray, rows: FloatArray) -> None:
+@internal
+def fill_jacobian(sensors: FloatArray, w: FloatArray, rows: FloatArray) -> None:
     """Derivative of the readings along the tangents at the trial state, of its moment."""
     for s in range(len(sensors)):
         x0, x1, x2 = sensors[s, 0], sensors[s, 1], sensors[s, 2]
@@ -314,8 +300,8 @@ def _fill_jacobian(sensors: FloatArray, w: FloatArray, rows: FloatArray) -> None
             _put_column(r, JACOBIAN + 2 * LANES, i, (dot(g0, b2), dot(g1, b2), dot(g2, b2)))
 
 
-@compiled
-def _fill_normal(w: FloatArray, rows: FloatArray) -> None:
+@internal
+def fill_normal(w: FloatArray, rows: FloatArray) -> None:
     """Normal equations of the trial state, by Kaufman's form: the moment's part of every column is taken out."""
     w[ALONG : ALONG + 9 * LANES] = 0.0
     w[TRIAL + NORMAL : TRIAL + NORMAL + 9 * LANES] = 0.0

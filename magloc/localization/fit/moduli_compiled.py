@@ -12,13 +12,14 @@ from typing import NamedTuple
 import numpy as np
 
 from arrays.typing import FloatArray, IntArray
-from magloc.compilation import compiled, inlined, own
+from magloc.compilation import compiled, inlined, internal, own
 from magloc.localization.fit.linearisation_compiled import (
     BASIS,
     CHI2,
     DIRECTION,
     END,
     GAIN,
+    JACOBIAN,
     LANES,
     LEFT,
     MOMENT,
@@ -32,10 +33,14 @@ from magloc.localization.fit.linearisation_compiled import (
     WORKSPACE,
     column,
     dot,
+    fill_basis,
     fill_directions,
+    fill_jacobian,
     fill_normal,
-    fit_moment,
+    fill_tangents,
     less,
+    orthogonalise,
+    project,
     three,
 )
 from magloc.localization.fit.variable_projection_compiled import FAILED, Refined, fill_lanes, judge, step
@@ -119,8 +124,13 @@ def refine_by_moduli(
     common, dots = np.zeros((n_sensors, n_triples, 9 * LANES)), np.empty((n_triples, 9 * LANES))
     start_of_lane, set_of_lane, held = np.full(LANES, -1), np.full(LANES, -1), np.full(LANES, -1)
     w[END : END + LANES] = FAILED
-    next_start = fill_lanes(0, start_of_lane, set_of_lane, signal, reading, starts, model, w, rows, common, out)
-    while start_of_lane.max() >= 0:
+    next_start: int = np.int64(0)  # type: ignore[assignment]  # no literal: it would be compiled for itself
+    while True:
+        next_start, n_running = fill_lanes(
+            next_start, start_of_lane, set_of_lane, signal, reading, starts, model, w, rows, common, out
+        )
+        if n_running == 0:
+            return
         for i in range(LANES):
             k = start_of_lane[i]
             if k >= 0 and k != held[i]:
@@ -137,22 +147,24 @@ def refine_by_moduli(
         _hold(w)
         for _ in range(_FITS_OF_MOMENT):
             _linearise(moduli.sensor, w, rows, bent)
-            fit_moment(w, rows, common, dots)
+            fill_basis(rows)
+            project(BASIS, rows, common, dots)
+            orthogonalise(w, rows)
         _begin(w)
         _fill_exact(moduli.sensor, w, rows, bent)
         _project_residual(rows, common, dots)
         _fill_left(w, rows)
-        fill_normal(model.sensors, w, rows, common, dots, free_range)
+        fill_tangents(w, free_range)
+        fill_jacobian(model.sensors, w, rows)
+        project(JACOBIAN, rows, common, dots)
+        fill_normal(w, rows)
         judge(w, tolerance, max_iterations)
         step(w, free_range)
         for i in range(3 * LANES):
             w[TRIAL + MOMENT + i] = w[MOMENT + i]
-        next_start = fill_lanes(
-            next_start, start_of_lane, set_of_lane, signal, reading, starts, model, w, rows, common, out
-        )
 
 
-@compiled
+@internal
 def _load(
     i: int, signal: FloatArray, gain: FloatArray, ambient: FloatArray, sensor: IntArray, bent: FloatArray
 ) -> None:
@@ -163,14 +175,14 @@ def _load(
             bent[m, AMBIENT + a * LANES + i] = ambient[m, a]
 
 
-@compiled
+@internal
 def _hold(w: FloatArray) -> None:
     """Keep the moments that trial states come with."""
     for i in range(3 * LANES):
         w[HELD + i] = w[TRIAL + MOMENT + i]
 
 
-@compiled
+@internal
 def _begin(w: FloatArray) -> None:
     """A start that has a moment is judged with it: no fit may end above it."""
     for i in range(LANES):
@@ -200,7 +212,7 @@ def _excess(b: tuple[float, float, float], a: tuple[float, float, float]) -> tup
     return raised, (t[0] * scale, t[1] * scale, t[2] * scale)
 
 
-@compiled
+@internal
 def _linearise(sensor: IntArray, w: FloatArray, rows: FloatArray, bent: FloatArray) -> None:
     """Gains and readings of moduli that are linear about the field of the trial moment."""
     for m in range(len(sensor)):
@@ -213,7 +225,7 @@ def _linearise(sensor: IntArray, w: FloatArray, rows: FloatArray, bent: FloatArr
             r[SIGNAL + i] = k[READING + i] - weight * (raised - dot(direction, b))
 
 
-@compiled
+@internal
 def _fill_exact(sensor: IntArray, w: FloatArray, rows: FloatArray, bent: FloatArray) -> None:
     """Residuals of the trial moments, of moduli those of the exact ones."""
     for s in range(len(rows)):
@@ -230,7 +242,7 @@ def _fill_exact(sensor: IntArray, w: FloatArray, rows: FloatArray, bent: FloatAr
             r[RESIDUAL + i] = k[READING + i] - k[WEIGHT + i] * raised
 
 
-@compiled
+@internal
 def _project_residual(rows: FloatArray, common: FloatArray, dots: FloatArray) -> None:
     """Remove the common field from the residual."""
     for k in range(len(dots)):
@@ -251,7 +263,7 @@ def _project_residual(rows: FloatArray, common: FloatArray, dots: FloatArray) ->
                 r[RESIDUAL + i], r[RESIDUAL + LANES + i], r[RESIDUAL + 2 * LANES + i] = y
 
 
-@compiled
+@internal
 def _fill_left(w: FloatArray, rows: FloatArray) -> None:
     """χ² of the trial states, and what of it the linear moduli would still take by another moment."""
     w[PRODUCT + 3 * LANES : PRODUCT + 6 * LANES] = 0.0

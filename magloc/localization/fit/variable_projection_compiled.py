@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arrays.typing import FloatArray, IntArray
-from magloc.compilation import compiled, inlined, own
+from magloc.compilation import compiled, inlined, internal, own
 from magloc.localization.fit.linearisation_compiled import (
     CHI2,
     DAMPING,
@@ -109,17 +109,19 @@ def refine(
     common, dots = np.zeros((n_sensors, n_triples, 9 * LANES)), np.empty((n_triples, 9 * LANES))
     start_of_lane, set_of_lane = np.full(LANES, -1), np.full(LANES, -1)
     w[END : END + LANES] = FAILED
-    next_start = fill_lanes(0, start_of_lane, set_of_lane, signal, reading, starts, model, w, rows, common, out)
-    while start_of_lane.max() >= 0:
+    next_start: int = np.int64(0)  # type: ignore[assignment]  # no literal: it would be compiled for itself
+    while True:
+        next_start, n_running = fill_lanes(
+            next_start, start_of_lane, set_of_lane, signal, reading, starts, model, w, rows, common, out
+        )
+        if n_running == 0:
+            return
         linearise(model.sensors, w, rows, common, dots, free_range)
         judge(w, tolerance, max_iterations)
         step(w, free_range)
-        next_start = fill_lanes(
-            next_start, start_of_lane, set_of_lane, signal, reading, starts, model, w, rows, common, out
-        )
 
 
-@compiled
+@internal
 def fill_lanes(
     next_start: int,
     start_of_lane: IntArray,
@@ -132,11 +134,12 @@ def fill_lanes(
     rows: FloatArray,
     common: FloatArray,
     out: Refined,
-) -> int:
-    """Put out the starts that have ended, and begin others in their lanes: the start that comes next."""
-    n = len(starts)
+) -> tuple[int, int]:
+    """Put out the starts that have ended, and begin others in their lanes: the start that comes next, how many run."""
+    n, n_running = len(starts), 0
     for i in range(LANES):
         if w[END + i] == RUNNING:
+            n_running += start_of_lane[i] >= 0
             continue
         k = start_of_lane[i]
         if k >= 0:
@@ -148,6 +151,7 @@ def fill_lanes(
             out.iterations[k] = int(w[ITERATIONS + i])
             out.converged[k] = w[END + i] == CONVERGED
         start_of_lane[i] = next_start if next_start < n else -1
+        n_running += next_start < n
         k = min(next_start, n - 1)  # an idle lane computes something, too
         next_start += 1
         _load(i, starts[k], signal[reading[k]], w, rows)
@@ -155,10 +159,10 @@ def fill_lanes(
         if set_of_lane[i] != of_row:
             set_of_lane[i] = of_row
             _load_model(i, model.gain[of_row], model.common[of_row], rows, common)
-    return next_start
+    return next_start, n_running
 
 
-@compiled
+@internal
 def _load(i: int, start: FloatArray, signal: FloatArray, w: FloatArray, rows: FloatArray) -> None:
     """Begin a start in lane i: a place, where moduli count with a moment behind it."""
     for d in range(len(start)):
@@ -172,7 +176,7 @@ def _load(i: int, start: FloatArray, signal: FloatArray, w: FloatArray, rows: Fl
             rows[s, SIGNAL + a * LANES + i] = signal[s, a]
 
 
-@compiled
+@internal
 def _load_model(i: int, gain: FloatArray, of_row: FloatArray, rows: FloatArray, common: FloatArray) -> None:
     for s in range(len(gain)):
         for a in range(9):
@@ -218,7 +222,7 @@ def _take(w: FloatArray, at: int, i: int, taken: bool) -> None:
     w[at + i] = w[TRIAL + at + i] if taken else w[at + i]
 
 
-@compiled
+@internal
 def judge(w: FloatArray, tolerance: float, max_iterations: float) -> None:
     """Take the trial state where its χ² is lower, adapt the damping, and see which lanes have ended."""
     for i in range(LANES):
@@ -269,7 +273,7 @@ def judge(w: FloatArray, tolerance: float, max_iterations: float) -> None:
         w[END + i] = end if decrement < math.inf and chi2 < math.inf else FAILED
 
 
-@compiled
+@internal
 def step(w: FloatArray, free_range: float) -> None:
     """A damped step of every lane, half a radian at most."""
     for i in range(LANES):

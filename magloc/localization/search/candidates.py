@@ -77,7 +77,7 @@ def chosen_candidates(
     single = candidates.astype(np.float32)
     for begin in range(0, len(residual), _ROWS_AT_ONCE):
         some = residual[begin : begin + _ROWS_AT_ONCE]
-        components = (bases.T @ some.T.astype(np.float32)).reshape(3, len(candidates), -1)
+        components = (some.astype(np.float32) @ bases).reshape(len(some), 3, -1)
         of_some = chosen[begin : begin + _ROWS_AT_ONCE]
         over_rows(choose_rows, len(some), components, single, math.cos(apart_rad), of_some)
     return chosen

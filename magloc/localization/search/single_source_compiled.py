@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arrays.typing import FloatArray, IntArray
-from magloc.compilation import compiled, inlined
+from magloc.compilation import compiled, inlined, internal
 from magloc.linalg_compiled import put
 from magloc.localization.fit.linearisation_compiled import LANES
 from magloc.localization.fit.variable_projection_compiled import OPTIMUM_TOLERANCE, Refined, refine, same_optimum
@@ -61,63 +61,57 @@ def choose_rows(
 ) -> None:
     """Candidates (n, 4) that explain most of rows begin to end, some angle apart; the best again if none is left.
 
-    Components (3, n, rows) are those of the readings along the candidates' bases. Rows are lanes. Four candidates are
-    compared before the best so far is: a processor waits for that from one comparison to the next.
+    Components (rows, 3, n) are those of the readings along the candidates' bases. Candidates are lanes, four of a lane
+    are compared before the best so far is: a processor waits for that from one comparison to the next.
     """
     n, apart = len(candidates), np.float32(cos_apart)
-    n_fours = -(-n // 4)
-    fours = np.zeros((n_fours, 16), np.float32)  # coordinates of four candidates
+    n_fours = -(-n // (4 * LANES))
+    fours = np.zeros((n_fours, 4, 4 * LANES), np.float32)
     for j in range(n):
         for d in range(4):
-            fours[j // 4, 4 * (j % 4) + d] = candidates[j, d]
-    score = np.empty((4 * n_fours, LANES), np.float32)
-    for j in range(n, 4 * n_fours):
-        for i in range(LANES):
-            score[j, i] = -1.0
+            fours[j // (4 * LANES), d, j % (4 * LANES)] = candidates[j, d]
+    q = fours.reshape(n_fours, 16 * LANES)
+    score = np.full(n_fours * 4 * LANES, np.float32(-1.0))
     scores_of_four = score.reshape(n_fours, 4 * LANES)
-    w = np.empty(6 * LANES, np.float32)  # coordinates of the last choice (4), best score, its candidate
-    for block in range(begin, end, LANES):
-        width = min(LANES, end - block)
+    w = np.empty(2 * LANES, np.float32)  # best score of a lane, and its place
+    last = np.empty(4, np.float32)
+    for row in range(begin, end):
+        x, y, z = components[row, 0], components[row, 1], components[row, 2]
         for j in range(n):
-            x, y, z = components[0, j, block:], components[1, j, block:], components[2, j, block:]
-            for i in range(width):
-                score[j, i] = x[i] * x[i] + y[i] * y[i] + z[i] * z[i]
-        w[: 4 * LANES] = 0.0
+            score[j] = x[j] * x[j] + y[j] * y[j] + z[j] * z[j]
+        last[:] = 0.0
         for k in range(chosen.shape[1]):
-            w[4 * LANES :] = 0.0
+            w[:] = 0.0
+            of_last = (last[0], last[1], last[2], last[3])
             for j in range(n_fours):
-                s, place = scores_of_four[j], np.float32(4 * j)
-                c0, c1, c2, c3 = _four(fours[j], 0), _four(fours[j], 4), _four(fours[j], 8), _four(fours[j], 12)
+                c, s, place = q[j], scores_of_four[j], np.float32(4 * LANES * j)
                 for i in range(LANES):
-                    q = (w[i], w[LANES + i], w[2 * LANES + i], w[3 * LANES + i])
-                    v0, v1 = _left(c0, q, apart, s[i]), _left(c1, q, apart, s[LANES + i])
-                    v2, v3 = _left(c2, q, apart, s[2 * LANES + i]), _left(c3, q, apart, s[3 * LANES + i])
+                    v0, v1 = _left(c, i, of_last, apart, s), _left(c, LANES + i, of_last, apart, s)
+                    v2, v3 = _left(c, 2 * LANES + i, of_last, apart, s), _left(c, 3 * LANES + i, of_last, apart, s)
                     s[i], s[LANES + i], s[2 * LANES + i], s[3 * LANES + i] = v0, v1, v2, v3
-                    p01, v01 = np.float32(1.0) if v1 > v0 else np.float32(0.0), v1 if v1 > v0 else v0
-                    p23, v23 = np.float32(3.0) if v3 > v2 else np.float32(2.0), v3 if v3 > v2 else v2
+                    p01, v01 = np.float32(LANES) if v1 > v0 else np.float32(0.0), v1 if v1 > v0 else v0
+                    p23, v23 = np.float32(3 * LANES) if v3 > v2 else np.float32(2 * LANES), v3 if v3 > v2 else v2
                     which, value = p23 if v23 > v01 else p01, v23 if v23 > v01 else v01
-                    better = value > w[4 * LANES + i]
-                    w[4 * LANES + i] = value if better else w[4 * LANES + i]
-                    w[5 * LANES + i] = place + which if better else w[5 * LANES + i]
-            for i in range(width):
-                of_row = chosen[block + i]
-                of_row[k] = int(w[5 * LANES + i]) if w[4 * LANES + i] > 0.0 else of_row[0] if k > 0 else 0
-                for d in range(4):
-                    w[d * LANES + i] = candidates[of_row[k], d]
-
-
-@inlined
-def _four(of_four: NDArray[np.float32], at: int) -> tuple[float, float, float, float]:
-    return of_four[at], of_four[at + 1], of_four[at + 2], of_four[at + 3]
+                    better = value > w[i]
+                    w[i] = value if better else w[i]
+                    w[LANES + i] = place + which if better else w[LANES + i]
+            best = 0
+            for i in range(1, LANES):
+                earlier = w[i] == w[best] and w[LANES + i] + i < w[LANES + best] + best
+                best = i if w[i] > w[best] or earlier else best
+            found = int(w[LANES + best]) + best
+            chosen[row, k] = found if w[best] > 0.0 else chosen[row, 0] if k > 0 else 0
+            for d in range(4):
+                last[d] = candidates[chosen[row, k], d]
 
 
 @inlined
 def _left(
-    candidate: tuple[float, float, float, float], q: tuple[float, float, float, float], cos_apart: Any, score: float
+    c: NDArray[np.float32], at: int, q: tuple[float, float, float, float], cos_apart: Any, score: NDArray[np.float32]
 ) -> Any:
     """Score of a candidate, or less than any where it is near q."""
-    t = candidate[0] * q[0] + candidate[1] * q[1] + candidate[2] * q[2] + candidate[3] * q[3]
-    return np.float32(-1.0) if abs(t) > cos_apart else score
+    t = c[at] * q[0] + c[4 * LANES + at] * q[1] + c[8 * LANES + at] * q[2] + c[12 * LANES + at] * q[3]
+    return np.float32(-1.0) if abs(t) > cos_apart else score[at]
 
 
 @compiled
@@ -180,7 +174,7 @@ def search_rows(
         _distinct(ends, first, last, keep_within, row, out)
 
 
-@compiled
+@internal
 def _distinct(refined: Refined, first: int, last: int, keep_within: float, row: int, out: Ends) -> None:
     """Optima of a row among ends first to last, best first, without those that are known already."""
     kept = 0

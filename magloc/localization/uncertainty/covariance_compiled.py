@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from arrays.typing import FloatArray
-from magloc.compilation import compiled
+from magloc.compilation import internal
 from magloc.linalg_compiled import orthonormalise
 from magloc.measurement.whitened_compiled import (
     ModelRow,
@@ -17,7 +17,7 @@ from magloc.measurement.whitened_compiled import (
 )
 
 
-@compiled
+@internal
 def covariance_and_volume(
     q: FloatArray, mu: FloatArray, row: ModelRow, variance: float, covariance: FloatArray
 ) -> float:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from arrays.typing import FloatArray, IntArray
-from magloc.compilation import compiled
+from magloc.compilation import internal
 from magloc.linalg_compiled import put
 from magloc.localization.fit.variable_projection_compiled import Refined, refine
 from magloc.measurement.whitened_compiled import SMALLEST_S, LaneModel
@@ -37,7 +37,7 @@ class FlatFits(NamedTuple):
     chi2: FloatArray
 
 
-@compiled
+@internal
 def _begin(
     q: FloatArray, chi2: float, rise: float, toward: float, step: float, state: FloatArray, u: FloatArray
 ) -> None:
@@ -56,13 +56,13 @@ def _begin(
     state[_TRIED] = _within_bound(alpha + toward * step, toward)
 
 
-@compiled
+@internal
 def _within_bound(alpha: float, toward: float) -> float:
     bound = toward * (0.5 * math.pi - SMALLEST_S)
     return bound if toward * (alpha - bound) > 0.0 else alpha
 
 
-@compiled
+@internal
 def _next(state: FloatArray, chi2: float) -> tuple[bool, bool]:
     """Whether a search has ended at the α that it tried, and whether that is within the rise; else the next α to try.
 
@@ -98,7 +98,7 @@ def _next(state: FloatArray, chi2: float) -> tuple[bool, bool]:
     return False, within
 
 
-@compiled
+@internal
 def _place(direction: FloatArray, alpha: float, q: FloatArray) -> None:
     """Homogeneous coordinates at an α, but not at infinity."""
     if abs(alpha) < SMALLEST_S:
@@ -108,7 +108,7 @@ def _place(direction: FloatArray, alpha: float, q: FloatArray) -> None:
     q[3] = math.sin(alpha)
 
 
-@compiled
+@internal
 def _gaussian_step(q: FloatArray, covariance: FloatArray, rise: float) -> float:
     """Step in α where a Gaussian profile would rise by `rise`: dα = dρ / (1 + ρ²)."""
     rho2 = (q[0] * q[0] + q[1] * q[1] + q[2] * q[2]) / (q[3] * q[3])
@@ -121,7 +121,7 @@ def _gaussian_step(q: FloatArray, covariance: FloatArray, rise: float) -> float:
     return min(max(step, 1e-9), LARGEST_PROFILE_STEP) if math.isfinite(step) else 0.05
 
 
-@compiled
+@internal
 def profile_rows(
     begin: int,
     end: int,

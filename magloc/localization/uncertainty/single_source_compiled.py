@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arrays.typing import BoolArray, FloatArray
-from magloc.compilation import compiled
+from magloc.compilation import compiled, internal
 from magloc.levels import CERTAIN_WEIGHT, DELTA_CHI2_95
 from magloc.localization.uncertainty.ambiguity import LARGEST_BEND, LARGEST_GAUSSIAN_SIGMA
 from magloc.localization.uncertainty.covariance_compiled import covariance_and_volume
@@ -106,7 +106,7 @@ def certainty_rows(
                 out.gaussian[k] = _is_gaussian(fits.q[k], fits.mu[k], fits.chi2[k], covariance, y[row], of_row)
 
 
-@compiled
+@internal
 def _weigh(chi2: FloatArray, log_volume: FloatArray, understated: float, weight: FloatArray) -> float:
     """Weights of solutions, and the rise above the best one within which 95 % of all of them are."""
     best, lowest, total, several = -math.inf, math.inf, 0.0, 0
@@ -140,7 +140,7 @@ def _weigh(chi2: FloatArray, log_volume: FloatArray, understated: float, weight:
     return high
 
 
-@compiled
+@internal
 def _interpolated(x: float, xs: FloatArray, ys: FloatArray) -> float:
     """Value at x of ys at xs that ascend; beyond their ends as at these."""
     low, high = 0, len(xs) - 1
@@ -157,7 +157,7 @@ def _interpolated(x: float, xs: FloatArray, ys: FloatArray) -> float:
     return ys[low] + (x - xs[low]) / (xs[high] - xs[low]) * (ys[high] - ys[low])
 
 
-@compiled
+@internal
 def _rise(energy: float, chi2: float, level: float, levels: Levels) -> float:
     """:func:`magloc.localization.uncertainty.range_interval.rise` of one row."""
     if not energy > levels.detected:
@@ -171,7 +171,7 @@ def _rise(energy: float, chi2: float, level: float, levels: Levels) -> float:
     return max(explained - weakest * weakest, level)
 
 
-@compiled
+@internal
 def _unite(alpha: FloatArray, rise: float, sets: FloatArray, n_sets: NDArray[np.int64]) -> None:
     """Disjoint ascending ranges, in radii, that stretches (n, 2) of α cover; everything where nothing bounds them."""
     if not math.isfinite(rise):
@@ -205,7 +205,7 @@ def _unite(alpha: FloatArray, rise: float, sets: FloatArray, n_sets: NDArray[np.
     n_sets[0] = kept
 
 
-@compiled
+@internal
 def _widen(q: FloatArray, low: float, high: float, covariance: FloatArray) -> None:
     """:func:`magloc.localization.uncertainty.ambiguity.widened` of one covariance."""
     size = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
@@ -225,7 +225,7 @@ def _widen(q: FloatArray, low: float, high: float, covariance: FloatArray) -> No
             covariance[i, j] += missing * following[i] * following[j]
 
 
-@compiled
+@internal
 def _is_gaussian(
     q: FloatArray, mu: FloatArray, chi2: float, covariance: FloatArray, y: FloatArray, row: ModelRow
 ) -> bool:
