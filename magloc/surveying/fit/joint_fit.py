@@ -254,7 +254,7 @@ def fit_jointly(
     most: int = _MOST_STEPS,
     settled: float = _SETTLED,
 ) -> JointFit:
-    """Levenberg-Marquardt from some sources, the noise held, until χ² gains less than settled times χ² per reading."""
+    """Levenberg-Marquardt from some sources, the noise held."""
 
     def cost_of(sources: Sources) -> tuple[float, FloatArray, FloatArray, FloatArray]:
         fields = sources.fields(record)
@@ -288,6 +288,6 @@ def fit_jointly(
                 break
             damping *= 10.0
         J, J_layer, H = linearised(sources, fields)
-        if gain < settled * max(1.0, cost / len(residual)):
+        if gain < settled:
             break
     return JointFit(sources, cost, H, residual)
