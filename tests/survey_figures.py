@@ -80,7 +80,7 @@ def judged(field: Simulation, false_per_hectare: float = 0.1) -> Field:
     record, errors = record_of(found.array, whole_rows(field.array, field.readings)[1])
     record = replace(record, values_T=record.values_T - np.median(record.values_T, axis=0))
     layer = Layer.below(record, 15.0, 5e-9)
-    background = Background.of(record, truth, layer, errors, Drift(), np.arange(len(record)))
+    background = next(Background.of_each(record, truth, layer, errors, Drift(), [np.arange(len(record))]))
     at_truth = fit_jointly(record, background, truth, everywhere, most=0)
     bound = np.sqrt(np.diagonal(at_truth.covariance).reshape(-1, 6)[:, :3].sum(axis=1))
     pairs, missed, used = [], [], set()

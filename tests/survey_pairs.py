@@ -43,7 +43,9 @@ def fitted_as_one(scenario: MagneticScenario, seed: int) -> tuple[bool, bool] | 
     along = moments @ fit.sources.moment_Am2[0]
     error = fit.sources.position_m[0] - along @ places / along.sum()
     off = error @ np.linalg.solve(fit.covariance[:3, :3], error) > chdtri(3, 0.05)
-    return "merged" in str(targets_of(model, fit, background, 0.0)["flags"][0]).split(), bool(off)
+    return "merged" in str(
+        targets_of(model, fit, background, 0.0, np.ones(len(fit.sources), np.bool_))["flags"][0]
+    ).split(), bool(off)
 
 
 def main() -> None:

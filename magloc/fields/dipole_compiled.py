@@ -114,6 +114,30 @@ def field_at_points(points: ArrayLike, sources: ArrayLike, moments: ArrayLike) -
     return out
 
 
+def gradient_at_points(points: Array, sources: Array, moments: Array) -> Array:
+    """Gradient tensors (N, 3, 3) at points of dipoles together; twin of :func:`dipole.total_gradient_tensor`."""
+    out = np.zeros((len(points), 3, 3))
+    _fill_gradients(_rows("points", points, "N"), _rows("sources", sources, "K"), _rows("moments", moments, "K"), out)
+    return out
+
+
+@compiled_parallel
+def _fill_gradients(points: Array, sources: Array, moments: Array, out: Array) -> None:
+    """Add the gradients at points (N, 3) to out (N, 3, 3)."""
+    for i in prange(len(points)):
+        G = out[i]
+        for k in range(len(sources)):
+            x, y, z = points[i, 0] - sources[k, 0], points[i, 1] - sources[k, 1], points[i, 2] - sources[k, 2]
+            xx, xy, xz, yy, yz, zz = gradient_components(x, y, z, moments[k, 0], moments[k, 1], moments[k, 2])
+            G[0, 0] += xx
+            G[0, 1] += xy
+            G[0, 2] += xz
+            G[1, 1] += yy
+            G[1, 2] += yz
+            G[2, 2] += zz
+        G[1, 0], G[2, 0], G[2, 1] = G[0, 1], G[0, 2], G[1, 2]
+
+
 def _rows(name: str, values: ArrayLike, n: str) -> Array:
     """Return values as a contiguous, read-only float array of shape (n, 3)."""
     array = np.asarray(values, dtype=np.float64, order="C")

@@ -33,7 +33,7 @@ class Lag(NamedTuple):
 def lag_of(model: Model, sources: Sources, group: IntArray, delayed: Callable[[float], SurveyRecord]) -> Lag:
     """Likeliest lag of a record, 0 where it explains no more than chance does; ``delayed`` has one corrected."""
     record = model.record
-    way = np.linalg.norm(np.diff(record.sensors_m.mean(axis=1), axis=0), axis=1)
+    way = np.linalg.norm(np.diff(record.middles_m, axis=0), axis=1)
     speed = float(np.median(way / np.diff(record.time_s)))
     if not len(sources) or speed * _MOST_S < _STEP_M:
         return Lag(0.0, math.inf)
@@ -44,16 +44,20 @@ def lag_of(model: Model, sources: Sources, group: IntArray, delayed: Callable[[f
         at = replace(model, record=delayed(lag_s)) if lag_s else model
         return at.misfit(at.refitted(sources, group), group)
 
+    size = (int(group[-1]) + 1) * record.array.n_channels
+
+    def chance(cost: float) -> float:
+        """What a lag explains by chance: what is not found yet makes it larger."""
+        return model.threshold * max(1.0, cost / size)
+
     before, here, after = cost(-step), cost(0.0), cost(step)
     curvature = (before - 2.0 * here + after) / step**2
     slope = (after - before) / (2.0 * step)
-    if here < min(before, after) and slope**2 < 2.0 * curvature * model.threshold:
+    if here < min(before, after) and slope**2 < 2.0 * curvature * chance(here):
         return Lag(0.0, math.sqrt(2.0 / curvature))
     found = minimize_scalar(cost, bounds=(-_MOST_S, _MOST_S), method="bounded", options={"xatol": _TOLERANCE_S})
-    size = (int(group[-1]) + 1) * record.array.n_channels
     explained = found.fun < max(_MISFIT * size, _SHARE * here)  # else something is wrong that a lag imitates
-    least = model.threshold * max(1.0, found.fun / size)  # what is not found yet makes chance larger
-    if not explained or here - found.fun < least or abs(found.x) > 0.99 * _MOST_S:
+    if not explained or here - found.fun < chance(found.fun) or abs(found.x) > 0.99 * _MOST_S:
         return Lag(0.0, math.inf)
     around = [cost(found.x + sign * step) for sign in (-1.0, 1.0)]
     return Lag(float(found.x), step * math.sqrt(2.0 / (sum(around) - 2.0 * found.fun)))

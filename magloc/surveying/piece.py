@@ -22,7 +22,7 @@ from magloc.surveying.reach import least_moments
 from magloc.surveying.rounds import AT_LAST, MOST_ROUNDS, Model, found_in
 from magloc.surveying.search import PITCH, SearchGrid
 from magloc.surveying.targets import targets_of
-from magloc.surveying.tiles import Tile
+from magloc.surveying.tiles import SEAM_M, Tile
 
 OF_ROWS = ("place_m", "anomaly_T", "residual_T")
 _FIRST_ROUNDS = 4  # until the clock is looked at
@@ -122,7 +122,7 @@ class Piece:
 
     def groups(self, record: SurveyRecord, length_m: float) -> IntArray:
         """Group of every row (n,): neighbours that pass within a length count as one."""
-        steps = np.linalg.norm(np.diff(record.sensors_m.mean(axis=1), axis=0), axis=1)[np.diff(self.tile.rows) == 1]
+        steps = np.linalg.norm(np.diff(record.middles_m, axis=0), axis=1)[np.diff(self.tile.rows) == 1]
         step = float(np.median(steps)) if steps.size else 0.0
         together = max(1, math.floor(length_m / step)) if step > 0.0 else 1
         return np.unique(self.tile.rows // together, return_inverse=True)[1]
@@ -131,41 +131,44 @@ class Piece:
 @one_blas_thread
 def strongest_in(piece: Piece) -> Arrays:
     """The strongest sources, after some rounds."""
-    return _rounds_in(piece, _FIRST_ROUNDS)
+    return _rounds_in(piece, _FIRST_ROUNDS, math.inf)
 
 
 @one_blas_thread
 def sources_in(piece: Piece) -> Arrays:
-    """All sources that are significant."""
-    return _rounds_in(piece, MOST_ROUNDS)
+    """All sources that are significant; of those farther beside the tile its neighbours tell."""
+    return _rounds_in(piece, MOST_ROUNDS, 1.0)
 
 
-def _rounds_in(piece: Piece, most: int) -> Arrays:
+def _rounds_in(piece: Piece, most: int, beside: float) -> Arrays:
+    """Sources that are looked for in the tile and beside it, as far as the deepest are from the sensors, or a share."""
     model = piece.model()
-    grid = SearchGrid.below(model.record, model.bounds.low_m, model.bounds.high_m)
+    reach = beside * (model.record.height_m - model.bounds.low_m[2])
+    low, high = np.append(piece.tile.low_m - reach, -math.inf), np.append(piece.tile.high_m + reach, math.inf)
+    grid = SearchGrid.below(model.record, np.maximum(model.bounds.low_m, low), np.minimum(model.bounds.high_m, high))
     return dict(vars(found_in(model, partial(piece.groups, model.record), grid, piece.known, most)))
 
 
 @one_blas_thread
 def targets_in(piece: Piece) -> Arrays:
-    """The sources that are known, fitted to all rows: parts of targets, reach, and what is left of the tile's rows."""
+    """The sources that are known, fitted to all rows: targets of the tile, reach, and what is left of its rows."""
     model = piece.model()
     groups = partial(piece.groups, model.record)
     fit, background = model.fitted(piece.known, groups(AT_LAST * model.nearest_m), _SETTLED)
     record = model.record
     left = record.values_T - record.predicted(fit.sources.fields(record))
     lines = (
-        record.sensors_m.mean(axis=1),
+        record.middles_m,
         record.along_ambient(record.values_T),
         record.along_ambient(left),
     )
-    own = piece.tile.own
+    own, which = piece.tile.own, piece.tile.inside_m(fit.sources.position_m) > -SEAM_M
     extent = piece.tile.extent_m(lines[0][own, :2])
     places, moments = least_moments(model, fit.sources, groups, *extent, piece.ground.ground_m)
     return {
         "reach_m": places,
         "reach_Am2": moments,
-        **targets_of(model, fit, background, piece.ground.ground_m),
+        **targets_of(model, fit, background, piece.ground.ground_m, which),
         **{name: values[own] for name, values in zip(OF_ROWS, lines, strict=True)},
         "chi2": np.array(fit.chi2),
         "size": np.array(fit.residual.size),

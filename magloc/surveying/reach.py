@@ -31,8 +31,9 @@ def least_moments(
     places, moments = [], []
     inside = [at for at in DEPTHS_M if bounds.low_m[2] <= ground_m - at <= bounds.high_m[2] and (low <= high).all()]
     distances = [record.height_m - ground_m + at for at in inside]
-    for distance, level in SearchGrid.of(low, high, record.height_m, distances).levels.items():
-        background = model.background(sources, groups(WHILE_SEARCHING * distance))
+    levels = SearchGrid.of(low, high, record.height_m, distances).levels
+    of_levels = model.backgrounds(sources, (groups(WHILE_SEARCHING * distance) for distance in levels))
+    for (distance, level), background in zip(levels.items(), of_levels, strict=True):
         white, Q = background.white, with_free_sources(record, background, sources)
         for _, at in level.tiles:
             used = groups_near(record, white, at, WINDOW * distance)

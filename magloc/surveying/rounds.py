@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,6 +21,7 @@ _MOST_OF_MISFITS, _MISFIT = 8, 1.5  # and as long as χ² per reading says that 
 _PROGRESS, _WORSE = 0.999, 1.02
 _MOST_AT_ONCE = 8
 _SAME_PLACE_M = 1e-6
+_FELT = 0.3  # of the noise: sources that change the field by less are the same
 _REACH = 0.6  # of a fit, over the distance from the sensors
 _MOST_WEIGHINGS = 4
 _SETTLED_COARSELY = 0.5
@@ -51,7 +52,11 @@ class Model:
 
     def background(self, sources: Sources, group: IntArray) -> Background:
         """Where some sources are, for groups of rows."""
-        return Background.of(self.record, sources, self.layer, self.errors, self.drift, group, self.body_length_m)
+        return next(self.backgrounds(sources, [group]))
+
+    def backgrounds(self, sources: Sources, groups: Iterable[IntArray]) -> Iterator[Background]:
+        """Where some sources are, for several ways to group the rows."""
+        return Background.of_each(self.record, sources, self.layer, self.errors, self.drift, groups, self.body_length_m)
 
     def refitted(self, sources: Sources, group: IntArray) -> Sources:
         """The same sources where they fit best, within their reach."""
@@ -94,9 +99,10 @@ class Model:
 
     def candidates(self, sources: Sources, grid: SearchGrid, groups: Groups) -> Candidates:
         """Where one more source would explain most; the deeper, the longer the averages of rows that show it."""
+        of_levels = self.backgrounds(sources, (groups(WHILE_SEARCHING * distance) for distance in grid.levels))
         return Candidates.joined(
-            search(self.record, self.background(sources, groups(WHILE_SEARCHING * distance)), sources, level)
-            for distance, level in grid.levels.items()
+            search(self.record, background, sources, level)
+            for background, level in zip(of_levels, grid.levels.values(), strict=True)
         )
 
 
@@ -110,6 +116,8 @@ def found_in(model: Model, groups: Groups, grid: SearchGrid, known: Sources, mos
     in_vain = 0
     tried: FloatArray = np.zeros((0, 3))
     least = math.inf
+    felt_T = _FELT * float(model.record.array.channel_noise_T.min())
+    searched_T: FloatArray = np.full_like(model.record.sensors_m, math.inf)
     for _ in range(most):
         fit, _ = wide.fitted(sources, group, _SETTLED_COARSELY)
         at_once = _MOST_AT_ONCE
@@ -123,7 +131,9 @@ def found_in(model: Model, groups: Groups, grid: SearchGrid, known: Sources, mos
         if in_vain > (_MOST_OF_MISFITS if fit.chi2 > _MISFIT * fit.residual.size else _MOST_IN_VAIN):
             break
         best, least = fit.sources, min(least, fit.chi2)
-        candidates = wide.candidates(fit.sources, grid, groups)
+        fields = fit.sources.fields(wide.record)
+        if np.abs(fields - searched_T).max() > felt_T:
+            candidates, searched_T = wide.candidates(fit.sources, grid, groups), fields
         # What was left out again is not tried twice, unless something else was found meanwhile.
         tried_before = (np.linalg.norm(candidates.place_m[:, None] - tried, axis=-1) < _SAME_PLACE_M).any(axis=1)
         chosen = sources_at(candidates, peaks(candidates.without(tried_before), model.threshold)[:at_once])

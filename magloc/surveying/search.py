@@ -151,7 +151,7 @@ def _stands_beside(found: Candidates, i: int, stronger: int) -> bool:
 
 def groups_near(record: SurveyRecord, white: Whitening, places: FloatArray, window_m: float) -> IntArray:
     """Groups of rows within some distance of places (m, 3), on the map."""
-    middles = record.sensors_m.mean(axis=1)[white.starts[:-1], :2]
+    middles = record.middles_m[white.starts[:-1], :2]
     low, high = places[:, :2].min(axis=0) - window_m, places[:, :2].max(axis=0) + window_m
     return np.flatnonzero(np.all((middles >= low) & (middles <= high), axis=1))
 

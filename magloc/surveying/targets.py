@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from arrays.typing import FloatArray, IntArray
+from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.fields.multipole import multipole_field_matrix
 from magloc.surveying.fit.joint_fit import Background, JointFit, jacobian_of, with_free_sources
 from magloc.surveying.rounds import Model
@@ -98,15 +98,17 @@ def second_source_chi2(
     return float(np.sum((axes.T @ (A.T @ left))[-_N_SECOND:] ** 2 / size[-_N_SECOND:]))
 
 
-def targets_of(model: Model, fit: JointFit, background: Background, ground_m: float) -> dict[str, NDArray[Any]]:
-    """Of all sources of a fit: the parts of targets, an entry for each."""
+def targets_of(
+    model: Model, fit: JointFit, background: Background, ground_m: float, which: BoolArray
+) -> dict[str, NDArray[Any]]:
+    """Of some sources (K,) of a fit: the parts of targets, an entry for each."""
     sources, K = fit.sources, len(fit.sources)
     covariance = fit.covariance.reshape(K, 6, K, 6)[np.arange(K), :, np.arange(K)]
     significance = fit.significance
     depth, sigma = ground_m - sources.position_m[:, 2], np.sqrt(covariance[:, 2, 2])
     interval = np.column_stack([np.maximum(0.0, depth - 1.96 * sigma), depth + 1.96 * sigma])
     weak = significance < _WEAK
-    for j in np.flatnonzero(weak):
+    for j in np.flatnonzero(weak & which):
         interval[j], scatter = profile_of(model, fit, background, int(j), ground_m)
         covariance[j] = _scattered(covariance[j], scatter)
     apart = np.linalg.norm(sources.position_m[:, None] - sources.position_m, axis=-1) + np.diag(np.full(K, np.inf))
@@ -115,20 +117,22 @@ def targets_of(model: Model, fit: JointFit, background: Background, ground_m: fl
     directions = model.record.directions(sources.fields(model.record))
     Q = with_free_sources(model.record, background, sources)
     free = fit.residual - Q @ (Q.T @ fit.residual)
-    second = [second_source_chi2(model, background, directions, Q, free, place) for place in sources.position_m]
-    middles = model.record.sensors_m.mean(axis=1)[background.white.starts[:-1]]
+    second = np.zeros(K)
+    for j in np.flatnonzero(which):
+        second[j] = second_source_chi2(model, background, directions, Q, free, sources.position_m[j])
+    middles = model.record.middles_m[background.white.starts[:-1]]
     reach = _NEAR * (model.record.height_m - sources.position_m[:, 2:])
     above = np.linalg.norm(sources.position_m[:, None, :2] - middles[:, :2], axis=-1) < reach
     flags = {
         "weak": weak,
         "near": apart.min(axis=1, initial=np.inf) < _NEAR * depth + 0.5,
         "misfit": np.array([is_misfit(left, np.flatnonzero(near)) for near in above], np.bool_),
-        "merged": np.array(second) > chdtri(_N_SECOND, _FALSE_MERGED),
+        "merged": second > chdtri(_N_SECOND, _FALSE_MERGED),
         "edge": (rim[:, :2] < 0.3).any(axis=1) | (rim[:, 2] < 0.02),
     }
     words = np.array([" ".join(name for name, set_ in flags.items() if set_[j]) for j in range(K)], np.str_)
     parts = (sources.position_m, sources.moment_Am2, covariance, interval, significance, words)
-    return dict(zip(OF_TARGETS, parts, strict=True))
+    return {name: part[which] for name, part in zip(OF_TARGETS, parts, strict=True)}
 
 
 def is_misfit(left: FloatArray, at: IntArray) -> bool:

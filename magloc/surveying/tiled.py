@@ -157,18 +157,27 @@ class TiledSurvey:
         return int(np.argmax([len(sources) for sources in self.found]))
 
     def on_time(self) -> tuple[TiledSurvey, Lag]:
-        """Readings that belong to their poses, and by how much they did not."""
+        """Readings that belong to their poses, and by how much they did not, as a tile without its margin tells."""
         number = self._richest()
-        piece = self.piece(number)
+        tile = self.tiles[number]
+        rows = tile.rows[tile.own]
+        inside = tile.inside_m(self.sources.position_m) > -_BESIDE_M
+        piece = replace(
+            self.piece(number),
+            readings=self.readings[rows],
+            tile=replace(tile, rows=rows, own=np.ones(len(rows), np.bool_)),
+            known=self.sources.some(inside),
+            outside=self.sources.some(~inside),
+        )
         model = piece.model()
-        around = rows_around(self.readings.time_s, self.tiles[number].rows)
-        readings, own = self.readings[around], np.searchsorted(around, self.tiles[number].rows)
+        around = rows_around(self.readings.time_s, rows)
+        readings, own = self.readings[around], np.searchsorted(around, rows)
 
         def delayed(lag_s: float) -> SurveyRecord:
             return replace(piece, readings=taken_earlier(readings, lag_s)[own]).model().record
 
         group = piece.groups(model.record, WHILE_SEARCHING * model.nearest_m)
-        lag = lag_of(model, self.found[number], group, delayed)
+        lag = lag_of(model, piece.known, group, delayed)
         return (replace(self, readings=taken_earlier(self.readings, lag.s)) if lag.s else self), lag
 
     def with_likeliest_pose(self) -> TiledSurvey:

@@ -10,7 +10,7 @@ import numpy as np
 from arrays.typing import BoolArray, FloatArray, IntArray
 
 _CORE, _MARGIN = 6.0, 2.0  # over the distance from the sensors to the deepest sources
-_SEAM_M = 1.2  # more than a source may stand beside the rows
+SEAM_M = 1.2  # more than a source may stand beside the rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,13 +68,13 @@ def owned(tiles: Sequence[Tile], position_m: Sequence[FloatArray], same_m: float
     found = []
     for t, (tile, places) in enumerate(zip(tiles, position_m, strict=True)):
         inside = tile.inside_m(places)
-        found += [(float(inside[k]), t, int(k)) for k in np.flatnonzero(inside > -_SEAM_M)]
+        found += [(float(inside[k]), t, int(k)) for k in np.flatnonzero(inside > -SEAM_M)]
     found.sort(key=lambda entry: (-entry[0], entry[1:]))
     kept: list[tuple[int, int]] = []
     on_seam: list[tuple[int, FloatArray, set[int]]] = []  # which tiles have them
     for inside_m, t, k in found:
         place = position_m[t][k]
-        if inside_m <= _SEAM_M:
+        if inside_m <= SEAM_M:
             same = [s for s in on_seam if t not in s[2] and np.linalg.norm(s[1] - place) < same_m]
             if same:
                 min(same, key=lambda s: float(np.linalg.norm(s[1] - place)))[2].add(t)

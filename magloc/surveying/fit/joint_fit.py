@@ -9,6 +9,7 @@ in white units, and so are their columns in the Jacobian of the sources: Levenbe
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -110,27 +111,32 @@ class Background:
         return float(np.linalg.slogdet(np.eye(self.Q.shape[1]) - self.Q.T @ self.Q)[1])
 
     @classmethod
-    def of(
+    def of_each(
         cls,
         record: SurveyRecord,
         sources: Sources,
         layer: Layer,
         errors: PoseErrors,
         drift: Drift,
-        group: IntArray,
+        groups: Iterable[IntArray],
         body_length_m: float = 0.0,
-    ) -> Background:
-        """With errors of the pose as the field of the sources makes them felt, and of bodies that are no points."""
+    ) -> Iterator[Background]:
+        """With errors of the pose as the field of the sources makes them felt, and of bodies that are no points.
+
+        One for every way to group the rows (n,).
+        """
         fields = sources.fields(record)
         gradients = record.gradients(sources.position_m, sources.moment_Am2)
         directions = record.directions(fields)
         least_T = _NEGLIGIBLE * float(record.array.channel_noise_T.min())
         where = directions, sources.position_m, sources.moment_Am2
         by_square = record.by_squared_shift(*where, least_T)
-        white = Whitening.of(record, record.by_pose(directions, fields, gradients), by_square, errors, drift, group)
+        by_pose = record.by_pose(directions, fields, gradients)
         wrong = record.by_sensors(directions), record.by_bodies(*where, body_length_m, least_T)
-        columns = [layer.columns(record, directions, white), *map(white, wrong)]
-        return cls(white, orthogonal(np.concatenate(columns, axis=1)))
+        for group in groups:
+            white = Whitening.of(record, by_pose, by_square, errors, drift, group)
+            columns = [layer.columns(record, directions, white), *map(white, wrong)]
+            yield cls(white, orthogonal(np.concatenate(columns, axis=1)))
 
 
 def with_free_sources(record: SurveyRecord, background: Background, sources: Sources) -> FloatArray:

@@ -22,8 +22,7 @@ from scipy.spatial.transform import Rotation
 from arrays.array import SensorArray
 from arrays.pose import PoseUncertainty
 from arrays.typing import BoolArray, FloatArray
-from magloc.fields import dipole
-from magloc.fields.dipole_compiled import field_at_points
+from magloc.fields.dipole_compiled import field_at_points, gradient_at_points
 from magloc.fields.multipole import finite_body_errors, finite_body_fields
 from magloc.measurement.pose import LEVER, N_POSE, SHIFT, TURN, PoseErrors, rates_of
 from magloc.navigation.rotations import cross_matrix
@@ -113,8 +112,8 @@ class SurveyRecord:
 
     def gradients(self, position_m: FloatArray, moment_Am2: FloatArray) -> FloatArray:
         """Gradients (n, N, 3, 3) of the same."""
-        own = dipole.total_gradient_tensor(self.sensors_m, position_m, moment_Am2)
-        return np.asarray(own + self.gradient_beside_T_m)
+        own = gradient_at_points(self.sensors_m.reshape(-1, 3), position_m, moment_Am2)
+        return np.asarray(own.reshape(*self.sensors_m.shape, 3) + self.gradient_beside_T_m)
 
     def predicted(self, fields_T: FloatArray) -> FloatArray:
         """Anomalies (n, C) of fields (n, N, 3) beside the ambient one."""
@@ -130,6 +129,11 @@ class SurveyRecord:
             turned = np.einsum("nij,nsj->nsi", turn, b + seen) - b
             out[:, self.is_vector] = turned.reshape(len(self), -1)
         return out
+
+    @cached_property
+    def middles_m(self) -> FloatArray:
+        """Means of the sensors' places (n, 3)."""
+        return np.asarray(self.sensors_m.mean(axis=1))
 
     @property
     def height_m(self) -> float:
@@ -238,7 +242,8 @@ class SurveyRecord:
     ) -> Iterator[tuple[BoolArray, FloatArray, FloatArray]]:
         """Sources whose second derivatives, times a square, exceed some field: where (n, N), from there, and moment."""
         reach_m = (_SECOND_ORDER * np.linalg.norm(moment_Am2, axis=-1) * square_m2 / least_T) ** 0.2
-        for position, moment, reach in zip(position_m, moment_Am2, reach_m, strict=True):
+        felt = self.sensors_m[..., 2].min() - position_m[..., 2] < reach_m
+        for position, moment, reach in zip(position_m[felt], moment_Am2[felt], reach_m[felt], strict=True):
             away = self.sensors_m - position
             near = np.linalg.norm(away, axis=-1) < reach
             if near.any():

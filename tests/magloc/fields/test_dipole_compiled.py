@@ -37,23 +37,15 @@ def symmetric(components: list[tuple[float, ...]]) -> Array:
     return matrices
 
 
-def gradients_at(points: Array, sources: Array, moments: Array) -> Array:
-    """Gradient tensors (N, 3, 3) of dipoles together, from the compiled components."""
-    total = np.zeros((len(points), 3, 3))
-    for p, m in zip(sources, moments, strict=True):
-        total += symmetric([kernels.gradient_components(*d, *m) for d in np.subtract(points, p)])
-    return total
-
-
 def jacobians_at(points: Array, source: Array, moment: Array) -> Array:
     """Jacobians (N, 3, 6) of one dipole's field by (p, m), from the compiled components."""
     by_moment = symmetric([kernels.field_matrix_components(*d) for d in np.subtract(points, source)])
-    return np.concatenate([-gradients_at(points, source[None], moment[None]), by_moment], axis=-1)
+    return np.concatenate([-kernels.gradient_at_points(points, source[None], moment[None]), by_moment], axis=-1)
 
 
 PAIRS = [
     pytest.param(kernels.field_at_points, dipole.total_field, dipole.field, id="field"),
-    pytest.param(gradients_at, dipole.total_gradient_tensor, dipole.gradient_tensor, id="gradient"),
+    pytest.param(kernels.gradient_at_points, dipole.total_gradient_tensor, dipole.gradient_tensor, id="gradient"),
 ]
 
 
@@ -119,7 +111,7 @@ class TestAccuracy:
         source, moment = rng.normal(size=3), rng.normal(size=3)
         points = source + 10.0**exponent * rng.normal(size=(10, 3))
         fields = kernels.field_at_points(points, [source], [moment])
-        gradients = gradients_at(points, [source], [moment])
+        gradients = kernels.gradient_at_points(points, [source], [moment])
         for s, field, gradient in zip(points, fields, gradients, strict=True):
             exact_field = oracles.decimal_field(s, source, moment)
             exact_gradient = oracles.decimal_gradient_tensor(s, source, moment)
@@ -132,7 +124,7 @@ class TestAccuracy:
         # Norms are taken of numbers near one: the squares of these would leave the range themselves.
         unit = 1e-7 / distance_m / distance_m / distance_m
         field = kernels.field_at_points(point, [origin], [moment])[0] / unit
-        gradient = gradients_at(point, [origin], [moment])[0] / unit * distance_m
+        gradient = kernels.gradient_at_points(point, [origin], [moment])[0] / unit * distance_m
         exact_field = oracles.decimal_field(point[0], origin, moment) / unit
         exact_gradient = oracles.decimal_gradient_tensor(point[0], origin, moment) / unit * distance_m
         assert np.linalg.norm(field - exact_field) <= ROUNDING * np.linalg.norm(exact_field)
@@ -160,7 +152,7 @@ class TestSingularPoint:
         points[index] = sources[1]
         for result in (
             kernels.field_at_points(points, sources, moments),
-            gradients_at(points, sources, moments),
+            kernels.gradient_at_points(points, sources, moments),
             jacobians_at(points, sources[1], moments[1]),
         ):
             is_nan = np.isnan(result.reshape(len(points), -1))
