@@ -42,8 +42,6 @@ _SAME_SCORE = 0.1
 _MUCH_STRONGER = 100.0
 # Share of a source's energy in one sensor above which no other sensor sees it.
 _LONELY = 0.9
-# Two halves of a source stand apart by twice this share of its distance from the array's centre.
-_HALVES_APART = 0.4
 # What is known of a new source: the direction of its moment [rad], ln of its strength, its place over its distance.
 _TURN, _LOG_STRENGTH, _PLACE = 1.0, 1.5, 0.5
 
@@ -147,14 +145,23 @@ class RowProblem:
         moved = self.updated(manoeuvring, plain.ids, plain.out, plain.penalty + MANOEUVRE)
         return [moved] if self.holds(moved) else self._beam(moved, 1)
 
-    def _beam(self, plain: Explanation, most_events: int) -> list[Explanation]:
+    def of_more_sources(self, common: JointState, out: BoolArray, least: int) -> list[Explanation]:
+        """Explanations from nothing, with some number of sources at least: fewer may hold in a row, and be wrong."""
+        return self._beam(self.updated(common, (), out), least + 1, least)
+
+    def _beam(self, plain: Explanation, most_events: int, least: int = 0) -> list[Explanation]:
         level = [plain]
         for _ in range(most_events):
             # An event that does not make the row likelier by more than it costs leads nowhere.
             level = distinct(
-                one for before in level[:_WIDTH] for one in self._one_event_more(before) if one.score < before.score
+                one
+                for before in level[:_WIDTH]
+                for one in self._one_event_more(before)
+                if one.score < before.score or len(before.ids) < len(one.ids) <= least
             )
-            holding = [found for found in level if self.holds(found)]
+            holding = [found for found in level if len(found.ids) >= least and self.holds(found)]
+            if holding and least:
+                return holding[:_RETURNED]
             if holding:
                 holding = distinct([*holding, *(fewer for found in holding[:_WIDTH] for fewer in self._merged(found))])
                 return [found for found in holding if found.score < holding[0].score + _AS_GOOD][:_RETURNED]
@@ -183,18 +190,6 @@ class RowProblem:
             others = tuple(name for k, name in enumerate(ids) if k not in (first, second))
             alone = self.with_source(prior.without(second).without(first), place_m, together)
             yield self.updated(alone, (*others, min(ids[first], ids[second])), found.out, penalty)
-
-    def halved(self, found: Explanation) -> Iterator[Explanation]:
-        """From nothing, with two sources in place of one: where too few explain a row, one stands for two."""
-        state = found.update.found
-        centre = self.row.origin_m + self.row.R_world_from_array @ self.scene.array.centroid
-        for k in range(state.n_sources):
-            others = np.arange(state.n_sources) != k
-            place, half = state.position_m[k], 0.5 * state.moment_Am2[k]
-            moments = np.vstack([state.moment_Am2[others], half, half])
-            for apart in _HALVES_APART * np.linalg.norm(place - centre) * np.eye(3):
-                places = np.vstack([state.position_m[others], place + apart, place - apart])
-                yield self.found_anew(state.common_alone, places, moments, found.out)
 
     def _one_event_more(self, found: Explanation) -> Iterator[Explanation]:
         """A sensor out, a death, and births at the best cells."""

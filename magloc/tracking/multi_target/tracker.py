@@ -48,8 +48,8 @@ _LESS_LIKELY = 25.0
 # the first one comes so many rows after the number of sources has changed, and each next one after twice as many.
 _JUDGED_ROWS = 11
 _RESTART_PAUSE, _FIRST_PAUSE = 15, 4
-# Restarts with a source more, and others; so many with one less are tried with one of them halved.
-_MOST_RESTARTS = 4
+# Restarts with a source more, and others.
+_MOST_RESTARTS = 3
 # Rows after which it is asked whether a source is one too many.
 _DOUBT_EVERY = 12
 # Memories of the excess of χ² [rows], and five times the deviation of its mean with each.
@@ -281,12 +281,9 @@ class SourcesTracker:
         common, dead, known = best.state.common_alone, best.health.dead, len(best.ids)
         again = problem.found_anew(common, best.state.position_m, best.state.moment_Am2, dead)
         anew = [again]
-        if known <= MOST_BY_ITSELF:  # of many it takes seconds and leads nowhere
-            pairs = list(combinations(range(known), 2))
-            fewer = distinct(problem.one_less(again, range(known), pairs))
-            anew += [halved for one in fewer[:_MOST_RESTARTS] for halved in problem.halved(one)]
-            if known < self.scene.most_sources:
-                anew += problem.halved(again)
+        for number in (known, known - 1, known + 1):  # of many, one by one takes seconds and leads nowhere
+            if 0 < number <= min(self.scene.most_sources, MOST_BY_ITSELF):
+                anew += problem.of_more_sources(common, dead, number)
         if known < self.scene.most_sources:
             anew += distinct(one for start in (found, again) for one in problem.births(start))
         tried = [one for one in distinct(anew) if one.update.converged]
@@ -311,7 +308,7 @@ class SourcesTracker:
         for one in (one for one in hypotheses if one.judged):
             gain = believed[0].score - one.score
             if gain > (_MUST_GAIN if one.judged == 1 else _CLEAR_GAIN):
-                ids = _old_names(one, believed[0], NAMES_A_ROW * self._n_rows)
+                ids = _old_names(one, believed[0])
                 believed.append(replace(one, ids=ids, score=believed[0].score - _MUST_GAIN, judged=0))
             elif one.judged > 1:
                 judged.append(one)
@@ -384,8 +381,8 @@ def _moments(states: list[JointState], weights: FloatArray, source: int) -> tupl
     return mean[:3], mean[3:], covariance + (share[:, None] * (x - mean)).T @ (x - mean)
 
 
-def _old_names(restart: Hypothesis, before: Hypothesis, first_id: int) -> tuple[int, ...]:
-    """Names of a restart's sources: those of the nearest ones before it, where they may be the same, or new ones.
+def _old_names(restart: Hypothesis, before: Hypothesis) -> tuple[int, ...]:
+    """Names of a restart's sources: those of the nearest ones before it, where they may be the same.
 
     One that was taken for somewhere else is another source to whoever followed it.
     """
@@ -394,7 +391,7 @@ def _old_names(restart: Hypothesis, before: Hypothesis, first_id: int) -> tuple[
         one.state.P[at[:, :, None], at[:, None]] for one in (restart, before) for at in [one.state.of_source[:, :3]]
     )
     apart = np.vecdot(offset, np.linalg.solve(P[:, None] + Q, offset[..., None])[..., 0])
-    names = [first_id + k for k in range(len(restart.ids))]
+    names = list(restart.ids)
     for new, old in zip(*linear_sum_assignment(np.linalg.norm(offset, axis=-1)), strict=True):
         if apart[new, old] < _ANOTHER_SIGMA2:
             names[new] = before.ids[old]
