@@ -16,11 +16,12 @@ MAKE_VENV = $(PYTHON) -m venv --clear
 map: .venv/installed
 	$(BIN)/magloc map
 
+# Three at once also on two processors: some wait for commands, servers and pages.
 test: ready chromium
-	$(BIN)/python -m pytest -q -n 2 -m "not slow"
+	$(BIN)/python -m pytest -q -n 3 -m "not slow"
 
 test-full: ready chromium
-	HYPOTHESIS_PROFILE=random $(BIN)/python -m pytest -q -n 2
+	HYPOTHESIS_PROFILE=random $(BIN)/python -m pytest -q -n 3
 
 lint: .venv/installed-test
 	$(BIN)/ruff check
@@ -100,7 +101,7 @@ pictures: .venv/installed-test chromium
 
 # The lower bounds of pyproject.toml, installed exactly.
 test-oldest: .venv-oldest/installed chromium
-	.venv-oldest/bin/python -m pytest -q -n 2 -m "not slow"
+	.venv-oldest/bin/python -m pytest -q -n 3 -m "not slow"
 
 .venv/made: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit("magloc needs Python 3.11 or newer, found " + sys.version.split()[0]) if sys.version_info < (3, 11) else None'
