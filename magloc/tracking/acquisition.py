@@ -19,8 +19,11 @@ from magloc.measurement.pose import PoseErrors
 from magloc.tracking.results import Row
 
 START_RANGE_ERROR = 0.03
-"""Standard deviation of the range over the range that a start may have, and of the whole position where one row alone
-does not determine the source: beyond it the posterior is no Gaussian in Cartesian coordinates."""
+"""Standard deviation of the range over the range that a start may have: beyond it the posterior is no Gaussian in
+Cartesian coordinates."""
+STACKED_POSITION_ERROR = 0.01
+"""Standard deviation of the whole position over the range, for a start from several rows of which one alone does not
+determine the source: the prediction is then Gaussian in Cartesian coordinates, so that it must be as good as linear."""
 # Another solution within this Δχ² forbids a start.
 _RIVAL_WITHIN = 9.0
 # Rows that together may determine a source at rest: how far back, how many, how often it is tried.

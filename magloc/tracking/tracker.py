@@ -33,7 +33,7 @@ from magloc.levels import CONTRADICTION
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.measurement.nuisances import Drift
 from magloc.readings import Readings
-from magloc.tracking.acquisition import START_RANGE_ERROR, Acquisition
+from magloc.tracking.acquisition import STACKED_POSITION_ERROR, Acquisition
 from magloc.tracking.acquisition import Start as RowsStart
 from magloc.tracking.chart.mixture import Mixture
 from magloc.tracking.chart.row import ChartRow
@@ -409,7 +409,7 @@ class Tracker:
         if found is None:
             return None
         offset, root = seen.measurement.place_in_array(found.x, found.S)
-        if float(np.linalg.norm(root)) > START_RANGE_ERROR * float(np.linalg.norm(offset)):
+        if float(np.linalg.norm(root)) > STACKED_POSITION_ERROR * float(np.linalg.norm(offset)):
             return None
         return Known(charted(found.x, found.S, seen), self.known_before(seen, found.x))
 
