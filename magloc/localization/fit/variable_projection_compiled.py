@@ -121,7 +121,7 @@ def refine(
         step(w, free_range)
 
 
-@internal
+@inlined
 def fill_lanes(
     next_start: int,
     start_of_lane: IntArray,
