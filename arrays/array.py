@@ -121,6 +121,9 @@ class SensorArray:
         """Ids of the sensors."""
         return tuple(sensor.id for sensor in self.sensors)
 
+    def __repr__(self) -> str:
+        return f"<SensorArray {self.name!r}: {self.n_sensors} sensors, {self.n_channels} channels>"
+
     @property
     def n_sensors(self) -> int:
         """Number of sensors N."""

@@ -48,6 +48,12 @@ def test_they_are_small() -> None:
     assert sum(path.stat().st_size for folder in (MAGLOC, ADCS) for path in folder.iterdir()) < LARGEST_BYTES
 
 
+def test_one_is_said_in_a_line() -> None:
+    """A prompt shows what is typed at it; this was thirty sensors with all that is known of each."""
+    board = "<Dataset 'board': 101 rows of <SensorArray 'board-30': 30 sensors, 90 channels>, with the truth>"
+    assert repr(magloc.datasets.load("board")) == board
+
+
 def test_names() -> None:
     assert set(magloc.datasets.names()) == set(RATES_HZ)
     assert adcs.datasets.names() == ("imu", "satellite")

@@ -37,6 +37,9 @@ class Dataset:
     truth: Truth
     path: Path
 
+    def __repr__(self) -> str:
+        return f"<Dataset {self.path.stem!r}: {len(self.readings)} rows of {self.array}, with the truth>"
+
 
 def names() -> tuple[str, ...]:
     """Names of the recordings.
