@@ -112,10 +112,12 @@ def whitened_jacobian(
     columns = [(channel_jacobian(array, p, m), np.inf)]
     if array.pose is not None:
         columns.append((pose_errors_at_rest(array, array.pose, p, m), 1.0))
-    if ambient_uncertainty_T:
-        columns.append((array.linear_gain(fields_at_sensors(array, p, m)), ambient_uncertainty_T))
-    if np.any(body_length_m):
+    has_length = np.any(body_length_m)
+    if ambient_uncertainty_T or has_length:
         gain = array.linear_gain(fields_at_sensors(array, p, m))
+    if ambient_uncertainty_T:
+        columns.append((gain, ambient_uncertainty_T))
+    if has_length:
         length_m = np.asarray(body_length_m, dtype=np.float64)[..., None, None, None]
         beyond = finite_body_errors(array.positions - p[..., None, :], m[..., None, :], length_m)
         columns.append((np.einsum("...ci,...cij->...cj", gain, beyond[..., array.channel_sensor, :, :]), 1.0))
@@ -163,7 +165,7 @@ def cramer_rao_bounds(
     known_moment_sigma_Am2 : float
         Standard deviation of what is known beforehand of the moment's modulus [A·m²]; nothing is by default.
     body_length_m : array_like, shape (...)
-        Lengths of the sources: what a dipole leaves out of the field of such a body counts as noise. 0 of points.
+        Lengths of the sources [m]: what a dipole leaves out of the field of such a body counts as noise. 0 of points.
 
     Returns
     -------

@@ -84,11 +84,10 @@ def refined_by_moduli(
     tolerance: float,
 ) -> Refined:
     """Refinements from starts q (b, 4) and mu (b, 3) of rows of whitened readings (b, C); a moment may be zero."""
-    n = len(q)
-    out = Refined(np.empty((n, 4)), np.empty((n, 3)), np.empty(n), np.empty(n, np.intp), np.empty(n, np.bool_))
+    out = Refined.empty(len(q))
     refine_by_moduli(
         signals(model, y - model.of_ambient),
-        np.arange(n),
+        np.arange(len(q)),
         np.concatenate([q, mu], axis=1),
         model.lanes,
         Moduli.of(model),

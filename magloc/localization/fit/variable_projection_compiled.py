@@ -52,6 +52,11 @@ class Refined(NamedTuple):
     iterations: IntArray
     converged: NDArray[np.bool_]
 
+    @classmethod
+    def empty(cls, n: int) -> Refined:
+        """For a kernel to fill."""
+        return cls(np.empty((n, 4)), np.empty((n, 3)), np.empty(n), np.empty(n, np.intp), np.empty(n, np.bool_))
+
 
 def refined(
     model: WhitenedModel,
@@ -62,12 +67,10 @@ def refined(
     tolerance: float = OPTIMUM_TOLERANCE,
 ) -> Refined:
     """:func:`refine` of one start (b, 4) of every row of whitened readings (b, C)."""
-    n = len(starts)
-    out = Refined(np.empty((n, 4)), np.empty((n, 3)), np.empty(n), np.empty(n, np.intp), np.empty(n, np.bool_))
-    each = np.arange(n)
+    out = Refined.empty(len(starts))
     refine(
         signals(model, y),
-        each,
+        np.arange(len(starts)),
         own(starts),
         model.lanes,
         free_range,
