@@ -269,8 +269,13 @@ def tiles(grid: int, edge: int) -> Iterator[Box]:
 
 
 def computed(cube: CubeMap, box: Box) -> Chunk:
-    """Values of one box, with their time; compiling is not part of it. Ctrl-C waits for a part of the box."""
+    """Values of one box, with their time; compiling is not part of it."""
     cube.warm_up()
+    return _computed_warm(cube, box)
+
+
+def _computed_warm(cube: CubeMap, box: Box) -> Chunk:
+    """Values of one box, everything compiled. Ctrl-C waits for a part of the box."""
     began = time.perf_counter()
     x, y, z = box.region
     layers = -(-(x.stop - x.start) // _PARTS)
@@ -284,7 +289,9 @@ def computed(cube: CubeMap, box: Box) -> Chunk:
 
 def computed_here(cube: CubeMap, wanted: Iterable[Box]) -> Iterator[Chunk]:
     """Values of some boxes, one after the other, in this process."""
-    return (computed(cube, box) for box in wanted)
+    cube.warm_up()  # once: between boxes an interruption would find compiled code that nothing protects
+    for box in wanted:
+        yield _computed_warm(cube, box)
 
 
 @contextmanager
