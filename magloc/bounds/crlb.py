@@ -18,7 +18,7 @@ from arrays.io.errors import _vectors
 from arrays.io.lazy import by_name
 from arrays.noise import reading_covariance
 from arrays.typing import BoolArray, FloatArray, IntArray
-from magloc.fields.multipole import check_body_length, finite_body_errors
+from magloc.fields.multipole import assumed_body_lengths, check_body_length, finite_body_errors
 from magloc.measurement.differences import channel_jacobian, fields_at_sensors, predicted_channels
 from magloc.measurement.pose import pose_errors_at_rest
 from magloc.measurement.rows import check_magnitudes
@@ -95,7 +95,7 @@ def whitened_jacobian(
     *,
     ambient_uncertainty_T: float = 0.0,
     known_moment_sigma_Am2: float = np.inf,
-    body_length_m: ArrayLike = 0.0,
+    body_length_m: ArrayLike | None = 0.0,
 ) -> FloatArray:
     """Jacobian W (..., C, 6) of readings freed of all nuisances, of unit variance: the information is ``Wᵀ W``.
 
@@ -112,14 +112,14 @@ def whitened_jacobian(
     columns = [(channel_jacobian(array, p, m), np.inf)]
     if array.pose is not None:
         columns.append((pose_errors_at_rest(array, array.pose, p, m), 1.0))
-    has_length = np.any(body_length_m)
+    length_m = assumed_body_lengths(array.positions, p, array.circumradius, body_length_m)
+    has_length = np.any(length_m)
     if ambient_uncertainty_T or has_length:
         gain = array.linear_gain(fields_at_sensors(array, p, m))
     if ambient_uncertainty_T:
         columns.append((gain, ambient_uncertainty_T))
     if has_length:
-        length_m = np.asarray(body_length_m, dtype=np.float64)[..., None, None, None]
-        beyond = finite_body_errors(array.positions - p[..., None, :], m[..., None, :], length_m)
+        beyond = finite_body_errors(array.positions - p[..., None, :], m[..., None, :], length_m[..., None, None, None])
         columns.append((np.einsum("...ci,...cij->...cj", gain, beyond[..., array.channel_sensor, :, :]), 1.0))
     with np.errstate(invalid="ignore"):
         left = [(root @ of, sigma) for of, sigma in columns]
@@ -148,7 +148,7 @@ def cramer_rao_bounds(
     *,
     ambient_uncertainty_T: float = 0.0,
     known_moment_sigma_Am2: float = np.inf,
-    body_length_m: ArrayLike = 0.0,
+    body_length_m: ArrayLike | None = 0.0,
 ) -> Bounds:
     """Cramér-Rao bounds of a source, or of many over leading axes.
 
@@ -164,8 +164,9 @@ def cramer_rao_bounds(
         array's own [T].
     known_moment_sigma_Am2 : float
         Standard deviation of what is known beforehand of the moment's modulus [A·m²]; nothing is by default.
-    body_length_m : array_like, shape (...)
-        Lengths of the sources [m]: what a dipole leaves out of the field of such a body counts as noise. 0 of points.
+    body_length_m : array_like, shape (...), optional
+        Lengths of the sources: what a dipole leaves out of the field of such a body counts as noise. 0 of points; None:
+        a quarter of the distance near the array, as :func:`magloc.locate` assumes.
 
     Returns
     -------

@@ -19,8 +19,8 @@ from magloc.compilation import compiled
 # Information about a parameter that is less than this part of what it would be were the others known is none.
 LOST_INFORMATION = 1e-12
 # Nuisances: components of the common field, its modulus for scalar sensors, components of the ambient field's error,
-# turns of the array, and its shifts.
-COMMON, COMMON_MODULUS, AMBIENT, TURN, SHIFT = 0, 3, 4, 7, 10
+# turns of the array, its shifts, and what a dipole leaves out of a body.
+COMMON, COMMON_MODULUS, AMBIENT, TURN, SHIFT, BODY = 0, 3, 4, 7, 10, 13
 
 
 class BoundModel(NamedTuple):
@@ -48,7 +48,7 @@ class BoundModel(NamedTuple):
     nuisances : ndarray, shape (q,)
         Which ones there are.
     prior : ndarray, shape (q,)
-        Their inverse standard deviations, 0 if nothing is known [1/T, 1/rad, 1/m].
+        Their inverse standard deviations, 0 if nothing is known [1/T, 1/rad, 1/m, 1].
     lever_arm : ndarray, shape (3,)
         From the point about which the array turns to its origin [m].
     modulus_prior : float
@@ -76,9 +76,12 @@ class BoundModel(NamedTuple):
 
     @classmethod
     def of(
-        cls, array: SensorArray, ambient_uncertainty_T: float = 0.0, known_moment_sigma_Am2: float = math.inf
+        cls, array: SensorArray, ambient_uncertainty_T: float, known_moment_sigma_Am2: float, n_body_errors: int
     ) -> BoundModel:
-        """Model of an array at rest, its ambient field known to a σ [T] per axis, the moment's modulus to another."""
+        """Model of an array at rest, its ambient field known to a σ [T] per axis, the moment's modulus to another.
+
+        Sources are points, or bodies of as many independent errors as given.
+        """
         scales = np.tile(np.eye(3), (array.n_sensors, 1, 1))
         for scale, sensor in zip(scales, array.sensors, strict=True):
             scale[: sensor.n_channels, : sensor.n_channels] = sensor.calibration.scale
@@ -90,6 +93,7 @@ class BoundModel(NamedTuple):
         pose = array.pose or PoseUncertainty(position_constant_m=0.0, attitude_constant_rad=0.0)
         deviation += 3 * [math.hypot(pose.attitude_rad, pose.attitude_constant_rad)]
         deviation += 3 * [math.hypot(pose.position_m, pose.position_constant_m)]
+        deviation += n_body_errors * [1.0]
         nuisances = np.flatnonzero(deviation)
         constant = nuisances.max(initial=0) < COMMON_MODULUS and not array.noise_depends_on_reading
         return cls(

@@ -1,9 +1,9 @@
 """Compiled information of many moments of one source at once, where axes or noise depend on the moment.
 
-So it is with scalar sensors, and with noise or errors of the calibration that grow with the field. A moment is a lane
-(docs/theory/lanes.md), 64 of them at most a block: ``w[ROW + i]`` or ``columns[c, k, i]`` for lane i. A sensor's
-covariance, :func:`arrays.noise.reading_covariance`, is divided out of its axes: a row of the whitened Jacobian is that
-of a channel with a whitened axis, by the formulas of docs/theory/cramer-rao-bounds.md.
+So it is with scalar sensors, with noise or errors of the calibration that grow with the field, and with bodies. A
+moment is a lane (docs/theory/lanes.md), 64 of them at most a block: ``w[ROW + i]`` or ``columns[c, k, i]`` for lane i.
+A sensor's covariance, :func:`arrays.noise.reading_covariance`, is divided out of its axes: a row of the whitened
+Jacobian is that of a channel with a whitened axis, by the formulas of docs/theory/cramer-rao-bounds.md.
 """
 
 from __future__ import annotations
@@ -15,9 +15,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arrays.typing import FloatArray
-from magloc.bounds.frame_compiled import AMBIENT, COMMON_MODULUS, LOST_INFORMATION, SHIFT, TURN, BoundModel, turned
+from magloc.bounds.frame_compiled import (
+    AMBIENT,
+    BODY,
+    COMMON_MODULUS,
+    LOST_INFORMATION,
+    SHIFT,
+    TURN,
+    BoundModel,
+    turned,
+)
 from magloc.compilation import compiled
 from magloc.fields.dipole_compiled import field_components, gradient_components
+from magloc.fields.multipole import N_BODY_ERRORS
+from magloc.fields.multipole_compiled import fill_finite_body_errors
 
 LANES = 64  # at most
 # Rows of the workspace w, as offsets.
@@ -51,6 +62,8 @@ class Block(NamedTuple):
         As in the model.
     arm : ndarray, shape (3,)
         From the point about which the array turns to the source.
+    bodies : ndarray, shape (N, n, 6)
+        Of :func:`fill_finite_body_errors`, for every sensor.
     """
 
     w: FloatArray
@@ -63,6 +76,7 @@ class Block(NamedTuple):
     axes: FloatArray
     rotations: FloatArray
     arm: FloatArray
+    bodies: FloatArray
 
 
 @compiled
@@ -85,6 +99,7 @@ def new_block(model: BoundModel, n_moments: int) -> Block:
         np.empty(model.axes.shape),
         np.empty(model.rotations.shape),
         np.empty(3),
+        np.empty((model.scalar.size, N_BODY_ERRORS, 6)),
     )
 
 
@@ -92,6 +107,7 @@ def new_block(model: BoundModel, n_moments: int) -> Block:
 def fill_entries(
     model: BoundModel,
     position: FloatArray,
+    length_m: float,
     moments: FloatArray,
     frame: FloatArray,
     block: Block,
@@ -102,6 +118,9 @@ def fill_entries(
     Rows: uu, uv, vv, un, vn, nn; then uu, vv, nn of what it would be for a known moment.
     """
     _place(model, position, frame, block)
+    if model.nuisances.size > 0 and model.nuisances[-1] >= BODY:
+        for s in range(model.scalar.size):
+            fill_finite_body_errors(block.displacements[s], length_m, block.bodies[s])
     n_lanes = block.columns.shape[2]
     for begin in range(0, moments.shape[0], n_lanes):
         _fill_moments(moments, begin, n_lanes, frame, block.w)
@@ -192,6 +211,9 @@ def _fill_columns(model: BoundModel, block: Block) -> None:
                 if TURN <= nuisance < SHIFT:
                     _fill_turn(nuisance - TURN, block.arm, block.ambient[s], w[axis:], w, columns[c, q])
                     continue
+                if nuisance >= BODY:
+                    _fill_body(block.bodies[s, nuisance - BODY], w[axis:], w, columns[c, q])
+                    continue
                 effect = w[_effect(nuisance, model.scalar[s], axis) :]
                 for i in range(n_lanes):
                     columns[c, q, i] = effect[i]
@@ -250,6 +272,19 @@ def _fill_turn(k: int, arm: FloatArray, ambient: FloatArray, axis: FloatArray, w
         )
         by_place = w[ROW + (3 + a) * LANES + i] * arm[b] - w[ROW + (3 + b) * LANES + i] * arm[a]
         out[i] = by_moment - by_place + axis[a * LANES + i] * ambient[b] - axis[b * LANES + i] * ambient[a]
+
+
+@compiled
+def _fill_body(e: FloatArray, axis: FloatArray, w: FloatArray, out: FloatArray) -> None:
+    """What a channel reads of one error of a body, which is a symmetric matrix times the moment."""
+    for i in range(out.size):
+        mx, my, mz = w[MOMENT + i], w[MOMENT + LANES + i], w[MOMENT + 2 * LANES + i]
+        x, y, z = (
+            e[0] * mx + e[1] * my + e[2] * mz,
+            e[1] * mx + e[3] * my + e[4] * mz,
+            e[2] * mx + e[4] * my + e[5] * mz,
+        )
+        out[i] = axis[i] * x + axis[LANES + i] * y + axis[2 * LANES + i] * z
 
 
 @compiled

@@ -25,6 +25,7 @@ from arrays.io.errors import check_positive
 from arrays.typing import FloatArray
 from magloc.bounds.over_moments import table_and_spreads
 from magloc.directions import moments_on_sphere
+from magloc.fields.multipole import check_body_length
 from magloc.grids.computed import computed_map
 from magloc.grids.cube import Box, CubeMap, Tally, Values, Variable, check_half_width, described, flags, tallied
 from magloc.measurement.rows import check_magnitudes
@@ -75,6 +76,8 @@ class BoundScenario:
         Directions of the moment.
     ambient_uncertainty_T, known_moment_sigma_Am2 : float
         See :func:`magloc.bounds.crlb.cramer_rao_bounds`.
+    body_length_m : float, optional
+        Of the source; by default a quarter of its distance near the array. 0: a point.
 
     Raises
     ------
@@ -89,8 +92,10 @@ class BoundScenario:
     n_moments: int = 50
     ambient_uncertainty_T: float = 0.0
     known_moment_sigma_Am2: float = np.inf
+    body_length_m: float | None = None
 
     def __post_init__(self) -> None:
+        check_body_length(self.body_length_m)
         check_magnitudes(self.array)
         check_positive(half_width_m=self.half_width_m, accuracy_m=self.accuracy_m)
         if np.shape(self.moment_Am2) != (3,) or not 0.0 < np.linalg.norm(self.moment_Am2) < np.inf:
@@ -105,6 +110,12 @@ class BoundScenario:
         return moments_on_sphere(size, self.n_moments, half=half)
 
     @property
+    def uncertain(self) -> dict[str, Any]:
+        """What is uncertain beside the array, as arguments of bounds."""
+        names = ("ambient_uncertainty_T", "known_moment_sigma_Am2", "body_length_m")
+        return {name: getattr(self, name) for name in names}
+
+    @property
     def settings(self) -> dict[str, Any]:
         """What determines the bounds beside the array, for a dataset."""
         known = {"known_moment_sigma_Am2": self.known_moment_sigma_Am2}
@@ -114,6 +125,7 @@ class BoundScenario:
             "accuracy_m": self.accuracy_m,
             "ambient_uncertainty_nT": 1e9 * self.ambient_uncertainty_T,
             **(known if self.known_moment_sigma_Am2 < np.inf else {}),
+            **({} if self.body_length_m is None else {"body_length_m": self.body_length_m}),
         }
 
     @property
@@ -131,8 +143,7 @@ def bounds_at(scenario: BoundScenario, positions_m: ArrayLike) -> dict[str, Floa
         flat,
         [scenario.moment_Am2],
         scenario.moments_Am2,
-        ambient_uncertainty_T=scenario.ambient_uncertainty_T,
-        known_moment_sigma_Am2=scenario.known_moment_sigma_Am2,
+        **scenario.uncertain,
     )
     values = {}
     for name, one, spread in zip(_UNITS, given, spreads, strict=True):
@@ -219,6 +230,7 @@ def bound_map(
     n_moments: int = BoundScenario.n_moments,
     ambient_uncertainty_T: float = 0.0,
     known_moment_sigma_Am2: float = np.inf,
+    body_length_m: float | None = None,
     out: str | PathLike[str] | None = None,
     scheduler: str | None = None,
     progress: Callable[[int], None] | None = None,
@@ -241,6 +253,9 @@ def bound_map(
         Directions of the moment.
     ambient_uncertainty_T, known_moment_sigma_Am2 : float
         See :func:`magloc.bounds.crlb.cramer_rao_bounds`.
+    body_length_m : float, optional
+        Length of every source: what a dipole leaves out of its field counts as noise. By default a quarter of its
+        distance near the array, as :func:`magloc.locate` assumes; 0 for points.
     out, scheduler, progress
         See :func:`magloc.grids.computed.computed_map`: a zarr folder that streams and resumes, the address of a dask
         scheduler, and a call with the number of sources finished.
@@ -267,9 +282,8 @@ def bound_map(
     """
     mx, my, mz = np.asarray(moment_Am2, dtype=np.float64).tolist()
     half_width_m = check_half_width(edge_m)
-    scenario = BoundScenario(
-        array, (mx, my, mz), half_width_m, accuracy_m, n_moments, ambient_uncertainty_T, known_moment_sigma_Am2
-    )
+    uncertain = (ambient_uncertainty_T, known_moment_sigma_Am2, body_length_m)
+    scenario = BoundScenario(array, (mx, my, mz), half_width_m, accuracy_m, n_moments, *uncertain)
     return computed_map(BoundMap(scenario, n), out, scheduler, progress)
 
 

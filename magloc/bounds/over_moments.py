@@ -6,7 +6,7 @@ for when they are infinite see docs/theory/cramer-rao-bounds.md.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from arrays.array import SensorArray
 from arrays.typing import FloatArray
 from magloc.bounds.crlb import check_uncertainty
+from magloc.fields.multipole import N_BODY_ERRORS, assumed_body_lengths, check_body_length
 from magloc.levels import TYPICAL_AND_BAD
 
 
@@ -49,13 +50,18 @@ def bounds_over_moments(
     *,
     ambient_uncertainty_T: float = 0.0,
     known_moment_sigma_Am2: float = np.inf,
+    body_length_m: float | None = 0.0,
 ) -> MomentBounds:
     """Mean, median, 95 % quantile and worst (P,) of the bounds of positions (P, 3) over moments (M, 3) [A·m²].
 
     The other parameters are those of :func:`magloc.bounds.crlb.cramer_rao_bounds`.
     """
     none = np.empty((0, 3))
-    uncertain = {"ambient_uncertainty_T": ambient_uncertainty_T, "known_moment_sigma_Am2": known_moment_sigma_Am2}
+    uncertain: dict[str, Any] = {
+        "ambient_uncertainty_T": ambient_uncertainty_T,
+        "known_moment_sigma_Am2": known_moment_sigma_Am2,
+        "body_length_m": body_length_m,
+    }
     return table_and_spreads(array, positions_m, none, moments_Am2, **uncertain)[1]
 
 
@@ -67,6 +73,7 @@ def table_and_spreads(
     *,
     ambient_uncertainty_T: float = 0.0,
     known_moment_sigma_Am2: float = np.inf,
+    body_length_m: float | None = 0.0,
 ) -> tuple[SigmaTable, MomentBounds]:
     """:func:`sigma_table` (P, K) of some moments and :func:`bounds_over_moments` (P,) of others, in one pass."""
     from magloc.bounds import table_compiled as bounds
@@ -75,8 +82,18 @@ def table_and_spreads(
     positions, alone = _rows("positions_m", positions_m, least=1), _rows("alone_Am2", alone_Am2)
     moments = _rows("moments_Am2", moments_Am2, least=0 if len(alone) else 1)
     check_uncertainty(ambient_uncertainty_T, known_moment_sigma_Am2)
-    model = BoundModel.of(array, ambient_uncertainty_T, known_moment_sigma_Am2)
-    table, spreads = bounds.table_and_spreads(model, positions, alone, moments, np.array(TYPICAL_AND_BAD))
+    check_body_length(body_length_m)
+    lengths = assumed_body_lengths(array.positions, positions, array.circumradius, body_length_m)
+    quantiles = np.array(TYPICAL_AND_BAD)
+    table = np.empty((3, len(positions), len(alone)))
+    spreads = np.empty((len(positions), 3, 2 + quantiles.size))
+    # Bodies have so many nuisances that points are not to pay for them.
+    for which, n_errors in ((~(lengths > 0.0), 0), (lengths > 0.0, N_BODY_ERRORS)):
+        if which.any():
+            model = BoundModel.of(array, ambient_uncertainty_T, known_moment_sigma_Am2, n_errors)
+            table[:, which], spreads[which] = bounds.table_and_spreads(
+                model, positions[which], lengths[which], alone, moments, quantiles
+            )
     return SigmaTable(*table), MomentBounds(*(Spread(*spreads[:, i].T) for i in range(3)))
 
 
@@ -87,6 +104,7 @@ def sigma_table(
     *,
     ambient_uncertainty_T: float = 0.0,
     known_moment_sigma_Am2: float = np.inf,
+    body_length_m: float | None = 0.0,
 ) -> SigmaTable:
     """Bounds (P, M) of range, bearing and position for every pair of positions (P, 3) and moments (M, 3).
 
@@ -94,7 +112,11 @@ def sigma_table(
     singular, NaN where :class:`magloc.bounds.crlb.Bounds` is.
     """
     moments, none = _rows("moments_Am2", moments_Am2, least=1), np.empty((0, 3))
-    uncertain = {"ambient_uncertainty_T": ambient_uncertainty_T, "known_moment_sigma_Am2": known_moment_sigma_Am2}
+    uncertain: dict[str, Any] = {
+        "ambient_uncertainty_T": ambient_uncertainty_T,
+        "known_moment_sigma_Am2": known_moment_sigma_Am2,
+        "body_length_m": body_length_m,
+    }
     return table_and_spreads(array, positions_m, moments, none, **uncertain)[0]
 
 

@@ -31,9 +31,16 @@ class _Work(NamedTuple):
 
 
 def table_and_spreads(
-    model: BoundModel, positions: FloatArray, alone: FloatArray, moments: FloatArray, quantiles: FloatArray
+    model: BoundModel,
+    positions: FloatArray,
+    lengths: FloatArray,
+    alone: FloatArray,
+    moments: FloatArray,
+    quantiles: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
     """σ of range [m], bearing [rad] and position [m] of positions (P, 3), a table and statistics.
+
+    Sources are bodies of some lengths (P,) [m] where the model has errors of bodies.
 
     The table (3, P, K) is that of moments that stand alone (K, 3); mean, quantiles and greatest (P, 3, 2 + quantiles)
     are those of other moments (M, 3), NaN if there are none.
@@ -42,7 +49,8 @@ def table_and_spreads(
     spreads = np.full((len(positions), 3, 2 + quantiles.size), np.nan)
     ranks = np.ceil(quantiles * len(moments)).astype(np.intp) - 1
     every = np.concatenate([alone, moments])
-    over_rows(_fill, len(positions), read_only(positions), read_only(every), model, read_only(ranks), table, spreads)
+    inputs = map(read_only, (positions, lengths, every))
+    over_rows(_fill, len(positions), *inputs, model, read_only(ranks), table, spreads)
     return np.ascontiguousarray(np.moveaxis(table, -1, 0)), spreads
 
 
@@ -51,6 +59,7 @@ def _fill(
     begin: int,
     end: int,
     positions: FloatArray,
+    lengths: FloatArray,
     moments: FloatArray,
     model: BoundModel,
     ranks: NDArray[np.intp],
@@ -69,7 +78,7 @@ def _fill(
     for i in range(begin, end):
         length = fill_frame(positions[i] - model.centroid, work.frame)
         if model.varies:
-            bound_lanes.fill_entries(model, positions[i], moments, work.frame, work.block, work.entries)
+            bound_lanes.fill_entries(model, positions[i], lengths[i], moments, work.frame, work.block, work.entries)
         else:
             bound_forms.fill_entries(model, positions[i], work.frame, work.forms, work.entries)
         _fill_sigmas(length, work.entries, sigmas)

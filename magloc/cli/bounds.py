@@ -17,7 +17,7 @@ from arrays.io.outputs import refuse_file
 from arrays.io.text import write_netcdf
 from arrays.typing import Vector
 from magloc.cli.framework import CommonOptions, print_json, progress
-from magloc.cli.options import Grid, array_of_several, print_note, refuse_not_positive
+from magloc.cli.options import Grid, array_of_several, naming_options, print_note, refuse_not_positive
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -58,6 +58,9 @@ class SourceOptions:
         Standard deviation per axis of the ambient field that the array file states, for scalar sensors [nT].
     known_moment_sigma_Am2 : float
         Standard deviation of what is known beforehand of the moment's modulus [A·m²]. Nothing is by default.
+    body_length_m : float
+        Length of the source: what a dipole leaves out of its field counts as noise. By default a quarter of its
+        distance, where four sensors are nearer than 0.6 of the array's circumradius; 0 for a point.
     """
 
     array: Path | None = None
@@ -65,6 +68,7 @@ class SourceOptions:
     moment_Am2: Annotated[Vector | None, Parameter(name="--moment-Am2")] = None
     ambient_uncertainty_nT: Annotated[float, Parameter(name="--ambient-uncertainty-nT")] = 0.0
     known_moment_sigma_Am2: Annotated[float | None, Parameter(name="--known-moment-sigma-Am2")] = None
+    body_length_m: float | None = None
 
 
 @Parameter(name="*", group="What is required, and where")
@@ -131,7 +135,8 @@ def bounds(
     out : Path
         Folder to write; by default bounds-SCENARIO-GRID, or bounds-ARRAY-GRID, and the moment if one is given.
     json : bool
-        Print one JSON object: "position_m", "moment_Am2", "range_m"; "rank" of the information, 6 if everything is
+        Print one JSON object: "position_m", "moment_Am2", "range_m"; "body_length_m" that is taken, 0 of a point,
+        where it is not; "rank" of the information, 6 if everything is
         estimable; "sigma_position_m", "sigma_moment_Am2" (three numbers), "sigma_range_m", "sigma_bearing_deg" (null:
         infinite); "over_moments": "sigma_range_m" and "sigma_bearing_deg" with "mean", "median", "q95",
         "worst_sampled" for the same position; "accuracy_m"; "accuracy_range_m": for "moment", "median", "q95",
@@ -146,6 +151,7 @@ def bounds(
 
     from magloc.bounds.over_moments import bounds_over_moments
     from magloc.convergence.scenario_files import read_starts_scenario
+    from magloc.fields.multipole import assumed_body_lengths
     from magloc.measurement.rows import check_magnitudes
 
     source = read_starts_scenario(scenario)
@@ -157,12 +163,14 @@ def bounds(
     wanted = _scenario(array, source.moment_Am2 if of.moment_Am2 is None else of.moment_Am2, radius, of, task)
     if array.channel_is_scalar.any() and array.ambient_T is None:
         print_note("warning: the array has scalar sensors and no ambient_nT, the ambient field is taken to be zero")
-    uncertain = {
-        "ambient_uncertainty_T": wanted.ambient_uncertainty_T,
-        "known_moment_sigma_Am2": wanted.known_moment_sigma_Am2,
-    }
-    of_source = magloc.cramer_rao_bounds(array, place, wanted.moment_Am2, **uncertain)
-    over_moments = bounds_over_moments(array, place[None], wanted.moments_Am2, **uncertain)
+    length_m = float(assumed_body_lengths(array.positions, place, array.circumradius, wanted.body_length_m))
+    if wanted.body_length_m is None and length_m:
+        print_note(
+            f"note: the source is so near that its size matters: a quarter of its distance, {length_m:.3g} m, is taken;"
+            " --body-length-m says it, 0 a point"
+        )
+    of_source = magloc.cramer_rao_bounds(array, place, wanted.moment_Am2, **wanted.uncertain)
+    over_moments = bounds_over_moments(array, place[None], wanted.moments_Am2, **wanted.uncertain)
     name = Path(scenario).stem if of.array is None else of.array.stem
     moment = "" if of.moment_Am2 is None else "-" + "_".join(f"{value:g}" for value in of.moment_Am2)
     folder = Path(f"bounds-{name}-{task.grid}{moment}") if out is None else out
@@ -173,7 +181,7 @@ def bounds(
     if json:
         print_json(
             {
-                **_json(of_source, over_moments, spheres, wanted),
+                **_json(of_source, over_moments, spheres, wanted, length_m),
                 **_detection_json(detector, task.probability, spheres),
                 "grid": task.grid,
                 "moments": task.moments,
@@ -248,7 +256,7 @@ def _scenario(
 ) -> BoundScenario:
     from magloc.bounds.maps import BoundScenario
 
-    with naming("--moment-Am2"):
+    with naming("--moment-Am2"), naming_options("body_length_m"):
         return BoundScenario(
             array,
             moment_Am2,
@@ -257,6 +265,7 @@ def _scenario(
             n_moments=task.moments,
             ambient_uncertainty_T=1e-9 * of.ambient_uncertainty_nT,
             known_moment_sigma_Am2=math.inf if of.known_moment_sigma_Am2 is None else of.known_moment_sigma_Am2,
+            body_length_m=of.body_length_m,
         )
 
 
@@ -283,8 +292,7 @@ def _cube(task: BoundScenario, grid: int, folder: Path, *, quiet: bool) -> Bound
             n=grid,
             accuracy_m=task.accuracy_m,
             n_moments=task.n_moments,
-            ambient_uncertainty_T=task.ambient_uncertainty_T,
-            known_moment_sigma_Am2=task.known_moment_sigma_Am2,
+            **task.uncertain,
             out=folder / "map.zarr",
             progress=advance,
         )
@@ -331,13 +339,14 @@ def _pictures(
     return spheres
 
 
-def _json(of: Bounds, over: MomentBounds, spheres: xr.Dataset, task: BoundScenario) -> dict[str, Any]:
+def _json(of: Bounds, over: MomentBounds, spheres: xr.Dataset, task: BoundScenario, length_m: float) -> dict[str, Any]:
     import numpy as np
 
     return {
         "position_m": of.position_m,
         "moment_Am2": of.moment_Am2,
         "range_m": float(of.range_m),
+        **({"body_length_m": length_m} if length_m else {}),
         "rank": int(of.rank),
         "sigma_position_m": _finite(of.sigma[:3]),
         "sigma_moment_Am2": _finite(of.sigma[3:]),

@@ -14,10 +14,17 @@ from arrays.io.errors import _vectors
 from arrays.typing import FloatArray
 from magloc.fields.dipole import MU0_OVER_4PI
 
-# Standard deviations of a component of a body's moments of rank 2 and 4, over L² and L⁴.
-_SIGMA = {2: 0.025, 4: 0.0015}
+BODY_SIGMA = {2: 0.025, 4: 0.0015}
+"""Standard deviations of a component of a body's moments of rank 2 and 4, over L² and L⁴."""
 _LONGEST_BODY_M = 1e4
-N_BODY_ERRORS = sum(2 * rank + 1 for rank in _SIGMA)
+DEFAULT_LENGTH = 0.25
+"""Length over the distance from the nearest sensor that is assumed of a body of which nothing is said."""
+NEAR, _N_NEAR = 0.6, 4
+"""Sensors that are nearer than this, in circumradii of the array, where a body of default length is assumed.
+
+A source that a single sensor is near to may be a fault of it.
+"""
+N_BODY_ERRORS = sum(2 * rank + 1 for rank in BODY_SIGMA)
 """Independent errors of a body that counts as a dipole."""
 
 
@@ -50,7 +57,7 @@ def multipole_field_matrix(points_m: ArrayLike, source_m: ArrayLike, order: int)
     r = np.where(r > 0.0, r, np.nan)
     n = separation / r
     # Contracted with n once per index: S n^(l-1) is a vector, S n^l a number.
-    contracted = np.broadcast_to(_traceless_basis(order), n.shape[:-1] + (2 * order + 1,) + (3,) * order)
+    contracted = np.broadcast_to(traceless_basis(order), n.shape[:-1] + (2 * order + 1,) + (3,) * order)
     for _ in range(order - 1):
         contracted = np.einsum(
             "...i,...i->...", contracted, n[(..., *(None,) * (contracted.ndim - n.ndim), slice(None))]
@@ -71,7 +78,7 @@ def finite_body_fields(separation_m: FloatArray, moment_Am2: FloatArray, rank: i
     with np.errstate(invalid="ignore", divide="ignore"):
         n = separation_m[..., None, :] / r
     # Contracted with n but for two indices, for one, for none.
-    basis = _traceless_basis(rank).reshape(2 * rank + 1, 3, 3, -1)
+    basis = traceless_basis(rank).reshape(2 * rank + 1, 3, 3, -1)
     powers = np.ones_like(r[..., 0]) if rank == 2 else (n.mT * n).reshape(*n.shape[:-2], 9)
     matrix = (powers @ basis.reshape(-1, basis.shape[-1]).T).reshape(*n.shape[:-2], *basis.shape[:3])
     vector = (matrix @ n[..., None])[..., 0]
@@ -94,20 +101,33 @@ def finite_body_errors(separation_m: FloatArray, moment_Am2: FloatArray, length_
     Their moments of rank 2 and 4 are unknown, with standard deviations that grow with the length:
     docs/theory/extended-sources.md.
     """
-    parts = [s * length_m**rank * finite_body_fields(separation_m, moment_Am2, rank) for rank, s in _SIGMA.items()]
+    parts = [s * length_m**rank * finite_body_fields(separation_m, moment_Am2, rank) for rank, s in BODY_SIGMA.items()]
     return np.concatenate(parts, axis=-1)
 
 
-def check_body_length(body_length_m: ArrayLike) -> None:
-    """Raise ValueError for lengths of bodies that are none."""
-    length_m = np.ravel(body_length_m)
+def assumed_body_lengths(
+    sensors_m: FloatArray, position_m: FloatArray, radius_m: float, body_length_m: ArrayLike | None
+) -> FloatArray:
+    """Lengths (...) of bodies at positions (..., 3): what is said, else a share of the distance near the array."""
+    if body_length_m is not None:
+        length_m = np.asarray(body_length_m, dtype=np.float64)
+        return np.broadcast_to(length_m, np.broadcast_shapes(length_m.shape, position_m.shape[:-1]))
+    distance = np.linalg.norm(position_m[..., None, :] - sensors_m, axis=-1)
+    last = min(_N_NEAR, distance.shape[-1]) - 1
+    ordered = np.partition(distance, [0, last], axis=-1)
+    return np.where(ordered[..., last] < NEAR * radius_m, DEFAULT_LENGTH * ordered[..., 0], 0.0)
+
+
+def check_body_length(body_length_m: ArrayLike | None) -> None:
+    """Raise ValueError for lengths of bodies that are none; None: nothing is said."""
+    length_m = np.ravel(0.0 if body_length_m is None else body_length_m)
     wrong = length_m[~((length_m >= 0.0) & (length_m <= _LONGEST_BODY_M))]
     if wrong.size:
         raise ValueError(f"Input body_length_m must be from 0 to {_LONGEST_BODY_M:g} m; instead received {wrong[0]:g}.")
 
 
 @cache
-def _traceless_basis(order: int) -> FloatArray:
+def traceless_basis(order: int) -> FloatArray:
     """Orthonormal basis of the symmetric traceless tensors of a rank, (2 l + 1, 3, …, 3)."""
     symmetric = []
     for index in combinations_with_replacement(range(3), order):

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from arrays.io.arguments import Flag
 from arrays.io.errors import InputError, naming
 from magloc.cli.framework import CommonOptions, print_json
-from magloc.cli.options import print_note
+from magloc.cli.options import naming_options, print_note
 
 
 def simulate(
@@ -15,6 +16,7 @@ def simulate(
     /,
     *,
     out: Path,
+    body_length_m: float | None = None,
     json: Flag = False,
     common: CommonOptions = CommonOptions(),  # noqa: B008 - frozen
 ) -> None:
@@ -32,6 +34,9 @@ def simulate(
         ship-headings, survey-cart, survey-diver, survey-drone, three-magnets or weaving.
     out : Path
         Readings file (CSV) to write. Existing files are replaced.
+    body_length_m : float
+        Length of every source, in place of the scenario's: a thin bar along the body's axis x that has the source's
+        moment. 0: a point.
     json : bool
         Print one JSON object that names the files.
     common : CommonOptions
@@ -46,6 +51,12 @@ def simulate(
     if not out.name:
         raise InputError(f"--out: found {out}, expected the name of a file.")
     wanted = read_scenario(scenario)
+    if body_length_m is not None:
+        if not wanted.sources:
+            raise InputError(f"--body-length-m: found {body_length_m:g}, expected a scenario with a source.")
+        with naming_options("body_length_m"):
+            bodies = tuple(replace(source, body_length_m=body_length_m) for source in wanted.sources)
+        wanted = replace(wanted, sources=bodies)
     for path in files_beside(out, len(wanted.sources), has_targets=wanted.targets is not None).all:
         refuse_unwritable(path, "--out")
     with naming(scenario):

@@ -11,6 +11,7 @@ from arrays.array import SensorArray
 from arrays.io.errors import check_positive
 from arrays.pose import PoseUncertainty
 from arrays.typing import FloatArray
+from magloc.fields.multipole import check_body_length
 from magloc.signature.path import PathError
 from sims.magnetics.ground import Geology, Targets
 from sims.magnetics.paths import Attitude, Path, Steered, Vector
@@ -39,7 +40,7 @@ class Carrier:
 
 @dataclass(frozen=True)
 class Source:
-    """A dipole fixed to a body.
+    """A dipole fixed to a body, or a bar.
 
     Its moment in body axes is :math:`m = m_{permanent} + α B_a/μ_0` with the ambient field B_a in body axes. Only the
     main ambient field magnetises it, not its pulsations.
@@ -54,6 +55,9 @@ class Source:
         α: volume times susceptibility, demagnetisation included; 4π a³ for a sphere of iron of radius a.
     radius_m : float
         Size of the body: no sensor may come nearer.
+    body_length_m : float
+        Length of a thin bar along the body's axis x that has this moment, evenly spread. 0: a point. No sensor may come
+        nearer to its centre than that length.
     path_error : PathError
         Of what is known of its path and its attitude.
     from_s, until_s : float
@@ -67,6 +71,10 @@ class Source:
     path_error: PathError = field(default_factory=PathError)
     from_s: float = -math.inf
     until_s: float = math.inf
+    body_length_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_body_length(self.body_length_m)
 
 
 @dataclass(frozen=True)

@@ -173,8 +173,8 @@ def _source(place: str, table: SourceTable) -> Source:
         math.radians(table.attitude_sigma_deg),
         table.attitude_correlation_s,
     )
-    carrier, radius_m = _carrier(place, table), table.radius_m
-    return Source(carrier, table.moment_Am2, polarisability, radius_m, error, table.from_s, table.until_s)
+    carrier, radius_m, length_m = _carrier(place, table), table.radius_m, table.body_length_m
+    return Source(carrier, table.moment_Am2, polarisability, radius_m, error, table.from_s, table.until_s, length_m)
 
 
 def _matrix(place: str, value: float | list[float | list[float]]) -> Matrix:

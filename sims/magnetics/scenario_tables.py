@@ -77,6 +77,7 @@ class SourceTable(CarrierTable, kw_only=True):
     moment_Am2: Vector = _ORIGIN
     polarisability_m3: float | list[float | list[float]] = 0.0
     radius_m: NotNegative = 0.0
+    body_length_m: NotNegative = 0.0
     path_sigma_m: NotNegative = 0.0
     path_correlation_s: Annotated[NotNegative, MAY_BE_INFINITE] = math.inf
     attitude_sigma_deg: NotNegative = 0.0

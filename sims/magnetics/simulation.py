@@ -24,6 +24,8 @@ from sims.noise import coloured_noise, lasting, low_passed, random_walk, stream
 MU0 = 4.0 * math.pi * MU0_OVER_4PI
 NEAREST_M = 1e-3
 """No sensor may come nearer to a source, whatever its size."""
+_ALONG_BAR, _WEIGHTS = np.polynomial.legendre.leggauss(8)
+"""Where dipoles stand for a bar, in half lengths, and twice their shares: its field a length away to 2e-7."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +102,7 @@ def simulate(scenario: MagneticScenario, seed: int) -> Simulation:
         moment_Am2 = _moments(source, pose.rotation, ambient_T)
         there = (time_s >= source.from_s) & (time_s <= source.until_s)
         _refuse_contact(scenario, number, time_s[there], (sensors_m - pose.position_m[:, None, :])[there])
-        fields_T[there] += field(sensors_m, pose.position_m[:, None, :], moment_Am2[:, None, :])[there]
+        fields_T[there] += _source_fields(source, sensors_m, pose, moment_Am2)[there]
         truths.append(Truth(time_s[there], pose.position_m[there], moment_Am2[there]))
         poses.append(pose)
     buried = (np.zeros((0, 3)),) * 2 if scenario.targets is None else scenario.targets.drawn(seed)
@@ -181,13 +183,26 @@ def _moments(source: Source, rotation: Rotation, ambient_T: FloatArray) -> Float
     return induced_and_permanent_moment(rotation.as_matrix(), source.moment_Am2, polarisability, ambient_T)
 
 
+def _source_fields(source: Source, sensors_m: FloatArray, pose: _Pose, moment_Am2: FloatArray) -> FloatArray:
+    """Fields of a source (n, N, 3), of its dipole or of dipoles along its bar, world frame."""
+    if not source.body_length_m:
+        return field(sensors_m, pose.position_m[:, None, :], moment_Am2[:, None, :])
+    half_m = 0.5 * source.body_length_m * pose.rotation.as_matrix()[:, :, 0]
+    total = np.zeros_like(sensors_m)
+    for along, weight in zip(_ALONG_BAR, _WEIGHTS, strict=True):
+        place_m = pose.position_m + along * half_m
+        total += field(sensors_m, place_m[:, None, :], 0.5 * weight * moment_Am2[:, None, :])
+    return total
+
+
 def _refuse_contact(scenario: MagneticScenario, number: int, time_s: FloatArray, offset_m: FloatArray) -> None:
     """Raise if a sensor is inside a source; offset (n, N, 3)."""
     if not len(time_s):  # the source is never there
         return
     distance = np.linalg.norm(offset_m, axis=-1)
     row, sensor = np.unravel_index(int(distance.argmin()), distance.shape)
-    nearest = max(scenario.sources[number - 1].radius_m, NEAREST_M)
+    source = scenario.sources[number - 1]
+    nearest = max(source.radius_m, source.body_length_m, NEAREST_M)
     if distance[row, sensor] < nearest:
         raise ValueError(
             f"Input scenario must keep its sensors at least {nearest:g} m from source {number}; "
@@ -236,12 +251,10 @@ def _induced_fields(scenario: MagneticScenario, time_s: FloatArray, ambient_T: F
     """
     platform, names = scenario.platform, scenario.array.ids
     total = np.zeros((len(time_s), len(names), 3))
-    # One row shows no change.
-    rate_T_s = np.gradient(ambient_T, time_s, axis=0) if len(time_s) > 1 else np.zeros_like(ambient_T)
-    for size, cause, field_T in (
-        (platform.induced, "induced", ambient_T),
-        (platform.eddy_s, "eddy currents", rate_T_s),
-    ):
+    causes = [(platform.induced, "induced", ambient_T)]
+    if platform.eddy_s and len(time_s) > 1:  # one row shows no change
+        causes.append((platform.eddy_s, "eddy currents", np.gradient(ambient_T, time_s, axis=0)))
+    for size, cause, field_T in causes:
         if size:
             drawn = size * np.stack([stream(seed, cause, name).standard_normal((3, 3)) for name in names])
             total += np.einsum("sij,nj->nsi", drawn, field_T)

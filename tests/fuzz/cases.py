@@ -28,7 +28,11 @@ MAINS = {"magloc": magloc_main, "adcs": adcs_main}
 
 # What is written is written into "out"; a command that is not here fails the test that reads this table.
 LINES: dict[str, tuple[str, ...]] = {
-    "magloc simulate": ("simulate.toml --out out.csv --json", "moving.toml --out out.csv", "ground.toml --out out.csv"),
+    "magloc simulate": (
+        "simulate.toml --out out.csv --json",
+        "moving.toml --out out.csv --body-length-m 0.01",
+        "ground.toml --out out.csv",
+    ),
     "magloc survey": (
         "ground.csv --array ground-array.toml --json",
         "ground.csv --array ground-array.toml --ground-m -0.1 --region=z>-2 --out out",

@@ -14,16 +14,11 @@ from dataclasses import replace
 import numpy as np
 
 from arrays.typing import BoolArray, FloatArray, IntArray
-from magloc.fields.multipole import finite_body_errors
+from magloc.fields.multipole import NEAR, assumed_body_lengths, finite_body_errors
 from magloc.localization.fit.gauss_newton import JointFits, refine
 from magloc.localization.fit.optima import Optima
 from magloc.measurement.whitened import WhitenedModel
 
-DEFAULT_LENGTH = 0.25
-"""Length over the distance from the nearest sensor that is assumed of a body of which nothing is said."""
-# Sensors that are nearer than this, in circumradii of the array, where a body of default length is assumed. A source
-# that a single sensor is near to may be a fault of it.
-_NEAR, _N_NEAR = 0.6, 4
 # Variance of what a dipole leaves out, summed over the channels in units of the noise, that does not matter.
 _NEGLIGIBLE = 0.1
 _ROUNDS = 3
@@ -44,13 +39,8 @@ def body_errors(model: WhitenedModel, q: FloatArray, mu: FloatArray, length_m: F
 
 def assumed_lengths(model: WhitenedModel, q: FloatArray, body_length_m: float | None) -> FloatArray:
     """Lengths (b, K) of the bodies at q (b, K, 4): what is said, else a share of the distance near the array."""
-    if body_length_m is not None:
-        return np.full(q.shape[:2], body_length_m)
     sensors = model.centroid + model.radius * model.sensors
-    distance = np.linalg.norm(model.position(q)[:, :, None] - sensors, axis=-1)
-    last = min(_N_NEAR, len(sensors)) - 1
-    ordered = np.partition(distance, [0, last], axis=-1)
-    return np.where(ordered[..., last] < _NEAR * model.radius, DEFAULT_LENGTH * ordered[..., 0], 0.0)
+    return assumed_body_lengths(sensors, model.position(q), model.radius, body_length_m)
 
 
 def ambient_errors(model: WhitenedModel, q: FloatArray, mu: FloatArray, sigma_T: float) -> FloatArray:
@@ -95,7 +85,7 @@ def with_model_errors(
 def _all_far(q: FloatArray) -> bool:
     """Whether all sources are so far from the centroid that they are near to no sensor: most of them, cheaply."""
     u = q[..., :3]
-    return bool(np.all(np.sum(u * u, axis=-1) > ((1.0 + _NEAR) * q[..., 3]) ** 2))
+    return bool(np.all(np.sum(u * u, axis=-1) > ((1.0 + NEAR) * q[..., 3]) ** 2))
 
 
 def _refined(optima: Optima, lengths: FloatArray, ambient_sigma_T: float) -> Optima:

@@ -26,7 +26,7 @@ from scipy.stats import chi2
 
 from arrays.array import SensorArray
 from arrays.differences import decorrelated_differences
-from arrays.geometries import cube, hexagon, square, tetrahedron
+from arrays.geometries import cube, grid, hexagon, square, tetrahedron
 from arrays.pose import PoseUncertainty
 from magloc.bounds.crlb import cramer_rao_bounds, whitened_jacobian
 from magloc.bounds.over_moments import (
@@ -160,6 +160,16 @@ class TestBodies:
             unit = np.sqrt(np.diagonal(covariance))
             information = H.T @ np.linalg.solve(noise, H) * unit * unit[:, None]
             assert_allclose(information @ (covariance / unit / unit[:, None]), np.eye(6), atol=1e-6)
+
+    def test_nothing_said_is_a_quarter_of_the_distance_near_the_array(self):
+        array = grid(6, 5, 0.1, noise_T=1e-9)
+        near, far = np.array([0.02, 0.03, 0.05]), np.array([0.0, 0.0, 2.0])
+        nearest_m = np.linalg.norm(array.positions - near, axis=1).min()
+        for position, length_m in ((near, 0.25 * nearest_m), (far, 0.0)):
+            of_unsaid, of_said = (
+                cramer_rao_bounds(array, position, [0.1, 0.0, 0.2], body_length_m=length) for length in (None, length_m)
+            )
+            assert_allclose(of_unsaid.covariance, of_said.covariance, rtol=1e-12)
 
     @pytest.mark.parametrize("length_m", [-0.1, np.nan, 1e5])
     def test_is_refused(self, length_m):
@@ -488,6 +498,17 @@ class TestTable:
         table = sigma_table(array, positions, moments, ambient_uncertainty_T=3e-8)
         assert_allclose(table.range_m, twin.sigma_range_m, rtol=1e-10)
         assert_allclose(table.bearing_rad, twin.sigma_bearing_rad, rtol=1e-10)
+
+    @each_array
+    @pytest.mark.parametrize("length_m", [None, 0.3])
+    def test_equals_its_twin_for_bodies(self, array, length_m):
+        inside = array.centroid + 0.3 * array.circumradius * sphere_directions(4)  # where nothing said is no point
+        positions, moments = np.concatenate([places(array, 6), inside]), moments_over(array, 70)
+        twin = cramer_rao_bounds(array, positions[:, None], moments, body_length_m=length_m)
+        table = sigma_table(array, positions, moments, body_length_m=length_m)
+        assert_allclose(table.range_m, twin.sigma_range_m, rtol=1e-8)
+        assert_allclose(table.bearing_rad, twin.sigma_bearing_rad, rtol=1e-8)
+        assert (table.range_m >= sigma_table(array, positions, moments).range_m * (1.0 - 1e-9)).all()
 
     def test_singular_and_undefined_ones_too(self):
         array = replace(hexagon(1.0, kind="scalar", noise_T=1e-10), ambient_T=AMBIENT)  # five differences

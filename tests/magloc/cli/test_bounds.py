@@ -11,7 +11,8 @@ import pytest
 import xarray as xr
 from PIL import Image
 
-from arrays.geometries import tetrahedron
+from arrays.array_file import write_array
+from arrays.geometries import grid, tetrahedron
 from magloc.bounds.crlb import cramer_rao_bounds
 from magloc.cli.app import main
 from magloc.grids.store import Sweep, open_map
@@ -122,6 +123,25 @@ class TestResult:
         assert re.search(r"position \[m\] +0\.1335 +0\.2297 +0\.2543", text)
         assert re.search(r"σ of range ≤ 0.5 m up to +least +median +greatest", text)
         assert re.search(r"found with 90 % up to +least +median +greatest", text)
+
+    @with_plain_pictures
+    def test_a_body_is_taken_as_locate_takes_it(self, tmp_path, capsys):
+        array = tmp_path / "board.toml"
+        board, place, moment = grid(6, 5, 0.1), (0.02, 0.03, 0.05), (0.1, 0.0, 0.2)
+        near_m = 0.25 * np.linalg.norm(board.positions - place, axis=1).min()
+        write_array(array, board)
+        command = ["--array", array, "--position", *place, "--moment-Am2", *moment]
+        for i, (options, length_m) in enumerate(
+            (([], near_m), (["--body-length-m", 0.05], 0.05), (["--body-length-m", 0], 0))
+        ):
+            result = run_json(*command, *options, "--out", tmp_path / str(i), capsys=capsys)
+            assert result.get("body_length_m", 0.0) == pytest.approx(length_m)
+            expected = cramer_rao_bounds(board, place, moment, body_length_m=length_m)
+            assert result["sigma_range_m"] == pytest.approx(float(expected.sigma_range_m), rel=1e-9)
+            with open_map(tmp_path / str(i) / "map.zarr") as cube:
+                assert ("body_length_m" in cube.attrs) == bool(options)
+        assert main(["bounds", *QUICK, "--body-length-m", "-1", "--out", str(tmp_path / "no")]) == 2
+        assert "--body-length-m must be from 0 to 10000 m" in capsys.readouterr().err
 
     @with_plain_pictures
     def test_threads_do_not_matter(self, tmp_path, capsys):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -60,6 +61,20 @@ class TestFiles:
         second = read_truth(tmp_path / "run-truth-2.csv")
         np.testing.assert_allclose(second.position_m[-1], [2.5, 4.0, 0.0], atol=1e-12)
 
+    def test_bodies(self, run: Run, tmp_path: Path) -> None:
+        for name, options in (("point", ()), ("bar", ("--body-length-m", "0.5"))):
+            (tmp_path / name).mkdir()
+            assert run("simulate", "weaving", "--out", tmp_path / name / "run.csv", *options).status == 0
+        point, bar = ((tmp_path / name / "run.csv").read_text() for name in ("point", "bar"))
+        assert point != bar
+        bodies = read_scenario("weaving")
+        bodies = replace(bodies, sources=tuple(replace(source, body_length_m=0.5) for source in bodies.sources))
+        array = read_array(tmp_path / "bar" / "run-array.toml")
+        found = read_readings(tmp_path / "bar" / "run.csv", array).values_T
+        np.testing.assert_allclose(found, simulate(bodies, 0).readings.values_T, rtol=1e-14)
+        truths = [(tmp_path / name / "run-truth.csv").read_text() for name in ("point", "bar")]
+        assert truths[0] == truths[1]
+
     def test_the_seed_makes_the_noise(self, run: Run, tmp_path: Path) -> None:
         texts = []
         for i, seed in enumerate((1, 1, 2)):
@@ -99,6 +114,13 @@ class TestBadInput:
     def test_an_unknown_key(self, run: Run, tmp_path: Path) -> None:
         (tmp_path / "two.toml").write_text(TWO_SOURCES.replace("rate_Hz", "rate_Hertz"))
         assert_refused(run("simulate", tmp_path / "two.toml", "--out", tmp_path / "run.csv"), "rate_Hertz", "rate_Hz")
+
+    def test_bodies_where_there_are_none(self, run: Run, tmp_path: Path) -> None:
+        command = ("simulate", "paper", "--out", tmp_path / "run.csv", "--body-length-m")
+        assert_refused(run(*command, "-1"), "--body-length-m", "-1")
+        no_source = TWO_SOURCES[: TWO_SOURCES.index("[[source]]")]
+        (tmp_path / "none.toml").write_text(no_source)
+        assert_refused(run("simulate", tmp_path / "none.toml", *command[2:], "1"), "--body-length-m", "a source")
 
     def test_an_array_inside_the_source(self, run: Run, tmp_path: Path) -> None:
         (tmp_path / "two.toml").write_text(f"{TWO_SOURCES}radius_m = 4\n")
