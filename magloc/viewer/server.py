@@ -18,6 +18,7 @@ from arrays.io.errors import InputError
 from arrays.io.text import replaced, write_text
 from magloc.viewer.chromium import BrowserError, Chromium
 from magloc.viewer.origin import guarded_server
+from magloc.viewer.panels.static_plot import static_plot
 from magloc.viewer.scene.framing import SIDES_OF_A_PHONE
 from magloc.viewer.scene.legend import ABOVE_THE_PLAYER, NARROW_PX, with_legend
 
@@ -33,14 +34,14 @@ _CONNECTION_S = 60.0
 _PLAY = "the bar below plays the rows"
 # viser's player begins by itself, and has nothing to show until it has begun; the space bar stops it.
 _STANDS_S = 2.0
-_STAND_STILL = """
+_STAND_STILL = """<script>
 const player = setInterval(() => {
   const time = document.querySelector('input[inputmode=decimal]');
   if (!time || Number(time.value) === 0) return;
   clearInterval(player);
   window.dispatchEvent(new KeyboardEvent('keydown', {key: ' ', code: 'Space', bubbles: true}));
 }, 20);
-"""
+</script>"""
 _CLOSE_NOTICES = "document.querySelectorAll('.mantine-Notification-closeButton').forEach(button => button.click())"
 
 
@@ -127,14 +128,17 @@ def page_html(server: viser.ViserServer, page: Page) -> str:
     # The page stands still on the row that a live one would show, until it is played.
     recording = server.get_scene_serializer()
     recording.insert_sleep(_STANDS_S)
+    step_s = playing.duration_s / len(playing.steps)
+    marked = [page.plot.index] if page.plot else []
     for step in playing.steps:
         playing.show(step)
-        recording.insert_sleep(playing.duration_s / len(playing.steps))
+        recording.insert_sleep(step_s)
+        marked += [page.plot.index] if page.plot else []
     html = recording.as_html()
     playing.show(playing.first)
-    return with_legend(
-        html, page.title, page.entries, (*page.notes, _PLAY), bottom=ABOVE_THE_PLAYER, script=_STAND_STILL
-    )
+    beside = _STAND_STILL + (static_plot(page.plot, marked, _STANDS_S, step_s) if page.plot else "")
+    notes = (*page.notes, _PLAY)
+    return with_legend(html, page.title, page.entries, notes, bottom=ABOVE_THE_PLAYER, beside=beside)
 
 
 def write_page(html: str, path: Path) -> None:

@@ -6,19 +6,23 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from arrays.array_file import write_array
 from arrays.geometries import tetrahedron
 from magloc.viewer.pages.open_result import MapResult
-from magloc.viewer.pages.pages import array_page, map_page
+from magloc.viewer.pages.pages import array_page, map_page, track_page
 from magloc.viewer.scene.framing import SIDES_OF_A_PHONE
 from magloc.viewer.scene.glyphs import DIPOLE_COLOUR
 from magloc.viewer.server import opened, page_html, write_page
 from tests.browser.screen import Screen, Sight, dark_grey, hue_of
 from tests.browser.test_map_page import DIPOLE, RESULT, sights
+from tests.browser.test_track_page import ARRAY, ORANGE, READINGS, TIMES, arrow_in
+from tests.browser.test_track_page import RESULT as TRACK
 from tests.command_line import Run
 
 LARGEST = 15_000_000
+PLAYED = "document.querySelector('[role=slider]').ariaValueNow"
 
 
 class TestStaticPages:
@@ -81,3 +85,32 @@ class TestStaticPages:
                 screen.keep("static-phone")
             finally:
                 screen.browser.call("Emulation.setDeviceMetricsOverride", width=1280, height=800, **shape)
+
+
+class TestReadings:
+    """A track of 41 rows, played for 20 s after it has stood still for 2 s; its last row is shown at first."""
+
+    def test_a_click_into_the_plot_moves_the_scene_and_the_cursor(self, screen: Screen, tmp_path: Path) -> None:
+        page = tmp_path / "track.html"
+        with opened(0, "track") as server:
+            write_page(page_html(server, track_page(server, TRACK, ARRAY, READINGS)), page)
+            screen.open(page.as_uri())
+            camera = screen.camera(server.initial_camera)
+        places = camera.pixels(arrow_in(20))
+        screen.until_seen(Sight("the moment at the end", camera.pixels(arrow_in(40)), ORANGE, radius=4))
+        assert self.numbers(screen) == [f"{1e9 * value:.5g}" for value in READINGS.values_T[40]]
+        box = screen.evaluate(
+            "[...document.querySelectorAll('#readings svg')].find(s => s.clientWidth).getBoundingClientRect().toJSON()"
+        )
+        middle = 0.5 * (52.0 + 352.0) / 360.0  # of the axes
+        screen.until(lambda: float(screen.evaluate(PLAYED)) > 0.0, "the player has begun")
+        screen.browser.click(box["x"] + middle * box["width"], box["y"] + 0.4 * box["height"])
+        screen.until_seen(Sight("the moment in the middle", places, ORANGE, radius=4))
+        assert float(screen.evaluate(PLAYED)) == pytest.approx(2.0 + 20.5 / 41.0 * TIMES[-1], abs=0.01)
+        assert self.numbers(screen) == [f"{1e9 * value:.5g}" for value in READINGS.values_T[20]]
+        assert screen.browser.errors == []
+        screen.keep("static-readings")
+
+    def numbers(self, screen: Screen) -> list[str]:
+        """At the cursor, of every channel."""
+        return list(screen.evaluate("[...document.querySelectorAll('#readings b')].map(found => found.textContent)"))

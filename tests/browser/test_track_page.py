@@ -28,6 +28,19 @@ POSITIONS = np.stack([np.linspace(-4.0, 4.0, 41), np.full(41, 3.0), np.linspace(
 MOMENT = np.array([0.0, 0.0, 80.0])
 SIGMA_M = 0.1
 Z = np.array([0.0, 0.0, 1.0])
+RESULT = TrackResult(
+    tuple(
+        TrackPoint(
+            float(time), position, MOMENT, np.diag([SIGMA_M**2] * 3 + [1.0] * 3), nis=9.0, nis_dof=9, status="tracked"
+        )
+        for time, position in zip(TIMES, POSITIONS, strict=True)
+    ),
+    is_truth=False,
+)
+READINGS = Readings(np.array([predicted_channels(ARRAY, place, MOMENT) for place in POSITIONS]), time_s=TIMES)
+# The scene holds the track and the array: a fifth of its radius.
+_SEEN = np.vstack([POSITIONS, ARRAY.positions])
+ARROW_M = 0.2 * float(np.linalg.norm(_SEEN - 0.5 * (_SEEN.min(axis=0) + _SEEN.max(axis=0)), axis=1).max())
 ORANGE = hue_of(DIPOLE_COLOUR)
 EARLY, LATE = (hue_of(colour, 35.0, 0.25) for colour in time_colours(np.array([0.0, 0.3, 0.75, 1.0]))[1:3])
 
@@ -40,14 +53,8 @@ def coloured(picture: FloatArray) -> NDArray[np.bool_]:
 
 @pytest.fixture(scope="module")
 def server(screen: Screen) -> Iterator[viser.ViserServer]:
-    covariance = np.diag([SIGMA_M**2] * 3 + [1.0] * 3)
-    points = tuple(
-        TrackPoint(float(time), position, MOMENT, covariance, nis=9.0, nis_dof=9, status="tracked")
-        for time, position in zip(TIMES, POSITIONS, strict=True)
-    )
-    values = np.array([predicted_channels(ARRAY, position, MOMENT) for position in POSITIONS])
     with opened(0, "track") as server:
-        page = track_page(server, TrackResult(points, is_truth=False), ARRAY, Readings(values, time_s=TIMES))
+        page = track_page(server, RESULT, ARRAY, READINGS)
         screen.open_server(server)
         yield server
         screen.leave()
@@ -67,23 +74,16 @@ def row_of(screen: Screen) -> int:
     return int(words[1]) - 1
 
 
-def arrow_in(row: int, arrow_m: float) -> FloatArray:
+def arrow_in(row: int) -> FloatArray:
     """The head of the moment's arrow, beyond the ellipsoid."""
-    return POSITIONS[row : row + 1] + 0.85 * arrow_m * Z
+    return POSITIONS[row : row + 1] + 0.85 * ARROW_M * Z
 
 
 class TestTrack:
     """In the order of a user's session."""
 
-    @pytest.fixture
-    def arrow_m(self) -> float:
-        # The scene holds the track and the array: a fifth of its radius.
-        seen = np.vstack([POSITIONS, ARRAY.positions])
-        centre = 0.5 * (seen.min(axis=0) + seen.max(axis=0))
-        return 0.2 * float(np.linalg.norm(seen - centre, axis=1).max())
-
     def test_line_arrow_and_array_are_where_the_camera_has_them(
-        self, screen: Screen, server: viser.ViserServer, arrow_m: float
+        self, screen: Screen, server: viser.ViserServer
     ) -> None:
         camera = screen.live_camera(server)
         between = 0.5 * (POSITIONS[1:] + POSITIONS[:-1])
@@ -91,7 +91,7 @@ class TestTrack:
             Sight("track", camera.pixels(between), coloured),
             Sight("track a third on", camera.pixels(POSITIONS[11:14]), EARLY),
             Sight("track three quarters on", camera.pixels(POSITIONS[29:32]), LATE),
-            Sight("moment at the end", camera.pixels(arrow_in(40, arrow_m)), ORANGE, radius=4),
+            Sight("moment at the end", camera.pixels(arrow_in(40)), ORANGE, radius=4),
             Sight("sensor", camera.pixels(ARRAY.positions), dark_grey),
             Sight("track", camera.pixels(between[::8] + 1.5 * Z), coloured, absent=True),
         )
@@ -99,15 +99,15 @@ class TestTrack:
         assert row_of(screen) == 40
         assert screen.browser.errors == []
 
-    def test_the_time_slider_moves_the_scene(self, screen: Screen, server: viser.ViserServer, arrow_m: float) -> None:
+    def test_the_time_slider_moves_the_scene(self, screen: Screen, server: viser.ViserServer) -> None:
         camera = screen.live_camera(server)
         slid(screen, "Time [s]", 0.3, lambda: abs(row_of(screen) - 12) <= 2)
         row = row_of(screen)
         later = 0.5 * (POSITIONS[row + 2 :] + POSITIONS[row + 1 : -1])
         screen.until_seen(
-            Sight("moment", camera.pixels(arrow_in(row, arrow_m)), ORANGE, radius=4),
+            Sight("moment", camera.pixels(arrow_in(row)), ORANGE, radius=4),
             Sight("track so far", camera.pixels(POSITIONS[1:row]), coloured),
-            Sight("moment where it was", camera.pixels(arrow_in(40, arrow_m)), ORANGE, radius=4, absent=True),
+            Sight("moment where it was", camera.pixels(arrow_in(40)), ORANGE, radius=4, absent=True),
             Sight("track of later times", camera.pixels(later[2:]), coloured, absent=True),
         )
         screen.keep("track-earlier")
@@ -121,9 +121,7 @@ class TestTrack:
             Sight("track before the tail", camera.pixels(POSITIONS[:27]), coloured, absent=True),
         )
 
-    def test_play_and_pause(
-        self, screen: Screen, server: viser.ViserServer, arrow_m: float, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_play_and_pause(self, screen: Screen, server: viser.ViserServer, monkeypatch: pytest.MonkeyPatch) -> None:
         tenths, last = iter(range(52)), [52]  # the clock stands still after 5.2 s, in row 10
         monkeypatch.setattr("magloc.viewer.panels.played_time.perf_counter", lambda: 0.1 * next(tenths, last[0]))
         camera = screen.live_camera(server)
@@ -137,7 +135,7 @@ class TestTrack:
         screen.browser.click(*screen.button("Pause"))
         screen.browser.wait_for("[...document.querySelectorAll('button')].some(b => b.innerText.trim() === 'Play')")
         last[0] = 150  # it goes on, and moves nothing
-        screen.until_seen(Sight("moment", camera.pixels(arrow_in(10, arrow_m)), ORANGE, radius=4))
+        screen.until_seen(Sight("moment", camera.pixels(arrow_in(10)), ORANGE, radius=4))
         assert row_of(screen) == 10
 
     def test_keys_step_from_row_to_row(self, screen: Screen, server: viser.ViserServer) -> None:

@@ -197,7 +197,12 @@ PICTURES: dict[str, Picture] = {
     "view-mockup.png": OfCommands(
         ("adcs run mockup --part fusion --png view-mockup.png",),
         "view-mockup.png",
-        ("adcs/viewer/drive_page.py", "adcs/viewer/drive_player.py", "adcs/viewer/table_scene.py"),
+        (
+            "adcs/viewer/drive_page.py",
+            "adcs/viewer/drive_player.py",
+            "adcs/viewer/table_scene.py",
+            "magloc/viewer/panels/played_time.py",
+        ),
     ),
     "card-locate.png": Panel("notebook-03-real-magnet.png", (12, 58, 296, 326)),
     "card-track.png": Panel("notebook-05-tracking.png", (434, 362, 852, 562)),

@@ -98,6 +98,8 @@ class Page:
         Ends what runs by itself; to be called before the server is stopped.
     playing : Playing, optional
         What its static page plays.
+    plot : ReadingsPlot, optional
+        Readings that follow what is played.
     """
 
     title: str
@@ -105,6 +107,7 @@ class Page:
     notes: tuple[str, ...]
     close: Callable[[], None] = lambda: None
     playing: Playing | None = None
+    plot: ReadingsPlot | None = None
 
 
 def array_page(server: viser.ViserServer, array: SensorArray, *, live: bool, file: Path | None = None) -> Page:
@@ -159,6 +162,7 @@ def readings_page(server: viser.ViserServer, array: SensorArray, fixes: Sequence
     followers: list[Callable[[int], None]] = [move_array]
     view.add_controls(followers)
     followers.append(FieldPanel(server, array, view, rows, size).show_row)
+    plot = None
     if rows is not None and len(rows) > 1:
         sources = single_sources(fixes)
         left = None if sources is None else residuals_of(array, rows, *sources)
@@ -171,7 +175,8 @@ def readings_page(server: viser.ViserServer, array: SensorArray, fixes: Sequence
     playing = (
         Playing.of(times, lambda row: follow([view.show_row, *followers], row), view.row) if len(fixes) > 1 else None
     )
-    return _finished(server, legend, ball, array.name or "readings", entries, drops=[view.drop], playing=playing)
+    name = array.name or "readings"
+    return _finished(server, legend, ball, name, entries, drops=[view.drop], playing=playing, plot=plot)
 
 
 def track_page(
@@ -201,14 +206,16 @@ def track_page(
         entries += _array_entries(server, glyphs, rows, ball)
     followers: list[Callable[[int], None]] = []
     player = TrackPlayer(server, result, 0.2 * ball.radius_m, array_poses=poses, on_pose=on_pose, on_row=followers)
+    plot = None
     if array is not None and rows is not None:
         of_point = _nearest_rows(rows, points)
         left = None if result.ids else np.full_like(rows.values_T, np.nan)
         if left is not None:
             left[of_point] = residuals_of(array, rows[of_point], positions, stacked(points, "moment_Am2", 3))
         plot = ReadingsPlot(server, rows, array, left)
-        plot.show_row(int(of_point[player.index]))
-        followers.append(lambda index: plot.show_row(int(of_point[index])))
+        show_row = plot.show_row
+        show_row(int(of_point[player.index]))
+        followers.append(lambda index: show_row(int(of_point[index])))
     nodes = [f"/times/of-{id}" for id in result.ids] or ["/times"]
     for node, place in zip(nodes, each, strict=True):
         tracked = np.flatnonzero(np.isfinite(place).all(axis=1))
@@ -217,7 +224,7 @@ def track_page(
             screen_label(server.scene, f"{node}/{i}", f"{points[i].time_s:.6g} s", below)
     drops = [trail.drop for trail in player.trails]
     playing = Playing.of(stacked(points, "time_s"), player.show_row, player.index) if len(points) > 1 else None
-    return _finished(server, legend, ball, name, entries, close=player.pause, drops=drops, playing=playing)
+    return _finished(server, legend, ball, name, entries, close=player.pause, drops=drops, playing=playing, plot=plot)
 
 
 def _line_entries(result: TrackResult, name: str) -> list[Entry]:
@@ -282,6 +289,7 @@ def _finished(
     ruler: bool = True,
     of_array: bool = True,
     playing: Playing | None = None,
+    plot: ReadingsPlot | None = None,
 ) -> Page:
     """Floor, light, camera, axes, what stands on the floor, and legend."""
     floor = prepare(server, ball)
@@ -293,7 +301,7 @@ def _finished(
     all_notes = (*notes, *[AXES_WORDS] * of_array, height, f"one square of the floor: {length_text(floor.cell_m)}")
     with legend:
         server.gui.add_html(legend_html(entries, all_notes))
-    return Page(title, tuple(entries), all_notes, close, playing)
+    return Page(title, tuple(entries), all_notes, close, playing, plot)
 
 
 def follow(followers: Sequence[Callable[[int], None]], row: int) -> None:

@@ -8,6 +8,7 @@ Use, inside a tab or folder of the GUI::
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -48,6 +49,31 @@ class Channel(NamedTuple):
     label: str
     sensor: str
     axis: str
+
+
+class PlotLines(NamedTuple):
+    """Lines of the channels that are chosen, in the order of time.
+
+    Attributes
+    ----------
+    since_first_s : ndarray, shape (k,)
+        Thinned to what can be seen.
+    values : ndarray, shape (k, C)
+        NaN where missing [nT].
+    span : tuple of 2 floats
+        Of the axis [nT].
+    labels, colours : tuple of str
+        Of the C channels.
+    at : callable
+        Times (m,) [s] and values (m, C) [nT] of rows (m,) of the readings, not thinned.
+    """
+
+    since_first_s: FloatArray
+    values: FloatArray
+    span: tuple[float, float]
+    labels: tuple[str, ...]
+    colours: tuple[str, ...]
+    at: Callable[[Sequence[int]], tuple[FloatArray, FloatArray]]
 
 
 class ReadingsPlot:
@@ -141,6 +167,23 @@ class ReadingsPlot:
         """
         self.index = index
         self._follow()
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """What can be shown."""
+        return tuple(self.kind_dropdown.options)
+
+    def lines(self, kind: str) -> PlotLines:
+        """What it shows of a kind, to be drawn elsewhere."""
+        chosen = self._chosen()
+        (_, *series, _), time, values, span = self._thinned(kind, tuple(chosen))
+
+        def at(rows: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+            places = self._rank[list(rows)]
+            return self._time_s[places], self._values_nT(kind)[places][:, chosen]
+
+        labels, colours = (tuple(str(one[key]) for one in series) for key in ("label", "stroke"))
+        return PlotLines(time, values, span, labels, colours, at)
 
     def _chosen(self) -> list[int]:
         return [

@@ -24,8 +24,9 @@ if (matchMedia('(prefers-color-scheme: dark)').matches) {
 </script>"""
 """Of the head of viser's page, which asks its address whether it is to be dark: as the browser is, light or dark."""
 _BOX = """<style>
-#legend { background: rgba(255,255,255,.9); color: #222 }
-@media (prefers-color-scheme: dark) { #legend { background: rgba(30,32,36,.9); color: #ddd } }
+.box { background: rgba(255,255,255,.9); color: #222; position: fixed; z-index: 1000; border-radius: .4em;
+  box-shadow: 0 1px 4px rgba(0,0,0,.25); font-family: sans-serif }
+@media (prefers-color-scheme: dark) { .box { background: rgba(30,32,36,.9); color: #ddd } }
 </style>"""
 # viser's page takes its first camera from its address, which a page of a file must not change.
 _SEES_AS_WIDE = f"""<script>
@@ -94,16 +95,15 @@ def with_legend(
     notes: Sequence[str] = (),
     *,
     bottom: str = ".8em",
-    script: str = "",
+    beside: str = "",
 ) -> str:
-    """A static page as viser makes it, without a panel, with a legend that folds in its corner, and a script.
+    """A static page as viser makes it, without a panel, with a legend that folds in its corner, and HTML beside it.
 
     A page as narrow as a phone sees as far to the sides as a wider one, and more above and below.
     """
     box = (
-        f'<details id="legend" open style="position:fixed;bottom:{bottom};left:.8em;z-index:1000;max-width:19rem;'
-        "border-radius:.4em;box-shadow:0 1px 4px rgba(0,0,0,.25);font-family:sans-serif;"
-        'pointer-events:none">'
+        f'<details id="legend" class="box" open'
+        f' style="bottom:{bottom};left:.8em;max-width:19rem;pointer-events:none">'
         '<summary style="font-weight:600;padding:.5em .6em .2em;pointer-events:auto;cursor:pointer">'
         f"{escape(title)}</summary>{legend_html(entries, notes)}</details>"
         f"<script>document.getElementById('legend').open = innerWidth > {NARROW_PX}</script>"
@@ -111,9 +111,7 @@ def with_legend(
     before, end, after = page.replace("<head>", f"<head>{FOLLOWS_THE_SCHEME}{_SEES_AS_WIDE}{_BOX}", 1).rpartition(
         "</body>"
     )
-    if script:
-        box += f"<script>{script}</script>"
-    return f"{before}{box}{end}{after}"
+    return f"{before}{box}{beside}{end}{after}"
 
 
 def _row(entry: Entry) -> str:
