@@ -182,7 +182,7 @@ class BoundMap(CubeMap):
     @property
     def point_s(self) -> float:
         """Seconds of one core that the bounds of a point with all moments take, roughly."""
-        return 3e-7 * self.scenario.n_moments
+        return (1e-5 if self.scenario.body_length_m else 3e-7) * self.scenario.n_moments
 
     @property
     def settings(self) -> Mapping[str, Any]:
