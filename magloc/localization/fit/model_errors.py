@@ -9,6 +9,7 @@ for every source: docs/theory/extended-sources.md.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -24,6 +25,8 @@ DEFAULT_LENGTH = 0.25
 # Sensors that are nearer than this, in circumradii of the array, where a body of default length is assumed. A source
 # that a single sensor is near to may be a fault of it.
 _NEAR, _N_NEAR = 0.6, 4
+# |s| of q = (u, s), of unit norm, whose |u| is farther than that from every sensor.
+_FAR_S = 1.0 / math.hypot(1.0, 1.0 + _NEAR)
 # Variance of what a dipole leaves out, summed over the channels in units of the noise, that does not matter.
 _NEGLIGIBLE = 0.1
 _ROUNDS = 3
@@ -65,7 +68,7 @@ def with_model_errors(
     """Optima refined with the errors that matter, and the lengths (b,) of their rows' bodies, 0 where none does."""
     rows, none = optima.rows, np.zeros(len(optima.rows))
     point = body_length_m == 0.0 or (body_length_m is None and _all_far(optima.fits.q))
-    ambient_sigma_T = ambient_sigma_T if rows.model.channel_is_scalar.any() else 0.0
+    ambient_sigma_T = ambient_sigma_T if rows.model.sees_moduli else 0.0
     if (point and not ambient_sigma_T) or optima.position_m is not None or not len(optima.of_row):
         return [(optima, none)]
     first = np.searchsorted(optima.of_row, np.arange(len(rows)))
@@ -94,8 +97,7 @@ def with_model_errors(
 
 def _all_far(q: FloatArray) -> bool:
     """Whether all sources are so far from the centroid that they are near to no sensor: most of them, cheaply."""
-    u = q[..., :3]
-    return bool(np.all(np.sum(u * u, axis=-1) > ((1.0 + _NEAR) * q[..., 3]) ** 2))
+    return bool((np.abs(q[..., 3]) < _FAR_S).all())
 
 
 def _refined(optima: Optima, lengths: FloatArray, ambient_sigma_T: float) -> Optima:
