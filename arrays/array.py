@@ -112,6 +112,14 @@ class SensorArray:
                 f"at {_plain(self.positions[0])} m."
             )
 
+    def __hash__(self) -> int:
+        return self._hash
+
+    @cached_property
+    def _hash(self) -> int:
+        """Of all fields: what is cached by an array asks for it in every fix."""
+        return hash(tuple(getattr(self, field.name) for field in fields(self)))
+
     def __getstate__(self) -> dict[str, Any]:
         # Cached arrays are left out: they would come back writeable.
         return {field.name: getattr(self, field.name) for field in fields(self)}

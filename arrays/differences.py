@@ -109,13 +109,18 @@ def decorrelated_differences(
     return Differences(np.concatenate(transforms), np.concatenate(variances))
 
 
-def _channels(
-    array: SensorArray, available: BoolArray | None, covariance_T2: FloatArray | None
-) -> tuple[BoolArray, FloatArray]:
+def _mask(array: SensorArray, available: BoolArray | None) -> BoolArray:
     n = array.n_channels
     mask = np.ones(n, dtype=np.bool_) if available is None else np.asarray(available, dtype=np.bool_)
     if mask.shape != (n,):
         raise ValueError(f"Input available must have shape ({n},); instead received {mask.shape}.")
+    return mask
+
+
+def _channels(
+    array: SensorArray, available: BoolArray | None, covariance_T2: FloatArray | None
+) -> tuple[BoolArray, FloatArray]:
+    n, mask = array.n_channels, _mask(array, available)
     if covariance_T2 is None:
         return mask, np.diag(array.channel_noise_T**2)
     covariance = np.asarray(covariance_T2, dtype=np.float64)

@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 
 from arrays.array import SensorArray
-from arrays.differences import _channels, _common_field, _groups
+from arrays.differences import _channels, _common_field, _groups, _mask
 from arrays.noise import _block_diagonal
 from arrays.typing import BoolArray, FloatArray
 
@@ -59,10 +59,9 @@ def whitening(
     With channels ``y = U c + n``, n of covariance ``L Lᵀ`` and c the common field of prior variance λ:
     ``L⁻¹ U = Q diag(s) Vᵀ`` gives the shrinkage ``1 - 1/√(1 + s² λ)``, which is 1 for an unknown field.
     """
-    mask, covariance = _channels(array, available, covariance_T2)
     if covariance_T2 is None:
-        return _of_constant_noise(array, mask.tobytes())
-    return whitenings(array, mask, covariance)
+        return _of_constant_noise(array, _mask(array, available).tobytes())
+    return whitenings(array, *_channels(array, available, covariance_T2))
 
 
 @lru_cache(maxsize=16)  # readings that come one by one miss the same channels

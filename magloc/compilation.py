@@ -156,7 +156,7 @@ def over_rows(kernel: Callable[..., None], n_rows: int, *arguments: Any) -> None
     For large kernels: a ``prange`` loop around one more than doubles the time that it takes to compile. The kernel is
     made by :func:`compiled`, which lets go of the interpreter's lock, and writes rows begin to end only.
     """
-    n_threads = min(get_num_threads(), n_rows)
+    n_threads = 1 if n_rows == 1 else min(get_num_threads(), n_rows)
     if n_threads <= 1:
         kernel(0, n_rows, *arguments)
         return

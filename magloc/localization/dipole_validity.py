@@ -204,17 +204,17 @@ def too_near(
 ) -> BoolArray:
     """Whether each row's source is too near for a dipole, by length or misfit; fixes are in the array's frame."""
     near = np.zeros(len(fixes), dtype=bool)
-    solved, solutions = np.flatnonzero(fixes.solved), fixes.solutions
-    alone = solved[solutions.n_sources[fixes.first[solved]] == 1]
-    best = fixes.first[alone]
-    place, moment, dof = solutions.position_m[best, 0], solutions.moment_Am2[best, 0], solutions.dof[best]
+    first, solutions = fixes.first[fixes.solved], fixes.solutions
+    best = first[solutions.n_sources[first] == 1]
+    alone, dof = solutions.of_row[best], solutions.dof[best]
     if body_length_m:
+        place = solutions.position_m[best, 0]
         nearest = np.min([np.linalg.norm(place - sensor, axis=1) for sensor in array.positions], axis=0)
         near[alone] = ~dipole_validity(nearest, body_length_m)
     doubtful = ~near[alone] & (dof > 0) & (chdtrc(np.maximum(dof, 1), solutions.chi2[best]) < SECOND_LOOK)
-    for i in np.flatnonzero(doubtful).tolist():
-        row = alone[i]
+    for i in doubtful.nonzero()[0].tolist():
+        row, place, moment = alone[i], solutions.position_m[best[i], 0], solutions.moment_Am2[best[i], 0]
         used = ~np.isin(array.ids, fixes.dropped_sensors[row])[array.channel_sensor]
         of_row = array if ambient_T is None else replace(array, ambient_T=tuple(ambient_T[row].tolist()))
-        near[row] = nearness_test(of_row, place[i], moment[i], np.where(used, readings_T[row], np.nan)).extended
+        near[row] = nearness_test(of_row, place, moment, np.where(used, readings_T[row], np.nan)).extended
     return near

@@ -203,7 +203,6 @@ class _Rows:
 
     def __init__(self, n: int, body_length_m: float | None = 0.0, ambient_sigma_T: float = 0.0) -> None:
         self.body_length_m, self.ambient_sigma_T = body_length_m, ambient_sigma_T
-        self.allows_for_more = False
         self.assumed_length_m = np.zeros(n)
         self.detected = np.zeros(n, dtype=bool)
         self.reason = [""] * n
@@ -222,9 +221,7 @@ class _Rows:
         loud = rows.chosen(~silent) if silent.any() else rows
         if not len(loud):
             return
-        energy = np.zeros(len(self.reason))
-        energy[loud.index] = loud.energy
-        self.detected[loud.index] = is_detected(energy[loud.index], loud.n_differences)
+        self.detected[loud.index] = is_detected(loud.energy, loud.n_differences)
         pieces = [
             piece
             for optima in search(loud)
@@ -233,15 +230,13 @@ class _Rows:
         for optima, lengths in pieces:
             of_all = optima.rows.index
             self.assumed_length_m[of_all] = lengths
-            noisier = lengths.any() or self.ambient_sigma_T or self.allows_for_more
-            known = optima.rows.energy if noisier else energy[of_all]
-            found = solutions_of(optima, known, self.detected[of_all])
+            found = solutions_of(optima, optima.rows.energy, self.detected[of_all])
             solved = np.bincount(found.of_row, minlength=len(of_all)) > 0
             for row, reason, has in zip(of_all.tolist(), optima.reason, solved.tolist(), strict=True):
                 self.reason[row] = reason or ("" if has else optima.undetermined)
                 self.detected[row] &= reason != NOISE_ALONE
             self.failed_starts[of_all] = optima.failed_starts
-            self.parts.append(replace(found, of_row=of_all[found.of_row]))
+            self.parts.append(found.of_rows(of_all[found.of_row]))
 
     def fixes(self) -> Fixes:
         """All of it."""
@@ -284,7 +279,6 @@ def fit_at_rest(
         found.refuse(rows.index, NOISE_ALONE)
     else:
         errors = None if poses is None else stacked_errors(poses, readings_T, ambient_T)
-        found.allows_for_more = poses is not None
         found.fill(rows, lambda loud: [optima_at_rest(loud, prior, errors)])
     return found.fixes()[0]
 

@@ -79,14 +79,18 @@ class WhitenedRows:
     @property
     def silent(self) -> BoolArray:
         """Whether the differences (b,) are rounding errors."""
-        return np.asarray(np.einsum("bc,bc->b", self.y, self.y) < _SILENT * self.n_differences)
+        return np.asarray(self._squares < _SILENT * self.n_differences)
 
-    @property
+    @cached_property
+    def _squares(self) -> FloatArray:
+        return np.einsum("bc,bc->b", self.y, self.y)
+
+    @cached_property
     def energy(self) -> FloatArray:
         """Sums of squared differences (b,), as they are without a source."""
-        without = self.y
-        if self.model.channel_is_scalar.any():
-            without = without - self.model.of_ambient
+        if not self.model.sees_moduli:
+            return self._squares
+        without = self.y - self.model.of_ambient
         return np.einsum("bc,bc->b", without, without)
 
 

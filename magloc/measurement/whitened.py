@@ -42,6 +42,12 @@ class ScaledSensors:
     sensors: FloatArray
     channel_sensor: NDArray[np.intp]
 
+    @cached_property
+    def unit_covariance(self) -> FloatArray:
+        """Covariance (6, 6) of position and moment [m, A·m²] whose entries are 1 in radii and scaled moments."""
+        unit = np.repeat([self.radius, self.radius**3 / MU0_OVER_4PI], 3)
+        return np.outer(unit, unit)
+
     def homogeneous(self, position_m: ArrayLike) -> FloatArray:
         """Homogeneous coordinates (..., 4), of unit norm and s > 0, of positions (..., 3) [m]."""
         rho = (np.asarray(position_m, dtype=np.float64) - self.centroid) / self.radius
@@ -112,6 +118,11 @@ class WhitenedModel(ScaledSensors):
 
     def __len__(self) -> int:
         return len(self.gain)
+
+    @cached_property
+    def sees_moduli(self) -> bool:
+        """Whether there are scalar channels."""
+        return bool(self.channel_is_scalar.any())
 
     @property
     def shares_whitening(self) -> bool:

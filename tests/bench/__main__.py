@@ -15,6 +15,7 @@ from tests.bench import (
     inertial,
     machine,
     maps,
+    memory,
     mockup,
     recording,
     sources,
@@ -37,6 +38,7 @@ GROUPS = {
     "stars": stars,
     "machine": machine,
     "recording": recording,
+    "memory": memory,
 }
 
 

@@ -14,11 +14,12 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from arrays.geometries import tetrahedron
 from magloc.fields.dipole import total_field
 from magloc.measurement.differences import DifferenceMeasurement
-from tests.bench import fields, filters
+from tests.bench import fields, filters, memory
 from tests.bench.__main__ import GROUPS, report
 from tests.bench.fixes import simulated
 from tests.bench.table import Row, ratio_text, table, time_text
 from tests.bench.timing import Contestant, Size, Timing, installed, interleaved
+from tests.fuzz.cases import commands
 
 TINY = Size(points=30, rows=2, problems=1, grid=2, sample=1, rounds=1)
 
@@ -116,10 +117,32 @@ class TestPeersHaveTheSameProblem:
         assert len(count) == filters.ITERATIONS
 
 
+class TestMemory:
+    def test_has_every_command(self):
+        assert set(memory.CASES) == {name for name, _ in commands()}
+
+    def test_a_longer_log_goes_on_in_time(self, tmp_path):
+        log = tmp_path / "log.csv"
+        log.write_text("time_s,a\n1.0,x\n1.5,y\n")
+        memory.lengthen(log, 5)
+        rows = log.read_text().split()
+        assert rows == ["time_s,a", *(f"{t:.6f},{a}" for t, a in zip((1.0, 1.5, 2.0, 2.5, 3.0), "xyxyx", strict=True))]
+
+    def test_a_peak_is_what_the_command_held_and_not_the_one_that_starts_it(self, tmp_path):
+        held = np.ones(60_000_000)  # 480 MB
+        assert memory._run("magloc new-array a.toml --shape tetrahedron --size-m 1.5 --noise-nT 1", tmp_path) < 2e8
+        assert held.nbytes > 4e8
+
+    @pytest.mark.parametrize(("peaks", "text"), [((5e7, 5.1e7), "flat"), ((5e7, 7.7e7), "30,000 bytes a row")])
+    def test_the_slope_is_of_the_two_sizes(self, peaks, text):
+        assert memory.told([int(peak) for peak in peaks], [100, 1000], "row").endswith(text)
+
+
 @pytest.mark.parametrize("group", GROUPS)
 def test_group_runs(group, monkeypatch):
     monkeypatch.setattr("tests.bench.timing.SAMPLE_S", 1e-9)
     monkeypatch.setattr("tests.bench.attitude.N_RUNS", 2)
+    monkeypatch.setattr("tests.bench.memory.CASES", {"magloc new-array": memory.CASES["magloc new-array"]})
     lines = report([group], TINY).splitlines()
     assert any(line.startswith(f"-- {GROUPS[group].TITLE}") for line in lines)
     assert "|" in lines[-1]

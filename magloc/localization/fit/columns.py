@@ -126,8 +126,12 @@ class Solutions:
     def chosen(self, index: IntArray | BoolArray, of_row: IntArray | None = None) -> Solutions:
         """Some of the solutions, of other rows if these are named."""
         at = np.arange(len(self))[index]
-        values = {name: value[at] for name, value in vars(self).items()}
-        return Solutions(**(values if of_row is None else values | {"of_row": of_row}))
+        chosen = Solutions(**{name: value[at] for name, value in vars(self).items()})
+        return chosen if of_row is None else chosen.of_rows(of_row)
+
+    def of_rows(self, of_row: IntArray) -> Solutions:
+        """The same solutions, of other rows."""
+        return Solutions(**(vars(self) | {"of_row": of_row}))
 
     @property
     def covariance_of_source(self) -> FloatArray:
@@ -139,14 +143,13 @@ class Solutions:
 
     def solution(self, i: int) -> Solution:
         """One of them as an object."""
-        n = int(self.n_sources[i])
-        of_source = self.covariance_of_source
-        used = n * of_source.shape[2]
+        n, covariance = int(self.n_sources[i]), self.covariance[i]
+        size = len(covariance) // self.position_m.shape[1]
         sources = tuple(
             Source(
                 self.position_m[i, k],
                 self.moment_Am2[i, k],
-                of_source[i, k],
+                covariance[k * size : (k + 1) * size, k * size : (k + 1) * size],
                 intervals_of(self.ranges[i, k]),
                 bool(self.gaussian[i, k]),
                 bool(self.merged[i, k]),
@@ -155,7 +158,7 @@ class Solutions:
         )
         return Solution(
             sources,
-            self.covariance[i, :used, :used],
+            covariance[: n * size, : n * size],
             float(self.chi2[i]),
             int(self.dof[i]),
             float(self.weight[i]),

@@ -97,7 +97,7 @@ class Fixes(Sequence[Fix]):
     @cached_property
     def _edges(self) -> IntArray:
         """First solution of every row (n + 1,)."""
-        return np.searchsorted(self.solutions.of_row, np.arange(len(self) + 1))
+        return self.solutions.of_row.searchsorted(np.arange(len(self) + 1))
 
     @cached_property
     def best(self) -> IntArray:
@@ -121,10 +121,10 @@ class Fixes(Sequence[Fix]):
             raise ValueError("Some rows have several sources: see fixes[row].best.sources, or to_xarray().")
         return values
 
-    @property
+    @cached_property
     def solved(self) -> BoolArray:
         """Whether a row has a solution (n,)."""
-        return np.diff(self._edges) > 0
+        return self._edges[1:] > self._edges[:-1]
 
     @property
     def position_m(self) -> FloatArray:

@@ -9,6 +9,7 @@ for every source: docs/theory/extended-sources.md.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -19,6 +20,8 @@ from magloc.localization.fit.gauss_newton import JointFits, refine
 from magloc.localization.fit.optima import Optima
 from magloc.measurement.whitened import WhitenedModel
 
+# |s| of q = (u, s), of unit norm, whose |u| is farther than NEAR from every sensor.
+_FAR_S = 1.0 / math.hypot(1.0, 1.0 + NEAR)
 # Variance of what a dipole leaves out, summed over the channels in units of the noise, that does not matter.
 _NEGLIGIBLE = 0.1
 _ROUNDS = 3
@@ -55,7 +58,7 @@ def with_model_errors(
     """Optima refined with the errors that matter, and the lengths (b,) of their rows' bodies, 0 where none does."""
     rows, none = optima.rows, np.zeros(len(optima.rows))
     point = body_length_m == 0.0 or (body_length_m is None and _all_far(optima.fits.q))
-    ambient_sigma_T = ambient_sigma_T if rows.model.channel_is_scalar.any() else 0.0
+    ambient_sigma_T = ambient_sigma_T if rows.model.sees_moduli else 0.0
     if (point and not ambient_sigma_T) or optima.position_m is not None or not len(optima.of_row):
         return [(optima, none)]
     first = np.searchsorted(optima.of_row, np.arange(len(rows)))
@@ -84,8 +87,7 @@ def with_model_errors(
 
 def _all_far(q: FloatArray) -> bool:
     """Whether all sources are so far from the centroid that they are near to no sensor: most of them, cheaply."""
-    u = q[..., :3]
-    return bool(np.all(np.sum(u * u, axis=-1) > ((1.0 + NEAR) * q[..., 3]) ** 2))
+    return bool((np.abs(q[..., 3]) < _FAR_S).all())
 
 
 def _refined(optima: Optima, lengths: FloatArray, ambient_sigma_T: float) -> Optima:

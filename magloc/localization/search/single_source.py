@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -101,16 +102,16 @@ class SingleSourceSearch:
         self.apart_rad = apart_rad
         self.max_iterations = max_iterations
         self.prior = prior
+        self._everything = prior == NOTHING_KNOWN
         self._candidates = allowed_positions(array, prior)
         self._ranking_of: dict[bytes, _Ranking] = {}
 
     def optima(self, rows: WhitenedRows) -> list[Optima]:
         """Distinct optima of every row within Δχ² = 20 of its best one that the prior allows."""
-        everything = self.prior == NOTHING_KNOWN
+        everything = self._everything
         keep_within = DISTINCT_WITHIN if everything else math.inf
         found = self.ends(rows, np.arange(len(rows)), self.starts(rows), keep_within)
-        dof = rows.n_differences - N_UNKNOWNS
-        doubtful = np.flatnonzero(~(found.chi2[:, 0] <= (chdtri(dof, 1.0 - CREDIBLE_FIT) if dof > 0 else math.inf)))
+        doubtful = np.flatnonzero(~(found.chi2[:, 0] <= _largest_credible(rows.n_differences - N_UNKNOWNS)))
         if doubtful.size:
             some = rows.chosen(doubtful)
             more = self.ends(some, np.arange(len(some)), self.starts(some, _MORE * self.n_starts), keep_within)
@@ -198,6 +199,12 @@ class SingleSourceSearch:
             np.take_along_axis(found.iterations, order, axis=1),
             counts,
         )
+
+
+@lru_cache(maxsize=64)
+def _largest_credible(dof: int) -> float:
+    """Largest χ² of an optimum after which no other is looked for."""
+    return float(chdtri(dof, 1.0 - CREDIBLE_FIT)) if dof > 0 else math.inf
 
 
 def _why_unsolved(n_optima: int) -> str:

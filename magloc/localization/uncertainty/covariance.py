@@ -17,7 +17,6 @@ from scipy.special import chdtrc, chdtri
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.chi_square import energy_threshold
 from magloc.compilation import over_rows, own
-from magloc.fields.dipole import MU0_OVER_4PI
 from magloc.levels import CERTAIN_WEIGHT, DELTA_CHI2_95, MISFIT
 from magloc.localization.fit.columns import Solutions
 from magloc.localization.fit.gauss_newton import covariances
@@ -60,7 +59,7 @@ def solutions_of(optima: Optima, energy: FloatArray, detected: BoolArray) -> Sol
         position = optima.position_m[of_row]
         known = _of_known_position(optima, optima.position_m, moment)
     elif n_sources == 1:
-        lanes = not model.channel_is_scalar.any() and model.known is None
+        lanes = not model.sees_moduli and model.known is None
         known = (known_of_one_compiled if lanes else known_of_one)(optima, energy)
     else:
         known = _of_several(optima, detected)
@@ -84,8 +83,8 @@ def solutions_of(optima: Optima, energy: FloatArray, detected: BoolArray) -> Sol
         known_chi2=of_moments,
         n_known=np.full(n_fits, n_known),
     )
-    determined = np.asarray(np.isfinite(known.covariance).all(axis=(1, 2)))
-    return every if determined.all() else every.chosen(determined)
+    finite = np.isfinite(known.covariance)
+    return every if finite.all() else every.chosen(np.asarray(finite.all(axis=(1, 2))))
 
 
 def covariance_is_valid(optima: Optima, covariance: FloatArray, which: IntArray) -> BoolArray:
@@ -152,8 +151,8 @@ def known_of_one_compiled(optima: Optima, energy: FloatArray) -> _Known:
     """:func:`known_of_one` of vector sensors."""
     rows, fits, of_row = optima.rows, optima.fits, optima.of_row
     model, n_rows = rows.model, len(rows)
-    first = np.searchsorted(of_row, np.arange(n_rows + 1))
-    found = Certainties.empty(len(of_row), n_rows, int(np.diff(first).max(initial=1)))
+    first = of_row.searchsorted(np.arange(n_rows + 1))
+    found = Certainties.empty(len(of_row), n_rows, int((first[1:] - first[:-1]).max(initial=1)))
     over_rows(
         certainty_rows,
         n_rows,
@@ -166,9 +165,8 @@ def known_of_one_compiled(optima: Optima, energy: FloatArray) -> _Known:
         levels_of(rows.n_differences, optima.dof),
         found,
     )
-    unit = np.repeat([model.radius, model.radius**3 / MU0_OVER_4PI], 3)
     sets = model.radius * found.sets[:, : max(1, int(found.n_sets.max(initial=1)))]
-    return _Known(sets[of_row, None], found.covariance * np.outer(unit, unit), found.gaussian[:, None], found.weight)
+    return _Known(sets[of_row, None], found.covariance * model.unit_covariance, found.gaussian[:, None], found.weight)
 
 
 @lru_cache(maxsize=64)
