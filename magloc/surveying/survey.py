@@ -147,6 +147,8 @@ def survey(
                 f"the readings are {lag.s:.3f} ± {lag.sigma_s:.3f} s later than their poses, as the targets show: taken"
                 " into account"
             )
+        if len(every) > 1:  # what is strong beside a tile is looked for in it, in vain, until it is told
+            tiled = tiled.searched(strongest_in, every, each, tell)
         due: Sequence[int] = every
         for _ in range(_MOST_SWEEPS):
             tiled = tiled.searched(sources_in, due, each, tell)

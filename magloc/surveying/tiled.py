@@ -21,7 +21,7 @@ from magloc.surveying.piece import Ground, Piece
 from magloc.surveying.pose_components import with_likeliest_pose
 from magloc.surveying.preparation import FEWEST_ROWS, record_of
 from magloc.surveying.rounds import AT_LAST, WHILE_SEARCHING
-from magloc.surveying.tiles import Tile, owned, tiles_of
+from magloc.surveying.tiles import SEAM_M, Tile, owned, tiles_of
 
 _LOG = logging.getLogger(__name__)
 _SAMPLE = 20_000  # rows that tell what is the same everywhere
@@ -48,8 +48,9 @@ class TiledSurvey:
     geology_T : float
         Of the anomalies: their medians, and how large they are.
     sources : Sources
-    found, outside : sequence of Sources
-        What every tile found last, its margin included, and what had been taken from its readings.
+    found, known, outside : sequence of Sources
+        What every tile found last, its margin included, what it had been told of these, and what had been taken from
+        its readings.
     """
 
     array: SensorArray
@@ -62,6 +63,7 @@ class TiledSurvey:
     geology_T: float
     sources: Sources
     found: Sequence[Sources]
+    known: Sequence[Sources]
     outside: Sequence[Sources]
 
     @classmethod
@@ -91,8 +93,7 @@ class TiledSurvey:
             offset,
             max(min(spread, _MOST_GEOLOGY_T), _LEAST_GEOLOGY_T),
             Sources.none(),
-            [Sources.none()] * len(tiles),
-            [Sources.none()] * len(tiles),
+            *[[Sources.none()] * len(tiles)] * 3,
         )
 
     @property
@@ -124,33 +125,33 @@ class TiledSurvey:
 
     def searched(self, work: Work, which: Sequence[int], each: Each, tell: Tell) -> TiledSurvey:
         """After a search of some tiles."""
-        found, outside = list(self.found), list(self.outside)
+        found, known, outside = list(self.found), list(self.known), list(self.outside)
         for done, (index, result) in enumerate(each(work, map(self.piece, which)), start=1):
             number = which[index]
             found[number] = Sources(**result)
-            outside[number] = self._told(self.tiles[number])[1]
+            known[number], outside[number] = self._told(self.tiles[number])
             tell(f"{done} of {len(which)} tiles searched: {sum(map(len, found))} sources")
         kept = owned(self.tiles, [sources.position_m for sources in found], self.same_m)
         sources = Sources.none()
         for number, k in kept:
             sources = sources.with_more(found[number].some(np.array([k])))
-        return replace(self, sources=sources, found=found, outside=outside)
+        return replace(self, sources=sources, found=found, known=known, outside=outside)
 
     def changed(self) -> list[int]:
-        """Tiles for which others found something else than what they had been told, or found themselves."""
+        """Tiles for which others found something else than they had been told and found themselves."""
         return [number for number in range(len(self.tiles)) if self._is_changed(number)]
 
     def _is_changed(self, number: int) -> bool:
         tile, before = self.tiles[number], self.outside[number]
         change = self._told(tile)[1].with_more(Sources(before.position_m, -before.moment_Am2))
-        field = field_at_points(self._places(tile), change.position_m, change.moment_Am2)
+        field = field_at_points(self._places(tile)[tile.own], change.position_m, change.moment_Am2)
         if np.linalg.norm(field, axis=1).max() > _CHANGED * self.array.channel_noise_T.min():
             return True
-        own, of_all = (
-            int((tile.inside_m(sources.position_m) > -0.5 * self.margin_m).sum())
-            for sources in (self.found[number], self.sources)
+        own, told, of_all = (
+            int((tile.inside_m(sources.position_m) > -SEAM_M).sum())
+            for sources in (self.found[number], self.known[number], self.sources)
         )
-        return own != of_all
+        return of_all not in (own, told)
 
     def _richest(self) -> int:
         """The tile with most sources, which tells most of what all tiles have in common."""

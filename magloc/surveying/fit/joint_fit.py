@@ -288,6 +288,6 @@ def fit_jointly(
                 break
             damping *= 10.0
         J, J_layer, H = linearised(sources, fields)
-        if gain < settled:
+        if gain < settled * max(1.0, cost / residual.size):  # while much is missing, little is settled
             break
     return JointFit(sources, cost, H, residual)

@@ -154,8 +154,9 @@ def source_columns(
                     of_channel[4] = xy * u[0] + yy * u[1] + yz * u[2]
                     of_channel[5] = xz * u[0] + yz * u[1] + zz * u[2]
                     for j in range(k):
-                        for a in range(6):
-                            out[n, j, 6 * q + a] += scale * U[j, c] * of_channel[a]
+                        if U[j, c] != 0.0:
+                            for a in range(6):
+                                out[n, j, 6 * q + a] += scale * U[j, c] * of_channel[a]
     return out
 
 

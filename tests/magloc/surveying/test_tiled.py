@@ -13,6 +13,7 @@ import magloc
 import sims
 from magloc.grids.work import workers
 from magloc.surveying.clock import rows_around, taken_earlier
+from magloc.surveying.fit.joint_fit import Sources
 from magloc.surveying.piece import Ground, strongest_in, targets_in
 from magloc.surveying.preparation import whole_rows
 from magloc.surveying.tiled import TiledSurvey
@@ -58,7 +59,6 @@ class TestTwoTiles:
     def test_there_are_two(self) -> None:
         assert len(tiled().tiles) == 2
 
-    @pytest.mark.slow
     def test_each_target_once(self) -> None:
         """What one tile finds is not a ghost in the other; errors within what is claimed."""
         found = surveyed(1)
@@ -70,7 +70,6 @@ class TestTwoTiles:
             # χ² of three: 1 in 10,000 right ones is beyond 21.
             assert error @ np.linalg.solve(target.covariance[:3, :3], error) < 21.0
 
-    @pytest.mark.slow
     def test_every_row_once(self) -> None:
         rows = surveyed(1).rows
         assert len(rows.time_s) == len(field().readings)
@@ -108,6 +107,30 @@ class TestTwoTiles:
             magloc.survey(field().array, field().readings, progress=interrupt, **arguments)
         assert first.stat().st_mtime_ns == before
         assert len(list(kept.iterdir())) == 2
+
+
+class TestChanged:
+    """The western tile: x below 0, rows of the margin up to 4.4 m."""
+
+    @staticmethod
+    def told(x_m: float, moment_Am2: float) -> TiledSurvey:
+        """All had been told what they found, but of one more source."""
+        more = Sources(np.array([[x_m, 0.0, -0.5]]), np.array([[0.0, 0.0, moment_Am2]]))
+        return replace(tiled(), sources=more)
+
+    @pytest.mark.parametrize(("moment_Am2", "changed"), [(0.03, False), (3.0, True)])
+    def test_what_its_margin_alone_feels_is_none(self, moment_Am2: float, changed: bool) -> None:
+        then = self.told(5.6, moment_Am2)
+        outside = then.piece(0).outside
+        assert len(outside) == 1
+        assert (0 in then.changed()) == changed
+
+    def test_one_that_is_new_is_sought_once(self) -> None:
+        """Told of it, and not finding it, a tile would say the same again."""
+        then = self.told(-0.5, 1.0)
+        assert 0 in then.changed()
+        assert 0 not in replace(then, known=[then.sources] * 2).changed()
+        assert 0 not in replace(then, found=[then.sources] * 2).changed()
 
 
 class TestReach:
