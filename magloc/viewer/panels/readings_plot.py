@@ -29,7 +29,7 @@ TICKED, ALL = "those ticked", "all"
 # Okabe and Ito, without yellow, which is not seen on white; all are seen on a dark page.
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#666666")
 # Opacities of the axes. Dashes of noise take a browser without a graphics card a second a picture, and cannot be told.
-_SHADES = {"x": "", "y": "a6", "z": "59", "": ""}
+_SHADES = {"x": "", "y": "bf", "z": "80", "": ""}
 _MOST_POINTS = 400
 _MOST_CHANNELS_AT_FIRST = 12
 

@@ -73,9 +73,10 @@ def static_plot(plot: ReadingsPlot, rows: Sequence[int], begin_s: float, step_s:
         for label, colour in zip(kinds[0].labels, kinds[0].colours, strict=True)
     )
     return (
-        '<details id="readings" class="box" open style="top:.8em;right:.8em;width:19rem">'
+        '<details id="readings" class="box" open style="top:.8em;right:.8em">'
         '<summary style="font-weight:600;padding:.5em .6em .2em;cursor:pointer">Readings [nT]</summary>'
-        f'<div style="padding:0 .6em .5em;font-size:.75rem"><select aria-label="Show" style="font:inherit">{options}'
+        '<div style="padding:0 .6em .5em;font-size:.75rem;width:18rem">'
+        f'<select aria-label="Show" style="font:inherit">{options}'
         f"</select>{''.join(map(_svg, kinds))}"
         '<div style="display:grid;grid-template-columns:repeat(auto-fill,minmax(5.4rem,1fr))">'
         f"{channels}</div></div></details><script>{_CURSOR % (json.dumps(cursor), NARROW_PX)}</script>"
@@ -98,13 +99,13 @@ def _svg(lines: PlotLines) -> str:
     )
     times = _ticks(float(time[0]), float(time[-1]))
     axes += "".join(
-        f'<text x="{at:.1f}" y="{_BOTTOM + 12}" text-anchor="middle">{level:g}</text>'
+        f'<text x="{at:.1f}" y="{_BOTTOM + 13}" text-anchor="middle">{level:g}</text>'
         for level, at in zip(times, _scaled(times, (time[0], time[-1]), (_LEFT, _RIGHT)), strict=True)
     )
     width, height = _SIZE
     return (
         f'<svg viewBox="0 0 {width} {height}" style="width:100%;cursor:crosshair;touch-action:none;user-select:none"'
-        f' font-size="9" fill="currentColor">{axes}'
+        f' font-size="11" fill="currentColor">{axes}'
         f'<text x="{_RIGHT}" y="{height - 3}" text-anchor="end">time since the first row [s]</text>'
         f'<g fill="none" stroke-linecap="round" stroke-linejoin="round">{paths}</g>'
         f'<path class="now" d="M0 {_TOP}V{_BOTTOM}" stroke="#808080" stroke-width="1.5"/></svg>'
