@@ -29,7 +29,7 @@ from arrays.geometries import tetrahedron
 from arrays.sensor import Sensor
 from magloc.fields import dipole
 from magloc.fields.body import demagnetising_factors, equivalent_dipole, induced_and_permanent_moment
-from magloc.fields.multipole import _traceless_basis, finite_body_fields, multipole_field_matrix
+from magloc.fields.multipole import traceless_basis, finite_body_fields, multipole_field_matrix
 from magloc.localization.dipole_validity import dipole_validity, nearness_test
 from magloc.measurement.differences import predicted_channels
 from tests import oracles
@@ -136,7 +136,7 @@ class TestFiniteBodyFields:
         tensor = x
         for _ in range(rank - 1):
             tensor = np.einsum("n...,ni->n...i", tensor, x)
-        return np.tensordot(_traceless_basis(rank), tensor.mean(axis=0), rank)
+        return np.tensordot(traceless_basis(rank), tensor.mean(axis=0), rank)
 
     def test_each_order_takes_most_of_what_is_left(self):
         cuboid = magpylib.magnet.Cuboid(polarization=(0.3, 0.0, 1.0), dimension=self.SIDES)
