@@ -29,7 +29,7 @@ from arrays.geometries import tetrahedron
 from arrays.sensor import Sensor
 from magloc.fields import dipole
 from magloc.fields.body import demagnetising_factors, equivalent_dipole, induced_and_permanent_moment
-from magloc.fields.multipole import traceless_basis, finite_body_fields, multipole_field_matrix
+from magloc.fields.multipole import finite_body_fields, multipole_field_matrix, traceless_basis
 from magloc.localization.dipole_validity import dipole_validity, nearness_test
 from magloc.measurement.differences import predicted_channels
 from tests import oracles
