@@ -280,6 +280,7 @@ def _started(binary: str, profile: str, size: tuple[int, int]) -> subprocess.Pop
         "--headless=new",
         "--disable-dev-shm-usage",
         "--disable-background-networking",
+        "--disable-features=BackForwardCache",  # a page that is left gives its socket back
         "--no-first-run",
         "--no-proxy-server",
         "--hide-scrollbars",
