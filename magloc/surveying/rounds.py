@@ -118,7 +118,7 @@ def found_in(model: Model, groups: Groups, grid: SearchGrid, known: Sources, mos
     least = math.inf
     felt_T = _FELT * float(model.record.array.channel_noise_T.min())
     searched_T: FloatArray = np.full_like(model.record.sensors_m, math.inf)
-    for _ in range(most):
+    for number in range(most):
         fit, _ = wide.fitted(sources, group, _SETTLED_COARSELY)
         at_once = _MOST_AT_ONCE
         if fit.chi2 > _WORSE * least:
@@ -131,6 +131,8 @@ def found_in(model: Model, groups: Groups, grid: SearchGrid, known: Sources, mos
         if in_vain > (_MOST_OF_MISFITS if fit.chi2 > _MISFIT * fit.residual.size else _MOST_IN_VAIN):
             break
         best, least = fit.sources, min(least, fit.chi2)
+        if number == most - 1:
+            break
         fields = fit.sources.fields(wide.record)
         if np.abs(fields - searched_T).max() > felt_T:
             candidates, searched_T = wide.candidates(fit.sources, grid, groups), fields
