@@ -68,6 +68,10 @@ class Magnets:
             present[-1, : int(0.3 * n_rows)] = present[-1, int(0.7 * n_rows) :] = False
         return cls(position, moment, present)
 
+    def first(self, n_rows: int) -> Magnets:
+        """The same for as long as some rows."""
+        return Magnets(self.position_m[:, :n_rows], self.moment_Am2[:, :n_rows], self.present[:, :n_rows])
+
     def readings_T(self, array: SensorArray, rng: np.random.Generator) -> FloatArray:
         """What the board reads (n, C)."""
         fields = np.zeros((self.present.shape[1], array.n_sensors, 3)) + AMBIENT_T

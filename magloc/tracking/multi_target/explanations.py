@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
 
@@ -29,6 +29,10 @@ MANOEUVRE_AGILITY = 10.0
 """How much faster than usual a source moves and turns in the step of a manoeuvre."""
 NAMES_A_ROW = 100
 """A source's name is this times the row of its birth, and a number."""
+MOST_BY_ITSELF = 5
+"""Sources that are searched for one by one; of more that takes seconds and leads nowhere."""
+# Squared distance in units of its covariance below which two states are one.
+_SAME_SIGMA2 = 1.0
 # What three readings of noise cost, and half as much again: a sensor that is well is better not left out.
 _LEFT_OUT = 4.5
 # A birth starts from so many cells, if they explain that much.
@@ -38,6 +42,16 @@ _WORTH_A_BIRTH = 16.0
 _WIDTH = 4
 _RETURNED = 3
 _AS_GOOD = 20.0
+# From nothing: explanations of which sources are split, and those that are refined, so often until they are that good.
+_SPLIT_WIDTH = 2
+_REFINED = 10
+_ROUNDS, _SCORE_GAIN = 4, 0.05
+# More sources are not looked for where one more was that much less likely, and explanations are kept up to that.
+_NO_MORE = 15.0
+_WEIGHED = 25.0
+_MOST_WEIGHED = 8
+# By what share of the distance to the nearest sensor the halves of a source are moved apart.
+_HALVES = 0.25
 _SAME_SCORE = 0.1
 _MUCH_STRONGER = 100.0
 # Share of a source's energy in one sensor above which no other sensor sees it.
@@ -139,11 +153,56 @@ class RowProblem:
 
         That the known sources manoeuvre is only tried where nothing else holds: else an old one jumps onto a newcomer.
         """
+        if not plain.ids:
+            return self.anew(plain.prior, plain.out) or self._beam(plain, self.scene.most_sources + 1)
         found = self._beam(plain, self.scene.most_sources + 1)
-        if found or not plain.ids:
+        if found:
             return found
         moved = self.updated(manoeuvring, plain.ids, plain.out, plain.penalty + MANOEUVRE)
         return [moved] if self.holds(moved) else self._beam(moved, 1)
+
+    def anew(self, common: JointState, out: BoolArray) -> list[Explanation]:
+        """Explanations from nothing that hold, the likeliest first, of each number of sources that is not hopeless.
+
+        Two sources may explain what three do, in a wrong place, and leave nothing for a birth to start from: so sources
+        are split in two as well, and all of them refined together.
+        """
+        level, best = [self.updated(common, (), out)], np.inf
+        found: list[Explanation] = []
+        while level and len(level[0].ids) < min(self.scene.most_sources, MOST_BY_ITSELF):
+            starts = [child for one in level[:_WIDTH] for child in self.births(one)]
+            starts += [child for one in level[:_SPLIT_WIDTH] for child in self._halved(common, one)]
+            level = apart(self._refined(common, one) for one in distinct(starts)[:_REFINED])
+            found += level
+            if level and level[0].score > best + _NO_MORE:
+                break
+            best = min([best, *(one.score for one in level)])
+        held = [one for one in sorted(found, key=_score) if self.holds(one) and self._allows(one.update)]
+        held = [one for one in held if one.score < held[0].score + _WEIGHED][:_MOST_WEIGHED]
+        return [replace(one, ids=self._names(len(one.ids), i * MOST_BY_ITSELF)) for i, one in enumerate(held)]
+
+    def _halved(self, common: JointState, found: Explanation) -> Iterator[Explanation]:
+        """The row explained with a source in two halves, along each axis."""
+        state = found.update.found
+        for k, (place_m, moment) in enumerate(zip(state.position_m, state.moment_Am2, strict=True)):
+            others = np.arange(len(state.position_m)) != k
+            in_array = self.row.R_world_from_array.T @ (place_m - self.row.origin_m)
+            nearest_m = float(np.linalg.norm(self.scene.array.positions - in_array, axis=1).min())
+            for axis in np.eye(3):
+                halves_m = place_m + _HALVES * nearest_m * np.stack([axis, -axis])
+                places_m = np.concatenate([state.position_m[others], halves_m])
+                moments = np.concatenate([state.moment_Am2[others], 0.5 * np.stack([moment, moment])])
+                yield self.found_anew(common, places_m, moments, found.out)
+
+    def _refined(self, common: JointState, found: Explanation) -> Explanation:
+        """The same with nothing known but where it was found, until that does not make it likelier."""
+        for _ in range(_ROUNDS):
+            state = found.update.found
+            again = self.found_anew(common, state.position_m, state.moment_Am2, found.out)
+            if not again.score < found.score - _SCORE_GAIN:
+                break
+            found = again
+        return found
 
     def of_more_sources(self, common: JointState, out: BoolArray, least: int) -> list[Explanation]:
         """Explanations from nothing, with some number of sources at least: fewer may hold in a row, and be wrong."""
@@ -221,27 +280,32 @@ class RowProblem:
             # Where it is found, not where it was looked for, is what the next event starts from.
             prior = self.with_source(found.prior, start.position_m[-1], start.moment_Am2[-1])
             child = self.updated(prior, ids, found.out, found.penalty + BIRTH)
-            if self._allows(child.update):
+            if self._allows(child.update, slice(-1, None)):
                 yield child
 
     @property
     def _first_id(self) -> int:
         return self.index * NAMES_A_ROW
 
-    def _allows(self, update: JointUpdate) -> bool:
-        """Whether the last source agrees with what is known, and may be told from a fault and from the ambient field.
+    def _allows(self, update: JointUpdate, born: slice = slice(None)) -> bool:
+        """Whether sources agree with what is known, and may be told from a fault and from the ambient field.
 
-        A single sensor that sees it may be at fault; one so far away that it is much stronger than the others is a
+        A single sensor that sees one may be at fault; one so far away that it is much stronger than the others is a
         gradient of the ambient field.
         """
-        position, moment = update.found.position_m[-1], update.found.moment_Am2[-1]
-        in_array = self.row.R_world_from_array.T @ (position - self.row.origin_m)
-        if not (self.scene.prior.allows_position(in_array) and self.scene.prior.allows_moment(moment)):
-            return False
         strength = np.linalg.norm(update.found.moment_Am2, axis=1)
         if strength.max() > _MUCH_STRONGER * strength.min():
             return False
-        energy = update.row.energy_of(position, moment)
+        return all(
+            self._allows_one(update.row, position, moment)
+            for position, moment in zip(update.found.position_m[born], update.found.moment_Am2[born], strict=True)
+        )
+
+    def _allows_one(self, row: JointRow, position_m: FloatArray, moment_Am2: FloatArray) -> bool:
+        in_array = self.row.R_world_from_array.T @ (position_m - self.row.origin_m)
+        if not (self.scene.prior.allows_position(in_array) and self.scene.prior.allows_moment(moment_Am2)):
+            return False
+        energy = row.energy_of(position_m, moment_Am2)
         return bool(energy.max() < _LONELY * energy.sum())
 
     def with_source(self, state: JointState, position_m: FloatArray, moment_Am2: FloatArray) -> JointState:
@@ -265,14 +329,41 @@ class RowProblem:
         state = common
         for position, moment in zip(positions_m, moments_Am2, strict=True):
             state = self.with_source(state, position, moment)
-        ids = tuple(self._first_id + 1 + k for k in range(len(positions_m)))
+        ids = self._names(len(positions_m))
         return self.updated(state, ids, out, BIRTH * len(ids))
+
+    def _names(self, number: int, after: int = 0) -> tuple[int, ...]:
+        return tuple(self._first_id + after + 1 + k for k in range(number))
 
 
 def distinct(found: Iterable[Explanation]) -> list[Explanation]:
     """The likeliest first, without those that are one: births from different cells often end in the same place."""
     kept: list[Explanation] = []
-    for one in sorted(found, key=lambda one: one.score):
+    for one in sorted(found, key=_score):
         if not any(abs(one.score - other.score) < _SAME_SCORE and len(one.ids) == len(other.ids) for other in kept):
             kept.append(one)
     return kept
+
+
+def apart(found: Iterable[Explanation]) -> list[Explanation]:
+    """The likeliest first, without those whose sources are where those of a likelier one are."""
+    kept: list[Explanation] = []
+    for one in sorted((one for one in found if np.isfinite(one.score)), key=_score):
+        if not any(are_same(one.update.state, other.update.state) for other in kept):
+            kept.append(one)
+    return kept
+
+
+def are_same(first: JointState, second: JointState) -> bool:
+    """Whether two states have the same sources, in some order."""
+    if first.n_sources != second.n_sources:
+        return False
+    offset = first.position_m[:, None] - second.position_m
+    at = first.of_source[:, :3]
+    inverse = np.linalg.inv(first.P[at[:, :, None], at[:, None, :]])
+    near = np.einsum("kli,kij,klj->kl", offset, inverse, offset) < _SAME_SIGMA2
+    return bool(near.any(axis=1).all() and near.any(axis=0).all())
+
+
+def _score(found: Explanation) -> float:
+    return found.score

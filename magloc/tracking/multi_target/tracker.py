@@ -21,10 +21,12 @@ from magloc.tracking.multi_target.explanations import (
     BIRTH,
     COST_LIMIT,
     MANOEUVRE_AGILITY,
+    MOST_BY_ITSELF,
     NAMES_A_ROW,
     Explanation,
     RowProblem,
     Scene,
+    are_same,
     distinct,
 )
 from magloc.tracking.multi_target.measurement import Channels
@@ -40,7 +42,6 @@ ROWS_TO_REPORT = 10
 """Rows after its birth in which a source is not yet told, unless there is no other: one taken for two dies sooner."""
 MERGED_GAP = 1.0 / 3.0
 """Standard deviation of a gap over the gap above which two sources are merged."""
-MOST_BY_ITSELF = 5
 # Hypotheses that are kept, and by how much they may be less likely (-2 ln).
 _MOST_HYPOTHESES = 8
 _LESS_LIKELY = 25.0
@@ -57,8 +58,10 @@ _MEMORIES = np.array([10.0, 80.0])
 _POOR = 5.0 / np.sqrt(2.0 * _MEMORIES - 1.0)
 # By how much it must be likelier in the end, or at once.
 _MUST_GAIN, _CLEAR_GAIN = 20.0, 60.0
-# Squared distances, in units of their covariance, below which two states are one, and two places may be of one source.
-_SAME_SIGMA2, _ANOTHER_SIGMA2 = 1.0, 25.0
+# Squared distance, in units of its covariance, below which two places may be of one source.
+_ANOTHER_SIGMA2 = 25.0
+# Farther than any two sources are apart.
+_BEYOND_M = 1e6
 # Standard deviation of ln |m| below which a source is none too many by itself.
 _CERTAIN_STRENGTH = 0.05
 # What a row costs at most that nothing explains.
@@ -239,7 +242,10 @@ class SourcesTracker:
         if not explanations:
             kept = replace(before, state=prior, score=before.score + min(plain.score, _UNBEARABLE))
             return [(self._with_excess(kept, plain), plain)]
-        return [(self._after(problem, before, found), found) for found in explanations]
+        after = [self._after(problem, before, found) for found in explanations]
+        if not before.ids:  # a source has one name wherever it may be the same
+            after[1:] = [replace(one, ids=_old_names(one, after[0])) for one in after[1:]]
+        return list(zip(after, explanations, strict=True))
 
     def _after(self, problem: RowProblem, before: Hypothesis, found: Explanation) -> Hypothesis:
         """A hypothesis after an explanation of the row."""
@@ -314,7 +320,7 @@ class SourcesTracker:
                 judged.append(one)
         kept: list[Hypothesis] = []
         for one in sorted(believed, key=_score):
-            same = (i for i, other in enumerate(kept) if _are_same(one.state, other.state))
+            same = (i for i, other in enumerate(kept) if are_same(one.state, other.state))
             if (i := next(same, None)) is not None:
                 score = -2.0 * np.logaddexp(-0.5 * one.score, -0.5 * kept[i].score)
                 kept[i] = replace(kept[i], score=float(score))
@@ -342,11 +348,11 @@ class SourcesTracker:
         merged = np.isin(np.arange(len(best.ids)), merged_pairs(best.state))
         believed = [one for one in self._hypotheses if not one.judged]
         likely = np.exp(-0.5 * np.array([one.score - best.score for one in believed]))
-        alike = [(one, weight) for one, weight in zip(believed, likely, strict=True) if one.ids == best.ids]
+        mates = [_mates(best, one) for one in believed]
         tracks = [
             SourcePoint(
                 row.time_s,
-                *_moments([one.state for one, _ in alike], np.array([weight for _, weight in alike]), k),
+                *_moments([one.state for one in believed], likely, [of_one.get(k) for of_one in mates]),
                 nis=chi2,
                 nis_dof=int(np.count_nonzero(row.available)),
                 status="predicted" if status in ("misfit", "no readings") else "merged" if merged[k] else status,
@@ -372,12 +378,23 @@ def _score(hypothesis: Hypothesis) -> float:
     return hypothesis.score
 
 
-def _moments(states: list[JointState], weights: FloatArray, source: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Position, moment and covariance of a source in a mixture of states."""
-    x = np.array([np.concatenate([one.position_m[source], one.moment_Am2[source]]) for one in states])
-    share = weights / weights.sum()
+def _mates(best: Hypothesis, other: Hypothesis) -> dict[int, int]:
+    """Which source of another hypothesis each of the best one's is: that of its name, or else the nearest one."""
+    apart_m = np.linalg.norm(best.state.position_m[:, None] - other.state.position_m, axis=-1)
+    apart_m[np.equal.outer(best.ids, other.ids)] = -_BEYOND_M
+    return {int(k): int(j) for k, j in zip(*linear_sum_assignment(apart_m), strict=True)}
+
+
+def _moments(
+    states: list[JointState], weights: FloatArray, sources: list[int | None]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Position, moment and covariance of a source in a mixture of states, of those that have it."""
+    parts = [(w, one, k) for w, one, k in zip(weights, states, sources, strict=True) if k is not None]
+    x = np.array([np.concatenate([one.position_m[k], one.moment_Am2[k]]) for _, one, k in parts])
+    share = np.array([weight for weight, _, _ in parts])
+    share /= share.sum()
     mean = share @ x
-    covariance = sum(part * one.covariance(source) for part, one in zip(share, states, strict=True))
+    covariance = sum(part * one.covariance(k) for part, (_, one, k) in zip(share, parts, strict=True))
     return mean[:3], mean[3:], covariance + (share[:, None] * (x - mean)).T @ (x - mean)
 
 
@@ -396,17 +413,6 @@ def _old_names(restart: Hypothesis, before: Hypothesis) -> tuple[int, ...]:
         if apart[new, old] < _ANOTHER_SIGMA2:
             names[new] = before.ids[old]
     return tuple(names)
-
-
-def _are_same(first: JointState, second: JointState) -> bool:
-    """Whether two states have the same sources, in some order."""
-    if first.n_sources != second.n_sources:
-        return False
-    offset = first.position_m[:, None] - second.position_m
-    at = first.of_source[:, :3]
-    inverse = np.linalg.inv(first.P[at[:, :, None], at[:, None, :]])
-    near = np.einsum("kli,kij,klj->kl", offset, inverse, offset) < _SAME_SIGMA2
-    return bool(near.any(axis=1).all() and near.any(axis=0).all())
 
 
 def merged_pairs(state: JointState) -> list[tuple[int, int]]:

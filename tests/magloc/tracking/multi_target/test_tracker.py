@@ -117,6 +117,25 @@ class TestTracks:
             np.testing.assert_allclose(np.array(other.range_interval_m), np.array(one.range_interval_m), rtol=0.01)
 
 
+class TestFirstRow:
+    def test_three_are_told_where_two_hold(self):
+        """Two in other places pass every test of this row; three are likelier by far."""
+        rng = np.random.default_rng(3)
+        truth = Magnets.drawn(3, 1000, 0.02, rng)
+        points, took = followed(BOARD, truth.readings_T(BOARD, rng)[:1])
+        (told,) = points
+        assert len(told.tracks) == 3
+        assert judged(points, truth.first(1), took).nees < 5.0
+
+    def test_what_the_row_leaves_open_is_told(self):
+        """Two in wrong places are a little likelier than the three that are there: the next row decides."""
+        rng = np.random.default_rng(7)
+        truth = Magnets.drawn(3, 1000, 0.02, rng)
+        points, took = followed(BOARD, truth.readings_T(BOARD, rng)[:4])
+        assert [len(point.tracks) for point in points] == [2, 3, 3, 3]
+        assert judged(points, truth.first(4), took).nees < 5.0
+
+
 class TestFaults:
     @pytest.mark.parametrize("kind", FAULTS)
     def test_a_sensor_that_dies_is_named(self, kind):
