@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ CHI2_REACHED = 0.05
 # Distance from the maximum-likelihood position that a filter with a prior may keep.
 PRIOR_REACHED_M = 0.5
 _PASS_S = 4e-8
+DEVICES = ("cpu", "cuda")
 
 
 class Filter(Protocol):
@@ -50,7 +51,10 @@ class _PositiveSettings:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if not (value > 0 or isinstance(value, bool) or (value == 0 and name == "tolerance_T")):
+            if name == "device":
+                if value not in DEVICES:
+                    raise ValueError(f"Input device must be one of {', '.join(DEVICES)}; instead received {value!r}.")
+            elif not (value > 0 or isinstance(value, bool) or (value == 0 and name == "tolerance_T")):
                 raise ValueError(f"Input {name} must be positive; instead received {value}.")
 
 
@@ -97,6 +101,8 @@ class RepeatedFilter(_LikelihoodFilter):
         Stop when the predicted differences change by less than this between passes [T].
     max_iterations : int
         Passes at most.
+    device : str
+        cpu, or cuda: an NVIDIA graphics processor, which does not relinearise before every scalar.
 
     Examples
     --------
@@ -115,6 +121,12 @@ class RepeatedFilter(_LikelihoodFilter):
     relinearise_every_scalar: bool = False
     tolerance_T: float = 1e-12
     max_iterations: int = 200
+    device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.relinearise_every_scalar and self.device != "cpu":
+            raise ValueError(f"Input device must be cpu for relinearise_every_scalar; instead received {self.device}.")
 
     @property
     def pass_s(self) -> float:
@@ -133,7 +145,9 @@ class RepeatedFilter(_LikelihoodFilter):
         steps = self.position_step_m, self.moment_step_Am2
         if self.relinearise_every_scalar:
             return Ends(*relinearised_map(starts, z, variance, sensors, weights, inflation, *steps, *rule))
-        found = ends(REPEATED, Model.of(z, inflation * variance, sensors, weights, *steps), starts, *rule)
+        found = ends(
+            REPEATED, Model.of(z, inflation * variance, sensors, weights, *steps), starts, *rule, device=self.device
+        )
         return found._replace(chi2=inflation * found.chi2)
 
     def run_one(self, measurement: DifferenceMeasurement, z: FloatArray, start: FloatArray) -> IteratedUpdate:
@@ -169,16 +183,19 @@ class IekfFilter(_PriorFilter):
         Stop when the predicted differences change by less than this between iterations [T].
     max_iterations : int
         Linearisations at most.
+    device : str
+        cpu, or cuda: an NVIDIA graphics processor.
     """
 
     name: ClassVar[str] = "iekf"
     tolerance_T: float = 1e-12
     max_iterations: int = 200
+    device: str = "cpu"
 
     def run(self, measurement: DifferenceMeasurement, z: FloatArray, starts: FloatArray) -> Ends:
         """End of every start (n, 6), compiled; :meth:`run_one` is the readable twin."""
         model = Model.of(*_inputs(measurement, z), self.position_sigma_m, self.moment_sigma_Am2)
-        return ends(IEKF, model, starts, self.tolerance_T, self.max_iterations)
+        return ends(IEKF, model, starts, self.tolerance_T, self.max_iterations, device=self.device)
 
     def run_one(self, measurement: DifferenceMeasurement, z: FloatArray, start: FloatArray) -> IteratedUpdate:
         """End of one start (6,), by :func:`magloc.kalman.iterated_update`."""
@@ -214,6 +231,8 @@ class DampedFilter(_PriorFilter):
         changes them by less as well, stop.
     max_iterations : int
         Linearisations at most, at states that are not taken as well.
+    device : str
+        cpu, or cuda: an NVIDIA graphics processor.
 
     Notes
     -----
@@ -224,11 +243,13 @@ class DampedFilter(_PriorFilter):
     first_damping: float = 1.0
     tolerance_T: float = 1e-12
     max_iterations: int = 200
+    device: str = "cpu"
 
     def run(self, measurement: DifferenceMeasurement, z: FloatArray, starts: FloatArray) -> Ends:
         """End of every start (n, 6), compiled; :meth:`run_one` is the readable twin."""
         model = Model.of(*_inputs(measurement, z), self.position_sigma_m, self.moment_sigma_Am2)
-        return ends(DAMPED, model, starts, self.tolerance_T, self.max_iterations, self.first_damping)
+        rule = self.tolerance_T, self.max_iterations, self.first_damping
+        return ends(DAMPED, model, starts, *rule, self.device)
 
     def run_one(self, measurement: DifferenceMeasurement, z: FloatArray, start: FloatArray) -> IteratedUpdate:
         """End of one start (6,), in units of the standard deviations of readings and prior."""
@@ -303,6 +324,11 @@ class GlobalFilter(_LikelihoodFilter):
 FILTERS: dict[str, Filter] = {
     method.name: method for method in (RepeatedFilter(), IekfFilter(), DampedFilter(), GlobalFilter())
 }
+
+
+def settings(method: Filter) -> dict[str, Any]:
+    """What a filter computes with, whichever machine does it."""
+    return {name: value for name, value in vars(method).items() if name != "device"}
 
 
 def _inputs(measurement: DifferenceMeasurement, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:

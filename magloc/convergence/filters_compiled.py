@@ -34,11 +34,13 @@ from magloc.convergence.workspace_compiled import (
     PRIOR,
     RIGHT,
     SENSOR_ROWS,
+    START,
     STATE,
     STOPPED,
     WORKSPACE,
     add_identity,
     aligned,
+    lanes_of,
     swept,
     swept_once,
     triangle,
@@ -73,7 +75,7 @@ class Ends(NamedTuple):
     stopped: NDArray[np.bool_]
 
 
-class _Rules(NamedTuple):
+class Rules(NamedTuple):
     """First damping, square of the tolerance in the model's unit of fields, most iterations."""
 
     first_damping: float
@@ -82,59 +84,87 @@ class _Rules(NamedTuple):
 
 
 def ends(
-    method: int, model: Model, starts: FloatArray, tolerance_T: float, max_iterations: int, first_damping: float = 0.0
+    method: int,
+    model: Model,
+    starts: FloatArray,
+    tolerance_T: float,
+    max_iterations: int,
+    first_damping: float = 0.0,
+    device: str = "cpu",
 ) -> Ends:
     """End of every start (n, 6), the mean of its prior, by IEKF, REPEATED or DAMPED; a step has the prior's units."""
     unit = np.repeat([model.length, model.moment], 3)
     tolerance = tolerance_T / (model.moment / model.length**3)
-    states, chi2, iterations, stopped = _run(
-        method,
-        np.ascontiguousarray(starts / unit),
-        _Rules(float(first_damping), tolerance**2, float(max_iterations)),
-        min(get_num_threads(), -(-len(starts) // LANES)),
-        model,
-    )
+    rules = Rules(float(first_damping), tolerance**2, float(max_iterations))
+    in_units = np.ascontiguousarray(starts / unit)
+    if device == "cpu":
+        found = _run(method, in_units, rules, min(get_num_threads(), -(-len(starts) // LANES)), model)
+    else:
+        from magloc.convergence.filters_cuda import run_on_device
+
+        found = run_on_device(method, in_units, rules, model)
+    states, chi2, iterations, stopped = found
     return Ends(states * unit, chi2, iterations, stopped)
+
+
+class Workspace(NamedTuple):
+    """What the lanes of a block have in memory: LANES numbers a row."""
+
+    rows: FloatArray  # :mod:`magloc.convergence.workspace_compiled` has their order
+    fields: FloatArray  # SENSOR_ROWS a sensor, for the matrix form
+    before: FloatArray  # residuals of two passes
+    residuals: FloatArray
+
+
+@compiled
+def n_rows(model: Model) -> tuple[int, int, int]:
+    """Rows of the workspace's first three parts."""
+    if model.blend.size:
+        return WORKSPACE // LANES, 0, 3 * model.blend.size
+    return WORKSPACE // LANES, SENSOR_ROWS * (model.sensors.size // 3), model.measured.size
 
 
 @compiled_parallel
 def _run(
-    method: int, starts: FloatArray, rules: _Rules, n_blocks: int, model: Model
+    method: int, starts: FloatArray, rules: Rules, n_blocks: int, model: Model
 ) -> tuple[FloatArray, FloatArray, NDArray[np.int64], NDArray[np.bool_]]:
     n = starts.shape[0]
     states, chi2 = np.empty((n, 6)), np.empty(n)
     iterations, stopped = np.empty(n, np.int64), np.empty(n, np.bool_)
     for block in prange(n_blocks):
-        _run_block(method, starts, block, n_blocks, rules, model, Ends(states, chi2, iterations, stopped))
+        n_w, n_fields, n_residuals = n_rows(model)
+        w, fields = aligned(n_w * LANES), aligned(n_fields * LANES)
+        space = Workspace(w, fields, aligned(n_residuals * LANES), aligned(n_residuals * LANES))
+        out = Ends(states, chi2, iterations, stopped)
+        run_every(method, starts, np.int64(block), n_blocks, rules, model, space, out, None)
     return states, chi2, iterations, stopped
 
 
 @compiled
-def _run_block(
+def run_every(
     method: int,
     starts: FloatArray,
-    block: int,
-    n_blocks: int,
-    rules: _Rules,
+    first: int | np.int64,
+    every: int,
+    rules: Rules,
     model: Model,
+    space: Workspace,
     out: Ends,
+    lane: int | None,
 ) -> None:
-    """Starts block, block + n_blocks, … from first to last."""
-    n, first = starts.shape[0], np.int64(block)  # prange counts in unsigned numbers
-    w = aligned(WORKSPACE)
+    """Starts first, first + every, … from first to last, in one lane of the workspace, or in all of them."""
+    n = starts.shape[0]
+    w, before, residuals = space.rows, space.before, space.residuals
     in_rows = model.blend.size == 0
-    n_residuals = model.measured.size if in_rows else 3 * model.blend.size
-    fields = aligned(SENSOR_ROWS * LANES * (model.sensors.size // 3) if in_rows else 0)
-    before, residuals = aligned(n_residuals * LANES), aligned(n_residuals * LANES)
-    start_of_lane = np.full(LANES, -1)
-    w[DONE : DONE + LANES] = 1.0
+    for i in lanes_of(lane):
+        w[DONE + i] = 1.0
     next_start, active = first, 0
     while True:
-        for i in range(LANES):
+        for i in lanes_of(lane):
             if w[DONE + i] == 0.0:
                 continue
             w[DONE + i] = 0.0
-            start = min(next_start, n - 1)  # an idle lane computes something, too
+            start = next_start if next_start < n else n - 1  # an idle lane computes something, too
             for r in range(6):
                 w[STATE + r * LANES + i] = starts[start, r]
                 w[PRIOR + r * LANES + i] = starts[start, r]
@@ -142,25 +172,29 @@ def _run_block(
             if method == REPEATED:
                 _begin_information(w, i)
             w[ITERATIONS + i] = 0.0 if next_start < n else -math.inf
-            start_of_lane[i] = next_start
+            w[START + i] = next_start
             active += next_start < n
-            next_start += n_blocks
+            next_start += every
         if active == 0:
             return
-        w[NORMAL : CHI2 + LANES] = 0.0
-        w[CHANGE : CHANGE + 3 * LANES] = 0.0
+        for r in range(LINEARISATION - 6):
+            for i in lanes_of(lane):
+                w[NORMAL + r * LANES + i] = 0.0
+        for r in range(3):
+            for i in lanes_of(lane):
+                w[CHANGE + r * LANES + i] = 0.0
         if in_rows:
-            linearise_rows(w, fields, before, residuals, model)
+            linearise_rows(w, space.fields, before, residuals, model, lane)
         else:
-            linearise_contrasts(w, before, residuals, model)
+            linearise_contrasts(w, before, residuals, model, lane)
         if method == DAMPED:
-            _judge(w, before, residuals, rules)
+            _judge(lane, w, before, residuals, rules)
         else:
-            _see_ends(w, rules)
+            _see_ends(lane, w, rules)
         before, residuals = residuals, before
-        for i in range(LANES):
+        for i in lanes_of(lane):
             if w[DONE + i] != 0.0:
-                k = start_of_lane[i]
+                k = int(w[START + i])
                 for r in range(6):
                     out.states[k, r] = w[STATE + r * LANES + i]
                 out.chi2[k] = w[CHI2 + i]
@@ -168,9 +202,9 @@ def _run_block(
                 out.stopped[k] = w[STOPPED + i] != 0.0
                 active -= 1
         if method == REPEATED:
-            _step_and_grow(w)
+            _step_and_grow(lane, w)
         else:
-            _step_from_prior(w)
+            _step_from_prior(lane, w)
 
 
 @compiled
@@ -183,10 +217,10 @@ def _begin_information(w: FloatArray, i: int) -> None:
 
 
 @compiled
-def _see_ends(w: FloatArray, rules: _Rules) -> None:
+def _see_ends(lane: int | None, w: FloatArray, rules: Rules) -> None:
     """Rows DONE and STOPPED."""
     tolerance2, max_iterations = rules.tolerance2, rules.max_iterations
-    for i in range(LANES):
+    for i in lanes_of(lane):
         n, change = w[ITERATIONS + i], w[CHANGE + i] + w[CHANGE + LANES + i] + w[CHANGE + 2 * LANES + i]
         stopped = change < tolerance2
         done = (n > 0.0) & (stopped | (n >= max_iterations) | (not (change < math.inf)))
@@ -195,10 +229,10 @@ def _see_ends(w: FloatArray, rules: _Rules) -> None:
 
 
 @compiled
-def _judge(w: FloatArray, before: FloatArray, residuals: FloatArray, rules: _Rules) -> None:
+def _judge(lane: int | None, w: FloatArray, before: FloatArray, residuals: FloatArray, rules: Rules) -> None:
     """Accept the trial state if it lowers the cost, adapt the damping, and see which starts end."""
     tolerance2, max_iterations = rules.tolerance2, rules.max_iterations
-    for i in range(LANES):
+    for i in lanes_of(lane):
         x0, x1, x2, x3, x4, x5 = vector(w, STATE, i)
         p0, p1, p2, p3, p4, p5 = vector(w, PRIOR, i)
         d0, d1, d2, d3, d4, d5 = x0 - p0, x1 - p1, x2 - p2, x3 - p3, x4 - p4, x5 - p5
@@ -220,15 +254,15 @@ def _judge(w: FloatArray, before: FloatArray, residuals: FloatArray, rules: _Rul
         w[ACCEPT + i] = 1.0 if accept else 0.0
         w[STOPPED + i] = 1.0 if stopped else 0.0
         w[DONE + i] = 1.0 if done else 0.0
-    _keep_best(w, w[:BEST], w[BEST : BEST + LINEARISATION * LANES])
-    _keep_best(w, residuals, before)
+    _keep_best(lane, w, w[:BEST], w[BEST : BEST + LINEARISATION * LANES])
+    _keep_best(lane, w, residuals, before)
 
 
 @compiled
-def _keep_best(w: FloatArray, trial: FloatArray, best: FloatArray) -> None:
+def _keep_best(lane: int | None, w: FloatArray, trial: FloatArray, best: FloatArray) -> None:
     """All rows of both become the trial's in the lanes where it was accepted, and those of the best elsewhere."""
     for r in range(trial.size // LANES):
-        for i in range(LANES):
+        for i in lanes_of(lane):
             new, old = trial[r * LANES + i], best[r * LANES + i]
             value = new if w[ACCEPT + i] != 0.0 else old
             trial[r * LANES + i] = value
@@ -236,25 +270,27 @@ def _keep_best(w: FloatArray, trial: FloatArray, best: FloatArray) -> None:
 
 
 @compiled
-def _step_from_prior(w: FloatArray) -> None:
+def _step_from_prior(lane: int | None, w: FloatArray) -> None:
     """Gauss-Newton step on χ² and prior, with the normal matrix's diagonal damped."""
-    for i in range(6 * LANES):
-        w[RIGHT + i] -= w[STATE + i] - w[PRIOR + i]
-    for i in range(LANES):
+    for r in range(6):
+        for i in lanes_of(lane):
+            w[RIGHT + r * LANES + i] -= w[STATE + r * LANES + i] - w[PRIOR + r * LANES + i]
+    for i in lanes_of(lane):
         add_identity(w, NORMAL, i, 1.0 + w[DAMPING + i])
         _move(w, i)
 
 
 @compiled
-def _step_and_grow(w: FloatArray) -> None:
+def _step_and_grow(lane: int | None, w: FloatArray) -> None:
     """Update of the predicted state, and the information A of the next prediction.
 
     With Y = JᵀJ + A the information after the update, ``(Y⁻¹ + I)⁻¹ = I - (Y + I)⁻¹``. The covariance grows by I a pass
     at most, so A stays above 1 / (passes + 1) and the subtraction is harmless.
     """
-    for i in range(21 * LANES):
-        w[NORMAL + i] += w[INFORMATION + i]
-    for i in range(LANES):
+    for r in range(21):
+        for i in lanes_of(lane):
+            w[NORMAL + r * LANES + i] += w[INFORMATION + r * LANES + i]
+    for i in lanes_of(lane):
         _move(w, i)
         add_identity(w, NORMAL, i, 1.0)
         t = swept((*triangle(w, NORMAL, i), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))

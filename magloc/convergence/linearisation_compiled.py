@@ -23,6 +23,7 @@ from magloc.convergence.workspace_compiled import (
     SENSOR,
     SENSOR_ROWS,
     STATE,
+    lanes_of,
 )
 from magloc.fields.dipole_compiled import field_matrix_components, gradient_components
 
@@ -115,29 +116,33 @@ def linearise_contrasts(
     before: FloatArray,
     residuals: FloatArray,
     model: Model,
+    lane: int | None,
 ) -> None:
     """Add all sensors to NORMAL, RIGHT and CHI2 by recursive contrasts; CHANGE, and the residuals that it compares."""
     sensors, readings, blend, whiten = model.sensors, model.readings, model.blend, model.whiten
     for s in range(blend.size):
         _sensor_fields(
-            w, sensors[3 * s], sensors[3 * s + 1], sensors[3 * s + 2],
+            lane, w, sensors[3 * s], sensors[3 * s + 1], sensors[3 * s + 2],
             readings[3 * s], readings[3 * s + 1], readings[3 * s + 2],
         )  # fmt: skip
         if s == 0:
-            for i in range(SENSOR_ROWS * LANES):
-                w[COMMON + i] = w[SENSOR + i]
-            for i in range(3 * LANES):
-                w[BASE + i] = w[SENSOR + i]
+            for r in range(SENSOR_ROWS):
+                for i in lanes_of(lane):
+                    w[COMMON + r * LANES + i] = w[SENSOR + r * LANES + i]
+            for r in range(3):
+                for i in lanes_of(lane):
+                    w[BASE + r * LANES + i] = w[SENSOR + r * LANES + i]
         # An orthonormal transform of the differences leaves the sum of their squares alone: no need to transform them.
-        for i in range(3 * LANES):
-            residual = w[SENSOR + i] - w[BASE + i]
-            change = residual - before[3 * LANES * s + i]
-            residuals[3 * LANES * s + i] = residual
-            w[CHANGE + i] += change * change
+        for r in range(3):
+            for i in lanes_of(lane):
+                residual = w[SENSOR + r * LANES + i] - w[BASE + r * LANES + i]
+                change = residual - before[(3 * s + r) * LANES + i]
+                residuals[(3 * s + r) * LANES + i] = residual
+                w[CHANGE + r * LANES + i] += change * change
         if s == 0:
             continue
         a, b = blend[s], whiten[s]
-        for i in range(LANES):
+        for i in lanes_of(lane):
             ex, ey, ez = _contrast(w, 0, i, a, b), _contrast(w, 1, i, a, b), _contrast(w, 2, i, a, b)
             gxx, gxy, gxz = _contrast(w, 3, i, a, b), _contrast(w, 4, i, a, b), _contrast(w, 5, i, a, b)
             gyy, gyz = _contrast(w, 6, i, a, b), _contrast(w, 7, i, a, b)
@@ -156,26 +161,32 @@ def linearise_rows(
     before: FloatArray,
     residuals: FloatArray,
     model: Model,
+    lane: int | None,
 ) -> None:
     """:func:`linearise_contrasts` for any weights of the fields in the differences, row by row."""
     sensors, rows, measured, variance = model.sensors, model.rows, model.measured, model.variance
     for s in range(rows.shape[1]):
-        _sensor_fields(w, sensors[3 * s], sensors[3 * s + 1], sensors[3 * s + 2], 0.0, 0.0, 0.0)
-        fields[SENSOR_ROWS * LANES * s : SENSOR_ROWS * LANES * (s + 1)] = w[SENSOR : SENSOR + SENSOR_ROWS * LANES]
+        _sensor_fields(lane, w, sensors[3 * s], sensors[3 * s + 1], sensors[3 * s + 2], 0.0, 0.0, 0.0)
+        for r in range(SENSOR_ROWS):
+            for i in lanes_of(lane):
+                fields[(SENSOR_ROWS * s + r) * LANES + i] = w[SENSOR + r * LANES + i]
     for j in range(measured.size):
-        w[ROW : ROW + LANES] = measured[j]
-        w[ROW + LANES : ROW + 7 * LANES] = 0.0
+        for r in range(7):
+            for i in lanes_of(lane):
+                w[ROW + r * LANES + i] = 0.0 if r else measured[j]
         for s in range(rows.shape[1]):
             if rows[j, s, 0] != 0.0 or rows[j, s, 1] != 0.0 or rows[j, s, 2] != 0.0:
                 of_sensor = slice(SENSOR_ROWS * LANES * s, SENSOR_ROWS * LANES * (s + 1))
-                _add_to_row(w, fields[of_sensor], rows[j, s, 0], rows[j, s, 1], rows[j, s, 2])
-        _add_row(w, before[j * LANES : (j + 1) * LANES], residuals[j * LANES : (j + 1) * LANES], variance[j])
+                _add_to_row(lane, w, fields[of_sensor], rows[j, s, 0], rows[j, s, 1], rows[j, s, 2])
+        _add_row(lane, w, before[j * LANES : (j + 1) * LANES], residuals[j * LANES : (j + 1) * LANES], variance[j])
 
 
 @inlined
-def _sensor_fields(w: FloatArray, sx: float, sy: float, sz: float, yx: float, yy: float, yz: float) -> None:
+def _sensor_fields(
+    lane: int | None, w: FloatArray, sx: float, sy: float, sz: float, yx: float, yy: float, yz: float
+) -> None:
     """Rows SENSOR: reading minus field of the states at one sensor, and the field's derivatives."""
-    for i in range(LANES):
+    for i in lanes_of(lane):
         dx, dy, dz = sx - w[STATE + i], sy - w[STATE + LANES + i], sz - w[STATE + 2 * LANES + i]
         mx, my, mz = w[STATE + 3 * LANES + i], w[STATE + 4 * LANES + i], w[STATE + 5 * LANES + i]
         axx, axy, axz, ayy, ayz, azz = field_matrix_components(dx, dy, dz)
@@ -204,9 +215,9 @@ def _contrast(w: FloatArray, quantity: int, i: int, blend: float, whiten: float)
 
 
 @compiled
-def _add_to_row(w: FloatArray, f: FloatArray, x: float, y: float, z: float) -> None:
+def _add_to_row(lane: int | None, w: FloatArray, f: FloatArray, x: float, y: float, z: float) -> None:
     """Add one sensor, whose rows SENSOR are f, to a difference with the weights x, y, z of its field."""
-    for i in range(LANES):
+    for i in lanes_of(lane):
         gxx, gxy, gxz, gyy = f[3 * LANES + i], f[4 * LANES + i], f[5 * LANES + i], f[6 * LANES + i]
         gyz = f[7 * LANES + i]
         axx, axy, axz, ayy = f[8 * LANES + i], f[9 * LANES + i], f[10 * LANES + i], f[11 * LANES + i]
@@ -221,9 +232,9 @@ def _add_to_row(w: FloatArray, f: FloatArray, x: float, y: float, z: float) -> N
 
 
 @compiled
-def _add_row(w: FloatArray, before: FloatArray, residuals: FloatArray, variance: float) -> None:
+def _add_row(lane: int | None, w: FloatArray, before: FloatArray, residuals: FloatArray, variance: float) -> None:
     """Add a difference to NORMAL, RIGHT and CHI2, and its part of ‖ΔG‖² to CHANGE."""
-    for i in range(LANES):
+    for i in lanes_of(lane):
         r = w[ROW + i]
         change = r - before[i]
         w[CHANGE + i] += variance * (change * change)

@@ -49,7 +49,7 @@ from magloc.measurement.differences import DifferenceMeasurement, predicted_chan
 if TYPE_CHECKING:
     import xarray as xr
 from arrays.typing import FloatArray
-from magloc.convergence.filters import FILTERS, Filter, RepeatedFilter
+from magloc.convergence.filters import FILTERS, Filter, RepeatedFilter, settings
 from magloc.convergence.filters_compiled import Ends
 
 
@@ -167,7 +167,7 @@ class StartsMap(CubeMap):
         scenario = self.scenario
         return {
             "method": scenario.method.name,
-            **{f"method_{key}": _attribute(value) for key, value in vars(scenario.method).items()},
+            **{f"method_{key}": _attribute(value) for key, value in settings(scenario.method).items()},
             "position_m": np.asarray(scenario.position_m),
             "moment_Am2": np.asarray(scenario.moment_Am2),
             "centroid_m": scenario.array.centroid,

@@ -13,7 +13,7 @@ from arrays.array_file import array_of_table, read_array
 from arrays.io.errors import InputError, naming
 from arrays.io.toml import POSITIVE, BuiltIn, File, NotNegative, RefusalError, Rule, Table, in_si, one_of, section_of
 from arrays.typing import Vector
-from magloc.convergence.filters import FILTERS, Filter
+from magloc.convergence.filters import FILTERS, Filter, settings
 from magloc.convergence.over_sources import SourcesScenario
 from magloc.convergence.over_starts import StartsScenario
 
@@ -68,7 +68,7 @@ def _table_of(method: Filter) -> type[msgspec.Struct]:
     """The table of a filter: its fields, tolerances in nT."""
     fields = [
         (_key(name), Annotated[type(value), POSITIVE, _SENSIBLE] if not isinstance(value, bool) else bool, value)
-        for name, value in vars(method).items()
+        for name, value in settings(method).items()
     ]
     inline = {"is_inline": True}
     return msgspec.defstruct(f"_{type(method).__name__}", fields, bases=(Table,), namespace=inline, kw_only=True)

@@ -29,7 +29,8 @@ SENSOR = 105 * LANES  # one sensor: residual (3), gradient tensor (xx, xy, xz, y
 COMMON = 118 * LANES  # their weighted means over the sensors so far
 BASE = 131 * LANES  # residual at the base sensor (3)
 ROW = 134 * LANES  # one difference: residual, Jacobian (6)
-WORKSPACE = 141 * LANES
+START = 141 * LANES  # number of the lane's start
+WORKSPACE = 142 * LANES
 SENSOR_ROWS = 13
 DIAGONAL = (0, 6, 11, 15, 18, 20)  # rows of an upper triangle
 
@@ -40,6 +41,14 @@ def aligned(size: int) -> FloatArray:
     zeros = np.zeros(size + 8)
     first = (-(zeros.ctypes.data // 8)) % 8
     return zeros[first : first + size]
+
+
+@inlined
+def lanes_of(lane: int | None) -> range:
+    """The lanes that a thread computes: all of its block, as vector instructions, or one on a graphics processor."""
+    if lane is None:
+        return range(LANES)
+    return range(lane, lane + 1)
 
 
 @inlined

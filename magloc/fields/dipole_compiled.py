@@ -13,6 +13,8 @@ The arithmetic is that of the twin with n = d/r multiplied out, which saves thre
 rounding for distances from 1e-50 m to 1e50 m. On the source both are NaN.
 """
 
+import math
+
 import numpy as np
 from numba import prange
 from numpy.typing import ArrayLike, NDArray
@@ -43,7 +45,7 @@ def field_components(dx: float, dy: float, dz: float, mx: float, my: float, mz: 
 @compiled
 def field_matrix_components(dx: float, dy: float, dz: float) -> SymmetricComponents:
     """Matrix A with B = A m at the displacement d (m), in T/(A m^2), as (xx, xy, xz, yy, yz, zz), equation (2)."""
-    inv_r = 1.0 / np.sqrt(dx * dx + dy * dy + dz * dz)
+    inv_r = 1.0 / math.sqrt(dx * dx + dy * dy + dz * dz)
     inv_r2 = inv_r * inv_r
     scale = MU0_OVER_4PI * inv_r2 * inv_r
     x = 3.0 * inv_r2 * dx
@@ -62,7 +64,7 @@ def field_matrix_components(dx: float, dy: float, dz: float) -> SymmetricCompone
 @compiled
 def gradient_components(dx: float, dy: float, dz: float, mx: float, my: float, mz: float) -> SymmetricComponents:
     """Gradient tensor in T/m at the displacement d (m) from a dipole, as (xx, xy, xz, yy, yz, zz), equation (3)."""
-    inv_r = 1.0 / np.sqrt(dx * dx + dy * dy + dz * dz)
+    inv_r = 1.0 / math.sqrt(dx * dx + dy * dy + dz * dz)
     inv_r2 = inv_r * inv_r
     scale = 3.0 * MU0_OVER_4PI * inv_r2 * inv_r2 * inv_r
     radial = dx * mx + dy * my + dz * mz
