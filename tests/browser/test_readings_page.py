@@ -60,7 +60,8 @@ class TestReadings:
         screen.keep("readings")
 
     def test_what_is_not_connected_yet_says_so(self, screen: Screen, server: viser.ViserServer) -> None:
-        """viser's page says "Inactive" until it has connected."""
+        """viser's page says "Inactive" until it has connected: in its first minute."""
+        screen.open(f"http://127.0.0.1:{server.get_port()}")
         screen.evaluate("document.body.append(Object.assign(document.createElement('p'), {innerText: 'Inactive'}))")
         screen.until(lambda: "Connecting…" in screen.text() and "Inactive" not in screen.text(), "it connects")
 
