@@ -1,8 +1,10 @@
-"""What is closed, or goes on again, at the end of a block."""
+"""What is closed, goes on again, or is first heard of, at the end of a block."""
 
 from __future__ import annotations
 
 import gc
+import signal
+import threading
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -34,3 +36,23 @@ def garbage_waits() -> Iterator[None]:
     finally:
         if collects:
             gc.enable()
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Let signals wait for the end of the block: compiled code and writing would fail with errors of their own."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # which no signal interrupts
+        return
+    signals: list[int] = []
+    before = {
+        number: signal.signal(number, lambda number, _: signals.append(number)) or signal.SIG_DFL
+        for number in (signal.SIGINT, signal.SIGTERM)
+    }
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    if signals:
+        signal.raise_signal(signals[0])

@@ -7,6 +7,7 @@ import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
+from arrays.io.closing import uninterrupted
 from arrays.io.errors import InputError
 
 
@@ -50,7 +51,8 @@ def refuse_one_for_two(outputs: Mapping[str, Path | None]) -> None:
 def _refuse_closed(folder: Path, wanted: Path, option: str, prefix: str = ".") -> None:
     """Refuse a folder in which no file can be made: only an attempt tells, of whatever user and file system."""
     try:
-        with tempfile.NamedTemporaryFile(dir=folder, prefix=prefix, suffix=".tmp"):  # a name, which may be too long
+        # Of a name that may be too long. An interruption waits, or the file would be left behind.
+        with uninterrupted(), tempfile.NamedTemporaryFile(dir=folder, prefix=prefix, suffix=".tmp"):
             pass
     except OSError as error:
         raise InputError(

@@ -7,13 +7,10 @@ into a store on disk: :mod:`magloc.grids.store`).
 
 from __future__ import annotations
 
-import signal
-import threading
 import time
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from enum import IntEnum
 from importlib.metadata import version
@@ -24,6 +21,7 @@ from numpy.typing import NDArray
 
 from arrays.array import SensorArray
 from arrays.array_file import array_toml
+from arrays.io.closing import uninterrupted
 from arrays.io.errors import check_positive
 from arrays.typing import FloatArray
 
@@ -292,26 +290,6 @@ def computed_here(cube: CubeMap, wanted: Iterable[Box]) -> Iterator[Chunk]:
     cube.warm_up()  # once: between boxes an interruption would find compiled code that nothing protects
     for box in wanted:
         yield _computed_warm(cube, box)
-
-
-@contextmanager
-def uninterrupted() -> Iterator[None]:
-    """Let signals wait for the end of the block: compiled code and writing would fail with errors of their own."""
-    if threading.current_thread() is not threading.main_thread():
-        yield  # which no signal interrupts
-        return
-    signals: list[int] = []
-    before = {
-        number: signal.signal(number, lambda number, _: signals.append(number)) or signal.SIG_DFL
-        for number in (signal.SIGINT, signal.SIGTERM)
-    }
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-    if signals:
-        signal.raise_signal(signals[0])
 
 
 def coordinates(cube: CubeMap) -> dict[str, tuple[FloatArray, dict[str, str]]]:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from arrays.io.closing import Closing
+from arrays.io.closing import Closing, uninterrupted
 from arrays.io.errors import InputError, of_extra
 from arrays.typing import FloatArray
 from magloc.grids.cube import (
@@ -30,7 +30,6 @@ from magloc.grids.cube import (
     Values,
     coordinates,
     tiles,
-    uninterrupted,
 )
 
 if TYPE_CHECKING:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import itertools
 import json
 import os
@@ -17,14 +18,13 @@ from typing import Any
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
-from arrays.io.closing import Closing
+from arrays.io.closing import Closing, uninterrupted
 from arrays.io.errors import InputError
-from magloc.grids.cube import uninterrupted
 
 BINARIES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 # WebGL in software: without both of these the canvas stays blank on a machine without a graphics card.
 _SOFTWARE_WEBGL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
-# Ends the browser and removes its folder if this process is killed, which closes stdin.
+# Ends the browser with all its children and removes its folder once stdin is closed: by us, or as we are killed.
 _GUARD = 'exec >/dev/null 2>&1; read pid; cat; [ -z "$pid" ] || kill -9 "-$pid"; until rm -rf "$0"; do sleep 0.1; done'
 _POLL_S = 0.05
 _REPLY_S = 60.0
@@ -105,12 +105,14 @@ class Chromium(Closing):
                 self._process.kill()
                 self._process.wait()
             self._process = None
-        if self._profile:
-            shutil.rmtree(self._profile, ignore_errors=True)
-        if self._guard is not None:  # until here it would do the same
-            self._guard.kill()
-            self._guard.communicate()
-            self._guard = None
+        if self._guard is None:
+            if self._profile:
+                shutil.rmtree(self._profile, ignore_errors=True)
+            return
+        # Children of the browser outlive it, and write while its folder is removed: the guard ends them first.
+        with contextlib.suppress(subprocess.TimeoutExpired):  # it goes on without us
+            self._guard.communicate(timeout=10.0)
+        self._guard = None
 
     def open(self, url: str) -> None:
         """Open another page.

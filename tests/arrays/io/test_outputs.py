@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
+import signal
+import tempfile
 from pathlib import Path
+from typing import Any
 
 import pytest
 from matplotlib.figure import Figure
@@ -50,6 +53,23 @@ class TestRefuseUnwritable:
 
     def test_what_is_no_file_is_written_in_place(self, tmp_path: Path) -> None:
         refuse_unwritable(Path(os.devnull), "--out")
+
+
+class TestInterrupted:
+    def test_the_file_that_is_tried_is_not_left(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        made = tempfile.NamedTemporaryFile
+        kept: list[Any] = []  # as a traceback keeps it: else its own end would remove it
+
+        def interrupted(**options: Any) -> Any:
+            file = made(**options)
+            kept.append(file)
+            signal.raise_signal(signal.SIGINT)
+            return file
+
+        monkeypatch.setattr(tempfile, "NamedTemporaryFile", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            refuse_unwritable(tmp_path / "map.png", "--out")
+        assert list(tmp_path.iterdir()) == []
 
 
 class TestFolders:
