@@ -93,11 +93,14 @@ def tls_scheduler(tls):
     with dask.config.set(tls):
         security = Security()
     here = {"host": "127.0.0.1", "dashboard_address": None, "processes": False, "n_workers": 1}
+    # Else the scheduler asks for one port, and warns if it is taken.
+    here["scheduler_kwargs"] = {"dashboard_address": "127.0.0.1:0"}
     with LocalCluster(**here, threads_per_worker=1, protocol="tls://", security=security) as cluster:
         yield cluster.scheduler_address
 
 
 class TestCluster:
+    @pytest.mark.slow
     def test_command(self, cluster, tmp_path, capsys):
         address, _ = cluster
         arguments = ["map", "--over", "sources", "--grid", "7", "--quiet"]
@@ -110,6 +113,7 @@ class TestCluster:
         ):
             xr.testing.assert_equal(far, here)
 
+    @pytest.mark.slow
     def test_other_work(self, cluster):
         """Of a survey's tiles, for instance."""
         with workers(1, cluster[0], None) as each:
@@ -117,12 +121,14 @@ class TestCluster:
         for number, item in enumerate(ITEMS):
             np.testing.assert_array_equal(done[number]["square"], item**2)
 
+    @pytest.mark.slow
     def test_a_worker_that_fails(self, cluster, cube):
         address, _ = cluster
         broken = StartsMap(cube.scenario, cube.grid, None, cube.z, cube.optimum)
         with pytest.raises(InputError, match=r"a worker failed \(AttributeError: "):
             list(computed_by(address, broken, boxes(cube)))
 
+    @pytest.mark.slow
     def test_same_values_and_then_death(self, cluster, tmp_path, cube):
         """The last one: it ends the scheduler."""
         address, scheduler = cluster
