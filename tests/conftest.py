@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import os
 import signal
+from collections import Counter
 from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -43,7 +44,7 @@ def pytest_configure() -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the longer notebooks as slow, and choose the order for parallel processes.
+    """Mark the longer notebooks and the cases after the quick ones as slow, and choose the order for processes.
 
     What takes longest comes first, so that they end together; beside it what needs other kernels, so that where none is
     cached yet no two processes compile the same ones.
@@ -56,8 +57,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             return 1
         return 2 if item.path.suffix == ".ipynb" or item.path.stem == "test_guide" else 3
 
+    seen: Counter[str] = Counter()
     for item in items:
-        if item.path.suffix == ".ipynb" and item.path.stem not in QUICK_NOTEBOOKS:
+        kept = item.get_closest_marker("slow_after")
+        test = item.nodeid.partition("[")[0]
+        seen[test] += 1
+        longer_notebook = item.path.suffix == ".ipynb" and item.path.stem not in QUICK_NOTEBOOKS
+        if longer_notebook or (kept is not None and seen[test] > kept.args[0]):
             item.add_marker(pytest.mark.slow)
     items.sort(key=rank)
 

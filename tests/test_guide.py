@@ -8,6 +8,7 @@ import inspect
 import re
 import shlex
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import pytest
@@ -31,6 +32,8 @@ CODE = re.compile(r"^```[a-z]+\n(.*?)^```|^    ([^\n]*)$", re.DOTALL | re.MULTIL
 HIDDEN = re.compile(r"<!--.*?-->", re.DOTALL)
 # What a page of the site shows of a line of code at desktop width without a scroll bar.
 WIDEST = 88
+# Pages, and packages with examples, whose code takes many seconds.
+SLOW = {"array-design", "exporting", "monte-carlo", "live", "stated-uncertainty", "magloc.plots", "sims.experiments"}
 PACKAGES = [
     "arrays",
     "magloc",
@@ -52,6 +55,12 @@ def with_python(page: Path) -> bool:
     return BLOCKS.search(page.read_text(encoding="utf-8")) is not None
 
 
+def seldom(cases: list[Any]) -> list[Any]:
+    """Cases of which the slow ones are marked."""
+    slow = {case for case in cases if getattr(case, "stem", case) in SLOW}
+    return [pytest.param(case, marks=pytest.mark.slow) if case in slow else case for case in cases]
+
+
 def command_lines() -> list[tuple[str, bool]]:
     """Command lines of all pages, without comments, and whether they are whole; those in a sentence may be a part."""
     found = {
@@ -67,7 +76,7 @@ def test_the_guide_is_found() -> None:
     assert len(command_lines()) > 30
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if with_python(page)], ids=lambda page: page.stem)
+@pytest.mark.parametrize("page", seldom([page for page in PAGES if with_python(page)]), ids=lambda page: page.stem)
 def test_page(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     matplotlib.use("agg")
     monkeypatch.chdir(tmp_path)
@@ -103,7 +112,7 @@ def test_parameters_of_public_names_are_explained(package: str) -> None:
     assert missing == []
 
 
-@pytest.mark.parametrize("package", PACKAGES)
+@pytest.mark.parametrize("package", seldom(PACKAGES))
 def test_examples_of_public_names(package: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every public class and function has some, and they print what they say."""
     matplotlib.use("agg")

@@ -121,6 +121,7 @@ class TestVerdict:
             laboratory.verdict(Mutant("code_.py", 2, "constant", 26, 27, "3"), 6, 60.0)
 
 
+@pytest.mark.slow
 def test_a_change_is_one_that_can_be_read_and_differs() -> None:
     chosen = drawn(100, 0, ("arrays", "sims"))
     assert len({(one.path, one.line) for one in chosen}) == 100
@@ -130,6 +131,7 @@ def test_a_change_is_one_that_can_be_read_and_differs() -> None:
         assert one.diff(source)
 
 
+@pytest.mark.slow
 def test_the_mirror_comes_first() -> None:
     reach = Reach()
     assert reach.tests("magloc/kalman.py")[0] == "tests/magloc/test_kalman.py"

@@ -217,6 +217,7 @@ class TestNamesOfFiles:
 
 
 class TestWithoutUnix:
+    @pytest.mark.slow
     def test_every_module_can_be_imported(self) -> None:
         files = [path.relative_to(REPOSITORY).with_suffix("") for path in FILES if path.stem != "__main__"]
         modules = [".".join(file.parts) for file in files]

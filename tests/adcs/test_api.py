@@ -194,6 +194,7 @@ class TestComplementaryFilter:
         assert np.isnan(attitude.sigma_deg).all()
         assert "reference from body" in repr(attitude)
 
+    @pytest.mark.slow
     def test_adaptive_finds_the_bias_of_the_gyro(self, imu):
         """Its first vector is to be the field, in tesla."""
         time_s, gyro, body, frame, truth = imu

@@ -459,6 +459,7 @@ class TestReadingCovariance:
         expected = np.eye(array.n_channels) * proportional_noise(array, readings)[:, :, None] ** 2
         assert_array_equal(reading_covariance(array, readings), expected)
 
+    @pytest.mark.slow_after(1)
     @pytest.mark.parametrize(
         "error", ["both", *(pytest.param(one, marks=pytest.mark.slow) for one in ("rotations", "gains"))]
     )

@@ -21,6 +21,7 @@ from tests.bench.table import Row, ratio_text, table, time_text
 from tests.bench.timing import Contestant, Size, Timing, installed, interleaved
 from tests.fuzz.cases import commands
 
+QUICK = {"fields", "fixes", "machine"}
 TINY = Size(points=30, rows=2, problems=1, grid=2, sample=1, rounds=1)
 
 
@@ -138,7 +139,9 @@ class TestMemory:
         assert memory.told([int(peak) for peak in peaks], [100, 1000], "row").endswith(text)
 
 
-@pytest.mark.parametrize("group", GROUPS)
+@pytest.mark.parametrize(
+    "group", [pytest.param(group, marks=[] if group in QUICK else pytest.mark.slow) for group in GROUPS]
+)
 def test_group_runs(group, monkeypatch):
     monkeypatch.setattr("tests.bench.timing.SAMPLE_S", 1e-9)
     monkeypatch.setattr("tests.bench.attitude.N_RUNS", 2)

@@ -63,6 +63,7 @@ def is_under_the_mouse(camera: Camera, place_m: FloatArray, mouse_px: FloatArray
 
 
 class TestSensors:
+    @pytest.mark.slow
     def test_every_body_and_its_axis_are_where_the_camera_has_them(
         self, screen: Screen, server: viser.ViserServer
     ) -> None:
@@ -78,6 +79,7 @@ class TestSensors:
             Sight("sensor", nowhere, lambda picture: dark_grey(picture) | ROD_BLUE(picture), absent=True),
         )
 
+    @pytest.mark.slow
     def test_the_legend_names_them(self, screen: Screen, server: viser.ViserServer) -> None:
         assert "4 vector sensors, noise 1 nT" in screen.text()
         assert screen.browser.errors == []
@@ -86,6 +88,7 @@ class TestSensors:
 class TestDipole:
     """In the order of a user's session: each test leaves the dipole where the next one finds it."""
 
+    @pytest.mark.slow
     def test_arrow_fit_and_field_lines_are_where_the_camera_has_them(
         self, screen: Screen, server: viser.ViserServer
     ) -> None:
@@ -100,6 +103,7 @@ class TestDipole:
         screen.keep("array")
         assert np.linalg.norm(found_position(screen) - START_M) < 5.0 * rms_bound(screen)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(("axis", "push_px"), [(0, 90.0), (2, -60.0)])
     def test_it_is_dragged_by_an_arrow_of_its_control_and_the_fit_follows(
         self, screen: Screen, server: viser.ViserServer, axis: int, push_px: float
@@ -144,6 +148,7 @@ class TestDipole:
             Sight("the upright arrow", camera.pixels(dipole_places(position)[1:]), ORANGE, radius=4, absent=True),
         )
 
+    @pytest.mark.slow
     def test_back_to_the_start(self, screen: Screen, server: viser.ViserServer) -> None:
         screen.browser.click(*screen.button("Back to the start"))
         screen.until(lambda: np.allclose(screen.numbers("Position [m]"), START_M), "the dipole is back")
@@ -152,6 +157,7 @@ class TestDipole:
 
 
 class TestEditingTheArray:
+    @pytest.mark.slow
     def test_a_sensor_is_dragged(self, screen: Screen, server: viser.ViserServer) -> None:
         camera = screen.live_camera(server)
         screen.browser.click(*screen.button("Array"))

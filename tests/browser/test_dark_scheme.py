@@ -34,6 +34,7 @@ def sights(screen: Screen, server: viser.ViserServer, scheme: str) -> list[Sight
 
 
 class TestScheme:
+    @pytest.mark.slow
     def test_live_page(self, screen: Screen, scheme: str) -> None:
         with opened(0, "array") as server:
             array_page(server, ARRAY, live=False)

@@ -54,6 +54,7 @@ def frames_of(path: Path) -> list[np.ndarray]:
         return found
 
 
+@pytest.mark.slow
 def test_the_source_moves_from_frame_to_frame(screen: Screen, tmp_path: Path) -> None:
     """To the right in the picture, as its x does, and in its colour: the palette is one of all frames."""
     places = np.stack([np.linspace(-4.0, 4.0, 4), np.zeros(4), np.ones(4)], axis=1)

@@ -113,6 +113,7 @@ def folder(tmp_path: Path) -> Path:
 class TestCommands:
     """They serve the page until Ctrl-C, also when the rows have ended."""
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         "words", ["live --from - --view --speed-m-s 1", pytest.param("view -", marks=pytest.mark.slow)]
     )
@@ -140,6 +141,7 @@ class TestCommands:
         assert "Traceback" not in err
 
 
+@pytest.mark.slow
 def test_a_loop_of_ones_own(screen: Screen) -> None:
     """Points of a tracker, with the readings that they are found from."""
     tracker = magloc.Tracker(ARRAY, RandomWalk(1.0, 0.1))

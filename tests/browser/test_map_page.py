@@ -74,6 +74,7 @@ def sights(what: str, camera: Camera, places_m: FloatArray, *, within: float, ra
 class TestMap:
     """In the order of a user's session."""
 
+    @pytest.mark.slow
     def test_the_slice_the_source_and_the_array_are_where_the_camera_has_them(
         self, screen: Screen, server: viser.ViserServer
     ) -> None:
@@ -90,6 +91,7 @@ class TestMap:
         assert "passes until convergence" in screen.text()
         assert screen.browser.errors == []
 
+    @pytest.mark.slow
     def test_points_have_the_colours_of_the_legend(self, screen: Screen, server: viser.ViserServer) -> None:
         camera = screen.live_camera(server)
         screen.switch("coloured points", on=True)
@@ -132,6 +134,7 @@ class TestMap:
         screen.switch("surface", on=False)
         screen.until_seen(Sight("surface", ring(0.85 * radius), sky, radius=1, absent=True))
 
+    @pytest.mark.slow
     def test_a_slider_moves_a_slice(self, screen: Screen, server: viser.ViserServer) -> None:
         camera = screen.live_camera(server)
         screen.switch("coloured points", on=False)

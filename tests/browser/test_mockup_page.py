@@ -82,6 +82,7 @@ def sights(camera: Camera, drive: Drive, row: int) -> list[Sight]:
 class TestDrive:
     """In the order of a user's session."""
 
+    @pytest.mark.slow
     def test_satellite_lights_and_frame_are_where_they_should_be(self, screen: Screen, replay: Open) -> None:
         camera = screen.live_camera(replay.server)
         screen.until_seen(*sights(camera, replay.drive, replay.player.row))
@@ -97,6 +98,7 @@ class TestDrive:
         gone = Sight("satellite where it was", camera.pixels(was), dark_grey, radius=2, absent=True)
         screen.until_seen(*sights(camera, replay.drive, replay.player.row), gone)
 
+    @pytest.mark.slow
     def test_play_and_dial(self, screen: Screen, replay: Open) -> None:
         screen.browser.click(*screen.button("Error"))
         screen.until(lambda: "cross: truth" in screen.text(), "the dial")
@@ -107,6 +109,7 @@ class TestDrive:
         screen.until(lambda: not replay.player.is_playing, "time stands still")
         screen.keep("mockup-dial")
 
+    @pytest.mark.slow
     def test_the_file_that_plays(self, screen: Screen, replay: Open, tmp_path: Path) -> None:
         path = tmp_path / "drive.html"
         write_page(page_html(replay.server, replay.page), path)

@@ -40,6 +40,7 @@ def server(screen: Screen) -> Iterator[viser.ViserServer]:
 
 
 class TestReadings:
+    @pytest.mark.slow
     @pytest.mark.parametrize(("share", "row"), [(0.0, 0), (1.0, 8)])
     def test_the_row_slider_moves_the_source(
         self, screen: Screen, server: viser.ViserServer, share: float, row: int
@@ -59,6 +60,7 @@ class TestReadings:
         )
         screen.keep("readings")
 
+    @pytest.mark.slow
     def test_what_is_not_connected_yet_says_so(self, screen: Screen, server: viser.ViserServer) -> None:
         """viser's page says "Inactive" until it has connected: in its first minute."""
         screen.open(f"http://127.0.0.1:{server.get_port()}")

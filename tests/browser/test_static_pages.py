@@ -26,6 +26,7 @@ PLAYED = "document.querySelector('[role=slider]').ariaValueNow"
 
 
 class TestStaticPages:
+    @pytest.mark.slow
     def test_array_of_3_cm(self, screen: Screen, run: Run, tmp_path: Path) -> None:
         array = tetrahedron(0.03)
         write_array(tmp_path / "array.toml", array)
@@ -90,6 +91,7 @@ class TestStaticPages:
 class TestReadings:
     """A track of 41 rows, played for 20 s after it has stood still for 2 s; its last row is shown at first."""
 
+    @pytest.mark.slow
     def test_a_click_into_the_plot_moves_the_scene_and_the_cursor(self, screen: Screen, tmp_path: Path) -> None:
         page = tmp_path / "track.html"
         with opened(0, "track") as server:

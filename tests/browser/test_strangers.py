@@ -121,6 +121,7 @@ def test_a_page_from_elsewhere_does_not_frame_it(screen: Screen, server: viser.V
             assert not server.get_clients()
 
 
+@pytest.mark.slow
 def test_no_address_leads_it_to_another_server(screen: Screen, server: viser.ViserServer) -> None:
     """That server could have its own scripts run in the page, and these could speak to this one."""
     with another_viewer() as (other, came), redirect_stdout(io.StringIO()):

@@ -82,6 +82,7 @@ def arrow_in(row: int) -> FloatArray:
 class TestTrack:
     """In the order of a user's session."""
 
+    @pytest.mark.slow
     def test_line_arrow_and_array_are_where_the_camera_has_them(
         self, screen: Screen, server: viser.ViserServer
     ) -> None:
@@ -99,6 +100,7 @@ class TestTrack:
         assert row_of(screen) == 40
         assert screen.browser.errors == []
 
+    @pytest.mark.slow
     def test_the_time_slider_moves_the_scene(self, screen: Screen, server: viser.ViserServer) -> None:
         camera = screen.live_camera(server)
         slid(screen, "Time [s]", 0.3, lambda: abs(row_of(screen) - 12) <= 2)
@@ -112,6 +114,7 @@ class TestTrack:
         )
         screen.keep("track-earlier")
 
+    @pytest.mark.slow
     def test_the_tail_is_cut(self, screen: Screen, server: viser.ViserServer) -> None:
         camera = screen.live_camera(server)
         slid(screen, "Time [s]", 1.0, lambda: row_of(screen) == 40)
@@ -148,6 +151,7 @@ class TestTrack:
             press(key)
             screen.until(lambda row=row: row_of(screen) == row, f"the row after {key}")  # type: ignore[misc]
 
+    @pytest.mark.slow
     def test_the_plot_marks_the_time(self, screen: Screen, server: viser.ViserServer) -> None:
         slid(screen, "Time [s]", 0.5, lambda: abs(row_of(screen) - 20) <= 2)
         share = row_of(screen) / 40.0

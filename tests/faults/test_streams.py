@@ -52,6 +52,7 @@ def test_full_standard_output(command, folder):
         )
 
 
+@pytest.mark.slow_after(1)
 @pytest.mark.parametrize("command", COMMANDS)
 def test_no_streams(command, folder, monkeypatch):
     """As the interpreter leaves them where the shell closed them: None."""

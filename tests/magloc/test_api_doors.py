@@ -135,6 +135,7 @@ class TestCalibrate:
 
 
 class TestDesign:
+    @pytest.mark.slow
     def test_story(self):
         """Story 7, with a quick search: a design betters its best start; its gain is over the best reference."""
         task = magloc.DesignTask.read("half-space-2m")
@@ -170,6 +171,7 @@ class TestBounds:
         np.testing.assert_allclose(np.linalg.norm(moments, axis=1), 3.0)
         np.testing.assert_allclose(moments.mean(axis=0), 0.0, atol=0.05)
 
+    @pytest.mark.slow
     def test_detection_range(self):
         """A quantile over directions and moments; it grows with the fourth root of the moment, as differences fall."""
         found = magloc.detection_range(ARRAY, moment_Am2=1e3)

@@ -63,10 +63,12 @@ def call(folder: Path, before: str = "", **environment: str) -> tuple[str, str]:
     return done.stdout.strip(), done.stderr
 
 
+@pytest.mark.slow
 def test_kept(kept: Path) -> None:
     assert call(kept) == ("6.0 1", "")
 
 
+@pytest.mark.slow_after(1)
 @pytest.mark.parametrize(
     ("ending", "share"),
     [

@@ -166,6 +166,7 @@ class TestFiles:
         assert path.read_text(encoding="utf-8") == shown.html
         assert [file.name for file in tmp_path.iterdir()] == ["fixes.html"]
 
+    @pytest.mark.slow
     @needs_chromium
     def test_page_fetches_nothing_and_the_picture_is_one(self, tmp_path: Path, fixes: Fixes) -> None:
         page, picture = tmp_path / "fixes.html", tmp_path / "fixes.png"

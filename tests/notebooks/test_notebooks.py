@@ -66,6 +66,7 @@ class TestKeptOutputs:
 
 @pytest.mark.parametrize("name", ["03-real-magnet", pytest.param("from-a-log", marks=pytest.mark.slow)])
 class TestRecordings:
+    @pytest.mark.slow
     def test_without_the_recording_a_simulated_twin_tells_the_story(self, name, tmp_path, monkeypatch):
         monkeypatch.delenv("MAGLOC_DATA", raising=False)
         monkeypatch.setenv("PYTHONWARNINGS", "error")

@@ -90,10 +90,12 @@ class TestErrors:
         found = run_many(short, lambda *_: {"seed": 1.0}, seeds=[1], processes=1)
         assert "'seed'" in str(found["error"].values[0])
 
+    @pytest.mark.slow
     def test_a_process_that_dies_is_one(self, short: MagneticScenario) -> None:
         found = run_many(short, dying, seeds=[1, 2], processes=2)
         assert all("process" in str(text) for text in found["error"].values)
 
+    @pytest.mark.slow
     def test_it_can_be_interrupted(self, short: MagneticScenario) -> None:
         for processes in (1, 2):
             with pytest.raises(KeyboardInterrupt):

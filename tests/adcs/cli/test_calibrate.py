@@ -48,6 +48,7 @@ def files(log):
 
 
 class TestResult:
+    @pytest.mark.slow
     def test_json(self, adcs, log):
         outcome = adcs("calibrate", *files(log), "--json", "--quiet")
         assert outcome.status == 0, outcome.err
@@ -62,6 +63,7 @@ class TestResult:
         assert not any("residuals are" in text for text in found["warnings"])
         assert any("does not tell gain_" in text for text in found["warnings"])
 
+    @pytest.mark.slow
     def test_text_and_log(self, adcs, log, tmp_path):
         outcome = adcs("calibrate", *files(log), "--out", tmp_path / "calibrated.csv")
         assert outcome.status == 0, outcome.err

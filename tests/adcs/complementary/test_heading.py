@@ -111,6 +111,7 @@ class TestParts:
 
 
 class TestRooms:
+    @pytest.mark.slow
     def test_honest(self):
         """NEES of the heading, filtered and smoothed, over 16 rooms drawn from the model: false alarms 1 in 1,000."""
         squares = []
@@ -162,6 +163,7 @@ class TestRooms:
         at = np.searchsorted(time_s, [22.0, 40.0, 59.0])
         assert (np.diff(found.sigma_rad[at]) > 0.03 * found.sigma_rad[at[0]]).all()
 
+    @pytest.mark.slow_after(1)
     @pytest.mark.parametrize("offline", [False, True])
     def test_sigma_grows_after_the_last_reading(self, offline):
         """By 0.023 rad in 45 s, of 0.0007 rad/s that are forgotten in 20 s; false alarms of χ² 1 in 1,000."""

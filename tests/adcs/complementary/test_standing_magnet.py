@@ -70,6 +70,7 @@ class TestBroad:
         readings = record.time_s, record.rate_rad_s, record.acceleration_m_s2, record.field_T
         return prepare(record), inertial_magnetic_filter(*readings, magnet="rejected").q, log.position_m
 
+    @pytest.mark.slow
     def test_found(self, data_folder):
         """A magnet some 7 to 13 cm beside the path, passed twice: it explains most of what is disturbed near it."""
         prepared, q, position_m = self.log(data_folder, "30_disturbed_stationary_magnet_C")

@@ -220,6 +220,7 @@ class TestPlant:
 
 
 class TestAttitudeLoop:
+    @pytest.mark.slow_after(1)
     @pytest.mark.parametrize("rule", ["lemma", "optimal", "tightened"])
     @pytest.mark.parametrize(("noise", "most"), [(1.0, 8.0), (4.0, 14.0)])  # 5.2, 4.9, 3.9; 9.9, 8.8, 6.4
     def test_one_orbit(self, noise, most, rule):

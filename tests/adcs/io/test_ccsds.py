@@ -97,6 +97,7 @@ class TestAttitude:
 
 
 class TestCommand:
+    @pytest.mark.slow
     def test_estimate_of_a_message_along_an_ephemeris(self, adcs, tmp_path) -> None:
         assert adcs("run", "tabletsat", "--seeds", "1", "--duration", "60", "--out", tmp_path, "--quiet").status == 0
         config, out = tmp_path / "scenario.toml", tmp_path / "first"

@@ -34,6 +34,7 @@ class TestResidualsThatLast:
     def test_a_torque_that_swings_is_told(self, period_s: float) -> None:
         assert all(lasting(*swinging(period_s)))
 
+    @pytest.mark.slow
     def test_a_truth_as_the_filter_believes_is_not(self) -> None:
         # False-alarm rate 1e-6 a run.
         runs = believed_runs(SETTINGS, 1000.0, range(40))

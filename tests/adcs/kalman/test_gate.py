@@ -66,6 +66,7 @@ def rms_deg(runs: AttitudeRuns, chosen: FilterSettings) -> float:
 
 
 class TestTwins:
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         ("sensors", "states"),
         [

@@ -288,6 +288,7 @@ class TestCompiledTwin:
 
 
 class TestClosedLoop:
+    @pytest.mark.slow
     def test_wheels_that_follow_the_estimate(self) -> None:
         """The loop is closed by the estimate itself, and the filter is told the torque: it is as accurate as ever."""
         chosen = settings("mag+sun+gyro")
@@ -433,6 +434,7 @@ class TestAcceptance:
         assert (evaluate(runs, estimates)["angle_rms_deg"] or 0.0) > 5.0
         assert all("a bias of the gyro is not in the state" in one[0] for one in warnings_of(runs, estimates))
 
+    @pytest.mark.slow
     def test_closed_loop_jacobian_is_overconfident(self) -> None:
         """Negative: the F of the source, which takes the torque for a feedback of the truth."""
         chosen = settings("mag+sun")
@@ -472,6 +474,7 @@ class TestConsistency:
         low, high = chi2.ppf([0.0005, 0.9995], len(seeds) * chosen.sensors.size)
         assert low < total < high
 
+    @pytest.mark.slow_after(1)
     @pytest.mark.parametrize(("sensors", "states"), CASES)
     def test_hundred_runs(self, sensors: str, states: tuple[str, ...]) -> None:
         self.check(sensors, states, range(100))
@@ -492,6 +495,7 @@ class TestFieldModel:
         error = quaternion.error_vector(estimates.q, runs.q)[:, 1000:]
         return float(normalised_square(error, covariance).mean() / 3.0)
 
+    @pytest.mark.slow_after(1)
     @pytest.mark.parametrize("field_error_T", [150e-9, 400e-9])
     def test_sigma_is_honest(self, field_error_T: float) -> None:
         """Even where its size or its time constant is half or twice what the filter believes."""

@@ -119,6 +119,7 @@ class TestEclipses:
 class TestLog:
     """The quaternions as they are: times in UTC, columns of its own, from inertial to body, 72 gaps."""
 
+    @pytest.mark.slow
     def test_every_row_is_read_and_estimated(self, data_folder: Path, tmp_path: Path) -> None:
         config = tmp_path / "opssat.toml"
         config.write_text(CONFIG)

@@ -169,11 +169,13 @@ def few() -> Detumbling:
 
 
 class TestRuns:
+    @pytest.mark.slow
     def test_they_end_slow(self, few: Detumbling) -> None:
         rate = np.linalg.norm(few.runs.w, axis=-1)
         assert (few.time_s < 1500.0).all()
         assert np.degrees(rate[:, -60:]).max() < 0.5 < np.degrees(rate[:, 0]).min()
 
+    @pytest.mark.slow
     def test_a_filter_that_is_told_follows(self, few: Detumbling) -> None:
         """The commands are in the record: without a gyro the attitude stays known while torquers brake."""
         used = settings("mag+sun", ["disturbance"])
@@ -186,6 +188,7 @@ class TestRuns:
         assert errors[0] < 0.2
         assert errors[1] > 3.0 * errors[0]
 
+    @pytest.mark.slow
     def test_a_rate_that_is_estimated(self) -> None:
         """Told nothing but readings: where the Sun is seen it does not take their noise for a turn; else it waits."""
         by = {

@@ -163,6 +163,7 @@ class TestWhatIsNotTold:
 
 
 class TestRows:
+    @pytest.mark.slow
     def test_a_shift_of_minutes_is_found(self) -> None:
         wide = replace(PRIOR, time_shift_s=150.0)
         time_s, readings, _ = simulated("tumbling", 4)

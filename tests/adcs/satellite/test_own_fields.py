@@ -31,6 +31,7 @@ def flown() -> LoadsRun:
 
 
 class TestFields:
+    @pytest.mark.slow_after(1)
     @pytest.mark.parametrize("rate_deg_s", [0.4, 2.0, 8.0])
     def test_what_is_left_is_far_below_the_noise(self, rate_deg_s: float) -> None:
         """The figure asked for is 0.5 σ at the magnetometer of the attitude; NEES of all fields, 6 × 24 numbers."""

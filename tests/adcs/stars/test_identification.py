@@ -60,6 +60,7 @@ def image_of(sky, R, rng, lost=0.05, false=3, camera=CAMERA):
 
 
 class TestRandomSky:
+    @pytest.mark.slow
     def test_stars_are_identified(self):
         """30,000 stars, 20 in an image, with noise in places and magnitudes, 5 % lost and three false ones."""
         sky, rng = random_sky(30_000), np.random.default_rng(1)
@@ -78,6 +79,7 @@ class TestRandomSky:
         assert right / there > 0.98
         assert right / identified > 0.995
 
+    @pytest.mark.slow
     def test_the_scale_may_be_wrong(self):
         sky, rng = random_sky(30_000), np.random.default_rng(10)
         for R, off in zip(Rotation.random(3, random_state=11).as_matrix(), (0.955, 1.02, 1.045), strict=True):

@@ -122,6 +122,7 @@ def is_right(found, R):
 
 
 class TestUnknownScale:
+    @pytest.mark.slow
     def test_photographs(self):
         """With gradient, vignetting, hot pixels and trails, the scale wrong by up to 10 %."""
         rng = np.random.default_rng(4)
@@ -138,6 +139,7 @@ class TestUnknownScale:
                 )
         assert solved >= 5
 
+    @pytest.mark.slow
     def test_without_any_scale(self):
         R = Rotation.random(random_state=6).as_matrix()
         picture, _, _ = photograph(SKY, CAMERA, R, np.random.default_rng(7))

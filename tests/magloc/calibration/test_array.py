@@ -461,6 +461,7 @@ class TestUncertainty:
 
         self.check(run)
 
+    @pytest.mark.slow
     def test_self_calibration(self):
         prior = replace(TestSelfCalibration.TRUSTED, position_m=5e-4, gain=0.01, axes_rad=5e-3)
 
@@ -591,6 +592,7 @@ class TestRecording:
         best = [fix.solutions[0] for fix in plain_locator(array).fit_rows(readings)]
         return np.array([solution.position_m[:2] for solution in best]), sum(solution.chi2 for solution in best)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("every", [2, pytest.param(1, marks=pytest.mark.slow)])
     def test_perturbed(self, recording, every):
         self.check(recording, 0, removed=False, proportional=True, every=every)

@@ -153,6 +153,7 @@ class TestConsistency:
         low, high = chi2.ppf([5e-4, 1 - 5e-4], dof)
         assert low < np.sum(residuals) < high
 
+    @pytest.mark.slow_after(1)
     @pytest.mark.parametrize(
         ("noise", "n", "cap", "at_least"), [(1e-9, 9, np.pi, 0.75), (1e-9, 300, 0.5, 0.75), (1e-8, 300, 0.7, 0.5)]
     )
@@ -212,6 +213,7 @@ class TestAgainstOtherFits:
         assert ours <= 1.01 * twostep
         assert ours <= plain
 
+    @pytest.mark.slow_after(1)
     @pytest.mark.parametrize("n_sets", [3, pytest.param(6, marks=pytest.mark.slow)])
     def test_uneven_sensors_with_strong_noise_more_accurate_than_both(self, n_sets):
         """Many readings, so that the others' bias of the second order in noise over modulus is what remains."""
@@ -244,6 +246,7 @@ class TestNotDetermined:
         readings = modulus[:, None] * u @ random_scale(rng, 0.2) + 1e-5 + noise * rng.normal(size=(500, 3))
         self.refused(readings, max(noise, 1e-12), modulus)
 
+    @pytest.mark.slow_after(1)
     @pytest.mark.parametrize("noise", [1e-9, 1e-7, 1e-6])
     def test_many_readings_along_six_directions(self, noise):
         """Noise makes them 1,800 different directions, which tells nothing more."""

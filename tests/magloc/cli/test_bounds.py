@@ -124,6 +124,7 @@ class TestResult:
         assert re.search(r"σ of range ≤ 0.5 m up to +least +median +greatest", text)
         assert re.search(r"found with 90 % up to +least +median +greatest", text)
 
+    @pytest.mark.slow
     @with_plain_pictures
     def test_a_body_is_taken_as_locate_takes_it(self, tmp_path, capsys):
         array = tmp_path / "board.toml"
@@ -160,6 +161,7 @@ class TestResult:
         assert main(["bounds", *QUICK, "--accuracy-m", "1", "--out", str(tmp_path)]) == 2
         assert "found another map, with accuracy_m 0.5 in place of 1.0" in capsys.readouterr().err
 
+    @pytest.mark.slow
     @with_plain_pictures
     def test_default_folder(self, tmp_path, capsys, monkeypatch):
         monkeypatch.chdir(tmp_path)
@@ -171,6 +173,7 @@ class TestResult:
 
 
 class TestArrays:
+    @pytest.mark.slow
     @pytest.mark.usefixtures("coarse")
     def test_too_few_sensors_are_said_to_be_too_few(self, tmp_path, capsys):
         array = tmp_path / "four.toml"

@@ -32,6 +32,7 @@ class TestDemo:
         assert (tmp_path / "magloc-demo" / "target.html").exists() == scene
         assert "321 of 321 rows answered" in done.out
 
+    @pytest.mark.slow
     def test_its_commands_do_what_it_does(self, run: Run, tmp_path: Path) -> None:
         done = run("demo", tmp_path / "a demo")
         call = next(call for call in typed(done.out, "magloc") if call[0] == "locate")
@@ -41,6 +42,7 @@ class TestDemo:
         shown = next(i for i, line in enumerate(lines) if line.startswith("$ magloc locate"))
         assert again.out.splitlines()[:4] == lines[shown + 1 : shown + 5]
 
+    @pytest.mark.slow
     def test_without_the_viewer(self, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr("magloc.cli.first_steps.demo.find_spec", lambda _: None)
         done = run("demo", tmp_path / "demo")
@@ -53,6 +55,7 @@ class TestDemo:
 
 
 class TestWarmUp:
+    @pytest.mark.slow
     def test_runs_every_command_that_compiles(self, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
         called: list[str] = []
         for name in ("convergence", "sources", "bound_slices", "bound_sphere", "bound_reach"):  # nothing of it compiles

@@ -47,6 +47,7 @@ def reported(run: Run, *arguments: str | Path) -> dict[str, Any]:
 
 
 class TestResult:
+    @pytest.mark.slow
     def test_json_and_array_file(self, run, task, tmp_path):
         out = tmp_path / "array.toml"
         result = reported(run, task, "--out", out)
@@ -107,6 +108,7 @@ class TestResult:
         assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
         assert read_array(tmp_path / "design-task.toml").n_sensors == 4
 
+    @pytest.mark.slow
     def test_seed_and_threads(self, run, task, tmp_path):
         places = [
             reported(run, task, "--out", tmp_path / f"{i}.toml", *options)["positions_m"]

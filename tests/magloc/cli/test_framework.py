@@ -87,6 +87,7 @@ class TestLoaded:
         calls = [[*command, "--help"] for command in (["run"], *runs, ["compare"], ["tables"], ["estimate"], ["stars"])]
         assert not modules_of("adcs", *calls) & (HEAVY - {"numpy", "msgspec"})
 
+    @pytest.mark.slow
     def test_by_fixes(self, recording: tuple[Path, Path]) -> None:
         readings, array = recording
         loaded = modules_of("magloc", ["locate", readings, "--array", array])
@@ -124,6 +125,7 @@ class TestMissingExtra:
             without(["view"], "view", recording[1]), 'the viewer needs the extra "view": pip install "magloc['
         )
 
+    @pytest.mark.slow
     def test_maps(self, tmp_path: Path) -> None:
         outcome = without(["maps"], "map", "--grid", "2", "--out", tmp_path / "map", "--quiet")
         assert_refused(outcome, 'a stored map needs the extra "maps": pip install "magloc[maps]".')
@@ -145,6 +147,7 @@ class TestMissingExtra:
             with pytest.raises(InputError, match='the mesh of an array needs the extra "view"'):
                 import_module("arrays.meshes")
 
+    @pytest.mark.slow
     def test_a_fix_needs_none(self, recording: tuple[Path, Path]) -> None:
         readings, array = recording
         assert without(list(EXTRAS), "locate", readings, "--array", array, "--quiet").status == 0
@@ -166,6 +169,7 @@ class TestCommonOptions:
         assert run("locate", readings, "--array", array, *threads).status == 0
         assert set_to == used
 
+    @pytest.mark.slow_after(1)
     @pytest.mark.parametrize("quiet", [False, True])
     def test_quiet_says_nothing_of_what_is_written(
         self, quiet: bool, recording: tuple[Path, Path], tmp_path: Path, run: Run

@@ -65,6 +65,7 @@ class TestLines:
         assert entries(outcome.out)[-1]["status"] == "tracked"
         assert "1 garbled" in outcome.err
 
+    @pytest.mark.slow
     def test_a_rest_is_answered_without_a_source(self, folder: Path, run: Run) -> None:
         source = f"replay:{folder / 'rows.csv'}"
         outcome = run(

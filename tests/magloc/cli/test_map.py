@@ -149,6 +149,7 @@ class TestOverSources:
         assert main(["map", str(path), "--over", "sources", "--grid", "3", "--out", str(tmp_path / "out")]) == 0
         assert "of 6 sources found" in capsys.readouterr().out
 
+    @pytest.mark.slow
     @with_plain_pictures
     def test_what_is_known_of_sources(self, tmp_path):
         """The file says it, an option stands in its place."""
@@ -236,6 +237,7 @@ class TestInterrupted:
         ):
             xr.testing.assert_equal(found, expected)
 
+    @pytest.mark.slow
     def test_kill_9(self, tmp_path, chunked, whole, capsys):
         process = self.started(chunked, tmp_path / "out")
         process.kill()
@@ -243,6 +245,7 @@ class TestInterrupted:
         assert not (tmp_path / "out/convergence.png").exists()
         self.resumed(chunked, tmp_path / "out", whole, capsys)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(("number", "word"), [(signal.SIGINT, "interrupted"), (signal.SIGTERM, "terminated")])
     def test_a_signal(self, number, word, tmp_path, chunked, whole, capsys):
         process = self.started(chunked, tmp_path / "out")
@@ -278,6 +281,7 @@ class TestInterrupted:
             assert "found another map, with" in err
         assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
 
+    @pytest.mark.slow
     def test_what_cannot_be_written(self, tmp_path, capsys):
         """A limit on the size of files stands for a full disk."""
         script = (

@@ -111,6 +111,7 @@ sys.exit(main())
         done = subprocess.run(command, capture_output=True, text=True, timeout=WAIT_S, check=False)
         assert (done.returncode, done.stderr) == (130, f"{program}: interrupted\n")
 
+    @pytest.mark.slow_after(1)
     @needs_chromium
     @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
     def test_ended_with_a_browser(self, number: signal.Signals, tmp_path: Path) -> None:

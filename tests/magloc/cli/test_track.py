@@ -343,6 +343,7 @@ class TestGeojson:
 
 
 class TestOut:
+    @pytest.mark.slow
     def test_picture_and_table(self, run: Run, array: Path, readings: Path, truth: Path, tmp_path: Path) -> None:
         folder = tmp_path / "new" / "folder"
         outcome = run("track", readings, "--array", array, "--truth", truth, "--json", *MOTION, "--out", folder)

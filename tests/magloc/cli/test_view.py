@@ -139,6 +139,7 @@ class TestKindsOfFiles:
             assert np.isfinite(result.values).any()
             assert not (np.isfinite(result.values) & result.failed).any()
 
+    @pytest.mark.slow
     def test_large_maps_are_thinned(self, run: Run, tmp_path: Path) -> None:
         folder = tmp_path / "map"
         assert run("map", "--grid", "66", "--out", folder, "--quiet").status == 0
@@ -325,6 +326,7 @@ class TestPages:
         assert_refused(run("view", array_file, "--html", tmp_path / "page.html"), "--html", "found a folder")
         assert sorted(tmp_path.iterdir()) == before
 
+    @pytest.mark.slow
     @needs_chromium
     def test_nothing_is_downloaded(self, run: Run, array_file: Path, tmp_path: Path) -> None:
         page = tmp_path / "page.html"
@@ -339,6 +341,7 @@ class TestPages:
 class TestPicture:
     """``--png`` draws without a person."""
 
+    @pytest.mark.slow
     @needs_chromium
     def test_sensors_are_seen_where_the_first_camera_has_them(
         self, run: Run, array_file: Path, tmp_path: Path, read_png: Callable[[Path], np.ndarray]

@@ -65,6 +65,7 @@ def assert_near(found: Ends, expected: Ends) -> None:
 
 
 class TestOneLane:
+    @pytest.mark.slow
     @pytest.mark.parametrize("code", [IEKF, REPEATED, DAMPED])
     @pytest.mark.parametrize("array", [TETRAHEDRON, any_array(3, 5)], ids=["contrasts", "rows"])
     def test_ends_as_in_all_of_them(self, array: SensorArray, code: int) -> None:

@@ -126,6 +126,7 @@ class TestKnownStrength:
     def known_map(cls):
         return computed_map(SourcesMap(cls.KNOWN, 7))
 
+    @pytest.mark.slow
     def test_fixes_know_it_as_well_as_their_bounds(self, known_map):
         assert summary(known_map).fraction == 1.0
         used = known_map.status.to_numpy() == SourceStatus.FOUND

@@ -123,6 +123,7 @@ class TestStartFree:
 class TestOtherRowsOfTheTable:
     """Those rows that the specification's recipe reproduces within its ±0.08; all: docs/validation/convergence.md."""
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         ("method", "moment", "front", "near", "back"),
         [

@@ -223,6 +223,7 @@ class TestEquivalentDipole:
         disc = equivalent_dipole(ellipsoid_mesh([1.0, 1.0, 1e-4]), 100.0, [0.0, 0.0, 5e-5])
         assert_allclose(disc.moment_Am2[2], disc.volume_m3 * 100.0 / 101.0 * 5e-5 / MU0, rtol=2e-2)
 
+    @pytest.mark.slow
     @given(st.integers(0, 2**32 - 1))
     @settings(max_examples=20, deadline=None)
     def test_an_ellipsoid_is_found_wherever_it_is_and_however_it_is_turned(self, seed):
@@ -341,6 +342,7 @@ class TestNearness:
             dimension=(length, length / 4, length / 4), magnetization=magnetisation, position=self.SOURCE
         )
 
+    @pytest.mark.slow_after(1)
     @pytest.mark.parametrize(("array", "source"), [(board(), SOURCE), (tetrahedron(1.5, noise_T=1e-9), 2.0 * SOURCE)])
     def test_false_alarms_for_a_dipole(self, array, source):
         """600 dipoles at a stated rate of 5 %: more than allowed in 1e-3 of all seeds at that rate."""

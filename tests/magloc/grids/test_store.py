@@ -242,6 +242,7 @@ class TestResume:
         assert sweep.unreadable == []
         assert_same(tmp_path / "map.zarr", in_memory(waves))
 
+    @pytest.mark.slow_after(1)
     @pytest.mark.parametrize("name", ["height", "sign"])
     @pytest.mark.parametrize("place", [(0, 1, 0), (2, 2, 2)])
     def test_a_damaged_chunk_is_reported_and_done_again(self, waves, name, place, tmp_path):
@@ -360,6 +361,7 @@ class TestFullDisk:
 
 
 class TestMemory:
+    @pytest.mark.slow
     def test_does_not_grow_with_the_map(self, tmp_path):
         peaks = [peak_mib(tmp_path, grid) for grid in (64, 128)]
         # In memory, 128³ points would take 128³ · (8 + 1) bytes = 18 MiB more even without a copy.

@@ -92,6 +92,7 @@ def squared_error_after_a_rest(seed: int) -> float:
 
 
 class TestTrackAfterARest:
+    @pytest.mark.slow
     def test_is_as_good_as_it_says(self) -> None:
         """The sum of ten NEES is above its bound once in 10,000; the source moves less than is said."""
         assert sum(map(squared_error_after_a_rest, range(10))) < chi2.ppf(1.0 - 1e-4, 30)

@@ -235,6 +235,7 @@ class TestOtherLocators:
         assert np.median(position_errors(fixes, position)) <= 1e-3
         assert position_errors(fixes, position).max() <= 1e-2
 
+    @pytest.mark.slow
     def test_the_ambient_field_of_every_row_is_used(self):
         rng = np.random.default_rng(11)
         array = scattered_scalars(rng)

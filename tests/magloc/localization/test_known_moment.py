@@ -93,6 +93,7 @@ class TestKnownModulus:
         np.testing.assert_array_equal(fixes.dof, plain.dof)
         np.testing.assert_allclose(fixes.position_m, plain.position_m, atol=1e-6)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("stated", [0.5, 1.5])
     def test_a_wrong_one_is_a_misfit_where_the_readings_tell(self, stated):
         array = tetrahedron(1.5)

@@ -155,6 +155,7 @@ class TestRecording:
     def rms(self, error, rows):
         return np.sqrt(np.mean(error[rows] ** 2))
 
+    @pytest.mark.slow
     def test_coil(self, coil_field_T):
         """6.6 mm up to 0.52 m, where noise alone allows 1 cm; 8.8 mm at 15 times the noise; 13.1 mm over all rows.
 
@@ -172,6 +173,7 @@ class TestRecording:
             assert np.linalg.norm(line.start_m) == pytest.approx(0.151, abs=0.005)
             assert line.radius_m == pytest.approx(0.121, abs=0.005)
 
+    @pytest.mark.slow
     def test_a_dipole_does_not_describe_the_near_rows_as_well(self, coil_field_T):
         """9.1 mm where the coil's loop has 6.6, χ² of 1.8 per degree of freedom instead of 1.1."""
         error, deviation, lines = self.errors(coil_field_T, coil=False)

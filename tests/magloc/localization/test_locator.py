@@ -165,6 +165,7 @@ class TestFewScalarSensors:
 class TestBestFit:
     """Nothing that scipy finds from the truth is better."""
 
+    @pytest.mark.slow_after(1)
     @pytest.mark.parametrize("kind", ["scalar", "scalar in ambient", "mixed", "mixed in ambient"])
     def test_no_worse_than_scipy_from_the_truth(self, kind):
         array = array_of(kind, 9, 16)

@@ -68,6 +68,7 @@ def magnet_array(data_folder: Path) -> Path:
 
 
 class TestNoiseThatGrowsWithTheField:
+    @pytest.mark.slow_after(1)
     @pytest.mark.parametrize("common_field_T", [None, pytest.param(1e-6, marks=pytest.mark.slow)])
     def test_all_sensors(self, magnet_array, common_field_T):
         errors = errors_m(magnet_array, noisy_array(magnet_array, common_field_T=common_field_T))
@@ -101,9 +102,11 @@ class TestKnownStrength:
 class TestHowHonestTheErrorBarsAre:
     """docs/validation/fixes.md: the share is that of the recording, and so exact but for rounding."""
 
+    @pytest.mark.slow
     def test_noise_alone_says_too_little(self, magnet_array):
         assert 0.6 < share_in_ellipses(magnet_array) < 0.75
 
+    @pytest.mark.slow
     def test_errors_of_the_sensors_make_them_wide_enough(self, magnet_array):
         stated = {"gain_uncertainty": 0.05, "misalignment_rad": 0.05, "offset_uncertainty_T": 2e-6}
         assert 0.93 < share_in_ellipses(magnet_array, **stated) < 0.99

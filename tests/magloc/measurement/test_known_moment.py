@@ -38,6 +38,7 @@ def least_by_multistart(rng, eigenvalue, along, modulus, sigma):
 
 
 class TestMomentsOfModulus:
+    @pytest.mark.slow_after(1)
     @pytest.mark.parametrize("spread", [0.5, 3.0])
     def test_no_multistart_is_better(self, spread):
         rng = np.random.default_rng(7)

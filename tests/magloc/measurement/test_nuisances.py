@@ -299,6 +299,7 @@ class TestErrorsAreFound:
             ambient_T=AMBIENT_T,
         )
 
+    @pytest.mark.slow
     def test_state_against_true_turns(self) -> None:
         """χ² of source and turns of all runs inside its 99 % bounds, and most of what was unknown is learned.
 

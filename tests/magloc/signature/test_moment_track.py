@@ -146,6 +146,7 @@ class TestKnownAttitude:
 
 
 class TestUncertainPath:
+    @pytest.mark.slow_after(1)
     @pytest.mark.parametrize("correlation_s", [20.0, *(pytest.param(s, marks=pytest.mark.slow) for s in (0.0, np.inf))])
     def test_nees(self, correlation_s: float) -> None:
         """Of the last moment over 30 draws of the path's error: one false alarm in 100."""

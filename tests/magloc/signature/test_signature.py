@@ -238,6 +238,7 @@ class TestHostileWorld:
         paths = [replace(p.path, rotation=turned(p.rotation)) for p in self.PASSES]  # type: ignore[operator]
         assert self.with_paths(paths).misfit
 
+    @pytest.mark.slow
     def test_a_roll_that_the_path_does_not_have(self) -> None:
         level = [replace(p.path, rotation=None) for p in self.PASSES]
         assert self.with_paths(level).misfit

@@ -149,6 +149,7 @@ class TestHostileWorld:
         found = self.check(replace(readings, values_T=values), caplog, "high sticks in")
         assert (len(found), found.array.ids) == (2, ("low",))
 
+    @pytest.mark.slow_after(1)
     @pytest.mark.parametrize("share", [0.001, 0.01])
     def test_wild_readings(self, share: float, caplog: pytest.LogCaptureFixture) -> None:
         readings, rng = simulated("survey-drone", 901).readings, np.random.default_rng(11)
@@ -283,6 +284,7 @@ class TestOutputs:
         assert least == pytest.approx(target.strength_Am2 / 0.3)
         assert most == pytest.approx(target.strength_Am2 / 0.05)
 
+    @pytest.mark.slow
     def test_unstated_pose_is_said(self) -> None:
         field = simulated("survey-drone", 901)
         found = magloc.survey(arrays.SensorArray(field.array.sensors), field.readings)

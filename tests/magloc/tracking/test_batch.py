@@ -149,6 +149,7 @@ class TestCompiledRecord:
         points = self.both(array, SLOW, rows_from(time_s, readings_of(array, p, m)))
         assert statuses(points).count("tracked") > 30
 
+    @pytest.mark.slow_after(1)
     @pytest.mark.parametrize("seed", range(3))
     def test_a_source_at_rest_that_is_known_along_a_curve(self, seed: int) -> None:
         """The paper's scenario, where a prior that bends changes the track by several σ: see test_row_measurement."""

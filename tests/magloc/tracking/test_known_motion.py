@@ -75,6 +75,7 @@ class TestTrack:
         assert "outlier" not in known.status
         assert "outlier" in magloc.track(ARRAY, replace(readings, motion=None), motion=UNKNOWN).status
 
+    @pytest.mark.slow
     def test_nees_of_wrong_measurements(self) -> None:
         """Of the last row over 30 seeds, a log wrong by 1 cm/s and a gyroscope by 0.2°/s: one false alarm in 100."""
         squares = []

@@ -131,6 +131,7 @@ class TestTrack:
         track = magloc.track(replace(simulation.array, pose=WHITE), simulation.readings.high_passed(0.01), motion=REST)
         assert track.innovations.z_constants > THRESHOLD
 
+    @pytest.mark.slow
     def test_a_stream_of_rows_knows_its_motion_from_the_rows_before(self) -> None:
         """Velocities by the row before in place of both neighbours: another track, as right within 5 σ."""
         simulation, track = run(WHITE, 3)
@@ -140,6 +141,7 @@ class TestTrack:
         assert nees(simulation, replace(track, points=tuple(points))) < stats.chi2.ppf(1.0 - 1e-6, 6)
         assert np.abs(points[-1].position_m - track.position_m[-1]).max() > 1e-6
 
+    @pytest.mark.slow
     def test_rows_may_state_their_own(self) -> None:
         """The same σ in columns, and none that is constant: the same track as from the array."""
         simulation, track = run(replace(WHITE, time_s=0.0), 4)

@@ -133,6 +133,7 @@ class TestFaultySensorOfRowsAlone:
             np.testing.assert_allclose(positions(points), place, atol=0.1)
         return points
 
+    @pytest.mark.slow_after(1)
     @pytest.mark.parametrize("fault", ["stuck", "noisy"])
     def test_is_named_left_out_and_taken_back(self, fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr("magloc.tracking.sensor_health.ROWS_TO_RETURN", 2)

@@ -153,6 +153,7 @@ class TestSourceAtRest:
 
     PLACE = (48.0, 11.0, 500.0)
 
+    @pytest.mark.slow
     def test_diver(self) -> None:
         """The magnet lies 0.6 m below the origin; the point is that of the best row, with its σ."""
         diver = magloc.datasets.load("diver")

@@ -117,6 +117,7 @@ class TestMatchedModel:
 
     N_ROWS = 15
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(("motion", "n_runs"), MATCHED)
     def test_nis_nees_and_smoother(self, motion: MotionModel, n_runs: int) -> None:
         rng = np.random.default_rng(20260)
@@ -174,6 +175,7 @@ class TestWeavingTarget:
     Its motion is no model's. Position rms over a few runs; a row that is not tracked is NaN, and fails them.
     """
 
+    @pytest.mark.slow
     @SEEDS
     def test_motion_in_the_state(self, seeds: range) -> None:
         """Speed and turn rate in the state: 0.029 m filtered, 0.020 m smoothed."""
@@ -185,6 +187,7 @@ class TestWeavingTarget:
         assert rms(list(finished)) <= rms(list(filtered))
         assert 0.6 <= float(np.mean(nees)) <= 1.4
 
+    @pytest.mark.slow
     @SEEDS
     def test_random_walk(self, seeds: range) -> None:
         """The paper's S_q: consistent. Its rms is 0.051 m, and so not held to the 0.05 m of a motion in the state."""
@@ -194,6 +197,7 @@ class TestWeavingTarget:
         assert rms(list(filtered)) < 0.16  # what single rows alone give
         assert 0.6 <= float(np.mean(nees)) <= 1.4
 
+    @pytest.mark.slow_after(1)
     @pytest.mark.parametrize("absent", [True, False])
     @pytest.mark.parametrize("motion", [RandomWalk(SPEED_M_S, TURN_RAD_S), OrnsteinUhlenbeck(SPEED_M_S, TURN_RAD_S)])
     def test_is_found_again_after_a_gap(self, motion: MotionModel, absent: bool) -> None:

@@ -104,6 +104,7 @@ class TestCommand:
 
 
 class TestFiles:
+    @pytest.mark.slow
     @pytest.mark.parametrize("outage", ["raw", pytest.param(None, marks=pytest.mark.slow)])
     def test_picture_and_data(self, tmp_path, outage):
         options = ComplementaryOptions(seeds=2, outage=outage)

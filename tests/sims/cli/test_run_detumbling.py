@@ -10,6 +10,7 @@ from tests.adcs.refusals import assert_refused
 from tests.command_line import refuse_constant
 
 
+@pytest.mark.slow
 def test_numbers_and_text(adcs):
     arguments = ("run", "detumbling", "--seeds", "2", "--rate-deg-s", "0.7", "--duration", "500")
     outcome = adcs(*arguments, "--json")

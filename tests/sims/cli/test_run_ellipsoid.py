@@ -118,6 +118,7 @@ class TestCommand:
 
 
 class TestFiles:
+    @pytest.mark.slow
     @pytest.mark.parametrize("closed_loop", [True, pytest.param(False, marks=pytest.mark.slow)])
     def test_picture_and_data(self, tmp_path, closed_loop):
         options = EllipsoidOptions(seeds=3, duration=400.0, closed_loop=closed_loop)

@@ -123,6 +123,7 @@ class TestSky:
         assert lines[1] == "noise 6 DN, 10 % of the lights lost, 20 °/s"
         assert len(lines) == 8
 
+    @pytest.mark.slow
     def test_files_can_be_read_again(self, adcs, tmp_path):
         out, again = tmp_path / "new" / "folder", tmp_path / "again"
         outcome = adcs("run", "mockup", "--poses", "6", "--seeds", "2", "--lost", "0.3", "--json", "--out", out)
@@ -349,6 +350,7 @@ class TestReplay:
         assert outcome.err == f"adcs: wrote {page}\n"
         assert "Table-top satellite: delayed filter" in page.read_text(encoding="utf-8")
 
+    @pytest.mark.slow
     def test_the_server_runs_until_it_is_interrupted(self):
         command = [sys.executable, "-m", "adcs.cli", "run", "mockup", *SHORT, "--view", "--port", "0"]
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:

@@ -190,6 +190,7 @@ class TestNumbers:
 class TestNamedProblems:
     """Each says in its result what is wrong, without being told the truth."""
 
+    @pytest.mark.slow_after(1)
     @pytest.mark.parametrize(
         ("name", "words"),
         [
@@ -296,6 +297,7 @@ class TestFiles:
             "truth.csv",
         ]
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("name", ["errors", "consistency"])
     def test_pictures(self, folder, name):
         picture = image.imread(folder / f"tabletsat-{name}.png")
@@ -383,6 +385,7 @@ class TestCompare:
         assert {key: rows[1][key] for key in KEYS} == alone
         assert any("field differs" in line for line in rows[1]["warnings"])
 
+    @pytest.mark.slow
     def test_lists_and_files(self, adcs, tmp_path):
         arguments = ("--sensors", "st,mag+sun", "--states", "none,disturbance", "--filter", "mekf,smoother")
         outcome = adcs("compare", "tabletsat", *arguments, "--seeds", "1", "--out", tmp_path)

@@ -26,12 +26,14 @@ def summaries():
 
 
 class TestFusion:
+    @pytest.mark.slow
     def test_the_ordering_of_the_methods(self, summaries) -> None:
         rms = [
             summaries[method]["position_rms_mm"] for method in ("ekf", "velocity-corrected", "paper", "camera", "imu")
         ]
         assert rms == sorted(rms)
 
+    @pytest.mark.slow
     def test_the_delayed_filter(self, summaries) -> None:
         assert summaries["ekf"]["position_rms_mm"] <= 4.0
         assert summaries["ekf"]["position_max_mm"] <= 15.0

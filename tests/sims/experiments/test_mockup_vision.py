@@ -247,6 +247,7 @@ class TestRun:
         np.testing.assert_array_equal(runs[2].estimates, runs[1].estimates[3:])
         assert not np.array_equal(runs[0].truth, runs[2].truth)
 
+    @pytest.mark.slow
     def test_number_of_threads_changes_no_digit(self, tmp_path):
         script = (
             "from adcs.mockup.vision.sky import led_sky; from adcs.mockup.vision.triangles import TriangleCatalogue;"

@@ -269,6 +269,7 @@ class TestUnmatchedPaths:
     40 runs or more never. Farther than 5 σ: once in 1.7 million, of each run.
     """
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("n_runs", [3, pytest.param(150, marks=SLOW)])
     def test_weaving(self, n_runs: int) -> None:
         """Measured over 40 runs (seeds 1000 to 1039): 0.84 of the whole record."""
@@ -276,6 +277,7 @@ class TestUnmatchedPaths:
         assert 0.6 < nees_of_the_last(result, 5) < 1.4
         assert_none_is_far(result)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("n_runs", [1, *(pytest.param(n, marks=SLOW) for n in (2, 60))])
     def test_ship(self, n_runs: int) -> None:
         """The last 30 s, when it has passed: measured 0.9 to 1.1 over 40 runs (seeds 1000 to 1039).
@@ -286,6 +288,7 @@ class TestUnmatchedPaths:
         assert 0.6 < nees_of_the_last(result, 3) < 1.4
         assert_none_is_far(result)
 
+    @pytest.mark.slow_after(1)
     @pytest.mark.parametrize(("n_runs", "duration_s"), [(2, 4.0), pytest.param(40, 20.0, marks=SLOW)])
     def test_hand_magnet(self, n_runs: int, duration_s: float) -> None:
         """White noise only: errors of the gain of 30 sensors are 180 states.

@@ -421,6 +421,7 @@ class TestBar:
         with pytest.raises(ValueError, match="at least 2 m from source 1"):
             simulate(scenario(sources=(self.source((1.0, 1.0, 0.5)),)), 1)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("stated", [True, False])
     @pytest.mark.parametrize("lengths", [2.0, 3.0, 4.5, 6.0])
     def test_fixes_are_as_good_as_they_say(self, lengths: float, stated: bool) -> None:

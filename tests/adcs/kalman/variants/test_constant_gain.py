@@ -21,6 +21,7 @@ class TestConstantGain:
         assert (reached["rate_rms_deg_s"] or 9.0) <= 1e-4
         assert reached["diverged_runs"] == 0
 
+    @pytest.mark.slow_after(1)
     @pytest.mark.parametrize(
         ("sensors", "angle", "rate"), [("st", 1.1e-3, 4e-4), ("mag+sun", 0.12, 3.2e-3), ("mag+sun+gyro", 0.25, 2e-3)]
     )

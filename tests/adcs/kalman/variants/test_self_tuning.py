@@ -28,6 +28,7 @@ def runs_with(torque_Nm: float, period_s: float, duration_s: float = 1200.0, see
 
 
 class TestConsistency:
+    @pytest.mark.slow_after(1)
     @pytest.mark.parametrize(
         ("sensors", "torque_Nm", "period_s"),
         [

@@ -36,6 +36,7 @@ class TestParallelFilter:
         assert (reached["angle_rms_deg"] or 9.0) <= 4e-2
         assert (reached["disturbance_rms_s2"] or 9.0) <= 8e-8
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(("sensors", "duration_s"), [("st", 200.0), ("mag+sun+gyro", 600.0)])
     def test_printed_form_fails(self, sensors: str, duration_s: float, monkeypatch: pytest.MonkeyPatch) -> None:
         """Negative: without the correction of the state it is tens of times worse, and its covariance is void."""
@@ -67,6 +68,7 @@ class TestParallelFilter:
         nees = normalised_error_squared(runs, estimates)[:, 50:].mean() / 9.0
         assert 0.2 < nees < 1.6
 
+    @pytest.mark.slow
     def test_slow_disturbance(self) -> None:
         scenario = replace(scenario_for(CHOSEN.sensors, 1000.0), torque_period_s=5800.0)
         runs = simulate(scenario, SEEDS)

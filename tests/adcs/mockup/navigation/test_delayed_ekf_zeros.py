@@ -49,6 +49,7 @@ def squares(factor, settings=FilterSettings(), sigma=StartSigma()):  # noqa: B00
     return np.sum(squared, axis=0)
 
 
+@pytest.mark.slow_after(1)
 @pytest.mark.parametrize("factor", [3.0, 1.0])
 def test_errors_are_no_larger_than_stated(factor: float) -> None:
     total = squares(factor)

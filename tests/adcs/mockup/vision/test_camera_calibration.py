@@ -80,6 +80,7 @@ class TestEstimates:
         covariance = np.linalg.inv(best.jac.T @ best.jac) * np.sum(best.fun**2) / free
         np.testing.assert_allclose(calibration.std, np.sqrt(np.diagonal(covariance)) * [1e-3, 1, 1, 1], rtol=0.1)
 
+    @pytest.mark.slow_after(1)
     @pytest.mark.parametrize(("position_sigma", "heading_sigma"), [(0.0, 0.0), (1e-3, 1e-3)])
     def test_unbiased_and_as_uncertain_as_it_says(self, position_sigma, heading_sigma):
         """25 calibrations: each mean within 4 standard errors, and χ² of all four errors in its 99.99 % interval.

@@ -128,6 +128,7 @@ class TestEveryMatcher:
         assert result.position_rms_m <= (0.2e-3 if make is PaperMatcher else 0.1e-3)
         assert result.heading_rms_rad <= math.radians(0.02)
 
+    @pytest.mark.slow
     def test_candidates_are_worked_through_in_arrays(self, matcher):
         """No frame makes many interpreted calls: 420 of the paper's matcher, 1,100 of the others at most."""
         assert max(calls_of(lambda p=points: matcher.identify(p)) for _, points in rendered_set(SkySetup())) <= 2000

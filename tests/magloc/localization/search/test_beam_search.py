@@ -59,6 +59,7 @@ def fits_of(q, mu, chi2):
 class TestLinearScores:
     """A candidate's score is the energy of the residual that its three moments explain."""
 
+    @pytest.mark.slow_after(1)
     @pytest.mark.parametrize("kind", ["vector", "scalar in ambient", "mixed in ambient"])
     def test_against_least_squares(self, kind):
         array = array_of(kind, 1)

@@ -91,6 +91,7 @@ class TestSeveralSources:
             assert_allclose([source.position_m for source in fix.best.sources], self.PLACES)
             assert fix.best.dof == differences.n_differences - 6
 
+    @pytest.mark.slow_after(1)
     @pytest.mark.parametrize("ambient_T", [None, tuple(AMBIENT.tolist())])
     def test_moduli_are_as_precise_as_they_say(self, ambient_T):
         """NEES of 6 × 60 within 99.9 %; without an ambient field both signs are listed, and the nearer one counts."""
@@ -247,6 +248,7 @@ class TestNoAmbientField:
                 assert other.chi2 == one.chi2
                 assert_allclose(other.covariance, one.covariance, rtol=1e-6)
 
+    @pytest.mark.slow
     def test_the_solutions_are_the_roots_of_the_differences(self):
         """Twenty random places and moments; usually there are four."""
         rng = np.random.default_rng(5)

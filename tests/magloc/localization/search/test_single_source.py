@@ -108,6 +108,7 @@ class TestNoiseFreeReadings:
 class TestBestFit:
     """The first solution is the maximum of the likelihood: nothing that scipy finds from the truth is better."""
 
+    @pytest.mark.slow_after(1)
     @pytest.mark.parametrize("case", ["tetrahedron", "irregular", "square", "common field", "proportional noise"])
     def test_no_worse_than_scipy_from_the_truth(self, case):
         array, nearest, farthest = {
@@ -166,6 +167,7 @@ class TestSolutionsAreRanked:
             assert chi2 == sorted(chi2)
             assert chi2[-1] <= chi2[0] + 20.0
 
+    @pytest.mark.slow
     def test_weak_mirror_solution_is_listed(self):
         """The truth's own basin is among the solutions even where another one fits better."""
         rng = np.random.default_rng(5)

@@ -274,6 +274,7 @@ class TestUndetected:
 class TestSetOfRanges:
     """It is where the least χ² at a range, whatever the direction, is within the rise of the least of all."""
 
+    @pytest.mark.slow_after(1)
     @pytest.mark.parametrize("case", ["tetrahedron 1.5 m", "seven irregular"])
     def test_against_all_directions(self, case: str) -> None:
         problems, sphere = Problems.of(case, 120, 4), Sphere(CASES[case][0])

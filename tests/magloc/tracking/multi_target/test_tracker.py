@@ -127,6 +127,7 @@ class TestFirstRow:
         assert len(told.tracks) == 3
         assert judged(points, truth.first(1), took).nees < 5.0
 
+    @pytest.mark.slow
     def test_what_the_row_leaves_open_is_told(self):
         """Two in wrong places are a little likelier than the three that are there: the next row decides."""
         rng = np.random.default_rng(7)
@@ -137,6 +138,7 @@ class TestFirstRow:
 
 
 class TestFaults:
+    @pytest.mark.slow_after(1)
     @pytest.mark.parametrize("kind", FAULTS)
     def test_a_sensor_that_dies_is_named(self, kind):
         """And no other one: within five rows of a wrong reading, which a stuck sensor has somewhat later."""
@@ -168,6 +170,7 @@ class TestFaults:
         assert not any(point.dropped_sensors for point in points)
         assert judged(points, truth, took).nees < 2.0
 
+    @pytest.mark.slow
     def test_what_nothing_explains_is_a_misfit(self):
         _, readings = run_of(11, 2, 40)
         bad = readings.copy()

@@ -130,6 +130,7 @@ class TestConsistency:
 
 
 class TestTrack:
+    @pytest.mark.slow
     def test_lines_of_any_slope_are_one(self, caplog: pytest.LogCaptureFixture) -> None:
         """The slopes are unknown: the same track with other ones, within what the prior of 10⁵ σ leaves."""
         with caplog.at_level(logging.WARNING, logger="magloc"):
