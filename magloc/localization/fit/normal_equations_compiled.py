@@ -56,12 +56,12 @@ def has_digits(signal: FloatArray, gain: FloatArray, model: LaneModel) -> bool:
     """Whether this serves a signal (s, 3) with gains (s, 9): not large ones, nor where noise has a direction."""
     energy = 0.0
     for s in range(len(gain)):
-        a, b, c = gain[s, 0:3], gain[s, 3:6], gain[s, 6:9]
-        weight = a[0] * a[0] + b[0] * b[0] + c[0] * c[0]
+        g = gain[s]
+        weight = g[0] * g[0] + g[3] * g[3] + g[6] * g[6]
         for i in range(3):
             energy += signal[s, i] * signal[s, i]
             for j in range(i, 3):
-                square = a[i] * a[j] + b[i] * b[j] + c[i] * c[j]
+                square = g[i] * g[j] + g[3 + i] * g[3 + j] + g[6 + i] * g[6 + j]
                 if not abs(square - (weight if i == j else 0.0)) <= _SAME_WEIGHT * weight:
                     return False
     return model.is_unknown and energy <= _MOST_ENERGY
@@ -114,33 +114,6 @@ def _add(r: FloatArray, at: int, i: int, x: tuple[float, float, float]) -> None:
 
 
 @inlined
-def _unit_fields(n: tuple[float, float, float], inverse: float) -> tuple[float, ...]:
-    """Fields (3 n nᵀ - I) / r³ of the three unit moments."""
-    cube = inverse * inverse * inverse
-    t0, t1 = 3.0 * cube * n[0], 3.0 * cube * n[1]
-    return (
-        t0 * n[0] - cube, t0 * n[1], t0 * n[2], t1 * n[1] - cube, t1 * n[2], 3.0 * cube * n[2] * n[2] - cube
-    )  # fmt: skip
-
-
-@inlined
-def _change(n: tuple[float, float, float], m: tuple[float, float, float], inverse: float) -> tuple[float, ...]:
-    """Gradient tensor of the field of a moment."""
-    quartic = 3.0 * inverse * inverse * inverse * inverse
-    along = quartic * dot(n, m)
-    f0, f1, f2 = 5.0 * along * n[0], 5.0 * along * n[1], 5.0 * along * n[2]
-    q0, q1, q2 = quartic * n[0], quartic * n[1], quartic * n[2]
-    return (
-        along + 2.0 * q0 * m[0] - f0 * n[0],
-        q0 * m[1] + q1 * m[0] - f0 * n[1],
-        q0 * m[2] + q2 * m[0] - f0 * n[2],
-        along + 2.0 * q1 * m[1] - f1 * n[1],
-        q1 * m[2] + q2 * m[1] - f1 * n[2],
-        along + 2.0 * q2 * m[2] - f2 * n[2],
-    )
-
-
-@inlined
 def _root(a: tuple[float, ...]) -> tuple[float, ...]:
     """LDLᵀ of a symmetric matrix: one over its pivots, 0 for those that are lost, and the factors (10, 20, 21)."""
     i0 = 1.0 / a[0] if a[0] > 0.0 else 0.0
@@ -187,7 +160,10 @@ def _fill_fields(sensor: FloatArray, first: bool, w: FloatArray, r: FloatArray) 
         n = (v[0] * inverse, v[1] * inverse, v[2] * inverse)
         r[DIRECTION + i], r[DIRECTION + LANES + i], r[DIRECTION + 2 * LANES + i] = n
         r[DIRECTION + 3 * LANES + i] = inverse
-        _put_six(r, FIELD, i, _unit_fields(n, inverse))
+        cube = inverse * inverse * inverse
+        t0, t1, t2 = 3.0 * cube * n[0], 3.0 * cube * n[1], 3.0 * cube * n[2]
+        f = (t0 * n[0] - cube, t0 * n[1], t0 * n[2], t1 * n[1] - cube, t1 * n[2], t2 * n[2] - cube)
+        _put_six(r, FIELD, i, f)
     if first:
         for i in range(6 * LANES):
             w[FIRST + i] = r[FIELD + i]
@@ -233,7 +209,15 @@ def _fill_jacobian(sensor: FloatArray, w: FloatArray, r: FloatArray) -> None:
     x0, x1, x2 = sensor[0], sensor[1], sensor[2]
     for i in range(LANES):
         f, weight, m = _six(r, FIELD, i), r[WEIGHT + i], three(w, TRIAL + MOMENT, i)
-        change = _change(three(r, DIRECTION, i), m, r[DIRECTION + 3 * LANES + i])
+        n, inverse = three(r, DIRECTION, i), r[DIRECTION + 3 * LANES + i]
+        quartic = 3.0 * inverse * inverse * inverse * inverse
+        along = quartic * dot(n, m)
+        f0, f1, f2 = 5.0 * along * n[0], 5.0 * along * n[1], 5.0 * along * n[2]
+        q0, q1, q2 = quartic * n[0], quartic * n[1], quartic * n[2]
+        change = (  # gradient tensor of the moment's field
+            along + 2.0 * q0 * m[0] - f0 * n[0], q0 * m[1] + q1 * m[0] - f0 * n[1], q0 * m[2] + q2 * m[0] - f0 * n[2],
+            along + 2.0 * q1 * m[1] - f1 * n[1], q1 * m[2] + q2 * m[1] - f1 * n[2], along + 2.0 * q2 * m[2] - f2 * n[2],
+        )  # fmt: skip
         t0, t1, t2 = three(w, TANGENT, i), three(w, TANGENT + 3 * LANES, i), three(w, TANGENT + 6 * LANES, i)
         t23 = w[TANGENT + 9 * LANES + i]
         # What moves the source moves a sensor the other way.

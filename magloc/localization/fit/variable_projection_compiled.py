@@ -167,7 +167,7 @@ def refine(
 @internal
 def easy_first(signal: FloatArray, reading: IntArray, model: LaneModel, order: IntArray) -> int:
     """Order of readings, first those for which few digits do; how many these are."""
-    n, n_easy = len(reading), np.int64(0)
+    n, n_easy = len(reading), 0
     for i in range(n):
         if has_digits(signal[reading[i]], model.gain[model.set_of_row[reading[i]]], model):
             order[n_easy] = i

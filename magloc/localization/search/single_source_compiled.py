@@ -90,19 +90,23 @@ def choose_rows(
             key[j] = (np.int64(bits[j]) << 32) + (n - j)
         for b in range(n_blocks):
             highest[b] = _largest(blocks[b])
-        chosen[row] = 0
         n_found = 0
         while n_found < n_chosen:
             best = _largest(highest)
-            if best <= 0:
-                chosen[row, n_found:] = chosen[row, 0]
-                break
+            if best <= 0:  # none is left
+                chosen[row, n_found] = chosen[row, 0] if n_found else 0
+                n_found += 1
+                continue
             j = n - (best & 0xFFFFFFFF)
             key[j] = -1
             highest[j // _BLOCK] = _largest(blocks[j // _BLOCK])
             near = False
             for k in range(n_found):
-                near |= _are_near(candidates[j], candidates[chosen[row, k]], apart)
+                i = chosen[row, k]
+                t = np.float32(0.0)
+                for d in range(4):
+                    t += candidates[i, d] * candidates[j, d]
+                near |= abs(t) > apart
             if not near:
                 chosen[row, n_found] = j
                 n_found += 1
@@ -114,11 +118,6 @@ def _largest(values: IntArray) -> Any:
     for i in range(1, len(values)):
         largest = max(largest, values[i])
     return largest
-
-
-@inlined
-def _are_near(q: NDArray[np.float32], other: NDArray[np.float32], cos_apart: Any) -> bool:
-    return abs(q[0] * other[0] + q[1] * other[1] + q[2] * other[2] + q[3] * other[3]) > cos_apart
 
 
 @compiled
@@ -140,7 +139,7 @@ def search_rows(
     reading. The first ones say above which χ² the others are given up.
     """
     n_rows, n_starts = end - begin, starts.shape[1]
-    n_first, n, n_easy = min(_FIRST_STARTS, n_starts), n_rows * n_starts, np.int64(0)
+    n_first, n, n_easy = min(_FIRST_STARTS, n_starts), n_rows * n_starts, 0
     place, reading = np.empty((n_rows, n_starts), np.intp), np.empty(n, np.intp)
     of_place, order = np.empty((n, starts.shape[2])), np.empty(n_rows, np.intp)
     if moduli is None:
@@ -170,7 +169,7 @@ def search_rows(
                 lowest = _lowest(near, place[row, :n_first])
                 for j in place[row, n_first:]:
                     limit[j] = lowest + keep_within + 1.0
-    distinct, count = np.empty((n, starts.shape[2])), np.int64(0)
+    distinct, count = np.empty((n, starts.shape[2])), 0
     chi2, iterations, first_end = np.empty(n), np.empty(n, np.intp), np.zeros(n_rows + 1, np.intp)
     for row in range(begin, end):
         lowest = _lowest(near, place[row - begin])
