@@ -162,8 +162,8 @@ def _fill_fields(sensor: FloatArray, first: bool, w: FloatArray, r: FloatArray) 
         r[DIRECTION + 3 * LANES + i] = inverse
         cube = inverse * inverse * inverse
         t0, t1, t2 = 3.0 * cube * n[0], 3.0 * cube * n[1], 3.0 * cube * n[2]
-        f = (t0 * n[0] - cube, t0 * n[1], t0 * n[2], t1 * n[1] - cube, t1 * n[2], t2 * n[2] - cube)
-        _put_six(r, FIELD, i, f)
+        at_sensor = (t0 * n[0] - cube, t0 * n[1], t0 * n[2], t1 * n[1] - cube, t1 * n[2], t2 * n[2] - cube)
+        _put_six(r, FIELD, i, at_sensor)
     if first:
         for i in range(6 * LANES):
             w[FIRST + i] = r[FIELD + i]

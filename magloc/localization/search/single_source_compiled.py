@@ -106,7 +106,7 @@ def choose_rows(
                 t = np.float32(0.0)
                 for d in range(4):
                     t += candidates[i, d] * candidates[j, d]
-                near |= abs(t) > apart
+                near = near or bool(abs(t) > apart)
             if not near:
                 chosen[row, n_found] = j
                 n_found += 1
