@@ -26,7 +26,7 @@ from magloc.measurement.whitened_compiled import ModelRow, candidate_bases
 SingleArray = NDArray[np.float32]
 _SAME_GAIN = 0.02
 _CANDIDATES_AT_ONCE = 512
-_ROWS_AT_ONCE = 128  # whose components stay in the processor's cache
+_ROWS_AT_ONCE = 64  # whose components stay in the processor's cache
 
 
 def linear_bases(problem: WhitenedModel, gain: FloatArray, row: int, candidates: FloatArray) -> SingleArray:
@@ -74,12 +74,13 @@ def chosen_candidates(
 ) -> NDArray[np.intp]:
     """:func:`distinct_best` of the :func:`linear_scores` of residuals (b, C), compiled."""
     chosen = np.zeros((len(residual), n_starts), dtype=np.intp)
-    single = candidates.astype(np.float32)
+    single, of_rows = candidates.astype(np.float32), residual.astype(np.float32)
+    # One piece of memory for all: a new one is cleared by the system first, which takes as long as the choice.
+    components = np.empty((min(_ROWS_AT_ONCE, len(residual)), bases.shape[1]), dtype=np.float32)
     for begin in range(0, len(residual), _ROWS_AT_ONCE):
-        some = residual[begin : begin + _ROWS_AT_ONCE]
-        components = (some.astype(np.float32) @ bases).reshape(len(some), 3, -1)
-        of_some = chosen[begin : begin + _ROWS_AT_ONCE]
-        over_rows(choose_rows, len(some), components, single, math.cos(apart_rad), of_some)
+        some = of_rows[begin : begin + _ROWS_AT_ONCE]
+        of_some = np.matmul(some, bases, out=components[: len(some)]).reshape(len(some), 3, -1)
+        over_rows(choose_rows, len(some), of_some, single, math.cos(apart_rad), chosen[begin : begin + _ROWS_AT_ONCE])
     return chosen
 
 

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from arrays.typing import FloatArray, IntArray
 from magloc.compilation import compiled, inlined, internal
 from magloc.linalg_compiled import put
-from magloc.localization.fit.linearisation_compiled import LANES
 from magloc.localization.fit.variable_projection_compiled import OPTIMUM_TOLERANCE, Refined, refine, same_optimum
 from magloc.measurement.whitened_compiled import LaneModel
 
@@ -23,6 +22,8 @@ from magloc.measurement.whitened_compiled import LaneModel
 _NEAR_TOLERANCE = 1e-2
 # Times the linearisations that one of these may take from there on: along a flat valley steps hardly get shorter.
 _LONGER = 3.0
+# Candidates of which the best one is known.
+_BLOCK = 64
 
 
 class Ends(NamedTuple):
@@ -61,57 +62,52 @@ def choose_rows(
 ) -> None:
     """Candidates (n, 4) that explain most of rows begin to end, some angle apart; the best again if none is left.
 
-    Components (rows, 3, n) are those of the readings along the candidates' bases. Candidates are lanes, four of a lane
-    are compared before the best so far is: a processor waits for that from one comparison to the next.
+    Components (rows, 3, n) are those of the readings along the candidates' bases. Candidates are taken one by one, the
+    best first, and left where they are near one that is chosen already. A key has the score, whose bits as an integer
+    are in order, and behind it how many candidates follow: the largest key of a block is the first of its best ones.
     """
-    n, apart = len(candidates), np.float32(cos_apart)
-    n_fours = -(-n // (4 * LANES))
-    fours = np.zeros((n_fours, 4, 4 * LANES), np.float32)
-    for j in range(n):
-        for d in range(4):
-            fours[j // (4 * LANES), d, j % (4 * LANES)] = candidates[j, d]
-    q = fours.reshape(n_fours, 16 * LANES)
-    score = np.full(n_fours * 4 * LANES, np.float32(-1.0))
-    scores_of_four = score.reshape(n_fours, 4 * LANES)
-    w = np.empty(2 * LANES, np.float32)  # best score of a lane, and its place
-    last = np.empty(4, np.float32)
+    n, n_chosen, apart = len(candidates), chosen.shape[1], np.float32(cos_apart)
+    n_blocks = -(-n // _BLOCK)
+    score, key = np.empty(n, np.float32), np.full(n_blocks * _BLOCK, -1)
+    bits, blocks, highest = score.view(np.int32), key.reshape(n_blocks, _BLOCK), np.empty(n_blocks, np.int64)
     for row in range(begin, end):
         x, y, z = components[row, 0], components[row, 1], components[row, 2]
         for j in range(n):
-            score[j] = x[j] * x[j] + y[j] * y[j] + z[j] * z[j]
-        last[:] = 0.0
-        for k in range(chosen.shape[1]):
-            w[:] = 0.0
-            of_last = (last[0], last[1], last[2], last[3])
-            for j in range(n_fours):
-                c, s, place = q[j], scores_of_four[j], np.float32(4 * LANES * j)
-                for i in range(LANES):
-                    v0, v1 = _left(c, i, of_last, apart, s), _left(c, LANES + i, of_last, apart, s)
-                    v2, v3 = _left(c, 2 * LANES + i, of_last, apart, s), _left(c, 3 * LANES + i, of_last, apart, s)
-                    s[i], s[LANES + i], s[2 * LANES + i], s[3 * LANES + i] = v0, v1, v2, v3
-                    p01, v01 = np.float32(LANES) if v1 > v0 else np.float32(0.0), v1 if v1 > v0 else v0
-                    p23, v23 = np.float32(3 * LANES) if v3 > v2 else np.float32(2 * LANES), v3 if v3 > v2 else v2
-                    which, value = p23 if v23 > v01 else p01, v23 if v23 > v01 else v01
-                    better = value > w[i]
-                    w[i] = value if better else w[i]
-                    w[LANES + i] = place + which if better else w[LANES + i]
-            best = 0
-            for i in range(1, LANES):
-                earlier = w[i] == w[best] and w[LANES + i] + i < w[LANES + best] + best
-                best = i if w[i] > w[best] or earlier else best
-            found = int(w[LANES + best]) + best
-            chosen[row, k] = found if w[best] > 0.0 else chosen[row, 0] if k > 0 else 0
-            for d in range(4):
-                last[d] = candidates[chosen[row, k], d]
+            explained = x[j] * x[j] + y[j] * y[j] + z[j] * z[j]
+            score[j] = explained if explained > 0.0 else np.float32(-1.0)
+        for j in range(n):
+            key[j] = (np.int64(bits[j]) << 32) + (n - j)
+        for b in range(n_blocks):
+            highest[b] = _largest(blocks[b])
+        chosen[row] = 0
+        n_found = 0
+        while n_found < n_chosen:
+            best = _largest(highest)
+            if best <= 0:
+                chosen[row, n_found:] = chosen[row, 0]
+                break
+            j = n - (best & 0xFFFFFFFF)
+            key[j] = -1
+            highest[j // _BLOCK] = _largest(blocks[j // _BLOCK])
+            near = False
+            for k in range(n_found):
+                near |= _are_near(candidates[j], candidates[chosen[row, k]], apart)
+            if not near:
+                chosen[row, n_found] = j
+                n_found += 1
 
 
 @inlined
-def _left(
-    c: NDArray[np.float32], at: int, q: tuple[float, float, float, float], cos_apart: Any, score: NDArray[np.float32]
-) -> Any:
-    """Score of a candidate, or less than any where it is near q."""
-    t = c[at] * q[0] + c[4 * LANES + at] * q[1] + c[8 * LANES + at] * q[2] + c[12 * LANES + at] * q[3]
-    return np.float32(-1.0) if abs(t) > cos_apart else score[at]
+def _largest(values: IntArray) -> Any:
+    largest = values[0]
+    for i in range(1, len(values)):
+        largest = max(largest, values[i])
+    return largest
+
+
+@inlined
+def _are_near(q: NDArray[np.float32], other: NDArray[np.float32], cos_apart: Any) -> bool:
+    return abs(q[0] * other[0] + q[1] * other[1] + q[2] * other[2] + q[3] * other[3]) > cos_apart
 
 
 @compiled
