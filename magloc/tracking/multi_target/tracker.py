@@ -41,6 +41,8 @@ ROWS_TO_REPORT = 10
 """Rows after its birth in which a source is not yet told, unless there is no other: one taken for two dies sooner."""
 MERGED_GAP = 1.0 / 3.0
 """Standard deviation of a gap over the gap above which two sources are merged."""
+# How often many sources are searched for in the first row, with other random numbers, until they explain it.
+_SEARCHES = 4
 # Hypotheses that are kept, and by how much they may be less likely (-2 ln).
 _MOST_HYPOTHESES = 8
 _LESS_LIKELY = 25.0
@@ -208,16 +210,27 @@ class SourcesTracker:
         nothing, scene, row = self._nothing_yet(problem), self.scene, problem.row
         if scene.most_sources <= MOST_BY_ITSELF:
             return nothing
-        locator = Locator(
-            scene.array, sources=scene.most_sources, prior=scene.prior, body_length_m=0.0, exclude_faulty=False
-        )
-        fix, R = locator.fit(row.readings_T, row.ambient_T), row.R_world_from_array
-        if not fix.solutions:
-            return nothing
-        positions_m = np.array([row.origin_m + R @ source.position_m for source in fix.best.sources])
-        moments_Am2 = np.array([R @ source.moment_Am2 for source in fix.best.sources])
-        found = problem.found_anew(nothing.state, positions_m, moments_Am2, nothing.health.dead)
-        return replace(nothing, state=found.prior, ids=found.ids)
+        R, best = row.R_world_from_array, None
+        for seed in range(_SEARCHES):
+            locator = Locator(
+                scene.array,
+                sources=scene.most_sources,
+                prior=scene.prior,
+                body_length_m=0.0,
+                exclude_faulty=False,
+                seed=seed,
+            )
+            fix = locator.fit(row.readings_T, row.ambient_T)
+            if not fix.solutions:
+                continue
+            positions_m = np.array([row.origin_m + R @ source.position_m for source in fix.best.sources])
+            moments_Am2 = np.array([R @ source.moment_Am2 for source in fix.best.sources])
+            found = problem.found_anew(nothing.state, positions_m, moments_Am2, nothing.health.dead)
+            if best is None or found.score < best.score:
+                best = found
+            if best.excess < COST_LIMIT:
+                break
+        return nothing if best is None else replace(nothing, state=best.prior, ids=best.ids)
 
     def _nothing_yet(self, problem: RowProblem) -> Hypothesis:
         """No source, and a common field that may be as large as the readings."""
