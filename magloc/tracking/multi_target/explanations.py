@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import combinations
 
@@ -120,11 +120,14 @@ class RowProblem:
     row : Row
     index : int
         Of the row: sources that are born in it are called by it.
+    further : dict
+        Explanations that were asked what else may have happened, by their identity, and the answers.
     """
 
     scene: Scene
     row: Row
     index: int
+    further: dict[int, tuple[Explanation, list[Explanation]]] = field(default_factory=dict)
 
     @cached_property
     def measured(self) -> JointRow:
@@ -204,9 +207,9 @@ class RowProblem:
             found = again
         return found
 
-    def of_more_sources(self, common: JointState, out: BoolArray, least: int) -> list[Explanation]:
+    def of_more_sources(self, nothing: Explanation, least: int) -> list[Explanation]:
         """Explanations from nothing, with some number of sources at least: fewer may hold in a row, and be wrong."""
-        return self._beam(self.updated(common, (), out), least + 1, least)
+        return self._beam(nothing, least + 1, least)
 
     def _beam(self, plain: Explanation, most_events: int, least: int = 0) -> list[Explanation]:
         level = [plain]
@@ -250,8 +253,13 @@ class RowProblem:
             alone = self.with_source(prior.without(second).without(first), place_m, together)
             yield self.updated(alone, (*others, min(ids[first], ids[second])), found.out, penalty)
 
-    def _one_event_more(self, found: Explanation) -> Iterator[Explanation]:
+    def _one_event_more(self, found: Explanation) -> list[Explanation]:
         """A sensor out, a death, and births at the best cells."""
+        if id(found) not in self.further:
+            self.further[id(found)] = found, list(self._events(found))
+        return self.further[id(found)][1]
+
+    def _events(self, found: Explanation) -> Iterator[Explanation]:
         if not found.update.converged and not np.isfinite(found.update.cost):
             return
         chi2 = found.update.sensor_chi2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -94,12 +95,13 @@ class JointRow:
         Beside it the innovation has errors of unit variance along the columns of `linear` (C, d).
         """
         fields = dipole.field_matrix(self.positions_m, position_m)[self.channel_sensor]
-        columns = (self.gain[:, None] @ fields)[:, 0]
-        size = np.linalg.norm(columns)
-        d = linear.shape[1]
-        A = np.block([[columns / size, linear], [np.zeros((d, 3)), np.eye(d)]])
-        found: FloatArray = np.linalg.lstsq(A, np.concatenate([innovation, np.zeros(d)]), rcond=None)[0]
-        return found[:3] / size
+        A = (self.gain[:, None] @ fields)[:, 0]
+        # What the errors may explain of it counts for as much less: (I + J Jᵀ)⁻¹ = I - J (I + JᵀJ)⁻¹ Jᵀ.
+        of_errors = linear.T @ np.column_stack([A, innovation])
+        N = np.eye(linear.shape[1]) + linear.T @ linear
+        left = A.T @ np.column_stack([A, innovation]) - of_errors[:, :3].T @ np.linalg.solve(N, of_errors)
+        found: FloatArray = np.linalg.lstsq(left[:, :3], left[:, 3], rcond=None)[0]
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,15 +140,18 @@ class Cells:
         energy: FloatArray = np.sum(np.square(components), axis=0, dtype=np.float64)
         return energy
 
+    @cached_property
+    def _near(self) -> BoolArray:
+        """Which cells (n, n) are nearer to one than half its distance from the array's centre."""
+        from_centre = np.linalg.norm(self.position_m - self.position_m.mean(axis=0), axis=1)
+        return np.linalg.norm(self.position_m[:, None] - self.position_m, axis=2) < 0.5 * from_centre[:, None]
+
     def best(self, energy: FloatArray, n: int) -> IntArray:
         """The `n` best cells, half their distance from the array's centre apart from each other."""
         left, chosen = energy.copy(), []
-        centre = self.position_m.mean(axis=0)
         for _ in range(n):
-            cell = int(np.argmax(left))
-            chosen.append(cell)
-            apart = np.linalg.norm(self.position_m - self.position_m[cell], axis=1)
-            left[apart < 0.5 * np.linalg.norm(self.position_m[cell] - centre)] = -1.0
+            chosen.append(int(np.argmax(left)))
+            left[self._near[chosen[-1]]] = -1.0
         return np.array(chosen, dtype=np.intp)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from itertools import combinations
 from typing import Literal
 
 import numpy as np
@@ -42,6 +41,8 @@ ROWS_TO_REPORT = 10
 """Rows after its birth in which a source is not yet told, unless there is no other: one taken for two dies sooner."""
 MERGED_GAP = 1.0 / 3.0
 """Standard deviation of a gap over the gap above which two sources are merged."""
+# How often many sources are searched for in the first row, with other random numbers, until they explain it.
+_SEARCHES = 4
 # Hypotheses that are kept, and by how much they may be less likely (-2 ln).
 _MOST_HYPOTHESES = 8
 _LESS_LIKELY = 25.0
@@ -209,16 +210,27 @@ class SourcesTracker:
         nothing, scene, row = self._nothing_yet(problem), self.scene, problem.row
         if scene.most_sources <= MOST_BY_ITSELF:
             return nothing
-        locator = Locator(
-            scene.array, sources=scene.most_sources, prior=scene.prior, body_length_m=0.0, exclude_faulty=False
-        )
-        fix, R = locator.fit(row.readings_T, row.ambient_T), row.R_world_from_array
-        if not fix.solutions:
-            return nothing
-        positions_m = np.array([row.origin_m + R @ source.position_m for source in fix.best.sources])
-        moments_Am2 = np.array([R @ source.moment_Am2 for source in fix.best.sources])
-        found = problem.found_anew(nothing.state, positions_m, moments_Am2, nothing.health.dead)
-        return replace(nothing, state=found.prior, ids=found.ids)
+        R, best = row.R_world_from_array, None
+        for seed in range(_SEARCHES):
+            locator = Locator(
+                scene.array,
+                sources=scene.most_sources,
+                prior=scene.prior,
+                body_length_m=0.0,
+                exclude_faulty=False,
+                seed=seed,
+            )
+            fix = locator.fit(row.readings_T, row.ambient_T)
+            if not fix.solutions:
+                continue
+            positions_m = np.array([row.origin_m + R @ source.position_m for source in fix.best.sources])
+            moments_Am2 = np.array([R @ source.moment_Am2 for source in fix.best.sources])
+            found = problem.found_anew(nothing.state, positions_m, moments_Am2, nothing.health.dead)
+            if best is None or found.score < best.score:
+                best = found
+            if best.excess < COST_LIMIT:
+                break
+        return nothing if best is None else replace(nothing, state=best.prior, ids=best.ids)
 
     def _nothing_yet(self, problem: RowProblem) -> Hypothesis:
         """No source, and a common field that may be as large as the readings."""
@@ -286,10 +298,10 @@ class SourcesTracker:
         """
         common, dead, known = best.state.common_alone, best.health.dead, len(best.ids)
         again = problem.found_anew(common, best.state.position_m, best.state.moment_Am2, dead)
-        anew = [again]
+        anew, nothing = [again], problem.updated(common, (), dead)
         for number in (known, known - 1, known + 1):  # of many, one by one takes seconds and leads nowhere
             if 0 < number <= min(self.scene.most_sources, MOST_BY_ITSELF):
-                anew += problem.of_more_sources(common, dead, number)
+                anew += problem.of_more_sources(nothing, number)
         if known < self.scene.most_sources:
             anew += distinct(one for start in (found, again) for one in problem.births(start))
         tried = [one for one in distinct(anew) if one.update.converged]
@@ -380,6 +392,8 @@ def _score(hypothesis: Hypothesis) -> float:
 
 def _mates(best: Hypothesis, other: Hypothesis) -> dict[int, int]:
     """Which source of another hypothesis each of the best one's is: that of its name, or else the nearest one."""
+    if other.ids == best.ids:
+        return {k: k for k in range(len(best.ids))}
     apart_m = np.linalg.norm(best.state.position_m[:, None] - other.state.position_m, axis=-1)
     apart_m[np.equal.outer(best.ids, other.ids)] = -_BEYOND_M
     return {int(k): int(j) for k, j in zip(*linear_sum_assignment(apart_m), strict=True)}
@@ -390,11 +404,14 @@ def _moments(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Position, moment and covariance of a source in a mixture of states, of those that have it."""
     parts = [(w, one, k) for w, one, k in zip(weights, states, sources, strict=True) if k is not None]
+    if len(parts) == 1:
+        ((_, one, k),) = parts
+        return one.position_m[k], one.moment_Am2[k], one.covariances[k]
     x = np.array([np.concatenate([one.position_m[k], one.moment_Am2[k]]) for _, one, k in parts])
     share = np.array([weight for weight, _, _ in parts])
     share /= share.sum()
     mean = share @ x
-    covariance = sum(part * one.covariance(k) for part, (_, one, k) in zip(share, parts, strict=True))
+    covariance = sum(part * one.covariances[k] for part, (_, one, k) in zip(share, parts, strict=True))
     return mean[:3], mean[3:], covariance + (share[:, None] * (x - mean)).T @ (x - mean)
 
 
@@ -417,8 +434,12 @@ def _old_names(restart: Hypothesis, before: Hypothesis) -> tuple[int, ...]:
 
 def merged_pairs(state: JointState) -> list[tuple[int, int]]:
     """Pairs of sources that are too near to each other for their gap to be known."""
+    # A gap is no less certain than both places together.
+    spread = np.sqrt(np.trace(state.covariances[:, :3, :3], axis1=1, axis2=2))
+    apart_m = np.linalg.norm(state.position_m[:, None] - state.position_m, axis=-1)
+    close = np.argwhere(np.triu(np.add.outer(spread, spread) > MERGED_GAP * apart_m, 1))
     pairs = []
-    for first, second in combinations(range(state.n_sources), 2):
+    for first, second in close.tolist():
         distance, sigma = state.gap(first, second)
         if sigma > MERGED_GAP * distance:
             pairs.append((first, second))
