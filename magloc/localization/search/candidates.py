@@ -9,7 +9,7 @@ scored by the energy along one template.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -47,17 +47,31 @@ def linear_bases(problem: WhitenedModel, gain: FloatArray, row: int, candidates:
 
 
 class LastBases:
-    """:func:`linear_bases` of the same candidates, kept as long as the rows are whitened alike."""
+    """:func:`linear_bases` and :func:`modulus_templates` of the same candidates, kept while rows are whitened alike."""
 
     def __init__(self) -> None:
-        self._key, self._bases = b"", np.empty((0, 0), dtype=np.float32)
+        self._kept: dict[str, tuple[bytes, SingleArray]] = {}
 
     def of(self, problem: WhitenedModel, gain: FloatArray, row: int, candidates: FloatArray) -> SingleArray:
-        """Those of one row."""
+        """Bases of one row."""
+        return self._last("bases", problem, gain, row, lambda: linear_bases(problem, gain, row, candidates))
+
+    def templates(
+        self, problem: WhitenedModel, row: int, candidates: FloatArray, directions: FloatArray
+    ) -> SingleArray:
+        """Templates of one row."""
+        gain = problem.gain[row]
+        return self._last(
+            "templates", problem, gain, row, lambda: modulus_templates(problem, row, candidates, directions)
+        )
+
+    def _last(
+        self, what: str, problem: WhitenedModel, gain: FloatArray, row: int, make: Callable[[], SingleArray]
+    ) -> SingleArray:
         key = b"".join(values.tobytes() for values in (gain, problem.basis[row], problem.shrinkage[row]))
-        if key != self._key:
-            self._key, self._bases = key, linear_bases(problem, gain, row, candidates)
-        return self._bases
+        if what not in self._kept or self._kept[what][0] != key:
+            self._kept[what] = key, make()
+        return self._kept[what][1]
 
 
 def linear_scores(bases: SingleArray, residual: FloatArray) -> FloatArray:

@@ -15,13 +15,22 @@ from numpy.typing import NDArray
 from arrays.typing import FloatArray, IntArray
 from magloc.compilation import compiled, inlined, internal
 from magloc.linalg_compiled import put
-from magloc.localization.fit.variable_projection_compiled import OPTIMUM_TOLERANCE, Refined, refine, same_optimum
+from magloc.localization.fit.moduli_compiled import Moduli, refine_by_moduli
+from magloc.localization.fit.variable_projection_compiled import (
+    OPTIMUM_TOLERANCE,
+    Refined,
+    Rules,
+    refine,
+    same_optimum,
+)
 from magloc.measurement.whitened_compiled import LaneModel
 
 # Gauss-Newton gain in χ² at which a start is so near an optimum that others are known to lead to the same.
 _NEAR_TOLERANCE = 1e-2
 # Times the linearisations that one of these may take from there on: along a flat valley steps hardly get shorter.
 _LONGER = 3.0
+# Starts of a row that say how high χ² may be where the others lead.
+_FIRST_STARTS = 3
 # Candidates of which the best one is known.
 _BLOCK = 64
 
@@ -120,58 +129,113 @@ def search_rows(
     keep_within: float,
     max_iterations: int,
     model: LaneModel,
+    moduli: Moduli | None,
     out: Ends,
 ) -> None:
     """Distinct optima of rows begin to end, best first; for :func:`magloc.compilation.over_rows`.
 
-    Starts (rows, k, 4) of a row are refined on the signal (readings, s, 3) of its reading.
+    Starts (rows, k, 4) of a row, or with moduli (rows, k, 7), are refined on the signal (readings, s, 3) of its
+    reading. The first ones say above which χ² the others are given up.
     """
-    n_starts = starts.shape[1]
-    n = (end - begin) * n_starts
-    reading = np.empty(n, np.intp)
-    for k in range(n):
-        reading[k] = reading_of_row[begin + k // n_starts]
-    near = Refined(
-        np.empty((n, 4)), np.empty((n, 3)), np.empty(n), np.empty(n, np.intp), np.empty(n, np.bool_)
-    )  # fmt: skip
-    of_block = starts[begin:end].reshape(n, 4)
-    refine(signal, reading, of_block, model, 1.0, _NEAR_TOLERANCE, float(max_iterations), near)
-    first_end, n = np.zeros(end - begin + 1, np.intp), 0
+    n_rows, n_starts = end - begin, starts.shape[1]
+    n_first, n = min(_FIRST_STARTS, n_starts), n_rows * n_starts
+    place, reading = np.empty((n_rows, n_starts), np.intp), np.empty(n, np.intp)
+    of_place = np.empty((n, starts.shape[2]))
+    for row in range(n_rows):
+        for k in range(n_starts):
+            j = row * n_first + k if k < n_first else n_rows * n_first + row * (n_starts - n_first) + k - n_first
+            place[row, k], reading[j] = j, reading_of_row[begin + row]
+            put(of_place[j], starts[begin + row, k])
+    near, limit = _places(n), np.full(n, math.inf)
+    for first, last in ((0, n_rows * n_first), (n_rows * n_first, n)):
+        rules = Rules(_NEAR_TOLERANCE, float(max_iterations), limit[first:last], True)
+        of_part = Refined(
+            near.q[first:last],
+            near.mu[first:last],
+            near.chi2[first:last],
+            near.iterations[first:last],
+            near.converged[first:last],
+        )
+        _refine(signal, reading[first:last], of_place[first:last], model, moduli, rules, of_part)
+        for row in range(n_rows):
+            lowest = _lowest(near, place[row, :n_first])
+            for j in place[row, n_first:]:
+                limit[j] = lowest + keep_within + 1.0
+    distinct, count = np.empty((n, starts.shape[2])), np.int64(0)
+    chi2, iterations, first_end = np.empty(n), np.empty(n, np.intp), np.zeros(n_rows + 1, np.intp)
     for row in range(begin, end):
-        first = (row - begin) * n_starts
-        lowest = math.inf
+        lowest = _lowest(near, place[row - begin])
         out.counts[row, 1] = out.counts[row, 2] = 0
-        for k in range(first, first + n_starts):
+        for k in place[row - begin]:
             out.counts[row, 1] += 0 if near.converged[k] else 1
             out.counts[row, 2] += near.iterations[k]
-            lowest = min(lowest, near.chi2[k] if near.converged[k] else math.inf)
-        for k in range(first, first + n_starts):
             if not near.converged[k] or near.chi2[k] > lowest + keep_within + 1.0:
                 continue
             known = False
-            for j in range(first_end[row - begin], n):
-                known = known or same_optimum(near.q[k], near.chi2[k], near.q[j], near.chi2[j])
+            for j in range(first_end[row - begin], count):
+                same = same_optimum(near.q[k], near.chi2[k], distinct[j], chi2[j])
+                if moduli is not None:
+                    same = same and _same_side(near.mu[k], distinct[j, 4:])
+                known = known or same
             if not known:
-                put(near.q[n], near.q[k])
-                near.chi2[n], near.iterations[n] = near.chi2[k], near.iterations[k]
-                reading[n] = reading_of_row[row]
-                n += 1
-        first_end[row - begin + 1] = n
-    ends = Refined(
-        np.empty((n, 4)), np.empty((n, 3)), np.empty(n), np.empty(n, np.intp), np.empty(n, np.bool_)
-    )  # fmt: skip
-    refine(signal, reading[:n], near.q[:n], model, 1.0, OPTIMUM_TOLERANCE, _LONGER * max_iterations, ends)
+                put(distinct[count], near.q[k])
+                if moduli is not None:
+                    put(distinct[count, 4:], near.mu[k])
+                chi2[count], iterations[count] = near.chi2[k], near.iterations[k]
+                reading[count] = reading_of_row[row]
+                count += 1
+        first_end[row - begin + 1] = count
+    ends = _places(count)
+    rules = Rules(OPTIMUM_TOLERANCE, _LONGER * max_iterations, np.full(count, math.inf), False)
+    _refine(signal, reading[:count], distinct[:count], model, moduli, rules, ends)
     for row in range(begin, end):
         first, last = first_end[row - begin], first_end[row - begin + 1]
         for k in range(first, last):
             out.counts[row, 1] += 0 if ends.converged[k] else 1
             out.counts[row, 2] += ends.iterations[k]
-            ends.iterations[k] += near.iterations[k]
-        _distinct(ends, first, last, keep_within, row, out)
+            ends.iterations[k] += iterations[k]
+        _distinct(ends, first, last, keep_within, moduli, row, out)
 
 
 @internal
-def _distinct(refined: Refined, first: int, last: int, keep_within: float, row: int, out: Ends) -> None:
+def _places(n: int) -> Refined:
+    return Refined(np.empty((n, 4)), np.empty((n, 3)), np.empty(n), np.empty(n, np.intp), np.empty(n, np.bool_))
+
+
+@internal
+def _refine(
+    signal: FloatArray,
+    reading: IntArray,
+    starts: FloatArray,
+    model: LaneModel,
+    moduli: Moduli | None,
+    rules: Rules,
+    out: Refined,
+) -> None:
+    if moduli is None:
+        refine(signal, reading, starts, model, 1.0, rules, out)
+    else:
+        refine_by_moduli(signal, reading, starts, model, moduli, 1.0, rules, out)
+
+
+@internal
+def _lowest(near: Refined, places: IntArray) -> float:
+    lowest = math.inf
+    for j in places:
+        lowest = min(lowest, near.chi2[j] if near.converged[j] else math.inf)
+    return lowest
+
+
+@internal
+def _same_side(mu: FloatArray, other: FloatArray) -> bool:
+    """Whether moments are not opposite: without an ambient field moduli do not tell these apart."""
+    return mu[0] * other[0] + mu[1] * other[1] + mu[2] * other[2] > 0.0
+
+
+@internal
+def _distinct(
+    refined: Refined, first: int, last: int, keep_within: float, moduli: Moduli | None, row: int, out: Ends
+) -> None:
     """Optima of a row among ends first to last, best first, without those that are known already."""
     kept = 0
     while True:
@@ -184,7 +248,10 @@ def _distinct(refined: Refined, first: int, last: int, keep_within: float, row: 
         refined.converged[best] = False
         known = False
         for j in range(kept):
-            known = known or same_optimum(refined.q[best], refined.chi2[best], out.q[row, j], out.chi2[row, j])
+            same = same_optimum(refined.q[best], refined.chi2[best], out.q[row, j], out.chi2[row, j])
+            if moduli is not None:
+                same = same and _same_side(refined.mu[best], out.mu[row, j])
+            known = known or same
         if not known:
             put(out.q[row, kept], refined.q[best])
             put(out.mu[row, kept], refined.mu[best])
