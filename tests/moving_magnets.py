@@ -48,8 +48,8 @@ def board() -> SensorArray:
 class Within:
     """What magnets are drawn within: heights, strengths, and of the box the share of each axis that one moves in.
 
-    `one_by_one`: a path is drawn until it keeps the gap to those before it, not all of them anew, which of three magnets
-    takes a minute, and of more for ever.
+    `one_by_one`: a path is drawn until it keeps the gap to those before it, not all of them anew, which of three
+    magnets takes a minute, and of more for ever.
     """
 
     highest_m: float = HIGH_M[2]

@@ -1,4 +1,4 @@
-"""A weak source that comes nearer, tracked from its first row: ``python -m tests.weak_approach --first 100 --seeds 20``.
+"""A weak source that comes nearer, from its first row: ``python -m tests.weak_approach --first 100 --seeds 20``.
 
 A tetrahedron of 1.5 m, 0.2 nT, 2 Hz. The source starts 20 m away in any direction, with a moment in any direction that
 is 4 to 6 standard deviations strong in the first row, and passes by at 5 m in the last one, at constant velocity; its
@@ -17,6 +17,7 @@ import numpy as np
 
 from arrays.typing import FloatArray
 from magloc.measurement.differences import predicted_channels
+from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.consistency import nees_of
 from magloc.tracking.motion import OrnsteinUhlenbeck
 from magloc.tracking.posterior_bound import posterior_bound
@@ -57,19 +58,16 @@ def drawn(seed: int) -> tuple[FloatArray, list[Row]]:
 def judged(seed: int) -> FloatArray:
     """Of every row (n, 8).
 
-    Whether the source is detected and whether the row is answered; squared error and its bound; NEES per dimension;
+    Whether it shows the source, and whether it is answered; squared error and its bound; NEES per dimension;
     whether the range set holds the truth; Brier's score of the weights, and what it is on average if they are honest.
     """
     truth, rows = drawn(seed)
     tracker = Tracker(ARRAY, MOTION)
     bounds = posterior_bound(tracker, rows, truth[:, :3], truth[:, 3:])
     result = np.full((N_ROWS, 8), np.nan)
-    seen = False
     for i, point in enumerate(tracker.run(rows)):
-        seen = seen or bool(np.isfinite(bounds[i]))
+        seen = ChartRow.of(tracker.measurements.of(rows[i])).is_detected(tracker.errors.sigma)
         result[i, :2] = seen, point.position_m is not None
-        if seen and point.position_m is None:
-            print(seed, i, point.status)
         if point.position_m is None:
             continue
         ((low, high),) = point.range_interval_m or ((0.0, None),)
@@ -111,10 +109,10 @@ def main() -> None:
         begin = time.process_time()
         runs.append(judged(seed))
         took, run = time.process_time() - begin, runs[-1]
-        last = run[-1]
+        last, missing = run[-1], int(np.sum(run[:, 0] > run[:, 1]))
         print(
-            f"seed {seed}: detected in row {int(np.argmax(run[:, 0]))}, {int(np.nansum(run[:, 0] - run[:, 1]))} rows"
-            f" since unanswered; last row: error {math.sqrt(last[2]):.3f} m, bound {math.sqrt(last[3]):.3f} m, NEES"
+            f"seed {seed}: detected in row {int(np.argmax(run[:, 0]))}, {missing} detected rows"
+            f" unanswered; last row: error {math.sqrt(last[2]):.3f} m, bound {math.sqrt(last[3]):.3f} m, NEES"
             f" {last[4]:.2f}; sets hold {100.0 * np.nanmean(run[:, 5]):.0f} %; {took:.1f} s",
             flush=True,
         )
@@ -131,20 +129,21 @@ def print_rows(runs: FloatArray) -> None:
             continue
         finite = told[np.isfinite(told[:, 3])]
         ratio = math.sqrt(finite[:, 2].mean() / finite[:, 3].mean()) if len(finite) else math.nan
+        answered = int(np.sum(of_row[:, 1] * of_row[:, 0]))
         print(
-            f"{row}: {len(told)} of {int(of_row[:, 0].sum())}, {ratio:.2f}, {told[:, 4].mean():.2f}"
+            f"{row}: {answered} of {int(of_row[:, 0].sum())}, {ratio:.2f}, {told[:, 4].mean():.2f}"
             f" ({np.median(told[:, 4]):.2f}), {100.0 * told[:, 5].mean():.0f} %, {told[:, 6].mean():.2f}"
             f" ({told[:, 7].mean():.2f})"
         )
     detected, inside = runs[..., 0] > 0.0, runs[..., 5]
-    worst = int(np.argmin(np.where(np.isfinite(inside).sum(axis=0) >= 0.5 * len(runs), np.nanmean(inside, axis=0), 2)))
-    print(f"worst row {worst}")
-    many = [row for row in range(runs.shape[1]) if np.isfinite(inside[:, row]).sum() >= 0.5 * len(runs)]
-    rows = [float(np.nanmean(inside[:, row])) for row in many]
+    told = np.isfinite(inside).sum(axis=0) >= 0.5 * len(runs)
+    held = np.nansum(inside, axis=0) / np.maximum(np.isfinite(inside).sum(axis=0), 1)
+    rows = np.where(told, held, np.inf)
     print(
-        f"{len(runs)} runs: {100.0 * np.mean(runs[..., 1][detected]):.1f} % of rows answered since the first detected"
-        f" one; sets hold the truth in {100.0 * np.nanmean(inside):.1f} %, {100.0 * min(rows):.1f} % at the worst row;"
-        f" Brier's score {np.nanmean(runs[..., 6]):.3f}, {np.nanmean(runs[..., 7]):.3f} if weights are honest"
+        f"{len(runs)} runs: {100.0 * np.mean(runs[..., 1][detected]):.1f} % of detected rows answered; sets hold the"
+        f" truth in {100.0 * np.nanmean(inside):.1f} %, {100.0 * rows.min():.1f} % at the worst row,"
+        f" {int(np.argmin(rows))}; Brier's score {np.nanmean(runs[..., 6]):.3f}, {np.nanmean(runs[..., 7]):.3f} if"
+        " weights are honest"
     )
 
 

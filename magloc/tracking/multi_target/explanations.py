@@ -38,6 +38,8 @@ _LEFT_OUT = 4.5
 # A birth starts from so many cells, if they explain that much.
 _BIRTH_STARTS = 4
 _WORTH_A_BIRTH = 16.0
+# Steps of a first update that tells where a birth is to begin.
+_START_TRIALS = 20
 # Explanations that go on from one event to the next, and those that are returned.
 _WIDTH = 4
 _RETURNED = 3
@@ -281,10 +283,11 @@ class RowProblem:
         for cell in self._cells.best(energy, _BIRTH_STARTS):
             if energy[cell] < _WORTH_A_BIRTH:
                 continue
-            place_m = self.row.origin_m + self.row.R_world_from_array @ self._cells.position_m[cell]
-            moment = found.update.row.moment_at(place_m, found.update.innovation, found.update.linear)
+            update, R = found.update, self.row.R_world_from_array
+            place_m = self.row.origin_m + R @ self._cells.position_m[cell]
+            moment = R @ self._cells.moment(cell, update.innovation, update.linear, update.row.used)
             ids = (*found.ids, self._first_id + born)
-            start = joint_update(self.with_source(found.prior, place_m, moment), found.update.row).found
+            start = joint_update(self.with_source(found.prior, place_m, moment), update.row, _START_TRIALS).found
             # Where it is found, not where it was looked for, is what the next event starts from.
             prior = self.with_source(found.prior, start.position_m[-1], start.moment_Am2[-1])
             child = self.updated(prior, ids, found.out, found.penalty + BIRTH)

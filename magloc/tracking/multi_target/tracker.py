@@ -25,6 +25,7 @@ from magloc.tracking.multi_target.explanations import (
     Explanation,
     RowProblem,
     Scene,
+    apart,
     are_same,
     distinct,
 )
@@ -304,7 +305,7 @@ class SourcesTracker:
                 anew += problem.of_more_sources(nothing, number)
         if known < self.scene.most_sources:
             anew += distinct(one for start in (found, again) for one in problem.births(start))
-        tried = [one for one in distinct(anew) if one.update.converged]
+        tried = apart(one for one in anew if one.update.converged)
         more = [one for one in tried if len(one.ids) > known]
         tried = [one for one in tried if len(one.ids) <= known][:_MOST_RESTARTS] + more[:_MOST_RESTARTS]
         # What the sources' motion tells is still to be learned by them, and was by the best one.

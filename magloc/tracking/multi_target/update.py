@@ -98,15 +98,17 @@ class JointUpdate:
 
 
 _FOLLOWED = 1e-3
+MOST_TRIALS = 60
+"""Steps of an update that are tried."""
 
 
-def joint_update(prior: JointState, row: JointRow) -> JointUpdate:
+def joint_update(prior: JointState, row: JointRow, most: int = MOST_TRIALS) -> JointUpdate:
     """A predicted state after a row's readings, by damped Gauss-Newton in the chart of the prediction."""
     d, n = prior.n_seen, len(row.z)
     L: FloatArray = np.asarray(np.linalg.cholesky(prior.P[:d, :d]), dtype=np.float64)
     y, R, residuals, HLs = np.zeros(d), np.eye(d), np.empty((2, n)), np.zeros((2, n, d))
     residuals[:] = row.z
-    cost, converged = iterate(prior.means, L, row.parts, y, residuals, HLs, R)
+    cost, converged = iterate(prior.means, L, row.parts, y, residuals, HLs, R, most)
     return JointUpdate(prior, row, L, R, y, residuals[1], HLs[1], residuals[0], HLs[0], cost, converged)
 
 

@@ -12,7 +12,7 @@ from magloc.fields.dipole_compiled import field_components, field_matrix_compone
 from magloc.linalg_compiled import put, put_rows
 from magloc.tracking.multi_target.state import N_COMMON, N_SEEN
 
-_TOLERANCE, _MOST_ITERATIONS = 0.02, 60
+_TOLERANCE = 0.02
 
 
 @compiled
@@ -297,13 +297,14 @@ def iterate(
     residuals: FloatArray,
     HLs: FloatArray,
     R: FloatArray,
+    most: int,
 ) -> tuple[float, bool]:
     """Fill y (d,), residuals (2, C) and HL (2, C, d) at the prediction and the end, R (d, d); cost, converged."""
     z, (K, d), best = row[0], (len(state[0]), y.size), math.inf
     p, m, b, D = np.empty((K, 3)), np.empty((K, 3)), np.empty(3), np.empty((K, 3, 3))
     error, new, trial, step = np.empty(d), np.empty(d), np.zeros(d), np.empty(d)
     r, HL, along = np.empty_like(z), HLs[1], np.empty_like(z)
-    for _ in range(_MOST_ITERATIONS):
+    for _ in range(most):
         for i in range(d):
             t = 0.0
             for k in range(i + 1):

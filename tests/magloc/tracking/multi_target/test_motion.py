@@ -76,7 +76,9 @@ def readably_predicted(motion: FreeMotion, state: JointState, dt_s: float, agili
 def test_compiled_step_is_the_readable_one(k, turns):
     state = state_of(k, seed=k)
     state = replace(state, rate_rad_s=turns * state.rate_rad_s)
-    found, expected = (step(state, 0.3, agility=3.0) for step in (MOTION.predicted, partial(readably_predicted, MOTION)))
+    found, expected = (
+        step(state, 0.3, agility=3.0) for step in (MOTION.predicted, partial(readably_predicted, MOTION))
+    )
     for name in vars(expected):
         np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-10, atol=1e-11)
 
