@@ -103,6 +103,18 @@ class Whitening:
         summed = _summed(self.U @ channels, self.group, np.sqrt(1.0 / np.bincount(self.group)))
         return self.of_groups(np.ascontiguousarray(summed))
 
+    def entries(self, groups: IntArray) -> IntArray:
+        """Where the measurements of some groups are in white columns."""
+        k = len(self.U)
+        return np.asarray((groups[:, None] * k + np.arange(k)).ravel())
+
+    def of_some(self, channels: FloatArray, groups: IntArray) -> FloatArray:
+        """White columns (g'·k, m) of columns (n', C, m) of all rows of some groups; nothing is elsewhere."""
+        count = np.diff(self.starts)[groups]
+        Y = _summed(self.U @ channels, np.repeat(np.arange(len(groups)), count), np.sqrt(1.0 / count))
+        whiten(Y, groups, self.H, self.gains, self.kept, self.dt_s)
+        return Y.reshape(-1, Y.shape[2])
+
     @property
     def log_determinant(self) -> float:
         """Of the noise's covariance."""
