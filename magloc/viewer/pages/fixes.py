@@ -11,6 +11,7 @@ import viser
 from arrays.typing import FloatArray, IntArray
 from magloc.localization.fit.results import Fix, Solution, Source
 from magloc.viewer.pages import words
+from magloc.viewer.panels.inputs import set_value
 from magloc.viewer.panels.latest import Latest
 from magloc.viewer.scene.glyphs import (
     DIPOLE_COLOUR,
@@ -136,6 +137,10 @@ class FixView:
 
         if len(self._fixes) > 1:
             self.slider.on_update(Latest(follow))
+
+    def choose(self, row: int) -> None:
+        """Show a row that the user has chosen elsewhere than at the slider."""
+        set_value(self.slider, row)
 
     def words(self) -> str:
         """What is known of the row's fix, as HTML."""

@@ -68,19 +68,22 @@ class Playing:
         How long it takes to play them.
     first : int
         Row that the live page shows at first.
+    said : callable
+        What is said of the row that is shown, as HTML.
     """
 
     steps: tuple[int, ...]
     show: Callable[[int], None]
     duration_s: float
     first: int
+    said: Callable[[], str]
 
     @classmethod
-    def of(cls, times_s: FloatArray, show: Callable[[int], None], first: int) -> Playing:
+    def of(cls, times_s: FloatArray, show: Callable[[int], None], first: int, said: Callable[[], str]) -> Playing:
         """Of all rows, or of 150, evenly: as long as they took, but 5 s at least and 30 s at most."""
         n = len(times_s)
         steps = np.unique(np.linspace(0, n - 1, min(n, _MOST_STEPS)).round().astype(int))
-        return cls(tuple(steps.tolist()), show, float(np.clip(np.ptp(times_s), *_PLAYED_S)), first)
+        return cls(tuple(steps.tolist()), show, float(np.clip(np.ptp(times_s), *_PLAYED_S)), first, said)
 
 
 @dataclass(frozen=True)
@@ -168,13 +171,14 @@ def readings_page(server: viser.ViserServer, array: SensorArray, fixes: Sequence
         left = None if sources is None else residuals_of(array, rows, *sources)
         plot = ReadingsPlot(server, rows, array, left)
         plot.show_row(view.row)
+        plot.when_pointed(view.choose)
         followers.append(plot.show_row)
     if view.region.mesh is not None and view.region.visible:
         ball = extent_of(ball.points_m, view.region.mesh.vertices)
     entries = [*view.entries(), *_array_entries(server, glyphs, rows, ball)]
-    playing = (
-        Playing.of(times, lambda row: follow([view.show_row, *followers], row), view.row) if len(fixes) > 1 else None
-    )
+    playing = None
+    if len(fixes) > 1:
+        playing = Playing.of(times, lambda row: follow([view.show_row, *followers], row), view.row, view.words)
     name = array.name or "readings"
     return _finished(server, legend, ball, name, entries, drops=[view.drop], playing=playing, plot=plot)
 
@@ -216,6 +220,8 @@ def track_page(
         show_row = plot.show_row
         show_row(int(of_point[player.index]))
         followers.append(lambda index: show_row(int(of_point[index])))
+        times_s = stacked(points, "time_s")
+        plot.when_pointed(lambda row: player.choose(int(nearest_rows(rows.time_s[[row]], times_s)[0])))
     nodes = [f"/times/of-{id}" for id in result.ids] or ["/times"]
     for node, place in zip(nodes, each, strict=True):
         tracked = np.flatnonzero(np.isfinite(place).all(axis=1))
@@ -223,7 +229,9 @@ def track_page(
             below = place[i] - np.array([0.0, 0.0, 0.14 * ball.radius_m])  # above, the arrow of the moment may be
             screen_label(server.scene, f"{node}/{i}", f"{points[i].time_s:.6g} s", below)
     drops = [trail.drop for trail in player.trails]
-    playing = Playing.of(stacked(points, "time_s"), player.show_row, player.index) if len(points) > 1 else None
+    playing = None
+    if len(points) > 1:
+        playing = Playing.of(stacked(points, "time_s"), player.show_row, player.index, lambda: player.row_panel.content)
     return _finished(server, legend, ball, name, entries, close=player.pause, drops=drops, playing=playing, plot=plot)
 
 

@@ -192,9 +192,13 @@ class TrackPlayer(PlayedTime):
         self.tail_slider.on_update(self._follow)
         self.whole_checkbox.on_update(self._follow)
 
-    def _step_row(self, step: int) -> None:
+    def choose(self, index: int) -> None:
+        """Show a row that the user has chosen, and stand still there."""
         self.pause()
-        self.show_row(self.index + step)
+        self.show_row(index)
+
+    def _step_row(self, step: int) -> None:
+        self.choose(self.index + step)
 
     def _label(self, source: int) -> str:
         """What stands beside a source: its id, or of a single one the time, but where that stands already."""
