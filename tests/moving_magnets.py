@@ -31,6 +31,8 @@ SPEED_M_S, STRENGTH_AM2 = 0.3, (0.02, 0.1)
 RATE_RAD_S, RATE_LASTS_S = 1.2, 0.4
 # Rows in which a track must be nearer to another magnet than to its own to be counted as swapped.
 ROWS_OF_A_SWAP = 20
+# Square of a distance in units of a track's covariance within which a magnet may be the one it is of.
+TOLD_APART = 25.0
 FAULTS = ("zero", "stuck", "noisy", "drift")
 
 
@@ -158,9 +160,14 @@ def with_fault(readings_T: FloatArray, kind: str, sensor: int, first: int, drift
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """How one run went; NEES is per dimension, over all rows and tracks that are told."""
+    """How one run went; NEES is per dimension, over all rows and tracks that are told.
+
+    `early_swaps` counts from the row in which a track was first told, where its covariance may have two magnets within;
+    `swaps` from the first one in which it has a single one.
+    """
 
     swaps: int
+    early_swaps: int
     false_births: int
     lost_rows: int
     misfit_rows: int
@@ -174,11 +181,12 @@ class Run:
 
 
 def judged(points: list[SourcesPoint], truth: Magnets, row_ms: FloatArray) -> Run:
-    """Tracks against the magnets: each is the one that it was nearest to when it was first told."""
-    owner: dict[int, int] = {}
-    away: dict[int, int] = {}
+    """Tracks against the magnets: each is of the nearest one when it is first told, or first told apart."""
+    owners: tuple[dict[int, int], dict[int, int]] = {}, {}
+    away: tuple[dict[int, int], dict[int, int]] = {}, {}
+    swaps = [0, 0]
     named: dict[str, int] = {}
-    squares, errors, swaps, false, lost = [], [], 0, 0, 0
+    squares, errors, false, lost = [], [], 0, 0
     last = truth.present[-1]
     first, end = int(np.argmax(last)), int(len(last) - np.argmax(last[::-1]))
     seen_first, seen_last = len(last), 0
@@ -192,11 +200,18 @@ def judged(points: list[SourcesPoint], truth: Magnets, row_ms: FloatArray) -> Ru
             assert track.position_m is not None
             apart = np.linalg.norm(truth.position_m[:, row] - track.position_m, axis=1)
             nearest = int(there[np.argmin(apart[there])])
-            own = owner.setdefault(track.id, nearest)
-            away[track.id] = away.get(track.id, 0) + 1 if nearest != own and apart[nearest] < 0.5 * apart[own] else 0
-            if away[track.id] == ROWS_OF_A_SWAP:
-                swaps, owner[track.id] = swaps + 1, nearest
-            own = owner[track.id]
+            offsets = truth.position_m[there, row] - track.position_m
+            within = np.vecdot(offsets, np.linalg.solve(track.covariance[:3, :3], offsets[..., None])[..., 0])
+            for i, (owner, gone) in enumerate(zip(owners, away, strict=True)):
+                if track.id not in owner and i and np.count_nonzero(within < TOLD_APART) != 1:
+                    continue
+                own = owner.setdefault(track.id, nearest)
+                gone[track.id] = (
+                    gone.get(track.id, 0) + 1 if nearest != own and apart[nearest] < 0.5 * apart[own] else 0
+                )
+                if gone[track.id] == ROWS_OF_A_SWAP:
+                    swaps[i], owner[track.id] = swaps[i] + 1, nearest
+            own = owners[0][track.id]
             if own == len(truth.present) - 1:
                 seen_first, seen_last = min(seen_first, row), row + 1
             offset = track.position_m - truth.position_m[own, row]
@@ -205,7 +220,8 @@ def judged(points: list[SourcesPoint], truth: Magnets, row_ms: FloatArray) -> Ru
                 squares.append(error @ np.linalg.solve(track.covariance, error) / 6.0)
                 errors.append(offset @ offset)
     return Run(
-        swaps=swaps,
+        swaps=swaps[1],
+        early_swaps=swaps[0],
         false_births=false,
         lost_rows=lost,
         misfit_rows=sum(point.status == "misfit" for point in points),
@@ -258,7 +274,9 @@ def main() -> None:
         runs.append(judged(*_points_and_truth(array, readings_T, truth)))
         run = runs[-1]
         print(
-            f"seed {seed}: swaps {run.swaps}, rows with too many {run.false_births}, too few {run.lost_rows}, misfit"
+            f"seed {seed}: swaps {run.swaps} ({run.early_swaps} since first told), rows with too many"
+            f" {run.false_births},"
+            f" too few {run.lost_rows}, misfit"
             f" {run.misfit_rows}, merged {run.merged_rows}, birth after {run.late_birth_rows}, loss after"
             f" {run.late_loss_rows}, NEES {run.nees:.2f}, rms {1e3 * run.rms_m:.2f} mm, named {run.named},"
             f" {np.median(run.row_ms):.2f} ms a row, {run.row_ms.mean():.2f} mean, {run.row_ms.max():.0f} most",
@@ -266,10 +284,13 @@ def main() -> None:
         )
     nees = np.array([run.nees for run in runs])
     print(
-        f"{len(runs)} runs: {sum(run.swaps > 0 for run in runs)} with a swap,"
+        f"{len(runs)} runs: {sum(run.swaps > 0 for run in runs)} with a swap"
+        f" ({sum(run.early_swaps > 0 for run in runs)} since first told),"
         f" {sum(run.false_births > 0 for run in runs)} with a false birth, {np.sum(nees > 3.0)} broken (NEES above 3);"
         f" NEES of the median run {np.median(nees):.2f};"
-        f" {np.median([np.median(run.row_ms) for run in runs]):.2f} ms a row"
+        f" {np.median([np.median(run.row_ms) for run in runs]):.2f} ms a row,"
+        f" {np.mean([run.row_ms for run in runs]):.2f} mean,"
+        f" {np.median([run.row_ms.max() for run in runs]):.0f} the longest one of the median run"
     )
 
 

@@ -65,7 +65,7 @@ class SourcesWanted:
 
     def printed(self, point: SourcesPoint, **more: float) -> SourcesPoint:
         """The point, after its line is printed."""
-        from magloc.tracking.multi_target.files import json_of_sources
+        from magloc.tracking.multi_target.results import json_of_sources
 
         print_json(json_of_sources(point, single=self.sources == 1) | more)
         sys.stdout.flush()
@@ -126,7 +126,7 @@ def follow_sources(
     array: SensorArray, rows: Readings, wanted: SourcesWanted, name: str, outputs: SourcesOutputs
 ) -> None:
     """Follow sources through a file of readings; none in any row is an InputError."""
-    from magloc.tracking.multi_target.files import json_of_sources
+    from magloc.tracking.multi_target.results import json_of_sources
 
     json, jsonl, quiet = outputs.json, outputs.jsonl, outputs.quiet
     if rows.background:

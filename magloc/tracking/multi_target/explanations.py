@@ -122,6 +122,8 @@ class RowProblem:
     row : Row
     index : int
         Of the row: sources that are born in it are called by it.
+    step : ndarray, shape (12,)
+        Of the motion to it.
     further : dict
         Explanations that were asked what else may have happened, by their identity, and the answers.
     """
@@ -129,6 +131,7 @@ class RowProblem:
     scene: Scene
     row: Row
     index: int
+    step: FloatArray
     further: dict[int, tuple[Explanation, list[Explanation]]] = field(default_factory=dict)
 
     @cached_property

@@ -58,17 +58,20 @@ class FreeMotion:
             if not 0.0 < value < math.inf:
                 raise ValueError(f"Input {name} must be positive and finite; instead received {value}.")
 
-    def predicted(self, state: JointState, dt_s: float, *, agility: float = 1.0) -> JointState:
-        """State after a step without readings; `agility` times the noise of velocity and turn."""
+    def numbers(self, dt_s: float, *, agility: float = 1.0) -> FloatArray:
+        """A step as the compiled one takes it (12,); `agility` times the noise of velocity and turn."""
         lasts_s, kept, root_v = wandering_step(self.correlation_s, dt_s)
         turn_lasts_s, turn_kept, root_w = wandering_step(self.turn_correlation_s, dt_s)
         of_p_v = (agility * self.speed_m_s) ** 2 * (root_v @ root_v.T)
         of_c_w = (agility * self.turn_rad_s) ** 2 * (root_w @ root_w.T)
         upper = np.array([0, 0, 1]), np.array([0, 1, 1])
         walks = self.strength_change**2 * dt_s, self.common_walk_T**2 * dt_s
-        step = np.array([lasts_s, kept, turn_lasts_s, turn_kept, *of_p_v[upper], *of_c_w[upper], *walks])
+        return np.array([lasts_s, kept, turn_lasts_s, turn_kept, *of_p_v[upper], *of_c_w[upper], *walks])
+
+    def predicted(self, state: JointState, dt_s: float, *, agility: float = 1.0) -> JointState:
+        """State after a step without readings; `agility` times the noise of velocity and turn."""
         moving = state.position_m, state.moment_Am2, state.velocity_m_s, state.rate_rad_s
-        position, moment, velocity, rate, P = step_all(moving, state.P, step)
+        position, moment, velocity, rate, P = step_all(moving, state.P, self.numbers(dt_s, agility=agility))
         return JointState(position, moment, velocity, rate, state.common_T, P)
 
     def start(self, direction: FloatArray, position_m: float, turn_rad: float, log_strength: float) -> FloatArray:

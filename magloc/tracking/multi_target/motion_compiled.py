@@ -36,7 +36,7 @@ def _fill_turn(angle: FloatArray, R: FloatArray, J: FloatArray) -> None:
 
 
 @compiled
-def _move_rows(P: FloatArray, k: int, at: int, step: FloatArray, R: FloatArray, M: FloatArray) -> None:
+def move_rows(P: FloatArray, k: int, at: int, step: FloatArray, R: FloatArray, M: FloatArray) -> None:
     """Multiply rows of one source, whose motion stands from row `at` on, by its transition."""
     lasts, kept, turn_kept = step[0], step[1], step[3]
     c = N_SEEN * k + 3
@@ -51,6 +51,32 @@ def _move_rows(P: FloatArray, k: int, at: int, step: FloatArray, R: FloatArray, 
 
 
 @compiled
+def fill_transition(
+    rate: FloatArray, moment: FloatArray, step: FloatArray, m: FloatArray, R: FloatArray, M: FloatArray
+) -> None:
+    """Fill a source's moment m (3,) after a step, how it turns, R (3, 3), and how it does by its rate, M (3, 3)."""
+    angle, J, turned = np.empty(3), np.empty((3, 3)), np.zeros((3, 3))
+    for i in range(3):
+        angle[i] = step[2] * rate[i]
+    _fill_turn(angle, R, J)
+    for i in range(3):
+        m[i] = R[i, 0] * moment[0] + R[i, 1] * moment[1] + R[i, 2] * moment[2]
+    length = math.sqrt(m[0] * m[0] + m[1] * m[1] + m[2] * m[2])
+    _fill_turned(m, length, turned)
+    for i in range(3):
+        for j in range(3):
+            M[i, j] = step[2] * (turned[i, 0] * J[0, j] + turned[i, 1] * J[1, j] + turned[i, 2] * J[2, j])
+
+
+@compiled
+def _fill_turned(m: FloatArray, length: float, turned: FloatArray) -> None:
+    """What a small turn changes of a moment's direction u: -[u]×."""
+    x, y, z = m[0] / length, m[1] / length, m[2] / length
+    turned[0, 1], turned[0, 2], turned[1, 2] = z, -y, x
+    turned[1, 0], turned[2, 0], turned[2, 1] = -z, y, -x
+
+
+@compiled
 def step_all(
     state: tuple[FloatArray, FloatArray, FloatArray, FloatArray], P: FloatArray, step: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -62,35 +88,23 @@ def step_all(
     position, moment, velocity, rate = state
     K, n = len(position), len(P)
     p, m, v, w = np.empty((K, 3)), np.empty((K, 3)), np.empty((K, 3)), np.empty((K, 3))
-    R, J, M, turned = np.empty((K, 3, 3)), np.empty((3, 3)), np.empty((K, 3, 3)), np.empty((K, 3, 3))
-    after, u, angle = P.copy(), np.empty((K, 3)), np.empty(3)
+    R, M, turned = np.empty((K, 3, 3)), np.empty((K, 3, 3)), np.zeros((K, 3, 3))
+    after, u = P.copy(), np.empty((K, 3))
     seen = N_SEEN * K + N_COMMON
     for k in range(K):
-        for i in range(3):
-            angle[i] = step[2] * rate[k, i]
-        _fill_turn(angle, R[k], J)
-        for i in range(3):
-            p[k, i] = position[k, i] + step[0] * velocity[k, i]
-            m[k, i] = R[k, i, 0] * moment[k, 0] + R[k, i, 1] * moment[k, 1] + R[k, i, 2] * moment[k, 2]
-            v[k, i], w[k, i] = step[1] * velocity[k, i], step[3] * rate[k, i]
+        fill_transition(rate[k], moment[k], step, m[k], R[k], M[k])
         length = math.sqrt(m[k, 0] * m[k, 0] + m[k, 1] * m[k, 1] + m[k, 2] * m[k, 2])
+        _fill_turned(m[k], length, turned[k])
         for i in range(3):
             u[k, i] = m[k, i] / length
-        # What a small turn changes of u: -[u]×.
-        x, y, z = u[k, 0], u[k, 1], u[k, 2]
-        turned[k, 0, 0], turned[k, 0, 1], turned[k, 0, 2] = 0.0, z, -y
-        turned[k, 1, 0], turned[k, 1, 1], turned[k, 1, 2] = -z, 0.0, x
-        turned[k, 2, 0], turned[k, 2, 1], turned[k, 2, 2] = y, -x, 0.0
-        for i in range(3):
-            for j in range(3):
-                t = turned[k, i, 0] * J[0, j] + turned[k, i, 1] * J[1, j] + turned[k, i, 2] * J[2, j]
-                M[k, i, j] = step[2] * t
-        _move_rows(after, k, seen + 6 * k, step, R[k], M[k])
+            p[k, i] = position[k, i] + step[0] * velocity[k, i]
+            v[k, i], w[k, i] = step[1] * velocity[k, i], step[3] * rate[k, i]
+        move_rows(after, k, seen + 6 * k, step, R[k], M[k])
     for i in range(n):  # F P Fᵀ = F (F P)ᵀ, as P is symmetric
         for j in range(i):
             after[i, j], after[j, i] = after[j, i], after[i, j]
     for k in range(K):
-        _move_rows(after, k, seen + 6 * k, step, R[k], M[k])
+        move_rows(after, k, seen + 6 * k, step, R[k], M[k])
     for k in range(K):
         first, at = N_SEEN * k, seen + 6 * k
         for i in range(3):

@@ -16,7 +16,7 @@ _TOLERANCE = 0.02
 
 
 @compiled
-def _move_moment(m: FloatArray, c: FloatArray, moved: FloatArray, D: FloatArray) -> None:
+def move_moment(m: FloatArray, c: FloatArray, moved: FloatArray, D: FloatArray) -> None:
     """A moment at an error c, and its derivative D (3, 3) by it; twins: ``moved_moment`` and its derivative."""
     u, turn = np.empty(3), np.empty(3)
     length = math.sqrt(m[0] * m[0] + m[1] * m[1] + m[2] * m[2])
@@ -61,7 +61,7 @@ def _fill_rows(position: FloatArray, moment: FloatArray, D: FloatArray, at: Floa
 
 
 @compiled
-def _linearise(
+def linearise(
     position: FloatArray,
     moment: FloatArray,
     D: FloatArray,
@@ -90,7 +90,7 @@ def _linearise(
 
 
 @compiled
-def _read(
+def read(
     position: FloatArray,
     moment: FloatArray,
     common: FloatArray,
@@ -134,13 +134,13 @@ def _move(
         first = N_SEEN * k
         for i in range(3):
             p[k, i] = position[k, i] + error[first + i]
-        _move_moment(moment[k], error[first + 3 : first + N_SEEN], m[k], D[k])
+        move_moment(moment[k], error[first + 3 : first + N_SEEN], m[k], D[k])
     for i in range(N_COMMON):
         b[i] = common[i] + error[N_SEEN * len(p) + i]
 
 
 @compiled
-def _fill_root(HL: FloatArray, R: FloatArray) -> None:
+def fill_root(HL: FloatArray, R: FloatArray) -> None:
     """Lower root R of I + HLᵀ HL."""
     d = len(R)
     for i in range(d):
@@ -164,7 +164,7 @@ def _fill_root(HL: FloatArray, R: FloatArray) -> None:
 
 
 @compiled
-def _solve(R: FloatArray, b: FloatArray) -> None:
+def solve_root(R: FloatArray, b: FloatArray) -> None:
     """Solve R Rᵀ y = b in place."""
     d = len(R)
     for i in range(d):
@@ -192,7 +192,7 @@ def _over_root(columns: FloatArray, first: int, root: FloatArray) -> None:
 
 
 @compiled
-def _square(columns: FloatArray, first: int, sign: float, P: FloatArray) -> None:
+def _add_square(columns: FloatArray, first: int, sign: float, P: FloatArray) -> None:
     """Add columnsᵀ columns, from one column on, to the same rows and columns of P, in its lower triangle."""
     for k in range(len(columns)):
         for i in range(first, columns.shape[1]):
@@ -202,12 +202,12 @@ def _square(columns: FloatArray, first: int, sign: float, P: FloatArray) -> None
 
 
 @compiled
-def posterior(
-    P: FloatArray, L: FloatArray, R: FloatArray, y: FloatArray, moment: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Error (n,) of the state, moments there (K, 3), and its covariance (n, n) in the chart there."""
+def fill_posterior(
+    P: FloatArray, L: FloatArray, R: FloatArray, y: FloatArray, error: FloatArray, after: FloatArray
+) -> None:
+    """Add to an error (n,) what a row tells of it, and fill the covariance (n, n) after the row."""
     n, d = len(P), len(L)
-    W, error, after = np.zeros((d, n)), np.zeros(n), np.zeros((n, n))
+    W = np.zeros((d, n))
     for k in range(d):
         for i in range(k, d):
             W[k, i] = L[i, k]
@@ -217,19 +217,30 @@ def posterior(
     for k in range(d):
         for i in range(n):
             error[i] += y[k] * W[k, i]
+    after[:] = 0.0
     for i in range(d, n):
         for j in range(d, i + 1):
             after[i, j] = P[i, j]
-    _square(W, d, -1.0, after)
+    _add_square(W, d, -1.0, after)
     _over_root(W, 0, R)
-    _square(W, 0, 1.0, after)
+    _add_square(W, 0, 1.0, after)
     for i in range(n):
         for j in range(i):
             after[j, i] = after[i, j]
+
+
+@compiled
+def posterior(
+    P: FloatArray, L: FloatArray, R: FloatArray, y: FloatArray, moment: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Error (n,) of the state, moments there (K, 3), and its covariance (n, n) in the chart there."""
+    n, error = len(P), np.zeros(len(P))
+    after = np.empty((n, n))
+    fill_posterior(P, L, R, y, error, after)
     moved, D, old = np.empty_like(moment), np.empty((3, 3)), np.empty(3)
     for k in range(len(moment)):
         c = N_SEEN * k + 3
-        _move_moment(moment[k], error[c : c + 3], moved[k], D)
+        move_moment(moment[k], error[c : c + 3], moved[k], D)
         length = math.sqrt(moved[k, 0] ** 2 + moved[k, 1] ** 2 + moved[k, 2] ** 2)
         for by_rows in range(2):
             for j in range(n):
@@ -311,7 +322,7 @@ def iterate(
                 t += L[i, k] * trial[k]
             error[i] = t
         _move(state, error, p, m, b, D)
-        _read(p, m, b, row, r)
+        read(p, m, b, row, r)
         cost = 0.0
         for c in range(r.size):
             r[c] = z[c] - r[c]
@@ -331,18 +342,18 @@ def iterate(
         is_first, best = best == math.inf, cost
         put(y, trial)
         put(residuals[1], r)
-        _linearise(p, m, D, L, row, HL)
+        linearise(p, m, D, L, row, HL)
         if is_first:
             put(residuals[0], r)
             put_rows(HLs[0], HL)
-        _fill_root(HL, R)
+        fill_root(HL, R)
         _along(HL, y, along)
         new[:] = 0.0
         for c in range(r.size):
             t = r[c] + along[c]
             for k in range(d):
                 new[k] += HL[c, k] * t
-        _solve(R, new)
+        solve_root(R, new)
         for i in range(d):
             step[i] = new[i] - y[i]
         if _along(HL, step, along) < _TOLERANCE:
@@ -369,12 +380,12 @@ def fill_bends(
     n, K = len(row[0]), len(state[0])
     at, ahead, behind = np.empty(n), np.empty(n), np.empty(n)
     p, m, b, D = np.empty((K, 3)), np.empty((K, 3)), np.empty(3), np.empty((K, 3, 3))
-    _read(state[0], state[1], state[2], row, at)
+    read(state[0], state[1], state[2], row, at)
     for i in range(len(errors)):
         _move(state, errors[i], p, m, b, D)
-        _read(p, m, b, row, ahead)
+        read(p, m, b, row, ahead)
         _move(state, -errors[i], p, m, b, D)
-        _read(p, m, b, row, behind)
+        read(p, m, b, row, behind)
         square = 0.0
         for c in range(n):
             t = 0.5 * (ahead[c] + behind[c]) - at[c]
