@@ -29,6 +29,7 @@ _LEAST_GEOLOGY_T, _MOST_GEOLOGY_T = 1e-10, 5e-9
 _SAME = 0.5  # over the distance to the nearest sources: what two tiles find at a seam is one source
 _FELT, _CHANGED = 0.1, 1.0  # of the noise
 _MOVED_M = 0.15
+_NARROW, _NEARLY_ALL = 0.2, 0.95  # of the distance to the nearest sources, and of the rows
 _BESIDE_M = 1.0
 Tell = Callable[[str], None]
 
@@ -84,13 +85,21 @@ class TiledSurvey:
         tiles = [t for t in tiles if len(t.rows) >= FEWEST_ROWS and _narrowed(ground.prior, t, margin_m) is not None]
         if not tiles:
             raise ValueError(f"Input readings must have {FEWEST_ROWS} rows near each other; instead received none.")
+        nearest_m = sample.height_m - float(bounds.high_m[2])
+        away_m = sample.middles_m[:, :2] - sample.middles_m[:, :2].mean(axis=0)
+        across_m = np.abs(away_m @ np.linalg.svd(away_m, full_matrices=False)[2][-1])
+        if np.quantile(across_m, _NEARLY_ALL) < _NARROW * nearest_m:
+            _LOG.warning(
+                "the readings are of one line: on which side of it a target is, and how far, they hardly tell, and of"
+                " several targets they make other ones"
+            )
         return cls(
             array,
             readings,
             ground,
             tiles,
             margin_m,
-            sample.height_m - float(bounds.high_m[2]),
+            nearest_m,
             offset,
             max(min(spread, _MOST_GEOLOGY_T), _LEAST_GEOLOGY_T),
             Sources.none(),

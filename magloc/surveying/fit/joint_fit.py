@@ -161,9 +161,10 @@ class Background:
         size[:, :3] = _BESIDE_M
         by_square = record.by_squared_shift(*where, least_T)
         by_pose = record.by_pose(directions, fields, gradients)
+        by_turn = record.by_turned_carrier(errors, least_T)
         wrong = record.by_sensors(directions), record.by_bodies(*where, body_length_m, least_T)
         for group in groups:
-            white = Whitening.of(record, by_pose, by_square, errors, drift, group)
+            white = Whitening.of(record, by_pose, by_turn, by_square, errors, drift, group)
             moved = size.ravel() * source_jacobian(record, directions, white, beside)
             columns = [layer.columns(record, directions, white), moved, *map(white, wrong)]
             yield cls(white, orthogonal(np.concatenate(columns, axis=1)))

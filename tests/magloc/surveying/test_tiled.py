@@ -185,6 +185,15 @@ class TestOnTime:
 
 
 class TestBadInput:
+    @pytest.mark.parametrize(("width_m", "said"), [(0.1, True), (2.0, False)])
+    def test_one_line_tells_little_of_sides(self, width_m: float, said: bool, caplog: pytest.LogCaptureFixture) -> None:
+        array, rows = whole_rows(field().array, field().readings)
+        assert rows.array_position_m is not None
+        wave = np.sin(np.arange(len(rows)))[:, None] * [0.0, width_m, 0.0]
+        line = replace(rows, array_position_m=rows.array_position_m * [1.0, 0.0, 1.0] + wave)
+        TiledSurvey.of(array, line, Ground(SHALLOW, 0.0, 15.0, 25.0))
+        assert ("of one line" in caplog.text) == said
+
     def test_rows_that_are_far_from_each_other(self) -> None:
         readings = field().readings[:40]
         assert readings.array_position_m is not None
