@@ -32,6 +32,7 @@ from magloc.viewer.scene.glyphs import (
     FIELD_LINE_COLOUR,
     FIT_COLOUR,
     REGION_COLOUR,
+    UNUSED_COLOUR,
     ArrayGlyphs,
     DipoleGlyph,
     length_text,
@@ -51,6 +52,7 @@ _FARTHEST_IN_MEDIANS = 3.0
 _LEAST_LEGIBLE = 0.04
 _LIVE_RADII = 1.5  # half the side of the cube that a live page shows at first
 _SHADES = 9
+_UNUSED = Swatch(UNUSED_COLOUR, "sensor that contradicts the others, and is not used")
 _MOST_STEPS, _PLAYED_S = 150, (5.0, 30.0)
 
 
@@ -160,9 +162,13 @@ def readings_page(server: viser.ViserServer, array: SensorArray, fixes: Sequence
         if rows is not None and rows.pose is not None:
             glyphs.set_pose(rows.pose[0][row], rows.pose[1][row].as_quat())
 
+    def mark_sensors(_: int) -> None:
+        glyphs.mark(view.dropped)
+
     move_array(view.row)
+    mark_sensors(view.row)
     # The plot stands below the choice of the row, which has to move its mark.
-    followers: list[Callable[[int], None]] = [move_array]
+    followers: list[Callable[[int], None]] = [move_array, mark_sensors]
     view.add_controls(followers)
     followers.append(FieldPanel(server, array, view, rows, size).show_row)
     plot = None
@@ -176,6 +182,8 @@ def readings_page(server: viser.ViserServer, array: SensorArray, fixes: Sequence
     if view.region.mesh is not None and view.region.visible:
         ball = extent_of(ball.points_m, view.region.mesh.vertices)
     entries = [*view.entries(), *_array_entries(server, glyphs, rows, ball)]
+    if any(fix.dropped_sensors for fix in fixes):
+        entries.append(_UNUSED)
     playing = None
     if len(fixes) > 1:
         playing = Playing.of(times, lambda row: follow([view.show_row, *followers], row), view.row, view.words)
@@ -195,10 +203,12 @@ def track_page(
     name = "true path" if result.is_truth else "track"
     entries = [*_line_entries(result, name), Swatch(DIPOLE_COLOUR, "direction of the moment at this time")]
     seen = [positions]
+    followers: list[Callable[[int], None]] = []
     poses = on_pose = None
     if array is not None:
         glyphs = ArrayGlyphs(server.scene, array)
         on_pose = glyphs.set_pose
+        followers.append(lambda index: glyphs.mark(points[index].dropped_sensors))
         if rows is not None and rows.pose is not None:
             of_point = _nearest_rows(rows, points)
             poses = (rows.pose[0][of_point], rows.pose[1][of_point].as_quat())
@@ -208,7 +218,8 @@ def track_page(
     ball = extent_of(*seen)
     if array is not None:
         entries += _array_entries(server, glyphs, rows, ball)
-    followers: list[Callable[[int], None]] = []
+        if any(point.dropped_sensors for point in points):
+            entries.append(_UNUSED)
     player = TrackPlayer(server, result, 0.2 * ball.radius_m, array_poses=poses, on_pose=on_pose, on_row=followers)
     plot = None
     if array is not None and rows is not None:

@@ -10,6 +10,8 @@ from magloc.viewer.panels.lines import POINTED, across, cursor_svg, lines_svg, n
 from magloc.viewer.panels.readings_plot import ReadingsPlot
 from magloc.viewer.scene.legend import NARROW_PX
 
+_LOW_PX = 640  # of a page
+
 # viser's player says its time in a slider, and takes one from its input, in which it stands rounded. It begins by
 # itself, and has nothing to show until it has begun; a time that is typed stops it.
 _SCRIPT = """<script>
@@ -49,6 +51,8 @@ _SCRIPT = """<script>
     typeInto(input(), 0.05);
   }, 20);
   box.open = innerWidth > %d;
+  const folded = innerHeight < %d && box.querySelector('.plot');  // as in a notebook, where it would hide the scene
+  if (folded) folded.open = false;
   show();
 })();
 </script>"""
@@ -69,13 +73,15 @@ def static_player(
         held["values"] = [[number_texts(lines, row) for row in lines.at(rows)[1].tolist()] for lines in kinds]
         options = "".join(f"<option>{escape(kind)}</option>" for kind in plot.kinds)
         drawn = (
+            '<details class="plot" open><summary style="font-size:.8rem;cursor:pointer">Readings</summary>'
             f'<select aria-label="Show" style="font:inherit;font-size:.75rem;margin:.3em 0">{options}</select>'
-            f"{''.join(lines_svg(lines, plot.time_words) for lines in kinds)}{cursor_svg(0.0)}{numbers_html(kinds[0])}"
+            f"{''.join(lines_svg(lines, plot.time_words) for lines in kinds)}"
+            f"{cursor_svg(0.0)}{numbers_html(kinds[0])}</details>"
         )
     data = json.dumps(held).replace("</", "<\\/")
     return (
         '<details id="row" class="box" open style="top:.8em;right:.8em">'
         '<summary style="font-weight:600;padding:.5em .6em .2em;cursor:pointer">At this time</summary>'
         f'<div style="padding:0 .6em .5em;width:18rem"><div class="said" style="margin:0 -.6em"></div>{drawn}</div>'
-        f"</details>{_SCRIPT % (data, POINTED, NARROW_PX)}"
+        f"</details>{_SCRIPT % (data, POINTED, NARROW_PX, _LOW_PX)}"
     )
