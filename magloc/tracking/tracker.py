@@ -359,6 +359,8 @@ class Tracker:
         if before.young:
             young = (*before.young, (seen, self.motion))
             known = self.filter.refitted(replace(known, young=young, nis=before.nis + update.nis))
+        if width_of(known.mixture) > LARGEST_WIDTH and self.filter.is_detected(seen):
+            return self._started(row, index, predicted.matched())
         return out, self._kept(
             seen.row,
             index,
