@@ -162,8 +162,7 @@ class Tracker:
             out, point = self._started(row, index)
         else:
             out, point = self._followed(self._known, row, index, dt_s)
-        names = (name for name, is_out in zip(self.array.ids, out, strict=True) if is_out)
-        return replace(point, dropped_sensors=tuple(names)) if out.any() else point
+        return replace(point, dropped_sensors=tuple(np.array(self.array.ids)[out].tolist())) if out.any() else point
 
     def run(
         self, rows: Iterable[Row | Readings], progress: Callable[[int], None] | None = None
