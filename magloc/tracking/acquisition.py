@@ -12,6 +12,7 @@ from scipy.special import chdtri
 from arrays.array import SensorArray
 from arrays.typing import FloatArray
 from magloc.levels import CONTRADICTION, DISAGREEMENT
+from magloc.localization.fit.prior import SourcePrior
 from magloc.localization.fit.results import Fix, Solution
 from magloc.localization.locator import fit_at_rest
 from magloc.localization.uncertainty.range_interval import relative_range_sigma
@@ -56,8 +57,12 @@ class Start:
 class Acquisition:
     """Looks for a source in the latest rows together, of which one alone does not determine it."""
 
-    def __init__(self, array: SensorArray) -> None:
+    def __init__(self, array: SensorArray, prior: SourcePrior) -> None:
         self.array = array
+        # Bounds, and three numbers, are known in the axes of an array that moves.
+        modulus = prior.known_moment_Am2 if isinstance(prior.known_moment_Am2, float | int) else None
+        sigma_Am2 = None if modulus is None else prior.known_moment_sigma_Am2
+        self._prior = SourcePrior(known_moment_Am2=modulus, known_moment_sigma_Am2=sigma_Am2)
         self._pose_errors = PoseErrors.of_array(array)
         self.forget()
 
@@ -88,6 +93,7 @@ class Acquisition:
             np.stack([earlier.origin_m for earlier in chosen]),
             np.stack([earlier.R_world_from_array for earlier in chosen]),
             np.stack(known) if len(known) == len(chosen) else None,
+            prior=self._prior,
             poses=errors.of_rows(
                 self.array,
                 np.array([earlier.time_s for earlier in chosen]),

@@ -18,8 +18,8 @@ from magloc.tracking.chart.mixture import Mixture, component_moments, root_of
 from magloc.tracking.chart.steps import LARGEST_GROWTH, LARGEST_WIDTH
 from magloc.tracking.chart.update import LEAST_GAIN, LEAST_SHARE, MOST_ITERATIONS, ROUNDING, TOLERANCE
 from magloc.tracking.motion import N_SOURCE, LinearMotion
-from magloc.tracking.results import Prediction, Row, Step, TrackPoint
-from magloc.tracking.tracker import Tracker, learned
+from magloc.tracking.results import Prediction, Row, Step, TrackPoint, learned
+from magloc.tracking.tracker import Tracker
 
 _MOST_AT_ONCE = 64
 _STATUS = {kernels.TRACKED: "tracked", kernels.PREDICTED: "predicted"}

@@ -35,6 +35,7 @@ from magloc.measurement.nuisances import Drift
 from magloc.readings import Readings
 from magloc.tracking.acquisition import STACKED_POSITION_ERROR, Acquisition
 from magloc.tracking.acquisition import Start as RowsStart
+from magloc.tracking.chart.known_moment import KeptModulus, KnownInWorld
 from magloc.tracking.chart.mixture import Mixture
 from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.chart.start import NO_DIPOLE, prior_root
@@ -42,7 +43,17 @@ from magloc.tracking.chart.steps import LARGEST_WIDTH, ChartFilter, Known, RowUp
 from magloc.tracking.chart.undetermined import Undetermined
 from magloc.tracking.measurement import RowMeasurement, RowMeasurements
 from magloc.tracking.motion import N_SOURCE, MotionModel
-from magloc.tracking.results import UNDETERMINED, Innovation, Prediction, Row, Step, TrackPoint, moving, next_row
+from magloc.tracking.results import (
+    UNDETERMINED,
+    Innovation,
+    Prediction,
+    Row,
+    Step,
+    TrackPoint,
+    moving,
+    next_row,
+    of_mixture,
+)
 from magloc.tracking.sensor_health import SENSOR_LIMIT, SensorHealth, Suspects
 
 ROWS_TO_LOSE = 3
@@ -74,7 +85,7 @@ class Tracker:
     array : SensorArray
     motion : MotionModel
     prior : SourcePrior
-        Bounds for the fixes that start a track, in the array's frame.
+        Bounds of the first row's source, and what its moment is known to be, in the array's frame.
     keep_steps : bool
         Keep what a smoother needs, in `steps`.
     background : Drift, optional
@@ -111,23 +122,21 @@ class Tracker:
         background: Drift | None = None,
     ) -> None:
         self.array = array
-        self.motion = motion
         self.prior = prior
+        self.motion = motion
         self.background = background
         self.measurements = RowMeasurements(array, motion.n_states, background)
         self.errors, self.pose_errors = self.measurements.errors, self.measurements.pose_errors
         self.keep_steps = keep_steps
         self.steps: list[Step] = []
-        self._acquisition = Acquisition(array)
+        self._acquisition = Acquisition(array, prior)
         self.filter = ChartFilter(array, self.errors, self.pose_errors, prior)
         self._undetermined = Undetermined(self.filter)
         self._known: Known | None = None
-        self._time_s = math.nan
-        self._n_rows = 0
+        self._time_s, self._n_rows = math.nan, 0
         self._last: Innovation | None = None
         self._row_before: Row | None = None
-        self._health = SensorHealth.of(array.n_sensors)
-        self._suspects = Suspects.of(array.n_sensors)
+        self._health, self._suspects = SensorHealth.of(array.n_sensors), Suspects.of(array.n_sensors)
 
     @one_blas_thread
     def update(self, row: Row | Readings) -> TrackPoint:
@@ -153,8 +162,7 @@ class Tracker:
             out, point = self._started(row, index)
         else:
             out, point = self._followed(self._known, row, index, dt_s)
-        names = (name for name, is_out in zip(self.array.ids, out, strict=True) if is_out)
-        return replace(point, dropped_sensors=tuple(names)) if out.any() else point
+        return replace(point, dropped_sensors=tuple(np.array(self.array.ids)[out].tolist())) if out.any() else point
 
     def run(
         self, rows: Iterable[Row | Readings], progress: Callable[[int], None] | None = None
@@ -164,6 +172,15 @@ class Tracker:
             yield self.update(row)
             if progress is not None:
                 progress(1)
+
+    @property
+    def motion(self) -> MotionModel:
+        """How the source moves: a modulus that is known stays."""
+        return self._motion
+
+    @motion.setter
+    def motion(self, motion: MotionModel) -> None:
+        self._motion = KeptModulus.of(motion, self.prior)
 
     @property
     def known(self) -> Known | None:
@@ -258,6 +275,11 @@ class Tracker:
         unknown = np.diag(_UNKNOWN * np.sqrt(np.diagonal(covariance)))
         x[:n], S[:n, :n] = self.motion.start(centres[0][:N_SOURCE], unknown)
         S[n + np.arange(n_errors), n + np.arange(n_errors)] = self.error_sigma
+        known = KnownInWorld.of(self.prior, measurements[0].row.R_world_from_array)
+        if known is not None:
+            centre = centres[0]
+            H = known.along(centre[None], np.eye(len(centre))[None])[0]
+            x, S = block_update(x, S, H, known.residual(centre[None])[0] - H @ (x - centre), np.ones(len(H)))
         chi2, of_rows = 0.0, []
         for j, (measurement, centre) in enumerate(zip(measurements, centres, strict=True)):
             if j:
@@ -426,25 +448,3 @@ class Tracker:
         heaviest = mixture.x[np.argmax(mixture.log_weight)]
         point = of_mixture(seen.row.time_s, mixture, np.diagonal(self.known_before(seen, heaviest)))
         return replace(point, status=UNDETERMINED)
-
-
-def learned(variance: FloatArray, open_loop: FloatArray) -> FloatArray:
-    """Estimability: 1 - σ / σ without any readings, from both variances."""
-    return 1.0 - np.sqrt(np.minimum(variance / open_loop, 1.0))
-
-
-def of_mixture(time_s: float, mixture: Mixture, open_loop: FloatArray) -> TrackPoint:
-    """What is known at an instant, for a user; open_loop (n,) are the variances had no readings been taken."""
-    source = mixture.of_source()
-    mean, covariance = source.moments()
-    return TrackPoint(
-        time_s,
-        mean[:3],
-        mean[3:],
-        covariance,
-        learned(np.diagonal(covariance), open_loop[:N_SOURCE]),
-        weight=float(source.weight.max()),
-        centroid_m=source.centroid_m,
-        radius_m=source.radius_m,
-        mixture=source,
-    )

@@ -24,6 +24,7 @@ from arrays.typing import FloatArray, IntArray
 from magloc.levels import CONTRADICTION
 from magloc.localization.fit.prior import SourcePrior
 from magloc.tracking.chart.coordinates import MOMENT_POWER, Chart
+from magloc.tracking.chart.known_moment import UNIFORM_IN_SPACE
 from magloc.tracking.chart.mixture import FARTHEST, NEAREST, Mixture, root_of
 from magloc.tracking.chart.stack import Stack
 from magloc.tracking.motion import N_SOURCE
@@ -161,13 +162,15 @@ def _of_places(stack: Stack, places: Sequence[Places], prior: SourcePrior) -> Mi
         log_C[block] = 2.0 * np.sum(np.log(np.diagonal(root)))
     R = np.asarray(np.linalg.qr(both, mode="r"))
     with np.errstate(all="ignore"):
-        x = np.concatenate([x[:, :3], np.linalg.solve(R[:, :3, :3], R[:, :3, 3:])[..., 0]], axis=1)
-        chart, chi2 = stack.chart(x), R[:, 3, 3] ** 2
+        moment, R, chi2 = _moments(stack, prior, R)
+        x = np.concatenate([x[:, :3], moment], axis=1)
+        chart = stack.chart(x)
         log_range = np.log(chart.length)
-        log_information = 2.0 * np.sum(np.log(np.abs(np.diagonal(R[:, :3, :3], axis1=1, axis2=2))), axis=1)
-        log_strength = np.log(np.linalg.norm(x[:, 3:6], axis=1)) - MOMENT_POWER * log_range
-        log_weight = -0.5 * (chi2 + log_C + log_information) - 3.0 * (MOMENT_POWER * log_range + log_strength)
-        log_weight -= log_density
+        log_information = 2.0 * np.sum(np.log(np.abs(np.diagonal(R, axis1=1, axis2=2))), axis=1)
+        log_prior = -3.0 * np.log(np.linalg.norm(moment, axis=1))
+        if prior.known_moment is not None:
+            log_prior = log_prior + UNIFORM_IN_SPACE * log_range
+        log_weight = log_prior - 0.5 * (chi2 + log_C + log_information) - log_density
     reach = np.linalg.norm(x[:, :3] - stack.centroid_m, axis=1) / stack.radius_m
     in_array = (x[:, :3] - stack.row.origin_m) @ stack.row.R_world_from_array
     sound = np.isfinite(log_weight) & (reach > NEAREST) & (reach < FARTHEST)
@@ -177,5 +180,26 @@ def _of_places(stack: Stack, places: Sequence[Places], prior: SourcePrior) -> Mi
         return None
     S = np.zeros((len(x), N_SOURCE, N_SOURCE))
     S[:, :3, :3] = _POINT * np.eye(3)
-    S[sound, 3:, 3:] = root_of(np.linalg.inv(R[sound, :3, :3])) / chart.length[sound, None, None] ** MOMENT_POWER
+    S[sound, 3:, 3:] = root_of(np.linalg.inv(R[sound])) / chart.length[sound, None, None] ** MOMENT_POWER
     return Mixture(x, S, log_weight, N_SOURCE, stack.centroid_m, stack.radius_m).take(sound)
+
+
+def _moments(stack: Stack, prior: SourcePrior, R: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Moments (n, 3) that fit best, upper roots (n, 3, 3) of their information, and χ² (n,), by roots (n, 4, 4)."""
+    chi2 = R[:, 3, 3] ** 2
+    known, turn = prior.known_moment, stack.row.R_world_from_array
+    of_moment, y = R[:, :3, :3], R[:, :3, 3]
+    if known is None:
+        return np.asarray(np.linalg.solve(of_moment, y[..., None])[..., 0]), of_moment, chi2
+    # In the array's axes, in which it is known.
+    of_moment = of_moment @ turn
+    information, pull = (
+        np.swapaxes(of_moment, -1, -2) @ of_moment,
+        (np.swapaxes(of_moment, -1, -2) @ y[..., None])[..., 0],
+    )
+    moment = known.best_moments(information, pull, np.ones(len(R)))
+    chi2 = chi2 + np.sum((y - (of_moment @ moment[..., None])[..., 0]) ** 2, axis=1)
+    chi2 += np.sum(known.residual(moment[:, None]) ** 2, axis=1)
+    by_known = known.jacobian(moment[:, None])[:, 0]
+    both = np.concatenate([of_moment, by_known], axis=1) @ turn.T
+    return moment @ turn.T, np.asarray(np.linalg.qr(both, mode="r")), chi2

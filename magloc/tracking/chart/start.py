@@ -28,6 +28,7 @@ from magloc.localization.locator import Locator
 from magloc.measurement.nuisances import SensorErrors
 from magloc.measurement.rows import check_magnitudes, check_spans
 from magloc.tracking.chart.coordinates import MOMENT_POWER, Chart, source_root
+from magloc.tracking.chart.known_moment import UNIFORM_IN_SPACE, KnownInWorld
 from magloc.tracking.chart.mixture import DROPPED_BELOW, FARTHEST, NEAREST, Mixture, block_root
 from magloc.tracking.chart.row import ChartRow, where_smooth
 from magloc.tracking.chart.stack import Measured
@@ -155,29 +156,32 @@ class Start:
             return None, "not acquired: no signal stands out of noise"
         # Before it nothing is known of source and sensors together: the sensors' errors are noise.
         alone = measurement.with_errors_as_noise(self.errors.sigma)
+        known = KnownInWorld.of(self.prior, measurement.row.R_world_from_array)
         seeds = self._seeds(alone)
         if not len(seeds.cell):
             array = alone.model.array
             is_linear = array.ambient_fields.any() or not array.channel_is_scalar.any()
             return None, NOT_ALLOWED if is_linear or alone.z.size >= N_SOURCE else NO_AMBIENT
-        found = _components(alone, motion, seeds)
+        found = _components(alone, motion, seeds, known)
         for refined in (_centred, _along_valleys):
             finer = refined(seeds, found, measurement)
             if not len(finer.cell):
                 return None, NOT_ALLOWED
             if finer is not seeds:
-                seeds, found = finer, _components(alone, motion, finer)
+                seeds, found = finer, _components(alone, motion, finer, known)
         row = measurement.row
         position = (found.x[:, :3] - row.origin_m) @ row.R_world_from_array
         sound = self.prior.allows_position(position) & self.prior.allows_moment(found.x[:, 3:6])
         sound &= np.isfinite(found.log_evidence) & found.converged
         if not sound.any():
             return None, NOT_ALLOWED
-        dof = measurement.z.size - N_SOURCE
+        dof = measurement.z.size - N_SOURCE + (0 if known is None else known.n_known)
         if dof > 0 and found.chi2[sound].min() > chdtri(dof, CONTRADICTION):
             return None, NO_DIPOLE
         log_weight = found.log_evidence + _EVEN * ((seeds.cell < 0) @ np.array([1.0, 2.0, 0.0]))
         log_weight -= math.log(2.0) * seeds.cell[:, 2]
+        if known is not None:
+            log_weight += UNIFORM_IN_SPACE * np.log(measurement.chart(found.x).length)
         mixture = _mixture(found, log_weight, measurement)
         return mixture.take(sound).take(once(mixture.take(sound), seeds.cell[sound])), ""
 
@@ -208,7 +212,9 @@ class Start:
         return _Seeds(np.vstack(position), np.vstack(moment), np.vstack(cell))
 
 
-def _components(measurement: Measured, motion: MotionModel, seeds: _Seeds) -> Updated:
+def _components(
+    measurement: Measured, motion: MotionModel, seeds: _Seeds, known: KnownInWorld | None = None
+) -> Updated:
     """What the row makes of cells about seeds."""
     state, _ = motion.start(np.zeros(N_SOURCE), np.zeros((N_SOURCE, N_SOURCE)))
     x = np.tile(state, (len(seeds.cell), 1))
@@ -216,7 +222,7 @@ def _components(measurement: Measured, motion: MotionModel, seeds: _Seeds) -> Up
     chart, sigma = measurement.chart(x), np.tile(_CELL, (len(x), 1))
     sigma[:, 0] /= 2.0 ** seeds.cell[:, 2]
     S = chart.inverse_jacobian() @ _with_motion(chart, motion, sigma)
-    return updated(x, S, measurement, np.zeros(len(x), dtype=bool))
+    return updated(x, S, measurement, np.zeros(len(x), dtype=bool), known=known)
 
 
 def _mixture(found: Updated, log_weight: FloatArray, measurement: Measured) -> Mixture:

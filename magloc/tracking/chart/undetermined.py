@@ -79,6 +79,12 @@ class Undetermined:
                 places.append(Places.of(found))
             told = weighed(stack, places, self.filter.prior)
         self._told = told
+        if told is None:
+            # They contradict each other, or no place is left: what moves otherwise than stated is told by fewer.
+            for _ in range(len(self._rows) // 2):
+                self._rows.popleft()
+            self._n_rows = len(self._rows)
+            self._next_fit = self._next_search = self._n_rows + 1
 
 
 def _leads(motion: MotionModel) -> bool:

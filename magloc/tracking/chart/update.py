@@ -17,6 +17,7 @@ import numpy as np
 
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.tracking.chart.coordinates import Chart
+from magloc.tracking.chart.known_moment import KnownInWorld
 from magloc.tracking.chart.mixture import root_of
 from magloc.tracking.chart.stack import Measured, Stack
 
@@ -105,7 +106,12 @@ class Updated:
 
 
 def updated(
-    x: FloatArray, S: FloatArray, measurement: Measured, bends: BoolArray, lasting: Measured | None = None
+    x: FloatArray,
+    S: FloatArray,
+    measurement: Measured,
+    bends: BoolArray,
+    lasting: Measured | None = None,
+    known: KnownInWorld | None = None,
 ) -> Updated:
     r"""Iterated update of states (K, N) with roots (K, N, N), each on its own.
 
@@ -115,12 +121,12 @@ def updated(
     .. math:: \min_e |C^{-1/2}(z - h(x \oplus e) - \ldots)|^2 + e^T P^{-1} e.
 
     Predictions bend as `lasting` does: the row, where of the pose's errors only those have an effect that the rows
-    before had as well.
+    before had as well. What is `known` of the moment is measured with it, of a row without errors of sensors.
     """
     n = measurement.n_motion
     chart = measurement.chart(x[:, :n]).firmly(S)
-    problem = _Problem.of(chart, x, S, measurement).bent(bends, lasting or measurement)
-    K, k = len(x), measurement.z.size
+    problem = replace(_Problem.of(chart, x, S, measurement).bent(bends, lasting or measurement), known=known)
+    K, k = len(x), measurement.z.size + (0 if known is None else known.n_known)
     zeta = np.zeros((K, n))
     residual = problem.residual(zeta)
     cost = np.sum(residual * residual, axis=1)
@@ -192,6 +198,7 @@ class _Problem:
     M: FloatArray
     J: FloatArray
     h: FloatArray
+    known: KnownInWorld | None = None
 
     @classmethod
     def of(cls, chart: Chart, x: FloatArray, S: FloatArray, measurement: Measured) -> _Problem:
@@ -272,6 +279,8 @@ class _Problem:
         left = self.z - h
         if self.whiten is not None:
             left = left - (self.of_errors @ standard[..., None])[..., 0]
+        if self.known is not None:
+            left = np.concatenate([left, self.known.residual(self.chart.retracted(e))], axis=1)
         return np.concatenate([left, -standard], axis=1)
 
     def jacobian(self, zeta: FloatArray) -> FloatArray:
@@ -281,6 +290,8 @@ class _Problem:
         standard = self.bending(e, J)
         if self.whiten is not None:
             J = J + self.of_errors @ standard
+        if self.known is not None:
+            J = np.concatenate([J, self.known.along(*self.chart.linearised(e)) @ self.U], axis=1)
         return np.concatenate([J, standard], axis=1)
 
     def bending(self, e: FloatArray, J: FloatArray) -> FloatArray:

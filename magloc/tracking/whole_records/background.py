@@ -28,8 +28,8 @@ from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.chart.steps import charted
 from magloc.tracking.measurement import RowMeasurement
 from magloc.tracking.motion import N_SOURCE
-from magloc.tracking.results import Innovation, Prediction, Row, Step, TrackPoint, rows_of
-from magloc.tracking.tracker import LARGEST_RANGE_ERROR, Tracker, of_mixture
+from magloc.tracking.results import Innovation, Prediction, Row, Step, TrackPoint, of_mixture, rows_of
+from magloc.tracking.tracker import LARGEST_RANGE_ERROR, Tracker
 from magloc.tracking.whole_records.smoother import smoothed, smoothed_states
 
 _LOG = logging.getLogger(__name__)

@@ -75,6 +75,20 @@ class TestTogether:
         assert high < 1.5 * low  # one row of three differences has the direction and the range open
         assert point.status == "undetermined"
 
+    def test_rows_that_contradict_each_other_are_left(self) -> None:
+        """A source that jumps by its range, said to rest: after as many rows again those before are forgotten."""
+        rng, tracker, moment = np.random.default_rng(4), Tracker(PAIR, REST), np.array([20.0, 200.0, -50.0])
+        for i in range(24):
+            place = np.array([2.0, 2.5, 1.0]) if i < 8 else np.array([-3.0, 1.0, -2.0])
+            origin = np.array([0.1 * i, 0.0, 0.0])
+            readings = predicted_channels(PAIR, place - origin, moment) + 2e-10 * rng.normal(size=6)
+            point = tracker.update(Row(0.5 * i, readings, origin))
+            assert point.position_m is not None
+        ((low, high),) = point.range_interval_m or ((0.0, None),)
+        range_m = float(np.linalg.norm(place - origin - PAIR.centroid))
+        assert high is not None
+        assert low < range_m < high < 2.0 * low
+
     def test_in_the_axes_of_an_array_that_moves_each_row_speaks_for_itself(self) -> None:
         assert not any(_leads(motion) for motion in (REST, WALK, magloc.OrnsteinUhlenbeck(0.5, 0.1)))
         assert _leads(KnownMotion(0.0, 0.0, array_velocity_m_s=(1.0, 0.0, 0.0)))
