@@ -70,13 +70,14 @@ class LaneModel(NamedTuple):
 
     Sensors (s, 3); of every set gains (sets, s, 9) and, in threes too, orthonormal common fields (sets, t, s, 9); the
     set of a row. A channel that is not there is zero. A prior of the common field is readings of it, so that taking
-    that out is a projection, whatever is known of it.
+    that out is a projection, whatever is known of it. It is unknown where there is none, and nothing else is taken out.
     """
 
     sensors: FloatArray
     gain: FloatArray
     common: FloatArray
     set_of_row: NDArray[np.intp]
+    is_unknown: bool
 
     @classmethod
     def of(cls, model: WhitenedModel) -> LaneModel:
@@ -98,6 +99,7 @@ class LaneModel(NamedTuple):
                 n_sets, n_triples, n_sensors, 9
             ),
             np.zeros(len(model), dtype=np.intp) if n_sets == 1 else np.arange(len(model), dtype=np.intp),
+            n_common == 3 and known.size == 0,
         )
 
 

@@ -43,7 +43,15 @@ from magloc.localization.fit.linearisation_compiled import (
     project,
     three,
 )
-from magloc.localization.fit.variable_projection_compiled import FAILED, Refined, Rules, fill_lanes, judge, step
+from magloc.localization.fit.variable_projection_compiled import (
+    FAILED,
+    Refined,
+    Rules,
+    fill_lanes,
+    judge,
+    load_lanes,
+    step,
+)
 from magloc.measurement.whitened import WhitenedModel
 from magloc.measurement.whitened_compiled import LaneModel, signals
 
@@ -92,7 +100,7 @@ def refined_by_moduli(
         model.lanes,
         Moduli.of(model),
         free_range,
-        Rules(tolerance, float(max_iterations), np.full(len(q), math.inf), False),
+        Rules(tolerance, float(max_iterations), np.full(len(q), math.inf), False, False),
         out,
     )
     return out
@@ -119,15 +127,15 @@ def refine_by_moduli(
     w, rows = np.zeros(WORKSPACE), np.zeros((n_sensors, SENSOR_ROWS))
     bent = np.zeros((len(moduli.sensor), MODULUS_ROWS))
     common, dots = np.zeros((n_sensors, n_triples, 9 * LANES)), np.empty((n_triples, 9 * LANES))
-    start_of_lane, set_of_lane, held = np.full(LANES, -1), np.full(LANES, -1), np.full(LANES, -1)
+    start_of_lane, loaded, set_of_lane = np.full(LANES, -1), np.full(LANES, -1), np.full(LANES, -1)
+    held = np.full(LANES, -1)
     w[END : END + LANES] = FAILED
     next_start: int = np.int64(0)  # type: ignore[assignment]  # no literal: it would be compiled for itself
     while True:
-        next_start, n_running = fill_lanes(
-            next_start, start_of_lane, set_of_lane, signal, reading, starts, model, w, rows, common, rules, out
-        )
+        next_start, n_running = fill_lanes(next_start, start_of_lane, starts, w, rules, out)
         if n_running == 0:
             return
+        load_lanes(start_of_lane, loaded, set_of_lane, signal, reading, model, rows, common)
         for i in range(LANES):
             k = start_of_lane[i]
             if k >= 0 and k != held[i]:

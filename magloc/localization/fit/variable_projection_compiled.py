@@ -29,9 +29,15 @@ from magloc.localization.fit.linearisation_compiled import (
     STATE,
     TOO_HIGH,
     TRIAL,
-    WORKSPACE,
     linearise,
     tangents,
+)
+from magloc.localization.fit.normal_equations_compiled import (
+    NARROW_ROWS,
+    SPACE,
+    fill_normal_equations,
+    has_digits,
+    load,
 )
 from magloc.measurement.whitened import WhitenedModel
 from magloc.measurement.whitened_compiled import SMALLEST_S, LaneModel, signals
@@ -50,13 +56,15 @@ class Rules(NamedTuple):
     """How refinements end: where a Gauss-Newton step would gain less than the tolerance, or after most iterations.
 
     They also end, and count as converged, where they will not come below a χ² (n,) above which none is of use. Ahead,
-    what is put out is where the last step leads, unseen, with the χ² that it promises.
+    what is put out is where the last step leads, unseen, with the χ² that it promises. Few digits do for readings of
+    which :func:`easy_first` says so.
     """
 
     tolerance: float
     max_iterations: float
     too_high: FloatArray
     ahead: bool
+    few_digits: bool
 
 
 class Refined(NamedTuple):
@@ -72,6 +80,18 @@ class Refined(NamedTuple):
     def empty(cls, n: int) -> Refined:
         """For a kernel to fill."""
         return cls(np.empty((n, 4)), np.empty((n, 3)), np.empty(n), np.empty(n, np.intp), np.empty(n, np.bool_))
+
+
+@internal
+def part(refined: Refined, first: int, last: int) -> Refined:
+    """Some of them."""
+    return Refined(
+        refined.q[first:last],
+        refined.mu[first:last],
+        refined.chi2[first:last],
+        refined.iterations[first:last],
+        refined.converged[first:last],
+    )
 
 
 def refined(
@@ -90,7 +110,7 @@ def refined(
         own(starts),
         model.lanes,
         free_range,
-        Rules(tolerance, float(max_iterations), np.full(len(starts), math.inf), False),
+        Rules(tolerance, float(max_iterations), np.full(len(starts), math.inf), False, False),
         out,
     )
     return out
@@ -121,36 +141,45 @@ def refine(
     n, n_sensors, n_triples = len(starts), len(model.sensors), model.common.shape[1]
     if n == 0:  # idle lanes compute the last start
         return
-    w, rows = np.zeros(WORKSPACE), np.zeros((n_sensors, SENSOR_ROWS))
+    w, rows = np.zeros(SPACE), np.zeros((n_sensors, NARROW_ROWS if rules.few_digits else SENSOR_ROWS))
     common, dots = np.zeros((n_sensors, n_triples, 9 * LANES)), np.empty((n_triples, 9 * LANES))
-    start_of_lane, set_of_lane = np.full(LANES, -1), np.full(LANES, -1)
+    start_of_lane, loaded, set_of_lane = np.full(LANES, -1), np.full(LANES, -1), np.full(LANES, -1)
     w[END : END + LANES] = FAILED
     next_start: int = np.int64(0)  # type: ignore[assignment]  # no literal: it would be compiled for itself
     while True:
-        next_start, n_running = fill_lanes(
-            next_start, start_of_lane, set_of_lane, signal, reading, starts, model, w, rows, common, rules, out
-        )
+        next_start, n_running = fill_lanes(next_start, start_of_lane, starts, w, rules, out)
         if n_running == 0:
             return
-        linearise(model.sensors, w, rows, common, dots, free_range)
+        if rules.few_digits:
+            for i in range(LANES):
+                k = start_of_lane[i] if start_of_lane[i] >= 0 else n - 1
+                if k != loaded[i]:
+                    loaded[i] = k
+                    load(i, signal[reading[k]], model.gain[model.set_of_row[reading[k]]], w, rows)
+            fill_normal_equations(model.sensors, w, rows, free_range)
+        else:
+            load_lanes(start_of_lane, loaded, set_of_lane, signal, reading, model, rows, common)
+            linearise(model.sensors, w, rows, common, dots, free_range)
         judge(w, rules)
         step(w, free_range)
 
 
+@internal
+def easy_first(signal: FloatArray, reading: IntArray, model: LaneModel, order: IntArray) -> int:
+    """Order of readings, first those for which few digits do; how many these are."""
+    n, n_easy = len(reading), 0
+    for i in range(n):
+        if has_digits(signal[reading[i]], model.gain[model.set_of_row[reading[i]]], model):
+            order[n_easy] = i
+            n_easy += 1
+        else:
+            order[n - 1 - (i - n_easy)] = i
+    return n_easy
+
+
 @inlined
 def fill_lanes(
-    next_start: int,
-    start_of_lane: IntArray,
-    set_of_lane: IntArray,
-    signal: FloatArray,
-    reading: IntArray,
-    starts: FloatArray,
-    model: LaneModel,
-    w: FloatArray,
-    rows: FloatArray,
-    common: FloatArray,
-    rules: Rules,
-    out: Refined,
+    next_start: int, start_of_lane: IntArray, starts: FloatArray, w: FloatArray, rules: Rules, out: Refined
 ) -> tuple[int, int]:
     """Put out the starts that have ended, and begin others in their lanes: the start that comes next, how many run."""
     n, n_running = len(starts), 0
@@ -172,27 +201,45 @@ def fill_lanes(
         n_running += next_start < n
         k = min(next_start, n - 1)  # an idle lane computes something, too
         next_start += 1
-        _load(i, starts[k], signal[reading[k]], w, rows)
-        w[TOO_HIGH + i] = rules.too_high[k]
-        of_row = model.set_of_row[reading[k]]
-        if set_of_lane[i] != of_row:
-            set_of_lane[i] = of_row
-            _load_model(i, model.gain[of_row], model.common[of_row], rows, common)
+        _begin(i, starts[k], rules.too_high[k], w)
     return next_start, n_running
 
 
 @internal
-def _load(i: int, start: FloatArray, signal: FloatArray, w: FloatArray, rows: FloatArray) -> None:
+def _begin(i: int, start: FloatArray, too_high: float, w: FloatArray) -> None:
     """Begin a start in lane i: a place, where moduli count with a moment behind it."""
     for d in range(len(start)):
         w[TRIAL + d * LANES + i] = start[d]
     for d in range(9):
         w[NORMAL + d * LANES + i] = 0.0
     w[CHI2 + i], w[DAMPING + i], w[PROMISED + i] = math.inf, 1e-3, 0.0
-    w[ITERATIONS + i], w[END + i] = 0.0, RUNNING
-    for s in range(len(signal)):
-        for a in range(3):
-            rows[s, SIGNAL + a * LANES + i] = signal[s, a]
+    w[ITERATIONS + i], w[END + i], w[TOO_HIGH + i] = 0.0, RUNNING, too_high
+
+
+@inlined
+def load_lanes(
+    start_of_lane: IntArray,
+    loaded: IntArray,
+    set_of_lane: IntArray,
+    signal: FloatArray,
+    reading: IntArray,
+    model: LaneModel,
+    rows: FloatArray,
+    common: FloatArray,
+) -> None:
+    """Readings and sensors of the lanes whose starts are not loaded so far."""
+    for i in range(LANES):
+        k = start_of_lane[i] if start_of_lane[i] >= 0 else len(reading) - 1
+        if k == loaded[i]:
+            continue
+        loaded[i], of_row = k, model.set_of_row[reading[k]]
+        of_start = signal[reading[k]]
+        for s in range(len(of_start)):
+            for a in range(3):
+                rows[s, SIGNAL + a * LANES + i] = of_start[s, a]
+        if set_of_lane[i] != of_row:
+            set_of_lane[i] = of_row
+            _load_model(i, model.gain[of_row], model.common[of_row], rows, common)
 
 
 @internal

@@ -20,6 +20,8 @@ from magloc.localization.fit.variable_projection_compiled import (
     OPTIMUM_TOLERANCE,
     Refined,
     Rules,
+    easy_first,
+    part,
     refine,
     same_optimum,
 )
@@ -88,19 +90,23 @@ def choose_rows(
             key[j] = (np.int64(bits[j]) << 32) + (n - j)
         for b in range(n_blocks):
             highest[b] = _largest(blocks[b])
-        chosen[row] = 0
         n_found = 0
         while n_found < n_chosen:
             best = _largest(highest)
-            if best <= 0:
-                chosen[row, n_found:] = chosen[row, 0]
-                break
+            if best <= 0:  # none is left
+                chosen[row, n_found] = chosen[row, 0] if n_found else 0
+                n_found += 1
+                continue
             j = n - (best & 0xFFFFFFFF)
             key[j] = -1
             highest[j // _BLOCK] = _largest(blocks[j // _BLOCK])
             near = False
             for k in range(n_found):
-                near |= _are_near(candidates[j], candidates[chosen[row, k]], apart)
+                i = chosen[row, k]
+                t = np.float32(0.0)
+                for d in range(4):
+                    t += candidates[i, d] * candidates[j, d]
+                near |= abs(t) > apart
             if not near:
                 chosen[row, n_found] = j
                 n_found += 1
@@ -112,11 +118,6 @@ def _largest(values: IntArray) -> Any:
     for i in range(1, len(values)):
         largest = max(largest, values[i])
     return largest
-
-
-@inlined
-def _are_near(q: NDArray[np.float32], other: NDArray[np.float32], cos_apart: Any) -> bool:
-    return abs(q[0] * other[0] + q[1] * other[1] + q[2] * other[2] + q[3] * other[3]) > cos_apart
 
 
 @compiled
@@ -138,30 +139,37 @@ def search_rows(
     reading. The first ones say above which χ² the others are given up.
     """
     n_rows, n_starts = end - begin, starts.shape[1]
-    n_first, n = min(_FIRST_STARTS, n_starts), n_rows * n_starts
+    n_first, n, n_easy = min(_FIRST_STARTS, n_starts), n_rows * n_starts, 0
     place, reading = np.empty((n_rows, n_starts), np.intp), np.empty(n, np.intp)
-    of_place = np.empty((n, starts.shape[2]))
-    for row in range(n_rows):
+    of_place, order = np.empty((n, starts.shape[2])), np.empty(n_rows, np.intp)
+    if moduli is None:
+        n_easy = easy_first(signal, reading_of_row[begin:end], model, order)
+    else:
+        for row in range(n_rows):
+            order[row] = row
+    for i in range(n_rows):
+        row = order[i]
         for k in range(n_starts):
-            j = row * n_first + k if k < n_first else n_rows * n_first + row * (n_starts - n_first) + k - n_first
+            j = i * n_first + k if k < n_first else n_rows * n_first + i * (n_starts - n_first) + k - n_first
             place[row, k], reading[j] = j, reading_of_row[begin + row]
             put(of_place[j], starts[begin + row, k])
     near, limit = _places(n), np.full(n, math.inf)
-    for first, last in ((0, n_rows * n_first), (n_rows * n_first, n)):
-        rules = Rules(_NEAR_TOLERANCE, float(max_iterations), limit[first:last], True)
-        of_part = Refined(
-            near.q[first:last],
-            near.mu[first:last],
-            near.chi2[first:last],
-            near.iterations[first:last],
-            near.converged[first:last],
-        )
-        _refine(signal, reading[first:last], of_place[first:last], model, moduli, rules, of_part)
-        for row in range(n_rows):
-            lowest = _lowest(near, place[row, :n_first])
-            for j in place[row, n_first:]:
-                limit[j] = lowest + keep_within + 1.0
-    distinct, count = np.empty((n, starts.shape[2])), np.int64(0)
+    first_ends, n_others = n_rows * n_first, n_starts - n_first
+    edges = (0, n_easy * n_first, first_ends, first_ends + n_easy * n_others, n)
+    for i in range(4):
+        first, last = edges[i], edges[i + 1]
+        rules = Rules(_NEAR_TOLERANCE, float(max_iterations), limit[first:last], True, i % 2 == 0)
+        ends = part(near, first, last)
+        if moduli is None:
+            refine(signal, reading[first:last], of_place[first:last], model, 1.0, rules, ends)
+        else:
+            refine_by_moduli(signal, reading[first:last], of_place[first:last], model, moduli, 1.0, rules, ends)
+        if i == 1:
+            for row in range(n_rows):
+                lowest = _lowest(near, place[row, :n_first])
+                for j in place[row, n_first:]:
+                    limit[j] = lowest + keep_within + 1.0
+    distinct, count = np.empty((n, starts.shape[2])), 0
     chi2, iterations, first_end = np.empty(n), np.empty(n, np.intp), np.zeros(n_rows + 1, np.intp)
     for row in range(begin, end):
         lowest = _lowest(near, place[row - begin])
@@ -186,8 +194,11 @@ def search_rows(
                 count += 1
         first_end[row - begin + 1] = count
     ends = _places(count)
-    rules = Rules(OPTIMUM_TOLERANCE, _LONGER * max_iterations, np.full(count, math.inf), False)
-    _refine(signal, reading[:count], distinct[:count], model, moduli, rules, ends)
+    rules = Rules(OPTIMUM_TOLERANCE, _LONGER * max_iterations, np.full(count, math.inf), False, False)
+    if moduli is None:
+        refine(signal, reading[:count], distinct[:count], model, 1.0, rules, ends)
+    else:
+        refine_by_moduli(signal, reading[:count], distinct[:count], model, moduli, 1.0, rules, ends)
     for row in range(begin, end):
         first, last = first_end[row - begin], first_end[row - begin + 1]
         for k in range(first, last):
@@ -200,22 +211,6 @@ def search_rows(
 @internal
 def _places(n: int) -> Refined:
     return Refined(np.empty((n, 4)), np.empty((n, 3)), np.empty(n), np.empty(n, np.intp), np.empty(n, np.bool_))
-
-
-@internal
-def _refine(
-    signal: FloatArray,
-    reading: IntArray,
-    starts: FloatArray,
-    model: LaneModel,
-    moduli: Moduli | None,
-    rules: Rules,
-    out: Refined,
-) -> None:
-    if moduli is None:
-        refine(signal, reading, starts, model, 1.0, rules, out)
-    else:
-        refine_by_moduli(signal, reading, starts, model, moduli, 1.0, rules, out)
 
 
 @internal

@@ -14,7 +14,7 @@ import numpy as np
 from arrays.typing import FloatArray, IntArray
 from magloc.compilation import internal
 from magloc.linalg_compiled import put
-from magloc.localization.fit.variable_projection_compiled import Refined, Rules, refine
+from magloc.localization.fit.variable_projection_compiled import Refined, Rules, easy_first, part, refine
 from magloc.measurement.whitened_compiled import SMALLEST_S, LaneModel
 
 # Gauss-Newton gain in χ² at which a point of the profile is one: it is read at a rise of 3.84 to 0.01.
@@ -140,8 +140,10 @@ def profile_rows(
     """
     n = 2 * (fits.first[end] - fits.first[begin])
     state, direction, place = np.empty((n, _COLUMNS)), np.empty((n, 3)), np.empty((n, 3), np.intp)
-    n = 0
-    for row in range(begin, end):
+    order = np.empty(end - begin, np.intp)
+    n_easy, n_easy_ends, n = easy_first(signal, np.arange(begin, end), model, order), 0, 0
+    for i in range(end - begin):
+        row = begin + order[i]
         for k in range(fits.first[row], fits.first[row + 1]):
             left = rise[row] - (fits.chi2[k] - fits.chi2[fits.first[row]])
             if not (left > 0.0 and math.isfinite(left)):
@@ -151,12 +153,13 @@ def profile_rows(
                 _begin(fits.q[k], fits.chi2[k], left, 2.0 * side - 1.0, step, state[n], direction[n])
                 place[n, 0], place[n, 1], place[n, 2] = row, k, side
                 n += 1
+        n_easy_ends = n if i < n_easy else n_easy_ends
     live, n_live = np.arange(n), n
     starts, reading = np.empty((n, 4)), np.empty(n, np.intp)
     ends = Refined(
         np.empty((n, 4)), np.empty((n, 3)), np.empty(n), np.empty(n, np.intp), np.empty(n, np.bool_)
     )  # fmt: skip
-    rules = Rules(PROFILE_TOLERANCE, 30.0, np.full(n, math.inf), True)
+    nothing = np.full(n, math.inf)
     for _ in range(_MOST_STEPS):
         if n_live == 0:
             break
@@ -164,7 +167,12 @@ def profile_rows(
             k = live[i]
             reading[i] = place[k, 0]
             _place(direction[k], state[k, _TRIED], starts[i])
-        refine(signal, reading[:n_live], starts[:n_live], model, 0.0, rules, ends)
+        middle = 0
+        while middle < n_live and live[middle] < n_easy_ends:
+            middle += 1
+        for first, last, easy in ((0, middle, True), (middle, n_live, False)):
+            rules = Rules(PROFILE_TOLERANCE, 30.0, nothing, True, easy)
+            refine(signal, reading[first:last], starts[first:last], model, 0.0, rules, part(ends, first, last))
         n_before, n_live = n_live, 0
         for i in range(n_before):
             k = live[i]
