@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 
 # Two vector sensors have no more: too few for the six numbers of a source in one row.
 _FEW_CHANNELS = 6
-_USE_SURVEY = "; sources at rest that few sensors move past are found by magloc survey"
+_USE_SURVEY = "sources at rest that few sensors move past are found by magloc survey"
 
 
 @Parameter(name="*", group="Motion")
@@ -255,6 +255,9 @@ def track(
         write_moment_track(moments, readings, known, outputs)
         return
     printed = jsonl and not smooth and not rows.background
+    few = used.n_channels <= _FEW_CHANNELS and rows.array_rotation is not None
+    if few and not common.quiet:
+        print_note(_USE_SURVEY)
     with progress(len(rows), "rows", quiet=common.quiet) as advance, naming(str(array)):
         if printed:
             tracker = magloc.Tracker(with_stated_pose(used, rows), model, prior=prior)
@@ -263,8 +266,7 @@ def track(
             found = magloc.track(used, rows, motion=model, smooth=smooth, prior=prior, progress=advance)
     if not any(point.is_on_track for point in found):
         _print_track(found, None, json=json, jsonl=jsonl, printed=printed)
-        few = used.n_channels <= _FEW_CHANNELS and rows.array_rotation is not None
-        raise _no_track(str(readings), found.status, _USE_SURVEY if few else "")
+        raise _no_track(str(readings), found.status, f"; {_USE_SURVEY}" if few else "")
     result = None if truth is None else found.consistency(magloc.read_truth(truth))
     maps.write(found, known.place)
     if out is not None:
