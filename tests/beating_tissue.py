@@ -24,6 +24,8 @@ PITCH_M, ROWS, COLUMNS = 0.0195, 4, 6
 TRIAD_M = np.array([[-2.15e-3, 1.7e-3, 0.0], [2.15e-3, 1.7e-3, 0.0], [0.0, -2.743e-3, 0.0]])
 T_PER_COUNT = 16e-4 / 2**16
 NOISE_T, RATE_HZ = 9.5e-6, 100.0
+# What is drawn: the last seconds, and how far apart lines are.
+SHOWN_S, APART_UM = 10.0, 20.0
 # The first rows carry times that go to and fro.
 FIRST_ROW = 5
 WELL = np.array([[PITCH_M * (n % COLUMNS), -PITCH_M * (n // COLUMNS), 0.0] for n in range(ROWS * COLUMNS)])
@@ -73,29 +75,23 @@ def followed(array: SensorArray, values: FloatArray) -> tuple[FloatArray, FloatA
 
 
 def drawn(places: FloatArray, sigma: FloatArray) -> Figure:
-    """Heights of all magnets over some seconds, and one of them with its σ."""
-    figure = Figure(figsize=(11, 7), layout="constrained")
+    """One axis of all magnets over ten seconds, and all axes of the one that moves most with its σ."""
+    figure = Figure(figsize=(11, 6), layout="constrained")
     left, right = figure.subplots(1, 2)
-    time_s = np.arange(places.shape[1]) / RATE_HZ
-    away = 1e6 * (places - np.nanmean(places, axis=1, keepdims=True))
+    n = int(SHOWN_S * RATE_HZ)
+    time_s, shown = np.arange(n) / RATE_HZ, places[:, -n:]
+    away = 1e6 * (shown - np.nanmean(shown, axis=1, keepdims=True))
     order = np.argsort([int(np.argmin(np.linalg.norm(WELL[:, :2] - place[:2], axis=1))) for place in places[:, 0]])
-    shown = slice(0, int(10 * RATE_HZ))
     for i, k in enumerate(order):
-        left.plot(time_s[shown], away[k, shown, 0] + 40.0 * i, linewidth=0.7)
-    left.set_yticks(40.0 * np.arange(len(order)), [f"{n + 1}" for n in range(len(order))])
-    left.set(xlabel="time [s]", ylabel="well; x of its magnet, 40 µm from line to line")
-    most = order[int(np.argmax(np.nanstd(away[order, :, 0], axis=1)))]
+        left.plot(time_s, away[k, :, 0] + APART_UM * i, color=f"C{i % 2}", linewidth=0.8)
+    left.set_yticks(APART_UM * np.arange(len(order)), [f"{i + 1}" for i in range(len(order))])
+    left.set(xlabel="time [s]", ylabel=f"well: x of its magnet, lines {APART_UM:g} µm apart")
+    well = int(np.argmax(np.nanstd(away[order], axis=1).max(axis=1)))
     for axis, name in enumerate("xyz"):
-        right.plot(time_s[shown], away[most, shown, axis] + 60.0 * axis, label=name)
-        width = 1e6 * sigma[most, shown, axis]
-        right.fill_between(
-            time_s[shown],
-            away[most, shown, axis] + 60.0 * axis - width,
-            away[most, shown, axis] + 60.0 * axis + width,
-            alpha=0.3,
-        )
-    right.set(xlabel="time [s]", ylabel="the magnet that moves most [µm], with its σ")
-    right.legend()
+        moved, width = away[order[well], :, axis], 1e6 * np.median(sigma[order[well], -n:, axis])
+        right.plot(time_s, moved + 2.0 * APART_UM * axis, linewidth=0.9, label=f"{name}, σ {width:.0f} µm")
+    right.set(xlabel="time [s]", ylabel=f"magnet of well {well + 1} [µm], axes {2.0 * APART_UM:g} µm apart")
+    right.legend(loc="lower center", ncols=3)
     return figure
 
 
@@ -103,12 +99,14 @@ def main() -> None:
     """Follow the magnets, and draw them."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rows", type=int, default=10_000)
+    parser.add_argument("--without", default="", help="a sensor that is left out")
     parser.add_argument("--out", type=Path)
     given = parser.parse_args()
     array = plate()
     values = readings_T(Path(os.environ["MAGLOC_DATA"]) / "curibio")[FIRST_ROW : FIRST_ROW + given.rows]
+    left_out = np.array([name == given.without for name in array.ids])
+    values[:, left_out[array.channel_sensor]] = np.nan
     places, sigma, named, took = followed(array, values)
-    np.savez("/tmp/w/K/beating.npz", places=places, sigma=sigma, took=took)
     told = np.isfinite(places[:, :, 0])
     mean = np.nanmean(places, axis=1)
     nearest = np.array([np.linalg.norm(WELL[:, :2] - place[:2], axis=1).argmin() for place in mean])

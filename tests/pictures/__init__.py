@@ -99,6 +99,22 @@ class OfPage:
 
 
 @dataclass(frozen=True)
+class OfRecording:
+    """Drawn by a module of the tests from a recording, in minutes."""
+
+    module: str
+    sources: tuple[str, ...]
+
+    def steps(self) -> tuple[str, ...]:
+        return (f"python -m {self.module} --out recording.png",)
+
+    def draw(self, folder: Path) -> bytes:
+        file = folder / "recording.png"
+        subprocess.run([sys.executable, "-m", self.module, "--out", str(file)], cwd=REPOSITORY, check=True)
+        return small(file.read_bytes())
+
+
+@dataclass(frozen=True)
 class Panel:
     """One panel of another picture, cut out: left, top, right and bottom [px]."""
 
@@ -179,6 +195,7 @@ PICTURES: dict[str, Picture] = {
     "background-diver.png": OfPage("background"),
     "distance-of-a-coil.png": OfPage("single-sensor-ranging"),
     "gradient-tensor.png": OfPage("gradient-tensor"),
+    "beating-tissue.png": OfRecording("tests.beating_tissue", ("tests/beating_tissue.py",)),
     "stars-identified.png": OfPage("star-identification"),
     "view-array.png": OfCommands(
         (
