@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
@@ -25,15 +24,13 @@ from magloc.cli.moments.known_path import (
     write_moment_track,
     write_moment_tracks,
 )
-from magloc.cli.multi_target.sources_track import SourcesOutputs, SourcesWanted, follow_sources, stream_sources
+from magloc.cli.multi_target.sources_track import SourcesOptions, SourcesOutputs, follow_sources, stream_sources
 from magloc.cli.options import (
     STREAM,
     KnownOptions,
     MapOptions,
-    MotionOptions,
     ambient_field,
     naming_place,
-    number_of_sources,
     print_note,
     refuse_not_positive,
 )
@@ -41,7 +38,6 @@ from magloc.cli.options import (
 if TYPE_CHECKING:
     from arrays.array import SensorArray
     from magloc.ambient import Place
-    from magloc.localization.fit.prior import SourcePrior
     from magloc.readings import Readings
     from magloc.signature.path import ObjectPath
     from magloc.tracking.consistency import Consistency
@@ -58,7 +54,7 @@ _USE_SURVEY = "sources at rest that few sensors move past are found by magloc su
 
 @Parameter(name="*", group="Motion")
 @dataclass(frozen=True)
-class PathOptions(MotionOptions):
+class PathOptions(SourcesOptions):
     """What is known of the motion.
 
     Parameters
@@ -87,24 +83,9 @@ class PathOptions(MotionOptions):
         How wrong a known path may be.
     """
 
-    sources: str | None = None
     position: list[Vector] | None = None
     object_path: Path | None = None
     error: PathErrorOptions = field(default_factory=PathErrorOptions)
-
-    def several(self, prior: SourcePrior) -> SourcesWanted | None:
-        """What several sources are asked for; None: one source is followed on its own."""
-        if self.sources is None:
-            return None
-        if self.motion is not None:
-            raise InputError(f"--motion: found {self.motion} together with --sources, expected one of them.")
-        refuse_not_positive(self, "speed_m_s", "turn_deg_s", "correlation_s")
-        motion = magloc.FreeMotion(speed_m_s=self.speed_m_s)
-        if self.turn_deg_s is not None:
-            motion = replace(motion, turn_rad_s=math.radians(self.turn_deg_s))
-        if self.correlation_s is not None:
-            motion = replace(motion, correlation_s=self.correlation_s)
-        return SourcesWanted(number_of_sources(self.sources), motion, prior)
 
     def known_path(self) -> ObjectPath | list[Vector] | None:
         """Where the source is known to be, None where that is to be found."""
