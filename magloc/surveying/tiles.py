@@ -79,14 +79,17 @@ def owned(tiles: Sequence[Tile], position_m: Sequence[FloatArray], same_m: float
         found += [(float(inside[k]), t, int(k)) for k in np.flatnonzero(inside > -SEAM_M)]
     found.sort(key=lambda entry: (-entry[0], entry[1:]))
     kept: list[tuple[int, int]] = []
-    on_seam: list[tuple[int, FloatArray, set[int]]] = []  # which tiles have them
+    on_seam: list[set[int]] = []  # which tiles have them
+    places = np.empty((len(found), 3))
     for inside_m, t, k in found:
-        place = position_m[t][k]
         if inside_m <= SEAM_M:
-            same = [s for s in on_seam if t not in s[2] and np.linalg.norm(s[1] - place) < same_m]
+            n = len(on_seam)
+            apart = np.linalg.norm(places[:n] - position_m[t][k], axis=1)
+            same = [int(s) for s in np.flatnonzero(apart < same_m) if t not in on_seam[s]]
             if same:
-                min(same, key=lambda s: float(np.linalg.norm(s[1] - place)))[2].add(t)
+                on_seam[min(same, key=apart.__getitem__)].add(t)
                 continue
-            on_seam.append((t, place, {t}))
+            places[n] = position_m[t][k]
+            on_seam.append({t})
         kept.append((t, k))
     return kept
