@@ -56,10 +56,12 @@ def tiles_of(places_m: FloatArray, reach_m: float) -> tuple[list[Tile], float]:
     number = np.maximum(1, np.round((high - low) / (_CORE * reach_m))).astype(np.intp)
     size = (high - low) / number
     cell = np.clip(((places_m - low) / np.where(size > 0.0, size, 1.0)).astype(np.intp), 0, number - 1)
+    cell = cell[:, 0] * number[1] + cell[:, 1]
     order = np.argsort(places_m[:, 0], kind="stable")
     x = places_m[order, 0]
     tiles = []
-    for own_cell in np.unique(cell, axis=0):
+    for index in np.unique(cell):
+        own_cell = np.array(divmod(index, number[1]))
         start, end = low + own_cell * size, low + (own_cell + 1) * size
         strip = order[slice(*np.searchsorted(x, [start[0] - margin, end[0] + margin]))]
         y = places_m[strip, 1]
@@ -67,7 +69,7 @@ def tiles_of(places_m: FloatArray, reach_m: float) -> tuple[list[Tile], float]:
         open_low = np.where(own_cell == 0, -np.inf, start)
         open_high = np.where(own_cell == number - 1, np.inf, end)
         colour = int(own_cell[0] % 2 + 2 * (own_cell[1] % 2))
-        tiles.append(Tile(open_low, open_high, rows, np.all(cell[rows] == own_cell, axis=1), colour))
+        tiles.append(Tile(open_low, open_high, rows, cell[rows] == index, colour))
     return tiles, margin
 
 
