@@ -105,14 +105,19 @@ def search(record: SurveyRecord, background: Background, sources: Sources, grid:
     def explained(tile: tuple[float, FloatArray]) -> Candidates:
         distance, places = tile
         used = groups_near(record, white, places, WINDOW * distance)
-        alone, projected, v = normal_equations(record, white, directions, places, used, Q, left)
-        # Of a source that others nearly imitate rounding and the window's edge are left, which must not count.
-        least = np.maximum(_LEAST_SEEN * np.trace(alone, axis1=1, axis2=2), _TINY)[:, None, None] * np.eye(3)
-        moment = np.linalg.solve(projected + least, v[..., None])[..., 0]
-        return Candidates(places, np.full(len(places), distance), np.sum(v * moment, axis=1), moment)
+        moment, chi2 = likeliest_moments(*normal_equations(record, white, directions, places, used, Q, left))
+        return Candidates(places, np.full(len(places), distance), chi2, moment)
 
     with ThreadPoolExecutor(get_num_threads()) as pool:
         return list(pool.map(explained, grid.tiles))
+
+
+def likeliest_moments(alone: FloatArray, projected: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Moments (m, 3) of normal equations, and the χ² (m,) that they explain."""
+    # Of a source that others nearly imitate rounding and the window's edge are left, which must not count.
+    least = np.maximum(_LEAST_SEEN * np.trace(alone, axis1=1, axis2=2), _TINY)[:, None, None] * np.eye(3)
+    moment = np.linalg.solve(projected + least, v[..., None])[..., 0]
+    return moment, np.sum(v * moment, axis=1)
 
 
 def normal_equations(

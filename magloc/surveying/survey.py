@@ -34,6 +34,7 @@ _TRIALS = 1.25  # independent ones of a map, over its area in distances to the s
 _HECTARE_M2 = 1e4
 _MOST_SWEEPS = 5
 _MISFIT = 2.0
+_MOST_DOUBTED = 1_000_000  # rows
 _LONGEST_BODY_M = 10.0
 
 
@@ -129,7 +130,7 @@ def survey(
             f"Input body_length_m must be from 0 to {_LONGEST_BODY_M:g} m; instead received {body_length_m:g}."
         )
     rows = readings if isinstance(readings, Readings) else joined(readings)
-    warn_of_doubts(array, rows)
+    warn_of_doubts(array, rows[:_MOST_DOUBTED])
     assumed = array.pose is None and rows.pose_sigma is None
     ground = Ground(prior, ground_m, shortest_geology_m, math.inf, body_length_m)
     tiled = TiledSurvey.of(*whole_rows(array, rows, base), ground)

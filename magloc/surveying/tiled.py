@@ -126,7 +126,7 @@ class TiledSurvey:
         places = self._places(tile)
         apart = np.linalg.norm(position - np.clip(position, places.min(axis=0), places.max(axis=0)), axis=1)
         felt = 2e-7 * strength > _FELT * self.array.channel_noise_T.min() * apart**3
-        return tuple(self.sources.some(which) for which in (own, near & ~own, felt & ~near))
+        return self.sources.some(own), self.sources.some(near & ~own), self.sources.some(felt & ~near)
 
     def _places(self, tile: Tile) -> FloatArray:
         assert self.readings.array_position_m is not None

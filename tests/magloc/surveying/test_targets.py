@@ -32,7 +32,7 @@ from magloc.surveying.preparation import whole_rows
 from magloc.surveying.reach import DEPTHS_M, least_moments
 from magloc.surveying.rounds import AT_LAST, WHILE_SEARCHING, Model, Searched
 from magloc.surveying.search import PITCH, WINDOW, SearchGrid
-from magloc.surveying.targets import is_misfit, profile_of, second_source_chi2
+from magloc.surveying.targets import is_misfit, moved_by_second, profile_of, second_source_chi2
 from magloc.surveying.tiled import TiledSurvey
 from sims.magnetics.paths import Lawnmower, Steered
 from sims.magnetics.scenario import Carrier, MagneticScenario, Source
@@ -252,6 +252,19 @@ class TestSecondSource:
         explained, left = self.chi2s(gap_m)
         assert 0.9 * left < explained < 1.02 * left
         assert left > 1.0
+
+    @pytest.mark.parametrize("beside", [(0.9, 0.3, 0.1), (-0.5, 0.8, -0.3)])
+    def test_it_moves_the_first_one(self, beside: tuple[float, float, float]) -> None:
+        """By about as much as one dipole in place of two errs, which its covariance without noise does not tell."""
+        place, moment = np.array([0.3, -0.2, -0.8]), np.array([6.0, -4.0, 9.0])
+        places, moments = np.array([place, place + beside]), np.array([moment, 0.06 * moment[::-1]])
+        model, fit, background = plot_of(
+            lambda sensors: dipole.total_field(sensors, places, moments), Sources(place[None], moment[None])
+        )
+        Q = with_free_sources(model.record, background, fit.sources)
+        moved = moved_by_second(model, fit, background, Q, fit.residual - Q @ (Q.T @ fit.residual), 0)
+        wrong = np.linalg.norm(fit.sources.position_m[0] - place)
+        assert 0.3 * wrong < np.linalg.norm(moved[:3]) < 3.0 * wrong
 
     @pytest.mark.parametrize("body_length_m", [0.0, 0.7])
     def test_of_noise_it_is_chi_square(self, body_length_m: float) -> None:
