@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from arrays.array import SensorArray
-from arrays.typing import BoolArray, FloatArray
+from arrays.typing import BoolArray, FloatArray, IntArray
 
 # Relative addition to the variances of an uncertain calibration, which are singular: above rounding, below any effect.
 _REGULAR_RTOL = 1e-13
@@ -55,21 +55,21 @@ def reading_covariance(array: SensorArray, readings_T: FloatArray) -> FloatArray
     the known ambient field, else the mean of the other sensors' fields, else zero. Returns (..., C, C):
     block-diagonal by sensor, in the units of the readings [T²]. Entries of missing channels are finite.
     """
-    return _block_diagonal(array, _covariance_blocks(array, readings_T), array.sensor_channels >= 0)
+    return block_diagonal(array.sensor_channels, covariance_blocks(array, readings_T))
 
 
 def reading_errors(array: SensorArray, readings_T: FloatArray, normal: FloatArray) -> FloatArray:
     """Errors (..., C) [T] of the covariance of :func:`reading_covariance`, from standard normal numbers (..., C)."""
     if not array.noise_depends_on_reading:
         return array.channel_noise_T * normal
-    channel, used = array.sensor_channels, array.sensor_channels >= 0
-    root = np.linalg.cholesky(_covariance_blocks(array, readings_T))
-    slots = np.where(used, np.asarray(normal, dtype=np.float64)[..., channel], 0.0)
+    used = array.sensor_channels >= 0
+    root = np.linalg.cholesky(covariance_blocks(array, readings_T))
+    slots = in_slots(used, np.asarray(normal, dtype=np.float64))
     errors: FloatArray = np.einsum("...nij,...nj->...ni", root, slots)
     return errors[..., used]
 
 
-def _covariance_blocks(array: SensorArray, readings_T: FloatArray) -> FloatArray:
+def covariance_blocks(array: SensorArray, readings_T: FloatArray) -> FloatArray:
     """Blocks of :func:`reading_covariance`, (..., N, 3, 3) [T²], with unit variances in the slots that are not used."""
     readings_T = np.asarray(readings_T, dtype=np.float64)
     channel, used = array.sensor_channels, array.sensor_channels >= 0
@@ -146,10 +146,19 @@ def _mean_of_finite(values: FloatArray, axis: int) -> FloatArray:
     return np.where(finite, values, 0.0).sum(axis=axis, keepdims=True) / count
 
 
-def _block_diagonal(array: SensorArray, blocks: FloatArray, present: BoolArray) -> FloatArray:
-    """Matrices (..., C, C) of the sensors' blocks (..., N, 3, 3), zero for channels that are not present (N, 3)."""
-    n = array.n_channels
-    slot = np.where(present, array.sensor_channels, n)  # the others end in a row and a column that are cut off
+def block_diagonal(channels: IntArray, blocks: FloatArray) -> FloatArray:
+    """Matrices (..., C, C) of the sensors' blocks (..., N, 3, 3), whose axes are channels (N, 3) or none, negative."""
+    n = int(channels.max()) + 1
+    slot = np.where(channels >= 0, channels, n)  # the others end in a row and a column that are cut off
     matrix = np.zeros((*blocks.shape[:-3], n + 1, n + 1))
     matrix[..., slot[:, :, None], slot[:, None, :]] = blocks
     return matrix[..., :n, :n]
+
+
+def in_slots(used: BoolArray, channels: FloatArray) -> FloatArray:
+    """Channels (..., C) by sensor and axis (..., N, 3), zero for the axes that a scalar sensor has none of."""
+    if used.all():
+        return channels.reshape(*channels.shape[:-1], *used.shape)
+    slots = np.zeros((*channels.shape[:-1], *used.shape))
+    slots[..., used] = channels
+    return slots

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 
 from arrays.array import SensorArray
 from arrays.differences import _channels, _common_field, _groups, _mask
-from arrays.noise import _block_diagonal
-from arrays.typing import BoolArray, FloatArray
+from arrays.noise import block_diagonal, in_slots
+from arrays.typing import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,9 +22,9 @@ class Whitening:
 
     Attributes
     ----------
-    root : ndarray, shape (..., C, C)
-        ``L⁻¹`` [1/T], block-diagonal by sensor: 1/σ of every channel where the channels' noise is independent. Rows and
-        columns of missing channels are zero; a sensor's other channels keep the covariance that they have without them.
+    roots : ndarray, shape (..., N, 3, 3)
+        ``L⁻¹`` [1/T] of every sensor, lower triangular: 1/σ where the channels' noise is independent. Rows and columns
+        of missing channels are zero; a sensor's other channels keep the covariance that they have without them.
     gain : ndarray, shape (..., C, 3)
         Of every channel in units of the noise: ``L⁻¹`` times the array's [1/T].
     basis : ndarray, shape (..., C, q)
@@ -33,13 +33,27 @@ class Whitening:
         1 where the common field is unknown, less where a prior bounds it.
     n_differences : int
         Number of independent scalars in w.
+    channels : ndarray of int, shape (N, 3)
+        Which the roots' rows are; negative where a scalar sensor has none.
     """
 
-    root: FloatArray
+    roots: FloatArray
     gain: FloatArray
     basis: FloatArray
     shrinkage: FloatArray
     n_differences: int
+    channels: IntArray
+
+    @cached_property
+    def root(self) -> FloatArray:
+        """``L⁻¹`` of all channels (..., C, C)."""
+        return block_diagonal(self.channels, self.roots)
+
+    def of_unit_noise(self, channels: FloatArray) -> FloatArray:
+        """Channels (..., C) [T] of every row in units of the noise, their common field included."""
+        used = self.channels >= 0
+        of_sensors: FloatArray = (self.roots @ in_slots(used, channels)[..., None])[..., 0]
+        return of_sensors[..., used]
 
     def apply(self, channels: FloatArray) -> FloatArray:
         """Whitened channels (..., C) of readings without offset, predictions or columns of a Jacobian [T], of one row.
@@ -61,28 +75,37 @@ def whitening(
     """
     if covariance_T2 is None:
         return _of_constant_noise(array, _mask(array, available).tobytes())
-    return whitenings(array, *_channels(array, available, covariance_T2))
+    mask, covariance = _channels(array, available, covariance_T2)
+    return whitenings(array, mask, _blocks(array, covariance))
 
 
 @lru_cache(maxsize=16)  # readings that come one by one miss the same channels
 def _of_constant_noise(array: SensorArray, available: bytes) -> Whitening:
     """Whitening of the channels of a mask, with the noise that the array states."""
     mask, covariance = _channels(array, np.frombuffer(available, dtype=np.bool_), None)
-    return whitenings(array, mask, covariance)
+    return whitenings(array, mask, _blocks(array, covariance))
 
 
-def whitenings(array: SensorArray, available: BoolArray, covariances_T2: FloatArray) -> Whitening:
-    """:func:`whitening` of covariances (..., C, C) [T²], for rows that have the same readings."""
-    n = array.n_channels
-    root = _inverse_root(array, available, covariances_T2)
-    gain = root @ array.channel_gain
+def _blocks(array: SensorArray, covariance_T2: FloatArray) -> FloatArray:
+    """Blocks (N, 3, 3) of a covariance (C, C) that is block-diagonal by sensor; what a scalar has none of is unity."""
+    channel, used = array.sensor_channels, array.sensor_channels >= 0
+    both = used[:, :, None] & used[:, None, :]
+    return np.where(both, covariance_T2[channel[:, :, None], channel[:, None, :]], np.eye(3))
+
+
+def whitenings(array: SensorArray, available: BoolArray, blocks_T2: FloatArray) -> Whitening:
+    """:func:`whitening` of the sensors' covariances (..., N, 3, 3) [T²], for rows that have the same readings."""
+    n, used = array.n_channels, array.sensor_channels >= 0
+    roots = _inverse_roots(blocks_T2, used & available[array.sensor_channels])
+    of_sensors = in_slots(used, array.channel_gain.T).transpose(1, 2, 0)
+    gain = (roots @ of_sensors)[..., used, :]
     prior = np.inf if array.common_field_T is None else array.common_field_T
-    bases, shrinkages, lost = [np.zeros((*root.shape[:-1], 0))], [np.zeros((*root.shape[:-2], 0))], 0
+    bases, shrinkages, lost = [np.zeros((*gain.shape[:-1], 0))], [np.zeros((*gain.shape[:-2], 0))], 0
     for group in _groups(array, available):
         q, s, _ = np.linalg.svd(_common_field(array, group, gain), full_matrices=False)
         keep = s > s.max(axis=-1, keepdims=True, initial=0.0) * 1e-10
         some = keep.reshape(-1, keep.shape[-1]).any(axis=0)
-        basis = np.zeros((*root.shape[:-2], n, int(some.sum())))
+        basis = np.zeros((*gain.shape[:-2], n, int(some.sum())))
         basis[..., group, :] = q[..., some]
         with np.errstate(invalid="ignore"):  # zero times infinity, for what is not kept
             shrinkage = np.where(keep, 1.0 - 1.0 / np.sqrt(1.0 + (s * prior) ** 2), 0.0)[..., some]
@@ -90,17 +113,24 @@ def whitenings(array: SensorArray, available: BoolArray, covariances_T2: FloatAr
         shrinkages.append(shrinkage)
         lost += basis.shape[-1] if array.common_field_T is None else 0
     basis, shrinkage = np.concatenate(bases, axis=-1), np.concatenate(shrinkages, axis=-1)
-    return Whitening(root, gain, basis, shrinkage, int(available.sum()) - lost)
+    return Whitening(roots, gain, basis, shrinkage, int(available.sum()) - lost, array.sensor_channels)
 
 
-def _inverse_root(array: SensorArray, mask: BoolArray, covariance: FloatArray) -> FloatArray:
-    """``L⁻¹`` of ``covariance = L Lᵀ`` among the channels that have a reading, zero elsewhere: (..., C, C)."""
-    channel = array.sensor_channels
-    present = (channel >= 0) & mask[channel]
-    blocks = covariance[..., channel[:, :, None], channel[:, None, :]]
-    blocks = np.where(present[:, :, None] & present[:, None, :], blocks, np.eye(3))
-    try:
-        inverse = np.linalg.inv(np.linalg.cholesky(blocks))
-    except np.linalg.LinAlgError:
-        raise ValueError("Input covariance_T2 must be positive definite; instead received one that is not.") from None
-    return _block_diagonal(array, inverse, present)
+def _inverse_roots(covariance: FloatArray, present: BoolArray) -> FloatArray:
+    """``L⁻¹`` of the sensors' ``L Lᵀ`` (..., N, 3, 3) among the axes that have a reading, zero elsewhere."""
+    blocks = np.where(present[:, :, None] & present[:, None, :], covariance, np.eye(3))
+    inverse = np.zeros_like(blocks)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        l00 = np.sqrt(blocks[..., 0, 0])
+        l10, l20 = blocks[..., 1, 0] / l00, blocks[..., 2, 0] / l00
+        l11 = np.sqrt(blocks[..., 1, 1] - l10 * l10)
+        l21 = (blocks[..., 2, 1] - l20 * l10) / l11
+        l22 = np.sqrt(blocks[..., 2, 2] - l20 * l20 - l21 * l21)
+        for i, pivot in enumerate((l00, l11, l22)):
+            inverse[..., i, i] = 1.0 / pivot
+        inverse[..., 1, 0] = -l10 * inverse[..., 0, 0] / l11
+        inverse[..., 2, 1] = -l21 * inverse[..., 1, 1] / l22
+        inverse[..., 2, 0] = -(l20 * inverse[..., 0, 0] + l21 * inverse[..., 1, 0]) / l22
+    if not np.isfinite(inverse).all():
+        raise ValueError("Input covariance_T2 must be positive definite; instead received one that is not.")
+    return inverse if present.all() else inverse * (present[:, :, None] & present[:, None, :])

@@ -145,6 +145,13 @@ def inlined(function: Function) -> Function:
     return cast(Function, cached(_njit(forceinline=True, no_cpython_wrapper=True)(function)))
 
 
+def inlined_sum(function: Function) -> Function:
+    """Compile a sum whose terms may be added in any order, which lets vector instructions do it."""
+    return cast(
+        Function, cached(_njit(forceinline=True, no_cpython_wrapper=True, fastmath={"contract", "reassoc"})(function))
+    )
+
+
 def compiled_parallel(function: Function) -> Function:
     """Compile a kernel whose ``prange`` loops run on numba's threads."""
     return cast(Function, cached(_njit(parallel=True)(function)))

@@ -4,8 +4,45 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from arrays.typing import FloatArray
-from magloc.compilation import compiled
+from magloc.compilation import compiled, inlined_sum
+
+# Products of a matrix with fewer columns take longer to be handed to BLAS than to be computed.
+_SMALL = 400
+
+
+@inlined_sum
+def dot(a: FloatArray, b: FloatArray) -> float:
+    """Product of two vectors."""
+    t = 0.0
+    for c in range(a.size):
+        t += a[c] * b[c]
+    return t
+
+
+@compiled
+def multiply_transposed(a: FloatArray, b: FloatArray, product: FloatArray) -> None:
+    """Products (n, m) of rows a (n, c) and b (m, c)."""
+    if product.size > _SMALL:
+        np.dot(a, b.T, product)
+        return
+    for i in range(len(a)):
+        for j in range(len(b)):
+            product[i, j] = dot(a[i], b[j])
+
+
+@compiled
+def subtract_product(rows: FloatArray, factors: FloatArray, others: FloatArray) -> None:
+    """Subtract factors (n, m) times other rows (m, c) from rows (n, c) in place."""
+    if factors.size > _SMALL:
+        rows -= np.dot(factors, others)
+        return
+    for i in range(len(rows)):
+        for j in range(len(others)):
+            for c in range(rows.shape[1]):
+                rows[i, c] -= factors[i, j] * others[j, c]
 
 
 @compiled
@@ -17,16 +54,11 @@ def orthonormalise(rows: FloatArray, triangle: FloatArray) -> None:
             triangle[k, j] = 0.0
         for _ in range(2):
             for k in range(j):
-                t = 0.0
-                for c in range(n):
-                    t += rows[k, c] * rows[j, c]
+                t = dot(rows[k], rows[j])
                 triangle[k, j] += t
                 for c in range(n):
                     rows[j, c] -= t * rows[k, c]
-        t = 0.0
-        for c in range(n):
-            t += rows[j, c] * rows[j, c]
-        norm = math.sqrt(t)
+        norm = math.sqrt(dot(rows[j], rows[j]))
         triangle[j, j] = norm
         inverse = 1.0 / norm if norm > 0.0 else 0.0
         for c in range(n):

@@ -133,8 +133,6 @@ class DipoleFilter:
         )
         chosen = chosen_candidates(self._bases, whitened, self._candidates, _N_STARTS, _APART_RAD)
         found = Ends.empty(n, _N_STARTS)
-        signal, in_lanes = signals(problem, whitened), problem.lanes
-        over_rows(
-            search_rows, n, signal, np.arange(n), self._candidates[chosen], np.inf, _MOST_ITERATIONS, in_lanes, found
-        )  # fmt: skip
+        signal, starts = signals(problem, whitened), self._candidates[chosen]
+        over_rows(search_rows, n, signal, np.arange(n), starts, np.inf, _MOST_ITERATIONS, problem.lanes, None, found)
         return self.energy(whitened) - np.where(found.counts[:, 0] > 0, found.chi2[:, 0], np.inf)

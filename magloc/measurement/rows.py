@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from arrays.array import SensorArray
-from arrays.noise import reading_covariance
+from arrays.noise import covariance_blocks
 from arrays.typing import BoolArray, FloatArray, IntArray
 from arrays.whitening import Whitening, whitening, whitenings
 from magloc.measurement.known_moment import KnownMoment
@@ -131,7 +131,7 @@ def whitenings_of(array: SensorArray, mask: NDArray[np.bool_], readings_T: Float
     """Whitening of rows of readings (..., C) with the channels of a mask: that of all where the noise is constant."""
     if not array.noise_depends_on_reading:
         return whitening(array, mask)
-    return whitenings(array, mask, reading_covariance(array, readings_T))
+    return whitenings(array, mask, covariance_blocks(array, readings_T))
 
 
 def ambient_fields(array: SensorArray, n_rows: int, ambient_T: FloatArray | None) -> FloatArray:
@@ -167,14 +167,12 @@ def whitened_model(
     :meth:`WhitenedModel.whitened` frees these from the common field. The whitening is that of every row or of all, and
     `ambient_T` (n, 3) stands in place of the array's ambient field.
     """
-    root = whitening.root
-    if len(readings_T) == 1 and ambient_T is None and root.ndim == 2:
+    if len(readings_T) == 1 and ambient_T is None and whitening.roots.ndim == 3:
         model = _model_of_one_row(array, whitening)
     else:
         model = WhitenedModel.of(array, whitening, ambient_fields(array, len(readings_T), ambient_T))
     channels = channels_above_ambient(array, mask, readings_T, model.ambient)
-    raw = channels @ root.T if root.ndim == 2 else (root @ channels[..., None])[..., 0]
-    return model, raw
+    return model, whitening.of_unit_noise(channels)
 
 
 @lru_cache(maxsize=16)  # readings that come one by one have one model, and what kernels take of it

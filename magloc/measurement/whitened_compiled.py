@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from arrays.typing import FloatArray
 from magloc.compilation import compiled, internal, own
-from magloc.linalg_compiled import orthonormalise
+from magloc.linalg_compiled import dot, orthonormalise
 
 if TYPE_CHECKING:
     from magloc.measurement.whitened import ScaledSensors, WhitenedModel
@@ -128,10 +128,7 @@ def project_common(rows: FloatArray, n_rows: int, row: ModelRow) -> None:
     common, shrinkage = row.common, row.shrinkage
     for j in range(n_rows):
         for k in range(shrinkage.size):
-            t = 0.0
-            for c in range(rows.shape[1]):
-                t += common[k, c] * rows[j, c]
-            t *= shrinkage[k]
+            t = shrinkage[k] * dot(common[k], rows[j])
             for c in range(rows.shape[1]):
                 rows[j, c] -= t * common[k, c]
 

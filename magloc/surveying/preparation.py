@@ -23,6 +23,7 @@ FEWEST_ROWS = 20
 _WILD, _NEIGHBOURS = 15.0, 20  # over the medians of all rows and of so many on either side
 _MOST_APART = 2.0  # ratio of the fields at two places a day trip apart: more is another unit
 _MOST_WILD = 0.25  # of all readings: more are not
+_FASTEST_M_S = 300.0
 _LONGEST_RUN = 25  # of the same reading, over what the liveliest sensor repeats
 
 
@@ -59,6 +60,7 @@ def whole_rows(array: SensorArray, readings: Readings, base: Readings | None = N
     readings = replace(readings, values_T=readings.values_T[:, np.isin(owner, kept)])[whole]
     if not (np.diff(readings.time_s) > 0.0).all():
         raise ValueError("Input readings must be in order of time; instead received others.")
+    readings = readings[~leaping_rows(readings)]
     array = replace(array, sensors=tuple(array.sensors[i] for i in kept))
     array = with_stated_pose(array, readings)
     array = replace(array, pose=UNSTATED) if array.pose is None else array
@@ -96,6 +98,24 @@ def wild_readings(values: FloatArray) -> BoolArray:
         if not more.any() or (wild | more).mean() > _MOST_WILD:
             return np.asarray(wild & ~np.isnan(values))
         wild |= more
+
+
+def leaping_rows(readings: Readings) -> BoolArray:
+    """Rows (n,) whose place is far from that of the row before and of the one after."""
+    assert readings.array_position_m is not None
+    way, time_s = np.linalg.norm(np.diff(readings.array_position_m, axis=0), axis=1), readings.time_s
+    leaps = way > _FASTEST_M_S * np.diff(time_s)
+    wild = np.concatenate([[False], leaps[1:] & leaps[:-1], [False]])
+    if wild.any():
+        _LOG.warning(f"{wild.sum()} places leap and come back: their rows are left out")
+    left = np.flatnonzero(leaps & ~wild[1:] & ~wild[:-1])
+    if left.size:
+        k = int(left[0])
+        raise ValueError(
+            f"Input readings must have all poses in one frame; instead received rows at {time_s[k]:.15g} and"
+            f" {time_s[k + 1]:.15g} s that are {way[k]:.4g} m apart."
+        )
+    return np.asarray(wild)
 
 
 def record_of(array: SensorArray, readings: Readings) -> tuple[SurveyRecord, PoseErrors]:

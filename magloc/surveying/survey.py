@@ -141,15 +141,19 @@ def survey(
     every = range(len(tiled.tiles))
     at_once = min(get_num_threads() if processes is None else processes, len(every))
     with workers(at_once, scheduler, folder) as each:
-        tiled, lag = tiled.searched(strongest_in, every, each, tell).on_time()
+        due: Sequence[int] = every
+        for _ in range(_MOST_SWEEPS):  # what is strong beside a tile is in the way of all else, until it is told
+            tiled = tiled.searched(strongest_in, due, each, tell)
+            due = tiled.changed()
+            if not due:
+                break
+        tiled, lag = tiled.on_time()
         if lag.s:
             _LOG.warning(
                 f"the readings are {lag.s:.3f} ± {lag.sigma_s:.3f} s later than their poses, as the targets show: taken"
                 " into account"
             )
-        if len(every) > 1:  # what is strong beside a tile is looked for in it, in vain, until it is told
-            tiled = tiled.searched(strongest_in, every, each, tell)
-        due: Sequence[int] = every
+        due = every
         for _ in range(_MOST_SWEEPS):
             tiled = tiled.searched(sources_in, due, each, tell)
             due = tiled.changed()

@@ -11,8 +11,8 @@ from scipy.special import chdtri
 
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.fields.multipole import multipole_field_matrix
-from magloc.surveying.fit.joint_fit import Background, JointFit, jacobian_of, with_free_sources
-from magloc.surveying.rounds import Model
+from magloc.surveying.fit.joint_fit import Background, JointFit, jacobian_of, residual_of, with_free_sources
+from magloc.surveying.rounds import WHILE_SEARCHING, Groups, Model
 from magloc.surveying.search import WINDOW, groups_near, normal_equations
 
 OF_TARGETS = ("position_m", "moment_Am2", "covariance", "depth_interval95_m", "significance", "flags")
@@ -46,11 +46,11 @@ def profile_of(model: Model, fit: JointFit, background: Background, which: int, 
     near = np.linalg.norm(others.position_m[:, :2] - position[:2], axis=1) < reach
     Q = with_free_sources(record, background, others.some(near))
     # What the source explains itself is put back, to first order: it is weak.
-    own_field = source.fields(record)
+    own_field, fields = source.fields(record), fit.sources.fields(record)
     own = jacobian_of(record, background, source, own_field)[:, 3:] @ source.moment_Am2[0]
-    left = fit.residual + own
+    left = residual_of(record, background, fields) + own
     left = left - Q @ (Q.T @ left)
-    directions = record.directions(fit.sources.fields(record))
+    directions = record.directions(fields)
     depth = ground_m - position[2]
     lowest = ground_m - model.bounds.high_m[2]
     depths = np.geomspace(max(lowest, depth / _SPAN), min(ground_m - model.bounds.low_m[2], depth * _SPAN), _N_DEPTHS)
@@ -89,17 +89,23 @@ def second_source_chi2(
     Two dipoles near each other are one at their middle with these, to third order of the gap. Q projects everything
     else out, the source's own place too, so that 9 degrees of freedom are left of their 12.
     """
-    record = model.record
-    fields = np.concatenate([multipole_field_matrix(record.sensors_m, position, order) for order in (2, 3)], axis=-1)
-    A = background.white(np.einsum("nci,ncij->ncj", directions, fields[:, record.array.channel_sensor]))
+    record, white = model.record, background.white
+    near = groups_near(record, white, position[None], WINDOW * (record.height_m - position[2]))
+    rows, of = np.flatnonzero(np.isin(white.group, near)), white.entries(near)
+    fields = np.concatenate(
+        [multipole_field_matrix(record.sensors_m[rows], position, order) for order in (2, 3)], axis=-1
+    )
+    seen = np.einsum("nci,ncij->ncj", directions[rows], fields[:, record.array.channel_sensor])
+    A = white.of_some(seen, near)
     A = A / np.linalg.norm(A, axis=0)
+    lost = Q[of].T @ A
     # 1 - QQᵀ is a weight, no projector: it stands once in the information, and ``left`` has it already.
-    size, axes = np.linalg.eigh(A.T @ (A - Q @ (Q.T @ A)))
-    return float(np.sum((axes.T @ (A.T @ left))[-_N_SECOND:] ** 2 / size[-_N_SECOND:]))
+    size, axes = np.linalg.eigh(A.T @ A - lost.T @ lost)
+    return float(np.sum((axes.T @ (A.T @ left[of]))[-_N_SECOND:] ** 2 / size[-_N_SECOND:]))
 
 
 def targets_of(
-    model: Model, fit: JointFit, background: Background, ground_m: float, which: BoolArray
+    model: Model, fit: JointFit, background: Background, groups: Groups, ground_m: float, which: BoolArray
 ) -> dict[str, NDArray[Any]]:
     """Of some sources (K,) of a fit: the parts of targets, an entry for each."""
     sources, K = fit.sources, len(fit.sources)
@@ -109,7 +115,8 @@ def targets_of(
     interval = np.column_stack([np.maximum(0.0, depth - 1.96 * sigma), depth + 1.96 * sigma])
     weak = significance < _WEAK
     for j in np.flatnonzero(weak & which):
-        interval[j], scatter = profile_of(model, fit, background, int(j), ground_m)
+        coarse = model.background(sources, groups(WHILE_SEARCHING * (model.record.height_m - sources.position_m[j, 2])))
+        interval[j], scatter = profile_of(model, fit, coarse, int(j), ground_m)
         covariance[j] = _scattered(covariance[j], scatter)
     apart = np.linalg.norm(sources.position_m[:, None] - sources.position_m, axis=-1) + np.diag(np.full(K, np.inf))
     rim = np.minimum(sources.position_m - model.bounds.low_m, model.bounds.high_m - sources.position_m)

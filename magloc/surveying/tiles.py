@@ -9,7 +9,7 @@ import numpy as np
 
 from arrays.typing import BoolArray, FloatArray, IntArray
 
-_CORE, _MARGIN = 6.0, 2.0  # over the distance from the sensors to the deepest sources
+_CORE, _MARGIN = 4.0, 1.2  # over the distance from the sensors to the deepest sources
 SEAM_M = 1.2  # more than a source may stand beside the rows
 
 
@@ -24,12 +24,15 @@ class Tile:
     rows : ndarray of int
     own : ndarray of bool
         Which of them are in the rectangle, not in the margin.
+    colour : int
+        0 to 3; no two that touch have the same.
     """
 
     low_m: FloatArray
     high_m: FloatArray
     rows: IntArray
     own: BoolArray
+    colour: int = 0
 
     def extent_m(self, places_m: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Ends of the rectangle, where it is open those of places (n, 2) in it."""
@@ -40,6 +43,10 @@ class Tile:
         """How far within the rectangle positions (K, 3) are, negative beside it."""
         xy = position_m[:, :2]
         return np.asarray(np.minimum(xy - self.low_m, self.high_m - xy).min(axis=1, initial=np.inf))
+
+    def holds(self, position_m: FloatArray) -> BoolArray:
+        """Which positions (K, 3) are within, or hardly beside it."""
+        return self.inside_m(position_m) > -SEAM_M
 
 
 def tiles_of(places_m: FloatArray, reach_m: float) -> tuple[list[Tile], float]:
@@ -59,7 +66,8 @@ def tiles_of(places_m: FloatArray, reach_m: float) -> tuple[list[Tile], float]:
         rows = np.sort(strip[(y >= start[1] - margin) & (y <= end[1] + margin)])
         open_low = np.where(own_cell == 0, -np.inf, start)
         open_high = np.where(own_cell == number - 1, np.inf, end)
-        tiles.append(Tile(open_low, open_high, rows, np.all(cell[rows] == own_cell, axis=1)))
+        colour = int(own_cell[0] % 2 + 2 * (own_cell[1] % 2))
+        tiles.append(Tile(open_low, open_high, rows, np.all(cell[rows] == own_cell, axis=1), colour))
     return tiles, margin
 
 

@@ -30,6 +30,8 @@ _RIVAL_WITHIN = 9.0
 _WINDOW_ROWS = 64
 _STACKED_ROWS = 16
 _TRY_EVERY = 4
+# Of the error that a start may have, as all rows so far tell it: with more of it none is tried.
+_MOST_HOPEFUL = 1.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,12 +67,15 @@ class Acquisition:
         self._n_rows = 0
         self._proposed: Solution | None = None
 
-    def start(self, row: Row) -> Start | None:
-        """A start with one more row, where the array moves enough for it, and the source is as good as at rest."""
+    def start(self, row: Row, position_error: float = 0.0) -> Start | None:
+        """A start with one more row, where the array moves enough for it, and the source is as good as at rest.
+
+        `position_error`: standard deviation of the position over the range, as far as it is known otherwise.
+        """
         self._recent.append(row)
         self._n_rows += 1
         recent = list(self._recent)
-        if self._n_rows % _TRY_EVERY or len(recent) < 2:
+        if self._n_rows % _TRY_EVERY or len(recent) < 2 or position_error > _MOST_HOPEFUL * STACKED_POSITION_ERROR:
             return None
         if np.ptp([earlier.origin_m for earlier in recent], axis=0).max() <= self.array.circumradius:
             return None

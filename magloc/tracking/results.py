@@ -21,7 +21,7 @@ from magloc.readings import Readings, without_saturated
 from magloc.tracking.chart.mixture import Mixture
 
 UNDETERMINED = "undetermined"
-"""Status of a row before a track that shows a source and does not determine it: what it says alone."""
+"""Status of a row before a track that shows a source and does not determine it: what is known by the rows so far."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,8 +107,8 @@ class TrackPoint:
         Normalised innovation squared, and `nis_dof` its degrees of freedom. NaN for rows that the track started from.
     status : str
         "tracked", "acquired" (a new track started here), "predicted" (no readings), "outlier" (readings that contradict
-        the track, not used), "undetermined" (no track yet: what this row of few readings says alone), or why there is
-        no track.
+        the track, not used), "undetermined" (no track yet: what rows of few readings say together so far), or why
+        there is no track.
     weight : float
         How likely the place is the right one of all that explain the readings so far. NaN without a track.
     rivals : tuple of Solution

@@ -33,6 +33,7 @@ from magloc.tracking.posterior_bound import posterior_bound, smoothing_bound
 from magloc.tracking.results import Row, TrackPoint, rows_of, stacked
 from magloc.tracking.tracker import Tracker
 from magloc.tracking.whole_records.background import track_on_background
+from magloc.tracking.whole_records.body_errors import body_factor
 from magloc.tracking.whole_records.constants import constants_test
 from magloc.tracking.whole_records.smoother import smoothed
 from magloc.truth import Truth, truth_of_rows
@@ -211,7 +212,13 @@ class Track(TrackColumns):
         if self.readings.motion is not None:  # whose steps the test does not have
             return test
         exact = constants_test(self.tracker, self._rows, self.points)
-        return replace(test, z_constants=exact.mounting, z_ambient=exact.field, ambient_factor=exact.field_factor)
+        return replace(
+            test,
+            z_constants=exact.mounting,
+            z_ambient=exact.field,
+            ambient_factor=exact.field_factor,
+            body_factor=body_factor(self.tracker, self._rows, self.points),
+        )
 
     def table(self) -> str:
         """The table that ``magloc track`` prints, and what is wrong with the track."""

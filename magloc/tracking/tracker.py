@@ -39,6 +39,7 @@ from magloc.tracking.chart.mixture import Mixture
 from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.chart.start import NO_DIPOLE, prior_root
 from magloc.tracking.chart.steps import LARGEST_WIDTH, ChartFilter, Known, RowUpdate, cartesian, charted, width_of
+from magloc.tracking.chart.undetermined import Undetermined
 from magloc.tracking.measurement import RowMeasurement, RowMeasurements
 from magloc.tracking.motion import N_SOURCE, MotionModel
 from magloc.tracking.results import UNDETERMINED, Innovation, Prediction, Row, Step, TrackPoint, moving, next_row
@@ -119,6 +120,7 @@ class Tracker:
         self.steps: list[Step] = []
         self._acquisition = Acquisition(array)
         self.filter = ChartFilter(array, self.errors, self.pose_errors, prior)
+        self._undetermined = Undetermined(self.filter)
         self._known: Known | None = None
         self._time_s = math.nan
         self._n_rows = 0
@@ -334,6 +336,8 @@ class Tracker:
         if before.young:
             young = (*before.young, (seen, self.motion))
             known = self.filter.refitted(replace(known, young=young, nis=before.nis + update.nis))
+        if width_of(known.mixture) > LARGEST_WIDTH and self.filter.is_detected(seen):
+            return self._started(row, index, predicted.matched())
         return out, self._kept(
             seen.row,
             index,
@@ -392,11 +396,13 @@ class Tracker:
 
     def _acquired(self, seen: ChartRow, index: int) -> TrackPoint:
         """A new track from several rows of which one alone does not determine the source; else what this one says."""
-        start = self._acquisition.start(seen.row)
+        mixture, reason = self._undetermined.after(seen, self.motion)
+        start = self._acquisition.start(seen.row, self._undetermined.position_error)
         known = None if start is None else self._found(start, seen)
         if start is None or known is None:
-            return self._undetermined(seen)
+            return self._of_rows(mixture, reason, seen)
         self._acquisition.forget()
+        self._undetermined.forget()
         solution = start.solution
         point = self._kept(seen.row, index, known, None, status="acquired", iterations=solution.iterations)
         return replace(point, weight=solution.weight, rivals=start.rivals)
@@ -413,9 +419,8 @@ class Tracker:
             return None
         return Known(charted(found.x, found.S, seen), self.known_before(seen, found.x))
 
-    def _undetermined(self, seen: ChartRow) -> TrackPoint:
-        """What a row says alone that shows a source and does not determine it."""
-        mixture, reason = self.filter.of_row(seen, self.motion)
+    def _of_rows(self, mixture: Mixture | None, reason: str, seen: ChartRow) -> TrackPoint:
+        """What rows say that show a source, of which one alone does not determine it."""
         if mixture is None:
             return self._lost(seen.row, reason)
         heaviest = mixture.x[np.argmax(mixture.log_weight)]

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from arrays.array import SensorArray
 from arrays.differences import contrasts, decorrelated_differences, eigen_decorrelation, helmert_decorrelation
 from arrays.geometries import tetrahedron
-from arrays.noise import calibration_errors, proportional_noise, reading_covariance, reading_errors
+from arrays.noise import calibration_errors, covariance_blocks, proportional_noise, reading_covariance, reading_errors
 from arrays.sensor import Calibration, Sensor
 from arrays.whitening import whitening, whitenings
 
@@ -258,12 +258,14 @@ class TestLikelihoodDoesNotDependOnItsForm:
         )
         rng = np.random.default_rng(seed)
         available = rng.random(array.n_channels) > 0.3
-        covariances = reading_covariance(array, array.readings_of(5e-5 * rng.normal(size=(4, 6, 3))))
-        together = whitenings(array, available, covariances)
-        for i, covariance in enumerate(covariances):
+        readings = array.readings_of(5e-5 * rng.normal(size=(4, 6, 3)))
+        together = whitenings(array, available, covariance_blocks(array, readings))
+        for i, covariance in enumerate(reading_covariance(array, readings)):
             alone = whitening(array, available, covariance_T2=covariance)
             channels = 1e-8 * rng.normal(size=array.n_channels)
-            of_row = replace(together, root=together.root[i], basis=together.basis[i], shrinkage=together.shrinkage[i])
+            of_row = replace(
+                together, roots=together.roots[i], basis=together.basis[i], shrinkage=together.shrinkage[i]
+            )
             assert_allclose(of_row.apply(channels), alone.apply(channels), atol=1e-9)
             assert_array_equal(of_row.root, alone.root)
             assert together.n_differences == alone.n_differences

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from arrays.typing import FloatArray
 from magloc.compilation import over_rows, own
 from magloc.fields.dipole import MU0_OVER_4PI
-from magloc.localization.fit.joint_compiled import LARGEST_DAMPING, LARGEST_STEP_RAD, JointEnds, refine_rows
+from magloc.localization.fit.joint_compiled import LARGEST_DAMPING, LARGEST_STEP_RAD, JointEnds, JointRules, refine_rows
 from magloc.localization.fit.moduli_compiled import refined_by_moduli
 from magloc.localization.fit.variable_projection_compiled import refined
 from magloc.measurement.whitened import WhitenedModel
@@ -186,13 +186,15 @@ def refine(
     free: NDArray[np.bool_] | None = None,
     max_iterations: int = 60,
     promise: float = PROMISE_ABSOLUTE,
+    too_high: FloatArray | None = None,
 ) -> JointFits:
     """Positions and moments from starts (b, K, 4) and (b, K, 3): damped Gauss-Newton that never raises χ².
 
     y (b, C) are whitened readings, `free` (K, 3) says which :func:`tangents` of a source may change: without the third
     its range stays. It has converged where the linearised model promises to lower χ² by less than `promise`, of one
     free source by less than that of :func:`refined`. Where the sources' moments are free compiled twins do it: of
-    vector sensors, which begin with the moments that fit best, and of one source by any sensors.
+    vector sensors, which begin with the moments that fit best, and of one source by any sensors. Several sources by
+    vector sensors are given up where they will not come below a χ² (b,) that is too high.
     """
     free = np.ones((q.shape[1], 3), dtype=bool) if free is None else free
     linear = problem.known is None and not problem.channel_is_scalar.any()
@@ -206,8 +208,9 @@ def refine(
         return JointFits(found.q[:, None], found.mu[:, None], chi2, found.iterations)
     if linear and free.any():
         ends = JointEnds(own(q), own(mu), np.empty(len(q)), np.empty(len(q), dtype=np.int64))
-        small = (promise, PROMISE_RELATIVE)
-        over_rows(refine_rows, len(q), own(y), free.astype(np.float64), problem.of_kernels, small, max_iterations, ends)
+        limit = np.full(len(q), np.inf) if too_high is None else too_high
+        rules = JointRules(promise, PROMISE_RELATIVE, max_iterations, limit)
+        over_rows(refine_rows, len(q), own(y), free.astype(np.float64), problem.of_kernels, rules, ends)
         return JointFits(*ends)
     return damped_gauss_newton(problem, y, q, mu, free, max_iterations, promise)
 
@@ -331,19 +334,24 @@ def _moved(
 
 def covariances(problem: WhitenedModel, fits: JointFits) -> FloatArray:
     """Inverse information of (p₁, m₁, p₂, m₂, …) of every fit: (b, 6 K, 6 K) [m, A·m²], NaN where it is singular."""
-    n_fits, n_sources = fits.q.shape[:2]
-    if not n_fits:
+    n_sources = fits.n_sources
+    if not len(fits.q):
         return np.empty((0, 6 * n_sources, 6 * n_sources))
-    s = fits.q[..., 3:]
-    rho = np.concatenate([fits.q[..., :3] / s, np.ones_like(s)], axis=-1)
-    mu = fits.mu / np.abs(s) ** 3
+    unit = np.tile(np.repeat([problem.radius, problem.radius**3 / MU0_OVER_4PI], 3), n_sources)
+    return inverse_information(scaled_jacobian(problem, fits.q, fits.mu)) * np.outer(unit, unit)
+
+
+def scaled_jacobian(problem: WhitenedModel, q: FloatArray, mu: FloatArray) -> FloatArray:
+    """Derivative of what is measured and known by (p₁, m₁, …): (b, C + K k, 6 K), in radii and tesla of a moment."""
+    n_fits, n_sources = q.shape[:2]
+    s = q[..., 3:]
+    rho = np.concatenate([q[..., :3] / s, np.ones_like(s)], axis=-1)
+    mu = mu / np.abs(s) ** 3
     gain = problem.linear_gain(problem.source_fields(rho, mu))
     along = np.broadcast_to(np.eye(4)[:, :3], (n_fits, n_sources, 4, 3))
     by_position = _by_position(problem, rho, mu, gain, along).reshape(n_fits, -1, n_sources, 3)
     by_moment = _by_moment(problem, rho, mu, gain).reshape(n_fits, -1, n_sources, 3)
-    jacobian = np.concatenate([by_position, by_moment], axis=-1).reshape(n_fits, -1, 6 * n_sources)
-    unit = np.tile(np.repeat([problem.radius, problem.radius**3 / MU0_OVER_4PI], 3), n_sources)
-    return inverse_information(jacobian) * np.outer(unit, unit)
+    return np.concatenate([by_position, by_moment], axis=-1).reshape(n_fits, -1, 6 * n_sources)
 
 
 def inverse_information(jacobian: FloatArray, least_singular: float = 1e-13) -> FloatArray:

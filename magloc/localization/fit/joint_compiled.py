@@ -13,7 +13,17 @@ from numpy.typing import NDArray
 
 from arrays.typing import FloatArray
 from magloc.compilation import compiled
-from magloc.linalg_compiled import cholesky, fill_frame, put_rows, solve_cholesky
+from magloc.linalg_compiled import (
+    cholesky,
+    dot,
+    fill_frame,
+    multiply_transposed,
+    put,
+    put_rows,
+    solve_cholesky,
+    subtract_product,
+)
+from magloc.localization.fit.variable_projection_compiled import MOST_GAINED
 from magloc.measurement.whitened_compiled import (
     SMALLEST_S,
     ModelRow,
@@ -37,6 +47,18 @@ class JointEnds(NamedTuple):
     iterations: NDArray[np.int64]
 
 
+class JointRules(NamedTuple):
+    """How refinements end: where the linearised model promises to lower χ² by less than absolute and relative parts.
+
+    Or after most iterations, or where they will not come below a χ² (n,) that is too high.
+    """
+
+    promise: float
+    of_chi2: float
+    max_iterations: int
+    too_high: FloatArray
+
+
 class _Workspace(NamedTuple):
     """Of K sources and C channels: columns as rows, of unit norm in `basis`; see :func:`_fit_moments` and on."""
 
@@ -44,7 +66,8 @@ class _Workspace(NamedTuple):
     norm: FloatArray  # (3 K,) of these before
     root: FloatArray  # (3 K, 3 K) of their Gram matrix
     mu: FloatArray  # (3 K, 1)
-    residual: FloatArray  # (C, 1)
+    residual: FloatArray  # (C,)
+    common: FloatArray  # (3 K, c) of the rows along the common field
     more: FloatArray  # (3 K, 1)
     jacobian: FloatArray  # (3 K, C) along the tangents, free of the basis
     along: FloatArray  # (3 K, 3 K) of the Jacobian along the basis
@@ -66,40 +89,40 @@ def refine_rows(
     y: FloatArray,
     free: FloatArray,
     rows: ModelRows,
-    promise: tuple[float, float],
-    max_iterations: int,
+    rules: JointRules,
     out: JointEnds,
 ) -> None:
     """Damped Gauss-Newton of fits begin to end, from the q (n, K, 4) of the outputs, on whitened readings y (n, C).
 
-    `free` (K, 3) is 1 where a source may move along a tangent, else 0. It has converged where the linearised model
-    promises to lower χ² by less than an absolute and a relative amount.
+    `free` (K, 3) is 1 where a source may move along a tangent, else 0.
     """
     n, n_sources, n_channels = 3 * out.q.shape[1], out.q.shape[1], y.shape[1]
     w = _Workspace(
-        np.empty((n, n_channels)), np.empty(n), np.empty((n, n)), np.empty((n, 1)), np.empty((n_channels, 1)),
-        np.empty((n, 1)), np.empty((n, n_channels)), np.empty((n, n)), np.empty((n, n)), np.empty((n, 1)),
-        np.empty(n), np.empty((n, n)), np.empty((n, 1)), np.empty((n_sources, 3, 4)), np.empty((4, n_channels)),
-        np.empty((3, 3)), np.empty((n_sources, 4)),
+        np.empty((n, n_channels)), np.empty(n), np.empty((n, n)), np.empty((n, 1)), np.empty(n_channels),
+        np.empty((n, rows.shrinkage.shape[1])), np.empty((n, 1)), np.empty((n, n_channels)), np.empty((n, n)),
+        np.empty((n, n)), np.empty((n, 1)), np.empty(n), np.empty((n, n)), np.empty((n, 1)),
+        np.empty((n_sources, 3, 4)), np.empty((4, n_channels)), np.empty((3, 3)), np.empty((n_sources, 4)),
     )  # fmt: skip
     for i in range(begin, end):
         q, row = out.q[i], row_at(rows, i)
         chi2 = _fit_moments(q, row, y[i], w)
         _keep_moments(w, out.mu[i])
         damping, count, fresh, optimum = 1e-3, 0, True, False
-        for _ in range(max_iterations):
+        for _ in range(rules.max_iterations):
             if not chi2 < math.inf:
                 break
             if fresh:
                 _linearise(q, row, free, w)
                 reachable = _promised(0.0, w)
                 count += 1
+            if chi2 - MOST_GAINED * reachable > rules.too_high[i]:
+                break
             promised = _promised(damping, w)
             share = _move(q, free, w)
             lower = _fit_moments(w.trial, row, y[i], w)
             gained = chi2 - lower
             fresh = gained > 0.0
-            small = abs(reachable) < promise[0] + promise[1] * chi2
+            small = abs(reachable) < rules.promise + rules.of_chi2 * chi2
             ended = small or (not fresh and damping > LARGEST_DAMPING)
             optimum = small or (ended and abs(reachable) < 1e-6 * (1.0 + chi2))
             if fresh:
@@ -123,40 +146,37 @@ def _fit_moments(q: FloatArray, row: ModelRow, y: FloatArray, w: _Workspace) -> 
     """Basis, moments and residual of sources at q (K, 4); χ²."""
     for k in range(len(q)):
         unit_readings(q[k], row, w.basis[3 * k : 3 * k + 3])
-    _project_common(w.basis, row)
+    _project_common(w.basis, row, w.common)
     for j in range(len(w.basis)):
-        column, square = w.basis[j], 0.0
-        for c in range(y.size):
-            square += column[c] * column[c]
+        column = w.basis[j]
+        square = dot(column, column)
         w.norm[j] = math.sqrt(square)
         inverse = 1.0 / w.norm[j] if square > 0.0 else 0.0
         for c in range(y.size):
             column[c] *= inverse
-    np.dot(w.basis, w.basis.T, w.root)
+    multiply_transposed(w.basis, w.basis, w.root)
     cholesky(w.root, _RIDGE)
     w.mu[:] = 0.0
-    w.residual[:, 0] = y
+    put(w.residual, y)
     for _ in range(2):  # once more, for the digits that squares lose
-        np.dot(w.basis, w.residual, w.more)
+        for j in range(len(w.basis)):
+            w.more[j, 0] = dot(w.basis[j], w.residual)
         solve_cholesky(w.root, w.more)
         for j in range(len(w.basis)):
             w.mu[j, 0] += w.more[j, 0]
             for c in range(y.size):
-                w.residual[c, 0] -= w.more[j, 0] * w.basis[j, c]
-    chi2 = 0.0
-    for c in range(y.size):
-        chi2 += w.residual[c, 0] * w.residual[c, 0]
-    return chi2
+                w.residual[c] -= w.more[j, 0] * w.basis[j, c]
+    return dot(w.residual, w.residual)
 
 
 @compiled
-def _project_common(rows: FloatArray, row: ModelRow) -> None:
+def _project_common(rows: FloatArray, row: ModelRow, along: FloatArray) -> None:
     """Remove the common field, which may have many columns, from whitened rows (n, C) in place."""
-    along = np.dot(rows, row.common.T)
+    multiply_transposed(rows, row.common, along)
     for j in range(len(along)):
         for k in range(row.shrinkage.size):
             along[j, k] *= row.shrinkage[k]
-    rows -= np.dot(along, row.common)
+    subtract_product(rows, along, row.common)
 
 
 @compiled
@@ -183,13 +203,16 @@ def _linearise(q: FloatArray, row: ModelRow, free: FloatArray, w: _Workspace) ->
                     + t[2] * w.homogeneous[2, c]
                     + t[3] * w.homogeneous[3, c]
                 )
-    _project_common(w.jacobian, row)
-    np.dot(w.basis, w.jacobian.T, w.along)
+    _project_common(w.jacobian, row, w.common)
+    multiply_transposed(w.basis, w.jacobian, w.along)
     solve_cholesky(w.root, w.along)
-    w.jacobian[:] -= np.dot(w.along.T, w.basis)
-    np.dot(w.jacobian, w.jacobian.T, w.normal)
-    np.dot(w.jacobian, w.residual, w.gradient)
+    for j in range(len(w.along)):
+        for k in range(len(w.along)):
+            w.normal[k, j] = w.along[j, k]
+    subtract_product(w.jacobian, w.normal, w.basis)
+    multiply_transposed(w.jacobian, w.jacobian, w.normal)
     for j in range(len(w.normal)):
+        w.gradient[j, 0] = dot(w.jacobian[j], w.residual)
         w.scale[j] = 1.0 / math.sqrt(w.normal[j, j]) if w.normal[j, j] > 0.0 else 0.0
 
 

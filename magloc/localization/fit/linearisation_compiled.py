@@ -41,7 +41,8 @@ PRODUCT = 56 * LANES  # of the basis's columns (01, 02, 12), then with the signa
 ALONG = 62 * LANES  # of the basis's columns with the Jacobian's (3 × 3)
 ITERATIONS = 71 * LANES
 END = 72 * LANES
-WORKSPACE = 73 * LANES
+TOO_HIGH = 73 * LANES
+WORKSPACE = 74 * LANES
 
 
 @internal

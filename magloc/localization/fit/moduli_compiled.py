@@ -43,7 +43,7 @@ from magloc.localization.fit.linearisation_compiled import (
     project,
     three,
 )
-from magloc.localization.fit.variable_projection_compiled import FAILED, Refined, fill_lanes, judge, step
+from magloc.localization.fit.variable_projection_compiled import FAILED, Refined, Rules, fill_lanes, judge, step
 from magloc.measurement.whitened import WhitenedModel
 from magloc.measurement.whitened_compiled import LaneModel, signals
 
@@ -92,8 +92,7 @@ def refined_by_moduli(
         model.lanes,
         Moduli.of(model),
         free_range,
-        tolerance,
-        float(max_iterations),
+        Rules(tolerance, float(max_iterations), np.full(len(q), math.inf), False),
         out,
     )
     return out
@@ -107,8 +106,7 @@ def refine_by_moduli(
     model: LaneModel,
     moduli: Moduli,
     free_range: float,
-    tolerance: float,
-    max_iterations: float,
+    rules: Rules,
     out: Refined,
 ) -> None:
     """:func:`magloc.localization.fit.variable_projection_compiled.refine` where some sensors read moduli.
@@ -126,7 +124,7 @@ def refine_by_moduli(
     next_start: int = np.int64(0)  # type: ignore[assignment]  # no literal: it would be compiled for itself
     while True:
         next_start, n_running = fill_lanes(
-            next_start, start_of_lane, set_of_lane, signal, reading, starts, model, w, rows, common, out
+            next_start, start_of_lane, set_of_lane, signal, reading, starts, model, w, rows, common, rules, out
         )
         if n_running == 0:
             return
@@ -157,7 +155,7 @@ def refine_by_moduli(
         fill_jacobian(model.sensors, w, rows)
         project(JACOBIAN, rows, common, dots)
         fill_normal(w, rows)
-        judge(w, tolerance, max_iterations)
+        judge(w, rules)
         step(w, free_range)
         for i in range(3 * LANES):
             w[TRIAL + MOMENT + i] = w[MOMENT + i]

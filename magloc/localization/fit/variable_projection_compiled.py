@@ -27,6 +27,7 @@ from magloc.localization.fit.linearisation_compiled import (
     SENSOR_ROWS,
     SIGNAL,
     STATE,
+    TOO_HIGH,
     TRIAL,
     WORKSPACE,
     linearise,
@@ -37,10 +38,25 @@ from magloc.measurement.whitened_compiled import SMALLEST_S, LaneModel, signals
 
 # How a refinement ends.
 RUNNING, CONVERGED, FAILED = 0.0, 1.0, 2.0
+# A start is given up where this many times the Gauss-Newton gain in χ² would leave it too high to count.
+MOST_GAINED = 10.0
 # Gauss-Newton gain in χ² at which an optimum is one: the position is then within 1e-5 σ of it.
 OPTIMUM_TOLERANCE = 1e-10
 # Two ends are one optimum 0.01 rad apart on the sphere of homogeneous coordinates, at the same χ².
 SAME_COS, SAME_CHI2 = 0.99995, 0.01
+
+
+class Rules(NamedTuple):
+    """How refinements end: where a Gauss-Newton step would gain less than the tolerance, or after most iterations.
+
+    They also end, and count as converged, where they will not come below a χ² (n,) above which none is of use. Ahead,
+    what is put out is where the last step leads, unseen, with the χ² that it promises.
+    """
+
+    tolerance: float
+    max_iterations: float
+    too_high: FloatArray
+    ahead: bool
 
 
 class Refined(NamedTuple):
@@ -74,8 +90,7 @@ def refined(
         own(starts),
         model.lanes,
         free_range,
-        tolerance,
-        float(max_iterations),
+        Rules(tolerance, float(max_iterations), np.full(len(starts), math.inf), False),
         out,
     )
     return out
@@ -95,15 +110,13 @@ def refine(
     starts: FloatArray,
     model: LaneModel,
     free_range: float,
-    tolerance: float,
-    max_iterations: float,
+    rules: Rules,
     out: Refined,
 ) -> None:
     """Damped Gauss-Newton on the projected cost from starts q (n, 4) of the signals (rows, sensors, 3) of a row each.
 
     It moves on the sphere of homogeneous coordinates, or, where `free_range` is 0 instead of 1, at one range. Every
-    accepted step decreases χ². It ends where a further Gauss-Newton step would gain less than the tolerance. A lane
-    whose start has ended takes the next one. The iterations are no integer: a literal one would be compiled for itself.
+    accepted step decreases χ². A lane whose start has ended takes the next one.
     """
     n, n_sensors, n_triples = len(starts), len(model.sensors), model.common.shape[1]
     if n == 0:  # idle lanes compute the last start
@@ -115,12 +128,12 @@ def refine(
     next_start: int = np.int64(0)  # type: ignore[assignment]  # no literal: it would be compiled for itself
     while True:
         next_start, n_running = fill_lanes(
-            next_start, start_of_lane, set_of_lane, signal, reading, starts, model, w, rows, common, out
+            next_start, start_of_lane, set_of_lane, signal, reading, starts, model, w, rows, common, rules, out
         )
         if n_running == 0:
             return
         linearise(model.sensors, w, rows, common, dots, free_range)
-        judge(w, tolerance, max_iterations)
+        judge(w, rules)
         step(w, free_range)
 
 
@@ -136,6 +149,7 @@ def fill_lanes(
     w: FloatArray,
     rows: FloatArray,
     common: FloatArray,
+    rules: Rules,
     out: Refined,
 ) -> tuple[int, int]:
     """Put out the starts that have ended, and begin others in their lanes: the start that comes next, how many run."""
@@ -146,11 +160,12 @@ def fill_lanes(
             continue
         k = start_of_lane[i]
         if k >= 0:
+            at = TRIAL if rules.ahead else STATE
             for d in range(4):
-                out.q[k, d] = w[STATE + d * LANES + i]
+                out.q[k, d] = w[at + d * LANES + i]
             for d in range(3):
                 out.mu[k, d] = w[STATE + MOMENT + d * LANES + i]
-            out.chi2[k] = w[CHI2 + i]
+            out.chi2[k] = w[CHI2 + i] - w[PROMISED + i] if rules.ahead else w[CHI2 + i]
             out.iterations[k] = int(w[ITERATIONS + i])
             out.converged[k] = w[END + i] == CONVERGED
         start_of_lane[i] = next_start if next_start < n else -1
@@ -158,6 +173,7 @@ def fill_lanes(
         k = min(next_start, n - 1)  # an idle lane computes something, too
         next_start += 1
         _load(i, starts[k], signal[reading[k]], w, rows)
+        w[TOO_HIGH + i] = rules.too_high[k]
         of_row = model.set_of_row[reading[k]]
         if set_of_lane[i] != of_row:
             set_of_lane[i] = of_row
@@ -226,8 +242,9 @@ def _take(w: FloatArray, at: int, i: int, taken: bool) -> None:
 
 
 @internal
-def judge(w: FloatArray, tolerance: float, max_iterations: float) -> None:
+def judge(w: FloatArray, rules: Rules) -> None:
     """Take the trial state where its χ² is lower, adapt the damping, and see which lanes have ended."""
+    tolerance, max_iterations = rules.tolerance, rules.max_iterations
     for i in range(LANES):
         before, promised, damping = w[CHI2 + i], w[PROMISED + i], w[DAMPING + i]
         gained = before - w[TRIAL + CHI2 + i]
@@ -272,7 +289,8 @@ def judge(w: FloatArray, tolerance: float, max_iterations: float) -> None:
         limit = tolerance + 1e-14 * chi2
         small = 1e-6 * (1.0 + chi2) if stuck else limit
         lost = FAILED if stuck or w[ITERATIONS + i] >= max_iterations else RUNNING
-        end = CONVERGED if decrement < small else lost
+        useless = chi2 - MOST_GAINED * decrement > w[TOO_HIGH + i]
+        end = CONVERGED if decrement < small or useless else lost
         w[END + i] = end if decrement < math.inf and chi2 < math.inf else FAILED
 
 

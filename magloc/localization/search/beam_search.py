@@ -5,6 +5,7 @@ Everything works on b sets of readings of one :class:`magloc.measurement.whitene
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
@@ -12,8 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arrays.typing import FloatArray
+from magloc.compilation import over_rows
 from magloc.directions import hemisphere
 from magloc.localization.fit.gauss_newton import JointFits, fit_moments, refine
+from magloc.localization.fit.moduli_compiled import Moduli
+from magloc.localization.fit.results import DISTINCT_WITHIN
 from magloc.localization.search.candidates import (
     LastBases,
     SingleArray,
@@ -21,11 +25,12 @@ from magloc.localization.search.candidates import (
     distinct_best,
     linear_scores,
     modulus_scores,
-    modulus_templates,
     rows_of_equal_gain,
 )
 from magloc.localization.search.known_moment import starts_of_known_moment
+from magloc.localization.search.single_source_compiled import Ends, search_rows
 from magloc.measurement.whitened import WhitenedModel
+from magloc.measurement.whitened_compiled import signals
 
 Allowed = Callable[[FloatArray, FloatArray], NDArray[np.bool_]]
 _SAME_RAD = 0.02
@@ -38,6 +43,7 @@ _ROWS_OF_TEMPLATES = 64
 _MORE_STARTS = 4
 # A restart draws its new source from this many of the best candidates.
 _RESTART_CANDIDATES = 16
+_MOST_ITERATIONS = 60
 
 
 def best_distinct(fits: JointFits, n_rows: int, width: int) -> JointFits:
@@ -83,6 +89,8 @@ class Search:
         Whether sources (..., 4), (..., 3) agree with what is known.
     width : int
         Fits kept of every set of readings.
+    within : float
+        How far above the best one the χ² of a fit of one source by moduli may be to be of use.
     n_starts : int
         Starts of a restart for every fit that is kept; half as many again for the first source.
     apart_rad : float
@@ -94,6 +102,7 @@ class Search:
     candidates: FloatArray
     allowed: Allowed
     width: int = 3
+    within: float = math.inf
     n_starts: int = 6
     apart_rad: float = 0.25
     bases: LastBases = field(default_factory=LastBases)
@@ -116,11 +125,7 @@ class Search:
         starts: list[tuple[FloatArray, FloatArray]] = []
         if np.any(gain):
             n_starts = 3 * self.n_starts // 2
-            chosen = np.empty((len(y), n_starts), dtype=np.intp)
-            for rows in rows_of_equal_gain(gain):
-                bases = self.bases_of(problem, gain[rows[0]], int(rows[0]))
-                chosen[rows] = chosen_candidates(bases, residual[rows], self.candidates, n_starts, self.apart_rad)
-            q = self.candidates[chosen]
+            q = self.candidates[self._chosen(problem, gain, residual, n_starts, self.apart_rad)]
             row = np.repeat(np.arange(len(y)), n_starts)
             # From none the first step leads to the moments that fit best, but by steps to what is known of them.
             mu = np.zeros((len(y), n_starts, 3))
@@ -136,11 +141,32 @@ class Search:
         if templates:
             starts.append(self._template_starts(problem, y))
         q, mu = (np.concatenate(parts, axis=1) for parts in zip(*starts, strict=True))
-        row = np.repeat(np.arange(len(y)), q.shape[1])
-        fits = refine(problem.rows(row), y[row], q.reshape(-1, 1, 4), mu.reshape(-1, 1, 3))
+        if problem.sees_moduli and problem.known is None:
+            fits = self._ends(problem, y, q, mu)
+        else:
+            row = np.repeat(np.arange(len(y)), q.shape[1])
+            fits = refine(problem.rows(row), y[row], q.reshape(-1, 1, 4), mu.reshape(-1, 1, 3))
         if problem.is_even:
             fits = fits.with_opposite_moments(len(y))
         return best_distinct(self._known(fits), len(y), self.width)
+
+    def _ends(self, problem: WhitenedModel, y: FloatArray, q: FloatArray, mu: FloatArray) -> JointFits:
+        """Distinct fits of one source by moduli, as many as there are starts (b, k, …); the others have no χ²."""
+        found = Ends.empty(*q.shape[:2])
+        over_rows(
+            search_rows,
+            len(y),
+            signals(problem, y - problem.of_ambient),
+            np.arange(len(y)),
+            np.concatenate([q, mu], axis=-1),
+            self.within,
+            _MOST_ITERATIONS,
+            problem.lanes,
+            Moduli.of(problem),
+            found,
+        )
+        chi2 = np.where(np.arange(q.shape[1]) < found.counts[:, :1], found.chi2, np.inf)
+        return JointFits(found.q[:, :, None], found.mu[:, :, None], chi2, found.iterations).shaped(-1)
 
     def _needs_templates(self, problem: WhitenedModel, y: FloatArray) -> NDArray[np.bool_]:
         """Rows (b,) with moduli far from linear: their source's field is not small against the ambient field."""
@@ -156,7 +182,7 @@ class Search:
         scores = np.empty((len(y), len(self.candidates)))
         best = np.empty(scores.shape, dtype=np.intp)
         for rows in rows_of_equal_gain(problem.gain):
-            templates = modulus_templates(problem, int(rows[0]), self.candidates, directions)
+            templates = self.bases.templates(problem, int(rows[0]), self.candidates, directions)
             for some in np.array_split(rows, -(-rows.size // _ROWS_OF_TEMPLATES)):
                 scores[some], best[some] = modulus_scores(templates, y[some])
         n_starts = 3 * self.n_starts
@@ -178,6 +204,23 @@ class Search:
             scores[rows] = linear_scores(bases, residual[rows])
         return scores
 
+    def _chosen(
+        self, problem: WhitenedModel, gain: FloatArray, residual: FloatArray, n_starts: int, apart_rad: float
+    ) -> NDArray[np.intp]:
+        """Distinct candidates (b, n_starts) that explain most of residuals."""
+        chosen = np.empty((len(residual), n_starts), dtype=np.intp)
+        for rows in rows_of_equal_gain(gain):
+            bases = self.bases_of(problem, gain[rows[0]], int(rows[0]))
+            chosen[rows] = chosen_candidates(bases, residual[rows], self.candidates, n_starts, apart_rad)
+        return chosen
+
+    def _chosen_for_left(
+        self, problem: WhitenedModel, y: FloatArray, q: FloatArray, mu: FloatArray, n_starts: int, apart_rad: float
+    ) -> NDArray[np.intp]:
+        """Those that explain most of what the sources (b, K, …) leave."""
+        fields = problem.source_fields(q, mu)
+        return self._chosen(problem, problem.linear_gain(fields), y - problem.predicted(fields), n_starts, apart_rad)
+
     def bases_of(self, problem: WhitenedModel, gain: FloatArray, row: int) -> SingleArray:
         """:func:`linear_bases` of the candidates."""
         return self.bases.of(problem, gain, row, self.candidates)
@@ -187,18 +230,20 @@ class Search:
         allowed = np.all(self.allowed(fits.q, fits.mu), axis=1)
         return replace(fits, chi2=np.where(allowed, fits.chi2, np.inf))
 
-    def one_more(self, problem: WhitenedModel, y: FloatArray, beam: JointFits) -> JointFits:
-        """Beam with another source: every fit is extended by the candidates that explain most of what it leaves."""
+    def one_more(self, problem: WhitenedModel, y: FloatArray, beam: JointFits, credible: float = 0.0) -> JointFits:
+        """Beam with another source: every fit is extended by the candidates that explain most of what it leaves.
+
+        Where the first of them lead to a χ² that is credible, others are given up that will stay far above it.
+        """
         width = beam.chi2.shape[1]
         row = np.repeat(np.arange(len(y)), width)
         q, mu = _filled(beam)
-        scores = self.left_scores(problem.rows(row), y[row], q, mu)
-        chosen = distinct_best(scores, self.candidates, width * _MORE_STARTS, self.apart_rad)
+        chosen = self._chosen_for_left(problem.rows(row), y[row], q, mu, width * _MORE_STARTS, self.apart_rad)
         # The best fit, where it stands in for one that there is not, goes on from the candidates that come next.
         chosen = chosen.reshape(len(y), width, width, _MORE_STARTS)
         turn = np.where(np.isfinite(beam.chi2), 0, np.arange(width))
         chosen = np.take_along_axis(chosen, turn[:, :, None, None], axis=2).reshape(-1, _MORE_STARTS)
-        fits = self._extended(problem, y, np.repeat(row, _MORE_STARTS), q, mu, chosen)
+        fits = self._extended(problem, y, np.repeat(row, _MORE_STARTS), q, mu, chosen, credible)
         return best_distinct(fits, len(y), self.width)
 
     def left_scores(self, problem: WhitenedModel, y: FloatArray, q: FloatArray, mu: FloatArray) -> FloatArray:
@@ -214,6 +259,7 @@ class Search:
         q: FloatArray,
         mu: FloatArray,
         chosen: NDArray[np.intp],
+        credible: float = 0.0,
     ) -> JointFits:
         """Refined fits of sources (f, K, …) and one of the chosen candidates (f, n) each; row is that of every fit."""
         each = np.repeat(np.arange(len(q)), chosen.shape[1])
@@ -227,8 +273,16 @@ class Search:
         normal += (1e-12 * trace + 1e-300)[:, None, None] * np.eye(3)
         new_mu = np.linalg.solve(normal, jacobian.transpose(0, 2, 1) @ residual[..., None])[:, None, :, 0]
         q, mu = np.concatenate([q[each], new], axis=1), np.concatenate([mu[each], new_mu], axis=1)
-        fits = refine(at, y_each, q, mu)
-        return self._known(fits)
+        if not credible:
+            return self._known(refine(at, y_each, q, mu))
+        place = np.arange(len(q)).reshape(len(y), -1)
+        first, others = place[:, :_MORE_STARTS].ravel(), place[:, _MORE_STARTS:].ravel()
+        fits = refine(at.rows(first), y_each[first], q[first], mu[first])
+        lowest = fits.chi2.reshape(len(y), -1).min(axis=1)
+        limit = np.where(lowest <= credible, lowest + DISTINCT_WITHIN, np.inf)
+        too_high = np.repeat(limit, place.shape[1] - _MORE_STARTS)
+        more = refine(at.rows(others), y_each[others], q[others], mu[others], too_high=too_high)
+        return JointFits.none((len(q),), q.shape[1]).replaced(first, fits).replaced(others, more)
 
     def one_less(self, problem: WhitenedModel, y: FloatArray, beam: JointFits) -> JointFits:
         """Beam without one source: every source of the best fit is left out in turn."""
@@ -252,8 +306,8 @@ class Search:
         kept_q = q[rows, which[..., None], order].reshape(-1, n_sources - 1, 4)
         kept_mu = mu[rows, which[..., None], order].reshape(-1, n_sources - 1, 3)
         row = np.repeat(np.arange(n_rows), n_tries)
-        scores = self.left_scores(problem.rows(row), y[row], kept_q, kept_mu)
-        best = distinct_best(scores, self.candidates, _RESTART_CANDIDATES, 0.5 * self.apart_rad)
+        half = 0.5 * self.apart_rad
+        best = self._chosen_for_left(problem.rows(row), y[row], kept_q, kept_mu, _RESTART_CANDIDATES, half)
         chosen = best[np.arange(len(row)), rng.integers(_RESTART_CANDIDATES, size=len(row))][:, None]
         fits = self._extended(problem, y, row, kept_q, kept_mu, chosen)
         return merged(beam, best_distinct(fits, n_rows, self.width))

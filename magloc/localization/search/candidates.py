@@ -9,7 +9,7 @@ scored by the energy along one template.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,7 +26,7 @@ from magloc.measurement.whitened_compiled import ModelRow, candidate_bases
 SingleArray = NDArray[np.float32]
 _SAME_GAIN = 0.02
 _CANDIDATES_AT_ONCE = 512
-_ROWS_AT_ONCE = 128  # whose components stay in the processor's cache
+_ROWS_AT_ONCE = 64  # whose components stay in the processor's cache
 
 
 def linear_bases(problem: WhitenedModel, gain: FloatArray, row: int, candidates: FloatArray) -> SingleArray:
@@ -47,17 +47,31 @@ def linear_bases(problem: WhitenedModel, gain: FloatArray, row: int, candidates:
 
 
 class LastBases:
-    """:func:`linear_bases` of the same candidates, kept as long as the rows are whitened alike."""
+    """:func:`linear_bases` and :func:`modulus_templates` of the same candidates, kept while rows are whitened alike."""
 
     def __init__(self) -> None:
-        self._key, self._bases = b"", np.empty((0, 0), dtype=np.float32)
+        self._kept: dict[str, tuple[bytes, SingleArray]] = {}
 
     def of(self, problem: WhitenedModel, gain: FloatArray, row: int, candidates: FloatArray) -> SingleArray:
-        """Those of one row."""
+        """Bases of one row."""
+        return self._last("bases", problem, gain, row, lambda: linear_bases(problem, gain, row, candidates))
+
+    def templates(
+        self, problem: WhitenedModel, row: int, candidates: FloatArray, directions: FloatArray
+    ) -> SingleArray:
+        """Templates of one row."""
+        gain = problem.gain[row]
+        return self._last(
+            "templates", problem, gain, row, lambda: modulus_templates(problem, row, candidates, directions)
+        )
+
+    def _last(
+        self, what: str, problem: WhitenedModel, gain: FloatArray, row: int, make: Callable[[], SingleArray]
+    ) -> SingleArray:
         key = b"".join(values.tobytes() for values in (gain, problem.basis[row], problem.shrinkage[row]))
-        if key != self._key:
-            self._key, self._bases = key, linear_bases(problem, gain, row, candidates)
-        return self._bases
+        if what not in self._kept or self._kept[what][0] != key:
+            self._kept[what] = key, make()
+        return self._kept[what][1]
 
 
 def linear_scores(bases: SingleArray, residual: FloatArray) -> FloatArray:
@@ -74,12 +88,13 @@ def chosen_candidates(
 ) -> NDArray[np.intp]:
     """:func:`distinct_best` of the :func:`linear_scores` of residuals (b, C), compiled."""
     chosen = np.zeros((len(residual), n_starts), dtype=np.intp)
-    single = candidates.astype(np.float32)
+    single, of_rows = candidates.astype(np.float32), residual.astype(np.float32)
+    # One piece of memory for all: a new one is cleared by the system first, which takes as long as the choice.
+    components = np.empty((min(_ROWS_AT_ONCE, len(residual)), bases.shape[1]), dtype=np.float32)
     for begin in range(0, len(residual), _ROWS_AT_ONCE):
-        some = residual[begin : begin + _ROWS_AT_ONCE]
-        components = (some.astype(np.float32) @ bases).reshape(len(some), 3, -1)
-        of_some = chosen[begin : begin + _ROWS_AT_ONCE]
-        over_rows(choose_rows, len(some), components, single, math.cos(apart_rad), of_some)
+        some = of_rows[begin : begin + _ROWS_AT_ONCE]
+        of_some = np.matmul(some, bases, out=components[: len(some)]).reshape(len(some), 3, -1)
+        over_rows(choose_rows, len(some), of_some, single, math.cos(apart_rad), chosen[begin : begin + _ROWS_AT_ONCE])
     return chosen
 
 

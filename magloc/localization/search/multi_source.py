@@ -126,6 +126,7 @@ class _Levels:
             rows.model.homogeneous(locator._candidates),
             partial(locator.prior.allows, rows.model),
             width=8 if self.most == 1 else 3,
+            within=DISTINCT_WITHIN if self.most == 1 and locator.prior == NOTHING_KNOWN else math.inf,
             bases=locator.bases,
         )
 
@@ -143,11 +144,14 @@ class _Levels:
             if not rows.size:
                 break
             before = beams[-1].rows(rows)
-            wider = self.search.one_more(self.problem.rows(rows), self.y[rows], before)
             last = len(beams) + 1 == self.most
+            credible = self._quantile(len(beams) + 1, CREDIBLE_FIT)
+            ends = last and self.locator.prior == NOTHING_KNOWN
+            wider = self.search.one_more(
+                self.problem.rows(rows), self.y[rows], before, credible=credible if ends else 0.0
+            )
             gained = self._stands_out(before.chi2[:, 0], wider.chi2[:, 0])
             # Where no number of sources is credible so far, the search failed, at this number or at an earlier one.
-            credible = self._quantile(wider.n_sources, CREDIBLE_FIT)
             failed = np.flatnonzero(~(wider.chi2[:, 0] <= credible) & (last | ~gained))
             if failed.size:
                 wider = wider.replaced(failed, self._restarted(rows[failed], wider.rows(failed)))

@@ -181,6 +181,7 @@ class SingleSourceSearch:
             keep_within,
             self.max_iterations,
             rows.model.lanes,
+            None,
             found,
         )
         return found

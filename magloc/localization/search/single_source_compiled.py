@@ -15,14 +15,24 @@ from numpy.typing import NDArray
 from arrays.typing import FloatArray, IntArray
 from magloc.compilation import compiled, inlined, internal
 from magloc.linalg_compiled import put
-from magloc.localization.fit.linearisation_compiled import LANES
-from magloc.localization.fit.variable_projection_compiled import OPTIMUM_TOLERANCE, Refined, refine, same_optimum
+from magloc.localization.fit.moduli_compiled import Moduli, refine_by_moduli
+from magloc.localization.fit.variable_projection_compiled import (
+    OPTIMUM_TOLERANCE,
+    Refined,
+    Rules,
+    refine,
+    same_optimum,
+)
 from magloc.measurement.whitened_compiled import LaneModel
 
 # Gauss-Newton gain in χ² at which a start is so near an optimum that others are known to lead to the same.
 _NEAR_TOLERANCE = 1e-2
 # Times the linearisations that one of these may take from there on: along a flat valley steps hardly get shorter.
 _LONGER = 3.0
+# Starts of a row that say how high χ² may be where the others lead.
+_FIRST_STARTS = 3
+# Candidates of which the best one is known.
+_BLOCK = 64
 
 
 class Ends(NamedTuple):
@@ -61,57 +71,52 @@ def choose_rows(
 ) -> None:
     """Candidates (n, 4) that explain most of rows begin to end, some angle apart; the best again if none is left.
 
-    Components (rows, 3, n) are those of the readings along the candidates' bases. Candidates are lanes, four of a lane
-    are compared before the best so far is: a processor waits for that from one comparison to the next.
+    Components (rows, 3, n) are those of the readings along the candidates' bases. Candidates are taken one by one, the
+    best first, and left where they are near one that is chosen already. A key has the score, whose bits as an integer
+    are in order, and behind it how many candidates follow: the largest key of a block is the first of its best ones.
     """
-    n, apart = len(candidates), np.float32(cos_apart)
-    n_fours = -(-n // (4 * LANES))
-    fours = np.zeros((n_fours, 4, 4 * LANES), np.float32)
-    for j in range(n):
-        for d in range(4):
-            fours[j // (4 * LANES), d, j % (4 * LANES)] = candidates[j, d]
-    q = fours.reshape(n_fours, 16 * LANES)
-    score = np.full(n_fours * 4 * LANES, np.float32(-1.0))
-    scores_of_four = score.reshape(n_fours, 4 * LANES)
-    w = np.empty(2 * LANES, np.float32)  # best score of a lane, and its place
-    last = np.empty(4, np.float32)
+    n, n_chosen, apart = len(candidates), chosen.shape[1], np.float32(cos_apart)
+    n_blocks = -(-n // _BLOCK)
+    score, key = np.empty(n, np.float32), np.full(n_blocks * _BLOCK, -1)
+    bits, blocks, highest = score.view(np.int32), key.reshape(n_blocks, _BLOCK), np.empty(n_blocks, np.int64)
     for row in range(begin, end):
         x, y, z = components[row, 0], components[row, 1], components[row, 2]
         for j in range(n):
-            score[j] = x[j] * x[j] + y[j] * y[j] + z[j] * z[j]
-        last[:] = 0.0
-        for k in range(chosen.shape[1]):
-            w[:] = 0.0
-            of_last = (last[0], last[1], last[2], last[3])
-            for j in range(n_fours):
-                c, s, place = q[j], scores_of_four[j], np.float32(4 * LANES * j)
-                for i in range(LANES):
-                    v0, v1 = _left(c, i, of_last, apart, s), _left(c, LANES + i, of_last, apart, s)
-                    v2, v3 = _left(c, 2 * LANES + i, of_last, apart, s), _left(c, 3 * LANES + i, of_last, apart, s)
-                    s[i], s[LANES + i], s[2 * LANES + i], s[3 * LANES + i] = v0, v1, v2, v3
-                    p01, v01 = np.float32(LANES) if v1 > v0 else np.float32(0.0), v1 if v1 > v0 else v0
-                    p23, v23 = np.float32(3 * LANES) if v3 > v2 else np.float32(2 * LANES), v3 if v3 > v2 else v2
-                    which, value = p23 if v23 > v01 else p01, v23 if v23 > v01 else v01
-                    better = value > w[i]
-                    w[i] = value if better else w[i]
-                    w[LANES + i] = place + which if better else w[LANES + i]
-            best = 0
-            for i in range(1, LANES):
-                earlier = w[i] == w[best] and w[LANES + i] + i < w[LANES + best] + best
-                best = i if w[i] > w[best] or earlier else best
-            found = int(w[LANES + best]) + best
-            chosen[row, k] = found if w[best] > 0.0 else chosen[row, 0] if k > 0 else 0
-            for d in range(4):
-                last[d] = candidates[chosen[row, k], d]
+            explained = x[j] * x[j] + y[j] * y[j] + z[j] * z[j]
+            score[j] = explained if explained > 0.0 else np.float32(-1.0)
+        for j in range(n):
+            key[j] = (np.int64(bits[j]) << 32) + (n - j)
+        for b in range(n_blocks):
+            highest[b] = _largest(blocks[b])
+        chosen[row] = 0
+        n_found = 0
+        while n_found < n_chosen:
+            best = _largest(highest)
+            if best <= 0:
+                chosen[row, n_found:] = chosen[row, 0]
+                break
+            j = n - (best & 0xFFFFFFFF)
+            key[j] = -1
+            highest[j // _BLOCK] = _largest(blocks[j // _BLOCK])
+            near = False
+            for k in range(n_found):
+                near |= _are_near(candidates[j], candidates[chosen[row, k]], apart)
+            if not near:
+                chosen[row, n_found] = j
+                n_found += 1
 
 
 @inlined
-def _left(
-    c: NDArray[np.float32], at: int, q: tuple[float, float, float, float], cos_apart: Any, score: NDArray[np.float32]
-) -> Any:
-    """Score of a candidate, or less than any where it is near q."""
-    t = c[at] * q[0] + c[4 * LANES + at] * q[1] + c[8 * LANES + at] * q[2] + c[12 * LANES + at] * q[3]
-    return np.float32(-1.0) if abs(t) > cos_apart else score[at]
+def _largest(values: IntArray) -> Any:
+    largest = values[0]
+    for i in range(1, len(values)):
+        largest = max(largest, values[i])
+    return largest
+
+
+@inlined
+def _are_near(q: NDArray[np.float32], other: NDArray[np.float32], cos_apart: Any) -> bool:
+    return abs(q[0] * other[0] + q[1] * other[1] + q[2] * other[2] + q[3] * other[3]) > cos_apart
 
 
 @compiled
@@ -124,58 +129,113 @@ def search_rows(
     keep_within: float,
     max_iterations: int,
     model: LaneModel,
+    moduli: Moduli | None,
     out: Ends,
 ) -> None:
     """Distinct optima of rows begin to end, best first; for :func:`magloc.compilation.over_rows`.
 
-    Starts (rows, k, 4) of a row are refined on the signal (readings, s, 3) of its reading.
+    Starts (rows, k, 4) of a row, or with moduli (rows, k, 7), are refined on the signal (readings, s, 3) of its
+    reading. The first ones say above which χ² the others are given up.
     """
-    n_starts = starts.shape[1]
-    n = (end - begin) * n_starts
-    reading = np.empty(n, np.intp)
-    for k in range(n):
-        reading[k] = reading_of_row[begin + k // n_starts]
-    near = Refined(
-        np.empty((n, 4)), np.empty((n, 3)), np.empty(n), np.empty(n, np.intp), np.empty(n, np.bool_)
-    )  # fmt: skip
-    of_block = starts[begin:end].reshape(n, 4)
-    refine(signal, reading, of_block, model, 1.0, _NEAR_TOLERANCE, float(max_iterations), near)
-    first_end, n = np.zeros(end - begin + 1, np.intp), 0
+    n_rows, n_starts = end - begin, starts.shape[1]
+    n_first, n = min(_FIRST_STARTS, n_starts), n_rows * n_starts
+    place, reading = np.empty((n_rows, n_starts), np.intp), np.empty(n, np.intp)
+    of_place = np.empty((n, starts.shape[2]))
+    for row in range(n_rows):
+        for k in range(n_starts):
+            j = row * n_first + k if k < n_first else n_rows * n_first + row * (n_starts - n_first) + k - n_first
+            place[row, k], reading[j] = j, reading_of_row[begin + row]
+            put(of_place[j], starts[begin + row, k])
+    near, limit = _places(n), np.full(n, math.inf)
+    for first, last in ((0, n_rows * n_first), (n_rows * n_first, n)):
+        rules = Rules(_NEAR_TOLERANCE, float(max_iterations), limit[first:last], True)
+        of_part = Refined(
+            near.q[first:last],
+            near.mu[first:last],
+            near.chi2[first:last],
+            near.iterations[first:last],
+            near.converged[first:last],
+        )
+        _refine(signal, reading[first:last], of_place[first:last], model, moduli, rules, of_part)
+        for row in range(n_rows):
+            lowest = _lowest(near, place[row, :n_first])
+            for j in place[row, n_first:]:
+                limit[j] = lowest + keep_within + 1.0
+    distinct, count = np.empty((n, starts.shape[2])), np.int64(0)
+    chi2, iterations, first_end = np.empty(n), np.empty(n, np.intp), np.zeros(n_rows + 1, np.intp)
     for row in range(begin, end):
-        first = (row - begin) * n_starts
-        lowest = math.inf
+        lowest = _lowest(near, place[row - begin])
         out.counts[row, 1] = out.counts[row, 2] = 0
-        for k in range(first, first + n_starts):
+        for k in place[row - begin]:
             out.counts[row, 1] += 0 if near.converged[k] else 1
             out.counts[row, 2] += near.iterations[k]
-            lowest = min(lowest, near.chi2[k] if near.converged[k] else math.inf)
-        for k in range(first, first + n_starts):
             if not near.converged[k] or near.chi2[k] > lowest + keep_within + 1.0:
                 continue
             known = False
-            for j in range(first_end[row - begin], n):
-                known = known or same_optimum(near.q[k], near.chi2[k], near.q[j], near.chi2[j])
+            for j in range(first_end[row - begin], count):
+                same = same_optimum(near.q[k], near.chi2[k], distinct[j], chi2[j])
+                if moduli is not None:
+                    same = same and _same_side(near.mu[k], distinct[j, 4:])
+                known = known or same
             if not known:
-                put(near.q[n], near.q[k])
-                near.chi2[n], near.iterations[n] = near.chi2[k], near.iterations[k]
-                reading[n] = reading_of_row[row]
-                n += 1
-        first_end[row - begin + 1] = n
-    ends = Refined(
-        np.empty((n, 4)), np.empty((n, 3)), np.empty(n), np.empty(n, np.intp), np.empty(n, np.bool_)
-    )  # fmt: skip
-    refine(signal, reading[:n], near.q[:n], model, 1.0, OPTIMUM_TOLERANCE, _LONGER * max_iterations, ends)
+                put(distinct[count], near.q[k])
+                if moduli is not None:
+                    put(distinct[count, 4:], near.mu[k])
+                chi2[count], iterations[count] = near.chi2[k], near.iterations[k]
+                reading[count] = reading_of_row[row]
+                count += 1
+        first_end[row - begin + 1] = count
+    ends = _places(count)
+    rules = Rules(OPTIMUM_TOLERANCE, _LONGER * max_iterations, np.full(count, math.inf), False)
+    _refine(signal, reading[:count], distinct[:count], model, moduli, rules, ends)
     for row in range(begin, end):
         first, last = first_end[row - begin], first_end[row - begin + 1]
         for k in range(first, last):
             out.counts[row, 1] += 0 if ends.converged[k] else 1
             out.counts[row, 2] += ends.iterations[k]
-            ends.iterations[k] += near.iterations[k]
-        _distinct(ends, first, last, keep_within, row, out)
+            ends.iterations[k] += iterations[k]
+        _distinct(ends, first, last, keep_within, moduli, row, out)
 
 
 @internal
-def _distinct(refined: Refined, first: int, last: int, keep_within: float, row: int, out: Ends) -> None:
+def _places(n: int) -> Refined:
+    return Refined(np.empty((n, 4)), np.empty((n, 3)), np.empty(n), np.empty(n, np.intp), np.empty(n, np.bool_))
+
+
+@internal
+def _refine(
+    signal: FloatArray,
+    reading: IntArray,
+    starts: FloatArray,
+    model: LaneModel,
+    moduli: Moduli | None,
+    rules: Rules,
+    out: Refined,
+) -> None:
+    if moduli is None:
+        refine(signal, reading, starts, model, 1.0, rules, out)
+    else:
+        refine_by_moduli(signal, reading, starts, model, moduli, 1.0, rules, out)
+
+
+@internal
+def _lowest(near: Refined, places: IntArray) -> float:
+    lowest = math.inf
+    for j in places:
+        lowest = min(lowest, near.chi2[j] if near.converged[j] else math.inf)
+    return lowest
+
+
+@internal
+def _same_side(mu: FloatArray, other: FloatArray) -> bool:
+    """Whether moments are not opposite: without an ambient field moduli do not tell these apart."""
+    return mu[0] * other[0] + mu[1] * other[1] + mu[2] * other[2] > 0.0
+
+
+@internal
+def _distinct(
+    refined: Refined, first: int, last: int, keep_within: float, moduli: Moduli | None, row: int, out: Ends
+) -> None:
     """Optima of a row among ends first to last, best first, without those that are known already."""
     kept = 0
     while True:
@@ -188,7 +248,10 @@ def _distinct(refined: Refined, first: int, last: int, keep_within: float, row: 
         refined.converged[best] = False
         known = False
         for j in range(kept):
-            known = known or same_optimum(refined.q[best], refined.chi2[best], out.q[row, j], out.chi2[row, j])
+            same = same_optimum(refined.q[best], refined.chi2[best], out.q[row, j], out.chi2[row, j])
+            if moduli is not None:
+                same = same and _same_side(refined.mu[best], out.mu[row, j])
+            known = known or same
         if not known:
             put(out.q[row, kept], refined.q[best])
             put(out.mu[row, kept], refined.mu[best])

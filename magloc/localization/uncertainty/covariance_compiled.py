@@ -8,7 +8,7 @@ import numpy as np
 
 from arrays.typing import FloatArray
 from magloc.compilation import internal
-from magloc.linalg_compiled import orthonormalise
+from magloc.linalg_compiled import dot, orthonormalise, put
 from magloc.measurement.whitened_compiled import (
     ModelRow,
     homogeneous_jacobian,
@@ -40,11 +40,8 @@ def covariance_and_volume(
     scale = np.empty(6)
     # Moment first: its three columns are the well-conditioned part.
     for j in range(6):
-        t = 0.0
-        for c in range(n):
-            rows[j, c] = basis[j, c] if j < 3 else jacobian[j - 3, c]
-            t += rows[j, c] * rows[j, c]
-        scale[j] = math.sqrt(t)
+        put(rows[j], basis[j] if j < 3 else jacobian[j - 3])
+        scale[j] = math.sqrt(dot(rows[j], rows[j]))
         if not (scale[j] > 0.0 and math.isfinite(scale[j])):
             return math.nan
         for c in range(n):

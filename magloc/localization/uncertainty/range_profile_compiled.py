@@ -14,11 +14,11 @@ import numpy as np
 from arrays.typing import FloatArray, IntArray
 from magloc.compilation import internal
 from magloc.linalg_compiled import put
-from magloc.localization.fit.variable_projection_compiled import Refined, refine
+from magloc.localization.fit.variable_projection_compiled import Refined, Rules, refine
 from magloc.measurement.whitened_compiled import SMALLEST_S, LaneModel
 
 # Gauss-Newton gain in χ² at which a point of the profile is one: it is read at a rise of 3.84 to 0.01.
-PROFILE_TOLERANCE = 1e-3
+PROFILE_TOLERANCE = 1e-2
 _SAME_RISE = 0.01
 # No step of the profile is longer, in α: it would leap over what is between.
 LARGEST_PROFILE_STEP = 0.2
@@ -156,6 +156,7 @@ def profile_rows(
     ends = Refined(
         np.empty((n, 4)), np.empty((n, 3)), np.empty(n), np.empty(n, np.intp), np.empty(n, np.bool_)
     )  # fmt: skip
+    rules = Rules(PROFILE_TOLERANCE, 30.0, np.full(n, math.inf), True)
     for _ in range(_MOST_STEPS):
         if n_live == 0:
             break
@@ -163,7 +164,7 @@ def profile_rows(
             k = live[i]
             reading[i] = place[k, 0]
             _place(direction[k], state[k, _TRIED], starts[i])
-        refine(signal, reading[:n_live], starts[:n_live], model, 0.0, PROFILE_TOLERANCE, 30.0, ends)
+        refine(signal, reading[:n_live], starts[:n_live], model, 0.0, rules, ends)
         n_before, n_live = n_live, 0
         for i in range(n_before):
             k = live[i]

@@ -251,12 +251,13 @@ def _is_gaussian(
         trace = 0.0
         for i in range(6):
             trace += power[i, i]
+        scale = 1.0 / (trace * trace)
         for i in range(6):
-            for j in range(6):
+            for j in range(i, 6):
                 t = 0.0
                 for k in range(6):
-                    t += power[i, k] * power[k, j]
-                square[i, j] = t / (trace * trace)
+                    t += power[i, k] * power[j, k]
+                square[i, j] = square[j, i] = t * scale
         power, square = square, power
     for i in range(6):
         largest = i if power[i, i] > power[largest, largest] else largest

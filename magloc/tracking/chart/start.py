@@ -30,6 +30,7 @@ from magloc.measurement.rows import check_magnitudes, check_spans
 from magloc.tracking.chart.coordinates import MOMENT_POWER, Chart, source_root
 from magloc.tracking.chart.mixture import DROPPED_BELOW, FARTHEST, NEAREST, Mixture, block_root
 from magloc.tracking.chart.row import ChartRow, where_smooth
+from magloc.tracking.chart.stack import Measured
 from magloc.tracking.chart.update import Updated, updated
 from magloc.tracking.measurement import whitening
 from magloc.tracking.motion import N_SOURCE, MotionModel
@@ -148,7 +149,7 @@ class Start:
             self._locator = Locator(array, prior=prior, body_length_m=0.0, exclude_faulty=False)
             self._examiner = Locator(array, prior=prior)
 
-    def mixture(self, measurement: ChartRow, motion: MotionModel) -> tuple[Mixture | None, str]:
+    def mixture(self, measurement: Measured, motion: MotionModel) -> tuple[Mixture | None, str]:
         """What one row says of a source and of the pose's errors, or why there is none."""
         if not measurement.is_detected(self.errors.sigma):
             return None, "not acquired: no signal stands out of noise"
@@ -185,7 +186,7 @@ class Start:
         dropped = () if self._examiner is None else self._examiner.fit(row.readings_T, row.ambient_T).dropped_sensors
         return np.isin(self.errors.array.ids, dropped)
 
-    def _seeds(self, measurement: ChartRow) -> _Seeds:
+    def _seeds(self, measurement: Measured) -> _Seeds:
         """Chosen cells, and the row's best fits."""
         cells, row = self._grid.position_m, measurement.row
         world = row.origin_m + cells @ row.R_world_from_array.T
@@ -207,7 +208,7 @@ class Start:
         return _Seeds(np.vstack(position), np.vstack(moment), np.vstack(cell))
 
 
-def _components(measurement: ChartRow, motion: MotionModel, seeds: _Seeds) -> Updated:
+def _components(measurement: Measured, motion: MotionModel, seeds: _Seeds) -> Updated:
     """What the row makes of cells about seeds."""
     state, _ = motion.start(np.zeros(N_SOURCE), np.zeros((N_SOURCE, N_SOURCE)))
     x = np.tile(state, (len(seeds.cell), 1))
@@ -218,12 +219,12 @@ def _components(measurement: ChartRow, motion: MotionModel, seeds: _Seeds) -> Up
     return updated(x, S, measurement, np.zeros(len(x), dtype=bool))
 
 
-def _mixture(found: Updated, log_weight: FloatArray, measurement: ChartRow) -> Mixture:
+def _mixture(found: Updated, log_weight: FloatArray, measurement: Measured) -> Mixture:
     n, centroid_m, radius_m = measurement.n_motion, measurement.centroid_m, measurement.radius_m
     return Mixture(found.x, found.S, log_weight, n, centroid_m, radius_m, measurement.n_pose)
 
 
-def _centred(seeds: _Seeds, found: Updated, measurement: ChartRow) -> _Seeds:
+def _centred(seeds: _Seeds, found: Updated, measurement: Measured) -> _Seeds:
     """Seeds that stand where the row puts them, along the coordinates in which it tells more than their cells do."""
     sigma = np.sqrt(np.sum(found.S[:, :3] ** 2, axis=2))
     narrow = sigma < _NARROW * _CELL
@@ -245,7 +246,7 @@ def _centred(seeds: _Seeds, found: Updated, measurement: ChartRow) -> _Seeds:
     )
 
 
-def _along_valleys(seeds: _Seeds, found: Updated, measurement: ChartRow) -> _Seeds:
+def _along_valleys(seeds: _Seeds, found: Updated, measurement: Measured) -> _Seeds:
     """The seeds, and instead of such as found a valley of ranges that bends others along it, as dense as it bends.
 
     A row that tells much leaves a source in a narrow valley, and a Gaussian in the middle says nothing of its ends.

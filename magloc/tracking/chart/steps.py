@@ -26,6 +26,7 @@ from magloc.tracking.chart.mixture import Mixture, block_root, root_of
 from magloc.tracking.chart.posed_motion import PosedMotion
 from magloc.tracking.chart.refit import Cells, refitted
 from magloc.tracking.chart.row import ChartRow
+from magloc.tracking.chart.stack import Stack
 from magloc.tracking.chart.start import OF_PITCH, Start, once, with_errors
 from magloc.tracking.chart.update import Move, predicted_root, updated
 from magloc.tracking.motion import N_SOURCE, MotionModel
@@ -106,7 +107,7 @@ class ChartFilter:
     """Starts tracks of one array, and steps them."""
 
     def __init__(self, array: SensorArray, errors: SensorErrors, pose_errors: PoseErrors, prior: SourcePrior) -> None:
-        self.errors, self.pose_errors = errors, pose_errors
+        self.errors, self.pose_errors, self.prior = errors, pose_errors, prior
         self._start = Start(array, errors, prior)
         self.n_differences = decorrelated_differences(array).n_differences
 
@@ -121,6 +122,10 @@ class ChartFilter:
     def of_row(self, row: ChartRow, motion: MotionModel) -> tuple[Mixture | None, str]:
         """What one row alone says of a source and the pose, by every cell that explains it, or why it says nothing."""
         return self._start.mixture(row, self._posed(motion))
+
+    def of_stack(self, stack: Stack, at_rest: MotionModel) -> tuple[Mixture | None, str]:
+        """What rows say together of a source alone, that is where it is in the last of them."""
+        return self._start.mixture(stack, at_rest)
 
     def faulty(self, row: ChartRow) -> BoolArray:
         """Sensors (N,) that contradict all others in a row that no dipole fits."""

@@ -18,7 +18,7 @@ import numpy as np
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.tracking.chart.coordinates import Chart
 from magloc.tracking.chart.mixture import root_of
-from magloc.tracking.chart.row import ChartRow
+from magloc.tracking.chart.stack import Measured, Stack
 
 TOLERANCE = 1e-3
 """Stop of the iteration: length of the next step in posterior standard deviations."""
@@ -105,7 +105,7 @@ class Updated:
 
 
 def updated(
-    x: FloatArray, S: FloatArray, measurement: ChartRow, bends: BoolArray, lasting: ChartRow | None = None
+    x: FloatArray, S: FloatArray, measurement: Measured, bends: BoolArray, lasting: Measured | None = None
 ) -> Updated:
     r"""Iterated update of states (K, N) with roots (K, N, N), each on its own.
 
@@ -182,8 +182,8 @@ class _Problem:
     chart: Chart
     x: FloatArray
     S: FloatArray
-    measurement: ChartRow
-    lasting: ChartRow
+    measurement: Measured
+    lasting: Measured
     U: FloatArray
     z: FloatArray
     whiten: FloatArray | None
@@ -194,10 +194,16 @@ class _Problem:
     h: FloatArray
 
     @classmethod
-    def of(cls, chart: Chart, x: FloatArray, S: FloatArray, measurement: ChartRow) -> _Problem:
+    def of(cls, chart: Chart, x: FloatArray, S: FloatArray, measurement: Measured) -> _Problem:
         n, k, K = measurement.n_motion, measurement.z.size, len(x)
         z = np.broadcast_to(measurement.z, (K, k))
         straight = np.zeros((K, n, k)), np.zeros((K, k, n)), np.zeros((K, k))
+        if isinstance(measurement, Stack):
+            root = np.linalg.cholesky(measurement.covariance(x))
+            whiten = np.linalg.inv(root)
+            log_C = 2.0 * np.sum(np.log(np.diagonal(root, axis1=-2, axis2=-1)), axis=1)
+            z = (whiten @ z[..., None])[..., 0]
+            return cls(chart, x, S, measurement, measurement, S, z, whiten, np.zeros((K, k, n)), log_C, *straight)
         if not measurement.effect.shape[1]:
             return cls(chart, x, S, measurement, measurement, S, z, None, np.zeros((K, k, 0)), np.zeros(K), *straight)
         U = root_of(S[:, :n])
@@ -234,7 +240,7 @@ class _Problem:
         """Coordinates (K, n)."""
         return (self.U @ zeta[..., None])[..., 0]
 
-    def bent(self, bends: BoolArray, lasting: ChartRow) -> _Problem:
+    def bent(self, bends: BoolArray, lasting: Measured) -> _Problem:
         """The same, the prediction being Gaussian in what the row measures where it bends so: see :func:`updated`."""
         if not bends.any():
             return self
@@ -247,12 +253,12 @@ class _Problem:
     def _whitened(self, values: FloatArray) -> FloatArray:
         return values if self.whiten is None else self.whiten @ values
 
-    def _predicted(self, measurement: ChartRow, e: FloatArray) -> FloatArray:
+    def _predicted(self, measurement: Measured, e: FloatArray) -> FloatArray:
         """Whitened predictions (K, k) without errors of sensors."""
         h = measurement.of_source(self.chart.retracted(e))
         return np.asarray(self._whitened(h[..., None])[..., 0])
 
-    def _derivative(self, measurement: ChartRow, e: FloatArray) -> FloatArray:
+    def _derivative(self, measurement: Measured, e: FloatArray) -> FloatArray:
         """Their derivative (K, k, n) by ζ."""
         return self._whitened(self._of_coordinates(measurement, e)) @ self.U
 
@@ -283,7 +289,7 @@ class _Problem:
             J = self._derivative(self.lasting, e)
         return np.eye(J.shape[2]) + self.M @ (J - self.J)
 
-    def _of_coordinates(self, measurement: ChartRow, e: FloatArray) -> FloatArray:
+    def _of_coordinates(self, measurement: Measured, e: FloatArray) -> FloatArray:
         """Derivative (K, k, n) of the source's differences, in units of their noise, by its coordinates."""
         return measurement.along(*self.chart.linearised(e))
 
@@ -294,7 +300,7 @@ class _Problem:
         x[:, :n] = self.chart.retracted(e)
         after = self.measurement.chart(x[:, :n])
         turned = after.inverse_jacobian() @ self.chart.jacobian(e)
-        if self.whiten is None:
+        if not self.measurement.effect.shape[1]:
             root = np.linalg.solve(np.swapaxes(R, -1, -2), np.swapaxes(self.U, -1, -2))
             return x, turned @ np.swapaxes(root, -1, -2)
         return self._posterior_of_errors(x, residual, e, turned)

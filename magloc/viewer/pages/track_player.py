@@ -50,7 +50,7 @@ from magloc.viewer.scene.track_glyph import TrackGlyph, track_segments
 Poses = tuple[FloatArray, FloatArray]
 _DARKEST, _BRIGHTEST = 0.12, 0.88  # what is seen on a dark page, and on white
 _WHOLE_COLOUR = (190, 196, 203)
-_SOURCE_COLOURS: tuple[Colour, ...] = (TRACK_COLOUR, FIELD_LINE_COLOUR, ARROW_COLOUR, OTHER_COLOUR, REGION_COLOUR)
+SOURCE_COLOURS: tuple[Colour, ...] = (TRACK_COLOUR, FIELD_LINE_COLOUR, ARROW_COLOUR, OTHER_COLOUR, REGION_COLOUR)
 
 
 class Trail:
@@ -238,7 +238,7 @@ def time_colours(time_s: FloatArray) -> ByteArray:
 
 def source_colours(result: TrackResult) -> list[Colour | None]:
     """A colour for every source of a result; of a single one None, as time is its colour."""
-    return [colour for colour, _ in zip(cycle(_SOURCE_COLOURS), result.ids, strict=False)] or [None]
+    return [colour for colour, _ in zip(cycle(SOURCE_COLOURS), result.ids, strict=False)] or [None]
 
 
 def row_words(result: TrackResult, index: int) -> str:
