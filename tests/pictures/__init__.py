@@ -23,6 +23,7 @@ from typing import Protocol
 from PIL import Image
 
 from arrays.array_file import read_array
+from magloc.viewer.origin import SMOOTH
 from magloc.viewer.pages.pages import array_page
 from magloc.viewer.server import opened
 from tests.browser.browser import Browser
@@ -151,7 +152,7 @@ class LivePage:
         array = read_array(folder / self.array)
         with Browser("about:blank", self.size_px) as browser, opened(0, self.array) as server:
             screen, page = Screen(browser, folder), array_page(server, array, live=True)
-            screen.open_server(server)
+            screen.open_server(server, SMOOTH)
             screen.until(lambda: "found at" in screen.text(), "the fit is found")
             screen.keep("live")
             screen.leave()

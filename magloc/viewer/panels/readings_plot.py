@@ -90,7 +90,8 @@ class ReadingsPlot:
         self._server, self._array, self._window_s = server, array, window_s
         self._channels, self._ids = channels_of(array), array.ids
         self._hold(readings, residuals_T)
-        self._follow, self._drawn = Latest(self._show), ("", (), 0.0, -1)
+        self._follow = Latest(self._show)
+        self._drawn: tuple[str, tuple[int, ...], float, int] | None = None
         self._wanted: Callable[[int], None] = lambda row: None
         self.index = 0
         gui = server.gui
@@ -135,7 +136,7 @@ class ReadingsPlot:
     def take(self, readings: Readings, residuals_T: FloatArray | None = None) -> None:
         """Show other readings of the array in place of those so far, and mark the last row."""
         self._hold(readings, residuals_T)
-        self._drawn = ("", (), 0.0, -1)
+        self._drawn = None
         self.show_row(len(readings) - 1)
 
     def _hold(self, readings: Readings, residuals_T: FloatArray | None) -> None:
