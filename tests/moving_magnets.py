@@ -1,8 +1,8 @@
 """Magnets that move over a board, and their tracks: ``python -m tests.moving_magnets --sources 3 --seeds 20``.
 
 Prints every run, and of all of them: swaps, births and losses, NEES per dimension, sensors that were named, and the
-processor time of a row. Paths are sums of sinusoids, rates of turn Ornstein-Uhlenbeck processes; a path is drawn anew
-where two magnets come nearer than ``--gap-mm``.
+processor time of a row. Paths are sums of sinusoids, rates of turn Ornstein-Uhlenbeck processes; paths are drawn anew
+where two magnets come nearer than ``--gap-mm``, all of them or ``--one-by-one``.
 """
 
 from __future__ import annotations
@@ -25,10 +25,14 @@ RATE_HZ = 100.0
 NOISE_T = 5e-7
 AMBIENT_T = np.array([1.5e-6, 20.5e-6, -43e-6])
 LOW_M, HIGH_M = np.array([-0.05, -0.04, 0.03]), np.array([0.05, 0.04, 0.08])
+# Paths that are drawn one after the other: tries for one of them until all begin anew.
+TRIES = 5000
 SPEED_M_S, STRENGTH_AM2 = 0.3, (0.02, 0.1)
 RATE_RAD_S, RATE_LASTS_S = 1.2, 0.4
 # Rows in which a track must be nearer to another magnet than to its own to be counted as swapped.
 ROWS_OF_A_SWAP = 20
+# Square of a distance in units of a track's covariance within which a magnet may be the one it is of.
+TOLD_APART = 25.0
 FAULTS = ("zero", "stuck", "noisy", "drift")
 
 
@@ -42,6 +46,20 @@ def board() -> SensorArray:
     return replace(array, sensors=tuple(sensors), ambient_T=None)
 
 
+@dataclass(frozen=True)
+class Within:
+    """What magnets are drawn within: heights, strengths, and of the box the share of each axis that one moves in.
+
+    `one_by_one`: a path is drawn until it keeps the gap to those before it, not all of them anew, which of three
+    magnets takes a minute, and of more for ever.
+    """
+
+    highest_m: float = HIGH_M[2]
+    weakest_Am2: float = STRENGTH_AM2[0]
+    roam: float = 1.0
+    one_by_one: bool = False
+
+
 @dataclass(frozen=True, eq=False)
 class Magnets:
     """Truth: positions and moments (K, n, 3), and when each magnet is there (K, n)."""
@@ -52,16 +70,18 @@ class Magnets:
 
     @classmethod
     def drawn(
-        cls, k: int, n_rows: int, gap_m: float, rng: np.random.Generator, *, come_and_go: bool = False
+        cls,
+        k: int,
+        n_rows: int,
+        gap_m: float,
+        rng: np.random.Generator,
+        *,
+        come_and_go: bool = False,
+        within: Within = Within(),
     ) -> Magnets:
         """Magnets whose paths keep a gap; `come_and_go`: the last one comes at 30 % of the rows and goes at 70 %."""
-        while True:
-            position = np.stack([_path(n_rows, rng) for _ in range(k)])
-            apart = np.linalg.norm(position[:, None] - position, axis=-1)
-            apart[np.arange(k), np.arange(k)] = np.inf
-            if apart.min() >= gap_m:
-                break
-        strength = rng.uniform(*STRENGTH_AM2, k)
+        position = _paths(k, n_rows, gap_m, within, rng)
+        strength = rng.uniform(within.weakest_Am2, STRENGTH_AM2[1], k)
         moment = np.stack([one * _direction(n_rows, rng) for one in strength])
         present = np.ones((k, n_rows), dtype=bool)
         if come_and_go:
@@ -80,15 +100,35 @@ class Magnets:
         return array.readings_of(fields) + NOISE_T * rng.normal(size=(len(fields), array.n_channels))
 
 
-def _path(n_rows: int, rng: np.random.Generator) -> FloatArray:
-    """Three sinusoids an axis within the box, no faster than the largest speed."""
+def _paths(k: int, n_rows: int, gap_m: float, within: Within, rng: np.random.Generator) -> FloatArray:
+    """Paths (k, n, 3) that keep a gap."""
+    at_once, position = 1 if within.one_by_one else k, np.zeros((0, n_rows, 3))
+    while len(position) < k:
+        for _ in range(TRIES):
+            more = np.stack([_path(n_rows, within, rng) for _ in range(at_once)])
+            tried = np.concatenate([position, more])
+            apart = np.linalg.norm(tried[:, None] - more, axis=-1)
+            if np.sort(apart, axis=0)[1:].min(initial=np.inf) >= gap_m:
+                position = tried
+                break
+        else:
+            position = np.zeros((0, n_rows, 3))
+    return position
+
+
+def _path(n_rows: int, within: Within, rng: np.random.Generator) -> FloatArray:
+    """Three sinusoids an axis within the box, or a part of it, no faster than the largest speed."""
     t = np.arange(n_rows) / RATE_HZ
     frequency, phase = rng.uniform(0.15, 0.45, (3, 3)), rng.uniform(0.0, 2.0 * np.pi, (3, 3))
     share = rng.dirichlet(np.ones(3), 3)
     wave = np.sum(share[:, :, None] * np.sin(2.0 * np.pi * frequency[:, :, None] * t + phase[:, :, None]), axis=1).T
-    position = 0.5 * (LOW_M + HIGH_M) + 0.5 * (HIGH_M - LOW_M) * wave
+    low, high = LOW_M, np.array([*HIGH_M[:2], within.highest_m])
+    if within.roam < 1.0:
+        low = low + (1.0 - within.roam) * (high - low) * rng.uniform(size=3)
+        high = low + within.roam * (np.array([*HIGH_M[:2], within.highest_m]) - LOW_M)
+    position = 0.5 * (low + high) + 0.5 * (high - low) * wave
     speed = np.linalg.norm(np.diff(position, axis=0), axis=1).max(initial=0.0) * RATE_HZ
-    return position if speed <= SPEED_M_S else _path(n_rows, rng)
+    return position if speed <= SPEED_M_S else _path(n_rows, within, rng)
 
 
 def _direction(n_rows: int, rng: np.random.Generator) -> FloatArray:
@@ -120,9 +160,14 @@ def with_fault(readings_T: FloatArray, kind: str, sensor: int, first: int, drift
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """How one run went; NEES is per dimension, over all rows and tracks that are told."""
+    """How one run went; NEES is per dimension, over all rows and tracks that are told.
+
+    `early_swaps` counts from the row in which a track was first told, where its covariance may have two magnets within;
+    `swaps` from the first one in which it has a single one. Before that its error is that from the nearest.
+    """
 
     swaps: int
+    early_swaps: int
     false_births: int
     lost_rows: int
     misfit_rows: int
@@ -136,11 +181,12 @@ class Run:
 
 
 def judged(points: list[SourcesPoint], truth: Magnets, row_ms: FloatArray) -> Run:
-    """Tracks against the magnets: each is the one that it was nearest to when it was first told."""
-    owner: dict[int, int] = {}
-    away: dict[int, int] = {}
+    """Tracks against the magnets: each is of the nearest one when it is first told, or first told apart."""
+    owners: tuple[dict[int, int], dict[int, int]] = {}, {}
+    away: tuple[dict[int, int], dict[int, int]] = {}, {}
+    swaps = [0, 0]
     named: dict[str, int] = {}
-    squares, errors, swaps, false, lost = [], [], 0, 0, 0
+    squares, errors, false, lost = [], [], 0, 0
     last = truth.present[-1]
     first, end = int(np.argmax(last)), int(len(last) - np.argmax(last[::-1]))
     seen_first, seen_last = len(last), 0
@@ -154,11 +200,18 @@ def judged(points: list[SourcesPoint], truth: Magnets, row_ms: FloatArray) -> Ru
             assert track.position_m is not None
             apart = np.linalg.norm(truth.position_m[:, row] - track.position_m, axis=1)
             nearest = int(there[np.argmin(apart[there])])
-            own = owner.setdefault(track.id, nearest)
-            away[track.id] = away.get(track.id, 0) + 1 if nearest != own and apart[nearest] < 0.5 * apart[own] else 0
-            if away[track.id] == ROWS_OF_A_SWAP:
-                swaps, owner[track.id] = swaps + 1, nearest
-            own = owner[track.id]
+            offsets = truth.position_m[there, row] - track.position_m
+            within = np.vecdot(offsets, np.linalg.solve(track.covariance[:3, :3], offsets[..., None])[..., 0])
+            for i, (owner, gone) in enumerate(zip(owners, away, strict=True)):
+                if track.id not in owner and i and np.count_nonzero(within < TOLD_APART) != 1:
+                    continue
+                own = owner.setdefault(track.id, nearest)
+                gone[track.id] = (
+                    gone.get(track.id, 0) + 1 if nearest != own and apart[nearest] < 0.5 * apart[own] else 0
+                )
+                if gone[track.id] == ROWS_OF_A_SWAP:
+                    swaps[i], owner[track.id] = swaps[i] + 1, nearest
+            own = owners[1].get(track.id, nearest)
             if own == len(truth.present) - 1:
                 seen_first, seen_last = min(seen_first, row), row + 1
             offset = track.position_m - truth.position_m[own, row]
@@ -167,7 +220,8 @@ def judged(points: list[SourcesPoint], truth: Magnets, row_ms: FloatArray) -> Ru
                 squares.append(error @ np.linalg.solve(track.covariance, error) / 6.0)
                 errors.append(offset @ offset)
     return Run(
-        swaps=swaps,
+        swaps=swaps[1],
+        early_swaps=swaps[0],
         false_births=false,
         lost_rows=lost,
         misfit_rows=sum(point.status == "misfit" for point in points),
@@ -200,20 +254,30 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--gap-mm", type=float, default=20.0)
+    parser.add_argument("--highest-mm", type=float, default=1e3 * HIGH_M[2])
+    parser.add_argument("--weakest-Am2", type=float, default=STRENGTH_AM2[0])
+    parser.add_argument("--roam", type=float, default=1.0)
+    parser.add_argument("--one-by-one", action="store_true")
     parser.add_argument("--come-and-go", action="store_true")
     parser.add_argument("--fault", choices=FAULTS)
+    parser.add_argument("--only", type=int, nargs="*", help="these seeds")
     given = parser.parse_args()
     array, n_rows, runs = board(), int(given.seconds * RATE_HZ), []
-    for seed in range(given.first, given.first + given.seeds):
+    for seed in given.only or range(given.first, given.first + given.seeds):
         rng = np.random.default_rng(seed)
-        truth = Magnets.drawn(given.sources, n_rows, 1e-3 * given.gap_mm, rng, come_and_go=given.come_and_go)
+        within = Within(1e-3 * given.highest_mm, given.weakest_Am2, given.roam, given.one_by_one)
+        truth = Magnets.drawn(
+            given.sources, n_rows, 1e-3 * given.gap_mm, rng, come_and_go=given.come_and_go, within=within
+        )
         readings_T = truth.readings_T(array, rng)
         if given.fault:
             readings_T = with_fault(readings_T, given.fault, int(rng.integers(array.n_sensors)), n_rows // 2)
         runs.append(judged(*_points_and_truth(array, readings_T, truth)))
         run = runs[-1]
         print(
-            f"seed {seed}: swaps {run.swaps}, rows with too many {run.false_births}, too few {run.lost_rows}, misfit"
+            f"seed {seed}: swaps {run.swaps} ({run.early_swaps} since first told), rows with too many"
+            f" {run.false_births},"
+            f" too few {run.lost_rows}, misfit"
             f" {run.misfit_rows}, merged {run.merged_rows}, birth after {run.late_birth_rows}, loss after"
             f" {run.late_loss_rows}, NEES {run.nees:.2f}, rms {1e3 * run.rms_m:.2f} mm, named {run.named},"
             f" {np.median(run.row_ms):.2f} ms a row, {run.row_ms.mean():.2f} mean, {run.row_ms.max():.0f} most",
@@ -221,10 +285,13 @@ def main() -> None:
         )
     nees = np.array([run.nees for run in runs])
     print(
-        f"{len(runs)} runs: {sum(run.swaps > 0 for run in runs)} with a swap,"
+        f"{len(runs)} runs: {sum(run.swaps > 0 for run in runs)} with a swap"
+        f" ({sum(run.early_swaps > 0 for run in runs)} since first told),"
         f" {sum(run.false_births > 0 for run in runs)} with a false birth, {np.sum(nees > 3.0)} broken (NEES above 3);"
         f" NEES of the median run {np.median(nees):.2f};"
-        f" {np.median([np.median(run.row_ms) for run in runs]):.2f} ms a row"
+        f" {np.median([np.median(run.row_ms) for run in runs]):.2f} ms a row,"
+        f" {np.mean([run.row_ms for run in runs]):.2f} mean,"
+        f" {np.median([run.row_ms.max() for run in runs]):.0f} the longest one of the median run"
     )
 
 

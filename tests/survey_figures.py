@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
+import resource
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -18,9 +20,12 @@ from scipy.special import chdtri
 import magloc
 import sims
 from arrays.typing import FloatArray
-from magloc.surveying.fit.joint_fit import Background, Bounds, Layer, Sources, fit_jointly
-from magloc.surveying.fit.whitening import Drift
-from magloc.surveying.preparation import record_of, whole_rows
+from magloc.localization.fit.prior import NOTHING_KNOWN
+from magloc.surveying.fit.joint_fit import Bounds, Sources, fit_jointly
+from magloc.surveying.piece import Ground
+from magloc.surveying.preparation import whole_rows
+from magloc.surveying.rounds import AT_LAST
+from magloc.surveying.tiled import TiledSurvey
 from sims.magnetics.paths import Lawnmower
 from sims.magnetics.scenario import MagneticScenario
 from sims.magnetics.simulation import Simulation
@@ -64,6 +69,8 @@ class Field(NamedTuple):
     n_false: int
     threshold: float
     seconds: float
+    processors_s: float
+    rows: int
     chi2_per_dof: float
 
     @property
@@ -74,31 +81,50 @@ class Field(NamedTuple):
 
 def judged(field: Simulation, false_per_hectare: float = 0.1) -> Field:
     """A simulated field surveyed, and its targets paired with the true ones."""
+    began = sum(os.times()[:4])  # of this process and of those that it waited for
     found = magloc.survey(field.array, field.readings, false_per_hectare=false_per_hectare)
-    truth = Sources(field.target_position_m, field.target_moment_Am2)
-    everywhere = Bounds(np.full(3, -1e4), np.full(3, 1e4), np.inf)
-    record, errors = record_of(found.array, whole_rows(field.array, field.readings)[1])
-    record = replace(record, values_T=record.values_T - np.median(record.values_T, axis=0))
-    layer = Layer.below(record, 15.0, 5e-9)
-    background = next(Background.of_each(record, truth, layer, errors, Drift(), [np.arange(len(record))]))
-    at_truth = fit_jointly(record, background, truth, everywhere, most=0)
-    bound = np.sqrt(np.diagonal(at_truth.covariance).reshape(-1, 6)[:, :3].sum(axis=1))
+    processors_s = sum(os.times()[:4]) - began
+    significance, bound = at_truth(field, found)
     pairs, missed, used = [], [], set()
-    for j, position in enumerate(truth.position_m):
+    for j, position in enumerate(field.target_position_m):
         apart = np.linalg.norm(found.position_m - position, axis=1)
         k = int(apart.argmin()) if len(found) else -1
         near = k >= 0 and apart[k] < max(NEAREST_M, 4.0 * np.sqrt(np.trace(found[k].covariance[:3, :3])))
         if not near or k in used:
-            missed.append(float(at_truth.significance[j]))
+            missed.append(float(significance[j]))
             continue
         used.add(k)
         target = found[k]
         error = target.position_m - position
         own = target.covariance[:3, :3]
-        interval, chi2 = target.depth_interval95_m, float(at_truth.significance[j])
+        interval, chi2 = target.depth_interval95_m, float(significance[j])
         merged = "merged" in target.flags
         pairs.append(Pair(error, -position[2], own, interval, target.significance, float(bound[j]), chi2, merged))
-    return Field(pairs, missed, len(found) - len(used), found.threshold, found.seconds, found.chi2_per_dof)
+    n_false = len(found) - len(used)
+    cost = found.seconds, processors_s, len(field.readings)
+    return Field(pairs, missed, n_false, found.threshold, *cost, found.chi2_per_dof)
+
+
+def at_truth(field: Simulation, found: magloc.Survey) -> tuple[FloatArray, FloatArray]:
+    """χ² of the true targets (K,), and Cramér-Rao bounds of their places [m], each from the rows of its tile."""
+    truth = Sources(field.target_position_m, field.target_moment_Am2)
+    ground = Ground(NOTHING_KNOWN, found.ground_m, 15.0, found.threshold)
+    tiled = replace(TiledSurvey.of(found.array, whole_rows(field.array, field.readings)[1], ground), sources=truth)
+    everywhere = Bounds(np.full(3, -np.inf), np.full(3, np.inf), np.inf)
+    significance, bound = np.zeros(len(truth)), np.zeros(len(truth))
+    for number, tile in enumerate(tiled.tiles):
+        piece, inside_m = tiled.piece(number), tile.inside_m(truth.position_m)
+        held = tile.holds(truth.position_m)
+        if not (inside_m > 0.0).any():
+            continue
+        model = piece.model()
+        background = model.background(piece.known, piece.groups(model.record, AT_LAST * model.nearest_m))
+        fit = fit_jointly(model.record, background, piece.known, everywhere, most=0)
+        own = inside_m[held] > 0.0
+        significance[inside_m > 0.0] = fit.significance[own]
+        squares = np.diagonal(fit.covariance).reshape(-1, 6)[:, :3]
+        bound[inside_m > 0.0] = np.sqrt(squares.sum(axis=1))[own]
+    return significance, bound
 
 
 def holds(pair: Pair) -> bool:
@@ -152,9 +178,12 @@ def main() -> None:
         last = fields[-1]
         print(
             f"seed {seed}: found {len(last.pairs)}, missed {[round(chi2) for chi2 in last.missed_chi2]} (χ²),"
-            f" false {last.n_false}, χ²/dof {last.chi2_per_dof:.3f}, {last.seconds:.0f} s",
+            f" false {last.n_false}, χ²/dof {last.chi2_per_dof:.3f}, {last.seconds:.0f} s, {last.processors_s:.0f} s of"
+            f" processors, {last.rows} rows",
             flush=True,
         )
+    most = [resource.getrusage(who).ru_maxrss >> 10 for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    print(f"memory: {most[0]} MB, and {most[1]} MB in another process")
     pairs = [pair for field in fields for pair in field.pairs]
     visible = sum(pair.visible_chi2 > 2.0 * fields[0].threshold for pair in pairs)
     lost = sum(chi2 > 2.0 * fields[0].threshold for field in fields for chi2 in field.missed_chi2)

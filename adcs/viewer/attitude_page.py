@@ -104,5 +104,7 @@ def attitude_page(server: viser.ViserServer, replay: AttitudeReplay) -> Page:
     entries = scene_entries(replay)
     with server.gui.add_folder("Legend"):
         server.gui.add_html(legend_html(entries, notes))
-    playing = Playing.of(replay.time_s, player.show_row, player.row) if len(replay.time_s) > 1 else None
+    playing = None
+    if len(replay.time_s) > 1:
+        playing = Playing.of(replay.time_s, player.show_row, player.row, lambda: player.row_panel.content)
     return Page(replay.title, entries, notes, player.pause, playing)

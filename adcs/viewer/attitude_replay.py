@@ -138,7 +138,7 @@ def replay_of(
         shape = (len(readings), 3)
         directions = [
             _direction("field", readings.field_T, np.broadcast_to(north, shape), at),
-            _direction("up", readings.acceleration_m_s2, np.broadcast_to([0.0, 0.0, 1.0], shape), at),
+            _direction("accelerometer", readings.acceleration_m_s2, np.broadcast_to([0.0, 0.0, 1.0], shape), at),
         ]
         own_s, axes = readings.time_s, ("east", "north", "up")
     q_true = np.full((n, 4), np.nan)

@@ -13,7 +13,7 @@ from magloc.viewer.scene.glyphs import screen_label, screen_lines, solid
 from magloc.viewer.scene.legend import Colour, Swatch
 from magloc.viewer.scene.shapes import Surface, line_segments, surface_of, unit_circle
 
-TRUTH_COLOUR: Colour = (70, 76, 85)
+TRUTH_COLOUR: Colour = (122, 128, 136)  # seen on white and in the dark
 DIRECTION_COLOURS: tuple[Colour, ...] = ((204, 121, 167), (230, 159, 0))
 _AXIS_COLOURS: tuple[Colour, ...] = ((213, 60, 50), (0, 158, 115), (0, 114, 178))
 _BODY_COLOUR: Colour = (196, 204, 212)

@@ -33,5 +33,5 @@ def drive_page(server: viser.ViserServer, drive: Drive, at_s: float) -> tuple[Pa
     player.move_to(at_s)
     steps_s = np.arange(0.0, drive.duration_s, max(_STEP_S, drive.duration_s / _MOST_STEPS))
     rows = tuple(drive.row_at(float(time_s)) for time_s in steps_s)
-    playing = Playing(rows, player.show_row, drive.duration_s, player.row)
+    playing = Playing(rows, player.show_row, drive.duration_s, player.row, lambda: player.row_panel.content)
     return Page(drive.title, entries, notes, player.pause, playing), player

@@ -1,4 +1,4 @@
-"""``magloc live``: one source followed while its readings come in."""
+"""``magloc live``: one source followed while its readings come in, or several."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from cyclopts import Parameter
 from arrays.io.arguments import Flag
 from arrays.io.errors import LARGEST, InputError, naming
 from magloc.cli.framework import QuietOptions, print_json
-from magloc.cli.options import STREAM, KnownOptions, MotionOptions, Port, naming_options, naming_place, print_note
+from magloc.cli.multi_target.sources_track import SourcesOptions, SourcesWanted
+from magloc.cli.options import STREAM, KnownOptions, Port, naming_options, naming_place, print_note
 
 if TYPE_CHECKING:
     from magloc.live.follower import Follower, LivePoint
@@ -51,10 +52,10 @@ def live(
     replay_speed: float = 1.0,
     page: PageOptions = PageOptions(),
     known: KnownOptions = KnownOptions(),  # noqa: B008 - frozen
-    motion: MotionOptions = MotionOptions(),  # noqa: B008 - frozen
+    motion: SourcesOptions = SourcesOptions(),  # noqa: B008 - frozen
     common: QuietOptions = QuietOptions(),  # noqa: B008 - frozen
 ) -> None:
-    """Follow one source while its readings come in.
+    """Follow one source, or several, while their readings come in.
 
     Every row is answered by one JSON line at once, as of magloc track --jsonl, with latency_ms. Rows are CSV, first a
     header with the columns of a readings file, or JSON objects with these names. Those that are late, lost, doubled or
@@ -76,8 +77,8 @@ def live(
         The live page.
     known : KnownOptions
         What is known of the sensors, of the source when a track starts, and of the ambient field.
-    motion : MotionOptions
-        What is known of the motion.
+    motion : SourcesOptions
+        How many sources there are, and what is known of their motion.
     common : QuietOptions
         Common options.
     """
@@ -87,15 +88,19 @@ def live(
         raise InputError(f"--rest-s: found {rest_s:g}, expected 0 or a positive number.")
     if not 0.0 < replay_speed <= LARGEST:
         raise InputError(f"--replay-speed: found {replay_speed:g}, expected a positive number.")
-    used, model = known.array(array), motion.model()
+    used, wanted = known.array(array), motion.several(known.prior)
     with naming(str(array)):
-        follower = Follower(used, model, prior=known.prior, sensors=known.ids, place=known.where, rest_s=rest_s)
+        if wanted is not None:
+            follower = wanted.follower(used, known.ids, known.where, rest_s)
+        else:
+            model = motion.model()
+            follower = Follower(used, model, prior=known.prior, sensors=known.ids, place=known.where, rest_s=rest_s)
     with ExitStack() as open_page:
         view = open_page.enter_context(shown(follower, page, quiet=common.quiet)) if page.view else None
         try:
             with naming_place(), naming(str(array)):
                 for point in follower.follow(source, replay_speed=replay_speed):
-                    print_point(point)
+                    print_point(point, wanted)
                     if view is not None:
                         view.update(point)
         finally:
@@ -117,9 +122,13 @@ def shown(follower: Follower, page: PageOptions, *, quiet: bool) -> LiveView:
     return view
 
 
-def print_point(point: LivePoint) -> None:
+def print_point(point: LivePoint, wanted: SourcesWanted | None) -> None:
     """Print the line of a point at once."""
     from magloc.tracking.files import json_entry
 
-    print_json(json_entry(point) | {"latency_ms": 1e3 * point.latency_s})
+    latency_ms = 1e3 * point.latency_s
+    if wanted is not None and point.sources is not None:
+        wanted.printed(point.sources, latency_ms=latency_ms)
+        return
+    print_json(json_entry(point) | {"latency_ms": latency_ms})
     sys.stdout.flush()

@@ -230,6 +230,8 @@ def _notes(fixes: Fixes, *, assumed: bool) -> Iterator[str]:
             f"note: in {bodies.sum()} of {n} rows the source is so near that its size matters: a length of a quarter of"
             " its distance is assumed, --body-length-m says it, 0 a point"
         )
+    if fixes.caution:
+        yield f"note: {fixes.caution}, --body-length-m, 0 of a point"
     if fixes.too_near.any():
         yield (
             f"warning: in {fixes.too_near.sum()} of {n} rows the source is too near, or too large, for a dipole: what"

@@ -188,8 +188,8 @@ class KnownOptions:
     max_moment_Am2 : float
         Largest moment that the source can have [A·m²]; solutions with a larger one are left out.
     known_moment_Am2 : float
-        What the modulus of the moment is known to be [A·m²]: counts as one more measurement, in a track only where it
-        starts.
+        What the modulus of the moment is known to be [A·m²]: counts as one more measurement, of a track before its
+        first row, and stays while the moment turns.
     known_moment_sigma_Am2 : float
         1 σ of that [A·m²]; a tenth of the modulus by default.
     place : tuple of 3 floats

@@ -96,8 +96,8 @@ def survey(
     scheduler : str
         Address of a dask scheduler (tcp://HOST:PORT) whose workers search the tiles of a large survey.
     out : Path
-        Folder for targets.csv, residual.csv, reach.csv (the least moment seen) and the map; of a large survey it keeps
-        what is done, until all is: the same command goes on with one that was interrupted.
+        Folder for targets.csv, residual.csv, reach.csv (the least moment seen), the map and the lines past the targets;
+        of a large survey it keeps what is done, until all is: the same command goes on with one that was interrupted.
     html : Path
         Write the survey in three dimensions, lines, ground and targets, as one page that needs no server.
     json : bool
@@ -165,9 +165,10 @@ def _naming(readings: str) -> Iterator[None]:
 
 
 def _write(found: Survey, folder: Path) -> None:
-    """targets.csv, residual.csv, reach.csv, and the map."""
+    """targets.csv, residual.csv, reach.csv, the map, and the lines past the targets."""
     from arrays.io.csv import write_columns
     from magloc.plots import save
+    from magloc.plots.profiles import survey_profiles
     from magloc.plots.surveys import survey_figure
     from magloc.surveying.files import columns_of_survey, reach_columns, residual_columns
 
@@ -176,4 +177,5 @@ def _write(found: Survey, folder: Path) -> None:
     write_columns(residual_columns(found), folder / "residual.csv")
     write_columns(reach_columns(found), folder / "reach.csv")
     save(survey_figure(found), folder / "survey.png")
-    print_note(f"wrote targets.csv, residual.csv, reach.csv and survey.png into {folder}/")
+    save(survey_profiles(found), folder / "profiles.png")
+    print_note(f"wrote targets.csv, residual.csv, reach.csv, survey.png and profiles.png into {folder}/")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
@@ -25,15 +24,13 @@ from magloc.cli.moments.known_path import (
     write_moment_track,
     write_moment_tracks,
 )
-from magloc.cli.multi_target.sources_track import SourcesOutputs, SourcesWanted, follow_sources, stream_sources
+from magloc.cli.multi_target.sources_track import SourcesOptions, SourcesOutputs, follow_sources, stream_sources
 from magloc.cli.options import (
     STREAM,
     KnownOptions,
     MapOptions,
-    MotionOptions,
     ambient_field,
     naming_place,
-    number_of_sources,
     print_note,
     refuse_not_positive,
 )
@@ -41,7 +38,6 @@ from magloc.cli.options import (
 if TYPE_CHECKING:
     from arrays.array import SensorArray
     from magloc.ambient import Place
-    from magloc.localization.fit.prior import SourcePrior
     from magloc.readings import Readings
     from magloc.signature.path import ObjectPath
     from magloc.tracking.consistency import Consistency
@@ -53,12 +49,12 @@ if TYPE_CHECKING:
 
 # Two vector sensors have no more: too few for the six numbers of a source in one row.
 _FEW_CHANNELS = 6
-_USE_SURVEY = "; sources at rest that few sensors move past are found by magloc survey"
+_USE_SURVEY = "sources at rest that few sensors move past are found by magloc survey"
 
 
 @Parameter(name="*", group="Motion")
 @dataclass(frozen=True)
-class PathOptions(MotionOptions):
+class PathOptions(SourcesOptions):
     """What is known of the motion.
 
     Parameters
@@ -87,24 +83,9 @@ class PathOptions(MotionOptions):
         How wrong a known path may be.
     """
 
-    sources: str | None = None
     position: list[Vector] | None = None
     object_path: Path | None = None
     error: PathErrorOptions = field(default_factory=PathErrorOptions)
-
-    def several(self, prior: SourcePrior) -> SourcesWanted | None:
-        """What several sources are asked for; None: one source is followed on its own."""
-        if self.sources is None:
-            return None
-        if self.motion is not None:
-            raise InputError(f"--motion: found {self.motion} together with --sources, expected one of them.")
-        refuse_not_positive(self, "speed_m_s", "turn_deg_s", "correlation_s")
-        motion = magloc.FreeMotion(speed_m_s=self.speed_m_s)
-        if self.turn_deg_s is not None:
-            motion = replace(motion, turn_rad_s=math.radians(self.turn_deg_s))
-        if self.correlation_s is not None:
-            motion = replace(motion, correlation_s=self.correlation_s)
-        return SourcesWanted(number_of_sources(self.sources), motion, prior)
 
     def known_path(self) -> ObjectPath | list[Vector] | None:
         """Where the source is known to be, None where that is to be found."""
@@ -274,6 +255,9 @@ def track(
         write_moment_track(moments, readings, known, outputs)
         return
     printed = jsonl and not smooth and not rows.background
+    few = used.n_channels <= _FEW_CHANNELS and rows.array_rotation is not None
+    if few and not common.quiet:
+        print_note(_USE_SURVEY)
     with progress(len(rows), "rows", quiet=common.quiet) as advance, naming(str(array)):
         if printed:
             tracker = magloc.Tracker(with_stated_pose(used, rows), model, prior=prior)
@@ -282,8 +266,7 @@ def track(
             found = magloc.track(used, rows, motion=model, smooth=smooth, prior=prior, progress=advance)
     if not any(point.is_on_track for point in found):
         _print_track(found, None, json=json, jsonl=jsonl, printed=printed)
-        few = used.n_channels <= _FEW_CHANNELS and rows.array_rotation is not None
-        raise _no_track(str(readings), found.status, _USE_SURVEY if few else "")
+        raise _no_track(str(readings), found.status, f"; {_USE_SURVEY}" if few else "")
     result = None if truth is None else found.consistency(magloc.read_truth(truth))
     maps.write(found, known.place)
     if out is not None:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Generator, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -24,12 +26,17 @@ from magloc.measurement.pose import with_stated_pose
 from magloc.readings import EXPECTED_HEADER, Readings, log_format, without_saturated
 from magloc.tracking.batch import compiled_motion, next_points
 from magloc.tracking.motion import MotionModel, RandomWalk
+from magloc.tracking.multi_target.motion import FreeMotion
+from magloc.tracking.multi_target.results import SourcesPoint
+from magloc.tracking.multi_target.tracker import SourcesTracker
 from magloc.tracking.results import Row, TrackPoint, rows_of
 from magloc.tracking.track import SPEED_M_S, TURN_RAD_S
 from magloc.tracking.tracker import Tracker
 
 _LOG = logging.getLogger(__name__)
 _ROWS_TO_LOAD = 3
+# Rows that may wait while several sources are followed before all but the newest are skipped.
+_MOST_WAITING = 200
 RESTING, STOPPED, SKIPPED = "rest: the background is taken", "stopped", "skipped: newer rows were waiting"
 Source = str | Iterable["Readings | Mapping[str, float | None] | str"]
 
@@ -50,6 +57,9 @@ class LivePoint(TrackPoint):
         From the arrival of the row to this answer.
     tally : Tally
         Of the whole stream, as it is now.
+    sources : SourcesPoint, optional
+        What is known of several sources, where they are followed: time and status are then all that the point itself
+        says.
 
     Examples
     --------
@@ -63,19 +73,23 @@ class LivePoint(TrackPoint):
     row: Row = field(kw_only=True)
     latency_s: float = field(kw_only=True)
     tally: Tally = field(kw_only=True)
+    sources: SourcesPoint | None = None
 
 
 _OF_POINT = tuple(each.name for each in fields(TrackPoint))
 
 
 class Follower:
-    """Follows one source through a stream that may be stopped, started and tared meanwhile, from another thread too.
+    """Follows sources through a stream that may be stopped, started and tared meanwhile, from another thread too.
 
     Parameters
     ----------
     array : SensorArray
-    motion : MotionModel, optional
-        By default :class:`magloc.RandomWalk` of 0.5 m/s and 5°/s.
+    motion : MotionModel or FreeMotion, optional
+        By default :class:`magloc.RandomWalk` of 0.5 m/s and 5°/s; of several sources it is a
+        :class:`magloc.FreeMotion`.
+    sources : int or "auto", optional
+        How many sources are followed in one filter, as by :class:`magloc.SourcesTracker`; by default one on its own.
     prior : SourcePrior
         Bounds for the fixes that start a track, in the array's frame.
     sensors : sequence of str, optional
@@ -103,8 +117,9 @@ class Follower:
     def __init__(
         self,
         array: SensorArray,
-        motion: MotionModel | None = None,
+        motion: MotionModel | FreeMotion | None = None,
         *,
+        sources: int | Literal["auto"] | None = None,
         prior: SourcePrior = NOTHING_KNOWN,
         sensors: Sequence[str] | None = None,
         place: Place | None = None,
@@ -112,10 +127,12 @@ class Follower:
     ) -> None:
         check_not_negative(rest_s=rest_s)
         self.array, self.prior, self.tally = array, prior, Tally()
-        self.motion = RandomWalk(SPEED_M_S, TURN_RAD_S) if motion is None else motion
+        self._motion, self._sources = motion, sources
+        if sources is not None or isinstance(motion, FreeMotion):
+            self._new_tracker(array)  # whether the array can tell them
         self._sensors, self._place = sensors, place
         self._in_field: SensorArray | None = None
-        self._tracker: Tracker | None = None
+        self._tracker: Tracker | SourcesTracker | None = None
         self._clock = Clock(self.tally, self.restart)
         self._background: Background | None = None
         self._rest_rows: list[Row] = []
@@ -162,9 +179,21 @@ class Follower:
     def _load(self) -> None:
         """Load what a track needs, by following a made source, while nobody waits yet."""
         values_T = predicted_channels(self.array, *suitable_dipole(self.array)) + self.array.channel_offset_T
-        tracker = Tracker(self.array, self.motion, prior=self.prior)
+        tracker = self._new_tracker(self.array)
         for i in range(_ROWS_TO_LOAD):
-            next_points(tracker, [Row(float(i), values_T)])
+            _next_points(tracker, [Row(float(i), values_T)])
+
+    def _new_tracker(self, array: SensorArray) -> Tracker | SourcesTracker:
+        """A filter of what is to be followed."""
+        motion = self._motion
+        if self._sources is None:
+            if isinstance(motion, FreeMotion):
+                raise ValueError("Input motion must be a motion of one source where sources are not given.")
+            return Tracker(array, RandomWalk(SPEED_M_S, TURN_RAD_S) if motion is None else motion, prior=self.prior)
+        motion = FreeMotion() if motion is None else motion
+        if not isinstance(motion, FreeMotion):
+            raise ValueError(f"Input motion must be a FreeMotion for several sources; instead received {motion}.")
+        return SourcesTracker(array, sources=self._sources, motion=motion, prior=self.prior)
 
     def _follow_stream(self, stream: Stream, *, waits: bool) -> Generator[LivePoint]:
         parser = RowParser(self.array, stream.name, self.tally, self._sensors)
@@ -200,10 +229,16 @@ class Follower:
         while rows:
             answers = self._next_answers(rows, waits=waits)
             for row, point in answers:
-                self.tally.tracked += point.is_on_track
                 latency_s = time.perf_counter() - arrived
                 self.tally.latencies_s.append(latency_s)
-                known = {name: getattr(point, name) for name in _OF_POINT}
+                known: dict[str, Any]
+                if isinstance(point, SourcesPoint):
+                    self.tally.tracked += bool(point.tracks)
+                    of_all = {"nis": point.chi2, "nis_dof": point.dof, "dropped_sensors": point.dropped_sensors}
+                    known = {"time_s": point.time_s, "status": point.status, "sources": point, **of_all}
+                else:
+                    self.tally.tracked += point.is_on_track
+                    known = {name: getattr(point, name) for name in _OF_POINT}
                 yield LivePoint(**known, row=row, latency_s=latency_s, tally=self.tally)
             rows = rows[len(answers) :]
 
@@ -223,23 +258,32 @@ class Follower:
         return [row for one in used for row in rows_of(one)]  # whose motion is that since the row before
 
     @one_blas_thread
-    def _next_answers(self, rows: Sequence[Row], *, waits: bool) -> list[tuple[Row, TrackPoint]]:
+    def _next_answers(self, rows: Sequence[Row], *, waits: bool) -> list[tuple[Row, TrackPoint | SourcesPoint]]:
         """The first of the rows, or some of them, with what is known of the source there."""
         if self._stopped:
-            return _without_track(rows, STOPPED)
+            return self._without_track(rows, STOPPED)
         if self._rest_s and self._rests(rows[0]):
-            return _without_track(rows[:1], RESTING)
+            return self._without_track(rows[:1], RESTING)
         if self._tracker is None:
             assert self._in_field is not None
             array = self._in_field if self._background is None else self._background.array(self._in_field)
-            self._tracker = Tracker(array, self.motion, prior=self.prior)
-        is_quick = self._tracker.is_tracking and compiled_motion(self._tracker) is not None
+            self._tracker = self._new_tracker(array)
+        if isinstance(self._tracker, SourcesTracker):
+            is_quick = len(rows) <= _MOST_WAITING  # where one is born, some wait
+        else:
+            is_quick = self._tracker.is_tracking and compiled_motion(self._tracker) is not None
         if len(rows) > 1 and not waits and not is_quick:
             self.tally.skipped += len(rows) - 1
-            return _without_track(rows[:-1], SKIPPED)
+            return self._without_track(rows[:-1], SKIPPED)
         if self._background is not None:
             rows = [self._background.subtracted(row) for row in rows]
-        return list(zip(rows, next_points(self._tracker, rows), strict=False))
+        return list(zip(rows, _next_points(self._tracker, rows), strict=False))
+
+    def _without_track(self, rows: Sequence[Row], status: str) -> list[tuple[Row, TrackPoint | SourcesPoint]]:
+        """Rows of which nothing is asked."""
+        if self._sources is None:
+            return [(row, TrackPoint(row.time_s, status=status)) for row in rows]
+        return [(row, SourcesPoint(row.time_s, (), status, math.nan, 0)) for row in rows]
 
     def _rests(self, row: Row) -> bool:
         """Whether a row belongs to the rest; the first one behind it makes the background of it."""
@@ -257,20 +301,22 @@ class Follower:
         return False
 
 
-def _without_track(rows: Sequence[Row], status: str) -> list[tuple[Row, TrackPoint]]:
-    return [(row, TrackPoint(row.time_s, status=status)) for row in rows]
+def _next_points(tracker: Tracker | SourcesTracker, rows: Sequence[Row]) -> Sequence[TrackPoint | SourcesPoint]:
+    """What is known at the first of the rows, or at some of them."""
+    return [tracker.update(rows[0])] if isinstance(tracker, SourcesTracker) else next_points(tracker, rows)
 
 
 def track(
     source: Source,
     array: SensorArray,
     *,
-    motion: MotionModel | None = None,
+    motion: MotionModel | FreeMotion | None = None,
+    sources: int | Literal["auto"] | None = None,
     prior: SourcePrior = NOTHING_KNOWN,
     rest_s: float = 0.0,
     replay_speed: float = 1.0,
 ) -> Generator[LivePoint]:
-    """Follow one source while its readings come in.
+    """Follow one source, or several, while their readings come in.
 
     Rows are CSV, whose first line is a header with the columns of a readings file, or JSON objects with these names.
     Those that are late, doubled or garbled are counted in the tally and left out; none ends the stream.
@@ -282,8 +328,12 @@ def track(
         ``"serial:DEVICE@BAUD"`` (needs the extra ``serial``) or ``"replay:FILE"`` (a readings file in its own time); or
         rows: :class:`magloc.Readings`, mappings from the names of columns to numbers, or lines of text.
     array : SensorArray
-    motion : MotionModel, optional
-        By default :class:`magloc.RandomWalk` of 0.5 m/s and 5°/s.
+    motion : MotionModel or FreeMotion, optional
+        By default :class:`magloc.RandomWalk` of 0.5 m/s and 5°/s; of several sources it is a
+        :class:`magloc.FreeMotion`.
+    sources : int or "auto", optional
+        How many sources are followed in one filter, as by :class:`magloc.SourcesTracker`: points then have them in
+        `sources`. By default it is one on its own.
     prior : SourcePrior
         Bounds for the fixes that start a track, in the array's frame.
     rest_s : float
@@ -311,4 +361,5 @@ def track(
     >>> point.status, round(float(point.position_m[2]), 1), point.tally.lost
     ('tracked', -0.6, 0)
     """
-    return Follower(array, motion, prior=prior, rest_s=rest_s).follow(source, replay_speed=replay_speed)
+    follower = Follower(array, motion, sources=sources, prior=prior, rest_s=rest_s)
+    return follower.follow(source, replay_speed=replay_speed)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from magloc.localization.fit.fixes import Fixes
+from magloc.localization.fit.fixes import BODY_MATTERS, Fixes
 from magloc.localization.fit.results import Fix, Solution, Source
 
 
@@ -24,6 +24,7 @@ def _entry(fix: Fix, joint: bool) -> dict[str, object]:
         "too_near": fix.too_near,
         "misfit": fix.misfit,
         "body_length_m": fix.body_length_m,
+        "body_factor": fix.body_factor if fix.body_factor > BODY_MATTERS else None,
     }
     return entry | {name: value for name, value in flags.items() if value}
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -22,6 +23,7 @@ from magloc.averages import averaging_array, complete_rows
 from magloc.blas_threads import one_blas_thread
 from magloc.conditioning import NO_BACKGROUND
 from magloc.fields.multipole import check_body_length
+from magloc.localization.body_errors import body_covariances
 from magloc.localization.dipole_validity import too_near
 from magloc.localization.fault_exclusion import without_faulty_sensors
 from magloc.localization.fit.columns import Solutions, in_stable_order
@@ -166,7 +168,13 @@ class Locator:
         if (fixes.solutions.n_sources > 1).any() and not isinstance(self._search, MomentSearch):
             fixes = replace(fixes, solutions=in_stable_order(fixes.solutions))
         near = too_near(self.array, fixes, readings, ambient, self.body_length_m)
-        return replace(fixes, time_s=times, too_near=near)
+        fixes = replace(fixes, time_s=times, too_near=near)
+        if self.body_length_m is not None:
+            return fixes
+        known_place = isinstance(self._search, MomentSearch)
+        return replace(
+            fixes, bodies=partial(body_covariances, self.array, fixes, readings, ambient, known_place=known_place)
+        )
 
     def _credible(self, index: IntArray, readings: FloatArray, ambient: FloatArray | None) -> Fixes:
         """Fixes of some of the rows, without the sensors that contradict all others."""

@@ -21,6 +21,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "source_tracks": "magloc.plots.tracks:sources_figure",
         "sources": "magloc.plots.maps",
         "survey": "magloc.plots.surveys:survey_figure",
+        "survey_profiles": "magloc.plots.profiles",
         "track": "magloc.plots.tracks:track_figure",
         "write": "magloc.plots.style",
     },

@@ -12,6 +12,7 @@ from magloc.plots.localization import fixes as fixes
 from magloc.plots.localization import residuals as residuals
 from magloc.plots.maps import convergence as convergence
 from magloc.plots.maps import sources as sources
+from magloc.plots.profiles import survey_profiles as survey_profiles
 from magloc.plots.style import save as save
 from magloc.plots.style import write as write
 

@@ -24,9 +24,13 @@ _DECADES = 10.0 ** np.arange(-9, 10)
 _LIGHT_FROM = 0.65  # share of the colours from which on a line has to be black to be seen
 
 
-def name_accuracy(ax: Axes, scenario: BoundScenario) -> None:
-    """The thick line, for the legend."""
-    ax.plot([], [], color=style.ORANGE, lw=1.8, label=f"required: {style.length_text(scenario.accuracy_m)}")
+def name_accuracy(ax: Axes, scenario: BoundScenario, values_m: FloatArray) -> None:
+    """The thick line, for the legend; where no value (…) is on its other side, this in words."""
+    known = values_m[np.isfinite(values_m)]
+    met, words = known <= scenario.accuracy_m, f"required: {style.length_text(scenario.accuracy_m)}"
+    if met.all() or not met.any():
+        words += f", met {'everywhere' if met.all() else 'nowhere'}"
+    ax.plot([], [], color=style.ORANGE, lw=1.8, label=words)
 
 
 def sigma_unit(values_m: FloatArray, most_m: float) -> tuple[str, float]:

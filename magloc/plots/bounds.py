@@ -134,7 +134,7 @@ def bound_slices(dataset: xr.Dataset, scenario: BoundScenario) -> Figure:
             _slice(ax, dataset, part, norm, accuracy, per_m)
             _sensors(ax, scenario, plane, per_m)
             if accuracy is not None:
-                name_accuracy(ax, scenario)
+                name_accuracy(ax, scenario, values_m)
             style.dress(ax, f"{plane[0]} [{unit}]", f"{plane[1]} [{unit}]", f"plane {plane}" if row is axes[0] else "")
             ax.grid(visible=False)
         colour_bar(figure, row[-1], norm, label.format(of_sigma))
@@ -183,7 +183,7 @@ def bound_sphere(dataset: xr.Dataset, scenario: BoundScenario, range_m: float) -
         for ax, case, values in zip(row, cases, panels, strict=True):
             _sphere(ax, sphere, values, norm, levels, accuracy, f"{label.split(' [')[0]}, {_CASES[case][0]}")
             if accuracy is not None:
-                name_accuracy(ax, scenario)
+                name_accuracy(ax, scenario, values / factor)
             if not case:
                 _moment_marks(ax, scenario)
         mark_lines(colour_bar(figure, row[-1], norm, label), levels, accuracy, norm)

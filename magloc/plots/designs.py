@@ -30,6 +30,7 @@ _LINES = {
 }
 # More sensors than this would hide behind their names.
 _MOST_NAMED = 12
+_FEWEST_TICKS = 3
 _ELEVATION, _AZIMUTH = 22.0, -55.0
 # About the azimuth, and behind the array [°]: the first of them that is clearest.
 _TURNS = (0.0, -15.0, 15.0, 90.0, -90.0, 180.0, 75.0, 105.0, -75.0, -105.0, 165.0, 195.0)
@@ -56,7 +57,7 @@ def design(result: Design, seed: int = 0) -> Figure:
     scene = figure.add_axes((0.025, 0.06, 0.36, 0.84), projection="3d")
     _scene(scene, result)
     ax = figure.add_axes((0.5, 0.15, 0.205, 0.68))
-    relative = figure.add_axes((0.785, 0.15, 0.205, 0.68))
+    relative = figure.add_axes((0.78, 0.15, 0.2, 0.68))
     sources = random_sample(result.task, _N_SOURCES, np.random.default_rng(seed))
     distances = _distances(result)
     arrays = _shown(result)
@@ -73,15 +74,14 @@ def design(result: Design, seed: int = 0) -> Figure:
         style.dress(panel, "distance of the source [m]", up)
         panel.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
         panel.xaxis.set_minor_formatter("")
-        ticks = [d for d in (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200) if distances[0] <= d <= distances[-1]]
-        panel.set_xticks(ticks)
+        panel.set_xticks(_ticks(distances[0], distances[-1]))
     style.logarithmic(ax, curves)
     relative.set_ylim(bottom=0.0)
     style.legend(
         figure,
         handles=ax.get_legend_handles_labels()[0],
         loc="upper right",
-        bbox_to_anchor=(1.0, 0.92),
+        bbox_to_anchor=(0.985, 0.92),
         ncols=5,
         columnspacing=0.8,
     )
@@ -142,7 +142,7 @@ def _shown(result: Design) -> list[Judgement]:
 
 def _headline(result: Design) -> str:
     own = result.judged[0]
-    text = f"'{result.task.name}': {result.task.criterion} of the σ of the range {own.criterion_m:.3g} m"
+    text = f"'{result.task.name}': {result.task.criterion} of the σ of the range {style.length_text(own.criterion_m)}"
     others = [other for other in _shown(result)[1:] if other.fits]
     if not others:
         return text
@@ -151,6 +151,16 @@ def _headline(result: Design) -> str:
     whose = {BEST_START: f"that of its {first.name}", EVEN: f"an {EVEN} of the same volume"}
     what = whose.get(first.name, f"a {first.name} of the same span")
     return f"{text}, {100.0 * abs(first.gain):.0f} % {sign} {what}"
+
+
+def _ticks(first_m: float, last_m: float) -> list[float]:
+    """Round distances between two, with more to a decade where they would be few."""
+    for steps in ((1, 2, 5), (1, 1.5, 2, 3, 4, 5, 6, 8)):
+        every = [step * 10.0**decade for decade in range(-4, 5) for step in steps]
+        ticks = [tick for tick in every if first_m * (1.0 - 1e-9) <= tick <= last_m * (1.0 + 1e-9)]
+        if len(ticks) >= _FEWEST_TICKS:
+            break
+    return ticks
 
 
 def _name(result: Design, judged: Judgement) -> str:

@@ -239,7 +239,7 @@ def fix_figure(columns: FixColumns, sensors_m: FloatArray, truth_m: FloatArray |
             style.legend(figure, handles=ax.get_legend_handles_labels()[0], loc="outside upper center", ncols=6)
     spread = figure.add_subplot(grid[1, :])
     if (columns.covariance[:, :3, :3] > 0.0).any():
-        _spread(spread, columns, truth_m, unit, per_m)
+        _spread(spread, columns, truth_m)
     else:
         _moments(spread, columns)
     squares = figure.add_subplot(grid[2, :], sharex=spread)
@@ -332,10 +332,13 @@ def _plane(
     ax.plot(*sensors[-1][:, [a, b]].T, "^", color="white", mec=style.BLACK, ms=4, mew=0.6, label="sensors", zorder=2.6)
 
 
-def _spread(ax: Axes, columns: FixColumns, truth_m: FloatArray | None, unit: str, per_m: float) -> None:
+def _spread(ax: Axes, columns: FixColumns, truth_m: FloatArray | None) -> None:
     """Standard deviation of the position of every source by its covariance, and its distance from the truth."""
-    sigma = per_m * np.sqrt(np.trace(columns.covariance[:, :3, :3], axis1=1, axis2=2))
-    error = np.full_like(sigma, np.nan) if truth_m is None else per_m * distances_from_truth(columns, truth_m)
+    sigma_m = np.sqrt(np.trace(columns.covariance[:, :3, :3], axis1=1, axis2=2))
+    error_m = np.full_like(sigma_m, np.nan) if truth_m is None else distances_from_truth(columns, truth_m)
+    both = np.concatenate([sigma_m, error_m])
+    unit, per_m = style.length_unit(float(np.max(both[np.isfinite(both)], initial=0.0)) or 1.0)
+    sigma, error = per_m * sigma_m, per_m * error_m
     style.logarithmic(ax, [sigma, error])
     style.dress(ax, "", f"distance [{unit}]", "certainty" if truth_m is None else "error and certainty")
     size = style.dot_size(len(sigma))

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from magloc.surveying.results import Survey, Target
 
 _FLAT = 1e-6  # across over along a line
+_FEWEST_TICKS = 3
 _GAP = 3.0  # over the usual step between places: nothing is known across it
 _ACROSS, _UP = "x, east [m]", "y, north [m]"
 
@@ -47,7 +48,7 @@ def survey_figure(found: Survey) -> Figure:
     >>> figure = magloc.plots.survey(magloc.survey(field.array, field.readings))
     """
     x, y, _ = found.rows.place_m.T
-    height = style.WIDTH_IN * 0.5 * float(np.clip(np.ptp(y) / max(np.ptp(x), 1e-9), 0.4, 1.6)) + 1.0
+    height = style.WIDTH_IN * 0.5 * float(np.clip(np.ptp(y) / max(np.ptp(x), 1e-9), 0.12, 1.6)) + 1.0
     figure = style.new_figure(2.0 * height)
     rows = found.rows.thinned()
     both, reach = figure.subplots(2, 2, sharex=True, sharey=True)
@@ -79,7 +80,17 @@ def _draw_reach(figure: Figure, ax: Axes, places_m: FloatArray, moments_Am2: Flo
     sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
     between.set_mask((sides > _GAP * np.median(sides)).any(axis=1))
     surface = ax.tripcolor(between, moments_Am2, norm="log", cmap="viridis", shading="gouraud", rasterized=True)
-    _draw_bar(figure, ax, surface, np.geomspace(moments_Am2.min(), moments_Am2.max(), 4).tolist(), "A·m²")
+    _draw_bar(figure, ax, surface, _round_moments(float(moments_Am2.min()), float(moments_Am2.max())), "A·m²")
+
+
+def _round_moments(least: float, most: float) -> list[float]:
+    """1, 2 and 5 of every decade between two; of many decades 1 alone, and the ends where there is none."""
+    for steps in ((1.0,), (1.0, 2.0, 5.0)):
+        every = [step * 10.0**decade for decade in range(-12, 13) for step in steps]
+        ticks = [tick for tick in every if least <= tick <= most]
+        if len(ticks) >= _FEWEST_TICKS:
+            return ticks
+    return ticks or [least, most]
 
 
 def _draw_values(figure: Figure, ax: Axes, places_m: FloatArray, values_nT: FloatArray) -> None:
@@ -94,7 +105,7 @@ def _draw_values(figure: Figure, ax: Axes, places_m: FloatArray, values_nT: Floa
 
 def _draw_bar(figure: Figure, ax: Axes, shown: Collection, ticks: Sequence[float], unit: str) -> None:
     bar = figure.colorbar(shown, ax=ax, orientation="horizontal", shrink=0.8, aspect=30)
-    bar.set_ticks(ticks, labels=[f"{float(f'{tick:.2g}'):g}" for tick in ticks])
+    bar.set_ticks(ticks, labels=[f"{float(f'{tick:.2g}'):g}".replace("-", "\N{MINUS SIGN}") for tick in ticks])
     bar.minorticks_off()
     bar.ax.tick_params(labelsize=style.SMALL_LETTERS)
     bar.set_label(unit, fontsize=style.LETTERS)
@@ -106,4 +117,6 @@ def _draw_target(ax: Axes, target: Target, *, named: bool) -> None:
     ax.add_patch(style.ellipse95(target.position_m[:2], target.covariance[:2, :2], edgecolor=style.BLACK))
     if named:
         words = f"{target.id}: {target.depth_m:.1f} m"
-        ax.annotate(words, place, (3.0, 3.0), textcoords="offset points", fontsize=5.5, zorder=4)
+        low, high = ax.get_xlim()
+        side, aligned = (-3.0, "right") if place[0] > high - 0.15 * (high - low) else (3.0, "left")
+        ax.annotate(words, place, (side, 3.0), textcoords="offset points", ha=aligned, fontsize=5.5, zorder=4)

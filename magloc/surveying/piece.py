@@ -22,10 +22,11 @@ from magloc.surveying.reach import least_moments
 from magloc.surveying.rounds import AT_LAST, MOST_ROUNDS, Model, found_in
 from magloc.surveying.search import PITCH, SearchGrid
 from magloc.surveying.targets import targets_of
-from magloc.surveying.tiles import SEAM_M, Tile
+from magloc.surveying.tiles import Tile
 
 OF_ROWS = ("place_m", "anomaly_T", "residual_T")
 _FIRST_ROUNDS = 4  # until the clock is looked at
+_BESIDE = 0.6  # of the distance to the deepest sources
 _DEEPEST = 4.0
 _MARGIN_M = 1.0
 _LARGEST_MOMENT_Am2 = 300.0
@@ -88,8 +89,8 @@ class Piece:
         Of the anomalies.
     geology_T : float
         How strong the field of the ground is expected to be.
-    known, outside : Sources
-        Of the piece, and others whose field reaches it.
+    known, beside, outside : Sources
+        Of the tile, of its margin, and others whose field reaches it.
     """
 
     array: SensorArray
@@ -99,20 +100,24 @@ class Piece:
     offset_T: FloatArray
     geology_T: float
     known: Sources
+    beside: Sources
     outside: Sources
 
     def model(self) -> Model:
-        """Of the rows, with the field of sources outside."""
+        """Of the rows, with the field of sources that are not of the tile."""
         record, errors = record_of(self.array, self.readings)
         record = replace(record, values_T=record.values_T - self.offset_T)
-        if len(self.outside):
-            record = record.beside(self.outside.position_m, self.outside.moment_Am2)
+        others = self.beside.with_more(self.outside)
+        if len(others):
+            record = record.beside(others.position_m, others.moment_Am2)
         bounds = self.ground.bounds(record)
         layer = Layer.below(record, self.ground.shortest_geology_m, self.geology_T)
         x, y = (bounds.high_m - bounds.low_m)[:2]
-        model = Model(record, errors, layer, Drift(), bounds, self.ground.threshold, self.ground.body_length_m)
+        known = self.ground.threshold, self.ground.body_length_m, self.beside
+        model = Model(record, errors, layer, Drift(), bounds, *known)
         height = model.nearest_m
-        numbers = (self.groups(record, AT_LAST * height)[-1] + 1) * record.array.n_channels * len(layer.places_m)
+        measurements = (self.groups(record, AT_LAST * height)[-1] + 1) * record.array.n_channels
+        numbers = max(measurements, len(layer.places_m)) * len(layer.places_m)
         if numbers > _MOST_NUMBERS or x * y / (max(height, 0.3) / PITCH) ** 2 > _MOST_PLACES:
             raise ValueError(
                 f"Input readings must be cut into smaller pieces; instead received {len(record)} rows over {x:.3g} m by"
@@ -131,22 +136,23 @@ class Piece:
 @one_blas_thread
 def strongest_in(piece: Piece) -> Arrays:
     """The strongest sources, after some rounds."""
-    return _rounds_in(piece, _FIRST_ROUNDS, math.inf)
+    return _rounds_in(piece, _FIRST_ROUNDS)
 
 
 @one_blas_thread
 def sources_in(piece: Piece) -> Arrays:
-    """All sources that are significant; of those farther beside the tile its neighbours tell."""
-    return _rounds_in(piece, MOST_ROUNDS, 1.0)
+    """All sources that are significant; of those beside the tile its neighbours tell."""
+    return _rounds_in(piece, MOST_ROUNDS)
 
 
-def _rounds_in(piece: Piece, most: int, beside: float) -> Arrays:
-    """Sources that are looked for in the tile and beside it, as far as the deepest are from the sensors, or a share."""
+def _rounds_in(piece: Piece, most: int) -> Arrays:
+    """Sources of the tile, which are looked for beside it too: what is strong there makes skirts here."""
     model = piece.model()
-    reach = beside * (model.record.height_m - model.bounds.low_m[2])
+    reach = _BESIDE * (model.record.height_m - model.bounds.low_m[2])
     low, high = np.append(piece.tile.low_m - reach, -math.inf), np.append(piece.tile.high_m + reach, math.inf)
     grid = SearchGrid.below(model.record, np.maximum(model.bounds.low_m, low), np.minimum(model.bounds.high_m, high))
-    return dict(vars(found_in(model, partial(piece.groups, model.record), grid, piece.known, most)))
+    groups = partial(piece.groups, model.record)
+    return dict(vars(found_in(model, groups, grid, piece.known, most, piece.tile.holds)))
 
 
 @one_blas_thread
@@ -162,13 +168,13 @@ def targets_in(piece: Piece) -> Arrays:
         record.along_ambient(record.values_T),
         record.along_ambient(left),
     )
-    own, which = piece.tile.own, piece.tile.inside_m(fit.sources.position_m) > -SEAM_M
+    own, which = piece.tile.own, piece.tile.holds(fit.sources.position_m)
     extent = piece.tile.extent_m(lines[0][own, :2])
     places, moments = least_moments(model, fit.sources, groups, *extent, piece.ground.ground_m)
     return {
         "reach_m": places,
         "reach_Am2": moments,
-        **targets_of(model, fit, background, piece.ground.ground_m, which),
+        **targets_of(model, fit, background, groups, piece.ground.ground_m, which),
         **{name: values[own] for name, values in zip(OF_ROWS, lines, strict=True)},
         "chi2": np.array(fit.chi2),
         "size": np.array(fit.residual.size),

@@ -23,6 +23,8 @@ FEWEST_ROWS = 20
 _WILD, _NEIGHBOURS = 15.0, 20  # over the medians of all rows and of so many on either side
 _MOST_APART = 2.0  # ratio of the fields at two places a day trip apart: more is another unit
 _MOST_WILD = 0.25  # of all readings: more are not
+_FASTEST_M_S = 300.0
+_BLOCK = 2**18  # rows that are looked at together
 _LONGEST_RUN = 25  # of the same reading, over what the liveliest sensor repeats
 
 
@@ -35,13 +37,8 @@ def whole_rows(array: SensorArray, readings: Readings, base: Readings | None = N
         raise ValueError("Input readings must have the pose of the array in every row; instead received none.")
     check_magnitudes(array)
     readings = without_saturated(readings, array)
-    stuck = stuck_readings(array, readings.values_T)
-    owner = array.channel_sensor
-    moduli = np.linalg.norm(array.calibrated_field(readings.values_T), axis=2)  # which no attitude changes
-    scalar = array.channel_is_scalar
-    moduli[:, owner[scalar]] = readings.values_T[:, scalar]
-    wild = wild_readings(moduli) & ~stuck
-    missing = np.isnan(moduli) | wild | stuck
+    blocks = (readings.values_T[first : first + _BLOCK] for first in range(0, max(len(readings), 1), _BLOCK))
+    stuck, wild, missing = map(np.concatenate, zip(*(_unusable(array, values) for values in blocks), strict=True))
     order = np.argsort(missing.sum(axis=0), kind="stable")
     worth = [(i + 1) * int((~missing[:, order[: i + 1]].any(axis=1)).sum()) for i in range(len(order))]
     kept = np.sort(order[: len(worth) - int(np.argmax(worth[::-1]))])
@@ -56,14 +53,31 @@ def whole_rows(array: SensorArray, readings: Readings, base: Readings | None = N
         _LOG.warning(f"{wild[:, kept].sum()} readings leap and come back: their rows are left out")
     if whole.sum() < FEWEST_ROWS:
         raise ValueError(f"Input readings must have {FEWEST_ROWS} whole rows or more; instead received {whole.sum()}.")
-    readings = replace(readings, values_T=readings.values_T[:, np.isin(owner, kept)])[whole]
+    if len(kept) < array.n_sensors:
+        readings = replace(readings, values_T=readings.values_T[:, np.isin(array.channel_sensor, kept)])
+    readings = _some(readings, whole)
     if not (np.diff(readings.time_s) > 0.0).all():
         raise ValueError("Input readings must be in order of time; instead received others.")
+    readings = _some(readings, ~leaping_rows(readings))
     array = replace(array, sensors=tuple(array.sensors[i] for i in kept))
     array = with_stated_pose(array, readings)
     array = replace(array, pose=UNSTATED) if array.pose is None else array
     ambient = _ambient_T(array, readings)
     return array, replace(readings, ambient_T=ambient if base is None else varying(ambient, readings.time_s, base))
+
+
+def _some(readings: Readings, which: BoolArray) -> Readings:
+    return readings if which.all() else readings[which]
+
+
+def _unusable(array: SensorArray, values: FloatArray) -> tuple[BoolArray, BoolArray, BoolArray]:
+    """Readings (n, N) that stick, those that leap, and all that tell nothing."""
+    scalar = array.channel_is_scalar
+    stuck = stuck_readings(array, values)
+    moduli = np.linalg.norm(array.calibrated_field(values), axis=2)  # which no attitude changes
+    moduli[:, array.channel_sensor[scalar]] = values[:, scalar]
+    wild = wild_readings(moduli) & ~stuck
+    return stuck, wild, np.asarray(np.isnan(moduli) | wild | stuck)
 
 
 def stuck_readings(array: SensorArray, values: FloatArray) -> BoolArray:
@@ -96,6 +110,24 @@ def wild_readings(values: FloatArray) -> BoolArray:
         if not more.any() or (wild | more).mean() > _MOST_WILD:
             return np.asarray(wild & ~np.isnan(values))
         wild |= more
+
+
+def leaping_rows(readings: Readings) -> BoolArray:
+    """Rows (n,) whose place is far from that of the row before and of the one after."""
+    assert readings.array_position_m is not None
+    way, time_s = np.linalg.norm(np.diff(readings.array_position_m, axis=0), axis=1), readings.time_s
+    leaps = way > _FASTEST_M_S * np.diff(time_s)
+    wild = np.concatenate([[False], leaps[1:] & leaps[:-1], [False]])
+    if wild.any():
+        _LOG.warning(f"{wild.sum()} places leap and come back: their rows are left out")
+    left = np.flatnonzero(leaps & ~wild[1:] & ~wild[:-1])
+    if left.size:
+        k = int(left[0])
+        raise ValueError(
+            f"Input readings must have all poses in one frame; instead received rows at {time_s[k]:.15g} and"
+            f" {time_s[k + 1]:.15g} s that are {way[k]:.4g} m apart."
+        )
+    return np.asarray(wild)
 
 
 def record_of(array: SensorArray, readings: Readings) -> tuple[SurveyRecord, PoseErrors]:

@@ -56,7 +56,7 @@ class Target:
     >>> field = sims.simulate(scenario, seed=1)
     >>> target = magloc.survey(field.array, field.readings)[0]
     >>> target.id, round(target.depth_m, 1), round(target.strength_Am2)
-    ('t1', 0.4, 14)
+    ('t1', 0.4, 13)
     """
 
     id: str

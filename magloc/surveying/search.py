@@ -19,9 +19,9 @@ from magloc.surveying.fit.whitening_compiled import moment_columns, whiten
 N_DISTANCES = 5
 PITCH = 1.8
 """Distance of a source from the sensors over the pitch of the grid: 91 % of its energy is found in the median."""
-WINDOW = 5.0
+WINDOW = 4.0
 """Of rows that count, in distances from the sensors."""
-_CHUNK = 8  # places along each side of a tile
+_CHUNK = 6  # places along each side of a tile
 _LEAST_SEEN, _TINY = 1e-3, 1e-30
 # Peaks start sources if they have a share of the strongest one's χ²; within some distances of a stronger one a larger
 # share, as they may be its skirts; and none within fewer, where they are the same.
@@ -41,7 +41,7 @@ class Candidates:
 
     @classmethod
     def joined(cls, parts: Iterable[Candidates]) -> Candidates:
-        """Those of several grids."""
+        """Those of several tiles of grids."""
         return cls(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
 
     def without(self, which: BoolArray) -> Candidates:
@@ -60,6 +60,14 @@ class SearchGrid:
         """The grid of every distance alone."""
         distances = dict.fromkeys(distance for distance, _ in self.tiles)
         return {at: SearchGrid([tile for tile in self.tiles if tile[0] == at]) for at in distances}
+
+    def some(self, which: BoolArray) -> SearchGrid:
+        """Some of its tiles."""
+        return SearchGrid([tile for tile, kept in zip(self.tiles, which, strict=True) if kept])
+
+    def seeing(self, places_m: FloatArray) -> BoolArray:
+        """Which tiles look at rows at some places (n, 3)."""
+        return np.array([near(places_m, places, WINDOW * distance).any() for distance, places in self.tiles], np.bool_)
 
     @classmethod
     def below(cls, record: SurveyRecord, low_m: FloatArray, high_m: FloatArray) -> SearchGrid:
@@ -84,26 +92,32 @@ class SearchGrid:
         return cls(tiles)
 
 
-def search(record: SurveyRecord, background: Background, sources: Sources, grid: SearchGrid) -> Candidates:
-    """χ² of one more source at every place of a grid, with the sources so far free to move."""
+def search(record: SurveyRecord, background: Background, sources: Sources, grid: SearchGrid) -> list[Candidates]:
+    """χ² of one more source at every place of each tile of a grid, with the sources so far free to move."""
     white = background.white
     fields = sources.fields(record)
     directions = record.directions(fields)
     Q = with_free_sources(record, background, sources)
     residual = residual_of(record, background, fields)
     left = residual - Q @ (Q.T @ residual)
+    Q = Q.astype(np.float32)  # of what is projected out rounding does not count
 
-    def explained(tile: tuple[float, FloatArray]) -> tuple[FloatArray, ...]:
+    def explained(tile: tuple[float, FloatArray]) -> Candidates:
         distance, places = tile
         used = groups_near(record, white, places, WINDOW * distance)
-        alone, projected, v = normal_equations(record, white, directions, places, used, Q, left)
-        # Of a source that others nearly imitate rounding and the window's edge are left, which must not count.
-        least = np.maximum(_LEAST_SEEN * np.trace(alone, axis1=1, axis2=2), _TINY)[:, None, None] * np.eye(3)
-        moment = np.linalg.solve(projected + least, v[..., None])[..., 0]
-        return places, np.full(len(places), distance), np.sum(v * moment, axis=1), moment
+        moment, chi2 = likeliest_moments(*normal_equations(record, white, directions, places, used, Q, left))
+        return Candidates(places, np.full(len(places), distance), chi2, moment)
 
     with ThreadPoolExecutor(get_num_threads()) as pool:
-        return Candidates(*map(np.concatenate, zip(*pool.map(explained, grid.tiles), strict=True)))
+        return list(pool.map(explained, grid.tiles))
+
+
+def likeliest_moments(alone: FloatArray, projected: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Moments (m, 3) of normal equations, and the χ² (m,) that they explain."""
+    # Of a source that others nearly imitate rounding and the window's edge are left, which must not count.
+    least = np.maximum(_LEAST_SEEN * np.trace(alone, axis1=1, axis2=2), _TINY)[:, None, None] * np.eye(3)
+    moment = np.linalg.solve(projected + least, v[..., None])[..., 0]
+    return moment, np.sum(v * moment, axis=1)
 
 
 def normal_equations(
@@ -122,11 +136,10 @@ def normal_equations(
     A = moment_columns(record.sensors_m, directions, white.U, record.array.channel_sensor, places, white.starts, used)
     whiten(A, used, white.H, white.gains, white.kept, white.dt_s)
     A = A.reshape(-1, A.shape[-1])
-    k = len(white.U)
-    of = (used[:, None] * k + np.arange(k)).ravel()
-    whole, lost = (X.reshape(-1, len(places), 3).transpose(1, 2, 0) for X in (A, Q[of].T @ A))
+    of = white.entries(used)
+    whole, lost = (X.reshape(-1, 3, len(places)).transpose(2, 1, 0) for X in (A, Q[of].T @ A.astype(Q.dtype)))
     alone = whole @ whole.mT
-    return alone, alone - lost @ lost.mT, (A.T @ left[of]).reshape(-1, 3)
+    return alone, alone - lost @ lost.mT, (A.T @ left[of]).reshape(3, -1).T
 
 
 def peaks(found: Candidates, threshold: float) -> IntArray:
@@ -149,11 +162,15 @@ def _stands_beside(found: Candidates, i: int, stronger: int) -> bool:
     return bool(apart > _SKIRT * h or found.chi2[i] > _SKIRT_SHARE * found.chi2[stronger])
 
 
+def near(rows_m: FloatArray, places: FloatArray, window_m: float) -> BoolArray:
+    """Which rows at (n, 3) are within some distance of places (m, 3), on the map."""
+    low, high = places[:, :2].min(axis=0) - window_m, places[:, :2].max(axis=0) + window_m
+    return np.asarray(np.all((rows_m[:, :2] >= low) & (rows_m[:, :2] <= high), axis=1))
+
+
 def groups_near(record: SurveyRecord, white: Whitening, places: FloatArray, window_m: float) -> IntArray:
     """Groups of rows within some distance of places (m, 3), on the map."""
-    middles = record.middles_m[white.starts[:-1], :2]
-    low, high = places[:, :2].min(axis=0) - window_m, places[:, :2].max(axis=0) + window_m
-    return np.flatnonzero(np.all((middles >= low) & (middles <= high), axis=1))
+    return np.flatnonzero(near(record.middles_m[white.starts[:-1]], places, window_m))
 
 
 def sources_at(found: Candidates, which: IntArray) -> Sources:

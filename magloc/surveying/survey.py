@@ -34,6 +34,7 @@ _TRIALS = 1.25  # independent ones of a map, over its area in distances to the s
 _HECTARE_M2 = 1e4
 _MOST_SWEEPS = 5
 _MISFIT = 2.0
+_MOST_DOUBTED = 1_000_000  # rows
 _LONGEST_BODY_M = 10.0
 
 
@@ -129,7 +130,7 @@ def survey(
             f"Input body_length_m must be from 0 to {_LONGEST_BODY_M:g} m; instead received {body_length_m:g}."
         )
     rows = readings if isinstance(readings, Readings) else joined(readings)
-    warn_of_doubts(array, rows)
+    warn_of_doubts(array, rows[:_MOST_DOUBTED])
     assumed = array.pose is None and rows.pose_sigma is None
     ground = Ground(prior, ground_m, shortest_geology_m, math.inf, body_length_m)
     tiled = TiledSurvey.of(*whole_rows(array, rows, base), ground)
@@ -141,15 +142,19 @@ def survey(
     every = range(len(tiled.tiles))
     at_once = min(get_num_threads() if processes is None else processes, len(every))
     with workers(at_once, scheduler, folder) as each:
-        tiled, lag = tiled.searched(strongest_in, every, each, tell).on_time()
+        due: Sequence[int] = every
+        for _ in range(_MOST_SWEEPS):  # what is strong beside a tile is in the way of all else, until it is told
+            tiled = tiled.searched(strongest_in, due, each, tell)
+            due = tiled.changed()
+            if not due:
+                break
+        tiled, lag = tiled.on_time()
         if lag.s:
             _LOG.warning(
                 f"the readings are {lag.s:.3f} ± {lag.sigma_s:.3f} s later than their poses, as the targets show: taken"
                 " into account"
             )
-        if len(every) > 1:  # what is strong beside a tile is looked for in it, in vain, until it is told
-            tiled = tiled.searched(strongest_in, every, each, tell)
-        due: Sequence[int] = every
+        due = every
         for _ in range(_MOST_SWEEPS):
             tiled = tiled.searched(sources_in, due, each, tell)
             due = tiled.changed()

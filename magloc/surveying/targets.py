@@ -11,9 +11,10 @@ from scipy.special import chdtri
 
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.fields.multipole import multipole_field_matrix
-from magloc.surveying.fit.joint_fit import Background, JointFit, jacobian_of, with_free_sources
-from magloc.surveying.rounds import Model
-from magloc.surveying.search import WINDOW, groups_near, normal_equations
+from magloc.surveying.fit.joint_fit import Background, JointFit, jacobian_of, residual_of, with_free_sources
+from magloc.surveying.fit.whitening_compiled import moment_columns, whiten
+from magloc.surveying.rounds import WHILE_SEARCHING, Groups, Model
+from magloc.surveying.search import WINDOW, groups_near, likeliest_moments, normal_equations
 
 OF_TARGETS = ("position_m", "moment_Am2", "covariance", "depth_interval95_m", "significance", "flags")
 _WEAK = 200.0
@@ -24,6 +25,7 @@ _N_DEPTHS = 16
 _SPAN = 3.0  # over and under the depth, as a factor
 _N_SECOND = 9  # degrees of freedom
 _FALSE_MERGED = 0.01  # of single sources
+_WITHIN, _N_BESIDE, _DEEPER, _N_BELOW = 1.0, 7, 1.6, 5  # of the distance: where a second source may be
 _SIGMAS, _STEPS = 3.0, 9  # places on the map, in standard deviations of the position
 
 
@@ -46,11 +48,11 @@ def profile_of(model: Model, fit: JointFit, background: Background, which: int, 
     near = np.linalg.norm(others.position_m[:, :2] - position[:2], axis=1) < reach
     Q = with_free_sources(record, background, others.some(near))
     # What the source explains itself is put back, to first order: it is weak.
-    own_field = source.fields(record)
+    own_field, fields = source.fields(record), fit.sources.fields(record)
     own = jacobian_of(record, background, source, own_field)[:, 3:] @ source.moment_Am2[0]
-    left = fit.residual + own
+    left = residual_of(record, background, fields) + own
     left = left - Q @ (Q.T @ left)
-    directions = record.directions(fit.sources.fields(record))
+    directions = record.directions(fields)
     depth = ground_m - position[2]
     lowest = ground_m - model.bounds.high_m[2]
     depths = np.geomspace(max(lowest, depth / _SPAN), min(ground_m - model.bounds.low_m[2], depth * _SPAN), _N_DEPTHS)
@@ -89,27 +91,65 @@ def second_source_chi2(
     Two dipoles near each other are one at their middle with these, to third order of the gap. Q projects everything
     else out, the source's own place too, so that 9 degrees of freedom are left of their 12.
     """
-    record = model.record
-    fields = np.concatenate([multipole_field_matrix(record.sensors_m, position, order) for order in (2, 3)], axis=-1)
-    A = background.white(np.einsum("nci,ncij->ncj", directions, fields[:, record.array.channel_sensor]))
+    record, white = model.record, background.white
+    near = groups_near(record, white, position[None], WINDOW * (record.height_m - position[2]))
+    rows, of = np.flatnonzero(np.isin(white.group, near)), white.entries(near)
+    fields = np.concatenate(
+        [multipole_field_matrix(record.sensors_m[rows], position, order) for order in (2, 3)], axis=-1
+    )
+    seen = np.einsum("nci,ncij->ncj", directions[rows], fields[:, record.array.channel_sensor])
+    A = white.of_some(seen, near)
     A = A / np.linalg.norm(A, axis=0)
+    lost = Q[of].T @ A
     # 1 - QQᵀ is a weight, no projector: it stands once in the information, and ``left`` has it already.
-    size, axes = np.linalg.eigh(A.T @ (A - Q @ (Q.T @ A)))
-    return float(np.sum((axes.T @ (A.T @ left))[-_N_SECOND:] ** 2 / size[-_N_SECOND:]))
+    size, axes = np.linalg.eigh(A.T @ A - lost.T @ lost)
+    return float(np.sum((axes.T @ (A.T @ left[of]))[-_N_SECOND:] ** 2 / size[-_N_SECOND:]))
+
+
+def moved_by_second(
+    model: Model, fit: JointFit, background: Background, Q: FloatArray, left: FloatArray, which: int
+) -> FloatArray:
+    """How position and moment (6,) of a source would change by a second one, where such a one explains most.
+
+    To first order; Q projects all sources out, and ``left`` is what they leave.
+    """
+    record, white = model.record, background.white
+    fields = fit.sources.fields(record)
+    directions = record.directions(fields)
+    position = fit.sources.position_m[which]
+    distance = record.height_m - position[2]
+    used = groups_near(record, white, position[None], WINDOW * distance)
+    beside = distance * np.linspace(-_WITHIN, _WITHIN, _N_BESIDE)
+    below = record.height_m - distance * np.geomspace(1.0 / _DEEPER, _DEEPER, _N_BELOW)
+    below = np.unique(np.clip(below, model.bounds.low_m[2], model.bounds.high_m[2]))
+    places = np.stack(np.meshgrid(position[0] + beside, position[1] + beside, below, indexing="ij"), axis=-1).reshape(
+        -1, 3
+    )
+    moments, explained = likeliest_moments(*normal_equations(record, white, directions, places, used, Q, left))
+    best = int(np.argmax(explained))
+    where = places[[best]], white.starts, used
+    A = moment_columns(record.sensors_m, directions, white.U, record.array.channel_sensor, *where)
+    whiten(A, used, white.H, white.gains, white.kept, white.dt_s)
+    of = white.entries(used)
+    added = A.reshape(len(of), 3) @ moments[best]
+    J = jacobian_of(record, background, fit.sources, fields)
+    gradient = J[of].T @ added - (background.Q.T @ J).T @ (background.Q[of].T @ added)
+    return np.asarray(fit.covariance[6 * which : 6 * which + 6] @ gradient)
 
 
 def targets_of(
-    model: Model, fit: JointFit, background: Background, ground_m: float, which: BoolArray
+    model: Model, fit: JointFit, background: Background, groups: Groups, ground_m: float, which: BoolArray
 ) -> dict[str, NDArray[Any]]:
     """Of some sources (K,) of a fit: the parts of targets, an entry for each."""
     sources, K = fit.sources, len(fit.sources)
     covariance = fit.covariance.reshape(K, 6, K, 6)[np.arange(K), :, np.arange(K)]
     significance = fit.significance
     depth, sigma = ground_m - sources.position_m[:, 2], np.sqrt(covariance[:, 2, 2])
-    interval = np.column_stack([np.maximum(0.0, depth - 1.96 * sigma), depth + 1.96 * sigma])
+    interval = np.column_stack([depth - 1.96 * sigma, depth + 1.96 * sigma])
     weak = significance < _WEAK
     for j in np.flatnonzero(weak & which):
-        interval[j], scatter = profile_of(model, fit, background, int(j), ground_m)
+        coarse = model.background(sources, groups(WHILE_SEARCHING * (model.record.height_m - sources.position_m[j, 2])))
+        interval[j], scatter = profile_of(model, fit, coarse, int(j), ground_m)
         covariance[j] = _scattered(covariance[j], scatter)
     apart = np.linalg.norm(sources.position_m[:, None] - sources.position_m, axis=-1) + np.diag(np.full(K, np.inf))
     rim = np.minimum(sources.position_m - model.bounds.low_m, model.bounds.high_m - sources.position_m)
@@ -123,11 +163,20 @@ def targets_of(
     middles = model.record.middles_m[background.white.starts[:-1]]
     reach = _NEAR * (model.record.height_m - sources.position_m[:, 2:])
     above = np.linalg.norm(sources.position_m[:, None, :2] - middles[:, :2], axis=-1) < reach
+    merged = second > chdtri(_N_SECOND, _FALSE_MERGED)
+    for j in np.flatnonzero(merged):
+        moved = moved_by_second(model, fit, background, Q, free, int(j))
+        # Where the second one is is hardly known, and so where it would move the first.
+        square = np.repeat(np.sum(moved.reshape(2, 3) ** 2, axis=1), 3)
+        covariance[j] += np.diag(square)
+        low, high = interval[j] - depth[j]
+        interval[j] = depth[j] + np.hypot([low, high], 1.96 * math.sqrt(square[0])) * np.sign([low, high])
+    interval = np.maximum(0.0, interval)
     flags = {
         "weak": weak,
         "near": apart.min(axis=1, initial=np.inf) < _NEAR * depth + 0.5,
         "misfit": np.array([is_misfit(left, np.flatnonzero(near)) for near in above], np.bool_),
-        "merged": second > chdtri(_N_SECOND, _FALSE_MERGED),
+        "merged": merged,
         "edge": (rim[:, :2] < 0.3).any(axis=1) | (rim[:, 2] < 0.02),
     }
     words = np.array([" ".join(name for name, set_ in flags.items() if set_[j]) for j in range(K)], np.str_)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from arrays.array import SensorArray
-from arrays.typing import FloatArray
+from arrays.typing import BoolArray, FloatArray
 from magloc.fields.dipole_compiled import field_at_points
 from magloc.grids.work import Arrays, Each, Work
 from magloc.localization.fit.prior import SourcePrior
@@ -21,13 +21,15 @@ from magloc.surveying.piece import Ground, Piece
 from magloc.surveying.pose_components import with_likeliest_pose
 from magloc.surveying.preparation import FEWEST_ROWS, record_of
 from magloc.surveying.rounds import AT_LAST, WHILE_SEARCHING
-from magloc.surveying.tiles import SEAM_M, Tile, owned, tiles_of
+from magloc.surveying.tiles import Tile, owned, tiles_of
 
 _LOG = logging.getLogger(__name__)
 _SAMPLE = 20_000  # rows that tell what is the same everywhere
 _LEAST_GEOLOGY_T, _MOST_GEOLOGY_T = 1e-10, 5e-9
 _SAME = 0.5  # over the distance to the nearest sources: what two tiles find at a seam is one source
-_FELT, _CHANGED = 0.1, 0.3  # of the noise
+_FELT, _CHANGED = 0.1, 1.0  # of the noise
+_MOVED_M = 0.15
+_NARROW, _NEARLY_ALL = 0.2, 0.95  # of the distance to the nearest sources, and of the rows
 _BESIDE_M = 1.0
 Tell = Callable[[str], None]
 
@@ -83,13 +85,21 @@ class TiledSurvey:
         tiles = [t for t in tiles if len(t.rows) >= FEWEST_ROWS and _narrowed(ground.prior, t, margin_m) is not None]
         if not tiles:
             raise ValueError(f"Input readings must have {FEWEST_ROWS} rows near each other; instead received none.")
+        nearest_m = sample.height_m - float(bounds.high_m[2])
+        away_m = sample.middles_m[:, :2] - sample.middles_m[:, :2].mean(axis=0)
+        across_m = np.abs(away_m @ np.linalg.svd(away_m, full_matrices=False)[2][-1])
+        if np.quantile(across_m, _NEARLY_ALL) < _NARROW * nearest_m:
+            _LOG.warning(
+                "the readings are of one line: on which side of it a target is, and how far, they hardly tell, and of"
+                " several targets they make other ones"
+            )
         return cls(
             array,
             readings,
             ground,
             tiles,
             margin_m,
-            sample.height_m - float(bounds.high_m[2]),
+            nearest_m,
             offset,
             max(min(spread, _MOST_GEOLOGY_T), _LEAST_GEOLOGY_T),
             Sources.none(),
@@ -106,52 +116,65 @@ class TiledSurvey:
         tile = self.tiles[number]
         prior = _narrowed(self.ground.prior, tile, self.margin_m)
         assert prior is not None
-        known, outside = self._told(tile)
         readings, ground = self.readings[tile.rows], replace(self.ground, prior=prior)
-        return Piece(self.array, readings, ground, tile, self.offset_T, self.geology_T, known, outside)
+        return Piece(self.array, readings, ground, tile, self.offset_T, self.geology_T, *self._told(tile))
 
-    def _told(self, tile: Tile) -> tuple[Sources, Sources]:
-        """Sources of a tile, and others whose field is felt there."""
+    def _told(self, tile: Tile) -> tuple[Sources, Sources, Sources]:
+        """Sources of a tile, of its margin, and others whose field is felt there."""
         position, strength = self.sources.position_m, np.linalg.norm(self.sources.moment_Am2, axis=1)
-        inside = tile.inside_m(position) > -self.margin_m - _BESIDE_M
+        own, near = tile.holds(position), tile.inside_m(position) > -self.margin_m - _BESIDE_M
         places = self._places(tile)
         apart = np.linalg.norm(position - np.clip(position, places.min(axis=0), places.max(axis=0)), axis=1)
         felt = 2e-7 * strength > _FELT * self.array.channel_noise_T.min() * apart**3
-        return self.sources.some(inside), self.sources.some(felt & ~inside)
+        return self.sources.some(own), self.sources.some(near & ~own), self.sources.some(felt & ~near)
 
     def _places(self, tile: Tile) -> FloatArray:
         assert self.readings.array_position_m is not None
         return self.readings.array_position_m[tile.rows]
 
     def searched(self, work: Work, which: Sequence[int], each: Each, tell: Tell) -> TiledSurvey:
-        """After a search of some tiles."""
-        found, known, outside = list(self.found), list(self.known), list(self.outside)
-        for done, (index, result) in enumerate(each(work, map(self.piece, which)), start=1):
-            number = which[index]
-            found[number] = Sources(**result)
-            known[number], outside[number] = self._told(self.tiles[number])
-            tell(f"{done} of {len(which)} tiles searched: {sum(map(len, found))} sources")
-        kept = owned(self.tiles, [sources.position_m for sources in found], self.same_m)
-        sources = Sources.none()
-        for number, k in kept:
-            sources = sources.with_more(found[number].some(np.array([k])))
-        return replace(self, sources=sources, found=found, known=known, outside=outside)
+        """After a search of some tiles, one colour after the other: each is told what those before it found."""
+        tiled, done = self, 0
+        for colour in sorted({self.tiles[number].colour for number in which}):
+            some = [number for number in which if self.tiles[number].colour == colour]
+            found, known, outside = list(tiled.found), list(tiled.known), list(tiled.outside)
+            for index, result in each(work, map(tiled.piece, some)):
+                number = some[index]
+                found[number] = Sources(**result)
+                known[number], *others = tiled._told(self.tiles[number])
+                outside[number] = Sources.joined(others)
+                done += 1
+                tell(f"{done} of {len(which)} tiles searched: {sum(map(len, found))} sources")
+            kept = owned(self.tiles, [sources.position_m for sources in found], self.same_m)
+            sources = Sources.joined([found[number].some(np.array([k])) for number, k in kept])
+            tiled = replace(tiled, sources=sources, found=found, known=known, outside=outside)
+        return tiled
 
     def changed(self) -> list[int]:
         """Tiles for which others found something else than they had been told and found themselves."""
         return [number for number in range(len(self.tiles)) if self._is_changed(number)]
 
     def _is_changed(self, number: int) -> bool:
-        tile, before = self.tiles[number], self.outside[number]
-        change = self._told(tile)[1].with_more(Sources(before.position_m, -before.moment_Am2))
-        field = field_at_points(self._places(tile)[tile.own], change.position_m, change.moment_Am2)
-        if np.linalg.norm(field, axis=1).max() > _CHANGED * self.array.channel_noise_T.min():
-            return True
-        own, told, of_all = (
-            int((tile.inside_m(sources.position_m) > -SEAM_M).sum())
-            for sources in (self.found[number], self.known[number], self.sources)
+        """Whether sources are felt among a tile's own rows that it did not have, or others that it had are none."""
+        tile, found = self.tiles[number], self.found[number]
+        now, *others = self._told(tile)
+        beside, before = Sources.joined(others), self.outside[number]
+        # What two tiles find at a seam is the same, if hardly elsewhere; beside it they are told.
+        new = Sources.joined(
+            [
+                now.some(~_same(now, found.with_more(self.known[number]).with_more(before), self.same_m)),
+                beside.some(~_same(beside, before, _MOVED_M) & ~_same(beside, found, self.same_m)),
+            ]
         )
-        return of_all not in (own, told)
+        gone = Sources.joined(
+            [
+                found.some(~_same(found, now.with_more(beside), self.same_m)),
+                before.some(~_same(before, beside, _MOVED_M) & ~_same(before, now, self.same_m)),
+            ]
+        )
+        change = new.with_more(Sources(gone.position_m, -gone.moment_Am2))
+        field = field_at_points(self._places(tile)[tile.own], change.position_m, change.moment_Am2)
+        return bool(np.linalg.norm(field, axis=1).max() > _CHANGED * self.array.channel_noise_T.min())
 
     def _richest(self) -> int:
         """The tile with most sources, which tells most of what all tiles have in common."""
@@ -168,6 +191,7 @@ class TiledSurvey:
             readings=self.readings[rows],
             tile=replace(tile, rows=rows, own=np.ones(len(rows), np.bool_)),
             known=self.sources.some(inside),
+            beside=Sources.none(),
             outside=self.sources.some(~inside),
         )
         model = piece.model()
@@ -197,6 +221,12 @@ class TiledSurvey:
             results[number] = result
             tell(f"{done} of {len(self.tiles)} tiles measured")
         return results
+
+
+def _same(sources: Sources, others: Sources, same_m: float) -> BoolArray:
+    """Which sources (K,) are among others, hardly elsewhere."""
+    apart = np.linalg.norm(sources.position_m[:, None] - others.position_m, axis=-1)
+    return np.asarray(apart.min(axis=1, initial=np.inf) < same_m)
 
 
 def _narrowed(prior: SourcePrior, tile: Tile, margin_m: float) -> SourcePrior | None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from arrays.typing import BoolArray, FloatArray, IntArray
 
-_CORE, _MARGIN = 6.0, 2.0  # over the distance from the sensors to the deepest sources
+_CORE, _MARGIN = 4.0, 1.2  # over the distance from the sensors to the deepest sources
 SEAM_M = 1.2  # more than a source may stand beside the rows
 
 
@@ -24,12 +24,15 @@ class Tile:
     rows : ndarray of int
     own : ndarray of bool
         Which of them are in the rectangle, not in the margin.
+    colour : int
+        0 to 3; no two that touch have the same.
     """
 
     low_m: FloatArray
     high_m: FloatArray
     rows: IntArray
     own: BoolArray
+    colour: int = 0
 
     def extent_m(self, places_m: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Ends of the rectangle, where it is open those of places (n, 2) in it."""
@@ -41,6 +44,10 @@ class Tile:
         xy = position_m[:, :2]
         return np.asarray(np.minimum(xy - self.low_m, self.high_m - xy).min(axis=1, initial=np.inf))
 
+    def holds(self, position_m: FloatArray) -> BoolArray:
+        """Which positions (K, 3) are within, or hardly beside it."""
+        return self.inside_m(position_m) > -SEAM_M
+
 
 def tiles_of(places_m: FloatArray, reach_m: float) -> tuple[list[Tile], float]:
     """Tiles of rows at places (n, 2), and the width of their margins: sources are no farther from rows than a reach."""
@@ -49,17 +56,20 @@ def tiles_of(places_m: FloatArray, reach_m: float) -> tuple[list[Tile], float]:
     number = np.maximum(1, np.round((high - low) / (_CORE * reach_m))).astype(np.intp)
     size = (high - low) / number
     cell = np.clip(((places_m - low) / np.where(size > 0.0, size, 1.0)).astype(np.intp), 0, number - 1)
+    cell = cell[:, 0] * number[1] + cell[:, 1]
     order = np.argsort(places_m[:, 0], kind="stable")
     x = places_m[order, 0]
     tiles = []
-    for own_cell in np.unique(cell, axis=0):
+    for index in np.unique(cell):
+        own_cell = np.array(divmod(index, number[1]))
         start, end = low + own_cell * size, low + (own_cell + 1) * size
         strip = order[slice(*np.searchsorted(x, [start[0] - margin, end[0] + margin]))]
         y = places_m[strip, 1]
         rows = np.sort(strip[(y >= start[1] - margin) & (y <= end[1] + margin)])
         open_low = np.where(own_cell == 0, -np.inf, start)
         open_high = np.where(own_cell == number - 1, np.inf, end)
-        tiles.append(Tile(open_low, open_high, rows, np.all(cell[rows] == own_cell, axis=1)))
+        colour = int(own_cell[0] % 2 + 2 * (own_cell[1] % 2))
+        tiles.append(Tile(open_low, open_high, rows, cell[rows] == index, colour))
     return tiles, margin
 
 
@@ -71,14 +81,17 @@ def owned(tiles: Sequence[Tile], position_m: Sequence[FloatArray], same_m: float
         found += [(float(inside[k]), t, int(k)) for k in np.flatnonzero(inside > -SEAM_M)]
     found.sort(key=lambda entry: (-entry[0], entry[1:]))
     kept: list[tuple[int, int]] = []
-    on_seam: list[tuple[int, FloatArray, set[int]]] = []  # which tiles have them
+    on_seam: list[set[int]] = []  # which tiles have them
+    places = np.empty((len(found), 3))
     for inside_m, t, k in found:
-        place = position_m[t][k]
         if inside_m <= SEAM_M:
-            same = [s for s in on_seam if t not in s[2] and np.linalg.norm(s[1] - place) < same_m]
+            n = len(on_seam)
+            apart = np.linalg.norm(places[:n] - position_m[t][k], axis=1)
+            same = [int(s) for s in np.flatnonzero(apart < same_m) if t not in on_seam[s]]
             if same:
-                min(same, key=lambda s: float(np.linalg.norm(s[1] - place)))[2].add(t)
+                on_seam[min(same, key=apart.__getitem__)].add(t)
                 continue
-            on_seam.append((t, place, {t}))
+            places[n] = position_m[t][k]
+            on_seam.append({t})
         kept.append((t, k))
     return kept

@@ -12,6 +12,7 @@ from scipy.special import chdtri
 from arrays.array import SensorArray
 from arrays.typing import FloatArray
 from magloc.levels import CONTRADICTION, DISAGREEMENT
+from magloc.localization.fit.prior import SourcePrior
 from magloc.localization.fit.results import Fix, Solution
 from magloc.localization.locator import fit_at_rest
 from magloc.localization.uncertainty.range_interval import relative_range_sigma
@@ -30,6 +31,8 @@ _RIVAL_WITHIN = 9.0
 _WINDOW_ROWS = 64
 _STACKED_ROWS = 16
 _TRY_EVERY = 4
+# Of the error that a start may have, as all rows so far tell it: with more of it none is tried.
+_MOST_HOPEFUL = 1.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,8 +57,12 @@ class Start:
 class Acquisition:
     """Looks for a source in the latest rows together, of which one alone does not determine it."""
 
-    def __init__(self, array: SensorArray) -> None:
+    def __init__(self, array: SensorArray, prior: SourcePrior) -> None:
         self.array = array
+        # Bounds, and three numbers, are known in the axes of an array that moves.
+        modulus = prior.known_moment_Am2 if isinstance(prior.known_moment_Am2, float | int) else None
+        sigma_Am2 = None if modulus is None else prior.known_moment_sigma_Am2
+        self._prior = SourcePrior(known_moment_Am2=modulus, known_moment_sigma_Am2=sigma_Am2)
         self._pose_errors = PoseErrors.of_array(array)
         self.forget()
 
@@ -65,12 +72,15 @@ class Acquisition:
         self._n_rows = 0
         self._proposed: Solution | None = None
 
-    def start(self, row: Row) -> Start | None:
-        """A start with one more row, where the array moves enough for it, and the source is as good as at rest."""
+    def start(self, row: Row, position_error: float = 0.0) -> Start | None:
+        """A start with one more row, where the array moves enough for it, and the source is as good as at rest.
+
+        `position_error`: standard deviation of the position over the range, as far as it is known otherwise.
+        """
         self._recent.append(row)
         self._n_rows += 1
         recent = list(self._recent)
-        if self._n_rows % _TRY_EVERY or len(recent) < 2:
+        if self._n_rows % _TRY_EVERY or len(recent) < 2 or position_error > _MOST_HOPEFUL * STACKED_POSITION_ERROR:
             return None
         if np.ptp([earlier.origin_m for earlier in recent], axis=0).max() <= self.array.circumradius:
             return None
@@ -83,6 +93,7 @@ class Acquisition:
             np.stack([earlier.origin_m for earlier in chosen]),
             np.stack([earlier.R_world_from_array for earlier in chosen]),
             np.stack(known) if len(known) == len(chosen) else None,
+            prior=self._prior,
             poses=errors.of_rows(
                 self.array,
                 np.array([earlier.time_s for earlier in chosen]),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 from scipy.special import chdtri
@@ -18,8 +19,8 @@ from magloc.tracking.chart.mixture import Mixture, component_moments, root_of
 from magloc.tracking.chart.steps import LARGEST_GROWTH, LARGEST_WIDTH
 from magloc.tracking.chart.update import LEAST_GAIN, LEAST_SHARE, MOST_ITERATIONS, ROUNDING, TOLERANCE
 from magloc.tracking.motion import N_SOURCE, LinearMotion
-from magloc.tracking.results import Prediction, Row, Step, TrackPoint
-from magloc.tracking.tracker import Tracker, learned
+from magloc.tracking.results import Prediction, Row, Step, TrackPoint, learned
+from magloc.tracking.tracker import Tracker
 
 _MOST_AT_ONCE = 64
 _STATUS = {kernels.TRACKED: "tracked", kernels.PREDICTED: "predicted"}
@@ -54,8 +55,9 @@ def next_points(tracker: Tracker, rows: Sequence[Row], begin: int = 0) -> list[T
 
 def compiled_motion(tracker: Tracker) -> LinearMotion | None:
     """The motion of a tracker whose steps are compiled, None where they are not."""
-    motion = tracker.motion
-    return motion if isinstance(motion, LinearMotion) and not tracker.n_errors else None
+    # Not by isinstance, which looks through all attributes of a protocol in every row.
+    is_linear = hasattr(tracker.motion, "linear_step") and not tracker.n_errors
+    return cast(LinearMotion, tracker.motion) if is_linear else None
 
 
 class _CompiledSteps:

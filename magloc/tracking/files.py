@@ -250,7 +250,8 @@ def _tracks(path: Path, entries: Sequence[dict[str, Any]]) -> dict[int, tuple[Tr
             raise InputError(f"{path}, result {i}, key tracks: found something else, expected objects with an id.")
         own.append({track["id"]: track for track in tracks})
     ids = sorted({id for of_id in own for id in of_id}) or [0]
-    rows = [{"time_s": entry.get("time_s"), "status": entry.get("status", "")} for entry in entries]
+    shared = ("time_s", "status", "dropped_sensors")
+    rows = [{key: entry[key] for key in shared if key in entry} for entry in entries]
     return {id: _points(path, [row | of_id.get(id, {}) for row, of_id in zip(rows, own, strict=True)]) for id in ids}
 
 
@@ -265,12 +266,24 @@ def _points(path: Path, rows: Sequence[dict[str, Any]]) -> tuple[TrackPoint, ...
         if covariance is not None and covariance.diagonal().min() < 0.0:
             raise InputError(f"{path}, result {i}, key covariance: found a variance below zero, expected none.")
     statuses = [str(row.get("status", "")) for row in rows]
+    dropped = [_names(path, i, row.get("dropped_sensors", ())) for i, row in enumerate(rows, start=1)]
     nis = [math.nan if value is None else value for value in nis]
-    columns = zip(times, positions, moments, covariances, nis, nis_dof, statuses, strict=True)
+    columns = zip(times, positions, moments, covariances, nis, nis_dof, statuses, dropped, strict=True)
     return tuple(
-        TrackPoint(float(t), place, moment, C, nis=float(value), nis_dof=int(dof or 0), status=status)
-        for t, place, moment, C, value, dof, status in columns
+        TrackPoint(
+            float(t), place, moment, C, nis=float(value), nis_dof=int(dof or 0), status=status, dropped_sensors=names
+        )
+        for t, place, moment, C, value, dof, status, names in columns
     )
+
+
+def _names(path: Path, number: int, value: Any) -> tuple[str, ...]:
+    """Names of sensors in a result."""
+    if not all(isinstance(name, str) for name in (value if isinstance(value, list | tuple) else [None])):
+        raise InputError(
+            f"{path}, result {number}, key dropped_sensors: found {value!r:.40}, expected a list of names."
+        )
+    return tuple(value)
 
 
 def _numbers(path: Path, rows: Sequence[dict[str, Any]], key: str) -> list[Any]:

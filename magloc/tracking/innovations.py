@@ -43,6 +43,9 @@ class InnovationTest:
     ambient_factor : float
         How many times their standard deviations errors of the last row would be, rms, if that field were wrong by
         300 nT per axis.
+    body_factor : float
+        The same if the source, which counts as a point, were a body of a quarter of its distance from the nearest
+        sensor, where it was nearest. NaN where the range is not known, and where the motion is measured.
     starts : int
         Rows in which a track begins.
     """
@@ -53,6 +56,7 @@ class InnovationTest:
     z_constants: float = math.nan
     z_ambient: float = math.nan
     ambient_factor: float = math.nan
+    body_factor: float = math.nan
     starts: int = 0
 
     @property
@@ -98,12 +102,18 @@ class InnovationTest:
     @property
     def caution(self) -> str:
         """What may be wrong and could not be seen, in a sentence; empty where it would not matter."""
-        if not self.ambient_factor > MATTERS:
-            return ""
-        return (
-            "the ambient field counts as exact: were it wrong by 300 nT, errors would be about"
-            f" {self.ambient_factor:.2g} times their standard deviations; state ambient_uncertainty_nT"
-        )
+        cautions = []
+        if self.ambient_factor > MATTERS:
+            cautions.append(
+                "the ambient field counts as exact: were it wrong by 300 nT, errors would be about"
+                f" {self.ambient_factor:.2g} times their standard deviations; state ambient_uncertainty_nT"
+            )
+        if self.body_factor > MATTERS:
+            cautions.append(
+                "the source counts as a point: were it a body of a quarter of its distance, errors would be about"
+                f" {self.body_factor:.2g} times their standard deviations"
+            )
+        return "; ".join(cautions)
 
     @property
     def json(self) -> dict[str, object]:

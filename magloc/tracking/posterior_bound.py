@@ -9,6 +9,7 @@ import numpy as np
 
 from arrays.typing import FloatArray
 from magloc.kalman import block_update
+from magloc.tracking.chart.known_moment import KnownInWorld
 from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.chart.start import prior_root
 from magloc.tracking.results import Row, Step
@@ -77,6 +78,11 @@ def _steps_at_truth(
             predicted_S = np.diag(np.concatenate([np.zeros(motion.n_states), tracker.error_sigma]))
             root = prior_root(ChartRow.of(measurement).chart(truth[i]))
             _, predicted_S[: motion.n_states, : motion.n_states] = motion.start(truth[i], root)
+            known = KnownInWorld.of(tracker.prior, row.R_world_from_array)
+            if known is not None:
+                state = np.concatenate([truth[i], np.zeros(len(predicted_S) - len(truth[i]))])
+                H = known.along(state[None], np.eye(len(state))[None])[0]
+                _, predicted_S = block_update(state, predicted_S, H, np.zeros(len(H)), np.ones(len(H)))
         else:
             continue
         state = np.concatenate([motion.state_of(truth[i], velocity[i], rate[i]), np.zeros(n_errors)])

@@ -19,9 +19,10 @@ from magloc.localization.uncertainty.range_interval import gaussian_ranges
 from magloc.measurement.pose import ArrayPose, rates_of
 from magloc.readings import Readings, without_saturated
 from magloc.tracking.chart.mixture import Mixture
+from magloc.tracking.motion import N_SOURCE
 
 UNDETERMINED = "undetermined"
-"""Status of a row before a track that shows a source and does not determine it: what it says alone."""
+"""Status of a row before a track that shows a source and does not determine it: what is known by the rows so far."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,8 +108,8 @@ class TrackPoint:
         Normalised innovation squared, and `nis_dof` its degrees of freedom. NaN for rows that the track started from.
     status : str
         "tracked", "acquired" (a new track started here), "predicted" (no readings), "outlier" (readings that contradict
-        the track, not used), "undetermined" (no track yet: what this row of few readings says alone), or why there is
-        no track.
+        the track, not used), "undetermined" (no track yet: what rows of few readings say together so far), or why
+        there is no track.
     weight : float
         How likely the place is the right one of all that explain the readings so far. NaN without a track.
     rivals : tuple of Solution
@@ -177,6 +178,28 @@ class TrackPoint:
             return False
         sigma = relative_sigma(self.covariance, self.position_m - self.centroid_m, self.moment_Am2)
         return bool(sigma <= LARGEST_GAUSSIAN_SIGMA)
+
+
+def learned(variance: FloatArray, open_loop: FloatArray) -> FloatArray:
+    """Estimability: 1 - σ / σ without any readings, from both variances."""
+    return 1.0 - np.sqrt(np.minimum(variance / open_loop, 1.0))
+
+
+def of_mixture(time_s: float, mixture: Mixture, open_loop: FloatArray) -> TrackPoint:
+    """What is known at an instant, for a user; open_loop (n,) are the variances had no readings been taken."""
+    source = mixture.of_source()
+    mean, covariance = source.moments()
+    return TrackPoint(
+        time_s,
+        mean[:3],
+        mean[3:],
+        covariance,
+        learned(np.diagonal(covariance), open_loop[:N_SOURCE]),
+        weight=float(source.weight.max()),
+        centroid_m=source.centroid_m,
+        radius_m=source.radius_m,
+        mixture=source,
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,6 +33,7 @@ from magloc.tracking.posterior_bound import posterior_bound, smoothing_bound
 from magloc.tracking.results import Row, TrackPoint, rows_of, stacked
 from magloc.tracking.tracker import Tracker
 from magloc.tracking.whole_records.background import track_on_background
+from magloc.tracking.whole_records.body_errors import body_factor
 from magloc.tracking.whole_records.constants import constants_test
 from magloc.tracking.whole_records.smoother import smoothed
 from magloc.truth import Truth, truth_of_rows
@@ -211,7 +212,13 @@ class Track(TrackColumns):
         if self.readings.motion is not None:  # whose steps the test does not have
             return test
         exact = constants_test(self.tracker, self._rows, self.points)
-        return replace(test, z_constants=exact.mounting, z_ambient=exact.field, ambient_factor=exact.field_factor)
+        return replace(
+            test,
+            z_constants=exact.mounting,
+            z_ambient=exact.field,
+            ambient_factor=exact.field_factor,
+            body_factor=body_factor(self.tracker, self._rows, self.points),
+        )
 
     def table(self) -> str:
         """The table that ``magloc track`` prints, and what is wrong with the track."""
@@ -268,7 +275,7 @@ def track(
     smooth : bool
         Use later rows too: a fixed-interval smoother.
     prior : SourcePrior
-        Bounds for the fixes that start a track, in the array's frame.
+        Bounds of the source where a track starts, and what its moment is known to be, in the array's frame.
     progress : callable, optional
         Called with the number of rows finished since the last call.
 
@@ -305,21 +312,25 @@ def track(
     if used.motion is None:
         points = track_record(tracker, list(rows_of(used)), progress)
     else:
-        points = _of_known_motion(tracker, used, used.motion, progress)
+        points = _of_known_motion(tracker, motion, used, used.motion, progress)
     return Track(tuple(smoothed(points, tracker.steps) if smooth else points), used, tracker, smooth)
 
 
 def _of_known_motion(
-    tracker: Tracker, readings: Readings, measured: MeasuredMotion, progress: Callable[[int], None] | None
+    tracker: Tracker,
+    unmeasured: MotionModel,
+    readings: Readings,
+    measured: MeasuredMotion,
+    progress: Callable[[int], None] | None,
 ) -> list[TrackPoint]:
     """Points of a record whose motion is measured: the tracker's motion is that of the step to each row."""
-    if not isinstance(tracker.motion, RandomWalk):
+    if not isinstance(unmeasured, RandomWalk):
         raise ValueError(
             "Input motion must be a RandomWalk, of what is not measured, for readings with measured velocities or"
-            f" rates; instead received {type(tracker.motion).__name__}."
+            f" rates; instead received {type(unmeasured).__name__}."
         )
     points = []
-    for row, motion in zip(rows_of(readings), known_motions(measured, tracker.motion), strict=True):
+    for row, motion in zip(rows_of(readings), known_motions(measured, unmeasured), strict=True):
         tracker.motion = motion
         points += list(tracker.run([row], progress))
     return points

@@ -35,13 +35,25 @@ from magloc.measurement.nuisances import Drift
 from magloc.readings import Readings
 from magloc.tracking.acquisition import STACKED_POSITION_ERROR, Acquisition
 from magloc.tracking.acquisition import Start as RowsStart
+from magloc.tracking.chart.known_moment import KeptModulus, KnownInWorld
 from magloc.tracking.chart.mixture import Mixture
 from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.chart.start import NO_DIPOLE, prior_root
 from magloc.tracking.chart.steps import LARGEST_WIDTH, ChartFilter, Known, RowUpdate, cartesian, charted, width_of
+from magloc.tracking.chart.undetermined import Undetermined
 from magloc.tracking.measurement import RowMeasurement, RowMeasurements
 from magloc.tracking.motion import N_SOURCE, MotionModel
-from magloc.tracking.results import UNDETERMINED, Innovation, Prediction, Row, Step, TrackPoint, moving, next_row
+from magloc.tracking.results import (
+    UNDETERMINED,
+    Innovation,
+    Prediction,
+    Row,
+    Step,
+    TrackPoint,
+    moving,
+    next_row,
+    of_mixture,
+)
 from magloc.tracking.sensor_health import SENSOR_LIMIT, SensorHealth, Suspects
 
 ROWS_TO_LOSE = 3
@@ -73,7 +85,7 @@ class Tracker:
     array : SensorArray
     motion : MotionModel
     prior : SourcePrior
-        Bounds for the fixes that start a track, in the array's frame.
+        Bounds of the first row's source, and what its moment is known to be, in the array's frame.
     keep_steps : bool
         Keep what a smoother needs, in `steps`.
     background : Drift, optional
@@ -110,22 +122,21 @@ class Tracker:
         background: Drift | None = None,
     ) -> None:
         self.array = array
-        self.motion = motion
         self.prior = prior
+        self.motion = motion
         self.background = background
         self.measurements = RowMeasurements(array, motion.n_states, background)
         self.errors, self.pose_errors = self.measurements.errors, self.measurements.pose_errors
         self.keep_steps = keep_steps
         self.steps: list[Step] = []
-        self._acquisition = Acquisition(array)
+        self._acquisition = Acquisition(array, prior)
         self.filter = ChartFilter(array, self.errors, self.pose_errors, prior)
+        self._undetermined = Undetermined(self.filter)
         self._known: Known | None = None
-        self._time_s = math.nan
-        self._n_rows = 0
+        self._time_s, self._n_rows = math.nan, 0
         self._last: Innovation | None = None
         self._row_before: Row | None = None
-        self._health = SensorHealth.of(array.n_sensors)
-        self._suspects = Suspects.of(array.n_sensors)
+        self._health, self._suspects = SensorHealth.of(array.n_sensors), Suspects.of(array.n_sensors)
 
     @one_blas_thread
     def update(self, row: Row | Readings) -> TrackPoint:
@@ -151,8 +162,7 @@ class Tracker:
             out, point = self._started(row, index)
         else:
             out, point = self._followed(self._known, row, index, dt_s)
-        names = (name for name, is_out in zip(self.array.ids, out, strict=True) if is_out)
-        return replace(point, dropped_sensors=tuple(names)) if out.any() else point
+        return replace(point, dropped_sensors=tuple(np.array(self.array.ids)[out].tolist())) if out.any() else point
 
     def run(
         self, rows: Iterable[Row | Readings], progress: Callable[[int], None] | None = None
@@ -162,6 +172,15 @@ class Tracker:
             yield self.update(row)
             if progress is not None:
                 progress(1)
+
+    @property
+    def motion(self) -> MotionModel:
+        """How the source moves: a modulus that is known stays."""
+        return self._motion
+
+    @motion.setter
+    def motion(self, motion: MotionModel) -> None:
+        self._motion = KeptModulus.of(motion, self.prior)
 
     @property
     def known(self) -> Known | None:
@@ -256,6 +275,11 @@ class Tracker:
         unknown = np.diag(_UNKNOWN * np.sqrt(np.diagonal(covariance)))
         x[:n], S[:n, :n] = self.motion.start(centres[0][:N_SOURCE], unknown)
         S[n + np.arange(n_errors), n + np.arange(n_errors)] = self.error_sigma
+        known = KnownInWorld.of(self.prior, measurements[0].row.R_world_from_array)
+        if known is not None:
+            centre = centres[0]
+            H = known.along(centre[None], np.eye(len(centre))[None])[0]
+            x, S = block_update(x, S, H, known.residual(centre[None])[0] - H @ (x - centre), np.ones(len(H)))
         chi2, of_rows = 0.0, []
         for j, (measurement, centre) in enumerate(zip(measurements, centres, strict=True)):
             if j:
@@ -334,6 +358,8 @@ class Tracker:
         if before.young:
             young = (*before.young, (seen, self.motion))
             known = self.filter.refitted(replace(known, young=young, nis=before.nis + update.nis))
+        if width_of(known.mixture) > LARGEST_WIDTH and self.filter.is_detected(seen):
+            return self._started(row, index, predicted.matched())
         return out, self._kept(
             seen.row,
             index,
@@ -392,11 +418,13 @@ class Tracker:
 
     def _acquired(self, seen: ChartRow, index: int) -> TrackPoint:
         """A new track from several rows of which one alone does not determine the source; else what this one says."""
-        start = self._acquisition.start(seen.row)
+        mixture, reason = self._undetermined.after(seen, self.motion)
+        start = self._acquisition.start(seen.row, self._undetermined.position_error)
         known = None if start is None else self._found(start, seen)
         if start is None or known is None:
-            return self._undetermined(seen)
+            return self._of_rows(mixture, reason, seen)
         self._acquisition.forget()
+        self._undetermined.forget()
         solution = start.solution
         point = self._kept(seen.row, index, known, None, status="acquired", iterations=solution.iterations)
         return replace(point, weight=solution.weight, rivals=start.rivals)
@@ -413,33 +441,10 @@ class Tracker:
             return None
         return Known(charted(found.x, found.S, seen), self.known_before(seen, found.x))
 
-    def _undetermined(self, seen: ChartRow) -> TrackPoint:
-        """What a row says alone that shows a source and does not determine it."""
-        mixture, reason = self.filter.of_row(seen, self.motion)
+    def _of_rows(self, mixture: Mixture | None, reason: str, seen: ChartRow) -> TrackPoint:
+        """What rows say that show a source, of which one alone does not determine it."""
         if mixture is None:
             return self._lost(seen.row, reason)
         heaviest = mixture.x[np.argmax(mixture.log_weight)]
         point = of_mixture(seen.row.time_s, mixture, np.diagonal(self.known_before(seen, heaviest)))
         return replace(point, status=UNDETERMINED)
-
-
-def learned(variance: FloatArray, open_loop: FloatArray) -> FloatArray:
-    """Estimability: 1 - σ / σ without any readings, from both variances."""
-    return 1.0 - np.sqrt(np.minimum(variance / open_loop, 1.0))
-
-
-def of_mixture(time_s: float, mixture: Mixture, open_loop: FloatArray) -> TrackPoint:
-    """What is known at an instant, for a user; open_loop (n,) are the variances had no readings been taken."""
-    source = mixture.of_source()
-    mean, covariance = source.moments()
-    return TrackPoint(
-        time_s,
-        mean[:3],
-        mean[3:],
-        covariance,
-        learned(np.diagonal(covariance), open_loop[:N_SOURCE]),
-        weight=float(source.weight.max()),
-        centroid_m=source.centroid_m,
-        radius_m=source.radius_m,
-        mixture=source,
-    )

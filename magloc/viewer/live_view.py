@@ -10,6 +10,7 @@ import viser
 from arrays.array import SensorArray
 from magloc.live.follower import LivePoint
 from magloc.readings import Readings
+from magloc.tracking.multi_target.results import SourcesPoint
 from magloc.tracking.results import TrackPoint, rows_of
 from magloc.viewer.pages.live import Controls, LivePage
 from magloc.viewer.pages.pages import Page, live_page
@@ -18,7 +19,7 @@ from magloc.viewer.view import View
 
 
 class LiveView(View):
-    """A page of a source that is followed: scene, readings, residuals, rate, latency and lost rows.
+    """A page of sources that are followed: scene, readings, residuals, rate, latency and lost rows.
 
     It draws the newest point whenever it is ready, in a thread of its own, so that no row waits for the picture. A
     context manager that closes it.
@@ -67,13 +68,13 @@ class LiveView(View):
         if open:
             webbrowser.open(self.address)
 
-    def update(self, point: TrackPoint, row: Readings | None = None) -> None:
+    def update(self, point: TrackPoint | SourcesPoint, row: Readings | None = None) -> None:
         """Show one more point, unless a newer one comes before it is drawn.
 
         Parameters
         ----------
-        point : TrackPoint
-            Of :meth:`magloc.Tracker.update` or :func:`magloc.live.track`.
+        point : TrackPoint or SourcesPoint
+            Of :meth:`magloc.Tracker.update`, :meth:`magloc.SourcesTracker.update` or :func:`magloc.live.track`.
         row : Readings of length one, optional
             That it was found from; a LivePoint has it already.
         """

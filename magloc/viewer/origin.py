@@ -22,6 +22,8 @@ from websockets.asyncio.server import ServerConnection
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
+from magloc.viewer.panels.lines import POINTED
+from magloc.viewer.panels.readings_plot import AT
 from magloc.viewer.scene.legend import FOLLOWS_THE_SCHEME
 
 NAMES = ("127.0.0.1", "localhost")
@@ -38,18 +40,41 @@ def comes_from_outside(headers: Headers) -> bool:
     return origins != [f"http://{hosts[0]}"] and not (may_be_silent and not origins)
 
 
+SMOOTH = "?smooth"
+"""Asked for by a page that is to be a picture, which may take its time."""
+# Without a graphics card the smoothing of edges is half of the work of a picture: a page that moves does without.
+_QUICK_IN_SOFTWARE = f"""<script>
+if (location.search !== '{SMOOTH}') {{
+  const plain = HTMLCanvasElement.prototype.getContext;
+  const probe = plain.call(document.createElement('canvas'), 'webgl');
+  const named = probe && probe.getExtension('WEBGL_debug_renderer_info');
+  if (named && /swiftshader|llvmpipe|software/i.test(probe.getParameter(named.UNMASKED_RENDERER_WEBGL)))
+    HTMLCanvasElement.prototype.getContext = function (kind, options) {{
+      return plain.call(this, kind, kind.startsWith('webgl') ? {{...options, antialias: false}} : options);
+    }};
+}}
+</script>"""
 # Until it has connected, viser's page says that it is inactive, as if nothing were to come. On a phone its panel lies
 # over the scene, and is folded at first by a click on its title: the server's word to fold it reaches wider pages only.
-_ADDED = """<style>.tabler-icon-player-pause { display: none; }</style>
+# Where a plot is pointed at, the time of it is typed into its input.
+_ADDED = f"""<style>.tabler-icon-player-pause {{ display: none; }}</style>
 <script>
 let isToFold = matchMedia('(max-width: 36em)').matches;
-const waiting = setInterval(() => {
+const waiting = setInterval(() => {{
   const title = isToFold && document.querySelector('[style*="cursor: pointer"][style*="height: 3.5em"]');
-  if (title) { title.click(); isToFold = false; }
+  if (title) {{ title.click(); isToFold = false; }}
   const said = document.evaluate("//text()[. = 'Inactive']", document, null, 6, null);
   for (let i = 0; i < said.snapshotLength; i++) said.snapshotItem(i).data = "Connecting…";
-}, 30);
+}}, 30);
 setTimeout(() => clearInterval(waiting), 60000);
+(() => {{
+  {POINTED}
+  whenPointed(document, (plot, event) => {{
+    const label = [...document.querySelectorAll('label[for]')].find(found => found.innerText === '{AT}');
+    const input = label && document.getElementById(label.htmlFor);
+    if (input) typeInto(input, timeOf(plot, event).toFixed(3));
+  }});
+}})();
 </script>
 """.encode()
 
@@ -64,7 +89,7 @@ def _say_what_it_waits_for(page: Response) -> None:
 @lru_cache(maxsize=4)
 def _with_words(body: bytes, compressed: bool) -> bytes:
     page = gzip.decompress(body) if compressed else body
-    page = page.replace(b"<head>", b"<head>" + FOLLOWS_THE_SCHEME.encode(), 1) + _ADDED
+    page = page.replace(b"<head>", b"<head>" + (FOLLOWS_THE_SCHEME + _QUICK_IN_SOFTWARE).encode(), 1) + _ADDED
     return gzip.compress(page) if compressed else page
 
 

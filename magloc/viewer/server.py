@@ -17,8 +17,8 @@ import viser
 from arrays.io.errors import InputError
 from arrays.io.text import replaced, write_text
 from magloc.viewer.chromium import BrowserError, Chromium
-from magloc.viewer.origin import guarded_server
-from magloc.viewer.panels.static_plot import static_plot
+from magloc.viewer.origin import SMOOTH, guarded_server
+from magloc.viewer.panels.static_player import static_player
 from magloc.viewer.scene.framing import SIDES_OF_A_PHONE
 from magloc.viewer.scene.legend import ABOVE_THE_PLAYER, NARROW_PX, with_legend
 
@@ -32,16 +32,7 @@ _PICTURE_PX = (1280, 800)
 _PANEL_PX = 330
 _CONNECTION_S = 60.0
 _PLAY = "the bar below plays the rows"
-# viser's player begins by itself, and has nothing to show until it has begun; the space bar stops it.
-_STANDS_S = 2.0
-_STAND_STILL = """<script>
-const player = setInterval(() => {
-  const time = document.querySelector('input[inputmode=decimal]');
-  if (!time || Number(time.value) === 0) return;
-  clearInterval(player);
-  window.dispatchEvent(new KeyboardEvent('keydown', {key: ' ', code: 'Space', bubbles: true}));
-}, 20);
-</script>"""
+_STANDS_S = 2.0  # on the first row, before the others are played
 _CLOSE_NOTICES = "document.querySelectorAll('.mantine-Notification-closeButton').forEach(button => button.click())"
 
 
@@ -128,15 +119,16 @@ def page_html(server: viser.ViserServer, page: Page) -> str:
     # The page stands still on the row that a live one would show, until it is played.
     recording = server.get_scene_serializer()
     recording.insert_sleep(_STANDS_S)
-    step_s = playing.duration_s / len(playing.steps)
-    marked = [page.plot.index] if page.plot else []
+    step_s, plot = playing.duration_s / len(playing.steps), page.plot
+    said, marked = [playing.said()], [] if plot is None else [plot.index]
     for step in playing.steps:
         playing.show(step)
         recording.insert_sleep(step_s)
-        marked += [page.plot.index] if page.plot else []
+        said.append(playing.said())
+        marked += [] if plot is None else [plot.index]
     html = recording.as_html()
     playing.show(playing.first)
-    beside = _STAND_STILL + (static_plot(page.plot, marked, _STANDS_S, step_s) if page.plot else "")
+    beside = static_player(said, _STANDS_S, step_s, plot, marked)
     notes = (*page.notes, _PLAY)
     return with_legend(html, page.title, page.entries, notes, bottom=ABOVE_THE_PLAYER, beside=beside)
 
@@ -163,7 +155,7 @@ def write_picture(server: viser.ViserServer, path: Path) -> None:
 @contextmanager
 def opened_page(server: viser.ViserServer, size: tuple[int, int]) -> Iterator[Chromium]:
     """A headless Chromium with the page of a server, at rest, notices closed."""
-    with Chromium(address(server), size) as browser:
+    with Chromium(address(server) + SMOOTH, size) as browser:
         browser.wait_for("document.querySelector('canvas') !== null")
         # The scene is sent when the page has reported its camera; before that a blank page is at rest too.
         _wait_for_client(server)

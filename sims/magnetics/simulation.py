@@ -14,6 +14,7 @@ from arrays.sensor import Calibration
 from arrays.typing import FloatArray
 from magloc.fields.body import induced_and_permanent_moment
 from magloc.fields.dipole import MU0_OVER_4PI, field
+from magloc.fields.dipole_compiled import field_at_points
 from magloc.readings import Readings
 from magloc.signature.path import ObjectPath
 from magloc.truth import Truth
@@ -106,8 +107,7 @@ def simulate(scenario: MagneticScenario, seed: int) -> Simulation:
         truths.append(Truth(time_s[there], pose.position_m[there], moment_Am2[there]))
         poses.append(pose)
     buried = (np.zeros((0, 3)),) * 2 if scenario.targets is None else scenario.targets.drawn(seed)
-    for position_m, moment in zip(*buried, strict=True):
-        fields_T += field(sensors_m, position_m, moment)
+    fields_T += field_at_points(sensors_m.reshape(-1, 3), *buried).reshape(sensors_m.shape)
     if scenario.geology is not None:
         fields_T += scenario.geology.at(sensors_m, seed)
     fields_T = _applied(array_pose.rotation.inv(), fields_T) + _platform_fields(scenario, time_s, seed)

@@ -68,10 +68,10 @@ class Screen:
         self.browser.open(url)
         self.browser.wait_for("document.querySelector('canvas') !== null")
 
-    def open_server(self, server: viser.ViserServer) -> None:
+    def open_server(self, server: viser.ViserServer, query: str = "") -> None:
         """Open the live page, and wait until it stands at the first camera, beside the panel."""
         before = set(server.get_clients())
-        self.open(f"http://127.0.0.1:{server.get_port()}")
+        self.open(f"http://127.0.0.1:{server.get_port()}/{query}")
         first = np.asarray(server.initial_camera.position)
 
         def arrived() -> bool:

@@ -17,7 +17,7 @@ from magloc.viewer.scene.glyphs import DIPOLE_COLOUR
 from magloc.viewer.server import opened, page_html, write_page
 from tests.browser.screen import Screen, Sight, dark_grey, hue_of
 from tests.browser.test_map_page import DIPOLE, RESULT, sights
-from tests.browser.test_track_page import ARRAY, ORANGE, READINGS, TIMES, arrow_in
+from tests.browser.test_track_page import ARRAY, ORANGE, READINGS, TIMES, across, arrow_in, plot_box
 from tests.browser.test_track_page import RESULT as TRACK
 from tests.command_line import Run
 
@@ -100,19 +100,19 @@ class TestReadings:
             camera = screen.camera(server.initial_camera)
         places = camera.pixels(arrow_in(20))
         screen.until_seen(Sight("the moment at the end", camera.pixels(arrow_in(40)), ORANGE, radius=4))
-        assert self.numbers(screen) == [f"{1e9 * value:.5g}" for value in READINGS.values_T[40]]
-        box = screen.evaluate(
-            "[...document.querySelectorAll('#readings svg')].find(s => s.clientWidth).getBoundingClientRect().toJSON()"
-        )
-        middle = 0.5 * (52.0 + 352.0) / 360.0  # of the axes
+        assert "row 41 of 41" in screen.text()
+        np.testing.assert_allclose(self.numbers(screen), 1e9 * READINGS.values_T[40], atol=0.051)
+        box = plot_box(screen)
         screen.until(lambda: float(screen.evaluate(PLAYED)) > 0.0, "the player has begun")
-        screen.browser.click(box["x"] + middle * box["width"], box["y"] + 0.4 * box["height"])
+        screen.browser.click(across(box, 0.5), box["y"] + 0.4 * box["height"])
         screen.until_seen(Sight("the moment in the middle", places, ORANGE, radius=4))
         assert float(screen.evaluate(PLAYED)) == pytest.approx(2.0 + 20.5 / 41.0 * TIMES[-1], abs=0.01)
-        assert self.numbers(screen) == [f"{1e9 * value:.5g}" for value in READINGS.values_T[20]]
+        np.testing.assert_allclose(self.numbers(screen), 1e9 * READINGS.values_T[20], atol=0.051)
+        assert "row 21 of 41" in screen.text()
         assert screen.browser.errors == []
         screen.keep("static-readings")
 
-    def numbers(self, screen: Screen) -> list[str]:
+    def numbers(self, screen: Screen) -> list[float]:
         """At the cursor, of every channel."""
-        return list(screen.evaluate("[...document.querySelectorAll('#readings b')].map(found => found.textContent)"))
+        texts = screen.evaluate("[...document.querySelectorAll('#row b.of-channel')].map(found => found.textContent)")
+        return [float(text.replace("\N{MINUS SIGN}", "-")) for text in texts]

@@ -17,6 +17,7 @@ from magloc.readings import Readings
 from magloc.tracking.results import TrackPoint, TrackResult
 from magloc.viewer.pages.pages import track_page
 from magloc.viewer.pages.track_player import time_colours
+from magloc.viewer.panels.lines import _LEFT, _RIGHT, _WIDTH
 from magloc.viewer.scene.glyphs import DIPOLE_COLOUR
 from magloc.viewer.server import opened
 from tests.browser.screen import Screen, Sight, close_to, dark_grey, hue_of
@@ -77,6 +78,21 @@ def row_of(screen: Screen) -> int:
 def arrow_in(row: int) -> FloatArray:
     """The head of the moment's arrow, beyond the ellipsoid."""
     return POSITIONS[row : row + 1] + 0.85 * ARROW_M * Z
+
+
+def plot_box(screen: Screen) -> dict[str, float]:
+    """Rectangle of the plot of the readings, scrolled into view [px]."""
+    box = screen.browser.wait_for(
+        "(() => { const plot = [...document.querySelectorAll('svg.lines')].find(found => found.clientWidth);"
+        " if (!plot) return null;"
+        " plot.scrollIntoView({block: 'nearest'}); return plot.getBoundingClientRect().toJSON() })()"
+    )
+    return dict(box)
+
+
+def across(box: dict[str, float], share: float) -> float:
+    """Where a share of the axis of time is in the page [px]."""
+    return box["x"] + box["width"] * (_LEFT + share * (_RIGHT - _LEFT)) / _WIDTH
 
 
 class TestTrack:
@@ -155,12 +171,9 @@ class TestTrack:
     def test_the_plot_marks_the_time(self, screen: Screen, server: viser.ViserServer) -> None:
         slid(screen, "Time [s]", 0.5, lambda: abs(row_of(screen) - 20) <= 2)
         share = row_of(screen) / 40.0
-        box = screen.browser.wait_for(
-            "(() => { const plot = document.querySelector('.u-over'); if (!plot) return null;"
-            " plot.scrollIntoView({block: 'nearest'}); return plot.getBoundingClientRect().toJSON() })()"
-        )
-        rows = box["y"] + box["height"] * np.linspace(0.15, 0.85, 8)
-        mark = np.column_stack([np.full(8, box["x"] + share * box["width"]), rows])
+        box = plot_box(screen)
+        rows = box["y"] + box["height"] * np.linspace(0.15, 0.75, 8)
+        mark = np.column_stack([np.full(8, across(box, share)), rows])
         elsewhere = mark + np.array([0.2 * box["width"], 0.0])
 
         grey = close_to((128, 128, 128), 30.0)
@@ -169,3 +182,14 @@ class TestTrack:
             Sight("mark of the time", elsewhere, grey, radius=2, absent=True),
         )
         screen.keep("track-plot")
+
+    def test_a_click_into_the_plot_moves_time(self, screen: Screen, server: viser.ViserServer) -> None:
+        camera = screen.live_camera(server)
+
+        def click() -> None:
+            box = plot_box(screen)
+            screen.browser.click(across(box, 0.25), box["y"] + 0.5 * box["height"])
+
+        click()
+        screen.until(lambda: row_of(screen) == 10, "the row that was pointed at", again=click)
+        screen.until_seen(Sight("moment", camera.pixels(arrow_in(10)), ORANGE, radius=4))

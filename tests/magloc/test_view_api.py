@@ -24,6 +24,7 @@ from magloc.readings import Readings
 from magloc.surveying.results import Reach, SurveyRows
 from magloc.tracking.results import TrackPoint, TrackResult
 from magloc.viewer.pages.pages import readings_page, survey_page
+from magloc.viewer.pages.survey import target_lines
 from magloc.viewer.server import address, free_port, opened
 from magloc.viewer.view import View, thinned
 from tests.browser.browser import Browser
@@ -125,6 +126,10 @@ class TestInline:
             np.testing.assert_allclose(nodes["/t1"].position, position)
             assert nodes["/t1-text"].text == "t1: 0.60 m"
             np.testing.assert_allclose(nodes["/rows"].points, rows, atol=1e-6)
+            np.testing.assert_allclose(nodes["/chosen"].position, [1.0, 2.0, 0.0])
+        said = " ".join(target_lines(target))
+        assert "depth 0.6 m: 0.5 m to 0.7 m (95 %)" in said
+        assert f"moment 2.24 A·m²; iron: {5**0.5 / 0.3:.2g}" in said
 
     def test_several_sources_are_all_seen(self) -> None:
         array = cube(1.5)

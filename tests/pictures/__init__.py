@@ -23,6 +23,7 @@ from typing import Protocol
 from PIL import Image
 
 from arrays.array_file import read_array
+from magloc.viewer.origin import SMOOTH
 from magloc.viewer.pages.pages import array_page
 from magloc.viewer.server import opened
 from tests.browser.browser import Browser
@@ -99,6 +100,22 @@ class OfPage:
 
 
 @dataclass(frozen=True)
+class OfRecording:
+    """Drawn by a module of the tests from a recording, in minutes."""
+
+    module: str
+    sources: tuple[str, ...]
+
+    def steps(self) -> tuple[str, ...]:
+        return (f"python -m {self.module} --out recording.png",)
+
+    def draw(self, folder: Path) -> bytes:
+        file = folder / "recording.png"
+        subprocess.run([sys.executable, "-m", self.module, "--out", str(file)], cwd=REPOSITORY, check=True)
+        return small(file.read_bytes())
+
+
+@dataclass(frozen=True)
 class Panel:
     """One panel of another picture, cut out: left, top, right and bottom [px]."""
 
@@ -135,7 +152,7 @@ class LivePage:
         array = read_array(folder / self.array)
         with Browser("about:blank", self.size_px) as browser, opened(0, self.array) as server:
             screen, page = Screen(browser, folder), array_page(server, array, live=True)
-            screen.open_server(server)
+            screen.open_server(server, SMOOTH)
             screen.until(lambda: "found at" in screen.text(), "the fit is found")
             screen.keep("live")
             screen.leave()
@@ -179,6 +196,7 @@ PICTURES: dict[str, Picture] = {
     "background-diver.png": OfPage("background"),
     "distance-of-a-coil.png": OfPage("single-sensor-ranging"),
     "gradient-tensor.png": OfPage("gradient-tensor"),
+    "beating-tissue.png": OfRecording("tests.beating_tissue", ("tests/beating_tissue.py",)),
     "stars-identified.png": OfPage("star-identification"),
     "view-array.png": OfCommands(
         (

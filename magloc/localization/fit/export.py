@@ -29,11 +29,14 @@ _UNITS = {
     "detected": ("1", "whether the readings stand out of noise"),
     "misfit": ("1", "whether χ² is far beyond noise"),
     "body_length_m": ("m", "length of the object that was taken into account, 0 for a point"),
+    "body_factor": ("1", "errors over their standard deviations, rms, if a point were a quarter of its distance long"),
     "too_near": ("1", "whether the source is too near for a dipole"),
     "dropped_sensors": ("1", "sensors that contradict all others"),
     "saturated_channels": ("1", "channels whose reading saturates"),
     "reason": ("1", "why there is no solution"),
 }
+
+_OF_ROWS = ("detected", "misfit", "too_near", "body_length_m", "body_factor")
 
 
 def dataset_of_fixes(fixes: Fixes, which: Literal["best", "all"]) -> xr.Dataset:
@@ -71,7 +74,10 @@ def dataset_of_fixes(fixes: Fixes, which: Literal["best", "all"]) -> xr.Dataset:
         "merged": (source, table(columns.merged[chosen], False)),
         **{name: (leading, table(getattr(columns, name)[chosen], np.nan)) for name in ("chi2", "weight")},
         **{name: (leading, table(getattr(columns, name)[chosen], 0)) for name in ("dof", "n_sources")},
-        **{name: ("row", getattr(fixes, name)) for name in ("detected", "misfit", "too_near", "body_length_m")},
+        **{
+            name: ("row", getattr(fixes, name))
+            for name in ("detected", "misfit", "too_near", "body_length_m", "body_factor")
+        },
         **{
             name: ("row", np.array([" ".join(names) for names in getattr(fixes, name)], dtype=str))
             for name in ("dropped_sensors", "saturated_channels")

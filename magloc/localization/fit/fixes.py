@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from html import escape
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, overload
 
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
 _Column = TypeVar("_Column")
+BODY_MATTERS = 1.5
+"""Times their standard deviations that errors of a point would be if it were a body, from which on that is told."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -41,6 +44,8 @@ class Fixes(Sequence[Fix]):
     failed_starts : ndarray of int, shape (n,)
     body_length_m : ndarray, shape (n,)
         Length of the object that was taken into account, said or assumed [m]; 0 for a point.
+    bodies : callable, optional
+        Gives `body_covariance`, when it is asked for.
 
     Examples
     --------
@@ -61,6 +66,7 @@ class Fixes(Sequence[Fix]):
     too_near: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=bool))
     frame: Literal["array", "world"] = "array"
     body_length_m: FloatArray = field(default_factory=lambda: np.zeros(0))
+    bodies: Callable[[], FloatArray] | None = None
 
     def __post_init__(self) -> None:
         if not len(self.too_near):
@@ -92,6 +98,7 @@ class Fixes(Sequence[Fix]):
             int(self.failed_starts[i]),
             float(self.time_s[i]),
             float(self.body_length_m[i]),
+            (self, i),
         )
 
     @cached_property
@@ -172,6 +179,37 @@ class Fixes(Sequence[Fix]):
         result[self.solved] = is_misfit(chi2[begin], dof[begin])
         return result
 
+    @cached_property
+    def body_covariance(self) -> FloatArray:
+        """What an object of a quarter of its distance would add to the covariance of the best solution (n, D, D).
+
+        Zero where the object counts as a point by what is said, or stands not far out of noise; (0, D, D) where all do.
+        """
+        return np.zeros((0, 6, 6)) if self.bodies is None else self.bodies()
+
+    @cached_property
+    def body_factor(self) -> FloatArray:
+        """How many times their standard deviations errors would be (n,), rms, of objects of `body_covariance`."""
+        factor = np.ones(len(self))
+        for i in np.flatnonzero(self.body_covariance.any(axis=(1, 2))).tolist():
+            solution = self.solutions.solution(int(self.best[i]))
+            n = len(solution.covariance)
+            share = np.trace(np.linalg.solve(solution.covariance, self.body_covariance[i, :n, :n]))
+            factor[i] = math.sqrt(1.0 + float(share) / n)
+        return factor
+
+    @property
+    def caution(self) -> str:
+        """What may be wrong and could not be seen, in a sentence; empty where it would not matter."""
+        matters = self.body_factor > BODY_MATTERS
+        if not matters.any():
+            return ""
+        middle = float(np.median(self.body_factor[matters]))
+        return (
+            f"in {matters.sum()} of {len(self)} rows the source counts as a point: were it a body of a quarter of its"
+            f" distance, errors would be about {middle:.2g} times their standard deviations; state its length"
+        )
+
     @classmethod
     def unsolved(cls, time_s: FloatArray, reason: str) -> Fixes:
         """Rows without a solution, all for one reason."""
@@ -210,16 +248,14 @@ class Fixes(Sequence[Fix]):
         """The same in another frame: places are turned and moved by the pose (n, 3) of every row, moments turned."""
         row, columns = self.solutions.of_row, self.solutions
         R = rotation.as_matrix()[row]
-        n = columns.covariance.shape[1] // 3
-        blocks = columns.covariance.reshape(-1, n, 3, n, 3)
-        turned = np.einsum("fab,fibjc,fdc->fiajd", R, blocks, R, optimize=True)
         moved = replace(
             columns,
             position_m=position_m[row][:, None] + np.einsum("fab,fkb->fka", R, columns.position_m),
             moment_Am2=np.einsum("fab,fkb->fka", R, columns.moment_Am2),
-            covariance=turned.reshape(columns.covariance.shape) + added_covariance,
+            covariance=_turned(columns.covariance, R) + added_covariance,
         )
-        return replace(self, solutions=moved, frame=frame)
+        bodies = None if self.bodies is None else partial(_turned_bodies, self, rotation)
+        return replace(self, solutions=moved, frame=frame, bodies=bodies)
 
     @property
     def first(self) -> IntArray:
@@ -240,8 +276,8 @@ class Fixes(Sequence[Fix]):
         return replace(self, solutions=Solutions.joined([kept, come]), **columns)
 
     def table(self) -> str:
-        """The table that ``magloc locate`` prints."""
-        return "\n".join(lines_of_fixes(self))
+        """The table that ``magloc locate`` prints, and what may be wrong with it."""
+        return "\n".join([*lines_of_fixes(self), *filter(None, [self.caution])])
 
     def plot(self) -> Figure:
         """Fixes in three planes with 95 % ellipses, their standard deviations and their χ²."""
@@ -270,3 +306,16 @@ class Fixes(Sequence[Fix]):
 
     def _repr_html_(self) -> str:
         return f"<pre>{escape(repr(self))}</pre>"
+
+
+def _turned(covariance: FloatArray, R: FloatArray) -> FloatArray:
+    """Covariances (f, 3 n, 3 n) of 3-vectors that are turned by rotations (f, 3, 3)."""
+    n = covariance.shape[1] // 3
+    turned = np.einsum("fab,fibjc,fdc->fiajd", R, covariance.reshape(-1, n, 3, n, 3), R, optimize=True)
+    return np.asarray(turned.reshape(covariance.shape))
+
+
+def _turned_bodies(fixes: Fixes, rotation: Rotation) -> FloatArray:
+    """Their `body_covariance` where every row is turned."""
+    of_rows = fixes.body_covariance
+    return _turned(of_rows, rotation.as_matrix()) if len(of_rows) else of_rows

@@ -334,19 +334,24 @@ def _moved(
 
 def covariances(problem: WhitenedModel, fits: JointFits) -> FloatArray:
     """Inverse information of (p₁, m₁, p₂, m₂, …) of every fit: (b, 6 K, 6 K) [m, A·m²], NaN where it is singular."""
-    n_fits, n_sources = fits.q.shape[:2]
-    if not n_fits:
+    n_sources = fits.n_sources
+    if not len(fits.q):
         return np.empty((0, 6 * n_sources, 6 * n_sources))
-    s = fits.q[..., 3:]
-    rho = np.concatenate([fits.q[..., :3] / s, np.ones_like(s)], axis=-1)
-    mu = fits.mu / np.abs(s) ** 3
+    unit = np.tile(np.repeat([problem.radius, problem.radius**3 / MU0_OVER_4PI], 3), n_sources)
+    return inverse_information(scaled_jacobian(problem, fits.q, fits.mu)) * np.outer(unit, unit)
+
+
+def scaled_jacobian(problem: WhitenedModel, q: FloatArray, mu: FloatArray) -> FloatArray:
+    """Derivative of what is measured and known by (p₁, m₁, …): (b, C + K k, 6 K), in radii and tesla of a moment."""
+    n_fits, n_sources = q.shape[:2]
+    s = q[..., 3:]
+    rho = np.concatenate([q[..., :3] / s, np.ones_like(s)], axis=-1)
+    mu = mu / np.abs(s) ** 3
     gain = problem.linear_gain(problem.source_fields(rho, mu))
     along = np.broadcast_to(np.eye(4)[:, :3], (n_fits, n_sources, 4, 3))
     by_position = _by_position(problem, rho, mu, gain, along).reshape(n_fits, -1, n_sources, 3)
     by_moment = _by_moment(problem, rho, mu, gain).reshape(n_fits, -1, n_sources, 3)
-    jacobian = np.concatenate([by_position, by_moment], axis=-1).reshape(n_fits, -1, 6 * n_sources)
-    unit = np.tile(np.repeat([problem.radius, problem.radius**3 / MU0_OVER_4PI], 3), n_sources)
-    return inverse_information(jacobian) * np.outer(unit, unit)
+    return np.concatenate([by_position, by_moment], axis=-1).reshape(n_fits, -1, 6 * n_sources)
 
 
 def inverse_information(jacobian: FloatArray, least_singular: float = 1e-13) -> FloatArray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,6 +12,9 @@ from scipy.special import chdtrc
 
 from arrays.typing import FloatArray
 from magloc.levels import MISFIT
+
+if TYPE_CHECKING:
+    from magloc.localization.fit.fixes import Fixes
 
 Intervals = tuple[tuple[float, float | None], ...]
 EVERYWHERE: Intervals = ((0.0, None),)
@@ -182,6 +185,8 @@ class Fix:
     time_s : float
     body_length_m : float
         Length of the object that was taken into account, said or assumed [m]; 0 for a point.
+    of_rows : tuple of Fixes and int, optional
+        The fixes that it is one of, and which.
 
     Examples
     --------
@@ -201,6 +206,15 @@ class Fix:
     failed_starts: int = 0
     time_s: float = math.nan
     body_length_m: float = 0.0
+    of_rows: tuple[Fixes, int] | None = None
+
+    @property
+    def body_factor(self) -> float:
+        """How many times their standard deviations errors would be, rms, were a point a quarter of its distance long.
+
+        1 where that does not matter, or where something is said of its length.
+        """
+        return 1.0 if self.of_rows is None else float(self.of_rows[0].body_factor[self.of_rows[1]])
 
     @property
     def best(self) -> Solution:

@@ -9,7 +9,8 @@ in white units, and so are their columns in the Jacobian of the sources: Levenbe
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import math
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,6 +26,7 @@ _MOST_STEPS = 25
 _SETTLED = 1e-3
 _UNKNOWN = 1e4  # standard deviation of a column of unit length
 _NEGLIGIBLE = 0.1  # of the noise
+_BESIDE_M, _BESIDE_SHARE = 0.1, 0.2  # errors of sources that other rows tell: of places, and of moments over their size
 _RIDGE = 1e-10  # of a parameter's own information: above rounding, so that few rows leave no matrix singular
 
 
@@ -51,11 +53,26 @@ class Sources:
         """Field (n, N, 3) of these, and of those that a record knows, at its sensors."""
         return record.fields(self.position_m, self.moment_Am2)
 
+    @classmethod
+    def joined(cls, parts: Sequence[Sources]) -> Sources:
+        """All of several."""
+        every = [cls.none(), *parts]
+        return cls(*(np.concatenate(each) for each in zip(*(vars(part).values() for part in every), strict=True)))
+
     def with_more(self, others: Sources) -> Sources:
         """These and others."""
-        return Sources(
-            np.concatenate([self.position_m, others.position_m]), np.concatenate([self.moment_Am2, others.moment_Am2])
-        )
+        return Sources.joined([self, others])
+
+    def without_twins(self, nearest_m: FloatArray) -> Sources:
+        """With one source, where they are together, in place of two that are nearer to each other than some (K,)."""
+        position, moment, alone = self.position_m.copy(), self.moment_Am2.copy(), np.ones(len(self), np.bool_)
+        for k in range(1, len(self)):
+            apart = np.where(alone[:k], np.linalg.norm(position[:k] - position[k], axis=1), np.inf)
+            twin = int(np.argmin(apart))
+            if apart[twin] < nearest_m[k]:
+                position[twin], moment[twin] = 0.5 * (position[twin] + position[k]), moment[twin] + moment[k]
+                alone[k] = False
+        return Sources(position, moment).some(alone)
 
     def moved(self, step: FloatArray) -> Sources:
         """After a step (K, 6)."""
@@ -72,12 +89,12 @@ class Layer:
 
     @classmethod
     def below(cls, record: SurveyRecord, shortest_m: float, field_T: float) -> Layer:
-        """A layer for fields whose wavelengths are not shorter than some length."""
+        """A layer for fields whose wavelengths are no shorter than some length; its places are those of all records."""
         depth = shortest_m / 2.5
         spacing = depth / 1.5
         low, high = record.sensors_m.min(axis=(0, 1)), record.sensors_m.max(axis=(0, 1))
         x, y = (
-            np.linspace(a - depth, b + depth, max(2, round((b - a + 2.0 * depth) / spacing) + 1))
+            spacing * np.arange(math.floor((a - depth) / spacing), math.ceil((b + depth) / spacing) + 1)
             for a, b in zip(low[:2], high[:2], strict=True)
         )
         grid = np.stack(np.meshgrid(x, y, [low[2] - depth], indexing="ij"), axis=-1).reshape(-1, 3)
@@ -85,8 +102,14 @@ class Layer:
 
     def columns(self, record: SurveyRecord, directions: FloatArray, white: Whitening) -> FloatArray:
         """White columns (g·k, P) of what poles of their expected strength add to the measurements."""
-        owner = record.array.channel_sensor
-        columns = pole_columns(record.sensors_m, directions, white.U, owner, self.places_m, white.starts)
+        starts, owner = white.starts, record.array.channel_sensor
+        # Poles are deep: from the middles of the halves of a group they are seen as from its rows.
+        halves = np.unique(np.concatenate([starts[:-1], (starts[:-1] + starts[1:]) // 2]))
+        weight = np.diff(halves, append=starts[-1])[:, None, None]
+        sensors, seen = (np.add.reduceat(rows, halves) for rows in (record.sensors_m, directions))
+        of_group = np.searchsorted(halves, starts)
+        scale = np.repeat(np.sqrt(np.diff(of_group) / np.diff(starts)), np.diff(of_group))[:, None, None]
+        columns = pole_columns(sensors / weight, seen * scale, white.U, owner, self.places_m, of_group)
         return self.field_T * self.depth_m**2 * white.of_groups(columns)
 
 
@@ -120,22 +143,30 @@ class Background:
         drift: Drift,
         groups: Iterable[IntArray],
         body_length_m: float = 0.0,
+        beside: Sources | None = None,
     ) -> Iterator[Background]:
         """With errors of the pose as the field of the sources makes them felt, and of bodies that are no points.
 
-        One for every way to group the rows (n,).
+        One for every way to group the rows (n,). Sources beside, which the record knows, are where they are said to be
+        but for small errors.
         """
+        beside = Sources.none() if beside is None else beside
         fields = sources.fields(record)
         gradients = record.gradients(sources.position_m, sources.moment_Am2)
         directions = record.directions(fields)
         least_T = _NEGLIGIBLE * float(record.array.channel_noise_T.min())
-        where = directions, sources.position_m, sources.moment_Am2
+        near = sources.with_more(beside)
+        where = directions, near.position_m, near.moment_Am2
+        size = _BESIDE_SHARE * np.repeat(np.linalg.norm(beside.moment_Am2, axis=1)[:, None], 6, axis=1)
+        size[:, :3] = _BESIDE_M
         by_square = record.by_squared_shift(*where, least_T)
         by_pose = record.by_pose(directions, fields, gradients)
+        by_turn = record.by_turned_carrier(errors, least_T)
         wrong = record.by_sensors(directions), record.by_bodies(*where, body_length_m, least_T)
         for group in groups:
-            white = Whitening.of(record, by_pose, by_square, errors, drift, group)
-            columns = [layer.columns(record, directions, white), *map(white, wrong)]
+            white = Whitening.of(record, by_pose, by_turn, by_square, errors, drift, group)
+            moved = size.ravel() * source_jacobian(record, directions, white, beside)
+            columns = [layer.columns(record, directions, white), moved, *map(white, wrong)]
             yield cls(white, orthogonal(np.concatenate(columns, axis=1)))
 
 
@@ -239,9 +270,12 @@ def residual_of(record: SurveyRecord, background: Background, fields_T: FloatArr
 
 def jacobian_of(record: SurveyRecord, background: Background, sources: Sources, fields_T: FloatArray) -> FloatArray:
     """White columns (g·k, 6 K) of what positions and moments add to the measurements, where their fields are."""
-    directions = record.directions(fields_T)
-    white, owner = background.white, record.array.channel_sensor
-    position, moment = sources.position_m, sources.moment_Am2
+    return source_jacobian(record, record.directions(fields_T), background.white, sources)
+
+
+def source_jacobian(record: SurveyRecord, directions: FloatArray, white: Whitening, sources: Sources) -> FloatArray:
+    """The same where it is said what channels read of a small change of the field."""
+    owner, position, moment = record.array.channel_sensor, sources.position_m, sources.moment_Am2
     return white.of_groups(source_columns(record.sensors_m, directions, white.U, owner, position, moment, white.starts))
 
 

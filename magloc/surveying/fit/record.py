@@ -206,6 +206,30 @@ class SurveyRecord:
         whole[:, self.is_vector, :, TURN] += turned[:, self.array.channel_sensor[self.is_vector]]
         return np.einsum("nci,ncij->ncj", directions, whole) @ self.pose_effects
 
+    def by_turned_carrier(self, errors: PoseErrors, least_T: float) -> tuple[FloatArray, FloatArray]:
+        """What errors of the attitude leave of its carrier's fields in the channels, (n, C, q) of unit variance.
+
+        Those fields are known as the stated attitude has them. Each channel has its own error, which lasts as that of
+        the attitude does, and one of the eddy currents, which is new in every row: a difference of attitudes makes
+        their rate. There is none of channels where it is below some field.
+        """
+        turn = np.sqrt(np.sum(self.pose_effects[:, TURN, errors.changes] ** 2, axis=(1, 2)) / 3.0)
+        body = np.einsum("nji,nj->ni", self.R_world_from_array, self.ambient_T)
+        b, rate = (np.linalg.norm(each, axis=1) for each in (body, np.gradient(body, self.time_s, axis=0)))
+        dt_s = 2.0 * float(np.median(np.diff(self.time_s)))
+        lasts_s = errors.uncertainty.correlation_s
+        of_rate = math.sqrt(2.0 * (1.0 - math.exp(-dt_s / lasts_s) if lasts_s else 1.0)) * b / dt_s
+        offset, induced, eddy = np.array(
+            [(s.offset_uncertainty_T, s.induced_uncertainty, s.eddy_uncertainty_s) for s in self.array.sensors]
+        ).T[..., None]
+        lasting = np.sqrt(2.0 * (offset**2 + 2.0 * (induced * b) ** 2 + 2.0 * (eddy * rate) ** 2))
+        parts = []
+        for size in (turn * lasting, turn * math.sqrt(2.0) * eddy * of_rate):
+            of_channels = size[self.array.channel_sensor].T
+            columns = of_channels[:, None] * np.eye(of_channels.shape[1])
+            parts.append(columns[..., of_channels.max(axis=0) > least_T])
+        return parts[0], parts[1]
+
     def by_squared_shift(
         self, directions: FloatArray, position_m: FloatArray, moment_Am2: FloatArray, least_T: float
     ) -> FloatArray:

@@ -68,17 +68,22 @@ class Whitening:
         cls,
         record: SurveyRecord,
         by_pose: FloatArray,
+        by_turn: tuple[FloatArray, FloatArray],
         by_square: FloatArray,
         errors: PoseErrors,
         drift: Drift,
         group: IntArray,
     ) -> Whitening:
-        """Where errors of the pose change the channels by (n, C, q), and squares of its shift by (n, C, 5) or none."""
+        """Where errors of the pose change the channels by (n, C, q).
+
+        Those of its turn by more (n, C, ...), in two ways, of which one is new in every row, and squares of its shift
+        by (n, C, 5) or none.
+        """
         U = independent_measurements(record)
         scale = np.sqrt(1.0 / np.bincount(group))
         time_s = np.bincount(group, record.time_s) * scale**2
         dt_s = np.diff(time_s, prepend=time_s[0])
-        by_pose = np.concatenate([by_pose, by_square], axis=2)
+        by_pose = np.concatenate([by_pose, *by_turn, by_square], axis=2)
         C, q = record.array.n_channels, by_pose.shape[2]
         # Offsets of the channels, and what is common to them: along the ambient field.
         H = np.zeros((len(time_s), len(U), q + C + 2))
@@ -87,9 +92,15 @@ class Whitening:
         H[..., q + C] = _summed((record.along @ U.T)[..., None], group, scale)[..., 0]
         kept, added = np.ones((len(dt_s), q + C + 2)), np.zeros((len(dt_s), q + C + 2))
         of_pose = errors.step(dt_s)[0]
-        # A square lasts half as long.
-        squared = of_pose[:, errors.of_pose == SHIFT.start].prod(axis=1, keepdims=True) ** 2
-        kept[:, :q] = np.concatenate([of_pose, np.repeat(squared, by_square.shape[2], axis=1)], axis=1)
+        lasting = of_pose[:, errors.of_pose == SHIFT.start].prod(axis=1, keepdims=True)
+        more = (
+            (by_turn[0], lasting),
+            (by_turn[1], 0.0 * lasting),
+            (by_square, lasting**2),
+        )  # a square lasts half as long
+        kept[:, :q] = np.concatenate(
+            [of_pose, *(np.repeat(share, columns.shape[2], axis=1) for columns, share in more)], axis=1
+        )
         added[1:, :q] = 1.0 - kept[1:, :q] ** 2
         kept[0] = 1.0
         walk = np.array([sensor.drift_T_rth**2 / _HOUR_S for sensor in record.array.sensors]) + drift.sensor_T2_s
@@ -102,6 +113,18 @@ class Whitening:
         """White columns (g·k, m) of columns (n, C, m) of the channels."""
         summed = _summed(self.U @ channels, self.group, np.sqrt(1.0 / np.bincount(self.group)))
         return self.of_groups(np.ascontiguousarray(summed))
+
+    def entries(self, groups: IntArray) -> IntArray:
+        """Where the measurements of some groups are in white columns."""
+        k = len(self.U)
+        return np.asarray((groups[:, None] * k + np.arange(k)).ravel())
+
+    def of_some(self, channels: FloatArray, groups: IntArray) -> FloatArray:
+        """White columns (g'·k, m) of columns (n', C, m) of all rows of some groups; nothing is elsewhere."""
+        count = np.diff(self.starts)[groups]
+        Y = _summed(self.U @ channels, np.repeat(np.arange(len(groups)), count), np.sqrt(1.0 / count))
+        whiten(Y, groups, self.H, self.gains, self.kept, self.dt_s)
+        return Y.reshape(-1, Y.shape[2])
 
     @property
     def log_determinant(self) -> float:

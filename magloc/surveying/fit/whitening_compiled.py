@@ -98,9 +98,11 @@ def moment_columns(
     starts: IntArray,
     rows: IntArray,
 ) -> FloatArray:
-    """What unit moments at places (m, 3) add to the measurements of some groups of rows: (g, k, 3 m)."""
+    """What moments of unit x, y and z at places (m, 3) add to measurements of some groups of rows: (g, k, 3 m)."""
     C, k, m = directions.shape[1], len(U), len(places)
     out = np.zeros((len(rows), k, 3 * m))
+    px, py, pz = places[:, 0].copy(), places[:, 1].copy(), places[:, 2].copy()
+    fx, fy, fz = np.empty(m), np.empty(m), np.empty(m)
     for n in range(len(rows)):
         first, end = starts[rows[n]], starts[rows[n] + 1]
         scale = 1e-7 / math.sqrt(end - first)
@@ -109,15 +111,18 @@ def moment_columns(
                 s = sensors[i, channel_sensor[c]]
                 u0, u1, u2 = directions[i, c, 0], directions[i, c, 1], directions[i, c, 2]
                 for q in range(m):
-                    x, y, z = s[0] - places[q, 0], s[1] - places[q, 1], s[2] - places[q, 2]
-                    square = x * x + y * y + z * z
-                    size = scale / (square * math.sqrt(square))
-                    along = 3.0 * (u0 * x + u1 * y + u2 * z) / square
-                    fx, fy, fz = size * (along * x - u0), size * (along * y - u1), size * (along * z - u2)
-                    for j in range(k):
-                        out[n, j, 3 * q] += U[j, c] * fx
-                        out[n, j, 3 * q + 1] += U[j, c] * fy
-                        out[n, j, 3 * q + 2] += U[j, c] * fz
+                    x, y, z = s[0] - px[q], s[1] - py[q], s[2] - pz[q]
+                    inverse = 1.0 / (x * x + y * y + z * z)
+                    size = scale * inverse * math.sqrt(inverse)
+                    along = 3.0 * (u0 * x + u1 * y + u2 * z) * inverse
+                    fx[q], fy[q], fz[q] = size * (along * x - u0), size * (along * y - u1), size * (along * z - u2)
+                for j in range(k):
+                    if U[j, c] != 0.0:
+                        row = out[n, j]
+                        for q in range(m):
+                            row[q] += U[j, c] * fx[q]
+                            row[m + q] += U[j, c] * fy[q]
+                            row[2 * m + q] += U[j, c] * fz[q]
     return out
 
 

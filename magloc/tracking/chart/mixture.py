@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import ndtr
+from scipy.special import ndtr, ndtri
 
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.kalman import symmetric_square_root
@@ -23,7 +24,8 @@ narrow."""
 _OUTSIDE = 0.025
 # Standard deviation of the log-range beyond which the mean range tells of the prior alone.
 _WIDEST = 1.0
-_N_BISECTIONS = 60
+# Logarithm of a range, in metres, that no quantile is beyond.
+_BEYOND, _N_BISECTIONS = 30.0, 60
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +145,10 @@ class Mixture:
         back = chart.length - r
 
         def quantile(share: float) -> float:
-            low, high = -30.0, 30.0
+            low, high = -_BEYOND, _BEYOND
+            if len(self) == 1:
+                at = float(chart.length[0]) * math.exp(float(sigma[0]) * float(ndtri(share))) - float(back[0])
+                return min(max(at, math.exp(low)), math.exp(high))
             for _ in range(_N_BISECTIONS):
                 middle = 0.5 * (low + high)
                 with np.errstate(divide="ignore"):

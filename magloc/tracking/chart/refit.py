@@ -16,6 +16,7 @@ import numpy as np
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.measurement.nuisances import SensorErrors
 from magloc.tracking.chart.coordinates import Chart
+from magloc.tracking.chart.known_moment import KnownInWorld
 from magloc.tracking.chart.mixture import Mixture
 from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.chart.start import first_root
@@ -76,9 +77,10 @@ def refitted(
     motions: Sequence[MotionModel],
     errors: SensorErrors,
     cells: Cells | None = None,
+    known: KnownInWorld | None = None,
 ) -> Refitted:
     """Components fitted to the rows, each on its own, and given up where it is far less likely than the best one."""
-    rows, K, N = _Rows(measurements, motions, errors), len(mixture), mixture.x.shape[1]
+    rows, K, N = _Rows(measurements, motions, errors, known), len(mixture), mixture.x.shape[1]
     n = rows.n
     x, P = np.zeros((K, N)), np.zeros((K, N, N))
     nis, log_evidence = np.full(K, np.inf), np.full(K, -np.inf)
@@ -139,6 +141,7 @@ class _Rows:
     measurements: Sequence[ChartRow]
     motions: Sequence[MotionModel]
     errors: SensorErrors
+    known: KnownInWorld | None = None
 
     @property
     def n(self) -> int:
@@ -193,7 +196,13 @@ class _Rows:
             L = chart.jacobian(np.zeros_like(chart.x))
             effect = np.broadcast_to(measurement.effect, (K, *measurement.effect.shape))
             J = np.concatenate([measurement.along(chart.x, L), effect], axis=2)
-            left = (measurement.z - measurement.of_source(chart.x))[..., None] - J @ mean[..., None]
+            left = measurement.z - measurement.of_source(chart.x)
+            if not row and self.known is not None:
+                of_known = np.zeros((K, self.known.n_known, N))
+                of_known[..., :n] = self.known.along(chart.x, L)
+                J = np.concatenate([J, of_known], axis=1)
+                left = np.concatenate([left, self.known.residual(chart.x)], axis=1)
+            left = left[..., None] - J @ mean[..., None]
             PJ = P @ _T(J)
             L_S, sound = _roots(np.eye(J.shape[1]) + J @ PJ)
             log_evidence[~sound] = -np.inf

@@ -28,8 +28,10 @@ from magloc.localization.locator import Locator
 from magloc.measurement.nuisances import SensorErrors
 from magloc.measurement.rows import check_magnitudes, check_spans
 from magloc.tracking.chart.coordinates import MOMENT_POWER, Chart, source_root
+from magloc.tracking.chart.known_moment import UNIFORM_IN_SPACE, KnownInWorld
 from magloc.tracking.chart.mixture import DROPPED_BELOW, FARTHEST, NEAREST, Mixture, block_root
 from magloc.tracking.chart.row import ChartRow, where_smooth
+from magloc.tracking.chart.stack import Measured
 from magloc.tracking.chart.update import Updated, updated
 from magloc.tracking.measurement import whitening
 from magloc.tracking.motion import N_SOURCE, MotionModel
@@ -148,35 +150,38 @@ class Start:
             self._locator = Locator(array, prior=prior, body_length_m=0.0, exclude_faulty=False)
             self._examiner = Locator(array, prior=prior)
 
-    def mixture(self, measurement: ChartRow, motion: MotionModel) -> tuple[Mixture | None, str]:
+    def mixture(self, measurement: Measured, motion: MotionModel) -> tuple[Mixture | None, str]:
         """What one row says of a source and of the pose's errors, or why there is none."""
         if not measurement.is_detected(self.errors.sigma):
             return None, "not acquired: no signal stands out of noise"
         # Before it nothing is known of source and sensors together: the sensors' errors are noise.
         alone = measurement.with_errors_as_noise(self.errors.sigma)
+        known = KnownInWorld.of(self.prior, measurement.row.R_world_from_array)
         seeds = self._seeds(alone)
         if not len(seeds.cell):
             array = alone.model.array
             is_linear = array.ambient_fields.any() or not array.channel_is_scalar.any()
             return None, NOT_ALLOWED if is_linear or alone.z.size >= N_SOURCE else NO_AMBIENT
-        found = _components(alone, motion, seeds)
+        found = _components(alone, motion, seeds, known)
         for refined in (_centred, _along_valleys):
             finer = refined(seeds, found, measurement)
             if not len(finer.cell):
                 return None, NOT_ALLOWED
             if finer is not seeds:
-                seeds, found = finer, _components(alone, motion, finer)
+                seeds, found = finer, _components(alone, motion, finer, known)
         row = measurement.row
         position = (found.x[:, :3] - row.origin_m) @ row.R_world_from_array
         sound = self.prior.allows_position(position) & self.prior.allows_moment(found.x[:, 3:6])
         sound &= np.isfinite(found.log_evidence) & found.converged
         if not sound.any():
             return None, NOT_ALLOWED
-        dof = measurement.z.size - N_SOURCE
+        dof = measurement.z.size - N_SOURCE + (0 if known is None else known.n_known)
         if dof > 0 and found.chi2[sound].min() > chdtri(dof, CONTRADICTION):
             return None, NO_DIPOLE
         log_weight = found.log_evidence + _EVEN * ((seeds.cell < 0) @ np.array([1.0, 2.0, 0.0]))
         log_weight -= math.log(2.0) * seeds.cell[:, 2]
+        if known is not None:
+            log_weight += UNIFORM_IN_SPACE * np.log(measurement.chart(found.x).length)
         mixture = _mixture(found, log_weight, measurement)
         return mixture.take(sound).take(once(mixture.take(sound), seeds.cell[sound])), ""
 
@@ -185,7 +190,7 @@ class Start:
         dropped = () if self._examiner is None else self._examiner.fit(row.readings_T, row.ambient_T).dropped_sensors
         return np.isin(self.errors.array.ids, dropped)
 
-    def _seeds(self, measurement: ChartRow) -> _Seeds:
+    def _seeds(self, measurement: Measured) -> _Seeds:
         """Chosen cells, and the row's best fits."""
         cells, row = self._grid.position_m, measurement.row
         world = row.origin_m + cells @ row.R_world_from_array.T
@@ -207,7 +212,9 @@ class Start:
         return _Seeds(np.vstack(position), np.vstack(moment), np.vstack(cell))
 
 
-def _components(measurement: ChartRow, motion: MotionModel, seeds: _Seeds) -> Updated:
+def _components(
+    measurement: Measured, motion: MotionModel, seeds: _Seeds, known: KnownInWorld | None = None
+) -> Updated:
     """What the row makes of cells about seeds."""
     state, _ = motion.start(np.zeros(N_SOURCE), np.zeros((N_SOURCE, N_SOURCE)))
     x = np.tile(state, (len(seeds.cell), 1))
@@ -215,15 +222,15 @@ def _components(measurement: ChartRow, motion: MotionModel, seeds: _Seeds) -> Up
     chart, sigma = measurement.chart(x), np.tile(_CELL, (len(x), 1))
     sigma[:, 0] /= 2.0 ** seeds.cell[:, 2]
     S = chart.inverse_jacobian() @ _with_motion(chart, motion, sigma)
-    return updated(x, S, measurement, np.zeros(len(x), dtype=bool))
+    return updated(x, S, measurement, np.zeros(len(x), dtype=bool), known=known)
 
 
-def _mixture(found: Updated, log_weight: FloatArray, measurement: ChartRow) -> Mixture:
+def _mixture(found: Updated, log_weight: FloatArray, measurement: Measured) -> Mixture:
     n, centroid_m, radius_m = measurement.n_motion, measurement.centroid_m, measurement.radius_m
     return Mixture(found.x, found.S, log_weight, n, centroid_m, radius_m, measurement.n_pose)
 
 
-def _centred(seeds: _Seeds, found: Updated, measurement: ChartRow) -> _Seeds:
+def _centred(seeds: _Seeds, found: Updated, measurement: Measured) -> _Seeds:
     """Seeds that stand where the row puts them, along the coordinates in which it tells more than their cells do."""
     sigma = np.sqrt(np.sum(found.S[:, :3] ** 2, axis=2))
     narrow = sigma < _NARROW * _CELL
@@ -245,7 +252,7 @@ def _centred(seeds: _Seeds, found: Updated, measurement: ChartRow) -> _Seeds:
     )
 
 
-def _along_valleys(seeds: _Seeds, found: Updated, measurement: ChartRow) -> _Seeds:
+def _along_valleys(seeds: _Seeds, found: Updated, measurement: Measured) -> _Seeds:
     """The seeds, and instead of such as found a valley of ranges that bends others along it, as dense as it bends.
 
     A row that tells much leaves a source in a narrow valley, and a Gaussian in the middle says nothing of its ends.

@@ -22,10 +22,12 @@ from magloc.localization.fit.prior import SourcePrior
 from magloc.measurement.nuisances import SensorErrors
 from magloc.measurement.pose import PoseErrors
 from magloc.tracking.chart.coordinates import mirrored
+from magloc.tracking.chart.known_moment import UNIFORM_IN_SPACE, KnownInWorld
 from magloc.tracking.chart.mixture import Mixture, block_root, root_of
 from magloc.tracking.chart.posed_motion import PosedMotion
-from magloc.tracking.chart.refit import Cells, refitted
+from magloc.tracking.chart.refit import Cells, Refitted, refitted
 from magloc.tracking.chart.row import ChartRow
+from magloc.tracking.chart.stack import Stack
 from magloc.tracking.chart.start import OF_PITCH, Start, once, with_errors
 from magloc.tracking.chart.update import Move, predicted_root, updated
 from magloc.tracking.motion import N_SOURCE, MotionModel
@@ -106,7 +108,7 @@ class ChartFilter:
     """Starts tracks of one array, and steps them."""
 
     def __init__(self, array: SensorArray, errors: SensorErrors, pose_errors: PoseErrors, prior: SourcePrior) -> None:
-        self.errors, self.pose_errors = errors, pose_errors
+        self.errors, self.pose_errors, self.prior = errors, pose_errors, prior
         self._start = Start(array, errors, prior)
         self.n_differences = decorrelated_differences(array).n_differences
 
@@ -121,6 +123,10 @@ class ChartFilter:
     def of_row(self, row: ChartRow, motion: MotionModel) -> tuple[Mixture | None, str]:
         """What one row alone says of a source and the pose, by every cell that explains it, or why it says nothing."""
         return self._start.mixture(row, self._posed(motion))
+
+    def of_stack(self, stack: Stack, at_rest: MotionModel) -> tuple[Mixture | None, str]:
+        """What rows say together of a source alone, that is where it is in the last of them."""
+        return self._start.mixture(stack, at_rest)
 
     def faulty(self, row: ChartRow) -> BoolArray:
         """Sensors (N,) that contradict all others in a row that no dipole fits."""
@@ -177,7 +183,7 @@ class ChartFilter:
         rows = [row for row, _ in known.young]
         motions = [self._posed(motion) for _, motion in known.young]
         known = replace(known, next_refit=int(REFITS_GROW * n_rows))
-        fit = refitted(seeds, rows, motions, self.errors)
+        fit = self._fitted(seeds, rows, motions)
         # A component that is not fitted to its end may be the true one: then the filter goes on with all of them.
         if not fit.decided[:n_seeds].all() or not _believed(fit.mixture, fit.nis, rows):
             return known
@@ -197,6 +203,17 @@ class ChartFilter:
                 return known
         return replace(known, mixture=self._along_the_range(found, rows, motions))
 
+    def _fitted(
+        self, seeds: Mixture, rows: Sequence[ChartRow], motions: Sequence[MotionModel], cells: Cells | None = None
+    ) -> Refitted:
+        """Components fitted to all rows, with what was known before them."""
+        known = KnownInWorld.of(self.prior, rows[0].row.R_world_from_array)
+        fit = refitted(seeds, rows, motions, self.errors, cells, known)
+        if known is None:
+            return fit
+        of_space = UNIFORM_IN_SPACE * np.log(fit.mixture.chart.length)
+        return replace(fit, mixture=replace(fit.mixture, log_weight=fit.mixture.log_weight + of_space))
+
     def _along_the_range(self, found: Mixture, rows: Sequence[ChartRow], motions: Sequence[MotionModel]) -> Mixture:
         """Where ranges are open, components fitted anew in cells of the range, as at the start, each with its evidence.
 
@@ -211,7 +228,7 @@ class ChartFilter:
         k, cell = np.divmod(np.arange(len(sigma) * N_CELLS), N_CELLS)
         pitch = CELL_PITCH * sigma[k]
         cells = Cells((cell - N_CELLS // 2) * pitch, OF_PITCH * pitch)
-        fit = refitted(found.take(k), rows, motions, self.errors, cells)
+        fit = self._fitted(found.take(k), rows, motions, cells)
         if not fit.decided.all() or not len(fit.mixture):
             return found
         spread = replace(fit.mixture, log_weight=fit.mixture.log_weight + np.log(pitch[fit.origin]))

@@ -17,8 +17,9 @@ import numpy as np
 
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.tracking.chart.coordinates import Chart
+from magloc.tracking.chart.known_moment import KnownInWorld
 from magloc.tracking.chart.mixture import root_of
-from magloc.tracking.chart.row import ChartRow
+from magloc.tracking.chart.stack import Measured, Stack
 
 TOLERANCE = 1e-3
 """Stop of the iteration: length of the next step in posterior standard deviations."""
@@ -105,7 +106,12 @@ class Updated:
 
 
 def updated(
-    x: FloatArray, S: FloatArray, measurement: ChartRow, bends: BoolArray, lasting: ChartRow | None = None
+    x: FloatArray,
+    S: FloatArray,
+    measurement: Measured,
+    bends: BoolArray,
+    lasting: Measured | None = None,
+    known: KnownInWorld | None = None,
 ) -> Updated:
     r"""Iterated update of states (K, N) with roots (K, N, N), each on its own.
 
@@ -115,12 +121,12 @@ def updated(
     .. math:: \min_e |C^{-1/2}(z - h(x \oplus e) - \ldots)|^2 + e^T P^{-1} e.
 
     Predictions bend as `lasting` does: the row, where of the pose's errors only those have an effect that the rows
-    before had as well.
+    before had as well. What is `known` of the moment is measured with it, of a row without errors of sensors.
     """
     n = measurement.n_motion
     chart = measurement.chart(x[:, :n]).firmly(S)
-    problem = _Problem.of(chart, x, S, measurement).bent(bends, lasting or measurement)
-    K, k = len(x), measurement.z.size
+    problem = replace(_Problem.of(chart, x, S, measurement).bent(bends, lasting or measurement), known=known)
+    K, k = len(x), measurement.z.size + (0 if known is None else known.n_known)
     zeta = np.zeros((K, n))
     residual = problem.residual(zeta)
     cost = np.sum(residual * residual, axis=1)
@@ -182,8 +188,8 @@ class _Problem:
     chart: Chart
     x: FloatArray
     S: FloatArray
-    measurement: ChartRow
-    lasting: ChartRow
+    measurement: Measured
+    lasting: Measured
     U: FloatArray
     z: FloatArray
     whiten: FloatArray | None
@@ -192,12 +198,19 @@ class _Problem:
     M: FloatArray
     J: FloatArray
     h: FloatArray
+    known: KnownInWorld | None = None
 
     @classmethod
-    def of(cls, chart: Chart, x: FloatArray, S: FloatArray, measurement: ChartRow) -> _Problem:
+    def of(cls, chart: Chart, x: FloatArray, S: FloatArray, measurement: Measured) -> _Problem:
         n, k, K = measurement.n_motion, measurement.z.size, len(x)
         z = np.broadcast_to(measurement.z, (K, k))
         straight = np.zeros((K, n, k)), np.zeros((K, k, n)), np.zeros((K, k))
+        if isinstance(measurement, Stack):
+            root = np.linalg.cholesky(measurement.covariance(x))
+            whiten = np.linalg.inv(root)
+            log_C = 2.0 * np.sum(np.log(np.diagonal(root, axis1=-2, axis2=-1)), axis=1)
+            z = (whiten @ z[..., None])[..., 0]
+            return cls(chart, x, S, measurement, measurement, S, z, whiten, np.zeros((K, k, n)), log_C, *straight)
         if not measurement.effect.shape[1]:
             return cls(chart, x, S, measurement, measurement, S, z, None, np.zeros((K, k, 0)), np.zeros(K), *straight)
         U = root_of(S[:, :n])
@@ -234,7 +247,7 @@ class _Problem:
         """Coordinates (K, n)."""
         return (self.U @ zeta[..., None])[..., 0]
 
-    def bent(self, bends: BoolArray, lasting: ChartRow) -> _Problem:
+    def bent(self, bends: BoolArray, lasting: Measured) -> _Problem:
         """The same, the prediction being Gaussian in what the row measures where it bends so: see :func:`updated`."""
         if not bends.any():
             return self
@@ -247,12 +260,12 @@ class _Problem:
     def _whitened(self, values: FloatArray) -> FloatArray:
         return values if self.whiten is None else self.whiten @ values
 
-    def _predicted(self, measurement: ChartRow, e: FloatArray) -> FloatArray:
+    def _predicted(self, measurement: Measured, e: FloatArray) -> FloatArray:
         """Whitened predictions (K, k) without errors of sensors."""
         h = measurement.of_source(self.chart.retracted(e))
         return np.asarray(self._whitened(h[..., None])[..., 0])
 
-    def _derivative(self, measurement: ChartRow, e: FloatArray) -> FloatArray:
+    def _derivative(self, measurement: Measured, e: FloatArray) -> FloatArray:
         """Their derivative (K, k, n) by ζ."""
         return self._whitened(self._of_coordinates(measurement, e)) @ self.U
 
@@ -266,6 +279,8 @@ class _Problem:
         left = self.z - h
         if self.whiten is not None:
             left = left - (self.of_errors @ standard[..., None])[..., 0]
+        if self.known is not None:
+            left = np.concatenate([left, self.known.residual(self.chart.retracted(e))], axis=1)
         return np.concatenate([left, -standard], axis=1)
 
     def jacobian(self, zeta: FloatArray) -> FloatArray:
@@ -275,6 +290,8 @@ class _Problem:
         standard = self.bending(e, J)
         if self.whiten is not None:
             J = J + self.of_errors @ standard
+        if self.known is not None:
+            J = np.concatenate([J, self.known.along(*self.chart.linearised(e)) @ self.U], axis=1)
         return np.concatenate([J, standard], axis=1)
 
     def bending(self, e: FloatArray, J: FloatArray) -> FloatArray:
@@ -283,7 +300,7 @@ class _Problem:
             J = self._derivative(self.lasting, e)
         return np.eye(J.shape[2]) + self.M @ (J - self.J)
 
-    def _of_coordinates(self, measurement: ChartRow, e: FloatArray) -> FloatArray:
+    def _of_coordinates(self, measurement: Measured, e: FloatArray) -> FloatArray:
         """Derivative (K, k, n) of the source's differences, in units of their noise, by its coordinates."""
         return measurement.along(*self.chart.linearised(e))
 
@@ -294,7 +311,7 @@ class _Problem:
         x[:, :n] = self.chart.retracted(e)
         after = self.measurement.chart(x[:, :n])
         turned = after.inverse_jacobian() @ self.chart.jacobian(e)
-        if self.whiten is None:
+        if not self.measurement.effect.shape[1]:
             root = np.linalg.solve(np.swapaxes(R, -1, -2), np.swapaxes(self.U, -1, -2))
             return x, turned @ np.swapaxes(root, -1, -2)
         return self._posterior_of_errors(x, residual, e, turned)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import combinations
 
@@ -38,6 +38,8 @@ _LEFT_OUT = 4.5
 # A birth starts from so many cells, if they explain that much.
 _BIRTH_STARTS = 4
 _WORTH_A_BIRTH = 16.0
+# Steps of a first update that tells where a birth is to begin.
+_START_TRIALS = 20
 # Explanations that go on from one event to the next, and those that are returned.
 _WIDTH = 4
 _RETURNED = 3
@@ -120,11 +122,17 @@ class RowProblem:
     row : Row
     index : int
         Of the row: sources that are born in it are called by it.
+    step : ndarray, shape (12,)
+        Of the motion to it.
+    further : dict
+        Explanations that were asked what else may have happened, by their identity, and the answers.
     """
 
     scene: Scene
     row: Row
     index: int
+    step: FloatArray
+    further: dict[int, tuple[Explanation, list[Explanation]]] = field(default_factory=dict)
 
     @cached_property
     def measured(self) -> JointRow:
@@ -204,9 +212,9 @@ class RowProblem:
             found = again
         return found
 
-    def of_more_sources(self, common: JointState, out: BoolArray, least: int) -> list[Explanation]:
+    def of_more_sources(self, nothing: Explanation, least: int) -> list[Explanation]:
         """Explanations from nothing, with some number of sources at least: fewer may hold in a row, and be wrong."""
-        return self._beam(self.updated(common, (), out), least + 1, least)
+        return self._beam(nothing, least + 1, least)
 
     def _beam(self, plain: Explanation, most_events: int, least: int = 0) -> list[Explanation]:
         level = [plain]
@@ -250,8 +258,13 @@ class RowProblem:
             alone = self.with_source(prior.without(second).without(first), place_m, together)
             yield self.updated(alone, (*others, min(ids[first], ids[second])), found.out, penalty)
 
-    def _one_event_more(self, found: Explanation) -> Iterator[Explanation]:
+    def _one_event_more(self, found: Explanation) -> list[Explanation]:
         """A sensor out, a death, and births at the best cells."""
+        if id(found) not in self.further:
+            self.further[id(found)] = found, list(self._events(found))
+        return self.further[id(found)][1]
+
+    def _events(self, found: Explanation) -> Iterator[Explanation]:
         if not found.update.converged and not np.isfinite(found.update.cost):
             return
         chi2 = found.update.sensor_chi2
@@ -273,10 +286,11 @@ class RowProblem:
         for cell in self._cells.best(energy, _BIRTH_STARTS):
             if energy[cell] < _WORTH_A_BIRTH:
                 continue
-            place_m = self.row.origin_m + self.row.R_world_from_array @ self._cells.position_m[cell]
-            moment = found.update.row.moment_at(place_m, found.update.innovation, found.update.linear)
+            update, R = found.update, self.row.R_world_from_array
+            place_m = self.row.origin_m + R @ self._cells.position_m[cell]
+            moment = R @ self._cells.moment(cell, update.innovation, update.linear, update.row.used)
             ids = (*found.ids, self._first_id + born)
-            start = joint_update(self.with_source(found.prior, place_m, moment), found.update.row).found
+            start = joint_update(self.with_source(found.prior, place_m, moment), update.row, _START_TRIALS).found
             # Where it is found, not where it was looked for, is what the next event starts from.
             prior = self.with_source(found.prior, start.position_m[-1], start.moment_Am2[-1])
             child = self.updated(prior, ids, found.out, found.penalty + BIRTH)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -88,19 +89,6 @@ class JointRow:
         energy: FloatArray = np.bincount(self.channel_sensor, np.vecdot(self.gain, fields) ** 2).astype(np.float64)
         return energy
 
-    def moment_at(self, position_m: FloatArray, innovation: FloatArray, linear: FloatArray) -> FloatArray:
-        """The moment (3,) of a source at a place that explains most of an innovation (C,).
-
-        Beside it the innovation has errors of unit variance along the columns of `linear` (C, d).
-        """
-        fields = dipole.field_matrix(self.positions_m, position_m)[self.channel_sensor]
-        columns = (self.gain[:, None] @ fields)[:, 0]
-        size = np.linalg.norm(columns)
-        d = linear.shape[1]
-        A = np.block([[columns / size, linear], [np.zeros((d, 3)), np.eye(d)]])
-        found: FloatArray = np.linalg.lstsq(A, np.concatenate([innovation, np.zeros(d)]), rcond=None)[0]
-        return found[:3] / size
-
 
 @dataclass(frozen=True, eq=False)
 class Cells:
@@ -110,11 +98,14 @@ class Cells:
     ----------
     position_m : ndarray, shape (n, 3)
         In the array's frame.
+    columns : ndarray, shape (n, C, 3)
+        Readings of unit moments at each of them.
     bases : ndarray, shape (C, 3 n)
-        Orthonormal readings of unit moments at each of them, the common field projected out: by axis, then by cell.
+        Orthonormal ones, the common field projected out: by axis, then by cell.
     """
 
     position_m: FloatArray
+    columns: FloatArray
     bases: FloatArray
 
     @classmethod
@@ -128,9 +119,8 @@ class Cells:
         common = common[:, size > 1e-10 * size.max(initial=0.0)]
         fields = dipole.field_matrix(array.positions, positions[:, None])[:, array.channel_sensor]
         columns = (gain[None, :, None] @ fields)[:, :, 0]
-        columns -= common @ (common.T @ columns)
-        bases, _ = np.linalg.qr(columns)
-        return cls(positions, bases.transpose(1, 2, 0).reshape(len(gain), -1).astype(np.float32))
+        bases, _ = np.linalg.qr(columns - common @ (common.T @ columns))
+        return cls(positions, columns, bases.transpose(1, 2, 0).reshape(len(gain), -1).astype(np.float32))
 
     def energy(self, residual: FloatArray) -> FloatArray:
         """Energy (n,) of residuals (C,) that a source at each cell explains: χ² with three degrees of freedom."""
@@ -138,15 +128,34 @@ class Cells:
         energy: FloatArray = np.sum(np.square(components), axis=0, dtype=np.float64)
         return energy
 
+    def moment(self, cell: int, innovation: FloatArray, linear: FloatArray, used: BoolArray) -> FloatArray:
+        """The moment (3,) in the array's frame of a source in a cell that explains most of an innovation (C,).
+
+        Beside it the innovation has errors of unit variance along the columns of `linear` (C, d).
+        """
+        A = self.columns[cell] * used[:, None]
+        A = np.concatenate([A, innovation[:, None]], axis=1)
+        # What the errors may explain of it counts for as much less: (I + J Jᵀ)⁻¹ = I - J (I + JᵀJ)⁻¹ Jᵀ.
+        of_errors = linear.T @ A
+        N = linear.T @ linear
+        N[np.diag_indices(len(N))] += 1.0
+        left = A[:, :3].T @ A - of_errors[:, :3].T @ np.linalg.solve(N, of_errors)
+        found: FloatArray = np.linalg.lstsq(left[:, :3], left[:, 3], rcond=None)[0]
+        return found
+
+    @cached_property
+    def _near(self) -> BoolArray:
+        """Which cells (n, n) are nearer to one than half its distance from the array's centre."""
+        from_centre = self.position_m - self.position_m.mean(axis=0)
+        square = np.vecdot(from_centre, from_centre)
+        return square[:, None] + square - 2.0 * from_centre @ from_centre.T < 0.25 * square[:, None]
+
     def best(self, energy: FloatArray, n: int) -> IntArray:
         """The `n` best cells, half their distance from the array's centre apart from each other."""
         left, chosen = energy.copy(), []
-        centre = self.position_m.mean(axis=0)
         for _ in range(n):
-            cell = int(np.argmax(left))
-            chosen.append(cell)
-            apart = np.linalg.norm(self.position_m - self.position_m[cell], axis=1)
-            left[apart < 0.5 * np.linalg.norm(self.position_m[cell] - centre)] = -1.0
+            chosen.append(int(np.argmax(left)))
+            left[self._near[chosen[-1]]] = -1.0
         return np.array(chosen, dtype=np.intp)
 
 
@@ -156,6 +165,8 @@ class Channels:
     def __init__(self, array: SensorArray) -> None:
         self.array = array
         self._known: dict[bytes, tuple[FloatArray, Cells]] = {}
+        if not array.noise_depends_on_reading:  # before the first row comes
+            self.of(Row(0.0, np.zeros(array.n_channels)))
 
     def of(self, row: Row) -> tuple[FloatArray, Cells]:
         """Whitening (C, C) and cells of a row; where the noise depends on the readings, those of the first such row."""

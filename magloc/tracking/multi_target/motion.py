@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from arrays.typing import FloatArray
-from magloc.navigation.rotations import cross_matrix, rotation_matrix, turn_of_change
 from magloc.tracking.motion import wandering_step
-from magloc.tracking.multi_target.state import N_COMMON, N_OF_SOURCE, N_SEEN, JointState
+from magloc.tracking.multi_target.motion_compiled import step_all
+from magloc.tracking.multi_target.state import N_OF_SOURCE, JointState
 
 P_, C_, V_, W_ = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 
@@ -58,42 +58,21 @@ class FreeMotion:
             if not 0.0 < value < math.inf:
                 raise ValueError(f"Input {name} must be positive and finite; instead received {value}.")
 
-    def predicted(self, state: JointState, dt_s: float, *, agility: float = 1.0) -> JointState:
-        """State after a step without readings; `agility` times the noise of velocity and turn."""
-        K = state.n_sources
+    def numbers(self, dt_s: float, *, agility: float = 1.0) -> FloatArray:
+        """A step as the compiled one takes it (12,); `agility` times the noise of velocity and turn."""
         lasts_s, kept, root_v = wandering_step(self.correlation_s, dt_s)
         turn_lasts_s, turn_kept, root_w = wandering_step(self.turn_correlation_s, dt_s)
-        root_v, root_w = agility * self.speed_m_s * root_v, agility * self.turn_rad_s * root_w
-        F, Q = np.zeros((K, N_OF_SOURCE, N_OF_SOURCE)), np.zeros((K, N_OF_SOURCE, N_OF_SOURCE))
-        one = np.eye(3)
-        F[:, P_, P_], F[:, P_, V_], F[:, V_, V_], F[:, W_, W_] = one, lasts_s * one, kept * one, turn_kept * one
-        of_p_v, of_c_w = root_v @ root_v.T, root_w @ root_w.T
-        Q[:, P_, P_], Q[:, V_, V_] = of_p_v[0, 0] * one, of_p_v[1, 1] * one
-        Q[:, P_, V_] = Q[:, V_, P_] = of_p_v[0, 1] * one
-        Q[:, W_, W_] = of_c_w[1, 1] * one
-        angle = turn_lasts_s * state.rate_rad_s
-        R = rotation_matrix(angle)
-        moments = (R @ state.moment_Am2[..., None])[..., 0]
-        u = moments / np.sqrt(np.vecdot(moments, moments))[:, None]
-        along, turned = u[..., None] * u[:, None], -cross_matrix(u)  # what a small turn changes of u
-        F[:, C_, C_], F[:, C_, W_] = R, turn_lasts_s * turned @ turn_of_change(angle)
-        Q[:, C_, C_] = of_c_w[0, 0] * (one - along) + self.strength_change**2 * dt_s * along
-        Q[:, C_, W_] = of_c_w[0, 1] * turned
-        Q[:, W_, C_] = -Q[:, C_, W_]
-        at = state.of_source
-        whole_F, whole_Q = np.eye(len(state.P)), np.zeros_like(state.P)
-        whole_F[at[:, :, None], at[:, None, :]] = F
-        whole_Q[at[:, :, None], at[:, None, :]] = Q
-        common = N_SEEN * K + np.arange(N_COMMON)
-        whole_Q[common, common] = self.common_walk_T**2 * dt_s
-        return replace(
-            state,
-            position_m=state.position_m + lasts_s * state.velocity_m_s,
-            moment_Am2=moments,
-            velocity_m_s=kept * state.velocity_m_s,
-            rate_rad_s=turn_kept * state.rate_rad_s,
-            P=whole_F @ state.P @ whole_F.T + whole_Q,
-        )
+        of_p_v = (agility * self.speed_m_s) ** 2 * (root_v @ root_v.T)
+        of_c_w = (agility * self.turn_rad_s) ** 2 * (root_w @ root_w.T)
+        upper = np.array([0, 0, 1]), np.array([0, 1, 1])
+        walks = self.strength_change**2 * dt_s, self.common_walk_T**2 * dt_s
+        return np.array([lasts_s, kept, turn_lasts_s, turn_kept, *of_p_v[upper], *of_c_w[upper], *walks])
+
+    def predicted(self, state: JointState, dt_s: float, *, agility: float = 1.0) -> JointState:
+        """State after a step without readings; `agility` times the noise of velocity and turn."""
+        moving = state.position_m, state.moment_Am2, state.velocity_m_s, state.rate_rad_s
+        position, moment, velocity, rate, P = step_all(moving, state.P, self.numbers(dt_s, agility=agility))
+        return JointState(position, moment, velocity, rate, state.common_T, P)
 
     def start(self, direction: FloatArray, position_m: float, turn_rad: float, log_strength: float) -> FloatArray:
         """Covariance (12, 12) of a source of which so much is known, whose moment points along a unit vector."""

@@ -11,6 +11,7 @@ The covariance's order is (p, c) of every source, b, then (v, ω) of every sourc
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -68,21 +69,19 @@ class JointState:
 
     def moved(self, error: FloatArray) -> JointState:
         """The state that an error (n,), or what a row sees of it, leads to; the covariance stays as it is."""
+        k = self.n_sources
+        c = error[: N_SEEN * k].reshape(k, N_SEEN)[:, 3:]
+        return self.moved_to(error, moved_moment(self.moment_Am2, c), self.P)
+
+    def moved_to(self, error: FloatArray, moment_Am2: FloatArray, P: FloatArray) -> JointState:
+        """The same, with the moments (K, 3) that the error leads to, and the covariance there."""
         k, seen = self.n_sources, self.n_seen
         of_seen, of_motion = error[: N_SEEN * k].reshape(k, N_SEEN), error[seen:].reshape(-1, N_SEEN)
-        moved = replace(
-            self,
-            position_m=self.position_m + of_seen[:, :3],
-            moment_Am2=moved_moment(self.moment_Am2, of_seen[:, 3:]),
-            common_T=self.common_T + error[N_SEEN * k : seen],
-        )
-        if not of_motion.size:
-            return moved
-        return replace(
-            moved,
-            velocity_m_s=self.velocity_m_s + of_motion[:, :3],
-            rate_rad_s=self.rate_rad_s + of_motion[:, 3:],
-        )
+        velocity_m_s, rate_rad_s = self.velocity_m_s, self.rate_rad_s
+        if of_motion.size:
+            velocity_m_s, rate_rad_s = velocity_m_s + of_motion[:, :3], rate_rad_s + of_motion[:, 3:]
+        position_m, common_T = self.position_m + of_seen[:, :3], self.common_T + error[N_SEEN * k : seen]
+        return JointState(position_m, moment_Am2, velocity_m_s, rate_rad_s, common_T, P)
 
     def moved_with(self, error: FloatArray, P: FloatArray) -> JointState:
         """The same with a covariance P of errors in this state's chart, brought into the chart there."""
@@ -94,21 +93,26 @@ class JointState:
             one[of_c] = turned @ one[of_c]
         return replace(moved, P=P)
 
-    def covariance(self, source: int) -> FloatArray:
-        """Second moments (6, 6) of the Cartesian error of a source's position and moment.
+    @cached_property
+    def covariances(self) -> FloatArray:
+        """Second moments (K, 6, 6) of the Cartesian errors of the sources' positions and moments.
 
         Where |m| is known better than its direction, what turns leave of a moment's length is more than the error of
         |m| itself: 1 - cos δ ≈ δ²/2, whose mean square is (tr² Σ + 2 tr Σ²)/4 for turns of covariance Σ.
         """
-        at, moment = self.of_source[source, :N_SEEN], self.moment_Am2[source]
-        scale = np.ones(N_SEEN)
-        scale[3:] = np.linalg.norm(moment)
-        covariance: FloatArray = self.P[np.ix_(at, at)] * np.outer(scale, scale)
-        across = np.eye(3) - np.outer(moment, moment) / (moment @ moment)
-        turns = across @ self.P[np.ix_(at[3:], at[3:])] @ across
-        shorter = 0.25 * np.trace(turns) ** 2 + 0.5 * np.sum(turns * turns)
-        covariance[3:, 3:] += shorter * np.outer(moment, moment)
-        return covariance
+        m, d = self.moment_Am2, N_SEEN * self.n_sources
+        square = np.vecdot(m, m)[:, None, None]
+        own = np.arange(self.n_sources)
+        P = self.P[:d, :d].reshape(self.n_sources, N_SEEN, self.n_sources, N_SEEN)[own, :, own]
+        across = np.eye(3) - m[:, :, None] * m[:, None] / square
+        turns = across @ P[:, 3:, 3:] @ across
+        trace = np.trace(turns, axis1=1, axis2=2)
+        shorter = 0.25 * trace**2 + 0.5 * np.sum(turns * turns, axis=(1, 2))
+        scale = np.ones((self.n_sources, N_SEEN))
+        scale[:, 3:] = np.sqrt(square[:, 0])
+        covariances: FloatArray = P * scale[:, :, None] * scale[:, None]
+        covariances[:, 3:, 3:] += shorter[:, None, None] * m[:, :, None] * m[:, None]
+        return covariances
 
     def log_strength_sigma(self, source: int) -> float:
         """Standard deviation of ln |m| of a source."""
@@ -128,7 +132,7 @@ class JointState:
     def common_alone(self) -> JointState:
         """What is known of the common field, and no source."""
         at = slice(self.n_seen - N_COMMON, self.n_seen)
-        return replace(JointState.empty(self.common_T, 0.0), P=self.P[at, at])
+        return replace(JointState.empty(self.common_T, 0.0), P=self.P[at, at].copy())
 
     def without(self, source: int) -> JointState:
         """The state of the others."""
@@ -145,13 +149,14 @@ class JointState:
 
     def with_source(self, position_m: FloatArray, moment_Am2: FloatArray, covariance: FloatArray) -> JointState:
         """The state with another source, last, at rest: covariance (12, 12) of its (p, c, v, ω)."""
-        k = self.n_sources
-        before = np.concatenate([self.of_source.ravel(), N_SEEN * k + np.arange(N_COMMON)])
-        new = places_of(k + 1)
-        after = np.concatenate([new[:k].ravel(), N_SEEN * (k + 1) + np.arange(N_COMMON)])
-        P = np.zeros((len(self.P) + N_OF_SOURCE,) * 2)
-        P[np.ix_(after, after)] = self.P[np.ix_(before, before)]
-        P[np.ix_(new[k], new[k])] = covariance
+        # What a row sees of it stands before the common field, its motion behind all others.
+        at, end = N_SEEN * self.n_sources, len(self.P) + N_SEEN
+        P = np.zeros((end + N_SEEN,) * 2)
+        behind, seen, motion = slice(at + N_SEEN, end), slice(at, at + N_SEEN), slice(end, None)
+        P[:at, :at], P[behind, behind] = self.P[:at, :at], self.P[at:, at:]
+        P[:at, behind], P[behind, :at] = self.P[:at, at:], self.P[at:, :at]
+        P[seen, seen], P[motion, motion] = covariance[:N_SEEN, :N_SEEN], covariance[N_SEEN:, N_SEEN:]
+        P[seen, motion], P[motion, seen] = covariance[:N_SEEN, N_SEEN:], covariance[N_SEEN:, :N_SEEN]
         rest = np.zeros((1, 3))
         return JointState(
             np.concatenate([self.position_m, position_m[None]]),

@@ -16,9 +16,8 @@ from arrays.typing import FloatArray
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.measurement.plausibility import usable_readings
 from magloc.readings import Readings
-from magloc.tracking.multi_target.files import lines_of_sources
 from magloc.tracking.multi_target.motion import FreeMotion
-from magloc.tracking.multi_target.results import SourcesPoint
+from magloc.tracking.multi_target.results import SourcesPoint, lines_of_sources
 from magloc.tracking.multi_target.tracker import SourcesTracker
 from magloc.tracking.results import TrackPoint, TrackResult, rows_of
 from magloc.tracking.track import TrackColumns

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
-from itertools import combinations
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from arrays.array import SensorArray
-from arrays.typing import FloatArray
 from magloc.blas_threads import one_blas_thread
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.locator import Locator
@@ -26,13 +23,24 @@ from magloc.tracking.multi_target.explanations import (
     Explanation,
     RowProblem,
     Scene,
+    apart,
     are_same,
     distinct,
+)
+from magloc.tracking.multi_target.hypotheses import (
+    REFITS,
+    Hypothesis,
+    by_score,
+    mates,
+    merged_pairs,
+    moments,
+    old_names,
+    split,
 )
 from magloc.tracking.multi_target.measurement import Channels
 from magloc.tracking.multi_target.motion import FreeMotion
 from magloc.tracking.multi_target.results import SourcePoint, SourcesPoint
-from magloc.tracking.multi_target.splitting import split
+from magloc.tracking.multi_target.smoothing import YoungTrack
 from magloc.tracking.multi_target.state import N_COMMON, N_SEEN, JointState
 from magloc.tracking.multi_target.update import innovation_chi2
 from magloc.tracking.results import Row, next_row
@@ -40,8 +48,8 @@ from magloc.tracking.sensor_health import SensorHealth
 
 ROWS_TO_REPORT = 10
 """Rows after its birth in which a source is not yet told, unless there is no other: one taken for two dies sooner."""
-MERGED_GAP = 1.0 / 3.0
-"""Standard deviation of a gap over the gap above which two sources are merged."""
+# How often many sources are searched for in the first row, with other random numbers, until they explain it.
+_SEARCHES = 4
 # Hypotheses that are kept, and by how much they may be less likely (-2 ln).
 _MOST_HYPOTHESES = 8
 _LESS_LIKELY = 25.0
@@ -58,40 +66,10 @@ _MEMORIES = np.array([10.0, 80.0])
 _POOR = 5.0 / np.sqrt(2.0 * _MEMORIES - 1.0)
 # By how much it must be likelier in the end, or at once.
 _MUST_GAIN, _CLEAR_GAIN = 20.0, 60.0
-# Squared distance, in units of its covariance, below which two places may be of one source.
-_ANOTHER_SIGMA2 = 25.0
-# Farther than any two sources are apart.
-_BEYOND_M = 1e6
 # Standard deviation of ln |m| below which a source is none too many by itself.
 _CERTAIN_STRENGTH = 0.05
 # What a row costs at most that nothing explains.
 _UNBEARABLE = 1000.0
-
-
-@dataclass(frozen=True, eq=False)
-class Hypothesis:
-    """One history of births, deaths and faults, and the state after it.
-
-    Attributes
-    ----------
-    state : JointState
-    ids : tuple of int
-        Of the sources, by the rows in which they were born.
-    health : SensorHealth
-    score : float
-        -2 ln of how likely it is, up to a constant.
-    excess : ndarray, shape (2,)
-        Mean excess of χ² over some last rows, and over more of them.
-    judged : int
-        Rows in which a restart is still judged, the last one counted; 0: it is believed.
-    """
-
-    state: JointState
-    ids: tuple[int, ...]
-    health: SensorHealth
-    score: float = 0.0
-    excess: FloatArray = field(default_factory=lambda: np.zeros(2))
-    judged: int = 0
 
 
 class SourcesTracker:
@@ -170,19 +148,20 @@ class SourcesTracker:
         row = next_row(row, self.scene.array, self._time_s)
         dt_s = 0.0 if math.isnan(self._time_s) else row.time_s - self._time_s
         self._time_s = row.time_s
-        problem = RowProblem(self.scene, row, self._n_rows)
+        problem = RowProblem(self.scene, row, self._n_rows, self.scene.motion.numbers(dt_s))
         self._n_rows += 1
         if not row.available.any():
             predicted = self.scene.motion.predicted
-            self._hypotheses = [replace(one, state=predicted(one.state, dt_s)) for one in self._hypotheses]
+            self._hypotheses = [replace(one, state=predicted(one.state, dt_s), young=None) for one in self._hypotheses]
             return self._point(problem, "no readings", math.nan)
         if not self._hypotheses:
             self._hypotheses = [self._begun(problem)]
         children = [child for one in self._hypotheses for child in self._continued(problem, one, dt_s)]
-        self._hypotheses = self._pruned([hypothesis for hypothesis, _ in children])
+        measured = problem.measured
+        known = [(one.refitted(measured), found, one.state is found.update.state) for one, found in children]
+        self._hypotheses = self._pruned([hypothesis for hypothesis, _, _ in known])
         best = self._hypotheses[0]
-        found = next(found for hypothesis, found in children if hypothesis.state is best.state)
-        explained = best.state is found.update.state
+        found, explained = next((found, fits) for one, found, fits in known if one.state is best.state)
         status = "misfit" if not explained else "tracked" if best.ids else "no source"
         is_poor = bool((best.excess > _POOR).any())
         if status == "tracked" and is_poor:
@@ -209,16 +188,27 @@ class SourcesTracker:
         nothing, scene, row = self._nothing_yet(problem), self.scene, problem.row
         if scene.most_sources <= MOST_BY_ITSELF:
             return nothing
-        locator = Locator(
-            scene.array, sources=scene.most_sources, prior=scene.prior, body_length_m=0.0, exclude_faulty=False
-        )
-        fix, R = locator.fit(row.readings_T, row.ambient_T), row.R_world_from_array
-        if not fix.solutions:
-            return nothing
-        positions_m = np.array([row.origin_m + R @ source.position_m for source in fix.best.sources])
-        moments_Am2 = np.array([R @ source.moment_Am2 for source in fix.best.sources])
-        found = problem.found_anew(nothing.state, positions_m, moments_Am2, nothing.health.dead)
-        return replace(nothing, state=found.prior, ids=found.ids)
+        R, best = row.R_world_from_array, None
+        for seed in range(_SEARCHES):
+            locator = Locator(
+                scene.array,
+                sources=scene.most_sources,
+                prior=scene.prior,
+                body_length_m=0.0,
+                exclude_faulty=False,
+                seed=seed,
+            )
+            fix = locator.fit(row.readings_T, row.ambient_T)
+            if not fix.solutions:
+                continue
+            positions_m = np.array([row.origin_m + R @ source.position_m for source in fix.best.sources])
+            moments_Am2 = np.array([R @ source.moment_Am2 for source in fix.best.sources])
+            found = problem.found_anew(nothing.state, positions_m, moments_Am2, nothing.health.dead)
+            if best is None or found.score < best.score:
+                best = found
+            if best.excess < COST_LIMIT:
+                break
+        return nothing if best is None else replace(nothing, state=best.prior, ids=best.ids)
 
     def _nothing_yet(self, problem: RowProblem) -> Hypothesis:
         """No source, and a common field that may be as large as the readings."""
@@ -240,11 +230,11 @@ class SourcesTracker:
             manoeuvring = motion.predicted(before.state, dt_s, agility=MANOEUVRE_AGILITY)
             explanations = problem.explanations(plain, manoeuvring)
         if not explanations:
-            kept = replace(before, state=prior, score=before.score + min(plain.score, _UNBEARABLE))
+            kept = replace(before, state=prior, young=None, score=before.score + min(plain.score, _UNBEARABLE))
             return [(self._with_excess(kept, plain), plain)]
         after = [self._after(problem, before, found) for found in explanations]
         if not before.ids:  # a source has one name wherever it may be the same
-            after[1:] = [replace(one, ids=_old_names(one, after[0])) for one in after[1:]]
+            after[1:] = [replace(one, ids=old_names(one, after[0])) for one in after[1:]]
         return list(zip(after, explanations, strict=True))
 
     def _after(self, problem: RowProblem, before: Hypothesis, found: Explanation) -> Hypothesis:
@@ -252,8 +242,16 @@ class SourcesTracker:
         of_dead = innovation_chi2(found.update.state, problem.measured, before.health.dead)
         used = found.update.row.used.reshape(-1, 3)
         residuals = np.where(used.all(axis=1, keepdims=True), found.update.standardised, np.nan)
+        young = before.young
+        if found.penalty or found.ids != before.ids or not found.ids:
+            young = YoungTrack(found.prior) if 0 < len(found.ids) <= MOST_BY_ITSELF else None
+        if young is not None:
+            likely = found.update.cost + found.update.log_volume
+            young = young.after(found.update.row, problem.step, found.update.state, likely)
+            young = young if len(young.rows) <= REFITS[-1] else None
         after = replace(
             before,
+            young=young,
             state=found.update.state,
             ids=found.ids,
             health=before.health.after(residuals, found.out, of_dead),
@@ -286,13 +284,13 @@ class SourcesTracker:
         """
         common, dead, known = best.state.common_alone, best.health.dead, len(best.ids)
         again = problem.found_anew(common, best.state.position_m, best.state.moment_Am2, dead)
-        anew = [again]
+        anew, nothing = [again], problem.updated(common, (), dead)
         for number in (known, known - 1, known + 1):  # of many, one by one takes seconds and leads nowhere
             if 0 < number <= min(self.scene.most_sources, MOST_BY_ITSELF):
-                anew += problem.of_more_sources(common, dead, number)
+                anew += problem.of_more_sources(nothing, number)
         if known < self.scene.most_sources:
             anew += distinct(one for start in (found, again) for one in problem.births(start))
-        tried = [one for one in distinct(anew) if one.update.converged]
+        tried = apart(one for one in anew if one.update.converged)
         more = [one for one in tried if len(one.ids) > known]
         tried = [one for one in tried if len(one.ids) <= known][:_MOST_RESTARTS] + more[:_MOST_RESTARTS]
         # What the sources' motion tells is still to be learned by them, and was by the best one.
@@ -309,17 +307,17 @@ class SourcesTracker:
 
     def _pruned(self, hypotheses: list[Hypothesis]) -> list[Hypothesis]:
         """The likeliest ones, the best first; behind them restarts while they are judged."""
-        believed = sorted((one for one in hypotheses if not one.judged), key=_score)
+        believed = sorted((one for one in hypotheses if not one.judged), key=by_score)
         judged = []
         for one in (one for one in hypotheses if one.judged):
             gain = believed[0].score - one.score
             if gain > (_MUST_GAIN if one.judged == 1 else _CLEAR_GAIN):
-                ids = _old_names(one, believed[0])
+                ids = old_names(one, believed[0])
                 believed.append(replace(one, ids=ids, score=believed[0].score - _MUST_GAIN, judged=0))
             elif one.judged > 1:
                 judged.append(one)
         kept: list[Hypothesis] = []
-        for one in sorted(believed, key=_score):
+        for one in sorted(believed, key=by_score):
             same = (i for i, other in enumerate(kept) if are_same(one.state, other.state))
             if (i := next(same, None)) is not None:
                 score = -2.0 * np.logaddexp(-0.5 * one.score, -0.5 * kept[i].score)
@@ -334,7 +332,7 @@ class SourcesTracker:
         for i, one in enumerate(self._hypotheses):
             room = _MOST_HYPOTHESES - len(parts) - sum(not other.judged for other in self._hypotheses[i:])
             of_one = split(one.state, problem.measured) if room > 1 and not one.judged else [(1.0, one.state)]
-            parts += [replace(one, state=state, score=one.score - 2.0 * math.log(share)) for share, state in of_one]
+            parts += [one.narrowed(share, state) for share, state in of_one]
         return parts
 
     def _point(self, problem: RowProblem, status: str, chi2: float) -> SourcesPoint:
@@ -348,11 +346,11 @@ class SourcesTracker:
         merged = np.isin(np.arange(len(best.ids)), merged_pairs(best.state))
         believed = [one for one in self._hypotheses if not one.judged]
         likely = np.exp(-0.5 * np.array([one.score - best.score for one in believed]))
-        mates = [_mates(best, one) for one in believed]
+        of_others = [mates(best, one) for one in believed]
         tracks = [
             SourcePoint(
                 row.time_s,
-                *_moments([one.state for one in believed], likely, [of_one.get(k) for of_one in mates]),
+                *moments([one.state for one in believed], likely, [of_one.get(k) for of_one in of_others]),
                 nis=chi2,
                 nis_dof=int(np.count_nonzero(row.available)),
                 status="predicted" if status in ("misfit", "no readings") else "merged" if merged[k] else status,
@@ -372,54 +370,3 @@ class SourcesTracker:
             int(np.count_nonzero(row.available)),
             tuple(name for name, dead in zip(array.ids, best.health.dead, strict=True) if dead),
         )
-
-
-def _score(hypothesis: Hypothesis) -> float:
-    return hypothesis.score
-
-
-def _mates(best: Hypothesis, other: Hypothesis) -> dict[int, int]:
-    """Which source of another hypothesis each of the best one's is: that of its name, or else the nearest one."""
-    apart_m = np.linalg.norm(best.state.position_m[:, None] - other.state.position_m, axis=-1)
-    apart_m[np.equal.outer(best.ids, other.ids)] = -_BEYOND_M
-    return {int(k): int(j) for k, j in zip(*linear_sum_assignment(apart_m), strict=True)}
-
-
-def _moments(
-    states: list[JointState], weights: FloatArray, sources: list[int | None]
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Position, moment and covariance of a source in a mixture of states, of those that have it."""
-    parts = [(w, one, k) for w, one, k in zip(weights, states, sources, strict=True) if k is not None]
-    x = np.array([np.concatenate([one.position_m[k], one.moment_Am2[k]]) for _, one, k in parts])
-    share = np.array([weight for weight, _, _ in parts])
-    share /= share.sum()
-    mean = share @ x
-    covariance = sum(part * one.covariance(k) for part, (_, one, k) in zip(share, parts, strict=True))
-    return mean[:3], mean[3:], covariance + (share[:, None] * (x - mean)).T @ (x - mean)
-
-
-def _old_names(restart: Hypothesis, before: Hypothesis) -> tuple[int, ...]:
-    """Names of a restart's sources: those of the nearest ones before it, where they may be the same.
-
-    One that was taken for somewhere else is another source to whoever followed it.
-    """
-    offset = restart.state.position_m[:, None] - before.state.position_m
-    P, Q = (
-        one.state.P[at[:, :, None], at[:, None]] for one in (restart, before) for at in [one.state.of_source[:, :3]]
-    )
-    apart = np.vecdot(offset, np.linalg.solve(P[:, None] + Q, offset[..., None])[..., 0])
-    names = list(restart.ids)
-    for new, old in zip(*linear_sum_assignment(np.linalg.norm(offset, axis=-1)), strict=True):
-        if apart[new, old] < _ANOTHER_SIGMA2:
-            names[new] = before.ids[old]
-    return tuple(names)
-
-
-def merged_pairs(state: JointState) -> list[tuple[int, int]]:
-    """Pairs of sources that are too near to each other for their gap to be known."""
-    pairs = []
-    for first, second in combinations(range(state.n_sources), 2):
-        distance, sigma = state.gap(first, second)
-        if sigma > MERGED_GAP * distance:
-            pairs.append((first, second))
-    return pairs

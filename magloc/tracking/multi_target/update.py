@@ -16,7 +16,7 @@ import numpy as np
 from arrays.typing import BoolArray, FloatArray
 from magloc.tracking.multi_target.measurement import JointRow
 from magloc.tracking.multi_target.state import N_COMMON, N_SEEN, JointState
-from magloc.tracking.multi_target.update_compiled import iterate, over_root
+from magloc.tracking.multi_target.update_compiled import fill_standardised, iterate, posterior
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,28 +70,15 @@ class JointUpdate:
     @cached_property
     def state(self) -> JointState:
         """The state after the row, with its covariance in its own chart."""
-        P, d = self.prior.P, self.prior.n_seen
-        rest = over_root(P[d:, :d], self.L)
-        W = np.concatenate([self.L, rest])
-        root = over_root(W, self.R)
-        after = root @ root.T
-        after[d:, d:] += P[d:, d:] - rest @ rest.T
-        return self.prior.moved_with(W @ self.y, after)
-
-    @cached_property
-    def seen(self) -> FloatArray:
-        """A root (C, 6 K + 3) of what the state's uncertainty makes of the predicted readings: A P⁺ Aᵀ."""
-        return over_root(self.HL, self.R)
+        error, moment, P = posterior(self.prior.P, self.L, self.R, self.y, self.prior.moment_Am2)
+        return self.prior.moved_to(error, moment, P)
 
     @cached_property
     def standardised(self) -> FloatArray:
         """Post-fit residuals (N, 3) of every sensor's channels with unit covariance; zero for those not used."""
-        # Channels of vector sensors stand three by three.
-        seen, residual = self.seen.reshape(-1, 3, self.seen.shape[1]), self.residual.reshape(-1, 3)
-        covariance = np.eye(3) - seen @ seen.transpose(0, 2, 1)
-        # A sensor that the fit follows wholly says nothing of itself.
-        root = np.linalg.cholesky(covariance + _FOLLOWED * np.eye(3))
-        found: FloatArray = np.linalg.solve(root, residual[..., None])[..., 0]
+        # Channels of vector sensors stand three by three. A sensor that the fit follows wholly says nothing of itself.
+        found = np.empty((len(self.residual) // 3, 3))
+        fill_standardised(self.HL, self.R, self.residual, _FOLLOWED, found)
         return found
 
     @property
@@ -111,15 +98,17 @@ class JointUpdate:
 
 
 _FOLLOWED = 1e-3
+MOST_TRIALS = 60
+"""Steps of an update that are tried."""
 
 
-def joint_update(prior: JointState, row: JointRow) -> JointUpdate:
+def joint_update(prior: JointState, row: JointRow, most: int = MOST_TRIALS) -> JointUpdate:
     """A predicted state after a row's readings, by damped Gauss-Newton in the chart of the prediction."""
     d, n = prior.n_seen, len(row.z)
     L: FloatArray = np.asarray(np.linalg.cholesky(prior.P[:d, :d]), dtype=np.float64)
     y, R, residuals, HLs = np.zeros(d), np.eye(d), np.empty((2, n)), np.zeros((2, n, d))
     residuals[:] = row.z
-    cost, converged = iterate(prior.means, L, row.parts, y, residuals, HLs, R)
+    cost, converged = iterate(prior.means, L, row.parts, y, residuals, HLs, R, most)
     return JointUpdate(prior, row, L, R, y, residuals[1], HLs[1], residuals[0], HLs[0], cost, converged)
 
 

@@ -28,8 +28,8 @@ from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.chart.steps import charted
 from magloc.tracking.measurement import RowMeasurement
 from magloc.tracking.motion import N_SOURCE
-from magloc.tracking.results import Innovation, Prediction, Row, Step, TrackPoint, rows_of
-from magloc.tracking.tracker import LARGEST_RANGE_ERROR, Tracker, of_mixture
+from magloc.tracking.results import Innovation, Prediction, Row, Step, TrackPoint, of_mixture, rows_of
+from magloc.tracking.tracker import LARGEST_RANGE_ERROR, Tracker
 from magloc.tracking.whole_records.smoother import smoothed, smoothed_states
 
 _LOG = logging.getLogger(__name__)
@@ -159,8 +159,12 @@ def _log_volume(S: FloatArray) -> float:
 
 def steps_at(tracker: Tracker, rows: Sequence[Row], states: Sequence[FloatArray]) -> list[Step]:
     """Steps of a forward pass that linearises all rows at some states."""
-    measurements = [tracker.measurements.of(row) for row in rows]
-    return _passed(tracker, measurements, 0, states, np.ones(len(rows), dtype=bool)).steps
+    return steps_of(tracker, [tracker.measurements.of(row) for row in rows], states)
+
+
+def steps_of(tracker: Tracker, measurements: Sequence[RowMeasurement], states: Sequence[FloatArray]) -> list[Step]:
+    """The same of what rows say."""
+    return _passed(tracker, measurements, 0, states, np.ones(len(measurements), dtype=bool)).steps
 
 
 def settled_steps(tracker: Tracker, rows: Sequence[Row], states: Sequence[FloatArray]) -> list[Step] | None:

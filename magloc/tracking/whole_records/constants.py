@@ -48,15 +48,11 @@ def constants_test(tracker: Tracker, rows: Sequence[Row], points: Sequence[Track
     Its first rows do not count, until the range is known: states from which nothing settles.
     """
     array = _with_constants(tracker.array)
-    known = [i for i, point in enumerate(points) if point.is_on_track]
-    if array is tracker.array or not known:
-        return ConstantsTest()
-    wider = Tracker(array, tracker.motion, background=tracker.background)
-    begin = max(i for i in known if points[i].status == "acquired" or i == known[0])
-    rest = np.zeros(wider.motion.n_states - N_SOURCE + wider.n_errors)
-    used = [(i, P) for i in known if i >= begin and (P := _placed_covariance(points[i])) is not None]
+    used = [] if array is tracker.array else placed_rows(points)
     if not used:
         return ConstantsTest()
+    wider = Tracker(array, tracker.motion, background=tracker.background)
+    rest = np.zeros(wider.motion.n_states - N_SOURCE + wider.n_errors)
     states = [np.concatenate([points[i].position_m, points[i].moment_Am2, rest]) for i, _ in used]
     steps = settled_steps(wider, [rows[i] for i, _ in used], states)
     if steps is None:
@@ -93,6 +89,13 @@ def _score(x: FloatArray, S: FloatArray, which: BoolArray) -> float:
         return math.nan
     square = float(np.sum((axes.T @ found)[told] ** 2 / spread[told]))
     return float(min(-ndtri(max(chdtrc(int(told.sum()), square), 1e-300)), 37.0))
+
+
+def placed_rows(points: Sequence[TrackPoint]) -> list[tuple[int, FloatArray]]:
+    """Rows of the last track that know the range so well that P (6, 6) is Cartesian, and P."""
+    known = [i for i, point in enumerate(points) if point.is_on_track]
+    begin = max((i for i in known if points[i].status == "acquired" or i == known[0]), default=0)
+    return [(i, P) for i in known if i >= begin and (P := _placed_covariance(points[i])) is not None]
 
 
 def _placed_covariance(point: TrackPoint) -> FloatArray | None:

@@ -11,7 +11,10 @@ import viser
 from arrays.typing import FloatArray, IntArray
 from magloc.localization.fit.results import Fix, Solution, Source
 from magloc.viewer.pages import words
+from magloc.viewer.panels.events import EventButtons, rows_of_change
+from magloc.viewer.panels.inputs import set_value
 from magloc.viewer.panels.latest import Latest
+from magloc.viewer.panels.played_time import time_strip
 from magloc.viewer.scene.glyphs import (
     DIPOLE_COLOUR,
     FIELD_LINE_COLOUR,
@@ -126,6 +129,16 @@ class FixView:
         with gui.add_folder("Fix"):
             if len(self._fixes) > 1:
                 self.slider = gui.add_slider("row", min=0, max=len(self._fixes) - 1, step=1, initial_value=self.row)
+                states = [(bool(fix.solutions), *words.doubts_of(fix)) for fix in self._fixes]
+                plain = np.array([state == (True,) for state in states])
+                text = f"{int(plain.sum())} of {len(plain)} rows have a fix that nothing speaks against; grey: others"
+                order = np.argsort(self._times, kind="stable")
+                since = self._times[order] - self._times[order[0]]
+                self.strip_panel = gui.add_html(words.panel([time_strip(since, plain[order], FIT_COLOUR), text]))
+                self.events = EventButtons(
+                    gui, rows_of_change(states), lambda: self.row, self.choose,
+                    "Rows in which a source is detected or lost, or a doubt comes or goes. Keys: E, and Shift E.",
+                )  # fmt: skip
             panel = gui.add_html(self.words())
 
         def follow() -> None:
@@ -136,6 +149,10 @@ class FixView:
 
         if len(self._fixes) > 1:
             self.slider.on_update(Latest(follow))
+
+    def choose(self, row: int) -> None:
+        """Show a row that the user has chosen elsewhere than at the slider."""
+        set_value(self.slider, row)
 
     def words(self) -> str:
         """What is known of the row's fix, as HTML."""
@@ -149,7 +166,7 @@ class FixView:
             places.append(words.place(source.position_m))
             places.append(f"moment {np.linalg.norm(source.moment_Am2):.3g} A·m²")
         lines = [
-            *([] if fix.detected else ["<b>nothing is detected</b> in this row: a fit of noise"]),
+            *words.doubts_of(fix),
             f"{time}, {places[0]}",
             *places[1:],
             f"χ² {best.chi2:.3g}, {best.dof} degrees of freedom",
@@ -162,7 +179,12 @@ class FixView:
         others = len(fix.solutions) - 1
         if others:
             lines.append(f"<b>{others} other solution{'s fit' if others > 1 else ' fits'}</b> almost as well")
-        return words.panel(lines, warning=not fix.detected)
+        return words.panel(lines, warning=bool(words.doubts_of(fix)))
+
+    @property
+    def dropped(self) -> tuple[str, ...]:
+        """Sensors that are not used in the row."""
+        return tuple(self._fixes[self.row].dropped_sensors)
 
     def entries(self) -> list[Entry]:
         """Lines of the legend."""

@@ -1,4 +1,4 @@
-"""The page of a source that is followed while its readings come in: the newest row, and the last seconds."""
+"""The page of sources that are followed while their readings come in: the newest row, and the last seconds."""
 
 from __future__ import annotations
 
@@ -18,17 +18,20 @@ from scipy.spatial.transform import Rotation
 from arrays.array import SensorArray
 from arrays.io.errors import InputError
 from arrays.typing import FloatArray
+from magloc.live.follower import LivePoint
 from magloc.live.tally import Tally
 from magloc.readings import Readings
+from magloc.tracking.multi_target.results import SourcesPoint
 from magloc.tracking.results import Row, TrackPoint, stacked
 from magloc.viewer.pages import words
-from magloc.viewer.pages.track_player import point_words
+from magloc.viewer.pages.track_player import SOURCE_COLOURS, point_words
 from magloc.viewer.panels.readings_plot import ReadingsPlot, residuals_of
 from magloc.viewer.scene.glyphs import (
     DIPOLE_COLOUR,
     REGION_COLOUR,
     TRACK_COLOUR,
     ArrayGlyphs,
+    Colour,
     DipoleGlyph,
     SurfaceGlyph,
     screen_lines,
@@ -45,6 +48,8 @@ _PLOT_S = 0.25
 _RATE_ROWS = 200
 _REST_S = 3.0
 NOWHERE = np.full(3, np.nan)
+ALONE = 0
+"""Instead of the id of a source that is followed on its own."""
 
 
 class Controls(Protocol):
@@ -64,8 +69,29 @@ class Controls(Protocol):
 class Seen:
     """One row as the page shows it."""
 
-    point: TrackPoint
+    point: TrackPoint | SourcesPoint
     row: Row | None
+
+
+class Marks:
+    """A source in the scene: its moment, its 95 % region, and its track of the last seconds."""
+
+    def __init__(self, scene: viser.SceneApi, name: str, array: SensorArray, colour: Colour, region: Colour) -> None:
+        size = 0.5 * array.circumradius
+        self.dipole = DipoleGlyph(scene, f"{name}/moment", size, DIPOLE_COLOUR)
+        self._tail = screen_lines(scene, f"{name}/tail", np.zeros((1, 2, 3)), colour, 3.0, visible=False)
+        self._region = SurfaceGlyph(scene, f"{name}/region", region, 0.35)
+
+    def show(self, point: TrackPoint | None, recent: Sequence[TrackPoint]) -> None:
+        """Show the source now, where it is known, and its last points."""
+        position, moment = (None, None) if point is None else (point.position_m, point.moment_Am2)
+        self.dipole.show(NOWHERE if position is None else position, NOWHERE if moment is None else moment)
+        covariance = None if point is None else point.covariance
+        self._region.show(None if position is None or covariance is None else ellipsoid(position, covariance[:3, :3]))
+        segments = line_segments(stacked(recent, "position_m", 3)) if len(recent) > 1 else np.zeros((0, 2, 3))
+        self._tail.visible = bool(len(segments))
+        if len(segments):
+            self._tail.points = segments.astype(np.float32)
 
 
 class LivePage:
@@ -87,11 +113,8 @@ class LivePage:
         self._latency_s = math.nan
         self._window: deque[Seen] = deque(maxlen=_MOST_ROWS + 1)
         self._arrivals: deque[float] = deque(maxlen=_RATE_ROWS)
-        size = 0.5 * array.circumradius
         self._glyphs = ArrayGlyphs(server.scene, array)
-        self._dipole = DipoleGlyph(server.scene, "/live/moment", size, DIPOLE_COLOUR)
-        self._tail = screen_lines(server.scene, "/live/tail", np.zeros((1, 2, 3)), TRACK_COLOUR, 3.0, visible=False)
-        self._region = SurfaceGlyph(server.scene, "/live/region", REGION_COLOUR, 0.35)
+        self._marks = {ALONE: Marks(server.scene, "/live", array, TRACK_COLOUR, REGION_COLOUR)}
         self._add_panels()
         self._thread = Thread(target=self._run, name="magloc-live-page", daemon=True)
         self._thread.start()
@@ -100,11 +123,11 @@ class LivePage:
         """Lines of the legend."""
         return [
             Swatch(DIPOLE_COLOUR, "the source now: the arrow is its moment"),
-            Swatch(TRACK_COLOUR, f"its track of the last {WINDOW_S:g} s"),
+            Swatch(TRACK_COLOUR, f"its track of the last {WINDOW_S:g} s; of several each has a colour"),
             Swatch(REGION_COLOUR, "95 % region of its position"),
         ]
 
-    def update(self, point: TrackPoint, row: Row | None, tally: Tally | None, latency_s: float) -> None:
+    def update(self, point: TrackPoint | SourcesPoint, row: Row | None, tally: Tally | None, latency_s: float) -> None:
         """Take one more row; what has not been shown yet is passed over."""
         seen = Seen(point, row)
         with self._lock:
@@ -183,16 +206,16 @@ class LivePage:
         if row is not None:
             x, y, z, w = _quaternion(row.R_world_from_array)
             self._glyphs.set_pose(row.origin_m, (x, y, z, w))
-        position, moment, covariance = point.position_m, point.moment_Am2, point.covariance
-        self._dipole.show(NOWHERE if position is None else position, NOWHERE if moment is None else moment)
-        region = None if position is None or covariance is None else ellipsoid(position, covariance[:3, :3])
-        self._region.show(region)
         recent = [seen.point for seen in window if seen.point.time_s >= point.time_s - WINDOW_S]
-        segments = line_segments(stacked(recent, "position_m", 3)) if len(recent) > 1 else np.zeros((0, 2, 3))
-        self._tail.visible = bool(len(segments))
-        if len(segments):
-            self._tail.points = segments.astype(np.float32)
-        self._source_panel.content = point_words(point, f"time {point.time_s:.3f} s")
+        now = sources_of(point)
+        for id in now:
+            if id not in self._marks:
+                colour = SOURCE_COLOURS[(id - 1) % len(SOURCE_COLOURS)]
+                self._marks[id] = Marks(self._server.scene, f"/live/{id}", self._array, colour, colour)
+        for id, marks in self._marks.items():
+            missing = TrackPoint(point.time_s)
+            marks.show(now.get(id), [sources_of(seen).get(id, missing) for seen in recent])
+        self._source_panel.content = words_of(point)
         self._stream_panel.content = words.panel(self._stream_lines())
 
     def _stream_lines(self) -> list[str]:
@@ -220,11 +243,35 @@ class LivePage:
             return
         values = np.array([row.readings_T for row in rows])
         origins, R = np.array([row.origin_m for row in rows]), np.array([row.R_world_from_array for row in rows])
-        points = [point for point, _ in shown]
-        time_s = np.array([point.time_s for point in points]) - last_s
+        time_s = np.array([point.time_s for point, _ in shown]) - last_s
         readings = Readings(values, time_s=time_s, array_position_m=origins, array_rotation=Rotation.from_matrix(R))
-        source = stacked(points, "position_m", 3), stacked(points, "moment_Am2", 3)
-        self._plot.take(readings, residuals_of(self._array, readings, *source))
+        of_rows = [sources_of(point) for point, _ in shown]
+        left = np.where(np.array([[bool(sources)] for sources in of_rows]), values, np.nan)
+        for id in set().union(*of_rows):
+            there = np.array([id in sources for sources in of_rows])
+            points = [sources[id] for sources in of_rows if id in sources]
+            source = stacked(points, "position_m", 3), stacked(points, "moment_Am2", 3)
+            left[there] += residuals_of(self._array, readings[there], *source) - values[there]
+        self._plot.take(readings, left)
+
+
+def sources_of(point: TrackPoint | SourcesPoint) -> dict[int, TrackPoint]:
+    """Sources by their ids; one that is followed on its own has none."""
+    several = point.sources if isinstance(point, LivePoint) else point
+    if isinstance(several, SourcesPoint):
+        return {source.id: source for source in several.tracks}
+    assert isinstance(point, TrackPoint)
+    return {ALONE: point}
+
+
+def words_of(point: TrackPoint | SourcesPoint) -> str:
+    """What is known of the sources now, as HTML."""
+    when = f"time {point.time_s:.3f} s"
+    sources = sources_of(point)
+    if ALONE in sources:
+        return point_words(sources[ALONE], when)
+    known = [point_words(source, f"source {id}") for id, source in sources.items()]
+    return "".join([words.panel([when, escape(point.status)], warning=not known), *known])
 
 
 def _quaternion(R: FloatArray) -> FloatArray:

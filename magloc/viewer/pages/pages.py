@@ -32,6 +32,7 @@ from magloc.viewer.scene.glyphs import (
     FIELD_LINE_COLOUR,
     FIT_COLOUR,
     REGION_COLOUR,
+    UNUSED_COLOUR,
     ArrayGlyphs,
     DipoleGlyph,
     length_text,
@@ -51,6 +52,7 @@ _FARTHEST_IN_MEDIANS = 3.0
 _LEAST_LEGIBLE = 0.04
 _LIVE_RADII = 1.5  # half the side of the cube that a live page shows at first
 _SHADES = 9
+_UNUSED = Swatch(UNUSED_COLOUR, "sensor that contradicts the others, and is not used")
 _MOST_STEPS, _PLAYED_S = 150, (5.0, 30.0)
 
 
@@ -68,19 +70,22 @@ class Playing:
         How long it takes to play them.
     first : int
         Row that the live page shows at first.
+    said : callable
+        What is said of the row that is shown, as HTML.
     """
 
     steps: tuple[int, ...]
     show: Callable[[int], None]
     duration_s: float
     first: int
+    said: Callable[[], str]
 
     @classmethod
-    def of(cls, times_s: FloatArray, show: Callable[[int], None], first: int) -> Playing:
+    def of(cls, times_s: FloatArray, show: Callable[[int], None], first: int, said: Callable[[], str]) -> Playing:
         """Of all rows, or of 150, evenly: as long as they took, but 5 s at least and 30 s at most."""
         n = len(times_s)
         steps = np.unique(np.linspace(0, n - 1, min(n, _MOST_STEPS)).round().astype(int))
-        return cls(tuple(steps.tolist()), show, float(np.clip(np.ptp(times_s), *_PLAYED_S)), first)
+        return cls(tuple(steps.tolist()), show, float(np.clip(np.ptp(times_s), *_PLAYED_S)), first, said)
 
 
 @dataclass(frozen=True)
@@ -157,9 +162,13 @@ def readings_page(server: viser.ViserServer, array: SensorArray, fixes: Sequence
         if rows is not None and rows.pose is not None:
             glyphs.set_pose(rows.pose[0][row], rows.pose[1][row].as_quat())
 
+    def mark_sensors(_: int) -> None:
+        glyphs.mark(view.dropped)
+
     move_array(view.row)
+    mark_sensors(view.row)
     # The plot stands below the choice of the row, which has to move its mark.
-    followers: list[Callable[[int], None]] = [move_array]
+    followers: list[Callable[[int], None]] = [move_array, mark_sensors]
     view.add_controls(followers)
     followers.append(FieldPanel(server, array, view, rows, size).show_row)
     plot = None
@@ -168,13 +177,16 @@ def readings_page(server: viser.ViserServer, array: SensorArray, fixes: Sequence
         left = None if sources is None else residuals_of(array, rows, *sources)
         plot = ReadingsPlot(server, rows, array, left)
         plot.show_row(view.row)
+        plot.when_pointed(view.choose)
         followers.append(plot.show_row)
     if view.region.mesh is not None and view.region.visible:
         ball = extent_of(ball.points_m, view.region.mesh.vertices)
     entries = [*view.entries(), *_array_entries(server, glyphs, rows, ball)]
-    playing = (
-        Playing.of(times, lambda row: follow([view.show_row, *followers], row), view.row) if len(fixes) > 1 else None
-    )
+    if any(fix.dropped_sensors for fix in fixes):
+        entries.append(_UNUSED)
+    playing = None
+    if len(fixes) > 1:
+        playing = Playing.of(times, lambda row: follow([view.show_row, *followers], row), view.row, view.words)
     name = array.name or "readings"
     return _finished(server, legend, ball, name, entries, drops=[view.drop], playing=playing, plot=plot)
 
@@ -191,10 +203,12 @@ def track_page(
     name = "true path" if result.is_truth else "track"
     entries = [*_line_entries(result, name), Swatch(DIPOLE_COLOUR, "direction of the moment at this time")]
     seen = [positions]
+    followers: list[Callable[[int], None]] = []
     poses = on_pose = None
     if array is not None:
         glyphs = ArrayGlyphs(server.scene, array)
         on_pose = glyphs.set_pose
+        followers.append(lambda index: glyphs.mark(points[index].dropped_sensors))
         if rows is not None and rows.pose is not None:
             of_point = _nearest_rows(rows, points)
             poses = (rows.pose[0][of_point], rows.pose[1][of_point].as_quat())
@@ -204,7 +218,8 @@ def track_page(
     ball = extent_of(*seen)
     if array is not None:
         entries += _array_entries(server, glyphs, rows, ball)
-    followers: list[Callable[[int], None]] = []
+        if any(point.dropped_sensors for point in points):
+            entries.append(_UNUSED)
     player = TrackPlayer(server, result, 0.2 * ball.radius_m, array_poses=poses, on_pose=on_pose, on_row=followers)
     plot = None
     if array is not None and rows is not None:
@@ -216,6 +231,8 @@ def track_page(
         show_row = plot.show_row
         show_row(int(of_point[player.index]))
         followers.append(lambda index: show_row(int(of_point[index])))
+        times_s = stacked(points, "time_s")
+        plot.when_pointed(lambda row: player.choose(int(nearest_rows(rows.time_s[[row]], times_s)[0])))
     nodes = [f"/times/of-{id}" for id in result.ids] or ["/times"]
     for node, place in zip(nodes, each, strict=True):
         tracked = np.flatnonzero(np.isfinite(place).all(axis=1))
@@ -223,7 +240,9 @@ def track_page(
             below = place[i] - np.array([0.0, 0.0, 0.14 * ball.radius_m])  # above, the arrow of the moment may be
             screen_label(server.scene, f"{node}/{i}", f"{points[i].time_s:.6g} s", below)
     drops = [trail.drop for trail in player.trails]
-    playing = Playing.of(stacked(points, "time_s"), player.show_row, player.index) if len(points) > 1 else None
+    playing = None
+    if len(points) > 1:
+        playing = Playing.of(stacked(points, "time_s"), player.show_row, player.index, lambda: player.row_panel.content)
     return _finished(server, legend, ball, name, entries, close=player.pause, drops=drops, playing=playing, plot=plot)
 
 

@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
+from html import escape
+
 import numpy as np
 import viser
 from matplotlib import colormaps
 from matplotlib.colors import SymLogNorm
 
 from arrays.typing import ByteArray, FloatArray
-from magloc.surveying.results import Survey, linear_and_most
+from magloc.surveying.results import Survey, Target, linear_and_most
+from magloc.viewer.pages import words
 from magloc.viewer.scene.glyphs import (
     DIPOLE_COLOUR,
     REGION_COLOUR,
     DipoleGlyph,
     dots,
+    length_text,
     screen_label,
     screen_lines,
     solid,
 )
 from magloc.viewer.scene.legend import ColourScale, Entry, Swatch
-from magloc.viewer.scene.shapes import Surface, ellipsoid, joined
+from magloc.viewer.scene.shapes import Surface, ellipsoid, joined, line_segments, unit_circle
 
 _SCALE = colormaps["RdBu_r"]
 _GROUND_COLOUR = (150, 120, 90)
@@ -61,7 +65,39 @@ def add_survey(server: viser.ViserServer, found: Survey) -> tuple[list[Entry], F
             Swatch(DIPOLE_COLOUR, f"{len(found)} targets: arrows along the moments, and depths below the ground")
         )
         entries.append(Swatch(REGION_COLOUR, "95 % ellipsoids of their positions"))
+        _add_targets(server, found, size)
     return entries, np.vstack([places, corners, found.position_m])
+
+
+def _add_targets(server: viser.ViserServer, found: Survey, size_m: float) -> None:
+    """A choice of the target, which gets a ring on the ground, and what is known of it."""
+    gui, of_id = server.gui, {target.id: target for target in found}
+    ring = screen_lines(server.scene, "/chosen", line_segments(size_m * unit_circle()), DIPOLE_COLOUR, 3.0)
+    with gui.add_folder("Target"):
+        dropdown = gui.add_dropdown("Target", tuple(of_id), hint="The most significant is first.")
+        panel = gui.add_html("")
+
+    def show(_: object = None) -> None:
+        target = of_id[dropdown.value]
+        ring.position = np.array([*target.position_m[:2], found.ground_m])
+        panel.content = words.panel(target_lines(target), warning=bool(target.flags))
+
+    dropdown.on_update(show)
+    show()
+
+
+def target_lines(target: Target) -> list[str]:
+    """What is known of a target, as lines of HTML."""
+    low, high = target.depth_interval95_m
+    iron = " to ".join(words.plain(mass, 2) for mass in target.iron_kg)
+    return [
+        f"<b>{escape(target.id)}</b> at {words.place(target.position_m)}",
+        f"depth {length_text(target.depth_m)}: {length_text(low)} to {length_text(high)} (95 %)",
+        f"95 % ellipse {length_text(target.ellipse95[0])} × {length_text(target.ellipse95[1])} (half axes)",
+        f"moment {words.plain(target.strength_Am2, 3)} A·m²; iron: {iron} kg",
+        f"χ² {words.plain(target.significance, 3)} is lost without it",
+        *([f"<b>{escape(', '.join(target.flags))}</b>"] if target.flags else []),
+    ]
 
 
 def _colours(shades: FloatArray) -> ByteArray:

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from arrays.typing import BoolArray, ByteArray, FloatArray
 from magloc.tracking.results import TrackPoint, TrackResult, stacked
 from magloc.viewer.pages import words
+from magloc.viewer.panels.events import EventButtons, rows_of_change
 from magloc.viewer.panels.played_time import PlayedTime, time_strip
 from magloc.viewer.scene.glyphs import (
     ARROW_COLOUR,
@@ -49,7 +50,7 @@ from magloc.viewer.scene.track_glyph import TrackGlyph, track_segments
 Poses = tuple[FloatArray, FloatArray]
 _DARKEST, _BRIGHTEST = 0.12, 0.88  # what is seen on a dark page, and on white
 _WHOLE_COLOUR = (190, 196, 203)
-_SOURCE_COLOURS: tuple[Colour, ...] = (TRACK_COLOUR, FIELD_LINE_COLOUR, ARROW_COLOUR, OTHER_COLOUR, REGION_COLOUR)
+SOURCE_COLOURS: tuple[Colour, ...] = (TRACK_COLOUR, FIELD_LINE_COLOUR, ARROW_COLOUR, OTHER_COLOUR, REGION_COLOUR)
 
 
 class Trail:
@@ -179,6 +180,10 @@ class TrackPlayer(PlayedTime):
             self.strip_panel = gui.add_html(_strip(self._since_first_s, self._tracked))
             super().__init__(gui, self._span_s, self._show, "magloc-track-player")
             self.row_buttons = gui.add_button_group("Row", ("previous", "next"))
+            self.events = EventButtons(
+                gui, rows_of_change(_states(self._result)), lambda: self.index, self.choose,
+                "Rows in which a source is found or lost, or the status changes. Keys: E, and Shift E.",
+            )  # fmt: skip
             longest, still = self.time_slider.max, self.time_slider.disabled
             self.tail_slider = gui.add_slider(
                 "Tail [s]", 0.0, longest, self.step_s, longest, disabled=still, hint="length of the tail"
@@ -192,9 +197,13 @@ class TrackPlayer(PlayedTime):
         self.tail_slider.on_update(self._follow)
         self.whole_checkbox.on_update(self._follow)
 
-    def _step_row(self, step: int) -> None:
+    def choose(self, index: int) -> None:
+        """Show a row that the user has chosen, and stand still there."""
         self.pause()
-        self.show_row(self.index + step)
+        self.show_row(index)
+
+    def _step_row(self, step: int) -> None:
+        self.choose(self.index + step)
 
     def _label(self, source: int) -> str:
         """What stands beside a source: its id, or of a single one the time, but where that stands already."""
@@ -229,7 +238,7 @@ def time_colours(time_s: FloatArray) -> ByteArray:
 
 def source_colours(result: TrackResult) -> list[Colour | None]:
     """A colour for every source of a result; of a single one None, as time is its colour."""
-    return [colour for colour, _ in zip(cycle(_SOURCE_COLOURS), result.ids, strict=False)] or [None]
+    return [colour for colour, _ in zip(cycle(SOURCE_COLOURS), result.ids, strict=False)] or [None]
 
 
 def row_words(result: TrackResult, index: int) -> str:
@@ -247,7 +256,8 @@ def point_words(point: TrackPoint, when: str) -> str:
     lines = [when]
     if point.position_m is None:
         return words.panel([*lines, f"<b>not tracked</b>: {escape(point.status or 'no reason given')}"], warning=True)
-    lines.append(f"{escape(point.status)} at {words.place(point.position_m)}")
+    without = "".join(f", without {name}" for name in point.dropped_sensors)
+    lines.append(f"{escape(point.status + without)} at {words.place(point.position_m)}")
     if point.covariance is not None:
         x, y, z = (length_text(sigma) for sigma in np.sqrt(np.diagonal(point.covariance)[:3]).tolist())
         lines.append(f"σ x {x}, y {y}, z {z}")
@@ -256,6 +266,12 @@ def point_words(point: TrackPoint, when: str) -> str:
     if np.isfinite(point.nis) and point.nis_dof:
         lines.append(f"NIS/dof {point.nis:.3g}/{point.nis_dof}")
     return words.panel(lines)
+
+
+def _states(result: TrackResult) -> list[tuple[object, ...]]:
+    """What is to be told of every row, where it changes."""
+    each = [[(point.position_m is None, point.status, point.dropped_sensors) for point in t] for t in result.tracks]
+    return list(zip(*each, strict=True))
 
 
 def _strip(since_first_s: FloatArray, tracked: NDArray[np.bool_]) -> str:

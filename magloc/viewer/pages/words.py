@@ -50,7 +50,7 @@ def bound_words(forecast: Forecast) -> list[str]:
     if not forecast.detectable:
         lines.append("<b>too weak to be detected</b>: the signal is below the noise")
     if np.isfinite(forecast.signal_to_noise):
-        lines.append(f"signal {_plain(forecast.signal_to_noise, 3)} σ of the sensors' differences")
+        lines.append(f"signal {plain(forecast.signal_to_noise, 3)} σ of the sensors' differences")
     if forecast.covariance is None:
         return [*lines, f"no bound: {escape(forecast.reason)}"]
     sigma = np.sqrt(np.diagonal(forecast.covariance))
@@ -58,7 +58,7 @@ def bound_words(forecast: Forecast) -> list[str]:
     return [
         *lines,
         f"σ x {x}, y {y}, z {z}",
-        f"σ of the moment {_plain(float(np.linalg.norm(sigma[3:])), 3)} A·m²",
+        f"σ of the moment {plain(float(np.linalg.norm(sigma[3:])), 3)} A·m²",
         range_words(forecast.range_interval_m, observable=forecast.range_observable),
     ]
 
@@ -76,13 +76,30 @@ def fix_words(fix: Fix, forecast: Forecast, position_m: FloatArray, moment_Am2: 
     error = f"error {length_text(distance)}"
     if forecast.covariance is not None:
         least = float(np.sqrt(np.trace(forecast.covariance[:3, :3])))
-        error += f", {_plain(distance / least, 2)} × the least rms error that is possible"
+        error += f", {plain(distance / least, 2)} × the least rms error that is possible"
     moment = float(np.linalg.norm(best.moment_Am2 - moment_Am2) / np.linalg.norm(moment_Am2))
-    lines += [error, f"error of the moment {_plain(100.0 * moment, 2)} %", _chi2_words(best)]
+    lines += [error, f"error of the moment {plain(100.0 * moment, 2)} %", _chi2_words(best)]
     lines += [range_words(interval, observable=best.range_observable) for interval in best.range_interval_m]
     others = len(fix.solutions) - 1
     if others:
         lines.append(f"<b>{others} other solution{'s fit' if others > 1 else ' fits'}</b> almost as well")
+    return lines
+
+
+def doubts_of(fix: Fix) -> list[str]:
+    """Why a fix is not to be trusted as it stands: the flags of the command's table, in words."""
+    lines = []
+    if not fix.detected:
+        lines.append("<b>nothing is detected</b> in this row: a fit of noise")
+    if fix.misfit:
+        lines.append("<b>misfit</b>: χ² is far beyond noise, neither place nor σ is to be trusted")
+    if fix.too_near:
+        lines.append("<b>near</b>: the source is too near, or too large, for a dipole")
+    if fix.solutions and any(source.merged for source in fix.best.sources):
+        lines.append("<b>merged</b>: two sources that the array does not tell apart")
+    lines += [f"sensor <b>{escape(name)}</b> contradicts all others and is not used" for name in fix.dropped_sensors]
+    if fix.saturated_channels:
+        lines.append(f"saturated, not used: {escape(', '.join(fix.saturated_channels))}")
     return lines
 
 
@@ -106,7 +123,7 @@ def readings_table(array: SensorArray, readings_T: FloatArray, signal_T: FloatAr
         cells = [_cell(1e9 * signal_T[c], 1e9 * readings_T[c], 1e9 * largest) for c in channels if c >= 0]
         others = [empty] * (len(columns) - len(cells))
         values = cells + others if sensor.kind == "vector" else others + cells
-        noise = f'<td style="text-align:right">{_plain(1e9 * sensor.noise_T, 2)}</td>'
+        noise = f'<td style="text-align:right">{plain(1e9 * sensor.noise_T, 2)}</td>'
         rows.append(f"<tr><td>{escape(sensor.id)}</td>{''.join(values)}{noise}</tr>")
     return (
         '<div style="font-size:0.75em;padding:0 0.9em;max-height:22em;overflow-y:auto">what the dipole adds [nT]'
@@ -121,8 +138,7 @@ def _cell(signal_nT: float, reading_nT: float, largest_nT: float) -> str:
     share = 0.0 if largest_nT == 0.0 else abs(signal_nT) / largest_nT
     tint = f"rgba({_POSITIVE if signal_nT > 0.0 else _NEGATIVE},{0.6 * share:.2f})"
     return (
-        f'<td style="text-align:right;background:{tint}" title="reading {reading_nT:.6g} nT">'
-        f"{_plain(signal_nT, 3)}</td>"
+        f'<td style="text-align:right;background:{tint}" title="reading {reading_nT:.6g} nT">{plain(signal_nT, 3)}</td>'
     )
 
 
@@ -137,7 +153,7 @@ def _chi2_words(solution: Solution) -> str:
     return f"χ²/dof {solution.chi2:.3g}/{solution.dof} = {solution.chi2 / solution.dof:.2g}"
 
 
-def _plain(value: float, digits: int) -> str:
+def plain(value: float, digits: int) -> str:
     """A number without an exponent as far as it stays readable."""
     if value == 0.0 or 1e-3 <= abs(value) < 1e5:
         return f"{float(f'{value:.{digits}g}'):.10g}".replace("-", "\N{MINUS SIGN}")

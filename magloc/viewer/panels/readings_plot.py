@@ -4,6 +4,7 @@ Use, inside a tab or folder of the GUI::
 
     plot = ReadingsPlot(server, readings, array)      # magloc.readings.Readings, arrays.array.SensorArray
     plot.show_row(index)                              # marks the time of a row of the readings
+    plot.when_pointed(player.show_row)                # called with the row that the user points at
 """
 
 from __future__ import annotations
@@ -14,24 +15,30 @@ from typing import NamedTuple
 
 import numpy as np
 import viser
-from viser import uplot
 
 from arrays.array import SensorArray
 from arrays.typing import FloatArray
 from magloc.measurement.differences import predicted_channels
 from magloc.readings import Readings
+from magloc.truth import nearest_rows
+from magloc.viewer.panels.inputs import SharedInput
 from magloc.viewer.panels.latest import Latest
+from magloc.viewer.panels.lines import PlotLines, across, cursor_svg, lines_svg, numbers_html
+from magloc.viewer.scene.glyphs import round_length
 
 RAW = "readings"
 DIFFERENCES = "differences from the mean"
 RESIDUALS = "residuals of the differences"
 TICKED, ALL = "those ticked", "all"
+AT = "At [s]"
+"""Label of the input that takes a time, which the page types when the plot is pointed at."""
 # Okabe and Ito, without yellow, which is not seen on white; all are seen on a dark page.
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#666666")
 # Opacities of the axes. Dashes of noise take a browser without a graphics card a second a picture, and cannot be told.
 _SHADES = {"x": "", "y": "bf", "z": "80", "": ""}
 _MOST_POINTS = 400
 _MOST_CHANNELS_AT_FIRST = 12
+_LEAST_ROWS = 20  # of the shortest span
 
 
 class Channel(NamedTuple):
@@ -49,31 +56,6 @@ class Channel(NamedTuple):
     label: str
     sensor: str
     axis: str
-
-
-class PlotLines(NamedTuple):
-    """Lines of the channels that are chosen, in the order of time.
-
-    Attributes
-    ----------
-    since_first_s : ndarray, shape (k,)
-        Thinned to what can be seen.
-    values : ndarray, shape (k, C)
-        NaN where missing [nT].
-    span : tuple of 2 floats
-        Of the axis [nT].
-    labels, colours : tuple of str
-        Of the C channels.
-    at : callable
-        Times (m,) [s] and values (m, C) [nT] of rows (m,) of the readings, not thinned.
-    """
-
-    since_first_s: FloatArray
-    values: FloatArray
-    span: tuple[float, float]
-    labels: tuple[str, ...]
-    colours: tuple[str, ...]
-    at: Callable[[Sequence[int]], tuple[FloatArray, FloatArray]]
 
 
 class ReadingsPlot:
@@ -109,6 +91,8 @@ class ReadingsPlot:
         self._channels, self._ids = channels_of(array), array.ids
         self._hold(readings, residuals_T)
         self._follow = Latest(self._show)
+        self._drawn: tuple[str, tuple[int, ...], float, int] | None = None
+        self._wanted: Callable[[int], None] = lambda row: None
         self.index = 0
         gui = server.gui
         with gui.add_folder("Readings"):
@@ -117,17 +101,10 @@ class ReadingsPlot:
                 (RAW, DIFFERENCES) if residuals_T is None else (RAW, DIFFERENCES, RESIDUALS),
                 hint="Differences are of the field in the array's axes, from the mean of the sensors with a reading.",
             )
-            series, data, scales = self._lines([0])
-            self.plot = gui.add_uplot(
-                data,
-                series,
-                scales=scales,
-                axes=(
-                    uplot.Axis(label=f"time {'since the first' if window_s is None else 'before the last'} row [s]"),
-                    uplot.Axis(label="field [nT]", size=76.0),
-                ),
-                aspect=1.2,
-            )
+            self.lines_panel = gui.add_html("")
+            self.cursor_panel = gui.add_html("")
+            if window_s is None:
+                self._add_times(gui)
             self.sensors_dropdown = gui.add_dropdown("Sensors", (TICKED, ALL, *array.ids), hint="or those ticked below")
             with gui.add_folder("Channels", expand_by_default=False):
                 axes = sorted({channel.axis for channel in self._channels if channel.axis})
@@ -142,9 +119,24 @@ class ReadingsPlot:
             checkbox.on_update(self._follow)
         self._follow()
 
+    def _add_times(self, gui: viser.GuiApi) -> None:
+        """Inputs for the time that is marked, and for how much time is seen."""
+        last_s, spans = float(self._time_s[-1]), ["all"]
+        self.at_input = gui.add_number(AT, 0.0, step=1e-3, hint="Or press the mouse in the plot.")
+        self._at = SharedInput(self.at_input, lambda: self._wanted(self._row_at(float(self.at_input.value))))
+        while last_s > 0.0 and len(self._time_s) * 0.1 ** len(spans) >= _LEAST_ROWS:
+            spans.append(f"{round_length(last_s * 0.1 ** len(spans)):g} s")
+        self.span_dropdown = gui.add_dropdown("Span", spans, disabled=len(spans) == 1, hint="Of the axis of time.")
+        self.span_dropdown.on_update(self._follow)
+
+    def when_pointed(self, wanted: Callable[[int], None]) -> None:
+        """Call something with the row whose time the user points at, or types."""
+        self._wanted = wanted
+
     def take(self, readings: Readings, residuals_T: FloatArray | None = None) -> None:
         """Show other readings of the array in place of those so far, and mark the last row."""
         self._hold(readings, residuals_T)
+        self._drawn = None
         self.show_row(len(readings) - 1)
 
     def _hold(self, readings: Readings, residuals_T: FloatArray | None) -> None:
@@ -173,17 +165,18 @@ class ReadingsPlot:
         """What can be shown."""
         return tuple(self.kind_dropdown.options)
 
+    @property
+    def time_words(self) -> str:
+        """What the axis of time is."""
+        return f"time {'since the first' if self._window_s is None else 'before the last'} row [s]"
+
     def lines(self, kind: str) -> PlotLines:
-        """What it shows of a kind, to be drawn elsewhere."""
-        chosen = self._chosen()
-        (_, *series, _), time, values, span = self._thinned(kind, tuple(chosen))
+        """What it shows of a kind at all times."""
+        return self._thinned(kind, tuple(self._chosen()), 0.0, 0)
 
-        def at(rows: Sequence[int]) -> tuple[FloatArray, FloatArray]:
-            places = self._rank[list(rows)]
-            return self._time_s[places], self._values_nT(kind)[places][:, chosen]
-
-        labels, colours = (tuple(str(one[key]) for one in series) for key in ("label", "stroke"))
-        return PlotLines(time, values, span, labels, colours, at)
+    def _row_at(self, time_s: float) -> int:
+        """Row of the readings that is nearest to a time since the first."""
+        return int(self._order[nearest_rows(np.array([time_s]), self._time_s)[0]])
 
     def _chosen(self) -> list[int]:
         return [
@@ -197,31 +190,20 @@ class ReadingsPlot:
         return bool(self.sensor_checkboxes[sensor].value) if chosen == TICKED else chosen in (ALL, sensor)
 
     def _show(self) -> None:
-        series, data, scales = self._lines(self._chosen())
-        # All change together, or the page would draw a line without data. New series or scales make a new chart, which
-        # forgets how far the user has zoomed in.
+        row, span_s = self.index, 0.0
+        now_s = self._time_s[self._rank[row : row + 1]]
+        if self._window_s is None and self.span_dropdown.value != "all":
+            span_s = float(self.span_dropdown.value.split()[0])
+        page = int(now_s[0] // span_s) if span_s else 0
+        wanted = (self.kind_dropdown.value, tuple(self._chosen()), span_s, page)
+        lines = self._thinned(*wanted)
+        cursor = cursor_svg(float(across(lines, now_s)[0])) + numbers_html(lines, lines.at([row])[1][0].tolist())
         with self._server.atomic():
-            if self.plot.series != series:
-                self.plot.series = series
-            if self.plot.scales != scales:
-                self.plot.scales = scales
-            self.plot.data = data
-
-    def _lines(
-        self, chosen: list[int]
-    ) -> tuple[tuple[uplot.Series, ...], tuple[FloatArray, ...], dict[str, uplot.Scale]]:
-        """What uPlot draws: the time, the channels, and the mark; and from where to where."""
-        kind = self.kind_dropdown.value
-        series, time, shown, span = self._thinned(kind, tuple(chosen))
-        row = int(self._rank[self.index]) if len(self._rank) else 0
-        time, shown, mark = with_mark(time, shown, float(self._time_s[row]), self._values_nT(kind)[row, chosen])
-        # uPlot finds no range of its own where a number is missing.
-        scales = {
-            "x": uplot.Scale(time=False, **({} if self._window_s is None else {"range": (-self._window_s, 0.0)})),
-            "y": uplot.Scale(range=span),
-            "mark": uplot.Scale(range=(0.0, 1.0)),
-        }
-        return series, (time, *shown.T, mark), scales
+            if wanted != self._drawn:  # what is drawn anew takes a picture as long as the whole scene
+                self.lines_panel.content, self._drawn = lines_svg(lines, self.time_words), wanted
+            self.cursor_panel.content = cursor
+            if self._window_s is None:
+                self._at.show(round(float(now_s[0]), 6))
 
     def _computed_nT(self, kind: str) -> FloatArray:
         """Readings (n, C), their differences, or what a source leaves of these, in the order of time."""
@@ -230,19 +212,28 @@ class ReadingsPlot:
         of = self._values_T if kind != RESIDUALS or self._residuals_T is None else self._residuals_T
         return 1e9 * differences_from_mean(self._array, of)
 
-    def _thinned_lines(
-        self, kind: str, chosen: tuple[int, ...]
-    ) -> tuple[tuple[uplot.Series, ...], FloatArray, FloatArray, tuple[float, float]]:
-        """Series, times, values (k, chosen) and their span, of no more points than can be seen."""
-        values = self._values_nT(kind)[:, chosen]
-        series = [uplot.Series(label="time [s]")]
-        for column, i in enumerate(chosen):
-            channel = self._channels[i]
-            colour = _COLOURS[self._ids.index(channel.sensor) % len(_COLOURS)] + _SHADES[channel.axis]
-            broken = bool(np.isnan(values[:, column]).any())
-            series.append(_series(channel, colour, broken=broken))
-        series.append(uplot.Series(label="now", scale="mark", stroke="#808080", width=1.5, points={"show": False}))
-        return tuple(series), *thinned(self._time_s, values, _MOST_POINTS), span_of(values)
+    def _thinned_lines(self, kind: str, chosen: tuple[int, ...], span_s: float, page: int) -> PlotLines:
+        """Lines of no more points than can be seen; of one page, if it has a span."""
+        values, time_s = self._values_nT(kind)[:, chosen], self._time_s
+        ends = (float(time_s[0]), float(time_s[-1])) if self._window_s is None else (-self._window_s, 0.0)
+        span = span_of(values)
+
+        def at(rows: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+            places = self._rank[list(rows)]
+            return self._time_s[places], values[places]
+
+        shown = values
+        if span_s:
+            ends = (page * span_s, (page + 1) * span_s)
+            first, last = np.searchsorted(time_s, ends)
+            time_s, shown = time_s[first : last + 1], values[first : last + 1]
+            span = span_of(shown)
+        channels = [self._channels[i] for i in chosen]
+        colours = tuple(
+            _COLOURS[self._ids.index(channel.sensor) % len(_COLOURS)] + _SHADES[channel.axis] for channel in channels
+        )
+        labels = tuple(channel.label for channel in channels)
+        return PlotLines(*thinned(time_s, shown, _MOST_POINTS), ends, span, labels, colours, at)
 
 
 def residuals_of(array: SensorArray, rows: Readings, positions_m: FloatArray, moments_Am2: FloatArray) -> FloatArray:
@@ -296,20 +287,6 @@ def thinned(time_s: FloatArray, values: FloatArray, most: int) -> tuple[FloatArr
     return np.stack([time_s[first], time_s[last]], axis=1).ravel(), extremes.reshape(-1, values.shape[1])
 
 
-def with_mark(
-    time_s: FloatArray, values: FloatArray, at_s: float, values_there: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Lines, and a mark that is 1 at one time and 0 elsewhere: three points are put in there.
-
-    ``time_s`` (k,). ``values`` (k, C). ``values_there`` (C,): values of the lines at that time. Returns times,
-    values and the mark, of k + 3 rows each.
-    """
-    place = int(np.searchsorted(time_s, at_s, side="right"))
-    mark = np.zeros(len(time_s) + 3)
-    mark[place + 1] = 1.0
-    return np.insert(time_s, place, [at_s] * 3), np.insert(values, place, [values_there] * 3, axis=0), mark
-
-
 def span_of(values: FloatArray) -> tuple[float, float]:
     """From below the least to above the greatest finite value."""
     known = values[np.isfinite(values)]
@@ -324,12 +301,3 @@ def _mean_of_known(values: FloatArray) -> FloatArray:
     with np.errstate(invalid="ignore"):
         mean: FloatArray = np.where(known, values, 0.0).sum(axis=1, keepdims=True) / known.sum(axis=1, keepdims=True)
     return mean
-
-
-def _series(channel: Channel, colour: str, *, broken: bool) -> uplot.Series:
-    """A line; only points where readings are missing, because the line would run across the gaps."""
-    if broken:
-        return uplot.Series(
-            label=channel.label, stroke=colour, width=0.0, points={"show": True, "size": 3.0, "fill": colour}
-        )
-    return uplot.Series(label=channel.label, stroke=colour, width=1.2, points={"show": False})

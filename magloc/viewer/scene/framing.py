@@ -16,7 +16,7 @@ FIELD_OF_VIEW_RAD = np.radians(40.0)
 """Of the first camera, upright."""
 # From where the first camera looks: from the front right, from above.
 _TOWARDS_CAMERA = np.array([0.55, -0.72, 0.42])
-_ASPECT = 1.15  # of the scene beside the panel, about
+_ASPECT = 1.0  # of the scene beside the panel, less the words to its right
 SIDES_OF_A_PHONE = 1.4
 """What a narrow page sees to its sides, over the height that the first camera sees: words are as large on it."""
 _MARGIN = 1.12

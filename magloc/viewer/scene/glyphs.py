@@ -6,6 +6,7 @@ extent, so that an array of 3 cm and one of 30 m look alike.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Literal
 
 import numpy as np
@@ -36,6 +37,7 @@ REGION_COLOUR: Colour = (86, 180, 233)
 OTHER_COLOUR: Colour = (204, 121, 167)
 ARROW_COLOUR: Colour = (0, 158, 115)
 UNDETECTED_COLOUR: Colour = (165, 165, 165)
+UNUSED_COLOUR: Colour = (200, 30, 60)
 _EDGE_COLOUR: Colour = (150, 156, 165)
 
 
@@ -57,7 +59,7 @@ def length_unit(length_m: float) -> tuple[str, float]:
 def length_text(length_m: float) -> str:
     """A length with the unit that suits it, such as ``5 mm``, ``0.5 m`` or ``2 km``."""
     # Not a figure more than it takes, and no exponent.
-    unit, metres = length_unit(length_m)
+    unit, metres = length_unit(length_m or 1.0)
     return f"{length_m / metres:.3g} {unit}"
 
 
@@ -136,6 +138,7 @@ class ArrayGlyphs:
         self._edges = scene.add_line_segments(f"{name}/bars", edges, _EDGE_COLOUR, thickness=0.08 * self.size_m)
         kinds: tuple[SensorKind, ...] = ("vector", "scalar")
         self._kinds = {kind: [i for i, sensor in enumerate(array.sensors) if sensor.kind == kind] for kind in kinds}
+        self._marks: viser.PointCloudHandle | None = None
         self._glyphs = {
             kind: scene.add_batched_meshes_trimesh(
                 f"{name}/{kind}-sensors",
@@ -166,6 +169,17 @@ class ArrayGlyphs:
         """
         self.frame.position = np.asarray(position_m, dtype=np.float64)
         self.frame.wxyz = np.roll(np.asarray(rotation_xyzw, dtype=np.float64), 1)
+
+    def mark(self, sensor_ids: Collection[str]) -> None:
+        """Mark sensors that are not used, and no others."""
+        places = self.array.positions[[sensor.id in sensor_ids for sensor in self.array.sensors]]
+        if len(places) and self._marks is None:
+            name, size = f"{self.frame.name}/not-used", 2.6 * self.size_m
+            self._marks = dots(self._scene, name, places, UNUSED_COLOUR, size)
+        if self._marks is not None:
+            self._marks.visible = bool(len(places))
+            if len(places):
+                self._marks.points = places.astype(np.float32)
 
     def set_array(self, array: SensorArray) -> None:
         """Show the same sensors at other places.

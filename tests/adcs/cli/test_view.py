@@ -45,7 +45,7 @@ class TestPage:
         log = library.datasets.load("imu").path
         assert adcs("view", log, "--html", tmp_path / "a.html", "--quiet").err == ""
         page = (tmp_path / "a.html").read_text(encoding="utf-8")
-        assert "up: thick as measured" in page
+        assert "accelerometer: thick as measured" in page
         assert "true body axes" not in page
 
 

@@ -56,6 +56,15 @@ class TestLines:
         (summary,) = outcome.err.splitlines()
         assert f"magloc: {N_ROWS} rows, {N_ROWS} tracked, 0 late, 0 lost, 0 doubled, 0 garbled; latency" in summary
 
+    def test_of_several_sources(self, folder: Path, run: Run) -> None:
+        options = ("--array", folder / "array.toml", *MOTION, "--sources", "1")
+        expected = entries(run("track", folder / "rows.csv", *options, "--jsonl").out)
+        source = f"replay:{folder / 'rows.csv'}"
+        found = entries(run("live", "--from", source, "--replay-speed", "1000", *options).out)
+        assert all(0.0 < entry.pop("latency_ms") < 1e6 for entry in found)
+        assert found == expected
+        assert [track["id"] for track in found[-1]["tracks"]] == [1]
+
     def test_standard_input_in_json(self, folder: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
         names, *rows = [line.split(",") for line in (folder / "rows.csv").read_text().splitlines()]
         objects = [json.dumps(dict(zip(names, map(float, row), strict=True))) for row in rows]

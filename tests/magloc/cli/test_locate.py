@@ -77,7 +77,7 @@ class TestJson:
     """One object, one entry for every row in order, every number valid JSON."""
 
     def test_entries(self, run: Run, array: Path, readings: Path) -> None:
-        outcome = run("locate", readings, "--array", array, "--json")
+        outcome = run("locate", readings, "--array", array, "--json", "--body-length-m", 0)
         results = results_of(outcome)
         assert outcome.err == ""
         assert [entry["time_s"] for entry in results] == [0.0, 1.0, 2.0]
@@ -179,9 +179,18 @@ class TestTable:
         assert line.split()[:4] == ["0", "20.00", "10.00", "5.00"]
 
     def test_summary(self, run: Run, array: Path, readings: Path) -> None:
-        outcome = run("locate", readings, "--array", array)
+        outcome = run("locate", readings, "--array", array, "--body-length-m", 0)
         assert outcome.err.startswith("magloc: 2 of 3 rows solved; not solved: 1 row: ")
         assert len(outcome.err.splitlines()) == 1
+
+    def test_what_a_body_would_do(self, run: Run, array: Path, readings: Path) -> None:
+        outcome = run("locate", readings, "--array", array, "--json")
+        factor = results_of(outcome)[0]["body_factor"]
+        assert (
+            "note: in 2 of 3 rows the source counts as a point: were it a body of a quarter of its distance"
+            in outcome.err
+        )
+        assert factor > 1.5
 
     def test_quiet(self, run: Run, array: Path, readings: Path) -> None:
         outcome = run("locate", readings, "--array", array, "--quiet")

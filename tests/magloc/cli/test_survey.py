@@ -91,6 +91,7 @@ class TestSurvey:
         done = run("survey", folder / "ground.csv", "--array", array, *outputs, "--place", 48, 11, 500)
         assert done.status == 0, done.err
         assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+            "profiles.png",
             "reach.csv",
             "residual.csv",
             "survey.png",

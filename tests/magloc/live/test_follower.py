@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 import magloc
 from arrays.io.errors import InputError
 from magloc.live import follower as follower_module
-from magloc.live.follower import SKIPPED, STOPPED, Follower, track
+from magloc.live.follower import RESTING, SKIPPED, STOPPED, Follower, track
 from magloc.live.transports import Stream
 from magloc.readings import Readings, write_readings
 from magloc.tracking.motion import RandomWalk
 from magloc.tracking.results import TrackPoint
+from tests.moving_magnets import Magnets, board
 from tests.passing_source import ARRAY, SLOW, moving_source, readings_of
 
 FloatArray = NDArray[np.float64]
@@ -83,6 +84,41 @@ class TestSources:
         readings = diver.readings[:20]
         expected = [tracker.update(row) for row in readings]
         assert_same(list(track(readings, diver.array, motion=motion)), expected)
+
+
+class TestSeveral:
+    BOARD = board()
+
+    def test_are_those_of_a_tracker(self) -> None:
+        """Two magnets through a replayed stream with a line that is no row."""
+        rng = np.random.default_rng(1)
+        readings = Magnets.drawn(2, 30, 0.03, rng).readings_T(self.BOARD, rng)
+        rows = [Readings(values[None], time_s=np.array([0.01 * i])) for i, values in enumerate(readings)]
+        tracker = magloc.SourcesTracker(self.BOARD, sources=2)
+        expected = [tracker.update(row) for row in rows]
+        lines: list[Readings | str] = [*rows[:9], "noise", *rows[9:]]
+        found = list(track(lines, self.BOARD, sources=2))
+        assert found[-1].tally.garbled == 1
+        assert found[-1].tally.tracked == len(found) == len(expected)
+        for one, other in zip(found, expected, strict=True):
+            assert one.sources is not None
+            assert (one.status, one.nis) == (other.status, other.chi2)
+            assert [source.id for source in one.sources.tracks] == [source.id for source in other.tracks] == [1, 2]
+            for of_one, of_other in zip(one.sources.tracks, other.tracks, strict=True):
+                np.testing.assert_array_equal(of_one.position_m, of_other.position_m)
+
+    def test_while_nothing_is_followed_there_are_none(self) -> None:
+        follower = Follower(self.BOARD, sources="auto", rest_s=0.02)
+        rows = [Readings(np.zeros((1, self.BOARD.n_channels)), time_s=np.array([0.01 * i])) for i in range(4)]
+        found = list(follower.follow(rows))
+        assert [point.status for point in found] == [RESTING, RESTING, "no source", "no source"]
+        assert all(point.sources is not None and point.sources.tracks == () for point in found)
+
+    def test_refuses_the_motion_of_the_other(self) -> None:
+        with pytest.raises(ValueError, match="Input motion must be a FreeMotion for several sources; instead received"):
+            Follower(self.BOARD, SLOW, sources=2)
+        with pytest.raises(ValueError, match="Input motion must be a motion of one source where sources are not given"):
+            Follower(self.BOARD, magloc.FreeMotion())
 
 
 class TestDamage:

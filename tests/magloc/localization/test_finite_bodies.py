@@ -8,7 +8,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import magpylib
 import numpy as np
@@ -17,12 +17,15 @@ from scipy.spatial.transform import Rotation
 
 import magloc
 from arrays.array import SensorArray
-from arrays.geometries import grid
+from arrays.geometries import grid, tetrahedron
+from arrays.pose import PoseUncertainty
+from magloc.fields.multipole import finite_body_errors
 from magloc.measurement.differences import DifferenceMeasurement
 from tests.oracles import fisher_information
 
 LENGTH_M = 0.02
 ASPECTS = (0.2, 0.5, 1.0, 2.0, 5.0)
+UNTURNED = Rotation.from_quat([[0.0, 0.0, 0.0, 1.0]])
 
 
 @dataclass(frozen=True)
@@ -128,6 +131,62 @@ class TestNothingSaid:
     def test_said_to_be_a_point(self):
         case = cases(2.0, 1e-3, 1)[0]
         assert magloc.locate(case.array, case.readings_T, body_length_m=0.0).body_length_m[0] == 0.0
+
+
+class TestFarFromTheArray:
+    """Nothing said, and too far for a default length: χ² does not see a body, so what one would do is told."""
+
+    def test_errors_of_bodies_of_a_quarter_of_the_distance_are_as_told(self):
+        """400 fixes of draws of such bodies: NEES over the square of the factor is known to a tenth, 4.5 σ here."""
+        rng, place, moment = np.random.default_rng(3), np.array([0.3, 0.2, -5.0]), np.array([50.0, 60.0, -60.0])
+        array = tetrahedron(1.5, noise_T=1e-10)
+        separation = array.positions - place
+        nearest = np.linalg.norm(separation, axis=1).min()
+        errors = finite_body_errors(separation, moment, 0.25 * nearest).reshape(12, 14)
+        exact = magloc.dipole.field(array.positions, place, moment).ravel()
+        readings = exact + rng.normal(size=(400, 14)) @ errors.T + 1e-10 * rng.normal(size=(400, 12))
+        fixes = magloc.locate(array, readings, prior=magloc.SourcePrior(high_m=(np.inf, np.inf, 0.0)))
+        off = np.hstack([fixes.position_m - place, fixes.moment_Am2 - moment])
+        squares = np.einsum("ni,nij,nj->n", off, np.linalg.inv(fixes.covariance), off) / 6.0
+        assert np.median(fixes.body_factor) > 3.0
+        assert np.mean(squares / fixes.body_factor**2) == pytest.approx(1.0, abs=0.45)
+
+    @pytest.mark.parametrize("relative_noise", [1e-2, 1e-3, 1e-4])
+    @pytest.mark.parametrize("lengths", [2.0, 3.0, 4.0, 6.0])
+    def test_no_body_errs_in_silence(self, lengths, relative_noise):
+        """magpylib's, at four lengths as told: NEES is below three squares, else it goes as length to the fourth."""
+        for case in cases(lengths, relative_noise, 1, seed=1):
+            value, fixes = nees(case, None)
+            assert fixes.body_length_m[0] == 0.0
+            assert value < 3.0 * fixes.body_factor[0] ** 2 * max(1.0, (4.0 / lengths) ** 4)
+            assert value < 10.0 or "were it a body" in fixes.caution
+
+    def test_what_is_said_of_the_length_ends_it(self):
+        case = cases(3.0, 1e-3, 1)[0]
+        for length in (0.0, LENGTH_M):
+            _, fixes = nees(case, length)
+            assert fixes.body_factor.tolist() == [1.0]
+            assert fixes[0].body_factor == 1.0
+            assert not fixes.caution
+
+    def test_a_pose_that_errs_more_hides_it(self):
+        case = cases(3.0, 1e-3, 1)[0]
+        readings = magloc.Readings(case.readings_T[None], array_position_m=np.zeros((1, 3)), array_rotation=UNTURNED)
+        factors = [
+            magloc.locate(replace(case.array, pose=pose), readings)[0].body_factor
+            for pose in (None, PoseUncertainty(1e-3, 0.1), PoseUncertainty(0.1, 0.3, 0.0, 0.1, 0.3))
+        ]
+        assert factors[0] > factors[1] > factors[2]
+        assert factors[2] < 0.2 * factors[0]  # a pose does not change the modulus of the moment
+
+    def test_of_moments_at_a_known_place(self):
+        """The covariance is of three numbers, and the body errs in those alone."""
+        case = cases(3.0, 1e-4, 1)[0]
+        fixes = magloc.locate(case.array, case.readings_T, position_m=case.position_m)
+        off = fixes.moment_Am2[0] - case.moment_Am2
+        assert fixes.body_covariance.shape == (1, 3, 3)
+        assert fixes.body_factor[0] > 2.0
+        assert off @ np.linalg.solve(fixes.covariance[0], off) / 3.0 < 10.0 * fixes.body_factor[0] ** 2
 
 
 class TestMisfit:

@@ -449,10 +449,10 @@ class TestFixes:
     def test_error_and_bound(self) -> None:
         truth = np.array([[2.0, 1.0, 0.0], [3.0, 1.0, np.nan]])
         fixes = [Fix((solution(np.array([2.0, 1.0, 0.5])),)), Fix((solution(np.array([3.0, 1.25, 0.5])),))]
-        ax = panel(self.figure(fixes, truth), "distance [m]")
-        np.testing.assert_allclose(line(ax, "error").get_ydata(), [0.5, 0.25])
+        ax = panel(self.figure(fixes, truth), "distance [mm]")
+        np.testing.assert_allclose(line(ax, "error").get_ydata(), [500.0, 250.0])
         stated = line(ax, "σ (Cramér-Rao bound at the fix)").get_ydata()
-        np.testing.assert_allclose(stated, math.sqrt(np.trace(COVARIANCE[:3, :3])))
+        np.testing.assert_allclose(stated, 1e3 * math.sqrt(np.trace(COVARIANCE[:3, :3])))
 
     def test_rows_without_a_solution_are_left_out(self) -> None:
         figure = self.figure([Fix((solution(np.array([2.0, 1.0, 0.5])),)), Fix((), "no signal")])

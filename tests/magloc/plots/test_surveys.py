@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
 from matplotlib.collections import TriMesh
 
 import arrays
@@ -38,6 +39,32 @@ class TestReach:
             triangles = [path.vertices for path in surface.get_paths()]
             assert len(triangles) == 2 * 2 * (2 * 3)
             assert max(np.ptp(each[:, 0]) for each in triangles) == 1.0
+
+
+class TestProfiles:
+    """Two lines, there and back 2 m beside, over a target below the first one."""
+
+    WAY = np.concatenate([np.arange(-20.0, 21.0), np.arange(20.0, -21.0, -1.0)])
+    PLACES = np.column_stack([WAY, np.repeat([0.0, 2.0], 41), np.ones(82)])
+
+    def axes(self, number: int) -> list[Axes]:
+        covariance, interval = np.eye(6) * 1e-4, (0.9, 1.1)
+        target = magloc.Target("t1", np.array([18.0, 0.0, -1.0]), np.ones(3), covariance, 1.0, interval, 99.0)
+        rows = SurveyRows(np.arange(82.0), self.PLACES, 1e-9 * self.WAY, np.full(82, 5e-9))
+        reach = Reach(np.zeros((0, 3)), np.zeros(0))
+        found = magloc.Survey((target,) * number, ONE, rows, reach, 0.0, 25.0, 1.0, False, 0.0, 1.0)
+        return magloc.plots.survey_profiles(found).axes
+
+    def test_a_line_ends_where_it_turns(self) -> None:
+        """Rows of the way there, 4 distances of 2 m before it, and none of the way back."""
+        measured, targets = self.axes(1)[0].lines
+        np.testing.assert_allclose(measured.get_xdata(), np.arange(-8.0, 2.0))
+        np.testing.assert_allclose(measured.get_ydata(), np.arange(10.0, 20.0))
+        np.testing.assert_allclose(targets.get_ydata(), measured.get_ydata())
+
+    @pytest.mark.parametrize(("number", "drawn"), [(0, 0), (20, 12)])
+    def test_as_many_as_a_page_holds(self, number: int, drawn: int) -> None:
+        assert sum(bool(ax.lines) for ax in self.axes(number)) == drawn
 
 
 class TestScale:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from arrays.typing import FloatArray
 from magloc.readings import Readings
-from magloc.surveying.preparation import varying
+from magloc.surveying.preparation import leaping_rows, varying
 
 
 class TestBaseStation:
@@ -33,3 +34,28 @@ class TestBaseStation:
         base = Readings(unit * np.full((100, 1), 47e-6), time_s=self.TIME_S)
         with pytest.raises(ValueError, match="Input base must read the modulus of the Earth's field, about 44721 nT"):
             varying(self.AMBIENT_T, self.TIME_S, base)
+
+
+class TestPlaces:
+    """Of a walk of 1 m in every second."""
+
+    @staticmethod
+    def walked(shift_m: FloatArray) -> Readings:
+        places = np.column_stack([np.arange(100.0) + shift_m, np.zeros(100), np.ones(100)])
+        turns = Rotation.identity(100)
+        return Readings(np.zeros((100, 1)), time_s=np.arange(100.0), array_position_m=places, array_rotation=turns)
+
+    def test_single_ones_that_leap_are_left_out(self) -> None:
+        shift = np.zeros(100)
+        shift[[20, 57]] = 1e4, -1e6
+        assert np.flatnonzero(leaping_rows(self.walked(shift))).tolist() == [20, 57]
+
+    def test_two_frames_are_refused(self) -> None:
+        with pytest.raises(
+            ValueError, match=r"in one frame; instead received rows at 59 and 60 s that are 6\.91e\+05 m"
+        ):
+            leaping_rows(self.walked(np.where(np.arange(100) < 60, 0.0, 691e3)))
+
+    def test_a_walk_to_another_field_is_none(self) -> None:
+        """300 m/s are not exceeded by one who reads every second and turns up 200 m away."""
+        assert not leaping_rows(self.walked(np.where(np.arange(100) < 60, 0.0, 200.0))).any()

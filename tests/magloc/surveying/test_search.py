@@ -19,12 +19,12 @@ class TestGrid:
     @pytest.mark.parametrize(("width_m", "places"), [(0.0, 1), (0.5, 1), (3.0, 3)])
     def test_one_place_at_least_across(self, width_m: float, places: int) -> None:
         """Of a line or a strip along x: in its middle, else half a pitch within its edge."""
-        low, high = np.array([0.0, 5.0]), np.array([8.0, 5.0 + width_m])
+        low, high = np.array([0.0, 5.0]), np.array([6.0, 5.0 + width_m])
         ((distance, at),) = SearchGrid.of(low, high, 1.5, [PITCH]).tiles
         assert distance == PITCH
         y = 5.0 + min(0.5 * width_m, 0.5) + np.arange(places)
-        np.testing.assert_allclose(at.reshape(8, places, 3)[2, :, 1], y)
-        np.testing.assert_allclose(at.reshape(8, places, 3)[:, 0, 0], 0.5 + np.arange(8.0))
+        np.testing.assert_allclose(at.reshape(6, places, 3)[2, :, 1], y)
+        np.testing.assert_allclose(at.reshape(6, places, 3)[:, 0, 0], 0.5 + np.arange(6.0))
 
 
 class TestPeaks:

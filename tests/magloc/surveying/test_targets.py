@@ -30,9 +30,9 @@ from magloc.surveying.fit.joint_fit import (
 from magloc.surveying.piece import Ground, Piece
 from magloc.surveying.preparation import whole_rows
 from magloc.surveying.reach import DEPTHS_M, least_moments
-from magloc.surveying.rounds import AT_LAST, Model
-from magloc.surveying.search import PITCH, WINDOW
-from magloc.surveying.targets import is_misfit, profile_of, second_source_chi2
+from magloc.surveying.rounds import AT_LAST, WHILE_SEARCHING, Model, Searched
+from magloc.surveying.search import PITCH, WINDOW, SearchGrid
+from magloc.surveying.targets import is_misfit, moved_by_second, profile_of, second_source_chi2
 from magloc.surveying.tiled import TiledSurvey
 from sims.magnetics.paths import Lawnmower, Steered
 from sims.magnetics.scenario import Carrier, MagneticScenario, Source
@@ -79,6 +79,22 @@ def test_free_sources_leave_nothing_of_themselves() -> None:
     Q = with_free_sources(model.record, background, fit.sources)
     left = np.linalg.norm(J - Q @ (Q.T @ J), axis=0)
     assert (left < 1e-6 * np.linalg.norm(J, axis=0)).all()
+
+
+def test_errors_of_sources_beside_are_projected_out() -> None:
+    """Of one that other rows tell, 2.6 cm beside where it is and 5 % stronger: less is left than that is unlikely."""
+    model, fit, _ = fitted()
+    record = model.record
+    weak, strong = (fit.sources.some(np.array([k])) for k in (0, 1))
+    beside = replace(model, record=record.beside(strong.position_m, strong.moment_Am2), beside=strong)
+    background = beside.background(weak, groups(AT_LAST * model.nearest_m))
+    moved = Sources(strong.position_m + np.array([0.015, -0.015, 0.015]), 1.05 * strong.moment_Am2)
+    change = record.predicted(moved.fields(record)) - record.predicted(strong.fields(record))
+    wrong = background.white(change[..., None])[:, 0]
+    assert wrong @ wrong > 50.0
+    # A tenth of a metre and a fifth of the moment are one σ.
+    unlikely = 3 * 0.15**2 + 0.25**2
+    assert wrong @ (wrong - background.Q @ (background.Q.T @ wrong)) < 1.2 * unlikely
 
 
 def test_at_its_ends_a_depth_interval_costs_what_chance_does() -> None:
@@ -136,6 +152,38 @@ def test_where_places_are_gaussian_their_scatter_is_the_covariance() -> None:
     model, fit, background = fitted()
     scatter = profile_of(model, fit, background, 1, 0.0).scatter_m2
     np.testing.assert_allclose(scatter, fit.covariance[6:8, 6:8], atol=0.15 * scatter.max())
+
+
+class TestSearchedAgain:
+    """Only where sources have changed more than noise hides."""
+
+    @staticmethod
+    def searched() -> tuple[Searched, Sources, Background]:
+        model, fit, _ = fitted()
+        grid = SearchGrid.of(model.bounds.low_m, model.bounds.high_m, model.record.height_m, [1.0])
+        background = model.background(fit.sources, groups(WHILE_SEARCHING * model.nearest_m))
+        return Searched.nowhere(model, groups, grid), fit.sources, background
+
+    def test_nowhere_where_nothing_has(self) -> None:
+        searched, sources, background = self.searched()
+        first = searched.again(sources, background)
+        assert (searched.of == 0).all()
+        again = searched.again(sources.moved(np.full((2, 6), 1e-6)), background)
+        assert (searched.of == 0).all()
+        np.testing.assert_array_equal(again.chi2, first.chi2)
+
+    def test_as_from_the_start_beside_a_new_one(self) -> None:
+        """In a corner: 0.02 A·m² that nobody feels in the other."""
+        searched, sources, background = self.searched()
+        searched.again(sources, background)
+        more = sources.with_more(Sources(np.array([[4.5, 4.5, -0.2]]), np.array([[0.0, 0.0, 0.02]])))
+        found = searched.again(more, background)
+        anew, *_ = self.searched()
+        whole = anew.again(more, background)
+        new = np.repeat(searched.of == 1, [len(places) for _, places in searched.grid.tiles])
+        assert 0 < new.sum() < len(new)
+        np.testing.assert_array_equal(found.chi2[new], whole.chi2[new])
+        np.testing.assert_allclose(found.chi2[~new], whole.chi2[~new], atol=1.0)
 
 
 def test_the_least_moment_is_seen_with_95_percent() -> None:
@@ -204,6 +252,19 @@ class TestSecondSource:
         explained, left = self.chi2s(gap_m)
         assert 0.9 * left < explained < 1.02 * left
         assert left > 1.0
+
+    @pytest.mark.parametrize("beside", [(0.9, 0.3, 0.1), (-0.5, 0.8, -0.3)])
+    def test_it_moves_the_first_one(self, beside: tuple[float, float, float]) -> None:
+        """By about as much as one dipole in place of two errs, which its covariance without noise does not tell."""
+        place, moment = np.array([0.3, -0.2, -0.8]), np.array([6.0, -4.0, 9.0])
+        places, moments = np.array([place, place + beside]), np.array([moment, 0.06 * moment[::-1]])
+        model, fit, background = plot_of(
+            lambda sensors: dipole.total_field(sensors, places, moments), Sources(place[None], moment[None])
+        )
+        Q = with_free_sources(model.record, background, fit.sources)
+        moved = moved_by_second(model, fit, background, Q, fit.residual - Q @ (Q.T @ fit.residual), 0)
+        wrong = np.linalg.norm(fit.sources.position_m[0] - place)
+        assert 0.3 * wrong < np.linalg.norm(moved[:3]) < 3.0 * wrong
 
     @pytest.mark.parametrize("body_length_m", [0.0, 0.7])
     def test_of_noise_it_is_chi_square(self, body_length_m: float) -> None:

@@ -21,9 +21,9 @@ from sims.magnetics.paths import Lawnmower, Steered
 from sims.magnetics.scenario import Carrier, MagneticScenario, Source
 from sims.magnetics.simulation import Simulation
 
-# Shallow targets make small tiles: 13 m with margins of 4.4 m. One on the seam, a weak one west of it, and one east of
+# Shallow targets make small tiles: 13 m with margins of 3.4 m. One on the seam, a weak one west of it, and one east of
 # the other tile's margin, which is felt there by hundreds of nanotesla.
-SHALLOW = magloc.SourcePrior(low_m=(-np.inf, -np.inf, -1.0))
+SHALLOW = magloc.SourcePrior(low_m=(-np.inf, -np.inf, -1.6))
 TARGETS = (
     ((0.05, 1.0, -0.5), (1.0, -2.0, -5.0)),
     ((-7.0, -1.0, -0.4), (0.6, 1.6, -1.0)),
@@ -94,23 +94,30 @@ class TestTwoTiles:
     def test_an_interrupted_one_goes_on(self, tmp_path: Path) -> None:
         """After the first tile; the folder is gone when all is done."""
 
-        def interrupt(_: str) -> None:
-            raise KeyboardInterrupt
-
         kept = tmp_path / "kept"
         arguments = {"prior": SHALLOW, "processes": 1, "unfinished": kept}
-        with pytest.raises(KeyboardInterrupt):
-            magloc.survey(field().array, field().readings, progress=interrupt, **arguments)
+
+        def interrupted_after(tiles: int) -> None:
+            told: list[str] = []
+
+            def interrupt(said: str) -> None:
+                told.append(said)
+                if len(told) == tiles:
+                    raise KeyboardInterrupt
+
+            with pytest.raises(KeyboardInterrupt):
+                magloc.survey(field().array, field().readings, progress=interrupt, **arguments)
+
+        interrupted_after(1)
         (first,) = kept.iterdir()
         before = first.stat().st_mtime_ns
-        with pytest.raises(KeyboardInterrupt):
-            magloc.survey(field().array, field().readings, progress=interrupt, **arguments)
+        interrupted_after(2)
         assert first.stat().st_mtime_ns == before
         assert len(list(kept.iterdir())) == 2
 
 
 class TestChanged:
-    """The western tile: x below 0, rows of the margin up to 4.4 m."""
+    """The western tile: x below 0, rows of the margin up to 3.4 m."""
 
     @staticmethod
     def told(x_m: float, moment_Am2: float) -> TiledSurvey:
@@ -131,6 +138,16 @@ class TestChanged:
         assert 0 in then.changed()
         assert 0 not in replace(then, known=[then.sources] * 2).changed()
         assert 0 not in replace(then, found=[then.sources] * 2).changed()
+
+
+class TestGround:
+    def test_tiles_have_it_in_common(self) -> None:
+        """The poles of both are those of the whole survey: a target does not depend on where the seams are."""
+        first, other = (set(map(tuple, tiled().piece(k).model().layer.places_m[:, :2].round(6))) for k in (0, 1))
+        assert len(first & other) > 10
+        both = np.array(sorted(first | other))
+        steps = (both - both[0]) / 4.0  # 15 m / 2.5 / 1.5
+        np.testing.assert_allclose(steps, steps.round(), atol=1e-6)
 
 
 class TestReach:
@@ -168,6 +185,15 @@ class TestOnTime:
 
 
 class TestBadInput:
+    @pytest.mark.parametrize(("width_m", "said"), [(0.1, True), (2.0, False)])
+    def test_one_line_tells_little_of_sides(self, width_m: float, said: bool, caplog: pytest.LogCaptureFixture) -> None:
+        array, rows = whole_rows(field().array, field().readings)
+        assert rows.array_position_m is not None
+        wave = np.sin(np.arange(len(rows)))[:, None] * [0.0, width_m, 0.0]
+        line = replace(rows, array_position_m=rows.array_position_m * [1.0, 0.0, 1.0] + wave)
+        TiledSurvey.of(array, line, Ground(SHALLOW, 0.0, 15.0, 25.0))
+        assert ("of one line" in caplog.text) == said
+
     def test_rows_that_are_far_from_each_other(self) -> None:
         readings = field().readings[:40]
         assert readings.array_position_m is not None

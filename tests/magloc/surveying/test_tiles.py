@@ -16,7 +16,7 @@ class TestTiles:
 
     def test_every_row_is_of_one(self) -> None:
         tiles, _ = tiles_of(self.PLACES, REACH_M)
-        assert len(tiles) == 3 * 2
+        assert len(tiles) == 5 * 3
         of_all = np.concatenate([tile.rows[tile.own] for tile in tiles])
         assert sorted(of_all.tolist()) == list(range(len(self.PLACES)))
 
@@ -27,6 +27,13 @@ class TestTiles:
             inside = (x >= tile.low_m[0] - margin_m) & (x <= tile.high_m[0] + margin_m)
             inside &= (y >= tile.low_m[1] - margin_m) & (y <= tile.high_m[1] + margin_m)
             assert tile.rows.tolist() == np.flatnonzero(inside).tolist()
+
+    def test_no_two_that_touch_have_one_colour(self) -> None:
+        tiles, _ = tiles_of(self.PLACES, REACH_M)
+        for i, tile in enumerate(tiles):
+            for other in tiles[:i]:
+                apart = np.maximum(tile.low_m - other.high_m, other.low_m - tile.high_m).max()
+                assert tile.colour != other.colour or apart > 1.0
 
     def test_a_small_survey_is_one(self) -> None:
         (tile,), _ = tiles_of(self.PLACES[:, ::-1] / 4.0, REACH_M)
@@ -45,7 +52,7 @@ class TestTiles:
         places = np.column_stack([x, y])
         tiles, _ = tiles_of(places, 5.7)
         ends = np.array([tile.extent_m(places[tile.rows[tile.own]]) for tile in tiles])
-        assert len(tiles) == 9
+        assert len(tiles) == 16
         assert np.prod(ends[:, 1] - ends[:, 0], axis=1).sum() == pytest.approx(1e4)
 
     def test_one_line(self) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import magloc
+from magloc.localization.fit.prior import NOTHING_KNOWN
 from magloc.tracking.acquisition import Acquisition
 from magloc.tracking.results import rows_of
 from magloc.tracking.tracker import Tracker
@@ -26,7 +27,7 @@ class TestRows:
     def start(cls):
         simulation = simulate(read_scenario("drone"), 3000)
         rows = list(rows_of(simulation.readings))[PASSING]
-        acquisition = Acquisition(simulation.array)
+        acquisition = Acquisition(simulation.array, NOTHING_KNOWN)
         return simulation.array, next(found for row in rows if (found := acquisition.start(row)) is not None)
 
     def test_none_is_left_out(self, start):

@@ -100,7 +100,7 @@ class TestNotStated:
     def test_is_not_told_of_where_it_is_stated(self) -> None:
         test = run(5, 200e-9)[1].innovations
         assert math.isnan(test.z_ambient)
-        assert not test.caution
+        assert "300 nT" not in test.caution
 
 
 class TestSimulated:

@@ -18,7 +18,7 @@ PLACE, MOMENT = np.array([1.0, 2.0, 3.0]), np.array([0.0, 0.1, 8.0])
 POINTS = (
     TrackPoint(0.0, status="no solution"),
     TrackPoint(0.5, PLACE, MOMENT, np.diag(np.arange(1.0, 7.0)), nis=3.0, nis_dof=4, status="tracked"),
-    TrackPoint(1.0, 1.1 * PLACE, MOMENT, np.eye(6), status="predicted"),
+    TrackPoint(1.0, 1.1 * PLACE, MOMENT, np.eye(6), status="predicted", dropped_sensors=("s2", "s3")),
 )
 TABLE: dict[str, Any] = msgspec.json.decode(
     msgspec.json.encode(json_of_track(POINTS, None), enc_hook=np.ndarray.tolist)
@@ -35,7 +35,16 @@ class TestReadTrack:
     def test_what_was_written_comes_back(self, tmp_path: Path) -> None:
         points = read_track(written(tmp_path, TABLE)).points
         for found, point in zip(points, POINTS, strict=True):
-            for name in ("time_s", "nis", "nis_dof", "status", "position_m", "moment_Am2", "covariance"):
+            for name in (
+                "time_s",
+                "nis",
+                "nis_dof",
+                "status",
+                "dropped_sensors",
+                "position_m",
+                "moment_Am2",
+                "covariance",
+            ):
                 np.testing.assert_equal(getattr(found, name), getattr(point, name))
 
     def test_rows_alone_are_as_good_as_those_of_one_source_with_an_id(self, tmp_path: Path) -> None:
@@ -55,6 +64,8 @@ class TestReadTrack:
             ("covariance", (-np.eye(6)).tolist(), "found a variance below zero"),
             ("nis", "4", "found '4', expected a number"),
             ("nis_dof", True, "found True, expected a number"),
+            ("dropped_sensors", [3], r"found \[3\], expected a list of names"),
+            ("dropped_sensors", 3, "found 3, expected a list of names"),
             ("time_s", None, "found None, expected a number"),
         ],
     )

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import combinations_with_replacement, pairwise
 
 import numpy as np
 import pytest
@@ -17,7 +18,11 @@ from scipy.spatial.transform import Rotation
 import magloc
 from arrays.geometries import tetrahedron
 from arrays.pose import PoseUncertainty
+from magloc.ambient import in_world_field
+from magloc.tracking.chart.row import ChartRow
+from magloc.tracking.chart.start import prior_root
 from magloc.tracking.innovations import THRESHOLD, innovation_test
+from magloc.tracking.posterior_bound import posterior_bound
 from magloc.tracking.results import TrackPoint, rows_of
 from magloc.tracking.track import Track
 from magloc.tracking.tracker import Tracker
@@ -123,7 +128,7 @@ class TestTrack:
         assert nees(simulation, track) < stats.chi2.ppf(1.0 - 1e-6, 6)
         assert not track.innovations.flagged
         assert math.isnan(track.innovations.z_constants)  # they are states already
-        assert track.table().count("\n") == len(track)
+        assert track.table().count("\n") == len(track) + bool(track.innovations.caution)
 
     def test_a_mounting_that_counts_as_exact_is_seen_on_a_background(self) -> None:
         """That is not: by 0.5° and 5 cm."""
@@ -160,6 +165,43 @@ class TestTrack:
         sigma = np.sqrt(np.diagonal(fixes.covariance, axis1=1, axis2=2))
         assert np.all(sigma[:, :3] > math.hypot(0.02, 0.05))
         assert np.all(sigma > np.sqrt(np.diagonal(exact.covariance, axis1=1, axis2=2)))
+
+
+class TestBound:
+    def test_is_that_of_all_rows_at_once(self) -> None:
+        """Derivatives by central differences, the covariance of all errors between all rows: a drone's moduli."""
+        scenario = replace(read_scenario("drone"), pose=ALL, duration_s=4.0)
+        simulation = simulate(scenario, 1)
+        tracker, truth = Tracker(simulation.array, magloc.RandomWalk(1e-9, 1e-9)), simulation.truth
+        complete = np.flatnonzero(np.isfinite(simulation.readings.values_T).all(axis=1))
+        rows = list(rows_of(in_world_field(simulation.readings, simulation.array)))
+        rows = [rows[i] for i in complete.tolist()]
+        assert truth.moment_Am2 is not None
+        bound = posterior_bound(tracker, rows, truth.position_m[complete], truth.moment_Am2[complete])
+        rows = rows[int(np.isfinite(bound).argmax()) :]
+        state = np.concatenate([truth.position_m[0], truth.moment_Am2[0], np.zeros(tracker.n_errors)])
+        steps = np.concatenate([np.full(6, 1e-3), 0.1 * np.maximum(tracker.error_sigma, 1e-15)])
+        by_state = []
+        for measurement in map(tracker.measurements.of, rows):
+            moved = [state + side * step for step in np.diag(steps) for side in (0.5, -0.5)]
+            h = np.array([measurement.predicted(x) for x in moved]).reshape(len(steps), 2, -1)
+            by_state.append(((h[:, 0] - h[:, 1]) / steps[:, None]).T)
+        variance = [tracker.error_sigma**2]
+        kept, added = zip(*(tracker.error_step(b.time_s - a.time_s) for a, b in pairwise(rows)), strict=True)
+        for share, noise in zip(kept, added, strict=True):
+            variance.append(share**2 * variance[-1] + noise**2)
+        n, k = len(rows), len(by_state[0])
+        C = np.eye(n * k).reshape(n, k, n, k)
+        for i, j in combinations_with_replacement(range(n), 2):
+            left = variance[i] * np.prod(np.array(kept)[i:j], axis=0)
+            between = by_state[i][:, 6:] @ (left[:, None] * by_state[j][:, 6:].T)
+            C[i, :, j] += between
+            C[j, :, i] += between.T if i != j else 0.0
+        J = np.concatenate(by_state)[:, :6]
+        root = prior_root(ChartRow.of(tracker.measurements.of(rows[0])).chart(state[:6]))
+        information = J.T @ np.linalg.solve(C.reshape(n * k, n * k), J) + np.linalg.inv(root @ root.T)
+        dense_m = math.sqrt(float(np.trace(np.linalg.inv(information)[:3, :3])))
+        assert bound[-1] == pytest.approx(dense_m, rel=5e-3)
 
 
 class TestInnovationTest:

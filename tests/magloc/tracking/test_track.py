@@ -122,7 +122,8 @@ class TestDecisions:
 
 class TestShapes:
     def test_text(self, track: magloc.Track) -> None:
-        lines = track.table().splitlines()
+        *lines, caution = track.table().splitlines()
+        assert caution.startswith("the source counts as a point")
         assert len(lines) == 1 + N_ROWS
         assert " ".join(lines[0].split()) == "time_s x_m y_m z_m s_x_m s_y_m s_z_m m_Am2 s_m nis status"
         short = repr(track).splitlines()

@@ -25,3 +25,12 @@ def test_few_rows(number: int) -> None:
     assert (np.diagonal(fit.covariance) > 0.0).all()
     if 6 * number > ROWS:
         assert np.diagonal(fit.covariance).max() > 1e6  # undetermined, and says so
+
+
+def test_twins_are_one() -> None:
+    """Where they are together, with both moments; those farther apart than a source's own length stay."""
+    places = np.array([[0.0, 0.0, -1.0], [5.0, 0.0, -1.0], [0.1, 0.0, -1.0], [5.0, 0.4, -1.0]])
+    moments = np.array([[9.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-8.0, 0.0, 2.0], [0.0, 0.0, 3.0]])
+    found = Sources(places, moments).without_twins(np.full(4, 0.3))
+    np.testing.assert_allclose(found.position_m, [[0.05, 0.0, -1.0], places[1], places[3]])
+    np.testing.assert_allclose(found.moment_Am2, [[1.0, 0.0, 2.0], moments[1], moments[3]])

@@ -141,6 +141,26 @@ class TestCarrier:
         # But for the square of what is added over the ambient field.
         np.testing.assert_allclose(columns, values, atol=1e-3 * np.abs(values).max())
 
+    def test_what_an_error_of_the_attitude_leaves_of_them(self) -> None:
+        """Standard deviation over 20,000 carriers and turns: within 3 %, six deviations of that of so many."""
+        induced, turn = 3e-4, 0.01
+        sensor = arrays.Sensor("s", "scalar", (0.0, 0.0, 0.0), noise_T=1e-10, induced_uncertainty=induced)
+        pose = arrays.PoseUncertainty(0.02, turn)
+        array = arrays.SensorArray((sensor,), pose=pose)
+        ambient = TURNS.inv().apply(np.tile(AMBIENT, (N, 1)))
+        rows = Readings(np.ones((N, 1)), time_s=TIME, array_position_m=PLACES, array_rotation=TURNS, ambient_T=ambient)
+        errors = PoseErrors.of(pose)
+        lasting, white = SurveyRecord.of(array, rows, ambient, errors).by_turned_carrier(errors, 1e-15)
+        assert white.shape == (N, 1, 0)
+        rng, b = np.random.default_rng(9), ambient[0]
+        A = induced * rng.standard_normal((20_000, 3, 3))
+        turned = Rotation.from_rotvec(turn * rng.standard_normal((20_000, 3))).apply(b)
+        reads = [
+            np.einsum("ki,kij,kj->k", along, A, along) / np.linalg.norm(b)
+            for along in (turned, np.tile(b, (20_000, 1)))
+        ]
+        assert np.std(reads[0] - reads[1]) == pytest.approx(lasting[0, 0, 0], rel=0.03)
+
 
 class TestSquaredShift:
     """What the square of a shift adds to fields, which first order does not know."""

@@ -72,7 +72,7 @@ class TestColumns:
 
     def test_moments(self) -> None:
         A = dipole.field_matrix(self.SENSORS[:, self.OWNER, None], self.PLACES)
-        expected = np.einsum("nci,ncmij->ncmj", self.DIRECTIONS, A).reshape(6, 4, -1)
+        expected = np.einsum("nci,ncmij->ncjm", self.DIRECTIONS, A).reshape(6, 4, -1)
         found = moment_columns(
             self.SENSORS, self.DIRECTIONS, self.U, self.OWNER, self.PLACES, self.STARTS, np.array([0, 2])
         )

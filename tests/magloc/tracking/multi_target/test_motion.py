@@ -1,16 +1,18 @@
-"""Free motion of several sources: numerical derivatives in the chart, and two half steps for one."""
+"""Free motion of several sources: numerical derivatives in the chart, two half steps for one, and the readable twin."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
 import magloc
-from magloc.tracking.motion import OrnsteinUhlenbeck
+from magloc.navigation.rotations import cross_matrix, rotation_matrix, turn_of_change
+from magloc.tracking.motion import OrnsteinUhlenbeck, wandering_step
 from magloc.tracking.multi_target.motion import FreeMotion
-from magloc.tracking.multi_target.state import JointState, places_of
+from magloc.tracking.multi_target.state import N_COMMON, N_OF_SOURCE, N_SEEN, JointState, places_of
 from tests.magloc.tracking.multi_target.test_state import state_of
 from tests.oracles import derivative
 
@@ -29,6 +31,56 @@ def difference(after: JointState, before: JointState) -> np.ndarray:
     return np.concatenate(
         [*parts, after.velocity_m_s[0] - before.velocity_m_s[0], after.rate_rad_s[0] - before.rate_rad_s[0]]
     )
+
+
+def readably_predicted(motion: FreeMotion, state: JointState, dt_s: float, agility: float) -> JointState:
+    """The twin of the compiled step: transition and noise of every source as matrices."""
+    K, one = state.n_sources, np.eye(3)
+    P_, C_, V_, W_ = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
+    lasts_s, kept, root_v = wandering_step(motion.correlation_s, dt_s)
+    turn_lasts_s, turn_kept, root_w = wandering_step(motion.turn_correlation_s, dt_s)
+    root_v, root_w = agility * motion.speed_m_s * root_v, agility * motion.turn_rad_s * root_w
+    F, Q = np.zeros((K, N_OF_SOURCE, N_OF_SOURCE)), np.zeros((K, N_OF_SOURCE, N_OF_SOURCE))
+    F[:, P_, P_], F[:, P_, V_], F[:, V_, V_], F[:, W_, W_] = one, lasts_s * one, kept * one, turn_kept * one
+    of_p_v, of_c_w = root_v @ root_v.T, root_w @ root_w.T
+    Q[:, P_, P_], Q[:, V_, V_] = of_p_v[0, 0] * one, of_p_v[1, 1] * one
+    Q[:, P_, V_] = Q[:, V_, P_] = of_p_v[0, 1] * one
+    Q[:, W_, W_] = of_c_w[1, 1] * one
+    angle = turn_lasts_s * state.rate_rad_s
+    R = rotation_matrix(angle)
+    moments = (R @ state.moment_Am2[..., None])[..., 0]
+    u = moments / np.linalg.norm(moments, axis=-1, keepdims=True)
+    along, turned = u[..., None] * u[:, None], -cross_matrix(u)  # what a small turn changes of u
+    F[:, C_, C_], F[:, C_, W_] = R, turn_lasts_s * turned @ turn_of_change(angle)
+    Q[:, C_, C_] = of_c_w[0, 0] * (one - along) + motion.strength_change**2 * dt_s * along
+    Q[:, C_, W_] = of_c_w[0, 1] * turned
+    Q[:, W_, C_] = -Q[:, C_, W_]
+    at = state.of_source
+    whole_F, whole_Q = np.eye(len(state.P)), np.zeros_like(state.P)
+    whole_F[at[:, :, None], at[:, None, :]] = F
+    whole_Q[at[:, :, None], at[:, None, :]] = Q
+    common = N_SEEN * K + np.arange(N_COMMON)
+    whole_Q[common, common] = motion.common_walk_T**2 * dt_s
+    return replace(
+        state,
+        position_m=state.position_m + lasts_s * state.velocity_m_s,
+        moment_Am2=moments,
+        velocity_m_s=kept * state.velocity_m_s,
+        rate_rad_s=turn_kept * state.rate_rad_s,
+        P=whole_F @ state.P @ whole_F.T + whole_Q,
+    )
+
+
+@pytest.mark.parametrize("turns", [0.0, 1e-4, 1.0])
+@pytest.mark.parametrize("k", [0, 1, 3])
+def test_compiled_step_is_the_readable_one(k, turns):
+    state = state_of(k, seed=k)
+    state = replace(state, rate_rad_s=turns * state.rate_rad_s)
+    found, expected = (
+        step(state, 0.3, agility=3.0) for step in (MOTION.predicted, partial(readably_predicted, MOTION))
+    )
+    for name in vars(expected):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-10, atol=1e-11)
 
 
 @pytest.mark.parametrize("dt_s", [1e-3, 0.01, 0.3, 3.0])

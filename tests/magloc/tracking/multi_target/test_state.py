@@ -58,7 +58,7 @@ class TestBookkeeping:
         state = state_of(3)
         left = state.without(1)
         for new, old in ((0, 0), (1, 2)):
-            np.testing.assert_array_equal(left.covariance(new), state.covariance(old))
+            np.testing.assert_array_equal(left.covariances[new], state.covariances[old])
             np.testing.assert_array_equal(left.rate_rad_s[new], state.rate_rad_s[old])
 
     def test_covariance_is_cartesian(self):
@@ -68,9 +68,9 @@ class TestBookkeeping:
         errors = np.random.default_rng(1).multivariate_normal(np.zeros(15), small.P, 50_000)
         moved = moved_moment(np.tile(state.moment_Am2, (len(errors), 1)), errors[:, 3:6])
         drawn = np.cov(np.hstack([state.position_m[0] + errors[:, :3], moved]).T)
-        scale = np.sqrt(np.diagonal(small.covariance(0)))
+        scale = np.sqrt(np.diagonal(small.covariances[0]))
         np.testing.assert_allclose(
-            drawn / np.outer(scale, scale), small.covariance(0) / np.outer(scale, scale), atol=0.04
+            drawn / np.outer(scale, scale), small.covariances[0] / np.outer(scale, scale), atol=0.04
         )
 
     def test_gap(self):
@@ -93,6 +93,6 @@ def test_second_moments_of_a_moment():
     state = JointState.empty(np.zeros(3), 1e-6).with_source(np.zeros(3), moment, P)
     drawn = moved_moment(moment, rng.multivariate_normal(np.zeros(3), P[3:6, 3:6], 200_000)) - moment
     expected = drawn.T @ drawn / len(drawn)
-    found = state.covariance(0)[3:, 3:]
+    found = state.covariances[0][3:, 3:]
     assert u @ found @ u == pytest.approx(u @ expected @ u, rel=0.1)
     np.testing.assert_allclose(found, expected, atol=0.08 * np.trace(expected))

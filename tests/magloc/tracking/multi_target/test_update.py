@@ -14,7 +14,7 @@ from magloc.fields import dipole
 from magloc.tracking.multi_target.measurement import Channels, JointRow
 from magloc.tracking.multi_target.motion import FreeMotion
 from magloc.tracking.multi_target.state import N_SEEN, JointState, moment_derivative
-from magloc.tracking.multi_target.update import innovation_chi2, joint_update
+from magloc.tracking.multi_target.update import JointUpdate, innovation_chi2, joint_update
 from magloc.tracking.results import Row
 from tests.oracles import derivative
 
@@ -106,8 +106,31 @@ def test_compiled_iteration_is_the_readable_one(n_sources):
     for name in ("residual", "innovation", "linear", "cost"):
         np.testing.assert_allclose(getattr(found, name), expected[name], rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(found.state.position_m, expected["state"].position_m, rtol=1e-6, atol=1e-9)
+    after = posterior_of(found)
+    for name in vars(after):
+        np.testing.assert_allclose(getattr(found.state, name), getattr(after, name), rtol=1e-6, atol=1e-11)
+    np.testing.assert_allclose(found.standardised, standardised(found), rtol=1e-6, atol=1e-9)
     on_sensor = replace(state, position_m=BOARD.positions[:n_sources])
     assert joint_update(on_sensor, row).converged == iterated(on_sensor, row)["converged"] == (n_sources == 0)
+
+
+def posterior_of(update: JointUpdate) -> JointState:
+    """The readable twin of the compiled posterior: P (I + Hᵀ H P)⁻¹ of the whole state, in the chart where it ends."""
+    prior, d = update.prior, update.prior.n_seen
+    H = np.zeros((len(update.HL), len(prior.P)))
+    H[:, :d] = update.HL @ np.linalg.inv(update.L)
+    error = prior.P[:, :d] @ np.linalg.solve(prior.P[:d, :d], update.L @ update.y)
+    P = prior.P - prior.P @ H.T @ np.linalg.solve(np.eye(len(H)) + H @ prior.P @ H.T, H @ prior.P)
+    return prior.moved_with(error, P)
+
+
+def standardised(update: JointUpdate) -> np.ndarray:
+    """The readable twin of residuals with unit covariance, by the inverse of I + Lᵀ N L."""
+    seen = update.HL @ np.linalg.inv(update.R).T
+    covariance = np.eye(len(seen)) - seen @ seen.T
+    blocks = [slice(3 * s, 3 * s + 3) for s in range(len(seen) // 3)]
+    roots = [np.linalg.cholesky(covariance[at, at] + 1e-3 * np.eye(3)) for at in blocks]
+    return np.array([np.linalg.solve(root, update.residual[at]) for root, at in zip(roots, blocks, strict=True)])
 
 
 def iterated(prior: JointState, row: JointRow) -> dict[str, Any]:

@@ -10,8 +10,12 @@ import pytest
 
 from arrays.geometries import tetrahedron
 from arrays.io.errors import InputError
+from magloc.fields import dipole
+from magloc.readings import Readings
+from magloc.tracking.multi_target.results import SourcePoint, SourcesPoint
 from magloc.tracking.results import TrackPoint
 from magloc.viewer.live_view import LiveView
+from magloc.viewer.pages.live import ALONE
 from tests.waiting import wait_for
 
 ARRAY = tetrahedron(1.5)
@@ -77,10 +81,35 @@ def test_what_is_said(view: LiveView) -> None:
     page = view._live
     wait_for(lambda: "time 1.900 s" in page._source_panel.content)
     assert "tracked at (1.000, 1.900, 0.500) m" in page._source_panel.content
-    np.testing.assert_allclose(page._dipole.frame.position, [1.0, 1.9, 0.5])
+    np.testing.assert_allclose(page._marks[ALONE].dipole.frame.position, [1.0, 1.9, 0.5])
     view.update(TrackPoint(2.0, status="lost: the range is no longer known"))
     wait_for(lambda: "lost: the range" in page._source_panel.content)
-    assert not page._dipole.frame.visible
+    assert not page._marks[ALONE].dipole.frame.visible
+
+
+def several_at(time_s: float, *ids: int) -> SourcesPoint:
+    tracks = tuple(
+        SourcePoint(time_s, np.array([1.0, time_s, id]), np.array([0.0, 0.0, 80.0]), 1e-4 * np.eye(6), id=id)
+        for id in ids
+    )
+    return SourcesPoint(time_s, tracks, "tracked" if ids else "no source", 12.0, 12)
+
+
+def test_several_sources_come_and_go(view: LiveView) -> None:
+    """Each has an arrow; the readings less those of all are what two dipoles leave of them."""
+    page = view._live
+    field = sum(dipole.field(ARRAY.positions, [1.0, 0.0, id], [0.0, 0.0, 80.0]) for id in (1, 2))
+    view.update(several_at(0.0, 1, 2), Readings(ARRAY.readings_of(field)[None], time_s=[0.0]))
+    wait_for(lambda: "source 2" in page._source_panel.content)
+    for id in (1, 2):
+        np.testing.assert_allclose(page._marks[id].dipole.frame.position, [1.0, 0.0, id])
+    assert not page._marks[ALONE].dipole.frame.visible
+    wait_for(lambda: page._plot._residuals_T is not None and np.abs(page._plot._residuals_T).max() < 1e-15)
+    view.update(several_at(1.0, 2))
+    wait_for(lambda: "source 1" not in page._source_panel.content)
+    assert not page._marks[1].dipole.frame.visible
+    view.update(several_at(2.0))
+    wait_for(lambda: "no source" in page._source_panel.content)
 
 
 def test_the_window_is_as_long_as_it_says(view: LiveView) -> None:

@@ -15,7 +15,7 @@ from magloc.readings import Readings
 from magloc.tracking.results import TrackPoint
 from magloc.viewer.pages.pages import _nearest_rows
 from magloc.viewer.panels.inputs import set_value
-from magloc.viewer.panels.readings_plot import ALL, ReadingsPlot, residuals_of
+from magloc.viewer.panels.readings_plot import ALL, RAW, ReadingsPlot, residuals_of
 from magloc.viewer.scene.track_glyph import linear, track_segments
 from magloc.viewer.server import opened
 from tests.waiting import wait_for
@@ -64,20 +64,21 @@ def test_linear_colours_are_srgb_undone() -> None:
 class TestPlot:
     def test_a_row_moves_the_mark_alone(self, server: viser.ViserServer) -> None:
         plot = ReadingsPlot(server, rows_of(2000, np.random.default_rng(2)), ARRAY)
-        before = plot._thinned.cache_info().misses
+        before, drawn, marks = plot._thinned.cache_info().misses, plot.lines_panel.content, set()
         for row in (3, 700, 1999):
             plot.show_row(row)
-            time, *_, mark = (np.asarray(line) for line in plot.plot.data)
-            assert time[np.argmax(mark)] == pytest.approx(plot._time_s[plot._rank[row]])
+            marks.add(plot.cursor_panel.content)
+        assert len(marks) == 3
+        assert plot.lines_panel.content is drawn
         assert plot._thinned.cache_info().misses == before
 
     def test_sensors_are_chosen_from_a_list(self, server: viser.ViserServer) -> None:
         plot = ReadingsPlot(server, rows_of(20, np.random.default_rng(3)), ARRAY)
         set_value(plot.sensors_dropdown, ARRAY.ids[2])
-        wait_for(lambda: len(plot.plot.series) == 1 + 3 + 1)
-        assert [series["label"] for series in plot.plot.series[1:-1]] == list(ARRAY.sensors[2].channel_names)
+        assert plot.lines(RAW).labels == ARRAY.sensors[2].channel_names
+        wait_for(lambda: plot.lines_panel.content.count('stroke="#') == 3)
         set_value(plot.sensors_dropdown, ALL)
-        wait_for(lambda: len(plot.plot.series) == 1 + ARRAY.n_channels + 1)
+        wait_for(lambda: plot.lines_panel.content.count('stroke="#') == ARRAY.n_channels)
 
 
 def test_a_source_leaves_the_noise_of_an_array_that_moves() -> None:

@@ -1,6 +1,7 @@
 """A track played through time, and readings plotted beside it. No browser: scene nodes and panels are read directly."""
 
 import itertools
+import re
 import threading
 import time
 from collections.abc import Iterator
@@ -25,11 +26,11 @@ from magloc.viewer.pages.track_player import TrackPlayer
 from magloc.viewer.panels.inputs import set_value
 from magloc.viewer.panels.readings_plot import (
     DIFFERENCES,
+    RAW,
     ReadingsPlot,
     differences_from_mean,
     span_of,
     thinned,
-    with_mark,
 )
 from magloc.viewer.scene.glyphs import FIELD_LINE_COLOUR, TRACK_COLOUR, ArrayGlyphs
 from magloc.viewer.server import free_port, opened
@@ -292,61 +293,112 @@ class TestReadingsPlot:
         rows = readings()
         plot = ReadingsPlot(server, rows, ARRAY)
         plot.show_row(25)
-        time_s, *lines, mark = plot.plot.data
-        kept = np.delete(np.arange(N + 3), [26, 27, 28])  # the three points of the mark stand after those of the row
-        np.testing.assert_allclose(time_s[kept], STEP_S * np.arange(N), atol=1e-9)
-        np.testing.assert_allclose(np.array(lines)[:, kept], 1e9 * rows.values_T.T)
-        np.testing.assert_allclose(np.array(lines)[:, 26:29], 1e9 * rows.values_T[25][:, None] * np.ones(3))
-        assert np.flatnonzero(mark).tolist() == [27]
-        np.testing.assert_allclose(time_s[26:29], 2.5, atol=1e-9)
-        labels = [series.get("label") for series in plot.plot.series]
-        assert labels == ["time [s]", *ARRAY.channel_names, "now"]
+        lines = plot.lines(RAW)
+        np.testing.assert_allclose(lines.since_first_s, STEP_S * np.arange(N), atol=1e-9)
+        np.testing.assert_allclose(lines.values, 1e9 * rows.values_T)
+        assert lines.labels == ARRAY.channel_names
+        begin, end = places_of_axis(plot, 0.0, STEP_S * (N - 1))
+        assert marked(plot) == pytest.approx(begin + 25.0 / (N - 1) * (end - begin), abs=0.02)
+        said = re.findall("<b[^>]*>(.*?)</b>", plot.cursor_panel.content)
+        np.testing.assert_allclose([number(text) for text in said], 1e9 * rows.values_T[25], atol=1e-3)
+        assert plot.at_input.value == pytest.approx(2.5)
 
     def test_chosen_sensors_and_axes_are_shown(self, server):
         plot = ReadingsPlot(server, readings(), ARRAY)
         set_value(plot.sensor_checkboxes["s2"], False)
         set_value(plot.axis_checkboxes["y"], False)
-        labels = [series.get("label") for series in plot.plot.series]
-        assert labels == ["time [s]", "s1_x", "s1_z", "s3_x", "s3_z", "s4_x", "s4_z", "now"]
-        assert len(plot.plot.data) == len(labels)
+        assert plot.lines(RAW).labels == ("s1_x", "s1_z", "s3_x", "s3_z", "s4_x", "s4_z")
+        wait_for(lambda: paths(plot) == 6)
         for checkbox in plot.sensor_checkboxes.values():
             set_value(checkbox, False)
-        assert len(plot.plot.data) == 2
+        wait_for(lambda: paths(plot) == 0)
 
     def test_differences_are_free_of_the_common_field(self, server):
         rows = readings()
         common = 5e-5 * np.sin(rows.time_s)[:, None]
         plot = ReadingsPlot(server, replace(rows, values_T=rows.values_T + common), ARRAY)
-        assert plot.plot.scales["y"]["range"][1] > 1e4
-        set_value(plot.kind_dropdown, DIFFERENCES)
-        lines = np.array(plot.plot.data[1:-1])
-        assert np.abs(lines).max() < 10.0
-        np.testing.assert_allclose(lines.reshape(4, 3, -1).sum(axis=0), 0.0, atol=1e-6)
-        assert plot.plot.scales["y"]["range"][1] < 10.0
-
-    def test_missing_readings_break_no_line_but_make_it_points(self, server):
-        rows = readings()
-        rows.values_T[30:35, 4] = np.nan
-        plot = ReadingsPlot(server, rows, ARRAY)
-        assert [series.get("width") for series in plot.plot.series[1:-1]] == [1.2] * 4 + [0.0] + [1.2] * 7
-        assert plot.plot.series[5]["points"]["show"] is True
-        assert np.isfinite(plot.plot.scales["y"]["range"]).all()
+        assert plot.lines(RAW).span[1] > 1e4
+        lines = plot.lines(DIFFERENCES)
+        assert np.abs(lines.values).max() < 10.0
+        np.testing.assert_allclose(lines.values.T.reshape(4, 3, -1).sum(axis=0), 0.0, atol=1e-6)
+        assert lines.span[1] < 10.0
 
     def test_rows_out_of_order_are_put_in_order_and_marked_by_their_row(self, server):
         rows = readings()
         shuffled = np.random.default_rng(2).permutation(N)
         plot = ReadingsPlot(server, rows[shuffled], ARRAY)
-        assert np.all(np.diff(plot.plot.data[0]) >= 0.0)
+        assert np.all(np.diff(plot.lines(RAW).since_first_s) >= 0.0)
         plot.show_row(7)
-        marked = float(plot.plot.data[0][plot.plot.data[-1] == 1.0][0])
-        assert marked == pytest.approx(STEP_S * shuffled[7], abs=1e-9)
+        begin, end = places_of_axis(plot, 0.0, STEP_S * (N - 1))
+        assert marked(plot) == pytest.approx(begin + shuffled[7] / (N - 1) * (end - begin), abs=0.02)
+
+    def test_a_time_that_is_typed_asks_for_the_nearest_row(self, server):
+        shuffled = np.random.default_rng(3).permutation(N)
+        plot, asked = ReadingsPlot(server, readings()[shuffled], ARRAY), []
+        plot.when_pointed(asked.append)
+        set_value(plot.at_input, 4.04)
+        wait_for(lambda: bool(asked))
+        assert [shuffled[row] for row in asked] == [40]
+
+    def test_a_row_that_is_shown_asks_for_none(self, server):
+        plot, asked = ReadingsPlot(server, readings(), ARRAY), []
+        plot.when_pointed(asked.append)
+        for row in (3, 50, 99):
+            plot.show_row(row)
+        assert asked == []
+
+    def test_a_span_shows_the_page_of_the_row(self, server):
+        rows = readings(2000)
+        plot = ReadingsPlot(server, rows, ARRAY)
+        assert plot.span_dropdown.options == ("all", "10 s", "1 s")
+        set_value(plot.span_dropdown, "10 s")
+        plot.show_row(1234)
+        wait_for(lambda: ends(plot) == (120.0, 130.0))
+        inside = (plot._time_s >= 120.0) & (plot._time_s <= 130.0)
+        low, high = span_of(1e9 * rows.values_T[inside])
+        lines = plot._thinned(RAW, tuple(range(12)), 10.0, 12)
+        assert lines.span == pytest.approx((low, high))
+        drawn = plot.lines_panel.content
+        plot.show_row(1250)
+        assert plot.lines_panel.content is drawn
 
     def test_a_long_record_is_thinned(self, server):
         rows = readings(20_000)
         rows.values_T[12_345, 2] = 1e-6  # a single outlier must stay in sight
-        plot = ReadingsPlot(server, rows, ARRAY)
-        assert all(len(line) <= 403 for line in plot.plot.data)
-        assert np.max(plot.plot.data[3]) == pytest.approx(1e3)
+        lines = ReadingsPlot(server, rows, ARRAY).lines(RAW)
+        assert len(lines.values) <= 400
+        assert lines.values[:, 2].max() == pytest.approx(1e3)
+
+
+def marked(plot: ReadingsPlot) -> float:
+    """Where the cursor is [px]."""
+    found = re.search(r"translate\(([-0-9.]+)\)", plot.cursor_panel.content)
+    assert found
+    return float(found[1])
+
+
+def places_of_axis(plot: ReadingsPlot, begin_s: float, end_s: float) -> list[float]:
+    """Where the ends of its axis are, by the lines drawn from the first row to the last [px]."""
+    assert ends(plot) == pytest.approx((begin_s, end_s))
+    first, *_, last = re.findall(r'<path d="M([0-9]+ .*?)"', plot.lines_panel.content)[-1].split()[::2]
+    return [0.1 * float(first), 0.1 * float(last)]
+
+
+def ends(plot: ReadingsPlot) -> tuple[float, float]:
+    """Of the axis of time that is drawn [s]."""
+    found = re.search('data-begin="(.*?)" data-end="(.*?)"', plot.lines_panel.content)
+    assert found
+    return float(found[1]), float(found[2])
+
+
+def paths(plot: ReadingsPlot) -> int:
+    """How many lines are drawn."""
+    return plot.lines_panel.content.count('stroke="#')
+
+
+def number(text: str) -> float:
+    """A number as people write it."""
+    return float(text.replace("\N{MINUS SIGN}", "-"))
 
 
 class TestThinning:
@@ -372,13 +424,6 @@ class TestThinning:
                 assert np.nanmax(kept[:, column]) == known.max()
             else:
                 assert np.isnan(kept[:, column]).all()
-
-    @given(st.floats(0.0, 9.0))
-    def test_the_mark_is_at_its_time_and_time_stays_in_order(self, at_s):
-        time_s, values, mark = with_mark(np.arange(10.0), np.zeros((10, 2)), at_s, np.ones(2))
-        assert np.all(np.diff(time_s) >= 0.0)
-        assert time_s[mark == 1.0].tolist() == [at_s]
-        assert np.flatnonzero(values[:, 0]).size == 3
 
     def test_span_of_nothing_and_of_one_value(self):
         assert span_of(np.full((3, 2), np.nan))[0] < span_of(np.full((3, 2), np.nan))[1]

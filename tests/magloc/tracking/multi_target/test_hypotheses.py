@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from magloc.tracking.multi_target.hypotheses import LARGEST_BEND, split
 from magloc.tracking.multi_target.measurement import JointRow
-from magloc.tracking.multi_target.splitting import LARGEST_BEND, split
 from magloc.tracking.results import Row
 from tests.magloc.tracking.multi_target.test_update import BOARD, known, readings
 

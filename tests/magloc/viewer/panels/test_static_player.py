@@ -1,4 +1,4 @@
-"""The readings of a page without a server: what is drawn, and the numbers at the cursor."""
+"""What a page without a server says of its rows: their readings, the numbers at the cursor, and words."""
 
 from __future__ import annotations
 
@@ -10,16 +10,10 @@ import numpy as np
 from arrays.geometries import tetrahedron
 from magloc.readings import Readings
 from magloc.viewer.panels.readings_plot import ReadingsPlot
-from magloc.viewer.panels.static_plot import _path, static_plot
+from magloc.viewer.panels.static_player import static_player
 from magloc.viewer.server import opened
 
 ARRAY = tetrahedron(1.0)
-
-
-class TestPath:
-    def test_is_broken_where_a_value_is_missing(self) -> None:
-        x = np.array([0.0, 1.0, 2.0, 3.0, 4.0, 5.0])
-        assert _path(x, np.array([7.0, 8.0, np.nan, 9.0, np.nan, np.nan])) == "M0 7h0L1 8M3 9h0"
 
 
 class TestCursor:
@@ -29,11 +23,19 @@ class TestCursor:
         rows = Readings(rng.normal(0.0, 1e-7, (1000, ARRAY.n_channels)), time_s=time_s)
         played = [999, 3, 500]
         with opened(0, "test") as server:
-            html = static_plot(ReadingsPlot(server, rows, ARRAY), played, 2.0, 0.5)
+            plot = ReadingsPlot(server, rows, ARRAY)
+            html = static_player(["<b>a</b>", "b", "c"], 2.0, 0.5, plot, played)
         found = re.search(r"= (\{.*\});", html)
         assert found
-        cursor = json.loads(found[1])
-        np.testing.assert_allclose(np.array(cursor["values"][0], dtype=float), 1e9 * rows.values_T[played], rtol=1e-4)
-        places, times = np.array(cursor["x"]), rows.time_s[played]
+        held = json.loads(found[1])
+        values = [[float(text.replace("\N{MINUS SIGN}", "-")) for text in row] for row in held["values"][0]]
+        np.testing.assert_allclose(values, 1e9 * rows.values_T[played], atol=0.051)
+        places, times = np.array(held["x"]), rows.time_s[played]
         slope = (places[1] - places[0]) / (times[1] - times[0])
         np.testing.assert_allclose(places - places[0], slope * (times - times[0]), atol=0.02)
+        assert held["words"] == ["<b>a</b>", "b", "c"]
+
+    def test_no_word_ends_the_script(self) -> None:
+        html = static_player(["</script>", "b"], 2.0, 0.5)
+        assert html.count("</script>") == 1
+        assert "<select" not in html

@@ -1,0 +1,106 @@
+"""What rows say of a source together of which one alone does not determine it, until a track begins."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import replace
+
+import numpy as np
+
+from magloc.tracking.chart.mixture import Mixture
+from magloc.tracking.chart.places import ENOUGH, Places, effective_number, weighed
+from magloc.tracking.chart.row import ChartRow
+from magloc.tracking.chart.stack import Stack, displacement
+from magloc.tracking.chart.steps import ChartFilter
+from magloc.tracking.chart.update import Move, predicted_root
+from magloc.tracking.motion import N_SOURCE, MotionModel, RandomWalk
+
+MOST_ROWS = 256
+"""The latest rows that are taken together."""
+REFITS_GROW = 1.03
+"""How many more rows there are each time that places are weighed anew; between, what is known is predicted."""
+SEARCHES_GROW = 1.4
+"""How many more there are each time that they are searched for anew."""
+_AT_REST = RandomWalk(0.0, 0.0)
+
+
+class Undetermined:
+    """Rows that show a source, and what they say together."""
+
+    def __init__(self, chart_filter: ChartFilter) -> None:
+        self.filter = chart_filter
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin anew."""
+        self._rows: deque[ChartRow] = deque(maxlen=MOST_ROWS)
+        self._told: Mixture | None = None
+        self._n_rows, self._next_fit, self._next_search = 0, 2, 2
+
+    @property
+    def position_error(self) -> float:
+        """Standard deviation of the position over the range; 0 where nothing is known of it."""
+        if self._told is None:
+            return 0.0
+        mean, covariance = self._told.moments()
+        distance = float(np.linalg.norm(mean[:3] - self._told.centroid_m))
+        return float(np.sqrt(np.trace(covariance[:3, :3]))) / distance if distance > 0.0 else np.inf
+
+    def after(self, row: ChartRow, motion: MotionModel) -> tuple[Mixture | None, str]:
+        """What is known of the source after one more row, or why that is nothing."""
+        is_detected = self.filter.is_detected(row)
+        if is_detected or self._rows:
+            self._add(row, motion)
+        if not is_detected or self._told is None:
+            return self.filter.of_row(row, motion)
+        return self._told, ""
+
+    def _add(self, row: ChartRow, motion: MotionModel) -> None:
+        """One row more; rows of fewer differences than the first one's are left out."""
+        before = self._rows[-1] if self._rows else None
+        if self._told is not None and before is not None:
+            self._told = _predicted(self._told, row, motion, row.row.time_s - before.row.time_s)
+        if row.z.size < (before.z.size if before else 1) or _leads(motion):
+            return
+        self._rows.append(row)
+        self._n_rows += 1
+        if self._n_rows >= self._next_fit:
+            self._next_fit = int(np.ceil(REFITS_GROW * self._n_rows))
+            self._fit(Stack(tuple(self._rows), self.filter.errors, self.filter.pose_errors, motion))
+
+    def _fit(self, stack: Stack) -> None:
+        """Weigh places anew, from where they were, and now and then from wherever the rows allow."""
+        places = [] if self._told is None else [Places.about(self._told)]
+        told = weighed(stack, places, self.filter.prior) if self._n_rows < self._next_search else None
+        if told is None or effective_number(told) < ENOUGH:
+            self._next_search = int(np.ceil(SEARCHES_GROW * self._n_rows))
+            found, _ = self.filter.of_stack(stack, _AT_REST)
+            if found is not None:
+                places.append(Places.of(found))
+            told = weighed(stack, places, self.filter.prior)
+        self._told = told
+        if told is None:
+            # They contradict each other, or no place is left: what moves otherwise than stated is told by fewer.
+            for _ in range(len(self._rows) // 2):
+                self._rows.popleft()
+            self._n_rows = len(self._rows)
+            self._next_fit = self._next_search = self._n_rows + 1
+
+
+def _leads(motion: MotionModel) -> bool:
+    """Whether a source at rest is elsewhere a second later: in the axes of an array that moves."""
+    x, _ = motion.start(np.arange(1.0, 1.0 + N_SOURCE), np.zeros((N_SOURCE, N_SOURCE)))
+    return not np.allclose(motion.step(x, 1.0)[0], x, rtol=1e-9)
+
+
+def _predicted(mixture: Mixture, row: ChartRow, motion: MotionModel, dt_s: float) -> Mixture:
+    """What is known of the source after a time without readings, as seen from a row's array."""
+    of_place, of_moment = displacement(motion, dt_s)
+    strength = np.linalg.norm(mixture.x[:, 3:6], axis=1)
+    S_q = np.zeros((len(mixture), N_SOURCE, N_SOURCE))
+    at = np.arange(3)
+    S_q[:, at, at] = of_place
+    S_q[:, 3 + at, 3 + at] = of_moment * strength[:, None]
+    after = replace(mixture, centroid_m=row.centroid_m)
+    move = Move(np.broadcast_to(np.eye(N_SOURCE), S_q.shape), S_q, np.zeros(0), np.zeros(0))
+    return replace(after, S=predicted_root(mixture.chart, after.chart, mixture.S, move))

@@ -1,0 +1,88 @@
+"""All rows of a young joint track together, linearised where they are after all.
+
+A filter linearises every row where its prediction stood, and while little is known that is far from where the sources
+are: it becomes too sure of itself. Gauss and Newton's iteration over all rows since the last birth is a filter and a
+smoother along the last trajectory, until that stays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from arrays.typing import FloatArray
+from magloc.tracking.multi_target.measurement import JointRow
+from magloc.tracking.multi_target.smoothing_compiled import Means, smooth
+from magloc.tracking.multi_target.state import JointState
+
+# Passes, and the change of the last state, in its standard deviations, below which the trajectory stays.
+_MOST_PASSES = 12
+_TOLERANCE = 0.1
+# Longest step of ln |m| or of a moment's direction in a pass.
+_LONGEST = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class YoungTrack:
+    """Rows since the number of sources changed.
+
+    Attributes
+    ----------
+    prior : JointState
+        Before the first of them.
+    rows : tuple of (JointRow, ndarray)
+        And the motion's step that led to each.
+    states : tuple of JointState
+        After each of them, as far as it is known.
+    score : float
+        -2 ln of how likely the rows are, as successive updates have it.
+    """
+
+    prior: JointState
+    rows: tuple[tuple[JointRow, FloatArray], ...] = ()
+    states: tuple[JointState, ...] = ()
+    score: float = 0.0
+
+    def after(self, row: JointRow, step: FloatArray, state: JointState, score: float) -> YoungTrack:
+        """After one more row."""
+        return replace(self, rows=(*self.rows, (row, step)), states=(*self.states, state), score=self.score + score)
+
+    def smoothed(self) -> YoungTrack | None:
+        """The same with all rows linearised along the trajectory that they lead to; None where there is no such."""
+        track, prior = _stacked(self.states), _means(self.prior)
+        rows = [row for row, _ in self.rows]
+        given = (
+            np.stack([row.z for row in rows]),
+            np.stack([row.gain for row in rows]),
+            np.stack([row.positions_m for row in rows]),
+            rows[0].channel_sensor,
+        )
+        steps = np.stack([step for _, step in self.rows])
+        offsets, last = np.empty((len(self.rows), len(self.prior.P))), np.empty_like(self.prior.P)
+        states = self.states
+        for _ in range(_MOST_PASSES):
+            cost, log_volume = smooth(track, prior, self.prior.P, steps, given, offsets, last)
+            if not (np.isfinite(cost) and np.isfinite(offsets).all() and np.isfinite(last).all()):
+                return None
+            turns = offsets[:, : 6 * self.prior.n_sources].reshape(len(offsets), -1, 6)[:, :, 3:]
+            share = min(1.0, _LONGEST / max(float(np.abs(turns).max(initial=0.0)), 1e-300))
+            change = np.abs(share * offsets[-1]) / np.sqrt(np.diagonal(last))
+            states = tuple(state.moved(share * offset) for state, offset in zip(states, offsets, strict=True))
+            if share == 1.0 and float(change.max(initial=0.0)) < _TOLERANCE:
+                end = replace(states[-1], P=last)
+                return replace(self, states=(*states[:-1], end), score=cost + log_volume)
+            track = _stacked(states)
+        return None
+
+
+def _means(state: JointState) -> Means:
+    """What a state says without its covariance."""
+    return state.position_m, state.moment_Am2, state.velocity_m_s, state.rate_rad_s, state.common_T
+
+
+def _stacked(states: Sequence[JointState]) -> Means:
+    """The same of a trajectory, (m, K, 3) each."""
+    parts = [np.stack(part) for part in zip(*(_means(state) for state in states), strict=True)]
+    return parts[0], parts[1], parts[2], parts[3], parts[4]

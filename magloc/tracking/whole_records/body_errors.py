@@ -1,0 +1,80 @@
+"""By how much the track of a point would err if the object were none: a body of the default length.
+
+What a dipole leaves out of a body's field lasts from row to row, and χ² does not see it.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from arrays.typing import FloatArray
+from magloc.fields.multipole import DEFAULT_LENGTH, N_BODY_ERRORS, finite_body_errors
+from magloc.measurement.differences import fields_at_sensors
+from magloc.tracking.measurement import RowMeasurement
+from magloc.tracking.motion import N_SOURCE
+from magloc.tracking.results import Row, TrackPoint
+from magloc.tracking.tracker import Tracker
+from magloc.tracking.whole_records.background import steps_of
+from magloc.tracking.whole_records.constants import placed_rows
+
+# Rows of which the error is told, the last ones: more of them err alike.
+_MOST_ROWS = 200
+# Sum of squares of what a body adds to the last row, in units of the noise, below which it does not matter.
+_NEGLIGIBLE = 1e-2
+
+
+def body_factor(tracker: Tracker, rows: Sequence[Row], points: Sequence[TrackPoint]) -> float:
+    """How many times their standard deviations errors of the last row would be, rms; NaN where the range is not known.
+
+    The body does not turn, and is a quarter as long as the source was from the nearest sensor in the row in which it
+    was nearest.
+    """
+    used = placed_rows(points)[-_MOST_ROWS:]
+    source = {i: np.concatenate([points[i].position_m, points[i].moment_Am2]) for i, _ in used}
+    measured = {i: tracker.measurements.of(rows[i]) for i in source}
+    seen = {i: measurement for i, measurement in measured.items() if measurement.z.size}
+    if not seen:
+        return math.nan
+    length_m = DEFAULT_LENGTH * min(_nearest_m(measurement, source[i]) for i, measurement in seen.items())
+    errors = {i: _errors(measurement, source[i], length_m) for i, measurement in seen.items()}
+    if not any(np.sum(columns**2) * len(errors) > _NEGLIGIBLE for columns in errors.values()):
+        return 1.0
+    wider, own = copy.copy(tracker), tracker.errors
+    none, n = np.zeros(N_BODY_ERRORS), tracker.motion.n_states + own.n_states
+    wider.errors = replace(
+        own,
+        sigma=np.concatenate([own.sigma, none + 1.0]),
+        decay_Hz=np.concatenate([own.decay_Hz, none]),
+        walk=np.concatenate([own.walk, none]),
+    )
+    rest = np.zeros(tracker.motion.n_states - N_SOURCE + wider.n_errors)
+    steps = steps_of(
+        wider,
+        [replace(seen[i], effect=np.concatenate([seen[i].effect, errors[i]], axis=1)) for i in seen],
+        [np.concatenate([source[i], rest]) for i in seen],
+    )
+    S = steps[-1].S
+    shift = S[:N_SOURCE] @ np.linalg.pinv(S[n : n + N_BODY_ERRORS])  # by errors that are taken for zero
+    share = np.trace(np.linalg.solve(used[-1][1], shift @ shift.T))
+    return math.sqrt(1.0 + float(share) / N_SOURCE)
+
+
+def _nearest_m(measurement: RowMeasurement, source: FloatArray) -> float:
+    """Distance of a source from the nearest sensor."""
+    in_array = measurement.pose.in_array(source)
+    return float(np.linalg.norm(measurement.model.array.positions - in_array[:3], axis=1).min())
+
+
+def _errors(measurement: RowMeasurement, source: FloatArray, length_m: float) -> FloatArray:
+    """What a body adds to a row (k, 14), of one σ, in units of the noise; its axes are those of the world."""
+    array, R = measurement.model.array, measurement.pose.R_world_from_array
+    in_array = measurement.pose.in_array(source)
+    fields = finite_body_errors((array.positions - in_array[:3]) @ R.T, source[3:], length_m)
+    gain = array.linear_gain(fields_at_sensors(array, in_array[:3], in_array[3:]))
+    columns = np.einsum("cj,ij,cin->cn", gain, R, fields[array.channel_sensor])
+    return np.asarray(measurement.model.differences.transform @ columns / measurement.sigma[:, None])
