@@ -121,7 +121,7 @@ def by_socket(given: argparse.Namespace, array: SensorArray, folder: Path) -> No
 def by_pipe(given: argparse.Namespace, array: SensorArray, folder: Path) -> None:
     """As many rows as it takes."""
     n, part = given.stdin, 20_000
-    options = ["--speed-m-s", "0.1", "--turn-deg-s", "20"]
+    options = ["--speed-m-s", "10", "--turn-deg-s", "20"]
     command = [sys.executable, "-m", "magloc.cli", "live", "--array"]
     command += [str(folder / "array.toml"), *options]
     process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
