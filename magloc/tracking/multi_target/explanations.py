@@ -330,8 +330,7 @@ class RowProblem:
         A single sensor that sees one may be at fault; one so far away that it is much stronger than the others is a
         gradient of the ambient field.
         """
-        strength = np.linalg.norm(state.moment_Am2, axis=1)
-        if strength.max() > _MUCH_STRONGER * strength.min():
+        if far_sources(state):
             return False
         return all(
             self._allows_one(row, position, moment)
@@ -390,6 +389,12 @@ def apart(found: Iterable[Explanation]) -> list[Explanation]:
         if not any(are_same(one.update.state, other.update.state) for other in kept):
             kept.append(one)
     return kept
+
+
+def far_sources(state: JointState) -> list[int]:
+    """Those that are so much stronger than another one that they are far away, where all is a gradient."""
+    strength = np.linalg.norm(state.moment_Am2, axis=1)
+    return np.flatnonzero(strength > _MUCH_STRONGER * strength.min(initial=np.inf)).tolist()
 
 
 def are_same(first: JointState, second: JointState) -> bool:

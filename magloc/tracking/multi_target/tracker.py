@@ -28,6 +28,7 @@ from magloc.tracking.multi_target.explanations import (
     apart,
     are_same,
     distinct,
+    far_sources,
 )
 from magloc.tracking.multi_target.hypotheses import (
     Hypothesis,
@@ -302,9 +303,14 @@ class SourcesTracker:
         """Hypotheses of a source less, where the row does not miss it; they are to be judged.
 
         It is taken away, or one with another that it is not told apart from: the two may be a single one, and their
-        moments then grow against each other.
+        moments then grow against each other. One that has gone so far that it is a gradient of the ambient field is
+        taken away without being judged.
         """
         state = best.state
+        far = problem.one_less(found, far_sources(state), [])
+        gone = [self._after(problem, best, one) for one in far if problem.holds(one)]
+        if gone:
+            return [replace(one, score=best.score - _MUST_GAIN) for one in gone]
         doubtful = [k for k in range(state.n_sources) if state.log_strength_sigma(k) > _CERTAIN_STRENGTH]
         fewer = problem.one_less(found, doubtful, merged_pairs(state))
         held = [self._after(problem, best, one) for one in fewer if problem.holds(one)]

@@ -10,6 +10,8 @@ from scipy.spatial.transform import Rotation
 
 import arrays
 import magloc
+from magloc.tracking.multi_target.explanations import far_sources
+from magloc.tracking.multi_target.state import JointState
 from magloc.tracking.multi_target.tracker import ROWS_TO_REPORT
 from magloc.tracking.sensor_health import ROWS_TO_RETURN
 from tests.moving_magnets import FAULTS, NOISE_T, RATE_HZ, Magnets, Within, board, followed, judged, with_fault
@@ -138,6 +140,13 @@ class TestFirstRow:
 
 
 class TestSlidesIn:
+    def test_what_is_far_is_a_gradient(self):
+        """A source a hundred times as strong as another, or none: the others stay."""
+        strengths = np.array([0.05, 4.9, 5.1])
+        state = JointState.empty(np.zeros(3), 1e-6).with_sources(np.eye(3), strengths[:, None] * np.eye(3), np.eye(12))
+        assert far_sources(state) == [2]
+        assert far_sources(state.without(2)) == far_sources(state.common_alone) == []
+
     @pytest.mark.slow
     def test_the_other_stays_where_it_is(self):
         """A magnet comes from 300 mm away: the other is told as well as it is known all the time, no sensor is blamed.
