@@ -24,8 +24,8 @@ from magloc.chi_square import energy_threshold
 from magloc.levels import CREDIBLE_ROW, MISFIT, SENSOR_FALSE_ALARM
 from magloc.localization.fit.fixes import Fixes
 from magloc.localization.fit.gauss_newton import JointFits, refine
-from magloc.localization.fit.model_errors import model_errors
 from magloc.localization.fit.results import Fix
+from magloc.localization.model_errors import model_errors
 from magloc.localization.search.multi_source import NOISE_ALONE
 from magloc.measurement.rows import (
     NO_SIGNAL,

@@ -28,10 +28,10 @@ from magloc.localization.dipole_validity import too_near
 from magloc.localization.fault_exclusion import without_faulty_sensors
 from magloc.localization.fit.columns import Solutions, in_stable_order
 from magloc.localization.fit.fixes import Fixes
-from magloc.localization.fit.model_errors import with_model_errors
 from magloc.localization.fit.optima import Optima
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import Fix
+from magloc.localization.model_errors import with_model_errors
 from magloc.localization.search.known_position import MomentSearch
 from magloc.localization.search.moving_array import optima_at_rest, stacked_errors, stacked_rows
 from magloc.localization.search.multi_source import NOISE_ALONE, MultiSourceSearch
