@@ -206,7 +206,7 @@ class SensorArray:
     @cached_property
     def noise_depends_on_reading(self) -> bool:
         """Whether the covariance of the readings changes with them; else it is diagonal, with the channels' noise."""
-        uncertain = any(sensor.misalignment_rad or sensor.gain_uncertainty for sensor in self.sensors)
+        uncertain = any(s.misalignment_rad or s.gain_uncertainty or s.induced_uncertainty for s in self.sensors)
         return bool(self.noise_fractions.any()) or uncertain
 
     @cached_property

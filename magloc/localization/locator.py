@@ -39,8 +39,9 @@ from magloc.localization.search.single_source import N_UNKNOWNS, SingleSourceSea
 from magloc.localization.uncertainty.covariance import solutions_of
 from magloc.localization.uncertainty.pose_covariance import pose_covariances
 from magloc.localization.uncertainty.range_interval import is_detected
+from magloc.measurement.nuisances import ambient_in_array, with_eddies_as_offsets
 from magloc.measurement.plausibility import warn_of_doubts
-from magloc.measurement.pose import PosesOfRows, with_stated_pose
+from magloc.measurement.pose import PosesOfRows, rates_of, with_stated_pose
 from magloc.measurement.rows import NO_SIGNAL, WhitenedRows, checked_rows, whitened_rows
 from magloc.readings import Readings, as_readings, without_saturated
 
@@ -360,6 +361,7 @@ def locate(
     pose = rows.pose
     place = None if position_m is None else _places_in_array(position_m, pose)
     stated = with_stated_pose(array, rows).pose
+    array = _with_eddies(array, rows)
     locator = Locator(
         array if stated is None else _seeing_turned_field(array, stated, rows, ambient),
         sources=sources,
@@ -384,6 +386,14 @@ def _places_in_array(position_m: ArrayLike, pose: tuple[FloatArray, Rotation] | 
         raise ValueError(f"Input position_m must have shape (3,) or (K, 3); instead received {place.shape}.")
     place = place.reshape(1, -1, 3)
     return place if pose is None else np.einsum("nji,nkj->nki", pose[1].as_matrix(), place - pose[0][:, None])
+
+
+def _with_eddies(array: SensorArray, rows: Readings) -> SensorArray:
+    """The array where eddy currents are errors of its offsets, as its turns between the rows tell of them."""
+    if rows.pose is None or not any(sensor.eddy_uncertainty_s for sensor in array.sensors):
+        return array
+    _, rate_rad_s = rates_of(rows.time_s, rows.pose[0], rows.pose[1].as_matrix())
+    return with_eddies_as_offsets(array, ambient_in_array(array, rows.values_T, rows.ambient_T), rate_rad_s)
 
 
 def _seeing_turned_field(
