@@ -2,7 +2,8 @@
 
 Prints every run, and of all of them: swaps, births and losses, NEES per dimension, sensors that were named, and the
 processor time of a row. Paths are sums of sinusoids, rates of turn Ornstein-Uhlenbeck processes; paths are drawn anew
-where two magnets come nearer than ``--gap-mm``, all of them or ``--one-by-one``.
+where two magnets come nearer than ``--gap-mm``, all of them or ``--one-by-one``. With ``--crossing-mm`` two magnets go
+to and fro past each other instead, and with ``--slide-in-mm`` the last one comes from so far away.
 """
 
 from __future__ import annotations
@@ -34,6 +35,16 @@ ROWS_OF_A_SWAP = 20
 # Square of a distance in units of a track's covariance within which a magnet may be the one it is of.
 TOLD_APART = 25.0
 FAULTS = ("zero", "stuck", "noisy", "drift")
+# Magnets that repel each other: speed of an axis and how long it lasts, within how far beyond the gap they are pushed,
+# how much, and rows that are drawn anew where one leaves the box, is too fast or too near.
+WANDER_M_S, WANDER_LASTS_S = 0.08, 1.0
+SOFT_M, PUSH_PER_S2, ROWS_ANEW = 0.01, 800.0, 50
+# A magnet that slides in begins to, and how long it takes.
+SLIDE_BEGINS_S, SLIDE_S = 2.0, 3.0
+# Rows after the birth of the last magnet in which the others are looked at.
+ROWS_AFTER_BIRTH = 100
+# How often a second two magnets go to and fro, and how far from the middle.
+PASSES_HZ, PASS_M = 0.4, 0.04
 
 
 def board() -> SensorArray:
@@ -51,13 +62,15 @@ class Within:
     """What magnets are drawn within: heights, strengths, and of the box the share of each axis that one moves in.
 
     `one_by_one`: a path is drawn until it keeps the gap to those before it, not all of them anew, which of three
-    magnets takes a minute, and of more for ever.
+    magnets takes a minute, and of more for ever. `repelled`: five in a narrow box keep clear of each other, as a swarm
+    does; sinusoids that do so by chance are not found.
     """
 
     highest_m: float = HIGH_M[2]
     weakest_Am2: float = STRENGTH_AM2[0]
     roam: float = 1.0
     one_by_one: bool = False
+    repelled: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +101,28 @@ class Magnets:
             present[-1, : int(0.3 * n_rows)] = present[-1, int(0.7 * n_rows) :] = False
         return cls(position, moment, present)
 
+    @classmethod
+    def crossing(cls, n_rows: int, gap_m: float, rng: np.random.Generator) -> Magnets:
+        """Two magnets that go to and fro along a line, against each other, and pass at a gap."""
+        half_m = np.full(3, np.inf)
+        while (half_m > 0.5 * (HIGH_M - LOW_M)).any():
+            way, across = Rotation.random(rng=rng).apply(np.eye(3)[:2])
+            half_m = np.abs(PASS_M * way) + np.abs(0.5 * gap_m * across)
+        centre = rng.uniform(LOW_M + half_m, HIGH_M - half_m)
+        wave = np.sin(2.0 * np.pi * (PASSES_HZ * np.arange(n_rows) / RATE_HZ + rng.uniform()))
+        offset = PASS_M * wave[:, None] * way + 0.5 * gap_m * across
+        moment = np.stack([one * _direction(n_rows, rng) for one in rng.uniform(*STRENGTH_AM2, 2)])
+        return cls(np.stack([centre + offset, centre - offset]), moment, np.ones((2, n_rows), dtype=bool))
+
+    def sliding(self, from_m: float, rng: np.random.Generator) -> Magnets:
+        """The same with the last one coming from far away, above the board."""
+        to_go = 1.0 - np.clip((np.arange(self.present.shape[1]) / RATE_HZ - SLIDE_BEGINS_S) / SLIDE_S, 0.0, 1.0)
+        way = rng.normal(size=3)
+        way[2] = abs(way[2])
+        position = self.position_m.copy()
+        position[-1] += from_m * (to_go**2 * (3.0 - 2.0 * to_go))[:, None] * way / np.linalg.norm(way)
+        return replace(self, position_m=position)
+
     def first(self, n_rows: int) -> Magnets:
         """The same for as long as some rows."""
         return Magnets(self.position_m[:, :n_rows], self.moment_Am2[:, :n_rows], self.present[:, :n_rows])
@@ -102,6 +137,8 @@ class Magnets:
 
 def _paths(k: int, n_rows: int, gap_m: float, within: Within, rng: np.random.Generator) -> FloatArray:
     """Paths (k, n, 3) that keep a gap."""
+    if within.repelled:
+        return _repelled_paths(k, n_rows, gap_m, within, rng)
     at_once, position = 1 if within.one_by_one else k, np.zeros((0, n_rows, 3))
     while len(position) < k:
         for _ in range(TRIES):
@@ -114,6 +151,35 @@ def _paths(k: int, n_rows: int, gap_m: float, within: Within, rng: np.random.Gen
         else:
             position = np.zeros((0, n_rows, 3))
     return position
+
+
+def _repelled_paths(k: int, n_rows: int, gap_m: float, within: Within, rng: np.random.Generator) -> FloatArray:
+    """Wanderers in the box that push each other and are pushed by its walls, softly.
+
+    Where two come too near after all, or one is too fast or leaves, some last rows are drawn anew.
+    """
+    low, high = LOW_M, np.array([*HIGH_M[:2], within.highest_m])
+    kept, itself = np.exp(-1.0 / (RATE_HZ * WANDER_LASTS_S)), np.diag(np.full(k, np.inf))
+    position = low + (high - low) * rng.uniform(size=(k, 3))
+    while (np.linalg.norm(position[:, None] - position, axis=-1) + itself).min() < gap_m:
+        position = low + (high - low) * rng.uniform(size=(k, 3))
+    path = [(position, np.zeros((k, 3)))]
+    while len(path) < n_rows:
+        position, velocity = path[-1]
+        offset = position[:, None] - position
+        apart = (np.linalg.norm(offset, axis=-1) + itself)[:, :, None]
+        push = np.sum(np.maximum(gap_m + SOFT_M - apart, 0.0) * offset / apart, axis=1)
+        push += np.maximum(low + SOFT_M - position, 0.0) - np.maximum(position - high + SOFT_M, 0.0)
+        noise = WANDER_M_S * np.sqrt(1.0 - kept**2) * rng.normal(size=(k, 3))
+        velocity = kept * velocity + PUSH_PER_S2 / RATE_HZ * push + noise
+        position = position + velocity / RATE_HZ
+        outside = np.maximum(low - position, position - high).max() > 0.0
+        too_near = (np.linalg.norm(position[:, None] - position, axis=-1) + itself).min() < gap_m
+        if outside or too_near or np.linalg.norm(velocity, axis=1).max() > SPEED_M_S:
+            del path[max(1, len(path) - ROWS_ANEW) :]
+        else:
+            path.append((position, velocity))
+    return np.stack([position for position, _ in path], axis=1)
 
 
 def _path(n_rows: int, within: Within, rng: np.random.Generator) -> FloatArray:
@@ -178,6 +244,7 @@ class Run:
     rms_m: float
     named: dict[str, int]
     row_ms: FloatArray
+    others: dict[str, float]
 
 
 def judged(points: list[SourcesPoint], truth: Magnets, row_ms: FloatArray) -> Run:
@@ -187,13 +254,15 @@ def judged(points: list[SourcesPoint], truth: Magnets, row_ms: FloatArray) -> Ru
     swaps = [0, 0]
     named: dict[str, int] = {}
     squares, errors, false, lost = [], [], 0, 0
+    of_others = np.full((len(points), 2), np.nan)
     last = truth.present[-1]
     first, end = int(np.argmax(last)), int(len(last) - np.argmax(last[::-1]))
     seen_first, seen_last = len(last), 0
     for row, point in enumerate(points):
         for name in point.dropped_sensors:
             named.setdefault(name, row)
-        there = np.flatnonzero(truth.present[:, row])
+        there, others = np.flatnonzero(truth.present[:, row]), []
+        of_others[row, 1] = point.status in ("misfit", "doubtful")
         false += len(point.tracks) > len(there)
         lost += len(point.tracks) < len(there)
         for track in point.tracks:
@@ -219,6 +288,9 @@ def judged(points: list[SourcesPoint], truth: Magnets, row_ms: FloatArray) -> Ru
             if truth.present[own, row]:
                 squares.append(error @ np.linalg.solve(track.covariance, error) / 6.0)
                 errors.append(offset @ offset)
+                if own != len(truth.present) - 1:
+                    others.append(squares[-1])
+        of_others[row, 0] = np.mean(others) if others else np.nan
     return Run(
         swaps=swaps[1],
         early_swaps=swaps[0],
@@ -232,7 +304,23 @@ def judged(points: list[SourcesPoint], truth: Magnets, row_ms: FloatArray) -> Ru
         rms_m=float(np.sqrt(np.mean(errors))),
         named=named,
         row_ms=row_ms,
+        others=_of_others(of_others, seen_first),
     )
+
+
+def _of_others(rows: FloatArray, born: int) -> dict[str, float]:
+    """NEES of the others while the last magnet slides in and is not told, and after; and where no row is flagged."""
+    begins = int(SLIDE_BEGINS_S * RATE_HZ)
+    told = max(born, begins)
+    spans = {"before": slice(begins, told), "after": slice(told, told + ROWS_AFTER_BIRTH)}
+    found: dict[str, float] = {"born": float(born)}
+    for name, span in (spans | {"later": slice(told + ROWS_AFTER_BIRTH, None)}).items():
+        part = rows[span]
+        kept = part[np.isfinite(part[:, 0])]
+        clear = kept[kept[:, 1] == 0.0]
+        found |= {name: float(np.mean(kept[:, 0])) if len(kept) else np.nan}
+        found |= {f"{name}, clear": float(np.mean(clear[:, 0])) if len(clear) else np.nan}
+    return found
 
 
 def followed(array: SensorArray, readings_T: FloatArray, **options: object) -> tuple[list[SourcesPoint], FloatArray]:
@@ -258,17 +346,25 @@ def main() -> None:
     parser.add_argument("--weakest-Am2", type=float, default=STRENGTH_AM2[0])
     parser.add_argument("--roam", type=float, default=1.0)
     parser.add_argument("--one-by-one", action="store_true")
+    parser.add_argument("--repelled", action="store_true", help="magnets that keep clear of each other")
     parser.add_argument("--come-and-go", action="store_true")
+    parser.add_argument("--crossing-mm", type=float, help="two magnets pass each other at this gap")
+    parser.add_argument("--slide-in-mm", type=float, help="the last magnet comes from so far away")
     parser.add_argument("--fault", choices=FAULTS)
     parser.add_argument("--only", type=int, nargs="*", help="these seeds")
     given = parser.parse_args()
     array, n_rows, runs = board(), int(given.seconds * RATE_HZ), []
     for seed in given.only or range(given.first, given.first + given.seeds):
         rng = np.random.default_rng(seed)
-        within = Within(1e-3 * given.highest_mm, given.weakest_Am2, given.roam, given.one_by_one)
-        truth = Magnets.drawn(
-            given.sources, n_rows, 1e-3 * given.gap_mm, rng, come_and_go=given.come_and_go, within=within
-        )
+        within = Within(1e-3 * given.highest_mm, given.weakest_Am2, given.roam, given.one_by_one, given.repelled)
+        if given.crossing_mm:
+            truth = Magnets.crossing(n_rows, 1e-3 * given.crossing_mm, rng)
+        else:
+            truth = Magnets.drawn(
+                given.sources, n_rows, 1e-3 * given.gap_mm, rng, come_and_go=given.come_and_go, within=within
+            )
+        if given.slide_in_mm:
+            truth = truth.sliding(1e-3 * given.slide_in_mm, rng)
         readings_T = truth.readings_T(array, rng)
         if given.fault:
             readings_T = with_fault(readings_T, given.fault, int(rng.integers(array.n_sensors)), n_rows // 2)
@@ -280,7 +376,10 @@ def main() -> None:
             f" too few {run.lost_rows}, misfit"
             f" {run.misfit_rows}, merged {run.merged_rows}, birth after {run.late_birth_rows}, loss after"
             f" {run.late_loss_rows}, NEES {run.nees:.2f}, rms {1e3 * run.rms_m:.2f} mm, named {run.named},"
-            f" {np.median(run.row_ms):.2f} ms a row, {run.row_ms.mean():.2f} mean, {run.row_ms.max():.0f} most",
+            f" {np.median(run.row_ms):.2f} ms a row, {run.row_ms.mean():.2f} mean, {run.row_ms.max():.0f} most"
+            + (
+                f", others { ({name: round(one, 2) for name, one in run.others.items()}) }" if given.slide_in_mm else ""
+            ),
             flush=True,
         )
     nees = np.array([run.nees for run in runs])

@@ -255,7 +255,7 @@ class RowProblem:
             place_m = 0.5 * (state.position_m[first] + state.position_m[second])
             together = state.moment_Am2[first] + state.moment_Am2[second]
             others = tuple(name for k, name in enumerate(ids) if k not in (first, second))
-            alone = self.with_source(prior.without(second).without(first), place_m, together)
+            alone = self.with_sources(prior.without(second).without(first), place_m[None], together[None])
             yield self.updated(alone, (*others, min(ids[first], ids[second])), found.out, penalty)
 
     def _one_event_more(self, found: Explanation) -> list[Explanation]:
@@ -290,9 +290,10 @@ class RowProblem:
             place_m = self.row.origin_m + R @ self._cells.position_m[cell]
             moment = R @ self._cells.moment(cell, update.innovation, update.linear, update.row.used)
             ids = (*found.ids, self._first_id + born)
-            start = joint_update(self.with_source(found.prior, place_m, moment), update.row, _START_TRIALS).found
+            prior = self.with_sources(found.prior, place_m[None], moment[None])
+            start = joint_update(prior, update.row, _START_TRIALS).found
             # Where it is found, not where it was looked for, is what the next event starts from.
-            prior = self.with_source(found.prior, start.position_m[-1], start.moment_Am2[-1])
+            prior = self.with_sources(found.prior, start.position_m[-1:], start.moment_Am2[-1:])
             child = self.updated(prior, ids, found.out, found.penalty + BIRTH)
             if self._allows(child.update, slice(-1, None)):
                 yield child
@@ -322,29 +323,26 @@ class RowProblem:
         energy = row.energy_of(position_m, moment_Am2)
         return bool(energy.max() < _LONELY * energy.sum())
 
-    def with_source(self, state: JointState, position_m: FloatArray, moment_Am2: FloatArray) -> JointState:
-        """The state with another source, of which hardly more is known than where the readings have it."""
+    def with_sources(self, state: JointState, position_m: FloatArray, moment_Am2: FloatArray) -> JointState:
+        """The state with other sources (j, 3), of which hardly more is known than where the readings have them."""
         scene = self.scene
-        strength = float(np.linalg.norm(moment_Am2))
+        strength = np.sqrt(np.vecdot(moment_Am2, moment_Am2))[:, None]
         direction, log_strength = moment_Am2 / strength, _LOG_STRENGTH
         known = scene.prior.known_moment
         if known is not None:
             log_strength = known.sigma_Am2 / known.modulus_Am2
-            strength = known.modulus_Am2
-        centroid = self.row.origin_m + self.row.R_world_from_array @ scene.array.centroid
-        place_m = max(_PLACE * float(np.linalg.norm(position_m - centroid)), scene.array.circumradius)
-        covariance = scene.motion.start(direction, place_m, _TURN, log_strength)
-        return state.with_source(position_m, strength * direction, covariance)
+            strength = np.full_like(strength, known.modulus_Am2)
+        from_centroid = position_m - self.row.origin_m - self.row.R_world_from_array @ scene.array.centroid
+        away_m = np.maximum(_PLACE * np.sqrt(np.vecdot(from_centroid, from_centroid)), scene.array.circumradius)
+        covariance = scene.motion.start(direction, away_m, _TURN, log_strength)
+        return state.with_sources(position_m, strength * direction, covariance)
 
     def found_anew(
         self, common: JointState, positions_m: FloatArray, moments_Am2: FloatArray, out: BoolArray
     ) -> Explanation:
         """The row explained by sources (K, 3) that a search has found, with nothing else known of them."""
-        state = common
-        for position, moment in zip(positions_m, moments_Am2, strict=True):
-            state = self.with_source(state, position, moment)
         ids = self._names(len(positions_m))
-        return self.updated(state, ids, out, BIRTH * len(ids))
+        return self.updated(self.with_sources(common, positions_m, moments_Am2), ids, out, BIRTH * len(ids))
 
     def _names(self, number: int, after: int = 0) -> tuple[int, ...]:
         return tuple(self._first_id + after + 1 + k for k in range(number))

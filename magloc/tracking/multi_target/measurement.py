@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
@@ -102,11 +101,14 @@ class Cells:
         Readings of unit moments at each of them.
     bases : ndarray, shape (C, 3 n)
         Orthonormal ones, the common field projected out: by axis, then by cell.
+    near : ndarray of bool, shape (n, n)
+        Which cells are nearer to one than half its distance from the array's centre.
     """
 
     position_m: FloatArray
     columns: FloatArray
     bases: FloatArray
+    near: BoolArray
 
     @classmethod
     def of(cls, array: SensorArray, root: FloatArray) -> Cells:
@@ -120,7 +122,10 @@ class Cells:
         fields = dipole.field_matrix(array.positions, positions[:, None])[:, array.channel_sensor]
         columns = (gain[None, :, None] @ fields)[:, :, 0]
         bases, _ = np.linalg.qr(columns - common @ (common.T @ columns))
-        return cls(positions, columns, bases.transpose(1, 2, 0).reshape(len(gain), -1).astype(np.float32))
+        from_centre = positions - positions.mean(axis=0)
+        square = np.vecdot(from_centre, from_centre)
+        near = square[:, None] + square - 2.0 * from_centre @ from_centre.T < 0.25 * square[:, None]
+        return cls(positions, columns, bases.transpose(1, 2, 0).reshape(len(gain), -1).astype(np.float32), near)
 
     def energy(self, residual: FloatArray) -> FloatArray:
         """Energy (n,) of residuals (C,) that a source at each cell explains: χ² with three degrees of freedom."""
@@ -143,19 +148,12 @@ class Cells:
         found: FloatArray = np.linalg.lstsq(left[:, :3], left[:, 3], rcond=None)[0]
         return found
 
-    @cached_property
-    def _near(self) -> BoolArray:
-        """Which cells (n, n) are nearer to one than half its distance from the array's centre."""
-        from_centre = self.position_m - self.position_m.mean(axis=0)
-        square = np.vecdot(from_centre, from_centre)
-        return square[:, None] + square - 2.0 * from_centre @ from_centre.T < 0.25 * square[:, None]
-
     def best(self, energy: FloatArray, n: int) -> IntArray:
         """The `n` best cells, half their distance from the array's centre apart from each other."""
         left, chosen = energy.copy(), []
         for _ in range(n):
             chosen.append(int(np.argmax(left)))
-            left[self._near[chosen[-1]]] = -1.0
+            left[self.near[chosen[-1]]] = -1.0
         return np.array(chosen, dtype=np.intp)
 
 

@@ -70,14 +70,22 @@ class FreeMotion:
 
     def predicted(self, state: JointState, dt_s: float, *, agility: float = 1.0) -> JointState:
         """State after a step without readings; `agility` times the noise of velocity and turn."""
-        moving = state.position_m, state.moment_Am2, state.velocity_m_s, state.rate_rad_s
-        position, moment, velocity, rate, P = step_all(moving, state.P, self.numbers(dt_s, agility=agility))
-        return JointState(position, moment, velocity, rate, state.common_T, P)
+        return stepped(state, self.numbers(dt_s, agility=agility))
 
-    def start(self, direction: FloatArray, position_m: float, turn_rad: float, log_strength: float) -> FloatArray:
-        """Covariance (12, 12) of a source of which so much is known, whose moment points along a unit vector."""
-        P = np.zeros((N_OF_SOURCE, N_OF_SOURCE))
-        along, one = np.outer(direction, direction), np.eye(3)
-        P[P_, P_], P[V_, V_], P[W_, W_] = position_m**2 * one, self.speed_m_s**2 * one, self.turn_rad_s**2 * one
-        P[C_, C_] = turn_rad**2 * (one - along) + log_strength**2 * along
+    def start(
+        self, direction: FloatArray, position_m: FloatArray | float, turn_rad: float, log_strength: float
+    ) -> FloatArray:
+        """Covariance (..., 12, 12) of sources of which so much is known, whose moments point along unit vectors."""
+        P = np.zeros((*direction.shape[:-1], N_OF_SOURCE, N_OF_SOURCE))
+        along, one = direction[..., :, None] * direction[..., None, :], np.eye(3)
+        P[..., P_, P_] = np.square(position_m)[..., None, None] * one
+        P[..., V_, V_], P[..., W_, W_] = self.speed_m_s**2 * one, self.turn_rad_s**2 * one
+        P[..., C_, C_] = turn_rad**2 * (one - along) + log_strength**2 * along
         return P
+
+
+def stepped(state: JointState, step: FloatArray) -> JointState:
+    """State after a step of the motion, whose numbers (12,) are known."""
+    moving = state.position_m, state.moment_Am2, state.velocity_m_s, state.rate_rad_s
+    position, moment, velocity, rate, P = step_all(moving, state.P, step)
+    return JointState(position, moment, velocity, rate, state.common_T, P)

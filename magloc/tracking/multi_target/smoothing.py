@@ -61,19 +61,17 @@ class YoungTrack:
         )
         steps = np.stack([step for _, step in self.rows])
         offsets, last = np.empty((len(self.rows), len(self.prior.P))), np.empty_like(self.prior.P)
-        states = self.states
         for _ in range(_MOST_PASSES):
-            cost, log_volume = smooth(track, prior, self.prior.P, steps, given, offsets, last)
+            cost, log_volume = smooth(_means(track), prior, self.prior.P, steps, given, offsets, last)
             if not (np.isfinite(cost) and np.isfinite(offsets).all() and np.isfinite(last).all()):
                 return None
             turns = offsets[:, : 6 * self.prior.n_sources].reshape(len(offsets), -1, 6)[:, :, 3:]
             share = min(1.0, _LONGEST / max(float(np.abs(turns).max(initial=0.0)), 1e-300))
             change = np.abs(share * offsets[-1]) / np.sqrt(np.diagonal(last))
-            states = tuple(state.moved(share * offset) for state, offset in zip(states, offsets, strict=True))
+            track = track.moved(share * offsets)
             if share == 1.0 and float(change.max(initial=0.0)) < _TOLERANCE:
-                end = replace(states[-1], P=last)
-                return replace(self, states=(*states[:-1], end), score=cost + log_volume)
-            track = _stacked(states)
+                states = tuple(JointState(*means, last) for means in zip(*_means(track), strict=True))
+                return replace(self, states=states, score=cost + log_volume)
         return None
 
 
@@ -82,7 +80,7 @@ def _means(state: JointState) -> Means:
     return state.position_m, state.moment_Am2, state.velocity_m_s, state.rate_rad_s, state.common_T
 
 
-def _stacked(states: Sequence[JointState]) -> Means:
-    """The same of a trajectory, (m, K, 3) each."""
+def _stacked(states: Sequence[JointState]) -> JointState:
+    """A trajectory, with the covariance at its end."""
     parts = [np.stack(part) for part in zip(*(_means(state) for state in states), strict=True)]
-    return parts[0], parts[1], parts[2], parts[3], parts[4]
+    return JointState(parts[0], parts[1], parts[2], parts[3], parts[4], states[-1].P)

@@ -29,8 +29,9 @@ class JointState:
 
     Attributes
     ----------
-    position_m, moment_Am2, velocity_m_s, rate_rad_s : ndarray, shape (K, 3)
-    common_T : ndarray, shape (3,)
+    position_m, moment_Am2, velocity_m_s, rate_rad_s : ndarray, shape (..., K, 3)
+        Leading axes: of the rows of a trajectory.
+    common_T : ndarray, shape (..., 3)
     P : ndarray, shape (12 K + 3, 12 K + 3)
     """
 
@@ -50,7 +51,7 @@ class JointState:
     @property
     def n_sources(self) -> int:
         """K."""
-        return len(self.position_m)
+        return self.position_m.shape[-2]
 
     @property
     def means(self) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -68,19 +69,18 @@ class JointState:
         return places_of(self.n_sources)
 
     def moved(self, error: FloatArray) -> JointState:
-        """The state that an error (n,), or what a row sees of it, leads to; the covariance stays as it is."""
-        k = self.n_sources
-        c = error[: N_SEEN * k].reshape(k, N_SEEN)[:, 3:]
+        """The state that an error (..., n), or what a row sees of it, leads to; the covariance stays as it is."""
+        c = error[..., : N_SEEN * self.n_sources].reshape(*error.shape[:-1], self.n_sources, N_SEEN)[..., 3:]
         return self.moved_to(error, moved_moment(self.moment_Am2, c), self.P)
 
     def moved_to(self, error: FloatArray, moment_Am2: FloatArray, P: FloatArray) -> JointState:
-        """The same, with the moments (K, 3) that the error leads to, and the covariance there."""
-        k, seen = self.n_sources, self.n_seen
-        of_seen, of_motion = error[: N_SEEN * k].reshape(k, N_SEEN), error[seen:].reshape(-1, N_SEEN)
+        """The same, with the moments (..., K, 3) that the error leads to, and the covariance there."""
+        end, seen, each = N_SEEN * self.n_sources, self.n_seen, (*error.shape[:-1], -1, N_SEEN)
+        of_seen, of_motion = error[..., :end].reshape(each), error[..., seen:].reshape(each)
         velocity_m_s, rate_rad_s = self.velocity_m_s, self.rate_rad_s
         if of_motion.size:
-            velocity_m_s, rate_rad_s = velocity_m_s + of_motion[:, :3], rate_rad_s + of_motion[:, 3:]
-        position_m, common_T = self.position_m + of_seen[:, :3], self.common_T + error[N_SEEN * k : seen]
+            velocity_m_s, rate_rad_s = velocity_m_s + of_motion[..., :3], rate_rad_s + of_motion[..., 3:]
+        position_m, common_T = self.position_m + of_seen[..., :3], self.common_T + error[..., end:seen]
         return JointState(position_m, moment_Am2, velocity_m_s, rate_rad_s, common_T, P)
 
     def moved_with(self, error: FloatArray, P: FloatArray) -> JointState:
@@ -147,20 +147,19 @@ class JointState:
             P,
         )
 
-    def with_source(self, position_m: FloatArray, moment_Am2: FloatArray, covariance: FloatArray) -> JointState:
-        """The state with another source, last, at rest: covariance (12, 12) of its (p, c, v, ω)."""
-        # What a row sees of it stands before the common field, its motion behind all others.
-        at, end = N_SEEN * self.n_sources, len(self.P) + N_SEEN
-        P = np.zeros((end + N_SEEN,) * 2)
-        behind, seen, motion = slice(at + N_SEEN, end), slice(at, at + N_SEEN), slice(end, None)
-        P[:at, :at], P[behind, behind] = self.P[:at, :at], self.P[at:, at:]
-        P[:at, behind], P[behind, :at] = self.P[:at, at:], self.P[at:, :at]
-        P[seen, seen], P[motion, motion] = covariance[:N_SEEN, :N_SEEN], covariance[N_SEEN:, N_SEEN:]
-        P[seen, motion], P[motion, seen] = covariance[:N_SEEN, N_SEEN:], covariance[N_SEEN:, :N_SEEN]
-        rest = np.zeros((1, 3))
+    def with_sources(self, position_m: FloatArray, moment_Am2: FloatArray, covariance: FloatArray) -> JointState:
+        """The state with other sources (j, 3), last, at rest: covariances (j, 12, 12) of their (p, c, v, ω)."""
+        # What a row sees of them stands before the common field, their motion behind all others.
+        known, n = self.n_sources, self.n_sources + len(position_m)
+        places, rest = places_of(n), np.zeros((len(position_m), 3))
+        seen, behind = np.arange(N_SEEN * known), N_SEEN * n + np.arange(N_COMMON)
+        old = np.concatenate([seen, behind, N_SEEN * n + N_COMMON + seen])
+        P, new = np.zeros((N_OF_SOURCE * n + N_COMMON,) * 2), places[known:]
+        P[old[:, None], old] = self.P
+        P[new[:, :, None], new[:, None]] = covariance
         return JointState(
-            np.concatenate([self.position_m, position_m[None]]),
-            np.concatenate([self.moment_Am2, moment_Am2[None]]),
+            np.concatenate([self.position_m, position_m]),
+            np.concatenate([self.moment_Am2, moment_Am2]),
             np.concatenate([self.velocity_m_s, rest]),
             np.concatenate([self.rate_rad_s, rest]),
             self.common_T,

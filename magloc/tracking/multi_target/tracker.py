@@ -38,7 +38,7 @@ from magloc.tracking.multi_target.hypotheses import (
     split,
 )
 from magloc.tracking.multi_target.measurement import Channels
-from magloc.tracking.multi_target.motion import FreeMotion
+from magloc.tracking.multi_target.motion import FreeMotion, stepped
 from magloc.tracking.multi_target.results import SourcePoint, SourcesPoint
 from magloc.tracking.multi_target.smoothing import YoungTrack
 from magloc.tracking.multi_target.state import N_COMMON, N_SEEN, JointState
@@ -151,8 +151,8 @@ class SourcesTracker:
         problem = RowProblem(self.scene, row, self._n_rows, self.scene.motion.numbers(dt_s))
         self._n_rows += 1
         if not row.available.any():
-            predicted = self.scene.motion.predicted
-            self._hypotheses = [replace(one, state=predicted(one.state, dt_s), young=None) for one in self._hypotheses]
+            step = problem.step
+            self._hypotheses = [replace(one, state=stepped(one.state, step), young=None) for one in self._hypotheses]
             return self._point(problem, "no readings", math.nan)
         if not self._hypotheses:
             self._hypotheses = [self._begun(problem)]
@@ -221,13 +221,12 @@ class SourcesTracker:
 
     def _continued(self, problem: RowProblem, before: Hypothesis, dt_s: float) -> list[tuple[Hypothesis, Explanation]]:
         """What becomes of a hypothesis: one for every explanation of the row, or the prediction if there is none."""
-        motion = self.scene.motion
-        prior = motion.predicted(before.state, dt_s)
+        prior = stepped(before.state, problem.step)
         plain = problem.updated(prior, before.ids, before.health.dead)
         if problem.holds(plain) or (before.judged > 0 and plain.update.converged):
             explanations = [plain]
         else:
-            manoeuvring = motion.predicted(before.state, dt_s, agility=MANOEUVRE_AGILITY)
+            manoeuvring = self.scene.motion.predicted(before.state, dt_s, agility=MANOEUVRE_AGILITY)
             explanations = problem.explanations(plain, manoeuvring)
         if not explanations:
             kept = replace(before, state=prior, young=None, score=before.score + min(plain.score, _UNBEARABLE))

@@ -46,7 +46,7 @@ class TestChart:
 class TestBookkeeping:
     def test_a_source_more_and_away_again(self):
         state = state_of(2)
-        more = state.with_source(np.ones(3), np.array([0.0, 0.0, 2.0]), np.diag(np.arange(1.0, 13.0)))
+        more = state.with_sources(np.ones((1, 3)), np.array([[0.0, 0.0, 2.0]]), np.diag(np.arange(1.0, 13.0)))
         assert more.n_sources == 3
         np.testing.assert_array_equal(more.P[np.ix_(places_of(3)[2], places_of(3)[2])], np.diag(np.arange(1.0, 13.0)))
         assert not more.P[np.ix_(places_of(3)[2], places_of(3)[:2].ravel())].any()
@@ -90,7 +90,7 @@ def test_second_moments_of_a_moment():
     moment = np.array([0.03, -0.02, 0.05])
     u = moment / np.linalg.norm(moment)
     P = FreeMotion().start(u, 0.01, 0.2, 1e-3)
-    state = JointState.empty(np.zeros(3), 1e-6).with_source(np.zeros(3), moment, P)
+    state = JointState.empty(np.zeros(3), 1e-6).with_sources(np.zeros((1, 3)), moment[None], P)
     drawn = moved_moment(moment, rng.multivariate_normal(np.zeros(3), P[3:6, 3:6], 200_000)) - moment
     expected = drawn.T @ drawn / len(drawn)
     found = state.covariances[0][3:, 3:]

@@ -37,7 +37,7 @@ def known(n_sources: int, share: float, rng: np.random.Generator | None = None, 
     state = JointState.empty(COMMON_T, 1e-5 * share)
     for place, moment in zip(PLACES[:n_sources], MOMENTS[:n_sources], strict=True):
         u = moment / np.linalg.norm(moment)
-        state = state.with_source(place, moment, MOTION.start(u, 0.03 * share, share, share))
+        state = state.with_sources(place[None], moment[None], MOTION.start(u, 0.03 * share, share, share))
     # Positions and velocities go together, or a row would say nothing of the latter.
     state = MOTION.predicted(state, dt_s)
     if rng is None:
