@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-import arrays
 import magloc
 from arrays.io.arguments import Flag, whole_number
 from arrays.io.errors import InputError, naming
@@ -18,7 +17,7 @@ from arrays.io.outputs import refuse_file
 from arrays.io.text import write_netcdf
 from arrays.typing import Vector
 from magloc.cli.framework import CommonOptions, print_json, progress
-from magloc.cli.options import Grid, naming_options, print_note, refuse_not_positive
+from magloc.cli.options import Grid, array_of_several, naming_options, print_note, refuse_not_positive
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -247,12 +246,7 @@ def _check_place(array: SensorArray, place: FloatArray) -> None:
 
 
 def _array_of(path: Path) -> SensorArray:
-    array = arrays.read_array(path)
-    if array.n_sensors < 2:
-        raise InputError(
-            f"{path}: sensors must be at least 2; instead received 1, which knows no place: magloc locate --position"
-            " has the covariance of the moment at a place that is known."
-        )
+    array = array_of_several(path, "which knows no place: magloc locate --position tells the moment at a known one")
     # A figure calls an array by its name; one without is called after its file.
     return array if array.name else replace(array, name=path.stem)
 
