@@ -36,9 +36,9 @@ ROWS_OF_A_SWAP = 20
 TOLD_APART = 25.0
 FAULTS = ("zero", "stuck", "noisy", "drift")
 # Magnets that repel each other: speed of an axis and how long it lasts, within how far beyond the gap they are pushed,
-# how much, and rows that are drawn anew where one leaves the box, is too fast or too near.
+# how much, and rows that are drawn anew where one leaves the box, is too fast or too near, and how often.
 WANDER_M_S, WANDER_LASTS_S = 0.08, 1.0
-SOFT_M, PUSH_PER_S2, ROWS_ANEW = 0.01, 800.0, 50
+SOFT_M, PUSH_PER_S2, ROWS_ANEW, MOST_FAILED = 0.01, 800.0, 50, 200
 # A magnet that slides in begins to, and how long it takes.
 SLIDE_BEGINS_S, SLIDE_S = 2.0, 3.0
 # Rows after the birth of the last magnet in which the others are looked at.
@@ -160,11 +160,14 @@ def _repelled_paths(k: int, n_rows: int, gap_m: float, within: Within, rng: np.r
     """
     low, high = LOW_M, np.array([*HIGH_M[:2], within.highest_m])
     kept, itself = np.exp(-1.0 / (RATE_HZ * WANDER_LASTS_S)), np.diag(np.full(k, np.inf))
-    position = low + (high - low) * rng.uniform(size=(k, 3))
-    while (np.linalg.norm(position[:, None] - position, axis=-1) + itself).min() < gap_m:
-        position = low + (high - low) * rng.uniform(size=(k, 3))
-    path = [(position, np.zeros((k, 3)))]
+    path: list[tuple[FloatArray, FloatArray]] = []
+    failed = 0
     while len(path) < n_rows:
+        if not path or failed > MOST_FAILED:
+            position, failed = low + (high - low) * rng.uniform(size=(k, 3)), 0
+            near = (np.linalg.norm(position[:, None] - position, axis=-1) + itself).min() < gap_m
+            path = [] if near else [(position, np.zeros((k, 3)))]
+            continue
         position, velocity = path[-1]
         offset = position[:, None] - position
         apart = (np.linalg.norm(offset, axis=-1) + itself)[:, :, None]
@@ -177,6 +180,7 @@ def _repelled_paths(k: int, n_rows: int, gap_m: float, within: Within, rng: np.r
         too_near = (np.linalg.norm(position[:, None] - position, axis=-1) + itself).min() < gap_m
         if outside or too_near or np.linalg.norm(velocity, axis=1).max() > SPEED_M_S:
             del path[max(1, len(path) - ROWS_ANEW) :]
+            failed += 1
         else:
             path.append((position, velocity))
     return np.stack([position for position, _ in path], axis=1)
@@ -254,7 +258,8 @@ def judged(points: list[SourcesPoint], truth: Magnets, row_ms: FloatArray) -> Ru
     swaps = [0, 0]
     named: dict[str, int] = {}
     squares, errors, false, lost = [], [], 0, 0
-    of_others = np.full((len(points), 2), np.nan)
+    old: set[int] = set()
+    of_others = np.full((len(points), 3), np.nan)
     last = truth.present[-1]
     first, end = int(np.argmax(last)), int(len(last) - np.argmax(last[::-1]))
     seen_first, seen_last = len(last), 0
@@ -288,9 +293,12 @@ def judged(points: list[SourcesPoint], truth: Magnets, row_ms: FloatArray) -> Ru
             if truth.present[own, row]:
                 squares.append(error @ np.linalg.solve(track.covariance, error) / 6.0)
                 errors.append(offset @ offset)
-                if own != len(truth.present) - 1:
+                if track.id in old and own != len(truth.present) - 1:
                     others.append(squares[-1])
+                elif track.id not in old and row >= SLIDE_BEGINS_S * RATE_HZ:
+                    of_others[row, 2] = squares[-1]
         of_others[row, 0] = np.mean(others) if others else np.nan
+        old |= {track.id for track in point.tracks if row < SLIDE_BEGINS_S * RATE_HZ}
     return Run(
         swaps=swaps[1],
         early_swaps=swaps[0],
@@ -309,18 +317,20 @@ def judged(points: list[SourcesPoint], truth: Magnets, row_ms: FloatArray) -> Ru
 
 
 def _of_others(rows: FloatArray, born: int) -> dict[str, float]:
-    """NEES of the others while the last magnet slides in and is not told, and after; and where no row is flagged."""
+    """NEES of the others while the last magnet slides in and is not told, for a while after that, and later.
+
+    Of the first two, how many rows have more than 3 and are not flagged; and NEES of what is told of the last one.
+    """
     begins = int(SLIDE_BEGINS_S * RATE_HZ)
     told = max(born, begins)
     spans = {"before": slice(begins, told), "after": slice(told, told + ROWS_AFTER_BIRTH)}
     found: dict[str, float] = {"born": float(born)}
     for name, span in (spans | {"later": slice(told + ROWS_AFTER_BIRTH, None)}).items():
-        part = rows[span]
-        kept = part[np.isfinite(part[:, 0])]
-        clear = kept[kept[:, 1] == 0.0]
-        found |= {name: float(np.mean(kept[:, 0])) if len(kept) else np.nan}
-        found |= {f"{name}, clear": float(np.mean(clear[:, 0])) if len(clear) else np.nan}
-    return found
+        found[name] = float(np.nanmean(rows[span, 0])) if np.isfinite(rows[span, 0]).any() else np.nan
+        newcomer = rows[span, 2][np.isfinite(rows[span, 2])]
+        found[f"its own {name}"] = float(np.mean(newcomer)) if len(newcomer) else np.nan
+    silent = (rows[:, 0] > 3.0) & (rows[:, 1] == 0.0)
+    return found | {"silent": float(np.count_nonzero(silent[begins : told + ROWS_AFTER_BIRTH]))}
 
 
 def followed(array: SensorArray, readings_T: FloatArray, **options: object) -> tuple[list[SourcesPoint], FloatArray]:

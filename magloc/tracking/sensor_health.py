@@ -71,6 +71,11 @@ class SensorHealth:
         return not (self.dead.any() or self.strikes.any())
 
     @property
+    def means(self) -> FloatArray:
+        """Means (4, N, 3) of residuals, of unit variance where nothing is wrong."""
+        return self.sums / np.sqrt(np.maximum(self.weight, 1e-300))[..., None]
+
+    @property
     def suspect(self) -> int | None:
         """The sensor whose mean residual is beyond noise, the worst one if there are several."""
         chi2 = np.max(np.vecdot(self.sums, self.sums) / np.maximum(self.weight, 1e-300), axis=0)

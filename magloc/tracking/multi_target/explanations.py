@@ -17,10 +17,12 @@ from magloc.tracking.multi_target.motion import FreeMotion
 from magloc.tracking.multi_target.state import JointState
 from magloc.tracking.multi_target.update import JointUpdate, joint_update
 from magloc.tracking.results import Row
-from magloc.tracking.sensor_health import SENSOR_LIMIT
+from magloc.tracking.sensor_health import SENSOR_LIMIT, SensorHealth
 
 BIRTH_LIMIT = 45.0
 """Energy, of three degrees of freedom, in one of some hundred cells above which another source is there."""
+LEFT_LIMIT = 25.0
+"""The same of mean residuals of the last rows, above which it is asked whether one has come slowly."""
 COST_LIMIT = 5.0
 """Standard deviations above its mean at which χ² of a row contradicts the prediction."""
 SENSOR_OUT, BIRTH, DEATH, MANOEUVRE = 32.0, 16.0, 14.0, 12.0
@@ -55,6 +57,10 @@ _MOST_WEIGHED = 8
 # By what share of the distance to the nearest sensor the halves of a source are moved apart.
 _HALVES = 0.25
 _SAME_SCORE = 0.1
+# Which of the memories of residuals is asked, and what a mean of unit variance is of one row.
+_LEFT_MEMORY, _LEFT_SHARE = 1, 0.25
+# How much less is known of a source that is found in many weak rows than where they first seem to have it.
+_LATE_SPREAD, _LATE_STARTS = 2.0, 8
 _MUCH_STRONGER = 100.0
 # Share of a source's energy in one sensor above which no other sensor sees it.
 _LONELY = 0.9
@@ -185,7 +191,9 @@ class RowProblem:
             if level and level[0].score > best + _NO_MORE:
                 break
             best = min([best, *(one.score for one in level)])
-        held = [one for one in sorted(found, key=_score) if self.holds(one) and self._allows(one.update)]
+        held = [
+            one for one in sorted(found, key=_score) if self.holds(one) and self.allows(one.update.found, self.measured)
+        ]
         held = [one for one in held if one.score < held[0].score + _WEIGHED][:_MOST_WEIGHED]
         return [replace(one, ids=self._names(len(one.ids), i * MOST_BY_ITSELF)) for i, one in enumerate(held)]
 
@@ -239,7 +247,7 @@ class RowProblem:
 
         A first birth between two sources is followed by two more, of which two stand for one.
         """
-        born = [k for k, name in enumerate(found.ids) if name >= self._first_id]
+        born = [k for k, name in enumerate(found.ids) if name >= self.first_id]
         if len(born) < 2:
             return []
         return [fewer for fewer in self.one_less(found, born, list(combinations(born, 2))) if self.holds(fewer)]
@@ -282,38 +290,51 @@ class RowProblem:
     def births(self, found: Explanation) -> Iterator[Explanation]:
         """Explanations with another source, from the cells that explain most of what is left."""
         energy = self._cells.energy(found.update.surprise)
-        born = 1 + sum(name >= self._first_id for name in found.ids)
+        born = 1 + sum(name >= self.first_id for name in found.ids)
         for cell in self._cells.best(energy, _BIRTH_STARTS):
             if energy[cell] < _WORTH_A_BIRTH:
                 continue
             update, R = found.update, self.row.R_world_from_array
             place_m = self.row.origin_m + R @ self._cells.position_m[cell]
             moment = R @ self._cells.moment(cell, update.innovation, update.linear, update.row.used)
-            ids = (*found.ids, self._first_id + born)
+            ids = (*found.ids, self.first_id + born)
             prior = self.with_sources(found.prior, place_m[None], moment[None])
             start = joint_update(prior, update.row, _START_TRIALS).found
             # Where it is found, not where it was looked for, is what the next event starts from.
             prior = self.with_sources(found.prior, start.position_m[-1:], start.moment_Am2[-1:])
             child = self.updated(prior, ids, found.out, found.penalty + BIRTH)
-            if self._allows(child.update, slice(-1, None)):
+            if self.allows(child.update.found, child.update.row, slice(-1, None)):
                 yield child
 
     @property
-    def _first_id(self) -> int:
+    def first_id(self) -> int:
+        """Below those of the sources that are born in this row."""
         return self.index * NAMES_A_ROW
 
-    def _allows(self, update: JointUpdate, born: slice = slice(None)) -> bool:
+    def left(self, health: SensorHealth) -> tuple[FloatArray, float]:
+        """Mean residuals (C,) of the last rows, of unit variance, and the most of their energy that a cell explains."""
+        mean = health.means[_LEFT_MEMORY].ravel()
+        return mean, float(self._cells.energy(mean).max())
+
+    def starts(self, prior: JointState, found: Explanation, left: FloatArray) -> Iterator[JointState]:
+        """Predictions with another source at the cells that explain most of mean residuals (C,)."""
+        update, R = found.update, self.row.R_world_from_array
+        for cell in self._cells.best(self._cells.energy(left), _LATE_STARTS):
+            place_m = self.row.origin_m + R @ self._cells.position_m[cell]
+            moment = R @ self._cells.moment(cell, _LEFT_SHARE * left, update.HL, update.row.used)
+            yield self.with_sources(prior, place_m[None], moment[None], _LATE_SPREAD)
+
+    def allows(self, state: JointState, row: JointRow, born: slice = slice(None)) -> bool:
         """Whether sources agree with what is known, and may be told from a fault and from the ambient field.
 
         A single sensor that sees one may be at fault; one so far away that it is much stronger than the others is a
         gradient of the ambient field.
         """
-        strength = np.linalg.norm(update.found.moment_Am2, axis=1)
-        if strength.max() > _MUCH_STRONGER * strength.min():
+        if far_sources(state):
             return False
         return all(
-            self._allows_one(update.row, position, moment)
-            for position, moment in zip(update.found.position_m[born], update.found.moment_Am2[born], strict=True)
+            self._allows_one(row, position, moment)
+            for position, moment in zip(state.position_m[born], state.moment_Am2[born], strict=True)
         )
 
     def _allows_one(self, row: JointRow, position_m: FloatArray, moment_Am2: FloatArray) -> bool:
@@ -323,17 +344,21 @@ class RowProblem:
         energy = row.energy_of(position_m, moment_Am2)
         return bool(energy.max() < _LONELY * energy.sum())
 
-    def with_sources(self, state: JointState, position_m: FloatArray, moment_Am2: FloatArray) -> JointState:
+    def with_sources(
+        self, state: JointState, position_m: FloatArray, moment_Am2: FloatArray, spread: float = 1.0
+    ) -> JointState:
         """The state with other sources (j, 3), of which hardly more is known than where the readings have them."""
         scene = self.scene
         strength = np.sqrt(np.vecdot(moment_Am2, moment_Am2))[:, None]
-        direction, log_strength = moment_Am2 / strength, _LOG_STRENGTH
+        direction, log_strength = moment_Am2 / strength, spread * _LOG_STRENGTH
         known = scene.prior.known_moment
         if known is not None:
             log_strength = known.sigma_Am2 / known.modulus_Am2
             strength = np.full_like(strength, known.modulus_Am2)
         from_centroid = position_m - self.row.origin_m - self.row.R_world_from_array @ scene.array.centroid
-        away_m = np.maximum(_PLACE * np.sqrt(np.vecdot(from_centroid, from_centroid)), scene.array.circumradius)
+        away_m = np.maximum(
+            spread * _PLACE * np.sqrt(np.vecdot(from_centroid, from_centroid)), scene.array.circumradius
+        )
         covariance = scene.motion.start(direction, away_m, _TURN, log_strength)
         return state.with_sources(position_m, strength * direction, covariance)
 
@@ -345,7 +370,7 @@ class RowProblem:
         return self.updated(self.with_sources(common, positions_m, moments_Am2), ids, out, BIRTH * len(ids))
 
     def _names(self, number: int, after: int = 0) -> tuple[int, ...]:
-        return tuple(self._first_id + after + 1 + k for k in range(number))
+        return tuple(self.first_id + after + 1 + k for k in range(number))
 
 
 def distinct(found: Iterable[Explanation]) -> list[Explanation]:
@@ -364,6 +389,12 @@ def apart(found: Iterable[Explanation]) -> list[Explanation]:
         if not any(are_same(one.update.state, other.update.state) for other in kept):
             kept.append(one)
     return kept
+
+
+def far_sources(state: JointState) -> list[int]:
+    """Those that are so much stronger than another one that they are far away, where all is a gradient."""
+    strength = np.linalg.norm(state.moment_Am2, axis=1)
+    return np.flatnonzero(strength > _MUCH_STRONGER * strength.min(initial=np.inf)).tolist()
 
 
 def are_same(first: JointState, second: JointState) -> bool:

@@ -54,7 +54,7 @@ class Hypothesis:
     judged : int
         Rows in which a restart is still judged, the last one counted; 0: it is believed.
     young : YoungTrack, optional
-        The rows since its last birth, while they are fitted together now and then.
+        The rows since its last birth, while they are fitted together now and then, and later the last ones.
     """
 
     state: JointState
@@ -71,7 +71,7 @@ class Hypothesis:
         Where readings bend far within what is not known there, the optimum is no mean, and its curvature no variance.
         """
         young = self.young
-        if young is None or len(young.rows) not in REFITS:
+        if young is None or not young.is_young or len(young.rows) not in REFITS:
             return self
         found = young.smoothed()
         if found is None or found.score > young.score + _WORSE or not is_straight(found.states[-1], row):

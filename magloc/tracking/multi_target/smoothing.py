@@ -14,9 +14,12 @@ import numpy as np
 
 from arrays.typing import FloatArray
 from magloc.tracking.multi_target.measurement import JointRow
+from magloc.tracking.multi_target.motion import stepped
 from magloc.tracking.multi_target.smoothing_compiled import Means, smooth
-from magloc.tracking.multi_target.state import JointState
+from magloc.tracking.multi_target.state import N_OF_SOURCE, JointState
 
+MOST_ROWS = 90
+"""Rows that are kept of a track."""
 # Passes, and the change of the last state, in its standard deviations, below which the trajectory stays.
 _MOST_PASSES = 12
 _TOLERANCE = 0.1
@@ -26,7 +29,7 @@ _LONGEST = 0.5
 
 @dataclass(frozen=True, eq=False)
 class YoungTrack:
-    """Rows since the number of sources changed.
+    """Rows since the number of sources changed, or the last ones.
 
     Attributes
     ----------
@@ -37,17 +40,31 @@ class YoungTrack:
     states : tuple of JointState
         After each of them, as far as it is known.
     score : float
-        -2 ln of how likely the rows are, as successive updates have it.
+        -2 ln of how likely the rows are, as successive updates have it, while it is young.
+    is_young : bool
+        Whether they are all rows since the number changed.
     """
 
     prior: JointState
     rows: tuple[tuple[JointRow, FloatArray], ...] = ()
     states: tuple[JointState, ...] = ()
     score: float = 0.0
+    is_young: bool = True
 
     def after(self, row: JointRow, step: FloatArray, state: JointState, score: float) -> YoungTrack:
-        """After one more row."""
+        """After one more row; where that are too many the older half is dropped."""
+        if len(self.rows) == MOST_ROWS:
+            n = MOST_ROWS // 2
+            prior = stepped(self.states[n - 1], self.rows[n][1])
+            return YoungTrack(prior, self.rows[n:], self.states[n:], is_young=False).after(row, step, state, score)
         return replace(self, rows=(*self.rows, (row, step)), states=(*self.states, state), score=self.score + score)
+
+    def joined(self, prior: JointState) -> YoungTrack:
+        """The same rows with the last sources of another prior all along, which rest there."""
+        new = slice(self.prior.n_sources, None)
+        means = prior.position_m[new], prior.moment_Am2[new]
+        states = tuple(state.with_sources(*means, np.zeros((N_OF_SOURCE, N_OF_SOURCE))) for state in self.states)
+        return YoungTrack(prior, self.rows, states)
 
     def smoothed(self) -> YoungTrack | None:
         """The same with all rows linearised along the trajectory that they lead to; None where there is no such."""

@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 
 from arrays.array import SensorArray
+from arrays.typing import FloatArray
 from magloc.blas_threads import one_blas_thread
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.locator import Locator
@@ -17,6 +18,7 @@ from magloc.readings import Readings
 from magloc.tracking.multi_target.explanations import (
     BIRTH,
     COST_LIMIT,
+    LEFT_LIMIT,
     MANOEUVRE_AGILITY,
     MOST_BY_ITSELF,
     NAMES_A_ROW,
@@ -26,9 +28,9 @@ from magloc.tracking.multi_target.explanations import (
     apart,
     are_same,
     distinct,
+    far_sources,
 )
 from magloc.tracking.multi_target.hypotheses import (
-    REFITS,
     Hypothesis,
     by_score,
     mates,
@@ -44,7 +46,7 @@ from magloc.tracking.multi_target.smoothing import YoungTrack
 from magloc.tracking.multi_target.state import N_COMMON, N_SEEN, JointState
 from magloc.tracking.multi_target.update import innovation_chi2
 from magloc.tracking.results import Row, next_row
-from magloc.tracking.sensor_health import SensorHealth
+from magloc.tracking.sensor_health import SENSOR_LIMIT, SensorHealth
 
 ROWS_TO_REPORT = 10
 """Rows after its birth in which a source is not yet told, unless there is no other: one taken for two dies sooner."""
@@ -70,6 +72,9 @@ _MUST_GAIN, _CLEAR_GAIN = 20.0, 60.0
 _CERTAIN_STRENGTH = 0.05
 # What a row costs at most that nothing explains.
 _UNBEARABLE = 1000.0
+# Rows from one try of a late birth to the next, fewest rows for one, and by how much it may be less likely than none.
+_LATE_PAUSE, _FEWEST_ROWS = 5, 10
+_LATE_WORSE = 10.0
 
 
 class SourcesTracker:
@@ -130,6 +135,7 @@ class SourcesTracker:
         self._ids: tuple[int, ...] = ()
         self._last_restart = self._next_restart = -_RESTART_PAUSE
         self._pause = _FIRST_PAUSE
+        self._next_late = 0
 
     @one_blas_thread
     def update(self, row: Row | Readings) -> SourcesPoint:
@@ -164,7 +170,8 @@ class SourcesTracker:
         found, explained = next((found, fits) for one, found, fits in known if one.state is best.state)
         status = "misfit" if not explained else "tracked" if best.ids else "no source"
         is_poor = bool((best.excess > _POOR).any())
-        if status == "tracked" and is_poor:
+        left, energy = problem.left(best.health) if best.ids else (None, 0.0)
+        if status == "tracked" and (is_poor or energy > SENSOR_LIMIT):
             status = "doubtful"
         poor = is_poor or best.health.suspect is not None
         if len(best.ids) > 1 and self._n_rows % _DOUBT_EVERY == 0:
@@ -179,6 +186,9 @@ class SourcesTracker:
             if poor:  # whether the suspect is at fault, they are to tell
                 self._hypotheses[0] = replace(best, health=best.health.forgetful)
             self._hypotheses += restarts
+        if left is not None and energy > LEFT_LIMIT and self._n_rows >= self._next_late:
+            self._next_late = self._n_rows + _LATE_PAUSE
+            self._hypotheses += self._born_late(problem, best, found, left)
         point = self._point(problem, status, found.update.cost)
         self._hypotheses = self._split(problem)
         return point
@@ -242,12 +252,13 @@ class SourcesTracker:
         used = found.update.row.used.reshape(-1, 3)
         residuals = np.where(used.all(axis=1, keepdims=True), found.update.standardised, np.nan)
         young = before.young
-        if found.penalty or found.ids != before.ids or not found.ids:
-            young = YoungTrack(found.prior) if 0 < len(found.ids) <= MOST_BY_ITSELF else None
-        if young is not None:
+        changed = bool(found.penalty) or found.ids != before.ids
+        if not 0 < len(found.ids) <= MOST_BY_ITSELF:
+            young = None
+        else:
+            young = YoungTrack(found.prior, is_young=changed) if changed or young is None else young
             likely = found.update.cost + found.update.log_volume
             young = young.after(found.update.row, problem.step, found.update.state, likely)
-            young = young if len(young.rows) <= REFITS[-1] else None
         after = replace(
             before,
             young=young,
@@ -263,13 +274,43 @@ class SourcesTracker:
         excess = min(found.excess, 2.0 * COST_LIMIT)
         return replace(after, excess=after.excess + (excess - after.excess) / _MEMORIES)
 
+    def _born_late(
+        self, problem: RowProblem, best: Hypothesis, found: Explanation, left: FloatArray
+    ) -> list[Hypothesis]:
+        """Hypotheses of a source more all along the last rows, where their mean residuals (C,) may be of one.
+
+        One that comes slowly bends what is known of the others, row by row, and no row alone shows it. All of these
+        rows fitted together, with it and without, say how likely it is, and where the others are then.
+        """
+        rows, ids = best.young, (*best.ids, problem.first_id + NAMES_A_ROW - 1)
+        if rows is None or len(rows.rows) < _FEWEST_ROWS or len(ids) > self.scene.most_sources:
+            return []
+        without = rows.smoothed()
+        if without is None:
+            return []
+        known, health = [one.state for one in self._hypotheses], best.health.forgetful
+        born: list[Hypothesis] = []
+        tried = [rows.joined(prior).smoothed() for prior in problem.starts(rows.prior, found, left)]
+        for young in sorted((one for one in tried if one is not None), key=lambda one: one.score):
+            state, score = young.states[-1], best.score + young.score - without.score + BIRTH
+            new = score < best.score + _LATE_WORSE and not any(are_same(state, other) for other in known)
+            if new and problem.allows(state, problem.measured.without(found.out), slice(-1, None)):
+                known.append(state)
+                born.append(replace(best, state=state, ids=ids, young=young, score=score, health=health))
+        return born
+
     def _superfluous(self, problem: RowProblem, best: Hypothesis, found: Explanation) -> list[Hypothesis]:
         """Hypotheses of a source less, where the row does not miss it; they are to be judged.
 
         It is taken away, or one with another that it is not told apart from: the two may be a single one, and their
-        moments then grow against each other.
+        moments then grow against each other. One that has gone so far that it is a gradient of the ambient field is
+        taken away without being judged.
         """
         state = best.state
+        far = problem.one_less(found, far_sources(state), [])
+        gone = [self._after(problem, best, one) for one in far if problem.holds(one)]
+        if gone:
+            return [replace(one, score=best.score - _MUST_GAIN) for one in gone]
         doubtful = [k for k in range(state.n_sources) if state.log_strength_sigma(k) > _CERTAIN_STRENGTH]
         fewer = problem.one_less(found, doubtful, merged_pairs(state))
         held = [self._after(problem, best, one) for one in fewer if problem.holds(one)]

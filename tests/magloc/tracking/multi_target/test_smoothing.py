@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 
 from magloc.tracking.multi_target.hypotheses import REFITS, Hypothesis
 from magloc.tracking.multi_target.measurement import JointRow
-from magloc.tracking.multi_target.smoothing import YoungTrack
+from magloc.tracking.multi_target.smoothing import MOST_ROWS, YoungTrack
 from magloc.tracking.multi_target.state import N_SEEN, JointState
 from magloc.tracking.multi_target.update import joint_update
 from magloc.tracking.results import Row
@@ -125,3 +125,38 @@ def test_a_hypothesis_is_fitted_anew_after_some_rows() -> None:
     np.testing.assert_array_equal(after.state.position_m, found.states[-1].position_m)
     other = replace(before, young=replace(track, rows=track.rows[:-1], states=track.states[:-1]))
     assert other.refitted(row) is other
+
+
+def test_a_source_that_joins_is_in_all_rows() -> None:
+    """Rows of two sources, filtered with one: with the other's prior they lead where they do with both from the first.
+
+    However the trajectory begins, all rows together have one optimum near.
+    """
+    both, _ = filtered(8, 2, 3, 0.05)
+    prior = both.prior
+    alone = YoungTrack(prior.without(1), both.rows, tuple(state.without(1) for state in both.states))
+    joined = alone.joined(prior)
+    np.testing.assert_array_equal(joined.states[-1].position_m[0], both.states[-1].position_m[0])
+    np.testing.assert_array_equal(joined.states[-1].position_m[1], prior.position_m[1])
+    found, expected = joined.smoothed(), both.smoothed()
+    assert found is not None
+    assert expected is not None
+    error = difference(expected.states[-1], found.states[-1]) / np.sqrt(np.diagonal(expected.states[-1].P))
+    assert np.abs(error).max() < 0.15
+    assert found.score == pytest.approx(expected.score, abs=0.5)  # both stop within a tenth of a deviation
+    fewer = alone.smoothed()
+    assert fewer is None or fewer.score > found.score + 1000.0
+
+
+def test_the_last_rows_are_kept() -> None:
+    """Of more rows than are kept the older half goes, and what was known then is the prior of those that stay."""
+    track, predictions = filtered(MOST_ROWS, 1, 4, 0.05)
+    assert track.is_young
+    row = track.rows[-1][0]
+    later = track.after(row, MOTION.numbers(DT_S), track.states[-1], 0.0)
+    first = MOST_ROWS // 2
+    assert not later.is_young
+    assert len(later.rows) == len(later.states) == MOST_ROWS - first + 1
+    assert later.rows[0] is track.rows[first]
+    np.testing.assert_allclose(later.prior.position_m, predictions[first].position_m, rtol=1e-12)
+    np.testing.assert_allclose(later.prior.P, predictions[first].P, rtol=1e-9, atol=1e-18)

@@ -10,9 +10,11 @@ from scipy.spatial.transform import Rotation
 
 import arrays
 import magloc
+from magloc.tracking.multi_target.explanations import far_sources
+from magloc.tracking.multi_target.state import JointState
 from magloc.tracking.multi_target.tracker import ROWS_TO_REPORT
 from magloc.tracking.sensor_health import ROWS_TO_RETURN
-from tests.moving_magnets import FAULTS, NOISE_T, RATE_HZ, Magnets, board, followed, judged, with_fault
+from tests.moving_magnets import FAULTS, NOISE_T, RATE_HZ, Magnets, Within, board, followed, judged, with_fault
 
 BOARD = board()
 
@@ -135,6 +137,30 @@ class TestFirstRow:
         points, took = followed(BOARD, truth.readings_T(BOARD, rng)[:4])
         assert [len(point.tracks) for point in points] == [2, 3, 3, 3]
         assert judged(points, truth.first(4), took).nees < 5.0
+
+
+class TestSlidesIn:
+    def test_what_is_far_is_a_gradient(self):
+        """A source a hundred times as strong as another, or none: the others stay."""
+        strengths = np.array([0.05, 4.9, 5.1])
+        state = JointState.empty(np.zeros(3), 1e-6).with_sources(np.eye(3), strengths[:, None] * np.eye(3), np.eye(12))
+        assert far_sources(state) == [2]
+        assert far_sources(state.without(2)) == far_sources(state.common_alone) == []
+
+    @pytest.mark.slow
+    def test_the_other_stays_where_it_is(self):
+        """A magnet comes from 300 mm away: the other is told as well as it is known all the time, no sensor is blamed.
+
+        χ² of three degrees of freedom is above 60 once in 10¹² rows.
+        """
+        rng = np.random.default_rng(12)
+        truth = Magnets.drawn(2, 420, 0.02, rng, within=Within(one_by_one=True)).sliding(0.3, rng)
+        points, took = followed(BOARD, truth.readings_T(BOARD, rng))
+        for point, place_m in zip(points, truth.position_m[0], strict=True):
+            offset = point.tracks[0].position_m - place_m
+            assert offset @ np.linalg.solve(point.tracks[0].covariance[:3, :3], offset) < 60.0
+        assert not judged(points, truth, took).named
+        assert len(points[-1].tracks) > 1
 
 
 class TestFaults:
