@@ -234,6 +234,12 @@ class SensorArray:
         return _read_only(np.concatenate([sensor.calibration.offset_T for sensor in self.sensors]))
 
     @cached_property
+    def channel_ambient_T(self) -> FloatArray:
+        """Reading of each vector channel in the known ambient field, of each scalar one in zero field, (C,) [T]."""
+        of_field = np.vecdot(self.ambient_fields[self.channel_sensor], self.channel_gain)
+        return _read_only(self.channel_offset_T + np.where(self.channel_is_scalar, 0.0, of_field))
+
+    @cached_property
     def channel_gain(self) -> FloatArray:
         """What each channel reads of the field, shape (C, 3).
 

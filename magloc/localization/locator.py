@@ -35,7 +35,7 @@ from magloc.localization.model_errors import with_model_errors
 from magloc.localization.search.known_position import MomentSearch
 from magloc.localization.search.moving_array import optima_at_rest, stacked_errors, stacked_rows
 from magloc.localization.search.multi_source import NOISE_ALONE, MultiSourceSearch
-from magloc.localization.search.single_source import N_UNKNOWNS, SingleSourceSearch
+from magloc.localization.search.single_source import N_UNKNOWNS, SingleSourceSearch, kept_search
 from magloc.localization.uncertainty.covariance import solutions_of
 from magloc.localization.uncertainty.pose_covariance import pose_covariances
 from magloc.localization.uncertainty.range_interval import is_detected
@@ -117,7 +117,8 @@ class Locator:
             self._search = MomentSearch(array, position_m, prior=prior)
             self._fewest = 3 * self._search.position_m.shape[1]
         elif free and not array.channel_is_scalar.any():
-            self._search, self._fewest = SingleSourceSearch(array, prior=prior), 6
+            alike = prior == NOTHING_KNOWN
+            self._search, self._fewest = kept_search(array) if alike else SingleSourceSearch(array, prior=prior), 6
         else:
             number = None if sources == "auto" else int(sources)
             self._search = MultiSourceSearch(array, n_sources=number, prior=prior, seed=seed)
@@ -161,21 +162,19 @@ class Locator:
         times = np.arange(len(readings), dtype=np.float64) if time_s is None else time_s
         parts = []
         for begin in range(0, len(readings), self._at_once):
-            index = np.arange(begin, min(begin + self._at_once, len(readings)))
-            parts.append(self._credible(index, readings[index], None if ambient is None else ambient[index]))
+            some = slice(begin, begin + self._at_once)
+            index = np.arange(len(readings))[some]
+            parts.append(self._credible(index, readings[some], None if ambient is None else ambient[some]))
             if progress is not None:
                 progress(len(index))
         fixes = Fixes.joined(parts)
-        if (fixes.solutions.n_sources > 1).any() and not isinstance(self._search, MomentSearch):
+        if fixes.solutions.position_m.shape[1] > 1 and not isinstance(self._search, MomentSearch):
             fixes = replace(fixes, solutions=in_stable_order(fixes.solutions))
-        near = too_near(self.array, fixes, readings, ambient, self.body_length_m)
-        fixes = replace(fixes, time_s=times, too_near=near)
-        if self.body_length_m is not None:
-            return fixes
-        known_place = isinstance(self._search, MomentSearch)
-        return replace(
-            fixes, bodies=partial(body_covariances, self.array, fixes, readings, ambient, known_place=known_place)
-        )
+        near, bodies = too_near(self.array, fixes, readings, ambient, self.body_length_m), None
+        if self.body_length_m is None:
+            known_place = isinstance(self._search, MomentSearch)
+            bodies = partial(body_covariances, self.array, fixes, readings, ambient, known_place=known_place)
+        return replace(fixes, time_s=times, too_near=near, bodies=bodies)
 
     def _credible(self, index: IntArray, readings: FloatArray, ambient: FloatArray | None) -> Fixes:
         """Fixes of some of the rows, without the sensors that contradict all others."""
@@ -225,11 +224,12 @@ class _Rows:
 
     def fill(self, rows: WhitenedRows, search: Callable[[WhitenedRows], list[Optima]]) -> None:
         """Detection, search and uncertainty of a block."""
-        silent = rows.silent
-        self.refuse(rows.index[silent], NO_SIGNAL)
-        loud = rows.chosen(~silent) if silent.any() else rows
-        if not len(loud):
-            return
+        loud, silent = rows, rows.silent
+        if np.count_nonzero(silent):
+            self.refuse(rows.index[silent], NO_SIGNAL)
+            loud = rows.chosen(~silent)
+            if not len(loud):
+                return
         self.detected[loud.index] = is_detected(loud.energy, loud.n_differences)
         pieces = [
             piece
@@ -239,13 +239,14 @@ class _Rows:
         for optima, lengths in pieces:
             of_all = optima.rows.index
             self.assumed_length_m[of_all] = lengths
-            found = solutions_of(optima, optima.rows.energy, self.detected[of_all])
-            solved = np.bincount(found.of_row, minlength=len(of_all)) > 0
-            for row, reason, has in zip(of_all.tolist(), optima.reason, solved.tolist(), strict=True):
-                self.reason[row] = reason or ("" if has else optima.undetermined)
-                self.detected[row] &= reason != NOISE_ALONE
+            found = solutions_of(optima, self.detected[of_all])
+            solved = set(found.of_row.tolist())
+            for row, reason in zip(of_all.tolist(), optima.reason, strict=True):
+                self.reason[row] = reason or ("" if row in solved else optima.undetermined)
+                if reason == NOISE_ALONE:
+                    self.detected[row] = False
             self.failed_starts[of_all] = optima.failed_starts
-            self.parts.append(found.of_rows(of_all[found.of_row]))
+            self.parts.append(found)
 
     def fixes(self) -> Fixes:
         """All of it."""
