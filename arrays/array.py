@@ -206,7 +206,7 @@ class SensorArray:
     @cached_property
     def noise_depends_on_reading(self) -> bool:
         """Whether the covariance of the readings changes with them; else it is diagonal, with the channels' noise."""
-        uncertain = any(sensor.misalignment_rad or sensor.gain_uncertainty for sensor in self.sensors)
+        uncertain = any(s.misalignment_rad or s.gain_uncertainty or s.induced_uncertainty for s in self.sensors)
         return bool(self.noise_fractions.any()) or uncertain
 
     @cached_property
@@ -232,6 +232,12 @@ class SensorArray:
     def channel_offset_T(self) -> FloatArray:
         """Reading of each channel in zero field, shape (C,) [T]."""
         return _read_only(np.concatenate([sensor.calibration.offset_T for sensor in self.sensors]))
+
+    @cached_property
+    def channel_ambient_T(self) -> FloatArray:
+        """Reading of each vector channel in the known ambient field, of each scalar one in zero field, (C,) [T]."""
+        of_field = np.vecdot(self.ambient_fields[self.channel_sensor], self.channel_gain)
+        return _read_only(self.channel_offset_T + np.where(self.channel_is_scalar, 0.0, of_field))
 
     @cached_property
     def channel_gain(self) -> FloatArray:

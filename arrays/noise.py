@@ -1,4 +1,4 @@
-"""Covariance of readings: noise that grows with the field, and errors of calibration."""
+"""Covariance of readings: noise that grows with the field, errors of calibration, and what the field induces."""
 
 from __future__ import annotations
 
@@ -33,22 +33,23 @@ def proportional_noise(array: SensorArray, readings_T: FloatArray) -> FloatArray
     if not vector.all():
         scalar = ~vector
         moduli = (readings_T[..., scalar] - array.channel_offset_T[scalar]) / array.channel_gain[scalar, 0]
-        modulus[..., scalar] = np.abs(moduli - _mean_of_finite(moduli, axis=-1))
+        modulus[..., scalar] = np.abs(moduli - mean_of_finite(moduli, axis=-1))
     gain = np.linalg.norm(array.channel_gain, axis=1)
     fraction = array.noise_fractions[array.channel_sensor]
     return np.hypot(noise, fraction * gain * np.nan_to_num(modulus))
 
 
 def reading_covariance(array: SensorArray, readings_T: FloatArray) -> FloatArray:
-    r"""Covariance of the readings' errors: noise, proportional noise, and what the calibration does not know.
+    r"""Covariance of the readings' errors: noise, proportional noise, calibration, and what the field induces.
 
     A vector sensor of scale S in the field b, in its own axes, that is turned by a small unknown rotation θ and has
     relative errors g of its gains reads :math:`S (b + θ × b + g ∘ b)`. Its block is
 
-    .. math:: diag(σ²) + S (σ_θ² (|b|² I - b b^T) + σ_g² diag(b²)) S^T
+    .. math:: diag(σ²) + S (σ_θ² (|b|² I - b b^T) + σ_g² diag(b²) + σ_i² |b|²) S^T
 
-    with σ of :func:`proportional_noise`; the error of an angle stands at right angles to the field. That of a scalar
-    sensor is :math:`σ² + σ_g² (reading - offset)²`. The rotations and gains are constant, so that the errors of one
+    with σ of :func:`proportional_noise`; the error of an angle stands at right angles to the field, what the field
+    induces in the carrier along any axis (σ_i, `induced_uncertainty`). That of a scalar sensor is
+    :math:`σ² + (σ_g² + σ_i²) (reading - offset)²`. Rotations, gains and carrier are constant, so that the errors of one
     sensor's rows are not independent of each other: this is their covariance within one row.
 
     ``readings_T`` (..., C): raw readings of the whole field [T], NaN where missing. For a missing axis of b stands
@@ -77,10 +78,16 @@ def covariance_blocks(array: SensorArray, readings_T: FloatArray) -> FloatArray:
     blocks: FloatArray = variance[..., None] * np.eye(3)
     misalignment = np.array([sensor.misalignment_rad for sensor in array.sensors])
     gain_error = np.array([sensor.gain_uncertainty for sensor in array.sensors])
-    if not (misalignment.any() or gain_error.any()):
+    induced = np.array([sensor.induced_uncertainty for sensor in array.sensors])
+    if not (misalignment.any() or gain_error.any() or induced.any()):
         return blocks
     turns, gains = np.split(calibration_errors(array, readings_T), 2, axis=-1)
-    factor = np.concatenate([misalignment[:, None, None] * turns, gain_error[:, None, None] * gains], axis=-1)
+    parts = [misalignment[:, None, None] * turns, gain_error[:, None, None] * gains]
+    if induced.any():
+        scale = _scales(array)
+        field = np.linalg.norm(_fields_in_sensor_axes(array, readings_T, scale), axis=-1)
+        parts.append(np.where(used[..., None], (induced * field)[..., None, None] * scale, 0.0))
+    factor = np.concatenate(parts, axis=-1)
     # Formed from its factor, the product is singular to the rounding of its diagonal, also for a field along an axis.
     calibration = factor @ np.swapaxes(factor, -1, -2)
     return blocks + calibration * (1.0 + _REGULAR_RTOL * np.eye(3))
@@ -92,13 +99,18 @@ def calibration_errors(array: SensorArray, readings_T: FloatArray) -> FloatArray
     By sensor, its three axes, and (θ, g): ``S (θ × b + g ∘ b)`` [T]. A scalar sensor has its first axis only. For what
     stands for missing readings see :func:`reading_covariance`.
     """
-    readings_T = np.asarray(readings_T, dtype=np.float64)
-    scale = np.tile(np.eye(3), (array.n_sensors, 1, 1))
-    for i, sensor in enumerate(array.sensors):
-        scale[i, : sensor.n_channels, : sensor.n_channels] = sensor.calibration.scale
+    readings_T, scale = np.asarray(readings_T, dtype=np.float64), _scales(array)
     b = _fields_in_sensor_axes(array, readings_T, scale)
     turned = np.swapaxes(np.cross(np.eye(3), b[..., None, :]), -1, -2)  # column k is e_k × b
     return scale @ np.concatenate([turned, b[..., None] * np.eye(3)], axis=-1)
+
+
+def _scales(array: SensorArray) -> FloatArray:
+    """Scales of the sensors' calibrations (N, 3, 3), those of scalar sensors in their first axis."""
+    scale = np.tile(np.eye(3), (array.n_sensors, 1, 1))
+    for i, sensor in enumerate(array.sensors):
+        scale[i, : sensor.n_channels, : sensor.n_channels] = sensor.calibration.scale
+    return scale
 
 
 def _fields_in_sensor_axes(array: SensorArray, readings_T: FloatArray, scale: FloatArray) -> FloatArray:
@@ -110,7 +122,7 @@ def _fields_in_sensor_axes(array: SensorArray, readings_T: FloatArray, scale: Fl
         if array.ambient_T is not None:
             elsewhere = array.ambient_fields
         else:
-            elsewhere = _mean_of_finite(array.calibrated_field(readings_T), axis=-2)
+            elsewhere = mean_of_finite(array.calibrated_field(readings_T), axis=-2)
         in_axes = np.einsum("nji,...nj->...ni", array.rotation_matrices, elsewhere + np.zeros((array.n_sensors, 1)))
         response = np.where(missing, np.einsum("nij,...nj->...ni", scale, in_axes), response)
     return np.einsum("nij,...nj->...ni", np.linalg.inv(scale), response)
@@ -120,7 +132,7 @@ def _deviations(array: SensorArray, readings_T: FloatArray) -> FloatArray:
     """Modulus of every sensor's field minus the array's mean: (..., N) [T]."""
     fields = array.calibrated_field(readings_T)
     # The mean stands for the common field. With one sensor there is none but the prior's, which is zero.
-    mean = _mean_of_finite(fields, axis=-2) if array.n_sensors > 1 else np.zeros((*fields.shape[:-2], 1, 3))
+    mean = mean_of_finite(fields, axis=-2) if array.n_sensors > 1 else np.zeros((*fields.shape[:-2], 1, 3))
     deviation: FloatArray = np.linalg.norm(fields - mean, axis=-1)
     missing = np.isnan(deviation)
     if missing.any():
@@ -130,7 +142,7 @@ def _deviations(array: SensorArray, readings_T: FloatArray) -> FloatArray:
         axes = np.where(np.isfinite(axes), axes / np.linalg.norm(gain, axis=1), np.nan)
         of_sensor = np.stack(
             [
-                _mean_of_finite(axes[..., array.channel_sensor[vector] == i] ** 2, axis=-1)
+                mean_of_finite(axes[..., array.channel_sensor[vector] == i] ** 2, axis=-1)
                 for i in range(array.n_sensors)
             ],
             axis=-2,
@@ -140,7 +152,8 @@ def _deviations(array: SensorArray, readings_T: FloatArray) -> FloatArray:
     return deviation
 
 
-def _mean_of_finite(values: FloatArray, axis: int) -> FloatArray:
+def mean_of_finite(values: FloatArray, axis: int) -> FloatArray:
+    """Mean along an axis, which stays, of what is no NaN; zero of nothing."""
     finite = np.isfinite(values)
     count = np.maximum(finite.sum(axis=axis, keepdims=True), 1)
     return np.where(finite, values, 0.0).sum(axis=axis, keepdims=True) / count

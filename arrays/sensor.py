@@ -128,7 +128,7 @@ class Sensor:
         Noise proportional to the field, in place of the array's: variance = noise² + (fraction · |B|)².
     induced_uncertainty : float
         Standard deviation of every component of what the ambient field induces in the carrier, as seen at the sensor in
-        the array's axes, over that field; surveys take it into account.
+        the array's axes, over that field.
     eddy_uncertainty_s : float
         The same of eddy currents: over the derivative of the ambient field in the array's axes [s].
 

@@ -49,8 +49,17 @@ class Whitening:
         """``L⁻¹`` of all channels (..., C, C)."""
         return block_diagonal(self.channels, self.roots)
 
+    @cached_property
+    def per_noise(self) -> FloatArray | None:
+        """1/σ of every channel (C,) [1/T], 0 of a missing one, where all rows have one noise without correlation."""
+        if self.roots.ndim > 3 or (self.roots * (1.0 - np.eye(3))).any():
+            return None
+        return np.einsum("nii->ni", self.roots)[self.channels >= 0]
+
     def of_unit_noise(self, channels: FloatArray) -> FloatArray:
         """Channels (..., C) [T] of every row in units of the noise, their common field included."""
+        if self.per_noise is not None:
+            return channels * self.per_noise
         used = self.channels >= 0
         of_sensors: FloatArray = (self.roots @ in_slots(used, channels)[..., None])[..., 0]
         return of_sensors[..., used]

@@ -177,3 +177,8 @@ def over_rows(kernel: Callable[..., None], n_rows: int, *arguments: Any) -> None
 def own(values: FloatArray) -> FloatArray:
     """A contiguous copy that may be written: kernels are compiled anew, for seconds, for arrays of any other kind."""
     return np.array(values, order="C")
+
+
+def readable(values: FloatArray) -> FloatArray:
+    """The same for a kernel that only reads: no copy where the array is of that kind."""
+    return values if values.flags.carray else own(values)

@@ -42,8 +42,8 @@ class BoundModel(NamedTuple):
         From the sensors' axes to the array's; calibration.
     noise : ndarray, shape (C,)
         [T]
-    uncertainty : ndarray, shape (N, 2)
-        Standard deviations of turns [rad] and gains.
+    uncertainty : ndarray, shape (N, 3)
+        Standard deviations of turns [rad], gains, and of what the field induces in the carrier, over it.
     noise_fraction : ndarray, shape (N,)
     nuisances : ndarray, shape (q,)
         Which ones there are.
@@ -106,7 +106,9 @@ class BoundModel(NamedTuple):
             rotations=read_only(array.rotation_matrices),
             scales=read_only(scales),
             noise=read_only(array.channel_noise_T),
-            uncertainty=read_only(np.array([(s.misalignment_rad, s.gain_uncertainty) for s in array.sensors])),
+            uncertainty=read_only(
+                np.array([(s.misalignment_rad, s.gain_uncertainty, s.induced_uncertainty) for s in array.sensors])
+            ),
             noise_fraction=read_only(array.noise_fractions),
             nuisances=read_only(nuisances),
             prior=read_only(1.0 / np.array(deviation)[nuisances]),

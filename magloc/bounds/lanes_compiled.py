@@ -294,7 +294,7 @@ def _fill_scalar_axis(model: BoundModel, s: int, block: Block) -> None:
     f, c = s * FIELD, model.channel[s]
     gain = model.axes[c, 0]
     constant = model.noise[c] ** 2
-    by_field = (gain * model.uncertainty[s, 1]) ** 2
+    by_field = gain**2 * (model.uncertainty[s, 1] ** 2 + model.uncertainty[s, 2] ** 2)
     by_difference = (gain * model.noise_fraction[s]) ** 2
     for i in range(n_lanes):
         modulus = fields[f + 3 * LANES + i]
@@ -317,7 +317,8 @@ def _fill_vector_axes(model: BoundModel, s: int, block: Block) -> None:
     p0, p1, p2 = block.axes[c, 0], block.axes[c, 1], block.axes[c, 2]
     q0, q1, q2 = block.axes[c + 1, 0], block.axes[c + 1, 1], block.axes[c + 1, 2]
     t0, t1, t2 = block.axes[c + 2, 0], block.axes[c + 2, 1], block.axes[c + 2, 2]
-    turn, gain, fraction = model.uncertainty[s, 0], model.uncertainty[s, 1], model.noise_fraction[s]
+    turn, gain, induced = model.uncertainty[s, 0], model.uncertainty[s, 1], model.uncertainty[s, 2]
+    fraction = model.noise_fraction[s]
     # Three channels p, q, t: axes p0, p1, p2, errors by turns pu, pv, pn and by gains px, py, pz, covariance qp.
     for i in range(n_lanes):
         x, y, z = fields[f + i], fields[f + LANES + i], fields[f + 2 * LANES + i]
@@ -334,15 +335,19 @@ def _fill_vector_axes(model: BoundModel, s: int, block: Block) -> None:
         px, py, pz = g[0, 0] * own0, g[0, 1] * own1, g[0, 2] * own2
         qx, qy, qz = g[1, 0] * own0, g[1, 1] * own1, g[1, 2] * own2
         tx, ty, tz = g[2, 0] * own0, g[2, 1] * own1, g[2, 2] * own2
-        pp = pu * pu + pv * pv + pn * pn + px * px + py * py + pz * pz
-        qp = qu * pu + qv * pv + qn * pn + qx * px + qy * py + qz * pz
-        qq = qu * qu + qv * qv + qn * qn + qx * qx + qy * qy + qz * qz
-        tp = tu * pu + tv * pv + tn * pn + tx * px + ty * py + tz * pz
-        tq = tu * qu + tv * qv + tn * qn + tx * qx + ty * qy + tz * qz
-        tt = tu * tu + tv * tv + tn * tn + tx * tx + ty * ty + tz * tz
-        pp = _REGULAR * pp + noise[c] ** 2 + proportional * (p0 * p0 + p1 * p1 + p2 * p2)
-        qq = _REGULAR * qq + noise[c + 1] ** 2 + proportional * (q0 * q0 + q1 * q1 + q2 * q2)
-        tt = _REGULAR * tt + noise[c + 2] ** 2 + proportional * (t0 * t0 + t1 * t1 + t2 * t2)
+        # What the field induces has no axis.
+        stray = induced * induced * (x * x + y * y + z * z)
+        p_p, q_p, q_q = p0 * p0 + p1 * p1 + p2 * p2, q0 * p0 + q1 * p1 + q2 * p2, q0 * q0 + q1 * q1 + q2 * q2
+        t_p, t_q, t_t = t0 * p0 + t1 * p1 + t2 * p2, t0 * q0 + t1 * q1 + t2 * q2, t0 * t0 + t1 * t1 + t2 * t2
+        pp = pu * pu + pv * pv + pn * pn + px * px + py * py + pz * pz + stray * p_p
+        qp = qu * pu + qv * pv + qn * pn + qx * px + qy * py + qz * pz + stray * q_p
+        qq = qu * qu + qv * qv + qn * qn + qx * qx + qy * qy + qz * qz + stray * q_q
+        tp = tu * pu + tv * pv + tn * pn + tx * px + ty * py + tz * pz + stray * t_p
+        tq = tu * qu + tv * qv + tn * qn + tx * qx + ty * qy + tz * qz + stray * t_q
+        tt = tu * tu + tv * tv + tn * tn + tx * tx + ty * ty + tz * tz + stray * t_t
+        pp = _REGULAR * pp + noise[c] ** 2 + proportional * p_p
+        qq = _REGULAR * qq + noise[c + 1] ** 2 + proportional * q_q
+        tt = _REGULAR * tt + noise[c + 2] ** 2 + proportional * t_t
 
         inverse = 1.0 / math.sqrt(pp)
         qp, tp = inverse * qp, inverse * tp

@@ -246,7 +246,7 @@ def _check_place(array: SensorArray, place: FloatArray) -> None:
 
 
 def _array_of(path: Path) -> SensorArray:
-    array = array_of_several(path)
+    array = array_of_several(path, "which knows no place: magloc locate --position tells the moment at a known one")
     # A figure calls an array by its name; one without is called after its file.
     return array if array.name else replace(array, name=path.stem)
 

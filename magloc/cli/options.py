@@ -63,11 +63,11 @@ def refuse_not_positive(options: object, *names: str, expected: str = "a positiv
             raise InputError(f"--{name.replace('_', '-')}: found {value:g}, expected {expected}.")
 
 
-def array_of_several(path: Path) -> SensorArray:
+def array_of_several(path: Path, why: str = "") -> SensorArray:
     """The array of a file, of two sensors at least."""
     array = arrays.read_array(path)
     if array.n_sensors < 2:
-        raise InputError(f"{path}: sensors must be at least 2; instead received 1.")
+        raise InputError(f"{path}: sensors must be at least 2; instead received 1{why and f', {why}'}.")
     return array
 
 

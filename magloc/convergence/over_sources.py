@@ -41,12 +41,12 @@ from magloc.grids.cube import (
 )
 from magloc.localization.fit.fixes import Fixes
 from magloc.localization.fit.gauss_newton import JointFits, refine
-from magloc.localization.fit.model_errors import assumed_lengths, with_model_errors
 from magloc.localization.fit.optima import Optima
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import is_observable, spans
 from magloc.localization.fit.variable_projection_compiled import SAME_CHI2, SAME_COS
 from magloc.localization.locator import Locator
+from magloc.localization.model_errors import assumed_lengths, with_model_errors
 from magloc.localization.search.single_source import N_UNKNOWNS
 from magloc.measurement.differences import fields_at_sensors
 from magloc.measurement.rows import check_magnitudes, whitened_rows

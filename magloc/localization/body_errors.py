@@ -15,7 +15,7 @@ from magloc.fields.multipole import DEFAULT_LENGTH
 from magloc.localization.fit.columns import Solutions
 from magloc.localization.fit.fixes import Fixes
 from magloc.localization.fit.gauss_newton import scaled_jacobian
-from magloc.localization.fit.model_errors import ambient_errors, body_errors
+from magloc.localization.model_errors import ambient_errors, body_errors
 from magloc.measurement.rows import whitened_rows
 from magloc.measurement.whitened import WhitenedModel
 

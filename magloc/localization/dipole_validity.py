@@ -13,14 +13,13 @@ from numpy.typing import ArrayLike
 from scipy.special import chdtrc, fdtrc
 
 from arrays.array import SensorArray
-from arrays.differences import decorrelated_differences
 from arrays.io.errors import _vector
-from arrays.noise import reading_covariance
 from arrays.typing import BoolArray, FloatArray
 from magloc.fields.multipole import multipole_field_matrix
 from magloc.levels import EXTENDED_BODY, NO_OTHER_MISFIT, SECOND_LOOK
 from magloc.localization.fit.fixes import Fixes
-from magloc.measurement.differences import DifferenceMeasurement, channel_jacobian, fields_at_sensors
+from magloc.measurement.differences import channel_jacobian, fields_at_sensors, predicted_channels
+from magloc.measurement.rows import whitenings_of
 
 BODY_LENGTHS = 3.0
 _ORDERS = (2, 3)
@@ -129,24 +128,21 @@ def nearness_test(
         raise ValueError(f"Input readings_T must have shape ({array.n_channels},); instead received {readings.shape}.")
     if not 0.0 < false_alarm < 1.0:
         raise ValueError(f"Input false_alarm must be between 0 and 1; instead received {false_alarm}.")
-    covariance = reading_covariance(array, readings)
-    measurement = DifferenceMeasurement(
-        array, decorrelated_differences(array, np.isfinite(readings), covariance_T2=covariance)
-    )
-    whitener = measurement.differences.transform / np.sqrt(measurement.variance)[:, None]
-    residual = (measurement.measured(readings) - measurement.predicted(position, moment)) / np.sqrt(
-        measurement.variance
-    )
-    known = _orthonormal(whitener @ channel_jacobian(array, position, moment), np.zeros((residual.size, 0)))
+    available = np.isfinite(readings)
+    whitening = whitenings_of(array, available, readings)
+    left_T = readings - array.channel_offset_T - predicted_channels(array, position, moment)
+    residual = whitening.apply(np.where(available, left_T, 0.0))
+    by_dipole = whitening.apply(channel_jacobian(array, position, moment).T).T
+    known = _orthonormal(by_dipole, np.zeros((residual.size, 0)))
     residual = residual - known @ (known.T @ residual)
-    chi2, dof = float(residual @ residual), residual.size - known.shape[1]
+    chi2, dof = float(residual @ residual), whitening.n_differences - known.shape[1]
     rows = array.linear_gain(fields_at_sensors(array, position, moment))
     steps: list[tuple[int, float, int]] = []
     left = dof
     for order in _ORDERS:
         fields = multipole_field_matrix(array.positions, position, order)[array.channel_sensor]
         columns = np.einsum("ci,cij->cj", rows, fields)
-        new = _orthonormal(whitener @ columns, known)
+        new = _orthonormal(whitening.apply(columns.T).T, known)
         if new.shape[1] == 0 or (steps and left - new.shape[1] <= 0):
             break
         steps.append((order, float(np.sum((new.T @ residual) ** 2)), new.shape[1]))
@@ -204,8 +200,9 @@ def too_near(
 ) -> BoolArray:
     """Whether each row's source is too near for a dipole, by length or misfit; fixes are in the array's frame."""
     near = np.zeros(len(fixes), dtype=bool)
-    first, solutions = fixes.first[fixes.solved], fixes.solutions
-    best = first[solutions.n_sources[first] == 1]
+    best, solutions = fixes.first[fixes.solved], fixes.solutions
+    if solutions.position_m.shape[1] > 1:
+        best = best[solutions.n_sources[best] == 1]
     alone, dof = solutions.of_row[best], solutions.dof[best]
     if body_length_m:
         place = solutions.position_m[best, 0]

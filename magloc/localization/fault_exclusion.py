@@ -24,8 +24,8 @@ from magloc.chi_square import energy_threshold
 from magloc.levels import CREDIBLE_ROW, MISFIT, SENSOR_FALSE_ALARM
 from magloc.localization.fit.fixes import Fixes
 from magloc.localization.fit.gauss_newton import JointFits, refine
-from magloc.localization.fit.model_errors import model_errors
 from magloc.localization.fit.results import Fix
+from magloc.localization.model_errors import model_errors
 from magloc.localization.search.multi_source import NOISE_ALONE
 from magloc.measurement.rows import (
     NO_SIGNAL,
@@ -426,7 +426,8 @@ def weighted(problem: WhitenedModel, raw: FloatArray, weight: FloatArray) -> Wei
     root = np.sqrt(weight)[..., None]
     flat = problem.shrinkage >= 1.0
     # A flat prior needs only the span of its columns; of the others the variance along each of them counts.
-    span = root * problem.basis * flat[:, None]
+    some, known = flat.any(axis=0), ~flat.all(axis=0)
+    span = root * (problem.basis * flat[:, None])[..., some]
     for _ in range(2):  # once more, for the digits that squares lose
         square, axes = np.linalg.eigh(span.transpose(0, 2, 1) @ span)
         seen = square > _UNSEEN * square[:, -1:]
@@ -435,5 +436,5 @@ def weighted(problem: WhitenedModel, raw: FloatArray, weight: FloatArray) -> Wei
     if not flat.all():
         with np.errstate(divide="ignore"):
             deviation = np.where(flat, 0.0, np.sqrt(1.0 / (1.0 - problem.shrinkage) ** 2 - 1.0))
-        lighter = lighter.marginalised(root * problem.basis * deviation[:, None])
+        lighter = lighter.marginalised(root * (problem.basis * deviation[:, None])[..., known])
     return lighter, root[..., 0] * raw

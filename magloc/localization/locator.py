@@ -28,19 +28,20 @@ from magloc.localization.dipole_validity import too_near
 from magloc.localization.fault_exclusion import without_faulty_sensors
 from magloc.localization.fit.columns import Solutions, in_stable_order
 from magloc.localization.fit.fixes import Fixes
-from magloc.localization.fit.model_errors import with_model_errors
 from magloc.localization.fit.optima import Optima
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import Fix
+from magloc.localization.model_errors import with_model_errors
 from magloc.localization.search.known_position import MomentSearch
 from magloc.localization.search.moving_array import optima_at_rest, stacked_errors, stacked_rows
 from magloc.localization.search.multi_source import NOISE_ALONE, MultiSourceSearch
-from magloc.localization.search.single_source import N_UNKNOWNS, SingleSourceSearch
+from magloc.localization.search.single_source import N_UNKNOWNS, SingleSourceSearch, kept_search
 from magloc.localization.uncertainty.covariance import solutions_of
 from magloc.localization.uncertainty.pose_covariance import pose_covariances
 from magloc.localization.uncertainty.range_interval import is_detected
+from magloc.measurement.nuisances import ambient_in_array, with_eddies_as_offsets
 from magloc.measurement.plausibility import warn_of_doubts
-from magloc.measurement.pose import PosesOfRows, with_stated_pose
+from magloc.measurement.pose import PosesOfRows, rates_of, with_stated_pose
 from magloc.measurement.rows import NO_SIGNAL, WhitenedRows, checked_rows, whitened_rows
 from magloc.readings import Readings, as_readings, without_saturated
 
@@ -116,7 +117,8 @@ class Locator:
             self._search = MomentSearch(array, position_m, prior=prior)
             self._fewest = 3 * self._search.position_m.shape[1]
         elif free and not array.channel_is_scalar.any():
-            self._search, self._fewest = SingleSourceSearch(array, prior=prior), 6
+            alike = prior == NOTHING_KNOWN
+            self._search, self._fewest = kept_search(array) if alike else SingleSourceSearch(array, prior=prior), 6
         else:
             number = None if sources == "auto" else int(sources)
             self._search = MultiSourceSearch(array, n_sources=number, prior=prior, seed=seed)
@@ -160,21 +162,19 @@ class Locator:
         times = np.arange(len(readings), dtype=np.float64) if time_s is None else time_s
         parts = []
         for begin in range(0, len(readings), self._at_once):
-            index = np.arange(begin, min(begin + self._at_once, len(readings)))
-            parts.append(self._credible(index, readings[index], None if ambient is None else ambient[index]))
+            some = slice(begin, begin + self._at_once)
+            index = np.arange(len(readings))[some]
+            parts.append(self._credible(index, readings[some], None if ambient is None else ambient[some]))
             if progress is not None:
                 progress(len(index))
         fixes = Fixes.joined(parts)
-        if (fixes.solutions.n_sources > 1).any() and not isinstance(self._search, MomentSearch):
+        if fixes.solutions.position_m.shape[1] > 1 and not isinstance(self._search, MomentSearch):
             fixes = replace(fixes, solutions=in_stable_order(fixes.solutions))
-        near = too_near(self.array, fixes, readings, ambient, self.body_length_m)
-        fixes = replace(fixes, time_s=times, too_near=near)
-        if self.body_length_m is not None:
-            return fixes
-        known_place = isinstance(self._search, MomentSearch)
-        return replace(
-            fixes, bodies=partial(body_covariances, self.array, fixes, readings, ambient, known_place=known_place)
-        )
+        near, bodies = too_near(self.array, fixes, readings, ambient, self.body_length_m), None
+        if self.body_length_m is None:
+            known_place = isinstance(self._search, MomentSearch)
+            bodies = partial(body_covariances, self.array, fixes, readings, ambient, known_place=known_place)
+        return replace(fixes, time_s=times, too_near=near, bodies=bodies)
 
     def _credible(self, index: IntArray, readings: FloatArray, ambient: FloatArray | None) -> Fixes:
         """Fixes of some of the rows, without the sensors that contradict all others."""
@@ -224,11 +224,12 @@ class _Rows:
 
     def fill(self, rows: WhitenedRows, search: Callable[[WhitenedRows], list[Optima]]) -> None:
         """Detection, search and uncertainty of a block."""
-        silent = rows.silent
-        self.refuse(rows.index[silent], NO_SIGNAL)
-        loud = rows.chosen(~silent) if silent.any() else rows
-        if not len(loud):
-            return
+        loud, silent = rows, rows.silent
+        if np.count_nonzero(silent):
+            self.refuse(rows.index[silent], NO_SIGNAL)
+            loud = rows.chosen(~silent)
+            if not len(loud):
+                return
         self.detected[loud.index] = is_detected(loud.energy, loud.n_differences)
         pieces = [
             piece
@@ -238,13 +239,14 @@ class _Rows:
         for optima, lengths in pieces:
             of_all = optima.rows.index
             self.assumed_length_m[of_all] = lengths
-            found = solutions_of(optima, optima.rows.energy, self.detected[of_all])
-            solved = np.bincount(found.of_row, minlength=len(of_all)) > 0
-            for row, reason, has in zip(of_all.tolist(), optima.reason, solved.tolist(), strict=True):
-                self.reason[row] = reason or ("" if has else optima.undetermined)
-                self.detected[row] &= reason != NOISE_ALONE
+            found = solutions_of(optima, self.detected[of_all])
+            solved = set(found.of_row.tolist())
+            for row, reason in zip(of_all.tolist(), optima.reason, strict=True):
+                self.reason[row] = reason or ("" if row in solved else optima.undetermined)
+                if reason == NOISE_ALONE:
+                    self.detected[row] = False
             self.failed_starts[of_all] = optima.failed_starts
-            self.parts.append(found.of_rows(of_all[found.of_row]))
+            self.parts.append(found)
 
     def fixes(self) -> Fixes:
         """All of it."""
@@ -360,6 +362,7 @@ def locate(
     pose = rows.pose
     place = None if position_m is None else _places_in_array(position_m, pose)
     stated = with_stated_pose(array, rows).pose
+    array = _with_eddies(array, rows)
     locator = Locator(
         array if stated is None else _seeing_turned_field(array, stated, rows, ambient),
         sources=sources,
@@ -384,6 +387,14 @@ def _places_in_array(position_m: ArrayLike, pose: tuple[FloatArray, Rotation] | 
         raise ValueError(f"Input position_m must have shape (3,) or (K, 3); instead received {place.shape}.")
     place = place.reshape(1, -1, 3)
     return place if pose is None else np.einsum("nji,nkj->nki", pose[1].as_matrix(), place - pose[0][:, None])
+
+
+def _with_eddies(array: SensorArray, rows: Readings) -> SensorArray:
+    """The array where eddy currents are errors of its offsets, as its turns between the rows tell of them."""
+    if rows.pose is None or not any(sensor.eddy_uncertainty_s for sensor in array.sensors):
+        return array
+    _, rate_rad_s = rates_of(rows.time_s, rows.pose[0], rows.pose[1].as_matrix())
+    return with_eddies_as_offsets(array, ambient_in_array(array, rows.values_T, rows.ambient_T), rate_rad_s)
 
 
 def _seeing_turned_field(

@@ -1,6 +1,6 @@
 r"""Errors of sensors that last from row to row, as states that are estimated along with a source.
 
-Turned axes, gains, the platform's field, 1/f noise and drift do not average out as noise does. Every one of them is a
+Turned axes, gains, the platform's fields, 1/f noise and drift do not average out as noise does. Every one of them is a
 first-order Markov process :math:`\dot e = -e/τ + w`: constant for the calibration, a random walk for drift, one
 process a decade of frequency for 1/f noise. See docs/theory/sensor-errors.md.
 """
@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from arrays.array import SensorArray
-from arrays.noise import calibration_errors
+from arrays.noise import calibration_errors, mean_of_finite
 from arrays.sensor import FLICKER_DECADES
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.conditioning import Background
@@ -26,8 +26,8 @@ _SECONDS_PER_HOUR = 3600.0
 _UNKNOWN = 1e5
 """Standard deviation, in that of a reading's noise, of a background of which nothing is known."""
 
-# Where the turns, the gains and the field start among the errors of a sensor.
-_TURN, _GAIN, _FIELD = 0, 3, 6
+# Where they start among the errors of a sensor: turns, gains, a field, and what the ambient field and its rate induce.
+_TURN, _GAIN, _FIELD, _INDUCED, _EDDY = 0, 3, 6, 9, 18
 
 
 @dataclass(frozen=True)
@@ -79,8 +79,8 @@ class SensorErrors:
     walk : ndarray, shape (n,)
         Standard deviation that a random walk adds in the root of a second.
     of_sensor : ndarray, shape (a, 2)
-        What the first a states are: sensor, and which of its errors: turns about its three axes, gains of them, and
-        components of a field that is fixed to the array.
+        What the first a states are: sensor, and which of its errors: turns about its three axes, gains of them,
+        components of a field that is fixed to the array, and of what the ambient field and its rate induce, 3×3 each.
     of_channel : ndarray, shape (n - a,)
         Channel to which the others, drift and 1/f noise, are added.
     is_slope : ndarray of bool, shape (n - a,)
@@ -107,6 +107,8 @@ class SensorErrors:
                 (_TURN, sensor.misalignment_rad, 3),
                 (_GAIN, sensor.gain_uncertainty, sensor.n_channels),
                 (_FIELD, sensor.offset_uncertainty_T, 3),
+                (_INDUCED, sensor.induced_uncertainty, 9),
+                (_EDDY, sensor.eddy_uncertainty_s, 9),
             ):
                 if value:
                     of_sensor += [(i, first + axis) for axis in range(n_axes)]
@@ -149,15 +151,26 @@ class SensorErrors:
         stationary = self.sigma * np.sqrt(-np.expm1(-2.0 * self.decay_Hz * dt_s))
         return kept, np.hypot(stationary, self.walk * math.sqrt(dt_s))
 
-    def effect(self, array: SensorArray, readings_T: FloatArray, time_s: float = 0.0) -> FloatArray:
-        """Derivative (C, n) of one row's readings (C,) [T] by the errors; finite also for missing readings."""
+    def effect(
+        self, array: SensorArray, readings_T: FloatArray, time_s: float = 0.0, rate_rad_s: FloatArray | None = None
+    ) -> FloatArray:
+        """Derivative (C, n) of one row's readings (C,) [T] by the errors; finite also for missing readings.
+
+        The array turns at a rate (3,) about its own axes.
+        """
         effect = np.zeros((array.n_channels, self.n_states))
         n = len(self.of_sensor)
         if n:
             sensor, column = self.of_sensor.T
             known = (column >= _FIELD).all()
             of_axes = np.zeros((array.n_sensors, 3, _FIELD)) if known else calibration_errors(array, readings_T)
-            of_axes = np.concatenate([of_axes, _of_fields(array)], axis=-1)
+            of_field = _of_fields(array)
+            of_axes = np.concatenate([of_axes, of_field], axis=-1)
+            if (column >= _INDUCED).any():
+                ambient_T = ambient_in_array(array, readings_T)
+                change_T_s = np.zeros(3) if rate_rad_s is None else np.cross(ambient_T, rate_rad_s)
+                induced = [(of_field[..., None] * field).reshape(-1, 3, 9) for field in (ambient_T, change_T_s)]
+                of_axes = np.concatenate([of_axes, *induced], axis=-1)
             channel = array.sensor_channels[sensor]
             state, axis = np.nonzero(channel >= 0)
             effect[channel[state, axis], state] = of_axes[sensor[state], axis, column[state]]
@@ -165,6 +178,31 @@ class SensorErrors:
             self.is_slope, time_s - self.about_s, 1.0
         )
         return effect
+
+
+def ambient_in_array(array: SensorArray, readings_T: FloatArray, ambient_T: FloatArray | None = None) -> FloatArray:
+    """The ambient field (..., 3) in the middle of the sensors: what is known of it, else what vector sensors read.
+
+    Of rows (..., C); that of each of them (..., 3) stands in place of the array's own.
+    """
+    known_T = array.ambient_fields.mean(axis=0) if ambient_T is None else ambient_T
+    if np.any(known_T):
+        return np.asarray(np.broadcast_to(known_T, (*readings_T.shape[:-1], 3)))
+    return mean_of_finite(array.calibrated_field(readings_T), axis=-2)[..., 0, :]
+
+
+def with_eddies_as_offsets(array: SensorArray, ambient_T: FloatArray, rate_rad_s: FloatArray) -> SensorArray:
+    """The array where eddy currents count as fields of their own, of their rms over rows that turn: (n, 3) each."""
+    change_T_s = math.sqrt(np.mean(np.sum(np.cross(ambient_T, rate_rad_s) ** 2, axis=-1)))
+    sensors = tuple(
+        replace(
+            sensor,
+            offset_uncertainty_T=math.hypot(sensor.offset_uncertainty_T, sensor.eddy_uncertainty_s * change_T_s),
+            eddy_uncertainty_s=0.0,
+        )
+        for sensor in array.sensors
+    )
+    return replace(array, sensors=sensors)
 
 
 def _of_fields(array: SensorArray) -> FloatArray:

@@ -6,6 +6,7 @@ Every doubt is a sentence. None is a refusal: the numbers could be true, of a la
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
@@ -175,8 +176,9 @@ def _of_attitude(array: SensorArray, readings: Readings, rotation: Rotation) -> 
         return float(np.median(np.arccos(np.clip(world @ (mean / np.linalg.norm(mean)), -1.0, 1.0))))
 
     stated = turns(rotation)
-    by_offsets = 3.0 * max((array.sensors[i].offset_uncertainty_T for i in vector), default=0.0) / middle
-    if stated < _TURNS_RAD + by_offsets:
+    of_carrier = [(s.offset_uncertainty_T / middle, s.induced_uncertainty) for s in array.sensors if s.kind == "vector"]
+    by_carrier = 3.0 * max((math.hypot(*fields) for fields in of_carrier), default=0.0)
+    if stated < _TURNS_RAD + by_carrier:
         return
     x, y, z, w = rotation.as_quat().T
     first = rotation[0]
@@ -189,7 +191,7 @@ def _of_attitude(array: SensorArray, readings: Readings, rotation: Rotation) -> 
     best = min(left, key=lambda words: left[words])
     if left[best] < stated / 3.0:
         explained, question = f", and {best} by {np.degrees(left[best]):.1f}°", "?"
-    elif stated > _TURNS_UNEXPLAINED_RAD + by_offsets:
+    elif stated > _TURNS_UNEXPLAINED_RAD + by_carrier:
         explained, question = "", ", and are the sensors calibrated?"
     else:
         return

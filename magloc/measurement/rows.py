@@ -79,19 +79,14 @@ class WhitenedRows:
     @property
     def silent(self) -> BoolArray:
         """Whether the differences (b,) are rounding errors."""
-        return np.asarray(self._squares < _SILENT * self.n_differences)
-
-    @cached_property
-    def _squares(self) -> FloatArray:
-        return np.einsum("bc,bc->b", self.y, self.y)
+        squares = np.vecdot(self.y, self.y) if self.model.sees_moduli else self.energy
+        return np.asarray(squares < _SILENT * self.n_differences)
 
     @cached_property
     def energy(self) -> FloatArray:
         """Sums of squared differences (b,), as they are without a source."""
-        if not self.model.sees_moduli:
-            return self._squares
-        without = self.y - self.model.of_ambient
-        return np.einsum("bc,bc->b", without, without)
+        without = self.y - self.model.of_ambient if self.model.sees_moduli else self.y
+        return np.asarray(np.vecdot(without, without))
 
 
 def whitened_rows(
@@ -119,7 +114,7 @@ def checked_rows(array: SensorArray, readings_T: ArrayLike) -> FloatArray:
 
 def rows_of_equal_mask(available: NDArray[np.bool_]) -> Iterator[tuple[NDArray[np.bool_], NDArray[np.intp]]]:
     """Every distinct row of available channels (n, C), and the rows that have it."""
-    if len(available) and (available == available[0]).all():
+    if len(available) == 1 or (len(available) and (available == available[0]).all()):
         yield available[0], np.arange(len(available))
         return
     masks, of_row = np.unique(available, axis=0, return_inverse=True)
@@ -144,15 +139,19 @@ def ambient_fields(array: SensorArray, n_rows: int, ambient_T: FloatArray | None
 
 
 def channels_above_ambient(
-    array: SensorArray, mask: BoolArray, readings_T: FloatArray, ambient_T: FloatArray
+    array: SensorArray, mask: BoolArray, readings_T: FloatArray, ambient_T: FloatArray | None
 ) -> FloatArray:
     """What vector channels (n, C) read above the ambient field at the sensors (n, N, 3), and all that scalars read.
 
-    Zero where the mask (n, C) or (C,) has no reading.
+    None stands for the array's own field. Zero where the mask (n, C) or (C,) has no reading.
     """
-    vector = ~array.channel_is_scalar
-    ambient = np.einsum("ncj,cj->nc", ambient_T[:, array.channel_sensor], array.channel_gain) * vector
-    return np.where(mask, readings_T - array.channel_offset_T - ambient, 0.0)
+    if ambient_T is None:
+        above = readings_T - array.channel_ambient_T
+    else:
+        vector = ~array.channel_is_scalar
+        ambient = np.einsum("ncj,cj->nc", ambient_T[:, array.channel_sensor], array.channel_gain) * vector
+        above = readings_T - array.channel_offset_T - ambient
+    return above if np.count_nonzero(mask) == mask.size else np.where(mask, above, 0.0)
 
 
 def whitened_model(
@@ -171,7 +170,8 @@ def whitened_model(
         model = _model_of_one_row(array, whitening)
     else:
         model = WhitenedModel.of(array, whitening, ambient_fields(array, len(readings_T), ambient_T))
-    channels = channels_above_ambient(array, mask, readings_T, model.ambient)
+    above = None if ambient_T is None else model.ambient
+    channels = channels_above_ambient(array, mask, readings_T, above)
     return model, whitening.of_unit_noise(channels)
 
 

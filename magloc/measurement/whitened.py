@@ -16,9 +16,10 @@ from numpy.typing import ArrayLike, NDArray
 from arrays.array import SensorArray
 from arrays.typing import FloatArray
 from arrays.whitening import Whitening
+from magloc.compilation import own
 from magloc.fields.dipole import MU0_OVER_4PI
 from magloc.measurement.known_moment import KnownMoment
-from magloc.measurement.whitened_compiled import LaneModel, ModelRows
+from magloc.measurement.whitened_compiled import LaneModel, ModelRows, Units
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,10 +44,9 @@ class ScaledSensors:
     channel_sensor: NDArray[np.intp]
 
     @cached_property
-    def unit_covariance(self) -> FloatArray:
-        """Covariance (6, 6) of position and moment [m, A·m²] whose entries are 1 in radii and scaled moments."""
-        unit = np.repeat([self.radius, self.radius**3 / MU0_OVER_4PI], 3)
-        return np.outer(unit, unit)
+    def units(self) -> Units:
+        """For compiled kernels."""
+        return Units(own(self.centroid), self.radius, self.radius**3 / MU0_OVER_4PI)
 
     def homogeneous(self, position_m: ArrayLike) -> FloatArray:
         """Homogeneous coordinates (..., 4), of unit norm and s > 0, of positions (..., 3) [m]."""
@@ -185,6 +185,9 @@ class WhitenedModel(ScaledSensors):
 
     def whitened(self, channels: FloatArray) -> FloatArray:
         """Channels (b, C) or columns of them (b, C, n), divided by the noise, without their common field."""
+        if channels.ndim == 2 and len(channels) and self.shares_whitening:
+            basis = self.basis[0]
+            return channels - (self.shrinkage[0] * (channels @ basis)) @ basis.T
         columns = channels if channels.ndim == 3 else channels[..., None]
         common = self.shrinkage[..., None] * (self.basis.transpose(0, 2, 1) @ columns)
         free: FloatArray = columns - self.basis @ common
@@ -193,17 +196,19 @@ class WhitenedModel(ScaledSensors):
     def marginalised(self, columns: FloatArray) -> WhitenedModel:
         """The same where errors of unit variance along columns (b, C, n), in units of the noise, count as noise."""
         flat = self.shrinkage >= 1.0
-        unknown = self.basis * flat[:, None]
+        # Columns that are of a kind in no row cost time, and are none.
+        some, bounded = flat.any(axis=0), ~flat.all(axis=0)
+        unknown = (self.basis * flat[:, None])[..., some]
         with np.errstate(divide="ignore"):
             variance = np.where(flat, 0.0, 1.0 / (1.0 - self.shrinkage) ** 2 - 1.0)
-        known = self.basis * np.sqrt(variance)[:, None]
+        known = (self.basis * np.sqrt(variance)[:, None])[..., bounded]
         free = columns - unknown @ (unknown.transpose(0, 2, 1) @ columns)
-        every = free if flat.all() else np.concatenate([known, free], axis=2)
-        basis, singular, _ = np.linalg.svd(every, full_matrices=False)
+        basis, singular, _ = np.linalg.svd(np.concatenate([known, free], axis=2), full_matrices=False)
+        shrinkage = 1.0 - 1.0 / np.sqrt(1.0 + singular**2)
         return replace(
             self,
             basis=np.concatenate([unknown, basis], axis=2),
-            shrinkage=np.concatenate([flat.astype(np.float64), 1.0 - 1.0 / np.sqrt(1.0 + singular**2)], axis=1),
+            shrinkage=np.concatenate([flat[:, some].astype(np.float64), shrinkage], axis=1),
         )
 
     def source_fields(self, q: FloatArray, mu: FloatArray) -> FloatArray:

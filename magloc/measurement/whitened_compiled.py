@@ -26,6 +26,14 @@ if TYPE_CHECKING:
 SMALLEST_S = 1e-5
 
 
+class Units(NamedTuple):
+    """Where radii begin (3,) [m], how long they are [m], and what a scaled moment at s = 1 is worth [A·m²]."""
+
+    centroid: FloatArray
+    radius: float
+    moment: float
+
+
 class ModelRow(NamedTuple):
     """Whitened channels of one row: their sensors, gains (c, 3), common field (q, c), shrinkage (q,)."""
 
@@ -106,6 +114,8 @@ class LaneModel(NamedTuple):
 def signals(model: WhitenedModel, y: FloatArray) -> FloatArray:
     """Whitened readings (b, C) as those of a :class:`LaneModel`: (b, s, 3)."""
     place, known, n_sensors = model.threes
+    if y.shape[1] == 3 * n_sensors:
+        return np.ascontiguousarray(y).reshape(len(y), n_sensors, 3)
     result = np.zeros((len(y), 3 * n_sensors))
     if not known.size:
         result[:, place] = y

@@ -108,6 +108,7 @@ def write_pictures(
     columns |= {name: getattr(fixes, name)[found.row] for name in ("detected", "misfit", "too_near", "body_length_m")}
     columns["dropped_sensors"] = [" ".join(fixes.dropped_sensors[row]) for row in found.row]
     columns["reason"] = [fixes.reason[row] for row in found.row]
+    columns["body_factor"] = fixes.body_factor[found.row]
     write(fix_figure(found, _sensors_of(fixes, array, rows), truth_m), folder / "fixes.png", columns)
     names = (f"{name}_residual_sigmas" for name in array.channel_names)
     write(

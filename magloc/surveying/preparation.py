@@ -7,6 +7,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
+from scipy.interpolate import Akima1DInterpolator
 from scipy.ndimage import maximum_filter1d, median_filter
 
 from arrays.array import SensorArray
@@ -96,13 +97,15 @@ def stuck_readings(array: SensorArray, values: FloatArray) -> BoolArray:
 def wild_readings(values: FloatArray) -> BoolArray:
     """Single readings (n, N) that are far from the cubic through their neighbours, over what is usual there."""
     wild = np.isnan(values)
-    if len(values) <= 2 * _NEIGHBOURS or wild.all(axis=0).any():
+    if len(values) <= 2 * _NEIGHBOURS or (~wild).sum(axis=0).min() < 2:
         return np.zeros(values.shape, np.bool_)
     index = np.arange(len(values))
     kept = values.copy()
     while True:
         for channel, lost in zip(kept.T, wild.T, strict=True):
-            channel[lost] = np.interp(index[lost], index[~lost], channel[~lost])
+            if lost.any():  # by lines, a field that bends would have a kink at each
+                good = index[~lost]
+                channel[lost] = Akima1DInterpolator(good, channel[good])(np.clip(index[lost], good[0], good[-1]))
         size = np.zeros(values.shape)
         size[2:-2] = np.abs(kept[2:-2] - (4.0 * (kept[1:-3] + kept[3:-1]) - kept[:-4] - kept[4:]) / 6.0)
         usual = median_filter(size, (2 * _NEIGHBOURS + 1, 1)) + np.median(size, axis=0)

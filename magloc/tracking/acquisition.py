@@ -16,6 +16,7 @@ from magloc.localization.fit.prior import SourcePrior
 from magloc.localization.fit.results import Fix, Solution
 from magloc.localization.locator import fit_at_rest
 from magloc.localization.uncertainty.range_interval import relative_range_sigma
+from magloc.measurement.nuisances import ambient_in_array, with_eddies_as_offsets
 from magloc.measurement.pose import PoseErrors
 from magloc.tracking.results import Row
 
@@ -88,7 +89,7 @@ class Acquisition:
         known = [earlier.ambient_T for earlier in chosen if earlier.ambient_T is not None]
         errors, lever_arm_m = self._pose_errors, np.array(self._pose_errors.uncertainty.lever_arm_m)
         fix = fit_at_rest(
-            self.array,
+            self._array_of(chosen),
             np.stack([earlier.readings_T for earlier in chosen]),
             np.stack([earlier.origin_m for earlier in chosen]),
             np.stack([earlier.R_world_from_array for earlier in chosen]),
@@ -106,6 +107,14 @@ class Acquisition:
         if self._proposed is None or not _agree(before, self._proposed):
             return None
         return Start(self._proposed, recent, fix.solutions[1:])
+
+    def _array_of(self, rows: Sequence[Row]) -> SensorArray:
+        """The array where eddy currents are errors of its offsets."""
+        if not any(sensor.eddy_uncertainty_s for sensor in self.array.sensors):
+            return self.array
+        ambient_T = [ambient_in_array(self.array, row.readings_T, row.ambient_T) for row in rows]
+        rates = [row.pose(np.zeros(3)).rate_rad_s for row in rows]
+        return with_eddies_as_offsets(self.array, np.stack(ambient_T), np.stack(rates))
 
 
 def _certain_solution(fix: Fix, centroid: FloatArray) -> Solution | None:

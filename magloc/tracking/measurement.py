@@ -233,8 +233,9 @@ class RowMeasurements:
             array = replace(array, ambient_T=(x, y, z))
         differences = self.differences(row)
         sigma = np.sqrt(differences.variance)
-        effect = differences.transform @ self.errors.effect(array, row.readings_T, row.time_s) / sigma[:, None]
         pose = row.pose(self._lever_arm_m)
+        of_errors = self.errors.effect(array, row.readings_T, row.time_s, pose.rate_rad_s)
+        effect = differences.transform @ of_errors / sigma[:, None]
         of_pose = self.pose_errors.effect(pose, row.pose_sigma)
         model = DifferenceMeasurement(array, differences)
         return RowMeasurement(model, sigma, row, self._n_motion, effect, pose, of_pose)

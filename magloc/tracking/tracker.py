@@ -153,7 +153,7 @@ class Tracker:
             Time goes backwards, or the readings are not one row.
         """
         row = next_row(row, self.array, self._time_s)
-        if self.pose_errors.n_states:
+        if self.n_errors:
             row, self._row_before = moving(row, self._row_before), row
         dt_s, self._time_s = row.time_s - self._time_s, row.time_s
         index, self._n_rows = self._n_rows, self._n_rows + 1

@@ -108,8 +108,7 @@ def on_a_sphere(n: int) -> DifferenceMeasurement:
 def stages(array: SensorArray, readings: np.ndarray, candidates: np.ndarray | None = None) -> dict[str, Contestant]:
     """What makes fixes of readings (n, C), alone and all together, with other candidates (k, 3) if they are given."""
     locator = plain_locator(array, body_length_m=0.0)
-    search = locator._search
-    assert isinstance(search, SingleSourceSearch)
+    search = locator._search = SingleSourceSearch(array)
     if candidates is not None:
         search._candidates = candidates
     (rows,) = whitened_rows(array, readings, None, len(readings))
@@ -119,7 +118,7 @@ def stages(array: SensorArray, readings: np.ndarray, candidates: np.ndarray | No
         "whitening": Contestant(lambda: list(whitened_rows(array, readings, None, n)), 1, n),
         "choice of starts": Contestant(lambda: search.starts(rows), 1, n),
         "refinement": Contestant(lambda: search.ends(rows, np.arange(n), starts, math.inf), 1, n),
-        "uncertainty": Contestant(lambda: solutions_of(optima, rows.energy, np.ones(n, dtype=bool)), 1, n),
+        "uncertainty": Contestant(lambda: solutions_of(optima, np.ones(n, dtype=bool)), 1, n),
         "a fix": Contestant(lambda: locator.fit_rows(readings), 1, n),
     }
 

@@ -23,9 +23,9 @@ from sims.cli.mockup_options import MockupOptions
 from sims.cli.mockup_replay import drive_of
 from sims.experiments.mockup_navigation import fused_runs
 from sims.mockup.table_run import TableScenario
-from tests.browser.screen import Camera, Screen, Sight, dark_grey, hue_of
+from tests.browser.screen import Camera, Screen, Sight, hue_of
 
-FloatArray = NDArray[np.float64]
+FloatArray, BoolArray = NDArray[np.float64], NDArray[np.bool_]
 DURATION_S = 20.0
 
 
@@ -49,6 +49,11 @@ def replay(screen: Screen) -> Iterator[Open]:
         page.close()
 
 
+def satellite_grey(picture: FloatArray) -> BoolArray:
+    """Pixels of the satellite, darker than the table, also where the estimate's light blue ellipse lies over it."""
+    return (np.ptp(picture, axis=-1) < 0.28) & (picture.max(axis=-1) < 0.72) & (picture.min(axis=-1) > 0.12)
+
+
 def on_ceiling(points_m: FloatArray) -> FloatArray:
     return np.column_stack([points_m, np.full(len(points_m), CEILING_M)])
 
@@ -66,7 +71,7 @@ def sights(camera: Camera, drive: Drive, row: int) -> list[Sight]:
     # Corners are left out: there the two outlines are close to each other.
     sides = np.arange(32) % 8 != 0
     return [
-        Sight("satellite", camera.pixels(body[None]), dark_grey, radius=8),
+        Sight("satellite", camera.pixels(body[None]), satellite_grey, radius=8),
         Sight("estimate's arrow", camera.pixels(np.append(tip, 0.11)[None]), hue_of(ESTIMATE_COLOUR), radius=16),
         Sight("identified lights", camera.pixels(on_ceiling(drive.lights_m[named])), hue_of(IDENTIFIED_COLOUR)),
         Sight("the frame's outline", camera.pixels(exposed[sides]), hue_of(FIX_COLOUR), share=0.7),
@@ -95,7 +100,7 @@ class TestDrive:
         screen.slide("Time [s]", 0.2)
         screen.until(lambda: abs(replay.drive.truth.time_s[replay.player.row] - 4.0) < 1.0, "the time follows")
         was = np.append(before, 0.05)[None]
-        gone = Sight("satellite where it was", camera.pixels(was), dark_grey, radius=2, absent=True)
+        gone = Sight("satellite where it was", camera.pixels(was), satellite_grey, radius=2, absent=True)
         screen.until_seen(*sights(camera, replay.drive, replay.player.row), gone)
 
     @pytest.mark.slow
@@ -117,7 +122,7 @@ class TestDrive:
         camera = screen.camera(replay.server.initial_camera)
         # Anywhere along the drive: it plays while one looks.
         body = np.column_stack([replay.drive.truth.position_m, np.full(len(replay.drive.truth), 0.05)])[::100]
-        later = [Sight("satellite", camera.pixels(place[None]), dark_grey, radius=3) for place in body[5:]]
+        later = [Sight("satellite", camera.pixels(place[None]), satellite_grey, radius=3) for place in body[5:]]
 
         def has_moved() -> bool:
             picture = screen.picture()

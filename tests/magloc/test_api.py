@@ -65,7 +65,9 @@ class TestFirstMinute:
         assert fixes.dropped_sensors == [()] * N_ROWS
         assert f"… {N_ROWS} rows" in str(fixes)
         assert "…" not in str(magloc.locate(array, readings[:2]))
-        assert fixes.table() + "\n" == run("locate", log, "--array", board).out
+        typed = run("locate", log, "--array", board)
+        assert fixes.table() + "\n" == f"{typed.out}{fixes.caution}\n"
+        assert f"note: {fixes.caution}" in typed.err
 
     def test_as_many_sources_as_there_are(self, board: Path, log: Path) -> None:
         array = arrays.read_array(board)

@@ -25,7 +25,7 @@ from magloc.measurement.whitened_compiled import ModelRow, candidate_bases
 
 SingleArray = NDArray[np.float32]
 _SAME_GAIN = 0.02
-_CANDIDATES_AT_ONCE = 512
+_CANDIDATES_AT_ONCE, _TURNED_AT_ONCE = 512, 128
 _ROWS_AT_ONCE = 64  # whose components stay in the processor's cache
 
 
@@ -35,15 +35,14 @@ def linear_bases(problem: WhitenedModel, gain: FloatArray, row: int, candidates:
     By moment axis, then by candidate, under the whitening of `row`; `gain` (C, 3) is in units of the noise. Single
     precision ranks the candidates as well.
     """
-    bases = np.zeros((len(candidates), 3, gain.shape[0]))
-    over_rows(
-        candidate_bases,
-        len(candidates),
-        candidates,
-        ModelRow.of(problem, gain, problem.basis[row], problem.shrinkage[row]),
-        bases,
-    )
-    return bases.transpose(2, 1, 0).astype(np.float32, order="C").reshape(gain.shape[0], -1)
+    every = np.empty((gain.shape[0], 3, len(candidates)), dtype=np.float32)
+    model = ModelRow.of(problem, gain, problem.basis[row], problem.shrinkage[row])
+    for begin in range(0, len(candidates), _TURNED_AT_ONCE):  # which stay in the processor's cache
+        some = candidates[begin : begin + _TURNED_AT_ONCE]
+        bases = np.zeros((len(some), 3, gain.shape[0]))
+        over_rows(candidate_bases, len(some), some, model, bases)
+        every[:, :, begin : begin + len(some)] = bases.transpose(2, 1, 0)
+    return every.reshape(gain.shape[0], -1)
 
 
 class LastBases:
@@ -88,13 +87,13 @@ def chosen_candidates(
 ) -> NDArray[np.intp]:
     """:func:`distinct_best` of the :func:`linear_scores` of residuals (b, C), compiled."""
     chosen = np.zeros((len(residual), n_starts), dtype=np.intp)
-    single, of_rows = candidates.astype(np.float32), residual.astype(np.float32)
+    of_rows, cos_apart = residual.astype(np.float32), math.cos(apart_rad)
     # One piece of memory for all: a new one is cleared by the system first, which takes as long as the choice.
     components = np.empty((min(_ROWS_AT_ONCE, len(residual)), bases.shape[1]), dtype=np.float32)
     for begin in range(0, len(residual), _ROWS_AT_ONCE):
         some = of_rows[begin : begin + _ROWS_AT_ONCE]
         of_some = np.matmul(some, bases, out=components[: len(some)]).reshape(len(some), 3, -1)
-        over_rows(choose_rows, len(some), of_some, single, math.cos(apart_rad), chosen[begin : begin + _ROWS_AT_ONCE])
+        over_rows(choose_rows, len(some), of_some, candidates, cos_apart, chosen[begin : begin + _ROWS_AT_ONCE])
     return chosen
 
 

@@ -104,15 +104,16 @@ class SingleSourceSearch:
         self.prior = prior
         self._everything = prior == NOTHING_KNOWN
         self._candidates = allowed_positions(array, prior)
-        self._ranking_of: dict[bytes, _Ranking] = {}
+        self._kept: tuple[bytes, _Ranking] | None = None
 
     def optima(self, rows: WhitenedRows) -> list[Optima]:
         """Distinct optima of every row within Δχ² = 20 of its best one that the prior allows."""
         everything = self._everything
         keep_within = DISTINCT_WITHIN if everything else math.inf
         found = self.ends(rows, np.arange(len(rows)), self.starts(rows), keep_within)
-        doubtful = np.flatnonzero(~(found.chi2[:, 0] <= _largest_credible(rows.n_differences - N_UNKNOWNS)))
-        if doubtful.size:
+        credible = found.chi2[:, 0] <= _largest_credible(rows.n_differences - N_UNKNOWNS)
+        if np.count_nonzero(credible) < len(rows):
+            doubtful = np.flatnonzero(~credible)
             some = rows.chosen(doubtful)
             more = self.ends(some, np.arange(len(some)), self.starts(some, _MORE * self.n_starts), keep_within)
             for values, others in zip(found, more, strict=True):
@@ -121,13 +122,13 @@ class SingleSourceSearch:
         unknown = found.counts[:, 0]
         if not everything:
             found = self._known(rows.model, found)
-        kept = found.counts[:, 0]
-        listed = np.arange(found.chi2.shape[1]) < kept[:, None]
-        fits = JointFits(found.q[:, :, None], found.mu[:, :, None], found.chi2, found.iterations).rows(listed)
-        reason = [
-            "" if n else _why_unsolved(int(of_all)) for n, of_all in zip(kept.tolist(), unknown.tolist(), strict=True)
-        ]
-        of_row = np.nonzero(listed)[0]
+        kept = found.counts[:, 0].tolist()
+        of_row = np.arange(len(rows)).repeat(kept)
+        # Of a row alone a slice: a table of what is listed takes longer than all else here.
+        listed = np.s_[0, : kept[0]] if len(rows) == 1 else np.arange(found.chi2.shape[1]) < found.counts[:, :1]
+        q, mu = found.q[listed], found.mu[listed]
+        reason = ["" if n else _why_unsolved(of_all) for n, of_all in zip(kept, unknown.tolist(), strict=True)]
+        fits = JointFits(q[:, None], mu[:, None], found.chi2[listed], found.iterations[listed])
         return [Optima(rows, fits, of_row, reason, failed_starts=found.counts[:, 1])]
 
     def optima_from(self, readings_T: ArrayLike, starts_m: ArrayLike) -> BestFits:
@@ -145,15 +146,14 @@ class SingleSourceSearch:
         )
 
     def _ranking(self, mask: BoolArray) -> _Ranking:
-        key = mask.tobytes()
-        if key not in self._ranking_of:
-            self._ranking_of.clear()  # bases are large, and rows come sorted by their mask
+        key, kept = mask.tobytes(), self._kept
+        if kept is None or kept[0] != key:  # the last one: bases are large, and rows come sorted by their mask
             of_mask = whitening(self.array, mask)
             model = WhitenedModel.of(self.array, of_mask, self.array.ambient_fields[None])
             candidates = model.homogeneous(self._candidates)
             bases = linear_bases(model, model.gain[0], 0, candidates)
-            self._ranking_of[key] = _Ranking(of_mask, candidates, bases)
-        return self._ranking_of[key]
+            kept = self._kept = key, _Ranking(of_mask, candidates, bases)
+        return kept[1]
 
     def starts(self, rows: WhitenedRows, n_starts: int | None = None) -> FloatArray:
         """Distinct candidates (b, n_starts, 4) that explain most of every row."""
@@ -200,6 +200,12 @@ class SingleSourceSearch:
             np.take_along_axis(found.iterations, order, axis=1),
             counts,
         )
+
+
+@lru_cache(maxsize=2)  # candidates' bases, which are large, take longer than a fix
+def kept_search(array: SensorArray) -> SingleSourceSearch:
+    """The search by one of the last arrays, where nothing is known: readings that come one by one have one."""
+    return SingleSourceSearch(array)
 
 
 @lru_cache(maxsize=64)

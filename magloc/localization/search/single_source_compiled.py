@@ -38,9 +38,9 @@ _BLOCK = 64
 
 
 class Ends(NamedTuple):
-    """Outputs of the search, (rows, starts, …): q, mu, χ², linearisations; counts (rows, 3).
+    """Outputs of the search, (rows, starts, …): q, mu, χ², linearisations; NaN and 0 where there are fewer optima.
 
-    These are the optima kept, the starts that did not converge, and all linearisations.
+    Counts (rows, 3) are the optima kept, the starts that did not converge, and all linearisations.
     """
 
     q: FloatArray
@@ -51,15 +51,10 @@ class Ends(NamedTuple):
 
     @classmethod
     def empty(cls, n_rows: int, n_starts: int) -> Ends:
-        """Places for them, NaN so far."""
+        """Places for them."""
         shape = (n_rows, n_starts)
-        return cls(
-            np.full((*shape, 4), np.nan),
-            np.full((*shape, 3), np.nan),
-            np.full(shape, np.nan),
-            np.zeros(shape, dtype=np.int64),
-            np.zeros((n_rows, 3), dtype=np.int64),
-        )
+        q, mu, chi2 = np.empty((*shape, 4)), np.empty((*shape, 3)), np.empty(shape)
+        return cls(q, mu, chi2, np.empty(shape, dtype=np.int64), np.empty((n_rows, 3), dtype=np.int64))
 
 
 @compiled
@@ -67,7 +62,7 @@ def choose_rows(
     begin: int,
     end: int,
     components: NDArray[np.float32],
-    candidates: NDArray[np.float32],
+    candidates: FloatArray,
     cos_apart: float,
     chosen: IntArray,
 ) -> None:
@@ -77,7 +72,7 @@ def choose_rows(
     best first, and left where they are near one that is chosen already. A key has the score, whose bits as an integer
     are in order, and behind it how many candidates follow: the largest key of a block is the first of its best ones.
     """
-    n, n_chosen, apart = len(candidates), chosen.shape[1], np.float32(cos_apart)
+    n, n_chosen = len(candidates), chosen.shape[1]
     n_blocks = -(-n // _BLOCK)
     score, key = np.empty(n, np.float32), np.full(n_blocks * _BLOCK, -1)
     bits, blocks, highest = score.view(np.int32), key.reshape(n_blocks, _BLOCK), np.empty(n_blocks, np.int64)
@@ -103,10 +98,10 @@ def choose_rows(
             near = False
             for k in range(n_found):
                 i = chosen[row, k]
-                t = np.float32(0.0)
+                t = 0.0
                 for d in range(4):
                     t += candidates[i, d] * candidates[j, d]
-                near = near or bool(abs(t) > apart)
+                near = near or abs(t) > cos_apart
             if not near:
                 chosen[row, n_found] = j
                 n_found += 1
@@ -253,3 +248,5 @@ def _distinct(
             out.chi2[row, kept], out.iterations[row, kept] = refined.chi2[best], refined.iterations[best]
             kept += 1
     out.counts[row, 0] = kept
+    out.q[row, kept:], out.mu[row, kept:], out.chi2[row, kept:] = math.nan, math.nan, math.nan
+    out.iterations[row, kept:] = 0

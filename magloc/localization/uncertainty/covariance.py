@@ -8,15 +8,15 @@ Several sources have no common range: each has its own ranges in each solution, 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtrc, chdtri
 
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.chi_square import energy_threshold
-from magloc.compilation import over_rows, own
+from magloc.compilation import over_rows, readable
 from magloc.levels import CERTAIN_WEIGHT, DELTA_CHI2_95, MISFIT
 from magloc.localization.fit.columns import Solutions
 from magloc.localization.fit.gauss_newton import covariances
@@ -40,51 +40,50 @@ from magloc.localization.uncertainty.single_source_compiled import Certainties, 
 from magloc.measurement.whitened import WhitenedModel
 
 
-@dataclass(frozen=True, eq=False)
-class _Known:
+class _Known(NamedTuple):
     """What is known of f fits of K sources: the columns of :class:`Solutions` of these names."""
 
+    position_m: FloatArray
+    moment_Am2: FloatArray
     ranges: FloatArray
     covariance: FloatArray
     gaussian: BoolArray
     weight: FloatArray
 
 
-def solutions_of(optima: Optima, energy: FloatArray, detected: BoolArray) -> Solutions:
-    """Solutions of b rows: the optima whose covariance is finite, with what is known of them."""
-    model, fits, of_row = optima.rows.model, optima.fits, optima.of_row
-    position, moment = model.position(fits.q), model.moment(fits.q, fits.mu)
-    n_fits, n_sources = position.shape[:2]
+def solutions_of(optima: Optima, detected: BoolArray) -> Solutions:
+    """Solutions of the rows of optima: those whose covariance is finite, with what is known of them."""
+    model, fits = optima.rows.model, optima.fits
+    n_fits, n_sources = fits.q.shape[:2]
     if optima.position_m is not None:
-        position = optima.position_m[of_row]
-        known = _of_known_position(optima, optima.position_m, moment)
-    elif n_sources == 1:
-        lanes = not model.sees_moduli and model.known is None
-        known = (known_of_one_compiled if lanes else known_of_one)(optima, energy)
-    else:
+        known = _of_known_position(optima, optima.position_m)
+    elif n_sources > 1:
         known = _of_several(optima, detected)
-    of_moments, n_known = np.zeros(n_fits), 0
+    else:
+        lanes = not model.sees_moduli and model.known is None
+        known = known_of_one_compiled(optima) if lanes else known_of_one(optima)
+    of_moments, n_known = np.zeros(n_fits), np.zeros(n_fits, dtype=np.intp)
     if model.known is not None:
-        moments = model.known.residual(moment)
-        of_moments, n_known = np.sum(moments**2, axis=1), moments.shape[1]
+        moments = model.known.residual(known.moment_Am2)
+        of_moments, n_known = np.sum(moments**2, axis=1), n_known + moments.shape[1]
     every = Solutions(
-        of_row=of_row,
+        of_row=optima.rows.index[optima.of_row],
         n_sources=np.full(n_fits, n_sources),
-        position_m=position,
-        moment_Am2=moment,
+        position_m=known.position_m,
+        moment_Am2=known.moment_Am2,
         covariance=known.covariance,
         chi2=fits.chi2 - of_moments,
         dof=np.full(n_fits, optima.dof),
         weight=known.weight,
         iterations=fits.iterations,
         ranges=known.ranges,
-        gaussian=known.gaussian & ~np.asarray(optima.bent)[..., None],
-        merged=np.full((n_fits, n_sources), optima.merged),
+        gaussian=known.gaussian if optima.bent is False else known.gaussian & ~np.asarray(optima.bent)[..., None],
+        merged=np.zeros((n_fits, n_sources), dtype=bool) | optima.merged,
         known_chi2=of_moments,
-        n_known=np.full(n_fits, n_known),
+        n_known=n_known,
     )
     finite = np.isfinite(known.covariance)
-    return every if finite.all() else every.chosen(np.asarray(finite.all(axis=(1, 2))))
+    return every if np.count_nonzero(finite) == finite.size else every.chosen(np.asarray(finite.all(axis=(1, 2))))
 
 
 def covariance_is_valid(optima: Optima, covariance: FloatArray, which: IntArray) -> BoolArray:
@@ -107,11 +106,10 @@ def covariance_is_valid(optima: Optima, covariance: FloatArray, which: IntArray)
     return np.asarray(described)
 
 
-def known_of_one(optima: Optima, energy: FloatArray) -> _Known:
+def known_of_one(optima: Optima) -> _Known:
     """What is known of single sources, all solutions of a row together."""
     rows, fits, of_row = optima.rows, optima.fits, optima.of_row
-    model, n_rows = rows.model, len(rows)
-    shape, at = _places(of_row, n_rows)
+    model, shape, at = rows.model, *_places(of_row, len(rows))
 
     def table(values: FloatArray, empty: float) -> FloatArray:
         full = np.full((*shape, *values.shape[1:]), empty)
@@ -119,7 +117,8 @@ def known_of_one(optima: Optima, energy: FloatArray) -> _Known:
         return full
 
     q, mu, chi2 = table(fits.q[:, 0], np.nan), table(fits.mu[:, 0], np.nan), table(fits.chi2, np.inf)
-    offset, moment = model.position(q) - model.centroid, model.moment(q, mu)
+    position, moment = model.position(q), model.moment(q, mu)
+    offset = position - model.centroid
     understated = _understated(chi2[:, 0], optima)
     covariance = table(covariances(model.rows(of_row), fits), np.nan) * understated[:, None, None, None]
     rivals = Rivals.of(
@@ -127,7 +126,7 @@ def known_of_one(optima: Optima, energy: FloatArray) -> _Known:
         covariance,
         offset,
         moment,
-        energy / understated,
+        rows.energy / understated,
         rows.n_differences,
         _scale_m(model),
     )
@@ -144,29 +143,30 @@ def known_of_one(optima: Optima, energy: FloatArray) -> _Known:
     claimed = np.flatnonzero(gaussian)
     if claimed.size:
         gaussian[claimed] = covariance_is_valid(optima, covariance[at][claimed], claimed)
-    return _Known(ranges.sets[of_row, None], ranges.covariance[at], gaussian[:, None], rivals.weight[at])
+    places = position[at][:, None], moment[at][:, None]
+    return _Known(*places, ranges.sets[of_row, None], ranges.covariance[at], gaussian[:, None], rivals.weight[at])
 
 
-def known_of_one_compiled(optima: Optima, energy: FloatArray) -> _Known:
+def known_of_one_compiled(optima: Optima) -> _Known:
     """:func:`known_of_one` of vector sensors."""
     rows, fits, of_row = optima.rows, optima.fits, optima.of_row
     model, n_rows = rows.model, len(rows)
     first = of_row.searchsorted(np.arange(n_rows + 1))
-    found = Certainties.empty(len(of_row), n_rows, int((first[1:] - first[:-1]).max(initial=1)))
+    found = Certainties.empty(len(of_row), max(1, np.maximum.reduce(first[1:] - first[:-1])))
     over_rows(
         certainty_rows,
         n_rows,
-        FlatFits(first, own(fits.q[:, 0]), own(fits.mu[:, 0]), own(fits.chi2)),
-        own(energy),
-        own(rows.y),
+        FlatFits(first, readable(fits.q[:, 0]), readable(fits.mu[:, 0]), readable(fits.chi2)),
+        readable(rows.energy),
+        readable(rows.y),
         rows.signal,
         model.of_kernels,
         model.lanes,
+        model.units,
         levels_of(rows.n_differences, optima.dof),
         found,
     )
-    sets = model.radius * found.sets[:, : max(1, int(found.n_sets.max(initial=1)))]
-    return _Known(sets[of_row, None], found.covariance * model.unit_covariance, found.gaussian[:, None], found.weight)
+    return _Known(found.position_m, found.moment_Am2, found.ranges, found.covariance, found.gaussian, found.weight)
 
 
 @lru_cache(maxsize=64)
@@ -196,7 +196,8 @@ def _of_several(optima: Optima, detected: BoolArray) -> _Known:
     model, y = rows.model.rows(of_row), rows.y[of_row]
     understated = _understated(fits.chi2[np.searchsorted(of_row, of_row)], optima)
     covariance = covariances(model, fits) * understated[:, None, None]
-    offset, moment = model.position(fits.q) - model.centroid, model.moment(fits.q, fits.mu)
+    position, moment = model.position(fits.q), model.moment(fits.q, fits.mu)
+    offset = position - model.centroid
     n_fits, n_sources = offset.shape[:2]
     wide = covariance.copy()
     sets = np.empty((n_fits, n_sources, 1, 2))
@@ -215,13 +216,13 @@ def _of_several(optima: Optima, detected: BoolArray) -> _Known:
     gaussian &= (weight >= CERTAIN_WEIGHT)[:, None]
     claimed = np.flatnonzero(gaussian.any(axis=1))
     gaussian[claimed] &= covariance_is_valid(optima, covariance[claimed], claimed)[:, None]
-    return _Known(sets, wide, gaussian, weight)
+    return _Known(position, moment, sets, wide, gaussian, weight)
 
 
-def _of_known_position(optima: Optima, position_m: FloatArray, moment: FloatArray) -> _Known:
-    """What is known of moments at known places; the range is that of the place."""
+def _of_known_position(optima: Optima, position_m: FloatArray) -> _Known:
+    """What is known of moments at known places (b, K, 3); the range is that of the place."""
     rows, fits, of_row = optima.rows, optima.fits, optima.of_row
-    model = rows.model
+    model, position, moment = rows.model, position_m[of_row], rows.model.moment(fits.q, fits.mu)
     understated = _understated(fits.chi2[np.searchsorted(of_row, of_row)], optima)
     covariance = moment_covariances(model.rows(of_row), rows.y[of_row], fits) * understated[:, None, None]
     told = np.where(np.isfinite(covariance).all(axis=(1, 2)), fits.chi2 / understated, np.inf)
@@ -231,8 +232,8 @@ def _of_known_position(optima: Optima, position_m: FloatArray, moment: FloatArra
         variance = np.diagonal(covariance, axis1=1, axis2=2).reshape(moment.shape).sum(axis=2)
         sigma = np.sqrt(variance) / np.linalg.norm(moment, axis=2)
     gaussian = (sigma <= LARGEST_GAUSSIAN_SIGMA) | (not model.channel_is_scalar.any())
-    distances = np.linalg.norm(position_m - model.centroid, axis=-1)[of_row]
-    return _Known(np.tile(distances[:, :, None, None], 2), covariance, gaussian, weight)
+    distances = np.linalg.norm(position - model.centroid, axis=-1)
+    return _Known(position, moment, np.tile(distances[:, :, None, None], 2), covariance, gaussian, weight)
 
 
 def _places(of_row: IntArray, n_rows: int) -> tuple[tuple[int, int], tuple[IntArray, IntArray]]:

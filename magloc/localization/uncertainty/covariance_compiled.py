@@ -23,10 +23,11 @@ def covariance_and_volume(
 ) -> float:
     """Covariance of (ρ, μ), ρ = u/s and μ scaled at s = 1, by QR of the whitened Jacobian, of noise of some variance.
 
-    The result is :func:`magloc.localization.uncertainty.ambiguity.log_evidence_volume`, NaN where it is singular: then
-    the covariance is left alone.
+    The result is :func:`magloc.localization.uncertainty.ambiguity.log_evidence_volume`, NaN where it is singular,
+    as the covariance is then.
     """
     n = row.channel_sensor.size
+    covariance[:] = math.nan
     rho, mu1 = np.empty(4), np.empty(3)
     for d in range(4):
         rho[d] = q[d] / q[3]

@@ -10,7 +10,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from arrays.typing import BoolArray, FloatArray
 from magloc.compilation import compiled, internal
@@ -18,7 +17,7 @@ from magloc.levels import CERTAIN_WEIGHT, DELTA_CHI2_95
 from magloc.localization.uncertainty.ambiguity import LARGEST_BEND, LARGEST_GAUSSIAN_SIGMA
 from magloc.localization.uncertainty.covariance_compiled import covariance_and_volume
 from magloc.localization.uncertainty.range_profile_compiled import FlatFits, profile_rows
-from magloc.measurement.whitened_compiled import LaneModel, ModelRow, ModelRows, row_at, unit_basis
+from magloc.measurement.whitened_compiled import LaneModel, ModelRow, ModelRows, Units, row_at, unit_basis
 
 _N_BISECTIONS = 24
 _N_SQUARINGS = 10
@@ -39,27 +38,24 @@ class Levels(NamedTuple):
 
 
 class Certainties(NamedTuple):
-    """Outputs: covariances (f, 6, 6) in the units given, NaN where singular, weights (f,), whether errors are Gaussian.
+    """Outputs: columns of :class:`magloc.localization.fit.columns.Solutions`.
 
-    Of rows: disjoint sets of ranges (rows, n, 2) in radii, NaN where there are fewer, and how many there are (rows,).
+    Covariances are NaN where singular. There is room for as many ranges as the row of most fits has of these.
     """
 
+    position_m: FloatArray
+    moment_Am2: FloatArray
     covariance: FloatArray
     weight: FloatArray
     gaussian: BoolArray
-    sets: FloatArray
-    n_sets: NDArray[np.int64]
+    ranges: FloatArray
 
     @classmethod
-    def empty(cls, n_fits: int, n_rows: int, most: int) -> Certainties:
+    def empty(cls, n_fits: int, most: int) -> Certainties:
         """Places for them."""
-        return cls(
-            np.full((n_fits, 6, 6), np.nan),
-            np.zeros(n_fits),
-            np.zeros(n_fits, dtype=np.bool_),
-            np.full((n_rows, most, 2), np.nan),
-            np.zeros(n_rows, dtype=np.int64),
-        )
+        position, moment, covariance = np.empty((n_fits, 1, 3)), np.empty((n_fits, 1, 3)), np.empty((n_fits, 6, 6))
+        gaussian, ranges = np.empty((n_fits, 1), dtype=np.bool_), np.empty((n_fits, 1, most, 2))
+        return cls(position, moment, covariance, np.empty(n_fits), gaussian, ranges)
 
 
 @compiled
@@ -72,10 +68,11 @@ def certainty_rows(
     signal: FloatArray,
     rows: ModelRows,
     model: LaneModel,
+    units: Units,
     levels: Levels,
     out: Certainties,
 ) -> None:
-    """What is known of the fits of rows begin to end, in units of the array's radius and of the scaled moment."""
+    """What is known of the fits of rows begin to end."""
     n_fits = fits.first[end] - fits.first[begin]
     rise, understated = np.empty(end), np.empty(end)
     alpha, weighed = np.empty((fits.first[end], 2)), np.empty(n_fits)
@@ -93,17 +90,38 @@ def certainty_rows(
         of_energy = energy[row] / understated[row]
         rise[row] = understated[row] * _rise(of_energy, chi2 / understated[row], level, levels)
     profile_rows(begin, end, signal, rise, model, fits, out.covariance, alpha)
+    sets = np.empty(out.ranges.shape[2:])
     for row in range(begin, end):
-        _unite(alpha[fits.first[row] : fits.first[row + 1]], rise[row], out.sets[row], out.n_sets[row : row + 1])
-        low, high = out.sets[row, 0, 0], out.sets[row, max(out.n_sets[row], 1) - 1, 1]
+        sets[:] = math.nan
+        n_sets = _unite(alpha[fits.first[row] : fits.first[row + 1]], rise[row], sets)
+        low, high = sets[0, 0], sets[max(n_sets, 1) - 1, 1]
         observable = low > 0.0 and high <= 2.0 * low
         of_row = row_at(rows, row)
         for k in range(fits.first[row], fits.first[row + 1]):
-            covariance = out.covariance[k]
+            covariance, q, gaussian = out.covariance[k], fits.q[k], False
             if not observable:
-                _widen(fits.q[k], low, high, covariance)
-            elif out.n_sets[row] == 1 and out.weight[k] >= CERTAIN_WEIGHT and fits.chi2[k] <= levels.misfit:
-                out.gaussian[k] = _is_gaussian(fits.q[k], fits.mu[k], fits.chi2[k], covariance, y[row], of_row)
+                _widen(q, low, high, covariance)
+            elif n_sets == 1 and out.weight[k] >= CERTAIN_WEIGHT and fits.chi2[k] <= levels.misfit:
+                gaussian = _is_gaussian(q, fits.mu[k], fits.chi2[k], covariance, y[row], of_row)
+            out.gaussian[k, 0] = gaussian
+            for i in range(len(sets)):
+                out.ranges[k, 0, i, 0], out.ranges[k, 0, i, 1] = units.radius * sets[i, 0], units.radius * sets[i, 1]
+            _in_units(q, fits.mu[k], units, out.position_m[k, 0], out.moment_Am2[k, 0], covariance)
+
+
+@internal
+def _in_units(
+    q: FloatArray, mu: FloatArray, units: Units, position: FloatArray, moment: FloatArray, covariance: FloatArray
+) -> None:
+    """Position and moment of a fit, and its covariance."""
+    unit = np.empty(6)
+    for d in range(3):
+        unit[d], unit[3 + d] = units.radius, units.moment
+        position[d] = units.centroid[d] + units.radius * q[d] / q[3]
+        moment[d] = units.moment * mu[d] / abs(q[3]) ** 3
+    for i in range(6):
+        for j in range(6):
+            covariance[i, j] *= unit[i] * unit[j]
 
 
 @internal
@@ -172,12 +190,15 @@ def _rise(energy: float, chi2: float, level: float, levels: Levels) -> float:
 
 
 @internal
-def _unite(alpha: FloatArray, rise: float, sets: FloatArray, n_sets: NDArray[np.int64]) -> None:
-    """Disjoint ascending ranges, in radii, that stretches (n, 2) of α cover; everything where nothing bounds them."""
+def _unite(alpha: FloatArray, rise: float, sets: FloatArray) -> int:
+    """Disjoint ascending ranges, in radii, that stretches (n, 2) of α cover; everything where nothing bounds them.
+
+    Put out is how many there are.
+    """
     if not math.isfinite(rise):
         if len(alpha):
-            sets[0, 0], sets[0, 1], n_sets[0] = 0.0, math.inf, 1
-        return
+            sets[0, 0], sets[0, 1] = 0.0, math.inf
+        return min(len(alpha), 1)
     n = 0
     for k in range(len(alpha)):
         first, last = alpha[k, 0], alpha[k, 1]
@@ -202,7 +223,7 @@ def _unite(alpha: FloatArray, rise: float, sets: FloatArray, n_sets: NDArray[np.
             kept += 1
     for k in range(kept, n):
         sets[k, 0] = sets[k, 1] = math.nan
-    n_sets[0] = kept
+    return kept
 
 
 @internal

@@ -65,7 +65,8 @@ class Model:
     """Readings of an array as a function of source and nuisances, in parameters that are of the order of one.
 
     Parameters: position and moment in units of their sizes; the common field of the vector sensors and the common
-    modulus of the scalar ones [nT]; error of the ambient field, turns and gains in units of their standard deviations.
+    modulus of the scalar ones [nT]; error of the ambient field, turns, gains and what the field induces in units of
+    their standard deviations.
     """
 
     def __init__(self, array, position, moment, ambient_uncertainty_T=0.0):
@@ -78,6 +79,7 @@ class Model:
         self.common_modulus = self._nuisances(1, prior)
         self.ambient = self._nuisances(3, 1.0)
         self.calibrations = [self._nuisances(6, 1.0) for _ in array.sensors]
+        self.carriers = [self._nuisances(9 if s.induced_uncertainty else 0, 1.0) for s in array.sensors]
 
     def _nuisances(self, n, prior):
         first = 6 + len(self.priors)
@@ -87,11 +89,16 @@ class Model:
     def readings(self, x):
         array, units = self.array, self.units
         p, m = [x[i] * units[i] for i in range(3)], [x[i] * units[i] for i in range(3, 6)]
-        for sensor, ambient, calibration in zip(array.sensors, array.ambient_fields, self.calibrations, strict=True):
+        for sensor, ambient, calibration, carrier in zip(
+            array.sensors, array.ambient_fields, self.calibrations, self.carriers, strict=True
+        ):
             d = [sensor.position_m[i] - p[i] for i in range(3)]
             r2, along = dot(d, d), dot(d, m)
             B = [1e-7 * (3.0 * along * d[i] * r2**-2.5 - m[i] * r2**-1.5) for i in range(3)]
             B = [B[i] + ambient[i] + self.ambient_uncertainty_T * x[self.ambient][i] for i in range(3)]
+            if sensor.induced_uncertainty:
+                induced = [dot(x[carrier][3 * i : 3 * i + 3], B) for i in range(3)]
+                B = [B[i] + sensor.induced_uncertainty * induced[i] for i in range(3)]
             scale = sensor.calibration.scale
             if sensor.kind == "scalar":
                 gain = 1.0 + sensor.gain_uncertainty * x[calibration][3]

@@ -141,7 +141,8 @@ class TestLikelihood:
     def test_all_at_once(self, common_field_T):
         array = random_array(5, 8, kinds=("vector", "scalar"), common_field_T=common_field_T, uncertain=True)
         array = replace(array, ambient_T=AMBIENT)
-        sensors = tuple(replace(s, offset_uncertainty_T=5e-10) for s in array.sensors)
+        errors = {"offset_uncertainty_T": 5e-10, "induced_uncertainty": 2e-5}
+        sensors = tuple(replace(s, **errors) for s in array.sensors)
         self.check(replace(array, sensors=sensors), *random_source(5), 20e-9)
 
 
@@ -490,6 +491,16 @@ class TestTable:
                 name, twin.sigma_position_m
             )
             assert_allclose(values, expected, rtol=1e-10, err_msg=name)
+
+    def test_equals_its_twin_where_the_field_induces_another(self):
+        array = ARRAYS["mixed"]
+        sensors = (replace(s, induced_uncertainty=1e-4 * (i + 1)) for i, s in enumerate(array.sensors))
+        array = replace(array, sensors=tuple(sensors))
+        positions, moments = places(array), moments_over(array, 5)
+        twin = cramer_rao_bounds(array, positions[:, None], moments)
+        table = sigma_table(array, positions, moments)
+        assert_allclose(table.range_m, twin.sigma_range_m, rtol=1e-10)
+        assert_allclose(table.bearing_rad, twin.sigma_bearing_rad, rtol=1e-10)
 
     def test_equals_its_twin_with_an_uncertain_ambient_field(self):
         array = ARRAYS["mixed"]

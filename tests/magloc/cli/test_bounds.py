@@ -11,6 +11,7 @@ import pytest
 import xarray as xr
 from PIL import Image
 
+from arrays.array import SensorArray
 from arrays.array_file import write_array
 from arrays.geometries import grid, tetrahedron
 from magloc.bounds.crlb import cramer_rao_bounds
@@ -282,6 +283,12 @@ class TestBadInput:
         assert len(err.splitlines()) == 1
         assert expected in err
         assert not list(tmp_path.iterdir())
+
+    def test_a_sensor_alone_knows_no_place(self, tmp_path, capsys):
+        path = tmp_path / "one.toml"
+        write_array(path, SensorArray(tetrahedron(1.0).sensors[:1], common_field_T=1e-9))
+        assert main(["bounds", "--array", str(path), "--out", str(tmp_path / "out")]) == 2
+        assert "received 1, which knows no place: magloc locate --position" in capsys.readouterr().err
 
     @with_plain_pictures
     def test_an_interruption_says_what_is_done(self, tmp_path, capsys, monkeypatch):

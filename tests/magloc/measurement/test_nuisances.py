@@ -3,7 +3,7 @@
 | what | who checks it |
 |---|---|
 | 1/f noise | its spectral density s²/(f ln 10), by the Lorentzians of the processes |
-| effect on readings | differences of readings of sensors with other calibrations |
+| effect on readings | differences of readings of sensors with other calibrations, in fields that carriers change |
 | start, states of a track | scipy's fit of source and errors together; the errors of simulated arrays |
 """
 
@@ -24,7 +24,12 @@ from arrays import geometries
 from arrays.array import SensorArray
 from arrays.sensor import Calibration, Sensor
 from magloc.measurement.differences import predicted_channels
-from magloc.measurement.nuisances import SensorErrors, without_lasting_errors
+from magloc.measurement.nuisances import (
+    SensorErrors,
+    ambient_in_array,
+    with_eddies_as_offsets,
+    without_lasting_errors,
+)
 from magloc.tracking.batch import track_record
 from magloc.tracking.chart.coordinates import Chart
 from magloc.tracking.chart.row import ChartRow
@@ -226,6 +231,61 @@ class TestEffect:
         known = SensorErrors.of(with_errors(array, misalignment_rad=0.0, gain_uncertainty=0.0))
         is_left = np.append(every.of_sensor[:, 1] >= 6, np.ones(len(every.of_channel), dtype=bool))
         np.testing.assert_array_equal(known.effect(known.array, readings), whole[:, is_left])
+
+    @pytest.mark.parametrize("is_known", [True, False], ids=["a known ambient field", "that of the readings"])
+    def test_of_a_carrier_is_the_difference_of_readings(self, is_known: bool) -> None:
+        """Central differences of readings in fields that a matrix times the ambient field, or its rate, is added to.
+
+        The rate is that in the axes of an array that turns, by scipy's rotations a millisecond before and after.
+        """
+        array = without_lasting_errors(mixed_array())
+        array = with_errors(array, induced_uncertainty=1e-4, eddy_uncertainty_s=2e-3)
+        if not is_known:
+            array = replace(array, sensors=array.sensors[::2], ambient_T=None)
+        rate, ambient = np.array([0.3, -0.7, 0.4]), np.array(AMBIENT_T)
+        errors = SensorErrors.of(array)
+        assert errors.n_states == 18 * array.n_sensors
+        np.testing.assert_array_equal(errors.sigma, np.tile(np.repeat([1e-4, 2e-3], 9), array.n_sensors))
+        before, after = (Rotation.from_rotvec(sign * 1e-3 * rate).inv().apply(ambient) for sign in (-1.0, 1.0))
+        causes = [ambient, (after - before) / 2e-3]
+        fields = np.tile(ambient, (array.n_sensors, 1))
+        effect = errors.effect(array, array.readings_of(fields), rate_rad_s=rate)
+        step = 1e-5
+        for state, (sensor, column) in enumerate(errors.of_sensor):
+            cause, entry = divmod(int(column) - 9, 9)
+            added = np.zeros((3, 3))
+            added.flat[entry] = step
+            other = np.zeros_like(fields)
+            other[sensor] = added @ causes[cause]
+            change = array.readings_of(fields + other) - array.readings_of(fields - other)
+            np.testing.assert_allclose(effect[:, state], change / (2.0 * step), rtol=1e-5, atol=1e-12)
+
+    def test_of_eddies_is_nil_at_rest(self) -> None:
+        array = with_errors(without_lasting_errors(mixed_array()), eddy_uncertainty_s=1e-3)
+        errors = SensorErrors.of(array)
+        assert not errors.effect(array, array.readings_of(np.tile(AMBIENT_T, (3, 1)))).any()
+
+
+class TestEddiesAsOffsets:
+    def test_have_the_rms_of_a_turning_field(self) -> None:
+        """1 rad/s about an axis across 48 µT, and along it: 48 µT/s and nothing."""
+        array = with_errors(geometries.tetrahedron(1.5), eddy_uncertainty_s=1e-3, offset_uncertainty_T=3e-8)
+        ambient = np.tile([0.0, 0.0, 48e-6], (2, 1))
+        found = with_eddies_as_offsets(array, ambient, np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]))
+        for sensor in found.sensors:
+            assert sensor.offset_uncertainty_T == pytest.approx(math.hypot(3e-8, 48e-9 / math.sqrt(2.0)), rel=1e-12)
+            assert sensor.eddy_uncertainty_s == 0.0
+
+
+class TestAmbientField:
+    def test_is_that_of_the_rows_the_array_or_the_readings(self) -> None:
+        array = mixed_array()
+        rows = np.stack([array.readings_of(np.tile(scale * np.array(AMBIENT_T), (3, 1))) for scale in (1.0, 2.0)])
+        np.testing.assert_allclose(ambient_in_array(array, rows), np.tile(AMBIENT_T, (2, 1)))
+        np.testing.assert_allclose(ambient_in_array(array, rows, 3.0 * np.ones((2, 3))), 3.0)
+        unknown = replace(array, ambient_T=None)
+        rows[0, 0] = np.nan  # the first sensor's; the third one's stay
+        np.testing.assert_allclose(ambient_in_array(unknown, rows), np.outer([1.0, 2.0], AMBIENT_T))
 
 
 def uncalibrated(array: SensorArray, rng: np.random.Generator) -> tuple[FloatArray, SensorArray]:

@@ -12,6 +12,7 @@ from scipy.stats import chi2
 
 from arrays.io.csv import write_columns
 from magloc.calibration.results import residual_rms
+from magloc.localization.fit.fixes import BODY_MATTERS
 from magloc.plots.tracks import write_picture
 from magloc.tracking.results import TrackPoint
 from tests.command_line import Run, assert_refused, results_of
@@ -60,6 +61,9 @@ class TestLocate:
         np.testing.assert_allclose(numbers(fixes["s_z_m"]), sigma)
         assert numbers(fixes["detected"]).tolist() == [entry["detected"] for entry in entries]
         assert numbers(fixes["misfit"]).tolist() == [entry.get("misfit", False) for entry in entries]
+        factor = numbers(fixes["body_factor"])
+        said = [entry.get("body_factor", np.nan) for entry in entries]
+        np.testing.assert_allclose(np.where(factor > BODY_MATTERS, factor, np.nan), said)
         true = np.column_stack([numbers(fixes[f"true_{name}_m"]) for name in "xyz"])
         np.testing.assert_allclose(numbers(fixes["error_m"]), np.linalg.norm(position - true, axis=1), rtol=1e-6)
         dof = numbers(fixes["dof"])

@@ -117,6 +117,7 @@ class TestTrack:
         low, high = stats.chi2.ppf([5e-4, 1.0 - 5e-4], 90)
         assert low < total < high
 
+    @pytest.mark.slow
     def test_of_rows_of_few_readings_the_range_is_known_sooner(self) -> None:
         """A pair of sensors, 4 m away, in eight rows: the set of ranges is narrower, and holds the truth."""
         pair = axial(1.5, "vector", 5e-9)

@@ -87,7 +87,8 @@ def with_model_errors(
 
 def _all_far(q: FloatArray) -> bool:
     """Whether all sources are so far from the centroid that they are near to no sensor: most of them, cheaply."""
-    return bool((np.abs(q[..., 3]) < _FAR_S).all())
+    s = q[..., 3]
+    return np.count_nonzero(np.abs(s) < _FAR_S) == s.size
 
 
 def _refined(optima: Optima, lengths: FloatArray, ambient_sigma_T: float) -> Optima:
