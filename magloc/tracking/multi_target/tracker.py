@@ -72,8 +72,10 @@ _MUST_GAIN, _CLEAR_GAIN = 20.0, 60.0
 _CERTAIN_STRENGTH = 0.05
 # What a row costs at most that nothing explains.
 _UNBEARABLE = 1000.0
-# Rows from one try of a late birth to the next, fewest rows for one, and by how much it may be less likely than none.
-_LATE_PAUSE, _FEWEST_ROWS = 5, 10
+# Rows from one try of a late birth to the next, at least and at most, fewest rows for one, and by how much it may be
+# less likely than none. What leaves such residuals and is no source, as gains do, stays: each try in vain is followed
+# by a pause that is twice as long.
+_LATE_PAUSE, _LONGEST_PAUSE, _FEWEST_ROWS = 5, 160, 10
 _LATE_WORSE = 10.0
 
 
@@ -135,7 +137,7 @@ class SourcesTracker:
         self._ids: tuple[int, ...] = ()
         self._last_restart = self._next_restart = -_RESTART_PAUSE
         self._pause = _FIRST_PAUSE
-        self._next_late = 0
+        self._late_pause, self._next_late = _LATE_PAUSE, 0
 
     @one_blas_thread
     def update(self, row: Row | Readings) -> SourcesPoint:
@@ -186,9 +188,13 @@ class SourcesTracker:
             if poor:  # whether the suspect is at fault, they are to tell
                 self._hypotheses[0] = replace(best, health=best.health.forgetful)
             self._hypotheses += restarts
-        if left is not None and energy > LEFT_LIMIT and self._n_rows >= self._next_late:
-            self._next_late = self._n_rows + _LATE_PAUSE
-            self._hypotheses += self._born_late(problem, best, found, left)
+        if left is None or energy < 0.5 * LEFT_LIMIT:
+            self._late_pause = _LATE_PAUSE
+        elif energy > LEFT_LIMIT and self._n_rows >= self._next_late:
+            born = self._born_late(problem, best, found, left)
+            self._hypotheses += born
+            self._late_pause = _LATE_PAUSE if born else min(2 * self._late_pause, _LONGEST_PAUSE)
+            self._next_late = self._n_rows + self._late_pause
         point = self._point(problem, status, found.update.cost)
         self._hypotheses = self._split(problem)
         return point
