@@ -43,6 +43,11 @@ def normalised_square(error: FloatArray, covariance: FloatArray) -> FloatArray:
         return np.asarray(np.sum(scaled * solved, axis=-1))
 
 
+def error_factor(claimed: FloatArray, added: FloatArray) -> float:
+    """How many times the standard deviations of a covariance (N, N) errors are, rms, to which another one is added."""
+    return math.sqrt(1.0 + float(np.trace(np.linalg.solve(claimed, added))) / len(claimed))
+
+
 class Detector(Protocol):
     """A statistic with a threshold, and the energy of a signal that it finds."""
 

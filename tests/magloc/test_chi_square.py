@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from magloc.chi_square import normalised_square
+from magloc.chi_square import error_factor, normalised_square
 
 
 def test_a_covariance_that_is_none_spoils_no_other() -> None:
@@ -14,3 +14,13 @@ def test_a_covariance_that_is_none_spoils_no_other() -> None:
     error = np.tile([2.0, 1e-10], (5, 1))
     squares = normalised_square(error, np.stack([good, *bad]))
     np.testing.assert_allclose(squares, [2.0, *[np.nan] * 4], rtol=1e-12)
+
+
+def test_the_factor_is_that_of_drawn_errors() -> None:
+    """Root of the mean NEES per dimension; of 200,000 draws its standard error is below 0.2 %, held at 1 %."""
+    rng = np.random.default_rng(0)
+    roots = rng.normal(size=(2, 3, 3))
+    claimed, added = roots @ np.swapaxes(roots, -1, -2)
+    errors = rng.multivariate_normal(np.zeros(3), claimed + added, size=200_000)
+    nees = normalised_square(errors, claimed[None]).mean() / 3.0
+    np.testing.assert_allclose(error_factor(claimed, added), np.sqrt(nees), rtol=0.01)

@@ -74,10 +74,7 @@ def dataset_of_fixes(fixes: Fixes, which: Literal["best", "all"]) -> xr.Dataset:
         "merged": (source, table(columns.merged[chosen], False)),
         **{name: (leading, table(getattr(columns, name)[chosen], np.nan)) for name in ("chi2", "weight")},
         **{name: (leading, table(getattr(columns, name)[chosen], 0)) for name in ("dof", "n_sources")},
-        **{
-            name: ("row", getattr(fixes, name))
-            for name in ("detected", "misfit", "too_near", "body_length_m", "body_factor")
-        },
+        **{name: ("row", getattr(fixes, name)) for name in _OF_ROWS},
         **{
             name: ("row", np.array([" ".join(names) for names in getattr(fixes, name)], dtype=str))
             for name in ("dropped_sensors", "saturated_channels")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -13,6 +12,7 @@ import numpy as np
 
 from arrays.io.lazy import by_name
 from arrays.typing import BoolArray, FloatArray, IntArray
+from magloc.chi_square import error_factor
 from magloc.localization.fit.columns import Solutions
 from magloc.localization.fit.results import EVERYWHERE, Fix, Intervals, intervals_of, is_misfit
 from magloc.localization.fit.table import lines_of_fixes
@@ -194,8 +194,7 @@ class Fixes(Sequence[Fix]):
         for i in np.flatnonzero(self.body_covariance.any(axis=(1, 2))).tolist():
             solution = self.solutions.solution(int(self.best[i]))
             n = len(solution.covariance)
-            share = np.trace(np.linalg.solve(solution.covariance, self.body_covariance[i, :n, :n]))
-            factor[i] = math.sqrt(1.0 + float(share) / n)
+            factor[i] = error_factor(solution.covariance, self.body_covariance[i, :n, :n])
         return factor
 
     @property

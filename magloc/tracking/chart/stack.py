@@ -199,13 +199,11 @@ class Stack:
         k = self.z.size
         C = np.eye(k) + self._of_sensors
         parts = []
-        H = np.zeros((len(state), k, N_SOURCE))
-        H_each, error = [], np.zeros((len(state), N_POSE))
-        by_pose = []
+        by_source, by_pose, error = [], [], np.zeros((len(state), N_POSE))
         for row in self._middle:
             in_array = row.pose.in_array(state)
             by_array = np.zeros((len(state), row.z.size, N_SOURCE)) if far else row._by_array(in_array, None)
-            H_each.append(row._by_source(by_array, None))
+            by_source.append(row._by_source(by_array, None))
             if row.n_pose:
                 by_pose.append(where_smooth(row._by_pose(by_array, in_array, error)))
         if by_pose:
@@ -213,7 +211,7 @@ class Stack:
             for lasts_s, share in self._of_pose.items():
                 parts.append(self._spread(E[..., self.pose_errors.lasts_s == lasts_s], share))
         if not far:
-            H = self._middles(H_each)
+            H = self._middles(by_source)
             of_place, of_moment = self._of_motion
             strength = np.linalg.norm(state[:, 3:6], axis=1)[:, None, None]
             parts += [self._spread(H[..., :3], of_place), self._spread(strength * H[..., 3:], of_moment)]

@@ -294,11 +294,9 @@ class RowProblem:
         for cell in self._cells.best(energy, _BIRTH_STARTS):
             if energy[cell] < _WORTH_A_BIRTH:
                 continue
-            update, R = found.update, self.row.R_world_from_array
-            place_m = self.row.origin_m + R @ self._cells.position_m[cell]
-            moment = R @ self._cells.moment(cell, update.innovation, update.linear, update.row.used)
+            update = found.update
             ids = (*found.ids, self.first_id + born)
-            prior = self.with_sources(found.prior, place_m[None], moment[None])
+            prior = self.with_sources(found.prior, *self._at(cell, update.innovation, update.linear, update.row.used))
             start = joint_update(prior, update.row, _START_TRIALS).found
             # Where it is found, not where it was looked for, is what the next event starts from.
             prior = self.with_sources(found.prior, start.position_m[-1:], start.moment_Am2[-1:])
@@ -318,11 +316,16 @@ class RowProblem:
 
     def starts(self, prior: JointState, found: Explanation, left: FloatArray) -> Iterator[JointState]:
         """Predictions with another source at the cells that explain most of mean residuals (C,)."""
-        update, R = found.update, self.row.R_world_from_array
+        update = found.update
         for cell in self._cells.best(self._cells.energy(left), _LATE_STARTS):
-            place_m = self.row.origin_m + R @ self._cells.position_m[cell]
-            moment = R @ self._cells.moment(cell, _LEFT_SHARE * left, update.HL, update.row.used)
-            yield self.with_sources(prior, place_m[None], moment[None], _LATE_SPREAD)
+            source = self._at(cell, _LEFT_SHARE * left, update.HL, update.row.used)
+            yield self.with_sources(prior, *source, _LATE_SPREAD)
+
+    def _at(self, cell: int, left: FloatArray, linear: FloatArray, used: BoolArray) -> tuple[FloatArray, FloatArray]:
+        """Place and moment (1, 3) of the source in a cell that explains most of what is left."""
+        R = self.row.R_world_from_array
+        place_m = self.row.origin_m + R @ self._cells.position_m[cell]
+        return place_m[None], (R @ self._cells.moment(cell, left, linear, used))[None]
 
     def allows(self, state: JointState, row: JointRow, born: slice = slice(None)) -> bool:
         """Whether sources agree with what is known, and may be told from a fault and from the ambient field.

@@ -14,7 +14,7 @@ from scipy.optimize import linear_sum_assignment
 
 from arrays.typing import FloatArray
 from magloc.tracking.multi_target.measurement import JointRow
-from magloc.tracking.multi_target.smoothing import YoungTrack
+from magloc.tracking.multi_target.smoothing import MOST_ROWS, YoungTrack
 from magloc.tracking.multi_target.state import JointState
 from magloc.tracking.multi_target.update_compiled import fill_bends
 from magloc.tracking.sensor_health import SensorHealth
@@ -23,7 +23,7 @@ LARGEST_BEND = 0.5
 """By how many standard deviations of noise the readings may bend within one of the state."""
 STRAIGHT = 2.0
 """By how many they may bend within one of the optimum of all rows of a young track together."""
-REFITS = (3, 5, 8, 12, 18, 27, 40, 60, 90)
+REFITS = (3, 5, 8, 12, 18, 27, 40, 60, MOST_ROWS)
 """Rows since the last birth after which they are fitted together; behind the last of them a track is old."""
 MERGED_GAP = 1.0 / 3.0
 """Standard deviation of a gap over the gap above which two sources are merged."""

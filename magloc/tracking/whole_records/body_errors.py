@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from arrays.typing import FloatArray
+from magloc.chi_square import error_factor
 from magloc.fields.multipole import DEFAULT_LENGTH, N_BODY_ERRORS, finite_body_errors
 from magloc.measurement.differences import fields_at_sensors
 from magloc.tracking.measurement import RowMeasurement
@@ -60,8 +61,7 @@ def body_factor(tracker: Tracker, rows: Sequence[Row], points: Sequence[TrackPoi
     )
     S = steps[-1].S
     shift = S[:N_SOURCE] @ np.linalg.pinv(S[n : n + N_BODY_ERRORS])  # by errors that are taken for zero
-    share = np.trace(np.linalg.solve(used[-1][1], shift @ shift.T))
-    return math.sqrt(1.0 + float(share) / N_SOURCE)
+    return error_factor(used[-1][1], shift @ shift.T)
 
 
 def _nearest_m(measurement: RowMeasurement, source: FloatArray) -> float:

@@ -17,6 +17,7 @@ from scipy.special import chdtrc, ndtri
 from arrays.array import SensorArray
 from arrays.pose import PoseUncertainty
 from arrays.typing import BoolArray, FloatArray
+from magloc.chi_square import error_factor
 from magloc.localization.uncertainty.range_interval import relative_range_sigma
 from magloc.tracking.acquisition import START_RANGE_ERROR
 from magloc.tracking.motion import N_SOURCE
@@ -64,8 +65,7 @@ def constants_test(tracker: Tracker, rows: Sequence[Row], points: Sequence[Track
         return ConstantsTest(mounting)
     claimed, source, field = used[-1][1], steps[-1].S[:N_SOURCE], of_errors[1][errors.of_field]
     shift = source @ np.linalg.pinv(field)  # of the source by errors of unit variance that are taken for zero
-    factor = math.sqrt(1.0 + float(np.trace(np.linalg.solve(claimed, shift @ shift.T))) / N_SOURCE)
-    return ConstantsTest(mounting, _score(*of_errors, errors.of_field), factor)
+    return ConstantsTest(mounting, _score(*of_errors, errors.of_field), error_factor(claimed, shift @ shift.T))
 
 
 def _with_constants(array: SensorArray) -> SensorArray:
