@@ -190,11 +190,13 @@ class Fixes(Sequence[Fix]):
     @cached_property
     def body_factor(self) -> FloatArray:
         """How many times their standard deviations errors would be (n,), rms, of objects of `body_covariance`."""
-        factor = np.ones(len(self))
-        for i in np.flatnonzero(self.body_covariance.any(axis=(1, 2))).tolist():
-            solution = self.solutions.solution(int(self.best[i]))
-            n = len(solution.covariance)
-            factor[i] = error_factor(solution.covariance, self.body_covariance[i, :n, :n])
+        factor, added, columns = np.ones(len(self)), self.body_covariance, self.solutions
+        matter = np.flatnonzero(added.any(axis=(1, 2)))
+        size = columns.covariance.shape[1] // columns.position_m.shape[1]  # of one source
+        n_unknowns = size * columns.n_sources[self.best[matter]]
+        for n in np.unique(n_unknowns).tolist():
+            rows = matter[n_unknowns == n]
+            factor[rows] = error_factor(columns.covariance[self.best[rows], :n, :n], added[rows, :n, :n])
         return factor
 
     @property
