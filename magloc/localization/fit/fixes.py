@@ -87,9 +87,8 @@ class Fixes(Sequence[Fix]):
         if isinstance(row, slice):
             return [self[i] for i in range(*row.indices(len(self)))]
         i = range(len(self))[row]
-        begin, end = self._edges[i : i + 2].tolist()
         return Fix(
-            tuple(self.solutions.solution(j) for j in range(begin, end)),
+            tuple(self.solutions.solution(j) for j in self.of_row(i)),
             self.reason[i],
             bool(self.detected[i]),
             self.dropped_sensors[i],
@@ -100,6 +99,10 @@ class Fixes(Sequence[Fix]):
             float(self.body_length_m[i]),
             (self, i),
         )
+
+    def of_row(self, row: int) -> range:
+        """Which of `solutions` are those of a row."""
+        return range(int(self._edges[row]), int(self._edges[row + 1]))
 
     @cached_property
     def _edges(self) -> IntArray:
