@@ -23,6 +23,8 @@ AMBIENT_CHANNELS = ("ambient_x", "ambient_y", "ambient_z")
 _FARTHEST_M = 1e9
 _SAME_PLACE_RTOL = 1e-9
 _GRADIENT_RTOL = 1e-6
+# What an array knows of itself by its ambient field.
+_OF_AMBIENT_FIELD = ("_hash", "ambient_fields", "channel_ambient_T")
 
 
 @dataclass(frozen=True)
@@ -296,6 +298,17 @@ class SensorArray:
             fewest = "1" if self.common_field_T is not None else "2 where no common field is known"
             raise ValueError(f"Input sensors must be at least {fewest}; instead received {len(ids)}.")
         return replace(self, sensors=tuple(by_id[name] for name in ids))
+
+    def in_ambient_field(self, ambient_T: ArrayLike) -> SensorArray:
+        """The array in another known ambient field (3,) [T] at its origin, with all that is known of its sensors.
+
+        For the rows of a log, each of which has a field of its own: nothing is computed anew.
+        """
+        _ = self.channel_gain, self.channel_offset_T, self.channel_noise_T, self.circumradius
+        kept = {name: value for name, value in vars(self).items() if name not in _OF_AMBIENT_FIELD}
+        other = object.__new__(SensorArray)
+        vars(other).update(kept, ambient_T=tuple(_finite("ambient_T", ambient_T, (3,)).tolist()))
+        return other
 
     def readings_of(self, fields: ArrayLike) -> FloatArray:
         """Readings without noise.

@@ -43,9 +43,10 @@ def normalised_square(error: FloatArray, covariance: FloatArray) -> FloatArray:
         return np.asarray(np.sum(scaled * solved, axis=-1))
 
 
-def error_factor(claimed: FloatArray, added: FloatArray) -> float:
-    """How many times the standard deviations of a covariance (N, N) errors are, rms, to which another one is added."""
-    return math.sqrt(1.0 + float(np.trace(np.linalg.solve(claimed, added))) / len(claimed))
+def error_factor(claimed: FloatArray, added: FloatArray) -> FloatArray:
+    """How many times their standard deviations errors are, rms, where a covariance (..., N, N) is added to theirs."""
+    ratio = np.linalg.solve(claimed, added)
+    return np.asarray(np.sqrt(1.0 + np.trace(ratio, axis1=-2, axis2=-1) / claimed.shape[-1]))
 
 
 class Detector(Protocol):

@@ -226,10 +226,10 @@ def _windows(time_s: FloatArray, s: FloatArray, used: BoolArray, window_s: float
     if not switches.size:
         return []
     at = 0.5 * (time_s[switches] + time_s[switches + 1])
-    away = np.abs(time_s[:, None] - at)
-    nearest = np.where(used & (away.min(axis=1) <= window_s), away.argmin(axis=1), -1)
-    rows = [np.flatnonzero(nearest == switch) for switch in range(len(switches))]
-    return [of_switch for of_switch in rows if len(of_switch) >= _LEAST_ROWS]
+    nearest = np.searchsorted(0.5 * (at[:-1] + at[1:]), time_s)
+    rows = np.flatnonzero(used & (np.abs(time_s - at[nearest]) <= window_s))
+    of_switches = np.split(rows, np.searchsorted(nearest[rows], np.arange(1, len(at))))
+    return [of_switch for of_switch in of_switches if len(of_switch) >= _LEAST_ROWS]
 
 
 def _turns(time_s: FloatArray, gyro_rad_s: FloatArray) -> FloatArray:

@@ -15,7 +15,7 @@ import os
 import shlex
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -248,6 +248,17 @@ def print_json(value: object) -> None:
     import msgspec
 
     print(msgspec.json.encode(value, enc_hook=lambda array: array.tolist()).decode())
+
+
+def print_json_list(name: str, entries: Iterable[object]) -> None:
+    """Print a JSON object with one list whose entries are made one by one: those of a long file are never all there."""
+    import msgspec
+
+    encoder = msgspec.json.Encoder(enc_hook=lambda array: array.tolist())
+    print(f'{{"{name}":[', end="")
+    for i, entry in enumerate(entries):
+        print("," if i else "", encoder.encode(entry).decode(), sep="", end="")
+    print("]}")
 
 
 def print_result(result: object, lines: Sequence[str], *, as_json: bool) -> None:

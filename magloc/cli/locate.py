@@ -16,7 +16,7 @@ from arrays.io.arguments import Flag
 from arrays.io.errors import InputError
 from arrays.io.outputs import refuse_file
 from arrays.typing import Vector
-from magloc.cli.framework import CommonOptions, print_json, progress
+from magloc.cli.framework import CommonOptions, print_json_list, progress
 from magloc.cli.options import KnownOptions, ambient_field, number_of_sources, print_note
 
 if TYPE_CHECKING:
@@ -108,7 +108,7 @@ def locate(
     common : CommonOptions
         Common options.
     """
-    from magloc.localization.files import json_of_fixes
+    from magloc.localization.files import entries_of_fixes
     from magloc.localization.fit.table import lines_of_fixes
     from magloc.localization.locator import used_rows
     from magloc.truth import truth_of_rows
@@ -155,7 +155,7 @@ def locate(
         raise InputError(f"{option or array}: {sentence}{_advice(sentence, used)}") from None
 
     if json:
-        print_json(json_of_fixes(fixes, joint=joint))
+        print_json_list("results", entries_of_fixes(fixes, joint=joint))
     else:
         print("\n".join(lines_of_fixes(fixes, joint=joint)))
     reasons = counted_reasons(reason for reason, solved in zip(fixes.reason, fixes.solved, strict=True) if not solved)

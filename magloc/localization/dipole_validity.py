@@ -6,7 +6,7 @@ The patterns that are looked for, quadrupole and octupole, are derived in docs/t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -212,6 +212,6 @@ def too_near(
     for i in doubtful.nonzero()[0].tolist():
         row, place, moment = alone[i], solutions.position_m[best[i], 0], solutions.moment_Am2[best[i], 0]
         used = ~np.isin(array.ids, fixes.dropped_sensors[row])[array.channel_sensor]
-        of_row = array if ambient_T is None else replace(array, ambient_T=tuple(ambient_T[row].tolist()))
+        of_row = array if ambient_T is None else array.in_ambient_field(ambient_T[row])
         near[row] = nearness_test(of_row, place, moment, np.where(used, readings_T[row], np.nan)).extended
     return near

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 from magloc.localization.fit.fixes import BODY_MATTERS, Fixes
 from magloc.localization.fit.results import Fix, Solution, Source
 
 
-def json_of_fixes(fixes: Fixes, *, joint: bool) -> dict[str, object]:
-    """What ``magloc locate --json`` prints; `joint`: every solution has a list of its sources, also for one."""
-    return {"results": [_entry(fix, joint) for fix in fixes]}
+def entries_of_fixes(fixes: Fixes, *, joint: bool) -> Iterator[dict[str, object]]:
+    """Results that ``magloc locate --json`` prints; `joint`: every solution has a list of its sources, also for one."""
+    for fix, misfit, factor in zip(fixes, fixes.misfit.tolist(), fixes.body_factor.tolist(), strict=True):
+        yield _entry(fix, joint=joint, misfit=misfit, body_factor=factor)
 
 
-def _entry(fix: Fix, joint: bool) -> dict[str, object]:
+def _entry(fix: Fix, *, joint: bool, misfit: bool, body_factor: float) -> dict[str, object]:
     entry: dict[str, object] = {
         "time_s": fix.time_s,
         "detected": fix.detected,
@@ -22,9 +25,9 @@ def _entry(fix: Fix, joint: bool) -> dict[str, object]:
         "dropped_sensors": fix.dropped_sensors,
         "saturated_channels": fix.saturated_channels,
         "too_near": fix.too_near,
-        "misfit": fix.misfit,
+        "misfit": misfit,
         "body_length_m": fix.body_length_m,
-        "body_factor": fix.body_factor if fix.body_factor > BODY_MATTERS else None,
+        "body_factor": body_factor if body_factor > BODY_MATTERS else None,
     }
     return entry | {name: value for name, value in flags.items() if value}
 

@@ -425,4 +425,7 @@ def used_rows(
 def _saturated_channels(measured: Readings, rows: Readings, array: SensorArray) -> list[tuple[str, ...]]:
     """Names of the channels that saturate, for every row."""
     lost = np.isfinite(measured.values_T) & ~np.isfinite(rows.values_T)
-    return [tuple(array.channel_names[channel] for channel in np.flatnonzero(row)) for row in lost]
+    names: list[tuple[str, ...]] = [()] * len(lost)
+    for row in np.flatnonzero(lost.any(axis=1)).tolist():
+        names[row] = tuple(array.channel_names[channel] for channel in np.flatnonzero(lost[row]))
+    return names

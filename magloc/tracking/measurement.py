@@ -229,8 +229,7 @@ class RowMeasurements:
         """What a row's readings say of the state."""
         array = self._array
         if row.ambient_T is not None:
-            x, y, z = row.ambient_T.tolist()
-            array = replace(array, ambient_T=(x, y, z))
+            array = array.in_ambient_field(row.ambient_T)
         differences = self.differences(row)
         sigma = np.sqrt(differences.variance)
         pose = row.pose(self._lever_arm_m)

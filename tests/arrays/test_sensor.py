@@ -12,6 +12,7 @@ from __future__ import annotations
 import copy
 import pickle
 from dataclasses import FrozenInstanceError, replace
+from functools import cached_property
 
 import magpylib
 import numpy as np
@@ -376,6 +377,21 @@ class TestSensorArray:
     def test_sensors_of_any_iterable(self, mixed: SensorArray) -> None:
         assert SensorArray(list(mixed.sensors)).sensors == mixed.sensors
         assert SensorArray(sensor for sensor in mixed.sensors).sensors == mixed.sensors
+
+    def test_in_another_ambient_field_it_is_as_made_there(self, mixed: SensorArray) -> None:
+        """Whatever it has computed of itself before."""
+        mixed = replace(mixed, ambient_T=(1e-6, 0.0, 0.0), ambient_gradient_T_m=np.diag([1e-9, 1e-9, -2e-9]).tolist())
+        cached = [name for name, value in vars(SensorArray).items() if isinstance(value, cached_property)]
+        for name in cached:
+            getattr(mixed, name)
+        field_T = np.array([2e-5, -1e-5, 4e-5])
+        other, made = mixed.in_ambient_field(field_T), replace(mixed, ambient_T=tuple(field_T.tolist()))
+        assert other == made == pickle.loads(pickle.dumps(other))
+        assert other != mixed
+        for name in cached:
+            assert_array_equal(getattr(other, name), getattr(made, name), err_msg=name)
+        with pytest.raises(ValueError, match="ambient_T"):
+            mixed.in_ambient_field([np.nan, 0.0, 0.0])
 
     def test_subset(self, mixed: SensorArray) -> None:
         pair = mixed.subset(["c", "a"])

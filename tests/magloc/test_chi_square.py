@@ -24,3 +24,5 @@ def test_the_factor_is_that_of_drawn_errors() -> None:
     errors = rng.multivariate_normal(np.zeros(3), claimed + added, size=200_000)
     nees = normalised_square(errors, claimed[None]).mean() / 3.0
     np.testing.assert_allclose(error_factor(claimed, added), np.sqrt(nees), rtol=0.01)
+    twice = error_factor(np.stack([claimed, added]), np.stack([added, claimed]))
+    np.testing.assert_allclose(twice, [error_factor(claimed, added), error_factor(added, claimed)], rtol=1e-12)

@@ -14,7 +14,7 @@ from cyclopts import Parameter
 
 import magloc
 from arrays.io.errors import InputError, naming
-from magloc.cli.framework import print_json, progress
+from magloc.cli.framework import print_json, print_json_list, progress
 from magloc.cli.options import MotionOptions, number_of_sources, print_note, refuse_not_positive
 
 if TYPE_CHECKING:
@@ -142,7 +142,7 @@ def follow_sources(
             told=wanted.printed if jsonl else None,
         )
     if json:
-        print_json({"results": [json_of_sources(point, single=wanted.sources == 1) for point in found]})
+        print_json_list("results", (json_of_sources(point, single=wanted.sources == 1) for point in found))
     if not found.ids:
         raise no_source(name, found)
     if outputs.out is not None:

@@ -87,9 +87,8 @@ class Fixes(Sequence[Fix]):
         if isinstance(row, slice):
             return [self[i] for i in range(*row.indices(len(self)))]
         i = range(len(self))[row]
-        begin, end = self._edges[i : i + 2].tolist()
         return Fix(
-            tuple(self.solutions.solution(j) for j in range(begin, end)),
+            tuple(self.solutions.solution(j) for j in self.of_row(i)),
             self.reason[i],
             bool(self.detected[i]),
             self.dropped_sensors[i],
@@ -100,6 +99,10 @@ class Fixes(Sequence[Fix]):
             float(self.body_length_m[i]),
             (self, i),
         )
+
+    def of_row(self, row: int) -> range:
+        """Which of `solutions` are those of a row."""
+        return range(int(self._edges[row]), int(self._edges[row + 1]))
 
     @cached_property
     def _edges(self) -> IntArray:
@@ -190,11 +193,13 @@ class Fixes(Sequence[Fix]):
     @cached_property
     def body_factor(self) -> FloatArray:
         """How many times their standard deviations errors would be (n,), rms, of objects of `body_covariance`."""
-        factor = np.ones(len(self))
-        for i in np.flatnonzero(self.body_covariance.any(axis=(1, 2))).tolist():
-            solution = self.solutions.solution(int(self.best[i]))
-            n = len(solution.covariance)
-            factor[i] = error_factor(solution.covariance, self.body_covariance[i, :n, :n])
+        factor, added, columns = np.ones(len(self)), self.body_covariance, self.solutions
+        matter = np.flatnonzero(added.any(axis=(1, 2)))
+        size = columns.covariance.shape[1] // columns.position_m.shape[1]  # of one source
+        n_unknowns = size * columns.n_sources[self.best[matter]]
+        for n in np.unique(n_unknowns).tolist():
+            rows = matter[n_unknowns == n]
+            factor[rows] = error_factor(columns.covariance[self.best[rows], :n, :n], added[rows, :n, :n])
         return factor
 
     @property

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from arrays.typing import FloatArray
+from magloc.localization.fit.results import intervals_of, is_observable_set
 
 if TYPE_CHECKING:
     from magloc.localization.fit.fixes import Fixes
-    from magloc.localization.fit.results import Fix, Source
 
 _WIDTH = 100
 _MILLIMETRES_BELOW_M = 1.0
@@ -46,15 +46,14 @@ def lines_of_fixes(fixes: Fixes, *, joint: bool | None = None, most: int | None 
         "flags",
     ]
     rows, reasons, middle = [header], [""], 0
-    for place, fix in enumerate(fixes[i] for i in shown):
+    for place, (i, cells) in enumerate(zip(shown, _cells_of_rows(fixes, shown, per_m, decimals), strict=True)):
         middle = len(rows) if place == len(shown) // 2 else middle
-        sources = fix.best.sources if fix.solutions else ()
-        if not sources:
-            rows.append([f"{fix.time_s:.10g}"])
-            reasons.append(fix.reason)
-        for k, source in enumerate(sources):
-            cells = _cells(fix, source, per_m, decimals)
-            rows.append([f"{fix.time_s:.10g}", *([str(k + 1)] if joint else []), *cells])
+        time = f"{fixes.time_s[i]:.10g}"
+        if not cells:
+            rows.append([time])
+            reasons.append(fixes.reason[i])
+        for k, of_source in enumerate(cells):
+            rows.append([time, *([str(k + 1)] if joint else []), *of_source])
             reasons.append("")
     widths = [max(len(row[i]) for row in rows if i < len(row)) for i in range(len(header) - 1)]
     lines = []
@@ -69,53 +68,76 @@ def lines_of_fixes(fixes: Fixes, *, joint: bool | None = None, most: int | None 
     return lines
 
 
-def _cells(fix: Fix, source: Source, per_m: float, decimals: int) -> list[str]:
-    best, others = fix.best, len(fix.solutions) - 1
-    covariance = np.zeros((6, 6)) if source.covariance is None else source.covariance
-    deviations = np.sqrt(np.diagonal(covariance))
-    of_position = deviations[:3] if deviations.size == 6 else np.zeros(3)
-    flags = [
-        *(_of_uncertainty(source, misfit=fix.misfit) if fix.detected else ["weak"]),
-        *([f"+{others}({100.0 * best.weight:.0f}%)"] if others else []),
-        *(["misfit"] if fix.misfit else []),
-        *(["merged"] if source.merged else []),
-        *(["near"] if fix.too_near else []),
-        *(f"-{name}" for name in fix.dropped_sensors),
-    ]
-    return [
-        *(f"{value * per_m:.{decimals}f}" for value in source.position_m),
-        *(_two_digits(value * per_m) for value in of_position),
-        *cells_of_strength(source.moment_Am2, covariance[-3:, -3:]),
-        f"{best.chi2:.1f}/{best.dof}",
-        _intervals(source.range_interval_m, per_m),
-        ",".join(flags),
-    ]
+def _cells_of_rows(fixes: Fixes, shown: list[int], per_m: float, decimals: int) -> Iterator[list[list[str]]]:
+    """Cells of the sources of the best solution of some rows."""
+    solved = [i for i in shown if fixes.solved[i]]
+    best = fixes.solutions.chosen(fixes.best[solved])
+    blocks = best.covariance_of_source
+    deviations = np.sqrt(np.einsum("fkii->fki", blocks))
+    of_position = deviations[..., :3] if deviations.shape[-1] == 6 else np.zeros(best.position_m.shape)
+    strengths, spreads = _strengths(best.moment_Am2, blocks[..., -3:, -3:])
+    place, misfit = dict(zip(solved, range(len(solved)), strict=True)), fixes.misfit
+    for i in shown:
+        j = place.get(i)
+        if j is None:
+            yield []
+            continue
+        others = len(fixes.of_row(i)) - 1
+        of_row = [
+            *([f"+{others}({100.0 * best.weight[j]:.0f}%)"] if others else []),
+            *(["misfit"] if misfit[i] else []),
+        ]
+        behind = [*(["near"] if fixes.too_near[i] else []), *(f"-{name}" for name in fixes.dropped_sensors[i])]
+        cells = []
+        for k in range(best.n_sources[j]):
+            intervals = intervals_of(best.ranges[j, k])
+            uncertain = ["weak"]
+            if fixes.detected[i]:
+                uncertain = _of_uncertainty(is_observable_set(intervals), bool(best.gaussian[j, k] or misfit[i]))
+            flags = [*uncertain, *of_row, *(["merged"] if best.merged[j, k] else []), *behind]
+            cells.append(
+                [
+                    *(f"{value * per_m:.{decimals}f}" for value in best.position_m[j, k].tolist()),
+                    *(_two_digits(value * per_m) for value in of_position[j, k].tolist()),
+                    *_cells_of_strength(float(strengths[j, k]), float(spreads[j, k])),
+                    f"{best.chi2[j]:.1f}/{best.dof[j]}",
+                    _intervals(intervals, per_m),
+                    ",".join(flags),
+                ]
+            )
+        yield cells
 
 
 def cells_of_strength(moment_Am2: FloatArray, covariance: FloatArray) -> tuple[str, str]:
     """Modulus of a moment, and its standard deviation by the covariance (3, 3) of the moment."""
-    strength = float(np.linalg.norm(moment_Am2))
-    spread = float(np.sqrt(np.trace(covariance)))
-    if strength <= 1e-6 * spread:  # the mean of two moments that differ in sign has no direction
-        return "0", _two_digits(spread)
-    along = moment_Am2 / strength
-    return f"{strength:.4g}", _two_digits(float(np.sqrt(along @ covariance @ along)))
+    return _cells_of_strength(*map(float, _strengths(moment_Am2, covariance)))
 
 
-def _of_uncertainty(source: Source, *, misfit: bool) -> list[str]:
-    """What has to be said of the standard deviations; of a misfit that alone."""
-    if not source.range_observable:
+def _strengths(moment_Am2: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Moduli (...) of moments (..., 3), and their standard deviations; 0 for the mean of two that differ in sign."""
+    strength = np.linalg.norm(moment_Am2, axis=-1)
+    spread = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1))
+    has_direction = strength > 1e-6 * spread
+    along = moment_Am2 / np.where(has_direction, strength, 1.0)[..., None]
+    sigma = np.sqrt(np.einsum("...i,...ij,...j->...", along, covariance, along))
+    return np.where(has_direction, strength, 0.0), np.where(has_direction, sigma, spread)
+
+
+def _cells_of_strength(strength: float, sigma: float) -> tuple[str, str]:
+    return f"{strength:.4g}", _two_digits(sigma)
+
+
+def _of_uncertainty(observable: bool, described: bool) -> list[str]:
+    """What has to be said of the standard deviations: described is a misfit, too, of which that alone is said."""
+    if not observable:
         return ["range?"]
-    return [] if source.gaussian or misfit else ["bent"]
+    return [] if described else ["bent"]
 
 
 def _two_digits(value: float) -> str:
     """Two significant digits, without an exponent where that is short."""
-    if value == 0.0:
-        return "0"
-    if not 1e-3 <= value < 1e5:
-        return f"{value:.1e}"
-    return np.format_float_positional(value, precision=2, unique=False, fractional=False, trim="-")
+    text = f"{value:.1e}"
+    return f"{float(text):g}" if value == 0.0 or 1e-3 <= value < 1e5 else text
 
 
 def _intervals(intervals: Sequence[tuple[float, float | None]], per_m: float) -> str:

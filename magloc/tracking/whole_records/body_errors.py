@@ -61,7 +61,7 @@ def body_factor(tracker: Tracker, rows: Sequence[Row], points: Sequence[TrackPoi
     )
     S = steps[-1].S
     shift = S[:N_SOURCE] @ np.linalg.pinv(S[n : n + N_BODY_ERRORS])  # by errors that are taken for zero
-    return error_factor(used[-1][1], shift @ shift.T)
+    return float(error_factor(used[-1][1], shift @ shift.T))
 
 
 def _nearest_m(measurement: RowMeasurement, source: FloatArray) -> float:

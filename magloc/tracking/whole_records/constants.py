@@ -65,7 +65,7 @@ def constants_test(tracker: Tracker, rows: Sequence[Row], points: Sequence[Track
         return ConstantsTest(mounting)
     claimed, source, field = used[-1][1], steps[-1].S[:N_SOURCE], of_errors[1][errors.of_field]
     shift = source @ np.linalg.pinv(field)  # of the source by errors of unit variance that are taken for zero
-    return ConstantsTest(mounting, _score(*of_errors, errors.of_field), error_factor(claimed, shift @ shift.T))
+    return ConstantsTest(mounting, _score(*of_errors, errors.of_field), float(error_factor(claimed, shift @ shift.T)))
 
 
 def _with_constants(array: SensorArray) -> SensorArray:

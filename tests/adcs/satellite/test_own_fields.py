@@ -8,11 +8,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from adcs.kalman.error_state import FilterSettings, ProcessNoise, sensor_set, start_near
 from adcs.kalman.mekf import run_filter
-from adcs.satellite.own_fields import OwnFields, find_own_fields
+from adcs.satellite.own_fields import WINDOW_S, OwnFields, _windows, find_own_fields
 from sims.attitude.simulation import start_estimates
 from sims.experiments import accuracy
 from sims.experiments.loads import LOADS, NOISE_T, LoadsRun, switching_loads
@@ -128,6 +130,21 @@ def test_the_attitude_is_that_of_the_quiet_satellite() -> None:
     assert np.sqrt(np.mean(np.square(cleaned))) < 1.05 * np.sqrt(np.mean(np.square(quiet)))
     assert np.mean(nees) < 1.3
     assert min(as_read) > 3.0
+
+
+@given(st.integers(0, 10_000))
+def test_a_row_belongs_to_the_nearest_switch(seed: int) -> None:
+    """As every distance compared with every other says, which a long log has no memory for."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(20, 200))
+    times, used = np.cumsum(rng.choice([0.5, 1.0, 3.0], n)), rng.random(n) < 0.9
+    states = np.cumsum(rng.random((n, 2)) < 0.05, axis=0) % 2.0
+    changed = np.flatnonzero(np.diff(states, axis=0).any(axis=1))
+    away = np.abs(times[:, None] - 0.5 * (times[changed] + times[changed + 1]))
+    near = used & (away.min(axis=1, initial=math.inf) <= WINDOW_S)
+    rows = [np.flatnonzero(near & (away.argmin(axis=1) == k)) for k in range(len(changed))]
+    expected = [of_switch.tolist() for of_switch in rows if len(of_switch) >= 6]
+    assert [of_switch.tolist() for of_switch in _windows(times, states, used, WINDOW_S)] == expected
 
 
 class TestRefusals:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -13,6 +14,7 @@ import pytest
 
 from arrays import read_array
 from arrays.io.errors import InputError
+from magloc.cli.framework import print_json_list
 from tests.command_line import Outcome, Run, assert_refused
 
 COMMANDS = (
@@ -151,6 +153,18 @@ class TestMissingExtra:
     def test_a_fix_needs_none(self, recording: tuple[Path, Path]) -> None:
         readings, array = recording
         assert without(list(EXTRAS), "locate", readings, "--array", array, "--quiet").status == 0
+
+
+class TestJsonLists:
+    @pytest.mark.parametrize("n", [0, 1, 3])
+    def test_are_what_one_value_would_be(self, n: int, capsys: pytest.CaptureFixture[str]) -> None:
+        """The oracle is Python's own encoder."""
+        entries = [{"x": [0.5, None], "µ": "ä"}] * n
+        print_json_list("results", iter(entries))
+        assert (
+            capsys.readouterr().out
+            == json.dumps({"results": entries}, separators=(",", ":"), ensure_ascii=False) + "\n"
+        )
 
 
 class TestCommonOptions:
