@@ -23,7 +23,7 @@ from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.chi_square import energy_threshold
 from magloc.levels import CREDIBLE_ROW, MISFIT, SENSOR_FALSE_ALARM
 from magloc.localization.fit.fixes import Fixes
-from magloc.localization.fit.gauss_newton import JointFits, refine
+from magloc.localization.fit.gauss_newton import JointFits, first_alike, refine
 from magloc.localization.fit.results import Fix
 from magloc.localization.model_errors import model_errors
 from magloc.localization.search.multi_source import NOISE_ALONE
@@ -45,6 +45,8 @@ _BEYOND_DOUBT = 10.0
 # A fix that explains the other sensors badly must be better by this factor in χ² per degree of freedom.
 _INCOMPARABLE = 1000.0
 _N_REWEIGHTINGS = 30
+# Fits of a row of which this is the difference, of the weights in themselves, end as one.
+_SAME_PLACE, _SAME_WEIGHT = 0.01, 0.05
 # Sensors of an array of which every two are left out in turn, and every one: of a larger one where a fit blames them.
 _MOST_IN_PAIRS, _MOST_ONE_BY_ONE = 8, 16
 # Fits without one sensor that are kept of a row.
@@ -58,7 +60,8 @@ _LONELY = 0.9
 _UNSEEN = 1e-13
 # Median of χ²/n of three degrees of freedom.
 _MEDIAN_RATIO = 0.789
-_ROWS_AT_ONCE = 64
+# Rows, and fits of them, whose numbers a processor's cache holds.
+_ROWS_AT_ONCE, _FITS_AT_ONCE = 64, 64
 
 
 Weighted = tuple[WhitenedModel, FloatArray]
@@ -175,19 +178,16 @@ class _Examination:
 
     def allow_for_model_errors(self, plain: Sequence[Fix]) -> None:
         """Count as noise what bodies and the ambient field add to the fixes: no sensor is to be accused of it."""
-        errors = []
         sigma_T = self.array.row_ambient_uncertainty_T if self.array.channel_is_scalar.any() else 0.0
-        for row, fix in enumerate(plain):
-            if fix.solutions and (fix.body_length_m > 0.0 or sigma_T):
-                q, mu = self._scaled(fix)
-                lengths = np.full((1, len(q)), fix.body_length_m)
-                at = self.problem.rows(np.array([row]))
-                errors.append((row, model_errors(at, q[None], mu[None], lengths, sigma_T)[0]))
+        length_m = np.array([fix.body_length_m for fix in plain])
+        errors = []
+        for rows, q, mu in self._by_count([(row, fix) for row, fix in enumerate(plain) if length_m[row] or sigma_T]):
+            lengths = np.tile(length_m[rows, None], q.shape[1])
+            errors.append((rows, model_errors(self.problem.rows(rows), q, mu, lengths, sigma_T)))
         if errors:
-            widest = max(columns.shape[1] for _, columns in errors)
-            every = np.zeros((len(plain), self.raw.shape[1], widest))
-            for row, columns in errors:
-                every[row, :, : columns.shape[1]] = columns
+            every = np.zeros((len(plain), self.raw.shape[1], max(columns.shape[2] for _, columns in errors)))
+            for rows, columns in errors:
+                every[rows, :, : columns.shape[2]] = columns
             self.problem = self.problem.marginalised(every)
 
     def without_lonely_sources(self, plain: Sequence[Fix]) -> list[Fix]:
@@ -397,22 +397,27 @@ class _Examination:
         """Squared residuals (f, N) of the sensors after reweighting from starts, and the scale of the noise."""
         owner, q, mu, weight = self.array.channel_sensor, q.copy(), mu.copy(), weight.copy()
         misfit, scale2 = np.empty(weight.shape), np.empty(len(row))
-        live = np.arange(len(row))
-        lighter = weighted(self.problem.rows(row), self.raw[row], weight[:, owner])
-        for last in range(_N_REWEIGHTINGS, -1, -1):
-            misfit[live] = self._squares(lighter, q[live], mu[live], weight[live])
+        live = twin = np.arange(len(row))
+        for n in range(_N_REWEIGHTINGS + 1):
+            for some in np.array_split(live, -(-live.size // _FITS_AT_ONCE)):
+                lighter = weighted(self.problem.rows(row[some]), self.raw[row[some]], weight[some][:, owner])
+                if n:
+                    fits = self._refined(lighter, q[some], mu[some], max_iterations=8)
+                    q[some], mu[some] = fits.q, fits.mu
+                misfit[some] = self._squares(lighter, q[some], mu[some], weight[some])
             scale2[live] = self._scale2(misfit[live])
             new = (DEGREES_OF_FREEDOM + self.count) / (DEGREES_OF_FREEDOM + misfit[live] / scale2[live, None])
             new = np.clip(new, _LEAST_WEIGHT, None)
             moved = np.any(np.abs(new - weight[live]) >= 1e-3 * weight[live], axis=1)
             live = live[moved]
-            if not live.size or not last:
-                break
             weight[live] = new[moved]
-            lighter = weighted(self.problem.rows(row[live]), self.raw[row[live]], weight[live][:, owner])
-            fits = self._refined(lighter, q[live], mu[live], max_iterations=8)
-            q[live], mu[live] = fits.q, fits.mu
-        return misfit, scale2
+            twin = np.minimum(twin, first_alike(row, q, weight, _SAME_PLACE, _SAME_WEIGHT))
+            live = live[twin[live] == live]
+            if not live.size:
+                break
+        while not np.array_equal(twin[twin], twin):
+            twin = twin[twin]
+        return misfit[twin], scale2[twin]
 
     def _refined(self, lighter: Weighted, q: FloatArray, mu: FloatArray, max_iterations: int = 60) -> JointFits:
         """Fits of weighted rows (f,) from sources (f, K, …)."""
