@@ -27,6 +27,7 @@ from magloc.fields import dipole
 from magloc.localization import reweighting
 from magloc.localization.fault_exclusion import _Examination
 from magloc.localization.locator import Locator, locate
+from magloc.localization.reweighting import WeightedFits
 from magloc.measurement.differences import predicted_channels
 from magloc.measurement.rows import whitened_rows
 from magloc.readings import Readings, read_readings
@@ -288,8 +289,8 @@ class TestStartsThatMeet:
         readings += 1e3 * NOISE * np.isin(CUBE.channel_sensor, [0, 3]) * (1.0 + np.arange(24) % 5)
         readings += 50.0 * NOISE * (CUBE.channel_sensor == which[:, None])
         refined = Locator(CUBE).fit_rows(readings)
-        plain, fits = _Examination._refined, []
-        monkeypatch.setattr(_Examination, "_refined", lambda *of, **to: fits.append(len(of[2])) or plain(*of, **to))
+        plain, fits = WeightedFits._refined, []
+        monkeypatch.setattr(WeightedFits, "_refined", lambda *of, **to: fits.append(len(of[2])) or plain(*of, **to))
         Locator(CUBE).fit_rows(readings)
         met = sum(fits)
         fits.clear()
