@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import atexit
 import gc
+import inspect
 import logging
 import os
 import shutil
@@ -20,7 +21,7 @@ import tempfile
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from functools import cache, partial
+from functools import cache, cached_property, partial
 from itertools import pairwise
 from typing import Any, TypeVar, cast
 
@@ -80,10 +81,43 @@ for _listener in (_Announcement(), _GarbageWaits(), compiler.QuickTyping(), comp
 
 
 _NumbasCache: Any = caching.FunctionCache  # which has no types
+_NumbasFiles: Any = caching.IndexDataCacheFile
+
+
+def _made_of(kernel: Any) -> tuple[Any, ...]:
+    """Stamps of the files of all kernels that one calls, and the numbers that are compiled into them."""
+    files, numbers, known, left = {}, [], {kernel}, [kernel]
+    while left:
+        function = left.pop()
+        path, variables = function.__code__.co_filename, inspect.getclosurevars(function)
+        with suppress(OSError):
+            status = os.stat(path)
+            files[os.path.basename(path), function.__module__] = status.st_mtime, status.st_size
+        for name, value in {**variables.globals, **variables.nonlocals}.items():
+            called = getattr(value, "py_func", None)
+            if called is not None and called not in known:
+                known.add(called)
+                left.append(called)
+            elif isinstance(value, int | float | np.generic):
+                numbers.append((function.__qualname__, name, repr(value)))
+    return tuple(sorted(files.items())), tuple(sorted(numbers))
 
 
 class _Cache(_NumbasCache):  # type: ignore[misc]
-    """numba's cache of a function, but a damaged file is compiled anew, and one that cannot be written is no error."""
+    """numba's cache of a function, but a damaged file is compiled anew, and one that cannot be written is no error.
+
+    numba looks for changes in the function's own file alone; here those of what it calls count, too.
+    """
+
+    def __init__(self, py_func: Any) -> None:
+        super().__init__(py_func)
+        del self._cache_file
+
+    @cached_property
+    def _cache_file(self) -> Any:
+        """The index, once all that the function calls is defined."""
+        stamp = self._impl.locator.get_source_stamp(), _made_of(self._py_func)
+        return _NumbasFiles(self._cache_path, self._impl.filename_base, stamp)
 
     def load_overload(self, *arguments: Any) -> Any:
         """What was compiled for these types, if it is there and whole."""

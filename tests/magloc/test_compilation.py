@@ -109,6 +109,21 @@ def test_cut_short(kept: Path, ending: str, share: float) -> None:
     assert call(kept) == ("6.0 1", "")
 
 
+@pytest.mark.slow_after(1)
+@pytest.mark.parametrize("of", ["function", "number"])
+def test_what_a_kernel_calls_has_changed(of: str, tmp_path: Path) -> None:
+    """In a file of its own, at which numba does not look."""
+    kernels = MODULE.replace("    return 2.0 * x", "    return other(x) * FACTOR")
+    (tmp_path / "kernels.py").write_text(f"from numbers_of import FACTOR\nfrom others import other\n{kernels}")
+    (tmp_path / "numbers_of.py").write_text("FACTOR = 2.0\n")
+    (tmp_path / "others.py").write_text(MODULE.split("@compiled")[0] + "@compiled\ndef other(x):\n    return 1.0 * x\n")
+    assert call(tmp_path) == ("6.0 0", "")
+    assert call(tmp_path) == ("6.0 1", "")
+    changed = tmp_path / ("others.py" if of == "function" else "numbers_of.py")
+    changed.write_text(changed.read_text().replace("1.0", "10.0").replace("2.0", "20.0"))
+    assert call(tmp_path) == ("42.0 0", "")
+
+
 def test_nowhere_to_keep_it(folder: Path) -> None:
     """As where package and home are read only; a folder for this process alone, which it removes."""
     (folder / "tmp").mkdir()
