@@ -16,16 +16,16 @@ from itertools import combinations
 from typing import Protocol
 
 import numpy as np
-from scipy.special import chdtri, fdtri
+from scipy.special import chdtri
 
 from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.chi_square import energy_threshold
 from magloc.levels import CREDIBLE_ROW, MISFIT, SENSOR_FALSE_ALARM
 from magloc.localization.fit.fixes import Fixes
-from magloc.localization.fit.gauss_newton import JointFits, refine
 from magloc.localization.fit.results import Fix
 from magloc.localization.model_errors import model_errors
+from magloc.localization.reweighting import DEGREES_OF_FREEDOM, LEAST_WEIGHT, WeightedFits
 from magloc.localization.search.multi_source import NOISE_ALONE
 from magloc.measurement.rows import (
     NO_SIGNAL,
@@ -35,33 +35,26 @@ from magloc.measurement.rows import (
 )
 from magloc.measurement.whitened import WhitenedModel
 
-DEGREES_OF_FREEDOM = 4.0
 # Above this χ² per degree of freedom a bad sensor may have bent the fit so much that it does not stand out.
 _SPOILT = 4.0
-# Above this variance, in units of what is stated, the noise is taken to be larger than stated.
-_UNDERSTATED = 2.0
 # Squared residuals, in limits, above which a larger one says nothing more.
 _BEYOND_DOUBT = 10.0
 # A fix that explains the other sensors badly must be better by this factor in χ² per degree of freedom.
 _INCOMPARABLE = 1000.0
-_N_REWEIGHTINGS = 30
 # Sensors of an array of which every two are left out in turn, and every one: of a larger one where a fit blames them.
 _MOST_IN_PAIRS, _MOST_ONE_BY_ONE = 8, 16
-# Fits without one sensor that are kept of a row.
-_MOST_REFINED = 3
+# Fits without one sensor that are refined, of those that should have the lowest χ², and that are kept of a row.
+_MOST_REFINED, _MOST_KEPT = 6, 3
+# Share of the largest fall of χ² below which that without another sensor does not matter beside it.
+_MATTERS = 0.05
+# Share of a sensor's readings, along any direction, that the others check: below the larger one a fit without it is
+# refined, whatever it promises; one that bends a fit, and draws a source to itself, leaves less than the smaller one.
+_HALF_CHECKED, _LEAST_CHECKED = 0.5, 0.1
 # Sensors of a larger array without which an optimum is searched for anew, of those that a fit blames.
 _MOST_SEARCHED = 2
-_LEAST_WEIGHT = 1e-16
 # Share of a source's energy in one sensor above which no other sensor sees it.
 _LONELY = 0.9
-# Columns of the common field whose squares are smaller than this against the largest are none.
-_UNSEEN = 1e-13
-# Median of χ²/n of three degrees of freedom.
-_MEDIAN_RATIO = 0.789
-_ROWS_AT_ONCE = 64
-
-
-Weighted = tuple[WhitenedModel, FloatArray]
+_ROWS_AT_ONCE = 64  # whose numbers a processor's cache holds
 
 
 class Refit(Protocol):
@@ -165,30 +158,35 @@ class _Examination:
     ) -> None:
         self.array, self.readings, self.ambient = array, readings, ambient
         self.refit, self.of_all = refit, rows
-        self.free_position = free_position
         of_rows = whitenings_of(array, mask, readings)
         self.n_differences = of_rows.n_differences
-        self.problem, self.raw = whitened_model(array, mask, readings, of_rows, ambient)
+        problem, self.raw = whitened_model(array, mask, readings, of_rows, ambient)
         self.count = np.bincount(array.channel_sensor[mask], minlength=array.n_sensors)
         level = 1.0 - SENSOR_FALSE_ALARM / array.n_sensors
         self.limits = np.array(chdtri(np.maximum(self.count, 1), 1.0 - level), dtype=np.float64)
+        channels = array.sensor_channels
+        self.fits = WeightedFits(problem, self.raw, channels, self.count, self.limits, free_position)
+        # By few sensors each says so much of the source that what is cheap to tell decides nothing.
+        self.many = np.count_nonzero(self.count) > _MOST_ONE_BY_ONE
+
+    @property
+    def problem(self) -> WhitenedModel:
+        """The rows' model, with the errors that are allowed for."""
+        return self.fits.problem
 
     def allow_for_model_errors(self, plain: Sequence[Fix]) -> None:
         """Count as noise what bodies and the ambient field add to the fixes: no sensor is to be accused of it."""
-        errors = []
         sigma_T = self.array.row_ambient_uncertainty_T if self.array.channel_is_scalar.any() else 0.0
-        for row, fix in enumerate(plain):
-            if fix.solutions and (fix.body_length_m > 0.0 or sigma_T):
-                q, mu = self._scaled(fix)
-                lengths = np.full((1, len(q)), fix.body_length_m)
-                at = self.problem.rows(np.array([row]))
-                errors.append((row, model_errors(at, q[None], mu[None], lengths, sigma_T)[0]))
+        length_m = np.array([fix.body_length_m for fix in plain])
+        errors = []
+        for rows, q, mu in self._by_count([(row, fix) for row, fix in enumerate(plain) if length_m[row] or sigma_T]):
+            lengths = np.tile(length_m[rows, None], q.shape[1])
+            errors.append((rows, model_errors(self.problem.rows(rows), q, mu, lengths, sigma_T)))
         if errors:
-            widest = max(columns.shape[1] for _, columns in errors)
-            every = np.zeros((len(plain), self.raw.shape[1], widest))
-            for row, columns in errors:
-                every[row, :, : columns.shape[1]] = columns
-            self.problem = self.problem.marginalised(every)
+            every = np.zeros((len(plain), self.raw.shape[1], max(columns.shape[2] for _, columns in errors)))
+            for rows, columns in errors:
+                every[rows, :, : columns.shape[2]] = columns
+            self.fits = replace(self.fits, problem=self.problem.marginalised(every))
 
     def without_lonely_sources(self, plain: Sequence[Fix]) -> list[Fix]:
         """Fixes without sources that a single sensor sees: nothing tells such a source from a fault of the sensor."""
@@ -220,13 +218,13 @@ class _Examination:
         if not suspected.size:
             return found
         starts = self._refined_without_one(plain, suspected)
-        unexplained = [row for row in suspected.tolist() if not any(start.explains for start in starts[row])]
+        unexplained = [row for row, tried in starts.items() if not any(start.explains for start in tried)]
         for sensors, without in self._searched(plain, starts, unexplained).items():
             for row, fix in zip(without, self._without(sensors, np.array(without)), strict=True):
                 starts[row] += self._start(fix, sensors)
-        standing_out = self._standing_out(
-            {row: [start for start in tried if start.explains] or tried for row, tried in starts.items()}
-        )
+        starts = {row: [start for start in tried if start.explains] or tried for row, tried in starts.items()}
+        certain = self._certain(starts)
+        standing_out = certain | self._standing_out({row: starts[row] for row in starts.keys() - certain.keys()})
         for dropped in set(standing_out.values()) - {frozenset()}:
             rows = np.array([row for row, sensors in standing_out.items() if sensors == dropped], dtype=np.intp)
             names = tuple(self.array.ids[sensor] for sensor in sorted(dropped))
@@ -246,9 +244,9 @@ class _Examination:
         spoilt[solved] = [fix.solutions[0].chi2 > _SPOILT * fix.solutions[0].dof for fix in plain if fix.solutions]
         judged = np.flatnonzero(~spoilt & ~credible).tolist()
         for of_count, q, mu in self._by_count([(row, plain[row]) for row in judged]):
-            misfit = self._misfit(of_count, q, mu, np.ones((len(of_count), self.array.n_sensors)))
+            misfit = self.fits.misfit(of_count, q, mu, np.ones((len(of_count), self.array.n_sensors)))
             spoilt[of_count] = np.any(
-                misfit > unseen[of_count, None] * self.limits * self._scale2(misfit)[:, None], axis=1
+                misfit > unseen[of_count, None] * self.limits * self.fits.scale2(misfit)[:, None], axis=1
             )
         return np.flatnonzero(spoilt & ~credible & ~self._as_noise(plain))
 
@@ -274,25 +272,48 @@ class _Examination:
         return [_Start(*self._scaled(fix), without, fix.solutions[0].dof > 0 and _is_credible(fix))]
 
     def _refined_without_one(self, plain: Sequence[Fix], rows: IntArray) -> dict[int, list[_Start]]:
-        """The plain fits of rows, and the best of those without one sensor, refined from them, best first."""
+        """The plain fits of rows, and the best of those without one sensor, refined from them, best first.
+
+        Rows are left out where no sensor stands out of what all others leave, and each is checked by them.
+        """
         starts = {row: self._start(plain[row], frozenset()) for row in rows.tolist()}
-        standing = np.flatnonzero(self.count)
-        for row in rows.tolist():
-            if not starts[row]:
+        for of_count, q, mu in self._by_count([(row, plain[row]) for row in rows.tolist()]):
+            chosen = self._to_leave_out(of_count, q, mu)
+            of_fit, sensor = np.nonzero(chosen)
+            for row in of_count[~chosen.any(axis=1)].tolist():
+                del starts[row]
+            if not of_fit.size:
                 continue
-            ((q, mu),) = [(start.q, start.mu) for start in starts[row]]
-            n = standing.size
+            of_row, n = of_count[of_fit], of_fit.size
             weight = np.ones((n, self.array.n_sensors))
-            weight[np.arange(n), standing] = _LEAST_WEIGHT
-            of_row = np.full(n, row)
-            lighter = weighted(self.problem.rows(of_row), self.raw[of_row], weight[:, self.array.channel_sensor])
-            fits = self._refined(lighter, np.tile(q, (n, 1, 1)), np.tile(mu, (n, 1, 1)))
-            dof = plain[row].solutions[0].dof - self.count[standing]
-            for k in np.argsort(fits.chi2)[:_MOST_REFINED]:
-                if np.isfinite(fits.chi2[k]):
-                    credible = dof[k] > 0 and fits.chi2[k] <= _largest_credible(dof[k], plain[row].body_length_m)
-                    starts[row].append(_Start(fits.q[k], fits.mu[k], frozenset({int(standing[k])}), bool(credible)))
+            weight[np.arange(n), sensor] = LEAST_WEIGHT
+            fits = self.fits.refined(of_row, q[of_fit], mu[of_fit], weight)
+            kept = dict.fromkeys(of_count.tolist(), _MOST_KEPT)
+            for k in np.argsort(fits.chi2, kind="stable").tolist():
+                row = int(of_row[k])
+                if not kept[row] or not fits.converged[k]:
+                    continue
+                kept[row] -= 1
+                dof = plain[row].solutions[0].dof - int(self.count[sensor[k]])
+                credible = dof > 0 and fits.chi2[k] <= _largest_credible(dof, plain[row].body_length_m)
+                starts[row].append(_Start(fits.q[k], fits.mu[k], frozenset({int(sensor[k])}), bool(credible)))
         return starts
+
+    def _to_leave_out(self, rows: IntArray, q: FloatArray, mu: FloatArray) -> BoolArray:
+        """Sensors (f, N) without which fits of rows might be much better: they stand out, or bend the fit unseen.
+
+        None where all of many leave evenly much, so that the noise is larger than stated.
+        """
+        fall, checked = self.fits.falls(rows, q, mu)
+        fall = np.where(self.count, fall, 0.0)
+        last = np.partition(fall, -_MOST_REFINED, axis=1)[:, -_MOST_REFINED:] if fall.shape[1] > _MOST_REFINED else fall
+        least = np.maximum(last.min(axis=1), _MATTERS * fall.max(axis=1) * self.many)
+        chosen: BoolArray = ((fall >= least[:, None]) | (checked < _HALF_CHECKED)) & (self.count > 0)
+        if self.many:
+            scale2 = self.fits.scale2(fall)
+            limits = np.array([scale * self.fits.limits_of(float(scale), q.shape[1]) for scale in scale2])
+            chosen &= np.any((fall > limits) | (checked < _LEAST_CHECKED), axis=1)[:, None]
+        return chosen
 
     def _searched(
         self, plain: Sequence[Fix], starts: dict[int, list[_Start]], unexplained: Sequence[int]
@@ -302,16 +323,17 @@ class _Examination:
         Of a large one those that the refinements blame most, and the nearest to every source.
         """
         standing = np.flatnonzero(self.count).tolist()
-        every = [frozenset({sensor}) for sensor in standing] + [frozenset(pair) for pair in combinations(standing, 2)]
+        every = [frozenset({sensor}) for sensor in standing] if len(standing) <= _MOST_ONE_BY_ONE else []
+        if len(standing) <= _MOST_IN_PAIRS:
+            every += [frozenset(pair) for pair in combinations(standing, 2)]
         chosen: dict[frozenset[int], list[int]] = {}
         for row in unexplained:
-            sets = every
+            sets = every.copy()
             if len(standing) > _MOST_IN_PAIRS:
-                sets = every[: len(standing)] if len(standing) <= _MOST_ONE_BY_ONE else []
                 sets += [start.without for start in starts[row][1 : 1 + _MOST_SEARCHED]]
                 q, mu = self._fit_of(plain[row])
                 distance = np.linalg.norm(self.array.positions[standing] - self.problem.position(q)[:, None], axis=-1)
-                misfit = self._misfit(np.array([row]), q[None], mu[None], np.ones((1, self.array.n_sensors)))[0]
+                misfit = self.fits.misfit(np.array([row]), q[None], mu[None], np.ones((1, self.array.n_sensors)))[0]
                 blamed = {*np.argsort(-misfit)[:_MOST_SEARCHED].tolist()}
                 blamed |= {standing[k] for k in np.argmin(distance, axis=1)} if plain[row].solutions else set()
                 sets += [frozenset({sensor}) for sensor in blamed]
@@ -333,27 +355,23 @@ class _Examination:
         q = self.problem.homogeneous(np.stack([source.position_m for source in sources]))
         return q, self.problem.scaled_moment(q, np.stack([source.moment_Am2 for source in sources]))
 
-    def _misfit(self, row: IntArray, q: FloatArray, mu: FloatArray, weight: FloatArray) -> FloatArray:
-        """Squared residuals (f, N) of the sensors of some rows, the common field being that of the weighted fit."""
-        owner = self.array.channel_sensor
-        return self._squares(weighted(self.problem.rows(row), self.raw[row], weight[:, owner]), q, mu, weight)
+    def _certain(self, starts: dict[int, list[_Start]]) -> dict[int, frozenset[int]]:
+        """Sensors that reweighting would leave out for certain: the only fit that explains a row does without them.
 
-    def _squares(self, lighter: Weighted, q: FloatArray, mu: FloatArray, weight: FloatArray) -> FloatArray:
-        """Squared residuals (f, N) of the sensors of some weighted rows."""
-        owner, (problem, raw) = self.array.channel_sensor, lighter
-        residual = problem.whitened(raw) - problem.predicted(problem.source_fields(q, mu))
-        of_sensor = owner[:, None] == np.arange(self.array.n_sensors)
-        squares: FloatArray = (residual**2 / weight[:, owner]) @ of_sensor
-        return squares
-
-    def _scale2(self, misfit: FloatArray) -> FloatArray:
-        """Variance of the noise (f,) in units of what is stated, one at least, from the median sensor.
-
-        Where everything fits badly it is the model or the stated noise that is wrong, not a sensor.
+        To it they are beyond doubt, and none of the others would stand out even if it did not count.
         """
-        standing = self.count > 0
-        ratio = np.median(misfit[:, standing] / self.count[standing], axis=1) / _MEDIAN_RATIO
-        return np.maximum(1.0, ratio)
+        only = [(row, tried[0]) for row, tried in starts.items() if len(tried) == 1 and tried[0].explains]
+        found: dict[int, frozenset[int]] = {}
+        for row, start in only if self.many else []:
+            left_out = np.isin(np.arange(self.array.n_sensors), list(start.without))[None]
+            if not left_out.any():
+                continue
+            weight = np.where(left_out, LEAST_WEIGHT, 1.0)
+            fall, _ = self.fits.falls(np.array([row]), start.q[None], start.mu[None], weight)
+            beyond = fall / weight > _BEYOND_DOUBT * self.limits
+            if np.all(np.where(left_out, beyond, fall <= self.limits)):
+                found[row] = start.without
+        return found
 
     def _standing_out(self, starts: dict[int, list[_Start]]) -> dict[int, frozenset[int]]:
         """Sensors of every row that stand out from the best of its robust fits."""
@@ -366,8 +384,8 @@ class _Examination:
             q, mu = np.stack([every[i][1].q for i in index]), np.stack([every[i][1].mu for i in index])
             weight = np.ones((len(row), self.array.n_sensors))
             for f, i in enumerate(index):
-                weight[f, list(every[i][1].without)] = _LEAST_WEIGHT
-            misfit, scale2 = self._reweighted(row, q, mu, weight)
+                weight[f, list(every[i][1].without)] = LEAST_WEIGHT
+            misfit, scale2 = self.fits.reweighted(row, q, mu, weight)
             # Beyond doubt is beyond doubt: two sensors that are far off must not cost less than one that is farther.
             bounded = np.minimum(misfit / scale2[:, None], _BEYOND_DOUBT * self.limits)
             score = 0.5 * np.sum(
@@ -376,65 +394,7 @@ class _Examination:
             for f, r in enumerate(row.tolist()):
                 if score[f] < best[r]:
                     best[r] = score[f]
-                    out = np.flatnonzero(misfit[f] > self._limits_of(float(scale2[f]), q.shape[1]) * scale2[f])
+                    out = np.flatnonzero(misfit[f] > self.fits.limits_of(float(scale2[f]), q.shape[1]) * scale2[f])
                     few = 2 * out.size < np.count_nonzero(self.count)
                     found[r] = frozenset(out.tolist()) if few else frozenset()
         return found
-
-    def _limits_of(self, scale2: float, n_sources: int) -> FloatArray:
-        """Limits (N,) of the squared residuals over the variance of the noise; wider where that is a guess."""
-        if scale2 < _UNDERSTATED:
-            return self.limits
-        count = np.maximum(self.count, 1)
-        # A median is about as good as the mean of half as many.
-        spare = 0.5 * max(2.0, self.count.sum() - 6.0 * n_sources - 6.0)
-        quantile: FloatArray = fdtri(count, spare, 1.0 - SENSOR_FALSE_ALARM / self.array.n_sensors)
-        return np.array(count * quantile, dtype=np.float64)
-
-    def _reweighted(
-        self, row: IntArray, q: FloatArray, mu: FloatArray, weight: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Squared residuals (f, N) of the sensors after reweighting from starts, and the scale of the noise."""
-        owner, q, mu, weight = self.array.channel_sensor, q.copy(), mu.copy(), weight.copy()
-        misfit, scale2 = np.empty(weight.shape), np.empty(len(row))
-        live = np.arange(len(row))
-        lighter = weighted(self.problem.rows(row), self.raw[row], weight[:, owner])
-        for last in range(_N_REWEIGHTINGS, -1, -1):
-            misfit[live] = self._squares(lighter, q[live], mu[live], weight[live])
-            scale2[live] = self._scale2(misfit[live])
-            new = (DEGREES_OF_FREEDOM + self.count) / (DEGREES_OF_FREEDOM + misfit[live] / scale2[live, None])
-            new = np.clip(new, _LEAST_WEIGHT, None)
-            moved = np.any(np.abs(new - weight[live]) >= 1e-3 * weight[live], axis=1)
-            live = live[moved]
-            if not live.size or not last:
-                break
-            weight[live] = new[moved]
-            lighter = weighted(self.problem.rows(row[live]), self.raw[row[live]], weight[live][:, owner])
-            fits = self._refined(lighter, q[live], mu[live], max_iterations=8)
-            q[live], mu[live] = fits.q, fits.mu
-        return misfit, scale2
-
-    def _refined(self, lighter: Weighted, q: FloatArray, mu: FloatArray, max_iterations: int = 60) -> JointFits:
-        """Fits of weighted rows (f,) from sources (f, K, …)."""
-        problem, raw = lighter
-        free = np.full((q.shape[1], 3), self.free_position)
-        return refine(problem, problem.whitened(raw), q, mu, free=free, max_iterations=max_iterations)
-
-
-def weighted(problem: WhitenedModel, raw: FloatArray, weight: FloatArray) -> Weighted:
-    """A problem and its raw readings (b, C) with the variance of every channel divided by a weight (b, C)."""
-    root = np.sqrt(weight)[..., None]
-    flat = problem.shrinkage >= 1.0
-    # A flat prior needs only the span of its columns; of the others the variance along each of them counts.
-    some, known = flat.any(axis=0), ~flat.all(axis=0)
-    span = root * (problem.basis * flat[:, None])[..., some]
-    for _ in range(2):  # once more, for the digits that squares lose
-        square, axes = np.linalg.eigh(span.transpose(0, 2, 1) @ span)
-        seen = square > _UNSEEN * square[:, -1:]
-        span = span @ (axes * np.where(seen, 1.0 / np.sqrt(np.where(seen, square, 1.0)), 0.0)[:, None])
-    lighter = replace(problem, gain=root * problem.gain, basis=span, shrinkage=seen.astype(np.float64))
-    if not flat.all():
-        with np.errstate(divide="ignore"):
-            deviation = np.where(flat, 0.0, np.sqrt(1.0 / (1.0 - problem.shrinkage) ** 2 - 1.0))
-        lighter = lighter.marginalised(root * (problem.basis * deviation[:, None])[..., known])
-    return lighter, root[..., 0] * raw

@@ -27,6 +27,8 @@ SingleArray = NDArray[np.float32]
 _SAME_GAIN = 0.02
 _APART_RAD, _LEAST_APART_RAD = 0.25, 0.075
 _CANDIDATES_AT_ONCE, _TURNED_AT_ONCE = 512, 128
+# Squares of a candidate's unit moment, along one direction, that only missing channels see.
+_UNSEEN = 1e-7
 _ROWS_AT_ONCE = 64  # whose components stay in the processor's cache
 
 
@@ -83,10 +85,37 @@ def linear_scores(bases: SingleArray, residual: FloatArray) -> FloatArray:
     return np.nan_to_num(scores, copy=False, nan=-1.0)
 
 
+def orthonormal_without(lost: SingleArray) -> SingleArray:
+    """What makes components along :func:`linear_bases` Q orthonormal where orthonormal directions count no more.
+
+    These have the components `lost` (k, 3 n), B of every candidate. Those that are left, ``Qᵀ r`` of readings r without
+    these directions, are along an orthonormal basis again times the inverse of the lower Cholesky factor of
+    ``I - Bᵀ B``: its diagonal, then the rest row by row (6, n). A candidate that only they see explains nothing.
+    """
+    x, y, z = lost.reshape(len(lost), 3, -1).astype(np.float64).swapaxes(0, 1)
+    xx, yx, yy, zx, zy, zz = (-np.sum(a * b, axis=0) for a, b in ((x, x), (y, x), (y, y), (z, x), (z, y), (z, z)))
+    l00 = np.sqrt(np.maximum(1.0 + xx, _UNSEEN))
+    l10, l20 = yx / l00, zx / l00
+    l11 = np.sqrt(np.maximum(1.0 + yy - l10 * l10, _UNSEEN))
+    l21 = (zy - l20 * l10) / l11
+    l22 = np.sqrt(np.maximum(1.0 + zz - l20 * l20 - l21 * l21, _UNSEEN))
+    i10, i21 = -l10 / (l11 * l00), -l21 / (l22 * l11)
+    i20 = -(l20 / l00 + l21 * i10) / l22
+    return np.array([1.0 / l00, 1.0 / l11, 1.0 / l22, i10, i20, i21], dtype=np.float32)
+
+
 def chosen_candidates(
-    bases: SingleArray, residual: FloatArray, candidates: FloatArray, n_starts: int, apart_rad: float
+    bases: SingleArray,
+    residual: FloatArray,
+    candidates: FloatArray,
+    n_starts: int,
+    apart_rad: float,
+    orthonormal: SingleArray | None = None,
 ) -> NDArray[np.intp]:
-    """:func:`distinct_best` of the :func:`linear_scores` of residuals (b, C), compiled."""
+    """:func:`distinct_best` of the :func:`linear_scores` of residuals (b, C), compiled.
+
+    `orthonormal`: of residuals without some directions, :func:`orthonormal_without` these.
+    """
     chosen = np.zeros((len(residual), n_starts), dtype=np.intp)
     of_rows, cos_apart = residual.astype(np.float32), math.cos(apart_rad)
     # One piece of memory for all: a new one is cleared by the system first, which takes as long as the choice.
@@ -94,6 +123,12 @@ def chosen_candidates(
     for begin in range(0, len(residual), _ROWS_AT_ONCE):
         some = of_rows[begin : begin + _ROWS_AT_ONCE]
         of_some = np.matmul(some, bases, out=components[: len(some)]).reshape(len(some), 3, -1)
+        if orthonormal is not None:
+            x, y, z = of_some.swapaxes(0, 1)
+            i00, i11, i22, i10, i20, i21 = orthonormal
+            z[:] = i20 * x + i21 * y + i22 * z
+            y[:] = i10 * x + i11 * y
+            x *= i00
         over_rows(choose_rows, len(some), of_some, candidates, cos_apart, chosen[begin : begin + _ROWS_AT_ONCE])
     return chosen
 

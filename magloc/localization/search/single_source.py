@@ -8,8 +8,8 @@ that only accepts steps which decrease χ², and every distinct optimum near the
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -30,6 +30,7 @@ from magloc.localization.search.candidates import (
     allowed_positions,
     chosen_candidates,
     linear_bases,
+    orthonormal_without,
     start_separation,
 )
 from magloc.measurement.rows import WhitenedRows, channels_above_ambient, check_magnitudes, check_spans, whitened_rows
@@ -37,6 +38,10 @@ from magloc.measurement.whitened import WhitenedModel
 
 N_UNKNOWNS = 6
 _MORE = 3  # times the starts where none of them explains a row
+# Share of the channels up to which a mask without them ranks candidates by the bases of all.
+_MOST_MISSING = 0.4
+# What the common field leaves of directions of missing channels that tell nothing else.
+_UNSEEN = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,11 +65,40 @@ class BestFits:
 
 @dataclass(frozen=True, eq=False)
 class _Ranking:
-    """All candidates, and their bases (3 n, C) under the whitening of a mask, by which its rows rank them."""
+    """All candidates, and their bases (C, 3 n) under the whitening of a mask, by which its rows rank them.
+
+    Of a mask that lacks few channels the whitening and the bases are those of all channels. What the others read counts
+    as unknown: the candidates' components are made `orthonormal` (6, n) without the directions `lost` (C, k).
+    """
 
     whitening: Whitening
     candidates: FloatArray
     bases: SingleArray
+    lost: FloatArray | None = None
+    orthonormal: SingleArray | None = None
+
+    def without(self, missing: BoolArray) -> _Ranking:
+        """The ranking of rows that miss some channels (C,), from that of all."""
+        basis, shrinkage, root = self.whitening.basis, self.whitening.shrinkage, self.whitening.root[:, missing]
+        unit = (root / np.linalg.norm(root, axis=0)).T
+        left, singular, lost = np.linalg.svd(unit - ((unit @ basis) * shrinkage) @ basis.T, full_matrices=False)
+        seen = singular > _UNSEEN
+        turned, touched = (left[:, seen] / singular[seen]).T @ unit, unit.any(axis=0)
+        bases = turned[:, touched].astype(np.float32) @ self.bases[touched]
+        if not (shrinkage >= 1.0).all():  # bases are orthogonal to a common field that is unknown
+            bases -= (turned @ basis * shrinkage).astype(np.float32) @ self.common
+        return replace(self, lost=lost[seen].T, orthonormal=orthonormal_without(bases))
+
+    @cached_property
+    def common(self) -> SingleArray:
+        """Components of the bases along the common field."""
+        common: SingleArray = self.whitening.basis.T.astype(np.float32) @ self.bases
+        return common
+
+    def whitened(self, channels: FloatArray) -> FloatArray:
+        """Readings (b, C) above the ambient field as they are ranked."""
+        whole = self.whitening.apply(channels)
+        return whole if self.lost is None else whole - (whole @ self.lost) @ self.lost.T
 
 
 class SingleSourceSearch:
@@ -111,6 +145,7 @@ class SingleSourceSearch:
         self.prior = prior
         self._everything = prior == NOTHING_KNOWN
         self._candidates = allowed_positions(array, prior)
+        self._of_all: _Ranking | None = None
         self._kept: tuple[bytes, _Ranking] | None = None
 
     def optima(self, rows: WhitenedRows) -> list[Optima]:
@@ -153,24 +188,33 @@ class SingleSourceSearch:
         )
 
     def _ranking(self, mask: BoolArray) -> _Ranking:
-        key, kept = mask.tobytes(), self._kept
-        if kept is None or kept[0] != key:  # the last one: bases are large, and rows come sorted by their mask
-            of_mask = whitening(self.array, mask)
-            model = WhitenedModel.of(self.array, of_mask, self.array.ambient_fields[None])
-            candidates = model.homogeneous(self._candidates)
-            bases = linear_bases(model, model.gain[0], 0, candidates)
-            kept = self._kept = key, _Ranking(of_mask, candidates, bases)
-        return kept[1]
+        """Bases are large, and dear: those of all channels are kept, and the last of what is made of them."""
+        key, few = mask.tobytes(), np.count_nonzero(~mask) <= _MOST_MISSING * mask.size
+        if few and self._of_all is None:
+            self._of_all = self._ranking_by(np.ones_like(mask))
+        if self._kept is None or self._kept[0] != key:
+            whole = self._of_all if few else None
+            found = self._ranking_by(mask) if whole is None else whole if mask.all() else whole.without(~mask)
+            self._kept = key, found
+        return self._kept[1]
+
+    def _ranking_by(self, mask: BoolArray) -> _Ranking:
+        of_mask = whitening(self.array, mask)
+        model = WhitenedModel.of(self.array, of_mask, self.array.ambient_fields[None])
+        candidates = model.homogeneous(self._candidates)
+        return _Ranking(of_mask, candidates, linear_bases(model, model.gain[0], 0, candidates))
 
     def starts(self, rows: WhitenedRows, n_starts: int | None = None) -> FloatArray:
         """Distinct candidates (b, n_starts, 4) that explain most of every row."""
         ranking = self._ranking(rows.mask)
         ranked = rows.y
-        if self.array.noise_depends_on_reading:
+        if self.array.noise_depends_on_reading or ranking.lost is not None:
             channels = channels_above_ambient(self.array, rows.mask, rows.readings_T, rows.model.ambient)
-            ranked = ranking.whitening.apply(channels)
+            ranked = ranking.whitened(channels)
         number = self.n_starts if n_starts is None else n_starts
-        chosen = chosen_candidates(ranking.bases, ranked, ranking.candidates, number, self.apart_rad)
+        chosen = chosen_candidates(
+            ranking.bases, ranked, ranking.candidates, number, self.apart_rad, ranking.orthonormal
+        )
         best: FloatArray = ranking.candidates[chosen]
         return best
 

@@ -4,7 +4,6 @@
 |---|---|
 | breakdown | fixes by the sensors that are left, the bad one being known |
 | false drops | binomial distribution |
-| weighted problem | whitening of an array whose sensors have that noise |
 | recordings | positions that the robot reports |
 """
 
@@ -21,14 +20,16 @@ from scipy.stats import chi2 as chi2_distribution
 
 from arrays.array import SensorArray
 from arrays.array_file import read_array
-from arrays.geometries import cube, tetrahedron
+from arrays.geometries import cube, grid, tetrahedron
 from arrays.sensor import Sensor
 from magloc.chi_square import energy_threshold
 from magloc.fields import dipole
-from magloc.localization.fault_exclusion import _Examination, weighted
+from magloc.localization import reweighting
+from magloc.localization.fault_exclusion import _Examination
 from magloc.localization.locator import Locator, locate
+from magloc.localization.reweighting import WeightedFits
 from magloc.measurement.differences import predicted_channels
-from magloc.measurement.rows import whitened_model, whitened_rows, whitenings_of
+from magloc.measurement.rows import whitened_rows
 from magloc.readings import Readings, read_readings
 from magloc.truth import read_truth
 from tests.passing_source import readings_of
@@ -280,6 +281,27 @@ class TestOtherLocators:
         assert max(error) <= 1.0
 
 
+class TestStartsThatMeet:
+    """Reweighting goes on from one of the fits of a row that have come together: where all go, it goes."""
+
+    def test_it_ends_where_all_of_them_end(self, monkeypatch):
+        readings, _, which = on_cube(20, seed=18)
+        readings += 1e3 * NOISE * np.isin(CUBE.channel_sensor, [0, 3]) * (1.0 + np.arange(24) % 5)
+        readings += 50.0 * NOISE * (CUBE.channel_sensor == which[:, None])
+        refined = Locator(CUBE).fit_rows(readings)
+        plain, fits = WeightedFits._refined, []
+        monkeypatch.setattr(WeightedFits, "_refined", lambda *of, **to: fits.append(len(of[2])) or plain(*of, **to))
+        Locator(CUBE).fit_rows(readings)
+        met = sum(fits)
+        fits.clear()
+        monkeypatch.setattr(reweighting, "_SAME_WEIGHT", 0.0)
+        every = Locator(CUBE).fit_rows(readings)
+        assert met < 0.8 * sum(fits)
+        assert sum(map(bool, every.dropped_sensors)) >= 10
+        assert refined.dropped_sensors == every.dropped_sensors
+        assert_array_equal(refined.position_m, every.position_m)
+
+
 class TestWithoutOneSensor:
     """Deleting a sensor moves a fit a little: one refinement of it is what a search without that sensor finds."""
 
@@ -299,48 +321,6 @@ class TestWithoutOneSensor:
                 place = examination.problem.position(start.q)[0]
                 assert_allclose(place, searched.position_m, rtol=1e-4)
                 assert start.explains
-
-
-class TestWeightedProblem:
-    """A weight divides the variance: χ² is that of an array whose sensors are as noisy as that."""
-
-    @pytest.mark.parametrize("common_field_T", [None, 3e-9, 1e-6])
-    @pytest.mark.parametrize("kinds", ["vector", "scalar", "mixed"])
-    def test_chi2(self, kinds, common_field_T):
-        rng = np.random.default_rng(14)
-        every = {kind: cube(1.0, kind, NOISE).sensors for kind in ("vector", "scalar")}
-        vector, scalar = every["vector"], tuple(replace(s, id=f"t{s.id}") for s in every["scalar"])
-        sensors = {"vector": vector, "scalar": scalar, "mixed": vector[:5] + scalar[5:]}[kinds]
-        array = SensorArray(sensors, ambient_T=tuple(AMBIENT.tolist()), common_field_T=common_field_T)
-        weight = rng.uniform(0.01, 1.0, array.n_sensors)
-        noisier = replace(
-            array,
-            sensors=tuple(
-                replace(s, noise_T=s.noise_T / np.sqrt(w)) for s, w in zip(array.sensors, weight, strict=True)
-            ),
-        )
-        fields = AMBIENT + 1e-8 * rng.normal(size=(4, array.n_sensors, 3))
-        readings = array.readings_of(fields)
-        mask = np.ones(array.n_channels, dtype=bool)
-        problem, raw = whitened_model(array, mask, readings, whitenings_of(array, mask, readings), None)
-        per_channel = np.broadcast_to(weight[array.channel_sensor], raw.shape)
-        lighter, lighter_raw = weighted(problem, raw, per_channel)
-        other, other_raw = whitened_model(noisier, mask, readings, whitenings_of(noisier, mask, readings), None)
-        q = problem.homogeneous(np.array([[[2.0, 1.0, 0.5]]] * 4))
-        mu = problem.scaled_moment(q, rng.normal(size=(4, 1, 3)))
-        chi2 = [
-            np.sum((p.whitened(y) - p.predicted(p.source_fields(q, mu))) ** 2, axis=1)
-            for p, y in ((lighter, lighter_raw), (other, other_raw))
-        ]
-        assert_allclose(chi2[0], chi2[1], rtol=1e-6)
-
-    def test_weights_of_one_change_nothing(self):
-        array = replace(CUBE, common_field_T=1e-8)
-        clean, _, _ = on_cube(2, seed=15)
-        mask = np.ones(24, dtype=bool)
-        problem, raw = whitened_model(array, mask, clean, whitenings_of(array, mask, clean), None)
-        same, same_raw = weighted(problem, raw, np.ones_like(raw))
-        assert_allclose(same.whitened(same_raw), problem.whitened(raw), rtol=1e-9, atol=1e-9)
 
 
 class TestRecording:
@@ -377,6 +357,43 @@ class TestRecording:
         ]
         assert np.median(error) <= 0.25e-3
         assert np.max(error) <= 1.5e-3
+
+
+class TestManySensors:
+    """A board of 30: what every deletion would do to the fit decides which fits and searches there are."""
+
+    BOARD = grid(6, 5, 0.08, noise_T=2e-7)
+
+    @pytest.fixture
+    def board(self):
+        """Noise (n, C) of one, and clean readings of sources below the board."""
+        rng = np.random.default_rng(17)
+        position, moment = random_sources(rng, 12, 0.15, 0.45, 1.0)
+        position[:, 2] = -np.abs(position[:, 2]) - 0.05
+        clean = self.BOARD.readings_of(
+            AMBIENT + dipole.field(self.BOARD.positions, (self.BOARD.centroid + position)[:, None], moment[:, None])
+        )
+        return clean, 2e-7 * rng.normal(size=clean.shape)
+
+    def test_noise_twice_what_is_stated_is_searched_once(self, board, monkeypatch):
+        """Each search is of all rows: no sensor stands out, and nothing is looked for without one."""
+        clean, noise = board
+        asked = []
+        whole = Locator.__dict__["_plain"]
+        monkeypatch.setattr(Locator, "_plain", lambda *args: asked.append(len(args[1])) or whole(*args))
+        fixes = Locator(self.BOARD, body_length_m=0.0).fit_rows(clean + 2.0 * noise)
+        assert fixes.misfit.all()
+        assert not any(fixes.dropped_sensors)
+        assert asked == [12]
+
+    @pytest.mark.parametrize("sigmas", [100.0, 1e4])
+    def test_a_sensor_that_draws_the_source_to_itself(self, board, sigmas):
+        """It has no residual, as the source beside it explains it: that nothing else checks it gives it away."""
+        clean, noise = board
+        readings, which = clean + noise, np.arange(12) * 7 % 30
+        readings[np.arange(12), 3 * which + 2] += sigmas * 2e-7
+        fixes = Locator(self.BOARD, body_length_m=0.0).fit_rows(readings)
+        assert [fix.dropped_sensors for fix in fixes] == [(self.BOARD.ids[sensor],) for sensor in which]
 
 
 class TestNoiseAlone:
