@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -92,7 +93,16 @@ class TestStaticPages:
 class TestReadings:
     """A track of 41 rows, played for 20 s after it has stood still for 2 s; its last row is shown at first."""
 
+    @pytest.fixture
+    def wide(self, screen: Screen) -> Iterator[None]:
+        """Room for the scene beside the plot."""
+        shape = {"deviceScaleFactor": 1, "mobile": False}
+        screen.browser.call("Emulation.setDeviceMetricsOverride", width=1280, height=800, **shape)
+        yield
+        screen.browser.call("Emulation.setDeviceMetricsOverride", width=SIZE[0], height=SIZE[1], **shape)
+
     @pytest.mark.slow
+    @pytest.mark.usefixtures("wide")
     def test_a_click_into_the_plot_moves_the_scene_and_the_cursor(self, screen: Screen, tmp_path: Path) -> None:
         page = tmp_path / "track.html"
         with opened(0, "track") as server:
