@@ -139,14 +139,9 @@ def _deviations(array: SensorArray, readings_T: FloatArray) -> FloatArray:
         vector = np.flatnonzero(~array.channel_is_scalar)
         gain = array.channel_gain[vector]
         axes = (readings_T - array.channel_offset_T)[..., vector] - mean[..., 0, :] @ gain.T
-        axes = np.where(np.isfinite(axes), axes / np.linalg.norm(gain, axis=1), np.nan)
-        of_sensor = np.stack(
-            [
-                mean_of_finite(axes[..., array.channel_sensor[vector] == i] ** 2, axis=-1)
-                for i in range(array.n_sensors)
-            ],
-            axis=-2,
-        )[..., 0]
+        squares = np.full(readings_T.shape, np.nan)
+        squares[..., vector] = np.where(np.isfinite(axes), axes / np.linalg.norm(gain, axis=1), np.nan) ** 2
+        of_sensor = mean_of_finite(in_slots(array.sensor_channels >= 0, squares), axis=-1)[..., 0]
         largest = np.max(np.where(missing, 0.0, deviation), axis=-1, keepdims=True)
         deviation = np.where(missing, np.maximum(np.sqrt(3.0 * of_sensor), largest), deviation)
     return deviation

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from arrays.typing import FloatArray
-from magloc.compilation import compiled, inlined_sum
+from magloc.compilation import inlined_sum, internal
 
 # Products of a matrix with fewer columns take longer to be handed to BLAS than to be computed.
 _SMALL = 400
@@ -22,7 +22,7 @@ def dot(a: FloatArray, b: FloatArray) -> float:
     return t
 
 
-@compiled
+@internal
 def multiply_transposed(a: FloatArray, b: FloatArray, product: FloatArray) -> None:
     """Products (n, m) of rows a (n, c) and b (m, c)."""
     if product.size > _SMALL:
@@ -33,7 +33,7 @@ def multiply_transposed(a: FloatArray, b: FloatArray, product: FloatArray) -> No
             product[i, j] = dot(a[i], b[j])
 
 
-@compiled
+@internal
 def subtract_product(rows: FloatArray, factors: FloatArray, others: FloatArray) -> None:
     """Subtract factors (n, m) times other rows (m, c) from rows (n, c) in place."""
     if factors.size > _SMALL:
@@ -45,7 +45,7 @@ def subtract_product(rows: FloatArray, factors: FloatArray, others: FloatArray) 
                 rows[i, c] -= factors[i, j] * others[j, c]
 
 
-@compiled
+@internal
 def orthonormalise(rows: FloatArray, triangle: FloatArray) -> None:
     """Gram-Schmidt, twice, of rows (k, c) in place; triangle (k, k) becomes R with rows = Rᵀ · orthonormal rows."""
     n_rows, n = rows.shape
@@ -65,7 +65,7 @@ def orthonormalise(rows: FloatArray, triangle: FloatArray) -> None:
             rows[j, c] *= inverse
 
 
-@compiled
+@internal
 def cholesky(matrix: FloatArray, ridge: float) -> None:
     """Upper root R of a positive matrix of unit diagonal, RᵀR, in place; the ridge is added, and the least pivot."""
     n = len(matrix)
@@ -81,7 +81,7 @@ def cholesky(matrix: FloatArray, ridge: float) -> None:
                 matrix[i, k] -= t * matrix[j, k]
 
 
-@compiled
+@internal
 def solve_cholesky(root: FloatArray, columns: FloatArray) -> None:
     """Solve RᵀR x = b for columns (n, m) in place."""
     n, m = columns.shape
@@ -101,21 +101,21 @@ def solve_cholesky(root: FloatArray, columns: FloatArray) -> None:
             columns[i, c] /= root[i, i]
 
 
-@compiled
+@internal
 def put(target: FloatArray, source: FloatArray) -> None:
     """Copy a vector. A slice's assignment would do, but it compiles an error sentence of its own every time."""
     for i in range(target.size):
         target[i] = source[i]
 
 
-@compiled
+@internal
 def put_rows(target: FloatArray, source: FloatArray) -> None:
     """Copy a matrix."""
     for i in range(len(target)):
         put(target[i], source[i])
 
 
-@compiled
+@internal
 def fill_frame(line: FloatArray, frame: FloatArray) -> float:
     """Axes u, v, n as rows, n along a line, and its length. Duff et al., "Building an orthonormal basis, revisited"."""
     length = math.sqrt(line[0] * line[0] + line[1] * line[1] + line[2] * line[2])

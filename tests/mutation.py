@@ -398,7 +398,8 @@ def copied(tree: Path, place: Path) -> None:
 
 def _caches(root: Path, module: str) -> list[Path]:
     path = root / module.replace(".", "/")
-    return [file for end in ("nbi", "nbc") for file in (path.parent / "__pycache__").glob(f"{path.name}.*.{end}")]
+    names = [f"{of}{path.name}.*.{end}" for of in ("", "internal-") for end in ("nbi", "nbc")]
+    return [file for name in names for file in (path.parent / "__pycache__").glob(name)]
 
 
 def drawn(n_lines: int, seed: int, packages: tuple[str, ...]) -> list[Mutant]:

@@ -33,7 +33,18 @@ HIDDEN = re.compile(r"<!--.*?-->", re.DOTALL)
 # What a page of the site shows of a line of code at desktop width without a scroll bar.
 WIDEST = 88
 # Pages, and packages with examples, whose code takes many seconds.
-SLOW = {"array-design", "exporting", "monte-carlo", "live", "stated-uncertainty", "magloc.plots", "sims.experiments"}
+SLOW = {
+    "array-design",
+    "exporting",
+    "live",
+    "magloc.plots",
+    "monte-carlo",
+    "ship-signature",
+    "sims.experiments",
+    "single-sensor-ranging",
+    "stated-uncertainty",
+    "uncertainty",
+}
 PACKAGES = [
     "arrays",
     "magloc",

@@ -48,8 +48,7 @@ NO_FILES = frozenset(
 def text_without_encoding(call: ast.Call) -> bool:
     """Whether it reads or writes text as the machine has it: no encoding, or no end of line where it writes."""
     name = call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
-    whole = ast.unparse(call.func)
-    if name not in OPENING or whole in NO_FILES:
+    if name not in OPENING or (whole := ast.unparse(call.func)) in NO_FILES:
         return False
     keywords = {keyword.arg: ast.unparse(keyword.value) for keyword in call.keywords}
     if name in {"run", "Popen"}:
@@ -71,7 +70,8 @@ def text_without_encoding(call: ast.Call) -> bool:
 def paths_as_text(node: ast.AST) -> bool:
     """Whether it puts a path together as one system writes it, or names a place of one."""
     if isinstance(node, ast.Attribute):
-        return bool(re.fullmatch(r"os\.(sep|altsep|pathsep|path\.(join|sep))", ast.unparse(node)))
+        last = node.attr in {"sep", "altsep", "pathsep", "join"}  # to write each of them out takes seconds
+        return last and bool(re.fullmatch(r"os\.(sep|altsep|pathsep|path\.(join|sep))", ast.unparse(node)))
     if isinstance(node, ast.Constant) and isinstance(node.value, str):
         return bool(re.match(r"(/(tmp|dev|proc|etc|usr|var|home|root|Users)\b|[A-Za-z]:\\|~/)", node.value))
     if isinstance(node, ast.Call) and ast.unparse(node.func) in {"Path", "open", "os.open", "os.replace"}:
@@ -80,11 +80,18 @@ def paths_as_text(node: ast.AST) -> bool:
     return False
 
 
+def asks_for_the_system(node: ast.AST) -> bool:
+    """Whether it is `sys.platform`, or asks what `os` or `signal` has."""
+    if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "hasattr":
+        return ast.unparse(node.args[0]) in {"os", "signal"}
+    return isinstance(node, ast.Attribute) and node.attr == "platform" and ast.unparse(node.value) == "sys"
+
+
 def unguarded(tree: ast.Module) -> Iterator[ast.AST]:
     """Modules and names that not every system has, outside of a function that asks which one it is."""
     asked: set[ast.AST] = set()
     for node in ast.walk(tree):
-        if isinstance(node, ast.FunctionDef) and re.search(r"sys\.platform|hasattr\((os|signal), ", ast.unparse(node)):
+        if isinstance(node, ast.FunctionDef) and any(asks_for_the_system(part) for part in ast.walk(node)):
             asked |= set(ast.walk(node))
     for node in set(ast.walk(tree)) - asked:
         names = [alias.name for alias in node.names] if isinstance(node, ast.Import | ast.ImportFrom) else []
@@ -92,7 +99,8 @@ def unguarded(tree: ast.Module) -> Iterator[ast.AST]:
             names += [node.module, *(f"{node.module}.{name}" for name in names)]
         if set(names) & ELSEWHERE or any(UNIX_ALONE.fullmatch(name) for name in names):
             yield node
-        if isinstance(node, ast.Attribute) and UNIX_ALONE.fullmatch(ast.unparse(node)):
+        of_module = isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name)
+        if of_module and UNIX_ALONE.fullmatch(f"{node.value.id}.{node.attr}"):
             yield node
 
 

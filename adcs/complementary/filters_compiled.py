@@ -28,7 +28,7 @@ from adcs.satellite.dynamics_compiled import (
     vector_at,
 )
 from adcs.satellite.vector_record import VectorRecord
-from magloc.compilation import compiled
+from magloc.compilation import compiled, internal
 
 Array = NDArray[np.float64]
 EXPLICIT, GAUSS_NEWTON = 0, 1
@@ -90,20 +90,20 @@ def exp(v: Vector) -> Quaternion:
     return c, s * v[0], s * v[1], s * v[2]
 
 
-@compiled
+@internal
 def unit(v: Vector) -> Vector:
     """Vector of length 1; NaN stays NaN."""
     inverse = 1.0 / np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
     return v[0] * inverse, v[1] * inverse, v[2] * inverse
 
 
-@compiled
+@internal
 def is_there(v: Vector) -> bool:
     """Whether a vector was measured."""
     return not np.isnan(v[0] + v[1] + v[2])
 
 
-@compiled
+@internal
 def gauss_newton_step(
     q: Quaternion, b: Vector, b_reference: Vector, s: Vector, s_reference: Vector, has_b: bool, has_s: bool, mu: float
 ) -> Quaternion:
@@ -228,7 +228,7 @@ def complementary(
             integral[r, i, 0], integral[r, i, 1], integral[r, i, 2] = total
 
 
-@compiled
+@internal
 def _scalar_update(P: Array, x: Array, h: Array, z: float, variance: float, Ph: Array) -> float:
     """Kalman update of x (6,) and P (6, 6), in place, by z = h·x + noise, h being zero from 3 on; its NIS."""
     expected = 0.0
@@ -249,7 +249,7 @@ def _scalar_update(P: Array, x: Array, h: Array, z: float, variance: float, Ph: 
     return nu * nu / s
 
 
-@compiled
+@internal
 def _vector_update(P: Array, x: Array, v: Vector, predicted: Vector, variance: float, h: Array, Ph: Array) -> float:
     """Update by a measured unit vector, along two axes across the predicted one; its NIS, of 2 degrees of freedom."""
     size = (abs(predicted[0]), abs(predicted[1]), abs(predicted[2]))
@@ -268,7 +268,7 @@ def _vector_update(P: Array, x: Array, v: Vector, predicted: Vector, variance: f
     return nis
 
 
-@compiled
+@internal
 def _predict(P: Array, w: Vector, dt: float, attitude_variance: float, bias_variance: float, M: Array) -> None:
     """Covariance after a step, in place: δθ turns by -ω and grows by the error of the bias, M (6, 6) is scratch."""
     turn = exp((w[0] * dt, w[1] * dt, w[2] * dt))

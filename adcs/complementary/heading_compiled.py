@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magloc.compilation import compiled
+from magloc.compilation import compiled, internal
 
 Array = NDArray[np.float64]
 SIZE = 14
@@ -69,14 +69,14 @@ class Step(NamedTuple):
     S_inverse: Array  # (3, 3)
 
 
-@compiled
+@internal
 def new_step() -> Step:
     """Room for one."""
     wide, small = np.zeros((3, 3, SIZE)), np.zeros((2, 3, 3))
     return Step(np.zeros(SIZE), np.ones(SIZE), wide[0], wide[1], wide[2], np.zeros(3), small[0], small[1])
 
 
-@compiled
+@internal
 def predict(x: Array, P: Array, i: int, blocks: Blocks, noise: Noise, step: Step) -> None:
     """State and covariance of block i, in place of those of the block before."""
     h, turns, turn, keeps = blocks.dt_s[i], blocks.turns[i], step.turn, step.keeps
@@ -108,7 +108,7 @@ def predict(x: Array, P: Array, i: int, blocks: Blocks, noise: Noise, step: Step
         P[11 + k, 11 + k] += local_T**2 * (1.0 - keeps[11] ** 2)
 
 
-@compiled
+@internal
 def innovation(x: Array, P: Array, i: int, blocks: Blocks, noise: Noise, step: Step) -> float:
     """Normalised square of a block's innovation."""
     c, s = np.cos(x[0]), np.sin(x[0])
@@ -141,7 +141,7 @@ def innovation(x: Array, P: Array, i: int, blocks: Blocks, noise: Noise, step: S
     return nis
 
 
-@compiled
+@internal
 def _determinant(S: Array) -> float:
     return (
         S[0, 0] * (S[1, 1] * S[2, 2] - S[1, 2] * S[2, 1])
@@ -150,7 +150,7 @@ def _determinant(S: Array) -> float:
     )
 
 
-@compiled
+@internal
 def update(x: Array, P: Array, step: Step) -> None:
     """Kalman's update, in place."""
     gain, HP, nu, inverse = step.gain, step.HP, step.nu, step.S_inverse
@@ -164,7 +164,7 @@ def update(x: Array, P: Array, step: Step) -> None:
             P[k, j] = P[j, k]
 
 
-@compiled
+@internal
 def tried(x: Array, P: Array, i: int, blocks: Blocks, noise: Noise, step: Step) -> float:
     """Go on with reading i, whatever it is; its logarithmic likelihood, not less than -50."""
     predict(x, P, i, blocks, noise, step)
@@ -237,7 +237,7 @@ def run(
             told[i, k], variances[i, k] = x[TOLD[k]], P[TOLD[k], TOLD[k]]
 
 
-@compiled
+@internal
 def _forward(x: Array, P: Array, i: int, blocks: Blocks, noise: Noise, jump_T: float, known: int, step: Step) -> None:
     """Predict and update, of what is known of a reading in hindsight."""
     if known == 2:
@@ -249,7 +249,7 @@ def _forward(x: Array, P: Array, i: int, blocks: Blocks, noise: Noise, jump_T: f
         update(x, P, step)
 
 
-@compiled
+@internal
 def _back(score: Array, information: Array, known: int, step: Step) -> None:
     """Take what later readings say of a block to the one before, with what its own reading says."""
     H, gain, turn, keeps = step.H, step.gain, step.turn, step.keeps

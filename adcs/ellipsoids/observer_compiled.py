@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from adcs.ellipsoids.ellipsoid import EPS, UNSEEN_RTOL, Outcome
 from adcs.ellipsoids.strip import LARGEST_STEP, SMALLEST_GROWTH, SMALLEST_TIGHTENED_DELTA, STEP_RULES
 from arrays.typing import FloatArray
-from magloc.compilation import compiled, over_rows
+from magloc.compilation import compiled, internal, over_rows
 
 IntArray = NDArray[np.int64]
 LEMMA = STEP_RULES.index("lemma")
@@ -103,7 +103,7 @@ def correct(
                 _intersect(x, H, h, y, bounds[run, channel], rule, Hh)
 
 
-@compiled
+@internal
 def _add(H: FloatArray, Q: FloatArray) -> None:
     n = H.shape[0]
     trace_H = trace_Q = 0.0
@@ -121,7 +121,7 @@ def _add(H: FloatArray, Q: FloatArray) -> None:
             H[i, j] = (1.0 + 1.0 / k) * Q[i, j] + (1.0 + k) * H[i, j]
 
 
-@compiled
+@internal
 def _cover(H: FloatArray, size: FloatArray) -> None:
     """Add the box of the centre's rounding, see _around_rounded of the twin."""
     n = H.shape[0]
@@ -138,7 +138,7 @@ def _cover(H: FloatArray, size: FloatArray) -> None:
         H[i, i] += (1.0 + 1.0 / k if k > 0.0 else 1.0) * n * (4.0 * EPS * size[i]) ** 2
 
 
-@compiled
+@internal
 def _intersect(x: FloatArray, H: FloatArray, h: FloatArray, y: float, c: float, rule: int, Hh: FloatArray) -> int:
     n = x.size
     e2 = trace = h2 = squared = size = reach = 0.0
@@ -195,7 +195,7 @@ def _intersect(x: FloatArray, H: FloatArray, h: FloatArray, y: float, c: float, 
     return _REDUCED
 
 
-@compiled
+@internal
 def _tightened(mu: float, delta: float) -> tuple[float, float]:
     low, high = max(-1.0, mu - delta), min(1.0, mu + delta)
     return 0.5 * (low + high), max(0.5 * (high - low), SMALLEST_TIGHTENED_DELTA)

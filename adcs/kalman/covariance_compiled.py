@@ -6,13 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adcs.satellite.dynamics_compiled import Body, Vector, applied, cross
-from magloc.compilation import compiled
+from magloc.compilation import internal
 
 Array = NDArray[np.float64]
 _ALWAYS = 6
 
 
-@compiled
+@internal
 def transition(F: Array, F2: Array, F3: Array, dt: float, Phi: Array, G: Array) -> None:
     """Φ (6, 6) of attitude and rate and G (6, 3) by a disturbance, from F; ``F2`` and ``F3`` are for work."""
     for i in range(6):
@@ -37,7 +37,7 @@ def transition(F: Array, F2: Array, F3: Array, dt: float, Phi: Array, G: Array) 
             G[i, j] = dt * one + half * F[i, 3 + j] + sixth * F2[i, 3 + j]
 
 
-@compiled
+@internal
 def by_dipole(G: Array, body: Body, b: Vector, by: Array) -> None:
     """Into ``by`` (6, 3) what a dipole does in a field b in body axes: G (6, 3) of a disturbance times -J⁻¹W(b)."""
     for j in range(3):
@@ -47,7 +47,7 @@ def by_dipole(G: Array, body: Body, b: Vector, by: Array) -> None:
             by[i, j] = G[i, 0] * acceleration[0] + G[i, 1] * acceleration[1] + G[i, 2] * acceleration[2]
 
 
-@compiled
+@internal
 def spread(Phi: Array, G: Array, firsts: tuple[int, int], variance: Array, P: Array, T: Array) -> None:
     """P becomes Φ P Φᵀ + Q; only the first six rows of Φ differ from those of the unit matrix.
 
@@ -85,7 +85,7 @@ def spread(Phi: Array, G: Array, firsts: tuple[int, int], variance: Array, P: Ar
         P[i, i] += variance[i]
 
 
-@compiled
+@internal
 def scalar(
     P: Array, dx: Array, h: Array, columns: NDArray[np.int64], m: int, residual: float, r: float, u: Array, A: Array
 ) -> tuple[float, float]:

@@ -31,7 +31,7 @@ from adcs.satellite.dynamics_compiled import (
     vector_at,
     with_dipole,
 )
-from magloc.compilation import compiled
+from magloc.compilation import compiled, internal
 
 Array = NDArray[np.float64]
 
@@ -128,7 +128,7 @@ class Steps(NamedTuple):
     T: Array
 
 
-@compiled
+@internal
 def _copied(P: Array, dx: Array, P_to: Array, dx_to: Array) -> None:
     for i in range(len(dx)):
         dx_to[i] = dx[i]
@@ -136,12 +136,12 @@ def _copied(P: Array, dx: Array, P_to: Array, dx_to: Array) -> None:
             P_to[i, j] = P[i, j]
 
 
-@compiled
+@internal
 def _at(x: Array, first: int) -> Vector:
     return x[first], x[first + 1], x[first + 2]
 
 
-@compiled
+@internal
 def _with_reading(
     one: Hypothesis,
     sensor: int,
@@ -209,18 +209,18 @@ def _with_reading(
     return nis, gate.eased(nis, r, length, one.attitude_variance[0]), np.log(determinant)
 
 
-@compiled
+@internal
 def _without_reading(one: Hypothesis, work: Work) -> None:
     """Undo the last reading."""
     _copied(work.P, work.dx, one.P, one.dx)
 
 
-@compiled
+@internal
 def _minus(a: Vector, b: Vector) -> Vector:
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
-@compiled
+@internal
 def _put(x: Array, q: Quaternion) -> None:
     x[0], x[1], x[2], x[3] = q
 
@@ -241,7 +241,7 @@ def _correct(one: Hypothesis, firsts: NDArray[np.int64]) -> None:
     dx[:] = 0.0
 
 
-@compiled
+@internal
 def _advance(
     one: Hypothesis,
     body: Body,
@@ -289,7 +289,7 @@ def _advance(
     x[4], x[5], x[6] = w
 
 
-@compiled
+@internal
 def _begin(main: Hypothesis, second: Hypothesis, sensor: int, q: Quaternion, settings: Settings) -> None:
     """Make the second hypothesis one in which a reading is right, before it."""
     firsts, variance = settings.firsts, settings.open_variance
@@ -308,18 +308,18 @@ def _begin(main: Hypothesis, second: Hypothesis, sensor: int, q: Quaternion, set
     _ready(second)
 
 
-@compiled
+@internal
 def _ready(one: Hypothesis) -> None:
     """Keep what the attitude's variance is before readings."""
     one.attitude_variance[0] = one.P[0, 0] + one.P[1, 1] + one.P[2, 2]
 
 
-@compiled
+@internal
 def _copy(source: Hypothesis, target: Hypothesis) -> None:
     target.x[:], target.P[:] = source.x, source.P
 
 
-@compiled
+@internal
 def _reading_of(record: Record, sensor: int, run: int, i: int) -> Array:
     if sensor == 0:
         return record.star[run, i]
@@ -328,13 +328,13 @@ def _reading_of(record: Record, sensor: int, run: int, i: int) -> Array:
     return record.field[run, i] if sensor == 2 else record.sun[run, i]
 
 
-@compiled
+@internal
 def _direction(values: Array, used: bool) -> Vector:
     """A reading, NaN of a sensor that is not in use."""
     return vector_at(values) if used else (np.nan, np.nan, np.nan)
 
 
-@compiled
+@internal
 def _take_readings(
     main: Hypothesis,
     second: Hypothesis,

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from adcs.satellite.dynamics import RigidBody, WheelControl
 from adcs.satellite.magnetic_control import MU0, HysteresisRods
-from magloc.compilation import compiled
+from magloc.compilation import compiled, internal
 
 Array = NDArray[np.float64]
 _MU0 = MU0
@@ -105,13 +105,13 @@ def quaternion_at(values: Array) -> Quaternion:
     return values[0], values[1], values[2], values[3]
 
 
-@compiled
+@internal
 def combined(a: Vector, scale: float, b: Vector) -> Vector:
     """Vector a + scale·b."""
     return a[0] + scale * b[0], a[1] + scale * b[1], a[2] + scale * b[2]
 
 
-@compiled
+@internal
 def dot(a: Vector, b: Vector) -> float:
     """Product a·b."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
@@ -156,7 +156,7 @@ def conjugate(q: Quaternion) -> Quaternion:
     return q[0], -q[1], -q[2], -q[3]
 
 
-@compiled
+@internal
 def moved(q: Quaternion, scale: float, dq: Quaternion) -> Quaternion:
     """Quaternion q + scale·dq, not normalised."""
     return q[0] + scale * dq[0], q[1] + scale * dq[1], q[2] + scale * dq[2], q[3] + scale * dq[3]
@@ -207,7 +207,7 @@ def angular_acceleration(body: Body, w: Vector, momentum: Vector, wheel_torque: 
     return applied(body.J_inverse, combined(combined(torque, -1.0, wheel_torque), -1.0, gyroscopic))
 
 
-@compiled
+@internal
 def quaternion_rate(q: Quaternion, w_relative: Vector) -> Quaternion:
     """Rate of change ½ q∘(0, ω)."""
     return multiply(q, (0.0, 0.5 * w_relative[0], 0.5 * w_relative[1], 0.5 * w_relative[2]))
@@ -287,7 +287,7 @@ def error_jacobian(
         F[3, 3 + i], F[4, 3 + i], F[5, 3 + i] = applied(J_inverse, gyroscopic)
 
 
-@compiled
+@internal
 def _clipped(value: float, limit: float) -> float:
     return min(max(value, -limit), limit)
 
@@ -312,7 +312,7 @@ def commanded_torque(
     )
 
 
-@compiled
+@internal
 def rods_moment(rods: Rods, state: Array, b: Vector) -> Vector:
     """Moment of rods after they have followed a field in body axes; ``state`` (2, K), H and z of each, goes on."""
     moment = (0.0, 0.0, 0.0)

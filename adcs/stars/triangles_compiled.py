@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from arrays.typing import BoolArray, FloatArray, IntArray
-from magloc.compilation import compiled
+from magloc.compilation import compiled, internal
 
 CELLS = 64
 """Of the sky's cube along each axis."""
@@ -48,13 +48,13 @@ class Checks(NamedTuple):
     most: int  # attitudes, with which it ends too
 
 
-@compiled
+@internal
 def cell_of(x: float) -> int:
     """Cell of a coordinate."""
     return min(max(int((x + 1.0) * (0.5 * CELLS)), 0), CELLS - 1)
 
 
-@compiled
+@internal
 def is_star_near(x: float, y: float, z: float, near: float, sky: SkyCells) -> bool:
     """Whether the catalogue has a star within a chord of a direction."""
     for i in range(cell_of(x - near), cell_of(x + near) + 1):
@@ -69,7 +69,7 @@ def is_star_near(x: float, y: float, z: float, near: float, sky: SkyCells) -> bo
     return False
 
 
-@compiled
+@internal
 def triad(corners: FloatArray, axes: FloatArray) -> None:
     """Axes (3, 3), in rows, of a triangle of directions (3, 3): its longest side, its middle across that, the third."""
     along = total = 0.0
@@ -91,7 +91,7 @@ def triad(corners: FloatArray, axes: FloatArray) -> None:
         axes[2, k] = axes[0, one] * axes[1, two] - axes[0, two] * axes[1, one]
 
 
-@compiled
+@internal
 def turn_between(tangents: FloatArray, stars: IntArray, factor: float, there: FloatArray, R: FloatArray) -> None:
     """Rotation R (3, 3) of three stars of the image, whose scale is by a factor another one, to directions (3, 3)."""
     seen, mine, theirs = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
@@ -106,7 +106,7 @@ def turn_between(tangents: FloatArray, stars: IntArray, factor: float, there: Fl
             R[a, b] = theirs[0, a] * mine[0, b] + theirs[1, a] * mine[1, b] + theirs[2, a] * mine[2, b]
 
 
-@compiled
+@internal
 def matched_stars(tangents: FloatArray, R: FloatArray, factor: float, sky: SkyCells, checks: Checks, least: int) -> int:
     """Stars of the image near to one of the catalogue; less than ``least`` as soon as it cannot be more."""
     matched = 0
@@ -123,7 +123,7 @@ def matched_stars(tangents: FloatArray, R: FloatArray, factor: float, sky: SkyCe
     return matched
 
 
-@compiled
+@internal
 def first_not_shorter(known: Triangles, begin: int, end: int, length: float) -> int:
     """First of some triangles, in the order of their longest sides, of which that is not shorter."""
     while begin < end:

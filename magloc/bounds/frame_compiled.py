@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from arrays.array import SensorArray
 from arrays.pose import PoseUncertainty
 from arrays.typing import FloatArray
-from magloc.compilation import compiled
+from magloc.compilation import internal
 
 # Information about a parameter that is less than this part of what it would be were the others known is none.
 LOST_INFORMATION = 1e-12
@@ -125,7 +125,7 @@ def read_only(values: NDArray) -> NDArray:  # type: ignore[type-arg]
     return array
 
 
-@compiled
+@internal
 def turned(frame: FloatArray, x: float, y: float, z: float) -> tuple[float, float, float]:
     """Components of a vector along the rows of a frame."""
     return (

@@ -25,7 +25,7 @@ from magloc.bounds.frame_compiled import (
     BoundModel,
     turned,
 )
-from magloc.compilation import compiled
+from magloc.compilation import internal
 from magloc.fields.dipole_compiled import field_components, gradient_components
 from magloc.fields.multipole import N_BODY_ERRORS
 from magloc.fields.multipole_compiled import fill_finite_body_errors
@@ -79,7 +79,7 @@ class Block(NamedTuple):
     bodies: FloatArray
 
 
-@compiled
+@internal
 def new_block(model: BoundModel, n_moments: int) -> Block:
     """Workspaces for an array and blocks of equal size that together have a lane for every moment."""
     n_rows, n_columns = model.noise.size, model.nuisances.size + 6
@@ -103,7 +103,7 @@ def new_block(model: BoundModel, n_moments: int) -> Block:
     )
 
 
-@compiled
+@internal
 def fill_entries(
     model: BoundModel,
     position: FloatArray,
@@ -131,7 +131,7 @@ def fill_entries(
         _eliminate(block, entries[:, begin : begin + n_lanes])
 
 
-@compiled
+@internal
 def _place(model: BoundModel, position: FloatArray, frame: FloatArray, block: Block) -> None:
     """Turn the array to the axes u, v, n."""
     arm = position + model.lever_arm
@@ -148,12 +148,12 @@ def _place(model: BoundModel, position: FloatArray, frame: FloatArray, block: Bl
         _turn_into(block.axes[c], frame, a[0], a[1], a[2])
 
 
-@compiled
+@internal
 def _turn_into(out: FloatArray, frame: FloatArray, x: float, y: float, z: float) -> None:
     out[0], out[1], out[2] = turned(frame, x, y, z)
 
 
-@compiled
+@internal
 def _fill_moments(moments: FloatArray, begin: int, n_lanes: int, frame: FloatArray, w: FloatArray) -> None:
     for i in range(n_lanes):
         j = min(begin + i, moments.shape[0] - 1)  # an idle lane computes something, too
@@ -161,7 +161,7 @@ def _fill_moments(moments: FloatArray, begin: int, n_lanes: int, frame: FloatArr
         w[MOMENT + i], w[MOMENT + LANES + i], w[MOMENT + 2 * LANES + i] = u, v, n
 
 
-@compiled
+@internal
 def _fill_fields(model: BoundModel, block: Block) -> None:
     w, fields, n_lanes = block.w, block.fields, block.columns.shape[2]
     for s in range(model.scalar.size):
@@ -177,7 +177,7 @@ def _fill_fields(model: BoundModel, block: Block) -> None:
             fields[f + 3 * LANES + i] = math.sqrt(x * x + y * y + z * z)
 
 
-@compiled
+@internal
 def _fill_means(scalar: NDArray[np.bool_], block: Block) -> None:
     """Mean field of the vector sensors, mean modulus of the scalar ones."""
     w, fields, n_lanes = block.w, block.fields, block.columns.shape[2]
@@ -192,7 +192,7 @@ def _fill_means(scalar: NDArray[np.bool_], block: Block) -> None:
                 w[MEAN + k * LANES + i] += share * fields[s * FIELD + k * LANES + i]
 
 
-@compiled
+@internal
 def _fill_columns(model: BoundModel, block: Block) -> None:
     """Columns of the nuisances, of the moment and of the position."""
     w, columns = block.w, block.columns
@@ -235,7 +235,7 @@ def _fill_columns(model: BoundModel, block: Block) -> None:
             columns[row, n_nuisances + 2, i] = along * n
 
 
-@compiled
+@internal
 def _effect(nuisance: int, scalar: bool, axis: int) -> int:
     """Where it stands what a channel reads of a nuisance."""
     if nuisance == COMMON_MODULUS:
@@ -247,7 +247,7 @@ def _effect(nuisance: int, scalar: bool, axis: int) -> int:
     return axis + (nuisance - AMBIENT) * LANES
 
 
-@compiled
+@internal
 def _fill_row(displacement: FloatArray, axis: FloatArray, n_lanes: int, w: FloatArray) -> None:
     """Derivatives of a channel with respect to moment and position; the latter's sign does not matter."""
     dx, dy, dz = displacement[0], displacement[1], displacement[2]
@@ -262,7 +262,7 @@ def _fill_row(displacement: FloatArray, axis: FloatArray, n_lanes: int, w: Float
         w[ROW + 5 * LANES + i] = xz * mx + yz * my + zz * mz
 
 
-@compiled
+@internal
 def _fill_turn(k: int, arm: FloatArray, ambient: FloatArray, axis: FloatArray, w: FloatArray, out: FloatArray) -> None:
     """What a channel reads of a turn about axis k: the source's place, its moment and the ambient field turn back."""
     a, b = (k + 1) % 3, (k + 2) % 3  # component a of v × e_k is v_b, component b is -v_a
@@ -274,7 +274,7 @@ def _fill_turn(k: int, arm: FloatArray, ambient: FloatArray, axis: FloatArray, w
         out[i] = by_moment - by_place + axis[a * LANES + i] * ambient[b] - axis[b * LANES + i] * ambient[a]
 
 
-@compiled
+@internal
 def _fill_body(e: FloatArray, axis: FloatArray, w: FloatArray, out: FloatArray) -> None:
     """What a channel reads of one error of a body, which is a symmetric matrix times the moment."""
     for i in range(out.size):
@@ -287,7 +287,7 @@ def _fill_body(e: FloatArray, axis: FloatArray, w: FloatArray, out: FloatArray) 
         out[i] = axis[i] * x + axis[LANES + i] * y + axis[2 * LANES + i] * z
 
 
-@compiled
+@internal
 def _fill_scalar_axis(model: BoundModel, s: int, block: Block) -> None:
     """Direction of the field times the gain, over the noise."""
     w, fields, n_lanes = block.w, block.fields, block.columns.shape[2]
@@ -308,7 +308,7 @@ def _fill_scalar_axis(model: BoundModel, s: int, block: Block) -> None:
         w[AXES + 2 * LANES + i] = along * fields[f + 2 * LANES + i]
 
 
-@compiled
+@internal
 def _fill_vector_axes(model: BoundModel, s: int, block: Block) -> None:
     """Axes times the inverse root of the covariance, by substitution in its Cholesky factor."""
     w, fields, n_lanes = block.w, block.fields, block.columns.shape[2]
@@ -363,7 +363,7 @@ def _fill_vector_axes(model: BoundModel, s: int, block: Block) -> None:
         w[AXES + 8 * LANES + i] = inverse * (t2 - tp * e2 - tq * f2)
 
 
-@compiled
+@internal
 def _eliminate(block: Block, entries: FloatArray) -> None:
     """Gram matrix of the position's columns, at right angles to those of the nuisances, and then to the moment's.
 
@@ -387,7 +387,7 @@ def _eliminate(block: Block, entries: FloatArray) -> None:
             entry += 1
 
 
-@compiled
+@internal
 def _project(columns: FloatArray, k: int, before: FloatArray, factors: FloatArray) -> None:
     """Turn the columns behind column k to right angles to it, unless next to nothing is left of its square before."""
     n_rows, n_columns, n_lanes = columns.shape
@@ -404,7 +404,7 @@ def _project(columns: FloatArray, k: int, before: FloatArray, factors: FloatArra
                 columns[c, j, i] -= factors[j, i] * columns[c, k, i]
 
 
-@compiled
+@internal
 def _fill_product(columns: FloatArray, j: int, k: int, out: FloatArray) -> None:
     """Scalar product of two columns."""
     out[:] = 0.0

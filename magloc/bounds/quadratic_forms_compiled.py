@@ -15,7 +15,7 @@ import numpy as np
 
 from arrays.typing import FloatArray
 from magloc.bounds.frame_compiled import LOST_INFORMATION, BoundModel, turned
-from magloc.compilation import compiled
+from magloc.compilation import internal
 from magloc.fields.dipole_compiled import field_components, gradient_components
 
 # Place of (i, a) among the six entries xx, xy, xz, yy, yz, zz of a symmetric tensor.
@@ -36,7 +36,7 @@ class Forms(NamedTuple):
     squares: FloatArray
 
 
-@compiled
+@internal
 def new_forms(model: BoundModel, moments: FloatArray) -> Forms:
     """Workspaces for an array and some moments (M, 3)."""
     squares = np.empty((6, moments.shape[0]))
@@ -55,7 +55,7 @@ def new_forms(model: BoundModel, moments: FloatArray) -> Forms:
     )
 
 
-@compiled
+@internal
 def fill_entries(model: BoundModel, position: FloatArray, frame: FloatArray, work: Forms, entries: FloatArray) -> None:
     """Information about (u, v, n) for every moment, into entries (9, M or more).
 
@@ -74,7 +74,7 @@ def fill_entries(model: BoundModel, position: FloatArray, frame: FloatArray, wor
             )  # fmt: skip
 
 
-@compiled
+@internal
 def _fill_columns(model: BoundModel, position: FloatArray, frame: FloatArray, columns: FloatArray) -> None:
     """Columns of the nuisances, of the moment (3) and of the six, in units of the noise."""
     sensors, n_channels, n_nuisances = model.sensors, model.noise.size, model.nuisances.size
@@ -99,7 +99,7 @@ def _fill_columns(model: BoundModel, position: FloatArray, frame: FloatArray, co
             columns[c, i + 6], columns[c, i + 7], columns[c, i + 8] = g[3], g[4], g[5]
 
 
-@compiled
+@internal
 def _eliminate(work: Forms) -> None:
     """Gram matrix (6, 6) of the last six columns: at right angles to the nuisances (whole), and to the moment (gram).
 
@@ -124,7 +124,7 @@ def _eliminate(work: Forms) -> None:
 # Sums over the rows keep their order, so the inner loops go over the columns: these can be vectorised.
 
 
-@compiled
+@internal
 def _project(columns: FloatArray, k: int, before: float, factors: FloatArray) -> None:
     """Turn the columns behind column k to right angles to it, unless next to nothing is left of its square before."""
     n_rows, n_columns = columns.shape
@@ -144,7 +144,7 @@ def _project(columns: FloatArray, k: int, before: float, factors: FloatArray) ->
             columns[c, j] -= value * factors[j]
 
 
-@compiled
+@internal
 def _fill_gram(columns: FloatArray, gram: FloatArray) -> None:
     first = columns.shape[1] - 6
     gram[:] = 0.0
@@ -155,7 +155,7 @@ def _fill_gram(columns: FloatArray, gram: FloatArray) -> None:
                 gram[i, j] += value * columns[c, first + j]
 
 
-@compiled
+@internal
 def _fill_forms(gram: FloatArray, whole: FloatArray, frame: FloatArray, forms: FloatArray) -> None:
     """Coefficients (9, 6) of xx, xy, xz, yy, yz, zz of the moment, array frame, in what :func:`fill_entries` writes."""
     form, turned_form = np.empty((3, 3)), np.empty((3, 3))

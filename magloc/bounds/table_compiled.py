@@ -17,7 +17,7 @@ from arrays.typing import FloatArray
 from magloc.bounds import lanes_compiled as bound_lanes
 from magloc.bounds import quadratic_forms_compiled as bound_forms
 from magloc.bounds.frame_compiled import LOST_INFORMATION, BoundModel, read_only
-from magloc.compilation import compiled, over_rows
+from magloc.compilation import compiled, internal, over_rows
 from magloc.linalg_compiled import fill_frame
 
 
@@ -89,7 +89,7 @@ def _fill(
             _fill_spread(sigmas[n_alone:], ranks, ordered, spreads[i])
 
 
-@compiled
+@internal
 def _fill_sigmas(length: float, e: FloatArray, out: FloatArray) -> None:
     """The three σ of one position for every moment, into out (M, 3)."""
     for j in range(out.shape[0]):
@@ -101,7 +101,7 @@ def _fill_sigmas(length: float, e: FloatArray, out: FloatArray) -> None:
         )
 
 
-@compiled
+@internal
 def _sigmas(
     length: float, uu: float, uv: float, vv: float, un: float, vn: float, nn: float, u: float, v: float, n: float
 ) -> tuple[float, float, float]:
@@ -125,7 +125,7 @@ def _sigmas(
     return math.sqrt(range_variance), math.sqrt(across) / length, math.sqrt(range_variance + across)
 
 
-@compiled
+@internal
 def _fill_spread(sigmas: FloatArray, ranks: NDArray[np.intp], ordered: FloatArray, out: FloatArray) -> None:
     """Mean, order statistics and greatest of every column, into out (3, 2 + ranks)."""
     n = ordered.size

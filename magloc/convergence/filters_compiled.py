@@ -14,7 +14,7 @@ from numba import get_num_threads, prange
 from numpy.typing import NDArray
 
 from arrays.typing import FloatArray
-from magloc.compilation import compiled, compiled_parallel, inlined
+from magloc.compilation import compiled, compiled_parallel, inlined, internal
 from magloc.convergence.linearisation_compiled import Model, linearise_contrasts, linearise_rows
 from magloc.convergence.workspace_compiled import (
     ACCEPT,
@@ -207,7 +207,7 @@ def run_every(
             _step_from_prior(lane, w)
 
 
-@compiled
+@internal
 def _begin_information(w: FloatArray, i: int) -> None:
     """Information of the first prediction, whose covariance is twice S_q S_qᵀ."""
     for row in range(21):
@@ -216,7 +216,7 @@ def _begin_information(w: FloatArray, i: int) -> None:
         w[INFORMATION + row * LANES + i] = 0.5
 
 
-@compiled
+@internal
 def _see_ends(lane: int | None, w: FloatArray, rules: Rules) -> None:
     """Rows DONE and STOPPED."""
     tolerance2, max_iterations = rules.tolerance2, rules.max_iterations
@@ -228,7 +228,7 @@ def _see_ends(lane: int | None, w: FloatArray, rules: Rules) -> None:
         w[DONE + i] = 1.0 if done else 0.0
 
 
-@compiled
+@internal
 def _judge(lane: int | None, w: FloatArray, before: FloatArray, residuals: FloatArray, rules: Rules) -> None:
     """Accept the trial state if it lowers the cost, adapt the damping, and see which starts end."""
     tolerance2, max_iterations = rules.tolerance2, rules.max_iterations
@@ -258,7 +258,7 @@ def _judge(lane: int | None, w: FloatArray, before: FloatArray, residuals: Float
     _keep_best(lane, w, residuals, before)
 
 
-@compiled
+@internal
 def _keep_best(lane: int | None, w: FloatArray, trial: FloatArray, best: FloatArray) -> None:
     """All rows of both become the trial's in the lanes where it was accepted, and those of the best elsewhere."""
     for r in range(trial.size // LANES):
@@ -269,7 +269,7 @@ def _keep_best(lane: int | None, w: FloatArray, trial: FloatArray, best: FloatAr
             best[r * LANES + i] = value
 
 
-@compiled
+@internal
 def _step_from_prior(lane: int | None, w: FloatArray) -> None:
     """Gauss-Newton step on χ² and prior, with the normal matrix's diagonal damped."""
     for r in range(6):
@@ -280,7 +280,7 @@ def _step_from_prior(lane: int | None, w: FloatArray) -> None:
         _move(w, i)
 
 
-@compiled
+@internal
 def _step_and_grow(lane: int | None, w: FloatArray) -> None:
     """Update of the predicted state, and the information A of the next prediction.
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from arrays.typing import FloatArray
-from magloc.compilation import compiled, inlined
+from magloc.compilation import inlined, internal
 from magloc.convergence.workspace_compiled import (
     BASE,
     CHANGE,
@@ -110,7 +110,7 @@ def _base_and_noise(weights: FloatArray, variance: FloatArray) -> tuple[int, Flo
     return base, 1.0 / certainty if recursive else None
 
 
-@compiled
+@internal
 def linearise_contrasts(
     w: FloatArray,
     before: FloatArray,
@@ -154,7 +154,7 @@ def linearise_contrasts(
             _add_difference(w, i, ez, -gxz, -gyz, gxx + gyy, axz, ayz, -(axx + ayy))
 
 
-@compiled
+@internal
 def linearise_rows(
     w: FloatArray,
     fields: FloatArray,
@@ -214,7 +214,7 @@ def _contrast(w: FloatArray, quantity: int, i: int, blend: float, whiten: float)
     return whiten * difference
 
 
-@compiled
+@internal
 def _add_to_row(lane: int | None, w: FloatArray, f: FloatArray, x: float, y: float, z: float) -> None:
     """Add one sensor, whose rows SENSOR are f, to a difference with the weights x, y, z of its field."""
     for i in lanes_of(lane):
@@ -231,7 +231,7 @@ def _add_to_row(lane: int | None, w: FloatArray, f: FloatArray, x: float, y: flo
         w[ROW + 6 * LANES + i] += x * axz + y * ayz - z * (axx + ayy)
 
 
-@compiled
+@internal
 def _add_row(lane: int | None, w: FloatArray, before: FloatArray, residuals: FloatArray, variance: float) -> None:
     """Add a difference to NORMAL, RIGHT and CHI2, and its part of ‖ΔG‖² to CHANGE."""
     for i in lanes_of(lane):

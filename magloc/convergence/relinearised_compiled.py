@@ -17,12 +17,12 @@ from numba import prange
 from numpy.typing import NDArray
 
 from arrays.typing import FloatArray
-from magloc.compilation import compiled, compiled_parallel
+from magloc.compilation import compiled_parallel, internal
 from magloc.fields.dipole import MU0_OVER_4PI
 from magloc.kalman_compiled import scalar_update, triangular_root
 
 
-@compiled
+@internal
 def _row(x: FloatArray, sensors: FloatArray, weights: FloatArray, j: int, h: FloatArray) -> float:
     """Difference j at the state x (p, m), and its gradient into h (6,)."""
     value = 0.0
@@ -50,7 +50,7 @@ def _row(x: FloatArray, sensors: FloatArray, weights: FloatArray, j: int, h: Flo
     return value
 
 
-@compiled
+@internal
 def _add_process_noise(S: FloatArray, s_q: FloatArray, wide: FloatArray) -> None:
     """S becomes a lower triangular square root of ``S Sᵀ + diag(s_q²)``."""
     wide[:] = 0.0
@@ -61,7 +61,7 @@ def _add_process_noise(S: FloatArray, s_q: FloatArray, wide: FloatArray) -> None
     triangular_root(wide, S)
 
 
-@compiled
+@internal
 def _finish(
     x: FloatArray, z: FloatArray, chi2_variance: FloatArray, sensors: FloatArray, weights: FloatArray, h: FloatArray
 ) -> float:

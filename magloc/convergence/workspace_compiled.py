@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from arrays.typing import FloatArray
-from magloc.compilation import compiled, inlined
+from magloc.compilation import inlined, internal
 
 LANES = 32
 # Rows, as offsets into the workspace. The first four groups are the linearisation at the state of its first six rows.
@@ -35,7 +35,7 @@ SENSOR_ROWS = 13
 DIAGONAL = (0, 6, 11, 15, 18, 20)  # rows of an upper triangle
 
 
-@compiled
+@internal
 def aligned(size: int) -> FloatArray:
     """Zeros that begin on a cache line, where a vector register never reaches into the next."""
     zeros = np.zeros(size + 8)

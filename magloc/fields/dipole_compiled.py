@@ -19,7 +19,7 @@ import numpy as np
 from numba import prange
 from numpy.typing import ArrayLike, NDArray
 
-from magloc.compilation import compiled, compiled_parallel
+from magloc.compilation import compiled, compiled_parallel, internal
 from magloc.fields.dipole import MU0_OVER_4PI
 
 Array = NDArray[np.float64]
@@ -163,7 +163,7 @@ def _fill_fields(points: Array, sources: Array, moments: Array, out: Array) -> N
         _fill_field_block(points[span], sources, moments, out[span])
 
 
-@compiled
+@internal
 def _fill_field_block(points: Array, sources: Array, moments: Array, out: Array) -> None:
     """Write the fields at up to BLOCK points."""
     n = len(points)

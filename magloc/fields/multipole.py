@@ -74,25 +74,28 @@ def finite_body_fields(separation_m: FloatArray, moment_Am2: FloatArray, rank: i
     :math:`T \cdot \nabla^n B / n!` to the field: by orthonormal components of T, in tesla per m^n. Separations (..., 3)
     are from the body's centre to the points.
     """
-    r = np.linalg.norm(separation_m, axis=-1)[..., None, None]
+    separation, moment = np.broadcast_arrays(separation_m, moment_Am2)
+    # Points come last, (3, p): what is done of each then runs over them.
+    x, m = (np.ascontiguousarray(of.reshape(-1, 3).T) for of in (separation, moment))
+    r = np.sqrt(np.sum(x * x, axis=0))
     with np.errstate(invalid="ignore", divide="ignore"):
-        n = separation_m[..., None, :] / r
-    # Contracted with n but for two indices, for one, for none.
-    basis = traceless_basis(rank).reshape(2 * rank + 1, 3, 3, -1)
-    powers = np.ones_like(r[..., 0]) if rank == 2 else (n.mT * n).reshape(*n.shape[:-2], 9)
-    matrix = (powers @ basis.reshape(-1, basis.shape[-1]).T).reshape(*n.shape[:-2], *basis.shape[:3])
-    vector = (matrix @ n[..., None])[..., 0]
-    number = np.sum(vector * n, axis=-1, keepdims=True)
-    m = moment_Am2[..., None, :]
-    n_m, v_m = np.sum(n * m, axis=-1, keepdims=True), np.sum(vector * m, axis=-1, keepdims=True)
+        n = x / r
+    factors, tensors = _contractions(rank)
+    powers = [n[of] for of in factors]
+    # Tensors contracted with n but for one index, and with the moment in place of one n.
+    vector = (tensors @ prod(powers)).reshape(3, 2 * rank + 1, r.size)
+    places = range(len(factors))
+    once = sum(prod([m[factors[i]] if i == at else powers[i] for i in places]) for at in places)
+    bent = (tensors @ (once / len(factors))).reshape(vector.shape)
+    number, v_m, n_m = np.sum(vector * n[:, None], axis=0), np.sum(vector * m[:, None], axis=0), np.sum(n * m, axis=0)
     a = 2 * rank + 1
     # The second derivatives of T·xⁿ/r^(2n+1) along the moment.
-    pattern = rank * (rank - 1) * (matrix @ m[..., None])[..., 0] - rank * a * (vector * n_m + v_m * n)
-    pattern += a * number * ((a + 2) * n_m * n - m)
-    scale = MU0_OVER_4PI * prod(range(1, a, 2)) / factorial(rank)
+    pattern = rank * (rank - 1) * bent - (rank * a * n_m) * vector
+    pattern += (a * (a + 2) * n_m * number - rank * a * v_m) * n[:, None]
+    pattern -= (a * number) * m[:, None]
     with np.errstate(invalid="ignore", divide="ignore"):
-        fields: FloatArray = np.swapaxes(scale * pattern / r ** (rank + 3), -1, -2)
-    return fields
+        pattern *= MU0_OVER_4PI * prod(range(1, a, 2)) / factorial(rank) / r ** (rank + 3)
+    return np.ascontiguousarray(pattern.transpose(2, 0, 1)).reshape(*separation.shape, a)
 
 
 def finite_body_errors(separation_m: FloatArray, moment_Am2: FloatArray, length_m: FloatArray | float) -> FloatArray:
@@ -140,3 +143,13 @@ def traceless_basis(order: int) -> FloatArray:
         return basis
     traces = np.trace(basis, axis1=1, axis2=2).reshape(len(basis), -1)
     return np.tensordot(null_space(traces.T).T, basis, axes=1)
+
+
+@cache
+def _contractions(rank: int) -> tuple[list[list[int]], FloatArray]:
+    """Indices of the factors of all monomials of rank - 1, and the traceless basis by them (3 (2 l + 1), f)."""
+    monomials = list(combinations_with_replacement(range(3), rank - 1))
+    basis = np.moveaxis(traceless_basis(rank), 0, 1).reshape(3, 2 * rank + 1, -1)
+    places = [[np.ravel_multi_index(of, (3,) * (rank - 1)) for of in set(permutations(every))] for every in monomials]
+    columns = [basis[..., of].sum(axis=-1) for of in places]
+    return [list(of) for of in zip(*monomials, strict=True)], np.stack(columns, axis=-1).reshape(-1, len(monomials))

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from arrays.typing import FloatArray
-from magloc.compilation import compiled
+from magloc.compilation import internal
 from magloc.fields.dipole import MU0_OVER_4PI
 from magloc.fields.multipole import BODY_SIGMA, traceless_basis
 
@@ -18,7 +18,7 @@ _QUARTIC = traceless_basis(4).reshape(9, 9, 9)
 _SIGMA_2, _SIGMA_4 = BODY_SIGMA[2], BODY_SIGMA[4]
 
 
-@compiled
+@internal
 def fill_finite_body_errors(separation_m: FloatArray, length_m: float, out: FloatArray) -> None:
     """Symmetric matrices by which the moment's field errs, of one σ, into out (14, 6): xx, xy, xz, yy, yz, zz."""
     x, y, z = separation_m[0], separation_m[1], separation_m[2]

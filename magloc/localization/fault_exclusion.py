@@ -58,7 +58,7 @@ _HALF_CHECKED, _LEAST_CHECKED = 0.5, 0.1
 _MOST_SEARCHED = 2
 # Share of a source's energy in one sensor above which no other sensor sees it.
 _LONELY = 0.9
-_ROWS_AT_ONCE = 64
+_ROWS_AT_ONCE = 64  # whose numbers a processor's cache holds
 
 
 class Refit(Protocol):
@@ -180,19 +180,16 @@ class _Examination:
 
     def allow_for_model_errors(self, plain: Sequence[Fix]) -> None:
         """Count as noise what bodies and the ambient field add to the fixes: no sensor is to be accused of it."""
-        errors = []
         sigma_T = self.array.row_ambient_uncertainty_T if self.array.channel_is_scalar.any() else 0.0
-        for row, fix in enumerate(plain):
-            if fix.solutions and (fix.body_length_m > 0.0 or sigma_T):
-                q, mu = self._scaled(fix)
-                lengths = np.full((1, len(q)), fix.body_length_m)
-                at = self.problem.rows(np.array([row]))
-                errors.append((row, model_errors(at, q[None], mu[None], lengths, sigma_T)[0]))
+        length_m = np.array([fix.body_length_m for fix in plain])
+        errors = []
+        for rows, q, mu in self._by_count([(row, fix) for row, fix in enumerate(plain) if length_m[row] or sigma_T]):
+            lengths = np.tile(length_m[rows, None], q.shape[1])
+            errors.append((rows, model_errors(self.problem.rows(rows), q, mu, lengths, sigma_T)))
         if errors:
-            widest = max(columns.shape[1] for _, columns in errors)
-            every = np.zeros((len(plain), self.raw.shape[1], widest))
-            for row, columns in errors:
-                every[row, :, : columns.shape[1]] = columns
+            every = np.zeros((len(plain), self.raw.shape[1], max(columns.shape[2] for _, columns in errors)))
+            for rows, columns in errors:
+                every[rows, :, : columns.shape[2]] = columns
             self.fits = replace(self.fits, problem=self.problem.marginalised(every))
 
     def without_lonely_sources(self, plain: Sequence[Fix]) -> list[Fix]:

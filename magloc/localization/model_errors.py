@@ -35,9 +35,14 @@ def body_errors(model: WhitenedModel, q: FloatArray, mu: FloatArray, length_m: F
     separation = sensors - model.position(q)[:, :, None]
     moment = np.broadcast_to(model.moment(q, mu)[:, :, None], separation.shape)
     fields = finite_body_errors(separation, moment, length_m[..., None, None, None])
-    gain = model.linear_gain(model.source_fields(q, mu))
-    columns = np.einsum("bcj,bkcjn->bckn", gain, fields[:, :, model.channel_sensor], optimize=True)
-    return columns.reshape(*gain.shape[:2], columns.shape[2] * columns.shape[3])
+    # In threes, those of a sensor.
+    gain = np.zeros((len(q), 1, 3 * len(sensors), 3))
+    place = model.threes[0]
+    gain[:, 0, place] = model.linear_gain(model.source_fields(q, mu))
+    columns = gain.reshape(len(q), 1, len(sensors), 3, 3) @ fields
+    n_sources, n_errors = q.shape[1], columns.shape[-1]
+    columns = columns.reshape(len(q), n_sources, 3 * len(sensors), n_errors)[:, :, place].transpose(0, 2, 1, 3)
+    return columns.reshape(len(q), place.size, n_sources * n_errors)
 
 
 def assumed_lengths(model: WhitenedModel, q: FloatArray, body_length_m: float | None) -> FloatArray:
@@ -65,17 +70,19 @@ def with_model_errors(
     solved = np.flatnonzero(np.bincount(optima.of_row, minlength=len(rows)))
     best, model = optima.fits.rows(first[solved]), rows.model.rows(solved)
     lengths = np.zeros((len(rows), optima.fits.n_sources))
+    known: FloatArray | None = None
     if not point:
         lengths[solved] = assumed_lengths(rows.model, best.q, body_length_m)
         near = np.flatnonzero(lengths[solved].any(axis=1))
         errors = body_errors(model.rows(near), best.q[near], best.mu[near], lengths[solved[near]])
         negligible = np.sum(model.rows(near).whitened(errors) ** 2, axis=(1, 2)) <= _NEGLIGIBLE
         lengths[solved[near[negligible]]] = 0.0
+        known = None if ambient_sigma_T else errors[~negligible]
     matters: BoolArray = np.asarray(lengths.any(axis=1))
     matters[solved] |= ambient_sigma_T > 0.0
     if not matters.any():
         return [(optima, none)]
-    refined = _refined(optima.chosen(matters), lengths[matters], ambient_sigma_T)
+    refined = _refined(optima.chosen(matters), lengths[matters], ambient_sigma_T, known)
     # A row of which no fit converged again stays that of a point in a known field.
     lost = np.bincount(refined.of_row, minlength=len(refined.rows)) == 0
     matters[np.flatnonzero(matters)[lost]] = False
@@ -91,13 +98,18 @@ def _all_far(q: FloatArray) -> bool:
     return np.count_nonzero(np.abs(s) < _FAR_S) == s.size
 
 
-def _refined(optima: Optima, lengths: FloatArray, ambient_sigma_T: float) -> Optima:
-    """Optima with errors linearised at the best fit of every row, refined, linearised there again."""
+def _refined(optima: Optima, lengths: FloatArray, ambient_sigma_T: float, errors: FloatArray | None) -> Optima:
+    """Optima with errors linearised at the best fit of every row, refined, linearised there again.
+
+    The errors at the first best fits may be known.
+    """
     fits, rows = optima.fits, optima.rows
     merged = np.broadcast_to(optima.merged, fits.mu.shape[:2])
     for _ in range(_ROUNDS):
-        best = fits.rows(np.searchsorted(optima.of_row, np.arange(len(rows))))
-        rows = optima.rows.marginalised(model_errors(optima.rows.model, best.q, best.mu, lengths, ambient_sigma_T))
+        if errors is None:
+            best = fits.rows(np.searchsorted(optima.of_row, np.arange(len(rows))))
+            errors = model_errors(optima.rows.model, best.q, best.mu, lengths, ambient_sigma_T)
+        rows, errors = optima.rows.marginalised(errors), None
         start = fits
         fits = refine(rows.model.rows(optima.of_row), rows.y[optima.of_row], start.q, start.mu)
         fits = replace(fits, iterations=fits.iterations + start.iterations)

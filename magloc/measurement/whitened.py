@@ -21,6 +21,9 @@ from magloc.fields.dipole import MU0_OVER_4PI
 from magloc.measurement.known_moment import KnownMoment
 from magloc.measurement.whitened_compiled import LaneModel, ModelRows, Units
 
+# Squares of columns of whose errors of rounding nothing is seen, in units of the noise; those of a column that is none.
+_MOST_SQUARES, _UNSEEN = 1e8, 1e-7
+
 
 @dataclass(frozen=True, eq=False)
 class ScaledSensors:
@@ -195,20 +198,24 @@ class WhitenedModel(ScaledSensors):
 
     def marginalised(self, columns: FloatArray) -> WhitenedModel:
         """The same where errors of unit variance along columns (b, C, n), in units of the noise, count as noise."""
-        flat = self.shrinkage >= 1.0
-        # Columns that are of a kind in no row cost time, and are none.
-        some, bounded = flat.any(axis=0), ~flat.all(axis=0)
-        unknown = (self.basis * flat[:, None])[..., some]
-        with np.errstate(divide="ignore"):
-            variance = np.where(flat, 0.0, 1.0 / (1.0 - self.shrinkage) ** 2 - 1.0)
-        known = (self.basis * np.sqrt(variance)[:, None])[..., bounded]
+        flat, unknown = self.shrinkage >= 1.0, self.basis
+        bounded = ~flat.all(axis=0)
+        if bounded.any():
+            # Columns that are of a kind in no row cost time, and are none.
+            with np.errstate(divide="ignore"):
+                variance = np.where(flat, 0.0, 1.0 / (1.0 - self.shrinkage) ** 2 - 1.0)
+            known = (unknown * np.sqrt(variance)[:, None])[..., bounded]
+            unknown = (unknown * flat[:, None])[..., flat.any(axis=0)]
+            flat = flat[:, flat.any(axis=0)]
         free = columns - unknown @ (unknown.transpose(0, 2, 1) @ columns)
-        basis, singular, _ = np.linalg.svd(np.concatenate([known, free], axis=2), full_matrices=False)
+        if bounded.any():
+            free = np.concatenate([known, free], axis=2)
+        basis, singular = _left_singular(free)
         shrinkage = 1.0 - 1.0 / np.sqrt(1.0 + singular**2)
         return replace(
             self,
             basis=np.concatenate([unknown, basis], axis=2),
-            shrinkage=np.concatenate([flat[:, some].astype(np.float64), shrinkage], axis=1),
+            shrinkage=np.concatenate([flat.astype(np.float64), shrinkage], axis=1),
         )
 
     def source_fields(self, q: FloatArray, mu: FloatArray) -> FloatArray:
@@ -290,3 +297,20 @@ class WhitenedModel(ScaledSensors):
         along_s = np.sum(slope * self.sensors[self.channel_sensor], axis=-1, keepdims=True)
         columns = np.concatenate([-slope, along_s], axis=-1) @ tangent
         return self.whitened(columns.transpose(0, 2, 1, 3).reshape(len(q), gain.shape[1], -1))
+
+
+def _left_singular(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Left singular vectors (b, C, k) of columns (b, C, n), k being n or C, and singular values (b, k).
+
+    By the squares of few columns that are not large, where those whose values are rounding errors are zero instead.
+    """
+    n = columns.shape[2]
+    square = columns.transpose(0, 2, 1) @ columns if 2 * n < columns.shape[1] else np.array(np.inf)
+    if not square.max(initial=0.0) < _MOST_SQUARES:
+        basis, singular, _ = np.linalg.svd(columns, full_matrices=False)
+        return basis, singular
+    basis = columns @ np.linalg.eigh(square)[1]
+    singular = np.sqrt(np.einsum("bcn,bcn->bn", basis, basis))
+    singular = np.where(singular > _UNSEEN * singular.max(axis=1, keepdims=True, initial=0.0), singular, 0.0)
+    basis *= np.where(singular > 0.0, 1.0 / np.where(singular > 0.0, singular, 1.0), 0.0)[:, None]
+    return basis, singular

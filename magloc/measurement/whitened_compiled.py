@@ -92,20 +92,23 @@ class LaneModel(NamedTuple):
         """All rows of a model."""
         sets = slice(0, 1) if model.shares_whitening else slice(None)
         basis, shrinkage = model.basis[sets], model.shrinkage[sets]
-        n_sets, _, n_common = basis.shape
+        n_sets, n_channels, n_common = basis.shape
         place, known, n_sensors = model.threes
-        gain = np.zeros((n_sets, 3 * n_sensors, 3))
-        gain[:, place] = model.gain[sets]
         n_triples = -(-n_common // 3)
-        common = np.zeros((n_sets, 3 * n_sensors, 3 * n_triples))
-        common[:, place, :n_common] = basis * np.sqrt(shrinkage * (2.0 - shrinkage))[:, None]
-        common[:, 3 * len(model.sensors) + np.arange(known.size), known] = 1.0 - shrinkage[:, known]
+        at: slice | NDArray[np.intp] = slice(n_channels) if n_channels == 3 * len(model.sensors) else place
+        gain = np.zeros((n_sets, 3 * n_sensors, 3))
+        gain[:, at] = model.gain[sets]
+        projected = np.zeros((n_sets, n_channels, 3 * n_triples))
+        np.multiply(basis, np.sqrt(shrinkage * (2.0 - shrinkage))[:, None], out=projected[..., :n_common])
+        common = np.zeros((n_sets, n_triples, 3 * n_sensors, 3))
+        by_channel = common.transpose(0, 2, 1, 3)
+        by_channel[:, at] = projected.reshape(n_sets, n_channels, n_triples, 3)
+        of_prior = 3 * len(model.sensors) + np.arange(known.size)
+        by_channel[:, of_prior, known // 3, known % 3] = 1.0 - shrinkage[:, known]
         return cls(
             own(np.concatenate([model.sensors, np.tile(model.sensors[:1], (n_sensors - len(model.sensors), 1))])),
             gain.reshape(n_sets, n_sensors, 9),
-            own(common.reshape(n_sets, n_sensors, 3, n_triples, 3).transpose(0, 3, 1, 2, 4)).reshape(
-                n_sets, n_triples, n_sensors, 9
-            ),
+            common.reshape(n_sets, n_triples, n_sensors, 9),
             np.zeros(len(model), dtype=np.intp) if n_sets == 1 else np.arange(len(model), dtype=np.intp),
             n_common == 3 and known.size == 0,
         )
@@ -120,9 +123,11 @@ def signals(model: WhitenedModel, y: FloatArray) -> FloatArray:
     if not known.size:
         result[:, place] = y
         return result.reshape(len(y), n_sensors, 3)
-    basis, shrinkage = model.basis[:, :, known], model.shrinkage[:, known]
-    along = np.einsum("bck,bc->bk", basis, y)
-    result[:, place] = y - np.einsum("bck,bk->bc", basis, shrinkage * along)
+    last = int(known[-1]) + 1
+    of_known = slice(last - known.size, last) if last - known[0] == known.size else known
+    basis, shrinkage = model.basis[..., of_known], model.shrinkage[:, of_known]
+    along = (y[:, None] @ basis)[:, 0]
+    result[:, place] = y - (basis @ (shrinkage * along)[..., None])[..., 0]
     result[:, 3 * len(model.sensors) + np.arange(known.size)] = -np.sqrt(shrinkage * (2.0 - shrinkage)) * along
     return result.reshape(len(y), n_sensors, 3)
 

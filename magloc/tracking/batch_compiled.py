@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arrays.typing import FloatArray
-from magloc.compilation import compiled
+from magloc.compilation import compiled, internal
 from magloc.fields.dipole import MU0_OVER_4PI
 from magloc.kalman_compiled import triangular_root
 from magloc.linalg_compiled import orthonormalise, put, put_rows
@@ -94,7 +94,7 @@ class State(NamedTuple):
     open_loop: FloatArray
 
 
-@compiled
+@internal
 def _predicted(
     x: FloatArray,
     origin: FloatArray,
@@ -158,7 +158,7 @@ def _predicted(
                     H[j, i] += w * slopes[c, i]
 
 
-@compiled
+@internal
 def _product(A: FloatArray, B: FloatArray, AB: FloatArray) -> None:
     """AB (n, m) = A (n, p) B (p, m)."""
     for i in range(A.shape[0]):
@@ -169,7 +169,7 @@ def _product(A: FloatArray, B: FloatArray, AB: FloatArray) -> None:
             AB[i, c] = t
 
 
-@compiled
+@internal
 def _widest(S: FloatArray) -> float:
     """Larger one of the standard deviations of log-range and direction."""
     widest = 0.0
@@ -181,7 +181,7 @@ def _widest(S: FloatArray) -> float:
     return math.sqrt(widest)
 
 
-@compiled
+@internal
 def _grows(S: FloatArray, predicted_S: FloatArray, largest_growth: float) -> bool:
     """Whether a standard deviation of position and moment has grown by more than a factor."""
     for i in range(6):
@@ -374,7 +374,7 @@ def follow(
     return end
 
 
-@compiled
+@internal
 def _derivatives(H: FloatArray, L: FloatArray, S: FloatArray, J_e: FloatArray, columns: FloatArray) -> None:
     """Derivatives of the readings by standard numbers, as rows (n, k) of columns."""
     k, n = J_e.shape
@@ -392,7 +392,7 @@ def _derivatives(H: FloatArray, L: FloatArray, S: FloatArray, J_e: FloatArray, c
             columns[i, j] = t
 
 
-@compiled
+@internal
 def _damped_inverse(columns: FloatArray, triangle: FloatArray, least_share: float, M: FloatArray) -> None:
     """The twin of :func:`magloc.tracking.chart.update.damped_inverse`; columns are spoilt."""
     n, k = M.shape
@@ -408,7 +408,7 @@ def _damped_inverse(columns: FloatArray, triangle: FloatArray, least_share: floa
             M[i, j] = t / triangle[i, i]
 
 
-@compiled
+@internal
 def _linearised(
     H: FloatArray,
     L: FloatArray,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+import time
 
 from tests.bench import (
     attitude,
@@ -47,8 +48,10 @@ def report(names: list[str], size: Size) -> str:
     head = header()  # before our own work loads the machine
     groups = []
     for name in names:
-        print(f"{name} ...", file=sys.stderr, flush=True)
+        print(f"{name} ...", end="", file=sys.stderr, flush=True)
+        began = time.perf_counter()
         groups.append((GROUPS[name].TITLE, list(GROUPS[name].rows(size))))
+        print(f" {time.perf_counter() - began:.0f} s", file=sys.stderr, flush=True)
     return f"{head}\n\n{table(groups)}"
 
 

@@ -13,6 +13,8 @@ from tests.browser.screen import Screen
 from tests.conftest import REPOSITORY
 
 ARTEFACTS = REPOSITORY / ".artefacts" / "browser"
+# Software draws each pixel of every frame, beside the other tests.
+SIZE = (960, 600)
 
 
 @pytest.fixture(scope="package")
@@ -22,5 +24,5 @@ def screen() -> Iterator[Screen]:
         find_chromium()
     except InputError:
         pytest.skip("needs Chromium or Chrome on the PATH: on Debian and Ubuntu, apt-get install chromium")
-    with Browser("about:blank") as browser:
+    with Browser("about:blank", SIZE) as browser:
         yield Screen(browser, ARTEFACTS)

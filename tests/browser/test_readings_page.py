@@ -15,6 +15,7 @@ from magloc.viewer.pages.live_fit import LiveFit
 from magloc.viewer.pages.pages import readings_page
 from magloc.viewer.scene.glyphs import DIPOLE_COLOUR, FIT_COLOUR
 from magloc.viewer.server import opened
+from tests.browser.conftest import SIZE
 from tests.browser.screen import Screen, Sight, dark_grey, hue_of
 
 ARRAY = tetrahedron(1.5)
@@ -85,4 +86,4 @@ class TestReadings:
             screen.until_seen(Sight("fixes", camera.pixels(POSITIONS[1:-1]), hue_of(FIT_COLOUR), share=0.7))
             screen.keep("readings-phone")
         finally:
-            screen.browser.call("Emulation.setDeviceMetricsOverride", width=1280, height=800, **shape)
+            screen.browser.call("Emulation.setDeviceMetricsOverride", width=SIZE[0], height=SIZE[1], **shape)

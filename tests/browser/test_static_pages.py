@@ -15,6 +15,7 @@ from magloc.viewer.pages.pages import array_page, map_page, track_page
 from magloc.viewer.scene.framing import SIDES_OF_A_PHONE
 from magloc.viewer.scene.glyphs import DIPOLE_COLOUR
 from magloc.viewer.server import opened, page_html, write_page
+from tests.browser.conftest import SIZE
 from tests.browser.screen import Screen, Sight, dark_grey, hue_of
 from tests.browser.test_map_page import DIPOLE, RESULT, sights
 from tests.browser.test_track_page import ARRAY, ORANGE, READINGS, TIMES, across, arrow_in, plot_box
@@ -85,7 +86,7 @@ class TestStaticPages:
                 screen.until_seen(Sight("body of a sensor", places, dark_grey))
                 screen.keep("static-phone")
             finally:
-                screen.browser.call("Emulation.setDeviceMetricsOverride", width=1280, height=800, **shape)
+                screen.browser.call("Emulation.setDeviceMetricsOverride", width=SIZE[0], height=SIZE[1], **shape)
 
 
 class TestReadings:

@@ -10,9 +10,9 @@ from tests.fuzz.cases import LINES, SELDOM, STREAM, commands
 from tests.fuzz.extremes import extremes
 from tests.fuzz.runner import Case, extreme_case, judged, read_files, report, run_case, verdict
 
-CHUNK = 100
-QUICK, NEW = 1, 22  # chunks that are always the same, and chunks that are new in every run
-PARTS = 250  # of all numbers that files and options take; the first one is quick, a tenth of them are tried at all
+CHUNK = 50
+QUICK, NEW = 1, 45  # chunks that are always the same, and chunks that are new in every run
+PARTS = 500  # of all numbers that files and options take; the first one is quick, a tenth of them are tried at all
 
 
 def test_every_command_has_a_line():

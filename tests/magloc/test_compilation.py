@@ -13,7 +13,7 @@ import pytest
 from tests.waiting import WAIT_S
 
 MODULE = """
-from magloc.compilation import compiled
+from magloc.compilation import compiled, inlined_sum, internal
 
 @compiled
 def twice(x):
@@ -22,6 +22,31 @@ def twice(x):
 @compiled
 def thrice(x):
     return twice(x) + x
+
+@internal
+def term(x, i):
+    return x[i]
+
+@inlined_sum
+def total(x):
+    sum_ = 0.0
+    for i in range(len(x)):
+        sum_ += term(x, i)
+    return sum_
+
+@internal
+def root(x):
+    if total(x) < 0.0:
+        raise ValueError(f"of {len(x)} numbers")
+    return total(x) ** 0.5
+
+@compiled
+def norm(x):
+    return root(x * x)
+
+@compiled
+def norm_of_sum(x):
+    return root(x)
 """
 CALL = """
 import logging, sys
@@ -53,11 +78,11 @@ def kept(compiled_once: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(compiled_once, tmp_path / "kept"))
 
 
-def call(folder: Path, before: str = "", **environment: str) -> tuple[str, str]:
+def call(folder: Path, before: str = "", script: str = CALL, **environment: str) -> tuple[str, str]:
     """What a process of its own prints: a result, and whether it found what was compiled on disk."""
     repository = str(Path(__file__).parents[2])
     changed = {**os.environ, "PYTHONPATH": repository, **environment}
-    command = [sys.executable, "-c", CALL.format(before=before)]
+    command = [sys.executable, "-c", script.format(before=before)]
     done = subprocess.run(command, cwd=folder, env=changed, capture_output=True, text=True, timeout=WAIT_S, check=False)
     assert done.returncode == 0, done.stderr
     return done.stdout.strip(), done.stderr
@@ -105,3 +130,91 @@ caching.IndexDataCacheFile.save = full"""
     assert out == "6.0 0"
     place = folder / "__pycache__"
     assert err == f"compiled code cannot be kept for the next run ({place}: No space left on device)\n"
+
+
+INTERNAL = """
+{before}
+import numpy as np, kernels
+print(kernels.norm(np.array([3.0, 4.0])), sum(kernels.root.stats.cache_hits.values()))
+try:
+    kernels.norm_of_sum(np.array([1.0, -2.0]))
+except ValueError as error:
+    print(error)
+"""
+AS_NUMBA_DOES = "from magloc import compiler; compiler.CAN_LINK_ONLY = False"
+
+
+class TestInternal:
+    """Functions that only kernels call; what they need of Python they find inside the kernel."""
+
+    def files(self, folder: Path, name: str) -> list[Path]:
+        return sorted((folder / "__pycache__").glob(f"{name}-*.nb?"))
+
+    @pytest.mark.slow_after(1)
+    @pytest.mark.parametrize("before", ["", AS_NUMBA_DOES])
+    def test_linked_from_memory_and_from_disk(self, folder: Path, before: str) -> None:
+        out = "5.0 {}\nof 2 numbers"
+        assert call(folder, before, INTERNAL) == (out.format(0), "")
+        kept = self.files(folder, "internal-kernels.root")
+        assert len(kept) == (0 if before else 2)
+        assert call(folder, before, INTERNAL) == (out.format(0), "")  # the kernel is read, and all in it
+        for n_read, names in ((1, ["kernels.norm"]), (0, ["kernels.norm", "kernels.norm_of_sum", "*kernels.root"])):
+            for name in names:
+                for path in self.files(folder, name):
+                    path.unlink()
+            assert call(folder, before, INTERNAL) == (out.format(n_read), "")
+            assert self.files(folder, "internal-kernels.root") == kept
+
+    def test_is_no_machine_code(self, folder: Path) -> None:
+        script = """
+import numpy as np, kernels
+kernels.norm(np.ones(2))
+for kernel in (kernels.total, kernels.root, kernels.norm):
+    (made,) = kernel.overloads.values()
+    print(made.library.get_pointer_to_function(made.fndesc.llvm_func_name) != 0)
+"""
+        assert call(folder, script=script)[0].split() == ["False", "False", "True"]
+
+
+TYPES = """
+import operator
+from itertools import product
+from numba import types
+from numba.core.registry import cpu_target
+from magloc import compiler
+
+NUMBERS = [getattr(types, name) for name in "boolean int8 uint8 int32 int64 uint64 float32 float64 complex128".split()]
+NUMBERS += [types.literal(2), types.literal(True), types.Optional(types.float64)]
+ARRAYS = [kind(dtype, n, "C") for kind in [types.Array] for dtype in NUMBERS[4:9] for n in (1, 2)]
+ARRAYS += [types.Array(types.float64, 2, "A", readonly=True), types.UniTuple(types.float64, 3)]
+INDICES = [types.int64, types.uint8, types.literal(1), types.boolean, types.slice2_type, types.none, types.float64]
+INDICES += [types.UniTuple(types.int64, 2), types.Tuple((types.slice2_type, types.literal(0)))]
+INDICES += [types.Array(types.int64, 1, "C")]
+typing = cpu_target.typing_context
+
+def all_types():
+    typing.refresh()
+    pairs = list(product(NUMBERS + ARRAYS[:2], repeat=2))
+    cases = list(product(compiler._OF_NUMBERS, pairs))
+    cases += [(operator.neg, (kind,)) for kind in NUMBERS]
+    cases += [(operator.getitem, pair) for pair in product(ARRAYS, INDICES)]
+    cases += [(operator.setitem, case) for case in product(ARRAYS, INDICES, NUMBERS)]
+    found = {{}}
+    for operation, arguments in cases:
+        try:
+            found[operation, arguments] = typing.resolve_function_type(operation, arguments, {{}})
+        except Exception as error:
+            found[operation, arguments] = type(error)
+    return found
+
+before = all_types()
+compiler._register()
+after = all_types()
+print(sum(isinstance(kind, type) for kind in before.values()) < len(before) / 2, len(before) > 1000)
+print([(case, before[case], after[case]) for case in before if before[case] != after[case]])
+"""
+
+
+@pytest.mark.slow
+def test_types_are_those_that_numba_finds(folder: Path) -> None:
+    assert call(folder, script=TYPES) == ("True True\n[]", "")

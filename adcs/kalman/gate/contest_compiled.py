@@ -22,7 +22,7 @@ from adcs.kalman.gate.contest import (
     WORSE,
 )
 from adcs.satellite.dynamics_compiled import Quaternion, Vector, cross, dot, multiply, normalised, rotate_back
-from magloc.compilation import compiled
+from magloc.compilation import compiled, internal
 
 Array = NDArray[np.float64]
 # Places of the counts of a contest.
@@ -45,7 +45,7 @@ class Contest(NamedTuple):
     score: Array
 
 
-@compiled
+@internal
 def reset(contest: Contest) -> None:
     """Nothing has been read."""
     contest.counts[:] = 0
@@ -54,7 +54,7 @@ def reset(contest: Contest) -> None:
     contest.of_sensor[INTERVAL] = 1
 
 
-@compiled
+@internal
 def decided(contest: Contest, sensor: int, limit: float, main: Fit, second: Fit) -> tuple[bool, bool]:
     """Who takes a reading, main and second; without a second one its fit is NaN."""
     counts = contest.counts
@@ -81,7 +81,7 @@ def decided(contest: Contest, sensor: int, limit: float, main: Fit, second: Fit)
     return use, use_second
 
 
-@compiled
+@internal
 def may_begin(contest: Contest, sensor: int, biased: bool, both: bool) -> bool:
     """Whether a rejected reading can begin a second hypothesis."""
     if contest.counts[BEGAN] >= 0 or (sensor == _GYRO and not biased):
@@ -89,7 +89,7 @@ def may_begin(contest: Contest, sensor: int, biased: bool, both: bool) -> bool:
     return sensor in (_STAR, _GYRO) or both or _waited(contest, sensor)
 
 
-@compiled
+@internal
 def begin(contest: Contest, sensor: int) -> None:
     """Count from a reading that begins a second hypothesis."""
     counts, of_sensor = contest.counts, contest.of_sensor
@@ -99,7 +99,7 @@ def begin(contest: Contest, sensor: int) -> None:
     contest.score[0] = 0.0
 
 
-@compiled
+@internal
 def read(contest: Contest, sensor: int) -> None:
     """Count a reading, after it has been decided on."""
     row, of_sensor = contest.counts[ROW], contest.of_sensor
@@ -110,7 +110,7 @@ def read(contest: Contest, sensor: int) -> None:
         of_sensor[LAST_READ, sensor] = row
 
 
-@compiled
+@internal
 def verdict(contest: Contest) -> int:
     """1 where the second hypothesis is believed, -1 where it is dropped, else 0; what is decided ends the contest."""
     counts, score, of_sensor = contest.counts, contest.score[0], contest.of_sensor
@@ -130,12 +130,12 @@ def verdict(contest: Contest) -> int:
     return found
 
 
-@compiled
+@internal
 def _waited(contest: Contest, sensor: int) -> bool:
     return contest.counts[ROW] - contest.of_sensor[LAST_TAKEN, sensor] >= contest.patience[sensor]
 
 
-@compiled
+@internal
 def begun(
     q: Quaternion, sensor: int, star: Quaternion, field: Vector, sun: Vector, model: Vector, sun_model: Vector
 ) -> Quaternion:
@@ -174,7 +174,7 @@ def turned_about(q: Quaternion, axis: Vector, body: Vector, reference: Vector) -
     return normalised(multiply(q, (np.cos(half), s * axis[0], s * axis[1], s * axis[2])))
 
 
-@compiled
+@internal
 def eased(nis: float, variance: float, length: float, attitude_variance: float) -> float:
     """NIS of a direction of some length, at least, with the error of linearising it."""
     return nis * variance / (variance + (2.0 * attitude_variance * length) ** 2)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from arrays.typing import FloatArray
+from arrays.typing import FloatArray, IntArray
 from magloc.compilation import over_rows, own
 from magloc.fields.dipole import MU0_OVER_4PI
 from magloc.localization.fit.joint_compiled import LARGEST_DAMPING, LARGEST_STEP_RAD, JointEnds, JointRules, refine_rows
@@ -330,6 +330,17 @@ def _moved(
     new_mu = mu + share[:, None, None] * turned
     norm = np.linalg.norm(moved, axis=-1, keepdims=True)
     return moved / norm, new_mu / norm**3, share
+
+
+def first_alike(row: IntArray, q: FloatArray, weight: FloatArray, same_place: float, same_weight: float) -> IntArray:
+    """The first of all fits (f,), row after row, of the same row, sources (f, K, 4) and weights (f, N) as each one."""
+    first = np.arange(len(row))
+    for apart in range(1, int(np.bincount(row).max(initial=0))):
+        alike = row[apart:] == row[:-apart]
+        alike &= np.all(np.abs(q[apart:] - q[:-apart]) < same_place, axis=(1, 2))
+        alike &= np.all(np.abs(weight[apart:] - weight[:-apart]) < same_weight * weight[:-apart], axis=1)
+        first[apart:][alike] = np.minimum(first[apart:], first[:-apart])[alike]
+    return first
 
 
 def covariances(problem: WhitenedModel, fits: JointFits) -> FloatArray:

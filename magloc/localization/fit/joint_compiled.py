@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arrays.typing import FloatArray
-from magloc.compilation import compiled
+from magloc.compilation import compiled, internal
 from magloc.linalg_compiled import (
     cholesky,
     dot,
@@ -141,7 +141,7 @@ def refine_rows(
         out.iterations[i] = count
 
 
-@compiled
+@internal
 def _fit_moments(q: FloatArray, row: ModelRow, y: FloatArray, w: _Workspace) -> float:
     """Basis, moments and residual of sources at q (K, 4); χ²."""
     for k in range(len(q)):
@@ -169,7 +169,7 @@ def _fit_moments(q: FloatArray, row: ModelRow, y: FloatArray, w: _Workspace) -> 
     return dot(w.residual, w.residual)
 
 
-@compiled
+@internal
 def _project_common(rows: FloatArray, row: ModelRow, along: FloatArray) -> None:
     """Remove the common field, which may have many columns, from whitened rows (n, C) in place."""
     multiply_transposed(rows, row.common, along)
@@ -179,14 +179,14 @@ def _project_common(rows: FloatArray, row: ModelRow, along: FloatArray) -> None:
     subtract_product(rows, along, row.common)
 
 
-@compiled
+@internal
 def _keep_moments(w: _Workspace, mu: FloatArray) -> None:
     """Scaled moments (K, 3)."""
     for j in range(len(w.mu)):
         mu[j // 3, j % 3] = w.mu[j, 0] / w.norm[j] if w.norm[j] > 0.0 else 0.0
 
 
-@compiled
+@internal
 def _linearise(q: FloatArray, row: ModelRow, free: FloatArray, w: _Workspace) -> None:
     """Normal equations of the positions by Kaufman's form, at q (K, 4) and its moments."""
     mu = np.empty((len(q), 3))
@@ -216,7 +216,7 @@ def _linearise(q: FloatArray, row: ModelRow, free: FloatArray, w: _Workspace) ->
         w.scale[j] = 1.0 / math.sqrt(w.normal[j, j]) if w.normal[j, j] > 0.0 else 0.0
 
 
-@compiled
+@internal
 def _fill_tangents(q: FloatArray, frame: FloatArray, tangent: FloatArray) -> None:
     """Orthonormal tangents (3, 4) of the sphere at q: two that turn u at one range, and along the range."""
     line = np.array([q[0], q[1], q[2]])
@@ -229,7 +229,7 @@ def _fill_tangents(q: FloatArray, frame: FloatArray, tangent: FloatArray) -> Non
     tangent[0, 3], tangent[1, 3], tangent[2, 3] = 0.0, 0.0, 0.0 if centred else -length
 
 
-@compiled
+@internal
 def _promised(damping: float, w: _Workspace) -> float:
     """Fill the damped step; by how much it promises to lower χ²."""
     n = len(w.normal)
@@ -251,7 +251,7 @@ def _promised(damping: float, w: _Workspace) -> float:
     return promised
 
 
-@compiled
+@internal
 def _move(q: FloatArray, free: FloatArray, w: _Workspace) -> float:
     """Fill the trial state; the share of the step that is taken, half a radian of every source at most."""
     longest = 0.0

@@ -104,7 +104,7 @@ def refined(
 ) -> Refined:
     """:func:`refine` of one start (b, 4) of every row of whitened readings (b, C)."""
     out = Refined.empty(len(starts))
-    refine(
+    refine_starts(
         signals(model, y),
         np.arange(len(starts)),
         own(starts),
@@ -123,7 +123,7 @@ def same_optimum(q: FloatArray, chi2: float, other_q: FloatArray, other_chi2: fl
     return abs(t) > SAME_COS and abs(chi2 - other_chi2) < SAME_CHI2
 
 
-@compiled
+@internal
 def refine(
     signal: FloatArray,
     reading: IntArray,
@@ -162,6 +162,20 @@ def refine(
             linearise(model.sensors, w, rows, common, dots, free_range)
         judge(w, rules)
         step(w, free_range)
+
+
+@compiled
+def refine_starts(
+    signal: FloatArray,
+    reading: IntArray,
+    starts: FloatArray,
+    model: LaneModel,
+    free_range: float,
+    rules: Rules,
+    out: Refined,
+) -> None:
+    """The same for Python."""
+    refine(signal, reading, starts, model, free_range, rules, out)
 
 
 @internal

@@ -25,6 +25,7 @@ from magloc.measurement.whitened_compiled import ModelRow, candidate_bases
 
 SingleArray = NDArray[np.float32]
 _SAME_GAIN = 0.02
+_APART_RAD, _LEAST_APART_RAD = 0.25, 0.075
 _CANDIDATES_AT_ONCE, _TURNED_AT_ONCE = 512, 128
 # Squares of a candidate's unit moment, along one direction, that only missing channels see.
 _UNSEEN = 1e-7
@@ -201,15 +202,27 @@ def candidate_positions(
     """
     shells = array.circumradius * np.asarray(ranges)
     outer = array.centroid + (shells[:, None, None] * fibonacci_directions(n_directions)).reshape(-1, 3)
-    distances = np.linalg.norm(array.positions[:, None] - array.positions, axis=-1)
-    np.fill_diagonal(distances, np.inf)
-    near_shells = distances.min(axis=1)[:, None] * np.array([0.35, 0.7, 1.4])
+    near_shells = _to_next_sensor(array)[:, None] * np.array([0.35, 0.7, 1.4])
     offsets = near_shells[:, :, None, None] * fibonacci_directions(n_near_directions)
     near = (array.positions[:, None, None] + offsets).reshape(-1, 3)
     inner = array.centroid + array.circumradius * np.multiply.outer(
         [0.2, 0.4], fibonacci_directions(n_inner_directions)
     )
     return np.concatenate([outer, near, inner.reshape(-1, 3)])
+
+
+def start_separation(array: SensorArray) -> float:
+    """Least angle [rad] of two starts: less where sensors stand close together, for several have to be near one."""
+    apart = _APART_RAD * float(np.median(_to_next_sensor(array))) / array.circumradius
+    return min(max(apart, _LEAST_APART_RAD), _APART_RAD)
+
+
+def _to_next_sensor(array: SensorArray) -> FloatArray:
+    """Distance (N,) [m] of the next sensor from every one."""
+    distances: FloatArray = np.linalg.norm(array.positions[:, None] - array.positions, axis=-1)
+    np.fill_diagonal(distances, np.inf)
+    nearest: FloatArray = distances.min(axis=1)
+    return nearest
 
 
 def fine_positions(array: SensorArray) -> FloatArray:

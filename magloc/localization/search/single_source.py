@@ -31,6 +31,7 @@ from magloc.localization.search.candidates import (
     chosen_candidates,
     linear_bases,
     orthonormal_without,
+    start_separation,
 )
 from magloc.measurement.rows import WhitenedRows, channels_above_ambient, check_magnitudes, check_spans, whitened_rows
 from magloc.measurement.whitened import WhitenedModel
@@ -109,8 +110,9 @@ class SingleSourceSearch:
         Vector sensors only.
     n_starts : int
         Distinct candidates that are refined; three times as many where none leads to a credible χ².
-    apart_rad : float
-        Least distance of two candidates, as an angle of their homogeneous coordinates.
+    apart_rad : float, optional
+        Least distance of two candidates, as an angle of their homogeneous coordinates; by default that of
+        :func:`start_separation`.
     max_iterations : int
         Linearisations of one refinement to near an optimum at most, and three times as many from there on; a refinement
         that needs more did not converge.
@@ -128,7 +130,7 @@ class SingleSourceSearch:
         array: SensorArray,
         *,
         n_starts: int = 12,
-        apart_rad: float = 0.25,
+        apart_rad: float | None = None,
         max_iterations: int = 100,
         prior: SourcePrior = NOTHING_KNOWN,
     ) -> None:
@@ -138,7 +140,7 @@ class SingleSourceSearch:
         check_spans(array)
         self.array = array
         self.n_starts = n_starts
-        self.apart_rad = apart_rad
+        self.apart_rad = start_separation(array) if apart_rad is None else apart_rad
         self.max_iterations = max_iterations
         self.prior = prior
         self._everything = prior == NOTHING_KNOWN

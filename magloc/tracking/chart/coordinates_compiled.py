@@ -7,11 +7,11 @@ import math
 import numpy as np
 
 from arrays.typing import FloatArray
-from magloc.compilation import compiled
+from magloc.compilation import internal
 from magloc.linalg_compiled import fill_frame
 
 
-@compiled
+@internal
 def fill_chart(x: FloatArray, centroid: FloatArray, radius: float, frame: FloatArray) -> float:
     """Tangents and direction of the chart about a state as rows, and its length."""
     offset = np.empty(3)
@@ -27,7 +27,7 @@ def fill_chart(x: FloatArray, centroid: FloatArray, radius: float, frame: FloatA
     return max(r, radius)
 
 
-@compiled
+@internal
 def is_firm(x: FloatArray, S: FloatArray, length: float, limit: float) -> bool:
     """Whether a root S (n, n) leaves so little of the moment open that it is moved by strength and direction."""
     square, variance = 0.0, 0.0
@@ -39,7 +39,7 @@ def is_firm(x: FloatArray, S: FloatArray, length: float, limit: float) -> bool:
     return variance * unit * unit < limit * limit * square
 
 
-@compiled
+@internal
 def _move_firmly(x: FloatArray, e: FloatArray, scale: float, unit: float, there: FloatArray, L: FloatArray) -> None:
     """The moment at coordinates e about x by strength and direction, and its derivative by δμ, in place."""
     square, nu = 0.0, 0.0
@@ -65,7 +65,7 @@ def _move_firmly(x: FloatArray, e: FloatArray, scale: float, unit: float, there:
             L[3 + i, 3 + j] = strength * unit / size * (b[i] * mine + across)
 
 
-@compiled
+@internal
 def move(
     x: FloatArray, e: FloatArray, frame: FloatArray, length: float, firm: bool, there: FloatArray, L: FloatArray
 ) -> None:
@@ -108,7 +108,7 @@ def move(
             L[i, i] = reach
 
 
-@compiled
+@internal
 def into_chart(x: FloatArray, frame: FloatArray, length: float, rows: FloatArray) -> None:
     """Multiply rows (n, m) by the inverse of the chart's L at x, in place."""
     n, m = rows.shape

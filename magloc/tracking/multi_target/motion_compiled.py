@@ -10,11 +10,11 @@ import math
 import numpy as np
 
 from arrays.typing import FloatArray
-from magloc.compilation import compiled
+from magloc.compilation import compiled, internal
 from magloc.tracking.multi_target.state import N_COMMON, N_SEEN
 
 
-@compiled
+@internal
 def _fill_turn(angle: FloatArray, R: FloatArray, J: FloatArray) -> None:
     """Rotation R by a vector, and the small turns J δ that follow when δ is added to it."""
     x, y, z = angle[0], angle[1], angle[2]
@@ -35,7 +35,7 @@ def _fill_turn(angle: FloatArray, R: FloatArray, J: FloatArray) -> None:
             J[i, j] = one + half * K[i][j] + third * of_square
 
 
-@compiled
+@internal
 def move_rows(P: FloatArray, k: int, at: int, step: FloatArray, R: FloatArray, M: FloatArray) -> None:
     """Multiply rows of one source, whose motion stands from row `at` on, by its transition."""
     lasts, kept, turn_kept = step[0], step[1], step[3]
@@ -50,7 +50,7 @@ def move_rows(P: FloatArray, k: int, at: int, step: FloatArray, R: FloatArray, M
             P[at + 3 + i, j] *= turn_kept
 
 
-@compiled
+@internal
 def fill_transition(
     rate: FloatArray, moment: FloatArray, step: FloatArray, m: FloatArray, R: FloatArray, M: FloatArray
 ) -> None:
@@ -68,7 +68,7 @@ def fill_transition(
             M[i, j] = step[2] * (turned[i, 0] * J[0, j] + turned[i, 1] * J[1, j] + turned[i, 2] * J[2, j])
 
 
-@compiled
+@internal
 def _fill_turned(m: FloatArray, length: float, turned: FloatArray) -> None:
     """What a small turn changes of a moment's direction u: -[u]×."""
     x, y, z = m[0] / length, m[1] / length, m[2] / length

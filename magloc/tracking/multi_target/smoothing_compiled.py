@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from arrays.typing import FloatArray, IntArray
-from magloc.compilation import compiled
+from magloc.compilation import compiled, internal
 from magloc.linalg_compiled import put, put_rows
 from magloc.tracking.multi_target.motion_compiled import fill_transition, move_rows, step_all
 from magloc.tracking.multi_target.state import N_COMMON, N_SEEN
@@ -27,7 +27,7 @@ from magloc.tracking.multi_target.update_compiled import (
 Means = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
 
 
-@compiled
+@internal
 def _fill_chart(m: FloatArray, other: FloatArray, c: FloatArray, T: FloatArray) -> None:
     """Coordinates c (3,) of another moment in the chart about one, and what a small error there is in its own."""
     length, size, cosine = 0.0, 0.0, 0.0
@@ -53,7 +53,7 @@ def _fill_chart(m: FloatArray, other: FloatArray, c: FloatArray, T: FloatArray) 
             T[i, j] /= size
 
 
-@compiled
+@internal
 def _to_chart(track: Means, row: int, other: Means, T: FloatArray, delta: FloatArray, P: FloatArray) -> None:
     """Errors (n,) and covariance (n, n) about a state become those about a trajectory's row; T (K, 3, 3) of moments.
 
@@ -86,7 +86,7 @@ def _to_chart(track: Means, row: int, other: Means, T: FloatArray, delta: FloatA
         delta[N_SEEN * K + i] += other[4][i] - track[4][row, i]
 
 
-@compiled
+@internal
 def _fill_cholesky(P: FloatArray, L: FloatArray) -> None:
     """Lower root of the leading block of a covariance."""
     for i in range(len(L)):
@@ -97,7 +97,7 @@ def _fill_cholesky(P: FloatArray, L: FloatArray) -> None:
             L[i, j] = math.sqrt(t) if i == j else t / L[j, j]
 
 
-@compiled
+@internal
 def _solve_lower(L: FloatArray, b: FloatArray) -> None:
     """Solve L x = b in place."""
     for i in range(len(L)):
@@ -106,7 +106,7 @@ def _solve_lower(L: FloatArray, b: FloatArray) -> None:
         b[i] /= L[i, i]
 
 
-@compiled
+@internal
 def _solve_transposed(L: FloatArray, b: FloatArray) -> None:
     """Solve Lᵀ x = b in place."""
     for i in range(len(L) - 1, -1, -1):
@@ -208,7 +208,7 @@ def smooth(
     return cost, log_volume
 
 
-@compiled
+@internal
 def _transpose_step(
     slope: FloatArray, new: FloatArray, K: int, T: FloatArray, step: FloatArray, R: FloatArray, M: FloatArray
 ) -> None:

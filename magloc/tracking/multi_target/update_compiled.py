@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from arrays.typing import FloatArray, IntArray
-from magloc.compilation import compiled
+from magloc.compilation import compiled, internal
 from magloc.fields.dipole_compiled import field_components, field_matrix_components, gradient_components
 from magloc.linalg_compiled import put, put_rows
 from magloc.tracking.multi_target.state import N_COMMON, N_SEEN
@@ -15,7 +15,7 @@ from magloc.tracking.multi_target.state import N_COMMON, N_SEEN
 _TOLERANCE = 0.02
 
 
-@compiled
+@internal
 def move_moment(m: FloatArray, c: FloatArray, moved: FloatArray, D: FloatArray) -> None:
     """A moment at an error c, and its derivative D (3, 3) by it; twins: ``moved_moment`` and its derivative."""
     u, turn = np.empty(3), np.empty(3)
@@ -42,7 +42,7 @@ def move_moment(m: FloatArray, c: FloatArray, moved: FloatArray, D: FloatArray) 
             D[i, j] = strength * (direction * u[j] + by_turn)
 
 
-@compiled
+@internal
 def _fill_rows(position: FloatArray, moment: FloatArray, D: FloatArray, at: FloatArray, rows: FloatArray) -> None:
     """Derivatives (3, d) of the field at a sensor by the errors of all sources."""
     for k in range(len(position)):
@@ -60,7 +60,7 @@ def _fill_rows(position: FloatArray, moment: FloatArray, D: FloatArray, at: Floa
             rows[2, first + 3 + j] = xz * a + yz * b + zz * c
 
 
-@compiled
+@internal
 def linearise(
     position: FloatArray,
     moment: FloatArray,
@@ -89,7 +89,7 @@ def linearise(
             HL[c, k] = x * by_y[s, 0, k] + y * by_y[s, 1, k] + z * by_y[s, 2, k]
 
 
-@compiled
+@internal
 def read(
     position: FloatArray,
     moment: FloatArray,
@@ -119,7 +119,7 @@ def read(
         h[c] = gain[c, 0] * fields[s, 0] + gain[c, 1] * fields[s, 1] + gain[c, 2] * fields[s, 2]
 
 
-@compiled
+@internal
 def _move(
     state: tuple[FloatArray, FloatArray, FloatArray],
     error: FloatArray,
@@ -139,7 +139,7 @@ def _move(
         b[i] = common[i] + error[N_SEEN * len(p) + i]
 
 
-@compiled
+@internal
 def fill_root(HL: FloatArray, R: FloatArray) -> None:
     """Lower root R of I + HLᵀ HL."""
     d = len(R)
@@ -163,7 +163,7 @@ def fill_root(HL: FloatArray, R: FloatArray) -> None:
         R[i, i] = math.sqrt(t)
 
 
-@compiled
+@internal
 def solve_root(R: FloatArray, b: FloatArray) -> None:
     """Solve R Rᵀ y = b in place."""
     d = len(R)
@@ -177,7 +177,7 @@ def solve_root(R: FloatArray, b: FloatArray) -> None:
             b[k] -= R[i, k] * b[i]
 
 
-@compiled
+@internal
 def _over_root(columns: FloatArray, first: int, root: FloatArray) -> None:
     """Columns (d, n), from one on, over a lower root in place: with root rootᵀ = A, roots of columnsᵀ A⁻¹ columns."""
     d, n = columns.shape
@@ -191,7 +191,7 @@ def _over_root(columns: FloatArray, first: int, root: FloatArray) -> None:
             columns[i, r] *= t
 
 
-@compiled
+@internal
 def _add_square(columns: FloatArray, first: int, sign: float, P: FloatArray) -> None:
     """Add columnsᵀ columns, from one column on, to the same rows and columns of P, in its lower triangle."""
     for k in range(len(columns)):
@@ -201,7 +201,7 @@ def _add_square(columns: FloatArray, first: int, sign: float, P: FloatArray) -> 
                 P[i, j] += t * columns[k, j]
 
 
-@compiled
+@internal
 def fill_posterior(
     P: FloatArray, L: FloatArray, R: FloatArray, y: FloatArray, error: FloatArray, after: FloatArray
 ) -> None:
@@ -286,7 +286,7 @@ def fill_standardised(HL: FloatArray, R: FloatArray, residual: FloatArray, follo
             found[s, i] = left / C[i, i]
 
 
-@compiled
+@internal
 def _along(HL: FloatArray, step: FloatArray, along: FloatArray) -> float:
     """Fill HL @ step (C,); its square."""
     square = 0.0

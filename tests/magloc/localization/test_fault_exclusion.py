@@ -24,8 +24,10 @@ from arrays.geometries import cube, grid, tetrahedron
 from arrays.sensor import Sensor
 from magloc.chi_square import energy_threshold
 from magloc.fields import dipole
+from magloc.localization import reweighting
 from magloc.localization.fault_exclusion import _Examination
 from magloc.localization.locator import Locator, locate
+from magloc.localization.reweighting import WeightedFits
 from magloc.measurement.differences import predicted_channels
 from magloc.measurement.rows import whitened_rows
 from magloc.readings import Readings, read_readings
@@ -277,6 +279,27 @@ class TestOtherLocators:
         assert [fix.dropped_sensors for fix in fixes] == [(array.ids[sensor],) for sensor in which]
         error = [np.linalg.norm(fix.solutions[0].moment_Am2 - m) for fix, m in zip(fixes, moment, strict=True)]
         assert max(error) <= 1.0
+
+
+class TestStartsThatMeet:
+    """Reweighting goes on from one of the fits of a row that have come together: where all go, it goes."""
+
+    def test_it_ends_where_all_of_them_end(self, monkeypatch):
+        readings, _, which = on_cube(20, seed=18)
+        readings += 1e3 * NOISE * np.isin(CUBE.channel_sensor, [0, 3]) * (1.0 + np.arange(24) % 5)
+        readings += 50.0 * NOISE * (CUBE.channel_sensor == which[:, None])
+        refined = Locator(CUBE).fit_rows(readings)
+        plain, fits = WeightedFits._refined, []
+        monkeypatch.setattr(WeightedFits, "_refined", lambda *of, **to: fits.append(len(of[2])) or plain(*of, **to))
+        Locator(CUBE).fit_rows(readings)
+        met = sum(fits)
+        fits.clear()
+        monkeypatch.setattr(reweighting, "_SAME_WEIGHT", 0.0)
+        every = Locator(CUBE).fit_rows(readings)
+        assert met < 0.8 * sum(fits)
+        assert sum(map(bool, every.dropped_sensors)) >= 10
+        assert refined.dropped_sensors == every.dropped_sensors
+        assert_array_equal(refined.position_m, every.position_m)
 
 
 class TestWithoutOneSensor:

@@ -20,8 +20,12 @@ from arrays.array import SensorArray
 from arrays.geometries import grid, tetrahedron
 from arrays.pose import PoseUncertainty
 from magloc.fields.multipole import finite_body_errors
+from magloc.localization.fit.gauss_newton import refine
+from magloc.localization.model_errors import body_errors
 from magloc.measurement.differences import DifferenceMeasurement
+from magloc.measurement.rows import whitened_rows
 from tests.oracles import fisher_information
+from tests.plain_locator import plain_locator
 
 LENGTH_M = 0.02
 ASPECTS = (0.2, 0.5, 1.0, 2.0, 5.0)
@@ -131,6 +135,38 @@ class TestNothingSaid:
     def test_said_to_be_a_point(self):
         case = cases(2.0, 1e-3, 1)[0]
         assert magloc.locate(case.array, case.readings_T, body_length_m=0.0).body_length_m[0] == 0.0
+
+
+class TestRounds:
+    """Errors of bodies are linearised where the fit is with them: after three rounds of that it stays there."""
+
+    ARRAY = grid(6, 5, 0.016, noise_T=1e-6)
+
+    @classmethod
+    def bars(cls):
+        """What thirty sensors read of forty bars 2 to 6 lengths above them, turned at random."""
+        rng = np.random.default_rng(6)
+        readings = []
+        for lengths in rng.uniform(2.0, 6.0, 40):
+            long = rng.uniform(0.003, 0.006)
+            bar = magpylib.magnet.Cuboid(polarization=(0.1, 0.2, 0.3), dimension=(long / 3.0, long / 3.0, long))
+            bar.position, bar.orientation = [*rng.uniform(-0.03, 0.03, 2), lengths * long], Rotation.random(rng=rng)
+            fields = bar.getB(cls.ARRAY.positions).ravel()
+            readings.append(fields * 1e-4 / np.abs(fields).max() + 1e-6 * rng.normal(size=fields.size))
+        return np.array(readings)
+
+    def test_another_round_would_not_move_a_fix(self):
+        """By a thousandth of its standard deviation."""
+        bars = self.bars()
+        fixes = plain_locator(self.ARRAY).fit_rows(bars)
+        assert (fixes.body_length_m > 0.0).sum() > 30
+        (rows,) = whitened_rows(self.ARRAY, bars, None, len(bars))
+        q = rows.model.homogeneous(fixes.position_m)[:, None]
+        mu = rows.model.scaled_moment(q, fixes.moment_Am2[:, None])
+        noisy = rows.marginalised(body_errors(rows.model, q, mu, fixes.body_length_m[:, None]))
+        moved = noisy.model.position(refine(noisy.model, noisy.y, q, mu).q)[:, 0] - fixes.position_m
+        squares = np.einsum("ni,nij,nj->n", moved, np.linalg.inv(fixes.covariance[:, :3, :3]), moved)
+        assert np.sqrt(squares.max()) < 1e-3
 
 
 class TestFarFromTheArray:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from arrays.array import SensorArray
-from arrays.geometries import tetrahedron
+from arrays.geometries import grid, tetrahedron
 from arrays.typing import FloatArray
 from magloc.measurement.rows import WhitenedRows, check_magnitudes, whitened_rows
 
@@ -68,3 +68,39 @@ class TestModelOfOneRow:
         np.testing.assert_allclose(alone.signal[0], many.signal[0], rtol=1e-12)
         np.testing.assert_allclose(alone.model.ambient[0], many.model.ambient[0])
         np.testing.assert_array_equal(alone.model.lanes.common, many.model.lanes.common)
+
+
+class TestMarginalised:
+    """Errors that count as noise: the squares of what is left are those of a regression on errors of unit variance."""
+
+    @staticmethod
+    def squares(common_field_T: float | None, columns: FloatArray) -> tuple[list[float], list[float]]:
+        """Squares of three rows of noise without what counts as noise, and those that LAPACK's regression leaves."""
+        array = replace(grid(4, 3, 0.1, noise_T=1e-9), common_field_T=common_field_T)
+        readings = np.random.default_rng(2).normal(scale=1e-9, size=(3, 36))
+        (rows,) = whitened_rows(array, readings, None, 3)
+        common = np.tile(np.eye(3), (12, 1)) * (1.0 if common_field_T is None else common_field_T / 1e-9)
+        left = []
+        for raw, of_row in zip(rows.raw, columns, strict=True):
+            every = np.hstack([common, of_row])
+            # What is known of an error is a reading of it.
+            known = np.eye(every.shape[1])[3 if common_field_T is None else 0 :]
+            whole, y = np.vstack([every, known]), np.concatenate([raw, np.zeros(len(known))])
+            left.append(float(np.sum((y - whole @ np.linalg.lstsq(whole, y)[0]) ** 2)))
+        return np.sum(rows.marginalised(columns).y ** 2, axis=1).tolist(), left
+
+    @pytest.mark.parametrize("common_field_T", [None, 2e-9])
+    @pytest.mark.parametrize("size", [1e-3, 1.0, 1e3, 1e5])
+    def test_squares_are_those_of_a_regression(self, size: float, common_field_T: float | None) -> None:
+        columns = size * np.random.default_rng(3).normal(size=(3, 36, 14))
+        np.testing.assert_allclose(*self.squares(common_field_T, columns), rtol=1e-9)
+
+    @pytest.mark.parametrize("common_field_T", [None, 2e-9])
+    def test_columns_that_repeat_others_or_are_none(self, common_field_T: float | None) -> None:
+        columns = np.random.default_rng(4).normal(size=(3, 36, 14)) * np.geomspace(1e-2, 1e3, 14)
+        columns[0, :, 7:], columns[1] = 0.5 * columns[0, :, :7], 0.0
+        np.testing.assert_allclose(*self.squares(common_field_T, columns), rtol=1e-9)
+
+    def test_more_columns_than_channels(self) -> None:
+        columns = np.random.default_rng(5).normal(size=(3, 36, 50))
+        np.testing.assert_allclose(*self.squares(2e-9, columns), rtol=1e-9)

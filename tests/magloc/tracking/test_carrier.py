@@ -79,7 +79,8 @@ class TestStated:
 
 
 class TestNotStated:
-    def test_no_track_is_silent(self) -> None:
-        for seed in range(4):
-            _, track = run(SCENARIO, seed, stated=False)
-            assert track.innovations.flagged or track.tracked.mean() < 0.5
+    @pytest.mark.slow_after(1)
+    @pytest.mark.parametrize("seed", range(4))
+    def test_no_track_is_silent(self, seed: int) -> None:
+        _, track = run(SCENARIO, seed, stated=False)
+        assert track.innovations.flagged or track.tracked.mean() < 0.5

@@ -17,7 +17,7 @@ from numpy.testing import assert_allclose
 
 from arrays.array import SensorArray
 from arrays.geometries import tetrahedron
-from magloc.localization.fit.variable_projection_compiled import Refined, Rules, refine
+from magloc.localization.fit.variable_projection_compiled import Refined, Rules, refine_starts
 from magloc.localization.search.single_source import SingleSourceSearch
 from magloc.measurement.differences import predicted_channels
 from magloc.measurement.rows import whitened_rows
@@ -31,7 +31,7 @@ def after_one(few_digits, rows, q, free_range, *, ahead):
     """Ends of starts (b, 4) of a row each after one linearisation."""
     out = Refined.empty(len(q))
     rules = Rules(0.0, 1.0, np.full(len(q), math.inf), ahead, few_digits)
-    refine(rows.signal, np.arange(len(q)), q, rows.model.lanes, free_range, rules, out)
+    refine_starts(rows.signal, np.arange(len(q)), q, rows.model.lanes, free_range, rules, out)
     return out
 
 

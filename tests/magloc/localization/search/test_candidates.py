@@ -22,6 +22,7 @@ from magloc.localization.search.candidates import (
     linear_scores,
 )
 from magloc.localization.search.single_source import SingleSourceSearch
+from magloc.measurement.differences import channel_jacobian
 from magloc.measurement.rows import whitened_rows
 from tests.magloc.localization.search.test_single_source import noisy_readings
 from tests.plain_locator import plain_locator
@@ -105,31 +106,45 @@ def test_twenty_thousand_problems(case):
 REGIMES = ("product", "near", "far", "close to the sensors")
 
 
-def regime(name, n, rng):
-    """Noisy readings of the tetrahedron of 1.5 m, and the places [m] of their sources."""
-    array = CASES["tetrahedron 1.5 m"][0]
+def regime(name, n, rng, array=CASES["tetrahedron 1.5 m"][0]):
+    """Noisy readings, and the places [m] of their sources: as far from the array, and as clear, as by a tetrahedron."""
     u, m = rng.normal(size=(2, n, 3))
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     m /= np.linalg.norm(m, axis=1, keepdims=True)
     size = rng.uniform(size=(2, n, 1))
+    tetrahedron_m = CASES["tetrahedron 1.5 m"][0].circumradius
+    scale, centre = array.circumradius / tetrahedron_m, array.centroid
     if name == "product":
-        p, moment = (2.0 + 6.0 * size[0]) * u, 300.0
+        distance, moment = 2.0 + 6.0 * size[0], 300.0
     elif name == "near":
-        p, moment = (0.1 + 1.4 * size[0]) * u, 0.1 * 3000.0 ** size[1]
+        distance, moment = 0.1 + 1.4 * size[0], 0.1 * 3000.0 ** size[1]
     elif name == "far":
-        p, moment = (8.0 + 32.0 * size[0]) * u, 300.0 * 30.0 ** size[1]
+        distance, moment = 8.0 + 32.0 * size[0], 300.0 * 30.0 ** size[1]
     else:
-        p = array.positions[rng.integers(4, size=n)] + (0.05 + 0.35 * size[0]) * u
-        moment = 0.01 * 3000.0 ** size[1]
-    return array, p, noisy_readings(array, p, moment * m, rng)
+        centre = array.positions[rng.integers(len(array.positions), size=n)]
+        scale = np.linalg.norm(array.positions[1:] - array.positions[0], axis=1).min() / 1.5
+        distance, moment = 0.05 + 0.35 * size[0], 0.01 * 3000.0 ** size[1]
+    p = centre + scale * distance * u
+    moments = moment * scale**3 * array.channel_noise_T[0] / 1e-9 * m
+    return array, p, noisy_readings(array, p, moments, rng)
+
+
+def lowest_of_random_starts(array, rows, rng):
+    """Least χ² (n,) of 32 starts that know of no grid: 24 at 0.5 to 80 circumradii, 8 at 0.2 to 0.4."""
+    n = len(rows)
+    u = rng.normal(size=(32, n, 3))
+    radii = np.concatenate([0.5 * 160.0 ** rng.uniform(size=(24, n, 1)), rng.uniform(0.2, 0.4, (8, n, 1))])
+    starts = array.centroid + array.circumradius * radii * u / np.linalg.norm(u, axis=-1, keepdims=True)
+    ends = [refined(rows.model, rows.y, rows.model.homogeneous(start), 300) for start in starts]
+    return np.min([np.where(of_start.converged, of_start.chi2, np.inf) for of_start in ends], axis=0)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", REGIMES)
 def test_against_many_more_starts(name):
-    """Of 20,000 rows none is above the optimum reached from the truth, ten at most above that of 32 starts."""
-    n = 20_000
-    array, p, readings = regime(name, n, np.random.default_rng(5))
+    """Of 20,000 rows none is above the optimum reached from the truth, ten at most above those of 32 starts, twice."""
+    n, rng = 20_000, np.random.default_rng(1201)
+    array, p, readings = regime(name, n, rng)
     (rows,) = whitened_rows(array, readings, None, n)
     (found,) = SingleSourceSearch(array).optima(rows)
     first = np.searchsorted(found.of_row, np.arange(n))
@@ -143,7 +158,62 @@ def test_against_many_more_starts(name):
     )
     (better,) = oracle.optima(rows)
     lowest = better.fits.chi2[np.searchsorted(better.of_row, np.arange(n))]
+    lowest = np.minimum(lowest, lowest_of_random_starts(array, rows, rng))
     assert np.sum(found.fits.chi2[first] > lowest + 0.05) <= 10
+
+
+def test_close_to_one_of_many_sensors():
+    """False alarms at the acceptance figure of 0.05 %: 0.4 % (more than four of two thousand)."""
+    n = 2000
+    array, p, readings = regime("close to the sensors", n, np.random.default_rng(1205), board_of_thirty())
+    (rows,) = whitened_rows(array, readings, None, n)
+    (found,) = SingleSourceSearch(array).optima(rows)
+    from_truth = refined(rows.model, rows.y, rows.model.homogeneous(p), 300)
+    above = found.fits.chi2[np.searchsorted(found.of_row, np.arange(n))] > from_truth.chi2 + 0.05
+    assert np.sum(above & from_truth.converged) <= 4
+
+
+def residual_in_extended_precision(array, readings, x):
+    """Whitened differences (n, 3 N) of sensors with equal noise, of which all share a field, for states x (n, 6)."""
+    d = array.positions.astype(np.longdouble) - x[:, None, :3]
+    m = x[:, None, 3:]
+    r2 = np.sum(d * d, axis=-1, keepdims=True)
+    field = np.longdouble(1e-7) * (3.0 * np.sum(m * d, axis=-1, keepdims=True) * d / r2 - m) / (r2 * np.sqrt(r2))
+    every = (readings.reshape(field.shape) - field) / array.channel_noise_T[0].astype(np.longdouble)
+    return (every - every.mean(axis=1, keepdims=True)).reshape(len(x), -1)
+
+
+@pytest.mark.parametrize("n", [200, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", REGIMES)
+def test_is_the_optimum_polished_in_extended_precision(name, n):
+    """By Gauss-Newton steps, halved where χ² would rise: nearer than 1e-3 σ, and its χ² within 1e-8."""
+    array, _, readings = regime(name, n, np.random.default_rng(1204))
+    fixes = plain_locator(array).fit_rows(readings)
+    best = fixes.first[fixes.solved]
+    found = np.concatenate([fixes.solutions.position_m[best], fixes.solutions.moment_Am2[best]], axis=-1).reshape(-1, 6)
+    x = found.astype(np.longdouble)
+    e = residual_in_extended_precision(array, readings, x)
+
+    def jacobian():
+        of_channels = channel_jacobian(array, x[:, :3].astype(float), x[:, 3:].astype(float)) / array.channel_noise_T[0]
+        of_sensors = of_channels.reshape(len(x), -1, 3, 6)
+        return (of_sensors - of_sensors.mean(axis=1, keepdims=True)).reshape(len(x), -1, 6)
+
+    for _ in range(60):
+        J = jacobian()
+        scale = np.linalg.norm(J, axis=1)
+        q, r = np.linalg.qr(J / scale[:, None])
+        along = np.einsum("nij,ni->nj", q, e.astype(float))
+        step = np.linalg.solve(r, along[..., None])[..., 0] / scale
+        for halvings in range(12):
+            tried = x + 0.5**halvings * step
+            e_tried = residual_in_extended_precision(array, readings, tried)
+            lower = np.sum(e_tried**2, axis=1) < np.sum(e**2, axis=1)
+            x[lower], e[lower], step[lower] = tried[lower], e_tried[lower], 0.0
+    assert np.max(np.sum(along**2, axis=1)) < 1e-9  # nothing that counts is left to gain
+    away = np.einsum("nij,nj->ni", jacobian(), (x - found).astype(float))
+    assert np.max(np.linalg.norm(away, axis=1)) < 1e-3
+    np.testing.assert_allclose(fixes.solutions.chi2[best], np.sum(e**2, axis=1).astype(float), rtol=0.0, atol=1e-8)
 
 
 class TestChoiceOfStarts:

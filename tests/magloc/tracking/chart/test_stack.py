@@ -93,7 +93,7 @@ class TestCovariance:
     ALL = PoseUncertainty(0.02, math.radians(0.3), 0.02, 0.0, 0.05, math.radians(0.5))
 
     @pytest.mark.parametrize("pose", [None, ALL, replace(ALL, correlation_s=1.0)], ids=["exact", "white", "walk"])
-    @pytest.mark.parametrize("n_rows", [15, 40])
+    @pytest.mark.parametrize("n_rows", [15, pytest.param(40, marks=pytest.mark.slow)])
     def test_is_that_of_simulated_errors(self, pose: PoseUncertainty | None, n_rows: int) -> None:
         scenario = MagneticScenario(
             PAIR,
