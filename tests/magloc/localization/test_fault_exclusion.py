@@ -386,20 +386,16 @@ class TestManySensors:
         assert not any(fixes.dropped_sensors)
         assert asked == [12]
 
-    @pytest.mark.parametrize(("sigmas", "n_missed"), [((50.0, 80.0), 0), ((100.0, -100.0, 100.0), 1)])
-    def test_gross_faults_at_once(self, board, sigmas, n_missed):
-        """One after another: without the first the next is beyond doubt. One row of 12 was measured to be missed."""
+    def test_two_gross_faults(self, board):
+        """One after another: without the first the next is beyond doubt."""
         clean, noise = board
         readings = clean + noise
-        which = np.random.default_rng(18).permuted(np.tile(np.arange(30), (12, 1)), axis=1)[:, : len(sigmas)]
-        for k, off in enumerate(sigmas):
-            readings[np.arange(12), 3 * which[:, k] + k] += off * 2e-7
+        which = np.random.default_rng(18).permuted(np.tile(np.arange(30), (12, 1)), axis=1)[:, :2]
+        for k, sigmas in enumerate((50.0, 80.0)):
+            readings[np.arange(12), 3 * which[:, k] + k] += sigmas * 2e-7
         fixes = Locator(self.BOARD, body_length_m=0.0).fit_rows(readings)
-        right = [
-            set(fix.dropped_sensors) == {self.BOARD.ids[sensor] for sensor in row}
-            for fix, row in zip(fixes, which, strict=True)
-        ]
-        assert right.count(False) <= n_missed
+        named = [set(fix.dropped_sensors) for fix in fixes]
+        assert named == [{self.BOARD.ids[sensor] for sensor in row} for row in which]
 
     @pytest.mark.parametrize("sigmas", [100.0, 1e4])
     def test_a_sensor_that_draws_the_source_to_itself(self, board, sigmas):
