@@ -1,11 +1,12 @@
 r"""Fixes that a bad sensor does not ruin.
 
-A row whose χ² is not credible is fitted again with Student-t scores, which give the residual of a whole sensor,
-:math:`\rho_s`, the weight :math:`(\nu + n_s)/(\nu + \rho_s)`, iterated from the plain fit and from the best fits
-without one sensor each. These are refined from the plain fit, which a single sensor seldom moves to another optimum;
-only where none of them explains the others are optima without some sensors searched for anew. The sensors that are then
-far outside of what their noise allows are named, and the row is fitted anew without them; what is returned is a plain
-least-squares fix, with the χ² and the covariance of the sensors that it uses.
+A row whose χ² is not credible is fitted again with Student-t scores (:mod:`magloc.localization.reweighting`), iterated
+from the plain fit and from the best fits without one sensor each. These are refined from the plain fit, which a single
+sensor seldom moves to another optimum; which are worth it is told to first order
+(:mod:`magloc.localization.leave_one_out`). Only where none of them explains the others are optima without some sensors
+searched for anew. The sensors that are then far outside of what their noise allows are named, and the row is fitted
+anew without them; what is returned is a plain least-squares fix, with the χ² and the covariance of the sensors that it
+uses.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.chi_square import energy_threshold
 from magloc.levels import CREDIBLE_ROW, MISFIT, SENSOR_FALSE_ALARM
 from magloc.localization.fit.fixes import Fixes
+from magloc.localization.fit.gauss_newton import JointFits
 from magloc.localization.fit.results import Fix
 from magloc.localization.model_errors import model_errors
 from magloc.localization.reweighting import DEGREES_OF_FREEDOM, LEAST_WEIGHT, WeightedFits
@@ -45,6 +47,8 @@ _INCOMPARABLE = 1000.0
 _MOST_IN_PAIRS, _MOST_ONE_BY_ONE = 8, 16
 # Fits without one sensor that are refined, of those that should have the lowest χ², and that are kept of a row.
 _MOST_REFINED, _MOST_KEPT = 6, 3
+# Sensors that are left out one after another where each is beyond doubt.
+_MOST_GROSS = 3
 # Share of the largest fall of χ² below which that without another sensor does not matter beside it.
 _MATTERS = 0.05
 # Share of a sensor's readings, along any direction, that the others check: below the larger one a fit without it is
@@ -219,9 +223,15 @@ class _Examination:
             return found
         starts = self._refined_without_one(plain, suspected)
         unexplained = [row for row, tried in starts.items() if not any(start.explains for start in tried)]
-        for sensors, without in self._searched(plain, starts, unexplained).items():
-            for row, fix in zip(without, self._without(sensors, np.array(without)), strict=True):
-                starts[row] += self._start(fix, sensors)
+        for row in unexplained if self.many else []:
+            starts[row] += self._without_gross_faults(plain[row], row, starts[row][1:2])
+        for searched in self._searched(plain, starts, unexplained):
+            for sensors, of_set in searched.items():
+                unsolved = [row for row in of_set if not (self.many and any(start.explains for start in starts[row]))]
+                for row, fix in zip(unsolved, self._without(sensors, np.array(unsolved, dtype=np.intp)), strict=True):
+                    anew = self._start(fix, sensors)
+                    starts[row] += anew
+                    starts[row] += self._without_gross_faults(plain[row], row, anew) if self.many else []
         starts = {row: [start for start in tried if start.explains] or tried for row, tried in starts.items()}
         certain = self._certain(starts)
         standing_out = certain | self._standing_out({row: starts[row] for row in starts.keys() - certain.keys()})
@@ -291,13 +301,42 @@ class _Examination:
             kept = dict.fromkeys(of_count.tolist(), _MOST_KEPT)
             for k in np.argsort(fits.chi2, kind="stable").tolist():
                 row = int(of_row[k])
-                if not kept[row] or not fits.converged[k]:
-                    continue
-                kept[row] -= 1
-                dof = plain[row].solutions[0].dof - int(self.count[sensor[k]])
-                credible = dof > 0 and fits.chi2[k] <= _largest_credible(dof, plain[row].body_length_m)
-                starts[row].append(_Start(fits.q[k], fits.mu[k], frozenset({int(sensor[k])}), bool(credible)))
+                start = self._fitted(plain[row], fits, k, frozenset({int(sensor[k])}))
+                if kept[row] and start is not None:
+                    kept[row] -= 1
+                    starts[row].append(start)
         return starts
+
+    def _without_gross_faults(self, plain: Fix, row: int, tried: Sequence[_Start]) -> list[_Start]:
+        """The fit that explains a row without two sensors or three, each of which is beyond doubt without the others.
+
+        From one without a sensor, the next one is that which lowers χ² most.
+        """
+        at, sensors = np.array([row]), np.arange(self.array.n_sensors)
+        last = tried[0] if tried and plain.solutions else None
+        while last is not None and not last.explains and len(last.without) < _MOST_GROSS:
+            weight = np.where(np.isin(sensors, list(last.without)), LEAST_WEIGHT, 1.0)[None]
+            fall, _ = self.fits.falls(at, last.q[None], last.mu[None], weight)
+            fall[weight < 1.0] = 0.0
+            worst, scale2 = int(np.argmax(fall)), float(self.fits.scale2(fall)[0])
+            if fall[0, worst] <= _BEYOND_DOUBT * scale2 * self.fits.limits_of(scale2, len(last.q))[worst]:
+                break
+            weight[0, worst] = LEAST_WEIGHT
+            fit = self.fits.refined(at, last.q[None], last.mu[None], weight)
+            without = last.without | {worst}
+            last = self._fitted(plain, fit, 0, without)
+            if last is not None and last.explains:
+                return [last]
+        return []
+
+    def _fitted(self, plain: Fix, fits: JointFits, k: int, without: frozenset[int]) -> _Start | None:
+        """Fit k of a row without some sensors, none where it did not converge."""
+        if not fits.converged[k]:
+            return None
+        dof = plain.solutions[0].dof - int(self.count[list(without)].sum())
+        dof += 6 * (len(plain.solutions[0].sources) - fits.n_sources)
+        credible = dof > 0 and fits.chi2[k] <= _largest_credible(dof, plain.body_length_m)
+        return _Start(fits.q[k], fits.mu[k], without, bool(credible))
 
     def _to_leave_out(self, rows: IntArray, q: FloatArray, mu: FloatArray) -> BoolArray:
         """Sensors (f, N) without which fits of rows might be much better: they stand out, or bend the fit unseen.
@@ -317,28 +356,32 @@ class _Examination:
 
     def _searched(
         self, plain: Sequence[Fix], starts: dict[int, list[_Start]], unexplained: Sequence[int]
-    ) -> dict[frozenset[int], list[int]]:
-        """Rows in which to search anew, by the sensors that are left out: of a small array every one and every two.
+    ) -> list[dict[frozenset[int], list[int]]]:
+        """Rows in which to search anew, by the sensors that are left out, one after another.
 
-        Of a large one those that the refinements blame most, and the nearest to every source.
+        Of a small array every one and every two, of a large one the nearest to every source and those that the
+        refinements blame most.
         """
         standing = np.flatnonzero(self.count).tolist()
         every = [frozenset({sensor}) for sensor in standing] if len(standing) <= _MOST_ONE_BY_ONE else []
         if len(standing) <= _MOST_IN_PAIRS:
             every += [frozenset(pair) for pair in combinations(standing, 2)]
-        chosen: dict[frozenset[int], list[int]] = {}
+        chosen: list[dict[frozenset[int], list[int]]] = []
         for row in unexplained:
             sets = every.copy()
             if len(standing) > _MOST_IN_PAIRS:
-                sets += [start.without for start in starts[row][1 : 1 + _MOST_SEARCHED]]
                 q, mu = self._fit_of(plain[row])
                 distance = np.linalg.norm(self.array.positions[standing] - self.problem.position(q)[:, None], axis=-1)
                 misfit = self.fits.misfit(np.array([row]), q[None], mu[None], np.ones((1, self.array.n_sensors)))[0]
-                blamed = {*np.argsort(-misfit)[:_MOST_SEARCHED].tolist()}
-                blamed |= {standing[k] for k in np.argmin(distance, axis=1)} if plain[row].solutions else set()
-                sets += [frozenset({sensor}) for sensor in blamed]
-            for sensors in dict.fromkeys(sets):
-                chosen.setdefault(sensors, []).append(row)
+                near = [standing[k] for k in np.argmin(distance, axis=1)] if plain[row].solutions else []
+                sets += [frozenset({sensor}) for sensor in near]
+                sets += [start.without for start in starts[row][1:] if len(start.without) == 1][:_MOST_SEARCHED]
+                sets += [frozenset({sensor}) for sensor in np.argsort(-misfit)[:_MOST_SEARCHED].tolist()]
+            for k, sensors in enumerate(dict.fromkeys(sets)):
+                turn = k if self.many else 0
+                if turn == len(chosen):
+                    chosen.append({})
+                chosen[turn].setdefault(sensors, []).append(row)
         return chosen
 
     def _fit_of(self, fix: Fix) -> tuple[FloatArray, FloatArray]:
@@ -346,6 +389,8 @@ class _Examination:
         return self._scaled(fix) if fix.solutions else (np.array([[0.0, 0.0, 1.0, 1e-3]]), np.zeros((1, 3)))
 
     def _without(self, sensors: set[int] | frozenset[int], rows: IntArray) -> list[Fix]:
+        if not rows.size:
+            return []
         readings = self.readings[rows].copy()
         readings[:, np.isin(self.array.channel_sensor, list(sensors))] = np.nan
         return list(self.refit(self.of_all[rows], readings))

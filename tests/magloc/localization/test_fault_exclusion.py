@@ -386,6 +386,17 @@ class TestManySensors:
         assert not any(fixes.dropped_sensors)
         assert asked == [12]
 
+    def test_two_gross_faults(self, board):
+        """One after another: without the first the next is beyond doubt."""
+        clean, noise = board
+        readings = clean + noise
+        which = np.random.default_rng(18).permuted(np.tile(np.arange(30), (12, 1)), axis=1)[:, :2]
+        for k, sigmas in enumerate((50.0, 80.0)):
+            readings[np.arange(12), 3 * which[:, k] + k] += sigmas * 2e-7
+        fixes = Locator(self.BOARD, body_length_m=0.0).fit_rows(readings)
+        named = [set(fix.dropped_sensors) for fix in fixes]
+        assert named == [{self.BOARD.ids[sensor] for sensor in row} for row in which]
+
     @pytest.mark.parametrize("sigmas", [100.0, 1e4])
     def test_a_sensor_that_draws_the_source_to_itself(self, board, sigmas):
         """It has no residual, as the source beside it explains it: that nothing else checks it gives it away."""
