@@ -9,6 +9,7 @@ import inspect
 import pkgutil
 import re
 from collections import Counter
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import get_args
 
@@ -16,6 +17,7 @@ import pytest
 
 import adcs
 import magloc
+from magloc import linalg_compiled
 from tests.conftest import REPOSITORY
 
 PACKAGES = ("arrays", "magloc", "adcs", "sims")
@@ -240,6 +242,48 @@ class TestInterruptedKernels:
         path = REPOSITORY / "magloc/convergence/filters_compiled.py"
         text = "class Ends(NamedTuple): ...\n@compiled\ndef _run() -> Ends: ...\ndef ends(): return _run()"
         assert self.callers({path: ast.parse(text)}) == ["magloc/convergence/filters_compiled.py: ends calls _run"]
+
+
+class TestInternalKernels:
+    """One that only kernels call has no code that Python could call: a process that does, ends."""
+
+    KINDS = frozenset(("compiled", "internal", "inlined", "inlined_sum", "compiled_parallel"))
+
+    def python(self, node: ast.AST) -> Iterator[ast.expr]:
+        """Names outside of all kernels."""
+        for child in ast.iter_child_nodes(node):
+            if isinstance(child, ast.FunctionDef) and self.KINDS & {getattr(d, "id", "") for d in child.decorator_list}:
+                continue
+            if isinstance(child, ast.Name | ast.Attribute):
+                yield child
+            yield from self.python(child)
+
+    def used(self, tree: ast.Module, known: Mapping[str, object]) -> list[str]:
+        """Internal kernels that Python uses in a module that knows some objects by name."""
+        found = []
+        for node in self.python(tree):
+            if isinstance(node, ast.Name):
+                value = known.get(node.id)
+            else:
+                value = getattr(known.get(getattr(node.value, "id", "")), node.attr, None)
+            if getattr(value, "targetoptions", {}).get("no_cpython_wrapper"):
+                found.append(ast.unparse(node))
+        return found
+
+    def test_none_is_used_by_python(self, trees: dict[Path, ast.Module]) -> None:
+        found = {}
+        for path, tree in trees.items():
+            if "_compiled" in path.read_text(encoding="utf-8") or path.stem.endswith("_compiled"):
+                name = ".".join(path.relative_to(REPOSITORY).with_suffix("").parts).removesuffix(".__init__")
+                found[name] = self.used(tree, vars(importlib.import_module(name)))
+        assert len(found) > 60
+        assert {name: of_module for name, of_module in found.items() if of_module} == {}
+
+    def test_such_would_be_found(self) -> None:
+        known = {"put": linalg_compiled.put, "linalg": linalg_compiled}
+        source = "@compiled\ndef kernel(a, b):\n    put(a, b)\n\ndef python(a, b):\n    put(a, b)\n    linalg.put(a, b)"
+        assert linalg_compiled.put.targetoptions["no_cpython_wrapper"]
+        assert self.used(ast.parse(source), known) == ["put", "linalg.put"]
 
 
 class TestSizes:

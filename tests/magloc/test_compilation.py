@@ -156,7 +156,7 @@ try:
 except ValueError as error:
     print(error)
 """
-AS_NUMBA_DOES = "from magloc import compiler; compiler.CAN_LINK_ONLY = False"
+AS_NUMBA_DOES = "from magloc.compilation import compiler; compiler.CAN_LINK_ONLY = False"
 
 
 class TestInternal:
@@ -196,7 +196,7 @@ import operator
 from itertools import product
 from numba import types
 from numba.core.registry import cpu_target
-from magloc import compiler
+from magloc.compilation import compiler
 
 NUMBERS = [getattr(types, name) for name in "boolean int8 uint8 int32 int64 uint64 float32 float64 complex128".split()]
 NUMBERS += [types.literal(2), types.literal(True), types.Optional(types.float64)]

@@ -30,7 +30,7 @@ from numba import config, get_num_threads, njit
 from numba.core import caching, event
 
 from arrays.typing import FloatArray
-from magloc import compiler
+from magloc.compilation import compiler
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 _LOG = logging.getLogger(__name__)

@@ -16,6 +16,7 @@ from contextlib import suppress
 from functools import cache
 from typing import Any
 
+import numba
 from numba.core import caching, codegen, compiler, event
 
 _Library: Any = getattr(codegen, "JITCodeLibrary", object)  # numba has no types
@@ -30,7 +31,11 @@ _REPLACED = (
     "serialize_using_object_code",
     "serialize_using_bitcode",
 )
-CAN_LINK_ONLY = all(hasattr(_Library, name) for name in _REPLACED) and hasattr(codegen.JITCPUCodegen, "_library_class")
+# Versions whose compiler this was tried with: a later one may do with these parts what nobody has seen.
+_TRIED = numba.version_info.short < (0, 69)
+CAN_LINK_ONLY = (
+    _TRIED and all(hasattr(_Library, name) for name in _REPLACED) and hasattr(codegen.JITCPUCodegen, "_library_class")
+)
 _OF_NUMBERS = frozenset(
     (
         *(operator.add, operator.sub, operator.mul, operator.truediv, operator.neg),
