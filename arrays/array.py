@@ -162,9 +162,12 @@ class SensorArray:
     @cached_property
     def rotation_matrices(self) -> FloatArray:
         """Rotations from the sensors' axes to the array's frame, shape (N, 3, 3)."""
-        from scipy.spatial.transform import Rotation  # a third of a second to import
+        xyzw = np.array([sensor.rotation_xyzw for sensor in self.sensors])
+        if not xyzw[:, :3].any():
+            return _read_only(np.tile(np.eye(3), (self.n_sensors, 1, 1)))
+        from scipy.spatial.transform import Rotation  # a tenth of a command that finds fixes, to import
 
-        return _read_only(Rotation.from_quat([sensor.rotation_xyzw for sensor in self.sensors]).as_matrix())
+        return _read_only(Rotation.from_quat(xyzw).as_matrix())
 
     @cached_property
     def channel_names(self) -> tuple[str, ...]:
