@@ -107,6 +107,6 @@ def _write(path: Path, result: Arrays) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with replaced(path) as written, written.open("wb") as file:
-            np.savez(file, allow_pickle=False, **result)
+            np.savez(file, **result)
     except OSError as error:
         raise InputError(f"{path} cannot be written ({error.strerror or error}).") from None
