@@ -107,6 +107,6 @@ def _write(path: Path, result: Arrays) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with replaced(path) as written, written.open("wb") as file:
-            np.savez(file, **result)
+            np.savez(file, **result)  # type: ignore[arg-type]  # allow_pickle, which NumPy 2.0 does not know
     except OSError as error:
         raise InputError(f"{path} cannot be written ({error.strerror or error}).") from None
