@@ -85,8 +85,8 @@ _NumbasFiles: Any = caching.IndexDataCacheFile
 
 
 def _made_of(kernel: Any) -> tuple[Any, ...]:
-    """Stamps of the files of all kernels that one calls, and the numbers that are compiled into them."""
-    files, numbers, known, left = {}, [], {kernel}, [kernel]
+    """Stamps of the files of all kernels that one calls, and the constants that are compiled into them."""
+    files, constants, known, left = {}, [], {kernel}, [kernel]
     while left:
         function = left.pop()
         path, variables = function.__code__.co_filename, inspect.getclosurevars(function)
@@ -98,9 +98,10 @@ def _made_of(kernel: Any) -> tuple[Any, ...]:
             if called is not None and called not in known:
                 known.add(called)
                 left.append(called)
-            elif isinstance(value, int | float | np.generic):
-                numbers.append((function.__qualname__, name, repr(value)))
-    return tuple(sorted(files.items())), tuple(sorted(numbers))
+            elif isinstance(value, int | float | np.generic | tuple | np.ndarray):
+                value = (value.shape, value.dtype.str, value.tolist()) if isinstance(value, np.ndarray) else value
+                constants.append((function.__qualname__, name, repr(value)))
+    return tuple(sorted(files.items())), tuple(sorted(constants))
 
 
 class _Cache(_NumbasCache):  # type: ignore[misc]
@@ -175,7 +176,7 @@ def compiled(function: Function) -> Function:
 
 
 def internal(function: Function, **options: Any) -> Function:
-    """Compile a kernel that others call and Python cannot, which takes half the time."""
+    """Compile a kernel that others call and Python cannot, which is optimised inside them alone."""
     kind = _InternalCache if compiler.CAN_LINK_ONLY else _Cache
     return cast(Function, cached(_njit(**compiler.internal_options(), **options)(function), kind))
 

@@ -110,17 +110,26 @@ def test_cut_short(kept: Path, ending: str, share: float) -> None:
 
 
 @pytest.mark.slow_after(1)
-@pytest.mark.parametrize("of", ["function", "number"])
-def test_what_a_kernel_calls_has_changed(of: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "was", "becomes"),
+    [
+        ("others", "1.0 * x", "10.0 * x"),
+        ("constants", "NUMBER = 2.0", "NUMBER = 20.0"),
+        ("constants", "TUPLE = (1.0,)", "TUPLE = (10.0,)"),
+        ("constants", "array([1.0])", "array([10.0])"),
+    ],
+)
+def test_what_a_kernel_is_made_of_has_changed(name: str, was: str, becomes: str, tmp_path: Path) -> None:
     """In a file of its own, at which numba does not look."""
-    kernels = MODULE.replace("    return 2.0 * x", "    return other(x) * FACTOR")
-    (tmp_path / "kernels.py").write_text(f"from numbers_of import FACTOR\nfrom others import other\n{kernels}")
-    (tmp_path / "numbers_of.py").write_text("FACTOR = 2.0\n")
+    kernels = MODULE.replace("    return 2.0 * x", "    return other(x) * NUMBER * TUPLE[0] * ARRAY[0]")
+    (tmp_path / "kernels.py").write_text(f"from constants import *\nfrom others import other\n{kernels}")
+    constants = "import numpy\nNUMBER = 2.0\nTUPLE = (1.0,)\nARRAY = numpy.array([1.0])\n"
+    (tmp_path / "constants.py").write_text(constants)
     (tmp_path / "others.py").write_text(MODULE.split("@compiled")[0] + "@compiled\ndef other(x):\n    return 1.0 * x\n")
     assert call(tmp_path) == ("6.0 0", "")
     assert call(tmp_path) == ("6.0 1", "")
-    changed = tmp_path / ("others.py" if of == "function" else "numbers_of.py")
-    changed.write_text(changed.read_text().replace("1.0", "10.0").replace("2.0", "20.0"))
+    changed = tmp_path / f"{name}.py"
+    changed.write_text(changed.read_text().replace(was, becomes))
     assert call(tmp_path) == ("42.0 0", "")
 
 
