@@ -1,4 +1,4 @@
-"""What numba does anew for every kernel, done once, which halves a first call; kernels compute the same.
+"""What numba does anew for every kernel, done once: two thirds of a first call remain, and kernels compute the same.
 
 - A function that Python never calls (:func:`internal_options`) is optimised and becomes machine code inside the kernels
   that call it. numba would do both for the function, too, and for those between.
