@@ -303,9 +303,24 @@ class SensorArray:
         return replace(self, sensors=tuple(by_id[name] for name in ids))
 
     def in_ambient_field(self, ambient_T: ArrayLike) -> SensorArray:
-        """The array in another known ambient field (3,) [T] at its origin, with all that is known of its sensors.
+        """The array in another known ambient field, as every row of a log may have one of its own.
 
-        For the rows of a log, each of which has a field of its own: nothing is computed anew.
+        What is known of the sensors is shared, not computed anew.
+
+        Parameters
+        ----------
+        ambient_T : array-like, shape (3,)
+            The field at the array's origin, in its frame [T].
+
+        Returns
+        -------
+        SensorArray
+            With everything else as in this array.
+
+        Raises
+        ------
+        ValueError
+            The field is not three finite numbers.
         """
         _ = self.channel_gain, self.channel_offset_T, self.channel_noise_T, self.circumradius
         kept = {name: value for name, value in vars(self).items() if name not in _OF_AMBIENT_FIELD}

@@ -96,7 +96,7 @@ def with_ambient_field(
     if scalar and not array.row_ambient_uncertainty_T:
         _LOG.info("note: the geomagnetic model is taken as exact; crust and storms make it wrong by some 100 nT")
     if readings.array_rotation is None:
-        return replace(array, ambient_T=tuple(model_T.tolist())), None
+        return array.in_ambient_field(model_T), None
     return array, readings.array_rotation.inv().apply(model_T)
 
 
