@@ -243,21 +243,23 @@ def warm_up(app: App, calls: Sequence[Sequence[str]], common: QuietOptions) -> N
         print_note("compiled: no command has to wait for that again", app.name[0])
 
 
-def print_json(value: object) -> None:
-    """Print one JSON value on stdout; numbers that are not finite become null, numpy arrays lists."""
+def _json(value: object) -> str:
+    """One JSON value: numbers that are not finite become null, numpy arrays lists."""
     import msgspec
 
-    print(msgspec.json.encode(value, enc_hook=lambda array: array.tolist()).decode())
+    return msgspec.json.encode(value, enc_hook=lambda array: array.tolist()).decode()
+
+
+def print_json(value: object) -> None:
+    """Print one JSON value on stdout; numbers that are not finite become null, numpy arrays lists."""
+    print(_json(value))
 
 
 def print_json_list(name: str, entries: Iterable[object]) -> None:
     """Print a JSON object with one list whose entries are made one by one: those of a long file are never all there."""
-    import msgspec
-
-    encoder = msgspec.json.Encoder(enc_hook=lambda array: array.tolist())
     print(f'{{"{name}":[', end="")
     for i, entry in enumerate(entries):
-        print("," if i else "", encoder.encode(entry).decode(), sep="", end="")
+        print("," if i else "", _json(entry), sep="", end="")
     print("]}")
 
 
