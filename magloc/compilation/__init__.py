@@ -199,13 +199,14 @@ def compiled_parallel(function: Function) -> Function:
     return cast(Function, cached(_njit(parallel=True)(function)))
 
 
-def over_rows(kernel: Callable[..., None], n_rows: int, *arguments: Any) -> None:
+def over_rows(kernel: Callable[..., None], n_rows: int, *arguments: Any, rows_a_thread: int = 1) -> None:
     """Run a serial kernel ``kernel(begin, end, *arguments)`` on all rows, with as many threads as numba has.
 
     For large kernels: a ``prange`` loop around one more than doubles the time that it takes to compile. The kernel is
-    made by :func:`compiled`, which lets go of the interpreter's lock, and writes rows begin to end only.
+    made by :func:`compiled`, which lets go of the interpreter's lock, and writes rows begin to end only. To begin
+    threads takes as long as some kernels of few rows: a thread is begun for `rows_a_thread` at least.
     """
-    n_threads = 1 if n_rows == 1 else min(get_num_threads(), n_rows)
+    n_threads = 1 if n_rows < 2 * rows_a_thread else min(get_num_threads(), n_rows // rows_a_thread)
     if n_threads <= 1:
         kernel(0, n_rows, *arguments)
         return

@@ -229,10 +229,14 @@ def candidate_bases(
     end: int,
     candidates: FloatArray,
     row: ModelRow,
-    bases: FloatArray,
+    bases: NDArray[np.float32],
 ) -> None:
-    """Orthonormal whitened bases (n, 3, c) of candidate positions q (n, 4), rows begin to end."""
-    triangle = np.zeros((3, 3))
+    """Orthonormal whitened bases (c, 3, n) of candidate positions q (n, 4), begin to end."""
+    n_channels = row.channel_sensor.size
+    triangle, basis = np.zeros((3, 3)), np.empty((3, n_channels))
     for i in range(begin, end):
-        unit_basis(candidates[i], row, bases[i])
-        orthonormalise(bases[i], triangle)
+        unit_basis(candidates[i], row, basis)
+        orthonormalise(basis, triangle)
+        for c in range(n_channels):
+            for axis in range(3):
+                bases[c, axis, i] = basis[axis, c]

@@ -8,8 +8,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from magloc import compilation
 from tests.waiting import WAIT_S
 
 MODULE = """
@@ -242,3 +244,23 @@ print([(case, before[case], after[case]) for case in before if before[case] != a
 @pytest.mark.slow
 def test_types_are_those_that_numba_finds(folder: Path) -> None:
     assert call(folder, script=TYPES) == ("True True\n[]", "")
+
+
+class TestOverRows:
+    """Rows are shared out among threads, each of them once; few rows of a quick kernel are not worth a thread."""
+
+    @pytest.mark.parametrize(
+        ("n_rows", "rows_a_thread", "n_parts"),
+        [(1, 1, 1), (3, 1, 3), (100, 1, 16), (100, 50, 8), (100, 51, 1), (199, 100, 1), (200, 100, 8)],
+    )
+    def test_parts(self, n_rows: int, rows_a_thread: int, n_parts: int, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(compilation, "get_num_threads", lambda: 4)
+        count, parts = np.zeros(n_rows, dtype=int), []
+
+        def kernel(begin: int, end: int, step: int) -> None:
+            count[begin:end] += step
+            parts.append((begin, end))
+
+        compilation.over_rows(kernel, n_rows, 1, rows_a_thread=rows_a_thread)
+        np.testing.assert_array_equal(count, 1)
+        assert len(parts) == n_parts

@@ -25,6 +25,8 @@ from magloc.measurement.whitened import WhitenedModel
 # A refinement has converged where the linearised model promises to lower χ² by less than this, absolute and relative.
 PROMISE_ABSOLUTE = 1e-8
 PROMISE_RELATIVE = 1e-11
+# Channels of rows to be refined that take a millisecond, which threads take to begin.
+CHANNELS_A_THREAD = 768
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,7 +212,9 @@ def refine(
         ends = JointEnds(own(q), own(mu), np.empty(len(q)), np.empty(len(q), dtype=np.int64))
         limit = np.full(len(q), np.inf) if too_high is None else too_high
         rules = JointRules(promise, PROMISE_RELATIVE, max_iterations, limit)
-        over_rows(refine_rows, len(q), own(y), free.astype(np.float64), problem.of_kernels, rules, ends)
+        enough = 1 + CHANNELS_A_THREAD // (q.shape[1] * y.shape[1])
+        given = own(y), free.astype(np.float64), problem.of_kernels, rules, ends
+        over_rows(refine_rows, len(q), *given, rows_a_thread=enough)
         return JointFits(*ends)
     return damped_gauss_newton(problem, y, q, mu, free, max_iterations, promise)
 

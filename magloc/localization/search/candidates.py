@@ -26,7 +26,8 @@ from magloc.measurement.whitened_compiled import ModelRow, candidate_bases
 SingleArray = NDArray[np.float32]
 _SAME_GAIN = 0.02
 _APART_RAD, _LEAST_APART_RAD = 0.25, 0.075
-_CANDIDATES_AT_ONCE, _TURNED_AT_ONCE = 512, 128
+_CANDIDATES_AT_ONCE = 512
+_NUMBERS_A_THREAD = 65536  # of bases, which take as long as beginning several threads
 # Squares of a candidate's unit moment, along one direction, that only missing channels see.
 _UNSEEN = 1e-7
 _ROWS_AT_ONCE = 64  # whose components stay in the processor's cache
@@ -38,14 +39,11 @@ def linear_bases(problem: WhitenedModel, gain: FloatArray, row: int, candidates:
     By moment axis, then by candidate, under the whitening of `row`; `gain` (C, 3) is in units of the noise. Single
     precision ranks the candidates as well.
     """
-    every = np.empty((gain.shape[0], 3, len(candidates)), dtype=np.float32)
+    bases = np.empty((gain.shape[0], 3, len(candidates)), dtype=np.float32)
     model = ModelRow.of(problem, gain, problem.basis[row], problem.shrinkage[row])
-    for begin in range(0, len(candidates), _TURNED_AT_ONCE):  # which stay in the processor's cache
-        some = candidates[begin : begin + _TURNED_AT_ONCE]
-        bases = np.zeros((len(some), 3, gain.shape[0]))
-        over_rows(candidate_bases, len(some), some, model, bases)
-        every[:, :, begin : begin + len(some)] = bases.transpose(2, 1, 0)
-    return every.reshape(gain.shape[0], -1)
+    enough = 1 + _NUMBERS_A_THREAD // gain.shape[0]
+    over_rows(candidate_bases, len(candidates), candidates, model, bases, rows_a_thread=enough)
+    return bases.reshape(gain.shape[0], -1)
 
 
 class LastBases:
@@ -129,7 +127,7 @@ def chosen_candidates(
             z[:] = i20 * x + i21 * y + i22 * z
             y[:] = i10 * x + i11 * y
             x *= i00
-        over_rows(choose_rows, len(some), of_some, candidates, cos_apart, chosen[begin : begin + _ROWS_AT_ONCE])
+        choose_rows(0, len(some), of_some, candidates, cos_apart, chosen[begin : begin + _ROWS_AT_ONCE])
     return chosen
 
 
