@@ -11,7 +11,7 @@ uses.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Protocol
@@ -29,12 +29,7 @@ from magloc.localization.fit.results import Fix
 from magloc.localization.model_errors import model_errors
 from magloc.localization.reweighting import DEGREES_OF_FREEDOM, LEAST_WEIGHT, WeightedFits
 from magloc.localization.search.multi_source import NOISE_ALONE
-from magloc.measurement.rows import (
-    NO_SIGNAL,
-    rows_of_equal_mask,
-    whitened_model,
-    whitenings_of,
-)
+from magloc.measurement.rows import NO_SIGNAL, rows_of_equal_mask, whitened_model, whitenings_of
 from magloc.measurement.whitened import WhitenedModel
 
 # Above this χ² per degree of freedom a bad sensor may have bent the fit so much that it does not stand out.
@@ -147,6 +142,9 @@ class _Start:
     explains: bool
 
 
+_StartOfRow = tuple[int, _Start]
+
+
 class _Examination:
     """Rows that miss the same channels and have a doubtful fix."""
 
@@ -183,7 +181,8 @@ class _Examination:
         sigma_T = self.array.row_ambient_uncertainty_T if self.array.channel_is_scalar.any() else 0.0
         length_m = np.array([fix.body_length_m for fix in plain])
         errors = []
-        for rows, q, mu in self._by_count([(row, fix) for row, fix in enumerate(plain) if length_m[row] or sigma_T]):
+        counted = [(row, fix) for row, fix in enumerate(plain) if length_m[row] or sigma_T]
+        for _, rows, q, mu, _ in self._stacked(self._starts(counted)):
             lengths = np.tile(length_m[rows, None], q.shape[1])
             errors.append((rows, model_errors(self.problem.rows(rows), q, mu, lengths, sigma_T)))
         if errors:
@@ -223,15 +222,17 @@ class _Examination:
             return found
         starts = self._refined_without_one(plain, suspected)
         unexplained = [row for row, tried in starts.items() if not any(start.explains for start in tried)]
-        for row in unexplained if self.many else []:
-            starts[row] += self._without_gross_faults(plain[row], row, starts[row][1:2])
+        if self.many:
+            best = [(row, starts[row][1]) for row in unexplained if len(starts[row]) > 1]
+            for row, start in self._without_gross_faults(plain, best):
+                starts[row].append(start)
         for searched in self._searched(plain, starts, unexplained):
             for sensors, of_set in searched.items():
                 unsolved = [row for row in of_set if not (self.many and any(start.explains for start in starts[row]))]
-                for row, fix in zip(unsolved, self._without(sensors, np.array(unsolved, dtype=np.intp)), strict=True):
-                    anew = self._start(fix, sensors)
-                    starts[row] += anew
-                    starts[row] += self._without_gross_faults(plain[row], row, anew) if self.many else []
+                fixes = self._without(sensors, np.array(unsolved, dtype=np.intp))
+                anew = self._starts(zip(unsolved, fixes, strict=True), sensors)
+                for row, start in anew + (self._without_gross_faults(plain, anew) if self.many else []):
+                    starts[row].append(start)
         starts = {row: [start for start in tried if start.explains] or tried for row, tried in starts.items()}
         certain = self._certain(starts)
         standing_out = certain | self._standing_out({row: starts[row] for row in starts.keys() - certain.keys()})
@@ -253,8 +254,8 @@ class _Examination:
         spoilt = ~solved
         spoilt[solved] = [fix.solutions[0].chi2 > _SPOILT * fix.solutions[0].dof for fix in plain if fix.solutions]
         judged = np.flatnonzero(~spoilt & ~credible).tolist()
-        for of_count, q, mu in self._by_count([(row, plain[row]) for row in judged]):
-            misfit = self.fits.misfit(of_count, q, mu, np.ones((len(of_count), self.array.n_sensors)))
+        for _, of_count, q, mu, weight in self._stacked(self._starts([(row, plain[row]) for row in judged])):
+            misfit = self.fits.misfit(of_count, q, mu, weight)
             spoilt[of_count] = np.any(
                 misfit > unseen[of_count, None] * self.limits * self.fits.scale2(misfit)[:, None], axis=1
             )
@@ -267,36 +268,29 @@ class _Examination:
         alone = np.array([fix.reason == NOISE_ALONE for fix in plain], dtype=bool)
         return alone & (energy <= energy_threshold(max(1, self.n_differences)))
 
-    def _by_count(self, fixes: Sequence[tuple[int, Fix]]) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
-        """Rows, and best solutions (f, K, …), of fixes of equally many sources."""
-        scaled = [(row, *self._scaled(fix)) for row, fix in fixes if fix.solutions]
-        for count in sorted({len(q) for _, q, _ in scaled}):
-            alike = [(row, q, mu) for row, q, mu in scaled if len(q) == count]
-            rows, q, mu = zip(*alike, strict=True)
-            yield np.array(rows, dtype=np.intp), np.stack(q), np.stack(mu)
-
-    def _start(self, fix: Fix, without: frozenset[int]) -> list[_Start]:
-        """The fit of a fix, if there is one."""
-        if not fix.solutions:
-            return []
-        return [_Start(*self._scaled(fix), without, fix.solutions[0].dof > 0 and _is_credible(fix))]
+    def _starts(self, fixes: Iterable[tuple[int, Fix]], without: frozenset[int] = frozenset()) -> list[_StartOfRow]:
+        """The fits of fixes of rows, where there is one."""
+        solved = [(row, fix) for row, fix in fixes if fix.solutions]
+        explains = [fix.solutions[0].dof > 0 and _is_credible(fix) for _, fix in solved]
+        return [
+            (row, _Start(*self._scaled(fix), without, good)) for (row, fix), good in zip(solved, explains, strict=True)
+        ]
 
     def _refined_without_one(self, plain: Sequence[Fix], rows: IntArray) -> dict[int, list[_Start]]:
         """The plain fits of rows, and the best of those without one sensor, refined from them, best first.
 
         Rows are left out where no sensor stands out of what all others leave, and each is checked by them.
         """
-        starts = {row: self._start(plain[row], frozenset()) for row in rows.tolist()}
-        for of_count, q, mu in self._by_count([(row, plain[row]) for row in rows.tolist()]):
+        every = self._starts([(row, plain[row]) for row in rows.tolist()])
+        starts: dict[int, list[_Start]] = {row: [] for row in rows.tolist()} | {row: [start] for row, start in every}
+        for _, of_count, q, mu, _ in self._stacked(every):
             chosen = self._to_leave_out(of_count, q, mu)
             of_fit, sensor = np.nonzero(chosen)
             for row in of_count[~chosen.any(axis=1)].tolist():
                 del starts[row]
             if not of_fit.size:
                 continue
-            of_row, n = of_count[of_fit], of_fit.size
-            weight = np.ones((n, self.array.n_sensors))
-            weight[np.arange(n), sensor] = LEAST_WEIGHT
+            of_row, weight = of_count[of_fit], self.fits.weights_without(sensor[:, None].tolist())
             fits = self.fits.refined(of_row, q[of_fit], mu[of_fit], weight)
             kept = dict.fromkeys(of_count.tolist(), _MOST_KEPT)
             for k in np.argsort(fits.chi2, kind="stable").tolist():
@@ -307,27 +301,47 @@ class _Examination:
                     starts[row].append(start)
         return starts
 
-    def _without_gross_faults(self, plain: Fix, row: int, tried: Sequence[_Start]) -> list[_Start]:
-        """The fit that explains a row without two sensors or three, each of which is beyond doubt without the others.
+    def _without_gross_faults(self, plain: Sequence[Fix], tried: Sequence[_StartOfRow]) -> list[_StartOfRow]:
+        """Fits that explain rows without two sensors or three, each of which is beyond doubt without the others.
 
         From one without a sensor, the next one is that which lowers χ² most.
         """
-        at, sensors = np.array([row]), np.arange(self.array.n_sensors)
-        last = tried[0] if tried and plain.solutions else None
-        while last is not None and not last.explains and len(last.without) < _MOST_GROSS:
-            weight = np.where(np.isin(sensors, list(last.without)), LEAST_WEIGHT, 1.0)[None]
-            fall, _ = self.fits.falls(at, last.q[None], last.mu[None], weight)
-            fall[weight < 1.0] = 0.0
-            worst, scale2 = int(np.argmax(fall)), float(self.fits.scale2(fall)[0])
-            if fall[0, worst] <= _BEYOND_DOUBT * scale2 * self.fits.limits_of(scale2, len(last.q))[worst]:
-                break
-            weight[0, worst] = LEAST_WEIGHT
-            fit = self.fits.refined(at, last.q[None], last.mu[None], weight)
-            without = last.without | {worst}
-            last = self._fitted(plain, fit, 0, without)
-            if last is not None and last.explains:
-                return [last]
-        return []
+        found = []
+        left = [(row, start) for row, start in tried if plain[row].solutions and not start.explains]
+        while left:
+            starts, left = left, []
+            for some, rows, q, mu, weight in self._stacked(starts):
+                fall, _ = self.fits.falls(rows, q, mu, weight)
+                fall[weight < 1.0] = 0.0
+                each, worst = np.arange(len(rows)), np.argmax(fall, axis=1)
+                gross = np.flatnonzero(fall[each, worst] > _BEYOND_DOUBT * self._limits(fall, q)[each, worst])
+                if not gross.size:
+                    continue
+                weight[each, worst] = LEAST_WEIGHT
+                fits = self.fits.refined(rows[gross], q[gross], mu[gross], weight[gross])
+                for k, i in enumerate(gross.tolist()):
+                    row, last = some[i]
+                    start = self._fitted(plain[row], fits, k, last.without | {int(worst[i])})
+                    if start is not None and start.explains:
+                        found.append((row, start))
+                    elif start is not None and len(start.without) < _MOST_GROSS:
+                        left.append((row, start))
+        return found
+
+    def _limits(self, misfit: FloatArray, q: FloatArray) -> FloatArray:
+        """Limits (f, N) of squared residuals, of fits of sources q (f, K, 4), as large as their noise makes them."""
+        scale2 = self.fits.scale2(misfit)
+        return np.array([scale * self.fits.limits_of(float(scale), q.shape[1]) for scale in scale2])
+
+    def _stacked(
+        self, starts: Sequence[_StartOfRow]
+    ) -> Iterator[tuple[list[_StartOfRow], IntArray, FloatArray, FloatArray, FloatArray]]:
+        """Starts of equally many sources: rows, sources (f, K, …), and weights (f, N) without what they leave out."""
+        for count in sorted({len(start.q) for _, start in starts}):
+            some = [(row, start) for row, start in starts if len(start.q) == count]
+            q, mu = np.stack([start.q for _, start in some]), np.stack([start.mu for _, start in some])
+            rows = np.array([row for row, _ in some], dtype=np.intp)
+            yield some, rows, q, mu, self.fits.weights_without([start.without for _, start in some])
 
     def _fitted(self, plain: Fix, fits: JointFits, k: int, without: frozenset[int]) -> _Start | None:
         """Fit k of a row without some sensors, none where it did not converge."""
@@ -349,9 +363,7 @@ class _Examination:
         least = np.maximum(last.min(axis=1), _MATTERS * fall.max(axis=1) * self.many)
         chosen: BoolArray = ((fall >= least[:, None]) | (checked < _HALF_CHECKED)) & (self.count > 0)
         if self.many:
-            scale2 = self.fits.scale2(fall)
-            limits = np.array([scale * self.fits.limits_of(float(scale), q.shape[1]) for scale in scale2])
-            chosen &= np.any((fall > limits) | (checked < _LEAST_CHECKED), axis=1)[:, None]
+            chosen &= np.any((fall > self._limits(fall, q)) | (checked < _LEAST_CHECKED), axis=1)[:, None]
         return chosen
 
     def _searched(
@@ -407,15 +419,11 @@ class _Examination:
         """
         only = [(row, tried[0]) for row, tried in starts.items() if len(tried) == 1 and tried[0].explains]
         found: dict[int, frozenset[int]] = {}
-        for row, start in only if self.many else []:
-            left_out = np.isin(np.arange(self.array.n_sensors), list(start.without))[None]
-            if not left_out.any():
-                continue
-            weight = np.where(left_out, LEAST_WEIGHT, 1.0)
-            fall, _ = self.fits.falls(np.array([row]), start.q[None], start.mu[None], weight)
+        for some, rows, q, mu, weight in self._stacked([of for of in only if of[1].without] if self.many else []):
+            fall, _ = self.fits.falls(rows, q, mu, weight)
             beyond = fall / weight > _BEYOND_DOUBT * self.limits
-            if np.all(np.where(left_out, beyond, fall <= self.limits)):
-                found[row] = start.without
+            certain = np.all(np.where(weight < 1.0, beyond, fall <= self.limits), axis=1)
+            found |= {row: start.without for (row, start), of_row in zip(some, certain, strict=True) if of_row}
         return found
 
     def _standing_out(self, starts: dict[int, list[_Start]]) -> dict[int, frozenset[int]]:
@@ -423,20 +431,14 @@ class _Examination:
         best = dict.fromkeys(starts, np.inf)
         found = dict.fromkeys(starts, frozenset[int]())
         every = [(row, start) for row, of_row in starts.items() for start in of_row]
-        for count in sorted({len(start.q) for _, start in every}):
-            index = [i for i, (_, start) in enumerate(every) if len(start.q) == count]
-            row = np.array([every[i][0] for i in index], dtype=np.intp)
-            q, mu = np.stack([every[i][1].q for i in index]), np.stack([every[i][1].mu for i in index])
-            weight = np.ones((len(row), self.array.n_sensors))
-            for f, i in enumerate(index):
-                weight[f, list(every[i][1].without)] = LEAST_WEIGHT
-            misfit, scale2 = self.fits.reweighted(row, q, mu, weight)
+        for _, rows, q, mu, weight in self._stacked(every):
+            misfit, scale2 = self.fits.reweighted(rows, q, mu, weight)
             # Beyond doubt is beyond doubt: two sensors that are far off must not cost less than one that is farther.
             bounded = np.minimum(misfit / scale2[:, None], _BEYOND_DOUBT * self.limits)
             score = 0.5 * np.sum(
                 (DEGREES_OF_FREEDOM + self.count) * np.log1p(bounded / DEGREES_OF_FREEDOM), axis=1
             ) + 0.5 * self.count.sum() * np.log(scale2)
-            for f, r in enumerate(row.tolist()):
+            for f, r in enumerate(rows.tolist()):
                 if score[f] < best[r]:
                     best[r] = score[f]
                     out = np.flatnonzero(misfit[f] > self.fits.limits_of(float(scale2[f]), q.shape[1]) * scale2[f])

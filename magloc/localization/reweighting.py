@@ -5,6 +5,7 @@ A sensor whose squared residual is :math:`\rho_s` has the weight :math:`(\nu + n
 
 from __future__ import annotations
 
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,6 +56,13 @@ class WeightedFits:
     def n_sensors(self) -> int:
         """Number of sensors N."""
         return len(self.count)
+
+    def weights_without(self, sensors: Sequence[Collection[int]]) -> FloatArray:
+        """Weights (f, N) of fits without some sensors."""
+        weight = np.ones((len(sensors), self.n_sensors))
+        for of_fit, some in zip(weight, sensors, strict=True):
+            of_fit[list(some)] = LEAST_WEIGHT
+        return weight
 
     def _weighted(self, row: IntArray, weight: FloatArray) -> Weighted:
         return weighted(self.problem.rows(row), self.raw[row], weight[:, self.problem.channel_sensor])
