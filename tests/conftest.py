@@ -51,7 +51,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """
 
     def rank(item: pytest.Item) -> int:
-        if "browser" in item.path.parts:
+        if "browser" in item.path.parts or item.path.stem == "test_scenario_consistency":
             return 0
         if item.path.is_relative_to(REPOSITORY / "tests" / "adcs"):
             return 1
