@@ -229,7 +229,7 @@ def candidate_bases(
     end: int,
     candidates: FloatArray,
     row: ModelRow,
-    bases: NDArray[np.float32],
+    bases: FloatArray | NDArray[np.float32],
 ) -> None:
     """Orthonormal whitened bases (c, 3, n) of candidate positions q (n, 4), begin to end."""
     n_channels = row.channel_sensor.size

@@ -407,10 +407,10 @@ class TestReadableTwin:
         whitened_compiled.unit_basis(q, row_of(self.problem), basis)
         expected = unit_basis(self.problem, q).T
         assert_allclose(basis, expected, rtol=1e-9, atol=1e-12 * np.abs(expected).max())
-        bases = np.empty((18, 3, 1), dtype=np.float32)
+        bases = np.empty((18, 3, 1))
         whitened_compiled.candidate_bases(0, 1, q[None], row_of(self.problem), bases)
-        assert_allclose(
-            y @ y - np.sum((y @ bases[..., 0]) ** 2), projected_chi2(self.problem, q, y), rtol=0.0, atol=1e-6 * (y @ y)
+        assert y @ y - np.sum((y @ bases[..., 0]) ** 2) == pytest.approx(
+            float(projected_chi2(self.problem, q, y)), rel=1e-7, abs=1e-9
         )
 
     @given(SEEDS)
