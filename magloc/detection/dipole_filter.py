@@ -19,6 +19,7 @@ from arrays.whitening import Whitening, whitening
 from magloc.chi_square import check_differences
 from magloc.compilation import over_rows
 from magloc.fields import dipole
+from magloc.localization.fit.gauss_newton import refined_a_thread
 from magloc.localization.search.candidates import (
     SingleArray,
     candidate_positions,
@@ -134,5 +135,6 @@ class DipoleFilter:
         chosen = chosen_candidates(self._bases, whitened, self._candidates, _N_STARTS, _APART_RAD)
         found = Ends.empty(n, _N_STARTS)
         signal, starts = signals(problem, whitened), self._candidates[chosen]
-        over_rows(search_rows, n, signal, np.arange(n), starts, np.inf, _MOST_ITERATIONS, problem.lanes, None, found)
+        given = signal, np.arange(n), starts, np.inf, _MOST_ITERATIONS, problem.lanes, None, found
+        over_rows(search_rows, n, *given, rows_a_thread=refined_a_thread(whitened.shape[1]))
         return self.energy(whitened) - np.where(found.counts[:, 0] > 0, found.chi2[:, 0], np.inf)

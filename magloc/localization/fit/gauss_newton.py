@@ -25,8 +25,7 @@ from magloc.measurement.whitened import WhitenedModel
 # A refinement has converged where the linearised model promises to lower χ² by less than this, absolute and relative.
 PROMISE_ABSOLUTE = 1e-8
 PROMISE_RELATIVE = 1e-11
-# Channels of rows to be refined that take a millisecond, which threads take to begin.
-CHANNELS_A_THREAD = 768
+_CHANNELS_A_THREAD = 768
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,11 +211,15 @@ def refine(
         ends = JointEnds(own(q), own(mu), np.empty(len(q)), np.empty(len(q), dtype=np.int64))
         limit = np.full(len(q), np.inf) if too_high is None else too_high
         rules = JointRules(promise, PROMISE_RELATIVE, max_iterations, limit)
-        enough = 1 + CHANNELS_A_THREAD // (q.shape[1] * y.shape[1])
         given = own(y), free.astype(np.float64), problem.of_kernels, rules, ends
-        over_rows(refine_rows, len(q), *given, rows_a_thread=enough)
+        over_rows(refine_rows, len(q), *given, rows_a_thread=refined_a_thread(q.shape[1] * y.shape[1]))
         return JointFits(*ends)
     return damped_gauss_newton(problem, y, q, mu, free, max_iterations, promise)
+
+
+def refined_a_thread(n_channels: int) -> int:
+    """Rows to refine, of so many channels (times sources), that take the millisecond that threads take to begin."""
+    return 1 + _CHANNELS_A_THREAD // n_channels
 
 
 def _is_by_moduli(problem: WhitenedModel, free: NDArray[np.bool_]) -> bool:

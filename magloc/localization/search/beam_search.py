@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from arrays.typing import FloatArray
 from magloc.compilation import over_rows
 from magloc.directions import hemisphere
-from magloc.localization.fit.gauss_newton import CHANNELS_A_THREAD, JointFits, fit_moments, refine
+from magloc.localization.fit.gauss_newton import JointFits, fit_moments, refine, refined_a_thread
 from magloc.localization.fit.moduli_compiled import Moduli
 from magloc.localization.fit.results import DISTINCT_WITHIN
 from magloc.localization.search.candidates import (
@@ -164,7 +164,7 @@ class Search:
             problem.lanes,
             Moduli.of(problem),
             found,
-            rows_a_thread=1 + CHANNELS_A_THREAD // y.shape[1],
+            rows_a_thread=refined_a_thread(y.shape[1]),
         )
         chi2 = np.where(np.arange(q.shape[1]) < found.counts[:, :1], found.chi2, np.inf)
         return JointFits(found.q[:, :, None], found.mu[:, :, None], chi2, found.iterations).shaped(-1)

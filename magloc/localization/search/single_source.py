@@ -20,7 +20,7 @@ from arrays.typing import BoolArray, FloatArray, IntArray
 from arrays.whitening import Whitening, whitening
 from magloc.compilation import over_rows
 from magloc.levels import CREDIBLE_FIT
-from magloc.localization.fit.gauss_newton import CHANNELS_A_THREAD, JointFits
+from magloc.localization.fit.gauss_newton import JointFits, refined_a_thread
 from magloc.localization.fit.optima import Optima
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import DISTINCT_WITHIN
@@ -234,7 +234,7 @@ class SingleSourceSearch:
             rows.model.lanes,
             None,
             found,
-            rows_a_thread=1 + CHANNELS_A_THREAD // rows.y.shape[1],
+            rows_a_thread=refined_a_thread(rows.y.shape[1]),
         )
         return found
 

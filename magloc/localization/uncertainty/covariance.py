@@ -19,7 +19,7 @@ from magloc.chi_square import energy_threshold
 from magloc.compilation import over_rows, readable
 from magloc.levels import CERTAIN_WEIGHT, DELTA_CHI2_95, MISFIT
 from magloc.localization.fit.columns import Solutions
-from magloc.localization.fit.gauss_newton import CHANNELS_A_THREAD, covariances
+from magloc.localization.fit.gauss_newton import covariances, refined_a_thread
 from magloc.localization.fit.optima import Optima
 from magloc.localization.fit.results import is_misfit, is_observable
 from magloc.localization.uncertainty.ambiguity import (
@@ -165,7 +165,7 @@ def known_of_one_compiled(optima: Optima) -> _Known:
         model.units,
         levels_of(rows.n_differences, optima.dof),
         found,
-        rows_a_thread=1 + CHANNELS_A_THREAD // rows.y.shape[1],
+        rows_a_thread=refined_a_thread(rows.y.shape[1]),
     )
     return _Known(found.position_m, found.moment_Am2, found.ranges, found.covariance, found.gaussian, found.weight)
 
