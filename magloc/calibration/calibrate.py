@@ -15,6 +15,7 @@ from magloc.calibration.model import GAINS, PER_SENSOR, unknowns
 from magloc.calibration.modulus import EllipsoidCalibration, calibrated_in_modulus, symmetric
 from magloc.calibration.observability import Unobservable
 from magloc.calibration.results import SourceCalibration, TurningCalibration
+from magloc.measurement.plausibility import warn_of_array, warn_of_moments
 from magloc.measurement.rows import check_magnitudes
 from magloc.readings import Readings, without_saturated
 from magloc.truth import Truth, rows_of_same_time
@@ -77,18 +78,21 @@ def calibrate(
     (True, (30, 15))
     """
     check_magnitudes(array)
+    warn_of_array(array)
     rows = without_saturated(readings, array)
     if modulus_T is not None:
         if truth is not None or moment is not None:
             raise ValueError("Input modulus_T must come without truth and moment: there is no source.")
         return _turned(array, rows, np.asarray(modulus_T, dtype=np.float64))
     try:
-        return _by_source(array, rows, truth, moment, prior)
+        result = _by_source(array, rows, truth, moment, prior)
     except np.linalg.LinAlgError:
         raise ValueError(
             "Input readings must be those of a source that passes the sensors at a distance; instead the model cannot"
             " place it (on a sensor, or at infinity)."
         ) from None
+    warn_of_moments(np.linalg.norm(result.position_m - result.array.centroid, axis=1), result.moment_Am2)
+    return result
 
 
 def _by_source(

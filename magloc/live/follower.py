@@ -22,14 +22,16 @@ from magloc.live.tally import Clock, Tally
 from magloc.live.transports import Stream, opened, sender_waits
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.measurement.differences import predicted_channels, suitable_dipole
+from magloc.measurement.plausibility import FEWEST_ROWS, warn_of_doubts
 from magloc.measurement.pose import with_stated_pose
+from magloc.measurement.rows import joined
 from magloc.readings import EXPECTED_HEADER, Readings, log_format, without_saturated
 from magloc.tracking.batch import compiled_motion, next_points
 from magloc.tracking.motion import MotionModel, RandomWalk
 from magloc.tracking.multi_target.motion import FreeMotion
 from magloc.tracking.multi_target.results import SourcesPoint
 from magloc.tracking.multi_target.tracker import SourcesTracker
-from magloc.tracking.results import Row, TrackPoint, rows_of
+from magloc.tracking.results import Row, TrackPoint, rows_of, warn_of_strengths
 from magloc.tracking.track import SPEED_M_S, TURN_RAD_S
 from magloc.tracking.tracker import Tracker
 
@@ -137,6 +139,8 @@ class Follower:
         self._background: Background | None = None
         self._rest_rows: list[Row] = []
         self._rest_s = 0.0
+        self._first_rows: list[Readings] = []
+        self._first_points: list[TrackPoint] = []
         self._stopped = self._moves = False
         if rest_s:
             self.tare(rest_s)
@@ -239,6 +243,7 @@ class Follower:
                 else:
                     self.tally.tracked += point.is_on_track
                     known = {name: getattr(point, name) for name in _OF_POINT}
+                self._doubt(point)
                 yield LivePoint(**known, row=row, latency_s=latency_s, tally=self.tally)
             rows = rows[len(answers) :]
 
@@ -253,9 +258,23 @@ class Follower:
             if self._rest_s:
                 refuse_rest(array, moves=self._moves)
         used = in_world_field(without_saturated(readings, self._in_field), self._in_field)
+        if sum(map(len, self._first_rows)) < FEWEST_ROWS:
+            first = (self._first_rows or [readings])[0]
+            if (first.pose is None, first.ambient_T is None) == (readings.pose is None, readings.ambient_T is None):
+                self._first_rows.append(readings)
+            if sum(map(len, self._first_rows)) >= FEWEST_ROWS:
+                warn_of_doubts(self._in_field, joined(self._first_rows))
         if self._in_field.pose is None:
             return list(rows_of(used))
         return [row for one in used for row in rows_of(one)]  # whose motion is that since the row before
+
+    def _doubt(self, point: TrackPoint | SourcesPoint) -> None:
+        """Warn once of moments that no object has, after as many points of a track as a record is judged by."""
+        if len(self._first_points) < FEWEST_ROWS:
+            tracks = point.tracks[:1] if isinstance(point, SourcesPoint) else (point,) * point.is_on_track
+            self._first_points += tracks
+            if tracks and len(self._first_points) == FEWEST_ROWS:
+                warn_of_strengths(self._first_points)
 
     @one_blas_thread
     def _next_answers(self, rows: Sequence[Row], *, waits: bool) -> list[tuple[Row, TrackPoint | SourcesPoint]]:

@@ -40,7 +40,7 @@ from magloc.localization.uncertainty.covariance import solutions_of
 from magloc.localization.uncertainty.pose_covariance import pose_covariances
 from magloc.localization.uncertainty.range_interval import is_detected
 from magloc.measurement.nuisances import ambient_in_array, with_eddies_as_offsets
-from magloc.measurement.plausibility import warn_of_doubts
+from magloc.measurement.plausibility import warn_of_doubts, warn_of_moments
 from magloc.measurement.pose import PosesOfRows, rates_of, with_stated_pose
 from magloc.measurement.rows import NO_SIGNAL, WhitenedRows, checked_rows, whitened_rows
 from magloc.readings import Readings, as_readings, without_saturated
@@ -374,6 +374,9 @@ def locate(
     )
     fixes = locator.fit_rows(rows.values_T, ambient, time_s=rows.time_s, progress=progress)
     fixes = replace(fixes, saturated_channels=saturated)
+    best = fixes.best[fixes.solved & fixes.detected]
+    distance_m = np.linalg.norm(fixes.solutions.position_m[best, 0] - array.centroid, axis=-1)
+    warn_of_moments(distance_m, fixes.solutions.moment_Am2[best, 0])
     if pose is None:
         return fixes
     added = 0.0 if stated is None else pose_covariances(stated, rows, fixes.solutions)

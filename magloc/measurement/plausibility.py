@@ -16,13 +16,15 @@ from numpy.typing import ArrayLike
 from arrays.array import SensorArray
 from arrays.typing import FloatArray
 from magloc.ambient import in_world_field
+from magloc.measurement.rows import ambient_fields
 from magloc.readings import Readings, as_readings, without_saturated
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
 _LOG = logging.getLogger(__name__)
-_FEWEST_ROWS = 20
+FEWEST_ROWS = 20
+"""Rows that a record is judged by."""
 _OF_A_NANOTESLA = {"µT": 1e-3, "G": 1e-5, "T": 1e-9}
 _LIKE = 3.0  # factor to the noise of another unit
 _WHITE = 5.0  # growth from lag 1 to lag 2: 1 for white noise, 8 behind a filter of second order, 2**6 for smooth fields
@@ -32,6 +34,18 @@ _TURNS_RAD = 0.06  # three times what an attitude of 1° and a source's share of
 _TURNS_UNEXPLAINED_RAD = 0.3  # offsets of 10 µT in 50 µT do 0.2
 _SLOWEST_M_S, _FASTEST_M_S, _FAR_M = 0.01, 500.0, 2.0
 _ORBIT_M_S = (3e3, 11e3)  # geostationary to escape
+_AMBIENT_SIGMAS = 4.0
+_MODEL_SIGMA_T = 150e-9  # of a geomagnetic model where nothing is stated: crust and storms
+_ALIKE = 0.25  # spread of a difference between rows and sensors, over it: a source's differs more
+_MOST_COMPARED = 10_000  # rows
+_WIDEST_M, _COARSE_T = 3.0, 50e-9  # across an array of coarse sensors, and their noise; finer ones stand farther apart
+_NARROWEST_M = 1e-3
+_WIDEST_ON_THE_MOVE_M = 30.0
+_MAGNET_A_m, _MAGNET_M = 1.1e6, 0.05  # magnetisation of the strongest magnets, and the radius of a large one
+_IRON_A_m = 125.0  # magnetisation of vehicles and ships, over a sphere that reaches the sensors
+_MOMENTS_Am2 = (1e-9, 1e7)  # a grain of magnetite, the largest ships
+FARTHEST_M = 1e5
+"""From the origin of a local frame: beyond it neither a plane Earth nor single centimetres of a track hold."""
 
 
 def usable_readings(array: SensorArray, values: Readings | ArrayLike) -> Readings:
@@ -45,6 +59,16 @@ def usable_readings(array: SensorArray, values: Readings | ArrayLike) -> Reading
 def warn_of_doubts(array: SensorArray, readings: Readings) -> None:
     """Warn of what in readings is hardly as stated."""
     _warn_of(doubts(array, readings))
+
+
+def warn_of_array(array: SensorArray) -> None:
+    """Warn of an array whose size is hardly in metres."""
+    _warn_of(array_doubts(array))
+
+
+def warn_of_moments(distance_m: ArrayLike, moment_Am2: ArrayLike) -> None:
+    """Warn of moments (n, 3) that no object has at such distances (n,) from the sensors, NaN where there is none."""
+    _warn_of(moment_doubts(distance_m, moment_Am2))
 
 
 def _warn_of(sentences: Iterator[str]) -> None:
@@ -61,9 +85,11 @@ def doubts(array: SensorArray, readings: Readings, used: Readings | None = None)
 
     `used` are those that do not saturate, in their ambient field, where they are known.
     """
-    if len(readings) < _FEWEST_ROWS:
-        return
     used = _usable(array, readings) if used is None else used
+    yield from array_doubts(array, moves=used.pose is not None and np.ptp(used.pose[0], axis=0).max(initial=0.0) > 0.0)
+    yield from _of_origin(used)
+    if len(readings) < FEWEST_ROWS:
+        return
     read = np.isfinite(readings.values_T)
     saturated = 1.0 - np.isfinite(used.values_T).sum() / max(int(read.sum()), 1)
     if read.any() and saturated > 0.5:
@@ -76,10 +102,62 @@ def doubts(array: SensorArray, readings: Readings, used: Readings | None = None)
                 f" {unit}: are they in nT, is noise_nT right, were they filtered?"
             )
     ambient_T = array.ambient_fields if used.ambient_T is None else used.ambient_T
-    yield from _of_moduli(used.values_T[:, array.channel_is_scalar], _median(np.linalg.norm(ambient_T, axis=-1)))
+    of_unit = list(_of_moduli(used.values_T[:, array.channel_is_scalar], _median(np.linalg.norm(ambient_T, axis=-1))))
+    yield from of_unit or _of_ambient(array, used)
     if used.pose is not None:
         yield from _of_path(used.time_s, used.pose[0])
         yield from _of_attitude(array, used, used.pose[1])
+
+
+def array_doubts(array: SensorArray, *, moves: bool = False) -> Iterator[str]:
+    """Sentences on an array whose size is hardly that of an array with such noise, or of one that `moves`."""
+    if array.n_sensors < 2:
+        return
+    across_m, noise_T = 2.0 * array.circumradius, float(np.median(array.channel_noise_T))
+    widest_m = _WIDEST_M * max(1.0, _COARSE_T / noise_T) ** (2.0 / 3.0)
+    if _NARROWEST_M <= across_m <= (min(widest_m, _WIDEST_ON_THE_MOVE_M) if moves else widest_m):
+        return
+    moving = "a moving array" if moves else f"an array with a noise of {1e9 * noise_T:.3g} nT"
+    yield (
+        f"the sensors span {across_m:.3g} m, which is not plausible for {moving}: are their positions in metres? If"
+        f" they are in mm the array spans {across_m / 1e3:.3g} m, in cm {across_m / 1e2:.3g} m, in inches"
+        f" {0.0254 * across_m:.3g} m"
+    )
+
+
+def moment_doubts(distance_m: ArrayLike, moment_Am2: ArrayLike) -> Iterator[str]:
+    """A sentence on moments (n, 3) that no object has at distances (n,) from the sensors; NaN are left out."""
+    distance, strength = np.asarray(distance_m, np.float64), np.linalg.norm(moment_Am2, axis=-1)
+    known = np.isfinite(distance) & np.isfinite(strength)
+    if not known.any():
+        return
+    distance, strength = distance[known], strength[known]
+    of_sphere = 4.0 / 3.0 * np.pi * np.array([_MAGNET_A_m, _IRON_A_m])
+    largest = of_sphere[0] * np.minimum(distance, _MAGNET_M) ** 3 + of_sphere[1] * distance**3
+    if np.median(strength / np.minimum(largest, _MOMENTS_Am2[1])) < 1.0 and np.median(strength) > _MOMENTS_Am2[0]:
+        return
+    yield (
+        f"the moment is {np.median(strength):.2g} A·m² at {np.median(distance):.2g} m in the median, which is not"
+        " plausible for any object: are the positions of the sensors in metres, and the readings in nT? Lengths in mm"
+        " make a moment 10⁹ times as large, in cm 10⁶ times, in inches 6·10⁴ times"
+    )
+
+
+def _of_origin(readings: Readings) -> Iterator[str]:
+    farthest_m = farthest_place(readings)
+    if farthest_m > FARTHEST_M:
+        yield (
+            f"places lie up to {farthest_m / 1e3:.4g} km from the origin of their frame: if they are eastings and"
+            " northings of a grid, subtract those of a place nearby, for so large numbers cost digits"
+        )
+
+
+def farthest_place(readings: Readings) -> float:
+    """Greatest distance of the array from the origin of the world frame [m], 0 where it has no pose."""
+    if readings.array_position_m is None:
+        return 0.0
+    far_m = np.linalg.norm(readings.array_position_m, axis=1)
+    return float(far_m[np.isfinite(far_m)].max(initial=0.0))
 
 
 def noise_ratio(array: SensorArray, values_T: FloatArray) -> float:
@@ -129,6 +207,54 @@ def _of_moduli(moduli_T: FloatArray, ambient_T: float) -> Iterator[str]:
         )
 
 
+def _of_ambient(array: SensorArray, used: Readings) -> Iterator[str]:
+    """Whether the moduli that sensors read are those of the stated ambient field, in rows where no source is near.
+
+    An error of that field is the same in most rows and for all sensors, unlike the field of a source.
+    """
+    if used.ambient_T is None and array.ambient_T is None:
+        return
+    used = used[:: -(-len(used) // _MOST_COMPARED)]
+    scalar = np.array([sensor.kind == "scalar" for sensor in array.sensors])
+    moduli = np.linalg.norm(array.calibrated_field(used.values_T), axis=2)
+    moduli[:, scalar] = used.values_T[:, array.channel_is_scalar] - array.channel_offset_T[array.channel_is_scalar]
+    if scalar.any():
+        moduli = np.where(scalar, moduli, np.nan)
+    stated = np.linalg.norm(ambient_fields(array, len(used), used.ambient_T), axis=2)
+    of_sensors = [_shortest_half(d[np.isfinite(d)]) for d in (moduli - stated).T if np.isfinite(d).any()]
+    modulus_T = _median(stated)
+    if not of_sensors or not _median(moduli) > modulus_T / _OTHER_UNIT or (moduli < 0.0).any():
+        return  # it was taken off the readings
+    levels, widths = np.array(of_sensors).T
+    off_T = float(np.median(levels))
+    spread_T = max(np.median(widths), np.quantile(np.abs(levels - off_T), 0.8, method="lower"))
+    of_field_T = array.row_ambient_uncertainty_T or _MODEL_SIGMA_T
+    of_sensor_T = [
+        math.hypot(s.offset_uncertainty_T, math.hypot(s.gain_uncertainty, s.induced_uncertainty) * modulus_T)
+        for s in array.sensors
+        if s.kind == ("scalar" if scalar.any() else "vector")
+    ]
+    sigma_T = math.hypot(of_field_T, max(of_sensor_T), array.common_field_T or 0.0)
+    if abs(off_T) < _AMBIENT_SIGMAS * sigma_T or spread_T > _ALIKE * abs(off_T):
+        return
+    stated_or_not = "stated" if array.row_ambient_uncertainty_T else "assumed, as none is stated"
+    yield (
+        f"the sensors read {abs(1e9 * off_T):.0f} nT {'more' if off_T > 0.0 else 'less'} than the ambient field of"
+        f" {1e9 * modulus_T:.0f} nT, in most rows, far beyond an uncertainty of {1e9 * sigma_T:.3g} nT"
+        f" ({stated_or_not}): check the place, the date and the units that the field is from, and whether iron or"
+        " geology is near; a larger ambient_uncertainty_nT of the array has the field estimated"
+    )
+
+
+def _shortest_half(values: FloatArray) -> tuple[float, float]:
+    """Middle and half of the width of the shortest interval that holds half of some values."""
+    ordered = np.sort(values)
+    n = len(ordered) // 2 + 1
+    widths = ordered[n - 1 :] - ordered[: len(ordered) - n + 1]
+    k = int(np.argmin(widths))
+    return float(ordered[k] + ordered[k + n - 1]) / 2.0, float(widths[k]) / 2.0
+
+
 def _of_path(time_s: FloatArray, position_m: FloatArray) -> Iterator[str]:
     known = np.isfinite(time_s) & np.isfinite(position_m).all(axis=1)
     time_s, position_m = time_s[known], position_m[known]
@@ -161,7 +287,7 @@ def _of_attitude(array: SensorArray, readings: Readings, rotation: Rotation) -> 
     else:
         return
     whole = np.flatnonzero(np.isfinite(field_T).all(axis=1) & np.isfinite(rotation.as_quat()).all(axis=1))
-    if len(whole) < _FEWEST_ROWS:
+    if len(whole) < FEWEST_ROWS:
         return
     field_T, rotation = field_T[whole], rotation[whole]
     size = np.linalg.norm(field_T, axis=1)

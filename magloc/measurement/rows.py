@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
@@ -16,6 +16,7 @@ from arrays.whitening import Whitening, whitening, whitenings
 from magloc.measurement.known_moment import KnownMoment
 from magloc.measurement.whitened import WhitenedModel
 from magloc.measurement.whitened_compiled import signals
+from magloc.readings import Readings
 
 NO_SIGNAL = "the sensors' readings do not differ: no signal"
 # Mean square of whitened differences below which they are rounding errors rather than noise.
@@ -178,6 +179,31 @@ def whitened_model(
 @lru_cache(maxsize=16)  # readings that come one by one have one model, and what kernels take of it
 def _model_of_one_row(array: SensorArray, whitening: Whitening) -> WhitenedModel:
     return WhitenedModel.of(array, whitening, array.ambient_fields[None])
+
+
+def joined(parts: Sequence[Readings]) -> Readings:
+    """Readings of several files, one after the other.
+
+    Raises ValueError where some have what others lack.
+    """
+    from scipy.spatial.transform import Rotation
+
+    rotations = [part.array_rotation for part in parts if part.array_rotation is not None]
+    return Readings(
+        np.concatenate([part.values_T for part in parts]),
+        time_s=np.concatenate([part.time_s for part in parts]),
+        array_position_m=_all_or_none([part.array_position_m for part in parts]),
+        array_rotation=Rotation.concatenate(rotations) if rotations else None,
+        ambient_T=_all_or_none([part.ambient_T for part in parts]),
+        pose_sigma=_all_or_none([part.pose_sigma for part in parts]),
+    )
+
+
+def _all_or_none(parts: Sequence[FloatArray | None]) -> FloatArray | None:
+    given = [part for part in parts if part is not None]
+    if given and len(given) < len(parts):
+        raise ValueError("Input readings must have the same columns; instead received some with more than others.")
+    return np.concatenate(given) if given else None
 
 
 def check_spans(array: SensorArray) -> None:

@@ -32,7 +32,7 @@ from magloc.signature.path import ObjectPath, PathError
 from magloc.tracking.consistency import consistency_lines
 from magloc.tracking.measurement import RowMeasurements
 from magloc.tracking.motion import N_SOURCE
-from magloc.tracking.results import TrackPoint, rows_of
+from magloc.tracking.results import TrackPoint, rows_of, warn_of_strengths
 from magloc.tracking.track import TURN_RAD_S, TrackColumns
 from magloc.truth import Truth, truth_of_rows
 
@@ -288,10 +288,9 @@ def _tracks(
     model = moment_model(array, [used], [position_m], basis, path_error, turn_rad_s)
     steps = settled(model, gate=True) if smooth else filtered(model)
     chi2, dof = goodness(model, steps)
-    return tuple(
-        MomentTrack(tuple(_points(model, steps, k, smooth=smooth)), used, model, chi2, dof, smooth)
-        for k in range(n_sources)
-    )
+    found = [tuple(_points(model, steps, k, smooth=smooth)) for k in range(n_sources)]
+    warn_of_strengths(point for points in found for point in points)
+    return tuple(MomentTrack(points, used, model, chi2, dof, smooth) for points in found)
 
 
 def known_rows(readings: Readings, path: ObjectPath | ArrayLike) -> tuple[FloatArray, FloatArray | None, Readings]:

@@ -27,7 +27,7 @@ from arrays.typing import FloatArray
 from magloc.blas_threads import one_blas_thread
 from magloc.fields import dipole
 from magloc.localization.fit.results import is_misfit
-from magloc.measurement.plausibility import usable_readings
+from magloc.measurement.plausibility import usable_readings, warn_of_moments
 from magloc.readings import Readings, as_readings
 from magloc.signature.files import lines_of_signature
 from magloc.signature.moment_filter import Basis, settled
@@ -324,7 +324,7 @@ def fit_signature(
         raise ValueError(f"Input path must be one, or one for each of {len(passes)} passes; instead: {len(paths)}.")
     if len({part.array_position_m is None for part in passes}) > 1:
         raise ValueError("Input readings must all have the array's pose, or none; instead some have it.")
-    used, positions, rotations, fields, rates = [], [], [], [], []
+    used, positions, rotations, fields, rates, distances = [], [], [], [], [], []
     for measured, of_part in zip(passes, paths, strict=True):
         part = usable_readings(array, measured)
         position, rotation, rows = known_rows(part, of_part.along_course())
@@ -333,6 +333,8 @@ def fit_signature(
         field = np.einsum("nij,ni->nj", rotation, _ambient(array, rows, ambient_T, needed=induced != "none" or eddy))
         used.append(rows)
         positions.append(position[:, None])
+        origin = 0.0 if rows.array_position_m is None else rows.array_position_m
+        distances.append(np.linalg.norm(position - origin - array.centroid, axis=1))
         rotations.append(rotation)
         fields.append(field)
         rates.append(np.gradient(field, rows.time_s, axis=0) if len(rows) > 1 else np.zeros_like(field))
@@ -343,6 +345,7 @@ def fit_signature(
     steps = settled(model, gate=False)
     theta, root = steps[-1].x[model.moment], steps[-1].S[model.moment]
     moment_rms = math.sqrt(float(np.mean(np.sum((model.basis.M @ theta) ** 2, axis=1))))
+    warn_of_moments([np.concatenate(distances).min()], [[moment_rms, 0.0, 0.0]])
     open_ = _undetermined(components.names, root, LEAST_KNOWN * moment_rms)
     chi2, dof = goodness(model, steps)
     return Signature(

@@ -20,8 +20,8 @@ from magloc.blas_threads import one_blas_thread
 from magloc.grids.work import Arrays, workers
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.measurement.plausibility import warn_of_doubts
+from magloc.measurement.rows import joined
 from magloc.readings import Readings
-from magloc.surveying.fit.record import joined
 from magloc.surveying.piece import OF_ROWS, Ground, sources_in, strongest_in, targets_in
 from magloc.surveying.preparation import whole_rows
 from magloc.surveying.results import Reach, Survey, SurveyRows, Target

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -16,6 +16,7 @@ from magloc.ambient import in_world_field
 from magloc.localization.fit.results import EVERYWHERE, Intervals, Solution, intervals_of, is_observable_set
 from magloc.localization.uncertainty.ambiguity import LARGEST_GAUSSIAN_SIGMA, relative_sigma
 from magloc.localization.uncertainty.range_interval import gaussian_ranges
+from magloc.measurement.plausibility import warn_of_moments
 from magloc.measurement.pose import ArrayPose, rates_of
 from magloc.readings import Readings, without_saturated
 from magloc.tracking.chart.mixture import Mixture
@@ -268,6 +269,14 @@ def next_row(row: Row | Readings, array: SensorArray, after_s: float) -> Row:
 def on_track(points: Sequence[TrackPoint]) -> Sequence[TrackPoint]:
     """The points, empty where a row alone is answered."""
     return [point if point.is_on_track else TrackPoint(point.time_s, status=point.status) for point in points]
+
+
+def warn_of_strengths(points: Iterable[TrackPoint]) -> None:
+    """Warn of moments that no object has at its distance from the sensors, in most points of a track."""
+    known = [point for point in points if point.is_on_track and point.centroid_m is not None]
+    if known:
+        places, moments, centroids = (stacked(known, name, 3) for name in ("position_m", "moment_Am2", "centroid_m"))
+        warn_of_moments(np.linalg.norm(places - centroids, axis=1), moments)
 
 
 def stacked(points: Sequence[TrackPoint], name: str, *shape: int) -> FloatArray:

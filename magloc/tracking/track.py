@@ -30,7 +30,7 @@ from magloc.tracking.files import dataset_of_track, geojson_of_track, kml_of_tra
 from magloc.tracking.innovations import InnovationTest, innovation_test
 from magloc.tracking.motion import MotionModel, OrnsteinUhlenbeck, RandomWalk, known_motions
 from magloc.tracking.posterior_bound import posterior_bound, smoothing_bound
-from magloc.tracking.results import Row, TrackPoint, rows_of, stacked
+from magloc.tracking.results import Row, TrackPoint, rows_of, stacked, warn_of_strengths
 from magloc.tracking.tracker import Tracker
 from magloc.tracking.whole_records.background import track_on_background
 from magloc.tracking.whole_records.body_errors import body_factor
@@ -308,11 +308,13 @@ def track(
         if used.motion is not None:
             raise ValueError("Input readings must have measured velocities and rates or a background, not both.")
         found = track_on_background(tracker, used, smooth=smooth, progress=progress)
+        warn_of_strengths(found)
         return Track(tuple(found), used, tracker, smooth)
     if used.motion is None:
         points = track_record(tracker, list(rows_of(used)), progress)
     else:
         points = _of_known_motion(tracker, motion, used, used.motion, progress)
+    warn_of_strengths(points)
     return Track(tuple(smoothed(points, tracker.steps) if smooth else points), used, tracker, smooth)
 
 

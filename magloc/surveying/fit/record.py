@@ -12,12 +12,11 @@ then on both sides, and is projected out.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from arrays.array import SensorArray
 from arrays.pose import PoseUncertainty
@@ -272,29 +271,6 @@ class SurveyRecord:
             near = np.linalg.norm(away, axis=-1) < reach
             if near.any():
                 yield near, away[near], np.broadcast_to(moment, away[near].shape)
-
-
-def joined(parts: Sequence[Readings]) -> Readings:
-    """Readings of several files, one after the other.
-
-    Raises ValueError where some have what others lack.
-    """
-    rotations = [part.array_rotation for part in parts if part.array_rotation is not None]
-    return Readings(
-        np.concatenate([part.values_T for part in parts]),
-        time_s=np.concatenate([part.time_s for part in parts]),
-        array_position_m=_all_or_none([part.array_position_m for part in parts]),
-        array_rotation=Rotation.concatenate(rotations) if rotations else None,
-        ambient_T=_all_or_none([part.ambient_T for part in parts]),
-        pose_sigma=_all_or_none([part.pose_sigma for part in parts]),
-    )
-
-
-def _all_or_none(parts: Sequence[FloatArray | None]) -> FloatArray | None:
-    given = [part for part in parts if part is not None]
-    if given and len(given) < len(parts):
-        raise ValueError("Input readings must have the same columns; instead received some with more than others.")
-    return np.concatenate(given) if given else None
 
 
 def shortest_turns(vectors: FloatArray, onto: FloatArray) -> FloatArray:

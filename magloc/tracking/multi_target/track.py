@@ -19,7 +19,7 @@ from magloc.readings import Readings
 from magloc.tracking.multi_target.motion import FreeMotion
 from magloc.tracking.multi_target.results import SourcesPoint, lines_of_sources
 from magloc.tracking.multi_target.tracker import SourcesTracker
-from magloc.tracking.results import TrackPoint, TrackResult, rows_of
+from magloc.tracking.results import TrackPoint, TrackResult, rows_of, warn_of_strengths
 from magloc.tracking.track import TrackColumns
 
 if TYPE_CHECKING:
@@ -187,4 +187,5 @@ def track_sources(
             told(points[-1])
         if progress is not None:
             progress(1)
+    warn_of_strengths(track for point in points for track in point.tracks)
     return SourcesTrack(tuple(points), used)
