@@ -54,8 +54,8 @@ class StarCamera:
             raise ValueError(f"Input rad_per_px must be {low:g} to {high:g} arc seconds; instead received {arcsec:g}.")
         if self.diagonal_rad > WIDEST_RAD:
             raise ValueError(
-                f"An image must be at most {math.degrees(WIDEST_RAD):.0f}° wide from corner to corner; "
-                f"instead received a camera of {math.degrees(self.diagonal_rad):.1f}°."
+                f"Input camera must be at most {math.degrees(WIDEST_RAD):.0f}° wide from corner to corner; "
+                f"instead received one of {math.degrees(self.diagonal_rad):.1f}°."
             )
 
     @property

@@ -10,6 +10,7 @@ import csv
 import datetime
 import difflib
 import io
+import itertools
 import math
 import re
 from array import array as packed
@@ -28,6 +29,8 @@ from arrays.io.text import read_text, write_text
 from arrays.typing import FloatArray, IntArray
 
 _SHOWN_CHARACTERS = 40
+_HEAD_CHARACTERS = 2**16
+_MOST_LINES_ABOVE = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,6 +203,8 @@ def table_of_text(
         line = text.count("\n", 0, text.index("\0")) + 1
         raise InputError(f"{name}, line {line}: found a NUL byte, expected UTF-8 text.")
     rows = _csv_rows(name, text, separator)
+    if head is None:
+        _refuse_preamble(name, text[:_HEAD_CHARACTERS], separator)
     if head is not None:
         header, header_line = head.header, 0
     else:
@@ -266,6 +271,20 @@ def _csv_rows(path: str, text: str, separator: str = ",") -> Iterator[tuple[int,
             line = rows.line_num + 1
     except csv.Error as error:
         raise InputError(f"{path}, line {line}: found what is not CSV ({error}), expected a row of cells.") from None
+
+
+def _refuse_preamble(name: str, head: str, separator: str) -> None:
+    """Raise an InputError for lines of text above the first row of names that has a row of numbers below it."""
+    rows = itertools.islice(_csv_rows(name, head, separator), _MOST_LINES_ABOVE)
+    for k, ((line, names), (_, below)) in enumerate(itertools.pairwise(rows)):
+        numbers = sum(map(_is_number_or_empty, below))
+        if len(names) == len(below) < 2 * numbers and len(names) > 1 and not any(map(_is_number_or_empty, names)):
+            if k:
+                raise InputError(
+                    f"{name}: found {line - 1} line{'s' * (line > 2)} of text before the header on line {line},"
+                    " expected the header first: delete what stands above it."
+                )
+            return
 
 
 def _checked_header(place: str, cells: Sequence[str], expected: str) -> tuple[str, ...]:

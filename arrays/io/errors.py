@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 
     from arrays.typing import FloatArray
 
+PACKAGES = ("arrays", "magloc", "adcs", "sims")
 LARGEST = 1e30
 """Of the numbers in files: more than anything measured, and less than what double precision cannot raise to a power."""
 
@@ -33,6 +34,17 @@ class InputError(ValueError):
     """
 
 
+def own_sentence(error: ValueError) -> str:
+    """Return what the library refuses, without its first word; raise any other error again, no file is to blame for it.
+
+    NumPy and SciPy raise ValueErrors too, whose words say nothing to a user.
+    """
+    text = str(error)
+    if not text.startswith(("Input ", "Inputs ")) and type(error).__module__.partition(".")[0] not in PACKAGES:
+        raise error
+    return text.removeprefix("Input ").removeprefix("Inputs ")
+
+
 @contextmanager
 def naming(place: str) -> Iterator[None]:
     """Turn what the library refuses into bad input at a place of a file or command."""
@@ -41,7 +53,7 @@ def naming(place: str) -> Iterator[None]:
     except InputError:
         raise
     except ValueError as error:
-        raise InputError(f"{place}: {str(error).removeprefix('Input ').removeprefix('Inputs ')}") from None
+        raise InputError(f"{place}: {own_sentence(error)}") from None
 
 
 @contextmanager

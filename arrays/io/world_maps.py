@@ -11,14 +11,31 @@ import numpy as np
 from arrays.io.errors import of_extra
 from arrays.typing import FloatArray, Vector
 
+FARTHEST_M = 1e5
+"""From the origin of a local frame: beyond it neither a plane Earth nor single centimetres of a track hold."""
+
 
 def world_place(position_m: FloatArray, origin: Vector) -> list[float]:
-    """Longitude, latitude [deg] and height [m] of a position (3,); `origin` has latitude, longitude, height."""
+    """Longitude, latitude [deg] and height [m] of a position (3,); `origin` has latitude, longitude, height.
+
+    Raises ValueError for what is no place near the origin, such as coordinates of a grid.
+    """
+    check_near(float(np.linalg.norm(position_m)))
     with of_extra("geo", "a map of the world"):
         from pymap3d import enu2geodetic
 
     latitude, longitude, height = enu2geodetic(*np.asarray(position_m).tolist(), *origin)
     return [float(longitude), float(latitude), float(height)]
+
+
+def check_near(farthest_m: float) -> None:
+    """Refuse places that lie so far from the origin of a local frame."""
+    if not farthest_m <= FARTHEST_M:
+        raise ValueError(
+            f"Input places must lie within {FARTHEST_M / 1e3:.0f} km of the origin of their frame, which is put at one"
+            f" place of the Earth; instead received one {farthest_m / 1e3:.5g} km away. If they are eastings and"
+            " northings of a grid (such as UTM), subtract those of the origin, or give latitude and longitude instead."
+        )
 
 
 def feature(kind: str, coordinates: Sequence[Any], properties: Mapping[str, Any]) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from cyclopts.validators import Number
 
 import magloc
 from arrays.io.arguments import Flag, whole_number
-from arrays.io.errors import InputError, naming
+from arrays.io.errors import InputError, naming, own_sentence
 from arrays.io.outputs import refuse_file
 from arrays.io.text import write_netcdf
 from arrays.typing import Vector
@@ -276,7 +276,7 @@ def _detector(array: SensorArray, false_alarm_rate: float, seed: int) -> Matched
             array, false_alarm_rate, n_draws=round(100 / false_alarm_rate), seed=seed
         )
     except ValueError as error:
-        print_note(f"how far a source is found is left out: {error}")
+        print_note(f"how far a source is found is left out: {own_sentence(error)}")
         return None
 
 

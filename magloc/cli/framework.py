@@ -14,8 +14,9 @@ import logging
 import os
 import shlex
 import sys
+import traceback
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,16 +24,19 @@ from pathlib import Path
 from cyclopts import App, CycloptsError, MissingArgumentError, Parameter, UnknownCommandError
 
 from arrays.io.arguments import Count, Flag, Seed
-from arrays.io.errors import InputError
+from arrays.io.errors import PACKAGES, InputError
 from arrays.io.outputs import make_folder
 from magloc.cli.entry import INTERRUPTED
 
 DONE = 0
+INTERNAL = 1
 BAD_INPUT = 2
 BROKEN_PIPE = 141
 _COMPILATION = "magloc.compilation"
 _LONGEST_WORD = 200
-_PACKAGES = ("arrays", "magloc", "adcs", "sims")
+_LOG = logging.getLogger(__name__)
+_warnings: list[str] = []
+"""What was warned of since a command line began, for its JSON."""
 
 
 @Parameter(name="*", group="Common options")
@@ -54,7 +58,7 @@ class QuietOptions:
     def apply(self) -> None:
         """Limit the threads of compiled code, and what is said."""
         if self.quiet:
-            for name in _PACKAGES:
+            for name in PACKAGES:
                 logging.getLogger(name).setLevel(logging.WARNING)
         if self.threads is not None:
             import numba
@@ -92,8 +96,10 @@ def run(app: App, arguments: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        Exit status: 0 done, 2 bad input, 130 interrupted, 141 the reader of the output is gone.
+        Exit status: 0 done, 1 a fault of the program, 2 bad input, 130 interrupted, 141 the reader of the output is
+        gone.
     """
+    _warnings.clear()
     program = app.name[0]
     tokens = sys.argv[1:] if arguments is None else list(arguments)
     # None where the shell closed it. In this order the first file that is opened does not become one of the others.
@@ -131,7 +137,25 @@ def run(app: App, arguments: Sequence[str] | None = None) -> int:
             _give_up_stdout()
         print_note(f"{error.filename}: {error.strerror}" if error.filename else str(error), program)
         return BAD_INPUT
+    except MemoryError:
+        print_note("found no memory left, expected fewer rows or points, or a coarser grid.", program)
+        return BAD_INPUT
+    except Exception as error:  # no file is to blame, and no trace helps who is not its author
+        print_note(_internal(error), program)
+        _LOG.debug("internal error", exc_info=error)
+        return INTERNAL
     return DONE
+
+
+def _internal(error: Exception) -> str:
+    """Say where in this program an error came up that nobody expected, and ask for a report."""
+    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
+    own = [frame for frame in frames if frame.f_globals.get("__name__", "").partition(".")[0] in PACKAGES]
+    place = f" in {own[-1].f_globals['__name__']}, line {own[-1].f_lineno}" if own else ""
+    return (
+        f"internal error{place} ({type(error).__name__}: {error}). The program is at fault, not the input alone: please"
+        " report this line, with the command and its files if you may."
+    )
 
 
 def _give_up_stdout() -> None:
@@ -176,9 +200,17 @@ def _show_whole_help(app: App, tokens: Sequence[str]) -> None:
 
 @contextmanager
 def _one_line_warnings(program: str) -> Iterator[None]:
-    """Show warnings without the source line that raised them."""
+    """Show own warnings without the source line that raised them, and keep those of other libraries from users."""
+
+    def show(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
+        if category.__module__.partition(".")[0] in PACKAGES:
+            _warnings.append(str(message))
+            print_note(f"warning: {message}", program)
+        else:
+            _LOG.debug("%s: %s", category.__name__, message)
+
     with warnings.catch_warnings():
-        warnings.showwarning = lambda message, *_, **__: print_note(f"warning: {message}", program)
+        warnings.showwarning = show
         yield
 
 
@@ -193,7 +225,10 @@ class _Notes(logging.Handler):
         """Print one record; progress only where somebody watches."""
         if record.name == _COMPILATION and not sys.stderr.isatty():
             return
-        prefix = "warning: " if record.levelno >= logging.WARNING else ""
+        prefix = ""
+        if record.levelno >= logging.WARNING:
+            prefix = "warning: "
+            _warnings.append(record.getMessage())
         print_note(prefix + record.getMessage(), self.program)
 
 
@@ -201,7 +236,7 @@ class _Notes(logging.Handler):
 def _notes_of_the_library(program: str) -> Iterator[None]:
     """Show what the packages log, one line each."""
     handler = _Notes(program)
-    loggers = [logging.getLogger(name) for name in _PACKAGES]
+    loggers = [logging.getLogger(name) for name in PACKAGES]
     for logger in loggers:
         logger.addHandler(handler)
         logger.setLevel(logging.INFO)
@@ -243,7 +278,7 @@ def warm_up(app: App, calls: Sequence[Sequence[str]], common: QuietOptions) -> N
         print_note("compiled: no command has to wait for that again", app.name[0])
 
 
-def _json(value: object) -> str:
+def json_text(value: object) -> str:
     """One JSON value: numbers that are not finite become null, numpy arrays lists."""
     import msgspec
 
@@ -252,21 +287,28 @@ def _json(value: object) -> str:
 
 def print_json(value: object) -> None:
     """Print one JSON value on stdout; numbers that are not finite become null, numpy arrays lists."""
-    print(_json(value))
+    print(json_text(value))
 
 
 def print_json_list(name: str, entries: Iterable[object]) -> None:
     """Print a JSON object with one list whose entries are made one by one: those of a long file are never all there."""
     print(f'{{"{name}":[', end="")
     for i, entry in enumerate(entries):
-        print("," if i else "", _json(entry), sep="", end="")
-    print("]}")
+        print("," if i else "", json_text(entry), sep="", end="")
+    print(f'],"warnings":{json_text(_warnings)}}}')
 
 
-def print_result(result: object, lines: Sequence[str], *, as_json: bool) -> None:
-    """Print a result as one JSON value, or as text."""
+def print_report(report: Mapping[str, object]) -> None:
+    """Print the report of a command as one JSON object, with what was warned of."""
+    own = report.get("warnings", [])
+    assert isinstance(own, list)
+    print_json({**report, "warnings": [*own, *(said for said in _warnings if said not in own)]})
+
+
+def print_result(result: Mapping[str, object], lines: Sequence[str], *, as_json: bool) -> None:
+    """Print a result as one JSON object, or as text."""
     if as_json:
-        print_json(result)
+        print_report(result)
     else:
         print("\n".join(lines))
 

@@ -13,7 +13,7 @@ from cyclopts import Parameter
 
 import magloc
 from arrays.io.arguments import Flag
-from arrays.io.errors import InputError
+from arrays.io.errors import InputError, own_sentence
 from arrays.io.outputs import refuse_file
 from arrays.typing import Vector
 from magloc.cli.framework import CommonOptions, print_json_list, progress
@@ -150,7 +150,7 @@ def locate(
     except InputError as error:
         raise InputError(f"{readings}: {error}") from None
     except ValueError as error:
-        sentence = str(error).removeprefix("Input ")
+        sentence = own_sentence(error)
         option = "" if sentence.startswith("array") else _option_of(sentence, known.region, wanted.sources)
         raise InputError(f"{option or array}: {sentence}{_advice(sentence, used)}") from None
 

@@ -7,7 +7,6 @@ import re
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
-from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
 
@@ -17,7 +16,7 @@ from cyclopts.validators import Number
 import arrays
 import magloc
 from arrays.io.arguments import whole_number
-from arrays.io.errors import LARGEST, InputError
+from arrays.io.errors import LARGEST, InputError, naming
 from arrays.io.outputs import refuse_unwritable
 from arrays.io.text import write_text
 from arrays.typing import Vector
@@ -317,11 +316,24 @@ class MapOptions:
             if path is not None:
                 refuse_unwritable(path, option)
 
+    def refuse_far(self, rows: Readings, name: str) -> None:
+        """Refuse, before long work, an array that is too far from the origin to be placed on the Earth."""
+        from arrays.io.world_maps import check_near
+        from magloc.measurement.plausibility import farthest_place
+
+        if self != MapOptions():
+            with naming(name):
+                check_near(farthest_place(rows))
+
     def write(self, found: OnMaps, place: Vector | None) -> None:
         """Write the files that are asked for."""
         if place is None:
             return
         if self.geojson is not None:
-            write_text(dumps(found.to_geojson(place), allow_nan=False) + "\n", self.geojson)
+            with naming("--geojson"):
+                text = framework.json_text(found.to_geojson(place))
+            write_text(text + "\n", self.geojson)
         if self.kml is not None:
-            write_text(found.to_kml(place), self.kml)
+            with naming("--kml"):
+                text = found.to_kml(place)
+            write_text(text, self.kml)

@@ -14,9 +14,9 @@ from cyclopts import Parameter
 import arrays
 import magloc
 from arrays.io.arguments import Flag
-from arrays.io.errors import InputError
+from arrays.io.errors import InputError, own_sentence
 from arrays.io.outputs import make_folder, refuse_file, refuse_one_for_two, refuse_unwritable
-from magloc.cli.framework import CommonOptions, print_json
+from magloc.cli.framework import CommonOptions, print_report
 from magloc.cli.options import (
     KnownOptions,
     MapOptions,
@@ -119,6 +119,8 @@ def survey(
     parts = [magloc.read_readings(path, used, sensors=known.ids, ordered=True) for path in readings]
     fields = [ambient_field(used, part, where) for part in parts]
     used, rows = fields[0][0], [replace(part, ambient_T=own) for part, (_, own) in zip(parts, fields, strict=True)]
+    for path, part in zip(readings, parts, strict=True):
+        maps.refuse_far(part, str(path))
     at_base = arrays.SensorArray((arrays.Sensor("base", "scalar", (0.0, 0.0, 0.0), 1e-10),))
     station = None if base is None else magloc.read_readings(base, at_base, ordered=True)
     with _naming(", ".join(map(str, readings))), naming_scheduler():
@@ -143,7 +145,7 @@ def survey(
     if json:
         from magloc.surveying.files import json_of_survey
 
-        print_json(json_of_survey(found))
+        print_report(json_of_survey(found))
         return
     print(found.table())
     if found.pose_assumed and not common.quiet:
@@ -161,7 +163,7 @@ def _naming(readings: str) -> Iterator[None]:
     except ValueError as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f"{readings}: {str(error).removeprefix('Input ')}") from None
+        raise InputError(f"{readings}: {own_sentence(error)}") from None
 
 
 def _write(found: Survey, folder: Path) -> None:

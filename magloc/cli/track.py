@@ -15,7 +15,7 @@ from arrays.io.arguments import Flag
 from arrays.io.errors import InputError, naming
 from arrays.io.outputs import refuse_file, refuse_one_for_two
 from arrays.typing import Vector
-from magloc.cli.framework import CommonOptions, print_json, progress
+from magloc.cli.framework import CommonOptions, print_json, print_report, progress
 from magloc.cli.moments.known_path import (
     MomentOutputs,
     PathErrorOptions,
@@ -197,6 +197,7 @@ def track(
     common : CommonOptions
         Common options.
     """
+    from magloc.measurement.plausibility import warn_of_doubts
     from magloc.measurement.pose import with_stated_pose
     from magloc.tracking.results import rows_of
 
@@ -230,6 +231,7 @@ def track(
                 _stream(used, known, model, where)
         return
     rows = magloc.read_readings(readings, used, sensors=known.ids, ordered=True)
+    maps.refuse_far(rows, str(readings))
     rows, used = conditioning.apply(rows, used, readings)
     used, rows = _in_ambient_field(used, rows, where)
     if several is not None:
@@ -260,6 +262,7 @@ def track(
         print_note(_USE_SURVEY)
     with progress(len(rows), "rows", quiet=common.quiet) as advance, naming(str(array)):
         if printed:
+            warn_of_doubts(used, rows)
             tracker = magloc.Tracker(with_stated_pose(used, rows), model, prior=prior)
             found = magloc.Track(tuple(_printed_points(tracker, list(rows_of(rows)), advance)), rows, tracker)
         else:
@@ -303,7 +306,7 @@ def _print_track(found: Track, result: Consistency | None, *, json: bool, jsonl:
     from magloc.tracking.files import json_of_track
 
     if json:
-        print_json(json_of_track(found, result) | {"innovations": found.innovations.json})
+        print_report(json_of_track(found, result) | {"innovations": found.innovations.json})
     elif not jsonl:
         print(found.table())
     elif not printed:

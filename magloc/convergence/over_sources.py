@@ -177,7 +177,7 @@ class SourcesMap(CubeMap):
         super().__post_init__()
         n_differences = whitening(self.scenario.array).n_differences
         if n_differences < N_UNKNOWNS:
-            raise ValueError(f"The array gives {n_differences} independent differences, {N_UNKNOWNS} are needed.")
+            raise ValueError(f"Input array gives {n_differences} independent differences, {N_UNKNOWNS} are needed.")
 
     def __getstate__(self) -> dict[str, Any]:
         return {"scenario": self.scenario, "grid": self.grid}  # the rest is large, and soon made again

@@ -152,7 +152,7 @@ class StartsMap(CubeMap):
         readings, measurement, z = simulated_measurement(scenario)
         fix = locator.fit(readings)
         if not fix.solutions:
-            raise ValueError(f"The scenario's readings have no maximum-likelihood solution: {fix.reason}.")
+            raise ValueError(f"Input scenario has readings with no maximum-likelihood solution: {fix.reason}.")
         return cls(scenario, grid, measurement, z, fix.solutions[0])
 
     @property

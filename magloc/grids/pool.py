@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import warnings
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
@@ -30,4 +31,5 @@ def process_pool(processes: int) -> Iterator[ProcessPoolExecutor]:
 def _prepare() -> None:
     """Settings of a process: one thread, and an interruption is the business of the process that started it."""
     os.environ["NUMBA_NUM_THREADS"] = "1"  # compiled code is not loaded yet
+    warnings.simplefilter("ignore")  # those of NumPy: what a user is told is logged
     signal.signal(signal.SIGINT, signal.SIG_IGN)

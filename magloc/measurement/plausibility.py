@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from arrays.array import SensorArray
+from arrays.io.world_maps import FARTHEST_M
 from arrays.typing import FloatArray
 from magloc.ambient import in_world_field
 from magloc.measurement.rows import ambient_fields
@@ -44,8 +45,6 @@ _WIDEST_ON_THE_MOVE_M = 30.0
 _MAGNET_A_m, _MAGNET_M = 1.1e6, 0.05  # magnetisation of the strongest magnets, and the radius of a large one
 _IRON_A_m = 125.0  # magnetisation of vehicles and ships, over a sphere that reaches the sensors
 _MOMENTS_Am2 = (1e-9, 1e7)  # a grain of magnetite, the largest ships
-FARTHEST_M = 1e5
-"""From the origin of a local frame: beyond it neither a plane Earth nor single centimetres of a track hold."""
 
 
 def usable_readings(array: SensorArray, values: Readings | ArrayLike) -> Readings:

@@ -35,6 +35,18 @@ _MOST_NUMBERS = 2.5e8  # of the columns of the ground: 2 GB
 _MOST_PLACES = 1e6
 
 
+HIGHEST_M = 25.0
+"""Above the ground: from higher up no target of a survey is seen."""
+
+
+def high_above(height_m: float, ground_m: float) -> str:
+    """Say that sensors are so high above the stated ground that their heights are hardly counted from it."""
+    return (
+        f"the sensors are {height_m:.3g} m above the ground, which is stated at a height of {ground_m:g} m: if their"
+        " heights are above the sea, or above an ellipsoid, state the height of the ground there too (ground_m)"
+    )
+
+
 @dataclass(frozen=True)
 class Ground:
     """What is known of the ground, and what is looked for in it.
@@ -119,9 +131,11 @@ class Piece:
         measurements = (self.groups(record, AT_LAST * height)[-1] + 1) * record.array.n_channels
         numbers = max(measurements, len(layer.places_m)) * len(layer.places_m)
         if numbers > _MOST_NUMBERS or x * y / (max(height, 0.3) / PITCH) ** 2 > _MOST_PLACES:
+            cure = "a longer shortest_geology_m needs less" if numbers > _MOST_NUMBERS else ""
+            cure = high_above(height, self.ground.ground_m) if height > HIGHEST_M else cure
             raise ValueError(
                 f"Input readings must be cut into smaller pieces; instead received {len(record)} rows over {x:.3g} m by"
-                f" {y:.3g} m, {height:.2g} m above the ground."
+                f" {y:.3g} m, {height:.2g} m above the ground{cure and f': {cure}'}."
             )
         return model
 

@@ -17,7 +17,7 @@ from magloc.readings import Readings
 from magloc.surveying.clock import Lag, lag_of, rows_around, taken_earlier
 from magloc.surveying.fit.joint_fit import Sources
 from magloc.surveying.fit.record import SurveyRecord
-from magloc.surveying.piece import Ground, Piece
+from magloc.surveying.piece import HIGHEST_M, Ground, Piece, high_above
 from magloc.surveying.pose_components import with_likeliest_pose
 from magloc.surveying.preparation import FEWEST_ROWS, record_of
 from magloc.surveying.rounds import AT_LAST, WHILE_SEARCHING
@@ -88,7 +88,9 @@ class TiledSurvey:
         nearest_m = sample.height_m - float(bounds.high_m[2])
         away_m = sample.middles_m[:, :2] - sample.middles_m[:, :2].mean(axis=0)
         across_m = np.abs(away_m @ np.linalg.svd(away_m, full_matrices=False)[2][-1])
-        if np.quantile(across_m, _NEARLY_ALL) < _NARROW * nearest_m:
+        if nearest_m > HIGHEST_M:
+            _LOG.warning(high_above(nearest_m, ground.ground_m))
+        elif np.quantile(across_m, _NEARLY_ALL) < _NARROW * nearest_m:
             _LOG.warning(
                 "the readings are of one line: on which side of it a target is, and how far, they hardly tell, and of"
                 " several targets they make other ones"

@@ -15,6 +15,7 @@ import viser
 
 from arrays.array import SensorArray
 from arrays.io.closing import Closing
+from arrays.io.errors import own_sentence
 from magloc.localization.fit.fixes import Fixes
 from magloc.readings import Readings
 from magloc.surveying.results import Survey
@@ -261,4 +262,4 @@ def fixes_of(array: SensorArray, rows: Readings, progress: Callable[[int], None]
     try:
         return locate(used, rows, ambient_T=ambient_T, progress=progress)
     except ValueError as error:
-        return Fixes.unsolved(rows.time_s, str(error).removeprefix("Input "))
+        return Fixes.unsolved(rows.time_s, own_sentence(error))

@@ -16,6 +16,7 @@ from magloc.readings import Readings
 
 # Of a gain from the array file: beyond it the modulus is in another unit.
 _LARGEST_CHANGE = 3.0
+_NEARLY_ALL, _OUTLYING = 0.9, 3.0  # a share of the readings, and how far others are beyond these
 
 
 def modulus_of(given: str, readings: Readings) -> float | FloatArray:
@@ -68,7 +69,8 @@ def check(result: TurningCalibration, readings: Path, array: Path, out: Path) ->
     """Refuse readings that do not determine a sensor, and a modulus that is in another unit."""
     for name, fit in result.fits.items():
         if not fit.converged:
-            raise InputError(f"{readings}: sensor {name} cannot be calibrated: {fit.reason}; {out} is not written.")
+            said = f"sensor {name} cannot be calibrated: {fit.reason}{overflow(result.readings_T)}"
+            raise InputError(f"{readings}: {said}; {out} is not written.")
     for before, sensor in zip(result.nominal.sensors, result.array.sensors, strict=True):
         volumes = np.linalg.det([sensor.calibration.scale, before.calibration.scale])
         ratio = float(np.cbrt(volumes[0] / volumes[1]))
@@ -78,6 +80,19 @@ def check(result: TurningCalibration, readings: Path, array: Path, out: Path) ->
                 f" {sensor.id} {ratio:.3g} times those of {array}, expected the modulus in nT, or an array file with"
                 f" its gains; {out} is not written."
             )
+
+
+def overflow(readings_T: FloatArray) -> str:
+    """Say how many readings are far larger than nearly all others; empty where none is."""
+    size = np.abs(readings_T[np.isfinite(readings_T)])
+    most = _OUTLYING * float(np.quantile(size, _NEARLY_ALL, method="lower")) if size.size else np.inf
+    n = int((size > most).sum())
+    if not n:
+        return ""
+    return (
+        f". {n} of {size.size} readings are beyond {1e9 * most:.3g} nT, unlike all others: if they are overflow values"
+        " or dummies of a logger, leave their cells empty or state saturation_nT of the sensors"
+    )
 
 
 def report(result: TurningCalibration, out: Path) -> dict[str, Any]:

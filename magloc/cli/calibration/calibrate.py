@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 # Gains beyond this many standard deviations of the prior are named.
 _STRANGE = 4.0
+_ALIKE = 0.1  # gains that differ by less have one cause
 
 
 @Parameter(name="*", group="What is known of the array")
@@ -154,11 +155,13 @@ def calibrate(
 
 
 def _check_converged(result: SourceCalibration, readings: Path, out: Path) -> None:
+    from magloc.cli.calibration.by_turning import overflow
+
     if not result.converged:
         raise InputError(
             f"{readings}: the calibration did not converge within {result.iterations} iterations "
-            f"(χ² {result.chi2:.4g}), expected readings that the array file, its noise and its priors describe; "
-            f"{out} is not written."
+            f"(χ² {result.chi2:.4g}), expected readings that the array file, its noise and its priors describe"
+            f"{overflow(result.readings_T)}; {out} is not written."
         )
 
 
@@ -302,6 +305,14 @@ def _notes(result: SourceCalibration, n_rows: int, prior: CalibrationPrior) -> l
         notes.append(f"not told by the readings, as in the array file: {names}")
     far = np.max(np.abs(result.change[:, GAINS]), axis=1) > _STRANGE * prior.gain
     strangers = [sensor for sensor, strange in zip(result.array.ids, far.tolist(), strict=True) if strange]
-    if strangers:
+    gains = 1.0 + result.change[:, GAINS]
+    common = float(np.median(gains))
+    if strangers and np.mean(np.abs(gains - common) < _ALIKE * abs(common)) > 0.5 and abs(common - 1.0) > 2.0 * _ALIKE:
+        notes.append(
+            f"warning: the gains of most sensors are about {common:.2g} times those of the array file, as they are"
+            f" where the moments in the truth file or the unit of the readings are wrong by {common:.2g}; sensors that"
+            " are wrong differ from each other"
+        )
+    elif strangers:
         notes.append(f"warning: gains far beyond --gain-prior, a dead or wrong sensor: {', '.join(strangers)}")
     return notes

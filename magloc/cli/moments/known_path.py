@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from cyclopts import Parameter
 
 from arrays.io.errors import LARGEST, InputError
-from magloc.cli.framework import print_json
+from magloc.cli.framework import print_json, print_report
 from magloc.cli.options import KnownOptions, MapOptions, print_note
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ def write_moment_track(found: MomentTrack, readings: Path, known: KnownOptions, 
         write_picture(found, None, outputs.out, array_m=found.readings.array_position_m)
     if outputs.json:
         report = json_of_track(found, None) | {"chi2": found.chi2, "dof": found.dof, "misfit": found.misfit}
-        print_json(report if result is None else report | {"consistency": asdict(result)})
+        print_report(report if result is None else report | {"consistency": asdict(result)})
     elif outputs.jsonl:
         for point in found:
             print_json(json_entry(point))
@@ -119,7 +119,7 @@ def write_moment_tracks(found: Sequence[MomentTrack], readings: Path, outputs: M
     entries = [_entry_of_several(points) for points in zip(*found, strict=True)]
     first = found[0]
     if outputs.json:
-        print_json({"results": entries, "chi2": first.chi2, "dof": first.dof, "misfit": first.misfit})
+        print_report({"results": entries, "chi2": first.chi2, "dof": first.dof, "misfit": first.misfit})
     elif outputs.jsonl:
         for entry in entries:
             print_json(entry)

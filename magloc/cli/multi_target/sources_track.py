@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Literal
 from cyclopts import Parameter
 
 import magloc
-from arrays.io.errors import InputError, naming
+from arrays.io.errors import InputError, naming, own_sentence
 from magloc.cli.framework import print_json, print_json_list, progress
 from magloc.cli.options import MotionOptions, number_of_sources, print_note, refuse_not_positive
 
@@ -58,7 +58,7 @@ class SourcesWanted:
         try:
             yield
         except ValueError as error:
-            sentence = str(error).removeprefix("Input ")
+            sentence = own_sentence(error)
             if not sentence.startswith("sources"):
                 raise
             raise InputError(f"--sources {self.sources}: {sentence}") from None

@@ -10,6 +10,7 @@ from scipy.special import chndtr
 
 from arrays.array import SensorArray
 from arrays.differences import Differences, decorrelated_differences
+from arrays.io.errors import own_sentence
 from arrays.noise import reading_covariance, reading_errors
 from arrays.typing import FloatArray
 from magloc.bounds.crlb import cramer_rao_bounds
@@ -69,7 +70,7 @@ class LiveFit:
         try:
             self._locator = Locator(array, exclude_faulty=False)
         except ValueError as error:
-            self._reason = str(error).removeprefix("Input ").rstrip(".")
+            self._reason = own_sentence(error).rstrip(".")
 
     def forecast(self, position_m: ArrayLike, moment_Am2: ArrayLike) -> Forecast:
         """Readings of a dipole, NaN of a sensor that it stands on, and their Cramér-Rao bound."""
