@@ -15,6 +15,7 @@ from adcs.satellite.magnetometer_calibration import NAMES, Attitude, Magnetomete
 from arrays.io.arguments import Flag
 from arrays.io.errors import naming
 from arrays.io.outputs import refuse_unwritable
+from arrays.io.tables import by_sigma
 from magloc.cli.framework import QuietOptions, print_result
 
 _UNITS = {"bias": (1e9, "nT"), "gain": (100.0, "percent"), "time": (1.0, "s")}
@@ -124,7 +125,8 @@ def lines(result: MagnetometerCalibration, attitude: Attitude) -> list[str]:
     sigma = result.sigma
 
     def row(values: Any, deviations: Any, scale: float) -> str:
-        return ", ".join(f"{scale * v:.4g} (1σ {scale * s:.2g})" for v, s in zip(values, deviations, strict=True))
+        pairs = (by_sigma(scale * float(v), scale * float(s)) for v, s in zip(values, deviations, strict=True))
+        return ", ".join(f"{v} (1σ {s})" for v, s in pairs)
 
     return [
         f"{result.used.sum()} of {len(result.used)} rows; rms of the {what}: "

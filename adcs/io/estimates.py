@@ -10,6 +10,7 @@ import numpy as np
 from adcs.kalman.results import SHOWN
 from adcs.satellite.attitude_track import AttitudeTrack
 from adcs.satellite.sensors import NIS_SIZES
+from arrays.io.tables import by_sigma
 
 _NAMES = {"st": "star", "gyro": "gyro", "mag": "field", "sun": "sun"}
 """What files call a sensor's innovations."""
@@ -56,8 +57,9 @@ def summary_lines(track: AttitudeTrack) -> list[str]:
             continue
         sigma = max(float(columns[f"sigma_{name}"][-1]) for name in names)
         if state in track.states:
-            values = ", ".join(f"{columns[name][-1]:.3g}" for name in names)
-            lines.append(f"{shown.words:27s}{values} {shown.unit} (1σ {sigma:.2g})")
+            cells = [by_sigma(float(columns[name][-1]), sigma) for name in names]
+            values = ", ".join(value for value, _ in cells)
+            lines.append(f"{shown.words:27s}{values} {shown.unit} (1σ {cells[0][1]})")
         else:
             lines.append(f"{shown.words + ', 1σ':27s}{sigma:.2g} {shown.unit}")
     if track.tuned_disturbance_s2 is not None:
@@ -76,4 +78,4 @@ def summary_lines(track: AttitudeTrack) -> list[str]:
 def unseen_line(torque_Nm: Mapping[float, float]) -> list[str]:
     """A line with the amplitude, by period, below which a torque does not show in the readings; none of nothing."""
     each = ", ".join(f"{torque:.2g} N·m ({period:g} s)" for period, torque in torque_Nm.items())
-    return [f"{'torques that do not show (period)':34s}{each}"] if each else []
+    return [f"{'largest torque unseen (its period)':34s}{each}"] if each else []

@@ -109,7 +109,7 @@ def locate(
         Common options.
     """
     from magloc.localization.files import entries_of_fixes
-    from magloc.localization.fit.table import lines_of_fixes
+    from magloc.localization.fit.table import legend, lines_of_fixes
     from magloc.localization.locator import used_rows
     from magloc.truth import truth_of_rows
 
@@ -157,7 +157,8 @@ def locate(
     if json:
         print_json_list("results", entries_of_fixes(fixes, joint=joint))
     else:
-        print("\n".join(lines_of_fixes(fixes, joint=joint)))
+        lines = lines_of_fixes(fixes, joint=joint)
+        print("\n".join(lines))
     reasons = counted_reasons(reason for reason, solved in zip(fixes.reason, fixes.solved, strict=True) if not solved)
     n_solved = int(fixes.solved.sum())
     if not n_solved:
@@ -170,7 +171,7 @@ def locate(
         return
     if not json:
         print_note(f"{n_solved} of {len(fixes)} rows solved" + (f"; not solved: {reasons}" if reasons else ""))
-    for note in _notes(fixes, assumed=length_m is None):
+    for note in [*_notes(fixes, assumed=length_m is None), *([] if json else legend(lines))]:
         print_note(note)
 
 

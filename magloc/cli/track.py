@@ -197,6 +197,7 @@ def track(
     common : CommonOptions
         Common options.
     """
+    from magloc.localization.fit.table import legend
     from magloc.measurement.plausibility import warn_of_doubts
     from magloc.measurement.pose import with_stated_pose
     from magloc.tracking.results import rows_of
@@ -288,6 +289,8 @@ def track(
         print_consistency(result.lines(), jsonl=jsonl)
     if not (json or jsonl or common.quiet):
         print_note(f"{found.tracked.sum()} of {len(found)} rows tracked")
+        for note in legend([found.table()]):
+            print_note(note)
     dropped = sorted({name for names in found.dropped_sensors for name in names})
     if dropped and not common.quiet:
         print_note(f"sensors left out of some rows: {', '.join(dropped)}")

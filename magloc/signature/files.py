@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from arrays.io.tables import aligned, by_sigma
 from arrays.typing import FloatArray
 
 if TYPE_CHECKING:
@@ -21,12 +22,10 @@ _POINTS = 61
 def lines_of_signature(signature: Signature) -> list[str]:
     """Parameters with their σ, what is not determined, and how well all of it fits."""
     determined = signature.determined
-    cells = [["part", "A·m²", "σ"]]
+    cells = [["part", "A·m²", "σ", ""]]
     for name, value, sigma in zip(signature.names, determined, signature.sigma_Am2, strict=True):
-        known = np.isfinite(value)
-        cells.append([name, f"{value:.1f}" if known else "-", f"{sigma:.2g}" if known else "-"])
-    widths = [max(len(row[i]) for row in cells) for i in range(3)]
-    lines = [f"{a.ljust(widths[0])}  {b.rjust(widths[1])}  {c.rjust(widths[2])}" for a, b, c in cells]
+        cells.append([name, *(by_sigma(value, sigma) if np.isfinite(value) else "--"), ""])
+    lines = aligned(cells, left=1)
     if signature.components.induced != "none":
         lines.append(f"induced at {1e9 * signature.components.ambient_T:.0f} nT")
     if signature.components.eddy:
@@ -48,7 +47,7 @@ def along_keel(signature: Signature, depth_m: float) -> tuple[FloatArray, FloatA
 
 def lines_of_depths(signature: Signature, depths_m: Sequence[float]) -> list[str]:
     """The largest field below the object at some depths, on four headings."""
-    lines = ["depth_m  heading  largest_nT     σ_nT  forward_m"] if depths_m else []
+    rows = [["depth_m", "heading", "largest_nT", "σ_nT", "forward_m", ""]]
     for depth in depths_m:
         x, field, covariance = along_keel(signature, depth)
         for heading, of_field, of_covariance in zip(HEADINGS, field, covariance, strict=True):
@@ -56,8 +55,9 @@ def lines_of_depths(signature: Signature, depths_m: Sequence[float]) -> list[str
             k = int(np.argmax(modulus))
             direction = of_field[k] / modulus[k]
             sigma = float(_sigma(direction @ of_covariance[k] @ direction))
-            lines.append(f"{depth:7g}  {heading:>7}  {1e9 * modulus[k]:10.1f}  {1e9 * sigma:7.2g}  {x[k]:9.1f}")
-    return lines
+            of_field_nT = by_sigma(1e9 * float(modulus[k]), 1e9 * sigma)
+            rows.append([f"{depth:g}", heading, *of_field_nT, f"{x[k]:.1f}", ""])
+    return aligned(rows) if depths_m else []
 
 
 def json_of_signature(signature: Signature, depths_m: Sequence[float]) -> dict[str, object]:

@@ -13,7 +13,9 @@ from scipy.special import chdtri
 
 from arrays.array import SensorArray
 from arrays.io.lazy import by_name
+from arrays.io.tables import aligned, by_sigma
 from arrays.typing import FloatArray, Vector
+from magloc.localization.fit.table import cells_of_strength
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -208,12 +210,20 @@ class Survey:
 
     def table(self) -> str:
         """The targets as text."""
-        head = f"{'id':>4} {'x':>9} {'y':>9} {'depth':>7} {'95 %':>13} {'|m|':>9} {'± xy':>7} {'χ²':>9}  flags"
-        unit = f"{'':>4} {'m':>9} {'m':>9} {'m':>7} {'m':>13} {'A·m²':>9} {'cm':>7} {'':>9}"
-        lines = [head, unit]
+        rows = [
+            ["id", "x", "y", "depth", "95 %", "|m|", "± xy", "χ²", "flags"],
+            ["", "m", "m", "m", "m", "A·m²", "cm", "", ""],
+        ]
         for t in self:
-            low, high = t.depth_interval95_m
-            where = f"{t.position_m[0]:9.2f} {t.position_m[1]:9.2f} {t.depth_m:7.2f} {f'{low:.2f}–{high:.2f}':>13}"
-            size = f"{t.strength_Am2:9.3g} {100.0 * t.ellipse95[0]:7.1f} {t.significance:9.4g}"
-            lines.append(f"{t.id:>4} {where} {size}  {', '.join(t.flags)}")
-        return "\n".join(line.rstrip() for line in lines)
+            sigma = np.sqrt(np.diagonal(t.covariance)).tolist()
+            x, y, depth, *interval = (
+                by_sigma(float(value), s)[0]
+                for value, s in zip(
+                    [*t.position_m[:2], t.depth_m, *t.depth_interval95_m], [*sigma[:2], *sigma[2:3] * 3], strict=True
+                )
+            )
+            strength, _ = cells_of_strength(t.moment_Am2, t.covariance[3:, 3:])
+            across = f"{100.0 * t.ellipse95[0]:.2g}"
+            size = [strength, across, f"{t.significance:.4g}"]
+            rows.append([t.id, x, y, depth, "–".join(interval), *size, ", ".join(t.flags)])
+        return "\n".join(aligned(rows))

@@ -14,11 +14,12 @@ from scipy.special import chdtri
 
 from arrays.io.closing import garbage_waits
 from arrays.io.errors import LARGEST, InputError
+from arrays.io.tables import aligned, by_sigma
 from arrays.io.text import read_text
 from arrays.io.world_maps import feature, feature_collection, kml, placemark, world_place
 from arrays.typing import FloatArray, Vector
 from magloc.levels import FALSE_ALARM
-from magloc.localization.fit.table import cells_of_strength
+from magloc.localization.fit.table import cells_of_strength, cells_of_vector
 from magloc.tracking.results import TrackPoint, TrackResult, on_track, stacked
 
 if TYPE_CHECKING:
@@ -64,22 +65,17 @@ def lines_of_track(points: Sequence[TrackPoint], *, most: int | None = None) -> 
         if point.position_m is None or point.moment_Am2 is None or point.covariance is None:
             rows.append([f"{point.time_s:.10g}", *["-"] * 9, point.status])
             continue
-        deviations = np.sqrt(np.diagonal(point.covariance)[:3])
         unsure = "" if point.range_observable or point.centroid_m is None else ", range?"
         rows.append(
             [
                 f"{point.time_s:.10g}",
-                *(f"{value:.3f}" for value in point.position_m),
-                *(f"{value:.2g}" for value in deviations),
+                *cells_of_vector(point.position_m, np.sqrt(np.diagonal(point.covariance)[:3])),
                 *cells_of_strength(point.moment_Am2, point.covariance[3:, 3:]),
                 f"{point.nis:.1f}/{point.nis_dof}" if np.isfinite(point.nis) else "-",
                 "".join((point.status, *(f", without {name}" for name in point.dropped_sensors), unsure)),
             ]
         )
-    widths = [max(len(row[i]) for row in rows) for i in range(len(header) - 1)]
-    lines = [
-        "  ".join([*(cell.rjust(width) for cell, width in zip(row, widths, strict=False)), row[-1]]) for row in rows
-    ]
+    lines = aligned(rows)
     if len(shown) < len(points):
         lines.insert(1 + len(shown) // 2, f"… {len(points)} rows")
     return lines
@@ -188,8 +184,9 @@ def _feature(point: TrackPoint, origin: Vector) -> dict[str, Any]:
 def _placemark(name: str, point: TrackPoint, origin: Vector) -> str:
     """A row with a source as a point, with what is known of it in a sentence."""
     position, moment, sigma = _known(point)
+    depth = " ± ".join(by_sigma(-float(position[2]), float(sigma[2])))
     words = (
-        f"{-position[2]:.2f} ± {sigma[2]:.2g} m below the origin, ± {np.hypot(*sigma[:2]):.2g} m on the map (1 σ), "
+        f"{depth} m below the origin, ± {np.hypot(*sigma[:2]):.2g} m on the map (1 σ), "
         f"{np.linalg.norm(moment):.3g} A·m² at {point.time_s:.6g} s."
     )
     return placemark(name, words, [world_place(position, origin)])

@@ -84,20 +84,18 @@ class InnovationTest:
                 " times, the speed and the rate of turn the source may be anywhere after a step (are times in seconds?)"
             )
         if self.z_constants > THRESHOLD:
-            what = f"the rows agree on another mounting or lever arm than the exact one (z = {self.z_constants:.1f})"
+            z, what = self.z_constants, "the rows agree on another mounting or lever arm than the exact one"
             why = "position_constant_m and attitude_constant_deg of the pose are stated too small"
         elif self.z_ambient > THRESHOLD:
-            what = f"the rows agree on another ambient field than the exact one (z = {self.z_ambient:.1f})"
+            z, what = self.z_ambient, "the rows agree on another ambient field than the exact one"
             why = "ambient_uncertainty_nT is stated too small"
         elif self.z_lag1 > THRESHOLD:
-            what = f"innovations of successive rows are alike (z = {self.z_lag1:.1f})"
-            why = (
-                "errors that last, of the pose or of sensors, a motion that is not the stated one, or filtered readings"
-            )
+            z, what = self.z_lag1, "differences between readings and predictions are alike in successive rows"
+            why = "the motion differs from the motion model, errors of pose or sensors last, or readings were filtered"
         else:
-            what = f"innovations are larger than is stated (z = {self.z_chi2:.1f})"
-            why = "errors of the pose, noise or a motion that are not stated"
-        return f"{what}: {why}; the standard deviations are too small"
+            z, what = self.z_chi2, "differences between readings and predictions are larger than is stated"
+            why = "the motion differs from the motion model, or noise and errors of the pose are larger"
+        return f"{what}: {why} ({z:.1f} standard deviations from a right model, {THRESHOLD} are allowed)"
 
     @property
     def caution(self) -> str:

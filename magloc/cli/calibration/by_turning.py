@@ -9,6 +9,7 @@ import numpy as np
 
 from arrays.io.csv import read_table
 from arrays.io.errors import InputError
+from arrays.io.tables import by_sigma
 from arrays.typing import FloatArray
 from magloc.calibration.modulus import EllipsoidCalibration
 from magloc.calibration.results import TurningCalibration
@@ -129,9 +130,14 @@ def _entry(name: str, result: EllipsoidCalibration) -> dict[str, Any]:
 
 def _line(name: str, result: EllipsoidCalibration) -> str:
     offset_sd, scale_sd = _deviations(result)
-    gains = " ".join(f"{value:.6f}" for value in np.diagonal(result.scale))
-    offsets = " ".join(f"{1e9 * value:.1f}" for value in result.offset_T)
-    return (
-        f"{name}: gains {gains} (s {scale_sd.max():.1g}), offset {offsets} nT (s {1e9 * offset_sd.max():.2g}),"
-        f" chi2 {result.chi2:.1f}/{result.dof}"
-    )
+    gains, gain_sd = values_by_sigma(np.diagonal(result.scale), scale_sd)
+    offsets, offset_nT = values_by_sigma(1e9 * result.offset_T, 1e9 * offset_sd)
+    goodness = f"chi2 {result.chi2:.1f}/{result.dof}"
+    return f"{name}: gains {gains} (s {gain_sd}), offset {offsets} nT (s {offset_nT}), {goodness}"
+
+
+def values_by_sigma(values: FloatArray, sigma: FloatArray) -> tuple[str, str]:
+    """Some values and the largest of their standard deviations, by whose digits they are rounded."""
+    largest = float(np.max(sigma))
+    cells = [by_sigma(value, largest) for value in values.tolist()]
+    return " ".join(value for value, _ in cells), cells[0][1]

@@ -14,6 +14,7 @@ import magloc
 from arrays.io.arguments import Flag
 from arrays.io.errors import InputError, naming
 from arrays.io.outputs import make_folder, refuse_file, refuse_unwritable
+from arrays.io.tables import aligned
 from magloc.cli.framework import CommonOptions, print_result
 from magloc.cli.options import array_of_several, print_note, refuse_not_positive
 
@@ -269,25 +270,20 @@ def _table(result: SourceCalibration) -> list[str]:
     import numpy as np
 
     from magloc.calibration.model import AXES, GAINS, OFFSET, POSITION
+    from magloc.cli.calibration import by_turning as turning
 
-    width = max(len("sensor"), *map(len, result.array.ids))
-    lines = [
-        f"{'sensor':<{width}}  {'position mm':>23} {'s':>6}  {'gain %':>20} {'s':>5}  {'axes °':>6} {'s':>5}"
-        f"  {'offset µT':>26} {'s':>7}  {'rms nT':>10}"
-    ]
+    rows = [["sensor", "position mm", "s", "gain %", "s", "axes °", "s", "offset µT", "s", "rms nT", ""]]
     for sensor, change, sd, rms in zip(
         result.array.ids, result.change, result.sigma, result.residual_rms_T, strict=True
     ):
-        position = " ".join(f"{1e3 * value:7.3f}" for value in change[POSITION])
-        gains = " ".join(f"{100 * value:6.2f}" for value in change[GAINS])
-        offset = " ".join(f"{1e6 * value:8.3f}" for value in change[OFFSET])
-        lines.append(
-            f"{sensor:<{width}}  {position:>23} {1e3 * sd[POSITION].max():6.3f}"
-            f"  {gains:>20} {100 * sd[GAINS].max():5.2f}"
-            f"  {np.degrees(np.abs(change[AXES]).max()):6.2f} {np.degrees(sd[AXES].max()):5.2f}"
-            f"  {offset:>26} {1e6 * sd[OFFSET].max():7.3f}  {1e9 * rms:10.1f}"
-        )
-    return lines
+        cells = [
+            *turning.values_by_sigma(1e3 * change[POSITION], 1e3 * sd[POSITION]),
+            *turning.values_by_sigma(100.0 * change[GAINS], 100.0 * sd[GAINS]),
+            *turning.values_by_sigma(np.degrees(np.abs(change[AXES]).max(keepdims=True)), np.degrees(sd[AXES])),
+            *turning.values_by_sigma(1e6 * change[OFFSET], 1e6 * sd[OFFSET]),
+        ]
+        rows.append([sensor, *cells, f"{1e9 * rms:.1f}", ""])
+    return aligned(rows, left=1)
 
 
 def _notes(result: SourceCalibration, n_rows: int, prior: CalibrationPrior) -> list[str]:

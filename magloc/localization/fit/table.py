@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from arrays.io.tables import by_sigma
 from arrays.typing import FloatArray
 from magloc.localization.fit.results import intervals_of, is_observable_set
 
@@ -15,6 +17,12 @@ if TYPE_CHECKING:
 
 _WIDTH = 100
 _MILLIMETRES_BELOW_M = 1.0
+_MEANINGS = {
+    r"\bbent\b": "bent: errors are not Gaussian, trust range95 rather than s",
+    r"\brange\?": "range?: the readings do not tell the distance, s is widened to hold all of its 95 % set",
+    r"\+\d+\(\d+%\)": "+1(95%): one other solution fits almost as well, the best one has 95 % of the probability",
+    r"\bmerged\b": "merged: two sources that the array does not tell apart",
+}
 
 
 def lines_of_fixes(fixes: Fixes, *, joint: bool | None = None, most: int | None = None) -> list[str]:
@@ -32,7 +40,7 @@ def lines_of_fixes(fixes: Fixes, *, joint: bool | None = None, most: int | None 
     distances = np.linalg.norm(solved.position_m, axis=-1)
     distances = distances[np.isfinite(distances)]
     in_mm = bool(distances.size) and float(np.median(distances)) < _MILLIMETRES_BELOW_M
-    unit, per_m, decimals = ("mm", 1e3, 2) if in_mm else ("m", 1.0, 3)
+    unit, per_m = ("mm", 1e3) if in_mm else ("m", 1.0)
 
     lengths = [f"{name}_{unit}" for name in ("x", "y", "z", "s_x", "s_y", "s_z", "range95")]
     header = [
@@ -46,7 +54,7 @@ def lines_of_fixes(fixes: Fixes, *, joint: bool | None = None, most: int | None 
         "flags",
     ]
     rows, reasons, middle = [header], [""], 0
-    for place, (i, cells) in enumerate(zip(shown, _cells_of_rows(fixes, shown, per_m, decimals), strict=True)):
+    for place, (i, cells) in enumerate(zip(shown, _cells_of_rows(fixes, shown, per_m), strict=True)):
         middle = len(rows) if place == len(shown) // 2 else middle
         time = f"{fixes.time_s[i]:.10g}"
         if not cells:
@@ -68,7 +76,7 @@ def lines_of_fixes(fixes: Fixes, *, joint: bool | None = None, most: int | None 
     return lines
 
 
-def _cells_of_rows(fixes: Fixes, shown: list[int], per_m: float, decimals: int) -> Iterator[list[list[str]]]:
+def _cells_of_rows(fixes: Fixes, shown: list[int], per_m: float) -> Iterator[list[list[str]]]:
     """Cells of the sources of the best solution of some rows."""
     solved = [i for i in shown if fixes.solved[i]]
     best = fixes.solutions.chosen(fixes.best[solved])
@@ -97,9 +105,8 @@ def _cells_of_rows(fixes: Fixes, shown: list[int], per_m: float, decimals: int) 
             flags = [*uncertain, *of_row, *(["merged"] if best.merged[j, k] else []), *behind]
             cells.append(
                 [
-                    *(f"{value * per_m:.{decimals}f}" for value in best.position_m[j, k].tolist()),
-                    *(_two_digits(value * per_m) for value in of_position[j, k].tolist()),
-                    *_cells_of_strength(float(strengths[j, k]), float(spreads[j, k])),
+                    *cells_of_vector(per_m * best.position_m[j, k], per_m * of_position[j, k]),
+                    *by_sigma(float(strengths[j, k]), float(spreads[j, k])),
                     f"{best.chi2[j]:.1f}/{best.dof[j]}",
                     _intervals(intervals, per_m),
                     ",".join(flags),
@@ -108,9 +115,22 @@ def _cells_of_rows(fixes: Fixes, shown: list[int], per_m: float, decimals: int) 
         yield cells
 
 
+def legend(lines: Iterable[str]) -> list[str]:
+    """Explain the flags in the lines of a table that no other note explains."""
+    text = "\n".join(lines)
+    return [meaning for flag, meaning in _MEANINGS.items() if re.search(flag, text)]
+
+
 def cells_of_strength(moment_Am2: FloatArray, covariance: FloatArray) -> tuple[str, str]:
     """Modulus of a moment, and its standard deviation by the covariance (3, 3) of the moment."""
-    return _cells_of_strength(*map(float, _strengths(moment_Am2, covariance)))
+    strength, sigma = _strengths(moment_Am2, covariance)
+    return by_sigma(float(strength), float(sigma))
+
+
+def cells_of_vector(values: FloatArray, sigma: FloatArray) -> list[str]:
+    """Components (n,), and then their standard deviations (n,), by whose digits they are rounded."""
+    pairs = [by_sigma(*pair) for pair in zip(values.tolist(), sigma.tolist(), strict=True)]
+    return [cell for cells in zip(*pairs, strict=True) for cell in cells]
 
 
 def _strengths(moment_Am2: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -123,21 +143,11 @@ def _strengths(moment_Am2: FloatArray, covariance: FloatArray) -> tuple[FloatArr
     return np.where(has_direction, strength, 0.0), np.where(has_direction, sigma, spread)
 
 
-def _cells_of_strength(strength: float, sigma: float) -> tuple[str, str]:
-    return f"{strength:.4g}", _two_digits(sigma)
-
-
 def _of_uncertainty(observable: bool, described: bool) -> list[str]:
     """What has to be said of the standard deviations: described is a misfit, too, of which that alone is said."""
     if not observable:
         return ["range?"]
     return [] if described else ["bent"]
-
-
-def _two_digits(value: float) -> str:
-    """Two significant digits, without an exponent where that is short."""
-    text = f"{value:.1e}"
-    return f"{float(text):g}" if value == 0.0 or 1e-3 <= value < 1e5 else text
 
 
 def _intervals(intervals: Sequence[tuple[float, float | None]], per_m: float) -> str:

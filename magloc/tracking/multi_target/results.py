@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from arrays.io.tables import aligned
 from arrays.typing import FloatArray
-from magloc.localization.fit.table import cells_of_strength
+from magloc.localization.fit.table import cells_of_strength, cells_of_vector
 from magloc.tracking.files import json_entry
 from magloc.tracking.results import TrackPoint
 
@@ -80,16 +81,12 @@ def lines_of_sources(points: Sequence[SourcesPoint], *, most: int | None = None)
                 [
                     f"{point.time_s:.10g}",
                     str(track.id),
-                    *(f"{value:.4f}" for value in track.position_m),
-                    *(f"{value:.2g}" for value in np.sqrt(np.diagonal(track.covariance)[:3])),
+                    *cells_of_vector(track.position_m, np.sqrt(np.diagonal(track.covariance)[:3])),
                     *cells_of_strength(track.moment_Am2, track.covariance[3:6, 3:6]),
                     ", ".join([point.status, *(["merged"] if track.merged else [])]) + faults,
                 ]
             )
-    widths = [max(len(row[i]) for row in rows) for i in range(len(_HEADER) - 1)]
-    return [
-        "  ".join([*(cell.rjust(width) for cell, width in zip(row, widths, strict=False)), row[-1]]) for row in rows
-    ]
+    return aligned(rows)
 
 
 def json_of_sources(point: SourcesPoint, *, single: bool) -> dict[str, object]:

@@ -163,7 +163,7 @@ class TestJsonLists:
         print_json_list("results", iter(entries))
         assert (
             capsys.readouterr().out
-            == json.dumps({"results": entries}, separators=(",", ":"), ensure_ascii=False) + "\n"
+            == json.dumps({"results": entries, "warnings": []}, separators=(",", ":"), ensure_ascii=False) + "\n"
         )
 
 
