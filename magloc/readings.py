@@ -306,7 +306,7 @@ def readings_of_table(table: Table, array: SensorArray, sensors: Sequence[str] |
 def readings_of_checked(table: Table, array: SensorArray) -> Readings:
     """Readings of a table whose header is that of the array, as :func:`readings_of_table` has found."""
     channels = [f"{name}_nT" for name in array.channel_names]
-    time_s = table.complete_and_distinct("time_s")
+    time_s = table.times()
     position_m = rotation = ambient_T = pose_sigma = None
     if table.has_group(POSITION_COLUMNS + ROTATION_COLUMNS):
         position_m, rotation = table.complete(POSITION_COLUMNS), unit_rotation(table, ROTATION_COLUMNS)

@@ -131,12 +131,16 @@ def read_imu(path: str | PathLike[str], layout: str | PathLike[str] | None = Non
     >>> len(log.record)
     1500
     """
-    if Path(path).suffix.lower() == ".mat":
-        if layout is not None:
-            raise InputError(f"{path}: found a MAT file with a layout, expected a CSV file, or none.")
-        return _broad_log(path)
-    table = None if layout is None else section_of(str(layout), read_toml(layout, "a layout of a log"), ImuFile).log
-    return _csv_log(path, table)
+    return imu_log(path, None if layout is None else (str(layout), read_toml(layout, "a layout of a log")))
+
+
+def imu_log(path: str | PathLike[str], layout: tuple[str, dict[str, Any]] | None) -> ImuLog:
+    """Return the log of :func:`read_imu` with the path and the table of a layout that was read before."""
+    if Path(path).suffix.lower() != ".mat":
+        return _csv_log(path, None if layout is None else section_of(*layout, ImuFile).log)
+    if layout is not None:
+        raise InputError(f"{path}: found a MAT file with a layout, expected a CSV file, or none.")
+    return _broad_log(path)
 
 
 def _csv_log(path: str | PathLike[str], named: ImuTable | None) -> ImuLog:

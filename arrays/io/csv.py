@@ -27,7 +27,10 @@ from arrays.io.errors import LARGEST, InputError
 from arrays.io.text import read_text, write_text
 from arrays.typing import FloatArray, IntArray
 
+LATEST_S = 1e11
+"""Latest time of a row, and earliest below zero: of microseconds since 1970 a row would be beyond it."""
 _SHOWN_CHARACTERS = 40
+_SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs", " ": "blanks"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,6 +128,18 @@ class Table:
             )
         return values
 
+    def refuse_late(self, column: str, time_s: FloatArray) -> None:
+        """Raise an InputError for the first time (n,) [s] that no clock shows."""
+        late = np.abs(time_s) > LATEST_S
+        found = f"found the time {time_s[np.argmax(late)]:.6g} s" if late.any() else ""
+        self.refuse(late[:, None], [column], f"{found}, beyond 3,000 years, expected seconds")
+
+    def times(self, column: str = "time_s") -> FloatArray:
+        """Return the times (n,) [s] of a column; a missing or repeated one, or one that no clock shows, is refused."""
+        time_s = self.complete_and_distinct(column)
+        self.refuse_late(column, time_s)
+        return time_s
+
     def _refuse_larger(self, values: FloatArray, columns: Sequence[str], largest: float) -> None:
         self.refuse(np.abs(values) > largest, columns, f"found a number above {largest:g}, expected a smaller one")
 
@@ -206,7 +221,7 @@ def table_of_text(
         header_line, cells = next(rows, (1, []))
         if not cells:
             raise InputError(f"{name} is empty, expected {expected_header}.")
-        header = _checked_header(f"{name}, line {header_line}", cells, expected_header)
+        header = _checked_header(f"{name}, line {header_line}", cells, expected_header, separator)
     # float() would also take 1_000 and digits of other scripts: only text without them may go through it directly.
     read = float if text.isascii() and "_" not in text[text.find("\n") if head is None else 0 :] else _number
     kept = [i for i, column in enumerate(header) if only is None or column in only]
@@ -234,14 +249,14 @@ def table_of_text(
         line_numbers.append(line)
     if not line_numbers:
         raise InputError(f"{name}, line {header_line}: found a header without rows, expected a row below it.")
-    table = np.array(values).reshape(-1, len(chosen))
+    table = np.array(values).reshape(len(line_numbers), len(chosen))
     return Table(name, chosen, header_line, table, np.array(line_numbers, dtype=np.int64))
 
 
 def table_of_header(line: str, name: str, expected_header: str, *, number: int = 1, separator: str = ",") -> Table:
     """Table without rows from the line that names its columns; `name` and `number` are what errors call it."""
     _, cells = next(_csv_rows(name, line, separator), (1, [""]))
-    header = _checked_header(f"{name}, line {number}", cells, expected_header)
+    header = _checked_header(f"{name}, line {number}", cells, expected_header, separator)
     return Table(name, header, number, np.zeros((0, len(header))), np.zeros(0, dtype=np.int64))
 
 
@@ -268,11 +283,13 @@ def _csv_rows(path: str, text: str, separator: str = ",") -> Iterator[tuple[int,
         raise InputError(f"{path}, line {line}: found what is not CSV ({error}), expected a row of cells.") from None
 
 
-def _checked_header(place: str, cells: Sequence[str], expected: str) -> tuple[str, ...]:
+def _checked_header(place: str, cells: Sequence[str], expected: str, separator: str) -> tuple[str, ...]:
     header = tuple(cell.strip() for cell in cells)
-    for separator, called in ((";", "semicolons"), ("\t", "tabs")):
-        if separator in header[0]:
-            raise InputError(f"{place}: found columns separated by {called}, expected commas.")
+    for other, called in _SEPARATORS.items():
+        is_one = len(header) == 1 or (separator == "," and other in ";\t")
+        if other != separator and is_one and other in header[0]:
+            wanted = f"{_SEPARATORS[separator]} as the separator" if separator != "," else "commas"
+            raise InputError(f"{place}: found columns separated by {called}, expected {wanted}.")
     seen: set[str] = set()
     for position, name in enumerate(header, start=1):
         if _is_number_or_empty(name):

@@ -30,7 +30,8 @@ _OPTIONS = dict(commands())
 # Words of libraries and of Python, which mean nothing to a user.
 _FOREIGN = re.compile(
     r"0x[0-9a-f]{7}|broadcast|same shape|reshape|singular|ndarray|dtype|out of bounds|NoneType|_io\.|Traceback|"
-    r"\w+Error\b|invalid value|must be real|not subscriptable|unpack|concatenate|positional|'\w+' object|integer string"
+    r"\w+Error\b|invalid value encountered|must be real|"
+    r"not subscriptable|unpack|concatenate|positional|'\w+' object|integer string"
 )
 
 
@@ -114,7 +115,7 @@ def _asks_for_much(words: Sequence[str]) -> Iterator[bool]:
     for option, word in pairwise(words):
         value = word.replace("_", "")  # 1_000 is a number too
         most = 3000 if option == "--duration" else 100
-        yield option.startswith("--") and value.isascii() and value.isdigit() and most < int(value) < 10**7
+        yield option.startswith("--") and value.isascii() and value.isdigit() and most < float(value) < 1e7
 
 
 def run_case(case: Case, folder: Path, seconds: float = LONGEST_S) -> Ended:
