@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from arrays.io.errors import LARGEST, InputError
 from arrays.io.text import read_text, write_text
+from arrays.io.values import numbers, seconds
 from arrays.typing import FloatArray, IntArray
 
 LATEST_S = 1e11
@@ -181,11 +182,13 @@ class Columns(Protocol):
 
 def table_of_columns(columns: Columns, name: str) -> Table:
     """Table as of :func:`read_table`, from columns in memory; `name` is what they are called in errors."""
-    header = tuple(map(str, columns))
+    # Iterating a frame of polars gives columns, not their names.
+    names = list(getattr(columns, "columns", columns))
+    header = tuple(map(str, names))
     values = []
-    for column in columns:
+    for column in names:
         try:
-            values.append(np.asarray(columns[column], dtype=np.float64))
+            values.append((seconds if str(column).startswith("time") else numbers)(columns[column]))
         except (TypeError, ValueError):
             raise InputError(f"{name}, column {column}: found what is not a number, expected numbers.") from None
     shapes = {column.shape for column in values}
@@ -242,10 +245,10 @@ def table_of_text(
             cells[timed[0]] = unix_seconds(place, "T".join(cells[i].strip() for i in timed))
             cells[timed[-1]] = cells[timed[0]]
         try:
-            numbers = [read(cell or "nan") for cell in cells]
+            found = [read(cell or "nan") for cell in cells]
         except ValueError:
-            numbers = _careful_numbers(f"{name}, line {line}", chosen, cells)
-        values.extend(numbers)
+            found = _careful_numbers(f"{name}, line {line}", chosen, cells)
+        values.extend(found)
         line_numbers.append(line)
     if not line_numbers:
         raise InputError(f"{name}, line {header_line}: found a header without rows, expected a row below it.")
@@ -303,14 +306,14 @@ def _checked_header(place: str, cells: Sequence[str], expected: str, separator: 
 
 def _careful_numbers(place: str, header: Sequence[str], cells: Sequence[str]) -> list[float]:
     """Numbers of one row, NaN for empty cells; names the column of a cell that is neither."""
-    numbers = []
+    found_numbers = []
     for name, cell in zip(header, cells, strict=True):
         try:
-            numbers.append(_number(cell))
+            found_numbers.append(_number(cell))
         except ValueError:
             found = repr(cell.strip()[:_SHOWN_CHARACTERS])
             raise InputError(f"{place}, column {name}: found {found}, expected a number or an empty cell.") from None
-    return numbers
+    return found_numbers
 
 
 def _number(cell: str) -> float:
