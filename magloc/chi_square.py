@@ -29,24 +29,36 @@ def normalised_square(error: FloatArray, covariance: FloatArray) -> FloatArray:
 
     NaN where the covariance is none, as that of a filter that has diverged.
     """
-    # States of mixed units: solved with the correlations, which are well-conditioned.
     with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
-        sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
-        correlation = covariance / (sigma[..., :, None] * sigma[..., None, :])
-        scaled = error / sigma
-        try:
-            solved = np.linalg.solve(correlation, scaled[..., None])[..., 0]
-        except np.linalg.LinAlgError:
-            regular = np.linalg.slogdet(correlation).sign > 0.0
-            correlation = np.where(regular[..., None, None], correlation, np.nan)
-            solved = np.linalg.solve(correlation, scaled[..., None])[..., 0]
-        return np.asarray(np.sum(scaled * solved, axis=-1))
+        scaled, solved = _solved(covariance, error[..., None])
+        return np.asarray(np.sum(scaled * solved, axis=(-2, -1)))
 
 
 def error_factor(claimed: FloatArray, added: FloatArray) -> FloatArray:
-    """How many times their standard deviations errors are, rms, where a covariance (..., N, N) is added to theirs."""
-    ratio = np.linalg.solve(claimed, added)
-    return np.asarray(np.sqrt(1.0 + np.trace(ratio, axis1=-2, axis2=-1) / claimed.shape[-1]))
+    """How many times their standard deviations errors are, rms, where a covariance (..., N, N) is added to theirs.
+
+    NaN where the claimed covariance is none.
+    """
+    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+        sigma = np.sqrt(np.diagonal(claimed, axis1=-2, axis2=-1))
+        _, ratio = _solved(claimed, added / sigma[..., None, :])
+        return np.asarray(np.sqrt(1.0 + np.trace(ratio, axis1=-2, axis2=-1) / claimed.shape[-1]))
+
+
+def _solved(covariance: FloatArray, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Columns (..., N, n) in units of standard deviations, and multiplied by the inverse of the correlations.
+
+    States have mixed units: their correlations are well-conditioned. NaN where the covariance is none.
+    """
+    sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+    correlation = covariance / (sigma[..., :, None] * sigma[..., None, :])
+    scaled = columns / sigma[..., None]
+    try:
+        return scaled, np.linalg.solve(correlation, scaled)
+    except np.linalg.LinAlgError:
+        regular = np.linalg.slogdet(correlation).sign > 0.0
+        correlation = np.where(regular[..., None, None], correlation, np.nan)
+        return scaled, np.linalg.solve(correlation, scaled)
 
 
 class Detector(Protocol):

@@ -28,6 +28,7 @@ from arrays.columns import POSITION_COLUMNS, ROTATION_COLUMNS, LogFormat
 from arrays.io.csv import Columns, Table, table_of_columns
 from arrays.io.errors import InputError
 from arrays.io.text import read_text, write_text
+from arrays.io.values import numbers, seconds
 from arrays.sensor import Sensor
 from arrays.typing import FloatArray, IntArray
 from magloc.conditioning import NO_BACKGROUND, Background, without_hum
@@ -56,9 +57,9 @@ class Readings:
     Attributes
     ----------
     values_T : ndarray, shape (n, C)
-        Raw readings [T] in the array's channel order; NaN where a reading is missing.
+        Raw readings [T] in the array's channel order; NaN, or masked, where a reading is missing.
     time_s : ndarray, shape (n,), optional
-        Instants [s]; by default one row a second from zero.
+        Instants [s], durations, or dates (UTC) as seconds since 1970; by default one row a second from zero.
     array_position_m : ndarray, shape (n, 3), optional
         Origin of the array's frame in the world frame [m].
     array_rotation : Rotation of n, optional
@@ -76,7 +77,7 @@ class Readings:
     Raises
     ------
     ValueError
-        The shapes do not fit, or a position comes without a rotation or the other way round.
+        The shapes do not fit, a time is not finite, or a position comes without a rotation or the other way round.
 
     Examples
     --------
@@ -105,7 +106,7 @@ class Readings:
     def __post_init__(self) -> None:
         for name in ("values_T", "time_s", "array_position_m", "ambient_T", "pose_sigma"):
             if getattr(self, name) is not None:
-                object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
+                object.__setattr__(self, name, (seconds if name == "time_s" else numbers)(getattr(self, name)))
         if self.values_T.ndim != 2:
             raise ValueError(f"Input values_T must have shape (n, C); instead received {self.values_T.shape}.")
         n = len(self.values_T)
@@ -116,6 +117,8 @@ class Readings:
             value = getattr(self, name)
             if value is not None and value.shape != shape:
                 raise ValueError(f"Input {name} must have shape {shape}; instead received {value.shape}.")
+        if (bad := ~np.isfinite(self.time_s)).any():
+            raise ValueError(f"Input time_s must be finite; instead row {bad.argmax() + 1} has {self.time_s[bad][0]}.")
         if (self.array_position_m is None) != (self.array_rotation is None):
             raise ValueError(
                 "Inputs array_position_m and array_rotation must come together; instead received one of them."
@@ -231,7 +234,7 @@ class Readings:
 
 def as_readings(values: Readings | ArrayLike) -> Readings:
     """Readings as they are, or from values (n, C) or (C,) [T]."""
-    return values if isinstance(values, Readings) else Readings(np.atleast_2d(np.asarray(values, dtype=np.float64)))
+    return values if isinstance(values, Readings) else Readings(np.atleast_2d(numbers(values)))
 
 
 def read_readings(
@@ -306,7 +309,7 @@ def readings_of_table(table: Table, array: SensorArray, sensors: Sequence[str] |
 def readings_of_checked(table: Table, array: SensorArray) -> Readings:
     """Readings of a table whose header is that of the array, as :func:`readings_of_table` has found."""
     channels = [f"{name}_nT" for name in array.channel_names]
-    time_s = table.complete_and_distinct("time_s")
+    time_s = table.times()
     position_m = rotation = ambient_T = pose_sigma = None
     if table.has_group(POSITION_COLUMNS + ROTATION_COLUMNS):
         position_m, rotation = table.complete(POSITION_COLUMNS), unit_rotation(table, ROTATION_COLUMNS)
@@ -335,8 +338,7 @@ def readings_of_checked(table: Table, array: SensorArray) -> Readings:
 def write_readings(path: str | PathLike[str], readings: Readings, array: SensorArray) -> None:
     """Write a readings file whose columns the array names, replacing it.
 
-    Fields are written in nT with 15 significant digits, which are those of the file that they were read from, if it had
-    no more; the other numbers are written exactly.
+    Fields are written in nT with 15 significant digits, as many as a file had; the other numbers are written exactly.
     """
     _check_channels(readings, array)
     header = ["time_s", *(f"{name}_nT" for name in array.channel_names)]
@@ -375,11 +377,8 @@ def change_between_rows(readings: Readings) -> tuple[str, int, str] | None:
     if ambient_T is not None:
         changed = np.linalg.norm(ambient_T - ambient_T[0], axis=1) > _SAME_AMBIENT_RTOL * np.linalg.norm(ambient_T[0])
         if changed.any():
-            return (
-                "the ambient field changed",
-                int(changed.argmax()),
-                "one ambient field for all rows that are averaged",
-            )
+            expected = "one ambient field for all rows that are averaged"
+            return "the ambient field changed", int(changed.argmax()), expected
     return None
 
 

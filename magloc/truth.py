@@ -77,7 +77,7 @@ def read_truth(path: str | PathLike[str]) -> Truth:
     for name in ("time_s", "x_m", "y_m"):
         table.require(name, known)
     table.refuse_unknown(known)
-    time_s = table.complete_and_distinct("time_s")
+    time_s = table.times()
     position_m = np.full((len(time_s), 3), np.nan)
     columns = TRUE_POSITION_COLUMNS if "z_m" in table.header else TRUE_POSITION_COLUMNS[:2]
     position_m[:, : len(columns)] = table.complete(columns)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,9 +9,10 @@ import adcs
 from adcs.cli.estimate import read_log
 from adcs.cli.imu import inertial_attitude
 from adcs.cli.options import print_note, warn
+from adcs.io.imu_files import imu_log
+from adcs.io.scenario_files import scenario_of, scenario_table
 from arrays.io.arguments import Flag
 from arrays.io.errors import InputError, naming
-from arrays.io.text import read_text
 from magloc.cli.framework import QuietOptions
 from magloc.cli.options import Port, naming_outputs
 
@@ -69,9 +69,11 @@ def view(
 
     with naming_outputs():
         check_outputs(html, png, movie)
-    track, *made_of, q_true = (
-        _of_inertial_unit(log, config, truth) if _is_layout(config) else _of_satellite(log, config, truth)
-    )
+    described = None if config is None else scenario_table(str(config))  # once: it may be a pipe
+    if described is None or set(described[1]) <= _OF_A_LAYOUT:
+        track, *made_of, q_true = _of_inertial_unit(log, described, truth)
+    else:
+        track, *made_of, q_true = _of_satellite(log, described, truth)
     warn(common, track.warnings)
     files: dict[str, Any] = {"html": html, "png": png, "movie": movie}
     written_or_served(
@@ -83,31 +85,22 @@ def view(
     )
 
 
-def _is_layout(config: Path | None) -> bool:
-    """Whether a file, if there is one, describes a log alone."""
-    if config is None:
-        return True
-    try:
-        return set(tomllib.loads(read_text(config, "a TOML file"))) <= _OF_A_LAYOUT
-    except tomllib.TOMLDecodeError:
-        return False
-
-
-def _of_inertial_unit(log: Path, config: Path | None, truth: Path | None) -> tuple[Any, ...]:
+def _of_inertial_unit(log: Path, layout: tuple[str, dict[str, Any]] | None, truth: Path | None) -> tuple[Any, ...]:
     if truth is not None:
         raise InputError(
             f"--truth {truth}: found it with the log of an inertial unit, expected the truth in its columns."
         )
-    data = adcs.read_imu(log, config)
+    data = imu_log(log, layout)
     return inertial_attitude(log, data), data, None, data.q_true
 
 
-def _of_satellite(log: Path, config: Path | None, truth: Path | None) -> tuple[Any, ...]:
-    scenario = adcs.read_scenario(str(config))
+def _of_satellite(log: Path, described: tuple[str, dict[str, Any]], truth: Path | None) -> tuple[Any, ...]:
+    scenario = scenario_of(*described)
     telemetry = read_log(log, scenario)
     q_true = None if truth is None else _truth(truth, telemetry.time_s)
     with naming(str(log)):
-        track = adcs.estimate(telemetry, scenario.satellite, sensors=scenario.estimator(f"{config}, table estimate"))
+        sensors = scenario.estimator(f"{described[0]}, table estimate")
+        track = adcs.estimate(telemetry, scenario.satellite, sensors=sensors)
     return track, telemetry, scenario.satellite, q_true
 
 
@@ -122,7 +115,7 @@ def _truth(path: Path, time_s: FloatArray) -> FloatArray:
     table = read_table(path, "a header with time_s, qw, qx, qy and qz", only=columns)
     for name in columns:
         table.require(name, columns)
-    at = rows_at(time_s, table.complete_and_distinct("time_s"))
+    at = rows_at(time_s, table.times())
     if (at < 0).all():
         raise InputError(f"{path}: found none of the log's times, expected rows with the same time_s.")
     return np.where((at >= 0)[:, None], table.finite_or_missing(_QUATERNION)[at], np.nan)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from adcs import quaternion
 from adcs.complementary.heading import HeadingModel
 from adcs.satellite.vector_record import GAP_STEPS, GyroSamples, instants_within, step_rates, steps_s
+from arrays.io.values import numbers, seconds
 from arrays.typing import BoolArray, FloatArray
 
 GRAVITY_TIME_S = 3.0
@@ -59,12 +60,12 @@ class InertialMagneticRecord:
     gyro_samples: GyroSamples = "mean"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "time_s", np.asarray(self.time_s, dtype=np.float64))
+        object.__setattr__(self, "time_s", seconds(self.time_s))
         shape = (len(steps_s(self.time_s)), 3)
         if np.ptp(self.time_s) < 1.0:
             raise ValueError(f"Input time_s must last a second at least; instead received {np.ptp(self.time_s):g} s.")
         for name in ("rate_rad_s", "acceleration_m_s2", "field_T"):
-            values = np.asarray(getattr(self, name), dtype=np.float64)
+            values = numbers(getattr(self, name))
             if values.shape != shape or np.isinf(values).any():
                 raise ValueError(f"Input {name} must be finite, of shape {shape}; instead received {values.shape}.")
             if np.nanmax(np.abs(values), initial=0.0) > _LARGEST[name]:

@@ -8,6 +8,7 @@ where errors count. An empty cell is a missing reading: sensors may have rates o
 from __future__ import annotations
 
 from dataclasses import dataclass
+from io import BytesIO
 from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any
@@ -29,6 +30,7 @@ from adcs.io.telemetry_files import TIME, columns_of, read_named
 from adcs.satellite.vector_record import GYRO_SAMPLES, GyroSamples
 from arrays.io.csv import read_table
 from arrays.io.errors import InputError, naming
+from arrays.io.text import read_bytes
 from arrays.io.toml import File, Table, one_of, read_toml, section_of
 from arrays.typing import BoolArray, FloatArray
 
@@ -129,12 +131,16 @@ def read_imu(path: str | PathLike[str], layout: str | PathLike[str] | None = Non
     >>> len(log.record)
     1500
     """
-    if Path(path).suffix.lower() == ".mat":
-        if layout is not None:
-            raise InputError(f"{path}: found a MAT file with a layout, expected a CSV file, or none.")
-        return _broad_log(path)
-    table = None if layout is None else section_of(str(layout), read_toml(layout, "a layout of a log"), ImuFile).log
-    return _csv_log(path, table)
+    return imu_log(path, None if layout is None else (str(layout), read_toml(layout, "a layout of a log")))
+
+
+def imu_log(path: str | PathLike[str], layout: tuple[str, dict[str, Any]] | None) -> ImuLog:
+    """Return the log of :func:`read_imu` with the path and the table of a layout that was read before."""
+    if Path(path).suffix.lower() != ".mat":
+        return _csv_log(path, None if layout is None else section_of(*layout, ImuFile).log)
+    if layout is not None:
+        raise InputError(f"{path}: found a MAT file with a layout, expected a CSV file, or none.")
+    return _broad_log(path)
 
 
 def _csv_log(path: str | PathLike[str], named: ImuTable | None) -> ImuLog:
@@ -188,12 +194,11 @@ def _standard(header: tuple[str, ...]) -> ImuTable:
 def _broad_log(path: str | PathLike[str]) -> ImuLog:
     from scipy.io import loadmat
 
-    if not Path(path).is_file():
-        raise InputError(f"{path} does not exist, expected a MAT file of the BROAD benchmark.")
+    data = read_bytes(path, "a MAT file of the BROAD benchmark")
     try:
-        content = loadmat(path)
-    except Exception as error:  # whatever SciPy makes of a file that is none
-        raise InputError(f"{path}: found no MAT file that can be read ({error}), expected one of BROAD.") from None
+        content = loadmat(BytesIO(data))
+    except Exception:  # whatever SciPy makes of a file that is none
+        raise InputError(f"{path}: found no whole MAT file, expected one of the BROAD benchmark.") from None
     if absent := [name for name in (*_BROAD, "sampling_rate") if name not in content]:
         raise InputError(f"{path}: found no variable {absent[0]}, expected those of a trial of the BROAD benchmark.")
     n = len(content["imu_gyr"])

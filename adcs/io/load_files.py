@@ -61,6 +61,7 @@ def read_load_log(path: Path, array: SensorArray, loads: list[str]) -> LoadLog:
     if not names:
         raise InputError(f"{path}, line {table.header_line}: found no column of a load, expected one, such as heater.")
     times = table.complete([TIME])[:, 0]
+    table.refuse_late(TIME, times)
     table.refuse_back(TIME, np.diff(times) <= 0.0, "times that ascend", "{:.15g} s")
     values = table.finite_or_missing(table.header)
     states = table.complete(names)

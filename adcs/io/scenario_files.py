@@ -90,7 +90,12 @@ def read_scenario(name_or_path: str) -> AttitudeFile:
     >>> adcs.read_scenario("tabletsat").satellite.field_model
     'IGRF-14'
     """
-    return scenario_of(*_FILES.read(name_or_path))
+    return scenario_of(*scenario_table(name_or_path))
+
+
+def scenario_table(name_or_path: str) -> tuple[str, dict[str, Any]]:
+    """Return the path and the table of a scenario."""
+    return _FILES.read(name_or_path)
 
 
 def scenario_text(file: AttitudeFile) -> str:

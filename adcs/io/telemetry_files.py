@@ -91,6 +91,7 @@ def columns_of(table: Table, layout: LogLayout) -> tuple[FloatArray, dict[str, F
     """Ascending times (n,), and readings by the names of a layout, in SI and body axes, NaN where missing."""
     table.require(layout.time, [layout.time])
     time_s = layout.seconds(table.complete([layout.time])[:, 0])
+    table.refuse_late(layout.time, time_s)
     table.refuse_back(layout.time, np.diff(time_s) <= 0.0, "times that ascend", "{:.15g} s")
     columns = {}
     for name, group in layout.columns.items():

@@ -19,6 +19,7 @@ from adcs.environment.environment import Environment, environment
 from adcs.satellite.satellite import Satellite
 from adcs.satellite.sensors import SENSORS
 from arrays.io.errors import check_positive
+from arrays.io.values import numbers, seconds
 from arrays.typing import BoolArray, FloatArray
 
 if TYPE_CHECKING:
@@ -136,7 +137,7 @@ class Telemetry:
     Attributes
     ----------
     time_s : ndarray, shape (n,)
-        Since :attr:`adcs.Satellite.start`, ascending in any steps; rows may be missing.
+        Seconds or durations since :attr:`adcs.Satellite.start`, ascending in any steps; rows may be missing.
     star : Rotation, or ndarray, shape (n, 4)
         Star tracker: inertial (J2000) from body. As quaternions with the scalar last where some are missing.
     gyro_rad_s : ndarray, shape (n, 3)
@@ -193,7 +194,7 @@ class Telemetry:
         star_covariance_rad2: ArrayLike | None = None,
         step_s: float | None = None,
     ) -> None:
-        times = np.array(time_s, dtype=np.float64)
+        times = seconds(time_s, dates=False).copy()
         if times.ndim != 1 or not times.size or not np.isfinite(times).all():
             raise ValueError(f"Input time_s must be finite with shape (n,); instead received shape {times.shape}.")
         back = np.diff(times) <= 0.0
@@ -284,7 +285,7 @@ class Telemetry:
 def _columns(name: str, given: ArrayLike | None, n: int) -> FloatArray:
     """Readings of a sensor, NaN where one of their numbers is missing."""
     shape = (n, 4 if name == "star" else 3)
-    values = np.full(shape, np.nan) if given is None else np.array(given, dtype=np.float64)
+    values = np.full(shape, np.nan) if given is None else numbers(given)
     if values.shape != shape or np.isinf(values).any():
         raise ValueError(f"Input {name} must have shape {shape} and no infinity; instead received {values.shape}.")
     if name in ("star", "sun") and (values == 0.0).all(axis=1).any():

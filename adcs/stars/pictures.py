@@ -7,6 +7,7 @@ a neighbourhood, not of the picture.
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from io import BytesIO
@@ -79,14 +80,14 @@ def read_picture(path: str | PathLike[str]) -> FloatArray:
     from PIL import Image
 
     try:
-        with Image.open(BytesIO(data)) as opened:
+        with warnings.catch_warnings(action="ignore"), Image.open(BytesIO(data)) as opened:
             if opened.width * opened.height > _MOST_PIXELS:
                 raise InputError(f"{path}: found {opened.width} × {opened.height} pixels, expected 10⁸ at most.")
             values = np.asarray(opened)
     except InputError:
         raise
-    except Exception as error:  # whatever the decoder makes of a file that is none
-        raise InputError(f"{path}: found no picture that can be read ({error}).") from None
+    except Exception:  # whatever the decoder makes of a file that is none
+        raise InputError(f"{path}: found no whole picture, expected one of a kind {', '.join(SUFFIXES)}.") from None
     if values.ndim == 3:
         values = values[..., : 3 if values.shape[2] > 2 else 1].mean(axis=2)
     return _checked(path, values)

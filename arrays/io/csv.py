@@ -26,11 +26,15 @@ from numpy.typing import NDArray
 
 from arrays.io.errors import LARGEST, InputError
 from arrays.io.text import read_text, write_text
+from arrays.io.values import numbers, seconds
 from arrays.typing import FloatArray, IntArray
 
+LATEST_S = 1e11
+"""Latest time of a row, and earliest below zero: of microseconds since 1970 a row would be beyond it."""
 _SHOWN_CHARACTERS = 40
 _HEAD_CHARACTERS = 2**16
 _MOST_LINES_ABOVE = 100
+_SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs", " ": "blanks"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,6 +132,18 @@ class Table:
             )
         return values
 
+    def refuse_late(self, column: str, time_s: FloatArray) -> None:
+        """Raise an InputError for the first time (n,) [s] that no clock shows."""
+        late = np.abs(time_s) > LATEST_S
+        found = f"found the time {time_s[np.argmax(late)]:.6g} s" if late.any() else ""
+        self.refuse(late[:, None], [column], f"{found}, beyond 3,000 years, expected seconds")
+
+    def times(self, column: str = "time_s") -> FloatArray:
+        """Return the times (n,) [s] of a column; a missing or repeated one, or one that no clock shows, is refused."""
+        time_s = self.complete_and_distinct(column)
+        self.refuse_late(column, time_s)
+        return time_s
+
     def _refuse_larger(self, values: FloatArray, columns: Sequence[str], largest: float) -> None:
         self.refuse(np.abs(values) > largest, columns, f"found a number above {largest:g}, expected a smaller one")
 
@@ -169,11 +185,13 @@ class Columns(Protocol):
 
 def table_of_columns(columns: Columns, name: str) -> Table:
     """Table as of :func:`read_table`, from columns in memory; `name` is what they are called in errors."""
-    header = tuple(map(str, columns))
+    # Iterating a frame of polars gives columns, not their names.
+    names = list(getattr(columns, "columns", columns))
+    header = tuple(map(str, names))
     values = []
-    for column in columns:
+    for column in names:
         try:
-            values.append(np.asarray(columns[column], dtype=np.float64))
+            values.append((seconds if str(column).startswith("time") else numbers)(columns[column]))
         except (TypeError, ValueError):
             raise InputError(f"{name}, column {column}: found what is not a number, expected numbers.") from None
     shapes = {column.shape for column in values}
@@ -203,15 +221,14 @@ def table_of_text(
         line = text.count("\n", 0, text.index("\0")) + 1
         raise InputError(f"{name}, line {line}: found a NUL byte, expected UTF-8 text.")
     rows = _csv_rows(name, text, separator)
-    if head is None:
-        _refuse_preamble(name, text[:_HEAD_CHARACTERS], separator)
     if head is not None:
         header, header_line = head.header, 0
     else:
+        _refuse_preamble(name, text[:_HEAD_CHARACTERS], separator)
         header_line, cells = next(rows, (1, []))
         if not cells:
             raise InputError(f"{name} is empty, expected {expected_header}.")
-        header = _checked_header(f"{name}, line {header_line}", cells, expected_header)
+        header = _checked_header(f"{name}, line {header_line}", cells, expected_header, separator)
     # float() would also take 1_000 and digits of other scripts: only text without them may go through it directly.
     read = float if text.isascii() and "_" not in text[text.find("\n") if head is None else 0 :] else _number
     kept = [i for i, column in enumerate(header) if only is None or column in only]
@@ -232,21 +249,21 @@ def table_of_text(
             cells[timed[0]] = unix_seconds(place, "T".join(cells[i].strip() for i in timed))
             cells[timed[-1]] = cells[timed[0]]
         try:
-            numbers = [read(cell or "nan") for cell in cells]
+            found = [read(cell or "nan") for cell in cells]
         except ValueError:
-            numbers = _careful_numbers(f"{name}, line {line}", chosen, cells)
-        values.extend(numbers)
+            found = _careful_numbers(f"{name}, line {line}", chosen, cells)
+        values.extend(found)
         line_numbers.append(line)
     if not line_numbers:
         raise InputError(f"{name}, line {header_line}: found a header without rows, expected a row below it.")
-    table = np.array(values).reshape(-1, len(chosen))
+    table = np.array(values).reshape(len(line_numbers), len(chosen))
     return Table(name, chosen, header_line, table, np.array(line_numbers, dtype=np.int64))
 
 
 def table_of_header(line: str, name: str, expected_header: str, *, number: int = 1, separator: str = ",") -> Table:
     """Table without rows from the line that names its columns; `name` and `number` are what errors call it."""
     _, cells = next(_csv_rows(name, line, separator), (1, [""]))
-    header = _checked_header(f"{name}, line {number}", cells, expected_header)
+    header = _checked_header(f"{name}, line {number}", cells, expected_header, separator)
     return Table(name, header, number, np.zeros((0, len(header))), np.zeros(0, dtype=np.int64))
 
 
@@ -287,11 +304,13 @@ def _refuse_preamble(name: str, head: str, separator: str) -> None:
             return
 
 
-def _checked_header(place: str, cells: Sequence[str], expected: str) -> tuple[str, ...]:
+def _checked_header(place: str, cells: Sequence[str], expected: str, separator: str) -> tuple[str, ...]:
     header = tuple(cell.strip() for cell in cells)
-    for separator, called in ((";", "semicolons"), ("\t", "tabs")):
-        if separator in header[0]:
-            raise InputError(f"{place}: found columns separated by {called}, expected commas.")
+    for other, called in _SEPARATORS.items():
+        is_one = len(header) == 1 or (separator == "," and other in ";\t")
+        if other != separator and is_one and other in header[0]:
+            wanted = f"{_SEPARATORS[separator]} as the separator" if separator != "," else "commas"
+            raise InputError(f"{place}: found columns separated by {called}, expected {wanted}.")
     seen: set[str] = set()
     for position, name in enumerate(header, start=1):
         if _is_number_or_empty(name):
@@ -305,14 +324,14 @@ def _checked_header(place: str, cells: Sequence[str], expected: str) -> tuple[st
 
 def _careful_numbers(place: str, header: Sequence[str], cells: Sequence[str]) -> list[float]:
     """Numbers of one row, NaN for empty cells; names the column of a cell that is neither."""
-    numbers = []
+    found_numbers = []
     for name, cell in zip(header, cells, strict=True):
         try:
-            numbers.append(_number(cell))
+            found_numbers.append(_number(cell))
         except ValueError:
             found = repr(cell.strip()[:_SHOWN_CHARACTERS])
             raise InputError(f"{place}, column {name}: found {found}, expected a number or an empty cell.") from None
-    return numbers
+    return found_numbers
 
 
 def _number(cell: str) -> float:

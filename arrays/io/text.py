@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import stat
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from os import PathLike
@@ -15,22 +16,52 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
-def read_bytes(path: str | PathLike[str], expected: str) -> bytes:
-    """What a file holds; `expected` says in words what it should be."""
+MOST_BYTES, MOST_PIPED_BYTES = 4 * 10**9, 10**9
+"""Bytes that are read of a file, and of what is none, such as a pipe or a device, which need not end."""
+LONGEST_LINE = 2**26
+"""Bytes of a pipe or device without the end of a line."""
+_CHUNK = 2**24
+
+
+def read_bytes(path: str | PathLike[str], expected: str, *, text: bool = False) -> bytes:
+    """Return the content of a file; `expected` says in words what it should be.
+
+    Of `text` nothing is read behind a NUL byte, which no text has.
+    """
     try:
-        return Path(path).read_bytes()
+        with Path(path).open("rb", buffering=0) as file:
+            status = os.fstat(file.fileno())
+            is_file = stat.S_ISREG(status.st_mode)
+            if is_file and status.st_size > MOST_BYTES:
+                raise InputError(f"{path}: found more than {MOST_BYTES / 1e9:g} GB, expected {expected}.")
+            chunks, size, line = [], 0, 0
+            while chunk := file.read(_CHUNK):
+                chunks.append(chunk)
+                size, end = size + len(chunk), chunk.rfind(b"\n")
+                line = line + len(chunk) if end < 0 else len(chunk) - end
+                if text and b"\0" in chunk:
+                    break
+                if not is_file and (size > MOST_PIPED_BYTES or line > LONGEST_LINE):
+                    end_of = "a line" if line > LONGEST_LINE else "the data"
+                    raise InputError(
+                        f"{path}: found no end of {end_of} in {size / 1e6:.0f} MB of a pipe or device,"
+                        f" expected {expected}."
+                    )
+            return b"".join(chunks)
     except FileNotFoundError:
         raise InputError(f"{path} does not exist, expected {expected}.") from None
     except IsADirectoryError:
         raise InputError(f"{path} is a directory, expected {expected}.") from None
+    except InputError:
+        raise
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"{path} cannot be read ({reason}), expected {expected}.") from None
 
 
 def read_text(path: str | PathLike[str], expected: str) -> str:
-    """Text of a UTF-8 file, with or without a byte order mark, as :func:`read_bytes`."""
-    data = read_bytes(path, expected)
+    """Return the text of a UTF-8 file, with or without a byte order mark, as :func:`read_bytes`."""
+    data = read_bytes(path, expected, text=True)
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:

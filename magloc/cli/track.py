@@ -270,6 +270,8 @@ def track(
             found = magloc.track(used, rows, motion=model, smooth=smooth, prior=prior, progress=advance)
     if not any(point.is_on_track for point in found):
         _print_track(found, None, json=json, jsonl=jsonl, printed=printed)
+        if truth is None and out is None and maps == MapOptions() and _is_undetermined(found):
+            return
         raise _no_track(str(readings), found.status, f"; {_USE_SURVEY}" if few else "")
     result = None if truth is None else found.consistency(magloc.read_truth(truth))
     maps.write(found, known.place)
@@ -317,6 +319,16 @@ def _print_track(found: Track, result: Consistency | None, *, json: bool, jsonl:
             _printed(point)
 
 
+def _is_undetermined(found: Iterable[TrackPoint]) -> bool:
+    """Whether rows tell where a source may be; warns that they do not tell where it is."""
+    from magloc.tracking.results import UNDETERMINED
+
+    rows = sum(point.status == UNDETERMINED for point in found)
+    if rows:
+        print_note(f"warning: {rows} rows show a source but do not determine its place: see the standard deviations")
+    return rows > 0
+
+
 def _no_track(readings: str, statuses: Iterable[str], hint: str = "") -> InputError:
     reasons = "; ".join(sorted(set(statuses))[:3])
     return InputError(f"{readings}: found no row where a source can be tracked ({reasons}){hint}.")
@@ -346,6 +358,7 @@ def _printed(point: TrackPoint) -> TrackPoint:
 def _stream(array: SensorArray, known: KnownOptions, model: MotionModel, where: Place | None) -> None:
     """Answer every row of standard input by one line; none that is tracked is an InputError at its end."""
     from magloc.live.follower import Follower
+    from magloc.tracking.results import UNDETERMINED
 
     follower = Follower(array, model, prior=known.prior, sensors=known.ids, place=where)
     statuses: set[str] = set()
@@ -355,5 +368,5 @@ def _stream(array: SensorArray, known: KnownOptions, model: MotionModel, where: 
             statuses.add(point.status)
     if follower.tally.faults:
         print_note(str(follower.tally))
-    if not follower.tally.tracked:
+    if not follower.tally.tracked and UNDETERMINED not in statuses:
         raise _no_track("standard input", statuses)

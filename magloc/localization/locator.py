@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from arrays.array import SensorArray
+from arrays.io.values import numbers
 from arrays.pose import PoseUncertainty
 from arrays.typing import FloatArray, IntArray
 from magloc.ambient import in_world_field
@@ -127,7 +128,7 @@ class Locator:
     def fit(self, readings_T: ArrayLike, ambient_T: ArrayLike | None = None) -> Fix:
         """Fix from one set of readings (C,) [T], NaN where missing, and the ambient field (3,) [T]."""
         ambient = None if ambient_T is None else np.asarray(ambient_T, dtype=np.float64)[None]
-        return self.fit_rows(np.asarray(readings_T, dtype=np.float64)[None], ambient)[0]
+        return self.fit_rows(numbers(readings_T)[None], ambient)[0]
 
     @one_blas_thread
     def fit_rows(

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from arrays.array import SensorArray
 from arrays.differences import Differences, decorrelated_differences
+from arrays.io.values import numbers
 from arrays.typing import FloatArray
 from magloc.fields import dipole
 
@@ -93,7 +94,7 @@ class DifferenceMeasurement:
         """
         transform = self.differences.transform
         used = np.any(transform != 0.0, axis=0)
-        channels = np.asarray(readings_T, dtype=np.float64) - self.array.channel_offset_T
+        channels = numbers(readings_T) - self.array.channel_offset_T
         return channels[..., used] @ transform[:, used].T
 
     def predicted(

@@ -171,7 +171,7 @@ def read_object_path(path: str | PathLike[str]) -> ObjectPath:
     for name in known[:4]:
         table.require(name, known)
     table.refuse_unknown(known)
-    time_s = table.complete_and_distinct("time_s")
+    time_s = table.times()
     rotation = unit_rotation(table, PATH_ROTATION_COLUMNS) if table.has_group(PATH_ROTATION_COLUMNS) else None
     return ObjectPath(time_s, table.complete(TRUE_POSITION_COLUMNS), rotation, str(path))
 

@@ -261,6 +261,8 @@ def next_row(row: Row | Readings, array: SensorArray, after_s: float) -> Row:
         if len(row) != 1:
             raise ValueError(f"Input row must be readings of length one; instead received {len(row)} rows.")
         row = next(rows_of(in_world_field(without_saturated(row, array), array)))
+    if not math.isfinite(row.time_s):
+        raise ValueError(f"Input time_s must be finite; instead received {row.time_s}.")
     if row.time_s <= after_s:
         raise ValueError(f"Input time_s must increase; instead {row.time_s} s follows {after_s} s.")
     return row

@@ -10,8 +10,19 @@ from pathlib import Path
 NUMBERS = (
     "0", "-0", "1", "-1", "2", "3.5", "1e-300", "5e-324", "1e-9", "1e9", "1e18", "1e80", "1e155", "1e300", "-1e300",
     "2e300", "1e308", "nan", "inf", "-inf",
-    "", "x", "1e", "0x10", "9" * 400, "1_000", "٣", "true", "None", "1;2", "1 2", "é", "\x1b[31m", "--", "..", "/",
+    "9" * 400, "9" * 4400,
+    "", "x", "1e", "0x10", "1_000", "٣", "true", "None", "1;2", "1 2", "é", "\x1b[31m", "--", "..", "/",
 )  # fmt: skip
+DUMMIES = ("-99999", "99999", "*", "0", "1e32", "65535", "1e12", "-1e9", "NaN", "null", "inf")
+_BINARY = (
+    b"\x89PNG\r\n\x1a\n",
+    b"PK\x03\x04",
+    b"\x1f\x8b\x08",
+    b"MATLAB 5.0 MAT-file",
+    b"\x89HDF\r\n\x1a\n",
+    b"CDF\x01",
+    b"PAR1",
+)
 _NUMBER = re.compile(rb"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
 _WORD = re.compile(rb"[A-Za-z_]{2,}")
 
@@ -124,6 +135,63 @@ def _cells(lines: list[bytes], rng: random.Random) -> None:
             lines[i] = b",".join(cells)
 
 
+def _scattered(lines: list[bytes], rng: random.Random) -> None:
+    """In every row other cells are missing, or have what a logger writes in place of a reading."""
+    share = rng.choice((0.02, 0.1, 0.3, 0.6))
+    values = rng.choice(((b"",), (b"",), (rng.choice(DUMMIES).encode(),), tuple(map(str.encode, DUMMIES))))
+    for i, line in enumerate(lines[1:], 1):
+        time, *cells = line.split(b",")
+        lines[i] = b",".join([time, *(rng.choice(values) if rng.random() < share else cell for cell in cells)])
+
+
+def _run_of_dummies(lines: list[bytes], rng: random.Random) -> None:
+    """Successive rows have the same dummy in some columns, or in all of them."""
+    first, value, all_of_them = rng.randrange(len(lines)), rng.choice(DUMMIES).encode(), rng.random() < 0.5
+    chosen = {i for i in range(1, lines[0].count(b",") + 1) if all_of_them or rng.random() < 0.3}
+    for at in range(max(first, 1), min(first + rng.choice((1, 2, 3, 25)), len(lines))):
+        lines[at] = b",".join(value if i in chosen else cell for i, cell in enumerate(lines[at].split(b",")))
+
+
+def _other_numbers(lines: list[bytes], rng: random.Random) -> None:
+    """A column in another unit, or shifted, from some row on: the time's too."""
+    column, first = (
+        rng.choice((0, 0, rng.randrange(lines[0].count(b",") + 1))),
+        rng.choice((1, rng.randrange(len(lines)))),
+    )
+    factor = rng.choice((1.0, 1.0, -1.0, 1e-9, 1e-3, 1e3, 1e6, 1e9, 57.29578, 0.01745))
+    offset = rng.choice((0.0, 1.0, -1e3, 1e7, 1.7e9, 1e12, 1e14, 1e15, -1e15, 1e18))
+    for i, line in enumerate(lines[max(first, 1) :], max(first, 1)):
+        cells = line.split(b",")
+        if column < len(cells) and _NUMBER.fullmatch(cells[column]):
+            cells[column] = repr(factor * float(cells[column]) + offset).encode()
+            lines[i] = b",".join(cells)
+
+
+def _separator(data: bytes, rng: random.Random) -> bytes:
+    """Another separator, which a declaration may name too."""
+    named = {b"comma": b",", b"semicolon": b";", b"tab": b"\t", b"space": b" "}
+    called = rng.choice(tuple(named))
+    if b"[columns]" in data:
+        return data.replace(b'separator = "semicolon"', b'separator = "%s"' % called)
+    if b"[[sensor]]" in data:
+        return data + b'\n[columns]\nseparator = "%s"\n' % called
+    return data.replace(rng.choice((b",", b";")), rng.choice((*named.values(), b"|", b", ", b" ,")))
+
+
+def _nested(data: bytes, rng: random.Random) -> bytes:
+    """Lists in lists in place of a number."""
+    found = list(_NUMBER.finditer(data))
+    depth = rng.choice((1, 2, 50, 3000))
+    match = rng.choice(found) if found else None
+    start, stop, inner = (match.start(), match.end(), match[0]) if match else (0, 0, b"")
+    return data[:start] + b"[" * depth + inner + b"]" * depth + data[stop:]
+
+
+def _binary(data: bytes, rng: random.Random) -> bytes:
+    """Another kind of file under this name."""
+    return rng.choice(_BINARY) + rng.choice((b"", rng.randbytes(100), data))
+
+
 def _bytes(data: bytes, rng: random.Random) -> bytes:
     """Bytes that belong to no text."""
     at = rng.randrange(len(data) + 1)
@@ -155,7 +223,9 @@ def _dressed(data: bytes, rng: random.Random) -> bytes:
 
 _OF_BYTES = (
     _numbers, _numbers, _numbers, _scaled, _scaled, _exponents, _words, _bytes, _cut, _dressed,
+    _separator, _nested, _binary,
     *map(_of_lines, (_delete_line, _repeat_line, _delete_lines, _shuffle, _column, _cells, _cells)),
+    *map(_of_lines, (_scattered, _scattered, _scattered, _run_of_dummies, _other_numbers, _other_numbers)),
 )  # fmt: skip
 
 
@@ -180,12 +250,12 @@ _OF_ARGUMENTS = (_change_value, _drop, _repeat, _add_option, _add_option)
 
 
 def mangle_names(folder: Path, rng: random.Random) -> None:
-    """One file is a folder, a link to itself, gone, or must not be read."""
+    """One file is a folder, a link to itself, gone, or a device that does not end."""
     files = [file for file in folder.rglob("*") if file.is_file()]
     file = rng.choice(files)
     file.unlink()
-    kind = rng.choice(("gone", "folder", "loop"))
+    kind = rng.choice(("gone", "folder", "loop", "/dev/zero", "/dev/urandom", "/dev/null"))
     if kind == "folder":
         file.mkdir()
-    elif kind == "loop":
-        file.symlink_to(file.name)
+    elif kind != "gone":
+        file.symlink_to(file.name if kind == "loop" else kind)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import random
+import re
 import shutil
 import signal
 import sys
@@ -26,6 +27,12 @@ LONGEST_S = 60.0  # of the processor's time: neither a loaded machine nor a slow
 LONGEST_WAIT_S = 300.0
 LONGEST_SENTENCE = 300
 _OPTIONS = dict(commands())
+# Words of libraries and of Python, which mean nothing to a user.
+_FOREIGN = re.compile(
+    r"0x[0-9a-f]{7}|broadcast|same shape|reshape|singular|ndarray|dtype|out of bounds|NoneType|_io\.|Traceback|"
+    r"\w+Error\b|invalid value encountered|must be real|"
+    r"not subscriptable|unpack|concatenate|positional|'\w+' object|integer string"
+)
 
 
 class Hang(BaseException):
@@ -38,6 +45,7 @@ class Case(NamedTuple):
     program: str
     arguments: list[str]
     stdin: bytes
+    mangled: str = ""  # file of the folder
 
 
 class Ended(NamedTuple):
@@ -57,7 +65,7 @@ def made_case(seed: int, files: Path, folder: Path) -> Case:
     words = rng.choice(LINES[command]).split()
     stdin = (files / STREAM).read_bytes()
     read = read_files(words, files, folder)
-    what = rng.random()
+    what, mangled = rng.random(), ""
     if "-" in words and what < 0.8:
         stdin = mangled_file(stdin, rng)
     elif read and what < 0.65:
@@ -65,11 +73,12 @@ def made_case(seed: int, files: Path, folder: Path) -> Case:
         inside = [file for file in sorted(target.rglob("*")) if file.is_file()] if target.is_dir() else [target]
         file = rng.choice(inside)
         file.write_bytes(mangled_file(file.read_bytes(), rng))
+        mangled = file.name
     elif read and what < 0.7:
         mangle_names(folder, rng)
     else:
         words = mangled_arguments(words, _OPTIONS[command], rng)
-    return _case(command, words, stdin)
+    return _case(command, words, stdin)._replace(mangled=mangled)
 
 
 def extreme_case(extreme: Extreme, files: Path, folder: Path) -> Case:
@@ -106,7 +115,7 @@ def _asks_for_much(words: Sequence[str]) -> Iterator[bool]:
     for option, word in pairwise(words):
         value = word.replace("_", "")  # 1_000 is a number too
         most = 3000 if option == "--duration" else 100
-        yield option.startswith("--") and value.isascii() and value.isdigit() and most < int(value) < 10**7
+        yield option.startswith("--") and value.isascii() and value.isdigit() and most < float(value) < 1e7
 
 
 def run_case(case: Case, folder: Path, seconds: float = LONGEST_S) -> Ended:
@@ -136,6 +145,11 @@ def faults(case: Case, ended: Ended, before: set[str], folder: Path) -> Iterator
         yield "a line of stderr without the program's name"
     if any(not char.isprintable() for line in lines for char in line):
         yield "control characters on stderr"
+    if foreign := _FOREIGN.search(ended.err):
+        yield f"foreign words: {foreign[0]}"
+    begun = lines[-1].removeprefix(f"{case.program}: ").partition(":")[0].partition(",")[0] if lines else ""
+    if case.mangled.endswith(".csv") and ended.status == 2 and begun.endswith(".toml"):
+        yield f"names {begun} in place of {case.mangled}"
     if ended.status == 2 and (not lines or len(lines[-1]) > LONGEST_SENTENCE):
         yield f"a sentence of {len(lines[-1]) if lines else 0} characters"
     after = {str(file.relative_to(folder)) for file in folder.rglob("*")}

@@ -38,7 +38,7 @@ def _modulus_through_time(path: Path, time_s: FloatArray) -> FloatArray:
     for name in columns:
         table.require(name, columns)
     table.refuse_unknown(columns)
-    known_s = table.complete_and_distinct("time_s")
+    known_s = table.times()
     order = np.argsort(known_s)
     known_s, modulus_nT = known_s[order], table.complete(columns[1:])[order, 0]
     if not (modulus_nT > 0.0).all():

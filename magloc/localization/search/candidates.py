@@ -31,6 +31,7 @@ _NUMBERS_A_THREAD = 65536  # of bases, which take as long as beginning several t
 # Squares of a candidate's unit moment, along one direction, that only missing channels see.
 _UNSEEN = 1e-7
 _ROWS_AT_ONCE = 64  # whose components stay in the processor's cache
+_LARGEST_SINGLE = 1e15  # of residuals in units of noise
 
 
 def linear_bases(problem: WhitenedModel, gain: FloatArray, row: int, candidates: FloatArray) -> SingleArray:
@@ -115,7 +116,10 @@ def chosen_candidates(
     `orthonormal`: of residuals without some directions, :func:`orthonormal_without` these.
     """
     chosen = np.zeros((len(residual), n_starts), dtype=np.intp)
-    of_rows, cos_apart = residual.astype(np.float32), math.cos(apart_rad)
+    # The order of candidates does not depend on the size of a row, whose squares single precision must hold.
+    largest = np.abs(residual).max(axis=1, keepdims=True, initial=0.0)
+    of_rows = (residual / np.where(largest > _LARGEST_SINGLE, largest, 1.0)).astype(np.float32)
+    cos_apart = math.cos(apart_rad)
     # One piece of memory for all: a new one is cleared by the system first, which takes as long as the choice.
     components = np.empty((min(_ROWS_AT_ONCE, len(residual)), bases.shape[1]), dtype=np.float32)
     for begin in range(0, len(residual), _ROWS_AT_ONCE):

@@ -175,7 +175,7 @@ def _of_places(stack: Stack, places: Sequence[Places], prior: SourcePrior) -> Mi
     in_array = (x[:, :3] - stack.row.origin_m) @ stack.row.R_world_from_array
     sound = np.isfinite(log_weight) & (reach > NEAREST) & (reach < FARTHEST)
     sound &= prior.allows_position(in_array) & prior.allows_moment(x[:, 3:6])
-    dof = stack.z.size - N_SOURCE
+    dof = stack.n_differences - N_SOURCE
     if not sound.any() or (dof > 0 and chi2[sound].min() > chdtri(dof, CONTRADICTION)):
         return None
     S = np.zeros((len(x), N_SOURCE, N_SOURCE))

@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
+from arrays.differences import Differences
 from arrays.typing import FloatArray
 from magloc.chi_square import energy_threshold
 from magloc.measurement.differences import DifferenceMeasurement
@@ -48,6 +49,11 @@ class ChartRow:
     def z(self) -> FloatArray:
         """Measured differences, shape (k,)."""
         return self.measurement.z
+
+    @property
+    def n_differences(self) -> int:
+        """Number of differences k."""
+        return self.z.size
 
     @property
     def model(self) -> DifferenceMeasurement:
@@ -92,6 +98,21 @@ class ChartRow:
     def chart(self, x: FloatArray) -> Chart:
         """About states (..., n)."""
         return Chart.at(x, self.centroid_m, self.radius_m, self.n_pose)
+
+    def padded(self, k: int) -> ChartRow:
+        """Return the row with k differences: those behind its own are zero, of unit noise, and see no source."""
+        own, more = self.measurement, k - self.n_differences
+        differences = Differences(
+            np.pad(own.model.differences.transform, ((0, more), (0, 0))),
+            np.pad(own.model.differences.variance, (0, more), constant_values=1.0),
+        )
+        padded = replace(
+            own,
+            model=replace(own.model, differences=differences),
+            sigma=np.pad(own.sigma, (0, more), constant_values=1.0),
+            effect=np.pad(own.effect, ((0, more), (0, 0))),
+        )
+        return replace(self, measurement=padded) if more else self
 
     def with_lasting_errors(self, lasting: FloatArray) -> ChartRow:
         """The row where only some shares (n_pose,) of the pose's errors have an effect."""

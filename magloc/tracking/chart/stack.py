@@ -27,15 +27,18 @@ from magloc.tracking.results import Row
 
 FEWEST_MEANS, MOST_ROWS_OF_ONE = 16, 4
 """Means of successive rows that stand for them, at least, and how many rows have one at most."""
+MOST_CHANGES = 32
+"""Rows at most, the latest, that miss other channels than the row before: each begins a mean of its own."""
 
 
 @dataclass(frozen=True, eq=False)
 class Stack:
-    """Rows of equally many differences in the order of time, as :class:`ChartRow` of the last one.
+    """Rows in the order of time, as :class:`ChartRow` of the last one.
 
     Attributes
     ----------
     rows : sequence of ChartRow
+        With equally many differences, see :meth:`of`.
     errors, pose_errors : SensorErrors, PoseErrors
         That the rows have, and how long they last.
     motion : MotionModel
@@ -48,6 +51,19 @@ class Stack:
     motion: MotionModel
     n_motion: int = N_SOURCE
     n_pose: int = 0
+
+    @classmethod
+    def of(cls, rows: Sequence[ChartRow], errors: SensorErrors, pose_errors: PoseErrors, motion: MotionModel) -> Stack:
+        """Return the latest of some rows, each of any number of differences."""
+        changes = _changes(rows)
+        latest = rows[changes[-MOST_CHANGES] :] if changes.size >= MOST_CHANGES else rows
+        k = max(row.n_differences for row in latest)
+        return cls(tuple(row.padded(k) for row in latest), errors, pose_errors, motion)
+
+    @cached_property
+    def n_differences(self) -> int:
+        """Number of differences without those that only pad rows."""
+        return int(self._transform.any(axis=2)[self._begin].sum())
 
     @property
     def row(self) -> Row:
@@ -87,7 +103,8 @@ class Stack:
         """First rows of the means."""
         n = len(self.rows)
         n_means = min(n, max(FEWEST_MEANS, -(-n // MOST_ROWS_OF_ONE)))
-        return np.unique(np.linspace(0, n, n_means, endpoint=False).astype(np.intp))
+        even = np.linspace(0, n, n_means, endpoint=False).astype(np.intp)
+        return np.union1d(even, _changes(self.rows))
 
     @cached_property
     def _size(self) -> IntArray:
@@ -192,7 +209,7 @@ class Stack:
     def is_detected(self, sigma_errors: FloatArray) -> bool:
         """Whether the differences stand out of noise and of what all errors may make of them."""
         left = self.whitening @ self.without_source
-        return bool(left @ left > energy_threshold(left.size))
+        return bool(left @ left > energy_threshold(self.n_differences))
 
     def covariance(self, state: FloatArray, *, far: bool = False) -> FloatArray:
         """Of the differences (K, k, k) where the source is at states (K, 6), or so far that there is none."""
@@ -290,6 +307,12 @@ class Stack:
             place[n - 1 - j, at] = place[at, n - 1 - j] = diagonal[:, :3].mean(axis=1)
             moment[n - 1 - j, at] = moment[at, n - 1 - j] = diagonal[:, 3:6].max(axis=1)
         return self._root_of_means(place), self._root_of_means(moment)
+
+
+def _changes(rows: Sequence[ChartRow]) -> IntArray:
+    """Rows that miss other channels than the row before."""
+    available = np.stack([row.row.available for row in rows])
+    return 1 + np.flatnonzero((available[1:] != available[:-1]).any(axis=1))
 
 
 def _of_unit_strength(motion: MotionModel) -> tuple[FloatArray, FloatArray]:

@@ -161,7 +161,7 @@ class Start:
         if not len(seeds.cell):
             array = alone.model.array
             is_linear = array.ambient_fields.any() or not array.channel_is_scalar.any()
-            return None, NOT_ALLOWED if is_linear or alone.z.size >= N_SOURCE else NO_AMBIENT
+            return None, NOT_ALLOWED if is_linear or alone.n_differences >= N_SOURCE else NO_AMBIENT
         found = _components(alone, motion, seeds, known)
         for refined in (_centred, _along_valleys):
             finer = refined(seeds, found, measurement)
@@ -175,7 +175,7 @@ class Start:
         sound &= np.isfinite(found.log_evidence) & found.converged
         if not sound.any():
             return None, NOT_ALLOWED
-        dof = measurement.z.size - N_SOURCE + (0 if known is None else known.n_known)
+        dof = measurement.n_differences - N_SOURCE + (0 if known is None else known.n_known)
         if dof > 0 and found.chi2[sound].min() > chdtri(dof, CONTRADICTION):
             return None, NO_DIPOLE
         log_weight = found.log_evidence + _EVEN * ((seeds.cell < 0) @ np.array([1.0, 2.0, 0.0]))

@@ -22,6 +22,8 @@ REFITS_GROW = 1.03
 SEARCHES_GROW = 1.4
 """How many more there are each time that they are searched for anew."""
 _AT_REST = RandomWalk(0.0, 0.0)
+# Numbers that a moment has: as few differences tell nothing of its place.
+_OF_A_MOMENT = 3
 
 
 class Undetermined:
@@ -56,20 +58,21 @@ class Undetermined:
         return self._told, ""
 
     def _add(self, row: ChartRow, motion: MotionModel) -> None:
-        """One row more; rows of fewer differences than the first one's are left out."""
-        before = self._rows[-1] if self._rows else None
-        if self._told is not None and before is not None:
-            self._told = _predicted(self._told, row, motion, row.row.time_s - before.row.time_s)
-        if row.z.size < (before.z.size if before else 1) or _leads(motion):
+        """One row more."""
+        if not row.n_differences or _leads(motion):
             return
+        if self._told is not None and self._rows:
+            self._told = _predicted(self._told, row, motion, row.row.time_s - self._rows[-1].row.time_s)
         self._rows.append(row)
         self._n_rows += 1
         if self._n_rows >= self._next_fit:
             self._next_fit = int(np.ceil(REFITS_GROW * self._n_rows))
-            self._fit(Stack(tuple(self._rows), self.filter.errors, self.filter.pose_errors, motion))
+            self._fit(Stack.of(tuple(self._rows), self.filter.errors, self.filter.pose_errors, motion))
 
     def _fit(self, stack: Stack) -> None:
         """Weigh places anew, from where they were, and now and then from wherever the rows allow."""
+        if stack.n_differences <= _OF_A_MOMENT:
+            return
         places = [] if self._told is None else [Places.about(self._told)]
         told = weighed(stack, places, self.filter.prior) if self._n_rows < self._next_search else None
         if told is None or effective_number(told) < ENOUGH:

@@ -1,0 +1,56 @@
+"""Numbers and times as callers hand them over, in double precision: masked arrays, dates, durations."""
+
+from __future__ import annotations
+
+import datetime
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from arrays.typing import FloatArray
+
+
+def numbers(values: ArrayLike) -> FloatArray:
+    """Return values as numbers, NaN where a masked array has a mask; TypeError for dates and durations."""
+    import numpy as np
+
+    mask = np.ma.getmask(values)
+    given = np.asarray(values)
+    if given.dtype.kind in "mM":
+        raise TypeError(f"found the type {given.dtype}, expected numbers")
+    if given.dtype != np.float64:
+        given = np.asarray(values, dtype=np.float64)
+    return given if mask is np.ma.nomask else np.where(mask, np.nan, given)
+
+
+def seconds(times: ArrayLike, *, name: str = "time_s", dates: bool = True) -> FloatArray:
+    """Return times as seconds, NaN where there is none.
+
+    Durations (timedelta64) count as such. Dates (datetime64, UTC) count from 1970; without `dates` they are refused,
+    as where times count from an instant of their own.
+    """
+    import numpy as np
+
+    mask = np.ma.getmask(times)
+    given = np.asarray(times)
+    if given.dtype.kind == "O":
+        given = np.array([_of_object(time) for time in given.ravel().tolist()]).reshape(given.shape)
+    if given.dtype.kind == "M":
+        if not dates:
+            raise ValueError(f"Input {name} must be seconds or durations from the start; instead received dates.")
+        given = given - np.datetime64(0, "s")
+    if given.dtype.kind == "m":
+        given = given / np.timedelta64(1, "s")
+    return numbers(given) if mask is np.ma.nomask else np.where(mask, np.nan, numbers(given))
+
+
+def _of_object(time: Any) -> Any:
+    """Return a date or duration of Python or pandas as one of NumPy; anything else as it is."""
+    import numpy as np
+
+    if isinstance(time, datetime.timedelta):
+        return np.timedelta64(time)
+    if isinstance(time, datetime.datetime):
+        return np.datetime64(time.astimezone(datetime.UTC).replace(tzinfo=None) if time.tzinfo else time)
+    return time
