@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping
 from importlib import import_module
-from typing import Any
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:  # loading typing takes longer than all the rest of an import
+    from collections.abc import Callable, Mapping
+    from typing import Any
 
 
 def lazy_names(
