@@ -16,7 +16,7 @@ from types import FrameType
 
 INTERRUPTED = 130
 TERMINATED = 143
-# Over small matrices the threads of BLAS do little but wait for each other. Its own variables, so a user's choice stays.
+# The threads of BLAS do little but wait for each other over small matrices; a choice of the user stays.
 _BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
 # `timeout` sends its signal twice, to the process and to its group; a user who insists takes longer.
 _SAME_SIGNAL_S = 0.05

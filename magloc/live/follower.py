@@ -15,7 +15,6 @@ import numpy as np
 from arrays.array import SensorArray
 from arrays.io.errors import InputError, check_not_negative
 from magloc.ambient import Place, in_world_field, with_ambient_field
-from magloc.blas_threads import one_blas_thread
 from magloc.live.rest import Background, refuse_rest
 from magloc.live.rows import RowParser
 from magloc.live.tally import Clock, Tally
@@ -257,7 +256,6 @@ class Follower:
             return list(rows_of(used))
         return [row for one in used for row in rows_of(one)]  # whose motion is that since the row before
 
-    @one_blas_thread
     def _next_answers(self, rows: Sequence[Row], *, waits: bool) -> list[tuple[Row, TrackPoint | SourcesPoint]]:
         """The first of the rows, or some of them, with what is known of the source there."""
         if self._stopped:
