@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping
 from importlib import import_module
-from typing import Any
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:  # loading typing takes longer than all the rest of an import
+    from collections.abc import Callable, Mapping
+    from typing import Any
+
+_tables: list[Mapping[str, str]] = []
 
 
 def lazy_names(
@@ -19,12 +24,17 @@ def lazy_names(
     def getattr_(name: str) -> object:
         if name not in modules:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        where = modules[name]
-        module, _, of_module = where.partition(":")
-        value = getattr(import_module(module), of_module or name) if module else import_module(of_module)
+        module, _, of_module = modules[name].partition(":")
+        loaded = import_module(module or of_module)
+        from arrays.io.blas_threads import guard_public
+
+        for table in _tables:
+            guard_public(table)
+        value = getattr(loaded, of_module or name) if module else loaded
         setattr(sys.modules[package], name, value)
         return value
 
+    _tables.append(modules)
     public = sorted(modules)
     return getattr_, lambda: public, public
 

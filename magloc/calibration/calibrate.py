@@ -9,7 +9,6 @@ from numpy.typing import ArrayLike
 
 from arrays.array import SensorArray
 from arrays.typing import FloatArray
-from magloc.blas_threads import one_blas_thread
 from magloc.calibration.array import CalibrationPrior, calibrate_on_path, self_calibrate
 from magloc.calibration.model import GAINS, PER_SENSOR, unknowns
 from magloc.calibration.modulus import EllipsoidCalibration, calibrated_in_modulus, symmetric
@@ -21,7 +20,6 @@ from magloc.readings import Readings, without_saturated
 from magloc.truth import Truth, rows_of_same_time
 
 
-@one_blas_thread
 def calibrate(
     array: SensorArray,
     readings: Readings,

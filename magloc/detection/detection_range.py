@@ -7,7 +7,6 @@ from numpy.typing import ArrayLike
 
 from arrays.array import SensorArray
 from arrays.typing import FloatArray
-from magloc.blas_threads import one_blas_thread
 from magloc.chi_square import Detector
 from magloc.detection.dipole_filter import DipoleFilter
 from magloc.detection.matched_filter import MatchedFilterDetector
@@ -25,7 +24,6 @@ _N_DIRECTIONS, _N_MOMENTS = 100, 50
 _EXCEEDANCES = 20
 
 
-@one_blas_thread
 def detection_range(
     array: SensorArray,
     moment_Am2: float,
@@ -78,7 +76,6 @@ def detection_range(
     return float(np.quantile(ranges, 1.0 - share, method="inverted_cdf"))
 
 
-@one_blas_thread
 def detection_ranges(
     array: SensorArray,
     directions: ArrayLike,

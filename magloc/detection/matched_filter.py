@@ -15,7 +15,6 @@ from scipy.optimize import brentq
 
 from arrays.array import SensorArray
 from arrays.typing import FloatArray
-from magloc.blas_threads import one_blas_thread
 from magloc.chi_square import ChiSquareDetector, check_differences, check_probability, check_share
 from magloc.detection.dipole_filter import DipoleFilter
 from magloc.directions import fibonacci_directions
@@ -63,7 +62,6 @@ class MatchedFilterDetector:
     seed: int
 
     @classmethod
-    @one_blas_thread
     def of(
         cls, array: SensorArray, false_alarm_rate: float = FALSE_ALARM, *, n_draws: int = 100_000, seed: int = 0
     ) -> MatchedFilterDetector:

@@ -16,6 +16,7 @@ from functools import partial
 from itertools import islice
 from typing import Any, TypeVar
 
+from arrays.io.blas_threads import one_blas_thread
 from arrays.io.errors import InputError, of_extra
 from magloc.grids.cube import Box, Chunk, CubeMap, computed
 
@@ -73,7 +74,7 @@ def _by_worker(work: Callable[[Item], Result], item: Item) -> Result:
     import numba
     from distributed import get_worker
 
-    with _one_chunk:
+    with _one_chunk, one_blas_thread:
         numba.set_num_threads(min(get_worker().state.nthreads, numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
         return work(item)
 

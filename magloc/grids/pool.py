@@ -10,6 +10,8 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from multiprocessing import get_context
 
+from arrays.io.blas_threads import one_blas_thread
+
 
 @contextmanager
 def process_pool(processes: int) -> Iterator[ProcessPoolExecutor]:
@@ -32,4 +34,5 @@ def _prepare() -> None:
     """Settings of a process: one thread, and an interruption is the business of the process that started it."""
     os.environ["NUMBA_NUM_THREADS"] = "1"  # compiled code is not loaded yet
     warnings.simplefilter("ignore")  # those of NumPy: what a user is told is logged
+    one_blas_thread.__enter__()  # for good
     signal.signal(signal.SIGINT, signal.SIG_IGN)

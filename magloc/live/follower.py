@@ -15,7 +15,6 @@ import numpy as np
 from arrays.array import SensorArray
 from arrays.io.errors import InputError, check_not_negative
 from magloc.ambient import Place, in_world_field, with_ambient_field
-from magloc.blas_threads import one_blas_thread
 from magloc.live.rest import Background, refuse_rest
 from magloc.live.rows import RowParser
 from magloc.live.tally import Clock, Tally
@@ -276,7 +275,6 @@ class Follower:
             if tracks and len(self._first_points) == FEWEST_ROWS:
                 warn_of_strengths(self._first_points)
 
-    @one_blas_thread
     def _next_answers(self, rows: Sequence[Row], *, waits: bool) -> list[tuple[Row, TrackPoint | SourcesPoint]]:
         """The first of the rows, or some of them, with what is known of the source there."""
         if self._stopped:

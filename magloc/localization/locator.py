@@ -21,7 +21,6 @@ from arrays.typing import FloatArray, IntArray
 from magloc.ambient import in_world_field
 from magloc.averages import average as averaged
 from magloc.averages import averaging_array, complete_rows
-from magloc.blas_threads import one_blas_thread
 from magloc.conditioning import NO_BACKGROUND
 from magloc.fields.multipole import check_body_length
 from magloc.localization.body_errors import body_covariances
@@ -130,7 +129,6 @@ class Locator:
         ambient = None if ambient_T is None else np.asarray(ambient_T, dtype=np.float64)[None]
         return self.fit_rows(numbers(readings_T)[None], ambient)[0]
 
-    @one_blas_thread
     def fit_rows(
         self,
         readings_T: ArrayLike,
@@ -264,7 +262,6 @@ class _Rows:
         )
 
 
-@one_blas_thread
 def fit_at_rest(
     array: SensorArray,
     readings_T: FloatArray,
@@ -294,7 +291,6 @@ def fit_at_rest(
     return found.fixes()[0]
 
 
-@one_blas_thread
 def locate(
     array: SensorArray,
     readings: Readings | ArrayLike,

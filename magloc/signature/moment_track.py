@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike
 from arrays.array import SensorArray
 from arrays.io.errors import InputError
 from arrays.typing import FloatArray
-from magloc.blas_threads import one_blas_thread
 from magloc.chi_square import mean_bounds, normalised_square
 from magloc.kalman import estimability
 from magloc.localization.fit.results import is_misfit
@@ -123,7 +122,6 @@ class MomentTrack(TrackColumns):
         """Whether no dipole on this path explains the readings: χ² is beyond noise by one in a million."""
         return bool(is_misfit(self.chi2, self.dof))
 
-    @one_blas_thread
     @np.errstate(over="ignore", divide="ignore", invalid="ignore")
     def consistency(self, truth: Truth) -> MomentConsistency:
         """Errors of the moment, their NEES and NIS, and the least error that is possible.
@@ -153,7 +151,6 @@ class MomentTrack(TrackColumns):
         )
 
 
-@one_blas_thread
 @np.errstate(over="ignore", divide="ignore", invalid="ignore")
 def track_moment(
     array: SensorArray,
@@ -211,7 +208,6 @@ def track_moment(
     return found
 
 
-@one_blas_thread
 @np.errstate(over="ignore", divide="ignore", invalid="ignore")
 def track_moments(
     array: SensorArray,

@@ -24,7 +24,6 @@ from arrays.array import SensorArray
 from arrays.io.errors import InputError
 from arrays.io.lazy import by_name
 from arrays.typing import FloatArray
-from magloc.blas_threads import one_blas_thread
 from magloc.fields import dipole
 from magloc.localization.fit.results import is_misfit
 from magloc.measurement.plausibility import usable_readings, warn_of_moments
@@ -264,7 +263,6 @@ class Signature:
         return f"<pre>{escape(repr(self))}</pre>"
 
 
-@one_blas_thread
 @np.errstate(over="ignore", divide="ignore", invalid="ignore")
 def fit_signature(
     array: SensorArray,

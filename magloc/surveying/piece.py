@@ -10,7 +10,6 @@ import numpy as np
 
 from arrays.array import SensorArray
 from arrays.typing import FloatArray, IntArray
-from magloc.blas_threads import one_blas_thread
 from magloc.grids.work import Arrays
 from magloc.localization.fit.prior import SourcePrior
 from magloc.readings import Readings
@@ -147,13 +146,11 @@ class Piece:
         return np.unique(self.tile.rows // together, return_inverse=True)[1]
 
 
-@one_blas_thread
 def strongest_in(piece: Piece) -> Arrays:
     """The strongest sources, after some rounds."""
     return _rounds_in(piece, _FIRST_ROUNDS)
 
 
-@one_blas_thread
 def sources_in(piece: Piece) -> Arrays:
     """All sources that are significant; of those beside the tile its neighbours tell."""
     return _rounds_in(piece, MOST_ROUNDS)
@@ -169,7 +166,6 @@ def _rounds_in(piece: Piece, most: int) -> Arrays:
     return dict(vars(found_in(model, groups, grid, piece.known, most, piece.tile.holds)))
 
 
-@one_blas_thread
 def targets_in(piece: Piece) -> Arrays:
     """The sources that are known, fitted to all rows: targets of the tile, reach, and what is left of its rows."""
     model = piece.model()

@@ -16,7 +16,6 @@ from numba import get_num_threads
 from scipy.special import chdtri
 
 from arrays.array import SensorArray
-from magloc.blas_threads import one_blas_thread
 from magloc.grids.work import Arrays, workers
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.measurement.plausibility import warn_of_doubts
@@ -38,7 +37,6 @@ _MOST_DOUBTED = 1_000_000  # rows
 _LONGEST_BODY_M = 10.0
 
 
-@one_blas_thread
 def survey(
     array: SensorArray,
     readings: Readings | Sequence[Readings],

@@ -16,7 +16,6 @@ from numpy.typing import ArrayLike
 from arrays.array import SensorArray
 from arrays.io.lazy import by_name
 from arrays.typing import BoolArray, FloatArray, IntArray, Vector
-from magloc.blas_threads import one_blas_thread
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import EVERYWHERE, Intervals
 from magloc.measurement.nuisances import Drift
@@ -225,7 +224,6 @@ class Track(TrackColumns):
         test = self.innovations
         return "\n".join([super().table(), *filter(None, (test.reason, test.caution))])
 
-    @one_blas_thread
     def consistency(self, truth: Truth) -> Consistency:
         """Errors of the track, its NEES and its NIS, and the least error that is possible where the moment is known.
 
@@ -248,7 +246,6 @@ class Track(TrackColumns):
         return consistency(self, self.tracker, self._rows, position_m, moment_Am2, bound)
 
 
-@one_blas_thread
 def track(
     array: SensorArray,
     readings: Readings | ArrayLike,

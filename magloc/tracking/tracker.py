@@ -22,7 +22,6 @@ from scipy.special import chdtri
 
 from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray
-from magloc.blas_threads import one_blas_thread
 from magloc.kalman import (
     block_update,
     normalised_innovation_squared,
@@ -138,7 +137,6 @@ class Tracker:
         self._row_before: Row | None = None
         self._health, self._suspects = SensorHealth.of(array.n_sensors), Suspects.of(array.n_sensors)
 
-    @one_blas_thread
     def update(self, row: Row | Readings) -> TrackPoint:
         """What is known of the source after one more row.
 

@@ -154,3 +154,86 @@ def test_ended_at_any_moment(first, files, tmp_path):
         case = made_case(seed)
         found += [f"seed {seed}: {case}: {fault}" for fault in faults(case, files, place / "case")]
     assert not found, "\n".join(found)
+
+
+# A program whose modules swallow what is raised while they load, as some libraries do.
+GREEDY = """
+import os, signal, time
+try:
+    os.kill(os.getpid(), signal.{name})
+    time.sleep(0.01)
+except BaseException:
+    pass
+print("loaded", flush=True)
+"""
+LOADS_FIRST = "import greedy, time\ndef main():\n    time.sleep(60)\n"
+LOADS_LATER = "import time\ndef main():\n    import greedy\n    time.sleep(60)\n"
+NEVER_ENDS = """
+import time
+def main():
+    print("runs", flush=True)
+    while True:
+        try:
+            time.sleep(60)
+        except BaseException:
+            print("swallowed", flush=True)
+"""
+TIDIES_UP = """
+import os, signal, time
+def main():
+    try:
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(60)
+    finally:
+        os.kill(os.getpid(), signal.SIGTERM)
+        print("tidied", flush=True)
+"""
+ENTER = "import sys; from magloc.cli.entry import entered; sys.exit(entered('greedy_program'))"
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs signals")
+class TestEntry:
+    @pytest.fixture
+    def start(self, tmp_path):
+        """Start a program whose application has a source text."""
+
+        def started(app: str, name: str = "SIGTERM") -> subprocess.Popen[str]:
+            (folder := tmp_path / "greedy_program" / "cli").mkdir(parents=True)
+            (folder / "app.py").write_text(app)
+            (tmp_path / "greedy.py").write_text(GREEDY.format(name=name))
+            return subprocess.Popen(
+                [sys.executable, "-c", ENTER],
+                env={**os.environ, "PYTHONPATH": os.pathsep.join([str(REPOSITORY), str(tmp_path)])},
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+            )
+
+        return started
+
+    @pytest.mark.parametrize("app", [LOADS_FIRST, LOADS_LATER], ids=["first", "later"])
+    @pytest.mark.parametrize(("name", "said"), [("SIGINT", "interrupted"), ("SIGTERM", "terminated")])
+    def test_one_that_a_loading_module_swallows_acts_when_it_is_loaded(self, start, app, name, said):
+        with start(app, name) as process:
+            out, err = process.communicate(timeout=WAIT_S)
+        assert (process.returncode, out, err) == (
+            128 + signal.Signals[name],
+            "loaded\n",
+            f"greedy_program: {said}\n",
+        )
+
+    @pytest.mark.parametrize("first", [signal.SIGINT, signal.SIGTERM])
+    @pytest.mark.parametrize("second", [signal.SIGINT, signal.SIGTERM])
+    def test_the_second_one_ends_a_program_that_swallows_the_first(self, start, first, second):
+        with start(NEVER_ENDS) as process:
+            process.stdout.readline()
+            process.send_signal(first)
+            assert process.stdout.readline() == "swallowed\n"
+            time.sleep(0.2)
+            process.send_signal(second)
+            assert process.wait(timeout=WAIT_S) == 128 + second
+
+    def test_the_same_one_twice_at_once_lets_it_tidy_up(self, start):
+        with start(TIDIES_UP) as process:
+            out, err = process.communicate(timeout=WAIT_S)
+        assert (process.returncode, out, err) == (143, "tidied\n", "greedy_program: terminated\n")

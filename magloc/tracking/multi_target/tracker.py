@@ -10,7 +10,6 @@ import numpy as np
 
 from arrays.array import SensorArray
 from arrays.typing import FloatArray
-from magloc.blas_threads import one_blas_thread
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.locator import Locator
 from magloc.measurement.rows import check_magnitudes, check_spans
@@ -139,7 +138,6 @@ class SourcesTracker:
         self._pause = _FIRST_PAUSE
         self._late_pause, self._next_late = _LATE_PAUSE, 0
 
-    @one_blas_thread
     def update(self, row: Row | Readings) -> SourcesPoint:
         """What is known of all sources after one more row.
 
