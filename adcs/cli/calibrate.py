@@ -29,6 +29,7 @@ def calibrate(
     config: Path,
     attitude: Attitude = "none",
     time_shift_s: Annotated[float, Parameter(name="--time-shift-s")] = 10.0,
+    allow_old_elements: Flag = False,
     out: Path | None = None,
     json: Flag = False,
     common: QuietOptions = QuietOptions(),  # noqa: B008 - frozen
@@ -50,6 +51,8 @@ def calibrate(
         the orbital frame ("orbital"), unknown there.
     time_shift_s : float
         One standard deviation of the time of the positions against that of the readings; 0 = known.
+    allow_old_elements : bool
+        Take two-line elements 30 days or more from their epoch too.
     out : Path, optional
         CSV file for the log with calibrated readings.
     json : bool
@@ -61,7 +64,7 @@ def calibrate(
 
     if out is not None:
         refuse_unwritable(out, "--out", ".csv")
-    scenario = adcs.read_scenario(str(config))
+    scenario = adcs.read_scenario(str(config), allow_old_elements=allow_old_elements)
     with naming_options():
         prior = adcs.MagnetometerPrior(
             noise_T=scenario.satellite.magnetometer.sigma_T,
@@ -79,7 +82,8 @@ def calibrate(
         _write(out, log, result)
         tell(common, f"wrote {out}")
     warn(common, warnings_of(result))
-    print_result(report(result), lines(result, attitude), as_json=json)
+    told = {"warnings": [*scenario.warnings, *warnings_of(result)]}
+    print_result(report(result) | told, lines(result, attitude), as_json=json)
 
 
 def warnings_of(result: MagnetometerCalibration) -> list[str]:
@@ -115,7 +119,6 @@ def report(result: MagnetometerCalibration) -> dict[str, Any]:
         "rows": len(result.used),
         "rows_used": int(result.used.sum()),
         "undetermined": list(result.undetermined),
-        "warnings": warnings_of(result),
     }
 
 

@@ -55,7 +55,7 @@ def estimate(
     from adcs.io.estimates import estimate_columns, rows_of, summary_lines
 
     refuse_file(out, "--out")
-    scenario = adcs.read_scenario(str(config))
+    scenario = adcs.read_scenario(str(config), allow_old_elements=options.allow_old_elements)
     scenario = scenario.changed({"estimate": options.estimate(scenario.estimate.states)})
     settings = scenario.estimator(f"{config}, table estimate")
     record = read_log(telemetry, scenario)
@@ -70,7 +70,7 @@ def estimate(
         adcs.write_aem(out / "attitude.aem", utc, track.rotation[track.rows].as_quat())
         adcs.write_oem(out / "orbit.oem", utc, *scenario.satellite.orbit.position_velocity_eci(utc))
         tell(common, f"wrote estimates.csv, attitude.aem, orbit.oem, estimates.png and consistency.png into {out}")
-    result = {"results": rows_of(columns), "warnings": track.warnings}
+    result = {"results": rows_of(columns), "warnings": [*scenario.warnings, *track.warnings]}
     print_result(result, summary_lines(track), as_json=json)
 
 

@@ -62,11 +62,14 @@ class EstimateOptions:
         With other sensors the scenario's own states stay, but for the bias of a sensor that is not in use.
     filter : str
         As of `adcs run tabletsat`.
+    allow_old_elements : bool
+        Take two-line elements 30 days or more from their epoch too.
     """
 
     sensors: str | None = None
     states: str | None = None
     filter: Filter | None = None
+    allow_old_elements: Flag = False
 
     def estimate(self, own: Sequence[str]) -> dict[str, Any]:
         """Keys of the table ``estimate``, and what replaces them; of its own states those stay that sensors measure."""
@@ -108,6 +111,8 @@ class ScenarioOptions(EstimateOptions):
         ("any").
     start_error_deg : float
         Error per axis of what the filter starts from.
+    allow_old_elements : bool
+        Take two-line elements 30 days or more from their epoch too.
     closed_loop_F : bool
         The Jacobian as printed by Ivanov et al., which takes the feedback of the control for dynamics.
     """

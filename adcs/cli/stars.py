@@ -43,6 +43,7 @@ def stars(
     """Identify the stars of images by a catalogue, without knowing where the camera looked.
 
     Of frames with the true numbers of the stars (result.csv) it says how many were found and how many were wrong.
+    Mirrored images are solved too, and named.
 
     Parameters
     ----------
@@ -138,18 +139,19 @@ def _pictures(
         if isinstance(found, NoFix):
             row |= dict.fromkeys(("ra_deg", "dec_deg", "roll_deg", "scale_arcsec", "scale_sigma_arcsec"))
             row |= dict.fromkeys(("corner_px", "corner_sigma_px", "field_deg"))
-            row |= {"matched": 0, "residual_arcsec": None, "reason": found.reason}
+            row |= {"mirrored": None, "matched": 0, "residual_arcsec": None, "reason": found.reason}
         else:
             row |= _where(found.R_catalogue_from_frame)
             camera, sigma = found.pose.camera, np.sqrt(np.diag(found.pose.covariance))
             width = math.atan(0.5 * picture.shape[1] * math.tan(camera.rad_per_px))
-            corner_px = 0.5 * math.hypot(camera.width_px, camera.height_px)
+            half_diagonal_px = 0.5 * math.hypot(camera.width_px, camera.height_px)
             row |= {
                 "scale_arcsec": _arcsec(camera.rad_per_px),
                 "scale_sigma_arcsec": _arcsec(camera.rad_per_px * sigma[3]),
-                "corner_px": camera.radial * camera.corner**2 * corner_px,
-                "corner_sigma_px": sigma[4] * camera.corner**2 * corner_px,
+                "corner_px": camera.corner_shift_px,
+                "corner_sigma_px": sigma[4] * camera.corner**2 * half_diagonal_px,
                 "field_deg": math.degrees(2.0 * width),
+                "mirrored": found.mirrored,
                 "matched": len(found.stars),
                 "residual_arcsec": _arcsec(found.rms_rad),
                 "reason": "",
@@ -164,6 +166,10 @@ def _pictures(
     print_result({"pictures": rows}, [_picture_line(row) for row in rows], as_json=json)
 
 
+def _mirrored(row: dict[str, Any]) -> str:
+    return "; mirrored: solved with left and right exchanged" if row["mirrored"] else ""
+
+
 def _arcsec(angle_rad: float) -> float:
     return math.degrees(angle_rad) * 3600.0
 
@@ -176,7 +182,7 @@ def _picture_line(row: dict[str, Any]) -> str:
         f"{row['file']}: RA {row['ra_deg']:.3f}°, Dec {row['dec_deg']:+.3f}°, roll {row['roll_deg']:+.2f}°; "
         f"{row['scale_arcsec']:.3f} ± {row['scale_sigma_arcsec']:.3f} arcsec/px, {row['field_deg']:.2f}° wide, "
         f"corners bent by {row['corner_px']:+.1f} ± {row['corner_sigma_px']:.1f} px; "
-        f"{row['matched']} stars, {row['residual_arcsec']:.1f} arcsec rms"
+        f"{row['matched']} stars, {row['residual_arcsec']:.1f} arcsec rms{_mirrored(row)}"
     )
 
 
@@ -229,17 +235,21 @@ def _row(catalogue: StarCatalogue, image: StarFrame, fix: StarFix | NoFix) -> di
     from adcs.stars.identification import NoFix
 
     numbers = np.full(len(image.points_px), NO_STAR)
-    row: dict[str, Any] = {"stars": len(numbers), "ra_deg": None, "dec_deg": None, "roll_deg": None, "rms_arcsec": None}
+    row: dict[str, Any] = {"stars": len(numbers)}
+    row |= dict.fromkeys(("ra_deg", "dec_deg", "roll_deg", "rms_arcsec", "mirrored"))
     if isinstance(fix, NoFix):
         return {**row, "reason": fix.reason, "hip": numbers}
     numbers[fix.stars[:, 0]] = catalogue.numbers[fix.stars[:, 1]]
     row |= _where(fix.R_catalogue_from_frame)
-    row["rms_arcsec"] = float(np.degrees(fix.rms_rad) * 3600.0)
+    row |= {"rms_arcsec": _arcsec(fix.rms_rad), "mirrored": fix.mirrored}
     return {**row, "reason": "", "hip": numbers}
 
 
 def _where(R_catalogue_from_frame: FloatArray) -> dict[str, float]:
-    """Right ascension and declination of the centre, and the angle of the image's y from north, towards east."""
+    """Right ascension and declination of the centre, and the angle of the image's y from north, towards east.
+
+    The same in a mirrored image, where left and right are exchanged and y stays.
+    """
     right, up, back = R_catalogue_from_frame.T
     north = np.array([0.0, 0.0, 1.0])
     return {
@@ -277,7 +287,7 @@ def _line(number: int, row: dict[str, Any]) -> str:
     identified = sum(int(hip) >= 0 for hip in row["hip"])
     return (
         f"frame {number}: RA {row['ra_deg']:.3f}°, Dec {row['dec_deg']:+.3f}°, roll {row['roll_deg']:+.2f}°; "
-        f"{identified} of {row['stars']} stars, {row['rms_arcsec']:.1f} arcsec rms"
+        f"{identified} of {row['stars']} stars, {row['rms_arcsec']:.1f} arcsec rms{_mirrored(row)}"
     )
 
 

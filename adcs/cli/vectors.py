@@ -19,6 +19,7 @@ def vectors(
     *,
     config: Path,
     method: VectorMethod = "quest",
+    allow_old_elements: Flag = False,
     out: Path | None = None,
     json: Flag = False,
     common: QuietOptions = QuietOptions(),  # noqa: B008 - frozen
@@ -33,6 +34,8 @@ def vectors(
         Scenario file, as of `adcs estimate`: its orbit, the noise of both sensors, its table log.
     method : str
         Least squares of both vectors ("quest"), or the Sun exactly and the field for the turn around it ("triad").
+    allow_old_elements : bool
+        Take two-line elements 30 days or more from their epoch too.
     out : Path, optional
         Folder for vectors.csv.
     json : bool
@@ -44,7 +47,7 @@ def vectors(
     from arrays.io.csv import write_columns
 
     refuse_file(out, "--out")
-    scenario = adcs.read_scenario(str(config))
+    scenario = adcs.read_scenario(str(config), allow_old_elements=allow_old_elements)
     record = adcs.read_telemetry(telemetry, scenario.step_s, layout=scenario.log)
     with naming(str(telemetry)):
         track = adcs.vector_attitude(record, scenario.satellite, method=method)

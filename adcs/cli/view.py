@@ -17,6 +17,7 @@ from magloc.cli.framework import QuietOptions
 from magloc.cli.options import Port, naming_outputs
 
 if TYPE_CHECKING:
+    from adcs.io.scenario_files import AttitudeFile
     from arrays.typing import FloatArray
 
 _OF_A_LAYOUT = {"log", "format_version"}
@@ -29,6 +30,7 @@ def view(
     *,
     config: Path | None = None,
     truth: Path | None = None,
+    allow_old_elements: Flag = False,
     html: Path | None = None,
     png: Path | None = None,
     movie: Path | None = None,
@@ -51,6 +53,8 @@ def view(
     truth : Path, optional
         CSV file of the true attitude of telemetry, such as `adcs run --out` writes: time_s, qw, qx, qy, qz, orbital
         frame from body.
+    allow_old_elements : bool
+        Take two-line elements 30 days or more from their epoch too.
     html : Path
         Write one static HTML file that plays and needs no server.
     png : Path
@@ -73,7 +77,8 @@ def view(
     if described is None or set(described[1]) <= _OF_A_LAYOUT:
         track, *made_of, q_true = _of_inertial_unit(log, described, truth)
     else:
-        track, *made_of, q_true = _of_satellite(log, described, truth)
+        scenario = scenario_of(*described, allow_old_elements=allow_old_elements)
+        track, *made_of, q_true = _of_satellite(log, scenario, truth)
     warn(common, track.warnings)
     files: dict[str, Any] = {"html": html, "png": png, "movie": movie}
     written_or_served(
@@ -94,13 +99,13 @@ def _of_inertial_unit(log: Path, layout: tuple[str, dict[str, Any]] | None, trut
     return inertial_attitude(log, data), data, None, data.q_true
 
 
-def _of_satellite(log: Path, described: tuple[str, dict[str, Any]], truth: Path | None) -> tuple[Any, ...]:
-    scenario = scenario_of(*described)
+def _of_satellite(log: Path, scenario: AttitudeFile, truth: Path | None) -> tuple[Any, ...]:
     telemetry = read_log(log, scenario)
     q_true = None if truth is None else _truth(truth, telemetry.time_s)
     with naming(str(log)):
-        sensors = scenario.estimator(f"{described[0]}, table estimate")
-        track = adcs.estimate(telemetry, scenario.satellite, sensors=sensors)
+        track = adcs.estimate(
+            telemetry, scenario.satellite, sensors=scenario.estimator(f"{scenario.path}, table estimate")
+        )
     return track, telemetry, scenario.satellite, q_true
 
 

@@ -6,13 +6,15 @@ An orbit is anything with :meth:`Orbit.position_velocity_eci`. Positions and vel
 
 from __future__ import annotations
 
+import logging
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 
-from adcs.frames import Dates, Instants, R_eci_from_teme, instants, julian_dates, pyerfa, turned
+from adcs.frames import DAY_S, Dates, Instants, R_eci_from_teme, instants, julian_dates, pyerfa, turned
 from arrays.io.errors import check_positive, of_extra
 from arrays.typing import FloatArray
 
@@ -20,6 +22,13 @@ MU_M3_S2 = 3.986004418e14
 """Gravitational parameter of the Earth, WGS-84."""
 EARTH_RADIUS_M = 6_378_137.0
 """Equatorial radius, WGS-84: altitudes of circular orbits are above it."""
+WARNED_DAYS, REFUSED_DAYS = 7.0, 30.0
+"""Age of two-line elements from which on there is a warning, and from which on they are refused."""
+_LOG = logging.getLogger(__name__)
+_FIRST_M, _PER_DAY_M = 1e3, 2e3  # published errors of two-line elements of low orbits: 1 km, and 1 to 3 km a day
+_DRAG_SHARE = 0.2  # by which models of the atmosphere are wrong
+_SURFACE_FIELD_T = 45e-6
+_DECAYED = 6  # of SGP4's errors
 
 
 class Orbit(Protocol):
@@ -164,6 +173,8 @@ class Sgp4Orbit:
     ----------
     line1, line2 : str
         The two lines of the elements.
+    allow_old_elements : bool
+        Compute positions at instants 30 days or more from the epoch too.
 
     Raises
     ------
@@ -171,7 +182,7 @@ class Sgp4Orbit:
         A line is malformed, or its checksum is wrong.
     """
 
-    def __init__(self, line1: str, line2: str) -> None:
+    def __init__(self, line1: str, line2: str, *, allow_old_elements: bool = False) -> None:
         with of_extra("satellites", "an orbit of two-line elements"):
             from sgp4.api import Satrec
 
@@ -182,6 +193,8 @@ class Sgp4Orbit:
                     f"instead received {line!r}."
                 )
         self._satellite = Satrec.twoline2rv(line1, line2)
+        self._allow_old_elements = allow_old_elements
+        self._is_told = False
 
     @property
     def epoch(self) -> np.datetime64:
@@ -189,23 +202,84 @@ class Sgp4Orbit:
         microseconds = round((self._satellite.jdsatepoch - 2_440_587.5 + self._satellite.jdsatepochF) * 86_400e6)
         return np.datetime64(microseconds, "us")
 
+    def age_days(self, utc: Instants) -> float:
+        """Time of the instants (...) from the epoch, the longest, before or after it [days]."""
+        return float(np.max(np.abs((instants(utc) - self.epoch).astype(np.float64)))) / (1e6 * DAY_S)
+
+    def relative_error(self, utc: Instants) -> float:
+        """Error of the position that is expected at worst of the instants (...), over the distance from the centre.
+
+        1 km at the epoch, 2 km a day, and 20 % of what drag moves the satellite by, which grows as the square of time.
+        The two ends of the orbit are no farther from each other than 2.
+        """
+        days = self.age_days(utc)
+        error_m = _FIRST_M + _PER_DAY_M * days + _DRAG_SHARE * self._drag_of_a_day_m * days**2
+        return min(error_m / self._radius_m, 2.0)
+
+    @property
+    def _radius_m(self) -> float:
+        """Semi-major axis."""
+        return float(1e3 * self._satellite.a * self._satellite.radiusearthkm)
+
+    @cached_property
+    def _drag_of_a_day_m(self) -> float:
+        """Distance by which drag moves the satellite in the first day."""
+        from sgp4.api import WGS72, Satrec
+
+        own, without = self._satellite, Satrec()
+        since_1949 = own.jdsatepoch - 2_433_281.5 + own.jdsatepochF
+        shape = own.ecco, own.argpo, own.inclo, own.mo, own.no_kozai, own.nodeo
+        without.sgp4init(WGS72, "i", 0, since_1949, 0.0, own.ndot, own.nddot, *shape)
+        (_, here, _), (_, there, _) = (one.sgp4_tsince(DAY_S / 60.0) for one in (own, without))
+        moved_m = 1e3 * math.dist(here, there)
+        return moved_m if math.isfinite(moved_m) else math.inf  # it decays within that day
+
+    def _age(self, utc: Instants) -> str:
+        """Age and what it means, in words."""
+        relative = self.relative_error(utc)
+        field_T = min(3.0 * relative, 2.0) * _SURFACE_FIELD_T * (EARTH_RADIUS_M / self._radius_m) ** 3
+        values = 1e-3 * relative * self._radius_m, 1e9 * field_T, math.degrees(min(2.0 * relative, math.pi))
+        error_km, field_nT, angle_deg = (f"{float(f'{value:.2g}'):g}" for value in values)
+        return (
+            f"{self.age_days(utc):.1f} days from the epoch {np.datetime_as_string(self.epoch, 's')} of the two-line "
+            f"elements, where positions may be off by {error_km} km, the field by {field_nT} nT and an attitude from "
+            f"it by {angle_deg}°"
+        )
+
+    def age_warning(self, utc: Instants) -> str:
+        """Sentence on elements that are a week or more from some instants (...), empty where they are not."""
+        if self.age_days(utc) < WARNED_DAYS:
+            return ""
+        return f"found instants {self._age(utc)}: use elements of that time"
+
+    def refuse_old(self, utc: Instants) -> None:
+        """Raise ValueError if elements are 30 days or more from one of some instants (...), unless that is allowed."""
+        if self.age_days(utc) >= REFUSED_DAYS and not self._allow_old_elements:
+            raise ValueError(
+                f"Input utc must be less than {REFUSED_DAYS:g} days from the epoch of the elements; instead received "
+                f"instants {self._age(utc)}. Use elements of that time, or set allow_old_elements."
+            )
+
     def position_velocity_teme(self, utc: Instants) -> tuple[FloatArray, FloatArray]:
         """Position [m] and velocity [m/s] in teme: instants (...) -> two arrays (..., 3).
 
         Raises
         ------
         ValueError
-            SGP4 fails, as for a satellite that has decayed; the message has its reason.
+            An instant is 30 days or more from the epoch, unless that is allowed; or SGP4 fails, as for a satellite that
+            has decayed.
         """
-        from sgp4.api import SGP4_ERRORS
-
+        self.refuse_old(utc)
+        if not self._is_told and (text := self.age_warning(utc)):
+            self._is_told = True
+            _LOG.warning(text)
         day, fraction = julian_dates(utc)
         errors, position, velocity = self._satellite.sgp4_array(np.ravel(day), np.ravel(fraction))
         if errors.any():
             first = int(np.flatnonzero(errors)[0])
             raise ValueError(
                 f"Input utc must be instants that SGP4 reaches; instead received {np.ravel(utc)[first]}: "
-                f"{SGP4_ERRORS[int(errors[first])]}."
+                + ("the satellite has decayed by then." if errors[first] == _DECAYED else "no orbit is left by then.")
             )
         shape = (*np.shape(utc), 3)
         return 1e3 * position.reshape(shape), 1e3 * velocity.reshape(shape)

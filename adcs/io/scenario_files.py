@@ -66,23 +66,32 @@ class AttitudeFile:
             tables[key] = {**tables.get(key, {}), **value} if isinstance(value, dict) else value
         return scenario_of(self.path, tables)
 
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Sentences on what the scenario itself leaves uncertain: old two-line elements."""
+        orbit, start = self.satellite.orbit, np.array(self.satellite.start)
+        return tuple(filter(None, [orbit.age_warning(start)])) if isinstance(orbit, Sgp4Orbit) else ()
+
     def estimator(self, place: str = "") -> EstimatorSettings:
         """What the table ``estimate`` orders, checked; errors name a place, or the file."""
         return _estimator(place or self.path, self.estimate)
 
 
-def read_scenario(name_or_path: str) -> AttitudeFile:
+def read_scenario(name_or_path: str, *, allow_old_elements: bool = False) -> AttitudeFile:
     """Scenario of a satellite.
 
     Parameters
     ----------
     name_or_path : str
         A built-in scenario's name, or a TOML file; ``scenarios/tabletsat.toml`` beside this module documents the keys.
+    allow_old_elements : bool
+        Take two-line elements 30 days or more from their epoch too, as the key of that name.
 
     Raises
     ------
     InputError
-        The file cannot be read or does not describe a scenario; the text says where and why.
+        The file cannot be read or does not describe a scenario, or its two-line elements are too old; the text says
+        where and why.
 
     Examples
     --------
@@ -90,7 +99,7 @@ def read_scenario(name_or_path: str) -> AttitudeFile:
     >>> adcs.read_scenario("tabletsat").satellite.field_model
     'IGRF-14'
     """
-    return scenario_of(*scenario_table(name_or_path))
+    return scenario_of(*scenario_table(name_or_path), allow_old_elements=allow_old_elements)
 
 
 def scenario_table(name_or_path: str) -> tuple[str, dict[str, Any]]:
@@ -129,8 +138,11 @@ def _toml(value: Any) -> str:
     return str(value) if math.isfinite(value) else f"{float(value)}"
 
 
-def scenario_of(path: str, tables: dict[str, Any]) -> AttitudeFile:
-    """Scenario of the tables of a file, as :func:`arrays.io.toml.read_toml` returns them."""
+def scenario_of(path: str, tables: dict[str, Any], *, allow_old_elements: bool = False) -> AttitudeFile:
+    """Return the scenario of the tables of a file, as :func:`arrays.io.toml.read_toml` returns them."""
+    orbit = tables.get("orbit")
+    if allow_old_elements and isinstance(orbit, dict) and "elements" in orbit:
+        tables = {**tables, "orbit": {**orbit, "allow_old_elements": True}}
     file = section_of(path, tables, FileTable)
     body, control = _satellite(f"{path}, table satellite", file.satellite)
     orbit, start_utc, model = _orbit(path, f"{path}, table orbit", file.orbit)
@@ -234,7 +246,9 @@ def _orbit(path: str, place: str, section: OrbitTable) -> tuple[Orbit, np.dateti
     start: np.datetime64 = instants(datetime.datetime.fromisoformat(section.start))[()]  # type: ignore[assignment]
     if section.elements is not None:
         with naming(f"{place}, key elements"):
-            return Sgp4Orbit(*section.elements), start, section.field_model
+            of_elements = Sgp4Orbit(*section.elements, allow_old_elements=section.allow_old_elements)
+            of_elements.refuse_old(start)
+        return of_elements, start, section.field_model
     if section.ephemeris is not None:
         # Beside the scenario file, wherever the command runs.
         return read_oem(Path(path).parent / section.ephemeris), start, section.field_model

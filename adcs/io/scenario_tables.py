@@ -45,6 +45,7 @@ class OrbitTable(Table, kw_only=True):
     node_deg: float | None = None
     latitude_argument_deg: float = 0.0
     elements: tuple[str, str] | None = None
+    allow_old_elements: bool = False
     ephemeris: str | None = None
     field_model: Annotated[str, one_of(MODELS)] = "IGRF-14"
 

@@ -164,7 +164,7 @@ def _estimate(telemetry: Telemetry, satellite: Satellite, chosen: EstimatorSetti
                 f"Input found no reading of the {SENSOR_WORDS[name]}, expected some because the sensors in use are "
                 f"{used.sensors}."
             )
-    check_conventions(telemetry, record.environment, used.sensors.split("+"))
+    check_conventions(telemetry, record, used.sensors.split("+"))
     first = first_told(record, used, with_gyro=chosen.filter == "reduced")
     record = part(record, np.array([0]), slice(first, None))
     tracks = estimated(record, chosen, any_start)

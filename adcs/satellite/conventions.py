@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from adcs import quaternion
-from adcs.environment.environment import Environment
+from adcs.environment.orbit import Sgp4Orbit
 from adcs.satellite.sensors import SENSOR_WORDS
-from adcs.satellite.telemetry import Telemetry, orbital_from_eci
+from adcs.satellite.telemetry import Record, Telemetry, orbital_from_eci
 from adcs.satellite.vector_record import step_rates, steps_s
 from adcs.satellite.wahba import attitude_of_vectors
 from arrays.typing import FloatArray
@@ -56,11 +56,15 @@ class _Log:
     model_sun: FloatArray
 
 
-def check_conventions(telemetry: Telemetry, around: Environment, used: Collection[str]) -> None:
+def check_conventions(telemetry: Telemetry, record: Record, used: Collection[str]) -> None:
     """Raise ValueError if one misreading of a sensor in use explains why a log contradicts itself or the orbit.
 
-    ``around``: surroundings at the log's instants, of one run. ``used``: names of :data:`SENSORS`.
+    ``record``: of the log. ``used``: names of :data:`SENSORS`. Where the orbit's elements are so old that the field
+    along it may be another one, the field is not compared.
     """
+    around, orbit = record.environment, record.satellite.orbit
+    old = isinstance(orbit, Sgp4Orbit) and 3.0 * orbit.relative_error(around.utc) > _SUSPICIOUS * math.log(_FACTOR)
+    model_field_T = around.b_orbital_T[0] * (np.nan if old else 1.0)
     rows = telemetry.rows
     chosen = slice(0, _MOST_ROWS)
     at = rows[chosen]
@@ -71,7 +75,7 @@ def check_conventions(telemetry: Telemetry, around: Environment, used: Collectio
         telemetry.gyro_rad_s[chosen],
         telemetry.field_T[chosen],
         telemetry.sun[chosen],
-        quaternion.rotate(eci_from_orbital, around.b_orbital_T[0, at]),
+        quaternion.rotate(eci_from_orbital, model_field_T[at]),
         quaternion.rotate(eci_from_orbital, around.sun_orbital[0, at]),
     )
     as_read = _disagreements(log)

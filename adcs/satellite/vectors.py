@@ -44,7 +44,7 @@ def vector_attitude(telemetry: Telemetry, satellite: Satellite, *, method: Vecto
     True
     """
     record = telemetry.record(satellite)
-    check_conventions(telemetry, record.environment, ("mag", "sun"))
+    check_conventions(telemetry, record, ("mag", "sun"))
     around, readings = record.environment, record.readings
     field_T, sun = readings.field_T[0], readings.sun[0]
     sigma_field = satellite.magnetometer.sigma_T / np.linalg.norm(field_T, axis=-1)

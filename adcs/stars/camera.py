@@ -73,6 +73,14 @@ class StarCamera:
         """Tangent of a corner's angle from the centre, through a pinhole."""
         return 0.5 * math.hypot(self.width_px, self.height_px) * math.tan(self.rad_per_px)
 
+    @property
+    def corner_shift_px(self) -> float:
+        """Shift by the lens of the star that a pinhole shows in a corner [px], negative towards the centre."""
+        bent, x = self.radial * self.corner**2, 1.0
+        for _ in range(8):  # Newton's steps to x (1 + bent x²) = 1
+            x -= (x * (1.0 + bent * x**2) - 1.0) / (1.0 + 3.0 * bent * x**2)
+        return 0.5 * math.hypot(self.width_px, self.height_px) * (x - 1.0)
+
     def tangents(self, points_px: ArrayLike) -> FloatArray:
         """Components (f, 2) across the line of sight, over that along it, of points (f, 2), y up.
 

@@ -54,12 +54,16 @@ class StarFix:
         Logarithm of the number of attitudes expected to match as many stars by chance alone.
     pose : CameraPose
         The same attitude with its covariance and that of the lens.
+    mirrored : bool
+        Whether the image shows the sky as a mirror does. Attitude and lens are then those of the image with left and
+        right exchanged.
     """
 
     stars: IntArray
     rms_rad: float
     log10_chance: float
     pose: CameraPose
+    mirrored: bool = False
 
     @property
     def R_catalogue_from_frame(self) -> FloatArray:
@@ -112,6 +116,8 @@ class StarMatcher:
         points_px: ArrayLike,
         magnitudes: ArrayLike,
         prior: LensPrior = LensPrior(),  # noqa: B008 - frozen
+        *,
+        mirrored: bool = False,
     ) -> StarFix | NoFix:
         """Attitude and stars of an image.
 
@@ -123,6 +129,8 @@ class StarMatcher:
             Their order counts, and of stars that are as near as the noise their differences.
         prior : LensPrior
             How well the camera is known: exactly, if not stated.
+        mirrored : bool
+            Exchange left and right first.
 
         Raises
         ------
@@ -137,6 +145,9 @@ class StarMatcher:
         if len(order) < 4:
             return NoFix(f"{len(order)} stars, 4 needed")
         points = np.asarray(points_px, dtype=np.float64)[order]
+        if mirrored:
+            points = points * [-1.0, 1.0] + [self.camera.width_px, 0.0]
+            tangents = tangents * [-1.0, 1.0]
         checks = self._checks(min(len(order), _CHECKED), prior)
         image = star_triangles(self.camera.directions(points[:_IMAGE_STARS]), 2.0, _IMAGE_BRIGHTER)
         found = self.index.best(tangents[order], image, self.catalogue.cells, checks)
@@ -145,7 +156,8 @@ class StarMatcher:
             fixes = [self._fitted(points, brightness[order], hypothesis, prior) for hypothesis in hypotheses]
             best = min(fixes, key=lambda fix: fix.log10_chance)
             if best.log10_chance <= math.log10(self.most_chance):
-                return replace(best, stars=np.stack([order[best.stars[:, 0]], best.stars[:, 1]], axis=1))
+                stars = np.stack([order[best.stars[:, 0]], best.stars[:, 1]], axis=1)
+                return replace(best, stars=stars, mirrored=mirrored)
             reason = f"chance matches {len(best.stars)} of {len(points)} stars too easily"
         return NoFix(reason)
 
@@ -240,7 +252,8 @@ def identify_stars(
     Returns
     -------
     list of StarFix or NoFix
-        One for every image: attitude and names of the stars, or why there are none.
+        One for every image: attitude and names of the stars, or why there are none. Images without a fix are tried
+        mirrored too.
 
     Examples
     --------
@@ -254,7 +267,11 @@ def identify_stars(
     matcher = StarMatcher.of(catalogue, camera, noise_px)
     fixes = []
     for points_px, magnitudes in frames:
-        fixes.append(matcher.identify(points_px, magnitudes, lens))
+        fix = matcher.identify(points_px, magnitudes, lens)
+        if isinstance(fix, NoFix):
+            of_mirror = matcher.identify(points_px, magnitudes, lens, mirrored=True)
+            fix = of_mirror if isinstance(of_mirror, StarFix) else fix
+        fixes.append(fix)
         if progress is not None:
             progress(1)
     return fixes

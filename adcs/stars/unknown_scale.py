@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -55,7 +56,8 @@ def solve_photograph(
     stars : PictureStars
         Lights that were found, brightest first.
     fix : StarFix or NoFix
-        Attitude, scale, distortion and the names of the stars, or why there are none.
+        Attitude, scale, distortion and the names of the stars, or why there are none. A picture without a fix is tried
+        mirrored too.
 
     Raises
     ------
@@ -113,12 +115,12 @@ def identify_at_unknown_scale(
     if len(points) < 4:
         return NoFix(f"{len(points)} stars, 4 needed")
     scales, within = _scales(math.hypot(width_px, height_px), rad_per_px, tolerance)
-    for scale in scales:
+    for mirrored, scale in product((False, True), scales):
         matcher = StarMatcher.of(catalogue, StarCamera(width_px, height_px, scale), noise_px)
-        fix = matcher.identify(points, magnitudes, replace(UNKNOWN_LENS, scale=within))
-        if isinstance(fix, StarFix) and fix.log10_chance < -6.0 - math.log10(len(scales)):
+        fix = matcher.identify(points, magnitudes, replace(UNKNOWN_LENS, scale=within), mirrored=mirrored)
+        if isinstance(fix, StarFix) and fix.log10_chance < -6.0 - math.log10(2 * len(scales)):
             return replace(fix, stars=np.stack([brightest[fix.stars[:, 0]], fix.stars[:, 1]], axis=1))
-    return NoFix(f"no scale of {len(scales)} explains the {len(points)} brightest lights")
+    return NoFix(f"no scale of {len(scales)} explains the {len(points)} brightest lights, mirrored or not")
 
 
 def _scales(diagonal_px: float, rad_per_px: float | None, tolerance: float) -> tuple[list[float], float]:

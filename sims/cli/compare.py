@@ -40,11 +40,14 @@ class CompareOptions:
         Sets of states, as in none,gyro-bias,gyro-bias+disturbance; by default each scenario's.
     filter : str
         Filters: mekf, constant-gain, parallel-disturbance, reduced, smoother, self-tuning; by default each scenario's.
+    allow_old_elements : bool
+        Take two-line elements 30 days or more from their epoch too.
     """
 
     sensors: str | None = None
     states: str | None = None
     filter: str | None = None
+    allow_old_elements: Flag = False
 
     def combinations(self) -> list[ScenarioOptions]:
         """All combinations of what is listed."""
@@ -52,7 +55,7 @@ class CompareOptions:
         for name in lists[2]:
             if name is not None and name not in FILTERS:
                 raise InputError(f"--filter: found {name!r}, expected some of {', '.join(FILTERS)}.")
-        empty = ScenarioOptions()
+        empty = ScenarioOptions(allow_old_elements=self.allow_old_elements)
         return [
             replace(empty, sensors=sensors, states=states, filter=name)  # type: ignore[arg-type]
             for sensors, states, name in product(*lists)
@@ -80,7 +83,7 @@ class Row:
             "states": list(used.states),
             "filter": self.estimate.filter,
             **self.outcome.numbers(),
-            "warnings": self.outcome.warning_lines(),
+            "warnings": [*self.file.warnings, *self.outcome.warning_lines()],
         }
 
 

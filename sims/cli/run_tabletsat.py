@@ -56,7 +56,7 @@ def wanted(scenario: str, options: ScenarioOptions, duration_s: float | None) ->
     """The scenario with the options in it, and its filter."""
     from adcs.io.scenario_tables import MOST_STEPS
 
-    file = adcs.read_scenario(scenario)
+    file = adcs.read_scenario(scenario, allow_old_elements=options.allow_old_elements)
     changes = options.changes(duration_s, file.estimate.states)
     if duration_s is not None and not 1.0 <= duration_s / file.step_s <= MOST_STEPS:
         longest_s = MOST_STEPS * file.step_s

@@ -21,7 +21,7 @@ from pymap3d import ecef2geodetic
 from adcs.environment.environment import Environment, environment, field_eci
 from adcs.environment.orbit import EARTH_RADIUS_M, MU_M3_S2, CircularOrbit, Sgp4Orbit, node_of_local_time
 from adcs.environment.sun import ASTRONOMICAL_UNIT_M, SUN_RADIUS_M, illuminated_fraction, sun_position_eci
-from adcs.frames import Instants, R_ecef_from_eci, instants, julian_dates, rotation_about_z, turned
+from adcs.frames import DAY_S, Instants, R_ecef_from_eci, instants, julian_dates, rotation_about_z, turned
 from magloc.fields.geomagnetic import field_ned
 
 Array = NDArray[np.float64]
@@ -104,6 +104,44 @@ class TestSgp4Orbit:
             Sgp4Orbit(VANGUARD[0][:-1] + "4", VANGUARD[1])
         with pytest.raises(ValueError, match=r"Input line2 must be line 2"):
             Sgp4Orbit(VANGUARD[0], VANGUARD[0])
+
+    @pytest.mark.parametrize("sign", [-1.0, 1.0])
+    def test_age(self, caplog: pytest.LogCaptureFixture, sign: float) -> None:
+        """Silent in the first week, one warning in the first month, refused later, before the epoch as after it."""
+        orbit = Sgp4Orbit(*VANGUARD)
+        days = sign * DAY_S * np.array([6.9, 7.1, 29.9, 30.1])
+        orbit.position_velocity_eci(instants(orbit.epoch, days[:1]))
+        assert not caplog.messages
+        for _ in range(2):
+            orbit.position_velocity_eci(instants(orbit.epoch, days[:2]))
+        (message,) = caplog.messages
+        assert message.startswith("found instants 7.1 days from the epoch 2000-06-27T18:50:19 of the two-line elements")
+        orbit.position_velocity_eci(instants(orbit.epoch, days[2:3]))
+        with pytest.raises(ValueError, match=r"Input utc must be less than 30 days .* 30\.1 days from the epoch"):
+            orbit.position_velocity_eci(instants(orbit.epoch, days))
+        Sgp4Orbit(*VANGUARD, allow_old_elements=True).position_velocity_eci(instants(orbit.epoch, days))
+
+    def test_error_grows_with_age_and_drag(self) -> None:
+        """As stated: 1 km, 2 km a day, a fifth of the way that drag makes; and never beyond the orbit."""
+        low = "2 99017  97.4000 210.7000 0008000  80.0000 280.0000 15.24000000 12346"
+        calm, dragged = (
+            Sgp4Orbit(line, low)
+            for line in (
+                "1 99017U 23999A   24080.50000000  .00000000  00000-0  00000-0 0  9997",
+                "1 99017U 23999A   24080.50000000  .00020000  00000-0  65000-3 0  9993",
+            )
+        )
+        days = np.array([[1.0], [7.0], [20.0], [800.0]])
+        radius_m = 6.86e6
+        errors = [
+            [radius_m * orbit.relative_error(instants(orbit.epoch, DAY_S * day)) for day in days]
+            for orbit in (calm, dragged)
+        ]
+        np.testing.assert_allclose(errors[0], 1e3 + 2e3 * days[:, 0], rtol=0.01)
+        # The mean motion's drift of 0.0002 revolutions a day, squared days, along the orbit.
+        way_m = 0.0002 * days[:, 0] ** 2 * 2.0 * np.pi * radius_m
+        np.testing.assert_allclose(np.subtract(errors[1], errors[0])[:3], 0.2 * way_m[:3], rtol=0.25)
+        assert errors[1][3] == pytest.approx(2.0 * radius_m, rel=0.01)
 
     def test_decayed(self) -> None:
         # A satellite that falls within days; from the same file of test elements.

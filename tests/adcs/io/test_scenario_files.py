@@ -141,9 +141,22 @@ class TestOrbit:
     def test_elements(self, file):
         text = MINIMAL[: MINIMAL.index("altitude_km")]
         text += f'elements = ["{ISS[0]}", "{ISS[1]}"]\n'
+        text = text.replace('"2014-09-01"', '"2008-09-21"')
         orbit = read_scenario(file(text)).satellite.orbit
         assert isinstance(orbit, Sgp4Orbit)
         assert orbit.epoch == np.datetime64("2008-09-20T12:25:40.104192")
+
+    @pytest.mark.parametrize("start", ["2008-08-10", "2008-11-01", "2014-09-01"])
+    def test_old_elements(self, file, start):
+        """Refused, before and after their epoch, unless that is allowed; a changed or written scenario keeps that."""
+        text = MINIMAL[: MINIMAL.index("altitude_km")].replace('"2014-09-01"', f'"{start}"')
+        path = file(text + f'elements = ["{ISS[0]}", "{ISS[1]}"]\n')
+        with pytest.raises(InputError, match=r"key elements: utc must be less than 30 days .* \d+\.\d days from"):
+            read_scenario(path)
+        allowed = read_scenario(path, allow_old_elements=True)
+        (text,) = allowed.changed({"duration_s": 7.0}).warnings
+        assert "days from the epoch 2008-09-20T12:25:40" in text
+        assert read_scenario(file(scenario_text(allowed))).warnings == (text,)
 
     @pytest.mark.parametrize("start", ["2014-09-01", '"2014-09-01T00:00:00"', '"2014-09-01T02:00:00+02:00"'])
     def test_start(self, file, start):

@@ -1,11 +1,13 @@
 """Logs that are misread are named by what they are misread as; those that are right, or just bad, are left alone."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import adcs
+from adcs.environment.orbit import Sgp4Orbit
 from sims.attitude.simulation import simulate
 from tests.adcs.filter_runs import tabletsat
 
@@ -53,6 +55,23 @@ class TestMangled:
         with pytest.raises(ValueError, match="must agree") as refused:
             adcs.estimate(changed(log, **MANGLED[name](log)), satellite, sensors="mag+sun+gyro")
         assert name in str(refused.value)
+
+    @pytest.mark.parametrize("days", [-40, 60, 850])
+    def test_old_elements_are_no_misreading(self, caplog, days):
+        """A good log of a satellite that is elsewhere than its elements say; what contradicts itself is named still."""
+        line2 = "2 99017  97.4000 210.7000 0008000  80.0000 280.0000 15.24000000 12346"
+        old = Sgp4Orbit(
+            "1 99017U 23999A   24080.50000000  .00020000  00000-0  65000-3 0  9993", line2, allow_old_elements=True
+        )
+        start = old.epoch + np.timedelta64(days, "D")
+        orbit = adcs.circular_orbit(altitude_m=480e3, inclination_deg=97.4, local_time_h=15.0, epoch=start)
+        there = replace(tabletsat(300.0).satellite, orbit=orbit, start=start)
+        log = adcs.Telemetry.of(simulate(replace(tabletsat(300.0), satellite=there), [0]), start)
+        believed = replace(there, orbit=old)
+        adcs.estimate(log, believed, sensors="mag+sun+gyro")
+        assert "days from the epoch 2024-03-20T12:00:00 of the two-line elements" in caplog.text
+        with pytest.raises(ValueError, match="the gyro in rad/s taken for °/s"):
+            adcs.estimate(changed(log, gyro_rad_s=np.radians(log.gyro_rad_s)), believed, sensors="st+gyro")
 
     def test_vectors_too(self, flight):
         log, satellite = flight

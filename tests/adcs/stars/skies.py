@@ -9,12 +9,19 @@ import numpy as np
 HARD = {"gradient": 1.0, "vignetting": 0.8, "hot": 20}
 
 
-def photograph(sky, camera, R, rng, gradient=0.0, vignetting=0.0, hot=0, trail_px=0.0):
-    """Grey picture (height, width) of 16 bits, first row at the top: lights of 1.2 pixels on a glow of 2,000 ± 20."""
+def photograph(sky, camera, R, rng, gradient=0.0, vignetting=0.0, hot=0, trail_px=0.0, corner_px=0.0):
+    """Grey picture (height, width) of 16 bits, first row at the top: lights of 1.2 pixels on a glow of 2,000 ± 20.
+
+    ``corner_px``: by how much the lens shifts a star outwards that a pinhole shows in a corner, by the cube elsewhere.
+    """
     seen = sky.directions @ R
     front = seen[:, 2] < -0.1
     points = seen[:, :2] / np.where(front, -seen[:, 2], 1.0)[:, None] / math.tan(camera.rad_per_px)
-    points = points + 0.5 * np.array([camera.width_px, camera.height_px])
+    middle = 0.5 * np.array([camera.width_px, camera.height_px])
+    reach = np.linalg.norm(middle)
+    # Far beyond the picture the cube would fold the sky back into it.
+    squared = np.minimum(np.sum(points**2, axis=1, keepdims=True), 4.0 * reach**2)
+    points = middle + points * (1.0 + corner_px * squared / reach**3)
     inside = front & (points > 8.0).all(axis=1) & (points < [camera.width_px - 8.0, camera.height_px - 8.0]).all(axis=1)
     rows = np.flatnonzero(inside)
     y, x = np.mgrid[0 : camera.height_px, 0 : camera.width_px]

@@ -17,14 +17,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cyclopts import App
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from adcs.cli.stars import stars
 from adcs.stars.camera import StarCamera
 from adcs.stars.catalogue import StarCatalogue
 from adcs.stars.files import read_star_catalogue, read_star_frames
-from adcs.stars.identification import NoFix, StarFix, StarMatcher
+from adcs.stars.identification import NoFix, StarFix, StarMatcher, identify_stars
 from adcs.stars.pose import UNKNOWN_LENS, CameraPose, fitted
 from adcs.stars.triangles import TriangleIndex, star_triangles
 from adcs.stars.triangles_compiled import KEPT, Checks
@@ -98,12 +98,18 @@ class TestRandomSky:
             points, magnitudes, _ = image_of(other, R, rng)
             assert isinstance(matcher.identify(points, magnitudes), NoFix)
 
-    def test_a_mirrored_image_gives_no_fix(self):
+    def test_a_mirrored_image_is_named(self):
+        """The matcher alone finds nothing; among images each is tried both ways."""
         sky, rng = random_sky(30_000), np.random.default_rng(6)
         matcher = StarMatcher.of(sky, CAMERA)
         for R in Rotation.random(10, random_state=7).as_matrix():
             points, magnitudes, _ = image_of(sky, R, rng)
-            assert isinstance(matcher.identify(points * [-1.0, 1.0] + [1392.0, 0.0], magnitudes), NoFix)
+            mirrored = points * [-1.0, 1.0] + [1392.0, 0.0]
+            assert isinstance(matcher.identify(mirrored, magnitudes), NoFix)
+            fixes = identify_stars(sky, CAMERA, [(points, magnitudes), (mirrored, magnitudes)])
+            assert [fix.mirrored for fix in fixes] == [False, True]
+            assert_array_equal(fixes[0].stars, fixes[1].stars)
+            assert_allclose(fixes[0].R_catalogue_from_frame, fixes[1].R_catalogue_from_frame, atol=1e-9)
 
     def test_turning_the_sky_turns_the_attitude(self):
         sky, rng = random_sky(30_000), np.random.default_rng(8)

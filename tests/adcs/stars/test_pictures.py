@@ -145,12 +145,35 @@ class TestUnknownScale:
         picture, _, _ = photograph(SKY, CAMERA, R, np.random.default_rng(7))
         assert is_right(solve_photograph(picture, SKY)[1], R)
 
-    def test_a_mirrored_picture_gives_no_fix(self):
-        for seed in range(3):
+    @pytest.mark.parametrize("axis", [0, 1])
+    def test_a_mirrored_picture_is_named(self, axis):
+        """Attitude of the picture with left and right exchanged: upside down where it was mirrored that way."""
+        R = Rotation.random(random_state=axis).as_matrix()
+        picture, _, _ = photograph(SKY, CAMERA, R, np.random.default_rng(axis))
+        _, found = solve_photograph(np.flip(picture, axis), SKY, rad_per_px=CAMERA.rad_per_px, tolerance=0.1)
+        assert found.mirrored
+        assert is_right(found, R if axis else R * [-1.0, -1.0, 1.0])
+        assert not solve_photograph(picture, SKY, rad_per_px=CAMERA.rad_per_px)[1].mirrored
+
+    @pytest.mark.slow
+    def test_another_sky_gives_no_fix(self):
+        """Chance produces one in a million."""
+        other = random_sky(30_000, seed=1)
+        for seed in range(6):
             R = Rotation.random(random_state=seed).as_matrix()
-            picture, _, _ = photograph(SKY, CAMERA, R, np.random.default_rng(seed))
-            _, found = solve_photograph(picture[:, ::-1], SKY, rad_per_px=CAMERA.rad_per_px, tolerance=0.1)
-            assert isinstance(found, NoFix)
+            picture, _, _ = photograph(other, CAMERA, R, np.random.default_rng(seed))
+            assert isinstance(solve_photograph(picture, SKY, rad_per_px=CAMERA.rad_per_px)[1], NoFix)
+
+    @pytest.mark.parametrize("corner_px", [-8.0, -2.0, 3.0, 8.0])
+    def test_the_lens_is_found_with_its_sign(self, corner_px):
+        """Negative where stars of a corner stand nearer to the centre: the deviations are of a Gaussian, so 1e-6."""
+        R = Rotation.random(random_state=3).as_matrix()
+        picture, _, _ = photograph(SKY, CAMERA, R, np.random.default_rng(3), corner_px=corner_px)
+        _, found = solve_photograph(picture, SKY, rad_per_px=CAMERA.rad_per_px)
+        assert is_right(found, R)
+        sigma_px = math.sqrt(found.pose.covariance[4, 4]) * CAMERA.corner**2 * 400.0
+        assert found.pose.camera.corner_shift_px == pytest.approx(corner_px, abs=5.0 * sigma_px)
+        assert sigma_px < 0.3
 
     def test_refusals(self):
         points, ones = np.ones((5, 2)), np.ones(5)
@@ -248,7 +271,20 @@ class TestCommand:
         assert main(["stars", *arguments]) == 0
         line = capsys.readouterr().out
         assert ": RA " in line
+        assert "mirrored" not in line
         assert float(line.split(";")[1].split()[0]) == pytest.approx(60.0, abs=0.1)
+
+    def test_mirrored(self, files, capsys):
+        """The way up is the same on the sky, and the sentence says it."""
+        command = ["stars", "--catalogue", str(files / "sky.csv"), "--scale-arcsec", "61"]
+        Image.fromarray(np.asarray(Image.open(files / "sky.png"))[:, ::-1]).save(files / "mirrored.png")
+        assert main([*command, "--json", str(files / "sky.png"), str(files / "mirrored.png")]) == 0
+        one, other = json.loads(capsys.readouterr().out)["pictures"]
+        assert (one["mirrored"], other["mirrored"]) == (False, True)
+        for key in ("ra_deg", "dec_deg", "roll_deg"):
+            assert one[key] == pytest.approx(other[key], abs=0.02)
+        assert main([*command, str(files / "mirrored.png")]) == 0
+        assert "; mirrored: solved with left and right exchanged" in capsys.readouterr().out
 
     @pytest.mark.parametrize(
         ("arguments", "said"),
