@@ -27,6 +27,8 @@ _REACH = 0.6  # of a fit, over the distance from the sensors
 _TWINS = 0.15  # over the distance from the sensors: sources that are nearer to each other are one
 _MOST_WEIGHINGS = 4
 _SETTLED_COARSELY = 0.5
+_MOST_STEPS, _SMALL_STEP = 6, 0.1  # of a fit whose weights follow it, and χ² that the last one may change by
+_HARDLY_DAMPED = 1e-9
 # Rows that pass within such a part of the distance to a source count as one.
 WHILE_SEARCHING, AT_LAST = 0.33, 0.15
 Groups = Callable[[float], IntArray]
@@ -104,6 +106,22 @@ class Model:
         if len(sources) < len(fit.sources):
             background = self.background(sources, group)
             fit = fit_jointly(self.record, background, sources, self.bounds, settled=settled)
+        return self.relinearised(fit, background, group)
+
+    def relinearised(
+        self, fit: JointFit, background: Background, group: IntArray, most: int = _MOST_STEPS
+    ) -> tuple[JointFit, Background]:
+        """Return the fit where sources and errors of the pose are linear about the same place, step by step.
+
+        A fit holds the weights of where it begins. An error that all places share is then told from a shift of all
+        sources by the curvature of their fields alone, which is noise.
+        """
+        for _ in range(most if len(fit.sources) else 0):
+            before, background = fit.sources, self.background(fit.sources, group)
+            fit = fit_jointly(self.record, background, before, self.bounds, most=1, damping=_HARDLY_DAMPED)
+            step = np.hstack([fit.sources.position_m - before.position_m, fit.sources.moment_Am2 - before.moment_Am2])
+            if step.ravel() @ fit.information @ step.ravel() < _SMALL_STEP:
+                break
         return fit, background
 
     def candidates(self, sources: Sources, grid: SearchGrid, groups: Groups) -> list[Candidates]:

@@ -23,7 +23,7 @@ from magloc.surveying.fit.whitening import Drift, Whitening
 from magloc.surveying.fit.whitening_compiled import pole_columns, source_columns
 
 _MOST_STEPS = 25
-_SETTLED = 1e-3
+_SETTLED, _DAMPING = 1e-3, 1e-3
 _UNKNOWN = 1e4  # standard deviation of a column of unit length
 _NEGLIGIBLE = 0.1  # of the noise
 _BESIDE_M, _BESIDE_SHARE = 0.1, 0.2  # errors of sources that other rows tell: of places, and of moments over their size
@@ -287,6 +287,7 @@ def fit_jointly(
     *,
     most: int = _MOST_STEPS,
     settled: float = _SETTLED,
+    damping: float = _DAMPING,
 ) -> JointFit:
     """Levenberg-Marquardt from some sources, the noise held."""
 
@@ -305,7 +306,6 @@ def fit_jointly(
     if not len(sources):
         return JointFit(sources, cost, np.zeros((0, 0)), residual)
     J, J_layer, H = linearised(sources, fields)
-    damping = 1e-3
     for _ in range(most):
         gradient = J.T @ residual - J_layer.T @ of_layer
         scale = 1.0 / np.sqrt(np.diagonal(H))
