@@ -60,9 +60,14 @@ def warn_of_doubts(array: SensorArray, readings: Readings) -> None:
     _warn_of(doubts(array, readings))
 
 
-def warn_of_array(array: SensorArray) -> None:
+def warn_of_array(array: SensorArray, readings: Readings | None = None) -> None:
     """Warn of an array whose size is hardly in metres."""
-    _warn_of(array_doubts(array))
+    _warn_of(array_doubts(array, readings))
+
+
+def warn_of_record(array: SensorArray, readings: Readings) -> None:
+    """Warn of what in readings alone is hardly as stated."""
+    _warn_of(record_doubts(array, readings))
 
 
 def warn_of_moments(distance_m: ArrayLike, moment_Am2: ArrayLike) -> None:
@@ -80,13 +85,18 @@ def _usable(array: SensorArray, readings: Readings) -> Readings:
 
 
 def doubts(array: SensorArray, readings: Readings, used: Readings | None = None) -> Iterator[str]:
-    """Sentences on readings that are hardly as stated; none for fewer than twenty rows.
+    """Sentences on an array and on readings that are hardly as stated.
 
     `used` are those that do not saturate, in their ambient field, where they are known.
     """
+    yield from array_doubts(array, readings)
+    yield from record_doubts(array, readings, used)
+
+
+def record_doubts(array: SensorArray, readings: Readings, used: Readings | None = None) -> Iterator[str]:
+    """Sentences on readings alone, of units and clocks for twenty rows or more."""
+    yield from _of_origin(readings)
     used = _usable(array, readings) if used is None else used
-    yield from array_doubts(array, moves=used.pose is not None and np.ptp(used.pose[0], axis=0).max(initial=0.0) > 0.0)
-    yield from _of_origin(used)
     if len(readings) < FEWEST_ROWS:
         yield from _of_ambient(array, used)
         return
@@ -109,10 +119,12 @@ def doubts(array: SensorArray, readings: Readings, used: Readings | None = None)
         yield from _of_attitude(array, used, used.pose[1])
 
 
-def array_doubts(array: SensorArray, *, moves: bool = False) -> Iterator[str]:
-    """Sentences on an array whose size is hardly that of an array with such noise, or of one that `moves`."""
+def array_doubts(array: SensorArray, readings: Readings | None = None) -> Iterator[str]:
+    """Sentences on an array whose size is hardly that of one with such noise, or of one that moves by its poses."""
     if array.n_sensors < 2:
         return
+    place_m = None if readings is None else readings.array_position_m
+    moves = place_m is not None and bool((np.abs(place_m - place_m[:1]) > 0.0).any())
     across_m, noise_T = 2.0 * array.circumradius, float(np.median(array.channel_noise_T))
     widest_m = _WIDEST_M * max(1.0, _COARSE_T / noise_T) ** (2.0 / 3.0)
     if _NARROWEST_M <= across_m <= (min(widest_m, _WIDEST_ON_THE_MOVE_M) if moves else widest_m):
