@@ -117,10 +117,10 @@ def survey(
     where = None if known.place is not None and known.date is None else known.where
     used = known.reduced(arrays.read_sensors(array), array)  # one is enough
     parts = [magloc.read_readings(path, used, sensors=known.ids, ordered=True) for path in readings]
-    fields = [ambient_field(used, part, where) for part in parts]
-    used, rows = fields[0][0], [replace(part, ambient_T=own) for part, (_, own) in zip(parts, fields, strict=True)]
     for path, part in zip(readings, parts, strict=True):
         maps.refuse_far(part, str(path))
+    fields = [ambient_field(used, part, where) for part in parts]
+    used, rows = fields[0][0], [replace(part, ambient_T=own) for part, (_, own) in zip(parts, fields, strict=True)]
     at_base = arrays.SensorArray((arrays.Sensor("base", "scalar", (0.0, 0.0, 0.0), 1e-10),))
     station = None if base is None else magloc.read_readings(base, at_base, ordered=True)
     with _naming(", ".join(map(str, readings))), naming_scheduler():

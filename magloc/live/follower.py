@@ -21,7 +21,7 @@ from magloc.live.tally import Clock, Tally
 from magloc.live.transports import Stream, opened, sender_waits
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.measurement.differences import predicted_channels, suitable_dipole
-from magloc.measurement.plausibility import FEWEST_ROWS, warn_of_doubts
+from magloc.measurement.plausibility import FEWEST_ROWS, warn_of_array, warn_of_record
 from magloc.measurement.pose import with_stated_pose
 from magloc.measurement.rows import joined
 from magloc.readings import EXPECTED_HEADER, Readings, log_format, without_saturated
@@ -256,13 +256,14 @@ class Follower:
             self._in_field, self._moves = with_stated_pose(array, readings), readings.pose is not None
             if self._rest_s:
                 refuse_rest(array, moves=self._moves)
+            warn_of_array(self._in_field)
         used = in_world_field(without_saturated(readings, self._in_field), self._in_field)
         if sum(map(len, self._first_rows)) < FEWEST_ROWS:
             first = (self._first_rows or [readings])[0]
             if (first.pose is None, first.ambient_T is None) == (readings.pose is None, readings.ambient_T is None):
                 self._first_rows.append(readings)
             if sum(map(len, self._first_rows)) >= FEWEST_ROWS:
-                warn_of_doubts(self._in_field, joined(self._first_rows))
+                warn_of_record(self._in_field, joined(self._first_rows))
         if self._in_field.pose is None:
             return list(rows_of(used))
         return [row for one in used for row in rows_of(one)]  # whose motion is that since the row before

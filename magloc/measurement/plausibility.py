@@ -37,8 +37,8 @@ _SLOWEST_M_S, _FASTEST_M_S, _FAR_M = 0.01, 500.0, 2.0
 _ORBIT_M_S = (3e3, 11e3)  # geostationary to escape
 _AMBIENT_SIGMAS = 4.0
 _MODEL_SIGMA_T = 150e-9  # of a geomagnetic model where nothing is stated: crust and storms
-_ALIKE = 0.25  # spread of a difference between rows and sensors, over it: a source's differs more
-_MOST_COMPARED = 10_000  # rows
+_ALIKE = 0.2  # spread of a difference between rows and sensors, over it: a source's differs more
+_FEWEST_COMPARED, _MOST_COMPARED = 16, 10_000  # readings, rows
 _WIDEST_M, _COARSE_T = 3.0, 50e-9  # across an array of coarse sensors, and their noise; finer ones stand farther apart
 _NARROWEST_M = 1e-3
 _WIDEST_ON_THE_MOVE_M = 30.0
@@ -60,9 +60,14 @@ def warn_of_doubts(array: SensorArray, readings: Readings) -> None:
     _warn_of(doubts(array, readings))
 
 
-def warn_of_array(array: SensorArray) -> None:
+def warn_of_array(array: SensorArray, readings: Readings | None = None) -> None:
     """Warn of an array whose size is hardly in metres."""
-    _warn_of(array_doubts(array))
+    _warn_of(array_doubts(array, readings))
+
+
+def warn_of_record(array: SensorArray, readings: Readings) -> None:
+    """Warn of what in readings alone is hardly as stated."""
+    _warn_of(record_doubts(array, readings))
 
 
 def warn_of_moments(distance_m: ArrayLike, moment_Am2: ArrayLike) -> None:
@@ -80,14 +85,20 @@ def _usable(array: SensorArray, readings: Readings) -> Readings:
 
 
 def doubts(array: SensorArray, readings: Readings, used: Readings | None = None) -> Iterator[str]:
-    """Sentences on readings that are hardly as stated; none for fewer than twenty rows.
+    """Sentences on an array and on readings that are hardly as stated.
 
     `used` are those that do not saturate, in their ambient field, where they are known.
     """
+    yield from array_doubts(array, readings)
+    yield from record_doubts(array, readings, used)
+
+
+def record_doubts(array: SensorArray, readings: Readings, used: Readings | None = None) -> Iterator[str]:
+    """Sentences on readings alone, of units and clocks for twenty rows or more."""
+    yield from _of_origin(readings)
     used = _usable(array, readings) if used is None else used
-    yield from array_doubts(array, moves=used.pose is not None and np.ptp(used.pose[0], axis=0).max(initial=0.0) > 0.0)
-    yield from _of_origin(used)
     if len(readings) < FEWEST_ROWS:
+        yield from _of_ambient(array, used)
         return
     read = np.isfinite(readings.values_T)
     saturated = 1.0 - np.isfinite(used.values_T).sum() / max(int(read.sum()), 1)
@@ -108,10 +119,12 @@ def doubts(array: SensorArray, readings: Readings, used: Readings | None = None)
         yield from _of_attitude(array, used, used.pose[1])
 
 
-def array_doubts(array: SensorArray, *, moves: bool = False) -> Iterator[str]:
-    """Sentences on an array whose size is hardly that of an array with such noise, or of one that `moves`."""
+def array_doubts(array: SensorArray, readings: Readings | None = None) -> Iterator[str]:
+    """Sentences on an array whose size is hardly that of one with such noise, or of one that moves by its poses."""
     if array.n_sensors < 2:
         return
+    place_m = None if readings is None else readings.array_position_m
+    moves = place_m is not None and bool((np.abs(place_m - place_m[:1]) > 0.0).any())
     across_m, noise_T = 2.0 * array.circumradius, float(np.median(array.channel_noise_T))
     widest_m = _WIDEST_M * max(1.0, _COARSE_T / noise_T) ** (2.0 / 3.0)
     if _NARROWEST_M <= across_m <= (min(widest_m, _WIDEST_ON_THE_MOVE_M) if moves else widest_m):
@@ -222,11 +235,12 @@ def _of_ambient(array: SensorArray, used: Readings) -> Iterator[str]:
     stated = np.linalg.norm(ambient_fields(array, len(used), used.ambient_T), axis=2)
     of_sensors = [_shortest_half(d[np.isfinite(d)]) for d in (moduli - stated).T if np.isfinite(d).any()]
     modulus_T = _median(stated)
-    if not of_sensors or not _median(moduli) > modulus_T / _OTHER_UNIT or (moduli < 0.0).any():
-        return  # it was taken off the readings
+    was_taken_off = not _median(moduli) > modulus_T / _OTHER_UNIT or bool((moduli < 0.0).any())
+    if was_taken_off or np.isfinite(moduli).sum() < _FEWEST_COMPARED:
+        return
     levels, widths = np.array(of_sensors).T
     off_T = float(np.median(levels))
-    spread_T = max(np.median(widths), np.quantile(np.abs(levels - off_T), 0.8, method="lower"))
+    spread_T = max(np.median(widths), np.quantile(np.abs(levels - off_T), 0.9, method="nearest"))
     of_field_T = array.row_ambient_uncertainty_T or _MODEL_SIGMA_T
     of_sensor_T = [
         math.hypot(s.offset_uncertainty_T, math.hypot(s.gain_uncertainty, s.induced_uncertainty) * modulus_T)

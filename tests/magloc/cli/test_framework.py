@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import json
+import logging
 import subprocess
 import sys
-from collections.abc import Sequence
+import warnings
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
 
 import numba
+import numpy as np
 import pytest
+from cyclopts import App
 
+from adcs.mockup.vision.sky import AmbiguousSkyWarning
 from arrays import read_array
-from arrays.io.errors import InputError
+from arrays.io.errors import InputError, naming
+from magloc.cli import framework
 from magloc.cli.framework import print_json_list
 from tests.command_line import Outcome, Run, assert_refused
 
@@ -153,6 +159,50 @@ class TestMissingExtra:
     def test_a_fix_needs_none(self, recording: tuple[Path, Path]) -> None:
         readings, array = recording
         assert without(list(EXTRAS), "locate", readings, "--array", array, "--quiet").status == 0
+
+
+class TestWhatNobodyExpected:
+    """A command line in which one command does what it is told to."""
+
+    @staticmethod
+    def outcome(command: Callable[[], object], capsys: pytest.CaptureFixture[str]) -> Outcome:
+        app = App(name="magloc")
+        app.command(command, name="go")
+        with warnings.catch_warnings():
+            warnings.simplefilter("default")  # as a user has it
+            return Outcome(framework.run(app, ["go"]), *capsys.readouterr())
+
+    def test_error_of_another_library_is_no_fault_of_a_file(self, capsys: pytest.CaptureFixture[str]) -> None:
+        def go() -> None:
+            with naming("log.csv"):
+                np.linalg.inv(np.zeros((2, 2)))
+
+        outcome = self.outcome(go, capsys)
+        assert outcome.status == 1
+        assert outcome.err.startswith("magloc: internal error in ")
+        assert "(LinAlgError: Singular matrix)" in outcome.err
+        assert "please report" in outcome.err
+        assert "log.csv" not in outcome.err
+        assert len(outcome.err.splitlines()) == 1
+
+    def test_want_of_memory_has_a_cure(self, capsys: pytest.CaptureFixture[str]) -> None:
+        outcome = self.outcome(lambda: bytearray(2**62), capsys)
+        assert_refused(outcome, "found no memory left, expected fewer rows")
+
+    def test_warnings_of_other_libraries_are_not_shown(self, capsys: pytest.CaptureFixture[str]) -> None:
+        outcome = self.outcome(lambda: np.log(np.zeros(1)), capsys)
+        assert outcome == Outcome(0, "", "")
+
+    def test_own_ones_are_and_stand_in_the_json(self, capsys: pytest.CaptureFixture[str]) -> None:
+        def go() -> None:
+            logging.getLogger("magloc.anything").warning("a doubt")
+            warnings.warn("a sky", AmbiguousSkyWarning, stacklevel=1)
+            framework.print_report({"rows": 1})
+
+        outcome = self.outcome(go, capsys)
+        assert json.loads(outcome.out) == {"rows": 1, "warnings": ["a doubt", "a sky"]}
+        assert outcome.err == "magloc: warning: a doubt\nmagloc: warning: a sky\n"
+        assert json.loads(self.outcome(lambda: framework.print_report({}), capsys).out) == {"warnings": []}
 
 
 class TestJsonLists:

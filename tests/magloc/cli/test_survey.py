@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -143,3 +144,41 @@ class TestSurvey:
         assert_refused(run(*line, "--ground-m", 5), "--ground-m")
         assert_refused(run(*line, "--false-per-hectare", 0), "--false-per-hectare")
         assert_refused(run(*line, "--region", "z>1"), "room below the ground")
+
+
+class TestDoubts:
+    """Numbers of another frame or field are refused or named, in the JSON too."""
+
+    def changed(self, folder: Path, tmp_path: Path, change: Callable[[dict[str, float]], dict[str, float]]) -> Path:
+        """The survey with every row changed."""
+        head, *rows = (folder / "ground.csv").read_text().splitlines()
+        columns, path = head.split(","), tmp_path / "changed.csv"
+        changed = [change(dict(zip(columns, map(float, row.split(",")), strict=True))) for row in rows]
+        path.write_text("\n".join([head, *(",".join(map(repr, row.values())) for row in changed), ""]))
+        return path
+
+    @pytest.mark.parametrize("command", ["survey", "track"])
+    @pytest.mark.parametrize("output", ["--geojson", "--kml"])
+    def test_grid_coordinates_are_put_nowhere(
+        self, command: str, output: str, folder: Path, tmp_path: Path, run: Run
+    ) -> None:
+        far = self.changed(folder, tmp_path, lambda row: row | {"array_y_m": row["array_y_m"] + 5.8e6})
+        place = ("--place", "52.4", "13.1", "41")
+        outcome = run(command, far, "--array", folder / "ground-array.toml", *place, output, tmp_path / "map")
+        assert_refused(outcome, "changed.csv: places must lie within 100 km", "northings of a grid")
+        assert not (tmp_path / "map").exists()
+
+    def test_field_that_is_another_one(self, folder: Path, tmp_path: Path, run: Run) -> None:
+        off = self.changed(folder, tmp_path, lambda row: row | {"ambient_z_nT": row["ambient_z_nT"] - 1700.0})
+        found = json.loads(run("survey", off, "--array", folder / "ground-array.toml", "--json").out)
+        said = [sentence for sentence in found["warnings"] if "less than the ambient field" in sentence]
+        assert len(said) == 1
+        assert len(found["targets"]) == 1
+
+    def test_heights_above_the_sea(self, folder: Path, tmp_path: Path, run: Run) -> None:
+        high = self.changed(folder, tmp_path, lambda row: row | {"array_z_m": row["array_z_m"] + 83.0})
+        line = ("survey", high, "--array", folder / "ground-array.toml", "--json")
+        found, right = (json.loads(run(*line, *more).out) for more in ((), ("--ground-m", "83")))
+        assert any("state the height of the ground" in sentence for sentence in found["warnings"])
+        assert right["warnings"] == []
+        assert len(right["targets"]) == 1

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import logging
 import random
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -240,3 +242,21 @@ class TestEnds:
         (tmp_path / "rows.csv").write_text(text.replace("HEADER", lines[0]))
         with pytest.raises(InputError, match=what):
             list(track(f"replay:{tmp_path / 'rows.csv'}", ARRAY))
+
+
+class TestDoubts:
+    """The first rows and the first points of a track are judged as a record is."""
+
+    def test_an_array_in_millimetres(self, caplog: pytest.LogCaptureFixture) -> None:
+        sensors = [replace(one, position_m=tuple(1e3 * x for x in one.position_m)) for one in ARRAY.sensors]
+        follower = Follower(replace(ARRAY, sensors=tuple(sensors)), SLOW)
+        with caplog.at_level(logging.WARNING):
+            points = list(follower.follow(passage(n=60)[0]))
+        assert points[-1].is_on_track
+        assert sum("the sensors span" in text for text in caplog.messages) == 1
+        assert sum("the moment is" in text for text in caplog.messages) == 1
+
+    def test_none_of_what_is_right(self, caplog: pytest.LogCaptureFixture) -> None:
+        with caplog.at_level(logging.WARNING):
+            list(Follower(ARRAY, SLOW).follow(passage(n=60)[0]))
+        assert not caplog.messages

@@ -6,12 +6,15 @@ Built-in data and scenarios are the right ones; wrong ones are made of them.
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
 from numpy.typing import ArrayLike
 from scipy.signal import butter, sosfilt, sosfiltfilt
 from scipy.spatial.transform import Rotation
@@ -19,8 +22,9 @@ from scipy.spatial.transform import Rotation
 import magloc
 import sims
 from arrays.array import SensorArray
+from arrays.geometries import axial, cube, grid, tetrahedron
 from arrays.typing import FloatArray
-from magloc.measurement.plausibility import doubts, noise_ratio
+from magloc.measurement.plausibility import array_doubts, doubts, moment_doubts, noise_ratio
 from magloc.readings import Readings
 from tests.passing_source import ARRAY, moving_source, readings_of
 
@@ -231,3 +235,127 @@ class TestDoors:
             except ValueError:
                 assert door == "survey"  # whose sensors have no targets below them
         assert "are they in nT" in caplog.text
+
+
+class TestAmbientField:
+    """A stated field that differs from what all sensors read is doubted, a source beside them is not."""
+
+    EARTH_T = np.array([5e-6, 18e-6, -45e-6])
+
+    def said(
+        self, kind: str, *, off_T: float, sigma_T: float, place_m: ArrayLike = (9.0, 4.0, 1.0), n: int = 40
+    ) -> str:
+        """Sentences on an array whose stated field is stronger than the true one, beside a source of 200 A·m²."""
+        array = cube(1.0, kind=kind, noise_T=1e-10)
+        modulus = np.linalg.norm(self.EARTH_T)
+        stated = tuple((self.EARTH_T * (1.0 + off_T / modulus)).tolist())
+        array = replace(array, ambient_T=stated, ambient_uncertainty_T=sigma_T)
+        fields_T = self.EARTH_T + magloc.dipole.field(array.positions, place_m, [0.0, 120.0, 160.0])
+        values_T = np.linalg.norm(fields_T, axis=1) if kind == "scalar" else fields_T.ravel()
+        noise = array.channel_noise_T * np.random.default_rng(0).normal(size=(n, array.n_channels))
+        return " ".join(doubts(array, Readings(values_T + noise)))
+
+    @pytest.mark.parametrize("kind", ["scalar", "vector"])
+    @pytest.mark.parametrize(("off_T", "sigma_T"), [(1537e-9, 20e-9), (-800e-9, 50e-9), (1500e-9, 0.0)])
+    @pytest.mark.parametrize("n", [2, 40])
+    def test_difference_is_said(self, kind: str, off_T: float, sigma_T: float, n: int) -> None:
+        said = self.said(kind, off_T=off_T, sigma_T=sigma_T, n=n)
+        found = re.search(r"the sensors read (\d+) nT (more|less) than the ambient field", said)
+        assert found is not None
+        assert float(found[1]) == pytest.approx(1e9 * abs(off_T), abs=150.0)  # what the source adds
+        assert found[2] == ("less" if off_T > 0.0 else "more")
+        assert ("assumed" in said) == (not sigma_T)
+
+    @pytest.mark.parametrize("kind", ["scalar", "vector"])
+    @pytest.mark.parametrize(
+        ("off_T", "sigma_T", "place_m"),
+        [(300e-9, 200e-9, (9.0, 4.0, 1.0)), (400e-9, 0.0, (9.0, 4.0, 1.0)), (0.0, 5e-9, (2.0, 1.0, 1.0))],
+    )
+    def test_nothing_where_it_is_within_its_uncertainty_or_a_source_is_near(
+        self, kind: str, off_T: float, sigma_T: float, place_m: tuple[float, float, float]
+    ) -> None:
+        assert not self.said(kind, off_T=off_T, sigma_T=sigma_T, place_m=place_m)
+
+    @pytest.mark.parametrize("name", ["drone", "survey-drone"])
+    @given(off_nT=st.floats(-3000.0, 3000.0), sigma_nT=st.floats(5.0, 300.0))
+    def test_of_records_of_passing_sources(self, name: str, off_nT: float, sigma_nT: float) -> None:
+        """From 5 standard deviations on it is said, below 3 it is not: the sources take up to half of one."""
+        array, readings = record(name)
+        assume(not 3.0 * sigma_nT < abs(off_nT) < 5.0 * sigma_nT)
+        assert readings.ambient_T is not None
+        modulus = np.linalg.norm(readings.ambient_T, axis=1, keepdims=True)
+        off = replace(readings, ambient_T=readings.ambient_T * (1.0 + 1e-9 * off_nT / modulus))[::5]
+        said = " ".join(doubts(replace(array, ambient_uncertainty_T=1e-9 * sigma_nT), off))
+        assert ("than the ambient field" in said) == (abs(off_nT) > 4.0 * sigma_nT)
+
+
+class TestSize:
+    """Places in another unit than metres make an array of a size that no array of its noise has."""
+
+    @pytest.mark.parametrize(
+        ("array", "factors"),
+        [
+            (grid(3, 3, 0.03, noise_T=200e-9), (1000.0, 100.0, 1.0 / 0.0254)),
+            (grid(4, 4, 0.02, noise_T=1e-6), (1000.0, 100.0)),
+            (tetrahedron(0.5, noise_T=1e-9), (1000.0, 100.0)),
+            (axial(1.0, "scalar", noise_T=1e-11), (1000.0,)),
+        ],
+    )
+    def test_other_units(self, array: SensorArray, factors: tuple[float, ...]) -> None:
+        assert not list(array_doubts(array))
+        for factor in factors:
+            assert "in metres? If they are in mm" in " ".join(array_doubts(scaled(array, factor)))
+
+    def test_nanometres(self) -> None:
+        assert "in metres?" in " ".join(array_doubts(scaled(ARRAY, 1e-6)))
+
+    def test_what_moves_is_not_as_wide(self) -> None:
+        wide = axial(100.0, "scalar", noise_T=1e-10)
+        still = Rotation.from_quat(np.tile([0.0, 0.0, 0.0, 1.0], (3, 1)))
+        walked = Readings(np.zeros((3, 2)), array_position_m=np.eye(3), array_rotation=still)
+        assert not list(array_doubts(wide))
+        assert "a moving array" in " ".join(array_doubts(wide, walked))
+
+    @given(st.floats(0.01, 3.0), st.floats(1e-12, 1e-5))
+    def test_nothing_up_to_three_metres(self, edge_m: float, noise_T: float) -> None:
+        assert not list(array_doubts(axial(edge_m, noise_T=noise_T)))
+
+
+class TestMoments:
+    @pytest.mark.parametrize("factor", [1000.0, 100.0, 1.0 / 0.0254])
+    @pytest.mark.parametrize(("distance_m", "moment_Am2"), [(0.07, 0.36), (0.3, 20.0), (5.0, 300.0)])
+    def test_length_in_another_unit(self, factor: float, distance_m: float, moment_Am2: float) -> None:
+        """The field stays, so that the moment grows with the cube; inches of a weak source could be true."""
+        distance, moment = np.full(20, distance_m), np.outer(np.full(20, moment_Am2), [0.6, 0.0, 0.8])
+        assert not list(moment_doubts(distance, moment))
+        said = " ".join(moment_doubts(factor * distance, factor**3 * moment))
+        assert ("not plausible" in said and "in mm" in said) or (factor < 100.0 and distance_m > 0.07)
+
+    def test_none_of_nothing(self) -> None:
+        assert not list(moment_doubts([], []))
+        assert not list(moment_doubts([np.nan], [[np.nan] * 3]))
+
+    def test_a_moment_of_nothing(self) -> None:
+        assert "not plausible" in " ".join(moment_doubts([1e-3], [[1e-12, 0.0, 0.0]]))
+
+    @pytest.mark.parametrize("door", ["locate", "track"])
+    def test_of_an_array_in_millimetres(self, door: str, caplog: pytest.LogCaptureFixture) -> None:
+        """Its size is doubted, and the moment that follows."""
+        board, readings = record("board")
+        with caplog.at_level(logging.WARNING):
+            getattr(magloc, door)(scaled(board, 1000.0), readings[:25])
+        assert "the sensors span 102 m" in caplog.text
+        assert "the moment is" in caplog.text
+
+
+class TestGrid:
+    def test_eastings_and_northings(self) -> None:
+        walk = np.outer(np.arange(30.0), [1.0, 0.0, 0.0])
+        assert not moved(walk)
+        assert "eastings and northings" in moved(walk + np.array([372125.0, 5808303.0, 41.0]))
+
+
+def scaled(array: SensorArray, factor: float) -> SensorArray:
+    """The array with its places multiplied."""
+    sensors = (replace(sensor, position_m=tuple(factor * x for x in sensor.position_m)) for sensor in array.sensors)
+    return replace(array, sensors=tuple(sensors))
