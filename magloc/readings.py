@@ -28,7 +28,7 @@ from arrays.columns import POSITION_COLUMNS, ROTATION_COLUMNS, LogFormat
 from arrays.io.csv import Columns, Table, table_of_columns
 from arrays.io.errors import InputError
 from arrays.io.text import read_text, write_text
-from arrays.io.values import numbers, seconds
+from arrays.io.values import LARGEST_T, fields, numbers, seconds
 from arrays.sensor import Sensor
 from arrays.typing import FloatArray, IntArray
 from magloc.conditioning import NO_BACKGROUND, Background, without_hum
@@ -45,7 +45,7 @@ EXPECTED_HEADER = "a header with time_s and the sensors' columns"
 _T_IN_nT = 1e9
 _SIGMA_UNITS = np.array([1.0, np.pi / 180.0])  # of a pose's standard deviations, m and degrees
 _SATURATION_RTOL = 1e-12
-_LARGEST_nT = 1e15  # a million tesla: a column of something else, or a broken line
+_LARGEST_nT = LARGEST_T * _T_IN_nT
 _SAME_AMBIENT_RTOL = 1e-3  # change of the ambient field within which moduli may be averaged: 50 nT in 50 µT
 _SENSOR_COLUMN = re.compile(r"(?P<id>.+?)(_[xyz])?_nT")
 
@@ -57,7 +57,7 @@ class Readings:
     Attributes
     ----------
     values_T : ndarray, shape (n, C)
-        Raw readings [T] in the array's channel order; NaN, or masked, where a reading is missing.
+        Raw readings [T] in the array's channel order; NaN, masked or beyond 1e6 T where a reading is missing.
     time_s : ndarray, shape (n,), optional
         Instants [s], durations, or dates (UTC) as seconds since 1970; by default one row a second from zero.
     array_position_m : ndarray, shape (n, 3), optional
@@ -106,7 +106,8 @@ class Readings:
     def __post_init__(self) -> None:
         for name in ("values_T", "time_s", "array_position_m", "ambient_T", "pose_sigma"):
             if getattr(self, name) is not None:
-                object.__setattr__(self, name, (seconds if name == "time_s" else numbers)(getattr(self, name)))
+                checked = {"values_T": fields, "time_s": seconds}.get(name, numbers)
+                object.__setattr__(self, name, checked(getattr(self, name)))
         if self.values_T.ndim != 2:
             raise ValueError(f"Input values_T must have shape (n, C); instead received {self.values_T.shape}.")
         n = len(self.values_T)

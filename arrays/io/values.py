@@ -5,6 +5,9 @@ from __future__ import annotations
 import datetime
 from typing import TYPE_CHECKING, Any
 
+LARGEST_T = 1e6
+"""Readings beyond it are those of something else, or of a broken line."""
+
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
@@ -22,6 +25,16 @@ def numbers(values: ArrayLike) -> FloatArray:
     if given.dtype != np.float64:
         given = np.asarray(values, dtype=np.float64)
     return given if mask is np.ma.nomask else np.where(mask, np.nan, given)
+
+
+def fields(values_T: ArrayLike) -> FloatArray:
+    """Return readings of fields [T] as numbers, NaN where they are beyond all magnets and what can be squared."""
+    import numpy as np
+
+    given = numbers(values_T)
+    with np.errstate(invalid="ignore"):
+        is_field = np.abs(given) <= LARGEST_T
+    return given if is_field.all() else np.where(is_field, given, np.nan)
 
 
 def seconds(times: ArrayLike, *, name: str = "time_s", dates: bool = True) -> FloatArray:

@@ -17,7 +17,7 @@ from scipy.special import chdtrc
 
 from arrays.array import SensorArray
 from arrays.io.errors import check_positive
-from arrays.io.values import numbers
+from arrays.io.values import fields
 from arrays.sensor import Calibration
 from arrays.typing import FloatArray
 from magloc.levels import MISFIT
@@ -172,7 +172,7 @@ def calibrated_in_modulus(
 
 
 def _checked(readings_T: ArrayLike, modulus_T: ArrayLike, noise_T: float) -> tuple[FloatArray, FloatArray]:
-    readings = numbers(readings_T)
+    readings = fields(readings_T)
     if readings.ndim != 2 or readings.shape[1] != 3:
         raise ValueError(f"Input readings_T must have shape (n, 3); instead received {readings.shape}.")
     modulus = np.asarray(modulus_T, dtype=np.float64)

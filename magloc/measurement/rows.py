@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from arrays.array import SensorArray
-from arrays.io.values import numbers
+from arrays.io.values import fields
 from arrays.noise import covariance_blocks
 from arrays.typing import BoolArray, FloatArray, IntArray
 from arrays.whitening import Whitening, whitening, whitenings
@@ -106,7 +106,7 @@ def whitened_rows(
 
 def checked_rows(array: SensorArray, readings_T: ArrayLike) -> FloatArray:
     """Raw readings (n, C) of an array [T] as numbers; ValueError where they have another shape."""
-    readings = numbers(readings_T)
+    readings = fields(readings_T)
     if readings.ndim != 2 or readings.shape[1] != array.n_channels:
         raise ValueError(
             f"Input readings_T must have shape (n, {array.n_channels}); instead received {readings.shape}."

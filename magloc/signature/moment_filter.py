@@ -113,7 +113,8 @@ class MomentModel:
         at_rest = np.zeros(self.moment.stop + self.errors.n_states)
         strength = [np.linalg.norm(self.jacobian(i, at_rest)[:, self.moment]) for i in range(len(self.rows))]
         signal = [np.linalg.norm(row.z - self.predicted(i, at_rest)) for i, row in enumerate(self.rows)]
-        return max(1.0, float(np.max(signal))) / float(np.max(strength))
+        # No row has a difference where nothing has any strength: any size will do.
+        return max(1.0, float(np.max(signal))) / (float(np.max(strength)) or 1.0)
 
     def sources(self, i: int, x: FloatArray) -> FloatArray:
         """Positions and moments (K, 6) of a state in row i."""

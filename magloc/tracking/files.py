@@ -221,8 +221,9 @@ def read_track(path: Path) -> TrackResult:
         else:
             entries = msgspec.json.decode(text)
             entries = entries.get("results") if isinstance(entries, dict) else entries
-    except msgspec.DecodeError as error:
-        raise InputError(f"{path}: found what is not JSON ({str(error).lower()}), expected a track.") from None
+    except (msgspec.DecodeError, RecursionError) as error:
+        fault = "nested too deeply" if isinstance(error, RecursionError) else str(error).lower()
+        raise InputError(f"{path}: found what is not JSON ({fault}), expected a track.") from None
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise InputError(f"{path}: found no list of results, expected what `magloc track --json` or --jsonl prints.")
     if any("solutions" in entry for entry in entries):

@@ -234,6 +234,14 @@ class TestFile:
             ('[columns.sensors]\nlow = "A"', "time_s,low_nT,high_nT", "column A"),
             ('[columns]\ntime = "UTC"', "time_s,low_nT,high_nT", "UTC"),
             ("[columns]", "time_s,low_nT,Mag2", "high_nT"),
+            ("[columns]", "a,b,c", "column time_s"),
+            (
+                '[columns]\nseparator = "tab"',
+                "time_s,low_nT,high_nT",
+                "separated by commas, expected tabs as the separator",
+            ),
+            ('[columns]\nseparator = "semicolon"', "time_s\tlow_nT\thigh_nT", "separated by tabs, expected semicolons"),
+            ("[columns]", "time_s low_nT high_nT", "separated by blanks, expected commas"),
         ],
     )
     def test_bad_logs(self, columns: str, header: str, word: str, tmp_path: Path) -> None:

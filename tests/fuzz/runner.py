@@ -31,7 +31,7 @@ _OPTIONS = dict(commands())
 _FOREIGN = re.compile(
     r"0x[0-9a-f]{7}|broadcast|same shape|reshape|singular|ndarray|dtype|out of bounds|NoneType|_io\.|Traceback|"
     r"\w+Error\b|invalid value encountered|must be real|"
-    r"not subscriptable|unpack|concatenate|positional|'\w+' object|integer string"
+    r"not subscriptable|unpack|concatenate|'\w+' object|integer string"
 )
 
 

@@ -26,3 +26,10 @@ def test_the_factor_is_that_of_drawn_errors() -> None:
     np.testing.assert_allclose(error_factor(claimed, added), np.sqrt(nees), rtol=0.01)
     twice = error_factor(np.stack([claimed, added]), np.stack([added, claimed]))
     np.testing.assert_allclose(twice, [error_factor(claimed, added), error_factor(added, claimed)], rtol=1e-12)
+
+
+def test_a_singular_covariance_is_one_of_many() -> None:
+    """The others are as they are alone, whatever units their states have."""
+    claimed = np.stack([np.diag([1.0, 1e-18]), np.ones((2, 2)), np.diag([4.0, 9.0])])
+    added = np.stack([np.diag([3.0, 3e-18]), np.eye(2), np.zeros((2, 2))])
+    np.testing.assert_allclose(error_factor(claimed, added), [2.0, np.nan, 1.0])

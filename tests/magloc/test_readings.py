@@ -325,6 +325,17 @@ class TestReadingsShapes:
             with pytest.raises(ValueError, match=f"array_rotation must have 2 rotations; instead received {received}"):
                 Readings(np.zeros((2, 6)), array_position_m=np.zeros((2, 3)), array_rotation=turn)
 
+    @pytest.mark.parametrize(
+        "time_s", [[0.0, np.nan], [np.inf, 0.0], [np.datetime64("NaT"), np.datetime64("2026", "s")]]
+    )
+    def test_times_that_are_none(self, time_s: list[object]) -> None:
+        with pytest.raises(ValueError, match=r"time_s must be finite; instead row [12] has (nan|inf)"):
+            Readings(np.zeros((2, 6)), time_s=time_s)
+
+    def test_masks_and_what_no_magnet_makes_are_missing(self) -> None:
+        values = np.ma.MaskedArray([[1.0, 2.0, -np.inf, 2e6]], [[True, False, False, False]])
+        np.testing.assert_array_equal(Readings(values).values_T, [[np.nan, 2.0, np.nan, np.nan]])
+
 
 class TestSaturation:
     """A reading at its sensor's limit, or beyond it, is no measurement."""
@@ -414,6 +425,10 @@ class TestFromMemory:
             (
                 {"s1_x_nT": [0.0, 1.0]},
                 r"the readings: found columns of the shapes \[\(2,\), \(3,\)\], expected one length",
+            ),
+            (
+                {"time_s": [0.0, 1.7e15, 1.0]},
+                "the readings, row 2, column time_s: found the time 1.7e\\+15 s, beyond 3,000 y",
             ),
             ({"s1_x_nT": ["a", "b", "c"]}, "the readings, column s1_x_nT: found what is not a number"),
             ({"s9_nT": [1.0, 2.0, 3.0]}, "the readings, column s9_nT: found a column of sensor s9"),

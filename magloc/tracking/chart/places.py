@@ -189,6 +189,8 @@ def _moments(stack: Stack, prior: SourcePrior, R: FloatArray) -> tuple[FloatArra
     chi2 = R[:, 3, 3] ** 2
     known, turn = prior.known_moment, stack.row.R_world_from_array
     of_moment, y = R[:, :3, :3], R[:, :3, 3]
+    regular = (np.diagonal(of_moment, axis1=1, axis2=2) != 0.0).all(axis=1)
+    of_moment = np.where(regular[:, None, None], of_moment, np.nan)
     if known is None:
         return np.asarray(np.linalg.solve(of_moment, y[..., None])[..., 0]), of_moment, chi2
     # In the array's axes, in which it is known.

@@ -298,6 +298,8 @@ class RowProblem:
             ids = (*found.ids, self.first_id + born)
             prior = self.with_sources(found.prior, *self._at(cell, update.innovation, update.linear, update.row.used))
             start = joint_update(prior, update.row, _START_TRIALS).found
+            if not 0.0 < np.linalg.norm(start.moment_Am2[-1]) < np.inf:
+                continue
             # Where it is found, not where it was looked for, is what the next event starts from.
             prior = self.with_sources(found.prior, start.position_m[-1:], start.moment_Am2[-1:])
             child = self.updated(prior, ids, found.out, found.penalty + BIRTH)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -47,6 +49,16 @@ class TestPage:
         page = (tmp_path / "a.html").read_text(encoding="utf-8")
         assert "accelerometer: thick as measured" in page
         assert "true body axes" not in page
+
+    @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes in the file system")
+    def test_files_that_can_be_read_once(self, adcs, satellite, tmp_path):
+        """Pipes, such as a shell makes of a command."""
+        pipes = [tmp_path / "log", tmp_path / "config"]
+        for pipe, file in zip(pipes, (satellite, config_of(satellite)), strict=True):
+            os.mkfifo(pipe)
+            threading.Thread(target=pipe.write_bytes, args=(file.read_bytes(),), daemon=True).start()
+        outcome = adcs("view", pipes[0], "--config", pipes[1], "--html", tmp_path / "a.html")
+        assert outcome.status == 0, outcome.err
 
 
 class TestRefused:

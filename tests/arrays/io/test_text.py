@@ -1,0 +1,64 @@
+"""Files are read whole; what does not end, or is no text, is refused by a sentence with its name."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from arrays.io import text
+from arrays.io.csv import read_table
+from arrays.io.errors import InputError
+from arrays.io.text import read_bytes, read_text
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="pipes in the file system, and devices")
+
+
+class TestEndless:
+    """Devices and pipes that do not end, and files larger than memory."""
+
+    def test_device_without_lines(self) -> None:
+        with pytest.raises(
+            InputError, match=r"^/dev/zero: found no end of a line in \d+ MB of a pipe or device, expec"
+        ):
+            read_bytes("/dev/zero", "a picture")
+
+    @pytest.mark.parametrize("device", ["/dev/zero", "/dev/urandom"])
+    def test_device_as_text(self, device: str) -> None:
+        with pytest.raises(InputError, match=device):
+            read_table(device, "a header")
+
+    def test_pipe_of_lines(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(text, "MOST_PIPED_BYTES", 10**6)
+        monkeypatch.setattr(text, "_CHUNK", 2**16)
+        with pytest.raises(InputError, match=r"no end of the data in 1 MB of a pipe"):
+            read_text(piped(tmp_path, b"y\n" * 10**6), "a CSV file")
+
+    def test_large_file(self, tmp_path: Path) -> None:
+        """It is sparse: no byte of it is read or written."""
+        path = tmp_path / "large.csv"
+        with path.open("wb") as file:
+            file.truncate(4 * 10**9 + 1)
+        with pytest.raises(InputError, match=r"large\.csv: found more than 4 GB, expected a CSV file"):
+            read_text(path, "a CSV file")
+
+    def test_pipe_that_ends(self, tmp_path: Path) -> None:
+        data = b"time_s,x\n" + b"".join(b"%d,1\n" % i for i in range(20_000))
+        assert read_bytes(piped(tmp_path, data), "a CSV file") == data
+
+
+def piped(folder: Path, data: bytes) -> Path:
+    """A pipe that gives some bytes to whoever opens it."""
+    path = folder / "pipe"
+    os.mkfifo(path)
+
+    def write() -> None:
+        with contextlib.suppress(BrokenPipeError):  # the reader has had enough
+            path.write_bytes(data)
+
+    threading.Thread(target=write, daemon=True).start()
+    return path
