@@ -61,6 +61,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "read_readings": "magloc.readings",
         "read_truth": "magloc.truth",
         "source_map": "magloc.convergence.over_sources",
+        "subtract_rest": "magloc.live.rest",
         "survey": "magloc.surveying.survey",
         "track": "magloc.tracking.track",
         "track_moment": "magloc.signature.moment_track",

@@ -21,6 +21,7 @@ from magloc.fields import dipole as dipole
 from magloc.fields import geomagnetic as geomagnetic
 from magloc.fields.body import equivalent_dipole as equivalent_dipole
 from magloc.kalman import IteratedExtendedKalmanFilter as IteratedExtendedKalmanFilter
+from magloc.live.rest import subtract_rest as subtract_rest
 from magloc.localization.fit.fixes import Fixes as Fixes
 from magloc.localization.fit.prior import SourcePrior as SourcePrior
 from magloc.localization.fit.results import Fix as Fix

@@ -14,6 +14,7 @@ import logging
 import os
 import shlex
 import sys
+import threading
 import traceback
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -37,6 +38,11 @@ _LONGEST_WORD = 200
 _LOG = logging.getLogger(__name__)
 _warnings: list[str] = []
 """What was warned of since a command line began, for its JSON."""
+# Commands that end when their user or their stream does.
+_ENDLESS = {"live", "view"}
+_FIRST_SIGN_S = 10.0
+_bars: list[object] = []
+_PACKAGES = ("arrays", "magloc", "adcs", "sims")
 
 
 @Parameter(name="*", group="Common options")
@@ -176,10 +182,35 @@ def call(app: App, tokens: Sequence[str]) -> None:
         raise InputError(str(error).replace(" requires an argument.", " is missing.")) from None
     except ImportError as error:
         raise InputError(f"the command cannot be loaded ({error.__cause__ or error}).") from None
+    quiet = False
     for value in bound.arguments.values():
         if isinstance(value, QuietOptions):
             value.apply()
-    command(*bound.args, **bound.kwargs)
+            quiet = value.quiet
+    endless = "-" in tokens or not _ENDLESS.isdisjoint(tokens[:1])
+    with contextlib.nullcontext() if quiet or endless else _signs_of_life(app.name[0]):
+        command(*bound.args, **bound.kwargs)
+
+
+@contextmanager
+def _signs_of_life(program: str) -> Iterator[None]:
+    """Tell on a terminal how long a command has run, at growing intervals, while it shows no progress of its own."""
+    ended = threading.Event()
+
+    def tell() -> None:
+        wait_s, passed_s = _FIRST_SIGN_S, 0.0
+        while not ended.wait(wait_s):
+            passed_s += wait_s
+            wait_s = passed_s
+            if not _bars:
+                print_note(f"still computing after {passed_s:g} s", program)
+
+    if sys.stderr.isatty():
+        threading.Thread(target=tell, daemon=True).start()
+    try:
+        yield
+    finally:
+        ended.set()
 
 
 def _unknown_command(app: App, error: UnknownCommandError) -> str:
@@ -344,4 +375,10 @@ def progress(total: int, unit: str, *, quiet: bool) -> Iterator[Callable[[int], 
         def advance(finished: int) -> None:
             bar.update(finished)
 
-        yield advance
+        if not hidden:
+            _bars.append(bar)
+        try:
+            yield advance
+        finally:
+            if not hidden:
+                _bars.remove(bar)

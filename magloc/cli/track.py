@@ -49,6 +49,7 @@ if TYPE_CHECKING:
 
 # Two vector sensors have no more: too few for the six numbers of a source in one row.
 _FEW_CHANNELS = 6
+_STATE_OFFSETS = "; state offset_uncertainty_nT in the array file, use --rest-s, or calibrate the array"
 _USE_SURVEY = "sources at rest that few sensors move past are found by magloc survey"
 
 
@@ -109,6 +110,9 @@ class ConditioningOptions:
 
     Parameters
     ----------
+    rest_s : float
+        The first seconds are a rest, without a source, whose mean is taken off all readings; vector sensors of an array
+        that stands.
     detrend : bool
         Every channel has a straight line through its mean, whose slope is estimated beside the source.
     high_pass_hz : float
@@ -119,6 +123,7 @@ class ConditioningOptions:
         Average windows of this length.
     """
 
+    rest_s: float | None = None
     detrend: Flag = False
     high_pass_hz: float | None = None
     mains_hz: float | None = None
@@ -129,9 +134,11 @@ class ConditioningOptions:
         from magloc.averages import window_averages, window_averaging_array
         from magloc.readings import without_saturated
 
-        refuse_not_positive(self, "window_s")
+        refuse_not_positive(self, "window_s", "rest_s")
         rows = without_saturated(rows, array)
         try:
+            if self.rest_s is not None:
+                array, rows = magloc.subtract_rest(array, rows, self.rest_s)
             if self.detrend:
                 rows = rows.detrended()
             if self.high_pass_hz is not None:
@@ -201,6 +208,7 @@ def track(
     from magloc.measurement.plausibility import warn_of_doubts
     from magloc.measurement.pose import with_stated_pose
     from magloc.tracking.results import rows_of
+    from magloc.tracking.sensor_health import OFFSETS
 
     if json and jsonl:
         raise InputError("--json: found it together with --jsonl, expected one of them.")
@@ -272,7 +280,8 @@ def track(
         _print_track(found, None, json=json, jsonl=jsonl, printed=printed)
         if truth is None and out is None and maps == MapOptions() and _is_undetermined(found):
             return
-        raise _no_track(str(readings), found.status, f"; {_USE_SURVEY}" if few else "")
+        hint = f"; {_USE_SURVEY}" if few else _STATE_OFFSETS if OFFSETS in found.status else ""
+        raise _no_track(str(readings), found.status, hint)
     result = None if truth is None else found.consistency(magloc.read_truth(truth))
     maps.write(found, known.place)
     if out is not None:

@@ -312,10 +312,6 @@ class Follower:
         self._background = Background.of(self.array, rest)
         self._rest_s = 0.0
         self.restart()
-        _LOG.info(f"the background is taken from {len(rest)} rows")
-        if self._background.restless:
-            names = ", ".join(self._background.restless)
-            _LOG.warning(f"the readings of {names} changed by more than their noise: was the array at rest?")
         return False
 
 

@@ -6,6 +6,7 @@ Its own error, of variance :math:`σ^2/n`, is the same in every later row: an un
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,10 +14,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from arrays.array import SensorArray
-from arrays.io.errors import InputError
+from arrays.io.errors import InputError, check_positive
 from arrays.typing import FloatArray
-from magloc.tracking.results import Row
+from magloc.readings import Readings, without_saturated
+from magloc.tracking.results import Row, rows_of
 
+_LOG = logging.getLogger(__name__)
 _OUTLIER = 5.0
 _MAD_TO_SIGMA = 1.4826
 _TOO_NOISY = 3.0
@@ -57,6 +60,11 @@ class Background:
             sigma = scatter / np.sqrt(count)
         noisy = scatter > _TOO_NOISY * stated
         restless = tuple(name for i, name in enumerate(array.ids) if noisy[array.channel_sensor == i].any())
+        _LOG.info(f"the background is taken from {len(rows)} rows")
+        if restless:
+            _LOG.warning(
+                f"the readings of {', '.join(restless)} changed by more than their noise: was the array at rest?"
+            )
         return cls(mean - array.channel_offset_T, sigma, len(rows), restless)
 
     def subtracted(self, row: Row) -> Row:
@@ -71,6 +79,52 @@ class Background:
             for sensor, value in zip(array.sensors, sigma, strict=True)
         )
         return replace(array, sensors=sensors)
+
+
+def subtract_rest(array: SensorArray, readings: Readings, rest_s: float) -> tuple[SensorArray, Readings]:
+    """Subtract what an array reads at rest: the mean of a record's first seconds, in which no source is near.
+
+    With it go the offsets of the sensors, the field of the Earth and that of iron nearby. The mean of n rows has an
+    error of variance :math:`σ^2/n`, the same in all rows, which the returned array states as offset uncertainties.
+
+    Parameters
+    ----------
+    array : SensorArray
+        Vector sensors alone.
+    readings : Readings
+        Of an array that stands still. Readings that saturate become NaN.
+    rest_s : float
+        Length of the rest, from the first row on [s].
+
+    Returns
+    -------
+    array : SensorArray
+        The array with the offset uncertainties that are left.
+    readings : Readings
+        All rows, less the mean.
+
+    Raises
+    ------
+    InputError
+        The array moves or has a scalar sensor, or no row is later than the rest.
+
+    Examples
+    --------
+    >>> import magloc
+    >>> board = magloc.datasets.load("board")
+    >>> array, readings = magloc.subtract_rest(board.array, board.readings, 0.2)
+    >>> len(readings) == len(board.readings)
+    True
+    """
+    check_positive(rest_s=rest_s)
+    refuse_rest(array, moves=readings.pose is not None)
+    used = without_saturated(readings, array)
+    rests = used.time_s - used.time_s[0] < rest_s
+    if rests.all():
+        last_s = float(used.time_s[-1] - used.time_s[0])
+        raise InputError(f"a rest of {rest_s:g} s: found {last_s:g} s of readings, expected rows after the rest.")
+    background = Background.of(array, list(rows_of(used[rests])))
+    return background.array(array), replace(used, values_T=used.values_T - background.mean_T)
 
 
 def refuse_rest(array: SensorArray, *, moves: bool) -> None:

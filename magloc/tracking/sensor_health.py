@@ -1,13 +1,15 @@
-"""Sensors that die while sources are followed: named, left out, and taken back when they are well."""
+"""Sensors that die while sources are followed, named, left out and taken back; and errors of all that last."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import logging
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from arrays.typing import BoolArray, FloatArray, IntArray
 
+_LOG = logging.getLogger(__name__)
 SENSOR_LIMIT = 32.0
 """χ² with three degrees of freedom of a sensor's residual above which it contradicts the others: 5e-7."""
 RIVAL_WITHIN = 9.0
@@ -27,6 +29,67 @@ _FORGIVEN = 0.25
 _REMEMBERED = 0.9
 # Rows over which residuals are averaged.
 _MEMORIES = np.array([4.0, 16.0, 64.0, 256.0])
+
+# Share of the squared misfit that is the same in all rows from which on it lasts; of independent rows it is 1/n.
+_LASTING = 0.5
+# Rows from which on that is asked, and from which on it is told.
+_FEWEST_ALIKE, _ROWS_TO_TELL = 3, 10
+OFFSETS = "not acquired: no dipole fits the readings, which have offsets that are not stated"
+
+
+@dataclass(frozen=True, eq=False)
+class Misfits:
+    """Misfits of successive rows that no source explains, in units of noise.
+
+    Attributes
+    ----------
+    rows : int
+    mean : ndarray, shape (k,)
+    energy : float
+        Mean of the squared length.
+    pause : int
+        Rows between two searches once a warning was given, 0 before.
+    waits : int
+        Rows that are still passed over.
+    """
+
+    rows: int = 0
+    mean: FloatArray = field(default_factory=lambda: np.zeros(0))
+    energy: float = 0.0
+    pause: int = 0
+    waits: int = 0
+
+    @property
+    def are_alike(self) -> bool:
+        """Whether most of the misfit is the same in all rows, as offsets make it."""
+        return self.rows >= _FEWEST_ALIKE and float(self.mean @ self.mean) > _LASTING * self.energy
+
+    @property
+    def passed_over(self) -> Misfits:
+        """State after a row in which nothing was searched for."""
+        return replace(self, waits=self.waits - 1)
+
+    def after(self, misfit: FloatArray, noise_T: float) -> Misfits:
+        """Add a row, and warn once if the misfit lasts: from then on rows are searched ever more seldom."""
+        if len(misfit) < len(self.mean):
+            return self  # a row without some sensors
+        before = self if len(misfit) == len(self.mean) else Misfits(0, np.zeros(len(misfit)), pause=self.pause)
+        n = before.rows + 1
+        mean = before.mean + (misfit - before.mean) / n
+        energy = before.energy + (float(misfit @ misfit) - before.energy) / n
+        found = Misfits(n, mean, energy, before.pause)
+        if n < _ROWS_TO_TELL or not found.are_alike:
+            return found
+        if not found.pause:
+            size_uT = 1e6 * noise_T * float(np.sqrt(np.mean(mean**2)))
+            _LOG.warning(
+                f"no source explains {n} rows, and their misfit is nearly the same, {size_uT:.2g} µT rms where the"
+                f" noise is {1e6 * noise_T:.2g} µT: the sensors have offsets that are not stated, or iron or another"
+                " magnet rests nearby. State offset_uncertainty_nT of the sensors, calibrate them, or subtract a"
+                " rest: the mean of rows without the source"
+            )
+        pause = max(_ROWS_TO_TELL, 2 * found.pause)
+        return replace(found, pause=pause, waits=pause)
 
 
 @dataclass(frozen=True, eq=False)

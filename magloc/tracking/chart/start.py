@@ -143,6 +143,7 @@ class Start:
         check_magnitudes(array)
         check_spans(array)
         self.errors, self.prior = errors, prior
+        self.misfit = np.zeros(0)  # of the last row that no dipole fits
         self._grid = _Grid.of(array)
         self._locator: Locator | None = None
         self._examiner: Locator | None = None
@@ -177,6 +178,8 @@ class Start:
             return None, NOT_ALLOWED
         dof = measurement.n_differences - N_SOURCE + (0 if known is None else known.n_known)
         if dof > 0 and found.chi2[sound].min() > chdtri(dof, CONTRADICTION):
+            best = int(np.argmin(np.where(sound, found.chi2, np.inf)))
+            self.misfit = found.residual[best, : measurement.z.size]
             return None, NO_DIPOLE
         log_weight = found.log_evidence + _EVEN * ((seeds.cell < 0) @ np.array([1.0, 2.0, 0.0]))
         log_weight -= math.log(2.0) * seeds.cell[:, 2]

@@ -28,9 +28,10 @@ from magloc.tracking.chart.posed_motion import PosedMotion
 from magloc.tracking.chart.refit import Cells, Refitted, refitted
 from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.chart.stack import Stack
-from magloc.tracking.chart.start import OF_PITCH, Start, once, with_errors
+from magloc.tracking.chart.start import NO_DIPOLE, OF_PITCH, Start, once, with_errors
 from magloc.tracking.chart.update import Move, predicted_root, updated
 from magloc.tracking.motion import N_SOURCE, MotionModel
+from magloc.tracking.sensor_health import OFFSETS, Misfits
 
 LARGEST_GROWTH = 1.5
 """A prediction bends as the readings do while no standard deviation grows by more in the step: beyond that it is the
@@ -111,12 +112,20 @@ class ChartFilter:
         self.errors, self.pose_errors, self.prior = errors, pose_errors, prior
         self._start = Start(array, errors, prior)
         self.n_differences = decorrelated_differences(array).n_differences
+        self._noise_T = float(np.median(array.channel_noise_T))
+        self._misfits = Misfits()
 
     def started(self, row: ChartRow, motion: MotionModel, near: Mixture | None = None) -> tuple[Mixture | None, str]:
         """What one row says of a source, weighed by a prediction of its place if there is one, or why there is none."""
+        if self._misfits.waits:
+            self._misfits = self._misfits.passed_over
+            return None, OFFSETS
         mixture, reason = self.of_row(row, motion)
         if mixture is None:
+            if reason == NO_DIPOLE:
+                self._misfits = self._misfits.after(self._start.misfit, self._noise_T)
             return None, reason
+        self._misfits = Misfits()
         mixture = with_errors(mixture.likely(), row, self.errors.sigma)
         return (mixture if near is None else _near(mixture.reduced(), near)).reduced(), ""
 
@@ -129,7 +138,9 @@ class ChartFilter:
         return self._start.mixture(stack, at_rest)
 
     def faulty(self, row: ChartRow) -> BoolArray:
-        """Sensors (N,) that contradict all others in a row that no dipole fits."""
+        """Sensors (N,) that contradict all others in a row that no dipole fits; none where rows misfit alike."""
+        if self._misfits.are_alike:
+            return np.zeros(self.errors.array.n_sensors, dtype=bool)
         return self._start.faulty(row.row)
 
     def _posed(self, motion: MotionModel) -> MotionModel:

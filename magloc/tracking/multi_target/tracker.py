@@ -45,7 +45,7 @@ from magloc.tracking.multi_target.smoothing import YoungTrack
 from magloc.tracking.multi_target.state import N_COMMON, N_SEEN, JointState
 from magloc.tracking.multi_target.update import innovation_chi2
 from magloc.tracking.results import Row, next_row
-from magloc.tracking.sensor_health import SENSOR_LIMIT, SensorHealth
+from magloc.tracking.sensor_health import SENSOR_LIMIT, Misfits, SensorHealth
 
 ROWS_TO_REPORT = 10
 """Rows after its birth in which a source is not yet told, unless there is no other: one taken for two dies sooner."""
@@ -137,6 +137,7 @@ class SourcesTracker:
         self._last_restart = self._next_restart = -_RESTART_PAUSE
         self._pause = _FIRST_PAUSE
         self._late_pause, self._next_late = _LATE_PAUSE, 0
+        self._noise_T, self._misfits = float(np.median(array.channel_noise_T)), Misfits()
 
     def update(self, row: Row | Readings) -> SourcesPoint:
         """What is known of all sources after one more row.
@@ -156,9 +157,12 @@ class SourcesTracker:
         self._time_s = row.time_s
         problem = RowProblem(self.scene, row, self._n_rows, self.scene.motion.numbers(dt_s))
         self._n_rows += 1
-        if not row.available.any():
+        if not row.available.any() or self._misfits.waits:
             step = problem.step
             self._hypotheses = [replace(one, state=stepped(one.state, step), young=None) for one in self._hypotheses]
+            if self._misfits.waits and self._hypotheses:
+                self._misfits = self._misfits.passed_over
+                return self._point(problem, "misfit", math.nan)
             return self._point(problem, "no readings", math.nan)
         if not self._hypotheses:
             self._hypotheses = [self._begun(problem)]
@@ -169,6 +173,9 @@ class SourcesTracker:
         best = self._hypotheses[0]
         found, explained = next((found, fits) for one, found, fits in known if one.state is best.state)
         status = "misfit" if not explained else "tracked" if best.ids else "no source"
+        self._misfits = (
+            Misfits() if explained else self._misfits.after(found.update.standardised.ravel(), self._noise_T)
+        )
         is_poor = bool((best.excess > _POOR).any())
         left, energy = problem.left(best.health) if best.ids else (None, 0.0)
         if status == "tracked" and (is_poor or energy > SENSOR_LIMIT):

@@ -66,7 +66,11 @@ def counted() -> Iterator[dict[str, set[int]]]:
         code = frame.f_code
         if event == "call" and before is not None and code.co_filename.startswith(LINEAR_ALGEBRA):
             place = before.f_code.co_filename
-            if place.startswith(OURS) and code.co_name != "norm" and np.size(frame.f_locals[code.co_varnames[0]]) > 9:
+            if (
+                place.startswith(OURS)
+                and "norm" not in code.co_name
+                and np.size(frame.f_locals[code.co_varnames[0]]) > 9
+            ):
                 met.setdefault(f"{place}:{before.f_lineno}", set()).update(threads())
 
     sys.setprofile(count)

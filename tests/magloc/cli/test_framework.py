@@ -6,11 +6,13 @@ import json
 import logging
 import subprocess
 import sys
+import threading
 import warnings
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
 
+import cyclopts
 import numba
 import numpy as np
 import pytest
@@ -22,6 +24,7 @@ from arrays.io.errors import InputError, naming
 from magloc.cli import framework
 from magloc.cli.framework import print_json_list
 from tests.command_line import Outcome, Run, assert_refused
+from tests.waiting import WAIT_S
 
 COMMANDS = (
     "calibrate",
@@ -254,3 +257,38 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     values = [f"{100.0 / (1 + k):.3f}" for k in range(len(names))]
     (folder / "readings.csv").write_text(f"time_s,{','.join(names)}\n0,{','.join(values)}\n")
     return folder / "readings.csv", file
+
+
+class TestSignsOfLife:
+    """A command that shows no progress of its own tells a terminal that it runs."""
+
+    def told(self, monkeypatch: pytest.MonkeyPatch, *tokens: str, watched: bool, bar: bool = False) -> list[str]:
+        """Notes of a command that waits for three of them, where there may be some."""
+        notes: list[str] = []
+        seen = threading.Event()
+
+        def note(text: str, _: str) -> None:
+            notes.append(text)
+            if len(notes) == 3:
+                seen.set()
+
+        app = cyclopts.App(name="magloc")
+
+        @app.command
+        def work(*, common: framework.QuietOptions = framework.QuietOptions()) -> None:  # noqa: B008 - frozen
+            with framework.progress(1, "rows", quiet=not bar):
+                seen.wait(WAIT_S if watched and not common.quiet and not bar else 0.2)
+
+        monkeypatch.setattr(framework, "_FIRST_SIGN_S", 0.01)
+        monkeypatch.setattr(framework, "print_note", note)
+        monkeypatch.setattr(sys.stderr, "isatty", lambda: watched)
+        framework.call(app, ["work", *tokens])
+        return notes
+
+    def test_at_growing_intervals(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        assert self.told(monkeypatch, watched=True)[:3] == [f"still computing after {s} s" for s in (0.01, 0.02, 0.04)]
+
+    def test_not_into_a_pipe_nor_quietly_nor_beside_a_bar(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        assert self.told(monkeypatch, watched=False) == []
+        assert self.told(monkeypatch, "--quiet", watched=True) == []
+        assert self.told(monkeypatch, watched=True, bar=True) == []

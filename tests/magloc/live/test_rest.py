@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+import magloc
 from arrays import geometries
 from arrays.io.errors import InputError
 from arrays.sensor import Calibration
@@ -106,3 +107,28 @@ class TestTrackAfterARest:
     def test_scalar_sensors_are_refused(self) -> None:
         with pytest.raises(InputError, match="scalar sensor s1"):
             Follower(geometries.tetrahedron(1.0, "scalar"), rest_s=1.0)
+
+
+class TestSubtractRest:
+    def test_a_track_behind_it_is_that_of_live(self) -> None:
+        rows = rows_at_rest(5)
+        time_s, p, m = moving_source(30, dt_s=0.1)
+        moving_T = readings_of(ARRAY, p, m) + OFFSET_T
+        times = np.concatenate([[row.time_s for row in rows], 0.1 * N_REST + time_s - time_s[0]])
+        readings = Readings(np.concatenate([[row.readings_T for row in rows], moving_T]), time_s=times)
+        track = magloc.track(*magloc.subtract_rest(ARRAY, readings, 0.1 * (N_REST - 0.5)), motion=SLOW)
+        live = list(Follower(ARRAY, SLOW, rest_s=0.1 * (N_REST - 0.5)).follow(readings))
+        told = [point.position_m for point in live[N_REST:]]
+        assert track.tracked[N_REST:].all()
+        np.testing.assert_allclose(track.position_m[N_REST:], np.array(told), rtol=1e-9)
+
+    def test_a_record_that_is_all_rest_is_refused(self) -> None:
+        readings = Readings(np.zeros((3, ARRAY.n_channels)), time_s=np.arange(3.0))
+        with pytest.raises(InputError, match="expected rows after the rest"):
+            magloc.subtract_rest(ARRAY, readings, 10.0)
+
+    def test_what_it_says_nothing_of_is_refused(self) -> None:
+        scalar = geometries.cube(1.0, "scalar", 1e-9)
+        readings = Readings(np.zeros((3, scalar.n_channels)), time_s=np.arange(3.0))
+        with pytest.raises(InputError, match="scalar sensor"):
+            magloc.subtract_rest(scalar, readings, 1.0)
