@@ -29,6 +29,8 @@ class PoseUncertainty:
         Of errors that change from row to row.
     correlation_s : float
         How long these last: first-order Markov processes of that time. 0: they are new in every row.
+    position_white_m : float
+        Of an error of the position beside that, new in every row.
     position_constant_m : float
         Of an error of the lever arm, constant in the array's axes.
     attitude_constant_rad : float
@@ -62,6 +64,7 @@ class PoseUncertainty:
     attitude_constant_rad: float = math.radians(0.5)
     time_constant_s: float = 0.0
     lever_arm_m: Vector = (0.0, 0.0, 0.0)
+    position_white_m: float = 0.0
 
     def __post_init__(self) -> None:
         for name in _SIGMAS:
@@ -89,6 +92,7 @@ class PoseTable(Table, kw_only=True):
     attitude_constant_deg: Annotated[float, _BELOW_30] = 0.5
     time_constant_s: NotNegative = 0.0
     lever_arm_m: Vector = _NOT_SAID.lever_arm_m
+    position_white_m: NotNegative = 0.0
 
     def uncertainty(self, place: str) -> PoseUncertainty:
         """What the table states; `place` is for errors."""
@@ -102,6 +106,7 @@ class PoseTable(Table, kw_only=True):
                 attitude_constant_rad=math.radians(self.attitude_constant_deg),
                 time_constant_s=self.time_constant_s,
                 lever_arm_m=self.lever_arm_m,
+                position_white_m=self.position_white_m,
             )
 
 

@@ -71,6 +71,8 @@ class Readings:
     pose_sigma : ndarray, shape (n, 2), optional
         Standard deviations of the array's position along each axis [m] and of its attitude about each axis [rad], in
         place of those of the array's :class:`arrays.PoseUncertainty`.
+    interpolated_m : ndarray, shape (n,), optional
+        Standard deviation along each axis that interpolation between fixes adds to the error of a position [m].
     background : Background
         What of the values is said to be no signal, by :meth:`detrended` and :meth:`high_passed`.
 
@@ -101,10 +103,11 @@ class Readings:
     ambient_T: FloatArray | None = None
     motion: MeasuredMotion | None = None
     pose_sigma: FloatArray | None = None
+    interpolated_m: FloatArray | None = None
     background: Background = NO_BACKGROUND
 
     def __post_init__(self) -> None:
-        for name in ("values_T", "time_s", "array_position_m", "ambient_T", "pose_sigma"):
+        for name in ("values_T", "time_s", "array_position_m", "ambient_T", "pose_sigma", "interpolated_m"):
             if getattr(self, name) is not None:
                 checked = {"values_T": fields, "time_s": seconds}.get(name, numbers)
                 object.__setattr__(self, name, checked(getattr(self, name)))
@@ -114,6 +117,7 @@ class Readings:
         if self.time_s is None:
             object.__setattr__(self, "time_s", np.arange(float(n)))
         shapes = {"time_s": (n,), "array_position_m": (n, 3), "ambient_T": (n, 3), "pose_sigma": (n, 2)}
+        shapes["interpolated_m"] = (n,)
         for name, shape in shapes.items():
             value = getattr(self, name)
             if value is not None and value.shape != shape:
@@ -169,6 +173,7 @@ class Readings:
             ambient_T=chosen(self.ambient_T),
             motion=None if self.motion is None else self.motion.of_rows(rows),
             pose_sigma=chosen(self.pose_sigma),
+            interpolated_m=chosen(self.interpolated_m),
             background=self.background,
         )
 

@@ -92,7 +92,7 @@ class BoundModel(NamedTuple):
         deviation += 3 * [(ambient_uncertainty_T or array.row_ambient_uncertainty_T) if scalar.any() else 0.0]
         pose = array.pose or PoseUncertainty(position_constant_m=0.0, attitude_constant_rad=0.0)
         deviation += 3 * [math.hypot(pose.attitude_rad, pose.attitude_constant_rad)]
-        deviation += 3 * [math.hypot(pose.position_m, pose.position_constant_m)]
+        deviation += 3 * [math.hypot(pose.position_m, pose.position_white_m, pose.position_constant_m)]
         deviation += n_body_errors * [1.0]
         nuisances = np.flatnonzero(deviation)
         constant = nuisances.max(initial=0) < COMMON_MODULUS and not array.noise_depends_on_reading

@@ -42,7 +42,6 @@ _warnings: list[str] = []
 _ENDLESS = {"live", "view"}
 _FIRST_SIGN_S = 10.0
 _bars: list[object] = []
-_PACKAGES = ("arrays", "magloc", "adcs", "sims")
 
 
 @Parameter(name="*", group="Common options")

@@ -150,7 +150,9 @@ def survey(
     print(found.table())
     if found.pose_assumed and not common.quiet:
         pose = found.array.pose
-        size = "" if pose is None else f" {100.0 * pose.position_m:g} cm that last {pose.correlation_s:g} s"
+        size = "" if pose is None else f" {100.0 * pose.position_m:.2g} cm that last {pose.correlation_s:g} s"
+        if pose is not None and pose.position_white_m:
+            size += f", and {100.0 * pose.position_white_m:.2g} cm new in every row"
         print_note(f"nothing is stated of the pose's errors: as the rows show them{size}")
 
 

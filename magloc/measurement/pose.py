@@ -175,15 +175,20 @@ class PoseErrors:
         How long it does: 0 of one that is new in every row, infinite of a constant.
     ambient_T : tuple of 2 floats
         Standard deviations of the ambient field's constant error and of the one that is new in every row.
+    between_s : float
+        How long errors of places last that were interpolated between fixes; 0 where none were.
     """
 
     uncertainty: PoseUncertainty
     of_pose: IntArray
     lasts_s: FloatArray
     ambient_T: tuple[float, float] = (0.0, 0.0)
+    between_s: float = 0.0
 
     @classmethod
-    def of(cls, uncertainty: PoseUncertainty | None, ambient_T: tuple[float, float] = (0.0, 0.0)) -> PoseErrors:
+    def of(
+        cls, uncertainty: PoseUncertainty | None, ambient_T: tuple[float, float] = (0.0, 0.0), between_s: float = 0.0
+    ) -> PoseErrors:
         """All errors that are stated; what changes of place and attitude always is, a row may say how much."""
         turn, shift, lever, field = (list(range(N_POSE)[part]) for part in (TURN, SHIFT, LEVER, FIELD))
         clock, known = [N_POSE], uncertainty or PoseUncertainty()
@@ -195,11 +200,12 @@ class PoseErrors:
                 (turn, np.inf, known.attitude_constant_rad),
                 (lever, np.inf, known.position_constant_m),
                 (clock, np.inf, known.time_constant_s),
+                (shift, 0.0, known.position_white_m),
             ]
-        parts += [(field, np.inf, ambient_T[0]), (field, 0.0, ambient_T[1])]
+        parts += [(field, np.inf, ambient_T[0]), (field, 0.0, ambient_T[1]), (shift, between_s, between_s)]
         stated = [(component, lasts_s) for of, lasts_s, size in parts if size for component in of]
         of_pose, lasts = np.array(stated, dtype=np.float64).reshape(-1, 2).T
-        return cls(known, of_pose.astype(np.intp), lasts, ambient_T)
+        return cls(known, of_pose.astype(np.intp), lasts, ambient_T, between_s)
 
     @classmethod
     def of_array(cls, array: SensorArray) -> PoseErrors:
@@ -240,8 +246,17 @@ class PoseErrors:
             return np.zeros((N_POSE, 0))
         return self.effects(pose.rate_rad_s, pose.reference_velocity_m_s, sigma)
 
-    def effects(self, rate_rad_s: FloatArray, velocity_m_s: FloatArray, sigma: FloatArray | None = None) -> FloatArray:
-        """Those (..., 12, n) of arrays that turn and whose reference points move so, (..., 3) each."""
+    def effects(
+        self,
+        rate_rad_s: FloatArray,
+        velocity_m_s: FloatArray,
+        sigma: FloatArray | None = None,
+        between_m: FloatArray | None = None,
+    ) -> FloatArray:
+        """Those (..., 12, n) of arrays that turn and whose reference points move so, (..., 3) each.
+
+        Places that were interpolated have errors of `between_m` (...,) beside those that are stated.
+        """
         known, rows = self.uncertainty, rate_rad_s.shape[:-1]
         stated = np.array([known.position_m, known.attitude_rad]) if sigma is None else sigma
         unit = np.zeros((*rows, N_POSE, N_POSE + _N_CLOCK))
@@ -255,6 +270,11 @@ class PoseErrors:
             [known.attitude_constant_rad, 0.0, arm_m, constant_T, known.time_constant_s], [3, 3, 3, 3, 1]
         )
         size = np.where(self.changes, changing[..., self.of_pose], constant[self.of_pose])
+        shifts = np.flatnonzero((self.of_pose >= SHIFT.start) & (self.of_pose < SHIFT.stop))
+        if known.position_white_m:
+            size[..., shifts[3:6]] = known.position_white_m
+        if between_m is not None:
+            size[..., shifts[-3:]] = between_m[..., None]
         return unit[..., self.of_pose] * size[..., None, :]
 
     def of_rows(

@@ -197,6 +197,7 @@ def joined(parts: Sequence[Readings]) -> Readings:
         array_rotation=Rotation.concatenate(rotations) if rotations else None,
         ambient_T=_all_or_none([part.ambient_T for part in parts]),
         pose_sigma=_all_or_none([part.pose_sigma for part in parts]),
+        interpolated_m=_all_or_none([part.interpolated_m for part in parts]),
     )
 
 

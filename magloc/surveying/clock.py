@@ -4,23 +4,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from scipy.interpolate import BSpline, make_lsq_spline
 from scipy.optimize import minimize_scalar
+from scipy.spatial.transform import Rotation
 
 from arrays.typing import FloatArray, IntArray
 from magloc.navigation.poses import vectors_at
 from magloc.readings import Readings
 from magloc.surveying.fit.joint_fit import Sources
-from magloc.surveying.fit.record import SurveyRecord
-from magloc.surveying.rounds import Model
+from magloc.surveying.piece import Piece, sources_after
+from magloc.surveying.rounds import WHILE_SEARCHING
 
 _STEP_M = 0.05  # of the way, for the curvature of the likelihood
-_MOST_S = 1.0
-_TOLERANCE_S = 1e-3
+_MOST_S = 1.2
+_TOLERANCE = 0.1  # of a step, until the likelihood is a parabola
+_APART, _ROUNDS = 0.6, 3  # of lags that are searched anew, in distances to the nearest sources; and how long
+_WRONG = 1.5  # χ² per reading from which on sources may be those of another lag
 _MISFIT, _SHARE = 2.0, 0.5  # per reading, and of the misfit without a lag
+_ROWS = 6  # that a smooth track follows together
 
 
 class Lag(NamedTuple):
@@ -30,59 +36,163 @@ class Lag(NamedTuple):
     sigma_s: float
 
 
-def lag_of(model: Model, sources: Sources, group: IntArray, delayed: Callable[[float], SurveyRecord]) -> Lag:
-    """Likeliest lag of a record, 0 where it explains no more than chance does; ``delayed`` has one corrected."""
-    record = model.record
-    way = np.linalg.norm(np.diff(record.middles_m, axis=0), axis=1)
-    speed = float(np.median(way / np.diff(record.time_s)))
-    if not len(sources) or speed * _MOST_S < _STEP_M:
-        return Lag(0.0, math.inf)
-    step = _STEP_M / speed
+class Trial(NamedTuple):
+    """Sources that fit best at some lag, minus twice the log-likelihood, and χ² per reading."""
 
-    def cost(lag_s: float) -> float:
-        """Twice the negative logarithm of the likelihood, sources refitted."""
-        at = replace(model, record=delayed(lag_s)) if lag_s else model
-        return at.misfit(at.refitted(sources, group), group)
-
-    size = (int(group[-1]) + 1) * record.array.n_channels
-
-    def chance(cost: float) -> float:
-        """What a lag explains by chance: what is not found yet makes it larger."""
-        return model.threshold * max(1.0, cost / size)
-
-    before, here, after = cost(-step), cost(0.0), cost(step)
-    curvature = (before - 2.0 * here + after) / step**2
-    slope = (after - before) / (2.0 * step)
-    if here < min(before, after) and slope**2 < 2.0 * curvature * chance(here):
-        return Lag(0.0, math.sqrt(2.0 / curvature))
-    found = minimize_scalar(cost, bounds=(-_MOST_S, _MOST_S), method="bounded", options={"xatol": _TOLERANCE_S})
-    explained = found.fun < max(_MISFIT * size, _SHARE * here)  # else something is wrong that a lag imitates
-    if not explained or here - found.fun < chance(found.fun) or abs(found.x) > 0.99 * _MOST_S:
-        return Lag(0.0, math.inf)
-    around = [cost(found.x + sign * step) for sign in (-1.0, 1.0)]
-    return Lag(float(found.x), step * math.sqrt(2.0 / (sum(around) - 2.0 * found.fun)))
+    lag_s: float
+    sources: Sources
+    cost: float
+    chi2: float
 
 
-def rows_around(time_s: FloatArray, rows: IntArray) -> IntArray:
-    """Some rows of a record, with those that a lag of them reaches and the next ones to these."""
-    first = np.maximum(np.searchsorted(time_s, time_s[rows] - _MOST_S) - 1, 0)
-    end = np.minimum(np.searchsorted(time_s, time_s[rows] + _MOST_S) + 1, len(time_s))
-    size = len(time_s) + 1
-    return np.flatnonzero(np.cumsum(np.bincount(first, minlength=size) - np.bincount(end, minlength=size)))
+def lag_of(piece_at: Callable[[float], Piece], here: Trial | None = None, near: Trial | None = None) -> Lag:
+    """Return the likeliest lag of a piece, 0 where it explains no more than chance does.
 
-
-def taken_earlier(readings: Readings, lag_s: float) -> Readings:
-    """Readings with the poses of some time before their own, and the direction of the ambient field with these.
-
-    Its modulus stays that of the row's own time, as a base station at the clock of the readings has it.
+    ``piece_at`` has the readings with the poses of some time earlier. A lag is compared with ``here``, by default the
+    same piece without one; it is looked for near some trial, by default everywhere.
     """
-    posed = readings.posed_later(-lag_s)
-    ambient = readings.ambient_T
-    if ambient is not None:  # in the world it hardly turns between two rows
+    piece = piece_at(0.0)
+    model = piece.model()
+    way = np.linalg.norm(np.diff(model.record.middles_m, axis=0), axis=1)
+    speed = float(np.median(way / np.diff(model.record.time_s)))
+    if not len(piece.known) or speed * _MOST_S < _STEP_M:
+        return Lag(0.0, math.inf)
+    step, apart = _STEP_M / speed, _APART * model.nearest_m / speed
+
+    def best_near(lag: Trial) -> Trial:
+        """The likeliest one beside some trial."""
+        found = minimize_scalar(
+            lambda lag_s: trial(piece_at, float(lag_s), lag.sources).cost,
+            bounds=(lag.lag_s - apart, lag.lag_s + apart),
+            method="bounded",
+            options={"xatol": _TOLERANCE * step},
+        )
+        return trial(piece_at, float(found.x), lag.sources)
+
+    def beside(lag: Trial) -> tuple[float, float]:
+        """Slope and curvature of its cost."""
+        before, after = (trial(piece_at, lag.lag_s + sign * step, lag.sources).cost for sign in (-1.0, 1.0))
+        return (after - before) / (2.0 * step), (before - 2.0 * lag.cost + after) / step**2
+
+    here = trial(piece_at, 0.0, piece.known) if here is None else here
+    if near is None:
+        slope, curvature = beside(here)
+        if (
+            here.chi2 < _WRONG
+            and curvature > 0.0
+            and slope**2 < 2.0 * curvature * model.threshold * max(1.0, here.chi2)
+        ):
+            return Lag(0.0, math.sqrt(2.0 / curvature))
+        at = best_near(here)
+        if at.chi2 > _WRONG:  # the sources may be two images of each, one from either way
+            n = math.ceil(_MOST_S / apart)
+            lags = np.linspace(-_MOST_S, _MOST_S, 2 * n + 1).tolist()
+            new = [trial(piece_at, lag_s, None) for lag_s in lags]
+            here = min(here, new[n], key=lambda one: one.cost)
+            at = min(at, best_near(min(new, key=lambda one: one.cost)), key=lambda one: one.cost)
+    else:
+        at = best_near(near)
+    explained = at.chi2 < max(_MISFIT, _SHARE * here.chi2)  # else something is wrong that a lag imitates
+    if not explained or here.cost - at.cost < model.threshold * max(1.0, at.chi2):
+        return Lag(0.0, math.inf)
+    slope, curvature = beside(at)
+    lag_s = at.lag_s - slope / curvature if curvature > 0.0 else math.inf
+    return Lag(lag_s, math.sqrt(2.0 / curvature)) if abs(lag_s) < _MOST_S else Lag(0.0, math.inf)
+
+
+def trial(piece_at: Callable[[float], Piece], lag_s: float, start: Sources | None) -> Trial:
+    """Fit sources at a lag, from some, or from those of a new search."""
+    piece = replace(piece_at(lag_s), known=Sources.none() if start is None else start)
+    start = sources_after(piece, _ROUNDS) if start is None else start
+    model = piece.model()
+    group = piece.groups(model.record, WHILE_SEARCHING * model.nearest_m)
+    fit, background = model.refitted(start, group)
+    cost = fit.chi2 + background.noise_log_determinant + model.threshold * len(fit.sources)
+    return Trial(lag_s, fit.sources, cost, fit.chi2 / fit.residual.size)
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothTrack:
+    """The track of some readings, smoothed: least-squares cubic splines with a knot at every sixth row.
+
+    Each piece without gaps has its own. A spline is a projection: what it keeps of white errors and what it leaves are
+    independent, so that rows which the one moves and not the other err as before.
+
+    Attributes
+    ----------
+    readings : Readings
+    first : ndarray of int
+        First row of every piece.
+    splines : list of BSpline
+        Of places and quaternions against time, one of every piece.
+    """
+
+    readings: Readings
+    first: IntArray
+    splines: list[BSpline]
+
+    @classmethod
+    def of(cls, readings: Readings) -> SmoothTrack:
+        """Smooth the poses of readings in order of time."""
+        time_s, step_s = readings.time_s, np.diff(readings.time_s)
+        assert readings.array_position_m is not None
         assert readings.array_rotation is not None
-        assert posed.array_rotation is not None
-        in_world = vectors_at(readings.time_s - lag_s, readings.time_s, readings.array_rotation.apply(ambient))
-        earlier = posed.array_rotation.inv().apply(in_world)
-        own, theirs = (np.linalg.norm(field, axis=1, keepdims=True) for field in (ambient, earlier))
-        ambient = earlier * (own / theirs)
-    return replace(posed, ambient_T=ambient)
+        quaternion = readings.array_rotation.as_quat()
+        same = np.concatenate([[1.0], np.sum(quaternion[1:] * quaternion[:-1], axis=1)])
+        quaternion = quaternion * np.cumprod(np.where(same < 0.0, -1.0, 1.0))[:, None]  # -q turns as q does
+        rows = np.hstack([readings.array_position_m, quaternion])
+        ends = np.flatnonzero(step_s > _ROWS * np.median(step_s)) + 1
+        splines = []
+        for own in np.split(np.arange(len(time_s)), ends):
+            t, degree = time_s[own], min(3, len(own) - 1)
+            knots = [[t[0]] * (degree + 1), t[_ROWS : len(t) - _ROWS : _ROWS], [t[-1]] * (degree + 1)]
+            flat = BSpline(np.array([t[0], t[0] + 1.0]), rows[own], 0)
+            splines.append(make_lsq_spline(t, rows[own], np.concatenate(knots), degree) if degree else flat)
+        return cls(readings, np.concatenate([[0], ends]), splines)
+
+    @cached_property
+    def _ambient_in_world_T(self) -> FloatArray | None:
+        ambient, turn = self.readings.ambient_T, self.readings.array_rotation
+        return None if ambient is None or turn is None else np.asarray(turn.apply(ambient))
+
+    def taken_earlier(self, lag_s: float, rows: IntArray | None = None) -> Readings:
+        """Return some readings with the poses of some time before their own, and the ambient field as these have it.
+
+        Each pose is moved by what the smooth track does in that time. A pose between two rows would average their
+        errors, and seem likelier for that alone. The modulus of the ambient field stays that of the row's own time, as
+        a base station at the clock of the readings has it.
+        """
+        rows = np.arange(len(self.readings)) if rows is None else rows
+        own = self.readings[rows]
+        if not lag_s:
+            return own
+        place, turn = own.array_position_m, own.array_rotation
+        assert place is not None
+        assert turn is not None
+        now, earlier = self._at(own.time_s, rows), self._at(own.time_s - lag_s, rows)
+        turned = turn * Rotation.from_quat(now[:, 3:]).inv() * Rotation.from_quat(earlier[:, 3:])
+        posed = replace(own, array_position_m=place + earlier[:, :3] - now[:, :3], array_rotation=turned)
+        if own.ambient_T is None or self._ambient_in_world_T is None:
+            return posed
+        # In the world it hardly turns between two rows.
+        in_world = vectors_at(own.time_s - lag_s, self.readings.time_s, self._ambient_in_world_T)
+        ambient = turned.inv().apply(in_world)
+        as_read, then = (np.linalg.norm(field, axis=1, keepdims=True) for field in (own.ambient_T, ambient))
+        return replace(posed, ambient_T=ambient * (as_read / then))
+
+    def _at(self, wanted_s: FloatArray, rows: IntArray) -> FloatArray:
+        """Places and quaternions (m, 7) at other times; the pieces of the rows go straight on at their ends."""
+        out = np.empty((len(rows), 7))
+        which = np.searchsorted(self.first, rows, "right") - 1
+        ends = np.append(self.first[1:], len(self.readings)) - 1
+        for piece in np.unique(which):
+            spline, own = self.splines[piece], which == piece
+            start_s, end_s = self.readings.time_s[[self.first[piece], ends[piece]]]
+            inside = np.clip(wanted_s[own], start_s, end_s)
+            beyond = (wanted_s[own] - inside)[:, None]
+            out[own] = spline(inside)
+            if beyond.any() and end_s > start_s:
+                far = min(1.0, 2.0 * _ROWS / (ends[piece] - self.first[piece])) * (end_s - start_s)
+                before, after = ((spline(at + far) - spline(at)) / far for at in (start_s, end_s - far))
+                out[own] += np.where(beyond < 0.0, before, after) * beyond
+        return out

@@ -148,22 +148,25 @@ class Piece:
 
 def strongest_in(piece: Piece) -> Arrays:
     """The strongest sources, after some rounds."""
-    return _rounds_in(piece, _FIRST_ROUNDS)
+    return dict(vars(sources_after(piece, _FIRST_ROUNDS)))
 
 
 def sources_in(piece: Piece) -> Arrays:
     """All sources that are significant; of those beside the tile its neighbours tell."""
-    return _rounds_in(piece, MOST_ROUNDS)
+    return dict(vars(sources_after(piece, MOST_ROUNDS)))
 
 
-def _rounds_in(piece: Piece, most: int) -> Arrays:
-    """Sources of the tile, which are looked for beside it too: what is strong there makes skirts here."""
+def sources_after(piece: Piece, most: int) -> Sources:
+    """Return the sources of a tile after some rounds.
+
+    They are looked for beside it, too: what is strong there makes skirts here.
+    """
     model = piece.model()
     reach = _BESIDE * (model.record.height_m - model.bounds.low_m[2])
     low, high = np.append(piece.tile.low_m - reach, -math.inf), np.append(piece.tile.high_m + reach, math.inf)
     grid = SearchGrid.below(model.record, np.maximum(model.bounds.low_m, low), np.minimum(model.bounds.high_m, high))
     groups = partial(piece.groups, model.record)
-    return dict(vars(found_in(model, groups, grid, piece.known, most, piece.tile.holds)))
+    return found_in(model, groups, grid, piece.known, most, piece.tile.holds)
 
 
 def targets_in(piece: Piece) -> Arrays:

@@ -17,6 +17,7 @@ from magloc.measurement.rows import check_magnitudes
 from magloc.navigation.poses import vectors_at
 from magloc.readings import Readings, without_saturated
 from magloc.surveying.fit.record import SurveyRecord
+from magloc.surveying.fixes import interval_of_fixes
 from magloc.surveying.pose_components import UNSTATED
 
 _LOG = logging.getLogger(__name__)
@@ -136,7 +137,7 @@ def leaping_rows(readings: Readings) -> BoolArray:
 def record_of(array: SensorArray, readings: Readings) -> tuple[SurveyRecord, PoseErrors]:
     """Anomalies of whole rows in the world frame, offsets of the sensors with them, and the errors of their pose."""
     assert array.pose is not None
-    errors = PoseErrors.of(array.pose)
+    errors = PoseErrors.of(array.pose, between_s=interval_of_fixes(readings))
     assert readings.ambient_T is not None
     return SurveyRecord.of(array, readings, readings.ambient_T, errors), errors
 

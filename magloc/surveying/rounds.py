@@ -27,7 +27,11 @@ _REACH = 0.6  # of a fit, over the distance from the sensors
 _TWINS = 0.15  # over the distance from the sensors: sources that are nearer to each other are one
 _MOST_WEIGHINGS = 4
 _SETTLED_COARSELY = 0.5
-_MOST_STEPS, _SMALL_STEP = 6, 0.1  # of a fit whose weights follow it, and χ² that the last one may change by
+_MOST_STEPS, _FEW_STEPS, _SMALL_STEP = (
+    6,
+    3,
+    0.1,
+)  # of a fit whose weights follow it, and χ² that the last one may change by
 _HARDLY_DAMPED = 1e-9
 # Rows that pass within such a part of the distance to a source count as one.
 WHILE_SEARCHING, AT_LAST = 0.33, 0.15
@@ -64,14 +68,11 @@ class Model:
         what = self.layer, self.errors, self.drift
         return Background.of_each(self.record, sources, *what, groups, self.body_length_m, self.beside)
 
-    def refitted(self, sources: Sources, group: IntArray) -> Sources:
+    def refitted(self, sources: Sources, group: IntArray) -> tuple[JointFit, Background]:
         """The same sources where they fit best, within their reach."""
-        for _ in range(2):
-            background = self.background(sources, group)
-            sources = fit_jointly(
-                self.record, background, sources, self._around(sources), settled=_SETTLED_COARSELY
-            ).sources
-        return sources
+        background = self.background(sources, group)
+        fit = fit_jointly(self.record, background, sources, self._around(sources), settled=_SETTLED_COARSELY)
+        return self.relinearised(fit, background, group, _FEW_STEPS)
 
     def misfit(self, sources: Sources, group: IntArray) -> float:
         """Minus twice the log-likelihood of some sources, but for a constant; the ground is Gaussian."""
@@ -80,7 +81,7 @@ class Model:
         residual = residual_of(self.record, background, fields)
         of_layer = background.Q.T @ residual
         square = float(residual @ residual - of_layer @ of_layer)
-        return square + background.white.log_determinant - background.log_determinant
+        return square + background.noise_log_determinant
 
     def _around(self, sources: Sources) -> Bounds:
         """Bounds within which sources stay what they are: one that leaps takes the place of one not found yet."""
@@ -106,7 +107,7 @@ class Model:
         if len(sources) < len(fit.sources):
             background = self.background(sources, group)
             fit = fit_jointly(self.record, background, sources, self.bounds, settled=settled)
-        return self.relinearised(fit, background, group)
+        return self.relinearised(fit, background, group) if settled < _SETTLED_COARSELY else (fit, background)
 
     def relinearised(
         self, fit: JointFit, background: Background, group: IntArray, most: int = _MOST_STEPS
@@ -118,7 +119,8 @@ class Model:
         """
         for _ in range(most if len(fit.sources) else 0):
             before, background = fit.sources, self.background(fit.sources, group)
-            fit = fit_jointly(self.record, background, before, self.bounds, most=1, damping=_HARDLY_DAMPED)
+            around = self._around(before)
+            fit = fit_jointly(self.record, background, before, around, most=1, damping=_HARDLY_DAMPED)
             step = np.hstack([fit.sources.position_m - before.position_m, fit.sources.moment_Am2 - before.moment_Am2])
             if step.ravel() @ fit.information @ step.ravel() < _SMALL_STEP:
                 break

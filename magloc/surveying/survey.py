@@ -16,11 +16,12 @@ from numba import get_num_threads
 from scipy.special import chdtri
 
 from arrays.array import SensorArray
-from magloc.grids.work import Arrays, workers
+from magloc.grids.work import Arrays, Work, workers
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.measurement.plausibility import warn_of_doubts
 from magloc.measurement.rows import joined
 from magloc.readings import Readings
+from magloc.surveying.fixes import between_fixes
 from magloc.surveying.piece import OF_ROWS, Ground, sources_in, strongest_in, targets_in
 from magloc.surveying.preparation import whole_rows
 from magloc.surveying.results import Reach, Survey, SurveyRows, Target
@@ -130,6 +131,7 @@ def survey(
     rows = readings if isinstance(readings, Readings) else joined(readings)
     warn_of_doubts(array, rows[:_MOST_DOUBTED])
     assumed = array.pose is None and rows.pose_sigma is None
+    array, rows = between_fixes(array, rows)
     ground = Ground(prior, ground_m, shortest_geology_m, math.inf, body_length_m)
     tiled = TiledSurvey.of(*whole_rows(array, rows, base), ground)
     trials = _TRIALS * _HECTARE_M2 / tiled.nearest_m**2
@@ -140,25 +142,27 @@ def survey(
     every = range(len(tiled.tiles))
     at_once = min(get_num_threads() if processes is None else processes, len(every))
     with workers(at_once, scheduler, folder) as each:
-        due: Sequence[int] = every
-        for _ in range(_MOST_SWEEPS):  # what is strong beside a tile is in the way of all else, until it is told
-            tiled = tiled.searched(strongest_in, due, each, tell)
-            due = tiled.changed()
-            if not due:
-                break
-        tiled, lag = tiled.on_time()
+
+        def settled(tiled: TiledSurvey, work: Work) -> tuple[TiledSurvey, Sequence[int]]:
+            """After searches of all tiles, and again of those that differ from what others tell them."""
+            due: Sequence[int] = every
+            for _ in range(_MOST_SWEEPS):
+                tiled = tiled.searched(work, due, each, tell)
+                due = tiled.changed()
+                if not due:
+                    break
+            return tiled, due
+
+        # What is strong beside a tile is in the way of all else, until it is told.
+        tiled, lag = settled(tiled, strongest_in)[0].on_time(assumed)
         if lag.s:
             _LOG.warning(
                 f"the readings are {lag.s:.3f} ± {lag.sigma_s:.3f} s later than their poses, as the targets show: taken"
                 " into account"
             )
-        due = every
-        for _ in range(_MOST_SWEEPS):
-            tiled = tiled.searched(sources_in, due, each, tell)
-            due = tiled.changed()
-            if not due:
-                break
-        else:
+            tiled, _ = settled(tiled, strongest_in)
+        tiled, due = settled(tiled, sources_in)
+        if due:
             _LOG.warning(f"{len(due)} of {len(every)} tiles do not agree with others on what lies beside them")
         if assumed:
             tiled = tiled.with_likeliest_pose()

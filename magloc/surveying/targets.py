@@ -73,7 +73,8 @@ def profile_of(model: Model, fit: JointFit, background: Background, which: int, 
         math.exp(np.interp(level, explained[[beyond, last]], np.log(depths[[beyond, last]])))
         for beyond, last in ((max(inside[0] - 1, 0), inside[0]), (min(inside[-1] + 1, _N_DEPTHS - 1), inside[-1]))
     )
-    return Profile((low, high), scatter)
+    # The profile is linear in all other sources, so that its peak may be beside the fit, which counts, too.
+    return Profile((min(low, depth), max(high, depth)), scatter)
 
 
 def _scattered(covariance: FloatArray, scatter_m2: FloatArray) -> FloatArray:

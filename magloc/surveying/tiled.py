@@ -14,13 +14,12 @@ from magloc.fields.dipole_compiled import field_at_points
 from magloc.grids.work import Arrays, Each, Work
 from magloc.localization.fit.prior import SourcePrior
 from magloc.readings import Readings
-from magloc.surveying.clock import Lag, lag_of, rows_around, taken_earlier
+from magloc.surveying.clock import Lag, SmoothTrack, Trial, lag_of, trial
 from magloc.surveying.fit.joint_fit import Sources
-from magloc.surveying.fit.record import SurveyRecord
 from magloc.surveying.piece import HIGHEST_M, Ground, Piece, high_above
 from magloc.surveying.pose_components import with_likeliest_pose
 from magloc.surveying.preparation import FEWEST_ROWS, record_of
-from magloc.surveying.rounds import AT_LAST, WHILE_SEARCHING
+from magloc.surveying.rounds import AT_LAST
 from magloc.surveying.tiles import Tile, owned, tiles_of
 
 _LOG = logging.getLogger(__name__)
@@ -182,8 +181,12 @@ class TiledSurvey:
         """The tile with most sources, which tells most of what all tiles have in common."""
         return int(np.argmax([len(sources) for sources in self.found]))
 
-    def on_time(self) -> tuple[TiledSurvey, Lag]:
-        """Readings that belong to their poses, and by how much they did not, as a tile without its margin tells."""
+    def on_time(self, pose_assumed: bool) -> tuple[TiledSurvey, Lag]:
+        """Readings that belong to their poses, and by how much they did not, as a tile without its margin tells.
+
+        Where there is a lag nothing else is known then. Errors of places that last a line are like one, so that those
+        that are assumed are those likeliest with it, and without.
+        """
         number = self._richest()
         tile = self.tiles[number]
         rows = tile.rows[tile.own]
@@ -196,16 +199,26 @@ class TiledSurvey:
             beside=Sources.none(),
             outside=self.sources.some(~inside),
         )
-        model = piece.model()
-        around = rows_around(self.readings.time_s, rows)
-        readings, own = self.readings[around], np.searchsorted(around, rows)
+        track = SmoothTrack.of(self.readings)
 
-        def delayed(lag_s: float) -> SurveyRecord:
-            return replace(piece, readings=taken_earlier(readings, lag_s)[own]).model().record
+        def piece_at(lag_s: float) -> Piece:
+            return replace(piece, readings=track.taken_earlier(lag_s, rows))
 
-        group = piece.groups(model.record, WHILE_SEARCHING * model.nearest_m)
-        lag = lag_of(model, piece.known, group, delayed)
-        return (replace(self, readings=taken_earlier(self.readings, lag.s)) if lag.s else self), lag
+        def at_likeliest_pose(lag_s: float, start: Sources | None) -> tuple[Callable[[float], Piece], Trial]:
+            sources = trial(piece_at, lag_s, start).sources
+            array = with_likeliest_pose(piece_at(lag_s).model(), sources).record.array
+            posed = lambda lag_s: replace(piece_at(lag_s), array=array)  # noqa: E731
+            return posed, trial(posed, lag_s, sources)
+
+        lag = lag_of(piece_at)
+        if lag.s and pose_assumed:
+            posed, near = at_likeliest_pose(lag.s, None)
+            lag = lag_of(posed, at_likeliest_pose(0.0, piece.known)[1], near)
+        if not lag.s:
+            return self, lag
+        nothing = [Sources.none()] * len(self.tiles)
+        known = {"sources": Sources.none(), "found": nothing, "known": nothing, "outside": nothing}
+        return replace(self, readings=track.taken_earlier(lag.s), **known), lag
 
     def with_likeliest_pose(self) -> TiledSurvey:
         """With the errors of the pose that the sources of a tile tell."""

@@ -129,9 +129,9 @@ class Background:
     Q: FloatArray
 
     @property
-    def log_determinant(self) -> float:
-        """Of what is left of white noise when the columns are projected out: minus that of ``LᵀL + 1``."""
-        return float(np.linalg.slogdet(np.eye(self.Q.shape[1]) - self.Q.T @ self.Q)[1])
+    def noise_log_determinant(self) -> float:
+        """Of the covariance of all that is projected out: of the noise in time, and of ``LᵀL + 1``."""
+        return self.white.log_determinant - float(np.linalg.slogdet(np.eye(self.Q.shape[1]) - self.Q.T @ self.Q)[1])
 
     @classmethod
     def of_each(

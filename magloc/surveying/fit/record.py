@@ -19,7 +19,6 @@ from functools import cached_property
 import numpy as np
 
 from arrays.array import SensorArray
-from arrays.pose import PoseUncertainty
 from arrays.typing import BoolArray, FloatArray
 from magloc.fields.dipole_compiled import field_at_points, gradient_at_points
 from magloc.fields.multipole import finite_body_errors, finite_body_fields
@@ -48,6 +47,8 @@ class SurveyRecord:
         Anomalies: calibrated, less what the ambient field alone gives.
     pose_effects : ndarray, shape (n, 9, q)
         Of errors of the pose, of unit variance, on turn, shift and lever arm.
+    interpolated_m : ndarray, shape (n,), optional
+        Standard deviation of the shift where places were interpolated between fixes.
     beside_T, gradient_beside_T_m : ndarray, shapes (n, N, 3) and (n, N, 3, 3), or 0
         Field and its gradient of sources that are known: what is fitted adds to them.
     """
@@ -59,6 +60,7 @@ class SurveyRecord:
     ambient_T: FloatArray
     values_T: FloatArray
     pose_effects: FloatArray
+    interpolated_m: FloatArray | None = None
     beside_T: FloatArray | float = 0.0
     gradient_beside_T_m: FloatArray | float = 0.0
 
@@ -82,17 +84,17 @@ class SurveyRecord:
         velocity, rate = rates_of(readings.time_s, readings.array_position_m, R)
         arm = np.array(errors.uncertainty.lever_arm_m)
         velocity = velocity - np.einsum("nij,nj->ni", R, np.cross(rate, arm))
-        effects = errors.effects(rate, velocity, readings.pose_sigma)
-        return cls(array, readings.time_s, places, R, b, values, effects)
+        effects = errors.effects(rate, velocity, readings.pose_sigma, readings.interpolated_m)
+        return cls(array, readings.time_s, places, R, b, values, effects, readings.interpolated_m)
 
     def __len__(self) -> int:
         return len(self.time_s)
 
-    def with_pose(self, pose: PoseUncertainty) -> SurveyRecord:
-        """The same rows where another pose is stated, without an error of the clock."""
+    def with_pose(self, errors: PoseErrors) -> SurveyRecord:
+        """The same rows where other errors of the pose are stated, without one of the clock."""
         still = np.zeros((len(self), 3))
-        effects = PoseErrors.of(pose).effects(still, still)
-        return replace(self, array=replace(self.array, pose=pose), pose_effects=effects)
+        effects = errors.effects(still, still, None, self.interpolated_m)
+        return replace(self, array=replace(self.array, pose=errors.uncertainty), pose_effects=effects)
 
     @cached_property
     def is_vector(self) -> BoolArray:

@@ -83,24 +83,29 @@ class Whitening:
         scale = np.sqrt(1.0 / np.bincount(group))
         time_s = np.bincount(group, record.time_s) * scale**2
         dt_s = np.diff(time_s, prepend=time_s[0])
-        by_pose = np.concatenate([by_pose, *by_turn, by_square], axis=2)
-        C, q = record.array.n_channels, by_pose.shape[2]
-        # Offsets of the channels, and what is common to them: along the ambient field.
-        H = np.zeros((len(time_s), len(U), q + C + 2))
-        H[..., :q] = _summed(U @ by_pose, group, scale)
-        H[..., q : q + C] = U / scale[:, None, None]
-        H[..., q + C] = _summed((record.along @ U.T)[..., None], group, scale)[..., 0]
-        kept, added = np.ones((len(dt_s), q + C + 2)), np.zeros((len(dt_s), q + C + 2))
         of_pose = errors.step(dt_s)[0]
-        lasting = of_pose[:, errors.of_pose == SHIFT.start].prod(axis=1, keepdims=True)
+        lasting = of_pose[:, errors.of_pose == SHIFT.start][:, :1]  # of those with the stated correlation
         more = (
             (by_turn[0], lasting),
             (by_turn[1], 0.0 * lasting),
             (by_square, lasting**2),
         )  # a square lasts half as long
-        kept[:, :q] = np.concatenate(
+        of_pose = np.concatenate(
             [of_pose, *(np.repeat(share, columns.shape[2], axis=1) for columns, share in more)], axis=1
         )
+        seen, lasts = U @ np.concatenate([by_pose, *by_turn, by_square], axis=2), of_pose.any(axis=0)
+        seen = np.concatenate(
+            [_summed(seen[..., lasts], group, scale), _roots_of_summed_squares(seen[..., ~lasts], group, scale)], axis=2
+        )
+        C, q = record.array.n_channels, seen.shape[2]
+        # Offsets of the channels, and what is common to them: along the ambient field.
+        H = np.zeros((len(time_s), len(U), q + C + 2))
+        H[..., :q] = seen
+        H[..., q : q + C] = U / scale[:, None, None]
+        H[..., q + C] = _summed((record.along @ U.T)[..., None], group, scale)[..., 0]
+        kept, added = np.ones((len(dt_s), q + C + 2)), np.zeros((len(dt_s), q + C + 2))
+        kept[:, :q] = 0.0
+        kept[:, : lasts.sum()] = of_pose[:, lasts]
         added[1:, :q] = 1.0 - kept[1:, :q] ** 2
         kept[0] = 1.0
         walk = np.array([sensor.drift_T_rth**2 / _HOUR_S for sensor in record.array.sensors]) + drift.sensor_T2_s
@@ -161,3 +166,11 @@ def _summed(rows: FloatArray, group: IntArray, scale: FloatArray) -> FloatArray:
         return rows
     starts = np.flatnonzero(np.diff(group, prepend=-1))
     return np.add.reduceat(rows, starts, axis=0) * scale.reshape(-1, *[1] * (rows.ndim - 1))
+
+
+def _roots_of_summed_squares(rows: FloatArray, group: IntArray, scale: FloatArray) -> FloatArray:
+    """Columns (g, k, q) whose products are the mean covariance of columns (n, k, q) that are new in every row."""
+    if not rows.shape[2] or (len(scale) == len(rows) and rows.shape[2] <= rows.shape[1]):
+        return rows[: len(scale)]
+    square, axes = np.linalg.eigh(_summed(rows @ rows.mT, group, scale**2))
+    return np.asarray(axes * np.sqrt(np.maximum(square, 0.0))[:, None])[..., -rows.shape[2] :]
