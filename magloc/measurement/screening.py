@@ -8,6 +8,7 @@ the good ones between them, and where a peak is sampled so coarsely that a sourc
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -173,12 +174,12 @@ class _Scene:
     def _size(self, rows: IntArray) -> float:
         """Standard deviation of the process as some rows show it, not below the noise."""
         values = self._values[rows]
-        return float(np.sqrt(max(values @ self._inverse(rows) @ values / len(rows), self._least)))
+        return math.sqrt(max(float(values @ self._inverse(rows) @ values) / len(rows), self._least))
 
     def _scores(self, errors: FloatArray, covariance: FloatArray) -> float:
         """Largest error of a prediction over its limit, along the axes of its covariance, for a process of size one."""
         variances, axes = np.linalg.eigh(covariance)
-        along = np.abs(np.asarray(axes.T @ errors, dtype=np.float64)) / np.sqrt(np.maximum(variances, self._nugget))
+        along = np.abs(axes.T @ errors) / np.sqrt(np.maximum(variances, self._nugget))
         return float((along / _limits(variances - self._nugget)).max())
 
 
