@@ -9,6 +9,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "Calibration": "arrays.sensor",
         "InputError": "arrays.io.errors",
         "LogColumns": "arrays.columns",
+        "ValidRows": "arrays.columns",
         "PoseUncertainty": "arrays.pose",
         "SENSOR_PRESETS": "arrays.presets",
         "Sensor": "arrays.sensor",

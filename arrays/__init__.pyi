@@ -4,6 +4,7 @@ from arrays.array_file import read_array as read_array
 from arrays.array_file import read_sensors as read_sensors
 from arrays.array_file import write_array as write_array
 from arrays.columns import LogColumns as LogColumns
+from arrays.columns import ValidRows as ValidRows
 from arrays.geometries import GEOMETRIES as GEOMETRIES
 from arrays.geometries import axial as axial
 from arrays.geometries import cross as cross

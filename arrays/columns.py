@@ -7,19 +7,22 @@ east, north, up of an origin, and yaw, pitch and roll a quaternion. Columns that
 from __future__ import annotations
 
 import json
+import logging
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 
 import msgspec
 import numpy as np
 
+from arrays.io.csv import DUMMY, table_of_header, table_of_text, unix_seconds
 from arrays.io.csv import Table as CsvTable
-from arrays.io.csv import table_of_header, table_of_text, unix_seconds
+from arrays.io.dummies import dummy_cells
 from arrays.io.errors import InputError, naming, of_extra
 from arrays.io.toml import Table
 from arrays.typing import FloatArray, Vector
 
+_LOG = logging.getLogger(__name__)
 POSITION_COLUMNS = ("array_x_m", "array_y_m", "array_z_m")
 ROTATION_COLUMNS = ("array_qx", "array_qy", "array_qz", "array_qw")
 _NANOTESLA = {"nT": 1.0, "uT": 1e3, "µT": 1e3, "mT": 1e6, "T": 1e9, "mG": 1e2, "G": 1e5}
@@ -28,6 +31,28 @@ _SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t", "space": " "}
 _CHOICES = {"separator": _SEPARATORS, "decimal": (".", ","), "time_unit": _SECONDS}
 _ENU_FROM_NED = ((0, 1, 0), (1, 0, 0), (0, 0, -1))
 _BODY_FROM_ARRAY = ((1, 0, 0), (0, -1, 0), (0, 0, -1))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ValidRows:
+    """Rows of a log whose readings count.
+
+    Attributes
+    ----------
+    column : str
+        Name of a column of numbers.
+    equals : tuple of float
+        Its values in rows that count; rows with another one, or with none, have no reading.
+
+    Examples
+    --------
+    >>> import arrays
+    >>> arrays.LogColumns(valid=arrays.ValidRows(column="MagValid", equals=(1.0,))).valid.column
+    'MagValid'
+    """
+
+    column: str
+    equals: tuple[float, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,6 +87,10 @@ class LogColumns:
         axes are forward, left, up. Without any attitude its axes are those of the world.
     pose_latency_s : float
         How much older the pose of a row is than its readings [s].
+    dummy : tuple of float and str
+        Numbers, in the unit of the log, and words that stand where there is no reading.
+    valid : ValidRows, optional
+        Rows whose readings count; by default all.
 
     Raises
     ------
@@ -89,6 +118,8 @@ class LogColumns:
     quaternion: tuple[str, str, str, str] | None = None
     angles: tuple[str, ...] | None = None
     pose_latency_s: float = 0.0
+    dummy: tuple[float | str, ...] = ()
+    valid: ValidRows | None = None
 
     def __post_init__(self) -> None:
         for name, choices in _CHOICES.items():
@@ -119,6 +150,11 @@ class LogColumns:
             raise ValueError(f"Inputs origin and pose_latency_s must be finite; instead received {numbers}.")
 
     @property
+    def unit_nT(self) -> float:
+        """Unit of the sensors' columns [nT]."""
+        return self.unit if isinstance(self.unit, float | int) else _NANOTESLA[self.unit]
+
+    @property
     def clock(self) -> tuple[str, ...]:
         """Column of the time, or those of date and time."""
         return (self.time,) if isinstance(self.time, str) else self.time
@@ -146,6 +182,13 @@ class LogColumns:
         return named
 
 
+class ValidTable(Table, kw_only=True):
+    """The table ``columns.valid`` of an array file."""
+
+    column: str
+    equals: list[float]
+
+
 class ColumnsTable(Table, kw_only=True):
     """The table ``columns`` of an array file."""
 
@@ -161,15 +204,19 @@ class ColumnsTable(Table, kw_only=True):
     quaternion: tuple[str, str, str, str] | None = None
     angles: list[str] | None = None
     pose_latency_s: float = 0.0
+    dummy: list[float | str] = msgspec.field(default_factory=list)
+    valid: ValidTable | None = None
 
     def columns(self, path: str, channels: Mapping[str, Sequence[str]]) -> LogColumns:
         """What the table of the array file `path` says, whose sensors have these channels."""
         said = msgspec.structs.asdict(self)
         sensors = {name: tuple(of) if isinstance(of, list) else of for name, of in self.sensors.items()}
+        said |= {"sensors": sensors, "angles": None if self.angles is None else tuple(self.angles)}
+        said |= {"dummy": tuple(self.dummy)}
+        if self.valid is not None:
+            said |= {"valid": ValidRows(column=self.valid.column, equals=tuple(self.valid.equals))}
         with naming(f"{path}, table columns"):
-            columns = LogColumns(
-                **said | {"sensors": sensors, "angles": None if self.angles is None else tuple(self.angles)}
-            )
+            columns = LogColumns(**said)
         for sensor in sensors:
             if sensor not in channels:
                 expected = f"one of {', '.join(channels)}"
@@ -191,6 +238,8 @@ def columns_toml(columns: LogColumns) -> list[str]:
 
 
 def _toml(value: object) -> str:
+    if isinstance(value, ValidRows):
+        return f"{{column = {_toml(value.column)}, equals = {_toml(value.equals)}}}"
     return json.dumps(list(value) if isinstance(value, tuple) else value, ensure_ascii=False)
 
 
@@ -264,6 +313,7 @@ class LogFormat:
             separator=self.separator,
             decimal=columns.decimal,
             head=head,
+            dummy=[each for each in columns.dummy if isinstance(each, str)],
         )
         return self.translated(table)
 
@@ -279,8 +329,14 @@ class LogFormat:
         found = {name: logged.values[:, i] for name, i in index.items() if name in own or name in self.others}
         named = columns.of_sensors(self.channels)
         found |= {ours: logged.values[:, index[in_log]] for ours, in_log in named.items()}
-        unit = columns.unit if isinstance(columns.unit, float | int) else _NANOTESLA[columns.unit]
-        found |= {name: unit * found[name] for name in own & found.keys()}
+        unusable = np.zeros(len(logged.values), np.bool_)
+        if columns.valid is not None:
+            unusable = ~np.isin(logged.values[:, index[columns.valid.column]], columns.valid.equals)
+            if unusable.any() and logged.header_line:  # of a file, not of a stream
+                fault = f"{columns.valid.column} that is not {' or '.join(map('{:g}'.format, columns.valid.equals))}"
+                _LOG.warning(f"{logged.path}: the readings of {unusable.sum()} rows have {fault} and are left out")
+        readings = {name: np.where(unusable, np.nan, columns.unit_nT * found[name]) for name in own & found.keys()}
+        found |= {name: np.where(found[name] == DUMMY, DUMMY, of) for name, of in readings.items()}
         found["time_s"] = _SECONDS[columns.time_unit] * logged.complete_and_distinct(columns.clock[0])
         if columns.place:
             found |= zip(POSITION_COLUMNS, _position(logged, columns).T, strict=True)
@@ -294,7 +350,9 @@ class LogFormat:
         return {name for of_sensor in self.channels.values() for name in of_sensor}
 
     def _theirs(self, columns: LogColumns) -> tuple[str, ...]:
-        return (*columns.clock, *columns.of_sensors(self.channels).values(), *columns.place, *columns.attitude)
+        valid = () if columns.valid is None else (columns.valid.column,)
+        named = columns.of_sensors(self.channels).values()
+        return (*columns.clock, *named, *columns.place, *columns.attitude, *valid)
 
 
 READINGS_FILE = LogFormat({}, None, "", ())
@@ -325,3 +383,43 @@ def _quaternion(table: CsvTable, columns: LogColumns) -> FloatArray:
     enu_from_ned, body_from_array = map(Rotation.from_matrix, (_ENU_FROM_NED, _BODY_FROM_ARRAY))
     turn = enu_from_ned * Rotation.from_euler("ZYX", angles, degrees=True) * body_from_array
     return np.asarray(turn.as_quat())
+
+
+def without_dummies(
+    table: CsvTable, form: LogFormat, name: Callable[[str, int], None] | None = None, before: FloatArray | None = None
+) -> CsvTable:
+    """Return a table of readings with NaN in place of dummy values, which are named for every sensor.
+
+    Parameters
+    ----------
+    table : Table
+        With the columns of a readings file.
+    form : LogFormat
+        Its sensors, and which dummies are declared.
+    name : callable, optional
+        Called with a sentence and the number of readings for every sensor that has dummies; by default a warning is
+        logged.
+    before : ndarray, shape (m, columns), optional
+        Rows that came before.
+    """
+    columns = form.columns or LogColumns()
+    declared = [columns.unit_nT * each for each in columns.dummy if not isinstance(each, str)]
+    values = table.values.copy()
+    earlier = values[:0] if before is None else before
+    for sensor, channels in form.channels.items():
+        own = [table.header.index(channel) for channel in channels]
+        known = np.concatenate([earlier[:, own], values[:, own]])
+        cells = dummy_cells(known, declared, (1.0, columns.unit_nT))[len(earlier) :]
+        if cells.any():
+            count = int(cells.any(axis=1).sum())
+            numbers = ", ".join("*" if n == DUMMY else f"{n:.10g}" for n in np.unique(values[:, own][cells]))
+            what = "reading of" if count == 1 else "readings of"
+            is_dummy = "is a dummy value" if count == 1 else "are dummy values"
+            is_out = "is left out" if count == 1 else "are left out"
+            words = f"{table.path}: {count} {what} sensor {sensor} {is_dummy} ({numbers}) and {is_out}"
+            if name is None:
+                _LOG.warning(words)
+            else:
+                name(words, count)
+            values[:, own] = np.where(cells, np.nan, values[:, own])
+    return replace(table, values=values)

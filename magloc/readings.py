@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from arrays.array import AMBIENT_CHANNELS, SensorArray
-from arrays.columns import POSITION_COLUMNS, ROTATION_COLUMNS, LogFormat
+from arrays.columns import POSITION_COLUMNS, ROTATION_COLUMNS, LogFormat, without_dummies
 from arrays.io.csv import Columns, Table, table_of_columns
 from arrays.io.errors import InputError
 from arrays.io.text import read_text, write_text
@@ -309,11 +309,11 @@ def readings_of_table(table: Table, array: SensorArray, sensors: Sequence[str] |
         array = array.subset(sensors)
     channels = [f"{name}_nT" for name in array.channel_names]
     _check_sensor_columns(table, array, channels, ignore_others=sensors is not None)
-    return readings_of_checked(table, array)
+    return readings_of_checked(without_dummies(table, log_format(array, None)), array)
 
 
 def readings_of_checked(table: Table, array: SensorArray) -> Readings:
-    """Readings of a table whose header is that of the array, as :func:`readings_of_table` has found."""
+    """Readings of a table without dummies whose header is that of the array, as :func:`readings_of_table` has found."""
     channels = [f"{name}_nT" for name in array.channel_names]
     time_s = table.times()
     position_m = rotation = ambient_T = pose_sigma = None

@@ -35,6 +35,13 @@ _SHOWN_CHARACTERS = 40
 _HEAD_CHARACTERS = 2**16
 _MOST_LINES_ABOVE = 100
 _SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs", " ": "blanks"}
+DUMMY = math.nextafter(1e32, math.inf)
+"""Number, as good as unique, for a word that says that there is no value."""
+_DUMMY_WORDS = frozenset({"*"})
+_MISSING_WORDS = frozenset(
+    ("#N/A", "#N/A N/A", "#NA", "-1.#IND", "-1.#QNAN", "1.#IND", "1.#QNAN", "<NA>", "N/A", "NA", "NULL", "None", "n/a")
+) | {"null"}
+"""Words that pandas takes for missing, beside those that float() does."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +120,7 @@ class Table:
     def complete(self, columns: Sequence[str], largest: float = LARGEST) -> FloatArray:
         """Values of some columns (n, k); a missing or infinite one, or one above the largest, is an InputError."""
         values = self.values[:, [self._index[name] for name in columns]]
-        self.refuse(np.isnan(values), columns, "found no value, expected a number")
+        self.refuse(np.isnan(values) | (values == DUMMY), columns, "found no value, expected a number")
         self.refuse(np.isinf(values), columns, "found an infinite number, expected a finite number")
         self._refuse_larger(values, columns, largest)
         return values
@@ -211,10 +218,12 @@ def table_of_text(
     separator: str = ",",
     decimal: str = ".",
     head: Table | None = None,
+    dummy: Collection[str] = (),
 ) -> Table:
     """As :func:`read_table`, from text that errors call `name` and whose rows begin at `first_line` of a longer one.
 
-    ``head``: the table whose header the rows have; the text has none then.
+    ``head``: the table whose header the rows have; the text has none then. ``dummy``: words that become `DUMMY`, as
+    ``*`` does.
     """
     text = text.replace("\r\n", "\n").replace("\r", "\n")
     if "\0" in text:
@@ -251,7 +260,7 @@ def table_of_text(
         try:
             found = [read(cell or "nan") for cell in cells]
         except ValueError:
-            found = _careful_numbers(f"{name}, line {line}", chosen, cells)
+            found = _careful_numbers(f"{name}, line {line}", chosen, cells, dummy)
         values.extend(found)
         line_numbers.append(line)
     if not line_numbers:
@@ -322,12 +331,16 @@ def _checked_header(place: str, cells: Sequence[str], expected: str, separator: 
     return header
 
 
-def _careful_numbers(place: str, header: Sequence[str], cells: Sequence[str]) -> list[float]:
+def _careful_numbers(place: str, header: Sequence[str], cells: Sequence[str], dummy: Collection[str]) -> list[float]:
     """Numbers of one row, NaN for empty cells; names the column of a cell that is neither."""
     found_numbers = []
     for name, cell in zip(header, cells, strict=True):
+        word = cell.strip()
         try:
-            found_numbers.append(_number(cell))
+            if word in _MISSING_WORDS:
+                found_numbers.append(math.nan)
+            else:
+                found_numbers.append(DUMMY if word in _DUMMY_WORDS or word in dummy else _number(cell))
         except ValueError:
             found = repr(cell.strip()[:_SHOWN_CHARACTERS])
             raise InputError(f"{place}, column {name}: found {found}, expected a number or an empty cell.") from None

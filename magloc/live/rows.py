@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import Any
 
 import msgspec
+import numpy as np
 
 from arrays.array import SensorArray
+from arrays.columns import without_dummies
 from arrays.io.csv import Table
 from arrays.io.errors import InputError
+from arrays.typing import FloatArray
 from magloc.live.tally import Tally
 from magloc.readings import EXPECTED_HEADER, Readings, log_format, readings_of_checked, readings_of_table
 
 _LINES_WITHOUT_HEADER = 100
+_RECENT = 100  # rows that tell whether a number is a dummy value
 _AROUND = "\ufeff \r\t"
 
 
@@ -45,6 +50,7 @@ class RowParser:
         self._around = _AROUND.replace(self._format.separator, "")
         self._array, self._name, self._tally, self._sensors = array, name, tally, sensors
         self._used = array
+        self._recent: FloatArray | None = None
         self._header = ""
         self._head: Table | None = None
         self._n_lines = 0
@@ -125,6 +131,7 @@ class RowParser:
             self._tally.name("garbled", str(error))
             return
         self._header, self._head = text, table
+        self._recent = np.zeros((0, len(self._format.translated(table).header)))
         self._used = self._array if self._sensors is None else self._array.subset(self._sensors)
 
     def _readings(self, rows: list[str], first_line: int) -> Iterator[Readings]:
@@ -133,7 +140,11 @@ class RowParser:
             return
         try:
             table = self._format.table("\n".join(rows), self._head.path, first_line=first_line, head=self._head)
-            readings = readings_of_checked(table, self._used)
+            usable = without_dummies(
+                table, log_format(self._used, None), partial(self._tally.name, "dummies"), self._recent
+            )
+            self._recent = np.concatenate([self._recent, usable.values])[-_RECENT:]
+            readings = readings_of_checked(usable, self._used)
             if len(readings) == len(rows):
                 yield readings
                 return

@@ -39,6 +39,8 @@ class Tally:
         That came a second time.
     garbled : int
         Lines that are no rows, and rows whose time is not to be believed.
+    dummies : int
+        Readings, one of a sensor in a row, that were dummy values.
     restarts : int
         How often the sender's clock was set back.
     latencies_s : deque of float
@@ -59,15 +61,16 @@ class Tally:
     lost: int = 0
     doubled: int = 0
     garbled: int = 0
+    dummies: int = 0
     restarts: int = 0
     latencies_s: deque[float] = field(default_factory=lambda: deque(maxlen=_LATENCIES), repr=False)
 
-    def name(self, kind: str, what: str) -> None:
-        """Count a row of a kind, and name the first ones."""
-        count = getattr(self, kind) + 1
-        setattr(self, kind, count)
-        if count <= _MOST_NAMED:
-            last = "; more of them are only counted" if count == _MOST_NAMED else ""
+    def name(self, kind: str, what: str, number: int = 1) -> None:
+        """Count a row of a kind, or some, and name the first ones."""
+        before = getattr(self, kind)
+        setattr(self, kind, before + number)
+        if before < _MOST_NAMED:
+            last = "; more of them are only counted" if before + number >= _MOST_NAMED else ""
             _LOG.info(f"{kind}: {what}{last}")
 
     @property
@@ -84,6 +87,7 @@ class Tally:
         words = f"{self.rows} rows, {self.tracked} tracked, {self.late} late, {self.lost} lost, {self.doubled} doubled"
         words += f", {self.garbled} garbled"
         words += f", {self.skipped} skipped" if self.skipped else ""
+        words += f", {self.dummies} dummy values" if self.dummies else ""
         words += f", clock set back {self.restarts} times" if self.restarts else ""
         if not self.latencies_s:
             return words

@@ -26,7 +26,7 @@ from magloc.surveying.tiles import Tile
 OF_ROWS = ("place_m", "anomaly_T", "residual_T")
 _FIRST_ROUNDS = 4  # until the clock is looked at
 _BESIDE = 0.6  # of the distance to the deepest sources
-_DEEPEST = 4.0
+_SHALLOWEST_M, _DEEPEST = 0.05, 4.0
 _MARGIN_M = 1.0
 _LARGEST_MOMENT_Am2 = 300.0
 _SETTLED = 1e-3
@@ -66,6 +66,12 @@ class Ground:
     threshold: float
     body_length_m: float = 0.0
 
+    @property
+    def shallowest_m(self) -> float:
+        """Height of the highest sources in the world frame [m]."""
+        given = float(self.prior.high_m[2])
+        return given if math.isfinite(given) else self.ground_m - _SHALLOWEST_M
+
     def bounds(self, record: SurveyRecord) -> Bounds:
         """Where sources may be that rows show, and how strong."""
         low, high = record.sensors_m.min(axis=(0, 1)), record.sensors_m.max(axis=(0, 1))
@@ -75,7 +81,7 @@ class Ground:
                 f" {low[2]:g} m."
             )
         own_low = np.array([low[0] - _MARGIN_M, low[1] - _MARGIN_M, self.ground_m - _DEEPEST])
-        own_high = np.array([high[0] + _MARGIN_M, high[1] + _MARGIN_M, self.ground_m - 0.05])
+        own_high = np.array([high[0] + _MARGIN_M, high[1] + _MARGIN_M, self.shallowest_m])
         low_m, high_m = (
             np.where(np.isfinite(given), given, own)
             for given, own in ((self.prior.low_m, own_low), (self.prior.high_m, own_high))

@@ -7,13 +7,12 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from scipy.interpolate import Akima1DInterpolator
-from scipy.ndimage import maximum_filter1d, median_filter
 
 from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray
 from magloc.measurement.pose import PoseErrors, with_stated_pose
 from magloc.measurement.rows import check_magnitudes
+from magloc.measurement.screening import wild_readings
 from magloc.navigation.poses import vectors_at
 from magloc.readings import Readings, without_saturated
 from magloc.surveying.fit.record import SurveyRecord
@@ -22,25 +21,28 @@ from magloc.surveying.pose_components import UNSTATED
 
 _LOG = logging.getLogger(__name__)
 FEWEST_ROWS = 20
-_WILD, _NEIGHBOURS = 15.0, 20  # over the medians of all rows and of so many on either side
 _MOST_APART = 2.0  # ratio of the fields at two places a day trip apart: more is another unit
-_MOST_WILD = 0.25  # of all readings: more are not
+_LEAST_DEPTH_M, _LOWEST = 0.1, 0.1  # from the sensor to the shallowest sources: least, and quantile of its heights
+_LEAST_JITTER_M = 0.01
+_BASE_STEP, _BASE_NOISE_T = 0.4, 1e-10  # usual step of a base's rows over the depth of what it sees, and its noise
+_LONG_GAP, _LONG_GAP_S = 5.0, 30.0  # of a base: over its usual step, and at least
 _FASTEST_M_S = 300.0
 _BLOCK = 2**18  # rows that are looked at together
 _LONGEST_RUN = 25  # of the same reading, over what the liveliest sensor repeats
 
 
-def whole_rows(array: SensorArray, readings: Readings, base: Readings | None = None) -> tuple[SensorArray, Readings]:
-    """Rows where all sensors read, without the sensors that would cost more rows than they are worth.
+def whole_rows(
+    array: SensorArray, readings: Readings, base: Readings | None = None, shallowest_m: float = 0.0
+) -> tuple[SensorArray, Readings]:
+    """Return rows where all sensors read, without the sensors that would cost more rows than they are worth.
 
-    Their ambient field varies as the modulus at a base station.
+    Their ambient field varies as the modulus at a base station. No source is higher than `shallowest_m`.
     """
     if readings.array_rotation is None:
         raise ValueError("Input readings must have the pose of the array in every row; instead received none.")
     check_magnitudes(array)
     readings = without_saturated(readings, array)
-    blocks = (readings.values_T[first : first + _BLOCK] for first in range(0, max(len(readings), 1), _BLOCK))
-    stuck, wild, missing = map(np.concatenate, zip(*(_unusable(array, values) for values in blocks), strict=True))
+    stuck, wild, missing = _unusable(array, readings, shallowest_m)
     order = np.argsort(missing.sum(axis=0), kind="stable")
     worth = [(i + 1) * int((~missing[:, order[: i + 1]].any(axis=1)).sum()) for i in range(len(order))]
     kept = np.sort(order[: len(worth) - int(np.argmax(worth[::-1]))])
@@ -51,8 +53,10 @@ def whole_rows(array: SensorArray, readings: Readings, base: Readings | None = N
             _LOG.warning(f"sensor {sensor.id} {why} in {missing[:, i].sum()} of {len(missing)} rows and is left out")
         elif stuck[:, i].any():
             _LOG.warning(f"sensor {sensor.id} sticks in {stuck[:, i].sum()} of {len(missing)} rows, which are left out")
-    if wild[:, kept].any():
-        _LOG.warning(f"{wild[:, kept].sum()} readings leap and come back: their rows are left out")
+        if i in kept and wild[:, i].any():
+            _LOG.warning(
+                f"{wild[:, i].sum()} readings of sensor {sensor.id} leap and come back: their rows are left out"
+            )
     if whole.sum() < FEWEST_ROWS:
         raise ValueError(f"Input readings must have {FEWEST_ROWS} whole rows or more; instead received {whole.sum()}.")
     if len(kept) < array.n_sensors:
@@ -72,14 +76,40 @@ def _some(readings: Readings, which: BoolArray) -> Readings:
     return readings if which.all() else readings[which]
 
 
-def _unusable(array: SensorArray, values: FloatArray) -> tuple[BoolArray, BoolArray, BoolArray]:
+def _unusable(array: SensorArray, readings: Readings, shallowest_m: float) -> tuple[BoolArray, BoolArray, BoolArray]:
     """Readings (n, N) that stick, those that leap, and all that tell nothing."""
+    assert readings.array_position_m is not None
+    assert readings.array_rotation is not None
+    blocks = [readings.values_T[first : first + _BLOCK] for first in range(0, max(len(readings), 1), _BLOCK)]
+    stuck = np.concatenate([stuck_readings(array, values) for values in blocks])
+    moduli = np.concatenate([_moduli(array, values) for values in blocks])  # which no attitude changes
+    moduli[stuck] = np.nan
+    wild = np.zeros(moduli.shape, np.bool_)
+    jitter_m = _jitter_m(array, readings)
+    for i, arm_m in enumerate(array.positions.copy()):
+        place_m = readings.array_position_m + readings.array_rotation.apply(arm_m)
+        depth_m = max(float(np.quantile(place_m[:, 2], _LOWEST)) - shallowest_m, _LEAST_DEPTH_M)
+        noise_T = float(array.channel_noise_T[array.channel_sensor == i].max())
+        wild[:, i] = wild_readings(moduli[:, i], place_m, depth_m, noise_T, jitter_m)
+    return stuck, wild, np.asarray(np.isnan(moduli) | wild)
+
+
+def _moduli(array: SensorArray, values: FloatArray) -> FloatArray:
     scalar = array.channel_is_scalar
-    stuck = stuck_readings(array, values)
-    moduli = np.linalg.norm(array.calibrated_field(values), axis=2)  # which no attitude changes
+    moduli = np.linalg.norm(array.calibrated_field(values), axis=2)
     moduli[:, array.channel_sensor[scalar]] = values[:, scalar]
-    wild = wild_readings(moduli) & ~stuck
-    return stuck, wild, np.asarray(np.isnan(moduli) | wild | stuck)
+    return np.asarray(moduli)
+
+
+def _jitter_m(array: SensorArray, readings: Readings) -> float:
+    """Error of the place from one row to the next [m]."""
+    pose = with_stated_pose(array, readings).pose
+    if pose is None:
+        return _LEAST_JITTER_M
+    stated = pose.position_m if readings.pose_sigma is None else float(np.median(readings.pose_sigma[:, 0]))
+    if pose.correlation_s and len(readings) > 1:
+        stated *= min(1.0, math.sqrt(2.0 * abs(float(np.median(np.diff(readings.time_s)))) / pose.correlation_s))
+    return max(stated, _LEAST_JITTER_M)
 
 
 def stuck_readings(array: SensorArray, values: FloatArray) -> BoolArray:
@@ -93,27 +123,6 @@ def stuck_readings(array: SensorArray, values: FloatArray) -> BoolArray:
         lengths[:, i] = np.bincount(run)[run]
     typical = [len(column) / np.sum(1.0 / column) for column in lengths.T]  # mean length of a run
     return np.asarray(lengths > max(_LONGEST_RUN, _LONGEST_RUN * min(typical, default=math.inf)))
-
-
-def wild_readings(values: FloatArray) -> BoolArray:
-    """Single readings (n, N) that are far from the cubic through their neighbours, over what is usual there."""
-    wild = np.isnan(values)
-    if len(values) <= 2 * _NEIGHBOURS or (~wild).sum(axis=0).min() < 2:
-        return np.zeros(values.shape, np.bool_)
-    index = np.arange(len(values))
-    kept = values.copy()
-    while True:
-        for channel, lost in zip(kept.T, wild.T, strict=True):
-            if lost.any():  # by lines, a field that bends would have a kink at each
-                good = index[~lost]
-                channel[lost] = Akima1DInterpolator(good, channel[good])(np.clip(index[lost], good[0], good[-1]))
-        size = np.zeros(values.shape)
-        size[2:-2] = np.abs(kept[2:-2] - (4.0 * (kept[1:-3] + kept[3:-1]) - kept[:-4] - kept[4:]) / 6.0)
-        usual = median_filter(size, (2 * _NEIGHBOURS + 1, 1)) + np.median(size, axis=0)
-        more = (size == maximum_filter1d(size, 5, axis=0)) & (size > _WILD * usual) & ~wild
-        if not more.any() or (wild | more).mean() > _MOST_WILD:
-            return np.asarray(wild & ~np.isnan(values))
-        wild |= more
 
 
 def leaping_rows(readings: Readings) -> BoolArray:
@@ -146,13 +155,14 @@ def varying(ambient_T: FloatArray, time_s: FloatArray, base: Readings) -> FloatA
     """Ambient field (n, 3) whose modulus changes as that at a base station about its median over them."""
     if base.values_T.shape[1] != 1:
         raise ValueError(f"Input base must have one channel; instead received {base.values_T.shape[1]}.")
-    read = base[np.isfinite(base.values_T[:, 0])]
+    read = _usable_base(base)
     if not len(read) or time_s[0] < read.time_s.min() or time_s[-1] > read.time_s.max():
         ends = f"{read.time_s.min():.15g} to {read.time_s.max():.15g} s" if len(read) else "nothing"
         raise ValueError(
             f"Input base must read from {time_s[0]:.15g} to {time_s[-1]:.15g} s, as the survey does; instead received"
             f" {ends}."
         )
+    _warn_of_gap(time_s, read)
     there, modulus = vectors_at(time_s, read.time_s, read.values_T), np.linalg.norm(ambient_T, axis=1, keepdims=True)
     middle, usual = float(np.median(there)), float(np.median(modulus))  # stations read before and after the survey
     if not usual / _MOST_APART < middle < usual * _MOST_APART:
@@ -161,6 +171,31 @@ def varying(ambient_T: FloatArray, time_s: FloatArray, base: Readings) -> FloatA
             f" {1e9 * middle:.4g} nT in the median."
         )
     return np.asarray(ambient_T * (1.0 + (there - middle) / modulus))
+
+
+def _usable_base(base: Readings) -> Readings:
+    """Return the readings of a base station without wild ones, and name these and long gaps."""
+    base = base[np.argsort(base.time_s, kind="stable")]
+    read = base[np.isfinite(base.values_T[:, 0])]
+    step_s = float(np.median(np.abs(np.diff(read.time_s)))) if len(read) > 1 else 1.0
+    place_m = np.zeros((len(read), 3))
+    place_m[:, 0] = read.time_s * (_BASE_STEP / step_s)
+    wild = wild_readings(read.values_T[:, 0], place_m, 1.0, _BASE_NOISE_T, 0.0)
+    if wild.any():
+        _LOG.warning(f"{wild.sum()} readings of the base station leap and come back, and are left out")
+    return _some(read, ~wild)
+
+
+def _warn_of_gap(time_s: FloatArray, read: Readings) -> None:
+    """Name the longest gap of a base station during a survey."""
+    gaps = np.diff(read.time_s)
+    gaps[(read.time_s[1:] < time_s[0]) | (read.time_s[:-1] > time_s[-1])] = 0.0
+    k = int(gaps.argmax()) if len(gaps) else 0
+    if len(gaps) and gaps[k] > max(_LONG_GAP * float(np.median(np.diff(read.time_s))), _LONG_GAP_S):
+        _LOG.warning(
+            f"the base station reads nothing from {read.time_s[k]:.15g} to {read.time_s[k + 1]:.15g} s: its field is"
+            " interpolated there"
+        )
 
 
 def _ambient_T(array: SensorArray, readings: Readings) -> FloatArray:

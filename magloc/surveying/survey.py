@@ -133,7 +133,7 @@ def survey(
     assumed = array.pose is None and rows.pose_sigma is None
     array, rows = between_fixes(array, rows)
     ground = Ground(prior, ground_m, shortest_geology_m, math.inf, body_length_m)
-    tiled = TiledSurvey.of(*whole_rows(array, rows, base), ground)
+    tiled = TiledSurvey.of(*whole_rows(array, rows, base, ground.shallowest_m), ground)
     trials = _TRIALS * _HECTARE_M2 / tiled.nearest_m**2
     threshold = float(chdtri(3, min(0.5, false_per_hectare / trials)))
     tiled = replace(tiled, ground=replace(ground, threshold=threshold))

@@ -7,9 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from arrays.typing import FloatArray
-from magloc.fields import dipole
 from magloc.readings import Readings
-from magloc.surveying.preparation import leaping_rows, varying, wild_readings
+from magloc.surveying.preparation import leaping_rows, varying
 
 
 class TestBaseStation:
@@ -35,29 +34,6 @@ class TestBaseStation:
         base = Readings(unit * np.full((100, 1), 47e-6), time_s=self.TIME_S)
         with pytest.raises(ValueError, match="Input base must read the modulus of the Earth's field, about 44721 nT"):
             varying(self.AMBIENT_T, self.TIME_S, base)
-
-
-class TestWildReadings:
-    """Of a cart that turns a corner of a line, 16 times a second at a metre a second, beside a strong target."""
-
-    def read(self) -> FloatArray:
-        way = np.arange(-10.0, 10.0, 1.0 / 16.0)
-        place = np.column_stack([np.minimum(way, 0.03), np.maximum(way - 0.03, 0.0), np.full(len(way), 0.6)])
-        fields = dipole.field(place, np.array([0.2, -0.1, -0.2]), np.array([5.0, 10.0, -25.0]))
-        noise_T = 2e-10 * np.random.default_rng(0).normal(size=len(way))
-        return np.asarray(np.linalg.norm(fields + np.array([1.5e-5, 0.0, -4.5e-5]), axis=1) + noise_T)[:, None]
-
-    def test_a_corner_is_hardly_any(self) -> None:
-        """The field has a kink there: what is put into its place has none, that others seem wild beside it."""
-        assert wild_readings(self.read()).sum() <= 3
-
-    def test_single_ones_are_found_and_no_others(self) -> None:
-        wild = np.arange(20, 300, 20)
-        values = self.read()
-        values[wild, 0] += 1e-6 * np.random.default_rng(1).choice([-1.0, 1.0], len(wild))
-        found = set(np.flatnonzero(wild_readings(values)).tolist())
-        assert set(wild.tolist()) <= found
-        assert len(found) <= len(wild) + 3
 
 
 class TestPlaces:

@@ -1,0 +1,70 @@
+"""Dummy values: numbers that a log writes in place of a missing reading, such as -99999, 1e32, or 0 beside 48,000."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from arrays.typing import BoolArray, FloatArray
+
+_FEWEST_NINES, _LARGE = 5, 1e20
+_BLANKS = (1.70141e38, 3.40282e38)  # largest numbers of single precision, as they are often written
+_FEWEST = 10  # other readings that say that zeros, or a number that is repeated, are none
+_APART, _KNOWN_APART = 10.0, 3.0  # over the spread of the others, or over their size
+_ALONE, _MOST_NEAR = 0.5, 0.02  # share of other readings that are nearer than so much of the distance to the middle
+
+
+def dummy_cells(readings: FloatArray, declared: Sequence[float] = (), units: Sequence[float] = (1.0,)) -> BoolArray:
+    """Return which cells of one sensor's channels (n, k) hold dummy values.
+
+    Dummies are what is declared; numbers that are known for it (-99999 and other rows of nines, powers of ten from 1e20
+    on), unless other readings are as large; and where nearly all else is far away, zeros and numbers that are repeated.
+
+    Parameters
+    ----------
+    readings : ndarray, shape (n, k)
+        NaN where there is none.
+    declared : sequence of float
+        In the unit of the readings.
+    units : sequence of float
+        In which a known number may be written, over the unit of the readings.
+    """
+    cells = np.isin(readings, declared) if len(declared) else np.zeros(readings.shape, np.bool_)
+    for own, column in zip(cells.T, np.where(cells, np.nan, readings).T, strict=True):
+        own |= np.isin(column, _dummy_values(column, units))
+    moduli = np.linalg.norm(readings, axis=1)
+    if len(_dummy_values(moduli, ())):
+        cells |= (moduli == 0.0)[:, None]
+    return cells
+
+
+def _dummy_values(column: FloatArray, units: Sequence[float]) -> FloatArray:
+    """Values of a column (n,), NaN where there is none, that are dummies."""
+    found, counts = np.unique(column[np.isfinite(column)], return_counts=True)
+    known = np.zeros(len(found), np.bool_)
+    for unit in units:
+        known |= _is_known(np.abs(found) / unit)
+    common = np.repeat(found, counts)[np.repeat(~known & (found != 0.0), counts)]
+    if not len(common):
+        return found[known]
+    middle, size = float(np.median(common)), float(np.quantile(np.abs(common), 0.9))
+    off = np.abs(found - middle)
+    spread = float(np.quantile(np.abs(common - middle), 0.9))
+    dummy = known & (off > _KNOWN_APART * spread)
+    if len(common) >= _FEWEST:
+        dummy |= (found == 0.0) & (off > _APART * spread)
+        dummy |= (counts > 1) & (np.abs(found) > _APART * size)
+    for k in np.flatnonzero(dummy):
+        near = np.abs(common - found[k]) < _ALONE * off[k]
+        dummy[k] = (near & (common != found[k])).mean() <= _MOST_NEAR
+    return np.asarray(found[dummy])
+
+
+def _is_known(size: FloatArray) -> BoolArray:
+    """Whether magnitudes (n,) are numbers that are known for dummies."""
+    power = 10.0 ** np.round(np.log10(np.maximum(size, 1.0)))
+    large = (size >= _LARGE) & np.isclose(size, power, rtol=1e-6)
+    large |= np.isclose(size[:, None], _BLANKS, rtol=1e-4).any(axis=1)
+    short = np.isclose((power - size)[:, None], (1.0, 0.1, 0.01), rtol=1e-6).any(axis=1)
+    return np.asarray(large | (short & (power >= 10.0**_FEWEST_NINES)))
