@@ -31,17 +31,20 @@ def imu(
     json: Flag = False,
     common: QuietOptions = QuietOptions(),  # noqa: B008 - frozen
 ) -> None:
-    """Attitude of an inertial unit with a magnetometer, with iron and magnets near it or not.
+    """Attitude of an inertial unit, with iron and magnets near its magnetometer or not.
 
-    The first second must be at rest, and its field is north. After D. Laidig and T. Seel (VQF, Information Fusion 91,
+    The first second should be at rest, and its field is north. Without a magnetometer the heading is relative to the
+    first row. Within gaps σ grows, and they are named; a log with misread units or axes is refused.
+
+    After D. Laidig and T. Seel (VQF, Information Fusion 91,
     2023), with a Kalman filter of the heading that knows what else changes a field.
 
     Parameters
     ----------
     log : Path
-        CSV file: time_s, gyro_x_rad_s or gyro_x_deg_s, acceleration_x_m_s2, field_x_nT with y and z, and if known the
-        truth qw, qx, qy, qz (east, north, up from body) and moving (1 where errors count). Empty cells are missing
-        readings. Or a MAT file of the BROAD benchmark.
+        CSV file: time_s, gyro_x_rad_s or gyro_x_deg_s, acceleration_x_m_s2 and, of a unit with a magnetometer,
+        field_x_nT, with y and z, and if known the truth qw, qx, qy, qz (east, north, up from body) and moving (1 where
+        errors count). Empty cells are missing readings. Or a MAT file of the BROAD benchmark.
     config : Path, optional
         TOML file whose table log names other columns, units and mountings.
     method : str

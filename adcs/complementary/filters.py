@@ -14,8 +14,8 @@ from adcs import quaternion
 from adcs.complementary.adaptive import AdaptiveTuning, adaptive_track
 from adcs.complementary.explicit import BEST_GAINS, Gains, explicit_track
 from adcs.complementary.gauss_newton import gauss_newton_track
-from adcs.complementary.heading import HeadingModel, heading_track, turned_to_north
-from adcs.complementary.inertial_magnetic import InertialMagneticRecord, prepare
+from adcs.complementary.heading import HeadingModel, heading_track, relative_heading, turned_to_north
+from adcs.complementary.inertial_magnetic import InertialMagneticRecord, check_units, prepare
 from adcs.complementary.names import MAGNETS, METHODS, Magnet, Method
 from adcs.satellite.attitude_track import AttitudeTrack
 from adcs.satellite.telemetry import is_read
@@ -25,6 +25,13 @@ from arrays.typing import BoolArray, FloatArray
 
 LEFT_OUT, SUBTRACTED = "field left out", "magnet subtracted"
 """What an inertial unit's field is where it is not the room's."""
+LOST = "heading lost"
+"""Where the heading of an inertial unit is hardly known."""
+LOST_RAD = 0.5
+_RELATIVE = (
+    "there is no magnetometer: the heading is that of gyro and accelerometer alone, against the first row, "
+    "and its σ grows to {:.2g}°"
+)
 _NAMES = ("first vector", "second vector")
 _MAGNET = 5.0  # σ of the sensor's own offset: a larger one is a magnet's
 
@@ -122,7 +129,7 @@ def inertial_magnetic_filter(
     time_s: ArrayLike,
     gyro_rad_s: ArrayLike,
     acceleration_m_s2: ArrayLike,
-    field_T: ArrayLike,
+    field_T: ArrayLike | None,
     *,
     magnet: Magnet = "auto",
     gyro_samples: GyroSamples = "mean",
@@ -132,16 +139,17 @@ def inertial_magnetic_filter(
     """Attitude of an inertial unit with a magnetometer that is moved by hand, with magnets near it or not.
 
     The acceleration is smoothed in a frame that does not turn, the gyro's bias is that of rests, and the
-    magnetometer's lag is found. The field of the first second, which must be at rest, is north. A Kalman filter of the
-    heading has as states what else changes a field: the gyro's scale and drift, the sensor's offset, and how the room's
-    field differs from that of the start.
+    magnetometer's lag is found. The field of the first second, which should be at rest, is north. A Kalman filter of
+    the heading has as states what else changes a field: the gyro's scale and drift, the sensor's offset, and how the
+    room's field differs from that of the start. Without a field the heading is that of the gyro, against the first row.
 
     Parameters
     ----------
     time_s : array_like, shape (n,)
         Ascending, in any steps.
     gyro_rad_s, acceleration_m_s2, field_T : array_like, shape (n, 3)
-        Body axes; at rest the acceleration is upwards. NaN where a sensor has no reading.
+        Body axes; at rest the acceleration is upwards. NaN where a sensor has no reading; within a gap of the gyro σ
+        grows by what a hand may have turned. The field is None, or NaN everywhere, of a unit without a magnetometer.
     magnet : str
         A field that contradicts the filter is left out (``rejected``) or taken for a magnet that moves with the sensor
         (``subtracted``); ``auto`` leaves it out until the turns that were made have shown that it moves with the
@@ -157,13 +165,15 @@ def inertial_magnetic_filter(
     -------
     AttitudeTrack
         East, north, up from body. ``sigma["level"]`` (n, 3) is about east, north and up [rad]: the first two are those
-        of the tilt, the third that of the heading. ``degraded`` says where the field was left out, and where a magnet
-        was subtracted, ``warnings`` in which minutes nothing could tell the two apart.
+        of the tilt, the third that of the heading. ``degraded`` says where the field was left out, where a magnet
+        was subtracted, and where the heading is lost. ``warnings`` name gaps, a start that is not at rest, a missing
+        magnetometer, and minutes in which the gyro alone held the heading.
 
     Raises
     ------
     ValueError
-        A shape does not match, the times do not ascend, a sensor has no first reading, or a vector is zero.
+        A shape does not match, the times do not ascend, a sensor has no first reading, a vector is zero, or a sensor or
+        the time is misread: its unit or its axes are not those that the other sensors show.
 
     Examples
     --------
@@ -176,13 +186,26 @@ def inertial_magnetic_filter(
     """
     if magnet not in MAGNETS:
         raise ValueError(f"Input magnet must be one of {', '.join(MAGNETS)}; instead received {magnet!r}.")
-    times, rate, acceleration, field = (
-        np.asarray(values, dtype=np.float64) for values in (time_s, gyro_rad_s, acceleration_m_s2, field_T)
+    times, rate, acceleration = (
+        np.asarray(values, dtype=np.float64) for values in (time_s, gyro_rad_s, acceleration_m_s2)
     )
-    prepared = prepare(InertialMagneticRecord(times, rate, acceleration, field, gyro_samples), model, offline=offline)
-    heading = heading_track(
-        times, prepared.rate_rad_s, prepared.q_level, prepared.field_T, _for(magnet, model), offline=offline
-    )
+    field = np.full_like(rate, np.nan) if field_T is None else np.asarray(field_T, dtype=np.float64)
+    record = InertialMagneticRecord(times, rate, acceleration, field, gyro_samples)
+    check_units(record)
+    prepared = prepare(record, model, offline=offline)
+    model = replace(model, gyro_drift_rad_s=max(model.gyro_drift_rad_s, prepared.bias_sigma_rad_s))
+    turns = times, prepared.rate_rad_s, prepared.q_level
+    if record.has_field:
+        heading = heading_track(
+            *turns,
+            prepared.field_T,
+            _for(magnet, model),
+            offline=offline,
+            hidden_rad2=prepared.hidden_rad2,
+            start_tilt_rad=prepared.start_tilt_rad,
+        )
+    else:
+        heading = relative_heading(*turns, model, hidden_rad2=prepared.hidden_rad2)
     q = turned_to_north(prepared.q_level, heading.heading_rad)
     of_tilt = prepared.tilt_sigma_rad / math.sqrt(2.0)
     changed = heading.changes.size > 0
@@ -193,14 +216,21 @@ def inertial_magnetic_filter(
         rows=np.arange(len(times)),
         q=q,
         states={"rate": prepared.rate_rad_s, "gyro-bias": prepared.bias_rad_s},
-        used=("accelerometer", "magnetometer"),
-        seen={"accelerometer": is_read(acceleration), "magnetometer": is_read(field) & ~heading.left_out},
+        used=("accelerometer", "magnetometer") if record.has_field else ("accelerometer",),
+        seen={
+            "accelerometer": is_read(record.acceleration_m_s2),
+            "magnetometer": is_read(record.field_T) & ~heading.left_out,
+        },
         sigma={
             "attitude": _body_sigma(q, of_tilt, heading.sigma_rad),
             "level": np.stack([of_tilt, of_tilt, heading.sigma_rad], axis=-1),
         },
-        warnings=_minutes(times, heading.left_out),
-        degraded={LEFT_OUT: heading.left_out, SUBTRACTED: subtracted},
+        warnings=(
+            *prepared.warnings,
+            *(() if record.has_field else (_RELATIVE.format(math.degrees(heading.sigma_rad[-1])),)),
+            *_minutes(times, heading.left_out),
+        ),
+        degraded={LEFT_OUT: heading.left_out, SUBTRACTED: subtracted, LOST: heading.sigma_rad > LOST_RAD},
     )
 
 
@@ -223,11 +253,12 @@ def _body_sigma(q: FloatArray, of_tilt: FloatArray, of_heading: FloatArray) -> F
 
 def _minutes(time_s: FloatArray, left_out: BoolArray) -> tuple[str, ...]:
     """One sentence for each minute in which the gyro alone held the heading for a second or more."""
-    minute = ((time_s[left_out] - time_s[0]) // 60.0).astype(np.intp)
-    seconds = np.bincount(minute, weights=steps_s(time_s)[left_out])
+    minutes, which = np.unique((time_s[left_out] - time_s[0]) // 60.0, return_inverse=True)
+    seconds = np.bincount(which, weights=steps_s(time_s)[left_out], minlength=len(minutes))
     return tuple(
-        f"minute {i + 1}: the field was left out for {seconds[i]:.0f} s, the gyro alone held the heading"
-        for i in np.flatnonzero(seconds >= 1.0)
+        f"minute {minute + 1:.0f}: the field was left out for {lasted:.0f} s, the gyro alone held the heading"
+        for minute, lasted in zip(minutes, seconds, strict=True)
+        if lasted >= 1.0
     )
 
 

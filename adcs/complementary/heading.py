@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adcs import quaternion
+from adcs.complementary.inertial.gaps import HELD_VARIANCE, UNKNOWN_RAD
 from adcs.satellite.telemetry import is_read
-from adcs.satellite.vector_record import GAP_STEPS, instants_within, steps_s
+from adcs.satellite.vector_record import instants_within, steps_s
 from arrays.typing import BoolArray, FloatArray
 
 if TYPE_CHECKING:
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 _BLOCK_S = 0.035
 """How long readings are averaged: within it a hand turns by a few degrees."""
 _START_S = 1.0
+_LONG_STEP_S = 1.0  # a longer time without a field is one of the gyro alone
 
 
 @dataclass(frozen=True)
@@ -52,8 +54,9 @@ class HeadingModel:
         Of the heading at the start.
     turning_rad_s : float
         The rate from which on the sensor counts as moved: while it lies still, neither place nor drift changes.
-    gap_rad_s : float
-        Of the rate within a gap of the gyro.
+    gap_rad_s, long_gap_rad_s : float
+        Of the mean rate within a gap of the gyro, against that of its ends: in a short one, and in one beyond a second,
+        which is that of the whole log where that is higher.
     jump_T : float
         Of the field of a magnet, each axis.
     gate, mean_nis, memory : float
@@ -84,6 +87,7 @@ class HeadingModel:
     start_rad: float = 0.01
     turning_rad_s: float = math.radians(3.0)
     gap_rad_s: float = 0.1
+    long_gap_rad_s: float = 1.0
     jump_T: float = 20e-6
     gate: float = 25.0
     mean_nis: float = 2.0
@@ -128,21 +132,28 @@ def heading_track(
     model: HeadingModel = HeadingModel(),
     *,
     offline: bool = False,
+    hidden_rad2: FloatArray | None = None,
+    start_tilt_rad: float = 0.0,
 ) -> HeadingTrack:
     """Filter, or smoother, of the field in the level frame.
 
     ``rate_rad_s`` (n, 3): mean over the step that ends at each instant. ``q_level`` (n, 4): level from body, of gyro
-    and accelerometer alone. ``field_T`` (n, 3): NaN where there is no reading. Raises ValueError: there is no reading
-    within the first second.
+    and accelerometer alone. ``field_T`` (n, 3): NaN where there is no reading. ``hidden_rad2`` (n,): growth of the
+    heading's variance within gaps of the gyro. ``start_tilt_rad``: error of the tilt, 1 σ, at the first reading. Raises
+    ValueError: there is no reading.
     """
     from adcs.complementary.heading_compiled import Noise, Tests, run, smooth
 
-    blocks, ends = _blocks(time_s, rate_rad_s, q_level, field_T, model)
+    hidden = np.zeros(len(time_s)) if hidden_rad2 is None else hidden_rad2
+    blocks, ends = _blocks(time_s, rate_rad_s, q_level, field_T, model, hidden)
     start = blocks.start_T
     x = np.zeros(14)
     x[0] = math.atan2(-start[0], start[1])
     blocks = blocks._replace(start_T=np.array([0.0, math.hypot(start[0], start[1]), start[2]]))
     P = np.diag(model.deviations() ** 2)
+    # A tilt that is wrong turns the vertical field into a horizontal one, and that into a vertical one.
+    _, north, up = start_tilt_rad * blocks.start_T
+    P[[0, 9, 10], [0, 9, 10]] += [min((up / blocks.start_T[1]) ** 2, UNKNOWN_RAD**2), up**2, north**2]
     m = len(ends)
     told, variances, used, known = np.empty((m, 4)), np.empty((m, 4)), np.zeros(m, np.int64), np.zeros(m, np.int64)
     noise = Noise(
@@ -156,7 +167,6 @@ def heading_track(
         model.local_T,
         0.5 * model.local_T,
         model.local_s,
-        model.gap_rad_s,
     )
     anywhere = noise._replace(room_T=model.jump_T, room_s=model.local_s)
     tests = Tests(
@@ -169,12 +179,17 @@ def heading_track(
     # A block is known at its end; before the first one there is the start.
     ended = np.zeros(len(time_s), np.intp)
     ended[ends] = 1
-    last = np.clip(np.cumsum(ended) - (ended if offline else 1), 0, m - 1)
+    after = np.cumsum(ended)
+    gap = (hidden > 0.0) & (np.append(hidden[1:], 0.0) > 0.0)
+    last = np.clip(np.where(offline & ~gap, after - ended, after - 1), 0, m - 1)
     sigma = np.sqrt(variances)
-    since = ends[last], np.maximum(time_s - time_s[ends[last]], 0.0)
+    hidden = np.cumsum(hidden)
+    hidden = np.abs(hidden - hidden[ends[last]]) * np.where(gap, HELD_VARIANCE, 1.0)
+    since = np.maximum(time_s - time_s[ends[last]], 0.0)
+    variance = variances[last, 0] + _drifted(time_s, rate_rad_s, ends[last], since, model) + hidden
     return HeadingTrack(
         heading_rad=told[last, 0],
-        sigma_rad=np.sqrt(variances[last, 0] + _drifted(time_s, rate_rad_s, *since, model)),
+        sigma_rad=np.minimum(np.sqrt(variance), UNKNOWN_RAD),
         offset_T=told[last, 1:],
         offset_sigma_T=sigma[last, 1:],
         left_out=(used == 0)[last],
@@ -182,46 +197,85 @@ def heading_track(
     )
 
 
+def relative_heading(
+    time_s: FloatArray,
+    rate_rad_s: FloatArray,
+    q_level: FloatArray,
+    model: HeadingModel = HeadingModel(),
+    *,
+    hidden_rad2: FloatArray | None = None,
+) -> HeadingTrack:
+    """Heading of gyro and accelerometer alone, against that of the first instant; arguments as of heading_track."""
+    n = len(time_s)
+    zero = np.zeros(n, np.intp)
+    turned = rate_rad_s * quaternion.matrix(q_level)[:, 2] * steps_s(time_s)[:, None]
+    turned[0] = 0.0
+    scale = np.square(model.gyro_scale * np.cumsum(turned, axis=0)).sum(axis=1)
+    drifted = _drifted(time_s, rate_rad_s, zero, time_s - time_s[0], model)
+    hidden = 0.0 if hidden_rad2 is None else np.cumsum(hidden_rad2)
+    none = np.full((n, 3), np.nan)
+    sigma = np.minimum(np.sqrt(scale + drifted + hidden), UNKNOWN_RAD)
+    return HeadingTrack(np.zeros(n), sigma, none, none, np.zeros(n, np.bool_), zero[:0])
+
+
 def _blocks(
-    time_s: FloatArray, rate_rad_s: FloatArray, q_level: FloatArray, field_T: FloatArray, model: HeadingModel
+    time_s: FloatArray,
+    rate_rad_s: FloatArray,
+    q_level: FloatArray,
+    field_T: FloatArray,
+    model: HeadingModel,
+    hidden_rad2: FloatArray | None = None,
 ) -> tuple[Blocks, NDArray[np.intp]]:
     """Means over short times, and the instants (m,) that end them; ``start_T`` is in the level frame still."""
     from adcs.complementary.heading_compiled import Blocks
     from adcs.complementary.inertial_magnetic_compiled import rotated
 
+    growth = np.zeros(len(time_s)) if hidden_rad2 is None else hidden_rad2
     level = rotated(q_level, field_T)
     rows = np.flatnonzero(is_read(level))
-    level = level[rows]
-    starting = time_s[rows] < time_s[0] + _START_S
-    if not starting.any():
+    if not rows.size:
         raise ValueError("Input field_T must be there within the first second; instead received none.")
+    start_T = level[rows[time_s[rows] < time_s[rows[0]] + _START_S]].mean(axis=0)
     size = instants_within(_BLOCK_S, time_s[rows])
-    of_block = rows[: len(rows) // size * size].reshape(-1, size)
+    # No block begins before a gap and ends after it.
+    pieces = np.split(rows, np.searchsorted(rows, np.flatnonzero(growth > 0.0)))
+    rows = np.concatenate([piece[: len(piece) // size * size] for piece in pieces])
+    if not rows.size:
+        rows, size = pieces[0], len(pieces[0])
+    of_block = rows.reshape(-1, size)
     ends = of_block[:, -1]
     dt_s = steps_s(time_s)
-    gap_s = np.cumsum(np.where(dt_s > GAP_STEPS * np.median(dt_s), dt_s, 0.0))
     turned = np.cumsum(rate_rad_s * dt_s[:, None], axis=0)
     steps = np.diff(time_s[ends], prepend=time_s[0] - dt_s[0])
     rates = np.diff(turned[ends], axis=0, prepend=0.0) / steps[:, None]
+    begins = np.concatenate([[0], ends[:-1]])
+    long = steps > _LONG_STEP_S
+    gap_rad2 = np.diff(np.cumsum(growth)[ends], prepend=0.0)
+    gap_rad2[long] += _drifted(time_s, rate_rad_s, begins, steps, model, until=ends)[long]
     blocks = Blocks(
-        field_T=level[: of_block.size].reshape(-1, size, 3).mean(axis=1),
+        field_T=level[rows].reshape(-1, size, 3).mean(axis=1),
         R_level=np.ascontiguousarray(quaternion.matrix(q_level[of_block[:, size // 2]])),
         rate_rad_s=rates,
-        dt_s=steps,
-        gap_s=np.diff(gap_s[ends], prepend=0.0),
+        dt_s=np.minimum(steps, model.gyro_drift_s),
+        gap_rad2=np.minimum(gap_rad2, UNKNOWN_RAD**2),
         turns=(np.linalg.norm(rates, axis=1) > model.turning_rad_s).astype(np.float64),
-        start_T=level[starting].mean(axis=0),
+        start_T=start_T,
     )
     return blocks, ends
 
 
 def _drifted(
-    time_s: FloatArray, rate_rad_s: FloatArray, ends: NDArray[np.intp], since_s: FloatArray, model: HeadingModel
+    time_s: FloatArray,
+    rate_rad_s: FloatArray,
+    since: NDArray[np.intp],
+    since_s: FloatArray,
+    model: HeadingModel,
+    until: NDArray[np.intp] | slice = slice(None),
 ) -> FloatArray:
-    """What the gyro alone adds to the heading's variance (n,) since the blocks that ended at some instants."""
+    """What the gyro alone adds to the heading's variance from some instants to others, all n unless they are given."""
     turning = np.linalg.norm(rate_rad_s, axis=1) > model.turning_rad_s
     turned_s = np.cumsum(turning * steps_s(time_s))
-    of_drift = np.maximum(turned_s - turned_s[ends], 0.0) / model.gyro_drift_s
+    of_drift = np.maximum(turned_s[until] - turned_s[since], 0.0) / model.gyro_drift_s
     # Of the integral of a bias that is forgotten.
     drift_s = 2.0 * model.gyro_drift_s**2 * (of_drift + np.expm1(-of_drift))
     variance: FloatArray = model.gyro_walk_rad_rts**2 * since_s + model.gyro_drift_rad_s**2 * drift_s
@@ -239,7 +293,7 @@ def transition(i: int, blocks: Blocks, noise: Noise) -> tuple[FloatArray, FloatA
     Phi[0, 2:5] = h * blocks.R_level[i, 2] * blocks.rate_rad_s[i]
     local = [noise.local_T, noise.local_T, noise.local_up_T]
     variance = np.zeros(14)
-    variance[0] = noise.walk_rad_rts**2 * h * turns + (noise.gap_rad_s * blocks.gap_s[i]) ** 2
+    variance[0] = noise.walk_rad_rts**2 * h * turns + blocks.gap_rad2[i]
     variance[5:8] = noise.offset_T_rts**2 * h
     variance[decaying] = np.square([noise.drift_rad_s, *[noise.room_T] * 3, *local]) * (1.0 - keeps**2)
     return Phi, np.diag(variance)

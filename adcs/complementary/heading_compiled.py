@@ -14,6 +14,8 @@ SIZE = 14
 """Numbers of the state: heading, drift; gyro's scales, sensor's offset, room's slow and quick variation, 3 each."""
 TOLD = (0, 5, 6, 7)
 """Those that are told: heading and offset."""
+LOST_RAD = 0.5
+"""Beyond this deviation of the heading the field tells it alone: it is too far for a linear update."""
 
 
 class Noise(NamedTuple):
@@ -29,7 +31,6 @@ class Noise(NamedTuple):
     local_T: float
     local_up_T: float
     local_s: float
-    gap_rad_s: float
 
 
 class Blocks(NamedTuple):
@@ -39,7 +40,7 @@ class Blocks(NamedTuple):
     R_level: Array  # (m, 3, 3): level from body
     rate_rad_s: Array  # (m, 3): body axes
     dt_s: Array  # (m,)
-    gap_s: Array  # (m,): of it without a gyro
+    gap_rad2: Array  # (m,): variance of the turn that a gap of the gyro hides within it
     turns: Array  # (m,): 1 where the sensor turns, 0 where it lies still
     start_T: Array  # (3,): east, north, up: the field at the start
 
@@ -67,13 +68,14 @@ class Step(NamedTuple):
     nu: Array  # (3,): innovation
     S: Array  # (3, 3): its covariance
     S_inverse: Array  # (3, 3)
+    jump: Array  # (1,): by which a lost heading was turned to the field
 
 
 @internal
 def new_step() -> Step:
     """Room for one."""
     wide, small = np.zeros((3, 3, SIZE)), np.zeros((2, 3, 3))
-    return Step(np.zeros(SIZE), np.ones(SIZE), wide[0], wide[1], wide[2], np.zeros(3), small[0], small[1])
+    return Step(np.zeros(SIZE), np.ones(SIZE), wide[0], wide[1], wide[2], np.zeros(3), small[0], small[1], np.zeros(1))
 
 
 @internal
@@ -99,7 +101,7 @@ def predict(x: Array, P: Array, i: int, blocks: Blocks, noise: Noise, step: Step
         x[j] *= keeps[j]
         for k in range(SIZE):
             P[j, k] *= keeps[j] * keeps[k]
-    P[0, 0] += noise.walk_rad_rts**2 * h * turns + (noise.gap_rad_s * blocks.gap_s[i]) ** 2
+    P[0, 0] += noise.walk_rad_rts**2 * h * turns + blocks.gap_rad2[i]
     P[1, 1] += noise.drift_rad_s**2 * (1.0 - keeps[1] ** 2)
     for k in range(3):
         local_T = noise.local_up_T if k == 2 else noise.local_T
@@ -110,10 +112,15 @@ def predict(x: Array, P: Array, i: int, blocks: Blocks, noise: Noise, step: Step
 
 @internal
 def innovation(x: Array, P: Array, i: int, blocks: Blocks, noise: Noise, step: Step) -> float:
-    """Normalised square of a block's innovation."""
-    c, s = np.cos(x[0]), np.sin(x[0])
+    """Normalised square of a block's innovation; a heading that is lost is first turned to the field."""
     H, HP, nu, S, R = step.H, step.HP, step.nu, step.S, blocks.R_level[i]
     east, north = blocks.start_T[0] + x[8] + x[11], blocks.start_T[1] + x[9] + x[12]
+    step.jump[0] = 0.0
+    if P[0, 0] > LOST_RAD**2:
+        seen = blocks.field_T[i] - R @ x[5:8]
+        step.jump[0] = np.arctan2(seen[1], seen[0]) - np.arctan2(north, east) - x[0]
+        x[0] += step.jump[0]
+    c, s = np.cos(x[0]), np.sin(x[0])
     level = (c * east - s * north, s * east + c * north, blocks.start_T[2] + x[10] + x[13])
     H[0, 0], H[1, 0] = -level[1], level[0]
     H[:, 5:8] = R
@@ -204,7 +211,9 @@ def run(
         predict(x, P, i, blocks, noise, step)
         nis = innovation(x, P, i, blocks, noise, step)
         smoothed = tests.memory * smoothed + (1.0 - tests.memory) * min(nis, 2.0 * tests.gate) / 3.0
-        if nis <= tests.gate and smoothed <= tests.mean_nis:
+        # A heading that was turned to the field agrees with any direction: length and dip have to be right.
+        gate = tests.gate if P[0, 0] <= LOST_RAD**2 else min(tests.gate, 3.0 * tests.mean_nis)
+        if nis <= gate and smoothed <= tests.mean_nis:
             update(x, P, step)
             used[i], known[i] = 1, 1
             right_s += h
@@ -308,6 +317,10 @@ def smooth(
     for i in range(n):
         _forward(x, P, i, blocks, noise, jump_T, known[i], step)
         xs[i], Ps[i] = x, P
+        k = i - 1
+        while known[i] > 0 and step.jump[0] != 0.0 and k >= 0 and Ps[k, 0, 0] > LOST_RAD**2:
+            xs[k, 0] += step.jump[0]
+            k -= 1
     score, information = np.zeros(SIZE), np.zeros((SIZE, SIZE))
     for i in range(n - 1, -1, -1):
         for k in range(4):

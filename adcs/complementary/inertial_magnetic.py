@@ -7,25 +7,42 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adcs import quaternion
 from adcs.complementary.heading import HeadingModel
-from adcs.satellite.vector_record import GAP_STEPS, GyroSamples, instants_within, step_rates, steps_s
+from adcs.complementary.inertial.gaps import (
+    LOST_RAD,
+    UNKNOWN_RAD,
+    gap_warnings,
+    hidden_variance,
+    numbered_windows,
+    sensor_gaps,
+    shown_turns,
+)
+from adcs.complementary.inertial.level import GRAVITY_TIME_S, Steady, Up, direction_up
+from adcs.complementary.inertial.misreadings import check_lengths, check_turns
+from adcs.satellite.conventions import median
+from adcs.satellite.telemetry import is_read
+from adcs.satellite.vector_record import GyroSamples, instants_within, step_rates, steps_s
 from arrays.io.values import numbers, seconds
 from arrays.typing import BoolArray, FloatArray
 
-GRAVITY_TIME_S = 3.0
-"""Time constant of the low-pass of the acceleration, as published for VQF."""
 _TILT_FLOOR_RAD = math.radians(0.4)
 _TURN_S = 0.5  # for how long a hand turns one way
+_USEFUL_TILT_RAD = math.radians(2.0)  # a field is levelled by a tilt that is known better
 _UP_STEP = 0.15  # part of the tilt's error that a step corrects: the direction up is smooth already
 _LONGEST_UP_STEP = 0.5 / _UP_STEP  # of usual ones: after a gap half of it is corrected
 _REST_S = 1.5
 _REST_RATE_RAD_S = math.radians(0.5)
 _REST_ACCELERATION_M_S2 = 0.15
+_START_RATE_RAD_S = math.radians(2.0)
+_START_ACCELERATION_M_S2 = 0.3
+_START_BIAS_RAD_S = math.radians(5.0)
+_UNKNOWN_BIAS_RAD_S = 0.01  # of a gyro that was never seen at rest
 _LAG_WINDOW_S = 0.2
 _LAG_EVERY_S = 0.01  # readings closer than that say the same
 _LONGEST_LAG_S = 0.04
@@ -42,7 +59,8 @@ class InertialMagneticRecord:
     time_s : ndarray, shape (n,)
         Ascending, in any steps.
     rate_rad_s, acceleration_m_s2, field_T : ndarray, shape (n, 3)
-        The acceleration is 9.8 m/s² upwards at rest.
+        The acceleration is 9.8 m/s² upwards at rest. A field without any reading is that of a unit without a
+        magnetometer.
     gyro_samples : str
         What a sample of the gyro is: see :func:`adcs.satellite.vector_record.step_rates`.
 
@@ -63,18 +81,32 @@ class InertialMagneticRecord:
         object.__setattr__(self, "time_s", seconds(self.time_s))
         shape = (len(steps_s(self.time_s)), 3)
         if np.ptp(self.time_s) < 1.0:
-            raise ValueError(f"Input time_s must last a second at least; instead received {np.ptp(self.time_s):g} s.")
+            raise ValueError(
+                f"Input time_s must last a second at least, in seconds; instead received {np.ptp(self.time_s):g} s."
+            )
         for name in ("rate_rad_s", "acceleration_m_s2", "field_T"):
             values = numbers(getattr(self, name))
             if values.shape != shape or np.isinf(values).any():
                 raise ValueError(f"Input {name} must be finite, of shape {shape}; instead received {values.shape}.")
             if np.nanmax(np.abs(values), initial=0.0) > _LARGEST[name]:
                 raise ValueError(f"Input {name} must not exceed {_LARGEST[name]:g}; instead received more.")
-            if not np.isfinite(values[self.starting]).all(axis=1).any():
+            missing = np.isnan(values).any(axis=1)
+            if missing.any():
+                values = np.where(missing[:, None], np.nan, values)
+            if missing[self.starting].all() and not (name == "field_T" and missing.all()):
                 raise ValueError(f"Input {name} must have a reading within the first second; instead received none.")
             if name != "rate_rad_s" and (values == 0.0).all(axis=1).any():
-                raise ValueError(f"Input {name} must have a length; instead received a zero vector.")
+                zero = int(np.argmax((values == 0.0).all(axis=1)))
+                raise ValueError(
+                    f"Input {name} must have a length, of gravity or of the Earth's field; instead received a zero "
+                    f"vector at row {zero + 1}."
+                )
             object.__setattr__(self, name, values)
+
+    @property
+    def has_field(self) -> bool:
+        """Whether there is a magnetometer."""
+        return bool(is_read(self.field_T).any())
 
     @property
     def dt_s(self) -> FloatArray:
@@ -98,7 +130,7 @@ def rest_bias(record: InertialMagneticRecord) -> FloatArray:
     """
     from adcs.complementary.inertial_magnetic_compiled import window_scatter
 
-    window = np.floor((record.time_s - record.time_s[0]) / _REST_S * (1.0 + 1e-9)).astype(np.intp)
+    window = numbered_windows(record.time_s, _REST_S)
     rate, *of_rate = window_scatter(record.rate_rad_s, window)
     _, *of_acceleration = window_scatter(record.acceleration_m_s2, window)
     rest = np.ones(len(rate), dtype=np.bool_)
@@ -111,6 +143,22 @@ def rest_bias(record: InertialMagneticRecord) -> FloatArray:
     # A rest is known at its end.
     latest = np.maximum(np.cumsum(np.concatenate([[False], rest[:-1]])) - 1, 0)
     return means[latest[window]]
+
+
+def start_motion(record: InertialMagneticRecord, bias_rad_s: FloatArray) -> str:
+    """Return how the unit moves in the first second, in words; the empty string where it rests.
+
+    ``bias_rad_s`` (3,): of the gyro, as far as it is known.
+    """
+    rate, acceleration = (v[record.starting] for v in (record.rate_rad_s, record.acceleration_m_s2))
+    turns, varies = (float(np.nanstd(v, axis=0).max()) for v in (rate, acceleration))
+    mean = float(np.linalg.norm(np.nanmean(rate, axis=0) - bias_rad_s))
+    if turns < _START_RATE_RAD_S and varies < _START_ACCELERATION_M_S2 and mean < _START_BIAS_RAD_S:
+        return ""
+    return (
+        f"the rate is {math.degrees(mean):.2g}°/s and varies by {math.degrees(turns):.2g}°/s, "
+        f"the acceleration varies by {varies:.2g} m/s²"
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,11 +176,31 @@ class Prepared:
     q_level: FloatArray
     lag_s: float  # of the magnetometer behind the gyro
     tilt_sigma_rad: FloatArray  # (n,): of the angle between up and its estimate
+    hidden_rad2: FloatArray | None = None  # (n,): growth of the attitude's variance within gaps of the gyro
+    start_tilt_rad: float = 0.0  # what a start that moves leaves of the tilt where the field is used first
+    bias_sigma_rad_s: float = 0.0  # of a gyro that was never seen at rest
+    warnings: tuple[str, ...] = ()
 
     @property
     def starting(self) -> BoolArray:
         """Which instants are within the first second (n,)."""
         return self.time_s < self.time_s[0] + 1.0
+
+
+def check_units(record: InertialMagneticRecord) -> None:
+    """Raise ValueError if units or axes of a sensor, or the unit of the time, are not those that the others show."""
+    check_lengths(record.acceleration_m_s2, record.field_T, record.starting)
+    gap = np.zeros(len(record), np.bool_)
+    for before, after in sensor_gaps(record.time_s, is_read(record.rate_rad_s)):
+        gap[before + 1 : after + 1] = True
+    rate = step_rates(_from_the_start(record.rate_rad_s), record.dt_s, record.gyro_samples)
+    check_turns(record.time_s, rate, record.acceleration_m_s2, record.field_T, gap)
+
+
+def _from_the_start(rate_rad_s: FloatArray) -> FloatArray:
+    """Rates with the first reading before it."""
+    first = int(np.argmax(is_read(rate_rad_s)))
+    return np.concatenate([np.repeat(rate_rad_s[first : first + 1], first, axis=0), rate_rad_s[first:]])
 
 
 def prepare(record: InertialMagneticRecord, model: HeadingModel = HeadingModel(), *, offline: bool = False) -> Prepared:
@@ -141,42 +209,95 @@ def prepare(record: InertialMagneticRecord, model: HeadingModel = HeadingModel()
     Everything but the lag, for which the whole record is used, is what can be known at the time, or, offline, what the
     whole record tells.
     """
-    from adcs.complementary.inertial_magnetic_compiled import gyro_attitudes, levelled
+    from adcs.complementary.inertial_magnetic_compiled import gyro_attitudes, rotated
 
-    dt_s, bias = record.dt_s, rest_bias(record)
-    rate = step_rates(record.rate_rad_s - bias, dt_s, record.gyro_samples)
+    time_s, dt_s, bias = record.time_s, record.dt_s, rest_bias(record)
+    moves = start_motion(record, bias[0])
+    read = {
+        "gyro": is_read(record.rate_rad_s),
+        "accelerometer": is_read(record.acceleration_m_s2),
+        "magnetometer": is_read(record.field_T),
+    }
+    bias_sigma = 0.0
+    if not bias.any():
+        bias_sigma = _UNKNOWN_BIAS_RAD_S if moves else 0.0
+        bias = bias if moves else bias + np.nanmean(record.rate_rad_s[record.starting], axis=0)
+    rate = step_rates(_from_the_start(record.rate_rad_s) - bias, dt_s, record.gyro_samples)
     q_gyro = gyro_attitudes(rate, dt_s)
-    steady = _steady_up(q_gyro, record, dt_s, offline)
-    lag = _lag_s(q_gyro, record)
-    field_T = _without_lag(q_gyro, record.time_s, record.field_T, lag)
-    usual = float(np.median(dt_s))
-    part = _UP_STEP * np.minimum(dt_s / usual, _LONGEST_UP_STEP)
-    q_level = levelled(q_gyro, steady, part, _attitude(steady[0], _across(steady[0])))
-    return Prepared(record.time_s, rate, bias, field_T, q_level, lag, _tilt_sigma_rad(dt_s, rate, model))
+    gaps = sensor_gaps(time_s, read["gyro"])
+    hidden = hidden_variance(time_s, record.rate_rad_s, gaps, model.gap_rad_s, model.long_gap_rad_s)
+    hidden += shown_turns(time_s, gaps, hidden, rotated(q_gyro, _usual_field(record)))
+    at_rest = record.starting & (not moves) & (np.cumsum(hidden) < LOST_RAD**2)
+    acceleration = rotated(q_gyro, record.acceleration_m_s2)
+    drift = max(model.gyro_drift_rad_s, bias_sigma)
+    up = direction_up(Steady(time_s, dt_s, acceleration, at_rest, gaps, hidden, drift), offline=offline)
+    part = _UP_STEP * np.minimum(dt_s / float(np.median(dt_s)), _LONGEST_UP_STEP)
+    q_level = _levelled(q_gyro, up, np.where(up.fresh, 1.0, part))
+    lag, field_T, start_tilt = 0.0, record.field_T, 0.0
+    if record.has_field:
+        lag = _lag_s(q_gyro, record)
+        field_T = _without_lag(q_gyro, time_s, field_T, lag)
+        best = float(up.sigma_rad[read["magnetometer"]].min())
+        useful = up.sigma_rad <= max(_USEFUL_TILT_RAD, 1.5 * best)
+        for before, after in gaps:
+            useful[before + 1 : after] = False
+        field_T = np.where(useful[:, None], field_T, np.nan)
+        start_tilt = float(up.sigma_rad[np.argmax(useful & read["magnetometer"])])
+    else:
+        del read["magnetometer"]
+    hides = [np.sum(hidden[before + 1 : after + 1]) > LOST_RAD**2 for before, after in gaps]
+    return Prepared(
+        time_s,
+        rate,
+        bias,
+        field_T,
+        q_level,
+        lag,
+        _tilt_sigma_rad(dt_s, rate, up.hidden_rad2, model, np.hypot(up.sigma_rad, GRAVITY_TIME_S * bias_sigma)),
+        up.hidden_rad2,
+        start_tilt,
+        bias_sigma,
+        (*_start_warnings(moves, bias_sigma), *gap_warnings(time_s, read, gaps[np.array(hides, np.bool_)])),
+    )
 
 
-def _tilt_sigma_rad(dt_s: FloatArray, rate: FloatArray, model: HeadingModel) -> FloatArray:
+def _levelled(q_gyro: FloatArray, up: Up, part: FloatArray) -> FloatArray:
+    """Level attitudes (n, 4), from body; where the direction up begins anew the shortest turn takes it upwards."""
+    from adcs.complementary.inertial_magnetic_compiled import levelled
+
+    q_level = np.empty_like(q_gyro)
+    starts = 1 + np.flatnonzero(up.fresh[1:] & ~up.fresh[:-1])
+    for begin, end in pairwise([0, *starts, len(up.up)]):
+        v = up.up[begin]
+        start = _attitude(v, _across(v))
+        if begin > 0:
+            start = quaternion.multiply(q_level[begin - 1], quaternion.conjugate(q_gyro[begin - 1]))
+            x, y, z = quaternion.rotate(start, v)
+            across = math.hypot(x, y)
+            turn = np.array([y, -x, 0.0]) * (math.atan2(across, z) / across if across > 0.0 else 0.0)
+            start = quaternion.multiply(quaternion.exp(turn), start)
+        q_level[begin:end] = levelled(q_gyro[begin:end], up.up[begin:end], part[begin:end], start)
+    return q_level
+
+
+def _start_warnings(moves: str, bias_sigma_rad_s: float) -> list[str]:
+    """Say that the first second is not at rest, and what that leaves."""
+    if not moves:
+        return []
+    never = ", and it never rests, so that the gyro's bias is unknown" if bias_sigma_rad_s else ""
+    return [f"the unit is not at rest in the first second ({moves}){never}; the start is estimated with a larger σ"]
+
+
+def _tilt_sigma_rad(
+    dt_s: FloatArray, rate: FloatArray, hidden_rad2: FloatArray, model: HeadingModel, more_rad: FloatArray
+) -> FloatArray:
     """What an accelerometer at rest leaves, and what the gyro's scale makes of turns while the low-pass is behind."""
     from adcs.complementary.inertial_magnetic_compiled import low_pass
 
-    gap_rad_s = model.gap_rad_s * np.where(dt_s > GAP_STEPS * np.median(dt_s), dt_s, 0.0) / _TURN_S
-    squares = (model.gyro_scale**2 * np.einsum("ni,ni->n", rate, rate) + gap_rad_s**2)[:, None]
+    squares = (model.gyro_scale**2 * np.einsum("ni,ni->n", rate, rate) + hidden_rad2 / _TURN_S**2)[:, None]
     smooth = low_pass(squares, dt_s, GRAVITY_TIME_S, squares[0])[:, 0]
-    return np.sqrt(_TILT_FLOOR_RAD**2 + _TURN_S**2 * np.maximum(smooth, 0.0))
-
-
-def _steady_up(q_gyro: FloatArray, record: InertialMagneticRecord, dt_s: FloatArray, offline: bool) -> FloatArray:
-    """Upward unit vectors (n, 3) in the gyro's frame; offline the mean of a low-pass from either end, never late."""
-    from adcs.complementary.inertial_magnetic_compiled import low_pass, rotated
-
-    steady = rotated(q_gyro, record.acceleration_m_s2)
-    smooth = low_pass(steady, dt_s, GRAVITY_TIME_S, np.nanmean(steady[record.starting], axis=0))
-    if offline:
-        seen = steady[np.isfinite(steady).all(axis=1)]
-        end = seen[-np.count_nonzero(record.starting) :].mean(axis=0)
-        steps = np.concatenate([dt_s[:1], dt_s[:0:-1]])
-        smooth = 0.5 * (smooth + low_pass(steady[::-1].copy(), steps, GRAVITY_TIME_S, end)[::-1])
-    return smooth / np.sqrt(np.einsum("ni,ni->n", smooth, smooth))[:, None]
+    sigma = np.sqrt(_TILT_FLOOR_RAD**2 + _TURN_S**2 * np.maximum(smooth, 0.0) + np.square(more_rad))
+    return np.minimum(sigma, UNKNOWN_RAD)
 
 
 def _lag_s(q_gyro: FloatArray, record: InertialMagneticRecord) -> float:
@@ -201,6 +322,13 @@ def _lag_s(q_gyro: FloatArray, record: InertialMagneticRecord) -> float:
         return least * step
     a, b, c = changes[least - 1 : least + 2]
     return (least + 0.5 * (a - c) / (a - 2.0 * b + c)) * step
+
+
+def _usual_field(record: InertialMagneticRecord) -> FloatArray:
+    """Readings (n, 3) whose length is that of the first second; the others are NaN."""
+    lengths = np.sqrt(np.einsum("ni,ni->n", record.field_T, record.field_T))
+    usual = median(lengths[record.starting])
+    return np.where((np.abs(lengths - usual) < _USUAL_LENGTH * usual)[:, None], record.field_T, np.nan)
 
 
 def _without_lag(q_gyro: FloatArray, time_s: FloatArray, field_T: FloatArray, lag_s: float) -> FloatArray:

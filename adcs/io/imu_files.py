@@ -1,8 +1,9 @@
-"""Logs of an inertial unit with a magnetometer: CSV files, and MAT files of the BROAD benchmark.
+"""Logs of an inertial unit, with a magnetometer or without: CSV files, and MAT files of the BROAD benchmark.
 
-Columns of a CSV file without a layout: ``time_s``, ``gyro_x_rad_s`` or ``gyro_x_deg_s``, ``acceleration_x_m_s2``,
-``field_x_nT`` with y and z, and if known the truth ``qw, qx, qy, qz`` (east, north, up from body) and ``moving``, 1
-where errors count. An empty cell is a missing reading: sensors may have rates of their own, and steps may jitter.
+Columns of a CSV file without a layout: ``time_s``, ``gyro_x_rad_s`` or ``gyro_x_deg_s``, ``acceleration_x_m_s2`` and,
+of a unit with a magnetometer, ``field_x_nT``, with y and z, and if known the truth ``qw, qx, qy, qz`` (east, north, up
+from body) and ``moving``, 1 where errors count. An empty cell is a missing reading: sensors may have rates of their
+own, and steps may jitter.
 """
 
 from __future__ import annotations
@@ -67,7 +68,7 @@ class ImuTable(Table, kw_only=True):
 
     gyro: SampledGyroColumns
     accelerometer: AccelerometerColumns
-    magnetometer: MagnetometerColumns
+    magnetometer: MagnetometerColumns | None = None
     time: str = TIME
     time_format: Annotated[str, one_of(TIME_FORMATS)] = "seconds"
     truth: TruthColumns | None = None
@@ -110,7 +111,7 @@ class ImuLog:
 
 
 def read_imu(path: str | PathLike[str], layout: str | PathLike[str] | None = None) -> ImuLog:
-    """Read a log of gyro, accelerometer and magnetometer.
+    """Read a log of gyro and accelerometer, with a magnetometer or without.
 
     Parameters
     ----------
@@ -118,6 +119,7 @@ def read_imu(path: str | PathLike[str], layout: str | PathLike[str] | None = Non
         A CSV file, or a MAT file of the BROAD benchmark.
     layout : str or path-like, optional
         A TOML file whose table ``log`` names columns, units and mountings of a CSV file; see the file formats.
+        Without a table of the magnetometer its columns are not read.
 
     Raises
     ------
@@ -148,7 +150,7 @@ def _csv_log(path: str | PathLike[str], named: ImuTable | None) -> ImuLog:
     if named is None:
         table = read_table(path, expected)
         given = _standard(table.header)
-        for group in (given.gyro, given.accelerometer, given.magnetometer):
+        for group in _layout(given).columns.values():
             for name in group.columns:
                 table.require(name, group.columns)
     else:
@@ -157,6 +159,7 @@ def _csv_log(path: str | PathLike[str], named: ImuTable | None) -> ImuLog:
         table = read_named(path, expected, _layout(given), more)
     time_s, values = columns_of(table, _layout(given))
     truth = values.pop("truth", None)
+    values.setdefault("field_T", np.full((len(time_s), 3), np.nan))
     samples: GyroSamples = given.gyro.samples  # type: ignore[assignment]
     with naming(str(path)):
         record = InertialMagneticRecord(time_s, **values, gyro_samples=samples)
@@ -168,13 +171,9 @@ def _csv_log(path: str | PathLike[str], named: ImuTable | None) -> ImuLog:
 
 
 def _layout(given: ImuTable) -> LogLayout:
-    columns: dict[str, Any] = {
-        "rate_rad_s": given.gyro,
-        "acceleration_m_s2": given.accelerometer,
-        "field_T": given.magnetometer,
-    }
-    if given.truth is not None:
-        columns["truth"] = given.truth
+    columns: dict[str, Any] = {"rate_rad_s": given.gyro, "acceleration_m_s2": given.accelerometer}
+    columns |= {"field_T": given.magnetometer} if given.magnetometer is not None else {}
+    columns |= {"truth": given.truth} if given.truth is not None else {}
     return LogLayout(np.datetime64(0, "us"), given.time, given.time_format, columns)
 
 
@@ -182,10 +181,12 @@ def _standard(header: tuple[str, ...]) -> ImuTable:
     """Layout of a file without one, by its header."""
     per_rad = SampledGyroColumns(columns=("gyro_x_rad_s", "gyro_y_rad_s", "gyro_z_rad_s"), unit="rad/s")
     truth = TruthColumns()
+    # A column of a similar name is a magnetometer's that is misspelt; without one there is no magnetometer.
+    magnetic = any("field" in name.lower() or "mag" in name.lower() for name in header)
     return ImuTable(
         gyro=per_rad if per_rad.columns[0] in header else SampledGyroColumns(),
         accelerometer=AccelerometerColumns(),
-        magnetometer=MagnetometerColumns(),
+        magnetometer=MagnetometerColumns() if magnetic else None,
         truth=truth if set(truth.columns) <= set(header) else None,
         moving=MOVING if MOVING in header else None,
     )

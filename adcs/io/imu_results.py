@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from adcs.complementary.filters import LEFT_OUT, SUBTRACTED
+from adcs.complementary.filters import LEFT_OUT, LOST, SUBTRACTED
 from adcs.complementary.orientation_errors import orientation_errors
 from adcs.io.imu_files import ImuLog
 from adcs.satellite.attitude_track import AttitudeTrack
@@ -31,16 +31,18 @@ def attitude_columns(track: AttitudeTrack) -> dict[str, Any]:
 def imu_summary(track: AttitudeTrack, log: ImuLog) -> dict[str, Any]:
     """Totals of a track, and its errors where the log has a truth."""
     left_out, subtracted = track.degraded[LEFT_OUT], track.degraded[SUBTRACTED]
-    flags = {"field-left-out": left_out, "magnet-subtracted": subtracted}
+    flags = {"field-left-out": left_out, "magnet-subtracted": subtracted, "heading-lost": track.degraded[LOST]}
+    relative = "magnetometer" not in track.used
+    used = "subtract" if subtracted.any() else "reject" if left_out.any() else "plain"
     summary: dict[str, Any] = {
         "rows": len(track),
-        "method": "subtract" if subtracted.any() else "reject" if left_out.any() else "plain",
+        "method": "six-axes" if relative else used,
         "disturbed_fraction": float((left_out | subtracted).mean()),
-        "flags": [name for name, there in flags.items() if there.any()],
+        "flags": [*(["heading-relative"] if relative else []), *(name for name, there in flags.items() if there.any())],
     }
     if log.q_true is not None and (log.moving & np.isfinite(log.q_true).all(axis=1)).any():
         errors = orientation_errors(track.q, log.q_true, log.moving)
-        for name in ("total", "heading", "inclination"):
+        for name in ("inclination",) if relative else ("total", "heading", "inclination"):
             summary[f"{name}_rms_deg"] = float(np.degrees(getattr(errors, name)))
     return summary
 
@@ -51,9 +53,12 @@ def summary_words(summary: dict[str, Any]) -> list[str]:
         "plain": "the field was used as it is",
         "reject": "the field was left out where it contradicts",
         "subtract": "a magnet that moves with the sensor was subtracted",
+        "six-axes": "there is no field: the heading is relative to the first row",
     }
     lines = [f"{summary['rows']} rows; {used[summary['method']]}; disturbed in {summary['disturbed_fraction']:.1%}"]
     if "total_rms_deg" in summary:
         total, heading, tilt = (summary[f"{name}_rms_deg"] for name in ("total", "heading", "inclination"))
         lines.append(f"rms while it moved: {total:.2f}° in all, heading {heading:.2f}°, inclination {tilt:.2f}°")
+    elif "inclination_rms_deg" in summary:
+        lines.append(f"rms while it moved: inclination {summary['inclination_rms_deg']:.2f}°")
     return lines

@@ -8,7 +8,7 @@ attitude. Where they do, every change that a misreading makes is tried, and name
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,7 +28,7 @@ _FACTOR = 1.4
 _ANGLE_RAD = math.radians(20.0)
 _TURN_RAD = math.radians(45.0)
 _LEAST_TURN_RAD = math.radians(5.0)
-_FIELD_UNITS = {
+FIELD_UNITS = {
     "µT taken for nT": 1e3,
     "nT taken for µT": 1e-3,
     "T taken for nT": 1e9,
@@ -38,7 +38,7 @@ _FIELD_UNITS = {
     "nT taken for mG": 1e-2,
     "G taken for nT": 1e5,
 }
-_RATE_UNITS = {"rad/s taken for °/s": 180.0 / math.pi, "°/s taken for rad/s": math.pi / 180.0}
+RATE_UNITS = {"rad/s taken for °/s": 180.0 / math.pi, "°/s taken for rad/s": math.pi / 180.0}
 # Components (w, x, y, z) as read, of columns that are (x, y, z, w), and the other way round.
 _ORDERS = {"scalar last taken for scalar first": [3, 0, 1, 2], "scalar first taken for scalar last": [1, 2, 3, 0]}
 
@@ -81,26 +81,38 @@ def check_conventions(telemetry: Telemetry, record: Record, used: Collection[str
     as_read = _disagreements(log)
     if as_read.max() < _SUSPICIOUS:
         return
-    worst, mended = int(np.argmax(as_read)), {}
-    for sensor, name, attribute, matrix in _changes():
-        with np.errstate(over="ignore"):
-            found = _disagreements(_changed(log, attribute, matrix)) if sensor in used else as_read
-        if found[worst] <= min(as_read[worst] / _MENDED, 1.0) and (found <= np.maximum(as_read, 1.0)).all():
-            mended[f"the {SENSOR_WORDS[sensor]}{name}"] = found.sum()
-    if mended:
-        least = min(mended.values())
-        named = [name for name, value in mended.items() if value <= 1.2 * least + 0.01]
+    with np.errstate(over="ignore"):
+        changed = {
+            f"the {SENSOR_WORDS[sensor]}{name}": _disagreements(_changed(log, attribute, matrix))
+            for sensor, name, attribute, matrix in _changes()
+            if sensor in used
+        }
+    if named := mending(as_read, changed, int(np.argmax(as_read))):
         raise ValueError(
             "Input telemetry must agree with itself and with the orbit; instead received what agrees if this is "
             f"undone: {', or '.join(named)}."
         )
 
 
+def mending(as_read: FloatArray, changed: Mapping[str, FloatArray], worst: int) -> list[str]:
+    """Return the names of the changes that mend a disagreement, that of number ``worst``, and make no other one worse.
+
+    ``as_read`` (k,): disagreements, in units of what is allowed, and those after each change by its name.
+    """
+    mended = {
+        name: found.sum()
+        for name, found in changed.items()
+        if found[worst] <= min(as_read[worst] / _MENDED, 1.0) and (found <= np.maximum(as_read, 1.0)).all()
+    }
+    least = min(mended.values(), default=0.0)
+    return [name for name, value in mended.items() if value <= 1.2 * least + 0.01]
+
+
 def _changes() -> Iterator[tuple[str, str, str, FloatArray]]:
     """Sensors, names of their misreadings, the attribute of a log, and the matrix that undoes each."""
-    for name, factor in _FIELD_UNITS.items():
+    for name, factor in FIELD_UNITS.items():
         yield "mag", f" in {name}", "field", factor * np.eye(3)
-    for name, factor in _RATE_UNITS.items():
+    for name, factor in RATE_UNITS.items():
         yield "gyro", f" in {name}", "gyro", factor * np.eye(3)
     about, conjugation = (
         "body from inertial taken for inertial from body (conjugated)",
@@ -112,7 +124,7 @@ def _changes() -> Iterator[tuple[str, str, str, FloatArray]]:
         yield "st", f", {name}", "star", ordering
         yield "st", f", {name} and {about}", "star", ordering @ conjugation
     for sensor, attribute in (("gyro", "gyro"), ("mag", "field"), ("sun", "sun")):
-        for name, matrix in _axes():
+        for name, matrix in reflected_axes():
             yield sensor, name, attribute, matrix
 
 
@@ -120,7 +132,7 @@ def _changed(log: _Log, attribute: str, matrix: FloatArray) -> _Log:
     return replace(log, **{attribute: getattr(log, attribute) @ matrix})
 
 
-def _axes() -> Iterator[tuple[str, FloatArray]]:
+def reflected_axes() -> Iterator[tuple[str, FloatArray]]:
     """Axes that are reversed or exchanged."""
     yield ", all its signs reversed", -np.eye(3)
     for axis, name in enumerate("xyz"):
@@ -135,13 +147,13 @@ def _axes() -> Iterator[tuple[str, FloatArray]]:
 def _disagreements(log: _Log) -> FloatArray:
     """Contradictions (6,) in units of what is allowed; 0 of those that the log does not allow to see."""
     vectors = attitude_of_vectors([log.sun, log.field], [log.model_sun, log.model_field], [1.0, 1.0], method="triad").q
-    vectors[np.sin(_angle(log.sun, log.field)) < _LEAST_SINE] = np.nan
+    vectors[np.sin(angle(log.sun, log.field)) < _LEAST_SINE] = np.nan
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         found = [
-            _median(np.abs(np.log(_lengths(log.field) / _lengths(log.model_field)))) / math.log(_FACTOR),
-            _median(np.abs(_angle(log.field, log.sun) - _angle(log.model_field, log.model_sun))) / _ANGLE_RAD,
+            median(np.abs(np.log(_lengths(log.field) / _lengths(log.model_field)))) / math.log(_FACTOR),
+            median(np.abs(angle(log.field, log.sun) - angle(log.model_field, log.model_sun))) / _ANGLE_RAD,
             *(
-                _median(_angle(reading, quaternion.rotate_back(log.star, model))) / _ANGLE_RAD
+                median(angle(reading, quaternion.rotate_back(log.star, model))) / _ANGLE_RAD
                 for reading, model in ((log.field, log.model_field), (log.sun, log.model_sun))
             ),
             *(_turns(log, q) for q in (log.star, vectors)),
@@ -157,25 +169,26 @@ def _turns(log: _Log, q: FloatArray) -> float:
     window, of_gyro = 1, quaternion.exp(step_rates(log.gyro, steps, "point") * steps[:, None])[1:]
     while True:
         of_q = quaternion.multiply(quaternion.conjugate(q[:-window]), q[window:])
-        turned = _median(quaternion.angle_between(of_q, quaternion.IDENTITY))
+        turned = median(quaternion.angle_between(of_q, quaternion.IDENTITY))
         if turned >= _TURN_RAD or 2 * window >= len(q) - 1:
             break
         of_gyro = quaternion.multiply(of_gyro[:-window], of_gyro[window:])
         window *= 2
     if turned < _LEAST_TURN_RAD:
         return 0.0
-    return _median(quaternion.angle_between(of_gyro, of_q)) / (0.3 * turned + math.radians(2.0))
+    return median(quaternion.angle_between(of_gyro, of_q)) / (0.3 * turned + math.radians(2.0))
 
 
 def _lengths(v: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.norm(v, axis=-1))
 
 
-def _angle(a: FloatArray, b: FloatArray) -> FloatArray:
+def angle(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return the angles (...) between vectors (..., 3) of any length."""
     return np.arctan2(_lengths(np.cross(a, b)), np.sum(a * b, axis=-1))
 
 
-def _median(values: FloatArray) -> float:
-    """Of what is there; 0 of nothing."""
+def median(values: FloatArray) -> float:
+    """Return the median of what is there; 0 of nothing."""
     there = values[np.isfinite(values)]
     return float(np.median(there)) if there.size else 0.0

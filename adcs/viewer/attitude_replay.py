@@ -134,12 +134,11 @@ def replay_of(
         own_s, axes = readings.time_s, ("e1, ahead", "e2", "e3, up")
     elif readings is not None:
         at = rows_at(track.time_s, readings.time_s)
-        north = quaternion.to_rotation(q[:1]).apply(readings.field_T[np.isfinite(readings.field_T[:, 0])][0])
-        shape = (len(readings), 3)
-        directions = [
-            _direction("field", readings.field_T, np.broadcast_to(north, shape), at),
-            _direction("accelerometer", readings.acceleration_m_s2, np.broadcast_to([0.0, 0.0, 1.0], shape), at),
-        ]
+        shape, up = (len(readings), 3), [0.0, 0.0, 1.0]
+        directions = [_direction("accelerometer", readings.acceleration_m_s2, np.broadcast_to(up, shape), at)]
+        if readings.has_field:
+            north = quaternion.to_rotation(q[:1]).apply(readings.field_T[np.isfinite(readings.field_T[:, 0])][0])
+            directions.insert(0, _direction("field", readings.field_T, np.broadcast_to(north, shape), at))
         own_s, axes = readings.time_s, ("east", "north", "up")
     q_true = np.full((n, 4), np.nan)
     if truth is not None:

@@ -16,7 +16,7 @@ from adcs.complementary.heading_compiled import Tests as Limits
 
 MODEL = HeadingModel()
 STEP_S, FIELD_T = 0.02, np.array([0.0, 18e-6, -45e-6])
-NOISE = Noise(1e-6, 3e-4, 7e-4, 20.0, 2e-8, 4e-7, 40.0, 2e-6, 1e-6, 0.3, 0.1)
+NOISE = Noise(1e-6, 3e-4, 7e-4, 20.0, 2e-8, 4e-7, 40.0, 2e-6, 1e-6, 0.3)
 
 
 def room(seconds=60.0, seed=0, turning=1.0, **changes):

@@ -335,7 +335,8 @@ class TestInput:
         with pytest.raises(ValueError, match="field_T must be finite, of shape"):
             InertialMagneticRecord(time_s, good, good, np.full((200, 3), np.inf))
         with pytest.raises(ValueError, match="field_T must have a reading within the first second"):
-            InertialMagneticRecord(time_s, good, good, np.full((200, 3), np.nan))
+            InertialMagneticRecord(time_s, good, good, np.where(time_s[:, None] < 1.5, np.nan, good))
+        assert not InertialMagneticRecord(time_s, good, good, np.full((200, 3), np.nan)).has_field
         with pytest.raises(ValueError, match="rate_rad_s must not exceed 10000"):
             InertialMagneticRecord(time_s, 1e18 * good, good, good)
         with pytest.raises(ValueError, match="acceleration_m_s2 must have a length"):

@@ -1,0 +1,1 @@
+"""Inertial units on Earth: gaps in their readings, the direction up, and logs that are misread."""

@@ -1,0 +1,132 @@
+"""Gaps in the readings of an inertial unit, and the turn that a gap of the gyro hides."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adcs.satellite.conventions import angle
+from adcs.satellite.telemetry import is_read
+from adcs.satellite.vector_record import GAP_STEPS
+from arrays.typing import BoolArray, FloatArray
+
+_CHANGE_S = 1.0  # a hand changes its rate within that time; what a shorter gap hides shows after it
+_STEEP, _LONG = 6, 10.0
+_SHOWN_RAD, _SHOWN_S = 0.15, 0.3  # over a shorter gap a room's field turns as much as the unit
+_TINY = 1e-12
+HELD_VARIANCE = 4.0
+"""Part by which the rate at one end of a gap says less of a turn than the mean of both, as of a rate that wanders."""
+UNKNOWN_RAD = math.pi / math.sqrt(3.0)
+"""Standard deviation of an angle that may be any."""
+LOST_RAD = 0.05
+"""A gap that hides a turn of this size, 1 σ, is named."""
+LEAST_GAP_S = 1.0
+"""A shorter gap is not named, unless it hides a turn."""
+
+
+def numbered_windows(time_s: FloatArray, window_s: float) -> NDArray[np.intp]:
+    """Return the number (n,) of the window that each instant is in; windows without an instant are not counted."""
+    window = np.floor((time_s - time_s[0]) / window_s * (1.0 + 1e-9))
+    return np.cumsum(np.diff(window, prepend=0.0) > 0.0, dtype=np.intp)
+
+
+def sensor_gaps(time_s: FloatArray, read: BoolArray, least_s: float = 0.0) -> NDArray[np.intp]:
+    """Return the rows (k, 2) before and after each gap of a sensor; n stands after a gap that lasts to the end.
+
+    A gap is longer than 2.5 usual steps of the sensor and than ``least_s``. Time before the first reading is none.
+    """
+    rows = np.flatnonzero(read)
+    span = np.diff(time_s[rows])
+    longest = max(least_s, GAP_STEPS * float(np.median(span))) if len(span) else math.inf
+    at = np.flatnonzero(span > longest)
+    found = np.stack([rows[at], rows[at + 1]], axis=1)
+    if len(rows) and time_s[-1] - time_s[rows[-1]] > longest:
+        found = np.concatenate([found, [[rows[-1], len(time_s)]]])
+    return found
+
+
+def hidden_turn_rad(seconds: FloatArray, held_rad_s: float, usual_rad_s: float) -> FloatArray:
+    """Return the standard deviation of the turn that a gap of the gyro hides, beside that by the mean rate of its ends.
+
+    In a short gap the mean rate is off by ``held_rad_s``; beyond a second the unit may have any of its usual rates.
+    """
+    part = np.power(np.minimum(seconds / _CHANGE_S, _LONG), _STEEP)
+    rate = np.hypot(held_rad_s, usual_rad_s * part / (1.0 + part))
+    return np.asarray(np.minimum(rate * seconds, UNKNOWN_RAD))
+
+
+def hidden_variance(
+    time_s: FloatArray, rate_rad_s: FloatArray, gaps: NDArray[np.intp], held_rad_s: float, usual_rad_s: float
+) -> FloatArray:
+    """Return by how much the variance of the attitude grows at each instant (n,), within the gaps of the gyro [rad²].
+
+    It is positive in all of a gap. ``rate_rad_s`` (n, 3) is NaN without a reading. Rates as of
+    :func:`hidden_turn_rad`, ``usual_rad_s`` at least that of the whole log.
+    """
+    growth = np.zeros(len(time_s))
+    usual = max(usual_rad_s, math.sqrt(float(np.nanmean(np.einsum("ni,ni->n", rate_rad_s, rate_rad_s)))))
+    for before, after in gaps:
+        within = slice(before + 1, after + 1)
+        variance = np.square(hidden_turn_rad(time_s[within] - time_s[before], held_rad_s, usual))
+        growth[within] = np.maximum(np.diff(variance, prepend=0.0), _TINY)
+    return growth
+
+
+def shown_turns(
+    time_s: FloatArray, gaps: NDArray[np.intp], hidden_rad2: FloatArray, steady_field: FloatArray
+) -> FloatArray:
+    """Return what is to be added to the variance (n,) after each gap over which the field turns by more [rad²].
+
+    ``steady_field`` (n, 3) is in the frame of the gyro alone, where it stands still but for a gap, and NaN where it is
+    not the Earth's.
+    """
+    more = np.zeros(len(time_s))
+    rows = np.flatnonzero(is_read(steady_field))
+    for before, after in gaps:
+        i, k = np.searchsorted(rows, [before + 1, after])
+        if i == 0 or k == len(rows) or not _SHOWN_S <= time_s[after] - time_s[before]:
+            continue
+        if time_s[rows[k]] - time_s[rows[i - 1]] < time_s[after] - time_s[before] + _CHANGE_S:
+            variance = float(np.sum(hidden_rad2[before + 1 : after + 1]))
+            turned = float(angle(steady_field[rows[i - 1]], steady_field[rows[k]]))
+            if turned > max(math.sqrt(variance), _SHOWN_RAD):
+                more[after] = turned**2 - variance
+    return more
+
+
+def gap_warnings(time_s: FloatArray, read: Mapping[str, BoolArray], lost: NDArray[np.intp]) -> list[str]:
+    """Return a sentence for each sensor with gaps: how many, how long, and when.
+
+    Parameters
+    ----------
+    time_s : ndarray, shape (n,)
+    read : mapping of str to ndarray of bool, shape (n,)
+        Sensors by name, the gyro first.
+    lost : ndarray, shape (k, 2)
+        Gaps of the gyro that hide a turn.
+    """
+    gyro, *others = read
+    texts = []
+    if len(lost):
+        texts.append(f"{_named(time_s, gyro, lost)}; the turn within a gap is unknown, and the field tells it again")
+    for name in others:
+        gaps = sensor_gaps(time_s, read[name], LEAST_GAP_S)
+        seen = np.concatenate([[0], np.cumsum(read[gyro])])
+        own = gaps[seen[np.minimum(gaps[:, 1], len(time_s))] - seen[gaps[:, 0] + 1] > 0]
+        if len(own):
+            texts.append(f"{_named(time_s, name, own)}; the gyro alone held the attitude there")
+    return texts
+
+
+def _named(time_s: FloatArray, name: str, gaps: NDArray[np.intp]) -> str:
+    lasts_s = time_s[np.minimum(gaps[:, 1], len(time_s) - 1)] - time_s[gaps[:, 0]]
+    k = int(np.argmax(lasts_s))
+    times = "1 gap, of" if len(gaps) == 1 else f"{len(gaps)} gaps, the longest of"
+    return f"the {name} has {times} {_duration(lasts_s[k])} from {time_s[gaps[k, 0]]:.10g} s on"
+
+
+def _duration(seconds: float) -> str:
+    return f"{seconds:.3g} s" if seconds < 1e3 else f"{seconds:.0f} s ({seconds / 86400.0:.3g} days)"

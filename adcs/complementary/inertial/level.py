@@ -1,0 +1,145 @@
+"""Direction up of an inertial unit: the acceleration smoothed in a frame that does not turn, anew after each gap."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adcs.complementary.inertial.gaps import HELD_VARIANCE, LEAST_GAP_S, UNKNOWN_RAD, numbered_windows, sensor_gaps
+from adcs.satellite.conventions import angle
+from adcs.satellite.telemetry import is_read
+from arrays.typing import BoolArray, FloatArray
+
+GRAVITY_TIME_S = 3.0
+"""Time constant of the low-pass of the acceleration, as published for VQF."""
+_GRAVITY_M_S2 = 9.81
+_MEAN_S = 0.5  # mean accelerations of a hand fall with the time that they are of, from here on
+_WINDOW_S = 1.5
+_LEAST_RAD = 0.025  # a gap that hides less is smoothed over
+_MUCH = 2.0  # what was known before counts if it is not worse than some readings
+_LEAST_M_S2 = 0.1  # what an accelerometer's mean is off by
+
+
+@dataclass(frozen=True, eq=False)
+class Up:
+    """Direction up at n instants, in the frame of the gyro alone."""
+
+    up: FloatArray  # (n, 3): unit vectors
+    sigma_rad: FloatArray  # (n,): of their angle, what gaps and a start that moves leave of it
+    fresh: BoolArray  # (n,): where few readings tell it: it is followed at once
+    hidden_rad2: FloatArray  # (n,): growth of the attitude's variance in gaps of the gyro, with what shows after them
+
+
+@dataclass(frozen=True, eq=False)
+class Steady:
+    """Accelerations at n instants, in the frame of the gyro alone, and where they say little."""
+
+    time_s: FloatArray
+    dt_s: FloatArray
+    acceleration_m_s2: FloatArray  # (n, 3): NaN without a reading
+    at_rest: BoolArray  # (n,): readings that start the first low-pass; none where the unit moves at the start
+    gaps: NDArray[np.intp]  # (k, 2): rows before and after the gaps of the gyro
+    hidden_rad2: FloatArray  # (n,): growth of the attitude's variance within them
+    drift_rad_s: float  # of the gyro
+
+
+def direction_up(steady: Steady, *, offline: bool) -> Up:
+    """Smooth accelerations; offline the mean of a low-pass from either end, never late.
+
+    After a gap that hides more than a few readings leave open, the mean of the first seconds starts the low-pass anew.
+    """
+    n, acceleration = len(steady.time_s), steady.acceleration_m_s2
+    smooth, sigma, fresh, hidden = np.empty((n, 3)), np.zeros(n), np.zeros(n, np.bool_), steady.hidden_rad2.copy()
+    gaps = _gaps(steady)
+    scatter = _scatter_rad(steady, gaps)
+    read = is_read(acceleration)
+    rest = steady.at_rest & read
+    smooth[0] = acceleration[rest].mean(axis=0) if rest.any() else acceleration[read][0]
+    begin, unknown = 0, UNKNOWN_RAD
+    for before, after, growth, turns in [*gaps, (n - 1, n, np.zeros(0), False)]:
+        piece = slice(begin, before + 1)
+        last = smooth[max(begin - 1, 0)]
+        smooth[piece], sigma[piece], fresh[piece] = _piece(steady, piece, last, unknown, scatter, offline)
+        smooth[before + 1 : after] = smooth[before]
+        sigma[before + 1 : after] = np.sqrt(sigma[before] ** 2 + HELD_VARIANCE * growth[: after - before - 1])
+        if after < n:
+            begin, unknown = after, math.hypot(sigma[before], math.sqrt(growth[-1]))
+            seen = float(angle(smooth[before], acceleration[after])) if turns and read[after] else 0.0
+            if seen > max(unknown, 3.0 * scatter[after]):
+                hidden[after] += seen**2 - unknown**2
+                unknown = seen
+        elif before < n - 1:
+            break
+    return Up(smooth / np.sqrt(np.einsum("ni,ni->n", smooth, smooth))[:, None], sigma, fresh, hidden)
+
+
+def _gaps(steady: Steady) -> list[tuple[int, int, FloatArray, bool]]:
+    """Gaps that matter: rows before and after, the variance at each row within and after, and whether the gyro's."""
+    time_s, found = steady.time_s, []
+    for before, after in steady.gaps:
+        growth = np.cumsum(steady.hidden_rad2[before + 1 : after + 1])
+        if growth[-1] > _LEAST_RAD**2:
+            found.append((int(before), int(after), growth, True))
+    for before, after in sensor_gaps(time_s, is_read(steady.acceleration_m_s2), LEAST_GAP_S):
+        if not any(a < after and before < b for a, b, *_ in found):
+            since = time_s[before + 1 : after + 1] - time_s[before]
+            found.append((int(before), int(after), np.square(steady.drift_rad_s * since), False))
+    return sorted(found, key=lambda one: one[0])
+
+
+def _scatter_rad(steady: Steady, gaps: list[tuple[int, int, FloatArray, bool]]) -> FloatArray:
+    """Angle (n,) by which one reading is off: that of accelerations nearby, and of all."""
+    from adcs.complementary.inertial_magnetic_compiled import window_scatter
+
+    begins = np.diff(numbered_windows(steady.time_s, _WINDOW_S), prepend=0) > 0
+    for before, after, *_ in gaps:
+        begins[[before + 1, min(after, len(begins) - 1)]] = True
+    window = np.cumsum(begins)
+    _, scatter, _ = window_scatter(steady.acceleration_m_s2, window)
+    scatter = np.where(np.isfinite(scatter), scatter, 0.0)
+    near = np.maximum(scatter, np.append(scatter[1:], 0.0))
+    return np.asarray(np.hypot(np.maximum(near, np.median(scatter)), _LEAST_M_S2)[window] / _GRAVITY_M_S2)
+
+
+def _piece(
+    steady: Steady, piece: slice, last: FloatArray, before_rad: float, scatter: FloatArray, offline: bool
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Smooth accelerations of some rows, σ of their direction, and which are fresh.
+
+    ``last`` is the smooth acceleration before them, and ``before_rad`` σ of its direction.
+    """
+    from adcs.complementary.inertial_magnetic_compiled import low_pass
+
+    values, dt_s = steady.acceleration_m_s2[piece], steady.dt_s[piece]
+    seen = np.flatnonzero(is_read(values))
+    age_s = steady.time_s[piece] - steady.time_s[piece][seen[0] if len(seen) else 0]
+    fresh = np.zeros(len(values), np.bool_)
+    if steady.at_rest[piece][0]:
+        start, sigma = last, np.zeros(len(values))
+    elif len(seen) == 0:
+        return np.broadcast_to(last, values.shape), np.full(len(values), before_rad), fresh
+    elif before_rad < _MUCH * scatter[piece][seen[0]]:
+        start, part = last, np.maximum(age_s, 0.0) / GRAVITY_TIME_S
+        sigma = before_rad * (1.0 + part) * np.exp(-part)
+    else:
+        fresh = age_s < GRAVITY_TIME_S
+        late = np.maximum(age_s - GRAVITY_TIME_S, 0.0) / GRAVITY_TIME_S
+        sigma = scatter[piece][seen[0]] / (1.0 + np.maximum(age_s, 0.0) / _MEAN_S) * np.exp(-late)
+        sigma[: seen[0]] = before_rad
+        counts = np.maximum(np.cumsum(is_read(values)), 1)[:, None]
+        means = np.nancumsum(values, axis=0) / counts
+        means[: seen[0]] = means[seen[0]]
+        start = means[fresh][-1]
+    smooth = low_pass(values, dt_s, GRAVITY_TIME_S, start)
+    if fresh.any():
+        k = np.count_nonzero(fresh)
+        smooth = np.concatenate([means[:k], low_pass(values[k:], dt_s[k:], GRAVITY_TIME_S, start)])
+    if offline and len(seen):
+        count = max(np.count_nonzero(age_s < 1.0), 1)
+        end = values[seen[-count:]].mean(axis=0)
+        steps = np.concatenate([dt_s[:1], dt_s[:0:-1]])
+        smooth = 0.5 * (smooth + low_pass(values[::-1].copy(), steps, GRAVITY_TIME_S, end)[::-1])
+    return smooth, sigma, fresh
