@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import adcs
 import arrays
-from adcs.cli.options import tell
+from adcs.cli.options import tell, warn
 from arrays.io.arguments import Flag
 from arrays.io.errors import naming
 from arrays.io.outputs import refuse_unwritable
@@ -65,8 +65,9 @@ def loads(
         own = adcs.find_own_fields(sensors, log.readings_T, log.time_s, log.gyro_rad_s, log.states, window_s=window_s)
     with naming(str(array)):
         located = own.located() if sensors.n_sensors >= _LEAST_SENSORS else {}
+    warn(common, own.warnings)
     if out is not None:
-        clean_nT = 1e9 * own.subtracted(log.readings_T, log.states)
+        clean_nT = 1e9 * own.subtracted(log.readings_T, log.states, log.time_s)
         write_columns(log.columns | dict(zip(channel_columns(sensors), clean_nT.T, strict=True)), out)
         tell(common, f"wrote {out}")
     print_result(report(own, located), lines(own, located), as_json=json)
@@ -93,7 +94,15 @@ def report(own: adcs.OwnFields, located: dict[str, Fix]) -> dict[str, Any]:
             entry["position_m"], entry["moment_Am2"] = best.position_m.tolist(), best.moment_Am2.tolist()
             entry["covariance"] = best.covariance.tolist()
         results.append(entry)
-    return {"results": results, "noise_nT": dict(zip(own.array.ids, (1e9 * own.noise_T).tolist(), strict=True))}
+    return {
+        "results": results,
+        "noise_nT": dict(zip(own.array.ids, (1e9 * own.noise_T).tolist(), strict=True)),
+        "chi2_per_dof": own.chi2_per_dof,
+        "lag_rows": own.lag.rows if own.lag.is_known else None,
+        "lag_bounds_rows": [own.lag.least_rows, own.lag.most_rows] if own.lag.is_known else None,
+        "lag_s": own.lag.seconds if own.lag.is_known else None,
+        "warnings": list(own.warnings),
+    }
 
 
 def lines(own: adcs.OwnFields, located: dict[str, Fix]) -> list[str]:
@@ -101,7 +110,11 @@ def lines(own: adcs.OwnFields, located: dict[str, Fix]) -> list[str]:
     import numpy as np
 
     noise = ", ".join(f"{name} {1e9 * one:.3g}" for name, one in zip(own.array.ids, own.noise_T, strict=True))
-    text = [f"noise that is left [nT]: {noise}"]
+    lag = f"{own.lag.rows:g} rows, {own.lag.seconds:.3g} s" if own.lag.is_known else "not told by these switches"
+    text = [
+        f"noise that is left [nT]: {noise}; χ² / numbers (1 is as stated): {own.chi2_per_dof:.3g}",
+        f"readings later than states by: {lag}",
+    ]
     for name, vectors, sigma, switches in zip(own.names, own.vectors_T, own.sigma_T, own.switches, strict=True):
         text.append(f"{name}: {switches} switches")
         for sensor, field, deviation in zip(own.array.ids, vectors, sigma, strict=True):

@@ -10,8 +10,8 @@ import numpy as np
 
 from adcs import quaternion
 from adcs.kalman.diagnostics import COLLINEAR, collinear_rows, unseen_torque_Nm, warnings_of
-from adcs.kalman.error_state import AttitudeTracks, FilterSettings, Start, sensor_set, tuned_noise
-from adcs.kalman.initialisation import any_start, first_told, vector_start
+from adcs.kalman.error_state import ALWAYS, AttitudeTracks, FilterSettings, Start, sensor_set, tuned_noise
+from adcs.kalman.initialisation import any_start, checked_start, first_told, vector_start
 from adcs.kalman.mekf import closed_loop_jacobian, run_filter, run_readable
 from adcs.kalman.names import FILTERS, Filter, StartKind
 from adcs.kalman.results import sigma_by_state
@@ -42,7 +42,8 @@ class EstimatorSettings:
     filter : str
         One of :data:`adcs.kalman.names.FILTERS`.
     start : str
-        One of :data:`adcs.kalman.names.STARTS`, for simulations; :func:`estimate` starts from any attitude.
+        One of :data:`adcs.kalman.names.STARTS`, for simulations; :func:`estimate` starts from any attitude. With a
+        magnetometer alone any other attitude is taken that explains the readings better.
     start_attitude_rad, start_rate_rad_s : float
         Standard deviations per axis of what it starts from.
     forgetting : float
@@ -206,7 +207,10 @@ def estimated(
         try:
             # What leaves double precision is not finite in the end, which is for the caller to tell.
             with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
-                first = start if isinstance(start, Start) else start(record, chosen.settings)
+                if isinstance(start, Start):
+                    first = checked_start(record, chosen.settings, start)
+                else:
+                    first = start(record, chosen.settings)
                 return _estimated(record, chosen, first)
         except np.linalg.LinAlgError:
             raise InputError(
@@ -219,6 +223,9 @@ def _estimated(record: Record, chosen: EstimatorSettings, start: Start) -> Attit
     settings = chosen.settings
     if chosen.filter == "constant-gain":
         return run_constant_gain(record, settings, start)
+    if chosen.filter in ("parallel-disturbance", "self-tuning"):
+        # Their disturbance is not that of the filter by which the start was found.
+        start = Start(start.q, start.w, start.covariance[:, :ALWAYS, :ALWAYS])
     if chosen.filter == "parallel-disturbance":
         return run_parallel(record, settings, start, forgetting=chosen.forgetting)
     if chosen.filter == "reduced":

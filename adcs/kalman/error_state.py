@@ -8,11 +8,11 @@ then reaches.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.special import chdtri
 
 from adcs.kalman.names import MEASURED_BY, TOGETHER, is_measured
@@ -321,11 +321,17 @@ class FilterSettings:
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """Where the filter starts; the optional states start from zero."""
+    """Estimates before the first reading; optional states are zero with the settings' deviations unless it has them."""
 
     q: FloatArray  # (runs, 4)
     w: FloatArray  # (runs, 3)
-    covariance: FloatArray  # (runs, 6, 6): of (δq, δω): δq is half of the angle
+    covariance: FloatArray  # (runs, 6, 6) of (δq, δω), δq being half of the angle, or (runs, N, N) of all states
+    optional: Mapping[str, FloatArray] = field(default_factory=dict)  # (runs, k), by name
+
+    def of_runs(self, runs: NDArray[np.intp]) -> Start:
+        """Return the start of some runs, each as often as its index comes."""
+        optional = {name: values[runs] for name, values in self.optional.items()}
+        return Start(self.q[runs], self.w[runs], self.covariance[runs], optional)
 
 
 def start_near(q: FloatArray, w: FloatArray, attitude_rad: float, rate_rad_s: float) -> Start:
@@ -336,6 +342,13 @@ def start_near(q: FloatArray, w: FloatArray, attitude_rad: float, rate_rad_s: fl
     """
     variance = np.repeat(np.square([0.5 * attitude_rad, rate_rad_s]), 3)
     return Start(np.array(q), np.array(w), np.tile(np.diag(variance), (len(q), 1, 1)))
+
+
+def joined_starts(starts: Sequence[Start]) -> Start:
+    """Return one start of the runs of several, which have the same optional states."""
+    q, w, covariance = (np.concatenate([getattr(one, of) for one in starts]) for of in ("q", "w", "covariance"))
+    names = starts[0].optional
+    return Start(q, w, covariance, {name: np.concatenate([one.optional[name] for one in starts]) for name in names})
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,21 +4,26 @@ A multiplicative filter that starts tens of degrees off may never find back: its
 the wrong place, and its covariance believes them. With a star tracker, or with two directions, the first readings fix
 the attitude (:func:`vector_start`, Wahba's problem, :func:`adcs.attitude_of_vectors`). With one
 direction, or two that nearly coincide, the turn about it stays open: then filters start at all turns and the one whose
-innovations are smallest is taken (:func:`any_start`).
+innovations are the most likely is taken (:func:`any_start`).
+
+A magnetometer alone leaves the rate about the field open too, and the torques. A filter that allows for any rate goes
+astray where the satellite is nearly at rest, and one that does not where it tumbles: both compete. Then all turns start
+again from the torques and the dipole that the best one ended with, as long as that explains the readings better.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adcs import quaternion
-from adcs.kalman.error_state import OPEN_RAD, RATE_RAD_S, FilterSettings, SensorSet, Start
+from adcs.kalman.error_state import OPEN_RAD, RATE_RAD_S, FilterSettings, SensorSet, Start, joined_starts
 from adcs.kalman.gate.contest import turned_onto
-from adcs.kalman.mekf import deviations, run_filter
+from adcs.kalman.mekf import deviations, run_filter, whole_start
 from adcs.quaternion import rotate_back
 from adcs.satellite.dynamics import absolute_rate
 from adcs.satellite.telemetry import Record, is_read, part
@@ -31,6 +36,12 @@ AGAIN = 10.0
 WINDOW_S, ALONE_S = 300.0, 3000.0
 """How much of a record tells which turn about the first direction is right, and with a magnetometer alone, for which
 the field must turn along the orbit."""
+RATES_ALONE = (1.0, 0.2, 0.04)
+"""Deviations of the rate that compete with a magnetometer alone, as parts of the largest: from tumbling to rest."""
+ROUNDS = 6
+"""How often a magnetometer alone starts again at most."""
+BETTER = 10.0
+"""Misfit by which a start must be better than the one before."""
 KNOWN_RAD = math.radians(75.0)
 """An attitude is known where no axis of its start has a larger standard deviation: 10° by the readings themselves."""
 
@@ -106,12 +117,22 @@ def largest_deviation_rad(start: Start) -> FloatArray:
     return 2.0 * np.sqrt(np.linalg.eigvalsh(start.covariance[:, :3, :3])[:, -1])
 
 
+class _Tried(NamedTuple):
+    """Start of one run, minus twice the log-likelihood of a window's readings, and optional states and P at its end."""
+
+    start: Start
+    misfit: float
+    optional: dict[str, FloatArray]
+    P: FloatArray
+
+
 def any_start(record: Record, settings: FilterSettings, turns: int = 36, rate_rad_s: float = RATE_RAD_S) -> Start:
     """Start from any attitude: :func:`vector_start`, and where it leaves a turn open the best of several hypotheses.
 
     ``turns``: hypotheses, at equal angles about the axis that is left open; :data:`WINDOW_S` or :data:`ALONE_S` of the
-    record decide between them. ``rate_rad_s``: as :func:`vector_start`. Returns: where a hypothesis was chosen, the
-    deviation about the open axis is the distance between hypotheses.
+    record decide between them. ``rate_rad_s``: as :func:`vector_start`; with a magnetometer alone smaller ones compete
+    too (:data:`RATES_ALONE`). Returns: where a hypothesis was chosen, the deviation about the open axis is the distance
+    between hypotheses; with a magnetometer alone the start has the optional states too.
     """
     start = vector_start(record, settings, rate_rad_s)
     open_runs = np.flatnonzero(largest_deviation_rad(start) > KNOWN_RAD)
@@ -121,23 +142,71 @@ def any_start(record: Record, settings: FilterSettings, turns: int = 36, rate_ra
     variances, axes = np.linalg.eigh(start.covariance[open_runs, :3, :3])
     if (2.0 * np.sqrt(variances[:, 1]) > KNOWN_RAD).any():
         raise ValueError("Input record must have a direction at the first instant of every run; one has none.")
-    used = settings.sensors
-    window_s = WINDOW_S if used.sun or used.gyro else ALONE_S
-    n = 1 + round(min(window_s / record.dt_s, record.momentum_Nms.shape[1] - 1))
     spacing = 2.0 * math.pi / turns
     angles = spacing * np.arange(turns)
-    q, w, covariance = start.q.copy(), start.w.copy(), start.covariance.copy()
-    # One run after the other: the covariances of all hypotheses are held.
+    chosen = [start.of_runs(np.array([run])) for run in range(len(start.q))]
     for run, across in zip(open_runs, axes, strict=True):
         repeated, axis = np.full(turns, run), across[:, 2]
         narrow = _narrowed(start, repeated, np.tile(axis, (turns, 1)), spacing)
         turned = quaternion.multiply(start.q[run], quaternion.exp(angles[:, None] * axis))
-        hypotheses = replace(narrow, q=turned)
-        # Without a gate: how badly a wrong turn fits is what tells it.
-        tried = run_filter(part(record, repeated, slice(n)), replace(settings, gate=0.0), hypotheses)
-        best = int(np.nansum(tried.nis, axis=(1, 2)).argmin())
-        q[run], w[run], covariance[run] = hypotheses.q[best], hypotheses.w[best], hypotheses.covariance[best]
-    return Start(q, w, covariance)
+        search = _likeliest_alone if settings.sensors.sensors == "mag" else _likeliest
+        chosen[run] = search(record, settings, replace(narrow, q=turned), repeated).start
+    return joined_starts(chosen)
+
+
+def checked_start(record: Record, settings: FilterSettings, start: Start) -> Start:
+    """Return a given start, and with a magnetometer alone :func:`any_start` where that explains the readings better.
+
+    Deviations of degrees and of a tenth of a degree a second are enough to lead such a filter astray: it learns of the
+    turn about the field late, by equations of motion that are linearised where it believes to be.
+    """
+    if settings.sensors.sensors != "mag":
+        return start
+    rivals = whole_start(settings, start), any_start(record, settings)
+    chosen = []
+    for run in range(len(start.q)):
+        only = np.array([run])
+        tried = [_likeliest(record, settings, rival.of_runs(only), only) for rival in rivals]
+        chosen.append(min(tried, key=lambda one: one.misfit).start)
+    return joined_starts(chosen)
+
+
+def _likeliest(record: Record, settings: FilterSettings, hypotheses: Start, runs: NDArray[np.intp]) -> _Tried:
+    """Likeliest hypothesis of one run, which comes as often as there are hypotheses."""
+    used = settings.sensors
+    window_s = WINDOW_S if used.sun or used.gyro else ALONE_S
+    n = 1 + round(min(window_s / record.dt_s, record.momentum_Nms.shape[1] - 1))
+    # Without a gate: how badly a wrong turn fits is what tells it.
+    tracks = run_filter(part(record, runs, slice(n)), replace(settings, gate=0.0), hypotheses)
+    misfit = np.nansum(tracks.nis + tracks.log_det, axis=(1, 2))
+    best = np.array([np.where(np.isfinite(misfit), misfit, np.inf).argmin()])
+    optional = {name: values[best, -1] for name, values in tracks.optional.items()}
+    return _Tried(hypotheses.of_runs(best), float(misfit[best[0]]), optional, tracks.covariance[best, -1])
+
+
+def _likeliest_alone(record: Record, settings: FilterSettings, hypotheses: Start, runs: NDArray[np.intp]) -> _Tried:
+    """The same with a magnetometer alone: by several deviations of the rate, and again from the torques so found."""
+    used, tried = settings.sensors, []
+    for share in RATES_ALONE:
+        covariance = hypotheses.covariance.copy()
+        covariance[:, 3:, 3:] *= share**2
+        rivals = whole_start(settings, replace(hypotheses, covariance=covariance))
+        tried.append((_likeliest(record, settings, rivals, runs), rivals))
+    best, rivals = min(tried, key=lambda one: one[0].misfit)
+    kept = settings.kept(record.dt_s)
+    lasting = [name for name in used.states if (kept[used.place(name)] == 1.0).all()]
+    places = np.concatenate([np.arange(0), *(np.arange(used.size)[used.place(name)] for name in lasting)])
+    block = np.ix_(np.arange(len(runs)), places, places)
+    for _ in range(ROUNDS if lasting else 0):
+        covariance = rivals.covariance.copy()
+        covariance[block] = AGAIN**2 * best.P[:, places[:, None], places]
+        found = {name: np.repeat(best.optional[name], len(runs), axis=0) for name in lasting}
+        rivals = replace(rivals, covariance=covariance, optional={**rivals.optional, **found})
+        again = _likeliest(record, settings, rivals, runs)
+        if not again.misfit < best.misfit - BETTER:
+            break
+        best = again
+    return best
 
 
 def _narrowed(start: Start, runs: NDArray[np.intp], axis: FloatArray, deviation_rad: float) -> Start:

@@ -31,9 +31,17 @@ def first_state(settings: FilterSettings, start: Start) -> State:
     """State before the first reading."""
     runs, size = len(start.q), settings.sensors.size
     P = np.zeros((runs, size, size))
-    P[:, :ALWAYS, :ALWAYS] = start.covariance
     P[:, range(ALWAYS, size), range(ALWAYS, size)] = settings.start_variance
-    return State(start.q, start.w, {state: np.zeros((runs, SIZES[state])) for state in settings.sensors.states}, P)
+    known = start.covariance.shape[-1]
+    P[:, :known, :known] = start.covariance
+    zero = {state: np.zeros((runs, SIZES[state])) for state in settings.sensors.states}
+    return State(start.q, start.w, {**zero, **start.optional}, P)
+
+
+def whole_start(settings: FilterSettings, start: Start) -> Start:
+    """Return a start that has the optional states too."""
+    state = first_state(settings, start)
+    return Start(state.q, state.w, state.P, state.optional)
 
 
 def known_torque_jacobian(record: Record, row: int, state: State) -> FloatArray:
@@ -339,8 +347,7 @@ def run_readable(
     tracks = []
     for run in range(len(start.q)):
         only = np.array([run])
-        begins = Start(start.q[only], start.w[only], start.covariance[only])
-        one = _Readable(part(record, only), settings, begins, jacobian)
+        one = _Readable(part(record, only), settings, start.of_runs(only), jacobian)
         states = [one.state_of(row) for row in range(record.momentum_Nms.shape[1])]
         tracks.append(collected(settings, states, one.nis, one.rejected, one.log_det))
     names = ("q", "w", "covariance", "nis", "rejected", "log_det")
@@ -372,7 +379,8 @@ def collected(
 def check_start(record: Record, start: Start) -> None:
     """Raise ValueError unless a start has as many runs as the record, and none of it is missing."""
     runs = record.momentum_Nms.shape[0]
-    for name, shape in (("q", (runs, 4)), ("w", (runs, 3)), ("covariance", (runs, ALWAYS, ALWAYS))):
+    size = ALWAYS + sum(SIZES[state] for state in start.optional)
+    for name, shape in (("q", (runs, 4)), ("w", (runs, 3)), ("covariance", (runs, size, size))):
         values = getattr(start, name)
         if values.shape != shape or not np.isfinite(values).all():
             raise ValueError(f"Input start.{name} must be finite with shape {shape}; instead received {values.shape}.")
@@ -400,6 +408,7 @@ def run_filter(record: Record, settings: FilterSettings, start: Start) -> Attitu
     q, w, optional = np.empty((runs, n, 4)), np.empty((runs, n, 3)), np.empty((runs, n, used.size - ALWAYS))
     covariance, (nis, log_det) = np.empty((runs, n, used.size, used.size)), np.full((2, runs, n, len(SENSORS)), np.nan)
     rejected = np.zeros(nis.shape, dtype=np.bool_)
+    own = np.concatenate([np.zeros((runs, 0)), *first.optional.values()], axis=1)
     readings = record.readings
     wheels = (record.momentum_Nms, record.wheel_torque_Nm, record.torquers_Am2)
     star = (readings.star, readings.star_whitening)
@@ -409,7 +418,7 @@ def run_filter(record: Record, settings: FilterSettings, start: Start) -> Attitu
         kernel.run,
         runs,
         kernel.Estimated(q, w, optional, covariance, nis, rejected, log_det),
-        kernel.First(np.ascontiguousarray(first.q), np.ascontiguousarray(first.w), first.P),
+        kernel.First(np.ascontiguousarray(first.q), np.ascontiguousarray(first.w), own, first.P),
         dynamics_compiled.Body.of(record.satellite.body),
         # One layout in memory, for which the kernel is compiled.
         kernel.Record(*(np.ascontiguousarray(values, dtype=np.float64) for values in (*wheels, *read))),

@@ -49,10 +49,11 @@ class Estimated(NamedTuple):
 
 
 class First(NamedTuple):
-    """Attitude (R, 4), rate (R, 3) and covariance (R, N, N) before the first reading."""
+    """Attitude (R, 4), rate (R, 3), optional states (R, N - 6) and covariance (R, N, N) before the first reading."""
 
     q: Array
     w: Array
+    optional: Array
     P: Array
 
 
@@ -405,6 +406,9 @@ def run(
     for run in range(begin, end):
         main.x[:] = 0.0
         main.x[:4], main.x[4:7], main.P[:] = first.q[run], first.w[run], first.P[run]
+        for k in range(K):
+            for j in range(3 if settings.firsts[k] >= 0 else 0):
+                main.x[7 + 3 * k + j] = first.optional[run, settings.firsts[k] - 6 + j]
         gate.reset(contest)
         for i in range(n_rows):
             if i > 0:

@@ -9,16 +9,21 @@ with the states s_k of the loads, the field V_k of each there and an offset o. T
 switches make one regression for V. No model of the ambient field enters, nor an attitude, and V_k has the errors of
 gain and axes that the readings have: it is what must be subtracted of them. Where a load is, and what its moment is,
 tells a dipole that is fitted to its fields at all magnetometers.
+
+States may be of another clock than readings. How much later the field changes than the states is found first, from
+what the readings jump by between two rows: the lag in whole rows at which jumps and switches explain each other best.
+Then the rows beside the switches are left out if they fit neither state: the lag is between two rows.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import chdtri
 
 from adcs import quaternion
 from arrays.array import SensorArray
@@ -39,8 +44,70 @@ _AMBIENT_T = 30e-6
 _PRIOR_T = 100e-6
 """Standard deviation of a component of V and o beforehand: what the readings do not tell stays there."""
 _UNKNOWN = 0.5
+LONGEST_LAG_S = 30.0
+"""Between states and readings, looked for both ways."""
+_Fitted = tuple[FloatArray, FloatArray, FloatArray, int]
+_FALSE_ALARM, _MISFIT = 1e-6, 2.0
 _OTHERS = 12
 """Numbers of each magnetometer that the regression finds besides: its offset, and nine errors of gains and axes."""
+
+
+@dataclass(frozen=True)
+class Lag:
+    """Time by which the field changes later than the states.
+
+    Attributes
+    ----------
+    least_rows, most_rows : int
+        Bounds in rows, equal unless the lag is between two rows; both 0 where the readings do not tell.
+    step_s : float
+        Median time from row to row.
+    is_known : bool
+        Whether the readings tell it.
+    """
+
+    least_rows: int
+    most_rows: int
+    step_s: float
+    is_known: bool
+
+    @property
+    def rows(self) -> float:
+        """Lag in rows."""
+        return 0.5 * (self.least_rows + self.most_rows)
+
+    @property
+    def seconds(self) -> float:
+        """Lag in seconds; negative where the field changes earlier than the states."""
+        return self.rows * self.step_s
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Return what a user must know of it."""
+        if not self.is_known:
+            return (
+                "the switches do not tell whether states and readings are of one clock: they are too few, too alike or "
+                "too weak; the fields are wrong if the states are a row early or late",
+            )
+        if self.least_rows == self.most_rows == 0:
+            return ()
+        least, most = sorted(abs(rows) for rows in (self.least_rows, self.most_rows))
+        by = f"{most} row{'s' * (most != 1)}" if least == most and self.rows else f"{least} to {most} rows"
+        way = "later" if self.rows > 0.0 else "earlier" if self.rows < 0.0 else "earlier or later"
+        return (
+            f"states and readings are not of one clock: the field changes {by} ({abs(self.seconds):.3g} s) {way} than "
+            "the states; the fields are corrected for it",
+        )
+
+    def delayed(self, time_s: FloatArray, s: FloatArray) -> FloatArray:
+        """Return the states (n, K) that act at the rows; NaN where a state changes within the bounds."""
+        tolerance = 1e-3 * self.step_s
+        first = np.searchsorted(time_s, time_s - self.most_rows * self.step_s + tolerance, side="right") - 1
+        last = np.searchsorted(time_s, time_s - self.least_rows * self.step_s - tolerance)
+        inside = (first >= 0) & (last < len(s))
+        changes = np.concatenate([[0], np.cumsum((np.diff(s, axis=0) != 0.0).any(axis=1))])
+        first, last = np.maximum(first, 0), np.minimum(last, len(s) - 1)
+        return np.where((inside & (changes[first] == changes[last]))[:, None], s[last], np.nan)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +128,10 @@ class OwnFields:
         How often the state of each load changed.
     noise_T : ndarray, shape (M,)
         Standard deviation of a component of what the regression leaves.
+    chi2_per_dof : float
+        Mean square of that over the noise that the array states; 1 where all is as stated.
+    lag : Lag
+        Between states and readings, which the fields are corrected for.
 
     Examples
     --------
@@ -78,8 +149,23 @@ class OwnFields:
     sigma_T: FloatArray
     switches: NDArray[np.int64]
     noise_T: FloatArray
+    chi2_per_dof: float
+    lag: Lag
 
-    def subtracted(self, readings_T: ArrayLike, states: Mapping[str, ArrayLike]) -> FloatArray:
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Return what makes the fields doubtful, or was corrected."""
+        texts = self.lag.warnings
+        if self.chi2_per_dof > _MISFIT:
+            texts += (
+                f"χ² per number is {self.chi2_per_dof:.1f}: the noise is larger than the array states, a load is not "
+                "in the log, or the states of one have a clock of their own; the deviations are those of what is left",
+            )
+        return texts
+
+    def subtracted(
+        self, readings_T: ArrayLike, states: Mapping[str, ArrayLike], time_s: ArrayLike | None = None
+    ) -> FloatArray:
         """Readings (n, C) without what the loads add to them.
 
         Parameters
@@ -88,8 +174,12 @@ class OwnFields:
             Of the array's channels.
         states : mapping of str to array_like, shape (n,)
             Of each load at each row.
+        time_s : array_like, shape (n,), optional
+            Of the rows, which a lag needs; by default equal steps. A row is NaN where the lag leaves a state open.
         """
         s = _states(states, self.names, len(np.asarray(readings_T)))
+        times = np.asarray(self.lag.step_s * np.arange(len(s)) if time_s is None else time_s, dtype=np.float64)
+        s = self.lag.delayed(times, s)
         fields = np.einsum("nk,kmi->nmi", s, self.vectors_T)
         return np.asarray(readings_T) - self.array.readings_of(fields) + self.array.channel_offset_T
 
@@ -182,19 +272,9 @@ def find_own_fields(
     fields = array.calibrated_field(readings)
     used: BoolArray = np.isfinite(np.concatenate([readings, gyro], axis=1)).all(axis=1)
     turns = _turns(times, gyro)
-    windows = _windows(times, s, used, window_s)
-    if 3 * sum(len(rows) - _DEGREE - 1 for rows in windows) <= 3 * len(names) + _OTHERS:
-        raise ValueError(
-            f"Input states must change where there are readings; instead received {len(windows)} switches."
-        )
-    D = [_attitudes(turns, rows) for rows in windows]
-    vectors = np.zeros((len(names), array.n_sensors, 3))
-    for _ in range(2):
-        # The second time without the steps, of which the gains' errors would take a hundredth for the ambient field's.
-        ambient = np.mean(fields - np.einsum("nk,kmi->nmi", s, vectors), axis=1)
-        vectors, deviations, noise = _regression(
-            [_projected(times[i], R, s[i], fields[i], ambient[i]) for i, R in zip(windows, D, strict=True)], len(names)
-        )
+    whole = _whole_lag(times, fields, turns, s)
+    lag, fit = _lag_between_rows(whole, lambda lag: _fit(times, lag.delayed(times, s), fields, used, turns, window_s))
+    vectors, deviations, noise, _ = fit
     for name, deviation in zip(names, deviations, strict=True):
         if deviation.max() > _UNKNOWN * _PRIOR_T:
             raise ValueError(
@@ -202,7 +282,76 @@ def find_own_fields(
                 f"{name}, whose field the readings do not tell."
             )
     switches = np.sum(np.diff(s, axis=0) != 0.0, axis=0)
-    return OwnFields(names, array, vectors, deviations, switches, noise)
+    stated = np.mean(array.channel_noise_T.reshape(-1, 3) ** 2, axis=1)
+    return OwnFields(names, array, vectors, deviations, switches, noise, float(np.mean(noise**2 / stated)), lag)
+
+
+def _fit(
+    times: FloatArray, s: FloatArray, fields: FloatArray, used: BoolArray, turns: FloatArray, window_s: float
+) -> _Fitted:
+    """Fields, deviations, noise and degrees of freedom by all switches of states (n, K), NaN where not known."""
+    known = np.flatnonzero(np.isfinite(s).all(axis=1))
+    windows = [known[rows] for rows in _windows(times[known], s[known], used[known], window_s)]
+    if 3 * sum(len(rows) - _DEGREE - 1 for rows in windows) <= 3 * s.shape[1] + _OTHERS:
+        raise ValueError(
+            f"Input states must change where there are readings; instead received {len(windows)} switches."
+        )
+    D = [_attitudes(turns, rows) for rows in windows]
+    fitted = np.zeros((s.shape[1], fields.shape[1], 3)), np.zeros(0), np.zeros(0), 0
+    for _ in range(2):
+        # The second time without the steps, of which the gains' errors would take a hundredth for the ambient field's.
+        ambient = np.mean(fields - np.einsum("nk,kmi->nmi", s, fitted[0]), axis=1)
+        fitted = _regression(
+            [_projected(times[i], R, s[i], fields[i], ambient[i]) for i, R in zip(windows, D, strict=True)], s.shape[1]
+        )
+    return fitted
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def _whole_lag(times: FloatArray, fields: FloatArray, turns: FloatArray, s: FloatArray) -> Lag:
+    """Lag in whole rows at which switches explain most of what the fields jump by between two rows."""
+    steps, changes = np.diff(times), np.diff(s, axis=0)
+    step_s, switches = float(np.median(steps)), np.flatnonzero((changes != 0.0).any(axis=1))
+    jumps = np.einsum("nij,nmj->nmi", quaternion.matrix(turns[1:]), fields[1:]) - fields[:-1]
+    # Less what the steps before and after lead to expect, in deviations.
+    slopes = (jumps[:-2] + jumps[2:]) / (steps[:-2] + steps[2:])[:, None, None]
+    jumps = (jumps[1:-1] - steps[1:-1, None, None] * slopes).reshape(len(slopes), 3 * fields.shape[1])
+    jumps = jumps[:, np.isfinite(jumps).any(axis=0)]
+    if not jumps.size:
+        return Lag(0, 0, step_s, is_known=False)
+    jumps /= np.maximum(1.4826 * np.nanmedian(np.abs(jumps), axis=0), 1e-12)
+    lags = np.arange(-int(LONGEST_LAG_S / step_s), int(LONGEST_LAG_S / step_s) + 1)
+    explained = np.zeros(len(lags))
+    for place, lag in enumerate(lags):
+        rows = np.searchsorted(times, 0.5 * (times[switches] + times[switches + 1]) + lag * step_s) - 2
+        there = (rows >= 0) & (rows < len(jumps))
+        there[there] = np.isfinite(jumps[rows[there]]).all(axis=1)
+        A, y = changes[switches[there]], jumps[rows[there]]
+        across = A.T @ y
+        explained[place] = np.sum(across * (np.linalg.pinv(A.T @ A) @ across))
+    limit = chdtri(jumps.shape[1] * s.shape[1], _FALSE_ALARM / len(lags))
+    alike = lags[explained >= explained.max(initial=0.0) - limit]
+    best = 0 if not alike.size or 0 in alike else int(lags[np.argmax(explained)])
+    is_known = bool(explained.max(initial=0.0) > limit and (np.abs(alike - best) <= 1).all())
+    return Lag(best if is_known else 0, best if is_known else 0, step_s, is_known)
+
+
+def _lag_between_rows(whole: Lag, fit: Callable[[Lag], _Fitted]) -> tuple[Lag, _Fitted]:
+    """Narrowest bounds about a lag in whole rows within which no row beside the switches contradicts, and their fit."""
+    first = fit(whole)
+    if not whole.is_known:
+        return whole, first
+    wide = replace(whole, least_rows=whole.least_rows - 1, most_rows=whole.most_rows + 1)
+    try:
+        without = fit(wide)
+    except ValueError:
+        return whole, first
+    for lag in (whole, replace(whole, least_rows=wide.least_rows), replace(whole, most_rows=wide.most_rows)):
+        fitted = first if lag is whole else fit(lag)
+        numbers = len(fitted[2]) * max(fitted[3] - without[3], 1)
+        if np.sum((fitted[3] * fitted[2] ** 2) / without[2] ** 2 - without[3]) <= chdtri(numbers, _FALSE_ALARM):
+            return lag, fitted
+    return wide, without
 
 
 def _states(states: Mapping[str, ArrayLike], names: tuple[str, ...], n: int) -> FloatArray:
@@ -282,10 +431,11 @@ def _inverse(normal: FloatArray) -> FloatArray:
     return np.asarray(root @ root.T)
 
 
-def _regression(
-    windows: Sequence[tuple[FloatArray, FloatArray]], loads: int
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Fields (K, M, 3) of the loads, deviations and noise (M,), by M least squares of one design and a weak prior."""
+def _regression(windows: Sequence[tuple[FloatArray, FloatArray]], loads: int) -> _Fitted:
+    """Fields (K, M, 3) of the loads, deviations, noise (M,) and degrees of freedom of each of M least squares.
+
+    They have one design and a weak prior.
+    """
     A, y = (np.concatenate(parts) for parts in zip(*windows, strict=True))
     dof = len(A) - 3 * (_DEGREE + 1) * len(windows) - A.shape[1]
     normal = A.T @ A
@@ -297,4 +447,4 @@ def _regression(
         noise = np.sqrt(np.sum((y - A @ x) ** 2, axis=0) / dof)
     sigma = np.stack([one * np.sqrt(np.diagonal(of_one)) for one, of_one in zip(noise, inverse, strict=True)], axis=1)
     fields, deviations = (v[: 3 * loads].reshape(loads, 3, -1).transpose(0, 2, 1) for v in (x, sigma))
-    return fields, deviations, noise
+    return fields, deviations, noise, dof

@@ -42,6 +42,22 @@ class TestResult:
         quiet = np.array([[float(row[f"{name}_nT"]) for name in flight.array.channel_names] for row in rows])
         assert np.abs(quiet - 1e9 * flight.quiet_T).max() < 2e9 * NOISE_T
 
+        assert (found["lag_rows"], found["lag_s"], found["lag_bounds_rows"]) == (0.0, 0.0, [0, 0])
+        assert 0.8 < found["chi2_per_dof"] < 1.2
+        assert found["warnings"] == []
+
+    def test_states_of_another_clock(self, adcs, files, flight):
+        """The states two rows early: said, corrected, and in the JSON."""
+        early = {name: np.append(flight.states[name][2:], [flight.states[name][-1]] * 2) for name in LOADS}
+        write_columns(flight.columns | early, files[1])
+        outcome = adcs(*files, "--json")
+        found = json.loads(outcome.out)
+        assert (found["lag_rows"], found["lag_s"]) == (2.0, 2.0)
+        assert "not of one clock: the field changes 2 rows (2 s) later" in outcome.err
+        assert found["warnings"][0] in outcome.err
+        for entry, fields in zip(found["results"], flight.fields_T, strict=True):
+            np.testing.assert_allclose(entry["field_nT"]["m1"], 1e9 * fields[0], atol=1e9 * NOISE_T)
+
     def test_text_of_one_load(self, adcs, files):
         out = adcs(*files, "--loads", "radio").out
         assert "radio: " in out

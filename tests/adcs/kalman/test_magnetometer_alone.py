@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 
 from adcs import quaternion
-from adcs.kalman.initialisation import any_start, vector_start
+from adcs.kalman.error_state import start_near
+from adcs.kalman.initialisation import any_start, checked_start, vector_start
 from adcs.kalman.mekf import run_filter
 from adcs.satellite.dynamics import absolute_rate
 from magloc.chi_square import normalised_square
 from sims.attitude.simulation import AttitudeRuns, prepare, simulate
-from sims.experiments.accuracy import error_norm_deg
+from sims.experiments.accuracy import error_norm_deg, normalised_error_squared
 from tests.adcs.attitudes import random_attitudes
-from tests.adcs.filter_runs import ANY_START, followed, settings, tabletsat
+from tests.adcs.filter_runs import ANY_START, followed, settings, start_of, tabletsat
 
 STATES = ("dipole",)
 SCENARIO = replace(tabletsat(12_000.0), conditions=ANY_START, torque_Nm=0.0, dipole_Am2=(0.0, 0.05, 0.02))
@@ -48,6 +49,42 @@ class TestFromNothing:
         rate = math.radians(0.2) * rng.standard_normal((n, 3))
         w = absolute_rate(q, rate, prepared.environment.orbital_rate_rad_s[:, 0])
         self.check(followed(replace(prepared, q=q, w=w)), 0.95)
+
+
+class TestUnknownTorque:
+    """A torque of 8e-7 N·m and a dipole that nobody knows, which lead a filter astray within the first orbit."""
+
+    STATES = ("disturbance", "dipole")
+
+    def check(self, seeds: range) -> None:
+        """Last minute of every run, and NEES of all states over the second orbits, which correlate over an orbit."""
+        chosen = settings("mag", self.STATES)
+        runs = simulate(replace(SCENARIO, torque_Nm=8e-7), seeds)
+        given = start_of(runs)
+        tracks = run_filter(runs, chosen, checked_start(runs, chosen, given))
+        assert error_norm_deg(runs, tracks)[:, -60:].max() < 0.2
+        assert 0.2 < np.mean(normalised_error_squared(runs, tracks)[:, 6000:] / chosen.sensors.size) < 1.6
+
+    def test_one_run(self) -> None:
+        self.check(range(772, 773))
+
+    @pytest.mark.slow
+    def test_ten_runs(self) -> None:
+        self.check(range(900, 910))
+
+
+class TestCheckedStart:
+    def test_a_start_that_is_right_is_taken(self) -> None:
+        runs = simulate(replace(SCENARIO, duration_s=1500.0), range(1))
+        right = start_near(runs.q[:, 0], runs.w[:, 0], math.radians(0.01), math.radians(1e-4))
+        taken = checked_start(runs, settings("mag", STATES), right)
+        np.testing.assert_array_equal(taken.q, right.q)
+        np.testing.assert_array_equal(taken.covariance[:, :6, :6], right.covariance)
+
+    def test_other_sensors_start_where_they_are_told(self) -> None:
+        runs = simulate(replace(SCENARIO, duration_s=5.0), range(1))
+        given = start_of(runs)
+        assert checked_start(runs, settings("mag+sun", STATES), given) is given
 
 
 class TestStart:

@@ -43,6 +43,7 @@ from adcs.kalman.mekf import (
     residuals,
     run_filter,
     run_readable,
+    whole_start,
     with_error,
 )
 from adcs.kalman.smoother import difference
@@ -266,6 +267,20 @@ class TestCompiledTwin:
         by_deviations = slow.sigma[..., :, None] * slow.sigma[..., None, :]
         np.testing.assert_allclose(fast.covariance / by_deviations, slow.covariance / by_deviations, rtol=0, atol=1e-9)
         np.testing.assert_allclose(fast.nis, slow.nis, rtol=1e-7, atol=1e-7)
+
+    def test_agrees_from_a_start_of_all_states(self) -> None:
+        chosen = settings("mag+sun", ["disturbance", "dipole"])
+        runs, start = runs_for(chosen.sensors, 40.0, range(2))
+        rng = np.random.default_rng(8)
+        own = {name: size * rng.standard_normal((2, 3)) for name, size in (("disturbance", 1e-6), ("dipole", 0.05))}
+        whole = whole_start(chosen, start)
+        whole = replace(whole, covariance=0.1 * whole.covariance, optional=own)
+        fast, slow = run_filter(runs, chosen, whole), run_readable(runs, chosen, whole)
+        np.testing.assert_allclose(fast.q, slow.q, rtol=0, atol=1e-13)
+        for name in own:
+            np.testing.assert_allclose(fast.optional[name], slow.optional[name], rtol=1e-9, atol=1e-15)
+            # One instant tells almost nothing of them.
+            np.testing.assert_allclose(fast.optional[name][:, 0], own[name], rtol=0.05, atol=1e-9)
 
     def test_runs_do_not_depend_on_each_other(self) -> None:
         chosen = settings("mag+sun+gyro", ["gyro-bias"])

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from adcs.kalman.error_state import FilterSettings, ProcessNoise, sensor_set, start_near
 from adcs.kalman.mekf import run_filter
-from adcs.satellite.own_fields import WINDOW_S, OwnFields, _windows, find_own_fields
+from adcs.satellite.own_fields import WINDOW_S, Lag, OwnFields, _windows, find_own_fields
 from sims.attitude.simulation import start_estimates
 from sims.experiments import accuracy
 from sims.experiments.loads import LOADS, NOISE_T, LoadsRun, switching_loads
@@ -70,6 +70,80 @@ class TestFields:
         readings[100:400, 5] = np.nan
         error = found(flown, readings).vectors_T - flown.fields_T
         assert np.abs(error).max() < 2.0 * NOISE_T
+
+
+def early(run: LoadsRun, rows: int, also_one_more: float = 0.0) -> LoadsRun:
+    """The run with its states some rows before the field, of a share of the switches one more."""
+    rng, states = np.random.default_rng(4), {}
+    for name, values in run.states.items():
+        shifted = np.full(len(values), values[0])
+        for switch in np.flatnonzero(np.diff(values)) + 1:
+            shifted[max(switch - rows - int(rng.random() < also_one_more), 0) :] = values[switch]
+        states[name] = shifted
+    return replace(run, states=states)
+
+
+class TestLag:
+    @pytest.mark.parametrize("rows", [-9, -1, 1, 3, 20])
+    def test_whole_rows(self, rows: int) -> None:
+        """Fields within 4.5 σ (false-alarm rate 2e-4), with the lag and a word on it."""
+        run = switching_loads(seed=20, duration_s=600.0, rate_deg_s=2.0)
+        own = found(early(run, rows))
+        assert (own.lag.least_rows, own.lag.most_rows, own.lag.seconds) == (rows, rows, float(rows))
+        assert np.abs((own.vectors_T - run.fields_T) / own.sigma_T).max() < 4.5
+        assert own.chi2_per_dof < 1.3
+        assert ("later" if rows > 0 else "earlier") in own.warnings[0]
+        rest = own.subtracted(run.readings_T, early(run, rows).states) - run.quiet_T
+        assert np.nanmax(np.abs(rest)) < 3.0 * NOISE_T
+        assert np.isnan(rest).any(axis=1).sum() == abs(rows)  # whose state was before the log, or comes after it
+
+    @pytest.mark.parametrize(("rows", "share"), [(0, 0.4), (-3, 0.5), (2, 0.2)])
+    def test_between_two_rows(self, rows: int, share: float) -> None:
+        run = switching_loads(seed=21, duration_s=900.0)
+        own = found(early(run, rows, share))
+        assert (own.lag.least_rows, own.lag.most_rows) == (rows, rows + 1)
+        assert np.abs((own.vectors_T - run.fields_T) / own.sigma_T).max() < 4.5
+
+    @pytest.mark.slow_after(1)
+    def test_none_is_claimed_of_one_clock(self) -> None:
+        """False-alarm rate below 1e-5 a log."""
+        for seed in range(30, 42):
+            own = found(switching_loads(seed, duration_s=200.0 + 50.0 * (seed % 5), rate_deg_s=(0.4, 8.0)[seed % 2]))
+            assert own.lag.is_known
+            assert own.lag.least_rows == own.lag.most_rows == 0
+            assert own.warnings == ()
+
+    def test_rows_are_missing(self) -> None:
+        """A clock is off by seconds, not by rows."""
+        run = early(switching_loads(seed=22, duration_s=900.0), -4)
+        rows = np.flatnonzero(np.random.default_rng(1).random(len(run.time_s)) < 0.85)
+        states = {name: values[rows] for name, values in run.states.items()}
+        own = find_own_fields(run.array, run.readings_T[rows], run.time_s[rows], run.gyro_rad_s[rows], states)
+        assert own.lag.seconds == -4.0
+        assert np.abs((own.vectors_T - run.fields_T) / own.sigma_T).max() < 4.5
+
+    def test_says_that_it_cannot_be_told(self, flown: LoadsRun) -> None:
+        own = found(early(flown, 1), flown.quiet_T)
+        assert not own.lag.is_known
+        assert "do not tell" in own.warnings[0]
+
+    def test_a_clock_of_one_load_is_a_misfit(self, flown: LoadsRun) -> None:
+        states = dict(flown.states) | {"heater": early(flown, 3).states["heater"]}
+        own = find_own_fields(flown.array, flown.readings_T, flown.time_s, flown.gyro_rad_s, states)
+        assert "clock of their own" in own.warnings[-1]
+
+    @given(st.integers(0, 10_000), st.integers(-5, 5), st.integers(0, 2))
+    def test_states_within_the_bounds(self, seed: int, least: int, width: int) -> None:
+        """As every row's window of states says, of equal steps."""
+        rng = np.random.default_rng(seed)
+        n, step_s = int(rng.integers(3, 40)), float(rng.choice([0.02, 0.3, 7.0]))
+        s = np.cumsum(rng.random((n, 2)) < 0.1, axis=0) % 2.0
+        delayed = Lag(least, least + width, step_s, is_known=True).delayed(step_s * np.arange(n), s)
+        for row in range(n):
+            window = s[max(row - least - width, 0) : max(row - least + 1, 0)]
+            # Strictly between two rows there is none of its own, and both beside it count.
+            whole = row - least - width >= 0 and row - least < n and (window == window[0]).all()
+            np.testing.assert_array_equal(delayed[row], s[row - least] if whole else [np.nan, np.nan])
 
 
 class TestPlaces:
