@@ -7,6 +7,7 @@ a neighbourhood, not of the picture.
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from io import BytesIO
@@ -79,14 +80,20 @@ def read_picture(path: str | PathLike[str]) -> FloatArray:
     from PIL import Image
 
     try:
-        with Image.open(BytesIO(data)) as opened:
-            if opened.width * opened.height > _MOST_PIXELS:
-                raise InputError(f"{path}: found {opened.width} × {opened.height} pixels, expected 10⁸ at most.")
-            values = np.asarray(opened)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of a decoder's own
+            with Image.open(BytesIO(data)) as opened:
+                if opened.width * opened.height > _MOST_PIXELS:
+                    raise InputError(f"{path}: found {opened.width} × {opened.height} pixels, expected 10⁸ at most.")
+                values = np.asarray(opened)
     except InputError:
         raise
-    except Exception as error:  # whatever the decoder makes of a file that is none
-        raise InputError(f"{path}: found no picture that can be read ({error}).") from None
+    except Image.DecompressionBombError:
+        raise InputError(f"{path}: found too many pixels, expected 10⁸ at most.") from None
+    except Exception:  # whatever the decoder makes of a file that is none
+        raise InputError(
+            f"{path}: found no picture that can be read, expected a whole PNG, TIFF or JPEG file of 8 or 16 bits."
+        ) from None
     if values.ndim == 3:
         values = values[..., : 3 if values.shape[2] > 2 else 1].mean(axis=2)
     return _checked(path, values)
@@ -106,8 +113,9 @@ def _fits(path: str | PathLike[str], data: bytes) -> FloatArray:
         kind = np.dtype(_FITS_TYPES[int(header["BITPIX"])])
         width, height = int(header["NAXIS1"]), int(header["NAXIS2"])
         values = np.frombuffer(data, kind, width * height, start).reshape(height, width)
-        scaled = float(header.get("BSCALE", 1.0)) * values + float(header.get("BZERO", 0.0))
-    except (KeyError, ValueError):
+        with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is refused
+            scaled = float(header.get("BSCALE", 1.0)) * values + float(header.get("BZERO", 0.0))
+    except (KeyError, OverflowError, ValueError):
         raise InputError(
             f"{path}: found no image in two dimensions, expected one as the first of a FITS file."
         ) from None
