@@ -25,7 +25,7 @@ STANDARD_INPUT = "-"
 KINDS = "-, tcp://HOST:PORT, udp://HOST:PORT, serial:DEVICE@BAUD or replay:FILE"
 """Of addresses."""
 _CHUNK = 65536
-_ALL_THAT_WAITS = 2**22  # bytes of a connection
+_ALL_THAT_WAITS = 2**20  # bytes of a connection, read at once
 _DATAGRAMS = 10_000  # read at once: more would keep what was read from being handed out
 _PAUSE_S = 0.002  # before senders of nothing but what is no row are heard: a flood must not take the whole processor
 LONGEST_LINE = 2**20
@@ -186,9 +186,11 @@ def _of_udp(own: socket.socket, senders: Senders) -> Iterator[Batch]:
 
 def _receive(own: socket.socket, senders: Senders) -> None:
     """Take in the datagrams that wait."""
+    buffer = bytearray(_CHUNK)  # one for all: bytes that are shortened afterwards leave holes in the memory
     with suppress(BlockingIOError):
         for _ in range(_DATAGRAMS):
-            senders.put(*own.recvfrom(_CHUNK))
+            size, sender = own.recvfrom_into(buffer)
+            senders.put(bytes(buffer[:size]), sender)
 
 
 def _of_serial(port: serial.Serial) -> Iterator[bytes]:  # type: ignore[name-defined]  # noqa: F821 - an extra

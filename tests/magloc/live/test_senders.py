@@ -13,7 +13,7 @@ from magloc.live.senders import Senders
 from tests.live_flood import KINDS, flooded
 
 DATAGRAMS = st.lists(
-    st.tuples(st.sampled_from([b"a", b"a\n", b"a\nb", b"\n\n", b"a\n" * 200]), st.integers(0, 5)), max_size=60
+    st.tuples(st.sampled_from([b"a", b"a\n", b"a\nb", b"\n\n", b"", b"a\n" * 20]), st.integers(0, 5)), max_size=28
 )
 
 
@@ -70,6 +70,13 @@ class TestTurns:
 
 
 class TestBounds:
+    def test_empty_datagrams_are_bounded_too(self) -> None:
+        senders = Senders()
+        for _ in range(5000):
+            senders.put(b"", "one")
+        assert len(senders.take().lines) + senders._dropped < 5000
+        assert sum(len(q.datagrams) for queues in senders._waiting for q in queues.values()) < 100
+
     @pytest.mark.parametrize("senders_of_all", [1, 64, 1000])
     def test_the_newest_are_kept_and_the_rest_is_counted(self, senders_of_all: int) -> None:
         senders, size, n = Senders(), 10_000, 3000
