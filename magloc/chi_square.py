@@ -8,9 +8,10 @@ from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.special import chdtri, chndtr, chndtrinc
 
+from arrays.io.csv import Column
 from arrays.typing import FloatArray
 from magloc.levels import CONSISTENCY, FALSE_ALARM
 
@@ -22,6 +23,20 @@ def mean_bounds(degrees_of_freedom: int, level: float = CONSISTENCY) -> tuple[fl
     tail = 0.5 * (1.0 - level)
     low, high = chdtri(degrees_of_freedom, 1.0 - tail), chdtri(degrees_of_freedom, tail)
     return float(low) / degrees_of_freedom, float(high) / degrees_of_freedom
+
+
+def bounds99(degrees_of_freedom: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Two-sided 99 % bounds of χ² over its degrees of freedom; NaN where there are none."""
+    dof = np.asarray(degrees_of_freedom, dtype=np.float64)
+    known = np.where(dof > 0.0, dof, np.nan)
+    return chdtri(known, 0.995) / known, chdtri(known, 0.005) / known
+
+
+def square_columns(name: str, square: FloatArray, dof: NDArray[np.int64]) -> dict[str, Column]:
+    """Columns of a normalised square, its degrees of freedom, and its 99 % bounds."""
+    low, high = bounds99(dof)
+    prefix = "" if name == "chi2" else f"{name}_"
+    return {name: square, f"{prefix}dof": dof, f"{name}_low99": low * dof, f"{name}_high99": high * dof}
 
 
 def normalised_square(error: FloatArray, covariance: FloatArray) -> FloatArray:

@@ -287,8 +287,8 @@ class Sgp4Orbit:
     def position_velocity_eci(self, utc: Instants) -> tuple[FloatArray, FloatArray]:
         """Position [m] and velocity [m/s] in eci, as :meth:`position_velocity_teme`."""
         utc = instants(utc)
-        rotation = R_eci_from_teme(utc)
         position, velocity = self.position_velocity_teme(utc)
+        rotation = R_eci_from_teme(utc)
         return turned(rotation, position), turned(rotation, velocity)
 
 

@@ -44,8 +44,8 @@ def read_frame(path: str | PathLike[str], camera: Camera = Camera()) -> ByteArra
         raise InputError(f"{path}: found far too many pixels, expected {_size_of(camera)}.") from None
     except InputError:
         raise
-    except (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error) as error:
-        raise InputError(f"{path}: found a damaged image ({str(error).rstrip('.')}), expected {_EXPECTED}.") from None
+    except (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error):
+        raise InputError(f"{path}: found a damaged image, expected {_EXPECTED}.") from None
     with naming(str(path)):
         return checked_frame(image)
 

@@ -30,7 +30,7 @@ from adcs.io.log_layout import (
 from adcs.io.telemetry_files import TIME, columns_of, read_named
 from adcs.satellite.vector_record import GYRO_SAMPLES, GyroSamples
 from arrays.io.csv import read_table
-from arrays.io.errors import InputError, naming
+from arrays.io.errors import LARGEST, InputError, naming
 from arrays.io.text import read_bytes
 from arrays.io.toml import File, Table, one_of, read_toml, section_of
 from arrays.typing import BoolArray, FloatArray
@@ -199,16 +199,20 @@ def _broad_log(path: str | PathLike[str]) -> ImuLog:
     try:
         content = loadmat(BytesIO(data))
     except Exception:  # whatever SciPy makes of a file that is none
-        raise InputError(f"{path}: found no whole MAT file, expected one of the BROAD benchmark.") from None
+        raise InputError(
+            f"{path}: found no MAT file that can be read, expected a trial of BROAD, of version 7 at most."
+        ) from None
     if absent := [name for name in (*_BROAD, "sampling_rate") if name not in content]:
         raise InputError(f"{path}: found no variable {absent[0]}, expected those of a trial of the BROAD benchmark.")
-    n = len(content["imu_gyr"])
     try:
+        n = len(content["imu_gyr"])
         values = {name: np.asarray(content[name], np.float64).reshape(n, k) for name, k in _BROAD.items()}
-        time_s = np.arange(n) / float(content["sampling_rate"].item())
-    except (TypeError, ValueError):
+        rate_Hz = float(content["sampling_rate"].item())
+    except (AttributeError, TypeError, ValueError):
         raise InputError(f"{path}: found variables of other shapes, expected those of a trial of BROAD.") from None
+    if not 0.0 < rate_Hz <= LARGEST:
+        raise InputError(f"{path}: found the sampling rate {rate_Hz:g}, expected a positive number.")
     with naming(str(path)):
         readings = values["imu_gyr"], values["imu_acc"], 1e-6 * values["imu_mag"]
-        record = InertialMagneticRecord(time_s, *readings)
+        record = InertialMagneticRecord(np.arange(n) / rate_Hz, *readings)
     return ImuLog(record, values["opt_quat"], values["movement"][:, 0] != 0.0, values["opt_pos"])

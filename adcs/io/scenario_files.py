@@ -247,7 +247,7 @@ def _orbit(path: str, place: str, section: OrbitTable) -> tuple[Orbit, np.dateti
     if section.elements is not None:
         with naming(f"{place}, key elements"):
             of_elements = Sgp4Orbit(*section.elements, allow_old_elements=section.allow_old_elements)
-            of_elements.refuse_old(start)
+            of_elements.refuse_old(instants(start))
         return of_elements, start, section.field_model
     if section.ephemeris is not None:
         # Beside the scenario file, wherever the command runs.

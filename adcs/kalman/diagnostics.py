@@ -202,7 +202,7 @@ def _field_model(record: Record, estimates: AttitudeTracks, run: int) -> list[st
     effect = "the star tracker keeps the attitude" if used.star else "attitude is degraded"
     return [
         f"field differs from its model by {1e9 * largest_T:.0f} nT in modulus or angle with the Sun: error of the "
-        f"model, bias or the satellite's own field; {effect}"
+        f"model or of the orbit, bias or the satellite's own field; {effect}"
     ]
 
 

@@ -86,8 +86,12 @@ def read_picture(path: str | PathLike[str]) -> FloatArray:
             values = np.asarray(opened)
     except InputError:
         raise
+    except Image.DecompressionBombError:
+        raise InputError(f"{path}: found too many pixels, expected 10⁸ at most.") from None
     except Exception:  # whatever the decoder makes of a file that is none
-        raise InputError(f"{path}: found no whole picture, expected one of a kind {', '.join(SUFFIXES)}.") from None
+        raise InputError(
+            f"{path}: found no picture that can be read, expected a whole PNG, TIFF or JPEG file of 8 or 16 bits."
+        ) from None
     if values.ndim == 3:
         values = values[..., : 3 if values.shape[2] > 2 else 1].mean(axis=2)
     return _checked(path, values)
@@ -107,8 +111,9 @@ def _fits(path: str | PathLike[str], data: bytes) -> FloatArray:
         kind = np.dtype(_FITS_TYPES[int(header["BITPIX"])])
         width, height = int(header["NAXIS1"]), int(header["NAXIS2"])
         values = np.frombuffer(data, kind, width * height, start).reshape(height, width)
-        scaled = float(header.get("BSCALE", 1.0)) * values + float(header.get("BZERO", 0.0))
-    except (KeyError, ValueError):
+        with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is refused
+            scaled = float(header.get("BSCALE", 1.0)) * values + float(header.get("BZERO", 0.0))
+    except (KeyError, OverflowError, ValueError):
         raise InputError(
             f"{path}: found no image in two dimensions, expected one as the first of a FITS file."
         ) from None

@@ -17,9 +17,10 @@ from array import array as packed
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from io import FileIO
 from os import PathLike
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -375,9 +376,46 @@ Column = NDArray[np.float64] | NDArray[np.int64] | NDArray[np.bool_] | Sequence[
 
 def write_columns(columns: Mapping[str, Column], path: Path) -> None:
     """Write columns of equal length as CSV; numbers in full, those that are not finite as empty cells, texts quoted."""
+    write_text("\n".join([*csv_lines(columns), ""]), path)
+
+
+def csv_lines(columns: Mapping[str, Column]) -> list[str]:
+    """Return the header and the rows of columns, as of :func:`write_columns`."""
     cells = [[_cell(value) for value in column] for column in columns.values()]
-    lines = [",".join(columns), *(",".join(row) for row in zip(*cells, strict=True))]
-    write_text("\n".join([*lines, ""]), path)
+    return [",".join(columns), *(",".join(row) for row in zip(*cells, strict=True))]
+
+
+class GrowingTable:
+    """A CSV file that is written row by row, each whole, so that an interruption leaves complete rows.
+
+    Parameters
+    ----------
+    path : Path
+        Replaced when the first row comes.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._file: FileIO | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._file is not None:
+            self._file.close()
+
+    def add(self, columns: Mapping[str, Column]) -> None:
+        """Write rows; the names are those of the first ones."""
+        header, *rows = csv_lines(columns)
+        try:
+            if self._file is None:
+                self._file = FileIO(self._path, "w")
+                rows.insert(0, header)
+            if rows:
+                self._file.write("\n".join([*rows, ""]).encode())
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(self._path)) from None
 
 
 def _cell(value: object) -> str:

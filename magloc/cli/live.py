@@ -11,12 +11,15 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from arrays.io.arguments import Flag
+from arrays.io.csv import GrowingTable
 from arrays.io.errors import LARGEST, InputError, naming
+from arrays.io.outputs import refuse_unwritable
 from magloc.cli.framework import QuietOptions, print_json
 from magloc.cli.multi_target.sources_track import SourcesOptions, SourcesWanted
 from magloc.cli.options import STREAM, KnownOptions, Port, naming_options, naming_place, print_note
 
 if TYPE_CHECKING:
+    from arrays.io.csv import Column
     from magloc.live.follower import Follower, LivePoint
     from magloc.viewer.live_view import LiveView
 
@@ -50,6 +53,7 @@ def live(
     source: Annotated[str, Parameter(name="--from", allow_leading_hyphen=True)] = STREAM,
     rest_s: float = 0.0,
     replay_speed: float = 1.0,
+    out: Path | None = None,
     page: PageOptions = PageOptions(),
     known: KnownOptions = KnownOptions(),  # noqa: B008 - frozen
     motion: SourcesOptions = SourcesOptions(),  # noqa: B008 - frozen
@@ -73,6 +77,9 @@ def live(
         array that stands.
     replay_speed : float
         How much faster than in its own time a file is replayed.
+    out : Path, optional
+        CSV file with the columns of track.csv of magloc track --out, a row for every line, or for every source of it.
+        Every row is in the file as soon as it is known.
     page : PageOptions
         The live page.
     known : KnownOptions
@@ -88,6 +95,8 @@ def live(
         raise InputError(f"--rest-s: found {rest_s:g}, expected 0 or a positive number.")
     if not 0.0 < replay_speed <= LARGEST:
         raise InputError(f"--replay-speed: found {replay_speed:g}, expected a positive number.")
+    if out is not None:
+        refuse_unwritable(out, "--out", ".csv")
     used, wanted = known.array(array), motion.several(known.prior)
     with naming(str(array)):
         if wanted is not None:
@@ -97,10 +106,13 @@ def live(
             follower = Follower(used, model, prior=known.prior, sensors=known.ids, place=known.where, rest_s=rest_s)
     with ExitStack() as open_page:
         view = open_page.enter_context(shown(follower, page, quiet=common.quiet)) if page.view else None
+        table = None if out is None else open_page.enter_context(GrowingTable(out))
         try:
             with naming_place(), naming(str(array)):
                 for point in follower.follow(source, replay_speed=replay_speed):
                     print_point(point, wanted)
+                    if table is not None:
+                        table.add(_columns(point, moves=follower.moves))
                     if view is not None:
                         view.update(point)
         finally:
@@ -120,6 +132,15 @@ def shown(follower: Follower, page: PageOptions, *, quiet: bool) -> LiveView:
     if not quiet:
         print_note(f"open {view.address} in a browser; Ctrl-C ends the page")
     return view
+
+
+def _columns(point: LivePoint, *, moves: bool) -> dict[str, Column]:
+    """Columns of the file with one row, or of several sources one of each."""
+    from magloc.tracking.files import columns_of_sources, columns_of_track
+
+    if point.sources is not None:
+        return columns_of_sources([(track.id, track) for track in point.sources.tracks])
+    return columns_of_track([point], point.row.origin_m[None] if moves else None)
 
 
 def print_point(point: LivePoint, wanted: SourcesWanted | None) -> None:

@@ -17,8 +17,8 @@ from arrays.io.errors import InputError, check_not_negative
 from magloc.ambient import Place, in_world_field, with_ambient_field
 from magloc.live.rest import Background, refuse_rest
 from magloc.live.rows import RowParser
-from magloc.live.tally import Clock, Tally
-from magloc.live.transports import Stream, opened, sender_waits
+from magloc.live.tally import Clock, Pace, Tally
+from magloc.live.transports import STANDARD_INPUT, Stream, opened, sender_waits
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.measurement.differences import predicted_channels, suitable_dipole
 from magloc.measurement.plausibility import FEWEST_ROWS, warn_of_array, warn_of_record
@@ -38,6 +38,8 @@ _LOG = logging.getLogger(__name__)
 _ROWS_TO_LOAD = 3
 # Rows that may wait while several sources are followed before all but the newest are skipped.
 _MOST_WAITING = 200
+# Longest time that a row may have waited, where whoever sends does not: older ones are skipped.
+_LONGEST_WAIT_S = 0.5
 RESTING, STOPPED, SKIPPED = "rest: the background is taken", "stopped", "skipped: newer rows were waiting"
 Source = str | Iterable["Readings | Mapping[str, float | None] | str"]
 
@@ -104,6 +106,8 @@ class Follower:
     ----------
     tally : Tally
         Of all rows so far.
+    moves : bool
+        Whether rows have the array's pose.
 
     Examples
     --------
@@ -140,7 +144,7 @@ class Follower:
         self._rest_s = 0.0
         self._first_rows: list[Readings] = []
         self._first_points: list[TrackPoint] = []
-        self._stopped = self._moves = False
+        self._stopped = self.moves = False
         if rest_s:
             self.tare(rest_s)
 
@@ -152,7 +156,7 @@ class Follower:
         InputError
             The array moves, or has scalar sensors, whose readings are not linear in the field.
         """
-        refuse_rest(self.array, moves=self._moves)
+        refuse_rest(self.array, moves=self.moves)
         self._rest_rows, self._rest_s = [], rest_s
 
     def stop(self) -> None:
@@ -177,7 +181,7 @@ class Follower:
         if not waits:
             self._load()
         with opened(source, replay_speed=replay_speed, form=log_format(self.array, self._sensors)) as stream:
-            yield from self._follow_stream(stream, waits=waits)
+            yield from self._follow_stream(stream, waits=waits, is_file=source != STANDARD_INPUT and waits)
 
     def _load(self) -> None:
         """Load what a track needs, by following a made source, while nobody waits yet."""
@@ -198,39 +202,55 @@ class Follower:
             raise ValueError(f"Input motion must be a FreeMotion for several sources; instead received {motion}.")
         return SourcesTracker(array, sources=self._sources, motion=motion, prior=self.prior)
 
-    def _follow_stream(self, stream: Stream, *, waits: bool) -> Generator[LivePoint]:
-        parser = RowParser(self.array, stream.name, self.tally, self._sensors)
+    def _follow_stream(self, stream: Stream, *, waits: bool, is_file: bool = False) -> Generator[LivePoint]:
+        parser = RowParser(self.array, stream.name, self.tally, self._sensors, is_file=is_file)
+        pace = None if waits else Pace(stream.name)
         if not waits:
             _LOG.info(f"{stream.name}: waiting for rows")
-        for lines in stream.lines:
-            arrived = time.perf_counter()
-            for readings in parser.rows_of(lines):
-                yield from self._answers(readings, arrived, waits=waits)
-        if self.tally.rows:
-            return
-        if self.tally.garbled:
-            raise InputError(f"{stream.name}: found garbled lines alone ({self.tally.garbled}), expected rows.")
-        if parser.has_header:
-            raise InputError(f"{stream.name}, line 1: found a header without rows, expected a row below it.")
-        raise InputError(f"{stream.name}: found nothing, expected {EXPECTED_HEADER}.")
+        for batch in stream.batches:
+            self.tally.drop(batch.dropped, stream.name)
+            for readings in parser.rows_of(batch.lines, batch.sender):
+                stream.accept(batch.sender)
+                yield from self._answers(readings, batch.arrived_s, pace)
+            if parser.has_header_of(batch.sender):
+                stream.accept(batch.sender)
+        self._refuse_nothing(parser, stream.name)
 
     def _follow_rows(self, source: Iterable[Readings | Mapping[str, float | None] | str]) -> Generator[LivePoint]:
         parser = RowParser(self.array, "the rows", self.tally, self._sensors)
         for row in source:
             arrived = time.perf_counter()
             if isinstance(row, Readings):
-                yield from self._answers(row, arrived, waits=True)
+                yield from self._answers(row, arrived)
                 continue
             line = row.encode() if isinstance(row, str) else msgspec.json.encode(row)
             for readings in parser.rows_of([line]):
-                yield from self._answers(readings, arrived, waits=True)
+                yield from self._answers(readings, arrived)
+        if self.tally.garbled:
+            self._refuse_nothing(parser, "the rows")
 
-    def _answers(self, readings: Readings, arrived: float, *, waits: bool) -> Generator[LivePoint]:
-        """Answers to the rows that are new."""
+    def _refuse_nothing(self, parser: RowParser, name: str) -> None:
+        """Raise InputError at the end of a stream without a row."""
+        if self.tally.rows:
+            return
+        if self.tally.garbled:
+            fault = parser.fault.rstrip(".")
+            raise InputError(f"{name}: found garbled lines alone ({self.tally.garbled}), expected rows ({fault}).")
+        if parser.has_header:
+            raise InputError(f"{name}, line 1: found a header without rows, expected a row below it.")
+        raise InputError(f"{name}: found nothing, expected {EXPECTED_HEADER}.")
+
+    def _answers(self, readings: Readings, arrived: float, pace: Pace | None = None) -> Generator[LivePoint]:
+        """Answers to the rows that are new; with a pace those alone that can be followed in time."""
         new = np.array([self._clock.takes(time_s) for time_s in readings.time_s.tolist()], dtype=bool)
         rows = self._rows(readings[new]) if new.any() else []
         while rows:
-            answers = self._next_answers(rows, waits=waits)
+            skipped = self.tally.skipped
+            is_late = time.perf_counter() - arrived > _LONGEST_WAIT_S
+            answers = self._next_answers(rows, waits=pace is None, is_late=is_late)
+            if pace is not None:
+                skipped = self.tally.skipped - skipped
+                pace.count(len(answers) - skipped, skipped)
             for row, point in answers:
                 latency_s = time.perf_counter() - arrived
                 self.tally.latencies_s.append(latency_s)
@@ -253,9 +273,9 @@ class Follower:
             if ambient_T is not None and readings.ambient_T is None and readings.array_rotation is not None:
                 x, y, z = readings.array_rotation[0].apply(ambient_T[0]).tolist()
                 array = replace(array, ambient_world_T=(x, y, z))
-            self._in_field, self._moves = with_stated_pose(array, readings), readings.pose is not None
+            self._in_field, self.moves = with_stated_pose(array, readings), readings.pose is not None
             if self._rest_s:
-                refuse_rest(array, moves=self._moves)
+                refuse_rest(array, moves=self.moves)
             warn_of_array(self._in_field)
         used = in_world_field(without_saturated(readings, self._in_field), self._in_field)
         if sum(map(len, self._first_rows)) < FEWEST_ROWS:
@@ -276,7 +296,9 @@ class Follower:
             if tracks and len(self._first_points) == FEWEST_ROWS:
                 warn_of_strengths(self._first_points)
 
-    def _next_answers(self, rows: Sequence[Row], *, waits: bool) -> list[tuple[Row, TrackPoint | SourcesPoint]]:
+    def _next_answers(
+        self, rows: Sequence[Row], *, waits: bool, is_late: bool
+    ) -> list[tuple[Row, TrackPoint | SourcesPoint]]:
         """The first of the rows, or some of them, with what is known of the source there."""
         if self._stopped:
             return self._without_track(rows, STOPPED)
@@ -290,7 +312,7 @@ class Follower:
             is_quick = len(rows) <= _MOST_WAITING  # where one is born, some wait
         else:
             is_quick = self._tracker.is_tracking and compiled_motion(self._tracker) is not None
-        if len(rows) > 1 and not waits and not is_quick:
+        if len(rows) > 1 and not waits and (is_late or not is_quick):
             self.tally.skipped += len(rows) - 1
             return self._without_track(rows[:-1], SKIPPED)
         if self._background is not None:

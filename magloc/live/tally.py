@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+import math
 import statistics
+import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -17,6 +19,7 @@ _EVERY = 20  # rows, the median step is counted anew
 _LATENCIES = 10_000
 _JUMP_STEPS, _JUMP_S = 100.0, 1.0
 _ROWS_TO_JUMP, _ROWS_TO_SET_BACK = 2, 10
+_PACE_S, _LONGEST_PACE_S, _MOST_SKIPPED = 1.0, 10.0, 0.1
 
 
 @dataclass
@@ -41,6 +44,8 @@ class Tally:
         Lines that are no rows, and rows whose time is not to be believed.
     dummies : int
         Readings, one of a sensor in a row, that were dummy values.
+    dropped : int
+        Lines that were not read, because one sender sent more than can be read.
     restarts : int
         How often the sender's clock was set back.
     latencies_s : deque of float
@@ -62,6 +67,7 @@ class Tally:
     doubled: int = 0
     garbled: int = 0
     dummies: int = 0
+    dropped: int = 0
     restarts: int = 0
     latencies_s: deque[float] = field(default_factory=lambda: deque(maxlen=_LATENCIES), repr=False)
 
@@ -72,6 +78,12 @@ class Tally:
         if before < _MOST_NAMED:
             last = "; more of them are only counted" if before + number >= _MOST_NAMED else ""
             _LOG.info(f"{kind}: {what}{last}")
+
+    def drop(self, lines: int, stream: str) -> None:
+        """Count lines that were not read, and say it the first time."""
+        if lines and not self.dropped:
+            _LOG.warning(f"{stream}: more comes than can be read, the oldest lines of who sends most are dropped")
+        self.dropped += lines
 
     @property
     def faults(self) -> int:
@@ -88,10 +100,42 @@ class Tally:
         words += f", {self.garbled} garbled"
         words += f", {self.skipped} skipped" if self.skipped else ""
         words += f", {self.dummies} dummy values" if self.dummies else ""
+        words += f", {self.dropped} lines not read" if self.dropped else ""
         words += f", clock set back {self.restarts} times" if self.restarts else ""
         if not self.latencies_s:
             return words
         return f"{words}; latency {self.latency_ms(0.5):.2g} ms, 99.9 % within {self.latency_ms(0.999):.2g} ms"
+
+
+class Pace:
+    """Whether rows come faster than they can be followed, which is said once.
+
+    Parameters
+    ----------
+    stream : str
+        Its name.
+    """
+
+    def __init__(self, stream: str) -> None:
+        self._stream = stream
+        self._since_s = -math.inf
+        self._answered = self._skipped = 0
+        self._is_told = False
+
+    def count(self, answered: int, skipped: int) -> None:
+        """Count rows that were answered and that were skipped, and compare them once a second."""
+        now_s = time.perf_counter()
+        self._answered, self._skipped = self._answered + answered, self._skipped + skipped
+        elapsed_s = now_s - self._since_s
+        if elapsed_s < _PACE_S:
+            return
+        if elapsed_s < _LONGEST_PACE_S and self._skipped > _MOST_SKIPPED * self._answered and not self._is_told:
+            self._is_told = True
+            come, can = (n / elapsed_s for n in (self._answered + self._skipped, self._answered))
+            _LOG.warning(
+                f"{self._stream}: {come:.3g} rows a second come and {can:.3g} can be followed: the oldest are skipped"
+            )
+        self._since_s, self._answered, self._skipped = now_s, 0, 0
 
 
 class Clock:

@@ -1,6 +1,7 @@
 """Where rows come from: addresses of pipes, sockets, serial ports and files, and the lines that arrive there.
 
-Lines come in batches: all that have arrived since the last look, so that whoever is behind catches up.
+Lines come in batches: all that have arrived since the last look, so that whoever is behind catches up; of datagrams in
+turns of their senders.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import select
 import socket
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from urllib.parse import SplitResult, urlsplit
@@ -18,11 +19,15 @@ from urllib.parse import SplitResult, urlsplit
 from arrays.columns import READINGS_FILE, LogFormat
 from arrays.io.errors import InputError, check_positive, of_extra
 from arrays.io.text import read_bytes
+from magloc.live.senders import Batch, Senders
 
 STANDARD_INPUT = "-"
 KINDS = "-, tcp://HOST:PORT, udp://HOST:PORT, serial:DEVICE@BAUD or replay:FILE"
 """Of addresses."""
 _CHUNK = 65536
+_ALL_THAT_WAITS = 2**20  # bytes of a connection, read at once
+_DATAGRAMS = 10_000  # read at once: more would keep what was read from being handed out
+_PAUSE_S = 0.002  # before senders of nothing but what is no row are heard: a flood must not take the whole processor
 LONGEST_LINE = 2**20
 """Bytes: what has no line end until then is a garbled line."""
 _CONNECTION_S = 10.0
@@ -38,12 +43,15 @@ class Stream:
     ----------
     name : str
         In errors.
-    lines : iterator of lists of bytes
-        All whole lines that have arrived since the last ones.
+    batches : iterator of Batch
+        Whole lines that have arrived since the last ones.
+    accept : callable
+        To be called with the sender of lines that were rows or a header.
     """
 
     name: str
-    lines: Iterator[list[bytes]]
+    batches: Iterator[Batch]
+    accept: Callable[[Hashable], object] = lambda _: None
 
 
 def sender_waits(address: str) -> bool:
@@ -64,7 +72,8 @@ def opened(address: str, *, replay_speed: float = 1.0, form: LogFormat = READING
                 yield Stream(address, _lines(_of_tcp(peer)))
         case "udp":
             with _bound(address) as peer:
-                yield Stream(address, _of_udp(peer))
+                senders = Senders()
+                yield Stream(address, _of_udp(peer, senders), senders.accept)
         case "serial":
             device, separator, baud = rest.rpartition("@")
             if not (separator and device and baud.isascii() and baud.isdigit() and int(baud)):
@@ -90,7 +99,7 @@ def _reason(error: Exception) -> str:
     return getattr(error, "strerror", None) or str(error)
 
 
-def _lines(chunks: Iterator[bytes]) -> Iterator[list[bytes]]:
+def _lines(chunks: Iterator[bytes]) -> Iterator[Batch]:
     """Whole lines of chunks of bytes; the last one may have no end."""
     begun = b""
     for chunk in chunks:
@@ -99,9 +108,9 @@ def _lines(chunks: Iterator[bytes]) -> Iterator[list[bytes]]:
             whole.append(begun)
             begun = b""
         if whole:
-            yield whole
+            yield Batch(whole)
     if begun:
-        yield [begun]
+        yield Batch([begun])
 
 
 def _of_stdin() -> Iterator[bytes]:
@@ -139,7 +148,7 @@ def _connected(address: str) -> Iterator[socket.socket]:
 
 def _of_tcp(peer: socket.socket) -> Iterator[bytes]:
     try:
-        while chunk := peer.recv(_CHUNK):
+        while chunk := peer.recv(_ALL_THAT_WAITS):
             yield chunk
     except ConnectionError:  # as good an end as another
         return
@@ -162,13 +171,26 @@ def _bound(address: str) -> Iterator[socket.socket]:
         yield bound
 
 
-def _of_udp(own: socket.socket) -> Iterator[list[bytes]]:
-    """Lines of all datagrams that wait; each ends with its last line."""
+def _of_udp(own: socket.socket, senders: Senders) -> Iterator[Batch]:
+    """Lines of the datagrams that wait, of one sender at a time; each datagram ends with its last line."""
+    own.setblocking(False)
     while True:
-        waiting = [own.recv(_CHUNK)]
-        while select.select([own], [], [], 0.0)[0]:
-            waiting.append(own.recv(_CHUNK))
-        yield [line for datagram in waiting for line in datagram.removesuffix(b"\n").split(b"\n")]
+        select.select([own], [], [], 0.0 if senders else None)
+        _receive(own, senders)
+        if senders and not senders.is_urgent:
+            time.sleep(_PAUSE_S)
+            _receive(own, senders)
+        if senders:
+            yield senders.take()
+
+
+def _receive(own: socket.socket, senders: Senders) -> None:
+    """Take in the datagrams that wait."""
+    buffer = bytearray(_CHUNK)  # one for all: bytes that are shortened afterwards leave holes in the memory
+    with suppress(BlockingIOError):
+        for _ in range(_DATAGRAMS):
+            size, sender = own.recvfrom_into(buffer)
+            senders.put(bytes(buffer[:size]), sender)
 
 
 def _of_serial(port: serial.Serial) -> Iterator[bytes]:  # type: ignore[name-defined]  # noqa: F821 - an extra
@@ -181,7 +203,7 @@ def _of_serial(port: serial.Serial) -> Iterator[bytes]:  # type: ignore[name-def
             return
 
 
-def _in_own_time(lines: list[bytes], speed: float, form: LogFormat) -> Iterator[list[bytes]]:
+def _in_own_time(lines: list[bytes], speed: float, form: LogFormat) -> Iterator[Batch]:
     """Lines of a readings file, each when its time has come; nobody waits for long pauses."""
     seconds_of = form.clock(lines[0].removeprefix(b"\xef\xbb\xbf").decode(errors="replace") if lines else "")
     due_s, last_s = time.monotonic(), math.inf
@@ -193,9 +215,9 @@ def _in_own_time(lines: list[bytes], speed: float, form: LogFormat) -> Iterator[
             due_s += step_s / speed if 0.0 < step_s <= _LONGEST_PAUSE_S * speed else 0.0
         if due_s > time.monotonic():
             if waiting:
-                yield waiting
+                yield Batch(waiting)
                 waiting = []
             time.sleep(max(0.0, due_s - time.monotonic()))
         waiting.append(line)
     if waiting:
-        yield waiting
+        yield Batch(waiting)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from arrays.array import SensorArray
 from arrays.io.csv import Column
 from arrays.io.outputs import make_folder
+from magloc.chi_square import square_columns
 from magloc.localization.fit.fixes import Fixes
 from magloc.localization.fit.results import is_observable, spans
 from magloc.localization.residuals import fix_residuals
@@ -99,7 +100,7 @@ def write_pictures(
     found = fix_columns(fixes)
     columns: dict[str, Column] = {"time_s": found.time_s, "source": found.source}
     columns |= state_columns(found.position_m, found.moment_Am2, found.covariance)
-    columns |= style.square_columns("chi2", found.chi2, found.dof)
+    columns |= square_columns("chi2", found.chi2, found.dof)
     columns |= {"range95_low_m": found.range95_m[:, 0], "range95_high_m": found.range95_m[:, 1]}
     columns["range_observable"] = found.range_observable
     if truth_m is not None:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from arrays.io.csv import Column, write_columns
@@ -24,6 +24,7 @@ from arrays.io.text import replace_file
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 from arrays.typing import FloatArray
+from magloc.chi_square import bounds99 as bounds99
 from magloc.levels import INTERVAL
 from magloc.levels import SIGMAS_95 as SIGMAS_95
 from magloc.truth import STATE_COLUMNS
@@ -250,23 +251,9 @@ def shade_gaps(ax: Axes, time_s: FloatArray, present: NDArray[np.bool_], label: 
         label = "_"
 
 
-def bounds99(degrees_of_freedom: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Two-sided 99 % bounds of χ² over its degrees of freedom; NaN where there are none."""
-    dof = np.asarray(degrees_of_freedom, dtype=np.float64)
-    known = np.where(dof > 0.0, dof, np.nan)
-    return chdtri(known, 0.995) / known, chdtri(known, 0.005) / known
-
-
 def truth_columns(truth_m: FloatArray) -> dict[str, Column]:
     """Columns of true positions (n, 3)."""
     return dict(zip((f"true_{name}" for name in STATE_COLUMNS), truth_m.T, strict=False))
-
-
-def square_columns(name: str, square: FloatArray, dof: NDArray[np.int64]) -> dict[str, Column]:
-    """A normalised square, its degrees of freedom, and its 99 % bounds."""
-    low, high = bounds99(dof)
-    prefix = "" if name == "chi2" else f"{name}_"
-    return {name: square, f"{prefix}dof": dof, f"{name}_low99": low * dof, f"{name}_high99": high * dof}
 
 
 def dot_size(n: int) -> float:

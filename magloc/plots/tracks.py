@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.figure import Figure
 
-from arrays.io.csv import Column, write_columns
+from arrays.io.csv import write_columns
 from arrays.io.outputs import make_folder
 from arrays.typing import FloatArray, IntArray
+from magloc.chi_square import square_columns
 from magloc.plots import style
 from magloc.plots.style import save
+from magloc.tracking.files import columns_of_sources, columns_of_track, states_of
 from magloc.tracking.results import TrackPoint, TrackResult, on_track, stacked
-from magloc.truth import STATE_COLUMNS, state_columns
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -42,23 +43,15 @@ def write_picture(
     every row. Raises InputError: the folder cannot be written.
     """
     make_folder(folder, "--out")
-    time, position, moment, covariance = _columns_of(points)
-    nis, nis_dof = np.array([point.nis for point in points]), np.array([point.nis_dof for point in points])
-    estimability = stacked(points, "estimability", 6)
-    columns: dict[str, Column] = {"time_s": time}
-    columns |= state_columns(position, moment, covariance)
-    columns |= style.square_columns("nis", nis, nis_dof)
-    components = (name.split("_")[0] for name in STATE_COLUMNS)
-    columns |= dict(zip((f"estimability_{name}" for name in components), estimability.T, strict=True))
+    columns = columns_of_track(points, array_m)
+    status = columns.pop("status")
     if truth_m is not None:
         columns |= style.truth_columns(truth_m)
     if nees is not None:
-        columns |= style.square_columns("nees", *nees)
+        columns |= square_columns("nees", *nees)
     if bound_m is not None:
         columns["bound_m"] = bound_m
-    if array_m is not None:
-        columns |= dict(zip(("array_x_m", "array_y_m", "array_z_m"), array_m.T, strict=True))
-    columns["status"] = [point.status for point in points]
+    columns["status"] = status
     write_columns(columns, folder / "track.csv")
     save(track_figure(points, truth_m, array_m), folder / "track.png")
     save(consistency_figure(points, truth_m, nees, bound_m), folder / "consistency.png")
@@ -75,10 +68,7 @@ def write_sources(result: TrackResult, folder: Path, array_m: FloatArray | None 
         if point.position_m is not None
     ]
     named.sort(key=lambda pair: pair[1].time_s)
-    time, position, moment, covariance = _columns_of([point for _, point in named])
-    columns: dict[str, Column] = {"time_s": time, "id": np.array([id for id, _ in named])}
-    columns |= state_columns(position, moment, covariance)
-    columns["status"] = [point.status for _, point in named]
+    columns = columns_of_sources(named)
     write_columns(columns, folder / "track.csv")
     save(sources_figure(result, array_m), folder / "track.png")
     _LOG.info(f"wrote track.png and track.csv into {folder}/")
@@ -144,7 +134,7 @@ def _figure(
 ) -> Figure:
     """Sources by their names, of which a single one has its truth."""
     tracks = {name: on_track(points) for name, points in tracks.items()}
-    columns = {name: _columns_of(points) for name, points in tracks.items()}
+    columns = {name: states_of(points) for name, points in tracks.items()}
     tracked = np.any([np.isfinite(position[:, 0]) for _, position, _, _ in columns.values()], axis=0)
     origin_m = np.zeros((1, 3)) if array_m is None else array_m
     extent = [position for _, position, _, _ in columns.values()] + ([] if truth_m is None else [truth_m])
@@ -224,7 +214,7 @@ def consistency_figure(
     >>> track = magloc.track(diver.array, diver.readings[90:])
     >>> figure = magloc.plots.consistency(track.points)
     """
-    time, position, _, covariance = _columns_of(points)
+    time, position, _, covariance = states_of(points)
     n_panels = 5 if truth_m is not None and nees is not None else 3
     figure = style.new_figure(1.35 * n_panels + 0.3)
     axes = list(figure.subplots(n_panels, 1, sharex=True))
@@ -251,16 +241,6 @@ def consistency_figure(
     return figure
 
 
-def _columns_of(points: Sequence[TrackPoint]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Times (n,), positions, moments (n, 3) and covariances (n, 6, 6) of a track, NaN where there is none."""
-    return (
-        stacked(points, "time_s"),
-        stacked(points, "position_m", 3),
-        stacked(points, "moment_Am2", 3),
-        stacked(points, "covariance", 6, 6),
-    )
-
-
 def _at_least(width: float, low: float, high: float) -> tuple[float, float]:
     """Limits that are this wide at least."""
     missing = max(0.0, width - (high - low))
@@ -280,7 +260,7 @@ def _plan(
         style.draw_truth(ax, per_m * truth_m[:, 0], per_m * truth_m[:, 1])
     edges = {} if len(tracks) == 1 else {source: {"edgecolor": _colour(tracks, source)} for source in tracks}
     for source, points in tracks.items():
-        _, position, _, covariance = _columns_of(points)
+        _, position, _, covariance = states_of(points)
         shown = per_m * position
         ax.plot(shown[:, 0], shown[:, 1], color=_colour(tracks, source), lw=1.2, label=source, zorder=2.2)
         for i in style.some_of(np.flatnonzero(np.isfinite(position[:, 0]))):

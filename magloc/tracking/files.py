@@ -13,14 +13,17 @@ import numpy as np
 from scipy.special import chdtri
 
 from arrays.io.closing import garbage_waits
+from arrays.io.csv import Column
 from arrays.io.errors import LARGEST, InputError
 from arrays.io.tables import aligned, by_sigma
 from arrays.io.text import read_text
 from arrays.io.world_maps import feature, feature_collection, kml, placemark, world_place
 from arrays.typing import FloatArray, Vector
+from magloc.chi_square import square_columns
 from magloc.levels import FALSE_ALARM
 from magloc.localization.fit.table import cells_of_strength, cells_of_vector
 from magloc.tracking.results import TrackPoint, TrackResult, on_track, stacked
+from magloc.truth import STATE_COLUMNS, state_columns
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -104,6 +107,38 @@ def json_entry(point: TrackPoint) -> dict[str, object]:
         "weight": point.weight,
         "rivals": [{key: getattr(rival, key) for key in _RIVAL_KEYS} for rival in point.rivals],
     }
+
+
+def states_of(points: Sequence[TrackPoint]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Times (n,), positions, moments (n, 3) and covariances (n, 6, 6) of a track, NaN where there is none."""
+    return (
+        stacked(points, "time_s"),
+        stacked(points, "position_m", 3),
+        stacked(points, "moment_Am2", 3),
+        stacked(points, "covariance", 6, 6),
+    )
+
+
+def columns_of_track(points: Sequence[TrackPoint], array_m: FloatArray | None = None) -> dict[str, Column]:
+    """Columns of the CSV file of a track; ``array_m`` (n, 3): origin of the array's frame in every row."""
+    time, position, moment, covariance = states_of(points)
+    nis, nis_dof = np.array([point.nis for point in points]), np.array([point.nis_dof for point in points])
+    columns: dict[str, Column] = {"time_s": time}
+    columns |= state_columns(position, moment, covariance) | square_columns("nis", nis, nis_dof)
+    components = (name.split("_")[0] for name in STATE_COLUMNS)
+    estimability = stacked(points, "estimability", 6)
+    columns |= dict(zip((f"estimability_{name}" for name in components), estimability.T, strict=True))
+    if array_m is not None:
+        columns |= dict(zip(("array_x_m", "array_y_m", "array_z_m"), array_m.T, strict=True))
+    return columns | {"status": [point.status for point in points]}
+
+
+def columns_of_sources(named: Sequence[tuple[int, TrackPoint]]) -> dict[str, Column]:
+    """Columns of the CSV file of several sources: points with the ids of their tracks."""
+    time, position, moment, covariance = states_of([point for _, point in named])
+    columns: dict[str, Column] = {"time_s": time, "id": np.array([id for id, _ in named])}
+    columns |= state_columns(position, moment, covariance)
+    return columns | {"status": [point.status for _, point in named]}
 
 
 def json_of_track(points: Sequence[TrackPoint], consistency: Consistency | None) -> dict[str, object]:

@@ -58,7 +58,7 @@ LINES: dict[str, tuple[str, ...]] = {
     ),
     "magloc live": (
         "--array array.toml --from - --speed-m-s 0.1",
-        "--array array.toml --from replay:readings.csv --replay-speed 1e6 --rest-s 3",
+        "--array array.toml --from replay:readings.csv --replay-speed 1e6 --rest-s 3 --out out.csv",
         "--array log.toml --from replay:log.csv --replay-speed 1e6",
     ),
     "magloc signature": (

@@ -111,6 +111,7 @@ class TestRefusals:
             ({"imu_gyr": None}, "found no variable imu_gyr"),
             ({"imu_mag": np.zeros((7, 3))}, "found variables of other shapes"),
             ({"imu_acc": np.zeros((1500, 3))}, "acceleration_m_s2 must have a length"),
+            ({"sampling_rate": np.zeros((1, 1))}, "found the sampling rate 0, expected a positive number"),
         ],
     )
     def test_matlab(self, tmp_path, changes, expected):
@@ -119,7 +120,9 @@ class TestRefusals:
 
     def test_no_matlab_file(self, tmp_path):
         (tmp_path / "cut.mat").write_bytes(matlab(tmp_path / "trial.mat").read_bytes()[:4000])
-        with pytest.raises(InputError, match="no MAT file that can be read"):
+        with pytest.raises(
+            InputError, match=r"no MAT file that can be read, expected a trial of BROAD, of version 7 at most\.$"
+        ):
             read_imu(tmp_path / "cut.mat")
         with pytest.raises(InputError, match="does not exist"):
             read_imu(tmp_path / "none.mat")

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -53,6 +54,24 @@ class TestFiles:
         values = np.random.default_rng(0).integers(0, 255, (70, 90, 4)).astype(np.uint8)
         Image.fromarray(values, "RGBA").save(tmp_path / "a.png")
         np.testing.assert_allclose(read_picture(tmp_path / "a.png"), values[..., :3].mean(axis=2))
+
+    @pytest.mark.filterwarnings("error")
+    @pytest.mark.parametrize("kind", ["PNG", "TIFF", "JPEG"])
+    def test_damaged_files_are_refused_in_one_sentence(self, tmp_path, kind):
+        """Cut or with a byte changed anywhere: without the decoder's words, or read where the damage is in pixels."""
+        rng, path = np.random.default_rng(1), tmp_path / f"a.{kind.lower()}"
+        Image.fromarray(rng.integers(0, 255, (70, 90)).astype(np.uint8)).save(path, kind)
+        whole = path.read_bytes()
+        for i in range(60):
+            at = int(rng.integers(len(whole) if i % 2 else 60))
+            path.write_bytes(whole[:at] if i % 3 else whole[:at] + bytes([whole[at] ^ 255]) + whole[at + 1 :])
+            try:
+                assert read_picture(path).ndim == 2
+            except InputError as error:
+                said = str(error).removeprefix(f"{path}: ")
+                assert re.fullmatch(
+                    r"found (no picture that can be read|a picture of shape|too many|\d+ × \d+).*", said
+                )
 
     def test_refusals(self, tmp_path):
         (tmp_path / "no.png").write_bytes(b"no picture")

@@ -85,6 +85,35 @@ class TestLines:
         assert "the background is taken from 10 rows" in outcome.err
         assert "was the array at rest?" in outcome.err  # a source passes
 
+    def test_table_has_the_columns_of_track(self, folder: Path, run: Run, tmp_path: Path) -> None:
+        options = ("--array", folder / "array.toml", *MOTION)
+        run("track", folder / "rows.csv", *options, "--out", tmp_path)
+        expected = (tmp_path / "track.csv").read_text().splitlines()
+        source = f"replay:{folder / 'rows.csv'}"
+        run("live", "--from", source, "--replay-speed", "1000", *options, "--out", tmp_path / "live.csv")
+        found = (tmp_path / "live.csv").read_text().splitlines()
+        assert found[0] == expected[0]
+        assert len(found) == len(expected)
+        for one, other in zip(found[1:], expected[1:], strict=True):
+            (*numbers, status), (*expected_numbers, expected_status) = one.split(","), other.split(",")
+            assert status == expected_status
+            np.testing.assert_allclose(
+                [float(n or "nan") for n in numbers],
+                [float(n or "nan") for n in expected_numbers],
+                rtol=1e-6,
+                atol=1e-9,
+            )
+
+    def test_table_of_several_sources(self, folder: Path, run: Run, tmp_path: Path) -> None:
+        options = ("--array", folder / "array.toml", *MOTION, "--sources", "1")
+        source = f"replay:{folder / 'rows.csv'}"
+        out = run("live", "--from", source, "--replay-speed", "1000", *options, "--out", tmp_path / "live.csv").out
+        header, *rows = (tmp_path / "live.csv").read_text().splitlines()
+        assert header.startswith("time_s,id,x_m,y_m,z_m,")
+        tracks = [(entry["time_s"], track) for entry in entries(out) for track in entry["tracks"]]
+        assert [float(row.split(",")[2]) for row in rows] == [track["position_m"][0] for _, track in tracks]
+        assert [row.split(",")[:2] for row in rows] == [[str(time_s), str(track["id"])] for time_s, track in tracks]
+
     def test_quiet(self, folder: Path, run: Run) -> None:
         source = f"replay:{folder / 'rows.csv'}"
         options = ("--replay-speed", "1000", "--quiet")
@@ -102,6 +131,8 @@ class TestBadInput:
             ("--replay-speed 0", ("--replay-speed: found 0",)),
             ("--speed-m-s 0", ("--speed-m-s",)),
             ("--sensors s9", ("--sensors: found 's9'",)),
+            ("--out out.txt", ("--out out.txt: found a name that ends with '.txt', expected .csv",)),
+            ("--out nowhere/out.csv", ("--out nowhere/out.csv: found no folder",)),
         ],
     )
     def test_options(self, folder: Path, run: Run, words: str, fragments: tuple[str, ...]) -> None:
@@ -139,11 +170,11 @@ class TestSocket:
         ("number", "status", "word"), [(signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "terminated")]
     )
     def test_every_row_is_answered_until_a_signal(
-        self, folder: Path, number: signal.Signals, status: int, word: str
+        self, folder: Path, tmp_path: Path, number: signal.Signals, status: int, word: str
     ) -> None:
-        """By whole lines, though nobody reads them for a while and the pipe is full."""
+        """By whole lines, though nobody reads them for a while and the pipe is full; the table has whole rows too."""
         header, *rows = (folder / "rows.csv").read_text().splitlines()
-        with followed(folder) as (process, peer):
+        with followed(folder, "--out", str(tmp_path / "out.csv")) as (process, peer):
             assert process.stdout is not None
             assert process.stderr is not None
             peer.sendall(f"{header}\n".encode())
@@ -151,6 +182,7 @@ class TestSocket:
                 peer.sendall(f"{row}\n".encode())
                 answer = json.loads(process.stdout.readline())
                 assert answer["time_s"] == float(row.split(",")[0])
+            assert len((tmp_path / "out.csv").read_text().splitlines()) >= 5
             for i in range(500):  # far more than a pipe holds
                 peer.sendall(f"{1000.0 + i},{rows[0].partition(',')[2]}\n".encode())
             process.send_signal(number)
@@ -158,6 +190,9 @@ class TestSocket:
         assert process.returncode == status
         assert all(json.loads(line) for line in out.splitlines())
         assert out.endswith("\n") or not out
+        names, *table = (tmp_path / "out.csv").read_text().split("\n")
+        assert table.pop() == ""
+        assert {line.count(",") for line in table} == {names.count(",")}
         *_, summary, last = err.splitlines()
         assert "rows, " in summary
         assert last == f"magloc: {word}"

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import logging
 import random
+import re
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +18,9 @@ from numpy.typing import NDArray
 import magloc
 from arrays.io.errors import InputError
 from magloc.live import follower as follower_module
+from magloc.live import tally as tally_module
 from magloc.live.follower import RESTING, SKIPPED, STOPPED, Follower, track
+from magloc.live.senders import Batch
 from magloc.live.transports import Stream
 from magloc.readings import Readings, write_readings
 from magloc.tracking.motion import RandomWalk
@@ -165,9 +169,10 @@ class TestDamage:
         assert points[-1].status == "tracked"
 
 
-def batches_of(lines: list[str], size: int) -> Iterator[list[bytes]]:
+def batches_of(lines: list[str], size: int, waited_s: float = 0.0) -> Iterator[Batch]:
     for i in range(0, len(lines), size):
-        yield [line.encode() for line in lines[i : i + size]]
+        encoded = [line.encode() for line in lines[i : i + size]]
+        yield Batch(encoded, arrived_s=time.perf_counter() - waited_s)
 
 
 class TestWhoFallsBehind:
@@ -182,6 +187,21 @@ class TestWhoFallsBehind:
         assert len(points) == N_ROWS
         assert [point.status for point in points[:49]] == [SKIPPED] * 48 + ["acquired"]
         assert {point.status for point in points[49:]} == {"tracked"}
+
+    def test_rows_that_waited_too_long_are_skipped(self, lines: list[str], caplog: pytest.LogCaptureFixture) -> None:
+        """All but the newest of a batch, though there is a track; it is said with both rates, once."""
+        batches = [*batches_of(lines[:50], 1), *batches_of(lines[50:], 50, waited_s=60.0)]
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(tally_module, "_PACE_S", 0.01)
+            follower = Follower(ARRAY, SLOW)
+            points = list(follower._follow_stream(Stream("the stream", iter(batches)), waits=False))
+        assert len(points) == N_ROWS
+        assert [point.status for point in points[50:]] == ([SKIPPED] * 49 + ["tracked"]) * ((N_ROWS - 50) // 50)
+        assert follower.tally.skipped == 49 * ((N_ROWS - 50) // 50)
+        (message,) = [record.message for record in caplog.records if record.levelname == "WARNING"]
+        assert re.fullmatch(
+            r"the stream: \S+ rows a second come and \S+ can be followed: the oldest are skipped", message
+        )
 
     def test_nobody_is_behind_with_single_rows(self, lines: list[str]) -> None:
         assert SKIPPED not in {point.status for point in self.points(lines, 1)}

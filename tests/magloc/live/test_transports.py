@@ -24,7 +24,7 @@ LINES = TEXT.split(b"\n")
 
 def lines_at(address: str, **options: float) -> list[bytes]:
     with opened(address, **options) as stream:
-        return [line for batch in stream.lines for line in batch]
+        return [line for batch in stream.batches for line in batch.lines]
 
 
 @pytest.fixture
@@ -80,7 +80,7 @@ class TestUdp:
             for datagram in (b"time_s,a\n0,1", b"1,2\n", b"\n2,3"):
                 sender.sendto(datagram, ("127.0.0.1", port))
             while len(found) < len(LINES):
-                found += next(stream.lines)
+                found += next(stream.batches).lines
         assert found == LINES
 
     def test_a_port_in_use(self) -> None:
@@ -103,10 +103,10 @@ class TestSerial:
             os.write(master, TEXT + b"\n")
             found: list[bytes] = []
             while len(found) < len(LINES):
-                found += next(stream.lines)
+                found += next(stream.batches).lines
             os.close(slave)
             os.close(master)
-            assert list(stream.lines) == []
+            assert list(stream.batches) == []
         assert found == LINES
 
     def test_no_such_device(self) -> None:
@@ -144,7 +144,7 @@ class TestReplay:
         time = Time()
         monkeypatch.setattr(transports, "time", time)
         with opened(f"replay:{path}", replay_speed=speed, form=form) as stream:
-            return [(line, time.now_s - 100.0) for batch in stream.lines for line in batch]
+            return [(line, time.now_s - 100.0) for batch in stream.batches for line in batch.lines]
 
     @pytest.mark.parametrize("speed", [1.0, 10.0])
     def test_every_line_comes_when_its_time_has_come(

@@ -35,6 +35,7 @@ from skimage.color import rgb2lab
 from arrays.geometries import grid, tetrahedron
 from arrays.sensor import Calibration
 from magloc.bounds.maps import BoundScenario, bound_slices
+from magloc.chi_square import square_columns
 from magloc.convergence.over_starts import Status
 from magloc.localization.fit.results import Fix, Solution
 from magloc.plots import style
@@ -172,7 +173,7 @@ class TestBounds:
     def test_columns_of_a_square_are_named_after_it(self) -> None:
         dof = np.array([3, 6])
         for name, of_dof in (("chi2", "dof"), ("nis", "nis_dof")):
-            columns = style.square_columns(name, np.array([2.0, 9.0]), dof)
+            columns = square_columns(name, np.array([2.0, 9.0]), dof)
             assert list(columns) == [name, of_dof, f"{name}_low99", f"{name}_high99"]
             np.testing.assert_allclose(columns[f"{name}_high99"], chi2.ppf(0.995, dof))
 
