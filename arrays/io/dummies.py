@@ -8,7 +8,7 @@ import numpy as np
 
 from arrays.typing import BoolArray, FloatArray
 
-_FEWEST_NINES, _LARGE = 5, 1e20
+_NINES, _LARGE = (1e5, 1e9), 1e20  # powers of ten just above a row of nines
 _BLANKS = (1.70141e38, 3.40282e38)  # largest numbers of single precision, as they are often written
 _FEWEST = 10  # other readings that say that zeros, or a number that is repeated, are none
 _APART, _KNOWN_APART = 10.0, 3.0  # over the spread of the others, or over their size
@@ -67,4 +67,4 @@ def _is_known(size: FloatArray) -> BoolArray:
     large = (size >= _LARGE) & np.isclose(size, power, rtol=1e-6)
     large |= np.isclose(size[:, None], _BLANKS, rtol=1e-4).any(axis=1)
     short = np.isclose((power - size)[:, None], (1.0, 0.1, 0.01), rtol=1e-6).any(axis=1)
-    return np.asarray(large | (short & (power >= 10.0**_FEWEST_NINES)))
+    return np.asarray(large | (short & (power >= _NINES[0]) & (power <= _NINES[1])))

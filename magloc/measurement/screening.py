@@ -23,6 +23,7 @@ _ZONE, _HALO = 50, 25  # rows that are judged, and that are looked at on either 
 _CUT, _STEP = 8.0, 3.0  # over the usual leap
 _QUARTILE = 3.1  # standard deviation of normal numbers over the lower quartile of their absolute values
 _SUPPORTS, _NEAR = 3, 0.25  # rows of a piece that speaks for itself; variance of a row that is predicted well
+_JOINED = 3  # rows of the record between neighbours
 _STARTS, _SWEEPS = 3, 4
 _FEWEST = 20
 
@@ -56,7 +57,7 @@ def wild_readings(values: FloatArray, place_m: FloatArray, depth_m: float, noise
         for first in range(0, n, _ZONE):
             low, high = max(first - _HALO, 0), min(first + _ZONE + _HALO, n)
             if cuts[low + 1 : high].any():
-                scene = _Scene(read[low:high], place_m[index[low:high]] / depth_m, nugget, noise)
+                scene = _Scene(index[low:high], read[low:high], place_m[index[low:high]] / depth_m, nugget, noise)
                 judged = slice(first, min(first + _ZONE, n))
                 more[judged] = scene.wild(np.flatnonzero(cuts[low + 1 : high]) + 1)[first - low : judged.stop - low]
         if not more.any():
@@ -80,14 +81,16 @@ class _Scene:
 
     Parameters
     ----------
-    values : ndarray, shape (n,)
+    index, values : ndarray, shape (n,)
+        Rows of the record, and what was read there.
     place : ndarray, shape (n, 3)
         In depths.
     nugget, noise : float
         As of :func:`wild_readings`, the nugget a variance over that of the process.
     """
 
-    def __init__(self, values: FloatArray, place: FloatArray, nugget: float, noise: float) -> None:
+    def __init__(self, index: IntArray, values: FloatArray, place: FloatArray, nugget: float, noise: float) -> None:
+        self._joined = np.concatenate([[False], np.diff(index) <= _JOINED, [False]])
         self._values, self._nugget = values - np.median(values), nugget
         self._least = noise**2 / nugget
         apart2 = ((place[:, None] - place) ** 2).sum(axis=-1)
@@ -133,9 +136,10 @@ class _Scene:
             errors = self._values[rest] - across @ (weights @ self._values[kept])
             covariance = self._covariance[np.ix_(rest, rest)] - across @ weights @ across.T
             unknown = covariance.diagonal() - self._nugget
-            beside = np.zeros(len(self._values) + 2, np.bool_)
-            beside[kept] = beside[kept + 2] = True
-            told = beside[rest + 1] | (unknown < _NEAR)
+            is_kept = np.zeros(len(self._values) + 2, np.bool_)
+            is_kept[kept + 1] = True
+            beside = (is_kept[:-2] & self._joined[:-1]) | (is_kept[2:] & self._joined[1:])
+            told = beside[rest] | (unknown < _NEAR)
             agree, end = [], 0
             for k, piece in enumerate(others):
                 own = slice(end, end := end + len(piece))
@@ -145,10 +149,10 @@ class _Scene:
                 score = self._scores(errors[own], covariance[own, own]) / largest
                 if score <= 1.0:
                     agree.append((float(unknown[own].min()), score, k))
-            sure = {k for least, score, k in agree if score < 0.5 and least < 0.1}
-            more = sure or ({min(agree)[2]} if agree else set())
-            if not more:
+            if not agree:
                 break
+            best, _, first = min(agree)
+            more = {first} | {k for least, score, k in agree if score < 0.5 and least < max(0.1, 1.2 * best)}
             kept = np.sort(np.concatenate([kept, *(others[k] for k in more)]))
             others = [piece for k, piece in enumerate(others) if k not in more]
         return kept
@@ -173,7 +177,7 @@ class _Scene:
 
     def _size(self, rows: IntArray) -> float:
         """Standard deviation of the process as some rows show it, not below the noise."""
-        values = self._values[rows]
+        values = self._values[rows] - np.median(self._values[rows])
         return math.sqrt(max(float(values @ self._inverse(rows) @ values) / len(rows), self._least))
 
     def _scores(self, errors: FloatArray, covariance: FloatArray) -> float:

@@ -28,6 +28,36 @@ def read(folder: Path, array: arrays.SensorArray, text: str) -> magloc.Readings:
     return magloc.read_readings(path, array)
 
 
+class TestMissing:
+    """What stands for no reading: what is declared, and what pandas takes for it."""
+
+    LOG = "time_s,low_nT,high_nT,MagValid\n0,{},2,1\n1,3,4,0\n2,5,6,1\n"
+
+    @pytest.mark.parametrize("cell", ["", "NA", "N/A", "null", "None", "<NA>", "#N/A", "-nan", "*", "7777", "---"])
+    def test_cells(self, cell: str, tmp_path: Path) -> None:
+        array = array_of(tmp_path, '[columns]\ndummy = [7777, "---"]\n')
+        found = read(tmp_path, array, self.LOG.format(cell))
+        np.testing.assert_allclose(1e9 * found.values_T, [[np.nan, 2.0], [3.0, 4.0], [5.0, 6.0]])
+
+    def test_rows_that_are_not_valid(self, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+        array = array_of(tmp_path, '[columns]\nvalid = {column = "MagValid", equals = [1]}\n')
+        found = read(tmp_path, array, self.LOG.format(1))
+        np.testing.assert_allclose(1e9 * found.values_T, [[1.0, 2.0], [np.nan, np.nan], [5.0, 6.0]])
+        assert "the readings of 1 rows have MagValid that is not 1 and are left out" in caplog.text
+
+    def test_they_are_counted_and_named(self, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+        array = array_of(tmp_path, '[columns]\ndummy = [7777]\nunit = "uT"\n')
+        read(tmp_path, array, "time_s,low_nT,high_nT\n0,7777,2\n1,3,-99999\n2,7777,*\n")
+        assert "2 readings of sensor low are dummy values (7777000) and are left out" in caplog.text
+        assert "2 readings of sensor high are dummy values (-99999000, *) and are left out" in caplog.text
+
+    def test_the_array_file_keeps_them(self, tmp_path: Path) -> None:
+        columns = '[columns]\ndummy = [-7.5, "*"]\nvalid = {column = "V", equals = [1, 4]}\n'
+        array = array_of(tmp_path, columns)
+        arrays.write_array(tmp_path / "again.toml", array)
+        assert arrays.read_array(tmp_path / "again.toml").columns == array.columns
+
+
 class TestValues:
     def test_names_units_and_times(self, tmp_path: Path) -> None:
         array = array_of(

@@ -29,6 +29,19 @@ class TestBaseStation:
         hour = np.arange(0.0, 3600.0, 3.0)
         np.testing.assert_allclose(self.varying(hour), self.varying(self.TIME_S), rtol=0.0, atol=1e-18)
 
+    @pytest.mark.parametrize("rows", [[40], [40, 41], [40, 42], list(range(30, 42))])
+    def test_wild_readings_are_left_out(self, rows: list[int], caplog: pytest.LogCaptureFixture) -> None:
+        base_T = 47e-6 + 1e-9 * self.TIME_S
+        base_T[rows] -= 3e-7
+        found = varying(self.AMBIENT_T, self.TIME_S, Readings(base_T[:, None], time_s=self.TIME_S))
+        np.testing.assert_allclose(found, self.varying(self.TIME_S), rtol=0.0, atol=2e-9)
+        assert f"{len(rows)} readings of the base station leap" in caplog.text
+
+    def test_a_long_gap_is_named(self, caplog: pytest.LogCaptureFixture) -> None:
+        gap = self.TIME_S[(self.TIME_S < 20.0) | (self.TIME_S > 70.0)]
+        np.testing.assert_allclose(self.varying(gap), self.varying(self.TIME_S), rtol=0.0, atol=2e-9)
+        assert "the base station reads nothing from 19 to 71 s" in caplog.text
+
     @pytest.mark.parametrize("unit", [1e-3, 1e3])
     def test_another_unit_is_refused(self, unit: float) -> None:
         base = Readings(unit * np.full((100, 1), 47e-6), time_s=self.TIME_S)
