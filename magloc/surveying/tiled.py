@@ -215,8 +215,8 @@ class TiledSurvey:
         if not lag.s:
             return self, lag
         nothing = [Sources.none()] * len(self.tiles)
-        known = {"sources": Sources.none(), "found": nothing, "known": nothing, "outside": nothing}
-        return replace(self, readings=track.taken_earlier(lag.s), **known), lag
+        unknown = replace(self, sources=Sources.none(), found=nothing, known=nothing, outside=nothing)
+        return replace(unknown, readings=track.taken_earlier(lag.s)), lag
 
     def with_likeliest_pose(self) -> TiledSurvey:
         """With the errors of the pose that the sources of a tile tell."""
