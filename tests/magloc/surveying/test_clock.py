@@ -52,11 +52,12 @@ def white_errors() -> FloatArray:
 class TestTakenEarlier:
     @pytest.mark.parametrize("lag_s", [-0.95, -0.05, 0.05, 0.23])
     def test_white_errors_stay_as_large(self, lag_s: float) -> None:
-        """Of 2,310 the variance differs by 12 % once in 20,000 times; means of two lose a half."""
+        """Of 2,310 the variance differs by 12 % once in 20,000 times; means of two lose a half. Not beyond the ends."""
         still = replace(walked(0.0, 0.0), array_position_m=white_errors())
         moved = SmoothTrack.of(still).taken_earlier(lag_s).array_position_m
         assert moved is not None
-        assert np.mean(moved**2) == pytest.approx(np.mean(white_errors() ** 2), rel=0.12)
+        inside = np.abs(np.arange(770) % 110 - 54.5) < 45.0
+        assert np.mean(moved[inside] ** 2) == pytest.approx(np.mean(white_errors()[inside] ** 2), rel=0.12)
 
     def test_a_smooth_way_moves_along_itself(self) -> None:
         readings = walked(0.0, 0.0)
@@ -81,7 +82,7 @@ class TestTakenEarlier:
         )
         moved = SmoothTrack.of(replace(readings, array_rotation=turn)).taken_earlier(0.1).array_rotation
         assert moved is not None
-        assert np.all((moved * before.inv()).magnitude() < 2e-3)
+        assert np.all((moved * before.inv()).magnitude()[np.arange(770) % 110 > 0] < 1e-5)
 
     def test_the_modulus_stays_that_of_the_readings(self) -> None:
         """A base station has it at their clock; the direction in the world moves with the poses."""
