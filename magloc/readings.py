@@ -42,6 +42,7 @@ POSE_SIGMA_COLUMNS = ("array_sigma_m", "array_sigma_deg")
 AMBIENT_COLUMNS = tuple(f"{name}_nT" for name in AMBIENT_CHANNELS)
 _OPTIONAL_COLUMNS = (*POSITION_COLUMNS, *ROTATION_COLUMNS, *POSE_SIGMA_COLUMNS, *AMBIENT_COLUMNS, *MOTION_COLUMNS)
 EXPECTED_HEADER = "a header with time_s and the sensors' columns"
+_ROW_SHAPES = {"time_s": (), "array_position_m": (3,), "ambient_T": (3,), "pose_sigma": (2,), "interpolated_m": ()}
 _T_IN_nT = 1e9
 _SIGMA_UNITS = np.array([1.0, np.pi / 180.0])  # of a pose's standard deviations, m and degrees
 _SATURATION_RTOL = 1e-12
@@ -107,7 +108,7 @@ class Readings:
     background: Background = NO_BACKGROUND
 
     def __post_init__(self) -> None:
-        for name in ("values_T", "time_s", "array_position_m", "ambient_T", "pose_sigma", "interpolated_m"):
+        for name in ("values_T", *_ROW_SHAPES):
             if getattr(self, name) is not None:
                 checked = {"values_T": fields, "time_s": seconds}.get(name, numbers)
                 object.__setattr__(self, name, checked(getattr(self, name)))
@@ -116,12 +117,10 @@ class Readings:
         n = len(self.values_T)
         if self.time_s is None:
             object.__setattr__(self, "time_s", np.arange(float(n)))
-        shapes = {"time_s": (n,), "array_position_m": (n, 3), "ambient_T": (n, 3), "pose_sigma": (n, 2)}
-        shapes["interpolated_m"] = (n,)
-        for name, shape in shapes.items():
+        for name, shape in _ROW_SHAPES.items():
             value = getattr(self, name)
-            if value is not None and value.shape != shape:
-                raise ValueError(f"Input {name} must have shape {shape}; instead received {value.shape}.")
+            if value is not None and value.shape != (n, *shape):
+                raise ValueError(f"Input {name} must have shape {(n, *shape)}; instead received {value.shape}.")
         if (bad := ~np.isfinite(self.time_s)).any():
             raise ValueError(f"Input time_s must be finite; instead row {bad.argmax() + 1} has {self.time_s[bad][0]}.")
         if (self.array_position_m is None) != (self.array_rotation is None):

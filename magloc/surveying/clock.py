@@ -145,9 +145,9 @@ class SmoothTrack:
         splines = []
         for own in np.split(np.arange(len(time_s)), ends):
             t, degree = time_s[own], min(3, len(own) - 1)
-            knots = [[t[0]] * (degree + 1), t[_ROWS : len(t) - _ROWS : _ROWS], [t[-1]] * (degree + 1)]
+            knots = np.concatenate([np.full(degree + 1, t[0]), t[_ROWS:-_ROWS:_ROWS], np.full(degree + 1, t[-1])])
             flat = BSpline(np.array([t[0], t[0] + 1.0]), rows[own], 0)
-            splines.append(make_lsq_spline(t, rows[own], np.concatenate(knots), degree) if degree else flat)
+            splines.append(make_lsq_spline(t, rows[own], knots, degree) if degree else flat)
         return cls(readings, np.concatenate([[0], ends]), splines)
 
     @cached_property

@@ -13,10 +13,10 @@ from arrays.typing import BoolArray, FloatArray
 from magloc.measurement.pose import PoseErrors, with_stated_pose
 from magloc.measurement.rows import check_magnitudes
 from magloc.measurement.screening import wild_readings
+from magloc.navigation.fixes import between_fixes, interval_of_fixes
 from magloc.navigation.poses import vectors_at
 from magloc.readings import Readings, without_saturated
 from magloc.surveying.fit.record import SurveyRecord
-from magloc.surveying.fixes import interval_of_fixes
 from magloc.surveying.pose_components import UNSTATED
 
 _LOG = logging.getLogger(__name__)
@@ -70,6 +70,26 @@ def whole_rows(
     array = replace(array, pose=UNSTATED) if array.pose is None else array
     ambient = _ambient_T(array, readings)
     return array, replace(readings, ambient_T=ambient if base is None else varying(ambient, readings.time_s, base))
+
+
+def with_places_between_fixes(array: SensorArray, readings: Readings) -> tuple[SensorArray, Readings]:
+    """Return readings whose places move between fixes, and the array whose errors last as long as these."""
+    if readings.array_position_m is None or readings.array_rotation is None:
+        return array, readings
+    found = between_fixes(readings.time_s, readings.array_position_m, readings.array_rotation)
+    if found is None:
+        return array, readings
+    n = len(readings)
+    _LOG.warning(
+        f"places stand still in {found.held} of {n} rows, between fixes that come {found.rate_Hz:.3g} times a second:"
+        " interpolated between fixes" + (f", and the last {n - found.end} rows left out" if found.end < n else "")
+    )
+    poses = {"array_position_m": found.position_m, "array_rotation": found.rotation, "interpolated_m": found.error_m}
+    readings = replace(readings, **poses)[: found.end]  # type: ignore[arg-type]
+    pose, interval_s = array.pose, 1.0 / found.rate_Hz
+    if pose is not None and pose.correlation_s < interval_s:  # a fix errs as long as it counts
+        array = replace(array, pose=replace(pose, correlation_s=interval_s))
+    return array, readings
 
 
 def _some(readings: Readings, which: BoolArray) -> Readings:
@@ -146,7 +166,7 @@ def leaping_rows(readings: Readings) -> BoolArray:
 def record_of(array: SensorArray, readings: Readings) -> tuple[SurveyRecord, PoseErrors]:
     """Anomalies of whole rows in the world frame, offsets of the sensors with them, and the errors of their pose."""
     assert array.pose is not None
-    errors = PoseErrors.of(array.pose, between_s=interval_of_fixes(readings))
+    errors = PoseErrors.of(array.pose, between_s=interval_of_fixes(readings.time_s, readings.interpolated_m))
     assert readings.ambient_T is not None
     return SurveyRecord.of(array, readings, readings.ambient_T, errors), errors
 

@@ -21,9 +21,8 @@ from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.measurement.plausibility import warn_of_doubts
 from magloc.measurement.rows import joined
 from magloc.readings import Readings
-from magloc.surveying.fixes import between_fixes
 from magloc.surveying.piece import OF_ROWS, Ground, sources_in, strongest_in, targets_in
-from magloc.surveying.preparation import whole_rows
+from magloc.surveying.preparation import whole_rows, with_places_between_fixes
 from magloc.surveying.results import Reach, Survey, SurveyRows, Target
 from magloc.surveying.targets import OF_TARGETS
 from magloc.surveying.tiled import TiledSurvey
@@ -131,7 +130,7 @@ def survey(
     rows = readings if isinstance(readings, Readings) else joined(readings)
     warn_of_doubts(array, rows[:_MOST_DOUBTED])
     assumed = array.pose is None and rows.pose_sigma is None
-    array, rows = between_fixes(array, rows)
+    array, rows = with_places_between_fixes(array, rows)
     ground = Ground(prior, ground_m, shortest_geology_m, math.inf, body_length_m)
     tiled = TiledSurvey.of(*whole_rows(array, rows, base, ground.shallowest_m), ground)
     trials = _TRIALS * _HECTARE_M2 / tiled.nearest_m**2

@@ -210,15 +210,20 @@ class TiledSurvey:
             posed = lambda lag_s: replace(piece_at(lag_s), array=array)  # noqa: E731
             return posed, trial(posed, lag_s, sources)
 
-        lag = lag_of(piece_at)
-        if lag.s and pose_assumed:
-            posed, near = at_likeliest_pose(lag.s, None)
-            lag = lag_of(posed, at_likeliest_pose(0.0, piece.known)[1], near)
+        if pose_assumed and len(piece.known):
+            posed, here = at_likeliest_pose(0.0, piece.known)
+            pose = posed(0.0).array.pose
+            lag = lag_of(piece_at if pose is not None and pose.correlation_s else posed)
+            if lag.s:
+                posed, near = at_likeliest_pose(lag.s, None)
+                lag = lag_of(posed, here, near)
+        else:
+            lag = lag_of(piece_at)
         if not lag.s:
             return self, lag
         nothing = [Sources.none()] * len(self.tiles)
-        known = {"sources": Sources.none(), "found": nothing, "known": nothing, "outside": nothing}
-        return replace(self, readings=track.taken_earlier(lag.s), **known), lag
+        unknown = replace(self, sources=Sources.none(), found=nothing, known=nothing, outside=nothing)
+        return replace(unknown, readings=track.taken_earlier(lag.s)), lag
 
     def with_likeliest_pose(self) -> TiledSurvey:
         """With the errors of the pose that the sources of a tile tell."""

@@ -12,7 +12,6 @@ import pytest
 import magloc
 import sims
 from magloc.grids.work import workers
-from magloc.surveying.clock import rows_around, taken_earlier
 from magloc.surveying.fit.joint_fit import Sources
 from magloc.surveying.piece import Ground, strongest_in, targets_in
 from magloc.surveying.preparation import whole_rows
@@ -160,28 +159,6 @@ class TestReach:
         places = targets_in(west)["reach_m"]
         for depth in set(places[:, 2]):
             assert abs(places[places[:, 2] == depth, 0].max()) < 1.0  # half a step between places
-
-
-class TestOnTime:
-    @pytest.mark.parametrize("lag_s", [-0.95, 0.07, 1.0])
-    def test_the_rows_of_a_tile_move_as_in_all(self, lag_s: float) -> None:
-        rows, readings = tiled().tiles[0].rows, tiled().readings
-        around = rows_around(readings.time_s, rows)
-        assert len(rows) < len(around) < len(readings)
-        own = taken_earlier(readings[around], lag_s)[np.searchsorted(around, rows)]
-        of_all = taken_earlier(readings, lag_s)[rows]
-        np.testing.assert_allclose(own.array_position_m, of_all.array_position_m, atol=1e-12)
-        np.testing.assert_allclose(own.ambient_T, of_all.ambient_T, rtol=1e-12)
-
-    def test_the_modulus_stays_that_of_the_readings(self) -> None:
-        """A base station has it at their clock; the direction in the world moves with the poses."""
-        readings = tiled().readings
-        assert readings.ambient_T is not None
-        storm = 1.0 + 1e-3 * np.sin(readings.time_s)[:, None]
-        quiet = taken_earlier(readings, 0.5).ambient_T
-        assert quiet is not None
-        stormy = taken_earlier(replace(readings, ambient_T=readings.ambient_T * storm), 0.5).ambient_T
-        np.testing.assert_allclose(stormy, quiet * storm, rtol=1e-6)
 
 
 class TestBadInput:

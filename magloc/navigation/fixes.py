@@ -2,67 +2,70 @@
 
 from __future__ import annotations
 
-import logging
-from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from arrays.array import SensorArray
 from arrays.typing import FloatArray, IntArray
 from magloc.navigation.poses import rotations_at, vectors_at
-from magloc.readings import Readings
 
-_LOG = logging.getLogger(__name__)
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
+
 _FEWEST_PLACES = 4
 _LOST = 3  # rows: where places are new in every row, the next one that changes leaps if so many were held
 _AS_FAST = 0.5  # of the usual speed, over all of a run: it was held, and the carrier did not rest
 
 
-def between_fixes(array: SensorArray, readings: Readings) -> tuple[SensorArray, Readings]:
-    """Return readings whose places move evenly between fixes, and the array whose errors last as long as these.
+class Interpolated(NamedTuple):
+    """Poses between fixes, standard deviation of places along each axis, and how many rows had stood still.
+
+    Rows after the last fix stand beyond ``end``: their places are not known.
+    """
+
+    position_m: FloatArray
+    rotation: Rotation
+    error_m: FloatArray
+    held: int
+    end: int
+    rate_Hz: float
+
+
+def between_fixes(time_s: FloatArray, position_m: FloatArray, rotation: Rotation) -> Interpolated | None:
+    """Return poses that move evenly between fixes, or None where places do not stand still.
 
     Where most places are repeated in a row they are a staircase: one step for each fix. A carrier that rests repeats
-    its place, too, but it goes on from there by no more than in any other interval.
+    its place, too, but it goes on from there by no more than in any other interval. An attitude that stands still with
+    the places moves with them.
     """
-    if readings.array_position_m is None or readings.array_rotation is None:
-        return array, readings
-    place, time_s, n = readings.array_position_m, readings.time_s, len(readings)
-    first = np.flatnonzero(np.concatenate([[True], (place[1:] != place[:-1]).any(axis=1)]))
+    first = np.flatnonzero(np.concatenate([[True], (position_m[1:] != position_m[:-1]).any(axis=1)]))
     if len(first) < _FEWEST_PLACES or not (np.diff(time_s) > 0.0).all():
-        return array, readings
-    last, end = _last_fixes(place, time_s, first)
-    fixes = np.union1d(first, last)
-    rows = np.arange(n)
-    known = np.isin(rows, fixes) | (rows <= last[np.searchsorted(first, rows, "right") - 1])
+        return None
+    last, end = _last_fixes(position_m, time_s, first)
+    rows = np.arange(len(time_s))
+    known = np.isin(rows, first) | (rows <= last[np.searchsorted(first, rows, "right") - 1])
     held = int((~known).sum())
     if not held:
-        return array, readings
-    rate_Hz = (len(fixes) - 1) / (time_s[fixes[-1]] - time_s[fixes[0]])
-    _LOG.warning(
-        f"places stand still in {held} of {n} rows, between fixes that come {rate_Hz:.3g} times a second: interpolated"
-        f" between fixes{f', and the last {n - end} rows left out' if end < n else ''}"
+        return None
+    fixes_s = time_s[np.union1d(first, last)]
+    stands = (rotation[1:].inv() * rotation[:-1]).magnitude() == 0.0
+    too = bool(stands[~known[1:]].all())
+    return Interpolated(
+        vectors_at(time_s, time_s[known], position_m[known]),
+        rotations_at(time_s, time_s[known], rotation[known]) if too else rotation,
+        _errors_m(position_m, time_s, np.flatnonzero(known)),
+        held,
+        end,
+        (len(fixes_s) - 1) / float(fixes_s[-1] - fixes_s[0]),
     )
-    turns = readings.array_rotation
-    still = (turns[1:].inv() * turns[:-1]).magnitude() == 0.0
-    turns_too = bool(still[~known[1:]].all())
-    moved = replace(
-        readings,
-        array_position_m=vectors_at(time_s, time_s[known], place[known]),
-        array_rotation=rotations_at(time_s, time_s[known], turns[known]) if turns_too else turns,
-        interpolated_m=_errors_m(place, time_s, np.flatnonzero(known)),
-    )[:end]
-    pose, interval_s = array.pose, interval_of_fixes(moved)
-    if pose is not None and pose.correlation_s < interval_s:  # a fix errs as long as it counts
-        array = replace(array, pose=replace(pose, correlation_s=interval_s))
-    return array, moved
 
 
-def interval_of_fixes(readings: Readings) -> float:
-    """Usual time between fixes where places were interpolated [s], 0 where none were."""
-    if readings.interpolated_m is None or not (known := readings.interpolated_m == 0.0).any():
+def interval_of_fixes(time_s: FloatArray, error_m: FloatArray | None) -> float:
+    """Usual time between fixes where places with such errors were interpolated [s], 0 where none were."""
+    if error_m is None:
         return 0.0
-    held = np.flatnonzero(np.diff(known.astype(np.int8)) == 1)  # the last row before each fix
-    times = readings.time_s[held + 1]
+    known = error_m == 0.0
+    times = time_s[1:][known[1:] & ~known[:-1]]  # of fixes after rows that were interpolated
     return float(np.median(np.diff(times))) if len(times) > 1 else 0.0
 
 
