@@ -98,7 +98,7 @@ def live(
     with ExitStack() as open_page:
         view = open_page.enter_context(shown(follower, page, quiet=common.quiet)) if page.view else None
         try:
-            with naming_place(), naming(str(array)):
+            with naming_place(), naming(str(array), readings=source, time_s=source):
                 for point in follower.follow(source, replay_speed=replay_speed):
                     print_point(point, wanted)
                     if view is not None:
