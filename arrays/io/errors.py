@@ -46,14 +46,18 @@ def own_sentence(error: ValueError) -> str:
 
 
 @contextmanager
-def naming(place: str) -> Iterator[None]:
-    """Turn what the library refuses into bad input at a place of a file or command."""
+def naming(place: str, **others: str) -> Iterator[None]:
+    """Turn what the library refuses into bad input at a place of a file or command.
+
+    `others` are the places of arguments that come from elsewhere, by their names, the first words of such sentences.
+    """
     try:
         yield
     except InputError:
         raise
     except ValueError as error:
-        raise InputError(f"{place}: {own_sentence(error)}") from None
+        sentence = own_sentence(error)
+        raise InputError(f"{others.get(sentence.partition(' ')[0], place)}: {sentence}") from None
 
 
 @contextmanager

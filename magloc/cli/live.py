@@ -108,7 +108,7 @@ def live(
         view = open_page.enter_context(shown(follower, page, quiet=common.quiet)) if page.view else None
         table = None if out is None else open_page.enter_context(GrowingTable(out))
         try:
-            with naming_place(), naming(str(array)):
+            with naming_place(), naming(str(array), readings=source, time_s=source):
                 for point in follower.follow(source, replay_speed=replay_speed):
                     print_point(point, wanted)
                     if table is not None:

@@ -152,7 +152,8 @@ def locate(
     except ValueError as error:
         sentence = own_sentence(error)
         option = "" if sentence.startswith("array") else _option_of(sentence, known.region, wanted.sources)
-        raise InputError(f"{option or array}: {sentence}{_advice(sentence, used)}") from None
+        place = readings if sentence.startswith("readings") else array
+        raise InputError(f"{option or place}: {sentence}{_advice(sentence, used)}") from None
 
     if json:
         print_json_list("results", entries_of_fixes(fixes, joint=joint))

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,7 +12,7 @@ from cyclopts import Parameter
 import arrays
 import magloc
 from arrays.io.arguments import Flag
-from arrays.io.errors import InputError, own_sentence
+from arrays.io.errors import InputError, naming
 from arrays.io.outputs import make_folder, refuse_file, refuse_one_for_two, refuse_unwritable
 from magloc.cli.framework import CommonOptions, print_report
 from magloc.cli.options import (
@@ -123,7 +121,8 @@ def survey(
     used, rows = fields[0][0], [replace(part, ambient_T=own) for part, (_, own) in zip(parts, fields, strict=True)]
     at_base = arrays.SensorArray((arrays.Sensor("base", "scalar", (0.0, 0.0, 0.0), 1e-10),))
     station = None if base is None else magloc.read_readings(base, at_base, ordered=True)
-    with _naming(", ".join(map(str, readings))), naming_scheduler():
+    named = naming(", ".join(map(str, readings)), array=str(array))
+    with named, naming_options("ground_m", "base", "body_length_m"), naming_scheduler():
         found = magloc.survey(
             used,
             rows,
@@ -154,18 +153,6 @@ def survey(
         if pose is not None and pose.position_white_m:
             size += f", and {100.0 * pose.position_white_m:.2g} cm new in every row"
         print_note(f"nothing is stated of the pose's errors: as the rows show them{size}")
-
-
-@contextmanager
-def _naming(readings: str) -> Iterator[None]:
-    """Let errors of the library speak of the options and of the file."""
-    try:
-        with naming_options("ground_m", "base", "body_length_m"):
-            yield
-    except ValueError as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{readings}: {own_sentence(error)}") from None
 
 
 def _write(found: Survey, folder: Path) -> None:

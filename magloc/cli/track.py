@@ -249,7 +249,7 @@ def track(
     if path is not None:
         outputs = MomentOutputs(json, jsonl, maps, out, truth, common.quiet)
         turn_rad_s = motion.turn_rad_s
-        with naming(str(array)):
+        with naming(str(array), readings=str(readings), time_s=str(readings)):
             if isinstance(path, list) and len(path) > 1:
                 write_moment_tracks(
                     magloc.track_moments(used, rows, path, turn_rad_s=turn_rad_s, smooth=smooth), readings, outputs
@@ -269,7 +269,8 @@ def track(
     few = used.n_channels <= _FEW_CHANNELS and rows.array_rotation is not None
     if few and not common.quiet:
         print_note(_USE_SURVEY)
-    with progress(len(rows), "rows", quiet=common.quiet) as advance, naming(str(array)):
+    named = naming(str(array), readings=str(readings), time_s=str(readings))
+    with progress(len(rows), "rows", quiet=common.quiet) as advance, named:
         if printed:
             warn_of_doubts(used, rows)
             tracker = magloc.Tracker(with_stated_pose(used, rows), model, prior=prior)

@@ -131,14 +131,14 @@ def calibrate(
             raise InputError("--modulus-nT: found it together with an option for a moving source, expected none.")
         nominal = arrays.read_sensors(array)
         rows = read_readings(readings, nominal)
-        with naming(str(array)):
+        with naming(str(array), readings=str(readings)):
             result = magloc.calibrate(nominal, rows, modulus_T=turning.modulus_of(modulus_nT, rows))
     else:
         nominal = array_of_several(array)
         prior = _prior(known, nominal, array)
         rows = read_readings(readings, nominal)
         path = _path(rows, truth, height_m, readings)
-        with naming(str(readings)):
+        with naming(str(readings), array=str(array), truth=str(truth)):
             result = magloc.calibrate(nominal, rows, truth=path, moment=moment, prior=prior)
     if isinstance(result, TurningCalibration):
         turning.check(result, readings, array, out)

@@ -86,7 +86,8 @@ def signature(
             )
         passes.append(replace(rows, ambient_T=ambient_T))
     paths = [magloc.read_object_path(path) for path in object_path]
-    with naming(str(array)):
+    names = ", ".join(map(str, readings))
+    with naming(str(array), readings=names, time_s=names, path=", ".join(map(str, object_path))):
         result = magloc.fit_signature(
             used or nominal,
             passes,

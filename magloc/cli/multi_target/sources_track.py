@@ -131,7 +131,7 @@ def follow_sources(
     json, jsonl, quiet = outputs.json, outputs.jsonl, outputs.quiet
     if rows.background:
         raise InputError("--sources: found it together with --detrend or --high-pass-hz, expected one of them.")
-    with progress(len(rows), "rows", quiet=quiet) as advance, naming(name), wanted.named():
+    with progress(len(rows), "rows", quiet=quiet) as advance, naming(name, array="--array"), wanted.named():
         found = magloc.track_sources(
             array,
             rows,

@@ -64,12 +64,14 @@ def lines_of_fixes(fixes: Fixes, *, joint: bool | None = None, most: int | None 
             rows.append([time, *([str(k + 1)] if joint else []), *of_source])
             reasons.append("")
     widths = [max(len(row[i]) for row in rows if i < len(row)) for i in range(len(header) - 1)]
+    widest = sum(widths) + max(len(row[-1]) for row in rows if len(row) == len(header)) + 2 * len(widths)
+    gap = "  " if widest <= _WIDTH else " "
     lines = []
     for row, reason in zip(rows, reasons, strict=True):
         aligned = [cell.rjust(width) for cell, width in zip(row, widths, strict=False)]
         complete = len(row) == len(header)
         lines.append(
-            "  ".join([*aligned, row[-1]]).rstrip() if complete else f"{aligned[0]}  not solved: {reason}"[:_WIDTH]
+            gap.join([*aligned, row[-1]]).rstrip() if complete else f"{aligned[0]}  not solved: {reason}"[:_WIDTH]
         )
     if len(shown) < len(fixes):
         lines.insert(middle, f"… {len(fixes)} rows")

@@ -14,6 +14,10 @@ class TestNaming:
         with pytest.raises(InputError, match=r"^log\.csv: (noise_T|a and b) must"), naming("log.csv"):
             raise ValueError(sentence)
 
+    def test_the_argument_at_fault_is_named(self) -> None:
+        with pytest.raises(InputError, match=r"^array\.toml: array must"), naming("log.csv", array="array.toml"):
+            raise ValueError("Input array must have two sensors.")
+
     def test_others_stay_what_they_are(self) -> None:
         with pytest.raises(np.linalg.LinAlgError, match=r"^Singular matrix$"), naming("log.csv"):
             np.linalg.inv(np.zeros((2, 2)))

@@ -159,7 +159,7 @@ class TestTable:
         header, *lines = outcome.out.splitlines()
         assert header.split()[:4] == ["time_s", "x_m", "y_m", "z_m"]
         assert len(lines) == 3
-        assert lines[0].split()[:4] == ["0", "2.000", "1.000", "0.500"]
+        assert [float(cell) for cell in lines[0].split()[:4]] == [0.0, 2.0, 1.0, 0.5]
         assert len(lines[0].split("/")[0]) == len(lines[1].split("/")[0])
         assert "not solved" in lines[2]
         assert max(map(len, [header, *lines])) <= 100
@@ -176,7 +176,7 @@ class TestTable:
         outcome = run("locate", path, "--array", array)
         header, line = outcome.out.splitlines()
         assert header.split()[:4] == ["time_s", "x_mm", "y_mm", "z_mm"]
-        assert line.split()[:4] == ["0", "20.00", "10.00", "5.00"]
+        assert [float(cell) for cell in line.split()[:4]] == [0.0, 20.0, 10.0, 5.0]
 
     def test_summary(self, run: Run, array: Path, readings: Path) -> None:
         outcome = run("locate", readings, "--array", array, "--body-length-m", 0)
