@@ -90,7 +90,7 @@ class InertialMagneticRecord:
                 raise ValueError(f"Input {name} must be finite, of shape {shape}; instead received {values.shape}.")
             if np.nanmax(np.abs(values), initial=0.0) > _LARGEST[name]:
                 raise ValueError(f"Input {name} must not exceed {_LARGEST[name]:g}; instead received more.")
-            missing = np.isnan(values).any(axis=1)
+            missing = np.asarray(np.isnan(values).any(axis=1))
             if missing.any():
                 values = np.where(missing[:, None], np.nan, values)
             if missing[self.starting].all() and not (name == "field_T" and missing.all()):

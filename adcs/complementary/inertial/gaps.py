@@ -87,7 +87,7 @@ def shown_turns(
     rows = np.flatnonzero(is_read(steady_field))
     for before, after in gaps:
         i, k = np.searchsorted(rows, [before + 1, after])
-        if i == 0 or k == len(rows) or not _SHOWN_S <= time_s[after] - time_s[before]:
+        if i == 0 or k == len(rows) or time_s[after] - time_s[before] < _SHOWN_S:
             continue
         if time_s[rows[k]] - time_s[rows[i - 1]] < time_s[after] - time_s[before] + _CHANGE_S:
             variance = float(np.sum(hidden_rad2[before + 1 : after + 1]))

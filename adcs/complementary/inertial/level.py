@@ -97,7 +97,7 @@ def _scatter_rad(steady: Steady, gaps: list[tuple[int, int, FloatArray, bool]]) 
     begins = np.diff(numbered_windows(steady.time_s, _WINDOW_S), prepend=0) > 0
     for before, after, *_ in gaps:
         begins[[before + 1, min(after, len(begins) - 1)]] = True
-    window = np.cumsum(begins)
+    window = np.cumsum(begins, dtype=np.intp)
     _, scatter, _ = window_scatter(steady.acceleration_m_s2, window)
     scatter = np.where(np.isfinite(scatter), scatter, 0.0)
     near = np.maximum(scatter, np.append(scatter[1:], 0.0))
@@ -138,7 +138,7 @@ def _piece(
         k = np.count_nonzero(fresh)
         smooth = np.concatenate([means[:k], low_pass(values[k:], dt_s[k:], GRAVITY_TIME_S, start)])
     if offline and len(seen):
-        count = max(np.count_nonzero(age_s < 1.0), 1)
+        count = max(int(np.count_nonzero(age_s < 1.0)), 1)
         end = values[seen[-count:]].mean(axis=0)
         steps = np.concatenate([dt_s[:1], dt_s[:0:-1]])
         smooth = 0.5 * (smooth + low_pass(values[::-1].copy(), steps, GRAVITY_TIME_S, end)[::-1])

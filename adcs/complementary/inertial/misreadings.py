@@ -119,7 +119,7 @@ def check_turns(
     hidden : ndarray of bool, shape (n,)
         Instants within a gap of the gyro.
     """
-    gaps = np.cumsum(hidden)
+    gaps = np.cumsum(hidden, dtype=np.intp)
     vectors = {"magnetometer": field_T, "accelerometer": acceleration_m_s2}
     windows = {name: _windows(time_s, v, gaps, _TURNS_RAD[name]) for name, v in vectors.items()}
     windows = {name: w for name, w in windows.items() if len(w.first)}

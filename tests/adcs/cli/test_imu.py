@@ -75,6 +75,31 @@ class TestImu:
         assert "total_rms_deg" not in summary
         assert set(summary) == {"rows", "method", "disturbed_fraction", "flags", "seconds"}
 
+    def test_without_a_magnetometer(self, adcs, tmp_path):
+        """No columns of a field: flagged in JSON, said on stderr, and a misspelt column is no missing magnetometer."""
+        table = read_table(IMU.path, "a log")
+        columns = dict(zip(table.header, table.values.T, strict=True))
+        six = {name: values for name, values in columns.items() if "field" not in name}
+        write_columns(six, tmp_path / "six.csv")
+        outcome = adcs("imu", tmp_path / "six.csv", "--json", "--out", tmp_path / "out")
+        summary = json.loads(outcome.out)
+        assert summary["method"] == "six-axes"
+        assert summary["flags"] == ["heading-relative"]
+        assert "there is no magnetometer" in outcome.err
+        write_columns(six | {"mag_x": IMU.time_s}, tmp_path / "other.csv")
+        assert_refused(adcs("imu", tmp_path / "other.csv"), "column field_x_nT: found no such column")
+
+    def test_a_misread_gyro(self, adcs, tmp_path):
+        table = read_table(IMU.path, "a log")
+        columns = dict(zip(table.header, table.values.T, strict=True))
+        turned = {n: -values if n.startswith("gyro") else values for n, values in columns.items()}
+        write_columns(turned, tmp_path / "log.csv")
+        outcome = adcs("imu", tmp_path / "log.csv", "--out", tmp_path / "out")
+        assert_refused(
+            outcome, "log.csv: gyro_rad_s must turn as the other sensors do", "the gyro, all its signs reversed"
+        )
+        assert not (tmp_path / "out").exists()
+
     def test_refusals(self, adcs, log, tmp_path):
         assert_refused(adcs("imu", tmp_path / "none.csv"), "none.csv does not exist")
         text = log.read_text().splitlines()
