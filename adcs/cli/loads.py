@@ -32,8 +32,9 @@ def loads(
     """Find the fields of loads, magnets and torquers that switch on board, at each magnetometer.
 
     Each switch is a step of the readings, and the gyro tells how the satellite turns meanwhile; no model of the
-    Earth's field is needed. With three magnetometers or more every load is located too, as a dipole: that names it,
-    gives its torque, and predicts its field elsewhere. What is subtracted is the field that was found, not the
+    Earth's field is needed. Where the states are of another clock than the readings, a warning says the lag, and the
+    fields are corrected for it. With three magnetometers or more every load is located too, as a dipole: that names
+    it, gives its torque, and predicts its field elsewhere. What is subtracted is the field that was found, not the
     dipole's.
 
     Parameters

@@ -179,6 +179,8 @@ def _likeliest(record: Record, settings: FilterSettings, hypotheses: Start, runs
     # Without a gate: how badly a wrong turn fits is what tells it.
     tracks = run_filter(part(record, runs, slice(n)), replace(settings, gate=0.0), hypotheses)
     misfit = np.nansum(tracks.nis + tracks.log_det, axis=(1, 2))
+    # A filter that left double precision has no innovations, which must not count as small ones.
+    misfit[~np.isfinite(tracks.q[:, -1]).all(axis=-1)] = np.inf
     best = np.array([np.where(np.isfinite(misfit), misfit, np.inf).argmin()])
     optional = {name: values[best, -1] for name, values in tracks.optional.items()}
     return _Tried(hypotheses.of_runs(best), float(misfit[best[0]]), optional, tracks.covariance[best, -1])

@@ -240,7 +240,7 @@ def find_own_fields(
     Returns
     -------
     OwnFields
-        The field of each at each magnetometer, per unit of its state.
+        The field of each per unit of its state, corrected for a lag of up to 30 s between states and readings.
 
     Raises
     ------
@@ -310,7 +310,7 @@ def _fit(
 @np.errstate(over="ignore", invalid="ignore")
 def _whole_lag(times: FloatArray, fields: FloatArray, turns: FloatArray, s: FloatArray) -> Lag:
     """Lag in whole rows at which switches explain most of what the fields jump by between two rows."""
-    steps, changes = np.diff(times), np.diff(s, axis=0)
+    steps, changes = np.diff(times), np.diff(s / np.maximum(np.abs(s).max(axis=0), np.finfo(float).tiny), axis=0)
     step_s, switches = float(np.median(steps)), np.flatnonzero((changes != 0.0).any(axis=1))
     jumps = np.einsum("nij,nmj->nmi", quaternion.matrix(turns[1:]), fields[1:]) - fields[:-1]
     # Less what the steps before and after lead to expect, in deviations.
@@ -320,7 +320,8 @@ def _whole_lag(times: FloatArray, fields: FloatArray, turns: FloatArray, s: Floa
     if not jumps.size:
         return Lag(0, 0, step_s, is_known=False)
     jumps /= np.maximum(1.4826 * np.nanmedian(np.abs(jumps), axis=0), 1e-12)
-    lags = np.arange(-int(LONGEST_LAG_S / step_s), int(LONGEST_LAG_S / step_s) + 1)
+    longest = int(min(LONGEST_LAG_S / step_s, len(times)))
+    lags = np.arange(-longest, longest + 1)
     explained = np.zeros(len(lags))
     for place, lag in enumerate(lags):
         rows = np.searchsorted(times, 0.5 * (times[switches] + times[switches + 1]) + lag * step_s) - 2
@@ -432,10 +433,7 @@ def _inverse(normal: FloatArray) -> FloatArray:
 
 
 def _regression(windows: Sequence[tuple[FloatArray, FloatArray]], loads: int) -> _Fitted:
-    """Fields (K, M, 3) of the loads, deviations, noise (M,) and degrees of freedom of each of M least squares.
-
-    They have one design and a weak prior.
-    """
+    """Fields (K, M, 3), deviations, noise (M,) and degrees of freedom by M least squares of one design, weak prior."""
     A, y = (np.concatenate(parts) for parts in zip(*windows, strict=True))
     dof = len(A) - 3 * (_DEGREE + 1) * len(windows) - A.shape[1]
     normal = A.T @ A
