@@ -34,13 +34,15 @@ class InputError(ValueError):
 
 
 @contextmanager
-def naming(place: str) -> Iterator[None]:
-    """Turn what the library refuses into bad input at a place of a file or command."""
+def naming(place: str, *, readings: object = None) -> Iterator[None]:
+    """Turn what the library refuses into bad input at a place of a file or command, or in a file of `readings`."""
     try:
         yield
     except InputError:
         raise
     except ValueError as error:
+        if readings is not None and str(error).startswith("Input readings"):
+            place = str(readings)
         raise InputError(f"{place}: {str(error).removeprefix('Input ').removeprefix('Inputs ')}") from None
 
 

@@ -238,7 +238,7 @@ def track(
     if path is not None:
         outputs = MomentOutputs(json, jsonl, maps, out, truth, common.quiet)
         turn_rad_s = motion.turn_rad_s
-        with naming(str(array)):
+        with naming(str(array), readings=readings):
             if isinstance(path, list) and len(path) > 1:
                 write_moment_tracks(
                     magloc.track_moments(used, rows, path, turn_rad_s=turn_rad_s, smooth=smooth), readings, outputs
@@ -258,7 +258,7 @@ def track(
     few = used.n_channels <= _FEW_CHANNELS and rows.array_rotation is not None
     if few and not common.quiet:
         print_note(_USE_SURVEY)
-    with progress(len(rows), "rows", quiet=common.quiet) as advance, naming(str(array)):
+    with progress(len(rows), "rows", quiet=common.quiet) as advance, naming(str(array), readings=readings):
         if printed:
             tracker = magloc.Tracker(with_stated_pose(used, rows), model, prior=prior)
             found = magloc.Track(tuple(_printed_points(tracker, list(rows_of(rows)), advance)), rows, tracker)

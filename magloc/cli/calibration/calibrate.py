@@ -129,7 +129,7 @@ def calibrate(
             raise InputError("--modulus-nT: found it together with an option for a moving source, expected none.")
         nominal = arrays.read_sensors(array)
         rows = read_readings(readings, nominal)
-        with naming(str(array)):
+        with naming(str(array), readings=readings):
             result = magloc.calibrate(nominal, rows, modulus_T=turning.modulus_of(modulus_nT, rows))
     else:
         nominal = array_of_several(array)

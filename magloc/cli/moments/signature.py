@@ -86,7 +86,7 @@ def signature(
             )
         passes.append(replace(rows, ambient_T=ambient_T))
     paths = [magloc.read_object_path(path) for path in object_path]
-    with naming(str(array)):
+    with naming(str(array), readings=", ".join(map(str, readings))):
         result = magloc.fit_signature(
             used or nominal,
             passes,
