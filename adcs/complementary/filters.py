@@ -21,6 +21,7 @@ from adcs.satellite.attitude_track import AttitudeTrack
 from adcs.satellite.telemetry import is_read
 from adcs.satellite.vector_record import GyroSamples, VectorRecord, step_rates, steps_s
 from adcs.satellite.wahba import attitude_of_vectors
+from arrays.io.values import numbers, seconds
 from arrays.typing import BoolArray, FloatArray
 
 LEFT_OUT, SUBTRACTED = "field left out", "magnet subtracted"
@@ -92,13 +93,12 @@ def complementary_filter(
     """
     if method not in METHODS:
         raise ValueError(f"Input method must be one of {', '.join(METHODS)}; instead received {method!r}.")
-    times = np.asarray(time_s, dtype=np.float64)
+    times = seconds(time_s)
     dt_s = steps_s(times)
     for name, vectors in (("body_vectors", body_vectors), ("frame_vectors", frame_vectors)):
         if len(vectors) != 2:
             raise ValueError(f"Input {name} must be two vectors; instead received {len(vectors)}.")
-    rate = np.asarray(gyro_rad_s, dtype=np.float64)
-    body = [np.asarray(v, dtype=np.float64) for v in body_vectors]
+    rate, body = numbers(gyro_rad_s), list(map(numbers, body_vectors))
     frame = [np.broadcast_to(np.asarray(v, dtype=np.float64), (len(times), 3)) for v in frame_vectors]
     vectors = body[0], body[1], frame[0], frame[1]
     record = VectorRecord(dt_s, step_rates(rate, dt_s, gyro_samples), *vectors, np.zeros_like(rate))
@@ -186,10 +186,8 @@ def inertial_magnetic_filter(
     """
     if magnet not in MAGNETS:
         raise ValueError(f"Input magnet must be one of {', '.join(MAGNETS)}; instead received {magnet!r}.")
-    times, rate, acceleration = (
-        np.asarray(values, dtype=np.float64) for values in (time_s, gyro_rad_s, acceleration_m_s2)
-    )
-    field = np.full_like(rate, np.nan) if field_T is None else np.asarray(field_T, dtype=np.float64)
+    times, rate, acceleration = seconds(time_s), numbers(gyro_rad_s), numbers(acceleration_m_s2)
+    field = np.full_like(rate, np.nan) if field_T is None else numbers(field_T)
     record = InertialMagneticRecord(times, rate, acceleration, field, gyro_samples)
     check_units(record)
     prepared = prepare(record, model, offline=offline)

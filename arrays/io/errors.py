@@ -46,7 +46,7 @@ def own_sentence(error: ValueError) -> str:
 
 
 @contextmanager
-def naming(place: str, **others: str) -> Iterator[None]:
+def naming(place: str, **others: object) -> Iterator[None]:
     """Turn what the library refuses into bad input at a place of a file or command.
 
     `others` are the places of arguments that come from elsewhere, by their names, the first words of such sentences.

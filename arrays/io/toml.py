@@ -58,12 +58,13 @@ def one_of(names: Collection[str], expected: str = "") -> Rule:
     return Rule(lambda value: value in names, expected or f"one of {', '.join(names)}")
 
 
-# What a rate of less is divided into is no number any more.
-POSITIVE = Rule(lambda value: float(value) >= 1.0 / LARGEST, "a positive number")
+POSITIVE = Rule(lambda value: value > 0, "a positive number")
 NOT_NEGATIVE = Rule(lambda value: value >= 0, "a number that is not negative")
 MAY_BE_INFINITE = Rule(lambda _: True, "", may_be_infinite=True)
 _VERSION = Rule(lambda value: value == FORMAT_VERSION, str(FORMAT_VERSION))
 Positive = Annotated[float, POSITIVE]
+Rate = Annotated[float, Rule(lambda value: value >= 1.0 / LARGEST, f"a rate of {1.0 / LARGEST:g} at least")]
+"""Positive, and no time divided by it is infinite."""
 NotNegative = Annotated[float, NOT_NEGATIVE]
 
 
@@ -228,8 +229,6 @@ def _check_value(where: str, value: Any, rules: tuple[Rule, ...]) -> None:
             if isinstance(value, int) and value.bit_length() > 1000:
                 value = math.inf if value > 0 else -math.inf
             found = repr(value) if isinstance(value, str) else f"{value:g}"
-            if rule is POSITIVE and value > 0:
-                found += ", as good as zero"
             raise InputError(f"{where}: found {found}, expected {rule.expected}.")
 
 

@@ -15,6 +15,7 @@ from arrays.io.toml import (
     File,
     NotNegative,
     Positive,
+    Rate,
     RefusalError,
     Rule,
     Table,
@@ -192,7 +193,7 @@ class FileTable(File, kw_only=True):
     """The whole file."""
 
     duration_s: Positive
-    rate_Hz: Positive
+    rate_Hz: Rate
     array: dict[str, Any] | str
     name: str | None = None
     sensors: SensorsTable = msgspec.field(default_factory=SensorsTable)
