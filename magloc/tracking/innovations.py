@@ -91,12 +91,10 @@ class InnovationTest:
             why = "ambient_uncertainty_nT is stated too small"
         elif self.z_lag1 > THRESHOLD:
             what = f"innovations of successive rows are alike (z = {self.z_lag1:.1f})"
-            why = (
-                "errors that last, of the pose or of sensors, a motion that is not the stated one, or filtered readings"
-            )
+            why = "errors that last (offsets, pose), another motion than the stated one, or filtered readings"
         else:
             what = f"innovations are larger than is stated (z = {self.z_chi2:.1f})"
-            why = "errors of the pose, noise or a motion that are not stated"
+            why = "offsets, errors of the pose, noise or a motion that are not stated"
         return f"{what}: {why}; the standard deviations are too small"
 
     @property
