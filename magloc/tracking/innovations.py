@@ -91,10 +91,10 @@ class InnovationTest:
             why = "ambient_uncertainty_nT is stated too small"
         elif self.z_lag1 > THRESHOLD:
             z, what = self.z_lag1, "differences between readings and predictions are alike in successive rows"
-            why = "the motion differs from the motion model, errors of pose or sensors last, or readings were filtered"
+            why = "the motion differs from the motion model, offsets or errors of the pose last, or readings were filtered"
         else:
             z, what = self.z_chi2, "differences between readings and predictions are larger than is stated"
-            why = "the motion differs from the motion model, or noise and errors of the pose are larger"
+            why = "the motion differs from the motion model, or offsets, noise or errors of the pose are larger"
         return f"{what}: {why} ({z:.1f} standard deviations from a right model, {THRESHOLD} are allowed)"
 
     @property
