@@ -12,7 +12,7 @@ import socket
 import sys
 import time
 from collections.abc import Callable, Hashable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from urllib.parse import SplitResult, urlsplit
 
@@ -26,7 +26,8 @@ KINDS = "-, tcp://HOST:PORT, udp://HOST:PORT, serial:DEVICE@BAUD or replay:FILE"
 """Of addresses."""
 _CHUNK = 65536
 _ALL_THAT_WAITS = 2**20  # bytes of a connection, read at once
-_DATAGRAMS = 10_000  # read at once: more would keep what was read from being handed out
+_DATAGRAMS = 200  # of a socket, read at once: more would keep what was read from being handed out
+_OWN_SOCKETS = 8
 _PAUSE_S = 0.002  # before senders of nothing but what is no row are heard: a flood must not take the whole processor
 LONGEST_LINE = 2**20
 """Bytes: what has no line end until then is a garbled line."""
@@ -71,9 +72,9 @@ def opened(address: str, *, replay_speed: float = 1.0, form: LogFormat = READING
             with _connected(address) as peer:
                 yield Stream(address, _lines(_of_tcp(peer)))
         case "udp":
-            with _bound(address) as peer:
-                senders = Senders()
-                yield Stream(address, _of_udp(peer, senders), senders.accept)
+            with _bound(address) as peer, ExitStack() as stack:
+                port_of_all = _Port(peer, stack)
+                yield Stream(address, port_of_all.batches(), port_of_all.accept)
         case "serial":
             device, separator, baud = rest.rpartition("@")
             if not (separator and device and baud.isascii() and baud.isdigit() and int(baud)):
@@ -171,26 +172,61 @@ def _bound(address: str) -> Iterator[socket.socket]:
         yield bound
 
 
-def _of_udp(own: socket.socket, senders: Senders) -> Iterator[Batch]:
-    """Lines of the datagrams that wait, of one sender at a time; each datagram ends with its last line."""
-    own.setblocking(False)
-    while True:
-        select.select([own], [], [], 0.0 if senders else None)
-        _receive(own, senders)
-        if senders and not senders.is_urgent:
-            time.sleep(_PAUSE_S)
-            _receive(own, senders)
-        if senders:
-            yield senders.take()
+class _Port:
+    """Datagrams that arrive at a port, handed out by sender; each ends with its last line.
 
+    On Linux a good sender gets a socket of its own, with a buffer that no flood fills.
+    """
 
-def _receive(own: socket.socket, senders: Senders) -> None:
-    """Take in the datagrams that wait."""
-    buffer = bytearray(_CHUNK)  # one for all: bytes that are shortened afterwards leave holes in the memory
-    with suppress(BlockingIOError):
-        for _ in range(_DATAGRAMS):
-            size, sender = own.recvfrom_into(buffer)
-            senders.put(bytes(buffer[:size]), sender)
+    def __init__(self, common: socket.socket, stack: ExitStack) -> None:
+        common.setblocking(False)
+        self._common, self._stack = common, stack
+        self._own: dict[Hashable, socket.socket] = {}
+        self._senders = Senders()
+
+    def batches(self) -> Iterator[Batch]:
+        """Lines of the datagrams that wait, of one sender at a time."""
+        senders = self._senders
+        while True:
+            select.select([self._common, *self._own.values()], [], [], 0.0 if senders else None)
+            self._receive()
+            if senders and not senders.is_urgent:
+                time.sleep(_PAUSE_S)
+                self._receive()
+            if senders:
+                yield senders.take()
+
+    def accept(self, sender: Hashable) -> None:
+        """Note that a sender sent a row or a header."""
+        self._senders.accept(sender)
+        if sys.platform == "linux" and sender not in self._own and len(self._own) < _OWN_SOCKETS:
+            with suppress(OSError):  # the sender then stays among the others
+                self._own[sender] = self._socket_of(sender)
+
+    def _socket_of(self, sender: Hashable) -> socket.socket:
+        """A socket of the same port, connected to a sender, to which the system hands that sender's datagrams."""
+        common = self._common
+        own = self._stack.enter_context(socket.socket(common.family, common.type, common.proto))
+        own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _UDP_BUFFER)
+        own.setblocking(False)
+        for each in (common, own):
+            each.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            own.bind(common.getsockname())
+        finally:  # or another program could take the port
+            for each in (common, own):
+                each.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 0)
+        own.connect(sender)  # type: ignore[arg-type]  # an address
+        return own
+
+    def _receive(self) -> None:
+        """Take in the datagrams that wait."""
+        buffer = bytearray(_CHUNK)  # one for all: bytes that are shortened afterwards leave holes in the memory
+        for each in (*self._own.values(), self._common):
+            with suppress(BlockingIOError, ConnectionError):
+                for _ in range(_DATAGRAMS):
+                    size, sender = each.recvfrom_into(buffer)
+                    self._senders.put(bytes(buffer[:size]), sender)
 
 
 def _of_serial(port: serial.Serial) -> Iterator[bytes]:  # type: ignore[name-defined]  # noqa: F821 - an extra

@@ -83,6 +83,32 @@ class TestUdp:
                 found += next(stream.batches).lines
         assert found == LINES
 
+    def test_a_good_sender_is_heard_beside_a_full_buffer(self) -> None:
+        """Its datagrams come once each, in order, before and after it is known, and the port stays taken."""
+        found: dict[object, list[bytes]] = {}
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.bind(("127.0.0.1", 0))
+            port = ("127.0.0.1", probe.getsockname()[1])
+        with (
+            opened(f"udp://127.0.0.1:{port[1]}") as stream,
+            socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as good,
+            socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as foreign,
+        ):
+            good.bind(("127.0.0.1", 0))
+            for i in range(20):
+                good.sendto(b"%d" % i, port)
+                for _ in range(1000 if sys.platform == "linux" and i > 2 else 1):
+                    foreign.sendto(b"x" * 1000, port)
+                while len(found.get(good.getsockname(), ())) <= i:
+                    batch = next(stream.batches)
+                    found.setdefault(batch.sender, []).extend(batch.lines)
+                stream.accept(good.getsockname())
+            assert found[good.getsockname()] == [b"%d" % i for i in range(20)]
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+                other.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                with pytest.raises(OSError, match="in use"):
+                    other.bind(port)
+
     def test_a_port_in_use(self) -> None:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
             other.bind(("127.0.0.1", 0))
