@@ -94,7 +94,7 @@ class InnovationTest:
             why = "the motion differs from the motion model, offsets or errors of the pose last, or readings were filtered"
         else:
             z, what = self.z_chi2, "differences between readings and predictions are larger than is stated"
-            why = "the motion differs from the motion model, or offsets, noise or errors of the pose are larger"
+            why = "the motion differs from the motion model, or noise and errors of the pose are larger"
         return f"{what}: {why} ({z:.1f} standard deviations from a right model, {THRESHOLD} are allowed)"
 
     @property
