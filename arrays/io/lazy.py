@@ -26,7 +26,7 @@ def lazy_names(
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         module, _, of_module = modules[name].partition(":")
         loaded = import_module(module or of_module)
-        from arrays.io.blas_threads import guard_public
+        from arrays.blas_threads import guard_public
 
         for table in _tables:
             guard_public(table)

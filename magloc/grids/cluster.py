@@ -16,7 +16,7 @@ from functools import partial
 from itertools import islice
 from typing import Any, TypeVar
 
-from arrays.io.blas_threads import one_blas_thread
+from arrays.blas_threads import one_blas_thread
 from arrays.io.errors import InputError, of_extra
 from magloc.grids.cube import Box, Chunk, CubeMap, computed
 

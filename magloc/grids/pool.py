@@ -10,7 +10,7 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from multiprocessing import get_context
 
-from arrays.io.blas_threads import one_blas_thread
+from arrays.blas_threads import one_blas_thread
 
 
 @contextmanager

@@ -21,7 +21,7 @@ import scipy.linalg
 from threadpoolctl import ThreadpoolController, threadpool_limits
 
 import magloc
-from arrays.io.blas_threads import guard_public, one_blas_thread
+from arrays.blas_threads import guard_public, one_blas_thread
 from tests.conftest import REPOSITORY
 from tests.fuzz.cases import LINES, STREAM
 from tests.test_guide import PACKAGES, documented
