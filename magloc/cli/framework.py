@@ -336,9 +336,11 @@ def print_report(report: Mapping[str, object]) -> None:
 
 
 def print_result(result: Mapping[str, object], lines: Sequence[str], *, as_json: bool) -> None:
-    """Print a result as one JSON object, or as text."""
-    if as_json:
+    """Print a result as one JSON object, with what was warned of if anything was, or as text."""
+    if as_json and _warnings:
         print_report(result)
+    elif as_json:
+        print_json(result)
     else:
         print("\n".join(lines))
 

@@ -229,7 +229,7 @@ class TestJson:
         report: dict[str, Any] = json.loads(outcome.out, parse_constant=self.refuse_constant)
         assert set(report) == {
             "out", "rows", "rows_used", "chi2_before", "dof_before", "chi2_after", "dof_after", "iterations",
-            "converged", "moment_Am2", "sensors", "unobservable", "warnings",
+            "converged", "moment_Am2", "sensors", "unobservable",
         }  # fmt: skip
         assert report["converged"] is True
         assert report["chi2_before"] > 100 * report["dof_before"]

@@ -235,7 +235,7 @@ class TestTruth:
     def test_numbers(self, run: Run, array: Path, readings: Path, truth: Path) -> None:
         outcome = run("track", readings, "--array", array, "--truth", truth, "--json", *MOTION)
         parsed = json.loads(outcome.out, parse_constant=refuse_constant)
-        assert list(parsed) == ["results", "consistency", "innovations"]
+        assert list(parsed) == ["results", "consistency", "innovations", "warnings"]
         tracked = [entry for entry in parsed["results"] if entry["position_m"] is not None]
         errors = np.array([entry["position_m"] for entry in tracked]) - source()[1][N_EMPTY:]
         result = parsed["consistency"]

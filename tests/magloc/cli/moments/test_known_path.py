@@ -43,7 +43,7 @@ class TestOutput:
         outcome = run(*arguments(files), "--turn-deg-s", 0.1, "--json", "--truth", files / "truth.csv")
         assert outcome.status == 0, outcome.err
         found = json.loads(outcome.out, parse_constant=refuse_constant)
-        assert list(found) == ["results", "chi2", "dof", "misfit", "consistency"]
+        assert list(found) == ["results", "chi2", "dof", "misfit", "consistency", "warnings"]
         readings = magloc.read_readings(files / "ship.csv", ARRAY)
         path = magloc.read_object_path(files / "path.csv")
         track = magloc.track_moment(ARRAY, readings, path, turn_rad_s=np.radians(0.1))
