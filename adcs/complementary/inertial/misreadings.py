@@ -139,7 +139,9 @@ def check_turns(
         changed[f"the {sensor} in {name}"] = _differences(
             windows, _gyro_turns(factor * rate_rad_s, dt_s, windows), pair
         )
-    for sensor, name, matrix in _axes(windows):
+    # A gyro that agrees with the field is right, and so is the field.
+    agree = "magnetometer" in windows and as_read[0] < _SUSPICIOUS
+    for sensor, name, matrix in _axes(["accelerometer"] if agree else ["gyro", *windows]):
         changed[f"the {sensor}{name}"] = _differences(windows, turns, pair, sensor, matrix)
     disagreements = {name: _disagreements(found, allowed) for name, found in changed.items()}
     for worst in np.argsort(as_read)[::-1]:
@@ -255,9 +257,9 @@ def _units(dt_s: FloatArray, rate_rad_s: FloatArray, windows: dict[str, _Windows
             yield "gyro", name, factor
 
 
-def _axes(windows: dict[str, _Windows]) -> Iterator[tuple[str, str, FloatArray]]:
-    """Sensors, misreadings of their axes by name, and the matrix that undoes each."""
-    for sensor in ("gyro", *windows):
+def _axes(sensors: list[str]) -> Iterator[tuple[str, str, FloatArray]]:
+    """Some sensors, misreadings of their axes by name, and the matrix that undoes each."""
+    for sensor in sensors:
         known = [np.eye(3)]
         for name, matrix in _all_axes():
             # The turns of a vector are those of its opposite.
