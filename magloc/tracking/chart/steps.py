@@ -125,7 +125,7 @@ class ChartFilter:
             if reason == NO_DIPOLE:
                 self._misfits = self._misfits.after(self._start.misfit, self._noise_T)
             return None, reason
-        self._misfits = Misfits()
+        self._misfits = Misfits(pause=self._misfits.pause)
         mixture = with_errors(mixture.likely(), row, self.errors.sigma)
         return (mixture if near is None else _near(mixture.reduced(), near)).reduced(), ""
 

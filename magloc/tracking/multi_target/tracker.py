@@ -173,9 +173,10 @@ class SourcesTracker:
         best = self._hypotheses[0]
         found, explained = next((found, fits) for one, found, fits in known if one.state is best.state)
         status = "misfit" if not explained else "tracked" if best.ids else "no source"
-        self._misfits = (
-            Misfits() if explained else self._misfits.after(found.update.standardised.ravel(), self._noise_T)
-        )
+        if explained:
+            self._misfits = Misfits(pause=self._misfits.pause)
+        else:
+            self._misfits = self._misfits.after(found.update.standardised.ravel(), self._noise_T)
         is_poor = bool((best.excess > _POOR).any())
         left, energy = problem.left(best.health) if best.ids else (None, 0.0)
         if status == "tracked" and (is_poor or energy > SENSOR_LIMIT):
