@@ -7,8 +7,7 @@ array_z_m, array_qx, array_qy, array_qz, array_qw``), the ambient field in the a
 ambient_y_nT, ambient_z_nT``), velocities and rates (:mod:`magloc.navigation.measured_motion`), and standard deviations
 of the pose (``array_sigma_m, array_sigma_deg``).
 
-Whatever is wrong with a file is an :class:`arrays.io.errors.InputError` of one sentence: the file, the line as an
-editor counts it, the column, what was found and what was expected.
+A fault of a file raises :class:`arrays.io.errors.InputError`: file, line, column, what was found, what was expected.
 """
 
 from __future__ import annotations
@@ -70,8 +69,7 @@ class Readings:
     motion : MeasuredMotion of n, optional
         Measured velocities and rates of array and object.
     pose_sigma : ndarray, shape (n, 2), optional
-        Standard deviations of the array's position along each axis [m] and of its attitude about each axis [rad], in
-        place of those of the array's :class:`arrays.PoseUncertainty`.
+        Standard deviations per axis of position [m] and attitude [rad], in place of :class:`arrays.PoseUncertainty`.
     interpolated_m : ndarray, shape (n,), optional
         Standard deviation along each axis that interpolation between fixes adds to the error of a position [m].
     background : Background
@@ -109,17 +107,16 @@ class Readings:
 
     def __post_init__(self) -> None:
         for name in ("values_T", *_ROW_SHAPES):
-            if getattr(self, name) is not None:
-                checked = {"values_T": fields, "time_s": seconds}.get(name, numbers)
-                object.__setattr__(self, name, checked(getattr(self, name)))
+            if (value := getattr(self, name)) is not None:
+                checked = fields(value) if name == "values_T" else seconds(value) if name == "time_s" else numbers(value)
+                object.__setattr__(self, name, checked)
         if self.values_T.ndim != 2:
             raise ValueError(f"Input values_T must have shape (n, C); instead received {self.values_T.shape}.")
         n = len(self.values_T)
         if self.time_s is None:
             object.__setattr__(self, "time_s", np.arange(float(n)))
         for name, shape in _ROW_SHAPES.items():
-            value = getattr(self, name)
-            if value is not None and value.shape != (n, *shape):
+            if (value := getattr(self, name)) is not None and value.shape != (n, *shape):
                 raise ValueError(f"Input {name} must have shape {(n, *shape)}; instead received {value.shape}.")
         if (bad := ~np.isfinite(self.time_s)).any():
             raise ValueError(f"Input time_s must be finite; instead row {bad.argmax() + 1} has {self.time_s[bad][0]}.")
