@@ -108,8 +108,8 @@ class Readings:
     def __post_init__(self) -> None:
         for name in ("values_T", *_ROW_SHAPES):
             if (value := getattr(self, name)) is not None:
-                checked = fields(value) if name == "values_T" else seconds(value) if name == "time_s" else numbers(value)
-                object.__setattr__(self, name, checked)
+                read = fields if name == "values_T" else seconds if name == "time_s" else numbers
+                object.__setattr__(self, name, read(value))
         if self.values_T.ndim != 2:
             raise ValueError(f"Input values_T must have shape (n, C); instead received {self.values_T.shape}.")
         n = len(self.values_T)

@@ -91,7 +91,7 @@ class InnovationTest:
             why = "ambient_uncertainty_nT is stated too small"
         elif self.z_lag1 > THRESHOLD:
             z, what = self.z_lag1, "differences between readings and predictions are alike in successive rows"
-            why = "the motion differs from the motion model, offsets or errors of the pose last, or readings were filtered"
+            why = "the motion differs from the motion model, offsets or pose errors last, or readings were filtered"
         else:
             z, what = self.z_chi2, "differences between readings and predictions are larger than is stated"
             why = "the motion differs from the motion model, or noise and errors of the pose are larger"
