@@ -8,7 +8,7 @@ import numpy as np
 
 from arrays.typing import BoolArray, FloatArray
 
-_NINES, _LARGE = (1e5, 1e9), 1e20  # powers of ten just above a row of nines
+_NINES, _LARGE = (1e5, 1e8), 1e20  # powers of ten just above a row of nines
 _BLANKS = (1.70141e38, 3.40282e38)  # largest numbers of single precision, as they are often written
 _FEWEST = 10  # other readings that say that zeros, or a number that is repeated, are none
 _APART, _KNOWN_APART = 10.0, 3.0  # over the spread of the others, or over their size

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import arrays
 from arrays.columns import LogColumns
 from arrays.io.errors import InputError
 from magloc.live.rows import RowParser
@@ -297,3 +298,16 @@ class TestColumnsOfAnotherProgram:
         parser = RowParser(self.ARRAY, "the stream", Tally())
         assert not list(parser.rows_of([self.TEXT.replace("Ay", "By").encode(), *map(str.encode, self.rows(2))]))
         assert "line 1, column Ay: found no such column" in parser.fault
+
+
+class TestDummies:
+    def test_they_are_counted_and_missing(self) -> None:
+        """A known number at once, zero after ten rows that are far from it."""
+        array, tally = arrays.axial(1.0, "scalar"), Tally()
+        parser = RowParser(array, "the rows", tally)
+        good = [f"{i},{48e3 + i},{48e3 - i}" for i in range(1, 12)]
+        lines = ["time_s,s1_nT,s2_nT", "0,-99999,48000", *good, "12,0,48000"]
+        rows = [row for line in lines for row in parser.rows_of([line.encode()])]
+        assert [i for i, row in enumerate(rows) if np.isnan(row.values_T[0, 0])] == [0, 12]
+        assert not any(np.isnan(row.values_T[0, 1]) for row in rows)
+        assert tally.dummies == 2
