@@ -105,9 +105,9 @@ class Readings:
 
     def __post_init__(self) -> None:
         for name in ("values_T", "time_s", "array_position_m", "ambient_T", "pose_sigma"):
-            if getattr(self, name) is not None:
-                checked = {"values_T": fields, "time_s": seconds}.get(name, numbers)
-                object.__setattr__(self, name, checked(getattr(self, name)))
+            if (given := getattr(self, name)) is not None:
+                read = fields(given) if name == "values_T" else seconds(given) if name == "time_s" else numbers(given)
+                object.__setattr__(self, name, read)
         if self.values_T.ndim != 2:
             raise ValueError(f"Input values_T must have shape (n, C); instead received {self.values_T.shape}.")
         n = len(self.values_T)

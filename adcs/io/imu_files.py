@@ -196,7 +196,7 @@ def _broad_log(path: str | PathLike[str]) -> ImuLog:
 
     data = read_bytes(path, "a MAT file of the BROAD benchmark")
     try:
-        content = loadmat(BytesIO(data))
+        content = loadmat(BytesIO(data))  # type: ignore[arg-type]  # its stubs know paths alone
     except Exception:  # whatever SciPy makes of a file that is none
         raise InputError(f"{path}: found no whole MAT file, expected one of the BROAD benchmark.") from None
     if absent := [name for name in (*_BROAD, "sampling_rate") if name not in content]:
