@@ -69,11 +69,11 @@ def _solved(covariance: FloatArray, columns: FloatArray) -> tuple[FloatArray, Fl
     correlation = covariance / (sigma[..., :, None] * sigma[..., None, :])
     scaled = columns / sigma[..., None]
     try:
-        return scaled, np.asarray(np.linalg.solve(correlation, scaled))
+        return scaled, np.asarray(np.linalg.solve(correlation, scaled), dtype=np.float64)
     except np.linalg.LinAlgError:
         regular = np.linalg.slogdet(correlation).sign > 0.0
         correlation = np.where(regular[..., None, None], correlation, np.nan)
-        return scaled, np.asarray(np.linalg.solve(correlation, scaled))
+        return scaled, np.asarray(np.linalg.solve(correlation, scaled), dtype=np.float64)
 
 
 class Detector(Protocol):

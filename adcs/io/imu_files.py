@@ -197,7 +197,7 @@ def _broad_log(path: str | PathLike[str]) -> ImuLog:
 
     data = read_bytes(path, "a MAT file of the BROAD benchmark")
     try:
-        content = loadmat(BytesIO(data))  # type: ignore[arg-type] # the stubs know no stream
+        content = loadmat(BytesIO(data))  # type: ignore[arg-type]  # its stubs know paths alone
     except Exception:  # whatever SciPy makes of a file that is none
         raise InputError(
             f"{path}: found no MAT file that can be read, expected a trial of BROAD, of version 7 at most."

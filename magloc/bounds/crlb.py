@@ -282,7 +282,7 @@ def _marginalised(W: FloatArray, nuisance: FloatArray, sigma: float) -> FloatArr
     Q, s, _ = np.linalg.svd(np.where(known, nuisance, 0.0), full_matrices=False)
     present = s > 1e-10 * s.max(axis=-1, keepdims=True, initial=0.0)
     with np.errstate(invalid="ignore"):
-        shrinkage = np.where(present, 1.0 - 1.0 / np.sqrt(1.0 + (s * sigma) ** 2), 0.0)
+        shrinkage = np.where(present, 1.0 - 1.0 / np.hypot(1.0, s * sigma), 0.0)
     result: FloatArray = W - Q @ (shrinkage[..., None] * (Q.mT @ W))
     return np.where(known, result, np.nan)
 

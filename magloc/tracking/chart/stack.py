@@ -63,7 +63,7 @@ class Stack:
     @cached_property
     def n_differences(self) -> int:
         """Number of differences without those that only pad rows."""
-        return int(self._transform[self._begin].any(axis=1).sum())
+        return int(self._transform[self._begin].any(axis=2).sum())
 
     @property
     def row(self) -> Row:
