@@ -92,6 +92,7 @@ def lag_of(piece_at: Callable[[float], Piece], here: Trial | None = None, near: 
             at = min(at, best_near(min(new, key=lambda one: one.cost)), key=lambda one: one.cost)
     else:
         at = best_near(near)
+    here = min(here, trial(piece_at, 0.0, at.sources), key=lambda one: one.cost)  # a search may have found more
     explained = at.chi2 < max(_MISFIT, _SHARE * here.chi2)  # else something is wrong that a lag imitates
     if not explained or here.cost - at.cost < model.threshold * max(1.0, at.chi2):
         return Lag(0.0, math.inf)

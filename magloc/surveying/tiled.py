@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -30,6 +31,7 @@ _FELT, _CHANGED = 0.1, 1.0  # of the noise
 _MOVED_M = 0.15
 _NARROW, _NEARLY_ALL = 0.2, 0.95  # of the distance to the nearest sources, and of the rows
 _BESIDE_M = 1.0
+_POSES = 2  # times that errors of the pose and the lag are estimated in turn
 Tell = Callable[[str], None]
 
 
@@ -213,10 +215,15 @@ class TiledSurvey:
         if pose_assumed and len(piece.known):
             posed, here = at_likeliest_pose(0.0, piece.known)
             pose = posed(0.0).array.pose
-            lag = lag_of(piece_at if pose is not None and pose.correlation_s else posed)
-            if lag.s:
+            assert pose is not None
+            size_m = math.hypot(pose.position_m, pose.position_white_m)
+            white = replace(self.array, pose=replace(pose, position_m=size_m, correlation_s=0.0, position_white_m=0.0))
+            lag = lag_of(lambda lag_s: replace(piece_at(lag_s), array=white))  # errors that do not look like one
+            for _ in range(_POSES if lag.s else 0):
                 posed, near = at_likeliest_pose(lag.s, None)
                 lag = lag_of(posed, here, near)
+                if not lag.s:
+                    break
         else:
             lag = lag_of(piece_at)
         if not lag.s:
