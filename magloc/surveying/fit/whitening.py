@@ -93,9 +93,11 @@ class Whitening:
         of_pose = np.concatenate(
             [of_pose, *(np.repeat(share, columns.shape[2], axis=1) for columns, share in more)], axis=1
         )
-        seen, lasts = U @ np.concatenate([by_pose, *by_turn, by_square], axis=2), of_pose.any(axis=0)
+        seen, white = U @ np.concatenate([by_pose, *by_turn, by_square], axis=2), ~of_pose.any(axis=0)
+        # Errors of rates count as alike in a group: central differences of successive rows share a step.
+        white[by_pose.shape[2] + by_turn[0].shape[2] :][: by_turn[1].shape[2]] = False
         seen = np.concatenate(
-            [_summed(seen[..., lasts], group, scale), _roots_of_summed_squares(seen[..., ~lasts], group, scale)], axis=2
+            [_summed(seen[..., ~white], group, scale), _roots_of_summed_squares(seen[..., white], group, scale)], axis=2
         )
         C, q = record.array.n_channels, seen.shape[2]
         # Offsets of the channels, and what is common to them: along the ambient field.
@@ -105,7 +107,7 @@ class Whitening:
         H[..., q + C] = _summed((record.along @ U.T)[..., None], group, scale)[..., 0]
         kept, added = np.ones((len(dt_s), q + C + 2)), np.zeros((len(dt_s), q + C + 2))
         kept[:, :q] = 0.0
-        kept[:, : lasts.sum()] = of_pose[:, lasts]
+        kept[:, : (~white).sum()] = of_pose[:, ~white]
         added[1:, :q] = 1.0 - kept[1:, :q] ** 2
         kept[0] = 1.0
         walk = np.array([sensor.drift_T_rth**2 / _HOUR_S for sensor in record.array.sensors]) + drift.sensor_T2_s
