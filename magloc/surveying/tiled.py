@@ -93,8 +93,8 @@ class TiledSurvey:
             _LOG.warning(high_above(nearest_m, ground.ground_m))
         elif np.quantile(across_m, _NEARLY_ALL) < _NARROW * nearest_m:
             _LOG.warning(
-                "the readings are of one line: on which side of it a target is, and how far, they hardly tell, and of"
-                " several targets they make other ones"
+                "all readings lie on one line: the side and the distance of a target are poorly determined, and several"
+                " targets are taken for others"
             )
         return cls(
             array,
