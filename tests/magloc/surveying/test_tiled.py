@@ -169,7 +169,7 @@ class TestBadInput:
         wave = np.sin(np.arange(len(rows)))[:, None] * [0.0, width_m, 0.0]
         line = replace(rows, array_position_m=rows.array_position_m * [1.0, 0.0, 1.0] + wave)
         TiledSurvey.of(array, line, Ground(SHALLOW, 0.0, 15.0, 25.0))
-        assert ("of one line" in caplog.text) == said
+        assert ("lie on one line" in caplog.text) == said
 
     def test_rows_that_are_far_from_each_other(self) -> None:
         readings = field().readings[:40]
