@@ -388,7 +388,7 @@ def _quaternion(table: CsvTable, columns: LogColumns) -> FloatArray:
 def without_dummies(
     table: CsvTable, form: LogFormat, name: Callable[[str, int], None] | None = None, before: FloatArray | None = None
 ) -> CsvTable:
-    """Return a table of readings with NaN in place of dummy values, which are named for every sensor.
+    """Return a table of readings with NaN in place of dummy values, which are counted and named.
 
     Parameters
     ----------
@@ -397,8 +397,7 @@ def without_dummies(
     form : LogFormat
         Its sensors, and which dummies are declared.
     name : callable, optional
-        Called with a sentence and the number of readings for every sensor that has dummies; by default a warning is
-        logged.
+        Called with a sentence and the number of dummies; by default a warning is logged.
     before : ndarray, shape (m, columns), optional
         Rows that came before.
     """
@@ -406,20 +405,21 @@ def without_dummies(
     declared = [columns.unit_nT * each for each in columns.dummy if not isinstance(each, str)]
     values = table.values.copy()
     earlier = values[:0] if before is None else before
+    found: dict[str, int] = {}
     for sensor, channels in form.channels.items():
         own = [table.header.index(channel) for channel in channels]
         known = np.concatenate([earlier[:, own], values[:, own]])
         cells = dummy_cells(known, declared, (1.0, columns.unit_nT))[len(earlier) :]
         if cells.any():
-            count = int(cells.any(axis=1).sum())
             numbers = ", ".join("*" if n == DUMMY else f"{n:.10g}" for n in np.unique(values[:, own][cells]))
-            what = "reading of" if count == 1 else "readings of"
-            is_dummy = "is a dummy value" if count == 1 else "are dummy values"
-            is_out = "is left out" if count == 1 else "are left out"
-            words = f"{table.path}: {count} {what} sensor {sensor} {is_dummy} ({numbers}) and {is_out}"
-            if name is None:
-                _LOG.warning(words)
-            else:
-                name(words, count)
+            found[f"of sensor {sensor} ({numbers})"] = int(cells.any(axis=1).sum())
             values[:, own] = np.where(cells, np.nan, values[:, own])
+    if found:
+        total = sum(found.values())
+        each = ", ".join(f"{count} {where}" for where, count in found.items())
+        words = f"{table.path}: dummy values are left out: {total} in all, {each}"
+        if name is None:
+            _LOG.warning(words)
+        else:
+            name(words, total)
     return replace(table, values=values)

@@ -53,10 +53,9 @@ def whole_rows(
             _LOG.warning(f"sensor {sensor.id} {why} in {missing[:, i].sum()} of {len(missing)} rows and is left out")
         elif stuck[:, i].any():
             _LOG.warning(f"sensor {sensor.id} sticks in {stuck[:, i].sum()} of {len(missing)} rows, which are left out")
-        if i in kept and wild[:, i].any():
-            _LOG.warning(
-                f"{wild[:, i].sum()} readings of sensor {sensor.id} leap and come back: their rows are left out"
-            )
+    if (counts := wild[:, kept].sum(axis=0)).any():
+        each = ", ".join(f"{n} of sensor {array.sensors[i].id}" for i, n in zip(kept, counts, strict=True) if n)
+        _LOG.warning(f"readings leap and come back: {counts.sum()} in all, {each}; their rows are left out")
     if whole.sum() < FEWEST_ROWS:
         raise ValueError(f"Input readings must have {FEWEST_ROWS} whole rows or more; instead received {whole.sum()}.")
     if len(kept) < array.n_sensors:

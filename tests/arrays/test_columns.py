@@ -48,8 +48,8 @@ class TestMissing:
     def test_they_are_counted_and_named(self, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
         array = array_of(tmp_path, '[columns]\ndummy = [7777]\nunit = "uT"\n')
         read(tmp_path, array, "time_s,low_nT,high_nT\n0,7777,2\n1,3,-99999\n2,7777,*\n")
-        assert "2 readings of sensor low are dummy values (7777000) and are left out" in caplog.text
-        assert "2 readings of sensor high are dummy values (-99999000, *) and are left out" in caplog.text
+        each = "2 of sensor low (7777000), 2 of sensor high (-99999000, *)"
+        assert f"dummy values are left out: 4 in all, {each}" in caplog.text
 
     def test_the_array_file_keeps_them(self, tmp_path: Path) -> None:
         columns = '[columns]\ndummy = [-7.5, "*"]\nvalid = {column = "V", equals = [1, 4]}\n'
