@@ -93,7 +93,7 @@ class Whitening:
         of_pose = np.concatenate(
             [of_pose, *(np.repeat(share, columns.shape[2], axis=1) for columns, share in more)], axis=1
         )
-        seen, white = U @ np.concatenate([by_pose, *by_turn, by_square], axis=2), ~of_pose.any(axis=0)
+        seen, white = U @ np.concatenate([by_pose, *by_turn, by_square], axis=2), (of_pose == 0.0).all(axis=0)
         # Errors of rates count as alike in a group: central differences of successive rows share a step.
         white[by_pose.shape[2] + by_turn[0].shape[2] :][: by_turn[1].shape[2]] = False
         seen = np.concatenate(
