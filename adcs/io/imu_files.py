@@ -133,12 +133,17 @@ def read_imu(path: str | PathLike[str], layout: str | PathLike[str] | None = Non
     >>> len(log.record)
     1500
     """
-    return imu_log(path, None if layout is None else (str(layout), read_toml(layout, "a layout of a log")))
+    described = None if layout is None or _is_matlab(path) else read_toml(layout, "a layout of a log")
+    return imu_log(path, None if layout is None else (str(layout), described or {}))
+
+
+def _is_matlab(path: str | PathLike[str]) -> bool:
+    return Path(path).suffix.lower() == ".mat"
 
 
 def imu_log(path: str | PathLike[str], layout: tuple[str, dict[str, Any]] | None) -> ImuLog:
     """Return the log of :func:`read_imu` with the path and the table of a layout that was read before."""
-    if Path(path).suffix.lower() != ".mat":
+    if not _is_matlab(path):
         return _csv_log(path, None if layout is None else section_of(*layout, ImuFile).log)
     if layout is not None:
         raise InputError(f"{path}: found a MAT file with a layout, expected a CSV file, or none.")

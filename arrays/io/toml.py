@@ -63,7 +63,7 @@ NOT_NEGATIVE = Rule(lambda value: value >= 0, "a number that is not negative")
 MAY_BE_INFINITE = Rule(lambda _: True, "", may_be_infinite=True)
 _VERSION = Rule(lambda value: value == FORMAT_VERSION, str(FORMAT_VERSION))
 Positive = Annotated[float, POSITIVE]
-Rate = Annotated[float, Rule(lambda value: value >= 1.0 / LARGEST, f"a rate of {1.0 / LARGEST:g} at least")]
+Rate = Annotated[float, Rule(lambda value: value >= 1.0 / LARGEST, f"a positive rate, {1.0 / LARGEST:g} at least")]
 """Positive, and no time divided by it is infinite."""
 NotNegative = Annotated[float, NOT_NEGATIVE]
 

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from arrays.io.arguments import Flag
-from arrays.io.csv import GrowingTable
 from arrays.io.errors import LARGEST, InputError, naming
 from arrays.io.outputs import refuse_unwritable
 from magloc.cli.framework import QuietOptions, print_json
@@ -89,6 +88,7 @@ def live(
     common : QuietOptions
         Common options.
     """
+    from arrays.io.csv import GrowingTable
     from magloc.live.follower import Follower
 
     if not 0.0 <= rest_s <= LARGEST:

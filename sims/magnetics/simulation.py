@@ -152,6 +152,7 @@ def _stated_pose(scenario: MagneticScenario, of: PoseUncertainty, time_s: FloatA
     true = _pose(scenario.carrier, time_s - late_s, seed, "array")
     rotation = true.rotation * Rotation.from_rotvec(-turn)
     reference_m = true.position_m - true.rotation.apply(true_lever_m) - of.position_m * changing[:, 3:6]
+    reference_m = reference_m - of.position_white_m * stream(seed, "pose white").standard_normal((len(time_s), 3))
     return _Pose(reference_m + rotation.apply(lever_arm_m), rotation)
 
 

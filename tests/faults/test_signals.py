@@ -171,12 +171,13 @@ LOADS_LATER = "import time\ndef main():\n    import greedy\n    time.sleep(60)\n
 NEVER_ENDS = """
 import time
 def main():
-    print("runs", flush=True)
+    word = "runs"
     while True:
         try:
+            print(word, flush=True)
             time.sleep(60)
         except BaseException:
-            print("swallowed", flush=True)
+            word = "swallowed"
 """
 TIDIES_UP = """
 import os, signal, time

@@ -94,16 +94,15 @@ sys.exit(main())
         """As in a callback of the collector, which swallows it; the interruption comes again."""
         code = f"""
 import sys, time
-class Hand:
-    def find_spec(self, name, *_):
-        if name == "cyclopts":
-            Deleted()
-            for _ in range(30_000):
-                time.sleep(0.01)
+import {program}.cli.app as app
 class Deleted:
     def __del__(self):
         raise KeyboardInterrupt
-sys.meta_path.insert(0, Hand())
+def never_ends():
+    Deleted()
+    for _ in range(30_000):
+        time.sleep(0.01)
+app.main = never_ends
 from {program}.cli.__main__ import main
 sys.exit(main())
 """

@@ -12,8 +12,9 @@ import arrays
 from arrays.typing import FloatArray
 from magloc.fields import dipole
 from magloc.measurement.pose import PoseErrors
+from magloc.measurement.rows import joined
 from magloc.readings import Readings
-from magloc.surveying.fit.record import SurveyRecord, joined, shortest_turns
+from magloc.surveying.fit.record import SurveyRecord, shortest_turns
 
 RNG = np.random.default_rng(3)
 N = 6
