@@ -15,6 +15,7 @@ _APART, _KNOWN_APART = 10.0, 3.0  # over the spread of the others, or over their
 _ALONE, _MOST_NEAR = 0.5, 0.02  # share of other readings that are nearer than so much of the distance to the middle
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def dummy_cells(readings: FloatArray, declared: Sequence[float] = (), units: Sequence[float] = (1.0,)) -> BoolArray:
     """Return which cells of one sensor's channels (n, k) hold dummy values.
 

@@ -59,3 +59,9 @@ class TestReadings:
     )
     def test_none_is_a_dummy(self, values: FloatArray) -> None:
         assert not dummy_cells(values).any()
+
+
+def test_numbers_whose_squares_overflow_are_no_fault() -> None:
+    readings = np.full((12, 3), 4e4)
+    readings[3:6] = 1e155, -1.7e308, 2.0
+    assert dummy_cells(readings)[3:6, 0].all()
