@@ -27,7 +27,7 @@ from arrays.typing import BoolArray, FloatArray
 LEFT_OUT, SUBTRACTED = "field left out", "magnet subtracted"
 """What an inertial unit's field is where it is not the room's."""
 LOST = "heading lost"
-"""Where the heading of an inertial unit is hardly known."""
+"""Name of the rows in which the heading of an inertial unit is hardly known."""
 LOST_RAD = 0.5
 _RELATIVE = (
     "there is no magnetometer: the heading is that of gyro and accelerometer alone, against the first row, "

@@ -272,7 +272,7 @@ def _drifted(
     model: HeadingModel,
     until: NDArray[np.intp] | slice = slice(None),
 ) -> FloatArray:
-    """What the gyro alone adds to the heading's variance from some instants to others, all n unless they are given."""
+    """Return what the gyro alone adds to the heading's variance between instants, by default all n."""
     turning = np.linalg.norm(rate_rad_s, axis=1) > model.turning_rad_s
     turned_s = np.cumsum(turning * steps_s(time_s))
     of_drift = np.maximum(turned_s[until] - turned_s[since], 0.0) / model.gyro_drift_s

@@ -37,7 +37,7 @@ _COMPILATION = "magloc.compilation"
 _LONGEST_WORD = 200
 _LOG = logging.getLogger(__name__)
 _warnings: list[str] = []
-"""What was warned of since a command line began, for its JSON."""
+"""Warnings since a command line began, for its JSON."""
 # Commands that end when their user or their stream does.
 _ENDLESS = {"live", "view"}
 _FIRST_SIGN_S = 10.0

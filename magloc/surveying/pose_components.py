@@ -53,7 +53,7 @@ def with_likeliest_pose(model: Model, sources: Sources) -> Model:
 
 
 def pose_of(lasting_m: float, lasts_s: float, white_m: float) -> PoseUncertainty:
-    """What is assumed of a pose, with places whose errors are of two kinds."""
+    """Return an assumed pose whose places have errors of two kinds."""
     if not lasting_m:
         return replace(UNSTATED, position_m=white_m)
     return replace(UNSTATED, position_m=lasting_m, correlation_s=lasts_s, position_white_m=white_m)

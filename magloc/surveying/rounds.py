@@ -27,11 +27,8 @@ _REACH = 0.6  # of a fit, over the distance from the sensors
 _TWINS = 0.15  # over the distance from the sensors: sources that are nearer to each other are one
 _MOST_WEIGHINGS = 4
 _SETTLED_COARSELY = 0.5
-_MOST_STEPS, _FEW_STEPS, _SMALL_STEP = (
-    6,
-    3,
-    0.1,
-)  # of a fit whose weights follow it, and χ² that the last one may change by
+# Steps of a fit whose weights follow it, and χ² that the last one may change by.
+_MOST_STEPS, _FEW_STEPS, _SMALL_STEP = 6, 3, 0.1
 _HARDLY_DAMPED = 1e-9
 # Rows that pass within such a part of the distance to a source count as one.
 WHILE_SEARCHING, AT_LAST = 0.33, 0.15

@@ -130,7 +130,7 @@ class Background:
 
     @property
     def noise_log_determinant(self) -> float:
-        """Of the covariance of all that is projected out: of the noise in time, and of ``LᵀL + 1``."""
+        """Log-determinant of the covariance of all that is projected out: of the noise in time, and of ``LᵀL + 1``."""
         return self.white.log_determinant - float(np.linalg.slogdet(np.eye(self.Q.shape[1]) - self.Q.T @ self.Q)[1])
 
     @classmethod
