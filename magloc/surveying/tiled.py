@@ -11,7 +11,7 @@ import numpy as np
 
 from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray
-from magloc.fields.dipole_compiled import field_at_points
+from magloc.fields.points import field_at_points
 from magloc.grids.work import Arrays, Each, Work
 from magloc.localization.fit.prior import SourcePrior
 from magloc.readings import Readings

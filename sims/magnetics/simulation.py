@@ -14,7 +14,7 @@ from arrays.sensor import Calibration
 from arrays.typing import FloatArray
 from magloc.fields.body import induced_and_permanent_moment
 from magloc.fields.dipole import MU0_OVER_4PI, field
-from magloc.fields.dipole_compiled import field_at_points
+from magloc.fields.points import field_at_points
 from magloc.readings import Readings
 from magloc.signature.path import ObjectPath
 from magloc.truth import Truth

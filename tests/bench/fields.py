@@ -9,7 +9,7 @@ import numba
 import numpy as np
 
 from magloc.fields.dipole import total_field
-from magloc.fields.dipole_compiled import field_at_points
+from magloc.fields.points import field_at_points
 from tests.bench.table import Row
 from tests.bench.timing import Contestant, Size, installed, interleaved
 

@@ -20,8 +20,8 @@ import numpy as np
 
 from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray
-from magloc.fields.dipole_compiled import field_at_points, gradient_at_points
 from magloc.fields.multipole import finite_body_errors, finite_body_fields
+from magloc.fields.points import field_at_points, gradient_at_points
 from magloc.measurement.pose import LEVER, N_POSE, SHIFT, TURN, PoseErrors, rates_of
 from magloc.navigation.rotations import cross_matrix
 from magloc.readings import Readings

@@ -1,22 +1,20 @@
-"""Tests of magloc.fields.dipole_compiled: the compiled functions are their NumPy twins in magloc.fields.dipole.
+"""Tests of magloc.fields.points: the kernels agree with magloc.fields.dipole to rounding, in all instruction sets.
 
-To rounding.
-
-Physics is tested on the twins (test_dipole.py). What is tested here is what compilation could spoil: the blocks and
-their edges, the threads, the rule on the source, and the layouts of the arrays that go in.
+Physics is tested on the reference (test_dipole.py). What is tested here is what compilation could spoil: the blocks
+and their edges, the lanes, the threads, the rule on the source, and the layouts of the arrays that go in.
 """
 
 from collections.abc import Callable, Iterator
 from typing import Any, cast
 
-import numba
 import numpy as np
 import pytest
 from numba import njit
 from numpy.typing import NDArray
 
-from magloc.fields import dipole
-from magloc.fields import dipole_compiled as kernels
+from magloc import core
+from magloc.fields import dipole, dipole_compiled
+from magloc.fields import points as kernels
 from tests import oracles
 
 Array = NDArray[np.float64]
@@ -24,7 +22,7 @@ EPS = float(np.finfo(np.float64).eps)
 # Each of the twins is within 64 eps of the exact value (test_dipole.py derives it; fused multiply-adds only lower it).
 ROUNDING = 64 * EPS
 BETWEEN_TWINS = 2 * ROUNDING
-BLOCK = kernels.BLOCK
+BLOCK = 256
 # No point, one, the blocks' edges, and several blocks of which the last is not full
 SIZES = [0, 1, 7, BLOCK - 1, BLOCK, BLOCK + 1, 3 * BLOCK + 5]
 UPPER = np.triu_indices(3)
@@ -39,7 +37,7 @@ def symmetric(components: list[tuple[float, ...]]) -> Array:
 
 def jacobians_at(points: Array, source: Array, moment: Array) -> Array:
     """Jacobians (N, 3, 6) of one dipole's field by (p, m), from the compiled components."""
-    by_moment = symmetric([kernels.field_matrix_components(*d) for d in np.subtract(points, source)])
+    by_moment = symmetric([dipole_compiled.field_matrix_components(*d) for d in np.subtract(points, source)])
     return np.concatenate([-kernels.gradient_at_points(points, source[None], moment[None]), by_moment], axis=-1)
 
 
@@ -56,17 +54,28 @@ def points_and_dipoles(n_points: int, n_dipoles: int) -> tuple[Array, Array, Arr
 
 def components_at(d: Array, m: Array) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
     return (
-        kernels.field_components(d[0], d[1], d[2], m[0], m[1], m[2]),
-        kernels.field_matrix_components(d[0], d[1], d[2]),
-        kernels.gradient_components(d[0], d[1], d[2], m[0], m[1], m[2]),
+        dipole_compiled.field_components(d[0], d[1], d[2], m[0], m[1], m[2]),
+        dipole_compiled.field_matrix_components(d[0], d[1], d[2]),
+        dipole_compiled.gradient_components(d[0], d[1], d[2], m[0], m[1], m[2]),
     )
 
 
 @pytest.fixture
 def threads() -> Iterator[Callable[[int], None]]:
-    before = numba.get_num_threads()
-    yield numba.set_num_threads
-    numba.set_num_threads(before)
+    before = core.threads()
+    yield core.set_threads
+    core.set_threads(before)
+
+
+@pytest.fixture(params=["baseline", "avx2", "avx512"], autouse=True)
+def instruction_set(request: pytest.FixtureRequest) -> Iterator[str]:
+    before = core.instruction_set()
+    try:
+        core.use_instruction_set(request.param)
+    except ValueError:
+        pytest.skip(f"this machine does not have {request.param}")
+    yield request.param
+    core.use_instruction_set(before)
 
 
 class TestTwins:
@@ -132,10 +141,13 @@ class TestAccuracy:
 
 
 class TestThreads:
-    def test_result_does_not_depend_on_their_number(self, threads: Callable[[int], None]) -> None:
+    def test_result_does_not_depend_on_their_number(
+        self, threads: Callable[[int], None], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(kernels, "_TERMS_A_BLOCK", BLOCK)
         points, sources, moments = points_and_dipoles(20 * BLOCK + 3, 4)
         results = []
-        for number in range(1, numba.get_num_threads() + 1):
+        for number in range(1, 5):
             threads(number)
             results.append(kernels.field_at_points(points, sources, moments))
         for result in results[1:]:

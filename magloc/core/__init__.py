@@ -1,0 +1,157 @@
+"""Compiled kernels: C++17 behind one C header, called by thin modules of the rooms that use them.
+
+A thin module checks shapes, allocates results, describes the problem (:func:`problem`) and computes its items
+(:func:`run`). Users call its functions, not these. docs/development/kernels.md shows how to add a kernel.
+
+The environment variable MAGLOC_ISA names the instruction set to use ("baseline", "avx2", "avx512"; default: the best
+one of the machine), MAGLOC_NUM_THREADS the number of threads (default: all processors that the process may use).
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from magloc.core._declarations import ffi
+
+_HERE = Path(__file__).parent
+_SUFFIX = {"win32": ".dll", "darwin": ".so"}.get(sys.platform, ".so")
+_lib: Any = ffi.dlopen(str(_HERE / f"kernels{_SUFFIX}"))
+_TYPES = {"double": np.dtype(np.float64), "int64_t": np.dtype(np.int64), "uint8_t": np.dtype(np.uint8)}
+
+
+class Problem:
+    """A C struct that describes a problem, and the arrays that it points to."""
+
+    def __init__(self, kind: str, fields: dict[str, Any]) -> None:
+        self.struct = ffi.new(f"magloc_{kind} *")
+        self.arrays = {name: value for name, value in fields.items() if isinstance(value, np.ndarray)}
+        types = dict(ffi.typeof(self.struct).item.fields)
+        if fields.keys() != types.keys():
+            raise TypeError(f"magloc_{kind} has the fields {[*types]}; instead received {[*fields]}")
+        for name, value in fields.items():
+            setattr(self.struct, name, _pointer(name, types[name].type, value) if name in self.arrays else value)
+
+
+def _pointer(name: str, pointer_type: Any, array: np.ndarray[Any, Any]) -> Any:
+    """Return the address of an array's first element as a C pointer of the field's type."""
+    wanted = _TYPES[pointer_type.item.cname]
+    if array.dtype != wanted or not array.flags.c_contiguous or not array.flags.aligned:
+        raise TypeError(f"{name} must be a C-contiguous array of {wanted}; instead received {array.dtype}")
+    return ffi.cast(pointer_type, array.ctypes.data)
+
+
+def problem(kind: str, **fields: Any) -> Problem:
+    """
+    Describe a problem to a kernel.
+
+    Parameters
+    ----------
+    kind : str
+        Name of the struct in magloc.h, without "magloc_".
+    **fields
+        All fields of the struct: numbers, and arrays in C order of the type that the header states. None is a null
+        pointer.
+
+    Returns
+    -------
+    Problem
+        The struct; it keeps the arrays alive.
+
+    Raises
+    ------
+    TypeError
+        If a field is missing or unknown, or an array has another type or order.
+    """
+    return Problem(kind, {name: ffi.NULL if value is None else value for name, value in fields.items()})
+
+
+def run(kernel: str, work: Problem, n: int, *, block: int) -> None:
+    """
+    Compute the items 0 to n - 1 of a problem, by several threads if there is more than one block.
+
+    The interpreter's lock is released, and Ctrl-C acts between blocks.
+
+    Parameters
+    ----------
+    kernel : str
+        Name of the function in magloc.h, without "magloc_".
+    work : Problem
+        What the kernel computes.
+    n : int
+        Number of items.
+    block : int
+        Number of items that one call computes. It should take 1 to 100 ms.
+    """
+    function = getattr(_lib, f"magloc_{kernel}")
+    size = function(work.struct, 0, 0, ffi.NULL)
+    begins = range(0, n, block)
+
+    def compute(begins: range) -> None:
+        workspace = ffi.new("double[]", size + 1)
+        for begin in begins:
+            function(work.struct, begin, min(begin + block, n), workspace)
+
+    n_threads = min(threads(), len(begins))
+    if n_threads <= 1:
+        compute(begins)
+        return
+    with ThreadPoolExecutor(n_threads) as pool:
+        try:
+            for done in [pool.submit(compute, begins[i : i + 1]) for i in range(len(begins))]:
+                done.result()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def threads() -> int:
+    """Return the number of threads that kernels use."""
+    return _threads
+
+
+def set_threads(n: int) -> None:
+    """Set the number of threads that kernels use."""
+    global _threads
+    _threads = n
+
+
+def _available_threads() -> int:
+    if wanted := os.environ.get("MAGLOC_NUM_THREADS"):
+        return max(1, int(wanted))
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+_threads = _available_threads()
+
+
+def instruction_set() -> str:
+    """Return the instruction set in use: "baseline", "avx2" or "avx512"."""
+    return str(ffi.string(_lib.magloc_instruction_set()).decode())
+
+
+def use_instruction_set(name: str) -> None:
+    """
+    Use an instruction set by its name.
+
+    Raises
+    ------
+    ValueError
+        If this machine or build does not have it.
+    """
+    if _lib.magloc_use_instruction_set(name.encode()):
+        raise ValueError(f"Instruction set {name!r} is unknown, or this machine or build does not have it.")
+
+
+def include_dir() -> Path:
+    """Return the folder of the C and C++ headers, for the compiler's option -I."""
+    return _HERE / "include"
+
+
+if _wanted := os.environ.get("MAGLOC_ISA"):
+    use_instruction_set(_wanted)

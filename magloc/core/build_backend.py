@@ -1,0 +1,102 @@
+"""Build backend: scikit-build-core, with Zig from the package index as compiler on machines that have none."""
+
+import base64
+import hashlib
+import os
+import shutil
+import stat
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from zipfile import ZIP_DEFLATED, ZipFile
+
+from scikit_build_core import build as _build
+from scikit_build_core.build import (  # the other hooks of a build backend
+    build_sdist,
+    get_requires_for_build_sdist,
+    prepare_metadata_for_build_editable,
+    prepare_metadata_for_build_wheel,
+)
+
+__all__ = [
+    "build_editable",
+    "build_sdist",
+    "build_wheel",
+    "get_requires_for_build_editable",
+    "get_requires_for_build_sdist",
+    "get_requires_for_build_wheel",
+    "prepare_metadata_for_build_editable",
+    "prepare_metadata_for_build_wheel",
+]
+_COMPILERS = ("c++", "g++", "clang++", "clang-cl")
+_ROOT = Path(__file__).resolve().parents[2]
+Settings = dict[str, Any] | None
+
+
+def _has_compiler() -> bool:
+    return bool(os.environ.get("CXX")) or any(shutil.which(name) for name in _COMPILERS)
+
+
+def _requirements(hook: Callable[[Settings], list[str]], settings: Settings) -> list[str]:
+    return [*hook(settings), *([] if _has_compiler() else ["ziglang>=0.13"])]
+
+
+def get_requires_for_build_wheel(config_settings: Settings = None) -> list[str]:
+    """Return what a build needs beyond pyproject.toml."""
+    return _requirements(_build.get_requires_for_build_wheel, config_settings)
+
+
+def get_requires_for_build_editable(config_settings: Settings = None) -> list[str]:
+    """Return what an editable build needs beyond pyproject.toml."""
+    return _requirements(_build.get_requires_for_build_editable, config_settings)
+
+
+def _use_zig_without_compiler() -> None:
+    """Let CMake find Zig as its compiler: it expects programs of one word."""
+    if _has_compiler():
+        return
+    folder = Path(tempfile.mkdtemp(prefix="magloc-zig-"))
+    tools = {}
+    for variable, command in (("CC", "cc"), ("CXX", "c++"), ("AR", "ar"), ("RANLIB", "ranlib")):
+        program = folder / f"zig-{command}"
+        program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m ziglang {command} "$@"\n', encoding="utf-8")
+        program.chmod(program.stat().st_mode | stat.S_IEXEC)
+        tools[variable] = str(program)
+    os.environ.update(CC=tools["CC"], CXX=tools["CXX"])
+    given = os.environ.get("CMAKE_ARGS", "")
+    os.environ["CMAKE_ARGS"] = f"{given} -DCMAKE_AR={tools['AR']} -DCMAKE_RANLIB={tools['RANLIB']}"
+
+
+def build_wheel(wheel_directory: str, config_settings: Settings = None, metadata_directory: str | None = None) -> str:
+    """Build a wheel and return its name."""
+    _use_zig_without_compiler()
+    return _build.build_wheel(wheel_directory, config_settings, metadata_directory)
+
+
+def build_editable(
+    wheel_directory: str, config_settings: Settings = None, metadata_directory: str | None = None
+) -> str:
+    """Build the library beside the sources, and a wheel that adds the sources to Python's path; return its name.
+
+    scikit-build-core's own editable wheel has an import hook, which would win over PYTHONPATH.
+    """
+    _use_zig_without_compiler()
+    name = _build.build_editable(wheel_directory, config_settings, metadata_directory)
+    path = Path(wheel_directory) / name
+    with ZipFile(path) as wheel:
+        files = {each: wheel.read(each) for each in wheel.namelist() if ".dist-info/" in each}
+    files["magloc.pth"] = f"{_ROOT}\n".encode()
+    record = next(each for each in files if each.endswith(".dist-info/RECORD"))
+    del files[record]
+    lines = [f"{each},sha256={_digest(data)},{len(data)}" for each, data in files.items()]
+    files[record] = "\n".join([*lines, f"{record},,", ""]).encode()
+    with ZipFile(path, "w", ZIP_DEFLATED) as wheel:
+        for each, data in files.items():
+            wheel.writestr(each, data)
+    return name
+
+
+def _digest(data: bytes) -> str:
+    return base64.urlsafe_b64encode(hashlib.sha256(data).digest()).rstrip(b"=").decode()
