@@ -35,7 +35,7 @@ def star_triangles(directions: FloatArray, longest: float, brighter: int) -> Tri
     opposite = np.linalg.norm(at[:, [1, 2, 0]] - at[:, [2, 0, 1]], axis=-1)
     order = np.argsort(opposite, axis=1)
     corners, sides = np.take_along_axis(corners, order, axis=1), np.take_along_axis(opposite, order, axis=1)
-    short = sides[:, 2] <= longest
+    short = (sides[:, 2] > 0.0) & (sides[:, 2] <= longest)  # stars at one place make no triangle
     # Turned inside out: the triple product is positive for corners that go round clockwise seen from the centre.
     a, b, c = np.moveaxis(directions[corners[short]], 1, 0)
     return Triangles(corners[short], sides[short], np.sum(np.cross(a, b) * c, axis=-1) < 0.0)

@@ -54,12 +54,15 @@ def get_requires_for_build_editable(config_settings: Settings = None) -> list[st
 
 
 def _use_zig_without_compiler() -> None:
-    """Let CMake find Zig as its compiler: it expects programs of one word."""
+    """Let CMake find Zig as its compiler: it expects programs of one word.
+
+    `zig cc` compiles C++, too; `zig c++` would first compile the C++ library, which the kernels do not need.
+    """
     if _has_compiler():
         return
     folder = Path(tempfile.mkdtemp(prefix="magloc-zig-"))
     tools = {}
-    for variable, command in (("CC", "cc"), ("CXX", "c++"), ("AR", "ar"), ("RANLIB", "ranlib")):
+    for variable, command in (("CC", "cc"), ("CXX", "cc"), ("AR", "ar"), ("RANLIB", "ranlib")):
         program = folder / f"zig-{command}"
         program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m ziglang {command} "$@"\n', encoding="utf-8")
         program.chmod(program.stat().st_mode | stat.S_IEXEC)

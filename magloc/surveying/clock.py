@@ -60,14 +60,19 @@ def lag_of(piece_at: Callable[[float], Piece], here: Trial | None = None, near: 
     step, apart = _STEP_M / speed, _APART * model.nearest_m / speed
 
     def best_near(lag: Trial) -> Trial:
-        """The likeliest one beside some trial."""
-        found = minimize_scalar(
-            lambda lag_s: trial(piece_at, float(lag_s), lag.sources).cost,
-            bounds=(lag.lag_s - apart, lag.lag_s + apart),
-            method="bounded",
-            options={"xatol": _TOLERANCE * step},
-        )
-        return trial(piece_at, float(found.x), lag.sources)
+        """Return the likeliest trial beside some trial; one at the edge of the interval begins the next interval."""
+        for _ in range(math.ceil(_MOST_S / apart)):
+            start, sources = lag.lag_s, lag.sources
+            found = minimize_scalar(
+                lambda lag_s, known=sources: trial(piece_at, float(lag_s), known).cost,
+                bounds=(start - apart, start + apart),
+                method="bounded",
+                options={"xatol": _TOLERANCE * step},
+            )
+            lag = trial(piece_at, float(found.x), sources)
+            if abs(lag.lag_s - start) < apart - 2.0 * _TOLERANCE * step:
+                break
+        return lag
 
     def beside(lag: Trial) -> tuple[float, float]:
         """Slope and curvature of its cost."""

@@ -293,6 +293,11 @@ def _points(path: Path, rows: Sequence[dict[str, Any]]) -> tuple[TrackPoint, ...
     times, nis, nis_dof = (_numbers(path, rows, key) for key in ("time_s", "nis", "nis_dof"))
     if None in times:
         raise InputError(f"{path}, result {times.index(None) + 1}, key time_s: found None, expected a number.")
+    if back := next((i for i in range(1, len(times)) if times[i] < times[i - 1]), None):
+        raise InputError(
+            f"{path}, result {back + 1}, key time_s: found {times[back]:g} after {times[back - 1]:g}, expected times in"
+            " order."
+        )
     positions, moments = (_vectors(path, rows, key, 3) for key in ("position_m", "moment_Am2"))
     covariances = _vectors(path, rows, "covariance", 6, 6)
     for i, covariance in enumerate(covariances, start=1):

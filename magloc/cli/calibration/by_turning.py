@@ -91,8 +91,8 @@ def overflow(readings_T: FloatArray) -> str:
     if not n:
         return ""
     return (
-        f". {n} of {size.size} readings are beyond {1e9 * most:.3g} nT, unlike all others: if they are overflow values"
-        " or dummies of a logger, leave their cells empty or state saturation_nT of the sensors"
+        f". {n} of {size.size} readings are beyond {1e9 * most:.3g} nT, unlike all others: leave overflow values and"
+        " dummies empty, or state saturation_nT"
     )
 
 

@@ -138,6 +138,11 @@ class TestGeometry:
         assert (np.diff(many.sides, axis=1) >= 0.0).all()
         assert many.sides.max() <= 0.3
 
+    def test_stars_at_one_place_make_no_triangle(self):
+        directions = np.tile([1.0, 0.0, 0.0], (10, 1))
+        assert not len(star_triangles(directions, 0.3, 4).sides)
+        assert not len(TriangleIndex.of(directions, 0.3, 4).triangles.sides)
+
     @pytest.mark.parametrize(
         ("camera", "text"),
         [

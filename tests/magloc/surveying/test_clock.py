@@ -112,6 +112,11 @@ class TestLag:
             assert error @ np.linalg.solve(target.covariance[:3, :3], error) < 21.0
 
     @pytest.mark.slow
+    def test_a_lag_beyond_the_first_interval(self) -> None:
+        found = magloc.survey(ARRAY, walked(0.9, white_errors()))
+        assert found.lag_s == pytest.approx(0.9, abs=0.02)  # four standard deviations
+
+    @pytest.mark.slow
     def test_what_all_places_share_is_in_the_ellipses(self) -> None:
         """A constant of 5 cm moves all targets together: nothing tells it, nor does the curvature of fields."""
         shifting = replace(ARRAY, pose=replace(ARRAY.pose, position_constant_m=0.05))

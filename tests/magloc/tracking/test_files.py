@@ -67,6 +67,7 @@ class TestReadTrack:
             ("dropped_sensors", [3], r"found \[3\], expected a list of names"),
             ("dropped_sensors", 3, "found 3, expected a list of names"),
             ("time_s", None, "found None, expected a number"),
+            ("time_s", 0.2, "found 0.2 after 0.5, expected times in order"),
         ],
     )
     def test_what_is_wrong_is_named_with_its_row(self, tmp_path: Path, key: str, value: object, sentence: str) -> None:
