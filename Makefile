@@ -10,7 +10,9 @@ unexport PYTHONDONTWRITEBYTECODE
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 MAKE_VENV = $(PYTHON) -m venv --clear
 
-.PHONY: map test test-full test-oldest mutation coverage licences sbom audit wheel bench docs notebooks pictures chromium lint clean
+KERNEL_TESTS := tests/magloc/core tests/magloc/fields/test_points.py
+
+.PHONY: map test test-full test-oldest mutation coverage licences sbom audit wheel bench docs notebooks pictures chromium lint sanitize clean
 .PHONY: ready compiled-magloc compiled-adcs compiled-tests
 
 map: .venv/installed
@@ -26,6 +28,7 @@ test-full: ready chromium
 lint: .venv/installed-test
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
+	$(BIN)/clang-format --dry-run -Werror $$(find magloc adcs -name '*.cpp' -o -name '*.hpp' -o -name '*.h')
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-cache --no-logo
 
@@ -39,6 +42,13 @@ compiled-magloc compiled-adcs: compiled-%: .venv/installed-test
 
 compiled-tests: .venv/installed-test
 	@$(BIN)/python -m pytest -qq --collect-only >/dev/null
+
+# The tests of kernels with address and undefined-behaviour sanitizers, which end the tests at the first fault.
+sanitize: .venv/installed-test
+	cmake -G Ninja -S magloc/core -B build/sanitize -DMAGLOC_SANITIZE=ON -DPython_EXECUTABLE=$(abspath $(BIN)/python) >/dev/null
+	cmake --build build/sanitize
+	ASAN_OPTIONS=detect_leaks=0 LD_PRELOAD=$$($(CXX) -print-file-name=libasan.so) MAGLOC_KERNELS=$(abspath build/sanitize/kernels.so) \
+		$(BIN)/python -m pytest -q -p no:cacheprovider $(KERNEL_TESTS)
 
 # Whether the tests see a change in 300 lines of the code; hours, and it goes on where it was stopped. Other lines and
 # more processors: `python -m tests.mutation --seed 1 --count 100 --jobs 4`.
@@ -139,5 +149,5 @@ test-oldest: .venv-oldest/installed chromium
 	@touch $@
 
 clean:
-	rm -rf .venv .venv-oldest .venv-supply build dist *.egg-info docs/_build docs/gallery/notebooks docs/reference/commands docs/reference/names
+	rm -rf .venv .venv-oldest .venv-supply build dist magloc/core/kernels.* magloc/core/_declarations.py *.egg-info docs/_build docs/gallery/notebooks docs/reference/commands docs/reference/names
 	find . -name __pycache__ -prune -exec rm -rf {} +

@@ -183,7 +183,9 @@ class TestRules:
 
 def names() -> list[str]:
     """All files of the tree, but for what is made from them."""
-    made = re.compile(r"\.(?!github)|_build$|__pycache__$|build$|dist$|.*\.egg-info$|map-")
+    made = re.compile(
+        r"\.(?!github)|kernels\.(so|dll)$|_declarations\.py$|_build$|__pycache__$|build$|dist$|.*\.egg-info$|map-"
+    )
     made_pages = {
         Path(REPOSITORY, "docs", *place)
         for place in (("reference", "names"), ("reference", "commands"), ("gallery", "notebooks"))

@@ -4,7 +4,8 @@ A thin module checks shapes, allocates results, describes the problem (:func:`pr
 (:func:`run`). Users call its functions, not these. docs/development/kernels.md shows how to add a kernel.
 
 The environment variable MAGLOC_ISA names the instruction set to use ("baseline", "avx2", "avx512"; default: the best
-one of the machine), MAGLOC_NUM_THREADS the number of threads (default: all processors that the process may use).
+one of the machine), MAGLOC_NUM_THREADS the number of threads (default: all processors that the process may use), and
+MAGLOC_KERNELS another library, such as one built with sanitizers.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ import numpy as np
 from magloc.core._declarations import ffi
 
 _HERE = Path(__file__).parent
-_SUFFIX = {"win32": ".dll", "darwin": ".so"}.get(sys.platform, ".so")
-_lib: Any = ffi.dlopen(str(_HERE / f"kernels{_SUFFIX}"))
+_SUFFIX = ".dll" if sys.platform == "win32" else ".so"
+_lib: Any = ffi.dlopen(os.environ.get("MAGLOC_KERNELS") or str(_HERE / f"kernels{_SUFFIX}"))
 _TYPES = {"double": np.dtype(np.float64), "int64_t": np.dtype(np.int64), "uint8_t": np.dtype(np.uint8)}
 
 

@@ -3,9 +3,9 @@
 
 #define DECLARE(name, problem_type, isa) \
   extern "C" int64_t magloc_##name##_##isa(const magloc_##problem_type *, int64_t, int64_t, double *);
-#define DECLARE_ALL(name, problem_type)      \
-  DECLARE(name, problem_type, baseline)      \
-  DECLARE(name, problem_type, avx2)          \
+#define DECLARE_ALL(name, problem_type) \
+  DECLARE(name, problem_type, baseline) \
+  DECLARE(name, problem_type, avx2)     \
   DECLARE(name, problem_type, avx512)
 MAGLOC_KERNELS(DECLARE_ALL)
 
@@ -15,7 +15,9 @@ const char *const names[] = {"baseline", "avx2", "avx512"};
 
 #if defined(MAGLOC_SET_avx2) || defined(MAGLOC_SET_avx512)
 void cpuid(uint32_t leaf, uint32_t (&registers)[4]) {
-  __asm__ volatile("cpuid" : "=a"(registers[0]), "=b"(registers[1]), "=c"(registers[2]), "=d"(registers[3]) : "a"(leaf), "c"(0));
+  __asm__ volatile("cpuid"
+                   : "=a"(registers[0]), "=b"(registers[1]), "=c"(registers[2]), "=d"(registers[3])
+                   : "a"(leaf), "c"(0));
 }
 
 // Which sets the processor has and the operating system saves; __builtin_cpu_supports does not work with Zig.
@@ -44,14 +46,18 @@ InstructionSet best_of_machine() { return baseline; }
 
 bool is_built(InstructionSet set) {
   switch (set) {
-    case baseline: return true;
+    case baseline:
+      return true;
 #ifdef MAGLOC_SET_avx2
-    case avx2: return true;
+    case avx2:
+      return true;
 #endif
 #ifdef MAGLOC_SET_avx512
-    case avx512: return true;
+    case avx512:
+      return true;
 #endif
-    default: return false;
+    default:
+      return false;
   }
 }
 
@@ -86,20 +92,22 @@ int magloc_use_instruction_set(const char *name) {
 }
 
 #ifdef MAGLOC_SET_avx2
-#define IF_AVX2(call) if (set == avx2) return call;
+#define IF_AVX2(call) \
+  if (set == avx2) return call;
 #else
 #define IF_AVX2(call)
 #endif
 #ifdef MAGLOC_SET_avx512
-#define IF_AVX512(call) if (set == avx512) return call;
+#define IF_AVX512(call) \
+  if (set == avx512) return call;
 #else
 #define IF_AVX512(call)
 #endif
-#define DISPATCH(name, problem_type)                                                                          \
-  int64_t magloc_##name(const magloc_##problem_type *p, int64_t begin, int64_t end, double *workspace) {     \
-    [[maybe_unused]] const int set = instruction_set();                                                       \
-    IF_AVX512(magloc_##name##_avx512(p, begin, end, workspace))                                               \
-    IF_AVX2(magloc_##name##_avx2(p, begin, end, workspace))                                                   \
-    return magloc_##name##_baseline(p, begin, end, workspace);                                                \
+#define DISPATCH(name, problem_type)                                                                     \
+  int64_t magloc_##name(const magloc_##problem_type *p, int64_t begin, int64_t end, double *workspace) { \
+    [[maybe_unused]] const int set = instruction_set();                                                  \
+    IF_AVX512(magloc_##name##_avx512(p, begin, end, workspace))                                          \
+    IF_AVX2(magloc_##name##_avx2(p, begin, end, workspace))                                              \
+    return magloc_##name##_baseline(p, begin, end, workspace);                                           \
   }
 MAGLOC_KERNELS(DISPATCH)

@@ -6,9 +6,9 @@ problem, on different items.
 
     int64_t magloc_<kernel>(const magloc_<problem> *problem, int64_t begin, int64_t end, double *workspace);
 
-With workspace = NULL a kernel computes nothing and returns the number of doubles that its workspace must have. Otherwise
-it returns 0. Each thread needs a workspace of its own. Kernels allocate nothing, do not check their input and never
-fail: what cannot be computed is NaN.
+With workspace = NULL a kernel computes nothing and returns the number of doubles that its workspace must have.
+Otherwise it returns 0. Each thread needs a workspace of its own. Kernels allocate nothing, do not check their input and
+never fail: what cannot be computed is NaN.
 
 All quantities are in SI units: m, A m^2, T, s, rad.
 */

@@ -4,8 +4,8 @@
 #include "numbers.hpp"
 
 // X(kernel, problem)
-#define MAGLOC_KERNELS(X)                                                                                              \
-  X(dipole_fields, dipoles)                                                                                            \
+#define MAGLOC_KERNELS(X)   \
+  X(dipole_fields, dipoles) \
   X(dipole_gradients, dipoles)
 
 #define MAGLOC_JOIN_(a, b, c) magloc_##a##_##b##c
@@ -13,7 +13,7 @@
 // Define the kernel of this instruction set: MAGLOC_KERNEL(dipole_fields, dipoles) { ... return 0; }
 #define MAGLOC_KERNEL(name, problem_type)                                                                              \
   extern "C" int64_t MAGLOC_JOIN(name, MAGLOC_ISA, )(const magloc_##problem_type *problem, int64_t begin, int64_t end, \
-                                                      double *workspace)
+                                                     double *workspace)
 
 MAGLOC_BEGIN
 // The caller's workspace, handed out in pieces that start at multiples of 64 bytes. With a null pointer it only counts.
@@ -25,7 +25,8 @@ class Workspace {
   explicit Workspace(double *memory) : start_(memory) {
     if (memory) start_ += (64 - (uintptr_t)memory % 64) % 64 / sizeof(double);
   }
-  template <class T> T *take(int64_t count) {
+  template <class T>
+  T *take(int64_t count) {
     T *piece = start_ ? reinterpret_cast<T *>(start_ + used_) : nullptr;
     used_ += (count * (int64_t)sizeof(T) + 63) / 64 * 8;
     return piece;

@@ -14,8 +14,12 @@
 #ifndef MAGLOC_LANES
 #define MAGLOC_LANES 1
 #endif
-#define MAGLOC_BEGIN namespace magloc { inline namespace MAGLOC_ISA {
-#define MAGLOC_END } }
+#define MAGLOC_BEGIN \
+  namespace magloc { \
+  inline namespace MAGLOC_ISA {
+#define MAGLOC_END \
+  }                \
+  }
 #if defined(__GNUC__)
 #define MAGLOC_INLINE inline __attribute__((always_inline))
 #else
@@ -56,20 +60,30 @@ typedef double Lanes;
 typedef bool Mask;
 #endif
 
-template <class T> constexpr int n_lanes = sizeof(T) / sizeof(double);
-template <class T> MAGLOC_INLINE T broadcast(double x) { return T{} + x; }
-template <class T> MAGLOC_INLINE T maximum(T a, T b) { return choose(a > b, a, b); }
+template <class T>
+constexpr int n_lanes = sizeof(T) / sizeof(double);
+template <class T>
+MAGLOC_INLINE T broadcast(double x) {
+  return T{} + x;
+}
+template <class T>
+MAGLOC_INLINE T maximum(T a, T b) {
+  return choose(a > b, a, b);
+}
 
 // Read component `axis` of the 3-vectors i, i + 1, ... of an array (n, 3), one in each lane. Beyond the end the last
 // vector is repeated.
-template <class T> MAGLOC_INLINE T load_component(const double *vectors, int64_t i, int64_t n, int axis) {
+template <class T>
+MAGLOC_INLINE T load_component(const double *vectors, int64_t i, int64_t n, int axis) {
   T x{};
-  for (int lane = 0; lane < n_lanes<T>; ++lane) set_lane(x, lane, vectors[3 * (i + lane < n ? i + lane : n - 1) + axis]);
+  for (int lane = 0; lane < n_lanes<T>; ++lane)
+    set_lane(x, lane, vectors[3 * (i + lane < n ? i + lane : n - 1) + axis]);
   return x;
 }
 
 // A value and its derivatives with respect to n variables.
-template <class T, int n> struct Dual {
+template <class T, int n>
+struct Dual {
   T value, derivative[n];
 
   MAGLOC_INLINE static Dual constant(T value) {
@@ -83,12 +97,12 @@ template <class T, int n> struct Dual {
     r.derivative[which] = broadcast<T>(1.0);
     return r;
   }
-#define MAGLOC_RULE(arguments, of_value, of_derivative)                                                                \
-  friend MAGLOC_INLINE Dual operator arguments {                                                                       \
-    Dual r;                                                                                                            \
-    r.value = of_value;                                                                                                \
-    for (int i = 0; i < n; ++i) r.derivative[i] = of_derivative;                                                       \
-    return r;                                                                                                          \
+#define MAGLOC_RULE(arguments, of_value, of_derivative)          \
+  friend MAGLOC_INLINE Dual operator arguments {                 \
+    Dual r;                                                      \
+    r.value = of_value;                                          \
+    for (int i = 0; i < n; ++i) r.derivative[i] = of_derivative; \
+    return r;                                                    \
   }
   MAGLOC_RULE(+(const Dual &a, const Dual &b), a.value + b.value, a.derivative[i] + b.derivative[i])
   MAGLOC_RULE(-(const Dual &a, const Dual &b), a.value - b.value, a.derivative[i] - b.derivative[i])
@@ -96,11 +110,15 @@ template <class T, int n> struct Dual {
   MAGLOC_RULE(+(const Dual &a, T b), a.value + b, a.derivative[i])
   MAGLOC_RULE(-(const Dual &a, T b), a.value - b, a.derivative[i])
   MAGLOC_RULE(*(const Dual &a, T b), a.value *b, a.derivative[i] * b)
-  MAGLOC_RULE(*(T a, const Dual &b), a *b.value, a * b.derivative[i])
+  MAGLOC_RULE(*(T a, const Dual &b), a *b.value, a *b.derivative[i])
 #undef MAGLOC_RULE
 };
-template <class T> MAGLOC_INLINE T inverse_root(T x) { return 1.0 / square_root(x); }
-template <class T, int n> MAGLOC_INLINE Dual<T, n> inverse_root(const Dual<T, n> &x) {
+template <class T>
+MAGLOC_INLINE T inverse_root(T x) {
+  return 1.0 / square_root(x);
+}
+template <class T, int n>
+MAGLOC_INLINE Dual<T, n> inverse_root(const Dual<T, n> &x) {
   Dual<T, n> r;
   r.value = 1.0 / square_root(x.value);
   const T slope = -0.5 * r.value * r.value * r.value;
@@ -108,11 +126,13 @@ template <class T, int n> MAGLOC_INLINE Dual<T, n> inverse_root(const Dual<T, n>
   return r;
 }
 
-template <class A, class B> MAGLOC_INLINE auto dot(const A (&a)[3], const B (&b)[3]) {
+template <class A, class B>
+MAGLOC_INLINE auto dot(const A (&a)[3], const B (&b)[3]) {
   return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 }
 
-template <class T> MAGLOC_INLINE void cross(const T (&a)[3], const T (&b)[3], T (&c)[3]) {
+template <class T>
+MAGLOC_INLINE void cross(const T (&a)[3], const T (&b)[3], T (&c)[3]) {
   c[0] = a[1] * b[2] - a[2] * b[1];
   c[1] = a[2] * b[0] - a[0] * b[2];
   c[2] = a[0] * b[1] - a[1] * b[0];
