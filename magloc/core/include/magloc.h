@@ -40,6 +40,35 @@ typedef struct {
 int64_t magloc_dipole_fields(const magloc_dipoles *problem, int64_t begin, int64_t end, double *workspace);
 int64_t magloc_dipole_gradients(const magloc_dipoles *problem, int64_t begin, int64_t end, double *workspace);
 
+/* Attitudes of a camera that triangles of its image's stars state by those of a catalogue. An item is a triangle of the
+   image; calls are in order, and compute nothing more once the best attitudes match enough stars or enough attitudes
+   were tried. Corners are ordered by the opposite side, shortest first; sides, all in units of the sphere's radius, too. */
+typedef struct {
+  int64_t n_image, n_checked;
+  const double *tangents;         /* (n_checked or more, 2): places of the image's stars, brightest first */
+  const int64_t *image_corners;   /* (n_image, 3): numbers of stars */
+  const double *image_sides;      /* (n_image, 3) */
+  const uint8_t *image_is_counter_clockwise; /* (n_image,) */
+  int64_t n_ratios;               /* cells of each of the ratios of the two shorter sides to the longest one */
+  const int64_t *begins;          /* (n_ratios^2 + 1,): first triangle of the catalogue in each cell */
+  const int64_t *corners;         /* (n, 3): numbers of stars; by cell, and in it by the longest side */
+  const double *sides;            /* (n, 3) */
+  const uint8_t *is_counter_clockwise; /* (n,) */
+  const double *bright;           /* (n_stars, 3): directions of the stars of these triangles */
+  int64_t n_cells;                /* of the cube [-1, 1]^3 along each axis */
+  const int64_t *sky_begins;      /* (n_cells^3 + 1,): first star of the catalogue in each cell */
+  const double *sky;              /* (n, 3): directions of all stars, by cell */
+  double side_gate, scale_gate;   /* how far sides and, relatively, the image's scale may be off */
+  double star_gate;               /* within which a star of the image is one of the catalogue */
+  int64_t n_enough, n_most;       /* stars that match, attitudes tried: with either the search ends */
+  int64_t *progress;              /* (2,): triangles looked up, attitudes tried; zero at first */
+  int64_t n_kept;
+  int64_t *matched;               /* (n_kept,): stars that match with the best attitudes, ascending; zero at first */
+  double *rotations;              /* (n_kept, 3, 3): into the catalogue's frame from the image's */
+  double *scales;                 /* (n_kept,): relative to the image's */
+} magloc_star_triangles;
+int64_t magloc_star_search(const magloc_star_triangles *problem, int64_t begin, int64_t end, double *workspace);
+
 /* end of the declarations */
 #ifdef __GNUC__
 #pragma GCC visibility pop
