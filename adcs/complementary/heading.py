@@ -228,10 +228,9 @@ def _blocks(
 ) -> tuple[Blocks, NDArray[np.intp]]:
     """Means over short times, and the instants (m,) that end them; ``start_T`` is in the level frame still."""
     from adcs.complementary.heading_compiled import Blocks
-    from adcs.complementary.inertial_magnetic_compiled import rotated
 
     growth = np.zeros(len(time_s)) if hidden_rad2 is None else hidden_rad2
-    level = rotated(q_level, field_T)
+    level = quaternion.rotate(q_level, field_T)
     rows = np.flatnonzero(is_read(level))
     if not rows.size:
         raise ValueError("Input field_T must be there within the first second; instead received none.")

@@ -69,6 +69,78 @@ typedef struct {
 } magloc_star_triangles;
 int64_t magloc_star_search(const magloc_star_triangles *problem, int64_t begin, int64_t end, double *workspace);
 
+/* Readings of a gyro and of two vectors, such as field and Sun, of several runs. A vector has any length, and is NaN where
+   it was not read. Either all runs share the references and turns of the frame (n_references = 1) or each has its own. */
+typedef struct {
+  int64_t n_runs, n_steps, n_references;
+  const double *dt;                                /* (n_steps,): steps that end at each instant */
+  const double *rate;                              /* (n_runs, n_steps, 3): mean rate of each step */
+  const double *first, *second;                    /* (n_runs, n_steps, 3): body axes */
+  const double *first_reference, *second_reference; /* (n_references, n_steps, 3): the same in the frame */
+  const double *frame_turn;                        /* (n_references, n_steps, 4): turn of the frame in each step */
+} magloc_vector_record;
+
+/* Complementary filter of the attitude. Item run * n_steps + i is instant i of a run; those of a run are in order, with
+   one workspace. Gains are K_P and K_I. */
+typedef struct {
+  const magloc_vector_record *record;
+  int64_t is_gauss_newton;   /* 1: error against a measured quaternion, by Gauss and Newton; 0: explicit error */
+  double mu;                 /* added to the diagonal of Gauss and Newton's normal equations */
+  double weights[2];         /* of the two vectors in the explicit error */
+  double gains[2], outage_gains[2]; /* with the second vector, and while it is missing */
+  double boost, boost_level, boost_memory; /* factor of K_I while the smoothed error exceeds a level, and its memory */
+  int64_t is_substituted, is_transported, delay; /* whether the first vector of so many steps ago stands in for a second
+                                one that is missing, and whether it is turned as body and frame have turned since */
+  const double *counted;     /* (n_steps,): time for which the vectors of each instant count */
+  double *q;                 /* (n_runs, n_steps, 4): reference from body; the first one of a run is where it starts */
+  double *integral;          /* (n_runs, n_steps, 3): minus the gyro's bias */
+  double *q_measured;        /* (n_runs, n_steps, 4): of Gauss and Newton's filter */
+} magloc_complementary;
+int64_t magloc_complementary_filter(const magloc_complementary *problem, int64_t begin, int64_t end, double *workspace);
+
+/* Adaptive error-state filter of attitude and gyro bias; items as of magloc_complementary. */
+typedef struct {
+  const magloc_vector_record *record;
+  double first_sigma, second_sigma;       /* noise of the first vector in its unit, and of the unit second one */
+  double attitude_growth, bias_growth;    /* of the variances, in a second */
+  double memory, threshold, changed_growth; /* of the smoothed NIS; above it the bias's variance grows by more */
+  double *q;                              /* (n_runs, n_steps, 4) */
+  double *bias;                           /* (n_runs, n_steps, 3) */
+  double *covariance;                     /* (n_runs, n_steps, 6, 6): of the error angle in body axes, and of the bias */
+  double *smoothed_nis;                   /* (n_runs, n_steps) */
+} magloc_adaptive;
+int64_t magloc_adaptive_filter(const magloc_adaptive *problem, int64_t begin, int64_t end, double *workspace);
+
+/* Attitudes of a gyro alone, from the identity on; an item is an instant, all in order. */
+typedef struct {
+  const double *rate; /* (n, 3): mean rate of the step that ends at each instant */
+  const double *dt;   /* (n,) */
+  double *q;          /* (n, 4) */
+} magloc_gyro;
+int64_t magloc_gyro_attitudes(const magloc_gyro *problem, int64_t begin, int64_t end, double *workspace);
+
+/* Attitudes of a gyro, turned from the left so that a vector of its frame goes up; an item is an instant, all in order. */
+typedef struct {
+  double start[4];       /* level frame from that of the gyro, at first */
+  const double *q_gyro;  /* (n, 4) */
+  const double *up;      /* (n, 3) */
+  const double *part;    /* (n,): part of the angle that is corrected */
+  double *q;             /* (n, 4) */
+} magloc_level;
+int64_t magloc_level_attitudes(const magloc_level *problem, int64_t begin, int64_t end, double *workspace);
+
+/* Butterworth filter of second order in any steps, exact for an input that is its mean within each step; an item is an
+   instant, all in order. NaN is the value before. */
+typedef struct {
+  int64_t n_columns;
+  const double *values;  /* (n, n_columns) */
+  const double *start;   /* (n_columns,): where the filter rests at first */
+  const double *steps;   /* (n,): s dt of the step that ends at each instant; the distance z of the filter to its input
+                            obeys z'' + 2 s z' + 2 s^2 z = 0 */
+  double *out;           /* (n, n_columns) */
+} magloc_butterworth;
+int64_t magloc_low_pass(const magloc_butterworth *problem, int64_t begin, int64_t end, double *workspace);
+
 /* end of the declarations */
 #ifdef __GNUC__
 #pragma GCC visibility pop

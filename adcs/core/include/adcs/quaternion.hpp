@@ -45,15 +45,15 @@ inline Vector rotate(const Quaternion &q, const Vector &v) {
 }
 inline Vector rotate_back(const Quaternion &q, const Vector &v) { return rotate(conjugate(q), v); }
 
-// (cos t/2, n sin t/2) of a rotation vector t n, by power series of h^2 = t^2/4, exact to rounding up to h^2 = 0.6. A
-// longer rotation is halved until it is short enough, and its quaternion squared as often.
+// (cos t/2, n sin t/2) of a rotation vector t n, by power series of h = t/2, exact to rounding up to h^2 = 0.04. A longer
+// rotation is halved until it is short enough, and its quaternion squared as often.
 inline Quaternion exponential(Vector v) {
   double square = 0.25 * dot(v, v);
   int halved = 0;
-  for (; square > 0.6 && halved < 64; ++halved) v = 0.5 * v, square *= 0.25;
+  for (; square > 0.04 && halved < 64; ++halved) v = 0.5 * v, square *= 0.25;
   double cosine = 1.0, sine = 1.0;  // cos h and sin(h)/h
-#pragma GCC unroll 8
-  for (int i = 16; i > 0; i -= 2) {
+#pragma GCC unroll 5
+  for (int i = 10; i > 0; i -= 2) {
     cosine = 1.0 - square * (1.0 / (i * (i - 1))) * cosine;
     sine = 1.0 - square * (1.0 / (i * (i + 1))) * sine;
   }
