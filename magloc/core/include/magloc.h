@@ -141,6 +141,35 @@ typedef struct {
 } magloc_butterworth;
 int64_t magloc_low_pass(const magloc_butterworth *problem, int64_t begin, int64_t end, double *workspace);
 
+/* How the states of a heading filter move on in each block: the heading, the gyro's drift, scales of its axes, the sensor's
+   offset, and the slow and the quick variation of the room's field. */
+typedef struct {
+  const double *kept;   /* (n_blocks, 14): part of each state that is left */
+  const double *growth; /* (n_blocks, 14): of its variance */
+} magloc_heading_room;
+
+/* Heading of an inertial unit from means over n blocks of time; an item of the filter is a block, all in order. The
+   smoother has 2 n items, forwards and backwards, and uses the blocks that the filter has found to be known. */
+typedef struct {
+  int64_t n_blocks;
+  const double *field;       /* (n_blocks, 3): in the frame that is level and whose heading is the gyro's */
+  const double *level;       /* (n_blocks, 3, 3): to that frame from the body */
+  const double *dt;          /* (n_blocks,) */
+  const double *turn;        /* (n_blocks, 4): what drift and scales add to the heading */
+  const magloc_heading_room *room, *other_room; /* the latter where the field is another one everywhere */
+  const double *x, *P;       /* (14,), (14, 14): at the start */
+  double start_field[3];     /* east, north, up */
+  double noise;              /* of the field, 1 sigma, each axis */
+  double gate, mean_nis, memory; /* limits of the NIS of a block and, each axis, of the mean of the last ones */
+  double patience, trial;    /* how long blocks contradict before a change of the offset is tried, and for how long */
+  double jump, evidence;     /* the change, 1 sigma, and the logarithm of its odds from which on it is believed */
+  double *told, *variances;  /* (n_blocks, 4): heading and offset */
+  int64_t *used, *known;     /* (n_blocks,): 1 where a block is used, and where it is in hindsight; 2 where the offset
+                                began to be another one; zero at first */
+} magloc_heading;
+int64_t magloc_heading_filter(const magloc_heading *problem, int64_t begin, int64_t end, double *workspace);
+int64_t magloc_heading_smoother(const magloc_heading *problem, int64_t begin, int64_t end, double *workspace);
+
 /* end of the declarations */
 #ifdef __GNUC__
 #pragma GCC visibility pop

@@ -12,7 +12,9 @@
   X(adaptive_filter, adaptive)                                                                                         \
   X(gyro_attitudes, gyro)                                                                                              \
   X(level_attitudes, level)                                                                                            \
-  X(low_pass, butterworth)
+  X(low_pass, butterworth)                                                                                             \
+  X(heading_filter, heading)                                                                                           \
+  X(heading_smoother, heading)
 
 #define MAGLOC_JOIN_(a, b, c) magloc_##a##_##b##c
 #define MAGLOC_JOIN(a, b, c) MAGLOC_JOIN_(a, b, c)
