@@ -46,7 +46,7 @@ def conjugate(q: ArrayLike) -> FloatArray:
 def normalised(q: ArrayLike) -> FloatArray:
     """Quaternion of length 1, shape (..., 4); NaN where the length is zero or not finite."""
     values = np.asarray(q, dtype=np.float64)
-    norm = np.linalg.norm(values, axis=-1, keepdims=True)
+    norm = np.sqrt(np.einsum("...i,...i->...", values, values))[..., None]
     return values / np.where(norm > 0.0, norm, np.nan)
 
 
