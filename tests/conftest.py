@@ -14,6 +14,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from adcs.cli.app import main as adcs_main
+from magloc import core
 from magloc.cli.app import main
 from tests.command_line import Outcome, Run
 from tests.fuzz.cases import write_files
@@ -101,6 +102,18 @@ def forgetful(request: pytest.FixtureRequest) -> Iterator[None]:
     for kept in vars(request.module).values():
         if hasattr(kept, "cache_clear") and kept.__module__ == request.module.__name__:
             kept.cache_clear()
+
+
+@pytest.fixture(params=["baseline", "avx2", "avx512"])
+def instruction_set(request: pytest.FixtureRequest) -> Iterator[str]:
+    """Use each of the machine's instruction sets in compiled kernels."""
+    before = core.instruction_set()
+    try:
+        core.use_instruction_set(request.param)
+    except ValueError:
+        pytest.skip(f"this machine or build does not have {request.param}")
+    yield request.param
+    core.use_instruction_set(before)
 
 
 @pytest.fixture(scope="session")

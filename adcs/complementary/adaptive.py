@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from adcs import quaternion
-from adcs.complementary.explicit import first_attitude, turned
+from adcs.complementary.explicit import BLOCK, first_attitude, record_problem, turned
 from adcs.satellite.vector_record import VectorRecord
 from arrays.io.errors import check_positive
 from arrays.typing import FloatArray
+from magloc import core
 from magloc.chi_square import normalised_square
-from magloc.compilation import over_rows
 from magloc.navigation.rotations import cross_matrix
 
 
@@ -99,26 +99,28 @@ def adaptive_track(
 
     ``q_start`` (4,): first estimate. Raises ValueError: the first estimate has no length.
     """
-    from adcs.complementary.filters_compiled import Record, adaptive
-
     shape = (record.n_runs, len(record))
     track = AdaptiveTrack(np.empty((*shape, 4)), np.zeros((*shape, 3)), np.empty((*shape, 6, 6)), np.empty(shape))
     if len(record) == 0:
         return track
     track.q[:, 0] = first_attitude(q_start)
     track.covariance[:, 0] = tuning.start_covariance
-    over_rows(
-        adaptive,
-        record.n_runs,
-        Record.of(record),
-        np.array([tuning.first_sigma, tuning.second_sigma_rad]),
-        np.square([tuning.attitude_noise_rad, tuning.bias_noise_rad_s]) / record.usual_dt_s,
-        np.array([tuning.memory, tuning.threshold, tuning.growth_rad_s**2 / record.usual_dt_s]),
-        track.q,
-        track.bias_rad_s,
-        track.covariance,
-        track.smoothed_nis,
+    work = core.problem(
+        "adaptive",
+        record=record_problem(record),
+        first_sigma=tuning.first_sigma,
+        second_sigma=tuning.second_sigma_rad,
+        attitude_growth=tuning.attitude_noise_rad**2 / record.usual_dt_s,
+        bias_growth=tuning.bias_noise_rad_s**2 / record.usual_dt_s,
+        memory=tuning.memory,
+        threshold=tuning.threshold,
+        changed_growth=tuning.growth_rad_s**2 / record.usual_dt_s,
+        q=track.q,
+        bias=track.bias_rad_s,
+        covariance=track.covariance,
+        smoothed_nis=track.smoothed_nis,
     )
+    core.run("adaptive_filter", work, track.smoothed_nis.size, block=BLOCK, chain=len(record))
     return track
 
 
@@ -129,7 +131,7 @@ def adaptive_steps(
     q_start: ArrayLike = quaternion.IDENTITY,
     run: int = 0,
 ) -> Iterator[tuple[FloatArray, FloatArray, FloatArray]]:
-    """Readable twin of :func:`adaptive_track`: attitude, bias and covariance of one run at every instant.
+    """Readable reference of :func:`adaptive_track`: attitude, bias and covariance of one run at every instant.
 
     Yields ``q`` (4,), ``bias`` (3,), ``covariance`` (6, 6).
     """

@@ -14,15 +14,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from adcs import quaternion
-from adcs.complementary.outage import NO_SUBSTITUTE, Substitute, Substitution, delay_steps, substitute_code
+from adcs.complementary.outage import NO_SUBSTITUTE, Substitute, Substitution, delay_steps
 from adcs.satellite.vector_record import VectorRecord
 from arrays.typing import FloatArray
-from magloc.compilation import over_rows
+from magloc import core
 
 LARGEST_EIGENVALUE = 2.0
 """Of e against the error angle, for unit vectors: the eigenvalues are 1 ± |cos| of their angle, and 2."""
 WARNING_FRACTION = 0.9
 """Of the stability limit."""
+BLOCK = 20_000
+"""Instants that one call of a kernel computes: some milliseconds."""
 
 
 @dataclass(frozen=True)
@@ -140,44 +142,65 @@ def explicit_track(
     ``q_start`` (4,): first estimate. ``substitution``: in place of a second vector that is missing. Raises
     ValueError: the gains are beyond the stability limit, or the first estimate has no length.
     """
-    from adcs.complementary.filters_compiled import EXPLICIT
-
-    return compiled_track(EXPLICIT, record, gains, q_start, substitution, 0.0)
+    return compiled_track(record, gains, q_start, substitution)
 
 
 def compiled_track(
-    method: int, record: VectorRecord, gains: Gains, q_start: ArrayLike, substitution: Substitution, mu: float
+    record: VectorRecord,
+    gains: Gains,
+    q_start: ArrayLike,
+    substitution: Substitution,
+    gauss_newton_mu: float | None = None,
 ) -> ComplementaryTrack:
     """Call the compiled filter.
 
-    See :func:`explicit_track` and :func:`adcs.complementary.gauss_newton.gauss_newton_track`.
+    See :func:`explicit_track` and, with ``gauss_newton_mu``,
+    :func:`adcs.complementary.gauss_newton.gauss_newton_track`.
     """
-    from adcs.complementary.filters_compiled import Outage, Record, Weights, complementary
-
     gains.check(record.usual_dt_s)
     shape = (record.n_runs, len(record))
     q, integral, measured = np.empty((*shape, 4)), np.zeros((*shape, 3)), np.full((*shape, 4), np.nan)
     if len(record) == 0:
         return ComplementaryTrack(q, integral, measured)
     q[:, 0] = first_attitude(q_start)
-    over_rows(
-        complementary,
-        record.n_runs,
-        Record.of(record),
-        Weights(
-            np.array([gains.first_weight, gains.second_weight]),
-            np.array([*gains.during(False), *gains.during(True)]),
-            np.array([gains.boost, gains.boost_level_rad, gains.boost_memory]),
-        ),
-        method,
-        counted_s(record, gains),
-        Outage(substitute_code(substitution), delay_steps(substitution, record.usual_dt_s)),
-        mu,
-        q,
-        integral,
-        measured,
+    work = core.problem(
+        "complementary",
+        record=record_problem(record),
+        is_gauss_newton=gauss_newton_mu is not None,
+        mu=gauss_newton_mu or 0.0,
+        weights=(gains.first_weight, gains.second_weight),
+        gains=gains.during(False),
+        outage_gains=gains.during(True),
+        boost=gains.boost,
+        boost_level=gains.boost_level_rad,
+        boost_memory=gains.boost_memory,
+        is_substituted=substitution.rule != "magnetometer-only",
+        is_transported=substitution.rule == "transported",
+        delay=delay_steps(substitution, record.usual_dt_s),
+        counted=counted_s(record, gains),
+        q=q,
+        integral=integral,
+        q_measured=measured,
     )
+    core.run("complementary_filter", work, q.size // 4, block=BLOCK, chain=len(record))
     return ComplementaryTrack(q, integral, measured)
+
+
+def record_problem(record: VectorRecord) -> core.Problem:
+    """Describe a record to a kernel."""
+    return core.problem(
+        "vector_record",
+        n_runs=record.n_runs,
+        n_steps=len(record),
+        n_references=len(record.first_reference),
+        dt=np.ascontiguousarray(record.dt_s),
+        rate=record.rate_rad_s,
+        first=record.first_body,
+        second=record.second_body,
+        first_reference=record.first_reference,
+        second_reference=record.second_reference,
+        frame_turn=quaternion.exp(record.frame_rate_rad_s * record.dt_s[:, None]),
+    )
 
 
 def counted_s(record: VectorRecord, gains: Gains) -> FloatArray:
@@ -206,7 +229,7 @@ def steps(
     substitution: Substitution = NO_SUBSTITUTE,
     run: int = 0,
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Readable twin of the compiled filters: (q̂, I) of one run at every instant.
+    """Readable reference of the compiled filters: (q̂, I) of one run at every instant.
 
     ``correction``: error angle e of an estimate and the instant's two unit vectors, such as :func:`explicit_error` or
     :class:`adcs.complementary.gauss_newton.MeasuredQuaternion`. ``gains``, ``q_start``, ``substitution``: as

@@ -86,6 +86,4 @@ def gauss_newton_track(
     a second vector that is missing. ``mu``: added to the normal equations. Raises ValueError: the gains are beyond
     the stability limit.
     """
-    from adcs.complementary.filters_compiled import GAUSS_NEWTON
-
-    return compiled_track(GAUSS_NEWTON, record, gains, q_start, substitution, mu)
+    return compiled_track(record, gains, q_start, substitution, mu)

@@ -8,8 +8,8 @@ it was shows in the turns that were made, and only there: where they do not tell
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,13 +19,13 @@ from adcs.complementary.inertial.gaps import HELD_VARIANCE, UNKNOWN_RAD
 from adcs.satellite.telemetry import is_read
 from adcs.satellite.vector_record import instants_within, steps_s
 from arrays.typing import BoolArray, FloatArray
-
-if TYPE_CHECKING:
-    from adcs.complementary.heading_compiled import Blocks, Noise
+from magloc import core
 
 _BLOCK_S = 0.035
 """How long readings are averaged: within it a hand turns by a few degrees."""
 _START_S = 1.0
+_BLOCK = 4000
+"""Means that one call of a kernel computes: some milliseconds."""
 _LONG_STEP_S = 1.0  # a longer time without a field is one of the gyro alone
 
 
@@ -112,6 +112,18 @@ class HeadingModel:
         )
 
 
+class Blocks(NamedTuple):
+    """Means over short times (m of them), in the frame that is level and whose heading is the gyro's."""
+
+    field_T: FloatArray  # (m, 3)
+    R_level: FloatArray  # (m, 3, 3): level from body
+    rate_rad_s: FloatArray  # (m, 3): body axes
+    dt_s: FloatArray  # (m,)
+    gap_rad2: FloatArray  # (m,): variance of the turn that a gap of the gyro hides within it
+    turns: FloatArray  # (m,): 1 where the sensor turns, 0 where it lies still
+    start_T: FloatArray  # (3,): east, north, up: the field at the start
+
+
 @dataclass(frozen=True, eq=False)
 class HeadingTrack:
     """Heading at n instants, and what the magnetometer told of it."""
@@ -142,8 +154,6 @@ def heading_track(
     heading's variance within gaps of the gyro. ``start_tilt_rad``: error of the tilt, 1 σ, at the first reading. Raises
     ValueError: there is no reading.
     """
-    from adcs.complementary.heading_compiled import Noise, Tests, run, smooth
-
     hidden = np.zeros(len(time_s)) if hidden_rad2 is None else hidden_rad2
     blocks, ends = _blocks(time_s, rate_rad_s, q_level, field_T, model, hidden)
     start = blocks.start_T
@@ -154,28 +164,8 @@ def heading_track(
     # A tilt that is wrong turns the vertical field into a horizontal one, and that into a vertical one.
     _, north, up = start_tilt_rad * blocks.start_T
     P[[0, 9, 10], [0, 9, 10]] += [min((up / blocks.start_T[1]) ** 2, UNKNOWN_RAD**2), up**2, north**2]
+    told, variances, used, changed = filtered(x, P, blocks, model, offline=offline)
     m = len(ends)
-    told, variances, used, known = np.empty((m, 4)), np.empty((m, 4)), np.zeros(m, np.int64), np.zeros(m, np.int64)
-    noise = Noise(
-        model.noise_T,
-        model.gyro_walk_rad_rts,
-        model.gyro_drift_rad_s,
-        model.gyro_drift_s,
-        model.offset_T_rts,
-        model.room_T,
-        model.room_s,
-        model.local_T,
-        0.5 * model.local_T,
-        model.local_s,
-    )
-    anywhere = noise._replace(room_T=model.jump_T, room_s=model.local_s)
-    tests = Tests(
-        model.gate, model.mean_nis, model.memory, model.patience_s, model.jump_T, model.evidence, model.trial_s
-    )
-    run(x.copy(), P.copy(), blocks, noise, anywhere, tests, told, variances, used, known)
-    if offline:
-        smooth(x, P, blocks, noise, model.jump_T, known, told, variances)
-        used = known
     # A block is known at its end; before the first one there is the start.
     ended = np.zeros(len(time_s), np.intp)
     ended[ends] = 1
@@ -192,9 +182,72 @@ def heading_track(
         sigma_rad=np.minimum(np.sqrt(variance), UNKNOWN_RAD),
         offset_T=told[last, 1:],
         offset_sigma_T=sigma[last, 1:],
-        left_out=(used == 0)[last],
-        changes=ends[known == 2],
+        left_out=~used[last],
+        changes=ends[changed],
     )
+
+
+def filtered(
+    x: FloatArray, P: FloatArray, blocks: Blocks, model: HeadingModel, *, offline: bool
+) -> tuple[FloatArray, FloatArray, BoolArray, BoolArray]:
+    """Return heading and offset (m, 4) and their variances, which blocks are used, and where the offset changed.
+
+    ``x`` (14,), ``P`` (14, 14): at the start.
+    """
+    m = len(blocks.dt_s)
+    told, variances, used, known = np.empty((m, 4)), np.empty((m, 4)), np.zeros(m, np.int64), np.zeros(m, np.int64)
+    turn, kept, growth = transitions(blocks, model)
+    _, other_kept, other_growth = transitions(blocks, replace(model, room_T=model.jump_T, room_s=model.local_s))
+    work = core.problem(
+        "heading",
+        n_blocks=m,
+        field=blocks.field_T,
+        level=blocks.R_level,
+        dt=blocks.dt_s,
+        turn=turn,
+        room=core.problem("heading_room", kept=kept, growth=growth),
+        other_room=core.problem("heading_room", kept=other_kept, growth=other_growth),
+        x=x,
+        P=P,
+        start_field=tuple(blocks.start_T),
+        noise=model.noise_T,
+        gate=model.gate,
+        mean_nis=model.mean_nis,
+        memory=model.memory,
+        patience=model.patience_s,
+        trial=model.trial_s,
+        jump=model.jump_T,
+        evidence=model.evidence,
+        told=told,
+        variances=variances,
+        used=used,
+        known=known,
+    )
+    core.run("heading_filter", work, m, block=_BLOCK, chain=m)
+    if offline:
+        core.run("heading_smoother", work, 2 * m, block=_BLOCK, chain=2 * m)
+    return told, variances, (known if offline else used) > 0, known == 2
+
+
+def transitions(blocks: Blocks, model: HeadingModel) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return how the state (14,) moves on in each of m blocks, of which Φ and Q are made.
+
+    Of drift and scales what they add to the heading (m, 4), and of each state the part that is kept and the growth of
+    its variance (m, 14).
+    """
+    h, turns = blocks.dt_s[:, None], blocks.turns[:, None]
+    turn = h * np.concatenate([turns, blocks.R_level[:, 2] * blocks.rate_rad_s], axis=1)
+    kept, growth = np.ones((len(h), 14)), np.zeros((len(h), 14))
+    kept[:, 1:2] = np.exp(-h * turns / model.gyro_drift_s)
+    kept[:, 8:11] = np.exp(-h * turns / model.room_s)
+    kept[:, 11:] = np.exp(-h / model.local_s)
+    local_T = model.local_T * np.array([1.0, 1.0, 0.5])
+    sigma = np.concatenate([[model.gyro_drift_rad_s], np.full(3, model.room_T), local_T])
+    decays = [1, *range(8, 14)]
+    growth[:, decays] = np.square(sigma) * (1.0 - np.square(kept[:, decays]))
+    growth[:, 0] = model.gyro_walk_rad_rts**2 * blocks.dt_s * blocks.turns + blocks.gap_rad2
+    growth[:, 5:8] = model.offset_T_rts**2 * h
+    return turn, kept, growth
 
 
 def relative_heading(
@@ -227,11 +280,8 @@ def _blocks(
     hidden_rad2: FloatArray | None = None,
 ) -> tuple[Blocks, NDArray[np.intp]]:
     """Means over short times, and the instants (m,) that end them; ``start_T`` is in the level frame still."""
-    from adcs.complementary.heading_compiled import Blocks
-    from adcs.complementary.inertial_magnetic_compiled import rotated
-
     growth = np.zeros(len(time_s)) if hidden_rad2 is None else hidden_rad2
-    level = rotated(q_level, field_T)
+    level = quaternion.rotate(q_level, field_T)
     rows = np.flatnonzero(is_read(level))
     if not rows.size:
         raise ValueError("Input field_T must be there within the first second; instead received none.")
@@ -280,32 +330,6 @@ def _drifted(
     drift_s = 2.0 * model.gyro_drift_s**2 * (of_drift + np.expm1(-of_drift))
     variance: FloatArray = model.gyro_walk_rad_rts**2 * since_s + model.gyro_drift_rad_s**2 * drift_s
     return variance
-
-
-def transition(i: int, blocks: Blocks, noise: Noise) -> tuple[FloatArray, FloatArray]:
-    """Readable twin of :func:`adcs.complementary.heading_compiled.predict`: Φ (14, 14) and Q (14, 14) of a block."""
-    h, turns, Phi = blocks.dt_s[i], blocks.turns[i], np.eye(14)
-    lasting_s = np.repeat([noise.drift_s, noise.room_s, noise.local_s], [1, 3, 3])
-    decaying = np.array([1, *range(8, 14)])
-    keeps = np.exp(-h * np.array([turns] * 4 + [1.0] * 3) / lasting_s)
-    Phi[decaying, decaying] = keeps
-    Phi[0, 1] = h * turns
-    Phi[0, 2:5] = h * blocks.R_level[i, 2] * blocks.rate_rad_s[i]
-    local = [noise.local_T, noise.local_T, noise.local_up_T]
-    variance = np.zeros(14)
-    variance[0] = noise.walk_rad_rts**2 * h * turns + blocks.gap_rad2[i]
-    variance[5:8] = noise.offset_T_rts**2 * h
-    variance[decaying] = np.square([noise.drift_rad_s, *[noise.room_T] * 3, *local]) * (1.0 - keeps**2)
-    return Phi, np.diag(variance)
-
-
-def expected_field(x: FloatArray, i: int, blocks: Blocks) -> tuple[FloatArray, FloatArray]:
-    """Readable twin of :func:`adcs.complementary.heading_compiled.innovation`: level field (3,), derivative (3, 14)."""
-    c, s = np.cos(x[0]), np.sin(x[0])
-    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    level, R = turn @ (blocks.start_T + x[8:11] + x[11:14]), blocks.R_level[i]
-    of_heading = np.array([[-level[1]], [level[0]], [0.0]])
-    return level + R @ x[5:8], np.hstack([of_heading, np.zeros((3, 4)), R, turn, turn])
 
 
 def turned_to_north(q_level: FloatArray, heading_rad: FloatArray) -> FloatArray:

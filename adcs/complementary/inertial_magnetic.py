@@ -22,7 +22,9 @@ from adcs.complementary.inertial.gaps import (
     numbered_windows,
     sensor_gaps,
     shown_turns,
+    window_scatter,
 )
+from adcs.complementary.inertial.integration import gyro_attitudes, levelled, low_pass
 from adcs.complementary.inertial.level import GRAVITY_TIME_S, Steady, Up, direction_up
 from adcs.complementary.inertial.misreadings import check_lengths, check_turns
 from adcs.satellite.conventions import median
@@ -128,8 +130,6 @@ def rest_bias(record: InertialMagneticRecord) -> FloatArray:
 
     Returns (n, 3): zero where the sensor never rests [rad/s].
     """
-    from adcs.complementary.inertial_magnetic_compiled import window_scatter
-
     window = numbered_windows(record.time_s, _REST_S)
     rate, *of_rate = window_scatter(record.rate_rad_s, window)
     _, *of_acceleration = window_scatter(record.acceleration_m_s2, window)
@@ -209,8 +209,6 @@ def prepare(record: InertialMagneticRecord, model: HeadingModel = HeadingModel()
     Everything but the lag, for which the whole record is used, is what can be known at the time, or, offline, what the
     whole record tells.
     """
-    from adcs.complementary.inertial_magnetic_compiled import gyro_attitudes, rotated
-
     time_s, dt_s, bias = record.time_s, record.dt_s, rest_bias(record)
     moves = start_motion(record, bias[0])
     read = {
@@ -226,9 +224,9 @@ def prepare(record: InertialMagneticRecord, model: HeadingModel = HeadingModel()
     q_gyro = gyro_attitudes(rate, dt_s)
     gaps = sensor_gaps(time_s, read["gyro"])
     hidden = hidden_variance(time_s, record.rate_rad_s, gaps, model.gap_rad_s, model.long_gap_rad_s)
-    hidden += shown_turns(time_s, gaps, hidden, rotated(q_gyro, _usual_field(record)))
+    hidden += shown_turns(time_s, gaps, hidden, quaternion.rotate(q_gyro, _usual_field(record)))
     at_rest = record.starting & (not moves) & (np.cumsum(hidden) < LOST_RAD**2)
-    acceleration = rotated(q_gyro, record.acceleration_m_s2)
+    acceleration = quaternion.rotate(q_gyro, record.acceleration_m_s2)
     drift = max(model.gyro_drift_rad_s, bias_sigma)
     up = direction_up(Steady(time_s, dt_s, acceleration, at_rest, gaps, hidden, drift), offline=offline)
     part = _UP_STEP * np.minimum(dt_s / float(np.median(dt_s)), _LONGEST_UP_STEP)
@@ -263,8 +261,6 @@ def prepare(record: InertialMagneticRecord, model: HeadingModel = HeadingModel()
 
 def _levelled(q_gyro: FloatArray, up: Up, part: FloatArray) -> FloatArray:
     """Level attitudes (n, 4), from body; where the direction up begins anew the shortest turn takes it upwards."""
-    from adcs.complementary.inertial_magnetic_compiled import levelled
-
     q_level = np.empty_like(q_gyro)
     starts = 1 + np.flatnonzero(up.fresh[1:] & ~up.fresh[:-1])
     for begin, end in pairwise([0, *starts, len(up.up)]):
@@ -292,8 +288,6 @@ def _tilt_sigma_rad(
     dt_s: FloatArray, rate: FloatArray, hidden_rad2: FloatArray, model: HeadingModel, more_rad: FloatArray
 ) -> FloatArray:
     """What an accelerometer at rest leaves, and what the gyro's scale makes of turns while the low-pass is behind."""
-    from adcs.complementary.inertial_magnetic_compiled import low_pass
-
     squares = (model.gyro_scale**2 * np.einsum("ni,ni->n", rate, rate) + hidden_rad2 / _TURN_S**2)[:, None]
     smooth = low_pass(squares, dt_s, GRAVITY_TIME_S, squares[0])[:, 0]
     sigma = np.sqrt(_TILT_FLOOR_RAD**2 + _TURN_S**2 * np.maximum(smooth, 0.0) + np.square(more_rad))
@@ -305,8 +299,6 @@ def _lag_s(q_gyro: FloatArray, record: InertialMagneticRecord) -> float:
 
     Readings whose length is not that of the first second are left out: a magnet on the sensor turns with it.
     """
-    from adcs.complementary.inertial_magnetic_compiled import change_without_turns
-
     time_s, field_T = record.time_s, record.field_T
     lengths = np.sqrt(np.einsum("ni,ni->n", field_T, field_T))
     usual = np.nanmedian(lengths[record.starting])
@@ -316,7 +308,11 @@ def _lag_s(q_gyro: FloatArray, record: InertialMagneticRecord) -> float:
     apart = instants_within(_LAG_WINDOW_S, time_s[rows])
     good = np.abs(lengths[rows] - usual) < _USUAL_LENGTH * usual
     most = round(_LONGEST_LAG_S / step)
-    changes = [change_without_turns(q_gyro, time_s, rows, field_T, good, apart, lag * step) for lag in range(most + 1)]
+    pairs = np.flatnonzero(good[apart:] & good[:-apart])
+    changes = []
+    for lag in range(most + 1):
+        steady = without_turns(q_gyro, time_s, rows, field_T, lag * step)
+        changes.append(float(np.sum(np.square(steady[pairs + apart] - steady[pairs]))))
     least = int(np.argmin(changes))
     if not 0 < least < most:
         return least * step
@@ -332,21 +328,19 @@ def _usual_field(record: InertialMagneticRecord) -> FloatArray:
 
 
 def _without_lag(q_gyro: FloatArray, time_s: FloatArray, field_T: FloatArray, lag_s: float) -> FloatArray:
-    from adcs.complementary.inertial_magnetic_compiled import rotated, without_turns
-
     steady = without_turns(q_gyro, time_s, np.arange(len(time_s)), field_T, lag_s)
-    return rotated(quaternion.conjugate(q_gyro), steady)
+    return quaternion.rotate_back(q_gyro, steady)
 
 
-def turned_back(
+def without_turns(
     q: FloatArray, time_s: FloatArray, rows: NDArray[np.intp], field_T: FloatArray, lag_s: float
 ) -> FloatArray:
-    """Readable twin of :func:`adcs.complementary.inertial_magnetic_compiled.without_turns`."""
-    wanted_s = time_s[rows] - lag_s
-    row = np.clip(np.searchsorted(time_s, wanted_s, side="right") - 1, 0, len(time_s) - 2)
-    part = np.clip((wanted_s - time_s[row]) / (time_s[row + 1] - time_s[row]), 0.0, 1.0)[:, None]
-    then = quaternion.normalised((1.0 - part) * q[row] + part * q[row + 1])
-    return quaternion.rotate(then, field_T[rows])
+    """Return readings (k, 3) of some rows in a frame that does not turn, of a sensor that lags behind its attitude.
+
+    ``q`` (n, 4): attitudes at the times (n,), on straight lines between them. ``rows`` (k,): of ``field_T`` (n, 3).
+    """
+    then = np.stack([np.interp(time_s[rows] - lag_s, time_s, component) for component in q.T], axis=-1)
+    return quaternion.rotate(quaternion.normalised(then), field_T[rows])
 
 
 def _attitude(up: FloatArray, north: FloatArray) -> FloatArray:

@@ -52,11 +52,6 @@ def delay_steps(substitution: Substitution, dt_s: float) -> int:
     return 0 if substitution.rule == "magnetometer-only" else max(1, round(substitution.delay_s / dt_s))
 
 
-def substitute_code(substitution: Substitution) -> int:
-    """Code of the compiled filter."""
-    return RULES.index(substitution.rule)
-
-
 class Substitute:
     """The delay line of one run: measured first vectors, never one that was put in place of another.
 

@@ -4,14 +4,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.constants import speed_of_light
 from scipy.spatial import cKDTree
 
-from adcs.stars.triangles_compiled import CELLS, SkyCells
 from arrays.typing import FloatArray, IntArray
+
+CELLS = 64
+"""Of the sky's cube along each axis."""
+
+
+class SkyCells(NamedTuple):
+    """Stars of a catalogue by the cell of the cube [-1, 1]³ in which they are."""
+
+    directions: FloatArray  # (n, 3): ordered by cell
+    begins: IntArray  # (CELLS³ + 1,)
 
 
 @dataclass(frozen=True, eq=False)

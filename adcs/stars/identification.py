@@ -17,8 +17,7 @@ from scipy.stats import binom
 from adcs.stars.camera import StarCamera
 from adcs.stars.catalogue import StarCatalogue
 from adcs.stars.pose import CameraPose, LensPrior, fitted
-from adcs.stars.triangles import Hypothesis, TriangleIndex, star_triangles
-from adcs.stars.triangles_compiled import Checks
+from adcs.stars.triangles import Checks, Hypothesis, TriangleIndex, star_triangles
 from arrays.typing import FloatArray, IntArray
 
 # Brighter neighbours with which a star makes triangles: of the catalogue, and of an image, which has hot pixels too.

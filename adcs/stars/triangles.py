@@ -5,15 +5,42 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from adcs.stars.triangles_compiled import RATIOS, Checks, SkyCells, Triangles, search
-from arrays.typing import FloatArray, IntArray
+from adcs.stars.catalogue import CELLS, SkyCells
+from arrays.typing import BoolArray, FloatArray, IntArray
+from magloc import core
 
 NEIGHBOURS = 24
 """Among which brighter ones are looked for."""
+KEPT = 8
+"""Best hypotheses."""
+_RATIOS = 64
+"""Cells of a ratio of two sides."""
+_BLOCK = 16
+"""Triangles of an image that one call looks up, each in up to a millisecond."""
+
+
+class Triangles(NamedTuple):
+    """Triangles of stars: corners ordered by the opposite side, shortest first."""
+
+    corners: IntArray  # (T, 3)
+    sides: FloatArray  # (T, 3): chords, ascending
+    is_counter_clockwise: BoolArray  # (T,): seen from the centre of the sphere
+
+
+class Checks(NamedTuple):
+    """What an attitude has to pass."""
+
+    side: float  # chord within which sides agree
+    scale: float  # relative error of the image's scale
+    near: float  # chord within which a star of the image is one of the catalogue
+    stars: int  # of the image, brightest first
+    enough: int  # of these, with which a search ends
+    most: int  # attitudes, with which it ends too
 
 
 def star_triangles(directions: FloatArray, longest: float, brighter: int) -> Triangles:
@@ -56,16 +83,16 @@ class TriangleIndex:
 
     bright: FloatArray  # (n, 3): directions of stars that make triangles, brightest first
     triangles: Triangles  # by cell of the ratios, and in it by the longest side
-    begins: IntArray  # (RATIOS² + 1,): of the cells
+    begins: IntArray  # (_RATIOS² + 1,): of the cells
 
     @classmethod
     def of(cls, bright: FloatArray, longest: float, brighter: int) -> TriangleIndex:
         """Index of all triangles of these stars; see :func:`star_triangles`."""
         made = star_triangles(bright, longest, brighter)
-        ratios = np.minimum((made.sides[:, :2] / made.sides[:, 2:] * RATIOS).astype(np.intp), RATIOS - 1)
-        cell = ratios @ np.array([RATIOS, 1])
+        ratios = np.minimum((made.sides[:, :2] / made.sides[:, 2:] * _RATIOS).astype(np.intp), _RATIOS - 1)
+        cell = ratios @ np.array([_RATIOS, 1])
         order = np.lexsort((made.sides[:, 2], cell))
-        begins = np.searchsorted(cell[order], np.arange(RATIOS**2 + 1))
+        begins = np.searchsorted(cell[order], np.arange(_RATIOS**2 + 1))
         ordered = Triangles(made.corners[order], made.sides[order], made.is_counter_clockwise[order])
         return cls(bright, ordered, begins)
 
@@ -74,38 +101,40 @@ class TriangleIndex:
 
         ``tangents`` (f, 2): of the image's stars, brightest first.
         """
-        begin = tried = 0
-        while begin < len(image.corners) and tried < checks.most:
-            begin, agreeing, matched, R, scale = search(
-                tangents, image, begin, self.triangles, self.begins, self.bright, sky, checks
+        n, known = len(image.corners), self.triangles
+        progress = np.zeros(2, np.int64)
+        while progress[0] < n and progress[1] < checks.most:
+            matched, R, scale = np.zeros(KEPT, np.int64), np.empty((KEPT, 3, 3)), np.empty(KEPT)
+            work = core.problem(
+                "star_triangles",
+                n_image=n,
+                n_checked=checks.stars,
+                tangents=np.ascontiguousarray(tangents),
+                image_corners=image.corners,
+                image_sides=image.sides,
+                image_is_counter_clockwise=image.is_counter_clockwise.view(np.uint8),
+                n_ratios=_RATIOS,
+                begins=self.begins,
+                corners=known.corners,
+                sides=known.sides,
+                is_counter_clockwise=known.is_counter_clockwise.view(np.uint8),
+                bright=self.bright,
+                n_cells=CELLS,
+                sky_begins=sky.begins,
+                sky=sky.directions,
+                side_gate=checks.side,
+                scale_gate=checks.scale,
+                star_gate=checks.near,
+                n_enough=checks.enough,
+                n_most=int(progress[1]) + checks.most,
+                progress=progress,
+                n_kept=KEPT,
+                matched=matched,
+                rotations=R,
+                scales=scale,
             )
-            tried += agreeing
-            goes_on = begin < len(image.corners) and tried < checks.most
+            core.run("star_search", work, n, block=_BLOCK, chain=n)
+            goes_on = progress[0] < n and progress[1] < checks.most
             chosen = np.flatnonzero(matched >= (checks.enough if goes_on else 1))[::-1]
             if len(chosen):
-                yield [Hypothesis(R[i], float(scale[i]), tried) for i in chosen]
-
-    def hypotheses(self, tangents: FloatArray, image: Triangles, checks: Checks) -> tuple[FloatArray, FloatArray]:
-        """Rotations (h, 3, 3) and relative scales (h,) of all pairs of triangles that agree."""
-        known, longest = self.triangles, image.sides[:, 2:]
-        gate = checks.side / longest
-        off = image.sides[:, None, :2] / longest[:, None] - known.sides[:, :2] / known.sides[:, 2:]
-        agree = (off**2).sum(axis=-1) <= gate**2
-        agree &= np.abs(known.sides[:, 2] - longest) <= checks.scale * longest + checks.side
-        agree &= image.is_counter_clockwise[:, None] == known.is_counter_clockwise
-        i, k = np.nonzero(agree)
-        scale = np.clip(known.sides[k].sum(axis=1) / image.sides[i].sum(axis=1), 1.0 - checks.scale, 1.0 + checks.scale)
-        seen = scale[:, None, None] * tangents[image.corners[i]]
-        seen = np.concatenate([seen, np.full((*seen.shape[:2], 1), -1.0)], axis=2)
-        seen /= np.linalg.norm(seen, axis=2, keepdims=True)
-        return np.swapaxes(_triad(self.bright[known.corners[k]]), 1, 2) @ _triad(seen), scale
-
-
-def _triad(corners: FloatArray) -> FloatArray:
-    """Axes (h, 3, 3), in rows, of triangles (h, 3, 3): the longest side, the middle across it, and the third."""
-    along = corners[:, 1] - corners[:, 0]
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
-    middle = corners.sum(axis=1)
-    middle -= np.sum(middle * along, axis=1, keepdims=True) * along
-    middle /= np.linalg.norm(middle, axis=1, keepdims=True)
-    return np.stack([along, middle, np.cross(along, middle)], axis=1)
+                yield [Hypothesis(R[i], float(scale[i]), int(progress[1])) for i in chosen]

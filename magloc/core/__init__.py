@@ -14,6 +14,7 @@ import os
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import numpy as np
@@ -27,16 +28,18 @@ _TYPES = {"double": np.dtype(np.float64), "int64_t": np.dtype(np.int64), "uint8_
 
 
 class Problem:
-    """A C struct that describes a problem, and the arrays that it points to."""
+    """A C struct that describes a problem, and the arrays and structs that it points to."""
 
     def __init__(self, kind: str, fields: dict[str, Any]) -> None:
         self.struct = ffi.new(f"magloc_{kind} *")
-        self.arrays = {name: value for name, value in fields.items() if isinstance(value, np.ndarray)}
+        self.kept = {name: value for name, value in fields.items() if isinstance(value, np.ndarray | Problem)}
         types = dict(ffi.typeof(self.struct).item.fields)
         if fields.keys() != types.keys():
             raise TypeError(f"magloc_{kind} has the fields {[*types]}; instead received {[*fields]}")
         for name, value in fields.items():
-            setattr(self.struct, name, _pointer(name, types[name].type, value) if name in self.arrays else value)
+            if isinstance(value, np.ndarray):
+                value = _pointer(name, types[name].type, value)
+            setattr(self.struct, name, value.struct if isinstance(value, Problem) else value)
 
 
 def _pointer(name: str, pointer_type: Any, array: np.ndarray[Any, Any]) -> Any:
@@ -56,13 +59,13 @@ def problem(kind: str, **fields: Any) -> Problem:
     kind : str
         Name of the struct in magloc.h, without "magloc_".
     **fields
-        All fields of the struct: numbers, and arrays in C order of the type that the header states. None is a null
-        pointer.
+        All fields of the struct: numbers, tuples of numbers, arrays in C order of the type that the header states, and
+        structs that are Problems themselves. None is a null pointer.
 
     Returns
     -------
     Problem
-        The struct; it keeps the arrays alive.
+        The struct; it keeps what it points to alive.
 
     Raises
     ------
@@ -72,7 +75,7 @@ def problem(kind: str, **fields: Any) -> Problem:
     return Problem(kind, {name: ffi.NULL if value is None else value for name, value in fields.items()})
 
 
-def run(kernel: str, work: Problem, n: int, *, block: int) -> None:
+def run(kernel: str, work: Problem, n: int, *, block: int, chain: int | None = None) -> None:
     """
     Compute the items 0 to n - 1 of a problem, by several threads if there is more than one block.
 
@@ -88,25 +91,34 @@ def run(kernel: str, work: Problem, n: int, *, block: int) -> None:
         Number of items.
     block : int
         Number of items that one call computes. It should take 1 to 100 ms.
+    chain : int, optional
+        Number of items that depend on each other, such as the steps of a filter. One thread computes them in order, and
+        the workspace is the same for all of them.
     """
     function = getattr(_lib, f"magloc_{kernel}")
     size = function(work.struct, 0, 0, ffi.NULL)
-    begins = range(0, n, block)
+    chain = chain or block
+    parts = range(0, n, chain)
+    stopped = Event()
 
-    def compute(begins: range) -> None:
+    def compute(parts: range) -> None:
         workspace = ffi.new("double[]", size + 1)
-        for begin in begins:
-            function(work.struct, begin, min(begin + block, n), workspace)
+        for part in parts:
+            end = min(part + chain, n)
+            for begin in range(part, end, block):
+                if not stopped.is_set():
+                    function(work.struct, begin, min(begin + block, end), workspace)
 
-    n_threads = min(threads(), len(begins))
+    n_threads = min(threads(), len(parts))
     if n_threads <= 1:
-        compute(begins)
+        compute(parts)
         return
     with ThreadPoolExecutor(n_threads) as pool:
         try:
-            for done in [pool.submit(compute, begins[i : i + 1]) for i in range(len(begins))]:
+            for done in [pool.submit(compute, parts[i : i + 1]) for i in range(len(parts))]:
                 done.result()
         except BaseException:
+            stopped.set()
             pool.shutdown(wait=False, cancel_futures=True)
             raise
 

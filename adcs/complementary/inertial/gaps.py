@@ -33,6 +33,19 @@ def numbered_windows(time_s: FloatArray, window_s: float) -> NDArray[np.intp]:
     return np.cumsum(np.diff(window, prepend=0.0) > 0.0, dtype=np.intp)
 
 
+def window_scatter(values: FloatArray, window: NDArray[np.intp]) -> tuple[FloatArray, FloatArray, NDArray[np.intp]]:
+    """Return means (k, 3) of each window's readings, their largest standard deviation (k,), and their number (k,).
+
+    ``values`` (n, 3): NaN without a reading. ``window`` (n,): number of the window that each is in, ascending from 0.
+    """
+    begins, read = np.flatnonzero(np.diff(window, prepend=-1)), np.isfinite(values.sum(axis=1))
+    counts = np.add.reduceat(read, begins, dtype=np.intp)
+    with np.errstate(invalid="ignore"):  # a window without a reading
+        means = np.add.reduceat(np.where(read[:, None], values, 0.0), begins) / counts[:, None]
+        squares = np.add.reduceat(np.where(read[:, None], (values - means[window]) ** 2, 0.0), begins)
+        return means, np.sqrt(squares.max(axis=1) / counts), counts
+
+
 def sensor_gaps(time_s: FloatArray, read: BoolArray, least_s: float = 0.0) -> NDArray[np.intp]:
     """Return the rows (k, 2) before and after each gap of a sensor; n stands after a gap that lasts to the end.
 

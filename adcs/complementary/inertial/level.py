@@ -8,7 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from adcs.complementary.inertial.gaps import HELD_VARIANCE, LEAST_GAP_S, UNKNOWN_RAD, numbered_windows, sensor_gaps
+from adcs.complementary.inertial.gaps import (
+    HELD_VARIANCE,
+    LEAST_GAP_S,
+    UNKNOWN_RAD,
+    numbered_windows,
+    sensor_gaps,
+    window_scatter,
+)
+from adcs.complementary.inertial.integration import low_pass
 from adcs.satellite.conventions import angle
 from adcs.satellite.telemetry import is_read
 from arrays.typing import BoolArray, FloatArray
@@ -92,8 +100,6 @@ def _gaps(steady: Steady) -> list[tuple[int, int, FloatArray, bool]]:
 
 def _scatter_rad(steady: Steady, gaps: list[tuple[int, int, FloatArray, bool]]) -> FloatArray:
     """Angle (n,) by which one reading is off: that of accelerations nearby, and of all."""
-    from adcs.complementary.inertial_magnetic_compiled import window_scatter
-
     begins = np.diff(numbered_windows(steady.time_s, _WINDOW_S), prepend=0) > 0
     for before, after, *_ in gaps:
         begins[[before + 1, min(after, len(begins) - 1)]] = True
@@ -111,8 +117,6 @@ def _piece(
 
     ``last`` is the smooth acceleration before them, and ``before_rad`` σ of its direction.
     """
-    from adcs.complementary.inertial_magnetic_compiled import low_pass
-
     values, dt_s = steady.acceleration_m_s2[piece], steady.dt_s[piece]
     seen = np.flatnonzero(is_read(values))
     age_s = steady.time_s[piece] - steady.time_s[piece][seen[0] if len(seen) else 0]

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adcs import quaternion
+from adcs.complementary.inertial.integration import gyro_attitudes
 from adcs.satellite.conventions import FIELD_UNITS, RATE_UNITS, angle, median, mending, reflected_axes
 from adcs.satellite.telemetry import is_read
 from adcs.satellite.vector_record import instants_within, steps_s
@@ -194,8 +195,6 @@ def _windows(time_s: FloatArray, v: FloatArray, gaps: NDArray[np.intp], turn_rad
 
 def _gyro_turns(rate_rad_s: FloatArray, dt_s: FloatArray, windows: dict[str, _Windows]) -> dict[str, FloatArray]:
     """Turns of the gyro (k, 3) over the windows of each vector, as rotation vectors of the body."""
-    from adcs.complementary.inertial_magnetic_compiled import gyro_attitudes
-
     q = gyro_attitudes(rate_rad_s, dt_s)
     return {
         name: quaternion.log(quaternion.multiply(quaternion.conjugate(q[w.first]), q[w.last]))

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adcs.mockup.vision.light_map_compiled import misses_of_poses
 from adcs.mockup.vision.triangles import TriangleCatalogue
 from arrays.typing import ComplexArray, FloatArray, IntArray
 
@@ -55,5 +54,8 @@ class LightMap:
         return np.minimum(offset.real**2 + offset.imag**2, limit_m**2).sum(axis=-1)
 
     def misses_of_poses(self, image: ComplexArray, a: ComplexArray, b: ComplexArray, limit_m: float) -> FloatArray:
-        """:meth:`misses` of an image under poses (h,), compiled; see :mod:`adcs.mockup.vision.similarity`."""
-        return misses_of_poses(a, b, image, self.plane, self.nearest, self.corner, 1.0 / self.cell_m, limit_m**2)
+        """:meth:`misses` of an image under poses (h,), star by star; see :mod:`adcs.mockup.vision.similarity`."""
+        total = np.zeros(len(a))
+        for star in image:
+            total += self.misses((a * star + b)[:, None], limit_m)
+        return total

@@ -40,6 +40,136 @@ typedef struct {
 int64_t magloc_dipole_fields(const magloc_dipoles *problem, int64_t begin, int64_t end, double *workspace);
 int64_t magloc_dipole_gradients(const magloc_dipoles *problem, int64_t begin, int64_t end, double *workspace);
 
+/* Attitudes of a camera that triangles of its image's stars state by those of a catalogue. An item is a triangle of the
+   image; calls are in order, and compute nothing more once the best attitudes match enough stars or enough attitudes
+   were tried. Corners are ordered by the opposite side, shortest first; sides, all in units of the sphere's radius, too. */
+typedef struct {
+  int64_t n_image, n_checked;
+  const double *tangents;         /* (n_checked or more, 2): places of the image's stars, brightest first */
+  const int64_t *image_corners;   /* (n_image, 3): numbers of stars */
+  const double *image_sides;      /* (n_image, 3) */
+  const uint8_t *image_is_counter_clockwise; /* (n_image,) */
+  int64_t n_ratios;               /* cells of each of the ratios of the two shorter sides to the longest one */
+  const int64_t *begins;          /* (n_ratios^2 + 1,): first triangle of the catalogue in each cell */
+  const int64_t *corners;         /* (n, 3): numbers of stars; by cell, and in it by the longest side */
+  const double *sides;            /* (n, 3) */
+  const uint8_t *is_counter_clockwise; /* (n,) */
+  const double *bright;           /* (n_stars, 3): directions of the stars of these triangles */
+  int64_t n_cells;                /* of the cube [-1, 1]^3 along each axis */
+  const int64_t *sky_begins;      /* (n_cells^3 + 1,): first star of the catalogue in each cell */
+  const double *sky;              /* (n, 3): directions of all stars, by cell */
+  double side_gate, scale_gate;   /* how far sides and, relatively, the image's scale may be off */
+  double star_gate;               /* within which a star of the image is one of the catalogue */
+  int64_t n_enough, n_most;       /* stars that match, attitudes tried: with either the search ends */
+  int64_t *progress;              /* (2,): triangles looked up, attitudes tried; zero at first */
+  int64_t n_kept;
+  int64_t *matched;               /* (n_kept,): stars that match with the best attitudes, ascending; zero at first */
+  double *rotations;              /* (n_kept, 3, 3): into the catalogue's frame from the image's */
+  double *scales;                 /* (n_kept,): relative to the image's */
+} magloc_star_triangles;
+int64_t magloc_star_search(const magloc_star_triangles *problem, int64_t begin, int64_t end, double *workspace);
+
+/* Readings of a gyro and of two vectors, such as field and Sun, of several runs. A vector has any length, and is NaN where
+   it was not read. Either all runs share the references and turns of the frame (n_references = 1) or each has its own. */
+typedef struct {
+  int64_t n_runs, n_steps, n_references;
+  const double *dt;                                /* (n_steps,): steps that end at each instant */
+  const double *rate;                              /* (n_runs, n_steps, 3): mean rate of each step */
+  const double *first, *second;                    /* (n_runs, n_steps, 3): body axes */
+  const double *first_reference, *second_reference; /* (n_references, n_steps, 3): the same in the frame */
+  const double *frame_turn;                        /* (n_references, n_steps, 4): turn of the frame in each step */
+} magloc_vector_record;
+
+/* Complementary filter of the attitude. Item run * n_steps + i is instant i of a run; those of a run are in order, with
+   one workspace. Gains are K_P and K_I. */
+typedef struct {
+  const magloc_vector_record *record;
+  int64_t is_gauss_newton;   /* 1: error against a measured quaternion, by Gauss and Newton; 0: explicit error */
+  double mu;                 /* added to the diagonal of Gauss and Newton's normal equations */
+  double weights[2];         /* of the two vectors in the explicit error */
+  double gains[2], outage_gains[2]; /* with the second vector, and while it is missing */
+  double boost, boost_level, boost_memory; /* factor of K_I while the smoothed error exceeds a level, and its memory */
+  int64_t is_substituted, is_transported, delay; /* whether the first vector of so many steps ago stands in for a second
+                                one that is missing, and whether it is turned as body and frame have turned since */
+  const double *counted;     /* (n_steps,): time for which the vectors of each instant count */
+  double *q;                 /* (n_runs, n_steps, 4): reference from body; the first one of a run is where it starts */
+  double *integral;          /* (n_runs, n_steps, 3): minus the gyro's bias */
+  double *q_measured;        /* (n_runs, n_steps, 4): of Gauss and Newton's filter */
+} magloc_complementary;
+int64_t magloc_complementary_filter(const magloc_complementary *problem, int64_t begin, int64_t end, double *workspace);
+
+/* Adaptive error-state filter of attitude and gyro bias; items as of magloc_complementary. */
+typedef struct {
+  const magloc_vector_record *record;
+  double first_sigma, second_sigma;       /* noise of the first vector in its unit, and of the unit second one */
+  double attitude_growth, bias_growth;    /* of the variances, in a second */
+  double memory, threshold, changed_growth; /* of the smoothed NIS; above it the bias's variance grows by more */
+  double *q;                              /* (n_runs, n_steps, 4) */
+  double *bias;                           /* (n_runs, n_steps, 3) */
+  double *covariance;                     /* (n_runs, n_steps, 6, 6): of the error angle in body axes, and of the bias */
+  double *smoothed_nis;                   /* (n_runs, n_steps) */
+} magloc_adaptive;
+int64_t magloc_adaptive_filter(const magloc_adaptive *problem, int64_t begin, int64_t end, double *workspace);
+
+/* Attitudes of a gyro alone, from the identity on; an item is an instant, all in order. */
+typedef struct {
+  const double *rate; /* (n, 3): mean rate of the step that ends at each instant */
+  const double *dt;   /* (n,) */
+  double *q;          /* (n, 4) */
+} magloc_gyro;
+int64_t magloc_gyro_attitudes(const magloc_gyro *problem, int64_t begin, int64_t end, double *workspace);
+
+/* Attitudes of a gyro, turned from the left so that a vector of its frame goes up; an item is an instant, all in order. */
+typedef struct {
+  double start[4];       /* level frame from that of the gyro, at first */
+  const double *q_gyro;  /* (n, 4) */
+  const double *up;      /* (n, 3) */
+  const double *part;    /* (n,): part of the angle that is corrected */
+  double *q;             /* (n, 4) */
+} magloc_level;
+int64_t magloc_level_attitudes(const magloc_level *problem, int64_t begin, int64_t end, double *workspace);
+
+/* Butterworth filter of second order in any steps, exact for an input that is its mean within each step; an item is an
+   instant, all in order. NaN is the value before. */
+typedef struct {
+  int64_t n_columns;
+  const double *values;  /* (n, n_columns) */
+  const double *start;   /* (n_columns,): where the filter rests at first */
+  const double *steps;   /* (n,): s dt of the step that ends at each instant; the distance z of the filter to its input
+                            obeys z'' + 2 s z' + 2 s^2 z = 0 */
+  double *out;           /* (n, n_columns) */
+} magloc_butterworth;
+int64_t magloc_low_pass(const magloc_butterworth *problem, int64_t begin, int64_t end, double *workspace);
+
+/* How the states of a heading filter move on in each block: the heading, the gyro's drift, scales of its axes, the sensor's
+   offset, and the slow and the quick variation of the room's field. */
+typedef struct {
+  const double *kept;   /* (n_blocks, 14): part of each state that is left */
+  const double *growth; /* (n_blocks, 14): of its variance */
+} magloc_heading_room;
+
+/* Heading of an inertial unit from means over n blocks of time; an item of the filter is a block, all in order. The
+   smoother has 2 n items, forwards and backwards, and uses the blocks that the filter has found to be known. */
+typedef struct {
+  int64_t n_blocks;
+  const double *field;       /* (n_blocks, 3): in the frame that is level and whose heading is the gyro's */
+  const double *level;       /* (n_blocks, 3, 3): to that frame from the body */
+  const double *dt;          /* (n_blocks,) */
+  const double *turn;        /* (n_blocks, 4): what drift and scales add to the heading */
+  const magloc_heading_room *room, *other_room; /* the latter where the field is another one everywhere */
+  const double *x, *P;       /* (14,), (14, 14): at the start */
+  double start_field[3];     /* east, north, up */
+  double noise;              /* of the field, 1 sigma, each axis */
+  double gate, mean_nis, memory; /* limits of the NIS of a block and, each axis, of the mean of the last ones */
+  double patience, trial;    /* how long blocks contradict before a change of the offset is tried, and for how long */
+  double jump, evidence;     /* the change, 1 sigma, and the logarithm of its odds from which on it is believed */
+  double *told, *variances;  /* (n_blocks, 4): heading and offset */
+  int64_t *used, *known;     /* (n_blocks,): 1 where a block is used, and where it is in hindsight; 2 where the offset
+                                began to be another one; zero at first */
+} magloc_heading;
+int64_t magloc_heading_filter(const magloc_heading *problem, int64_t begin, int64_t end, double *workspace);
+int64_t magloc_heading_smoother(const magloc_heading *problem, int64_t begin, int64_t end, double *workspace);
+
 /* end of the declarations */
 #ifdef __GNUC__
 #pragma GCC visibility pop

@@ -124,6 +124,7 @@ class TestConsistency:
 
 
 class TestTwins:
+    @pytest.mark.usefixtures("instruction_set")
     @pytest.mark.parametrize("rate", [0.0, 0.05])
     def test_agree(self, rate):
         scenario = SatelliteScenario(duration_s=250.0, step_orbits=0.01, outage_orbits=0.025)

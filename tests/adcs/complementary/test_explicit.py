@@ -11,11 +11,13 @@ from scipy import signal
 from scipy.spatial.transform import Rotation
 
 from adcs import quaternion
+from adcs.complementary import explicit
 from adcs.complementary.explicit import Gains, explicit_error, explicit_track, steps
 from adcs.complementary.gauss_newton import MeasuredQuaternion, gauss_newton_track
 from adcs.complementary.names import RULES
 from adcs.complementary.outage import Substitution
 from adcs.satellite.vector_record import VectorRecord
+from magloc import core
 from sims.attitude.complementary import ORBIT, SatelliteScenario, attitude, satellite_runs
 from tests.adcs.attitudes import random_attitudes
 from tests.calls import calls_of
@@ -114,6 +116,7 @@ class TestError:
 
 
 class TestTwins:
+    @pytest.mark.usefixtures("instruction_set")
     @pytest.mark.parametrize("rule", RULES)
     @pytest.mark.parametrize("missing", [(), [("second", 25, 45)], [("second", 0, 60)], [("first", 10, 20)]])
     @pytest.mark.parametrize("method", ["explicit", "gauss-newton"])
@@ -147,6 +150,19 @@ class TestTwins:
             expected = Rotation.from_rotvec(-0.5 * frame) * expected * Rotation.from_rotvec(0.5 * rate)
         track = explicit_track(record, Gains(0.1))
         assert quaternion.angle_between(track.q[0, -1], quaternion.from_rotation(expected)) < 1e-7
+
+    def test_blocks_and_threads_change_nothing(self, monkeypatch):
+        """A filter goes on where the call before ended, with its delayed vectors; long turns, too."""
+        record = short_record(runs=5, missing=[("second", 25, 45)])
+        record = replace(record, rate_rad_s=8.0 * record.rate_rad_s)
+        found, before = [], core.threads()
+        for block, threads in ((1000, 1), (7, 1), (13, 3)):
+            monkeypatch.setattr(explicit, "BLOCK", block)
+            core.set_threads(threads)
+            found.append(explicit_track(record, substitution=Substitution("transported", 5.0)))
+        core.set_threads(before)
+        for other in found[1:]:
+            np.testing.assert_array_equal(other.q, found[0].q)
 
     def test_runs_do_not_depend_on_each_other(self):
         record = short_record()

@@ -10,13 +10,30 @@ from scipy.differentiate import jacobian
 from scipy.stats import chi2
 
 from adcs import quaternion
-from adcs.complementary.heading import HeadingModel, _blocks, expected_field, heading_track, transition, turned_to_north
-from adcs.complementary.heading_compiled import TOLD, Noise, run, smooth
-from adcs.complementary.heading_compiled import Tests as Limits
+from adcs.complementary.heading import HeadingModel, _blocks, filtered, heading_track, transitions, turned_to_north
 
 MODEL = HeadingModel()
 STEP_S, FIELD_T = 0.02, np.array([0.0, 18e-6, -45e-6])
-NOISE = Noise(1e-6, 3e-4, 7e-4, 20.0, 2e-8, 4e-7, 40.0, 2e-6, 1e-6, 0.3)
+TOLD = (0, 5, 6, 7)  # heading and offset, of the state
+
+
+def expected_field(x, i, blocks):
+    """Field in the level frame (3,) that a state (14,) makes expect in a block, and its derivative (3, 14)."""
+    c, s = np.cos(x[0]), np.sin(x[0])
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    level, R = turn @ (blocks.start_T + x[8:11] + x[11:14]), blocks.R_level[i]
+    of_heading = np.array([[-level[1]], [level[0]], [0.0]])
+    return level + R @ x[5:8], np.hstack([of_heading, np.zeros((3, 4)), R, turn, turn])
+
+
+def transition_matrices(blocks, model):
+    """Φ and Q (m, 14, 14) of all blocks."""
+    turn, kept, growth = transitions(blocks, model)
+    Phi, Q = np.zeros((2, len(kept), 14, 14))
+    for i in range(14):
+        Phi[:, i, i], Q[:, i, i] = kept[:, i], growth[:, i]
+    Phi[:, 0, 1:5] = turn
+    return Phi, Q
 
 
 def room(seconds=60.0, seed=0, turning=1.0, **changes):
@@ -56,33 +73,31 @@ def room(seconds=60.0, seed=0, turning=1.0, **changes):
 
 
 class TestParts:
+    @pytest.mark.usefixtures("instruction_set")
     def test_against_filterpy(self):
-        """Filter and smoother of a record without anything wrong, with Φ, Q and H of the readable twins."""
+        """Filter and smoother of a record without anything wrong."""
+        model = replace(MODEL, noise_T=1e-6, room_s=40.0, gate=math.inf, mean_nis=math.inf, evidence=math.inf)
         time_s, rate, q_level, field, _ = room(10.0)
         blocks, _ = _blocks(time_s, rate, q_level, field, MODEL)
         x, P = 1e-3 * np.arange(14.0) * [1, 1, 1, 1, 1, *[1e-4] * 9], np.diag(MODEL.deviations() ** 2)
         other = ExtendedKalmanFilter(14, 3)
-        other.x, other.P, other.R = x.copy(), P.copy(), NOISE.reading_T**2 * np.eye(3)
-        m = len(blocks.dt_s)
-        told, variances, flags = np.empty((2, m, 4)), np.empty((2, m, 4)), np.ones((2, m), np.int64)
-        everything = Limits(math.inf, math.inf, 0.9, 1.0, 0.0, math.inf, 1.0)
-        run(x.copy(), P.copy(), blocks, NOISE, NOISE, everything, told[0], variances[0], flags[0], flags[1])
-        smooth(x, P, blocks, NOISE, 0.0, flags[1], told[1], variances[1])
-        filtered = []
-        for i in range(m):
-            other.F, other.Q = transition(i, blocks, NOISE)
+        other.x, other.P, other.R = x.copy(), P.copy(), model.noise_T**2 * np.eye(3)
+        ours = [filtered(x, P, blocks, model, offline=offline)[:2] for offline in (False, True)]
+        theirs = []
+        for i, (Phi, Q) in enumerate(zip(*transition_matrices(blocks, model), strict=True)):
+            other.F, other.Q = Phi, Q
             other.predict()
             other.update(
                 blocks.field_T[i],
                 lambda state, i=i: expected_field(state, i, blocks)[1],
                 lambda state, i=i: expected_field(state, i, blocks)[0],
             )
-            filtered.append((other.x, other.P, other.F, other.Q))
-        xs, Ps, *system = (np.array(column) for column in zip(*filtered, strict=True))
+            theirs.append((other.x, other.P, other.F, other.Q))
+        xs, Ps, *system = (np.array(column) for column in zip(*theirs, strict=True))
         smoothed, covariances, *_ = KalmanFilter(14, 3).rts_smoother(xs, Ps, *system)
-        for k, (states, matrices) in enumerate(((xs, Ps), (smoothed, covariances))):
-            np.testing.assert_allclose(told[k], states[:, TOLD], rtol=1e-5, atol=1e-9)
-            np.testing.assert_allclose(variances[k], np.diagonal(matrices, 0, 1, 2)[:, TOLD], rtol=1e-4)
+        for (told, variances), states, matrices in zip(ours, (xs, smoothed), (Ps, covariances), strict=True):
+            np.testing.assert_allclose(told, states[:, TOLD], rtol=1e-5, atol=1e-9)
+            np.testing.assert_allclose(variances, np.diagonal(matrices, 0, 1, 2)[:, TOLD], rtol=1e-4)
 
     def test_derivatives(self):
         time_s, rate, q_level, field, _ = room(8.0)
@@ -103,7 +118,7 @@ class TestParts:
         blocks, _ = _blocks(time_s, rate, q_level, field, MODEL)
         x = np.zeros(14)
         x[2:5] = 0.01, -0.02, 0.03
-        after = transition(160, blocks, NOISE)[0] @ x
+        after = transition_matrices(blocks, MODEL)[0][160] @ x
         h = blocks.dt_s[160]
         R = blocks.R_level[160]
         extra = R @ (x[2:5] * blocks.rate_rad_s[160]) * h

@@ -12,16 +12,9 @@ from adcs import quaternion
 from adcs.complementary.explicit import Gains, explicit_track
 from adcs.complementary.filters import LEFT_OUT, SUBTRACTED, inertial_magnetic_filter
 from adcs.complementary.heading import heading_track
-from adcs.complementary.inertial_magnetic import InertialMagneticRecord, prepare, rest_bias, turned_back
-from adcs.complementary.inertial_magnetic_compiled import (
-    change_without_turns,
-    gyro_attitudes,
-    levelled,
-    low_pass,
-    rotated,
-    window_scatter,
-    without_turns,
-)
+from adcs.complementary.inertial.gaps import window_scatter
+from adcs.complementary.inertial.integration import gyro_attitudes, levelled, low_pass
+from adcs.complementary.inertial_magnetic import InertialMagneticRecord, prepare, rest_bias
 from adcs.complementary.names import MAGNETS
 from adcs.complementary.orientation_errors import error_angles, orientation_errors
 from adcs.io.imu_files import read_imu
@@ -110,21 +103,8 @@ class TestParts:
         assert errors[1] < 0.7 * errors[0]
 
 
-class TestCompiled:
-    def test_turns_undone(self):
-        rng = np.random.default_rng(0)
-        time_s = np.cumsum(rng.uniform(0.005, 0.015, 200))
-        q = quaternion.exp(np.cumsum(0.05 * rng.standard_normal((200, 3)), axis=0))
-        rows, field = np.arange(0, 200, 3), rng.standard_normal((200, 3))
-        good = rng.random(len(rows)) < 0.7
-        pairs = np.flatnonzero(good[4:] & good[:-4])
-        for lag_s in (0.0, 0.013, 0.3):
-            steady = turned_back(q, time_s, rows, field, lag_s)
-            np.testing.assert_allclose(without_turns(q, time_s, rows, field, lag_s), steady, atol=1e-12)
-            change = change_without_turns(q, time_s, rows, field, good, 4, lag_s)
-            assert change == pytest.approx(np.sum((steady[pairs + 4] - steady[pairs]) ** 2))
-        np.testing.assert_allclose(rotated(q, field), quaternion.rotate(q, field), atol=1e-14)
-
+@pytest.mark.usefixtures("instruction_set")
+class TestIntegration:
     def test_level_is_the_explicit_filters(self):
         """With one vector, in steps that jitter: it corrects the same part of the angle, in another frame."""
         rng = np.random.default_rng(3)
@@ -139,6 +119,15 @@ class TestCompiled:
         gains = Gains(1.0, 0.0, second_weight=3.0)
         expected = explicit_track(record, gains, q_start=start).q[0]
         np.testing.assert_allclose(levelled(q_gyro, steady, 3.0 * dt_s, start), expected, atol=1e-12)
+
+    @pytest.mark.parametrize("largest_rad", [1e-9, 0.3, 3.0, 300.0])
+    def test_gyro_attitudes_are_products(self, largest_rad):
+        """Of SciPy's rotations, for turns of any size within a step."""
+        turns = np.random.default_rng(5).uniform(-largest_rad, largest_rad, (50, 3))
+        expected = Rotation.identity()
+        for found, turn in zip(gyro_attitudes(2.0 * turns, np.full(50, 0.5))[1:], turns[1:], strict=True):
+            expected = expected * Rotation.from_rotvec(turn)
+            assert quaternion.angle_between(found, quaternion.from_rotation(expected)) < 1e-12 + 1e-13 * largest_rad
 
     def test_scatter_within_windows(self):
         values, window = np.random.default_rng(4).standard_normal((100, 3)), np.repeat([0, 1, 2], [50, 30, 20])
@@ -159,6 +148,18 @@ class TestCompiled:
         expected, _ = signal.sosfilt(sections, values, axis=0, zi=start)
         found = low_pass(values, np.full(4000, DT), 2.0, values[0])
         np.testing.assert_allclose(found, expected, atol=0.01 * np.ptp(values))
+
+    @pytest.mark.parametrize("time_s", [1e-3, 1.0, 1e3])
+    def test_a_step_of_the_low_pass_is_exact(self, time_s):
+        """The solution of z'' + 2s z' + 2s² z = 0 after a step, from rest, and its slope in the step after."""
+        values, dt_s = np.array([[0.0], [2.0], [2.0]]), np.array([1.0, 0.7, 0.4])
+        found = low_pass(values, dt_s, time_s, values[0])
+        a, b = dt_s[1:] / time_s
+        # Input 1 in the first step, 2 in the second one: z is -1 and the slope zero, then z is one less.
+        z = -math.exp(-a) * (math.cos(a) + math.sin(a))
+        slope = 2.0 * math.exp(-a) * math.sin(a)
+        after = math.exp(-b) * ((z - 1.0) * math.cos(b) + (slope + z - 1.0) * math.sin(b))
+        np.testing.assert_allclose(found[:, 0], [0.0, 1.0 + z, 2.0 + after], rtol=1e-13, atol=1e-13)
 
     def test_low_pass_in_any_steps(self):
         """SciPy's simulation of the same equation, the input on straight lines, and NaN as the value before."""

@@ -26,8 +26,7 @@ from adcs.stars.catalogue import StarCatalogue
 from adcs.stars.files import read_star_catalogue, read_star_frames
 from adcs.stars.identification import NoFix, StarFix, StarMatcher, identify_stars
 from adcs.stars.pose import UNKNOWN_LENS, CameraPose, fitted
-from adcs.stars.triangles import TriangleIndex, star_triangles
-from adcs.stars.triangles_compiled import KEPT, Checks
+from adcs.stars.triangles import KEPT, Checks, TriangleIndex, star_triangles
 from arrays.io.errors import InputError
 from magloc.cli import framework
 from tests.adcs.refusals import assert_refused
@@ -163,7 +162,34 @@ class TestGeometry:
             CAMERA.directions(points)
 
 
+def hypotheses(index, tangents, image, checks):
+    """Rotations (h, 3, 3) and relative scales (h,) of all pairs of triangles that agree: what the search tries."""
+    known, longest = index.triangles, image.sides[:, 2:]
+    gate = checks.side / longest
+    off = image.sides[:, None, :2] / longest[:, None] - known.sides[:, :2] / known.sides[:, 2:]
+    agree = (off**2).sum(axis=-1) <= gate**2
+    agree &= np.abs(known.sides[:, 2] - longest) <= checks.scale * longest + checks.side
+    agree &= image.is_counter_clockwise[:, None] == known.is_counter_clockwise
+    i, k = np.nonzero(agree)
+    scale = np.clip(known.sides[k].sum(axis=1) / image.sides[i].sum(axis=1), 1.0 - checks.scale, 1.0 + checks.scale)
+    seen = scale[:, None, None] * tangents[image.corners[i]]
+    seen = np.concatenate([seen, np.full((*seen.shape[:2], 1), -1.0)], axis=2)
+    seen /= np.linalg.norm(seen, axis=2, keepdims=True)
+    return np.swapaxes(triangle_axes(index.bright[known.corners[k]]), 1, 2) @ triangle_axes(seen), scale
+
+
+def triangle_axes(corners):
+    """Axes (h, 3, 3), in rows, of triangles (h, 3, 3): the longest side, the middle across it, and the third."""
+    along = corners[:, 1] - corners[:, 0]
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    middle = corners.sum(axis=1)
+    middle -= np.sum(middle * along, axis=1, keepdims=True) * along
+    middle /= np.linalg.norm(middle, axis=1, keepdims=True)
+    return np.stack([along, middle, np.cross(along, middle)], axis=1)
+
+
 class TestCompiledSearch:
+    @pytest.mark.usefixtures("instruction_set")
     @pytest.mark.parametrize("scale", [0.0, 0.05])
     def test_is_that_of_all_pairs_of_triangles(self, scale):
         """Of a small sky, all that match by chance too: the best are those of a k-d tree."""
@@ -174,7 +200,7 @@ class TestCompiledSearch:
         index = TriangleIndex.of(sky.directions[np.argsort(sky.magnitudes)[:1000]], 1.0, 4)
         image = star_triangles(camera.directions(points[:20]), 2.0, 4)
         checks = Checks(0.02, scale, 0.01, 15, 1000, 10**9)
-        R, factor = index.hypotheses(tangents, image, checks)
+        R, factor = hypotheses(index, tangents, image, checks)
         scaled = factor[:, None, None] * tangents[:15]
         scaled = np.concatenate([scaled, np.full((*scaled.shape[:2], 1), -1.0)], axis=2)
         scaled /= np.linalg.norm(scaled, axis=2, keepdims=True)

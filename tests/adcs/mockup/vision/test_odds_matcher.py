@@ -198,7 +198,7 @@ class TestLookUps:
         found = lights.lights_near(known.plane[:, None] + reach)
         assert_array_equal(found, np.repeat(np.arange(180)[:, None], 20, axis=1))
 
-    def test_misses_of_poses_are_those_of_the_readable_twin(self):
+    def test_misses_of_poses_are_those_of_their_points(self):
         lights, rng = LightMap.of(catalogue()), np.random.default_rng(1)
         image = 300.0 * (rng.uniform(-1.0, 1.0, 9) + 1j * rng.uniform(-1.0, 1.0, 9))
         a = Camera().m_per_px * np.exp(2j * math.pi * rng.random(200))

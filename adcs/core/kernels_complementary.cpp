@@ -1,0 +1,122 @@
+// Filters of a gyro and two vectors, and what an inertial unit shows without a magnetometer.
+#include "adcs/complementary.hpp"
+#include "magloc/kernel.hpp"
+
+MAGLOC_BEGIN
+// exp(-a) cos a and exp(-a) sin a for a > 0, by the power series of exp((i - 1) a). A large a is halved until it is small
+// enough, and the result squared as often.
+inline void damped_rotation(double a, double &cosine, double &sine) {
+  int halved = 0;
+  for (; a > 0.05 && halved < 64; ++halved) a *= 0.5;
+  cosine = 1.0, sine = 0.0;
+#pragma GCC unroll 9
+  for (int n = 9; n > 0; --n) {
+    const double sum = cosine + sine, difference = cosine - sine;
+    cosine = 1.0 - a * (1.0 / n) * sum;
+    sine = a * (1.0 / n) * difference;
+  }
+  for (; halved > 0; --halved) {
+    const double square = cosine * cosine - sine * sine;
+    sine = 2.0 * cosine * sine;
+    cosine = square;
+  }
+}
+MAGLOC_END
+
+using namespace magloc;
+
+MAGLOC_KERNEL(complementary_filter, complementary) {
+  const magloc_complementary &p = *problem;
+  Workspace memory(workspace);
+  auto *state = memory.take<ComplementaryFilter>(1);
+  auto *delayed = memory.take<VectorPair>(p.delay);
+  if (!workspace) return memory.size();
+  ComplementaryFilter filter = *state;
+  for_instants(*p.record, begin, end, [&](const Instant &at) {
+    const int64_t row = at.row();
+    if (at.i == 0)
+      filter = ComplementaryFilter::start(Quaternion::load(p.q + 4 * row), Vector::load(p.integral + 3 * row));
+    else
+      filter.turn(p, at);
+    filter.correct(p, at, delayed);
+    filter.attitude().store(p.q + 4 * row);
+    filter.integral().store(p.integral + 3 * row);
+    if (p.is_gauss_newton) filter.measured().store(p.q_measured + 4 * row);
+  });
+  *state = filter;
+  return 0;
+}
+
+MAGLOC_KERNEL(adaptive_filter, adaptive) {
+  const magloc_adaptive &p = *problem;
+  Workspace memory(workspace);
+  auto *state = memory.take<AdaptiveFilter>(1);
+  if (!workspace) return memory.size();
+  AdaptiveFilter filter = *state;
+  for_instants(*p.record, begin, end, [&](const Instant &at) {
+    const int64_t row = at.row();
+    if (at.i == 0)
+      filter = AdaptiveFilter::start(Quaternion::load(p.q + 4 * row), Vector::load(p.bias + 3 * row),
+                                     p.covariance + 36 * row);
+    else
+      filter.predict(p, at);
+    filter.update(p, at);
+    filter.store(p, row);
+  });
+  *state = filter;
+  return 0;
+}
+
+MAGLOC_KERNEL(gyro_attitudes, gyro) {
+  if (!workspace) return 0;
+  const magloc_gyro &p = *problem;
+  for (int64_t i = begin; i < end; ++i) {
+    Quaternion q = identity;
+    if (i > 0) q = normalised(Quaternion::load(p.q + 4 * i - 4) * exponential(p.dt[i] * Vector::load(p.rate + 3 * i)));
+    q.store(p.q + 4 * i);
+  }
+  return 0;
+}
+
+MAGLOC_KERNEL(level_attitudes, level) {
+  const magloc_level &p = *problem;
+  Workspace memory(workspace);
+  auto *level_from_gyro = memory.take<Quaternion>(1);
+  if (!workspace) return memory.size();
+  if (begin == 0) *level_from_gyro = Quaternion::load(p.start);
+  for (int64_t i = begin; i < end; ++i) {
+    const Vector up = rotate(*level_from_gyro, unit(Vector::load(p.up + 3 * i)));
+    const Quaternion turn = exponential(p.part[i] * Vector{up.y, -up.x, 0.0});
+    *level_from_gyro = normalised(turn * *level_from_gyro);
+    (*level_from_gyro * Quaternion::load(p.q_gyro + 4 * i)).store(p.q + 4 * i);
+  }
+  return 0;
+}
+
+MAGLOC_KERNEL(low_pass, butterworth) {
+  const magloc_butterworth &p = *problem;
+  struct Column {
+    double output, slope, input;  // the slope in units of s
+  };
+  Workspace memory(workspace);
+  auto *columns = memory.take<Column>(p.n_columns);
+  if (!workspace) return memory.size();
+  if (begin == 0)
+    for (int64_t k = 0; k < p.n_columns; ++k) columns[k] = {p.start[k], 0.0, p.start[k]};
+  for (int64_t i = begin; i < end; ++i) {
+    double cosine, sine;
+    damped_rotation(p.steps[i], cosine, sine);
+    for (int64_t k = 0; k < p.n_columns; ++k) {
+      Column &column = columns[k];
+      const double value = p.values[p.n_columns * i + k], input = value == value ? value : column.input;
+      if (i > 0) {
+        const double mean = 0.5 * (column.input + input), z = column.output - mean, slope = column.slope;
+        column.output = mean + z * cosine + (slope + z) * sine;
+        column.slope = slope * cosine - (slope + 2.0 * z) * sine;
+      }
+      column.input = input;
+      p.out[p.n_columns * i + k] = column.output;
+    }
+  }
+  return 0;
+}
