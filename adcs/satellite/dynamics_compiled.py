@@ -3,7 +3,7 @@
 :mod:`adcs.satellite.dynamics` is the readable twin and has the formulas.
 
 Vectors, quaternions and matrices are tuples of scalars, which the compiler keeps in registers. The
-functions of this module are made to be called by other kernels; :func:`run` follows whole runs, one row each.
+functions of this module are made to be called by other kernels.
 """
 
 from __future__ import annotations
@@ -13,12 +13,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adcs.satellite.dynamics import RigidBody, WheelControl
-from adcs.satellite.magnetic_control import MU0, HysteresisRods
+from adcs.satellite.dynamics import RigidBody
 from magloc.compilation import compiled, internal
 
 Array = NDArray[np.float64]
-_MU0 = MU0
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 Matrix = tuple[Vector, Vector, Vector]
@@ -37,54 +35,12 @@ class Body(NamedTuple):
         return cls(matrix_at(body.inertia_kgm2), matrix_at(body.inverse), vector_at(body.residual_dipole_Am2))
 
 
-class Control(NamedTuple):
-    """Proportional-derivative control of the wheels towards a reference attitude."""
-
-    attitude_gain: Vector
-    rate_gain: Vector
-    torque_limit: float
-    momentum_limit: float
-    q_reference: Quaternion
-
-    @classmethod
-    def of(cls, control: WheelControl, q_reference: Array) -> Control:
-        """In the layout of the compiled code."""
-        gains = vector_at(control.attitude_gain_Nm), vector_at(control.rate_gain_Nms)
-        return cls(*gains, control.torque_limit_Nm, control.momentum_limit_Nms, quaternion_at(q_reference))
-
-
-class Rods(NamedTuple):
-    """Hysteresis rods: axes (K, 3), H_c, k of their loop, and the moment of the largest flux times 2/π."""
-
-    axes: Array
-    coercivity: float
-    steepness: float
-    strength: float
-
-    @classmethod
-    def of(cls, rods: HysteresisRods | None) -> Rods:
-        """In the layout of the compiled code; without rods no axes."""
-        if rods is None:
-            return cls(np.empty((0, 3)), 0.0, 0.0, 0.0)
-        strength = 2.0 / np.pi * rods.saturation_T * rods.volume_m3 / MU0
-        return cls(np.ascontiguousarray(rods.axes), rods.coercivity_A_m, rods.steepness_m_A, strength)
-
-
 class Surroundings(NamedTuple):
     """Orbital rate and gravity (R, n), field in the orbital frame (R, n, 3), of all instants of all runs."""
 
     orbital_rate: Array
     gravity: Array
     b_orbital: Array
-
-
-class Motion(NamedTuple):
-    """Attitude (R, n, 4), rate, momentum and torque of the wheels (R, n, 3) of all instants of all runs."""
-
-    q: Array
-    w: Array
-    momentum: Array
-    wheel_torque: Array
 
 
 @compiled
@@ -285,88 +241,3 @@ def error_jacobian(
         F[3, i], F[4, i], F[5, i] = applied(J_inverse, torque)
         gyroscopic = combined(cross(total, e), -1.0, cross(w, applied(J, e)))
         F[3, 3 + i], F[4, 3 + i], F[5, 3 + i] = applied(J_inverse, gyroscopic)
-
-
-@internal
-def _clipped(value: float, limit: float) -> float:
-    return min(max(value, -limit), limit)
-
-
-@compiled
-def commanded_torque(
-    J: Matrix, control: Control, q: Quaternion, w: Vector, momentum: Vector, orbital_rate: float, dt: float
-) -> Vector:
-    """Wheel torque of the proportional-derivative control, within its limits."""
-    attitude_gain, rate_gain = control.attitude_gain, control.rate_gain
-    torque_limit, momentum_limit = control.torque_limit, control.momentum_limit
-    angle = error_vector(control.q_reference, q)
-    rate = relative_rate(q, w, orbital_rate)
-    gyroscopic = cross(w, combined(momentum, 1.0, applied(J, w)))
-    x = _clipped(attitude_gain[0] * angle[0] + rate_gain[0] * rate[0] - gyroscopic[0], torque_limit)
-    y = _clipped(attitude_gain[1] * angle[1] + rate_gain[1] * rate[1] - gyroscopic[1], torque_limit)
-    z = _clipped(attitude_gain[2] * angle[2] + rate_gain[2] * rate[2] - gyroscopic[2], torque_limit)
-    return (
-        (_clipped(momentum[0] + x * dt, momentum_limit) - momentum[0]) / dt,
-        (_clipped(momentum[1] + y * dt, momentum_limit) - momentum[1]) / dt,
-        (_clipped(momentum[2] + z * dt, momentum_limit) - momentum[2]) / dt,
-    )
-
-
-@internal
-def rods_moment(rods: Rods, state: Array, b: Vector) -> Vector:
-    """Moment of rods after they have followed a field in body axes; ``state`` (2, K), H and z of each, goes on."""
-    moment = (0.0, 0.0, 0.0)
-    for i in range(len(rods.axes)):
-        axis = vector_at(rods.axes[i])
-        H = (axis[0] * b[0] + axis[1] * b[1] + axis[2] * b[2]) / _MU0
-        way = -1.0 if state[0, i] > H else 1.0
-        s = 0.5 + 0.5 * way * (state[0, i] - state[1, i]) / rods.coercivity
-        t = np.tanh(0.5 * abs(H - state[0, i]) / rods.coercivity)
-        state[0, i] = H
-        state[1, i] = H - way * rods.coercivity * (2.0 * (s + t) / (1.0 + s * t) - 1.0)
-        moment = combined(moment, rods.strength * np.arctan(rods.steepness * state[1, i]), axis)
-    return moment
-
-
-@compiled
-def run(
-    begin: int,
-    end: int,
-    motion: Motion,
-    body: Body,
-    control: Control,
-    torque: Array,
-    dipole: Array,
-    rods: Rods,
-    around: Surroundings,
-    dt: float,
-) -> None:
-    """Runs begin to end under control that sees the true state, from their first rows on.
-
-    The first rows of the motion hold the start of attitude, rate and momentum, and the others are filled; the wheels'
-    torque is what is held from each instant to the next (the last row: what would be). ``torque`` and ``dipole``
-    (R, n, 3), besides the residual one, are held likewise; surroundings are those at the start of every step. The
-    rods' moment is held too, that of the field at the middle of the step, or they would lag by half of it more.
-    """
-    q, w, momentum, wheel_torque = motion
-    n = q.shape[1]
-    for r in range(begin, end):
-        q_now = quaternion_at(q[r, 0])
-        w_now = vector_at(w[r, 0])
-        k_now = vector_at(momentum[r, 0])
-        iron = np.zeros((2, len(rods.axes)))
-        for i in range(n):
-            rate = around.orbital_rate[r, i]
-            u = commanded_torque(body.J, control, q_now, w_now, k_now, rate, dt)
-            q[r, i, 0], q[r, i, 1], q[r, i, 2], q[r, i, 3] = q_now
-            w[r, i, 0], w[r, i, 1], w[r, i, 2] = w_now
-            momentum[r, i, 0], momentum[r, i, 1], momentum[r, i, 2] = k_now
-            wheel_torque[r, i, 0], wheel_torque[r, i, 1], wheel_torque[r, i, 2] = u
-            if i == n - 1:
-                break
-            outside, b_orbital = vector_at(torque[r, i]), vector_at(around.b_orbital[r, i])
-            b = rotate_back(q_now, b_orbital)
-            own = rods_moment(rods, iron, combined(b, 0.5 * dt, cross(b, w_now)))
-            now = with_dipole(body, combined(own, 1.0, vector_at(dipole[r, i])))
-            gravity = around.gravity[r, i]
-            q_now, w_now, k_now = step(now, q_now, w_now, k_now, u, outside, rate, gravity, b_orbital, dt)

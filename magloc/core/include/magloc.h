@@ -40,6 +40,27 @@ typedef struct {
 int64_t magloc_dipole_fields(const magloc_dipoles *problem, int64_t begin, int64_t end, double *workspace);
 int64_t magloc_dipole_gradients(const magloc_dipoles *problem, int64_t begin, int64_t end, double *workspace);
 
+/* Rotation of satellites whose wheels follow a reference, from one instant to another; an item is a run.
+   The first instant of q, w and momentum is the start. Torque and dipole are held from each instant to the next. */
+typedef struct {
+  int64_t n_runs, n_instants, n_rods, first_instant, last_instant;
+  double dt;
+  const double *inertia, *inverse_inertia;     /* (3, 3) */
+  const double *attitude_gain, *rate_gain;     /* (3,), of the wheels' control */
+  double torque_limit, momentum_limit;
+  const double *reference;                     /* (4,), attitude that the control holds */
+  const double *rod_axes;                      /* (n_rods, 3) of hysteresis rods */
+  double coercivity, steepness, rod_strength;  /* H_c, k of the arc tangent, largest moment times 2/pi */
+  const double *torque, *dipole;               /* (n_runs, n_instants, 3), body axes */
+  const double *orbital_rate, *gravity;        /* (n_runs, n_instants); mu/r^3 */
+  const double *field;                         /* (n_runs, n_instants, 3), orbital frame */
+  double *q;                                   /* (n_runs, n_instants, 4) */
+  double *w, *momentum, *wheel_torque;         /* (n_runs, n_instants, 3) */
+  double *rod_fields;                          /* (n_runs, n_rods, 2): H and z at the first instant, then at the last */
+} magloc_attitude_motion;
+int64_t magloc_attitude_motion_runs(const magloc_attitude_motion *problem, int64_t begin, int64_t end,
+                                    double *workspace);
+
 /* end of the declarations */
 #ifdef __GNUC__
 #pragma GCC visibility pop

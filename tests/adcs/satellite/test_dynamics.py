@@ -377,23 +377,6 @@ class TestKernels:
         compiled = rigid_body.with_dipole(rigid_body.Body.of(MAGNETIC), tuple(extra))
         np.testing.assert_allclose(compiled.dipole, both.residual_dipole_Am2, rtol=1e-15)
 
-    @pytest.mark.parametrize("limits", [(5e-3, 0.17), (1e-4, 5e-3)])
-    def test_control_agrees_with_its_twin(self, limits: tuple[float, float]) -> None:
-        control = replace(CONTROL, torque_limit_Nm=limits[0], momentum_limit_Nms=limits[1])
-        q, w, k = random_state(np.random.default_rng(19))
-        k = np.clip(k, -limits[1], limits[1])
-        reference = quaternion.exp(np.array([0.1, 0.2, -0.3]))
-        expected = dynamics.commanded_torque(BODY, control, q, w, k, reference, RATE, 1.0)
-        for i in range(20):
-            compiled = rigid_body.commanded_torque(
-                rigid_body.Body.of(BODY).J,
-                rigid_body.Control.of(control, reference),
-                *(tuple(one[i]) for one in (q, w, k)),
-                RATE,
-                1.0,
-            )
-            np.testing.assert_allclose(compiled, expected[i], rtol=0, atol=1e-17)
-
     def test_error_jacobian_agrees_with_its_twin(self) -> None:
         q, w, k = random_state(np.random.default_rng(25))
         expected = dynamics.error_jacobian(MAGNETIC, q, w, k, GRAVITY, B)
