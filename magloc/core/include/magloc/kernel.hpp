@@ -7,7 +7,8 @@
 #define MAGLOC_KERNELS(X)                                                                                              \
   X(dipole_fields, dipoles)                                                                                            \
   X(dipole_gradients, dipoles)                                                                                         \
-  X(attitude_motion_runs, attitude_motion)
+  X(attitude_motion_runs, attitude_motion)                                                                             \
+  X(mekf_runs, mekf)
 
 #define MAGLOC_JOIN_(a, b, c) magloc_##a##_##b##c
 #define MAGLOC_JOIN(a, b, c) MAGLOC_JOIN_(a, b, c)
