@@ -135,5 +135,5 @@ def test_a_change_is_one_that_can_be_read_and_differs() -> None:
 def test_the_mirror_comes_first() -> None:
     reach = Reach()
     assert reach.tests("magloc/kalman.py")[0] == "tests/magloc/test_kalman.py"
-    assert reach.tests("adcs/kalman/mekf_compiled.py")[0] == "tests/adcs/kalman/test_mekf.py"
-    assert "tests/magloc/test_kalman.py" not in reach.tests("adcs/kalman/mekf_compiled.py")
+    assert reach.tests("adcs/kalman/mekf.py")[0] == "tests/adcs/kalman/test_mekf.py"
+    assert "tests/magloc/test_kalman.py" not in reach.tests("adcs/kalman/mekf.py")

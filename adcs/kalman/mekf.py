@@ -14,8 +14,9 @@ import numpy as np
 
 from adcs import quaternion
 from adcs.frames import turned
-from adcs.kalman.error_state import ALWAYS, SIZES, STATES, AttitudeTracks, FilterSettings, SensorSet, Start, State
-from adcs.kalman.gate.contest import FIELD, GYRO, SUN, Contest, Fit, begun, eased, patience
+from adcs.kalman.error_state import ALWAYS, SIZES, AttitudeTracks, FilterSettings, SensorSet, Start, State
+from adcs.kalman.gate.contest import FIELD, GYRO, SUN, Contest, Fit, begun, eased
+from adcs.kalman.mekf_runs import filter_runs
 from adcs.quaternion import rotate_back
 from adcs.satellite import dynamics
 from adcs.satellite.sensors import SENSORS
@@ -386,56 +387,12 @@ def check_start(record: Record, start: Start) -> None:
             raise ValueError(f"Input start.{name} must be finite with shape {shape}; instead received {values.shape}.")
 
 
-def _begins(used: SensorSet, state: str, part: int) -> int:
-    """Where three numbers of an optional state begin in the error state; -1 where the set does not have it."""
-    return used.place(state).start + 3 * part if state in used.states else -1
-
-
 def run_filter(record: Record, settings: FilterSettings, start: Start) -> AttitudeTracks:
-    """Filter of whole runs, compiled; runs are shared out among the threads of numba.
+    """Filter of whole runs, compiled; runs are shared out among threads.
 
     ``record``: of any number of runs, such as :class:`sims.attitude.simulation.AttitudeRuns`. ``start``: one for
     every run: :func:`start_near`, or :mod:`adcs.kalman.initialisation`. Raises ValueError: the start does not have
     as many runs as the record.
     """
-    from adcs.kalman import mekf_compiled as kernel
-    from adcs.satellite import dynamics_compiled
-    from magloc.compilation import over_rows
-
     check_start(record, start)
-    used, first, around = settings.sensors, first_state(settings, start), record.environment
-    runs, n = record.momentum_Nms.shape[:2]
-    q, w, optional = np.empty((runs, n, 4)), np.empty((runs, n, 3)), np.empty((runs, n, used.size - ALWAYS))
-    covariance, (nis, log_det) = np.empty((runs, n, used.size, used.size)), np.full((2, runs, n, len(SENSORS)), np.nan)
-    rejected = np.zeros(nis.shape, dtype=np.bool_)
-    own = np.concatenate([np.zeros((runs, 0)), *first.optional.values()], axis=1)
-    readings = record.readings
-    wheels = (record.momentum_Nms, record.wheel_torque_Nm, record.torquers_Am2)
-    star = (readings.star, readings.star_whitening)
-    read = (*star, readings.gyro_rad_s, readings.field_T, readings.sun, around.sun_orbital)
-    places = (around.orbital_rate_rad_s, around.gravity_s2, around.b_orbital_T)
-    over_rows(
-        kernel.run,
-        runs,
-        kernel.Estimated(q, w, optional, covariance, nis, rejected, log_det),
-        kernel.First(np.ascontiguousarray(first.q), np.ascontiguousarray(first.w), own, first.P),
-        dynamics_compiled.Body.of(record.satellite.body),
-        # One layout in memory, for which the kernel is compiled.
-        kernel.Record(*(np.ascontiguousarray(values, dtype=np.float64) for values in (*wheels, *read))),
-        dynamics_compiled.Surroundings(*(np.ascontiguousarray(values, dtype=np.float64) for values in places)),
-        kernel.Settings(
-            np.array([used.star, used.gyro, used.magnetometer, used.sun]),
-            deviations(record, settings),
-            np.array([_begins(used, state, part) for state in STATES for part in range(SIZES[state] // 3)]),
-            settings.process_variance(record.steps_s[:, None], record.dt_s),
-            settings.open_variance,
-            settings.kept(record.steps_s[:, None]),
-            settings.gate_limit,
-            np.array([patience(sensor, record.dt_s) for sensor in range(len(SENSORS))]),
-        ),
-        record.steps_s,
-    )
-    parts = np.split(optional, np.cumsum([SIZES[state] for state in used.states]), axis=-1)
-    return AttitudeTracks(
-        settings, q, w, dict(zip(used.states, parts, strict=False)), covariance, nis, rejected, log_det
-    )
+    return filter_runs(record, settings, first_state(settings, start), deviations(record, settings))

@@ -75,6 +75,11 @@ def problem(kind: str, **fields: Any) -> Problem:
     return Problem(kind, {name: ffi.NULL if value is None else value for name, value in fields.items()})
 
 
+def workspace_size(kernel: str, work: Problem) -> int:
+    """Return how many doubles the workspace of a kernel has."""
+    return int(getattr(_lib, f"magloc_{kernel}")(work.struct, 0, 0, ffi.NULL))
+
+
 def run(kernel: str, work: Problem, n: int, *, block: int, chain: int | None = None) -> None:
     """
     Compute the items 0 to n - 1 of a problem, by several threads if there is more than one block.
@@ -96,7 +101,7 @@ def run(kernel: str, work: Problem, n: int, *, block: int, chain: int | None = N
         the workspace is the same for all of them.
     """
     function = getattr(_lib, f"magloc_{kernel}")
-    size = function(work.struct, 0, 0, ffi.NULL)
+    size = workspace_size(kernel, work)
     chain = chain or block
     parts = range(0, n, chain)
     stopped = Event()

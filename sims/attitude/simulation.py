@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import signal
 
 from adcs import quaternion
@@ -20,8 +21,10 @@ from adcs.environment.orbit import EARTH_RADIUS_M
 from adcs.frames import turned
 from adcs.satellite import dynamics, sensors
 from adcs.satellite.attitude_track import AttitudeTrack
+from adcs.satellite.magnetic_control import MU0
 from adcs.satellite.telemetry import Readings, Record, is_read, orbital_from_eci
 from arrays.typing import BoolArray, FloatArray
+from magloc import core
 from sims.attitude.scenario import AttitudeScenario
 from sims.attitude.starts import starts
 from sims.noise import HOUR_S, random_walk, stream
@@ -29,6 +32,8 @@ from sims.noise import HOUR_S, random_walk, stream
 _SENSORS = ("star", "gyro", "field", "sun")
 _WILD_RAD_S, _WILD_T = math.radians(2.0), 30e-6
 """Standard deviations of a wild reading of a component, of gyro and magnetometer."""
+_INSTANTS_A_CALL = 20_000
+"""Instants that one call computes for at most eight runs: about ten milliseconds."""
 State = tuple[FloatArray, FloatArray, FloatArray]
 Command = Callable[[Record, int], FloatArray]
 """Moment (runs, 3) until the next instant, from a record that ends with the readings of an instant."""
@@ -158,29 +163,53 @@ def simulate(scenario: AttitudeScenario, seeds: Sequence[int]) -> AttitudeRuns:
 @np.errstate(over="ignore", divide="ignore", invalid="ignore")
 def moved(prepared: Prepared) -> AttitudeRuns:
     """Truth and readings from the start, torques and dipoles of prepared runs, which may have been changed."""
-    from adcs.satellite import dynamics_compiled as rigid_body
-    from magloc.compilation import over_rows
-
-    scenario = prepared.scenario
+    scenario, around = prepared.scenario, prepared.environment
     runs, n = prepared.torque_Nm.shape[:2]
+    body, control, rods = scenario.satellite.body, scenario.satellite.control, scenario.rods
     q, w, momentum, wheel_torque = np.empty((runs, n, 4)), *np.empty((3, runs, n, 3))
     q[:, 0], w[:, 0], momentum[:, 0] = prepared.q, prepared.w, prepared.momentum_Nms
-    around = prepared.environment
-    over_rows(
-        rigid_body.run,
-        runs,
-        rigid_body.Motion(q, w, momentum, wheel_torque),
-        rigid_body.Body.of(scenario.satellite.body),
-        rigid_body.Control.of(scenario.satellite.control, quaternion.IDENTITY),
-        prepared.torque_Nm,
-        prepared.dipole_Am2 + prepared.torquers_Am2,
-        rigid_body.Rods.of(scenario.rods),
-        rigid_body.Surroundings(around.orbital_rate_rad_s, around.gravity_s2, prepared.true_field_orbital_T),
-        scenario.dt_s,
+    axes = np.empty((0, 3)) if rods is None else rods.axes
+    work = core.problem(
+        "attitude_motion",
+        n_runs=runs,
+        n_instants=n,
+        n_rods=len(axes),
+        first_instant=0,
+        last_instant=0,
+        dt=scenario.dt_s,
+        inertia=_array(body.inertia_kgm2),
+        inverse_inertia=_array(body.inverse),
+        attitude_gain=_array(control.attitude_gain_Nm),
+        rate_gain=_array(control.rate_gain_Nms),
+        torque_limit=control.torque_limit_Nm,
+        momentum_limit=control.momentum_limit_Nms,
+        reference=_array(quaternion.IDENTITY),
+        rod_axes=_array(axes),
+        coercivity=0.0 if rods is None else rods.coercivity_A_m,
+        steepness=0.0 if rods is None else rods.steepness_m_A,
+        rod_strength=0.0 if rods is None else 2.0 / np.pi * rods.saturation_T * rods.volume_m3 / MU0,
+        torque=_array(prepared.torque_Nm),
+        dipole=_array(body.residual_dipole_Am2 + prepared.dipole_Am2 + prepared.torquers_Am2),
+        orbital_rate=_array(around.orbital_rate_rad_s),
+        gravity=_array(around.gravity_s2),
+        field=_array(prepared.true_field_orbital_T),
+        q=q,
+        w=w,
+        momentum=momentum,
+        wheel_torque=wheel_torque,
+        rod_fields=np.zeros((runs, len(axes), 2)),
     )
+    for first in range(0, max(n - 1, 1), _INSTANTS_A_CALL):
+        last = min(first + _INSTANTS_A_CALL, n - 1)
+        work.struct.first_instant, work.struct.last_instant = first, last
+        core.run("attitude_motion_runs", work, runs, block=max(8, _INSTANTS_A_CALL // (last - first + 1)))
     if not (np.isfinite(q).all() and np.isfinite(w).all()):
         raise ValueError("Input found a motion beyond double precision, expected smaller torques, dipoles and rates.")
     return AttitudeRuns.of(prepared, q, w, momentum, wheel_torque)
+
+
+def _array(values: ArrayLike) -> FloatArray:
+    return np.ascontiguousarray(values, dtype=np.float64)
 
 
 def sense(prepared: Prepared, q: FloatArray, w: FloatArray, rows: slice = slice(None)) -> Readings:

@@ -1,4 +1,4 @@
-"""Tests of adcs.kalman.mekf, adcs.kalman.mekf_compiled, sims.experiments.accuracy and adcs.kalman.diagnostics.
+"""Tests of adcs.kalman.mekf, its kernel, sims.experiments.accuracy and adcs.kalman.diagnostics.
 
 One class per property.
 
@@ -287,6 +287,16 @@ class TestCompiledTwin:
         runs, start = runs_for(chosen.sensors, 30.0, range(5))
         alone, start_alone = runs_for(chosen.sensors, 30.0, [3])
         np.testing.assert_array_equal(run_filter(runs, chosen, start).q[3], run_filter(alone, chosen, start_alone).q[0])
+
+    @pytest.mark.usefixtures("instruction_set")
+    def test_every_instruction_set_agrees(self) -> None:
+        chosen = settings(*EVERYTHING)
+        runs, start = runs_for(chosen.sensors, 20.0, range(2))
+        fast, slow = run_filter(runs, chosen, start), run_readable(runs, chosen, start)
+        np.testing.assert_allclose(fast.q, slow.q, rtol=0, atol=1e-13)
+        by_deviations = slow.sigma[..., :, None] * slow.sigma[..., None, :]
+        np.testing.assert_allclose(fast.covariance / by_deviations, slow.covariance / by_deviations, rtol=0, atol=1e-9)
+        np.testing.assert_array_equal(fast.covariance, fast.covariance.mT)
 
     def test_bad_start(self) -> None:
         chosen = settings("st")

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from adcs import quaternion
-from adcs.frames import turned
 from adcs.satellite import dynamics
 from adcs.satellite import dynamics_compiled as rigid_body
 from adcs.satellite.dynamics import RigidBody, WheelControl, wheel_control
@@ -337,24 +336,7 @@ class TestErrorJacobian:
         np.testing.assert_allclose(F[2, 3], dynamics.error_jacobian(BODY, *(one[2, 3] for one in shaped), GRAVITY, B))
 
 
-class TestKernels:
-    def test_step_agrees_with_its_twin(self) -> None:
-        rng = np.random.default_rng(17)
-        q, w, k = random_state(rng)
-        u, torque = 1e-4 * rng.standard_normal((2, 20, 3))
-        expected = dynamics.step(MAGNETIC, q, w, k, u, torque, RATE, GRAVITY, B, 1.0)
-        for i in range(20):
-            compiled = rigid_body.step(
-                rigid_body.Body.of(MAGNETIC),
-                *(tuple(one[i]) for one in (q, w, k, u, torque)),
-                RATE,
-                GRAVITY,
-                tuple(B),
-                1.0,
-            )
-            for one, twin in zip(compiled, expected, strict=True):
-                np.testing.assert_allclose(one, twin[i], rtol=0, atol=1e-15)
-
+class TestDipole:
     def test_a_dipole_besides_the_residual_one(self) -> None:
         """Of torque, step and Jacobian: the same as a body with the sum of both."""
         rng = np.random.default_rng(18)
@@ -374,37 +356,10 @@ class TestKernels:
             ),
         ):
             np.testing.assert_allclose(one, other, rtol=1e-13, atol=1e-16)
-        compiled = rigid_body.with_dipole(rigid_body.Body.of(MAGNETIC), tuple(extra))
-        np.testing.assert_allclose(compiled.dipole, both.residual_dipole_Am2, rtol=1e-15)
 
-    @pytest.mark.parametrize("limits", [(5e-3, 0.17), (1e-4, 5e-3)])
-    def test_control_agrees_with_its_twin(self, limits: tuple[float, float]) -> None:
-        control = replace(CONTROL, torque_limit_Nm=limits[0], momentum_limit_Nms=limits[1])
-        q, w, k = random_state(np.random.default_rng(19))
-        k = np.clip(k, -limits[1], limits[1])
-        reference = quaternion.exp(np.array([0.1, 0.2, -0.3]))
-        expected = dynamics.commanded_torque(BODY, control, q, w, k, reference, RATE, 1.0)
-        for i in range(20):
-            compiled = rigid_body.commanded_torque(
-                rigid_body.Body.of(BODY).J,
-                rigid_body.Control.of(control, reference),
-                *(tuple(one[i]) for one in (q, w, k)),
-                RATE,
-                1.0,
-            )
-            np.testing.assert_allclose(compiled, expected[i], rtol=0, atol=1e-17)
 
-    def test_error_jacobian_agrees_with_its_twin(self) -> None:
-        q, w, k = random_state(np.random.default_rng(25))
-        expected = dynamics.error_jacobian(MAGNETIC, q, w, k, GRAVITY, B)
-        F = np.full((6, 6), np.nan)
-        for i in range(20):
-            rigid_body.error_jacobian(
-                rigid_body.Body.of(MAGNETIC), *(tuple(one[i]) for one in (q, w, k)), GRAVITY, tuple(B), F
-            )
-            np.testing.assert_allclose(F, expected[i], rtol=0, atol=1e-16)
-
-    def test_small_functions(self) -> None:
+class TestQuaternions:
+    def test_compiled_agree_with_their_twins(self) -> None:
         rng = np.random.default_rng(21)
         p, q = random_attitudes(2, rng)
         v = rng.standard_normal(3)
@@ -413,4 +368,3 @@ class TestKernels:
         np.testing.assert_allclose(
             rigid_body.error_vector(tuple(p), tuple(q)), quaternion.error_vector(p, q), atol=1e-16
         )
-        np.testing.assert_allclose(rigid_body.applied(rigid_body.matrix_at(J), tuple(v)), turned(J, v), atol=1e-16)

@@ -9,11 +9,22 @@ import pytest
 from numpy.typing import NDArray
 
 from adcs import quaternion
-from adcs.satellite import dynamics
+from adcs.satellite.magnetic_control import HysteresisRods
 from adcs.satellite.sensors import Gyro, Magnetometer, StarTracker
+from magloc import core
+from sims.attitude import simulation
 from sims.attitude.scenario import AttitudeScenario, StartConditions
-from sims.attitude.simulation import AttitudeRuns, _field_error, advance, prepare, sense, simulate, start_estimates
-from tests.adcs.filter_runs import ANY_START, tabletsat
+from sims.attitude.simulation import (
+    AttitudeRuns,
+    Prepared,
+    _field_error,
+    moved,
+    prepare,
+    sense,
+    simulate,
+    start_estimates,
+)
+from tests.adcs.filter_runs import ANY_START, followed, tabletsat
 from tests.calls import calls_of
 
 Array = NDArray[np.float64]
@@ -36,17 +47,6 @@ class TestTruth:
         assert runs.q.shape == runs.readings.star.shape == (12, 201, 4)
         for values in (runs.w, runs.momentum_Nms, runs.wheel_torque_Nm, runs.readings.sun, runs.states["disturbance"]):
             assert values.shape == (12, 201, 3)
-
-    def test_compiled_run_agrees_with_the_readable_steps(self, runs: AttitudeRuns) -> None:
-        prepared, known = runs.prepared, runs.satellite
-        state = (prepared.q, prepared.w, prepared.momentum_Nms)
-        for row in range(200):
-            rate = prepared.environment.orbital_rate_rad_s[:, row]
-            torque = dynamics.commanded_torque(known.body, known.control, *state, quaternion.IDENTITY, rate, 1.0)
-            np.testing.assert_allclose(runs.wheel_torque_Nm[:, row], torque, rtol=0, atol=1e-15)
-            state = advance(prepared, state, torque, row)
-        for compiled, readable in zip((runs.q, runs.w, runs.momentum_Nms), state, strict=True):
-            np.testing.assert_allclose(compiled[:, 200], readable, rtol=0, atol=1e-13)
 
     def test_holds_the_orbital_frame(self, runs: AttitudeRuns) -> None:
         angle = quaternion.angle_between(runs.q, quaternion.IDENTITY)
@@ -74,6 +74,45 @@ class TestTruth:
     def test_motion_beyond_double_precision_is_refused(self, torque_Nm: float) -> None:
         with pytest.raises(ValueError, match="motion beyond double precision"):
             simulate(replace(tabletsat(), torque_Nm=torque_Nm), [0])
+
+
+class TestKernel:
+    """Against adcs.satellite.dynamics, with a dipole and wheels that come to their limits."""
+
+    @staticmethod
+    def prepared(n_runs: int, rods: HysteresisRods | None = None) -> Prepared:
+        scenario = replace(tabletsat(100.0), conditions=ANY_START, start_rate_rad_s=0.02, rods=rods)
+        satellite = replace(scenario.satellite, residual_dipole_Am2=(0.3, -0.2, 0.5))
+        control = replace(satellite.control, torque_limit_Nm=2e-4, momentum_limit_Nms=3e-3)
+        prepared = prepare(replace(scenario, satellite=replace(satellite, control=control)), range(n_runs))
+        rng = np.random.default_rng(n_runs)
+        prepared.dipole_Am2[:] = 0.1 * rng.standard_normal((n_runs, 101, 3))
+        prepared.torque_Nm[:] = 1e-5 * rng.standard_normal((n_runs, 101, 3))
+        return prepared
+
+    @pytest.mark.usefixtures("instruction_set")
+    @pytest.mark.parametrize("n_runs", [1, 2, 4, 5, 9])
+    def test_agrees_with_the_readable_steps(self, n_runs: int) -> None:
+        prepared = self.prepared(n_runs)
+        found, expected = moved(prepared), followed(prepared)
+        np.testing.assert_allclose(found.wheel_torque_Nm, expected.wheel_torque_Nm, rtol=0, atol=1e-15)
+        for name in ("q", "w", "momentum_Nms"):
+            np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=0, atol=1e-13)
+        assert (np.abs(np.abs(found.wheel_torque_Nm) - 2e-4) < 1e-12).any()
+        assert (np.abs(np.abs(found.momentum_Nms) - 3e-3) < 1e-12).any()
+
+    def test_neither_calls_nor_threads_change_it(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        prepared = self.prepared(20, HysteresisRods())
+        whole, threads = moved(prepared), core.threads()
+        monkeypatch.setattr(simulation, "_INSTANTS_A_CALL", 7)
+        try:
+            for n_threads in (1, 3):
+                core.set_threads(n_threads)
+                found = moved(prepared)
+                for name in ("q", "w", "momentum_Nms", "wheel_torque_Nm"):
+                    np.testing.assert_array_equal(getattr(found, name), getattr(whole, name))
+        finally:
+            core.set_threads(threads)
 
 
 class TestReadings:

@@ -14,7 +14,9 @@
   X(level_attitudes, level) \
   X(low_pass, butterworth) \
   X(heading_filter, heading) \
-  X(heading_smoother, heading)
+  X(heading_smoother, heading) \
+  X(attitude_motion_runs, attitude_motion) \
+  X(mekf_runs, mekf)
 
 #define MAGLOC_JOIN_(a, b, c) magloc_##a##_##b##c
 #define MAGLOC_JOIN(a, b, c) MAGLOC_JOIN_(a, b, c)

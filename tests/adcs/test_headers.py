@@ -1,0 +1,129 @@
+"""Tests of the C++ headers of adcs, compiled by the compiler of this machine; skipped where there is none.
+
+The oracles: NumPy's functions, and the readable references.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import re
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import adcs
+from adcs import quaternion
+from adcs.kalman.gate import contest
+from adcs.satellite import dynamics
+from magloc import core
+from tests.adcs.attitudes import random_attitudes
+
+Array = NDArray[np.float64]
+COMPILER = shutil.which(os.environ.get("CXX", "c++"))
+INCLUDE = Path(adcs.__file__).parent / "core/include"
+FLAGS = ("-std=c++17", "-O1", "-Wall", "-Wextra", "-Werror", "-Wno-psabi", "-fno-exceptions", "-fno-rtti")
+SAFE = ("-fno-math-errno", f"-I{core.include_dir()}", f"-I{INCLUDE}")
+EPS = float(np.finfo(np.float64).eps)
+pytestmark = pytest.mark.skipif(COMPILER is None, reason="no C++ compiler")
+
+
+def compiled(output: Path, *flags: str) -> Path:
+    source = Path(__file__).with_name("headers.cpp")
+    subprocess.run([str(COMPILER), *FLAGS, *SAFE, *flags, source, "-o", output], check=True)
+    return output
+
+
+@pytest.fixture(scope="module", params=[1, 4], ids=["double", "four lanes"])
+def library(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
+    output = tmp_path_factory.mktemp("headers") / "headers.so"
+    return ctypes.CDLL(str(compiled(output, "-shared", "-fPIC", f"-DMAGLOC_LANES={request.param}")))
+
+
+def called(function: Callable[..., object], *inputs: object, shape: tuple[int, ...]) -> Array:
+    """Call a function that writes its result to the last pointer."""
+    out = np.empty(shape)
+    arrays = [one if isinstance(one, float) else np.ascontiguousarray(one, dtype=np.float64) for one in (*inputs, out)]
+    function(*(ctypes.c_double(one) if isinstance(one, float) else ctypes.c_void_p(one.ctypes.data) for one in arrays))
+    return arrays[-1] if isinstance(arrays[-1], np.ndarray) else out
+
+
+def mapped(function: Callable[..., object], x: Array) -> Array:
+    y = np.empty_like(x)
+    function(ctypes.c_void_p(x.ctypes.data), ctypes.c_void_p(y.ctypes.data), len(x))
+    return y
+
+
+SIZES = np.concatenate([[0.0], np.geomspace(1e-300, 1e-3, 1001), np.geomspace(1e-3, 1e3, 10_001)])
+
+
+class TestElementary:
+    def test_arc_tangent(self, library: ctypes.CDLL) -> None:
+        x = np.concatenate([-SIZES[::-1], SIZES, [1e300, np.inf, -np.inf, np.nan]])
+        np.testing.assert_allclose(mapped(library.arc_tangents, x), np.arctan(x), rtol=1e-15, atol=0)
+
+    def test_hyperbolic_tangent(self, library: ctypes.CDLL) -> None:
+        x = np.concatenate([SIZES, [1e300, np.inf, np.nan]])
+        np.testing.assert_allclose(mapped(library.hyperbolic_tangents, x), np.tanh(x), rtol=2e-15, atol=0)
+
+    def test_logarithm(self, library: ctypes.CDLL) -> None:
+        near_one = 1.0 + np.geomspace(1e-16, 1.0, 1001)
+        x = np.concatenate([SIZES, near_one, 1.0 / near_one, [5e-324, 1e-310, 1e300, np.inf, np.nan]])
+        with np.errstate(divide="ignore"):
+            expected = np.log(x)
+        np.testing.assert_allclose(mapped(library.logarithms, x), expected, rtol=1e-15, atol=0)
+        assert np.isnan(mapped(library.logarithms, np.array([-1.0])))
+
+
+class TestReferences:
+    def test_turns(self, library: ctypes.CDLL) -> None:
+        rng = np.random.default_rng(0)
+        vectors, turns = rng.standard_normal((40, 4, 3)), random_attitudes(40, rng)
+        turns[0] = quaternion.IDENTITY
+        vectors[0, 1] = -3.0 * vectors[0, 0]  # half a turn
+        for q, (one, one_there, two, two_there) in zip(turns, vectors, strict=True):
+            axis = one / np.linalg.norm(one)
+            onto = contest.turned_onto(q[None], one[None], one_there[None])
+            about = contest.turned_about(onto, axis[None], two[None], two_there[None])[0]
+            first = called(library.turn_onto, q, one, one_there, shape=(4,))
+            second = called(library.turn_about, first, axis, two, two_there, shape=(4,))
+            np.testing.assert_allclose(first, onto[0], rtol=0, atol=1e-12)
+            assert min(np.abs(second - about).max(), np.abs(second + about).max()) < 1e-12
+
+    def test_no_turn_about_a_direction_along_the_axis(self, library: ctypes.CDLL) -> None:
+        z = np.array([0.0, 0.0, 1.0])
+        found = called(library.turn_about, quaternion.IDENTITY, z, z, z, shape=(4,))
+        np.testing.assert_array_equal(found, quaternion.IDENTITY)
+
+    def test_error_jacobian(self, library: ctypes.CDLL) -> None:
+        rng = np.random.default_rng(25)
+        body = dynamics.RigidBody(np.array([[0.519, 0.002, 0.005], [0.002, 0.579, 0.009], [0.005, 0.009, 0.71]]))
+        for q in random_attitudes(20, rng):
+            w, momentum = 0.02 * rng.standard_normal((2, 3))
+            dipole, b = rng.standard_normal(3), 3e-5 * rng.standard_normal(3)
+            expected = dynamics.error_jacobian(body, q, w, momentum, 1.2e-6, b, dipole)
+            known = body.inertia_kgm2, body.inverse, dipole, q, w, momentum, 1.2e-6, b
+            found = called(library.jacobian, *known, shape=(6, 6))
+            np.testing.assert_allclose(found, expected, rtol=0, atol=1e-16)
+
+    def test_the_gate_has_the_same_numbers(self) -> None:
+        header = (INCLUDE / "adcs/gate.hpp").read_text(encoding="utf-8")
+        rules = re.search(r"struct Rules \{(.*?)\};", header, re.DOTALL)
+        assert rules is not None
+        found = {name.upper(): float(value) for name, value in re.findall(r"(\w+) = (-?[\d.]+)", rules[1])}
+        assert found == {name: getattr(contest, name) for name in found}
+        assert len(found) == 8
+
+
+def test_a_microcontroller_needs_no_library(tmp_path: Path) -> None:
+    """Without a C library the code needs nothing but what copies and clears memory."""
+    if (nm := shutil.which("nm")) is None:
+        pytest.skip("no nm")
+    built = compiled(tmp_path / "headers.o", "-c", "-ffreestanding", "-fno-threadsafe-statics")
+    listed = subprocess.run([nm, "-u", built], check=True, capture_output=True, text=True).stdout
+    assert set(re.findall(r"U _?(\w+)", listed)) <= {"memcpy", "memset", "memmove", "GLOBAL_OFFSET_TABLE_"}
