@@ -40,6 +40,33 @@ typedef struct {
 int64_t magloc_dipole_fields(const magloc_dipoles *problem, int64_t begin, int64_t end, double *workspace);
 int64_t magloc_dipole_gradients(const magloc_dipoles *problem, int64_t begin, int64_t end, double *workspace);
 
+/* Ends of a filter from many starts, which are states (position, moment) of a dipole; an item is a start.
+   What is measured are differences of the fields at the sensors, in one of two forms. For noise that is the same along
+   the axes of each sensor (n_differences = 0): a sensor's field minus the weighted mean over the sensors before it; the
+   stop rule takes differences to the first sensor. For any other noise: sums of weighted fields,
+   filled up with zeros to a multiple of three.
+   In units in which mu_0/4pi, the standard deviations of the prior, or of the process noise of a pass, are one. */
+typedef struct {
+  int64_t method; /* 0: iterated Kalman filter, start as the prior's mean; 1: Kalman filter repeated with process noise;
+                     2: as 0, damped; 3: as 1, linearised before each difference, which needs weights */
+  int64_t n_sensors, n_differences, max_iterations;
+  double tolerance2;      /* a start stops when the differences change by less than its root */
+  double first_damping;   /* method 2 */
+  const double *sensors;  /* (n_sensors, 3) */
+  const double *readings; /* (n_sensors, 3) fields at the sensors, up to one that is common to all */
+  const double *blend;    /* (n_sensors) weight of a sensor in the mean over the sensors so far */
+  const double *whiten;   /* (n_sensors) inverse standard deviation of a sensor minus the mean before it */
+  const double *weights;  /* (n_differences, n_sensors, 3) of the fields in a difference, divided by its deviation */
+  const double *measured; /* (n_differences) divided by their standard deviations */
+  const double *variance; /* (n_differences) */
+  const double *starts;   /* (n, 6) */
+  double *states;         /* (n, 6) */
+  double *chi2;           /* (n) */
+  int64_t *iterations;    /* (n) passes over the differences */
+  uint8_t *stopped;       /* (n) whether the stop rule was met */
+} magloc_starts;
+int64_t magloc_filter_starts(const magloc_starts *problem, int64_t begin, int64_t end, double *workspace);
+
 /* end of the declarations */
 #ifdef __GNUC__
 #pragma GCC visibility pop

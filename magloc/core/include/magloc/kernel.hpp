@@ -6,7 +6,8 @@
 // X(kernel, problem)
 #define MAGLOC_KERNELS(X)                                                                                              \
   X(dipole_fields, dipoles)                                                                                            \
-  X(dipole_gradients, dipoles)
+  X(dipole_gradients, dipoles)                                                                                         \
+  X(filter_starts, starts)
 
 #define MAGLOC_JOIN_(a, b, c) magloc_##a##_##b##c
 #define MAGLOC_JOIN(a, b, c) MAGLOC_JOIN_(a, b, c)
