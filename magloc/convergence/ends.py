@@ -15,8 +15,9 @@ from magloc import core
 from magloc.fields.dipole import MU0_OVER_4PI
 
 ITERATED, REPEATED, DAMPED, RELINEARISED = range(4)
-# One call of the kernel takes 0.05 s at most, unless so many passes of a few starts take longer.
-_BLOCK_S, _PASS_OF_SENSOR_S, _FEWEST = 0.05, 5e-8, 16
+# One call of the kernel takes 0.05 s at most, unless the passes of the fewest starts take longer.
+_BLOCK_S, _FEWEST = 0.05, 8
+_TERM_S = 4e-9  # a weighted field in a difference; a contrast takes five times as long, relinearisation four times
 
 
 class Ends(NamedTuple):
@@ -183,6 +184,7 @@ def ends(
         starts=np.ascontiguousarray(starts / unit),
         **out._asdict(),
     )
-    start_s = _PASS_OF_SENSOR_S * max_iterations * max(len(differences.sensors), len(differences.measured))
+    n_terms = len(differences.sensors) * (len(differences.measured) or 5) * (4 if method == RELINEARISED else 1)
+    start_s = _TERM_S * n_terms * max_iterations
     core.run("filter_starts", work, n, block=max(_FEWEST, int(_BLOCK_S / start_s)))
     return out._replace(states=out.states * unit, stopped=out.stopped.astype(bool))

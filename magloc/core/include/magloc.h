@@ -41,11 +41,11 @@ int64_t magloc_dipole_fields(const magloc_dipoles *problem, int64_t begin, int64
 int64_t magloc_dipole_gradients(const magloc_dipoles *problem, int64_t begin, int64_t end, double *workspace);
 
 /* Ends of a filter from many starts, which are states (position, moment) of a dipole; an item is a start.
-   What is measured are differences of the fields at the sensors, in one of two forms. For noise that is the same along
-   the axes of each sensor (n_differences = 0): a sensor's field minus the weighted mean over the sensors before it; the
-   stop rule takes differences to the first sensor. For any other noise: sums of weighted fields,
-   filled up with zeros to a multiple of three.
-   In units in which mu_0/4pi, the standard deviations of the prior, or of the process noise of a pass, are one. */
+   The filter measures differences of the fields at the sensors. If the noise is the same along the axes of each sensor
+   (n_differences = 0), a difference is a sensor's field minus the weighted mean over the sensors before it, and the stop
+   rule takes differences to the first sensor. For any other noise a difference is a sum of weighted fields; zeros fill
+   up their number to a multiple of three.
+   Units are such that mu_0/4pi and the standard deviations of the prior, or of the process noise of a pass, are one. */
 typedef struct {
   int64_t method; /* 0: iterated Kalman filter, start as the prior's mean; 1: Kalman filter repeated with process noise;
                      2: as 0, damped; 3: as 1, linearised before each difference, which needs weights */
