@@ -33,29 +33,3 @@ def triangular_root(rows: FloatArray, root: FloatArray) -> None:
                 root[j, i] = t
                 for c in range(m):
                     rows[j, c] -= t * rows[i, c]
-
-
-@compiled
-def scalar_update(
-    x: FloatArray, S: FloatArray, h: FloatArray, innovation: float, variance: float, phi: FloatArray
-) -> float:
-    """Potter's update in place by a scalar of the first len(h) states, phi (n,) for work; the innovation's NIS."""
-    s = variance
-    for c in range(phi.size):
-        t = 0.0
-        for i in range(h.size):
-            t += S[i, c] * h[i]
-        phi[c] = t
-        s += t * t
-    alpha = 1.0 / s
-    shrink = 1.0 / (1.0 + math.sqrt(alpha * variance))
-    for i in range(phi.size):
-        t = 0.0
-        for c in range(phi.size):
-            t += S[i, c] * phi[c]
-        t *= alpha
-        x[i] += t * innovation
-        t *= shrink
-        for c in range(phi.size):
-            S[i, c] -= t * phi[c]
-    return innovation * innovation * alpha

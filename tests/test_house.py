@@ -239,9 +239,9 @@ class TestInterruptedKernels:
         assert self.callers(trees) == []
 
     def test_such_would_be_found(self) -> None:
-        path = REPOSITORY / "magloc/convergence/filters_compiled.py"
-        text = "class Ends(NamedTuple): ...\n@compiled\ndef _run() -> Ends: ...\ndef ends(): return _run()"
-        assert self.callers({path: ast.parse(text)}) == ["magloc/convergence/filters_compiled.py: ends calls _run"]
+        path = REPOSITORY / "magloc/convergence/ends.py"
+        text = "class Ends(NamedTuple): ...\n@compiled\ndef ends() -> Ends: ...\ndef run(): return ends()"
+        assert self.callers({path: ast.parse(text)}) == ["magloc/convergence/ends.py: run calls ends"]
 
 
 class TestInternalKernels:

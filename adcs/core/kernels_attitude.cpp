@@ -41,8 +41,8 @@ class Runs {
 };
 
 inline FilterModel model_of(const magloc_mekf &p) {
-  FilterModel model = {{matrix_at(p.inertia), matrix_at(p.inverse_inertia)}, vector_at(p.residual_dipole),
-                       (int)p.n_states, {}, {}};
+  FilterModel model = {
+      {matrix_at(p.inertia), matrix_at(p.inverse_inertia)}, vector_at(p.residual_dipole), (int)p.n_states, {}, {}};
   for (int k = 0; k < Optional::count; ++k) model.place[k] = (int)p.place[k];
   for (int k = 0; k < Sensor::count; ++k) model.variance[k] = p.sigma[k] * p.sigma[k];
   return model;
@@ -72,8 +72,7 @@ inline void start(const magloc_mekf &p, const FilterModel &model, int64_t run, G
     if (model.has(k)) first.optional[k] = vector_at(p.first_optional + run * (model.n - 6) + model.place[k] - 6);
   filter.start(first);
   for (int i = 0; i < model.n; ++i)
-    for (int j = 0; j < model.n; ++j)
-      filter.main().P()[i][j] = p.first_covariance[(run * model.n + i) * model.n + j];
+    for (int j = 0; j < model.n; ++j) filter.main().P()[i][j] = p.first_covariance[(run * model.n + i) * model.n + j];
 }
 
 inline void put(const Hypothesis &found, const FilterModel &model, int64_t row, const magloc_mekf &p) {

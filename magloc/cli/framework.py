@@ -68,6 +68,9 @@ class QuietOptions:
         if self.threads is not None:
             import numba
 
+            from magloc import core
+
+            core.set_threads(min(self.threads, os.cpu_count() or 1))
             numba.set_num_threads(min(self.threads, numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
 
 

@@ -61,7 +61,7 @@ def map_(
     method : str
         Filter over starts, in place of the scenario's: repeated, iekf, damped, global.
     device : str
-        What the filter runs on: cpu, or cuda, an NVIDIA graphics processor (repeated, iekf and damped).
+        cpu. Filters no longer run on graphics processors; the next release will not have this option.
     grid : int
         Points along every axis; by default 41 starts, 21 sources.
     noise : bool
@@ -82,6 +82,8 @@ def map_(
     """
     from magloc.grids.store import chunk_seconds
 
+    if device != "cpu":
+        raise InputError(f"--device: found {device}, expected cpu: filters no longer run on graphics processors.")
     n = (41 if over == "starts" else 21) if grid is None else grid
     scenario = scenario or ("paper" if over == "starts" else "wide")
     if over == "starts":
@@ -89,10 +91,8 @@ def map_(
             raise InputError(
                 f"--body-length-m: found {body_length_m:g}, expected none over starts: they are no bodies."
             )
-        name, compute = _over_starts(scenario, method, device, common.seed if noise else None)
+        name, compute = _over_starts(scenario, method, common.seed if noise else None)
     else:
-        if device != "cpu":
-            raise InputError(f"--device: found {device}, expected cpu over sources: fixes run on no other.")
         name, compute = over, _over_sources(scenario, method, common.seed, body_length_m)
     drawn = f"-seed{common.seed}" if noise or (over == "sources" and common.seed) else ""
     folder = Path(f"map-{Path(scenario).stem}-{name}-{n}{drawn}") if out is None else out
@@ -133,9 +133,7 @@ _KEYS = dict.fromkeys(
 )
 
 
-def _over_starts(
-    scenario: str, method: str | None, device: Device, noise_seed: int | None
-) -> tuple[str, Callable[..., xr.Dataset]]:
+def _over_starts(scenario: str, method: str | None, noise_seed: int | None) -> tuple[str, Callable[..., xr.Dataset]]:
     """Name of the method, and the map without the arguments that all maps have."""
     import numpy as np
 
@@ -146,16 +144,7 @@ def _over_starts(
         raise InputError(f"--method: found {method!r}, expected one of {', '.join(FILTERS)}.")
     task = read_starts_scenario(scenario, method=method, noise_seed=noise_seed)
     source = magloc.Source(np.asarray(task.position_m), np.asarray(task.moment_Am2))
-    chosen: Any = task.method
-    if device != "cpu":
-        if not hasattr(chosen, "device"):
-            raise InputError(f"--device: found {device}, expected cpu for the method {chosen.name}.")
-        from magloc.convergence.filters_cuda import check_device
-
-        with naming_options("device"):
-            check_device()
-            chosen = replace(chosen, device=device)
-    options: dict[str, Any] = {"method": chosen, "edge_m": 2.0 * task.half_width_m, "noise_seed": noise_seed}
+    options: dict[str, Any] = {"method": task.method, "edge_m": 2.0 * task.half_width_m, "noise_seed": noise_seed}
     return task.method.name, partial(magloc.convergence_map, task.array, source, **options)
 
 

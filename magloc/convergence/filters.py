@@ -9,9 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arrays.typing import FloatArray
-from magloc.convergence.filters_compiled import DAMPED, DAMPING_DECREASE, DAMPING_INCREASE, IEKF, REPEATED, Ends, ends
-from magloc.convergence.linearisation_compiled import Model
-from magloc.convergence.relinearised_compiled import relinearised_map
+from magloc.convergence.ends import DAMPED, ITERATED, RELINEARISED, REPEATED, Ends, ScaledDifferences, ends
 from magloc.kalman import IteratedUpdate, iterated_update, predict_square_root, scalar_update, sequential_update
 from magloc.localization.search.single_source import SingleSourceSearch
 from magloc.measurement.differences import DifferenceMeasurement
@@ -20,8 +18,9 @@ from magloc.measurement.differences import DifferenceMeasurement
 CHI2_REACHED = 0.05
 # Distance from the maximum-likelihood position that a filter with a prior may keep.
 PRIOR_REACHED_M = 0.5
+# A step that lowers the cost divides the damping, any other multiplies it.
+DAMPING_DECREASE, DAMPING_INCREASE = 5.0, 4.0
 _PASS_S = 4e-8
-DEVICES = ("cpu", "cuda")
 
 
 class Filter(Protocol):
@@ -52,8 +51,8 @@ class _PositiveSettings:
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if name == "device":
-                if value not in DEVICES:
-                    raise ValueError(f"Input device must be one of {', '.join(DEVICES)}; instead received {value!r}.")
+                if value != "cpu":
+                    raise ValueError(f"Input device must be cpu: filters run on no other; instead received {value!r}.")
             elif not (value > 0 or isinstance(value, bool) or (value == 0 and name == "tolerance_T")):
                 raise ValueError(f"Input {name} must be positive; instead received {value}.")
 
@@ -102,7 +101,7 @@ class RepeatedFilter(_LikelihoodFilter):
     max_iterations : int
         Passes at most.
     device : str
-        cpu, or cuda: an NVIDIA graphics processor, which does not relinearise before every scalar.
+        "cpu"; the next release will not have this setting.
 
     Examples
     --------
@@ -123,11 +122,6 @@ class RepeatedFilter(_LikelihoodFilter):
     max_iterations: int = 200
     device: str = "cpu"
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.relinearise_every_scalar and self.device != "cpu":
-            raise ValueError(f"Input device must be cpu for relinearise_every_scalar; instead received {self.device}.")
-
     @property
     def pass_s(self) -> float:
         """Seconds of one core that a pass takes, roughly, for the nine differences of four vector sensors."""
@@ -141,13 +135,12 @@ class RepeatedFilter(_LikelihoodFilter):
     def run(self, measurement: DifferenceMeasurement, z: FloatArray, starts: FloatArray) -> Ends:
         """End of every start (n, 6), compiled; :meth:`run_one` is the readable twin."""
         z, variance, sensors, weights = _inputs(measurement, z)
-        inflation, rule = self.noise_inflation, (self.tolerance_T, self.max_iterations)
-        steps = self.position_step_m, self.moment_step_Am2
-        if self.relinearise_every_scalar:
-            return Ends(*relinearised_map(starts, z, variance, sensors, weights, inflation, *steps, *rule))
-        found = ends(
-            REPEATED, Model.of(z, inflation * variance, sensors, weights, *steps), starts, *rule, device=self.device
-        )
+        inflation = self.noise_inflation
+        each = self.relinearise_every_scalar
+        scaled = ScaledDifferences.weighted if each else ScaledDifferences.of
+        differences = scaled(z, inflation * variance, sensors, weights, self.position_step_m, self.moment_step_Am2)
+        method = RELINEARISED if each else REPEATED
+        found = ends(method, differences, starts, self.tolerance_T, self.max_iterations)
         return found._replace(chi2=inflation * found.chi2)
 
     def run_one(self, measurement: DifferenceMeasurement, z: FloatArray, start: FloatArray) -> IteratedUpdate:
@@ -184,7 +177,7 @@ class IekfFilter(_PriorFilter):
     max_iterations : int
         Linearisations at most.
     device : str
-        cpu, or cuda: an NVIDIA graphics processor.
+        "cpu"; the next release will not have this setting.
     """
 
     name: ClassVar[str] = "iekf"
@@ -194,8 +187,8 @@ class IekfFilter(_PriorFilter):
 
     def run(self, measurement: DifferenceMeasurement, z: FloatArray, starts: FloatArray) -> Ends:
         """End of every start (n, 6), compiled; :meth:`run_one` is the readable twin."""
-        model = Model.of(*_inputs(measurement, z), self.position_sigma_m, self.moment_sigma_Am2)
-        return ends(IEKF, model, starts, self.tolerance_T, self.max_iterations, device=self.device)
+        differences = ScaledDifferences.of(*_inputs(measurement, z), self.position_sigma_m, self.moment_sigma_Am2)
+        return ends(ITERATED, differences, starts, self.tolerance_T, self.max_iterations)
 
     def run_one(self, measurement: DifferenceMeasurement, z: FloatArray, start: FloatArray) -> IteratedUpdate:
         """End of one start (6,), by :func:`magloc.kalman.iterated_update`."""
@@ -232,7 +225,7 @@ class DampedFilter(_PriorFilter):
     max_iterations : int
         Linearisations at most, at states that are not taken as well.
     device : str
-        cpu, or cuda: an NVIDIA graphics processor.
+        "cpu"; the next release will not have this setting.
 
     Notes
     -----
@@ -247,9 +240,8 @@ class DampedFilter(_PriorFilter):
 
     def run(self, measurement: DifferenceMeasurement, z: FloatArray, starts: FloatArray) -> Ends:
         """End of every start (n, 6), compiled; :meth:`run_one` is the readable twin."""
-        model = Model.of(*_inputs(measurement, z), self.position_sigma_m, self.moment_sigma_Am2)
-        rule = self.tolerance_T, self.max_iterations, self.first_damping
-        return ends(DAMPED, model, starts, *rule, self.device)
+        differences = ScaledDifferences.of(*_inputs(measurement, z), self.position_sigma_m, self.moment_sigma_Am2)
+        return ends(DAMPED, differences, starts, self.tolerance_T, self.max_iterations, self.first_damping)
 
     def run_one(self, measurement: DifferenceMeasurement, z: FloatArray, start: FloatArray) -> IteratedUpdate:
         """End of one start (6,), in units of the standard deviations of readings and prior."""
@@ -327,7 +319,7 @@ FILTERS: dict[str, Filter] = {
 
 
 def settings(method: Filter) -> dict[str, Any]:
-    """What a filter computes with, whichever machine does it."""
+    """Return the settings of a filter that its ends depend on."""
     return {name: value for name, value in vars(method).items() if name != "device"}
 
 

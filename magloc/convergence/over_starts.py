@@ -49,8 +49,8 @@ from magloc.measurement.differences import DifferenceMeasurement, predicted_chan
 if TYPE_CHECKING:
     import xarray as xr
 from arrays.typing import FloatArray
+from magloc.convergence.ends import Ends
 from magloc.convergence.filters import FILTERS, Filter, RepeatedFilter, settings
-from magloc.convergence.filters_compiled import Ends
 
 
 class Status(IntEnum):

@@ -18,6 +18,7 @@ from typing import Any, TypeVar
 
 from arrays.blas_threads import one_blas_thread
 from arrays.io.errors import InputError, of_extra
+from magloc import core
 from magloc.grids.cube import Box, Chunk, CubeMap, computed
 
 Item = TypeVar("Item")
@@ -75,6 +76,7 @@ def _by_worker(work: Callable[[Item], Result], item: Item) -> Result:
     from distributed import get_worker
 
     with _one_chunk, one_blas_thread:
+        core.set_threads(get_worker().state.nthreads)
         numba.set_num_threads(min(get_worker().state.nthreads, numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
         return work(item)
 

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from multiprocessing import get_context
 
 from arrays.blas_threads import one_blas_thread
+from magloc import core
 
 
 @contextmanager
@@ -33,6 +34,7 @@ def process_pool(processes: int) -> Iterator[ProcessPoolExecutor]:
 def _prepare() -> None:
     """Settings of a process: one thread, and an interruption is the business of the process that started it."""
     os.environ["NUMBA_NUM_THREADS"] = "1"  # compiled code is not loaded yet
+    core.set_threads(1)
     warnings.simplefilter("ignore")  # those of NumPy: what a user is told is logged
     one_blas_thread.__enter__()  # for good
     signal.signal(signal.SIGINT, signal.SIG_IGN)

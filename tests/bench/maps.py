@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from functools import partial
 
-import numba
 import numpy as np
 
 from arrays.geometries import tetrahedron
+from magloc import core
+from magloc.convergence.ends import Ends
 from magloc.convergence.filters import IekfFilter, RepeatedFilter
-from magloc.convergence.filters_compiled import Ends
 from magloc.convergence.over_starts import StartsScenario, simulated_measurement
 from magloc.measurement.differences import DifferenceMeasurement
 from tests.bench.filters import TIME, functions, stonesoup_update
@@ -45,7 +45,7 @@ def rows_of(
     optimum = plain_locator(scenario.array).fit(readings).solutions[0]
     starts = starts_of(scenario, size.grid)
     sampled = np.random.default_rng(6).permutation(len(starts))[: size.sample]
-    threads = numba.get_num_threads()
+    threads = core.threads()
     candidates = {"magloc run_one": ("magloc", our_loop), **peers, "scipy": ("scipy", scipy_loop)}
     loops = {name: make(measurement, z, method) for name, (package, make) in candidates.items() if installed(package)}
     found: dict[str, list[tuple[np.ndarray, bool]]] = {}

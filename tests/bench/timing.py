@@ -14,6 +14,8 @@ import numba
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
+from magloc import core
+
 # A sample is the shortest of the calls that begin within this time [s]: what else runs disturbs few of them.
 SAMPLE_S = 0.05
 
@@ -97,14 +99,16 @@ def _shortest(run: Callable[[], object]) -> float:
 
 @contextmanager
 def _threads(n: int) -> Iterator[None]:
-    """Limit numba's threads, and those of the BLAS libraries that are loaded by now."""
-    before = numba.get_num_threads()
+    """Limit the threads of compiled code, and those of the BLAS libraries that are loaded by now."""
+    before, before_core = numba.get_num_threads(), core.threads()
     numba.set_num_threads(n)
+    core.set_threads(n)
     try:
         with ThreadpoolController().limit(limits=n, user_api="blas"):
             yield
     finally:
         numba.set_num_threads(before)
+        core.set_threads(before_core)
 
 
 def installed(package: str) -> bool:

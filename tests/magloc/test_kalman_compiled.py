@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from magloc.kalman import predict_square_root, scalar_update
-from magloc.kalman_compiled import scalar_update as compiled_update
+from magloc.kalman import predict_square_root
 from magloc.kalman_compiled import triangular_root
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -40,21 +38,3 @@ class TestTriangularRoot:
         rows = np.array([[3.0, 4.0, 0.0], [0.0, 0.0, 0.0], [3.0, 4.0, 0.0], [0.0, 0.0, 2.0]])
         expected = [[5.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0], [5.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 2.0]]
         assert_allclose(root_of(rows), expected, rtol=1e-15, atol=1e-15)
-
-
-class TestScalarUpdate:
-    @given(SEEDS, st.integers(1, 12), st.floats(-8.0, 2.0), st.data())
-    @settings(max_examples=60)
-    def test_is_that_of_the_twin(self, seed, n, decades, data):
-        """A row of the first states alone is one whose other entries are zero."""
-        n_seen = data.draw(st.integers(1, n))
-        rng = np.random.default_rng(seed)
-        x, S, h, innovation = rng.normal(size=n), rng.normal(size=(n, n)), rng.normal(size=n), rng.normal()
-        h[n_seen:] = 0.0
-        variance = 10.0**decades
-        spread = h @ S
-        x_twin, S_twin = scalar_update(x, S, h, innovation, variance)
-        nis = compiled_update(x, S, h[:n_seen], innovation, variance, np.full(n, np.nan))
-        assert_allclose(x, x_twin, rtol=0.0, atol=1e-12 * max(1.0, np.abs(x_twin).max()))
-        assert_allclose(S, S_twin, rtol=0.0, atol=1e-12 * max(1.0, np.abs(S_twin).max()))
-        assert nis == pytest.approx(innovation**2 / (spread @ spread + variance), rel=1e-12)

@@ -42,72 +42,74 @@ int64_t magloc_dipole_gradients(const magloc_dipoles *problem, int64_t begin, in
 
 /* Attitudes of a camera that triangles of its image's stars state by those of a catalogue. An item is a triangle of the
    image; calls are in order, and compute nothing more once the best attitudes match enough stars or enough attitudes
-   were tried. Corners are ordered by the opposite side, shortest first; sides, all in units of the sphere's radius, too. */
+   were tried. Corners are ordered by the opposite side, shortest first; sides, all in units of the sphere's radius,
+   too. */
 typedef struct {
   int64_t n_image, n_checked;
-  const double *tangents;         /* (n_checked or more, 2): places of the image's stars, brightest first */
-  const int64_t *image_corners;   /* (n_image, 3): numbers of stars */
-  const double *image_sides;      /* (n_image, 3) */
+  const double *tangents;                    /* (n_checked or more, 2): places of the image's stars, brightest first */
+  const int64_t *image_corners;              /* (n_image, 3): numbers of stars */
+  const double *image_sides;                 /* (n_image, 3) */
   const uint8_t *image_is_counter_clockwise; /* (n_image,) */
-  int64_t n_ratios;               /* cells of each of the ratios of the two shorter sides to the longest one */
-  const int64_t *begins;          /* (n_ratios^2 + 1,): first triangle of the catalogue in each cell */
-  const int64_t *corners;         /* (n, 3): numbers of stars; by cell, and in it by the longest side */
-  const double *sides;            /* (n, 3) */
+  int64_t n_ratios;                    /* cells of each of the ratios of the two shorter sides to the longest one */
+  const int64_t *begins;               /* (n_ratios^2 + 1,): first triangle of the catalogue in each cell */
+  const int64_t *corners;              /* (n, 3): numbers of stars; by cell, and in it by the longest side */
+  const double *sides;                 /* (n, 3) */
   const uint8_t *is_counter_clockwise; /* (n,) */
-  const double *bright;           /* (n_stars, 3): directions of the stars of these triangles */
-  int64_t n_cells;                /* of the cube [-1, 1]^3 along each axis */
-  const int64_t *sky_begins;      /* (n_cells^3 + 1,): first star of the catalogue in each cell */
-  const double *sky;              /* (n, 3): directions of all stars, by cell */
-  double side_gate, scale_gate;   /* how far sides and, relatively, the image's scale may be off */
-  double star_gate;               /* within which a star of the image is one of the catalogue */
-  int64_t n_enough, n_most;       /* stars that match, attitudes tried: with either the search ends */
-  int64_t *progress;              /* (2,): triangles looked up, attitudes tried; zero at first */
+  const double *bright;                /* (n_stars, 3): directions of the stars of these triangles */
+  int64_t n_cells;                     /* of the cube [-1, 1]^3 along each axis */
+  const int64_t *sky_begins;           /* (n_cells^3 + 1,): first star of the catalogue in each cell */
+  const double *sky;                   /* (n, 3): directions of all stars, by cell */
+  double side_gate, scale_gate;        /* how far sides and, relatively, the image's scale may be off */
+  double star_gate;                    /* within which a star of the image is one of the catalogue */
+  int64_t n_enough, n_most;            /* stars that match, attitudes tried: with either the search ends */
+  int64_t *progress;                   /* (2,): triangles looked up, attitudes tried; zero at first */
   int64_t n_kept;
-  int64_t *matched;               /* (n_kept,): stars that match with the best attitudes, ascending; zero at first */
-  double *rotations;              /* (n_kept, 3, 3): into the catalogue's frame from the image's */
-  double *scales;                 /* (n_kept,): relative to the image's */
+  int64_t *matched;  /* (n_kept,): stars that match with the best attitudes, ascending; zero at first */
+  double *rotations; /* (n_kept, 3, 3): into the catalogue's frame from the image's */
+  double *scales;    /* (n_kept,): relative to the image's */
 } magloc_star_triangles;
 int64_t magloc_star_search(const magloc_star_triangles *problem, int64_t begin, int64_t end, double *workspace);
 
-/* Readings of a gyro and of two vectors, such as field and Sun, of several runs. A vector has any length, and is NaN where
-   it was not read. Either all runs share the references and turns of the frame (n_references = 1) or each has its own. */
+/* Readings of a gyro and of two vectors, such as field and Sun, of several runs. A vector has any length, and is NaN
+   where it was not read. Either all runs share the references and turns of the frame (n_references = 1) or each has its
+   own. */
 typedef struct {
   int64_t n_runs, n_steps, n_references;
-  const double *dt;                                /* (n_steps,): steps that end at each instant */
-  const double *rate;                              /* (n_runs, n_steps, 3): mean rate of each step */
-  const double *first, *second;                    /* (n_runs, n_steps, 3): body axes */
+  const double *dt;                                 /* (n_steps,): steps that end at each instant */
+  const double *rate;                               /* (n_runs, n_steps, 3): mean rate of each step */
+  const double *first, *second;                     /* (n_runs, n_steps, 3): body axes */
   const double *first_reference, *second_reference; /* (n_references, n_steps, 3): the same in the frame */
-  const double *frame_turn;                        /* (n_references, n_steps, 4): turn of the frame in each step */
+  const double *frame_turn;                         /* (n_references, n_steps, 4): turn of the frame in each step */
 } magloc_vector_record;
 
 /* Complementary filter of the attitude. Item run * n_steps + i is instant i of a run; those of a run are in order, with
    one workspace. Gains are K_P and K_I. */
 typedef struct {
   const magloc_vector_record *record;
-  int64_t is_gauss_newton;   /* 1: error against a measured quaternion, by Gauss and Newton; 0: explicit error */
-  double mu;                 /* added to the diagonal of Gauss and Newton's normal equations */
-  double weights[2];         /* of the two vectors in the explicit error */
+  int64_t is_gauss_newton;          /* 1: error against a measured quaternion, by Gauss and Newton; 0: explicit error */
+  double mu;                        /* added to the diagonal of Gauss and Newton's normal equations */
+  double weights[2];                /* of the two vectors in the explicit error */
   double gains[2], outage_gains[2]; /* with the second vector, and while it is missing */
   double boost, boost_level, boost_memory; /* factor of K_I while the smoothed error exceeds a level, and its memory */
   int64_t is_substituted, is_transported, delay; /* whether the first vector of so many steps ago stands in for a second
                                 one that is missing, and whether it is turned as body and frame have turned since */
-  const double *counted;     /* (n_steps,): time for which the vectors of each instant count */
-  double *q;                 /* (n_runs, n_steps, 4): reference from body; the first one of a run is where it starts */
-  double *integral;          /* (n_runs, n_steps, 3): minus the gyro's bias */
-  double *q_measured;        /* (n_runs, n_steps, 4): of Gauss and Newton's filter */
+  const double *counted;                         /* (n_steps,): time for which the vectors of each instant count */
+  double *q;          /* (n_runs, n_steps, 4): reference from body; the first one of a run is where it starts */
+  double *integral;   /* (n_runs, n_steps, 3): minus the gyro's bias */
+  double *q_measured; /* (n_runs, n_steps, 4): of Gauss and Newton's filter */
 } magloc_complementary;
 int64_t magloc_complementary_filter(const magloc_complementary *problem, int64_t begin, int64_t end, double *workspace);
 
 /* Adaptive error-state filter of attitude and gyro bias; items as of magloc_complementary. */
 typedef struct {
   const magloc_vector_record *record;
-  double first_sigma, second_sigma;       /* noise of the first vector in its unit, and of the unit second one */
-  double attitude_growth, bias_growth;    /* of the variances, in a second */
+  double first_sigma, second_sigma;         /* noise of the first vector in its unit, and of the unit second one */
+  double attitude_growth, bias_growth;      /* of the variances, in a second */
   double memory, threshold, changed_growth; /* of the smoothed NIS; above it the bias's variance grows by more */
-  double *q;                              /* (n_runs, n_steps, 4) */
-  double *bias;                           /* (n_runs, n_steps, 3) */
-  double *covariance;                     /* (n_runs, n_steps, 6, 6): of the error angle in body axes, and of the bias */
-  double *smoothed_nis;                   /* (n_runs, n_steps) */
+  double *q;                                /* (n_runs, n_steps, 4) */
+  double *bias;                             /* (n_runs, n_steps, 3) */
+  double *covariance;   /* (n_runs, n_steps, 6, 6): of the error angle in body axes, and of the bias */
+  double *smoothed_nis; /* (n_runs, n_steps) */
 } magloc_adaptive;
 int64_t magloc_adaptive_filter(const magloc_adaptive *problem, int64_t begin, int64_t end, double *workspace);
 
@@ -119,13 +121,14 @@ typedef struct {
 } magloc_gyro;
 int64_t magloc_gyro_attitudes(const magloc_gyro *problem, int64_t begin, int64_t end, double *workspace);
 
-/* Attitudes of a gyro, turned from the left so that a vector of its frame goes up; an item is an instant, all in order. */
+/* Attitudes of a gyro, turned from the left so that a vector of its frame goes up; an item is an instant, all in order.
+ */
 typedef struct {
-  double start[4];       /* level frame from that of the gyro, at first */
-  const double *q_gyro;  /* (n, 4) */
-  const double *up;      /* (n, 3) */
-  const double *part;    /* (n,): part of the angle that is corrected */
-  double *q;             /* (n, 4) */
+  double start[4];      /* level frame from that of the gyro, at first */
+  const double *q_gyro; /* (n, 4) */
+  const double *up;     /* (n, 3) */
+  const double *part;   /* (n,): part of the angle that is corrected */
+  double *q;            /* (n, 4) */
 } magloc_level;
 int64_t magloc_level_attitudes(const magloc_level *problem, int64_t begin, int64_t end, double *workspace);
 
@@ -133,16 +136,16 @@ int64_t magloc_level_attitudes(const magloc_level *problem, int64_t begin, int64
    instant, all in order. NaN is the value before. */
 typedef struct {
   int64_t n_columns;
-  const double *values;  /* (n, n_columns) */
-  const double *start;   /* (n_columns,): where the filter rests at first */
-  const double *steps;   /* (n,): s dt of the step that ends at each instant; the distance z of the filter to its input
-                            obeys z'' + 2 s z' + 2 s^2 z = 0 */
-  double *out;           /* (n, n_columns) */
+  const double *values; /* (n, n_columns) */
+  const double *start;  /* (n_columns,): where the filter rests at first */
+  const double *steps;  /* (n,): s dt of the step that ends at each instant; the distance z of the filter to its input
+                           obeys z'' + 2 s z' + 2 s^2 z = 0 */
+  double *out;          /* (n, n_columns) */
 } magloc_butterworth;
 int64_t magloc_low_pass(const magloc_butterworth *problem, int64_t begin, int64_t end, double *workspace);
 
-/* How the states of a heading filter move on in each block: the heading, the gyro's drift, scales of its axes, the sensor's
-   offset, and the slow and the quick variation of the room's field. */
+/* How the states of a heading filter move on in each block: the heading, the gyro's drift, scales of its axes, the
+   sensor's offset, and the slow and the quick variation of the room's field. */
 typedef struct {
   const double *kept;   /* (n_blocks, 14): part of each state that is left */
   const double *growth; /* (n_blocks, 14): of its variance */
@@ -152,20 +155,20 @@ typedef struct {
    smoother has 2 n items, forwards and backwards, and uses the blocks that the filter has found to be known. */
 typedef struct {
   int64_t n_blocks;
-  const double *field;       /* (n_blocks, 3): in the frame that is level and whose heading is the gyro's */
-  const double *level;       /* (n_blocks, 3, 3): to that frame from the body */
-  const double *dt;          /* (n_blocks,) */
-  const double *turn;        /* (n_blocks, 4): what drift and scales add to the heading */
+  const double *field; /* (n_blocks, 3): in the frame that is level and whose heading is the gyro's */
+  const double *level; /* (n_blocks, 3, 3): to that frame from the body */
+  const double *dt;    /* (n_blocks,) */
+  const double *turn;  /* (n_blocks, 4): what drift and scales add to the heading */
   const magloc_heading_room *room, *other_room; /* the latter where the field is another one everywhere */
-  const double *x, *P;       /* (14,), (14, 14): at the start */
-  double start_field[3];     /* east, north, up */
-  double noise;              /* of the field, 1 sigma, each axis */
+  const double *x, *P;                          /* (14,), (14, 14): at the start */
+  double start_field[3];                        /* east, north, up */
+  double noise;                                 /* of the field, 1 sigma, each axis */
   double gate, mean_nis, memory; /* limits of the NIS of a block and, each axis, of the mean of the last ones */
-  double patience, trial;    /* how long blocks contradict before a change of the offset is tried, and for how long */
-  double jump, evidence;     /* the change, 1 sigma, and the logarithm of its odds from which on it is believed */
-  double *told, *variances;  /* (n_blocks, 4): heading and offset */
-  int64_t *used, *known;     /* (n_blocks,): 1 where a block is used, and where it is in hindsight; 2 where the offset
-                                began to be another one; zero at first */
+  double patience, trial;   /* how long blocks contradict before a change of the offset is tried, and for how long */
+  double jump, evidence;    /* the change, 1 sigma, and the logarithm of its odds from which on it is believed */
+  double *told, *variances; /* (n_blocks, 4): heading and offset */
+  int64_t *used, *known;    /* (n_blocks,): 1 where a block is used, and where it is in hindsight; 2 where the offset
+                               began to be another one; zero at first */
 } magloc_heading;
 int64_t magloc_heading_filter(const magloc_heading *problem, int64_t begin, int64_t end, double *workspace);
 int64_t magloc_heading_smoother(const magloc_heading *problem, int64_t begin, int64_t end, double *workspace);
@@ -174,18 +177,18 @@ int64_t magloc_heading_smoother(const magloc_heading *problem, int64_t begin, in
 typedef struct {
   int64_t n_runs, n_instants, n_rods, first_instant, last_instant;
   double dt;
-  const double *inertia, *inverse_inertia;     /* (3, 3) */
-  const double *attitude_gain, *rate_gain;     /* (3,), of the wheels' control */
+  const double *inertia, *inverse_inertia; /* (3, 3) */
+  const double *attitude_gain, *rate_gain; /* (3,), of the wheels' control */
   double torque_limit, momentum_limit;
-  const double *reference;                     /* (4,), attitude that the control holds */
-  const double *rod_axes;                      /* (n_rods, 3) of hysteresis rods */
-  double coercivity, steepness, rod_strength;  /* H_c, k of the arc tangent, largest moment times 2/pi */
-  const double *torque, *dipole;               /* (n_runs, n_instants, 3), body axes */
-  const double *orbital_rate, *gravity;        /* (n_runs, n_instants); mu/r^3 */
-  const double *field;                         /* (n_runs, n_instants, 3), orbital frame */
-  double *q;                                   /* (n_runs, n_instants, 4) */
-  double *w, *momentum, *wheel_torque;         /* (n_runs, n_instants, 3) */
-  double *rod_fields;                          /* (n_runs, n_rods, 2): H and z at the first instant, then at the last */
+  const double *reference;                    /* (4,), attitude that the control holds */
+  const double *rod_axes;                     /* (n_rods, 3) of hysteresis rods */
+  double coercivity, steepness, rod_strength; /* H_c, k of the arc tangent, largest moment times 2/pi */
+  const double *torque, *dipole;              /* (n_runs, n_instants, 3), body axes */
+  const double *orbital_rate, *gravity;       /* (n_runs, n_instants); mu/r^3 */
+  const double *field;                        /* (n_runs, n_instants, 3), orbital frame */
+  double *q;                                  /* (n_runs, n_instants, 4) */
+  double *w, *momentum, *wheel_torque;        /* (n_runs, n_instants, 3) */
+  double *rod_fields;                         /* (n_runs, n_rods, 2): H and z at the first instant, then at the last */
 } magloc_attitude_motion;
 int64_t magloc_attitude_motion_runs(const magloc_attitude_motion *problem, int64_t begin, int64_t end,
                                     double *workspace);
@@ -197,33 +200,59 @@ int64_t magloc_attitude_motion_runs(const magloc_attitude_motion *problem, int64
 typedef struct {
   int64_t n_runs, n_instants, n_states;
   int64_t first_instant, end_instant;
-  const double *inertia, *inverse_inertia;       /* (3, 3) */
-  const double *residual_dipole;                 /* (3,) */
-  const double *dt;                              /* (n_instants - 1,), steps */
-  const double *first_q, *first_w;               /* (n_runs, 4), (n_runs, 3): before the first reading */
-  const double *first_optional;                  /* (n_runs, n_states - 6) */
-  const double *first_covariance;                /* (n_runs, n_states, n_states) */
-  const double *momentum, *wheel_torque;         /* (n_runs, n_instants, 3), of the wheels */
-  const double *torquers;                        /* (n_runs, n_instants, 3), their dipole */
-  const double *orbital_rate, *gravity;          /* (n_runs, n_instants); mu/r^3 */
-  const double *field_model, *sun_model;         /* (n_runs, n_instants, 3), orbital frame */
-  const double *star, *star_whitening;           /* (n_runs, n_instants, 4), (n_runs, n_instants, 3, 3) */
-  const double *gyro, *field, *sun;              /* (n_runs, n_instants, 3), readings */
-  const uint8_t *used;                           /* (4,), sensors in use */
-  const double *sigma;                           /* (4,), noise of a component */
-  const int64_t *place;                          /* (8,), of the optional states in the error state, -1 if not in use */
-  const double *kept, *added_variance;           /* (n_instants - 1, n_states), of each step */
-  const double *open_variance;                   /* (n_states,), where nothing is known */
+  const double *inertia, *inverse_inertia; /* (3, 3) */
+  const double *residual_dipole;           /* (3,) */
+  const double *dt;                        /* (n_instants - 1,), steps */
+  const double *first_q, *first_w;         /* (n_runs, 4), (n_runs, 3): before the first reading */
+  const double *first_optional;            /* (n_runs, n_states - 6) */
+  const double *first_covariance;          /* (n_runs, n_states, n_states) */
+  const double *momentum, *wheel_torque;   /* (n_runs, n_instants, 3), of the wheels */
+  const double *torquers;                  /* (n_runs, n_instants, 3), their dipole */
+  const double *orbital_rate, *gravity;    /* (n_runs, n_instants); mu/r^3 */
+  const double *field_model, *sun_model;   /* (n_runs, n_instants, 3), orbital frame */
+  const double *star, *star_whitening;     /* (n_runs, n_instants, 4), (n_runs, n_instants, 3, 3) */
+  const double *gyro, *field, *sun;        /* (n_runs, n_instants, 3), readings */
+  const uint8_t *used;                     /* (4,), sensors in use */
+  const double *sigma;                     /* (4,), noise of a component */
+  const int64_t *place;                    /* (8,), of the optional states in the error state, -1 if not in use */
+  const double *kept, *added_variance;     /* (n_instants - 1, n_states), of each step */
+  const double *open_variance;             /* (n_states,), where nothing is known */
   double gate_limit;
-  const int64_t *patience;                       /* (4,), instants */
-  double *memory;                                /* (n_runs, workspace) between calls, or null if one does all */
-  double *q, *w;                                 /* (n_runs, n_instants, 4), (n_runs, n_instants, 3) */
-  double *optional;                              /* (n_runs, n_instants, n_states - 6) */
-  double *covariance;                            /* (n_runs, n_instants, n_states, n_states) */
-  double *nis, *log_determinant;                 /* (n_runs, n_instants, 4), left as they are without a reading */
-  uint8_t *rejected;                             /* (n_runs, n_instants, 4), likewise */
+  const int64_t *patience;       /* (4,), instants */
+  double *memory;                /* (n_runs, workspace) between calls, or null if one does all */
+  double *q, *w;                 /* (n_runs, n_instants, 4), (n_runs, n_instants, 3) */
+  double *optional;              /* (n_runs, n_instants, n_states - 6) */
+  double *covariance;            /* (n_runs, n_instants, n_states, n_states) */
+  double *nis, *log_determinant; /* (n_runs, n_instants, 4), left as they are without a reading */
+  uint8_t *rejected;             /* (n_runs, n_instants, 4), likewise */
 } magloc_mekf;
 int64_t magloc_mekf_runs(const magloc_mekf *problem, int64_t begin, int64_t end, double *workspace);
+/* Ends of a filter from many starts, which are states (position, moment) of a dipole; an item is a start.
+   The filter measures differences of the fields at the sensors. If the noise is the same along the axes of each sensor
+   (n_differences = 0), a difference is a sensor's field minus the weighted mean over the sensors before it, and the
+   stop rule takes differences to the first sensor. For any other noise a difference is a sum of weighted fields; zeros
+   fill up their number to a multiple of three. Units are such that mu_0/4pi and the standard deviations of the prior,
+   or of the process noise of a pass, are one. */
+typedef struct {
+  int64_t method; /* 0: iterated Kalman filter, start as the prior's mean; 1: Kalman filter repeated with process noise;
+                     2: as 0, damped; 3: as 1, linearised before each difference, which needs weights */
+  int64_t n_sensors, n_differences, max_iterations;
+  double tolerance2;      /* a start stops when the differences change by less than its root */
+  double first_damping;   /* method 2 */
+  const double *sensors;  /* (n_sensors, 3) */
+  const double *readings; /* (n_sensors, 3) fields at the sensors, up to one that is common to all */
+  const double *blend;    /* (n_sensors) weight of a sensor in the mean over the sensors so far */
+  const double *whiten;   /* (n_sensors) inverse standard deviation of a sensor minus the mean before it */
+  const double *weights;  /* (n_differences, n_sensors, 3) of the fields in a difference, divided by its deviation */
+  const double *measured; /* (n_differences) divided by their standard deviations */
+  const double *variance; /* (n_differences) */
+  const double *starts;   /* (n, 6) */
+  double *states;         /* (n, 6) */
+  double *chi2;           /* (n) */
+  int64_t *iterations;    /* (n) passes over the differences */
+  uint8_t *stopped;       /* (n) whether the stop rule was met */
+} magloc_starts;
+int64_t magloc_filter_starts(const magloc_starts *problem, int64_t begin, int64_t end, double *workspace);
 
 /* end of the declarations */
 #ifdef __GNUC__

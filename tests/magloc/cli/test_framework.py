@@ -21,6 +21,7 @@ from cyclopts import App
 from adcs.mockup.vision.sky import AmbiguousSkyWarning
 from arrays import read_array
 from arrays.io.errors import InputError, naming
+from magloc import core
 from magloc.cli import framework
 from magloc.cli.framework import print_json_list
 from tests.command_line import Outcome, Run, assert_refused
@@ -231,10 +232,13 @@ class TestCommonOptions:
         monkeypatch: pytest.MonkeyPatch,
     ) -> None:
         set_to: list[int] = []
+        set_of_core: list[int] = []
         monkeypatch.setattr(numba, "set_num_threads", set_to.append)
+        monkeypatch.setattr(core, "set_threads", set_of_core.append)
+        monkeypatch.setattr("os.cpu_count", lambda: MOST)
         readings, array = recording
         assert run("locate", readings, "--array", array, *threads).status == 0
-        assert set_to == used
+        assert set_to == set_of_core == used
 
     @pytest.mark.slow_after(1)
     @pytest.mark.parametrize("quiet", [False, True])

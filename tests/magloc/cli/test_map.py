@@ -356,10 +356,13 @@ class TestBadInput:
             (["--grid", "1"], "--grid"),
             (["--grid", "2.5"], "--grid"),
             (["--method", "newton"], "--method"),
+            (["--device", "cuda"], "--device: found cuda, expected cpu: filters no longer run on graphics processors."),
+            (["--over", "sources", "--device", "cuda"], "--device: found cuda, expected cpu"),
         ],
     )
     def test_options(self, arguments, expected, tmp_path, capsys):
-        assert main(["map", *arguments]) == 2
+        assert main(["map", *arguments, "--out", str(tmp_path / "out")]) == 2
+        assert not (tmp_path / "out").exists()
         lines = capsys.readouterr().err.splitlines()
         assert len(lines) == 1
         assert expected in lines[0]

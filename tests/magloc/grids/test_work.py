@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from arrays.io.errors import InputError
+from magloc import core
 from magloc.grids.work import Arrays, workers
 
 ITEMS = [np.arange(3.0), np.arange(4.0), np.ones(2)]
@@ -18,6 +19,10 @@ ITEMS = [np.arange(3.0), np.arange(4.0), np.ones(2)]
 
 def squared(item: Any) -> Arrays:
     return {"square": item**2, "name": np.array(["a", "bc"])}
+
+
+def threads(_: Any) -> Arrays:
+    return {"threads": np.array(core.threads())}
 
 
 def died(_: Any) -> Arrays:
@@ -36,6 +41,11 @@ class TestWorkers:
         assert sorted(done) == [0, 1, 2]
         for number, item in enumerate(ITEMS):
             np.testing.assert_array_equal(done[number]["square"], item**2)
+
+    def test_a_process_has_one_thread(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setenv("MAGLOC_NUM_THREADS", "3")
+        with workers(2, None, None) as each:
+            assert [int(made["threads"]) for _, made in each(threads, ITEMS)] == [1, 1, 1]
 
     def test_what_is_done_is_kept(self, tmp_path: Path) -> None:
         """Of an interrupted run everything that it had finished."""

@@ -158,14 +158,13 @@ class AdaptiveFilter {
     const double dt = at.dt();
     const Quaternion turn = exponential(dt * (at.rate() - bias_));
     q_ = normalised(conjugate(at.frame_turn()) * q_ * turn);
-    double(&P)[n][n] = covariance_, M[n][n];
+    double (&P)[n][n] = covariance_, M[n][n];
     for (int j = 0; j < n; ++j) {
       const Vector angle = rotate_back(turn, {P[0][j], P[1][j], P[2][j]}) - dt * Vector{P[3][j], P[4][j], P[5][j]};
       M[0][j] = angle.x, M[1][j] = angle.y, M[2][j] = angle.z;
       for (int i = 3; i < n; ++i) M[i][j] = P[i][j];
     }
-    for (int i = 0; i < n; ++i)
-      (rotate_back(turn, Vector::load(M[i])) - dt * Vector::load(M[i] + 3)).store(M[i]);
+    for (int i = 0; i < n; ++i) (rotate_back(turn, Vector::load(M[i])) - dt * Vector::load(M[i] + 3)).store(M[i]);
     for (int i = 0; i < n; ++i)
       for (int j = 0; j <= i; ++j) P[i][j] = P[j][i] = 0.5 * (M[i][j] + M[j][i]);
     for (int i = 0; i < 3; ++i) {
@@ -209,7 +208,7 @@ class AdaptiveFilter {
   }
   // Kalman update of the error x by z = h . (error angle) + noise; returns the normalised innovation squared.
   double scalar_update(const Vector &h, double z, double variance, double (&x)[n]) {
-    double(&P)[n][n] = covariance_, Ph[n];
+    double (&P)[n][n] = covariance_, Ph[n];
     for (int i = 0; i < n; ++i) Ph[i] = dot(h, Vector::load(P[i]));
     const double S = variance + dot(h, Vector::load(Ph)), innovation = z - dot(h, Vector::load(x));
     for (int i = 0; i < n; ++i) {

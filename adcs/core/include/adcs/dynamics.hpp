@@ -9,24 +9,28 @@ struct Body {
 };
 
 // The attitude, orbital from body, and the rate against inertial space in body axes.
-template <class T> struct Motion {
+template <class T>
+struct Motion {
   Quaternion<T> q;
   Vector<T> w;
 };
 
 // The momentum of the wheels, and the torque that drives them.
-template <class T> struct Wheels {
+template <class T>
+struct Wheels {
   Vector<T> momentum, torque;
 };
 
 // The rate of the orbit, the gravity mu/r^3, and the field in the orbital frame.
-template <class T> struct Surroundings {
+template <class T>
+struct Surroundings {
   T orbital_rate, gravity;
   Vector<T> field;
 };
 
 // The rate against the orbital frame.
-template <class T> MAGLOC_INLINE Vector<T> relative_rate(const Motion<T> &motion, T orbital_rate) {
+template <class T>
+MAGLOC_INLINE Vector<T> relative_rate(const Motion<T> &motion, T orbital_rate) {
   return motion.w - orbital_rate * axis_back(motion.q, 1);
 }
 
@@ -79,7 +83,8 @@ struct Control {
   Quaternion<double> reference;
 };
 
-template <class T> MAGLOC_INLINE T clipped(T x, double limit) {
+template <class T>
+MAGLOC_INLINE T clipped(T x, double limit) {
   return choose(x > limit, broadcast<T>(limit), choose(x < -limit, broadcast<T>(-limit), x));
 }
 
@@ -107,7 +112,8 @@ struct Rods {
 };
 
 // The field H that a rod has followed, and the field z that lags behind it.
-template <class T> struct Hysteresis {
+template <class T>
+struct Hysteresis {
   T followed, lagging;
 };
 
@@ -131,8 +137,8 @@ inline Vector<T> follow_field(const Rods &rods, const Vector<T> &field, Hysteres
   return moment;
 }
 
-// The transposed Jacobian of the error's rate of change: row i is the rate (6) by the unit error i, with two zeros more.
-// The error is (dq, dw) with half angles dq; the torque of the wheels is known.
+// The transposed Jacobian of the error's rate of change: row i is the rate (6) by the unit error i, with two zeros
+// more. The error is (dq, dw) with half angles dq; the torque of the wheels is known.
 inline void transposed_error_jacobian(const Body &body, const Vector<double> &dipole, const Motion<double> &motion,
                                       const Vector<double> &momentum, const Surroundings<double> &around,
                                       double (&F)[6][8]) {

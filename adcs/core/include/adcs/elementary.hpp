@@ -5,7 +5,8 @@
 
 MAGLOC_BEGIN
 // The arc tangent. tan(a/2) = t/(1 + sqrt(1 + t^2)) halves the angle until its series converges fast.
-template <class T> inline T arc_tangent(T x) {
+template <class T>
+inline T arc_tangent(T x) {
   const T size = choose(x < 0.0, -x, x), inverse = 1.0 / size;
   T t = choose(size > 1.0, inverse, size);
   for (int halving = 0; halving < 2; ++halving) t = t / (1.0 + square_root(1.0 + t * t));  // at most tan(pi/16)
@@ -19,7 +20,8 @@ template <class T> inline T arc_tangent(T x) {
 }
 
 // The hyperbolic tangent of a number that is not negative. tanh(2x) = 2t/(1 + t^2) doubles a small one.
-template <class T> inline T hyperbolic_tangent(T x) {
+template <class T>
+inline T hyperbolic_tangent(T x) {
   constexpr int doublings = 6;
   const T small = choose(x > 20.0, broadcast<T>(20.0), x) * (1.0 / (1 << doublings)), square = small * small;
   T fraction = broadcast<T>(15.0);

@@ -2,14 +2,15 @@
 // explains the model; matrices are small, so that their products are written out as loops.
 #pragma once
 #include <magloc.h>
+
 #include <magloc/elementary.hpp>
 #include <magloc/kernel.hpp>
 
 #include "quaternion.hpp"
 
 MAGLOC_BEGIN
-// Where the state's parts begin: the heading, the gyro's drift, scales of its axes, the sensor's offset, and the slow and
-// the quick variation of the room's field, in the frame whose heading is zero.
+// Where the state's parts begin: the heading, the gyro's drift, scales of its axes, the sensor's offset, and the slow
+// and the quick variation of the room's field, in the frame whose heading is zero.
 enum HeadingState { state_heading, state_drift, state_scale, state_offset = 5, state_room = 8, state_local = 11 };
 constexpr int n_heading = 14;
 constexpr int told_states[4] = {state_heading, state_offset, state_offset + 1, state_offset + 2};
@@ -37,7 +38,8 @@ struct FieldInnovation {
 struct HeadingFilter {
   double x[n_heading], P[n_heading][n_heading];
 
-  // To block i. The heading grows by the drift and the scales times turn; all but the heading decay to a part that is kept.
+  // To block i. The heading grows by the drift and the scales times turn; all but the heading decay to a part that is
+  // kept.
   void predict(const magloc_heading &p, const magloc_heading_room &room, int64_t i) {
     const double *turn = p.turn + 4 * i, *kept = room.kept + n_heading * i, *growth = room.growth + n_heading * i;
     double row[n_heading];
@@ -57,7 +59,8 @@ struct HeadingFilter {
 
   // Compare the field of block i with that which is expected; a heading that is lost is first turned to the field.
   void compare(const magloc_heading &p, int64_t i, FieldInnovation &update) {
-    const double *measured = p.field + 3 * i, *level = p.level + 9 * i;  // level: matrix to the level frame from the body
+    const double *measured = p.field + 3 * i,
+                 *level = p.level + 9 * i;  // level: matrix to the level frame from the body
     const double field[3] = {p.start_field[0] + x[state_room] + x[state_local],
                              p.start_field[1] + x[state_room + 1] + x[state_local + 1],
                              p.start_field[2] + x[state_room + 2] + x[state_local + 2]};
@@ -72,7 +75,7 @@ struct HeadingFilter {
     const Quaternion half = exponential({0.0, 0.0, x[0]});
     const double c = half.w * half.w - half.z * half.z, s = 2.0 * half.w * half.z;
     const double expected[3] = {c * field[0] - s * field[1], s * field[0] + c * field[1], field[2]};
-    double(&H)[3][n_heading] = update.H;
+    double (&H)[3][n_heading] = update.H;
     for (auto &row : H)
       for (double &value : row) value = 0.0;
     H[0][state_heading] = -expected[1], H[1][state_heading] = expected[0];
@@ -100,14 +103,16 @@ struct HeadingFilter {
   }
 
   void correct(FieldInnovation &update) {
-    const double(&HP)[3][n_heading] = update.HP, (&nu)[3] = update.innovation;
-    double(&gain)[3][n_heading] = update.gain;
+    const double (&HP)[3][n_heading] = update.HP, (&nu)[3] = update.innovation;
+    double (&gain)[3][n_heading] = update.gain;
     for (int a = 0; a < 3; ++a)
       for (int j = 0; j < n_heading; ++j)
-        gain[a][j] = update.S_inverse[a][0] * HP[0][j] + update.S_inverse[a][1] * HP[1][j] + update.S_inverse[a][2] * HP[2][j];
+        gain[a][j] =
+            update.S_inverse[a][0] * HP[0][j] + update.S_inverse[a][1] * HP[1][j] + update.S_inverse[a][2] * HP[2][j];
     for (int j = 0; j < n_heading; ++j) {
       x[j] += gain[0][j] * nu[0] + gain[1][j] * nu[1] + gain[2][j] * nu[2];
-      for (int k = 0; k < n_heading; ++k) P[j][k] -= HP[0][j] * gain[0][k] + HP[1][j] * gain[1][k] + HP[2][j] * gain[2][k];
+      for (int k = 0; k < n_heading; ++k)
+        P[j][k] -= HP[0][j] * gain[0][k] + HP[1][j] * gain[1][k] + HP[2][j] * gain[2][k];
     }
     for (int j = 0; j < n_heading; ++j)
       for (int k = 0; k < j; ++k) P[j][k] = P[k][j];
@@ -118,10 +123,10 @@ struct HeadingFilter {
   }
 };
 
-// The filter over all blocks. A block is left out where it, or the mean of the last ones, contradicts the state. When that
-// goes on for a while, three others run beside the filter from there: one whose sensor's offset changed, one whose room's
-// field did, and one in whose room it is another one everywhere. The first takes over when the blocks speak for it against
-// both others, which only turns can make them do. All end when the filter agrees with its blocks again.
+// The filter over all blocks. A block is left out where it, or the mean of the last ones, contradicts the state. When
+// that goes on for a while, three others run beside the filter from there: one whose sensor's offset changed, one whose
+// room's field did, and one in whose room it is another one everywhere. The first takes over when the blocks speak for
+// it against both others, which only turns can make them do. All end when the filter agrees with its blocks again.
 class HeadingRun {
   enum Explanation { offset_changed, room_changed, room_differs, n_explanations };
   HeadingFilter filter_, others_[n_explanations];
@@ -185,8 +190,8 @@ class HeadingRun {
       const double log_likelihood = -0.5 * (update_.nis + logarithm(1e36 * update_.determinant));
       log_likelihoods_[k] += log_likelihood < -50.0 ? -50.0 : log_likelihood;
     }
-    const double odds = log_likelihoods_[offset_changed] -
-                        maximum(log_likelihoods_[room_changed], log_likelihoods_[room_differs]);
+    const double odds =
+        log_likelihoods_[offset_changed] - maximum(log_likelihoods_[room_changed], log_likelihoods_[room_differs]);
     if (right_s_ > 3.0 * p.patience) {
       trial_s_ = -1.0, wrong_s_ = 0.0;
     } else if (odds > p.evidence && trial_s_ > p.patience) {
@@ -199,9 +204,9 @@ class HeadingRun {
   }
 };
 
-// Smoother of the blocks that are used in hindsight, after Bryson and Frazier in Bierman's form: what later blocks say of a
-// state is a score and an information matrix that are carried backwards, so that nothing larger than an innovation's
-// covariance is inverted.
+// Smoother of the blocks that are used in hindsight, after Bryson and Frazier in Bierman's form: what later blocks say
+// of a state is a score and an information matrix that are carried backwards, so that nothing larger than an
+// innovation's covariance is inverted.
 class HeadingSmoother {
   HeadingFilter filter_;
   double score_[n_heading], information_[n_heading][n_heading];
@@ -254,7 +259,7 @@ class HeadingSmoother {
   }
   // (I - K H)^T L (I - K H) + H^T S^-1 H = L + H^T M + M^T H, with M = (S^-1 + K^T L K) H / 2 - K^T L.
   void add_reading() {
-    const double(&H)[3][n_heading] = update_.H, (&K)[3][n_heading] = update_.gain;
+    const double (&H)[3][n_heading] = update_.H, (&K)[3][n_heading] = update_.gain;
     double M[3][n_heading] = {}, of_reading[3], halves[3][3];
     for (int a = 0; a < 3; ++a) {
       of_reading[a] = dot(update_.S_inverse[a], update_.innovation);

@@ -217,8 +217,8 @@ class Hypothesis {
     double nis = 0.0, determinant = 1.0;
     for (int j = 0; j < 3; ++j) {
       const int from = j == 0 ? before : after;
-      const Innovation innovation = scalar_update(model.n, model.width(), m.H[j], m.residual[j], r, P_[from], dx_[from],
-                                                  P_[after], dx_[after]);
+      const Innovation innovation =
+          scalar_update(model.n, model.width(), m.H[j], m.residual[j], r, P_[from], dx_[from], P_[after], dx_[after]);
       nis += innovation.value * innovation.value / innovation.variance;
       determinant *= innovation.variance / r;
     }

@@ -4,19 +4,20 @@
 #include "numbers.hpp"
 
 // X(kernel, problem)
-#define MAGLOC_KERNELS(X) \
-  X(dipole_fields, dipoles) \
-  X(dipole_gradients, dipoles) \
-  X(star_search, star_triangles) \
-  X(complementary_filter, complementary) \
-  X(adaptive_filter, adaptive) \
-  X(gyro_attitudes, gyro) \
-  X(level_attitudes, level) \
-  X(low_pass, butterworth) \
-  X(heading_filter, heading) \
-  X(heading_smoother, heading) \
+#define MAGLOC_KERNELS(X)                  \
+  X(dipole_fields, dipoles)                \
+  X(dipole_gradients, dipoles)             \
+  X(star_search, star_triangles)           \
+  X(complementary_filter, complementary)   \
+  X(adaptive_filter, adaptive)             \
+  X(gyro_attitudes, gyro)                  \
+  X(level_attitudes, level)                \
+  X(low_pass, butterworth)                 \
+  X(heading_filter, heading)               \
+  X(heading_smoother, heading)             \
   X(attitude_motion_runs, attitude_motion) \
-  X(mekf_runs, mekf)
+  X(mekf_runs, mekf)                       \
+  X(filter_starts, starts)
 
 #define MAGLOC_JOIN_(a, b, c) magloc_##a##_##b##c
 #define MAGLOC_JOIN(a, b, c) MAGLOC_JOIN_(a, b, c)

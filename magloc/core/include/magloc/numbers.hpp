@@ -25,6 +25,14 @@
 #else
 #define MAGLOC_INLINE inline
 #endif
+// Before a loop of few turns: repeat its body, so that arrays with its index become registers.
+#if defined(__clang__)
+#define MAGLOC_UNROLL _Pragma("unroll")
+#elif defined(__GNUC__)
+#define MAGLOC_UNROLL _Pragma("GCC unroll 16")
+#else
+#define MAGLOC_UNROLL
+#endif
 
 MAGLOC_BEGIN
 constexpr double infinity = __builtin_inf(), nan = __builtin_nan("");

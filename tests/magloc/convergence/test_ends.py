@@ -1,4 +1,4 @@
-"""Tests of magloc.convergence.filters_compiled: many starts at once end as one start does alone.
+"""Tests of magloc.convergence.ends: many starts at once end as one start does alone, with all instruction sets.
 
 | what | who checks it |
 |---|---|
@@ -22,7 +22,6 @@ from fractions import Fraction
 from math import sqrt
 from typing import cast
 
-import numba
 import numpy as np
 import pytest
 import scipy.optimize
@@ -32,10 +31,9 @@ from numpy.typing import NDArray
 from arrays.array import SensorArray
 from arrays.geometries import tetrahedron
 from arrays.sensor import Sensor
+from magloc import core
+from magloc.convergence.ends import Ends, ScaledDifferences
 from magloc.convergence.filters import DampedFilter, IekfFilter, RepeatedFilter, field_weights
-from magloc.convergence.filters_compiled import Ends
-from magloc.convergence.linearisation_compiled import Model
-from magloc.convergence.workspace_compiled import LANES
 from magloc.kalman import predict_square_root, sequential_update
 from magloc.measurement.differences import DifferenceMeasurement
 from tests.arrays.test_differences import random_array
@@ -46,8 +44,10 @@ EPS = float(np.finfo(np.float64).eps)
 SOURCE = np.array([5.0, 0.0, 0.306, 100.0, 0.0, 0.0])
 TETRAHEDRON = tetrahedron(1.5, noise_T=1e-9)
 FILTERS = [IekfFilter(), RepeatedFilter(), DampedFilter()]
+RELINEARISED = RepeatedFilter(relinearise_every_scalar=True, noise_inflation=4.0)
 # A difference that no user of a fix could see: a billionth of its standard deviation.
 ROUNDING = 1e-9
+all_instruction_sets = pytest.mark.usefixtures("instruction_set")
 any_array = cast(Callable[..., SensorArray], random_array)
 each_filter = pytest.mark.parametrize("method", FILTERS, ids=lambda method: method.name)
 
@@ -98,9 +98,20 @@ def in_sigmas(difference: Array, S: Array) -> float:
 
 @pytest.fixture
 def threads() -> Iterator[Callable[[int], None]]:
-    before = numba.get_num_threads()
-    yield numba.set_num_threads
-    numba.set_num_threads(before)
+    before = core.threads()
+    yield core.set_threads
+    core.set_threads(before)
+
+
+@pytest.fixture(params=["baseline", "avx2", "avx512"])
+def instruction_set(request: pytest.FixtureRequest) -> Iterator[None]:
+    before = core.instruction_set()
+    try:
+        core.use_instruction_set(request.param)
+    except ValueError:
+        pytest.skip(f"this machine does not have {request.param}")
+    yield
+    core.use_instruction_set(before)
 
 
 def solve_exactly(matrix: list[list[Fraction]], right: list[Fraction]) -> list[Fraction]:
@@ -114,6 +125,12 @@ def solve_exactly(matrix: list[list[Fraction]], right: list[Fraction]) -> list[F
 
 
 class TestSettings:
+    def test_graphics_processors_are_gone(self) -> None:
+        with pytest.raises(
+            ValueError, match="Input device must be cpu: filters run on no other; instead received 'cuda'"
+        ):
+            IekfFilter(device="cuda")
+
     @each_filter
     @pytest.mark.parametrize("setting", [{"max_iterations": 0}, {"tolerance_T": -1.0}, {"tolerance_T": np.nan}])
     def test_no_pass_at_all_is_no_filter(self, method: Filter, setting: dict[str, float]) -> None:
@@ -123,6 +140,7 @@ class TestSettings:
             replace(method, **setting)  # type: ignore[arg-type]
 
 
+@all_instruction_sets
 class TestOnePassIsTheExactUpdate:
     """The update of a linear model has one right answer: that of the Jacobian and the innovations in doubles.
 
@@ -176,8 +194,13 @@ class TestOnePassIsTheExactUpdate:
         return solve_exactly(information, right), information
 
 
+@all_instruction_sets
 class TestReadableTwins:
-    @pytest.mark.parametrize("method", [*FILTERS, RepeatedFilter(noise_inflation=100.0)], ids=lambda m: m.name)
+    @pytest.mark.parametrize(
+        "method",
+        [*FILTERS, RepeatedFilter(noise_inflation=100.0), RELINEARISED],
+        ids=["iekf", "repeated", "damped", "inflated", "relinearised"],
+    )
     @pytest.mark.parametrize("kind", ["cube", "cube with moment", "far"])
     def test_one_pass(self, method: Filter, kind: str) -> None:
         measurement, z = problem(TETRAHEDRON)
@@ -189,7 +212,7 @@ class TestReadableTwins:
         for passes in range(2, 6):
             self.compare(RepeatedFilter(max_iterations=passes), measurement, z, starts_of("cube", 25), 1e-8)
 
-    @each_filter
+    @pytest.mark.parametrize("method", [*FILTERS, RELINEARISED], ids=["iekf", "repeated", "damped", "relinearised"])
     @pytest.mark.parametrize("tolerance_T", [1e-9, 1e-10, 1e-12])
     def test_whole_runs_from_near_the_source(self, method: Filter, tolerance_T: float) -> None:
         measurement, z = problem(TETRAHEDRON)
@@ -279,8 +302,9 @@ class TestTwoFormsOfTheDifferences:
 
     @staticmethod
     def form(measurement: DifferenceMeasurement, z: Array) -> str:
-        model = Model.of(z, measurement.variance, measurement.array.positions, field_weights(measurement), 1.0, 1.0)
-        return "recursive" if model.blend.size else "matrix"
+        weights = field_weights(measurement)
+        scaled = ScaledDifferences.of(z, measurement.variance, measurement.array.positions, weights, 1.0, 1.0)
+        return "recursive" if scaled.blend.size else "matrix"
 
 
 class TestDamped:
@@ -393,9 +417,19 @@ class TestNoWrongFix:
             assert np.linalg.norm(Q.T @ np.concatenate([residual, prior])) < tolerance
 
 
+@all_instruction_sets
 class TestLanes:
+    """Lanes, and blocks of 8 starts."""
+
     measurement, z = problem(TETRAHEDRON)
+    each_filter = pytest.mark.parametrize(
+        "method", [*FILTERS, RELINEARISED], ids=["iekf", "repeated", "damped", "each"]
+    )
     arrays = pytest.mark.parametrize("array", [TETRAHEDRON, any_array(3, 5)], ids=["contrasts", "rows"])
+
+    @pytest.fixture(autouse=True)
+    def small_blocks(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("magloc.convergence.ends._BLOCK_S", 0.0)
 
     @staticmethod
     def assert_same(a: Ends, b: Ends) -> None:
@@ -417,17 +451,16 @@ class TestLanes:
     @each_filter
     @arrays
     def test_threads_change_nothing(self, method: Filter, array: SensorArray, threads: Callable[[int], None]) -> None:
-        if numba.get_num_threads() < 2:
-            pytest.skip("needs two threads")
         measurement, z = problem(array)
         starts = starts_of("cube", 200)
         threads(1)
         one = method.run(measurement, z, starts)
-        threads(2)
-        self.assert_same(method.run(measurement, z, starts), one)
+        for number in range(2, 5):
+            threads(number)
+            self.assert_same(method.run(measurement, z, starts), one)
 
     @each_filter
-    @pytest.mark.parametrize("n", [0, 1, LANES - 1, LANES, LANES + 1])
+    @pytest.mark.parametrize("n", [0, 1, 7, 8, 9, 35])
     def test_any_number_of_starts(self, method: Filter, n: int) -> None:
         starts = starts_of("cube", 100)
         ends = method.run(self.measurement, self.z, starts)
