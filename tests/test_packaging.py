@@ -68,7 +68,7 @@ class TestImports:
         assert set(declared(["magloc[all]"])) == {
             name
             for extra in EXTRAS
-            if extra not in {"all", "gpu", "test", "bench", "docs"}
+            if extra not in {"all", "test", "bench", "docs"}
             for name in declared(EXTRAS[extra])
         }
 

@@ -67,15 +67,7 @@ def threads() -> Iterator[Callable[[int], None]]:
     core.set_threads(before)
 
 
-@pytest.fixture(params=["baseline", "avx2", "avx512"], autouse=True)
-def instruction_set(request: pytest.FixtureRequest) -> Iterator[str]:
-    before = core.instruction_set()
-    try:
-        core.use_instruction_set(request.param)
-    except ValueError:
-        pytest.skip(f"this machine does not have {request.param}")
-    yield request.param
-    core.use_instruction_set(before)
+pytestmark = pytest.mark.usefixtures("instruction_set")
 
 
 class TestTwins:

@@ -15,6 +15,7 @@ class LaneItems {
   // without a result. Return whether any lane has an item.
   template <class Begin>
   MAGLOC_INLINE bool refill(const T &is_free, Begin begin) {
+    if (n_active_ == 0 && next_ >= end_) return false;  // there may be no item at all to repeat
     for (int lane = 0; lane < n_lanes<T>; ++lane) {
       if (get_lane(is_free, lane) == 0.0) continue;
       const bool is_idle = next_ >= end_;
@@ -22,7 +23,7 @@ class LaneItems {
       n_active_ += !is_idle;
       begin(lane, is_idle ? end_ - 1 : item_[lane], is_idle);
     }
-    return n_active_ > 0;
+    return true;
   }
 
   // Call end(lane, item) for each lane whose item is done.
