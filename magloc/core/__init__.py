@@ -22,20 +22,29 @@ from magloc.core._declarations import ffi
 _HERE = Path(__file__).parent
 _SUFFIX = {"win32": ".dll", "darwin": ".so"}.get(sys.platform, ".so")
 _lib: Any = ffi.dlopen(str(_HERE / f"kernels{_SUFFIX}"))
-_TYPES = {"double": np.dtype(np.float64), "int64_t": np.dtype(np.int64), "uint8_t": np.dtype(np.uint8)}
+_TYPES = {
+    "double": np.dtype(np.float64),
+    "float": np.dtype(np.float32),
+    "int64_t": np.dtype(np.int64),
+    "uint8_t": np.dtype(np.uint8),
+}
 
 
 class Problem:
-    """A C struct that describes a problem, and the arrays that it points to."""
+    """A C struct that describes a problem, and the arrays and other problems that it points to."""
 
     def __init__(self, kind: str, fields: dict[str, Any]) -> None:
         self.struct = ffi.new(f"magloc_{kind} *")
-        self.arrays = {name: value for name, value in fields.items() if isinstance(value, np.ndarray)}
+        self.fields = fields  # kept alive
         types = dict(ffi.typeof(self.struct).item.fields)
         if fields.keys() != types.keys():
             raise TypeError(f"magloc_{kind} has the fields {[*types]}; instead received {[*fields]}")
         for name, value in fields.items():
-            setattr(self.struct, name, _pointer(name, types[name].type, value) if name in self.arrays else value)
+            if isinstance(value, np.ndarray):
+                value = _pointer(name, types[name].type, value)
+            elif isinstance(value, Problem):
+                value = value.struct
+            setattr(self.struct, name, value)
 
 
 def _pointer(name: str, pointer_type: Any, array: np.ndarray[Any, Any]) -> Any:
@@ -55,8 +64,8 @@ def problem(kind: str, **fields: Any) -> Problem:
     kind : str
         Name of the struct in magloc.h, without "magloc_".
     **fields
-        All fields of the struct: numbers, and arrays in C order of the type that the header states. None is a null
-        pointer.
+        All fields of the struct: numbers, arrays in C order of the type that the header states, and other problems.
+        None is a null pointer.
 
     Returns
     -------

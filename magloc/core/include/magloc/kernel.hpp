@@ -6,7 +6,11 @@
 // X(kernel, problem)
 #define MAGLOC_KERNELS(X)                                                                                              \
   X(dipole_fields, dipoles)                                                                                            \
-  X(dipole_gradients, dipoles)
+  X(dipole_gradients, dipoles)                                                                                         \
+  X(refine, refinement)                                                                                                \
+  X(candidate_bases, candidate_positions)                                                                              \
+  X(choose_candidates, candidate_choice)                                                                               \
+  X(search_optima, search)
 
 #define MAGLOC_JOIN_(a, b, c) magloc_##a##_##b##c
 #define MAGLOC_JOIN(a, b, c) MAGLOC_JOIN_(a, b, c)
