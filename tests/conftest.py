@@ -155,15 +155,3 @@ def adcs(capsys: pytest.CaptureFixture[str]) -> Run:
         return Outcome(status, *capsys.readouterr())
 
     return run_in_process
-
-
-@pytest.fixture(params=["baseline", "avx2", "avx512"])
-def instruction_set(request: pytest.FixtureRequest) -> Iterator[str]:
-    """Each instruction set of this machine and build in turn."""
-    before = core.instruction_set()
-    try:
-        core.use_instruction_set(request.param)
-    except ValueError:
-        pytest.skip(f"this machine or build does not have {request.param}")
-    yield request.param
-    core.use_instruction_set(before)

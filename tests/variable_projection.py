@@ -1,6 +1,6 @@
 """Variable projection: the moment is linear and eliminated, so that a fit of one source is a search over its position.
 
-The readable twin of :mod:`magloc.localization.fit.variable_projection_compiled`, for models of one row: its oracle.
+The readable reference of :mod:`magloc.localization.fit.refinement`, for models of one row: its oracle.
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from arrays.typing import FloatArray
+from magloc.localization.fit.refinement import Refined, refine_starts
 from magloc.measurement.whitened import WhitenedModel
 
 
@@ -30,3 +31,9 @@ def best_moment(model: WhitenedModel, q: FloatArray, y: FloatArray) -> FloatArra
     """Scaled moment (3,) that fits whitened readings y (C,) best at q (4,)."""
     mu: FloatArray = np.asarray(np.linalg.lstsq(unit_basis(model, q), y, rcond=None)[0], dtype=np.float64)
     return mu
+
+
+def refined(model: WhitenedModel, y: FloatArray, q: FloatArray, max_iterations: int = 100) -> Refined:
+    """Refinements of one source from a start (b, 4) for each row of whitened readings (b, C), by the kernel."""
+    ends = refine_starts(model, y, q[:, None], max_iterations=max_iterations)
+    return ends._replace(q=ends.q[:, 0], mu=ends.mu[:, 0])

@@ -24,7 +24,12 @@ from magloc.core._declarations import ffi
 _HERE = Path(__file__).parent
 _SUFFIX = ".dll" if sys.platform == "win32" else ".so"
 _lib: Any = ffi.dlopen(os.environ.get("MAGLOC_KERNELS") or str(_HERE / f"kernels{_SUFFIX}"))
-_TYPES = {"double": np.dtype(np.float64), "int64_t": np.dtype(np.int64), "uint8_t": np.dtype(np.uint8)}
+_TYPES = {
+    "double": np.dtype(np.float64),
+    "float": np.dtype(np.float32),
+    "int64_t": np.dtype(np.int64),
+    "uint8_t": np.dtype(np.uint8),
+}
 
 
 class Problem:

@@ -17,9 +17,7 @@ from arrays.array import SensorArray
 from arrays.typing import FloatArray
 from arrays.whitening import Whitening, whitening
 from magloc.chi_square import check_differences
-from magloc.compilation import over_rows
 from magloc.fields import dipole
-from magloc.localization.fit.gauss_newton import refined_a_thread
 from magloc.localization.search.candidates import (
     SingleArray,
     candidate_positions,
@@ -27,9 +25,9 @@ from magloc.localization.search.candidates import (
     linear_bases,
     linear_scores,
 )
-from magloc.localization.search.single_source_compiled import Ends, search_rows
+from magloc.localization.search.kernels import search_optima
+from magloc.measurement.channels import signals_of
 from magloc.measurement.whitened import WhitenedModel
-from magloc.measurement.whitened_compiled import signals
 
 # As Locator searches: starts of every refinement, least angle between them, linearisations at most.
 _N_STARTS, _APART_RAD, _MOST_ITERATIONS = 12, 0.25, 100
@@ -129,12 +127,13 @@ class DipoleFilter:
     def refined_energy(self, whitened: FloatArray) -> FloatArray:
         """The same of refined candidates alone: minus infinity where none converged."""
         n = len(whitened)
+        # All channels as linear ones.
         problem = replace(
-            self._problem.rows(np.zeros(n, dtype=np.intp)), gain=np.broadcast_to(self._gain, (n, *self._gain.shape))
+            self._problem.rows(np.zeros(n, dtype=np.intp)),
+            gain=np.broadcast_to(self._gain, (n, *self._gain.shape)),
+            channel_is_scalar=np.zeros_like(self.array.channel_is_scalar),
         )
         chosen = chosen_candidates(self._bases, whitened, self._candidates, _N_STARTS, _APART_RAD)
-        found = Ends.empty(n, _N_STARTS)
-        signal, starts = signals(problem, whitened), self._candidates[chosen]
-        given = signal, np.arange(n), starts, np.inf, _MOST_ITERATIONS, problem.lanes, None, found
-        over_rows(search_rows, n, *given, rows_a_thread=refined_a_thread(whitened.shape[1]))
+        signals, starts = signals_of(problem, whitened), self._candidates[chosen]
+        found = search_optima(problem, signals, np.arange(n), starts, None, np.inf, _MOST_ITERATIONS)
         return self.energy(whitened) - np.where(found.counts[:, 0] > 0, found.chi2[:, 0], np.inf)

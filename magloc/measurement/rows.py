@@ -14,6 +14,7 @@ from arrays.io.values import fields
 from arrays.noise import covariance_blocks
 from arrays.typing import BoolArray, FloatArray, IntArray
 from arrays.whitening import Whitening, whitening, whitenings
+from magloc.measurement.channels import signals_of
 from magloc.measurement.known_moment import KnownMoment
 from magloc.measurement.whitened import WhitenedModel
 from magloc.measurement.whitened_compiled import signals
@@ -72,6 +73,11 @@ class WhitenedRows:
     def knowing(self, moment: KnownMoment | None) -> WhitenedRows:
         """The same where the moment of every source is known."""
         return replace(self, model=replace(self.model, known=moment)) if moment is not None else self
+
+    @cached_property
+    def signals(self) -> FloatArray:
+        """Whitened readings for the kernels of fits: (b, C + k)."""
+        return signals_of(self.model, self.y)
 
     @cached_property
     def signal(self) -> FloatArray:

@@ -16,8 +16,10 @@ from numpy.typing import ArrayLike, NDArray
 from arrays.array import SensorArray
 from arrays.typing import FloatArray
 from arrays.whitening import Whitening
+from magloc import core
 from magloc.compilation import own
 from magloc.fields.dipole import MU0_OVER_4PI
+from magloc.measurement.channels import channels_of
 from magloc.measurement.known_moment import KnownMoment
 from magloc.measurement.whitened_compiled import LaneModel, ModelRows, Units
 
@@ -142,6 +144,11 @@ class WhitenedModel(ScaledSensors):
         """Whitened readings without a source: (b, C), or (1, C) where all rows have the same."""
         alone = self.rows(np.arange(min(1, len(self)))) if self.shares_whitening and self.shares_ambient else self
         return alone.predicted(np.zeros(alone.ambient.shape))
+
+    @cached_property
+    def channels(self) -> core.Problem:
+        """Channels for the kernels of fits."""
+        return channels_of(self)
 
     @cached_property
     def of_kernels(self) -> ModelRows:

@@ -15,17 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arrays.typing import FloatArray, IntArray
-from magloc.compilation import over_rows, own
 from magloc.fields.dipole import MU0_OVER_4PI
-from magloc.localization.fit.joint_compiled import LARGEST_DAMPING, LARGEST_STEP_RAD, JointEnds, JointRules, refine_rows
-from magloc.localization.fit.moduli_compiled import refined_by_moduli
-from magloc.localization.fit.variable_projection_compiled import refined
+from magloc.localization.fit.refinement import MOST_SOURCES, OPTIMUM_TOLERANCE, RELATIVE_TOLERANCE, refine_starts
 from magloc.measurement.whitened import WhitenedModel
 
 # A refinement has converged where the linearised model promises to lower χ² by less than this, absolute and relative.
 PROMISE_ABSOLUTE = 1e-8
 PROMISE_RELATIVE = 1e-11
 _CHANNELS_A_THREAD = 768
+LARGEST_STEP_RAD, LARGEST_DAMPING = 0.5, 1e9
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,38 +191,40 @@ def refine(
 
     y (b, C) are whitened readings, `free` (K, 3) says which :func:`tangents` of a source may change: without the third
     its range stays. It has converged where the linearised model promises to lower χ² by less than `promise`, of one
-    free source by less than that of :func:`refined`. Where the sources' moments are free compiled twins do it: of
-    vector sensors, which begin with the moments that fit best, and of one source by any sensors. Several sources by
-    vector sensors are given up where they will not come below a χ² (b,) that is too high.
+    free source by vector sensors by less than ``OPTIMUM_TOLERANCE``. Kernels refine sources of free moments by vector
+    sensors, beginning with the moments that fit best, and one source by any sensors; they give up what will not come
+    below a χ² (b,) that is too high.
     """
     free = np.ones((q.shape[1], 3), dtype=bool) if free is None else free
-    linear = problem.known is None and not problem.channel_is_scalar.any()
-    by_moduli = _is_by_moduli(problem, free)
-    if by_moduli or (linear and q.shape[1] == 1 and free.all()):
-        if by_moduli:
-            found = refined_by_moduli(problem, y, q[:, 0], mu[:, 0], max_iterations, float(free[0, 2]), promise)
-        else:
-            found = refined(problem, y, q[:, 0], max_iterations)
-        chi2 = np.where(found.converged, found.chi2, np.inf)
-        return JointFits(found.q[:, None], found.mu[:, None], chi2, found.iterations)
-    if linear and free.any():
-        ends = JointEnds(own(q), own(mu), np.empty(len(q)), np.empty(len(q), dtype=np.int64))
-        limit = np.full(len(q), np.inf) if too_high is None else too_high
-        rules = JointRules(promise, PROMISE_RELATIVE, max_iterations, limit)
-        given = own(y), free.astype(np.float64), problem.of_kernels, rules, ends
-        over_rows(refine_rows, len(q), *given, rows_a_thread=refined_a_thread(q.shape[1] * y.shape[1]))
-        return JointFits(*ends)
-    return damped_gauss_newton(problem, y, q, mu, free, max_iterations, promise)
+    if not _has_kernel(problem, free):
+        return damped_gauss_newton(problem, y, q, mu, free, max_iterations, promise)
+    moduli, one_free_source = problem.sees_moduli, len(free) == 1 and free.all()
+    several = len(free) > 1
+    found = refine_starts(
+        problem,
+        y - problem.of_ambient if moduli else y,
+        q,
+        mu if moduli else None,
+        free=None if free.all() else free,
+        max_iterations=max_iterations,
+        tolerance=OPTIMUM_TOLERANCE if one_free_source and not moduli else promise,
+        relative_tolerance=PROMISE_RELATIVE if several else RELATIVE_TOLERANCE,
+        too_high=too_high,
+    )
+    useful = found.converged if too_high is None else found.converged & ~(found.chi2 > too_high)
+    return JointFits(found.q, found.mu, np.where(useful, found.chi2, np.inf), found.iterations)
+
+
+def _has_kernel(problem: WhitenedModel, free: NDArray[np.bool_]) -> bool:
+    """Whether kernels refine: sources of free moments by vector sensors, or one of free direction by any sensors."""
+    if problem.known is not None or not free.any() or len(free) > MOST_SOURCES:
+        return False
+    return not problem.sees_moduli or (len(free) == 1 and bool(free[0, :2].all()))
 
 
 def refined_a_thread(n_channels: int) -> int:
     """Rows to refine, of so many channels (times sources), that take the millisecond that threads take to begin."""
     return 1 + _CHANNELS_A_THREAD // n_channels
-
-
-def _is_by_moduli(problem: WhitenedModel, free: NDArray[np.bool_]) -> bool:
-    """Whether :func:`refined_by_moduli` refines: one source of free direction and moment, by scalar sensors too."""
-    return bool(problem.known is None and problem.channel_is_scalar.any() and len(free) == 1 and free[0, :2].all())
 
 
 def damped_gauss_newton(

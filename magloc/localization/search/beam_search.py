@@ -13,10 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arrays.typing import FloatArray
-from magloc.compilation import over_rows
 from magloc.directions import hemisphere
-from magloc.localization.fit.gauss_newton import JointFits, fit_moments, refine, refined_a_thread
-from magloc.localization.fit.moduli_compiled import Moduli
+from magloc.localization.fit.gauss_newton import JointFits, fit_moments, refine
 from magloc.localization.fit.results import DISTINCT_WITHIN
 from magloc.localization.search.candidates import (
     LastBases,
@@ -27,10 +25,10 @@ from magloc.localization.search.candidates import (
     modulus_scores,
     rows_of_equal_gain,
 )
+from magloc.localization.search.kernels import search_optima
 from magloc.localization.search.known_moment import starts_of_known_moment
-from magloc.localization.search.single_source_compiled import Ends, search_rows
+from magloc.measurement.channels import signals_of
 from magloc.measurement.whitened import WhitenedModel
-from magloc.measurement.whitened_compiled import signals
 
 Allowed = Callable[[FloatArray, FloatArray], NDArray[np.bool_]]
 _SAME_RAD = 0.02
@@ -152,20 +150,8 @@ class Search:
 
     def _ends(self, problem: WhitenedModel, y: FloatArray, q: FloatArray, mu: FloatArray) -> JointFits:
         """Distinct fits of one source by moduli, as many as there are starts (b, k, …); the others have no χ²."""
-        found = Ends.empty(*q.shape[:2])
-        over_rows(
-            search_rows,
-            len(y),
-            signals(problem, y - problem.of_ambient),
-            np.arange(len(y)),
-            np.concatenate([q, mu], axis=-1),
-            self.within,
-            _MOST_ITERATIONS,
-            problem.lanes,
-            Moduli.of(problem),
-            found,
-            rows_a_thread=refined_a_thread(y.shape[1]),
-        )
+        signals = signals_of(problem, y - problem.of_ambient)
+        found = search_optima(problem, signals, np.arange(len(y)), q, mu, self.within, _MOST_ITERATIONS)
         chi2 = np.where(np.arange(q.shape[1]) < found.counts[:, :1], found.chi2, np.inf)
         return JointFits(found.q[:, :, None], found.mu[:, :, None], chi2, found.iterations).shaped(-1)
 

@@ -16,18 +16,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from arrays.array import SensorArray
 from arrays.typing import FloatArray
-from magloc.compilation import over_rows
 from magloc.directions import fibonacci_directions
 from magloc.localization.fit.prior import SourcePrior
-from magloc.localization.search.single_source_compiled import choose_rows
+from magloc.localization.search.kernels import candidate_bases, choose_candidates
 from magloc.measurement.whitened import WhitenedModel
-from magloc.measurement.whitened_compiled import ModelRow, candidate_bases
 
 SingleArray = NDArray[np.float32]
 _SAME_GAIN = 0.02
 _APART_RAD, _LEAST_APART_RAD = 0.25, 0.075
 _CANDIDATES_AT_ONCE = 512
-_NUMBERS_A_THREAD = 65536  # of bases, which take as long as beginning several threads
 # Squares of a candidate's unit moment, along one direction, that only missing channels see.
 _UNSEEN = 1e-7
 _ROWS_AT_ONCE = 64  # whose components stay in the processor's cache
@@ -40,11 +37,8 @@ def linear_bases(problem: WhitenedModel, gain: FloatArray, row: int, candidates:
     By moment axis, then by candidate, under the whitening of `row`; `gain` (C, 3) is in units of the noise. Single
     precision ranks the candidates as well.
     """
-    bases = np.empty((gain.shape[0], 3, len(candidates)), dtype=np.float32)
-    model = ModelRow.of(problem, gain, problem.basis[row], problem.shrinkage[row])
-    enough = 1 + _NUMBERS_A_THREAD // gain.shape[0]
-    over_rows(candidate_bases, len(candidates), candidates, model, bases, rows_a_thread=enough)
-    return bases.reshape(gain.shape[0], -1)
+    columns = problem.basis[row] * np.sqrt(problem.shrinkage[row])
+    return candidate_bases(problem, gain, columns, candidates).reshape(gain.shape[0], -1)
 
 
 class LastBases:
@@ -131,7 +125,7 @@ def chosen_candidates(
             z[:] = i20 * x + i21 * y + i22 * z
             y[:] = i10 * x + i11 * y
             x *= i00
-        choose_rows(0, len(some), of_some, candidates, cos_apart, chosen[begin : begin + _ROWS_AT_ONCE])
+        chosen[begin : begin + _ROWS_AT_ONCE] = choose_candidates(of_some, candidates, cos_apart, n_starts)
     return chosen
 
 

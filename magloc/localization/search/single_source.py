@@ -1,6 +1,6 @@
 """Search for one dipole by vector sensors, without a start.
 
-The moment is eliminated (:mod:`magloc.localization.fit.variable_projection_compiled`), a grid of positions is scored by
+The moment is eliminated (:mod:`magloc.localization.fit.refinement`), a grid of positions is scored by
 how much of the readings' energy they explain, the best distinct ones are refined by a damped Gauss-Newton iteration
 that only accepts steps which decrease χ², and every distinct optimum near the best one is returned.
 """
@@ -18,13 +18,11 @@ from scipy.special import chdtri
 from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray, IntArray
 from arrays.whitening import Whitening, whitening
-from magloc.compilation import over_rows
 from magloc.levels import CREDIBLE_FIT
-from magloc.localization.fit.gauss_newton import JointFits, refined_a_thread
+from magloc.localization.fit.gauss_newton import JointFits
 from magloc.localization.fit.optima import Optima
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import DISTINCT_WITHIN
-from magloc.localization.search import single_source_compiled as kernels
 from magloc.localization.search.candidates import (
     SingleArray,
     allowed_positions,
@@ -33,6 +31,7 @@ from magloc.localization.search.candidates import (
     orthonormal_without,
     start_separation,
 )
+from magloc.localization.search.kernels import Ends, search_optima
 from magloc.measurement.rows import WhitenedRows, channels_above_ambient, check_magnitudes, check_spans, whitened_rows
 from magloc.measurement.whitened import WhitenedModel
 
@@ -218,34 +217,18 @@ class SingleSourceSearch:
         best: FloatArray = ranking.candidates[chosen]
         return best
 
-    def ends(
-        self, rows: WhitenedRows, reading_of_row: IntArray, starts: FloatArray, keep_within: float
-    ) -> kernels.Ends:
+    def ends(self, rows: WhitenedRows, reading_of_row: IntArray, starts: FloatArray, keep_within: float) -> Ends:
         """Distinct optima that starts (n, k, 4) lead to, each of the reading of some row."""
-        found = kernels.Ends.empty(*starts.shape[:2])
-        over_rows(
-            kernels.search_rows,
-            len(starts),
-            rows.signal,
-            reading_of_row,
-            starts,
-            keep_within,
-            self.max_iterations,
-            rows.model.lanes,
-            None,
-            found,
-            rows_a_thread=refined_a_thread(rows.y.shape[1]),
-        )
-        return found
+        return search_optima(rows.model, rows.signals, reading_of_row, starts, None, keep_within, self.max_iterations)
 
-    def _known(self, model: WhitenedModel, found: kernels.Ends) -> kernels.Ends:
+    def _known(self, model: WhitenedModel, found: Ends) -> Ends:
         """Optima that agree with what is known, again those within Δχ² of the best of them."""
         chi2 = np.where(self.prior.allows(model, found.q, found.mu), found.chi2, np.inf)
         order = np.argsort(chi2, axis=1, kind="stable")
         chi2 = np.take_along_axis(chi2, order, axis=1)
         counts = found.counts.copy()
         counts[:, 0] = (np.isfinite(chi2) & (chi2 <= chi2[:, :1] + DISTINCT_WITHIN)).sum(axis=1)
-        return kernels.Ends(
+        return Ends(
             np.take_along_axis(found.q, order[..., None], axis=1),
             np.take_along_axis(found.mu, order[..., None], axis=1),
             chi2,

@@ -17,7 +17,11 @@
   X(heading_smoother, heading)             \
   X(attitude_motion_runs, attitude_motion) \
   X(mekf_runs, mekf)                       \
-  X(filter_starts, starts)
+  X(filter_starts, starts)                 \
+  X(refine, refinement)                    \
+  X(candidate_bases, candidate_positions)  \
+  X(choose_candidates, candidate_choice)   \
+  X(search_optima, search)
 
 #define MAGLOC_JOIN_(a, b, c) magloc_##a##_##b##c
 #define MAGLOC_JOIN(a, b, c) MAGLOC_JOIN_(a, b, c)

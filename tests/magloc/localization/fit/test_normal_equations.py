@@ -3,7 +3,6 @@
 | what | who checks it |
 |---|---|
 | χ², moment and step at any place | the lanes that keep all digits, ended after one linearisation |
-| search where it has not the digits | the truth of readings without noise |
 """
 
 from __future__ import annotations
@@ -15,11 +14,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from arrays.array import SensorArray
-from arrays.geometries import tetrahedron
 from magloc.localization.fit.variable_projection_compiled import Refined, Rules, refine_starts
-from magloc.localization.search.single_source import SingleSourceSearch
-from magloc.measurement.differences import predicted_channels
 from magloc.measurement.rows import whitened_rows
 from tests.magloc.localization.search.test_candidates import CASES, random_problems
 from tests.magloc.localization.search.test_single_source import noisy_readings
@@ -50,28 +45,3 @@ class TestOneLinearisation:
         assert_allclose(found.chi2, expected.chi2, rtol=1e-9, atol=1e-12 * rows.energy.max())
         assert_allclose(found.q, expected.q, atol=1e-7)
         assert_allclose(found.mu, expected.mu, rtol=1e-7, atol=1e-9 * np.abs(expected.mu).max())
-
-
-class TestWithoutTheDigits:
-    """The search takes all digits there: squares of such readings have none left."""
-
-    @pytest.mark.parametrize("noise_T", [1e-15, 1e-17])
-    def test_nearly_no_noise(self, noise_T: float) -> None:
-        array = tetrahedron(1.5, noise_T=noise_T)
-        self.check(array)
-
-    def test_noise_with_a_direction(self) -> None:
-        array = tetrahedron(1.5, noise_T=1e-9)
-        sensors = tuple(replace(sensor, misalignment_rad=0.1, gain_uncertainty=0.1) for sensor in array.sensors)
-        self.check(SensorArray(sensors))
-
-    def check(self, array: SensorArray) -> None:
-        rng = np.random.default_rng(4)
-        u, m = rng.normal(size=(2, N_ROWS, 3))
-        places = 4.0 * u / np.linalg.norm(u, axis=1, keepdims=True)
-        readings = predicted_channels(array, places, 300.0 * m) + array.channel_offset_T
-        (rows,) = whitened_rows(array, readings, None, N_ROWS)
-        (optima,) = SingleSourceSearch(array).optima(rows)
-        best = optima.fits.rows(np.searchsorted(optima.of_row, np.arange(N_ROWS)))
-        assert_allclose(rows.model.position(best.q[:, 0]), places, rtol=0.0, atol=1e-4)
-        assert np.all(best.chi2 < 1e-6)

@@ -13,7 +13,6 @@ import pytest
 from arrays.array import SensorArray
 from arrays.geometries import square, tetrahedron
 from arrays.sensor import Sensor
-from magloc.localization.fit.variable_projection_compiled import refined
 from magloc.localization.search.candidates import (
     candidate_positions,
     chosen_candidates,
@@ -26,7 +25,7 @@ from magloc.measurement.differences import channel_jacobian
 from magloc.measurement.rows import whitened_rows
 from tests.magloc.localization.search.test_single_source import noisy_readings
 from tests.plain_locator import plain_locator
-from tests.variable_projection import best_moment, projected_chi2
+from tests.variable_projection import best_moment, projected_chi2, refined
 
 
 def seven_irregular_sensors():
@@ -217,7 +216,7 @@ def test_is_the_optimum_polished_in_extended_precision(name, n):
 
 
 class TestChoiceOfStarts:
-    """The compiled choice against its readable twin."""
+    """The kernel's choice against its readable reference."""
 
     @pytest.mark.parametrize("n_rows", [1, 16, 45])
     @pytest.mark.parametrize("apart_rad", [0.25, 1.2])
@@ -276,7 +275,7 @@ class TestLanes:
         for name, of_two in zip(together._fields, refined(alone.model, alone.y, q[[3, 40]]), strict=True):
             np.testing.assert_array_equal(of_two, getattr(together, name)[[3, 40]])
 
-    def test_chi2_is_that_of_the_readable_twin(self):
+    def test_chi2_is_that_of_the_readable_reference(self):
         """With a prior of the common field, which the lanes have as readings of it."""
         array, p, readings = regime("product", 20, np.random.default_rng(8))
         array = SensorArray(array.sensors, common_field_T=2e-9)

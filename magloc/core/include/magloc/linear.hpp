@@ -1,0 +1,91 @@
+// Small linear algebra in lanes.
+#pragma once
+#include "numbers.hpp"
+
+MAGLOC_BEGIN
+// Modified Gram-Schmidt of D columns a (n, D) and of a vector y (n,), in place: the columns become orthogonal to each
+// other, and y to all of them. A column that loses all but `lost` of its square consists of rounding; it counts as
+// zero.
+template <class T, int D>
+class Orthogonalisation {
+  T square_[D] = {}, share_[D][D] = {}, share_of_y_[D] = {};  // share_[j][k] of column j in column k
+
+  // Subtract column j - 1 from the later ones and from y, then project these on column j.
+  template <int j>
+  MAGLOC_INLINE void pass(T *a, T *y, int64_t n, double lost) {
+    T product[D] = {}, product_y = {}, sum_y = {};
+    for (int64_t i = 0; i < n; ++i) {
+      T *row = a + i * D, rest = y[i];
+      if constexpr (j > 0) {
+        for (int k = j; k < D; ++k) row[k] -= share_[j - 1][k] * row[j - 1];
+        rest -= share_of_y_[j - 1] * row[j - 1];
+        y[i] = rest;
+      } else {
+        for (int k = 1; k < D; ++k) square_[k] += row[k] * row[k];
+      }
+      if constexpr (j < D) {
+        for (int k = j; k < D; ++k) product[k] += row[j] * row[k];
+        product_y += row[j] * rest;
+      } else {
+        sum_y += rest * rest;
+      }
+    }
+    if constexpr (j < D) {
+      const T before = j > 0 ? square_[j] : product[j];
+      inverse[j] = choose(product[j] > lost * before, 1.0 / product[j], T{});
+      for (int k = j + 1; k < D; ++k) share_[j][k] = inverse[j] * product[k];
+      share_of_y_[j] = inverse[j] * product_y;
+      pass<j + 1>(a, y, n, lost);
+    } else {
+      rest_square = sum_y;
+    }
+  }
+
+ public:
+  T inverse[D], rest_square;  // one over the squares of the orthogonal columns; the square of what is left of y
+
+  MAGLOC_INLINE Orthogonalisation(T *a, T *y, int64_t n, double lost) { pass<0>(a, y, n, lost); }
+
+  // Solve the least-squares problem y = a x of the original columns.
+  MAGLOC_INLINE void solve(T (&x)[D]) const {
+    for (int j = D; j-- > 0;) {
+      x[j] = share_of_y_[j];
+      for (int k = j + 1; k < D; ++k) x[j] -= share_[j][k] * x[k];
+    }
+  }
+};
+
+// Factors L D L^T of a positive matrix (its lower triangle) whose diagonal a_jj is raised to (1 + damping) a_jj +
+// added_j. A pivot that loses all but `lost` of its diagonal counts as infinite: its variable stays zero.
+template <class T, int n>
+struct Ldl {
+  T l[n][n], inverse[n];
+
+  MAGLOC_INLINE Ldl(const T (&a)[n][n], T damping, const T (&added)[n], double lost) {
+    for (int j = 0; j < n; ++j) {
+      const T diagonal = (1.0 + damping) * a[j][j] + added[j];
+      T pivot = diagonal;
+      for (int k = 0; k < j; ++k) {
+        const T scaled = l[j][k];  // l times the pivot, until here
+        l[j][k] *= inverse[k];
+        pivot -= scaled * l[j][k];
+      }
+      inverse[j] = choose(pivot > lost * diagonal, 1.0 / pivot, T{});
+      for (int i = j + 1; i < n; ++i) {
+        l[i][j] = a[i][j];
+        for (int k = 0; k < j; ++k) l[i][j] -= l[i][k] * l[j][k];
+      }
+    }
+  }
+  MAGLOC_INLINE void solve(const T (&b)[n], T (&x)[n]) const {
+    for (int i = 0; i < n; ++i) {
+      x[i] = b[i];
+      for (int k = 0; k < i; ++k) x[i] -= l[i][k] * x[k];
+    }
+    for (int i = n; i-- > 0;) {
+      x[i] *= inverse[i];
+      for (int k = i + 1; k < n; ++k) x[i] -= l[k][i] * x[k];
+    }
+  }
+};
+MAGLOC_END

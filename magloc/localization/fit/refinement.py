@@ -1,0 +1,106 @@
+"""Fits of dipoles from starts by compiled kernels: damped Gauss-Newton with the moments eliminated.
+
+:func:`magloc.localization.fit.gauss_newton.damped_gauss_newton` is the readable reference.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arrays.typing import BoolArray, FloatArray, IntArray
+from magloc import core
+from magloc.measurement.channels import signals_of
+from magloc.measurement.whitened import WhitenedModel
+
+MOST_SOURCES = 4
+"""Most sources that the kernels fit together."""
+OPTIMUM_TOLERANCE = 1e-10
+"""Predicted gain in χ² at which a state of one source is an optimum: its position is within 1e-5 σ of it."""
+RELATIVE_TOLERANCE = 1e-14
+_CHANNELS_A_BLOCK = 100_000
+
+
+class Refined(NamedTuple):
+    """Ends of n refinements of K sources: q (n, K, 4), scaled moments (n, K, 3), χ² (n,), linearisations (n,).
+
+    The last item tells which converged, or were given up because they would not come below a useful χ².
+    """
+
+    q: FloatArray
+    mu: FloatArray
+    chi2: FloatArray
+    iterations: IntArray
+    converged: NDArray[np.bool_]
+
+
+def refine_starts(
+    model: WhitenedModel,
+    y: FloatArray,
+    q: FloatArray,
+    mu: FloatArray | None = None,
+    *,
+    free: BoolArray | None = None,
+    max_iterations: int = 100,
+    tolerance: float = OPTIMUM_TOLERANCE,
+    relative_tolerance: float = RELATIVE_TOLERANCE,
+    too_high: FloatArray | None = None,
+) -> Refined:
+    """
+    Refine one start for each row of whitened readings.
+
+    Parameters
+    ----------
+    model : WhitenedModel
+    y : ndarray, shape (b, C)
+        Whitened readings; those of moduli above the ambient field's.
+    q : ndarray, shape (b, K, 4)
+        Positions to start from. K is at most :data:`MOST_SOURCES`, and one with moduli.
+    mu : ndarray, shape (b, K, 3), optional
+        Moments about which moduli are linearised first; zero where there is none.
+    free : ndarray of bool, shape (K, 3), optional
+        Whether each source may turn in two directions and change its range. By default all may.
+    max_iterations : int
+        Largest number of linearisations.
+    tolerance, relative_tolerance : float
+        Predicted gain in χ² at which a state is an optimum, absolute and relative to χ².
+    too_high : ndarray, shape (b,), optional
+        χ² above which a fit is of no use.
+
+    Returns
+    -------
+    Refined
+    """
+    n, n_sources = q.shape[:2]
+    channels = model.channels
+    out = Refined(
+        np.empty((n, n_sources, 4)), np.empty((n, n_sources, 3)), np.empty(n), np.empty(n, np.int64), np.empty(n, bool)
+    )
+    work = core.problem(
+        "refinement",
+        channels=channels,
+        n_sources=n_sources,
+        max_iterations=max_iterations,
+        tolerance=tolerance,
+        relative_tolerance=relative_tolerance,
+        signals=signals_of(model, y),
+        row=np.arange(n),
+        start=np.ascontiguousarray(q),
+        start_moment=None if mu is None else np.ascontiguousarray(mu),
+        too_high=None if too_high is None else np.ascontiguousarray(too_high),
+        free=None if free is None else np.ascontiguousarray(free).view(np.uint8),
+        q=out.q,
+        mu=out.mu,
+        chi2=out.chi2,
+        iterations=out.iterations,
+        converged=out.converged.view(np.uint8),
+    )
+    core.run("refine", work, n, block=rows_a_block(n_sources * n_sources * channels.struct.n_channels))
+    return out
+
+
+def rows_a_block(n_channels: int) -> int:
+    """Return how many rows of so many channels take a few milliseconds."""
+    return 64 + _CHANNELS_A_BLOCK // n_channels
