@@ -3,8 +3,8 @@
 #include "magloc/kernel.hpp"
 
 MAGLOC_BEGIN
-// exp(-a) cos a and exp(-a) sin a for a > 0, by the power series of exp((i - 1) a). A large a is halved until it is small
-// enough, and the result squared as often.
+// exp(-a) cos a and exp(-a) sin a for a > 0, by the power series of exp((i - 1) a). A large a is halved until it is
+// small enough, and the result squared as often.
 inline void damped_rotation(double a, double &cosine, double &sine) {
   int halved = 0;
   for (; a > 0.05 && halved < 64; ++halved) a *= 0.5;

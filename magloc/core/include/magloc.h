@@ -42,7 +42,7 @@ int64_t magloc_dipole_gradients(const magloc_dipoles *problem, int64_t begin, in
 
 /* Attitudes of a camera that triangles of its image's stars state by those of a catalogue. An item is a triangle of the
    image; calls are in order, and compute nothing more once the best attitudes match enough stars or enough attitudes
-   were tried. Corners are ordered by the opposite side, shortest first; sides, all in units of the sphere's radius, too. */
+   were tried. Corners are ordered by the opposite side, shortest first, and so are sides, all on the unit sphere. */
 typedef struct {
   int64_t n_image, n_checked;
   const double *tangents;         /* (n_checked or more, 2): places of the image's stars, brightest first */
@@ -69,8 +69,8 @@ typedef struct {
 } magloc_star_triangles;
 int64_t magloc_star_search(const magloc_star_triangles *problem, int64_t begin, int64_t end, double *workspace);
 
-/* Readings of a gyro and of two vectors, such as field and Sun, of several runs. A vector has any length, and is NaN where
-   it was not read. Either all runs share the references and turns of the frame (n_references = 1) or each has its own. */
+/* Readings of a gyro and of two vectors, such as field and Sun, of several runs. A vector has any length, and is NaN
+   where it was not read. All runs share references and turns of the frame (n_references = 1), or each has its own. */
 typedef struct {
   int64_t n_runs, n_steps, n_references;
   const double *dt;                                /* (n_steps,): steps that end at each instant */
@@ -106,7 +106,7 @@ typedef struct {
   double memory, threshold, changed_growth; /* of the smoothed NIS; above it the bias's variance grows by more */
   double *q;                              /* (n_runs, n_steps, 4) */
   double *bias;                           /* (n_runs, n_steps, 3) */
-  double *covariance;                     /* (n_runs, n_steps, 6, 6): of the error angle in body axes, and of the bias */
+  double *covariance;                     /* (n_runs, n_steps, 6, 6): of the error angle in body axes, and the bias */
   double *smoothed_nis;                   /* (n_runs, n_steps) */
 } magloc_adaptive;
 int64_t magloc_adaptive_filter(const magloc_adaptive *problem, int64_t begin, int64_t end, double *workspace);
@@ -119,7 +119,7 @@ typedef struct {
 } magloc_gyro;
 int64_t magloc_gyro_attitudes(const magloc_gyro *problem, int64_t begin, int64_t end, double *workspace);
 
-/* Attitudes of a gyro, turned from the left so that a vector of its frame goes up; an item is an instant, all in order. */
+/* Attitudes of a gyro, turned so that a vector of its frame goes up; an item is an instant, all in order. */
 typedef struct {
   double start[4];       /* level frame from that of the gyro, at first */
   const double *q_gyro;  /* (n, 4) */
@@ -141,8 +141,8 @@ typedef struct {
 } magloc_butterworth;
 int64_t magloc_low_pass(const magloc_butterworth *problem, int64_t begin, int64_t end, double *workspace);
 
-/* How the states of a heading filter move on in each block: the heading, the gyro's drift, scales of its axes, the sensor's
-   offset, and the slow and the quick variation of the room's field. */
+/* How the states of a heading filter move on in each block: the heading, the gyro's drift, scales of its axes, the
+   sensor's offset, and the slow and the quick variation of the room's field. */
 typedef struct {
   const double *kept;   /* (n_blocks, 14): part of each state that is left */
   const double *growth; /* (n_blocks, 14): of its variance */

@@ -8,8 +8,8 @@
 #include "quaternion.hpp"
 
 MAGLOC_BEGIN
-// Where the state's parts begin: the heading, the gyro's drift, scales of its axes, the sensor's offset, and the slow and
-// the quick variation of the room's field, in the frame whose heading is zero.
+// Where the state's parts begin: the heading, the gyro's drift, scales of its axes, the sensor's offset, and the slow
+// and the quick variation of the room's field, in the frame whose heading is zero.
 enum HeadingState { state_heading, state_drift, state_scale, state_offset = 5, state_room = 8, state_local = 11 };
 constexpr int n_heading = 14;
 constexpr int told_states[4] = {state_heading, state_offset, state_offset + 1, state_offset + 2};
@@ -37,7 +37,8 @@ struct FieldInnovation {
 struct HeadingFilter {
   double x[n_heading], P[n_heading][n_heading];
 
-  // To block i. The heading grows by the drift and the scales times turn; all but the heading decay to a part that is kept.
+  // To block i. The heading grows by the drift and the scales times turn; all but the heading decay to a part that is
+  // kept.
   void predict(const magloc_heading &p, const magloc_heading_room &room, int64_t i) {
     const double *turn = p.turn + 4 * i, *kept = room.kept + n_heading * i, *growth = room.growth + n_heading * i;
     double row[n_heading];
@@ -57,7 +58,7 @@ struct HeadingFilter {
 
   // Compare the field of block i with that which is expected; a heading that is lost is first turned to the field.
   void compare(const magloc_heading &p, int64_t i, FieldInnovation &update) {
-    const double *measured = p.field + 3 * i, *level = p.level + 9 * i;  // level: matrix to the level frame from the body
+    const double *measured = p.field + 3 * i, *level = p.level + 9 * i;
     const double field[3] = {p.start_field[0] + x[state_room] + x[state_local],
                              p.start_field[1] + x[state_room + 1] + x[state_local + 1],
                              p.start_field[2] + x[state_room + 2] + x[state_local + 2]};
@@ -102,12 +103,15 @@ struct HeadingFilter {
   void correct(FieldInnovation &update) {
     const double(&HP)[3][n_heading] = update.HP, (&nu)[3] = update.innovation;
     double(&gain)[3][n_heading] = update.gain;
-    for (int a = 0; a < 3; ++a)
+    for (int a = 0; a < 3; ++a) {
+      const double(&inverse)[3] = update.S_inverse[a];
       for (int j = 0; j < n_heading; ++j)
-        gain[a][j] = update.S_inverse[a][0] * HP[0][j] + update.S_inverse[a][1] * HP[1][j] + update.S_inverse[a][2] * HP[2][j];
+        gain[a][j] = inverse[0] * HP[0][j] + inverse[1] * HP[1][j] + inverse[2] * HP[2][j];
+    }
     for (int j = 0; j < n_heading; ++j) {
       x[j] += gain[0][j] * nu[0] + gain[1][j] * nu[1] + gain[2][j] * nu[2];
-      for (int k = 0; k < n_heading; ++k) P[j][k] -= HP[0][j] * gain[0][k] + HP[1][j] * gain[1][k] + HP[2][j] * gain[2][k];
+      for (int k = 0; k < n_heading; ++k)
+        P[j][k] -= HP[0][j] * gain[0][k] + HP[1][j] * gain[1][k] + HP[2][j] * gain[2][k];
     }
     for (int j = 0; j < n_heading; ++j)
       for (int k = 0; k < j; ++k) P[j][k] = P[k][j];
@@ -118,10 +122,10 @@ struct HeadingFilter {
   }
 };
 
-// The filter over all blocks. A block is left out where it, or the mean of the last ones, contradicts the state. When that
-// goes on for a while, three others run beside the filter from there: one whose sensor's offset changed, one whose room's
-// field did, and one in whose room it is another one everywhere. The first takes over when the blocks speak for it against
-// both others, which only turns can make them do. All end when the filter agrees with its blocks again.
+// The filter over all blocks. A block is left out where it, or the mean of the last ones, contradicts the state. When
+// that goes on for a while, three others run beside the filter from there: one whose sensor's offset changed, one whose
+// room's field did, and one in whose room it is another one everywhere. The first takes over when the blocks speak for
+// it against both others, which only turns can make them do. All end when the filter agrees with its blocks again.
 class HeadingRun {
   enum Explanation { offset_changed, room_changed, room_differs, n_explanations };
   HeadingFilter filter_, others_[n_explanations];
@@ -199,9 +203,9 @@ class HeadingRun {
   }
 };
 
-// Smoother of the blocks that are used in hindsight, after Bryson and Frazier in Bierman's form: what later blocks say of a
-// state is a score and an information matrix that are carried backwards, so that nothing larger than an innovation's
-// covariance is inverted.
+// Smoother of the blocks that are used in hindsight, after Bryson and Frazier in Bierman's form: what later blocks say
+// of a state is a score and an information matrix that are carried backwards, so that nothing larger than an
+// innovation's covariance is inverted.
 class HeadingSmoother {
   HeadingFilter filter_;
   double score_[n_heading], information_[n_heading][n_heading];

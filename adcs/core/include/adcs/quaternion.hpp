@@ -45,8 +45,8 @@ inline Vector rotate(const Quaternion &q, const Vector &v) {
 }
 inline Vector rotate_back(const Quaternion &q, const Vector &v) { return rotate(conjugate(q), v); }
 
-// (cos t/2, n sin t/2) of a rotation vector t n, by power series of h = t/2, exact to rounding up to h^2 = 0.04. A longer
-// rotation is halved until it is short enough, and its quaternion squared as often.
+// (cos t/2, n sin t/2) of a rotation vector t n, by power series of h = t/2, exact to rounding up to h^2 = 0.04. A
+// longer rotation is halved until it is short enough, and its quaternion squared as often.
 inline Quaternion exponential(Vector v) {
   double square = 0.25 * dot(v, v);
   int halved = 0;

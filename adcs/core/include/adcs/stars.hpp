@@ -33,7 +33,8 @@ struct Rotation {
   Vector operator*(const Vector &v) const { return {dot(rows[0], v), dot(rows[1], v), dot(rows[2], v)}; }
 };
 
-// Number from 0 to n - 1 of the cell of a value that is 0 to n; values beyond, and NaN, belong to the cells at the ends.
+// Number from 0 to n - 1 of the cell of a value that is 0 to n; values beyond, and NaN, belong to the cells at the
+// ends.
 inline int64_t cell_of(double value, int64_t n) {
   return value > 0.0 ? value < (double)n ? (int64_t)value : n - 1 : 0;
 }
@@ -108,7 +109,8 @@ inline void try_attitude(const magloc_star_triangles &p, int64_t i, int64_t k) {
 inline void try_triangle(const magloc_star_triangles &p, int64_t i) {
   const double *seen = p.image_sides + 3 * i, longest = seen[2];
   const double first = seen[0] / longest, second = seen[1] / longest, gate = p.side_gate / longest;
-  const double least = longest * (1.0 - p.scale_gate) - p.side_gate, most = longest * (1.0 + p.scale_gate) + p.side_gate;
+  const double least = longest * (1.0 - p.scale_gate) - p.side_gate;
+  const double most = longest * (1.0 + p.scale_gate) + p.side_gate;
   const auto cell = [&](double x) { return cell_of(x * (double)p.n_ratios, p.n_ratios); };
   for (int64_t row = cell(first - gate); row <= cell(first + gate); ++row)
     for (int64_t column = cell(second - gate); column <= cell(second + gate); ++column) {
