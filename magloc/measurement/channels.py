@@ -41,11 +41,6 @@ def problem(model: WhitenedModel, gain: FloatArray, columns: FloatArray, *, modu
     Channels behind those of the sensors are known parts of the common field. Without moduli all channels are linear.
     """
     n_sets, n_channels, n_common = columns.shape
-    n_triples = -(-n_common // 3)
-    common = np.zeros((n_sets, n_triples, n_channels, 3))
-    padded = np.zeros((n_sets, n_channels, 3 * n_triples))
-    padded[..., :n_common] = columns
-    common[:] = padded.reshape(n_sets, n_channels, n_triples, 3).transpose(0, 2, 1, 3)
     is_modulus = np.zeros(n_channels, dtype=np.uint8)
     is_modulus[: model.channel_is_scalar.size] = model.channel_is_scalar
     fields = model.ambient[:1] if model.shares_ambient else model.ambient
@@ -54,13 +49,13 @@ def problem(model: WhitenedModel, gain: FloatArray, columns: FloatArray, *, modu
         "channels",
         n_sensors=len(model.sensors),
         n_channels=n_channels,
-        n_triples=n_triples,
+        n_common=n_common,
         n_sets=n_sets,
         n_fields=len(fields),
         sensors=np.ascontiguousarray(model.sensors),
         first_channel=np.searchsorted(model.channel_sensor, np.arange(len(model.sensors) + 1)),
         gain=np.ascontiguousarray(gain),
-        common=common,
+        common=np.ascontiguousarray(columns.transpose(0, 2, 1)),
         is_modulus=is_modulus if moduli else None,
         ambient=np.ascontiguousarray(fields) if moduli else None,
         is_isotropic=n_sets == 1 and n_common == 3 and n_known == 0 and not moduli and _is_isotropic(model, gain[0]),

@@ -257,11 +257,11 @@ int64_t magloc_filter_starts(const magloc_starts *problem, int64_t begin, int64_
    centroid; of a channel all numbers are in units of its noise. One set of gains and common fields serves all rows of
    readings, or each row has its own; the same holds for the ambient field. */
 typedef struct {
-  int64_t n_sensors, n_channels, n_triples, n_sets, n_fields;
+  int64_t n_sensors, n_channels, n_common, n_sets, n_fields;
   const double *sensors;        /* (n_sensors, 3) */
   const int64_t *first_channel; /* (n_sensors + 1) of each sensor; known parts of the common field come behind */
   const double *gain;           /* (n_sets, n_channels, 3); of a modulus the first number counts */
-  const double *common;         /* (n_sets, n_triples, n_channels, 3) orthonormal columns or zeros, projected out */
+  const double *common;         /* (n_sets, n_common, n_channels) orthonormal or zero, projected out */
   const uint8_t *is_modulus;    /* (n_channels), or NULL: none is */
   const double *ambient;        /* (n_fields, n_sensors, 3) field, or NULL without moduli */
   int64_t is_isotropic;         /* whether a sensor's gains are a turned unit matrix times a weight, and the common

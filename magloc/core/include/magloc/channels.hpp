@@ -2,10 +2,10 @@
 //
 // Each type of channels has readings y of the row in each lane, and
 //   load(lane, row)             puts a row of readings into a lane,
-//   read(s, f, rows)            turns columns f (3, 3) of fields at sensor s into its channels' rows of a matrix (n,
-//   D), project(columns)            takes the common field out of a matrix (n, D) of channels, linearise(rays, mu)
-//   linearises channels that are not linear in the field about that of moments mu, residual(rays, mu, r)       then
-//   fills the exact residual.
+//   read(s, f, rows)            turns columns f (3, 3) of fields at sensor s into its rows of a matrix (n, D),
+//   project(columns)            takes the common field out of a matrix (n, D) of channels,
+//   linearise(rays, mu)         linearises channels that are not linear in the field about that of moments mu,
+//   residual(rays, mu, r)       then fills the exact residual.
 #pragma once
 #include "dipole.hpp"
 #include "kernel.hpp"
@@ -93,7 +93,7 @@ struct General {
         m_(m),
         signals_(signals),
         gain_(room.take<T>(3 * m.n_channels)),
-        common_(room.take<T>(3 * m.n_triples * m.n_channels)) {
+        common_(room.take<T>(m.n_common * m.n_channels)) {
     for (int64_t &set : set_of_lane_) set = -1;
   }
   int64_t first(int64_t sensor) const { return m_.first_channel[sensor]; }
@@ -103,7 +103,7 @@ struct General {
     load_model(lane, m_.n_sets == 1 ? 0 : row);
   }
   void load_model(int lane, int64_t set) {
-    const int64_t n_gains = 3 * n_channels, n_common = m_.n_triples * n_gains;
+    const int64_t n_gains = 3 * n_channels, n_common = m_.n_common * n_channels;
     if (set == set_of_lane_[lane]) return;
     set_of_lane_[lane] = set;
     for (int64_t i = 0; i < n_gains; ++i) set_lane(gain_[i], lane, m_.gain[set * n_gains + i]);
@@ -118,16 +118,9 @@ struct General {
   }
   template <int D>
   MAGLOC_INLINE void project(T *columns) const {
-    const T *common = common_;
-    for (int64_t k = 0; k < m_.n_triples; ++k, common += 3 * n_channels) {
-      T product[3][D] = {};
-      for (int64_t c = 0; c < n_channels; ++c)
-        for (int a = 0; a < 3; ++a)
-          for (int j = 0; j < D; ++j) product[a][j] += common[3 * c + a] * columns[D * c + j];
-      for (int64_t c = 0; c < n_channels; ++c)
-        for (int j = 0; j < D; ++j)
-          for (int a = 0; a < 3; ++a) columns[D * c + j] -= common[3 * c + a] * product[a][j];
-    }
+    int64_t k = 0;
+    for (; k + 3 <= m_.n_common; k += 3) project_some<D, 3>(common_ + k * n_channels, columns);
+    for (; k < m_.n_common; ++k) project_some<D, 1>(common_ + k * n_channels, columns);
   }
   bool few_digits_do(int64_t) const { return false; }
 
@@ -138,10 +131,20 @@ struct General {
 
  private:
   int64_t set_of_lane_[n_lanes<T>];
+
+  template <int D, int n>
+  MAGLOC_INLINE void project_some(const T *common, T *columns) const {
+    T product[n][D] = {};
+    for (int64_t c = 0; c < n_channels; ++c)
+      for (int a = 0; a < n; ++a)
+        for (int j = 0; j < D; ++j) product[a][j] += common[a * n_channels + c] * columns[D * c + j];
+    for (int64_t c = 0; c < n_channels; ++c)
+      for (int a = 0; a < n; ++a)
+        for (int j = 0; j < D; ++j) columns[D * c + j] -= common[a * n_channels + c] * product[a][j];
+  }
 };
 
-// Some channels read the modulus of the field. Their readings are what they read above the modulus of the ambient
-// field.
+// Some channels read the modulus of the field. Their readings are those above the modulus of the ambient field.
 template <class T>
 struct Moduli : General<T> {
   static constexpr bool linear = false;
@@ -151,7 +154,7 @@ struct Moduli : General<T> {
       : General<T>(m, signals, room),
         reading_(room.take<T>(m.n_channels)),
         weight_(room.take<T>(m.n_channels)),
-        ambient_(room.take<T>(3 * m.n_sensors)) {}
+        ambient_(room.take<T>(4 * m.n_sensors)) {}
 
   void load(int lane, int64_t row) {
     General<T>::load(lane, row);
@@ -160,7 +163,11 @@ struct Moduli : General<T> {
       set_lane(reading_[c], lane, get_lane(y[c], lane));
       set_lane(weight_[c], lane, m_.gain[3 * (set * n_channels + c)]);
     }
-    for (int64_t i = 0; i < 3 * n_sensors; ++i) set_lane(ambient_[i], lane, m_.ambient[3 * n_sensors * field + i]);
+    for (int64_t s = 0; s < n_sensors; ++s) {
+      const double *b = m_.ambient + 3 * (n_sensors * field + s);
+      for (int a = 0; a < 3; ++a) set_lane(ambient_[4 * s + a], lane, b[a]);
+      set_lane(ambient_[4 * s + 3], lane, square_root(b[0] * b[0] + b[1] * b[1] + b[2] * b[2]));
+    }
   }
   template <int K>
   MAGLOC_INLINE void linearise(const Ray<T> *rays, const T (&mu)[K][3]) {
@@ -169,7 +176,7 @@ struct Moduli : General<T> {
         if (!m_.is_modulus[c]) continue;
         T b[3], direction[3];
         field_of<K>(rays + s * K, mu, b);
-        const T rise = rise_of_modulus(b, ambient_ + 3 * s, direction);
+        const T rise = rise_of_modulus(b, ambient_ + 4 * s, direction);
         for (int a = 0; a < 3; ++a) gain_[3 * c + a] = weight_[c] * direction[a];
         y[c] = reading_[c] - weight_[c] * (rise - dot(direction, b));
       }
@@ -180,7 +187,7 @@ struct Moduli : General<T> {
     for (int64_t s = 0; s < n_sensors; ++s) {
       T b[3], direction[3];
       field_of<K>(rays + s * K, mu, b);
-      const T rise = rise_of_modulus(b, ambient_ + 3 * s, direction);
+      const T rise = rise_of_modulus(b, ambient_ + 4 * s, direction);
       for (int64_t c = this->first(s); c < this->first(s + 1); ++c) {
         const T *g = gain_ + 3 * c;
         r[c] -= m_.is_modulus[c] ? weight_[c] * rise : g[0] * b[0] + g[1] * b[1] + g[2] * b[2];
@@ -190,7 +197,7 @@ struct Moduli : General<T> {
   }
 
  private:
-  T *const reading_, *const weight_, *const ambient_;
+  T *const reading_, *const weight_, *const ambient_;  // ambient_: of each sensor the field and its modulus
 
   template <int K>
   MAGLOC_INLINE static void field_of(const Ray<T> *rays, const T (&mu)[K][3], T (&b)[3]) {
@@ -203,37 +210,16 @@ struct Moduli : General<T> {
   }
   // By how much a field b raises the modulus of the ambient field, to all digits, and the direction of their sum.
   MAGLOC_INLINE static T rise_of_modulus(const T (&b)[3], const T *ambient, T (&direction)[3]) {
-    T total[3], sum[3], squares = {};
+    T total[3], sum[3];
     for (int a = 0; a < 3; ++a) {
       total[a] = ambient[a] + b[a];
       sum[a] = ambient[a] + total[a];
-      squares += ambient[a] * ambient[a];
     }
-    const T modulus = square_root(dot(total, total)), both = modulus + square_root(squares);
+    const T modulus = square_root(dot(total, total)), both = modulus + ambient[3];
     const T inverse = choose(modulus > 0.0, 1.0 / modulus, T{});
     for (int a = 0; a < 3; ++a) direction[a] = total[a] * inverse;
     return choose(both > 0.0, dot(b, sum) / both, T{});
   }
 };
 
-// Call use(channels) with the type that a problem's channels need.
-template <class T, class Use>
-MAGLOC_INLINE void with_linear_channels(const magloc_channels &m, const double *signals, Workspace &room, Use use) {
-  if (m.is_isotropic) {
-    Isotropic<T> channels(m, signals, room);
-    use(channels);
-  } else {
-    General<T> channels(m, signals, room);
-    use(channels);
-  }
-}
-template <class T, class Use>
-MAGLOC_INLINE void with_channels(const magloc_channels &m, const double *signals, Workspace &room, Use use) {
-  if (m.is_modulus) {
-    Moduli<T> channels(m, signals, room);
-    use(channels);
-  } else {
-    with_linear_channels<T>(m, signals, room, use);
-  }
-}
 MAGLOC_END

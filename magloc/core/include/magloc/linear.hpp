@@ -4,8 +4,7 @@
 
 MAGLOC_BEGIN
 // Modified Gram-Schmidt of D columns a (n, D) and of a vector y (n,), in place: the columns become orthogonal to each
-// other, and y to all of them. A column that loses all but `lost` of its square consists of rounding; it counts as
-// zero.
+// other, and y to all of them. A column that loses all but `lost` of its square is rounding; it counts as zero.
 template <class T, int D>
 class Orthogonalisation {
   T square_[D] = {}, share_[D][D] = {}, share_of_y_[D] = {};  // share_[j][k] of column j in column k
@@ -55,8 +54,8 @@ class Orthogonalisation {
   }
 };
 
-// Factors L D L^T of a positive matrix (its lower triangle) whose diagonal a_jj is raised to (1 + damping) a_jj +
-// added_j. A pivot that loses all but `lost` of its diagonal counts as infinite: its variable stays zero.
+// Factors L D L^T of a positive matrix (lower triangle) whose diagonal a_jj is raised to (1 + damping) a_jj + added_j.
+// A pivot that loses all but `lost` of its diagonal counts as infinite: its variable stays zero.
 template <class T, int n>
 struct Ldl {
   T l[n][n], inverse[n];

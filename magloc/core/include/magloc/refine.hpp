@@ -274,9 +274,9 @@ class Refinement {
     }
   }
 
-  // The same for one source and isotropic noise by sums of products alone, in two passes over the sensors. It takes
-  // half the time and has half the digits. Fields count relative to that at the first sensor; what they have in common
-  // is unknown, and the readings are free of it.
+  // The same for one source and isotropic noise by sums of products alone, in two passes over the sensors: faster, with
+  // half the digits. Fields count relative to that at the first sensor; what they have in common is
+  // unknown, and the readings are free of it.
   MAGLOC_INLINE void linearise_by_products(const Isotropic<T> &c, State<T, K> &p, const Rules &rules) {
     const T(&mu)[3] = p.mu[0];
     T at_first[3][3], sum[3][3] = {}, square[3][3] = {}, product[3] = {};
@@ -353,8 +353,8 @@ class Refinement {
       const T(&x)[3] = reinterpret_cast<const T(&)[3]>(step[3 * k]);
       longest = maximum(longest, dot(x, x));
     }
-    const T share =
-        choose(longest > longest_step * longest_step, longest_step / square_root(longest), broadcast<T>(1.0));
+    const auto too_long = longest > longest_step * longest_step;
+    const T share = choose(too_long, longest_step / square_root(longest), broadcast<T>(1.0));
     for (int j = 0; j < D; ++j) step[j] *= share;
     T promised = at.gain_by_moments;
     for (int j = 0; j < D; ++j) {
@@ -376,10 +376,9 @@ class Refinement {
       const T square_s = moved[3] * moved[3];
       const T scale = 1.0 / square_root(range_is_free ? square + square_s : square / (1.0 - square_s));
       const T s = range_is_free ? scale * moved[3] : moved[3];
-      const T size = choose(s >= 0.0, s, -s),
-              least = choose(s >= 0.0, broadcast<T>(smallest_s), broadcast<T>(-smallest_s));
+      const T sign = choose(s >= 0.0, broadcast<T>(1.0), broadcast<T>(-1.0));
       for (int a = 0; a < 3; ++a) trial.q[k][a] = scale * moved[a];
-      trial.q[k][3] = choose(size >= smallest_s, s, least);
+      trial.q[k][3] = choose(sign * s >= smallest_s, s, sign * smallest_s);
       for (int a = 0; a < 3; ++a) trial.mu[k][a] = at.mu[k][a];
     }
     return promised;

@@ -1,5 +1,4 @@
-// Search for one source without a start: bases of candidate positions, the choice of starts, and the optima they lead
-// to.
+// Search for one source without a start: bases of candidate positions, the choice of starts, and their optima.
 #pragma once
 #include "refine.hpp"
 
@@ -106,8 +105,7 @@ struct EndsOfOne : Ends {
 // of each row before the others; then the distinct ends to the optima.
 template <class T, class Channels>
 class Search {
-  // A start is near an optimum if Gauss-Newton predicts a smaller gain in chi-square, and at one at a much smaller
-  // gain.
+  // A start is near an optimum, or at one, if Gauss-Newton predicts a smaller gain in chi-square.
   static constexpr double near_tolerance = 1e-2, optimum_tolerance = 1e-10, relative_tolerance = 1e-14;
   // Linearisations allowed from there on, in units of those allowed before: along a flat valley steps stay long.
   static constexpr int64_t times_longer = 3;
