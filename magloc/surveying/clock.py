@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +26,7 @@ _MOST_S = 1.2
 _TOLERANCE = 0.1  # of a step, until the likelihood is a parabola
 _APART, _ROUNDS = 0.6, 3  # of lags that are searched anew, in distances to the nearest sources; and how long
 _WRONG = 1.5  # χ² per reading from which on sources may be those of another lag
+_SETTLING = 8  # times that a claimed lag is looked for anew
 _MISFIT, _SHARE = 2.0, 0.5  # per reading, and of the misfit without a lag
 _ROWS = 6  # that a smooth track follows together
 
@@ -45,6 +47,9 @@ class Trial(NamedTuple):
     chi2: float
 
 
+by_cost = attrgetter("cost")
+
+
 def lag_of(piece_at: Callable[[float], Piece], here: Trial | None = None, near: Trial | None = None) -> Lag:
     """Return the likeliest lag of a piece, 0 where it explains no more than chance does.
 
@@ -60,23 +65,22 @@ def lag_of(piece_at: Callable[[float], Piece], here: Trial | None = None, near: 
     step, apart = _STEP_M / speed, _APART * model.nearest_m / speed
 
     def best_near(lag: Trial) -> Trial:
-        """Return the likeliest trial beside some trial; one at the edge of the interval begins the next interval."""
-        for _ in range(math.ceil(_MOST_S / apart)):
-            start, sources = lag.lag_s, lag.sources
-            found = minimize_scalar(
-                lambda lag_s, known=sources: trial(piece_at, float(lag_s), known).cost,
-                bounds=(start - apart, start + apart),
-                method="bounded",
-                options={"xatol": _TOLERANCE * step},
-            )
-            lag = trial(piece_at, float(found.x), sources)
-            if abs(lag.lag_s - start) < apart - 2.0 * _TOLERANCE * step:
-                break
-        return lag
+        """Return the likeliest trial beside some trial, from its sources."""
+        found = minimize_scalar(
+            lambda lag_s: trial(piece_at, float(lag_s), lag.sources).cost,
+            bounds=(lag.lag_s - apart, lag.lag_s + apart),
+            method="bounded",
+            options={"xatol": _TOLERANCE * step},
+        )
+        return trial(piece_at, float(found.x), lag.sources)
+
+    def sides(lag: Trial) -> list[Trial]:
+        """Return the trials a step before and after one."""
+        return [trial(piece_at, lag.lag_s + sign * step, lag.sources) for sign in (-1.0, 1.0)]
 
     def beside(lag: Trial) -> tuple[float, float]:
-        """Slope and curvature of its cost."""
-        before, after = (trial(piece_at, lag.lag_s + sign * step, lag.sources).cost for sign in (-1.0, 1.0))
+        """Return slope and curvature of the cost."""
+        before, after = (side.cost for side in sides(lag))
         return (after - before) / (2.0 * step), (before - 2.0 * lag.cost + after) / step**2
 
     here = trial(piece_at, 0.0, piece.known) if here is None else here
@@ -93,14 +97,20 @@ def lag_of(piece_at: Callable[[float], Piece], here: Trial | None = None, near: 
             n = math.ceil(_MOST_S / apart)
             lags = np.linspace(-_MOST_S, _MOST_S, 2 * n + 1).tolist()
             new = [trial(piece_at, lag_s, None) for lag_s in lags]
-            here = min(here, new[n], key=lambda one: one.cost)
-            at = min(at, best_near(min(new, key=lambda one: one.cost)), key=lambda one: one.cost)
+            here = min(here, new[n], key=by_cost)
+            at = min(at, best_near(min(new, key=by_cost)), key=by_cost)
     else:
         at = best_near(near)
-    here = min(here, trial(piece_at, 0.0, at.sources), key=lambda one: one.cost)  # a search may have found more
+    here = min(here, trial(piece_at, 0.0, at.sources), key=by_cost)  # a search may have found more
     explained = at.chi2 < max(_MISFIT, _SHARE * here.chi2)  # else something is wrong that a lag imitates
     if not explained or here.cost - at.cost < model.threshold * max(1.0, at.chi2):
         return Lag(0.0, math.inf)
+    for _ in range(_SETTLING):  # sources of another lag hold the search back
+        new = best_near(min(trial(piece_at, at.lag_s, None), *sides(at), key=by_cost))
+        settled = new.cost > at.cost - 1.0
+        at = min(at, new, key=by_cost)
+        if settled:
+            break
     slope, curvature = beside(at)
     lag_s = at.lag_s - slope / curvature if curvature > 0.0 else math.inf
     return Lag(lag_s, math.sqrt(2.0 / curvature)) if abs(lag_s) < _MOST_S else Lag(0.0, math.inf)

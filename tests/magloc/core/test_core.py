@@ -6,13 +6,13 @@ import re
 import shutil
 import subprocess
 import sys
-import threading
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from magloc import core
+from tests.waiting import WAIT_S
 
 HERE = Path(core.__file__).parent
 HEADER = (HERE / "include" / "magloc.h").read_text(encoding="utf-8")
@@ -93,17 +93,27 @@ class TestRun:
         assert np.isfinite(results[0]).all()
         np.testing.assert_array_equal(*results)
 
-    def test_ctrl_c_ends_it_between_blocks(self) -> None:
-        fields = dipoles(1)
-        source, moment = np.zeros((100_000, 3)), np.ones((100_000, 3))
-        n = 1_000_000  # half an hour
-        fields |= {"n_points": n, "n_sources": len(source), "sources": source, "moments": moment}
-        fields |= {"points": np.ones((n, 3)), "out": np.empty((n, 3))}
-        code = threading.Timer(0.2, lambda: __import__("_thread").interrupt_main())
-        code.start()
-        with pytest.raises(KeyboardInterrupt):
-            core.run("dipole_fields", core.problem("dipoles", **fields), n, block=50)
-        code.join()
+    @pytest.mark.skipif(sys.platform == "win32", reason="signals to a thread")
+    @pytest.mark.parametrize("threads", [1, 2])
+    def test_ctrl_c_ends_it_between_blocks(self, threads: int) -> None:
+        code = f"""
+import signal, threading
+import numpy as np
+from magloc import core
+from tests.waiting import WAIT_S
+n, k = 1_000_000, 100_000  # half an hour
+points, sources, out = np.ones((n, 3)), np.zeros((k, 3)), np.empty((n, 3))
+work = core.problem("dipoles", n_points=n, n_sources=k, points=points, sources=sources, moments=sources, out=out)
+core.set_threads({threads})
+main = threading.get_ident()
+threading.Timer(0.3, lambda: signal.pthread_kill(main, signal.SIGINT)).start()
+try:
+    core.run("dipole_fields", work, n, block=50)
+except KeyboardInterrupt:
+    print("interrupted")
+"""
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, encoding="utf-8", timeout=WAIT_S)
+        assert done.stdout == "interrupted\n", done.stderr
 
 
 class TestHeaders:
