@@ -124,24 +124,21 @@ MAGLOC_KERNEL(attitude_motion_runs, attitude_motion) {
 MAGLOC_KERNEL(mekf_runs, mekf) {
   const auto &p = *problem;
   Workspace room(workspace);
-  auto *filters = room.take<GatedFilter>(1);
-  const int64_t size = room.size();
-  if (!workspace) return size;
+  auto *filter = room.take<GatedFilter>(1);
+  if (!workspace) return room.size();
   const FilterModel model = model_of(p);
   Gate gate = {p.gate_limit, {}, p.open_variance};
   for (int k = 0; k < Sensor::count; ++k) gate.patience[k] = p.patience[k];
-  for (int64_t run = begin; run < end; ++run) {
-    GatedFilter &filter = p.memory ? *reinterpret_cast<GatedFilter *>(p.memory + run * size) : *filters;
-    if (p.first_instant == 0) start(p, model, run, filter);
-    for (int64_t i = p.first_instant; i < p.end_instant; ++i) {
-      const int64_t row = run * p.n_instants + i, step = (i - 1) * model.n;
-      const Instant now = instant_at(p, row);
-      if (i > 0)
-        filter.predict(model, instant_at(p, row - 1), now, p.kept + step, p.added_variance + step, p.dt[i - 1]);
-      filter.update(model, gate, now, readings_at(p, row), i, p.nis + 4 * row, p.log_determinant + 4 * row,
-                    p.rejected + 4 * row);
-      store(filter.main(), model, row, p);
-    }
+  for (int64_t row = begin; row < end; ++row) {
+    const int64_t run = row / p.n_instants, i = row % p.n_instants, step = (i - 1) * model.n;
+    const Instant now = instant_at(p, row);
+    if (i == 0)
+      start(p, model, run, *filter);
+    else
+      filter->predict(model, instant_at(p, row - 1), now, p.kept + step, p.added_variance + step, p.dt[i - 1]);
+    filter->update(model, gate, now, readings_at(p, row), i, p.nis + 4 * row, p.log_determinant + 4 * row,
+                   p.rejected + 4 * row);
+    store(filter->main(), model, row, p);
   }
   return 0;
 }
