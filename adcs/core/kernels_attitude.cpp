@@ -4,14 +4,6 @@
 #include "magloc/kernel.hpp"
 
 MAGLOC_BEGIN
-inline Vector<double> vector_at(const double *numbers) { return {{numbers[0], numbers[1], numbers[2]}}; }
-inline Quaternion<double> quaternion_at(const double *numbers) { return {numbers[0], vector_at(numbers + 1)}; }
-inline Matrix matrix_at(const double *numbers) {
-  return {{vector_at(numbers), vector_at(numbers + 3), vector_at(numbers + 6)}};
-}
-
-inline void put(const Vector<double> &v, double *numbers) { __builtin_memcpy(numbers, v.at, sizeof v.at); }
-
 // Several runs, one in each lane, of arrays (n_runs, n_instants, size). Lanes beyond the last run repeat it.
 class Runs {
   int64_t first_row_[n_lanes<Lanes>];
@@ -75,12 +67,11 @@ inline void start(const magloc_mekf &p, const FilterModel &model, int64_t run, G
     for (int j = 0; j < model.n; ++j) filter.main().P()[i][j] = p.first_covariance[(run * model.n + i) * model.n + j];
 }
 
-inline void put(const Hypothesis &found, const FilterModel &model, int64_t row, const magloc_mekf &p) {
-  p.q[4 * row] = found.x.motion.q.scalar;
-  put(found.x.motion.q.vector, p.q + 4 * row + 1);
-  put(found.x.motion.w, p.w + 3 * row);
+inline void store(const Hypothesis &found, const FilterModel &model, int64_t row, const magloc_mekf &p) {
+  store(found.x.motion.q, p.q + 4 * row);
+  store(found.x.motion.w, p.w + 3 * row);
   for (int k = 0; k < Optional::count; ++k)
-    if (model.has(k)) put(found.x.optional[k], p.optional + row * (model.n - 6) + model.place[k] - 6);
+    if (model.has(k)) store(found.x.optional[k], p.optional + row * (model.n - 6) + model.place[k] - 6);
   for (int i = 0; i < model.n; ++i)
     __builtin_memcpy(p.covariance + (row * model.n + i) * model.n, found.P()[i], model.n * sizeof(double));
 }
@@ -133,24 +124,21 @@ MAGLOC_KERNEL(attitude_motion_runs, attitude_motion) {
 MAGLOC_KERNEL(mekf_runs, mekf) {
   const auto &p = *problem;
   Workspace room(workspace);
-  auto *filters = room.take<GatedFilter>(1);
-  const int64_t size = room.size();
-  if (!workspace) return size;
+  auto *filter = room.take<GatedFilter>(1);
+  if (!workspace) return room.size();
   const FilterModel model = model_of(p);
   Gate gate = {p.gate_limit, {}, p.open_variance};
   for (int k = 0; k < Sensor::count; ++k) gate.patience[k] = p.patience[k];
-  for (int64_t run = begin; run < end; ++run) {
-    GatedFilter &filter = p.memory ? *reinterpret_cast<GatedFilter *>(p.memory + run * size) : *filters;
-    if (p.first_instant == 0) start(p, model, run, filter);
-    for (int64_t i = p.first_instant; i < p.end_instant; ++i) {
-      const int64_t row = run * p.n_instants + i, step = (i - 1) * model.n;
-      const Instant now = instant_at(p, row);
-      if (i > 0)
-        filter.predict(model, instant_at(p, row - 1), now, p.kept + step, p.added_variance + step, p.dt[i - 1]);
-      filter.update(model, gate, now, readings_at(p, row), i, p.nis + 4 * row, p.log_determinant + 4 * row,
-                    p.rejected + 4 * row);
-      put(filter.main(), model, row, p);
-    }
+  for (int64_t row = begin; row < end; ++row) {
+    const int64_t run = row / p.n_instants, i = row % p.n_instants, step = (i - 1) * model.n;
+    const Instant now = instant_at(p, row);
+    if (i == 0)
+      start(p, model, run, *filter);
+    else
+      filter->predict(model, instant_at(p, row - 1), now, p.kept + step, p.added_variance + step, p.dt[i - 1]);
+    filter->update(model, gate, now, readings_at(p, row), i, p.nis + 4 * row, p.log_determinant + 4 * row,
+                   p.rejected + 4 * row);
+    store(filter->main(), model, row, p);
   }
   return 0;
 }

@@ -32,16 +32,16 @@ MAGLOC_KERNEL(complementary_filter, complementary) {
   auto *delayed = memory.take<VectorPair>(p.delay);
   if (!workspace) return memory.size();
   ComplementaryFilter filter = *state;
-  for_instants(*p.record, begin, end, [&](const Instant &at) {
+  for_instants(*p.record, begin, end, [&](const RecordInstant &at) {
     const int64_t row = at.row();
     if (at.i == 0)
-      filter = ComplementaryFilter::start(Quaternion::load(p.q + 4 * row), Vector::load(p.integral + 3 * row));
+      filter = ComplementaryFilter::start(quaternion_at(p.q + 4 * row), vector_at(p.integral + 3 * row));
     else
       filter.turn(p, at);
     filter.correct(p, at, delayed);
-    filter.attitude().store(p.q + 4 * row);
-    filter.integral().store(p.integral + 3 * row);
-    if (p.is_gauss_newton) filter.measured().store(p.q_measured + 4 * row);
+    store(filter.attitude(), p.q + 4 * row);
+    store(filter.integral(), p.integral + 3 * row);
+    if (p.is_gauss_newton) store(filter.measured(), p.q_measured + 4 * row);
   });
   *state = filter;
   return 0;
@@ -53,11 +53,11 @@ MAGLOC_KERNEL(adaptive_filter, adaptive) {
   auto *state = memory.take<AdaptiveFilter>(1);
   if (!workspace) return memory.size();
   AdaptiveFilter filter = *state;
-  for_instants(*p.record, begin, end, [&](const Instant &at) {
+  for_instants(*p.record, begin, end, [&](const RecordInstant &at) {
     const int64_t row = at.row();
     if (at.i == 0)
-      filter = AdaptiveFilter::start(Quaternion::load(p.q + 4 * row), Vector::load(p.bias + 3 * row),
-                                     p.covariance + 36 * row);
+      filter =
+          AdaptiveFilter::start(quaternion_at(p.q + 4 * row), vector_at(p.bias + 3 * row), p.covariance + 36 * row);
     else
       filter.predict(p, at);
     filter.update(p, at);
@@ -71,9 +71,9 @@ MAGLOC_KERNEL(gyro_attitudes, gyro) {
   if (!workspace) return 0;
   const magloc_gyro &p = *problem;
   for (int64_t i = begin; i < end; ++i) {
-    Quaternion q = identity;
-    if (i > 0) q = normalised(Quaternion::load(p.q + 4 * i - 4) * exponential(p.dt[i] * Vector::load(p.rate + 3 * i)));
-    q.store(p.q + 4 * i);
+    Quaternion<double> q = identity;
+    if (i > 0) q = normalised(quaternion_at(p.q + 4 * i - 4) * exponential(p.dt[i] * vector_at(p.rate + 3 * i)));
+    store(q, p.q + 4 * i);
   }
   return 0;
 }
@@ -81,14 +81,14 @@ MAGLOC_KERNEL(gyro_attitudes, gyro) {
 MAGLOC_KERNEL(level_attitudes, level) {
   const magloc_level &p = *problem;
   Workspace memory(workspace);
-  auto *level_from_gyro = memory.take<Quaternion>(1);
+  auto *level_from_gyro = memory.take<Quaternion<double>>(1);
   if (!workspace) return memory.size();
-  if (begin == 0) *level_from_gyro = Quaternion::load(p.start);
+  if (begin == 0) *level_from_gyro = quaternion_at(p.start);
   for (int64_t i = begin; i < end; ++i) {
-    const Vector up = rotate(*level_from_gyro, unit(Vector::load(p.up + 3 * i)));
-    const Quaternion turn = exponential(p.part[i] * Vector{up.y, -up.x, 0.0});
+    const Vector<double> up = rotate(*level_from_gyro, normalised(vector_at(p.up + 3 * i)));
+    const Quaternion<double> turn = exponential({{p.part[i] * up[1], -p.part[i] * up[0], 0.0}});
     *level_from_gyro = normalised(turn * *level_from_gyro);
-    (*level_from_gyro * Quaternion::load(p.q_gyro + 4 * i)).store(p.q + 4 * i);
+    store(*level_from_gyro * quaternion_at(p.q_gyro + 4 * i), p.q + 4 * i);
   }
   return 0;
 }

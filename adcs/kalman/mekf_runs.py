@@ -64,8 +64,6 @@ def filter_runs(record: Record, settings: FilterSettings, first: State, sigma: F
         n_runs=runs,
         n_instants=n,
         n_states=used.size,
-        first_instant=0,
-        end_instant=n,
         used=np.array([used.star, used.gyro, used.magnetometer, used.sun], dtype=np.uint8),
         place=np.array(places, dtype=np.int64),
         gate_limit=settings.gate_limit,
@@ -79,13 +77,9 @@ def filter_runs(record: Record, settings: FilterSettings, first: State, sigma: F
         rejected=rejected.view(np.uint8),
         **{name: np.ascontiguousarray(values, dtype=np.float64) for name, values in inputs.items()},
     )
-    work = core.problem("mekf", memory=None, **fields)
-    instants = _COVARIANCES_A_CALL // used.size**2
-    if n > instants:
-        work = core.problem("mekf", memory=np.empty((runs, core.workspace_size("mekf_runs", work))), **fields)
-    for instant in range(0, n, instants):
-        work.struct.first_instant, work.struct.end_instant = instant, min(instant + instants, n)
-        core.run("mekf_runs", work, runs, block=max(1, instants // n))
+    work = core.problem("mekf", **fields)
+    block = _COVARIANCES_A_CALL // used.size**2
+    core.run("mekf_runs", work, runs * n, block=block, chain=n * max(1, block // max(1, n)))
     parts = np.split(optional, np.cumsum([SIZES[state] for state in used.states]), axis=-1)
     return AttitudeTracks(
         settings, q, w, dict(zip(used.states, parts, strict=False)), covariance, nis, rejected, log_det

@@ -193,13 +193,13 @@ typedef struct {
 int64_t magloc_attitude_motion_runs(const magloc_attitude_motion *problem, int64_t begin, int64_t end,
                                     double *workspace);
 
-/* Error-state Kalman filter of attitude and rate with a gate, over whole runs; an item is a run.
+/* Error-state Kalman filter of attitude and rate with a gate. Item run * n_instants + i is instant i of a run; those of
+   a run are in order, with one workspace.
    The optional states, three numbers each, in this order: bias of field and gyro, disturbance, error of the field
    model, dipole, three rows of the magnetometer's gain. Sensors: star tracker, gyro, magnetometer, Sun sensor.
-   Missing readings are NaN. The first call starts at instant 0; a later one goes on where the one before ended. */
+   Missing readings are NaN. */
 typedef struct {
   int64_t n_runs, n_instants, n_states;
-  int64_t first_instant, end_instant;
   const double *inertia, *inverse_inertia; /* (3, 3) */
   const double *residual_dipole;           /* (3,) */
   const double *dt;                        /* (n_instants - 1,), steps */
@@ -219,7 +219,6 @@ typedef struct {
   const double *open_variance;             /* (n_states,), where nothing is known */
   double gate_limit;
   const int64_t *patience;       /* (4,), instants */
-  double *memory;                /* (n_runs, workspace) between calls, or null if one does all */
   double *q, *w;                 /* (n_runs, n_instants, 4), (n_runs, n_instants, 3) */
   double *optional;              /* (n_runs, n_instants, n_states - 6) */
   double *covariance;            /* (n_runs, n_instants, n_states, n_states) */

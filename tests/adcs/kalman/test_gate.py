@@ -22,7 +22,7 @@ from adcs.kalman.gate import contest as gate
 from adcs.kalman.initialisation import any_start
 from adcs.kalman.mekf import run_filter, run_readable
 from adcs.satellite.sensors import SENSORS
-from adcs.satellite.telemetry import is_read
+from adcs.satellite.telemetry import is_read, part
 from magloc import core
 from sims.attitude.scenario import StartConditions
 from sims.attitude.simulation import AttitudeRuns, simulate
@@ -114,6 +114,11 @@ class TestTwins:
                     np.testing.assert_array_equal(getattr(found, name), getattr(whole, name))
         finally:
             core.set_threads(threads)
+
+    def test_no_instant(self) -> None:
+        runs = eventful()
+        none = part(runs, np.arange(4), slice(0))
+        assert run_filter(none, settings("gyro+mag"), start_of(runs)).q.shape == (4, 0, 4)
 
     def test_turns(self) -> None:
         rng = np.random.default_rng(0)

@@ -1,4 +1,4 @@
-"""Tests of adcs.satellite.dynamics and adcs.satellite.dynamics_compiled: one class per law.
+"""Tests of adcs.satellite.dynamics: one class per law.
 
 The oracles: conservation of energy and angular momentum, closed forms of a symmetric top, a pendulum in the gravity
 gradient and a compass needle, scipy's solver of differential equations, and central differences of the full equations.
@@ -17,7 +17,6 @@ from scipy.integrate import solve_ivp
 
 from adcs import quaternion
 from adcs.satellite import dynamics
-from adcs.satellite import dynamics_compiled as rigid_body
 from adcs.satellite.dynamics import RigidBody, WheelControl, wheel_control
 from magloc.navigation.rotations import cross_matrix
 from tests.adcs.attitudes import random_attitudes
@@ -356,15 +355,3 @@ class TestDipole:
             ),
         ):
             np.testing.assert_allclose(one, other, rtol=1e-13, atol=1e-16)
-
-
-class TestQuaternions:
-    def test_compiled_agree_with_their_twins(self) -> None:
-        rng = np.random.default_rng(21)
-        p, q = random_attitudes(2, rng)
-        v = rng.standard_normal(3)
-        np.testing.assert_allclose(rigid_body.multiply(tuple(p), tuple(q)), quaternion.multiply(p, q), atol=1e-16)
-        np.testing.assert_allclose(rigid_body.rotate_back(tuple(q), tuple(v)), quaternion.rotate_back(q, v), atol=1e-15)
-        np.testing.assert_allclose(
-            rigid_body.error_vector(tuple(p), tuple(q)), quaternion.error_vector(p, q), atol=1e-16
-        )

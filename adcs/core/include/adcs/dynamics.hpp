@@ -1,7 +1,7 @@
 // Rotation of a satellite with wheels: adcs/satellite/dynamics.py is the readable reference and has the formulas.
 #pragma once
-#include "adcs/elementary.hpp"
 #include "adcs/rotation.hpp"
+#include "magloc/elementary.hpp"
 
 MAGLOC_BEGIN
 struct Body {
@@ -54,7 +54,7 @@ MAGLOC_INLINE Motion<T> slope(const Body &body, const Vector<T> &dipole, const M
   const Vector<T> outside = torque + environment_torque(body, dipole, motion.q, around);
   const Vector<T> gyroscopic = gyroscopic_torque(body, motion.w, wheels.momentum);
   const Quaternion<T> rate = {T{}, 0.5 * relative_rate(motion, around.orbital_rate)};
-  return {multiply(motion.q, rate), body.inverse_inertia * (outside - wheels.torque - gyroscopic)};
+  return {motion.q * rate, body.inverse_inertia * (outside - wheels.torque - gyroscopic)};
 }
 
 // One step of the classical Runge-Kutta method; torques, dipole and surroundings are held.

@@ -134,7 +134,7 @@ inline Quaternion<double> turned_onto(const Quaternion<double> &q, const Vector<
       if (__builtin_fabs(body[i]) < __builtin_fabs(body[least])) least = i;
     turn = {0.0, cross(body, unit_vector<double>(least))};
   }
-  return normalised(multiply(q, turn));
+  return normalised(q * turn);
 }
 
 // The attitude after the turn about a unit axis that brings a direction nearest to that of the reference frame.
@@ -147,7 +147,7 @@ inline Quaternion<double> turned_about(const Quaternion<double> &q, const Vector
   Quaternion<double> turn = {length + cosine, sine * axis};
   if (cosine < 0.0) turn = {sine, (length - cosine) * axis};
   if (length == 0.0) turn = {1.0, {}};
-  return normalised(multiply(q, turn));
+  return normalised(q * turn);
 }
 
 // The filter of one satellite, with its gate and second hypothesis.

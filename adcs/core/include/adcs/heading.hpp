@@ -1,12 +1,9 @@
 // Kalman filter of the heading of an inertial unit with a magnetometer, and its smoother. adcs/complementary/heading.py
 // explains the model; matrices are small, so that their products are written out as loops.
 #pragma once
-#include <magloc.h>
-
-#include <magloc/elementary.hpp>
-#include <magloc/kernel.hpp>
-
-#include "quaternion.hpp"
+#include "adcs/rotation.hpp"
+#include "magloc/elementary.hpp"
+#include "magloc/kernel.hpp"
 
 MAGLOC_BEGIN
 // Where the state's parts begin: the heading, the gyro's drift, scales of its axes, the sensor's offset, and the slow
@@ -70,10 +67,11 @@ struct HeadingFilter {
       for (int k = 0; k < 3; ++k) seen[a] -= level[3 * a + k] * x[state_offset + k];
     }
     update.turned = 0.0;
-    if (P[0][0] > lost_variance) update.turned = arctangent(seen[1], seen[0]) - arctangent(field[1], field[0]) - x[0];
+    if (P[0][0] > lost_variance) update.turned = arc_tangent(seen[1], seen[0]) - arc_tangent(field[1], field[0]) - x[0];
     x[0] += update.turned;
-    const Quaternion half = exponential({0.0, 0.0, x[0]});
-    const double c = half.w * half.w - half.z * half.z, s = 2.0 * half.w * half.z;
+    const Quaternion<double> half = exponential({{0.0, 0.0, x[0]}});
+    const double half_c = half.scalar, half_s = half.vector[2];
+    const double c = half_c * half_c - half_s * half_s, s = 2.0 * half_c * half_s;
     const double expected[3] = {c * field[0] - s * field[1], s * field[0] + c * field[1], field[2]};
     double (&H)[3][n_heading] = update.H;
     for (auto &row : H)

@@ -238,7 +238,7 @@ class Hypothesis {
     const Vector<double> turn = {{dx[0], dx[1], dx[2]}};
     const double square = dot(turn, turn), scalar = square_root(maximum(1.0 - square, 0.0));
     const Quaternion<double> delta = {scalar, 1.0 / square_root(maximum(square, 1.0)) * turn};
-    x.motion.q = normalised(multiply(x.motion.q, delta));
+    x.motion.q = normalised(x.motion.q * delta);
     for (int j = 0; j < 3; ++j) {
       x.motion.w[j] += dx[3 + j];
       for (int k = 0; k < Optional::count; ++k)

@@ -43,6 +43,12 @@ MAGLOC_INLINE Vector<T> cross(const Vector<T> &a, const Vector<T> &b) {
   cross(a.at, b.at, c.at);
   return c;
 }
+template <class T>
+MAGLOC_INLINE Vector<T> normalised(const Vector<T> &v) {
+  return inverse_root(dot(v, v)) * v;
+}
+// Whether no component is NaN, as those of a missing reading are.
+MAGLOC_INLINE bool is_read(const Vector<double> &v) { return dot(v, v) >= 0.0; }
 // e_i, the unit vector of axis i.
 template <class T>
 MAGLOC_INLINE Vector<T> unit_vector(int i) {
@@ -52,6 +58,8 @@ template <class T>
 MAGLOC_INLINE Vector<T> broadcast(const Vector<double> &v) {
   return {{broadcast<T>(v[0]), broadcast<T>(v[1]), broadcast<T>(v[2])}};
 }
+MAGLOC_INLINE Vector<double> vector_at(const double *numbers) { return {{numbers[0], numbers[1], numbers[2]}}; }
+MAGLOC_INLINE void store(const Vector<double> &v, double *numbers) { __builtin_memcpy(numbers, v.at, sizeof v.at); }
 
 // A constant matrix: row i is row[i].
 struct Matrix {
@@ -59,6 +67,12 @@ struct Matrix {
 
   MAGLOC_INLINE double operator()(int i, int j) const { return row[i][j]; }
 };
+MAGLOC_INLINE Matrix matrix_at(const double *numbers) {
+  return {{vector_at(numbers), vector_at(numbers + 3), vector_at(numbers + 6)}};
+}
+MAGLOC_INLINE void store(const Matrix &m, double *numbers) {
+  for (int i = 0; i < 3; ++i) store(m.row[i], numbers + 3 * i);
+}
 
 template <class T>
 MAGLOC_INLINE Vector<T> operator*(const Matrix &m, const Vector<T> &v) {
@@ -72,6 +86,12 @@ struct Quaternion {
   T scalar;
   Vector<T> vector;
 };
+constexpr Quaternion<double> identity = {1.0, {}};
+MAGLOC_INLINE Quaternion<double> quaternion_at(const double *numbers) { return {numbers[0], vector_at(numbers + 1)}; }
+MAGLOC_INLINE void store(const Quaternion<double> &q, double *numbers) {
+  numbers[0] = q.scalar;
+  store(q.vector, numbers + 1);
+}
 
 template <class T>
 MAGLOC_INLINE Quaternion<T> operator+(const Quaternion<T> &p, const Quaternion<T> &q) {
@@ -86,9 +106,9 @@ MAGLOC_INLINE Quaternion<T> conjugate(const Quaternion<T> &q) {
   return {q.scalar, -1.0 * q.vector};
 }
 
-// The product p q of Hamilton.
+// The product p q of Hamilton: the rotation q, then p.
 template <class T>
-MAGLOC_INLINE Quaternion<T> multiply(const Quaternion<T> &p, const Quaternion<T> &q) {
+MAGLOC_INLINE Quaternion<T> operator*(const Quaternion<T> &p, const Quaternion<T> &q) {
   return {p.scalar * q.scalar - dot(p.vector, q.vector),
           p.scalar * q.vector + q.scalar * p.vector + cross(p.vector, q.vector)};
 }
@@ -103,6 +123,11 @@ template <class T>
 MAGLOC_INLINE Vector<T> rotate_back(const Quaternion<T> &q, const Vector<T> &v) {
   const Vector<T> twice = 2.0 * cross(q.vector, v);
   return v - q.scalar * twice + cross(q.vector, twice);
+}
+// A vector in body axes in the reference frame.
+template <class T>
+MAGLOC_INLINE Vector<T> rotate(const Quaternion<T> &q, const Vector<T> &v) {
+  return rotate_back(conjugate(q), v);
 }
 
 // The axis i of the reference frame in body axes: rotate_back of e_i, without its products with zero.
@@ -120,7 +145,24 @@ MAGLOC_INLINE Vector<T> axis_back(const Quaternion<T> &q, int i) {
 // The vector part of the turn from one attitude to another, of the two turns the one below 180 degrees.
 template <class T>
 MAGLOC_INLINE Vector<T> error_vector(const Quaternion<T> &from, const Quaternion<T> &to) {
-  const Quaternion<T> turn = multiply(conjugate(from), to);
+  const Quaternion<T> turn = conjugate(from) * to;
   return choose(turn.scalar < 0.0, broadcast<T>(-1.0), broadcast<T>(1.0)) * turn.vector;
+}
+
+// (cos t/2, n sin t/2) of a rotation vector t n, by power series of h = t/2, exact to rounding up to h^2 = 0.04. A
+// longer rotation is halved until it is short enough, and its quaternion squared as often.
+inline Quaternion<double> exponential(Vector<double> v) {
+  double square = 0.25 * dot(v, v);
+  int halved = 0;
+  for (; square > 0.04 && halved < 64; ++halved) v = 0.5 * v, square *= 0.25;
+  double cosine = 1.0, sine = 1.0;  // cos h and sin(h)/h
+#pragma GCC unroll 5
+  for (int i = 10; i > 0; i -= 2) {
+    cosine = 1.0 - square * (1.0 / (i * (i - 1))) * cosine;
+    sine = 1.0 - square * (1.0 / (i * (i + 1))) * sine;
+  }
+  Quaternion<double> q = {cosine, 0.5 * sine * v};
+  for (; halved > 0; --halved) q = q * q;
+  return q;
 }
 MAGLOC_END

@@ -1,42 +1,62 @@
-// Elementary functions of a double, to a few units in the last place; kernels use no C library.
+// Elementary functions, to a few units in the last place, by +, -, *, / and square roots alone: lanes can compute them,
+// and kernels use no C library.
 #pragma once
-#include <string.h>
-
 #include "numbers.hpp"
 
 MAGLOC_BEGIN
-// Natural logarithm of a normal positive number; NaN of others. With x = 2^e m and s = (m - 1)/(m + 1) it is
-// e log 2 + 2 (s + s^3/3 + s^5/5 + ...).
-inline double logarithm(double x) {
-  if (!(x >= 0x1p-1022 && x < infinity)) return nan;
-  uint64_t bits;
-  memcpy(&bits, &x, sizeof bits);
-  int64_t exponent = (int64_t)(bits >> 52) - 1023;
-  bits = (bits & 0xfffffffffffff) | 0x3ff0000000000000;
-  double m;
-  memcpy(&m, &bits, sizeof m);
-  if (m > 1.4142135623730951) m *= 0.5, ++exponent;
-  const double s = (m - 1.0) / (m + 1.0), square = s * s;  // up to 0.03
-  double sum = 0.0;
-  for (int i = 21; i > 1; i -= 2) sum = square * (1.0 / i + sum);
-  // log 2 in two parts, of which the first one times an exponent is exact.
-  return exponent * 0x1.62e42fee00000p-1 + (2.0 * (s + s * sum) + exponent * 0x1.a39ef35793c76p-33);
+// The arc tangent. tan(a/2) = t/(1 + sqrt(1 + t^2)) halves the angle until its series converges fast.
+template <class T>
+inline T arc_tangent(T x) {
+  const T size = choose(x < 0.0, -x, x), inverse = 1.0 / size;
+  T t = choose(size > 1.0, inverse, size);
+  for (int halving = 0; halving < 2; ++halving) t = t / (1.0 + square_root(1.0 + t * t));  // at most tan(pi/16)
+  const T square = t * t;
+  T series{};
+  for (int k = 25; k >= 1; k -= 2) series = 1.0 / k - square * series;
+  const T angle = 4.0 * t * series;
+  constexpr double right_angle = 1.5707963267948966;
+  const T positive = choose(size > 1.0, right_angle - angle, angle);
+  return choose(x < 0.0, -positive, positive);
 }
 
-// Angle of the vector (x, y), from -pi to pi. tan(t/2) = tan t/(1 + sqrt(1 + tan^2 t)), until the power series of the
-// arctangent is short.
-inline double arctangent(double y, double x) {
+// The angle of the vector (x, y), from -pi to pi; zero of a vector that is zero.
+inline double arc_tangent(double y, double x) {
   if (x == 0.0 && y == 0.0) return 0.0;
-  const double size_x = __builtin_fabs(x), size_y = __builtin_fabs(y);
-  double t = size_y > size_x ? size_x / size_y : size_y / size_x;
-  for (int i = 0; i < 2; ++i) t /= 1.0 + __builtin_sqrt(1.0 + t * t);
-  const double square = t * t;  // up to 0.04
-  double sum = 0.0;
-  for (int i = 23; i > 1; i -= 2) sum = square * (1.0 / i - sum);
-  double angle = 4.0 * (t - t * sum);
-  const double pi = 3.141592653589793;
-  if (size_y > size_x) angle = 0.5 * pi - angle;
-  if (x < 0.0) angle = pi - angle;
+  constexpr double pi = 3.141592653589793;
+  const double acute = arc_tangent(__builtin_fabs(y) / __builtin_fabs(x)), angle = x < 0.0 ? pi - acute : acute;
   return y < 0.0 ? -angle : angle;
+}
+
+// The hyperbolic tangent of a number that is not negative. tanh(2x) = 2t/(1 + t^2) doubles a small one.
+template <class T>
+inline T hyperbolic_tangent(T x) {
+  constexpr int doublings = 6;
+  const T small = choose(x > 20.0, broadcast<T>(20.0), x) * (1.0 / (1 << doublings)), square = small * small;
+  T fraction = broadcast<T>(15.0);
+  for (int odd = 13; odd >= 1; odd -= 2) fraction = double(odd) + square / fraction;
+  T t = small / fraction;
+  for (int doubling = 0; doubling < doublings; ++doubling) t = 2.0 * t / (1.0 + t * t);
+  return t;
+}
+
+// The natural logarithm; NaN of a negative number. With x = 2^e m and s = (m - 1)/(m + 1) it is
+// e log(2) + 2 (s + s^3/3 + s^5/5 + ...).
+inline double logarithm(double x) {
+  if (!(x > 0.0 && x < infinity)) return x == 0.0 ? -infinity : x > 0.0 ? x : nan;
+  int exponent = 0;
+  if (x < 0x1p-1022) x *= 0x1p54, exponent = -54;
+  uint64_t bits;
+  __builtin_memcpy(&bits, &x, sizeof bits);
+  exponent += int(bits >> 52) - 1023;
+  bits = (bits & 0xfffffffffffff) | 0x3ff0000000000000;
+  double m;
+  __builtin_memcpy(&m, &bits, sizeof m);
+  if (m > 1.4142135623730951) m *= 0.5, ++exponent;
+  const double s = (m - 1.0) / (m + 1.0), square = s * s;  // up to 0.03
+  double series = 0.0;
+  for (int k = 21; k >= 3; k -= 2) series = 1.0 / k + square * series;
+  // log(2) in two parts, of which the first one times an exponent is exact.
+  constexpr double log_2_high = 0x1.62e42feep-1, log_2_low = 0x1.a39ef35793c76p-33;
+  return exponent * log_2_high + (exponent * log_2_low + 2.0 * s * square * series + 2.0 * s);
 }
 MAGLOC_END
