@@ -3,9 +3,11 @@
 A thin module checks shapes, allocates results, describes the problem (:func:`problem`) and computes its items
 (:func:`run`). Users call its functions, not these. docs/development/kernels.md shows how to add a kernel.
 
-The environment variable MAGLOC_ISA names the instruction set to use ("baseline", "avx2", "avx512"; default: the best
-one of the machine), MAGLOC_NUM_THREADS the number of threads (default: all processors that the process may use), and
-MAGLOC_KERNELS another library, such as one built with sanitizers.
+Environment variables:
+
+- MAGLOC_ISA: the instruction set, "baseline", "avx2" or "avx512" (default: the best one of the machine);
+- MAGLOC_NUM_THREADS: the number of threads (default: NUMBA_NUM_THREADS, or all processors that the process may use);
+- MAGLOC_KERNELS: another library, such as one built with sanitizers.
 """
 
 from __future__ import annotations
@@ -145,7 +147,7 @@ def set_threads(n: int) -> None:
 
 
 def _available_threads() -> int:
-    if wanted := os.environ.get("MAGLOC_NUM_THREADS"):
+    if wanted := os.environ.get("MAGLOC_NUM_THREADS") or os.environ.get("NUMBA_NUM_THREADS"):
         return max(1, int(wanted))
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
