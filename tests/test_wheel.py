@@ -117,3 +117,28 @@ class TestSdist:
         } <= wanted
         assert wanted <= there
         assert not [name for name in there if "__pycache__" in name or name.endswith((".pyc", ".nbi", ".nbc"))]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows needs clang-cl")
+def test_a_machine_without_a_compiler_builds_it(unpacked: Path, tmp_path: Path) -> None:
+    """PATH holds Python alone, so that the build asks the package index for Zig."""
+    subprocess.run([sys.executable, "-m", "venv", str(tmp_path / "fresh")], check=True, timeout=WAIT_S)
+    fresh = tmp_path / "fresh" / "bin"
+    environment = {**os.environ, "PATH": str(fresh), "HOME": str(tmp_path)}
+    environment = {name: value for name, value in environment.items() if name not in ("CC", "CXX")}
+    command = [str(fresh / "python"), "-m", "pip", "wheel", "--no-deps", "--wheel-dir", str(tmp_path), str(unpacked)]
+    done = subprocess.run(command, env=environment, capture_output=True, encoding="utf-8", timeout=1800)
+    if "No matching distribution found" in done.stderr or "Connection" in done.stderr:
+        pytest.skip("needs the package index")
+    assert done.returncode == 0, done.stderr
+    with zipfile.ZipFile(next(tmp_path.glob("magloc-*.whl"))) as archive:
+        archive.extractall(tmp_path / "installed")
+    code = "import magloc.core as c; from magloc.fields.points import field_at_points as f; print(c.__file__)"
+    code += "; assert f([[0, 0, 1]], [[0, 0, 0]], [[0, 0, 5]])[0, 2] == 1e-6"
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path / "installed")}
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, encoding="utf-8"
+    )
+    assert done.returncode == 0, done.stderr
+    assert str(tmp_path) in done.stdout
