@@ -1,8 +1,8 @@
 /* Kernels of magloc and adcs, callable from C, Python (cffi), MATLAB or Julia.
 
 A kernel computes the items begin, ..., end - 1 of a problem. Its data are described by a struct of sizes and of
-pointers to arrays in C order (last index fastest). Items do not depend on each other: several threads may work at one
-problem, on different items.
+pointers to arrays in C order (last index fastest). Several threads may work at one problem, on different items. Only
+the steps of a filter depend on each other: they are computed in order, with one workspace that keeps the state.
 
     int64_t magloc_<kernel>(const magloc_<problem> *problem, int64_t begin, int64_t end, double *workspace);
 
