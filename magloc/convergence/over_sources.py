@@ -44,9 +44,9 @@ from magloc.localization.fit.gauss_newton import JointFits, refine
 from magloc.localization.fit.optima import Optima
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import is_observable, spans
-from magloc.localization.fit.variable_projection_compiled import SAME_CHI2, SAME_COS
 from magloc.localization.locator import Locator
 from magloc.localization.model_errors import assumed_lengths, with_model_errors
+from magloc.localization.search.kernels import SAME_CHI2, SAME_COSINE
 from magloc.localization.search.single_source import N_UNKNOWNS
 from magloc.measurement.differences import fields_at_sensors
 from magloc.measurement.rows import check_magnitudes, whitened_rows
@@ -330,7 +330,7 @@ class SourcesMap(CubeMap):
         every = fixes.solutions
         cosine = np.sum(self._model.homogeneous(every.position_m[:, 0]) * ends.q[every.of_row, 0], axis=1)
         chi2 = every.chi2 + every.known_chi2
-        same = (np.abs(cosine) > SAME_COS) & (np.abs(chi2 - ends.chi2[every.of_row]) < SAME_CHI2)
+        same = (np.abs(cosine) > SAME_COSINE) & (np.abs(chi2 - ends.chi2[every.of_row]) < SAME_CHI2)
         return np.bincount(every.of_row[same], minlength=len(fixes)) > 0
 
 

@@ -15,8 +15,8 @@ from __future__ import annotations
 import os
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
 from pathlib import Path
-from threading import Event
 from typing import Any
 
 import numpy as np
@@ -26,7 +26,7 @@ from magloc.core._declarations import ffi
 _HERE = Path(__file__).parent
 _SUFFIX = ".dll" if sys.platform == "win32" else ".so"
 _lib: Any = ffi.dlopen(os.environ.get("MAGLOC_KERNELS") or str(_HERE / f"kernels{_SUFFIX}"))
-_TYPES = {
+_TYPES: dict[str, np.dtype[Any]] = {
     "double": np.dtype(np.float64),
     "float": np.dtype(np.float32),
     "int64_t": np.dtype(np.int64),
@@ -40,21 +40,32 @@ class Problem:
     def __init__(self, kind: str, fields: dict[str, Any]) -> None:
         self.struct = ffi.new(f"magloc_{kind} *")
         self.kept = {name: value for name, value in fields.items() if isinstance(value, np.ndarray | Problem)}
-        types = dict(ffi.typeof(self.struct).item.fields)
+        types = _field_types(kind)
         if fields.keys() != types.keys():
             raise TypeError(f"magloc_{kind} has the fields {[*types]}; instead received {[*fields]}")
         for name, value in fields.items():
-            if isinstance(value, np.ndarray):
-                value = _pointer(name, types[name].type, value)
-            setattr(self.struct, name, value.struct if isinstance(value, Problem) else value)
+            if name in self.kept:
+                value = value.struct if isinstance(value, Problem) else _pointer(name, *types[name], value)
+            elif value is None:
+                value = ffi.NULL
+            setattr(self.struct, name, value)
 
 
-def _pointer(name: str, pointer_type: Any, array: np.ndarray[Any, Any]) -> Any:
-    """Return the address of an array's first element as a C pointer of the field's type."""
-    wanted = _TYPES[pointer_type.item.cname]
+@lru_cache  # readings that come one by one describe the same kinds of problems again and again
+def _field_types(kind: str) -> dict[str, tuple[Any, np.dtype[Any] | None]]:
+    """Return the C type of an array, and that of its elements, of every field that points to numbers."""
+    types: dict[str, tuple[Any, np.dtype[Any] | None]] = {}
+    for name, field in ffi.typeof(f"magloc_{kind}").fields:
+        element = field.type.item.cname if field.type.kind == "pointer" else ""
+        types[name] = (ffi.typeof(f"{element}[]"), _TYPES[element]) if element in _TYPES else (None, None)
+    return types
+
+
+def _pointer(name: str, array_type: Any, wanted: np.dtype[Any] | None, array: np.ndarray[Any, Any]) -> Any:
+    """Return an array as a C array of the field's type."""
     if array.dtype != wanted or not array.flags.c_contiguous or not array.flags.aligned:
         raise TypeError(f"{name} must be a C-contiguous array of {wanted}; instead received {array.dtype}")
-    return ffi.cast(pointer_type, array.ctypes.data)
+    return ffi.from_buffer(array_type, array)
 
 
 def problem(kind: str, **fields: Any) -> Problem:
@@ -79,7 +90,7 @@ def problem(kind: str, **fields: Any) -> Problem:
     TypeError
         If a field is missing or unknown, or an array has another type or order.
     """
-    return Problem(kind, {name: ffi.NULL if value is None else value for name, value in fields.items()})
+    return Problem(kind, fields)
 
 
 def workspace_size(kernel: str, work: Problem) -> int:
@@ -111,14 +122,14 @@ def run(kernel: str, work: Problem, n: int, *, block: int, chain: int | None = N
     size = workspace_size(kernel, work)
     chain = chain or block
     parts = range(0, n, chain)
-    stopped = Event()
+    stopped = False
 
     def compute(parts: range) -> None:
         workspace = ffi.new("double[]", size + 1)
         for part in parts:
             end = min(part + chain, n)
             for begin in range(part, end, block):
-                if not stopped.is_set():
+                if not stopped:
                     function(work.struct, begin, min(begin + block, end), workspace)
 
     n_threads = min(threads(), len(parts))
@@ -130,7 +141,7 @@ def run(kernel: str, work: Problem, n: int, *, block: int, chain: int | None = N
             for done in [pool.submit(compute, parts[i : i + 1]) for i in range(len(parts))]:
                 done.result()
         except BaseException:
-            stopped.set()
+            stopped = True
             pool.shutdown(wait=False, cancel_futures=True)
             raise
 

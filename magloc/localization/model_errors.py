@@ -37,7 +37,8 @@ def body_errors(model: WhitenedModel, q: FloatArray, mu: FloatArray, length_m: F
     fields = finite_body_errors(separation, moment, length_m[..., None, None, None])
     # In threes, those of a sensor.
     gain = np.zeros((len(q), 1, 3 * len(sensors), 3))
-    place = model.threes[0]
+    owner = model.channel_sensor
+    place = 3 * owner + np.arange(owner.size) - np.searchsorted(owner, owner)
     gain[:, 0, place] = model.linear_gain(model.source_fields(q, mu))
     columns = gain.reshape(len(q), 1, len(sensors), 3, 3) @ fields
     n_sources, n_errors = q.shape[1], columns.shape[-1]

@@ -17,7 +17,6 @@ from arrays.whitening import Whitening, whitening, whitenings
 from magloc.measurement.channels import signals_of
 from magloc.measurement.known_moment import KnownMoment
 from magloc.measurement.whitened import WhitenedModel
-from magloc.measurement.whitened_compiled import signals
 from magloc.readings import Readings
 
 NO_SIGNAL = "the sensors' readings do not differ: no signal"
@@ -78,11 +77,6 @@ class WhitenedRows:
     def signals(self) -> FloatArray:
         """Whitened readings for the kernels of fits: (b, C + k)."""
         return signals_of(self.model, self.y)
-
-    @cached_property
-    def signal(self) -> FloatArray:
-        """Whitened readings for compiled kernels: (b, s, 3)."""
-        return signals(self.model, self.y)
 
     @property
     def silent(self) -> BoolArray:

@@ -2,7 +2,7 @@ r"""Whitened model: dipoles in homogeneous coordinates, and what an array reads 
 
 Positions are :math:`q = (u, s)` on the unit sphere of :math:`R^4`, :math:`p = c + \rho_0 \, u / s` with the sensors'
 centroid c and circumradius :math:`\rho_0`; moments are :math:`\mu = k |s|^3 m / \rho_0^3`, so that infinity (s = 0) is
-an ordinary point: docs/theory/homogeneous-coordinates.md. The twin of :mod:`magloc.measurement.whitened_compiled`.
+an ordinary point: docs/theory/homogeneous-coordinates.md.
 """
 
 from __future__ import annotations
@@ -17,11 +17,9 @@ from arrays.array import SensorArray
 from arrays.typing import FloatArray
 from arrays.whitening import Whitening
 from magloc import core
-from magloc.compilation import own
 from magloc.fields.dipole import MU0_OVER_4PI
 from magloc.measurement.channels import channels_of
 from magloc.measurement.known_moment import KnownMoment
-from magloc.measurement.whitened_compiled import LaneModel, ModelRows, Units
 
 # Squares of columns of whose errors of rounding nothing is seen, in units of the noise; those of a column that is none.
 _MOST_SQUARES, _UNSEEN = 1e8, 1e-7
@@ -47,11 +45,6 @@ class ScaledSensors:
     radius: float
     sensors: FloatArray
     channel_sensor: NDArray[np.intp]
-
-    @cached_property
-    def units(self) -> Units:
-        """For compiled kernels."""
-        return Units(own(self.centroid), self.radius, self.radius**3 / MU0_OVER_4PI)
 
     def homogeneous(self, position_m: ArrayLike) -> FloatArray:
         """Homogeneous coordinates (..., 4), of unit norm and s > 0, of positions (..., 3) [m]."""
@@ -149,24 +142,6 @@ class WhitenedModel(ScaledSensors):
     def channels(self) -> core.Problem:
         """Channels for the kernels of fits."""
         return channels_of(self)
-
-    @cached_property
-    def of_kernels(self) -> ModelRows:
-        """The model for compiled kernels."""
-        return ModelRows.of(self)
-
-    @cached_property
-    def lanes(self) -> LaneModel:
-        """The model for compiled kernels that fit many starts side by side."""
-        return LaneModel.of(self)
-
-    @cached_property
-    def threes(self) -> tuple[NDArray[np.intp], NDArray[np.intp], int]:
-        """Places of the channels in lanes, columns of the common field with a prior, and sensors with theirs."""
-        owner = self.channel_sensor
-        known = np.flatnonzero((self.shrinkage < 1.0).any(axis=0))
-        place = 3 * owner + np.arange(owner.size) - np.searchsorted(owner, owner)
-        return place, known, len(self.sensors) + -(-known.size // 3)
 
     def rows(self, index: NDArray[np.intp]) -> WhitenedModel:
         """Model of some of the readings, repeated at will."""

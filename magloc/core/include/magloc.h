@@ -321,6 +321,33 @@ int64_t magloc_candidate_bases(const magloc_candidate_positions *problem, int64_
 int64_t magloc_choose_candidates(const magloc_candidate_choice *problem, int64_t begin, int64_t end, double *workspace);
 int64_t magloc_search_optima(const magloc_search *problem, int64_t begin, int64_t end, double *workspace);
 
+/* What is known of the fits of one source by vector sensors, all solutions of a row together; an item is a row.
+   Covariances are of the position in radii and the moment in T at s = 1. */
+typedef struct {
+  const magloc_channels *channels;
+  int64_t most_fits;        /* of a row */
+  const double *signals;    /* (n_rows, n_channels) */
+  const double *energy;     /* (n_rows), square of what they differ */
+  const int64_t *first_fit; /* (n_rows + 1) of each row, best first */
+  const int64_t *row;       /* (n_fits) */
+  const double *q, *mu;     /* (n_fits, 4), (n_fits, 3) */
+  const double *chi2;       /* (n_fits) */
+  double detected;          /* energy above which there is a source */
+  double misfit, dof;       /* chi-square above which a fit is none, and its degrees of freedom */
+  double level, outside;    /* rise of chi-square within the set of ranges, and the probability outside */
+  double certain_weight;    /* of a solution, */
+  double largest_sigma;     /* standard deviations over range and moment, */
+  double largest_bend;      /* and how far chi-square may be from a parabola, with which errors are Gaussian */
+  int64_t n_strengths;
+  const double *strengths, *gained; /* (n_strengths), ascending: roots of energies, and what detection tells of them */
+  double *covariance;               /* (n_fits, 6, 6), NaN where it is singular */
+  double *weight;                   /* (n_fits), probability of a solution */
+  double *ranges;                   /* (n_fits, most_fits, 2) radii, 95 % set of intervals, NaN behind them */
+  uint8_t *gaussian;                /* (n_fits), whether the covariance describes the errors */
+} magloc_source_uncertainty;
+int64_t magloc_source_uncertainties(const magloc_source_uncertainty *problem, int64_t begin, int64_t end,
+                                    double *workspace);
+
 /* end of the declarations */
 #ifdef __GNUC__
 #pragma GCC visibility pop

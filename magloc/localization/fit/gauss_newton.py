@@ -22,7 +22,6 @@ from magloc.measurement.whitened import WhitenedModel
 # A refinement has converged where the linearised model promises to lower χ² by less than this, absolute and relative.
 PROMISE_ABSOLUTE = 1e-8
 PROMISE_RELATIVE = 1e-11
-_CHANNELS_A_THREAD = 768
 LARGEST_STEP_RAD, LARGEST_DAMPING = 0.5, 1e9
 
 
@@ -220,11 +219,6 @@ def _has_kernel(problem: WhitenedModel, free: NDArray[np.bool_]) -> bool:
     if problem.known is not None or not free.any() or len(free) > MOST_SOURCES:
         return False
     return not problem.sees_moduli or (len(free) == 1 and bool(free[0, :2].all()))
-
-
-def refined_a_thread(n_channels: int) -> int:
-    """Rows to refine, of so many channels (times sources), that take the millisecond that threads take to begin."""
-    return 1 + _CHANNELS_A_THREAD // n_channels
 
 
 def damped_gauss_newton(

@@ -16,6 +16,8 @@ from magloc.localization.fit.refinement import rows_a_block
 from magloc.measurement.channels import problem
 from magloc.measurement.whitened import WhitenedModel
 
+SAME_COSINE, SAME_CHI2 = 0.99995, 0.01
+"""Two optima are one if their positions are 0.01 rad apart at most, and χ² is equal: those of the kernel."""
 _ROWS_TO_CHOOSE_FOR = 512
 
 

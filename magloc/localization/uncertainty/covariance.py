@@ -15,12 +15,14 @@ import numpy as np
 from scipy.special import chdtrc, chdtri
 
 from arrays.typing import BoolArray, FloatArray, IntArray
+from magloc import core
 from magloc.chi_square import energy_threshold
-from magloc.compilation import over_rows, readable
+from magloc.fields.dipole import MU0_OVER_4PI
 from magloc.levels import CERTAIN_WEIGHT, DELTA_CHI2_95, MISFIT
 from magloc.localization.fit.columns import Solutions
-from magloc.localization.fit.gauss_newton import covariances, refined_a_thread
+from magloc.localization.fit.gauss_newton import covariances
 from magloc.localization.fit.optima import Optima
+from magloc.localization.fit.refinement import rows_a_block
 from magloc.localization.fit.results import is_misfit, is_observable
 from magloc.localization.uncertainty.ambiguity import (
     LARGEST_BEND,
@@ -33,11 +35,12 @@ from magloc.localization.uncertainty.ambiguity import (
     widened,
 )
 from magloc.localization.uncertainty.moment_covariance import moment_covariances
-from magloc.localization.uncertainty.range_interval import left_of_detected, relative_range_sigma
+from magloc.localization.uncertainty.range_interval import OUTSIDE, left_of_detected, relative_range_sigma
 from magloc.localization.uncertainty.range_profile import profile_stretches, ranges_within
-from magloc.localization.uncertainty.range_profile_compiled import FlatFits
-from magloc.localization.uncertainty.single_source_compiled import Certainties, Levels, certainty_rows
 from magloc.measurement.whitened import WhitenedModel
+
+# Linearisations that the profile of a fit takes, roughly.
+_LINEARISATIONS = 20
 
 
 class _Known(NamedTuple):
@@ -60,8 +63,8 @@ def solutions_of(optima: Optima, detected: BoolArray) -> Solutions:
     elif n_sources > 1:
         known = _of_several(optima, detected)
     else:
-        lanes = not model.sees_moduli and model.known is None
-        known = known_of_one_compiled(optima) if lanes else known_of_one(optima)
+        kernel = not model.sees_moduli and model.known is None
+        known = known_of_one_compiled(optima) if kernel else known_of_one(optima)
     of_moments, n_known = np.zeros(n_fits), np.zeros(n_fits, dtype=np.intp)
     if model.known is not None:
         moments = model.known.residual(known.moment_Am2)
@@ -130,9 +133,8 @@ def known_of_one(optima: Optima) -> _Known:
         rows.n_differences,
         _scale_m(model),
     )
-    rise = rivals.rise * understated
     alpha = np.full((*shape, 2), np.nan)
-    left = rise[of_row] - (fits.chi2 - chi2[of_row, 0])
+    left = (rivals.rise * understated)[of_row] - (fits.chi2 - chi2[of_row, 0])
     inside = np.flatnonzero((left > 0.0) & np.isfinite(left))
     sigma = relative_range_sigma(covariance[at], offset[at])
     alpha[of_row[inside], at[1][inside]] = profile_stretches(
@@ -148,34 +150,56 @@ def known_of_one(optima: Optima) -> _Known:
 
 
 def known_of_one_compiled(optima: Optima) -> _Known:
-    """:func:`known_of_one` of vector sensors."""
-    rows, fits, of_row = optima.rows, optima.fits, optima.of_row
-    model, n_rows = rows.model, len(rows)
-    first = of_row.searchsorted(np.arange(n_rows + 1))
-    found = Certainties.empty(len(of_row), max(1, np.maximum.reduce(first[1:] - first[:-1])))
-    over_rows(
-        certainty_rows,
-        n_rows,
-        FlatFits(first, readable(fits.q[:, 0]), readable(fits.mu[:, 0]), readable(fits.chi2)),
-        readable(rows.energy),
-        readable(rows.y),
-        rows.signal,
-        model.of_kernels,
-        model.lanes,
-        model.units,
-        levels_of(rows.n_differences, optima.dof),
-        found,
-        rows_a_thread=refined_a_thread(rows.y.shape[1]),
+    """Return :func:`known_of_one` of vector sensors, by the kernel."""
+    rows, fits, model = optima.rows, optima.fits, optima.rows.model
+    n_fits = len(optima.of_row)
+    first_fit = optima.of_row.searchsorted(np.arange(len(rows) + 1))
+    most = max(1, int(np.maximum.reduce(first_fit[1:] - first_fit[:-1])))
+    covariance, weight = np.empty((n_fits, 6, 6)), np.empty(n_fits)
+    ranges, gaussian = np.empty((n_fits, 1, most, 2)), np.empty((n_fits, 1), dtype=bool)
+    misfit, strengths, gained = _detection(rows.n_differences, optima.dof)
+    work = core.problem(
+        "source_uncertainty",
+        channels=model.channels,
+        most_fits=most,
+        signals=rows.signals,
+        energy=np.ascontiguousarray(rows.energy),
+        first_fit=first_fit,
+        row=np.ascontiguousarray(optima.of_row),
+        q=np.ascontiguousarray(fits.q),
+        mu=np.ascontiguousarray(fits.mu),
+        chi2=np.ascontiguousarray(fits.chi2),
+        detected=energy_threshold(rows.n_differences),
+        misfit=misfit,
+        dof=optima.dof,
+        level=DELTA_CHI2_95,
+        outside=OUTSIDE,
+        certain_weight=CERTAIN_WEIGHT,
+        largest_sigma=LARGEST_GAUSSIAN_SIGMA,
+        largest_bend=LARGEST_BEND,
+        n_strengths=strengths.size,
+        strengths=strengths,
+        gained=gained,
+        covariance=covariance,
+        weight=weight,
+        ranges=ranges,
+        gaussian=gaussian.view(np.uint8),
     )
-    return _Known(found.position_m, found.moment_Am2, found.ranges, found.covariance, found.gaussian, found.weight)
+    block = rows_a_block(_LINEARISATIONS * rows.signals.shape[1])
+    core.run("source_uncertainties", work, len(rows), block=block)
+    unit = np.array(3 * [model.radius] + 3 * [model.radius**3 / MU0_OVER_4PI])
+    covariance *= unit
+    covariance *= unit[:, None]
+    ranges *= model.radius
+    position, moment = model.position(fits.q), model.moment(fits.q, fits.mu)
+    return _Known(position, moment, ranges, covariance, gaussian, weight)
 
 
 @lru_cache(maxsize=64)
-def levels_of(n_differences: int, dof: int) -> Levels:
-    """What the compiled code compares with."""
-    misfit = float(chdtri(dof, MISFIT)) if dof > 0 else math.inf
+def _detection(n_differences: int, dof: int) -> tuple[float, FloatArray, FloatArray]:
+    """Return χ² of a misfit, and what the detection of a signal tells of its strength: both columns ascending."""
     strength, left = left_of_detected(n_differences)
-    return Levels(energy_threshold(n_differences), misfit, float(dof), strength, -left)
+    return float(chdtri(dof, MISFIT)) if dof > 0 else math.inf, strength, np.ascontiguousarray(-left)
 
 
 def _understated(chi2: FloatArray, optima: Optima) -> FloatArray:

@@ -22,7 +22,8 @@ from magloc.levels import DELTA_CHI2_95
 # Signals so many standard deviations above the root of the threshold are seen for certain.
 _CERTAIN = 8.0
 _N_STRENGTHS = 1200
-_OUTSIDE = 0.05
+OUTSIDE = 0.05
+"""Probability of ranges outside a set."""
 _N_BISECTIONS = 24
 
 
@@ -72,7 +73,7 @@ def levels(chi2: FloatArray, weight: FloatArray) -> FloatArray:
         middle = 0.5 * (low + high)
         # P(χ²_1 > x) = erfc(√(x/2)).
         outside = np.sum(share * erfc(np.sqrt(0.5 * np.maximum(middle[:, None] - above, 0.0))), axis=1)
-        too_low = outside > _OUTSIDE
+        too_low = outside > OUTSIDE
         low, high = np.where(too_low, middle, low), np.where(too_low, high, middle)
     result[several] = high
     return result

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.special import erfc
 
 from magloc import core
 
@@ -37,6 +38,15 @@ void logarithms(const double *x, double *y, int n) {
 }
 void angles(const double *x, double *y, int n) {
   for (int i = 0; i < n; ++i) y[i] = arc_tangent(x[2 * i], x[2 * i + 1]);
+}
+void exponentials(const double *x, double *y, int n) {
+  for (int i = 0; i < n; ++i) y[i] = exponential(x[i]);
+}
+void complementary_errors(const double *x, double *y, int n) {
+  for (int i = 0; i < n; ++i) y[i] = complementary_error(x[i]);
+}
+void sines_and_cosines(const double *x, double *y, int n) {
+  for (int i = 0; i < n; ++i) fill_sine_and_cosine(x[i], y[2 * i], y[2 * i + 1]);
 }
 }
 """
@@ -91,3 +101,19 @@ class TestElementary:
             expected = np.log(x)
         np.testing.assert_allclose(mapped(functions.logarithms, x), expected, rtol=3.0 * EPS, atol=0)
         assert np.isnan(mapped(functions.logarithms, np.array([-1.0, -np.inf]))).all()
+
+    def test_exponential(self, functions: ctypes.CDLL) -> None:
+        x = np.concatenate([np.random.default_rng(2).uniform(-700, 700, 4000), np.linspace(-2.0, 2.0, 401)])
+        np.testing.assert_allclose(mapped(functions.exponentials, x), np.exp(x), rtol=4.0 * EPS, atol=0)
+        assert mapped(functions.exponentials, np.array([-1e4])) == 0.0
+
+    def test_complementary_error(self, functions: ctypes.CDLL) -> None:
+        x = np.linspace(0.0, 25.0, 5001)
+        np.testing.assert_allclose(mapped(functions.complementary_errors, x), erfc(x), rtol=1e-12, atol=0)
+
+    def test_sine_and_cosine(self, functions: ctypes.CDLL) -> None:
+        x = np.concatenate([np.linspace(-0.5 * np.pi, 0.5 * np.pi, 4001), [1e-5, -1e-9]])
+        found = np.empty((len(x), 2))
+        functions.sines_and_cosines(ctypes.c_void_p(x.ctypes.data), ctypes.c_void_p(found.ctypes.data), len(x))
+        assert (np.abs(found[:, 0] - np.sin(x)) <= 4.0 * EPS * np.abs(np.sin(x))).all()
+        assert (np.abs(found[:, 1] - np.cos(x)) <= 4.0 * EPS).all()

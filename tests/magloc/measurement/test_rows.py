@@ -46,7 +46,7 @@ class TestModelOfOneRow:
     def test_rows_share_it(self) -> None:
         readings = np.random.default_rng(1).normal(scale=1e-7, size=(2, 12))
         first, second = (self.rows(self.ARRAY, row[None]) for row in readings)
-        assert first.model.lanes is second.model.lanes
+        assert first.model.channels is second.model.channels
 
     def test_other_channels_array_or_noise_have_another(self) -> None:
         readings = np.random.default_rng(1).normal(scale=1e-7, size=(1, 12))
@@ -56,8 +56,8 @@ class TestModelOfOneRow:
         cases += [(louder, readings), (louder, 2.0 * readings)]
         models = [self.rows(*case).model for case in cases]
         assert len({id(model) for model in models}) == len(cases)
-        assert not np.allclose(models[0].lanes.gain, models[1].lanes.gain)
-        assert not np.allclose(models[3].lanes.gain, models[4].lanes.gain)
+        assert not np.allclose(models[0].channels.kept["gain"], models[1].channels.kept["gain"])
+        assert not np.allclose(models[3].channels.kept["gain"], models[4].channels.kept["gain"])
 
     @pytest.mark.parametrize("ambient_T", [None, np.array([[2e-5, -1e-6, 4e-5]])])
     def test_as_a_row_of_many(self, ambient_T: FloatArray | None) -> None:
@@ -65,9 +65,9 @@ class TestModelOfOneRow:
         several = None if ambient_T is None else np.tile(ambient_T, (3, 1))
         alone, many = self.rows(self.ARRAY, readings[:1], ambient_T), self.rows(self.ARRAY, readings, several)
         np.testing.assert_allclose(alone.y[0], many.y[0], rtol=1e-12)
-        np.testing.assert_allclose(alone.signal[0], many.signal[0], rtol=1e-12)
+        np.testing.assert_allclose(alone.signals[0], many.signals[0], rtol=1e-12)
         np.testing.assert_allclose(alone.model.ambient[0], many.model.ambient[0])
-        np.testing.assert_array_equal(alone.model.lanes.common, many.model.lanes.common)
+        np.testing.assert_array_equal(*(rows.model.channels.kept["common"] for rows in (alone, many)))
 
 
 class TestMarginalised:

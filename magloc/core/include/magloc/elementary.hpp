@@ -59,4 +59,43 @@ inline double logarithm(double x) {
   constexpr double log_2_high = 0x1.62e42feep-1, log_2_low = 0x1.a39ef35793c76p-33;
   return exponent * log_2_high + (exponent * log_2_low + 2.0 * s * square * series + 2.0 * s);
 }
+
+// Sine and cosine of an angle up to pi/2 in size: power series of half of it, then the formulas of the double angle.
+inline void fill_sine_and_cosine(double x, double &sine, double &cosine) {
+  const double half = 0.5 * x, square = half * half;  // up to 0.62
+  double s = 1.0, c = 1.0;
+  for (int i = 20; i > 0; i -= 2) {
+    s = 1.0 - square / (i * (i + 1)) * s;
+    c = 1.0 - square / (i * (i - 1)) * c;
+  }
+  s *= half;
+  sine = 2.0 * s * c;
+  cosine = 1.0 - 2.0 * s * s;
+}
+
+// Exponential of a number up to 700; zero below -700. x = n log 2 + r, and the power series of e^r.
+inline double exponential(double x) {
+  if (x < -700.0) return 0.0;
+  const int64_t n = (int64_t)(x * 1.4426950408889634 + (x < 0.0 ? -0.5 : 0.5));
+  const double r = (x - n * 0x1.62e42fee00000p-1) - n * 0x1.a39ef35793c76p-33;
+  double sum = 1.0;
+  for (int i = 14; i > 0; --i) sum = 1.0 + r / i * sum;
+  const uint64_t bits = (uint64_t)(n + 1023) << 52;
+  double power;
+  __builtin_memcpy(&power, &bits, sizeof power);
+  return power * sum;
+}
+
+// Complementary error function of x >= 0, to 1e-12 of it: a power series, from 2 on a continued fraction.
+inline double complementary_error(double x) {
+  const double square = x * x, density = exponential(-square);
+  if (x < 2.0) {
+    double sum = 1.0;
+    for (int i = 71; i > 1; i -= 2) sum = 1.0 + 2.0 * square / i * sum;
+    return 1.0 - 1.1283791670955126 * density * x * sum;
+  }
+  double below = x;
+  for (int i = 40; i > 0; --i) below = x + 0.5 * i / below;
+  return 0.5641895835477563 * density / below;
+}
 MAGLOC_END

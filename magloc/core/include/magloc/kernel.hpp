@@ -21,7 +21,8 @@
   X(refine, refinement)                    \
   X(candidate_bases, candidate_positions)  \
   X(choose_candidates, candidate_choice)   \
-  X(search_optima, search)
+  X(search_optima, search)                 \
+  X(source_uncertainties, source_uncertainty)
 
 #define MAGLOC_JOIN_(a, b, c) magloc_##a##_##b##c
 #define MAGLOC_JOIN(a, b, c) MAGLOC_JOIN_(a, b, c)

@@ -45,6 +45,22 @@ class Orthogonalisation {
 
   MAGLOC_INLINE Orthogonalisation(T *a, T *y, int64_t n, double lost) { pass<0>(a, y, n, lost); }
 
+  // Fill the lower triangle of (a^T a)^-1 of the original columns; NaN if a column is lost.
+  MAGLOC_INLINE void fill_inverse_squares(T (&result)[D][D]) const {
+    T inverse_share[D][D] = {};  // of the unit upper triangle of shares
+    for (int k = 0; k < D; ++k) {
+      inverse_share[k][k] = broadcast<T>(1.0);
+      for (int j = k; j-- > 0;)
+        for (int i = j + 1; i <= k; ++i) inverse_share[j][k] -= share_[j][i] * inverse_share[i][k];
+    }
+    for (int i = 0; i < D; ++i)
+      for (int j = 0; j <= i; ++j) {
+        result[i][j] = T{};
+        for (int k = i; k < D; ++k) result[i][j] += inverse_share[i][k] * inverse[k] * inverse_share[j][k];
+        for (const T &x : inverse) result[i][j] = choose(x > 0.0, result[i][j], broadcast<T>(nan));
+      }
+  }
+
   // Solve the least-squares problem y = a x of the original columns.
   MAGLOC_INLINE void solve(T (&x)[D]) const {
     for (int j = D; j-- > 0;) {

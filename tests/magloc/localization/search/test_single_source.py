@@ -28,7 +28,6 @@ from magloc.levels import DELTA_CHI2_95
 from magloc.localization.fit.prior import SourcePrior
 from magloc.localization.search.candidates import candidate_positions, linear_bases
 from magloc.localization.search.single_source import SingleSourceSearch
-from magloc.measurement import whitened_compiled
 from magloc.measurement.differences import DifferenceMeasurement, predicted_channels
 from magloc.measurement.whitened import WhitenedModel
 from tests import oracles
@@ -66,11 +65,6 @@ def scipy_chi2(array, readings, position, moment):
         residual, np.concatenate([position, moment / size]), x_scale="jac", xtol=1e-12, ftol=1e-12, gtol=1e-12
     )
     return 2.0 * found.cost
-
-
-def row_of(problem):
-    """The first row of a model in the layout of the compiled code."""
-    return whitened_compiled.row_at(whitened_compiled.ModelRows.of(problem), 0)
 
 
 class TestNoiseFreeReadings:
@@ -387,7 +381,7 @@ class TestIndependence:
 
 
 class TestReadableReference:
-    """The kernels against magloc.measurement.whitened."""
+    """The kernels and the model against its unit readings."""
 
     problem = WhitenedModel.of(
         random_array(2, 6), whitening(random_array(2, 6)), random_array(2, 6).ambient_fields[None]
@@ -402,10 +396,6 @@ class TestReadableReference:
         q = rng.normal(size=4)
         q /= np.linalg.norm(q)
         y = self.white.apply(1e-9 * rng.normal(size=18))
-        basis = np.empty((3, 18))
-        whitened_compiled.unit_basis(q, row_of(self.problem), basis)
-        expected = unit_basis(self.problem, q).T
-        assert_allclose(basis, expected, rtol=1e-9, atol=1e-12 * np.abs(expected).max())
         bases = linear_bases(self.problem, self.problem.gain[0], 0, q[None])
         assert y @ y - np.sum((y @ bases) ** 2) == pytest.approx(  # in single precision
             float(projected_chi2(self.problem, q, y)), abs=1e-5 * (y @ y)
@@ -416,12 +406,12 @@ class TestReadableReference:
     def test_homogeneous_jacobian(self, seed):
         rng = np.random.default_rng(seed)
         q, mu = rng.normal(size=4), rng.normal(size=3)
-        jacobian = np.empty((4, 18))
-        whitened_compiled.homogeneous_jacobian(q, mu, row_of(self.problem), jacobian)
-        free = jacobian.T - (self.white.basis @ (self.white.basis.T @ jacobian.T))
         scale = np.abs(unit_basis(self.problem, q) @ mu).max()
         expected = oracles.derivative(lambda x: unit_basis(self.problem, x) @ mu / scale, q, 1e-2, 1e-9)
-        assert_allclose(free / scale, expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
+        for axes in ([0, 1, 2], [1, 2, 3]):
+            tangent = np.eye(4)[None, None, :, axes]
+            jacobian = self.problem.position_jacobian(q[None, None], mu[None, None], self.problem.gain, tangent)[0]
+            assert_allclose(jacobian / scale, expected[:, axes], rtol=1e-5, atol=1e-6 * np.abs(expected).max())
 
     @given(SEEDS)
     @settings(max_examples=25, deadline=None)
