@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -47,7 +46,9 @@ class Trial(NamedTuple):
     chi2: float
 
 
-by_cost = attrgetter("cost")
+def by_cost(one: Trial) -> float:
+    """Return the cost of a trial, to sort by."""
+    return one.cost
 
 
 def lag_of(piece_at: Callable[[float], Piece], here: Trial | None = None, near: Trial | None = None) -> Lag:
