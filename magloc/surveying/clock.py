@@ -107,9 +107,9 @@ def lag_of(piece_at: Callable[[float], Piece], here: Trial | None = None, near: 
     if not explained or here.cost - at.cost < model.threshold * max(1.0, at.chi2):
         return Lag(0.0, math.inf)
     for _ in range(_SETTLING):  # sources of another lag hold the search back
-        new = best_near(min(trial(piece_at, at.lag_s, None), *sides(at), key=by_cost))
-        settled = new.cost > at.cost - 1.0
-        at = min(at, new, key=by_cost)
+        again = best_near(min([trial(piece_at, at.lag_s, None), *sides(at)], key=by_cost))
+        settled = again.cost > at.cost - 1.0
+        at = min(at, again, key=by_cost)
         if settled:
             break
     slope, curvature = beside(at)
