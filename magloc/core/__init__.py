@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from arrays.io.errors import InputError
 from magloc.core._declarations import ffi
 
 _HERE = Path(__file__).parent
@@ -158,8 +159,11 @@ def set_threads(n: int) -> None:
 
 
 def _available_threads() -> int:
-    if wanted := os.environ.get("MAGLOC_NUM_THREADS") or os.environ.get("NUMBA_NUM_THREADS"):
-        return max(1, int(wanted))
+    for variable in ("MAGLOC_NUM_THREADS", "NUMBA_NUM_THREADS"):
+        if wanted := os.environ.get(variable):
+            if not (wanted.isascii() and wanted.isdecimal() and int(wanted[:9]) > 0):
+                raise InputError(f"Environment variable {variable}: found {wanted!r:.40}, expected a number above 0.")
+            return int(wanted[:9])
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -190,4 +194,10 @@ def include_dir() -> Path:
 
 
 if _wanted := os.environ.get("MAGLOC_ISA"):
-    use_instruction_set(_wanted)
+    try:
+        use_instruction_set(_wanted)
+    except ValueError:
+        raise InputError(
+            f"Environment variable MAGLOC_ISA: found {_wanted!r:.40}, expected baseline, avx2 or avx512, as far as this"
+            " machine and build have them."
+        ) from None

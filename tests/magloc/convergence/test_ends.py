@@ -16,7 +16,7 @@ agrees if the difference is small in units of its own standard deviations, ``√
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
 from math import sqrt
@@ -31,7 +31,6 @@ from numpy.typing import NDArray
 from arrays.array import SensorArray
 from arrays.geometries import tetrahedron
 from arrays.sensor import Sensor
-from magloc import core
 from magloc.convergence.ends import Ends, ScaledDifferences
 from magloc.convergence.filters import DampedFilter, IekfFilter, RepeatedFilter, field_weights
 from magloc.kalman import predict_square_root, sequential_update
@@ -94,24 +93,6 @@ def starts_of(kind: str, n: int, array: SensorArray = TETRAHEDRON) -> Array:
 
 def in_sigmas(difference: Array, S: Array) -> float:
     return float(np.linalg.norm(np.linalg.solve(S, difference)))
-
-
-@pytest.fixture
-def threads() -> Iterator[Callable[[int], None]]:
-    before = core.threads()
-    yield core.set_threads
-    core.set_threads(before)
-
-
-@pytest.fixture(params=["baseline", "avx2", "avx512"])
-def instruction_set(request: pytest.FixtureRequest) -> Iterator[None]:
-    before = core.instruction_set()
-    try:
-        core.use_instruction_set(request.param)
-    except ValueError:
-        pytest.skip(f"this machine does not have {request.param}")
-    yield
-    core.use_instruction_set(before)
 
 
 def solve_exactly(matrix: list[list[Fraction]], right: list[Fraction]) -> list[Fraction]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import subprocess
@@ -125,3 +126,18 @@ class TestHeaders:
     def test_the_list_of_kernels_is_that_of_the_header(self) -> None:
         listed = re.findall(r"X\((\w+), \w+\)", (core.include_dir() / "magloc" / "kernel.hpp").read_text())
         assert {f"magloc_{name}" for name in listed if name != "kernel"} == KERNELS
+
+
+class TestEnvironment:
+    @pytest.mark.parametrize(
+        ("variable", "value", "expected"),
+        [("MAGLOC_ISA", "sse9", "baseline, avx2 or avx512"), ("MAGLOC_NUM_THREADS", "two", "a number above 0")],
+    )
+    def test_a_wrong_value_is_named_in_one_sentence(self, variable: str, value: str, expected: str) -> None:
+        code = "import sys; from magloc.cli.__main__ import main; sys.exit(main())"
+        command = [sys.executable, "-c", code, "map", "--grid", "3"]
+        environment = {**os.environ, variable: value}
+        done = subprocess.run(command, capture_output=True, encoding="utf-8", env=environment, timeout=WAIT_S)
+        assert done.returncode == 2
+        assert f"Environment variable {variable}: found {value!r}, expected {expected}" in done.stderr
+        assert done.stderr.count("\n") == 1

@@ -4,7 +4,7 @@ Physics is tested on the reference (test_dipole.py). What is tested here is what
 and their edges, the lanes, the threads, the rule on the source, and the layouts of the arrays that go in.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, cast
 
 import numpy as np
@@ -12,7 +12,6 @@ import pytest
 from numba import njit
 from numpy.typing import NDArray
 
-from magloc import core
 from magloc.fields import dipole, dipole_compiled
 from magloc.fields import points as kernels
 from tests import oracles
@@ -58,13 +57,6 @@ def components_at(d: Array, m: Array) -> tuple[tuple[float, ...], tuple[float, .
         dipole_compiled.field_matrix_components(d[0], d[1], d[2]),
         dipole_compiled.gradient_components(d[0], d[1], d[2], m[0], m[1], m[2]),
     )
-
-
-@pytest.fixture
-def threads() -> Iterator[Callable[[int], None]]:
-    before = core.threads()
-    yield core.set_threads
-    core.set_threads(before)
 
 
 pytestmark = pytest.mark.usefixtures("instruction_set")

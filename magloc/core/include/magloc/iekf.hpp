@@ -7,7 +7,7 @@
 #include "dipole.hpp"
 #include "kernel.hpp"
 #include "lane_items.hpp"
-#include "symmetric.hpp"
+#include "linear.hpp"
 
 MAGLOC_BEGIN
 // Reading of a sensor less the field of a state there, and derivatives of this field by position and moment. Their
@@ -268,7 +268,7 @@ class StartsFilter {
     const Ldl<T, 6> factors(now_.matrix, lost_pivot);
     T change[6];
     factors.solve(now_.right, change);
-    for (int i = 0; i < 6; ++i) x_[i] += factors.definite * change[i];
+    for (int i = 0; i < 6; ++i) x_[i] += factors.definite() * change[i];
     if (problem_.method == repeated) predict();
   }
 

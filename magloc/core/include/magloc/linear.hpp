@@ -70,12 +70,13 @@ class Orthogonalisation {
   }
 };
 
-// Factors L D L^T of a positive matrix (lower triangle) whose diagonal a_jj is raised to (1 + damping) a_jj + added_j.
-// A pivot that loses all but `lost` of its diagonal counts as infinite: its variable stays zero.
+// Factors L D L^T of a positive matrix (lower triangle) whose diagonal a_jj may be raised to (1 + damping) a_jj +
+// added_j. A pivot that loses all but `lost` of its diagonal counts as infinite: its variable stays zero.
 template <class T, int n>
 struct Ldl {
-  T l[n][n], inverse[n];
+  T l[n][n], inverse[n];  // inverse: of D, or zero where a pivot is lost
 
+  MAGLOC_INLINE Ldl(const T (&a)[n][n], double lost) : Ldl(a, T{}, no_ridge, lost) {}
   MAGLOC_INLINE Ldl(const T (&a)[n][n], T damping, const T (&added)[n], double lost) {
     for (int j = 0; j < n; ++j) {
       const T diagonal = (1.0 + damping) * a[j][j] + added[j];
@@ -92,6 +93,12 @@ struct Ldl {
       }
     }
   }
+  // One, or NaN if a pivot is lost.
+  MAGLOC_INLINE T definite() const {
+    T result = broadcast<T>(1.0);
+    for (const T &x : inverse) result = choose(x > 0.0, result, broadcast<T>(nan));
+    return result;
+  }
   MAGLOC_INLINE void solve(const T (&b)[n], T (&x)[n]) const {
     for (int i = 0; i < n; ++i) {
       x[i] = b[i];
@@ -102,5 +109,29 @@ struct Ldl {
       for (int k = i + 1; k < n; ++k) x[i] -= l[k][i] * x[k];
     }
   }
+
+ private:
+  static constexpr T no_ridge[n] = {};
 };
+
+// Replace the lower triangle of A by that of -A^-1: the sweep operator on every variable.
+template <class T, int n>
+MAGLOC_INLINE void invert_and_negate(T (&a)[n][n]) {
+  MAGLOC_UNROLL
+  for (int k = 0; k < n; ++k) {
+    const T inverse = 1.0 / a[k][k];
+    T column[n];
+    MAGLOC_UNROLL
+    for (int i = 0; i < n; ++i) column[i] = i < k ? a[k][i] : a[i][k];
+    MAGLOC_UNROLL
+    for (int i = 0; i < n; ++i) {
+      const T scaled = inverse * column[i];
+      MAGLOC_UNROLL
+      for (int j = 0; j <= i; ++j)
+        if (i != k && j != k) a[i][j] -= scaled * column[j];
+      if (i != k) (i < k ? a[k][i] : a[i][k]) = scaled;
+    }
+    a[k][k] = -inverse;
+  }
+}
 MAGLOC_END

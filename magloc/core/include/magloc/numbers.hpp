@@ -41,7 +41,6 @@ MAGLOC_INLINE double square_root(double x) { return __builtin_sqrt(x); }
 MAGLOC_INLINE double choose(bool condition, double a, double b) { return condition ? a : b; }
 MAGLOC_INLINE double get_lane(double x, int) { return x; }
 MAGLOC_INLINE void set_lane(double &x, int, double value) { x = value; }
-MAGLOC_INLINE bool any(bool condition) { return condition; }
 
 #if MAGLOC_LANES > 1
 typedef double Lanes __attribute__((vector_size(8 * MAGLOC_LANES)));
@@ -58,11 +57,6 @@ MAGLOC_INLINE Lanes square_root(Lanes x) {
 MAGLOC_INLINE Lanes choose(Mask condition, Lanes a, Lanes b) { return condition ? a : b; }
 MAGLOC_INLINE double get_lane(const Lanes &x, int i) { return x[i]; }
 MAGLOC_INLINE void set_lane(Lanes &x, int i, double value) { x[i] = value; }
-MAGLOC_INLINE bool any(Mask condition) {
-  bool found = false;
-  for (int i = 0; i < MAGLOC_LANES; ++i) found |= condition[i] != 0;
-  return found;
-}
 #else
 typedef double Lanes;
 typedef bool Mask;

@@ -9,7 +9,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -19,7 +19,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 from arrays.array import SensorArray
 from arrays.geometries import tetrahedron
 from arrays.sensor import Sensor
-from magloc import core
 from magloc.localization.fit import refinement
 from magloc.localization.fit.gauss_newton import damped_gauss_newton, refine
 from magloc.localization.search.single_source import SingleSourceSearch
@@ -32,22 +31,7 @@ from tests.magloc.localization.search.test_candidates import CASES, regime
 N_ROWS = 13  # no multiple of a number of lanes
 
 
-@pytest.fixture(params=["baseline", "avx2", "avx512"], autouse=True)
-def instruction_set(request: pytest.FixtureRequest) -> Iterator[str]:
-    before = core.instruction_set()
-    try:
-        core.use_instruction_set(request.param)
-    except ValueError:
-        pytest.skip(f"this machine does not have {request.param}")
-    yield request.param
-    core.use_instruction_set(before)
-
-
-@pytest.fixture
-def threads() -> Iterator[Callable[[int], None]]:
-    before = core.threads()
-    yield core.set_threads
-    core.set_threads(before)
+pytestmark = pytest.mark.usefixtures("instruction_set")
 
 
 def equal_sensors() -> SensorArray:

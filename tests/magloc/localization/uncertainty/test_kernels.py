@@ -9,7 +9,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -18,7 +18,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from arrays.array import SensorArray
 from arrays.sensor import Sensor
-from magloc import core
 from magloc.localization.fit import refinement
 from magloc.localization.fit.gauss_newton import covariances
 from magloc.localization.fit.optima import Optima
@@ -38,22 +37,7 @@ ARRAYS = {
 }
 
 
-@pytest.fixture(params=["baseline", "avx2", "avx512"], autouse=True)
-def instruction_set(request: pytest.FixtureRequest) -> Iterator[str]:
-    before = core.instruction_set()
-    try:
-        core.use_instruction_set(request.param)
-    except ValueError:
-        pytest.skip(f"this machine does not have {request.param}")
-    yield request.param
-    core.use_instruction_set(before)
-
-
-@pytest.fixture
-def threads() -> Iterator[Callable[[int], None]]:
-    before = core.threads()
-    yield core.set_threads
-    core.set_threads(before)
+pytestmark = pytest.mark.usefixtures("instruction_set")
 
 
 def optima_of(array: SensorArray, name: str = "product", n_rows: int = N_ROWS) -> Optima:
