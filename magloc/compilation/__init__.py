@@ -181,14 +181,6 @@ def internal(function: Function, **options: Any) -> Function:
     return cast(Function, cached(_njit(**compiler.internal_options(), **options)(function), kind))
 
 
-def inlined(function: Function) -> Function:
-    """Compile a piece of a loop over lanes: a call that remained one would keep the loop from being vectorised.
-
-    Python cannot call it.
-    """
-    return internal(function, forceinline=True)
-
-
 def inlined_sum(function: Function) -> Function:
     """Compile a sum whose terms may be added in any order, which lets vector instructions do it."""
     return internal(function, forceinline=True, fastmath={"contract", "reassoc"})
