@@ -32,6 +32,7 @@ def made(kind: str, tree: Path, place: Path) -> Path:
         "PYTHONPATH": str(tree / "magloc" / "core"),
         "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",  # cmake and ninja
         "SKBUILD_BUILD_DIR": str(place / "build"),
+        "PYTHONDONTWRITEBYTECODE": "1",  # a build must not add files to the tree that another test lists
     }
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=tree, stdout=subprocess.PIPE, encoding="utf-8", timeout=WAIT_S, check=True,
