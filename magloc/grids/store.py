@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import shutil
 import sys
@@ -140,6 +141,8 @@ class Sweep(Closing):
             if np.isnan(self._seconds[box.place]):
                 continue
             try:
+                for name, array in self._arrays.items():
+                    _check_stated_size(array, self.path.joinpath(name, "c", *map(str, box.place)))
                 values = {name: np.asarray(array[box.region]) for name, array in self._arrays.items()}
                 self._check_complete(values)
             except UNREADABLE as error:
@@ -160,6 +163,9 @@ def open_map(path: str | os.PathLike[str]) -> xr.Dataset:
 
     with warnings.catch_warnings():
         warnings.filterwarnings("error", ".*not recognized as a component")  # an array whose description is damaged
+        for name, array in _opened(Path(path)).arrays():
+            for file in Path(path, name, "c").rglob("*"):
+                _check_stated_size(array, file)
         dataset = xr.open_zarr(path, chunks=None, consolidated=False)
     seconds = float(dataset[SECONDS_OF_CHUNK].sum())
     dataset = dataset.drop_vars(SECONDS_OF_CHUNK).assign_attrs(seconds=seconds)
@@ -236,6 +242,9 @@ def _opened(path: Path) -> zarr.Group:
 
     if not path.is_dir():  # early versions of zarr make what they are to open
         raise InputError(_SOMETHING_ELSE.format(path))
+    for file in path.rglob("*"):
+        if not (file.is_file() or file.is_dir()):  # a device or a pipe would be read without end
+            raise InputError(f"{path}: found {file.relative_to(path)}, which is neither a file nor a folder.")
     try:
         return zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
     except UNREADABLE:
@@ -261,6 +270,26 @@ def _arrays_of_same_map(cube: CubeMap, group: zarr.Group, path: Path) -> dict[st
             f"{path}: found a map of which a part is missing: remove it, or choose another folder."
         ) from None
     return arrays
+
+
+def _check_stated_size(array: Any, file: Path) -> None:
+    """Refuse a chunk compressed by zstd that states another size than its own: the decoder allocates what it states.
+
+    The layout of the first bytes is that of RFC 8878, section 3.1.1.1.
+    """
+    if not file.is_file():  # a folder, or a chunk that is not done
+        return
+    with file.open("rb") as stream:
+        head = stream.read(18)
+    if len(head) < 5 or head[:4] != b"\x28\xb5\x2f\xfd":
+        return
+    single_segment = head[4] >> 5 & 1
+    width = (single_segment, 2, 4, 8)[head[4] >> 6]
+    begin = 6 - single_segment + (0, 1, 2, 4)[head[4] & 3]
+    stated = int.from_bytes(head[begin : begin + width], "little") + (256 if width == 2 else 0)
+    expected = math.prod(array.chunks) * array.dtype.itemsize
+    if width and stated != expected:
+        raise ValueError(f"it states {stated} bytes in place of {expected}")
 
 
 def _edge(arrays: Mapping[str, Any], marks: FloatArray, path: Path) -> int:

@@ -152,6 +152,8 @@ def _read_map(folder: Path) -> MapResult:
 
     try:
         dataset = open_map(store)
+    except InputError:
+        raise
     except UNREADABLE:
         raise _no_map(store) from None
     return map_of(dataset, str(folder))

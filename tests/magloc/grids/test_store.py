@@ -265,6 +265,22 @@ class TestResume:
         assert len(run(waves, tmp_path / "map.zarr").unreadable) == 1
         assert_same(tmp_path / "map.zarr", in_memory(waves))
 
+    def test_a_chunk_that_states_a_huge_size(self, waves, tmp_path):
+        """The decoder would allocate the size that the chunk's header states."""
+        run(waves, tmp_path / "map.zarr")
+        path = tmp_path / "map.zarr/height/c/0/0/0"
+        data = path.read_bytes()
+        width = (data[4] >> 5 & 1, 2, 4, 8)[data[4] >> 6]
+        begin = 6 - (data[4] >> 5 & 1)
+        stated = int.from_bytes(data[begin : begin + width], "little") + (256 if width == 2 else 0)
+        assert stated == 16**3 * 8  # the field of RFC 8878 is where this test looks for it
+        header = data[:4] + bytes([data[4] & 0x3F | 0xC0]) + data[5:begin] + (2**34).to_bytes(8, "little")
+        path.write_bytes(header + data[begin + width :])
+        with pytest.raises(ValueError, match=f"states {2**34} bytes"):
+            open_map(tmp_path / "map.zarr")
+        assert len(run(waves, tmp_path / "map.zarr").unreadable) == 1
+        assert_same(tmp_path / "map.zarr", in_memory(waves))
+
     def test_a_damaged_mark(self, waves, tmp_path):
         run(waves, tmp_path / "map.zarr")
         truncate(tmp_path / "map.zarr/seconds_of_chunk/c/0/0/1")
@@ -307,6 +323,16 @@ class TestRefused:
         (tmp_path / "map.zarr/height/zarr.json").unlink()
         with pytest.raises(InputError, match="a part is missing"):
             Sweep(waves, tmp_path / "map.zarr")
+
+    @pytest.mark.skipif(sys.platform == "win32", reason="there are no devices in folders")
+    @pytest.mark.parametrize("name", ["height/c/0/0/0", "x/zarr.json"])
+    def test_a_device_in_place_of_a_file(self, waves, name, tmp_path):
+        run(waves, tmp_path / "map.zarr")
+        (tmp_path / "map.zarr" / name).unlink()
+        (tmp_path / "map.zarr" / name).symlink_to("/dev/zero")
+        for attempt in (lambda: Sweep(waves, tmp_path / "map.zarr"), lambda: open_map(tmp_path / "map.zarr")):
+            with pytest.raises(InputError, match=f"found {name}, which is neither a file nor a folder"):
+                attempt()
 
     def test_marks_of_other_chunks(self, waves, tmp_path):
         run(waves, tmp_path / "map.zarr")
