@@ -5,7 +5,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 export OPENBLAS_NUM_THREADS ?= 1
-# Compiled modules are kept, beside those of numba: without them every command that a test starts compiles its own.
+# Compiled modules are kept: without them every command that a test starts compiles its own.
 unexport PYTHONDONTWRITEBYTECODE
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 MAKE_VENV = $(PYTHON) -m venv --clear
@@ -13,7 +13,7 @@ MAKE_VENV = $(PYTHON) -m venv --clear
 KERNEL_TESTS := tests/magloc/core tests/magloc/fields/test_points.py
 
 .PHONY: map test test-full test-oldest mutation coverage licences sbom audit wheel bench docs notebooks pictures chromium lint sanitize clean
-.PHONY: ready compiled-magloc compiled-adcs compiled-tests
+.PHONY: ready compiled-tests
 
 map: .venv/installed
 	$(BIN)/magloc map
@@ -32,13 +32,9 @@ lint: .venv/installed-test
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-cache --no-logo
 
-# Kernels and tests are compiled once, beside the linters: left to the tests, both of their processes would do it, and
-# keep the memory that the compiler takes.
+# Tests are compiled once, beside the linters.
 ready: .venv/installed-test
-	@$(MAKE) --no-print-directory --jobs=2 lint compiled-magloc compiled-adcs compiled-tests
-
-compiled-magloc compiled-adcs: compiled-%: .venv/installed-test
-	$(BIN)/$* warm-up --quiet
+	@$(MAKE) --no-print-directory --jobs=2 lint compiled-tests
 
 compiled-tests: .venv/installed-test
 	@$(BIN)/python -m pytest -qq --collect-only >/dev/null
@@ -55,7 +51,7 @@ sanitize: .venv/installed-test
 mutation: .venv/installed-test
 	$(BIN)/python -m tests.mutation
 
-# Which lines and branches the tests run, compiled code left out; fails below 92 and 85 %.
+# Which lines and branches the tests run; fails below 92 and 85 %.
 coverage: .venv/installed-test chromium
 	rm -f .coverage .coverage.*
 	$(BIN)/coverage run -m pytest -q -n 2 -m "not slow"

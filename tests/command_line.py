@@ -50,7 +50,7 @@ def assert_refused(outcome: Outcome, *fragments: str) -> None:
 def viewer_started(*arguments: str | Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
     """``magloc view`` in a process of its own, and the address that it prints."""
     command = [sys.executable, "-m", "magloc.cli", "view", *map(str, arguments)]
-    environment = {**os.environ, "NUMBA_NUM_THREADS": "1"}
+    environment = {**os.environ, "MAGLOC_NUM_THREADS": "1"}
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
     ) as process:

@@ -2,8 +2,7 @@
 
 Nothing is changed in place: the tree is copied, and the tests run there. A change is killed by the first test file that
 fails or hangs among those nearest to it: its mirror first, then those that reach it by the fewest imports. All lines
-are drawn before any is tried; those with little to compile are tried first. What is found goes to a file line by line,
-and the same seed goes on where it was stopped.
+are drawn before any is tried. What is found goes to a file line by line, and the same seed goes on where it was stopped.
 """
 
 from __future__ import annotations
@@ -70,8 +69,8 @@ CONVERSION = re.compile(
 )
 # Of a tolerance, a small power of ten, the order alone means something; so does that of a choice, which has a name.
 TOLERANCE = 1e-4
-# A hang: longer than this, with kernels to compile or without, and than some times what the file takes unchanged.
-LONGEST_S, LONGEST_COMPILED_S, SLOWER = 60.0, 300.0, 4.0
+# A hang: longer than this, and than some times what the file takes unchanged.
+LONGEST_S, SLOWER = 60.0, 4.0
 HANGS = "hangs"
 UNTESTED = "untested"  # no test file reaches it, or none in time: no part of the score
 
@@ -264,7 +263,7 @@ class Reach:
 
     def tests(self, path: str) -> list[str]:
         """Test files of a product file: its mirror, then by imports and by how much of the path is the same."""
-        where = Path("tests", path).with_name(f"test_{Path(path).stem.removesuffix('_compiled')}.py")
+        where = Path("tests", path).with_name(f"test_{Path(path).stem}.py")
 
         def near(module: str) -> tuple[bool, bool, int, int, str]:
             file = Path(*module.split(".")).with_suffix(".py")
@@ -289,11 +288,11 @@ def _names(module: str, tree: ast.Module) -> Iterator[str]:
             yield node.value.replace(":", ".")  # as commands are registered
     if ".test_" in module:
         mirror = module.removeprefix("tests.").replace(".test_", ".")
-        yield from (f"{mirror}.x", f"{mirror}_compiled.x")
+        yield f"{mirror}.x"
 
 
 class Laboratory:
-    """A copy of the tree in which changes are tried, with what numba has compiled for it."""
+    """A copy of the tree in which changes are tried."""
 
     def __init__(self, root: Path, unchanged: Path, reach: Reach, seconds: dict[str, float]) -> None:
         self.root, self.unchanged, self.reach, self.seconds = root, unchanged, reach, seconds
@@ -301,32 +300,21 @@ class Laboratory:
         self.stopped = False
         copied(unchanged, root)
 
-    def inside(self, mutant: Mutant) -> list[str]:
-        """Modules whose compiled code may hold what is changed, which numba does not look at.
-
-        Compiled callers hold what they called and all numbers of modules; no module computes one of these by a function
-        of the product.
-        """
-        if mutant.in_function and "\n@compiled" not in (self.unchanged / mutant.path).read_text(encoding="utf-8"):
-            return []
-        return [name for name in self.reach.from_module(mutant.path) if not name.startswith("tests.")]
-
     def verdict(self, mutant: Mutant, most_files: int, most_s: float) -> str:
         """What killed a change; empty where it survives."""
         file = self.root / mutant.path
         source, times = file.read_bytes(), file.stat()
-        inside, left, tried = self.inside(mutant), most_s, 0
-        limit_s = LONGEST_COMPILED_S if sum(self._forget(name) for name in inside) else LONGEST_S
+        left, tried = most_s, 0
         try:
             file.write_bytes(mutant.applied(source))
             for test in self.reach.tests(mutant.path)[:most_files]:
                 if self.seconds.get(test, 0.0) >= left:
                     continue
                 begin = time.monotonic()
-                killed = self._run(self.root, test, max(limit_s, SLOWER * self.seconds.get(test, 0.0)))
+                killed = self._run(self.root, test, max(LONGEST_S, SLOWER * self.seconds.get(test, 0.0)))
                 took = time.monotonic() - begin
                 left -= took
-                if killed and self._unchanged(killed, limit_s):
+                if killed and self._unchanged(killed):
                     return killed
                 if not killed:
                     self.seconds.setdefault(test, took)
@@ -334,8 +322,6 @@ class Laboratory:
         finally:
             file.write_bytes(source)
             os.utime(file, ns=(times.st_atime_ns, times.st_mtime_ns))
-            for name in {*inside, mutant.path.removesuffix(".py").replace("/", ".")}:
-                self._recall(name)
         return "" if tried else UNTESTED
 
     def stop(self) -> None:
@@ -344,15 +330,15 @@ class Laboratory:
         if self.process and self.process.poll() is None:
             os.killpg(self.process.pid, signal.SIGKILL)
 
-    def _unchanged(self, killed: str, limit_s: float) -> bool:
+    def _unchanged(self, killed: str) -> bool:
         """Whether what failed does not fail in the tree as it is, nor takes as long."""
         test = killed.removesuffix(f": {HANGS}")
         if test not in self.seconds:
             begin = time.monotonic()
-            failed = self._run(self.unchanged, test.partition(": status")[0], limit_s)
+            failed = self._run(self.unchanged, test.partition(": status")[0], LONGEST_S)
             fails = failed and not failed.endswith(HANGS)
             self.seconds[test] = float("inf") if fails else time.monotonic() - begin
-        return self.seconds[test] < (limit_s / SLOWER if killed.endswith(HANGS) else float("inf"))
+        return self.seconds[test] < (LONGEST_S / SLOWER if killed.endswith(HANGS) else float("inf"))
 
     def _run(self, root: Path, test: str, most_s: float) -> str:
         """What fails first in a test file, or that it hangs; empty where all is well."""
@@ -378,28 +364,11 @@ class Laboratory:
         failed = re.search(r"^(?:FAILED|ERROR) ([^\s[]+)", out, re.MULTILINE)
         return failed[1] if failed else f"{test}: status {self.process.returncode}"
 
-    def _forget(self, module: str) -> int:
-        files = _caches(self.root, module)
-        for file in files:
-            file.unlink()
-        return len(files)
-
-    def _recall(self, module: str) -> None:
-        self._forget(module)
-        for file in _caches(self.unchanged, module):
-            shutil.copy2(file, self.root / file.relative_to(self.unchanged))
-
 
 def copied(tree: Path, place: Path) -> None:
-    """The tree as it is, and what numba has compiled for it."""
+    """The tree as it is."""
     left_out = shutil.ignore_patterns(".git", ".venv*", ".artefacts", "_build", ".*_cache")
     shutil.copytree(tree, place, ignore=left_out)
-
-
-def _caches(root: Path, module: str) -> list[Path]:
-    path = root / module.replace(".", "/")
-    names = [f"{of}{path.name}.*.{end}" for of in ("", "internal-") for end in ("nbi", "nbc")]
-    return [file for name in names for file in (path.parent / "__pycache__").glob(name)]
 
 
 def drawn(n_lines: int, seed: int, packages: tuple[str, ...]) -> list[Mutant]:
@@ -456,9 +425,6 @@ def main() -> int:
         for laboratory in laboratories:
             free.put(laboratory)
 
-        def compiles(mutant: Mutant) -> int:
-            return sum(len(_caches(unchanged, name)) for name in laboratories[0].inside(mutant))
-
         def tried(mutant: Mutant) -> None:
             laboratory = free.get()
             try:
@@ -473,7 +439,7 @@ def main() -> int:
                 known[mutant.name] = one
 
         with ThreadPoolExecutor(arguments.jobs) as pool:
-            left = sorted((mutant for mutant in chosen if mutant.name not in known), key=compiles)
+            left = [mutant for mutant in chosen if mutant.name not in known]
             futures = [pool.submit(tried, mutant) for mutant in left]
             try:
                 for future in futures:

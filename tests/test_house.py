@@ -17,7 +17,6 @@ import pytest
 
 import adcs
 import magloc
-from magloc import linalg_compiled
 from tests.conftest import REPOSITORY
 
 PACKAGES = ("arrays", "magloc", "adcs", "sims")
@@ -202,90 +201,6 @@ class TestWholeFiles:
             "style.save(figure, path)",
         ):
             assert not self.in_place(ast.parse(code)), code
-
-
-class TestInterruptedKernels:
-    """A named tuple is made by Python code, in which a signal may raise: numba does not look, and crashes."""
-
-    @staticmethod
-    def callers(trees: dict[Path, ast.Module]) -> list[str]:
-        """Functions that are not compiled themselves and get a named tuple from a kernel."""
-        functions = {
-            path: [n for n in ast.walk(tree) if isinstance(n, ast.FunctionDef)] for path, tree in trees.items()
-        }
-        named = {
-            node.name
-            for tree in trees.values()
-            for node in ast.walk(tree)
-            if isinstance(node, ast.ClassDef) and any(ast.unparse(base) == "NamedTuple" for base in node.bases)
-        }
-        compiled = {
-            (path, node.name): "" if node.returns is None else ast.unparse(node.returns)
-            for path, nodes in functions.items()
-            for node in nodes
-            if any(ast.unparse(decorator).startswith("compiled") for decorator in node.decorator_list)
-        }
-        kernels = {name for (_, name), made in compiled.items() if named & set(re.findall(r"\w+", made))}
-        own = {name for _, name in compiled}
-        return [
-            f"{path.relative_to(REPOSITORY)}: {node.name} calls {call.func.id}"
-            for path, nodes in functions.items()
-            if any(f"{name}(" in path.read_text(encoding="utf-8") for name in kernels)
-            for node in nodes
-            if node.name not in own
-            for call in ast.walk(node)
-            if isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id in kernels
-        ]
-
-    def test_none_makes_a_named_tuple(self, trees: dict[Path, ast.Module]) -> None:
-        assert self.callers(trees) == []
-
-    def test_such_would_be_found(self) -> None:
-        path = REPOSITORY / "magloc/convergence/ends.py"
-        text = "class Ends(NamedTuple): ...\n@compiled\ndef ends() -> Ends: ...\ndef run(): return ends()"
-        assert self.callers({path: ast.parse(text)}) == ["magloc/convergence/ends.py: run calls ends"]
-
-
-class TestInternalKernels:
-    """One that only kernels call has no code that Python could call: a process that does, ends."""
-
-    KINDS = frozenset(("compiled", "internal", "inlined", "inlined_sum", "compiled_parallel"))
-
-    def python(self, node: ast.AST) -> Iterator[ast.expr]:
-        """Names outside of all kernels."""
-        for child in ast.iter_child_nodes(node):
-            if isinstance(child, ast.FunctionDef) and self.KINDS & {getattr(d, "id", "") for d in child.decorator_list}:
-                continue
-            if isinstance(child, ast.Name | ast.Attribute):
-                yield child
-            yield from self.python(child)
-
-    def used(self, tree: ast.Module, known: Mapping[str, object]) -> list[str]:
-        """Internal kernels that Python uses in a module that knows some objects by name."""
-        found = []
-        for node in self.python(tree):
-            if isinstance(node, ast.Name):
-                value = known.get(node.id)
-            else:
-                value = getattr(known.get(getattr(node.value, "id", "")), node.attr, None)
-            if getattr(value, "targetoptions", {}).get("no_cpython_wrapper"):
-                found.append(ast.unparse(node))
-        return found
-
-    def test_none_is_used_by_python(self, trees: dict[Path, ast.Module]) -> None:
-        found = {}
-        for path, tree in trees.items():
-            if "_compiled" in path.read_text(encoding="utf-8") or path.stem.endswith("_compiled"):
-                name = ".".join(path.relative_to(REPOSITORY).with_suffix("").parts).removesuffix(".__init__")
-                found[name] = self.used(tree, vars(importlib.import_module(name)))
-        assert len(found) > 20
-        assert {name: of_module for name, of_module in found.items() if of_module} == {}
-
-    def test_such_would_be_found(self) -> None:
-        known = {"put": linalg_compiled.put, "linalg": linalg_compiled}
-        source = "@compiled\ndef kernel(a, b):\n    put(a, b)\n\ndef python(a, b):\n    put(a, b)\n    linalg.put(a, b)"
-        assert linalg_compiled.put.targetoptions["no_cpython_wrapper"]
-        assert self.used(ast.parse(source), known) == ["put", "linalg.put"]
 
 
 class TestSizes:

@@ -66,8 +66,8 @@ for _name, _where, _help in (
     ),
     (
         "warm-up",
-        "adcs.cli.warm_up:warm_up",
-        "Compile ahead what run, estimate and imu compile when they are first used.",
+        "magloc.cli.first_steps.warm_up:warm_up",
+        "Do nothing: no command compiles anything any more. The next release removes it.",
     ),
 ):
     app.command(_where, name=_name, help=_help)

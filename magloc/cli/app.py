@@ -67,7 +67,7 @@ for _name, _where, _help in (
     (
         "warm-up",
         "magloc.cli.first_steps.warm_up:warm_up",
-        "Compile ahead what locate, track, map and bounds compile when they are first used.",
+        "Do nothing: no command compiles anything any more. The next release removes it.",
     ),
 ):
     app.command(_where, name=_name, help=_help)

@@ -33,7 +33,6 @@ DONE = 0
 INTERNAL = 1
 BAD_INPUT = 2
 BROKEN_PIPE = 141
-_COMPILATION = "magloc.compilation"
 _LONGEST_WORD = 200
 _LOG = logging.getLogger(__name__)
 _warnings: list[str] = []
@@ -66,12 +65,9 @@ class QuietOptions:
             for name in PACKAGES:
                 logging.getLogger(name).setLevel(logging.WARNING)
         if self.threads is not None:
-            import numba
-
             from magloc import core
 
             core.set_threads(min(self.threads, os.cpu_count() or 1))
-            numba.set_num_threads(min(self.threads, numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
 
 
 @Parameter(name="*", group="Common options")
@@ -255,9 +251,7 @@ class _Notes(logging.Handler):
         self.program = program
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Print one record; progress only where somebody watches."""
-        if record.name == _COMPILATION and not sys.stderr.isatty():
-            return
+        """Print one record."""
         prefix = ""
         if record.levelno >= logging.WARNING:
             prefix = "warning: "
@@ -296,19 +290,6 @@ def demonstrate(
         if len(lines) > first + last:
             lines[first:-last] = [f"… {len(lines) - first - last} more lines …"]
         print("".join(f"{line}\n" for line in lines), end="", flush=True)
-
-
-def warm_up(app: App, calls: Sequence[Sequence[str]], common: QuietOptions) -> None:
-    """Run commands for what they compile, not for what they print."""
-    if not common.quiet:
-        print_note("compiling for this machine, some minutes if nothing is compiled yet", app.name[0])
-    with progress(len(calls), "commands", quiet=common.quiet) as advance:
-        for tokens in calls:
-            with contextlib.redirect_stdout(io.StringIO()):
-                call(app, [*tokens, "--quiet"])
-            advance(1)
-    if not common.quiet:
-        print_note("compiled: no command has to wait for that again", app.name[0])
 
 
 def json_text(value: object) -> str:

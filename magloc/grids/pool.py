@@ -33,7 +33,6 @@ def process_pool(processes: int) -> Iterator[ProcessPoolExecutor]:
 
 def _prepare() -> None:
     """Settings of a process: one thread, and an interruption is the business of the process that started it."""
-    os.environ["NUMBA_NUM_THREADS"] = "1"  # compiled code is not loaded yet
     core.set_threads(1)
     warnings.simplefilter("ignore")  # those of NumPy: what a user is told is logged
     one_blas_thread.__enter__()  # for good

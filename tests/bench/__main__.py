@@ -14,7 +14,6 @@ from tests.bench import (
     filters,
     fixes,
     inertial,
-    machine,
     maps,
     memory,
     mockup,
@@ -37,7 +36,6 @@ GROUPS = {
     "bounds": bounds,
     "mockup": mockup,
     "stars": stars,
-    "machine": machine,
     "recording": recording,
     "memory": memory,
 }

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
-import numba
 import numpy as np
 
 from arrays.array import SensorArray
 from arrays.geometries import cube, tetrahedron
+from magloc import core
 from magloc.bounds.crlb import cramer_rao_bounds
 from magloc.bounds.over_moments import sigma_table
 from magloc.directions import moments_on_sphere
@@ -33,7 +33,7 @@ def arrays() -> dict[str, SensorArray]:
 
 def rows(size: Size) -> Iterator[Row]:
     """Ours with all threads and with one; NumPy with one."""
-    threads = numba.get_num_threads()
+    threads = core.threads()
     for name, array in arrays().items():
         positions = np.random.default_rng(8).uniform(-20.0, 20.0, (size.rows, 3))
         moments = moments_on_sphere(100.0, N_MOMENTS, half=not array.channel_is_scalar.any())

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from functools import cache
 
-import numba
 import numpy as np
 
+from magloc import core
 from magloc.fields.dipole import total_field
 from magloc.fields.points import field_at_points
 from tests.bench.table import Row
@@ -18,7 +18,7 @@ TITLE = "field: induction of dipoles at points"
 
 def rows(size: Size) -> Iterator[Row]:
     """Compiled against compiled with all threads; magpylib has one, so there ours has one too."""
-    threads = numba.get_num_threads()
+    threads = core.threads()
     for n_points, n_dipoles in ((size.points, 1), (size.points, 20), (10 * size.points, 1)):
         rng = np.random.default_rng(1)
         points = rng.uniform(-1.0, 1.0, (n_points, 3))
@@ -59,8 +59,10 @@ Field = Callable[[], object]
 
 @cache
 def choclo_loop() -> Callable[..., None]:
-    """choclo has the field of one dipole at one point; this loop around it is compiled like ours."""
+    """choclo has the field of one dipole at one point; this loop around it is compiled by numba."""
     from choclo.dipole import magnetic_field
+
+    import numba
 
     # Not cached on disk: numba would not see that another choclo has been installed.
     @numba.njit(parallel=True, error_model="numpy", fastmath={"contract"})

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 
-import numba
 import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 
 from arrays.array import SensorArray
 from arrays.geometries import tetrahedron
 from arrays.sensor import Sensor
+from magloc import core
 from magloc.directions import fibonacci_directions
 from magloc.localization.search.candidates import candidate_positions
 from magloc.localization.search.single_source import SingleSourceSearch
@@ -52,7 +52,7 @@ def rows(size: Size) -> Iterator[Row]:
     ours = success([fix.solutions[0].chi2 if fix.solutions else np.inf for fix in fixes])
     chi2_found = {n_starts: multi_starts(n_starts, few) for n_starts in (6, 20)}
     timed = size.timed(few)
-    threads = numba.get_num_threads()
+    threads = core.threads()
     timings = interleaved(
         {
             "many": Contestant(lambda: locator.fit_rows(readings), 1, size.rows),

@@ -114,7 +114,7 @@ def told(peaks: list[int], sizes: list[int], unit: str) -> str:
 
 
 def peak(name: str, case: Case, n: int, pristine: Path) -> int:
-    """Peak [bytes] of a command with its files in a folder of its own, once all that it calls is compiled."""
+    """Peak [bytes] of a command with its files in a folder of its own."""
     with TemporaryDirectory() as made:
         folder = Path(made) / "files"
         shutil.copytree(pristine, folder)
@@ -123,12 +123,7 @@ def peak(name: str, case: Case, n: int, pristine: Path) -> int:
             _run(case.first.format(**words), folder)
         for file in case.files:
             lengthen(folder / file, n)
-        before = _kernels()
-        found = _run(f"{name} {case.line}".format(**words), folder, *case.files[:1])
-        if _kernels() > before:
-            shutil.rmtree(folder / "out", ignore_errors=True)
-            found = _run(f"{name} {case.line}".format(**words), folder, *case.files[:1])
-    return found
+        return _run(f"{name} {case.line}".format(**words), folder, *case.files[:1])
 
 
 def lengthen(path: Path, n: int) -> None:
@@ -145,11 +140,6 @@ def lengthen(path: Path, n: int) -> None:
     period = logged[-1][0] - logged[0][0] + logged[1][0] - logged[0][0]
     many = (f"{logged[i % len(logged)][0] + period * (i // len(logged)):.6f}" for i in range(n))
     path.write_text("\n".join([head, *(f"{time},{rest}" for time, (_, rest) in zip(many, cycle(logged)))]) + "\n")
-
-
-def _kernels() -> int:
-    """How many compiled kernels the caches hold."""
-    return sum(1 for _ in Path(__file__).parents[2].rglob("__pycache__/*.nbc"))
 
 
 def _run(line: str, folder: Path, stdin: str = "") -> int:

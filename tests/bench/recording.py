@@ -6,9 +6,9 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-import numba
 
 from arrays.array_file import read_array
+from magloc import core
 from magloc.readings import read_readings
 from tests.bench.table import Row
 from tests.bench.timing import Contestant, Size, interleaved
@@ -26,7 +26,7 @@ def rows(size: Size) -> Iterator[Row]:
     array = read_array(folder / "array.toml")
     readings = read_readings(folder / "readings.csv", array).values_T[: size.rows]
     locator = plain_locator(array, body_length_m=0.0)
-    threads = numba.get_num_threads()
+    threads = core.threads()
     contestants = {n: Contestant(lambda: locator.fit_rows(readings), n, len(readings)) for n in {1, threads}}
     for n, timing in sorted(interleaved(contestants, size.rounds).items()):
         yield Row(f"a fix, {n} thr.", timing, note=f"{1.0 / timing.best:,.0f} rows per second, {len(readings):,} rows")

@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numba
 import numpy as np
 
+from magloc import core
 from tests.bench.timing import Timing, version_of
 
 PEERS = ("scipy", "choclo", "harmonica", "magpylib", "filterpy", "stonesoup")
@@ -80,8 +80,8 @@ def header() -> str:
     """When, on what, and with which versions."""
     lines = [
         f"{datetime.datetime.now().astimezone():%Y-%m-%d %H:%M %z}, {_cpu_model()}, "
-        f"{numba.get_num_threads()} threads, load {_load()} before the run",
-        f"Python {platform.python_version()}, numpy {np.__version__}, numba {numba.__version__}, "
+        f"{core.threads()} threads, load {_load()} before the run",
+        f"Python {platform.python_version()}, numpy {np.__version__}, "
         + ", ".join(f"{peer} {version_of(peer)}" for peer in PEERS),
         *LEGEND,
     ]

@@ -5,13 +5,13 @@ from __future__ import annotations
 import itertools
 from types import SimpleNamespace
 
-import numba
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from arrays.geometries import tetrahedron
+from magloc import core
 from magloc.fields.dipole import total_field
 from magloc.measurement.differences import DifferenceMeasurement
 from tests.bench import fields, filters, memory
@@ -21,7 +21,7 @@ from tests.bench.table import Row, ratio_text, table, time_text
 from tests.bench.timing import Contestant, Size, Timing, installed, interleaved
 from tests.fuzz.cases import commands
 
-QUICK = {"fields", "fixes", "machine"}
+QUICK = {"fields", "fixes"}
 TINY = Size(points=30, rows=2, problems=1, grid=2, sample=1, rounds=1)
 
 
@@ -69,7 +69,7 @@ class TestInterleaved:
 
         def threads():
             of_blas = (each["num_threads"] for each in threadpool_info() if each["user_api"] == "blas")
-            return numba.get_num_threads(), *of_blas
+            return core.threads(), *of_blas
 
         with threadpool_limits(2, user_api="blas"):
             before = threads()

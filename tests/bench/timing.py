@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -10,7 +11,6 @@ from importlib.metadata import version
 from importlib.util import find_spec
 from typing import Any
 
-import numba
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
@@ -100,15 +100,18 @@ def _shortest(run: Callable[[], object]) -> float:
 @contextmanager
 def _threads(n: int) -> Iterator[None]:
     """Limit the threads of compiled code, and those of the BLAS libraries that are loaded by now."""
-    before, before_core = numba.get_num_threads(), core.threads()
-    numba.set_num_threads(n)
+    before, numba = core.threads(), sys.modules.get("numba")  # peers load it
+    all_of_numba = numba.get_num_threads() if numba else 0
     core.set_threads(n)
+    if numba:
+        numba.set_num_threads(min(n, all_of_numba))
     try:
         with ThreadpoolController().limit(limits=n, user_api="blas"):
             yield
     finally:
-        numba.set_num_threads(before)
-        core.set_threads(before_core)
+        core.set_threads(before)
+        if numba:
+            numba.set_num_threads(all_of_numba)
 
 
 def installed(package: str) -> bool:

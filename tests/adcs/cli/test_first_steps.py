@@ -1,4 +1,4 @@
-"""``adcs demo`` and ``adcs warm-up``."""
+"""``adcs demo``."""
 
 from __future__ import annotations
 
@@ -13,10 +13,3 @@ def test_demo(adcs: Run, tmp_path: Path) -> None:
     assert [line.split()[2] for line in done.out.splitlines() if line.startswith("$ adcs ")] == ["run", "estimate"]
     assert (tmp_path / "demo" / "estimates" / "estimates.png").stat().st_size > 20_000
     assert "diverged runs                     0" in done.out
-
-
-def test_warm_up(adcs: Run) -> None:
-    done = adcs("warm-up")
-    assert done.status == 0, done.err
-    assert done.out == ""
-    assert "compiled" in done.err

@@ -1,18 +1,13 @@
-"""First steps: ``demo`` of both command lines, ``warm-up``, and what is said while something compiles."""
+"""First steps: ``demo``, and ``warm-up`` of both command lines."""
 
 from __future__ import annotations
 
-import logging
 import shlex
-import sys
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 
-from magloc import compilation
-from magloc.cli import app, framework
-from magloc.plots import style
 from tests.command_line import Run, assert_refused
 
 
@@ -54,52 +49,9 @@ class TestDemo:
         assert_refused(run("demo", tmp_path / "demo"), "OUT", "expected a folder")
 
 
-class TestWarmUp:
-    @pytest.mark.slow
-    def test_runs_every_command_that_compiles(self, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-        called: list[str] = []
-        for name in ("convergence", "sources", "bound_slices", "bound_sphere", "bound_reach"):  # nothing of it compiles
-            monkeypatch.setattr(f"magloc.plots.{name}", lambda *_: style.new_figure(1.0))
-        whole = framework.call
-        monkeypatch.setattr(framework, "call", lambda app, tokens: called.append(tokens[0]) or whole(app, tokens))
-        done = run("warm-up")
-        assert done.status == 0, done.err
-        assert done.out == ""
-        assert set(called) == {"warm-up", "locate", "simulate", "track", "map", "bounds"}
-        assert "compiled" in done.err
-
-
-class TestCompiling:
-    @pytest.mark.parametrize("watched", [True, False])
-    def test_is_said_once_where_somebody_watches(
-        self, watched: bool, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        listener = compilation._Announcement()
-        monkeypatch.setattr(sys.stderr, "isatty", lambda: watched)
-        with framework._notes_of_the_library(app.app.name[0]):
-            for happens in (listener.on_start, listener.on_start, listener.on_end, listener.on_end):
-                happens(None)  # type: ignore[arg-type]  # what is compiled does not matter
-        assert capsys.readouterr().err.count(compilation.COMPILING) == watched
-
-    def test_numba_says_when_it_compiles(self, caplog: pytest.LogCaptureFixture) -> None:
-        from numba import njit
-        from numba.core import event
-
-        listener = compilation._Announcement()
-        with caplog.at_level(logging.INFO, "magloc"), event.install_listener("numba:compile", listener):
-            assert njit(lambda x: x + 1)(1) == 2
-        assert listener.said
-
-    @pytest.mark.parametrize("collects", [True, False])
-    def test_garbage_waits_until_a_kernel_and_those_that_it_calls_are_compiled(
-        self, collects: bool, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        listener, state = compilation._GarbageWaits(), [collects]
-        monkeypatch.setattr(compilation.gc, "isenabled", lambda: state[-1])
-        monkeypatch.setattr(compilation.gc, "disable", lambda: state.append(False))
-        monkeypatch.setattr(compilation.gc, "enable", lambda: state.append(True))
-        for happens in (listener.on_start, listener.on_start, listener.on_end):
-            happens(None)  # type: ignore[arg-type]
-            assert not state[-1]
-        listener.on_end(None)  # type: ignore[arg-type]
-        assert state[-1] == collects
+@pytest.mark.parametrize("program", ["magloc", "adcs"])
+def test_warm_up_has_nothing_to_do(program: str, request: pytest.FixtureRequest) -> None:
+    run: Run = request.getfixturevalue("run" if program == "magloc" else program)
+    done = run("warm-up")
+    assert (done.status, done.out) == (0, "")
+    assert done.err == f"{program}: warm-up has nothing to do: the package is compiled when it is installed\n"

@@ -9,10 +9,9 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from numba import njit
 from numpy.typing import NDArray
 
-from magloc.fields import dipole, dipole_compiled
+from magloc.fields import dipole
 from magloc.fields import points as kernels
 from tests import oracles
 
@@ -27,16 +26,9 @@ SIZES = [0, 1, 7, BLOCK - 1, BLOCK, BLOCK + 1, 3 * BLOCK + 5]
 UPPER = np.triu_indices(3)
 
 
-def symmetric(components: list[tuple[float, ...]]) -> Array:
-    """Matrices (N, 3, 3) of their components (xx, xy, xz, yy, yz, zz)."""
-    matrices = np.empty((len(components), 3, 3))
-    matrices[:, *UPPER] = matrices[:, *UPPER[::-1]] = np.reshape(components, (-1, 6))
-    return matrices
-
-
 def jacobians_at(points: Array, source: Array, moment: Array) -> Array:
-    """Jacobians (N, 3, 6) of one dipole's field by (p, m), from the compiled components."""
-    by_moment = symmetric([dipole_compiled.field_matrix_components(*d) for d in np.subtract(points, source)])
+    """Jacobians (N, 3, 6) of one dipole's field by (p, m)."""
+    by_moment = np.stack([kernels.field_at_points(points, source[None], m[None]) for m in np.eye(3)], axis=-1)
     return np.concatenate([-kernels.gradient_at_points(points, source[None], moment[None]), by_moment], axis=-1)
 
 
@@ -49,14 +41,6 @@ PAIRS = [
 def points_and_dipoles(n_points: int, n_dipoles: int) -> tuple[Array, Array, Array]:
     rng = np.random.default_rng([n_points, n_dipoles])
     return rng.uniform(-5, 5, (n_points, 3)), rng.uniform(-5, 5, (n_dipoles, 3)), rng.normal(size=(n_dipoles, 3))
-
-
-def components_at(d: Array, m: Array) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
-    return (
-        dipole_compiled.field_components(d[0], d[1], d[2], m[0], m[1], m[2]),
-        dipole_compiled.field_matrix_components(d[0], d[1], d[2]),
-        dipole_compiled.gradient_components(d[0], d[1], d[2], m[0], m[1], m[2]),
-    )
 
 
 pytestmark = pytest.mark.usefixtures("instruction_set")
@@ -155,21 +139,6 @@ class TestSingularPoint:
             expected = np.arange(len(points)) == index
             np.testing.assert_array_equal(is_nan, np.broadcast_to(expected[:, None], is_nan.shape))
             assert np.all(np.isfinite(result[~expected]))
-
-
-class TestComponents:
-    """The scalar functions, as another kernel calls them."""
-
-    def test_inside_another_kernel(self) -> None:
-        d, m = np.array([1.0, -2.0, 0.5]), np.array([3.0, 4.0, -5.0])
-        # Not cached: numba would not notice a change in the functions that are called.
-        field, matrix, gradient = cast(Callable[..., Any], njit(components_at))(d, m)
-        for actual, expected in [
-            (field, dipole.field(d, np.zeros(3), m)),
-            (matrix, dipole.field_matrix(d, np.zeros(3))[UPPER]),
-            (gradient, dipole.gradient_tensor(d, np.zeros(3), m)[UPPER]),
-        ]:
-            assert np.linalg.norm(actual - expected) <= BETWEEN_TWINS * np.linalg.norm(expected)
 
 
 class TestInputs:

@@ -24,6 +24,7 @@ from arrays.geometries import axial, cross, grid, square, tetrahedron
 from arrays.noise import proportional_noise
 from arrays.sensor import Sensor
 from arrays.whitening import whitening
+from magloc import core
 from magloc.levels import DELTA_CHI2_95
 from magloc.localization.fit.prior import SourcePrior
 from magloc.localization.search.candidates import candidate_positions, linear_bases
@@ -344,19 +345,17 @@ class TestIndependence:
     """Rows, blocks and threads do not see each other."""
 
     def test_of_other_rows_and_of_threads(self):
-        import numba
-
         rng = np.random.default_rng(12)
         p, m = random_sources(rng, 300, 2.0, 10.0)
         readings = noisy_readings(TETRAHEDRON, p, m, rng)
         locator = plain_locator(TETRAHEDRON)
         together = locator.fit_rows(readings)
-        threads = numba.get_num_threads()
-        numba.set_num_threads(1)
+        threads = core.threads()
+        core.set_threads(1)
         try:
             alone = [locator.fit(row) for row in readings[::50]]
         finally:
-            numba.set_num_threads(threads)
+            core.set_threads(threads)
         for one, other in zip(together[::50], alone, strict=True):
             assert len(one.solutions) == len(other.solutions)
             # BLAS may sum the scores of one row and of many in another order.
