@@ -66,7 +66,7 @@ def entered(program: str) -> int:
         if not came and isinstance(error, Exception):
             raise
         print(f"{program}: {'terminated' if signal.SIGTERM in came else 'interrupted'}", file=sys.stderr)
-    gc.freeze()  # the interpreter looks for circles as it ends: half a second over all that numba holds
+    gc.freeze()  # else the interpreter looks for circles among all modules as it ends
     if signal.SIGTERM in came:
         return TERMINATED
     return INTERRUPTED if came and status else status
