@@ -82,7 +82,7 @@ class TestReferences:
 
     def test_the_gate_has_the_same_numbers(self) -> None:
         header = (core.include_dir() / "adcs/gate.hpp").read_text(encoding="utf-8")
-        rules = re.search(r"struct Rules \{(.*?)\};", header, re.DOTALL)
+        rules = re.search(r"struct ContestRules \{(.*?)\};", header, re.DOTALL)
         assert rules is not None
         found = {name.upper(): float(value) for name, value in re.findall(r"(\w+) = (-?[\d.]+)", rules[1])}
         assert found == {name: getattr(contest, name) for name in found}
