@@ -21,8 +21,8 @@ SOURCE = """
 using namespace magloc;
 using Number = Dual<Lanes, 6>;
 
-// Fields (n, 3) of moments at the origin. Derivatives (n, 3, 6) by point and moment, by dual numbers and analytic; those
-// (n, 3, 3) by the point alone, the moment being constant.
+// Fields (n, 3) of moments at the origin. Derivatives (n, 3, 6) by point and moment, by dual numbers and analytic;
+// those (n, 3, 3) by the point alone, the moment being constant.
 extern "C" void derivatives(const double *points, const double *moments, int n, double *b, double *dual,
                             double *analytic, double *alone) {
   for (int i = 0; i < n; i += n_lanes<Lanes>) {
