@@ -28,7 +28,8 @@ test-full: ready chromium
 lint: .venv/installed-test
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
-	$(BIN)/clang-format --dry-run -Werror $$(find magloc adcs -name '*.cpp' -o -name '*.hpp' -o -name '*.h')
+	$(BIN)/clang-format --dry-run -Werror $$(find magloc adcs docs/examples -name '*.cpp' -o -name '*.hpp' -o -name '*.[ch]')
+	$(BIN)/clang-tidy --quiet magloc/core/*.cpp adcs/core/*.cpp docs/examples/*.cpp -- -std=c++17 -Imagloc/core/include -DMAGLOC_LANES=2
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-cache --no-logo
 

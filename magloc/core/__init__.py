@@ -189,7 +189,7 @@ def use_instruction_set(name: str) -> None:
 
 
 def include_dir() -> Path:
-    """Return the folder of the C and C++ headers, for the compiler's option -I."""
+    """Return the folder of the C and C++ headers of magloc and adcs, for the compiler's option -I."""
     return _HERE / "include"
 
 

@@ -3,7 +3,7 @@
 A reading whose normalised innovation squared is beyond its limit is not used. That alone never comes back from a wild
 first fix, and giving the estimate up after some rejections makes a lie the truth. So a rejected reading begins a second
 filter, which lives beside the main one until one of them is believed. See docs/theory/attitude-kalman-filters.md;
-gate.hpp in adcs/core is its compiled form.
+adcs/gate.hpp of the core is its compiled form.
 """
 
 from __future__ import annotations

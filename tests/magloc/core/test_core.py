@@ -119,7 +119,7 @@ except KeyboardInterrupt:
 
 class TestHeaders:
     def test_are_installed(self) -> None:
-        assert {"magloc.h", "magloc/dipole.hpp", "magloc/numbers.hpp"} <= {
+        assert {"magloc.h", "magloc/dipole.hpp", "magloc/numbers.hpp", "adcs/mekf.hpp"} <= {
             path.relative_to(core.include_dir()).as_posix() for path in core.include_dir().rglob("*") if path.is_file()
         }
 

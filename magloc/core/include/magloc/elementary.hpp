@@ -77,7 +77,7 @@ inline void fill_sine_and_cosine(double x, double &sine, double &cosine) {
 inline double exponential(double x) {
   if (x < -700.0) return 0.0;
   const int64_t n = (int64_t)(x * 1.4426950408889634 + (x < 0.0 ? -0.5 : 0.5));
-  const double r = (x - n * 0x1.62e42fee00000p-1) - n * 0x1.a39ef35793c76p-33;
+  const double whole = (double)n, r = (x - whole * 0x1.62e42fee00000p-1) - whole * 0x1.a39ef35793c76p-33;
   double sum = 1.0;
   for (int i = 14; i > 0; --i) sum = 1.0 + r / i * sum;
   const uint64_t bits = (uint64_t)(n + 1023) << 52;

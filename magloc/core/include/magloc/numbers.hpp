@@ -109,10 +109,13 @@ struct Dual {
   MAGLOC_RULE(+(const Dual &a, const Dual &b), a.value + b.value, a.derivative[i] + b.derivative[i])
   MAGLOC_RULE(-(const Dual &a, const Dual &b), a.value - b.value, a.derivative[i] - b.derivative[i])
   MAGLOC_RULE(*(const Dual &a, const Dual &b), a.value *b.value, a.derivative[i] * b.value + a.value * b.derivative[i])
-  MAGLOC_RULE(+(const Dual &a, T b), a.value + b, a.derivative[i])
-  MAGLOC_RULE(-(const Dual &a, T b), a.value - b, a.derivative[i])
-  MAGLOC_RULE(*(const Dual &a, T b), a.value *b, a.derivative[i] * b)
-  MAGLOC_RULE(*(T a, const Dual &b), a *b.value, a *b.derivative[i])
+  // S: a constant, double or of type T.
+  template <class S>
+  MAGLOC_RULE(-(const Dual &a, const S &b), a.value - b, a.derivative[i])
+  template <class S>
+  MAGLOC_RULE(*(const Dual &a, const S &b), a.value *b, a.derivative[i] * b)
+  template <class S>
+  MAGLOC_RULE(*(const S &a, const Dual &b), a *b.value, a *b.derivative[i])
 #undef MAGLOC_RULE
 };
 template <class T>

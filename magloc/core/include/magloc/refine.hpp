@@ -6,6 +6,7 @@
 // moments are fitted to channels linearised about the field of the trial state.
 #pragma once
 #include "channels.hpp"
+#include "lane_items.hpp"
 #include "linear.hpp"
 
 MAGLOC_BEGIN
@@ -71,46 +72,33 @@ class Refinement {
 
   template <class Channels>
   void run(Channels &c, const Starts &starts, const Rules &rules, const Ends &out) {
-    if (starts.n == 0) return;
-    constexpr int W = n_lanes<T>;
     State<T, K> at, trial;
     clear(at), clear(trial);
     T first_mu[K][3] = {}, damping = {}, promised = {}, iterations = {}, limit = {}, end = broadcast<T>(failed);
-    int64_t next = 0, start[W], loaded[W];
-    for (int i = 0; i < W; ++i) start[i] = loaded[i] = -1;
-    for (;;) {
-      int n_running = 0;
-      for (int i = 0; i < W; ++i) {
-        if (get_lane(end, i) == running) {
-          n_running += start[i] >= 0;
-          continue;
-        }
-        if (start[i] >= 0) {
-          const int64_t k = start[i];
-          for (int d = 0; d < 4 * K; ++d)
-            out.q[4 * K * k + d] = get_lane((rules.ahead ? trial : at).q[d / 4][d % 4], i);
-          for (int d = 0; d < D; ++d) out.mu[D * k + d] = get_lane(at.mu[d / 3][d % 3], i);
-          out.chi2[k] = get_lane(at.chi2, i) - (rules.ahead ? get_lane(promised, i) : 0.0);
-          out.iterations[k] = (int64_t)get_lane(iterations, i);
-          out.converged[k] = get_lane(end, i) == converged;
-        }
-        // Begin the next start; an idle lane repeats the last one.
-        const bool more = next < starts.n;
-        const int64_t k = more ? next : starts.n - 1, row = starts.row[k];
-        start[i] = more ? next++ : -1;
-        n_running += more;
-        for (int d = 0; d < 4 * K; ++d) set_lane(trial.q[d / 4][d % 4], i, starts.q[4 * K * k + d]);
-        for (int d = 0; d < D; ++d) {
-          const double m = starts.mu ? starts.mu[D * k + d] : 0.0;
-          set_lane(trial.mu[d / 3][d % 3], i, m);
-          set_lane(first_mu[d / 3][d % 3], i, m);
-        }
-        set_lane(at.chi2, i, infinity), set_lane(damping, i, 1e-3), set_lane(promised, i, 0.0);
-        set_lane(iterations, i, 0.0), set_lane(end, i, running);
-        set_lane(limit, i, starts.too_high ? starts.too_high[k] : infinity);
-        if (row != loaded[i]) loaded[i] = row, c.load(i, row);
+    int64_t loaded[n_lanes<T>];
+    for (int64_t &row : loaded) row = -1;
+    LaneItems<T> items(0, starts.n);
+    const auto begin = [&](int lane, int64_t k, bool) {
+      const int64_t row = starts.row[k];
+      for (int d = 0; d < 4 * K; ++d) set_lane(trial.q[d / 4][d % 4], lane, starts.q[4 * K * k + d]);
+      for (int d = 0; d < D; ++d) {
+        const double m = starts.mu ? starts.mu[D * k + d] : 0.0;
+        set_lane(trial.mu[d / 3][d % 3], lane, m);
+        set_lane(first_mu[d / 3][d % 3], lane, m);
       }
-      if (n_running == 0) return;
+      set_lane(at.chi2, lane, infinity), set_lane(damping, lane, 1e-3), set_lane(promised, lane, 0.0);
+      set_lane(iterations, lane, 0.0), set_lane(end, lane, running);
+      set_lane(limit, lane, starts.too_high ? starts.too_high[k] : infinity);
+      if (row != loaded[lane]) loaded[lane] = row, c.load(lane, row);
+    };
+    const auto finish = [&](int lane, int64_t k) {
+      for (int d = 0; d < 4 * K; ++d) out.q[4 * K * k + d] = get_lane((rules.ahead ? trial : at).q[d / 4][d % 4], lane);
+      for (int d = 0; d < D; ++d) out.mu[D * k + d] = get_lane(at.mu[d / 3][d % 3], lane);
+      out.chi2[k] = get_lane(at.chi2, lane) - (rules.ahead ? get_lane(promised, lane) : 0.0);
+      out.iterations[k] = (int64_t)get_lane(iterations, lane);
+      out.converged[k] = get_lane(end, lane) == converged;
+    };
+    while (items.refill(end, begin)) {
       linearise(c, trial, first_mu, at.chi2, rules);
 
       // Take a trial state with a lower chi-square, and adapt the damping to how well its gain was predicted.
@@ -142,6 +130,7 @@ class Refinement {
 
       Ldl<T, D>(at.information, damping, ridge, lost_pivot).solve(at.gradient, step);
       promised = move(at, step, rules, trial);
+      items.release(end, finish);
     }
   }
 

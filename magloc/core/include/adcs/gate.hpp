@@ -5,7 +5,7 @@
 
 MAGLOC_BEGIN
 // The numbers of contest.py, which explains them.
-struct Rules {
+struct ContestRules {
   static constexpr int agree = 3, strain = 4, open = 80, patient_readings = 10;
   static constexpr double clip = 25.0, better = 15.0, worse = -30.0, far = 6.0;
 };
@@ -42,14 +42,16 @@ class Contest {
   Use decide(const Gate &gate, int sensor, const Fit &main, const Fit &second) {
     auto &counts = sensors_[sensor];
     const bool fits = main.eased <= gate.limit;
-    Use use = {fits || counts.strain >= Rules::open, has_second() && second.eased <= gate.limit};
+    Use use = {fits || counts.strain >= ContestRules::open, has_second() && second.eased <= gate.limit};
     if (fits)
       counts.strain -= counts.strain > 0;
-    else if (sensor != began_ || agreed_ < Rules::patient_readings)
-      counts.strain = counts.strain + Rules::strain < 2 * Rules::open ? counts.strain + Rules::strain : 2 * Rules::open;
+    else if (sensor != began_ || agreed_ < ContestRules::patient_readings)
+      counts.strain = counts.strain + ContestRules::strain < 2 * ContestRules::open
+                          ? counts.strain + ContestRules::strain
+                          : 2 * ContestRules::open;
     if (has_second() && sensor == began_) {
-      if (use.main && use.second && agreed_ >= Rules::agree) {
-        use.main = main.eased + main.log_determinant <= second.eased + second.log_determinant + Rules::far;
+      if (use.main && use.second && agreed_ >= ContestRules::agree) {
+        use.main = main.eased + main.log_determinant <= second.eased + second.log_determinant + ContestRules::far;
         use.second = !use.main;
       }
       agreed_ += use.second;
@@ -77,7 +79,7 @@ class Contest {
     began_ = sensor;
     agreed_ = 1;
     main_agreed_ = missed_ = 0;
-    after_gap_ = instant_ - counts.last_read > Rules::patient_readings * counts.interval;
+    after_gap_ = instant_ - counts.last_read > ContestRules::patient_readings * counts.interval;
     score_ = 0.0;
   }
 
@@ -86,7 +88,7 @@ class Contest {
     auto &counts = sensors_[sensor];
     const int64_t gap = instant_ - counts.last_read;
     if (gap <= 0) return;
-    if (gap <= Rules::patient_readings * counts.interval || counts.last_read == 0) counts.interval = gap;
+    if (gap <= ContestRules::patient_readings * counts.interval || counts.last_read == 0) counts.interval = gap;
     counts.last_read = instant_;
   }
 
@@ -94,14 +96,14 @@ class Contest {
   Verdict verdict(const Gate &gate) {
     auto &counts = sensors_[began_];
     Verdict found = undecided;
-    if (score_ < Rules::worse) {
+    if (score_ < ContestRules::worse) {
       counts.strain = 0;
       found = dropped;
-    } else if (missed_ >= Rules::agree || main_agreed_ >= Rules::patient_readings) {
+    } else if (missed_ >= ContestRules::agree || main_agreed_ >= ContestRules::patient_readings) {
       found = dropped;
-    } else if (agreed_ >= Rules::agree) {
-      const bool unsupported = after_gap_ || counts.taken < Rules::agree || waited(gate, began_);
-      if (score_ > Rules::better || (unsupported && score_ > -Rules::better)) {
+    } else if (agreed_ >= ContestRules::agree) {
+      const bool unsupported = after_gap_ || counts.taken < ContestRules::agree || waited(gate, began_);
+      if (score_ > ContestRules::better || (unsupported && score_ > -ContestRules::better)) {
         found = believed;
         counts.taken = agreed_;
         counts.last_taken = instant_;
@@ -112,7 +114,7 @@ class Contest {
   }
 
  private:
-  static double clipped(double eased) { return eased < Rules::clip ? eased : Rules::clip; }
+  static double clipped(double eased) { return eased < ContestRules::clip ? eased : ContestRules::clip; }
   bool waited(const Gate &gate, int sensor) const {
     return instant_ - sensors_[sensor].last_taken >= gate.patience[sensor];
   }
