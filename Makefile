@@ -9,6 +9,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 unexport PYTHONDONTWRITEBYTECODE
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 MAKE_VENV = $(PYTHON) -m venv --clear
+NOT_INSTALLED = { echo "magloc could not be installed: it needs the package index, and a C++ compiler (g++, clang++) or else Zig from that index" >&2; exit 1; }
 
 KERNEL_TESTS := tests/magloc/core tests/magloc/fields/test_points.py
 
@@ -118,13 +119,13 @@ test-oldest: .venv-oldest/installed chromium
 	@touch $@
 
 .venv/installed: .venv/made
-	$(PIP) install --constraint constraints.txt --editable '.[maps]'
+	$(PIP) install --constraint constraints.txt --editable '.[maps]' || $(NOT_INSTALLED)
 	@touch $@
 
 # All at once: one after the other, what both need would be looked up twice. A module is compiled when a test imports
 # it: pip would compile all of them, three quarters for nothing.
 .venv/installed-test: .venv/made
-	$(PIP) install --no-compile --constraint constraints.txt --editable '.[test]'
+	$(PIP) install --no-compile --constraint constraints.txt --editable '.[test]' || $(NOT_INSTALLED)
 	@touch .venv/installed $@
 
 .venv/installed-bench: .venv/installed-test

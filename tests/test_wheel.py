@@ -143,3 +143,15 @@ def test_a_machine_without_a_compiler_builds_it(unpacked: Path, tmp_path: Path) 
     )
     assert done.returncode == 0, done.stderr
     assert str(tmp_path) in done.stdout
+
+
+def test_without_any_compiler_it_says_what_is_missing() -> None:
+    code = "import sys; sys.modules['ziglang'] = None; from build_backend import build_wheel; build_wheel('.')"
+    environment = {"PATH": "", "PYTHONPATH": str(REPOSITORY / "magloc" / "core"), "PYTHONDONTWRITEBYTECODE": "1"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=REPOSITORY, env=environment, capture_output=True, encoding="utf-8"
+    )
+    assert done.returncode == 1
+    assert done.stderr == (
+        "magloc: found no C++ compiler, expected g++ or clang++ in PATH, or Zig: pip install ziglang.\n"
+    )

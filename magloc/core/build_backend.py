@@ -8,6 +8,7 @@ import stat
 import sys
 import tempfile
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 from zipfile import ZIP_DEFLATED, ZipFile
@@ -60,6 +61,8 @@ def _use_zig_without_compiler() -> None:
     """
     if _has_compiler():
         return
+    if find_spec("ziglang") is None:
+        sys.exit("magloc: found no C++ compiler, expected g++ or clang++ in PATH, or Zig: pip install ziglang.")
     folder = Path(tempfile.mkdtemp(prefix="magloc-zig-"))
     tools = {}
     for variable, command in (("CC", "cc"), ("CXX", "cc"), ("AR", "ar"), ("RANLIB", "ranlib")):
