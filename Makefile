@@ -12,7 +12,7 @@ MAKE_VENV = $(PYTHON) -m venv --clear
 
 KERNEL_TESTS := tests/magloc/core tests/magloc/fields/test_points.py
 
-.PHONY: map test test-full test-oldest mutation coverage licences sbom audit wheel bench docs notebooks pictures chromium lint sanitize clean
+.PHONY: map test test-full test-oldest mutation coverage licences sbom audit wheel wheel-aarch64 bench docs notebooks pictures chromium lint sanitize clean
 .PHONY: ready compiled-magloc compiled-adcs compiled-tests
 
 map: .venv/installed
@@ -80,6 +80,10 @@ audit: .venv-supply/installed
 # Wheel and sdist in dist; what they must hold is looked at by tests/test_wheel.py.
 wheel: .venv-supply/installed
 	.venv-supply/bin/python -m build --outdir dist
+
+# The wheel for Linux on ARM (64 bits, glibc 2.17 or newer), cross-built by Zig.
+wheel-aarch64: .venv-supply/installed
+	MAGLOC_ZIG_TARGET=aarch64-linux-gnu.2.17 .venv-supply/bin/python -m build --wheel --outdir dist
 
 bench: .venv/installed-bench
 	$(BIN)/python -m tests.bench
