@@ -12,7 +12,7 @@ MAKE_VENV = $(PYTHON) -m venv --clear
 
 KERNEL_TESTS := tests/magloc/core tests/magloc/fields/test_points.py
 
-.PHONY: map test test-full test-oldest mutation coverage licences sbom audit wheel wheel-aarch64 bench docs notebooks pictures chromium lint sanitize clean
+.PHONY: map test test-full test-oldest mutation coverage licences sbom audit wheel wheel-aarch64 bench bench-against docs notebooks pictures chromium lint sanitize clean
 .PHONY: ready compiled-magloc compiled-adcs compiled-tests
 
 map: .venv/installed
@@ -87,6 +87,11 @@ wheel-aarch64: .venv-supply/installed
 
 bench: .venv/installed-bench
 	$(BIN)/python -m tests.bench
+
+# Processor time against that of another revision, built beside this one: `make bench-against REV=552c0b8`, with
+# ISA=baseline for kernels confined to what every processor has.
+bench-against: .venv/installed-test
+	$(BIN)/python -m tests.bench.against $(REV) --isa $(or $(ISA),best)
 
 docs: .venv/installed-docs
 	rm -rf docs/_build docs/reference/names
