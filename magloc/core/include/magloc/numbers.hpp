@@ -112,8 +112,12 @@ struct Dual {
   MAGLOC_RULE(+(const Dual &a, T b), a.value + b, a.derivative[i])
   MAGLOC_RULE(-(const Dual &a, T b), a.value - b, a.derivative[i])
   MAGLOC_RULE(*(const Dual &a, T b), a.value *b, a.derivative[i] * b)
-  MAGLOC_RULE(*(T a, const Dual &b), a *b.value, a *b.derivative[i])
 #undef MAGLOC_RULE
+  template <class S>  // T or double
+  friend MAGLOC_INLINE Dual operator*(S a, const Dual &b) {
+    return b * (T{} + a);
+  }
+  friend MAGLOC_INLINE Dual &operator+=(Dual &a, const Dual &b) { return a = a + b; }
 };
 template <class T>
 MAGLOC_INLINE T inverse_root(T x) {
