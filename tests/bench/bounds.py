@@ -55,6 +55,5 @@ def rows(size: Size) -> Iterator[Row]:
         )
         difference = np.abs(ours().range_m[: len(sample)] / reference().sigma_range_m - 1.0).max()
         yield Row(f"{name}, {threads} thr.", timings["ours"])
-        yield Row(
-            name, timings["one thread"], "NumPy reference", timings["reference"], f"σ of the range differ by {difference:.0e}"
-        )
+        agreement = f"σ of the range differ by {difference:.0e}"
+        yield Row(name, timings["one thread"], "NumPy reference", timings["reference"], agreement)
