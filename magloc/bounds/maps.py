@@ -189,11 +189,6 @@ class BoundMap(CubeMap):
         """Moment, and what is required."""
         return self.scenario.settings
 
-    def warm_up(self) -> None:
-        """Compile, or load what was compiled."""
-        array = self.scenario.array
-        bounds_at(self.scenario, array.centroid + 3.0 * array.circumradius * np.eye(3)[:1])
-
     def values_at(self, box: Box) -> Mapping[str, Any]:
         """Bounds of the sources of a box."""
         sigma = bounds_at(self.scenario, self.scenario.array.centroid + box.points(self.axis))

@@ -212,14 +212,6 @@ class SourcesMap(CubeMap):
             **({"body_length_m": length} if (length := scenario.body_length_m) is not None else {}),
         }
 
-    def warm_up(self) -> None:
-        """Compile, or load what was compiled."""
-        array = self.scenario.array
-        position = array.centroid + 3.0 * array.circumradius * np.eye(3)[:1]
-        moment = self.scenario.moment_Am2 * np.eye(3)[:1]
-        readings = self._readings(position, moment, np.zeros((1, array.n_channels)), np.zeros((1, N_BODY_ERRORS + 3)))
-        self._values_of(position, moment, readings)
-
     def values_at(self, box: Box) -> Mapping[str, Any]:
         """Fixes of the sources of a box."""
         relative = box.points(self.axis)

@@ -183,10 +183,6 @@ class StartsMap(CubeMap):
             "optimum_chi2": self.optimum.chi2,
         }
 
-    def warm_up(self) -> None:
-        """Compile, or load what was compiled."""
-        self.scenario.method.run(self.measurement, self.z, np.full((1, 6), self.scenario.half_width_m))
-
     def values_at(self, box: Box) -> Mapping[str, Any]:
         """Ends of the starts of a box."""
         scenario, centroid = self.scenario, self.scenario.array.centroid

@@ -237,10 +237,6 @@ class CubeMap(ABC):
         """What determines the values beside the array and the cube."""
 
     @abstractmethod
-    def warm_up(self) -> None:
-        """Compile, or load what was compiled."""
-
-    @abstractmethod
     def values_at(self, box: Box) -> Mapping[str, Any]:
         """Values of every variable at the points of a box, in their order."""
 
@@ -267,13 +263,7 @@ def tiles(grid: int, edge: int) -> Iterator[Box]:
 
 
 def computed(cube: CubeMap, box: Box) -> Chunk:
-    """Values of one box, with their time; compiling is not part of it."""
-    cube.warm_up()
-    return _computed_warm(cube, box)
-
-
-def _computed_warm(cube: CubeMap, box: Box) -> Chunk:
-    """Values of one box, everything compiled. Ctrl-C waits for a part of the box."""
+    """Values of one box, with their time. Ctrl-C waits for a part of the box."""
     began = time.perf_counter()
     x, y, z = box.region
     layers = -(-(x.stop - x.start) // _PARTS)
@@ -287,9 +277,8 @@ def _computed_warm(cube: CubeMap, box: Box) -> Chunk:
 
 def computed_here(cube: CubeMap, wanted: Iterable[Box]) -> Iterator[Chunk]:
     """Values of some boxes, one after the other, in this process."""
-    cube.warm_up()  # once: between boxes an interruption would find compiled code that nothing protects
     for box in wanted:
-        yield _computed_warm(cube, box)
+        yield computed(cube, box)
 
 
 def coordinates(cube: CubeMap) -> dict[str, tuple[FloatArray, dict[str, str]]]:

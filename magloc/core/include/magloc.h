@@ -348,6 +348,44 @@ typedef struct {
 int64_t magloc_source_uncertainties(const magloc_source_uncertainty *problem, int64_t begin, int64_t end,
                                     double *workspace);
 
+/* Sensors, as Cramer-Rao bounds see them. What readings depend on beside the source are nuisances of these kinds: 0 to
+   2, a field that is common to all vector sensors; 3, a modulus common to all that read one; 4 to 6, the ambient
+   field's error; 7 to 9 and 10 to 12, turns and shifts of the array; 13 and so on, errors of a body. */
+typedef struct {
+  int64_t n_sensors, n_channels, n_nuisances, n_errors;
+  const double *ambient;        /* (n_sensors, 3) field */
+  const uint8_t *is_modulus;    /* (n_sensors): such a sensor has one channel, others have three */
+  const int64_t *first_channel; /* (n_sensors + 1) of each sensor */
+  const double *gain;           /* (n_channels, 3), (g, 0, 0) of a modulus */
+  const double *noise;          /* (n_channels) */
+  int64_t noise_depends_on_field;
+  const double *errors_of_sensor; /* (n_sensors, 3): sigma of its turns, part of the field that it induces in the
+                                     carrier, part of the field that is noise */
+  const double *gain_errors;      /* (n_channels, 3, 3): what sigma of the gain of each axis adds to the channel's */
+  const int64_t *nuisances;       /* (n_nuisances), kinds, ascending */
+  const double *prior;            /* (n_nuisances), one over the standard deviation, 0 where nothing is known */
+  double modulus_prior;           /* the same of the moment's modulus */
+  double lever_arm[3];            /* to the array's origin from the point about which it turns */
+  double lost;                    /* a parameter of which the others leave less than this part is not known */
+} magloc_bound_array;
+
+/* Cramer-Rao bounds of sources: least standard deviations of any unbiased estimate from one set of readings; an item is
+   a source. Each place has the same moments, or moments of its own; source n_moments * i + k is at place i. */
+typedef struct {
+  const magloc_bound_array *array;
+  int64_t n_moments, moments_are_own;
+  const double *sensors;     /* (n_sensors, 3) */
+  double centroid[3];        /* from which ranges count */
+  const double *positions;   /* (n_places, 3) */
+  const double *moments;     /* (n_moments, 3) or (n_places, n_moments, 3) */
+  const double *body_errors; /* (n_places, n_sensors, n_errors, 6): xx, xy, xz, yy, yz, zz of the matrices that make an
+                                error's field of the moment */
+  double *sigma_range, *sigma_bearing, *sigma_position; /* (n): infinite where they are not known */
+  double *slopes; /* (n, n_sensors, 3): d log(sigma of the range)/d sensor, or NULL; for noise that depends on no field,
+                     and no nuisances but common fields */
+} magloc_bounds;
+int64_t magloc_source_bounds(const magloc_bounds *problem, int64_t begin, int64_t end, double *workspace);
+
 /* end of the declarations */
 #ifdef __GNUC__
 #pragma GCC visibility pop

@@ -63,9 +63,6 @@ class Waves:
     def findings(self) -> dict[str, Any]:
         return {"found": 1.5}
 
-    def warm_up(self) -> None:
-        pass
-
     def values(self, box: Box) -> dict[str, np.ndarray]:
         if box.region[0].start % self.edge == 0:  # a box is computed layer by layer
             with self.log.open("a") as log:

@@ -43,6 +43,9 @@ class Orthogonalisation {
  public:
   T inverse[D], rest_square;  // one over the squares of the orthogonal columns; the square of what is left of y
 
+  // Share of orthogonal column j in the original column k.
+  MAGLOC_INLINE T share(int j, int k) const { return share_[j][k]; }
+
   MAGLOC_INLINE Orthogonalisation(T *a, T *y, int64_t n, double lost) { pass<0>(a, y, n, lost); }
 
   // Fill the lower triangle of (a^T a)^-1 of the original columns; NaN if a column is lost.
@@ -69,6 +72,16 @@ class Orthogonalisation {
     }
   }
 };
+
+// Unit vectors u, v at right angles to a unit vector n and each other. Duff et al., "Building an orthonormal basis,
+// revisited".
+template <class T>
+MAGLOC_INLINE void fill_tangents(const T (&n)[3], T (&u)[3], T (&v)[3]) {
+  const T x = n[0], y = n[1], z = n[2], one = broadcast<T>(1.0);
+  const T sign = choose(z >= 0.0, one, -one), a = -1.0 / (sign + z), b = x * y * a;
+  u[0] = 1.0 + sign * x * x * a, u[1] = sign * b, u[2] = -sign * x;
+  v[0] = b, v[1] = sign + y * y * a, v[2] = -y;
+}
 
 // Factors L D L^T of a positive matrix (lower triangle) whose diagonal a_jj may be raised to (1 + damping) a_jj +
 // added_j. A pivot that loses all but `lost` of its diagonal counts as infinite: its variable stays zero.

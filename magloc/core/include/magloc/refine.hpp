@@ -197,16 +197,15 @@ class Refinement {
   }
 
   // Orthonormal tangents of the sphere at q: two that turn u at one range, and one along the range.
-  // Duff et al., "Building an orthonormal basis, revisited".
   static MAGLOC_INLINE void fill_tangents(const T (&q)[4], const uint8_t *free, T (&t)[3][4]) {
     const T square = q[0] * q[0] + q[1] * q[1] + q[2] * q[2], length = square_root(square);
     const auto off_centre = square > 1e-24;
     const T inverse = choose(off_centre, 1.0 / length, T{});
-    const T x = q[0] * inverse, y = q[1] * inverse, z = choose(off_centre, q[2] * inverse, broadcast<T>(1.0));
-    const T sign = choose(z >= 0.0, broadcast<T>(1.0), broadcast<T>(-1.0)), a = -1.0 / (sign + z), b = x * y * a;
-    const T rows[3][4] = {{1.0 + sign * x * x * a, sign * b, -sign * x, T{}},
-                          {b, sign + y * y * a, -y, T{}},
-                          {x * q[3], y * q[3], z * q[3], -length}};
+    const T n[3] = {q[0] * inverse, q[1] * inverse, choose(off_centre, q[2] * inverse, broadcast<T>(1.0))};
+    T u[3], v[3];
+    magloc::fill_tangents(n, u, v);
+    const T rows[3][4] = {
+        {u[0], u[1], u[2], T{}}, {v[0], v[1], v[2], T{}}, {n[0] * q[3], n[1] * q[3], n[2] * q[3], -length}};
     for (int j = 0; j < 3; ++j)
       for (int d = 0; d < 4; ++d) t[j][d] = free && !free[j] ? T{} : rows[j][d];
   }
