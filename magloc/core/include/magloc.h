@@ -193,6 +193,17 @@ typedef struct {
 int64_t magloc_attitude_motion_runs(const magloc_attitude_motion *problem, int64_t begin, int64_t end,
                                     double *workspace);
 
+/* Rotation of satellites at small angles to the orbital frame, in place; an item is a run. */
+typedef struct {
+  int64_t n_steps;
+  double dt, orbital_rate;
+  const double *inertia, *inverse_inertia; /* (3, 3) */
+  const double *control;                   /* (n_runs, 3), torque that is held */
+  const double *disturbance; /* (2 n_steps + 1, 3), torque at the beginning, middle and end of each step, of all runs */
+  double *state;             /* (n_runs, 9): roll, pitch and yaw, rate in body axes, and the integral of the rate */
+} magloc_small_motion;
+int64_t magloc_small_motion_runs(const magloc_small_motion *problem, int64_t begin, int64_t end, double *workspace);
+
 /* Error-state Kalman filter of attitude and rate with a gate. Item run * n_instants + i is instant i of a run; those of
    a run are in order, with one workspace.
    The optional states, three numbers each, in this order: bias of field and gyro, disturbance, error of the field

@@ -16,6 +16,7 @@
   X(heading_filter, heading)                  \
   X(heading_smoother, heading)                \
   X(attitude_motion_runs, attitude_motion)    \
+  X(small_motion_runs, small_motion)          \
   X(mekf_runs, mekf)                          \
   X(filter_starts, starts)                    \
   X(refine, refinement)                       \
