@@ -204,6 +204,23 @@ typedef struct {
 } magloc_small_motion;
 int64_t magloc_small_motion_runs(const magloc_small_motion *problem, int64_t begin, int64_t end, double *workspace);
 
+/* Guaranteed ellipsoids of the states of one linear system, in place; an item is a run. */
+typedef struct {
+  int64_t n_states, n_channels;
+  const double *A, *disturbance; /* (n_states, n_states): transition; shape of the ellipsoid of disturbances */
+  const double *inputs;          /* (n_runs, n_states), added by ellipsoids_predict */
+  const double *directions;      /* (n_channels, n_states) */
+  const double *readings;        /* (n_runs, n_channels), NaN where missing */
+  int64_t rule;                  /* of the step: 0 lemma, 1 optimal, 2 tightened */
+  double inflation;              /* least growth of a bound that is contradicted */
+  const double *reinflation;     /* (n_states, n_states), added to an ellipsoid that is contradicted */
+  double *centres, *shapes;      /* (n_runs, n_states), (n_runs, n_states, n_states) */
+  double *bounds;                /* (n_runs, n_channels) of the readings' errors */
+  int64_t *resets;               /* (n_runs), contradictions so far */
+} magloc_ellipsoids;
+int64_t magloc_ellipsoids_predict(const magloc_ellipsoids *problem, int64_t begin, int64_t end, double *workspace);
+int64_t magloc_ellipsoids_correct(const magloc_ellipsoids *problem, int64_t begin, int64_t end, double *workspace);
+
 /* Error-state Kalman filter of attitude and rate with a gate. Item run * n_instants + i is instant i of a run; those of
    a run are in order, with one workspace.
    The optional states, three numbers each, in this order: bias of field and gyro, disturbance, error of the field

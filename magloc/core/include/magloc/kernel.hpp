@@ -17,6 +17,8 @@
   X(heading_smoother, heading)                \
   X(attitude_motion_runs, attitude_motion)    \
   X(small_motion_runs, small_motion)          \
+  X(ellipsoids_predict, ellipsoids)           \
+  X(ellipsoids_correct, ellipsoids)           \
   X(mekf_runs, mekf)                          \
   X(filter_starts, starts)                    \
   X(refine, refinement)                       \
