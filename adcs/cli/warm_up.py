@@ -1,30 +1,17 @@
-"""``adcs warm-up``: what other commands compile when they are first used is compiled ahead."""
+"""``adcs warm-up``: nothing is left to compile; the command stays for one release."""
 
 from __future__ import annotations
 
-import adcs
-from adcs.complementary.names import METHODS
-from magloc.cli import framework
-from magloc.cli.framework import QuietOptions
+from magloc.cli.framework import QuietOptions, print_note
 
 
 def warm_up(*, common: QuietOptions = QuietOptions()) -> None:  # noqa: B008 - frozen
-    """Compile ahead what run, estimate and imu compile when they are first used, for this machine and version.
+    """Say that nothing is left to compile: the filters were compiled when the package was built.
 
     Parameters
     ----------
     common : QuietOptions
         Common options.
     """
-    from adcs.cli.app import app
-
-    few = ("--seeds", "1", "--duration", "60")
-    filters = ("mekf", "constant-gain", "parallel-disturbance", "smoother")
-    calls = [
-        *(("run", "tabletsat", "--filter", name, *few) for name in filters),
-        ("run", "tabletsat", "--sensors", "mag+sun+gyro", "--states", "gyro-bias", *few),
-        *(("run", "complementary", "--filter", name) for name in METHODS),
-        ("run", "ellipsoid", "--seeds", "1"),
-        ("imu", str(adcs.datasets.load("imu").path), "--offline"),
-    ]
-    framework.warm_up(app, calls, common)
+    if not common.quiet:
+        print_note("nothing is left to compile: the filters were compiled when the package was built", "adcs")

@@ -193,6 +193,34 @@ typedef struct {
 int64_t magloc_attitude_motion_runs(const magloc_attitude_motion *problem, int64_t begin, int64_t end,
                                     double *workspace);
 
+/* Rotation of satellites at small angles to the orbital frame, in place; an item is a run. */
+typedef struct {
+  int64_t n_steps;
+  double dt, orbital_rate;
+  const double *inertia, *inverse_inertia; /* (3, 3) */
+  const double *control;                   /* (n_runs, 3), torque that is held */
+  const double *disturbance; /* (2 n_steps + 1, 3), torque at the beginning, middle and end of each step, of all runs */
+  double *state;             /* (n_runs, 9): roll, pitch and yaw, rate in body axes, and the integral of the rate */
+} magloc_small_motion;
+int64_t magloc_small_motion_runs(const magloc_small_motion *problem, int64_t begin, int64_t end, double *workspace);
+
+/* Guaranteed ellipsoids of the states of one linear system, in place; an item is a run. */
+typedef struct {
+  int64_t n_states, n_channels;
+  const double *A, *disturbance; /* (n_states, n_states): transition; shape of the ellipsoid of disturbances */
+  const double *inputs;          /* (n_runs, n_states), added by ellipsoids_predict */
+  const double *directions;      /* (n_channels, n_states) */
+  const double *readings;        /* (n_runs, n_channels), NaN where missing */
+  int64_t rule;                  /* of the step: 0 lemma, 1 optimal, 2 tightened */
+  double inflation;              /* least growth of a bound that is contradicted */
+  const double *reinflation;     /* (n_states, n_states), added to an ellipsoid that is contradicted */
+  double *centres, *shapes;      /* (n_runs, n_states), (n_runs, n_states, n_states) */
+  double *bounds;                /* (n_runs, n_channels) of the readings' errors */
+  int64_t *resets;               /* (n_runs), contradictions so far */
+} magloc_ellipsoids;
+int64_t magloc_ellipsoids_predict(const magloc_ellipsoids *problem, int64_t begin, int64_t end, double *workspace);
+int64_t magloc_ellipsoids_correct(const magloc_ellipsoids *problem, int64_t begin, int64_t end, double *workspace);
+
 /* Error-state Kalman filter of attitude and rate with a gate. Item run * n_instants + i is instant i of a run; those of
    a run are in order, with one workspace.
    The optional states, three numbers each, in this order: bias of field and gyro, disturbance, error of the field
@@ -385,6 +413,49 @@ typedef struct {
                      and no nuisances but common fields */
 } magloc_bounds;
 int64_t magloc_source_bounds(const magloc_bounds *problem, int64_t begin, int64_t end, double *workspace);
+
+/* Filter that makes the noise of a survey white: measurements of unit noise, and states that decay and grow. The last
+   two states are a value and its slope. An item is a row, all in order. */
+typedef struct {
+  int64_t n_states, n_measurements;
+  const double *H; /* (n_rows, n_measurements, n_states) */
+  const double *kept,
+      *added;          /* (n_rows, n_states): part of each state that is left in a step; growth of its variance */
+  const double *dt;    /* (n_rows) */
+  const double *start; /* (n_states), variances before the first step */
+  double *gains;       /* (n_rows, n_measurements, n_states + 1): Kalman gains, and the innovation's 1/sigma */
+} magloc_survey_filter;
+int64_t magloc_survey_gains(const magloc_survey_filter *problem, int64_t begin, int64_t end, double *workspace);
+
+/* Innovations of columns over their standard deviation, by a filter whose gains are known; an item is a row of them,
+   all in order. Rows of the filter that are left out have columns of zeros. */
+typedef struct {
+  const magloc_survey_filter *filter;
+  int64_t n_columns;
+  const int64_t *rows; /* (n), ascending */
+  double *columns;     /* (n, n_measurements, n_columns) */
+} magloc_survey_whitening;
+int64_t magloc_survey_whiten(const magloc_survey_whitening *problem, int64_t begin, int64_t end, double *workspace);
+
+/* What sources add to the measurements of a survey. A measurement is the sum over the rows of a group, divided by the
+   root of their number; an item is a group. */
+typedef struct {
+  int64_t n_sensors, n_channels, n_measurements, n_sources;
+  const double *sensors;            /* (n_rows, n_sensors, 3) */
+  const double *directions;         /* (n_rows, n_channels, 3) that channels measure */
+  const double *mixing;             /* (n_measurements, n_channels) */
+  const int64_t *sensor_of_channel; /* (n_channels) */
+  const double *sources, *moments;  /* (n_sources, 3); moments for survey_sources only, else NULL */
+  const int64_t *first_row;         /* (n_groups + 1) of each group */
+  const int64_t *groups;            /* (n) that are wanted */
+  double *out;                      /* (n, n_measurements, size) */
+} magloc_survey_columns;
+/* Of moments of unit x, y and z: size 3 n_sources, by axis, then by source. */
+int64_t magloc_survey_moments(const magloc_survey_columns *problem, int64_t begin, int64_t end, double *workspace);
+/* Derivatives by position and moment: size 6 n_sources, by source. */
+int64_t magloc_survey_sources(const magloc_survey_columns *problem, int64_t begin, int64_t end, double *workspace);
+/* Of poles, whose field is d/r^3: size n_sources. */
+int64_t magloc_survey_poles(const magloc_survey_columns *problem, int64_t begin, int64_t end, double *workspace);
 
 /* end of the declarations */
 #ifdef __GNUC__

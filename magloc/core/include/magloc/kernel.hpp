@@ -16,6 +16,9 @@
   X(heading_filter, heading)                  \
   X(heading_smoother, heading)                \
   X(attitude_motion_runs, attitude_motion)    \
+  X(small_motion_runs, small_motion)          \
+  X(ellipsoids_predict, ellipsoids)           \
+  X(ellipsoids_correct, ellipsoids)           \
   X(mekf_runs, mekf)                          \
   X(filter_starts, starts)                    \
   X(refine, refinement)                       \
@@ -23,7 +26,12 @@
   X(choose_candidates, candidate_choice)      \
   X(search_optima, search)                    \
   X(source_uncertainties, source_uncertainty) \
-  X(source_bounds, bounds)
+  X(source_bounds, bounds)                    \
+  X(survey_gains, survey_filter)              \
+  X(survey_whiten, survey_whitening)          \
+  X(survey_moments, survey_columns)           \
+  X(survey_sources, survey_columns)           \
+  X(survey_poles, survey_columns)
 
 #define MAGLOC_JOIN_(a, b, c) magloc_##a##_##b##c
 #define MAGLOC_JOIN(a, b, c) MAGLOC_JOIN_(a, b, c)
