@@ -23,6 +23,8 @@ from tests.waiting import WAIT_S
 pytest.importorskip("scikit_build_core", reason="needs scikit-build-core, of the extra test")
 ONLY_TO_BUILD = (".cpp", "CMakeLists.txt", "core/build_backend.py", "core/declare.py")
 LIBRARY = ("magloc/core/kernels.", "magloc/core/_declarations.py")
+BUILD_S = 1800.0
+"""Longest time that a build takes on a busy machine."""
 
 
 def made(kind: str, tree: Path, place: Path) -> Path:
@@ -36,7 +38,7 @@ def made(kind: str, tree: Path, place: Path) -> Path:
         "PYTHONDONTWRITEBYTECODE": "1",  # a build must not add files to the tree that another test lists
     }
     done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tree, stdout=subprocess.PIPE, encoding="utf-8", timeout=WAIT_S, check=True,
+        [sys.executable, "-c", code], cwd=tree, stdout=subprocess.PIPE, encoding="utf-8", timeout=BUILD_S, check=True,
         env=environment,
     )  # fmt: skip
     return place / done.stdout.split()[-1]
@@ -128,7 +130,9 @@ def made_by_pip(tree: Path, place: Path, **environment: str) -> Path:
     environment = {"PATH": str(fresh), "HOME": str(place), **environment}
     others = {name: value for name, value in os.environ.items() if name not in ("CC", "CXX")}
     command = [str(fresh / "python"), "-m", "pip", "wheel", "--no-deps", "--wheel-dir", str(place), str(tree)]
-    done = subprocess.run(command, env={**others, **environment}, capture_output=True, encoding="utf-8", timeout=1800)
+    done = subprocess.run(
+        command, env={**others, **environment}, capture_output=True, encoding="utf-8", timeout=BUILD_S
+    )
     if "No matching distribution found" in done.stderr or "Connection" in done.stderr:
         pytest.skip("needs the package index")
     assert done.returncode == 0, done.stderr

@@ -36,19 +36,21 @@ __all__ = [
 ]
 _COMPILERS = ("c++", "g++", "clang++", "clang-cl")
 _ROOT = Path(__file__).resolve().parents[2]
+_TARGET = os.environ.get("MAGLOC_ZIG_TARGET", "")
 Settings = dict[str, Any] | None
+
+if _TARGET:
+    _machine, _system, _library = _TARGET.split("-")
+    _version = _library.removeprefix("gnu.").replace(".", "_")
+    os.environ["_PYTHON_HOST_PLATFORM"] = f"many{_system}_{_version}_{_machine}"  # the tag of the wheel
 
 
 def _has_compiler() -> bool:
     return bool(os.environ.get("CXX")) or any(shutil.which(name) for name in _COMPILERS)
 
 
-def _target() -> str:
-    return os.environ.get("MAGLOC_ZIG_TARGET", "")
-
-
 def _requirements(hook: Callable[[Settings], list[str]], settings: Settings) -> list[str]:
-    return [*hook(settings), *([] if _has_compiler() and not _target() else ["ziglang>=0.13"])]
+    return [*hook(settings), *([] if _has_compiler() and not _TARGET else ["ziglang>=0.13"])]
 
 
 def get_requires_for_build_wheel(config_settings: Settings = None) -> list[str]:
@@ -67,12 +69,11 @@ def _use_zig_where_needed() -> None:
     CMake expects programs of one word. `zig cc` compiles C++, too; `zig c++` would first compile the C++ library, which
     the kernels do not need.
     """
-    target = _target()
-    if _has_compiler() and not target:
+    if _has_compiler() and not _TARGET:
         return
     folder = Path(tempfile.mkdtemp(prefix="magloc-zig-"))
     tools = {}
-    compiler = f"cc -target {target}" if target else "cc"
+    compiler = f"cc -target {_TARGET}" if _TARGET else "cc"
     for variable, command in (("CC", compiler), ("CXX", compiler), ("AR", "ar"), ("RANLIB", "ranlib")):
         program = folder / f"zig-{variable.lower()}"
         program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m ziglang {command} "$@"\n', encoding="utf-8")
@@ -80,15 +81,12 @@ def _use_zig_where_needed() -> None:
         tools[variable] = str(program)
     os.environ.update(CC=tools["CC"], CXX=tools["CXX"])
     options = [os.environ.get("CMAKE_ARGS", ""), f"-DCMAKE_AR={tools['AR']}", f"-DCMAKE_RANLIB={tools['RANLIB']}"]
-    if target:
-        machine, system, library = target.split("-")
-        version = library.removeprefix("gnu.").replace(".", "_")
+    if _TARGET:
         options += [
-            f"-DCMAKE_SYSTEM_NAME={system.capitalize()}",
-            f"-DCMAKE_SYSTEM_PROCESSOR={machine}",
+            f"-DCMAKE_SYSTEM_NAME={_system.capitalize()}",
+            f"-DCMAKE_SYSTEM_PROCESSOR={_machine}",
             "-DCMAKE_STRIP=",
         ]
-        os.environ["_PYTHON_HOST_PLATFORM"] = f"many{system}_{version}_{machine}"
     os.environ["CMAKE_ARGS"] = " ".join(options)
 
 
