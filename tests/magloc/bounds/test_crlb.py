@@ -467,7 +467,7 @@ class TestKnownModulus:
     @each_array
     @pytest.mark.usefixtures("instruction_set")
     def test_equals_the_reference(self, array):
-        positions, moments = places(array, 6), moments_over(array, 5)
+        positions, moments = places(array, 6), moments_over(array, 9)
         table = sigma_table(array, positions, moments, known_moment_sigma_Am2=5.0)
         reference = cramer_rao_bounds(array, positions[:, None], moments, known_moment_sigma_Am2=5.0)
         assert_allclose(table.range_m, reference.sigma_range_m, rtol=1e-8)
@@ -532,6 +532,20 @@ class TestTable:
         assert np.isnan(np.array(table)[:, 1]).all()
         nothing = sigma_table(TETRAHEDRON, positions[:1], np.zeros((1, 3)))
         assert np.isinf(np.array(nothing)).all()
+
+    @pytest.mark.parametrize("n_moments", [1, 9])
+    @pytest.mark.usefixtures("instruction_set")
+    def test_singular_and_undefined_ones_of_vector_sensors(self, n_moments):
+        """Of few moments, and of as many as have their rows in common."""
+        moments, positions = moments_over(TETRAHEDRON, n_moments), np.array([SOURCE, 2.0 * SOURCE])
+        for n_sensors in (1, 2):
+            too_few = SensorArray(TETRAHEDRON.sensors[:n_sensors])
+            assert np.isinf(np.array(sigma_table(too_few, positions, moments))).all()
+        undefined = np.stack([TETRAHEDRON.positions[1], TETRAHEDRON.centroid])
+        assert np.isnan(np.array(sigma_table(TETRAHEDRON, undefined, moments))).all()
+        no_moment = np.array(sigma_table(TETRAHEDRON, positions, np.vstack([np.zeros(3), moments])))
+        assert np.isinf(no_moment[..., 0]).all()
+        assert np.isfinite(no_moment[..., 1:]).all()
 
     @each_array
     def test_spreads_are_those_of_the_table(self, array):

@@ -6,6 +6,72 @@
 #include "linear.hpp"
 
 MAGLOC_BEGIN
+// What all moments at a place have in common if neither axes nor noise depend on them: nine rows whose columns have the
+// same products as those of all channels, freed of nuisances. A row reads r[0], r[1], r[2] of a change of the moment,
+// and G m of minus a change of the position with G = r[3], ..., r[8] (xx, xy, xz, yy, yz, zz).
+class PlaceRows {
+  const magloc_bounds &p_;
+  const int64_t n_nuisances_, n_columns_;
+  double *const rows_;
+
+ public:
+  static constexpr int64_t n = 9, fewest_moments = 8;
+  const bool are_used;
+  int64_t place = -1;
+  double r[n][n];
+
+  PlaceRows(const magloc_bounds &p, Workspace &room)
+      : p_(p),
+        n_nuisances_(p.array->n_nuisances),
+        n_columns_(n_nuisances_ + n),
+        rows_(room.take<double>((p.array->n_channels + n_nuisances_) * n_columns_)),
+        are_used(p.n_moments >= fewest_moments && !p.slopes && !p.array->noise_depends_on_field &&
+                 p.array->n_channels == 3 * p.array->n_sensors &&
+                 (n_nuisances_ == 0 || p.array->nuisances[n_nuisances_ - 1] < 3)) {}
+
+  // R of a QR decomposition by modified Gram-Schmidt; what is left of a column may be rounding.
+  void fill(int64_t at) {
+    place = at;
+    fill_rows();
+    const int64_t n_rows = p_.array->n_channels + n_nuisances_;
+    double before[n + 3] = {};
+    for (int64_t i = 0; i < n_rows * n_columns_; ++i) before[i % n_columns_] += rows_[i] * rows_[i];
+    for (int64_t k = 0; k < n_columns_; ++k) {
+      double product[n + 3] = {};
+      for (int64_t i = 0; i < n_rows; ++i)
+        for (int64_t j = k; j < n_columns_; ++j) product[j] += rows_[i * n_columns_ + k] * rows_[i * n_columns_ + j];
+      const double inverse = product[k] <= 1e-26 * before[k] ? 0.0 : 1.0 / product[k];
+      for (int64_t j = n_nuisances_; j < n_columns_ && k >= n_nuisances_; ++j)
+        r[k - n_nuisances_][j - n_nuisances_] = j < k ? 0.0 : square_root(inverse) * product[j];
+      for (int64_t i = 0; i < n_rows; ++i)
+        for (int64_t j = n_columns_; j-- > k;)
+          rows_[i * n_columns_ + j] -= inverse * product[j] * rows_[i * n_columns_ + k];
+    }
+  }
+
+ private:
+  void fill_rows() {
+    const magloc_bound_array &array = *p_.array;
+    for (int64_t c = 0; c < array.n_channels; ++c) {
+      double axis[3], d[3], by_moment[3], g[3][3], *row = rows_ + c * n_columns_;
+      for (int a = 0; a < 3; ++a) {
+        axis[a] = array.gain[3 * c + a] / array.noise[c];
+        d[a] = p_.sensors[c / 3 * 3 + a] - p_.positions[3 * place + a];
+      }
+      const auto ray = Ray<double>::from(d);
+      field(ray, axis, by_moment);
+      gradient(ray, axis, g);
+      for (int64_t q = 0; q < n_nuisances_; ++q) *row++ = axis[array.nuisances[q]];
+      for (const double x : by_moment) *row++ = mu0_over_4pi * x;
+      for (int a = 0; a < 3; ++a)
+        for (int b = a; b < 3; ++b) *row++ = mu0_over_4pi * g[a][b];
+    }
+    for (int64_t q = 0; q < n_nuisances_; ++q)
+      for (int64_t j = 0; j < n_columns_; ++j)
+        rows_[(array.n_channels + q) * n_columns_ + j] = j == q ? array.prior[q] : 0.0;
+  }
+};
+
 // Sources side by side, one in each lane.
 template <class T>
 class Bounds {
@@ -17,17 +83,22 @@ class Bounds {
 
   const magloc_bounds &p_;
   const magloc_bound_array &array_;
+  PlaceRows place_rows_;
+  const int64_t n_nuisances_;
   // The whitened Jacobian (n_rows, ...): nuisances; moment and position across (u, v), and along (n) the line from the
   // centroid.
   T *const nuisances_, *const others_, *const range_;
   T *const products_, *const shares_, *const axes_, *const fields_, *const body_fields_;
   T position_[3], moment_[3], frame_[3][3], distance_, mean_field_[3], mean_modulus_[3], square_;
+  T r_[PlaceRows::n][PlaceRows::n] = {};  // of PlaceRows
   int64_t n_rows_, place_[n_lanes<T>];
 
  public:
   Bounds(const magloc_bounds &p, Workspace &room)
       : p_(p),
         array_(*p.array),
+        place_rows_(p, room),
+        n_nuisances_(place_rows_.are_used ? 0 : p.array->n_nuisances),
         nuisances_(room.take<T>(most_rows() * p.array->n_nuisances)),
         others_(room.take<T>(5 * most_rows())),
         range_(room.take<T>(most_rows())),
@@ -36,6 +107,7 @@ class Bounds {
         axes_(room.take<T>(3 * p.array->n_channels)),
         fields_(room.take<T>(3 * p.array->n_sensors)),
         body_fields_(room.take<T>(3 * p.array->n_errors)) {
+    for (int64_t &place : place_) place = -1;
     for (int64_t i = 0; axes_ && i < 3 * p.array->n_channels; ++i)
       axes_[i] = broadcast<T>(p.array->gain[i] / p.array->noise[i / 3]);
   }
@@ -43,8 +115,12 @@ class Bounds {
   // Sources begin, begin + 1, ... before end.
   void run(int64_t begin, int64_t end) {
     load(begin, end);
-    fill_fields();
-    fill_rows();
+    if (place_rows_.are_used) {
+      fill_rows_of_place();
+    } else {
+      fill_fields();
+      fill_rows();
+    }
     T square[3], x[5], slope[3];
     eliminate_nuisances(square);
     const Orthogonalisation<T, 5> others(others_, range_, n_rows_, array_.lost);
@@ -83,6 +159,11 @@ class Bounds {
   void load(int64_t begin, int64_t end) {
     int64_t place = begin / p_.n_moments, k = begin % p_.n_moments;
     for (int lane = 0; lane < n_lanes<T>; ++lane) {
+      if (place_rows_.are_used && place_[lane] != place) {
+        if (place_rows_.place != place) place_rows_.fill(place);
+        for (int64_t i = 0; i < PlaceRows::n; ++i)
+          for (int64_t j = i; j < PlaceRows::n; ++j) set_lane(r_[i][j], lane, place_rows_.r[i][j]);
+      }
       place_[lane] = place;
       const double *moment = p_.moments + 3 * (k + (p_.moments_are_own ? place * p_.n_moments : 0));
       for (int a = 0; a < 3; ++a) {
@@ -123,8 +204,25 @@ class Bounds {
     for (T &x : mean_field_) x /= broadcast<T>(array_.n_sensors - n_moduli);
   }
 
+  void fill_rows_of_place() {
+    square_ = T{};
+    n_rows_ = PlaceRows::n;
+    for (int64_t i = 0; i < n_rows_; ++i) {
+      const T *r = r_[i], g[3][3] = {{r[3], r[4], r[5]}, {r[4], r[6], r[7]}, {r[5], r[7], r[8]}};
+      T by_position[3];
+      for (int a = 0; a < 3; ++a) by_position[a] = -dot(g[a], moment_);
+      put_row(i, {r[0], r[1], r[2]}, by_position);
+    }
+  }
+  MAGLOC_INLINE void put_row(int64_t i, const T (&by_moment)[3], const T (&by_position)[3]) {
+    for (int a = 0; a < 3; ++a) others_[5 * i + a] = by_moment[a];
+    for (int a = 0; a < 2; ++a) others_[5 * i + 3 + a] = dot(by_position, frame_[a]);
+    range_[i] = dot(by_position, frame_[2]);
+  }
+
   void fill_rows() {
     square_ = T{};
+    n_rows_ = array_.n_channels;
     for (int64_t s = 0; s < array_.n_sensors; ++s) {
       const int64_t first = array_.first_channel[s];
       const Ray<T> ray = ray_to(s);
@@ -227,9 +325,7 @@ class Bounds {
       else
         *row++ = dot(axis, reinterpret_cast<T(&)[3]>(body_fields_[3 * (kind - body)]));
     }
-    for (int a = 0; a < 3; ++a) others_[5 * c + a] = by_moment[a];
-    for (int a = 0; a < 2; ++a) others_[5 * c + 3 + a] = dot(by_position, frame_[a]);
-    range_[c] = dot(by_position, frame_[2]);
+    put_row(c, by_moment, by_position);
     square_ += dot(by_position, by_position);
   }
   // A turn of the array about axis k turns the place of the source, its moment and the ambient field back.
@@ -245,8 +341,7 @@ class Bounds {
   // digits. What is known of a nuisance is a row of its own, which no column before it reaches. Squares of the columns
   // u, v and n are what is left of them.
   void eliminate_nuisances(T (&squares)[3]) {
-    const int64_t n = array_.n_nuisances;
-    n_rows_ = array_.n_channels;
+    const int64_t n = n_nuisances_;
     if (array_.modulus_prior > 0.0) {
       const int64_t i = add_row();
       const T scale = array_.modulus_prior / square_root(dot(moment_, moment_));
@@ -282,7 +377,7 @@ class Bounds {
     }
   }
   int64_t add_row() {
-    for (int64_t j = 0; j < array_.n_nuisances; ++j) nuisances_[n_rows_ * array_.n_nuisances + j] = T{};
+    for (int64_t j = 0; j < n_nuisances_; ++j) nuisances_[n_rows_ * n_nuisances_ + j] = T{};
     for (int j = 0; j < 5; ++j) others_[5 * n_rows_ + j] = T{};
     range_[n_rows_] = T{};
     return n_rows_++;
