@@ -3,7 +3,7 @@
 #include "magloc/kernel.hpp"
 
 MAGLOC_BEGIN
-// Fill n columns of each source: matrix(ray, m, f) computes f (n, 3), what the field's axes read of sources with moments
+// Fill n columns of each source: matrix(ray, m, f) computes f (n, 3), what the field's axes read of sources of moments
 // m, one in each lane, and at(q, j) is the place of the column j of source q.
 template <int n, class Matrix, class At>
 MAGLOC_INLINE int64_t fill_columns(const magloc_survey_columns &p, int64_t begin, int64_t end, double *workspace,

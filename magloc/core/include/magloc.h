@@ -144,6 +144,18 @@ typedef struct {
 } magloc_butterworth;
 int64_t magloc_low_pass(const magloc_butterworth *problem, int64_t begin, int64_t end, double *workspace);
 
+/* How much readings change, seen from a frame that does not turn, if they lag behind their attitude; an item is a lag.
+ */
+typedef struct {
+  int64_t n_instants, n_rows, apart; /* rows between the two readings of a change */
+  const double *time, *q, *field;    /* (n_instants), ascending; (n_instants, 4); (n_instants, 3) */
+  const int64_t *rows;               /* (n_rows), ascending: instants that count */
+  const uint8_t *is_good;            /* (n_rows) */
+  const double *lags;                /* (n_lags) */
+  double *changes;                   /* (n_lags), sum of squares */
+} magloc_lags;
+int64_t magloc_lag_changes(const magloc_lags *problem, int64_t begin, int64_t end, double *workspace);
+
 /* How the states of a heading filter move on in each block: the heading, the gyro's drift, scales of its axes, the
    sensor's offset, and the slow and the quick variation of the room's field. */
 typedef struct {
@@ -418,12 +430,11 @@ int64_t magloc_source_bounds(const magloc_bounds *problem, int64_t begin, int64_
    two states are a value and its slope. An item is a row, all in order. */
 typedef struct {
   int64_t n_states, n_measurements;
-  const double *H; /* (n_rows, n_measurements, n_states) */
-  const double *kept,
-      *added;          /* (n_rows, n_states): part of each state that is left in a step; growth of its variance */
-  const double *dt;    /* (n_rows) */
-  const double *start; /* (n_states), variances before the first step */
-  double *gains;       /* (n_rows, n_measurements, n_states + 1): Kalman gains, and the innovation's 1/sigma */
+  const double *H;            /* (n_rows, n_measurements, n_states) */
+  const double *kept, *added; /* (n_rows, n_states): part of each state that is left; growth of its variance */
+  const double *dt;           /* (n_rows) */
+  const double *start;        /* (n_states), variances before the first step */
+  double *gains;              /* (n_rows, n_measurements, n_states + 1): Kalman gains, and the innovation's 1/sigma */
 } magloc_survey_filter;
 int64_t magloc_survey_gains(const magloc_survey_filter *problem, int64_t begin, int64_t end, double *workspace);
 

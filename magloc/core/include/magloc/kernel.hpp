@@ -13,6 +13,7 @@
   X(gyro_attitudes, gyro)                     \
   X(level_attitudes, level)                   \
   X(low_pass, butterworth)                    \
+  X(lag_changes, lags)                        \
   X(heading_filter, heading)                  \
   X(heading_smoother, heading)                \
   X(attitude_motion_runs, attitude_motion)    \
