@@ -66,12 +66,13 @@ class QuietOptions:
             for name in PACKAGES:
                 logging.getLogger(name).setLevel(logging.WARNING)
         if self.threads is not None:
-            import numba
-
             from magloc import core
 
             core.set_threads(min(self.threads, os.cpu_count() or 1))
-            numba.set_num_threads(min(self.threads, numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
+            if numba := sys.modules.get("numba"):
+                numba.set_num_threads(min(self.threads, numba.config.NUMBA_NUM_THREADS))
+            else:  # few commands import it, which takes longer than a fix; it reads the variable then
+                os.environ["NUMBA_NUM_THREADS"] = str(core.threads())
 
 
 @Parameter(name="*", group="Common options")

@@ -169,7 +169,7 @@ class SingleSourceSearch:
         listed = np.s_[0, : kept[0]] if len(rows) == 1 else np.arange(found.chi2.shape[1]) < found.counts[:, :1]
         q, mu = found.q[listed], found.mu[listed]
         reason = [""] * len(rows)
-        for i in np.flatnonzero(found.counts[:, 0] == 0).tolist():
+        for i in [i for i, n in enumerate(kept) if not n]:
             reason[i] = _why_unsolved(int(unknown[i]))
         fits = JointFits(q[:, None], mu[:, None], found.chi2[listed], found.iterations[listed])
         return [Optima(rows, fits, of_row, reason, failed_starts=found.counts[:, 1])]
