@@ -22,6 +22,7 @@
   X(candidate_bases, candidate_positions)  \
   X(choose_candidates, candidate_choice)   \
   X(search_optima, search)                 \
+  X(follow_source, track)                  \
   X(source_uncertainties, source_uncertainty)
 
 #define MAGLOC_JOIN_(a, b, c) magloc_##a##_##b##c
