@@ -32,7 +32,8 @@
   X(survey_whiten, survey_whitening)          \
   X(survey_moments, survey_columns)           \
   X(survey_sources, survey_columns)           \
-  X(survey_poles, survey_columns)
+  X(survey_poles, survey_columns)             \
+  X(follow_source, track)
 
 #define MAGLOC_JOIN_(a, b, c) magloc_##a##_##b##c
 #define MAGLOC_JOIN(a, b, c) MAGLOC_JOIN_(a, b, c)

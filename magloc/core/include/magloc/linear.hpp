@@ -127,6 +127,46 @@ struct Ldl {
   static constexpr T no_ridge[n] = {};
 };
 
+// A row of numbers in registers, one after the other; the rest of the last register is zero.
+template <class T>
+constexpr int64_t n_registers(int64_t n) {
+  return (n + n_lanes<T> - 1) / n_lanes<T>;
+}
+template <class T>
+MAGLOC_INLINE double get_number(const T *row, int64_t i) {
+  return get_lane(row[i / n_lanes<T>], i % n_lanes<T>);
+}
+template <class T>
+MAGLOC_INLINE void set_number(T *row, int64_t i, double value) {
+  set_lane(row[i / n_lanes<T>], i % n_lanes<T>, value);
+}
+template <class T>
+MAGLOC_INLINE double dot(const T *a, const T *b, int64_t width) {
+  T sum{};
+  for (int64_t r = 0; r < width; ++r) sum += a[r] * b[r];
+  return sum_of_lanes(sum);
+}
+
+// Gram-Schmidt's method, twice, on n rows of `width` registers in place. The upper triangle becomes R with
+// rows = R^T times the orthonormal rows; a row of zeros remains.
+template <class T, int n>
+void orthonormalise(T *rows, int64_t width, double (&triangle)[n][n]) {
+  for (int j = 0; j < n; ++j) {
+    T *const row = rows + j * width;
+    for (int k = 0; k < j; ++k) triangle[k][j] = 0.0;
+    for (int pass = 0; pass < 2; ++pass)
+      for (int k = 0; k < j; ++k) {
+        const T *const before = rows + k * width;
+        const double share = dot(before, row, width);
+        triangle[k][j] += share;
+        for (int64_t r = 0; r < width; ++r) row[r] -= share * before[r];
+      }
+    const double norm = square_root(dot(row, row, width)), inverse = norm > 0.0 ? 1.0 / norm : 0.0;
+    triangle[j][j] = norm;
+    for (int64_t r = 0; r < width; ++r) row[r] *= inverse;
+  }
+}
+
 // Replace the lower triangle of A by that of -A^-1: the sweep operator on every variable.
 template <class T, int n>
 MAGLOC_INLINE void invert_and_negate(T (&a)[n][n]) {

@@ -69,6 +69,12 @@ MAGLOC_INLINE T broadcast(double x) {
   return T{} + x;
 }
 template <class T>
+MAGLOC_INLINE double sum_of_lanes(const T &x) {
+  double sum = 0.0;
+  for (int i = 0; i < n_lanes<T>; ++i) sum += get_lane(x, i);
+  return sum;
+}
+template <class T>
 MAGLOC_INLINE T maximum(T a, T b) {
   return choose(a > b, a, b);
 }
