@@ -39,27 +39,29 @@ class Problem:
     """A C struct that describes a problem, and the arrays and structs that it points to."""
 
     def __init__(self, kind: str, fields: dict[str, Any]) -> None:
-        self.struct = ffi.new(f"magloc_{kind} *")
-        self.kept = {name: value for name, value in fields.items() if isinstance(value, np.ndarray | Problem)}
-        types = _field_types(kind)
+        struct_type, types = _field_types(kind)
         if fields.keys() != types.keys():
             raise TypeError(f"magloc_{kind} has the fields {[*types]}; instead received {[*fields]}")
-        for name, value in fields.items():
-            if name in self.kept:
-                value = value.struct if isinstance(value, Problem) else _pointer(name, *types[name], value)
-            elif value is None:
-                value = ffi.NULL
-            setattr(self.struct, name, value)
+        values = []
+        for name, (array_type, element) in types.items():
+            value = fields[name]
+            if isinstance(value, np.ndarray):
+                value = _pointer(name, array_type, element, value)
+            elif isinstance(value, Problem):
+                value = value.struct
+            values.append(ffi.NULL if value is None else value)
+        self.struct: Any = ffi.new(struct_type, values)
+        self.kept = fields
 
 
 @lru_cache  # readings that come one by one describe the same kinds of problems again and again
-def _field_types(kind: str) -> dict[str, tuple[Any, np.dtype[Any] | None]]:
-    """Return the C type of an array, and that of its elements, of every field that points to numbers."""
+def _field_types(kind: str) -> tuple[Any, dict[str, tuple[Any, np.dtype[Any] | None]]]:
+    """Return the type of a struct, and of every field that points to numbers those of an array and its elements."""
     types: dict[str, tuple[Any, np.dtype[Any] | None]] = {}
     for name, field in ffi.typeof(f"magloc_{kind}").fields:
         element = field.type.item.cname if field.type.kind == "pointer" else ""
         types[name] = (ffi.typeof(f"{element}[]"), _TYPES[element]) if element in _TYPES else (None, None)
-    return types
+    return ffi.typeof(f"magloc_{kind} *"), types
 
 
 def _pointer(name: str, array_type: Any, wanted: np.dtype[Any] | None, array: np.ndarray[Any, Any]) -> Any:
@@ -121,6 +123,9 @@ def run(kernel: str, work: Problem, n: int, *, block: int, chain: int | None = N
     """
     function = getattr(_lib, f"magloc_{kernel}")
     size = workspace_size(kernel, work)
+    if 0 < n <= block:
+        function(work.struct, 0, n, ffi.new("double[]", size + 1))
+        return
     chain = chain or block
     parts = range(0, n, chain)
     stopped = False
