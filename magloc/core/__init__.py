@@ -121,6 +121,9 @@ def run(kernel: str, work: Problem, n: int, *, block: int, chain: int | None = N
     """
     function = getattr(_lib, f"magloc_{kernel}")
     size = workspace_size(kernel, work)
+    if 0 < n <= block:
+        function(work.struct, 0, n, ffi.new("double[]", size + 1))
+        return
     chain = chain or block
     parts = range(0, n, chain)
     stopped = False
