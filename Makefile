@@ -13,7 +13,7 @@ NOT_INSTALLED = { echo "magloc could not be installed: it needs the package inde
 
 KERNEL_TESTS := tests/magloc/core tests/magloc/fields/test_points.py
 
-.PHONY: map test test-full test-oldest mutation coverage licences sbom audit wheel bench docs notebooks pictures chromium lint sanitize clean
+.PHONY: map test test-full test-oldest mutation coverage licences sbom audit wheel wheel-aarch64 bench bench-against docs notebooks pictures chromium lint sanitize clean
 .PHONY: ready compiled-tests
 
 map: .venv/installed
@@ -78,8 +78,17 @@ audit: .venv-supply/installed
 wheel: .venv-supply/installed
 	.venv-supply/bin/python -m build --outdir dist
 
+# The wheel for Linux on ARM (64 bits, glibc 2.17 or newer), cross-built by Zig.
+wheel-aarch64: .venv-supply/installed
+	MAGLOC_ZIG_TARGET=aarch64-linux-gnu.2.17 .venv-supply/bin/python -m build --wheel --outdir dist
+
 bench: .venv/installed-bench
 	$(BIN)/python -m tests.bench
+
+# Processor time against that of another revision, built beside this one: `make bench-against REV=552c0b8`, with
+# ISA=baseline for kernels confined to what every processor has.
+bench-against: .venv/installed-test
+	$(BIN)/python -m tests.bench.against $(REV) --isa $(or $(ISA),best)
 
 docs: .venv/installed-docs
 	rm -rf docs/_build docs/reference/names

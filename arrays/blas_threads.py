@@ -10,7 +10,7 @@ import inspect
 import sys
 from collections.abc import Callable, Mapping
 from functools import cached_property, wraps
-from threading import Lock
+from threading import Lock, local
 from types import ModuleType
 from typing import Any
 
@@ -29,9 +29,11 @@ class _OneThread:
 
     def __init__(self) -> None:
         self._lock, self._calls = Lock(), 0
+        self.of_thread = local()
         self._before: list[tuple[Any, int]] = []
 
     def __enter__(self) -> None:
+        self.of_thread.calls = 1 + getattr(self.of_thread, "calls", 0)
         with self._lock:
             self._calls += 1
             if self._calls == 1:
@@ -40,6 +42,7 @@ class _OneThread:
                     library.set_num_threads(1)
 
     def __exit__(self, *_: object) -> None:
+        self.of_thread.calls -= 1
         with self._lock:
             self._calls -= 1
             if not self._calls:
@@ -95,6 +98,8 @@ def _guarded_function(function: Callable[..., Any]) -> Callable[..., Any]:
 
     @wraps(function)
     def limited(*arguments: Any, **options: Any) -> Any:
+        if getattr(one_blas_thread.of_thread, "calls", 0):  # our functions call each other often
+            return function(*arguments, **options)
         with one_blas_thread:
             return function(*arguments, **options)
 

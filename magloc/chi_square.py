@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import chdtri, chndtr, chndtrinc
 
 from arrays.io.csv import Column
-from arrays.typing import FloatArray
+from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.levels import CONSISTENCY, FALSE_ALARM
 
 
@@ -30,6 +30,20 @@ def bounds99(degrees_of_freedom: ArrayLike) -> tuple[FloatArray, FloatArray]:
     dof = np.asarray(degrees_of_freedom, dtype=np.float64)
     known = np.where(dof > 0.0, dof, np.nan)
     return chdtri(known, 0.995) / known, chdtri(known, 0.005) / known
+
+
+def exceeds(chi2: FloatArray, dof: IntArray, probability: float) -> BoolArray:
+    """Return whether each χ² exceeds what noise alone does with a probability; False without degrees of freedom."""
+    largest = np.full(dof.shape, np.inf)
+    for n in set(dof.tolist()):  # inverse distributions take longer than all else of a test, and rows are alike
+        if n > 0:
+            largest[dof == n] = _quantile(n, probability)
+    return np.asarray(chi2 > largest)
+
+
+@lru_cache(maxsize=256)
+def _quantile(dof: int, probability: float) -> float:
+    return float(chdtri(dof, probability))
 
 
 def square_columns(name: str, square: FloatArray, dof: NDArray[np.int64]) -> dict[str, Column]:

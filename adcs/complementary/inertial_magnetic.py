@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adcs import quaternion
 from adcs.complementary.heading import HeadingModel
@@ -32,6 +31,7 @@ from adcs.satellite.telemetry import is_read
 from adcs.satellite.vector_record import GyroSamples, instants_within, step_rates, steps_s
 from arrays.io.values import numbers, seconds
 from arrays.typing import BoolArray, FloatArray
+from magloc import core
 
 _TILT_FLOOR_RAD = math.radians(0.4)
 _TURN_S = 0.5  # for how long a hand turns one way
@@ -308,11 +308,21 @@ def _lag_s(q_gyro: FloatArray, record: InertialMagneticRecord) -> float:
     apart = instants_within(_LAG_WINDOW_S, time_s[rows])
     good = np.abs(lengths[rows] - usual) < _USUAL_LENGTH * usual
     most = round(_LONGEST_LAG_S / step)
-    pairs = np.flatnonzero(good[apart:] & good[:-apart])
-    changes = []
-    for lag in range(most + 1):
-        steady = without_turns(q_gyro, time_s, rows, field_T, lag * step)
-        changes.append(float(np.sum(np.square(steady[pairs + apart] - steady[pairs]))))
+    changes = np.zeros(most + 1)
+    work = core.problem(
+        "lags",
+        n_instants=len(time_s),
+        n_rows=len(rows),
+        apart=apart,
+        time=np.ascontiguousarray(time_s),
+        q=np.ascontiguousarray(q_gyro),
+        field=np.ascontiguousarray(field_T),
+        rows=np.ascontiguousarray(rows),
+        is_good=good.astype(np.uint8),
+        lags=step * np.arange(most + 1),
+        changes=changes,
+    )
+    core.run("lag_changes", work, len(changes), block=1)
     least = int(np.argmin(changes))
     if not 0 < least < most:
         return least * step
@@ -328,19 +338,16 @@ def _usual_field(record: InertialMagneticRecord) -> FloatArray:
 
 
 def _without_lag(q_gyro: FloatArray, time_s: FloatArray, field_T: FloatArray, lag_s: float) -> FloatArray:
-    steady = without_turns(q_gyro, time_s, np.arange(len(time_s)), field_T, lag_s)
-    return quaternion.rotate_back(q_gyro, steady)
+    return quaternion.rotate_back(q_gyro, without_turns(q_gyro, time_s, field_T, lag_s))
 
 
-def without_turns(
-    q: FloatArray, time_s: FloatArray, rows: NDArray[np.intp], field_T: FloatArray, lag_s: float
-) -> FloatArray:
-    """Return readings (k, 3) of some rows in a frame that does not turn, of a sensor that lags behind its attitude.
+def without_turns(q: FloatArray, time_s: FloatArray, field_T: FloatArray, lag_s: float) -> FloatArray:
+    """Return readings (n, 3) in a frame that does not turn, of a sensor that lags behind its attitude.
 
-    ``q`` (n, 4): attitudes at the times (n,), on straight lines between them. ``rows`` (k,): of ``field_T`` (n, 3).
+    ``q`` (n, 4): attitudes at the times (n,), on straight lines between them.
     """
-    then = np.stack([np.interp(time_s[rows] - lag_s, time_s, component) for component in q.T], axis=-1)
-    return quaternion.rotate(quaternion.normalised(then), field_T[rows])
+    then = np.stack([np.interp(time_s - lag_s, time_s, component) for component in q.T], axis=-1)
+    return quaternion.rotate(quaternion.normalised(then), field_T)
 
 
 def _attitude(up: FloatArray, north: FloatArray) -> FloatArray:

@@ -32,6 +32,23 @@ class Runs {
   }
 };
 
+// Roll, pitch and yaw against the orbital frame, the rate against inertial space in body axes, and its integral.
+struct SmallMotion {
+  Vector<Lanes> angles, w, turned;
+};
+
+inline SmallMotion operator+(const SmallMotion &a, const SmallMotion &b) {
+  return {a.angles + b.angles, a.w + b.w, a.turned + b.turned};
+}
+inline SmallMotion operator*(double scale, const SmallMotion &a) {
+  return {scale * a.angles, scale * a.w, scale * a.turned};
+}
+
+inline SmallMotion slope(const Body &body, double orbital_rate, const SmallMotion &x, const Vector<Lanes> &torque) {
+  const Vector<Lanes> orbit = {{x.angles[2], broadcast<Lanes>(1.0), -x.angles[0]}};
+  return {x.w + orbital_rate * orbit, body.inverse_inertia * (torque - gyroscopic_torque(body, x.w, {})), x.w};
+}
+
 inline FilterModel model_of(const magloc_mekf &p) {
   FilterModel model = {
       {matrix_at(p.inertia), matrix_at(p.inverse_inertia)}, vector_at(p.residual_dipole), (int)p.n_states, {}, {}};
@@ -117,6 +134,33 @@ MAGLOC_KERNEL(attitude_motion_runs, attitude_motion) {
       rod_runs.store(p.rod_fields, k, iron[k].followed, 2, 0);
       rod_runs.store(p.rod_fields, k, iron[k].lagging, 2, 1);
     }
+  }
+  return 0;
+}
+
+MAGLOC_KERNEL(small_motion_runs, small_motion) {
+  if (!workspace) return 0;
+  const auto &p = *problem;
+  const Body body = {matrix_at(p.inertia), matrix_at(p.inverse_inertia)};
+  for (int64_t run = begin; run < end; run += n_lanes<Lanes>) {
+    const Runs runs(run, end, 1);
+    SmallMotion x = {runs.load_vector(p.state, 0, 9), runs.load_vector(p.state, 0, 9, 3),
+                     runs.load_vector(p.state, 0, 9, 6)};
+    const Vector<Lanes> control = runs.load_vector(p.control, 0);
+    for (int64_t i = 0; i < p.n_steps; ++i) {
+      const double *disturbance = p.disturbance + 6 * i;
+      const Vector<Lanes> at_begin = control + broadcast<Lanes>(vector_at(disturbance));
+      const Vector<Lanes> at_middle = control + broadcast<Lanes>(vector_at(disturbance + 3));
+      const Vector<Lanes> at_end = control + broadcast<Lanes>(vector_at(disturbance + 6));
+      const SmallMotion k1 = slope(body, p.orbital_rate, x, at_begin);
+      const SmallMotion k2 = slope(body, p.orbital_rate, x + 0.5 * p.dt * k1, at_middle);
+      const SmallMotion k3 = slope(body, p.orbital_rate, x + 0.5 * p.dt * k2, at_middle);
+      const SmallMotion k4 = slope(body, p.orbital_rate, x + p.dt * k3, at_end);
+      x = x + p.dt / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4);
+    }
+    runs.store(p.state, 0, x.angles, 9);
+    runs.store(p.state, 0, x.w, 9, 3);
+    runs.store(p.state, 0, x.turned, 9, 6);
   }
   return 0;
 }

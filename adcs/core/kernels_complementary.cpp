@@ -120,3 +120,26 @@ MAGLOC_KERNEL(low_pass, butterworth) {
   }
   return 0;
 }
+
+MAGLOC_KERNEL(lag_changes, lags) {
+  const magloc_lags &p = *problem;
+  Workspace memory(workspace);
+  auto *steady = memory.take<Vector<double>>(p.n_rows);
+  if (!workspace) return memory.size();
+  for (int64_t item = begin; item < end; ++item) {
+    double change = 0.0;
+    for (int64_t i = 0, before = 0; i < p.n_rows; ++i) {
+      const double t = p.time[p.rows[i]] - p.lags[item];
+      while (before + 2 < p.n_instants && p.time[before + 1] <= t) ++before;
+      const double share = t > p.time[0] ? (t - p.time[before]) / (p.time[before + 1] - p.time[before]) : 0.0;
+      const double *q = p.q + 4 * before, *after = share > 0.0 ? q + 4 : q;
+      const Quaternion<double> then = (1.0 - share) * quaternion_at(q) + share * quaternion_at(after);
+      steady[i] = rotate(normalised(then), vector_at(p.field + 3 * p.rows[i]));
+      if (i < p.apart || !p.is_good[i] || !p.is_good[i - p.apart]) continue;
+      const Vector<double> difference = steady[i] - steady[i - p.apart];
+      change += dot(difference, difference);
+    }
+    p.changes[item] = change;
+  }
+  return 0;
+}

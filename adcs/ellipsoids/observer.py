@@ -24,9 +24,11 @@ from adcs.ellipsoids.ellipsoid import (
 from adcs.ellipsoids.strip import STEP_RULES, StepRule
 from arrays.io.errors import check_positive
 from arrays.typing import FloatArray
+from magloc import core
 
 IntArray = NDArray[np.int64]
 INFLATION = 1.5
+_RUNS_A_BLOCK = 4000
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,32 +221,36 @@ class EllipsoidObserver:
 
     def predict(self, known_inputs: ArrayLike = 0.0) -> None:
         """Advance all sets by one step; known_inputs of shape (n_runs, n), or one (n,) for all runs."""
-        from adcs.ellipsoids import observer_compiled as ellipsoids
-
-        inputs = np.ascontiguousarray(np.broadcast_to(np.asarray(known_inputs, dtype=np.float64), self.centres.shape))
-        A, Q = self.system.A, self.system.disturbance
-        ellipsoids.over_runs(ellipsoids.predict, len(self), self.centres, self.shapes, A, Q, inputs)
+        inputs = np.broadcast_to(np.asarray(known_inputs, dtype=np.float64), self.centres.shape)
+        self._run("ellipsoids_predict", inputs=np.ascontiguousarray(inputs), readings=None)
 
     def correct(self, readings: ArrayLike) -> None:
         """Correct all sets by the readings of one instant, shape (n_runs, m), NaN where missing."""
-        from adcs.ellipsoids import observer_compiled as ellipsoids
-
         shape = (len(self), self.system.m)
         values = np.asarray(readings, dtype=np.float64)
         if values.shape != shape or np.isinf(values).any():
             raise ValueError(
                 f"Input readings must have shape {shape} and be finite or NaN; instead received shape {values.shape}."
             )
-        ellipsoids.over_runs(
-            ellipsoids.correct,
-            len(self),
-            self.centres,
-            self.shapes,
-            self.bounds,
-            self.resets,
-            self.system.directions,
-            np.ascontiguousarray(values),
-            STEP_RULES.index(self.rule),
-            INFLATION,
-            self._reinflation,
+        self._run("ellipsoids_correct", inputs=None, readings=np.ascontiguousarray(values))
+
+    def _run(self, kernel: str, inputs: FloatArray | None, readings: FloatArray | None) -> None:
+        work = core.problem(
+            "ellipsoids",
+            n_states=self.system.n,
+            n_channels=self.system.m,
+            A=self.system.A,
+            disturbance=self.system.disturbance,
+            inputs=inputs,
+            directions=self.system.directions,
+            readings=readings,
+            rule=STEP_RULES.index(self.rule),
+            inflation=INFLATION,
+            reinflation=self._reinflation,
+            centres=self.centres,
+            shapes=self.shapes,
+            bounds=self.bounds,
+            resets=self.resets,
         )
+        # A step of a run takes a microsecond; starting threads takes hundreds.
+        core.run(kernel, work, len(self), block=_RUNS_A_BLOCK)

@@ -1,7 +1,7 @@
 """Cramér-Rao bounds of many sources, each with many moments: tables, and statistics over the directions of the moment.
 
-Compiled and parallel; the readable twin of every entry is :func:`magloc.bounds.crlb.cramer_rao_bounds`;
-for when they are infinite see docs/theory/cramer-rao-bounds.md.
+The readable reference of every entry is :func:`magloc.bounds.crlb.cramer_rao_bounds`; for when they are infinite see
+docs/theory/cramer-rao-bounds.md.
 """
 
 from __future__ import annotations
@@ -14,8 +14,11 @@ from numpy.typing import ArrayLike
 from arrays.array import SensorArray
 from arrays.typing import FloatArray
 from magloc.bounds.crlb import check_uncertainty
-from magloc.fields.multipole import N_BODY_ERRORS, assumed_body_lengths, check_body_length
+from magloc.bounds.sources import array_model, source_bounds
+from magloc.fields.multipole import assumed_body_lengths, check_body_length
 from magloc.levels import TYPICAL_AND_BAD
+
+_SOURCES_TOGETHER = 250_000  # places times moments that are computed at once
 
 
 class Spread(NamedTuple):
@@ -76,25 +79,32 @@ def table_and_spreads(
     body_length_m: float | None = 0.0,
 ) -> tuple[SigmaTable, MomentBounds]:
     """:func:`sigma_table` (P, K) of some moments and :func:`bounds_over_moments` (P,) of others, in one pass."""
-    from magloc.bounds import table_compiled as bounds
-    from magloc.bounds.frame_compiled import BoundModel
-
     positions, alone = _rows("positions_m", positions_m, least=1), _rows("alone_Am2", alone_Am2)
     moments = _rows("moments_Am2", moments_Am2, least=0 if len(alone) else 1)
     check_uncertainty(ambient_uncertainty_T, known_moment_sigma_Am2)
     check_body_length(body_length_m)
     lengths = assumed_body_lengths(array.positions, positions, array.circumradius, body_length_m)
-    quantiles = np.array(TYPICAL_AND_BAD)
     table = np.empty((3, len(positions), len(alone)))
-    spreads = np.empty((len(positions), 3, 2 + quantiles.size))
+    spreads = np.full((len(Spread._fields), 3, len(positions)), np.nan)
+    together = np.concatenate([alone, moments])
     # Bodies have so many nuisances that points are not to pay for them.
-    for which, n_errors in ((~(lengths > 0.0), 0), (lengths > 0.0, N_BODY_ERRORS)):
-        if which.any():
-            model = BoundModel.of(array, ambient_uncertainty_T, known_moment_sigma_Am2, n_errors)
-            table[:, which], spreads[which] = bounds.table_and_spreads(
-                model, positions[which], lengths[which], alone, moments, quantiles
-            )
-    return SigmaTable(*table), MomentBounds(*(Spread(*spreads[:, i].T) for i in range(3)))
+    for is_body in (False, True):
+        (places,) = np.nonzero((lengths > 0.0) == is_body)
+        model = array_model(
+            array,
+            ambient_uncertainty_T=ambient_uncertainty_T,
+            known_moment_sigma_Am2=known_moment_sigma_Am2,
+            bodies=is_body,
+        )
+        n_together = max(1, _SOURCES_TOGETHER // len(together))
+        for first in range(0, places.size, n_together):
+            of = places[first : first + n_together]
+            length_m = lengths[of] if is_body else None
+            sigma = source_bounds(model, array.positions, positions[of], together, length_m=length_m)
+            table[:, of] = sigma[..., : len(alone)]
+            if len(moments):
+                spreads[..., of] = spread_over(sigma[..., len(alone) :])
+    return SigmaTable(*table), MomentBounds(*(Spread(*spreads[:, i]) for i in range(3)))
 
 
 def sigma_table(
@@ -108,8 +118,7 @@ def sigma_table(
 ) -> SigmaTable:
     """Bounds (P, M) of range, bearing and position for every pair of positions (P, 3) and moments (M, 3).
 
-    Compiled and parallel twin of :func:`magloc.bounds.crlb.cramer_rao_bounds`. Infinite where the information is
-    singular, NaN where :class:`magloc.bounds.crlb.Bounds` is.
+    Infinite where the information is singular, NaN for a source on a sensor or in the centroid.
     """
     moments, none = _rows("moments_Am2", moments_Am2, least=1), np.empty((0, 3))
     uncertain: dict[str, Any] = {

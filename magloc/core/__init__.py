@@ -39,34 +39,34 @@ class Problem:
     """A C struct that describes a problem, and the arrays and structs that it points to."""
 
     def __init__(self, kind: str, fields: dict[str, Any]) -> None:
-        self.struct = ffi.new(f"magloc_{kind} *")
-        self.kept = {name: value for name, value in fields.items() if isinstance(value, np.ndarray | Problem)}
-        types = _field_types(kind)
+        struct, types = _type_and_fields(kind)
         if fields.keys() != types.keys():
             raise TypeError(f"magloc_{kind} has the fields {[*types]}; instead received {[*fields]}")
-        for name, value in fields.items():
-            if name in self.kept:
-                value = value.struct if isinstance(value, Problem) else _pointer(name, *types[name], value)
-            elif value is None:
-                value = ffi.NULL
-            setattr(self.struct, name, value)
+        self.kept = fields
+        self.struct = ffi.new(struct, {name: _c_value(name, types[name], value) for name, value in fields.items()})
 
 
 @lru_cache  # readings that come one by one describe the same kinds of problems again and again
-def _field_types(kind: str) -> dict[str, tuple[Any, np.dtype[Any] | None]]:
-    """Return the C type of an array, and that of its elements, of every field that points to numbers."""
+def _type_and_fields(kind: str) -> tuple[Any, dict[str, tuple[Any, np.dtype[Any] | None]]]:
+    """Return a pointer's type, and of every field that points to numbers the C type and that of its elements."""
     types: dict[str, tuple[Any, np.dtype[Any] | None]] = {}
     for name, field in ffi.typeof(f"magloc_{kind}").fields:
         element = field.type.item.cname if field.type.kind == "pointer" else ""
         types[name] = (ffi.typeof(f"{element}[]"), _TYPES[element]) if element in _TYPES else (None, None)
-    return types
+    return ffi.typeof(f"magloc_{kind} *"), types
 
 
-def _pointer(name: str, array_type: Any, wanted: np.dtype[Any] | None, array: np.ndarray[Any, Any]) -> Any:
-    """Return an array as a C array of the field's type."""
-    if array.dtype != wanted or not array.flags.c_contiguous or not array.flags.aligned:
-        raise TypeError(f"{name} must be a C-contiguous array of {wanted}; instead received {array.dtype}")
-    return ffi.from_buffer(array_type, array)
+def _c_value(name: str, types: tuple[Any, np.dtype[Any] | None], value: Any) -> Any:
+    """Return a field's value as cffi takes it: an array as a C array of the field's type."""
+    if isinstance(value, np.ndarray):
+        array_type, wanted = types
+        flags = value.flags
+        if value.dtype != wanted or not flags.c_contiguous or not flags.aligned:
+            raise TypeError(f"{name} must be a C-contiguous array of {wanted}; instead received {value.dtype}")
+        return ffi.from_buffer(array_type, value)
+    if isinstance(value, Problem):
+        return value.struct
+    return ffi.NULL if value is None else value
 
 
 def problem(kind: str, **fields: Any) -> Problem:
@@ -121,6 +121,9 @@ def run(kernel: str, work: Problem, n: int, *, block: int, chain: int | None = N
     """
     function = getattr(_lib, f"magloc_{kernel}")
     size = workspace_size(kernel, work)
+    if 0 < n <= block:
+        function(work.struct, 0, n, ffi.new("double[]", size + 1))
+        return
     chain = chain or block
     parts = range(0, n, chain)
     stopped = False

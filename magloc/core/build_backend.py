@@ -1,4 +1,8 @@
-"""Build backend: scikit-build-core, with Zig from the package index as compiler on machines that have none."""
+"""Build backend: scikit-build-core, with Zig from the package index as compiler on machines that have none.
+
+Zig compiles for other machines, too: with MAGLOC_ZIG_TARGET=aarch64-linux-gnu.2.17 in the environment a wheel is for
+Linux on ARM with glibc 2.17 or newer.
+"""
 
 import base64
 import hashlib
@@ -33,7 +37,13 @@ __all__ = [
 ]
 _COMPILERS = ("c++", "g++", "clang++", "clang-cl")
 _ROOT = Path(__file__).resolve().parents[2]
+_TARGET = os.environ.get("MAGLOC_ZIG_TARGET", "")
 Settings = dict[str, Any] | None
+
+if _TARGET:
+    _machine, _system, _library = _TARGET.split("-")
+    _version = _library.removeprefix("gnu.").replace(".", "_")
+    os.environ["_PYTHON_HOST_PLATFORM"] = f"many{_system}_{_version}_{_machine}"  # the tag of the wheel
 
 
 def _has_compiler() -> bool:
@@ -41,7 +51,7 @@ def _has_compiler() -> bool:
 
 
 def _requirements(hook: Callable[[Settings], list[str]], settings: Settings) -> list[str]:
-    return [*hook(settings), *([] if _has_compiler() else ["ziglang>=0.13"])]
+    return [*hook(settings), *([] if _has_compiler() and not _TARGET else ["ziglang>=0.13"])]
 
 
 def get_requires_for_build_wheel(config_settings: Settings = None) -> list[str]:
@@ -54,30 +64,38 @@ def get_requires_for_build_editable(config_settings: Settings = None) -> list[st
     return _requirements(_build.get_requires_for_build_editable, config_settings)
 
 
-def _use_zig_without_compiler() -> None:
-    """Let CMake find Zig as its compiler: it expects programs of one word.
+def _use_zig_where_needed() -> None:
+    """Let CMake find Zig as its compiler, if there is no other one or another machine is the target.
 
-    `zig cc` compiles C++, too; `zig c++` would first compile the C++ library, which the kernels do not need.
+    CMake expects programs of one word. `zig cc` compiles C++, too; `zig c++` would first compile the C++ library, which
+    the kernels do not need.
     """
-    if _has_compiler():
+    if _has_compiler() and not _TARGET:
         return
     if find_spec("ziglang") is None:
         sys.exit("magloc: found no C++ compiler, expected g++ or clang++ in PATH, or Zig: pip install ziglang.")
     folder = Path(tempfile.mkdtemp(prefix="magloc-zig-"))
     tools = {}
-    for variable, command in (("CC", "cc"), ("CXX", "cc"), ("AR", "ar"), ("RANLIB", "ranlib")):
-        program = folder / f"zig-{command}"
+    compiler = f"cc -target {_TARGET}" if _TARGET else "cc"
+    for variable, command in (("CC", compiler), ("CXX", compiler), ("AR", "ar"), ("RANLIB", "ranlib")):
+        program = folder / f"zig-{variable.lower()}"
         program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m ziglang {command} "$@"\n', encoding="utf-8")
         program.chmod(program.stat().st_mode | stat.S_IEXEC)
         tools[variable] = str(program)
     os.environ.update(CC=tools["CC"], CXX=tools["CXX"])
-    given = os.environ.get("CMAKE_ARGS", "")
-    os.environ["CMAKE_ARGS"] = f"{given} -DCMAKE_AR={tools['AR']} -DCMAKE_RANLIB={tools['RANLIB']}"
+    options = [os.environ.get("CMAKE_ARGS", ""), f"-DCMAKE_AR={tools['AR']}", f"-DCMAKE_RANLIB={tools['RANLIB']}"]
+    if _TARGET:
+        options += [
+            f"-DCMAKE_SYSTEM_NAME={_system.capitalize()}",
+            f"-DCMAKE_SYSTEM_PROCESSOR={_machine}",
+            "-DCMAKE_STRIP=",
+        ]
+    os.environ["CMAKE_ARGS"] = " ".join(options)
 
 
 def build_wheel(wheel_directory: str, config_settings: Settings = None, metadata_directory: str | None = None) -> str:
     """Build a wheel and return its name."""
-    _use_zig_without_compiler()
+    _use_zig_where_needed()
     return _build.build_wheel(wheel_directory, config_settings, metadata_directory)
 
 
@@ -88,7 +106,7 @@ def build_editable(
 
     scikit-build-core's own editable wheel has an import hook, which would win over PYTHONPATH.
     """
-    _use_zig_without_compiler()
+    _use_zig_where_needed()
     name = _build.build_editable(wheel_directory, config_settings, metadata_directory)
     path = Path(wheel_directory) / name
     with ZipFile(path) as wheel:

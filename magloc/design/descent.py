@@ -12,17 +12,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy.spatial.distance import pdist
 
 from arrays.typing import FloatArray
-from magloc.compilation import over_rows, own
-from magloc.design.criterion_compiled import range_deviation_rows
+from magloc import core
+from magloc.bounds.sources import array_model, source_bounds
 from magloc.design.task import DesignTask
 
 # Weights of order statistics below this share of the largest do not move the slope.
 _NEGLIGIBLE = 1e-6
+# Part of the information about a parameter below which the range has no bound.
+_SINGULAR = 1e-14
 _MEMORY = 8
 _SUFFICIENT = 1e-4
 _SHORTEST = 1e-8
@@ -73,21 +76,21 @@ class Sample:
     def _deviations_and_slopes(
         self, task: DesignTask, sensors: FloatArray, *, with_slopes: bool
     ) -> tuple[FloatArray, FloatArray]:
-        n = len(self.positions)
-        deviations, slopes = np.empty(n), np.empty((n if with_slopes else 0, *sensors.shape))
-        over_rows(
-            range_deviation_rows,
-            n,
-            own(sensors),
-            task.kind == "scalar",
-            np.zeros(3) if task.ambient_T is None else np.array(task.ambient_T),
-            task.noise_T,
-            own(self.positions),
-            own(self.moments),
-            deviations,
-            slopes,
+        slopes = np.empty((len(self.positions), *sensors.shape))
+        range_m, _, _ = source_bounds(
+            _model(task, len(sensors)),
+            sensors,
+            self.positions,
+            self.moments[:, None],
+            slopes=slopes if with_slopes else None,
         )
-        return deviations, slopes
+        return range_m[:, 0], slopes
+
+
+@lru_cache(maxsize=8)
+def _model(task: DesignTask, n_sensors: int) -> core.Problem:
+    """Return the kernel's model of so many sensors of a task, wherever they stand."""
+    return array_model(task.array(np.arange(3.0 * n_sensors).reshape(-1, 3)), lost=_SINGULAR)
 
 
 @dataclass(frozen=True, eq=False)

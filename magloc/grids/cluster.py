@@ -28,7 +28,7 @@ _PER_WORKER = 2
 # Those of TLS need dask's own configuration besides.
 _ADDRESS = re.compile(r"(?:(?:tcp|tls)://)?(?:[^\s/:@\[\]]+|\[[0-9a-fA-F:.]+\]):(?P<port>[0-9]{1,5})")
 _LARGEST_PORT = 65535
-# numba's threads serve one chunk of a process at a time.
+# All threads serve one chunk of a process at a time.
 _one_chunk = threading.Lock()
 
 
@@ -72,12 +72,10 @@ def worked_by(
 
 
 def _by_worker(work: Callable[[Item], Result], item: Item) -> Result:
-    import numba
     from distributed import get_worker
 
     with _one_chunk, one_blas_thread:
         core.set_threads(get_worker().state.nthreads)
-        numba.set_num_threads(min(get_worker().state.nthreads, numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
         return work(item)
 
 

@@ -15,6 +15,7 @@ from scipy.special import chdtrc, fdtrc
 from arrays.array import SensorArray
 from arrays.io.errors import _vector
 from arrays.typing import BoolArray, FloatArray
+from magloc.chi_square import exceeds
 from magloc.fields.multipole import multipole_field_matrix
 from magloc.levels import EXTENDED_BODY, NO_OTHER_MISFIT, SECOND_LOOK
 from magloc.localization.fit.fixes import Fixes
@@ -208,7 +209,7 @@ def too_near(
         place = solutions.position_m[best, 0]
         nearest = np.min([np.linalg.norm(place - sensor, axis=1) for sensor in array.positions], axis=0)
         near[alone] = ~dipole_validity(nearest, body_length_m)
-    doubtful = ~near[alone] & (dof > 0) & (chdtrc(np.maximum(dof, 1), solutions.chi2[best]) < SECOND_LOOK)
+    doubtful = ~near[alone] & exceeds(solutions.chi2[best], dof, SECOND_LOOK)
     for i in doubtful.nonzero()[0].tolist():
         row, place, moment = alone[i], solutions.position_m[best[i], 0], solutions.moment_Am2[best[i], 0]
         used = ~np.isin(array.ids, fixes.dropped_sensors[row])[array.channel_sensor]

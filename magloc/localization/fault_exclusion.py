@@ -21,7 +21,7 @@ from scipy.special import chdtri
 
 from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray, IntArray
-from magloc.chi_square import energy_threshold
+from magloc.chi_square import energy_threshold, exceeds
 from magloc.levels import CREDIBLE_ROW, MISFIT, SENSOR_FALSE_ALARM
 from magloc.localization.fit.fixes import Fixes
 from magloc.localization.fit.gauss_newton import JointFits
@@ -96,10 +96,11 @@ def without_faulty_sensors(
 
 def _doubtful(fixes: Fixes) -> BoolArray:
     """Rows (n,) to be looked at: those whose χ² is not credible, that have several sources, or no solution."""
-    result = ~fixes.solved & np.array([reason != NO_SIGNAL for reason in fixes.reason], dtype=bool)
+    result = ~fixes.solved
+    for row in np.flatnonzero(result).tolist():
+        result[row] = fixes.reason[row] != NO_SIGNAL
     solutions, first = fixes.solutions, fixes.first[fixes.solved]
-    dof = solutions.dof[first]
-    incredible = (dof > 0) & (solutions.chi2[first] > chdtri(np.maximum(dof, 1), 1.0 - CREDIBLE_ROW))
+    incredible = exceeds(solutions.chi2[first], solutions.dof[first], 1.0 - CREDIBLE_ROW)
     result[fixes.solved] = incredible | (solutions.n_sources[first] > 1)
     return result
 

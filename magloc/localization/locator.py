@@ -239,11 +239,14 @@ class _Rows:
             of_all = optima.rows.index
             self.assumed_length_m[of_all] = lengths
             found = solutions_of(optima, self.detected[of_all])
-            solved = set(found.of_row.tolist())
-            for row, reason in zip(of_all.tolist(), optima.reason, strict=True):
-                self.reason[row] = reason or ("" if row in solved else optima.undetermined)
-                if reason == NOISE_ALONE:
-                    self.detected[row] = False
+            unsolved = np.ones(len(self.reason), dtype=bool)
+            unsolved[found.of_row] = False
+            self.refuse(of_all[unsolved[of_all]], optima.undetermined)
+            if any(optima.reason):
+                for row, reason in zip(of_all.tolist(), optima.reason, strict=True):
+                    self.reason[row] = reason or self.reason[row]
+                    if reason == NOISE_ALONE:
+                        self.detected[row] = False
             self.failed_starts[of_all] = optima.failed_starts
             self.parts.append(found)
 

@@ -8,13 +8,12 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import get_num_threads
 
 from arrays.typing import BoolArray, FloatArray, IntArray
+from magloc import core
 from magloc.surveying.fit.joint_fit import Background, Sources, residual_of, with_free_sources
 from magloc.surveying.fit.record import SurveyRecord
 from magloc.surveying.fit.whitening import Whitening
-from magloc.surveying.fit.whitening_compiled import moment_columns, whiten
 
 N_DISTANCES = 5
 PITCH = 1.8
@@ -108,7 +107,7 @@ def search(record: SurveyRecord, background: Background, sources: Sources, grid:
         moment, chi2 = likeliest_moments(*normal_equations(record, white, directions, places, used, Q, left))
         return Candidates(places, np.full(len(places), distance), chi2, moment)
 
-    with ThreadPoolExecutor(get_num_threads()) as pool:
+    with ThreadPoolExecutor(core.threads()) as pool:
         return list(pool.map(explained, grid.tiles))
 
 
@@ -133,9 +132,7 @@ def normal_equations(
 
     The matrix of the moments alone, then that with everything else projected out by Q from what is ``left``.
     """
-    A = moment_columns(record.sensors_m, directions, white.U, record.array.channel_sensor, places, white.starts, used)
-    whiten(A, used, white.H, white.gains, white.kept, white.dt_s)
-    A = A.reshape(-1, A.shape[-1])
+    A = white.of_moments(record, directions, places, used)
     of = white.entries(used)
     whole, lost = (X.reshape(-1, 3, len(places)).transpose(2, 1, 0) for X in (A, Q[of].T @ A.astype(Q.dtype)))
     alone = whole @ whole.mT

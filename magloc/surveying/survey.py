@@ -12,10 +12,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numba import get_num_threads
 from scipy.special import chdtri
 
 from arrays.array import SensorArray
+from magloc import core
 from magloc.grids.work import Arrays, Work, workers
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.measurement.plausibility import warn_of_doubts
@@ -139,7 +139,7 @@ def survey(
     tell: Callable[[str], None] = progress or (lambda _: None)
     folder = None if unfinished is None else Path(unfinished)
     every = range(len(tiled.tiles))
-    at_once = min(get_num_threads() if processes is None else processes, len(every))
+    at_once = min(core.threads() if processes is None else processes, len(every))
     with workers(at_once, scheduler, folder) as each:
 
         def settled(tiled: TiledSurvey, work: Work) -> tuple[TiledSurvey, Sequence[int]]:

@@ -12,7 +12,6 @@ from scipy.special import chdtri
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.fields.multipole import multipole_field_matrix
 from magloc.surveying.fit.joint_fit import Background, JointFit, jacobian_of, residual_of, with_free_sources
-from magloc.surveying.fit.whitening_compiled import moment_columns, whiten
 from magloc.surveying.rounds import WHILE_SEARCHING, Groups, Model
 from magloc.surveying.search import WINDOW, groups_near, likeliest_moments, normal_equations
 
@@ -128,11 +127,8 @@ def moved_by_second(
     )
     moments, explained = likeliest_moments(*normal_equations(record, white, directions, places, used, Q, left))
     best = int(np.argmax(explained))
-    where = places[[best]], white.starts, used
-    A = moment_columns(record.sensors_m, directions, white.U, record.array.channel_sensor, *where)
-    whiten(A, used, white.H, white.gains, white.kept, white.dt_s)
     of = white.entries(used)
-    added = A.reshape(len(of), 3) @ moments[best]
+    added = white.of_moments(record, directions, places[[best]], used) @ moments[best]
     J = jacobian_of(record, background, fit.sources, fields)
     gradient = J[of].T @ added - (background.Q.T @ J).T @ (background.Q[of].T @ added)
     return np.asarray(fit.covariance[6 * which : 6 * which + 6] @ gradient)
@@ -154,7 +150,9 @@ def targets_of(
         covariance[j] = _scattered(covariance[j], scatter)
     apart = np.linalg.norm(sources.position_m[:, None] - sources.position_m, axis=-1) + np.diag(np.full(K, np.inf))
     rim = np.minimum(sources.position_m - model.bounds.low_m, model.bounds.high_m - sources.position_m)
-    left = (fit.residual - background.Q @ (background.Q.T @ fit.residual)).reshape(len(background.white.H), -1)
+    left = (fit.residual - background.Q @ (background.Q.T @ fit.residual)).reshape(
+        len(background.white.filter.gains), -1
+    )
     directions = model.record.directions(sources.fields(model.record))
     Q = with_free_sources(model.record, background, sources)
     free = fit.residual - Q @ (Q.T @ fit.residual)

@@ -10,10 +10,9 @@ import numpy as np
 from scipy.special import chdtri
 
 from arrays.typing import FloatArray
-from magloc.compilation import own
+from magloc import core
 from magloc.levels import CONTRADICTION
 from magloc.measurement.rows import ambient_fields
-from magloc.tracking import batch_compiled as kernels
 from magloc.tracking.chart.coordinates import FIRM, Chart
 from magloc.tracking.chart.mixture import Mixture, component_moments, root_of
 from magloc.tracking.chart.steps import LARGEST_GROWTH, LARGEST_WIDTH
@@ -23,7 +22,12 @@ from magloc.tracking.results import Prediction, Row, Step, TrackPoint, learned
 from magloc.tracking.tracker import Tracker
 
 _MOST_AT_ONCE = 64
-_STATUS = {kernels.TRACKED: "tracked", kernels.PREDICTED: "predicted"}
+_TERMS_A_CALL = 10_000_000
+"""Products that one call of the kernel computes, about: some 50 ms."""
+_TERMS_OF_STEPS = 3000
+"""Of them those of a row beside what its differences take."""
+_COMPILED_STATES = (N_SOURCE, N_SOURCE + 3)
+"""Position and moment, or velocity as well."""
 
 
 def track_record(
@@ -56,12 +60,12 @@ def next_points(tracker: Tracker, rows: Sequence[Row], begin: int = 0) -> list[T
 def compiled_motion(tracker: Tracker) -> LinearMotion | None:
     """The motion of a tracker whose steps are compiled, None where they are not."""
     # Not by isinstance, which looks through all attributes of a protocol in every row.
-    is_linear = hasattr(tracker.motion, "linear_step") and not tracker.n_errors
-    return cast(LinearMotion, tracker.motion) if is_linear else None
+    is_linear = hasattr(tracker.motion, "linear_step") and tracker.motion.n_states in _COMPILED_STATES
+    return cast(LinearMotion, tracker.motion) if is_linear and not tracker.n_errors else None
 
 
 class _CompiledSteps:
-    """A record in the layout of :func:`magloc.tracking.batch_compiled.follow`."""
+    """A record, and what the kernel needs and fills to follow a source through its rows."""
 
     def __init__(self, tracker: Tracker, motion: LinearMotion, rows: Sequence[Row]) -> None:
         array = tracker.array
@@ -77,91 +81,107 @@ class _CompiledSteps:
             transforms[i, : of_row.n_differences] = of_row.transform / np.sqrt(of_row.variance)[:, None]
         transform_of_row = np.array([index[id(of_row)] for of_row in differences])
         channels = np.nan_to_num(np.stack([row.readings_T for row in rows]) - array.channel_offset_T)
-        ambients, ambient_of_row = own(array.ambient_fields[None]), np.zeros(len(rows), dtype=np.int64)
+        ambients, ambient_of_row = array.ambient_fields[None], np.zeros(len(rows), dtype=np.int64)
         if any(row.ambient_T is not None for row in rows):
             usual = np.zeros(3) if array.ambient_T is None else np.asarray(array.ambient_T)
             of_rows = np.stack([usual if row.ambient_T is None else row.ambient_T for row in rows])
             ambients, ambient_of_row = ambient_fields(array, len(rows), of_rows), np.arange(len(rows))
-        self.given = kernels.Rows(
-            z=(transforms[transform_of_row] @ channels[..., None])[..., 0],
-            n_differences=np.array([of_row.n_differences for of_row in differences]),
-            transforms=transforms,
-            transform_of_row=transform_of_row,
-            origins=np.stack([row.origin_m for row in rows]),
-            rotations=np.stack([row.R_world_from_array for row in rows]),
-            ambients=ambients,
-            ambient_of_row=ambient_of_row,
-        )
         since_before = np.nan_to_num(np.subtract(self.times, self.times_before))  # NaN of the first of all
         lengths, step_of_row = np.unique(since_before, return_inverse=True)
         steps = [motion.linear_step(max(length, 0.0)) for length in lengths.tolist()]
         F, A, B = (np.stack(part) for part in zip(*steps, strict=True))
-        self.steps = kernels.Steps(F, A, B, step_of_row)
-        self.channels = kernels.Channels(
-            array.positions, array.centroid, array.channel_sensor, array.channel_is_scalar, array.channel_gain
+        n, m = motion.n_states, len(rows)
+        self.origins, self.rotations = (
+            np.stack([row.origin_m for row in rows]),
+            np.stack([row.R_world_from_array for row in rows]),
         )
-        self.rules = kernels.Rules(
+        self.F, self.step_of_row = F, step_of_row
+        self.n_differences = np.array([of_row.n_differences for of_row in differences])
+        self.x, self.S, self.centroid, self.open_loop = np.empty(n), np.empty((n, n)), np.empty(3), np.empty((n, n))
+        self.progress = np.zeros(2, dtype=np.int64)
+        self.block = max(1, _TERMS_A_CALL // (_TERMS_OF_STEPS + transforms[0].size))
+        self.predicted_x, self.predicted_S = np.empty((m, n)), np.empty((m, n, n))
+        self.updated_x, self.updated_S = np.empty((m, n)), np.empty((m, n, n))
+        self.open_loop_variances, self.nis = np.empty((m, n)), np.empty(m)
+        self.iterations = np.empty(m, dtype=np.int64)
+        self.work = core.problem(
+            "track",
+            n_states=n,
+            n_noise=A.shape[2],
+            n_sensors=array.n_sensors,
+            n_channels=array.n_channels,
+            n_differences=k,
+            sensors=array.positions,
+            array_centroid=tuple(array.centroid),
+            radius=array.circumradius,
+            first_channel=np.searchsorted(array.channel_sensor, np.arange(array.n_sensors + 1)),
+            gain=array.channel_gain,
+            is_modulus=array.channel_is_scalar.astype(np.uint8),
+            measured=np.ascontiguousarray((transforms[transform_of_row] @ channels[..., None])[..., 0]),
+            counts=self.n_differences,
+            transforms=transforms,
+            transform_of_row=transform_of_row,
+            origins=self.origins,
+            rotations=self.rotations,
+            ambients=np.ascontiguousarray(ambients),
+            ambient_of_row=ambient_of_row,
+            F=F,
+            A=A,
+            B=B,
+            step_of_row=step_of_row,
             nis_limits=np.asarray(chdtri(np.maximum(np.arange(k + 1), 1), CONTRADICTION), dtype=np.float64),
             tolerance=TOLERANCE,
             max_iterations=MOST_ITERATIONS,
-            rounding=ROUNDING,
             least_gain=LEAST_GAIN,
+            rounding=ROUNDING,
             least_share=LEAST_SHARE,
-            firm=FIRM,
-            full=tracker.filter.n_differences,
             largest_growth=LARGEST_GROWTH,
+            full_count=tracker.filter.n_differences,
+            firm=FIRM,
             largest_width=LARGEST_WIDTH,
-            radius=array.circumradius,
-        )
-        n, m = motion.n_states, len(rows)
-        self.out = kernels.Followed(
-            np.empty((m, n)),
-            np.empty((m, n, n)),
-            np.empty((m, n)),
-            np.empty((m, n, n)),
-            np.empty((m, n)),
-            np.full(m, np.nan),
-            *np.zeros((2, m), dtype=np.int64),
+            x=self.x,
+            root=self.S,
+            centroid=self.centroid,
+            open_loop=self.open_loop,
+            progress=self.progress,
+            predicted_x=self.predicted_x,
+            predicted_roots=self.predicted_S,
+            updated_x=self.updated_x,
+            updated_roots=self.updated_S,
+            open_loop_variances=self.open_loop_variances,
+            nis=self.nis,
+            iterations=self.iterations,
         )
 
     def follow(self, begin: int) -> list[TrackPoint]:
         """Points from a row to the one before the first that they do not explain, or that goes back in time."""
         tracker, times, before = self.tracker, self.times, self.times_before
-        given, out = self.given, self.out
         known = tracker.known
         assert known is not None
         mixture = known.mixture
-        state = kernels.State(
-            mixture.x[0].copy(), mixture.S[0].copy(), mixture.centroid_m.copy(), known.open_loop.copy()
-        )
-        end = kernels.follow(
-            begin,
-            next((i for i in range(begin, len(times)) if times[i] <= before[i]), len(times)),
-            state,
-            self.channels,
-            given,
-            self.steps,
-            self.rules,
-            out,
-        )
+        self.x[:], self.S[:], self.centroid[:] = mixture.x[0], mixture.S[0], mixture.centroid_m
+        self.open_loop[:], self.progress[:] = known.open_loop, (begin, 1)
+        n_later = next((i for i in range(begin, len(times)) if times[i] <= before[i]), len(times)) - begin
+        core.run("follow_source", self.work, n_later, block=self.block, chain=n_later or None)
+        end = int(self.progress[0])
         if end == begin:
             return []
         rows = slice(begin, end)
-        centroids = given.origins[rows] + given.rotations[rows] @ tracker.array.centroid
+        centroids = self.origins[rows] + self.rotations[rows] @ tracker.array.centroid
         steps = self._steps(rows, centroids) if tracker.keep_steps else []
-        after = replace(mixture, x=state.x[None], S=state.S[None], centroid_m=state.centroid)
-        explained = bool((out.status[rows] == kernels.TRACKED).any())
+        after = replace(mixture, x=self.x[None].copy(), S=self.S[None].copy(), centroid_m=self.centroid.copy())
+        explained = bool(self.n_differences[rows].any())
         contradictions = 0 if explained else known.contradictions
-        resumed = replace(known, mixture=after, open_loop=state.open_loop, contradictions=contradictions)
+        resumed = replace(known, mixture=after, open_loop=self.open_loop.copy(), contradictions=contradictions)
         tracker.resume(resumed, times[end - 1], end - begin, steps)
         means, covariances = component_moments(
-            Chart.at(out.x[rows, :N_SOURCE], centroids, mixture.radius_m), out.S[rows]
+            Chart.at(self.updated_x[rows, :N_SOURCE], centroids, mixture.radius_m), self.updated_S[rows]
         )
-        estimability = learned(np.diagonal(covariances, axis1=1, axis2=2), out.open_loop[rows, :N_SOURCE])
-        of_source, single, radius_m = out.S[rows, :N_SOURCE], np.zeros(1), mixture.radius_m
+        estimability = learned(np.diagonal(covariances, axis1=1, axis2=2), self.open_loop_variances[rows, :N_SOURCE])
+        of_source, single, radius_m = self.updated_S[rows, :N_SOURCE], np.zeros(1), mixture.radius_m
         roots = of_source if of_source.shape[2] == N_SOURCE else root_of(of_source)
-        sources = zip(out.x[rows, None, :N_SOURCE], roots[:, None], centroids, strict=True)
-        told = (of_row[rows].tolist() for of_row in (out.iterations, out.nis, given.n_differences, out.status))
+        sources = zip(self.updated_x[rows, None, :N_SOURCE], roots[:, None], centroids, strict=True)
+        told = (of_row[rows].tolist() for of_row in (self.iterations, self.nis, self.n_differences))
         return [
             TrackPoint(
                 time_s,
@@ -172,25 +192,30 @@ class _CompiledSteps:
                 iterations,
                 nis,
                 dof,
-                status=_STATUS[status],
+                status="tracked" if dof else "predicted",
                 weight=1.0,
                 centroid_m=centroid_m,
                 radius_m=radius_m,
                 mixture=Mixture(x, S, single, N_SOURCE, centroid_m, radius_m),
             )
-            for time_s, mean, covariance, estimable, (x, S, centroid_m), iterations, nis, dof, status in zip(
+            for time_s, mean, covariance, estimable, (x, S, centroid_m), iterations, nis, dof in zip(
                 times[rows], means, covariances, estimability, sources, *told, strict=True
             )
         ]
 
     def _steps(self, rows: slice, centroids: FloatArray) -> list[Step]:
         """Steps for a smoother of some rows."""
-        out, of_row, radius_m = self.out, self.steps.of_row, self.tracker.array.circumradius
+        radius_m = self.tracker.array.circumradius
         before, after = (
             Chart.at(x[rows], centroids, radius_m).jacobian(np.zeros_like(x[rows])) @ S[rows]
-            for x, S in ((out.predicted_x, out.predicted_S), (out.x, out.S))
+            for x, S in ((self.predicted_x, self.predicted_S), (self.updated_x, self.updated_S))
         )
         return [
-            Step(i, Prediction(out.predicted_x[i], before[j], self.steps.F[of_row[i]]), out.x[i], after[j])
+            Step(
+                i,
+                Prediction(self.predicted_x[i], before[j], self.F[self.step_of_row[i]]),
+                self.updated_x[i],
+                after[j],
+            )
             for j, i in enumerate(range(rows.start, rows.stop))
         ]

@@ -14,12 +14,13 @@ import numpy as np
 
 from adcs.ellipsoids.roll_yaw import ORBITAL_RATE, STEP_S, input_matrix, transition
 from arrays.typing import FloatArray
-from magloc.compilation import compiled
+from magloc import core
 from sims.noise import stream
 
 Controller = Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
 ACTUAL_INERTIA_KGM2 = np.array([[90.0, 0.2, 0.2], [0.2, 60.0, 0.1], [0.2, 0.1, 90.0]])
 JUMP = 4.0
+_RUNS_A_BLOCK = 1000  # a millisecond
 _SUBSTEPS = 10  # Runge-Kutta steps of 0.2 s: a fifth of the disturbance torque's period
 
 
@@ -135,62 +136,17 @@ def advance(
     and the integral of the rates over the cycle [rad].
     """
     state = np.concatenate([angles_rad, rates_rad_s, np.zeros_like(rates_rad_s)], axis=1)
-    inertia = np.ascontiguousarray(scenario.inertia_kgm2)
-    inverse: FloatArray = np.linalg.inv(inertia).astype(np.float64)
-    disturbance = (scenario.torque_Nm, scenario.torque_rate, scenario.torque_phases)
-    _advance(state, inertia, inverse, torque_Nm, disturbance, time_s)
+    at = np.linspace(time_s, time_s + STEP_S, 2 * _SUBSTEPS + 1)
+    work = core.problem(
+        "small_motion",
+        n_steps=_SUBSTEPS,
+        dt=STEP_S / _SUBSTEPS,
+        orbital_rate=ORBITAL_RATE,
+        inertia=np.ascontiguousarray(scenario.inertia_kgm2),
+        inverse_inertia=np.linalg.inv(scenario.inertia_kgm2),
+        control=np.ascontiguousarray(torque_Nm),
+        disturbance=scenario.torque_Nm * np.sin(scenario.torque_rate * at[:, None] + scenario.torque_phases),
+        state=state,
+    )
+    core.run("small_motion_runs", work, len(state), block=_RUNS_A_BLOCK)
     return state
-
-
-@compiled
-def _advance(
-    state: FloatArray,
-    inertia: FloatArray,
-    inverse: FloatArray,
-    torque: FloatArray,
-    disturbance: tuple[float, float, FloatArray],
-    time: float,
-) -> None:
-    h = STEP_S / _SUBSTEPS
-    k1, k2, k3, k4 = np.empty(9), np.empty(9), np.empty(9), np.empty(9)
-    work = np.empty(9)
-    for run in range(len(state)):
-        x, u = state[run], torque[run]
-        for substep in range(_SUBSTEPS):
-            t = time + substep * h
-            _derivative(t, x, u, inertia, inverse, disturbance, k1)
-            for i in range(9):
-                work[i] = x[i] + 0.5 * h * k1[i]
-            _derivative(t + 0.5 * h, work, u, inertia, inverse, disturbance, k2)
-            for i in range(9):
-                work[i] = x[i] + 0.5 * h * k2[i]
-            _derivative(t + 0.5 * h, work, u, inertia, inverse, disturbance, k3)
-            for i in range(9):
-                work[i] = x[i] + h * k3[i]
-            _derivative(t + h, work, u, inertia, inverse, disturbance, k4)
-            for i in range(9):
-                x[i] += h / 6.0 * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i])
-
-
-@compiled
-def _derivative(
-    t: float,
-    x: FloatArray,
-    torque: FloatArray,
-    inertia: FloatArray,
-    inverse: FloatArray,
-    disturbance: tuple[float, float, FloatArray],
-    out: FloatArray,
-) -> None:
-    amplitude, rate, phases = disturbance
-    w0, w1, w2 = x[3], x[4], x[5]
-    L0 = inertia[0, 0] * w0 + inertia[0, 1] * w1 + inertia[0, 2] * w2
-    L1 = inertia[1, 0] * w0 + inertia[1, 1] * w1 + inertia[1, 2] * w2
-    L2 = inertia[2, 0] * w0 + inertia[2, 1] * w1 + inertia[2, 2] * w2
-    m0 = torque[0] + amplitude * np.sin(rate * t + phases[0]) - (w1 * L2 - w2 * L1)
-    m1 = torque[1] + amplitude * np.sin(rate * t + phases[1]) - (w2 * L0 - w0 * L2)
-    m2 = torque[2] + amplitude * np.sin(rate * t + phases[2]) - (w0 * L1 - w1 * L0)
-    out[0], out[1], out[2] = w0 + ORBITAL_RATE * x[2], w1 + ORBITAL_RATE, w2 - ORBITAL_RATE * x[0]
-    for i in range(3):
-        out[3 + i] = inverse[i, 0] * m0 + inverse[i, 1] * m1 + inverse[i, 2] * m2
-        out[6 + i] = x[3 + i]

@@ -1,4 +1,4 @@
-"""Cramér-Rao bounds of a map, against their readable twin."""
+"""Cramér-Rao bounds of a map, against the readable reference."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from magloc.directions import moments_on_sphere
 from tests.bench.table import Row
 from tests.bench.timing import Contestant, Size, interleaved
 
-TITLE = "bounds: one source with one of 51 moments, in a cube of 40 m; peer: the NumPy twin on a sample"
+TITLE = "bounds: one source with one of 51 moments, in a cube of 40 m; peer: the NumPy reference on a sample"
 N_MOMENTS = 51
 EARTH_T = (2e-5, 1e-6, 4.5e-5)
 
@@ -42,19 +42,18 @@ def rows(size: Size) -> Iterator[Row]:
         def ours(array=array, positions=positions, moments=moments):
             return sigma_table(array, positions, moments)
 
-        def twin(array=array, sample=sample, moments=moments):
+        def reference(array=array, sample=sample, moments=moments):
             return cramer_rao_bounds(array, sample[:, None], moments)
 
         timings = interleaved(
             {
                 "ours": Contestant(ours, threads, len(positions) * N_MOMENTS),
                 "one thread": Contestant(ours, 1, len(positions) * N_MOMENTS),
-                "twin": Contestant(twin, 1, len(sample) * N_MOMENTS),
+                "reference": Contestant(reference, 1, len(sample) * N_MOMENTS),
             },
             size.rounds,
         )
-        difference = np.abs(ours().range_m[: len(sample)] / twin().sigma_range_m - 1.0).max()
+        difference = np.abs(ours().range_m[: len(sample)] / reference().sigma_range_m - 1.0).max()
         yield Row(f"{name}, {threads} thr.", timings["ours"])
-        yield Row(
-            name, timings["one thread"], "NumPy twin", timings["twin"], f"σ of the range differ by {difference:.0e}"
-        )
+        agreement = f"σ of the range differ by {difference:.0e}"
+        yield Row(name, timings["one thread"], "NumPy reference", timings["reference"], agreement)

@@ -13,7 +13,6 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike
 
-from adcs.mockup.navigation.delayed_ekf_compiled import N, predict_rows
 from adcs.mockup.navigation.fixes import Fix, Outcome
 from adcs.mockup.navigation.strapdown import Gate, ImuRecord, PlanarState, PlanarTrack, held, turned, wrapped
 from arrays.typing import FloatArray
@@ -23,6 +22,7 @@ STATES = (
     *("X_m", "Y_m", "vX_m_s", "vY_m_s", "heading_rad"),
     *("zero_x_m_s2", "zero_y_m_s2", "zero_rate_rad_s", "drift_x_m_s3", "drift_y_m_s3"),
 )
+N = len(STATES)
 H_FIX: FloatArray = np.eye(N)[[0, 1, 4]]
 
 
@@ -149,44 +149,52 @@ class FilterTrack(PlanarTrack):
 
 
 def predicted(
-    x: FloatArray, P: FloatArray, step_s: float, reading: ArrayLike, there: ArrayLike, densities: FloatArray
+    x: FloatArray, P: FloatArray, steps_s: ArrayLike, readings: ArrayLike, there: ArrayLike, densities: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """State and covariance after one sample, :math:`F P F^T + Q`: the readable twin of the compiled prediction.
+    """State and covariance after each of some samples, :math:`F P F^T + Q`.
 
-    Shapes ``x`` (10,), ``P`` (10, 10). ``reading`` (3,): accelerations along body x and y, and the rate. ``there``
-    (3,): which of them are believed. One that is not counts as zero acceleration, or as the rate that is given.
-    ``densities`` (7,): of :attr:`FilterSettings.densities`.
+    Shapes ``x`` (10,), ``P`` (10, 10) -> (n, 10), (n, 10, 10). ``steps_s`` (n,). ``readings`` (n, 3): accelerations
+    along body x and y, and the rate. ``there`` (n, 3): which of them are believed. One that is not counts as zero
+    acceleration, or as the rate that is given. ``densities`` (7,): of :attr:`FilterSettings.densities`.
     """
-    h, z, use = step_s, np.asarray(reading, dtype=np.float64), np.asarray(there, dtype=np.bool_)
-    rate = z[2] - x[7]
-    middle = x[4] + 0.5 * h * rate
-    R = turned(middle, np.eye(2)).T * use[:2]
-    a = R @ (z[:2] - x[5:7])
-    by_heading = np.array([-a[1], a[0]])
-    da = np.column_stack([by_heading, -R, -0.5 * h * by_heading])  # by φ, α, β, b
-    F = np.eye(N)
-    F[0:2, 2:4] = h * np.eye(2)
-    F[0:2, 4:8] = 0.5 * h**2 * da
-    F[2:4, 4:8] = h * da
-    F[4, 7] = -h
-    F[5:7, 8:10] = h * np.eye(2)
-    Q = np.zeros((N, N))
-    to_table = turned(middle, np.eye(2)).T
-    q = to_table @ np.diag(np.where(use[:2], densities[0], densities[2])) @ to_table.T
-    Q[0:2, 0:2], Q[0:2, 2:4] = h**3 / 3.0 * q, h**2 / 2.0 * q
-    Q[2:4, 0:2], Q[2:4, 2:4] = h**2 / 2.0 * q, h * q
-    Q[4, 4] = h * (densities[1] if use[2] else densities[3])
-    Q[7, 7] = h * densities[5]
-    for zero, drift in ((5, 8), (6, 9)):
-        Q[zero, zero] = h * densities[4] + h**3 / 3.0 * densities[6]
-        Q[zero, drift] = Q[drift, zero] = h**2 / 2.0 * densities[6]
-        Q[drift, drift] = h * densities[6]
-    x_next = x.copy()
-    x_next[0:2] += h * x[2:4] + 0.5 * h**2 * a
-    x_next[2:4] += h * a
-    x_next[4] += h * rate
-    x_next[5:7] += h * x[8:10]
-    return x_next, F @ P @ F.T + Q
+    h, z, use = np.asarray(steps_s), np.asarray(readings, dtype=np.float64), np.asarray(there, dtype=np.bool_)
+    # The gyro's zero and the drifts stay: headings, zeros, velocities and positions are sums, one after the other.
+    states = np.tile(x, (len(h), 1))
+    turn, passed = h * (z[:, 2] - x[7]), np.cumsum(h)
+    states[:, 4] += np.cumsum(turn)
+    states[:, 5:7] += passed[:, None] * x[8:10]
+    middle = states[:, 4] - 0.5 * turn
+    a = turned(middle, use[:, :2] * (z[:, :2] - x[5:7] - (passed - h)[:, None] * x[8:10]))
+    change = h[:, None] * a
+    states[:, 2:4] += np.cumsum(change, axis=0)
+    states[:, 0:2] += np.cumsum(h[:, None] * (states[:, 2:4] - 0.5 * change), axis=0)
+
+    c, s = np.cos(middle), np.sin(middle)
+    to_table = np.array([[c, -s], [s, c]]).transpose(2, 0, 1)
+    by_heading = np.stack([-a[:, 1], a[:, 0]], axis=1)[:, :, None]
+    da = np.concatenate(  # by φ, α, β, b
+        [by_heading, -to_table * use[:, None, :2], -0.5 * h[:, None, None] * by_heading], axis=2
+    )
+    F = np.tile(np.eye(N), (len(h), 1, 1))
+    F[:, [0, 1, 5, 6], [2, 3, 8, 9]] = h[:, None]
+    F[:, 4, 7] = -h
+    F[:, 2:4, 4:8] = h[:, None, None] * da
+    F[:, 0:2, 4:8] = 0.5 * h[:, None, None] * F[:, 2:4, 4:8]
+
+    q = to_table * np.where(use[:, None, :2], densities[0], densities[2]) @ to_table.mT
+    h1, h2, h3 = h[:, None, None], h[:, None, None] ** 2 / 2.0, h[:, None, None] ** 3 / 3.0
+    Q = np.zeros((len(h), N, N))
+    Q[:, 0:2, 0:2], Q[:, 2:4, 2:4] = h3 * q, h1 * q
+    Q[:, 0:2, 2:4] = Q[:, 2:4, 0:2] = h2 * q
+    Q[:, 4, 4], Q[:, 7, 7] = h * np.where(use[:, 2], densities[1], densities[3]), h * densities[5]
+    Q[:, [5, 6], [5, 6]] = h1[:, 0] * densities[4] + h3[:, 0] * densities[6]
+    Q[:, [5, 6, 8, 9], [8, 9, 5, 6]] = h2[:, 0] * densities[6]
+    Q[:, [8, 9], [8, 9]] = h1[:, 0] * densities[6]
+    covariances = np.empty_like(Q)
+    for after, transition, transposed, noise in zip(covariances, F, np.ascontiguousarray(F.mT), Q, strict=True):
+        P = np.dot(transition.dot(P), transposed, out=after)
+        P += noise
+    return states, 0.5 * (covariances + covariances.mT)
 
 
 @dataclass(eq=False)
@@ -388,10 +396,11 @@ class DelayedFilter:
         x, P = self._x[rows] if x is None else x, self._P[rows] if P is None else P
         lost = self._lost[first + 1 : last + 1]
         changes = 1 + np.flatnonzero((lost[1:] != lost[:-1]).any(axis=1))
-        read = self._time_s[rows], self._readings[rows], self._there[rows]
+        steps, readings, there = np.diff(self._time_s[rows]), self._readings[rows][1:], self._there[rows][1:]
         for begin, end in pairwise([0, *changes.tolist(), last - first]):
             densities = self._densities[*self._lost[first + end].astype(np.intp)]
-            predict_rows(begin, end, *read, densities, x, P)
+            part, after = slice(begin, end), slice(begin + 1, end + 1)
+            x[after], P[after] = predicted(x[begin], P[begin], steps[part], readings[part], there[part], densities)
 
     def _row_at(self, time_s: float) -> int:
         """Row of an instant; an interval that holds it is cut there."""

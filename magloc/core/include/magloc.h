@@ -144,6 +144,18 @@ typedef struct {
 } magloc_butterworth;
 int64_t magloc_low_pass(const magloc_butterworth *problem, int64_t begin, int64_t end, double *workspace);
 
+/* How much readings change, seen from a frame that does not turn, if they lag behind their attitude; an item is a lag.
+ */
+typedef struct {
+  int64_t n_instants, n_rows, apart; /* rows between the two readings of a change */
+  const double *time, *q, *field;    /* (n_instants), ascending; (n_instants, 4); (n_instants, 3) */
+  const int64_t *rows;               /* (n_rows), ascending: instants that count */
+  const uint8_t *is_good;            /* (n_rows) */
+  const double *lags;                /* (n_lags) */
+  double *changes;                   /* (n_lags), sum of squares */
+} magloc_lags;
+int64_t magloc_lag_changes(const magloc_lags *problem, int64_t begin, int64_t end, double *workspace);
+
 /* How the states of a heading filter move on in each block: the heading, the gyro's drift, scales of its axes, the
    sensor's offset, and the slow and the quick variation of the room's field. */
 typedef struct {
@@ -192,6 +204,34 @@ typedef struct {
 } magloc_attitude_motion;
 int64_t magloc_attitude_motion_runs(const magloc_attitude_motion *problem, int64_t begin, int64_t end,
                                     double *workspace);
+
+/* Rotation of satellites at small angles to the orbital frame, in place; an item is a run. */
+typedef struct {
+  int64_t n_steps;
+  double dt, orbital_rate;
+  const double *inertia, *inverse_inertia; /* (3, 3) */
+  const double *control;                   /* (n_runs, 3), torque that is held */
+  const double *disturbance; /* (2 n_steps + 1, 3), torque at the beginning, middle and end of each step, of all runs */
+  double *state;             /* (n_runs, 9): roll, pitch and yaw, rate in body axes, and the integral of the rate */
+} magloc_small_motion;
+int64_t magloc_small_motion_runs(const magloc_small_motion *problem, int64_t begin, int64_t end, double *workspace);
+
+/* Guaranteed ellipsoids of the states of one linear system, in place; an item is a run. */
+typedef struct {
+  int64_t n_states, n_channels;
+  const double *A, *disturbance; /* (n_states, n_states): transition; shape of the ellipsoid of disturbances */
+  const double *inputs;          /* (n_runs, n_states), added by ellipsoids_predict */
+  const double *directions;      /* (n_channels, n_states) */
+  const double *readings;        /* (n_runs, n_channels), NaN where missing */
+  int64_t rule;                  /* of the step: 0 lemma, 1 optimal, 2 tightened */
+  double inflation;              /* least growth of a bound that is contradicted */
+  const double *reinflation;     /* (n_states, n_states), added to an ellipsoid that is contradicted */
+  double *centres, *shapes;      /* (n_runs, n_states), (n_runs, n_states, n_states) */
+  double *bounds;                /* (n_runs, n_channels) of the readings' errors */
+  int64_t *resets;               /* (n_runs), contradictions so far */
+} magloc_ellipsoids;
+int64_t magloc_ellipsoids_predict(const magloc_ellipsoids *problem, int64_t begin, int64_t end, double *workspace);
+int64_t magloc_ellipsoids_correct(const magloc_ellipsoids *problem, int64_t begin, int64_t end, double *workspace);
 
 /* Error-state Kalman filter of attitude and rate with a gate. Item run * n_instants + i is instant i of a run; those of
    a run are in order, with one workspace.
@@ -347,6 +387,204 @@ typedef struct {
 } magloc_source_uncertainty;
 int64_t magloc_source_uncertainties(const magloc_source_uncertainty *problem, int64_t begin, int64_t end,
                                     double *workspace);
+
+/* Sensors, as Cramer-Rao bounds see them. What readings depend on beside the source are nuisances of these kinds: 0 to
+   2, a field that is common to all vector sensors; 3, a modulus common to all that read one; 4 to 6, the ambient
+   field's error; 7 to 9 and 10 to 12, turns and shifts of the array; 13 and so on, errors of a body. */
+typedef struct {
+  int64_t n_sensors, n_channels, n_nuisances, n_errors;
+  const double *ambient;        /* (n_sensors, 3) field */
+  const uint8_t *is_modulus;    /* (n_sensors): such a sensor has one channel, others have three */
+  const int64_t *first_channel; /* (n_sensors + 1) of each sensor */
+  const double *gain;           /* (n_channels, 3), (g, 0, 0) of a modulus */
+  const double *noise;          /* (n_channels) */
+  int64_t noise_depends_on_field;
+  const double *errors_of_sensor; /* (n_sensors, 3): sigma of its turns, part of the field that it induces in the
+                                     carrier, part of the field that is noise */
+  const double *gain_errors;      /* (n_channels, 3, 3): what sigma of the gain of each axis adds to the channel's */
+  const int64_t *nuisances;       /* (n_nuisances), kinds, ascending */
+  const double *prior;            /* (n_nuisances), one over the standard deviation, 0 where nothing is known */
+  double modulus_prior;           /* the same of the moment's modulus */
+  double lever_arm[3];            /* to the array's origin from the point about which it turns */
+  double lost;                    /* a parameter of which the others leave less than this part is not known */
+} magloc_bound_array;
+
+/* Cramer-Rao bounds of sources: least standard deviations of any unbiased estimate from one set of readings; an item is
+   a source. Each place has the same moments, or moments of its own; source n_moments * i + k is at place i. */
+typedef struct {
+  const magloc_bound_array *array;
+  int64_t n_moments, moments_are_own;
+  const double *sensors;     /* (n_sensors, 3) */
+  double centroid[3];        /* from which ranges count */
+  const double *positions;   /* (n_places, 3) */
+  const double *moments;     /* (n_moments, 3) or (n_places, n_moments, 3) */
+  const double *body_errors; /* (n_places, n_sensors, n_errors, 6): xx, xy, xz, yy, yz, zz of the matrices that make an
+                                error's field of the moment */
+  double *sigma_range, *sigma_bearing, *sigma_position; /* (n): infinite where they are not known */
+  double *slopes; /* (n, n_sensors, 3): d log(sigma of the range)/d sensor, or NULL; for noise that depends on no field,
+                     and no nuisances but common fields */
+} magloc_bounds;
+int64_t magloc_source_bounds(const magloc_bounds *problem, int64_t begin, int64_t end, double *workspace);
+
+/* Filter that makes the noise of a survey white: measurements of unit noise, and states that decay and grow. The last
+   two states are a value and its slope. An item is a row, all in order. */
+typedef struct {
+  int64_t n_states, n_measurements;
+  const double *H;            /* (n_rows, n_measurements, n_states) */
+  const double *kept, *added; /* (n_rows, n_states): part of each state that is left; growth of its variance */
+  const double *dt;           /* (n_rows) */
+  const double *start;        /* (n_states), variances before the first step */
+  double *gains;              /* (n_rows, n_measurements, n_states + 1): Kalman gains, and the innovation's 1/sigma */
+} magloc_survey_filter;
+int64_t magloc_survey_gains(const magloc_survey_filter *problem, int64_t begin, int64_t end, double *workspace);
+
+/* Innovations of columns over their standard deviation, by a filter whose gains are known; an item is a row of them,
+   all in order. Rows of the filter that are left out have columns of zeros. */
+typedef struct {
+  const magloc_survey_filter *filter;
+  int64_t n_columns;
+  const int64_t *rows; /* (n), ascending */
+  double *columns;     /* (n, n_measurements, n_columns) */
+} magloc_survey_whitening;
+int64_t magloc_survey_whiten(const magloc_survey_whitening *problem, int64_t begin, int64_t end, double *workspace);
+
+/* What sources add to the measurements of a survey. A measurement is the sum over the rows of a group, divided by the
+   root of their number; an item is a group. */
+typedef struct {
+  int64_t n_sensors, n_channels, n_measurements, n_sources;
+  const double *sensors;            /* (n_rows, n_sensors, 3) */
+  const double *directions;         /* (n_rows, n_channels, 3) that channels measure */
+  const double *mixing;             /* (n_measurements, n_channels) */
+  const int64_t *sensor_of_channel; /* (n_channels) */
+  const double *sources, *moments;  /* (n_sources, 3); moments for survey_sources only, else NULL */
+  const int64_t *first_row;         /* (n_groups + 1) of each group */
+  const int64_t *groups;            /* (n) that are wanted */
+  double *out;                      /* (n, n_measurements, size) */
+} magloc_survey_columns;
+/* Of moments of unit x, y and z: size 3 n_sources, by axis, then by source. */
+int64_t magloc_survey_moments(const magloc_survey_columns *problem, int64_t begin, int64_t end, double *workspace);
+/* Derivatives by position and moment: size 6 n_sources, by source. */
+int64_t magloc_survey_sources(const magloc_survey_columns *problem, int64_t begin, int64_t end, double *workspace);
+/* Of poles, whose field is d/r^3: size n_sources. */
+int64_t magloc_survey_poles(const magloc_survey_columns *problem, int64_t begin, int64_t end, double *workspace);
+
+/* A source followed by one component, from a state before row progress[0] to the first row that it does not explain; an
+   item is one more row. The state has 6 numbers, position and moment, or 9, with the velocity. Readings are differences
+   of channels in units of their noise; a row of fewer ones has zeros behind them. magloc/tracking/chart explains it. */
+typedef struct {
+  int64_t n_states, n_noise;
+  /* The array. */
+  int64_t n_sensors, n_channels, n_differences;
+  const double *sensors; /* (n_sensors, 3) */
+  double array_centroid[3], radius;
+  const int64_t *first_channel; /* (n_sensors + 1) of each sensor */
+  const double *gain;           /* (n_channels, 3); of a modulus the first number counts */
+  const uint8_t *is_modulus;    /* (n_channels) */
+  /* Rows. */
+  const double *measured;          /* (n_rows, n_differences) */
+  const int64_t *counts;           /* (n_rows) of differences; none: the state is predicted only */
+  const double *transforms;        /* (n_transforms, n_differences, n_channels) from channels to differences */
+  const int64_t *transform_of_row; /* (n_rows) */
+  const double *origins;           /* (n_rows, 3) of the array */
+  const double *rotations;         /* (n_rows, 3, 3) to the world from the array */
+  const double *ambients;          /* (n_ambients, n_sensors, 3) field */
+  const int64_t *ambient_of_row;   /* (n_rows) */
+  /* Steps of the motion: transition F, and root of its noise A + |m| B. */
+  const double *F;            /* (n_steps, n_states, n_states) */
+  const double *A, *B;        /* (n_steps, n_states, n_noise) */
+  const int64_t *step_of_row; /* (n_rows) */
+  /* When an update has converged, and when it is believed. */
+  const double *nis_limits; /* (n_differences + 1) by the number of differences */
+  double tolerance;
+  int64_t max_iterations;
+  double least_gain, rounding; /* a step that gains less, of what a linear problem would, is halved */
+  double least_share, largest_growth;
+  int64_t full_count; /* differences of a row without missing readings */
+  double firm, largest_width;
+  /* The state before the next row, which calls change: mean, root in the chart about it, the sensors' centroid there,
+     and the covariance had no readings been taken. */
+  double *x, *root, *centroid, *open_loop; /* (n), (n, n), (3), (n, n) */
+  int64_t *progress;                       /* (2): next row, and 1 as long as rows are explained */
+  /* Of each explained row. */
+  double *predicted_x, *predicted_roots; /* (n_rows, n), (n_rows, n, n) */
+  double *updated_x, *updated_roots;     /* (n_rows, n), (n_rows, n, n) */
+  double *open_loop_variances;           /* (n_rows, n) */
+  double *nis;                           /* (n_rows); NaN without readings */
+  int64_t *iterations;                   /* (n_rows) */
+} magloc_track;
+int64_t magloc_follow_source(const magloc_track *problem, int64_t begin, int64_t end, double *workspace);
+
+/* Several sources that one filter follows together; magloc/tracking/multi_target/state.py has the chart of their
+   errors. These are in the order (position, moment) of each source, common field, (velocity, rate of turn) of each
+   source: n = 12 n_sources + 3 numbers, of which a row of readings sees the first d = 6 n_sources + 3. */
+typedef struct {
+  int64_t n_sources;
+  double *position, *moment, *velocity, *rate; /* (n_sources, 3); of a trajectory (n_rows, n_sources, 3) */
+  double *common;                              /* (3) field; of a trajectory (n_rows, 3) */
+  double *covariance;                          /* (n, n); not read of a trajectory */
+} magloc_joint_state;
+
+/* Rows of whitened readings above the known ambient field. */
+typedef struct {
+  int64_t n_rows, n_sensors, n_channels;
+  const double *readings; /* (n_rows, n_channels), zero where there is none */
+  const double *gain;     /* (n_rows, n_channels, 3) of the field, zero where there is no reading */
+  const double *sensors;  /* (n_rows, n_sensors, 3) */
+  const int64_t *sensor;  /* (n_channels) of each channel */
+} magloc_joint_rows;
+
+/* Motion of all sources in a step. This and the following problems of a joint filter are one item each. */
+typedef struct {
+  const magloc_joint_state *before;
+  const double *step; /* (12): FreeMotion.numbers */
+  const magloc_joint_state *after;
+} magloc_joint_motion;
+
+/* Update by one row, of three channels a sensor, with roots L of what the row sees of the covariance and R R^T of
+   I + (H L)^T H L, both lower. */
+typedef struct {
+  const magloc_joint_state *prior;
+  const magloc_joint_rows *row;
+  int64_t most_trials;
+  double followed;      /* variance that residuals have beside what the fit leaves of them */
+  double *L, *R;        /* (d, d) */
+  double *y;            /* (d), the error is L y */
+  double *residuals;    /* (2, n_channels) at the prediction and at the end */
+  double *HL;           /* (2, n_channels, d) likewise */
+  double *standardised; /* (n_channels), residuals of each sensor with unit covariance */
+  double *outcome;      /* (2): cost, and 1 if a minimum was found */
+} magloc_joint_update;
+
+/* State after an update. */
+typedef struct {
+  const magloc_joint_state *prior;
+  const double *R, *y;
+  const magloc_joint_state *after;
+} magloc_joint_posterior;
+
+/* How far readings bend along errors: the length of their second difference, halved. */
+typedef struct {
+  const magloc_joint_state *state;
+  const magloc_joint_rows *row;
+  int64_t n_errors;
+  const double *errors; /* (n_errors, d) */
+  double *bends;        /* (n_errors) */
+} magloc_joint_bends;
+
+/* A pass of a smoother along a trajectory. */
+typedef struct {
+  const magloc_joint_state *trajectory, *prior;
+  const magloc_joint_rows *rows;
+  const double *steps; /* (n_rows, 12) that lead to each row; the first one is not used */
+  double *offsets;     /* (n_rows, n) from the trajectory to the smoothed one */
+  double *last;        /* (n, n) covariance at the end */
+  double *likelihood;  /* (2): chi-square and the logarithm of the volume of all rows */
+} magloc_joint_smoothing;
+int64_t magloc_joint_step(const magloc_joint_motion *problem, int64_t begin, int64_t end, double *workspace);
+int64_t magloc_joint_update_row(const magloc_joint_update *problem, int64_t begin, int64_t end, double *workspace);
+int64_t magloc_joint_state_after(const magloc_joint_posterior *problem, int64_t begin, int64_t end, double *workspace);
+int64_t magloc_joint_bend(const magloc_joint_bends *problem, int64_t begin, int64_t end, double *workspace);
+int64_t magloc_joint_smooth(const magloc_joint_smoothing *problem, int64_t begin, int64_t end, double *workspace);
 
 /* end of the declarations */
 #ifdef __GNUC__

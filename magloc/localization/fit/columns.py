@@ -101,7 +101,8 @@ class Solutions:
         filled = [part for part in parts if len(part)]
         if len(filled) <= 1:
             return filled[0] if filled else cls.none()
-        order = np.argsort(np.concatenate([part.of_row for part in filled]), kind="stable")
+        of_row = np.concatenate([part.of_row for part in filled])
+        order = None if (of_row[1:] >= of_row[:-1]).all() else np.argsort(of_row, kind="stable")
         most = max(part.position_m.shape[1] for part in filled)
         size = max(part.covariance.shape[1] for part in filled)
         widest = max(part.ranges.shape[2] for part in filled)
@@ -113,7 +114,7 @@ class Solutions:
             for value in values:
                 result[(slice(begin, begin + len(value)), *map(slice, value.shape[1:]))] = value
                 begin += len(value)
-            return result[order]
+            return result if order is None else result[order]
 
         return cls(
             **{name: stacked(name, (), 0) for name in _NUMBERS},

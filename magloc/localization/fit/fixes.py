@@ -228,8 +228,7 @@ class Fixes(Sequence[Fix]):
             return parts[0]
         begins = np.cumsum([0, *map(len, parts)])
         solutions = [
-            part.solutions.chosen(np.arange(len(part.solutions)), begin + part.solutions.of_row)
-            for begin, part in zip(begins, parts, strict=False)
+            part.solutions.of_rows(begin + part.solutions.of_row) for begin, part in zip(begins, parts, strict=False)
         ]
         return cls(
             Solutions.joined(solutions),

@@ -168,7 +168,9 @@ class SingleSourceSearch:
         # Of a row alone a slice: a table of what is listed takes longer than all else here.
         listed = np.s_[0, : kept[0]] if len(rows) == 1 else np.arange(found.chi2.shape[1]) < found.counts[:, :1]
         q, mu = found.q[listed], found.mu[listed]
-        reason = ["" if n else _why_unsolved(of_all) for n, of_all in zip(kept, unknown.tolist(), strict=True)]
+        reason = [""] * len(rows)
+        for i in [i for i, n in enumerate(kept) if not n]:
+            reason[i] = _why_unsolved(int(unknown[i]))
         fits = JointFits(q[:, None], mu[:, None], found.chi2[listed], found.iterations[listed])
         return [Optima(rows, fits, of_row, reason, failed_starts=found.counts[:, 1])]
 

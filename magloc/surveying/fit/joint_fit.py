@@ -18,9 +18,9 @@ from scipy.linalg import cho_factor, solve_triangular
 
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.measurement.pose import PoseErrors
+from magloc.surveying.fit.kernels import MeasuredRows
 from magloc.surveying.fit.record import SurveyRecord
 from magloc.surveying.fit.whitening import Drift, Whitening
-from magloc.surveying.fit.whitening_compiled import pole_columns, source_columns
 
 _MOST_STEPS = 25
 _SETTLED, _DAMPING = 1e-3, 1e-3
@@ -109,8 +109,8 @@ class Layer:
         sensors, seen = (np.add.reduceat(rows, halves) for rows in (record.sensors_m, directions))
         of_group = np.searchsorted(halves, starts)
         scale = np.repeat(np.sqrt(np.diff(of_group) / np.diff(starts)), np.diff(of_group))[:, None, None]
-        columns = pole_columns(sensors / weight, seen * scale, white.U, owner, self.places_m, of_group)
-        return self.field_T * self.depth_m**2 * white.of_groups(columns)
+        halved = MeasuredRows(sensors / weight, seen * scale, white.U, owner, of_group)
+        return self.field_T * self.depth_m**2 * white.of_groups(halved.pole_columns(self.places_m))
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,8 +275,8 @@ def jacobian_of(record: SurveyRecord, background: Background, sources: Sources, 
 
 def source_jacobian(record: SurveyRecord, directions: FloatArray, white: Whitening, sources: Sources) -> FloatArray:
     """The same where it is said what channels read of a small change of the field."""
-    owner, position, moment = record.array.channel_sensor, sources.position_m, sources.moment_Am2
-    return white.of_groups(source_columns(record.sensors_m, directions, white.U, owner, position, moment, white.starts))
+    rows = white.measured_rows(record, directions)
+    return white.of_groups(rows.source_columns(sources.position_m, sources.moment_Am2))
 
 
 def fit_jointly(

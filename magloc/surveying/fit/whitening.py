@@ -18,8 +18,8 @@ import numpy as np
 from arrays.typing import FloatArray, IntArray
 from magloc.measurement.nuisances import without_lasting_errors
 from magloc.measurement.pose import SHIFT, PoseErrors
+from magloc.surveying.fit.kernels import MeasuredRows, WhiteningFilter
 from magloc.surveying.fit.record import SurveyRecord
-from magloc.surveying.fit.whitening_compiled import gains_of, whiten
 
 OFFSET_T = 1e-6
 """Standard deviation of what a sensor's offset may be at first."""
@@ -52,16 +52,13 @@ class Whitening:
         From channels to independent measurements, in units of their noise.
     group : ndarray of int, shape (n,)
         Rows that count as one, their mean.
-    H, gains, kept, dt : ndarray
-        Of the Kalman filter over the groups.
+    filter : WhiteningFilter
+        Kalman filter over the groups.
     """
 
     U: FloatArray
     group: IntArray
-    H: FloatArray
-    gains: FloatArray
-    kept: FloatArray
-    dt_s: FloatArray
+    filter: WhiteningFilter
 
     @classmethod
     def of(
@@ -114,7 +111,7 @@ class Whitening:
         added[:, q : q + C] = dt_s[:, None] * walk[record.array.channel_sensor]
         added[:, -2], added[:, -1] = drift.common_T2_s3 * dt_s**3 / 3.0, drift.common_T2_s3 * dt_s
         start = np.concatenate([np.ones(q), np.full(C, OFFSET_T**2), [OFFSET_T**2, (1e-2 * OFFSET_T) ** 2]])
-        return cls(U, group, H, gains_of(H, kept, added, dt_s, start), kept, dt_s)
+        return cls(U, group, WhiteningFilter(H, kept, added, dt_s, start))
 
     def __call__(self, channels: FloatArray) -> FloatArray:
         """White columns (g·k, m) of columns (n, C, m) of the channels."""
@@ -130,13 +127,25 @@ class Whitening:
         """White columns (g'·k, m) of columns (n', C, m) of all rows of some groups; nothing is elsewhere."""
         count = np.diff(self.starts)[groups]
         Y = _summed(self.U @ channels, np.repeat(np.arange(len(groups)), count), np.sqrt(1.0 / count))
-        whiten(Y, groups, self.H, self.gains, self.kept, self.dt_s)
+        self.filter.whiten(Y, groups)
         return Y.reshape(-1, Y.shape[2])
+
+    def measured_rows(self, record: SurveyRecord, directions: FloatArray) -> MeasuredRows:
+        """The groups of a record whose channels read some directions (n, C, 3) of a small change of the field."""
+        return MeasuredRows(record.sensors_m, directions, self.U, record.array.channel_sensor, self.starts)
+
+    def of_moments(
+        self, record: SurveyRecord, directions: FloatArray, places_m: FloatArray, groups: IntArray
+    ) -> FloatArray:
+        """White columns (g·k, 3 m) of what unit moments at places (m, 3) add to some groups; nothing is elsewhere."""
+        columns = self.measured_rows(record, directions).moment_columns(places_m, groups)
+        self.filter.whiten(columns, groups)
+        return columns.reshape(-1, columns.shape[2])
 
     @property
     def log_determinant(self) -> float:
         """Of the noise's covariance."""
-        return float(-2.0 * np.log(self.gains[..., -1]).sum())
+        return float(-2.0 * np.log(self.filter.gains[..., -1]).sum())
 
     @cached_property
     def starts(self) -> IntArray:
@@ -145,7 +154,7 @@ class Whitening:
 
     def of_groups(self, Y: FloatArray) -> FloatArray:
         """White columns (g·k, m) of columns (g, k, m) of the independent measurements of the groups; they are lost."""
-        whiten(Y, np.arange(len(Y)), self.H, self.gains, self.kept, self.dt_s)
+        self.filter.whiten(Y, np.arange(len(Y)))
         return Y.reshape(len(Y) * Y.shape[1], Y.shape[2])
 
 

@@ -13,10 +13,10 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from arrays.typing import FloatArray
+from magloc import core
 from magloc.tracking.multi_target.measurement import JointRow
 from magloc.tracking.multi_target.smoothing import MOST_ROWS, YoungTrack
 from magloc.tracking.multi_target.state import JointState
-from magloc.tracking.multi_target.update_compiled import fill_bends
 from magloc.tracking.sensor_health import SensorHealth
 
 LARGEST_BEND = 0.5
@@ -115,7 +115,10 @@ def _bends(state: JointState, row: JointRow) -> tuple[FloatArray, FloatArray, Fl
     root, widest = np.sqrt(np.maximum(variance[-_AXES:], 0.0)), axes[:, -_AXES:].T
     errors = np.ascontiguousarray(sigma * widest * root[:, None])
     bends = np.empty(len(errors))
-    fill_bends(state.means, row.parts, errors, bends)
+    work = core.problem(
+        "joint_bends", state=state.problem, row=row.problem, n_errors=len(errors), errors=errors, bends=bends
+    )
+    core.run("joint_bend", work, 1, block=1)
     return sigma, widest, root, bends
 
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray, IntArray
+from magloc import core
 from magloc.fields import dipole
 from magloc.localization.search.candidates import candidate_positions
 from magloc.measurement.rows import ambient_fields, channels_above_ambient, whitenings_of
@@ -56,10 +58,10 @@ class JointRow:
         """Channels that are used."""
         return int(np.count_nonzero(self.used))
 
-    @property
-    def parts(self) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
-        """The row as compiled loops take it."""
-        return self.z, self.gain, self.positions_m, self.channel_sensor
+    @cached_property
+    def problem(self) -> core.Problem:
+        """The row as kernels take it."""
+        return rows_problem(self.z, self.gain, self.positions_m, self.channel_sensor)
 
     def without(self, out: BoolArray) -> JointRow:
         """The row without some of the sensors (N,)."""
@@ -87,6 +89,20 @@ class JointRow:
         fields = dipole.field(self.positions_m, position_m, moment_Am2)[self.channel_sensor]
         energy: FloatArray = np.bincount(self.channel_sensor, np.vecdot(self.gain, fields) ** 2).astype(np.float64)
         return energy
+
+
+def rows_problem(z: FloatArray, gain: FloatArray, positions_m: FloatArray, channel_sensor: IntArray) -> core.Problem:
+    """Rows, of which there may be one without an axis of rows, as kernels take them."""
+    return core.problem(
+        "joint_rows",
+        n_rows=len(z) if z.ndim > 1 else 1,
+        n_sensors=positions_m.shape[-2],
+        n_channels=z.shape[-1],
+        readings=np.ascontiguousarray(z),
+        gain=np.ascontiguousarray(gain),
+        sensors=np.ascontiguousarray(positions_m),
+        sensor=np.ascontiguousarray(channel_sensor, dtype=np.int64),
+    )
 
 
 @dataclass(frozen=True, eq=False)

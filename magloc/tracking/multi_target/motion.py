@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from arrays.typing import FloatArray
+from magloc import core
 from magloc.tracking.motion import wandering_step
-from magloc.tracking.multi_target.motion_compiled import step_all
 from magloc.tracking.multi_target.state import N_OF_SOURCE, JointState
 
 P_, C_, V_, W_ = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
@@ -59,7 +59,7 @@ class FreeMotion:
                 raise ValueError(f"Input {name} must be positive and finite; instead received {value}.")
 
     def numbers(self, dt_s: float, *, agility: float = 1.0) -> FloatArray:
-        """A step as the compiled one takes it (12,); `agility` times the noise of velocity and turn."""
+        """A step as its kernel takes it (12,); `agility` times the noise of velocity and turn."""
         lasts_s, kept, root_v = wandering_step(self.correlation_s, dt_s)
         turn_lasts_s, turn_kept, root_w = wandering_step(self.turn_correlation_s, dt_s)
         of_p_v = (agility * self.speed_m_s) ** 2 * (root_v @ root_v.T)
@@ -86,6 +86,7 @@ class FreeMotion:
 
 def stepped(state: JointState, step: FloatArray) -> JointState:
     """State after a step of the motion, whose numbers (12,) are known."""
-    moving = state.position_m, state.moment_Am2, state.velocity_m_s, state.rate_rad_s
-    position, moment, velocity, rate, P = step_all(moving, state.P, step)
-    return JointState(position, moment, velocity, rate, state.common_T, P)
+    after = JointState.unfilled(state.n_sources)
+    work = core.problem("joint_motion", before=state.problem, step=step, after=after.problem)
+    core.run("joint_step", work, 1, block=1)
+    return after

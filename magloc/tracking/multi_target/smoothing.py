@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from arrays.typing import FloatArray
-from magloc.tracking.multi_target.measurement import JointRow
+from magloc import core
+from magloc.tracking.multi_target.measurement import JointRow, rows_problem
 from magloc.tracking.multi_target.motion import stepped
-from magloc.tracking.multi_target.smoothing_compiled import Means, smooth
 from magloc.tracking.multi_target.state import N_OF_SOURCE, JointState
 
 MOST_ROWS = 90
@@ -68,19 +68,28 @@ class YoungTrack:
 
     def smoothed(self) -> YoungTrack | None:
         """The same with all rows linearised along the trajectory that they lead to; None where there is no such."""
-        track, prior = _stacked(self.states), _means(self.prior)
-        rows = [row for row, _ in self.rows]
-        given = (
+        track, rows = _stacked(self.states), [row for row, _ in self.rows]
+        given = rows_problem(
             np.stack([row.z for row in rows]),
             np.stack([row.gain for row in rows]),
             np.stack([row.positions_m for row in rows]),
             rows[0].channel_sensor,
         )
-        steps = np.stack([step for _, step in self.rows])
-        offsets, last = np.empty((len(self.rows), len(self.prior.P))), np.empty_like(self.prior.P)
+        steps, n = np.stack([step for _, step in self.rows]), len(self.prior.P)
+        offsets, last, likelihood = np.empty((len(rows), n)), np.empty((n, n)), np.empty(2)
         for _ in range(_MOST_PASSES):
-            cost, log_volume = smooth(_means(track), prior, self.prior.P, steps, given, offsets, last)
-            if not (np.isfinite(cost) and np.isfinite(offsets).all() and np.isfinite(last).all()):
+            work = core.problem(
+                "joint_smoothing",
+                trajectory=track.problem,
+                prior=self.prior.problem,
+                rows=given,
+                steps=steps,
+                offsets=offsets,
+                last=last,
+                likelihood=likelihood,
+            )
+            core.run("joint_smooth", work, 1, block=1)
+            if not (np.isfinite(likelihood[0]) and np.isfinite(offsets).all() and np.isfinite(last).all()):
                 return None
             turns = offsets[:, : 6 * self.prior.n_sources].reshape(len(offsets), -1, 6)[:, :, 3:]
             share = min(1.0, _LONGEST / max(float(np.abs(turns).max(initial=0.0)), 1e-300))
@@ -88,11 +97,11 @@ class YoungTrack:
             track = track.moved(share * offsets)
             if share == 1.0 and float(change.max(initial=0.0)) < _TOLERANCE:
                 states = tuple(JointState(*means, last) for means in zip(*_means(track), strict=True))
-                return replace(self, states=states, score=cost + log_volume)
+                return replace(self, states=states, score=float(likelihood.sum()))
         return None
 
 
-def _means(state: JointState) -> Means:
+def _means(state: JointState) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """What a state says without its covariance."""
     return state.position_m, state.moment_Am2, state.velocity_m_s, state.rate_rad_s, state.common_T
 

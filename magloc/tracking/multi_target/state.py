@@ -16,6 +16,7 @@ from functools import cached_property
 import numpy as np
 
 from arrays.typing import FloatArray, IntArray
+from magloc import core
 
 N_SEEN = 6
 """Numbers of a source that a row sees: position and moment."""
@@ -48,15 +49,31 @@ class JointState:
         none = np.zeros((0, 3))
         return cls(none, none, none, none, common_T, sigma_T**2 * np.eye(N_COMMON))
 
+    @classmethod
+    def unfilled(cls, n_sources: int) -> JointState:
+        """A state that a kernel is to fill."""
+        n = N_OF_SOURCE * n_sources + N_COMMON
+        position_m, moment_Am2, velocity_m_s, rate_rad_s = np.empty((4, n_sources, 3))
+        return cls(position_m, moment_Am2, velocity_m_s, rate_rad_s, np.empty(N_COMMON), np.empty((n, n)))
+
     @property
     def n_sources(self) -> int:
         """K."""
         return self.position_m.shape[-2]
 
-    @property
-    def means(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """What a row sees: positions, moments and the common field, as compiled loops take them."""
-        return self.position_m, self.moment_Am2, self.common_T
+    @cached_property
+    def problem(self) -> core.Problem:
+        """The state as kernels take it."""
+        return core.problem(
+            "joint_state",
+            n_sources=self.n_sources,
+            position=np.ascontiguousarray(self.position_m),
+            moment=np.ascontiguousarray(self.moment_Am2),
+            velocity=np.ascontiguousarray(self.velocity_m_s),
+            rate=np.ascontiguousarray(self.rate_rad_s),
+            common=np.ascontiguousarray(self.common_T),
+            covariance=np.ascontiguousarray(self.P),
+        )
 
     @property
     def n_seen(self) -> int:

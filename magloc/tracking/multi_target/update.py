@@ -14,9 +14,9 @@ from functools import cached_property
 import numpy as np
 
 from arrays.typing import BoolArray, FloatArray
+from magloc import core
 from magloc.tracking.multi_target.measurement import JointRow
 from magloc.tracking.multi_target.state import N_COMMON, N_SEEN, JointState
-from magloc.tracking.multi_target.update_compiled import fill_standardised, iterate, posterior
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +40,8 @@ class JointUpdate:
         The residual at the prediction.
     linear : ndarray, shape (C, 6 K + 3)
         The root at the prediction.
+    standardised : ndarray, shape (N, 3)
+        Post-fit residuals of every sensor's channels with unit covariance; zero for those not used.
     cost : float
         :math:`J = |r|^2 + e^T P^{-1} e`, χ² of the innovation with the number of readings as degrees of freedom.
     converged : bool
@@ -54,6 +56,7 @@ class JointUpdate:
     HL: FloatArray
     innovation: FloatArray
     linear: FloatArray
+    standardised: FloatArray
     cost: float
     converged: bool
 
@@ -70,16 +73,10 @@ class JointUpdate:
     @cached_property
     def state(self) -> JointState:
         """The state after the row, with its covariance in its own chart."""
-        error, moment, P = posterior(self.prior.P, self.L, self.R, self.y, self.prior.moment_Am2)
-        return self.prior.moved_to(error, moment, P)
-
-    @cached_property
-    def standardised(self) -> FloatArray:
-        """Post-fit residuals (N, 3) of every sensor's channels with unit covariance; zero for those not used."""
-        # Channels of vector sensors stand three by three. A sensor that the fit follows wholly says nothing of itself.
-        found = np.empty((len(self.residual) // 3, 3))
-        fill_standardised(self.HL, self.R, self.residual, _FOLLOWED, found)
-        return found
+        after = JointState.unfilled(self.prior.n_sources)
+        work = core.problem("joint_posterior", prior=self.prior.problem, R=self.R, y=self.y, after=after.problem)
+        core.run("joint_state_after", work, 1, block=1)
+        return after
 
     @property
     def sensor_chi2(self) -> FloatArray:
@@ -98,6 +95,7 @@ class JointUpdate:
 
 
 _FOLLOWED = 1e-3
+"""Variance of residuals beside what the fit leaves: a sensor that it follows wholly says nothing of itself."""
 MOST_TRIALS = 60
 """Steps of an update that are tried."""
 
@@ -105,11 +103,26 @@ MOST_TRIALS = 60
 def joint_update(prior: JointState, row: JointRow, most: int = MOST_TRIALS) -> JointUpdate:
     """A predicted state after a row's readings, by damped Gauss-Newton in the chart of the prediction."""
     d, n = prior.n_seen, len(row.z)
-    L: FloatArray = np.asarray(np.linalg.cholesky(prior.P[:d, :d]), dtype=np.float64)
-    y, R, residuals, HLs = np.zeros(d), np.eye(d), np.empty((2, n)), np.zeros((2, n, d))
-    residuals[:] = row.z
-    cost, converged = iterate(prior.means, L, row.parts, y, residuals, HLs, R, most)
-    return JointUpdate(prior, row, L, R, y, residuals[1], HLs[1], residuals[0], HLs[0], cost, converged)
+    L, R, y, residuals, HL = np.empty((d, d)), np.empty((d, d)), np.empty(d), np.empty((2, n)), np.empty((2, n, d))
+    # Channels of vector sensors stand three by three.
+    standardised, outcome = np.empty((n // 3, 3)), np.empty(2)
+    work = core.problem(
+        "joint_update",
+        prior=prior.problem,
+        row=row.problem,
+        most_trials=most,
+        followed=_FOLLOWED,
+        L=L,
+        R=R,
+        y=y,
+        residuals=residuals,
+        HL=HL,
+        standardised=standardised,
+        outcome=outcome,
+    )
+    core.run("joint_update_row", work, 1, block=1)
+    cost, converged = float(outcome[0]), bool(outcome[1])
+    return JointUpdate(prior, row, L, R, y, residuals[1], HL[1], residuals[0], HL[0], standardised, cost, converged)
 
 
 def innovation_chi2(state: JointState, row: JointRow, sensors: BoolArray) -> FloatArray:

@@ -76,6 +76,7 @@ class TestParts:
         other = InertialMagneticRecord(record.time_s, changed, record.acceleration_m_s2, record.field_T)
         np.testing.assert_array_equal(rest_bias(other)[:600], rest_bias(record)[:600])
 
+    @pytest.mark.usefixtures("instruction_set")
     @pytest.mark.parametrize("lag", [1, 3])
     def test_lag(self, lag):
         record, _, _ = motion(lag=lag)

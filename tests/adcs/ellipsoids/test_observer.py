@@ -56,6 +56,7 @@ class TestContainment:
 class TestTwins:
     """The batch is predict() and correct() for every run."""
 
+    @pytest.mark.usefixtures("instruction_set")
     @pytest.mark.parametrize("rule", STEP_RULES)
     @pytest.mark.parametrize(("n", "m"), [(1, 1), (2, 1), (3, 2), (7, 3), (12, 2)])
     def test_sets_bounds_and_contradictions(self, n, m, rule):

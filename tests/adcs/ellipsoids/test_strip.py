@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from adcs.ellipsoids import observer_compiled as kernel
 from adcs.ellipsoids import strip as strip_steps
 from adcs.ellipsoids.strip import growth, is_informative, lemma_step, optimal_step, tightened_strip, trace_ratio
 
@@ -71,15 +70,6 @@ class TestOptimalStep:
             return
         closed = 1.0 - math.sqrt(delta**2 * (1.0 - g) / (g * (1.0 - delta**2)))
         assert optimal_step(0.0, delta, g) == pytest.approx(min(closed, strip_steps.LARGEST_STEP), abs=1e-10)
-
-    @settings(deadline=None)
-    @given(shares, half_widths, fractions)
-    def test_compiled_twin_agrees(self, g, delta, fraction):
-        mu = (1.0 + delta) * fraction
-        if is_informative(mu, delta, g):
-            ours, twin = optimal_step(mu, delta, g), kernel._optimal(mu, delta, g)
-            assert 0.0 <= twin < 1.0
-            assert twin == pytest.approx(ours, rel=0, abs=1e-14)
 
     @settings(deadline=None)
     @given(shares, half_widths, fractions)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import subprocess
 import sys
 import threading
@@ -22,7 +23,7 @@ from arrays import read_array
 from arrays.io.errors import InputError, naming
 from magloc import core
 from magloc.cli import framework
-from magloc.cli.framework import print_json_list
+from magloc.cli.framework import QuietOptions, print_json_list
 from tests.command_line import Outcome, Run, assert_refused
 from tests.waiting import WAIT_S
 
@@ -236,6 +237,15 @@ class TestCommonOptions:
         readings, array = recording
         assert run("locate", readings, "--array", array, *threads).status == 0
         assert set_to == used
+
+    def test_threads_are_those_of_numba_where_it_is_imported_later(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(core, "set_threads", lambda n: None)
+        monkeypatch.setattr(core, "threads", lambda: 1)
+        monkeypatch.delitem(sys.modules, "numba")
+        monkeypatch.setenv("NUMBA_NUM_THREADS", "7")
+        QuietOptions(threads=1).apply()
+        assert os.environ["NUMBA_NUM_THREADS"] == "1"
+        assert "numba" not in sys.modules
 
     @pytest.mark.slow_after(1)
     @pytest.mark.parametrize("quiet", [False, True])

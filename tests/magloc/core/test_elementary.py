@@ -105,6 +105,9 @@ class TestElementary:
     def test_exponential(self, functions: ctypes.CDLL) -> None:
         x = np.concatenate([np.random.default_rng(2).uniform(-700, 700, 4000), np.linspace(-2.0, 2.0, 401)])
         np.testing.assert_allclose(mapped(functions.exponentials, x), np.exp(x), rtol=4.0 * EPS, atol=0)
+        ends = np.array([709.0, 710.0, 1e300, np.inf, -1e300, -np.inf, np.nan])
+        with np.errstate(over="ignore"):
+            np.testing.assert_allclose(mapped(functions.exponentials, ends), np.exp(ends), rtol=4.0 * EPS, atol=0)
         assert mapped(functions.exponentials, np.array([-1e4])) == 0.0
 
     def test_complementary_error(self, functions: ctypes.CDLL) -> None:

@@ -3,7 +3,7 @@
 ====================================  ==========================================================================
 what                                  who checks it
 ====================================  ==========================================================================
-compiled σ of the range               magloc.bounds.crlb (an SVD of the whitened Jacobian), vector and scalar sensors
+σ of the range                        magloc.bounds.crlb (an SVD of the whitened Jacobian), vector and scalar sensors
 its slope                             scipy.differentiate, by places of the sensors
 smoothed quantile                     scipy.stats.mstats.hdquantiles; its gap to the order statistic
 descent                               scipy's simplex search does not find better nearby; projected slope
@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numba
 import numpy as np
 import pytest
 import trimesh
@@ -59,6 +58,7 @@ class TestRangeDeviation:
     @pytest.mark.parametrize(
         ("task", "shape"), [(TASK, TETRAHEDRON), (SCALAR, CUBE), (replace(TASK, n_sensors=8), CUBE)]
     )
+    @pytest.mark.usefixtures("instruction_set")
     def test_equals_the_bounds(self, task, shape):
         sensors = shape + rng(1).normal(0.0, 0.1, shape.shape)
         sample = random_sample(task, 500, rng(2))
@@ -66,6 +66,7 @@ class TestRangeDeviation:
         np.testing.assert_allclose(sample.deviations(task, sensors), expected, rtol=1e-7)
 
     @pytest.mark.parametrize(("task", "shape"), [(TASK, TETRAHEDRON), (SCALAR, CUBE)])
+    @pytest.mark.usefixtures("instruction_set")
     def test_slope_is_the_derivative(self, task, shape):
         sensors = shape + rng(3).normal(0.0, 0.1, shape.shape)
         for source in range(5):
@@ -85,14 +86,12 @@ class TestRangeDeviation:
         flat = np.array([[0.0, 0.0, 1.0]] * 4)
         assert np.all(np.isinf(random_sample(TASK, 10, rng(5)).deviations(TASK, flat)))
 
-    def test_threads_do_not_matter(self):
-        before = numba.get_num_threads()
-        sample = random_sample(TASK, 1000, rng(6))
+    def test_threads_do_not_matter(self, threads):
+        sample = random_sample(TASK, 30_000, rng(6))  # several blocks
         results = []
-        for threads in (1, before):
-            numba.set_num_threads(threads)
+        for n_threads in (1, 4):
+            threads(n_threads)
             results.append(sample.log_value_and_slope(TASK, TETRAHEDRON))
-        numba.set_num_threads(before)
         assert results[0][0] == results[1][0]
         np.testing.assert_array_equal(results[0][1], results[1][1])
 
@@ -307,11 +306,9 @@ class TestDesign:
         assert found.judged[2].gain > 0.2
         assert found.near_optimal == ()
 
-    def test_same_seed_same_array_whatever_the_threads(self, found):
-        before = numba.get_num_threads()
-        numba.set_num_threads(1)
+    def test_same_seed_same_array_whatever_the_threads(self, found, threads):
+        threads(1)
         again = design_array(replace(TASK, search=SMALL), seed=1)
-        numba.set_num_threads(before)
         assert again.array == found.array
         other = design_array(
             replace(TASK, search=replace(SMALL, n_starts=2, small_iterations=3, large_iterations=3)), seed=2

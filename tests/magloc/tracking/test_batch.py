@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -14,6 +14,7 @@ import sims
 from arrays import geometries
 from arrays.array import SensorArray
 from magloc.readings import Readings
+from magloc.tracking import batch
 from magloc.tracking.batch import track_record
 from magloc.tracking.motion import MotionModel, OrnsteinUhlenbeck, RandomWalk
 from magloc.tracking.results import Row, TrackPoint, rows_of
@@ -33,6 +34,35 @@ from tests.passing_source import (
 )
 
 FloatArray = NDArray[np.float64]
+all_instruction_sets = pytest.mark.usefixtures("instruction_set")
+
+
+@dataclass(frozen=True)
+class WanderingVelocity:
+    """State (p, m, v): the velocity is a random walk, and moment and position have noise of their own."""
+
+    speed_m_s: float = 0.1
+    turn_rad_s: float = 0.02
+    n_states: int = 9
+
+    def start(self, source: FloatArray, S: FloatArray) -> tuple[FloatArray, FloatArray]:
+        root = np.diag(np.repeat([0.0, self.speed_m_s], [6, 3]))
+        root[:6, :6] = S
+        return self.state_of(source, np.zeros(3), np.zeros(3)), root
+
+    def state_of(self, source: FloatArray, velocity_m_s: FloatArray, rate_rad_s: FloatArray) -> FloatArray:
+        return np.concatenate([source, velocity_m_s])
+
+    def linear_step(self, dt_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        F, A, B = np.eye(9), np.zeros((9, 9)), np.zeros((9, 9))
+        F[:3, 6:] = dt_s * np.eye(3)
+        A[:3, :3], A[6:, 6:] = 0.01 * dt_s * np.eye(3), 0.02 * np.sqrt(dt_s) * np.eye(3)
+        B[3:6, 3:6] = self.turn_rad_s * dt_s * np.eye(3)
+        return F, A, B
+
+    def step(self, x: FloatArray, dt_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        F, A, B = self.linear_step(dt_s)
+        return F @ x, F, A + float(np.linalg.norm(x[3:6])) * B
 
 
 def assert_same_points(some: list[TrackPoint], others: list[TrackPoint]) -> None:
@@ -103,6 +133,7 @@ class TestCompiledRecord:
         with pytest.raises(ValueError, match="must increase"):
             track_record(tracker, rows[-1:])
 
+    @all_instruction_sets
     def test_gaps_missing_channels_and_spikes(self) -> None:
         n = 120
         rng = np.random.default_rng(8)
@@ -117,6 +148,7 @@ class TestCompiledRecord:
         assert {"acquired", "tracked", "predicted", "outlier"} <= set(statuses(points))
         assert statuses(points).count("acquired") >= 2
 
+    @all_instruction_sets
     def test_scalar_sensors_in_an_ambient_field_of_every_row(self) -> None:
         n = 60
         array = geometries.cube(1.5, "scalar", NOISE_T)
@@ -130,6 +162,7 @@ class TestCompiledRecord:
         assert statuses(points).count("tracked") > 50
         assert np.nanmax(np.linalg.norm(positions(points) - p, axis=1)) < 0.3
 
+    @all_instruction_sets
     def test_a_moving_array(self) -> None:
         n = 60
         time_s, p, m = moving_source(n)
@@ -143,12 +176,14 @@ class TestCompiledRecord:
         assert statuses(points) == ["acquired"] + ["tracked"] * (n - 1)
         assert np.linalg.norm(positions(points) - world_p, axis=1).max() < 0.2
 
+    @all_instruction_sets
     def test_noise_that_depends_on_the_reading(self) -> None:
         time_s, p, m = moving_source(40)
         array = replace(ARRAY, noise_fraction=1e-3)
         points = self.both(array, SLOW, rows_from(time_s, readings_of(array, p, m)))
         assert statuses(points).count("tracked") > 30
 
+    @all_instruction_sets
     @pytest.mark.slow_after(1)
     @pytest.mark.parametrize("seed", range(3))
     def test_a_source_at_rest_that_is_known_along_a_curve(self, seed: int) -> None:
@@ -158,6 +193,27 @@ class TestCompiledRecord:
         points = self.both(array, RandomWalk(1e-6, 1e-6), rows_from(readings.time_s, readings.values_T))
         assert statuses(points).count("tracked") >= 50
 
+    @all_instruction_sets
+    def test_a_velocity(self) -> None:
+        time_s, p, m = moving_source(50)
+        readings = readings_of(ARRAY, p, m)
+        readings[25:28] = np.nan
+        points = self.both(ARRAY, WanderingVelocity(), rows_from(time_s, readings))
+        assert statuses(points) == ["acquired", *["tracked"] * 24, *["predicted"] * 3, *["tracked"] * 22]
+
+    def test_blocks_of_rows_do_not_matter(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        time_s, p, m = moving_source(60)
+        readings = readings_of(ARRAY, p, m)
+        readings[40, 3] += 1e-6
+        rows = rows_from(time_s, readings)
+        expected = track_record(Tracker(ARRAY, SLOW), rows)
+        monkeypatch.setattr(batch, "_TERMS_A_CALL", 20_000)
+        points = track_record(Tracker(ARRAY, SLOW), rows)
+        assert statuses(points) == statuses(expected)
+        assert [point.nis for point in points] == [point.nis for point in expected]
+        np.testing.assert_array_equal(positions(points), positions(expected))
+
+    @all_instruction_sets
     def test_rows_that_have_no_coordinates_of_their_own(self) -> None:
         """Five differences: the prediction is taken as Gaussian in position and moment there."""
         time_s, p, m = moving_source(40)
@@ -167,6 +223,7 @@ class TestCompiledRecord:
         assert [point.nis_dof for point in points[10:14]] == [5, 9, 5, 9]
         assert set(statuses(points[1:])) == {"tracked"}
 
+    @all_instruction_sets
     def test_steps_that_swing(self) -> None:
         """A source that is weak and far: the iterations that shrink do so in both, and their number is the same."""
         array = geometries.tetrahedron(1.5, "vector", 1e-9)

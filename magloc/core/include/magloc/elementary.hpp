@@ -73,9 +73,10 @@ inline void fill_sine_and_cosine(double x, double &sine, double &cosine) {
   cosine = 1.0 - 2.0 * s * s;
 }
 
-// Exponential of a number up to 700; zero below -700. x = n log 2 + r, and the power series of e^r.
+// Exponential; zero below -700 and infinite above 709. x = n log 2 + r, and the power series of e^r.
 inline double exponential(double x) {
   if (x < -700.0) return 0.0;
+  if (!(x <= 709.0)) return x + infinity;
   const int64_t n = (int64_t)(x * 1.4426950408889634 + (x < 0.0 ? -0.5 : 0.5));
   const double whole = (double)n, r = (x - whole * 0x1.62e42fee00000p-1) - whole * 0x1.a39ef35793c76p-33;
   double sum = 1.0;

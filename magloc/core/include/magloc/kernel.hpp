@@ -4,25 +4,41 @@
 #include "numbers.hpp"
 
 // X(kernel, problem)
-#define MAGLOC_KERNELS(X)                  \
-  X(dipole_fields, dipoles)                \
-  X(dipole_gradients, dipoles)             \
-  X(star_search, star_triangles)           \
-  X(complementary_filter, complementary)   \
-  X(adaptive_filter, adaptive)             \
-  X(gyro_attitudes, gyro)                  \
-  X(level_attitudes, level)                \
-  X(low_pass, butterworth)                 \
-  X(heading_filter, heading)               \
-  X(heading_smoother, heading)             \
-  X(attitude_motion_runs, attitude_motion) \
-  X(mekf_runs, mekf)                       \
-  X(filter_starts, starts)                 \
-  X(refine, refinement)                    \
-  X(candidate_bases, candidate_positions)  \
-  X(choose_candidates, candidate_choice)   \
-  X(search_optima, search)                 \
-  X(source_uncertainties, source_uncertainty)
+#define MAGLOC_KERNELS(X)                     \
+  X(dipole_fields, dipoles)                   \
+  X(dipole_gradients, dipoles)                \
+  X(star_search, star_triangles)              \
+  X(complementary_filter, complementary)      \
+  X(adaptive_filter, adaptive)                \
+  X(gyro_attitudes, gyro)                     \
+  X(level_attitudes, level)                   \
+  X(low_pass, butterworth)                    \
+  X(lag_changes, lags)                        \
+  X(heading_filter, heading)                  \
+  X(heading_smoother, heading)                \
+  X(attitude_motion_runs, attitude_motion)    \
+  X(small_motion_runs, small_motion)          \
+  X(ellipsoids_predict, ellipsoids)           \
+  X(ellipsoids_correct, ellipsoids)           \
+  X(mekf_runs, mekf)                          \
+  X(filter_starts, starts)                    \
+  X(refine, refinement)                       \
+  X(candidate_bases, candidate_positions)     \
+  X(choose_candidates, candidate_choice)      \
+  X(search_optima, search)                    \
+  X(source_uncertainties, source_uncertainty) \
+  X(source_bounds, bounds)                    \
+  X(survey_gains, survey_filter)              \
+  X(survey_whiten, survey_whitening)          \
+  X(survey_moments, survey_columns)           \
+  X(survey_sources, survey_columns)           \
+  X(survey_poles, survey_columns)             \
+  X(follow_source, track)                     \
+  X(joint_step, joint_motion)                 \
+  X(joint_update_row, joint_update)           \
+  X(joint_state_after, joint_posterior)       \
+  X(joint_bend, joint_bends)                  \
+  X(joint_smooth, joint_smoothing)
 
 #define MAGLOC_JOIN_(a, b, c) magloc_##a##_##b##c
 #define MAGLOC_JOIN(a, b, c) MAGLOC_JOIN_(a, b, c)

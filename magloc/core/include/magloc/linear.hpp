@@ -43,6 +43,9 @@ class Orthogonalisation {
  public:
   T inverse[D], rest_square;  // one over the squares of the orthogonal columns; the square of what is left of y
 
+  // Share of orthogonal column j in the original column k.
+  MAGLOC_INLINE T share(int j, int k) const { return share_[j][k]; }
+
   MAGLOC_INLINE Orthogonalisation(T *a, T *y, int64_t n, double lost) { pass<0>(a, y, n, lost); }
 
   // Fill the lower triangle of (a^T a)^-1 of the original columns; NaN if a column is lost.
@@ -69,6 +72,16 @@ class Orthogonalisation {
     }
   }
 };
+
+// Unit vectors u, v at right angles to a unit vector n and each other. Duff et al., "Building an orthonormal basis,
+// revisited".
+template <class T>
+MAGLOC_INLINE void fill_tangents(const T (&n)[3], T (&u)[3], T (&v)[3]) {
+  const T x = n[0], y = n[1], z = n[2], one = broadcast<T>(1.0);
+  const T sign = choose(z >= 0.0, one, -one), a = -1.0 / (sign + z), b = x * y * a;
+  u[0] = 1.0 + sign * x * x * a, u[1] = sign * b, u[2] = -sign * x;
+  v[0] = b, v[1] = sign + y * y * a, v[2] = -y;
+}
 
 // Factors L D L^T of a positive matrix (lower triangle) whose diagonal a_jj may be raised to (1 + damping) a_jj +
 // added_j. A pivot that loses all but `lost` of its diagonal counts as infinite: its variable stays zero.
@@ -113,6 +126,46 @@ struct Ldl {
  private:
   static constexpr T no_ridge[n] = {};
 };
+
+// A row of numbers in registers, one after the other; the rest of the last register is zero.
+template <class T>
+constexpr int64_t n_registers(int64_t n) {
+  return (n + n_lanes<T> - 1) / n_lanes<T>;
+}
+template <class T>
+MAGLOC_INLINE double get_number(const T *row, int64_t i) {
+  return get_lane(row[i / n_lanes<T>], i % n_lanes<T>);
+}
+template <class T>
+MAGLOC_INLINE void set_number(T *row, int64_t i, double value) {
+  set_lane(row[i / n_lanes<T>], i % n_lanes<T>, value);
+}
+template <class T>
+MAGLOC_INLINE double dot(const T *a, const T *b, int64_t width) {
+  T sum{};
+  for (int64_t r = 0; r < width; ++r) sum += a[r] * b[r];
+  return sum_of_lanes(sum);
+}
+
+// Gram-Schmidt's method, twice, on n rows of `width` registers in place. The upper triangle becomes R with
+// rows = R^T times the orthonormal rows; a row of zeros remains.
+template <class T, int n>
+void orthonormalise(T *rows, int64_t width, double (&triangle)[n][n]) {
+  for (int j = 0; j < n; ++j) {
+    T *const row = rows + j * width;
+    for (int k = 0; k < j; ++k) triangle[k][j] = 0.0;
+    for (int pass = 0; pass < 2; ++pass)
+      for (int k = 0; k < j; ++k) {
+        const T *const before = rows + k * width;
+        const double share = dot(before, row, width);
+        triangle[k][j] += share;
+        for (int64_t r = 0; r < width; ++r) row[r] -= share * before[r];
+      }
+    const double norm = square_root(dot(row, row, width)), inverse = norm > 0.0 ? 1.0 / norm : 0.0;
+    triangle[j][j] = norm;
+    for (int64_t r = 0; r < width; ++r) row[r] *= inverse;
+  }
+}
 
 // Replace the lower triangle of A by that of -A^-1: the sweep operator on every variable.
 template <class T, int n>

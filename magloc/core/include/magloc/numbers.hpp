@@ -69,6 +69,12 @@ MAGLOC_INLINE T broadcast(double x) {
   return T{} + x;
 }
 template <class T>
+MAGLOC_INLINE double sum_of_lanes(const T &x) {
+  double sum = 0.0;
+  for (int i = 0; i < n_lanes<T>; ++i) sum += get_lane(x, i);
+  return sum;
+}
+template <class T>
 MAGLOC_INLINE T maximum(T a, T b) {
   return choose(a > b, a, b);
 }
@@ -117,6 +123,7 @@ struct Dual {
   template <class S>
   MAGLOC_RULE(*(const S &a, const Dual &b), a *b.value, a *b.derivative[i])
 #undef MAGLOC_RULE
+  friend MAGLOC_INLINE Dual &operator+=(Dual &a, const Dual &b) { return a = a + b; }
 };
 template <class T>
 MAGLOC_INLINE T inverse_root(T x) {

@@ -15,6 +15,12 @@ constexpr double smallest_s = 1e-5;
 // A start is given up if this many times the gain that Gauss-Newton predicts would leave its chi-square too high.
 constexpr double most_gained = 10.0;
 constexpr double longest_step = 0.5, largest_damping = 1e12;
+// A start ends at a known optimum that explains the readings (others may be local ones beside a better one) if a step
+// leads to it, but for a share of its length, and promises its chi-square, but for a share of the promise. Lengths that
+// count are these shares, at least and at most, of the way from the optimum to the nearest sensor. Channels that are
+// not linear follow what a step promises less far.
+constexpr double share_beside = 0.4, share_beside_moduli = 0.1, least_length = 0.1, most_length = 0.5;
+constexpr double explained_chi2_by_channels = 4.0;
 
 enum End : int { running = 0, converged = 1, failed = 2 };
 
@@ -28,11 +34,18 @@ struct Rules {
   const uint8_t *free;  // (K, 3), which tangents of each source may be followed; null: all
 };
 
+// An optimum of one source that starts of a row may lead to; its chi-square is NaN if there is none. Reach is the
+// square of the way to the nearest sensor on the sphere of q.
+struct KnownOptimum {
+  double q[4], mu[3], chi2, reach2;
+};
+
 struct Starts {
   int64_t n;
   const int64_t *row;      // (n,) of the readings
   const double *q, *mu;    // (n, K, 4), and (n, K, 3) moments to linearise about first, or null; zero: none is known
   const double *too_high;  // (n,) or null
+  const KnownOptimum *known = nullptr;  // (n,) or null
 };
 
 struct Ends {
@@ -74,6 +87,7 @@ class Refinement {
   void run(Channels &c, const Starts &starts, const Rules &rules, const Ends &out) {
     State<T, K> at, trial;
     clear(at), clear(trial);
+    KnownOfLanes known;
     T first_mu[K][3] = {}, damping = {}, promised = {}, iterations = {}, limit = {}, end = broadcast<T>(failed);
     int64_t loaded[n_lanes<T>];
     for (int64_t &row : loaded) row = -1;
@@ -89,6 +103,7 @@ class Refinement {
       set_lane(at.chi2, lane, infinity), set_lane(damping, lane, 1e-3), set_lane(promised, lane, 0.0);
       set_lane(iterations, lane, 0.0), set_lane(end, lane, running);
       set_lane(limit, lane, starts.too_high ? starts.too_high[k] : infinity);
+      if (starts.known) known.load(lane, starts.known[k], explained_chi2_by_channels * c.n_channels);
       if (row != loaded[lane]) loaded[lane] = row, c.load(lane, row);
     };
     const auto finish = [&](int lane, int64_t k) {
@@ -130,11 +145,43 @@ class Refinement {
 
       Ldl<T, D>(at.information, damping, ridge, lost_pivot).solve(at.gradient, step);
       promised = move(at, step, rules, trial);
+      if constexpr (K == 1)
+        if (starts.known) known.take_if_near(at, step, trial, promised, end, Channels::linear);
       items.release(end, finish);
     }
   }
 
  private:
+  struct KnownOfLanes {
+    T q[4], mu[3], chi2, reach2;
+
+    void load(int lane, const KnownOptimum &known, double explained) {
+      for (int d = 0; d < 4; ++d) set_lane(q[d], lane, known.q[d]);
+      for (int a = 0; a < 3; ++a) set_lane(mu[a], lane, known.mu[a]);
+      set_lane(chi2, lane, known.chi2 < explained ? known.chi2 : nan);
+      set_lane(reach2, lane, known.reach2);
+    }
+
+    // End at the known optimum where a step from `at` to `trial` leads nearly there.
+    MAGLOC_INLINE void take_if_near(State<T, K> &at, const T (&step)[D], State<T, K> &trial, T &promised, T &end,
+                                    bool is_linear) const {
+      T cosine = {};
+      for (int d = 0; d < 4; ++d) cosine += q[d] * trial.q[0][d];
+      const T chord2 = 2.0 * (1.0 - choose(cosine < 0.0, -cosine, cosine));
+      const double share = is_linear ? share_beside : share_beside_moduli;
+      const T least2 = least_length * least_length * reach2, most2 = most_length * most_length * reach2;
+      const T length2 = maximum(dot(step, step), least2);
+      const T beside2 = share * share * choose(length2 < most2, length2, most2);
+      const T beyond = at.chi2 - promised - chi2, most = share * promised;
+      auto near = (chord2 < beside2) & (beyond < most) & (-beyond < most) & (end == broadcast<T>(running));
+      if (!is_linear) near &= dot(mu, at.mu[0]) > 0.0;  // moduli alone do not tell opposite moments apart
+      for (int d = 0; d < 4; ++d) trial.q[0][d] = choose(near, q[d], trial.q[0][d]);
+      for (int a = 0; a < 3; ++a) at.mu[0][a] = choose(near, mu[a], at.mu[0][a]);
+      promised = choose(near, at.chi2 - chi2, promised);
+      end = choose(near, broadcast<T>(converged), end);
+    }
+  };
+
   static void clear(State<T, K> &state) {
     T *x = reinterpret_cast<T *>(&state);
     for (unsigned j = 0; j < sizeof(state) / sizeof(T); ++j) x[j] = T{};
@@ -150,16 +197,15 @@ class Refinement {
   }
 
   // Orthonormal tangents of the sphere at q: two that turn u at one range, and one along the range.
-  // Duff et al., "Building an orthonormal basis, revisited".
   static MAGLOC_INLINE void fill_tangents(const T (&q)[4], const uint8_t *free, T (&t)[3][4]) {
     const T square = q[0] * q[0] + q[1] * q[1] + q[2] * q[2], length = square_root(square);
     const auto off_centre = square > 1e-24;
     const T inverse = choose(off_centre, 1.0 / length, T{});
-    const T x = q[0] * inverse, y = q[1] * inverse, z = choose(off_centre, q[2] * inverse, broadcast<T>(1.0));
-    const T sign = choose(z >= 0.0, broadcast<T>(1.0), broadcast<T>(-1.0)), a = -1.0 / (sign + z), b = x * y * a;
-    const T rows[3][4] = {{1.0 + sign * x * x * a, sign * b, -sign * x, T{}},
-                          {b, sign + y * y * a, -y, T{}},
-                          {x * q[3], y * q[3], z * q[3], -length}};
+    const T n[3] = {q[0] * inverse, q[1] * inverse, choose(off_centre, q[2] * inverse, broadcast<T>(1.0))};
+    T u[3], v[3];
+    magloc::fill_tangents(n, u, v);
+    const T rows[3][4] = {
+        {u[0], u[1], u[2], T{}}, {v[0], v[1], v[2], T{}}, {n[0] * q[3], n[1] * q[3], n[2] * q[3], -length}};
     for (int j = 0; j < 3; ++j)
       for (int d = 0; d < 4; ++d) t[j][d] = free && !free[j] ? T{} : rows[j][d];
   }

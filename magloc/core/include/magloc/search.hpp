@@ -41,17 +41,24 @@ class CandidateBases {
 
 // Candidates that explain most of a row, some angle apart: the best first, then the best of those that are not near.
 //
-// A key has the score in its upper half (the bits of positive floats are in order), and in its lower half how many
-// candidates follow, so that the largest key is the first of the best candidates. The largest key of each block of
-// candidates is known.
+// A key is the score's bits: those of positive floats are in order. The largest key of each block of candidates is
+// known.
 class Choice {
   static constexpr int64_t block = 64;
   const int64_t n_, n_blocks_;
-  int64_t *const key_, *const highest_;
+  int32_t *const key_, *const highest_;
 
-  static int64_t largest(const int64_t *values, int64_t n) {
-    int64_t result = values[0];
-    for (int64_t i = 1; i < n; ++i) result = values[i] > result ? values[i] : result;
+  static int32_t largest(const int32_t *keys, int64_t n) {
+    int32_t result = keys[0];
+    for (int64_t i = 1; i < n; ++i) result = keys[i] > result ? keys[i] : result;
+    return result;
+  }
+  static int64_t first_of(int32_t key, const int32_t *keys, int64_t n) {
+    int32_t result = (int32_t)n;
+    for (int32_t i = 0; i < (int32_t)n; ++i) {
+      const int32_t place = keys[i] == key ? i : (int32_t)n;
+      result = place < result ? place : result;
+    }
     return result;
   }
 
@@ -59,29 +66,27 @@ class Choice {
   Choice(int64_t n_candidates, Workspace &room)
       : n_(n_candidates),
         n_blocks_((n_candidates + block - 1) / block),
-        key_(room.take<int64_t>(n_blocks_ * block)),
-        highest_(room.take<int64_t>(n_blocks_)) {}
+        key_(room.take<int32_t>(n_blocks_ * block)),
+        highest_(room.take<int32_t>(n_blocks_)) {}
 
   // Components (3, n) of the row along the candidates' bases.
   void choose(const float *components, const double *candidates, double cosine, int64_t n_chosen, int64_t *chosen) {
     const float *x = components, *y = x + n_, *z = y + n_;
     for (int64_t j = 0; j < n_; ++j) {
       const float energy = x[j] * x[j] + y[j] * y[j] + z[j] * z[j], score = energy > 0.0f ? energy : -1.0f;
-      int32_t bits;
-      __builtin_memcpy(&bits, &score, sizeof bits);
-      key_[j] = (int64_t)bits * ((int64_t)1 << 32) + (n_ - j);
+      __builtin_memcpy(&key_[j], &score, sizeof score);
     }
-    for (int64_t j = n_; j < n_blocks_ * block; ++j) key_[j] = -1;
+    for (int64_t j = n_; j < n_blocks_ * block; ++j) key_[j] = none;
     for (int64_t b = 0; b < n_blocks_; ++b) highest_[b] = largest(key_ + b * block, block);
     for (int64_t found = 0; found < n_chosen;) {
-      const int64_t best = largest(highest_, n_blocks_);
+      const int32_t best = largest(highest_, n_blocks_);
       if (best <= 0) {  // none is left: the best again
         chosen[found] = found ? chosen[0] : 0;
         ++found;
         continue;
       }
-      const int64_t j = n_ - (best & 0xffffffff), b = j / block;
-      key_[j] = -1;
+      const int64_t b = first_of(best, highest_, n_blocks_), j = b * block + first_of(best, key_ + b * block, block);
+      key_[j] = none;
       highest_[b] = largest(key_ + b * block, block);
       bool near = false;
       for (int64_t k = 0; k < found; ++k) {
@@ -91,6 +96,9 @@ class Choice {
       if (!near) chosen[found++] = j;
     }
   }
+
+ private:
+  static constexpr int32_t none = -1;
 };
 
 // Ends of refinements of one source, in the caller's memory.
@@ -109,8 +117,8 @@ class Search {
   static constexpr double near_tolerance = 1e-2, optimum_tolerance = 1e-10, relative_tolerance = 1e-14;
   // Linearisations allowed from there on, in units of those allowed before: along a flat valley steps stay long.
   static constexpr int64_t times_longer = 3;
-  // Starts of a row that tell how high chi-square may be where the others lead.
-  static constexpr int64_t most_first = 3;
+  // Starts of a row that are refined before the others, and before all others.
+  static constexpr int64_t n_stages = 2, ends_of_stages[n_stages] = {1, 3};
   // Two ends are one optimum if they are 0.01 rad apart on the sphere of q and their chi-squares are equal.
   static constexpr double same_cosine = 0.99995, same_chi2 = 0.01;
 
@@ -125,6 +133,7 @@ class Search {
  private:
   EndsOfOne near_, end_;
   double *const q_, *const mu_, *const limit_, *const known_chi2_;
+  KnownOptimum *const known_;
   int64_t *const row_, *const place_, *const order_, *const iterations_, *const first_end_;
 
  public:
@@ -139,6 +148,7 @@ class Search {
         mu_(room.take<double>(3 * rows_together * n_starts_)),
         limit_(room.take<double>(rows_together * n_starts_)),
         known_chi2_(room.take<double>(rows_together * n_starts_)),
+        known_(room.take<KnownOptimum>(rows_together * n_starts_)),
         row_(room.take<int64_t>(rows_together * n_starts_)),
         place_(room.take<int64_t>(rows_together * n_starts_)),
         order_(room.take<int64_t>(rows_together)),
@@ -158,51 +168,71 @@ class Search {
     return {tolerance, relative_tolerance, max_iterations, ahead, few_digits, nullptr};
   }
 
-  // Refine the starts to near an optimum. Rows for which few digits do come first, to be refined together.
+  // Refine the starts to near an optimum, those of each stage together: what the first ones of a row find tells how
+  // high chi-square may be where the others lead, and ends those that lead there, too. Rows for which few digits do
+  // come first.
   void refine_starts(int64_t begin, int64_t n_rows) {
-    const int64_t n_first = most_first < n_starts_ ? most_first : n_starts_, n_others = n_starts_ - n_first;
     int64_t n_easy = 0, n_hard = 0;
     for (int64_t i = 0; i < n_rows; ++i)
       if (channels_.few_digits_do(p_.row[begin + i]))
         order_[n_easy++] = i;
       else
         order_[n_rows - ++n_hard] = i;
+    for (int64_t stage = 0, first = 0; first < n_starts_; ++stage) {
+      const int64_t last = stage < n_stages && ends_of_stages[stage] < n_starts_ ? ends_of_stages[stage] : n_starts_;
+      refine_stage(begin, n_rows, n_easy, first, last);
+      first = last;
+    }
+  }
+  void refine_stage(int64_t begin, int64_t n_rows, int64_t n_easy, int64_t first, int64_t last) {
+    int64_t j = n_rows * first;
     for (int64_t at = 0; at < n_rows; ++at) {
-      const int64_t i = order_[at];
-      for (int64_t k = 0; k < n_starts_; ++k) {
-        const int64_t j = k < n_first ? at * n_first + k : n_rows * n_first + at * n_others + k - n_first;
+      const int64_t i = order_[at], best = lowest(i, first);
+      const KnownOptimum known = known_optimum(best);
+      for (int64_t k = first; k < last; ++k, ++j) {
         const int64_t from = (begin + i) * n_starts_ + k;
         place_[i * n_starts_ + k] = j;
         row_[j] = p_.row[begin + i];
-        limit_[j] = infinity;
+        limit_[j] = highest_useful(best);
+        known_[j] = known;
         for (int d = 0; d < 4; ++d) q_[4 * j + d] = p_.starts[4 * from + d];
         if (p_.start_moments)
           for (int d = 0; d < 3; ++d) mu_[3 * j + d] = p_.start_moments[3 * from + d];
       }
     }
-    const int64_t n = n_rows * n_starts_;
-    const int64_t edges[] = {0, n_easy * n_first, n_rows * n_first, n_rows * n_first + n_easy * n_others, n};
-    for (int part = 0; part < 4; ++part) {
-      const int64_t first = edges[part];
-      const Starts starts{edges[part + 1] - first, row_ + first, q_ + 4 * first,
-                          p_.start_moments ? mu_ + 3 * first : nullptr, limit_ + first};
-      refinement_.run(channels_, starts, rules(near_tolerance, p_.max_iterations, true, part % 2 == 0),
-                      near_.from<1>(first));
-      if (part == 1)
-        for (int64_t i = 0; i < n_rows; ++i) {
-          const double useful = lowest(i, n_first) + p_.keep_within + 1.0;
-          for (int64_t k = n_first; k < n_starts_; ++k) limit_[place_[i * n_starts_ + k]] = useful;
-        }
+    const int64_t n = last - first, edges[] = {n_rows * first, n_rows * first + n_easy * n, n_rows * last};
+    for (int part = 0; part < 2; ++part) {
+      const int64_t at = edges[part];
+      const Starts starts{edges[part + 1] - at, row_ + at,  q_ + 4 * at, p_.start_moments ? mu_ + 3 * at : nullptr,
+                          limit_ + at,          known_ + at};
+      refinement_.run(channels_, starts, rules(near_tolerance, p_.max_iterations, true, part == 0), near_.from<1>(at));
     }
   }
-  double lowest(int64_t i, int64_t n) const {
-    double result = infinity;
+  // The best end of the first n starts of a row; -1 if there is none.
+  int64_t lowest(int64_t i, int64_t n) const {
+    int64_t best = -1;
     for (int64_t k = 0; k < n; ++k) {
       const int64_t j = place_[i * n_starts_ + k];
-      if (near_.converged[j] && near_.chi2[j] < result) result = near_.chi2[j];
+      if (near_.converged[j] && (best < 0 || near_.chi2[j] < near_.chi2[best])) best = j;
     }
-    return result;
+    return best;
   }
+  KnownOptimum known_optimum(int64_t end) const {
+    KnownOptimum known{{}, {}, nan, 0.0};
+    if (end < 0) return known;
+    for (int d = 0; d < 4; ++d) known.q[d] = near_.q[4 * end + d];
+    for (int d = 0; d < 3; ++d) known.mu[d] = near_.mu[3 * end + d];
+    known.chi2 = near_.chi2[end], known.reach2 = 1.0;
+    for (int64_t s = 0; s < channels_.n_sensors; ++s) {
+      double v[3];
+      for (int a = 0; a < 3; ++a) v[a] = known.q[3] * channels_.sensors[3 * s + a] - known.q[a];
+      const double square = dot(v, v);
+      known.reach2 = square < known.reach2 ? square : known.reach2;
+    }
+    return known;
+  }
+  // Chi-square that is of use beside an end.
+  double highest_useful(int64_t best) const { return best < 0 ? infinity : near_.chi2[best] + p_.keep_within + 1.0; }
 
   bool same(const double *q, const double *mu, double chi2, const double *other_q, const double *other_mu,
             double other_chi2) const {
@@ -219,7 +249,7 @@ class Search {
       int64_t *counts = p_.counts + 3 * (begin + i);
       counts[1] = counts[2] = 0;
       first_end_[i] = count;
-      const double useful = lowest(i, n_starts_) + p_.keep_within + 1.0;
+      const double useful = highest_useful(lowest(i, n_starts_));
       for (int64_t k = 0; k < n_starts_; ++k) {
         const int64_t j = place_[i * n_starts_ + k];
         counts[1] += !near_.converged[j];

@@ -6,8 +6,8 @@ Who checks whom
 =========================  ============================================================================
 operation                  oracle
 =========================  ============================================================================
-predict_rows (compiled)    predicted, its readable twin
-predicted                  the integration step; derivatives by finite differences; the integral of
+predicted, of many         the same sample after sample
+predicted, of one          the integration step; derivatives by finite differences; the integral of
                            white noise (van Loan)
 the filter                 a textbook filter of ten lines that gets the fixes without delay; filterpy
 consistency                NEES of all states and of each, NIS of the fixes, with truth of the filter's
@@ -37,10 +37,10 @@ from adcs.mockup.navigation.delayed_ekf import (
     DelayedFilter,
     FilterSettings,
     FilterTrack,
+    N,
     StartSigma,
     predicted,
 )
-from adcs.mockup.navigation.delayed_ekf_compiled import N, predict_rows
 from adcs.mockup.navigation.fixes import Fix, FixRecord, Outcome, fuse
 from adcs.mockup.navigation.strapdown import ImuRecord, PlanarState, step, strapdown
 
@@ -48,6 +48,12 @@ seeds = st.integers(0, 2**32 - 1)
 SETTINGS, SIGMA = FilterSettings(), StartSigma()
 START = PlanarState(np.array([0.3, -0.2]), np.array([0.05, 0.02]), 0.4)
 FALSE_ALARM = 1e-4
+
+
+def predicted_once(x, P, step_s, reading, there, densities):
+    """State and covariance after one sample."""
+    (x,), (P,) = predicted(x, P, [step_s], [reading], [there], densities)
+    return x, P
 
 
 def random_covariance(rng):
@@ -91,7 +97,7 @@ def textbook(imu, fixes, settings=SETTINGS, sigma=SIGMA):
     P, R = sigma.covariance, np.diag(np.square([settings.fix_m, settings.fix_m, settings.fix_rad]))
     xs, Ps, k = [], [], 0
     for i, dt in enumerate(imu.steps_s):
-        x, P = predicted(x, P, dt, [*imu.acceleration_m_s2[i], imu.rate_rad_s[i]], [True] * 3, settings.densities)
+        x, P = predicted_once(x, P, dt, [*imu.acceleration_m_s2[i], imu.rate_rad_s[i]], [True] * 3, settings.densities)
         if k < len(fixes) and fixes.time_s[k] == imu.time_s[i]:
             y = np.append(fixes.position_m[k], fixes.heading_rad[k]) - x[[0, 1, 4]]
             y[2] = (y[2] + math.pi) % (2.0 * math.pi) - math.pi
@@ -117,7 +123,7 @@ class TestPrediction:
         rng = np.random.default_rng(seed)
         x, dt, z = rng.standard_normal(N), rng.uniform(0.001, 0.1), rng.standard_normal(3)
         state = step(PlanarState(x[0:2], x[2:4], x[4]), dt, z[:2] - x[5:7], z[2] - x[7])
-        mean, _ = predicted(x, np.eye(N), dt, z, [True] * 3, SETTINGS.densities)
+        mean, _ = predicted_once(x, np.eye(N), dt, z, [True] * 3, SETTINGS.densities)
         np.testing.assert_allclose(mean[0:2], state.position_m, atol=1e-14)
         np.testing.assert_allclose(mean[2:4], state.velocity_m_s, atol=1e-14)
         zeros = x[5:7] + dt * x[8:10]
@@ -131,15 +137,15 @@ class TestPrediction:
 
         def mean(points):
             flat = points.reshape(N, -1).T
-            return np.array([predicted(p, P, 0.1, z, there, none)[0] for p in flat]).T.reshape(points.shape)
+            return np.array([predicted_once(p, P, 0.1, z, there, none)[0] for p in flat]).T.reshape(points.shape)
 
         F = jacobian(mean, x, initial_step=0.05).df
-        _, after = predicted(x, P, 0.1, z, there, none)
+        _, after = predicted_once(x, P, 0.1, z, there, none)
         np.testing.assert_allclose(scaled(after, after), scaled(F @ P @ F.T, after), atol=1e-8)
 
     def test_the_noise_is_that_of_a_white_acceleration(self) -> None:
         # In one axis: x'' = w of density q; van Loan's integral of it over a step.
-        _, Q = predicted(np.zeros(N), np.zeros((N, N)), 0.3, [0.0] * 3, [True] * 3, SETTINGS.densities)
+        _, Q = predicted_once(np.zeros(N), np.zeros((N, N)), 0.3, [0.0] * 3, [True] * 3, SETTINGS.densities)
         _, other = van_loan_discretization(
             np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [math.sqrt(SETTINGS.densities[0])]]), 0.3
         )
@@ -157,26 +163,23 @@ class TestPrediction:
     def test_a_missing_axis_is_uncertain_along_itself(self) -> None:
         x = np.zeros(N)
         x[4] = math.pi / 2  # body x is table Y
-        _, Q = predicted(x, np.zeros((N, N)), 0.01, [0.0] * 3, [False, True, True], SETTINGS.densities)
+        _, Q = predicted_once(x, np.zeros((N, N)), 0.01, [0.0] * 3, [False, True, True], SETTINGS.densities)
         assert Q[3, 3] == pytest.approx(0.01 * 0.01 * SETTINGS.missing_acceleration_m_s2**2)
         assert Q[2, 2] == pytest.approx(0.01 * 0.01 * SETTINGS.acceleration_m_s2**2)
 
     @settings(max_examples=30, deadline=None)
     @given(seeds)
-    def test_the_kernel_is_its_twin(self, seed: int) -> None:
+    def test_many_samples_are_one_after_the_other(self, seed: int) -> None:
         rng = np.random.default_rng(seed)
         n = 20
-        time_s = np.cumsum(rng.uniform(0.001, 0.05, n))
+        steps = rng.uniform(0.001, 0.05, n)
         readings, there = rng.standard_normal((n, 3)), rng.random((n, 3)) < 0.8
-        x, P = np.zeros((n, N)), np.zeros((n, N, N))
         # Covariance and noises of order one, so that no term is lost in rounding.
         densities, root = rng.uniform(0.5, 2.0, SETTINGS.densities.size), rng.standard_normal((N, N))
-        x[0], P[0] = rng.standard_normal(N), root @ root.T
-        predict_rows(0, n - 1, time_s, readings, there, densities, x, P)
-        mean, covariance = x[0], P[0]
-        for i in range(1, n):
-            dt = time_s[i] - time_s[i - 1]
-            mean, covariance = predicted(mean, covariance, dt, readings[i], there[i], densities)
+        mean, covariance = rng.standard_normal(N), root @ root.T
+        x, P = predicted(mean, covariance, steps, readings, there, densities)
+        for i in range(n):
+            mean, covariance = predicted_once(mean, covariance, steps[i], readings[i], there[i], densities)
             np.testing.assert_allclose(x[i], mean, rtol=0, atol=1e-12)
             np.testing.assert_allclose(scaled(P[i], covariance), scaled(covariance, covariance), atol=1e-10)
         np.testing.assert_array_equal(P, P.transpose(0, 2, 1))
@@ -215,7 +218,7 @@ class TestDelay:
         k = 0
         for i, dt in enumerate(imu.steps_s):
             reading = [*imu.acceleration_m_s2[i], imu.rate_rad_s[i]]
-            other.x, other.P = predicted(other.x, other.P, dt, reading, [True] * 3, SETTINGS.densities)
+            other.x, other.P = predicted_once(other.x, other.P, dt, reading, [True] * 3, SETTINGS.densities)
             if k < len(fixes) and fixes.time_s[k] == imu.time_s[i]:
                 z = np.append(
                     fixes.position_m[k], other.x[4] + np.angle(np.exp(1j * (fixes.heading_rad[k] - other.x[4])))
@@ -422,7 +425,7 @@ class TestArrival:
         assert np.all(np.abs(fused.heading_rad - track.heading_rad) < 5.0 * fused.sigma[:, 4])
 
     def test_lost_readings_have_noises_of_their_own(self) -> None:
-        """Each channel is lost on its own, 50 ms after its last reading; the twin goes row by row."""
+        """Each channel is lost on its own, 50 ms after its last reading; the reference goes row by row."""
         rng, n = np.random.default_rng(6), 120
         acceleration, rate = 0.01 * rng.standard_normal((n, 2)), 0.1 * rng.standard_normal(n)
         acceleration[20:60, 1], rate[40:100], acceleration[110:113, 0] = np.nan, np.nan, np.nan
@@ -440,7 +443,7 @@ class TestArrival:
             held_rate = rate[i] if there[2] else held_rate
             lost = (int(25 <= i < 60), int(45 <= i < 100))
             reading = [*np.nan_to_num(acceleration[i]), held_rate]
-            x, P = predicted(x, P, dt[i], reading, there, SETTINGS.all_densities[lost])
+            x, P = predicted_once(x, P, dt[i], reading, there, SETTINGS.all_densities[lost])
         np.testing.assert_allclose(late.x, x, rtol=0, atol=1e-11)
         np.testing.assert_allclose(scaled(late.P, P), scaled(P, P), atol=1e-9)
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from arrays.typing import FloatArray
 from magloc.fields import dipole
-from magloc.surveying.fit.whitening_compiled import gains_of, moment_columns, pole_columns, source_columns, whiten
+from magloc.surveying.fit.kernels import MeasuredRows, WhiteningFilter
 
 N, K, S = 40, 2, 5
 RNG = np.random.default_rng(5)
@@ -33,28 +34,30 @@ def dense_covariance() -> FloatArray:
     return np.einsum("iks,ijst,jlt->ikjl", H, P, H).reshape(N * K, N * K) + np.eye(N * K)
 
 
+@pytest.mark.usefixtures("instruction_set")
 class TestWhitening:
     def test_is_a_root_of_the_inverse_covariance(self) -> None:
         columns = RNG.standard_normal((N, K, 3))
         white = columns.copy()
-        gains = gains_of(H, KEPT, ADDED, DT, START)
-        whiten(white, np.arange(N), H, gains, KEPT, DT)
+        filtered = WhiteningFilter(H, KEPT, ADDED, DT, START)
+        filtered.whiten(white, np.arange(N))
         flat, white = columns.reshape(N * K, 3), white.reshape(N * K, 3)
         np.testing.assert_allclose(white.T @ white, flat.T @ np.linalg.solve(dense_covariance(), flat), rtol=1e-9)
-        logarithm = -2.0 * np.log(gains[..., S]).sum()
+        logarithm = -2.0 * np.log(filtered.gains[..., S]).sum()
         np.testing.assert_allclose(logarithm, np.linalg.slogdet(dense_covariance())[1], rtol=1e-9)
 
     def test_rows_that_are_zero_before(self) -> None:
         """Of rows from some row on it gives what it gives of all, zero before."""
-        gains = gains_of(H, KEPT, ADDED, DT, START)
+        filtered = WhiteningFilter(H, KEPT, ADDED, DT, START)
         whole = np.zeros((N, K, 2))
         whole[12:] = RNG.standard_normal((N - 12, K, 2))
         part, rows = whole[12:].copy(), np.arange(12, N)
-        whiten(whole, np.arange(N), H, gains, KEPT, DT)
-        whiten(part, rows, H, gains, KEPT, DT)
+        filtered.whiten(whole, np.arange(N))
+        filtered.whiten(part, rows)
         np.testing.assert_allclose(part, whole[12:], rtol=1e-12)
 
 
+@pytest.mark.usefixtures("instruction_set")
 class TestColumns:
     """Compiled columns are what the field's own functions give."""
 
@@ -64,7 +67,7 @@ class TestColumns:
     OWNER = np.array([0, 0, 1, 1])
     PLACES = RNG.uniform([-1.0, -1.0, -2.0], [1.0, 1.0, 0.0], (5, 3))
     MOMENTS = RNG.standard_normal((5, 3))
-    STARTS = np.array([0, 2, 4, 6])
+    ROWS = MeasuredRows(SENSORS, DIRECTIONS, U, OWNER, np.array([0, 2, 4, 6]))
 
     def grouped(self, channels: FloatArray) -> FloatArray:
         """Measurements (3, 3, m) of channels (6, 4, m), two rows each."""
@@ -73,22 +76,18 @@ class TestColumns:
     def test_moments(self) -> None:
         A = dipole.field_matrix(self.SENSORS[:, self.OWNER, None], self.PLACES)
         expected = np.einsum("nci,ncmij->ncjm", self.DIRECTIONS, A).reshape(6, 4, -1)
-        found = moment_columns(
-            self.SENSORS, self.DIRECTIONS, self.U, self.OWNER, self.PLACES, self.STARTS, np.array([0, 2])
-        )
+        found = self.ROWS.moment_columns(self.PLACES, np.array([0, 2]))
         np.testing.assert_allclose(found, self.grouped(expected)[[0, 2]], rtol=1e-9, atol=1e-20)
 
     def test_sources(self) -> None:
         J = dipole.field_jacobian(self.SENSORS[:, self.OWNER, None], self.PLACES, self.MOMENTS)
         expected = np.einsum("nci,ncmij->ncmj", self.DIRECTIONS, J).reshape(6, 4, -1)
-        found = source_columns(
-            self.SENSORS, self.DIRECTIONS, self.U, self.OWNER, self.PLACES, self.MOMENTS, self.STARTS
-        )
+        found = self.ROWS.source_columns(self.PLACES, self.MOMENTS)
         np.testing.assert_allclose(found, self.grouped(expected), rtol=1e-9, atol=1e-20)
 
     def test_poles(self) -> None:
         away = self.SENSORS[:, self.OWNER, None] - self.PLACES
         pull = away / np.linalg.norm(away, axis=-1, keepdims=True) ** 3
         expected = np.einsum("nci,ncpi->ncp", self.DIRECTIONS, pull)
-        found = pole_columns(self.SENSORS, self.DIRECTIONS, self.U, self.OWNER, self.PLACES, self.STARTS)
+        found = self.ROWS.pole_columns(self.PLACES)
         np.testing.assert_allclose(found, self.grouped(expected), rtol=1e-9)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from magloc.tracking.multi_target.hypotheses import LARGEST_BEND, split
 from magloc.tracking.multi_target.measurement import JointRow
@@ -37,6 +38,7 @@ def test_parts_keep_mean_and_covariance():
         np.testing.assert_allclose(P + spread, state.P[np.ix_(at, at)], rtol=1e-6, atol=1e-12)
 
 
+@pytest.mark.usefixtures("instruction_set")
 def test_the_axis_is_the_one_along_which_readings_bend_most():
     """Half a second difference of the readings along the step that was taken, against all other axes."""
     state = known(1, 0.05)

@@ -52,6 +52,7 @@ def difference(about: JointState, state: JointState) -> np.ndarray:
     return error
 
 
+@pytest.mark.usefixtures("instruction_set")
 @pytest.mark.parametrize(("n_sources", "seed"), [(1, 0), (1, 1), (2, 0)])
 def test_is_the_minimum_of_all_squares(n_sources: int, seed: int) -> None:
     """Prior, noise of the motion and readings of four rows: no general minimiser finds less, and it ends there too."""

@@ -94,8 +94,9 @@ def test_is_a_plain_filter_where_little_is_unknown():
     np.testing.assert_allclose(found.state.P / np.outer(sigma, sigma), P / np.outer(sigma, sigma), atol=3e-3)
 
 
+@pytest.mark.usefixtures("instruction_set")
 @pytest.mark.parametrize("n_sources", [0, 1, 2])
-def test_compiled_iteration_is_the_readable_one(n_sources):
+def test_iteration_is_the_readable_one(n_sources):
     """And so are its linearisations at the prediction and at the end; on a sensor both give up."""
     rng = np.random.default_rng(n_sources)
     values = readings(rng)
@@ -114,8 +115,24 @@ def test_compiled_iteration_is_the_readable_one(n_sources):
     assert joint_update(on_sensor, row).converged == iterated(on_sensor, row)["converged"] == (n_sources == 0)
 
 
+@pytest.mark.usefixtures("instruction_set")
+def test_posterior_of_large_errors():
+    """Moments turn by several revolutions and change by powers of ten; beyond all numbers they are infinite."""
+    rng = np.random.default_rng(7)
+    update = joint_update(known(2, 0.2, rng), JointRow.of(BOARD, Row(0.0, readings(rng))))
+    for size in (0.1, 3.0, 30.0):
+        y = np.linalg.solve(update.L, size * np.r_[rng.normal(size=12), np.zeros(3)])
+        found, expected = replace(update, y=y).state, posterior_of(replace(update, y=y))
+        for name in ("position_m", "moment_Am2", "velocity_m_s", "rate_rad_s", "P"):
+            actual, value = getattr(found, name), getattr(expected, name)
+            np.testing.assert_allclose(actual, value, rtol=1e-7, atol=1e-9 * np.abs(value).max())
+    u = update.prior.moment_Am2[0] / np.linalg.norm(update.prior.moment_Am2[0])
+    beyond = np.linalg.solve(update.L, 800.0 * np.r_[0.0, 0.0, 0.0, u, np.zeros(9)])
+    assert np.isinf(np.abs(replace(update, y=beyond).state.moment_Am2[0])).any()
+
+
 def posterior_of(update: JointUpdate) -> JointState:
-    """The readable twin of the compiled posterior: P (I + Hᵀ H P)⁻¹ of the whole state, in the chart where it ends."""
+    """The reference of the posterior: P (I + Hᵀ H P)⁻¹ of the whole state, in the chart where it ends."""
     prior, d = update.prior, update.prior.n_seen
     H = np.zeros((len(update.HL), len(prior.P)))
     H[:, :d] = update.HL @ np.linalg.inv(update.L)
@@ -125,7 +142,7 @@ def posterior_of(update: JointUpdate) -> JointState:
 
 
 def standardised(update: JointUpdate) -> np.ndarray:
-    """The readable twin of residuals with unit covariance, by the inverse of I + Lᵀ N L."""
+    """The reference of residuals with unit covariance, by the inverse of I + Lᵀ N L."""
     seen = update.HL @ np.linalg.inv(update.R).T
     covariance = np.eye(len(seen)) - seen @ seen.T
     blocks = [slice(3 * s, 3 * s + 3) for s in range(len(seen) // 3)]
@@ -134,7 +151,7 @@ def standardised(update: JointUpdate) -> np.ndarray:
 
 
 def iterated(prior: JointState, row: JointRow) -> dict[str, Any]:
-    """The readable twin of the compiled iteration: damped Gauss-Newton, its steps in units of the prediction's root."""
+    """The reference of the iteration: damped Gauss-Newton, its steps in units of the prediction's root."""
     d, k = prior.n_seen, prior.n_sources
     L = np.linalg.cholesky(prior.P[:d, :d])
     y, best_y, best, residual, converged = np.zeros(d), np.zeros(d), np.inf, row.z, False

@@ -1,0 +1,145 @@
+"""Cramér-Rao bounds of many sources by a compiled kernel; :mod:`magloc.bounds.crlb` is the readable reference."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from arrays.array import SensorArray
+from arrays.pose import PoseUncertainty
+from arrays.typing import FloatArray
+from magloc import core
+from magloc.fields.multipole import N_BODY_ERRORS, finite_body_errors
+
+# Information about a parameter that is less than this part of what it would be were the others known is none.
+_LOST_INFORMATION = 1e-12
+_PRODUCTS_A_BLOCK = 10_000_000  # of columns, in one call: about two milliseconds
+
+
+def array_model(
+    array: SensorArray,
+    *,
+    ambient_uncertainty_T: float = 0.0,
+    known_moment_sigma_Am2: float = np.inf,
+    bodies: bool = False,
+    lost: float = _LOST_INFORMATION,
+) -> core.Problem:
+    """
+    Describe an array at rest to the kernel.
+
+    Parameters
+    ----------
+    array : SensorArray
+        Whose noise and uncertainties count.
+    ambient_uncertainty_T, known_moment_sigma_Am2 : float
+        See :func:`magloc.bounds.crlb.cramer_rao_bounds`.
+    bodies : bool
+        Whether sources are bodies, not points.
+    lost : float
+        The range is not known where the other parameters leave less than this part of the information about it.
+
+    Returns
+    -------
+    Problem
+        The struct magloc_bound_array of magloc.h: all of the array but where its sensors stand.
+    """
+    is_modulus = np.array([sensor.kind == "scalar" for sensor in array.sensors])
+    common = np.inf if array.common_field_T is None else array.common_field_T
+    ambient = ambient_uncertainty_T or array.row_ambient_uncertainty_T
+    pose = array.pose or PoseUncertainty(position_constant_m=0.0, attitude_constant_rad=0.0)
+    deviations = np.array(
+        3 * [0.0 if is_modulus.all() else common]
+        + [common if is_modulus.any() else 0.0]
+        + 3 * [ambient if is_modulus.any() else 0.0]
+        + 3 * [np.hypot(pose.attitude_rad, pose.attitude_constant_rad)]
+        + 3 * [np.linalg.norm([pose.position_m, pose.position_white_m, pose.position_constant_m])]
+        + (N_BODY_ERRORS * [1.0] if bodies else [])
+    )
+    nuisances = np.flatnonzero(deviations)
+    errors = [(s.misalignment_rad, s.induced_uncertainty, s.gain_uncertainty) for s in array.sensors]
+    misalignment, induced, gain_error = np.array(errors).T
+    # A modulus is read along an axis of its own.
+    rotation = np.where(is_modulus[:, None, None], np.eye(3), array.rotation_matrices)[array.channel_sensor]
+    scale = gain_error[array.channel_sensor, None] * np.einsum("ci,cik->ck", array.channel_gain, rotation)
+    return core.problem(
+        "bound_array",
+        n_sensors=array.n_sensors,
+        n_channels=array.n_channels,
+        n_nuisances=nuisances.size,
+        n_errors=N_BODY_ERRORS if bodies else 0,
+        ambient=np.ascontiguousarray(array.ambient_fields),
+        is_modulus=is_modulus.astype(np.uint8),
+        first_channel=np.append(array.sensor_channels[:, 0], array.n_channels).astype(np.int64),
+        gain=np.ascontiguousarray(array.channel_gain),
+        noise=np.ascontiguousarray(array.channel_noise_T),
+        noise_depends_on_field=array.noise_depends_on_reading,
+        errors_of_sensor=np.stack([misalignment, induced, array.noise_fractions], axis=1),
+        gain_errors=np.ascontiguousarray(scale[..., None] * rotation.mT),
+        nuisances=nuisances.astype(np.int64),
+        prior=1.0 / deviations[nuisances],
+        modulus_prior=1.0 / known_moment_sigma_Am2,
+        lever_arm=tuple(pose.lever_arm_m),
+        lost=lost,
+    )
+
+
+def source_bounds(
+    model: core.Problem,
+    sensors_m: FloatArray,
+    positions_m: FloatArray,
+    moments_Am2: FloatArray,
+    *,
+    length_m: FloatArray | None = None,
+    slopes: FloatArray | None = None,
+) -> FloatArray:
+    """
+    Return the σ of range [m], bearing [rad] and position [m] of M moments at each of P places, shape (3, P, M).
+
+    Parameters
+    ----------
+    model : Problem
+        Of :func:`array_model`.
+    sensors_m : ndarray, shape (N, 3)
+        Where the sensors stand [m].
+    positions_m : ndarray, shape (P, 3)
+        Positions of the sources [m].
+    moments_Am2 : ndarray, shape (M, 3) or (P, M, 3)
+        The same moments at all places, or moments of each place [A·m²].
+    length_m : ndarray, shape (P,), optional
+        Lengths of the bodies, if the model has any [m].
+    slopes : ndarray, shape (P, M, N, 3), optional
+        Receives d log σ/d sensor for the σ of the range [1/m]. For noise that does not depend on readings, and no other
+        nuisance than a common field.
+
+    Returns
+    -------
+    ndarray, shape (3, P, M)
+        Infinite where the information is singular; NaN for a source on a sensor or in the centroid.
+    """
+    n_places, n_moments = len(positions_m), moments_Am2.shape[-2]
+    sigma = np.empty((3, n_places, n_moments))
+    range_m, bearing_rad, position_m = sigma
+    work = core.problem(
+        "bounds",
+        array=model,
+        n_moments=n_moments,
+        moments_are_own=moments_Am2.ndim == 3,
+        sensors=np.ascontiguousarray(sensors_m),
+        centroid=tuple(sensors_m.mean(axis=0).tolist()),
+        positions=np.ascontiguousarray(positions_m),
+        moments=np.ascontiguousarray(moments_Am2),
+        body_errors=None if length_m is None else _body_errors(sensors_m, positions_m, length_m),
+        sigma_range=range_m,
+        sigma_bearing=bearing_rad,
+        sigma_position=position_m,
+        slopes=slopes,
+    )
+    products = model.struct.n_channels * (model.struct.n_nuisances + 6) ** 2
+    core.run("source_bounds", work, n_places * n_moments, block=max(32, _PRODUCTS_A_BLOCK // products))
+    return sigma
+
+
+def _body_errors(sensors: FloatArray, positions: FloatArray, length_m: FloatArray) -> FloatArray:
+    """Return the upper triangles (P, N, 14, 6) of the matrices by which the moment's field errs, of one σ."""
+    separation = sensors - positions[:, None]
+    matrices = finite_body_errors(separation[:, :, None], np.eye(3), length_m[:, None, None, None, None])
+    return np.ascontiguousarray(np.swapaxes(matrices[(..., *np.triu_indices(3), slice(None))], -1, -2))

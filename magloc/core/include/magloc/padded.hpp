@@ -1,0 +1,140 @@
+// Matrices of any size whose rows fill whole registers, and factors of positive ones. What lies beyond the end of a row
+// is never used.
+#pragma once
+#include "kernel.hpp"
+
+MAGLOC_BEGIN
+// Numbers at equal steps in memory, such as a column of a matrix, with a sign.
+struct Strided {
+  const double *first;
+  int64_t step = 1;
+  double sign = 1.0;
+
+  Strided operator-() const { return {first, step, -sign}; }
+};
+
+template <class T>
+class Padded {
+  int64_t width_;
+  T *start_;
+
+  Padded(int64_t width, T *start) : width_(width), start_(start) {}
+
+ public:
+  Padded(Workspace &space, int64_t n_rows, int64_t n_columns)
+      : width_((n_columns + n_lanes<T> - 1) / n_lanes<T>), start_(space.take<T>(n_rows * width_)) {}
+
+  int64_t width() const { return width_; }  // in lanes
+  T *lanes(int64_t row) const { return start_ + row * width_; }
+  double *operator[](int64_t row) const { return reinterpret_cast<double *>(lanes(row)); }
+  Strided column(int64_t column) const { return {(*this)[0] + column, width_ * n_lanes<T>}; }
+  Padded from(int64_t row) const { return {width_, lanes(row)}; }
+
+  void clear(int64_t n_rows) const { __builtin_memset(start_, 0, n_rows * width_ * sizeof(T)); }
+  void load(const double *matrix, int64_t n_rows, int64_t n_columns) const {
+    clear(n_rows);
+    for (int64_t i = 0; i < n_rows; ++i)
+      __builtin_memcpy((*this)[i], matrix + i * n_columns, n_columns * sizeof(double));
+  }
+  void copy(const Padded &other, int64_t n_rows) const {
+    __builtin_memcpy(start_, other.start_, n_rows * width_ * sizeof(T));
+  }
+  void store(double *matrix, int64_t n_rows, int64_t n_columns) const {
+    for (int64_t i = 0; i < n_rows; ++i)
+      __builtin_memcpy(matrix + i * n_columns, (*this)[i], n_columns * sizeof(double));
+  }
+};
+
+template <int m, class T>
+MAGLOC_INLINE void add_in_registers(T *target, Strided coefficients, const T *rows, int64_t width, int64_t n) {
+  T sum[m], odd[m] = {};  // two of each, as a sum waits for the one before it
+  for (int i = 0; i < m; ++i) sum[i] = target[i];
+  const double *next = coefficients.first;
+  int64_t k = 0;
+  for (; k + 1 < n; k += 2, next += 2 * coefficients.step, rows += 2 * width) {
+    const double a = coefficients.sign * next[0], b = coefficients.sign * next[coefficients.step];
+    MAGLOC_UNROLL
+    for (int i = 0; i < m; ++i) {
+      sum[i] += a * rows[i];
+      odd[i] += b * rows[width + i];
+    }
+  }
+  if (k < n)
+    for (int i = 0; i < m; ++i) sum[i] += coefficients.sign * next[0] * rows[i];
+  for (int i = 0; i < m; ++i) target[i] = sum[i] + odd[i];
+}
+
+// Add to a row the first n rows of a matrix, each times a coefficient, from some register of the row on.
+template <class T>
+void add_rows(T *target, Strided coefficients, const Padded<T> &rows, int64_t n, int64_t begin = 0) {
+  const int64_t width = rows.width();
+  const T *first = rows.lanes(0);
+  for (; begin + 4 <= width; begin += 4)
+    add_in_registers<4>(target + begin, coefficients, first + begin, width, n);
+  if (begin + 3 == width) add_in_registers<3>(target + begin, coefficients, first + begin, width, n);
+  if (begin + 2 == width) add_in_registers<2>(target + begin, coefficients, first + begin, width, n);
+  if (begin + 1 == width) add_in_registers<1>(target + begin, coefficients, first + begin, width, n);
+}
+
+// Fill a row with the sum of the first n rows of a matrix, each times a coefficient.
+template <class T>
+MAGLOC_INLINE void set_rows(T *target, Strided coefficients, const Padded<T> &rows, int64_t n) {
+  for (int64_t i = 0; i < rows.width(); ++i) target[i] = T{};
+  add_rows(target, coefficients, rows, n);
+}
+
+template <class T>
+MAGLOC_INLINE void scale(T *row, double factor, int64_t width, int64_t begin = 0) {
+  for (int64_t i = begin; i < width; ++i) row[i] *= factor;
+}
+
+// Replace n rows [A | B], A (n, n) symmetric and positive, by [U | U^-T B] with A = U^T U, U upper triangular. Only the
+// upper triangle of A is used. NaN follows a pivot that is not positive.
+template <class T>
+void factorise(const Padded<T> &rows, int64_t n) {
+  for (int64_t i = 0; i < n; ++i) {
+    const int64_t begin = i / n_lanes<T>;
+    add_rows(rows.lanes(i), -rows.column(i), rows, i, begin);
+    scale(rows.lanes(i), 1.0 / square_root(rows[i][i]), rows.width(), begin);
+    for (int64_t j = 0; j < i; ++j) rows[i][j] = 0.0;
+  }
+}
+
+// Solve U^T X = B of n rows B in place.
+template <class T>
+void solve_transposed(const Padded<T> &root, int64_t n, const Padded<T> &b) {
+  for (int64_t i = 0; i < n; ++i) {
+    add_rows(b.lanes(i), -root.column(i), b, i);
+    scale(b.lanes(i), 1.0 / root[i][i], b.width());
+  }
+}
+
+// Solve U^T x = b in place.
+template <class T>
+void solve_transposed(const Padded<T> &root, int64_t n, double *b) {
+  for (int64_t i = 0; i < n; ++i) {
+    b[i] /= root[i][i];
+    for (int64_t j = i + 1; j < n; ++j) b[j] -= b[i] * root[i][j];
+  }
+}
+
+// Solve U x = b in place.
+template <class T>
+void solve(const Padded<T> &root, int64_t n, double *b) {
+  for (int64_t i = n; i-- > 0;) {
+    for (int64_t j = i + 1; j < n; ++j) b[i] -= root[i][j] * b[j];
+    b[i] /= root[i][i];
+  }
+}
+
+// Replace a matrix by its transpose.
+template <class T>
+void transpose(const Padded<T> &a, int64_t n) {
+  for (int64_t i = 0; i < n; ++i)
+    for (int64_t j = 0; j < i; ++j) {
+      const double below = a[i][j];
+      a[i][j] = a[j][i];
+      a[j][i] = below;
+    }
+}
+MAGLOC_END
