@@ -238,15 +238,6 @@ class TestCommonOptions:
         assert run("locate", readings, "--array", array, *threads).status == 0
         assert set_to == used
 
-    def test_threads_are_those_of_numba_where_it_is_imported_later(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(core, "set_threads", lambda n: None)
-        monkeypatch.setattr(core, "threads", lambda: 1)
-        monkeypatch.delitem(sys.modules, "numba")
-        monkeypatch.setenv("NUMBA_NUM_THREADS", "7")
-        QuietOptions(threads=1).apply()
-        assert os.environ["NUMBA_NUM_THREADS"] == "1"
-        assert "numba" not in sys.modules
-
     @pytest.mark.slow_after(1)
     @pytest.mark.parametrize("quiet", [False, True])
     def test_quiet_says_nothing_of_what_is_written(
