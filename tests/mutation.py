@@ -2,7 +2,7 @@
 
 Nothing is changed in place: the tree is copied, and the tests run there. A change is killed by the first test file that
 fails or hangs among those nearest to it: its mirror first, then those that reach it by the fewest imports. All lines
-are drawn before any is tried. What is found goes to a file line by line, and the same seed goes on where it was stopped.
+are drawn before any is tried. Findings go to a file line by line, and the same seed goes on where it was stopped.
 """
 
 from __future__ import annotations

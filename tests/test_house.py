@@ -9,7 +9,6 @@ import inspect
 import pkgutil
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import get_args
 

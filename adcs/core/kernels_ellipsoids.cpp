@@ -51,7 +51,7 @@ class Ellipsoid {
   template <class Size>
   void cover_rounding(Size size) {
     for (int64_t i = 0; i < n_ * n_; ++i) M_[i] = 0.0;
-    for (int64_t i = 0; i < n_; ++i) M_[i * n_ + i] = n_ * 16.0 * eps * eps * size(i) * size(i);
+    for (int64_t i = 0; i < n_; ++i) M_[i * n_ + i] = 16.0 * (double)n_ * eps * eps * size(i) * size(i);
     add(M_);
   }
 
@@ -83,7 +83,7 @@ class Ellipsoid {
     for (int64_t i = 0; i < n_; ++i) {
       x_[i] = Hh_[i];
       for (int64_t j = 0; j <= i; ++j) {
-        double value = i == j ? 4.0 * n_ * eps * reach[i] * reach[i] : 0.0;
+        double value = i == j ? 4.0 * (double)n_ * eps * reach[i] * reach[i] : 0.0;
         for (int64_t k = 0; k < n_; ++k) value += M_[i * n_ + k] * A[j * n_ + k];
         H_[i * n_ + j] = H_[j * n_ + i] = value;
       }
@@ -107,7 +107,7 @@ class Ellipsoid {
       size += __builtin_fabs(h[i] * x_[i]), reach += __builtin_fabs(h[i]) * half_width(i);
     }
     const double nu = innovation(h, y), e = square_root(largest(e2, 0.0)), tr = trace(H_);
-    const double rounding = 4.0 * n_ * eps * reach * reach;
+    const double rounding = 4.0 * (double)n_ * eps * reach * reach;
     c += 4.0 * eps * (__builtin_fabs(y) + size);
     if (__builtin_fabs(nu) > c + square_root(largest(e2, 0.0) + rounding)) return false;
     if (e2 <= least_seen * tr * h2) return true;

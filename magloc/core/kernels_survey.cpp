@@ -37,7 +37,7 @@ MAGLOC_INLINE int64_t fill_columns(const magloc_survey_columns &p, int64_t begin
           for (int a = 0; a < 3; ++a) d[a] = p.sensors[3 * (row * p.n_sensors + s) + a] - place[a];
           matrix(Ray<Lanes>::from(d), m, f);
           for (int64_t k = 0; k < K; ++k) {
-            const double(&u)[3] = direction[s * K + k];
+            const double (&u)[3] = direction[s * K + k];
             if (u[0] == 0.0 && u[1] == 0.0 && u[2] == 0.0) continue;
             for (int j = 0; j < n; ++j) sum[block * K + k][j] += dot(f[j], u);
           }

@@ -60,9 +60,8 @@ Field = Callable[[], object]
 @cache
 def choclo_loop() -> Callable[..., None]:
     """choclo has the field of one dipole at one point; this loop around it is compiled by numba."""
-    from choclo.dipole import magnetic_field
-
     import numba
+    from choclo.dipole import magnetic_field
 
     # Not cached on disk: numba would not see that another choclo has been installed.
     @numba.njit(parallel=True, error_model="numpy", fastmath={"contract"})

@@ -6,7 +6,6 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-
 from arrays.array_file import read_array
 from magloc import core
 from magloc.readings import read_readings

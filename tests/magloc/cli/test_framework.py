@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import subprocess
 import sys
 import threading
@@ -23,7 +22,7 @@ from arrays import read_array
 from arrays.io.errors import InputError, naming
 from magloc import core
 from magloc.cli import framework
-from magloc.cli.framework import QuietOptions, print_json_list
+from magloc.cli.framework import print_json_list
 from tests.command_line import Outcome, Run, assert_refused
 from tests.waiting import WAIT_S
 

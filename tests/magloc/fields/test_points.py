@@ -5,7 +5,6 @@ and their edges, the lanes, the threads, the rule on the source, and the layouts
 """
 
 from collections.abc import Callable
-from typing import Any, cast
 
 import numpy as np
 import pytest

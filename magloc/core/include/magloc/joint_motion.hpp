@@ -41,9 +41,10 @@ inline void fill_sine_and_cosine_of_any(double angle, double &sine, double &cosi
     sine = cosine = nan;
     return;
   }
-  const int64_t quarters = (int64_t)(angle * 0.6366197723675814 + 0.5);
+  const int64_t quarters = (int64_t)(angle * 0.6366197723675814 + 0.5);  // NOLINT(bugprone-incorrect-roundings)
+  const double turned = (double)quarters;
   double s, c;
-  fill_sine_and_cosine(angle - quarters * 0x1.921fb54442d18p0 - quarters * 0x1.1a62633145c07p-54, s, c);
+  fill_sine_and_cosine(angle - turned * 0x1.921fb54442d18p0 - turned * 0x1.1a62633145c07p-54, s, c);
   const double sign = quarters & 2 ? -1.0 : 1.0;
   sine = sign * (quarters & 1 ? c : s);
   cosine = sign * (quarters & 1 ? -s : c);
@@ -195,7 +196,7 @@ void step_covariance(const Padded<T> &covariance, int64_t n_sources, const Joint
   transition_rows(covariance.lanes(0), covariance.width(), n_sources, step, turns);
   for (int64_t k = 0; k < n_sources; ++k) {
     const int64_t at = n_seen * k, motion = seen + n_motion * k;
-    const double(&u)[3] = turns[k].direction;
+    const double (&u)[3] = turns[k].direction;
     // What a small turn changes of the direction
     const Block turned = {{0.0, u[2], -u[1]}, {-u[2], 0.0, u[0]}, {u[1], -u[0], 0.0}};
     for (int i = 0; i < 3; ++i) {

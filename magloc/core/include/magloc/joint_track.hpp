@@ -71,7 +71,7 @@ class JointMeasurement {
   // Predicted readings of all channels.
   void predict(const JointRow &row, const JointMeans &state, double *readings) {
     for (int64_t i = 0; i < 3 * n_sensors_; ++i) fields_[i] = state.common[i % 3];
-    for_all(row, state, [&](int64_t, const Ray<T> &ray, const double(&m)[3], int64_t s, int n) {
+    for_all(row, state, [&](int64_t, const Ray<T> &ray, const double (&m)[3], int64_t s, int n) {
       T b[3];
       field(ray, m, b);
       for (int lane = 0; lane < n; ++lane)
@@ -86,7 +86,7 @@ class JointMeasurement {
   // Fill the rows H L of all channels.
   void linearise(const JointRow &row, const JointMeans &state, const Block *by_error, const Padded<T> &L,
                  const Padded<T> &HL) {
-    for_all(row, state, [&](int64_t k, const Ray<T> &ray, const double(&m)[3], int64_t s, int n) {
+    for_all(row, state, [&](int64_t k, const Ray<T> &ray, const double (&m)[3], int64_t s, int n) {
       T by_point[3][3], by_moment[3][3], by_turn[3];
       gradient(ray, m, by_point);
       field_matrix(ray, by_moment);

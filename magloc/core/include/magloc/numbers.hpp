@@ -123,7 +123,9 @@ struct Dual {
   template <class S>
   MAGLOC_RULE(*(const S &a, const Dual &b), a *b.value, a *b.derivative[i])
 #undef MAGLOC_RULE
-  friend MAGLOC_INLINE Dual &operator+=(Dual &a, const Dual &b) { return a = a + b; }
+  friend MAGLOC_INLINE Dual &operator+=(Dual &a, const Dual &b) {
+    return a = a + b;
+  }
 };
 template <class T>
 MAGLOC_INLINE T inverse_root(T x) {

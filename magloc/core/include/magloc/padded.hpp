@@ -69,8 +69,7 @@ template <class T>
 void add_rows(T *target, Strided coefficients, const Padded<T> &rows, int64_t n, int64_t begin = 0) {
   const int64_t width = rows.width();
   const T *first = rows.lanes(0);
-  for (; begin + 4 <= width; begin += 4)
-    add_in_registers<4>(target + begin, coefficients, first + begin, width, n);
+  for (; begin + 4 <= width; begin += 4) add_in_registers<4>(target + begin, coefficients, first + begin, width, n);
   if (begin + 3 == width) add_in_registers<3>(target + begin, coefficients, first + begin, width, n);
   if (begin + 2 == width) add_in_registers<2>(target + begin, coefficients, first + begin, width, n);
   if (begin + 1 == width) add_in_registers<1>(target + begin, coefficients, first + begin, width, n);
