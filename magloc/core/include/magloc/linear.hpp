@@ -133,10 +133,6 @@ constexpr int64_t n_registers(int64_t n) {
   return (n + n_lanes<T> - 1) / n_lanes<T>;
 }
 template <class T>
-MAGLOC_INLINE double get_number(const T *row, int64_t i) {
-  return get_lane(row[i / n_lanes<T>], i % n_lanes<T>);
-}
-template <class T>
 MAGLOC_INLINE void set_number(T *row, int64_t i, double value) {
   set_lane(row[i / n_lanes<T>], i % n_lanes<T>, value);
 }
