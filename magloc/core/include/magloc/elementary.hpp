@@ -73,6 +73,21 @@ inline void fill_sine_and_cosine(double x, double &sine, double &cosine) {
   cosine = 1.0 - 2.0 * s * s;
 }
 
+// Sine and cosine of any angle that is not negative; NaN where it is beyond all turns.
+inline void fill_sine_and_cosine_of_any(double angle, double &sine, double &cosine) {
+  if (!(angle < 1e9)) {
+    sine = cosine = nan;
+    return;
+  }
+  const int64_t quarters = (int64_t)(angle * 0.6366197723675814 + 0.5);  // NOLINT(bugprone-incorrect-roundings)
+  const double turned = (double)quarters;
+  double s, c;
+  fill_sine_and_cosine(angle - turned * 0x1.921fb54442d18p0 - turned * 0x1.1a62633145c07p-54, s, c);
+  const double sign = quarters & 2 ? -1.0 : 1.0;
+  sine = sign * (quarters & 1 ? c : s);
+  cosine = sign * (quarters & 1 ? -s : c);
+}
+
 // Exponential; zero below -700 and infinite above 709. x = n log 2 + r, and the power series of e^r.
 inline double exponential(double x) {
   if (x < -700.0) return 0.0;

@@ -35,21 +35,6 @@ MAGLOC_INLINE void multiply_transposed(const Block &block, const T *v, T (&produ
 
 inline double norm(const double *v) { return square_root(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]); }
 
-// Sine and cosine of any angle that is not negative; NaN where it is beyond all turns.
-inline void fill_sine_and_cosine_of_any(double angle, double &sine, double &cosine) {
-  if (!(angle < 1e9)) {
-    sine = cosine = nan;
-    return;
-  }
-  const int64_t quarters = (int64_t)(angle * 0.6366197723675814 + 0.5);  // NOLINT(bugprone-incorrect-roundings)
-  const double turned = (double)quarters;
-  double s, c;
-  fill_sine_and_cosine(angle - turned * 0x1.921fb54442d18p0 - turned * 0x1.1a62633145c07p-54, s, c);
-  const double sign = quarters & 2 ? -1.0 : 1.0;
-  sine = sign * (quarters & 1 ? c : s);
-  cosine = sign * (quarters & 1 ? -s : c);
-}
-
 // Moment at an error c in the chart about m, and its derivative by c: `moved_moment`, `moment_derivative`.
 inline void move_moment(const double *m, const double *c, double *moved, Block &derivative) {
   const double length = norm(m), u[3] = {m[0] / length, m[1] / length, m[2] / length};
