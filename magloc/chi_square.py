@@ -33,7 +33,7 @@ def bounds99(degrees_of_freedom: ArrayLike) -> tuple[FloatArray, FloatArray]:
 
 
 def exceeds(chi2: FloatArray, dof: IntArray, probability: float) -> BoolArray:
-    """Return whether each χ² exceeds what noise alone does with a probability; False without degrees of freedom."""
+    """Return whether each χ² is above the quantile that noise exceeds with a probability; False for dof = 0."""
     largest = np.full(dof.shape, np.inf)
     for n in set(dof.tolist()):  # inverse distributions take longer than all else of a test, and rows are alike
         if n > 0:

@@ -7,16 +7,13 @@ constexpr double eps = 2.220446049250313e-16, least_seen = 1e-12;
 constexpr double smallest_half_width = 1e-3, smallest_growth = 1e-6, largest_step = 1.0 - 1e-9;
 enum Rule { lemma, optimal, tightened };
 
-inline double largest(double a, double b) { return a > b ? a : b; }
-inline double smallest(double a, double b) { return a < b ? a : b; }
-
 // A strip |y - h x| <= c in units of the ellipsoid's half-width along h: its middle and its half-width.
 struct Strip {
   double mu, delta;
 
   Strip narrowed() const {
-    const double low = largest(-1.0, mu - delta), high = smallest(1.0, mu + delta);
-    return {0.5 * (low + high), largest(0.5 * (high - low), smallest_half_width)};
+    const double low = maximum(-1.0, mu - delta), high = minimum(1.0, mu + delta);
+    return {0.5 * (low + high), maximum(0.5 * (high - low), smallest_half_width)};
   }
 
   // The step of least trace: the root of a cubic by Newton's method, in a bracket that is halved wherever a step would
@@ -106,10 +103,10 @@ class Ellipsoid {
       e2 += h[i] * Hh_[i], h2 += h[i] * h[i], square += Hh_[i] * Hh_[i];
       size += __builtin_fabs(h[i] * x_[i]), reach += __builtin_fabs(h[i]) * half_width(i);
     }
-    const double nu = innovation(h, y), e = square_root(largest(e2, 0.0)), tr = trace(H_);
+    const double nu = innovation(h, y), e = square_root(maximum(e2, 0.0)), tr = trace(H_);
     const double rounding = 4.0 * (double)n_ * eps * reach * reach;
     c += 4.0 * eps * (__builtin_fabs(y) + size);
-    if (__builtin_fabs(nu) > c + square_root(largest(e2, 0.0) + rounding)) return false;
+    if (__builtin_fabs(nu) > c + square_root(maximum(e2, 0.0) + rounding)) return false;
     if (e2 <= least_seen * tr * h2) return true;
     Strip strip = {nu / e, c / e};
     if (n_ == 1) {
@@ -123,12 +120,12 @@ class Ellipsoid {
     }
     if (rule == tightened) strip = strip.narrowed();
     const double mu2 = strip.mu * strip.mu, delta2 = strip.delta * strip.delta;
-    const double g = smallest(square / (e2 * tr), 1.0), margin = rounding / e2;
+    const double g = minimum(square / (e2 * tr), 1.0), margin = rounding / e2;
     if (mu2 + g <= delta2) return true;
-    double step = rule == lemma ? smallest(1.0 - delta2 / (g + mu2), largest_step) : strip.optimal_step(g);
-    step = smallest(step, 1.0 / (1.0 + 2.0 * margin));
+    double step = rule == lemma ? minimum(1.0 - delta2 / (g + mu2), largest_step) : strip.optimal_step(g);
+    step = minimum(step, 1.0 / (1.0 + 2.0 * margin));
     const double growth =
-        largest(1.0 + step * (delta2 / (1.0 - step * (1.0 + margin)) - mu2) + margin, smallest_growth);
+        maximum(1.0 + step * (delta2 / (1.0 - step * (1.0 + margin)) - mu2) + margin, smallest_growth);
     if (!(growth * (1.0 - step * g + margin) < 1.0)) return true;
     for (int64_t i = 0; i < n_; ++i)
       for (int64_t j = 0; j <= i; ++j) {
@@ -170,7 +167,7 @@ MAGLOC_KERNEL(ellipsoids_correct, ellipsoids) {
       double &bound = p.bounds[run * m + channel];
       if (y != y || ellipsoid.intersect(h, y, bound, (Rule)p.rule)) continue;
       ellipsoid.add(p.reinflation);
-      bound = largest(__builtin_fabs(ellipsoid.innovation(h, y)), p.inflation * bound);
+      bound = maximum(__builtin_fabs(ellipsoid.innovation(h, y)), p.inflation * bound);
       ++p.resets[run];
       ellipsoid.intersect(h, y, bound, (Rule)p.rule);
     }

@@ -139,7 +139,7 @@ def source_bounds(
 
 
 def _body_errors(sensors: FloatArray, positions: FloatArray, length_m: FloatArray) -> FloatArray:
-    """Return the upper triangles (P, N, 14, 6) of the matrices by which the moment's field errs, of one σ."""
+    """Return upper triangles (P, N, 14, 6) of the matrices that give one σ of each body error of the field."""
     separation = sensors - positions[:, None]
     matrices = finite_body_errors(separation[:, :, None], np.eye(3), length_m[:, None, None, None, None])
     return np.ascontiguousarray(np.swapaxes(matrices[(..., *np.triu_indices(3), slice(None))], -1, -2))

@@ -46,12 +46,13 @@ if _TARGET:
     os.environ["_PYTHON_HOST_PLATFORM"] = f"many{_system}_{_version}_{_machine}"  # the tag of the wheel
 
 
-def _has_compiler() -> bool:
-    return bool(os.environ.get("CXX")) or any(shutil.which(name) for name in _COMPILERS)
+def _needs_zig() -> bool:
+    has_compiler = bool(os.environ.get("CXX")) or any(shutil.which(name) for name in _COMPILERS)
+    return bool(_TARGET) or not has_compiler
 
 
 def _requirements(hook: Callable[[Settings], list[str]], settings: Settings) -> list[str]:
-    return [*hook(settings), *([] if _has_compiler() and not _TARGET else ["ziglang>=0.13"])]
+    return [*hook(settings), *(["ziglang>=0.13"] if _needs_zig() else [])]
 
 
 def get_requires_for_build_wheel(config_settings: Settings = None) -> list[str]:
@@ -70,7 +71,7 @@ def _use_zig_where_needed() -> None:
     CMake expects programs of one word. `zig cc` compiles C++, too; `zig c++` would first compile the C++ library, which
     the kernels do not need.
     """
-    if _has_compiler() and not _TARGET:
+    if not _needs_zig():
         return
     if find_spec("ziglang") is None:
         sys.exit("magloc: found no C++ compiler, expected g++ or clang++ in PATH, or Zig: pip install ziglang.")

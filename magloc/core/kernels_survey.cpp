@@ -8,7 +8,7 @@ MAGLOC_BEGIN
 template <int n, class Matrix, class At>
 MAGLOC_INLINE int64_t fill_columns(const magloc_survey_columns &p, int64_t begin, int64_t end, double *workspace,
                                    Matrix matrix, At at) {
-  const int64_t K = p.n_measurements, n_blocks = (p.n_sources + n_lanes<Lanes> - 1) / n_lanes<Lanes>;
+  const int64_t K = p.n_measurements, n_blocks = n_registers<Lanes>(p.n_sources);
   Workspace room(workspace);
   auto *direction = room.take<double[3]>(p.n_sensors * K);  // that a measurement reads at a sensor
   auto *sum = room.take<Lanes[n]>(n_blocks * K);

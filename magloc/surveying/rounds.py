@@ -169,7 +169,7 @@ class Searched:
         due = self.of < 0
         for then in set(self.of[~due].tolist()):
             change = white((now - self.predicted[then])[..., None])[:, 0]
-            change = np.abs(change - Q @ (Q.T @ change)).reshape(len(white.starts) - 1, -1).max(axis=1)
+            change = np.abs(change - Q @ (Q.T @ change)).reshape(white.n_groups, -1).max(axis=1)
             due |= (self.of == then) & self.grid.seeing(record.middles_m[white.starts[:-1]][change > _FELT])
         found = iter(self.model.candidates(sources, self.grid.some(due), self.groups) if due.any() else [])
         self.candidates = [next(found) if new else old for new, old in zip_longest(due, self.candidates)]

@@ -150,9 +150,7 @@ def targets_of(
         covariance[j] = _scattered(covariance[j], scatter)
     apart = np.linalg.norm(sources.position_m[:, None] - sources.position_m, axis=-1) + np.diag(np.full(K, np.inf))
     rim = np.minimum(sources.position_m - model.bounds.low_m, model.bounds.high_m - sources.position_m)
-    left = (fit.residual - background.Q @ (background.Q.T @ fit.residual)).reshape(
-        len(background.white.filter.gains), -1
-    )
+    left = (fit.residual - background.Q @ (background.Q.T @ fit.residual)).reshape(background.white.n_groups, -1)
     directions = model.record.directions(sources.fields(model.record))
     Q = with_free_sources(model.record, background, sources)
     free = fit.residual - Q @ (Q.T @ fit.residual)

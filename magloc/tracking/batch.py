@@ -23,9 +23,9 @@ from magloc.tracking.tracker import Tracker
 
 _MOST_AT_ONCE = 64
 _TERMS_A_CALL = 10_000_000
-"""Products that one call of the kernel computes, about: some 50 ms."""
+"""Approximate number of products that one call of the kernel computes: some 50 ms."""
 _TERMS_OF_STEPS = 3000
-"""Of them those of a row beside what its differences take."""
+"""Products of a row that do not depend on the number of its differences."""
 _COMPILED_STATES = (N_SOURCE, N_SOURCE + 3)
 """Position and moment, or velocity as well."""
 
@@ -65,7 +65,7 @@ def compiled_motion(tracker: Tracker) -> LinearMotion | None:
 
 
 class _CompiledSteps:
-    """A record, and what the kernel needs and fills to follow a source through its rows."""
+    """A record with the arrays that the kernel reads and fills."""
 
     def __init__(self, tracker: Tracker, motion: LinearMotion, rows: Sequence[Row]) -> None:
         array = tracker.array

@@ -448,8 +448,8 @@ typedef struct {
 } magloc_survey_whitening;
 int64_t magloc_survey_whiten(const magloc_survey_whitening *problem, int64_t begin, int64_t end, double *workspace);
 
-/* What sources add to the measurements of a survey. A measurement is the sum over the rows of a group, divided by the
-   root of their number; an item is a group. */
+/* Columns that sources add to the measurements of a survey. A measurement is the sum over the rows of a group, divided
+   by the root of their number; an item is a group. */
 typedef struct {
   int64_t n_sensors, n_channels, n_measurements, n_sources;
   const double *sensors;            /* (n_rows, n_sensors, 3) */
@@ -461,11 +461,11 @@ typedef struct {
   const int64_t *groups;            /* (n) that are wanted */
   double *out;                      /* (n, n_measurements, size) */
 } magloc_survey_columns;
-/* Of moments of unit x, y and z: size 3 n_sources, by axis, then by source. */
+/* Columns of moments of unit x, y and z: size 3 n_sources, by axis, then by source. */
 int64_t magloc_survey_moments(const magloc_survey_columns *problem, int64_t begin, int64_t end, double *workspace);
 /* Derivatives by position and moment: size 6 n_sources, by source. */
 int64_t magloc_survey_sources(const magloc_survey_columns *problem, int64_t begin, int64_t end, double *workspace);
-/* Of poles, whose field is d/r^3: size n_sources. */
+/* Columns of poles, whose field is d/r^3: size n_sources. */
 int64_t magloc_survey_poles(const magloc_survey_columns *problem, int64_t begin, int64_t end, double *workspace);
 
 /* A source followed by one component, from a state before row progress[0] to the first row that it does not explain; an
@@ -505,7 +505,7 @@ typedef struct {
      and the covariance had no readings been taken. */
   double *x, *root, *centroid, *open_loop; /* (n), (n, n), (3), (n, n) */
   int64_t *progress;                       /* (2): next row, and 1 as long as rows are explained */
-  /* Of each explained row. */
+  /* Results of each explained row. */
   double *predicted_x, *predicted_roots; /* (n_rows, n), (n_rows, n, n) */
   double *updated_x, *updated_roots;     /* (n_rows, n), (n_rows, n, n) */
   double *open_loop_variances;           /* (n_rows, n) */

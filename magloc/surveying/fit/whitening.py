@@ -131,7 +131,7 @@ class Whitening:
         return Y.reshape(-1, Y.shape[2])
 
     def measured_rows(self, record: SurveyRecord, directions: FloatArray) -> MeasuredRows:
-        """The groups of a record whose channels read some directions (n, C, 3) of a small change of the field."""
+        """Return a record's groups of rows, whose channels read directions (n, C, 3) of a small change of the field."""
         return MeasuredRows(record.sensors_m, directions, self.U, record.array.channel_sensor, self.starts)
 
     def of_moments(
@@ -151,6 +151,11 @@ class Whitening:
     def starts(self) -> IntArray:
         """First row of every group, and the end of the last one."""
         return np.flatnonzero(np.diff(self.group, prepend=-1, append=self.group[-1] + 1))
+
+    @property
+    def n_groups(self) -> int:
+        """Number of groups."""
+        return len(self.filter.gains)
 
     def of_groups(self, Y: FloatArray) -> FloatArray:
         """White columns (g·k, m) of columns (g, k, m) of the independent measurements of the groups; they are lost."""

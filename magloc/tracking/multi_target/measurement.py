@@ -60,7 +60,7 @@ class JointRow:
 
     @cached_property
     def problem(self) -> core.Problem:
-        """The row as kernels take it."""
+        """Struct that describes the row to the kernels."""
         return rows_problem(self.z, self.gain, self.positions_m, self.channel_sensor)
 
     def without(self, out: BoolArray) -> JointRow:
@@ -92,7 +92,7 @@ class JointRow:
 
 
 def rows_problem(z: FloatArray, gain: FloatArray, positions_m: FloatArray, channel_sensor: IntArray) -> core.Problem:
-    """Rows, of which there may be one without an axis of rows, as kernels take them."""
+    """Describe rows to the kernels; z (C,) is one row, z (n, C) are several."""
     return core.problem(
         "joint_rows",
         n_rows=len(z) if z.ndim > 1 else 1,

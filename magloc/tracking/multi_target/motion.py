@@ -59,7 +59,7 @@ class FreeMotion:
                 raise ValueError(f"Input {name} must be positive and finite; instead received {value}.")
 
     def numbers(self, dt_s: float, *, agility: float = 1.0) -> FloatArray:
-        """A step as its kernel takes it (12,); `agility` times the noise of velocity and turn."""
+        """Return the numbers (12,) of a step for its kernel; `agility` multiplies the noise of velocity and turn."""
         lasts_s, kept, root_v = wandering_step(self.correlation_s, dt_s)
         turn_lasts_s, turn_kept, root_w = wandering_step(self.turn_correlation_s, dt_s)
         of_p_v = (agility * self.speed_m_s) ** 2 * (root_v @ root_v.T)

@@ -102,7 +102,7 @@ class YoungTrack:
 
 
 def _means(state: JointState) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """What a state says without its covariance."""
+    """Return the means of a state."""
     return state.position_m, state.moment_Am2, state.velocity_m_s, state.rate_rad_s, state.common_T
 
 

@@ -51,7 +51,7 @@ class JointState:
 
     @classmethod
     def unfilled(cls, n_sources: int) -> JointState:
-        """A state that a kernel is to fill."""
+        """Return a state whose arrays a kernel fills."""
         n = N_OF_SOURCE * n_sources + N_COMMON
         position_m, moment_Am2, velocity_m_s, rate_rad_s = np.empty((4, n_sources, 3))
         return cls(position_m, moment_Am2, velocity_m_s, rate_rad_s, np.empty(N_COMMON), np.empty((n, n)))
@@ -63,7 +63,7 @@ class JointState:
 
     @cached_property
     def problem(self) -> core.Problem:
-        """The state as kernels take it."""
+        """Struct that describes the state to the kernels."""
         return core.problem(
             "joint_state",
             n_sources=self.n_sources,

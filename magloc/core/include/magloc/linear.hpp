@@ -129,10 +129,6 @@ struct Ldl {
 
 // A row of numbers in registers, one after the other; the rest of the last register is zero.
 template <class T>
-constexpr int64_t n_registers(int64_t n) {
-  return (n + n_lanes<T> - 1) / n_lanes<T>;
-}
-template <class T>
 MAGLOC_INLINE void set_number(T *row, int64_t i, double value) {
   set_lane(row[i / n_lanes<T>], i % n_lanes<T>, value);
 }

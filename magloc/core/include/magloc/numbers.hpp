@@ -64,6 +64,11 @@ typedef bool Mask;
 
 template <class T>
 constexpr int n_lanes = sizeof(T) / sizeof(double);
+// Registers that n numbers fill.
+template <class T>
+constexpr int64_t n_registers(int64_t n) {
+  return (n + n_lanes<T> - 1) / n_lanes<T>;
+}
 template <class T>
 MAGLOC_INLINE T broadcast(double x) {
   return T{} + x;
@@ -77,6 +82,10 @@ MAGLOC_INLINE double sum_of_lanes(const T &x) {
 template <class T>
 MAGLOC_INLINE T maximum(T a, T b) {
   return choose(a > b, a, b);
+}
+template <class T>
+MAGLOC_INLINE T minimum(T a, T b) {
+  return choose(a < b, a, b);
 }
 
 // Read component `axis` of the 3-vectors i, i + 1, ... of an array (n, 3), one in each lane. Beyond the end the last

@@ -22,7 +22,7 @@ class Padded {
 
  public:
   Padded(Workspace &space, int64_t n_rows, int64_t n_columns)
-      : width_((n_columns + n_lanes<T> - 1) / n_lanes<T>), start_(space.take<T>(n_rows * width_)) {}
+      : width_(n_registers<T>(n_columns)), start_(space.take<T>(n_rows * width_)) {}
 
   int64_t width() const { return width_; }  // in lanes
   T *lanes(int64_t row) const { return start_ + row * width_; }

@@ -52,12 +52,12 @@ struct ProfileEnd {
       if (tried == toward * (right_angle - smallest_s)) return tried = toward * right_angle, true;
       const double reached = __builtin_fabs(tried - optimum), risen = maximum(f + rise, 1e-3 * rise);
       double step = maximum(1.05 * reached * (square_root(rise / risen) - 1.0), 0.1 * last_step);
-      step = step < 1.7 * last_step ? step : 1.7 * last_step;
-      last_step = step < longest_step ? step : longest_step;
+      step = minimum(step, 1.7 * last_step);
+      last_step = minimum(step, longest_step);
       tried = bounded(inside + toward * last_step);
     } else {
       const double near = __builtin_fabs(inside), far = __builtin_fabs(outside);
-      if (__builtin_fabs(outside - inside) < 1e-4 * (near < far ? near : far)) return true;
+      if (__builtin_fabs(outside - inside) < 1e-4 * minimum(near, far)) return true;
       const double a = square_root(maximum(f_inside + rise, 0.0)), b = square_root(f_outside + rise);
       const double share = b > a ? (square_root(rise) - a) / (b - a) : 0.5;
       tried = inside + (share < 0.05 ? 0.05 : share > 0.95 ? 0.95 : share) * (outside - inside);
