@@ -310,7 +310,8 @@ class Tracker:
             return out, self._lost(seen.row, reason)
         self._judge(row, out, lambda row: math.inf if self.filter.of_row(row, self.motion)[0] is None else 0.0)
         open_loop = self.known_before(seen, mixture.x[np.argmax(mixture.log_weight)])
-        known = self.filter.refitted(Known(mixture, open_loop, young=((seen, self.motion),)))
+        young = ((seen, self.motion),) if self.filter.has_lasting_errors else ()
+        known = self.filter.refitted(Known(mixture, open_loop, young=young))
         return out, self._kept(seen.row, index, known, None, status="acquired")
 
     def _seen(self, row: Row, out: BoolArray) -> ChartRow:
@@ -356,7 +357,10 @@ class Tracker:
         if before.young:
             young = (*before.young, (seen, self.motion))
             known = self.filter.refitted(replace(known, young=young, nis=before.nis + update.nis))
-        if width_of(known.mixture) > LARGEST_WIDTH and self.filter.is_detected(seen):
+        # Narrow components may stand anywhere along the range when no reading shows the source any more.
+        width = max(width_of(known.mixture), known.mixture.log_range_sigma)
+        is_detected = width <= LARGEST_WIDTH or self.filter.is_detected(seen)
+        if is_detected and width_of(known.mixture) > LARGEST_WIDTH:
             return self._started(row, index, predicted.matched())
         return out, self._kept(
             seen.row,
@@ -366,6 +370,7 @@ class Tracker:
             status="tracked",
             innovation=innovation,
             iterations=update.iterations,
+            is_lost=not is_detected,
         )
 
     def _judge(self, row: Row, out: BoolArray, excess: Callable[[ChartRow], float]) -> None:
@@ -400,12 +405,13 @@ class Tracker:
         status: str,
         innovation: Innovation | None = None,
         iterations: int = 0,
+        is_lost: bool = False,
     ) -> TrackPoint:
         mixture = known.mixture
         tracked = status == "tracked"
         told = {} if innovation is None else innovation.after(self._last if tracked else None)
         self._last = innovation if tracked else None
-        if status != "acquired" and width_of(mixture) > LARGEST_WIDTH:
+        if is_lost or (status != "acquired" and width_of(mixture) > LARGEST_WIDTH):
             self._known = None
             return replace(self._lost(row, "lost: the place is no longer known"), **told)
         self._known = known
