@@ -71,8 +71,13 @@ class Consistency:
     true_position_m: FloatArray
     bound_m: FloatArray | None
 
+    @property
+    def json(self) -> dict[str, object]:
+        """Entries of ``magloc track --json``."""
+        return {key: value for key, value in vars(self).items() if not isinstance(value, np.ndarray | None)}
+
     def lines(self) -> list[str]:
-        """Errors against the truth, and what they should be."""
+        """Return errors against the truth, and what they should be."""
         lines = [
             f"against the truth, {self.tracked_rows} of {self.rows} rows answered:",
             f"  position rms {self.position_rms_m:.4g} m",

@@ -22,7 +22,7 @@ from arrays.typing import FloatArray, Vector
 from magloc.chi_square import square_columns
 from magloc.levels import FALSE_ALARM
 from magloc.localization.fit.table import cells_of_strength, cells_of_vector
-from magloc.tracking.results import TrackPoint, TrackResult, on_track, stacked
+from magloc.tracking.results import SourcePoint, SourcesPoint, TrackPoint, TrackResult, stacked
 from magloc.truth import STATE_COLUMNS, state_columns
 
 if TYPE_CHECKING:
@@ -33,16 +33,33 @@ if TYPE_CHECKING:
 
 _SAME_PLACE_M = 1e-9
 _RIVAL_KEYS = ("position_m", "moment_Am2", "chi2", "dof", "weight")
-_CONSISTENCY_KEYS = (
-    "rows",
-    "tracked_rows",
-    "position_rms_m",
-    "position_bound_m",
-    "nees_per_dimension",
-    "nees_bounds",
-    "nis_per_dimension",
-    "nis_bounds",
-)
+_POINT_KEYS = [
+    "time_s",
+    "position_m",
+    "moment_Am2",
+    "covariance",
+    "estimability",
+    "iterations",
+    "nis",
+    "nis_dof",
+    "status",
+    "dropped_sensors",
+    "range_observable",
+    "range_interval95_m",
+    "gaussian",
+    "weight",
+]
+_ROW_KEYS = ("time_s", "status", "chi2", "dof", "dropped_sensors")
+_SOURCE_KEYS = [
+    "id",
+    "position_m",
+    "moment_Am2",
+    "covariance",
+    "weight",
+    "merged",
+    "range_observable",
+    "range_interval95_m",
+]
 
 _COLUMNS = {
     "position_m": (("axis",), "m", "position of the source"),
@@ -57,56 +74,57 @@ _COLUMNS = {
 }
 
 
-def lines_of_track(points: Sequence[TrackPoint], *, most: int | None = None) -> list[str]:
-    """Aligned lines: a header, then one for every row, or for the first and the last ones of `most`."""
+def lines_of_track(points: Sequence[TrackPoint | SourcesPoint], *, most: int | None = None) -> list[str]:
+    """Aligned lines: a header, then one for every source in every row, or in the first and last ones of `most` rows."""
     shown = list(points)
     if most is not None and len(shown) > most:
         shown = shown[: most // 2] + shown[-(most // 2) :]
-    header = ["time_s", "x_m", "y_m", "z_m", "s_x_m", "s_y_m", "s_z_m", "m_Am2", "s_m", "nis", "status"]
-    rows = [header]
-    for point in shown:
-        if point.position_m is None or point.moment_Am2 is None or point.covariance is None:
-            rows.append([f"{point.time_s:.10g}", *["-"] * 9, point.status])
-            continue
-        unsure = "" if point.range_observable or point.centroid_m is None else ", range?"
-        rows.append(
-            [
-                f"{point.time_s:.10g}",
+    several = bool(shown) and isinstance(shown[0], SourcesPoint)
+    header = ["x_m", "y_m", "z_m", "s_x_m", "s_y_m", "s_z_m", "m_Am2", "s_m"]
+    rows = [["time_s", "id", *header, "status"] if several else ["time_s", *header, "nis", "status"]]
+    middle = 0
+    for i, row in enumerate(shown):
+        middle = len(rows) if 2 * i == len(shown) else middle
+        time, faults = f"{row.time_s:.10g}", "".join(f", without {name}" for name in row.dropped_sensors)
+        if not row.tracks:
+            rows.append([time, *["-"] * 9, row.status + faults])
+        for point in row.tracks:
+            assert point.position_m is not None
+            assert point.moment_Am2 is not None
+            assert point.covariance is not None
+            cells = [
                 *cells_of_vector(point.position_m, np.sqrt(np.diagonal(point.covariance)[:3])),
                 *cells_of_strength(point.moment_Am2, point.covariance[3:, 3:]),
-                f"{point.nis:.1f}/{point.nis_dof}" if np.isfinite(point.nis) else "-",
-                "".join((point.status, *(f", without {name}" for name in point.dropped_sensors), unsure)),
             ]
-        )
+            if several:
+                assert isinstance(point, SourcePoint)
+                rows.append([time, str(point.id), *cells, row.status + ", merged" * point.merged + faults])
+                continue
+            unsure = "" if point.range_observable or point.centroid_m is None else ", range?"
+            nis = f"{point.nis:.1f}/{point.nis_dof}" if np.isfinite(point.nis) else "-"
+            rows.append([time, *cells, nis, row.status + faults + unsure])
     lines = aligned(rows)
     if len(shown) < len(points):
-        lines.insert(1 + len(shown) // 2, f"… {len(points)} rows")
+        lines.insert(middle, f"… {len(points)} rows")
     return lines
 
 
-def json_entry(point: TrackPoint) -> dict[str, object]:
-    """What ``--json`` and ``--jsonl`` print of one row; null where it has no answer.
+def json_entry(point: TrackPoint | SourcesPoint, *, single: bool = False) -> dict[str, object]:
+    """Return what ``--json`` and ``--jsonl`` print of one row; null where it has no answer.
 
-    What is said of the range is then that of the row alone, and its solutions are the rivals.
+    Without a track the range is that of the row alone, and its solutions are the rivals. Of several sources the row has
+    a list of tracks; if there is at most a `single` one, the keys of one track stand beside it.
     """
-    tracked = point.position_m is not None
-    return {
-        "time_s": point.time_s,
-        "position_m": point.position_m,
-        "moment_Am2": point.moment_Am2,
-        "covariance": point.covariance,
-        "estimability": point.estimability,
-        "iterations": point.iterations if tracked else None,
-        "nis": point.nis,
-        "nis_dof": point.nis_dof,
-        "status": point.status,
-        "dropped_sensors": point.dropped_sensors,
-        "range_observable": point.range_observable,
-        "range_interval95_m": point.range_interval_m,
-        "gaussian": point.gaussian if tracked else None,
-        "weight": point.weight,
-        "rivals": [{key: getattr(rival, key) for key in _RIVAL_KEYS} for rival in point.rivals],
-    }
+    if isinstance(point, SourcesPoint):
+        entry = json_entry(point.tracks[0]) if single and point.tracks else {}
+        return entry | _values(point, _ROW_KEYS) | {"tracks": [_values(track, _SOURCE_KEYS) for track in point.tracks]}
+    entry = _values(point, _POINT_KEYS) | {"rivals": [_values(rival, _RIVAL_KEYS) for rival in point.rivals]}
+    return entry if point.tracks else entry | {"iterations": None, "gaussian": None}
+
+
+def _values(of: object, keys: Sequence[str]) -> dict[str, object]:
+    """Return attributes by their keys in JSON."""
+    return {key: getattr(of, key.replace("interval95", "interval")) for key in keys}
 
 
 def states_of(points: Sequence[TrackPoint]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -119,57 +137,69 @@ def states_of(points: Sequence[TrackPoint]) -> tuple[FloatArray, FloatArray, Flo
     )
 
 
-def columns_of_track(points: Sequence[TrackPoint], array_m: FloatArray | None = None) -> dict[str, Column]:
-    """Columns of the CSV file of a track; ``array_m`` (n, 3): origin of the array's frame in every row."""
+def columns_of_track(
+    points: Sequence[TrackPoint], array_m: FloatArray | None = None, *, ids: Sequence[int] | None = None
+) -> dict[str, Column]:
+    """Return columns of the CSV file of one source, or with `ids` of several.
+
+    ``array_m`` (n, 3): origin of the array's frame in every row.
+    """
     time, position, moment, covariance = states_of(points)
-    nis, nis_dof = np.array([point.nis for point in points]), np.array([point.nis_dof for point in points])
     columns: dict[str, Column] = {"time_s": time}
-    columns |= state_columns(position, moment, covariance) | square_columns("nis", nis, nis_dof)
-    components = (name.split("_")[0] for name in STATE_COLUMNS)
-    estimability = stacked(points, "estimability", 6)
-    columns |= dict(zip((f"estimability_{name}" for name in components), estimability.T, strict=True))
+    if ids is not None:
+        columns["id"] = np.array(ids, dtype=np.intp)
+    columns |= state_columns(position, moment, covariance)
+    if ids is None:
+        nis, nis_dof = np.array([point.nis for point in points]), np.array([point.nis_dof for point in points])
+        columns |= square_columns("nis", nis, nis_dof)
+        components = (name.split("_")[0] for name in STATE_COLUMNS)
+        estimability = stacked(points, "estimability", 6)
+        columns |= dict(zip((f"estimability_{name}" for name in components), estimability.T, strict=True))
     if array_m is not None:
         columns |= dict(zip(("array_x_m", "array_y_m", "array_z_m"), array_m.T, strict=True))
     return columns | {"status": [point.status for point in points]}
 
 
-def columns_of_sources(named: Sequence[tuple[int, TrackPoint]]) -> dict[str, Column]:
-    """Columns of the CSV file of several sources: points with the ids of their tracks."""
-    time, position, moment, covariance = states_of([point for _, point in named])
-    columns: dict[str, Column] = {"time_s": time, "id": np.array([id for id, _ in named])}
-    columns |= state_columns(position, moment, covariance)
-    return columns | {"status": [point.status for _, point in named]}
-
-
 def json_of_track(points: Sequence[TrackPoint], consistency: Consistency | None) -> dict[str, object]:
-    """What ``magloc track --json`` prints."""
+    """Return what ``magloc track --json`` prints of one source."""
     entries: dict[str, object] = {"results": [json_entry(point) for point in points]}
-    if consistency is not None:
-        entries["consistency"] = {key: getattr(consistency, key) for key in _CONSISTENCY_KEYS}
-    return entries
+    return entries if consistency is None else entries | {"consistency": consistency.json}
 
 
 def geojson_of_track(points: Sequence[TrackPoint], origin: Vector) -> dict[str, Any]:
-    """:meth:`magloc.tracking.track.TrackColumns.to_geojson`."""
-    points = on_track(points)
-    rest = at_rest(points)
-    if rest is not None:
-        return feature_collection([_feature(rest, origin)])
-    features = [_feature(point, origin) for point in points if point.position_m is not None]
-    lines = [feature("LineString", part, {"name": "track"}) for part in _unbroken(points, origin)]
-    return feature_collection([*lines, *features])
+    """Return :meth:`magloc.tracking.track.TrackColumns.to_geojson`."""
+    lines, known = _on_the_map(points, origin)
+    features = [feature("LineString", line, {"name": "track"}) for line in lines]
+    return feature_collection([*features, *(_feature(point, origin) for _, point in known)])
 
 
 def kml_of_track(points: Sequence[TrackPoint], origin: Vector) -> str:
-    """:meth:`magloc.tracking.track.TrackColumns.to_kml`."""
-    points = on_track(points)
+    """Return :meth:`magloc.tracking.track.TrackColumns.to_kml`."""
+    lines, known = _on_the_map(points, origin)
+    ends = known[:: max(1, len(known) - 1)]  # the first and the last
+    tracks = [placemark("track", "", line) for line in lines]
+    return kml([*tracks, *(_placemark(name, point, origin) for name, point in ends)])
+
+
+def _on_the_map(
+    points: Sequence[TrackPoint], origin: Vector
+) -> tuple[list[list[list[float]]], list[tuple[str, TrackPoint]]]:
+    """Return the unbroken lines of a track and its points by name; no line and the best point of a source at rest.
+
+    A line has two rows at least and no row without the source.
+    """
     rest = at_rest(points)
     if rest is not None:
-        return kml([_placemark("source", rest, origin)])
-    ends = [point for point in points if point.position_m is not None]
-    ends = ends[:: max(1, len(ends) - 1)]  # the first and the last
-    lines = [placemark("track", "", part) for part in _unbroken(points, origin)]
-    return kml([*lines, *(_placemark(f"{point.time_s:.6g} s", point, origin) for point in ends)])
+        return [], [("source", rest)]
+    lines: list[list[list[float]]] = [[]]
+    known = []
+    for point in points:
+        if point.is_on_track and point.position_m is not None:
+            lines[-1].append(world_place(point.position_m, origin))
+            known.append((f"{point.time_s:.6g} s", point))
+        else:
+            lines.append([])
+    return [line for line in lines if len(line) > 1], known
 
 
 def at_rest(points: Sequence[TrackPoint]) -> TrackPoint | None:
@@ -189,17 +219,6 @@ def at_rest(points: Sequence[TrackPoint]) -> TrackPoint | None:
     offset = position - position[best]
     chi2 = np.einsum("ni,ni->n", offset, np.linalg.solve(both, offset[..., None])[..., 0])
     return known[best] if (chi2 <= chdtri(3, FALSE_ALARM)).all() else None
-
-
-def _unbroken(points: Sequence[TrackPoint], origin: Vector) -> list[list[list[float]]]:
-    """Places of every part of a track that has two rows at least and no row without the source."""
-    parts: list[list[list[float]]] = [[]]
-    for point in points:
-        if point.position_m is None:
-            parts.append([])
-        else:
-            parts[-1].append(world_place(point.position_m, origin))
-    return [part for part in parts if len(part) > 1]
 
 
 def _feature(point: TrackPoint, origin: Vector) -> dict[str, Any]:
