@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
 import numpy as np
@@ -33,33 +34,23 @@ if TYPE_CHECKING:
 
 _SAME_PLACE_M = 1e-9
 _RIVAL_KEYS = ("position_m", "moment_Am2", "chi2", "dof", "weight")
-_POINT_KEYS = [
-    "time_s",
-    "position_m",
-    "moment_Am2",
-    "covariance",
-    "estimability",
-    "iterations",
-    "nis",
-    "nis_dof",
-    "status",
-    "dropped_sensors",
-    "range_observable",
-    "range_interval95_m",
-    "gaussian",
-    "weight",
-]
+_STATE_KEYS, _RANGE_KEYS = ("position_m", "moment_Am2", "covariance"), ("range_observable", "range_interval95_m")
+_FILTER_KEYS = ("estimability", "iterations", "nis", "nis_dof", "status", "dropped_sensors")
+_POINT_KEYS = ("time_s", *_STATE_KEYS, *_FILTER_KEYS, *_RANGE_KEYS, "gaussian", "weight")
 _ROW_KEYS = ("time_s", "status", "chi2", "dof", "dropped_sensors")
-_SOURCE_KEYS = [
-    "id",
-    "position_m",
-    "moment_Am2",
-    "covariance",
-    "weight",
-    "merged",
-    "range_observable",
-    "range_interval95_m",
-]
+_SOURCE_KEYS = ("id", *_STATE_KEYS, "weight", "merged", *_RANGE_KEYS)
+
+_Number = Annotated[float, msgspec.Meta(ge=-LARGEST, le=LARGEST)]
+_Three = Annotated[list[_Number], msgspec.Meta(min_length=3, max_length=3)]
+_Six = Annotated[list[_Number], msgspec.Meta(min_length=6, max_length=6)]
+_Matrix = Annotated[list[_Six], msgspec.Meta(min_length=6, max_length=6)]
+_READ: dict[str, tuple[Any, str]] = {
+    "time_s": (_Number, "a number"),
+    **dict.fromkeys(("nis", "nis_dof"), (_Number | None, "a number")),
+    **dict.fromkeys(("position_m", "moment_Am2"), (_Three | None, "3 numbers or null")),
+    "covariance": (_Matrix | None, "6×6 numbers or null"),
+    "dropped_sensors": (list[str] | None, "a list of names"),
+}
 
 _COLUMNS = {
     "position_m": (("axis",), "m", "position of the source"),
@@ -308,72 +299,49 @@ def _tracks(path: Path, entries: Sequence[dict[str, Any]]) -> dict[int, tuple[Tr
 
 
 def _points(path: Path, rows: Sequence[dict[str, Any]]) -> tuple[TrackPoint, ...]:
-    """Points of a source. Numbers become arrays a column at once: by rows it takes five times as long."""
-    times, nis, nis_dof = (_numbers(path, rows, key) for key in ("time_s", "nis", "nis_dof"))
-    if None in times:
-        raise InputError(f"{path}, result {times.index(None) + 1}, key time_s: found None, expected a number.")
+    """Points of a source."""
+    times = _values_of(path, rows, "time_s")
     if back := next((i for i in range(1, len(times)) if times[i] < times[i - 1]), None):
         raise InputError(
             f"{path}, result {back + 1}, key time_s: found {times[back]:g} after {times[back - 1]:g}, expected times in"
             " order."
         )
-    positions, moments = (_vectors(path, rows, key, 3) for key in ("position_m", "moment_Am2"))
-    covariances = _vectors(path, rows, "covariance", 6, 6)
+    nis, nis_dof, names = (_values_of(path, rows, key) for key in ("nis", "nis_dof", "dropped_sensors"))
+    positions, moments, covariances = (_arrays(_values_of(path, rows, key)) for key in _STATE_KEYS)
     for i, covariance in enumerate(covariances, start=1):
         if covariance is not None and covariance.diagonal().min() < 0.0:
             raise InputError(f"{path}, result {i}, key covariance: found a variance below zero, expected none.")
-    statuses = [str(row.get("status", "")) for row in rows]
-    dropped = [_names(path, i, row.get("dropped_sensors", ())) for i, row in enumerate(rows, start=1)]
-    nis = [math.nan if value is None else value for value in nis]
-    columns = zip(times, positions, moments, covariances, nis, nis_dof, statuses, dropped, strict=True)
+    columns = zip(times, positions, moments, covariances, nis, nis_dof, names, rows, strict=True)
     return tuple(
         TrackPoint(
-            float(t), place, moment, C, nis=float(value), nis_dof=int(dof or 0), status=status, dropped_sensors=names
+            float(t),
+            place,
+            moment,
+            C,
+            nis=math.nan if value is None else float(value),
+            nis_dof=int(dof or 0),
+            status=str(row.get("status", "")),
+            dropped_sensors=tuple(dropped or ()),
         )
-        for t, place, moment, C, value, dof, status, names in columns
+        for t, place, moment, C, value, dof, dropped, row in columns
     )
 
 
-def _names(path: Path, number: int, value: Any) -> tuple[str, ...]:
-    """Names of sensors in a result."""
-    if not all(isinstance(name, str) for name in (value if isinstance(value, list | tuple) else [None])):
-        raise InputError(
-            f"{path}, result {number}, key dropped_sensors: found {value!r:.40}, expected a list of names."
-        )
-    return tuple(value)
-
-
-def _numbers(path: Path, rows: Sequence[dict[str, Any]], key: str) -> list[Any]:
-    """A number of every row; None where the key is missing or null."""
+def _values_of(path: Path, rows: Sequence[dict[str, Any]], key: str) -> list[Any]:
+    """Values of a key in every row, None where it is missing or null."""
+    kind, expected = _READ[key]
     values = [row.get(key) for row in rows]
-    for i, value in enumerate(values, start=1):
-        if value is not None and not (type(value) in (int, float) and abs(value) <= LARGEST):
-            raise InputError(f"{path}, result {i}, key {key}: found {value!r:.40}, expected a number.")
-    return values
-
-
-def _vectors(path: Path, rows: Sequence[dict[str, Any]], key: str, *shape: int) -> list[FloatArray | None]:
-    """Numbers of every row; None where the key is missing or null."""
-    values = [row.get(key) for row in rows]
-    known = [i for i, value in enumerate(values) if value is not None]
-    if not known:
-        return values
-    numbers = _array([values[i] for i in known], len(known), *shape)
-    if numbers is None:
-        wrong = next(i for i in known if _array(values[i], *shape) is None)
-        size = "×".join(map(str, shape))
-        raise InputError(
-            f"{path}, result {wrong + 1}, key {key}: found something else, expected {size} numbers or null."
-        )
-    for i, own in zip(known, numbers, strict=True):
-        values[i] = own
-    return values
-
-
-def _array(value: object, *shape: int) -> FloatArray | None:
-    """What a file holds as an array of a shape; None if it is none."""
     try:
-        numbers = np.array(value, dtype=np.float64)
-    except (OverflowError, TypeError, ValueError):
-        return None
-    return numbers if numbers.shape == shape and (np.abs(numbers) <= LARGEST).all() else None
+        msgspec.convert(values, list[kind])  # type: ignore[valid-type]
+    except msgspec.ValidationError as error:
+        number = int(re.findall(r"\$\[(\d+)\]", str(error))[0])
+        found = "something else" if expected.endswith("null") else f"{values[number]!r:.40}"
+        raise InputError(f"{path}, result {number + 1}, key {key}: found {found}, expected {expected}.") from None
+    return values
+
+
+def _arrays(values: list[Any]) -> list[FloatArray | None]:
+    """Lists of numbers as arrays, all of a column at once: one by one they take five times as long."""
+    known = [i for i, value in enumerate(values) if value is not None]
+    arrays = iter(np.array([values[i] for i in known], dtype=np.float64))
+    return [None if value is None else next(arrays) for value in values]

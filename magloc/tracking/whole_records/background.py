@@ -157,14 +157,14 @@ def _log_volume(S: FloatArray) -> float:
     return float(np.linalg.slogdet(S)[1])
 
 
-def steps_at(tracker: Tracker, rows: Sequence[Row], states: Sequence[FloatArray]) -> list[Step]:
-    """Steps of a forward pass that linearises all rows at some states."""
-    return steps_of(tracker, [tracker.measurements.of(row) for row in rows], states)
-
-
-def steps_of(tracker: Tracker, measurements: Sequence[RowMeasurement], states: Sequence[FloatArray]) -> list[Step]:
-    """The same of what rows say."""
-    return _passed(tracker, measurements, 0, states, np.ones(len(measurements), dtype=bool)).steps
+def steps_of(
+    tracker: Tracker,
+    measurements: Sequence[RowMeasurement],
+    states: Sequence[FloatArray],
+    start: tuple[FloatArray, FloatArray] | None = None,
+) -> list[Step]:
+    """Return the steps of a forward pass that linearises all rows at some states."""
+    return _passed(tracker, measurements, 0, states, np.ones(len(measurements), dtype=bool), start).steps
 
 
 def settled_steps(tracker: Tracker, rows: Sequence[Row], states: Sequence[FloatArray]) -> list[Step] | None:
@@ -222,13 +222,10 @@ def _passed(
     begin: int,
     states: Sequence[FloatArray],
     used: BoolArray,
+    start: tuple[FloatArray, FloatArray] | None = None,
 ) -> _Passed:
-    """One forward pass over rows that are linearised at some states, from a source that is hardly known."""
-    n = tracker.motion.n_states
-    offset = measurements[0].place_in_array(states[0], np.eye(states[0].size))[0]
-    sigma = _UNKNOWN * np.repeat([np.linalg.norm(offset), np.linalg.norm(states[0][3:6])], 3)
-    x, S = np.zeros(states[0].size), np.diag(np.concatenate([np.zeros(n), tracker.error_sigma]))
-    x[:n], S[:n, :n] = tracker.motion.start(states[0][:N_SOURCE], np.diag(sigma))
+    """One forward pass over rows that are linearised at some states; by default from a source that is hardly known."""
+    x, S = start or _hardly_known(tracker, measurements[0], states[0])
     steps: list[Step] = []
     innovations: list[Innovation | None] = []
     agrees = np.ones(len(measurements), dtype=bool)
@@ -251,6 +248,16 @@ def _passed(
                 x, S = block_update(x, S, H, innovation, ones)
         steps.append(Step(j, prediction, x, S))
     return _Passed(begin, steps, innovations, agrees, used)
+
+
+def _hardly_known(tracker: Tracker, measurement: RowMeasurement, state: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """State before the first row and a square root of its covariance, by the size of a state there."""
+    n = tracker.motion.n_states
+    offset = measurement.place_in_array(state, np.eye(state.size))[0]
+    sigma = _UNKNOWN * np.repeat([np.linalg.norm(offset), np.linalg.norm(state[3:6])], 3)
+    x, S = np.zeros(state.size), np.diag(np.concatenate([np.zeros(n), tracker.error_sigma]))
+    x[:n], S[:n, :n] = tracker.motion.start(state[:N_SOURCE], np.diag(sigma))
+    return x, S
 
 
 def _points(tracker: Tracker, measurements: Sequence[RowMeasurement], passed: _Passed) -> list[TrackPoint]:
