@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal  # noqa: F401 - of an inherited option
+from typing import TYPE_CHECKING, Annotated, Any, Literal  # noqa: F401 - of an inherited option
 
 from cyclopts import Parameter
 
@@ -237,35 +237,22 @@ def track(
         with named:
             found = _moments(used, rows, path, motion, smooth=smooth)
         write_moment_tracks(found, readings, known, outputs)
-    elif number is not None:
-        if on_background:
-            raise InputError("--sources: found it together with --detrend or --high-pass-hz, expected one of them.")
-        with progress(len(rows), "rows", quiet=common.quiet) as advance, named:
-            tracks = magloc.track_sources(
-                used,
-                rows,
-                sources=number,
-                motion=motion.model_of_several(),
-                prior=known.prior,
-                progress=advance,
-                told=motion.print_entry if jsonl else None,
-            )
-        _write_sources(tracks, str(readings), outputs, single=number == 1)
-    else:
-        few = used.n_channels <= _FEW_CHANNELS and rows.array_rotation is not None
-        if few and not common.quiet:
-            print_note(_USE_SURVEY)
-        with progress(len(rows), "rows", quiet=common.quiet) as advance, named:
-            one = magloc.track(
-                used,
-                rows,
-                motion=model,
-                smooth=smooth,
-                prior=known.prior,
-                progress=advance,
-                told=motion.print_entry if jsonl else None,
-            )
+        return
+    few = used.n_channels <= _FEW_CHANNELS and rows.array_rotation is not None
+    if number is not None and on_background:
+        raise InputError("--sources: found it together with --detrend or --high-pass-hz, expected one of them.")
+    if number is None and few and not common.quiet:
+        print_note(_USE_SURVEY)
+    with progress(len(rows), "rows", quiet=common.quiet) as advance, named:
+        alike: Any = {"prior": known.prior, "progress": advance, "told": motion.print_entry if jsonl else None}
+        if number is None:
+            one = magloc.track(used, rows, motion=model, smooth=smooth, **alike)
+        else:
+            several = magloc.track_sources(used, rows, sources=number, motion=motion.model_of_several(), **alike)
+    if number is None:
         _write_track(one, str(readings), known, outputs, f"; {_USE_SURVEY}" if few else "")
+    else:
+        _write_sources(several, str(readings), outputs, single=number == 1)
 
 
 def _moments(

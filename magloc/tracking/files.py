@@ -1,4 +1,4 @@
-"""Tracks as a table for people, and for other programs: JSON, GeoJSON, KML, xarray."""
+"""Tracks as a table, CSV, JSON, GeoJSON, KML and xarray, of one source or of several."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ _COLUMNS = {
 
 
 def lines_of_track(points: Sequence[TrackPoint | SourcesPoint], *, most: int | None = None) -> list[str]:
-    """Aligned lines: a header, then one for every source in every row, or in the first and last ones of `most` rows."""
+    """Return aligned lines: a header, then one for every source of every row, or of the first and last of `most`."""
     shown = list(points)
     if most is not None and len(shown) > most:
         shown = shown[: most // 2] + shown[-(most // 2) :]

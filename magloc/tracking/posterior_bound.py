@@ -9,8 +9,6 @@ from dataclasses import replace
 import numpy as np
 
 from arrays.typing import FloatArray
-from magloc.kalman import block_update
-from magloc.tracking.chart.known_moment import KnownInWorld
 from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.chart.start import prior_root
 from magloc.tracking.results import Row, Step
@@ -69,15 +67,9 @@ def _steps_at_truth(
     first = next(seen, None)
     if first is None:
         return []
-    S = np.diag(np.concatenate([np.zeros(motion.n_states), tracker.error_sigma]))
     root = prior_root(ChartRow.of(measurements[first]).chart(truth[first]))
-    x, S[: motion.n_states, : motion.n_states] = motion.start(truth[first], root)
-    x = np.concatenate([x, np.zeros(n_errors)])
-    known = KnownInWorld.of(tracker.prior, rows[first].R_world_from_array)
-    if known is not None:
-        H = known.along(x[None], np.eye(len(x))[None])[0]
-        x, S = block_update(x, S, H, np.zeros(len(H)), np.ones(len(H)))
-    steps = steps_of(tracker, measurements[first:], states[first:], (x, S))
+    start = tracker.state_before(states[first], root, rows[first].R_world_from_array)
+    steps = steps_of(tracker, measurements[first:], states[first:], start)
     return [replace(step, row=first + step.row) for step in steps]
 
 

@@ -1,4 +1,4 @@
-"""What goes into a track row by row, and what comes out of it."""
+"""Rows of readings for a tracker, and the points of tracks, of one source or of several."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ class Innovation:
 
 @dataclass(frozen=True, eq=False)
 class TrackPoint:
-    """What is known of the source at one instant; None where it is not tracked.
+    """State of the source at one instant; None where it is not tracked.
 
     Attributes
     ----------
@@ -102,7 +102,7 @@ class TrackPoint:
     covariance : ndarray, shape (6, 6)
         Of (position, moment).
     estimability : ndarray, shape (6,)
-        What the readings taught of every component since the track began: 1 - σ / σ without any of them.
+        Share of every σ that the readings took away since the track began: 1 - σ / σ without any of them.
     iterations : int
         Linearisations.
     nis : float
@@ -112,7 +112,7 @@ class TrackPoint:
         the track, not used), "undetermined" (no track yet: what rows of few readings say together so far), or why
         there is no track.
     weight : float
-        How likely the place is the right one of all that explain the readings so far. NaN without a track.
+        Probability that the place is the right one of all that explain the readings so far. NaN without a track.
     rivals : tuple of Solution
         Where a track starts from several rows, the other solutions of these.
     centroid_m : ndarray, shape (3,), optional

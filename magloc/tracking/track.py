@@ -1,4 +1,4 @@
-"""The one door to a track: one source followed through the rows of readings."""
+"""Follow one source through the rows of readings, and the results of tracks."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ class TrackColumns(TrackRows[TrackPoint]):
 
     @cached_property
     def estimability(self) -> FloatArray:
-        """What the readings taught since the track began (n, 6): 1 - σ / σ without any of them."""
+        """Share of the σ that the readings took away since the track began (n, 6): 1 - σ / σ without any of them."""
         return stacked(self, "estimability", 6)
 
     @cached_property
@@ -131,7 +131,7 @@ class TrackColumns(TrackRows[TrackPoint]):
 
     @cached_property
     def weight(self) -> FloatArray:
-        """How likely the track is the right one (n,)."""
+        """Probability that the track is the right one (n,)."""
         return stacked(self, "weight")
 
     @property
@@ -141,7 +141,7 @@ class TrackColumns(TrackRows[TrackPoint]):
 
     @property
     def status(self) -> list[str]:
-        """How every row was used, or why there is no track."""
+        """Use of every row, or the reason why there is no track."""
         return [point.status for point in self]
 
     @property
@@ -160,11 +160,11 @@ class TrackColumns(TrackRows[TrackPoint]):
         return TrackResult(self.points, is_truth=False)
 
     def to_xarray(self) -> xr.Dataset:
-        """Columns with units and names, along `row`."""
+        """Return a dataset of columns with units and names, along `row`."""
         return dataset_of_track(self)
 
     def to_geojson(self, place: Vector) -> dict[str, Any]:
-        """A FeatureCollection: one point of a source at rest, else a line for every unbroken part and a point a row.
+        """Return a FeatureCollection: a point of a source at rest, else a line for every unbroken part, a point a row.
 
         A source is at rest if no row puts it elsewhere than the best one does, by more than both are uncertain; the
         point is that of the best row, and its σ are too.
@@ -182,7 +182,7 @@ class TrackColumns(TrackRows[TrackPoint]):
         return geojson_of_track(self, place)
 
     def to_kml(self, place: Vector) -> str:
-        """The same as placemarks: one of a source at rest, else the track and its ends; ``place`` as before."""
+        """Return placemarks in KML: one of a source at rest, else the track and its ends; ``place`` as before."""
         return kml_of_track(self, place)
 
 
@@ -195,11 +195,11 @@ class Track(TrackColumns):
     Attributes
     ----------
     points : tuple of TrackPoint
-        Of every row.
+        One of every row.
     readings : Readings
-        That they were found from.
+        Readings that were used.
     tracker : Tracker
-        That found them.
+        Filter that found the points.
     is_smoothed : bool
         Whether later rows were used too.
 
@@ -223,7 +223,7 @@ class Track(TrackColumns):
 
     @cached_property
     def innovations(self) -> InnovationTest:
-        """Whether the readings agree with what is stated of sensors, pose and motion."""
+        """Test of the readings against what is stated of sensors, pose and motion."""
         test = innovation_test(self)
         if self.readings.motion is not None:  # whose steps the test does not have
             return test
@@ -237,12 +237,12 @@ class Track(TrackColumns):
         )
 
     def table(self) -> str:
-        """The table that ``magloc track`` prints, and what is wrong with the track."""
+        """Return the table that ``magloc track`` prints, and what is wrong with the track."""
         test = self.innovations
         return "\n".join([super().table(), *filter(None, (test.reason, test.caution))])
 
     def consistency(self, truth: Truth) -> Consistency:
-        """Errors of the track, its NEES and its NIS, and the least error that is possible where the moment is known.
+        """Return errors of the track, its NEES and NIS, and the least error that is possible where the moment is known.
 
         Raises
         ------

@@ -1,11 +1,11 @@
-"""The door to tracks of several moving sources."""
+"""Follow several moving sources through the rows of readings."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from numpy.typing import ArrayLike
 
@@ -17,9 +17,6 @@ from magloc.tracking.multi_target.motion import FreeMotion
 from magloc.tracking.multi_target.tracker import SourcesTracker
 from magloc.tracking.results import SourcesPoint, TrackPoint, TrackResult, rows_of, warn_of_strengths
 from magloc.tracking.track import TrackColumns, TrackRows, finished
-
-if TYPE_CHECKING:
-    pass
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -38,9 +35,9 @@ class SourcesTrack(TrackRows[SourcesPoint]):
     Attributes
     ----------
     points : tuple of SourcesPoint
-        Of every row.
+        One of every row.
     readings : Readings
-        That they were found from.
+        Readings that were used.
 
     Examples
     --------
@@ -58,7 +55,7 @@ class SourcesTrack(TrackRows[SourcesPoint]):
 
     @cached_property
     def ids(self) -> tuple[int, ...]:
-        """All ids, in the order in which they were first told."""
+        """All ids, in the order in which the sources were first reported."""
         return tuple(sorted({track.id for point in self for track in point.tracks}))
 
     @property
@@ -67,7 +64,7 @@ class SourcesTrack(TrackRows[SourcesPoint]):
         return tuple(sorted({name for point in self for name in point.dropped_sensors}))
 
     def of(self, id: int) -> SourceTrack:
-        """One source through all rows.
+        """Return one source through all rows.
 
         Raises
         ------

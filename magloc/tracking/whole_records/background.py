@@ -225,7 +225,11 @@ def _passed(
     start: tuple[FloatArray, FloatArray] | None = None,
 ) -> _Passed:
     """One forward pass over rows that are linearised at some states; by default from a source that is hardly known."""
-    x, S = start or _hardly_known(tracker, measurements[0], states[0])
+    if start is None:
+        offset = measurements[0].place_in_array(states[0], np.eye(states[0].size))[0]
+        sigma = _UNKNOWN * np.repeat([np.linalg.norm(offset), np.linalg.norm(states[0][3:6])], 3)
+        start = tracker.state_before(states[0], np.diag(sigma))
+    x, S = start
     steps: list[Step] = []
     innovations: list[Innovation | None] = []
     agrees = np.ones(len(measurements), dtype=bool)
@@ -248,16 +252,6 @@ def _passed(
                 x, S = block_update(x, S, H, innovation, ones)
         steps.append(Step(j, prediction, x, S))
     return _Passed(begin, steps, innovations, agrees, used)
-
-
-def _hardly_known(tracker: Tracker, measurement: RowMeasurement, state: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """State before the first row and a square root of its covariance, by the size of a state there."""
-    n = tracker.motion.n_states
-    offset = measurement.place_in_array(state, np.eye(state.size))[0]
-    sigma = _UNKNOWN * np.repeat([np.linalg.norm(offset), np.linalg.norm(state[3:6])], 3)
-    x, S = np.zeros(state.size), np.diag(np.concatenate([np.zeros(n), tracker.error_sigma]))
-    x[:n], S[:n, :n] = tracker.motion.start(state[:N_SOURCE], np.diag(sigma))
-    return x, S
 
 
 def _points(tracker: Tracker, measurements: Sequence[RowMeasurement], passed: _Passed) -> list[TrackPoint]:
