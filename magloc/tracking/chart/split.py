@@ -3,10 +3,11 @@ r"""Components of a mixture that are divided where a row's readings bend over th
 A Gaussian stays one under readings that are linear over its width. Along a principal axis of log-range and direction,
 one standard deviation v of the whole state changes the predicted readings, in units of their noise, by an odd part
 :math:`g = \tfrac12 (h(v) - h(-v))` and an even part :math:`c = \tfrac12 (h(v) + h(-v)) - h(0)`. A linearisation leaves
-out the even part, in every row alike. Over as many rows as determine the axis by themselves, :math:`1/|g|^2`, but at most
-the n rows that the component remembers, it adds up to
+out the even part, of which :math:`c / (1 + |g|^2)` remains within what the row leaves open of the axis. It does so in
+every row alike. Over as many rows as determine the axis by themselves, :math:`1/|g|^2`, but at most the n rows that the
+component remembers, it adds up to
 
-.. math:: \beta = |c| \sqrt{\min(\max(|g|^{-2}, 1), n)}
+.. math:: \beta = \frac{|c|}{1 + |g|^2} \sqrt{\min(\max(|g|^{-2}, 1), n)}
 
 standard deviations of the readings' noise. A component with :math:`\beta > 1` becomes three along that axis, which have
 the same mean and covariance together. The update's bent prediction (:mod:`magloc.tracking.chart.update`) treats what is
@@ -71,7 +72,7 @@ def bends(mixture: Mixture, row: ChartRow) -> tuple[FloatArray, FloatArray]:
     plus, minus = (row.of_source(chart.retracted(sign * steps)).reshape(K, 3, -1) for sign in (1.0, -1.0))
     odd = 0.25 * np.sum((plus - minus) ** 2, axis=-1)
     even = np.sum((0.5 * (plus + minus) - row.of_source(mixture.x[:, :n])[:, None]) ** 2, axis=-1)
-    bend = np.sqrt(even * np.clip(1.0 / odd, 1.0, min(mixture.n_rows, MOST_ROWS)))
+    bend = np.sqrt(even * np.clip(1.0 / odd, 1.0, min(mixture.n_rows, MOST_ROWS))) / (1.0 + odd)
     return np.where(np.isfinite(bend), bend, 0.0), axes
 
 
