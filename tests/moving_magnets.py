@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import time
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -20,7 +21,9 @@ import sims
 from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray
 from magloc.fields import dipole
-from magloc.tracking.multi_target.results import SourcesPoint
+
+if TYPE_CHECKING:
+    from magloc.tracking.multi_target.results import SourcesPoint
 
 RATE_HZ = 100.0
 NOISE_T = 5e-7
