@@ -38,7 +38,7 @@ def main() -> int:
     if given.list:
         print("\n".join(f"{name}: seeds {SCENARIOS[name].seeds}" for name in names))
         return 0
-    old = stored() if given.compare or given.only or given.quick else {}
+    old = stored() if given.compare or len(names) < len(SCENARIOS) else {}
     new: dict[str, Figures] = {}
     begin = time.perf_counter()
     for name, figures in figures_of(names, given.jobs):

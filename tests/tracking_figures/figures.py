@@ -3,8 +3,8 @@
 A figure is worse where its distance from the ideal grows by more than a tenth and a slack. The slack is the standard
 deviation that the figure of a right tracker has by chance if its rows are independent: √(2/n) of a NEES of n numbers,
 √(0.95 · 0.05/n) of the coverage of n sets, and 1/√(6 n) of the rms error of n places, relative, as a mean of 3 n
-squares has √(2/(3 n)). A median is worth 2/π of a mean, √(π/n). Errors of successive rows are alike, so that true
-scatter is larger; but old and new figures are of the same readings. Counts have no slack.
+squares has √(2/(3 n)). A median over runs scatters √(π/2) times as much as a mean. Errors of successive rows are alike,
+so that true scatter is larger; but old and new figures are of the same readings. Counts have no slack.
 """
 
 from __future__ import annotations
@@ -41,6 +41,8 @@ class Run:
         95 % range sets that hold the truth, and all of them.
     rms_m, bound_m : float
         Error, and the posterior bound of the same rows; A·m² where the place is known.
+    late_m, late_bound_m : float
+        The same after the first eighth of the rows.
     counts : dict
         Of what should not be: swaps, rows with a source too many.
     wrong : tuple of str
@@ -58,6 +60,8 @@ class Run:
     sets: int = 0
     rms_m: float = math.nan
     bound_m: float = math.nan
+    late_m: float = math.nan
+    late_bound_m: float = math.nan
     counts: dict[str, int] = field(default_factory=dict)
     wrong: tuple[str, ...] = ()
     cpu: float = math.nan
@@ -76,6 +80,8 @@ class Figures:
     coverage: float | None
     sets: int
     ratio: float | None
+    ratio_late: float | None
+    ratio_median: float | None
     rms_m: float | None
     broken: int
     counts: dict[str, int]
@@ -87,7 +93,10 @@ class Figures:
     @classmethod
     def of(cls, runs: Sequence[Run]) -> Figures:
         """Pooled over runs: errors and bounds are root mean squares."""
-        nees, rms, bound = (np.array([getattr(run, name) for run in runs]) for name in ("nees", "rms_m", "bound_m"))
+        nees, rms, bound, late, late_bound = (
+            np.array([getattr(run, name) for run in runs])
+            for name in ("nees", "rms_m", "bound_m", "late_m", "late_bound_m")
+        )
         sets = sum(run.sets for run in runs)
         counts: dict[str, int] = {}
         for run in runs:
@@ -98,11 +107,13 @@ class Figures:
             tracked=sum(run.tracked for run in runs),
             nees=_mean(nees),
             nees_late=_mean(np.array([run.nees_late for run in runs])),
-            nees_median=_rounded(float(np.median(nees[np.isfinite(nees)]))) if np.isfinite(nees).any() else None,
+            nees_median=_median(nees),
             nees_numbers=sum(run.nees_numbers for run in runs),
             coverage=_rounded(sum(run.held for run in runs) / sets) if sets else None,
             sets=sets,
-            ratio=_rounded(math.sqrt(float(np.mean(rms**2) / np.mean(bound**2)))) if np.isfinite(bound).all() else None,
+            ratio=_rounded(math.sqrt(float(np.mean(rms**2) / np.mean(bound**2)))),
+            ratio_late=_rounded(math.sqrt(float(np.mean(late**2) / np.mean(late_bound**2)))),
+            ratio_median=_median(rms / bound),
             rms_m=_root_mean_square(rms),
             broken=int(np.sum(nees > BROKEN)),
             counts=counts,
@@ -131,6 +142,10 @@ def _mean(values: np.ndarray) -> float | None:
     return _rounded(float(np.nanmean(values))) if np.isfinite(values).any() else None
 
 
+def _median(values: np.ndarray) -> float | None:
+    return _rounded(float(np.median(values[np.isfinite(values)]))) if np.isfinite(values).any() else None
+
+
 def _root_mean_square(values: np.ndarray) -> float | None:
     return None if (square := _mean(values**2)) is None else _rounded(math.sqrt(square))
 
@@ -148,12 +163,13 @@ class Comparison:
 
 def compared(old: Figures, new: Figures) -> list[Comparison]:
     """All figures of a scenario."""
-    late = math.ceil(old.nees_numbers * (1.0 - 1.0 / FIRST_ROWS))
-    places = max(old.nees_numbers / N_STATES, 1.0)
+    late, of_median = 1.0 - 1.0 / FIRST_ROWS, math.sqrt(0.5 * math.pi)
+    of_nees = math.sqrt(2.0 / max(old.nees_numbers, 1))
+    of_error = 1.0 / math.sqrt(max(old.nees_numbers, 1))  # six numbers a place
     found = [
-        _distance("nees", old.nees, new.nees, 1.0, math.sqrt(2.0 / max(old.nees_numbers, 1))),
-        _distance("nees_late", old.nees_late, new.nees_late, 1.0, math.sqrt(2.0 / max(late, 1))),
-        _distance("nees_median", old.nees_median, new.nees_median, 1.0, math.sqrt(math.pi / max(old.nees_numbers, 1))),
+        _distance("nees", old.nees, new.nees, 1.0, of_nees),
+        _distance("nees_late", old.nees_late, new.nees_late, 1.0, of_nees / math.sqrt(late)),
+        _distance("nees_median", old.nees_median, new.nees_median, 1.0, of_nees * of_median),
         _distance(
             "coverage",
             old.coverage,
@@ -163,12 +179,13 @@ def compared(old: Figures, new: Figures) -> list[Comparison]:
         ),
     ]
     # An error below the bound is no fault: what is asked is that it does not grow.
-    if old.ratio is not None:
-        slack = LARGEST_GROWTH * abs(old.ratio - 1.0) + old.ratio / math.sqrt(6.0 * places)
-        found.append(_at_most("ratio", old.ratio, new.ratio, old.ratio + slack))
-    elif old.rms_m is not None:
-        slack = LARGEST_GROWTH * old.rms_m + old.rms_m / math.sqrt(6.0 * places)
-        found.append(_at_most("rms_m", old.rms_m, new.rms_m, old.rms_m + slack))
+    ratios = (("ratio", of_error), ("ratio_late", of_error / math.sqrt(late)), ("ratio_median", of_error * of_median))
+    for name, relative in ratios:
+        if (of_old := getattr(old, name)) is not None:
+            most = of_old + LARGEST_GROWTH * abs(of_old - 1.0) + of_old * relative
+            found.append(_at_most(name, of_old, getattr(new, name), most))
+    if old.ratio is None and old.rms_m is not None:
+        found.append(_at_most("rms_m", old.rms_m, new.rms_m, old.rms_m * (1.0 + LARGEST_GROWTH + of_error)))
     found.append(Comparison("tracked", old.tracked, new.tracked, new.tracked < old.tracked, f">= {old.tracked}"))
     found.append(_at_most("broken", old.broken, new.broken, old.broken))
     for name in dict.fromkeys([*old.counts, *new.counts]):

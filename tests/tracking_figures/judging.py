@@ -82,6 +82,10 @@ def judged(seed: int, track: magloc.Track, truth: Truth, expected: Expected, clo
     result = track.consistency(truth)
     late = slice(len(track) // FIRST_ROWS, None)
     n_late = int(result.nees_dof[late].sum())
+    answered = np.isfinite(track.position_m).all(axis=1) & np.isfinite(result.true_position_m).all(axis=1)
+    answered[: late.start] = False
+    errors = np.linalg.norm(track.position_m - result.true_position_m, axis=1)[answered]
+    bounds = np.full(len(errors), np.nan) if result.bound_m is None else result.bound_m[answered]
     sets = [
         _holds(point, place)
         for point, place in zip(track, result.true_position_m, strict=True)
@@ -97,10 +101,16 @@ def judged(seed: int, track: magloc.Track, truth: Truth, expected: Expected, clo
         sets=len(sets),
         rms_m=result.position_rms_m,
         bound_m=result.position_bound_m,
+        late_m=root_mean_square(errors),
+        late_bound_m=root_mean_square(bounds),
         counts={"unanswered": sum(point.position_m is None for point in track)},
         wrong=(*wrong_names(track.dropped_sensors, expected.faulty), *_wrong_flags(track, expected.flagged)),
         cpu=clock.ratio,
     )
+
+
+def root_mean_square(values: FloatArray) -> float:
+    return math.sqrt(float(np.mean(values**2))) if len(values) else math.nan
 
 
 def _holds(point: magloc.TrackPoint, true_m: FloatArray) -> bool:

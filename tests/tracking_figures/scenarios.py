@@ -15,15 +15,14 @@ QUICK = (
     "paper",
     "weaving",
     "first rows, walk",
-    "sensor zero, four",
     "gaps",
-    "pose, walk and mounting",
-    "moduli, ambient 500 nT",
+    "carrier, vectors",
+    "moduli, ambient exact",
     "known modulus, 8 m",
-    "known motion",
-    "two magnets, auto",
+    "one magnet, auto",
+    "two magnets, told",
     "stream, first rows",
-    "stream, faulty sensor",
+    "stream, two magnets",
 )
 """Those of ``make test``, some seconds together; the others are slow."""
 

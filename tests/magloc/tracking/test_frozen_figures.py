@@ -11,7 +11,7 @@ from tests.tracking_figures.figures import Comparison, Figures, Run, compared
 from tests.tracking_figures.scenarios import QUICK, SCENARIOS, stored
 
 OLD = stored()
-LIKE = Run(1, 100, 1.2, 1.1, 600, 96, 100, 1.1, 1.0, {"swaps": 0}, ("s1 is well",))
+LIKE = Run(1, 100, 1.2, 1.1, 600, 96, 100, 1.1, 1.0, 1.1, 1.0, {"swaps": 0}, ("s1 is well",))
 
 
 def worse(**changes: object) -> list[str]:
@@ -59,6 +59,8 @@ class TestComparison:
             # A tenth of 0.1, and 1.1/√600 = 0.045.
             ({"rms_m": 1.15}, []),
             ({"rms_m": 1.16}, ["ratio"]),
+            ({"rms_m": 1.17}, ["ratio", "ratio_median"]),
+            ({"late_m": 1.16}, ["ratio_late"]),
             ({"tracked": 99}, ["tracked"]),
             ({"counts": {"swaps": 1}}, ["swaps"]),
             ({"counts": {"swaps": 0, "rows that differ": 1}}, ["rows that differ"]),
