@@ -192,7 +192,7 @@ def compared(old: Figures, new: Figures) -> list[Comparison]:
         of_old = old.counts.get(name, 0)
         found.append(_at_most(name, of_old, new.counts.get(name, 0), of_old))
     found.append(Comparison("wrong", old.wrong, new.wrong, bool(set(new.wrong) - set(old.wrong)), "no others"))
-    return found
+    return [one for one in found if one.old is not None or one.new is not None]
 
 
 def _distance(name: str, old: float | None, new: float | None, ideal: float, slack: float) -> Comparison:

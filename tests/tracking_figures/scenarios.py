@@ -20,9 +20,8 @@ QUICK = (
     "moduli, ambient exact",
     "known modulus, 8 m",
     "one magnet, auto",
-    "two magnets, told",
+    "two magnets, first seconds",
     "stream, first rows",
-    "stream, two magnets",
 )
 """Those of ``make test``, some seconds together; the others are slow."""
 

@@ -87,6 +87,7 @@ def recorded_board(seed: int) -> Run:
 
 RUNS: dict[str, tuple[Callable[[int], Run], range]] = {
     "one magnet, auto": (partial(magnets, 1, 2.0, "auto"), range(1000, 1003)),
+    "two magnets, first seconds": (partial(magnets, 2, 2.0, "auto"), range(20010, 20014)),
     "two magnets, told": (partial(magnets, 2, 4.0, 2), range(20000, 20006)),
     "two magnets, auto": (partial(magnets, 2, 6.0, "auto"), range(20000, 20008)),
     "three magnets, told": (partial(magnets, 3, 4.0, 3), range(20000, 20006)),
