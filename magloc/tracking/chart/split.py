@@ -30,8 +30,10 @@ MOST_COMPONENTS = 80
 """Number of components beyond which none is divided."""
 MOST_ROWS = 400
 """Number of rows that a component remembers at most."""
-# Weights, means and standard deviation of three normal densities that approximate one.
-_WEIGHTS, _MEANS, _SIGMA = np.array([0.2252246, 0.5495508, 0.2252246]), np.array([-1.0575155, 0.0, 1.0575155]), 0.6715662
+# Weights and standard deviation of three normal densities that approximate one (DeMars, Bishop and Jah, 2013), and means
+# that keep its variance.
+_WEIGHTS, _SIGMA = np.array([0.2252246, 0.5495508, 0.2252246]), 0.6715662
+_MEANS = np.sqrt((1.0 - _SIGMA**2) / (2.0 * _WEIGHTS[0])) * np.array([-1.0, 0.0, 1.0])
 # Logarithm of a weight, against the heaviest one, below which a component is not divided.
 _LIGHT = -7.0
 _MOST_ROUNDS = 4
