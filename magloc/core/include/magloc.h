@@ -586,6 +586,97 @@ int64_t magloc_joint_state_after(const magloc_joint_posterior *problem, int64_t 
 int64_t magloc_joint_bend(const magloc_joint_bends *problem, int64_t begin, int64_t end, double *workspace);
 int64_t magloc_joint_smooth(const magloc_joint_smoothing *problem, int64_t begin, int64_t end, double *workspace);
 
+/* Rows of readings of an array, as they depend on sources: n_readings combinations of channels, in units of their
+   noise; a row of fewer ones has zeros behind them. */
+typedef struct {
+  int64_t n_sensors, n_channels, n_readings, n_nuisances;
+  const double *sensors; /* (n_sensors, 3) */
+  double array_centroid[3], radius;
+  const int64_t *sensor;           /* (n_channels) of each channel, ascending */
+  const double *gain;              /* (n_channels, 3); of a modulus the first number counts */
+  const uint8_t *is_modulus;       /* (n_channels) */
+  const double *readings;          /* (n_rows, n_readings) */
+  const int64_t *counts;           /* (n_rows) of readings */
+  const double *transforms;        /* (n_transforms, n_readings, n_channels) from channels to readings */
+  const int64_t *transform_of_row; /* (n_rows) */
+  const double *effects;           /* (n_effects, n_readings, n_nuisances) of nuisances on readings */
+  const int64_t *effect_of_row;    /* (n_rows) */
+  const double *origins;           /* (n_rows, 3) of the array */
+  const double *rotations;         /* (n_rows, 3, 3) to the world from the array */
+  const double *ambients;          /* (n_ambients, n_sensors, 3) field */
+  const int64_t *ambient_of_row;   /* (n_rows) */
+} magloc_rows;
+
+/* Gaussians, each of the states of several sources: n_states numbers of each source, 6 (position and moment), 9 (the
+   velocity as well) or more, and behind them nuisances that are linear in the readings. magloc/tracking/chart explains
+   the chart. */
+typedef struct {
+  int64_t n_sources, n_states, n_nuisances;
+  int64_t power; /* of the range, 3 or 4, with which readings fall */
+  double firm;   /* share of a moment that is open, below which strength and direction are its coordinates */
+  double *x;     /* (n, N) means, N = n_sources n_states + n_nuisances */
+  double *roots; /* (n, N, N) of the covariances in the charts about them */
+} magloc_sources;
+
+/* Steps of a source: transition F and root of its noise, which are A + |m| B, or those of a rate of turn that lasts
+   (n_states = 12, n_noise = 15). With `moved`, one step for each source of each Gaussian. */
+typedef struct {
+  int64_t n_noise;
+  const double *F;       /* (n_steps, n_states, n_states) */
+  const double *A, *B;   /* (n_steps, n_states, n_noise); B may be null */
+  const double *moved;   /* (n, n_sources, n_states) after the steps, or null */
+  const double *turning; /* (n_steps, 12), or null: part of a second that velocities last, part that is kept of them,
+                            both of rates of turn; lower root (00, 10, 11) of the noise of position and velocity,
+                            of turn and rate; noise of the moment, relative to it, across and along */
+  const double *kept, *added; /* (n_steps, n_nuisances) of nuisances, and standard deviation of their noise; or null */
+  const int64_t *step_of_row; /* (n_rows) */
+} magloc_motion;
+
+/* When an iterated update has converged. */
+typedef struct {
+  double tolerance;            /* of the next step, in standard deviations */
+  double least_gain, rounding; /* a step that gains less, of what a linear problem would, is halved */
+  int64_t max_iterations;
+} magloc_convergence;
+
+/* Prediction of all Gaussians to a row; an item is a Gaussian, as of the next problems. */
+typedef struct {
+  const magloc_sources *before, *after;
+  const magloc_motion *motion;
+  const magloc_rows *rows;
+  int64_t row;
+  double centroid[3]; /* of the sensors, before */
+} magloc_row_prediction;
+int64_t magloc_predict_row(const magloc_row_prediction *problem, int64_t begin, int64_t end, double *workspace);
+
+/* Update of all Gaussians by a row. */
+typedef struct {
+  const magloc_sources *before, *after;
+  const magloc_rows *rows;
+  const magloc_convergence *convergence;
+  int64_t row;
+  double followed;      /* variance that readings have beside their noise in the test of sensors */
+  double *nis, *chi2;   /* (n) least sum of squares, and the readings' part of it */
+  double *log_evidence; /* (n) by Laplace's method, up to a constant */
+  int64_t *iterations;  /* (n) */
+  uint8_t *converged;   /* (n) */
+  double *innovation;   /* (n, n_readings) whitened, or null */
+  double *sensor_chi2;  /* (n, n_sensors) that free readings of a sensor would explain, or null */
+} magloc_row_update;
+int64_t magloc_update_row(const magloc_row_update *problem, int64_t begin, int64_t end, double *workspace);
+
+/* How far readings bend over one sigma along the principal axes of log-range and direction of each source, in sigma of
+   as many rows as are remembered. */
+typedef struct {
+  const magloc_sources *sources;
+  const magloc_rows *rows;
+  int64_t row;
+  double memory;
+  double *bends;      /* (n, 3 n_sources) */
+  double *directions; /* (n, 3 n_sources, N): one sigma of the whole state along each axis */
+} magloc_row_bends;
+int64_t magloc_bend_row(const magloc_row_bends *problem, int64_t begin, int64_t end, double *workspace);
+
 /* end of the declarations */
 #ifdef __GNUC__
 #pragma GCC visibility pop

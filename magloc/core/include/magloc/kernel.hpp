@@ -38,7 +38,10 @@
   X(joint_update_row, joint_update)           \
   X(joint_state_after, joint_posterior)       \
   X(joint_bend, joint_bends)                  \
-  X(joint_smooth, joint_smoothing)
+  X(joint_smooth, joint_smoothing)            \
+  X(predict_row, row_prediction)              \
+  X(update_row, row_update)                   \
+  X(bend_row, row_bends)
 
 #define MAGLOC_JOIN_(a, b, c) magloc_##a##_##b##c
 #define MAGLOC_JOIN(a, b, c) MAGLOC_JOIN_(a, b, c)

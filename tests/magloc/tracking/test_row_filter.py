@@ -1,0 +1,376 @@
+"""The compiled filter of several sources: against the readable one of one source, and against formulas for more."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from decimal import Decimal, localcontext
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from arrays import geometries
+from arrays.array import SensorArray
+from magloc.measurement.differences import predicted_channels
+from magloc.tracking import row_filter
+from magloc.tracking.chart import update as readable
+from magloc.tracking.chart.coordinates import Chart
+from magloc.tracking.chart.row import ChartRow
+from magloc.tracking.motion import CoordinatedTurn, KnownMotion, MotionModel, OrnsteinUhlenbeck, RandomWalk
+from magloc.tracking.results import Row
+from magloc.tracking.row_filter import Gaussians, Rows
+from magloc.tracking.tracker import Tracker
+from tests.passing_source import MOMENT, NOISE_T, POSITION
+
+FloatArray = NDArray[np.float64]
+all_instruction_sets = pytest.mark.usefixtures("instruction_set")
+SOURCE = np.concatenate([POSITION, MOMENT])
+MOTIONS: list[MotionModel] = [
+    RandomWalk(0.1, 0.02),
+    OrnsteinUhlenbeck(0.1, 0.02),
+    CoordinatedTurn(0.1, 0.1),
+    KnownMotion(0.1, 0.01, array_rate_rad_s=(0.0, 0.02, 0.1)),
+]
+ARRAYS = [
+    geometries.tetrahedron(1.5, "vector", NOISE_T),
+    replace(geometries.cube(1.5, "scalar", NOISE_T), ambient_T=(1e-5, -2e-5, 4.5e-5)),
+]
+
+
+@dataclass(frozen=True)
+class Case:
+    """A row, and predictions of the source that it shows."""
+
+    row: ChartRow
+    x: FloatArray
+    S: FloatArray
+
+    @property
+    def gaussians(self) -> Gaussians:
+        return Gaussians(self.x, self.S, n_nuisances=self.row.effect.shape[1])
+
+
+def case(array: SensorArray, motion: MotionModel, seed: int, offset_T: float = 0.0, missing: int = 0) -> Case:
+    """A row of an array somewhere, of which some channels are missing, and three broad predictions."""
+    rng = np.random.default_rng(seed)
+    if offset_T:
+        array = replace(array, sensors=tuple(replace(one, offset_uncertainty_T=offset_T) for one in array.sensors))
+    origin, R = rng.normal(size=3), Rotation.random(rng=rng)
+    readings = predicted_channels(array, POSITION, MOMENT) + array.channel_noise_T * rng.normal(size=array.n_channels)
+    readings[rng.choice(array.n_channels, missing, replace=False)] = np.nan
+    measurements = Tracker(array, motion).measurements
+    row = ChartRow.of(measurements.of(Row(0.5, readings, origin, R.as_matrix())))
+    n, e = motion.n_states, row.effect.shape[1]
+    x = np.zeros((3, n + e))
+    of_array = SOURCE * (1.0 + 0.05 * rng.normal(size=(3, 6)))
+    x[:, :3], x[:, 3:6] = R.apply(of_array[:, :3]) + origin, R.apply(of_array[:, 3:])
+    x[:, 6:n] = 0.05 * rng.normal(size=(3, n - 6))
+    unit = float(np.linalg.norm(MOMENT) / np.linalg.norm(POSITION) ** 4)
+    sigma = np.repeat([0.05, 0.05 * unit, 0.03], [3, 3, n - 6])
+    S = np.zeros((3, n + e, n + e))
+    S[:, :n] = sigma[:, None] * rng.normal(size=(3, n, n + e)) / 2.0
+    S[:, np.arange(n, n + e), np.arange(n, n + e)] = measurements.errors.sigma
+    return Case(row, x, S)
+
+
+def covariance(S: FloatArray) -> FloatArray:
+    return np.asarray(S @ np.swapaxes(S, -1, -2))
+
+
+def assert_same_covariances(found: FloatArray, expected: FloatArray, atol: float) -> None:
+    """Of roots (..., N, N): along every direction, in units of what is known of it."""
+    for of_found, of_expected in zip(found, expected, strict=True):
+        ratio = np.linalg.solve(of_expected, of_found)
+        np.testing.assert_allclose(ratio @ ratio.T, np.eye(len(ratio)), atol=atol)
+
+
+def _decimals(matrix: FloatArray) -> NDArray[np.object_]:
+    return np.vectorize(Decimal, otypes=[object])(matrix)
+
+
+def _solved(matrix: NDArray[np.object_], right: NDArray[np.object_]) -> NDArray[np.object_]:
+    """Gauss and Jordan's elimination with pivots."""
+    n, rows = len(matrix), np.concatenate([matrix, right], axis=1)
+    for i in range(n):
+        pivot = i + int(np.argmax(np.abs(rows[i:, i])))
+        rows[[i, pivot]] = rows[[pivot, i]]
+        rows[i] = rows[i] / rows[i, i]
+        for j in range(n):
+            if j != i:
+                rows[j] = rows[j] - rows[j, i] * rows[i]
+    return rows[:, n:]
+
+
+class TestOneSource:
+    @all_instruction_sets
+    @pytest.mark.parametrize("array", ARRAYS, ids=["vector", "scalar"])
+    @given(motion=st.sampled_from(MOTIONS), seed=st.integers(0, 2**32), missing=st.integers(0, 2))
+    @settings(max_examples=25)
+    def test_update_is_the_readable_one(self, array: SensorArray, motion: MotionModel, seed: int, missing: int) -> None:
+        at = case(array, motion, seed, missing=missing)
+        expected = readable.updated(at.x, at.S, at.row, np.zeros(3, dtype=bool))
+        found = row_filter.update(at.gaussians, Rows.of(at.row), innovation=True)
+        np.testing.assert_array_equal(found.converged, expected.converged)
+        good = expected.converged
+        np.testing.assert_array_equal(found.iterations[good], expected.iterations[good])
+        np.testing.assert_allclose(found.nis[good], expected.nis[good], rtol=1e-7, atol=1e-7)
+        np.testing.assert_allclose(found.chi2[good], expected.chi2[good], rtol=1e-7, atol=1e-7)
+        np.testing.assert_allclose(found.log_evidence[good], expected.log_evidence[good], rtol=1e-7, atol=1e-7)
+        assert found.innovation is not None
+        for i in np.flatnonzero(good):
+            np.testing.assert_allclose(found.innovation[i], expected.whitened_innovation(i), rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(found.after.x[good], expected.x[good], rtol=1e-7, atol=1e-7)
+        assert_same_covariances(found.after.S[good], expected.S[good], 1e-6)
+
+    @all_instruction_sets
+    @given(motion=st.sampled_from(MOTIONS), seed=st.integers(0, 2**32), offset_T=st.sampled_from([4e-9, 2e-5]))
+    @settings(max_examples=15)
+    def test_update_with_offsets(self, motion: MotionModel, seed: int, offset_T: float) -> None:
+        """Both end within 1e-3 σ of the optimum, where the cost is flat."""
+        at = case(ARRAYS[0], motion, seed, offset_T)
+        expected = readable.updated(at.x, at.S, at.row, np.zeros(3, dtype=bool))
+        found = row_filter.update(at.gaussians, Rows.of(at.row))
+        assert found.converged.all()
+        np.testing.assert_allclose(found.nis, expected.nis, atol=3e-6)
+        np.testing.assert_allclose(found.log_evidence, expected.log_evidence, atol=3e-3)
+        for x, x_expected, S in zip(found.after.x, expected.x, expected.S, strict=True):
+            assert (
+                np.linalg.norm((x - x_expected)[at.row.n_motion :] / np.linalg.norm(S, axis=1)[at.row.n_motion :])
+                < 2e-3
+            )
+
+    @all_instruction_sets
+    @given(motion=st.sampled_from(MOTIONS), seed=st.integers(0, 2**32), offset_T=st.sampled_from([0.0, 4e-9, 2e-5]))
+    @settings(max_examples=25)
+    def test_prediction_is_the_readable_one(self, motion: MotionModel, seed: int, offset_T: float) -> None:
+        at = case(ARRAYS[0], motion, seed, offset_T)
+        n, e = motion.n_states, at.row.effect.shape[1]
+        centroid = at.row.centroid_m + np.array([0.3, -0.2, 0.1])
+        kept, added = np.full(e, 0.99), np.where(np.arange(e) % 2, 1e-9, 0.0)
+        moved, F, S_q = (np.stack(part) for part in zip(*(motion.step(x, 0.5) for x in at.x[:, :n]), strict=True))
+        x = np.concatenate([moved, kept * at.x[:, n:]], axis=1)
+        before = Chart.at(at.x[:, :n], centroid, at.row.radius_m)
+        expected = readable.predicted_root(before, at.row.chart(moved), at.S, readable.Move(F, S_q, kept, added))
+        steps = row_filter.steps_problem(
+            motion, [0.5], np.zeros(1, dtype=np.intp), (kept[None], added[None]), at.x[:, :n]
+        )
+        found = row_filter.predict(at.gaussians, centroid, steps, Rows.of(at.row))
+        np.testing.assert_allclose(found.x, x, rtol=1e-12, atol=1e-12)
+        assert_same_covariances(found.S, expected, 1e-6)
+
+    @all_instruction_sets
+    @pytest.mark.parametrize("offset_T", [0.0, 2e-5])
+    def test_covariance_keeps_what_is_known_a_million_times_better(self, offset_T: float) -> None:
+        """Offsets of 20 µT beside 0.2 nT of noise, by the same formula with fifty digits."""
+        at = case(ARRAYS[0], RandomWalk(0.1, 0.02), 3, offset_T)
+        found = row_filter.update(at.gaussians, Rows.of(at.row)).after
+        n = at.row.n_motion
+        for before, x, S_before, S in zip(at.x, found.x, at.S, found.S, strict=True):
+            chart = at.row.chart(before[None, :n]).firmly(S_before[None])
+            after = at.row.chart(x[None, :n])
+            fit = least_squares(
+                lambda e, chart=chart, x=x: chart.retracted(e[None])[0] - x[:n], np.zeros(n), xtol=1e-15, x_scale=0.1
+            )
+            e = fit.x
+            H = at.row.along(*chart.linearised(e[None]))[0]
+            J = np.concatenate([H, at.row.effect], axis=1) @ S_before
+            turn = np.eye(len(x))
+            turn[:n, :n] = (after.inverse_jacobian() @ chart.jacobian(e[None]))[0]
+            with localcontext() as context:
+                context.prec = 50
+                left = _solved(_decimals(turn @ S_before), _decimals(S))
+                of_zeta = _decimals(np.eye(len(x))) + _decimals(J.T) @ _decimals(J)
+                square = (left.T @ of_zeta @ left).astype(float)
+            np.testing.assert_allclose(square, np.eye(len(x)), atol=1e-5)
+
+    def test_a_source_on_a_sensor_does_not_converge(self) -> None:
+        at = case(ARRAYS[0], RandomWalk(0.1, 0.02), 0)
+        at.x[:, :3] = at.row.row.origin_m + at.row.row.R_world_from_array @ ARRAYS[0].positions[1]
+        assert not row_filter.update(at.gaussians, Rows.of(at.row)).converged.any()
+
+
+def retracted(x: FloatArray, e: FloatArray, centroid: FloatArray, radius: float, q: int) -> FloatArray:
+    """One source's state (n,) at coordinates (n,) about x, by the chart's formulas, for a firm moment."""
+    d = x[:3] - centroid
+    r = float(np.linalg.norm(d))
+    u, length = d / r, max(r, radius)
+    E = Chart.at(x[None], centroid, radius).E[0]
+    w = u + E @ e[1:3]
+    there = x + e
+    growth = math.exp(e[0])
+    there[:3] = x[:3] + length * (growth * w / np.linalg.norm(w) - u)
+    size = float(np.linalg.norm(x[3:6]))
+    m = x[3:6] / size
+    n = length**q * e[3:6] / size
+    b = m + n - (m @ n) * m
+    there[3:6] = growth**q * size * math.exp(m @ n) * b / np.linalg.norm(b)
+    there[6:9] = growth * (x[6:9] + length * e[6:9])
+    return there
+
+
+class Board:
+    """Magnets above sixteen sensors, which read them in a common field of 100 µT that nobody knows."""
+
+    array = geometries.grid(4, 4, 0.026, "vector", 5e-7)
+    magnets = np.array(
+        [
+            [-0.03, -0.02, 0.05, 0.02, 0.03, 0.05],
+            [0.03, 0.02, 0.06, 0.05, -0.02, 0.01],
+            [0.0, 0.04, 0.07, -0.02, 0.02, 0.07],
+        ]
+    )
+
+    def __init__(self, n_sources: int, seed: int, n_states: int = 12) -> None:
+        self.K, self.n = n_sources, n_states
+        rng = np.random.default_rng(seed)
+        noise, N = self.array.channel_noise_T, n_sources * n_states + 3
+        self.origin, R = rng.normal(size=3), Rotation.random(rng=rng)
+        self.centroid, self.radius = self.origin + R.as_matrix() @ self.array.centroid, self.array.circumradius
+        sources = self.magnets[:n_sources] * (1.0 + 0.02 * rng.normal(size=(2, n_sources, 6)))
+        truth, common = self.magnets[:n_sources], 1e-4 * rng.normal(size=3)
+        fields = sum(predicted_channels(self.array, one[:3], one[3:]) for one in truth)
+        gain = self.array.channel_gain / noise[:, None]
+        z = fields / noise + gain @ common + rng.normal(size=len(noise))
+        self.rows = Rows(
+            self.array,
+            z[None],
+            np.array([len(z)]),
+            np.diag(1.0 / noise)[None],
+            np.zeros(1, dtype=np.intp),
+            gain[None],
+            self.origin[None],
+            R.as_matrix()[None],
+            np.zeros((1, self.array.n_sensors, 3)),
+        )
+        self.R, self.z, self.effect, self.noise = R, z, gain, noise
+        x = np.zeros((2, N))
+        of_sources = x[:, :-3].reshape(2, n_sources, n_states)
+        of_sources[..., :3] = R.apply(sources[..., :3].reshape(-1, 3)).reshape(2, -1, 3) + self.origin
+        of_sources[..., 3:6] = R.apply(sources[..., 3:].reshape(-1, 3)).reshape(2, -1, 3)
+        of_sources[..., 6:] = 0.1 * rng.normal(size=(2, n_sources, n_states - 6))
+        unit = 0.06 / 0.07**3
+        sigma = np.tile(np.repeat([0.03, 0.03 * unit, 0.3], [3, 3, n_states - 6]), n_sources)
+        S = np.concatenate([sigma, np.full(3, 1e-4)])[:, None] * rng.normal(size=(2, N, N)) / math.sqrt(N)
+        self.gaussians = Gaussians(x, S, n_sources, 3, power=3)
+
+    def retracted(self, x: FloatArray, e: FloatArray) -> FloatArray:
+        """A whole state at coordinates."""
+        there = x + e
+        for k in range(self.K):
+            of_source = slice(self.n * k, self.n * (k + 1))
+            there[of_source] = retracted(x[of_source], e[of_source], self.centroid, self.radius, 3)
+        return there
+
+    def h(self, x: FloatArray) -> FloatArray:
+        """Predicted readings in units of their noise."""
+        values = self.effect @ x[-3:]
+        for k in range(self.K):
+            source = x[self.n * k :]
+            p, m = self.R.inv().apply(source[:3] - self.origin), self.R.inv().apply(source[3:6])
+            values += predicted_channels(self.array, p, m) / self.noise
+        return values
+
+
+def slope(function: Callable[[FloatArray], FloatArray], at: FloatArray) -> FloatArray:
+    """Jacobian by central differences."""
+    steps = 1e-5 * np.eye(len(at))
+    return np.stack([(function(at + d) - function(at - d)) / 2e-5 for d in steps], axis=1)
+
+
+@all_instruction_sets
+@pytest.mark.parametrize("n_sources", [1, 2, 3])
+class TestSeveralSources:
+    """Against the formulas of the chart, minimised by SciPy, with derivatives by differences."""
+
+    def test_update(self, n_sources: int) -> None:
+        board = Board(n_sources, n_sources)
+        found = row_filter.update(board.gaussians, board.rows, sensors=True, innovation=True)
+        assert found.converged.all()
+        assert found.sensor_chi2 is not None
+        assert found.innovation is not None
+        for c, (x, S) in enumerate(zip(board.gaussians.x, board.gaussians.S, strict=True)):
+
+            def misfit(zeta: FloatArray, x: FloatArray = x, S: FloatArray = S) -> FloatArray:
+                return np.concatenate([board.z - board.h(board.retracted(x, S @ zeta)), -zeta])
+
+            fit = least_squares(misfit, np.zeros(len(x)), jac="3-point", xtol=1e-12, ftol=1e-14, gtol=1e-12)
+            J = -slope(misfit, fit.x)
+            k, there = len(board.z), board.retracted(x, S @ fit.x)
+            assert found.nis[c] == pytest.approx(2.0 * fit.cost, abs=1e-5)
+            assert found.chi2[c] == pytest.approx(float(np.sum(fit.fun[:k] ** 2)), abs=1e-2)
+            log_N = float(np.linalg.slogdet(J.T @ J)[1])
+            assert found.log_evidence[c] == pytest.approx(-fit.cost - 0.5 * log_N, abs=1e-2)
+            # Coordinates about the mode, of small changes of the coordinates about the prediction.
+            turn = np.linalg.solve(
+                slope(lambda e, there=there: board.retracted(there, e), np.zeros(len(x))),
+                slope(lambda e, x=x: board.retracted(x, e), S @ fit.x),
+            )
+            root = turn @ S @ np.linalg.inv(np.linalg.qr(J, mode="r"))
+            assert_same_covariances(found.after.S[c : c + 1], root[None], 1e-2)
+            off = np.linalg.solve(
+                slope(lambda e, there=there: board.retracted(there, e), np.zeros(len(x))) @ root,
+                found.after.x[c] - there,
+            )
+            assert np.linalg.norm(off) < 2e-3
+            # What three free readings of a sensor explain, all else being fitted again.
+            for s in range(board.array.n_sensors):
+                free = np.zeros((len(fit.fun), 3))
+                free[np.flatnonzero(board.array.channel_sensor == s), np.arange(3)] = 1.0
+                wide = np.concatenate([J, free], axis=1)
+                left = np.linalg.lstsq(wide, fit.fun)[0]
+                explained = 2.0 * fit.cost - float(np.sum((fit.fun - wide @ left) ** 2))
+                assert found.sensor_chi2[c, s] == pytest.approx(explained, rel=0.02, abs=0.02)
+            innovation = fit.fun[:k] - J[:k] @ fit.fun[k:]
+            whitened = np.linalg.solve(np.linalg.cholesky(np.eye(k) + J[:k] @ J[:k].T), innovation)
+            np.testing.assert_allclose(found.innovation[c], whitened, atol=1e-2)
+
+    def test_prediction(self, n_sources: int) -> None:
+        board, motion = Board(n_sources, 10 + n_sources), OrnsteinUhlenbeck(0.3, 1.8, 1.5)
+        before, centroid = board.gaussians, board.centroid + np.array([0.01, -0.02, 0.03])
+        steps = row_filter.steps_problem(
+            motion, [0.02], np.zeros(1, dtype=np.intp), (np.full((1, 3), 0.9), np.full((1, 3), 1e-6))
+        )
+        found = row_filter.predict(before, centroid, steps, board.rows)
+        for x, S, x_found, S_found in zip(before.x, before.S, found.x, found.S, strict=True):
+            expected, F, Q = x.copy(), np.eye(len(x)), np.zeros((len(x), len(x)))
+            L, L_after = np.eye(len(x)), np.eye(len(x))
+            F[-3:, -3:], Q[-3:, -3:], expected[-3:] = 0.9 * np.eye(3), 1e-12 * np.eye(3), 0.9 * x[-3:]
+            for k in range(n_sources):
+                at = slice(12 * k, 12 * (k + 1))
+                expected[at], F[at, at], S_q = motion.step(x[at], 0.02)
+                Q[at, at] = S_q @ S_q.T
+                for of_chart, state, origin in ((L, x, centroid), (L_after, expected, board.centroid)):
+                    of_chart[at, at] = slope(
+                        lambda e, x=state[at], c=origin: retracted(x, e, c, board.radius, 3), np.zeros(12)
+                    )
+            np.testing.assert_allclose(x_found, expected, rtol=1e-12)
+            moved = np.linalg.solve(L_after, F @ L @ S)
+            P = moved @ moved.T + np.linalg.solve(L_after, np.linalg.solve(L_after, Q).T)
+            scale = np.sqrt(np.diagonal(P))
+            np.testing.assert_allclose(
+                covariance(S_found) / np.outer(scale, scale), P / np.outer(scale, scale), atol=1e-7
+            )
+
+    def test_bends(self, n_sources: int) -> None:
+        board = Board(n_sources, 20 + n_sources)
+        bends, directions = row_filter.bends(board.gaussians, board.rows, 3.0)
+        for c, (x, S) in enumerate(zip(board.gaussians.x, board.gaussians.S, strict=True)):
+            P = S @ S.T
+            for k in range(n_sources):
+                at = slice(12 * k, 12 * k + 3)
+                variances, axes = np.linalg.eigh(P[at, at])
+                expected = P[:, at] @ axes / np.sqrt(variances)
+                order = np.argsort(np.linalg.norm(directions[c, 3 * k : 3 * k + 3, at], axis=1))
+                for v, one in zip(expected.T, 3 * k + order, strict=True):
+                    same = math.copysign(1.0, float(v[at] @ directions[c, one, at])) * directions[c, one]
+                    np.testing.assert_allclose(same / np.sqrt(np.diagonal(P)), v / np.sqrt(np.diagonal(P)), atol=1e-7)
+                    ahead, behind = board.h(board.retracted(x, v)), board.h(board.retracted(x, -v))
+                    bend, gradient = 0.5 * (ahead + behind) - board.h(x), 0.5 * (ahead - behind)
+                    share = math.sqrt(min(max(1.0 / float(gradient @ gradient), 1.0), 3.0))
+                    assert bends[c, one] == pytest.approx(share * float(np.linalg.norm(bend)), rel=1e-6)
