@@ -1,5 +1,5 @@
-// Steps of a filter of several sources. An item is a Gaussian.
-#include "magloc/row_filter.hpp"
+// Steps of a filter of several sources. An item is a Gaussian, or a row of a track.
+#include "magloc/track.hpp"
 
 using namespace magloc;
 
@@ -30,7 +30,7 @@ MAGLOC_KERNEL(update_row, row_update) {
   for (int64_t i = begin; i < end; ++i) {
     filter.load(*p.before, i);
     filter.update(*p.convergence);
-    if (p.sensor_chi2) filter.fill_sensor_chi2(*p.rows, p.followed, p.sensor_chi2 + p.rows->n_sensors * i);
+    if (p.sensor_chi2) filter.fill_sensor_chi2(p.followed, p.sensor_chi2 + p.rows->n_sensors * i);
     if (p.innovation) filter.fill_innovation(wide, triangle, p.innovation + k * i);
     filter.finish_update();
     filter.store(*p.after, i);
@@ -52,6 +52,17 @@ MAGLOC_KERNEL(bend_row, row_bends) {
   for (int64_t i = begin; i < end; ++i) {
     filter.load(*problem->sources, i);
     filter.fill_bends(problem->memory, problem->bends + axes * i, problem->directions + axes * filter.N * i);
+  }
+  return 0;
+}
+
+MAGLOC_KERNEL(follow_sources, track) {
+  Workspace space(workspace);
+  Track<Lanes> track(*problem, space);
+  if (!workspace) return space.size();
+  for (int64_t i = begin; i < end && problem->progress[1]; ++i) {
+    problem->progress[1] = track.follow(problem->progress[0]);
+    problem->progress[0] += problem->progress[1];
   }
   return 0;
 }

@@ -468,52 +468,6 @@ int64_t magloc_survey_sources(const magloc_survey_columns *problem, int64_t begi
 /* Columns of poles, whose field is d/r^3: size n_sources. */
 int64_t magloc_survey_poles(const magloc_survey_columns *problem, int64_t begin, int64_t end, double *workspace);
 
-/* A source followed by one component, from a state before row progress[0] to the first row that it does not explain; an
-   item is one more row. The state has 6 numbers, position and moment, or 9, with the velocity. Readings are differences
-   of channels in units of their noise; a row of fewer ones has zeros behind them. magloc/tracking/chart explains it. */
-typedef struct {
-  int64_t n_states, n_noise;
-  /* The array. */
-  int64_t n_sensors, n_channels, n_differences;
-  const double *sensors; /* (n_sensors, 3) */
-  double array_centroid[3], radius;
-  const int64_t *first_channel; /* (n_sensors + 1) of each sensor */
-  const double *gain;           /* (n_channels, 3); of a modulus the first number counts */
-  const uint8_t *is_modulus;    /* (n_channels) */
-  /* Rows. */
-  const double *measured;          /* (n_rows, n_differences) */
-  const int64_t *counts;           /* (n_rows) of differences; none: the state is predicted only */
-  const double *transforms;        /* (n_transforms, n_differences, n_channels) from channels to differences */
-  const int64_t *transform_of_row; /* (n_rows) */
-  const double *origins;           /* (n_rows, 3) of the array */
-  const double *rotations;         /* (n_rows, 3, 3) to the world from the array */
-  const double *ambients;          /* (n_ambients, n_sensors, 3) field */
-  const int64_t *ambient_of_row;   /* (n_rows) */
-  /* Steps of the motion: transition F, and root of its noise A + |m| B. */
-  const double *F;            /* (n_steps, n_states, n_states) */
-  const double *A, *B;        /* (n_steps, n_states, n_noise) */
-  const int64_t *step_of_row; /* (n_rows) */
-  /* When an update has converged, and when it is believed. */
-  const double *nis_limits; /* (n_differences + 1) by the number of differences */
-  double tolerance;
-  int64_t max_iterations;
-  double least_gain, rounding; /* a step that gains less, of what a linear problem would, is halved */
-  double least_share, largest_growth;
-  int64_t full_count; /* differences of a row without missing readings */
-  double firm, largest_width;
-  /* The state before the next row, which calls change: mean, root in the chart about it, the sensors' centroid there,
-     and the covariance had no readings been taken. */
-  double *x, *root, *centroid, *open_loop; /* (n), (n, n), (3), (n, n) */
-  int64_t *progress;                       /* (2): next row, and 1 as long as rows are explained */
-  /* Results of each explained row. */
-  double *predicted_x, *predicted_roots; /* (n_rows, n), (n_rows, n, n) */
-  double *updated_x, *updated_roots;     /* (n_rows, n), (n_rows, n, n) */
-  double *open_loop_variances;           /* (n_rows, n) */
-  double *nis;                           /* (n_rows); NaN without readings */
-  int64_t *iterations;                   /* (n_rows) */
-} magloc_track;
-int64_t magloc_follow_source(const magloc_track *problem, int64_t begin, int64_t end, double *workspace);
-
 /* Several sources that one filter follows together; magloc/tracking/multi_target/state.py has the chart of their
    errors. These are in the order (position, moment) of each source, common field, (velocity, rate of turn) of each
    source: n = 12 n_sources + 3 numbers, of which a row of readings sees the first d = 6 n_sources + 3. */
@@ -676,6 +630,27 @@ typedef struct {
   double *directions; /* (n, 3 n_sources, N): one sigma of the whole state along each axis */
 } magloc_row_bends;
 int64_t magloc_bend_row(const magloc_row_bends *problem, int64_t begin, int64_t end, double *workspace);
+
+/* Sources followed by one Gaussian, from a state before row progress[0] to the first row that does not continue their
+   track; an item is one more row. */
+typedef struct {
+  const magloc_rows *rows;
+  const magloc_motion *motion;
+  const magloc_convergence *convergence;
+  const double *nis_limits;    /* (n_readings + 1) by the number of readings, above which they contradict */
+  double largest_width;        /* standard deviation of log-range and direction beyond which a source has no place */
+  double largest_bend;         /* of readings, beyond which the state is not one Gaussian; infinite: all are */
+  int64_t longest_memory;      /* rows in which a bend is counted */
+  const magloc_sources *state; /* one: before the next row, and changed by calls, as are the next three */
+  double *centroid;            /* (3) of the sensors there */
+  double *open_loop;           /* (n_sources, n_states, n_states) covariance had no readings been taken */
+  int64_t *progress;           /* (3): next row, 1 as long as the track continues, and rows that it remembers */
+  const magloc_sources *predicted, *updated; /* by rows, where the track continues */
+  double *open_loop_variances;               /* (n_rows, n_sources n_states) */
+  double *nis;                               /* (n_rows); NaN without readings */
+  int64_t *iterations;                       /* (n_rows) */
+} magloc_track;
+int64_t magloc_follow_sources(const magloc_track *problem, int64_t begin, int64_t end, double *workspace);
 
 /* end of the declarations */
 #ifdef __GNUC__

@@ -16,7 +16,8 @@ from arrays.array import SensorArray
 from magloc.readings import Readings
 from magloc.tracking import batch
 from magloc.tracking.batch import track_record
-from magloc.tracking.motion import MotionModel, OrnsteinUhlenbeck, RandomWalk
+from magloc.tracking.chart import steps
+from magloc.tracking.motion import CoordinatedTurn, MotionModel, OrnsteinUhlenbeck, RandomWalk
 from magloc.tracking.results import Row, TrackPoint, rows_of
 from magloc.tracking.tracker import Tracker
 from magloc.tracking.whole_records.smoother import smoothed
@@ -35,6 +36,12 @@ from tests.passing_source import (
 
 FloatArray = NDArray[np.float64]
 all_instruction_sets = pytest.mark.usefixtures("instruction_set")
+
+
+@pytest.fixture(autouse=True)
+def straight_predictions(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Readable predictions that do not bend as the readings do, as the compiled ones."""
+    monkeypatch.setattr(steps, "LARGEST_GROWTH", -1.0)
 
 
 @dataclass(frozen=True)
@@ -124,6 +131,21 @@ class TestCompiledRecord:
         monkeypatch.setattr(Tracker, "update", counted)
         points = track_record(Tracker(ARRAY, SLOW), rows_from(time_s, readings_of(ARRAY, p, m)))
         assert (len(points), len(readable) <= 6) == (60, True)
+
+    def test_rows_that_bend_are_stepped_in_python(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        time_s, p, m = moving_source(20)
+        rows = rows_from(time_s, readings_of(ARRAY, p, m))
+        expected = followed(Tracker(ARRAY, SLOW), rows)
+        readable: list[float] = []
+        update = Tracker.update
+
+        def counted(tracker: Tracker, row: Row) -> TrackPoint:
+            readable.append(row.time_s)
+            return update(tracker, row)
+
+        monkeypatch.setattr(Tracker, "update", counted)
+        assert_same_points(track_record(Tracker(ARRAY, SLOW), rows, largest_bend=0.0), expected)
+        assert len(readable) == 20
 
     def test_a_row_that_is_not_later_than_the_piece_before(self) -> None:
         time_s, p, m = moving_source(30)
@@ -244,9 +266,15 @@ class TestCompiledRecord:
         points = self.both(array, SLOW, rows_from(time_s, readings_of(ARRAY, p, m)))
         assert statuses(points).count("tracked") == 19
 
+    @all_instruction_sets
+    def test_a_lasting_rate_of_turn(self) -> None:
+        time_s, p, m = moving_source(60)
+        points = self.both(ARRAY, OrnsteinUhlenbeck(0.1, 0.02), rows_from(time_s, readings_of(ARRAY, p, m)))
+        assert statuses(points).count("tracked") == 59
+
     def test_other_motions_take_the_readable_path(self) -> None:
         time_s, p, m = moving_source(20)
-        points = self.both(ARRAY, OrnsteinUhlenbeck(0.1, 0.02), rows_from(time_s, readings_of(ARRAY, p, m)))
+        points = self.both(ARRAY, CoordinatedTurn(0.1, 0.1), rows_from(time_s, readings_of(ARRAY, p, m)))
         assert statuses(points).count("tracked") == 19
 
     def test_no_rows(self) -> None:

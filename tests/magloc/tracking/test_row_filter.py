@@ -14,9 +14,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from arrays import geometries
 from arrays.array import SensorArray
+from magloc import core
 from magloc.measurement.differences import predicted_channels
 from magloc.tracking import row_filter
 from magloc.tracking.chart import update as readable
@@ -236,7 +238,8 @@ class Board:
         truth, common = self.magnets[:n_sources], 1e-4 * rng.normal(size=3)
         fields = sum(predicted_channels(self.array, one[:3], one[3:]) for one in truth)
         gain = self.array.channel_gain / noise[:, None]
-        z = fields / noise + gain @ common + rng.normal(size=len(noise))
+        self.exact = fields / noise + gain @ common
+        z = self.exact + rng.normal(size=len(noise))
         self.rows = Rows(
             self.array,
             z[None],
@@ -374,3 +377,53 @@ class TestSeveralSources:
                     bend, gradient = 0.5 * (ahead + behind) - board.h(x), 0.5 * (ahead - behind)
                     share = math.sqrt(min(max(1.0 / float(gradient @ gradient), 1.0), 3.0))
                     assert bends[c, one] == pytest.approx(share * float(np.linalg.norm(bend)), rel=1e-6)
+
+    def test_followed_rows_are_predicted_and_updated_one_by_one(self, n_sources: int) -> None:
+        """To the row that contradicts: readings of 100 σ; and to the first one where nothing may bend."""
+        board, motion, n_rows = Board(n_sources, 30 + n_sources), OrnsteinUhlenbeck(0.3, 1.8, 1.5), 5
+        state = Gaussians(board.gaussians.x[:1].copy(), board.gaussians.S[:1].copy(), n_sources, 3, power=3)
+        readings = board.exact + np.random.default_rng(n_sources).normal(size=(n_rows, len(board.z)))
+        readings[3, 7] += 100.0
+        same = {
+            name: np.repeat(getattr(board.rows, name), n_rows, axis=0) for name in ("counts", "effects", "rotations")
+        }
+        rows = replace(board.rows, readings=readings, origins_m=np.repeat(board.origin[None], n_rows, axis=0), **same)
+        rows = replace(rows, transform_of_row=np.zeros(n_rows, dtype=np.intp))
+        steps = row_filter.steps_problem(
+            motion, [0.02], np.zeros(n_rows, dtype=np.intp), (np.ones((1, 3)), np.full((1, 3), 1e-7))
+        )
+        n, N = n_sources * board.n, state.x.shape[1]
+        for largest_bend, n_followed in ((math.inf, 3), (0.0, 0)):
+            now, progress = replace(state, x=state.x.copy(), S=state.S.copy()), np.array([0, 1, 1])
+            predicted, after = (replace(state, x=np.empty((5, N)), S=np.empty((5, N, N))) for _ in range(2))
+            nis = np.empty(n_rows)
+            work = core.problem(
+                "track",
+                rows=rows.problem,
+                motion=steps,
+                convergence=row_filter.convergence(),
+                nis_limits=np.full(len(board.z) + 1, chi2.isf(1e-6, len(board.z))),
+                largest_width=1.0,
+                largest_bend=largest_bend,
+                longest_memory=10,
+                state=now.problem,
+                centroid=board.centroid.copy(),
+                open_loop=np.zeros((n_sources, board.n, board.n)),
+                progress=progress,
+                predicted=predicted.problem,
+                updated=after.problem,
+                open_loop_variances=np.empty((n_rows, n)),
+                nis=nis,
+                iterations=np.empty(n_rows, dtype=np.int64),
+            )
+            core.run("follow_sources", work, n_rows, block=2, chain=n_rows)
+            assert progress.tolist() == [n_followed, 0, 1 + n_followed]
+            expected = state
+            for row in range(n_followed):
+                expected = row_filter.predict(expected, board.centroid, steps, rows, row)
+                np.testing.assert_array_equal(predicted.x[row], expected.x[0])
+                updates = row_filter.update(expected, rows, row)
+                expected = updates.after
+                assert nis[row] == updates.nis[0]
+                np.testing.assert_array_equal(after.S[row], expected.S[0])
+            np.testing.assert_array_equal(now.x, expected.x)

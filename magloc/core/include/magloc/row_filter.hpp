@@ -13,54 +13,34 @@ MAGLOC_BEGIN
 template <class T>
 class RowFilter {
   const magloc_sources &p_;
-  const double radius_;
-  const int64_t K_, ns_, e_, seen_, d_;
-  RowReadings<T> readings_;
-  const int64_t n_readings_, k_;  // number of the readings, and registers that they fill
-  SourceChart *const charts_;     // about the mean
-  ChartedState *const there_;     // states of the sources at zeta
-  // The linearised problem has a column for each nuisance, for each seen number of the sources, and for the misfit.
-  // Their numbers are one for each reading, and one for each zeta, nuisances first.
-  Padded<T> columns_, triangle_, turned_, rows_, solved_;
-  T *const misfit_, *const trial_misfit_;            // of the readings
-  double *const e_there_;                            // coordinates at zeta
-  double *const zeta_, *const trial_, *const step_;  // (d) and, nuisances first, (d + 1)
+  const magloc_rows &given_;
+  Workspace &space_;
+  const int64_t K_ = p_.n_sources, ns_ = p_.n_states, e_ = p_.n_nuisances, seen_ = n_seen * K_, d_ = seen_ + e_;
+  RowReadings<T> readings_{given_, K_, space_};
+  const int64_t k_ = readings_.width();                        // registers that the readings fill
+  SourceChart *const charts_ = space_.take<SourceChart>(K_);   // about the mean
+  ChartedState *const there_ = space_.take<ChartedState>(K_);  // states of the sources at zeta
 
  public:
-  const int64_t N;                 // length of a state
-  double *const x;                 // mean
-  Padded<T> root;                  // of the covariance in the charts about it, rows in the inner order
-  double nis, chi2, log_evidence;  // of the last update
-  int64_t iterations;
-  bool converged;
+  const int64_t N = K_ * ns_ + e_;                   // length of a state
+  double *const x = space_.take<double>(N);          // mean
+  Padded<T> root{space_, N, N};                      // of the covariance in the charts about it, in the inner order
+  double nis = nan, chi2 = nan, log_evidence = nan;  // of the last update
+  int64_t iterations = 0;
+  bool converged = false;
 
-  RowFilter(const magloc_sources &p, const magloc_rows &rows, Workspace &space)
-      : p_(p),
-        radius_(rows.radius),
-        K_(p.n_sources),
-        ns_(p.n_states),
-        e_(p.n_nuisances),
-        seen_(n_seen * K_),
-        d_(seen_ + e_),
-        readings_(rows, K_, space),
-        n_readings_(rows.n_readings),
-        k_(readings_.width()),
-        charts_(space.take<SourceChart>(K_)),
-        there_(space.take<ChartedState>(K_)),
-        columns_(space, d_ + 1, k_ * n_lanes<T> + d_),
-        triangle_(space, K_ * ns_ + e_ + 1, K_ * ns_ + e_ + 1),
-        turned_(space, seen_, d_),
-        rows_(space, K_ * ns_ + e_, K_ * ns_ + e_),
-        solved_(space, d_, K_ * ns_ + e_),
-        misfit_(space.take<T>(k_)),
-        trial_misfit_(space.take<T>(k_)),
-        e_there_(space.take<double>(K_ * ns_ + e_)),
-        zeta_(space.take<double>(d_)),
-        trial_(space.take<double>(d_)),
-        step_(space.take<double>(d_ + 1)),
-        N(K_ * ns_ + e_),
-        x(space.take<double>(N)),
-        root(space, N, N) {}
+ private:
+  // The linearised problem has a column for each nuisance, for each seen number of the sources, and for the misfit.
+  // Their numbers are one for each reading, and one for each zeta, nuisances first.
+  Padded<T> columns_{space_, d_ + 1, k_ * n_lanes<T> + d_}, triangle_{space_, N + 1, N + 1};
+  Padded<T> turned_{space_, seen_, d_}, rows_{space_, N, N}, solved_{space_, d_, N};
+  T *const misfit_ = space_.take<T>(k_), *const trial_misfit_ = space_.take<T>(k_);  // of the readings
+  double *const e_there_ = space_.take<double>(N);                                   // coordinates at zeta
+  double *const zeta_ = space_.take<double>(d_), *const trial_ = space_.take<double>(d_);
+  double *const step_ = space_.take<double>(d_ + 1);  // nuisances first
+
+ public:
+  RowFilter(const magloc_sources &p, const magloc_rows &rows, Workspace &space) : p_(p), given_(rows), space_(space) {}
 
   // Go to a row of readings.
   void set_row(int64_t row) { readings_.set_row(row); }
@@ -92,7 +72,7 @@ class RowFilter {
     wide.clear(N);
     for (int64_t i = 0; i < N; ++i) __builtin_memcpy(wide.lanes(i), root.lanes(i), root.width() * sizeof(T));
     for (int64_t k = 0; k < K_; ++k) {
-      SourceChart before(x + ns_ * k, ns_, p_.power, centroid_before, radius_);
+      SourceChart before(x + ns_ * k, ns_, p_.power, centroid_before, given_.radius);
       before.move(zero, there_[0]);
       before.to_state(there_[0], wide.lanes(n_seen * k), further(wide, k), wide.width());
       motion.take(x + ns_ * k, step, K_ * item + k);
@@ -109,7 +89,7 @@ class RowFilter {
         __builtin_memcpy(wide[row_of(ns_ * k + i)] + N + m * k, motion.noise + m * i, m * sizeof(double));
         x[ns_ * k + i] = motion.x[i];
       }
-      SourceChart(x + ns_ * k, ns_, p_.power, readings_.centroid, radius_)
+      SourceChart(x + ns_ * k, ns_, p_.power, readings_.centroid, given_.radius)
           .to_coordinates(wide.lanes(n_seen * k), further(wide, k), wide.width());
     }
     if (motion.has_noisy_nuisances())
@@ -146,19 +126,18 @@ class RowFilter {
   }
 
   // After an update: chi-square (n_sensors) that free readings of each sensor would explain.
-  void fill_sensor_chi2(const magloc_rows &rows, double followed, double *chi2_of_sensors) const {
-    const int64_t zeta = d_;  // rows of the orthonormal columns; then that of what is left of the misfit
-    for (int64_t s = 0, c = 0; s < rows.n_sensors; ++s) {
+  void fill_sensor_chi2(double followed, double *chi2_of_sensors) const {
+    for (int64_t s = 0, c = 0; s < given_.n_sensors; ++s) {
       int64_t n = 0;
       double square[3][3] = {}, left[3] = {}, share[3];
-      for (; c + n < rows.n_channels && n < 3 && rows.sensor[c + n] == s; ++n)
+      for (; c + n < given_.n_channels && n < 3 && given_.sensor[c + n] == s; ++n)
         for (int64_t i = 0; i <= n; ++i)
           square[n][i] =
               (1.0 + followed) * dot(readings_.transform().lanes(c + n), readings_.transform().lanes(c + i), k_);
-      for (int64_t q = 0; q <= zeta; ++q)
+      for (int64_t q = 0; q <= d_; ++q)
         for (int64_t i = 0; i < n; ++i) {
           share[i] = dot(readings_.transform().lanes(c + i), columns_.lanes(q), k_);
-          if (q == zeta)
+          if (q == d_ /* what is left of the misfit */)
             left[i] = triangle_[q][q] * share[i];
           else
             for (int64_t j = 0; j <= i; ++j) square[i][j] -= share[i] * share[j];
@@ -176,8 +155,8 @@ class RowFilter {
   // covariance.
   void fill_innovation(const Padded<T> &wide, const Padded<T> &triangle, double *innovation) {
     fill_columns();
-    wide.clear(n_readings_);
-    for (int64_t i = 0; i < n_readings_; ++i) {
+    wide.clear(given_.n_readings);
+    for (int64_t i = 0; i < given_.n_readings; ++i) {
       innovation[i] = reinterpret_cast<const double *>(misfit_)[i];
       for (int64_t c = 0; c < d_; ++c) {
         wide[i][c] = columns_[c][i];
@@ -185,8 +164,8 @@ class RowFilter {
       }
       wide[i][d_ + i] = 1.0;
     }
-    triangularise(wide, n_readings_, triangle);
-    solve_transposed(triangle, n_readings_, innovation);
+    triangularise(wide, given_.n_readings, triangle);
+    solve_transposed(triangle, given_.n_readings, innovation);
   }
 
   // Let mean and root be those after the update, the root in the charts about the new mean.
@@ -248,7 +227,7 @@ class RowFilter {
   double *tail(int64_t column) const { return reinterpret_cast<double *>(columns_.lanes(column) + k_); }
 
   void set_chart(int64_t k) {
-    charts_[k] = SourceChart(x + ns_ * k, ns_, p_.power, readings_.centroid, radius_);
+    charts_[k] = SourceChart(x + ns_ * k, ns_, p_.power, readings_.centroid, given_.radius);
     judge(k);
   }
   void judge(int64_t k) {

@@ -7,35 +7,25 @@ MAGLOC_BEGIN
 template <class T>
 class RowReadings {
   const magloc_rows &p_;
-  const int64_t n_sources_, n_numbers_ = 1 + 6 * n_sources_;
+  Workspace &space_;
+  const int64_t n_sources_, n_numbers_ = 1 + 6 * n_sources_, n_ = p_.n_channels, k_ = p_.n_readings;
   // By channels: place of its sensor, gain, ambient field (3), whether it reads a modulus (1).
-  Padded<T> place_, gain_, ambient_, modulus_;
-  Padded<T> transform_;    // (n_channels, n_readings)
-  Padded<T> channels_;     // (n_numbers, n_channels): what they read, and its derivatives
-  Padded<T> numbers_;      // (n_numbers, n_readings): the same of the readings
-  double *const sources_;  // (n_sources, 6) in the array's axes, moments times mu_0/4pi
+  Padded<T> place_{space_, 3, n_}, gain_{space_, 3, n_}, ambient_{space_, 3, n_}, modulus_{space_, 1, n_};
+  Padded<T> transform_{space_, n_, k_};
+  // What channels read, and its derivatives by the sources; the same of the readings.
+  Padded<T> channels_{space_, n_numbers_, n_}, numbers_{space_, n_numbers_, k_};
+  double *const sources_ = space_.take<double>(6 * n_sources_);  // in the array's axes, moments times mu_0/4pi
   bool has_modulus_ = false;
   int64_t row_ = 0;
 
  public:
-  Padded<T> effect;                  // (n_nuisances, n_readings) of nuisances
-  Padded<T> measured;                // (1, n_readings)
+  Padded<T> effect{space_, p_.n_nuisances, k_};  // of nuisances on the readings
+  Padded<T> measured{space_, 1, k_};
   const double *rotation = nullptr;  // to the world from the array's axes
-  double centroid[3];                // of the sensors
+  double centroid[3] = {};           // of the sensors
 
   RowReadings(const magloc_rows &p, int64_t n_sources, Workspace &space)
-      : p_(p),
-        n_sources_(n_sources),
-        place_(space, 3, p.n_channels),
-        gain_(space, 3, p.n_channels),
-        ambient_(space, 3, p.n_channels),
-        modulus_(space, 1, p.n_channels),
-        transform_(space, p.n_channels, p.n_readings),
-        channels_(space, n_numbers_, p.n_channels),
-        numbers_(space, n_numbers_, p.n_readings),
-        sources_(space.take<double>(6 * n_sources)),
-        effect(space, p.n_nuisances, p.n_readings),
-        measured(space, 1, p.n_readings) {}
+      : p_(p), space_(space), n_sources_(n_sources) {}
 
   int64_t width() const { return numbers_.width(); }
   const T *values() const { return numbers_.lanes(0); }
@@ -50,7 +40,7 @@ class RowReadings {
     ambient_.clear(3);
     modulus_.clear(1);
     for (int64_t c = 0; c < place_.width() * n_lanes<T>; ++c) {
-      const int64_t last = p_.n_channels - 1, from = c < last ? c : last;
+      const int64_t last = n_ - 1, from = c < last ? c : last;
       for (int i = 0; i < 3; ++i) {
         place_[i][c] = p_.sensors[3 * p_.sensor[from] + i];
         if (c == from) gain_[i][c] = p_.gain[3 * c + i];
@@ -62,8 +52,8 @@ class RowReadings {
   void set_row(int64_t row) {
     const bool is_first = !rotation;
     if (is_first) begin();
-    const int64_t k = p_.n_readings, n = p_.n_channels, e = p_.n_nuisances;
-    measured.load(p_.readings + k * row, 1, k);
+    const int64_t e = p_.n_nuisances;
+    measured.load(p_.readings + k_ * row, 1, k_);
     rotation = p_.rotations + 9 * row;
     for (int i = 0; i < 3; ++i) {
       centroid[i] = p_.origins[3 * row + i];
@@ -71,18 +61,18 @@ class RowReadings {
     }
     if (is_first || p_.ambient_of_row[row] != p_.ambient_of_row[row_]) {
       const double *fields = p_.ambients + 3 * p_.n_sensors * p_.ambient_of_row[row];
-      for (int64_t c = 0; c < n; ++c)
+      for (int64_t c = 0; c < n_; ++c)
         for (int i = 0; i < 3; ++i) ambient_[i][c] = fields[3 * p_.sensor[c] + i];
     }
     if (is_first || p_.transform_of_row[row] != p_.transform_of_row[row_]) {
-      transform_.clear(n);
-      for (int64_t c = 0; c < n; ++c)
-        for (int64_t j = 0; j < k; ++j) transform_[c][j] = p_.transforms[(k * p_.transform_of_row[row] + j) * n + c];
+      transform_.clear(n_);
+      for (int64_t c = 0; c < n_; ++c)
+        for (int64_t j = 0; j < k_; ++j) transform_[c][j] = p_.transforms[(k_ * p_.transform_of_row[row] + j) * n_ + c];
     }
     if (e && (is_first || p_.effect_of_row[row] != p_.effect_of_row[row_])) {
       effect.clear(e);
       for (int64_t i = 0; i < e; ++i)
-        for (int64_t j = 0; j < k; ++j) effect[i][j] = p_.effects[(k * p_.effect_of_row[row] + j) * e + i];
+        for (int64_t j = 0; j < k_; ++j) effect[i][j] = p_.effects[(k_ * p_.effect_of_row[row] + j) * e + i];
     }
     row_ = row;
   }
@@ -123,7 +113,7 @@ class RowReadings {
       channels_.lanes(0)[r] = value;
     }
     for (int64_t i = 0; i < (with_slopes ? n_numbers_ : 1); ++i)
-      set_rows(numbers_.lanes(i), {channels_[i]}, transform_, p_.n_channels);
+      set_rows(numbers_.lanes(i), {channels_[i]}, transform_, n_);
   }
 
  private:
