@@ -1,4 +1,5 @@
-// Steps of a filter of several sources. An item is a Gaussian, or a row of a track.
+// Steps of a filter of several sources. An item is a Gaussian, a trajectory, or a row of a track.
+#include "magloc/smoother.hpp"
 #include "magloc/track.hpp"
 
 using namespace magloc;
@@ -64,5 +65,13 @@ MAGLOC_KERNEL(follow_sources, track) {
     problem->progress[1] = track.follow(problem->progress[0]);
     problem->progress[0] += problem->progress[1];
   }
+  return 0;
+}
+
+MAGLOC_KERNEL(smooth_rows, smoothing) {
+  Workspace space(workspace);
+  Smoother<Lanes> smoother(*problem, space);
+  if (!workspace) return space.size();
+  for (int64_t i = begin; i < end; ++i) smoother.run(i);
   return 0;
 }

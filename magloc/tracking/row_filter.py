@@ -18,6 +18,8 @@ from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.chart.update import LEAST_GAIN, MOST_ITERATIONS, ROUNDING, TOLERANCE
 from magloc.tracking.motion import LinearMotion, MotionModel, OrnsteinUhlenbeck
 
+_ROWS_A_CALL = 1000
+"""Rows of trajectories that one call of the kernel smooths: some 10 ms."""
 _FOLLOWED = 1e-3
 """Variance of readings beside their noise in the test of sensors: one that the fit follows wholly tells nothing."""
 
@@ -35,6 +37,8 @@ class Gaussians:
     n_sources, n_nuisances : int
     power : int
         Power of the range with which readings fall: 4, or 3 where a common field is a nuisance.
+    firm : float
+        Share of a moment that is open, below which its strength and direction are its coordinates.
     """
 
     x: FloatArray
@@ -42,6 +46,7 @@ class Gaussians:
     n_sources: int = 1
     n_nuisances: int = 0
     power: int = 4
+    firm: float = FIRM
 
     @property
     def problem(self) -> core.Problem:
@@ -52,7 +57,7 @@ class Gaussians:
             n_states=(self.x.shape[1] - self.n_nuisances) // self.n_sources,
             n_nuisances=self.n_nuisances,
             power=self.power,
-            firm=FIRM,
+            firm=self.firm,
             x=np.ascontiguousarray(self.x),
             roots=np.ascontiguousarray(self.S),
         )
@@ -295,3 +300,55 @@ def bends(gaussians: Gaussians, rows: Rows, memory: float, row: int = 0) -> tupl
     )
     core.run("bend_row", work, n, block=n)
     return found, directions
+
+
+@dataclass(frozen=True, eq=False)
+class Smoothed:
+    """A pass of a filter and a smoother along trajectories.
+
+    Attributes
+    ----------
+    offsets : ndarray, shape (C, n_rows, n)
+        From the trajectories to the smoothed ones, in the charts about the former.
+    last : Gaussians
+        After the last row; means are offsets, too, and those of nuisances behind them.
+    nis, log_evidence : ndarray, shape (C,)
+        Of all rows but the first, and of all.
+    """
+
+    offsets: FloatArray
+    last: Gaussians
+    nis: FloatArray
+    log_evidence: FloatArray
+
+
+def smooth(trajectories: FloatArray, prior: Gaussians, steps: core.Problem, rows: Rows) -> Smoothed:
+    """
+    Return a pass along trajectories, at which motion and readings are linearised.
+
+    Parameters
+    ----------
+    trajectories : ndarray, shape (C, n_rows, n)
+        States of all sources, without nuisances.
+    prior : Gaussians
+        What is known before the first row, in the charts about the trajectories: its means are offsets.
+    steps : core.Problem
+        Of :func:`steps_problem`.
+    rows : Rows
+    """
+    n, last, offsets = len(trajectories), prior.unfilled(), np.empty_like(trajectories, order="C")
+    nis, log_evidence = np.empty((2, n))
+    work = core.problem(
+        "smoothing",
+        n_rows=trajectories.shape[1],
+        trajectories=np.ascontiguousarray(trajectories),
+        prior=replace(prior, firm=0.0).problem,
+        rows=rows.problem,
+        motion=steps,
+        offsets=offsets,
+        last=last.problem,
+        nis=nis,
+        log_evidence=log_evidence,
+    )
+    core.run("smooth_rows", work, n, block=max(1, _ROWS_A_CALL // trajectories.shape[1]))
+    return Smoothed(offsets, last, nis, log_evidence)

@@ -652,6 +652,19 @@ typedef struct {
 } magloc_track;
 int64_t magloc_follow_sources(const magloc_track *problem, int64_t begin, int64_t end, double *workspace);
 
+/* A filter and smoother along trajectories, linearised there, in the charts about them; an item is a trajectory. */
+typedef struct {
+  int64_t n_rows;
+  const double *trajectories;  /* (n, n_rows, n_sources n_states) */
+  const magloc_sources *prior; /* before the first row: means are offsets in the chart about its state */
+  const magloc_rows *rows;
+  const magloc_motion *motion; /* to each row but the first; with `moved`, n_rows steps for each trajectory */
+  double *offsets;             /* as trajectories: from these to the smoothed ones, in the charts */
+  const magloc_sources *last;  /* after the last row; means are offsets, too */
+  double *nis, *log_evidence;  /* (n) of all rows but the first, and of all */
+} magloc_smoothing;
+int64_t magloc_smooth_rows(const magloc_smoothing *problem, int64_t begin, int64_t end, double *workspace);
+
 /* end of the declarations */
 #ifdef __GNUC__
 #pragma GCC visibility pop

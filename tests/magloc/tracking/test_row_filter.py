@@ -197,8 +197,10 @@ class TestOneSource:
         assert not row_filter.update(at.gaussians, Rows.of(at.row)).converged.any()
 
 
-def retracted(x: FloatArray, e: FloatArray, centroid: FloatArray, radius: float, q: int) -> FloatArray:
-    """One source's state (n,) at coordinates (n,) about x, by the chart's formulas, for a firm moment."""
+def retracted(
+    x: FloatArray, e: FloatArray, centroid: FloatArray, radius: float, q: int, *, firm: bool = True
+) -> FloatArray:
+    """One source's state (n,) at coordinates (n,) about x, by the chart's formulas, its moment being firm or not."""
     d = x[:3] - centroid
     r = float(np.linalg.norm(d))
     u, length = d / r, max(r, radius)
@@ -211,7 +213,7 @@ def retracted(x: FloatArray, e: FloatArray, centroid: FloatArray, radius: float,
     m = x[3:6] / size
     n = length**q * e[3:6] / size
     b = m + n - (m @ n) * m
-    there[3:6] = growth**q * size * math.exp(m @ n) * b / np.linalg.norm(b)
+    there[3:6] = growth**q * size * (math.exp(m @ n) * b / np.linalg.norm(b) if firm else m + n)
     there[6:9] = growth * (x[6:9] + length * e[6:9])
     return there
 
@@ -262,13 +264,27 @@ class Board:
         S = np.concatenate([sigma, np.full(3, 1e-4)])[:, None] * rng.normal(size=(2, N, N)) / math.sqrt(N)
         self.gaussians = Gaussians(x, S, n_sources, 3, power=3)
 
-    def retracted(self, x: FloatArray, e: FloatArray) -> FloatArray:
+    def repeated(self, readings: FloatArray) -> Rows:
+        """Rows (n) of readings (n, k) where the array stands."""
+        same = ("counts", "effects", "origins_m", "rotations", "transform_of_row")
+        many = {name: np.repeat(getattr(self.rows, name), len(readings), axis=0) for name in same}
+        return replace(self.rows, readings=readings, **many)
+
+    def retracted(self, x: FloatArray, e: FloatArray, *, firm: bool = True) -> FloatArray:
         """A whole state at coordinates."""
         there = x + e
         for k in range(self.K):
             of_source = slice(self.n * k, self.n * (k + 1))
-            there[of_source] = retracted(x[of_source], e[of_source], self.centroid, self.radius, 3)
+            there[of_source] = retracted(x[of_source], e[of_source], self.centroid, self.radius, 3, firm=firm)
         return there
+
+    def coordinates(self, x: FloatArray, there: FloatArray) -> FloatArray:
+        """The inverse of it near by, for moments that are not firm: Newton's steps."""
+        e = np.zeros(len(x))
+        for _ in range(6):
+            by_e = slope(lambda e: self.retracted(x, e, firm=False), e)
+            e += np.linalg.solve(by_e, there - self.retracted(x, e, firm=False))
+        return e
 
     def h(self, x: FloatArray) -> FloatArray:
         """Predicted readings in units of their noise."""
@@ -378,17 +394,62 @@ class TestSeveralSources:
                     share = math.sqrt(min(max(1.0 / float(gradient @ gradient), 1.0), 3.0))
                     assert bends[c, one] == pytest.approx(share * float(np.linalg.norm(bend)), rel=1e-6)
 
+    def test_smoothed_rows(self, n_sources: int) -> None:
+        """Against the Gaussian of all states and readings together, conditioned on the readings."""
+        board, motion, m, dt_s = Board(n_sources, 40 + n_sources), OrnsteinUhlenbeck(0.3, 1.8, 1.5), 4, 0.05
+        rng, n, k = np.random.default_rng(n_sources), n_sources * board.n, len(board.z)
+        N = n + 3
+        tracks = board.gaussians.x[:, None, :n] * (1.0 + 0.01 * rng.normal(size=(2, m, n)))
+        readings = board.exact + rng.normal(size=(m, k))
+        S = board.gaussians.S
+        prior = replace(board.gaussians, x=0.3 * np.linalg.norm(S, axis=2) * rng.normal(size=(2, N)))
+        kept, added = np.full((1, 3), 0.9), np.full((1, 3), 1e-6)
+        steps = row_filter.steps_problem(motion, [dt_s], np.zeros(m, dtype=np.intp), (kept, added))
+        found = row_filter.smooth(tracks, prior, steps, board.repeated(readings))
+        for c, track in enumerate(np.pad(tracks, ((0, 0), (0, 0), (0, 3)))):
+            # B (e_0, e_1, ...) = (e_0, shift_1 + noise_1, ...)
+            B, H = np.eye(m * N), np.zeros((m * k, m * N))
+            shift, D = np.zeros(m * N), np.zeros((m * N, m * N))
+            shift[:N], D[:N, :N] = prior.x[c], S[c] @ S[c].T
+            z = readings.ravel() - np.concatenate([board.h(x) for x in track])
+            L = [slope(lambda e, x=x: board.retracted(x, e), np.zeros(N)) for x in track]
+            for row, x in enumerate(track):
+                at = slice(N * row, N * (row + 1))
+                H[k * row : k * (row + 1), at] = slope(lambda e, x=x: board.h(board.retracted(x, e)), np.zeros(N))
+                if not row:
+                    continue
+                F, Q, moved = np.diag(np.r_[np.zeros(n), kept[0]]), np.diag(np.r_[np.zeros(n), added[0] ** 2]), x.copy()
+                for source in (slice(i, i + 12) for i in range(0, n, 12)):
+                    moved[source], F[source, source], S_q = motion.step(track[row - 1, source], dt_s)
+                    Q[source, source] = S_q @ S_q.T
+                B[at, N * (row - 1) : N * row] = -np.linalg.solve(L[row], F @ L[row - 1])
+                D[at, at] = np.linalg.solve(L[row], np.linalg.solve(L[row], Q).T)
+                shift[at] = board.coordinates(x, moved)
+            mean, C = np.linalg.solve(B, shift), np.linalg.solve(B, np.linalg.solve(B, D).T)
+            left, covariance_z = z - H @ mean, np.eye(m * k) + H @ C @ H.T
+            gain = np.linalg.solve(covariance_z, H @ C).T
+            expected, after = mean + gain @ left, C - gain @ H @ C
+            sigma = np.sqrt(np.diagonal(after))
+            offsets = np.pad(found.offsets[c], ((0, 0), (0, 3)))
+            offsets[-1] = found.last.x[c]
+            error = ((offsets.ravel() - expected) / sigma).reshape(m, N)
+            assert np.abs(error[:, :n]).max() < 1e-4
+            assert np.abs(error[-1]).max() < 1e-4
+            unit = np.outer(sigma[-N:], sigma[-N:])
+            np.testing.assert_allclose(covariance(found.last.S[c]) / unit, after[-N:, -N:] / unit, atol=1e-4)
+            square = float(left @ np.linalg.solve(covariance_z, left))
+            first = float(left[:k] @ np.linalg.solve(covariance_z[:k, :k], left[:k]))
+            assert found.nis[c] == pytest.approx(square - first, abs=1e-3)
+            log_evidence = -0.5 * square - 0.5 * float(np.linalg.slogdet(covariance_z)[1])
+            assert found.log_evidence[c] == pytest.approx(log_evidence, abs=1e-3)
+
     def test_followed_rows_are_predicted_and_updated_one_by_one(self, n_sources: int) -> None:
         """To the row that contradicts: readings of 100 σ; and to the first one where nothing may bend."""
         board, motion, n_rows = Board(n_sources, 30 + n_sources), OrnsteinUhlenbeck(0.3, 1.8, 1.5), 5
         state = Gaussians(board.gaussians.x[:1].copy(), board.gaussians.S[:1].copy(), n_sources, 3, power=3)
         readings = board.exact + np.random.default_rng(n_sources).normal(size=(n_rows, len(board.z)))
         readings[3, 7] += 100.0
-        same = {
-            name: np.repeat(getattr(board.rows, name), n_rows, axis=0) for name in ("counts", "effects", "rotations")
-        }
-        rows = replace(board.rows, readings=readings, origins_m=np.repeat(board.origin[None], n_rows, axis=0), **same)
-        rows = replace(rows, transform_of_row=np.zeros(n_rows, dtype=np.intp))
+        rows = board.repeated(readings)
         steps = row_filter.steps_problem(
             motion, [0.02], np.zeros(n_rows, dtype=np.intp), (np.ones((1, 3)), np.full((1, 3), 1e-7))
         )

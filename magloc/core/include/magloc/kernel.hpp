@@ -41,6 +41,7 @@
   X(predict_row, row_prediction)              \
   X(update_row, row_update)                   \
   X(bend_row, row_bends)                      \
+  X(smooth_rows, smoothing)                   \
   X(follow_sources, track)
 
 #define MAGLOC_JOIN_(a, b, c) magloc_##a##_##b##c

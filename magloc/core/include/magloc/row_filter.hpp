@@ -25,6 +25,7 @@ class RowFilter {
   const int64_t N = K_ * ns_ + e_;                   // length of a state
   double *const x = space_.take<double>(N);          // mean
   Padded<T> root{space_, N, N};                      // of the covariance in the charts about it, in the inner order
+  Padded<T> transition{space_, K_ * ns_, ns_};       // of the coordinates of each source, in the last prediction
   double nis = nan, chi2 = nan, log_evidence = nan;  // of the last update
   int64_t iterations = 0;
   bool converged = false;
@@ -33,7 +34,7 @@ class RowFilter {
   // The linearised problem has a column for each nuisance, for each seen number of the sources, and for the misfit.
   // Their numbers are one for each reading, and one for each zeta, nuisances first.
   Padded<T> columns_{space_, d_ + 1, k_ * n_lanes<T> + d_}, triangle_{space_, N + 1, N + 1};
-  Padded<T> turned_{space_, seen_, d_}, rows_{space_, N, N}, solved_{space_, d_, N};
+  Padded<T> turned_{space_, seen_, d_ + 1}, rows_{space_, N, N}, solved_{space_, d_, N};
   T *const misfit_ = space_.take<T>(k_), *const trial_misfit_ = space_.take<T>(k_);  // of the readings
   double *const e_there_ = space_.take<double>(N);                                   // coordinates at zeta
   double *const zeta_ = space_.take<double>(d_), *const trial_ = space_.take<double>(d_);
@@ -64,41 +65,52 @@ class RowFilter {
     return {space, N, N + motion.n_noise * K_ + (motion.has_noisy_nuisances() ? e_ : 0)};
   }
   // Predict all states after a step of the motion, which ends at the row; the sensors' centroid was elsewhere before.
-  // `item` counts states whose steps differ.
+  // `item` counts states whose steps differ. With a trajectory's state `to` the charts stand about that, and offsets of
+  // what is expected from it, in the inner order, are predicted as well.
   void predict(SourceMotion &motion, int64_t step, int64_t item, const double (&centroid_before)[3],
-               const Padded<T> &wide) {
+               const Padded<T> &wide, const double *to = nullptr, double *offset = nullptr) {
     const double zero[max_states] = {};
     const int64_t m = motion.n_noise;
     wide.clear(N);
-    for (int64_t i = 0; i < N; ++i) __builtin_memcpy(wide.lanes(i), root.lanes(i), root.width() * sizeof(T));
     for (int64_t k = 0; k < K_; ++k) {
-      SourceChart before(x + ns_ * k, ns_, p_.power, centroid_before, given_.radius);
+      double *const state = x + ns_ * k, expected[max_states];
+      SourceChart before(state, ns_, p_.power, centroid_before, given_.radius);
       before.move(zero, there_[0]);
-      before.to_state(there_[0], wide.lanes(n_seen * k), further(wide, k), wide.width());
-      motion.take(x + ns_ * k, step, K_ * item + k);
-      for (int64_t j = 0; j < root.width(); ++j) {
+      motion.take(state, step, K_ * item + k);
+      __builtin_memcpy(state, to ? to + ns_ * k : motion.x, ns_ * sizeof(double));
+      const SourceChart after(state, ns_, p_.power, readings_.centroid, given_.radius);
+      const Padded<T> A = transition.from(ns_ * k);
+      A.clear(ns_);
+      for (int64_t i = 0; i < ns_; ++i) A[i][i] = 1.0;
+      before.to_state(there_[0], A.lanes(0), A.lanes(n_seen), A.width());
+      for (int64_t j = 0; j < A.width(); ++j) {
         T change[max_states];
-        for (int64_t i = 0; i < ns_; ++i) change[i] = wide.lanes(row_of(ns_ * k + i))[j];
-        for (int64_t i = 0; i < ns_; ++i) {
-          T sum{};
-          for (int64_t c = 0; c < ns_; ++c) sum += motion.F[ns_ * i + c] * change[c];
-          wide.lanes(row_of(ns_ * k + i))[j] = sum;
-        }
+        for (int64_t i = 0; i < ns_; ++i) change[i] = A.lanes(i)[j], A.lanes(i)[j] = T{};
+        for (int64_t i = 0; i < ns_; ++i)
+          for (int64_t c = 0; c < ns_; ++c) A.lanes(i)[j] += motion.F[ns_ * i + c] * change[c];
       }
-      for (int64_t i = 0; i < ns_; ++i) {
+      after.to_coordinates(A.lanes(0), A.lanes(n_seen), A.width());
+      for (int64_t i = 0; i < ns_; ++i)
         __builtin_memcpy(wide[row_of(ns_ * k + i)] + N + m * k, motion.noise + m * i, m * sizeof(double));
-        x[ns_ * k + i] = motion.x[i];
+      after.to_coordinates(wide.lanes(n_seen * k), further(wide, k), wide.width());
+      if (offset) after.fill_coordinates(motion.x, expected);
+      for (int64_t i = 0; i < ns_; ++i) {
+        T *const row = wide.lanes(row_of(ns_ * k + i));
+        add_rows(row, {A[i]}, root.from(n_seen * k), n_seen);
+        add_rows(row, {A[i] + n_seen}, root.from(row_of(ns_ * k + n_seen)), ns_ - n_seen);
+        for (int64_t j = 0; offset && j < ns_; ++j) expected[i] += A[i][j] * offset[row_of(ns_ * k + j)];
       }
-      SourceChart(x + ns_ * k, ns_, p_.power, readings_.centroid, given_.radius)
-          .to_coordinates(wide.lanes(n_seen * k), further(wide, k), wide.width());
+      for (int64_t i = 0; offset && i < ns_; ++i) offset[row_of(ns_ * k + i)] = expected[i];
     }
-    if (motion.has_noisy_nuisances())
-      for (int64_t i = 0; i < e_; ++i) {
-        x[N - e_ + i] *= motion.kept(step)[i];
-        scale(wide.lanes(seen_ + i), motion.kept(step)[i], wide.width());
-        wide[seen_ + i][N + m * K_ + i] = motion.added(step)[i];
-      }
-    set_lower(wide);
+    for (int64_t i = 0; i < e_; ++i) {
+      const double kept = motion.has_noisy_nuisances() ? motion.kept(step)[i] : 1.0;
+      add_rows(wide.lanes(seen_ + i), {&kept}, root.from(seen_ + i), 1);
+      x[N - e_ + i] *= kept;
+      if (offset) offset[seen_ + i] *= kept;
+      if (motion.has_noisy_nuisances()) wide[seen_ + i][N + m * K_ + i] = motion.added(step)[i];
+    }
+    triangularise(wide, N, triangle_);
+    set_lower();
   }
 
   // Update the state by the row's readings: Gauss and Newton's steps, each halved until it lowers the cost enough.
@@ -160,7 +172,7 @@ class RowFilter {
       innovation[i] = reinterpret_cast<const double *>(misfit_)[i];
       for (int64_t c = 0; c < d_; ++c) {
         wide[i][c] = columns_[c][i];
-        innovation[i] += columns_[c][i] * zeta_[c < e_ ? seen_ + c : c - e_];
+        innovation[i] += columns_[c][i] * zeta_[zeta_of(c)];
       }
       wide[i][d_ + i] = 1.0;
     }
@@ -171,11 +183,7 @@ class RowFilter {
   // Let mean and root be those after the update, the root in the charts about the new mean.
   void finish_update() {
     move_to(zeta_);
-    for (int64_t c = 0; c < d_; ++c)
-      for (int64_t i = 0; i < N; ++i) solved_[c][i] = root[i][zeta_of(c)];
-    solve_transposed(triangle_, d_, solved_);
-    for (int64_t c = 0; c < d_; ++c)
-      for (int64_t i = 0; i < N; ++i) root[i][zeta_of(c)] = solved_[c][i];
+    condition_root();
     for (int64_t k = 0; k < K_; ++k) {
       charts_[k].to_state(there_[k], root.lanes(n_seen * k), further(root, k), root.width());
       __builtin_memcpy(x + ns_ * k, there_[k].x, ns_ * sizeof(double));
@@ -186,6 +194,36 @@ class RowFilter {
     double sum = 0.0;
     for (int64_t i = 0; i < N; ++i) sum += dot(root.lanes(i), root.lanes(i), root.width());
     converged &= sum < infinity;
+  }
+
+  // Let the root be a lower triangular one.
+  void lower_root() {
+    for (int64_t i = 0; i < N; ++i)
+      for (int64_t j = i + 1; j < N; ++j)
+        if (root[i][j] != 0.0) {
+          rows_.copy(root, N);
+          triangularise(rows_, N, triangle_);
+          set_lower();
+          return;
+        }
+  }
+
+  // Kalman's update by the row, linearised at the mean, of offsets from it (N) that are expected and of the root. The
+  // information (d, d) in standard numbers has the upper root, and their means are zeta, in the order of the columns.
+  void update_linearised(double *offset, const Padded<T> &information_root, double *zeta) {
+    begin_update();
+    misfit_at(zeta_, misfit_);
+    linearise(offset);
+    nis = triangle_[d_][d_] * triangle_[d_][d_];
+    log_evidence = -0.5 * nis;
+    for (int64_t c = 0; c < d_; ++c) {
+      log_evidence -= logarithm(triangle_[c][c]);
+      zeta[c] = zeta_[zeta_of(c)] = step_[c];
+      for (int64_t i = 0; i < d_; ++i) information_root[c][i] = triangle_[c][i];
+    }
+    fill_coordinates(zeta_);
+    for (int64_t i = 0; i < N; ++i) offset[i] += e_there_[i];
+    condition_root();
   }
 
   // How far readings bend over one sigma along the principal axes (3 K) of log-range and direction of each source, in
@@ -214,16 +252,17 @@ class RowFilter {
     }
   }
 
- private:
   // The inner order of a state's numbers.
   int64_t row_of(int64_t i) const {
     if (i >= N - e_) return seen_ + i - (N - e_);
     const int64_t k = i / ns_, j = i % ns_;
     return j < n_seen ? n_seen * k + j : d_ + (ns_ - n_seen) * k + j - n_seen;
   }
-  T *further(const Padded<T> &rows, int64_t k) const { return rows.lanes(d_ + (ns_ - n_seen) * k); }
-  // Which zeta a column of the linearised problem belongs to.
+  // Which standard number a column of the linearised problem belongs to.
   int64_t zeta_of(int64_t column) const { return column < e_ ? seen_ + column : column - e_; }
+
+ private:
+  T *further(const Padded<T> &rows, int64_t k) const { return rows.lanes(d_ + (ns_ - n_seen) * k); }
   double *tail(int64_t column) const { return reinterpret_cast<double *>(columns_.lanes(column) + k_); }
 
   void set_chart(int64_t k) {
@@ -236,25 +275,23 @@ class RowFilter {
     charts_[k].judge_moment(moment, p_.firm);
   }
 
-  // Let the root be the lower one of rows, which are lost.
-  void set_lower(const Padded<T> &rows) {
-    triangularise(rows, N, triangle_);
+  // Let the root be the transpose of the triangle.
+  void set_lower() {
     root.clear(N);
     for (int64_t i = 0; i < N; ++i)
       for (int64_t j = 0; j <= i; ++j) root[i][j] = triangle_[j][i];
   }
-  bool is_lower() const {
-    for (int64_t i = 0; i < N; ++i)
-      for (int64_t j = i + 1; j < N; ++j)
-        if (root[i][j] != 0.0) return false;
-    return true;
+  // Let the root be that after the update, in the same chart.
+  void condition_root() {
+    for (int64_t c = 0; c < d_; ++c)
+      for (int64_t i = 0; i < N; ++i) solved_[c][i] = root[i][zeta_of(c)];
+    solve_transposed(triangle_, d_, solved_);
+    for (int64_t c = 0; c < d_; ++c)
+      for (int64_t i = 0; i < N; ++i) root[i][zeta_of(c)] = solved_[c][i];
   }
 
   void begin_update() {
-    if (!is_lower()) {
-      rows_.copy(root, N);
-      set_lower(rows_);
-    }
+    lower_root();
     for (int64_t k = 0; k < K_; ++k) set_chart(k);
     for (int64_t i = 0; i < d_; ++i) zeta_[i] = 0.0;
     columns_.clear(d_ + 1);
@@ -264,11 +301,14 @@ class RowFilter {
 
   // The states at standard numbers.
   void move_to(const double *zeta) {
+    fill_coordinates(zeta);
+    place(1.0);
+  }
+  void fill_coordinates(const double *zeta) {
     for (int64_t i = 0; i < N; ++i) {
       e_there_[i] = 0.0;
       for (int64_t j = 0; j < d_ && j <= i; ++j) e_there_[i] += root[i][j] * zeta[j];
     }
-    place(1.0);
   }
   void place(double sign) {
     for (int64_t k = 0; k < K_; ++k) {
@@ -305,10 +345,14 @@ class RowFilter {
       tail(c)[c] = 1.0;
     }
   }
-  // Columns of the sources, and the misfit, where the readings were predicted last.
-  void fill_source_columns() {
+  // Columns of the sources, and the misfit, where the readings were predicted last. The state is expected at an offset
+  // from there, or nowhere else.
+  void fill_source_columns(const double *offset = nullptr) {
     const double *R = readings_.rotation;
-    for (int64_t i = 0; i < seen_; ++i) __builtin_memcpy(turned_[i], root[i], d_ * sizeof(double));
+    for (int64_t i = 0; i < seen_; ++i) {
+      __builtin_memcpy(turned_[i], root[i], d_ * sizeof(double));
+      turned_[i][d_] = offset ? offset[i] : 0.0;
+    }
     for (int64_t k = 0; k < K_; ++k) {
       T *rows = turned_.lanes(n_seen * k);
       const int64_t width = turned_.width();
@@ -330,6 +374,10 @@ class RowFilter {
       add_rows(column, root.from(seen_).column(j), readings_.effect, e_);
       tail(e_ + j)[e_ + j] = 1.0;
     }
+    if (offset) {
+      add_rows(misfit_, -turned_.column(d_), readings_.slopes(), seen_);
+      add_rows(misfit_, {offset + seen_, 1, -1.0}, readings_.effect, e_);
+    }
     __builtin_memcpy(columns_.lanes(d_), misfit_, k_ * sizeof(T));
     for (int64_t c = 0; c < d_; ++c) tail(d_)[c] = -zeta_[zeta_of(c)];
   }
@@ -341,8 +389,8 @@ class RowFilter {
   }
 
   // Find the step to the least cost of the linearised problem. Return by how much it is less.
-  double linearise() {
-    fill_source_columns();
+  double linearise(const double *offset = nullptr) {
+    fill_source_columns(offset);
     triangularise(columns_, d_ + 1, triangle_, e_);
     double gain = 0.0;
     for (int64_t c = 0; c < d_; ++c) {

@@ -5,6 +5,8 @@
 #include "linear.hpp"
 
 MAGLOC_BEGIN
+// Directions at right angles to the chart's own lie at infinity: they are taken as this near to it.
+constexpr double least_cosine = 0.05;
 constexpr int64_t n_seen = 6, max_states = 12;  // position and moment, which readings depend on; numbers of a source
 
 // A state, and how it changes with its coordinates: dx = (position da, power m da_0 + moment da, v da_0 + reach da,
@@ -58,6 +60,20 @@ class SourceChart {
     }
     move_moment(e + 3, to_power(growth), there);
     for (int64_t i = n_seen; i < n_; ++i) there.x[i] = i < 9 ? growth * (x_[i] + length_ * e[i]) : x_[i] + e[i];
+  }
+
+  // The coordinates of a state: the inverse of `move` where the moment is not firm.
+  void fill_coordinates(const double *state, double *e) const {
+    double offset[3];
+    for (int i = 0; i < 3; ++i) offset[i] = state[i] - x_[i] + length_ * direction_[i];
+    const double range = square_root(dot(offset, offset)), growth = range / length_;
+    const double cosine = maximum(dot(offset, direction_) / range, least_cosine);
+    e[0] = logarithm(growth);
+    for (int a = 0; a < 2; ++a) e[1 + a] = dot(offset, tangent_[a]) / (range * cosine);
+    for (int64_t i = 3; i < n_; ++i) {
+      const double rest = state[i] / (i < n_seen ? to_power(growth) : i < 9 ? growth : 1.0) - x_[i];
+      e[i] = rest / (i < n_seen ? unit_ : i < 9 ? length_ : 1.0);
+    }
   }
 
   // Turn small changes of the coordinates into those of the state, in place: rows of `width` registers for position and
