@@ -15,7 +15,7 @@ from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc import core
 from magloc.tracking.chart.coordinates import FIRM
 from magloc.tracking.chart.row import ChartRow
-from magloc.tracking.chart.update import LEAST_GAIN, MOST_ITERATIONS, ROUNDING, TOLERANCE
+from magloc.tracking.chart.update import LEAST_GAIN, LEAST_SHARE, MOST_ITERATIONS, ROUNDING, TOLERANCE
 from magloc.tracking.motion import LinearMotion, MotionModel, OrnsteinUhlenbeck
 
 _ROWS_A_CALL = 1000
@@ -226,7 +226,13 @@ def predict(before: Gaussians, centroid_m: FloatArray, steps: core.Problem, rows
 
 
 def update(
-    before: Gaussians, rows: Rows, row: int = 0, *, innovation: bool = False, sensors: bool = False
+    before: Gaussians,
+    rows: Rows,
+    row: int = 0,
+    *,
+    bends: BoolArray | None = None,
+    innovation: bool = False,
+    sensors: bool = False,
 ) -> RowUpdates:
     """
     Return Gaussians after a row's readings, each by an iterated update of its own.
@@ -238,9 +244,13 @@ def update(
     rows : Rows
     row : int
         Which of them.
+    bends : ndarray of bool, shape (C,), optional
+        Which of the predictions bend as the readings do; those of nuisances cannot.
     innovation, sensors : bool
         Whether to find the whitened innovations, and what each sensor's readings would explain if they were free.
     """
+    if bends is not None and before.n_nuisances:
+        raise ValueError("Predictions of nuisances do not bend.")
     after, n = before.unfilled(), len(before.x)
     nis, chi2, log_evidence = np.empty((3, n))
     iterations, converged = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.uint8)
@@ -253,6 +263,8 @@ def update(
         rows=rows.problem,
         convergence=convergence(),
         row=row,
+        bends=None if bends is None else bends.astype(np.uint8),
+        least_share=LEAST_SHARE,
         followed=_FOLLOWED,
         nis=nis,
         chi2=chi2,

@@ -609,6 +609,8 @@ typedef struct {
   const magloc_rows *rows;
   const magloc_convergence *convergence;
   int64_t row;
+  const uint8_t *bends; /* (n) whether predictions bend as the readings do, or null; only without nuisances */
+  double least_share;   /* standard deviation of a prediction below which what the readings tell of it does not count */
   double followed;      /* variance that readings have beside their noise in the test of sensors */
   double *nis, *chi2;   /* (n) least sum of squares, and the readings' part of it */
   double *log_evidence; /* (n) by Laplace's method, up to a constant */

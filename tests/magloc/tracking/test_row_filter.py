@@ -112,12 +112,19 @@ def _solved(matrix: NDArray[np.object_], right: NDArray[np.object_]) -> NDArray[
 class TestOneSource:
     @all_instruction_sets
     @pytest.mark.parametrize("array", ARRAYS, ids=["vector", "scalar"])
-    @given(motion=st.sampled_from(MOTIONS), seed=st.integers(0, 2**32), missing=st.integers(0, 2))
+    @given(
+        motion=st.sampled_from(MOTIONS),
+        seed=st.integers(0, 2**32),
+        missing=st.integers(0, 2),
+        bends=st.lists(st.booleans(), min_size=3, max_size=3),
+    )
     @settings(max_examples=25)
-    def test_update_is_the_readable_one(self, array: SensorArray, motion: MotionModel, seed: int, missing: int) -> None:
+    def test_update_is_the_readable_one(
+        self, array: SensorArray, motion: MotionModel, seed: int, missing: int, bends: list[bool]
+    ) -> None:
         at = case(array, motion, seed, missing=missing)
-        expected = readable.updated(at.x, at.S, at.row, np.zeros(3, dtype=bool))
-        found = row_filter.update(at.gaussians, Rows.of(at.row), innovation=True)
+        expected = readable.updated(at.x, at.S, at.row, np.array(bends))
+        found = row_filter.update(at.gaussians, Rows.of(at.row), bends=np.array(bends), innovation=True)
         np.testing.assert_array_equal(found.converged, expected.converged)
         good = expected.converged
         np.testing.assert_array_equal(found.iterations[good], expected.iterations[good])
@@ -190,6 +197,11 @@ class TestOneSource:
                 of_zeta = _decimals(np.eye(len(x))) + _decimals(J.T) @ _decimals(J)
                 square = (left.T @ of_zeta @ left).astype(float)
             np.testing.assert_allclose(square, np.eye(len(x)), atol=1e-5)
+
+    def test_predictions_of_nuisances_do_not_bend(self) -> None:
+        at = case(ARRAYS[0], MOTIONS[0], 0, 4e-9)
+        with pytest.raises(ValueError, match="nuisances do not bend"):
+            row_filter.update(at.gaussians, Rows.of(at.row), bends=np.ones(3, dtype=bool))
 
     def test_a_source_on_a_sensor_does_not_converge(self) -> None:
         at = case(ARRAYS[0], RandomWalk(0.1, 0.02), 0)

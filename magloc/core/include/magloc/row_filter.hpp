@@ -6,6 +6,7 @@
 // coordinates are the root times zeta. Orthogonal transformations keep what covariances and normal equations would lose
 // where a nuisance is known 1e5 times less well than a reading.
 #pragma once
+#include "bent_prediction.hpp"
 #include "row_readings.hpp"
 #include "source_motion.hpp"
 
@@ -39,6 +40,8 @@ class RowFilter {
   double *const e_there_ = space_.take<double>(N);                                   // coordinates at zeta
   double *const zeta_ = space_.take<double>(d_), *const trial_ = space_.take<double>(d_);
   double *const step_ = space_.take<double>(d_ + 1);  // nuisances first
+  BentPrediction<T> bending_{k_, d_, space_};
+  double *const standard_ = space_.take<double>(d_);  // zeta, or where the prediction bends what is normal there
 
  public:
   RowFilter(const magloc_sources &p, const magloc_rows &rows, Workspace &space) : p_(p), given_(rows), space_(space) {}
@@ -113,10 +116,16 @@ class RowFilter {
     set_lower();
   }
 
-  // Update the state by the row's readings: Gauss and Newton's steps, each halved until it lowers the cost enough.
-  void update(const magloc_convergence &limits) {
+  // Update the state by the row's readings: Gauss and Newton's steps, each halved until it lowers the cost enough. The
+  // prediction may bend as the readings do, along what they tell in more than a share of its standard deviation; there
+  // must be no nuisances then.
+  void update(const magloc_convergence &limits, bool bends = false, double least_share = 0.0) {
     begin_update();
     double length = 1.0, gain = 0.0, cost = misfit_at(zeta_, misfit_);
+    if (bends) {
+      fill_source_columns();
+      bending_.bend(misfit_, columns_, least_share, triangle_);
+    }
     bool is_stale = true;
     for (iterations = 0;; ++iterations) {
       if (is_stale) gain = linearise(), length = 1.0;
@@ -134,7 +143,8 @@ class RowFilter {
     nis = cost;
     chi2 = dot(misfit_, misfit_, k_);
     log_evidence = -0.5 * cost;
-    for (int64_t i = 0; i < d_; ++i) log_evidence -= logarithm(triangle_[i][i]);
+    if (bends) log_evidence += bending_.log_determinant(columns_);
+    for (int64_t i = 0; !bends && i < d_; ++i) log_evidence -= logarithm(triangle_[i][i]);
   }
 
   // After an update: chi-square (n_sensors) that free readings of each sensor would explain.
@@ -167,12 +177,13 @@ class RowFilter {
   // covariance.
   void fill_innovation(const Padded<T> &wide, const Padded<T> &triangle, double *innovation) {
     fill_columns();
+    bending_.straighten(columns_);
     wide.clear(given_.n_readings);
     for (int64_t i = 0; i < given_.n_readings; ++i) {
       innovation[i] = reinterpret_cast<const double *>(misfit_)[i];
       for (int64_t c = 0; c < d_; ++c) {
         wide[i][c] = columns_[c][i];
-        innovation[i] += columns_[c][i] * zeta_[zeta_of(c)];
+        innovation[i] -= columns_[c][i] * tail(d_)[c];
       }
       wide[i][d_ + i] = 1.0;
     }
@@ -291,6 +302,7 @@ class RowFilter {
   }
 
   void begin_update() {
+    bending_.bends = false;
     lower_root();
     for (int64_t k = 0; k < K_; ++k) set_chart(k);
     for (int64_t i = 0; i < d_; ++i) zeta_[i] = 0.0;
@@ -334,7 +346,8 @@ class RowFilter {
     add_rows(misfit, {x + N - e_, 1, -1.0}, readings_.effect, e_);
     add_rows(misfit, {e_there_ + seen_, 1, -1.0}, readings_.effect, e_);
     double cost = dot(misfit, misfit, k_);
-    for (int64_t i = 0; i < d_; ++i) cost += zeta[i] * zeta[i];
+    bending_.fill_standard(zeta, misfit, standard_);
+    for (int64_t i = 0; i < d_; ++i) cost += standard_[i] * standard_[i];
     return cost;
   }
 
@@ -378,8 +391,10 @@ class RowFilter {
       add_rows(misfit_, -turned_.column(d_), readings_.slopes(), seen_);
       add_rows(misfit_, {offset + seen_, 1, -1.0}, readings_.effect, e_);
     }
+    bending_.fill_derivatives(columns_);
     __builtin_memcpy(columns_.lanes(d_), misfit_, k_ * sizeof(T));
-    for (int64_t c = 0; c < d_; ++c) tail(d_)[c] = -zeta_[zeta_of(c)];
+    bending_.fill_standard(zeta_, misfit_, standard_);
+    for (int64_t c = 0; c < d_; ++c) tail(d_)[c] = -standard_[zeta_of(c)];
   }
   void fill_columns() {
     move_to(zeta_);
