@@ -20,7 +20,7 @@ import sims
 from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray
 from magloc.fields import dipole
-from magloc.tracking.multi_target.results import SourcesPoint
+from magloc.tracking.results import SourcesPoint
 
 RATE_HZ = 100.0
 NOISE_T = 5e-7

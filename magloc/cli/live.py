@@ -13,9 +13,8 @@ from cyclopts import Parameter
 from arrays.io.arguments import Flag
 from arrays.io.errors import LARGEST, InputError, naming
 from arrays.io.outputs import refuse_unwritable
-from magloc.cli.framework import QuietOptions, print_json
-from magloc.cli.multi_target.sources_track import SourcesOptions, SourcesWanted
-from magloc.cli.options import STREAM, KnownOptions, Port, naming_options, naming_place, print_note
+from magloc.cli.framework import QuietOptions
+from magloc.cli.options import STREAM, KnownOptions, MotionOptions, Port, naming_options, naming_place, print_note
 
 if TYPE_CHECKING:
     from arrays.io.csv import Column
@@ -55,7 +54,7 @@ def live(
     out: Path | None = None,
     page: PageOptions = PageOptions(),
     known: KnownOptions = KnownOptions(),  # noqa: B008 - frozen
-    motion: SourcesOptions = SourcesOptions(),  # noqa: B008 - frozen
+    motion: MotionOptions = MotionOptions(),  # noqa: B008 - frozen
     common: QuietOptions = QuietOptions(),  # noqa: B008 - frozen
 ) -> None:
     """Follow one source, or several, while their readings come in.
@@ -83,13 +82,12 @@ def live(
         The live page.
     known : KnownOptions
         What is known of the sensors, of the source when a track starts, and of the ambient field.
-    motion : SourcesOptions
+    motion : MotionOptions
         How many sources there are, and what is known of their motion.
     common : QuietOptions
         Common options.
     """
     from arrays.io.csv import GrowingTable
-    from magloc.live.follower import Follower
 
     if not 0.0 <= rest_s <= LARGEST:
         raise InputError(f"--rest-s: found {rest_s:g}, expected 0 or a positive number.")
@@ -97,20 +95,16 @@ def live(
         raise InputError(f"--replay-speed: found {replay_speed:g}, expected a positive number.")
     if out is not None:
         refuse_unwritable(out, "--out", ".csv")
-    used, wanted = known.array(array), motion.several(known.prior)
-    with naming(str(array)):
-        if wanted is not None:
-            follower = wanted.follower(used, known.ids, known.where, rest_s)
-        else:
-            model = motion.model()
-            follower = Follower(used, model, prior=known.prior, sensors=known.ids, place=known.where, rest_s=rest_s)
+    used = known.array(array)
+    with naming(str(array), sources=f"--sources {motion.sources}"):
+        follower = motion.follower(used, known, known.where, rest_s)
     with ExitStack() as open_page:
         view = open_page.enter_context(shown(follower, page, quiet=common.quiet)) if page.view else None
         table = None if out is None else open_page.enter_context(GrowingTable(out))
         try:
             with naming_place(), naming(str(array), readings=source, time_s=source):
                 for point in follower.follow(source, replay_speed=replay_speed):
-                    print_point(point, wanted)
+                    motion.print_entry(point, latency_ms=1e3 * point.latency_s)
                     if table is not None:
                         table.add(_columns(point, moves=follower.moves))
                     if view is not None:
@@ -136,20 +130,8 @@ def shown(follower: Follower, page: PageOptions, *, quiet: bool) -> LiveView:
 
 def _columns(point: LivePoint, *, moves: bool) -> dict[str, Column]:
     """Columns of the file with one row, or of several sources one of each."""
-    from magloc.tracking.files import columns_of_sources, columns_of_track
+    from magloc.tracking.files import columns_of_track
 
     if point.sources is not None:
-        return columns_of_sources([(track.id, track) for track in point.sources.tracks])
+        return columns_of_track(point.sources.tracks, ids=[track.id for track in point.sources.tracks])
     return columns_of_track([point], point.row.origin_m[None] if moves else None)
-
-
-def print_point(point: LivePoint, wanted: SourcesWanted | None) -> None:
-    """Print the line of a point at once."""
-    from magloc.tracking.files import json_entry
-
-    latency_ms = 1e3 * point.latency_s
-    if wanted is not None and point.sources is not None:
-        wanted.printed(point.sources, latency_ms=latency_ms)
-        return
-    print_json(json_entry(point) | {"latency_ms": latency_ms})
-    sys.stdout.flush()

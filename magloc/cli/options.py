@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import sys
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
@@ -28,9 +29,12 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from arrays.array import SensorArray
+    from magloc.live.follower import Follower
     from magloc.localization.fit.prior import SourcePrior
     from magloc.readings import Readings
     from magloc.tracking.motion import MotionModel
+    from magloc.tracking.multi_target.motion import FreeMotion
+    from magloc.tracking.results import SourcesPoint, TrackPoint
 
 
 Port = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=0, lte=65535))]
@@ -131,7 +135,7 @@ def naming_place() -> AbstractContextManager[None]:
 @Parameter(name="*", group="Motion")
 @dataclass(frozen=True)
 class MotionOptions:
-    """What is known of the motion.
+    """What is known of the motion of one source, or of several.
 
     Parameters
     ----------
@@ -144,13 +148,23 @@ class MotionOptions:
         wandering: speed and turn rate are estimated too, and forgotten in --correlation-s. turn: a steady turn about
         the vertical. By default unknown.
     correlation_s : float
-        How long a speed lasts, for wandering; by default as long as a turn at the characteristic rate.
+        How long a speed lasts, for wandering; by default as long as a turn at the characteristic rate. Of several
+        sources 1.5 by default.
+    sources : str
+        Follow several moving sources in one filter: at most so many, or "auto": as many as the readings support, five
+        at most. Speeds and rates of turn are then estimated too, and a sensor that dies is left out and named.
     """
 
     speed_m_s: float = 0.5
     turn_deg_s: float | None = None
     motion: Literal["unknown", "wandering", "turn"] | None = None
     correlation_s: float | None = None
+    sources: str | None = None
+
+    @property
+    def number(self) -> int | Literal["auto"] | None:
+        """Most sources that are followed in one filter; None: one on its own."""
+        return None if self.sources is None else number_of_sources(self.sources)
 
     @property
     def turn_rad_s(self) -> float:
@@ -158,7 +172,7 @@ class MotionOptions:
         return math.radians(5.0 if self.turn_deg_s is None else self.turn_deg_s)
 
     def model(self, *, lasting: bool = False) -> MotionModel:
-        """The motion model that the options name, or without a name one whose speed lasts, or a random walk."""
+        """Return the motion of one source that the options name: without a name a random walk or a `lasting` speed."""
         refuse_not_positive(self, "speed_m_s", "turn_deg_s", "correlation_s")
         turn = self.turn_rad_s
         name = self.motion or ("wandering" if lasting else "unknown")
@@ -167,6 +181,38 @@ class MotionOptions:
         if name == "wandering":
             return magloc.OrnsteinUhlenbeck(self.speed_m_s, turn, self.correlation_s)
         return magloc.CoordinatedTurn(self.speed_m_s, turn)
+
+    def model_of_several(self) -> FreeMotion:
+        """Return the motion of several sources."""
+        if self.motion is not None:
+            raise InputError(f"--motion: found {self.motion} together with --sources, expected one of them.")
+        refuse_not_positive(self, "speed_m_s", "turn_deg_s", "correlation_s")
+        turn_rad_s = None if self.turn_deg_s is None else self.turn_rad_s
+        given = {"turn_rad_s": turn_rad_s, "correlation_s": self.correlation_s}
+        return magloc.FreeMotion(self.speed_m_s, **{name: value for name, value in given.items() if value is not None})
+
+    def follower(
+        self, array: SensorArray, known: KnownOptions, place: Place | None = None, rest_s: float = 0.0
+    ) -> Follower:
+        """Return what follows the source, or the sources, through a stream."""
+        from magloc.live.follower import Follower
+
+        return Follower(
+            array,
+            self.model() if self.sources is None else self.model_of_several(),
+            sources=self.number,
+            prior=known.prior,
+            sensors=known.ids,
+            place=place,
+            rest_s=rest_s,
+        )
+
+    def print_entry(self, point: TrackPoint | SourcesPoint, **more: float) -> None:
+        """Print the JSON line of a row at once."""
+        from magloc.tracking.files import json_entry
+
+        framework.print_json(json_entry(getattr(point, "sources", None) or point, single=self.number == 1) | more)
+        sys.stdout.flush()
 
 
 _DATE = re.compile(r"\d{4}-\d{2}-\d{2}(T\d{2}:\d{2}(:\d{2}(\.\d+)?)?)?")

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal  # noqa: F401 - of an inherited option
+from typing import TYPE_CHECKING, Annotated, Any, Literal  # noqa: F401 - of an inherited option
 
 from cyclopts import Parameter
 
@@ -15,20 +14,19 @@ from arrays.io.arguments import Flag
 from arrays.io.errors import InputError, naming
 from arrays.io.outputs import refuse_file, refuse_one_for_two
 from arrays.typing import Vector
-from magloc.cli.framework import CommonOptions, print_json, print_report, progress
+from magloc.cli.framework import CommonOptions, print_json_list, print_report, progress
 from magloc.cli.moments.known_path import (
-    MomentOutputs,
     PathErrorOptions,
+    TrackOutputs,
     print_consistency,
     refuse_bounds,
-    write_moment_track,
     write_moment_tracks,
 )
-from magloc.cli.multi_target.sources_track import SourcesOptions, SourcesOutputs, follow_sources, stream_sources
 from magloc.cli.options import (
     STREAM,
     KnownOptions,
     MapOptions,
+    MotionOptions,
     ambient_field,
     naming_place,
     print_note,
@@ -39,12 +37,11 @@ if TYPE_CHECKING:
     from arrays.array import SensorArray
     from magloc.ambient import Place
     from magloc.readings import Readings
+    from magloc.signature.moment_track import MomentTrack
     from magloc.signature.path import ObjectPath
-    from magloc.tracking.consistency import Consistency
-    from magloc.tracking.motion import MotionModel
-    from magloc.tracking.results import Row, TrackPoint
+    from magloc.tracking.multi_target.track import SourcesTrack
+    from magloc.tracking.results import TrackPoint
     from magloc.tracking.track import Track
-    from magloc.tracking.tracker import Tracker
 
 
 # Two vector sensors have no more: too few for the six numbers of a source in one row.
@@ -55,7 +52,7 @@ _USE_SURVEY = "sources at rest that few sensors move past are found by magloc su
 
 @Parameter(name="*", group="Motion")
 @dataclass(frozen=True)
-class PathOptions(SourcesOptions):
+class PathOptions(MotionOptions):
     """What is known of the motion.
 
     Parameters
@@ -204,129 +201,158 @@ def track(
     common : CommonOptions
         Common options.
     """
-    from magloc.localization.fit.table import legend
-    from magloc.measurement.plausibility import warn_of_doubts
-    from magloc.measurement.pose import with_stated_pose
-    from magloc.tracking.results import rows_of
-    from magloc.tracking.sensor_health import OFFSETS
-
     if json and jsonl:
         raise InputError("--json: found it together with --jsonl, expected one of them.")
     if out is not None:
         refuse_file(out, "--out")
     refuse_one_for_two({"--out": out, **maps.outputs})
     maps.refuse(known.place)
+    outputs = TrackOutputs(json, jsonl, maps, out, truth, common.quiet)
     # A place without a date may be there for the map alone.
     where = None if known.place is not None and known.date is None else known.where
-    used, prior = known.array(array), known.prior
+    used = known.array(array)
     on_background = conditioning.detrend or conditioning.high_pass_hz is not None
     model = motion.model(lasting=smooth or on_background)
     path = motion.known_path()
     if path is not None:
         refuse_bounds(known)
-    several = motion.several(prior)
-    if several is not None:
+    number = motion.number
+    if number is not None:
         others = {"--smooth": smooth or None, "--truth": truth, "--position": path, **maps.outputs}
         for option in (name for name, value in others.items() if value is not None):
             raise InputError(f"{option}: found it together with --sources, expected one of them.")
+    named = naming(str(array), readings=str(readings), time_s=str(readings), sources=f"--sources {motion.sources}")
     if str(readings) == STREAM:
         whole = smooth or json or maps != MapOptions() or any(option is not None for option in (truth, out, path))
         if whole or conditioning != ConditioningOptions():
             raise InputError("READINGS -: found an option that needs the whole record, expected a stream of --jsonl.")
-        with naming(str(array)):
-            if several is not None:
-                stream_sources(used, known.ids, several)
-            else:
-                _stream(used, known, model, where)
+        with named:
+            _stream(used, known, motion, where)
         return
     rows = magloc.read_readings(readings, used, sensors=known.ids, ordered=True)
     maps.refuse_far(rows, str(readings))
     rows, used = conditioning.apply(rows, used, readings)
     used, rows = _in_ambient_field(used, rows, where)
-    if several is not None:
-        follow_sources(used, rows, several, str(readings), SourcesOutputs(out, json, jsonl, common.quiet))
-        return
     if path is not None:
-        outputs = MomentOutputs(json, jsonl, maps, out, truth, common.quiet)
-        turn_rad_s = motion.turn_rad_s
-        with naming(str(array), readings=str(readings), time_s=str(readings)):
-            if isinstance(path, list) and len(path) > 1:
-                write_moment_tracks(
-                    magloc.track_moments(used, rows, path, turn_rad_s=turn_rad_s, smooth=smooth), readings, outputs
-                )
-                return
-            moments = magloc.track_moment(
-                used,
-                rows,
-                path[0] if isinstance(path, list) else path,
-                turn_rad_s=turn_rad_s,
-                path_error=motion.error.path_error(),
-                smooth=smooth,
-            )
-        write_moment_track(moments, readings, known, outputs)
+        with named:
+            found = _moments(used, rows, path, motion, smooth=smooth)
+        write_moment_tracks(found, readings, known, outputs)
         return
-    printed = jsonl and not smooth and not rows.background
     few = used.n_channels <= _FEW_CHANNELS and rows.array_rotation is not None
-    if few and not common.quiet:
+    if number is not None and on_background:
+        raise InputError("--sources: found it together with --detrend or --high-pass-hz, expected one of them.")
+    if number is None and few and not common.quiet:
         print_note(_USE_SURVEY)
-    named = naming(str(array), readings=str(readings), time_s=str(readings))
     with progress(len(rows), "rows", quiet=common.quiet) as advance, named:
-        if printed:
-            warn_of_doubts(used, rows)
-            tracker = magloc.Tracker(with_stated_pose(used, rows), model, prior=prior)
-            found = magloc.Track(tuple(_printed_points(tracker, list(rows_of(rows)), advance)), rows, tracker)
+        alike: Any = {"prior": known.prior, "progress": advance, "told": motion.print_entry if jsonl else None}
+        if number is None:
+            one = magloc.track(used, rows, motion=model, smooth=smooth, **alike)
         else:
-            found = magloc.track(used, rows, motion=model, smooth=smooth, prior=prior, progress=advance)
-    if not any(point.is_on_track for point in found):
-        _print_track(found, None, json=json, jsonl=jsonl, printed=printed)
-        if truth is None and out is None and maps == MapOptions() and _is_undetermined(found):
-            return
-        hint = f"; {_USE_SURVEY}" if few else _STATE_OFFSETS if OFFSETS in found.status else ""
-        raise _no_track(str(readings), found.status, hint)
-    result = None if truth is None else found.consistency(magloc.read_truth(truth))
-    maps.write(found, known.place)
-    if out is not None:
+            several = magloc.track_sources(used, rows, sources=number, motion=motion.model_of_several(), **alike)
+    if number is None:
+        _write_track(one, str(readings), known, outputs, f"; {_USE_SURVEY}" if few else "")
+    else:
+        _write_sources(several, str(readings), outputs, single=number == 1)
+
+
+def _moments(
+    array: SensorArray, rows: Readings, path: ObjectPath | list[Vector], motion: PathOptions, *, smooth: bool
+) -> tuple[MomentTrack, ...]:
+    """Follow the moments of one source on a known path, or of several at known places."""
+    if isinstance(path, list) and len(path) > 1:
+        return magloc.track_moments(array, rows, path, turn_rad_s=motion.turn_rad_s, smooth=smooth)
+    return (
+        magloc.track_moment(
+            array,
+            rows,
+            path[0] if isinstance(path, list) else path,
+            turn_rad_s=motion.turn_rad_s,
+            path_error=motion.error.path_error(),
+            smooth=smooth,
+        ),
+    )
+
+
+def _write_track(found: Track, name: str, known: KnownOptions, outputs: TrackOutputs, hint: str) -> None:
+    """Print a track and write what is asked for; a `hint` may help where there is none."""
+    from magloc.localization.fit.table import legend
+    from magloc.tracking.files import json_of_track
+    from magloc.tracking.sensor_health import OFFSETS
+
+    json, jsonl = outputs.json, outputs.jsonl
+    is_found, result = any(point.is_on_track for point in found), None
+    if is_found:
+        result = None if outputs.truth is None else found.consistency(magloc.read_truth(outputs.truth))
+        outputs.maps.write(found, known.place)
+    if is_found and outputs.out is not None:
         from magloc.plots.tracks import write_picture
 
         write_picture(
             found,
             None if result is None else result.true_position_m,
-            out,
+            outputs.out,
             nees=None if result is None else (result.nees, result.nees_dof),
             bound_m=None if result is None else result.bound_m,
-            array_m=rows.array_position_m,
+            array_m=found.readings.array_position_m,
         )
-    _print_track(found, result, json=json, jsonl=jsonl, printed=printed)
+    if json:
+        print_report(json_of_track(found, result) | {"innovations": found.innovations.json})
+    elif not jsonl:
+        print(found.table())
+    if not is_found:
+        wants_files = outputs.truth is not None or outputs.out is not None or outputs.maps != MapOptions()
+        if not wants_files and _is_undetermined(found):
+            return
+        raise _no_track(name, found.status, hint or _STATE_OFFSETS * (OFFSETS in found.status))
     if result is not None and not json:
         print_consistency(result.lines(), jsonl=jsonl)
-    if not (json or jsonl or common.quiet):
+    if outputs.quiet:
+        return
+    if not (json or jsonl):
         print_note(f"{found.tracked.sum()} of {len(found)} rows tracked")
         for note in legend([found.table()]):
             print_note(note)
-    dropped = sorted({name for names in found.dropped_sensors for name in names})
-    if dropped and not common.quiet:
-        print_note(f"sensors left out of some rows: {', '.join(dropped)}")
-    if jsonl and not common.quiet:
+    _note_dropped({name for names in found.dropped_sensors for name in names})
+    if jsonl:
         for said in filter(None, (found.innovations.reason, found.innovations.caution)):
             print_note(said)
+
+
+def _write_sources(found: SourcesTrack, name: str, outputs: TrackOutputs, *, single: bool) -> None:
+    """Print the tracks of several sources and write what is asked for."""
+    from magloc.tracking.files import json_entry
+
+    if outputs.json:
+        print_json_list("results", (json_entry(point, single=single) for point in found))
+    if not found.ids:
+        raise _no_track(name, {point.status for point in found})
+    if outputs.out is not None:
+        from magloc.plots.tracks import write_sources
+
+        write_sources(found, outputs.out)
+    is_table = not (outputs.json or outputs.jsonl)
+    if is_table:
+        print(found.table())
+    if outputs.quiet:
+        return
+    if is_table:
+        tracked = sum(bool(point.tracks) for point in found)
+        print_note(f"{tracked} of {len(found)} rows with a source, {len(found.ids)} sources in all")
+    misfits = sum(point.status == "misfit" for point in found)
+    if misfits:
+        print_note(f"{misfits} of {len(found)} rows are explained by no sources, faults or losses: status misfit")
+    _note_dropped(found.dropped_sensors)
+
+
+def _note_dropped(names: Iterable[str]) -> None:
+    """Name the sensors that are left out of some rows."""
+    if names := sorted(names):
+        print_note(f"sensors left out of some rows: {', '.join(names)}")
 
 
 def _in_ambient_field(array: SensorArray, rows: Readings, where: Place | None) -> tuple[SensorArray, Readings]:
     array, ambient_T = ambient_field(array, rows, where)
     return array, replace(rows, ambient_T=ambient_T)
-
-
-def _print_track(found: Track, result: Consistency | None, *, json: bool, jsonl: bool, printed: bool) -> None:
-    """Print a finished track as it is asked for, unless its lines are `printed` already."""
-    from magloc.tracking.files import json_of_track
-
-    if json:
-        print_report(json_of_track(found, result) | {"innovations": found.innovations.json})
-    elif not jsonl:
-        print(found.table())
-    elif not printed:
-        for point in found:
-            _printed(point)
 
 
 def _is_undetermined(found: Iterable[TrackPoint]) -> bool:
@@ -344,37 +370,15 @@ def _no_track(readings: str, statuses: Iterable[str], hint: str = "") -> InputEr
     return InputError(f"{readings}: found no row where a source can be tracked ({reasons}){hint}.")
 
 
-def _printed_points(tracker: Tracker, rows: list[Row], advance: Callable[[int], None]) -> Iterator[TrackPoint]:
-    """Points of rows, each printed as soon as it is known."""
-    from magloc.tracking.batch import next_points
-
-    done = 0
-    while done < len(rows):
-        points = next_points(tracker, rows, done)
-        yield from map(_printed, points)
-        done += len(points)
-        advance(len(points))
-
-
-def _printed(point: TrackPoint) -> TrackPoint:
-    """The point, after its line is printed."""
-    from magloc.tracking.files import json_entry
-
-    print_json(json_entry(point))
-    sys.stdout.flush()
-    return point
-
-
-def _stream(array: SensorArray, known: KnownOptions, model: MotionModel, where: Place | None) -> None:
+def _stream(array: SensorArray, known: KnownOptions, motion: PathOptions, where: Place | None) -> None:
     """Answer every row of standard input by one line; none that is tracked is an InputError at its end."""
-    from magloc.live.follower import Follower
     from magloc.tracking.results import UNDETERMINED
 
-    follower = Follower(array, model, prior=known.prior, sensors=known.ids, place=where)
+    follower = motion.follower(array, known, where)
     statuses: set[str] = set()
     with naming_place():
         for point in follower.follow(STREAM):
-            _printed(point)
+            motion.print_entry(point)
             statuses.add(point.status)
     if follower.tally.faults:
         print_note(str(follower.tally))

@@ -28,9 +28,8 @@ from magloc.readings import EXPECTED_HEADER, Readings, log_format, without_satur
 from magloc.tracking.batch import is_compiled, next_points
 from magloc.tracking.motion import MotionModel, RandomWalk
 from magloc.tracking.multi_target.motion import FreeMotion
-from magloc.tracking.multi_target.results import SourcesPoint
 from magloc.tracking.multi_target.tracker import SourcesTracker
-from magloc.tracking.results import Row, TrackPoint, rows_of, warn_of_strengths
+from magloc.tracking.results import Row, SourcesPoint, TrackPoint, rows_of, warn_of_strengths
 from magloc.tracking.track import SPEED_M_S, TURN_RAD_S
 from magloc.tracking.tracker import Tracker
 
@@ -255,12 +254,11 @@ class Follower:
                 latency_s = time.perf_counter() - arrived
                 self.tally.latencies_s.append(latency_s)
                 known: dict[str, Any]
+                self.tally.tracked += bool(_known_sources(point))
                 if isinstance(point, SourcesPoint):
-                    self.tally.tracked += bool(point.tracks)
                     of_all = {"nis": point.chi2, "nis_dof": point.dof, "dropped_sensors": point.dropped_sensors}
                     known = {"time_s": point.time_s, "status": point.status, "sources": point, **of_all}
                 else:
-                    self.tally.tracked += point.is_on_track
                     known = {name: getattr(point, name) for name in _OF_POINT}
                 self._doubt(point)
                 yield LivePoint(**known, row=row, latency_s=latency_s, tally=self.tally)
@@ -291,7 +289,7 @@ class Follower:
     def _doubt(self, point: TrackPoint | SourcesPoint) -> None:
         """Warn once of moments that no object has, after as many points of a track as a record is judged by."""
         if len(self._first_points) < FEWEST_ROWS:
-            tracks = point.tracks[:1] if isinstance(point, SourcesPoint) else (point,) * point.is_on_track
+            tracks = _known_sources(point)[:1]
             self._first_points += tracks
             if tracks and len(self._first_points) == FEWEST_ROWS:
                 warn_of_strengths(self._first_points)
@@ -335,6 +333,11 @@ class Follower:
         self._rest_s = 0.0
         self.restart()
         return False
+
+
+def _known_sources(point: TrackPoint | SourcesPoint) -> Sequence[TrackPoint]:
+    """Sources that rows before tell of as well."""
+    return [track for track in point.tracks if track.is_on_track]
 
 
 def _next_points(tracker: Tracker | SourcesTracker, rows: Sequence[Row]) -> Sequence[TrackPoint | SourcesPoint]:

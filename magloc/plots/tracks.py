@@ -10,18 +10,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.figure import Figure
 
-from arrays.io.csv import write_columns
+from arrays.io.csv import Column, write_columns
 from arrays.io.outputs import make_folder
 from arrays.typing import FloatArray, IntArray
 from magloc.chi_square import square_columns
 from magloc.plots import style
 from magloc.plots.style import save
-from magloc.tracking.files import columns_of_sources, columns_of_track, states_of
+from magloc.tracking.files import columns_of_track, states_of
 from magloc.tracking.results import TrackPoint, TrackResult, on_track, stacked
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
+
+    from magloc.tracking.multi_target.track import SourcesTrack
 
 _LOG = logging.getLogger(__name__)
 
@@ -35,14 +37,13 @@ def write_picture(
     bound_m: FloatArray | None = None,
     array_m: FloatArray | None = None,
 ) -> None:
-    """Write track.png and consistency.png, and track.csv with the data behind both.
+    """Write track.png and consistency.png of one source, and track.csv with the data behind both.
 
     ``truth_m`` (n, 3): true positions [m], NaN where they are not known. ``folder``: made if it is not there.
     ``nees`` (n,): normalised estimation error squared of every row, and its degrees of freedom. ``bound_m`` (n,):
     posterior Cramér-Rao bound of the distance from the truth. ``array_m`` (n, 3): origin of the array's frame in
     every row. Raises InputError: the folder cannot be written.
     """
-    make_folder(folder, "--out")
     columns = columns_of_track(points, array_m)
     status = columns.pop("status")
     if truth_m is not None:
@@ -51,27 +52,26 @@ def write_picture(
         columns |= square_columns("nees", *nees)
     if bound_m is not None:
         columns["bound_m"] = bound_m
-    columns["status"] = status
-    write_columns(columns, folder / "track.csv")
-    save(track_figure(points, truth_m, array_m), folder / "track.png")
-    save(consistency_figure(points, truth_m, nees, bound_m), folder / "consistency.png")
-    _LOG.info(f"wrote track.png, consistency.png and track.csv into {folder}/")
+    figures = {
+        "track": track_figure(points, truth_m, array_m),
+        "consistency": consistency_figure(points, truth_m, nees, bound_m),
+    }
+    _write(folder, figures, columns | {"status": status})
 
 
-def write_sources(result: TrackResult, folder: Path, array_m: FloatArray | None = None) -> None:
+def write_sources(found: SourcesTrack, folder: Path) -> None:
     """Write track.png, as :func:`sources_figure`, and track.csv with a row for every source in every row."""
+    known = [track for point in found for track in point.tracks]
+    _write(folder, {"track": found.plot()}, columns_of_track(known, ids=[track.id for track in known]))
+
+
+def _write(folder: Path, figures: Mapping[str, Figure], columns: Mapping[str, Column]) -> None:
+    """Write figures by name and track.csv into a folder, which is made if it is not there."""
     make_folder(folder, "--out")
-    named = [
-        (id, point)
-        for id, track in zip(result.ids or (1,), result.tracks, strict=True)
-        for point in track
-        if point.position_m is not None
-    ]
-    named.sort(key=lambda pair: pair[1].time_s)
-    columns = columns_of_sources(named)
     write_columns(columns, folder / "track.csv")
-    save(sources_figure(result, array_m), folder / "track.png")
-    _LOG.info(f"wrote track.png and track.csv into {folder}/")
+    for name, figure in figures.items():
+        save(figure, folder / f"{name}.png")
+    _LOG.info(f"wrote {', '.join(f'{name}.png' for name in figures)} and track.csv into {folder}/")
 
 
 # Least and largest height of the plan, and its width [in].
@@ -124,9 +124,8 @@ def sources_figure(result: TrackResult, array_m: FloatArray | None = None) -> Fi
     >>> track = magloc.track_sources(board.array, board.readings[:20], sources=1)
     >>> figure = magloc.plots.source_tracks(track.as_result)
     """
-    if not result.ids:
-        return _figure({"track": result.points}, None, array_m)
-    return _figure({f"source {id}": track for id, track in zip(result.ids, result.tracks, strict=True)}, None, array_m)
+    names = [f"source {id}" for id in result.ids] or ["track"]
+    return _figure(dict(zip(names, result.tracks, strict=True)), None, array_m)
 
 
 def _figure(

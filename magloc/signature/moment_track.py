@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from arrays.array import SensorArray
 from arrays.io.errors import InputError
 from arrays.typing import FloatArray
-from magloc.chi_square import mean_bounds, normalised_square
+from magloc.chi_square import normalised_square
 from magloc.kalman import estimability
 from magloc.localization.fit.results import is_misfit
 from magloc.measurement.nuisances import Drift
@@ -28,7 +28,7 @@ from magloc.signature.moment_filter import (
     smoothed,
 )
 from magloc.signature.path import ObjectPath, PathError
-from magloc.tracking.consistency import consistency_lines
+from magloc.tracking.consistency import consistency_lines, mean_nis, root_mean
 from magloc.tracking.measurement import RowMeasurements
 from magloc.tracking.motion import N_SOURCE
 from magloc.tracking.results import TrackPoint, rows_of, warn_of_strengths
@@ -138,16 +138,15 @@ class MomentTrack(TrackColumns):
         known = self.tracked & np.isfinite(true).all(axis=1)
         error, covariance = (self.moment_Am2 - true)[known], self.covariance[known][:, 3:, 3:]
         nees, dof = float(np.sum(normalised_square(error, covariance))), 3 * int(known.sum())
-        used = [point for point in self if point.status == "tracked" and math.isfinite(point.nis)]
-        nis_dof = sum(point.nis_dof for point in used)
         bound = _covariances_at(self.model, true, smooth=self.is_smoothed)[known]
+        nis_per_dimension, nis_bounds = mean_nis(self)
         return MomentConsistency(
             rows=int(known.sum()),
-            moment_rms_Am2=math.sqrt(float(np.mean(np.sum(error**2, axis=1)))) if known.any() else math.nan,
-            moment_bound_Am2=math.sqrt(float(np.mean(np.trace(bound, axis1=1, axis2=2)))) if known.any() else math.nan,
+            moment_rms_Am2=root_mean(np.sum(error**2, axis=1)),
+            moment_bound_Am2=root_mean(np.trace(bound, axis1=1, axis2=2)),
             nees_per_dimension=nees / dof if dof else math.nan,
-            nis_per_dimension=sum(point.nis for point in used) / nis_dof if nis_dof else math.nan,
-            nis_bounds=mean_bounds(nis_dof),
+            nis_per_dimension=nis_per_dimension,
+            nis_bounds=nis_bounds,
         )
 
 

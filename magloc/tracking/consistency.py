@@ -22,7 +22,7 @@ from magloc.tracking.chart.mixture import Mixture
 from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.chart.update import damped_inverse
 from magloc.tracking.measurement import RowMeasurement
-from magloc.tracking.results import Row, TrackPoint
+from magloc.tracking.results import Row, TrackPoint, stacked
 from magloc.tracking.tracker import Tracker
 
 
@@ -71,8 +71,13 @@ class Consistency:
     true_position_m: FloatArray
     bound_m: FloatArray | None
 
+    @property
+    def json(self) -> dict[str, object]:
+        """Entries of ``magloc track --json``."""
+        return {key: value for key, value in vars(self).items() if not isinstance(value, np.ndarray | None)}
+
     def lines(self) -> list[str]:
-        """Errors against the truth, and what they should be."""
+        """Return errors against the truth, and what they should be."""
         lines = [
             f"against the truth, {self.tracked_rows} of {self.rows} rows answered:",
             f"  position rms {self.position_rms_m:.4g} m",
@@ -104,42 +109,40 @@ def consistency(
     moment_Am2: FloatArray | None,
     bound_m: FloatArray | None = None,
 ) -> Consistency:
-    """Errors of a track; true coordinates (n, 3) are NaN where they are not known, the bound is that of every row."""
-    squares, bounds, nis, nis_dof = [], [], 0.0, 0
-    for i, point in enumerate(points):
-        if point.position_m is None:
-            continue
-        if math.isfinite(point.nis) and point.nis_dof and point.status == "tracked":
-            nis, nis_dof = nis + point.nis, nis_dof + point.nis_dof
-        known = np.isfinite(position_m[i])
-        if known.any():
-            error = point.position_m[known] - position_m[i][known]
-            squares.append(float(error @ error))
-            if bound_m is not None:
-                bounds.append(float(bound_m[i]))
+    """Return errors of a track; true coordinates (n, 3) are NaN where they are not known, the bound is of every row."""
+    error = stacked(points, "position_m", 3) - position_m
+    answered = np.isfinite(error).any(axis=1)
     moments = np.full_like(position_m, np.nan) if moment_Am2 is None else moment_Am2
-    truth = np.hstack([position_m, moments])
-    of_points = [
-        nees_of(point, of_row, tracker.measurements.of(row))
-        for point, of_row, row in zip(points, truth, rows, strict=True)
-    ]
-    of_rows = np.array([square for square, _ in of_points])
-    dof_of_rows = np.array([dof for _, dof in of_points], dtype=np.intp)
-    nees, nees_dof = float(np.nansum(of_rows)), int(dof_of_rows.sum())
+    measurements = map(tracker.measurements.of, rows)
+    nees = [nees_of(*row) for row in zip(points, np.hstack([position_m, moments]), measurements, strict=True)]
+    square, dof = np.array([value for value, _ in nees]), np.array([n for _, n in nees], dtype=np.intp)
+    nis_per_dimension, nis_bounds = mean_nis(points)
     return Consistency(
         rows=int(np.isfinite(position_m).any(axis=1).sum()),
-        tracked_rows=len(squares),
-        position_rms_m=math.sqrt(float(np.mean(squares))) if squares else math.nan,
-        position_bound_m=math.sqrt(float(np.mean(np.square(bounds)))) if bounds else math.nan,
-        nees_per_dimension=nees / nees_dof if nees_dof else math.nan,
-        nees_bounds=mean_bounds(nees_dof),
-        nis_per_dimension=nis / nis_dof if nis_dof else math.nan,
-        nis_bounds=mean_bounds(nis_dof),
-        nees=of_rows,
-        nees_dof=dof_of_rows,
+        tracked_rows=int(answered.sum()),
+        position_rms_m=root_mean(np.nansum(error[answered] ** 2, axis=1)),
+        position_bound_m=math.nan if bound_m is None else root_mean(np.square(bound_m[answered])),
+        nees_per_dimension=float(np.nansum(square)) / int(dof.sum()) if dof.any() else math.nan,
+        nees_bounds=mean_bounds(int(dof.sum())),
+        nis_per_dimension=nis_per_dimension,
+        nis_bounds=nis_bounds,
+        nees=square,
+        nees_dof=dof,
         true_position_m=position_m,
         bound_m=bound_m,
     )
+
+
+def root_mean(squares: FloatArray) -> float:
+    """Return the root of the mean of squares, NaN of none."""
+    return math.sqrt(float(np.mean(squares))) if len(squares) else math.nan
+
+
+def mean_nis(points: Sequence[TrackPoint]) -> tuple[float, tuple[float, float]]:
+    """Return the mean NIS of the tracked rows over its degrees of freedom, and two-sided 99 % bounds of it."""
+    used = [point for point in points if point.tracks and point.status == "tracked" and math.isfinite(point.nis)]
+    dof = sum(point.nis_dof for point in used)
+    return sum(point.nis for point in used) / dof if dof else math.nan, mean_bounds(dof)
 
 
 def nees_of(point: TrackPoint, truth: FloatArray, measurement: RowMeasurement) -> tuple[float, int]:

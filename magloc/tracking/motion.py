@@ -28,6 +28,7 @@ from magloc.navigation.rotations import cross_matrix, rotation_matrix, turn_of_c
 
 N_SOURCE = 6
 _AT_REST: Vector = (0.0, 0.0, 0.0)
+_VERTICAL = np.array([0.0, 0.0, 1.0])
 
 
 def array_axes_transition(
@@ -103,17 +104,27 @@ class LinearMotion(MotionModel, Protocol):
         """F, and A and B (n, m) of the noise ``S_q = A + |m| B``."""
 
 
-def _without_rest(source: FloatArray, S: FloatArray, rest_sigma: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """A state whose further components are unknown but for their standard deviations."""
-    n = N_SOURCE + rest_sigma.size
-    x, root = np.zeros(n), np.zeros((n, n))
-    x[:N_SOURCE], root[:N_SOURCE, :N_SOURCE] = source, S
-    root[np.arange(N_SOURCE, n), np.arange(N_SOURCE, n)] = rest_sigma
-    return x, root
+class _MovingState:
+    """State of position and moment, then of velocity and turn rates, as many as the model has."""
+
+    speed_m_s: float
+    turn_rad_s: float
+    n_states: int
+
+    def start(self, source: FloatArray, S: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the state and the square root of its covariance, see :class:`MotionModel`."""
+        rest_sigma = np.repeat([self.speed_m_s, self.turn_rad_s], 3)[: self.n_states - N_SOURCE]
+        root = np.diag(np.concatenate([np.zeros(N_SOURCE), rest_sigma]))
+        root[:N_SOURCE, :N_SOURCE] = S
+        return np.concatenate([source, np.zeros(rest_sigma.size)]), root
+
+    def state_of(self, source: FloatArray, velocity_m_s: FloatArray, rate_rad_s: FloatArray) -> FloatArray:
+        """Return the state of a source of known motion, see :class:`MotionModel`."""
+        return np.concatenate([source, velocity_m_s, rate_rad_s])[: self.n_states]
 
 
 @dataclass(frozen=True)
-class RandomWalk:
+class RandomWalk(_MovingState):
     """Position and moment as random walks of the characteristic speed and turn rate: S_q of Pavlov et al.
 
     ``S_q = diag(V Δt, V Δt, V Δt, |m| W Δt, …)``: every step is as long as the object may have moved in that time.
@@ -139,14 +150,6 @@ class RandomWalk:
     turn_rad_s: float
     n_states: int = N_SOURCE
 
-    def start(self, source: FloatArray, S: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """As :class:`MotionModel`."""
-        return source.copy(), S.copy()
-
-    def state_of(self, source: FloatArray, velocity_m_s: FloatArray, rate_rad_s: FloatArray) -> FloatArray:
-        """As :class:`MotionModel`."""
-        return source.copy()
-
     def linear_step(self, dt_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """As :class:`LinearMotion`."""
         of_position = np.diag(np.repeat([self.speed_m_s * dt_s, 0.0], 3))
@@ -154,13 +157,13 @@ class RandomWalk:
         return np.eye(N_SOURCE), of_position, of_moment
 
     def step(self, x: FloatArray, dt_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """As :class:`MotionModel`."""
+        """Return the prediction, see :class:`MotionModel`."""
         F, of_position, of_moment = self.linear_step(dt_s)
         return F @ x, F, of_position + math.sqrt(float(x[3:6] @ x[3:6])) * of_moment
 
 
 @dataclass(frozen=True)
-class OrnsteinUhlenbeck:
+class OrnsteinUhlenbeck(_MovingState):
     r"""Position, and a moment that turns: speed and turn rate wander about zero, and are forgotten in time.
 
     State (p, m, v, ω), with
@@ -196,13 +199,11 @@ class OrnsteinUhlenbeck:
     moment_change: float = 3e-3
     n_states: int = 12
 
-    def start(self, source: FloatArray, S: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """As :class:`MotionModel`."""
-        return _without_rest(source, S, np.repeat([self.speed_m_s, self.turn_rad_s], 3))
-
-    def state_of(self, source: FloatArray, velocity_m_s: FloatArray, rate_rad_s: FloatArray) -> FloatArray:
-        """As :class:`MotionModel`."""
-        return np.concatenate([source, velocity_m_s, rate_rad_s])
+    @property
+    def _correlation_s(self) -> float:
+        if self.correlation_s is None:
+            return 1.0 / self.turn_rad_s if self.turn_rad_s > 0.0 else math.inf
+        return self.correlation_s
 
     def turning_step(self, dt_s: float) -> FloatArray:
         """Return the numbers (12,) of a step for its kernel."""
@@ -211,14 +212,8 @@ class OrnsteinUhlenbeck:
         change = self.moment_change * math.sqrt(dt_s)
         return np.array([moved, kept, moved, kept, *self.speed_m_s * lower, *self.turn_rad_s * lower, change, change])
 
-    @property
-    def _correlation_s(self) -> float:
-        if self.correlation_s is None:
-            return 1.0 / self.turn_rad_s if self.turn_rad_s > 0.0 else math.inf
-        return self.correlation_s
-
     def step(self, x: FloatArray, dt_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """As :class:`MotionModel`."""
+        """Return the prediction, see :class:`MotionModel`."""
         moved, kept, root = wandering_step(self._correlation_s, dt_s)
         p, m, v, rate = x[:3], x[3:6], x[6:9], x[9:]
         turn = rotation_matrix(moved * rate)
@@ -238,7 +233,7 @@ class OrnsteinUhlenbeck:
 
 
 @dataclass(frozen=True)
-class KnownMotion:
+class KnownMotion(_MovingState):
     r"""Position and moment while the velocities and rates of array and object are measured: MotionMT, equation (17).
 
     .. math:: p_j = p_{j-1} + (v_{object} - v_{array} - ω_{array} × p_{j-1}) Δt, \qquad
@@ -279,16 +274,8 @@ class KnownMotion:
     array_rate_sigma_rad_s: float = 0.0
     n_states: int = N_SOURCE
 
-    def start(self, source: FloatArray, S: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """As :class:`MotionModel`."""
-        return source.copy(), S.copy()
-
-    def state_of(self, source: FloatArray, velocity_m_s: FloatArray, rate_rad_s: FloatArray) -> FloatArray:
-        """As :class:`MotionModel`."""
-        return source.copy()
-
     def step(self, x: FloatArray, dt_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """As :class:`MotionModel`."""
+        """Return the prediction, see :class:`MotionModel`."""
         F, shift = array_axes_transition(
             dt_s,
             object_velocity_m_s=self.object_velocity_m_s,
@@ -346,7 +333,7 @@ def wandering_step(correlation_s: float, dt_s: float) -> tuple[float, float, Flo
 
 
 @dataclass(frozen=True)
-class CoordinatedTurn:
+class CoordinatedTurn(_MovingState):
     r"""A vehicle on a steady turn about the vertical: velocity and moment turn with one rate, which wanders.
 
     State (p, m, v, ω): :math:`\dot p = v`, :math:`\dot v = ω e_z × v`, :math:`\dot m = ω e_z × m`.
@@ -379,30 +366,19 @@ class CoordinatedTurn:
     moment_change: float = 0.002
     n_states: int = 10
 
-    def start(self, source: FloatArray, S: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """As :class:`MotionModel`."""
-        return _without_rest(source, S, np.array([self.speed_m_s] * 3 + [self.turn_rad_s]))
-
     def state_of(self, source: FloatArray, velocity_m_s: FloatArray, rate_rad_s: FloatArray) -> FloatArray:
-        """As :class:`MotionModel`."""
+        """Return the state of a source that turns about the vertical, see :class:`MotionModel`."""
         return np.concatenate([source, velocity_m_s, rate_rad_s[2:]])
 
     def step(self, x: FloatArray, dt_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """As :class:`MotionModel`."""
+        """Return the prediction, see :class:`MotionModel`."""
         p, m, v, rate = x[:3], x[3:6], x[6:9], float(x[9])
-        angle = rate * dt_s
-        sine, cosine = math.sin(angle), math.cos(angle)
-        # sin(a)/a and (1 - cos(a))/a, and their derivatives, by series where they cancel.
-        if abs(angle) < 1e-4:
-            along, across = 1.0 - angle**2 / 6.0, angle / 2.0 - angle**3 / 24.0
-            d_along, d_across = -angle / 3.0, 0.5 - angle**2 / 8.0
-        else:
-            along, across = sine / angle, (1.0 - cosine) / angle
-            d_along, d_across = (cosine - along) / angle, (sine - across) / angle
-        turn = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-        d_turn = np.array([[-sine, -cosine, 0.0], [cosine, -sine, 0.0], [0.0, 0.0, 0.0]])
-        path = np.array([[along, -across, 0.0], [across, along, 0.0], [0.0, 0.0, 1.0]])
-        d_path = np.array([[d_along, -d_across, 0.0], [d_across, d_along, 0.0], [0.0, 0.0, 0.0]])
+        angle, about_vertical = rate * dt_s, cross_matrix(_VERTICAL)
+        turn, path = rotation_matrix(angle * _VERTICAL), turn_of_change(angle * _VERTICAL)
+        d_turn = about_vertical @ turn
+        # Derivative of the path's matrix, by a series where the quotient cancels.
+        series = (0.5 - angle**2 / 8.0) * about_vertical + angle / 3.0 * about_vertical @ about_vertical
+        d_path = series if abs(angle) < 1e-4 else (turn - path) / angle
         F = np.eye(10)
         F[:3, 6:9] = dt_s * path
         F[3:6, 3:6] = F[6:9, 6:9] = turn

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from arrays.typing import FloatArray
-from magloc.kalman import block_update
-from magloc.tracking.chart.known_moment import KnownInWorld
 from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.chart.start import prior_root
 from magloc.tracking.results import Row, Step
 from magloc.tracking.tracker import Tracker
-from magloc.tracking.whole_records.background import steps_at
+from magloc.tracking.whole_records.background import steps_of
 from magloc.tracking.whole_records.smoother import smoothed_states
 
 
@@ -58,38 +57,20 @@ def _steps_at_truth(
     motion, n_errors = tracker.motion, tracker.n_errors
     truth = np.concatenate([position_m, moment_Am2], axis=1)
     velocity, rate = _velocities(np.array([row.time_s for row in rows]), truth)
+    states = [
+        np.concatenate([motion.state_of(truth[i], velocity[i], rate[i]), np.zeros(n_errors)]) for i in range(len(rows))
+    ]
+    measurements = [tracker.measurements.of(row) for row in rows]
     if tracker.background is not None:
-        states = [
-            np.concatenate([motion.state_of(truth[i], velocity[i], rate[i]), np.zeros(n_errors)])
-            for i in range(len(rows))
-        ]
-        return steps_at(tracker, rows, states)
-    steps: list[Step] = []
-    S: FloatArray | None = None
-    for i, row in enumerate(rows):
-        measurement = tracker.measurements.of(row)
-        before = max(i - 1, 0)
-        prediction = None
-        if S is not None:
-            state = np.concatenate([motion.state_of(truth[before], velocity[before], rate[before]), np.zeros(n_errors)])
-            prediction = tracker.predicted(state, S, row.time_s - rows[before].time_s)
-            predicted_S = prediction.S
-        elif ChartRow.of(measurement).is_detected(tracker.errors.sigma):
-            predicted_S = np.diag(np.concatenate([np.zeros(motion.n_states), tracker.error_sigma]))
-            root = prior_root(ChartRow.of(measurement).chart(truth[i]))
-            _, predicted_S[: motion.n_states, : motion.n_states] = motion.start(truth[i], root)
-            known = KnownInWorld.of(tracker.prior, row.R_world_from_array)
-            if known is not None:
-                state = np.concatenate([truth[i], np.zeros(len(predicted_S) - len(truth[i]))])
-                H = known.along(state[None], np.eye(len(state))[None])[0]
-                _, predicted_S = block_update(state, predicted_S, H, np.zeros(len(H)), np.ones(len(H)))
-        else:
-            continue
-        state = np.concatenate([motion.state_of(truth[i], velocity[i], rate[i]), np.zeros(n_errors)])
-        H = measurement.jacobian(state)
-        _, S = block_update(state, predicted_S, H, np.zeros(len(H)), np.ones(len(H)))
-        steps.append(Step(i, prediction, state, S))
-    return steps
+        return steps_of(tracker, measurements, states)
+    seen = (i for i, row in enumerate(map(ChartRow.of, measurements)) if row.is_detected(tracker.errors.sigma))
+    first = next(seen, None)
+    if first is None:
+        return []
+    root = prior_root(ChartRow.of(measurements[first]).chart(truth[first]))
+    start = tracker.state_before(states[first], root, rows[first].R_world_from_array)
+    steps = steps_of(tracker, measurements[first:], states[first:], start)
+    return [replace(step, row=first + step.row) for step in steps]
 
 
 def _velocities(time_s: FloatArray, truth: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -1,4 +1,4 @@
-"""What goes into a track row by row, and what comes out of it."""
+"""Rows of readings for a tracker, and the points of tracks, of one source or of several."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ class Innovation:
 
 @dataclass(frozen=True, eq=False)
 class TrackPoint:
-    """What is known of the source at one instant; None where it is not tracked.
+    """State of the source at one instant; None where it is not tracked.
 
     Attributes
     ----------
@@ -102,7 +102,7 @@ class TrackPoint:
     covariance : ndarray, shape (6, 6)
         Of (position, moment).
     estimability : ndarray, shape (6,)
-        What the readings taught of every component since the track began: 1 - σ / σ without any of them.
+        Share of every σ that the readings took away since the track began: 1 - σ / σ without any of them.
     iterations : int
         Linearisations.
     nis : float
@@ -112,7 +112,7 @@ class TrackPoint:
         the track, not used), "undetermined" (no track yet: what rows of few readings say together so far), or why
         there is no track.
     weight : float
-        How likely the place is the right one of all that explain the readings so far. NaN without a track.
+        Probability that the place is the right one of all that explain the readings so far. NaN without a track.
     rivals : tuple of Solution
         Where a track starts from several rows, the other solutions of these.
     centroid_m : ndarray, shape (3,), optional
@@ -147,6 +147,11 @@ class TrackPoint:
     dropped_sensors: tuple[str, ...] = ()
 
     @property
+    def tracks(self) -> tuple[TrackPoint, ...]:
+        """The source itself, none where it has no position: as :attr:`SourcesPoint.tracks`."""
+        return () if self.position_m is None else (self,)
+
+    @property
     def is_on_track(self) -> bool:
         """Whether the source is known, and not by this row alone."""
         return self.position_m is not None and self.status != UNDETERMINED
@@ -179,6 +184,55 @@ class TrackPoint:
             return False
         sigma = relative_sigma(self.covariance, self.position_m - self.centroid_m, self.moment_Am2)
         return bool(sigma <= LARGEST_GAUSSIAN_SIGMA)
+
+
+@dataclass(frozen=True, eq=False)
+class SourcePoint(TrackPoint):
+    """One of several sources at one instant.
+
+    Attributes
+    ----------
+    id : int
+        The same in all rows.
+    merged : bool
+        Whether it is so near to another that their gap is less certain than a third of it: which is which is then a
+        guess, and so are the places.
+    """
+
+    position_m: FloatArray
+    moment_Am2: FloatArray
+    covariance: FloatArray
+    id: int = 0
+    merged: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class SourcesPoint:
+    """All sources at one instant.
+
+    Attributes
+    ----------
+    time_s : float
+    tracks : tuple of SourcePoint
+        In the order of their ids.
+    status : str
+        "tracked", "no source", "no readings", "misfit": no sources, losses and faults explain the readings, and the
+        tracks are predictions; or "doubtful": χ² of the last rows together is beyond noise, and what is wrong is being
+        looked for.
+    chi2 : float
+        Of the row given its prediction.
+    dof : int
+        Number of its readings.
+    dropped_sensors : tuple of str
+        Sensors that are left out.
+    """
+
+    time_s: float
+    tracks: tuple[SourcePoint, ...]
+    status: str
+    chi2: float
+    dof: int
+    dropped_sensors: tuple[str, ...] = ()
 
 
 def learned(variance: FloatArray, open_loop: FloatArray) -> FloatArray:

@@ -1,14 +1,15 @@
-"""The one door to a track: one source followed through the rows of readings."""
+"""Follow one source through the rows of readings, and the results of tracks."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from abc import abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from html import escape
-from typing import TYPE_CHECKING, Any, Literal, overload
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,15 +22,14 @@ from magloc.localization.fit.results import EVERYWHERE, Intervals
 from magloc.measurement.nuisances import Drift
 from magloc.measurement.plausibility import usable_readings
 from magloc.measurement.pose import with_stated_pose
-from magloc.navigation.measured_motion import MeasuredMotion
 from magloc.readings import Readings
-from magloc.tracking.batch import track_record
+from magloc.tracking.batch import next_points, track_record
 from magloc.tracking.consistency import Consistency, consistency
 from magloc.tracking.files import dataset_of_track, geojson_of_track, kml_of_track, lines_of_track
 from magloc.tracking.innovations import InnovationTest, innovation_test
 from magloc.tracking.motion import MotionModel, OrnsteinUhlenbeck, RandomWalk, known_motions
 from magloc.tracking.posterior_bound import posterior_bound, smoothing_bound
-from magloc.tracking.results import Row, TrackPoint, rows_of, stacked, warn_of_strengths
+from magloc.tracking.results import Row, SourcesPoint, TrackPoint, TrackResult, rows_of, stacked, warn_of_strengths
 from magloc.tracking.tracker import Tracker
 from magloc.tracking.whole_records.background import track_on_background
 from magloc.tracking.whole_records.body_errors import body_factor
@@ -47,31 +47,57 @@ TURN_RAD_S = math.radians(5.0)
 """Characteristic rate at which its moment turns."""
 
 
-class TrackColumns(Sequence[TrackPoint]):
-    """Columns of the points of a record, NaN where the source is not tracked, and what is made of them."""
+_Row = TypeVar("_Row", TrackPoint, SourcesPoint)
 
-    points: tuple[TrackPoint, ...]
+
+class TrackRows(Sequence[_Row]):
+    """Rows of a record, each with one source or with several."""
+
+    points: tuple[_Row, ...]
     readings: Readings
 
     def __len__(self) -> int:
         return len(self.points)
 
     @overload
-    def __getitem__(self, row: int) -> TrackPoint: ...
+    def __getitem__(self, row: int) -> _Row: ...
     @overload
-    def __getitem__(self, row: slice) -> tuple[TrackPoint, ...]: ...
-    def __getitem__(self, row: int | slice) -> TrackPoint | tuple[TrackPoint, ...]:
+    def __getitem__(self, row: slice) -> tuple[_Row, ...]: ...
+    def __getitem__(self, row: int | slice) -> _Row | tuple[_Row, ...]:
         return self.points[row]
 
     @property
     def frame(self) -> Literal["array", "world"]:
-        """Of positions, moments and covariances."""
+        """Frame of positions, moments and covariances."""
         return "array" if self.readings.array_position_m is None else "world"
 
     @property
     def time_s(self) -> FloatArray:
         """Instants (n,) [s]."""
         return self.readings.time_s
+
+    @property
+    @abstractmethod
+    def as_result(self) -> TrackResult:
+        """Tracks of all sources, as they are drawn."""
+
+    def plot(self) -> Figure:
+        """Draw the tracks from above with 95 % ellipses, and their coordinates and strengths through time."""
+        return by_name("magloc.plots.tracks:sources_figure")(self.as_result, self.readings.array_position_m)
+
+    def table(self) -> str:
+        """Return the table that ``magloc track`` prints."""
+        return "\n".join(lines_of_track(self))
+
+    def __repr__(self) -> str:
+        return "\n".join(lines_of_track(self, most=10))
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(repr(self))}</pre>"
+
+
+class TrackColumns(TrackRows[TrackPoint]):
+    """Columns of one source through a record, NaN where it is not tracked."""
 
     @cached_property
     def position_m(self) -> FloatArray:
@@ -90,7 +116,7 @@ class TrackColumns(Sequence[TrackPoint]):
 
     @cached_property
     def estimability(self) -> FloatArray:
-        """What the readings taught since the track began (n, 6): 1 - σ / σ without any of them."""
+        """Share of the σ that the readings took away since the track began (n, 6): 1 - σ / σ without any of them."""
         return stacked(self, "estimability", 6)
 
     @cached_property
@@ -105,7 +131,7 @@ class TrackColumns(Sequence[TrackPoint]):
 
     @cached_property
     def weight(self) -> FloatArray:
-        """How likely the track is the right one (n,)."""
+        """Probability that the track is the right one (n,)."""
         return stacked(self, "weight")
 
     @property
@@ -115,7 +141,7 @@ class TrackColumns(Sequence[TrackPoint]):
 
     @property
     def status(self) -> list[str]:
-        """How every row was used, or why there is no track."""
+        """Use of every row, or the reason why there is no track."""
         return [point.status for point in self]
 
     @property
@@ -128,20 +154,17 @@ class TrackColumns(Sequence[TrackPoint]):
         """Whether the source is tracked (n,), and not answered by a row alone."""
         return np.array([point.is_on_track for point in self], dtype=bool)
 
-    def table(self) -> str:
-        """The table that ``magloc track`` prints."""
-        return "\n".join(lines_of_track(self))
-
-    def plot(self) -> Figure:
-        """The track from above with 95 % ellipses, and its coordinates and its strength through time."""
-        return by_name("magloc.plots.tracks:track_figure")(self, None, self.readings.array_position_m)
+    @property
+    def as_result(self) -> TrackResult:
+        """The track as it is drawn."""
+        return TrackResult(self.points, is_truth=False)
 
     def to_xarray(self) -> xr.Dataset:
-        """Columns with units and names, along `row`."""
+        """Return a dataset of columns with units and names, along `row`."""
         return dataset_of_track(self)
 
     def to_geojson(self, place: Vector) -> dict[str, Any]:
-        """A FeatureCollection: one point of a source at rest, else a line for every unbroken part and a point a row.
+        """Return a FeatureCollection: a point of a source at rest, else a line for every unbroken part, a point a row.
 
         A source is at rest if no row puts it elsewhere than the best one does, by more than both are uncertain; the
         point is that of the best row, and its σ are too.
@@ -159,14 +182,8 @@ class TrackColumns(Sequence[TrackPoint]):
         return geojson_of_track(self, place)
 
     def to_kml(self, place: Vector) -> str:
-        """The same as placemarks: one of a source at rest, else the track and its ends; ``place`` as before."""
+        """Return placemarks in KML: one of a source at rest, else the track and its ends; ``place`` as before."""
         return kml_of_track(self, place)
-
-    def __repr__(self) -> str:
-        return "\n".join(lines_of_track(self, most=10))
-
-    def _repr_html_(self) -> str:
-        return f"<pre>{escape(repr(self))}</pre>"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -178,11 +195,11 @@ class Track(TrackColumns):
     Attributes
     ----------
     points : tuple of TrackPoint
-        Of every row.
+        One of every row.
     readings : Readings
-        That they were found from.
+        Readings that were used.
     tracker : Tracker
-        That found them.
+        Filter that found the points.
     is_smoothed : bool
         Whether later rows were used too.
 
@@ -206,7 +223,7 @@ class Track(TrackColumns):
 
     @cached_property
     def innovations(self) -> InnovationTest:
-        """Whether the readings agree with what is stated of sensors, pose and motion."""
+        """Test of the readings against what is stated of sensors, pose and motion."""
         test = innovation_test(self)
         if self.readings.motion is not None:  # whose steps the test does not have
             return test
@@ -220,12 +237,12 @@ class Track(TrackColumns):
         )
 
     def table(self) -> str:
-        """The table that ``magloc track`` prints, and what is wrong with the track."""
+        """Return the table that ``magloc track`` prints, and what is wrong with the track."""
         test = self.innovations
         return "\n".join([super().table(), *filter(None, (test.reason, test.caution))])
 
     def consistency(self, truth: Truth) -> Consistency:
-        """Errors of the track, its NEES and its NIS, and the least error that is possible where the moment is known.
+        """Return errors of the track, its NEES and NIS, and the least error that is possible where the moment is known.
 
         Raises
         ------
@@ -254,6 +271,7 @@ def track(
     smooth: bool = False,
     prior: SourcePrior = NOTHING_KNOWN,
     progress: Callable[[int], None] | None = None,
+    told: Callable[[TrackPoint], object] | None = None,
 ) -> Track:
     """Follow one source through the rows of readings.
 
@@ -275,6 +293,8 @@ def track(
         Bounds of the source where a track starts, and what its moment is known to be, in the array's frame.
     progress : callable, optional
         Called with the number of rows finished since the last call.
+    told : callable, optional
+        Called with the point of every row: as soon as it is known or, where later rows are used, at the end.
 
     Returns
     -------
@@ -304,32 +324,51 @@ def track(
     if background is not None:
         if used.motion is not None:
             raise ValueError("Input readings must have measured velocities and rates or a background, not both.")
-        found = track_on_background(tracker, used, smooth=smooth, progress=progress)
-        warn_of_strengths(found)
-        return Track(tuple(found), used, tracker, smooth)
-    if used.motion is None:
-        points = track_record(tracker, list(rows_of(used)), progress)
+        points = finished(track_on_background(tracker, used, smooth=smooth, progress=progress), told)
+    elif smooth:
+        points = finished(smoothed(list(_followed(tracker, used, motion, progress)), tracker.steps), told)
     else:
-        points = _of_known_motion(tracker, motion, used, used.motion, progress)
+        points = finished(_followed(tracker, used, motion, progress, at_once=told is not None), told)
     warn_of_strengths(points)
-    return Track(tuple(smoothed(points, tracker.steps) if smooth else points), used, tracker, smooth)
+    return Track(points, used, tracker, smooth)
 
 
-def _of_known_motion(
+def finished(points: Iterable[_Row], told: Callable[[_Row], object] | None) -> tuple[_Row, ...]:
+    """Return all points of a record, each of which is reported first."""
+    found = []
+    for point in points:
+        found.append(point)
+        if told is not None:
+            told(point)
+    return tuple(found)
+
+
+def _followed(
     tracker: Tracker,
-    unmeasured: MotionModel,
     readings: Readings,
-    measured: MeasuredMotion,
+    unmeasured: MotionModel,
     progress: Callable[[int], None] | None,
-) -> list[TrackPoint]:
-    """Points of a record whose motion is measured: the tracker's motion is that of the step to each row."""
-    if not isinstance(unmeasured, RandomWalk):
-        raise ValueError(
-            "Input motion must be a RandomWalk, of what is not measured, for readings with measured velocities or"
-            f" rates; instead received {type(unmeasured).__name__}."
-        )
-    points = []
-    for row, motion in zip(rows_of(readings), known_motions(measured, unmeasured), strict=True):
-        tracker.motion = motion
-        points += list(tracker.run([row], progress))
-    return points
+    *,
+    at_once: bool = False,
+) -> Iterator[TrackPoint]:
+    """Points of a record, `at_once` as soon as they are known; a motion that is measured is set before every row."""
+    rows, motions = list(rows_of(readings)), None
+    if readings.motion is not None:
+        if not isinstance(unmeasured, RandomWalk):
+            raise ValueError(
+                "Input motion must be a RandomWalk, of what is not measured, for readings with measured velocities or"
+                f" rates; instead received {type(unmeasured).__name__}."
+            )
+        motions = known_motions(readings.motion, unmeasured)
+    elif not at_once:
+        yield from track_record(tracker, rows, progress)
+        return
+    done = 0
+    while done < len(rows):
+        if motions is not None:
+            tracker.motion = motions[done]
+        points = next_points(tracker, rows, done)
+        yield from points
+        done += len(points)
+        if progress is not None:
+            progress(len(points))

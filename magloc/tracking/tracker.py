@@ -22,12 +22,7 @@ from scipy.special import chdtri
 
 from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray
-from magloc.kalman import (
-    block_update,
-    normalised_innovation_squared,
-    predict_square_root,
-    symmetric_square_root,
-)
+from magloc.kalman import block_update, normalised_innovation_squared, predict_square_root, symmetric_square_root
 from magloc.levels import CONTRADICTION
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.measurement.nuisances import Drift
@@ -230,6 +225,21 @@ class Tracker:
         S_q[n + noisy, S_q_motion.shape[1] + np.arange(noisy.size)] = added[noisy]
         return Prediction(np.concatenate([moved, kept * x[n:]]), predict_square_root(S, F, S_q), F)
 
+    def state_before(
+        self, centre: FloatArray, root: FloatArray, R_world_from_array: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the state before the first row, and its root, from that (6, 6) of position and moment about a centre.
+
+        With the array's rotation a moment that is known counts, linearised at the centre.
+        """
+        n = self.motion.n_states
+        x, S = np.zeros(centre.size), np.diag(np.concatenate([np.zeros(n), self.error_sigma]))
+        x[:n], S[:n, :n] = self.motion.start(centre[:N_SOURCE], root)
+        if R_world_from_array is None or (known := KnownInWorld.of(self.prior, R_world_from_array)) is None:
+            return x, S
+        H = known.along(centre[None], np.eye(len(centre))[None])[0]
+        return block_update(x, S, H, known.residual(centre[None])[0] - H @ (x - centre), np.ones(len(H)))
+
     def known_before(self, seen: ChartRow, x: FloatArray) -> FloatArray:
         """Covariance (n, n) of the motion's states of a source at x before its first row."""
         root = prior_root(seen.chart(x[:N_SOURCE]))
@@ -268,16 +278,8 @@ class Tracker:
         self, centres: Sequence[FloatArray], covariance: FloatArray, measurements: Sequence[RowMeasurement]
     ) -> FilteredStart:
         """One pass of :meth:`start`, with the readings of every row linearised at a state (n,)."""
-        n, n_errors = self.motion.n_states, self.n_errors
-        x, S = np.zeros(n + n_errors), np.zeros((n + n_errors,) * 2)
         unknown = np.diag(_UNKNOWN * np.sqrt(np.diagonal(covariance)))
-        x[:n], S[:n, :n] = self.motion.start(centres[0][:N_SOURCE], unknown)
-        S[n + np.arange(n_errors), n + np.arange(n_errors)] = self.error_sigma
-        known = KnownInWorld.of(self.prior, measurements[0].row.R_world_from_array)
-        if known is not None:
-            centre = centres[0]
-            H = known.along(centre[None], np.eye(len(centre))[None])[0]
-            x, S = block_update(x, S, H, known.residual(centre[None])[0] - H @ (x - centre), np.ones(len(H)))
+        x, S = self.state_before(centres[0], unknown, measurements[0].row.R_world_from_array)
         chi2, of_rows = 0.0, []
         for j, (measurement, centre) in enumerate(zip(measurements, centres, strict=True)):
             if j:
@@ -310,7 +312,8 @@ class Tracker:
             return out, self._lost(seen.row, reason)
         self._judge(row, out, lambda row: math.inf if self.filter.of_row(row, self.motion)[0] is None else 0.0)
         open_loop = self.known_before(seen, mixture.x[np.argmax(mixture.log_weight)])
-        known = self.filter.refitted(Known(mixture, open_loop, young=((seen, self.motion),)))
+        young = ((seen, self.motion),) if self.filter.has_lasting_errors else ()
+        known = self.filter.refitted(Known(mixture, open_loop, young=young))
         return out, self._kept(seen.row, index, known, None, status="acquired")
 
     def _seen(self, row: Row, out: BoolArray) -> ChartRow:
@@ -356,7 +359,10 @@ class Tracker:
         if before.young:
             young = (*before.young, (seen, self.motion))
             known = self.filter.refitted(replace(known, young=young, nis=before.nis + update.nis))
-        if width_of(known.mixture) > LARGEST_WIDTH and self.filter.is_detected(seen):
+        # Narrow components may stand anywhere along the range when no reading shows the source any more.
+        width = max(width_of(known.mixture), known.mixture.log_range_sigma)
+        is_detected = width <= LARGEST_WIDTH or self.filter.is_detected(seen)
+        if is_detected and width_of(known.mixture) > LARGEST_WIDTH:
             return self._started(row, index, predicted.matched())
         return out, self._kept(
             seen.row,
@@ -366,6 +372,7 @@ class Tracker:
             status="tracked",
             innovation=innovation,
             iterations=update.iterations,
+            is_lost=not is_detected,
         )
 
     def _judge(self, row: Row, out: BoolArray, excess: Callable[[ChartRow], float]) -> None:
@@ -400,12 +407,13 @@ class Tracker:
         status: str,
         innovation: Innovation | None = None,
         iterations: int = 0,
+        is_lost: bool = False,
     ) -> TrackPoint:
         mixture = known.mixture
         tracked = status == "tracked"
         told = {} if innovation is None else innovation.after(self._last if tracked else None)
         self._last = innovation if tracked else None
-        if status != "acquired" and width_of(mixture) > LARGEST_WIDTH:
+        if is_lost or (status != "acquired" and width_of(mixture) > LARGEST_WIDTH):
             self._known = None
             return replace(self._lost(row, "lost: the place is no longer known"), **told)
         self._known = known

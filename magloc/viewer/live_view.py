@@ -10,8 +10,7 @@ import viser
 from arrays.array import SensorArray
 from magloc.live.follower import LivePoint
 from magloc.readings import Readings
-from magloc.tracking.multi_target.results import SourcesPoint
-from magloc.tracking.results import TrackPoint, rows_of
+from magloc.tracking.results import SourcesPoint, TrackPoint, rows_of
 from magloc.viewer.pages.live import Controls, LivePage
 from magloc.viewer.pages.pages import Page, live_page
 from magloc.viewer.server import FIRST_PORT

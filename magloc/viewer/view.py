@@ -211,12 +211,9 @@ def _filling(
     if isinstance(result, Truth):
         result = path_of_truth(result)
     if hasattr(result, "as_result"):
+        array = result.tracker.array if array is None and hasattr(result, "tracker") else array
         readings = result.readings if readings is None else readings
         result = result.as_result
-    elif hasattr(result, "tracker"):
-        array = result.tracker.array if array is None else array
-        readings = result.readings if readings is None else readings
-        result = TrackResult(result.points, is_truth=False)
     if isinstance(result, Survey):
         return lambda server: survey_page(server, result)
     if isinstance(result, TrackResult):

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 from cyclopts import Parameter
 
 from arrays.io.errors import LARGEST, InputError
@@ -22,8 +23,8 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class MomentOutputs:
-    """Where the moment through time goes; see :func:`magloc.cli.track.track`."""
+class TrackOutputs:
+    """Where a track goes; see :func:`magloc.cli.track.track`."""
 
     json: bool
     jsonl: bool
@@ -85,50 +86,36 @@ class PathErrorOptions:
         )
 
 
-def write_moment_track(found: MomentTrack, readings: Path, known: KnownOptions, outputs: MomentOutputs) -> None:
-    """Print it, and write what is asked for."""
+def write_moment_tracks(
+    found: Sequence[MomentTrack], readings: Path, known: KnownOptions, outputs: TrackOutputs
+) -> None:
+    """Print the moments of one source or of several, and write what is asked for."""
     import magloc
-    from magloc.tracking.files import json_entry, json_of_track
+    from magloc.tracking.files import json_entry
 
-    result = None
-    if outputs.truth is not None:
-        result = found.consistency(magloc.read_truth(outputs.truth))
-    outputs.maps.write(found, known.place)
+    first, several = found[0], len(found) > 1
+    for option, value in {**outputs.maps.outputs, "--truth": outputs.truth, "--out": outputs.out}.items():
+        if several and value is not None:
+            raise InputError(f"{option}: found several places of --position, expected one.")
+    result = None if outputs.truth is None else first.consistency(magloc.read_truth(outputs.truth))
+    outputs.maps.write(first, known.place)
     if outputs.out is not None:
         from magloc.plots.tracks import write_picture
 
-        write_picture(found, None, outputs.out, array_m=found.readings.array_position_m)
+        write_picture(first, None, outputs.out, array_m=first.readings.array_position_m)
+    entries = [_entry_of_several(points) if several else json_entry(points[0]) for points in zip(*found, strict=True)]
     if outputs.json:
-        report = json_of_track(found, None) | {"chi2": found.chi2, "dof": found.dof, "misfit": found.misfit}
+        report = {"results": entries, "chi2": first.chi2, "dof": first.dof, "misfit": first.misfit}
         print_report(report if result is None else report | {"consistency": asdict(result)})
-    elif outputs.jsonl:
-        for point in found:
-            print_json(json_entry(point))
-    else:
-        print(found.table())
-    if result is not None and not outputs.json:
-        print_consistency(result.lines(), jsonl=outputs.jsonl)
-    _note(found, found.tracked, readings, outputs)
-
-
-def write_moment_tracks(found: Sequence[MomentTrack], readings: Path, outputs: MomentOutputs) -> None:
-    """Print those of several sources."""
-    for option, value in {**outputs.maps.outputs, "--truth": outputs.truth, "--out": outputs.out}.items():
-        if value is not None:
-            raise InputError(f"{option}: found several places of --position, expected one.")
-    entries = [_entry_of_several(points) for points in zip(*found, strict=True)]
-    first = found[0]
-    if outputs.json:
-        print_report({"results": entries, "chi2": first.chi2, "dof": first.dof, "misfit": first.misfit})
     elif outputs.jsonl:
         for entry in entries:
             print_json(entry)
     else:
-        print("\n".join(f"source {k}\n{track.table()}" for k, track in enumerate(found, start=1)))
-    determined = first.tracked
-    for track in found[1:]:
-        determined = determined & track.tracked
-    _note(first, determined, readings, outputs)
+        tables = [f"source {k}\n{track.table()}" for k, track in enumerate(found, start=1)]
+        print("\n".join(tables) if several else first.table())
+    if result is not None and not outputs.json:
+        print_consistency(result.lines(), jsonl=outputs.jsonl)
+    _note(first, np.all([track.tracked for track in found], axis=0), readings, outputs)
 
 
 def _entry_of_several(points: Sequence[TrackPoint]) -> dict[str, object]:
@@ -138,7 +125,7 @@ def _entry_of_several(points: Sequence[TrackPoint]) -> dict[str, object]:
     return of_row | {"sources": [{key: getattr(point, key) for key in keys} for point in points]}
 
 
-def _note(found: MomentTrack, determined: BoolArray, readings: Path, outputs: MomentOutputs) -> None:
+def _note(found: MomentTrack, determined: BoolArray, readings: Path, outputs: TrackOutputs) -> None:
     """Say what does not fit, and refuse readings that determine nothing."""
     if not outputs.quiet:
         if found.misfit:

@@ -48,6 +48,8 @@ class Mixture:
         Largest distance of a sensor from it.
     n_pose : int
         How many of the last of them are errors of the array's pose.
+    n_rows : int
+        Number of rows that led to it.
     """
 
     x: FloatArray
@@ -57,6 +59,7 @@ class Mixture:
     centroid_m: FloatArray
     radius_m: float
     n_pose: int = 0
+    n_rows: int = 1
 
     @classmethod
     def of_gaussian(cls, x: FloatArray, P: FloatArray, centroid_m: FloatArray, radius_m: float) -> Mixture:
@@ -81,6 +84,13 @@ class Mixture:
     def widths(self) -> FloatArray:
         """Larger one of the standard deviations of log-range and direction (K,)."""
         return np.sqrt(np.max(np.sum(self.S[:, :3] ** 2, axis=2), axis=1))
+
+    @property
+    def log_range_sigma(self) -> float:
+        """Standard deviation of the log-range of all components together."""
+        log_range, weight = np.log(self.chart.length), self.weight
+        apart = log_range - weight @ log_range
+        return float(np.sqrt(weight @ (apart**2 + np.sum(self.S[:, 0] ** 2, axis=1))))
 
     def take(self, index: IntArray | BoolArray) -> Mixture:
         """Some of the components, their weights adding up to one."""

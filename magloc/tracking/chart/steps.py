@@ -1,9 +1,13 @@
 """How what is known of a source changes from row to row: started, predicted, updated, and fitted anew while young.
 
 The first row that shows a source makes a mixture (:mod:`magloc.tracking.chart.start`); every later one moves its
-components, updates them (:mod:`magloc.tracking.chart.update`) and leaves fewer of them, soon a single one. While the
-track is young, all its rows are fitted together now and then (:mod:`magloc.tracking.chart.refit`). Behind the states of
-the motion stand the errors of the array's pose, and behind them those of its sensors.
+components, divides those over which the readings bend (:mod:`magloc.tracking.chart.split`), updates them
+(:mod:`magloc.tracking.chart.update`) and merges those that are one.
+
+Behind the states of the motion stand the errors of the array's pose, and behind them those of its sensors. Where there
+are such lasting errors, a row leaves many numbers open in curved valleys, which would take more components than can be
+followed. Then none is divided, and all rows of a young track are fitted together now and then
+(:mod:`magloc.tracking.chart.refit`).
 """
 
 from __future__ import annotations
@@ -27,6 +31,7 @@ from magloc.tracking.chart.mixture import Mixture, block_root, root_of
 from magloc.tracking.chart.posed_motion import PosedMotion
 from magloc.tracking.chart.refit import Cells, Refitted, refitted
 from magloc.tracking.chart.row import ChartRow
+from magloc.tracking.chart.split import split
 from magloc.tracking.chart.stack import Stack
 from magloc.tracking.chart.start import NO_DIPOLE, OF_PITCH, Start, once, with_errors
 from magloc.tracking.chart.update import Move, predicted_root, updated
@@ -112,6 +117,7 @@ class ChartFilter:
         self.errors, self.pose_errors, self.prior = errors, pose_errors, prior
         self._start = Start(array, errors, prior)
         self.n_differences = decorrelated_differences(array).n_differences
+        self.has_lasting_errors = errors.n_states + pose_errors.n_states > 0
         self._noise_T = float(np.median(array.channel_noise_T))
         self._misfits = Misfits()
 
@@ -167,6 +173,9 @@ class ChartFilter:
         sigma, sigma_before = (np.linalg.norm(m.S[:, :N_SOURCE], axis=2) for m in (predicted, before))
         k = row.z.size
         bends = (sigma <= LARGEST_GROWTH * sigma_before).all(axis=1) & (k >= self.n_differences)
+        if not self.has_lasting_errors:
+            predicted, origin = split(predicted, row)
+            bends = bends[origin]
         lasting = row.with_lasting_errors(self.pose_errors.step(dt_s)[0] ** 2)
         after = updated(predicted.x, predicted.S, row, bends, lasting)
         sound = after.converged & np.isfinite(after.log_evidence)
@@ -175,12 +184,15 @@ class ChartFilter:
             return RowUpdate(None, float(after.nis[best]), after.whitened_innovation(best))
         log_weight = predicted.log_weight + np.where(sound, after.log_evidence, -np.inf)
         best = int(np.argmax(log_weight))
-        mixture = replace(predicted, x=after.x, S=after.S, log_weight=log_weight).take(sound).reduced()
+        found = replace(predicted, x=after.x, S=after.S, log_weight=log_weight, n_rows=predicted.n_rows + 1)
+        mixture = found.take(sound).reduced()
         return RowUpdate(mixture, float(after.nis[best]), after.whitened_innovation(best), int(after.iterations[best]))
 
     def refitted(self, known: Known) -> Known:
         """What is known when all rows of a young track are fitted together, if it is time to."""
         mixture, n_rows = known.mixture, len(known.young)
+        if not n_rows:
+            return known
         is_narrow = len(mixture) == 1 and mixture.widths[0] < OLD_WIDTH
         if n_rows > MOST_YOUNG_ROWS or (n_rows < FIRST_REFIT and is_narrow):
             return replace(known, young=())

@@ -1,29 +1,22 @@
-"""The door to tracks of several moving sources."""
+"""Follow several moving sources through the rows of readings."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from html import escape
-from typing import TYPE_CHECKING, Literal, overload
+from typing import Literal
 
 from numpy.typing import ArrayLike
 
 from arrays.array import SensorArray
-from arrays.io.lazy import by_name
-from arrays.typing import FloatArray
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.measurement.plausibility import usable_readings
 from magloc.readings import Readings
 from magloc.tracking.multi_target.motion import FreeMotion
-from magloc.tracking.multi_target.results import SourcesPoint, lines_of_sources
 from magloc.tracking.multi_target.tracker import SourcesTracker
-from magloc.tracking.results import TrackPoint, TrackResult, rows_of, warn_of_strengths
-from magloc.tracking.track import TrackColumns
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from magloc.tracking.results import SourcesPoint, TrackPoint, TrackResult, rows_of, warn_of_strengths
+from magloc.tracking.track import TrackColumns, TrackRows, finished
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -36,15 +29,15 @@ class SourceTrack(TrackColumns):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class SourcesTrack(Sequence[SourcesPoint]):
+class SourcesTrack(TrackRows[SourcesPoint]):
     """Several sources through time: all of them in a row, or one of them through all rows.
 
     Attributes
     ----------
     points : tuple of SourcesPoint
-        Of every row.
+        One of every row.
     readings : Readings
-        That they were found from.
+        Readings that were used.
 
     Examples
     --------
@@ -60,24 +53,9 @@ class SourcesTrack(Sequence[SourcesPoint]):
     points: tuple[SourcesPoint, ...]
     readings: Readings
 
-    def __len__(self) -> int:
-        return len(self.points)
-
-    @overload
-    def __getitem__(self, row: int) -> SourcesPoint: ...
-    @overload
-    def __getitem__(self, row: slice) -> tuple[SourcesPoint, ...]: ...
-    def __getitem__(self, row: int | slice) -> SourcesPoint | tuple[SourcesPoint, ...]:
-        return self.points[row]
-
-    @property
-    def time_s(self) -> FloatArray:
-        """Instants (n,) [s]."""
-        return self.readings.time_s
-
     @cached_property
     def ids(self) -> tuple[int, ...]:
-        """All ids, in the order in which they were first told."""
+        """All ids, in the order in which the sources were first reported."""
         return tuple(sorted({track.id for point in self for track in point.tracks}))
 
     @property
@@ -86,7 +64,7 @@ class SourcesTrack(Sequence[SourcesPoint]):
         return tuple(sorted({name for point in self for name in point.dropped_sensors}))
 
     def of(self, id: int) -> SourceTrack:
-        """One source through all rows.
+        """Return one source through all rows.
 
         Raises
         ------
@@ -107,20 +85,6 @@ class SourcesTrack(Sequence[SourcesPoint]):
         tracks = [self.of(id).points for id in self.ids] or [tuple(TrackPoint(point.time_s) for point in self)]
         ids = self.ids if len(tracks) > 1 else ()
         return TrackResult(tracks[0], is_truth=False, ids=ids, others=tuple(tracks[1:]))
-
-    def plot(self) -> Figure:
-        """Places and strengths of all sources through time."""
-        return by_name("magloc.plots.tracks:sources_figure")(self.as_result, self.readings.array_position_m)
-
-    def table(self) -> str:
-        """The table that ``magloc track --sources`` prints."""
-        return "\n".join(lines_of_sources(self))
-
-    def __repr__(self) -> str:
-        return "\n".join(lines_of_sources(self, most=10))
-
-    def _repr_html_(self) -> str:
-        return f"<pre>{escape(repr(self))}</pre>"
 
 
 def track_sources(
@@ -180,12 +144,13 @@ def track_sources(
     if used.background or used.motion is not None:
         raise ValueError("Input readings must have neither a background nor measured velocities for several sources.")
     tracker = SourcesTracker(array, sources=sources, motion=motion, prior=prior)
-    points = []
-    for row in rows_of(used):
-        points.append(tracker.update(row))
-        if told is not None:
-            told(points[-1])
-        if progress is not None:
-            progress(1)
+
+    def followed() -> Iterator[SourcesPoint]:
+        for row in rows_of(used):
+            yield tracker.update(row)
+            if progress is not None:
+                progress(1)
+
+    points = finished(followed(), told)
     warn_of_strengths(track for point in points for track in point.tracks)
-    return SourcesTrack(tuple(points), used)
+    return SourcesTrack(points, used)

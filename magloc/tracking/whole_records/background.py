@@ -157,14 +157,14 @@ def _log_volume(S: FloatArray) -> float:
     return float(np.linalg.slogdet(S)[1])
 
 
-def steps_at(tracker: Tracker, rows: Sequence[Row], states: Sequence[FloatArray]) -> list[Step]:
-    """Steps of a forward pass that linearises all rows at some states."""
-    return steps_of(tracker, [tracker.measurements.of(row) for row in rows], states)
-
-
-def steps_of(tracker: Tracker, measurements: Sequence[RowMeasurement], states: Sequence[FloatArray]) -> list[Step]:
-    """The same of what rows say."""
-    return _passed(tracker, measurements, 0, states, np.ones(len(measurements), dtype=bool)).steps
+def steps_of(
+    tracker: Tracker,
+    measurements: Sequence[RowMeasurement],
+    states: Sequence[FloatArray],
+    start: tuple[FloatArray, FloatArray] | None = None,
+) -> list[Step]:
+    """Return the steps of a forward pass that linearises all rows at some states."""
+    return _passed(tracker, measurements, 0, states, np.ones(len(measurements), dtype=bool), start).steps
 
 
 def settled_steps(tracker: Tracker, rows: Sequence[Row], states: Sequence[FloatArray]) -> list[Step] | None:
@@ -222,13 +222,14 @@ def _passed(
     begin: int,
     states: Sequence[FloatArray],
     used: BoolArray,
+    start: tuple[FloatArray, FloatArray] | None = None,
 ) -> _Passed:
-    """One forward pass over rows that are linearised at some states, from a source that is hardly known."""
-    n = tracker.motion.n_states
-    offset = measurements[0].place_in_array(states[0], np.eye(states[0].size))[0]
-    sigma = _UNKNOWN * np.repeat([np.linalg.norm(offset), np.linalg.norm(states[0][3:6])], 3)
-    x, S = np.zeros(states[0].size), np.diag(np.concatenate([np.zeros(n), tracker.error_sigma]))
-    x[:n], S[:n, :n] = tracker.motion.start(states[0][:N_SOURCE], np.diag(sigma))
+    """One forward pass over rows that are linearised at some states; by default from a source that is hardly known."""
+    if start is None:
+        offset = measurements[0].place_in_array(states[0], np.eye(states[0].size))[0]
+        sigma = _UNKNOWN * np.repeat([np.linalg.norm(offset), np.linalg.norm(states[0][3:6])], 3)
+        start = tracker.state_before(states[0], np.diag(sigma))
+    x, S = start
     steps: list[Step] = []
     innovations: list[Innovation | None] = []
     agrees = np.ones(len(measurements), dtype=bool)

@@ -59,6 +59,8 @@ class TestReadTrack:
         [
             ("position_m", [1.0, 2.0], "found something else, expected 3 numbers or null"),
             ("position_m", [1.0, 2.0, "x"], "found something else, expected 3 numbers or null"),
+            ("position_m", ["1", "2", "3"], "found something else, expected 3 numbers or null"),
+            ("position_m", [1.0, True, 3.0], "found something else, expected 3 numbers or null"),
             ("moment_Am2", [1.0, 2.0, 1e300], "found something else, expected 3 numbers or null"),
             ("covariance", [[1.0] * 6] * 5, "found something else, expected 6×6 numbers or null"),
             ("covariance", (-np.eye(6)).tolist(), "found a variance below zero"),

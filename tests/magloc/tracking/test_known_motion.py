@@ -11,6 +11,7 @@ columns                               what was written; sentences
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -20,12 +21,15 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+import arrays
 import magloc
 from arrays.columns import POSITION_COLUMNS, ROTATION_COLUMNS
 from arrays.io.errors import InputError
 from magloc.chi_square import mean_bounds, normalised_square
 from magloc.navigation.measured_motion import MOTION_COLUMNS
 from magloc.readings import write_readings
+from magloc.tracking.results import TrackPoint
+from tests.command_line import Run
 from tests.passing_source import ARRAY, MOMENT, readings_of
 
 FloatArray = NDArray[np.float64]
@@ -91,6 +95,25 @@ class TestTrack:
         readings, *_ = seen_from_a_moving_array(1)
         with pytest.raises(ValueError, match="Input motion must be a RandomWalk"):
             magloc.track(ARRAY, readings, motion=magloc.CoordinatedTurn(1.0, 0.1))
+
+    def test_rows_are_reported_as_soon_as_they_are_known(self) -> None:
+        """What is reported row by row, without knowing the rows to come, is the track itself."""
+        readings, _, _ = seen_from_a_moving_array(1)
+        reported: list[TrackPoint] = []
+        track = magloc.track(ARRAY, readings, motion=UNKNOWN, told=reported.append)
+        assert tuple(reported) == track.points
+        np.testing.assert_array_equal(track.position_m, magloc.track(ARRAY, readings, motion=UNKNOWN).position_m)
+
+    def test_lines_are_those_of_json(self, run: Run, tmp_path: Path) -> None:
+        """Measured motion counts also where the command prints each row at once."""
+        readings, _, _ = seen_from_a_moving_array(1)
+        write_readings(tmp_path / "rows.csv", readings, ARRAY)
+        arrays.write_array(tmp_path / "array.toml", ARRAY)
+        options = (tmp_path / "rows.csv", "--array", tmp_path / "array.toml", "--speed-m-s", 0.01, "--turn-deg-s", 0.1)
+        whole = json.loads(run("track", *options, "--json").out)["results"]
+        lines = [json.loads(line) for line in run("track", *options, "--jsonl").out.splitlines()]
+        assert lines == whole
+        assert [row["status"] for row in whole].count("tracked") > N_ROWS - 5
 
     def test_the_moment_alone(self) -> None:
         """Equation (29): at a known place in the array's axes, such as of a towed body, the moment turns with them."""

@@ -12,8 +12,7 @@ from arrays.geometries import tetrahedron
 from arrays.io.errors import InputError
 from magloc.fields import dipole
 from magloc.readings import Readings
-from magloc.tracking.multi_target.results import SourcePoint, SourcesPoint
-from magloc.tracking.results import TrackPoint
+from magloc.tracking.results import SourcePoint, SourcesPoint, TrackPoint
 from magloc.viewer.live_view import LiveView
 from magloc.viewer.pages.live import ALONE
 from tests.waiting import wait_for

@@ -1,0 +1,92 @@
+r"""Components of a mixture that are divided where a row's readings bend over them.
+
+A Gaussian stays one under readings that are linear over its width. Along a principal axis of log-range and direction,
+one standard deviation v of the whole state changes the predicted readings, in units of their noise, by an odd part
+:math:`g = \tfrac12 (h(v) - h(-v))` and an even part :math:`c = \tfrac12 (h(v) + h(-v)) - h(0)`. A linearisation leaves
+out the even part, in every row alike. Over as many rows as determine the axis by themselves, :math:`1/|g|^2`, but at most
+the n rows that the component remembers, it adds up to
+
+.. math:: \beta = |c| \sqrt{\min(\max(|g|^{-2}, 1), n)}
+
+standard deviations of the readings' noise. A component with :math:`\beta > 1` becomes three along that axis, which have
+the same mean and covariance together. The update's bent prediction (:mod:`magloc.tracking.chart.update`) treats what is
+less: a division approximates a Gaussian, so that many divisions lose more than they gain.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from arrays.typing import FloatArray, IntArray
+from magloc.tracking.chart.mixture import Mixture, block_root
+from magloc.tracking.chart.row import ChartRow
+
+LARGEST_BEND = 1.0
+"""Bend of the readings over a component, in standard deviations of their noise, beyond which it is divided."""
+MOST_COMPONENTS = 80
+"""Number of components beyond which none is divided."""
+MOST_ROWS = 400
+"""Number of rows that a component remembers at most."""
+# Weights, means and standard deviation of three normal densities that approximate one.
+_WEIGHTS, _MEANS, _SIGMA = np.array([0.2252246, 0.5495508, 0.2252246]), np.array([-1.0575155, 0.0, 1.0575155]), 0.6715662
+# Logarithm of a weight, against the heaviest one, below which a component is not divided.
+_LIGHT = -7.0
+_MOST_ROUNDS = 4
+
+
+def split(mixture: Mixture, row: ChartRow) -> tuple[Mixture, IntArray]:
+    """Divide the components of a prediction over which a row's readings bend.
+
+    Returns
+    -------
+    parts : Mixture
+        The components, divided where needed.
+    origin : ndarray of int
+        Index of the component that each part is of.
+    """
+    origin = np.arange(len(mixture))
+    for _ in range(_MOST_ROUNDS):
+        with np.errstate(all="ignore"):  # a wide component may reach beyond all numbers
+            bend, axes = bends(mixture, row)
+        worst = np.argmax(bend, axis=1)
+        divided = (np.max(bend, axis=1) > LARGEST_BEND) & (mixture.log_weight > mixture.log_weight.max() + _LIGHT)
+        index = np.flatnonzero(divided)
+        index = index[np.argsort(-mixture.log_weight[index], kind="stable")]
+        index = index[: max(0, (MOST_COMPONENTS - len(mixture)) // 2)]
+        if not index.size:
+            break
+        mixture = _divided(mixture, index, axes[index, worst[index]])
+        origin = np.concatenate([np.delete(origin, index), np.tile(origin[index], len(_WEIGHTS))])
+    return mixture, origin
+
+
+def bends(mixture: Mixture, row: ChartRow) -> tuple[FloatArray, FloatArray]:
+    """Return the bends (K, 3) of a row's readings, and the axes (K, 3, N) in standard numbers that they are along."""
+    n, K = mixture.n_motion, len(mixture)
+    _, _, axes = np.linalg.svd(mixture.S[:, :3], full_matrices=False)
+    steps = (axes @ np.swapaxes(mixture.S[:, :n], -1, -2)).reshape(-1, n)
+    chart = mixture.chart.firmly(mixture.S[:, :n]).take(np.repeat(np.arange(K), 3))
+    plus, minus = (row.of_source(chart.retracted(sign * steps)).reshape(K, 3, -1) for sign in (1.0, -1.0))
+    odd = 0.25 * np.sum((plus - minus) ** 2, axis=-1)
+    even = np.sum((0.5 * (plus + minus) - row.of_source(mixture.x[:, :n])[:, None]) ** 2, axis=-1)
+    bend = np.sqrt(even * np.clip(1.0 / odd, 1.0, min(mixture.n_rows, MOST_ROWS)))
+    return np.where(np.isfinite(bend), bend, 0.0), axes
+
+
+def _divided(mixture: Mixture, index: IntArray, axis: FloatArray) -> Mixture:
+    """Replace some components by three each, along axes (k, N) in their standard numbers."""
+    n, S, kept = mixture.n_motion, mixture.S[index], np.delete(np.arange(len(mixture)), index)
+    v = (S @ axis[..., None])[..., 0]
+    narrow = S - (1.0 - _SIGMA) * v[:, :, None] * axis[:, None, :]
+    chart = mixture.chart.take(index).firmly(S[:, :n])
+    x, roots, log_weight = [mixture.x[kept]], [mixture.S[kept]], [mixture.log_weight[kept]]
+    for weight, mean in zip(_WEIGHTS, _MEANS, strict=True):
+        state, root = mixture.x[index] + mean * v, narrow.copy()
+        state[:, :n], L = chart.linearised(mean * v[:, :n])
+        root[:, :n] = replace(mixture, x=state).chart.inverse_jacobian() @ L @ root[:, :n]
+        x.append(state)
+        roots.append(block_root(root))
+        log_weight.append(mixture.log_weight[index] + np.log(weight))
+    return replace(mixture, x=np.concatenate(x), S=np.concatenate(roots), log_weight=np.concatenate(log_weight))
