@@ -3,14 +3,15 @@ r"""Components of a mixture that are divided where a row's readings bend over th
 A Gaussian stays one under readings that are linear over its width. Along a principal axis of log-range and direction,
 one standard deviation v of the whole state changes the predicted readings, in units of their noise, by an odd part
 :math:`g = \tfrac12 (h(v) - h(-v))` and an even part :math:`c = \tfrac12 (h(v) + h(-v)) - h(0)`. A linearisation leaves
-out the even part, in every row alike. Over as many rows as determine the axis by themselves, :math:`1/|g|^2`, but at most
-the n rows that the component remembers, it adds up to
+out the even part, in every row alike. Over as many rows as determine the axis by themselves, :math:`1/|g|^2`, but at
+most the n rows that the component remembers, it adds up. Where a row alone determines the axis, it counts over the
+width :math:`1/|g|` that the row leaves. In standard deviations of the readings' noise it is
 
-.. math:: \beta = |c| \sqrt{\min(\max(|g|^{-2}, 1), n)}
+.. math:: \beta = |c| \sqrt{\min(|g|^{-2}, n)} \text{ where } |g| \le 1, \qquad \beta = |c| / |g|^2 \text{ beyond.}
 
-standard deviations of the readings' noise. A component with :math:`\beta > 1` becomes three along that axis, which have
-the same mean and covariance together. The update's bent prediction (:mod:`magloc.tracking.chart.update`) treats what is
-less: a division approximates a Gaussian, so that many divisions lose more than they gain.
+A component with :math:`\beta > 1` becomes three along that axis, which have the same mean and covariance together. The
+update's bent prediction (:mod:`magloc.tracking.chart.update`) treats what is less: a division approximates a Gaussian,
+so that many divisions lose more than they gain.
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ MOST_COMPONENTS = 80
 MOST_ROWS = 400
 """Number of rows that a component remembers at most."""
 # Weights, means and standard deviation of three normal densities that approximate one.
-_WEIGHTS, _MEANS, _SIGMA = np.array([0.2252246, 0.5495508, 0.2252246]), np.array([-1.0575155, 0.0, 1.0575155]), 0.6715662
+_WEIGHTS, _MEANS = np.array([0.2252246, 0.5495508, 0.2252246]), np.array([-1.0575155, 0.0, 1.0575155])
+_SIGMA = 0.6715662
 # Logarithm of a weight, against the heaviest one, below which a component is not divided.
 _LIGHT = -7.0
 _MOST_ROUNDS = 4
@@ -71,7 +73,7 @@ def bends(mixture: Mixture, row: ChartRow) -> tuple[FloatArray, FloatArray]:
     plus, minus = (row.of_source(chart.retracted(sign * steps)).reshape(K, 3, -1) for sign in (1.0, -1.0))
     odd = 0.25 * np.sum((plus - minus) ** 2, axis=-1)
     even = np.sum((0.5 * (plus + minus) - row.of_source(mixture.x[:, :n])[:, None]) ** 2, axis=-1)
-    bend = np.sqrt(even * np.clip(1.0 / odd, 1.0, min(mixture.n_rows, MOST_ROWS)))
+    bend = np.sqrt(even * np.where(odd > 1.0, odd**-2.0, np.minimum(1.0 / odd, min(mixture.n_rows, MOST_ROWS))))
     return np.where(np.isfinite(bend), bend, 0.0), axes
 
 

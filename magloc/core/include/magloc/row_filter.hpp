@@ -237,8 +237,8 @@ class RowFilter {
     condition_root();
   }
 
-  // How far readings bend over one sigma along the principal axes (3 K) of log-range and direction of each source, in
-  // sigma of as many rows as are remembered, and what the whole state (3 K, N) is expected to differ by along them.
+  // How far readings bend over what is not known along the principal axes (3 K) of log-range and direction of each
+  // source: magloc/tracking/chart/split.py. And by what the whole state (3 K, N) differs one sigma along them.
   void fill_bends(double memory, double *bends, double *directions) {
     T *const here = misfit_, *const ahead = trial_misfit_, *const behind = columns_.lanes(0);
     for (int64_t k = 0; k < K_; ++k) set_chart(k);
@@ -258,7 +258,7 @@ class RowFilter {
           gradient += slope * slope;
         }
         const double known = 1.0 / sum_of_lanes(gradient);
-        *bends = square_root(sum_of_lanes(bend) * (known > 1.0 ? minimum(known, memory) : 1.0));
+        *bends = square_root(sum_of_lanes(bend) * (known > 1.0 ? minimum(known, memory) : known * known));
       }
     }
   }
