@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -15,7 +14,9 @@ from magloc.levels import CONTRADICTION
 from magloc.measurement.rows import ambient_fields
 from magloc.tracking.chart.coordinates import Chart
 from magloc.tracking.chart.mixture import Mixture, component_moments, root_of
-from magloc.tracking.chart.steps import LARGEST_WIDTH
+from magloc.tracking.chart.split import LARGEST_BEND, MOST_ROWS
+from magloc.tracking.chart.steps import LARGEST_GROWTH, LARGEST_WIDTH
+from magloc.tracking.chart.update import LEAST_SHARE
 from magloc.tracking.motion import N_SOURCE, OrnsteinUhlenbeck
 from magloc.tracking.results import Prediction, Row, Step, TrackPoint, learned
 from magloc.tracking.row_filter import Gaussians, Rows, convergence, steps_problem
@@ -26,24 +27,20 @@ _TERMS_A_CALL = 10_000_000
 """Approximate number of products that one call of the kernel computes: some 50 ms."""
 _TERMS_OF_STEPS = 3000
 """Products of a row that do not depend on the number of its differences."""
-LONGEST_MEMORY = 400
-"""Rows in whose readings the bend of a row is counted."""
 
 
 def track_record(
     tracker: Tracker,
     rows: Sequence[Row],
     progress: Callable[[int], None] | None = None,
-    *,
-    largest_bend: float = math.inf,
 ) -> list[TrackPoint]:
     """Points of a whole record, or of the next rows of one: as :meth:`Tracker.run`, with compiled steps if there are.
 
-    Sensors with lasting errors, and a source that may be at several places or whose readings bend by more than
-    `largest_bend`, in units of their noise, are tracked by the readable steps.
+    Sensors with lasting errors, and a source that may be at several places or whose component a row divides, are
+    tracked by the readable steps.
     """
     points: list[TrackPoint] = []
-    compiled = _CompiledSteps(tracker, rows, largest_bend) if rows and is_compiled(tracker) else None
+    compiled = _CompiledSteps(tracker, rows) if rows and is_compiled(tracker) else None
     while len(points) < len(rows):
         before = len(points)
         if compiled is not None and tracker.is_tracking:
@@ -72,7 +69,7 @@ def is_compiled(tracker: Tracker) -> bool:
 class _CompiledSteps:
     """A record with the arrays that the kernel reads and fills."""
 
-    def __init__(self, tracker: Tracker, rows: Sequence[Row], largest_bend: float) -> None:
+    def __init__(self, tracker: Tracker, rows: Sequence[Row]) -> None:
         array, motion = tracker.array, tracker.motion
         self.tracker = tracker
         self.times = [row.time_s for row in rows]
@@ -125,8 +122,11 @@ class _CompiledSteps:
             convergence=convergence(),
             nis_limits=np.asarray(chdtri(np.maximum(np.arange(k + 1), 1), CONTRADICTION), dtype=np.float64),
             largest_width=LARGEST_WIDTH,
-            largest_bend=largest_bend,
-            longest_memory=LONGEST_MEMORY,
+            largest_bend=LARGEST_BEND,
+            longest_memory=MOST_ROWS,
+            largest_growth=LARGEST_GROWTH,
+            full_count=tracker.filter.n_differences,
+            least_share=LEAST_SHARE,
             state=self.state.problem,
             centroid=self.centroid,
             open_loop=self.open_loop,
@@ -145,7 +145,7 @@ class _CompiledSteps:
         assert known is not None
         mixture = known.mixture
         self.state.x[:], self.state.S[:], self.centroid[:] = mixture.x, mixture.S, mixture.centroid_m
-        self.open_loop[:], self.progress[:] = known.open_loop, (begin, 1, LONGEST_MEMORY)
+        self.open_loop[:], self.progress[:] = known.open_loop, (begin, 1, mixture.n_rows)
         n_later = next((i for i in range(begin, len(times)) if times[i] <= before[i]), len(times)) - begin
         core.run("follow_sources", self.work, n_later, block=self.block, chain=n_later or None)
         end = int(self.progress[0])
@@ -154,7 +154,13 @@ class _CompiledSteps:
         rows = slice(begin, end)
         centroids = self.origins[rows] + self.rotations[rows] @ tracker.array.centroid
         steps = self._steps(rows, centroids, mixture.x[0]) if tracker.keep_steps else []
-        after = replace(mixture, x=self.state.x.copy(), S=self.state.S.copy(), centroid_m=self.centroid.copy())
+        after = replace(
+            mixture,
+            x=self.state.x.copy(),
+            S=self.state.S.copy(),
+            centroid_m=self.centroid.copy(),
+            n_rows=int(self.progress[2]),
+        )
         explained = bool(self.n_differences[rows].any())
         contradictions = 0 if explained else known.contradictions
         resumed = replace(known, mixture=after, open_loop=self.open_loop.copy(), contradictions=contradictions)

@@ -641,12 +641,15 @@ typedef struct {
   const magloc_convergence *convergence;
   const double *nis_limits;    /* (n_readings + 1) by the number of readings, above which they contradict */
   double largest_width;        /* standard deviation of log-range and direction beyond which a source has no place */
-  double largest_bend;         /* of readings, beyond which the state is not one Gaussian; infinite: all are */
+  double largest_bend;         /* of readings, beyond which the state is not one Gaussian */
   int64_t longest_memory;      /* rows in which a bend is counted */
+  double largest_growth;       /* of standard deviations in a step, beyond which the prediction does not bend, */
+  int64_t full_count;          /* nor in rows of fewer readings, */
+  double least_share;          /* nor along what readings tell of less, in its standard deviation */
   const magloc_sources *state; /* one: before the next row, and changed by calls, as are the next three */
   double *centroid;            /* (3) of the sensors there */
   double *open_loop;           /* (n_sources, n_states, n_states) covariance had no readings been taken */
-  int64_t *progress;           /* (3): next row, 1 as long as the track continues, and rows that it remembers */
+  int64_t *progress;           /* (3): next row, 1 as long as the track continues, and updates that led to the state */
   const magloc_sources *predicted, *updated; /* by rows, where the track continues */
   double *open_loop_variances;               /* (n_rows, n_sources n_states) */
   double *nis;                               /* (n_rows); NaN without readings */

@@ -16,7 +16,6 @@ from arrays.array import SensorArray
 from magloc.readings import Readings
 from magloc.tracking import batch
 from magloc.tracking.batch import track_record
-from magloc.tracking.chart import steps
 from magloc.tracking.motion import CoordinatedTurn, MotionModel, OrnsteinUhlenbeck, RandomWalk
 from magloc.tracking.results import Row, TrackPoint, rows_of
 from magloc.tracking.tracker import Tracker
@@ -36,12 +35,6 @@ from tests.passing_source import (
 
 FloatArray = NDArray[np.float64]
 all_instruction_sets = pytest.mark.usefixtures("instruction_set")
-
-
-@pytest.fixture(autouse=True)
-def straight_predictions(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Readable predictions that do not bend as the readings do, as the compiled ones."""
-    monkeypatch.setattr(steps, "LARGEST_GROWTH", -1.0)
 
 
 @dataclass(frozen=True)
@@ -144,7 +137,8 @@ class TestCompiledRecord:
             return update(tracker, row)
 
         monkeypatch.setattr(Tracker, "update", counted)
-        assert_same_points(track_record(Tracker(ARRAY, SLOW), rows, largest_bend=0.0), expected)
+        monkeypatch.setattr(batch, "LARGEST_BEND", 0.0)
+        assert_same_points(track_record(Tracker(ARRAY, SLOW), rows), expected)
         assert len(readable) == 20
 
     def test_a_row_that_is_not_later_than_the_piece_before(self) -> None:
@@ -253,7 +247,7 @@ class TestCompiledRecord:
         n = 80
         p, m = np.tile([5.0, 0.0, 0.306], (n, 1)), np.tile([100.0, 0.0, 0.0], (n, 1))
         rows = rows_from(np.arange(float(n)), readings_of(array, p, m, seed=int(rng.integers(1000))))
-        motion = RandomWalk(0.02, 0.01)
+        motion = RandomWalk(0.1, 0.05)
         readable, compiled = followed(Tracker(array, motion), rows), track_record(Tracker(array, motion), rows)
         assert_same_points(compiled, readable)
         assert [point.iterations for point in compiled] == [point.iterations for point in readable]

@@ -14,6 +14,7 @@ class Track {
   const Padded<T> wide_ = filter_.wide(motion_, space_);
   double *const bends_ = space_.take<double>(3 * K_), *const directions_ = space_.take<double>(3 * K_ * filter_.N);
   double *const open_loop_ = space_.take<double>(K_ * ns_ * ns_);
+  double *const variances_ = space_.take<double>(n_seen * K_);  // of what readings depend on, before the step
 
  public:
   Track(const magloc_track &p, Workspace &space) : p_(p), space_(space) {}
@@ -25,17 +26,19 @@ class Track {
     __builtin_memcpy(centroid_before, p_.centroid, sizeof centroid_before);
     filter_.load(*p_.state, 0);
     filter_.set_row(row);
+    for (int64_t i = 0; i < n_seen * K_; ++i) variances_[i] = seen_variance(i);
     fill_open_loop(p_.motion->step_of_row[row]);
     filter_.predict(motion_, p_.motion->step_of_row[row], 0, centroid_before, wide_);
     filter_.store(*p_.predicted, row);
     if (is_too_wide()) return false;
     if (p_.rows->counts[row] > 0) {
       if (bends()) return false;
-      filter_.update(*p_.convergence);
+      filter_.update(*p_.convergence, prediction_bends(row), p_.least_share);
       filter_.finish_update();
       if (!(filter_.converged && filter_.nis <= p_.nis_limits[p_.rows->counts[row]]) || is_too_wide()) return false;
       p_.nis[row] = filter_.nis;
       p_.iterations[row] = filter_.iterations;
+      ++p_.progress[2];
     } else {
       p_.nis[row] = nan;
       p_.iterations[row] = 0;
@@ -45,7 +48,6 @@ class Track {
     __builtin_memcpy(p_.centroid, filter_.centroid(), sizeof centroid_before);
     __builtin_memcpy(p_.open_loop, open_loop_, K_ * ns_ * ns_ * sizeof(double));
     for (int64_t i = 0; i < K_ * ns_; ++i) p_.open_loop_variances[K_ * ns_ * row + i] = open_loop_[ns_ * i + i % ns_];
-    ++p_.progress[2];
     return true;
   }
 
@@ -58,8 +60,18 @@ class Track {
     return false;
   }
 
+  double seen_variance(int64_t i) const { return filter_.variance(ns_ * (i / n_seen) + i % n_seen); }
+
+  // Whether the prediction bends as the readings do: not if the motion has made it so wide, nor as a row does in which
+  // readings are missing.
+  bool prediction_bends(int64_t row) const {
+    bool bends = p_.state->n_nuisances == 0 && p_.rows->counts[row] >= p_.full_count;
+    for (int64_t i = 0; i < n_seen * K_; ++i)
+      bends &= seen_variance(i) <= p_.largest_growth * p_.largest_growth * variances_[i];
+    return bends;
+  }
+
   bool bends() {
-    if (p_.largest_bend == infinity) return false;
     filter_.fill_bends((double)(p_.progress[2] < p_.longest_memory ? p_.progress[2] : p_.longest_memory), bends_,
                        directions_);
     for (int64_t i = 0; i < 3 * K_; ++i)
