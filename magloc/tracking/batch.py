@@ -14,12 +14,13 @@ from magloc.levels import CONTRADICTION
 from magloc.measurement.rows import ambient_fields
 from magloc.tracking.chart.coordinates import Chart
 from magloc.tracking.chart.mixture import Mixture, component_moments, root_of
+from magloc.tracking.chart.row import Rows
 from magloc.tracking.chart.split import LARGEST_BEND, MOST_ROWS
 from magloc.tracking.chart.steps import LARGEST_GROWTH, LARGEST_WIDTH
 from magloc.tracking.chart.update import LEAST_SHARE
 from magloc.tracking.motion import N_SOURCE, OrnsteinUhlenbeck
 from magloc.tracking.results import Prediction, Row, Step, TrackPoint, learned
-from magloc.tracking.row_filter import Gaussians, Rows, convergence, steps_problem
+from magloc.tracking.row_filter import Gaussians, convergence, steps_problem
 from magloc.tracking.tracker import Tracker
 
 _MOST_AT_ONCE = 64

@@ -10,13 +10,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc import core
 from magloc.tracking.chart.coordinates import FIRM
-from magloc.tracking.chart.row import ChartRow
+from magloc.tracking.chart.row import Rows
 from magloc.tracking.chart.update import LEAST_GAIN, LEAST_SHARE, MOST_ITERATIONS, ROUNDING, TOLERANCE
-from magloc.tracking.motion import LinearMotion, MotionModel, OrnsteinUhlenbeck
+from magloc.tracking.motion import MotionModel, OrnsteinUhlenbeck
 
 _ROWS_A_CALL = 1000
 """Rows of trajectories that one call of the kernel smooths: some 10 ms."""
@@ -83,74 +82,20 @@ class RowUpdates:
     innovation: FloatArray | None
     sensor_chi2: FloatArray | None
 
-
-@dataclass(frozen=True, eq=False)
-class Rows:
-    """Rows of an array's readings.
-
-    Attributes
-    ----------
-    array : SensorArray
-    readings : ndarray, shape (n, k)
-        Differences in units of their noise, zero behind the last one of a row.
-    counts : ndarray of int, shape (n,)
-        Number of differences of each row.
-    transforms, transform_of_row : ndarray, shapes (m, k, n_channels) and (n,)
-        From channels to differences.
-    effects : ndarray, shape (n, k, n_nuisances)
-        Of nuisances on them.
-    origins_m, rotations : ndarray, shapes (n, 3) and (n, 3, 3)
-        Pose of the array.
-    ambients_T : ndarray, shape (n or 1, n_sensors, 3)
-        Field at the sensors without a source.
-    """
-
-    array: SensorArray
-    readings: FloatArray
-    counts: IntArray
-    transforms: FloatArray
-    transform_of_row: IntArray
-    effects: FloatArray
-    origins_m: FloatArray
-    rotations: FloatArray
-    ambients_T: FloatArray
-
-    @classmethod
-    def of(cls, row: ChartRow) -> Rows:
-        """Return a single row."""
-        model, one = row.model, np.zeros(1, dtype=np.int64)
-        transform = model.differences.transform / row.sigma[:, None]
-        ambient, count = model.array.ambient_fields, np.array([row.n_differences])
-        z, pose = row.z[None], (row.row.origin_m[None], row.row.R_world_from_array[None])
-        return cls(model.array, z, count, transform[None], one, row.effect[None], *pose, ambient[None])
+    @property
+    def x(self) -> FloatArray:
+        """Return the means (C, N)."""
+        return self.after.x
 
     @property
-    def problem(self) -> core.Problem:
-        """Return the arguments of kernels."""
-        array, order = self.array, np.arange(len(self.readings))
-        return core.problem(
-            "rows",
-            n_sensors=array.n_sensors,
-            n_channels=array.n_channels,
-            n_readings=self.readings.shape[1],
-            n_nuisances=self.effects.shape[2],
-            sensors=array.positions,
-            array_centroid=tuple(array.centroid),
-            radius=array.circumradius,
-            sensor=np.ascontiguousarray(array.channel_sensor, dtype=np.int64),
-            gain=array.channel_gain,
-            is_modulus=array.channel_is_scalar.astype(np.uint8),
-            readings=np.ascontiguousarray(self.readings),
-            counts=np.ascontiguousarray(self.counts, dtype=np.int64),
-            transforms=np.ascontiguousarray(self.transforms),
-            transform_of_row=np.ascontiguousarray(self.transform_of_row, dtype=np.int64),
-            effects=np.ascontiguousarray(self.effects),
-            effect_of_row=order,
-            origins=np.ascontiguousarray(self.origins_m),
-            rotations=np.ascontiguousarray(self.rotations),
-            ambients=np.ascontiguousarray(self.ambients_T),
-            ambient_of_row=order if len(self.ambients_T) > 1 else np.zeros_like(order),
-        )
+    def S(self) -> FloatArray:
+        """Return the roots (C, N, N)."""
+        return self.after.S
+
+    def whitened_innovation(self, index: int) -> FloatArray:
+        """Return the innovation of one of them."""
+        assert self.innovation is not None
+        return np.asarray(self.innovation[index])
 
 
 def convergence() -> core.Problem:
@@ -186,8 +131,8 @@ def steps_problem(
     n_noise = 15
     if isinstance(motion, OrnsteinUhlenbeck):
         turning = np.stack([motion.turning_step(length_s) for length_s in steps_s])
-    elif isinstance(motion, LinearMotion):
-        F, A, B = (np.stack(part) for part in zip(*map(motion.linear_step, steps_s), strict=True))
+    elif (linear_step := getattr(motion, "linear_step", None)) is not None:
+        F, A, B = (np.stack(part) for part in zip(*map(linear_step, steps_s), strict=True))
         n_noise = A.shape[2]
     else:
         assert states is not None

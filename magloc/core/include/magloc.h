@@ -621,8 +621,8 @@ typedef struct {
 } magloc_row_update;
 int64_t magloc_update_row(const magloc_row_update *problem, int64_t begin, int64_t end, double *workspace);
 
-/* How far readings bend along the principal axes of log-range and direction of each source, in sigma of as many rows as
-   are remembered, or over the width that one row leaves where it alone tells the axis. */
+/* How far readings bend along the principal axes of log-range and direction of each source, over what a row leaves
+   open of them, in sigma of as many rows as are remembered. */
 typedef struct {
   const magloc_sources *sources;
   const magloc_rows *rows;

@@ -88,6 +88,8 @@ class Mixture:
     @property
     def log_range_sigma(self) -> float:
         """Standard deviation of the log-range of all components together."""
+        if len(self) == 1:
+            return float(np.linalg.norm(self.S[0, 0]))
         log_range, weight = np.log(self.chart.length), self.weight
         apart = log_range - weight @ log_range
         return float(np.sqrt(weight @ (apart**2 + np.sum(self.S[:, 0] ** 2, axis=1))))
@@ -100,6 +102,8 @@ class Mixture:
 
     def of_source(self) -> Mixture:
         """Position and moment alone."""
+        if self.S.shape[2] == N_SOURCE:
+            return self
         return replace(self, x=self.x[:, :N_SOURCE], S=root_of(self.S[:, :N_SOURCE]), n_motion=N_SOURCE, n_pose=0)
 
     def likely(self) -> Mixture:
@@ -140,6 +144,8 @@ class Mixture:
     def moments(self) -> tuple[FloatArray, FloatArray]:
         """Cartesian mean (6,) and covariance (6, 6) of position and moment; a range is log-normal."""
         mean, covariance = component_moments(self.chart, self.S)
+        if len(self) == 1:
+            return mean[0], covariance[0]
         weight = self.weight
         centre = weight @ mean
         off = mean - centre
@@ -208,32 +214,37 @@ def block_root(rows: FloatArray) -> FloatArray:
 
 def _groups(mixture: Mixture) -> list[IntArray]:
     """Components in groups of such as are as good as the group's first, heaviest first."""
-    chart, S = mixture.chart, mixture.S
-    sigma = np.sqrt(np.sum(S[:, :3] ** 2, axis=2))
-    log_range = np.log(chart.length)
+    n, chart, S = mixture.n_motion, mixture.chart, mixture.S
+    variance = np.sum(S[:, :3] ** 2, axis=2)
+    log_range, log_variance = np.log(chart.length), np.log(variance[:, 0])
+    roots = chart.jacobian(np.zeros_like(chart.x)) @ S[:, :n]
     left, groups = np.arange(len(mixture)), []
     while left.size:
         first, others = left[0], left[1:]
-        # Divergence is at least half the square of an offset in any one coordinate.
-        reach = 2.0 * np.sqrt(MERGED_BELOW)
-        near = np.abs(log_range[others] - log_range[first]) < reach * sigma[first, 0]
-        angle = np.linalg.norm(chart.u[others] - chart.u[first], axis=1)
-        near &= angle < reach * np.hypot(sigma[first, 1], sigma[first, 2])
-        candidates = others[near]
-        same = candidates[_divergence(mixture, first, candidates) < MERGED_BELOW] if candidates.size else candidates
+        # A divergence is at least that of the log-range alone, and half the square of an offset in any one coordinate.
+        square = (log_range[others] - log_range[first]) ** 2 + variance[others, 0]
+        of_range = square / variance[first, 0] - 1.0 + log_variance[first] - log_variance[others]
+        near = of_range < 2.0 * MERGED_BELOW
+        angle = np.sum((chart.u[others] - chart.u[first]) ** 2, axis=1)
+        near &= angle < 4.0 * MERGED_BELOW * (variance[first, 1] + variance[first, 2])
+        same = others[near]
+        if same.size:
+            index = np.concatenate([[first], same])
+            same = same[_divergence(chart.take(np.full(len(index), first)), chart.x[index], roots[index]) < MERGED_BELOW]
         groups.append(np.concatenate([[first], same]))
-        left = others[~np.isin(others, same)]
+        left = others[~np.isin(others, same)] if same.size else others
     return groups
 
 
-def _divergence(mixture: Mixture, first: int, others: IntArray) -> FloatArray:
-    """Kullback and Leibler's divergence (m,) of source and motion of some components from one of them."""
-    n = mixture.n_motion
-    both = mixture.take(np.concatenate([[first], others]))
-    offset, roots = _in_chart(both.take(np.array([0])).chart, both)
-    P = roots[:, :n] @ np.swapaxes(roots[:, :n], -1, -2)
-    inverse = np.linalg.inv(P[0])
-    d = offset[1:, :n]
+def _divergence(about: Chart, x: FloatArray, roots: FloatArray) -> FloatArray:
+    """Kullback and Leibler's divergence (m,) of Gaussians from the first one, in a chart about that.
+
+    Of source and motion: states x (m + 1, n), and roots (m + 1, n, N) of their covariances.
+    """
+    d = about.coordinates(x)
+    roots = np.linalg.solve(about.jacobian(d), roots)
+    P = roots @ np.swapaxes(roots, -1, -2)
+    inverse, d = np.linalg.inv(P[0]), d[1:]
     traces = np.einsum("ij,kji->k", inverse, P[1:])
     log_det = np.linalg.slogdet(P)[1]
-    return 0.5 * (traces + np.einsum("ki,ij,kj->k", d, inverse, d) - n + log_det[0] - log_det[1:])
+    return 0.5 * (traces + np.einsum("ki,ij,kj->k", d, inverse, d) - len(inverse) + log_det[0] - log_det[1:])

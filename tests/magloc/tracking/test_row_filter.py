@@ -23,10 +23,10 @@ from magloc.measurement.differences import predicted_channels
 from magloc.tracking import row_filter
 from magloc.tracking.chart import update as readable
 from magloc.tracking.chart.coordinates import Chart
-from magloc.tracking.chart.row import ChartRow
+from magloc.tracking.chart.row import ChartRow, Rows
 from magloc.tracking.motion import CoordinatedTurn, KnownMotion, MotionModel, OrnsteinUhlenbeck, RandomWalk
 from magloc.tracking.results import Row
-from magloc.tracking.row_filter import Gaussians, Rows
+from magloc.tracking.row_filter import Gaussians
 from magloc.tracking.tracker import Tracker
 from tests.passing_source import MOMENT, NOISE_T, POSITION
 
@@ -124,7 +124,7 @@ class TestOneSource:
     ) -> None:
         at = case(array, motion, seed, missing=missing)
         expected = readable.updated(at.x, at.S, at.row, np.array(bends))
-        found = row_filter.update(at.gaussians, Rows.of(at.row), bends=np.array(bends), innovation=True)
+        found = row_filter.update(at.gaussians, at.row.compiled, bends=np.array(bends), innovation=True)
         np.testing.assert_array_equal(found.converged, expected.converged)
         good = expected.converged
         np.testing.assert_array_equal(found.iterations[good], expected.iterations[good])
@@ -144,7 +144,7 @@ class TestOneSource:
         """Both end within 1e-3 σ of the optimum, where the cost is flat."""
         at = case(ARRAYS[0], motion, seed, offset_T)
         expected = readable.updated(at.x, at.S, at.row, np.zeros(3, dtype=bool))
-        found = row_filter.update(at.gaussians, Rows.of(at.row))
+        found = row_filter.update(at.gaussians, at.row.compiled)
         assert found.converged.all()
         np.testing.assert_allclose(found.nis, expected.nis, atol=3e-6)
         np.testing.assert_allclose(found.log_evidence, expected.log_evidence, atol=3e-3)
@@ -169,7 +169,7 @@ class TestOneSource:
         steps = row_filter.steps_problem(
             motion, [0.5], np.zeros(1, dtype=np.intp), (kept[None], added[None]), at.x[:, :n]
         )
-        found = row_filter.predict(at.gaussians, centroid, steps, Rows.of(at.row))
+        found = row_filter.predict(at.gaussians, centroid, steps, at.row.compiled)
         np.testing.assert_allclose(found.x, x, rtol=1e-12, atol=1e-12)
         assert_same_covariances(found.S, expected, 1e-6)
 
@@ -178,7 +178,7 @@ class TestOneSource:
     def test_covariance_keeps_what_is_known_a_million_times_better(self, offset_T: float) -> None:
         """Offsets of 20 µT beside 0.2 nT of noise, by the same formula with fifty digits."""
         at = case(ARRAYS[0], RandomWalk(0.1, 0.02), 3, offset_T)
-        found = row_filter.update(at.gaussians, Rows.of(at.row)).after
+        found = row_filter.update(at.gaussians, at.row.compiled).after
         n = at.row.n_motion
         for before, x, S_before, S in zip(at.x, found.x, at.S, found.S, strict=True):
             chart = at.row.chart(before[None, :n]).firmly(S_before[None])
@@ -201,12 +201,12 @@ class TestOneSource:
     def test_predictions_of_nuisances_do_not_bend(self) -> None:
         at = case(ARRAYS[0], MOTIONS[0], 0, 4e-9)
         with pytest.raises(ValueError, match="nuisances do not bend"):
-            row_filter.update(at.gaussians, Rows.of(at.row), bends=np.ones(3, dtype=bool))
+            row_filter.update(at.gaussians, at.row.compiled, bends=np.ones(3, dtype=bool))
 
     def test_a_source_on_a_sensor_does_not_converge(self) -> None:
         at = case(ARRAYS[0], RandomWalk(0.1, 0.02), 0)
         at.x[:, :3] = at.row.row.origin_m + at.row.row.R_world_from_array @ ARRAYS[0].positions[1]
-        assert not row_filter.update(at.gaussians, Rows.of(at.row)).converged.any()
+        assert not row_filter.update(at.gaussians, at.row.compiled).converged.any()
 
 
 def retracted(
@@ -403,8 +403,8 @@ class TestSeveralSources:
                     np.testing.assert_allclose(same / np.sqrt(np.diagonal(P)), v / np.sqrt(np.diagonal(P)), atol=1e-7)
                     ahead, behind = board.h(board.retracted(x, v)), board.h(board.retracted(x, -v))
                     bend, gradient = 0.5 * (ahead + behind) - board.h(x), 0.5 * (ahead - behind)
-                    known = 1.0 / float(gradient @ gradient)
-                    share = known if known < 1.0 else math.sqrt(min(known, 3.0))
+                    told = float(gradient @ gradient)
+                    share = math.sqrt(min(max(1.0 / told, 1.0), 3.0)) / (1.0 + told)
                     assert bends[c, one] == pytest.approx(share * float(np.linalg.norm(bend)), rel=1e-6)
 
     def test_smoothed_rows(self, n_sources: int) -> None:

@@ -257,8 +257,8 @@ class RowFilter {
           bend += curve * curve;
           gradient += slope * slope;
         }
-        const double known = 1.0 / sum_of_lanes(gradient);
-        *bends = square_root(sum_of_lanes(bend) * (known > 1.0 ? minimum(known, memory) : known * known));
+        const double told = sum_of_lanes(gradient), n = told < 1.0 ? minimum(1.0 / told, memory) : 1.0;
+        *bends = square_root(sum_of_lanes(bend) * n) / (1.0 + told);
       }
     }
   }
