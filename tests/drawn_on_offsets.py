@@ -12,10 +12,9 @@ import math
 import numpy as np
 
 import magloc
-from magloc.readings import Readings
 from magloc.truth import Truth
-from tests.magloc.tracking.test_first_rows import DT_S, WALK, drawn
 from tests.passing_source import ARRAY
+from tests.tracked_sources import WALK, drawn
 
 MOTIONS = {"walk": WALK, "wandering": magloc.OrnsteinUhlenbeck(WALK.speed_m_s, WALK.turn_rad_s)}
 
@@ -30,8 +29,7 @@ def main() -> None:
     given = parser.parse_args()
     found = []
     for seed in range(given.first, given.first + given.seeds):
-        truth, rows = drawn(MOTIONS[given.motion], given.rows, seed)
-        readings = Readings(np.stack([row.readings_T for row in rows]), time_s=DT_S * np.arange(given.rows))
+        truth, readings = drawn(MOTIONS[given.motion], given.rows, seed)
         track = magloc.track(ARRAY, readings.high_passed(0.01), motion=MOTIONS[given.motion])
         nees = math.nan
         if track.tracked.any():

@@ -127,6 +127,10 @@ class Magnets:
         """The same for as long as some rows."""
         return Magnets(self.position_m[:, :n_rows], self.moment_Am2[:, :n_rows], self.present[:, :n_rows])
 
+    def since(self, row: int) -> Magnets:
+        """The same from a row on."""
+        return Magnets(self.position_m[:, row:], self.moment_Am2[:, row:], self.present[:, row:])
+
     def readings_T(self, array: SensorArray, rng: np.random.Generator) -> FloatArray:
         """What the board reads (n, C)."""
         fields = np.zeros((self.present.shape[1], array.n_sensors, 3)) + AMBIENT_T

@@ -12,12 +12,10 @@ from arrays import geometries
 from arrays.array import SensorArray
 from magloc.measurement.differences import predicted_channels
 from magloc.readings import Readings
-from magloc.tracking.chart.coordinates import Chart
-from magloc.tracking.chart.mixture import Mixture, root_of
 from magloc.tracking.motion import RandomWalk
 from magloc.tracking.results import Row, TrackPoint, rows_of
 from magloc.tracking.track import Track
-from magloc.tracking.tracker import Known, Tracker
+from magloc.tracking.tracker import Tracker
 from sims.magnetics.simulation import Simulation
 
 FloatArray = NDArray[np.float64]
@@ -39,14 +37,6 @@ def readings_of(array: SensorArray, p: FloatArray, m: FloatArray, seed: int = 0)
     """Readings (n, C) of a source (n, 3) with white noise."""
     noise = np.random.default_rng(seed).normal(size=(len(p), array.n_channels))
     return predicted_channels(array, p, m) + array.channel_noise_T * noise
-
-
-def known_of(tracker: Tracker, x: FloatArray, S: FloatArray) -> Known:
-    """What a tracker knows of a state (n,) from a Cartesian root (n, n) of its covariance, without lasting errors."""
-    chart = Chart.at(x[None], ARRAY.centroid, ARRAY.circumradius)
-    root = root_of(chart.inverse_jacobian() @ S)
-    mixture = Mixture(x[None], root, np.zeros(1), x.size, tracker.array.centroid, tracker.array.circumradius)
-    return Known(mixture, S @ S.T)
 
 
 def rows_from(time_s: FloatArray, readings_T: FloatArray) -> list[Row]:

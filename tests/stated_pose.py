@@ -19,10 +19,10 @@ import magloc
 import sims
 from arrays.pose import PoseUncertainty
 from sims.magnetics.scenario import MagneticScenario
-from tests.magloc.tracking import test_ambient_uncertainty, test_pose
-from tests.magloc.tracking.test_pose import REST, WHITE
+from tests.magloc.tracking import test_ambient_uncertainty
+from tests.tracked_sources import PASSING, REST, WHITE
 
-SCENARIOS = {"tetrahedron": test_pose.SCENARIO, "moduli": test_ambient_uncertainty.SCENARIO}
+SCENARIOS = {"tetrahedron": PASSING, "moduli": test_ambient_uncertainty.SCENARIO}
 WALK = replace(WHITE, correlation_s=10.0)
 MOUNTING = {"position_constant_m": 0.05, "attitude_constant_rad": math.radians(0.5)}
 SMALL = PoseUncertainty(0.002, math.radians(0.03), 0.0, 0.0, 0.0, 0.0)

@@ -16,43 +16,13 @@ import time
 import numpy as np
 
 from arrays.typing import FloatArray
-from magloc.measurement.differences import predicted_channels
 from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.consistency import nees_of
-from magloc.tracking.motion import OrnsteinUhlenbeck
 from magloc.tracking.posterior_bound import posterior_bound
-from magloc.tracking.results import Row, TrackPoint
+from magloc.tracking.results import TrackPoint, rows_of
 from magloc.tracking.tracker import Tracker
 from tests.passing_source import ARRAY
-
-FAR_M, NEAR_M, N_ROWS, DT_S = 20.0, 5.0, 60, 0.5
-SNR = (4.0, 6.0)
-SPEED_M_S = math.sqrt(FAR_M**2 - NEAR_M**2) / (DT_S * (N_ROWS - 1))
-MOTION = OrnsteinUhlenbeck(SPEED_M_S / math.sqrt(3.0), math.radians(1.2), correlation_s=math.inf)
-
-
-def drawn(seed: int) -> tuple[FloatArray, list[Row]]:
-    """True positions and moments (n, 6), and rows of them."""
-    rng = np.random.default_rng(seed)
-    toward, moment = rng.normal(size=(2, 3))
-    toward /= np.linalg.norm(toward)
-    aside = np.cross(toward, rng.normal(size=3))
-    aside /= np.linalg.norm(aside)
-    first = ARRAY.centroid + NEAR_M * toward + SPEED_M_S * DT_S * (N_ROWS - 1) * aside
-    sigma_T = float(ARRAY.channel_noise_T[0])
-    seen = predicted_channels(ARRAY, first, moment).reshape(-1, 3)
-    strength = rng.uniform(*SNR) * sigma_T / float(np.linalg.norm(seen - seen.mean(axis=0)))
-    source = np.concatenate([first, strength * moment])
-    x, _ = MOTION.start(source, np.zeros((6, 6)))
-    x[6:9], x[9:] = -SPEED_M_S * aside, MOTION.turn_rad_s * rng.normal(size=3)
-    states = [x]
-    while len(states) < N_ROWS:
-        mean, _, S_q = MOTION.step(states[-1], DT_S)
-        states.append(mean + S_q @ rng.normal(size=S_q.shape[1]))
-    truth = np.array(states)[:, :6]
-    readings = predicted_channels(ARRAY, truth[:, :3], truth[:, 3:])
-    readings += sigma_T * rng.normal(size=readings.shape)
-    return truth, [Row(DT_S * i, values) for i, values in enumerate(readings)]
+from tests.tracked_sources import APPROACH, N_APPROACH, approach
 
 
 def judged(seed: int) -> FloatArray:
@@ -61,10 +31,10 @@ def judged(seed: int) -> FloatArray:
     Whether it shows the source, and whether it is answered; squared error and its bound; NEES per dimension;
     whether the range set holds the truth; Brier's score of the weights, and what it is on average if they are honest.
     """
-    truth, rows = drawn(seed)
-    tracker = Tracker(ARRAY, MOTION)
+    truth, readings = approach(seed)
+    rows, tracker = list(rows_of(readings)), Tracker(ARRAY, APPROACH)
     bounds = posterior_bound(tracker, rows, truth[:, :3], truth[:, 3:])
-    result = np.full((N_ROWS, 8), np.nan)
+    result = np.full((N_APPROACH, 8), np.nan)
     for i, point in enumerate(tracker.run(rows)):
         seen = ChartRow.of(tracker.measurements.of(rows[i])).is_detected(tracker.errors.sigma)
         result[i, :2] = seen, point.position_m is not None

@@ -359,11 +359,13 @@ class Tracker:
         if before.young:
             young = (*before.young, (seen, self.motion))
             known = self.filter.refitted(replace(known, young=young, nis=before.nis + update.nis))
-        # Narrow components may stand anywhere along the range when no reading shows the source any more.
-        width = max(width_of(known.mixture), known.mixture.log_range_sigma)
-        is_detected = width <= LARGEST_WIDTH or self.filter.is_detected(seen)
-        if is_detected and width_of(known.mixture) > LARGEST_WIDTH:
+        is_wide = width_of(known.mixture) > LARGEST_WIDTH
+        # A range that was known may be open again although every component is narrow.
+        is_open = known.mixture.log_range_sigma > LARGEST_WIDTH
+        is_detected = (is_wide or (is_open and known.has_range)) and self.filter.is_detected(seen)
+        if is_wide and is_detected:
             return self._started(row, index, predicted.matched())
+        known = replace(known, has_range=known.has_range or not is_open)
         return out, self._kept(
             seen.row,
             index,
@@ -372,7 +374,7 @@ class Tracker:
             status="tracked",
             innovation=innovation,
             iterations=update.iterations,
-            is_lost=not is_detected,
+            is_lost=is_open and known.has_range and not is_detected,
         )
 
     def _judge(self, row: Row, out: BoolArray, excess: Callable[[ChartRow], float]) -> None:

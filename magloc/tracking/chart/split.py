@@ -3,15 +3,15 @@ r"""Components of a mixture that are divided where a row's readings bend over th
 A Gaussian stays one under readings that are linear over its width. Along a principal axis of log-range and direction,
 one standard deviation v of the whole state changes the predicted readings, in units of their noise, by an odd part
 :math:`g = \tfrac12 (h(v) - h(-v))` and an even part :math:`c = \tfrac12 (h(v) + h(-v)) - h(0)`. A linearisation leaves
-out the even part, in every row alike. Over as many rows as determine the axis by themselves, :math:`1/|g|^2`, but at
-most the n rows that the component remembers, it adds up. Where a row alone determines the axis, it counts over the
-width :math:`1/|g|` that the row leaves. In standard deviations of the readings' noise it is
+out the even part, of which :math:`c / (1 + |g|^2)` remains within what the row leaves open of the axis. It does so in
+every row alike. Over as many rows as determine the axis by themselves, :math:`1/|g|^2`, but at most the n rows that the
+component remembers, it adds up to
 
-.. math:: \beta = |c| \sqrt{\min(|g|^{-2}, n)} \text{ where } |g| \le 1, \qquad \beta = |c| / |g|^2 \text{ beyond.}
+.. math:: \beta = \frac{|c|}{1 + |g|^2} \sqrt{\min(\max(|g|^{-2}, 1), n)}
 
-A component with :math:`\beta > 1` becomes three along that axis, which have the same mean and covariance together. The
-update's bent prediction (:mod:`magloc.tracking.chart.update`) treats what is less: a division approximates a Gaussian,
-so that many divisions lose more than they gain.
+standard deviations of the readings' noise. A component with :math:`\beta > \tfrac12` becomes three along that axis,
+which have the same mean and covariance together. The update's bent prediction (:mod:`magloc.tracking.chart.update`)
+treats what is less: a division approximates a Gaussian, so that many divisions lose more than they gain.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from magloc.tracking.chart.mixture import Mixture, block_root
 from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.row_filter import Gaussians
 
-LARGEST_BEND = 1.0
+LARGEST_BEND = 0.5
 """Bend of the readings over a component, in standard deviations of their noise, beyond which it is divided."""
 MOST_COMPONENTS = 80
 """Number of components beyond which none is divided."""

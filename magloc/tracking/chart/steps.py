@@ -78,6 +78,8 @@ class Known:
         Cartesian covariance of the motion's states had no readings been taken since the track began.
     contradictions : int
         Contradicting rows before the next one.
+    has_range : bool
+        Whether the range was once known since the track began.
     young : tuple of (ChartRow, MotionModel)
         Rows of a track that are still fitted together, and the motion that led to each; `next_refit`, after how many.
     nis : float
@@ -87,6 +89,7 @@ class Known:
     mixture: Mixture
     open_loop: FloatArray
     contradictions: int = 0
+    has_range: bool = False
     young: tuple[tuple[ChartRow, MotionModel], ...] = ()
     next_refit: int = FIRST_REFIT
     nis: float = 0.0

@@ -10,49 +10,28 @@ import math
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 import magloc
 from arrays.geometries import axial
+from arrays.typing import FloatArray
 from magloc.measurement.differences import predicted_channels
 from magloc.tracking.batch import track_record
 from magloc.tracking.consistency import nees_of
 from magloc.tracking.files import json_entry
-from magloc.tracking.motion import MotionModel, OrnsteinUhlenbeck, RandomWalk
+from magloc.tracking.motion import MotionModel
 from magloc.tracking.posterior_bound import posterior_bound
-from magloc.tracking.results import Row
+from magloc.tracking.results import Row, rows_of
 from magloc.tracking.tracker import Tracker
 from tests.passing_source import ARRAY
-
-FloatArray = NDArray[np.float64]
-DT_S, RANGE_M, MOMENT_AM2 = 0.5, 8.0, 250.0
-TURN_RAD_S = math.radians(1.2)
-WALK, VELOCITY = RandomWalk(0.1, TURN_RAD_S), OrnsteinUhlenbeck(0.1, TURN_RAD_S, correlation_s=math.inf)
-
-
-def drawn(motion: MotionModel, n: int, seed: int) -> tuple[FloatArray, list[Row]]:
-    """True states (n, n_states), drawn from the motion model, and rows of them."""
-    rng = np.random.default_rng(seed)
-    direction, moment = rng.normal(size=(2, 3))
-    place = ARRAY.centroid + RANGE_M * direction / np.linalg.norm(direction)
-    source = np.concatenate([place, MOMENT_AM2 * moment / np.linalg.norm(moment)])
-    x, S = motion.start(source, np.zeros((6, 6)))
-    states = [x + S @ rng.normal(size=len(x))]
-    while len(states) < n:
-        mean, _, S_q = motion.step(states[-1], DT_S)
-        states.append(mean + S_q @ rng.normal(size=S_q.shape[1]))
-    truth = np.array(states)
-    readings = predicted_channels(ARRAY, truth[:, :3], truth[:, 3:6])
-    readings += ARRAY.channel_noise_T * rng.normal(size=readings.shape)
-    return truth, [Row(DT_S * i, values) for i, values in enumerate(readings)]
+from tests.tracked_sources import VELOCITY, WALK, drawn
 
 
 def judged(motion: MotionModel, n: int, seeds: range) -> FloatArray:
     """Squared error, its bound, NEES per dimension, and whether the range set holds the truth: (runs, n, 4)."""
     result = np.empty((len(seeds), n, 4))
     for k, seed in enumerate(seeds):
-        truth, rows = drawn(motion, n, seed)
-        tracker = Tracker(ARRAY, motion)
+        truth, readings = drawn(motion, n, seed)
+        rows, tracker = list(rows_of(readings)), Tracker(ARRAY, motion)
         bounds = posterior_bound(tracker, rows, truth[:, :3], truth[:, 3:6])
         for i, point in enumerate(track_record(tracker, rows)):
             assert point.position_m is not None
@@ -69,9 +48,9 @@ def judged(motion: MotionModel, n: int, seeds: range) -> FloatArray:
 
 def test_the_true_place_is_kept_beside_another() -> None:
     """A source at 8 m whose first rows fit one at 4.6 m, too: all rows together once led there for a minute."""
-    _, rows = drawn(WALK, 60, 30027)
+    _, readings = drawn(WALK, 60, 30027)
     tracker = Tracker(ARRAY, WALK)
-    ranges = [np.linalg.norm(point.position_m - ARRAY.centroid) for point in tracker.run(rows[:25])]
+    ranges = [np.linalg.norm(point.position_m - ARRAY.centroid) for point in tracker.run(rows_of(readings[:25]))]
     assert min(ranges[1:]) > 6.5
 
 

@@ -10,38 +10,24 @@ from numpy.typing import NDArray
 from scipy import stats
 
 import magloc
-from arrays.geometries import axial, tetrahedron
+from arrays.geometries import axial
 from magloc.measurement.differences import predicted_channels
 from magloc.tracking.chart.known_moment import KeptModulus
 from magloc.tracking.results import Row
 from magloc.tracking.tracker import Tracker
+from tests.passing_source import ARRAY
+from tests.tracked_sources import MODULUS_AM2 as MODULUS
+from tests.tracked_sources import MODULUS_SIGMA_AM2 as SIGMA
+from tests.tracked_sources import of_known_modulus as source
+from tests.tracked_sources import walk_of_known_modulus
 
-ARRAY = tetrahedron(1.5, noise_T=2e-10)
 WALK = magloc.RandomWalk(0.1, 0.02)
-MODULUS, SIGMA = 250.0, 5.0
 KNOWN = magloc.SourcePrior(known_moment_Am2=MODULUS, known_moment_sigma_Am2=SIGMA)
-
-
-def source(seed: int, range_m: float) -> NDArray[np.float64]:
-    """A place in any direction, and a moment in any whose modulus errs as is stated (6,)."""
-    rng = np.random.default_rng(seed)
-    direction, moment = rng.normal(size=(2, 3))
-    strength = MODULUS + SIGMA * rng.normal()
-    place = ARRAY.centroid + range_m * direction / np.linalg.norm(direction)
-    return np.concatenate([place, strength * moment / np.linalg.norm(moment)])
 
 
 def track(seed: int, range_m: float, prior: magloc.SourcePrior, n_rows: int = 10) -> magloc.Track:
     """Of a source that moves as is stated; it turns, and is as strong throughout."""
-    rng, x, readings = np.random.default_rng(1000 + seed), source(seed, range_m), []
-    for _ in range(n_rows):
-        readings.append(predicted_channels(ARRAY, x[:3], x[3:]) + 2e-10 * rng.normal(size=12))
-        turn = 0.02 * 0.5 * np.cross(rng.normal(size=3), x[3:])
-        x[:3] += 0.1 * 0.5 * rng.normal(size=3)
-        x[3:] = (x[3:] + turn) * np.linalg.norm(x[3:]) / np.linalg.norm(x[3:] + turn)
-    return magloc.track(
-        ARRAY, magloc.Readings(np.array(readings), time_s=0.5 * np.arange(n_rows)), motion=WALK, prior=prior
-    )
+    return magloc.track(ARRAY, walk_of_known_modulus(seed, range_m, n_rows)[1], motion=WALK, prior=prior)
 
 
 def range_sigma(point: magloc.TrackPoint | magloc.Solution, centroid_m: NDArray[np.float64]) -> float:
@@ -107,11 +93,7 @@ class TestTrack:
         """Last rows of 30 tracks of truths that are drawn as is stated: χ² of 90 numbers, at 1 in 1,000."""
         total = 0.0
         for seed in range(30):
-            found, x = track(seed, 8.0, KNOWN), source(seed, 8.0)
-            rng = np.random.default_rng(1000 + seed)
-            for _ in range(9):
-                rng.normal(size=12), rng.normal(size=3)
-                x[:3] += 0.1 * 0.5 * rng.normal(size=3)
+            found, x = track(seed, 8.0, KNOWN), walk_of_known_modulus(seed, 8.0, 10)[0][-1]
             off = found.position_m[-1] - x[:3]
             total += float(off @ np.linalg.solve(found.covariance[-1, :3, :3], off))
         low, high = stats.chi2.ppf([5e-4, 1.0 - 5e-4], 90)

@@ -16,7 +16,6 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 import magloc
-from arrays.geometries import tetrahedron
 from arrays.pose import PoseUncertainty
 from magloc.ambient import in_world_field
 from magloc.tracking.chart.row import ChartRow
@@ -26,28 +25,15 @@ from magloc.tracking.posterior_bound import posterior_bound
 from magloc.tracking.results import TrackPoint, rows_of
 from magloc.tracking.track import Track
 from magloc.tracking.tracker import Tracker
-from sims.magnetics.paths import Attitude, Steered
-from sims.magnetics.scenario import Carrier, MagneticScenario, Source
+from sims.magnetics.paths import Steered
+from sims.magnetics.scenario import MagneticScenario
 from sims.magnetics.scenario_files import read_scenario
-from sims.magnetics.sensors import SensorModel
 from sims.magnetics.simulation import Simulation, simulate
 from tests.passing_source import nees
+from tests.tracked_sources import PASSING as SCENARIO
+from tests.tracked_sources import REST, WHITE
 
-WHITE = PoseUncertainty(0.02, math.radians(0.3), 0.02, 0.0, 0.0, 0.0)
 ALL = replace(WHITE, correlation_s=10.0, position_constant_m=0.05, attitude_constant_rad=math.radians(0.5))
-REST = magloc.RandomWalk(1e-5, 1e-5)
-_MODEL = SensorModel("vector", noise_T_rtHz=1e-10 / math.sqrt(2.5))
-SCENARIO = MagneticScenario(
-    tetrahedron(1.2),
-    (_MODEL,) * 4,
-    duration_s=10.0,
-    rate_Hz=5.0,
-    carrier=Carrier(
-        Steered((-2.5, 0.5, 2.0), speed_m_s=0.5),
-        Attitude(True, wobble_rad=(0.1, 0.08, 0.1), wobble_period_s=(5.3, 4.1, 7.7)),
-    ),
-    sources=(Source(Carrier(Steered((0.0, 0.0, -1.0))), moment_Am2=(40.0, -20.0, 30.0)),),
-)
 
 
 def run(

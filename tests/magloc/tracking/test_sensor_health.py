@@ -27,18 +27,11 @@ from tests.passing_source import (
     rows_from,
     statuses,
 )
+from tests.tracked_sources import walk_from_5_m, with_fault
 
 FloatArray = NDArray[np.float64]
 FAULTS = ("stuck", "zero", "noisy")
 CUBE = geometries.cube(EDGE_M, "vector", NOISE_T)
-
-
-def with_fault(fault: str, good: FloatArray, rows: slice, channels: slice, rng: np.random.Generator) -> FloatArray:
-    """Readings of which a sensor is stuck at its last good one, zero, or 20 times as noisy in some rows."""
-    wrong, right = good.copy(), good[rows, channels]
-    noisy = right + 20.0 * NOISE_T * rng.normal(size=right.shape)
-    wrong[rows, channels] = {"stuck": good[rows.start - 1, channels], "zero": 0.0, "noisy": noisy}[fault]
-    return wrong
 
 
 class TestFaultySensor:
@@ -89,16 +82,8 @@ class TestFaultySensor:
         answered. The filter that is told has the sensor again in row 200, this one 50 rows later."""
         ratio = []
         for seed in range(100, 112):
-            rng = np.random.default_rng(seed)
-            direction, moment = rng.normal(size=(2, 3))
-            place = array.centroid + 5.0 * direction / np.linalg.norm(direction)
-            states = [SLOW.start(np.concatenate([place, 250.0 * moment / np.linalg.norm(moment)]), np.zeros((6, 6)))[0]]
-            while len(states) < 300:
-                mean, _, S_q = SLOW.step(states[-1], 0.5)
-                states.append(mean + S_q @ rng.normal(size=S_q.shape[1]))
-            truth = np.array(states)
-            good = predicted_channels(array, truth[:, :3], truth[:, 3:])
-            good += NOISE_T * rng.normal(size=good.shape)
+            truth, readings, rng = walk_from_5_m(array, 300, seed)
+            good = readings.values_T
             sensor = int(rng.integers(array.n_sensors))
             channels = slice(3 * sensor, 3 * sensor + 3)
             told = good.copy()

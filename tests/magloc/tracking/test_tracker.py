@@ -16,10 +16,12 @@ import sims
 from magloc.measurement.differences import predicted_channels
 from magloc.readings import Readings
 from magloc.tracking.batch import track_record
+from magloc.tracking.chart.coordinates import Chart
+from magloc.tracking.chart.mixture import Mixture, root_of
 from magloc.tracking.consistency import consistency
 from magloc.tracking.motion import CoordinatedTurn, MotionModel, OrnsteinUhlenbeck, RandomWalk
 from magloc.tracking.results import Row, TrackPoint, rows_of
-from magloc.tracking.tracker import Tracker
+from magloc.tracking.tracker import Known, Tracker
 from magloc.tracking.whole_records.smoother import smoothed
 from tests.oracles import magpylib_field
 from tests.passing_source import (
@@ -28,7 +30,6 @@ from tests.passing_source import (
     POSITION,
     SLOW,
     followed,
-    known_of,
     moving_source,
     positions,
     readings_of,
@@ -71,6 +72,14 @@ class TestStationarySource:
         # A filter linearises every row where it stood then: a shift of second order.
         assert np.abs(off).max() < 0.05
         np.testing.assert_allclose(np.sqrt(np.diagonal(last.covariance)), deviation, rtol=0.01)
+
+
+def known_of(tracker: Tracker, x: FloatArray, S: FloatArray) -> Known:
+    """What a tracker knows of a state (n,) from a Cartesian root (n, n) of its covariance, without lasting errors."""
+    chart = Chart.at(x[None], ARRAY.centroid, ARRAY.circumradius)
+    root = root_of(chart.inverse_jacobian() @ S)
+    mixture = Mixture(x[None], root, np.zeros(1), x.size, tracker.array.centroid, tracker.array.circumradius)
+    return Known(mixture, S @ S.T)
 
 
 def drawn_state(rng: np.random.Generator, motion: MotionModel, deviation: FloatArray) -> tuple[FloatArray, Tracker]:

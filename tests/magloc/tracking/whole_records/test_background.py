@@ -33,41 +33,9 @@ from magloc.tracking.results import rows_of
 from magloc.tracking.track import Track
 from magloc.tracking.tracker import Tracker
 from magloc.tracking.whole_records.background import settled_steps
-from sims.magnetics.paths import Attitude, Steered
-from sims.magnetics.scenario import Carrier, MagneticScenario, Source
-from sims.magnetics.sensors import SensorModel
-
-NOISE_T, RATE_HZ, CORNER_HZ = 1e-10, 2.5, 0.01
-REST = magloc.RandomWalk(1e-5, 1e-5)
-SCENARIO = MagneticScenario(
-    tetrahedron(1.2),
-    (SensorModel("vector", noise_T_rtHz=NOISE_T / math.sqrt(0.5 * RATE_HZ)),) * 4,
-    duration_s=60.0,
-    rate_Hz=RATE_HZ,
-    carrier=Carrier(
-        Steered((-3.0, 0.5, 2.0), speed_m_s=0.1),
-        Attitude(True, wobble_rad=(0.1, 0.08, 0.1), wobble_period_s=(5.3, 4.1, 7.7)),
-    ),
-    sources=(Source(Carrier(Steered((0.0, 0.0, -1.0))), moment_Am2=(40.0, -20.0, 30.0)),),
-)
-
-
-def none(readings: Readings, seed: int) -> FloatArray:
-    return np.zeros_like(readings.values_T)
-
-
-def lines(readings: Readings, seed: int) -> FloatArray:
-    """Slopes of 20 σ of a reading over the record."""
-    t = readings.time_s - readings.time_s.mean()
-    slopes = np.random.default_rng(10_000 + seed).normal(size=readings.values_T.shape[1])
-    return np.outer(t, slopes * 20.0 * NOISE_T / np.ptp(t))
-
-
-def walks(readings: Readings, seed: int) -> FloatArray:
-    """Offsets of 20 σ, and a random walk as the corner says."""
-    rng, shape = np.random.default_rng(20_000 + seed), readings.values_T.shape
-    step_T = NOISE_T * 2.0 * math.pi * CORNER_HZ / RATE_HZ
-    return 20.0 * NOISE_T * rng.normal(size=shape[1]) + np.cumsum(step_T * rng.normal(size=shape), axis=0)
+from tests.tracked_sources import BACKGROUND_NOISE_T as NOISE_T
+from tests.tracked_sources import CORNER_HZ, REST, lines, no_drift, walks
+from tests.tracked_sources import PASSING_SLOWLY as SCENARIO
 
 
 def high_passed(readings: Readings) -> Readings:
@@ -94,9 +62,9 @@ class TestConsistency:
         ("drift", "say", "least"),
         [
             (lines, Readings.detrended, 0.7),
-            (none, Readings.detrended, 0.5),
+            (no_drift, Readings.detrended, 0.5),
             (walks, high_passed, 0.7),
-            (none, high_passed, 0.5),
+            (no_drift, high_passed, 0.5),
         ],
         ids=["lines", "no lines", "walks", "no walks"],
     )
@@ -134,7 +102,7 @@ class TestTrack:
     def test_lines_of_any_slope_are_one(self, caplog: pytest.LogCaptureFixture) -> None:
         """The slopes are unknown: the same track with other ones, within what the prior of 10⁵ σ leaves."""
         with caplog.at_level(logging.WARNING, logger="magloc"):
-            _, flat = run(none, Readings.detrended, 1)
+            _, flat = run(no_drift, Readings.detrended, 1)
         assert "how the source moves" not in caplog.text  # it is at rest
         _, steep = run(lines, Readings.detrended, 1)
         np.testing.assert_array_equal(steep.tracked, flat.tracked)
@@ -150,7 +118,7 @@ class TestTrack:
 
     def test_a_corner_that_takes_the_source_is_warned_of(self, caplog: pytest.LogCaptureFixture) -> None:
         with caplog.at_level(logging.WARNING, logger="magloc"):
-            _, track = run(none, lambda readings: readings.high_passed(0.1), 0)
+            _, track = run(no_drift, lambda readings: readings.high_passed(0.1), 0)
         assert "the background looks like the source: positions are" in caplog.text
         assert track.tracked.any()
 
