@@ -163,8 +163,9 @@ class _CompiledSteps:
             n_rows=int(self.progress[2]),
         )
         explained = bool(self.n_differences[rows].any())
-        contradictions = 0 if explained else known.contradictions
-        resumed = replace(known, mixture=after, open_loop=self.open_loop.copy(), contradictions=contradictions)
+        resumed = replace(known, mixture=after, open_loop=self.open_loop.copy())
+        if explained:
+            resumed = replace(resumed, contradictions=0, has_range=True)
         tracker.resume(resumed, times[end - 1], end - begin, steps)
         means, covariances = component_moments(
             Chart.at(self.updated.x[rows, :N_SOURCE], centroids, mixture.radius_m), self.updated.S[rows]

@@ -119,10 +119,14 @@ class Mixture:
         groups = _groups(kept)
         if len(groups) == len(kept):
             return kept
-        parts = [kept.take(group).matched() if len(group) > 1 else kept.take(group) for group in groups]
-        log_weight = np.array([np.logaddexp.reduce(kept.log_weight[group]) for group in groups])
-        x, S = np.concatenate([part.x for part in parts]), np.concatenate([part.S for part in parts])
-        return replace(self, x=x, S=S, log_weight=log_weight - np.logaddexp.reduce(log_weight))
+        first = np.array([group[0] for group in groups])
+        found, log_weight = kept.take(first), kept.log_weight[first]
+        for i, group in enumerate(groups):
+            if len(group) > 1:
+                one = kept.take(group).matched()
+                found.x[i], found.S[i] = one.x[0], one.S[0]
+                log_weight[i] = np.logaddexp.reduce(kept.log_weight[group])
+        return replace(found, log_weight=log_weight - np.logaddexp.reduce(log_weight))
 
     def matched(self) -> Mixture:
         """The one Gaussian of the same mean and covariance, in the chart of the heaviest component."""
@@ -214,37 +218,36 @@ def block_root(rows: FloatArray) -> FloatArray:
 
 def _groups(mixture: Mixture) -> list[IntArray]:
     """Components in groups of such as are as good as the group's first, heaviest first."""
-    n, chart, S = mixture.n_motion, mixture.chart, mixture.S
+    chart, S, K = mixture.chart, mixture.S, len(mixture)
     variance = np.sum(S[:, :3] ** 2, axis=2)
     log_range, log_variance = np.log(chart.length), np.log(variance[:, 0])
-    roots = chart.jacobian(np.zeros_like(chart.x)) @ S[:, :n]
-    left, groups = np.arange(len(mixture)), []
-    while left.size:
-        first, others = left[0], left[1:]
-        # A divergence is at least that of the log-range alone, and half the square of an offset in any one coordinate.
-        square = (log_range[others] - log_range[first]) ** 2 + variance[others, 0]
-        of_range = square / variance[first, 0] - 1.0 + log_variance[first] - log_variance[others]
-        near = of_range < 2.0 * MERGED_BELOW
-        angle = np.sum((chart.u[others] - chart.u[first]) ** 2, axis=1)
-        near &= angle < 4.0 * MERGED_BELOW * (variance[first, 1] + variance[first, 2])
-        same = others[near]
-        if same.size:
-            index = np.concatenate([[first], same])
-            same = same[_divergence(chart.take(np.full(len(index), first)), chart.x[index], roots[index]) < MERGED_BELOW]
-        groups.append(np.concatenate([[first], same]))
-        left = others[~np.isin(others, same)] if same.size else others
+    # A divergence is at least that of the log-range alone, and half the square of an offset in any one coordinate.
+    square = (log_range - log_range[:, None]) ** 2 + variance[:, 0]
+    of_range = square / variance[:, :1] - 1.0 + log_variance[:, None] - log_variance
+    angle = np.sum((chart.u - chart.u[:, None]) ** 2, axis=2)
+    near = of_range < 2.0 * MERGED_BELOW
+    near &= angle < 4.0 * MERGED_BELOW * (variance[:, 1] + variance[:, 2])[:, None]
+    first, other = np.nonzero(np.triu(near, 1))
+    same, left = np.zeros((K, K), dtype=bool), np.ones(K, dtype=bool)
+    same[first, other] = _divergences(mixture, first, other) < MERGED_BELOW
+    groups = []
+    for i in range(K):
+        if left[i]:
+            same[i, i] = True
+            groups.append(np.flatnonzero(same[i] & left))
+            left[groups[-1]] = False
     return groups
 
 
-def _divergence(about: Chart, x: FloatArray, roots: FloatArray) -> FloatArray:
-    """Kullback and Leibler's divergence (m,) of Gaussians from the first one, in a chart about that.
-
-    Of source and motion: states x (m + 1, n), and roots (m + 1, n, N) of their covariances.
-    """
-    d = about.coordinates(x)
-    roots = np.linalg.solve(about.jacobian(d), roots)
-    P = roots @ np.swapaxes(roots, -1, -2)
-    inverse, d = np.linalg.inv(P[0]), d[1:]
-    traces = np.einsum("ij,kji->k", inverse, P[1:])
-    log_det = np.linalg.slogdet(P)[1]
-    return 0.5 * (traces + np.einsum("ki,ij,kj->k", d, inverse, d) - len(inverse) + log_det[0] - log_det[1:])
+def _divergences(mixture: Mixture, first: IntArray, others: IntArray) -> FloatArray:
+    """Kullback and Leibler's divergences (m,) of source and motion of some components from others, pair by pair."""
+    if not first.size:
+        return np.zeros(0)
+    n, about, chart = mixture.n_motion, mixture.chart.take(first), mixture.chart.take(others)
+    d, unit = about.coordinates(chart.x), root_of(mixture.S[first, :n])
+    # In units of the first ones' standard deviations.
+    of_others = chart.jacobian(np.zeros_like(d)) @ mixture.S[others, :n]
+    roots = np.linalg.solve(about.jacobian(d) @ unit, of_others)
+    e = np.linalg.solve(unit, d[..., None])[..., 0]
+    log_det = np.linalg.slogdet(roots @ np.swapaxes(roots, -1, -2))[1]
+    return np.asarray(0.5 * (np.sum(roots**2, axis=(1, 2)) + np.sum(e**2, axis=1) - n - log_det))

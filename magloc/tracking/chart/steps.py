@@ -94,6 +94,11 @@ class Known:
     next_refit: int = FIRST_REFIT
     nis: float = 0.0
 
+    @property
+    def is_settled(self) -> bool:
+        """Whether the track is no longer young, and of one place."""
+        return not self.young and len(self.mixture) == 1
+
 
 @dataclass(frozen=True, eq=False)
 class RowUpdate:
