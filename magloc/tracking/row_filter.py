@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
@@ -98,6 +99,7 @@ class RowUpdates:
         return np.asarray(self.innovation[index])
 
 
+@cache
 def convergence() -> core.Problem:
     """Return when an iterated update ends."""
     return core.problem(

@@ -11,7 +11,7 @@ from scipy.special import ndtr, ndtri
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.kalman import symmetric_square_root
 from magloc.localization.fit.results import Intervals
-from magloc.tracking.chart.coordinates import Chart
+from magloc.tracking.chart.coordinates import MOMENT_POWER, Chart
 from magloc.tracking.motion import N_SOURCE
 
 MERGED_BELOW = 0.02
@@ -183,12 +183,13 @@ class Mixture:
 
 def component_moments(chart: Chart, S: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Cartesian means (K, 6) and covariances (K, 6, 6) of single components with roots (K, N, N) in the chart."""
-    S = S[:, :N_SOURCE]
-    L = chart.jacobian(np.zeros_like(chart.x))[:, :N_SOURCE, :N_SOURCE]
+    reach = chart.length[:, None, None]
+    of_position = reach * (chart.u[:, :, None] * S[:, :1] + chart.E @ S[:, 1:3])
+    of_moment = MOMENT_POWER * chart.x[:, 3:6, None] * S[:, :1] + reach**MOMENT_POWER * S[:, 3:6]
+    root = np.concatenate([of_position, of_moment], axis=1)
     mean = chart.x[:, :N_SOURCE].copy()
     by_range = np.expm1(0.5 * np.minimum(np.sum(S[:, 0] ** 2, axis=1), _WIDEST**2))
     mean[:, :3] += (by_range * chart.length)[:, None] * chart.u
-    root = L @ S
     return mean, root @ np.swapaxes(root, -1, -2)
 
 
