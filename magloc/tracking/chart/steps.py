@@ -2,7 +2,8 @@
 
 The first row that shows a source makes a mixture (:mod:`magloc.tracking.chart.start`); every later one moves its
 components, divides those over which the readings bend (:mod:`magloc.tracking.chart.split`), updates them
-(:mod:`magloc.tracking.chart.update`) and merges those that are one.
+(:mod:`magloc.tracking.chart.update`) and merges those that are one. Where neither sensors nor pose have lasting errors,
+:mod:`magloc.tracking.row_filter` does so, compiled.
 
 Behind the states of the motion stand the errors of the array's pose, and behind them those of its sensors. Where there
 are such lasting errors, a row leaves many numbers open in curved valleys, which would take more components than can be
