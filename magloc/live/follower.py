@@ -25,7 +25,7 @@ from magloc.measurement.plausibility import FEWEST_ROWS, warn_of_array, warn_of_
 from magloc.measurement.pose import with_stated_pose
 from magloc.measurement.rows import joined
 from magloc.readings import EXPECTED_HEADER, Readings, log_format, without_saturated
-from magloc.tracking.batch import compiled_motion, next_points
+from magloc.tracking.batch import is_compiled, next_points
 from magloc.tracking.motion import MotionModel, RandomWalk
 from magloc.tracking.multi_target.motion import FreeMotion
 from magloc.tracking.multi_target.tracker import SourcesTracker
@@ -309,7 +309,7 @@ class Follower:
         if isinstance(self._tracker, SourcesTracker):
             is_quick = len(rows) <= _MOST_WAITING  # where one is born, some wait
         else:
-            is_quick = self._tracker.is_tracking and compiled_motion(self._tracker) is not None
+            is_quick = self._tracker.is_tracking and is_compiled(self._tracker)
         if len(rows) > 1 and not waits and (is_late or not is_quick):
             self.tally.skipped += len(rows) - 1
             return self._without_track(rows[:-1], SKIPPED)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import cast
 
 import numpy as np
 from scipy.special import chdtri
@@ -13,12 +12,15 @@ from arrays.typing import FloatArray
 from magloc import core
 from magloc.levels import CONTRADICTION
 from magloc.measurement.rows import ambient_fields
-from magloc.tracking.chart.coordinates import FIRM, Chart
+from magloc.tracking.chart.coordinates import Chart
 from magloc.tracking.chart.mixture import Mixture, component_moments, root_of
+from magloc.tracking.chart.row import Rows
+from magloc.tracking.chart.split import LARGEST_BEND, MOST_ROWS
 from magloc.tracking.chart.steps import LARGEST_GROWTH, LARGEST_WIDTH
-from magloc.tracking.chart.update import LEAST_GAIN, LEAST_SHARE, MOST_ITERATIONS, ROUNDING, TOLERANCE
-from magloc.tracking.motion import N_SOURCE, LinearMotion
+from magloc.tracking.chart.update import LEAST_SHARE
+from magloc.tracking.motion import N_SOURCE, OrnsteinUhlenbeck
 from magloc.tracking.results import Prediction, Row, Step, TrackPoint, learned
+from magloc.tracking.row_filter import Gaussians, convergence, steps_problem
 from magloc.tracking.tracker import Tracker
 
 _MOST_AT_ONCE = 64
@@ -26,20 +28,20 @@ _TERMS_A_CALL = 10_000_000
 """Approximate number of products that one call of the kernel computes: some 50 ms."""
 _TERMS_OF_STEPS = 3000
 """Products of a row that do not depend on the number of its differences."""
-_COMPILED_STATES = (N_SOURCE, N_SOURCE + 3)
-"""Position and moment, or velocity as well."""
 
 
 def track_record(
-    tracker: Tracker, rows: Sequence[Row], progress: Callable[[int], None] | None = None
+    tracker: Tracker,
+    rows: Sequence[Row],
+    progress: Callable[[int], None] | None = None,
 ) -> list[TrackPoint]:
     """Points of a whole record, or of the next rows of one: as :meth:`Tracker.run`, with compiled steps if there are.
 
-    Sensors with lasting errors, and a source that may be at several places, are tracked by the readable steps.
+    Sensors with lasting errors, and a source that may be at several places or whose component a row divides, are
+    tracked by the readable steps.
     """
     points: list[TrackPoint] = []
-    motion = compiled_motion(tracker)
-    compiled = _CompiledSteps(tracker, motion, rows) if motion is not None and rows else None
+    compiled = _CompiledSteps(tracker, rows) if rows and is_compiled(tracker) else None
     while len(points) < len(rows):
         before = len(points)
         if compiled is not None and tracker.is_tracking:
@@ -53,22 +55,23 @@ def track_record(
 
 def next_points(tracker: Tracker, rows: Sequence[Row], begin: int = 0) -> list[TrackPoint]:
     """Points of the rows from one on: of as many as compiled steps take in a moment, else of one."""
-    many = tracker.is_tracking and compiled_motion(tracker) is not None
+    many = tracker.is_tracking and is_compiled(tracker)
     return track_record(tracker, rows[begin : begin + (_MOST_AT_ONCE if many else 1)])
 
 
-def compiled_motion(tracker: Tracker) -> LinearMotion | None:
-    """The motion of a tracker whose steps are compiled, None where they are not."""
-    # Not by isinstance, which looks through all attributes of a protocol in every row.
-    is_linear = hasattr(tracker.motion, "linear_step") and tracker.motion.n_states in _COMPILED_STATES
-    return cast(LinearMotion, tracker.motion) if is_linear and not tracker.n_errors else None
+def is_compiled(tracker: Tracker) -> bool:
+    """Whether the steps of a tracker are compiled."""
+    # Not by isinstance of a protocol, which looks through all of its attributes in every row.
+    motion = tracker.motion
+    is_known = isinstance(motion, OrnsteinUhlenbeck) or hasattr(motion, "linear_step")
+    return is_known and not tracker.n_errors
 
 
 class _CompiledSteps:
     """A record with the arrays that the kernel reads and fills."""
 
-    def __init__(self, tracker: Tracker, motion: LinearMotion, rows: Sequence[Row]) -> None:
-        array = tracker.array
+    def __init__(self, tracker: Tracker, rows: Sequence[Row]) -> None:
+        array, motion = tracker.array, tracker.motion
         self.tracker = tracker
         self.times = [row.time_s for row in rows]
         self.times_before = [tracker.time_s, *self.times[:-1]]
@@ -81,73 +84,56 @@ class _CompiledSteps:
             transforms[i, : of_row.n_differences] = of_row.transform / np.sqrt(of_row.variance)[:, None]
         transform_of_row = np.array([index[id(of_row)] for of_row in differences])
         channels = _without_nan(np.stack([row.readings_T for row in rows]) - array.channel_offset_T)
-        ambients, ambient_of_row = array.ambient_fields[None], np.zeros(len(rows), dtype=np.int64)
+        ambients = array.ambient_fields[None]
         if any(row.ambient_T is not None for row in rows):
             usual = np.zeros(3) if array.ambient_T is None else np.asarray(array.ambient_T)
             of_rows = np.stack([usual if row.ambient_T is None else row.ambient_T for row in rows])
-            ambients, ambient_of_row = ambient_fields(array, len(rows), of_rows), np.arange(len(rows))
+            ambients = ambient_fields(array, len(rows), of_rows)
         since_before = _without_nan(np.subtract(self.times, self.times_before))  # NaN of the first of all
         lengths, step_of_row = np.unique(since_before, return_inverse=True)
-        steps = [motion.linear_step(max(length, 0.0)) for length in lengths.tolist()]
-        F, A, B = (np.stack(part) for part in zip(*steps, strict=True))
+        self.steps_s = np.maximum(lengths, 0.0)[step_of_row]
         n, m = motion.n_states, len(rows)
         self.origins, self.rotations = (
             np.stack([row.origin_m for row in rows]),
             np.stack([row.R_world_from_array for row in rows]),
         )
-        self.F, self.step_of_row = F, step_of_row
         self.n_differences = np.array([of_row.n_differences for of_row in differences])
-        self.x, self.S, self.centroid, self.open_loop = np.empty(n), np.empty((n, n)), np.empty(3), np.empty((n, n))
-        self.progress = np.zeros(2, dtype=np.int64)
+        self.centroid, self.open_loop = np.empty(3), np.empty((n, n))
+        self.progress = np.zeros(3, dtype=np.int64)
         self.block = max(1, _TERMS_A_CALL // (_TERMS_OF_STEPS + transforms[0].size))
-        self.predicted_x, self.predicted_S = np.empty((m, n)), np.empty((m, n, n))
-        self.updated_x, self.updated_S = np.empty((m, n)), np.empty((m, n, n))
+        self.state = Gaussians(np.empty((1, n)), np.empty((1, n, n)))
+        self.predicted, self.updated = (Gaussians(np.empty((m, n)), np.empty((m, n, n))) for _ in range(2))
         self.open_loop_variances, self.nis = np.empty((m, n)), np.empty(m)
         self.iterations = np.empty(m, dtype=np.int64)
+        given = Rows(
+            array,
+            (transforms[transform_of_row] @ channels[..., None])[..., 0],
+            self.n_differences,
+            transforms,
+            transform_of_row,
+            np.empty((m, k, 0)),
+            self.origins,
+            self.rotations,
+            ambients,
+        )
         self.work = core.problem(
             "track",
-            n_states=n,
-            n_noise=A.shape[2],
-            n_sensors=array.n_sensors,
-            n_channels=array.n_channels,
-            n_differences=k,
-            sensors=array.positions,
-            array_centroid=tuple(array.centroid),
-            radius=array.circumradius,
-            first_channel=np.searchsorted(array.channel_sensor, np.arange(array.n_sensors + 1)),
-            gain=array.channel_gain,
-            is_modulus=array.channel_is_scalar.astype(np.uint8),
-            measured=np.ascontiguousarray((transforms[transform_of_row] @ channels[..., None])[..., 0]),
-            counts=self.n_differences,
-            transforms=transforms,
-            transform_of_row=transform_of_row,
-            origins=self.origins,
-            rotations=self.rotations,
-            ambients=np.ascontiguousarray(ambients),
-            ambient_of_row=ambient_of_row,
-            F=F,
-            A=A,
-            B=B,
-            step_of_row=step_of_row,
+            rows=given.problem,
+            motion=steps_problem(motion, np.maximum(lengths, 0.0).tolist(), step_of_row),
+            convergence=convergence(),
             nis_limits=np.asarray(chdtri(np.maximum(np.arange(k + 1), 1), CONTRADICTION), dtype=np.float64),
-            tolerance=TOLERANCE,
-            max_iterations=MOST_ITERATIONS,
-            least_gain=LEAST_GAIN,
-            rounding=ROUNDING,
-            least_share=LEAST_SHARE,
+            largest_width=LARGEST_WIDTH,
+            largest_bend=LARGEST_BEND,
+            longest_memory=MOST_ROWS,
             largest_growth=LARGEST_GROWTH,
             full_count=tracker.filter.n_differences,
-            firm=FIRM,
-            largest_width=LARGEST_WIDTH,
-            x=self.x,
-            root=self.S,
+            least_share=LEAST_SHARE,
+            state=self.state.problem,
             centroid=self.centroid,
             open_loop=self.open_loop,
             progress=self.progress,
-            predicted_x=self.predicted_x,
-            predicted_roots=self.predicted_S,
-            updated_x=self.updated_x,
-            updated_roots=self.updated_S,
+            predicted=self.predicted.problem,
+            updated=self.updated.problem,
             open_loop_variances=self.open_loop_variances,
             nis=self.nis,
             iterations=self.iterations,
@@ -159,28 +145,35 @@ class _CompiledSteps:
         known = tracker.known
         assert known is not None
         mixture = known.mixture
-        self.x[:], self.S[:], self.centroid[:] = mixture.x[0], mixture.S[0], mixture.centroid_m
-        self.open_loop[:], self.progress[:] = known.open_loop, (begin, 1)
+        self.state.x[:], self.state.S[:], self.centroid[:] = mixture.x, mixture.S, mixture.centroid_m
+        self.open_loop[:], self.progress[:] = known.open_loop, (begin, 1, mixture.n_rows)
         n_later = next((i for i in range(begin, len(times)) if times[i] <= before[i]), len(times)) - begin
-        core.run("follow_source", self.work, n_later, block=self.block, chain=n_later or None)
+        core.run("follow_sources", self.work, n_later, block=self.block, chain=n_later or None)
         end = int(self.progress[0])
         if end == begin:
             return []
         rows = slice(begin, end)
         centroids = self.origins[rows] + self.rotations[rows] @ tracker.array.centroid
-        steps = self._steps(rows, centroids) if tracker.keep_steps else []
-        after = replace(mixture, x=self.x[None].copy(), S=self.S[None].copy(), centroid_m=self.centroid.copy())
+        steps = self._steps(rows, centroids, mixture.x[0]) if tracker.keep_steps else []
+        after = replace(
+            mixture,
+            x=self.state.x.copy(),
+            S=self.state.S.copy(),
+            centroid_m=self.centroid.copy(),
+            n_rows=int(self.progress[2]),
+        )
         explained = bool(self.n_differences[rows].any())
-        contradictions = 0 if explained else known.contradictions
-        resumed = replace(known, mixture=after, open_loop=self.open_loop.copy(), contradictions=contradictions)
+        resumed = replace(known, mixture=after, open_loop=self.open_loop.copy())
+        if explained:
+            resumed = replace(resumed, contradictions=0, has_range=True)
         tracker.resume(resumed, times[end - 1], end - begin, steps)
         means, covariances = component_moments(
-            Chart.at(self.updated_x[rows, :N_SOURCE], centroids, mixture.radius_m), self.updated_S[rows]
+            Chart.at(self.updated.x[rows, :N_SOURCE], centroids, mixture.radius_m), self.updated.S[rows]
         )
         estimability = learned(np.diagonal(covariances, axis1=1, axis2=2), self.open_loop_variances[rows, :N_SOURCE])
-        of_source, single, radius_m = self.updated_S[rows, :N_SOURCE], np.zeros(1), mixture.radius_m
+        of_source, single, radius_m = self.updated.S[rows, :N_SOURCE], np.zeros(1), mixture.radius_m
         roots = of_source if of_source.shape[2] == N_SOURCE else root_of(of_source)
-        sources = zip(self.updated_x[rows, None, :N_SOURCE], roots[:, None], centroids, strict=True)
+        sources = zip(self.updated.x[rows, None, :N_SOURCE], roots[:, None], centroids, strict=True)
         told = (of_row[rows].tolist() for of_row in (self.iterations, self.nis, self.n_differences))
         return [
             TrackPoint(
@@ -203,22 +196,18 @@ class _CompiledSteps:
             )
         ]
 
-    def _steps(self, rows: slice, centroids: FloatArray) -> list[Step]:
-        """Steps for a smoother of some rows."""
-        radius_m = self.tracker.array.circumradius
+    def _steps(self, rows: slice, centroids: FloatArray, x_before: FloatArray) -> list[Step]:
+        """Steps for a smoother of some rows, from the state (n,) before them."""
+        radius_m, steps = self.tracker.array.circumradius, []
         before, after = (
-            Chart.at(x[rows], centroids, radius_m).jacobian(np.zeros_like(x[rows])) @ S[rows]
-            for x, S in ((self.predicted_x, self.predicted_S), (self.updated_x, self.updated_S))
+            Chart.at(some.x[rows], centroids, radius_m).jacobian(np.zeros_like(some.x[rows])) @ some.S[rows]
+            for some in (self.predicted, self.updated)
         )
-        return [
-            Step(
-                i,
-                Prediction(self.predicted_x[i], before[j], self.F[self.step_of_row[i]]),
-                self.updated_x[i],
-                after[j],
-            )
-            for j, i in enumerate(range(rows.start, rows.stop))
-        ]
+        for j, i in enumerate(range(rows.start, rows.stop)):
+            _, F, _ = self.tracker.motion.step(x_before, float(self.steps_s[i]))
+            x_before = self.updated.x[i]
+            steps.append(Step(i, Prediction(self.predicted.x[i], before[j], F), x_before, after[j]))
+        return steps
 
 
 def _without_nan(values: FloatArray) -> FloatArray:

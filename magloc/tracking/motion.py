@@ -199,12 +199,22 @@ class OrnsteinUhlenbeck(_MovingState):
     moment_change: float = 3e-3
     n_states: int = 12
 
+    @property
+    def _correlation_s(self) -> float:
+        if self.correlation_s is None:
+            return 1.0 / self.turn_rad_s if self.turn_rad_s > 0.0 else math.inf
+        return self.correlation_s
+
+    def turning_step(self, dt_s: float) -> FloatArray:
+        """Return the numbers (12,) of a step for its kernel."""
+        moved, kept, root = wandering_step(self._correlation_s, dt_s)
+        lower = root[[0, 1, 1], [0, 0, 1]]
+        change = self.moment_change * math.sqrt(dt_s)
+        return np.array([moved, kept, moved, kept, *self.speed_m_s * lower, *self.turn_rad_s * lower, change, change])
+
     def step(self, x: FloatArray, dt_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the prediction, see :class:`MotionModel`."""
-        correlation_s = self.correlation_s
-        if correlation_s is None:
-            correlation_s = 1.0 / self.turn_rad_s if self.turn_rad_s > 0.0 else math.inf
-        moved, kept, root = wandering_step(correlation_s, dt_s)
+        moved, kept, root = wandering_step(self._correlation_s, dt_s)
         p, m, v, rate = x[:3], x[3:6], x[6:9], x[9:]
         turn = rotation_matrix(moved * rate)
         turned = turn @ m

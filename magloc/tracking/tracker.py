@@ -115,13 +115,10 @@ class Tracker:
         keep_steps: bool = False,
         background: Drift | None = None,
     ) -> None:
-        self.array = array
-        self.prior = prior
+        self.array, self.prior, self.background, self.keep_steps = array, prior, background, keep_steps
         self.motion = motion
-        self.background = background
         self.measurements = RowMeasurements(array, motion.n_states, background)
         self.errors, self.pose_errors = self.measurements.errors, self.measurements.pose_errors
-        self.keep_steps = keep_steps
         self.steps: list[Step] = []
         self._acquisition = Acquisition(array, prior)
         self.filter = ChartFilter(array, self.errors, self.pose_errors, prior)
@@ -150,7 +147,6 @@ class Tracker:
             row, self._row_before = moving(row, self._row_before), row
         dt_s, self._time_s = row.time_s - self._time_s, row.time_s
         index, self._n_rows = self._n_rows, self._n_rows + 1
-        out = self._health.dead
         if self._known is None:
             out, point = self._started(row, index)
         else:
@@ -188,15 +184,13 @@ class Tracker:
     @property
     def is_tracking(self) -> bool:
         """Whether the next row continues a track that is no longer young, of one place and with all sensors."""
-        known = self._known
-        return known is not None and not known.young and len(known.mixture) == 1 and self._health.is_well
+        return (known := self._known) is not None and known.is_settled and self._health.is_well
 
     def resume(self, known: Known, time_s: float, n_rows: int = 0, steps: Sequence[Step] = ()) -> None:
         """Go on from what is known at a time, after so many rows more."""
         self._known, self._time_s, self._last = known, time_s, None
         self._n_rows += n_rows
-        if self.keep_steps:
-            self.steps += steps
+        self.steps += steps
 
     @property
     def n_errors(self) -> int:
@@ -242,8 +236,7 @@ class Tracker:
 
     def known_before(self, seen: ChartRow, x: FloatArray) -> FloatArray:
         """Covariance (n, n) of the motion's states of a source at x before its first row."""
-        root = prior_root(seen.chart(x[:N_SOURCE]))
-        _, S = self.motion.start(x[:N_SOURCE], root)
+        _, S = self.motion.start(x[:N_SOURCE], prior_root(seen.chart(x[:N_SOURCE])))
         return S @ S.T
 
     def open_loop(self, covariance: FloatArray, x: FloatArray, dt_s: float) -> FloatArray:
@@ -359,9 +352,8 @@ class Tracker:
         if before.young:
             young = (*before.young, (seen, self.motion))
             known = self.filter.refitted(replace(known, young=young, nis=before.nis + update.nis))
-        is_wide = width_of(known.mixture) > LARGEST_WIDTH
         # A range that was known may be open again although every component is narrow.
-        is_open = known.mixture.log_range_sigma > LARGEST_WIDTH
+        is_wide, is_open = width_of(known.mixture) > LARGEST_WIDTH, known.mixture.log_range_sigma > LARGEST_WIDTH
         is_detected = (is_wide or (is_open and known.has_range)) and self.filter.is_detected(seen)
         if is_wide and is_detected:
             return self._started(row, index, predicted.matched())
@@ -379,6 +371,8 @@ class Tracker:
 
     def _judge(self, row: Row, out: BoolArray, excess: Callable[[ChartRow], float]) -> None:
         """Count a row without some sensors (N,), and the χ² that each dead one with readings would add to it."""
+        if self._health.is_well and not out.any():
+            return
         of_dead, read = np.full(len(out), np.inf), np.unique(self.array.channel_sensor[row.available])
         for sensor in np.intersect1d(np.flatnonzero(self._health.dead), read):
             of_dead[sensor] = excess(self._seen(row, out & (np.arange(len(out)) != sensor)))
@@ -433,15 +427,13 @@ class Tracker:
             return self._of_rows(mixture, reason, seen)
         self._acquisition.forget()
         self._undetermined.forget()
-        solution = start.solution
-        point = self._kept(seen.row, index, known, None, status="acquired", iterations=solution.iterations)
-        return replace(point, weight=solution.weight, rivals=start.rivals)
+        point = self._kept(seen.row, index, known, None, status="acquired", iterations=start.solution.iterations)
+        return replace(point, weight=start.solution.weight, rivals=start.rivals)
 
     def _found(self, start: RowsStart, seen: ChartRow) -> Known | None:
         """What is known of a source that several rows show, the last of them as it is seen, if it is known well."""
-        solution = start.solution
-        source = np.concatenate([solution.position_m, solution.moment_Am2])
-        found = self.start(source, solution.covariance, start.rows)
+        source = np.concatenate([start.solution.position_m, start.solution.moment_Am2])
+        found = self.start(source, start.solution.covariance, start.rows)
         if found is None:
             return None
         offset, root = seen.measurement.place_in_array(found.x, found.S)

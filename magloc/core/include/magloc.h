@@ -468,52 +468,6 @@ int64_t magloc_survey_sources(const magloc_survey_columns *problem, int64_t begi
 /* Columns of poles, whose field is d/r^3: size n_sources. */
 int64_t magloc_survey_poles(const magloc_survey_columns *problem, int64_t begin, int64_t end, double *workspace);
 
-/* A source followed by one component, from a state before row progress[0] to the first row that it does not explain; an
-   item is one more row. The state has 6 numbers, position and moment, or 9, with the velocity. Readings are differences
-   of channels in units of their noise; a row of fewer ones has zeros behind them. magloc/tracking/chart explains it. */
-typedef struct {
-  int64_t n_states, n_noise;
-  /* The array. */
-  int64_t n_sensors, n_channels, n_differences;
-  const double *sensors; /* (n_sensors, 3) */
-  double array_centroid[3], radius;
-  const int64_t *first_channel; /* (n_sensors + 1) of each sensor */
-  const double *gain;           /* (n_channels, 3); of a modulus the first number counts */
-  const uint8_t *is_modulus;    /* (n_channels) */
-  /* Rows. */
-  const double *measured;          /* (n_rows, n_differences) */
-  const int64_t *counts;           /* (n_rows) of differences; none: the state is predicted only */
-  const double *transforms;        /* (n_transforms, n_differences, n_channels) from channels to differences */
-  const int64_t *transform_of_row; /* (n_rows) */
-  const double *origins;           /* (n_rows, 3) of the array */
-  const double *rotations;         /* (n_rows, 3, 3) to the world from the array */
-  const double *ambients;          /* (n_ambients, n_sensors, 3) field */
-  const int64_t *ambient_of_row;   /* (n_rows) */
-  /* Steps of the motion: transition F, and root of its noise A + |m| B. */
-  const double *F;            /* (n_steps, n_states, n_states) */
-  const double *A, *B;        /* (n_steps, n_states, n_noise) */
-  const int64_t *step_of_row; /* (n_rows) */
-  /* When an update has converged, and when it is believed. */
-  const double *nis_limits; /* (n_differences + 1) by the number of differences */
-  double tolerance;
-  int64_t max_iterations;
-  double least_gain, rounding; /* a step that gains less, of what a linear problem would, is halved */
-  double least_share, largest_growth;
-  int64_t full_count; /* differences of a row without missing readings */
-  double firm, largest_width;
-  /* The state before the next row, which calls change: mean, root in the chart about it, the sensors' centroid there,
-     and the covariance had no readings been taken. */
-  double *x, *root, *centroid, *open_loop; /* (n), (n, n), (3), (n, n) */
-  int64_t *progress;                       /* (2): next row, and 1 as long as rows are explained */
-  /* Results of each explained row. */
-  double *predicted_x, *predicted_roots; /* (n_rows, n), (n_rows, n, n) */
-  double *updated_x, *updated_roots;     /* (n_rows, n), (n_rows, n, n) */
-  double *open_loop_variances;           /* (n_rows, n) */
-  double *nis;                           /* (n_rows); NaN without readings */
-  int64_t *iterations;                   /* (n_rows) */
-} magloc_track;
-int64_t magloc_follow_source(const magloc_track *problem, int64_t begin, int64_t end, double *workspace);
-
 /* Several sources that one filter follows together; magloc/tracking/multi_target/state.py has the chart of their
    errors. These are in the order (position, moment) of each source, common field, (velocity, rate of turn) of each
    source: n = 12 n_sources + 3 numbers, of which a row of readings sees the first d = 6 n_sources + 3. */
@@ -585,6 +539,136 @@ int64_t magloc_joint_update_row(const magloc_joint_update *problem, int64_t begi
 int64_t magloc_joint_state_after(const magloc_joint_posterior *problem, int64_t begin, int64_t end, double *workspace);
 int64_t magloc_joint_bend(const magloc_joint_bends *problem, int64_t begin, int64_t end, double *workspace);
 int64_t magloc_joint_smooth(const magloc_joint_smoothing *problem, int64_t begin, int64_t end, double *workspace);
+
+/* Rows of readings of an array, as they depend on sources: n_readings combinations of channels, in units of their
+   noise; a row of fewer ones has zeros behind them. */
+typedef struct {
+  int64_t n_sensors, n_channels, n_readings, n_nuisances;
+  const double *sensors; /* (n_sensors, 3) */
+  double array_centroid[3], radius;
+  const int64_t *sensor;           /* (n_channels) of each channel, ascending */
+  const double *gain;              /* (n_channels, 3); of a modulus the first number counts */
+  const uint8_t *is_modulus;       /* (n_channels) */
+  const double *readings;          /* (n_rows, n_readings) */
+  const int64_t *counts;           /* (n_rows) of readings */
+  const double *transforms;        /* (n_transforms, n_readings, n_channels) from channels to readings */
+  const int64_t *transform_of_row; /* (n_rows) */
+  const double *effects;           /* (n_effects, n_readings, n_nuisances) of nuisances on readings */
+  const int64_t *effect_of_row;    /* (n_rows) */
+  const double *origins;           /* (n_rows, 3) of the array */
+  const double *rotations;         /* (n_rows, 3, 3) to the world from the array */
+  const double *ambients;          /* (n_ambients, n_sensors, 3) field */
+  const int64_t *ambient_of_row;   /* (n_rows) */
+} magloc_rows;
+
+/* Gaussians, each of the states of several sources: n_states numbers of each source, 6 (position and moment), 9 (the
+   velocity as well) or more, and behind them nuisances that are linear in the readings. magloc/tracking/chart explains
+   the chart. */
+typedef struct {
+  int64_t n_sources, n_states, n_nuisances;
+  int64_t power; /* of the range, 3 or 4, with which readings fall */
+  double firm;   /* share of a moment that is open, below which strength and direction are its coordinates */
+  double *x;     /* (n, N) means, N = n_sources n_states + n_nuisances */
+  double *roots; /* (n, N, N) of the covariances in the charts about them */
+} magloc_sources;
+
+/* Steps of a source: transition F and root of its noise, which are A + |m| B, or those of a rate of turn that lasts
+   (n_states = 12, n_noise = 15). With `moved`, one step for each source of each Gaussian. */
+typedef struct {
+  int64_t n_noise;
+  const double *F;       /* (n_steps, n_states, n_states) */
+  const double *A, *B;   /* (n_steps, n_states, n_noise); B may be null */
+  const double *moved;   /* (n, n_sources, n_states) after the steps, or null */
+  const double *turning; /* (n_steps, 12), or null: part of a second that velocities last, part that is kept of them,
+                            both of rates of turn; lower root (00, 10, 11) of the noise of position and velocity,
+                            of turn and rate; noise of the moment, relative to it, across and along */
+  const double *kept, *added; /* (n_steps, n_nuisances) of nuisances, and standard deviation of their noise; or null */
+  const int64_t *step_of_row; /* (n_rows) */
+} magloc_motion;
+
+/* When an iterated update has converged. */
+typedef struct {
+  double tolerance;            /* of the next step, in standard deviations */
+  double least_gain, rounding; /* a step that gains less, of what a linear problem would, is halved */
+  int64_t max_iterations;
+} magloc_convergence;
+
+/* Prediction of all Gaussians to a row; an item is a Gaussian, as of the next problems. */
+typedef struct {
+  const magloc_sources *before, *after;
+  const magloc_motion *motion;
+  const magloc_rows *rows;
+  int64_t row;
+  double centroid[3]; /* of the sensors, before */
+} magloc_row_prediction;
+int64_t magloc_predict_row(const magloc_row_prediction *problem, int64_t begin, int64_t end, double *workspace);
+
+/* Update of all Gaussians by a row. */
+typedef struct {
+  const magloc_sources *before, *after;
+  const magloc_rows *rows;
+  const magloc_convergence *convergence;
+  int64_t row;
+  const uint8_t *bends; /* (n) whether predictions bend as the readings do, or null; only without nuisances */
+  double least_share;   /* standard deviation of a prediction below which what the readings tell of it does not count */
+  double followed;      /* variance that readings have beside their noise in the test of sensors */
+  double *nis, *chi2;   /* (n) least sum of squares, and the readings' part of it */
+  double *log_evidence; /* (n) by Laplace's method, up to a constant */
+  int64_t *iterations;  /* (n) */
+  uint8_t *converged;   /* (n) */
+  double *innovation;   /* (n, n_readings) whitened, or null */
+  double *sensor_chi2;  /* (n, n_sensors) that free readings of a sensor would explain, or null */
+} magloc_row_update;
+int64_t magloc_update_row(const magloc_row_update *problem, int64_t begin, int64_t end, double *workspace);
+
+/* How far readings bend along the principal axes of log-range and direction of each source, over what a row leaves
+   open of them, in sigma of as many rows as are remembered. */
+typedef struct {
+  const magloc_sources *sources;
+  const magloc_rows *rows;
+  int64_t row;
+  double memory;
+  double *bends;      /* (n, 3 n_sources) */
+  double *directions; /* (n, 3 n_sources, N): one sigma of the whole state along each axis */
+} magloc_row_bends;
+int64_t magloc_bend_row(const magloc_row_bends *problem, int64_t begin, int64_t end, double *workspace);
+
+/* Sources followed by one Gaussian, from a state before row progress[0] to the first row that does not continue their
+   track; an item is one more row. */
+typedef struct {
+  const magloc_rows *rows;
+  const magloc_motion *motion;
+  const magloc_convergence *convergence;
+  const double *nis_limits;    /* (n_readings + 1) by the number of readings, above which they contradict */
+  double largest_width;        /* standard deviation of log-range and direction beyond which a source has no place */
+  double largest_bend;         /* of readings, beyond which the state is not one Gaussian */
+  int64_t longest_memory;      /* rows in which a bend is counted */
+  double largest_growth;       /* of standard deviations in a step, beyond which the prediction does not bend, */
+  int64_t full_count;          /* nor in rows of fewer readings, */
+  double least_share;          /* nor along what readings tell of less, in its standard deviation */
+  const magloc_sources *state; /* one: before the next row, and changed by calls, as are the next three */
+  double *centroid;            /* (3) of the sensors there */
+  double *open_loop;           /* (n_sources, n_states, n_states) covariance had no readings been taken */
+  int64_t *progress;           /* (3): next row, 1 as long as the track continues, and updates that led to the state */
+  const magloc_sources *predicted, *updated; /* by rows, where the track continues */
+  double *open_loop_variances;               /* (n_rows, n_sources n_states) */
+  double *nis;                               /* (n_rows); NaN without readings */
+  int64_t *iterations;                       /* (n_rows) */
+} magloc_track;
+int64_t magloc_follow_sources(const magloc_track *problem, int64_t begin, int64_t end, double *workspace);
+
+/* A filter and smoother along trajectories, linearised there, in the charts about them; an item is a trajectory. */
+typedef struct {
+  int64_t n_rows;
+  const double *trajectories;  /* (n, n_rows, n_sources n_states) */
+  const magloc_sources *prior; /* before the first row: means are offsets in the chart about its state */
+  const magloc_rows *rows;
+  const magloc_motion *motion; /* to each row but the first; with `moved`, n_rows steps for each trajectory */
+  double *offsets;             /* as trajectories: from these to the smoothed ones, in the charts */
+  const magloc_sources *last;  /* after the last row; means are offsets, too */
+  double *nis, *log_evidence;  /* (n) of all rows but the first, and of all */
+} magloc_smoothing;
+int64_t magloc_smooth_rows(const magloc_smoothing *problem, int64_t begin, int64_t end, double *workspace);
 
 /* end of the declarations */
 #ifdef __GNUC__

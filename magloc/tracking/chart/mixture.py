@@ -11,7 +11,7 @@ from scipy.special import ndtr, ndtri
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.kalman import symmetric_square_root
 from magloc.localization.fit.results import Intervals
-from magloc.tracking.chart.coordinates import Chart
+from magloc.tracking.chart.coordinates import MOMENT_POWER, Chart
 from magloc.tracking.motion import N_SOURCE
 
 MERGED_BELOW = 0.02
@@ -88,6 +88,8 @@ class Mixture:
     @property
     def log_range_sigma(self) -> float:
         """Standard deviation of the log-range of all components together."""
+        if len(self) == 1:
+            return float(np.linalg.norm(self.S[0, 0]))
         log_range, weight = np.log(self.chart.length), self.weight
         apart = log_range - weight @ log_range
         return float(np.sqrt(weight @ (apart**2 + np.sum(self.S[:, 0] ** 2, axis=1))))
@@ -100,6 +102,8 @@ class Mixture:
 
     def of_source(self) -> Mixture:
         """Position and moment alone."""
+        if self.S.shape[2] == N_SOURCE:
+            return self
         return replace(self, x=self.x[:, :N_SOURCE], S=root_of(self.S[:, :N_SOURCE]), n_motion=N_SOURCE, n_pose=0)
 
     def likely(self) -> Mixture:
@@ -115,10 +119,14 @@ class Mixture:
         groups = _groups(kept)
         if len(groups) == len(kept):
             return kept
-        parts = [kept.take(group).matched() if len(group) > 1 else kept.take(group) for group in groups]
-        log_weight = np.array([np.logaddexp.reduce(kept.log_weight[group]) for group in groups])
-        x, S = np.concatenate([part.x for part in parts]), np.concatenate([part.S for part in parts])
-        return replace(self, x=x, S=S, log_weight=log_weight - np.logaddexp.reduce(log_weight))
+        first = np.array([group[0] for group in groups])
+        found, log_weight = kept.take(first), kept.log_weight[first]
+        for i, group in enumerate(groups):
+            if len(group) > 1:
+                one = kept.take(group).matched()
+                found.x[i], found.S[i] = one.x[0], one.S[0]
+                log_weight[i] = np.logaddexp.reduce(kept.log_weight[group])
+        return replace(found, log_weight=log_weight - np.logaddexp.reduce(log_weight))
 
     def matched(self) -> Mixture:
         """The one Gaussian of the same mean and covariance, in the chart of the heaviest component."""
@@ -140,6 +148,8 @@ class Mixture:
     def moments(self) -> tuple[FloatArray, FloatArray]:
         """Cartesian mean (6,) and covariance (6, 6) of position and moment; a range is log-normal."""
         mean, covariance = component_moments(self.chart, self.S)
+        if len(self) == 1:
+            return mean[0], covariance[0]
         weight = self.weight
         centre = weight @ mean
         off = mean - centre
@@ -173,12 +183,13 @@ class Mixture:
 
 def component_moments(chart: Chart, S: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Cartesian means (K, 6) and covariances (K, 6, 6) of single components with roots (K, N, N) in the chart."""
-    S = S[:, :N_SOURCE]
-    L = chart.jacobian(np.zeros_like(chart.x))[:, :N_SOURCE, :N_SOURCE]
+    reach = chart.length[:, None, None]
+    of_position = reach * (chart.u[:, :, None] * S[:, :1] + chart.E @ S[:, 1:3])
+    of_moment = MOMENT_POWER * chart.x[:, 3:6, None] * S[:, :1] + reach**MOMENT_POWER * S[:, 3:6]
+    root = np.concatenate([of_position, of_moment], axis=1)
     mean = chart.x[:, :N_SOURCE].copy()
     by_range = np.expm1(0.5 * np.minimum(np.sum(S[:, 0] ** 2, axis=1), _WIDEST**2))
     mean[:, :3] += (by_range * chart.length)[:, None] * chart.u
-    root = L @ S
     return mean, root @ np.swapaxes(root, -1, -2)
 
 
@@ -208,32 +219,36 @@ def block_root(rows: FloatArray) -> FloatArray:
 
 def _groups(mixture: Mixture) -> list[IntArray]:
     """Components in groups of such as are as good as the group's first, heaviest first."""
-    chart, S = mixture.chart, mixture.S
-    sigma = np.sqrt(np.sum(S[:, :3] ** 2, axis=2))
-    log_range = np.log(chart.length)
-    left, groups = np.arange(len(mixture)), []
-    while left.size:
-        first, others = left[0], left[1:]
-        # Divergence is at least half the square of an offset in any one coordinate.
-        reach = 2.0 * np.sqrt(MERGED_BELOW)
-        near = np.abs(log_range[others] - log_range[first]) < reach * sigma[first, 0]
-        angle = np.linalg.norm(chart.u[others] - chart.u[first], axis=1)
-        near &= angle < reach * np.hypot(sigma[first, 1], sigma[first, 2])
-        candidates = others[near]
-        same = candidates[_divergence(mixture, first, candidates) < MERGED_BELOW] if candidates.size else candidates
-        groups.append(np.concatenate([[first], same]))
-        left = others[~np.isin(others, same)]
+    chart, S, K = mixture.chart, mixture.S, len(mixture)
+    variance = np.sum(S[:, :3] ** 2, axis=2)
+    log_range, log_variance = np.log(chart.length), np.log(variance[:, 0])
+    # A divergence is at least that of the log-range alone, and half the square of an offset in any one coordinate.
+    square = (log_range - log_range[:, None]) ** 2 + variance[:, 0]
+    of_range = square / variance[:, :1] - 1.0 + log_variance[:, None] - log_variance
+    angle = np.sum((chart.u - chart.u[:, None]) ** 2, axis=2)
+    near = of_range < 2.0 * MERGED_BELOW
+    near &= angle < 4.0 * MERGED_BELOW * (variance[:, 1] + variance[:, 2])[:, None]
+    first, other = np.nonzero(np.triu(near, 1))
+    same, left = np.zeros((K, K), dtype=bool), np.ones(K, dtype=bool)
+    same[first, other] = _divergences(mixture, first, other) < MERGED_BELOW
+    groups = []
+    for i in range(K):
+        if left[i]:
+            same[i, i] = True
+            groups.append(np.flatnonzero(same[i] & left))
+            left[groups[-1]] = False
     return groups
 
 
-def _divergence(mixture: Mixture, first: int, others: IntArray) -> FloatArray:
-    """Kullback and Leibler's divergence (m,) of source and motion of some components from one of them."""
-    n = mixture.n_motion
-    both = mixture.take(np.concatenate([[first], others]))
-    offset, roots = _in_chart(both.take(np.array([0])).chart, both)
-    P = roots[:, :n] @ np.swapaxes(roots[:, :n], -1, -2)
-    inverse = np.linalg.inv(P[0])
-    d = offset[1:, :n]
-    traces = np.einsum("ij,kji->k", inverse, P[1:])
-    log_det = np.linalg.slogdet(P)[1]
-    return 0.5 * (traces + np.einsum("ki,ij,kj->k", d, inverse, d) - n + log_det[0] - log_det[1:])
+def _divergences(mixture: Mixture, first: IntArray, others: IntArray) -> FloatArray:
+    """Kullback and Leibler's divergences (m,) of source and motion of some components from others, pair by pair."""
+    if not first.size:
+        return np.zeros(0)
+    n, about, chart = mixture.n_motion, mixture.chart.take(first), mixture.chart.take(others)
+    d, unit = about.coordinates(chart.x), root_of(mixture.S[first, :n])
+    # In units of the first ones' standard deviations.
+    of_others = chart.jacobian(np.zeros_like(d)) @ mixture.S[others, :n]
+    roots = np.linalg.solve(about.jacobian(d) @ unit, of_others)
+    e = np.linalg.solve(unit, d[..., None])[..., 0]
+    log_det = np.linalg.slogdet(roots @ np.swapaxes(roots, -1, -2))[1]
+    return np.asarray(0.5 * (np.sum(roots**2, axis=(1, 2)) + np.sum(e**2, axis=1) - n - log_det))

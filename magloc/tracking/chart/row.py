@@ -7,8 +7,10 @@ from functools import cached_property
 
 import numpy as np
 
+from arrays.array import SensorArray
 from arrays.differences import Differences
-from arrays.typing import FloatArray
+from arrays.typing import FloatArray, IntArray
+from magloc import core
 from magloc.chi_square import energy_threshold
 from magloc.measurement.differences import DifferenceMeasurement
 from magloc.measurement.pose import N_POSE, ArrayPose
@@ -16,6 +18,66 @@ from magloc.tracking.chart.coordinates import Chart
 from magloc.tracking.measurement import RowMeasurement, whitening
 from magloc.tracking.motion import N_SOURCE
 from magloc.tracking.results import Row
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Rows of an array's readings.
+
+    Attributes
+    ----------
+    array : SensorArray
+    readings : ndarray, shape (n, k)
+        Differences in units of their noise, zero behind the last one of a row.
+    counts : ndarray of int, shape (n,)
+        Number of differences of each row.
+    transforms, transform_of_row : ndarray, shapes (m, k, n_channels) and (n,)
+        From channels to differences.
+    effects : ndarray, shape (n, k, n_nuisances)
+        Of nuisances on them.
+    origins_m, rotations : ndarray, shapes (n, 3) and (n, 3, 3)
+        Pose of the array.
+    ambients_T : ndarray, shape (n or 1, n_sensors, 3)
+        Field at the sensors without a source.
+    """
+
+    array: SensorArray
+    readings: FloatArray
+    counts: IntArray
+    transforms: FloatArray
+    transform_of_row: IntArray
+    effects: FloatArray
+    origins_m: FloatArray
+    rotations: FloatArray
+    ambients_T: FloatArray
+
+    @cached_property
+    def problem(self) -> core.Problem:
+        """Return the arguments of kernels."""
+        array, order = self.array, np.arange(len(self.readings))
+        return core.problem(
+            "rows",
+            n_sensors=array.n_sensors,
+            n_channels=array.n_channels,
+            n_readings=self.readings.shape[1],
+            n_nuisances=self.effects.shape[2],
+            sensors=array.positions,
+            array_centroid=tuple(array.centroid),
+            radius=array.circumradius,
+            sensor=np.ascontiguousarray(array.channel_sensor, dtype=np.int64),
+            gain=array.channel_gain,
+            is_modulus=array.channel_is_scalar.astype(np.uint8),
+            readings=np.ascontiguousarray(self.readings),
+            counts=np.ascontiguousarray(self.counts, dtype=np.int64),
+            transforms=np.ascontiguousarray(self.transforms),
+            transform_of_row=np.ascontiguousarray(self.transform_of_row, dtype=np.int64),
+            effects=np.ascontiguousarray(self.effects),
+            effect_of_row=order,
+            origins=np.ascontiguousarray(self.origins_m),
+            rotations=np.ascontiguousarray(self.rotations),
+            ambients=np.ascontiguousarray(self.ambients_T),
+            ambient_of_row=order if len(self.ambients_T) > 1 else np.zeros_like(order),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +156,15 @@ class ChartRow:
     def radius_m(self) -> float:
         """Largest distance of a sensor from it."""
         return self.model.array.circumradius
+
+    @cached_property
+    def compiled(self) -> Rows:
+        """The row as kernels take it, without errors of the pose."""
+        model, one = self.model, np.zeros(1, dtype=np.int64)
+        transform = model.differences.transform / self.sigma[:, None]
+        ambient, count = model.array.ambient_fields, np.array([self.n_differences])
+        pose = self.row.origin_m[None], self.row.R_world_from_array[None]
+        return Rows(model.array, self.z[None], count, transform[None], one, self.effect[None], *pose, ambient[None])
 
     def chart(self, x: FloatArray) -> Chart:
         """About states (..., n)."""

@@ -9,9 +9,9 @@ component remembers, it adds up to
 
 .. math:: \beta = \frac{|c|}{1 + |g|^2} \sqrt{\min(\max(|g|^{-2}, 1), n)}
 
-standard deviations of the readings' noise. A component with :math:`\beta > \tfrac12` becomes three along that axis, which have
-the same mean and covariance together. The update's bent prediction (:mod:`magloc.tracking.chart.update`) treats what is
-less: a division approximates a Gaussian, so that many divisions lose more than they gain.
+standard deviations of the readings' noise. A component with :math:`\beta > \tfrac12` becomes three along that axis,
+which have the same mean and covariance together. The update's bent prediction (:mod:`magloc.tracking.chart.update`)
+treats what is less: a division approximates a Gaussian, so that many divisions lose more than they gain.
 """
 
 from __future__ import annotations
@@ -21,8 +21,10 @@ from dataclasses import replace
 import numpy as np
 
 from arrays.typing import FloatArray, IntArray
+from magloc.tracking import row_filter
 from magloc.tracking.chart.mixture import Mixture, block_root
 from magloc.tracking.chart.row import ChartRow
+from magloc.tracking.row_filter import Gaussians
 
 LARGEST_BEND = 0.5
 """Bend of the readings over a component, in standard deviations of their noise, beyond which it is divided."""
@@ -51,8 +53,7 @@ def split(mixture: Mixture, row: ChartRow) -> tuple[Mixture, IntArray]:
     """
     origin = np.arange(len(mixture))
     for _ in range(_MOST_ROUNDS):
-        with np.errstate(all="ignore"):  # a wide component may reach beyond all numbers
-            bend, axes = bends(mixture, row)
+        bend, directions = bends(mixture, row)
         worst = np.argmax(bend, axis=1)
         divided = (np.max(bend, axis=1) > LARGEST_BEND) & (mixture.log_weight > mixture.log_weight.max() + _LIGHT)
         index = np.flatnonzero(divided)
@@ -60,28 +61,24 @@ def split(mixture: Mixture, row: ChartRow) -> tuple[Mixture, IntArray]:
         index = index[: max(0, (MOST_COMPONENTS - len(mixture)) // 2)]
         if not index.size:
             break
-        mixture = _divided(mixture, index, axes[index, worst[index]])
+        mixture = _divided(mixture, index, directions[index, worst[index]])
         origin = np.concatenate([np.delete(origin, index), np.tile(origin[index], len(_WEIGHTS))])
     return mixture, origin
 
 
 def bends(mixture: Mixture, row: ChartRow) -> tuple[FloatArray, FloatArray]:
-    """Return the bends (K, 3) of a row's readings, and the axes (K, 3, N) in standard numbers that they are along."""
-    n, K = mixture.n_motion, len(mixture)
-    _, _, axes = np.linalg.svd(mixture.S[:, :3], full_matrices=False)
-    steps = (axes @ np.swapaxes(mixture.S[:, :n], -1, -2)).reshape(-1, n)
-    chart = mixture.chart.firmly(mixture.S[:, :n]).take(np.repeat(np.arange(K), 3))
-    plus, minus = (row.of_source(chart.retracted(sign * steps)).reshape(K, 3, -1) for sign in (1.0, -1.0))
-    odd = 0.25 * np.sum((plus - minus) ** 2, axis=-1)
-    even = np.sum((0.5 * (plus + minus) - row.of_source(mixture.x[:, :n])[:, None]) ** 2, axis=-1)
-    bend = np.sqrt(even * np.clip(1.0 / odd, 1.0, min(mixture.n_rows, MOST_ROWS))) / (1.0 + odd)
-    return np.where(np.isfinite(bend), bend, 0.0), axes
+    """Return the bends (K, 3) of a row's readings, and one standard deviation (K, 3, N) along each axis."""
+    gaussians, memory = Gaussians(mixture.x, mixture.S), min(mixture.n_rows, MOST_ROWS)
+    bend, directions = row_filter.bends(gaussians, row.compiled, memory)
+    # A wide component may reach beyond all numbers.
+    return np.where(np.isfinite(bend), bend, 0.0), directions
 
 
-def _divided(mixture: Mixture, index: IntArray, axis: FloatArray) -> Mixture:
-    """Replace some components by three each, along axes (k, N) in their standard numbers."""
+def _divided(mixture: Mixture, index: IntArray, v: FloatArray) -> Mixture:
+    """Replace some components by three each, along principal axes of log-range and direction, one σ (k, N) long."""
     n, S, kept = mixture.n_motion, mixture.S[index], np.delete(np.arange(len(mixture)), index)
-    v = (S @ axis[..., None])[..., 0]
+    # In standard numbers v is a unit vector.
+    axis = (v[:, None, :3] @ S[:, :3])[:, 0] / np.sum(v[:, :3] ** 2, axis=1, keepdims=True)
     narrow = S - (1.0 - _SIGMA) * v[:, :, None] * axis[:, None, :]
     chart = mixture.chart.take(index).firmly(S[:, :n])
     x, roots, log_weight = [mixture.x[kept]], [mixture.S[kept]], [mixture.log_weight[kept]]

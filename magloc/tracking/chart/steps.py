@@ -2,7 +2,8 @@
 
 The first row that shows a source makes a mixture (:mod:`magloc.tracking.chart.start`); every later one moves its
 components, divides those over which the readings bend (:mod:`magloc.tracking.chart.split`), updates them
-(:mod:`magloc.tracking.chart.update`) and merges those that are one.
+(:mod:`magloc.tracking.chart.update`) and merges those that are one. Where neither sensors nor pose have lasting errors,
+:mod:`magloc.tracking.row_filter` does so, compiled.
 
 Behind the states of the motion stand the errors of the array's pose, and behind them those of its sensors. Where there
 are such lasting errors, a row leaves many numbers open in curved valleys, which would take more components than can be
@@ -25,6 +26,7 @@ from magloc.levels import CONTRADICTION
 from magloc.localization.fit.prior import SourcePrior
 from magloc.measurement.nuisances import SensorErrors
 from magloc.measurement.pose import PoseErrors
+from magloc.tracking import row_filter
 from magloc.tracking.chart.coordinates import mirrored
 from magloc.tracking.chart.known_moment import UNIFORM_IN_SPACE, KnownInWorld
 from magloc.tracking.chart.mixture import Mixture, block_root, root_of
@@ -34,8 +36,9 @@ from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.chart.split import split
 from magloc.tracking.chart.stack import Stack
 from magloc.tracking.chart.start import NO_DIPOLE, OF_PITCH, Start, once, with_errors
-from magloc.tracking.chart.update import Move, predicted_root, updated
+from magloc.tracking.chart.update import Move, Updated, predicted_root, updated
 from magloc.tracking.motion import N_SOURCE, MotionModel
+from magloc.tracking.row_filter import Gaussians, RowUpdates, steps_problem
 from magloc.tracking.sensor_health import OFFSETS, Misfits
 
 LARGEST_GROWTH = 1.5
@@ -91,6 +94,11 @@ class Known:
     young: tuple[tuple[ChartRow, MotionModel], ...] = ()
     next_refit: int = FIRST_REFIT
     nis: float = 0.0
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether the track is no longer young, and of one place."""
+        return not self.young and len(self.mixture) == 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,6 +169,10 @@ class ChartFilter:
 
     def predicted(self, mixture: Mixture, motion: MotionModel, dt_s: float, row: ChartRow) -> Mixture:
         """What is known after a time without readings, as seen from a row's array."""
+        if not self.has_lasting_errors:
+            step = steps_problem(motion, [dt_s], np.zeros(1, dtype=np.int64), states=mixture.x)
+            found = row_filter.predict(Gaussians(mixture.x, mixture.S), mixture.centroid_m, step, row.compiled)
+            return replace(mixture, x=found.x, S=found.S, centroid_m=row.centroid_m)
         n, posed = mixture.n_motion, self._posed(motion)
         steps = [posed.step(x, dt_s) for x in mixture.x[:, :n]]
         kept, added = self.errors.step(dt_s)
@@ -176,11 +188,14 @@ class ChartFilter:
         sigma, sigma_before = (np.linalg.norm(m.S[:, :N_SOURCE], axis=2) for m in (predicted, before))
         k = row.z.size
         bends = (sigma <= LARGEST_GROWTH * sigma_before).all(axis=1) & (k >= self.n_differences)
-        if not self.has_lasting_errors:
+        after: Updated | RowUpdates
+        if self.has_lasting_errors:
+            lasting = row.with_lasting_errors(self.pose_errors.step(dt_s)[0] ** 2)
+            after = updated(predicted.x, predicted.S, row, bends, lasting)
+        else:
             predicted, origin = split(predicted, row)
-            bends = bends[origin]
-        lasting = row.with_lasting_errors(self.pose_errors.step(dt_s)[0] ** 2)
-        after = updated(predicted.x, predicted.S, row, bends, lasting)
+            gaussians = Gaussians(predicted.x, predicted.S)
+            after = row_filter.update(gaussians, row.compiled, bends=bends[origin], innovation=True)
         sound = after.converged & np.isfinite(after.log_evidence)
         if not np.where(sound, after.nis, np.inf).min() <= chdtri(k, CONTRADICTION):
             best = int(np.argmin(after.nis))

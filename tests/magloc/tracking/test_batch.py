@@ -16,7 +16,7 @@ from arrays.array import SensorArray
 from magloc.readings import Readings
 from magloc.tracking import batch
 from magloc.tracking.batch import track_record
-from magloc.tracking.motion import MotionModel, OrnsteinUhlenbeck, RandomWalk
+from magloc.tracking.motion import CoordinatedTurn, MotionModel, OrnsteinUhlenbeck, RandomWalk
 from magloc.tracking.results import Row, TrackPoint, rows_of
 from magloc.tracking.tracker import Tracker
 from magloc.tracking.whole_records.smoother import smoothed
@@ -125,6 +125,22 @@ class TestCompiledRecord:
         points = track_record(Tracker(ARRAY, SLOW), rows_from(time_s, readings_of(ARRAY, p, m)))
         assert (len(points), len(readable) <= 6) == (60, True)
 
+    def test_rows_that_bend_are_stepped_in_python(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        time_s, p, m = moving_source(20)
+        rows = rows_from(time_s, readings_of(ARRAY, p, m))
+        expected = followed(Tracker(ARRAY, SLOW), rows)
+        readable: list[float] = []
+        update = Tracker.update
+
+        def counted(tracker: Tracker, row: Row) -> TrackPoint:
+            readable.append(row.time_s)
+            return update(tracker, row)
+
+        monkeypatch.setattr(Tracker, "update", counted)
+        monkeypatch.setattr(batch, "LARGEST_BEND", 0.0)
+        assert_same_points(track_record(Tracker(ARRAY, SLOW), rows), expected)
+        assert len(readable) == 20
+
     def test_a_row_that_is_not_later_than_the_piece_before(self) -> None:
         time_s, p, m = moving_source(30)
         rows = rows_from(time_s, readings_of(ARRAY, p, m))
@@ -231,7 +247,7 @@ class TestCompiledRecord:
         n = 80
         p, m = np.tile([5.0, 0.0, 0.306], (n, 1)), np.tile([100.0, 0.0, 0.0], (n, 1))
         rows = rows_from(np.arange(float(n)), readings_of(array, p, m, seed=int(rng.integers(1000))))
-        motion = RandomWalk(0.02, 0.01)
+        motion = RandomWalk(0.1, 0.05)
         readable, compiled = followed(Tracker(array, motion), rows), track_record(Tracker(array, motion), rows)
         assert_same_points(compiled, readable)
         assert [point.iterations for point in compiled] == [point.iterations for point in readable]
@@ -244,9 +260,15 @@ class TestCompiledRecord:
         points = self.both(array, SLOW, rows_from(time_s, readings_of(ARRAY, p, m)))
         assert statuses(points).count("tracked") == 19
 
+    @all_instruction_sets
+    def test_a_lasting_rate_of_turn(self) -> None:
+        time_s, p, m = moving_source(60)
+        points = self.both(ARRAY, OrnsteinUhlenbeck(0.1, 0.02), rows_from(time_s, readings_of(ARRAY, p, m)))
+        assert statuses(points).count("tracked") == 59
+
     def test_other_motions_take_the_readable_path(self) -> None:
         time_s, p, m = moving_source(20)
-        points = self.both(ARRAY, OrnsteinUhlenbeck(0.1, 0.02), rows_from(time_s, readings_of(ARRAY, p, m)))
+        points = self.both(ARRAY, CoordinatedTurn(0.1, 0.1), rows_from(time_s, readings_of(ARRAY, p, m)))
         assert statuses(points).count("tracked") == 19
 
     def test_no_rows(self) -> None:

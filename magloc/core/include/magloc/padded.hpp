@@ -2,6 +2,7 @@
 // is never used.
 #pragma once
 #include "kernel.hpp"
+#include "linear.hpp"
 
 MAGLOC_BEGIN
 // Numbers at equal steps in memory, such as a column of a matrix, with a sign.
@@ -123,6 +124,39 @@ void solve(const Padded<T> &root, int64_t n, double *b) {
   for (int64_t i = n; i-- > 0;) {
     for (int64_t j = i + 1; j < n; ++j) b[i] -= root[i][j] * b[j];
     b[i] /= root[i][i];
+  }
+}
+
+// Take the shares of a unit vector out of m rows.
+template <int m, class T>
+MAGLOC_INLINE void project(const T *unit, T *rows, int64_t width, double *shares) {
+  T sum[m] = {};
+  for (int64_t r = 0; r < width; ++r) {
+    MAGLOC_UNROLL
+    for (int i = 0; i < m; ++i) sum[i] += unit[r] * rows[i * width + r];
+  }
+  for (int i = 0; i < m; ++i) shares[i] = sum_of_lanes(sum[i]);
+  for (int64_t r = 0; r < width; ++r) {
+    MAGLOC_UNROLL
+    for (int i = 0; i < m; ++i) rows[i * width + r] -= shares[i] * unit[r];
+  }
+}
+
+// Gram and Schmidt's modified method on rows of which the first n_done are orthonormal. The upper triangle becomes R
+// with rows = R^T times the orthonormal rows; a row of zeros remains. R is as good as Householder's.
+template <class T>
+void triangularise(const Padded<T> &rows, int64_t n, const Padded<T> &triangle, int64_t n_done = 0) {
+  const int64_t width = rows.width();
+  for (int64_t j = 0; j < n; ++j) {
+    T *const unit = rows.lanes(j);
+    if (j >= n_done) {
+      const double norm = square_root(dot(unit, unit, width));
+      triangle[j][j] = norm;
+      scale(unit, norm > 0.0 ? 1.0 / norm : 0.0, width);
+    }
+    int64_t k = j < n_done ? n_done : j + 1;
+    for (; k + 4 <= n; k += 4) project<4>(unit, rows.lanes(k), width, triangle[j] + k);
+    for (; k < n; ++k) project<1>(unit, rows.lanes(k), width, triangle[j] + k);
   }
 }
 
