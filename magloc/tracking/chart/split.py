@@ -9,7 +9,7 @@ component remembers, it adds up to
 
 .. math:: \beta = \frac{|c|}{1 + |g|^2} \sqrt{\min(\max(|g|^{-2}, 1), n)}
 
-standard deviations of the readings' noise. A component with :math:`\beta > \tfrac12` becomes three along that axis,
+standard deviations of the readings' noise. A component with :math:`\beta > 1` becomes three along that axis,
 which have the same mean and covariance together. The update's bent prediction (:mod:`magloc.tracking.chart.update`)
 treats what is less: a division approximates a Gaussian, so that many divisions lose more than they gain.
 """
@@ -26,7 +26,7 @@ from magloc.tracking.chart.mixture import Mixture, block_root
 from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.row_filter import Gaussians
 
-LARGEST_BEND = 0.5
+LARGEST_BEND = 1.0
 """Bend of the readings over a component, in standard deviations of their noise, beyond which it is divided."""
 MOST_COMPONENTS = 80
 """Number of components beyond which none is divided."""
