@@ -9,9 +9,9 @@ component remembers, it adds up to
 
 .. math:: \beta = \frac{|c|}{1 + |g|^2} \sqrt{\min(\max(|g|^{-2}, 1), n)}
 
-standard deviations of the readings' noise. A component with :math:`\beta > 1` becomes three along that axis,
+standard deviations of the readings' noise. A component with :math:`\beta > \tfrac12` becomes three along that axis,
 which have the same mean and covariance together. The update's bent prediction (:mod:`magloc.tracking.chart.update`)
-treats what is less: a division approximates a Gaussian, so that many divisions lose more than they gain.
+treats what is less. A division approximates a Gaussian, so that needless ones lose accuracy.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from magloc.tracking.chart.mixture import Mixture, block_root
 from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.row_filter import Gaussians
 
-LARGEST_BEND = 1.0
+LARGEST_BEND = 0.5
 """Bend of the readings over a component, in standard deviations of their noise, beyond which it is divided."""
 MOST_COMPONENTS = 80
 """Number of components beyond which none is divided."""
 MOST_ROWS = 400
 """Number of rows that a component remembers at most."""
-# Weights and standard deviation of three normal densities that approximate one (DeMars, Bishop and Jah, 2013), and means
-# that keep its variance.
+# Weights and standard deviation of three normal densities that approximate one (DeMars and others, 2013). The means
+# keep its variance.
 _WEIGHTS, _SIGMA = np.array([0.2252246, 0.5495508, 0.2252246]), 0.6715662
 _MEANS = np.sqrt((1.0 - _SIGMA**2) / (2.0 * _WEIGHTS[0])) * np.array([-1.0, 0.0, 1.0])
 # Logarithm of a weight, against the heaviest one, below which a component is not divided.
