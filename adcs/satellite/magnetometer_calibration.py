@@ -41,6 +41,7 @@ OUTLIER = 5.0
 _ITERATIONS, _ROUNDS, _DECIMATED, _SETTLED, _FEWEST = 60, 10, 1000, 1e-4, 20
 _KNOT_S, _SHIFTS_S = 10.0, 15.0
 """Between instants at which the field is computed, and between shifts that are tried: it changes over minutes."""
+_LONGEST_SHIFT_S = 3600.0  # the field is computed along the orbit three times as far, before and after
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ class MagnetometerPrior:
     Raises
     ------
     ValueError
-        A number is not positive; the model's error and the shift may be zero.
+        A number is not positive; the model's error and the shift may be zero. Or the shift is more than an hour.
 
     Examples
     --------
@@ -84,6 +85,10 @@ class MagnetometerPrior:
         may_be_zero = ("field_error_T", "time_shift_s")
         check_not_negative(**{name: own[name] for name in may_be_zero})
         check_positive(**{name: value for name, value in own.items() if name not in may_be_zero})
+        if self.time_shift_s > _LONGEST_SHIFT_S:
+            raise ValueError(
+                f"Input time_shift_s must be at most {_LONGEST_SHIFT_S:g} s; instead received {self.time_shift_s:g}."
+            )
 
     @property
     def deviations(self) -> FloatArray:

@@ -8,13 +8,18 @@ from typing import Annotated
 from cyclopts import Parameter, Token
 from cyclopts.validators import Number
 
+_TOO_LARGE = 10**18
+
 
 def whole_number(_: type, tokens: Sequence[Token]) -> int:
-    """Convert one argument; cyclopts alone would round 1.5."""
+    """Convert one argument; cyclopts alone would round 1.5, and pass what no float or int64 can hold."""
     try:
-        return int(tokens[0].value)
+        number = int(tokens[0].value)
+        if abs(number) < _TOO_LARGE:
+            return number
     except ValueError:
-        raise ValueError(f"found {tokens[0].value!r}, expected a whole number.") from None
+        pass
+    raise ValueError(f"found {tokens[0].value!r}, expected a whole number of at most 18 digits.")
 
 
 Flag = Annotated[bool, Parameter(show_default=False)]

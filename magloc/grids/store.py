@@ -163,7 +163,10 @@ def open_map(path: str | os.PathLike[str]) -> xr.Dataset:
 
     with warnings.catch_warnings():
         warnings.filterwarnings("error", ".*not recognized as a component")  # an array whose description is damaged
-        for name, array in _opened(Path(path)).arrays():
+        group = _opened(Path(path))
+        # One by one: of several that zarr opens at once it retrieves one error, and asyncio prints the others.
+        for name in (folder.name for folder in sorted(Path(path).iterdir()) if folder.is_dir()):
+            array = group[name]
             for file in Path(path, name, "c").rglob("*"):
                 _check_stated_size(array, file)
         dataset = xr.open_zarr(path, chunks=None, consolidated=False)

@@ -8,7 +8,7 @@ from contextlib import chdir, redirect_stdout
 from pathlib import Path
 
 import numpy as np
-from cyclopts import App
+from cyclopts import App, ArgumentCollection
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -266,16 +266,22 @@ moment_Am2 = 100.0
 
 def commands() -> Iterator[tuple[str, list[str]]]:
     """Every command of both programs by name, with the names of its options, as the programs know them."""
+    for name, arguments in parsed_arguments():
+        yield name, [option for one in arguments for option in one.names if option[0] == "-"]
+
+
+def parsed_arguments() -> Iterator[tuple[str, ArgumentCollection]]:
+    """Every command of both programs by name, with its arguments as cyclopts reads them."""
     for program, app in APPS.items():
-        yield from _commands(program, app)
+        yield from _parsed_arguments(program, app)
 
 
-def _commands(name: str, app: App) -> Iterator[tuple[str, list[str]]]:
+def _parsed_arguments(name: str, app: App) -> Iterator[tuple[str, ArgumentCollection]]:
     inner = [key for key in app if not key.startswith("-")]
     for key in inner:
-        yield from _commands(f"{name} {key}", app[key])
+        yield from _parsed_arguments(f"{name} {key}", app[key])
     if app.default_command is not None:
-        yield name, [option for one in app.assemble_argument_collection() for option in one.names if option[0] == "-"]
+        yield name, app.assemble_argument_collection()
 
 
 def write_files(folder: Path) -> None:

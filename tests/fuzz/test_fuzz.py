@@ -5,8 +5,10 @@ from __future__ import annotations
 import random
 
 import pytest
+from cyclopts import Token
 
-from tests.fuzz.cases import LINES, SELDOM, STREAM, commands
+from arrays.io.arguments import whole_number
+from tests.fuzz.cases import LINES, SELDOM, STREAM, commands, parsed_arguments
 from tests.fuzz.extremes import extremes
 from tests.fuzz.runner import Case, extreme_case, judged, read_files, report, run_case, verdict
 
@@ -48,6 +50,17 @@ def test_mangled(chunk, files, tmp_path):
         if wrong:
             found.append(report(seed, case, ended, wrong))
     assert not found, "\n\n".join(found)
+
+
+def test_no_whole_number_is_too_large():
+    """For a float, an int64 or a file: the converter refuses it, whatever the option."""
+    for command, arguments in parsed_arguments():
+        whole = [one for one in arguments if one.hint in (int, int | None)]
+        assert all(one.parameter.converter is whole_number for one in whole), command
+    assert whole_number(int, [Token(value="-999_999_999_999_999_999")]) == 1 - 10**18
+    for digits in (19, 400, 4400):
+        with pytest.raises(ValueError, match=r"found '9+', expected a whole number of at most 18 digits"):
+            whole_number(int, [Token(value="9" * digits)])
 
 
 @pytest.mark.parametrize(

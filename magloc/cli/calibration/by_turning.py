@@ -91,7 +91,7 @@ def overflow(readings_T: FloatArray) -> str:
     if not n:
         return ""
     return (
-        f". {n} of {size.size} readings are beyond {1e9 * most:.3g} nT, unlike all others: leave overflow values and"
+        f". {n} of {size.size} readings are beyond {1e9 * most:.3g} nT: leave overflow values and"
         " dummies empty, or state saturation_nT"
     )
 

@@ -161,7 +161,7 @@ def _check_converged(result: SourceCalibration, readings: Path, out: Path) -> No
     if not result.converged:
         raise InputError(
             f"{readings}: the calibration did not converge within {result.iterations} iterations "
-            f"(χ² {result.chi2:.4g}), expected readings that agree with the array file, its noise and its priors"
+            f"(χ² {result.chi2:.4g}), expected readings that fit the array file and its noise"
             f"{overflow(result.readings_T)}; {out} is not written."
         )
 

@@ -24,6 +24,7 @@ from magloc.surveying.fit.record import SurveyRecord
 OFFSET_T = 1e-6
 """Standard deviation of what a sensor's offset may be at first."""
 _HOUR_S = 3600.0
+_LONGEST_GAP_S = _HOUR_S  # nothing is left of what was known of the ambient field; more would cost digits alone
 
 
 @dataclass(frozen=True)
@@ -108,7 +109,8 @@ class Whitening:
         added[1:, :q] = 1.0 - kept[1:, :q] ** 2
         kept[0] = 1.0
         walk = np.array([sensor.drift_T_rth**2 / _HOUR_S for sensor in record.array.sensors]) + drift.sensor_T2_s
-        added[:, q : q + C] = dt_s[:, None] * walk[record.array.channel_sensor]
+        added[:, q : q + C] = np.minimum(dt_s[:, None] * walk[record.array.channel_sensor], OFFSET_T**2)
+        dt_s = np.minimum(dt_s, _LONGEST_GAP_S)
         added[:, -2], added[:, -1] = drift.common_T2_s3 * dt_s**3 / 3.0, drift.common_T2_s3 * dt_s
         start = np.concatenate([np.ones(q), np.full(C, OFFSET_T**2), [OFFSET_T**2, (1e-2 * OFFSET_T) ** 2]])
         return cls(U, group, WhiteningFilter(H, kept, added, dt_s, start))

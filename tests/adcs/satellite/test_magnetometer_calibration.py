@@ -196,7 +196,9 @@ class TestRows:
         with pytest.raises(ValueError, match="10 rows of the magnetometer that fit each other, expected 20 or more"):
             calibrate_magnetometer(log, satellite)
 
-    @pytest.mark.parametrize("bad", [{"noise_T": 0.0}, {"gain": -1.0}, {"time_shift_s": math.nan}])
+    @pytest.mark.parametrize(
+        "bad", [{"noise_T": 0.0}, {"gain": -1.0}, {"time_shift_s": math.nan}, {"time_shift_s": 1e308}]
+    )
     def test_bad_prior(self, bad: dict[str, float]) -> None:
         with pytest.raises(ValueError, match=f"Input {next(iter(bad))} must be"):
             MagnetometerPrior(**bad)

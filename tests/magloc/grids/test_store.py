@@ -9,6 +9,7 @@
 
 from __future__ import annotations
 
+import gc
 import itertools
 import json
 import os
@@ -320,6 +321,16 @@ class TestRefused:
         (tmp_path / "map.zarr/height/zarr.json").unlink()
         with pytest.raises(InputError, match="a part is missing"):
             Sweep(waves, tmp_path / "map.zarr")
+
+    def test_parts_that_are_missing_are_told_once(self, waves, tmp_path, caplog):
+        """Tasks that fail beside the first one say nothing when they are collected."""
+        run(waves, tmp_path / "map.zarr")
+        for file in (tmp_path / "map.zarr").glob("*/zarr.json"):
+            file.unlink()
+        with pytest.raises(KeyError):
+            open_map(tmp_path / "map.zarr")
+        gc.collect()
+        assert not caplog.text
 
     @pytest.mark.skipif(sys.platform == "win32", reason="there are no devices in folders")
     @pytest.mark.parametrize("name", ["height/c/0/0/0", "x/zarr.json"])

@@ -142,6 +142,12 @@ class TestHostileWorld:
         assert len(found) == 2
         assert found.lag_s == pytest.approx(lag_s, abs=0.02)  # five standard deviations
 
+    def test_a_clock_that_leaps(self, caplog: pytest.LogCaptureFixture) -> None:
+        """From the time since the start to that since 1970: nothing is known of the ambient field after the leap."""
+        readings = simulated("survey-drone", 901).readings
+        time_s = readings.time_s + np.where(np.arange(len(readings)) < len(readings) // 2, 0.0, 1.7e9)
+        assert len(self.check(replace(readings, time_s=time_s), caplog, "")) == 2
+
     @pytest.mark.parametrize("since", [0, 500])
     def test_a_sensor_that_sticks(self, since: int, caplog: pytest.LogCaptureFixture) -> None:
         readings = simulated("survey-drone", 901).readings
