@@ -73,7 +73,7 @@ class Table:
 
     def place(self, row: int, column: str) -> str:
         """Where a cell is, for the start of an error's sentence."""
-        return f"{self.row_place(row)}, column {column}"
+        return f"{self.row_place(row)}, column {_clipped(column)}"
 
     @cached_property
     def _index(self) -> dict[str, int]:
@@ -82,15 +82,16 @@ class Table:
     def header_place(self, column: str) -> str:
         """Where a column's name is, or should be, for the start of an error's sentence."""
         line = "" if self.header_line is None else f", line {self.header_line}"
-        return f"{self.path}{line}, column {column}"
+        return f"{self.path}{line}, column {_clipped(column)}"
 
     def require(self, column: str, known: Sequence[str]) -> None:
         """Raise an InputError if a column is missing, with the nearest name in the file that is not a known one."""
         if column in self.header:
             return
         nearest = difflib.get_close_matches(column, [name for name in self.header if name not in known], n=1)
-        hint = f" (the nearest is {nearest[0]})" if nearest else ""
-        there = ", ".join(self.header if len(self.header) < 9 else [*self.header[:6], "…", self.header[-1]])
+        hint = f" (the nearest is {_clipped(nearest[0])})" if nearest else ""
+        names = self.header if len(self.header) < 9 else [*self.header[:6], "…", self.header[-1]]
+        there = ", ".join(_clipped(name) for name in names)
         raise InputError(f"{self.header_place(column)}: found no such column{hint}, expected it beside {there}.")
 
     def refuse_unknown(self, known: Sequence[str]) -> None:
@@ -201,7 +202,9 @@ def table_of_columns(columns: Columns, name: str) -> Table:
         try:
             values.append((seconds if str(column).startswith("time") else numbers)(columns[column]))
         except (TypeError, ValueError):
-            raise InputError(f"{name}, column {column}: found what is not a number, expected numbers.") from None
+            raise InputError(
+                f"{name}, column {_clipped(column)}: found what is not a number, expected numbers."
+            ) from None
     shapes = {column.shape for column in values}
     if len(shapes) != 1 or len(*shapes) != 1 or shapes == {(0,)}:
         raise InputError(f"{name}: found columns of the shapes {sorted(shapes)}, expected one length, 1 or more.")
@@ -327,7 +330,7 @@ def _checked_header(place: str, cells: Sequence[str], expected: str, separator: 
             found = f"{name!r} in place of a name" if name else "no name"
             raise InputError(f"{place}, column {position}: found {found}, expected {expected}.")
         if name in seen:
-            raise InputError(f"{place}, column {name}: found a second time, expected once.")
+            raise InputError(f"{place}, column {_clipped(name)}: found a second time, expected once.")
         seen.add(name)
     return header
 
@@ -344,7 +347,9 @@ def _careful_numbers(place: str, header: Sequence[str], cells: Sequence[str], du
                 found_numbers.append(DUMMY if word in _DUMMY_WORDS or word in dummy else _number(cell))
         except ValueError:
             found = repr(cell.strip()[:_SHOWN_CHARACTERS])
-            raise InputError(f"{place}, column {name}: found {found}, expected a number or an empty cell.") from None
+            raise InputError(
+                f"{place}, column {_clipped(name)}: found {found}, expected a number or an empty cell."
+            ) from None
     return found_numbers
 
 
@@ -416,6 +421,11 @@ class GrowingTable:
                 self._file.write("\n".join([*rows, ""]).encode())
         except OSError as error:
             raise OSError(error.errno, error.strerror, str(self._path)) from None
+
+
+def _clipped(name: str) -> str:
+    """Shorten a column's name for a sentence: a header of another separator is one long name."""
+    return name if len(name) <= _SHOWN_CHARACTERS else f"{name[: _SHOWN_CHARACTERS - 1]}…"
 
 
 def _cell(value: object) -> str:

@@ -23,6 +23,8 @@ _LOG = logging.getLogger(__name__)
 _OUTLIER = 5.0
 _MAD_TO_SIGMA = 1.4826
 _TOO_NOISY = 3.0
+# Scatter of a rest that no field at rest has: twenty times the Earth's.
+_LARGEST_SCATTER_T = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +49,13 @@ class Background:
 
     @classmethod
     def of(cls, array: SensorArray, rows: Sequence[Row]) -> Background:
-        """Of the rows of a rest; readings far from their channel's median do not count."""
+        """Return the background of the rows of a rest; readings far from their channel's median do not count.
+
+        Raises
+        ------
+        InputError
+            Readings of a channel scatter by more than a millitesla.
+        """
         values = np.array([row.readings_T for row in rows])
         stated = np.array([sensor.noise_T for sensor in array.sensors])[array.channel_sensor]
         known = np.isfinite(values)
@@ -58,6 +66,13 @@ class Background:
             count = used.sum(axis=0)
             mean = np.where(used, values, 0.0).sum(axis=0) / count
             sigma = scatter / np.sqrt(count)
+        wild = (scatter > _LARGEST_SCATTER_T) & (scatter > stated)
+        if wild.any():
+            channel = int(np.argmax(wild))
+            raise InputError(
+                f"a rest: found readings of {array.ids[array.channel_sensor[channel]]} that scatter by"
+                f" {1e9 * scatter[channel]:.3g} nT, expected an array at rest; leave wild readings empty."
+            )
         noisy = scatter > _TOO_NOISY * stated
         restless = tuple(name for i, name in enumerate(array.ids) if noisy[array.channel_sensor == i].any())
         _LOG.info(f"the background is taken from {len(rows)} rows")

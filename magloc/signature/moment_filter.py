@@ -16,6 +16,7 @@ from functools import cached_property
 import numpy as np
 from scipy.special import chdtri
 
+from arrays.io.errors import InputError
 from arrays.typing import BoolArray, FloatArray
 from magloc.kalman import (
     IteratedUpdate,
@@ -43,7 +44,7 @@ _MOST_PASSES = 20
 _SETTLED = 1e-2
 
 
-_OVERFLOW = "Input readings must be of a size that double precision squares; instead the filter's covariance overflows."
+_OVERFLOW = "the readings: found values whose squares exceed double precision, expected fields in the unit of the file."
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,7 +237,7 @@ def filtered(model: MomentModel, *, at: Sequence[FloatArray] | None = None, gate
             continue
         contradictions = 0
         if not np.isfinite(update.S).all():
-            raise ValueError(_OVERFLOW)
+            raise InputError(_OVERFLOW)
         steps.append(MomentStep(x, S, update.x, update.S, F, S_q, update.nis, status, update.iterations))
         x, S = update.x, update.S
     return steps

@@ -17,6 +17,7 @@ from magloc.kalman import estimability
 from magloc.localization.fit.results import is_misfit
 from magloc.measurement.nuisances import Drift
 from magloc.measurement.plausibility import usable_readings
+from magloc.measurement.rows import check_magnitudes
 from magloc.navigation.rotations import cross_matrix, rotation_matrix
 from magloc.readings import Readings
 from magloc.signature.moment_filter import (
@@ -328,6 +329,7 @@ def moment_model(
     turn_rad_s: float,
 ) -> MomentModel:
     """Model of records that follow each other in time, each with places (n, K, 3) of its own."""
+    check_magnitudes(array)
     background = Drift.of(passes[0].background, np.concatenate([of_pass.time_s for of_pass in passes]))
     measurements = RowMeasurements(array, N_SOURCE, background)
     rows = tuple(measurements.of(row) for of_pass in passes for row in rows_of(of_pass))

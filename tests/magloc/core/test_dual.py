@@ -88,13 +88,13 @@ class TestDual:
         pointers = [ctypes.c_void_p(one.ctypes.data) for one in (points, moments, *found)]
         library.derivatives(*pointers[:2], len(points), *pointers[2:])
         b, dual, analytic, alone = found
-        # Relative to the largest field and gradient of such a moment at such a distance.
+        # Thirty roundings of terms up to 15 times the field and gradient of such a moment at such a distance.
         r = np.linalg.norm(points, axis=1)[:, None, None]
         m = np.linalg.norm(moments, axis=1)[:, None, None]
         unit = np.concatenate([np.repeat(m / r**4, 3, axis=2), np.repeat(1.0 / r**3, 3, axis=2)], axis=2)
         jacobian = dipole.field_jacobian(points, np.zeros(3), moments) * ([-1.0] * 3 + [1.0] * 3) / dipole.MU0_OVER_4PI
-        assert (np.abs(dual - analytic) <= 1e-14 * unit).all()
-        assert (np.abs(dual - jacobian) <= 1e-14 * unit).all()
-        assert (np.abs(alone - jacobian[..., :3]) <= 1e-14 * unit[..., :3]).all()
+        assert (np.abs(dual - analytic) <= 1e-13 * unit).all()
+        assert (np.abs(dual - jacobian) <= 1e-13 * unit).all()
+        assert (np.abs(alone - jacobian[..., :3]) <= 1e-13 * unit[..., :3]).all()
         expected = dipole.field(points, np.zeros(3), moments) / dipole.MU0_OVER_4PI
         assert (np.abs(b - expected) <= 4e-15 * (m / r**3)[..., 0]).all()

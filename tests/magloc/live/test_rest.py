@@ -61,6 +61,14 @@ class TestBackground:
         assert Background.of(ARRAY, moved).restless == ("s2",)
         assert Background.of(ARRAY, rows).restless == ()
 
+    def test_readings_that_no_rest_has_are_refused(self) -> None:
+        """A wild value in a rest of two rows would be taken for the sensor's noise."""
+        rows = rows_at_rest(3)[:2]
+        wild = np.zeros(ARRAY.n_channels)
+        wild[4] = 1e5
+        with pytest.raises(InputError, match=r"a rest: found readings of s2 that scatter by .* nT, expected an array"):
+            Background.of(ARRAY, [rows[0], replace(rows[1], readings_T=rows[1].readings_T + wild)])
+
     def test_a_channel_without_readings_stays_without(self) -> None:
         rows = rows_at_rest(4)
         for row in rows:
