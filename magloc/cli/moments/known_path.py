@@ -8,7 +8,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
 from cyclopts import Parameter
 
 from arrays.io.errors import LARGEST, InputError
@@ -90,6 +89,8 @@ def write_moment_tracks(
     found: Sequence[MomentTrack], readings: Path, known: KnownOptions, outputs: TrackOutputs
 ) -> None:
     """Print the moments of one source or of several, and write what is asked for."""
+    import numpy as np
+
     import magloc
     from magloc.tracking.files import json_entry
 

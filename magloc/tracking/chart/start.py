@@ -27,7 +27,7 @@ from magloc.localization.fit.prior import SourcePrior
 from magloc.localization.locator import Locator
 from magloc.measurement.nuisances import SensorErrors
 from magloc.measurement.rows import check_magnitudes, check_spans
-from magloc.tracking.chart.coordinates import MOMENT_POWER, Chart, source_root
+from magloc.tracking.chart.coordinates import MOMENT_POWER, Chart, mirrored, source_root
 from magloc.tracking.chart.known_moment import UNIFORM_IN_SPACE, KnownInWorld
 from magloc.tracking.chart.mixture import DROPPED_BELOW, FARTHEST, NEAREST, Mixture, block_root
 from magloc.tracking.chart.row import ChartRow, where_smooth
@@ -208,11 +208,30 @@ class Start:
         position, moment = [world[chosen]], [moments[chosen]]
         cell = [np.stack([*np.divmod(chosen, _N_DIRECTIONS), np.zeros_like(chosen)], axis=1)]
         if self._locator is not None and measurement.z.size >= N_SOURCE:
+            R = row.R_world_from_array
             for solution in self._locator.fit(row.readings_T, row.ambient_T).solutions:
-                position.append(row.origin_m + row.R_world_from_array @ solution.position_m)
-                moment.append(row.R_world_from_array @ solution.moment_Am2)
+                source = np.concatenate([row.origin_m + R @ solution.position_m, R @ solution.moment_Am2])
+                position.append(source[:3])
+                moment.append(source[3:])
                 cell.append(np.array([-1, -1, 0]))
+                images, of_range = _images(source, measurement)
+                position.append(images[:, :3])
+                moment.append(images[:, 3:])
+                cell.append(np.stack([of_range, np.full_like(of_range, -1), np.zeros_like(of_range)], axis=1))
         return _Seeds(np.vstack(position), np.vstack(moment), np.vstack(cell))
+
+
+def _images(source: FloatArray, measurement: Measured) -> tuple[FloatArray, IntArray]:
+    """Return sources (n, 6) of the gradient tensor of a source, in the cells of range (n,) next to it, and these."""
+    images = mirrored(source[None], measurement.centroid_m)[1:, 0]
+    chart = measurement.chart(images)
+    below = math.floor(math.log(float(chart.length[0]) / measurement.radius_m / NEAREST) / _PITCH)
+    of_range = np.repeat(np.clip([below, below + 1], 0, _N_RANGES - 1), len(images))
+    images, length = np.tile(images, (2, 1)), np.tile(chart.length, 2)
+    r = measurement.radius_m * NEAREST * np.exp(_PITCH * of_range)
+    images[:, :3] = measurement.centroid_m + r[:, None] * np.tile(chart.u, (2, 1))
+    images[:, 3:] *= ((r / length) ** MOMENT_POWER)[:, None]
+    return images, of_range
 
 
 def _components(

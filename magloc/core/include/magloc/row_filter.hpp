@@ -16,7 +16,7 @@ class RowFilter {
   const magloc_sources &p_;
   const magloc_rows &given_;
   Workspace &space_;
-  const int64_t K_ = p_.n_sources, ns_ = p_.n_states, e_ = p_.n_nuisances, seen_ = n_seen * K_, d_ = seen_ + e_;
+  const int64_t K_ = p_.n_sources, ns_ = p_.n_states, e_ = p_.n_nuisances, seen_ = n_measured * K_, d_ = seen_ + e_;
   RowReadings<T> readings_{given_, K_, space_};
   const int64_t k_ = readings_.width();                        // registers that the readings fill
   SourceChart *const charts_ = space_.take<SourceChart>(K_);   // about the mean
@@ -72,11 +72,11 @@ class RowFilter {
   // what is expected from it, in the inner order, are predicted as well.
   void predict(SourceMotion &motion, int64_t step, int64_t item, const double (&centroid_before)[3],
                const Padded<T> &wide, const double *to = nullptr, double *offset = nullptr) {
-    const double zero[max_states] = {};
+    const double zero[max_source_states] = {};
     const int64_t m = motion.n_noise;
     wide.clear(N);
     for (int64_t k = 0; k < K_; ++k) {
-      double *const state = x + ns_ * k, expected[max_states];
+      double *const state = x + ns_ * k, expected[max_source_states];
       SourceChart before(state, ns_, p_.power, centroid_before, given_.radius);
       before.move(zero, there_[0]);
       motion.take(state, step, K_ * item + k);
@@ -85,22 +85,22 @@ class RowFilter {
       const Padded<T> A = transition.from(ns_ * k);
       A.clear(ns_);
       for (int64_t i = 0; i < ns_; ++i) A[i][i] = 1.0;
-      before.to_state(there_[0], A.lanes(0), A.lanes(n_seen), A.width());
+      before.to_state(there_[0], A.lanes(0), A.lanes(n_measured), A.width());
       for (int64_t j = 0; j < A.width(); ++j) {
-        T change[max_states];
+        T change[max_source_states];
         for (int64_t i = 0; i < ns_; ++i) change[i] = A.lanes(i)[j], A.lanes(i)[j] = T{};
         for (int64_t i = 0; i < ns_; ++i)
           for (int64_t c = 0; c < ns_; ++c) A.lanes(i)[j] += motion.F[ns_ * i + c] * change[c];
       }
-      after.to_coordinates(A.lanes(0), A.lanes(n_seen), A.width());
+      after.to_coordinates(A.lanes(0), A.lanes(n_measured), A.width());
       for (int64_t i = 0; i < ns_; ++i)
         __builtin_memcpy(wide[row_of(ns_ * k + i)] + N + m * k, motion.noise + m * i, m * sizeof(double));
-      after.to_coordinates(wide.lanes(n_seen * k), further(wide, k), wide.width());
+      after.to_coordinates(wide.lanes(n_measured * k), further(wide, k), wide.width());
       if (offset) after.fill_coordinates(motion.x, expected);
       for (int64_t i = 0; i < ns_; ++i) {
         T *const row = wide.lanes(row_of(ns_ * k + i));
-        add_rows(row, {A[i]}, root.from(n_seen * k), n_seen);
-        add_rows(row, {A[i] + n_seen}, root.from(row_of(ns_ * k + n_seen)), ns_ - n_seen);
+        add_rows(row, {A[i]}, root.from(n_measured * k), n_measured);
+        add_rows(row, {A[i] + n_measured}, root.from(row_of(ns_ * k + n_measured)), ns_ - n_measured);
         for (int64_t j = 0; offset && j < ns_; ++j) expected[i] += A[i][j] * offset[row_of(ns_ * k + j)];
       }
       for (int64_t i = 0; offset && i < ns_; ++i) offset[row_of(ns_ * k + i)] = expected[i];
@@ -196,10 +196,10 @@ class RowFilter {
     move_to(zeta_);
     condition_root();
     for (int64_t k = 0; k < K_; ++k) {
-      charts_[k].to_state(there_[k], root.lanes(n_seen * k), further(root, k), root.width());
+      charts_[k].to_state(there_[k], root.lanes(n_measured * k), further(root, k), root.width());
       __builtin_memcpy(x + ns_ * k, there_[k].x, ns_ * sizeof(double));
       set_chart(k);
-      charts_[k].to_coordinates(root.lanes(n_seen * k), further(root, k), root.width());
+      charts_[k].to_coordinates(root.lanes(n_measured * k), further(root, k), root.width());
     }
     for (int64_t i = 0; i < e_; ++i) x[N - e_ + i] += e_there_[seen_ + i];
     double sum = 0.0;
@@ -245,7 +245,7 @@ class RowFilter {
     for (int64_t i = 0; i < N; ++i) e_there_[i] = 0.0;
     readings_at(0.0, here);
     for (int64_t k = 0; k < K_; ++k) {
-      fill_principal_axes(n_seen * k);
+      fill_principal_axes(n_measured * k);
       for (int64_t a = 0; a < 3; ++a, ++bends, directions += N) {
         for (int64_t i = 0; i < N; ++i) e_there_[i] = dot(root.lanes(i), rows_.lanes(a), root.width());
         for (int64_t i = 0; i < N; ++i) directions[i] = e_there_[row_of(i)];
@@ -267,13 +267,13 @@ class RowFilter {
   int64_t row_of(int64_t i) const {
     if (i >= N - e_) return seen_ + i - (N - e_);
     const int64_t k = i / ns_, j = i % ns_;
-    return j < n_seen ? n_seen * k + j : d_ + (ns_ - n_seen) * k + j - n_seen;
+    return j < n_measured ? n_measured * k + j : d_ + (ns_ - n_measured) * k + j - n_measured;
   }
   // Which standard number a column of the linearised problem belongs to.
   int64_t zeta_of(int64_t column) const { return column < e_ ? seen_ + column : column - e_; }
 
  private:
-  T *further(const Padded<T> &rows, int64_t k) const { return rows.lanes(d_ + (ns_ - n_seen) * k); }
+  T *further(const Padded<T> &rows, int64_t k) const { return rows.lanes(d_ + (ns_ - n_measured) * k); }
   double *tail(int64_t column) const { return reinterpret_cast<double *>(columns_.lanes(column) + k_); }
 
   void set_chart(int64_t k) {
@@ -282,7 +282,7 @@ class RowFilter {
   }
   void judge(int64_t k) {
     double moment = 0.0;
-    for (int64_t i = 3; i < n_seen; ++i) moment += variance(ns_ * k + i);
+    for (int64_t i = 3; i < n_measured; ++i) moment += variance(ns_ * k + i);
     charts_[k].judge_moment(moment, p_.firm);
   }
 
@@ -324,7 +324,7 @@ class RowFilter {
   }
   void place(double sign) {
     for (int64_t k = 0; k < K_; ++k) {
-      double e[max_states];
+      double e[max_source_states];
       for (int64_t i = 0; i < ns_; ++i) e[i] = sign * e_there_[row_of(ns_ * k + i)];
       charts_[k].move(e, there_[k]);
       readings_.set_source(k, there_[k].x);
@@ -367,7 +367,7 @@ class RowFilter {
       turned_[i][d_] = offset ? offset[i] : 0.0;
     }
     for (int64_t k = 0; k < K_; ++k) {
-      T *rows = turned_.lanes(n_seen * k);
+      T *rows = turned_.lanes(n_measured * k);
       const int64_t width = turned_.width();
       charts_[k].to_state(there_[k], rows, (T *)nullptr, width);
       for (int64_t j = 0; j < 2 * width; ++j) {
@@ -380,7 +380,7 @@ class RowFilter {
       }
     }
     for (int64_t j = 0; j < seen_; ++j) {
-      const int64_t first = j - j % n_seen;  // sources before do not depend on this zeta
+      const int64_t first = j - j % n_measured;  // sources before do not depend on this zeta
       T *const column = columns_.lanes(e_ + j);
       for (int64_t r = 0; r < columns_.width(); ++r) column[r] = T{};
       add_rows(column, turned_.from(first).column(j), readings_.slopes().from(first), seen_ - first);

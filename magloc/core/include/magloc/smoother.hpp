@@ -10,7 +10,7 @@ class Smoother {
   Workspace &space_;
   const magloc_sources &prior_ = *p_.prior;
   const int64_t m_ = p_.n_rows, K_ = prior_.n_sources, ns_ = prior_.n_states, e_ = prior_.n_nuisances, n_ = K_ * ns_;
-  const int64_t N_ = n_ + e_, d_ = n_seen * K_ + e_;
+  const int64_t N_ = n_ + e_, d_ = n_measured * K_ + e_;
   RowFilter<T> filter_{prior_, *p_.rows, space_};
   SourceMotion motion_{*p_.motion, ns_, e_, space_};
   const Padded<T> wide_ = filter_.wide(motion_, space_);
@@ -88,7 +88,7 @@ class Smoother {
 
   void step_back(int64_t row) {
     for (int64_t k = 0; k < K_; ++k) {
-      double after[max_states] = {};
+      double after[max_source_states] = {};
       for (int64_t i = 0; i < ns_; ++i) after[i] = slope_[filter_.row_of(ns_ * k + i)];
       for (int64_t i = 0; i < ns_; ++i) {
         double &before = slope_[filter_.row_of(ns_ * k + i)] = 0.0;
@@ -96,7 +96,7 @@ class Smoother {
       }
     }
     if (motion_.has_noisy_nuisances())
-      for (int64_t i = 0; i < e_; ++i) slope_[n_seen * K_ + i] *= motion_.kept(p_.motion->step_of_row[row])[i];
+      for (int64_t i = 0; i < e_; ++i) slope_[n_measured * K_ + i] *= motion_.kept(p_.motion->step_of_row[row])[i];
   }
 };
 MAGLOC_END

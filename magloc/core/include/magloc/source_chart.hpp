@@ -7,12 +7,13 @@
 MAGLOC_BEGIN
 // Directions at right angles to the chart's own lie at infinity: they are taken as this near to it.
 constexpr double least_cosine = 0.05;
-constexpr int64_t n_seen = 6, max_states = 12;  // position and moment, which readings depend on; numbers of a source
+constexpr int64_t n_measured = 6,
+                  max_source_states = 12;  // position and moment, which readings depend on; numbers of a source
 
 // A state, and how it changes with its coordinates: dx = (position da, power m da_0 + moment da, v da_0 + reach da,
 // da).
 struct ChartedState {
-  double x[max_states], position[3][3], moment[3][3], reach;
+  double x[max_source_states], position[3][3], moment[3][3], reach;
 };
 
 // Coordinates about a state.
@@ -59,7 +60,7 @@ class SourceChart {
         there.position[i][1 + a] = there.reach * inverse * (tangent_[a][i] - u[i] * dot(u, tangent_[a]));
     }
     move_moment(e + 3, to_power(growth), there);
-    for (int64_t i = n_seen; i < n_; ++i) there.x[i] = i < 9 ? growth * (x_[i] + length_ * e[i]) : x_[i] + e[i];
+    for (int64_t i = n_measured; i < n_; ++i) there.x[i] = i < 9 ? growth * (x_[i] + length_ * e[i]) : x_[i] + e[i];
   }
 
   // The coordinates of a state: the inverse of `move` where the moment is not firm.
@@ -71,8 +72,8 @@ class SourceChart {
     e[0] = logarithm(growth);
     for (int a = 0; a < 2; ++a) e[1 + a] = dot(offset, tangent_[a]) / (range * cosine);
     for (int64_t i = 3; i < n_; ++i) {
-      const double rest = state[i] / (i < n_seen ? to_power(growth) : i < 9 ? growth : 1.0) - x_[i];
-      e[i] = rest / (i < n_seen ? unit_ : i < 9 ? length_ : 1.0);
+      const double rest = state[i] / (i < n_measured ? to_power(growth) : i < 9 ? growth : 1.0) - x_[i];
+      e[i] = rest / (i < n_measured ? unit_ : i < 9 ? length_ : 1.0);
     }
   }
 
@@ -86,7 +87,7 @@ class SourceChart {
       for (int i = 0; i < 3; ++i) {
         seen[i * width + j] = dot(there.position[i], e);
         seen[(3 + i) * width + j] = dot(there.moment[i], n) + (double)power_ * there.x[3 + i] * e[0];
-        if (further && n_ > n_seen) {
+        if (further && n_ > n_measured) {
           T &entry = further[i * width + j];
           entry = there.reach * entry + there.x[6 + i] * e[0];
         }
@@ -105,7 +106,7 @@ class SourceChart {
       for (int i = 0; i < 3; ++i) {
         T &moment = seen[(3 + i) * width + j];
         moment = per_unit * (moment - (double)power_ * x_[3 + i] * along);
-        if (further && n_ > n_seen) {
+        if (further && n_ > n_measured) {
           T &entry = further[i * width + j];
           entry = inverse * (entry - x_[6 + i] * along);
         }

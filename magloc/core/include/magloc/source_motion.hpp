@@ -15,13 +15,13 @@ struct TurningStep {
 class SourceMotion {
   const magloc_motion &p_;
   const int64_t n_, n_nuisances_;
-  double F_[max_states * max_states];
+  double F_[max_source_states * max_source_states];
   double *const noise_;  // (n, n_noise)
 
  public:
-  double x[max_states] = {};      // the state after the step
-  const double *F = nullptr;      // (n, n) its derivative by the state before
-  const double *noise = nullptr;  // (n, n_noise) root of its noise
+  double x[max_source_states] = {};  // the state after the step
+  const double *F = nullptr;         // (n, n) its derivative by the state before
+  const double *noise = nullptr;     // (n, n_noise) root of its noise
   const int64_t n_noise;
 
   SourceMotion(const magloc_motion &p, int64_t n_states, int64_t n_nuisances, Workspace &space)

@@ -14,7 +14,7 @@ class Track {
   const Padded<T> wide_ = filter_.wide(motion_, space_);
   double *const bends_ = space_.take<double>(3 * K_), *const directions_ = space_.take<double>(3 * K_ * filter_.N);
   double *const open_loop_ = space_.take<double>(K_ * ns_ * ns_);
-  double *const variances_ = space_.take<double>(n_seen * K_);  // of what readings depend on, before the step
+  double *const variances_ = space_.take<double>(n_measured * K_);  // of what readings depend on, before the step
 
  public:
   Track(const magloc_track &p, Workspace &space) : p_(p), space_(space) {}
@@ -26,7 +26,7 @@ class Track {
     __builtin_memcpy(centroid_before, p_.centroid, sizeof centroid_before);
     filter_.load(*p_.state, 0);
     filter_.set_row(row);
-    for (int64_t i = 0; i < n_seen * K_; ++i) variances_[i] = seen_variance(i);
+    for (int64_t i = 0; i < n_measured * K_; ++i) variances_[i] = seen_variance(i);
     fill_open_loop(p_.motion->step_of_row[row]);
     filter_.predict(motion_, p_.motion->step_of_row[row], 0, centroid_before, wide_);
     filter_.store(*p_.predicted, row);
@@ -60,13 +60,13 @@ class Track {
     return false;
   }
 
-  double seen_variance(int64_t i) const { return filter_.variance(ns_ * (i / n_seen) + i % n_seen); }
+  double seen_variance(int64_t i) const { return filter_.variance(ns_ * (i / n_measured) + i % n_measured); }
 
   // Whether the prediction bends as the readings do: not if the motion has made it so wide, nor as a row does in which
   // readings are missing.
   bool prediction_bends(int64_t row) const {
     bool bends = p_.state->n_nuisances == 0 && p_.rows->counts[row] >= p_.full_count;
-    for (int64_t i = 0; i < n_seen * K_; ++i)
+    for (int64_t i = 0; i < n_measured * K_; ++i)
       bends &= seen_variance(i) <= p_.largest_growth * p_.largest_growth * variances_[i];
     return bends;
   }
@@ -86,7 +86,7 @@ class Track {
       const double *before = p_.open_loop + ns_ * ns_ * k;
       motion_.take(filter_.x + ns_ * k, step, k);
       for (int64_t i = 0; i < ns_; ++i) {
-        double moved[max_states] = {};
+        double moved[max_source_states] = {};
         for (int64_t c = 0; c < ns_; ++c)
           for (int64_t j = 0; j < ns_; ++j) moved[j] += motion_.F[ns_ * i + c] * before[ns_ * c + j];
         for (int64_t j = 0; j < ns_; ++j) {
