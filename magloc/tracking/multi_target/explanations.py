@@ -59,6 +59,7 @@ _HALVES = 0.25
 _SAME_SCORE = 0.1
 # Which of the memories of residuals is asked, and what a mean of unit variance is of one row.
 _LEFT_MEMORY, _LEFT_SHARE = 1, 0.25
+_NEXT_TO_NO_MOMENT = np.array([0.0, 0.0, 1e-30])
 # How much less is known of a source that is found in many weak rows than where they first seem to have it.
 _LATE_SPREAD, _LATE_STARTS = 2.0, 8
 _MUCH_STRONGER = 100.0
@@ -354,6 +355,8 @@ class RowProblem:
     ) -> JointState:
         """The state with other sources (j, 3), of which hardly more is known than where the readings have them."""
         scene = self.scene
+        # Where another sensor is a billion times better, the best moment of a cell may be none.
+        moment_Am2 = np.where(moment_Am2.any(axis=-1, keepdims=True), moment_Am2, _NEXT_TO_NO_MOMENT)
         strength = np.sqrt(np.vecdot(moment_Am2, moment_Am2))[:, None]
         direction, log_strength = moment_Am2 / strength, spread * _LOG_STRENGTH
         known = scene.prior.known_moment
