@@ -114,15 +114,14 @@ def steps_problem(
     nuisances: tuple[FloatArray, FloatArray] | None = None,
     states: FloatArray | None = None,
 ) -> core.Problem:
-    """
-    Return how sources move in steps of some lengths.
+    """Return how sources move in steps of some lengths.
 
     Parameters
     ----------
     motion : MotionModel
     steps_s : sequence of float
     step_of_row : ndarray of int, shape (n_rows,)
-        Which of them leads to each row.
+        Index of the step that leads to each row.
     nuisances : tuple of ndarray, optional
         Part of nuisances that each step keeps, and standard deviation of what it adds, (n_steps, n_nuisances) each.
     states : ndarray, shape (n, n_states), optional
@@ -181,8 +180,7 @@ def update(
     innovation: bool = False,
     sensors: bool = False,
 ) -> RowUpdates:
-    """
-    Return Gaussians after a row's readings, each by an iterated update of its own.
+    """Return Gaussians after a row's readings, each by an iterated update of its own.
 
     Parameters
     ----------
@@ -190,9 +188,9 @@ def update(
         Predictions.
     rows : Rows
     row : int
-        Which of them.
+        Index of the row.
     bends : ndarray of bool, shape (C,), optional
-        Which of the predictions bend as the readings do; those of nuisances cannot.
+        Predictions that bend as the readings do; those of nuisances cannot.
     innovation, sensors : bool
         Whether to find the whitened innovations, and what each sensor's readings would explain if they were free.
     """
@@ -226,8 +224,7 @@ def update(
 
 
 def bends(gaussians: Gaussians, rows: Rows, memory: float, row: int = 0) -> tuple[FloatArray, FloatArray]:
-    """
-    Return how far readings bend over one σ along the axes of each source's place.
+    """Return how far readings bend over one σ along the axes of each source's place.
 
     Parameters
     ----------
@@ -237,7 +234,7 @@ def bends(gaussians: Gaussians, rows: Rows, memory: float, row: int = 0) -> tupl
     memory : float
         Number of rows in whose readings the bend is counted, as far as these made the σ as small as it is.
     row : int
-        Which of the rows.
+        Index of the row.
 
     Returns
     -------
@@ -272,7 +269,7 @@ class Smoothed:
     last : Gaussians
         After the last row; means are offsets, too, and those of nuisances behind them.
     nis, log_evidence : ndarray, shape (C,)
-        Of all rows but the first, and of all.
+        NIS of all rows but the first, and the evidence of all rows.
     """
 
     offsets: FloatArray
@@ -282,17 +279,16 @@ class Smoothed:
 
 
 def smooth(trajectories: FloatArray, prior: Gaussians, steps: core.Problem, rows: Rows) -> Smoothed:
-    """
-    Return a pass along trajectories, at which motion and readings are linearised.
+    """Return a pass along trajectories, at which motion and readings are linearised.
 
     Parameters
     ----------
     trajectories : ndarray, shape (C, n_rows, n)
         States of all sources, without nuisances.
     prior : Gaussians
-        What is known before the first row, in the charts about the trajectories: its means are offsets.
+        State before the first row, in the charts about the trajectories: its means are offsets.
     steps : core.Problem
-        Of :func:`steps_problem`.
+        Steps of the motion, from :func:`steps_problem`.
     rows : Rows
     """
     n, last, offsets = len(trajectories), prior.unfilled(), np.empty_like(trajectories, order="C")

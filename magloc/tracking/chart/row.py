@@ -34,7 +34,7 @@ class Rows:
     transforms, transform_of_row : ndarray, shapes (m, k, n_channels) and (n,)
         From channels to differences.
     effects : ndarray, shape (n, k, n_nuisances)
-        Of nuisances on them.
+        Effects of nuisances on the readings.
     origins_m, rotations : ndarray, shapes (n, 3) and (n, 3, 3)
         Pose of the array.
     ambients_T : ndarray, shape (n or 1, n_sensors, 3)

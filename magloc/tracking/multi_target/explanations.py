@@ -355,7 +355,7 @@ class RowProblem:
     ) -> JointState:
         """The state with other sources (j, 3), of which hardly more is known than where the readings have them."""
         scene = self.scene
-        # Where another sensor is a billion times better, the best moment of a cell may be none.
+        # The best moment of a cell may be zero beside a sensor that is a billion times better.
         moment_Am2 = np.where(moment_Am2.any(axis=-1, keepdims=True), moment_Am2, _NEXT_TO_NO_MOMENT)
         strength = np.sqrt(np.vecdot(moment_Am2, moment_Am2))[:, None]
         direction, log_strength = moment_Am2 / strength, spread * _LOG_STRENGTH

@@ -114,4 +114,26 @@ inline double complementary_error(double x) {
   for (int i = 40; i > 0; --i) below = x + 0.5 * i / below;
   return 0.5641895835477563 * density / below;
 }
+
+// Fill the rotation by an angle about its axis, and column by column the turns after it that follow from small changes
+// of the angle.
+inline void fill_rotation(const double (&angle)[3], double (&rotation)[3][3], double (&turns)[3][3]) {
+  const double square = dot(angle, angle), size = square_root(square);
+  // sin(a)/a, (1 - cos(a))/a^2 and (a - sin(a))/a^3, by series where they cancel.
+  double first = 1.0 - square / 6.0, half = 0.5 - square / 24.0, third = 1.0 / 6.0 - square / 120.0;
+  if (!(size <= 1e-2)) {
+    double sine, cosine;
+    fill_sine_and_cosine_of_any(0.5 * size, sine, cosine);
+    first = 2.0 * sine * cosine / size;
+    half = 2.0 * sine * sine / square;
+    third = (1.0 - first) / square;
+  }
+  const double crossed[3][3] = {{0.0, -angle[2], angle[1]}, {angle[2], 0.0, -angle[0]}, {-angle[1], angle[0], 0.0}};
+  for (int i = 0; i < 3; ++i)
+    for (int j = 0; j < 3; ++j) {
+      const double one = i == j, of_square = angle[i] * angle[j] - square * one;
+      rotation[i][j] = one + first * crossed[i][j] + half * of_square;
+      turns[j][i] = one + half * crossed[i][j] + third * of_square;
+    }
+}
 MAGLOC_END

@@ -107,32 +107,15 @@ struct Turn {
 // Turn a moment in place by a rate.
 inline void turn_moment(double *moment, const double *rate, double rate_lasts, Turn &turn) {
   const double angle[3] = {rate_lasts * rate[0], rate_lasts * rate[1], rate_lasts * rate[2]};
-  const double square = dot(angle, angle), size = square_root(square);
-  // sin(a)/a, (1 - cos(a))/a^2 and (a - sin(a))/a^3, by series where they cancel.
-  double first = 1.0 - square / 6.0, half = 0.5 - square / 24.0, third = 1.0 / 6.0 - square / 120.0;
-  if (!(size <= 1e-2)) {
-    double sine, cosine;
-    fill_sine_and_cosine_of_any(0.5 * size, sine, cosine);
-    first = 2.0 * sine * cosine / size;
-    half = 2.0 * sine * sine / square;
-    third = (1.0 - first) / square;
-  }
-  const Block crossed = {{0.0, -angle[2], angle[1]}, {angle[2], 0.0, -angle[0]}, {-angle[1], angle[0], 0.0}};
-  Block following;  // turns after the rotation that follow from small changes of its angle
-  for (int i = 0; i < 3; ++i)
-    for (int j = 0; j < 3; ++j) {
-      const double one = i == j, of_square = angle[i] * angle[j] - square * one;
-      turn.rotation[i][j] = one + first * crossed[i][j] + half * of_square;
-      following[i][j] = one + half * crossed[i][j] + third * of_square;
-    }
+  Block turns;
+  fill_rotation(angle, turn.rotation, turns);
   const double before[3] = {moment[0], moment[1], moment[2]};
   for (int i = 0; i < 3; ++i) moment[i] = dot(turn.rotation[i], before);
   const double length = norm(moment);
   for (int i = 0; i < 3; ++i) turn.direction[i] = moment[i] / length;
   for (int j = 0; j < 3; ++j) {
-    const double column[3] = {following[0][j], following[1][j], following[2][j]};
     double changed[3];
-    cross(column, turn.direction, changed);
+    cross(turns[j], turn.direction, changed);
     for (int i = 0; i < 3; ++i) turn.by_rate[i][j] = rate_lasts * changed[i];
   }
 }

@@ -70,26 +70,12 @@ class SourceMotion {
       x[9 + i] = step.rate_kept * before[9 + i];
       angle[i] = step.rate_lasts * before[9 + i];
     }
-    const double square = dot(angle, angle), size = square_root(square);
-    // sin(a)/a, (1 - cos(a))/a^2 and (a - sin(a))/a^3, by series where they cancel.
-    double first = 1.0 - square / 6.0, half = 0.5 - square / 24.0, third = 1.0 / 6.0 - square / 120.0;
-    if (!(size <= 1e-2)) {
-      double sine, cosine;
-      fill_sine_and_cosine_of_any(0.5 * size, sine, cosine);
-      first = 2.0 * sine * cosine / size;
-      half = 2.0 * sine * sine / square;
-      third = (1.0 - first) / square;
-    }
-    const double crossed[3][3] = {{0.0, -angle[2], angle[1]}, {angle[2], 0.0, -angle[0]}, {-angle[1], angle[0], 0.0}};
-    double turns[3][3];  // columns: turns after the rotation that follow from small changes of its angle
+    double rotation[3][3], turns[3][3];
+    fill_rotation(angle, rotation, turns);
+    const double moment[3] = {before[3], before[4], before[5]};
     for (int i = 0; i < 3; ++i) {
-      x[3 + i] = 0.0;
-      for (int j = 0; j < 3; ++j) {
-        const double one = i == j, of_square = angle[i] * angle[j] - square * one;
-        F_[12 * (3 + i) + 3 + j] = one + first * crossed[i][j] + half * of_square;
-        turns[j][i] = one + half * crossed[i][j] + third * of_square;
-        x[3 + i] += F_[12 * (3 + i) + 3 + j] * before[3 + j];
-      }
+      x[3 + i] = dot(rotation[i], moment);
+      for (int j = 0; j < 3; ++j) F_[12 * (3 + i) + 3 + j] = rotation[i][j];
     }
     const double m[3] = {x[3], x[4], x[5]}, strength = square_root(dot(m, m));
     for (int j = 0; j < 3; ++j) {
