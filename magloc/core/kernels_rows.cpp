@@ -11,7 +11,7 @@ MAGLOC_KERNEL(predict_row, row_prediction) {
   SourceMotion motion(*problem->motion, before.n_states, before.n_nuisances, space);
   const Padded<Lanes> wide = filter.wide(motion, space);
   if (!workspace) return space.size();
-  filter.set_row(problem->row);
+  filter.set_pose(problem->row);
   for (int64_t i = begin; i < end; ++i) {
     filter.load(before, i);
     filter.predict(motion, problem->motion->step_of_row[problem->row], i, problem->centroid, wide);
@@ -22,7 +22,7 @@ MAGLOC_KERNEL(predict_row, row_prediction) {
 
 MAGLOC_KERNEL(update_row, row_update) {
   const magloc_row_update &p = *problem;
-  const int64_t k = p.rows->n_readings;
+  const int64_t k = p.rows->n_readings, d = n_measured * p.before->n_sources + p.before->n_nuisances;
   Workspace space(workspace);
   RowFilter<Lanes> filter(*p.before, *p.rows, space);
   const Padded<Lanes> wide(space, p.innovation ? k : 0, filter.N + k), triangle(space, p.innovation ? k : 0, k);
@@ -30,8 +30,11 @@ MAGLOC_KERNEL(update_row, row_update) {
   filter.set_row(p.row);
   for (int64_t i = begin; i < end; ++i) {
     filter.load(*p.before, i);
-    filter.update(*p.convergence, p.bends && p.bends[i], p.least_share);
-    if (p.sensor_chi2) filter.fill_sensor_chi2(p.followed, p.sensor_chi2 + p.rows->n_sensors * i);
+    double *const misfits = p.misfits ? p.misfits + 2 * k * i : nullptr;
+    double *const Q = p.projectors ? p.projectors + 2 * d * k * i : nullptr;
+    filter.update(*p.convergence, p.bends && p.bends[i], p.least_share, misfits, Q);
+    if (Q) filter.store_linearisation(misfits + k, Q + d * k);
+    if (p.standardised) filter.fill_standardised(p.followed, p.standardised + 3 * p.rows->n_sensors * i);
     if (p.innovation) filter.fill_innovation(wide, triangle, p.innovation + k * i);
     filter.finish_update();
     filter.store(*p.after, i);

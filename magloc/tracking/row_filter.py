@@ -16,7 +16,7 @@ from magloc import core
 from magloc.tracking.chart.coordinates import FIRM
 from magloc.tracking.chart.row import Rows
 from magloc.tracking.chart.update import LEAST_GAIN, LEAST_SHARE, MOST_ITERATIONS, ROUNDING, TOLERANCE
-from magloc.tracking.motion import MotionModel, OrnsteinUhlenbeck
+from magloc.tracking.motion import N_SOURCE, MotionModel, OrnsteinUhlenbeck
 
 _ROWS_A_CALL = 1000
 """Rows of trajectories that one call of the kernel smooths: some 10 ms."""
@@ -54,7 +54,7 @@ class Gaussians:
         return core.problem(
             "sources",
             n_sources=self.n_sources,
-            n_states=(self.x.shape[1] - self.n_nuisances) // self.n_sources,
+            n_states=(self.x.shape[1] - self.n_nuisances) // max(1, self.n_sources) or N_SOURCE,
             n_nuisances=self.n_nuisances,
             power=self.power,
             firm=self.firm,
@@ -71,7 +71,15 @@ class Gaussians:
 class RowUpdates:
     """Gaussians after a row's readings; see :class:`magloc.tracking.chart.update.Updated`.
 
-    `sensor_chi2` (C, n_sensors) is by how much less `nis` would be if the readings of a sensor were free.
+    Attributes
+    ----------
+    standardised : ndarray, shape (C, n_sensors, 3), optional
+        Residuals of each sensor's channels, of unit covariance. Their square is by how much less `nis` would be if the
+        readings of the sensor were free.
+    misfits : ndarray, shape (C, 2, k), optional
+        Readings less predicted ones, at the prediction and after the update.
+    projectors : ndarray, shape (C, 2, d, k), optional
+        Q at the same states: I - Qᵀ Q is the inverse of the readings' covariance in units of their noise.
     """
 
     after: Gaussians
@@ -81,7 +89,9 @@ class RowUpdates:
     iterations: IntArray
     converged: BoolArray
     innovation: FloatArray | None
-    sensor_chi2: FloatArray | None
+    standardised: FloatArray | None
+    misfits: FloatArray | None
+    projectors: FloatArray | None
 
     @property
     def x(self) -> FloatArray:
@@ -100,10 +110,10 @@ class RowUpdates:
 
 
 @cache
-def convergence() -> core.Problem:
-    """Return when an iterated update ends."""
+def convergence(most: int = MOST_ITERATIONS) -> core.Problem:
+    """Return when an iterated update ends, at the latest after some trials."""
     return core.problem(
-        "convergence", tolerance=TOLERANCE, least_gain=LEAST_GAIN, rounding=ROUNDING, max_iterations=MOST_ITERATIONS
+        "convergence", tolerance=TOLERANCE, least_gain=LEAST_GAIN, rounding=ROUNDING, max_iterations=most
     )
 
 
@@ -178,7 +188,8 @@ def update(
     *,
     bends: BoolArray | None = None,
     innovation: bool = False,
-    sensors: bool = False,
+    linearisations: bool = False,
+    most: int = MOST_ITERATIONS,
 ) -> RowUpdates:
     """Return Gaussians after a row's readings, each by an iterated update of its own.
 
@@ -191,8 +202,10 @@ def update(
         Index of the row.
     bends : ndarray of bool, shape (C,), optional
         Predictions that bend as the readings do; those of nuisances cannot.
-    innovation, sensors : bool
-        Whether to find the whitened innovations, and what each sensor's readings would explain if they were free.
+    innovation, linearisations : bool
+        Whether to find the whitened innovations, and the optional attributes of the result.
+    most : int
+        Number of trials after which the iteration ends.
     """
     if bends is not None and before.n_nuisances:
         raise ValueError("Predictions of nuisances do not bend.")
@@ -200,13 +213,15 @@ def update(
     nis, chi2, log_evidence = np.empty((3, n))
     iterations, converged = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.uint8)
     whitened = np.empty((n, rows.readings.shape[1])) if innovation else None
-    sensor_chi2 = np.empty((n, rows.array.n_sensors)) if sensors else None
+    k, d = rows.readings.shape[1], N_SOURCE * before.n_sources + before.n_nuisances
+    shapes = (n, rows.array.n_sensors, 3), (n, 2, k), (n, 2, d, k)
+    standardised, misfits, projectors = (np.empty(shape) if linearisations else None for shape in shapes)
     work = core.problem(
         "row_update",
         before=before.problem,
         after=after.problem,
         rows=rows.problem,
-        convergence=convergence(),
+        convergence=convergence(most),
         row=row,
         bends=None if bends is None else bends.astype(np.uint8),
         least_share=LEAST_SHARE,
@@ -217,10 +232,13 @@ def update(
         iterations=iterations,
         converged=converged,
         innovation=whitened,
-        sensor_chi2=sensor_chi2,
+        standardised=standardised,
+        misfits=misfits,
+        projectors=projectors,
     )
     core.run("update_row", work, n, block=n)
-    return RowUpdates(after, nis, chi2, log_evidence, iterations, converged.astype(np.bool_), whitened, sensor_chi2)
+    sound = converged.astype(np.bool_)
+    return RowUpdates(after, nis, chi2, log_evidence, iterations, sound, whitened, standardised, misfits, projectors)
 
 
 def bends(gaussians: Gaussians, rows: Rows, memory: float, row: int = 0) -> tuple[FloatArray, FloatArray]:

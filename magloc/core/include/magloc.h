@@ -468,78 +468,6 @@ int64_t magloc_survey_sources(const magloc_survey_columns *problem, int64_t begi
 /* Columns of poles, whose field is d/r^3: size n_sources. */
 int64_t magloc_survey_poles(const magloc_survey_columns *problem, int64_t begin, int64_t end, double *workspace);
 
-/* Several sources that one filter follows together; magloc/tracking/multi_target/state.py has the chart of their
-   errors. These are in the order (position, moment) of each source, common field, (velocity, rate of turn) of each
-   source: n = 12 n_sources + 3 numbers, of which a row of readings sees the first d = 6 n_sources + 3. */
-typedef struct {
-  int64_t n_sources;
-  double *position, *moment, *velocity, *rate; /* (n_sources, 3); of a trajectory (n_rows, n_sources, 3) */
-  double *common;                              /* (3) field; of a trajectory (n_rows, 3) */
-  double *covariance;                          /* (n, n); not read of a trajectory */
-} magloc_joint_state;
-
-/* Rows of whitened readings above the known ambient field. */
-typedef struct {
-  int64_t n_rows, n_sensors, n_channels;
-  const double *readings; /* (n_rows, n_channels), zero where there is none */
-  const double *gain;     /* (n_rows, n_channels, 3) of the field, zero where there is no reading */
-  const double *sensors;  /* (n_rows, n_sensors, 3) */
-  const int64_t *sensor;  /* (n_channels) of each channel */
-} magloc_joint_rows;
-
-/* Motion of all sources in a step. This and the following problems of a joint filter are one item each. */
-typedef struct {
-  const magloc_joint_state *before;
-  const double *step; /* (12): FreeMotion.numbers */
-  const magloc_joint_state *after;
-} magloc_joint_motion;
-
-/* Update by one row, of three channels a sensor, with roots L of what the row sees of the covariance and R R^T of
-   I + (H L)^T H L, both lower. */
-typedef struct {
-  const magloc_joint_state *prior;
-  const magloc_joint_rows *row;
-  int64_t most_trials;
-  double followed;      /* variance that residuals have beside what the fit leaves of them */
-  double *L, *R;        /* (d, d) */
-  double *y;            /* (d), the error is L y */
-  double *residuals;    /* (2, n_channels) at the prediction and at the end */
-  double *HL;           /* (2, n_channels, d) likewise */
-  double *standardised; /* (n_channels), residuals of each sensor with unit covariance */
-  double *outcome;      /* (2): cost, and 1 if a minimum was found */
-} magloc_joint_update;
-
-/* State after an update. */
-typedef struct {
-  const magloc_joint_state *prior;
-  const double *R, *y;
-  const magloc_joint_state *after;
-} magloc_joint_posterior;
-
-/* How far readings bend along errors: the length of their second difference, halved. */
-typedef struct {
-  const magloc_joint_state *state;
-  const magloc_joint_rows *row;
-  int64_t n_errors;
-  const double *errors; /* (n_errors, d) */
-  double *bends;        /* (n_errors) */
-} magloc_joint_bends;
-
-/* A pass of a smoother along a trajectory. */
-typedef struct {
-  const magloc_joint_state *trajectory, *prior;
-  const magloc_joint_rows *rows;
-  const double *steps; /* (n_rows, 12) that lead to each row; the first one is not used */
-  double *offsets;     /* (n_rows, n) from the trajectory to the smoothed one */
-  double *last;        /* (n, n) covariance at the end */
-  double *likelihood;  /* (2): chi-square and the logarithm of the volume of all rows */
-} magloc_joint_smoothing;
-int64_t magloc_joint_step(const magloc_joint_motion *problem, int64_t begin, int64_t end, double *workspace);
-int64_t magloc_joint_update_row(const magloc_joint_update *problem, int64_t begin, int64_t end, double *workspace);
-int64_t magloc_joint_state_after(const magloc_joint_posterior *problem, int64_t begin, int64_t end, double *workspace);
-int64_t magloc_joint_bend(const magloc_joint_bends *problem, int64_t begin, int64_t end, double *workspace);
-int64_t magloc_joint_smooth(const magloc_joint_smoothing *problem, int64_t begin, int64_t end, double *workspace);
-
 /* Rows of readings of an array, as they depend on sources: n_readings combinations of channels, in units of their
    noise; a row of fewer ones has zeros behind them. */
 typedef struct {
@@ -617,7 +545,9 @@ typedef struct {
   int64_t *iterations;  /* (n) */
   uint8_t *converged;   /* (n) */
   double *innovation;   /* (n, n_readings) whitened, or null */
-  double *sensor_chi2;  /* (n, n_sensors) that free readings of a sensor would explain, or null */
+  double *standardised; /* (n, n_sensors, 3) residuals of each sensor's channels, of unit covariance, or null */
+  double *misfits;      /* (n, 2, n_readings) at the prediction and after the update, or null */
+  double *projectors;   /* (n, 2, d, n_readings) Q of the same: I - Q^T Q is the readings' information; or null */
 } magloc_row_update;
 int64_t magloc_update_row(const magloc_row_update *problem, int64_t begin, int64_t end, double *workspace);
 

@@ -157,7 +157,10 @@ class Chart:
         return moved, derivative
 
     def coordinates(self, x: FloatArray) -> FloatArray:
-        """Coordinates (..., n) of states (..., n): the inverse of :meth:`retracted`, for moments that are not firm."""
+        """Return the coordinates (..., n) of states (..., n): the inverse of :meth:`retracted`.
+
+        Directions of firm moments at right angles to the chart's own lie at infinity.
+        """
         length = self.length[..., None]
         offset = x[..., :3] - self.x[..., :3] + length * self.u
         r = np.sqrt(np.sum(offset * offset, axis=-1))
@@ -167,7 +170,11 @@ class Chart:
         e[..., 0] = np.log(r / self.length)
         e[..., 1:3] = (direction[..., None, :] @ self.E)[..., 0, :] / cosine[..., None]
         growth = (r / self.length)[..., None]
-        e[..., 3:6] = (x[..., 3:6] / growth**MOMENT_POWER - self.x[..., 3:6]) / length**MOMENT_POWER
+        moment = x[..., 3:6] / growth**MOMENT_POWER
+        change = moment - self.x[..., 3:6]
+        if self.firm.any():
+            change[self.firm] = _change_of_strength(self.x[self.firm, 3:6], moment[self.firm])
+        e[..., 3:6] = change / length**MOMENT_POWER
         if self.has_velocity:
             e[..., _VELOCITY] = (x[..., _VELOCITY] / growth - self.x[..., _VELOCITY]) / length
         return e
@@ -188,6 +195,15 @@ class Chart:
             inverse[..., _VELOCITY, :3] = by_range[..., :, None] * inverse[..., None, 0, :3]
             inverse[..., _VELOCITY, _VELOCITY] = np.eye(3) / length[..., None]
         return inverse
+
+
+def _change_of_strength(before: FloatArray, after: FloatArray) -> FloatArray:
+    """Return n |m| of firm moments (f, 3) that become others: the inverse of what :meth:`Chart.firmly` states."""
+    size, strength = (np.linalg.norm(m, axis=-1, keepdims=True) for m in (before, after))
+    along, direction = before / size, after / strength
+    cosine = np.maximum(np.sum(along * direction, axis=-1, keepdims=True), _LEAST_COSINE)
+    change: FloatArray = size * (direction / cosine - along + np.log(strength / size) * along)
+    return change
 
 
 def _tangents(u: FloatArray) -> FloatArray:

@@ -110,7 +110,7 @@ class Explanation:
     @property
     def score(self) -> float:
         """-2 ln of how likely the row is with what has happened, up to a constant."""
-        return self.update.cost + self.update.log_volume + self.penalty + _LEFT_OUT * float(np.count_nonzero(self.out))
+        return self.update.score + self.penalty + _LEFT_OUT * float(np.count_nonzero(self.out))
 
     @property
     def excess(self) -> float:
@@ -129,7 +129,7 @@ class RowProblem:
     row : Row
     index : int
         Of the row: sources that are born in it are called by it.
-    step : ndarray, shape (12,)
+    step : ndarray, shape (13,)
         Of the motion to it.
     further : dict
         Explanations that were asked what else may have happened, by their identity, and the answers.
@@ -193,14 +193,14 @@ class RowProblem:
                 break
             best = min([best, *(one.score for one in level)])
         held = [
-            one for one in sorted(found, key=_score) if self.holds(one) and self.allows(one.update.found, self.measured)
+            one for one in sorted(found, key=_score) if self.holds(one) and self.allows(one.update.state, self.measured)
         ]
         held = [one for one in held if one.score < held[0].score + _WEIGHED][:_MOST_WEIGHED]
         return [replace(one, ids=self._names(len(one.ids), i * MOST_BY_ITSELF)) for i, one in enumerate(held)]
 
     def _halved(self, common: JointState, found: Explanation) -> Iterator[Explanation]:
         """The row explained with a source in two halves, along each axis."""
-        state = found.update.found
+        state = found.update.state
         for k, (place_m, moment) in enumerate(zip(state.position_m, state.moment_Am2, strict=True)):
             others = np.arange(len(state.position_m)) != k
             in_array = self.row.R_world_from_array.T @ (place_m - self.row.origin_m)
@@ -214,7 +214,7 @@ class RowProblem:
     def _refined(self, common: JointState, found: Explanation) -> Explanation:
         """The same with nothing known but where it was found, until that does not make it likelier."""
         for _ in range(_ROUNDS):
-            state = found.update.found
+            state = found.update.state
             again = self.found_anew(common, state.position_m, state.moment_Am2, found.out)
             if not again.score < found.score - _SCORE_GAIN:
                 break
@@ -257,7 +257,7 @@ class RowProblem:
         self, found: Explanation, sources: Sequence[int], pairs: Sequence[tuple[int, int]]
     ) -> Iterator[Explanation]:
         """Without each of some sources, and with one source in place of each of some pairs."""
-        prior, state, ids, penalty = found.prior, found.update.found, found.ids, found.penalty - BIRTH
+        prior, state, ids, penalty = found.prior, found.update.state, found.ids, found.penalty - BIRTH
         for k in sources:
             yield self.updated(prior.without(k), ids[:k] + ids[k + 1 :], found.out, penalty)
         for first, second in pairs:
@@ -297,14 +297,16 @@ class RowProblem:
                 continue
             update = found.update
             ids = (*found.ids, self.first_id + born)
-            prior = self.with_sources(found.prior, *self._at(cell, update.innovation, update.linear, update.row.used))
-            start = joint_update(prior, update.row, _START_TRIALS).found
+            prior = self.with_sources(
+                found.prior, *self._at(cell, update.innovation, update.seen_before, update.row.used)
+            )
+            start = joint_update(prior, update.row, _START_TRIALS).state
             if not 0.0 < np.linalg.norm(start.moment_Am2[-1]) < np.inf:
                 continue
             # Where it is found, not where it was looked for, is what the next event starts from.
             prior = self.with_sources(found.prior, start.position_m[-1:], start.moment_Am2[-1:])
             child = self.updated(prior, ids, found.out, found.penalty + BIRTH)
-            if self.allows(child.update.found, child.update.row, slice(-1, None)):
+            if self.allows(child.update.state, child.update.row, slice(-1, None)):
                 yield child
 
     @property
@@ -321,14 +323,14 @@ class RowProblem:
         """Predictions with another source at the cells that explain most of mean residuals (C,)."""
         update = found.update
         for cell in self._cells.best(self._cells.energy(left), _LATE_STARTS):
-            source = self._at(cell, _LEFT_SHARE * left, update.HL, update.row.used)
+            source = self._at(cell, _LEFT_SHARE * left, update.seen, update.row.used)
             yield self.with_sources(prior, *source, _LATE_SPREAD)
 
-    def _at(self, cell: int, left: FloatArray, linear: FloatArray, used: BoolArray) -> tuple[FloatArray, FloatArray]:
+    def _at(self, cell: int, left: FloatArray, seen: FloatArray, used: BoolArray) -> tuple[FloatArray, FloatArray]:
         """Place and moment (1, 3) of the source in a cell that explains most of what is left."""
         R = self.row.R_world_from_array
         place_m = self.row.origin_m + R @ self._cells.position_m[cell]
-        return place_m[None], (R @ self._cells.moment(cell, left, linear, used))[None]
+        return place_m[None], (R @ self._cells.moment(cell, left, seen, used))[None]
 
     def allows(self, state: JointState, row: JointRow, born: slice = slice(None)) -> bool:
         """Whether sources agree with what is known, and may be told from a fault and from the ambient field.
@@ -358,17 +360,17 @@ class RowProblem:
         # The best moment of a cell may be zero beside a sensor that is a billion times better.
         moment_Am2 = np.where(moment_Am2.any(axis=-1, keepdims=True), moment_Am2, _NEXT_TO_NO_MOMENT)
         strength = np.sqrt(np.vecdot(moment_Am2, moment_Am2))[:, None]
-        direction, log_strength = moment_Am2 / strength, spread * _LOG_STRENGTH
+        log_strength = spread * _LOG_STRENGTH
         known = scene.prior.known_moment
         if known is not None:
             log_strength = known.sigma_Am2 / known.modulus_Am2
-            strength = np.full_like(strength, known.modulus_Am2)
-        from_centroid = position_m - self.row.origin_m - self.row.R_world_from_array @ scene.array.centroid
+            moment_Am2 = known.modulus_Am2 / strength * moment_Am2
+        from_centroid = position_m - self.measured.centroid_m
         away_m = np.maximum(
             spread * _PLACE * np.sqrt(np.vecdot(from_centroid, from_centroid)), scene.array.circumradius
         )
-        covariance = scene.motion.start(direction, away_m, _TURN, log_strength)
-        return state.with_sources(position_m, strength * direction, covariance)
+        roots = scene.motion.start(moment_Am2, away_m, _TURN, log_strength)
+        return state.with_sources(position_m, moment_Am2, roots)
 
     def found_anew(
         self, common: JointState, positions_m: FloatArray, moments_Am2: FloatArray, out: BoolArray
@@ -410,9 +412,8 @@ def are_same(first: JointState, second: JointState) -> bool:
     if first.n_sources != second.n_sources:
         return False
     offset = first.position_m[:, None] - second.position_m
-    at = first.of_source[:, :3]
-    inverse = np.linalg.inv(first.P[at[:, :, None], at[:, None, :]])
-    near = np.einsum("kli,kij,klj->kl", offset, inverse, offset) < _SAME_SIGMA2
+    apart = np.linalg.solve(first.covariances[:, None, :3, :3], offset[..., None])[..., 0]
+    near = np.vecdot(offset, apart) < _SAME_SIGMA2
     return bool(near.any(axis=1).all() and near.any(axis=0).all())
 
 

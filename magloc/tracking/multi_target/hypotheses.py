@@ -13,7 +13,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from arrays.typing import FloatArray
-from magloc import core
+from magloc.tracking import row_filter
 from magloc.tracking.multi_target.measurement import JointRow
 from magloc.tracking.multi_target.smoothing import MOST_ROWS, YoungTrack
 from magloc.tracking.multi_target.state import JointState
@@ -27,8 +27,6 @@ REFITS = (3, 5, 8, 12, 18, 27, 40, 60, MOST_ROWS)
 """Rows since the last birth after which they are fitted together; behind the last of them a track is old."""
 MERGED_GAP = 1.0 / 3.0
 """Standard deviation of a gap over the gap above which two sources are merged."""
-# Widest axes that are looked along.
-_AXES = 6
 # By how much all rows together may be less likely than one after the other were, as -2 ln.
 _WORSE = 10.0
 # Squared distance, in units of its covariance, below which two places may be of one source.
@@ -87,39 +85,27 @@ class Hypothesis:
 
 
 def split(state: JointState, row: JointRow) -> list[tuple[float, JointState]]:
-    """Weights and parts of a state, along the axis of its covariance on which a row's readings bend most.
+    """Return weights and parts of a state, along the axis of its covariance on which a row's readings bend most.
 
     Of a standard normal density, two parts of weight 1/4 at ±1 and one of 1/2 at 0, all of variance 1/2, keep mean and
     variance. A state along none of whose axes they bend is its own only part.
     """
-    sigma, axes, root, bends = _bends(state, row)
-    axis = int(np.argmax(bends))
-    if not bends[axis] > LARGEST_BEND:
+    bends, directions = _bends(state, row)
+    if not bends.size or not bends.max() > LARGEST_BEND:
         return [(1.0, state)]
-    # What the whole state does where its seen part goes along the axis by a standard deviation.
-    step = state.P[:, : len(sigma)] @ (axes[axis] / (sigma * root[axis]))
-    P = state.P - 0.5 * np.outer(step, step)
-    return [(0.5, replace(state, P=P)), (0.25, state.moved_with(step, P)), (0.25, state.moved_with(-step, P))]
+    along = directions[np.argmax(bends)]
+    return [(share, state.narrowed(along, 0.5, offset)) for share, offset in ((0.5, 0.0), (0.25, 1.0), (0.25, -1.0))]
 
 
 def is_straight(state: JointState, row: JointRow) -> bool:
-    """Whether a row's readings hardly bend within a state's covariance."""
-    return bool(_bends(state, row)[3].max() <= STRAIGHT)
+    """Return whether a row's readings hardly bend within a state's covariance."""
+    return bool(_bends(state, row)[0].max(initial=0.0) <= STRAIGHT)
 
 
-def _bends(state: JointState, row: JointRow) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Standard deviations (d,) of what a row sees, its widest axes (6, d) and their lengths in these, and its bends."""
-    d = state.n_seen
-    sigma = np.sqrt(np.diagonal(state.P)[:d])
-    variance, axes = np.linalg.eigh(state.P[:d, :d] / np.outer(sigma, sigma))
-    root, widest = np.sqrt(np.maximum(variance[-_AXES:], 0.0)), axes[:, -_AXES:].T
-    errors = np.ascontiguousarray(sigma * widest * root[:, None])
-    bends = np.empty(len(errors))
-    work = core.problem(
-        "joint_bends", state=state.problem, row=row.problem, n_errors=len(errors), errors=errors, bends=bends
-    )
-    core.run("joint_bend", work, 1, block=1)
-    return sigma, widest, root, bends
+def _bends(state: JointState, row: JointRow) -> tuple[FloatArray, FloatArray]:
+    """Return the bends (3 K,) of a row's readings, and one standard deviation (3 K, n) along each axis."""
+    bends, directions = row_filter.bends(state.gaussians, row.compiled, 1.0)
+    return bends[0], directions[0]
 
 
 def by_score(hypothesis: Hypothesis) -> float:
@@ -158,9 +144,7 @@ def old_names(restart: Hypothesis, before: Hypothesis) -> tuple[int, ...]:
     One that was taken for somewhere else is another source to whoever followed it.
     """
     offset = restart.state.position_m[:, None] - before.state.position_m
-    P, Q = (
-        one.state.P[at[:, :, None], at[:, None]] for one in (restart, before) for at in [one.state.of_source[:, :3]]
-    )
+    P, Q = (one.state.covariances[:, :3, :3] for one in (restart, before))
     apart = np.vecdot(offset, np.linalg.solve(P[:, None] + Q, offset[..., None])[..., 0])
     names = list(restart.ids)
     for new, old in zip(*linear_sum_assignment(np.linalg.norm(offset, axis=-1)), strict=True):

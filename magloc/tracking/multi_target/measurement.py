@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -9,11 +10,11 @@ import numpy as np
 
 from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray, IntArray
-from magloc import core
 from magloc.fields import dipole
 from magloc.localization.search.candidates import candidate_positions
 from magloc.measurement.rows import ambient_fields, channels_above_ambient, whitenings_of
-from magloc.tracking.multi_target.state import N_COMMON, N_SEEN, JointState
+from magloc.tracking.chart.row import Rows
+from magloc.tracking.multi_target.state import JointState
 from magloc.tracking.results import Row
 
 # Sets of channels that are kept: rows miss the same ones more often than not.
@@ -26,82 +27,94 @@ class JointRow:
 
     Attributes
     ----------
+    array : SensorArray
+    row : Row
+        Its pose.
     z : ndarray, shape (C,)
         Readings above the known ambient field.
-    gain : ndarray, shape (C, 3)
-        Of the field in the world frame [1/T].
-    positions_m : ndarray, shape (N, 3)
-        Of the sensors in the world.
-    channel_sensor : ndarray of int, shape (C,)
+    transform : ndarray, shape (C, C)
+        From channels to whitened readings.
     used : ndarray of bool, shape (C,)
     """
 
+    array: SensorArray
+    row: Row
     z: FloatArray
-    gain: FloatArray
-    positions_m: FloatArray
-    channel_sensor: IntArray
+    transform: FloatArray
     used: BoolArray
 
     @classmethod
     def of(cls, array: SensorArray, row: Row, root: FloatArray | None = None) -> JointRow:
-        """A row with all of its readings; `root` (C, C) is their whitening, where that is known already."""
+        """Return a row with all of its readings; `root` (C, C) is their whitening, where that is known already."""
         used = row.available
         root = whitenings_of(array, used, row.readings_T).root if root is None else root
         ambient = ambient_fields(array, 1, None if row.ambient_T is None else row.ambient_T[None])
         above = channels_above_ambient(array, used, row.readings_T[None], ambient)[0]
-        R = row.R_world_from_array
-        gain = root @ array.channel_gain @ R.T
-        return cls(root @ above, gain, row.origin_m + array.positions @ R.T, array.channel_sensor, used)
+        return cls(array, row, root @ above, root, used)
 
     @property
     def n_readings(self) -> int:
-        """Channels that are used."""
+        """Number of channels that are used."""
         return int(np.count_nonzero(self.used))
 
     @cached_property
-    def problem(self) -> core.Problem:
-        """Struct that describes the row to the kernels."""
-        return rows_problem(self.z, self.gain, self.positions_m, self.channel_sensor)
+    def effect(self) -> FloatArray:
+        """Effect (C, 3) of the common field in the world frame [1/T]."""
+        return np.asarray(self.transform @ self.array.channel_gain @ self.row.R_world_from_array.T)
+
+    @cached_property
+    def positions_m(self) -> FloatArray:
+        """Positions (N, 3) of the sensors in the world."""
+        return np.asarray(self.row.origin_m + self.array.positions @ self.row.R_world_from_array.T)
+
+    @cached_property
+    def centroid_m(self) -> FloatArray:
+        """Centroid (3,) of the sensors in the world."""
+        return np.asarray(self.row.origin_m + self.row.R_world_from_array @ self.array.centroid)
+
+    @cached_property
+    def compiled(self) -> Rows:
+        """The row for kernels."""
+        return stacked([self])
 
     def without(self, out: BoolArray) -> JointRow:
-        """The row without some of the sensors (N,)."""
+        """Return the row without some of the sensors (N,)."""
         if not out.any():
             return self
-        used = self.used & ~out[self.channel_sensor]
-        return replace(self, z=np.where(used, self.z, 0.0), gain=np.where(used[:, None], self.gain, 0.0), used=used)
+        used = self.used & ~out[self.array.channel_sensor]
+        z, transform = np.where(used, self.z, 0.0), np.where(used[:, None], self.transform, 0.0)
+        return replace(self, z=z, transform=transform, used=used)
 
-    def predicted(self, state: JointState) -> tuple[FloatArray, FloatArray]:
-        """Predicted channels (C,), and their derivatives (C, 6 K + 3) by (p, m) of every source and the common field.
-
-        The moments' derivatives are Cartesian.
-        """
-        k = state.n_sources
+    def linearised(self, state: JointState) -> tuple[FloatArray, FloatArray]:
+        """Return derivatives (K, C, 6) of the readings by each source's position and moment, and the readings (C,)."""
         by_source = dipole.field_jacobian(self.positions_m, state.position_m[:, None], state.moment_Am2[:, None])
-        fields = state.common_T + np.sum(by_source[..., 3:] @ state.moment_Am2[:, None, :, None], axis=0)[..., 0]
-        H = np.empty((len(self.z), N_SEEN * k + N_COMMON))
-        of_sources = self.gain[None, :, None] @ by_source[:, self.channel_sensor]
-        H[:, :-N_COMMON] = of_sources[:, :, 0].transpose(1, 0, 2).reshape(len(self.z), N_SEEN * k)
-        H[:, -N_COMMON:] = self.gain
-        return np.vecdot(self.gain, fields[self.channel_sensor]), H
+        sensor, gain = self.array.channel_sensor, self.array.channel_gain @ self.row.R_world_from_array.T
+        H = self.transform @ (gain[None, :, None] @ by_source[:, sensor])[:, :, 0]
+        h = np.sum(H[..., 3:] @ state.moment_Am2[:, :, None], axis=0)[:, 0]
+        return H, h + self.effect @ state.common_T
 
     def energy_of(self, position_m: FloatArray, moment_Am2: FloatArray) -> FloatArray:
-        """Energy (N,) of a source in each sensor."""
-        fields = dipole.field(self.positions_m, position_m, moment_Am2)[self.channel_sensor]
-        energy: FloatArray = np.bincount(self.channel_sensor, np.vecdot(self.gain, fields) ** 2).astype(np.float64)
+        """Return the energy (N,) of a source in each sensor."""
+        fields = dipole.field(self.positions_m, position_m, moment_Am2)[self.array.channel_sensor]
+        seen = np.vecdot(self.effect, fields) ** 2
+        energy: FloatArray = np.bincount(self.array.channel_sensor, seen).astype(np.float64)
         return energy
 
 
-def rows_problem(z: FloatArray, gain: FloatArray, positions_m: FloatArray, channel_sensor: IntArray) -> core.Problem:
-    """Describe rows to the kernels; z (C,) is one row, z (n, C) are several."""
-    return core.problem(
-        "joint_rows",
-        n_rows=len(z) if z.ndim > 1 else 1,
-        n_sensors=positions_m.shape[-2],
-        n_channels=z.shape[-1],
-        readings=np.ascontiguousarray(z),
-        gain=np.ascontiguousarray(gain),
-        sensors=np.ascontiguousarray(positions_m),
-        sensor=np.ascontiguousarray(channel_sensor, dtype=np.int64),
+def stacked(rows: Sequence[JointRow]) -> Rows:
+    """Return rows of one array for kernels."""
+    array, distinct = rows[0].array, {id(row.transform): row.transform for row in rows}
+    index = {key: i for i, key in enumerate(distinct)}
+    return Rows(
+        array,
+        np.stack([row.z for row in rows]),
+        np.full(len(rows), array.n_channels),
+        np.stack(list(distinct.values())),
+        np.array([index[id(row.transform)] for row in rows]),
+        np.stack([row.effect for row in rows]),
+        np.stack([row.row.origin_m for row in rows]),
+        np.stack([row.row.R_world_from_array for row in rows]),
+        np.zeros((1, array.n_sensors, 3)),
     )
 
 
@@ -149,18 +162,15 @@ class Cells:
         energy: FloatArray = np.sum(np.square(components), axis=0, dtype=np.float64)
         return energy
 
-    def moment(self, cell: int, innovation: FloatArray, linear: FloatArray, used: BoolArray) -> FloatArray:
-        """The moment (3,) in the array's frame of a source in a cell that explains most of an innovation (C,).
+    def moment(self, cell: int, innovation: FloatArray, seen: FloatArray, used: BoolArray) -> FloatArray:
+        """Return the moment (3,) in the array's frame of a source in a cell that explains most of an innovation (C,).
 
-        Beside it the innovation has errors of unit variance along the columns of `linear` (C, d).
+        The inverse of the innovation's covariance is I - Qᵀ Q, with Q = `seen` (d, C).
         """
         A = self.columns[cell] * used[:, None]
         A = np.concatenate([A, innovation[:, None]], axis=1)
-        # What the errors may explain of it counts for as much less: (I + J Jᵀ)⁻¹ = I - J (I + JᵀJ)⁻¹ Jᵀ.
-        of_errors = linear.T @ A
-        N = linear.T @ linear
-        N[np.diag_indices(len(N))] += 1.0
-        left = A[:, :3].T @ A - of_errors[:, :3].T @ np.linalg.solve(N, of_errors)
+        of_errors = seen @ A
+        left = A[:, :3].T @ A - of_errors[:, :3].T @ of_errors
         found: FloatArray = np.linalg.lstsq(left[:, :3], left[:, 3], rcond=None)[0]
         return found
 

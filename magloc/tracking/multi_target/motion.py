@@ -9,10 +9,13 @@ import numpy as np
 
 from arrays.typing import FloatArray
 from magloc import core
+from magloc.tracking import row_filter
 from magloc.tracking.motion import wandering_step
-from magloc.tracking.multi_target.state import N_OF_SOURCE, JointState
+from magloc.tracking.multi_target.measurement import JointRow
+from magloc.tracking.multi_target.state import N_COMMON, N_OF_SOURCE, JointState
 
-P_, C_, V_, W_ = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
+_N_TURNING = 12
+"""Numbers of a step of the sources; behind them stands the noise of the common field."""
 
 
 @dataclass(frozen=True)
@@ -59,34 +62,44 @@ class FreeMotion:
                 raise ValueError(f"Input {name} must be positive and finite; instead received {value}.")
 
     def numbers(self, dt_s: float, *, agility: float = 1.0) -> FloatArray:
-        """Return the numbers (12,) of a step for its kernel; `agility` multiplies the noise of velocity and turn."""
+        """Return the numbers (13,) of a step; `agility` multiplies the noise of velocity and turn."""
         lasts_s, kept, root_v = wandering_step(self.correlation_s, dt_s)
         turn_lasts_s, turn_kept, root_w = wandering_step(self.turn_correlation_s, dt_s)
-        of_p_v = (agility * self.speed_m_s) ** 2 * (root_v @ root_v.T)
-        of_c_w = (agility * self.turn_rad_s) ** 2 * (root_w @ root_w.T)
-        upper = np.array([0, 0, 1]), np.array([0, 1, 1])
-        walks = self.strength_change**2 * dt_s, self.common_walk_T**2 * dt_s
-        return np.array([lasts_s, kept, turn_lasts_s, turn_kept, *of_p_v[upper], *of_c_w[upper], *walks])
+        lower = [0, 1, 1], [0, 0, 1]
+        of_v, of_w = agility * self.speed_m_s * root_v[lower], agility * self.turn_rad_s * root_w[lower]
+        walks = self.strength_change * math.sqrt(dt_s), self.common_walk_T * math.sqrt(dt_s)
+        return np.array([lasts_s, kept, turn_lasts_s, turn_kept, *of_v, *of_w, 0.0, *walks])
 
-    def predicted(self, state: JointState, dt_s: float, *, agility: float = 1.0) -> JointState:
-        """State after a step without readings; `agility` times the noise of velocity and turn."""
-        return stepped(state, self.numbers(dt_s, agility=agility))
-
-    def start(
-        self, direction: FloatArray, position_m: FloatArray | float, turn_rad: float, log_strength: float
-    ) -> FloatArray:
-        """Covariance (..., 12, 12) of sources of which so much is known, whose moments point along unit vectors."""
-        P = np.zeros((*direction.shape[:-1], N_OF_SOURCE, N_OF_SOURCE))
-        along, one = direction[..., :, None] * direction[..., None, :], np.eye(3)
-        P[..., P_, P_] = np.square(position_m)[..., None, None] * one
-        P[..., V_, V_], P[..., W_, W_] = self.speed_m_s**2 * one, self.turn_rad_s**2 * one
-        P[..., C_, C_] = turn_rad**2 * (one - along) + log_strength**2 * along
-        return P
+    def start(self, moment_Am2: FloatArray, position_m: FloatArray, turn_rad: float, log_strength: float) -> FloatArray:
+        """Return roots (j, 12, 12) of Cartesian covariances of sources (j, 3) of which so much is known."""
+        one = np.eye(3)
+        strength = np.sqrt(np.vecdot(moment_Am2, moment_Am2))[:, None, None]
+        along = moment_Am2[:, :, None] * moment_Am2[:, None] / strength**2
+        S = np.zeros((len(moment_Am2), N_OF_SOURCE, N_OF_SOURCE))
+        S[:, :3, :3] = np.reshape(position_m, (-1, 1, 1)) * one
+        S[:, 3:6, 3:6] = strength * (turn_rad * (one - along) + log_strength * along)
+        S[:, 6:9, 6:9], S[:, 9:, 9:] = self.speed_m_s * one, self.turn_rad_s * one
+        return S
 
 
-def stepped(state: JointState, step: FloatArray) -> JointState:
-    """State after a step of the motion, whose numbers (12,) are known."""
-    after = JointState.unfilled(state.n_sources)
-    work = core.problem("joint_motion", before=state.problem, step=step, after=after.problem)
-    core.run("joint_step", work, 1, block=1)
-    return after
+def steps_problem(numbers: FloatArray) -> core.Problem:
+    """Return how sources move in the steps (m, 13) to m rows."""
+    added = np.repeat(numbers[:, _N_TURNING:], N_COMMON, axis=1)
+    return core.problem(
+        "motion",
+        n_noise=15,
+        F=None,
+        A=None,
+        B=None,
+        moved=None,
+        turning=np.ascontiguousarray(numbers[:, :_N_TURNING]),
+        kept=np.ones_like(added),
+        added=added,
+        step_of_row=np.arange(len(numbers)),
+    )
+
+
+def stepped(state: JointState, step: FloatArray, row: JointRow) -> JointState:
+    """Return the state after a step (13,) to a row, without its readings."""
+    found = row_filter.predict(state.gaussians, state.centroid_m, steps_problem(step[None]), row.compiled)
+    return state.after(found, row.centroid_m)

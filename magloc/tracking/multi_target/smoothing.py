@@ -7,23 +7,24 @@ smoother along the last trajectory, until that stays.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from arrays.typing import FloatArray
-from magloc import core
-from magloc.tracking.multi_target.measurement import JointRow, rows_problem
-from magloc.tracking.multi_target.motion import stepped
-from magloc.tracking.multi_target.state import N_OF_SOURCE, JointState
+from magloc.tracking import row_filter
+from magloc.tracking.chart.coordinates import Chart
+from magloc.tracking.multi_target.measurement import JointRow, stacked
+from magloc.tracking.multi_target.motion import stepped, steps_problem
+from magloc.tracking.multi_target.state import N_COMMON, N_OF_SOURCE, N_SEEN, JointState
+from magloc.tracking.row_filter import Gaussians
 
 MOST_ROWS = 90
 """Rows that are kept of a track."""
 # Passes, and the change of the last state, in its standard deviations, below which the trajectory stays.
 _MOST_PASSES = 12
 _TOLERANCE = 0.1
-# Longest step of ln |m| or of a moment's direction in a pass.
+# Longest step of the log-range, the direction, and the moment over its size in a pass.
 _LONGEST = 0.5
 
 
@@ -52,61 +53,58 @@ class YoungTrack:
     is_young: bool = True
 
     def after(self, row: JointRow, step: FloatArray, state: JointState, score: float) -> YoungTrack:
-        """After one more row; where that are too many the older half is dropped."""
+        """Return the track after one more row; where that are too many the older half is dropped."""
         if len(self.rows) == MOST_ROWS:
             n = MOST_ROWS // 2
-            prior = stepped(self.states[n - 1], self.rows[n][1])
+            first, to_first = self.rows[n]
+            prior = stepped(self.states[n - 1], to_first, first)
             return YoungTrack(prior, self.rows[n:], self.states[n:], is_young=False).after(row, step, state, score)
         return replace(self, rows=(*self.rows, (row, step)), states=(*self.states, state), score=self.score + score)
 
     def joined(self, prior: JointState) -> YoungTrack:
-        """The same rows with the last sources of another prior all along, which rest there."""
+        """Return the same rows with the last sources of another prior all along, which rest there."""
         new = slice(self.prior.n_sources, None)
-        means = prior.position_m[new], prior.moment_Am2[new]
-        states = tuple(state.with_sources(*means, np.zeros((N_OF_SOURCE, N_OF_SOURCE))) for state in self.states)
-        return YoungTrack(prior, self.rows, states)
+        known = np.zeros((prior.n_sources - self.prior.n_sources, N_OF_SOURCE, N_OF_SOURCE))
+        states = (state.with_sources(prior.position_m[new], prior.moment_Am2[new], known) for state in self.states)
+        return YoungTrack(prior, self.rows, tuple(states))
 
     def smoothed(self) -> YoungTrack | None:
-        """The same with all rows linearised along the trajectory that they lead to; None where there is no such."""
-        track, rows = _stacked(self.states), [row for row, _ in self.rows]
-        given = rows_problem(
-            np.stack([row.z for row in rows]),
-            np.stack([row.gain for row in rows]),
-            np.stack([row.positions_m for row in rows]),
-            rows[0].channel_sensor,
-        )
-        steps, n = np.stack([step for _, step in self.rows]), len(self.prior.P)
-        offsets, last, likelihood = np.empty((len(rows), n)), np.empty((n, n)), np.empty(2)
+        """Return the track with all rows linearised along the trajectory that they lead to, or None."""
+        rows = stacked([row for row, _ in self.rows])
+        steps = steps_problem(np.stack([step for _, step in self.rows]))
+        centroids = np.stack([row.centroid_m for row, _ in self.rows])
+        track = np.stack([state.sources for state in self.states])
         for _ in range(_MOST_PASSES):
-            work = core.problem(
-                "joint_smoothing",
-                trajectory=track.problem,
-                prior=self.prior.problem,
-                rows=given,
-                steps=steps,
-                offsets=offsets,
-                last=last,
-                likelihood=likelihood,
-            )
-            core.run("joint_smooth", work, 1, block=1)
-            if not (np.isfinite(likelihood[0]) and np.isfinite(offsets).all() and np.isfinite(last).all()):
+            chart = Chart.at(track, centroids[:, None], self.prior.radius_m)
+            with np.errstate(all="ignore"):  # a trajectory may lead out of double precision
+                prior = self._prior_about(chart.take(np.array(0)))
+                found = row_filter.smooth(track.reshape(1, len(track), -1), prior, steps, rows)
+            offsets, S = found.offsets.reshape(track.shape), found.last.S[0]
+            if not (np.isfinite(found.log_evidence[0]) and np.isfinite(offsets).all() and np.isfinite(S).all()):
                 return None
-            turns = offsets[:, : 6 * self.prior.n_sources].reshape(len(offsets), -1, 6)[:, :, 3:]
-            share = min(1.0, _LONGEST / max(float(np.abs(turns).max(initial=0.0)), 1e-300))
-            change = np.abs(share * offsets[-1]) / np.sqrt(np.diagonal(last))
-            track = track.moved(share * offsets)
+            sizes = np.abs(offsets[..., :N_SEEN])
+            sizes[..., 3:] *= (chart.length**4 / np.linalg.norm(track[..., 3:N_SEEN], axis=-1))[..., None]
+            share = min(1.0, _LONGEST / max(float(sizes.max(initial=0.0)), 1e-300))
+            sigma = np.linalg.norm(S[:-N_COMMON], axis=1)
+            change = np.abs(share * offsets[-1].ravel()) / sigma
+            track = chart.retracted(share * offsets)
             if share == 1.0 and float(change.max(initial=0.0)) < _TOLERANCE:
-                states = tuple(JointState(*means, last) for means in zip(*_means(track), strict=True))
-                return replace(self, states=states, score=float(likelihood.sum()))
+                return replace(self, states=self._states(track, found.last), score=-2.0 * float(found.log_evidence[0]))
         return None
 
+    def _prior_about(self, chart: Chart) -> Gaussians:
+        """Return the prior as offsets from states (K, 12), in the charts about them."""
+        e = self.prior.chart.coordinates(chart.x)
+        turn = chart.inverse_jacobian() @ self.prior.chart.linearised(e)[1]
+        n, S = e.size, self.prior.S.copy()
+        S[:n] = (turn @ S[:n].reshape(*e.shape, len(S))).reshape(n, len(S))
+        offset = np.concatenate([-(turn @ e[..., None]).ravel(), self.prior.common_T])
+        return replace(self.prior.gaussians, x=offset[None], S=S[None])
 
-def _means(state: JointState) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return the means of a state."""
-    return state.position_m, state.moment_Am2, state.velocity_m_s, state.rate_rad_s, state.common_T
-
-
-def _stacked(states: Sequence[JointState]) -> JointState:
-    """A trajectory, with the covariance at its end."""
-    parts = [np.stack(part) for part in zip(*(_means(state) for state in states), strict=True)]
-    return JointState(parts[0], parts[1], parts[2], parts[3], parts[4], states[-1].P)
+    def _states(self, track: FloatArray, last: Gaussians) -> tuple[JointState, ...]:
+        """Return the states of a trajectory (m, K, 12), with the common field and the covariance of its end."""
+        common_T = last.x[0, -N_COMMON:]
+        return tuple(
+            replace(state, x=np.concatenate([sources.ravel(), common_T]), S=last.S[0])
+            for state, sources in zip(self.states, track, strict=True)
+        )

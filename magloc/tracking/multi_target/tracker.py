@@ -158,7 +158,9 @@ class SourcesTracker:
         self._n_rows += 1
         if not row.available.any() or self._misfits.waits:
             step = problem.step
-            self._hypotheses = [replace(one, state=stepped(one.state, step), young=None) for one in self._hypotheses]
+            self._hypotheses = [
+                replace(one, state=stepped(one.state, step, problem.measured), young=None) for one in self._hypotheses
+            ]
             if self._misfits.waits and self._hypotheses:
                 self._misfits = self._misfits.passed_over
                 return self._point(problem, "misfit", math.nan)
@@ -238,16 +240,21 @@ class SourcesTracker:
         if sigma_T is None:
             largest = np.nanmax(np.abs(problem.row.readings_T - array.channel_offset_T))
             sigma_T = 3.0 * float(largest) + 100.0 * float(array.channel_noise_T.max())
-        return Hypothesis(JointState.empty(np.zeros(3), sigma_T), (), SensorHealth.of(array.n_sensors))
+        return Hypothesis(
+            JointState.empty(np.zeros(3), sigma_T, problem.measured.centroid_m, array.circumradius),
+            (),
+            SensorHealth.of(array.n_sensors),
+        )
 
     def _continued(self, problem: RowProblem, before: Hypothesis, dt_s: float) -> list[tuple[Hypothesis, Explanation]]:
         """What becomes of a hypothesis: one for every explanation of the row, or the prediction if there is none."""
-        prior = stepped(before.state, problem.step)
+        prior = stepped(before.state, problem.step, problem.measured)
         plain = problem.updated(prior, before.ids, before.health.dead)
         if problem.holds(plain) or (before.judged > 0 and plain.update.converged):
             explanations = [plain]
         else:
-            manoeuvring = self.scene.motion.predicted(before.state, dt_s, agility=MANOEUVRE_AGILITY)
+            agile = self.scene.motion.numbers(dt_s, agility=MANOEUVRE_AGILITY)
+            manoeuvring = stepped(before.state, agile, problem.measured)
             explanations = problem.explanations(plain, manoeuvring)
         if not explanations:
             kept = replace(before, state=prior, young=None, score=before.score + min(plain.score, _UNBEARABLE))
@@ -268,8 +275,7 @@ class SourcesTracker:
             young = None
         else:
             young = YoungTrack(found.prior, is_young=changed) if changed or young is None else young
-            likely = found.update.cost + found.update.log_volume
-            young = young.after(found.update.row, problem.step, found.update.state, likely)
+            young = young.after(found.update.row, problem.step, found.update.state, found.update.score)
         after = replace(
             before,
             young=young,
@@ -345,7 +351,7 @@ class SourcesTracker:
         more = [one for one in tried if len(one.ids) > known]
         tried = [one for one in tried if len(one.ids) <= known][:_MOST_RESTARTS] + more[:_MOST_RESTARTS]
         # What the sources' motion tells is still to be learned by them, and was by the best one.
-        learned = np.linalg.slogdet(again.update.state.P)[1] - np.linalg.slogdet(best.state.P)[1]
+        learned = 2.0 * (np.linalg.slogdet(again.update.state.S)[1] - np.linalg.slogdet(best.state.S)[1])
         score, health = best.score - max(0.0, float(learned)), best.health.forgetful
         restarts = [
             replace(self._after(problem, best, one), score=score + BIRTH * (len(one.ids) - known), health=health)

@@ -33,11 +33,6 @@
   X(survey_moments, survey_columns)           \
   X(survey_sources, survey_columns)           \
   X(survey_poles, survey_columns)             \
-  X(joint_step, joint_motion)                 \
-  X(joint_update_row, joint_update)           \
-  X(joint_state_after, joint_posterior)       \
-  X(joint_bend, joint_bends)                  \
-  X(joint_smooth, joint_smoothing)            \
   X(predict_row, row_prediction)              \
   X(update_row, row_update)                   \
   X(bend_row, row_bends)                      \

@@ -48,6 +48,7 @@ class RowFilter {
 
   // Go to a row of readings.
   void set_row(int64_t row) { readings_.set_row(row); }
+  void set_pose(int64_t row) { readings_.set_pose(row); }
   const double (&centroid() const)[3] { return readings_.centroid; }
 
   void load(const magloc_sources &sources, int64_t item) {
@@ -119,7 +120,9 @@ class RowFilter {
   // Update the state by the row's readings: Gauss and Newton's steps, each halved until it lowers the cost enough. The
   // prediction may bend as the readings do, along what they tell in more than a share of its standard deviation; there
   // must be no nuisances then.
-  void update(const magloc_convergence &limits, bool bends = false, double least_share = 0.0) {
+  // Misfit and Q at the prediction are stored where they are wanted.
+  void update(const magloc_convergence &limits, bool bends = false, double least_share = 0.0, double *misfit = nullptr,
+              double *Q = nullptr) {
     begin_update();
     double length = 1.0, gain = 0.0, cost = misfit_at(zeta_, misfit_);
     if (bends) {
@@ -129,6 +132,7 @@ class RowFilter {
     bool is_stale = true;
     for (iterations = 0;; ++iterations) {
       if (is_stale) gain = linearise(), length = 1.0;
+      if (Q && iterations == 0) store_linearisation(misfit, Q);
       converged = gain < limits.tolerance * limits.tolerance;
       if (converged || iterations >= limits.max_iterations) break;
       for (int64_t i = 0; i < d_; ++i) trial_[i] = zeta_[i] + length * step_[i < seen_ ? e_ + i : i - seen_];
@@ -147,8 +151,16 @@ class RowFilter {
     for (int64_t i = 0; !bends && i < d_; ++i) log_evidence -= logarithm(triangle_[i][i]);
   }
 
-  // After an update: chi-square (n_sensors) that free readings of each sensor would explain.
-  void fill_sensor_chi2(double followed, double *chi2_of_sensors) const {
+  // After a linearisation: the misfit (n_readings), and Q (d, n_readings): of a covariance I + J J^T of readings, with
+  // errors of the state as J makes of them, the inverse is I - Q^T Q.
+  void store_linearisation(double *misfit, double *Q) const {
+    __builtin_memcpy(misfit, misfit_, given_.n_readings * sizeof(double));
+    columns_.store(Q, d_, given_.n_readings);
+  }
+
+  // After an update: residuals (n_sensors, 3) of each sensor's channels, of unit covariance. Their square is the
+  // chi-square that free readings of the sensor would explain.
+  void fill_standardised(double followed, double *residuals) const {
     for (int64_t s = 0, c = 0; s < given_.n_sensors; ++s) {
       int64_t n = 0;
       double square[3][3] = {}, left[3] = {}, share[3];
@@ -166,9 +178,10 @@ class RowFilter {
         }
       for (int64_t i = n; i < 3; ++i) square[i][i] = 1.0;
       const Ldl<double, 3> factors(square, 1e-9);
-      double explained[3];
-      factors.solve(left, explained);
-      chi2_of_sensors[s] = dot(left, explained);
+      for (int64_t i = 0; i < 3; ++i) {
+        for (int64_t j = 0; j < i; ++j) left[i] -= factors.l[i][j] * left[j];
+        residuals[3 * s + i] = left[i] * square_root(factors.inverse[i]);
+      }
       c += n;
     }
   }

@@ -15,8 +15,9 @@ class RowReadings {
   // What channels read, and its derivatives by the sources; the same of the readings.
   Padded<T> channels_{space_, n_numbers_, n_}, numbers_{space_, n_numbers_, k_};
   double *const sources_ = space_.take<double>(6 * n_sources_);  // in the array's axes, moments times mu_0/4pi
-  bool has_modulus_ = false;
-  int64_t row_ = 0;
+  int64_t *const first_ = space_.take<int64_t>(n_), *const end_ = space_.take<int64_t>(n_);
+  bool has_modulus_ = false, is_sparse_ = false;
+  int64_t row_ = -1;  // whose readings are loaded
 
  public:
   Padded<T> effect{space_, p_.n_nuisances, k_};  // of nuisances on the readings
@@ -49,16 +50,20 @@ class RowReadings {
     }
   }
 
-  void set_row(int64_t row) {
-    const bool is_first = !rotation;
-    if (is_first) begin();
-    const int64_t e = p_.n_nuisances;
-    measured.load(p_.readings + k_ * row, 1, k_);
+  // Go to the pose of a row, of which no readings are predicted.
+  void set_pose(int64_t row) {
     rotation = p_.rotations + 9 * row;
     for (int i = 0; i < 3; ++i) {
       centroid[i] = p_.origins[3 * row + i];
       for (int j = 0; j < 3; ++j) centroid[i] += rotation[3 * i + j] * p_.array_centroid[j];
     }
+  }
+  void set_row(int64_t row) {
+    const bool is_first = row_ < 0;
+    if (is_first) begin();
+    const int64_t e = p_.n_nuisances;
+    measured.load(p_.readings + k_ * row, 1, k_);
+    set_pose(row);
     if (is_first || p_.ambient_of_row[row] != p_.ambient_of_row[row_]) {
       const double *fields = p_.ambients + 3 * p_.n_sensors * p_.ambient_of_row[row];
       for (int64_t c = 0; c < n_; ++c)
@@ -68,6 +73,7 @@ class RowReadings {
       transform_.clear(n_);
       for (int64_t c = 0; c < n_; ++c)
         for (int64_t j = 0; j < k_; ++j) transform_[c][j] = p_.transforms[(k_ * p_.transform_of_row[row] + j) * n_ + c];
+      find_entries();
     }
     if (e && (is_first || p_.effect_of_row[row] != p_.effect_of_row[row_])) {
       effect.clear(e);
@@ -112,11 +118,34 @@ class RowReadings {
       }
       channels_.lanes(0)[r] = value;
     }
-    for (int64_t i = 0; i < (with_slopes ? n_numbers_ : 1); ++i)
-      set_rows(numbers_.lanes(i), {channels_[i]}, transform_, n_);
+    const int64_t n = with_slopes ? n_numbers_ : 1;
+    if (!is_sparse_) {
+      for (int64_t i = 0; i < n; ++i) set_rows(numbers_.lanes(i), {channels_[i]}, transform_, n_);
+      return;
+    }
+    numbers_.clear(n);
+    for (int64_t c = 0; c < n_; ++c)
+      for (int64_t r = first_[c]; r < end_[c]; ++r) {
+        const T share = transform_.lanes(c)[r];
+        for (int64_t i = 0; i < n; ++i) numbers_.lanes(i)[r] += channels_[i][c] * share;
+      }
   }
 
  private:
+  // Registers that each channel adds to. They are few where channels are whitened sensor by sensor.
+  void find_entries() {
+    int64_t sum = 0;
+    for (int64_t c = 0; c < n_; ++c) {
+      first_[c] = k_, end_[c] = 0;
+      for (int64_t j = 0; j < k_; ++j)
+        if (transform_[c][j] != 0.0) {
+          if (end_[c] == 0) first_[c] = j / n_lanes<T>;
+          end_[c] = j / n_lanes<T> + 1;
+        }
+      sum += maximum(end_[c] - first_[c], (int64_t)0);
+    }
+    is_sparse_ = 4 * sum < n_ * width();
+  }
   MAGLOC_INLINE Ray<T> ray_to(int64_t r, int64_t k) const {
     T d[3];
     for (int i = 0; i < 3; ++i) d[i] = place_.lanes(i)[r] - sources_[6 * k + i];
