@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -36,7 +37,7 @@ class Gaussians:
         Roots of the covariances, in the charts about the means.
     n_sources, n_nuisances : int
     power : int
-        Power of the range with which readings fall: 4, or 3 where a common field is a nuisance.
+        Power of the range with which moments grow along the chart: 4 as differences fall, or 0.
     firm : float
         Share of a moment that is open, below which its strength and direction are its coordinates.
     """
@@ -110,10 +111,10 @@ class RowUpdates:
 
 
 @cache
-def convergence(most: int = MOST_ITERATIONS) -> core.Problem:
+def convergence(most: int = MOST_ITERATIONS, tolerance: float = TOLERANCE) -> core.Problem:
     """Return when an iterated update ends, at the latest after some trials."""
     return core.problem(
-        "convergence", tolerance=TOLERANCE, least_gain=LEAST_GAIN, rounding=ROUNDING, max_iterations=most
+        "convergence", tolerance=tolerance, least_gain=LEAST_GAIN, rounding=ROUNDING, max_iterations=most
     )
 
 
@@ -190,6 +191,7 @@ def update(
     innovation: bool = False,
     linearisations: bool = False,
     most: int = MOST_ITERATIONS,
+    tolerance: float = TOLERANCE,
 ) -> RowUpdates:
     """Return Gaussians after a row's readings, each by an iterated update of its own.
 
@@ -206,6 +208,8 @@ def update(
         Whether to find the whitened innovations, and the optional attributes of the result.
     most : int
         Number of trials after which the iteration ends.
+    tolerance : float
+        Length of the next step, in standard deviations, below which it ends.
     """
     if bends is not None and before.n_nuisances:
         raise ValueError("Predictions of nuisances do not bend.")
@@ -221,7 +225,7 @@ def update(
         before=before.problem,
         after=after.problem,
         rows=rows.problem,
-        convergence=convergence(most),
+        convergence=convergence(most, tolerance),
         row=row,
         bends=None if bends is None else bends.astype(np.uint8),
         least_share=LEAST_SHARE,
@@ -304,7 +308,8 @@ def smooth(trajectories: FloatArray, prior: Gaussians, steps: core.Problem, rows
     trajectories : ndarray, shape (C, n_rows, n)
         States of all sources, without nuisances.
     prior : Gaussians
-        State before the first row, in the charts about the trajectories: its means are offsets.
+        State before the first row, in the charts about the trajectories: its means are offsets. Moments are firm in
+        all charts if `firm` is infinite, else in none.
     steps : core.Problem
         Steps of the motion, from :func:`steps_problem`.
     rows : Rows
@@ -315,7 +320,7 @@ def smooth(trajectories: FloatArray, prior: Gaussians, steps: core.Problem, rows
         "smoothing",
         n_rows=trajectories.shape[1],
         trajectories=np.ascontiguousarray(trajectories),
-        prior=replace(prior, firm=0.0).problem,
+        prior=replace(prior, firm=prior.firm if math.isinf(prior.firm) else 0.0).problem,
         rows=rows.problem,
         motion=steps,
         offsets=offsets,

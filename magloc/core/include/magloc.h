@@ -494,7 +494,7 @@ typedef struct {
    the chart. */
 typedef struct {
   int64_t n_sources, n_states, n_nuisances;
-  int64_t power; /* of the range, 3 or 4, with which readings fall */
+  int64_t power; /* of the range, 0 or 4, with which moments grow along the chart */
   double firm;   /* share of a moment that is open, below which strength and direction are its coordinates */
   double *x;     /* (n, N) means, N = n_sources n_states + n_nuisances */
   double *roots; /* (n, N, N) of the covariances in the charts about them */

@@ -54,6 +54,8 @@ class Chart:
         Whose moment is moved by its strength and its direction: see :meth:`firmly`.
     n_pose : int
         How many of the last numbers of the states are errors of the array's pose.
+    power : float
+        Power of the range with which moments grow along the chart.
     """
 
     x: FloatArray
@@ -62,6 +64,7 @@ class Chart:
     E: FloatArray
     firm: BoolArray
     n_pose: int = 0
+    power: float = MOMENT_POWER
 
     @classmethod
     def at(cls, x: FloatArray, centroid_m: FloatArray, radius_m: float, n_pose: int = 0) -> Chart:
@@ -80,13 +83,14 @@ class Chart:
         The derivative at e = 0 is the same. A moment that stays what it is while its range wanders is a straight line
         here, while :math:`r'^4 (\mu + \delta\mu)` loses the square of each step.
         """
-        size = np.linalg.norm(self.x[..., 3:6], axis=-1) / self.length**MOMENT_POWER
+        size = np.linalg.norm(self.x[..., 3:6], axis=-1) / self.length**self.power
         sigma = np.sqrt(np.sum(S[..., 3:6, :] ** 2, axis=(-2, -1)))
         return replace(self, firm=sigma < FIRM * size)
 
     def take(self, index: IntArray | BoolArray) -> Chart:
         """About some of the states."""
-        return Chart(self.x[index], self.length[index], self.u[index], self.E[index], self.firm[index], self.n_pose)
+        own = self.x[index], self.length[index], self.u[index], self.E[index], self.firm[index]
+        return Chart(*own, self.n_pose, self.power)
 
     @property
     def has_velocity(self) -> bool:
@@ -110,10 +114,10 @@ class Chart:
         reach = growth * self.length
         L[..., :3, 0] = reach[..., None] * u
         L[..., :3, 1:3] = reach[..., None, None] * slope
-        L[..., 3:6, 0] = MOMENT_POWER * x[..., 3:6]
-        L[..., 3:6, 3:6] = (reach**MOMENT_POWER)[..., None, None] * np.eye(3)
+        L[..., 3:6, 0] = self.power * x[..., 3:6]
+        L[..., 3:6, 3:6] = (reach**self.power)[..., None, None] * np.eye(3)
         if self.firm.any():
-            L[self.firm, 3:6, 3:6] = by_moment * (reach[self.firm] ** MOMENT_POWER)[..., None, None]
+            L[self.firm, 3:6, 3:6] = by_moment * (reach[self.firm] ** self.power)[..., None, None]
         if self.has_velocity:
             L[..., _VELOCITY, 0] = x[..., _VELOCITY]
             L[..., _VELOCITY, _VELOCITY] = reach[..., None, None] * np.eye(3)
@@ -128,7 +132,7 @@ class Chart:
         slope = (self.E - u[..., :, None] * (u[..., None, :] @ self.E)) / norm[..., None, None]
         x = self.x + e
         x[..., :3] = self.x[..., :3] + length[..., None] * (growth[..., None] * u - self.u)
-        scale, unit = growth**MOMENT_POWER, length**MOMENT_POWER
+        scale, unit = growth**self.power, length**self.power
         x[..., 3:6] = scale[..., None] * (self.x[..., 3:6] + unit[..., None] * e[..., 3:6])
         by_moment = np.zeros((0, 3, 3))
         if self.firm.any():
@@ -144,7 +148,7 @@ class Chart:
         m = self.x[self.firm, 3:6]
         size = np.linalg.norm(m, axis=-1, keepdims=True)
         along = m / size
-        change = (self.length[self.firm] ** MOMENT_POWER)[:, None] * e[self.firm, 3:6] / size
+        change = (self.length[self.firm] ** self.power)[:, None] * e[self.firm, 3:6] / size
         nu = np.sum(along * change, axis=-1, keepdims=True)
         b = along + change - nu * along
         norm = np.linalg.norm(b, axis=-1, keepdims=True)
@@ -170,11 +174,11 @@ class Chart:
         e[..., 0] = np.log(r / self.length)
         e[..., 1:3] = (direction[..., None, :] @ self.E)[..., 0, :] / cosine[..., None]
         growth = (r / self.length)[..., None]
-        moment = x[..., 3:6] / growth**MOMENT_POWER
+        moment = x[..., 3:6] / growth**self.power
         change = moment - self.x[..., 3:6]
         if self.firm.any():
             change[self.firm] = _change_of_strength(self.x[self.firm, 3:6], moment[self.firm])
-        e[..., 3:6] = change / length**MOMENT_POWER
+        e[..., 3:6] = change / length**self.power
         if self.has_velocity:
             e[..., _VELOCITY] = (x[..., _VELOCITY] / growth - self.x[..., _VELOCITY]) / length
         return e
@@ -184,10 +188,10 @@ class Chart:
         n = self.x.shape[-1]
         inverse = np.zeros((*self.x.shape, n))
         inverse[..., np.arange(n), np.arange(n)] = 1.0
-        length, unit = self.length[..., None], self.length**MOMENT_POWER
+        length, unit = self.length[..., None], self.length**self.power
         inverse[..., 0, :3] = self.u / length
         inverse[..., 1:3, :3] = np.swapaxes(self.E, -1, -2) / length[..., None]
-        by_range = -MOMENT_POWER * self.x[..., 3:6] / unit[..., None]
+        by_range = -self.power * self.x[..., 3:6] / unit[..., None]
         inverse[..., 3:6, :3] = by_range[..., :, None] * inverse[..., None, 0, :3]
         inverse[..., 3:6, 3:6] = np.eye(3) / unit[..., None, None]
         if self.has_velocity:

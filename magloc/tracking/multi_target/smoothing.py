@@ -16,14 +16,14 @@ from magloc.tracking import row_filter
 from magloc.tracking.chart.coordinates import Chart
 from magloc.tracking.multi_target.measurement import JointRow, stacked
 from magloc.tracking.multi_target.motion import stepped, steps_problem
-from magloc.tracking.multi_target.state import N_COMMON, N_OF_SOURCE, N_SEEN, JointState
+from magloc.tracking.multi_target.state import N_COMMON, N_OF_SOURCE, N_SEEN, JointState, chart_at
 from magloc.tracking.row_filter import Gaussians
 
 MOST_ROWS = 90
 """Rows that are kept of a track."""
 # Passes, and the change of the last state, in its standard deviations, below which the trajectory stays.
-_MOST_PASSES = 12
-_TOLERANCE = 0.1
+_MOST_PASSES = 20
+_TOLERANCE = 0.05
 # Longest step of the log-range, the direction, and the moment over its size in a pass.
 _LONGEST = 0.5
 
@@ -75,7 +75,7 @@ class YoungTrack:
         centroids = np.stack([row.centroid_m for row, _ in self.rows])
         track = np.stack([state.sources for state in self.states])
         for _ in range(_MOST_PASSES):
-            chart = Chart.at(track, centroids[:, None], self.prior.radius_m)
+            chart = chart_at(track, centroids[:, None], self.prior.radius_m)
             with np.errstate(all="ignore"):  # a trajectory may lead out of double precision
                 prior = self._prior_about(chart.take(np.array(0)))
                 found = row_filter.smooth(track.reshape(1, len(track), -1), prior, steps, rows)
@@ -83,7 +83,7 @@ class YoungTrack:
             if not (np.isfinite(found.log_evidence[0]) and np.isfinite(offsets).all() and np.isfinite(S).all()):
                 return None
             sizes = np.abs(offsets[..., :N_SEEN])
-            sizes[..., 3:] *= (chart.length**4 / np.linalg.norm(track[..., 3:N_SEEN], axis=-1))[..., None]
+            sizes[..., 3:] /= np.linalg.norm(track[..., 3:N_SEEN], axis=-1, keepdims=True)
             share = min(1.0, _LONGEST / max(float(sizes.max(initial=0.0)), 1e-300))
             sigma = np.linalg.norm(S[:-N_COMMON], axis=1)
             change = np.abs(share * offsets[-1].ravel()) / sigma

@@ -23,6 +23,8 @@ N_SEEN = 6
 """Numbers of a source that a row sees: position and moment."""
 N_OF_SOURCE = 12
 N_COMMON = 3
+_POWER = 0
+"""Power of the range with which moments grow along the chart: near an array, strengths are known apart from ranges."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +81,7 @@ class JointState:
     @property
     def gaussians(self) -> Gaussians:
         """The state as the only one that a kernel is given."""
-        return Gaussians(self.x[None], self.S[None], self.n_sources, N_COMMON, firm=math.inf)
+        return Gaussians(self.x[None], self.S[None], self.n_sources, N_COMMON, _POWER, math.inf)
 
     def after(self, found: Gaussians, centroid_m: FloatArray) -> JointState:
         """Return the state that a kernel has found."""
@@ -88,8 +90,7 @@ class JointState:
     @cached_property
     def chart(self) -> Chart:
         """Charts (K,) about the sources."""
-        chart = Chart.at(self.sources, self.centroid_m, self.radius_m)
-        return replace(chart, firm=np.ones(self.n_sources, dtype=bool))
+        return chart_at(self.sources, self.centroid_m, self.radius_m)
 
     @cached_property
     def _roots(self) -> FloatArray:
@@ -140,7 +141,7 @@ class JointState:
         """Return the state with other sources (j, 3), last, at rest: roots (j, 12, 12) of Cartesian covariances."""
         n, j = len(self.x) - N_COMMON, len(position_m)
         new = np.concatenate([position_m, moment_Am2, np.zeros((j, N_OF_SOURCE - N_SEEN))], axis=1)
-        in_chart = Chart.at(new, self.centroid_m, self.radius_m).inverse_jacobian() @ roots
+        in_chart = chart_at(new, self.centroid_m, self.radius_m).inverse_jacobian() @ roots
         x = np.concatenate([self.x[:n], new.ravel(), self.common_T])
         S = np.zeros((len(x), len(x)))
         S[:n, : n + N_COMMON], S[-N_COMMON:, : n + N_COMMON] = self.S[:n], self.S[n:]
@@ -162,6 +163,12 @@ class JointState:
         sources, L = self.chart.linearised(error[:n].reshape(K, N_OF_SOURCE))
         x = np.concatenate([sources.ravel(), self.common_T + error[n:]])
         after = replace(self, x=x, S=S.copy())
-        turn = Chart.at(sources, self.centroid_m, self.radius_m).inverse_jacobian() @ L
+        turn = chart_at(sources, self.centroid_m, self.radius_m).inverse_jacobian() @ L
         after.S[:n] = (turn @ S[:n].reshape(K, N_OF_SOURCE, len(S))).reshape(n, len(S))
         return after
+
+
+def chart_at(sources: FloatArray, centroid_m: FloatArray, radius_m: float) -> Chart:
+    """Return the charts about sources (..., 12)."""
+    firm = np.ones(sources.shape[:-1], dtype=bool)
+    return replace(Chart.at(sources, centroid_m, radius_m), firm=firm, power=_POWER)

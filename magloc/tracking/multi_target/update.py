@@ -13,6 +13,8 @@ from magloc.tracking.multi_target.state import N_COMMON, N_OF_SOURCE, JointState
 
 MOST_TRIALS = 60
 """Steps of an update that are tried."""
+_TOLERANCE = 0.1
+"""Step, in standard deviations, below which an update ends: what it would gain is no more than 0.01 of χ²."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +66,7 @@ class JointUpdate:
 
 def joint_update(prior: JointState, row: JointRow, most: int = MOST_TRIALS) -> JointUpdate:
     """Return a predicted state after a row's readings."""
-    found = row_filter.update(prior.gaussians, row.compiled, linearisations=True, most=most)
+    found = row_filter.update(prior.gaussians, row.compiled, linearisations=True, most=most, tolerance=_TOLERANCE)
     assert found.misfits is not None
     assert found.projectors is not None
     assert found.standardised is not None

@@ -82,7 +82,8 @@ class RowFilter {
       before.move(zero, there_[0]);
       motion.take(state, step, K_ * item + k);
       __builtin_memcpy(state, to ? to + ns_ * k : motion.x, ns_ * sizeof(double));
-      const SourceChart after(state, ns_, p_.power, readings_.centroid, given_.radius);
+      SourceChart after(state, ns_, p_.power, readings_.centroid, given_.radius);
+      after.judge_moment(0.0, p_.firm);
       const Padded<T> A = transition.from(ns_ * k);
       A.clear(ns_);
       for (int64_t i = 0; i < ns_; ++i) A[i][i] = 1.0;

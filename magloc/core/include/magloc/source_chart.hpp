@@ -19,11 +19,11 @@ struct ChartedState {
 // Coordinates about a state.
 class SourceChart {
   const double *x_;
-  int64_t n_, power_;  // length of the state; power of the range with which readings fall
+  int64_t n_, power_;  // length of the state; power of the range with which the moment grows, 0 or 4
   double tangent_[2][3], direction_[3], length_, unit_, strength_;  // unit_: length^power
   bool firm_ = false;  // whether strength and direction of the moment are coordinates
 
-  double to_power(double x) const { return power_ == 4 ? (x * x) * (x * x) : x * x * x; }
+  double to_power(double x) const { return power_ == 4 ? (x * x) * (x * x) : 1.0; }
 
  public:
   // The chart about a state of n numbers, which must not go away, as seen from the sensors' centroid.
@@ -63,7 +63,7 @@ class SourceChart {
     for (int64_t i = n_measured; i < n_; ++i) there.x[i] = i < 9 ? growth * (x_[i] + length_ * e[i]) : x_[i] + e[i];
   }
 
-  // The coordinates of a state: the inverse of `move` where the moment is not firm.
+  // The coordinates of a state: the inverse of `move`.
   void fill_coordinates(const double *state, double *e) const {
     double offset[3];
     for (int i = 0; i < 3; ++i) offset[i] = state[i] - x_[i] + length_ * direction_[i];
@@ -75,6 +75,7 @@ class SourceChart {
       const double rest = state[i] / (i < n_measured ? to_power(growth) : i < 9 ? growth : 1.0) - x_[i];
       e[i] = rest / (i < n_measured ? unit_ : i < 9 ? length_ : 1.0);
     }
+    if (firm_) fill_turn(state + 3, to_power(growth), e + 3);
   }
 
   // Turn small changes of the coordinates into those of the state, in place: rows of `width` registers for position and
@@ -115,6 +116,17 @@ class SourceChart {
   }
 
  private:
+  // The coordinates of a firm moment, seen from where the range has grown by the scale.
+  void fill_turn(const double *moment, double scale, double *e) const {
+    const double size = square_root(moment[0] * moment[0] + moment[1] * moment[1] + moment[2] * moment[2]);
+    const double product = moment[0] * x_[3] + moment[1] * x_[4] + moment[2] * x_[5];
+    const double cosine = maximum(product / (size * strength_), least_cosine);
+    const double stretch = logarithm(size / (scale * strength_));
+    for (int i = 0; i < 3; ++i) {
+      const double along = x_[3 + i] / strength_, across = moment[i] / (size * cosine) - along;
+      e[i] = strength_ / unit_ * (across + stretch * along);
+    }
+  }
   // `scale`: the power of the growth of the range.
   void move_moment(const double *e, double scale, ChartedState &there) const {
     if (!firm_) {

@@ -63,7 +63,7 @@ def test_strength_and_rate_of_turn():
     weak, strong = (replace(MOTION, strength_change=change) for change in (1e-9, 0.2))
     after = predicted(state, dt_s, weak)
     more = covariance(predicted(state, dt_s, strong)) - covariance(after)
-    change = 0.2 * np.sqrt(dt_s) * after.moment_Am2[0] / after.chart.length[0] ** 4
+    change = 0.2 * np.sqrt(dt_s) * after.moment_Am2[0]
     np.testing.assert_allclose(more[3:6, 3:6], np.outer(change, change), rtol=1e-6, atol=1e-9 * change @ change)
     np.testing.assert_allclose(after.sources[0, 6:9], np.exp(-dt_s / 1.5) * state.sources[0, 6:9])
     np.testing.assert_allclose(after.sources[0, 9:], np.exp(-dt_s / 0.4) * state.sources[0, 9:])

@@ -18,8 +18,8 @@ def state_of(k: int, seed: int = 0) -> JointState:
     rng = np.random.default_rng(seed)
     n = 12 * k + 3
     state = JointState(rng.normal(size=n), 0.003 * rng.normal(size=(n, n)), CENTROID_M, RADIUS_M)
-    for source, length, rows in zip(state.sources, state.chart.length, state.S[:-3].reshape(k, 12, n), strict=True):
-        rows[3:6] *= np.linalg.norm(source[3:6]) / length**4
+    for source, rows in zip(state.sources, state.S[:-3].reshape(k, 12, n), strict=True):
+        rows[3:6] *= np.linalg.norm(source[3:6])
     return state
 
 

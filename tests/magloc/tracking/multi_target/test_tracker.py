@@ -143,7 +143,8 @@ class TestSlidesIn:
     def test_what_is_far_is_a_gradient(self):
         """A source a hundred times as strong as another, or none: the others stay."""
         strengths = np.array([0.05, 4.9, 5.1])
-        state = JointState.empty(np.zeros(3), 1e-6).with_sources(np.eye(3), strengths[:, None] * np.eye(3), np.eye(12))
+        empty = JointState.empty(np.zeros(3), 1e-6, BOARD.centroid, BOARD.circumradius)
+        state = empty.with_sources(np.eye(3), strengths[:, None] * np.eye(3), np.stack([np.eye(12)] * 3))
         assert far_sources(state) == [2]
         assert far_sources(state.without(2)) == far_sources(state.common_alone) == []
 
