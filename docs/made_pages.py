@@ -30,6 +30,7 @@ PICTURES = {
     "notebook-01-first-fix.png": ["magloc.locate", "magloc.Fixes", "magloc.Fix", "magloc.plots.fixes"],
     "notebook-09-several-sources.png": ["magloc.Solution"],
     "track-weaving.png": ["magloc.track", "magloc.Track", "magloc.Tracker", "magloc.plots.track"],
+    "track-three-magnets.png": ["magloc.track_sources", "magloc.SourcesTrack", "magloc.SourcesTracker"],
     "notebook-08-calibration.png": ["magloc.calibrate", "magloc.Calibration", "magloc.plots.calibration"],
     "bounds-reach.png": ["magloc.cramer_rao_bounds", "magloc.Bounds", "magloc.bound_map", "magloc.plots.bound_reach"],
     "design-half-space.png": ["magloc.design_array", "magloc.Design"],
