@@ -84,7 +84,8 @@ EXPLAINED = {
     " sims.experiments.sky_run sims.experiments.identified_files sims.experiments.fused_runs"
     " sims.experiments.fused_record sims.experiments.zeros_run",
     "tracking": "magloc.track magloc.Track magloc.Tracker magloc.RandomWalk magloc.OrnsteinUhlenbeck"
-    " magloc.CoordinatedTurn magloc.plots.track magloc.plots.consistency",
+    " magloc.CoordinatedTurn magloc.FreeMotion magloc.track_sources magloc.SourcesTrack magloc.SourcesTracker"
+    " magloc.subtract_rest magloc.plots.track magloc.plots.consistency",
 }
 # Other pages that a function's page names at most of each folder, in this order.
 MOST_PAGES = {"guide": 3, "theory": 2, "gallery": 2}
