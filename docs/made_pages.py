@@ -30,6 +30,7 @@ PICTURES = {
     "notebook-01-first-fix.png": ["magloc.locate", "magloc.Fixes", "magloc.Fix", "magloc.plots.fixes"],
     "notebook-09-several-sources.png": ["magloc.Solution"],
     "track-weaving.png": ["magloc.track", "magloc.Track", "magloc.Tracker", "magloc.plots.track"],
+    "track-three-magnets.png": ["magloc.track_sources", "magloc.SourcesTrack", "magloc.SourcesTracker"],
     "notebook-08-calibration.png": ["magloc.calibrate", "magloc.Calibration", "magloc.plots.calibration"],
     "bounds-reach.png": ["magloc.cramer_rao_bounds", "magloc.Bounds", "magloc.bound_map", "magloc.plots.bound_reach"],
     "design-half-space.png": ["magloc.design_array", "magloc.Design"],
@@ -83,7 +84,8 @@ EXPLAINED = {
     " sims.experiments.sky_run sims.experiments.identified_files sims.experiments.fused_runs"
     " sims.experiments.fused_record sims.experiments.zeros_run",
     "tracking": "magloc.track magloc.Track magloc.Tracker magloc.RandomWalk magloc.OrnsteinUhlenbeck"
-    " magloc.CoordinatedTurn magloc.plots.track magloc.plots.consistency",
+    " magloc.CoordinatedTurn magloc.FreeMotion magloc.track_sources magloc.SourcesTrack magloc.SourcesTracker"
+    " magloc.subtract_rest magloc.plots.track magloc.plots.consistency",
 }
 # Other pages that a function's page names at most of each folder, in this order.
 MOST_PAGES = {"guide": 3, "theory": 2, "gallery": 2}

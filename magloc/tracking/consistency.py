@@ -1,4 +1,4 @@
-r"""How true a track is: its errors against what it claims, and against what is possible.
+r"""Consistency of a track: its errors beside its covariance and beside the posterior Cramér-Rao bound.
 
 The normalised estimation error squared, NEES, of an estimate of n numbers with covariance P is
 :math:`e^T P^{-1} e`; over independent rows its mean times their number is a χ² of n numbers each. The posterior
@@ -28,34 +28,32 @@ from magloc.tracking.tracker import Tracker
 
 @dataclass(frozen=True, eq=False)
 class Consistency:
-    """A track against the truth.
+    """Errors of a track against a truth.
 
     Attributes
     ----------
     rows, tracked_rows : int
-        Rows with truth, and those of them that have a position.
+        Number of rows with truth, and of those that have a position too.
     position_rms_m : float
         Root of the mean squared distance from the truth.
     position_bound_m : float
-        The same of the posterior Cramér-Rao bound, over the same rows: that of a filter, or of a smoother if the track
-        is smoothed. NaN where the true moment is not known.
+        Root mean square of the posterior Cramér-Rao bound over the same rows, for a filter or, if the track is
+        smoothed, a smoother. NaN if the true moment is not known.
     nees_per_dimension : float
-        Mean NEES over the number of its dimensions: 1 if the covariance is right. It is counted in coordinates in
-        which an uncertain one is Gaussian, see :func:`nees_of`.
+        Mean NEES over its number of dimensions: 1 if the covariance is right. See :func:`nees_of` for the coordinates.
     nees_bounds : tuple of 2 floats
-        Two-sided 99 % bounds of it for independent rows. A track's rows are not independent: over one record it may
-        well lie outside.
+        Two-sided 99 % bounds of `nees_per_dimension` for independent rows. Rows of a track are not independent: one
+        record may well lie outside.
     nis_per_dimension : float
         Mean NIS over its degrees of freedom.
     nis_bounds : tuple of 2 floats
-        Two-sided 99 % bounds of it; the innovations of a right filter are independent.
+        Two-sided 99 % bounds of `nis_per_dimension`; the innovations of a right filter are independent.
     nees, nees_dof : ndarray, shape (n,)
-        NEES of every row, NaN where the source is not tracked or nothing is known of the truth, and the number of its
-        dimensions.
+        NEES of each row and its number of dimensions. NaN without a track or a truth.
     true_position_m : ndarray, shape (n, 3)
         NaN where it is not known.
     bound_m : ndarray, shape (n,), optional
-        The posterior Cramér-Rao bound of every row.
+        Posterior Cramér-Rao bound of each row.
     """
 
     rows: int
@@ -77,7 +75,7 @@ class Consistency:
         return {key: value for key, value in vars(self).items() if not isinstance(value, np.ndarray | None)}
 
     def lines(self) -> list[str]:
-        """Return errors against the truth, and what they should be."""
+        """Return lines that state the errors and their expected values."""
         lines = [
             f"against the truth, {self.tracked_rows} of {self.rows} rows answered:",
             f"  position rms {self.position_rms_m:.4g} m",
@@ -92,7 +90,7 @@ class Consistency:
 
 
 def consistency_lines(nees: float, nis: float, nis_bounds: tuple[float, float]) -> list[str]:
-    """Mean NEES and NIS per dimension of a filter, and what they should be."""
+    """Return lines that state the mean NEES and NIS per dimension and their expected values."""
     low, high = nis_bounds
     return [
         # Errors of neighbouring rows are alike: how far from 1 one record may be by chance, many seeds tell.
@@ -109,7 +107,7 @@ def consistency(
     moment_Am2: FloatArray | None,
     bound_m: FloatArray | None = None,
 ) -> Consistency:
-    """Return errors of a track; true coordinates (n, 3) are NaN where they are not known, the bound is of every row."""
+    """Return the errors of a track against true positions and moments (n, 3), NaN where not known."""
     error = stacked(points, "position_m", 3) - position_m
     answered = np.isfinite(error).any(axis=1)
     moments = np.full_like(position_m, np.nan) if moment_Am2 is None else moment_Am2
@@ -146,11 +144,11 @@ def mean_nis(points: Sequence[TrackPoint]) -> tuple[float, tuple[float, float]]:
 
 
 def nees_of(point: TrackPoint, truth: FloatArray, measurement: RowMeasurement) -> tuple[float, int]:
-    """Normalised estimation error squared of a point, and how many numbers it is of.
+    """Return the normalised estimation error squared of a point, and its number of dimensions.
 
-    It is that of what is known of the truth (6,), NaN elsewhere. If all of it is, the error is counted in the
-    coordinates in which it is Gaussian: those of :mod:`magloc.tracking.measurement`, or, of a young track, those of the
-    chart, bent as the row's readings bend.
+    The truth (6,) is NaN where it is not known, and these numbers do not count. With all six known, the error counts
+    in coordinates in which it is Gaussian: those of the chart, bent as the row's readings bend, or, without a mixture,
+    those of :mod:`magloc.tracking.measurement`.
     """
     if point.position_m is None or point.moment_Am2 is None or point.covariance is None:
         return math.nan, 0
@@ -174,7 +172,7 @@ def nees_of(point: TrackPoint, truth: FloatArray, measurement: RowMeasurement) -
 
 
 def _young_nees(source: Mixture, truth: FloatArray, row: ChartRow) -> tuple[float, int]:
-    """That of a single component, whose moment may not be known."""
+    """Return NEES and dimensions of a single component, whose true moment may not be known."""
     known = np.isfinite(truth)
     error = source.chart.coordinates(np.where(known, truth, source.x[0])[None])[0]
     if known.all():
@@ -184,7 +182,7 @@ def _young_nees(source: Mixture, truth: FloatArray, row: ChartRow) -> tuple[floa
 
 
 def standard_error(source: Mixture, truth: FloatArray, row: ChartRow) -> FloatArray:
-    """Error (6,) of a single component in standard numbers, bent as a row's readings bend."""
+    """Return the error (6,) of a component in standard numbers, bent as a row's readings bend."""
     L = source.chart.jacobian(np.zeros((1, truth.size)))[0]
     J = row.source_jacobian(source.x[0]) @ L @ source.S[0]
     standard = np.linalg.solve(source.S[0], source.chart.coordinates(truth[None])[0])

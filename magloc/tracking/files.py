@@ -1,4 +1,4 @@
-"""Tracks as a table, CSV, JSON, GeoJSON, KML and xarray, of one source or of several."""
+"""Tables, CSV, JSON, GeoJSON, KML and xarray of tracks of one source or several."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ _COLUMNS = {
     "position_m": (("axis",), "m", "position of the source"),
     "moment_Am2": (("axis",), "A m2", "magnetic moment of the source"),
     "covariance": (("component", "component_"), "m, A m2", "covariance of (position, moment)"),
-    "estimability": (("component",), "1", "what the readings taught: 1 - sigma / sigma without any of them"),
+    "estimability": (("component",), "1", "estimability: 1 - sigma / sigma without any readings"),
     "nis": ((), "1", "normalised innovation squared"),
     "nis_dof": ((), "1", "degrees of freedom of nis"),
     "weight": ((), "1", "probability that the track is the right one"),
@@ -66,7 +66,7 @@ _COLUMNS = {
 
 
 def lines_of_track(points: Sequence[TrackPoint | SourcesPoint], *, most: int | None = None) -> list[str]:
-    """Return aligned lines: a header, then one for every source of every row, or of the first and last of `most`."""
+    """Return aligned lines: a header and one for each source of each row, or of at most `most` rows."""
     shown = list(points)
     if most is not None and len(shown) > most:
         shown = shown[: most // 2] + shown[-(most // 2) :]
@@ -101,10 +101,10 @@ def lines_of_track(points: Sequence[TrackPoint | SourcesPoint], *, most: int | N
 
 
 def json_entry(point: TrackPoint | SourcesPoint, *, single: bool = False) -> dict[str, object]:
-    """Return what ``--json`` and ``--jsonl`` print of one row; null where it has no answer.
+    """Return the JSON object of one row, with null where there is no answer.
 
-    Without a track the range is that of the row alone, and its solutions are the rivals. Of several sources the row has
-    a list of tracks; if there is at most a `single` one, the keys of one track stand beside it.
+    Without a track the range is that of the row alone, and its solutions are the rivals. A row of several sources has a
+    list of tracks; with `single`, for at most one source, the keys of that source stand beside it.
     """
     if isinstance(point, SourcesPoint):
         entry = json_entry(point.tracks[0]) if single and point.tracks else {}
@@ -114,12 +114,12 @@ def json_entry(point: TrackPoint | SourcesPoint, *, single: bool = False) -> dic
 
 
 def _values(of: object, keys: Sequence[str]) -> dict[str, object]:
-    """Return attributes by their keys in JSON."""
+    """Return attributes of an object by their keys in JSON."""
     return {key: getattr(of, key.replace("interval95", "interval")) for key in keys}
 
 
 def states_of(points: Sequence[TrackPoint]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Times (n,), positions, moments (n, 3) and covariances (n, 6, 6) of a track, NaN where there is none."""
+    """Return times (n,), positions, moments (n, 3) and covariances (n, 6, 6) of a track, NaN where there is none."""
     return (
         stacked(points, "time_s"),
         stacked(points, "position_m", 3),
@@ -131,7 +131,7 @@ def states_of(points: Sequence[TrackPoint]) -> tuple[FloatArray, FloatArray, Flo
 def columns_of_track(
     points: Sequence[TrackPoint], array_m: FloatArray | None = None, *, ids: Sequence[int] | None = None
 ) -> dict[str, Column]:
-    """Return columns of the CSV file of one source, or with `ids` of several.
+    """Return the columns of the CSV file of one source or, with `ids`, of several.
 
     ``array_m`` (n, 3): origin of the array's frame in every row.
     """
@@ -152,20 +152,20 @@ def columns_of_track(
 
 
 def json_of_track(points: Sequence[TrackPoint], consistency: Consistency | None) -> dict[str, object]:
-    """Return what ``magloc track --json`` prints of one source."""
+    """Return the JSON object of a track of one source."""
     entries: dict[str, object] = {"results": [json_entry(point) for point in points]}
     return entries if consistency is None else entries | {"consistency": consistency.json}
 
 
 def geojson_of_track(points: Sequence[TrackPoint], origin: Vector) -> dict[str, Any]:
-    """Return :meth:`magloc.tracking.track.TrackColumns.to_geojson`."""
+    """Return a track as GeoJSON, see :meth:`magloc.tracking.track.TrackColumns.to_geojson`."""
     lines, known = _on_the_map(points, origin)
     features = [feature("LineString", line, {"name": "track"}) for line in lines]
     return feature_collection([*features, *(_feature(point, origin) for _, point in known)])
 
 
 def kml_of_track(points: Sequence[TrackPoint], origin: Vector) -> str:
-    """Return :meth:`magloc.tracking.track.TrackColumns.to_kml`."""
+    """Return a track as KML, see :meth:`magloc.tracking.track.TrackColumns.to_kml`."""
     lines, known = _on_the_map(points, origin)
     ends = known[:: max(1, len(known) - 1)]  # the first and the last
     tracks = [placemark("track", "", line) for line in lines]
@@ -175,7 +175,7 @@ def kml_of_track(points: Sequence[TrackPoint], origin: Vector) -> str:
 def _on_the_map(
     points: Sequence[TrackPoint], origin: Vector
 ) -> tuple[list[list[list[float]]], list[tuple[str, TrackPoint]]]:
-    """Return the unbroken lines of a track and its points by name; no line and the best point of a source at rest.
+    """Return the unbroken lines of a track and its points by name; of a source at rest the best point alone.
 
     A line has two rows at least and no row without the source.
     """
@@ -194,11 +194,11 @@ def _on_the_map(
 
 
 def at_rest(points: Sequence[TrackPoint]) -> TrackPoint | None:
-    """The row whose position is best known, if that of no other row differs from it by more than both are uncertain.
+    """Return the row of the best known position if the source is at rest, otherwise None.
 
-    Each difference has a χ² of three degrees of freedom under its quantile of 0.999, the covariances added: errors of
-    neighbouring rows go together, which makes true differences smaller still. None for a single row, for a source
-    that moves, and without a track.
+    The source is at rest if χ² of each row's difference from the best one, with both covariances added, is below the
+    0.999 quantile (3 degrees of freedom). Errors of neighbouring rows go together, so that true differences are smaller
+    still. A single row gives None.
     """
     known = [point for point in points if point.is_on_track and point.covariance is not None]
     if len(known) < 2:
@@ -213,7 +213,7 @@ def at_rest(points: Sequence[TrackPoint]) -> TrackPoint | None:
 
 
 def _feature(point: TrackPoint, origin: Vector) -> dict[str, Any]:
-    """A row with a source as a point."""
+    """Return a row with a source as a GeoJSON point."""
     position, moment, sigma = _known(point)
     properties = {
         "time_s": point.time_s,
@@ -227,7 +227,7 @@ def _feature(point: TrackPoint, origin: Vector) -> dict[str, Any]:
 
 
 def _placemark(name: str, point: TrackPoint, origin: Vector) -> str:
-    """A row with a source as a point, with what is known of it in a sentence."""
+    """Return a row with a source as a KML placemark with a description."""
     position, moment, sigma = _known(point)
     depth = " ± ".join(by_sigma(-float(position[2]), float(sigma[2])))
     words = (
@@ -238,12 +238,12 @@ def _placemark(name: str, point: TrackPoint, origin: Vector) -> str:
 
 
 def _known(point: TrackPoint) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Position, moment and standard deviations (6,) of a row with a source."""
+    """Return position, moment and standard deviations (6,) of a row with a source."""
     return np.asarray(point.position_m), np.asarray(point.moment_Am2), np.sqrt(np.diagonal(point.covariance))  # type: ignore[arg-type]
 
 
 def dataset_of_track(track: TrackColumns) -> xr.Dataset:
-    """:meth:`magloc.tracking.track.TrackColumns.to_xarray`."""
+    """Return a track as a dataset, see :meth:`magloc.tracking.track.TrackColumns.to_xarray`."""
     import xarray as xr
 
     dataset = xr.Dataset(coords={"time_s": ("row", track.time_s), "axis": list("xyz")})
@@ -257,7 +257,13 @@ def dataset_of_track(track: TrackColumns) -> xr.Dataset:
 
 @garbage_waits()
 def read_track(path: Path) -> TrackResult:
-    """A track as `magloc track --json` or --jsonl prints it; InputError where the file is none."""
+    """Read a track from a file of ``magloc track --json`` or ``--jsonl``.
+
+    Raises
+    ------
+    InputError
+        The file is not a track.
+    """
     text = read_text(path, "a track")
     try:
         entries: Any
@@ -283,7 +289,7 @@ def read_track(path: Path) -> TrackResult:
 
 
 def _tracks(path: Path, entries: Sequence[dict[str, Any]]) -> dict[int, tuple[TrackPoint, ...]]:
-    """Points of every source by its id; one without an id where the rows have no key tracks."""
+    """Return the points of each source by its id; rows without the key tracks are of source 0."""
     if not any("tracks" in entry for entry in entries):
         return {0: _points(path, entries)}
     own: list[dict[int, dict[str, Any]]] = []
@@ -299,7 +305,7 @@ def _tracks(path: Path, entries: Sequence[dict[str, Any]]) -> dict[int, tuple[Tr
 
 
 def _points(path: Path, rows: Sequence[dict[str, Any]]) -> tuple[TrackPoint, ...]:
-    """Points of a source."""
+    """Return the points of a source."""
     times = _values_of(path, rows, "time_s")
     if back := next((i for i in range(1, len(times)) if times[i] < times[i - 1]), None):
         raise InputError(
@@ -328,7 +334,7 @@ def _points(path: Path, rows: Sequence[dict[str, Any]]) -> tuple[TrackPoint, ...
 
 
 def _values_of(path: Path, rows: Sequence[dict[str, Any]], key: str) -> list[Any]:
-    """Values of a key in every row, None where it is missing or null."""
+    """Return the values of a key in each row, None where it is missing or null."""
     kind, expected = _READ[key]
     values = [row.get(key) for row in rows]
     try:
@@ -341,7 +347,7 @@ def _values_of(path: Path, rows: Sequence[dict[str, Any]], key: str) -> list[Any
 
 
 def _arrays(values: list[Any]) -> list[FloatArray | None]:
-    """Lists of numbers as arrays, all of a column at once: one by one they take five times as long."""
+    """Return lists of numbers as arrays, by one conversion: one by one they take five times as long."""
     known = [i for i, value in enumerate(values) if value is not None]
     arrays = iter(np.array([values[i] for i in known], dtype=np.float64))
     return [None if value is None else next(arrays) for value in values]

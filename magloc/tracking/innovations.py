@@ -1,4 +1,4 @@
-"""Whether the innovations of a track are what they should be: white, and of the size that is stated."""
+"""Test of the innovations of a track: white, and of the stated size."""
 
 from __future__ import annotations
 
@@ -13,41 +13,40 @@ from magloc.levels import CONTRADICTION
 from magloc.tracking.results import TrackPoint
 
 THRESHOLD = 3.3
-"""Standard deviations that a sum may be above its mean: 1 right track in 2,000 is beyond it."""
+"""Largest sum of a right track, in standard deviations above its mean; 1 track in 2,000 exceeds it."""
 
 MATTERS = 2.0
-"""Times their standard deviations that errors would be by what is not stated, from which on that is told."""
+"""Ratio of errors to their standard deviations, by unstated causes, above which a caution is given."""
 
 FEWEST_STARTS = 3
-"""Rows in which tracks begin that say something of the record, and not of its end."""
+"""Fewest starts of tracks that tell of the record, and not of its end."""
 
 
 @dataclass(frozen=True)
 class InnovationTest:
-    """Sums over a track, each in standard deviations from its mean: standard normal numbers of a right model.
+    """Sums over a track, each in standard deviations from its mean: standard normal for a right model.
 
     Attributes
     ----------
     rows : int
-        With an innovation.
+        Number of rows with an innovation.
     z_chi2 : float
-        Of the sum of squares of the whitened innovations: too large, there are errors that are not stated.
+        Sum of squares of the whitened innovations. If it is too large, there are errors that are not stated.
     z_lag1 : float
-        Of the sum of their products with the row before: too large, errors last that are said to be new in every row,
-        or the readings were filtered before. NaN where there are none: compiled steps keep no innovations.
+        Sum of their products with the row before. If it is too large, errors last that are stated as new in each row,
+        or the readings were filtered. NaN without products: compiled steps keep no innovations.
     z_constants : float
-        Of the lever arm and the mounting that the rows tell of, where a pose is stated and these count as exact: too
-        large, they are not. NaN elsewhere, and where the motion is measured.
+        Lever arm and mounting that a fit of the rows finds, if a pose is stated and these count as exact. If it is too
+        large, they are not exact. NaN otherwise, and with a measured motion.
     z_ambient : float
-        The same of the ambient field of scalar sensors, where it counts as exact.
+        Ambient field of scalar sensors that a fit of the rows finds, if it counts as exact.
     ambient_factor : float
-        How many times their standard deviations errors of the last row would be, rms, if that field were wrong by
-        300 nT per axis.
+        Ratio of the rms error of the last row to its standard deviation, if that field were wrong by 300 nT per axis.
     body_factor : float
-        The same if the source, which counts as a point, were a body of a quarter of its distance from the nearest
-        sensor, where it was nearest. NaN where the range is not known, and where the motion is measured.
+        The same ratio if the source were a body as long as a quarter of its least distance from a sensor. NaN if the
+        range is not known, and with a measured motion.
     starts : int
-        Rows in which a track begins.
+        Number of rows in which a track begins.
     """
 
     rows: int
@@ -61,7 +60,7 @@ class InnovationTest:
 
     @property
     def is_disjoint(self) -> bool:
-        """Whether tracks begin in more rows than they go on in, so that no row tells of the next."""
+        """True if tracks begin in more rows than they go on in, so that no row predicts the next."""
         return self.starts >= FEWEST_STARTS and self.starts > self.rows
 
     @property
@@ -70,12 +69,12 @@ class InnovationTest:
 
     @property
     def flagged(self) -> bool:
-        """Whether one of them is beyond the threshold, or rows tell nothing of each other."""
+        """True if a sum is beyond the threshold, or if no row predicts the next."""
         return self.is_disjoint or any(z > THRESHOLD for z in self._sums)
 
     @property
     def reason(self) -> str:
-        """What is wrong, in a sentence; empty where nothing is."""
+        """Sentence that names the fault; empty without one."""
         if not self.flagged:
             return ""
         if self.is_disjoint:
@@ -99,7 +98,7 @@ class InnovationTest:
 
     @property
     def caution(self) -> str:
-        """What may be wrong and could not be seen, in a sentence; empty where it would not matter."""
+        """Sentence that names a possible fault that the tests cannot see; empty if it would not matter."""
         cautions = []
         if self.ambient_factor > MATTERS:
             cautions.append(
@@ -115,12 +114,12 @@ class InnovationTest:
 
     @property
     def json(self) -> dict[str, object]:
-        """What ``magloc track --json`` prints of it."""
+        """Entries of ``magloc track --json``."""
         return {**asdict(self), "flagged": self.flagged, "reason": self.reason, "caution": self.caution}
 
 
 def innovation_test(points: Sequence[TrackPoint]) -> InnovationTest:
-    """The test of all rows of a track; a row that contradicts it counts as one at the limit."""
+    """Return the test of all rows of a track; a row that contradicts it counts as one at the gate."""
     nis, dof, lag1 = np.array([(p.nis, p.nis_dof, p.lag1) for p in points], dtype=np.float64).reshape(-1, 3).T
     known = np.isfinite(nis) & (dof > 0.0)
     limited = np.minimum(nis[known], chdtri(np.maximum(dof[known], 1.0), CONTRADICTION))

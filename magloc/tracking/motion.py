@@ -1,14 +1,14 @@
-r"""How sources and arrays move between rows: transition matrices and the square roots of their noise.
+r"""Motion of sources and arrays between rows: transition matrices and square roots of the noise.
 
-A model says which state it has, where position and moment are in it, and what one step of Δt does to it. Position and
-moment come first, whatever follows. With the array's pose known the state is in the world frame, which does not turn;
-:func:`array_axes_transition` is the source paper's model (17) in the axes of an array whose motion is known.
+A model has a state and its step over Δt. Position and moment come first in every state. With the array's pose known
+the state is in the world frame, which does not turn. :func:`array_axes_transition` is model (17) of the source paper,
+in the axes of an array whose motion is known.
 
 =============  =============================================================
 MotionMT       :class:`KnownMotion`, :class:`RandomWalk`
 MotionMV       :mod:`magloc.signature.moment_filter`, the moment alone, (29)
 O              the array's attitude: pose of the readings, or its rates
-σ_R, σ_M       the rows of S_q: what may move p, and what may turn m
+σ_R, σ_M       the rows of S_q: the noise that moves p and turns m
 =============  =============================================================
 """
 
@@ -39,7 +39,7 @@ def array_axes_transition(
     array_velocity_m_s: ArrayLike = (0.0, 0.0, 0.0),
     array_rate_rad_s: ArrayLike = (0.0, 0.0, 0.0),
 ) -> tuple[FloatArray, FloatArray]:
-    r"""One step of position and moment in the axes of a moving array, equations (17) and (29).
+    r"""Return one step of position and moment in the axes of a moving array, equations (17) and (29).
 
     .. math::
 
@@ -60,7 +60,7 @@ def array_axes_transition(
     F : ndarray, shape (6, 6)
         Transition matrix of (p, m).
     shift : ndarray, shape (6,)
-        What is added: ``x_next = F x + shift``.
+        Added to the state: ``x_next = F x + shift``.
     """
     from scipy.linalg import expm
 
@@ -76,7 +76,7 @@ def array_axes_transition(
 
 
 class MotionModel(Protocol):
-    """What a tracker needs to know of the motion."""
+    """Motion of a source, as a tracker uses it."""
 
     @property
     def speed_m_s(self) -> float:
@@ -87,21 +87,21 @@ class MotionModel(Protocol):
         """Length of the state, of which the first six are position [m] and moment [A·m²]."""
 
     def start(self, source: FloatArray, S: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """State and square root of its covariance from those of position and moment, (6,) and (6, 6)."""
+        """Return the state and the square root of its covariance from those of (p, m), (6,) and (6, 6)."""
 
     def step(self, x: FloatArray, dt_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Predicted state (n,), its Jacobian F (n, n), and a square root S_q (n, m) of the noise of the step."""
+        """Return the predicted state (n,), its Jacobian F (n, n), and a square root S_q (n, m) of the noise."""
 
     def state_of(self, source: FloatArray, velocity_m_s: FloatArray, rate_rad_s: FloatArray) -> FloatArray:
-        """State (n,) of a source (6,) that moves and turns so, (3,) each."""
+        """Return the state (n,) of a source (6,) with a velocity and a rate of turn, (3,) each."""
 
 
 @runtime_checkable
 class LinearMotion(MotionModel, Protocol):
-    """Motion whose step depends on the state by the strength of the moment only: for compiled tracking."""
+    """Motion whose step depends on the state only by the strength of the moment; it has compiled steps."""
 
     def linear_step(self, dt_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """F, and A and B (n, m) of the noise ``S_q = A + |m| B``."""
+        """Return F, and A and B (n, m) of the noise ``S_q = A + |m| B``."""
 
 
 class _MovingState:
@@ -125,9 +125,9 @@ class _MovingState:
 
 @dataclass(frozen=True)
 class RandomWalk(_MovingState):
-    """Position and moment as random walks of the characteristic speed and turn rate: S_q of Pavlov et al.
+    """Random walk of position and moment with a characteristic speed and rate of turn: S_q of Pavlov et al.
 
-    ``S_q = diag(V Δt, V Δt, V Δt, |m| W Δt, …)``: every step is as long as the object may have moved in that time.
+    ``S_q = diag(V Δt, V Δt, V Δt, |m| W Δt, …)``: the step has the length that the object may move in that time.
 
     Attributes
     ----------
@@ -151,7 +151,7 @@ class RandomWalk(_MovingState):
     n_states: int = N_SOURCE
 
     def linear_step(self, dt_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """As :class:`LinearMotion`."""
+        """Return the parts of the step, see :class:`LinearMotion`."""
         of_position = np.diag(np.repeat([self.speed_m_s * dt_s, 0.0], 3))
         of_moment = np.diag(np.repeat([0.0, self.turn_rad_s * dt_s], 3))
         return np.eye(N_SOURCE), of_position, of_moment
@@ -164,24 +164,23 @@ class RandomWalk(_MovingState):
 
 @dataclass(frozen=True)
 class OrnsteinUhlenbeck(_MovingState):
-    r"""Position, and a moment that turns: speed and turn rate wander about zero, and are forgotten in time.
+    r"""Velocity and rate of turn as Ornstein-Uhlenbeck processes: they wander about zero and last for a time τ.
 
     State (p, m, v, ω), with
 
     .. math:: \dot p = v, \quad \dot m = ω × m, \quad \dot v = -v/τ + w_v, \quad \dot ω = -ω/τ + w_ω
 
-    and white noises that keep the standard deviations of v and ω at the characteristic speed V and rate W; with τ
-    towards
-    infinity a constant velocity and turn. Discretised after van Loan.
+    and white noises that keep the standard deviations of v and ω at the characteristic speed V and rate W. With τ
+    towards infinity velocity and turn are constant. Discretised by van Loan's method.
 
     Attributes
     ----------
     speed_m_s, turn_rad_s : float
         Characteristic speed V and rate W, along and about each axis.
     correlation_s : float, optional
-        Correlation time τ; by default 1/W, the time in which a course changes that turns at the rate W.
+        Correlation time τ; by default 1/W, the time in which the course changes.
     moment_change : float
-        How much the moment changes otherwise, relative to its modulus, in the root of a second [1/√s].
+        Random walk of the moment beside its turn, relative to its modulus [1/√s].
     n_states : int
         12: position, moment, velocity and turn rates; not to be changed.
 
@@ -206,7 +205,7 @@ class OrnsteinUhlenbeck(_MovingState):
         return self.correlation_s
 
     def turning_step(self, dt_s: float) -> FloatArray:
-        """Return the numbers (12,) of a step for its kernel."""
+        """Return the numbers (12,) of a step for the C++ kernel."""
         moved, kept, root = wandering_step(self._correlation_s, dt_s)
         lower = root[[0, 1, 1], [0, 0, 1]]
         change = self.moment_change * math.sqrt(dt_s)
@@ -234,21 +233,22 @@ class OrnsteinUhlenbeck(_MovingState):
 
 @dataclass(frozen=True)
 class KnownMotion(_MovingState):
-    r"""Position and moment while the velocities and rates of array and object are measured: MotionMT, equation (17).
+    r"""Position and moment with measured velocities and rates of array and object: MotionMT, equation (17).
 
     .. math:: p_j = p_{j-1} + (v_{object} - v_{array} - ω_{array} × p_{j-1}) Δt, \qquad
         m_j = m_{j-1} + (ω_{object} - ω_{array}) × m_{j-1} Δt
 
-    exact for constant rates, in the array's axes; where its pose is known, in the world's, with its own at zero. The
-    noise is that of :class:`RandomWalk`, for what is not measured, and that of the measured ones: σ of the velocities
-    moves p, σ of the array's rate turns p and m together, σ of the object's rate turns m.
+    The step is exact for constant rates. It is in the array's axes; with a known pose it is in the world's, and the
+    array's velocity and rate are zero. The noise is that of :class:`RandomWalk` for the unmeasured rest, and that of
+    the measurements: σ of the velocities moves p, σ of the array's rate turns p and m together, and σ of the object's
+    rate turns m.
 
     Attributes
     ----------
     speed_m_s, turn_rad_s : float
-        Characteristic speed and rate of what is not measured, along and about each axis.
+        Characteristic unmeasured speed and rate, along and about each axis.
     object_velocity_m_s, object_rate_rad_s, array_velocity_m_s, array_rate_rad_s : tuple of 3 floats
-        Measured.
+        Measured velocities and rates.
     velocity_sigma_m_s, object_rate_sigma_rad_s, array_rate_sigma_rad_s : float
         Standard deviations of the difference of the velocities, and of the rates, along and about each axis; new in
         every row.
@@ -295,7 +295,7 @@ class KnownMotion(_MovingState):
 
 
 def known_motions(measured: MeasuredMotion, unknown: RandomWalk) -> list[KnownMotion]:
-    """Motion of the step to every row, with a random walk for what is not measured."""
+    """Return the motion of the step to each row, with a random walk for the unmeasured rest."""
     steps = measured.of_steps()
     rows = zip(
         steps.velocity_m_s.tolist(),
@@ -312,7 +312,7 @@ def known_motions(measured: MeasuredMotion, unknown: RandomWalk) -> list[KnownMo
 
 @lru_cache(maxsize=64)
 def wandering_step(correlation_s: float, dt_s: float) -> tuple[float, float, FloatArray]:
-    """Entries of F of (value, rate), and the square root of its noise for a rate of unit standard deviation."""
+    """Return the entries of F of (value, rate), and the square root of its noise for a rate with σ = 1."""
     if dt_s == 0.0:
         return 0.0, 1.0, np.zeros((2, 2))
     if dt_s > correlation_s:
@@ -334,7 +334,7 @@ def wandering_step(correlation_s: float, dt_s: float) -> tuple[float, float, Flo
 
 @dataclass(frozen=True)
 class CoordinatedTurn(_MovingState):
-    r"""A vehicle on a steady turn about the vertical: velocity and moment turn with one rate, which wanders.
+    r"""Steady turn about the vertical, as of a vehicle: velocity and moment turn with one rate, which wanders.
 
     State (p, m, v, ω): :math:`\dot p = v`, :math:`\dot v = ω e_z × v`, :math:`\dot m = ω e_z × m`.
 
@@ -343,11 +343,11 @@ class CoordinatedTurn(_MovingState):
     speed_m_s, turn_rad_s : float
         Standard deviations of the velocity along each axis, and of the turn rate, before anything is known.
     acceleration_m_s2 : float
-        How much the velocity changes otherwise: its noise in the square root of a second [m/s²·√s].
+        Random walk of the velocity beside the turn [m/s/√s].
     turn_change_rad_s : float
-        The same for the turn rate [rad/s/√s].
+        Random walk of the turn rate [rad/s/√s].
     moment_change : float
-        The same for the moment, relative to its modulus [1/√s].
+        Random walk of the moment beside its turn, relative to its modulus [1/√s].
     n_states : int
         10: position, moment, velocity and turn rate; not to be changed.
 

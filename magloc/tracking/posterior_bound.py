@@ -20,12 +20,11 @@ from magloc.tracking.whole_records.smoother import smoothed_states
 def posterior_bound(
     tracker: Tracker, rows: Sequence[Row], position_m: FloatArray, moment_Am2: FloatArray
 ) -> FloatArray:
-    """Posterior Cramér-Rao bound of the distance from the truth, for every row, from this row and those before.
+    """Return the posterior Cramér-Rao bound of the position error for each row, by this row and those before.
 
-    It begins with the first row that shows a source; before it no more is known than what a tracker starts with
-    (:func:`magloc.tracking.chart.start.prior_root`), and the standard deviations of the sensors' lasting errors, which
-    count as unknowns of their own. Speed and turn rate are those of the truth. The root of the trace of the position's
-    bound (n,) [m] is infinite before that row.
+    The bound (n,) [m] is the root of the trace for the position. It begins with the first row that shows a source, and
+    is infinite before. The prior is that of a tracker (:func:`magloc.tracking.chart.start.prior_root`). Lasting errors
+    of the sensors are unknowns with their standard deviations. Speed and turn rate are those of the truth.
     """
     bounds = np.full(len(rows), np.inf)
     for step in _steps_at_truth(tracker, rows, position_m, moment_Am2):
@@ -36,12 +35,12 @@ def posterior_bound(
 def smoothing_bound(
     tracker: Tracker, rows: Sequence[Row], position_m: FloatArray, moment_Am2: FloatArray
 ) -> FloatArray:
-    r"""Posterior Cramér-Rao bound of the distance from the truth, for every row, from all rows.
+    r"""Return the posterior Cramér-Rao bound of the position error for each row, by all rows.
 
-    The diagonal blocks of the inverse of the information of all states together (Šimandl, Královec and Tichavský 2001),
+    It is the diagonal block of the inverse information of all states together (Šimandl, Královec and Tichavský 2001),
     by the recursion of Rauch, Tung and Striebel from the last row backwards:
-    :math:`P_{j|n} = P_j + G (P_{j+1|n} - P_{j+1|j}) G^T` with :math:`G = P_j F^T P_{j+1|j}^{-1}`. It is infinite at the
-    same rows as :func:`posterior_bound`: a track that has not begun is not smoothed.
+    :math:`P_{j|n} = P_j + G (P_{j+1|n} - P_{j+1|j}) G^T` with :math:`G = P_j F^T P_{j+1|j}^{-1}`. It is infinite in
+    the same rows as :func:`posterior_bound`, because a track that has not begun is not smoothed.
     """
     bounds = np.full(len(rows), np.inf)
     steps = _steps_at_truth(tracker, rows, position_m, moment_Am2)
@@ -53,7 +52,7 @@ def smoothing_bound(
 def _steps_at_truth(
     tracker: Tracker, rows: Sequence[Row], position_m: FloatArray, moment_Am2: FloatArray
 ) -> list[Step]:
-    """What a filter that linearises at the truth knows at every row, from the first one that shows the source."""
+    """Return the steps of a filter that linearises at the truth, from the first row that shows the source."""
     motion, n_errors = tracker.motion, tracker.n_errors
     truth = np.concatenate([position_m, moment_Am2], axis=1)
     velocity, rate = _velocities(np.array([row.time_s for row in rows]), truth)
@@ -74,7 +73,7 @@ def _steps_at_truth(
 
 
 def _velocities(time_s: FloatArray, truth: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Velocities and turn rates (n, 3) of true positions and moments (n, 6), by differences of the rows."""
+    """Return velocities and turn rates (n, 3) of true positions and moments (n, 6), by differences of the rows."""
     if len(time_s) < 2:
         return np.zeros((len(time_s), 3)), np.zeros((len(time_s), 3))
     derivative = np.gradient(truth, time_s, axis=0)

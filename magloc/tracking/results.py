@@ -1,4 +1,4 @@
-"""Rows of readings for a tracker, and the points of tracks, of one source or of several."""
+"""Rows of readings for a tracker, and points of tracks of one source or several."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Row:
     ambient_T : ndarray, shape (3,), optional
         Ambient field in the array's frame, in place of the array's own.
     velocity_m_s, rate_rad_s : ndarray, shape (3,), optional
-        Of the array in the world, and about its own axes. None: from the row before.
+        Velocity of the array in the world and its rate about its own axes; by default from the row before.
     pose_sigma : ndarray, shape (2,), optional
         Standard deviations of position [m] and attitude [rad], in place of the array's own.
     """
@@ -60,13 +60,13 @@ class Row:
         return np.isfinite(self.readings_T)
 
     def pose(self, lever_arm_m: FloatArray) -> ArrayPose:
-        """The array's pose; where nothing is known of its motion it is at rest."""
+        """Return the array's pose; an array without a velocity or rate is at rest."""
         velocity, rate = (np.zeros(3) if value is None else value for value in (self.velocity_m_s, self.rate_rad_s))
         return ArrayPose(self.origin_m, self.R_world_from_array, velocity, rate, lever_arm_m)
 
 
 def moving(row: Row, before: Row | None) -> Row:
-    """A row with how its array moves, as the row before tells where it does not itself."""
+    """Return a row with the array's velocity and rate, from the row before if the row has none."""
     if before is None or row.velocity_m_s is not None:
         return row
     time_s, origins_m = np.array([before.time_s, row.time_s]), np.stack([before.origin_m, row.origin_m])
@@ -82,7 +82,7 @@ class Innovation:
     whitened: FloatArray
 
     def after(self, before: Innovation | None) -> dict[str, Any]:
-        """Its normalised square and its product with the one before, if that is of the same differences."""
+        """Return NIS, its degrees of freedom, and the product with the innovation before, if of the same channels."""
         same = before is not None and np.array_equal(before.available, self.available)
         return {
             "nis": float(self.whitened @ self.whitened),
@@ -100,33 +100,32 @@ class TrackPoint:
     time_s : float
     position_m, moment_Am2 : ndarray, shape (3,)
     covariance : ndarray, shape (6, 6)
-        Of (position, moment).
+        Covariance of (position, moment).
     estimability : ndarray, shape (6,)
-        Share of every σ that the readings took away since the track began: 1 - σ / σ without any of them.
+        1 - σ / σ₀ of each number, where σ₀ is its standard deviation without any readings.
     iterations : int
-        Linearisations.
+        Number of linearisations.
     nis : float
         Normalised innovation squared, and `nis_dof` its degrees of freedom. NaN for rows that the track started from.
     status : str
-        "tracked", "acquired" (a new track started here), "predicted" (no readings), "outlier" (readings that contradict
-        the track, not used), "undetermined" (no track yet: what rows of few readings say together so far), or why
-        there is no track.
+        "tracked", "acquired" (a new track starts here), "predicted" (no readings), "outlier" (readings that contradict
+        the track and are not used), "undetermined" (no track yet: rows of few readings answered together), or the
+        reason why there is no track.
     weight : float
-        Probability that the place is the right one of all that explain the readings so far. NaN without a track.
+        Probability of the place among all that explain the readings so far. NaN without a track.
     rivals : tuple of Solution
-        Where a track starts from several rows, the other solutions of these.
+        Other solutions of the rows, if a track starts from several rows.
     centroid_m : ndarray, shape (3,), optional
-        Of the sensors, where the range is counted from.
+        Centroid of the sensors, from which the range counts.
     radius_m : float
         Largest distance of a sensor from it.
     lag1 : float
-        Product of the whitened innovations of this row and of the one before, on average zero for a right model; its
-        variance is `nis_dof`. NaN where there is none before, or of other differences.
+        Product of the whitened innovations of this row and the one before: mean zero and variance `nis_dof` for a right
+        model. NaN if the row before has none, or other channels.
     dropped_sensors : tuple of str
-        Sensors that contradict the others, and are left out.
+        Sensors left out because they contradict the others.
     mixture : Mixture, optional
-        All that is known of position and moment, in the coordinates in which it is Gaussian; None of a track that is
-        read from a file.
+        Gaussian mixture of position and moment; None for a track that is read from a file.
     """
 
     time_s: float
@@ -148,20 +147,21 @@ class TrackPoint:
 
     @property
     def tracks(self) -> tuple[TrackPoint, ...]:
-        """The source itself, none where it has no position: as :attr:`SourcesPoint.tracks`."""
+        """The source as a tuple, empty without a position; as :attr:`SourcesPoint.tracks`."""
         return () if self.position_m is None else (self,)
 
     @property
     def is_on_track(self) -> bool:
-        """Whether the source is known, and not by this row alone."""
+        """True if a track answers the row, and not the row alone."""
         return self.position_m is not None and self.status != UNDETERMINED
 
     @cached_property
     def range_interval_m(self) -> Intervals | None:
-        """95 % set of the distance from the sensors' centroid [m], None where the sensors are not known.
+        """95 % set of the distance from the sensors' centroid [m], None if the sensors are not known.
 
-        Of a track it is :func:`magloc.localization.uncertainty.range_interval.gaussian_ranges` of its covariance;
-        without one it is every range.
+        Quantiles of the mixture; without one,
+        :func:`magloc.localization.uncertainty.range_interval.gaussian_ranges` of the covariance. Without a track, every
+        range.
         """
         if self.mixture is not None:
             return self.mixture.range_interval_m()
@@ -174,12 +174,12 @@ class TrackPoint:
 
     @property
     def range_observable(self) -> bool:
-        """Whether that set is closed, and its ends differ by a factor of two at most."""
+        """True if the range set is closed and its ends differ by a factor of two at most."""
         return is_observable_set(self.range_interval_m or EVERYWHERE)
 
     @property
     def gaussian(self) -> bool:
-        """Whether the standard deviations are so small that the covariance describes the uncertainty."""
+        """True if the standard deviations are small enough for the covariance to describe the uncertainty."""
         if self.position_m is None or self.moment_Am2 is None or self.covariance is None or self.centroid_m is None:
             return False
         sigma = relative_sigma(self.covariance, self.position_m - self.centroid_m, self.moment_Am2)
@@ -193,10 +193,9 @@ class SourcePoint(TrackPoint):
     Attributes
     ----------
     id : int
-        The same in all rows.
+        Number of the source, the same in all rows.
     merged : bool
-        Whether it is so near to another that their gap is less certain than a third of it: which is which is then a
-        guess, and so are the places.
+        True if the gap to another source is less certain than a third of it. Names and places are then a guess.
     """
 
     position_m: FloatArray
@@ -208,7 +207,7 @@ class SourcePoint(TrackPoint):
 
 @dataclass(frozen=True, eq=False)
 class SourcesPoint:
-    """All sources at one instant.
+    """State of all sources at one instant.
 
     Attributes
     ----------
@@ -216,11 +215,11 @@ class SourcesPoint:
     tracks : tuple of SourcePoint
         In the order of their ids.
     status : str
-        "tracked", "no source", "no readings", "misfit": no sources, losses and faults explain the readings, and the
-        tracks are predictions; or "doubtful": χ² of the last rows together is beyond noise, and what is wrong is being
-        looked for.
+        "tracked"; "no source"; "no readings"; "misfit": no births, losses or faults explain the readings, and the
+        tracks are predictions; "doubtful": χ² of the last rows together is beyond noise, and another explanation is
+        sought.
     chi2 : float
-        Of the row given its prediction.
+        χ² of the row given its prediction.
     dof : int
         Number of its readings.
     dropped_sensors : tuple of str
@@ -236,12 +235,12 @@ class SourcesPoint:
 
 
 def learned(variance: FloatArray, open_loop: FloatArray) -> FloatArray:
-    """Estimability: 1 - σ / σ without any readings, from both variances."""
+    """Return the estimability 1 - σ / σ₀ from the variances with readings and without any."""
     return 1.0 - np.sqrt(np.minimum(variance / open_loop, 1.0))
 
 
 def of_mixture(time_s: float, mixture: Mixture, open_loop: FloatArray) -> TrackPoint:
-    """What is known at an instant, for a user; open_loop (n,) are the variances had no readings been taken."""
+    """Return the point of a mixture; open_loop (n,) are the variances without any readings."""
     source = mixture.of_source()
     mean, covariance = source.moments()
     return TrackPoint(
@@ -259,7 +258,7 @@ def of_mixture(time_s: float, mixture: Mixture, open_loop: FloatArray) -> TrackP
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """State and square root of its covariance before a row's readings, and the transition that led there."""
+    """Predicted state, square root of its covariance, and the transition that led there."""
 
     x: FloatArray
     S: FloatArray
@@ -268,14 +267,14 @@ class Prediction:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """One step of a track, for smoothing.
+    """Step of a track, for the smoother.
 
     Attributes
     ----------
     row : int
-        Which row it belongs to.
+        Index of the row.
     prediction : Prediction, optional
-        From the step before; None at the first step of a track.
+        Prediction from the step before; None at the first step of a track.
     x, S : ndarray
         State and square root of its covariance after the row's readings.
     """
@@ -287,7 +286,7 @@ class Step:
 
 
 def rows_of(readings: Readings) -> Iterator[Row]:
-    """Rows of readings for a tracker."""
+    """Yield the rows of readings for a tracker."""
     columns: dict[str, FloatArray] = {}
     if readings.ambient_T is not None:
         columns["ambient_T"] = readings.ambient_T
@@ -304,7 +303,7 @@ def rows_of(readings: Readings) -> Iterator[Row]:
 
 
 def next_row(row: Row | Readings, array: SensorArray, after_s: float) -> Row:
-    """The one row that comes after a time: of readings, without those that saturate.
+    """Return the next row after a time; of readings, without saturated ones.
 
     Raises
     ------
@@ -323,12 +322,12 @@ def next_row(row: Row | Readings, array: SensorArray, after_s: float) -> Row:
 
 
 def on_track(points: Sequence[TrackPoint]) -> Sequence[TrackPoint]:
-    """The points, empty where a row alone is answered."""
+    """Return the points, empty where no track answers the row."""
     return [point if point.is_on_track else TrackPoint(point.time_s, status=point.status) for point in points]
 
 
 def warn_of_strengths(points: Iterable[TrackPoint]) -> None:
-    """Warn of moments that no object has at its distance from the sensors, in most points of a track."""
+    """Warn if most points of a track have a moment that no object at their distance has."""
     known = [point for point in points if point.is_on_track and point.centroid_m is not None]
     if known:
         places, moments, centroids = (stacked(known, name, 3) for name in ("position_m", "moment_Am2", "centroid_m"))
@@ -336,7 +335,7 @@ def warn_of_strengths(points: Iterable[TrackPoint]) -> None:
 
 
 def stacked(points: Sequence[TrackPoint], name: str, *shape: int) -> FloatArray:
-    """A column of a track (n, ...), NaN where there is no track."""
+    """Return a column of a track (n, ...), NaN where there is no track."""
     empty = np.full(shape, np.nan)
     values = [empty if value is None else value for value in (getattr(point, name) for point in points)]
     return np.array(values, dtype=np.float64).reshape(len(points), *shape)
@@ -344,17 +343,17 @@ def stacked(points: Sequence[TrackPoint], name: str, *shape: int) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class TrackResult:
-    """Tracks of one source or of several, or a truth.
+    """Tracks of one source or several, or a truth, for pictures and the viewer.
 
     Attributes
     ----------
     points : tuple of TrackPoint
-        Of the one source, or the first. A truth has no covariances.
+        Points of the first source. A truth has no covariances.
     is_truth : bool
     ids : tuple of int
-        Of several sources; none where there is but one.
+        Ids of several sources; empty for one source.
     others : tuple of tuple of TrackPoint
-        Of the further sources, in the same rows.
+        Points of the further sources, in the same rows.
     """
 
     points: tuple[TrackPoint, ...]
@@ -364,5 +363,5 @@ class TrackResult:
 
     @property
     def tracks(self) -> tuple[tuple[TrackPoint, ...], ...]:
-        """Of every source; some row of one of them at least has a position."""
+        """Points of each source; at least one row of one source has a position."""
         return (self.points, *self.others)

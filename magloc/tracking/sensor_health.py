@@ -1,4 +1,4 @@
-"""Sensors that die while sources are followed, named, left out and taken back; and errors of all that last."""
+"""Sensors that fail during a track are named, left out and taken back; offsets of all sensors are noticed."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from arrays.typing import BoolArray, FloatArray, IntArray
 
 _LOG = logging.getLogger(__name__)
 SENSOR_LIMIT = 32.0
-"""χ² with three degrees of freedom of a sensor's residual above which it contradicts the others: 5e-7."""
+"""χ² of a sensor's residual above which it contradicts the others (3 degrees of freedom, probability 5e-7)."""
 RIVAL_WITHIN = 9.0
-"""A sensor is at fault only where χ² of the rows without it is less than without any other by this at least."""
+"""Least difference of χ² to the rows without any other sensor for which a sensor is at fault."""
 ROWS_TO_DIE = 3.0
-"""Rows in which a sensor is left out before it is named: single spikes are none of its death."""
+"""Rows in which a sensor is left out before it is named, so that single spikes do not count."""
 ROWS_TO_RETURN = 50
-"""Good rows in a row after which a sensor is taken back."""
+"""Successive good rows after which a sensor is taken back."""
 DRIFT_LIMIT = 40.0
-"""χ² with three degrees of freedom of a sensor's mean residual over some rows above which it drifts: 1e-8."""
+"""χ² of a sensor's mean residual over some rows above which it drifts (3 degrees of freedom, probability 1e-8)."""
 MOST_DRIFTING = 2
-"""Sensors that may be said to drift: where more of them do, it is the model that is wrong."""
+"""Most sensors that may drift at a time: if more do, the model is wrong."""
 _GOOD = 16.27  # one good row in a thousand is worse
 # How much a row that is well undoes of one that is not.
 _FORGIVEN = 0.25
@@ -61,16 +61,16 @@ class Misfits:
 
     @property
     def are_alike(self) -> bool:
-        """Whether most of the misfit is the same in all rows, as offsets make it."""
+        """True if most of the misfit is the same in all rows, as offsets cause it."""
         return self.rows >= _FEWEST_ALIKE and float(self.mean @ self.mean) > _LASTING * self.energy
 
     @property
     def passed_over(self) -> Misfits:
-        """State after a row in which nothing was searched for."""
+        """State after a row that was not searched."""
         return replace(self, waits=self.waits - 1)
 
     def after(self, misfit: FloatArray, noise_T: float) -> Misfits:
-        """Add a row, and warn once if the misfit lasts: from then on rows are searched ever more seldom."""
+        """Return the state after one more row; warn once if the misfit lasts, and search later rows less often."""
         if len(misfit) < len(self.mean):
             return self  # a row without some sensors
         before = self if len(misfit) == len(self.mean) else Misfits(0, np.zeros(len(misfit)), pause=self.pause)
@@ -94,22 +94,22 @@ class Misfits:
 
 @dataclass(frozen=True, eq=False)
 class SensorHealth:
-    """What earlier rows say of every sensor.
+    """State of each sensor by earlier rows.
 
     Attributes
     ----------
     dead : ndarray of bool, shape (N,)
-        Left out until they are well.
+        Sensors that are left out until they are well.
     drifting : ndarray of bool, shape (N,)
-        Of these, the ones that drifted away.
+        Dead sensors that drifted.
     strikes : ndarray, shape (N,)
-        Recent rows in which they were left out.
+        Count of recent rows in which a sensor was left out.
     good : ndarray of int, shape (N,)
-        Of the dead, good rows in a row.
+        Successive good rows of a dead sensor.
     sums : ndarray, shape (4, N, 3)
-        Of standardised residuals, with the memories of some numbers of rows.
+        Sums of standardised residuals with memories of 4, 16, 64 and 256 rows.
     weight : ndarray, shape (4, N)
-        Their variance.
+        Variance of the sums.
     """
 
     dead: BoolArray
@@ -121,7 +121,7 @@ class SensorHealth:
 
     @classmethod
     def of(cls, n_sensors: int) -> SensorHealth:
-        """All well."""
+        """Return the state of sensors that are all well."""
         none = np.zeros(n_sensors, dtype=bool)
         memories = (len(_MEMORIES), n_sensors)
         return cls(
@@ -130,7 +130,7 @@ class SensorHealth:
 
     @property
     def is_well(self) -> bool:
-        """Whether no sensor is dead, or was left out of late."""
+        """True if no sensor is dead or was left out recently."""
         return not (self.dead.any() or self.strikes.any())
 
     @property
@@ -140,21 +140,21 @@ class SensorHealth:
 
     @property
     def suspect(self) -> int | None:
-        """The sensor whose mean residual is beyond noise, the worst one if there are several."""
+        """Index of the sensor whose mean residual is the farthest beyond noise; None without one."""
         chi2 = np.max(np.vecdot(self.sums, self.sums) / np.maximum(self.weight, 1e-300), axis=0)
         worst = int(np.argmax(chi2))
         return worst if chi2[worst] > DRIFT_LIMIT else None
 
     @property
     def may_drift(self) -> bool:
-        """Whether another sensor may be said to drift."""
+        """True if one more sensor may be named as drifting."""
         return int(np.count_nonzero(self.drifting)) < MOST_DRIFTING
 
     def after(self, residuals: FloatArray, out: BoolArray, of_dead: FloatArray) -> SensorHealth:
-        """After one more row.
+        """Return the state after one more row.
 
-        Standardised residuals (N, 3), NaN of sensors of which there are none; sensors (N,) that were left out of the
-        row, and χ² (N,) of the dead against the others.
+        Parameters are the standardised residuals (N, 3), NaN without a reading, the sensors (N,) left out of the row,
+        and χ² (N,) of the dead sensors given the others.
         """
         read = np.isfinite(residuals[:, 0])
         keep = (1.0 - 1.0 / _MEMORIES)[:, None]
@@ -176,45 +176,45 @@ class SensorHealth:
         )
 
     def without(self, sensor: int) -> SensorHealth:
-        """After a sensor is said to drift; what it has bent is no fault of the others."""
+        """Return the state after a sensor is named as drifting; forget residuals, which it has bent."""
         named = np.arange(len(self.dead)) == sensor
         return replace(self.forgetful, dead=self.dead | named, drifting=self.drifting | named)
 
     @property
     def forgetful(self) -> SensorHealth:
-        """With no memory of residuals, which were those of another state."""
+        """State without a memory of residuals, which belong to another state of the sources."""
         return replace(self, sums=np.zeros_like(self.sums), weight=np.zeros_like(self.weight))
 
 
 @dataclass(frozen=True, eq=False)
 class Suspects:
-    """Which sensor is at fault, where a row alone may be explained without any one of several.
+    """Sensors that may be at fault in rows that several sensors alone could explain.
 
     Attributes
     ----------
     excess : ndarray, shape (N,)
-        Of late rows, χ² without each sensor above that without the likeliest one.
+        χ² of recent rows without each sensor, above that without the likeliest one.
     """
 
     excess: FloatArray
 
     @classmethod
     def of(cls, n_sensors: int) -> Suspects:
-        """No row yet."""
+        """Return the state before the first row."""
         return cls(np.zeros(n_sensors))
 
     def after(self, chi2: FloatArray) -> Suspects:
-        """After a row that χ² (N,) has without each of the sensors."""
+        """Return the state after a row, by its χ² (N,) without each sensor."""
         return Suspects(self.excess + chi2 - chi2.min())
 
     @property
     def forgotten(self) -> Suspects:
-        """After a row that needs no sensor at fault."""
+        """State after a row that needs no sensor at fault."""
         return Suspects(_REMEMBERED * self.excess)
 
     @property
     def culprit(self) -> int | None:
-        """The sensor at fault, if one is far likelier than all others."""
+        """Index of the sensor at fault, if it is far likelier than all others."""
         first = int(np.argmin(self.excess))
         others = np.delete(self.excess, first)
         return first if others.size and others.min() - self.excess[first] > RIVAL_WITHIN else None

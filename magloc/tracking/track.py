@@ -1,4 +1,4 @@
-"""Follow one source through the rows of readings, and the results of tracks."""
+"""Follow one source through the rows of readings; results of tracks."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ _Row = TypeVar("_Row", TrackPoint, SourcesPoint)
 
 
 class TrackRows(Sequence[_Row]):
-    """Rows of a record, each with one source or with several."""
+    """Rows of a tracked record: a sequence of points with one source or several."""
 
     points: tuple[_Row, ...]
     readings: Readings
@@ -79,7 +79,7 @@ class TrackRows(Sequence[_Row]):
     @property
     @abstractmethod
     def as_result(self) -> TrackResult:
-        """Tracks of all sources, as they are drawn."""
+        """Tracks of all sources, for pictures and the viewer."""
 
     def plot(self) -> Figure:
         """Draw the tracks from above with 95 % ellipses, and their coordinates and strengths through time."""
@@ -116,7 +116,7 @@ class TrackColumns(TrackRows[TrackPoint]):
 
     @cached_property
     def estimability(self) -> FloatArray:
-        """Share of the σ that the readings took away since the track began (n, 6): 1 - σ / σ without any of them."""
+        """Estimability (n, 6): 1 - σ / σ₀, where σ₀ is the standard deviation without any readings."""
         return stacked(self, "estimability", 6)
 
     @cached_property
@@ -126,7 +126,7 @@ class TrackColumns(TrackRows[TrackPoint]):
 
     @cached_property
     def nis_dof(self) -> IntArray:
-        """Their degrees of freedom (n,)."""
+        """Degrees of freedom of `nis` (n,)."""
         return np.array([point.nis_dof for point in self], dtype=np.intp)
 
     @cached_property
@@ -136,38 +136,40 @@ class TrackColumns(TrackRows[TrackPoint]):
 
     @property
     def range_interval_m(self) -> list[Intervals]:
-        """95 % sets of the distance from the sensors' centroid [m], of every row."""
+        """95 % set of the distance from the sensors' centroid [m] for each row."""
         return [point.range_interval_m or EVERYWHERE for point in self]
 
     @property
     def status(self) -> list[str]:
-        """Use of every row, or the reason why there is no track."""
+        """Use of each row, or the reason why there is no track."""
         return [point.status for point in self]
 
     @property
     def dropped_sensors(self) -> list[tuple[str, ...]]:
-        """Sensors that contradict the others and are left out, of every row."""
+        """Sensors left out of each row because they contradict the others."""
         return [point.dropped_sensors for point in self]
 
     @property
     def tracked(self) -> BoolArray:
-        """Whether the source is tracked (n,), and not answered by a row alone."""
+        """Rows (n,) that a track answers; false where only the row itself does."""
         return np.array([point.is_on_track for point in self], dtype=bool)
 
     @property
     def as_result(self) -> TrackResult:
-        """The track as it is drawn."""
+        """Track of the source, for pictures and the viewer."""
         return TrackResult(self.points, is_truth=False)
 
     def to_xarray(self) -> xr.Dataset:
-        """Return a dataset of columns with units and names, along `row`."""
+        """Return the columns as a dataset with units and names, along `row`."""
         return dataset_of_track(self)
 
     def to_geojson(self, place: Vector) -> dict[str, Any]:
-        """Return a FeatureCollection: a point of a source at rest, else a line for every unbroken part, a point a row.
+        """Return a GeoJSON FeatureCollection of the track.
 
-        A source is at rest if no row puts it elsewhere than the best one does, by more than both are uncertain; the
-        point is that of the best row, and its σ are too.
+        A source at rest is one point. A moving source has a point for each row, and a line for each unbroken part.
+
+        A source is at rest if no row differs from the best known one by more than their uncertainties together. Its
+        point and its σ are those of the best row.
 
         Parameters
         ----------
@@ -182,20 +184,26 @@ class TrackColumns(TrackRows[TrackPoint]):
         return geojson_of_track(self, place)
 
     def to_kml(self, place: Vector) -> str:
-        """Return placemarks in KML: one of a source at rest, else the track and its ends; ``place`` as before."""
+        """Return the track as KML: one placemark of a source at rest, otherwise the line and its two ends.
+
+        Parameters
+        ----------
+        place : tuple of 3 floats
+            As for :meth:`to_geojson`.
+        """
         return kml_of_track(self, place)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Track(TrackColumns):
-    """A source through time: columns first, a :class:`TrackPoint` where one row is asked for.
+    """One source through time: columns by name, and a :class:`TrackPoint` by index.
 
     Columns are NaN where the source is not tracked.
 
     Attributes
     ----------
     points : tuple of TrackPoint
-        One of every row.
+        One for each row.
     readings : Readings
         Readings that were used.
     tracker : Tracker
@@ -223,7 +231,7 @@ class Track(TrackColumns):
 
     @cached_property
     def innovations(self) -> InnovationTest:
-        """Test of the readings against what is stated of sensors, pose and motion."""
+        """Test of the readings against the stated sensors, pose and motion."""
         test = innovation_test(self)
         if self.readings.motion is not None:  # whose steps the test does not have
             return test
@@ -237,17 +245,17 @@ class Track(TrackColumns):
         )
 
     def table(self) -> str:
-        """Return the table that ``magloc track`` prints, and what is wrong with the track."""
+        """Return the table that ``magloc track`` prints, with warnings about the track."""
         test = self.innovations
         return "\n".join([super().table(), *filter(None, (test.reason, test.caution))])
 
     def consistency(self, truth: Truth) -> Consistency:
-        """Return errors of the track, its NEES and NIS, and the least error that is possible where the moment is known.
+        """Return the errors against a truth, NEES, NIS, and the posterior Cramér-Rao bound if the moment is known.
 
         Raises
         ------
         InputError
-            The truth has none of the times of the readings.
+            The truth has no time of the readings.
         """
         position_m, moment_Am2 = truth_of_rows(self.readings, truth)
         bound = None
@@ -275,31 +283,31 @@ def track(
 ) -> Track:
     """Follow one source through the rows of readings.
 
-    The track starts by itself from the first row that shows a source, is updated by every row, and ends where the
-    readings contradict it three times in a row or its place is no longer known; then it starts anew.
+    The track starts by itself from the first row that shows a source, and each row updates it. It ends if three rows
+    in succession contradict it, or if the place is no longer known. Then a new track starts.
 
     Parameters
     ----------
     array : SensorArray
     readings : Readings or array_like, shape (n, C)
-        Raw readings [T], NaN where missing, in the order of time. Those that saturate are not used.
+        Raw readings [T], NaN where missing, in the order of time. Saturated readings are not used.
     motion : MotionModel, optional
-        By default :class:`magloc.RandomWalk` of 0.5 m/s and 5°/s; with `smooth`, or readings with a background,
-        :class:`magloc.OrnsteinUhlenbeck` of the same. Where the readings have measured velocities and rates, a random
-        walk of what is not measured.
+        Motion of the source. By default :class:`magloc.RandomWalk` of 0.5 m/s and 5°/s; with `smooth`, or readings with
+        a background, :class:`magloc.OrnsteinUhlenbeck` of the same. With measured velocities and rates, a random walk
+        of the unmeasured rest.
     smooth : bool
-        Use later rows too: a fixed-interval smoother.
+        Use later rows too (fixed-interval smoother).
     prior : SourcePrior
-        Bounds of the source where a track starts, and what its moment is known to be, in the array's frame.
+        Bounds of the source where a track starts, and its known moment, in the array's frame.
     progress : callable, optional
         Called with the number of rows finished since the last call.
     told : callable, optional
-        Called with the point of every row: as soon as it is known or, where later rows are used, at the end.
+        Called with the point of each row: at once, or at the end if later rows are used.
 
     Returns
     -------
     Track
-        In the world frame where the readings have the array's pose, else in the array's.
+        In the world frame if the readings have the array's pose, otherwise in the array's frame.
 
     Raises
     ------
@@ -334,7 +342,7 @@ def track(
 
 
 def finished(points: Iterable[_Row], told: Callable[[_Row], object] | None) -> tuple[_Row, ...]:
-    """Return all points of a record, each of which is reported first."""
+    """Report each point of a record, and return all of them."""
     found = []
     for point in points:
         found.append(point)
@@ -351,7 +359,7 @@ def _followed(
     *,
     at_once: bool = False,
 ) -> Iterator[TrackPoint]:
-    """Points of a record, `at_once` as soon as they are known; a motion that is measured is set before every row."""
+    """Yield the points of a record, `at_once` one by one; set a measured motion before each row."""
     rows, motions = list(rows_of(readings)), None
     if readings.motion is not None:
         if not isinstance(unmeasured, RandomWalk):

@@ -23,11 +23,18 @@ EARTH_T = (2e-5, 1e-6, 4.5e-5)
 
 def arrays() -> dict[str, SensorArray]:
     """Constant axes and noise; axes that turn with the field; noise that depends on the field."""
-    uncertain = tuple(replace(s, misalignment_rad=1e-4, gain_uncertainty=1e-4) for s in tetrahedron(1.5).sensors)
+
+    def uncertain(array: SensorArray) -> SensorArray:
+        sensors = tuple(replace(s, misalignment_rad=1e-4, gain_uncertainty=1e-4) for s in array.sensors)
+        return SensorArray(sensors, ambient_T=EARTH_T)
+
+    scalar = replace(cube(1.5, kind="scalar", noise_T=1e-11), ambient_T=EARTH_T)
     return {
         "4 vector sensors": tetrahedron(1.5),
-        "8 scalar sensors": replace(cube(1.5, kind="scalar", noise_T=1e-11), ambient_T=EARTH_T),
-        "4 vector sensors of uncertain axes": SensorArray(uncertain, ambient_T=EARTH_T),
+        "8 scalar sensors": scalar,
+        "8 scalar sensors, uncertain ambient field": replace(scalar, ambient_uncertainty_T=1e-7),
+        "4 vector sensors of uncertain axes": uncertain(tetrahedron(1.5)),
+        "8 vector sensors of uncertain axes": uncertain(cube(1.5)),
     }
 
 

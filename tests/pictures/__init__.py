@@ -175,6 +175,15 @@ PICTURES: dict[str, Picture] = {
         (WEAVING, "magloc/plots/tracks.py", STYLE),
         widest_px=1420,
     ),
+    "track-three-magnets.png": OfCommands(
+        (
+            "magloc simulate three-magnets --out three.csv",
+            "magloc track three.csv --array three-array.toml --sources 3 --out tracks",
+        ),
+        "tracks/track.png",
+        ("sims/magnetics/scenarios/three-magnets.toml", "magloc/plots/tracks.py", STYLE),
+        widest_px=1420,
+    ),
     "convergence-paper.png": OfCommands((MAP,), "map/convergence.png", PAPER, widest_px=1420),
     "bounds-reach.png": OfCommands(
         ("magloc bounds --moment-Am2 0 0 100 --accuracy-m 0.5 --out bounds",),
