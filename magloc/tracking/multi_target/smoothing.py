@@ -7,6 +7,7 @@ smoother along the last trajectory, until that stays.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,8 +25,12 @@ MOST_ROWS = 90
 # Passes, and the change of the last state, in its standard deviations, below which the trajectory stays.
 _MOST_PASSES = 20
 _TOLERANCE = 0.05
+# After how many passes a track is given up whose rows are less likely by so much, as -2 ln, than in the best pass.
+_LEAST_PASSES, _HOPELESS = 4, 60.0
 # Longest step of the log-range, the direction, and the moment over its size in a pass.
 _LONGEST = 0.5
+# Shortest part of Gauss and Newton's step that is taken.
+_SHORTEST = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,8 +78,9 @@ class YoungTrack:
         rows = stacked([row for row, _ in self.rows])
         steps = steps_problem(np.stack([step for _, step in self.rows]))
         centroids = np.stack([row.centroid_m for row, _ in self.rows])
-        track = np.stack([state.sources for state in self.states])
-        for _ in range(_MOST_PASSES):
+        track, best = np.stack([state.sources for state in self.states]), math.inf
+        share, last = 1.0, np.zeros(track[-1].size)
+        for passes in range(_MOST_PASSES):
             chart = chart_at(track, centroids[:, None], self.prior.radius_m)
             with np.errstate(all="ignore"):  # a trajectory may lead out of double precision
                 prior = self._prior_about(chart.take(np.array(0)))
@@ -82,14 +88,20 @@ class YoungTrack:
             offsets, S = found.offsets.reshape(track.shape), found.last.S[0]
             if not (np.isfinite(found.log_evidence[0]) and np.isfinite(offsets).all() and np.isfinite(S).all()):
                 return None
+            score = -2.0 * float(found.log_evidence[0])
+            best = min(best, score)
+            if passes >= _LEAST_PASSES and score > best + _HOPELESS:
+                return None
             sizes = np.abs(offsets[..., :N_SEEN])
             sizes[..., 3:] /= np.linalg.norm(track[..., 3:N_SEEN], axis=-1, keepdims=True)
-            share = min(1.0, _LONGEST / max(float(sizes.max(initial=0.0)), 1e-300))
-            sigma = np.linalg.norm(S[:-N_COMMON], axis=1)
-            change = np.abs(share * offsets[-1].ravel()) / sigma
-            track = chart.retracted(share * offsets)
-            if share == 1.0 and float(change.max(initial=0.0)) < _TOLERANCE:
-                return replace(self, states=self._states(track, found.last), score=-2.0 * float(found.log_evidence[0]))
+            length = min(1.0, _LONGEST / max(float(sizes.max(initial=0.0)), 1e-300))
+            before, last = last, offsets[-1].ravel() / np.linalg.norm(S[:-N_COMMON], axis=1)
+            # Barzilai and Borwein's length: steps that lead back are made shorter.
+            bent = float(before @ (before - last))
+            share = min(max(share * float(before @ before) / bent, _SHORTEST), 1.0) if bent > 0.0 else 1.0
+            track = chart.retracted(share * length * offsets)
+            if float(np.abs(last).max(initial=0.0)) < _TOLERANCE:
+                return replace(self, states=self._states(track, found.last), score=score)
         return None
 
     def _prior_about(self, chart: Chart) -> Gaussians:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -36,6 +38,20 @@ class TestChart:
         chart = Chart.at(STATE[None, :n], CENTROID, radius_m)
         product = chart.inverse_jacobian() @ chart.jacobian(np.zeros((1, n)))
         np.testing.assert_allclose(product[0], np.eye(n), atol=1e-9)
+
+
+@pytest.mark.parametrize("power", [0, 4])
+def test_firm_moments_keep_their_coordinates(power: int) -> None:
+    """Strength and direction of the moment, whether or not it grows with the range."""
+    chart = replace(Chart.at(STATE[None], CENTROID, 1.0), firm=np.ones(1, dtype=bool), power=power)
+    e = E[None] * np.repeat([1.0, 200.0 / chart.length[0] ** power, 1.0], [3, 3, 6])
+    moved, L = chart.linearised(e)
+    np.testing.assert_allclose(chart.coordinates(moved), e, rtol=1e-9, atol=1e-12)
+    slope = derivative(
+        lambda y: np.apply_along_axis(lambda e: chart.retracted(e[None])[0], -1, y), e[0], 1e-2, atol=1e-5
+    )
+    scale = np.abs(slope).max(axis=1, keepdims=True)
+    np.testing.assert_allclose(L[0] / scale, slope / scale, atol=1e-6)
 
 
 def test_a_step_along_the_range_keeps_what_differences_see() -> None:
