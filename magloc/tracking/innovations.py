@@ -34,7 +34,13 @@ class InnovationTest:
         Of the sum of squares of the whitened innovations: too large, there are errors that are not stated.
     z_lag1 : float
         Of the sum of their products with the row before: too large, errors last that are said to be new in every row,
-        or the readings were filtered before. NaN where there are none: compiled steps keep no innovations.
+        or the readings were filtered before. NaN where there are none. It counts unless `excess` is negative.
+    excess : float
+        By how much the variance of predicted readings is larger than is claimed, summed over rows and readings, in
+        units of that of the innovations. With innovations ν, their covariance S and the gain K it is
+        :math:`HK (νν^T - S)`, and the products with the row before, on average (Mehra 1970). Negative: innovations are
+        alike because the source moves more steadily than the model says, and the track is better than it claims. NaN
+        where errors of sensors or pose are states.
     z_constants : float
         Of the lever arm and the mounting that the rows tell of, where a pose is stated and these count as exact: too
         large, they are not. NaN elsewhere, and where the motion is measured.
@@ -53,6 +59,7 @@ class InnovationTest:
     rows: int
     z_chi2: float
     z_lag1: float
+    excess: float = math.nan
     z_constants: float = math.nan
     z_ambient: float = math.nan
     ambient_factor: float = math.nan
@@ -66,7 +73,8 @@ class InnovationTest:
 
     @property
     def _sums(self) -> tuple[float, ...]:
-        return self.z_chi2, self.z_lag1, self.z_constants, self.z_ambient
+        z_lag1 = math.nan if self.excess < 0.0 else self.z_lag1
+        return self.z_chi2, z_lag1, self.z_constants, self.z_ambient
 
     @property
     def flagged(self) -> bool:
@@ -89,7 +97,7 @@ class InnovationTest:
         elif self.z_ambient > THRESHOLD:
             z, what = self.z_ambient, "the rows agree on another ambient field than the exact one"
             why = "ambient_uncertainty_nT is stated too small"
-        elif self.z_lag1 > THRESHOLD:
+        elif self.z_lag1 > THRESHOLD and not self.excess < 0.0:
             z, what = self.z_lag1, "differences between readings and predictions are alike in successive rows"
             why = "the motion differs from the motion model, offsets or pose errors last, or readings were filtered"
         else:
@@ -121,14 +129,16 @@ class InnovationTest:
 
 def innovation_test(points: Sequence[TrackPoint]) -> InnovationTest:
     """The test of all rows of a track; a row that contradicts it counts as one at the limit."""
-    nis, dof, lag1 = np.array([(p.nis, p.nis_dof, p.lag1) for p in points], dtype=np.float64).reshape(-1, 3).T
+    of_rows = [(p.nis, p.nis_dof, p.lag1, p.correction) for p in points]
+    nis, dof, lag1, correction = np.array(of_rows, dtype=np.float64).reshape(-1, 4).T
     known = np.isfinite(nis) & (dof > 0.0)
     limited = np.minimum(nis[known], chdtri(np.maximum(dof[known], 1.0), CONTRADICTION))
-    paired = np.isfinite(lag1)
+    paired, corrected = np.isfinite(lag1), np.isfinite(lag1 + correction)
     return InnovationTest(
         int(known.sum()),
         _standardised(float(np.sum(limited - dof[known])), 2.0 * float(dof[known].sum())),
         _standardised(float(lag1[paired].sum()), float(dof[paired].sum())),
+        excess=float((lag1 + correction)[corrected].sum()) if corrected.any() else math.nan,
         starts=sum(point.status == "acquired" for point in points),
     )
 

@@ -76,10 +76,11 @@ def moving(row: Row, before: Row | None) -> Row:
 
 @dataclass(frozen=True, eq=False)
 class Innovation:
-    """Whitened innovations (k,) of a row, and the channels (C,) that it has."""
+    """Whitened innovations (k,) of a row, the channels (C,) that it has, and :attr:`TrackPoint.correction`."""
 
     available: BoolArray
     whitened: FloatArray
+    correction: float = math.nan
 
     def after(self, before: Innovation | None) -> dict[str, Any]:
         """Its normalised square and its product with the one before, if that is of the same differences."""
@@ -87,6 +88,7 @@ class Innovation:
         return {
             "nis": float(self.whitened @ self.whitened),
             "nis_dof": self.whitened.size,
+            "correction": self.correction,
             "lag1": float(self.whitened @ before.whitened) if before is not None and same else math.nan,
         }
 
@@ -122,6 +124,10 @@ class TrackPoint:
     lag1 : float
         Product of the whitened innovations of this row and of the one before, on average zero for a right model; its
         variance is `nis_dof`. NaN where there is none before, or of other differences.
+    correction : float
+        Square by which the readings moved the prediction, in its standard deviations, less its mean: on average zero
+        for a right model, and below where predictions are better than is claimed. NaN without a prediction, and where
+        errors of sensors or pose are states.
     dropped_sensors : tuple of str
         Sensors that contradict the others, and are left out.
     mixture : Mixture, optional
@@ -143,6 +149,7 @@ class TrackPoint:
     centroid_m: FloatArray | None = None
     radius_m: float = math.nan
     lag1: float = math.nan
+    correction: float = math.nan
     mixture: Mixture | None = None
     dropped_sensors: tuple[str, ...] = ()
 

@@ -207,10 +207,9 @@ class Suspects:
         """After a row that χ² (N,) has without each of the sensors."""
         return Suspects(self.excess + chi2 - chi2.min())
 
-    @property
-    def forgotten(self) -> Suspects:
-        """After a row that needs no sensor at fault."""
-        return Suspects(_REMEMBERED * self.excess)
+    def forgotten(self, n_rows: int) -> Suspects:
+        """After rows that need no sensor at fault."""
+        return Suspects(_REMEMBERED**n_rows * self.excess)
 
     @property
     def culprit(self) -> int | None:

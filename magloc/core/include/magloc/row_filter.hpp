@@ -187,21 +187,30 @@ class RowFilter {
   }
 
   // After an update: the innovation (n_readings) freed of correlations, L^-1 nu with the lower root L of its
-  // covariance.
-  void fill_innovation(const Padded<T> &wide, const Padded<T> &triangle, double *innovation) {
+  // covariance: each reading less what the ones before it tell of it, in its standard deviations. Return the square by
+  // which the readings move the prediction, in its standard deviations, less its mean, the trace of the gain.
+  double fill_innovation(double *innovation) {
     fill_columns();
     bending_.straighten(columns_);
-    wide.clear(given_.n_readings);
+    solved_.clear(d_);  // root of the standard numbers' covariance after the readings so far, whose means are trial_
+    for (int64_t i = 0; i < d_; ++i) solved_[i][i] = 1.0, trial_[i] = -tail(d_)[i];
+    T *const told = rows_.lanes(0);
     for (int64_t i = 0; i < given_.n_readings; ++i) {
-      innovation[i] = reinterpret_cast<const double *>(misfit_)[i];
+      const Strided slope = columns_.column(i);
+      set_rows(told, slope, solved_, d_);
+      const double variance = 1.0 + dot(told, told, solved_.width()), sigma = square_root(variance);
+      double rest = reinterpret_cast<const double *>(misfit_)[i];
+      for (int64_t c = 0; c < d_; ++c) rest += slope.first[c * slope.step] * trial_[c];
+      innovation[i] = rest / sigma;
       for (int64_t c = 0; c < d_; ++c) {
-        wide[i][c] = columns_[c][i];
-        innovation[i] -= columns_[c][i] * tail(d_)[c];
+        const double gain = dot(solved_.lanes(c), told, solved_.width());
+        trial_[c] -= gain * rest / variance;
+        add_rows(solved_.lanes(c), {&gain, 1, -1.0 / (variance + sigma)}, {rows_}, 1);
       }
-      wide[i][d_ + i] = 1.0;
     }
-    triangularise(wide, given_.n_readings, triangle);
-    solve_transposed(triangle, given_.n_readings, innovation);
+    double correction = nis - chi2 - d_;
+    for (int64_t c = 0; c < d_; ++c) correction += dot(solved_.lanes(c), solved_.lanes(c), solved_.width());
+    return correction;
   }
 
   // Let mean and root be those after the update, the root in the charts about the new mean.
