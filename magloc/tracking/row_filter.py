@@ -13,6 +13,7 @@ import numpy as np
 
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc import core
+from magloc.measurement.nuisances import SensorErrors
 from magloc.tracking.chart.coordinates import FIRM
 from magloc.tracking.chart.row import Rows
 from magloc.tracking.chart.update import LEAST_GAIN, LEAST_SHARE, MOST_ITERATIONS, ROUNDING, TOLERANCE
@@ -168,9 +169,11 @@ def steps_problem(
     )
 
 
-def refill_step(steps: core.Problem, slot: int, motion: MotionModel, dt_s: float) -> None:
-    """Replace one of the steps of :func:`steps_problem` by that of another length."""
+def refill_step(steps: core.Problem, slot: int, motion: MotionModel, errors: SensorErrors, dt_s: float) -> None:
+    """Replace one of the steps of :func:`steps_problem`, without states, by that of another length."""
     kept = steps.kept
+    if kept["added"] is not None:
+        kept["kept"][slot], kept["added"][slot] = errors.step(dt_s)
     if isinstance(motion, OrnsteinUhlenbeck):
         kept["turning"][slot] = motion.turning_step(dt_s)
     elif (linear_step := getattr(motion, "linear_step", None)) is not None:

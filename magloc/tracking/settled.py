@@ -1,4 +1,8 @@
-"""Rows of a settled track in one compiled call: one source at one place, without lasting errors of sensors or pose."""
+"""Rows of a settled track in one compiled call: one source at one place, without errors of the pose.
+
+Sensors may have offsets, new numbers of the state that are linear in the readings. A prediction does not bend then as
+that of the readable steps does, so that these take rows whose readings bend by more than little.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +21,7 @@ from magloc.levels import CONTRADICTION
 from magloc.measurement.rows import ambient_fields
 from magloc.readings import Readings
 from magloc.tracking.chart.coordinates import Chart
-from magloc.tracking.chart.mixture import Mixture
+from magloc.tracking.chart.mixture import Mixture, root_of
 from magloc.tracking.chart.row import Rows
 from magloc.tracking.chart.split import LARGEST_BEND, MOST_ROWS
 from magloc.tracking.chart.steps import LARGEST_GROWTH, LARGEST_WIDTH, Known
@@ -33,13 +37,18 @@ _TERMS_A_CALL = 10_000_000
 """Approximate number of products that the kernel computes without looking for Ctrl-C: some 50 ms."""
 _TERMS_OF_STEPS = 3000
 """Products of a row that do not depend on the number of its differences."""
+_MOST_ERRORS, _MOST_NUMBERS = 100, 500_000
+"""Errors of sensors that the kernel estimates in less time than NumPy, and numbers of all roots of a call."""
+_LARGEST_STRAIGHT = 0.05
+"""Bend of the readings, as LARGEST_BEND, up to which errors of sensors are estimated by straight predictions."""
 
 
 @dataclass(frozen=True, eq=False)
 class SettledRows:
-    """Points of rows, what is known after them, the last row's innovation, and steps for a smoother if wanted."""
+    """Points of rows, the last of them, what is known after it, its innovation, and steps for a smoother if wanted."""
 
     points: list[TrackPoint]
+    last: Row
     known: Known
     innovation: Innovation | None
     steps: list[Step]
@@ -52,7 +61,7 @@ class SettledTrack:
     ----------
     array : SensorArray
     motion : MotionModel
-        Linear, or a lasting rate of turn: see :meth:`has_steps_of`.
+        Linear, or a lasting rate of turn.
     measurements : RowMeasurements
     full_count : int
         Differences of a row in which nothing is missing.
@@ -62,7 +71,10 @@ class SettledTrack:
         self._array, self._motion, self._measurements = array, motion, measurements
         self._differences: Differences | None = None
         self._has_ambients = False
-        m, n, k, n_channels = MOST_AT_ONCE, motion.n_states, full_count, array.n_channels
+        errors, k, n_channels = measurements.errors, full_count, array.n_channels
+        n, e = motion.n_states, errors.n_states
+        N = n + e
+        m = self._most = max(1, min(MOST_AT_ONCE, _MOST_NUMBERS // N**2))
         one = np.zeros(m, dtype=np.int64)
         self._rows = Rows(
             array,
@@ -70,23 +82,26 @@ class SettledTrack:
             np.zeros(m, dtype=np.int64),
             np.zeros((1, k, n_channels)),
             one,
-            np.zeros((m, k, 0)),
+            np.zeros((1, k, e)),
             np.zeros((m, 3)),
             np.zeros((m, 3, 3)),
             np.tile(array.ambient_fields, (m, 1, 1)),
         )
         self._slot_of_step: dict[float, int] = {}
         self._step_of_row = np.zeros(m, dtype=np.int64)
-        self._motions = steps_problem(motion, [0.0] * m, self._step_of_row)
+        noisy = (np.zeros((m, e)), np.zeros((m, e))) if errors.decay_Hz.any() or errors.walk.any() else None
+        self._motions = steps_problem(motion, [0.0] * m, self._step_of_row, noisy)
         self._values, self._centroid, self._open_loop = np.empty((m, n_channels)), np.empty(3), np.empty((n, n))
-        self._state = Gaussians(np.empty((1, n)), np.empty((1, n, n)))
-        self._predicted, self._updated = (Gaussians(np.empty((m, n)), np.empty((m, n, n))) for _ in range(2))
+        self._state = Gaussians(np.empty((1, N)), np.empty((1, N, N)), n_nuisances=e)
+        self._predicted, self._updated = (
+            Gaussians(np.empty((m, N)), np.empty((m, N, N)), n_nuisances=e) for _ in range(2)
+        )
         self._means, self._estimability = np.empty((2, m, N_SOURCE))
         self._covariances = np.empty((m, N_SOURCE, N_SOURCE))
         self._nis, self._innovation, self._iterations = np.empty(m), np.empty((m, k)), np.empty(m, dtype=np.int64)
         self._correction = np.empty(m)
         self._progress = np.zeros(3, dtype=np.int64)
-        self._block = max(1, _TERMS_A_CALL // (_TERMS_OF_STEPS + k * n_channels))
+        self._block = max(1, _TERMS_A_CALL // (_TERMS_OF_STEPS + k * n_channels + N**3))
         self._work = core.problem(
             "track",
             rows=self._rows.problem,
@@ -94,7 +109,7 @@ class SettledTrack:
             convergence=convergence(),
             nis_limits=np.asarray(chdtri(np.maximum(np.arange(k + 1), 1), CONTRADICTION), dtype=np.float64),
             largest_width=LARGEST_WIDTH,
-            largest_bend=LARGEST_BEND,
+            largest_bend=_LARGEST_STRAIGHT if e else LARGEST_BEND,
             longest_memory=MOST_ROWS,
             largest_growth=LARGEST_GROWTH,
             full_count=full_count,
@@ -116,10 +131,16 @@ class SettledTrack:
         self._space = core.new_workspace("follow_sources", self._work)
 
     @staticmethod
-    def has_steps_of(motion: MotionModel) -> bool:
-        """Whether the kernel has the steps of a motion."""
-        # Not by isinstance of a protocol, which looks through all of its attributes in every row.
-        return isinstance(motion, OrnsteinUhlenbeck) or hasattr(motion, "linear_step")
+    def of(
+        array: SensorArray, motion: MotionModel, measurements: RowMeasurements, full_count: int
+    ) -> SettledTrack | None:
+        """None where the kernel does not have the motion's steps, or some of the errors."""
+        errors = measurements.errors
+        has_errors = not errors.is_constant or measurements.pose_errors.n_states or errors.n_states > _MOST_ERRORS
+        # Not by isinstance of a protocol, which looks through all of its attributes for every motion.
+        if has_errors or not (isinstance(motion, OrnsteinUhlenbeck) or hasattr(motion, "linear_step")):
+            return None
+        return SettledTrack(array, motion, measurements, full_count)
 
     def follow(
         self,
@@ -150,7 +171,7 @@ class SettledTrack:
             Up to the first row that misses other channels, goes back in time, or does not continue the track; None if
             that is the first one. The readable steps take that row.
         """
-        taken, mixture = self._fill(rows[:MOST_AT_ONCE], time_s), known.mixture
+        taken, mixture = self._fill(rows[: self._most], time_s), known.mixture
         n = len(taken)
         self._state.x[:], self._state.S[:], self._centroid[:] = mixture.x, mixture.S, mixture.centroid_m
         self._open_loop[:], self._progress[:] = known.open_loop, (0, 1, mixture.n_rows)
@@ -168,12 +189,12 @@ class SettledTrack:
         else:
             known = replace(known, mixture=after, open_loop=open_loop)
         lag1, innovation = self._lag1(taken[:end], dof, last)
-        return SettledRows(self._points(taken[:end], dof, lag1, centroids), known, innovation, steps)
+        return SettledRows(self._points(taken[:end], dof, lag1, centroids), taken[end - 1], known, innovation, steps)
 
     def _fill(self, rows: Sequence[Row | Readings], time_s: float) -> list[Row]:
         """Take up rows as long as they have the first one's differences, and return them."""
         differences, given, taken = None, self._rows, list[Row]()
-        if len(self._slot_of_step) + len(rows) > MOST_AT_ONCE:
+        if len(self._slot_of_step) + len(rows) > self._most:
             self._slot_of_step.clear()
         for i, row in enumerate(rows):
             if not isinstance(row, Row):
@@ -185,7 +206,7 @@ class SettledTrack:
             slot = self._slot_of_step.get(dt_s)
             if slot is None:
                 slot = self._slot_of_step[dt_s] = len(self._slot_of_step)
-                refill_step(self._motions, slot, self._motion, dt_s)
+                refill_step(self._motions, slot, self._motion, self._measurements.errors, dt_s)
             self._step_of_row[i] = slot
             self._values[i], given.origins_m[i], given.rotations[i] = (
                 row.readings_T,
@@ -202,6 +223,9 @@ class SettledTrack:
             given.transforms[0, :k] = differences.transform / np.sqrt(differences.variance)[:, None]
             given.transforms[0, k:] = 0.0
             given.counts[:] = k
+            errors = self._measurements.errors
+            if errors.n_states:
+                given.effects[0] = given.transforms[0] @ errors.effect(self._array, self._values[0])
         values = self._values[: len(taken)] - self._array.channel_offset_T
         values[np.isnan(values)] = 0.0  # of no weight
         np.matmul(values, given.transforms[0].T, out=given.readings[: len(taken)])
@@ -212,6 +236,8 @@ class SettledTrack:
         if not dof:
             return [math.nan] * len(rows), None
         whitened = self._innovation[: len(rows), :dof].copy()
+        if self._measurements.errors.n_states:
+            self._correction[: len(rows)] = np.nan
         first = Innovation(rows[0].available, whitened[0]).after(last)["lag1"]
         return [first, *(whitened[1:] * whitened[:-1]).sum(axis=1).tolist()], Innovation(
             rows[-1].available, whitened[-1]
@@ -222,7 +248,8 @@ class SettledTrack:
         means, covariances, estimability = (
             some[:end].copy() for some in (self._means, self._covariances, self._estimability)
         )
-        x, S = self._updated.x[:end, None, :N_SOURCE].copy(), self._updated.S[:end, None, :N_SOURCE].copy()
+        x, rows_of_S = self._updated.x[:end, None, :N_SOURCE].copy(), self._updated.S[:end, None, :N_SOURCE]
+        S = root_of(rows_of_S) if self._measurements.errors.n_states else rows_of_S.copy()
         columns = (some[:end].tolist() for some in (self._iterations, self._nis, self._correction))
         told = zip(*columns, lag1, strict=True)
         return [

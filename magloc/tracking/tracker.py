@@ -100,13 +100,12 @@ class Tracker(CartesianFilter):
         background: Drift | None = None,
     ) -> None:
         self.array, self.prior, self.background, self.keep_steps = array, prior, background, keep_steps
-        self._settled: SettledTrack | None = None
-        self.motion = motion
         self.measurements = RowMeasurements(array, motion.n_states, background)
         self.errors, self.pose_errors = self.measurements.errors, self.measurements.pose_errors
         self.steps: list[Step] = []
         self._acquisition = Acquisition(array, prior)
         self.filter = ChartFilter(array, self.errors, self.pose_errors, prior)
+        self.motion = motion
         self._undetermined = Undetermined(self.filter)
         self._known: Known | None = None
         self._time_s, self._n_rows = math.nan, 0
@@ -146,17 +145,17 @@ class Tracker(CartesianFilter):
         """Points of the first of some rows: of as many as one compiled call takes, else of one; see :meth:`update`."""
         row = next_row(rows[0], self.array, self._time_s)
         if self._known is not None and self.is_compiled:
-            if self._settled is None:
-                self._settled = SettledTrack(self.array, self.motion, self.measurements, self.filter.n_differences)
+            assert self._settled is not None
             index = self._n_rows if self.keep_steps else None
             found = self._settled.follow(self._known, self._time_s, self._last, [row, *rows[1:]], index)
             if found is not None:
                 points = found.points
                 self.resume(found.known, points[-1].time_s, len(points), found.steps)
-                self._last = found.innovation
+                self._last, self._row_before = found.innovation, found.last
                 if found.innovation is not None:
                     self._suspects = self._suspects.forgotten(len(points))
                 return points
+            self._known = replace(self._known, mixture=self._known.mixture.with_block_root())
         return [self._advanced(row)]
 
     def _advanced(self, row: Row) -> TrackPoint:
@@ -178,7 +177,8 @@ class Tracker(CartesianFilter):
 
     @motion.setter
     def motion(self, motion: MotionModel) -> None:
-        self._motion, self._settled = KeptModulus.of(motion, self.prior), None
+        self._motion = KeptModulus.of(motion, self.prior)
+        self._settled = SettledTrack.of(self.array, self._motion, self.measurements, self.filter.n_differences)
 
     @property
     def known(self) -> Known | None:
@@ -198,7 +198,7 @@ class Tracker(CartesianFilter):
     @property
     def is_compiled(self) -> bool:
         """Whether the next row is stepped by compiled code, if it continues the track."""
-        return self.is_tracking and not self.n_errors and SettledTrack.has_steps_of(self.motion)
+        return self.is_tracking and self._settled is not None and not (self.keep_steps and self.n_errors)
 
     def resume(self, known: Known, time_s: float, n_rows: int = 0, steps: Sequence[Step] = ()) -> None:
         """Go on from what is known at a time, after so many rows more."""

@@ -106,6 +106,11 @@ class Mixture:
             return self
         return replace(self, x=self.x[:, :N_SOURCE], S=root_of(self.S[:, :N_SOURCE]), n_motion=N_SOURCE, n_pose=0)
 
+    def with_block_root(self) -> Mixture:
+        """The same with block-triangular roots: what is known of the sensors' errors alone stands in the last rows."""
+        n = self.n_motion
+        return replace(self, S=block_root(self.S)) if self.S[:, n:, :n].any() else self
+
     def likely(self) -> Mixture:
         """Without components of no weight."""
         return self.take(self.log_weight > self.log_weight.max() + DROPPED_BELOW)

@@ -195,18 +195,19 @@ class RowFilter {
     solved_.clear(d_);  // root of the standard numbers' covariance after the readings so far, whose means are trial_
     for (int64_t i = 0; i < d_; ++i) solved_[i][i] = 1.0, trial_[i] = -tail(d_)[i];
     T *const told = rows_.lanes(0);
+    const int64_t width = solved_.width();
     for (int64_t i = 0; i < given_.n_readings; ++i) {
       const Strided slope = columns_.column(i);
       set_rows(told, slope, solved_, d_);
-      const double variance = 1.0 + dot(told, told, solved_.width()), sigma = square_root(variance);
+      const double square = dot(told, told, width), sigma = square_root(1.0 + square), length = square_root(square);
       double rest = reinterpret_cast<const double *>(misfit_)[i];
       for (int64_t c = 0; c < d_; ++c) rest += slope.first[c * slope.step] * trial_[c];
       innovation[i] = rest / sigma;
-      for (int64_t c = 0; c < d_; ++c) {
-        const double gain = dot(solved_.lanes(c), told, solved_.width());
-        trial_[c] -= gain * rest / variance;
-        add_rows(solved_.lanes(c), {&gain, 1, -1.0 / (variance + sigma)}, {rows_}, 1);
-      }
+      scale(told, length > 0.0 ? 1.0 / length : 0.0, width);
+      int64_t c = 0;
+      for (; c + 4 <= d_; c += 4) project<4>(told, solved_.lanes(c), width, step_ + c, 1.0 - 1.0 / sigma);
+      for (; c < d_; ++c) project<1>(told, solved_.lanes(c), width, step_ + c, 1.0 - 1.0 / sigma);
+      for (c = 0; c < d_; ++c) trial_[c] -= step_[c] * length * rest / (sigma * sigma);
     }
     double correction = nis - chi2 - d_;
     for (int64_t c = 0; c < d_; ++c) correction += dot(solved_.lanes(c), solved_.lanes(c), solved_.width());
