@@ -407,12 +407,13 @@ def without_dummies(
     values = table.values.copy()
     earlier = values[:0] if before is None else before
     all_rows, units = np.concatenate([earlier, values]), sorted({1.0, columns.unit_nT})
-    suspected = may_be_dummies(all_rows, len(values), declared, units) if len(values) <= _FEW_ROWS else None
+    is_quick = 0 < len(values) <= _FEW_ROWS
+    suspected = may_be_dummies(all_rows, len(values), declared, units).tolist() if is_quick else None
     found: dict[str, int] = {}
     index = {name: i for i, name in enumerate(table.header)}
     for sensor, channels in form.channels.items():
         own = [index[channel] for channel in channels]
-        if suspected is not None and not suspected[own].any():
+        if suspected is not None and not any(suspected[i] for i in own):
             continue
         cells = dummy_cells(all_rows[:, own], declared, units)[len(earlier) :]
         if cells.any():
