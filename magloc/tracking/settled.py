@@ -228,7 +228,8 @@ class SettledTrack:
                 given.effects[0] = given.transforms[0] @ errors.effect(self._array, self._values[0])
         values = self._values[: len(taken)] - self._array.channel_offset_T
         values[np.isnan(values)] = 0.0  # of no weight
-        np.matmul(values, given.transforms[0].T, out=given.readings[: len(taken)])
+        # One by one, so that a row that comes alone is rounded alike.
+        given.readings[: len(taken)] = (given.transforms @ values[..., None])[..., 0]
         return taken
 
     def _lag1(self, rows: Sequence[Row], dof: int, last: Innovation | None) -> tuple[list[float], Innovation | None]:
