@@ -17,7 +17,7 @@ import numpy as np
 
 from arrays.io.csv import DUMMY, table_of_header, table_of_text, unix_seconds
 from arrays.io.csv import Table as CsvTable
-from arrays.io.dummies import dummy_cells
+from arrays.io.dummies import dummy_cells, may_be_dummies
 from arrays.io.errors import InputError, naming, of_extra
 from arrays.io.toml import Table
 from arrays.typing import FloatArray, Vector
@@ -31,6 +31,7 @@ _SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t", "space": " "}
 _CHOICES = {"separator": _SEPARATORS, "decimal": (".", ","), "time_unit": _SECONDS}
 _ENU_FROM_NED = ((0, 1, 0), (1, 0, 0), (0, 0, -1))
 _BODY_FROM_ARRAY = ((1, 0, 0), (0, -1, 0), (0, 0, -1))
+_FEW_ROWS = 20  # whose cells are screened before columns are
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -405,11 +406,16 @@ def without_dummies(
     declared = [columns.unit_nT * each for each in columns.dummy if not isinstance(each, str)]
     values = table.values.copy()
     earlier = values[:0] if before is None else before
+    all_rows, units = np.concatenate([earlier, values]), sorted({1.0, columns.unit_nT})
+    is_quick = 0 < len(values) <= _FEW_ROWS
+    suspected = may_be_dummies(all_rows, len(values), declared, units).tolist() if is_quick else None
     found: dict[str, int] = {}
+    index = {name: i for i, name in enumerate(table.header)}
     for sensor, channels in form.channels.items():
-        own = [table.header.index(channel) for channel in channels]
-        known = np.concatenate([earlier[:, own], values[:, own]])
-        cells = dummy_cells(known, declared, (1.0, columns.unit_nT))[len(earlier) :]
+        own = [index[channel] for channel in channels]
+        if suspected is not None and not any(suspected[i] for i in own):
+            continue
+        cells = dummy_cells(all_rows[:, own], declared, units)[len(earlier) :]
         if cells.any():
             numbers = ", ".join("*" if n == DUMMY else f"{n:.10g}" for n in np.unique(values[:, own][cells]))
             found[f"of sensor {sensor} ({numbers})"] = int(cells.any(axis=1).sum())

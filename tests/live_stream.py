@@ -1,8 +1,8 @@
 """Rows of thirty sensors sent to ``magloc live`` by a socket, or of a tetrahedron on its standard input.
 
-``python -m tests.live_stream --seconds 600`` sends 200 rows a second and prints the time from the send to the line, the
-processor time of a row, and the memory from minute to minute; ``--lost 0.1 --garbled 0.01`` damages the stream, and
-``--stdin 1000000`` counts rows a second. ``--rest-s`` is passed on.
+``python -m tests.live_stream --seconds 600`` sends 200 rows a second, or ``--rate-hz`` others, and prints the time from
+the send to the line, the processor time of a row, and the memory from minute to minute; ``--lost 0.1 --garbled 0.01``
+damages the stream, and ``--stdin 1000000`` counts rows a second. ``--rest-s`` is passed on.
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ from arrays.typing import FloatArray
 from magloc.measurement.differences import predicted_channels
 from tests.moving_magnets import board
 
-RATE_HZ = 200.0
 TOO_FAR_M = 0.01
 
 
@@ -35,9 +34,11 @@ def header(array: SensorArray) -> str:
     return ",".join(["time_s", *(f"{name}_nT" for name in array.channel_names)]) + "\n"
 
 
-def rows_of(array: SensorArray, n: int, scale_m: float, rest_s: float, rng: np.random.Generator) -> list[str]:
+def rows_of(
+    array: SensorArray, n: int, scale_m: float, rest_s: float, rng: np.random.Generator, rate_Hz: float = 200.0
+) -> list[str]:
     """Lines of a source that circles, and of a rest before it."""
-    time_s = np.arange(n) / RATE_HZ
+    time_s = np.arange(n) / rate_Hz
     place, moment = path(time_s, scale_m), np.tile([0.01, 0.03, 0.05], (n, 1)) * (scale_m / 0.05) ** 3
     values = predicted_channels(array, place, moment) * (time_s >= rest_s)[:, None]
     values += array.channel_noise_T * rng.normal(size=values.shape)
@@ -63,10 +64,10 @@ def processor_s(pid: int) -> float:
 
 
 def by_socket(given: argparse.Namespace, array: SensorArray, folder: Path) -> None:
-    """200 rows a second."""
-    rng = np.random.default_rng(given.seed)
-    n = int(given.seconds * RATE_HZ)
-    lines = rows_of(array, n, 0.05, given.rest_s, rng)
+    """As many rows a second as are wanted."""
+    rng, rate_Hz = np.random.default_rng(given.seed), given.rate_hz
+    n = int(given.seconds * rate_Hz)
+    lines = rows_of(array, n, 0.05, given.rest_s, rng, rate_Hz)
     lost, garbled = (rng.random(n) < share for share in (given.lost, given.garbled))
     lost[:50] = garbled[:50] = False
     server = socket.create_server(("127.0.0.1", 0))
@@ -83,14 +84,14 @@ def by_socket(given: argparse.Namespace, array: SensorArray, folder: Path) -> No
         peer.sendall(header(array).encode())
         begin = time.perf_counter()
         for i, line in enumerate(lines):
-            time.sleep(max(0.0, begin + i / RATE_HZ - time.perf_counter()))
+            time.sleep(max(0.0, begin + i / rate_Hz - time.perf_counter()))
             if lost[i]:
                 continue
             at = int(rng.integers(len(line) - 1))
             shown = line[:at] + "x;\0"[i % 3] + line[at + 1 :] if garbled[i] else line
             sent[i] = time.perf_counter()
             peer.sendall(shown.encode())
-            if i % int(30 * RATE_HZ) == int(10 * RATE_HZ):
+            if i % int(30 * rate_Hz) == int(10 * rate_Hz):
                 used.append((memory_MiB(process.pid), processor_s(process.pid)))
         used.append((memory_MiB(process.pid), processor_s(process.pid)))
         peer.close()
@@ -101,7 +102,7 @@ def by_socket(given: argparse.Namespace, array: SensorArray, folder: Path) -> No
     assert process.stdout is not None
     for line in process.stdout:
         arrived, entry = time.perf_counter(), json.loads(line)
-        latency.append(arrived - sent[round(entry["time_s"] * RATE_HZ)])
+        latency.append(arrived - sent[round(entry["time_s"] * rate_Hz)])
         acquired += entry["status"] == "acquired"
         if entry["position_m"] is not None and entry["time_s"] >= given.rest_s:
             tracked += 1
@@ -109,7 +110,7 @@ def by_socket(given: argparse.Namespace, array: SensorArray, folder: Path) -> No
             far += bool(off_m > TOO_FAR_M)
     sender.join()
     median, most, longest = 1e3 * np.nanquantile(latency[200:], [0.5, 0.999, 1.0])
-    took_ms = 1e3 * (used[-1][1] - used[0][1]) / (n - 10 * RATE_HZ)
+    took_ms = 1e3 * (used[-1][1] - used[0][1]) / (n - 10 * rate_Hz)
     print(
         f"{n} rows, {int(lost.sum())} lost, {int(garbled.sum())} garbled: {len(latency)} answered, {tracked} tracked,"
         f" {acquired} tracks begun, {far} more than {1e3 * TOO_FAR_M:.0f} mm off; from the send to the line median"
@@ -133,7 +134,7 @@ def by_pipe(given: argparse.Namespace, array: SensorArray, folder: Path) -> None
     process.stdin.write(header(array))
     used, begin = [], time.perf_counter()
     for i in range(n):
-        process.stdin.write(f"{i / RATE_HZ:.3f},{cut[i % len(cut)]}")
+        process.stdin.write(f"{i / given.rate_hz:.3f},{cut[i % len(cut)]}")
         if i % (n // 10) == n // 20:
             used.append(memory_MiB(process.pid))
     spent = processor_s(process.pid)
@@ -150,6 +151,7 @@ def main() -> None:
     """Send rows."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--rate-hz", type=float, default=200.0)
     parser.add_argument("--lost", type=float, default=0.0)
     parser.add_argument("--garbled", type=float, default=0.0)
     parser.add_argument("--rest-s", type=float, default=0.0)

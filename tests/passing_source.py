@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,8 +48,14 @@ def statuses(points: list[TrackPoint]) -> list[str]:
     return [point.status for point in points]
 
 
-def followed(tracker: Tracker, rows: list[Row]) -> list[TrackPoint]:
-    return list(tracker.run(rows))
+class ReadableTracker(Tracker):
+    """Takes the readable steps alone."""
+
+    is_compiled = False
+
+
+def followed(tracker: Tracker, rows: list[Row], progress: Callable[[int], None] | None = None) -> list[TrackPoint]:
+    return list(tracker.run(rows, progress))
 
 
 def positions(points: list[TrackPoint]) -> FloatArray:

@@ -10,6 +10,8 @@ from arrays.typing import BoolArray, FloatArray
 
 _NINES, _LARGE = (1e5, 1e8), 1e20  # powers of ten just above a row of nines
 _BLANKS = (1.70141e38, 3.40282e38)  # largest numbers of single precision, as they are often written
+_ROUNDING = 1e-8
+_SQUARE_VANISHES = 1e-150
 _FEWEST = 10  # other readings that say that zeros, or a number that is repeated, are none
 _APART, _KNOWN_APART = 10.0, 3.0  # over the spread of the others, or over their size
 _ALONE, _MOST_NEAR = 0.5, 0.02  # share of other readings that are nearer than so much of the distance to the middle
@@ -40,6 +42,24 @@ def dummy_cells(readings: FloatArray, declared: Sequence[float] = (), units: Seq
     return cells
 
 
+def may_be_dummies(
+    readings: FloatArray, n_new: int, declared: Sequence[float] = (), units: Sequence[float] = (1.0,)
+) -> BoolArray:
+    """Return which channels (k,) may have dummies in the last rows of readings (n, k): a quick bound of `dummy_cells`.
+
+    A channel whose new cells are neither declared, known, zero nor large numbers that are repeated has none.
+    """
+    new, size = readings[-n_new:], np.abs(readings)
+    found = np.isin(new, declared) | (size[-n_new:] < _SQUARE_VANISHES)
+    for unit in units:
+        found |= _is_known(size[-n_new:] / unit)
+    least = np.min(size, axis=0, initial=np.inf, where=size > 0.0)
+    large = size[-n_new:] > _APART * least
+    for row, is_large in enumerate(large):
+        found[row] |= is_large & ((readings == new[row]).sum(axis=0) > 1)
+    return np.asarray(found.any(axis=0))
+
+
 def _dummy_values(column: FloatArray, units: Sequence[float]) -> FloatArray:
     """Values of a column (n,), NaN where there is none, that are dummies."""
     found, counts = np.unique(column[np.isfinite(column)], return_counts=True)
@@ -62,10 +82,14 @@ def _dummy_values(column: FloatArray, units: Sequence[float]) -> FloatArray:
     return np.asarray(found[dummy])
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def _is_known(size: FloatArray) -> BoolArray:
-    """Whether magnitudes (n,) are numbers that are known for dummies."""
+    """Whether magnitudes (...) are numbers that are known for dummies."""
     power = 10.0 ** np.round(np.log10(np.maximum(size, 1.0)))
-    large = (size >= _LARGE) & np.isclose(size, power, rtol=1e-6)
-    large |= np.isclose(size[:, None], _BLANKS, rtol=1e-4).any(axis=1)
-    short = np.isclose((power - size)[:, None], (1.0, 0.1, 0.01), rtol=1e-6).any(axis=1)
+    large = (size >= _LARGE) & (np.abs(size - power) <= 1e-6 * power)
+    short = np.zeros(size.shape, np.bool_)
+    for blank in _BLANKS:
+        large |= np.abs(size - blank) <= 1e-4 * blank
+    for below in (1.0, 0.1, 0.01):
+        short |= np.abs(power - size - below) <= 1e-6 * below + _ROUNDING
     return np.asarray(large | (short & (power >= _NINES[0]) & (power <= _NINES[1])))

@@ -99,7 +99,14 @@ def workspace_size(kernel: str, work: Problem) -> int:
     return int(getattr(_lib, f"magloc_{kernel}")(work.struct, 0, 0, ffi.NULL))
 
 
-def run(kernel: str, work: Problem, n: int, *, block: int, chain: int | None = None) -> None:
+def new_workspace(kernel: str, work: Problem) -> Any:
+    """Return a workspace for :func:`run`, to be used by one thread again and again."""
+    return ffi.new("double[]", workspace_size(kernel, work) + 1)
+
+
+def run(
+    kernel: str, work: Problem, n: int, *, block: int, chain: int | None = None, workspace: Any | None = None
+) -> None:
     """
     Compute the items 0 to n - 1 of a problem, by several threads if there is more than one block.
 
@@ -118,23 +125,24 @@ def run(kernel: str, work: Problem, n: int, *, block: int, chain: int | None = N
     chain : int, optional
         Number of items that depend on each other, such as the steps of a filter. One thread computes them in order, and
         the workspace is the same for all of them.
+    workspace : optional
+        Of :func:`new_workspace`, where there is one chain or block; by default a new one.
     """
     function = getattr(_lib, f"magloc_{kernel}")
-    size = workspace_size(kernel, work)
     if 0 < n <= block:
-        function(work.struct, 0, n, ffi.new("double[]", size + 1))
+        function(work.struct, 0, n, new_workspace(kernel, work) if workspace is None else workspace)
         return
     chain = chain or block
     parts = range(0, n, chain)
     stopped = False
 
     def compute(parts: range) -> None:
-        workspace = ffi.new("double[]", size + 1)
+        space = new_workspace(kernel, work) if workspace is None else workspace
         for part in parts:
             end = min(part + chain, n)
             for begin in range(part, end, block):
                 if not stopped:
-                    function(work.struct, begin, min(begin + block, end), workspace)
+                    function(work.struct, begin, min(begin + block, end), space)
 
     n_threads = min(threads(), len(parts))
     if n_threads <= 1:

@@ -25,7 +25,6 @@ MAGLOC_KERNEL(update_row, row_update) {
   const int64_t k = p.rows->n_readings, d = n_measured * p.before->n_sources + p.before->n_nuisances;
   Workspace space(workspace);
   RowFilter<Lanes> filter(*p.before, *p.rows, space);
-  const Padded<Lanes> wide(space, p.innovation ? k : 0, filter.N + k), triangle(space, p.innovation ? k : 0, k);
   if (!workspace) return space.size();
   filter.set_row(p.row);
   for (int64_t i = begin; i < end; ++i) {
@@ -35,7 +34,7 @@ MAGLOC_KERNEL(update_row, row_update) {
     filter.update(*p.convergence, p.bends && p.bends[i], p.least_share, misfits, Q);
     if (Q) filter.store_linearisation(misfits + k, Q + d * k);
     if (p.standardised) filter.fill_standardised(p.followed, p.standardised + 3 * p.rows->n_sensors * i);
-    if (p.innovation) filter.fill_innovation(wide, triangle, p.innovation + k * i);
+    if (p.innovation) p.correction[i] = filter.fill_innovation(p.innovation + k * i);
     filter.finish_update();
     filter.store(*p.after, i);
     p.nis[i] = filter.nis;

@@ -25,11 +25,11 @@ from magloc.measurement.plausibility import FEWEST_ROWS, warn_of_array, warn_of_
 from magloc.measurement.pose import with_stated_pose
 from magloc.measurement.rows import joined
 from magloc.readings import EXPECTED_HEADER, Readings, log_format, without_saturated
-from magloc.tracking.batch import is_compiled, next_points
 from magloc.tracking.motion import MotionModel, RandomWalk
 from magloc.tracking.multi_target.motion import FreeMotion
 from magloc.tracking.multi_target.tracker import SourcesTracker
 from magloc.tracking.results import Row, SourcesPoint, TrackPoint, rows_of, warn_of_strengths
+from magloc.tracking.settled import MOST_AT_ONCE
 from magloc.tracking.track import SPEED_M_S, TURN_RAD_S
 from magloc.tracking.tracker import Tracker
 
@@ -51,7 +51,7 @@ class LivePoint(TrackPoint):
     ----------
     time_s, position_m, moment_Am2, covariance, estimability, iterations
         As of every point of a track.
-    nis, nis_dof, status, weight, rivals, centroid_m, radius_m, lag1, dropped_sensors, mixture
+    nis, nis_dof, status, weight, rivals, centroid_m, radius_m, lag1, correction, dropped_sensors, mixture
         The same.
     row : Row
         Readings and pose that it was found from, without the background of a rest.
@@ -309,7 +309,7 @@ class Follower:
         if isinstance(self._tracker, SourcesTracker):
             is_quick = len(rows) <= _MOST_WAITING  # where one is born, some wait
         else:
-            is_quick = self._tracker.is_tracking and is_compiled(self._tracker)
+            is_quick = self._tracker.is_compiled
         if len(rows) > 1 and not waits and (is_late or not is_quick):
             self.tally.skipped += len(rows) - 1
             return self._without_track(rows[:-1], SKIPPED)
@@ -342,7 +342,7 @@ def _known_sources(point: TrackPoint | SourcesPoint) -> Sequence[TrackPoint]:
 
 def _next_points(tracker: Tracker | SourcesTracker, rows: Sequence[Row]) -> Sequence[TrackPoint | SourcesPoint]:
     """What is known at the first of the rows, or at some of them."""
-    return [tracker.update(rows[0])] if isinstance(tracker, SourcesTracker) else next_points(tracker, rows)
+    return [tracker.update(rows[0])] if isinstance(tracker, SourcesTracker) else tracker.advance(rows[:MOST_AT_ONCE])
 
 
 def track(

@@ -148,8 +148,12 @@ def _connected(address: str) -> Iterator[socket.socket]:
 
 
 def _of_tcp(peer: socket.socket) -> Iterator[bytes]:
+    quick = getattr(socket, "TCP_QUICKACK", None)  # Linux
     try:
         while chunk := peer.recv(_ALL_THAT_WAITS):
+            if quick is not None:
+                # A sender that gathers what is small (Nagle) waits for this; the system forgets the option again.
+                peer.setsockopt(socket.IPPROTO_TCP, quick, 1)
             yield chunk
     except ConnectionError:  # as good an end as another
         return

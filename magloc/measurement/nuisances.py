@@ -145,6 +145,12 @@ class SensorErrors:
         """Number of errors."""
         return self.sigma.size
 
+    @property
+    def is_constant(self) -> bool:
+        """Whether the effect is that of offsets, the same in every row, whatever is read."""
+        fields = (self.of_sensor[:, 1] >= _FIELD) & (self.of_sensor[:, 1] < _INDUCED)
+        return bool(fields.all() and not self.is_slope.any() and not self.array.channel_is_scalar.any())
+
     def step(self, dt_s: float) -> tuple[FloatArray, FloatArray]:
         """What remains of every error after a step, and the standard deviation of what is added: (n,) each."""
         kept = np.exp(-self.decay_Hz * dt_s)

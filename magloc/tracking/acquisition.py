@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,14 +12,18 @@ from scipy.special import chdtri
 
 from arrays.array import SensorArray
 from arrays.typing import FloatArray
+from magloc.kalman import block_update, normalised_innovation_squared, predict_square_root, symmetric_square_root
 from magloc.levels import CONTRADICTION, DISAGREEMENT
 from magloc.localization.fit.prior import SourcePrior
 from magloc.localization.fit.results import Fix, Solution
 from magloc.localization.locator import fit_at_rest
 from magloc.localization.uncertainty.range_interval import relative_range_sigma
-from magloc.measurement.nuisances import ambient_in_array, with_eddies_as_offsets
+from magloc.measurement.nuisances import SensorErrors, ambient_in_array, with_eddies_as_offsets
 from magloc.measurement.pose import PoseErrors
-from magloc.tracking.results import Row
+from magloc.tracking.chart.known_moment import KnownInWorld
+from magloc.tracking.measurement import RowMeasurement, RowMeasurements
+from magloc.tracking.motion import N_SOURCE, MotionModel
+from magloc.tracking.results import Prediction, Row
 
 START_RANGE_ERROR = 0.03
 """Standard deviation of the range over the range that a start may have: beyond it the posterior is no Gaussian in
@@ -34,6 +39,11 @@ _STACKED_ROWS = 16
 _TRY_EVERY = 4
 # Of the error that a start may have, as all rows so far tell it: with more of it none is tried.
 _MOST_HOPEFUL = 1.2
+# How often the rows that a track starts from are linearised anew, until they move it by less than a share of its σ.
+_MOST_START_STEPS = 30
+_START_TOLERANCE = 1e-3
+# How much less is known of a source before them than after, in standard deviations.
+_UNKNOWN = 1e4
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,3 +145,122 @@ def _agree(before: Solution | None, after: Solution) -> bool:
     offset = after.position_m - before.position_m
     both = before.covariance[:3, :3] + after.covariance[:3, :3]
     return bool(offset @ np.linalg.solve(both, offset) < chdtri(3, DISAGREEMENT))
+
+
+@dataclass(frozen=True, eq=False)
+class FilteredStart:
+    """State at the start of a track, square root of its covariance, χ² of the rows, and the state at each of them."""
+
+    x: FloatArray
+    S: FloatArray
+    chi2: float
+    of_rows: Sequence[FloatArray] = ()
+
+
+class CartesianFilter:
+    """A filter of Cartesian states, linearised where they are known: for starts from several rows, and smoothing.
+
+    Attributes
+    ----------
+    prior : SourcePrior
+        What is known of the source's moment, in the array's frame.
+    measurements : RowMeasurements
+        What rows say of the state.
+    errors : SensorErrors
+        The lasting errors of the array's sensors, whose states follow those of the motion.
+    pose_errors : PoseErrors
+        Those of its pose, behind them.
+    """
+
+    prior: SourcePrior
+    measurements: RowMeasurements
+    errors: SensorErrors
+    pose_errors: PoseErrors
+
+    @property
+    @abstractmethod
+    def motion(self) -> MotionModel:
+        """How the source moves."""
+
+    @property
+    def n_errors(self) -> int:
+        """States behind those of the motion: errors of sensors and of the pose."""
+        return self.errors.n_states + self.pose_errors.n_states
+
+    @property
+    def error_sigma(self) -> FloatArray:
+        """Their standard deviations before anything is known (n_errors,)."""
+        return np.concatenate([self.errors.sigma, np.ones(self.pose_errors.n_states)])
+
+    def error_step(self, dt_s: float) -> tuple[FloatArray, FloatArray]:
+        """What remains of every error after a step, and the standard deviation of what is added: (n_errors,) each."""
+        of_sensors, of_pose = self.errors.step(dt_s), self.pose_errors.step(dt_s)
+        return np.concatenate([of_sensors[0], of_pose[0]]), np.concatenate([of_sensors[1], of_pose[1]])
+
+    def predicted(self, x: FloatArray, S: FloatArray, dt_s: float) -> Prediction:
+        """State, square root of its covariance and transition after a step without readings."""
+        n, n_errors = self.motion.n_states, self.n_errors
+        moved, F_motion, S_q_motion = self.motion.step(x[:n], dt_s)
+        kept, added = self.error_step(dt_s)
+        noisy = np.flatnonzero(added)
+        F, S_q = np.zeros((n + n_errors,) * 2), np.zeros((n + n_errors, S_q_motion.shape[1] + noisy.size))
+        F[:n, :n], S_q[:n, : S_q_motion.shape[1]] = F_motion, S_q_motion
+        F[n + np.arange(n_errors), n + np.arange(n_errors)] = kept
+        S_q[n + noisy, S_q_motion.shape[1] + np.arange(noisy.size)] = added[noisy]
+        return Prediction(np.concatenate([moved, kept * x[n:]]), predict_square_root(S, F, S_q), F)
+
+    def state_before(
+        self, centre: FloatArray, root: FloatArray, R_world_from_array: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the state before the first row, and its root, from that (6, 6) of position and moment about a centre.
+
+        With the array's rotation a moment that is known counts, linearised at the centre.
+        """
+        n = self.motion.n_states
+        x, S = np.zeros(centre.size), np.diag(np.concatenate([np.zeros(n), self.error_sigma]))
+        x[:n], S[:n, :n] = self.motion.start(centre[:N_SOURCE], root)
+        if R_world_from_array is None or (known := KnownInWorld.of(self.prior, R_world_from_array)) is None:
+            return x, S
+        H = known.along(centre[None], np.eye(len(centre))[None])[0]
+        return block_update(x, S, H, known.residual(centre[None])[0] - H @ (x - centre), np.ones(len(H)))
+
+    def start(self, source: FloatArray, covariance: FloatArray, rows: Sequence[Row]) -> FilteredStart | None:
+        """State at the last of the rows that a source (6,) was found from, as if at rest, with a covariance (6, 6).
+
+        The rows are filtered once more, from a source that is hardly known, until they are linearised where they lead:
+        what moves between them, and the errors of sensors that they have in common, are counted as in the rows to come.
+        None where that does not converge, or they contradict each other then.
+        """
+        if len(rows) == 1 and not self.n_errors:
+            return FilteredStart(*self.motion.start(source, symmetric_square_root(covariance)), 0.0)
+        measurements = [self.measurements.of(row) for row in rows]
+        dof = sum(measurement.z.size for measurement in measurements) - N_SOURCE
+        n, n_errors = self.motion.n_states, self.n_errors
+        centres = [np.concatenate([source, np.zeros(n - N_SOURCE + n_errors)])] * len(rows)
+        # Errors of the pose that change are linearised as each row knows them, everything else as all rows together.
+        own = np.concatenate([np.zeros(n + self.errors.n_states, dtype=bool), self.pose_errors.changes])
+        for _ in range(_MOST_START_STEPS):
+            found = self.filtered_start(centres, covariance, measurements)
+            step = (found.x - centres[-1])[:N_SOURCE]
+            centres = [np.where(own, of_row, found.x) for of_row in found.of_rows]
+            if np.all(np.abs(step) < _START_TOLERANCE * np.linalg.norm(found.S[:N_SOURCE], axis=1)):
+                return found if dof <= 0 or found.chi2 < chdtri(dof, CONTRADICTION) else None
+        return None
+
+    def filtered_start(
+        self, centres: Sequence[FloatArray], covariance: FloatArray, measurements: Sequence[RowMeasurement]
+    ) -> FilteredStart:
+        """One pass of :meth:`start`, with the readings of every row linearised at a state (n,)."""
+        unknown = np.diag(_UNKNOWN * np.sqrt(np.diagonal(covariance)))
+        x, S = self.state_before(centres[0], unknown, measurements[0].row.R_world_from_array)
+        chi2, of_rows = 0.0, []
+        for j, (measurement, centre) in enumerate(zip(measurements, centres, strict=True)):
+            if j:
+                prediction = self.predicted(x, S, measurement.row.time_s - measurements[j - 1].row.time_s)
+                x, S = prediction.x, prediction.S
+            H, ones = measurement.jacobian(centre), np.ones(measurement.z.size)
+            innovation = measurement.z - measurement.predicted(centre) - H @ (x - centre)
+            chi2 += normalised_innovation_squared(S, H, innovation, ones)
+            x, S = block_update(x, S, H, innovation, ones)
+            of_rows.append(x)
+        return FilteredStart(x, S, chi2, of_rows)

@@ -157,7 +157,7 @@ def nees_of(point: TrackPoint, truth: FloatArray, measurement: RowMeasurement) -
     if not known.any():
         return math.nan, 0
     if known[:3].all() and point.mixture is not None:
-        return _young_nees(point.mixture.matched(), truth, ChartRow.of(measurement))
+        return _young_nees(point.mixture.of_source().matched(), truth, ChartRow.of(measurement))
     estimate = np.concatenate([point.position_m, point.moment_Am2])
     error, covariance = truth - estimate, point.covariance
     if known.all():

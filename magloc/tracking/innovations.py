@@ -34,7 +34,13 @@ class InnovationTest:
         Sum of squares of the whitened innovations. If it is too large, there are errors that are not stated.
     z_lag1 : float
         Sum of their products with the row before. If it is too large, errors last that are stated as new in each row,
-        or the readings were filtered. NaN without products: compiled steps keep no innovations.
+        or the readings were filtered. NaN without products. It counts unless `excess` is negative.
+    excess : float
+        Excess of the variance of predicted readings over the claimed one, summed over rows and readings, in units of
+        the innovations' variance. With innovations ν, their covariance S and the gain K it is
+        :math:`HK (νν^T - S)` plus the products with the row before, on average (Mehra 1970). If it is negative, the
+        source moves more steadily than the model says, and the track is better than it claims. NaN if errors of
+        sensors or pose are states.
     z_constants : float
         Lever arm and mounting that a fit of the rows finds, if a pose is stated and these count as exact. If it is too
         large, they are not exact. NaN otherwise, and with a measured motion.
@@ -52,6 +58,7 @@ class InnovationTest:
     rows: int
     z_chi2: float
     z_lag1: float
+    excess: float = math.nan
     z_constants: float = math.nan
     z_ambient: float = math.nan
     ambient_factor: float = math.nan
@@ -65,7 +72,8 @@ class InnovationTest:
 
     @property
     def _sums(self) -> tuple[float, ...]:
-        return self.z_chi2, self.z_lag1, self.z_constants, self.z_ambient
+        z_lag1 = math.nan if self.excess < 0.0 else self.z_lag1
+        return self.z_chi2, z_lag1, self.z_constants, self.z_ambient
 
     @property
     def flagged(self) -> bool:
@@ -88,7 +96,7 @@ class InnovationTest:
         elif self.z_ambient > THRESHOLD:
             z, what = self.z_ambient, "the rows agree on another ambient field than the exact one"
             why = "ambient_uncertainty_nT is stated too small"
-        elif self.z_lag1 > THRESHOLD:
+        elif self.z_lag1 > THRESHOLD and not self.excess < 0.0:
             z, what = self.z_lag1, "differences between readings and predictions are alike in successive rows"
             why = "the motion differs from the motion model, offsets or pose errors last, or readings were filtered"
         else:
@@ -119,15 +127,17 @@ class InnovationTest:
 
 
 def innovation_test(points: Sequence[TrackPoint]) -> InnovationTest:
-    """Return the test of all rows of a track; a row that contradicts it counts as one at the gate."""
-    nis, dof, lag1 = np.array([(p.nis, p.nis_dof, p.lag1) for p in points], dtype=np.float64).reshape(-1, 3).T
+    """Return the test of all rows of a track; a row that contradicts it counts as one at the limit."""
+    of_rows = [(p.nis, p.nis_dof, p.lag1, p.correction) for p in points]
+    nis, dof, lag1, correction = np.array(of_rows, dtype=np.float64).reshape(-1, 4).T
     known = np.isfinite(nis) & (dof > 0.0)
     limited = np.minimum(nis[known], chdtri(np.maximum(dof[known], 1.0), CONTRADICTION))
-    paired = np.isfinite(lag1)
+    paired, corrected = np.isfinite(lag1), np.isfinite(lag1 + correction)
     return InnovationTest(
         int(known.sum()),
         _standardised(float(np.sum(limited - dof[known])), 2.0 * float(dof[known].sum())),
         _standardised(float(lag1[paired].sum()), float(dof[paired].sum())),
+        excess=float((lag1 + correction)[corrected].sum()) if corrected.any() else math.nan,
         starts=sum(point.status == "acquired" for point in points),
     )
 

@@ -76,10 +76,11 @@ def moving(row: Row, before: Row | None) -> Row:
 
 @dataclass(frozen=True, eq=False)
 class Innovation:
-    """Whitened innovations (k,) of a row, and the channels (C,) that it has."""
+    """Whitened innovations (k,) of a row, the channels (C,) that it has, and :attr:`TrackPoint.correction`."""
 
     available: BoolArray
     whitened: FloatArray
+    correction: float = math.nan
 
     def after(self, before: Innovation | None) -> dict[str, Any]:
         """Return NIS, its degrees of freedom, and the product with the innovation before, if of the same channels."""
@@ -87,6 +88,7 @@ class Innovation:
         return {
             "nis": float(self.whitened @ self.whitened),
             "nis_dof": self.whitened.size,
+            "correction": self.correction,
             "lag1": float(self.whitened @ before.whitened) if before is not None and same else math.nan,
         }
 
@@ -122,6 +124,10 @@ class TrackPoint:
     lag1 : float
         Product of the whitened innovations of this row and the one before: mean zero and variance `nis_dof` for a right
         model. NaN if the row before has none, or other channels.
+    correction : float
+        Squared correction of the prediction by the readings, in its standard deviations, less its mean: mean zero for a
+        right model, and less if predictions are better than is claimed. NaN without a prediction, and if errors of
+        sensors or pose are states.
     dropped_sensors : tuple of str
         Sensors left out because they contradict the others.
     mixture : Mixture, optional
@@ -142,6 +148,7 @@ class TrackPoint:
     centroid_m: FloatArray | None = None
     radius_m: float = math.nan
     lag1: float = math.nan
+    correction: float = math.nan
     mixture: Mixture | None = None
     dropped_sensors: tuple[str, ...] = ()
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc import core
+from magloc.measurement.nuisances import SensorErrors
 from magloc.tracking.chart.coordinates import FIRM
 from magloc.tracking.chart.row import Rows
 from magloc.tracking.chart.update import LEAST_GAIN, LEAST_SHARE, MOST_ITERATIONS, ROUNDING, TOLERANCE
@@ -74,6 +75,8 @@ class RowUpdates:
 
     Attributes
     ----------
+    correction : ndarray, shape (C,), optional
+        Square by which the readings move the prediction, in its standard deviations, less its mean.
     standardised : ndarray, shape (C, n_sensors, 3), optional
         Residuals of each sensor's channels, of unit covariance. Their square is by how much less `nis` would be if the
         readings of the sensor were free.
@@ -90,6 +93,7 @@ class RowUpdates:
     iterations: IntArray
     converged: BoolArray
     innovation: FloatArray | None
+    correction: FloatArray | None
     standardised: FloatArray | None
     misfits: FloatArray | None
     projectors: FloatArray | None
@@ -166,6 +170,17 @@ def steps_problem(
     )
 
 
+def refill_step(steps: core.Problem, slot: int, motion: MotionModel, errors: SensorErrors, dt_s: float) -> None:
+    """Replace one of the steps of :func:`steps_problem`, without states, by that of another length."""
+    kept = steps.kept
+    if kept["added"] is not None:
+        kept["kept"][slot], kept["added"][slot] = errors.step(dt_s)
+    if isinstance(motion, OrnsteinUhlenbeck):
+        kept["turning"][slot] = motion.turning_step(dt_s)
+    elif (linear_step := getattr(motion, "linear_step", None)) is not None:
+        kept["F"][slot], kept["A"][slot], kept["B"][slot] = linear_step(dt_s)
+
+
 def predict(before: Gaussians, centroid_m: FloatArray, steps: core.Problem, rows: Rows, row: int = 0) -> Gaussians:
     """Return Gaussians after the step to a row; the sensors' centroid stood at `centroid_m` before."""
     after = before.unfilled()
@@ -217,6 +232,7 @@ def update(
     nis, chi2, log_evidence = np.empty((3, n))
     iterations, converged = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.uint8)
     whitened = np.empty((n, rows.readings.shape[1])) if innovation else None
+    correction = np.empty(n) if innovation else None
     k, d = rows.readings.shape[1], N_SOURCE * before.n_sources + before.n_nuisances
     shapes = (n, rows.array.n_sensors, 3), (n, 2, k), (n, 2, d, k)
     standardised, misfits, projectors = (np.empty(shape) if linearisations else None for shape in shapes)
@@ -236,13 +252,14 @@ def update(
         iterations=iterations,
         converged=converged,
         innovation=whitened,
+        correction=correction,
         standardised=standardised,
         misfits=misfits,
         projectors=projectors,
     )
     core.run("update_row", work, n, block=n)
-    sound = converged.astype(np.bool_)
-    return RowUpdates(after, nis, chi2, log_evidence, iterations, sound, whitened, standardised, misfits, projectors)
+    of_rows = (whitened, correction, standardised, misfits, projectors)
+    return RowUpdates(after, nis, chi2, log_evidence, iterations, converged.astype(np.bool_), *of_rows)
 
 
 def bends(gaussians: Gaussians, rows: Rows, memory: float, row: int = 0) -> tuple[FloatArray, FloatArray]:

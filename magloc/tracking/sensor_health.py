@@ -207,10 +207,9 @@ class Suspects:
         """Return the state after a row, by its χ² (N,) without each sensor."""
         return Suspects(self.excess + chi2 - chi2.min())
 
-    @property
-    def forgotten(self) -> Suspects:
-        """State after a row that needs no sensor at fault."""
-        return Suspects(_REMEMBERED * self.excess)
+    def forgotten(self, n_rows: int) -> Suspects:
+        """Return the state after rows that need no sensor at fault."""
+        return Suspects(_REMEMBERED**n_rows * self.excess)
 
     @property
     def culprit(self) -> int | None:

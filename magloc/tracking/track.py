@@ -23,13 +23,13 @@ from magloc.measurement.nuisances import Drift
 from magloc.measurement.plausibility import usable_readings
 from magloc.measurement.pose import with_stated_pose
 from magloc.readings import Readings
-from magloc.tracking.batch import next_points, track_record
 from magloc.tracking.consistency import Consistency, consistency
 from magloc.tracking.files import dataset_of_track, geojson_of_track, kml_of_track, lines_of_track
 from magloc.tracking.innovations import InnovationTest, innovation_test
 from magloc.tracking.motion import MotionModel, OrnsteinUhlenbeck, RandomWalk, known_motions
 from magloc.tracking.posterior_bound import posterior_bound, smoothing_bound
 from magloc.tracking.results import Row, SourcesPoint, TrackPoint, TrackResult, rows_of, stacked, warn_of_strengths
+from magloc.tracking.settled import MOST_AT_ONCE
 from magloc.tracking.tracker import Tracker
 from magloc.tracking.whole_records.background import track_on_background
 from magloc.tracking.whole_records.body_errors import body_factor
@@ -336,7 +336,7 @@ def track(
     elif smooth:
         points = finished(smoothed(list(_followed(tracker, used, motion, progress)), tracker.steps), told)
     else:
-        points = finished(_followed(tracker, used, motion, progress, at_once=told is not None), told)
+        points = finished(_followed(tracker, used, motion, progress), told)
     warn_of_strengths(points)
     return Track(points, used, tracker, smooth)
 
@@ -356,10 +356,8 @@ def _followed(
     readings: Readings,
     unmeasured: MotionModel,
     progress: Callable[[int], None] | None,
-    *,
-    at_once: bool = False,
 ) -> Iterator[TrackPoint]:
-    """Yield the points of a record, `at_once` one by one; set a measured motion before each row."""
+    """Yield the points of a record as soon as they are known; set a measured motion before each row."""
     rows, motions = list(rows_of(readings)), None
     if readings.motion is not None:
         if not isinstance(unmeasured, RandomWalk):
@@ -368,14 +366,11 @@ def _followed(
                 f" rates; instead received {type(unmeasured).__name__}."
             )
         motions = known_motions(readings.motion, unmeasured)
-    elif not at_once:
-        yield from track_record(tracker, rows, progress)
-        return
     done = 0
     while done < len(rows):
         if motions is not None:
             tracker.motion = motions[done]
-        points = next_points(tracker, rows, done)
+        points = tracker.advance(rows[done : done + MOST_AT_ONCE])
         yield from points
         done += len(points)
         if progress is not None:

@@ -8,34 +8,32 @@ that the array states of its sensors (:mod:`magloc.measurement.nuisances`), and 
 (:mod:`magloc.measurement.pose`): also those that are new in every row, so that the readings are modelled at the pose
 that they tell of. Positions, moments and steps for smoothing are Cartesian.
 
-This module is the readable form; :mod:`magloc.tracking.batch` steps long records, and a test holds the two together.
+Rows of a settled track are stepped by :mod:`magloc.tracking.settled` in one compiled call, all others here; a test
+holds the two together.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from scipy.special import chdtri
 
 from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray
-from magloc.kalman import block_update, normalised_innovation_squared, predict_square_root, symmetric_square_root
-from magloc.levels import CONTRADICTION
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.measurement.nuisances import Drift
 from magloc.readings import Readings
-from magloc.tracking.acquisition import STACKED_POSITION_ERROR, Acquisition
+from magloc.tracking.acquisition import STACKED_POSITION_ERROR, Acquisition, CartesianFilter
 from magloc.tracking.acquisition import Start as RowsStart
-from magloc.tracking.chart.known_moment import KeptModulus, KnownInWorld
+from magloc.tracking.chart.known_moment import KeptModulus
 from magloc.tracking.chart.mixture import Mixture
 from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.chart.start import NO_DIPOLE, prior_root
 from magloc.tracking.chart.steps import LARGEST_WIDTH, ChartFilter, Known, RowUpdate, cartesian, charted, width_of
 from magloc.tracking.chart.undetermined import Undetermined
-from magloc.tracking.measurement import RowMeasurement, RowMeasurements
+from magloc.tracking.measurement import RowMeasurements
 from magloc.tracking.motion import N_SOURCE, MotionModel
 from magloc.tracking.results import (
     UNDETERMINED,
@@ -49,29 +47,15 @@ from magloc.tracking.results import (
     of_mixture,
 )
 from magloc.tracking.sensor_health import SENSOR_LIMIT, SensorHealth, Suspects
+from magloc.tracking.settled import MOST_AT_ONCE, SettledTrack
 
 ROWS_TO_LOSE = 3
 """Contradicting rows in a row that end a track."""
 LARGEST_RANGE_ERROR = LARGEST_WIDTH
 """A track whose range is less certain, σ over range, is lost."""
-# How often the rows that a track starts from are linearised anew, until they move it by less than a share of its σ.
-_MOST_START_STEPS = 30
-_START_TOLERANCE = 1e-3
-# How much less is known of a source before them than after, in standard deviations.
-_UNKNOWN = 1e4
 
 
-@dataclass(frozen=True, eq=False)
-class FilteredStart:
-    """State at the start of a track, square root of its covariance, χ² of the rows, and the state at each of them."""
-
-    x: FloatArray
-    S: FloatArray
-    chi2: float
-    of_rows: Sequence[FloatArray] = ()
-
-
-class Tracker:
+class Tracker(CartesianFilter):
     """Follows one dipole, row by row.
 
     Parameters
@@ -116,12 +100,12 @@ class Tracker:
         background: Drift | None = None,
     ) -> None:
         self.array, self.prior, self.background, self.keep_steps = array, prior, background, keep_steps
-        self.motion = motion
         self.measurements = RowMeasurements(array, motion.n_states, background)
         self.errors, self.pose_errors = self.measurements.errors, self.measurements.pose_errors
         self.steps: list[Step] = []
         self._acquisition = Acquisition(array, prior)
         self.filter = ChartFilter(array, self.errors, self.pose_errors, prior)
+        self.motion = motion
         self._undetermined = Undetermined(self.filter)
         self._known: Known | None = None
         self._time_s, self._n_rows = math.nan, 0
@@ -142,7 +126,40 @@ class Tracker:
         ValueError
             Time goes backwards, or the readings are not one row.
         """
-        row = next_row(row, self.array, self._time_s)
+        return self.advance([row])[0]
+
+    def run(
+        self, rows: Iterable[Row | Readings], progress: Callable[[int], None] | None = None
+    ) -> Iterator[TrackPoint]:
+        """Points of successive rows; those of a sequence some at once, see :meth:`advance`."""
+        for part in [rows] if isinstance(rows, Sequence) else ([row] for row in rows):
+            done = 0
+            while done < len(part):
+                points = self.advance(part[done : done + MOST_AT_ONCE])
+                done += len(points)
+                yield from points
+                if progress is not None:
+                    progress(len(points))
+
+    def advance(self, rows: Sequence[Row | Readings]) -> list[TrackPoint]:
+        """Points of the first of some rows: of as many as one compiled call takes, else of one; see :meth:`update`."""
+        row = next_row(rows[0], self.array, self._time_s)
+        if self._known is not None and self.is_compiled:
+            assert self._settled is not None
+            index = self._n_rows if self.keep_steps else None
+            found = self._settled.follow(self._known, self._time_s, self._last, [row, *rows[1:]], index)
+            if found is not None:
+                points = found.points
+                self.resume(found.known, points[-1].time_s, len(points), found.steps)
+                self._last, self._row_before = found.innovation, found.last
+                if found.innovation is not None:
+                    self._suspects = self._suspects.forgotten(len(points))
+                return points
+            self._known = replace(self._known, mixture=self._known.mixture.with_block_root())
+        return [self._advanced(row)]
+
+    def _advanced(self, row: Row) -> TrackPoint:
+        """The point of a row by the readable steps."""
         if self.n_errors:
             row, self._row_before = moving(row, self._row_before), row
         dt_s, self._time_s = row.time_s - self._time_s, row.time_s
@@ -153,15 +170,6 @@ class Tracker:
             out, point = self._followed(self._known, row, index, dt_s)
         return replace(point, dropped_sensors=tuple(np.array(self.array.ids)[out].tolist())) if out.any() else point
 
-    def run(
-        self, rows: Iterable[Row | Readings], progress: Callable[[int], None] | None = None
-    ) -> Iterator[TrackPoint]:
-        """Points of successive rows."""
-        for row in rows:
-            yield self.update(row)
-            if progress is not None:
-                progress(1)
-
     @property
     def motion(self) -> MotionModel:
         """How the source moves: a modulus that is known stays."""
@@ -170,6 +178,7 @@ class Tracker:
     @motion.setter
     def motion(self, motion: MotionModel) -> None:
         self._motion = KeptModulus.of(motion, self.prior)
+        self._settled = SettledTrack.of(self.array, self._motion, self.measurements, self.filter.n_differences)
 
     @property
     def known(self) -> Known | None:
@@ -186,53 +195,16 @@ class Tracker:
         """Whether the next row continues a track that is no longer young, of one place and with all sensors."""
         return (known := self._known) is not None and known.is_settled and self._health.is_well
 
+    @property
+    def is_compiled(self) -> bool:
+        """Whether the next row is stepped by compiled code, if it continues the track."""
+        return self.is_tracking and self._settled is not None and not (self.keep_steps and self.n_errors)
+
     def resume(self, known: Known, time_s: float, n_rows: int = 0, steps: Sequence[Step] = ()) -> None:
         """Go on from what is known at a time, after so many rows more."""
         self._known, self._time_s, self._last = known, time_s, None
         self._n_rows += n_rows
         self.steps += steps
-
-    @property
-    def n_errors(self) -> int:
-        """States behind those of the motion: errors of sensors and of the pose."""
-        return self.errors.n_states + self.pose_errors.n_states
-
-    @property
-    def error_sigma(self) -> FloatArray:
-        """Their standard deviations before anything is known (n_errors,)."""
-        return np.concatenate([self.errors.sigma, np.ones(self.pose_errors.n_states)])
-
-    def error_step(self, dt_s: float) -> tuple[FloatArray, FloatArray]:
-        """What remains of every error after a step, and the standard deviation of what is added: (n_errors,) each."""
-        of_sensors, of_pose = self.errors.step(dt_s), self.pose_errors.step(dt_s)
-        return np.concatenate([of_sensors[0], of_pose[0]]), np.concatenate([of_sensors[1], of_pose[1]])
-
-    def predicted(self, x: FloatArray, S: FloatArray, dt_s: float) -> Prediction:
-        """State, square root of its covariance and transition after a step without readings."""
-        n, n_errors = self.motion.n_states, self.n_errors
-        moved, F_motion, S_q_motion = self.motion.step(x[:n], dt_s)
-        kept, added = self.error_step(dt_s)
-        noisy = np.flatnonzero(added)
-        F, S_q = np.zeros((n + n_errors,) * 2), np.zeros((n + n_errors, S_q_motion.shape[1] + noisy.size))
-        F[:n, :n], S_q[:n, : S_q_motion.shape[1]] = F_motion, S_q_motion
-        F[n + np.arange(n_errors), n + np.arange(n_errors)] = kept
-        S_q[n + noisy, S_q_motion.shape[1] + np.arange(noisy.size)] = added[noisy]
-        return Prediction(np.concatenate([moved, kept * x[n:]]), predict_square_root(S, F, S_q), F)
-
-    def state_before(
-        self, centre: FloatArray, root: FloatArray, R_world_from_array: FloatArray | None = None
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return the state before the first row, and its root, from that (6, 6) of position and moment about a centre.
-
-        With the array's rotation a moment that is known counts, linearised at the centre.
-        """
-        n = self.motion.n_states
-        x, S = np.zeros(centre.size), np.diag(np.concatenate([np.zeros(n), self.error_sigma]))
-        x[:n], S[:n, :n] = self.motion.start(centre[:N_SOURCE], root)
-        if R_world_from_array is None or (known := KnownInWorld.of(self.prior, R_world_from_array)) is None:
-            return x, S
-        H = known.along(centre[None], np.eye(len(centre))[None])[0]
-        return block_update(x, S, H, known.residual(centre[None])[0] - H @ (x - centre), np.ones(len(H)))
 
     def known_before(self, seen: ChartRow, x: FloatArray) -> FloatArray:
         """Covariance (n, n) of the motion's states of a source at x before its first row."""
@@ -243,47 +215,6 @@ class Tracker:
         """What becomes of it in a step from a state x in which no readings are taken."""
         _, F, S_q = self.motion.step(x[: self.motion.n_states], dt_s)
         return F @ covariance @ F.T + S_q @ S_q.T
-
-    def start(self, source: FloatArray, covariance: FloatArray, rows: Sequence[Row]) -> FilteredStart | None:
-        """State at the last of the rows that a source (6,) was found from, as if at rest, with a covariance (6, 6).
-
-        The rows are filtered once more, from a source that is hardly known, until they are linearised where they lead:
-        what moves between them, and the errors of sensors that they have in common, are counted as in the rows to come.
-        None where that does not converge, or they contradict each other then.
-        """
-        if len(rows) == 1 and not self.n_errors:
-            return FilteredStart(*self.motion.start(source, symmetric_square_root(covariance)), 0.0)
-        measurements = [self.measurements.of(row) for row in rows]
-        dof = sum(measurement.z.size for measurement in measurements) - N_SOURCE
-        n, n_errors = self.motion.n_states, self.n_errors
-        centres = [np.concatenate([source, np.zeros(n - N_SOURCE + n_errors)])] * len(rows)
-        # Errors of the pose that change are linearised as each row knows them, everything else as all rows together.
-        own = np.concatenate([np.zeros(n + self.errors.n_states, dtype=bool), self.pose_errors.changes])
-        for _ in range(_MOST_START_STEPS):
-            found = self.filtered_start(centres, covariance, measurements)
-            step = (found.x - centres[-1])[:N_SOURCE]
-            centres = [np.where(own, of_row, found.x) for of_row in found.of_rows]
-            if np.all(np.abs(step) < _START_TOLERANCE * np.linalg.norm(found.S[:N_SOURCE], axis=1)):
-                return found if dof <= 0 or found.chi2 < chdtri(dof, CONTRADICTION) else None
-        return None
-
-    def filtered_start(
-        self, centres: Sequence[FloatArray], covariance: FloatArray, measurements: Sequence[RowMeasurement]
-    ) -> FilteredStart:
-        """One pass of :meth:`start`, with the readings of every row linearised at a state (n,)."""
-        unknown = np.diag(_UNKNOWN * np.sqrt(np.diagonal(covariance)))
-        x, S = self.state_before(centres[0], unknown, measurements[0].row.R_world_from_array)
-        chi2, of_rows = 0.0, []
-        for j, (measurement, centre) in enumerate(zip(measurements, centres, strict=True)):
-            if j:
-                prediction = self.predicted(x, S, measurement.row.time_s - measurements[j - 1].row.time_s)
-                x, S = prediction.x, prediction.S
-            H, ones = measurement.jacobian(centre), np.ones(measurement.z.size)
-            innovation = measurement.z - measurement.predicted(centre) - H @ (x - centre)
-            chi2 += normalised_innovation_squared(S, H, innovation, ones)
-            x, S = block_update(x, S, H, innovation, ones)
-            of_rows.append(x)
-        return FilteredStart(x, S, chi2, of_rows)
 
     def _lost(self, row: Row, reason: str) -> TrackPoint:
         """What is known of a row without a track."""
@@ -338,8 +269,8 @@ class Tracker:
             out, update, of_sensor = self._without_one(update, lambda out: updated(self._seen(row, out)))
             seen = self._seen(row, out)
         else:
-            self._suspects = self._suspects.forgotten
-        innovation = Innovation(seen.row.available, update.innovation)
+            self._suspects = self._suspects.forgotten(1)
+        innovation = Innovation(seen.row.available, update.innovation, update.correction)
         if update.mixture is None:
             contradictions = before.contradictions + (not of_sensor)
             if contradictions >= ROWS_TO_LOSE:

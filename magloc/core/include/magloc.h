@@ -545,6 +545,7 @@ typedef struct {
   int64_t *iterations;  /* (n) */
   uint8_t *converged;   /* (n) */
   double *innovation;   /* (n, n_readings) whitened, or null */
+  double *correction;   /* (n), with that: square by which readings move a prediction, in its sigma, less its mean */
   double *standardised; /* (n, n_sensors, 3) residuals of each sensor's channels, of unit covariance, or null */
   double *misfits;      /* (n, 2, n_readings) at the prediction and after the update, or null */
   double *projectors;   /* (n, 2, d, n_readings) Q of the same: I - Q^T Q is the readings' information; or null */
@@ -581,8 +582,10 @@ typedef struct {
   double *open_loop;           /* (n_sources, n_states, n_states) covariance had no readings been taken */
   int64_t *progress;           /* (3): next row, 1 as long as the track continues, and updates that led to the state */
   const magloc_sources *predicted, *updated; /* by rows, where the track continues */
-  double *open_loop_variances;               /* (n_rows, n_sources n_states) */
+  double *means, *covariances;               /* (n_rows, n_sources, 6) and (.., 6, 6) of positions and moments */
+  double *estimability;                      /* (n_rows, n_sources, 6): 1 - sigma / sigma without any readings */
   double *nis;                               /* (n_rows); NaN without readings */
+  double *innovation, *correction;           /* (n_rows, n_readings) and (n_rows), as of magloc_row_update */
   int64_t *iterations;                       /* (n_rows) */
 } magloc_track;
 int64_t magloc_follow_sources(const magloc_track *problem, int64_t begin, int64_t end, double *workspace);

@@ -37,7 +37,7 @@ class Mixture:
     x : ndarray, shape (K, N)
         Cartesian states: source, motion, and the sensors' lasting errors.
     S : ndarray, shape (K, N, N)
-        Roots of their covariances, in the chart about each.
+        Roots of their covariances, in the chart about each; of a point of a track (K, 6, N) until :meth:`of_source`.
     log_weight : ndarray, shape (K,)
         Logarithms of their weights, which add up to one.
     n_motion : int
@@ -102,9 +102,14 @@ class Mixture:
 
     def of_source(self) -> Mixture:
         """Position and moment alone."""
-        if self.S.shape[2] == N_SOURCE:
+        if self.S.shape[1:] == (N_SOURCE, N_SOURCE):
             return self
         return replace(self, x=self.x[:, :N_SOURCE], S=root_of(self.S[:, :N_SOURCE]), n_motion=N_SOURCE, n_pose=0)
+
+    def with_block_root(self) -> Mixture:
+        """The same with block-triangular roots: what is known of the sensors' errors alone stands in the last rows."""
+        n = self.n_motion
+        return replace(self, S=block_root(self.S)) if self.S[:, n:, :n].any() else self
 
     def likely(self) -> Mixture:
         """Without components of no weight."""

@@ -33,7 +33,7 @@ class Rows:
         Number of differences of each row.
     transforms, transform_of_row : ndarray, shapes (m, k, n_channels) and (n,)
         From channels to differences.
-    effects : ndarray, shape (n, k, n_nuisances)
+    effects : ndarray, shape (n or 1, k, n_nuisances)
         Effects of nuisances on the readings.
     origins_m, rotations : ndarray, shapes (n, 3) and (n, 3, 3)
         Pose of the array.
@@ -72,7 +72,7 @@ class Rows:
             transforms=np.ascontiguousarray(self.transforms),
             transform_of_row=np.ascontiguousarray(self.transform_of_row, dtype=np.int64),
             effects=np.ascontiguousarray(self.effects),
-            effect_of_row=order,
+            effect_of_row=order if len(self.effects) > 1 else np.zeros_like(order),
             origins=np.ascontiguousarray(self.origins_m),
             rotations=np.ascontiguousarray(self.rotations),
             ambients=np.ascontiguousarray(self.ambients_T),

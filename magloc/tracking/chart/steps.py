@@ -13,6 +13,7 @@ followed. Then none is divided, and all rows of a young track are fitted togethe
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -113,12 +114,16 @@ class RowUpdate:
     innovation : ndarray, shape (k,)
         Whitened, of the component that explains them best.
     iterations : int
+    correction : float
+        Of the same: square by which the readings move it, in its standard deviations, less its mean; NaN where errors
+        of sensors or pose are states, since those that are new in every row count as noise.
     """
 
     mixture: Mixture | None
     nis: float
     innovation: FloatArray
     iterations: int = 0
+    correction: float = math.nan
 
 
 class ChartFilter:
@@ -204,7 +209,14 @@ class ChartFilter:
         best = int(np.argmax(log_weight))
         found = replace(predicted, x=after.x, S=after.S, log_weight=log_weight, n_rows=predicted.n_rows + 1)
         mixture = found.take(sound).reduced()
-        return RowUpdate(mixture, float(after.nis[best]), after.whitened_innovation(best), int(after.iterations[best]))
+        correction = getattr(after, "correction", None)
+        return RowUpdate(
+            mixture,
+            float(after.nis[best]),
+            after.whitened_innovation(best),
+            int(after.iterations[best]),
+            math.nan if correction is None else float(correction[best]),
+        )
 
     def refitted(self, known: Known) -> Known:
         """What is known when all rows of a young track are fitted together, if it is time to."""

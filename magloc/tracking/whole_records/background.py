@@ -22,7 +22,6 @@ from magloc.kalman import block_update, whitened_innovation
 from magloc.levels import CONTRADICTION
 from magloc.localization.uncertainty.range_interval import relative_range_sigma
 from magloc.readings import Readings
-from magloc.tracking.batch import track_record
 from magloc.tracking.chart.coordinates import Chart
 from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.chart.steps import charted
@@ -98,7 +97,7 @@ def _plain_tracks(tracker: Tracker, readings: Readings) -> Iterator[tuple[int, l
         for times in _NOISIER:
             sensors = tuple(replace(sensor, noise_T=times * sensor.noise_T) for sensor in tracker.array.sensors)
             plain = Tracker(replace(tracker.array, sensors=sensors), tracker.motion, prior=tracker.prior)
-            points = track_record(plain, list(rows_of(source)))
+            points = list(plain.run(list(rows_of(source))))
             known = np.flatnonzero([point.is_on_track for point in points])
             if len(known) < _FEWEST_ROWS:
                 continue

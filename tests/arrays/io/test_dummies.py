@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from arrays.io.dummies import dummy_cells
+from arrays.io.dummies import dummy_cells, may_be_dummies
 from arrays.typing import FloatArray
 
 RNG = np.random.default_rng(0)
@@ -65,3 +65,17 @@ def test_numbers_whose_squares_overflow_are_no_fault() -> None:
     readings = np.full((12, 3), 4e4)
     readings[3:6] = 1e155, -1.7e308, 2.0
     assert dummy_cells(readings)[3:6, 0].all()
+
+
+CELLS = st.sampled_from([0.0, -0.0, 1.0, -3.0, 20.0, 250.0, -99999.0, 1e-170, 99.9, 1e22, 7.0, np.nan])
+
+
+@given(st.lists(st.tuples(CELLS, CELLS), min_size=1, max_size=40), st.integers(1, 5))
+def test_a_quick_bound_misses_no_dummy(cells: list[tuple[float, float]], n_new: int) -> None:
+    readings, n_new = np.array(cells), min(n_new, len(cells))
+    found = dummy_cells(readings, (7.0,), (1.0, 10.0))[-n_new:].any(axis=0)
+    assert not (found & ~may_be_dummies(readings, n_new, (7.0,), (1.0, 10.0))).any()
+
+
+def test_the_quick_bound_rules_out_usual_readings() -> None:
+    assert not may_be_dummies(AXES, 3).any()

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from arrays import geometries
 from arrays.array_file import read_array
 from magloc.readings import Readings, read_readings
-from magloc.tracking.batch import track_record
 from magloc.tracking.motion import OrnsteinUhlenbeck, RandomWalk
 from magloc.tracking.posterior_bound import posterior_bound, smoothing_bound
 from magloc.tracking.results import rows_of
@@ -30,6 +29,7 @@ from magloc.tracking.whole_records.smoother import smoothed
 from magloc.truth import Truth, truth_of_rows
 from tests.command_line import Outcome, Run, assert_refused, refuse_constant, results_of
 from tests.oracles import magpylib_field
+from tests.passing_source import followed
 
 FloatArray = NDArray[np.float64]
 SENSORS = geometries.tetrahedron(1.5).positions
@@ -142,7 +142,7 @@ class TestJson:
         results = results_of(run("track", readings, "--array", array, "--json", *MOTION))
         tracker = Tracker(read_array(array), RandomWalk(0.1, float(np.deg2rad(1.2))))
         table = read_readings(readings, tracker.array)
-        points = track_record(tracker, list(rows_of(table)))
+        points = followed(tracker, list(rows_of(table)))
         for entry, point in zip(results, points, strict=True):
             expected = None if point.position_m is None else point.position_m.tolist()
             assert entry["position_m"] == expected
@@ -207,7 +207,7 @@ class TestSmooth:
         results = results_of(run("track", readings, "--array", array, "--json", "--smooth", *MOTION))
         tracker = Tracker(read_array(array), OrnsteinUhlenbeck(0.1, float(np.deg2rad(1.2))), keep_steps=True)
         table = read_readings(readings, tracker.array)
-        points = track_record(tracker, list(rows_of(table)))
+        points = followed(tracker, list(rows_of(table)))
         for entry, point in zip(results, smoothed(points, tracker.steps), strict=True):
             assert entry["position_m"] == (None if point.position_m is None else point.position_m.tolist())
 

@@ -30,7 +30,6 @@ from magloc.measurement.nuisances import (
     with_eddies_as_offsets,
     without_lasting_errors,
 )
-from magloc.tracking.batch import track_record
 from magloc.tracking.chart.coordinates import Chart
 from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.chart.update import updated
@@ -40,6 +39,7 @@ from magloc.tracking.tracker import Tracker
 from sims.magnetics.paths import Attitude, Steered
 from sims.magnetics.scenario import Carrier, MagneticScenario, Source
 from sims.magnetics.sensors import SensorModel
+from tests.passing_source import followed
 
 FloatArray = NDArray[np.float64]
 AMBIENT_T = (2e-6, 20e-6, -43e-6)
@@ -373,7 +373,7 @@ class TestErrorsAreFound:
             readings, truth = simulation.readings, simulation.truth
             rows = list(rows_of(readings))
             tracker = Tracker(simulation.array, RandomWalk(1e-7, 1e-7))
-            points = track_record(tracker, rows)
+            points = followed(tracker, rows)
             assert points[-1].status == "tracked"
             assert tracker.known is not None
             mixture = tracker.known.mixture

@@ -16,14 +16,13 @@ from arrays.array import SensorArray
 from arrays.geometries import axial, tetrahedron
 from arrays.typing import FloatArray
 from magloc.measurement.differences import predicted_channels
-from magloc.tracking.batch import track_record
 from magloc.tracking.consistency import nees_of
 from magloc.tracking.files import json_entry
 from magloc.tracking.motion import MotionModel
 from magloc.tracking.posterior_bound import posterior_bound
 from magloc.tracking.results import Row, rows_of
 from magloc.tracking.tracker import Tracker
-from tests.passing_source import ARRAY
+from tests.passing_source import ARRAY, followed
 from tests.tracked_sources import VELOCITY, WALK, drawn
 
 
@@ -34,7 +33,7 @@ def judged(motion: MotionModel, n: int, seeds: range, array: SensorArray = ARRAY
         truth, readings = drawn(motion, n, seed, array)
         rows, tracker = list(rows_of(readings)), Tracker(array, motion)
         bounds = posterior_bound(tracker, rows, truth[:, :3], truth[:, 3:6])
-        for i, point in enumerate(track_record(tracker, rows)):
+        for i, point in enumerate(followed(tracker, rows)):
             assert point.position_m is not None
             ((low, high),) = point.range_interval_m or ((0.0, None),)
             range_m = float(np.linalg.norm(truth[i, :3] - ARRAY.centroid))

@@ -23,6 +23,7 @@ from magloc.measurement.differences import predicted_channels
 from magloc.tracking import row_filter
 from magloc.tracking.chart import update as readable
 from magloc.tracking.chart.coordinates import Chart
+from magloc.tracking.chart.mixture import component_moments
 from magloc.tracking.chart.row import ChartRow, Rows
 from magloc.tracking.motion import CoordinatedTurn, KnownMotion, MotionModel, OrnsteinUhlenbeck, RandomWalk
 from magloc.tracking.results import Row
@@ -271,7 +272,7 @@ class Board:
         of_sources[..., :3] = R.apply(sources[..., :3].reshape(-1, 3)).reshape(2, -1, 3) + self.origin
         of_sources[..., 3:6] = R.apply(sources[..., 3:].reshape(-1, 3)).reshape(2, -1, 3)
         of_sources[..., 6:] = 0.1 * rng.normal(size=(2, n_sources, n_states - 6))
-        unit = 0.06 / 0.07**3
+        unit = 0.06
         sigma = np.tile(np.repeat([0.03, 0.03 * unit, 0.3], [3, 3, n_states - 6]), n_sources)
         S = np.concatenate([sigma, np.full(3, 1e-4)])[:, None] * rng.normal(size=(2, N, N)) / math.sqrt(N)
         self.gaussians = Gaussians(x, S, n_sources, 3, power=0)
@@ -287,7 +288,7 @@ class Board:
         there = x + e
         for k in range(self.K):
             of_source = slice(self.n * k, self.n * (k + 1))
-            there[of_source] = retracted(x[of_source], e[of_source], self.centroid, self.radius, 3, firm=firm)
+            there[of_source] = retracted(x[of_source], e[of_source], self.centroid, self.radius, 0, firm=firm)
         return there
 
     def coordinates(self, x: FloatArray, there: FloatArray) -> FloatArray:
@@ -361,6 +362,9 @@ class TestSeveralSources:
             innovation = fit.fun[:k] - J[:k] @ fit.fun[k:]
             whitened = np.linalg.solve(np.linalg.cholesky(np.eye(k) + J[:k] @ J[:k].T), innovation)
             np.testing.assert_allclose(found.innovation[c], whitened, atol=1e-2)
+            gain = float(np.trace(np.linalg.solve(J.T @ J, J[:k].T @ J[:k])))
+            assert found.correction is not None
+            assert found.correction[c] == pytest.approx(float(fit.x @ fit.x) - gain, abs=1e-2)
 
     def test_prediction(self, n_sources: int) -> None:
         board, motion = Board(n_sources, 10 + n_sources), OrnsteinUhlenbeck(0.3, 1.8, 1.5)
@@ -379,7 +383,7 @@ class TestSeveralSources:
                 Q[at, at] = S_q @ S_q.T
                 for of_chart, state, origin in ((L, x, centroid), (L_after, expected, board.centroid)):
                     of_chart[at, at] = slope(
-                        lambda e, x=state[at], c=origin: retracted(x, e, c, board.radius, 3), np.zeros(12)
+                        lambda e, x=state[at], c=origin: retracted(x, e, c, board.radius, 0), np.zeros(12)
                     )
             np.testing.assert_allclose(x_found, expected, rtol=1e-12)
             moved = np.linalg.solve(L_after, F @ L @ S)
@@ -467,11 +471,12 @@ class TestSeveralSources:
         steps = row_filter.steps_problem(
             motion, [0.02], np.zeros(n_rows, dtype=np.intp), (np.ones((1, 3)), np.full((1, 3), 1e-7))
         )
-        n, N = n_sources * board.n, state.x.shape[1]
+        N = state.x.shape[1]
         for largest_bend, n_followed in ((math.inf, 3), (0.0, 0)):
             now, progress = replace(state, x=state.x.copy(), S=state.S.copy()), np.array([0, 1, 1])
             predicted, after = (replace(state, x=np.empty((5, N)), S=np.empty((5, N, N))) for _ in range(2))
-            nis = np.empty(n_rows)
+            nis, innovation = np.empty(n_rows), np.empty((n_rows, len(board.z)))
+            means, covariances = np.empty((n_rows, n_sources, 6)), np.empty((n_rows, n_sources, 6, 6))
             work = core.problem(
                 "track",
                 rows=rows.problem,
@@ -490,8 +495,12 @@ class TestSeveralSources:
                 progress=progress,
                 predicted=predicted.problem,
                 updated=after.problem,
-                open_loop_variances=np.empty((n_rows, n)),
+                means=means,
+                covariances=covariances,
+                estimability=np.empty((n_rows, n_sources, 6)),
                 nis=nis,
+                innovation=innovation,
+                correction=np.empty(n_rows),
                 iterations=np.empty(n_rows, dtype=np.int64),
             )
             core.run("follow_sources", work, n_rows, block=2, chain=n_rows)
@@ -500,8 +509,15 @@ class TestSeveralSources:
             for row in range(n_followed):
                 expected = row_filter.predict(expected, board.centroid, steps, rows, row)
                 np.testing.assert_array_equal(predicted.x[row], expected.x[0])
-                updates = row_filter.update(expected, rows, row)
+                updates = row_filter.update(expected, rows, row, innovation=True)
                 expected = updates.after
                 assert nis[row] == updates.nis[0]
+                np.testing.assert_array_equal(innovation[row], updates.whitened_innovation(0))
+                of_sources = expected.x[0, :-3].reshape(n_sources, board.n)
+                S = expected.S[0, :-3].reshape(n_sources, board.n, N)[:, :6]
+                chart = Chart.at(of_sources, board.centroid, rows.array.circumradius)
+                mean, covariance = component_moments(chart, S)  # of places: moments fall by another power here
+                np.testing.assert_allclose(means[row, :, :3], mean[:, :3], rtol=1e-12)
+                np.testing.assert_allclose(covariances[row, :, :3, :3], covariance[:, :3, :3], rtol=1e-9, atol=1e-18)
                 np.testing.assert_array_equal(after.S[row], expected.S[0])
             np.testing.assert_array_equal(now.x, expected.x)

@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from magloc.chi_square import mean_bounds
-from magloc.tracking.batch import track_record
 from magloc.tracking.consistency import consistency, nees_of
 from magloc.tracking.motion import MotionModel, OrnsteinUhlenbeck, RandomWalk
 from magloc.tracking.posterior_bound import posterior_bound
@@ -33,6 +32,7 @@ from sims.magnetics.scenario import MagneticScenario
 from sims.magnetics.scenario_files import read_scenario
 from sims.magnetics.simulation import Simulation
 from sims.montecarlo import run_many
+from tests.passing_source import followed
 from tests.sims.magnetics.white_noise import with_white_noise_only
 
 FloatArray = NDArray[np.float64]
@@ -61,7 +61,7 @@ def track_statistics(simulation: Simulation, motion: MotionModel) -> dict[str, A
     readings, truth = simulation.readings, simulation.truth
     rows = list(rows_of(readings))
     tracker = Tracker(simulation.array, motion)
-    points = track_record(tracker, rows)
+    points = followed(tracker, rows)
     assert truth.moment_Am2 is not None
     source = np.concatenate([truth.position_m, truth.moment_Am2], axis=1)
     nees = np.full(N_INSTANTS, np.nan)
@@ -98,7 +98,7 @@ def at_rest_with_bound(simulation: Simulation, _: None) -> dict[str, Any]:
     rows = list(rows_of(readings))
     tracker = Tracker(simulation.array, REST)
     assert truth.moment_Am2 is not None
-    points = track_record(tracker, rows)
+    points = followed(tracker, rows)
     first = next(i for i, point in enumerate(points) if point.covariance is not None)
     seen = slice(first, None)
     position_m, moment_Am2 = truth.position_m[seen], truth.moment_Am2[seen]

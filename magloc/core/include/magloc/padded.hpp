@@ -127,9 +127,9 @@ void solve(const Padded<T> &root, int64_t n, double *b) {
   }
 }
 
-// Take the shares of a unit vector out of m rows.
+// Take the shares of a unit vector, or a part of each, out of m rows.
 template <int m, class T>
-MAGLOC_INLINE void project(const T *unit, T *rows, int64_t width, double *shares) {
+MAGLOC_INLINE void project(const T *unit, T *rows, int64_t width, double *shares, double part = 1.0) {
   T sum[m] = {};
   for (int64_t r = 0; r < width; ++r) {
     MAGLOC_UNROLL
@@ -138,7 +138,7 @@ MAGLOC_INLINE void project(const T *unit, T *rows, int64_t width, double *shares
   for (int i = 0; i < m; ++i) shares[i] = sum_of_lanes(sum[i]);
   for (int64_t r = 0; r < width; ++r) {
     MAGLOC_UNROLL
-    for (int i = 0; i < m; ++i) rows[i * width + r] -= shares[i] * unit[r];
+    for (int i = 0; i < m; ++i) rows[i * width + r] -= part * shares[i] * unit[r];
   }
 }
 

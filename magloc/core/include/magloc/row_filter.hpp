@@ -188,21 +188,31 @@ class RowFilter {
   }
 
   // After an update: the innovation (n_readings) freed of correlations, L^-1 nu with the lower root L of its
-  // covariance.
-  void fill_innovation(const Padded<T> &wide, const Padded<T> &triangle, double *innovation) {
+  // covariance: each reading less what the ones before it tell of it, in its standard deviations. Return the square by
+  // which the readings move the prediction, in its standard deviations, less its mean, the trace of the gain.
+  double fill_innovation(double *innovation) {
     fill_columns();
     bending_.straighten(columns_);
-    wide.clear(given_.n_readings);
+    solved_.clear(d_);  // root of the standard numbers' covariance after the readings so far, whose means are trial_
+    for (int64_t i = 0; i < d_; ++i) solved_[i][i] = 1.0, trial_[i] = -tail(d_)[i];
+    T *const told = rows_.lanes(0);
+    const int64_t width = solved_.width();
     for (int64_t i = 0; i < given_.n_readings; ++i) {
-      innovation[i] = reinterpret_cast<const double *>(misfit_)[i];
-      for (int64_t c = 0; c < d_; ++c) {
-        wide[i][c] = columns_[c][i];
-        innovation[i] -= columns_[c][i] * tail(d_)[c];
-      }
-      wide[i][d_ + i] = 1.0;
+      const Strided slope = columns_.column(i);
+      set_rows(told, slope, solved_, d_);
+      const double square = dot(told, told, width), sigma = square_root(1.0 + square), length = square_root(square);
+      double rest = reinterpret_cast<const double *>(misfit_)[i];
+      for (int64_t c = 0; c < d_; ++c) rest += slope.first[c * slope.step] * trial_[c];
+      innovation[i] = rest / sigma;
+      scale(told, length > 0.0 ? 1.0 / length : 0.0, width);
+      int64_t c = 0;
+      for (; c + 4 <= d_; c += 4) project<4>(told, solved_.lanes(c), width, step_ + c, 1.0 - 1.0 / sigma);
+      for (; c < d_; ++c) project<1>(told, solved_.lanes(c), width, step_ + c, 1.0 - 1.0 / sigma);
+      for (c = 0; c < d_; ++c) trial_[c] -= step_[c] * length * rest / (sigma * sigma);
     }
-    triangularise(wide, given_.n_readings, triangle);
-    solve_transposed(triangle, given_.n_readings, innovation);
+    double correction = nis - chi2 - d_;
+    for (int64_t c = 0; c < d_; ++c) correction += dot(solved_.lanes(c), solved_.lanes(c), solved_.width());
+    return correction;
   }
 
   // Let mean and root be those after the update, the root in the charts about the new mean.

@@ -14,6 +14,8 @@ class Track {
   const Padded<T> wide_ = filter_.wide(motion_, space_);
   double *const bends_ = space_.take<double>(3 * K_), *const directions_ = space_.take<double>(3 * K_ * filter_.N);
   double *const open_loop_ = space_.take<double>(K_ * ns_ * ns_);
+  const Padded<T> cartesian_{space_, n_measured,
+                             filter_.N};  // root of the covariance of a source's position and moment
   double *const variances_ = space_.take<double>(n_measured * K_);  // of what readings depend on, before the step
 
  public:
@@ -34,20 +36,21 @@ class Track {
     if (p_.rows->counts[row] > 0) {
       if (bends()) return false;
       filter_.update(*p_.convergence, prediction_bends(row), p_.least_share);
+      p_.correction[row] = filter_.fill_innovation(p_.innovation + p_.rows->n_readings * row);
       filter_.finish_update();
       if (!(filter_.converged && filter_.nis <= p_.nis_limits[p_.rows->counts[row]]) || is_too_wide()) return false;
       p_.nis[row] = filter_.nis;
       p_.iterations[row] = filter_.iterations;
       ++p_.progress[2];
     } else {
-      p_.nis[row] = nan;
+      p_.nis[row] = p_.correction[row] = nan;
       p_.iterations[row] = 0;
     }
     filter_.store(*p_.updated, row);
     filter_.store(*p_.state, 0);
     __builtin_memcpy(p_.centroid, filter_.centroid(), sizeof centroid_before);
     __builtin_memcpy(p_.open_loop, open_loop_, K_ * ns_ * ns_ * sizeof(double));
-    for (int64_t i = 0; i < K_ * ns_; ++i) p_.open_loop_variances[K_ * ns_ * row + i] = open_loop_[ns_ * i + i % ns_];
+    for (int64_t k = 0; k < K_; ++k) fill_moments(k, K_ * row + k);
     return true;
   }
 
@@ -77,6 +80,26 @@ class Track {
     for (int64_t i = 0; i < 3 * K_; ++i)
       if (!(bends_[i] <= p_.largest_bend)) return true;
     return false;
+  }
+
+  // Mean and covariance of a source's position and moment, the range being log-normal: see component_moments in
+  // magloc/tracking/chart/mixture.py; and which share of each standard deviation readings took away.
+  void fill_moments(int64_t k, int64_t item) const {
+    const double zero[max_source_states] = {}, *const x = filter_.x + ns_ * k;
+    const SourceChart chart(x, ns_, p_.state->power, filter_.centroid(), p_.rows->radius);
+    ChartedState here;
+    chart.move(zero, here);
+    const double open = filter_.variance(ns_ * k), growth = exponential(0.5 * minimum(open, 1.0)) - 1.0;
+    cartesian_.copy(filter_.root.from(n_measured * k), n_measured);
+    chart.to_state(here, cartesian_.lanes(0), (T *)nullptr, cartesian_.width());
+    for (int64_t i = 0; i < n_measured; ++i) {
+      p_.means[n_measured * item + i] = x[i] + (i < 3 ? growth * here.position[i][0] : 0.0);
+      double *const covariance = p_.covariances + n_measured * (n_measured * item + i);
+      for (int64_t j = 0; j < n_measured; ++j)
+        covariance[j] = dot(cartesian_.lanes(i), cartesian_.lanes(j), cartesian_.width());
+      const double left = covariance[i] / open_loop_[ns_ * (ns_ * k + i) + i];
+      p_.estimability[n_measured * item + i] = 1.0 - square_root(minimum(left, 1.0));
+    }
   }
 
   // Covariance of each source after the step had no readings been taken.

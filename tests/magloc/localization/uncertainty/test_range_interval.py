@@ -49,12 +49,11 @@ from magloc.localization.uncertainty.range_interval import (
 from magloc.measurement.differences import DifferenceMeasurement, predicted_channels
 from magloc.measurement.rows import whitened_rows
 from magloc.measurement.whitened import WhitenedModel
-from magloc.tracking.batch import track_record
 from magloc.tracking.motion import RandomWalk
 from magloc.tracking.results import Row, TrackPoint
 from magloc.tracking.tracker import Tracker
 from tests import oracles
-from tests.passing_source import ARRAY, MOMENT, POSITION, readings_of
+from tests.passing_source import ARRAY, MOMENT, POSITION, followed, readings_of
 from tests.plain_locator import plain_locator
 from tests.variable_projection import projected_chi2
 
@@ -716,7 +715,7 @@ class TestTrack:
         position = distance * POSITION / np.linalg.norm(POSITION)
         readings = readings_of(ARRAY, np.tile(position, (n, 1)), np.tile(MOMENT, (n, 1)), 0)
         tracker = Tracker(ARRAY, RandomWalk(0.01, 0.01))
-        return tracker, track_record(tracker, [Row(0.5 * i, values) for i, values in enumerate(readings)])
+        return tracker, followed(tracker, [Row(0.5 * i, values) for i, values in enumerate(readings)])
 
     def test_of_a_track_it_is_that_of_its_covariance(self) -> None:
         _, points = self.points(20, 2.5)

@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
-from magloc.tracking.batch import track_record
 from magloc.tracking.motion import OrnsteinUhlenbeck
 from magloc.tracking.results import Prediction, Step
 from magloc.tracking.tracker import Tracker
 from magloc.tracking.whole_records.smoother import smoothed, smoothed_states
-from tests.passing_source import ARRAY, SLOW, moving_source, positions, readings_of, rows_from
+from tests.passing_source import ARRAY, SLOW, followed, moving_source, positions, readings_of, rows_from
 
 
 class TestSmoother:
@@ -44,7 +43,7 @@ class TestSmoother:
         time_s, p, m = moving_source(30)
         p[15:] += [-6.0, 0.0, 0.0]
         tracker = Tracker(ARRAY, SLOW, keep_steps=True)
-        points = track_record(tracker, rows_from(time_s, readings_of(ARRAY, p, m)))
+        points = followed(tracker, rows_from(time_s, readings_of(ARRAY, p, m)))
         again = points.index(next(point for point in points[1:] if point.status == "acquired"))
         finished = smoothed(points, tracker.steps)
         np.testing.assert_allclose(positions(finished)[again - 1], positions(points)[again - 1], rtol=1e-9)
@@ -54,7 +53,7 @@ class TestSmoother:
     def test_never_claims_to_know_less(self) -> None:
         time_s, p, m = moving_source(40)
         tracker = Tracker(ARRAY, OrnsteinUhlenbeck(0.1, 0.02), keep_steps=True)
-        points = track_record(tracker, rows_from(time_s, readings_of(ARRAY, p, m)))
+        points = followed(tracker, rows_from(time_s, readings_of(ARRAY, p, m)))
         for before, after in zip(points, smoothed(points, tracker.steps), strict=True):
             assert before.covariance is not None
             assert after.covariance is not None
@@ -63,5 +62,5 @@ class TestSmoother:
     def test_keeps_no_steps_unless_asked(self) -> None:
         time_s, p, m = moving_source(5)
         tracker = Tracker(ARRAY, SLOW)
-        track_record(tracker, rows_from(time_s, readings_of(ARRAY, p, m)))
+        followed(tracker, rows_from(time_s, readings_of(ARRAY, p, m)))
         assert tracker.steps == []

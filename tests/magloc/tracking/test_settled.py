@@ -14,8 +14,8 @@ import sims
 from arrays import geometries
 from arrays.array import SensorArray
 from magloc.readings import Readings
-from magloc.tracking import batch
-from magloc.tracking.batch import track_record
+from magloc.tracking import settled
+from magloc.tracking.innovations import innovation_test
 from magloc.tracking.motion import CoordinatedTurn, MotionModel, OrnsteinUhlenbeck, RandomWalk
 from magloc.tracking.results import Row, TrackPoint, rows_of
 from magloc.tracking.tracker import Tracker
@@ -25,6 +25,7 @@ from tests.passing_source import (
     ARRAY,
     NOISE_T,
     SLOW,
+    ReadableTracker,
     followed,
     moving_source,
     positions,
@@ -71,6 +72,9 @@ def assert_same_points(some: list[TrackPoint], others: list[TrackPoint]) -> None
     for a, b in zip(some, others, strict=True):
         assert (a.time_s, a.nis_dof) == (b.time_s, b.nis_dof)
         np.testing.assert_allclose(a.nis, b.nis, rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(a.correction, b.correction, rtol=0.0, atol=1e-4)
+        # Each of two innovations may be off by what the last step of an iteration would change.
+        np.testing.assert_allclose(a.lag1, b.lag1, rtol=0.0, atol=1e-4 * max(1.0, a.nis_dof))
         assert (a.position_m is None) == (b.position_m is None)
         if a.position_m is None or b.position_m is None or a.moment_Am2 is None or b.moment_Am2 is None:
             continue
@@ -89,14 +93,29 @@ def assert_same_points(some: list[TrackPoint], others: list[TrackPoint]) -> None
         np.testing.assert_allclose(a.estimability, b.estimability, atol=1e-7)
 
 
+@pytest.fixture
+def readable_rows(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """Times of rows that take the readable steps."""
+    times: list[float] = []
+    advanced = Tracker._advanced
+
+    def counted(tracker: Tracker, row: Row) -> TrackPoint:
+        times.append(row.time_s)
+        return advanced(tracker, row)
+
+    monkeypatch.setattr(Tracker, "_advanced", counted)
+    return times
+
+
 class TestCompiledRecord:
     """The compiled steps and the readable ones: the same points to 1e-9, and the same steps."""
 
     def both(self, array: SensorArray, motion: MotionModel, rows: list[Row]) -> list[TrackPoint]:
-        readable, compiled = Tracker(array, motion, keep_steps=True), Tracker(array, motion, keep_steps=True)
-        expected, points = followed(readable, rows), track_record(compiled, rows)
+        readable, compiled = (kind(array, motion, keep_steps=True) for kind in (ReadableTracker, Tracker))
+        expected, points = followed(readable, rows), followed(compiled, rows)
         assert_same_points(points, expected)
         assert [step.row for step in compiled.steps] == [step.row for step in readable.steps]
+        assert innovation_test(points).flagged == innovation_test(expected).flagged
         for a, b in zip(smoothed(points, compiled.steps), smoothed(expected, readable.steps), strict=True):
             if a.position_m is not None and b.position_m is not None:
                 np.testing.assert_allclose(a.position_m, b.position_m, rtol=0.0, atol=1e-8)
@@ -106,48 +125,42 @@ class TestCompiledRecord:
         time_s, p, m = moving_source(60)
         rows = rows_from(time_s, readings_of(ARRAY, p, m))
         whole, pieces = Tracker(ARRAY, SLOW), Tracker(ARRAY, SLOW)
-        expected, points = track_record(whole, rows), list[TrackPoint]()
+        expected, points = followed(whole, rows), list[TrackPoint]()
         for first, last in pairwise([0, 3, 4, 5, 20, 47, 60]):
-            points += track_record(pieces, rows[first:last])
+            points += followed(pieces, rows[first:last])
         assert_same_points(points, expected)
         assert statuses(points).count("tracked") > 50
 
-    def test_few_rows_are_stepped_in_python(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_rows_one_by_one(self) -> None:
+        """As with :meth:`Tracker.update`, which takes the same call."""
         time_s, p, m = moving_source(60)
-        readable: list[float] = []
-        update = Tracker.update
+        rows = rows_from(time_s, readings_of(ARRAY, p, m))
+        tracker = Tracker(ARRAY, SLOW)
+        assert_same_points([tracker.update(row) for row in rows], followed(Tracker(ARRAY, SLOW), rows))
 
-        def counted(tracker: Tracker, row: Row) -> TrackPoint:
-            readable.append(row.time_s)
-            return update(tracker, row)
+    def test_few_rows_take_the_readable_steps(self, readable_rows: list[float]) -> None:
+        time_s, p, m = moving_source(60)
+        points = followed(Tracker(ARRAY, SLOW), rows_from(time_s, readings_of(ARRAY, p, m)))
+        assert (len(points), len(readable_rows) <= 6) == (60, True)
 
-        monkeypatch.setattr(Tracker, "update", counted)
-        points = track_record(Tracker(ARRAY, SLOW), rows_from(time_s, readings_of(ARRAY, p, m)))
-        assert (len(points), len(readable) <= 6) == (60, True)
-
-    def test_rows_that_bend_are_stepped_in_python(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_rows_that_bend_take_the_readable_steps(
+        self, monkeypatch: pytest.MonkeyPatch, readable_rows: list[float]
+    ) -> None:
         time_s, p, m = moving_source(20)
         rows = rows_from(time_s, readings_of(ARRAY, p, m))
         expected = followed(Tracker(ARRAY, SLOW), rows)
-        readable: list[float] = []
-        update = Tracker.update
-
-        def counted(tracker: Tracker, row: Row) -> TrackPoint:
-            readable.append(row.time_s)
-            return update(tracker, row)
-
-        monkeypatch.setattr(Tracker, "update", counted)
-        monkeypatch.setattr(batch, "LARGEST_BEND", 0.0)
-        assert_same_points(track_record(Tracker(ARRAY, SLOW), rows), expected)
-        assert len(readable) == 20
+        readable_rows.clear()
+        monkeypatch.setattr(settled, "LARGEST_BEND", 0.0)
+        assert_same_points(followed(Tracker(ARRAY, SLOW), rows), expected)
+        assert len(readable_rows) == 20
 
     def test_a_row_that_is_not_later_than_the_piece_before(self) -> None:
         time_s, p, m = moving_source(30)
         rows = rows_from(time_s, readings_of(ARRAY, p, m))
         tracker = Tracker(ARRAY, SLOW)
-        assert track_record(tracker, rows)[-1].status == "tracked"
+        assert followed(tracker, rows)[-1].status == "tracked"
         with pytest.raises(ValueError, match="must increase"):
-            track_record(tracker, rows[-1:])
+            followed(tracker, rows[-1:])
 
     @all_instruction_sets
     def test_gaps_missing_channels_and_spikes(self) -> None:
@@ -222,9 +235,9 @@ class TestCompiledRecord:
         readings = readings_of(ARRAY, p, m)
         readings[40, 3] += 1e-6
         rows = rows_from(time_s, readings)
-        expected = track_record(Tracker(ARRAY, SLOW), rows)
-        monkeypatch.setattr(batch, "_TERMS_A_CALL", 20_000)
-        points = track_record(Tracker(ARRAY, SLOW), rows)
+        expected = followed(Tracker(ARRAY, SLOW), rows)
+        monkeypatch.setattr(settled, "_TERMS_A_CALL", 20_000)
+        points = followed(Tracker(ARRAY, SLOW), rows)
         assert statuses(points) == statuses(expected)
         assert [point.nis for point in points] == [point.nis for point in expected]
         np.testing.assert_array_equal(positions(points), positions(expected))
@@ -248,17 +261,47 @@ class TestCompiledRecord:
         p, m = np.tile([5.0, 0.0, 0.306], (n, 1)), np.tile([100.0, 0.0, 0.0], (n, 1))
         rows = rows_from(np.arange(float(n)), readings_of(array, p, m, seed=int(rng.integers(1000))))
         motion = RandomWalk(0.1, 0.05)
-        readable, compiled = followed(Tracker(array, motion), rows), track_record(Tracker(array, motion), rows)
+        readable, compiled = (followed(kind(array, motion), rows) for kind in (ReadableTracker, Tracker))
         assert_same_points(compiled, readable)
         assert [point.iterations for point in compiled] == [point.iterations for point in readable]
         assert max(point.iterations for point in readable) > 5
 
-    def test_sensors_with_lasting_errors_take_the_readable_path(self) -> None:
+    def test_sensors_with_other_lasting_errors_take_the_readable_steps(self) -> None:
         time_s, p, m = moving_source(20)
-        sensors = tuple(replace(sensor, offset_uncertainty_T=1e-9) for sensor in ARRAY.sensors)
+        sensors = tuple(replace(sensor, offset_uncertainty_T=1e-9, gain_uncertainty=1e-3) for sensor in ARRAY.sensors)
         array = replace(ARRAY, sensors=sensors)
+        assert not Tracker(array, SLOW).is_compiled
         points = self.both(array, SLOW, rows_from(time_s, readings_of(ARRAY, p, m)))
         assert statuses(points).count("tracked") == 19
+
+    @all_instruction_sets
+    @pytest.mark.parametrize("noisy", [{}, {"drift_T_rth": 3e-9, "flicker_T": 1e-10}])
+    def test_offsets(self, noisy: dict[str, float], readable_rows: list[float]) -> None:
+        """To a fiftieth of σ: predictions are straight, where those of the readable steps bend by up to 0.05 σ."""
+        time_s, p, m = moving_source(80)
+        sensors = tuple(replace(sensor, offset_uncertainty_T=1e-9, **noisy) for sensor in ARRAY.sensors)
+        array = replace(ARRAY, sensors=sensors)
+        readings = readings_of(ARRAY, p, m) + 1e-9 * np.random.default_rng(5).normal(size=ARRAY.n_channels)
+        readings[50, 3:6], readings[60:63], readings[70, 2] = np.nan, np.nan, 1e-6
+        rows = rows_from(time_s, readings)
+        expected = followed(ReadableTracker(array, SLOW), rows)
+        readable_rows.clear()
+        points = followed(Tracker(array, SLOW), rows)
+        assert statuses(points) == statuses(expected)
+        assert len(readable_rows) < 60
+        for a, b in zip(points, expected, strict=True):
+            assert a.dropped_sensors == b.dropped_sensors
+            assert a.covariance is not None
+            assert b.covariance is not None
+            sigma = np.sqrt(np.diagonal(b.covariance))
+            error = np.concatenate([a.position_m - b.position_m, a.moment_Am2 - b.moment_Am2])  # type: ignore[operator]
+            assert np.abs(error / sigma).max() < 0.02
+            unit = np.outer(sigma, sigma)
+            np.testing.assert_allclose(a.covariance / unit, b.covariance / unit, atol=0.02)
+            np.testing.assert_allclose(a.estimability, b.estimability, atol=0.02)
+            # After a gap the prediction is wide, and its bend tells in the innovation.
+            np.testing.assert_allclose([a.nis, a.lag1], [b.nis, b.lag1], rtol=0.1, atol=0.05)
+            np.testing.assert_equal(a.correction, b.correction)
 
     @all_instruction_sets
     def test_a_lasting_rate_of_turn(self) -> None:
@@ -272,10 +315,10 @@ class TestCompiledRecord:
         assert statuses(points).count("tracked") == 19
 
     def test_no_rows(self) -> None:
-        assert track_record(Tracker(ARRAY, SLOW), []) == []
+        assert followed(Tracker(ARRAY, SLOW), []) == []
 
     def test_progress_counts_every_row_once(self) -> None:
         time_s, p, m = moving_source(25)
         finished: list[int] = []
-        track_record(Tracker(ARRAY, SLOW), rows_from(time_s, readings_of(ARRAY, p, m)), finished.append)
+        followed(Tracker(ARRAY, SLOW), rows_from(time_s, readings_of(ARRAY, p, m)), finished.append)
         assert sum(finished) == 25
