@@ -23,16 +23,17 @@ MAGLOC_KERNEL(predict_row, row_prediction) {
 MAGLOC_KERNEL(update_row, row_update) {
   const magloc_row_update &p = *problem;
   const int64_t k = p.rows->n_readings, d = n_measured * p.before->n_sources + p.before->n_nuisances;
+  const bool is_linearised = p.misfits && p.projectors;
   Workspace space(workspace);
   RowFilter<Lanes> filter(*p.before, *p.rows, space);
   if (!workspace) return space.size();
   filter.set_row(p.row);
   for (int64_t i = begin; i < end; ++i) {
     filter.load(*p.before, i);
-    double *const misfits = p.misfits ? p.misfits + 2 * k * i : nullptr;
-    double *const Q = p.projectors ? p.projectors + 2 * d * k * i : nullptr;
+    double *const misfits = is_linearised ? p.misfits + 2 * k * i : nullptr;
+    double *const Q = is_linearised ? p.projectors + 2 * d * k * i : nullptr;
     filter.update(*p.convergence, p.bends && p.bends[i], p.least_share, misfits, Q);
-    if (Q) filter.store_linearisation(misfits + k, Q + d * k);
+    if (is_linearised) filter.store_linearisation(misfits + k, Q + d * k);
     if (p.standardised) filter.fill_standardised(p.followed, p.standardised + 3 * p.rows->n_sensors * i);
     if (p.innovation) p.correction[i] = filter.fill_innovation(p.innovation + k * i);
     filter.finish_update();
