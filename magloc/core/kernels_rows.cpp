@@ -30,7 +30,7 @@ MAGLOC_KERNEL(update_row, row_update) {
   filter.set_row(p.row);
   for (int64_t i = begin; i < end; ++i) {
     filter.load(*p.before, i);
-    filter.update(*p.convergence, p.bends && p.bends[i], p.least_share);
+    filter.update(*p.convergence, p.bends && p.bends[i], p.least_share, p.pose_lasts);
     if (p.sensor_chi2) filter.fill_sensor_chi2(p.followed, p.sensor_chi2 + p.rows->n_sensors * i);
     if (p.innovation) filter.fill_innovation(wide, triangle, p.innovation + k * i);
     filter.finish_update();
