@@ -196,7 +196,8 @@ def update(
     row : int
         Index of the row.
     bends : ndarray of bool, shape (C,), optional
-        Predictions that bend as the readings do, of what is no linear nuisance.
+        Predictions that bend as the readings do: those of sources and pose by what they are told to, nuisances by the
+        rest.
     pose_lasts : ndarray, shape (n_pose,), optional
         Share of each error of the pose with which they do; not given, all of it.
     innovation, sensors : bool

@@ -49,6 +49,9 @@ SETTLED = 0.05
 narrow."""
 WIDER = 1.2
 """A filter's own component knows too much if a fit to all of its rows is wider by more."""
+NARROWER = 0.5
+"""A fit knows too much of the range beside errors of sensors if it is narrower by more: the curvature at a mode does
+not tell of a bent valley."""
 OLD_WIDTH = 0.03
 """Standard deviation of log-range or direction with which a track grows old."""
 SEEDS = 6
@@ -236,7 +239,10 @@ class ChartFilter:
                 # The mode of all states together stands nearer than the source does on average: the filter's own stays,
                 # unless it claims to know more than all rows together tell.
                 return known
-        return replace(known, mixture=self._along_the_range(found, rows, motions))
+        found = self._along_the_range(found, rows, motions)
+        if self.errors.n_states and found.log_range_sigma < NARROWER * mixture.log_range_sigma:
+            return known
+        return replace(known, mixture=found)
 
     def _fitted(
         self, seeds: Mixture, rows: Sequence[ChartRow], motions: Sequence[MotionModel], cells: Cells | None = None

@@ -1,4 +1,4 @@
-"""The compiled filter of several sources: against the readable one of one source, and against formulas for more."""
+"""The compiled filter: of one source against SciPy's optimum, of several against the chart's formulas."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from arrays.pose import PoseUncertainty
 from magloc import core
 from magloc.measurement.differences import predicted_channels
 from magloc.tracking import row_filter
-from magloc.tracking.chart import update as readable
 from magloc.tracking.chart.coordinates import Chart
 from magloc.tracking.chart.row import ChartRow, Rows
+from magloc.tracking.chart.update import LEAST_SHARE
 from magloc.tracking.motion import CoordinatedTurn, KnownMotion, MotionModel, OrnsteinUhlenbeck, RandomWalk
 from magloc.tracking.results import Row
 from magloc.tracking.row_filter import Gaussians
@@ -139,7 +139,8 @@ class Fit:
 def fitted(at: Case, i: int, bends: bool, shares: FloatArray) -> Fit:
     """Fit of one prediction: standard numbers ζ of what is seen, of errors of sensors, and of what else moves, in turn.
 
-    With bends, ζ + M (h(ζ) - h(0) - J ζ) of what is seen is normal in place of ζ, where errors of the pose have shares.
+    With bends, s = ζ + M (h(ζ) - h(0) - J ζ) of what is seen is normal in place of ζ, where errors of the pose have
+    shares, and of errors of sensors ζ + M' (h(ζ) - h(0) - J s).
     """
     row, n, m, x = at.row, at.row.n_motion, at.row.measurement.n_motion, at.x[i]
     seen, errors = np.r_[:6, m:n], np.arange(n, len(x))
@@ -156,14 +157,21 @@ def fitted(at: Case, i: int, bends: bool, shares: FloatArray) -> Fit:
     nowhere = np.zeros(len(x))
     J, of_errors = lasting.along(*chart.linearised(np.zeros((1, n))))[0] @ U[:n, :s], row.effect @ U[errors]
     whiten = np.linalg.cholesky(np.linalg.inv(np.eye(len(row.z)) + of_errors[:, s:d] @ of_errors[:, s:d].T)).T
-    Q, R = np.linalg.qr(np.concatenate([whiten @ J, readable.LEAST_SHARE * np.eye(s)]))
+    Q, R = np.linalg.qr(np.concatenate([whiten @ J, LEAST_SHARE * np.eye(s)]))
     M = bends * np.linalg.solve(R, Q[: len(whiten)].T @ whiten)
 
+    Q, R = np.linalg.qr(np.concatenate([of_errors[:, s:d], LEAST_SHARE * np.eye(d - s)]))
+    M_errors = bends * np.linalg.solve(R, Q[: len(J)].T)
+
     def normal(zeta: FloatArray) -> FloatArray:
-        return np.concatenate([zeta[:s] + M @ (h(zeta) - h(nowhere) - J @ zeta[:s]), zeta[s:]])
+        seen = zeta[:s] + M @ (h(zeta) - h(nowhere) - J @ zeta[:s])
+        return np.concatenate([seen, zeta[s:d] + M_errors @ (h(zeta) - h(nowhere) - J @ seen), zeta[d:]])
+
+    def bent(zeta: FloatArray) -> FloatArray:
+        return np.concatenate([normal(zeta)[:s], zeta[s:]])
 
     def misfit(zeta: FloatArray) -> FloatArray:
-        left = row.z - h(zeta, row) - row.effect @ x[errors] - of_errors @ normal(zeta)
+        left = row.z - h(zeta, row) - row.effect @ x[errors] - of_errors @ bent(zeta)
         return np.concatenate([left, -normal(zeta)])
 
     zeta = least_squares(misfit, nowhere, lambda zeta: slope(misfit, zeta), xtol=1e-12, ftol=1e-15, gtol=1e-12).x
@@ -173,7 +181,7 @@ def fitted(at: Case, i: int, bends: bool, shares: FloatArray) -> Fit:
     G = H[:k] @ np.linalg.inv(D)
     innovation = found[:k] + G @ normal(zeta)
     e, along = U @ zeta, U.copy()
-    e[errors], along[errors] = U[errors] @ normal(zeta), U[errors] @ D
+    e[errors], along[errors] = U[errors] @ bent(zeta), U[errors] @ slope(bent, zeta)
     after = x + e
     after[:n] = chart.retracted(e[None, :n])[0]
     along[:n] = (row.chart(after[None, :n]).inverse_jacobian() @ chart.jacobian(e[None, :n]))[0] @ along[:n]

@@ -147,7 +147,7 @@ class RowFilter {
       move_to(zeta_, lasts_);
       readings_.template predict<true>();
       fill_seen_columns();
-      bending_.bend(readings_.values(), columns_, least_share, triangle_);
+      bending_.bend(readings_.values(), by_nuisances_.from(seen_), columns_, least_share, triangle_);
     }
     double length = 1.0, gain = 0.0, cost = misfit_at(zeta_, misfit_);
     bool is_stale = true;
@@ -204,7 +204,7 @@ class RowFilter {
     readings_.template predict<true>();
     fill_nuisance_columns();
     fill_source_columns();
-    bending_.straighten(columns_.from(h_));
+    bending_.straighten(columns_);
     wide.clear(given_.n_readings);
     for (int64_t i = 0; i < given_.n_readings; ++i) {
       innovation[i] = reinterpret_cast<const double *>(misfit_)[i];
@@ -223,7 +223,7 @@ class RowFilter {
     move_to(zeta_);
     for (int64_t i = seen_; bending_.bends && i < seen_ + e_; ++i) {
       e_there_[i] = 0.0;
-      for (int64_t c = 0; c < d_; ++c) e_there_[i] += root[i][c] * standard_[c];
+      for (int64_t c = 0; c < d_; ++c) e_there_[i] += root[i][c] * (c < seen_ ? standard_ : zeta_)[c];
       bending_.bend_row(root[i], trial_);
     }
     condition_root();
@@ -382,10 +382,10 @@ class RowFilter {
     }
     readings_.template predict<true>();
     if (!lasts_) bending_.fill_standard(zeta, readings_.values(), trial_standard_);
-    __builtin_memcpy(trial_standard_ + seen_, zeta + seen_, h_ * sizeof(double));
     for (int64_t r = 0; r < k_; ++r) misfit[r] = readings_.measured.lanes(0)[r] - readings_.values()[r];
     add_rows(misfit, {x + N - e_, 1, -1.0}, readings_.effect, e_);
-    if (e_ > 0) add_rows(misfit, {trial_standard_, 1, -1.0}, by_nuisances_, d_);
+    if (e_ > 0) add_rows(misfit, {trial_standard_, 1, -1.0}, by_nuisances_, seen_);
+    add_rows(misfit, {zeta + seen_, 1, -1.0}, by_nuisances_.from(seen_), h_);
     double cost = dot(misfit, misfit, k_);
     for (int64_t i = 0; i < d_; ++i) cost += trial_standard_[i] * trial_standard_[i];
     return cost;
@@ -421,16 +421,15 @@ class RowFilter {
     }
     bending_.fill_standard(zeta_, readings_.values(), standard_);
     fill_seen_columns();
-    bending_.fill_derivatives(columns_.from(h_));
+    bending_.fill_derivatives(columns_);
     if (lasts_) {
       place(1.0);
       readings_.template predict<true>();
       fill_seen_columns();
     }
-    bending_.append_derivatives(columns_.from(h_));
+    bending_.append_derivatives(columns_);
     for (int64_t j = h_; e_ > 0 && j < d_; ++j) add_rows(columns_.lanes(j), {tail(j) + h_}, by_nuisances_, seen_);
     __builtin_memcpy(columns_.lanes(d_), misfit_, k_ * sizeof(T));
-    __builtin_memcpy(standard_ + seen_, zeta_ + seen_, h_ * sizeof(double));
     for (int64_t c = 0; c < d_; ++c) tail(d_)[c] = -standard_[zeta_of(c)];
   }
 

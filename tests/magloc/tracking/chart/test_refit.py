@@ -132,7 +132,7 @@ class TestLastingErrors:
     def test_is_the_best_fit_of_all_rows_sensors_and_poses(
         self, prior: SourcePrior, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        """SciPy's optimum of source, poses and offsets in five rows, over which the chart hardly bends; passes go on till they stay."""
+        """SciPy's optimum of source, poses and offsets, in rows over which the chart hardly bends."""
         monkeypatch.setattr(refit, "_TOLERANCE", 1e-4)
         monkeypatch.setattr(refit, "_MOST_PASSES", 200)
         pose = PoseUncertainty(0.02, 0.002, 0.0, 10.0, 0.0, 0.0)
