@@ -32,7 +32,7 @@ MAGLOC_KERNEL(update_row, row_update) {
     filter.load(*p.before, i);
     double *const misfits = is_linearised ? p.misfits + 2 * k * i : nullptr;
     double *const Q = is_linearised ? p.projectors + 2 * d * k * i : nullptr;
-    filter.update(*p.convergence, p.bends && p.bends[i], p.least_share, misfits, Q);
+    filter.update(*p.convergence, p.bends && p.bends[i], p.least_share, p.pose_lasts, misfits, Q);
     if (is_linearised) filter.store_linearisation(misfits + k, Q + d * k);
     if (p.standardised) filter.fill_standardised(p.followed, p.standardised + 3 * p.rows->n_sensors * i);
     if (p.innovation) p.correction[i] = filter.fill_innovation(p.innovation + k * i);

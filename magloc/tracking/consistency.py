@@ -20,7 +20,7 @@ from arrays.typing import FloatArray, IntArray
 from magloc.chi_square import mean_bounds, normalised_square
 from magloc.tracking.chart.mixture import Mixture
 from magloc.tracking.chart.row import ChartRow
-from magloc.tracking.chart.update import damped_inverse
+from magloc.tracking.chart.update import LEAST_SHARE
 from magloc.tracking.measurement import RowMeasurement
 from magloc.tracking.results import Row, TrackPoint, stacked
 from magloc.tracking.tracker import Tracker
@@ -187,4 +187,6 @@ def standard_error(source: Mixture, truth: FloatArray, row: ChartRow) -> FloatAr
     J = row.source_jacobian(source.x[0]) @ L @ source.S[0]
     standard = np.linalg.solve(source.S[0], source.chart.coordinates(truth[None])[0])
     difference = row.of_source(truth) - row.of_source(source.x[0])
-    return np.asarray(standard + damped_inverse(J[None])[0] @ (difference - J @ standard))
+    # Bent numbers along what J tells of, in standard deviations of the prediction, more than a share.
+    Q, R = np.linalg.qr(np.concatenate([J, LEAST_SHARE * np.eye(J.shape[1])]))
+    return np.asarray(standard + np.linalg.solve(R, Q[: len(J)].T @ (difference - J @ standard)))

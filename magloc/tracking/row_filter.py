@@ -9,6 +9,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import cycle
+from typing import Any
 
 import numpy as np
 
@@ -123,7 +125,7 @@ def convergence(most: int = MOST_ITERATIONS, tolerance: float = TOLERANCE) -> co
 
 
 def steps_problem(
-    motion: MotionModel,
+    motions: MotionModel | Sequence[MotionModel],
     steps_s: Sequence[float],
     step_of_row: IntArray,
     nuisances: tuple[FloatArray, FloatArray] | None = None,
@@ -133,26 +135,29 @@ def steps_problem(
 
     Parameters
     ----------
-    motion : MotionModel
+    motions : MotionModel, or sequence of them
+        Of all steps, or of each; of one class.
     steps_s : sequence of float
     step_of_row : ndarray of int, shape (n_rows,)
         Index of the step that leads to each row.
     nuisances : tuple of ndarray, optional
         Part of nuisances that each step keeps, and standard deviation of what it adds, (n_steps, n_nuisances) each.
     states : ndarray, shape (n, n_states), optional
-        States of all sources of all Gaussians, for a motion that is neither linear nor a lasting rate of turn; then
-        there is one step.
+        States before each step of every source of every Gaussian, for a motion that is neither linear nor a lasting
+        rate of turn.
     """
     F = A = B = moved = turning = None
     n_noise = 15
-    if isinstance(motion, OrnsteinUhlenbeck):
-        turning = np.stack([motion.turning_step(length_s) for length_s in steps_s])
-    elif (linear_step := getattr(motion, "linear_step", None)) is not None:
-        F, A, B = (np.stack(part) for part in zip(*map(linear_step, steps_s), strict=True))
+    every: Sequence[Any] = motions if isinstance(motions, Sequence) else [motions] * len(steps_s)
+    of_steps = list(zip(every, steps_s, strict=True))
+    if isinstance(every[0], OrnsteinUhlenbeck):
+        turning = np.stack([one.turning_step(length_s) for one, length_s in of_steps])
+    elif hasattr(every[0], "linear_step"):
+        F, A, B = (np.stack(part) for part in zip(*(one.linear_step(dt_s) for one, dt_s in of_steps), strict=True))
         n_noise = A.shape[2]
     else:
         assert states is not None
-        taken = [motion.step(x, steps_s[0]) for x in states]
+        taken = [one.step(x, dt_s) for x, (one, dt_s) in zip(states, cycle(of_steps), strict=False)]
         moved, F, A = (np.stack(part) for part in zip(*taken, strict=True))
         n_noise = A.shape[2]
     kept, added = (None, None) if nuisances is None else map(np.ascontiguousarray, nuisances)
@@ -203,6 +208,7 @@ def update(
     row: int = 0,
     *,
     bends: BoolArray | None = None,
+    pose_lasts: FloatArray | None = None,
     innovation: bool = False,
     linearisations: bool = False,
     most: int = MOST_ITERATIONS,
@@ -218,7 +224,10 @@ def update(
     row : int
         Index of the row.
     bends : ndarray of bool, shape (C,), optional
-        Predictions that bend as the readings do; those of nuisances cannot.
+        Predictions that bend as the readings do: those of sources and pose by what they are told to, nuisances by the
+        rest.
+    pose_lasts : ndarray, shape (n_pose,), optional
+        Share of each error of the pose with which they do; not given, all of it.
     innovation, linearisations : bool
         Whether to find the whitened innovations, and the optional attributes of the result.
     most : int
@@ -226,8 +235,6 @@ def update(
     tolerance : float
         Length of the next step, in standard deviations, below which it ends.
     """
-    if bends is not None and before.n_nuisances:
-        raise ValueError("Predictions of nuisances do not bend.")
     after, n = before.unfilled(), len(before.x)
     nis, chi2, log_evidence = np.empty((3, n))
     iterations, converged = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.uint8)
@@ -244,6 +251,7 @@ def update(
         convergence=convergence(most, tolerance),
         row=row,
         bends=None if bends is None else bends.astype(np.uint8),
+        pose_lasts=pose_lasts,
         least_share=LEAST_SHARE,
         followed=_FOLLOWED,
         nis=nis,

@@ -185,9 +185,9 @@ class SettledTrack:
         after = replace(mixture, x=x, S=S, centroid_m=centroids[-1], n_rows=int(n_rows))
         dof = int(self._rows.counts[0])
         if dof:
-            known = replace(known, mixture=after, open_loop=open_loop, contradictions=0, has_range=True)
+            known = replace(known, mixture=after, open_loop=open_loop, contradictions=0, has_range=True, used=None)
         else:
-            known = replace(known, mixture=after, open_loop=open_loop)
+            known = replace(known, mixture=after, open_loop=open_loop, used=known.used or known.mixture)
         lag1, innovation = self._lag1(taken[:end], dof, last)
         return SettledRows(self._points(taken[:end], dof, lag1, centroids), taken[end - 1], known, innovation, steps)
 

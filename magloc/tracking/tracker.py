@@ -155,7 +155,6 @@ class Tracker(CartesianFilter):
                 if found.innovation is not None:
                     self._suspects = self._suspects.forgotten(len(points))
                 return points
-            self._known = replace(self._known, mixture=self._known.mixture.with_block_root())
         return [self._advanced(row)]
 
     def _advanced(self, row: Row) -> TrackPoint:
@@ -251,7 +250,8 @@ class Tracker(CartesianFilter):
         seen = self._seen(row, dead)
         predicted = self.filter.predicted(before.mixture, self.motion, dt_s, seen)
         x = before.mixture.x[np.argmax(before.mixture.log_weight)]
-        known = replace(before, mixture=predicted, open_loop=self.open_loop(before.open_loop, x, dt_s))
+        open_loop = self.open_loop(before.open_loop, x, dt_s)
+        known = replace(before, mixture=predicted, open_loop=open_loop, used=before.used or before.mixture)
         prediction = self.predicted(*cartesian(before.mixture), dt_s) if self.keep_steps else None
         if not seen.z.size:
             return dead, self._kept(seen.row, index, known, prediction, status="predicted")
@@ -262,7 +262,7 @@ class Tracker(CartesianFilter):
             return dead, self._kept(seen.row, index, known, prediction, status="predicted")
 
         def updated(of_row: ChartRow) -> RowUpdate:
-            return self.filter.updated(before.mixture, predicted, dt_s, of_row)
+            return self.filter.updated(before, predicted, dt_s, of_row)
 
         update, out, of_sensor = updated(seen), dead, False
         if update.mixture is None:
@@ -279,7 +279,7 @@ class Tracker(CartesianFilter):
             point = self._kept(seen.row, index, known, prediction, status="outlier", innovation=innovation)
             return dead, replace(point, nis=update.nis)
         self._judge(row, out, lambda with_it: updated(with_it).nis - update.nis)
-        known = replace(known, mixture=update.mixture, contradictions=0)
+        known = replace(known, mixture=update.mixture, contradictions=0, used=None)
         if before.young:
             young = (*before.young, (seen, self.motion))
             known = self.filter.refitted(replace(known, young=young, nis=before.nis + update.nis))

@@ -471,7 +471,7 @@ int64_t magloc_survey_poles(const magloc_survey_columns *problem, int64_t begin,
 /* Rows of readings of an array, as they depend on sources: n_readings combinations of channels, in units of their
    noise; a row of fewer ones has zeros behind them. */
 typedef struct {
-  int64_t n_sensors, n_channels, n_readings, n_nuisances;
+  int64_t n_sensors, n_channels, n_readings, n_nuisances, n_pose;
   const double *sensors; /* (n_sensors, 3) */
   double array_centroid[3], radius;
   const int64_t *sensor;           /* (n_channels) of each channel, ascending */
@@ -487,11 +487,13 @@ typedef struct {
   const double *rotations;         /* (n_rows, 3, 3) to the world from the array */
   const double *ambients;          /* (n_ambients, n_sensors, 3) field */
   const int64_t *ambient_of_row;   /* (n_rows) */
+  const double *pose_effects;      /* (n_rows, 12, n_pose) of errors of the pose on turn, place, lever arm, ambient */
+  double lever_arm[3];             /* from the pose's reference point to the array's origin, in the array's axes */
 } magloc_rows;
 
 /* Gaussians, each of the states of several sources: n_states numbers of each source, 6 (position and moment), 9 (the
-   velocity as well) or more, and behind them nuisances that are linear in the readings. magloc/tracking/chart explains
-   the chart. */
+   velocity as well) or more, and behind them nuisances: errors of the pose, then such as are linear in the readings.
+   magloc/tracking/chart explains the chart. */
 typedef struct {
   int64_t n_sources, n_states, n_nuisances;
   int64_t power; /* of the range, 0 or 4, with which moments grow along the chart */
@@ -537,7 +539,8 @@ typedef struct {
   const magloc_rows *rows;
   const magloc_convergence *convergence;
   int64_t row;
-  const uint8_t *bends; /* (n) whether predictions bend as the readings do, or null; only without nuisances */
+  const uint8_t *bends;     /* (n) whether predictions of sources and pose bend as the readings do, or null */
+  const double *pose_lasts; /* (n_pose) share of each error of the pose with which they do, or null: all of it */
   double least_share;   /* standard deviation of a prediction below which what the readings tell of it does not count */
   double followed;      /* variance that readings have beside their noise in the test of sensors */
   double *nis, *chi2;   /* (n) least sum of squares, and the readings' part of it */
@@ -593,7 +596,7 @@ int64_t magloc_follow_sources(const magloc_track *problem, int64_t begin, int64_
 /* A filter and smoother along trajectories, linearised there, in the charts about them; an item is a trajectory. */
 typedef struct {
   int64_t n_rows;
-  const double *trajectories;  /* (n, n_rows, n_sources n_states) */
+  const double *trajectories;  /* (n, n_rows, n_sources n_states + n_pose) */
   const magloc_sources *prior; /* before the first row: means are offsets in the chart about its state */
   const magloc_rows *rows;
   const magloc_motion *motion; /* to each row but the first; with `moved`, n_rows steps for each trajectory */

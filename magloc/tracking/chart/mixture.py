@@ -106,11 +106,6 @@ class Mixture:
             return self
         return replace(self, x=self.x[:, :N_SOURCE], S=root_of(self.S[:, :N_SOURCE]), n_motion=N_SOURCE, n_pose=0)
 
-    def with_block_root(self) -> Mixture:
-        """The same with block-triangular roots: what is known of the sensors' errors alone stands in the last rows."""
-        n = self.n_motion
-        return replace(self, S=block_root(self.S)) if self.S[:, n:, :n].any() else self
-
     def likely(self) -> Mixture:
         """Without components of no weight."""
         return self.take(self.log_weight > self.log_weight.max() + DROPPED_BELOW)
@@ -148,7 +143,7 @@ class Mixture:
         rows = np.concatenate(list(spread), axis=1)
         turn = after.inverse_jacobian()[0] @ about.jacobian(mean[None, :n])[0]
         rows[:n] = turn @ rows[:n]
-        return replace(self, x=x[None], S=block_root(rows)[None], log_weight=np.zeros(1))
+        return replace(self, x=x[None], S=root_of(rows)[None], log_weight=np.zeros(1))
 
     def moments(self) -> tuple[FloatArray, FloatArray]:
         """Cartesian mean (6,) and covariance (6, 6) of position and moment; a range is log-normal."""
@@ -214,12 +209,6 @@ def _in_chart(about: Chart, mixture: Mixture) -> tuple[FloatArray, FloatArray]:
 def root_of(rows: FloatArray) -> FloatArray:
     """Lower root (..., n, n) of ``rows rowsᵀ``, by an orthogonal factorisation of rows (..., n, m), m ≥ n."""
     return np.swapaxes(np.linalg.qr(np.swapaxes(rows, -1, -2), mode="r"), -1, -2)
-
-
-def block_root(rows: FloatArray) -> FloatArray:
-    """Upper root (..., N, N) of ``rows rowsᵀ``: block-triangular, wherever its blocks end."""
-    # The lower root of the rows in reverse order is an upper one.
-    return root_of(rows[..., ::-1, :])[..., ::-1, ::-1]
 
 
 def _groups(mixture: Mixture) -> list[IntArray]:

@@ -8,19 +8,22 @@ trajectory, until that stays.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from arrays.typing import BoolArray, FloatArray, IntArray
+from magloc.kalman import block_update
 from magloc.measurement.nuisances import SensorErrors
+from magloc.measurement.pose import PoseErrors
 from magloc.tracking.chart.coordinates import Chart
 from magloc.tracking.chart.known_moment import KnownInWorld
 from magloc.tracking.chart.mixture import Mixture
-from magloc.tracking.chart.row import ChartRow
+from magloc.tracking.chart.row import ChartRow, Rows, stacked
 from magloc.tracking.chart.start import first_root
 from magloc.tracking.motion import N_SOURCE, MotionModel
+from magloc.tracking.row_filter import Gaussians, Smoothed, smooth, steps_problem
 
 _MOST_PASSES = 15
 # After how many passes a component is given up whose evidence is so much less, as a logarithm, than that of another.
@@ -76,34 +79,36 @@ def refitted(
     measurements: Sequence[ChartRow],
     motions: Sequence[MotionModel],
     errors: SensorErrors,
+    pose_errors: PoseErrors,
     cells: Cells | None = None,
     known: KnownInWorld | None = None,
 ) -> Refitted:
     """Components fitted to the rows, each on its own, and given up where it is far less likely than the best one."""
-    rows, K, N = _Rows(measurements, motions, errors, known), len(mixture), mixture.x.shape[1]
-    n = rows.n
-    x, P = np.zeros((K, N)), np.zeros((K, N, N))
+    rows, K, N = _Rows(measurements, motions, errors, pose_errors, known), len(mixture), mixture.x.shape[1]
+    n = measurements[0].n_motion
+    x, S = np.zeros((K, N)), np.zeros((K, N, N))
     nis, log_evidence = np.full(K, np.inf), np.full(K, -np.inf)
     converged, decided = np.zeros((2, K), dtype=bool)
     live, track = np.arange(K), rows.backwards(mixture.x)
-    prior = None if cells is None else cells.about(rows.chart(track, 0))
+    prior = None if cells is None else cells.about(measurements[0].chart(track[0]))
     share, last = np.ones(K), np.zeros((K, n))
     for passes in range(_MOST_PASSES):
         with np.errstate(all="ignore"):  # a trajectory may lead out of double precision: it is not kept
             found = rows.passed(track, prior)
-            largest = np.abs(found.offset[:, :, :3]).max(axis=(0, 2))
+            offset = np.swapaxes(found.offsets, 0, 1)
+            largest = np.abs(offset[:, :, :3]).max(axis=(0, 2))
             length = np.minimum(1.0, _LONGEST / np.maximum(largest, _LONGEST))
-            sigma = np.sqrt(np.diagonal(found.P, axis1=1, axis2=2))[:, :n]
-            before, last = last, found.offset[-1] / sigma
+            before, last = last, offset[-1] / np.linalg.norm(found.last.S[:, :n], axis=2)
             change = np.max(np.abs(last), axis=1)
             alive = np.isfinite(found.log_evidence) & np.isfinite(change)
             # Barzilai and Borwein's length: steps that lead back are made shorter, those that creep longer.
             square, bent = np.sum(before * before, axis=1), np.sum(before * (before - last), axis=1)
             share = np.clip(np.divide(share * square, bent, out=np.ones_like(share), where=bent > 0.0), *_SHARES)
-        track = rows.moved(track, np.where(alive, share * length, 0.0)[:, None] * np.nan_to_num(found.offset))
+        step = np.where(alive, share * length, 0.0)[:, None] * np.nan_to_num(offset)
+        track = rows.chart(track).retracted(step)
         there = (change < _TOLERANCE) & alive
         ended = live[there]
-        x[ended], P[ended] = np.concatenate([track[-1], found.errors], axis=1)[there], found.P[there]
+        x[ended], S[ended] = np.concatenate([track[-1], found.last.x[:, n:]], axis=1)[there], found.last.S[there]
         nis[ended], log_evidence[ended], converged[ended] = found.nis[there], found.log_evidence[there], True
         left = ~there
         if passes >= _LEAST_PASSES:
@@ -114,24 +119,9 @@ def refitted(
         prior = None if prior is None else prior.take(left)
         if not live.size:
             break
-    # Where nothing is known along some number, rounding may leave less than nothing: that is no fit.
-    roots, sound = _roots(P[converged][:, ::-1, ::-1])
-    converged[converged] = sound
-    S = roots[sound][:, ::-1, ::-1]
     end = measurements[-1]
-    after = Mixture(x[converged], S, log_evidence[converged], n, end.centroid_m, end.radius_m, end.n_pose)
+    after = Mixture(x[converged], S[converged], log_evidence[converged], n, end.centroid_m, end.radius_m, end.n_pose)
     return Refitted(after, nis[converged], np.flatnonzero(converged), converged | decided)
-
-
-@dataclass(frozen=True, eq=False)
-class _Passed:
-    """One pass: smoothed offsets (rows, K, n) from the trajectory, and what is known after the last row."""
-
-    offset: FloatArray
-    errors: FloatArray
-    P: FloatArray
-    nis: FloatArray
-    log_evidence: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,137 +131,82 @@ class _Rows:
     measurements: Sequence[ChartRow]
     motions: Sequence[MotionModel]
     errors: SensorErrors
+    pose_errors: PoseErrors
     known: KnownInWorld | None = None
 
-    @property
-    def n(self) -> int:
-        return self.motions[0].n_states
+    @cached_property
+    def _compiled(self) -> Rows:
+        return stacked(self.measurements)
 
-    def _dt_s(self, row: int) -> float:
-        return self.measurements[row].row.time_s - self.measurements[row - 1].row.time_s
+    @cached_property
+    def _steps_s(self) -> list[float]:
+        """Length of the step to each row."""
+        time_s = [one.row.time_s for one in self.measurements]
+        return np.diff(time_s, prepend=time_s[0]).tolist()
 
-    def chart(self, track: FloatArray, row: int) -> Chart:
-        """About the states at a row."""
-        return self.measurements[row].chart(track[row])
+    @cached_property
+    def _centroids_m(self) -> FloatArray:
+        return np.stack([one.centroid_m for one in self.measurements])[:, None]
+
+    def chart(self, track: FloatArray) -> Chart:
+        """Charts about the states of trajectories (rows, K, n)."""
+        first = self.measurements[0]
+        return Chart.at(track, self._centroids_m, first.radius_m, first.n_pose)
 
     def backwards(self, x: FloatArray) -> FloatArray:
         """Trajectories (rows, K, n) without noise, and without errors of the pose, that end at states (K, N)."""
-        m, track = self.n - self.measurements[0].n_pose, [x[:, : self.n]]
-        for row in range(len(self.measurements) - 1, 0, -1):
-            steps = [self.motions[row].step(state, self._dt_s(row)) for state in track[-1]]
-            back = np.zeros_like(track[-1])
-            for k, (moved, F, _) in enumerate(steps):
-                back[k, :m] = track[-1][k, :m] - np.linalg.solve(F[:m, :m], (moved - track[-1][k])[:m])
-            track.append(back)
-        return np.array(track[::-1])
+        m, track = self.motions[0].n_states, np.zeros((len(self.motions), len(x), self.measurements[0].n_motion))
+        track[-1] = x[:, : track.shape[2]]
+        for row in range(len(track) - 1, 0, -1):
+            after = track[row, :, :m]
+            steps = [self.motions[row].step(state, self._steps_s[row]) for state in after]
+            moved, F = np.stack([step[0] for step in steps]), np.stack([step[1] for step in steps])
+            track[row - 1, :, :m] = after - np.linalg.solve(F, (moved - after)[..., None])[..., 0]
+        return track
 
-    def moved(self, track: FloatArray, offset: FloatArray) -> FloatArray:
-        """Trajectories at offsets (rows, K, n) in the charts about others."""
-        return np.array([self.chart(track, row).retracted(offset[row]) for row in range(len(track))])
+    def passed(self, track: FloatArray, prior: Cells | None) -> Smoothed:
+        """A filter and a smoother that linearise along trajectories (rows, K, n)."""
+        m, before = self.motions[0].n_states, self._prior(self.measurements[0].chart(track[0]), prior)
+        trajectories, evidence = np.ascontiguousarray(np.swapaxes(track, 0, 1)), np.zeros(track.shape[1])
+        if self.known is not None:
+            before, evidence = self._with_known(trajectories[:, 0], before, self.known)
+        of_errors = [np.stack(part) for part in zip(*map(self._kept_and_added, self._steps_s), strict=True)]
+        states = np.roll(trajectories, 1, axis=1)[:, :, :m].reshape(-1, m)
+        order = np.arange(len(track))
+        steps = steps_problem(self.motions, self._steps_s, order, (of_errors[0], of_errors[1]), states)
+        found = smooth(trajectories, before, steps, self._compiled)
+        return replace(found, log_evidence=found.log_evidence + evidence)
 
-    def passed(self, track: FloatArray, prior: Cells | None) -> _Passed:
-        """A filter and a smoother that linearise along trajectories (rows, K, n).
+    def _kept_and_added(self, dt_s: float) -> tuple[FloatArray, FloatArray]:
+        of_errors = zip(self.pose_errors.step(dt_s), self.errors.step(dt_s), strict=True)
+        kept, added = (np.concatenate(parts) for parts in of_errors)
+        return kept, added
 
-        The smoother is Bryson and Frazier's: it carries the gradient of what later rows cost, and inverts nothing.
-        """
-        n, n_errors, K = self.n, self.errors.n_states, track.shape[1]
-        N = n + n_errors
-        chart = self.chart(track, 0)
-        root = chart.inverse_jacobian() @ first_root(chart, self.motions[0], None if prior is None else prior.sigma)
-        mean, P = np.zeros((K, N)), np.zeros((K, N, N))
+    def _prior(self, chart: Chart, cells: Cells | None) -> Gaussians:
+        """Return what is known before the first row, in charts about states there (K, n)."""
+        motion, n, n_errors = self.motions[0], chart.x.shape[1], self.errors.n_states
+        m = motion.n_states
+        mean, root = np.zeros((len(chart.x), n + n_errors)), np.zeros((len(chart.x), n + n_errors, n + n_errors))
+        root[:, :n, :n] = chart.inverse_jacobian() @ first_root(chart, motion, None if cells is None else cells.sigma)
+        root[:, np.arange(n, n + n_errors), np.arange(n, n + n_errors)] = self.errors.sigma
         # Where the source is, the first row alone says; what else moves is known by the prior.
-        before = np.stack([self.motions[0].start(x[:N_SOURCE], np.zeros((N_SOURCE, N_SOURCE)))[0] for x in chart.x])
+        before = np.zeros_like(chart.x)
+        before[:, :m] = [motion.start(x[:N_SOURCE], np.zeros((N_SOURCE, N_SOURCE)))[0] for x in chart.x]
         mean[:, N_SOURCE:n] = chart.coordinates(before)[:, N_SOURCE:]
-        P[:, :n, :n] = root @ _T(root)
-        P[:, np.arange(n, N), np.arange(n, N)] = self.errors.sigma**2
-        if prior is not None:
-            mean[:, 0] = prior.log_range - np.log(chart.length)
-        nis, log_evidence = np.zeros(K), np.zeros(K)
-        steps: list[_FilteredRow] = []
-        transition = np.zeros((K, n, n))
-        for row, measurement in enumerate(self.measurements):
-            if row:
-                mean, P, transition = self._step(track, row, mean, P)
-            chart = self.chart(track, row)
-            L = chart.jacobian(np.zeros_like(chart.x))
-            effect = np.broadcast_to(measurement.effect, (K, *measurement.effect.shape))
-            J = np.concatenate([measurement.along(chart.x, L), effect], axis=2)
-            left = measurement.z - measurement.of_source(chart.x)
-            if not row and self.known is not None:
-                of_known = np.zeros((K, self.known.n_known, N))
-                of_known[..., :n] = self.known.along(chart.x, L)
-                J = np.concatenate([J, of_known], axis=1)
-                left = np.concatenate([left, self.known.residual(chart.x)], axis=1)
-            left = left[..., None] - J @ mean[..., None]
-            PJ = P @ _T(J)
-            L_S, sound = _roots(np.eye(J.shape[1]) + J @ PJ)
-            log_evidence[~sound] = -np.inf
-            white = np.linalg.solve(L_S, np.concatenate([J, _T(PJ), left], axis=2))
-            J, gain, left = white[..., :N], white[..., N:-1], white[..., -1:]
-            steps.append(_FilteredRow(mean, P[:, :n], transition, J, gain, left))
-            square = np.sum(left[..., 0] ** 2, axis=1)
-            nis = nis + (square if row else 0.0)
-            log_evidence -= 0.5 * square + np.sum(np.log(np.diagonal(L_S, axis1=1, axis2=2)), axis=1)
-            mean = mean + (_T(gain) @ left)[..., 0]
-            P = P - _T(gain) @ gain
-        return _Passed(self._offsets(steps), mean[:, n:], P, nis, log_evidence)
+        if cells is not None:
+            mean[:, 0] = cells.log_range - np.log(chart.length)
+        return Gaussians(mean, root, n_nuisances=n - m + n_errors)
 
-    def _offsets(self, steps: Sequence[_FilteredRow]) -> FloatArray:
-        """Smoothed offsets (rows, K, n)."""
-        n = self.n
-        offsets, slope = [], np.zeros((*steps[0].mean.shape, 1))
-        for row in range(len(steps) - 1, -1, -1):
-            step = steps[row]
-            slope = slope - _T(step.J) @ (step.left + step.gain @ slope)
-            offsets.append(step.mean[:, :n] - (step.P @ slope)[..., 0])
-            kept, _ = self.errors.step(self._dt_s(row) if row else 0.0)
-            slope = np.concatenate([_T(step.transition) @ slope[:, :n], kept[:, None] * slope[:, n:]], axis=1)
-        return np.array(offsets[::-1])
-
-    def _step(
-        self, track: FloatArray, row: int, mean: FloatArray, P: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Mean and covariance predicted to a row, in the charts about the trajectory, and the transition there."""
-        n, before, after = self.n, self.chart(track, row - 1), self.chart(track, row)
-        steps = [self.motions[row].step(state, self._dt_s(row)) for state in track[row - 1]]
-        F, S_q = np.stack([step[1] for step in steps]), np.stack([step[2] for step in steps])
-        kept, added = self.errors.step(self._dt_s(row))
-        inverse = after.inverse_jacobian()
-        A, noise = inverse @ F @ before.jacobian(np.zeros_like(before.x)), inverse @ S_q
-        moved = np.empty_like(mean)
-        moved[:, :n] = (A @ mean[:, :n, None])[..., 0] + after.coordinates(np.stack([step[0] for step in steps]))
-        moved[:, n:] = kept * mean[:, n:]
-        predicted = P.copy()
-        predicted[:, :n, :n] = A @ P[:, :n, :n] @ _T(A) + noise @ _T(noise)
-        predicted[:, :n, n:] = (A @ P[:, :n, n:]) * kept
-        predicted[:, n:, :n] = _T(predicted[:, :n, n:])
-        predicted[:, n:, n:] = P[:, n:, n:] * np.outer(kept, kept) + np.diag(added**2)
-        return moved, predicted, A
-
-
-@dataclass(frozen=True, eq=False)
-class _FilteredRow:
-    """Mean and covariance (K, n, N) before a row, the source's transition that led there, and what it adds."""
-
-    mean: FloatArray
-    P: FloatArray
-    transition: FloatArray
-    J: FloatArray
-    gain: FloatArray
-    left: FloatArray
-
-
-def _roots(C: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Lower roots of (K, k, k), and which of them there are: a trajectory may lead through a sensor."""
-    try:
-        return np.asarray(np.linalg.cholesky(C)), np.ones(len(C), dtype=np.bool_)
-    except np.linalg.LinAlgError:
-        roots, sound = np.tile(np.eye(C.shape[1]), (len(C), 1, 1)), np.zeros(len(C), dtype=np.bool_)
-        for k, of_one in enumerate(C):
-            with suppress(np.linalg.LinAlgError):
-                roots[k], sound[k] = np.linalg.cholesky(of_one), True
-        return roots, sound
-
-
-def _T(matrices: FloatArray) -> FloatArray:
-    return np.swapaxes(matrices, -1, -2)
+    def _with_known(self, x: FloatArray, before: Gaussians, known: KnownInWorld) -> tuple[Gaussians, FloatArray]:
+        """Return a prior about states (K, n) updated by what is known of the moment, and the evidence of that (K,)."""
+        n, n_known = x.shape[1], known.n_known
+        chart = self.measurements[0].chart(x)
+        H = np.zeros((len(x), n_known, before.x.shape[1]))
+        H[..., :n] = known.along(x, chart.jacobian(np.zeros_like(x)))
+        left = known.residual(x) - (H @ before.x[..., None])[..., 0]
+        after, evidence = before.unfilled(), np.empty(len(x))
+        for k, given in enumerate(zip(before.x, before.S, H, left, strict=True)):
+            after.x[k], after.S[k] = block_update(*given, np.ones(n_known))
+            covariance = np.eye(n_known) + (H[k] @ before.S[k]) @ (H[k] @ before.S[k]).T
+            evidence[k] = -0.5 * (left[k] @ np.linalg.solve(covariance, left[k]) + np.linalg.slogdet(covariance)[1])
+        return after, evidence

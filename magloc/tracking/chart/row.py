@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -39,6 +40,10 @@ class Rows:
         Pose of the array.
     ambients_T : ndarray, shape (n or 1, n_sensors, 3)
         Field at the sensors without a source.
+    pose_effects : ndarray, shape (n, 12, n_pose), optional
+        Effects on the pose and the ambient field of errors of theirs.
+    lever_arm_m : tuple of 3 floats
+        From the pose's reference point to the array's origin, in the array's axes.
     """
 
     array: SensorArray
@@ -50,6 +55,13 @@ class Rows:
     origins_m: FloatArray
     rotations: FloatArray
     ambients_T: FloatArray
+    pose_effects: FloatArray | None = None
+    lever_arm_m: tuple[float, ...] = (0.0, 0.0, 0.0)
+
+    @property
+    def n_pose(self) -> int:
+        """Number of errors of the pose and of the ambient field."""
+        return 0 if self.pose_effects is None else self.pose_effects.shape[2]
 
     @cached_property
     def problem(self) -> core.Problem:
@@ -61,6 +73,7 @@ class Rows:
             n_channels=array.n_channels,
             n_readings=self.readings.shape[1],
             n_nuisances=self.effects.shape[2],
+            n_pose=self.n_pose,
             sensors=array.positions,
             array_centroid=tuple(array.centroid),
             radius=array.circumradius,
@@ -77,6 +90,8 @@ class Rows:
             rotations=np.ascontiguousarray(self.rotations),
             ambients=np.ascontiguousarray(self.ambients_T),
             ambient_of_row=order if len(self.ambients_T) > 1 else np.zeros_like(order),
+            pose_effects=None if self.pose_effects is None else np.ascontiguousarray(self.pose_effects),
+            lever_arm=self.lever_arm_m,
         )
 
 
@@ -159,12 +174,8 @@ class ChartRow:
 
     @cached_property
     def compiled(self) -> Rows:
-        """The row as kernels take it, without errors of the pose."""
-        model, one = self.model, np.zeros(1, dtype=np.int64)
-        transform = model.differences.transform / self.sigma[:, None]
-        ambient, count = model.array.ambient_fields, np.array([self.n_differences])
-        pose = self.row.origin_m[None], self.row.R_world_from_array[None]
-        return Rows(model.array, self.z[None], count, transform[None], one, self.effect[None], *pose, ambient[None])
+        """The row as kernels take it."""
+        return stacked([self])
 
     def chart(self, x: FloatArray) -> Chart:
         """About states (..., n)."""
@@ -184,10 +195,6 @@ class ChartRow:
             effect=np.pad(own.effect, ((0, more), (0, 0))),
         )
         return replace(self, measurement=padded) if more else self
-
-    def with_lasting_errors(self, lasting: FloatArray) -> ChartRow:
-        """The row where only some shares (n_pose,) of the pose's errors have an effect."""
-        return replace(self, pose_effect=self.pose_effect * lasting) if self.n_pose else self
 
     def with_errors_as_noise(self, sigma: FloatArray) -> ChartRow:
         """The row alone: its sensors' errors, known by their σ (n_errors,), are noise."""
@@ -265,6 +272,25 @@ class ChartRow:
     def _ambient_T(self, error: FloatArray | None) -> FloatArray | None:
         """Ambient fields at the sensors (..., N, 3) that errors make of the array's own, which is meant by None."""
         return None if error is None else self.pose.ambient(self.model.array.ambient_fields, error)
+
+
+def stacked(rows: Sequence[ChartRow]) -> Rows:
+    """Return rows of one array as kernels take them."""
+    k = max(row.n_differences for row in rows)
+    padded = [row.padded(k) for row in rows]
+    return Rows(
+        rows[0].model.array,
+        np.stack([row.z for row in padded]),
+        np.array([row.n_differences for row in rows]),
+        np.stack([row.model.differences.transform / row.sigma[:, None] for row in padded]),
+        np.arange(len(rows)),
+        np.stack([row.effect for row in padded]),
+        np.stack([row.row.origin_m for row in rows]),
+        np.stack([row.row.R_world_from_array for row in rows]),
+        np.stack([row.model.array.ambient_fields for row in rows]),
+        np.stack([row.pose_effect for row in rows]) if rows[0].n_pose else None,
+        tuple(rows[0].pose.lever_arm_m.tolist()),
+    )
 
 
 def where_smooth(derivative: FloatArray) -> FloatArray:

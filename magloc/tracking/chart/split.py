@@ -10,7 +10,7 @@ component remembers, it adds up to
 .. math:: \beta = \frac{|c|}{1 + |g|^2} \sqrt{\min(\max(|g|^{-2}, 1), n)}
 
 standard deviations of the readings' noise. A component with :math:`\beta > \tfrac12` becomes three along that axis,
-which have the same mean and covariance together. The update's bent prediction (:mod:`magloc.tracking.chart.update`)
+which have the same mean and covariance together. The bent prediction of :func:`magloc.tracking.row_filter.update`
 treats what is less. A division approximates a Gaussian, so that needless ones lose accuracy.
 """
 
@@ -22,7 +22,7 @@ import numpy as np
 
 from arrays.typing import FloatArray, IntArray
 from magloc.tracking import row_filter
-from magloc.tracking.chart.mixture import Mixture, block_root
+from magloc.tracking.chart.mixture import Mixture, root_of
 from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.row_filter import Gaussians
 
@@ -87,6 +87,6 @@ def _divided(mixture: Mixture, index: IntArray, v: FloatArray) -> Mixture:
         state[:, :n], L = chart.linearised(mean * v[:, :n])
         root[:, :n] = replace(mixture, x=state).chart.inverse_jacobian() @ L @ root[:, :n]
         x.append(state)
-        roots.append(block_root(root))
+        roots.append(root_of(root))
         log_weight.append(mixture.log_weight[index] + np.log(weight))
     return replace(mixture, x=np.concatenate(x), S=np.concatenate(roots), log_weight=np.concatenate(log_weight))

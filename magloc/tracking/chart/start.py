@@ -29,7 +29,7 @@ from magloc.measurement.nuisances import SensorErrors
 from magloc.measurement.rows import check_magnitudes, check_spans
 from magloc.tracking.chart.coordinates import MOMENT_POWER, Chart, mirrored, source_root
 from magloc.tracking.chart.known_moment import UNIFORM_IN_SPACE, KnownInWorld
-from magloc.tracking.chart.mixture import DROPPED_BELOW, FARTHEST, NEAREST, Mixture, block_root
+from magloc.tracking.chart.mixture import DROPPED_BELOW, FARTHEST, NEAREST, Mixture
 from magloc.tracking.chart.row import ChartRow, where_smooth
 from magloc.tracking.chart.stack import Measured
 from magloc.tracking.chart.update import Updated, updated
@@ -89,7 +89,8 @@ def _with_motion(chart: Chart, motion: MotionModel, sigma: FloatArray) -> FloatA
     """Cartesian roots (K, n, n) from standard deviations (K, 3) of range and direction; the moment is hardly known."""
     strength = np.linalg.norm(chart.x[:, 3:6], axis=1) / chart.length**MOMENT_POWER
     _, rest = motion.start(np.zeros(N_SOURCE), np.zeros((N_SOURCE, N_SOURCE)))
-    root = np.tile(rest, (len(chart.x), 1, 1))
+    root = np.tile(np.eye(chart.x.shape[1]), (len(chart.x), 1, 1))  # of the pose's errors, behind the motion
+    root[:, : len(rest), : len(rest)] = rest
     of_moment = _UNKNOWN_MOMENT * np.tile(strength[:, None], 3)
     root[:, :N_SOURCE, :N_SOURCE] = source_root(chart, np.concatenate([sigma, of_moment], axis=1))
     return root
@@ -239,12 +240,12 @@ def _components(
 ) -> Updated:
     """What the row makes of cells about seeds."""
     state, _ = motion.start(np.zeros(N_SOURCE), np.zeros((N_SOURCE, N_SOURCE)))
-    x = np.tile(state, (len(seeds.cell), 1))
+    x = np.tile(np.append(state, np.zeros(measurement.n_pose)), (len(seeds.cell), 1))
     x[:, :3], x[:, 3:6] = seeds.position_m, seeds.moment_Am2
     chart, sigma = measurement.chart(x), np.tile(_CELL, (len(x), 1))
     sigma[:, 0] /= 2.0 ** seeds.cell[:, 2]
     S = chart.inverse_jacobian() @ _with_motion(chart, motion, sigma)
-    return updated(x, S, measurement, np.zeros(len(x), dtype=bool), known=known)
+    return updated(x, S, measurement, known)
 
 
 def _mixture(found: Updated, log_weight: FloatArray, measurement: Measured) -> Mixture:
@@ -321,7 +322,7 @@ def with_errors(mixture: Mixture, measurement: ChartRow, sigma: FloatArray) -> M
     rows = np.zeros((len(mixture), n + sigma.size, n + sigma.size))
     rows[:, :n, :n], rows[:, n:, :n] = mixture.S, -gain @ (H @ mixture.S)
     rows[:, n:, n:] = sigma[:, None] * whitening(unit.T).T
-    return replace(mixture, x=np.concatenate([mixture.x, left @ gain.T], axis=1), S=block_root(rows))
+    return replace(mixture, x=np.concatenate([mixture.x, left @ gain.T], axis=1), S=rows)
 
 
 def once(mixture: Mixture, cell: IntArray | None = None) -> IntArray:

@@ -2,8 +2,7 @@
 
 The first row that shows a source makes a mixture (:mod:`magloc.tracking.chart.start`); every later one moves its
 components, divides those over which the readings bend (:mod:`magloc.tracking.chart.split`), updates them
-(:mod:`magloc.tracking.chart.update`) and merges those that are one. Where neither sensors nor pose have lasting errors,
-:mod:`magloc.tracking.row_filter` does so, compiled.
+(:mod:`magloc.tracking.row_filter`, compiled) and merges those that are one.
 
 Behind the states of the motion stand the errors of the array's pose, and behind them those of its sensors. Where there
 are such lasting errors, a row leaves many numbers open in curved valleys, which would take more components than can be
@@ -30,16 +29,14 @@ from magloc.measurement.pose import PoseErrors
 from magloc.tracking import row_filter
 from magloc.tracking.chart.coordinates import mirrored
 from magloc.tracking.chart.known_moment import UNIFORM_IN_SPACE, KnownInWorld
-from magloc.tracking.chart.mixture import Mixture, block_root, root_of
-from magloc.tracking.chart.posed_motion import PosedMotion
+from magloc.tracking.chart.mixture import Mixture, root_of
 from magloc.tracking.chart.refit import Cells, Refitted, refitted
 from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.chart.split import split
 from magloc.tracking.chart.stack import Stack
 from magloc.tracking.chart.start import NO_DIPOLE, OF_PITCH, Start, once, with_errors
-from magloc.tracking.chart.update import Move, Updated, predicted_root, updated
 from magloc.tracking.motion import N_SOURCE, MotionModel
-from magloc.tracking.row_filter import Gaussians, RowUpdates, steps_problem
+from magloc.tracking.row_filter import Gaussians, steps_problem
 from magloc.tracking.sensor_health import OFFSETS, Misfits
 
 LARGEST_GROWTH = 1.5
@@ -53,6 +50,9 @@ SETTLED = 0.05
 narrow."""
 WIDER = 1.2
 """A filter's own component knows too much if a fit to all of its rows is wider by more."""
+NARROWER = 0.5
+"""A fit knows too much of the range beside errors of sensors if it is narrower by more: the curvature at a mode does
+not tell of a bent valley."""
 OLD_WIDTH = 0.03
 """Standard deviation of log-range or direction with which a track grows old."""
 SEEDS = 6
@@ -86,6 +86,8 @@ class Known:
         Rows of a track that are still fitted together, and the motion that led to each; `next_refit`, after how many.
     nis : float
         Of all of them but the first, as the filter found it row by row.
+    used : Mixture, optional
+        After the last row whose readings were used, if later rows were not.
     """
 
     mixture: Mixture
@@ -95,6 +97,7 @@ class Known:
     young: tuple[tuple[ChartRow, MotionModel], ...] = ()
     next_refit: int = FIRST_REFIT
     nis: float = 0.0
+    used: Mixture | None = None
 
     @property
     def is_settled(self) -> bool:
@@ -153,7 +156,7 @@ class ChartFilter:
 
     def of_row(self, row: ChartRow, motion: MotionModel) -> tuple[Mixture | None, str]:
         """What one row alone says of a source and the pose, by every cell that explains it, or why it says nothing."""
-        return self._start.mixture(row, self._posed(motion))
+        return self._start.mixture(row, motion)
 
     def of_stack(self, stack: Stack, at_rest: MotionModel) -> tuple[Mixture | None, str]:
         """What rows say together of a source alone, that is where it is in the last of them."""
@@ -165,42 +168,41 @@ class ChartFilter:
             return np.zeros(self.errors.array.n_sensors, dtype=bool)
         return self._start.faulty(row.row)
 
-    def _posed(self, motion: MotionModel) -> MotionModel:
-        return PosedMotion.of(motion, self.pose_errors)
-
     def is_detected(self, row: ChartRow) -> bool:
         """Whether a row shows that there is a source."""
         return row.is_detected(self.errors.sigma)
 
     def predicted(self, mixture: Mixture, motion: MotionModel, dt_s: float, row: ChartRow) -> Mixture:
         """What is known after a time without readings, as seen from a row's array."""
-        if not self.has_lasting_errors:
-            step = steps_problem(motion, [dt_s], np.zeros(1, dtype=np.int64), states=mixture.x)
-            found = row_filter.predict(Gaussians(mixture.x, mixture.S), mixture.centroid_m, step, row.compiled)
-            return replace(mixture, x=found.x, S=found.S, centroid_m=row.centroid_m)
-        n, posed = mixture.n_motion, self._posed(motion)
-        steps = [posed.step(x, dt_s) for x in mixture.x[:, :n]]
-        kept, added = self.errors.step(dt_s)
-        x = mixture.x.copy()
-        x[:, :n] = [step[0] for step in steps]
-        x[:, n:] *= kept
-        move = Move(np.stack([step[1] for step in steps]), np.stack([step[2] for step in steps]), kept, added)
-        after = replace(mixture, x=x, centroid_m=row.centroid_m)
-        return replace(after, S=predicted_root(mixture.chart, after.chart, mixture.S, move))
+        of_errors = zip(self.pose_errors.step(dt_s), self.errors.step(dt_s), strict=True)
+        kept, added = (np.concatenate(parts)[None] for parts in of_errors)
+        nuisances = (kept, added) if kept.size else None
+        step = steps_problem(motion, [dt_s], np.zeros(1, dtype=np.int64), nuisances, mixture.x[:, : motion.n_states])
+        found = row_filter.predict(self._gaussians(mixture), mixture.centroid_m, step, row.compiled)
+        return replace(mixture, x=found.x, S=found.S, centroid_m=row.centroid_m)
 
-    def updated(self, before: Mixture, predicted: Mixture, dt_s: float, row: ChartRow) -> RowUpdate:
-        """What a row makes of a prediction from the mixture before it."""
+    def _gaussians(self, mixture: Mixture) -> Gaussians:
+        """Return components as kernels take them."""
+        return Gaussians(mixture.x, mixture.S, n_nuisances=self.errors.n_states + self.pose_errors.n_states)
+
+    def updated(self, known: Known, predicted: Mixture, dt_s: float, row: ChartRow) -> RowUpdate:
+        """Return what a row makes of a prediction from what was known before it."""
+        # Where errors of sensors bend as well, rows that were not used count as a part of the step.
+        before = known.used if self.has_lasting_errors and known.used is not None else known.mixture
         sigma, sigma_before = (np.linalg.norm(m.S[:, :N_SOURCE], axis=2) for m in (predicted, before))
         k = row.z.size
         bends = (sigma <= LARGEST_GROWTH * sigma_before).all(axis=1) & (k >= self.n_differences)
-        after: Updated | RowUpdates
-        if self.has_lasting_errors:
-            lasting = row.with_lasting_errors(self.pose_errors.step(dt_s)[0] ** 2)
-            after = updated(predicted.x, predicted.S, row, bends, lasting)
-        else:
+        if not self.has_lasting_errors:
             predicted, origin = split(predicted, row)
-            gaussians = Gaussians(predicted.x, predicted.S)
-            after = row_filter.update(gaussians, row.compiled, bends=bends[origin], innovation=True)
+            bends = bends[origin]
+        lasts = self.pose_errors.step(dt_s)[0] ** 2
+        after = row_filter.update(
+            self._gaussians(predicted),
+            row.compiled,
+            bends=bends,
+            pose_lasts=lasts if (lasts < 1.0).any() else None,
+            innovation=True,
+        )
         sound = after.converged & np.isfinite(after.log_evidence)
         if not np.where(sound, after.nis, np.inf).min() <= chdtri(k, CONTRADICTION):
             best = int(np.argmin(after.nis))
@@ -209,7 +211,7 @@ class ChartFilter:
         best = int(np.argmax(log_weight))
         found = replace(predicted, x=after.x, S=after.S, log_weight=log_weight, n_rows=predicted.n_rows + 1)
         mixture = found.take(sound).reduced()
-        correction = getattr(after, "correction", None)
+        correction = None if self.has_lasting_errors else after.correction
         return RowUpdate(
             mixture,
             float(after.nis[best]),
@@ -234,7 +236,7 @@ class ChartFilter:
             x = mirrored(seeds.x, seeds.centroid_m).reshape(-1, seeds.x.shape[1])
             seeds = replace(seeds, x=x, S=np.tile(seeds.S, (4, 1, 1)), log_weight=np.zeros(len(x)))
         rows = [row for row, _ in known.young]
-        motions = [self._posed(motion) for _, motion in known.young]
+        motions = [motion for _, motion in known.young]
         known = replace(known, next_refit=int(REFITS_GROW * n_rows))
         fit = self._fitted(seeds, rows, motions)
         # A component that is not fitted to its end may be the true one: then the filter goes on with all of them.
@@ -254,14 +256,17 @@ class ChartFilter:
                 # The mode of all states together stands nearer than the source does on average: the filter's own stays,
                 # unless it claims to know more than all rows together tell.
                 return known
-        return replace(known, mixture=self._along_the_range(found, rows, motions))
+        found = self._along_the_range(found, rows, motions)
+        if self.errors.n_states and found.log_range_sigma < NARROWER * mixture.log_range_sigma:
+            return known
+        return replace(known, mixture=found)
 
     def _fitted(
         self, seeds: Mixture, rows: Sequence[ChartRow], motions: Sequence[MotionModel], cells: Cells | None = None
     ) -> Refitted:
         """Components fitted to all rows, with what was known before them."""
         known = KnownInWorld.of(self.prior, rows[0].row.R_world_from_array)
-        fit = refitted(seeds, rows, motions, self.errors, cells, known)
+        fit = refitted(seeds, rows, motions, self.errors, self.pose_errors, cells, known)
         if known is None:
             return fit
         of_space = UNIFORM_IN_SPACE * np.log(fit.mixture.chart.length)
@@ -274,8 +279,9 @@ class ChartFilter:
         A source that moves by more than its range is open makes every row a valley of its own.
         """
         sigma, span_s = np.linalg.norm(found.S[:, 0], axis=1), rows[-1].row.time_s - rows[0].row.time_s
-        S_q = np.stack([motions[-1].step(x, span_s)[2] for x in found.x[:, : found.n_motion]])
-        added = np.linalg.norm((found.chart.inverse_jacobian() @ S_q)[:, 0], axis=1)
+        n = motions[-1].n_states
+        S_q = np.stack([motions[-1].step(x, span_s)[2] for x in found.x[:, :n]])
+        added = np.linalg.norm((found.chart.inverse_jacobian()[:, :1, :n] @ S_q)[:, 0], axis=1)
         if not ((sigma > BENT_RANGE) & (sigma > added)).any():
             return found
         k, cell = np.divmod(np.arange(len(sigma) * N_CELLS), N_CELLS)
@@ -324,8 +330,7 @@ def charted(x: FloatArray, S: FloatArray, row: ChartRow) -> Mixture:
     state, root = np.empty_like(x), np.empty_like(S)
     state[order], root[order] = x, S
     root[:n] = row.chart(state[None, :n]).inverse_jacobian()[0] @ root[:n]
-    S_young = block_root(root)
-    return Mixture(state[None], S_young[None], np.zeros(1), n, row.centroid_m, row.radius_m, row.n_pose)
+    return Mixture(state[None], root[None], np.zeros(1), n, row.centroid_m, row.radius_m, row.n_pose)
 
 
 def _sensors_first(n_all: int, n_motion: int, n_pose: int) -> IntArray:

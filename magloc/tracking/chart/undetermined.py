@@ -7,12 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from magloc.tracking.chart.mixture import Mixture
+from magloc.tracking.chart.mixture import Mixture, root_of
 from magloc.tracking.chart.places import ENOUGH, Places, effective_number, weighed
 from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.chart.stack import Stack, displacement
 from magloc.tracking.chart.steps import ChartFilter
-from magloc.tracking.chart.update import Move, predicted_root
 from magloc.tracking.motion import N_SOURCE, MotionModel, RandomWalk
 
 MOST_ROWS = 256
@@ -105,5 +104,5 @@ def _predicted(mixture: Mixture, row: ChartRow, motion: MotionModel, dt_s: float
     S_q[:, at, at] = of_place
     S_q[:, 3 + at, 3 + at] = of_moment * strength[:, None]
     after = replace(mixture, centroid_m=row.centroid_m)
-    move = Move(np.broadcast_to(np.eye(N_SOURCE), S_q.shape), S_q, np.zeros(0), np.zeros(0))
-    return replace(after, S=predicted_root(mixture.chart, after.chart, mixture.S, move))
+    rows = np.concatenate([mixture.chart.jacobian(np.zeros_like(mixture.x)) @ mixture.S, S_q], axis=2)
+    return replace(after, S=root_of(after.chart.inverse_jacobian() @ rows))

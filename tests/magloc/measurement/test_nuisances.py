@@ -30,11 +30,12 @@ from magloc.measurement.nuisances import (
     with_eddies_as_offsets,
     without_lasting_errors,
 )
+from magloc.tracking import row_filter
 from magloc.tracking.chart.coordinates import Chart
 from magloc.tracking.chart.row import ChartRow
-from magloc.tracking.chart.update import updated
 from magloc.tracking.motion import RandomWalk
 from magloc.tracking.results import Row, rows_of
+from magloc.tracking.row_filter import Gaussians
 from magloc.tracking.tracker import Tracker
 from sims.magnetics.paths import Attitude, Steered
 from sims.magnetics.scenario import Carrier, MagneticScenario, Source
@@ -324,7 +325,7 @@ class TestUpdate:
         fit = least_squares(residuals, np.zeros(N), xtol=1e-15, ftol=1e-15, gtol=1e-15)
         J = np.asarray(fit.jac)
         P = np.linalg.inv(J.T @ J) * np.outer(scale, scale)
-        found = updated(x, S, measurement, np.zeros(1, dtype=bool))
+        found = row_filter.update(Gaussians(x, S, n_nuisances=N - 6), measurement.compiled)
         deviation = np.sqrt(np.diagonal(P))
         assert found.nis[0] == pytest.approx(2.0 * fit.cost, rel=1e-6)
         offset = np.concatenate([chart.coordinates(found.x[:, :6])[0], found.x[0, 6:]])

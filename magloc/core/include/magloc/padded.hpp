@@ -170,4 +170,56 @@ void transpose(const Padded<T> &a, int64_t n) {
       a[j][i] = below;
     }
 }
+
+// Reflect columns `first` to first + n of the rows of a matrix, so that what they are turned into stands in the first h
+// of them: by Householder's reflections, each of which leaves the h-th number of some vectors of h numbers, one for
+// each column, in the first of the rest of them.
+template <class T>
+void gather(const Padded<T> &vectors, int64_t h, int64_t n, const Padded<T> &rows, int64_t n_rows, int64_t first,
+            const Padded<T> &work) {
+  for (int64_t r = 0; r < h; ++r) {
+    double square = 0.0;
+    work.clear(1);
+    for (int64_t c = r; c < n; ++c) {
+      work[0][first + c] = vectors[c][r];
+      square += vectors[c][r] * vectors[c][r];
+    }
+    if (square == 0.0) continue;
+    const double norm = square_root(square), at = vectors[r][r];
+    work[0][first + r] += at < 0.0 ? -norm : norm;
+    const double share = 1.0 / (square + norm * __builtin_fabs(at));
+    for (int64_t i = 0; i < n_rows; ++i) {
+      const double product = -share * dot(work.lanes(0), rows.lanes(i), rows.width());
+      add_rows(rows.lanes(i), {&product}, work, 1);
+    }
+    T *const sum = work.lanes(1);
+    set_rows(sum, {work[0] + first + r}, vectors.from(r), n - r);
+    for (int64_t c = r; c < n; ++c)
+      for (int64_t i = 0; i < vectors.width(); ++i) vectors.lanes(c)[i] -= share * work[0][first + c] * sum[i];
+  }
+}
+
+// Make three rows orthogonal by Jacobi's rotations, and their lengths one.
+template <class T>
+void fill_principal_axes(const Padded<T> &rows) {
+  const int64_t width = rows.width();
+  for (int sweep = 0; sweep < 8; ++sweep)
+    for (int pair = 0; pair < 3; ++pair) {
+      T *const a = rows.lanes(pair == 2), *const b = rows.lanes(pair == 0 ? 1 : 2);
+      const double product = dot(a, b, width);
+      if (product == 0.0) continue;
+      const double slope = 0.5 * (dot(b, b, width) - dot(a, a, width)) / product;
+      const double tangent = 1.0 / (slope + (slope < 0.0 ? -1.0 : 1.0) * square_root(1.0 + slope * slope));
+      const double cosine = inverse_root(1.0 + tangent * tangent), sine = tangent * cosine;
+      for (int64_t r = 0; r < width; ++r) {
+        const T before = a[r];
+        a[r] = cosine * before - sine * b[r];
+        b[r] = sine * before + cosine * b[r];
+      }
+    }
+  for (int a = 0; a < 3; ++a) {
+    const double norm = square_root(dot(rows.lanes(a), rows.lanes(a), width));
+    scale(rows.lanes(a), norm > 0.0 ? 1.0 / norm : 0.0, width);
+  }
+}
 MAGLOC_END

@@ -1,13 +1,16 @@
 // What rows of readings tell of several sources: magloc/tracking/chart explains it for one source.
 //
-// A state has n_states numbers of each source and, behind them, nuisances that are linear in the readings. Inside, what
-// readings depend on comes first: position and moment of each source, nuisances, then further numbers of each source. A
-// prediction's root is lower triangular, so that the readings depend on the first d of the standard numbers zeta alone;
-// coordinates are the root times zeta. Orthogonal transformations keep what covariances and normal equations would lose
-// where a nuisance is known 1e5 times less well than a reading.
+// A state has n_states numbers of each source and, behind them, errors of the array's pose and nuisances that are
+// linear in the readings. Inside, what readings depend on comes first: what is seen - position and moment of each
+// source, and the pose -, nuisances, then further numbers of each source. A prediction's root is lower triangular, so
+// that the readings depend on the first d of the standard numbers zeta alone; coordinates are the root times zeta. Of
+// more nuisances than readings, reflections leave as many columns of the root that the row sees. Orthogonal
+// transformations keep what covariances and normal equations would lose where a nuisance is known 1e5 times
+// less well than a reading.
 #pragma once
 #include "bent_prediction.hpp"
 #include "row_readings.hpp"
+#include "sensor_residuals.hpp"
 #include "source_motion.hpp"
 
 MAGLOC_BEGIN
@@ -16,14 +19,16 @@ class RowFilter {
   const magloc_sources &p_;
   const magloc_rows &given_;
   Workspace &space_;
-  const int64_t K_ = p_.n_sources, ns_ = p_.n_states, e_ = p_.n_nuisances, seen_ = n_measured * K_, d_ = seen_ + e_;
+  const int64_t K_ = p_.n_sources, ns_ = p_.n_states, n_pose_ = given_.n_pose, behind_ = p_.n_nuisances;
+  const int64_t measured_ = n_measured * K_, seen_ = measured_ + n_pose_, e_ = behind_ - n_pose_;
+  const int64_t h_ = e_ < given_.n_readings ? e_ : given_.n_readings, d_ = seen_ + h_;
   RowReadings<T> readings_{given_, K_, space_};
   const int64_t k_ = readings_.width();                        // registers that the readings fill
   SourceChart *const charts_ = space_.take<SourceChart>(K_);   // about the mean
   ChartedState *const there_ = space_.take<ChartedState>(K_);  // states of the sources at zeta
 
  public:
-  const int64_t N = K_ * ns_ + e_;                   // length of a state
+  const int64_t N = K_ * ns_ + behind_;              // length of a state
   double *const x = space_.take<double>(N);          // mean
   Padded<T> root{space_, N, N};                      // of the covariance in the charts about it, in the inner order
   Padded<T> transition{space_, K_ * ns_, ns_};       // of the coordinates of each source, in the last prediction
@@ -32,16 +37,20 @@ class RowFilter {
   bool converged = false;
 
  private:
-  // The linearised problem has a column for each nuisance, for each seen number of the sources, and for the misfit.
-  // Their numbers are one for each reading, and one for each zeta, nuisances first.
+  // The linearised problem has a column for each zeta of nuisances, for each of what is seen, and for the misfit. Their
+  // numbers are one for each reading, and one for each zeta, nuisances first.
   Padded<T> columns_{space_, d_ + 1, k_ * n_lanes<T> + d_}, triangle_{space_, N + 1, N + 1};
-  Padded<T> turned_{space_, seen_, d_ + 1}, rows_{space_, N, N}, solved_{space_, d_, N};
+  Padded<T> turned_{space_, seen_, seen_}, rows_{space_, N, N}, solved_{space_, d_, N};
+  Padded<T> by_nuisances_{space_, seen_ + e_, k_ * n_lanes<T>};  // of readings, by the columns of nuisances' root
   T *const misfit_ = space_.take<T>(k_), *const trial_misfit_ = space_.take<T>(k_);  // of the readings
   double *const e_there_ = space_.take<double>(N);                                   // coordinates at zeta
   double *const zeta_ = space_.take<double>(d_), *const trial_ = space_.take<double>(d_);
   double *const step_ = space_.take<double>(d_ + 1);  // nuisances first
-  BentPrediction<T> bending_{k_, d_, space_};
-  double *const standard_ = space_.take<double>(d_);  // zeta, or where the prediction bends what is normal there
+  BentPrediction<T> bending_{k_, seen_, h_, space_};
+  // Zeta, or where the prediction bends what is normal there; the same of trials.
+  double *const standard_ = space_.take<double>(d_), *const trial_standard_ = space_.take<double>(d_);
+  double *const pose_ = space_.take<double>(n_pose_);
+  const double *lasts_ = nullptr;  // shares of errors of the pose with which the prediction bends
 
  public:
   RowFilter(const magloc_sources &p, const magloc_rows &rows, Workspace &space) : p_(p), given_(rows), space_(space) {}
@@ -66,13 +75,20 @@ class RowFilter {
 
   // Space for the rows of a prediction and of the motion's noise.
   Padded<T> wide(const SourceMotion &motion, Workspace &space) const {
-    return {space, N, N + motion.n_noise * K_ + (motion.has_noisy_nuisances() ? e_ : 0)};
+    return {space, N, N + motion.n_noise * K_ + (motion.has_noisy_nuisances() ? behind_ : 0)};
   }
   // Predict all states after a step of the motion, which ends at the row; the sensors' centroid was elsewhere before.
-  // `item` counts states whose steps differ. With a trajectory's state `to` the charts stand about that, and offsets of
-  // what is expected from it, in the inner order, are predicted as well.
+  // `item` counts states whose steps differ.
   void predict(SourceMotion &motion, int64_t step, int64_t item, const double (&centroid_before)[3],
-               const Padded<T> &wide, const double *to = nullptr, double *offset = nullptr) {
+               const Padded<T> &wide) {
+    spread(motion, step, item, centroid_before, wide);
+    triangularise(wide, N, triangle_);
+    set_lower();
+  }
+  // Predict means, and rows of a root that are wider than long. With a trajectory's state `to` the charts stand about
+  // that, and offsets of what is expected from it, in the inner order, are predicted as well.
+  void spread(SourceMotion &motion, int64_t step, int64_t item, const double (&centroid_before)[3],
+              const Padded<T> &wide, const double *to = nullptr, double *offset = nullptr) {
     const double zero[max_source_states] = {};
     const int64_t m = motion.n_noise;
     wide.clear(N);
@@ -107,36 +123,43 @@ class RowFilter {
       }
       for (int64_t i = 0; offset && i < ns_; ++i) offset[row_of(ns_ * k + i)] = expected[i];
     }
-    for (int64_t i = 0; i < e_; ++i) {
+    for (int64_t i = 0; i < behind_; ++i) {
       const double kept = motion.has_noisy_nuisances() ? motion.kept(step)[i] : 1.0;
-      add_rows(wide.lanes(seen_ + i), {&kept}, root.from(seen_ + i), 1);
-      x[N - e_ + i] *= kept;
-      if (offset) offset[seen_ + i] *= kept;
-      if (motion.has_noisy_nuisances()) wide[seen_ + i][N + m * K_ + i] = motion.added(step)[i];
+      double &mean = x[K_ * ns_ + i];
+      add_rows(wide.lanes(measured_ + i), {&kept}, root.from(measured_ + i), 1);
+      mean *= kept;
+      if (offset) {
+        offset[measured_ + i] *= kept;
+        if (i < n_pose_) {
+          offset[measured_ + i] += mean - to[K_ * ns_ + i];
+          mean = to[K_ * ns_ + i];
+        }
+      }
+      if (motion.has_noisy_nuisances()) wide[measured_ + i][N + m * K_ + i] = motion.added(step)[i];
     }
-    triangularise(wide, N, triangle_);
-    set_lower();
   }
 
   // Update the state by the row's readings: Gauss and Newton's steps, each halved until it lowers the cost enough. The
-  // prediction may bend as the readings do, along what they tell in more than a share of its standard deviation; there
-  // must be no nuisances then.
-  // Misfit and Q at the prediction are stored where they are wanted.
-  void update(const magloc_convergence &limits, bool bends = false, double least_share = 0.0, double *misfit = nullptr,
-              double *Q = nullptr) {
+  // prediction may bend as the readings do, along what they tell in more than a share of its standard deviation; errors
+  // of the pose may have less effect there. Misfit and Q at the prediction are stored where they are wanted.
+  void update(const magloc_convergence &limits, bool bends = false, double least_share = 0.0,
+              const double *pose_lasts = nullptr, double *misfit = nullptr, double *Q = nullptr) {
     begin_update();
-    double length = 1.0, gain = 0.0, cost = misfit_at(zeta_, misfit_);
+    lasts_ = bends ? pose_lasts : nullptr;
     if (bends) {
-      fill_source_columns();
-      bending_.bend(misfit_, columns_, least_share, triangle_);
+      move_to(zeta_, lasts_);
+      readings_.template predict<true>();
+      fill_seen_columns();
+      bending_.bend(readings_.values(), by_nuisances_.from(seen_), columns_, least_share, triangle_);
     }
+    double length = 1.0, gain = 0.0, cost = misfit_at(zeta_, misfit_);
     bool is_stale = true;
     for (iterations = 0;; ++iterations) {
       if (is_stale) gain = linearise(), length = 1.0;
       if (Q && iterations == 0) store_linearisation(misfit, Q);
       converged = gain < limits.tolerance * limits.tolerance;
       if (converged || iterations >= limits.max_iterations) break;
-      for (int64_t i = 0; i < d_; ++i) trial_[i] = zeta_[i] + length * step_[i < seen_ ? e_ + i : i - seen_];
+      for (int64_t i = 0; i < d_; ++i) trial_[i] = zeta_[i] + length * step_[i < seen_ ? h_ + i : i - seen_];
       const double there = misfit_at(trial_, trial_misfit_);
       is_stale = there <= cost - limits.least_gain * length * gain + limits.rounding * (1.0 + cost);
       length *= 0.5;
@@ -148,8 +171,8 @@ class RowFilter {
     nis = cost;
     chi2 = dot(misfit_, misfit_, k_);
     log_evidence = -0.5 * cost;
-    if (bends) log_evidence += bending_.log_determinant(columns_);
-    for (int64_t i = 0; !bends && i < d_; ++i) log_evidence -= logarithm(triangle_[i][i]);
+    if (bends) log_evidence += bending_.log_determinant();
+    for (int64_t i = 0; i < d_; ++i) log_evidence -= logarithm(triangle_[i][i]);
   }
 
   // After a linearisation: the misfit (n_readings), and Q (d, n_readings): of a covariance I + J J^T of readings, with
@@ -159,39 +182,20 @@ class RowFilter {
     columns_.store(Q, d_, given_.n_readings);
   }
 
-  // After an update: residuals (n_sensors, 3) of each sensor's channels, of unit covariance. Their square is the
-  // chi-square that free readings of the sensor would explain.
+  // After an update: see sensor_residuals.hpp.
   void fill_standardised(double followed, double *residuals) const {
-    for (int64_t s = 0, c = 0; s < given_.n_sensors; ++s) {
-      int64_t n = 0;
-      double square[3][3] = {}, left[3] = {}, share[3];
-      for (; c + n < given_.n_channels && n < 3 && given_.sensor[c + n] == s; ++n)
-        for (int64_t i = 0; i <= n; ++i)
-          square[n][i] =
-              (1.0 + followed) * dot(readings_.transform().lanes(c + n), readings_.transform().lanes(c + i), k_);
-      for (int64_t q = 0; q <= d_; ++q)
-        for (int64_t i = 0; i < n; ++i) {
-          share[i] = dot(readings_.transform().lanes(c + i), columns_.lanes(q), k_);
-          if (q == d_ /* what is left of the misfit */)
-            left[i] = triangle_[q][q] * share[i];
-          else
-            for (int64_t j = 0; j <= i; ++j) square[i][j] -= share[i] * share[j];
-        }
-      for (int64_t i = n; i < 3; ++i) square[i][i] = 1.0;
-      const Ldl<double, 3> factors(square, 1e-9);
-      for (int64_t i = 0; i < 3; ++i) {
-        for (int64_t j = 0; j < i; ++j) left[i] -= factors.l[i][j] * left[j];
-        residuals[3 * s + i] = left[i] * square_root(factors.inverse[i]);
-      }
-      c += n;
-    }
+    const double left = triangle_[d_][d_];
+    fill_sensor_residuals(given_, readings_.transform(), columns_, d_, k_, {1.0 + followed, left}, residuals);
   }
 
   // After an update: the innovation (n_readings) freed of correlations, L^-1 nu with the lower root L of its
   // covariance: each reading less what the ones before it tell of it, in its standard deviations. Return the square by
   // which the readings move the prediction, in its standard deviations, less its mean, the trace of the gain.
   double fill_innovation(double *innovation) {
-    fill_columns();
+    move_to(zeta_);
+    readings_.template predict<true>();
+    fill_nuisance_columns();
+    fill_source_columns();
     bending_.straighten(columns_);
     solved_.clear(d_);  // root of the standard numbers' covariance after the readings so far, whose means are trial_
     for (int64_t i = 0; i < d_; ++i) solved_[i][i] = 1.0, trial_[i] = -tail(d_)[i];
@@ -218,6 +222,11 @@ class RowFilter {
   // Let mean and root be those after the update, the root in the charts about the new mean.
   void finish_update() {
     move_to(zeta_);
+    for (int64_t i = seen_; bending_.bends && i < seen_ + e_; ++i) {
+      e_there_[i] = 0.0;
+      for (int64_t c = 0; c < d_; ++c) e_there_[i] += root[i][c] * (c < seen_ ? standard_ : zeta_)[c];
+      bending_.bend_row(root[i], trial_);
+    }
     condition_root();
     for (int64_t k = 0; k < K_; ++k) {
       charts_[k].to_state(there_[k], root.lanes(n_measured * k), further(root, k), root.width());
@@ -225,7 +234,7 @@ class RowFilter {
       set_chart(k);
       charts_[k].to_coordinates(root.lanes(n_measured * k), further(root, k), root.width());
     }
-    for (int64_t i = 0; i < e_; ++i) x[N - e_ + i] += e_there_[seen_ + i];
+    for (int64_t i = 0; i < behind_; ++i) x[K_ * ns_ + i] += e_there_[measured_ + i];
     double sum = 0.0;
     for (int64_t i = 0; i < N; ++i) sum += dot(root.lanes(i), root.lanes(i), root.width());
     converged &= sum < infinity;
@@ -243,22 +252,20 @@ class RowFilter {
         }
   }
 
-  // Kalman's update by the row, linearised at the mean, of offsets from it (N) that are expected and of the root. The
-  // information (d, d) in standard numbers has the upper root, and their means are zeta, in the order of the columns.
-  void update_linearised(double *offset, const Padded<T> &information_root, double *zeta) {
-    begin_update();
-    misfit_at(zeta_, misfit_);
-    linearise(offset);
-    nis = triangle_[d_][d_] * triangle_[d_][d_];
-    log_evidence = -0.5 * nis;
-    for (int64_t c = 0; c < d_; ++c) {
-      log_evidence -= logarithm(triangle_[c][c]);
-      zeta[c] = zeta_[zeta_of(c)] = step_[c];
-      for (int64_t i = 0; i < d_; ++i) information_root[c][i] = triangle_[c][i];
-    }
-    fill_coordinates(zeta_);
-    for (int64_t i = 0; i < N; ++i) offset[i] += e_there_[i];
-    condition_root();
+  // Fill derivatives of the readings (d, n_readings) by coordinates about the mean, where the root is one, and the
+  // misfit of readings at offsets from there (N) that are expected.
+  void fill_slopes(const Padded<T> &slopes, const double *offset, double *misfit) {
+    for (int64_t k = 0; k < K_; ++k) set_chart(k);
+    for (int64_t i = 0; i < N; ++i) e_there_[i] = 0.0;
+    place(1.0);
+    readings_.template predict<true>();
+    fill_seen_columns();
+    for (int64_t c = 0; c < seen_ + e_; ++c)
+      __builtin_memcpy(slopes.lanes(c), c < seen_ ? columns_.lanes(h_ + c) : readings_.effect.lanes(c - seen_),
+                       k_ * sizeof(T));
+    for (int64_t r = 0; r < k_; ++r) misfit_[r] = readings_.measured.lanes(0)[r] - readings_.values()[r];
+    add_rows(misfit_, {offset, 1, -1.0}, slopes, seen_ + e_);
+    __builtin_memcpy(misfit, misfit_, given_.n_readings * sizeof(double));
   }
 
   // How far readings bend over what is not known along the principal axes (3 K) of log-range and direction of each
@@ -269,7 +276,8 @@ class RowFilter {
     for (int64_t i = 0; i < N; ++i) e_there_[i] = 0.0;
     readings_at(0.0, here);
     for (int64_t k = 0; k < K_; ++k) {
-      fill_principal_axes(n_measured * k);
+      rows_.copy(root.from(n_measured * k), 3);
+      fill_principal_axes(rows_);
       for (int64_t a = 0; a < 3; ++a, ++bends, directions += N) {
         for (int64_t i = 0; i < N; ++i) e_there_[i] = dot(root.lanes(i), rows_.lanes(a), root.width());
         for (int64_t i = 0; i < N; ++i) directions[i] = e_there_[row_of(i)];
@@ -289,22 +297,19 @@ class RowFilter {
 
   // The inner order of a state's numbers.
   int64_t row_of(int64_t i) const {
-    if (i >= N - e_) return seen_ + i - (N - e_);
+    if (i >= K_ * ns_) return measured_ + i - K_ * ns_;
     const int64_t k = i / ns_, j = i % ns_;
-    return j < n_measured ? n_measured * k + j : d_ + (ns_ - n_measured) * k + j - n_measured;
+    return j < n_measured ? n_measured * k + j : seen_ + e_ + (ns_ - n_measured) * k + j - n_measured;
   }
-  // Which standard number a column of the linearised problem belongs to.
-  int64_t zeta_of(int64_t column) const { return column < e_ ? seen_ + column : column - e_; }
 
  private:
-  T *further(const Padded<T> &rows, int64_t k) const { return rows.lanes(d_ + (ns_ - n_measured) * k); }
+  // Which standard number a column of the linearised problem belongs to.
+  int64_t zeta_of(int64_t column) const { return column < h_ ? seen_ + column : column - h_; }
+  T *further(const Padded<T> &rows, int64_t k) const { return rows.lanes(seen_ + e_ + (ns_ - n_measured) * k); }
   double *tail(int64_t column) const { return reinterpret_cast<double *>(columns_.lanes(column) + k_); }
 
   void set_chart(int64_t k) {
     charts_[k] = SourceChart(x + ns_ * k, ns_, p_.power, readings_.centroid, given_.radius);
-    judge(k);
-  }
-  void judge(int64_t k) {
     double moment = 0.0;
     for (int64_t i = 3; i < n_measured; ++i) moment += variance(ns_ * k + i);
     charts_[k].judge_moment(moment, p_.firm);
@@ -327,26 +332,32 @@ class RowFilter {
 
   void begin_update() {
     bending_.bends = false;
+    lasts_ = nullptr;
     lower_root();
     for (int64_t k = 0; k < K_; ++k) set_chart(k);
     for (int64_t i = 0; i < d_; ++i) zeta_[i] = 0.0;
     columns_.clear(d_ + 1);
+    for (int64_t c = 0; e_ > 0 && c < seen_ + e_; ++c)
+      set_rows(by_nuisances_.lanes(c), root.from(seen_).column(c), readings_.effect, e_);
+    if (h_ < e_) gather(by_nuisances_.from(seen_), h_, e_, root.from(seen_), N - seen_, seen_, rows_);
     fill_nuisance_columns();
-    triangularise(columns_, e_, triangle_);
+    triangularise(columns_, h_, triangle_);
   }
 
-  // The states at standard numbers.
-  void move_to(const double *zeta) {
+  // The states at standard numbers, where errors of the pose have shares of their effect, or all of it.
+  void move_to(const double *zeta, const double *shares = nullptr) {
     fill_coordinates(zeta);
-    place(1.0);
+    place(1.0, shares);
   }
   void fill_coordinates(const double *zeta) {
     for (int64_t i = 0; i < N; ++i) {
       e_there_[i] = 0.0;
-      for (int64_t j = 0; j < d_ && j <= i; ++j) e_there_[i] += root[i][j] * zeta[j];
+      for (int64_t j = 0; j < d_ && (j <= i || i >= seen_); ++j) e_there_[i] += root[i][j] * zeta[j];
     }
   }
-  void place(double sign) {
+  void place(double sign, const double *shares = nullptr) {
+    for (int64_t q = 0; q < n_pose_; ++q) pose_[q] = x[K_ * ns_ + q] + sign * e_there_[measured_ + q];
+    if (n_pose_ > 0) readings_.set_pose(pose_, shares);
     for (int64_t k = 0; k < K_; ++k) {
       double e[max_source_states];
       for (int64_t i = 0; i < ns_; ++i) e[i] = sign * e_there_[row_of(ns_ * k + i)];
@@ -364,73 +375,69 @@ class RowFilter {
 
   // Fill the misfit of the readings at standard numbers. Return the cost: its square and theirs.
   double misfit_at(const double *zeta, T *misfit) {
-    move_to(zeta);
+    move_to(zeta, lasts_);
+    if (lasts_) {
+      readings_.template predict<false>();
+      bending_.fill_standard(zeta, readings_.values(), trial_standard_);
+      place(1.0);
+    }
     readings_.template predict<true>();
+    if (!lasts_) bending_.fill_standard(zeta, readings_.values(), trial_standard_);
     for (int64_t r = 0; r < k_; ++r) misfit[r] = readings_.measured.lanes(0)[r] - readings_.values()[r];
     add_rows(misfit, {x + N - e_, 1, -1.0}, readings_.effect, e_);
-    add_rows(misfit, {e_there_ + seen_, 1, -1.0}, readings_.effect, e_);
+    if (e_ > 0) add_rows(misfit, {trial_standard_, 1, -1.0}, by_nuisances_, seen_);
+    add_rows(misfit, {zeta + seen_, 1, -1.0}, by_nuisances_.from(seen_), h_);
     double cost = dot(misfit, misfit, k_);
-    bending_.fill_standard(zeta, misfit, standard_);
-    for (int64_t i = 0; i < d_; ++i) cost += standard_[i] * standard_[i];
+    for (int64_t i = 0; i < d_; ++i) cost += trial_standard_[i] * trial_standard_[i];
     return cost;
   }
 
   void fill_nuisance_columns() {
-    for (int64_t c = 0; c < e_; ++c) {
-      for (int64_t r = 0; r < columns_.width(); ++r) columns_.lanes(c)[r] = T{};
-      add_rows(columns_.lanes(c), root.from(seen_).column(seen_ + c), readings_.effect, e_);
+    columns_.clear(h_);
+    for (int64_t c = 0; c < h_; ++c) {
+      __builtin_memcpy(columns_.lanes(c), by_nuisances_.lanes(seen_ + c), k_ * sizeof(T));
       tail(c)[c] = 1.0;
     }
   }
-  // Columns of the sources, and the misfit, where the readings were predicted last. The state is expected at an offset
-  // from there, or nowhere else.
-  void fill_source_columns(const double *offset = nullptr) {
-    const double *R = readings_.rotation;
-    for (int64_t i = 0; i < seen_; ++i) {
-      __builtin_memcpy(turned_[i], root[i], d_ * sizeof(double));
-      turned_[i][d_] = offset ? offset[i] : 0.0;
-    }
+  // Columns of what is seen, without nuisances, where the readings were predicted last.
+  void fill_seen_columns() {
+    for (int64_t i = 0; i < seen_; ++i) __builtin_memcpy(turned_[i], root[i], seen_ * sizeof(double));
     for (int64_t k = 0; k < K_; ++k) {
-      T *rows = turned_.lanes(n_measured * k);
-      const int64_t width = turned_.width();
-      charts_[k].to_state(there_[k], rows, (T *)nullptr, width);
-      for (int64_t j = 0; j < 2 * width; ++j) {
-        T *const row = rows + (j < width ? j : 2 * width + j);
-        const T world[3] = {row[0], row[width], row[2 * width]};
-        for (int i = 0; i < 3; ++i) {
-          const T turned = R[i] * world[0] + R[3 + i] * world[1] + R[6 + i] * world[2];
-          row[i * width] = j < width ? turned : mu0_over_4pi * turned;
-        }
-      }
+      T *const rows = turned_.lanes(n_measured * k);
+      charts_[k].to_state(there_[k], rows, (T *)nullptr, turned_.width());
+      readings_.to_array(rows, turned_.width());
     }
     for (int64_t j = 0; j < seen_; ++j) {
-      const int64_t first = j - j % n_measured;  // sources before do not depend on this zeta
-      T *const column = columns_.lanes(e_ + j);
+      const int64_t first = j < measured_ ? j - j % n_measured : j;  // what stands before does not depend on this zeta
+      T *const column = columns_.lanes(h_ + j);
       for (int64_t r = 0; r < columns_.width(); ++r) column[r] = T{};
       add_rows(column, turned_.from(first).column(j), readings_.slopes().from(first), seen_ - first);
-      add_rows(column, root.from(seen_).column(j), readings_.effect, e_);
-      tail(e_ + j)[e_ + j] = 1.0;
     }
-    if (offset) {
-      add_rows(misfit_, -turned_.column(d_), readings_.slopes(), seen_);
-      add_rows(misfit_, {offset + seen_, 1, -1.0}, readings_.effect, e_);
-    }
-    bending_.fill_derivatives(columns_);
-    __builtin_memcpy(columns_.lanes(d_), misfit_, k_ * sizeof(T));
-    bending_.fill_standard(zeta_, misfit_, standard_);
-    for (int64_t c = 0; c < d_; ++c) tail(d_)[c] = -standard_[zeta_of(c)];
   }
-  void fill_columns() {
-    move_to(zeta_);
-    readings_.template predict<true>();
-    fill_nuisance_columns();
-    fill_source_columns();
+  // Columns of what is seen, and the misfit, where the readings were predicted last.
+  void fill_source_columns() {
+    if (lasts_) {
+      place(1.0, lasts_);
+      readings_.template predict<true>();
+    }
+    bending_.fill_standard(zeta_, readings_.values(), standard_);
+    fill_seen_columns();
+    bending_.fill_derivatives(columns_);
+    if (lasts_) {
+      place(1.0);
+      readings_.template predict<true>();
+      fill_seen_columns();
+    }
+    bending_.append_derivatives(columns_);
+    for (int64_t j = h_; e_ > 0 && j < d_; ++j) add_rows(columns_.lanes(j), {tail(j) + h_}, by_nuisances_, seen_);
+    __builtin_memcpy(columns_.lanes(d_), misfit_, k_ * sizeof(T));
+    for (int64_t c = 0; c < d_; ++c) tail(d_)[c] = -standard_[zeta_of(c)];
   }
 
   // Find the step to the least cost of the linearised problem. Return by how much it is less.
-  double linearise(const double *offset = nullptr) {
-    fill_source_columns(offset);
-    triangularise(columns_, d_ + 1, triangle_, e_);
+  double linearise() {
+    fill_source_columns();
+    triangularise(columns_, d_ + 1, triangle_, h_);
     double gain = 0.0;
     for (int64_t c = 0; c < d_; ++c) {
       step_[c] = triangle_[c][d_];
@@ -438,31 +445,6 @@ class RowFilter {
     }
     solve(triangle_, d_, step_);
     return gain;
-  }
-
-  // Jacobi's rotations make three rows of the root orthogonal; then they have unit length. The root times one of them
-  // is what the state is expected to differ by, one sigma along a principal axis.
-  void fill_principal_axes(int64_t first) {
-    const int64_t width = root.width();
-    rows_.copy(root.from(first), 3);
-    for (int sweep = 0; sweep < 8; ++sweep)
-      for (int pair = 0; pair < 3; ++pair) {
-        T *const a = rows_.lanes(pair == 2), *const b = rows_.lanes(pair == 0 ? 1 : 2);
-        const double product = dot(a, b, width);
-        if (product == 0.0) continue;
-        const double slope = 0.5 * (dot(b, b, width) - dot(a, a, width)) / product;
-        const double tangent = 1.0 / (slope + (slope < 0.0 ? -1.0 : 1.0) * square_root(1.0 + slope * slope));
-        const double cosine = inverse_root(1.0 + tangent * tangent), sine = tangent * cosine;
-        for (int64_t r = 0; r < width; ++r) {
-          const T before = a[r];
-          a[r] = cosine * before - sine * b[r];
-          b[r] = sine * before + cosine * b[r];
-        }
-      }
-    for (int a = 0; a < 3; ++a) {
-      const double norm = square_root(dot(rows_.lanes(a), rows_.lanes(a), width));
-      scale(rows_.lanes(a), norm > 0.0 ? 1.0 / norm : 0.0, width);
-    }
   }
 };
 MAGLOC_END

@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
 
+from arrays.pose import PoseUncertainty
+from magloc.localization.fit.prior import SourcePrior
 from magloc.measurement.differences import predicted_channels
+from magloc.tracking.chart import refit
+from magloc.tracking.chart.known_moment import KnownInWorld
 from magloc.tracking.chart.mixture import Mixture
 from magloc.tracking.chart.refit import Cells, refitted
 from magloc.tracking.chart.row import ChartRow
@@ -40,7 +47,7 @@ class TestRefitted:
         measurements = [ChartRow.of(tracker.measurements.of(row)) for row in rows]
         seed = seed_of(tracker, rows[-1])
         beside = replace(seed, x=seed.x * np.repeat([1.05, 0.9], 3))
-        found = refitted(beside, measurements, [tracker.motion] * 5, tracker.errors)
+        found = refitted(beside, measurements, [tracker.motion] * 5, tracker.errors, tracker.pose_errors)
         assert found.decided.all()
         mixture = found.mixture
         offset = mixture.chart.coordinates(SOURCE[None])[0]
@@ -54,7 +61,7 @@ class TestRefitted:
         measurements = [ChartRow.of(tracker.measurements.of(row)) for row in rows]
         seed = seed_of(tracker, rows[-1])
         both = replace(seed, x=np.vstack([seed.x, -seed.x]), S=np.zeros((2, 6, 6)), log_weight=np.zeros(2))
-        found = refitted(both, measurements, [tracker.motion] * 5, tracker.errors)
+        found = refitted(both, measurements, [tracker.motion] * 5, tracker.errors, tracker.pose_errors)
         assert found.decided.all()
         assert len(found.mixture) == 1
 
@@ -68,12 +75,12 @@ class TestCells:
         rows = rows_of(np.linspace([-3.0, 0.0, 0.0], [0.0, 0.0, 0.0], 5))
         measurements = [ChartRow.of(tracker.measurements.of(row)) for row in rows]
         motions = [tracker.motion] * 5
-        mode = refitted(seed_of(tracker, rows[-1]), measurements, motions, tracker.errors).mixture
+        mode = refitted(seed_of(tracker, rows[-1]), measurements, motions, tracker.errors, tracker.pose_errors).mixture
         sigma = np.linalg.norm(mode.S[0, 0])
         pitch = 0.7 * sigma
         seeds = mode.take(np.zeros(15, dtype=np.intp))
         cells = Cells(pitch * np.arange(-7, 8), np.full(15, 0.6 * pitch))
-        found = refitted(seeds, measurements, motions, tracker.errors, cells)
+        found = refitted(seeds, measurements, motions, tracker.errors, tracker.pose_errors, cells)
         assert found.decided.all()
         np.testing.assert_array_equal(found.origin, np.arange(15))
         assert np.all(np.diff(found.mixture.chart.length) > 0.0)
@@ -92,7 +99,7 @@ class TestPrior:
         measurements = [ChartRow.of(tracker.measurements.of(row)) for row in still]
         seeds = seed_of(tracker, still[-1])
         fast = replace(seeds, x=seeds.x + np.array([0.0] * 6 + [-0.01, 0.0, 0.0] + [0.0] * 3))
-        found = refitted(fast, measurements, [motion] * 2, tracker.errors).mixture
+        found = refitted(fast, measurements, [motion] * 2, tracker.errors, tracker.pose_errors).mixture
         assert len(found) == 1
         sigma = np.sqrt(np.diagonal(found.S[0] @ found.S[0].T))[6:9] * found.chart.length[0]
         assert np.abs(found.x[0, 6:9]).max() < 4e-3
@@ -110,6 +117,66 @@ class TestPrior:
         seed.x[0, 6:9] = 0.5
         cells = Cells(np.linspace(-0.1, 0.1, 3), np.full(3, 0.1))
         found = refitted(
-            seed.take(np.zeros(3, dtype=np.intp)), measurements, [tracker.motion] * 5, tracker.errors, cells
+            seed.take(np.zeros(3, dtype=np.intp)),
+            measurements,
+            [tracker.motion] * 5,
+            tracker.errors,
+            tracker.pose_errors,
+            cells,
         )
         assert found.origin.tolist() == [0, 1, 2]
+
+
+class TestLastingErrors:
+    @pytest.mark.parametrize("prior", [SourcePrior(), SourcePrior(known_moment_Am2=250.0, known_moment_sigma_Am2=2.0)])
+    def test_is_the_best_fit_of_all_rows_sensors_and_poses(
+        self, prior: SourcePrior, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """SciPy's optimum of source, poses and offsets, in rows over which the chart hardly bends."""
+        monkeypatch.setattr(refit, "_TOLERANCE", 1e-4)
+        monkeypatch.setattr(refit, "_MOST_PASSES", 200)
+        pose = PoseUncertainty(0.02, 0.002, 0.0, 10.0, 0.0, 0.0)
+        array = replace(ARRAY, pose=pose, sensors=tuple(replace(s, offset_uncertainty_T=2e-9) for s in ARRAY.sensors))
+        tracker = Tracker(array, RandomWalk(0.01, 0.01), prior=prior)
+        rng = np.random.default_rng(5)
+        of_sensors = 2e-9 * rng.normal(size=array.n_channels)
+        rows = [
+            replace(row, readings_T=row.readings_T + of_sensors + array.channel_noise_T * rng.normal(size=12))
+            for row in rows_of(np.linspace([-3.0, 0.0, 0.0], [0.0, 0.0, 0.0], 5))
+        ]
+        measurements = [ChartRow.of(tracker.measurements.of(row)) for row in rows]
+        n, e, last = measurements[0].n_motion, tracker.errors.n_states, measurements[-1]
+        x = np.concatenate([SOURCE, np.zeros(n - 6 + e)])[None]
+        seed = Mixture(x, np.eye(n + e)[None], np.zeros(1), n, last.centroid_m, last.radius_m, last.n_pose)
+        in_world = KnownInWorld.of(tracker.prior, np.eye(3))
+        motions = [tracker.motion] * 5
+        found = refitted(seed, measurements, motions, tracker.errors, tracker.pose_errors, None, in_world).mixture
+        kept, added = tracker.pose_errors.step(1.0)
+        _, _, S_q = tracker.motion.step(found.x[0, :6], 1.0)
+        Q = S_q @ S_q.T
+        # A modulus that is kept has no noise: give it next to none.
+        S_q = np.linalg.cholesky(Q + 1e-10 * np.diag(np.diag(Q)))
+        scale = np.concatenate([np.tile(np.append(np.abs(SOURCE), np.ones(n - 6)), 5), tracker.errors.sigma])
+
+        def residuals(y: FloatArray) -> FloatArray:
+            states, errors = (scale * y)[: 5 * n].reshape(5, n), (scale * y)[5 * n :]
+            parts = [states[0, 6:], y[5 * n :]]
+            parts += [
+                row.z - row.of_source(x) - row.effect @ errors for row, x in zip(measurements, states, strict=True)
+            ]
+            for before, after in pairwise(states):
+                parts += [np.linalg.solve(S_q, (after - before)[:6]), (after[6:] - kept * before[6:]) / added]
+            if in_world is not None:
+                parts.append(in_world.residual(states[:1])[0])
+            return np.concatenate(parts)
+
+        fit = least_squares(residuals, np.append(np.tile(found.x[0, :n], 5), found.x[0, n:]) / scale, "3-point")
+        state = np.r_[4 * n : 5 * n + e]
+        spread = (scale[:, None] * np.linalg.inv(np.linalg.qr(fit.jac, "r")))[state]
+        P = spread @ spread.T
+        root = found.S[0].copy()
+        root[:n] = found.chart.jacobian(np.zeros((1, n)))[0] @ root[:n]
+        sigma = np.sqrt(np.diagonal(P))
+        assert np.abs((found.x[0] - (scale * fit.x)[state]) / sigma).max() < 0.1
+        unit = np.outer(sigma, sigma)
+        np.testing.assert_allclose(root @ root.T / unit, P / unit, atol=0.03)

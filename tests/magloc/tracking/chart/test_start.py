@@ -13,11 +13,13 @@ import magloc
 from arrays.array import SensorArray
 from arrays.pose import PoseUncertainty
 from magloc.ambient import in_world_field
+from magloc.tracking import row_filter
 from magloc.tracking.chart.mixture import Mixture
 from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.chart.start import NO_AMBIENT, with_errors
 from magloc.tracking.chart.update import updated
 from magloc.tracking.results import rows_of
+from magloc.tracking.row_filter import Gaussians
 from magloc.tracking.tracker import Tracker
 from sims.magnetics.scenario_files import read_scenario
 from sims.magnetics.simulation import simulate
@@ -32,21 +34,23 @@ class TestErrorsOfSensors:
         row = ChartRow.of(tracker.measurements.of(list(rows_of(simulation.readings))[120]))
         assert truth.moment_Am2 is not None
         x = np.concatenate([truth.position_m[120], truth.moment_Am2[120]]) * np.array([[1.0], [1.02], [0.99]])
-        sigma, bends = tracker.errors.sigma, np.zeros(3, dtype=bool)
+        sigma = tracker.errors.sigma
         S = np.broadcast_to(
             np.diag([0.3, 0.2, 0.2, *np.full(3, np.linalg.norm(x[0, 3:]) / row.radius_m**4)]), (3, 6, 6)
         )
-        alone = updated(x, S, row.with_errors_as_noise(sigma), bends)
+        alone = updated(x, S, row.with_errors_as_noise(sigma))
         mixture = Mixture(alone.x, alone.S, np.zeros(3), 6, row.centroid_m, row.radius_m)
         found = with_errors(mixture, row, sigma)
         zero = np.zeros((3, sigma.size))
         S_joint = np.stack([block_diag(S[0], np.diag(sigma))] * 3)
-        joint = updated(np.concatenate([x, zero], axis=1), S_joint, row, bends)
+        together = Gaussians(np.concatenate([x, zero], axis=1), S_joint, n_nuisances=sigma.size)
+        joint = row_filter.update(together, row.compiled)
         unit = np.maximum(np.linalg.norm(joint.S, axis=2), 1e-100)  # drift has not begun
-        np.testing.assert_allclose((found.x - joint.x) / unit, 0.0, atol=1e-5)
+        offset = np.concatenate([found.chart.coordinates(joint.x[:, :6]), (joint.x - found.x)[:, 6:]], axis=1)
+        np.testing.assert_allclose(offset / unit, 0.0, atol=3e-3)  # both end within 1e-3 σ of the optimum
         P, P_joint = (root @ np.swapaxes(root, 1, 2) for root in (found.S, joint.S))
         units = unit[:, :, None] * unit[:, None, :]
-        np.testing.assert_allclose((P - P_joint) / units, 0.0, atol=1e-6)
+        np.testing.assert_allclose((P - P_joint) / units, 0.0, atol=3e-3)
         assert np.abs(P_joint / units)[:, :6, 6:].max() > 0.1
 
 

@@ -9,11 +9,12 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import multivariate_normal
 
+from magloc.tracking import row_filter
 from magloc.tracking.chart.coordinates import Chart
 from magloc.tracking.chart.row import ChartRow
-from magloc.tracking.chart.update import Updated, updated
 from magloc.tracking.motion import RandomWalk
 from magloc.tracking.results import Row
+from magloc.tracking.row_filter import Gaussians
 from magloc.tracking.tracker import Tracker
 from tests.passing_source import ARRAY, MOMENT, POSITION
 
@@ -36,7 +37,8 @@ def far_update(shift: FloatArray) -> tuple[float, FloatArray, FloatArray, FloatA
     J = blank.source_jacobian(SOURCE) @ chart.jacobian(np.zeros((1, 6)))[0] @ S
     readings = np.linalg.lstsq(blank.model.differences.transform / blank.sigma[:, None], blank.of_source(there))[0]
     measurement = ChartRow.of(measurements.of(Row(0.0, readings)))
-    found = updated(SOURCE[None], S[None], measurement, np.ones(1, dtype=bool))
+    gaussian = Gaussians(SOURCE[None], S[None])
+    found = row_filter.update(gaussian, measurement.compiled, bends=np.ones(1, dtype=bool))
     assert found.converged.all()
     return float(found.log_evidence[0]), h, J, measurement.z
 
@@ -49,15 +51,3 @@ class TestEvidenceOfABentPrediction:
         found, h, J, z = far_update(shift)
         expected = multivariate_normal.logpdf(z, h, np.eye(6) + J @ J.T) + 3.0 * math.log(2.0 * math.pi)
         assert found == pytest.approx(float(expected), abs=0.05)
-
-
-class TestWhitenedInnovation:
-    def test_of_a_prediction_that_knows_next_to_nothing(self) -> None:
-        """Readings that err as it does tell nothing; those at right angles keep their squares."""
-        J = np.array([[[1e9], [1e9], [1.0]]])
-        of_one = np.ones(1)
-        for readings, square in (([1.0, -1.0], 2.0), ([1.0, 1.0], 0.0)):
-            residual = np.array([[*readings, 0.0]])
-            found = Updated(of_one, of_one, of_one, of_one, of_one, of_one, of_one, residual, J)  # type: ignore[arg-type]
-            whitened = found.whitened_innovation(0)
-            assert whitened @ whitened == pytest.approx(square, abs=1e-6)
