@@ -16,7 +16,7 @@ from magloc import core
 from magloc.tracking.chart.coordinates import FIRM
 from magloc.tracking.chart.row import Rows
 from magloc.tracking.chart.update import LEAST_GAIN, LEAST_SHARE, MOST_ITERATIONS, ROUNDING, TOLERANCE
-from magloc.tracking.motion import MotionModel, OrnsteinUhlenbeck
+from magloc.tracking.motion import N_SOURCE, MotionModel, OrnsteinUhlenbeck
 
 _ROWS_A_CALL = 1000
 """Rows of trajectories that one call of the kernel smooths: some 10 ms."""
@@ -224,7 +224,7 @@ def update(
 
 
 def bends(gaussians: Gaussians, rows: Rows, memory: float, row: int = 0) -> tuple[FloatArray, FloatArray]:
-    """Return how far readings bend over one σ along the axes of each source's place.
+    """Return how far readings bend over one σ along axes of position and moment of the sources.
 
     Parameters
     ----------
@@ -238,12 +238,12 @@ def bends(gaussians: Gaussians, rows: Rows, memory: float, row: int = 0) -> tupl
 
     Returns
     -------
-    bends : ndarray, shape (C, 3 n_sources)
+    bends : ndarray, shape (C, 6 n_sources)
         In σ of the readings.
-    directions : ndarray, shape (C, 3 n_sources, N)
-        One σ of the whole state along each axis, in its chart.
+    directions : ndarray, shape (C, 6 n_sources, N)
+        One σ of the whole state along each axis, a right singular vector of the readings, in its chart.
     """
-    n, axes = len(gaussians.x), 3 * gaussians.n_sources
+    n, axes = len(gaussians.x), N_SOURCE * gaussians.n_sources
     found, directions = np.empty((n, axes)), np.empty((n, axes, gaussians.x.shape[1]))
     work = core.problem(
         "row_bends",

@@ -237,29 +237,28 @@ class RowFilter {
     condition_root();
   }
 
-  // How far readings bend over what is not known along the principal axes (3 K) of log-range and direction of each
-  // source: magloc/tracking/chart/split.py. And by what the whole state (3 K, N) differs one sigma along them.
+  // How far readings bend over what is not known along axes (6 K) of the sources: magloc/tracking/chart/split.py. And
+  // by what the whole state (6 K, N) differs one sigma along them.
   void fill_bends(double memory, double *bends, double *directions) {
-    T *const here = misfit_, *const ahead = trial_misfit_, *const behind = columns_.lanes(0);
-    for (int64_t k = 0; k < K_; ++k) set_chart(k);
-    for (int64_t i = 0; i < N; ++i) e_there_[i] = 0.0;
-    readings_at(0.0, here);
-    for (int64_t k = 0; k < K_; ++k) {
-      fill_principal_axes(n_measured * k);
-      for (int64_t a = 0; a < 3; ++a, ++bends, directions += N) {
-        for (int64_t i = 0; i < N; ++i) e_there_[i] = dot(root.lanes(i), rows_.lanes(a), root.width());
-        for (int64_t i = 0; i < N; ++i) directions[i] = e_there_[row_of(i)];
-        readings_at(1.0, ahead);
-        readings_at(-1.0, behind);
-        T bend{}, gradient{};
-        for (int64_t r = 0; r < k_; ++r) {
-          const T curve = 0.5 * (ahead[r] + behind[r]) - here[r], slope = 0.5 * (ahead[r] - behind[r]);
-          bend += curve * curve;
-          gradient += slope * slope;
-        }
-        const double told = sum_of_lanes(gradient), n = told < 1.0 ? minimum(1.0 / told, memory) : 1.0;
-        *bends = square_root(sum_of_lanes(bend) * n) / (1.0 + told);
+    T *const here = misfit_, *const ahead = trial_misfit_, *const behind = columns_.lanes(d_);
+    begin_update();
+    fill_columns();
+    for (int64_t r = 0; r < k_; ++r) here[r] = readings_.values()[r];
+    turn_source_columns();
+    for (int64_t a = 0; a < seen_; ++a, ++bends, directions += N) {
+      for (int64_t j = 0; j < seen_; ++j) zeta_[j] = tail(e_ + a)[e_ + j];
+      fill_coordinates(zeta_);
+      for (int64_t i = 0; i < N; ++i) directions[i] = e_there_[row_of(i)];
+      readings_at(1.0, ahead);
+      readings_at(-1.0, behind);
+      T bend{}, gradient{};
+      for (int64_t r = 0; r < k_; ++r) {
+        const T curve = 0.5 * (ahead[r] + behind[r]) - here[r], slope = 0.5 * (ahead[r] - behind[r]);
+        bend += curve * curve;
+        gradient += slope * slope;
       }
+      const double told = sum_of_lanes(gradient), n = told < 1.0 ? minimum(1.0 / told, memory) : 1.0;
+      *bends = square_root(sum_of_lanes(bend) * n) / (1.0 + told);
     }
   }
 
@@ -416,28 +415,29 @@ class RowFilter {
     return gain;
   }
 
-  // Jacobi's rotations make three rows of the root orthogonal; then they have unit length. The root times one of them
-  // is what the state is expected to differ by, one sigma along a principal axis.
-  void fill_principal_axes(int64_t first) {
-    const int64_t width = root.width();
-    rows_.copy(root.from(first), 3);
-    for (int sweep = 0; sweep < 8; ++sweep)
-      for (int pair = 0; pair < 3; ++pair) {
-        T *const a = rows_.lanes(pair == 2), *const b = rows_.lanes(pair == 0 ? 1 : 2);
-        const double product = dot(a, b, width);
-        if (product == 0.0) continue;
-        const double slope = 0.5 * (dot(b, b, width) - dot(a, a, width)) / product;
-        const double tangent = 1.0 / (slope + (slope < 0.0 ? -1.0 : 1.0) * square_root(1.0 + slope * slope));
-        const double cosine = inverse_root(1.0 + tangent * tangent), sine = tangent * cosine;
-        for (int64_t r = 0; r < width; ++r) {
-          const T before = a[r];
-          a[r] = cosine * before - sine * b[r];
-          b[r] = sine * before + cosine * b[r];
+  // Jacobi's rotations make the columns of the sources orthogonal: the numbers behind them become right singular
+  // vectors.
+  void turn_source_columns() {
+    double rounding = 0.0;
+    for (int64_t i = e_; i < d_; ++i) rounding += 1e-15 * dot(columns_.lanes(i), columns_.lanes(i), k_);
+    bool is_turned = true;
+    for (int sweep = 0; sweep < 30 && is_turned; ++sweep) {
+      is_turned = false;
+      for (int64_t i = e_; i < d_; ++i)
+        for (int64_t j = i + 1; j < d_; ++j) {
+          T *const a = columns_.lanes(i), *const b = columns_.lanes(j);
+          const double product = dot(a, b, k_), of_a = dot(a, a, k_), of_b = dot(b, b, k_);
+          if (product * product <= 1e-16 * of_a * of_b + rounding * rounding) continue;
+          is_turned = true;
+          const double slope = 0.5 * (of_b - of_a) / product;
+          const double tangent = 1.0 / (slope + (slope < 0.0 ? -1.0 : 1.0) * square_root(1.0 + slope * slope));
+          const double cosine = inverse_root(1.0 + tangent * tangent), sine = tangent * cosine;
+          for (int64_t r = 0; r < columns_.width(); ++r) {
+            const T before = a[r];
+            a[r] = cosine * before - sine * b[r];
+            b[r] = sine * before + cosine * b[r];
+          }
         }
-      }
-    for (int a = 0; a < 3; ++a) {
-      const double norm = square_root(dot(rows_.lanes(a), rows_.lanes(a), width));
-      scale(rows_.lanes(a), norm > 0.0 ? 1.0 / norm : 0.0, width);
     }
   }
 };
