@@ -48,7 +48,7 @@ MAGLOC_KERNEL(update_row, row_update) {
 }
 
 MAGLOC_KERNEL(bend_row, row_bends) {
-  const int64_t axes = 3 * problem->sources->n_sources;
+  const int64_t axes = n_measured * problem->sources->n_sources;
   Workspace space(workspace);
   RowFilter<Lanes> filter(*problem->sources, *problem->rows, space);
   if (!workspace) return space.size();

@@ -271,7 +271,7 @@ def update(
 
 
 def bends(gaussians: Gaussians, rows: Rows, memory: float, row: int = 0) -> tuple[FloatArray, FloatArray]:
-    """Return how far readings bend over one σ along the axes of each source's place.
+    """Return how far readings bend over one σ along axes of position and moment of the sources.
 
     Parameters
     ----------
@@ -285,12 +285,12 @@ def bends(gaussians: Gaussians, rows: Rows, memory: float, row: int = 0) -> tupl
 
     Returns
     -------
-    bends : ndarray, shape (C, 3 n_sources)
+    bends : ndarray, shape (C, 6 n_sources)
         In σ of the readings.
-    directions : ndarray, shape (C, 3 n_sources, N)
-        One σ of the whole state along each axis, in its chart.
+    directions : ndarray, shape (C, 6 n_sources, N)
+        One σ of the whole state along each axis, a right singular vector of the readings, in its chart.
     """
-    n, axes = len(gaussians.x), 3 * gaussians.n_sources
+    n, axes = len(gaussians.x), N_SOURCE * gaussians.n_sources
     found, directions = np.empty((n, axes)), np.empty((n, axes, gaussians.x.shape[1]))
     work = core.problem(
         "row_bends",

@@ -555,15 +555,15 @@ typedef struct {
 } magloc_row_update;
 int64_t magloc_update_row(const magloc_row_update *problem, int64_t begin, int64_t end, double *workspace);
 
-/* How far readings bend along the principal axes of log-range and direction of each source, over what a row leaves
-   open of them, in sigma of as many rows as are remembered. */
+/* How far readings bend along axes of position and moment, over what a row leaves open of them, in sigma of as many
+   rows as are remembered. */
 typedef struct {
   const magloc_sources *sources;
   const magloc_rows *rows;
   int64_t row;
   double memory;
-  double *bends;      /* (n, 3 n_sources) */
-  double *directions; /* (n, 3 n_sources, N): one sigma of the whole state along each axis */
+  double *bends;      /* (n, 6 n_sources) */
+  double *directions; /* (n, 6 n_sources, N): one sigma of the whole state along each axis */
 } magloc_row_bends;
 int64_t magloc_bend_row(const magloc_row_bends *problem, int64_t begin, int64_t end, double *workspace);
 

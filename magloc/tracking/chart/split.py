@@ -1,17 +1,22 @@
 r"""Components of a mixture that are divided where a row's readings bend over them.
 
-A Gaussian stays one under readings that are linear over its width. Along a principal axis of log-range and direction,
-one standard deviation v of the whole state changes the predicted readings, in units of their noise, by an odd part
-:math:`g = \tfrac12 (h(v) - h(-v))` and an even part :math:`c = \tfrac12 (h(v) + h(-v)) - h(0)`. A linearisation leaves
-out the even part, of which :math:`c / (1 + |g|^2)` remains within what the row leaves open of the axis. It does so in
-every row alike. Over as many rows as determine the axis by themselves, :math:`1/|g|^2`, but at most the n rows that the
-component remembers, it adds up to
+A Gaussian stays one under readings that are linear over its width. With their Jacobian J in units of their noise and
+the root S of position and moment, the right singular vectors of J S are axes of the source: each changes the readings
+by its own singular value, and independently of the others. One standard deviation v along an axis, of the whole state,
+changes the predicted readings by an odd part :math:`g = \tfrac12 (h(v) - h(-v))` and an even part
+:math:`c = \tfrac12 (h(v) + h(-v)) - h(0)`. A linearisation leaves out the even part, of which
+:math:`c / (1 + |g|^2)` remains within what the row leaves open of the axis. It does so in every row alike. Over as many
+rows as determine the axis by themselves, :math:`1/|g|^2`, but at most the n rows that the component remembers, it adds
+up to
 
 .. math:: \beta = \frac{|c|}{1 + |g|^2} \sqrt{\min(\max(|g|^{-2}, 1), n)}
 
 standard deviations of the readings' noise. A component with :math:`\beta > \tfrac12` becomes three along that axis,
 which have the same mean and covariance together. The bent prediction of :func:`magloc.tracking.row_filter.update`
 treats what is less. A division approximates a Gaussian, so that needless ones lose accuracy.
+
+Principal axes of log-range and direction are not enough. Where direction and moment are nearly parallel, two sources of
+one gradient tensor come together, and the readings fold along an axis on which the moment turns as the direction does.
 """
 
 from __future__ import annotations
@@ -24,6 +29,7 @@ from arrays.typing import FloatArray, IntArray
 from magloc.tracking import row_filter
 from magloc.tracking.chart.mixture import Mixture, root_of
 from magloc.tracking.chart.row import ChartRow
+from magloc.tracking.motion import N_SOURCE
 from magloc.tracking.row_filter import Gaussians
 
 LARGEST_BEND = 0.5
@@ -67,7 +73,7 @@ def split(mixture: Mixture, row: ChartRow) -> tuple[Mixture, IntArray]:
 
 
 def bends(mixture: Mixture, row: ChartRow) -> tuple[FloatArray, FloatArray]:
-    """Return the bends (K, 3) of a row's readings, and one standard deviation (K, 3, N) along each axis."""
+    """Return the bends (K, 6) of a row's readings, and one standard deviation (K, 6, N) along each axis."""
     gaussians, memory = Gaussians(mixture.x, mixture.S), min(mixture.n_rows, MOST_ROWS)
     bend, directions = row_filter.bends(gaussians, row.compiled, memory)
     # A wide component may reach beyond all numbers.
@@ -75,11 +81,12 @@ def bends(mixture: Mixture, row: ChartRow) -> tuple[FloatArray, FloatArray]:
 
 
 def _divided(mixture: Mixture, index: IntArray, v: FloatArray) -> Mixture:
-    """Replace some components by three each, along principal axes of log-range and direction, one σ (k, N) long."""
-    n, S, kept = mixture.n_motion, mixture.S[index], np.delete(np.arange(len(mixture)), index)
-    # In standard numbers v is a unit vector.
-    axis = (v[:, None, :3] @ S[:, :3])[:, 0] / np.sum(v[:, :3] ** 2, axis=1, keepdims=True)
-    narrow = S - (1.0 - _SIGMA) * v[:, :, None] * axis[:, None, :]
+    """Replace some components by three each, along axes of the source, one σ of the state (k, N) long."""
+    n, S, kept = mixture.n_motion, root_of(mixture.S[index]), np.delete(np.arange(len(mixture)), index)
+    # In standard numbers, of which a lower root has those of the source first, v is a unit vector.
+    axis = np.linalg.solve(S[:, :N_SOURCE, :N_SOURCE], v[:, :N_SOURCE, None])
+    narrow = S.copy()
+    narrow[:, :, :N_SOURCE] -= (1.0 - _SIGMA) * v[:, :, None] * np.swapaxes(axis, 1, 2)
     chart = mixture.chart.take(index).firmly(S[:, :n])
     x, roots, log_weight = [mixture.x[kept]], [mixture.S[kept]], [mixture.log_weight[kept]]
     for weight, mean in zip(_WEIGHTS, _MEANS, strict=True):

@@ -463,21 +463,25 @@ class TestSeveralSources:
     def test_bends(self, n_sources: int) -> None:
         board = Board(n_sources, 20 + n_sources)
         bends, directions = row_filter.bends(board.gaussians, board.rows, 3.0)
+        first = [12 * k + i for k in range(n_sources) for i in range(6)]
+        order = np.array(first + [i for i in range(12 * n_sources + 3) if i not in first])
         for c, (x, S) in enumerate(zip(board.gaussians.x, board.gaussians.S, strict=True)):
-            P = S @ S.T
-            for k in range(n_sources):
-                at = slice(12 * k, 12 * k + 3)
-                variances, axes = np.linalg.eigh(P[at, at])
-                expected = P[:, at] @ axes / np.sqrt(variances)
-                order = np.argsort(np.linalg.norm(directions[c, 3 * k : 3 * k + 3, at], axis=1))
-                for v, one in zip(expected.T, 3 * k + order, strict=True):
-                    same = math.copysign(1.0, float(v[at] @ directions[c, one, at])) * directions[c, one]
-                    np.testing.assert_allclose(same / np.sqrt(np.diagonal(P)), v / np.sqrt(np.diagonal(P)), atol=1e-7)
-                    ahead, behind = board.h(board.retracted(x, v)), board.h(board.retracted(x, -v))
-                    bend, gradient = 0.5 * (ahead + behind) - board.h(x), 0.5 * (ahead - behind)
-                    told = float(gradient @ gradient)
-                    share = math.sqrt(min(max(1.0 / told, 1.0), 3.0)) / (1.0 + told)
-                    assert bends[c, one] == pytest.approx(share * float(np.linalg.norm(bend)), rel=1e-6)
+            # Standard numbers of the sources first.
+            root = np.zeros_like(S)
+            root[order] = np.linalg.qr(S[order].T, mode="r").T
+            J = slope(lambda e, x=x: board.h(board.retracted(x, e)), np.zeros(len(x))) @ root[:, : 6 * n_sources]
+            axes = np.linalg.svd(J)[2]
+            standard = np.linalg.solve(root, directions[c].T).T
+            told = np.linalg.norm(J @ standard[:, : 6 * n_sources].T, axis=0)
+            for one, axis in zip(np.argsort(-told), axes, strict=True):
+                found, v = standard[one], directions[c, one]
+                assert float(np.linalg.norm(found)) == pytest.approx(1.0, abs=1e-9)
+                assert abs(float(found[: 6 * n_sources] @ axis)) == pytest.approx(1.0, abs=1e-6)
+                ahead, behind = board.h(board.retracted(x, v)), board.h(board.retracted(x, -v))
+                bend, gradient = 0.5 * (ahead + behind) - board.h(x), 0.5 * (ahead - behind)
+                g2 = float(gradient @ gradient)
+                share = math.sqrt(min(max(1.0 / g2, 1.0), 3.0)) / (1.0 + g2)
+                assert bends[c, one] == pytest.approx(share * float(np.linalg.norm(bend)), rel=1e-6)
 
     def test_smoothed_rows(self, n_sources: int) -> None:
         """Against the Gaussian of all states and readings together, conditioned on the readings."""

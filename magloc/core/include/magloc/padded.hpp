@@ -199,27 +199,30 @@ void gather(const Padded<T> &vectors, int64_t h, int64_t n, const Padded<T> &row
   }
 }
 
-// Make three rows orthogonal by Jacobi's rotations, and their lengths one.
+// Make the first k registers of rows orthogonal to each other by Jacobi's rotations, which turn the rest of the rows,
+// too.
 template <class T>
-void fill_principal_axes(const Padded<T> &rows) {
-  const int64_t width = rows.width();
-  for (int sweep = 0; sweep < 8; ++sweep)
-    for (int pair = 0; pair < 3; ++pair) {
-      T *const a = rows.lanes(pair == 2), *const b = rows.lanes(pair == 0 ? 1 : 2);
-      const double product = dot(a, b, width);
-      if (product == 0.0) continue;
-      const double slope = 0.5 * (dot(b, b, width) - dot(a, a, width)) / product;
-      const double tangent = 1.0 / (slope + (slope < 0.0 ? -1.0 : 1.0) * square_root(1.0 + slope * slope));
-      const double cosine = inverse_root(1.0 + tangent * tangent), sine = tangent * cosine;
-      for (int64_t r = 0; r < width; ++r) {
-        const T before = a[r];
-        a[r] = cosine * before - sine * b[r];
-        b[r] = sine * before + cosine * b[r];
+void make_orthogonal(const Padded<T> &rows, int64_t begin, int64_t end, int64_t k) {
+  double rounding = 0.0;
+  for (int64_t i = begin; i < end; ++i) rounding += 1e-15 * dot(rows.lanes(i), rows.lanes(i), k);
+  bool is_turned = true;
+  for (int sweep = 0; sweep < 30 && is_turned; ++sweep) {
+    is_turned = false;
+    for (int64_t i = begin; i < end; ++i)
+      for (int64_t j = i + 1; j < end; ++j) {
+        T *const a = rows.lanes(i), *const b = rows.lanes(j);
+        const double product = dot(a, b, k), of_a = dot(a, a, k), of_b = dot(b, b, k);
+        if (product * product <= 1e-16 * of_a * of_b + rounding * rounding) continue;
+        is_turned = true;
+        const double slope = 0.5 * (of_b - of_a) / product;
+        const double tangent = 1.0 / (slope + (slope < 0.0 ? -1.0 : 1.0) * square_root(1.0 + slope * slope));
+        const double cosine = inverse_root(1.0 + tangent * tangent), sine = tangent * cosine;
+        for (int64_t r = 0; r < rows.width(); ++r) {
+          const T before = a[r];
+          a[r] = cosine * before - sine * b[r];
+          b[r] = sine * before + cosine * b[r];
+        }
       }
-    }
-  for (int a = 0; a < 3; ++a) {
-    const double norm = square_root(dot(rows.lanes(a), rows.lanes(a), width));
-    scale(rows.lanes(a), norm > 0.0 ? 1.0 / norm : 0.0, width);
   }
 }
 MAGLOC_END

@@ -4,9 +4,8 @@
 // linear in the readings. Inside, what readings depend on comes first: what is seen - position and moment of each
 // source, and the pose -, nuisances, then further numbers of each source. A prediction's root is lower triangular, so
 // that the readings depend on the first d of the standard numbers zeta alone; coordinates are the root times zeta. Of
-// more nuisances than readings, reflections leave as many columns of the root that the row sees. Orthogonal
-// transformations keep what covariances and normal equations would lose where a nuisance is known 1e5 times
-// less well than a reading.
+// more nuisances than readings, reflections leave as many columns of the root that the row sees. Orthogonal steps keep
+// what normal equations would lose where a nuisance is known 1e5 times less well than a reading.
 #pragma once
 #include "bent_prediction.hpp"
 #include "row_readings.hpp"
@@ -139,9 +138,9 @@ class RowFilter {
     }
   }
 
-  // Update the state by the row's readings: Gauss and Newton's steps, each halved until it lowers the cost enough. The
-  // prediction may bend as the readings do, along what they tell in more than a share of its standard deviation; errors
-  // of the pose may have less effect there. Misfit and Q at the prediction are stored where they are wanted.
+  // Update by the row: Gauss and Newton's steps, each halved until it lowers the cost enough. The prediction may bend
+  // as readings do, along what they tell in more than a share of its sigma, errors of the pose by shares. Misfit and Q
+  // at the prediction are stored where they are wanted.
   void update(const magloc_convergence &limits, bool bends = false, double least_share = 0.0,
               const double *pose_lasts = nullptr, double *misfit = nullptr, double *Q = nullptr) {
     begin_update();
@@ -181,11 +180,10 @@ class RowFilter {
     __builtin_memcpy(misfit, misfit_, given_.n_readings * sizeof(double));
     columns_.store(Q, d_, given_.n_readings);
   }
-
   // After an update: see sensor_residuals.hpp.
   void fill_standardised(double followed, double *residuals) const {
-    const double left = triangle_[d_][d_];
-    fill_sensor_residuals(given_, readings_.transform(), columns_, d_, k_, {1.0 + followed, left}, residuals);
+    const ResidualScale scale{1.0 + followed, triangle_[d_][d_]};
+    fill_sensor_residuals(given_, readings_.transform(), columns_, d_, k_, scale, residuals);
   }
 
   // After an update: the innovation (n_readings) freed of correlations, L^-1 nu with the lower root L of its
@@ -268,30 +266,32 @@ class RowFilter {
     __builtin_memcpy(misfit, misfit_, given_.n_readings * sizeof(double));
   }
 
-  // How far readings bend over what is not known along the principal axes (3 K) of log-range and direction of each
-  // source: magloc/tracking/chart/split.py. And by what the whole state (3 K, N) differs one sigma along them.
+  // How far readings bend along axes (6 K) of what is not known of the sources, and one sigma of the whole state
+  // (6 K, N) along each: magloc/tracking/chart/split.py.
   void fill_bends(double memory, double *bends, double *directions) {
-    T *const here = misfit_, *const ahead = trial_misfit_, *const behind = columns_.lanes(0);
-    for (int64_t k = 0; k < K_; ++k) set_chart(k);
-    for (int64_t i = 0; i < N; ++i) e_there_[i] = 0.0;
-    readings_at(0.0, here);
-    for (int64_t k = 0; k < K_; ++k) {
-      rows_.copy(root.from(n_measured * k), 3);
-      fill_principal_axes(rows_);
-      for (int64_t a = 0; a < 3; ++a, ++bends, directions += N) {
-        for (int64_t i = 0; i < N; ++i) e_there_[i] = dot(root.lanes(i), rows_.lanes(a), root.width());
-        for (int64_t i = 0; i < N; ++i) directions[i] = e_there_[row_of(i)];
-        readings_at(1.0, ahead);
-        readings_at(-1.0, behind);
-        T bend{}, gradient{};
-        for (int64_t r = 0; r < k_; ++r) {
-          const T curve = 0.5 * (ahead[r] + behind[r]) - here[r], slope = 0.5 * (ahead[r] - behind[r]);
-          bend += curve * curve;
-          gradient += slope * slope;
-        }
-        const double told = sum_of_lanes(gradient), n = told < 1.0 ? minimum(1.0 / told, memory) : 1.0;
-        *bends = square_root(sum_of_lanes(bend) * n) / (1.0 + told);
+    T *const here = misfit_, *const ahead = trial_misfit_, *const behind = columns_.lanes(d_);
+    begin_update();
+    move_to(zeta_);
+    readings_.template predict<true>();
+    fill_nuisance_columns();
+    fill_source_columns();
+    __builtin_memcpy(here, readings_.values(), k_ * sizeof(T));
+    // The numbers behind the sources' columns become right singular vectors.
+    make_orthogonal(columns_, h_, h_ + measured_, k_);
+    for (int64_t a = 0; a < measured_; ++a, ++bends, directions += N) {
+      for (int64_t j = 0; j < measured_; ++j) zeta_[j] = tail(h_ + a)[h_ + j];
+      fill_coordinates(zeta_);
+      for (int64_t i = 0; i < N; ++i) directions[i] = e_there_[row_of(i)];
+      readings_at(1.0, ahead);
+      readings_at(-1.0, behind);
+      T bend{}, gradient{};
+      for (int64_t r = 0; r < k_; ++r) {
+        const T curve = 0.5 * (ahead[r] + behind[r]) - here[r], slope = 0.5 * (ahead[r] - behind[r]);
+        bend += curve * curve;
+        gradient += slope * slope;
       }
+      const double told = sum_of_lanes(gradient), n = told < 1.0 ? minimum(1.0 / told, memory) : 1.0;
+      *bends = square_root(sum_of_lanes(bend) * n) / (1.0 + told);
     }
   }
 

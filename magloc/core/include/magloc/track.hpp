@@ -12,7 +12,8 @@ class Track {
   RowFilter<T> filter_{*p_.state, *p_.rows, space_};
   SourceMotion motion_{*p_.motion, ns_, p_.state->n_nuisances, space_};
   const Padded<T> wide_ = filter_.wide(motion_, space_);
-  double *const bends_ = space_.take<double>(3 * K_), *const directions_ = space_.take<double>(3 * K_ * filter_.N);
+  double *const bends_ = space_.take<double>(n_measured * K_);
+  double *const directions_ = space_.take<double>(n_measured * K_ * filter_.N);
   double *const open_loop_ = space_.take<double>(K_ * ns_ * ns_);
   const Padded<T> cartesian_{space_, n_measured,
                              filter_.N};  // root of the covariance of a source's position and moment
@@ -77,7 +78,7 @@ class Track {
   bool bends() {
     filter_.fill_bends((double)(p_.progress[2] < p_.longest_memory ? p_.progress[2] : p_.longest_memory), bends_,
                        directions_);
-    for (int64_t i = 0; i < 3 * K_; ++i)
+    for (int64_t i = 0; i < n_measured * K_; ++i)
       if (!(bends_[i] <= p_.largest_bend)) return true;
     return false;
   }

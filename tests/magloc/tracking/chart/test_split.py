@@ -43,6 +43,27 @@ class TestBends:
         np.testing.assert_allclose(bends(component(2e-4), ROW)[0], 4.0 * small, rtol=1e-2)
         np.testing.assert_allclose(bends(component(1e-4, n_rows=9), ROW)[0], 3.0 * small, rtol=1e-2)
 
+    def test_see_where_a_source_and_its_mirror_image_come_together(self) -> None:
+        """A moment along the direction: readings fold along an axis on which both turn.
+
+        They hardly bend along the principal axes of the place, the moment being what is expected there.
+        """
+        u = POSITION / np.linalg.norm(POSITION)
+        x = np.concatenate([8.0 * u, 50.0 * u])
+        chart = ROW.chart(x[None])
+        J = ROW.along(x[None], chart.jacobian(np.zeros((1, 6))))[0] / 5.0
+        before = 0.3 * np.array([1.0, 1.0, 1.0, *[50.0 / float(chart.length[0]) ** 4] * 3])
+        P = np.linalg.inv(J.T @ J + np.diag(before**-2.0))
+        S = np.linalg.cholesky(P)
+        variances, axes = np.linalg.eigh(P[:3, :3])
+        firm = chart.firmly(S[None])
+        for v in (P[:, :3] @ axes / np.sqrt(variances)).T:
+            behind, here, ahead = (ROW.of_source(firm.retracted(share * v[None]))[0] for share in (-1.0, 0.0, 1.0))
+            g2 = float(np.sum((0.5 * (ahead - behind)) ** 2))
+            assert np.linalg.norm(0.5 * (ahead + behind) - here) / (1.0 + g2) < 0.3 * LARGEST_BEND
+        one = Mixture(x[None], S[None], np.zeros(1), 6, ROW.centroid_m, ROW.radius_m)
+        assert bends(one, ROW)[0].max() > 2.0 * LARGEST_BEND
+
 
 class TestSplit:
     def test_leaves_alone_what_is_straight(self) -> None:
