@@ -330,24 +330,23 @@ class TestLossOfTrack:
         time_s = 0.5 * np.arange(n, dtype=np.float64)
         away = 200.0 * np.square(np.sin(np.pi * time_s / time_s[-1]))
         p = POSITION * (1.0 + away / np.linalg.norm(POSITION))[:, None]
-        points = followed(
-            Tracker(ARRAY, RandomWalk(8.0, 0.02)), rows_from(time_s, readings_of(ARRAY, p, np.tile(MOMENT, (n, 1))))
-        )
-        far = away > 100.0
-        assert all(point.position_m is None for point, is_far in zip(points, far, strict=True) if is_far)
-        reasons = {point.status for point, is_far in zip(points, far, strict=True) if is_far}
-        assert reasons
-        assert all(reason.startswith(("lost: ", "not acquired: ")) for reason in reasons)
-        assert points[0].status == "acquired"
-        assert points[-1].status in ("tracked", "acquired")
-        assert np.linalg.norm(positions(points)[-1] - p[-1]) < 0.1
-        inside = []
-        for point, truth in zip(points, p, strict=True):
-            if point.position_m is not None:
-                ((low, high),) = point.range_interval_m or ((0.0, None),)
-                range_m = float(np.linalg.norm(truth - ARRAY.centroid))
-                inside.append(low <= range_m and (high is None or range_m <= high))
-        # The path is no random walk: 95 % is not to be expected of it.
+        inside, far = [], away > 100.0
+        for seed in range(3):
+            readings = readings_of(ARRAY, p, np.tile(MOMENT, (n, 1)), seed=seed)
+            points = followed(Tracker(ARRAY, RandomWalk(8.0, 0.02)), rows_from(time_s, readings))
+            assert all(point.position_m is None for point, is_far in zip(points, far, strict=True) if is_far)
+            reasons = {point.status for point, is_far in zip(points, far, strict=True) if is_far}
+            assert reasons
+            assert all(reason.startswith(("lost: ", "not acquired: ")) for reason in reasons)
+            assert points[0].status == "acquired"
+            assert points[-1].status in ("tracked", "acquired")
+            assert np.linalg.norm(positions(points)[-1] - p[-1]) < 0.1
+            for point, truth in zip(points, p, strict=True):
+                if point.position_m is not None:
+                    ((low, high),) = point.range_interval_m or ((0.0, None),)
+                    range_m = float(np.linalg.norm(truth - ARRAY.centroid))
+                    inside.append(low <= range_m and (high is None or range_m <= high))
+        # The path is no random walk: 95 % is not to be expected of it. Eight seeds have 0.88, single ones 0.80 to 0.94.
         assert np.mean(inside) > 0.8
 
     def test_noise_starts_no_track(self) -> None:
