@@ -73,14 +73,17 @@ class YoungTrack:
         states = (state.with_sources(prior.position_m[new], prior.moment_Am2[new], known) for state in self.states)
         return YoungTrack(prior, self.rows, tuple(states))
 
-    def smoothed(self) -> YoungTrack | None:
-        """Return the track with all rows linearised along the trajectory that they lead to, or None."""
+    def smoothed(self, most: int = _MOST_PASSES, limit: float = math.inf) -> YoungTrack | None:
+        """Return the track with all rows linearised along the trajectory that they lead to, or None.
+
+        It is given up after the most passes, and early where the rows stay far less likely than a limit (a score).
+        """
         rows = stacked([row for row, _ in self.rows])
         steps = steps_problem(np.stack([step for _, step in self.rows]))
         centroids = np.stack([row.centroid_m for row, _ in self.rows])
-        track, best = np.stack([state.sources for state in self.states]), math.inf
+        track, best = np.stack([state.sources for state in self.states]), limit
         share, last = 1.0, np.zeros(track[-1].size)
-        for passes in range(_MOST_PASSES):
+        for passes in range(most):
             chart = chart_at(track, centroids[:, None], self.prior.radius_m)
             with np.errstate(all="ignore"):  # a trajectory may lead out of double precision
                 prior = self._prior_about(chart.take(np.array(0)))

@@ -75,6 +75,8 @@ _UNBEARABLE = 1000.0
 # by a pause that is twice as long.
 _LATE_PAUSE, _LONGEST_PAUSE, _FEWEST_ROWS = 5, 160, 10
 _LATE_WORSE = 10.0
+# Passes over all rows from each start of a late birth.
+_LATE_PASSES = 8
 
 
 class SourcesTracker:
@@ -307,7 +309,8 @@ class SourcesTracker:
             return []
         known, health = [one.state for one in self._hypotheses], best.health.forgetful
         born: list[Hypothesis] = []
-        tried = [rows.joined(prior).smoothed() for prior in problem.starts(rows.prior, found, left)]
+        starts = problem.starts(rows.prior, found, left)
+        tried = [rows.joined(prior).smoothed(_LATE_PASSES, without.score) for prior in starts]
         for young in sorted((one for one in tried if one is not None), key=lambda one: one.score):
             state, score = young.states[-1], best.score + young.score - without.score + BIRTH
             new = score < best.score + _LATE_WORSE and not any(are_same(state, other) for other in known)
