@@ -193,7 +193,7 @@ class CartesianFilter:
         return np.concatenate([self.errors.sigma, np.ones(self.pose_errors.n_states)])
 
     def error_step(self, dt_s: float) -> tuple[FloatArray, FloatArray]:
-        """What remains of every error after a step, and the standard deviation of what is added: (n_errors,) each."""
+        """Return the share of each error that a step keeps, and the σ that it adds: (n_errors,) each."""
         of_sensors, of_pose = self.errors.step(dt_s), self.pose_errors.step(dt_s)
         return np.concatenate([of_sensors[0], of_pose[0]]), np.concatenate([of_sensors[1], of_pose[1]])
 

@@ -1,6 +1,6 @@
 """Steps of a filter of several sources, compiled: predict, update by a row of readings, and how far readings bend.
 
-:mod:`magloc.tracking.chart` explains the chart and is the reference for one source.
+:mod:`magloc.tracking.chart.coordinates` explains the chart; tests/magloc/tracking/test_row_filter.py has the reference.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Rows of a settled track in one compiled call: one source at one place, without errors of the pose.
 
-Sensors may have offsets, new numbers of the state that are linear in the readings. A prediction does not bend then as
-that of the readable steps does, so that these take rows whose readings bend by more than little.
+Offsets of sensors are further numbers of the state, linear in the readings. With them predictions are straight, while
+those of the readable steps bend. Rows whose readings bend noticeably are left to the readable steps.
 """
 
 from __future__ import annotations
@@ -134,7 +134,7 @@ class SettledTrack:
     def of(
         array: SensorArray, motion: MotionModel, measurements: RowMeasurements, full_count: int
     ) -> SettledTrack | None:
-        """None where the kernel does not have the motion's steps, or some of the errors."""
+        """Return the problem, or None if the kernel lacks the steps of the motion or some of the errors."""
         errors = measurements.errors
         has_errors = not errors.is_constant or measurements.pose_errors.n_states or errors.n_states > _MOST_ERRORS
         # Not by isinstance of a protocol, which looks through all of its attributes for every motion.
