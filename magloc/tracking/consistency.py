@@ -184,7 +184,7 @@ def _young_nees(source: Mixture, truth: FloatArray, row: ChartRow) -> tuple[floa
 def standard_error(source: Mixture, truth: FloatArray, row: ChartRow) -> FloatArray:
     """Return the error (6,) of a component in standard numbers, bent as a row's readings bend."""
     L = source.chart.jacobian(np.zeros((1, truth.size)))[0]
-    J = row.source_jacobian(source.x[0]) @ L @ source.S[0]
+    J = row.along(source.x[0], L @ source.S[0])
     standard = np.linalg.solve(source.S[0], source.chart.coordinates(truth[None])[0])
     difference = row.of_source(truth) - row.of_source(source.x[0])
     # Bent numbers along what J tells of, in standard deviations of the prediction, more than a share.

@@ -13,6 +13,7 @@ from arrays.differences import Differences
 from arrays.typing import FloatArray, IntArray
 from magloc import core
 from magloc.chi_square import energy_threshold
+from magloc.fields import dipole
 from magloc.measurement.differences import DifferenceMeasurement
 from magloc.measurement.pose import N_POSE, ArrayPose
 from magloc.tracking.chart.coordinates import Chart
@@ -206,9 +207,15 @@ class ChartRow:
         in_array = self.pose.in_array(state[..., :N_SOURCE], error)
         return self.model.predicted(in_array[..., :3], in_array[..., 3:], self._ambient_T(error)) / self.sigma
 
-    def source_jacobian(self, source: FloatArray) -> FloatArray:
-        """Their Jacobian (..., k, 6) by sources (..., 6)."""
-        return self._by_source(self._by_array(self.pose.in_array(source), None), None)
+    def moment_columns(self, position_m: FloatArray) -> FloatArray:
+        """Return the derivative (..., k, 3) of the differences by the moment of a weak source at (..., 3)."""
+        array, R = self.model.array, self.row.R_world_from_array
+        matrix = dipole.field_matrix(array.positions, ((position_m - self.row.origin_m) @ R)[..., None, :])
+        of_channels = self.model.differences.transform / self.sigma[:, None]
+        of_sensors = of_channels[:, :, None] * array.linear_gain(array.ambient_fields)
+        sensors = array.channel_sensor == np.arange(array.n_sensors)[:, None]
+        of_fields = (sensors @ of_sensors).reshape(self.n_differences, -1)
+        return np.asarray(of_fields @ matrix.reshape(*matrix.shape[:-3], -1, 3) @ R.T)
 
     def along(self, state: FloatArray, directions: FloatArray) -> FloatArray:
         """Their derivative (..., k, m) along directions (..., n, m) in states."""

@@ -191,9 +191,9 @@ class Stack:
         predicted = self._means(channels @ np.swapaxes(self._transform, -1, -2))
         return predicted, np.swapaxes(self._means(np.swapaxes(by_world, -1, -2)), -1, -2)
 
-    def source_jacobian(self, source: FloatArray) -> FloatArray:
-        """Their Jacobian (K, k, 6) by sources (K, 6), of the rows in the middle of the means."""
-        return self._middles([row.source_jacobian(source) for row in self._middle])
+    def moment_columns(self, position_m: FloatArray) -> FloatArray:
+        """Return the derivative (K, k, 3) of rows in the middle of the means by the moment of a weak source."""
+        return self._middles([row.moment_columns(position_m) for row in self._middle])
 
     @cached_property
     def without_source(self) -> FloatArray:

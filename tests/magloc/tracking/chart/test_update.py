@@ -34,7 +34,7 @@ def far_update(shift: FloatArray) -> tuple[float, FloatArray, FloatArray, FloatA
     there = chart.retracted((S @ shift)[None])[0]
     blank = ChartRow.of(measurements.of(Row(0.0, np.zeros(THREE.n_channels))))
     h = blank.of_source(SOURCE)
-    J = blank.source_jacobian(SOURCE) @ chart.jacobian(np.zeros((1, 6)))[0] @ S
+    J = blank.along(SOURCE, chart.jacobian(np.zeros((1, 6)))[0]) @ S
     readings = np.linalg.lstsq(blank.model.differences.transform / blank.sigma[:, None], blank.of_source(there))[0]
     measurement = ChartRow.of(measurements.of(Row(0.0, readings)))
     gaussian = Gaussians(SOURCE[None], S[None])
