@@ -16,7 +16,6 @@ import time
 import numpy as np
 
 from arrays.typing import FloatArray
-from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.consistency import nees_of
 from magloc.tracking.posterior_bound import posterior_bound
 from magloc.tracking.results import TrackPoint, rows_of
@@ -36,7 +35,7 @@ def judged(seed: int) -> FloatArray:
     bounds = posterior_bound(tracker, rows, truth[:, :3], truth[:, 3:])
     result = np.full((N_APPROACH, 8), np.nan)
     for i, point in enumerate(tracker.run(rows)):
-        seen = ChartRow.of(tracker.measurements.of(rows[i])).is_detected(tracker.errors.sigma)
+        seen = tracker.measurements.of(rows[i]).is_detected(tracker.errors.sigma)
         result[i, :2] = seen, point.position_m is not None
         if point.position_m is None:
             continue

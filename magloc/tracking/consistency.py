@@ -19,10 +19,9 @@ import numpy as np
 from arrays.typing import FloatArray, IntArray
 from magloc.chi_square import mean_bounds, normalised_square
 from magloc.tracking.chart.mixture import Mixture
-from magloc.tracking.chart.row import ChartRow
-from magloc.tracking.chart.update import LEAST_SHARE
 from magloc.tracking.measurement import RowMeasurement
 from magloc.tracking.results import Row, TrackPoint, stacked
+from magloc.tracking.row_filter import LEAST_SHARE
 from magloc.tracking.tracker import Tracker
 
 
@@ -157,7 +156,7 @@ def nees_of(point: TrackPoint, truth: FloatArray, measurement: RowMeasurement) -
     if not known.any():
         return math.nan, 0
     if known[:3].all() and point.mixture is not None:
-        return _young_nees(point.mixture.of_source().matched(), truth, ChartRow.of(measurement))
+        return _young_nees(point.mixture.of_source().matched(), truth, measurement)
     estimate = np.concatenate([point.position_m, point.moment_Am2])
     error, covariance = truth - estimate, point.covariance
     if known.all():
@@ -171,7 +170,7 @@ def nees_of(point: TrackPoint, truth: FloatArray, measurement: RowMeasurement) -
     return float(normalised_square(error, covariance)), int(known.sum())
 
 
-def _young_nees(source: Mixture, truth: FloatArray, row: ChartRow) -> tuple[float, int]:
+def _young_nees(source: Mixture, truth: FloatArray, row: RowMeasurement) -> tuple[float, int]:
     """Return NEES and dimensions of a single component, whose true moment may not be known."""
     known = np.isfinite(truth)
     error = source.chart.coordinates(np.where(known, truth, source.x[0])[None])[0]
@@ -181,7 +180,7 @@ def _young_nees(source: Mixture, truth: FloatArray, row: ChartRow) -> tuple[floa
     return float(normalised_square(error[known], P)), int(known.sum())
 
 
-def standard_error(source: Mixture, truth: FloatArray, row: ChartRow) -> FloatArray:
+def standard_error(source: Mixture, truth: FloatArray, row: RowMeasurement) -> FloatArray:
     """Return the error (6,) of a component in standard numbers, bent as a row's readings bend."""
     L = source.chart.jacobian(np.zeros((1, truth.size)))[0]
     J = row.along(source.x[0], L @ source.S[0])

@@ -31,10 +31,9 @@ from magloc.tracking import row_filter
 from magloc.tracking.chart.coordinates import MOMENT_POWER, Chart, mirrored, source_root
 from magloc.tracking.chart.known_moment import UNIFORM_IN_SPACE, KnownInWorld
 from magloc.tracking.chart.mixture import DROPPED_BELOW, FARTHEST, NEAREST, Mixture
-from magloc.tracking.chart.row import ChartRow, where_smooth
 from magloc.tracking.chart.stack import Measured
 from magloc.tracking.chart.update import Updated, updated
-from magloc.tracking.measurement import whitening
+from magloc.tracking.measurement import RowMeasurement, where_smooth, whitening
 from magloc.tracking.motion import N_SOURCE, MotionModel
 from magloc.tracking.results import Row
 from magloc.tracking.row_filter import Gaussians, RowUpdates
@@ -247,13 +246,13 @@ def _components(
     chart, sigma = measurement.chart(x), np.tile(_CELL, (len(x), 1))
     sigma[:, 0] /= 2.0 ** seeds.cell[:, 2]
     S = chart.inverse_jacobian() @ _with_motion(chart, motion, sigma)
-    if known is None and isinstance(measurement, ChartRow):
+    if known is None and isinstance(measurement, RowMeasurement):
         return row_filter.update(Gaussians(x, S, n_nuisances=measurement.n_pose), measurement.compiled)
     return updated(x, S, measurement, known)
 
 
 def _mixture(found: Updated | RowUpdates, log_weight: FloatArray, measurement: Measured) -> Mixture:
-    n, centroid_m, radius_m = measurement.n_motion, measurement.centroid_m, measurement.radius_m
+    n, centroid_m, radius_m = measurement.n_charted, measurement.centroid_m, measurement.radius_m
     return Mixture(found.x, found.S, log_weight, n, centroid_m, radius_m, measurement.n_pose)
 
 
@@ -284,7 +283,7 @@ def _along_valleys(seeds: _Seeds, found: Updated | RowUpdates, measurement: Meas
 
     A row that tells much leaves a source in a narrow valley, and a Gaussian in the middle says nothing of its ends.
     """
-    n = measurement.n_motion
+    n = measurement.n_charted
     sound = np.isfinite(found.log_evidence) & found.converged
     likely = sound & (found.log_evidence > found.log_evidence[sound].max(initial=-np.inf) + DROPPED_BELOW)
     own = np.flatnonzero(likely & (seeds.cell[:, 0] < 0))
@@ -311,7 +310,7 @@ def _along_valleys(seeds: _Seeds, found: Updated | RowUpdates, measurement: Meas
     return _Seeds(np.vstack(position), np.vstack(moment), np.vstack(cell))
 
 
-def with_errors(mixture: Mixture, measurement: ChartRow, sigma: FloatArray) -> Mixture:
+def with_errors(mixture: Mixture, measurement: RowMeasurement, sigma: FloatArray) -> Mixture:
     r"""The same, and behind the states the sensors' errors, known by their σ (n_errors,) before the row alone.
 
     What the row leaves over where a component stands is of them and of the noise: with :math:`\Phi` of unit errors,
@@ -319,7 +318,7 @@ def with_errors(mixture: Mixture, measurement: ChartRow, sigma: FloatArray) -> M
     """
     if not sigma.size:
         return mixture
-    n, chart, unit = measurement.n_motion, mixture.chart, measurement.effect * sigma
+    n, chart, unit = measurement.n_charted, mixture.chart, measurement.effect * sigma
     gain = sigma[:, None] * np.linalg.solve(np.eye(len(unit)) + unit @ unit.T, unit).T
     left = measurement.z - measurement.of_source(mixture.x)
     H = measurement.along(mixture.x, chart.jacobian(np.zeros_like(mixture.x)))

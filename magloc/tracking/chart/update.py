@@ -14,17 +14,7 @@ from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.tracking.chart.coordinates import Chart
 from magloc.tracking.chart.known_moment import KnownInWorld
 from magloc.tracking.chart.stack import Measured, Stack
-
-TOLERANCE = 1e-3
-"""Stop of the iteration: length of the next step in posterior standard deviations."""
-LEAST_GAIN = 0.25
-"""Of the decrease that a linear problem would show, below which a step is halved: it leads across a valley."""
-MOST_ITERATIONS = 50
-# Steps that make the fit worse by more than rounding are halved.
-ROUNDING = 1e-9
-LEAST_SHARE = 0.02
-"""A prediction bends as a row's readings do along what the row tells, in standard deviations of the prediction, more
-than this: of less the other rows told, which may bend otherwise."""
+from magloc.tracking.row_filter import LEAST_GAIN, MOST_ITERATIONS, ROUNDING, TOLERANCE
 
 
 @dataclass(frozen=True, eq=False)

@@ -46,7 +46,7 @@ def body_factor(tracker: Tracker, rows: Sequence[Row], points: Sequence[TrackPoi
     if not any(np.sum(columns**2) * len(errors) > _NEGLIGIBLE for columns in errors.values()):
         return 1.0
     wider, own = copy.copy(tracker), tracker.errors
-    none, n = np.zeros(N_BODY_ERRORS), tracker.motion.n_states + own.n_states
+    none, n = np.zeros(N_BODY_ERRORS), tracker.motion.n_states + tracker.n_errors
     wider.errors = replace(
         own,
         sigma=np.concatenate([own.sigma, none + 1.0]),

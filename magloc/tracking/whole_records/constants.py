@@ -59,7 +59,8 @@ def constants_test(tracker: Tracker, rows: Sequence[Row], points: Sequence[Track
     if steps is None:
         return ConstantsTest()
     errors, own = wider.pose_errors, tracker.pose_errors
-    of_errors = steps[-1].x[-errors.n_states :], steps[-1].S[-errors.n_states :]
+    at = slice(wider.motion.n_states, wider.motion.n_states + errors.n_states)
+    of_errors = steps[-1].x[at], steps[-1].S[at]
     mounting = math.nan if own.of_mounting.any() else _score(*of_errors, errors.of_mounting)
     if own.of_field.any() or not errors.of_field.any():
         return ConstantsTest(mounting)

@@ -121,7 +121,7 @@ class TestNeesOfACurvedEstimate:
             estimate = self.solved(measurement, measurement.of_source(self.TRUTH) + noise)
             if estimate is None:
                 continue
-            H = measurement.source_jacobian(estimate)
+            H = measurement.along(estimate, np.eye(6))
             point = self.point(array, estimate, np.linalg.inv(H.T @ H))
             expected.append(noise @ noise)
             found.append(nees_of(point, self.TRUTH, measurement)[0])
@@ -142,7 +142,7 @@ class TestNeesOfACurvedEstimate:
         fit = least_squares(
             lambda y: measurement.of_source(y * self.UNIT) - z,
             self.TRUTH / self.UNIT,
-            lambda y: measurement.source_jacobian(y * self.UNIT) * self.UNIT,
+            lambda y: measurement.along(y * self.UNIT, np.diag(self.UNIT)),
             xtol=1e-15,
             ftol=1e-15,
             gtol=1e-15,

@@ -18,7 +18,6 @@ from scipy.spatial.transform import Rotation
 import magloc
 from arrays.pose import PoseUncertainty
 from magloc.ambient import in_world_field
-from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.chart.start import prior_root
 from magloc.tracking.innovations import THRESHOLD, innovation_test
 from magloc.tracking.posterior_bound import posterior_bound
@@ -184,7 +183,7 @@ class TestBound:
             C[i, :, j] += between
             C[j, :, i] += between.T if i != j else 0.0
         J = np.concatenate(by_state)[:, :6]
-        root = prior_root(ChartRow.of(tracker.measurements.of(rows[0])).chart(state[:6]))
+        root = prior_root(tracker.measurements.of(rows[0]).chart(state[:6]))
         information = J.T @ np.linalg.solve(C.reshape(n * k, n * k), J) + np.linalg.inv(root @ root.T)
         dense_m = math.sqrt(float(np.trace(np.linalg.inv(information)[:3, :3])))
         assert bound[-1] == pytest.approx(dense_m, rel=5e-3)

@@ -15,7 +15,6 @@ import magloc
 from arrays.array import SensorArray
 from arrays.geometries import axial, square
 from arrays.pose import PoseUncertainty
-from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.chart.stack import Stack, displacement
 from magloc.tracking.motion import MotionModel
 from magloc.tracking.results import Row, rows_of
@@ -34,7 +33,7 @@ TRUTH = np.array([0.5, 3.0, -1.0, 30.0, -20.0, 10.0])
 
 def stack_of(array: SensorArray, rows: Sequence[Row], motion: MotionModel = REST) -> Stack:
     tracker = Tracker(array, motion)
-    measured = [ChartRow.of(tracker.measurements.of(row)) for row in rows]
+    measured = [tracker.measurements.of(row) for row in rows]
     return Stack(tuple(measured), tracker.errors, tracker.pose_errors, motion)
 
 
