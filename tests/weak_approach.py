@@ -17,9 +17,10 @@ import numpy as np
 
 from arrays.typing import FloatArray
 from magloc.tracking.consistency import nees_of
-from magloc.tracking.posterior_bound import posterior_bound
-from magloc.tracking.results import TrackPoint, rows_of
+from magloc.tracking.results import TrackPoint
+from magloc.tracking.rows import rows_of
 from magloc.tracking.tracker import Tracker
+from magloc.tracking.whole_records.posterior_bound import posterior_bound
 from tests.passing_source import ARRAY
 from tests.tracked_sources import APPROACH, N_APPROACH, approach
 

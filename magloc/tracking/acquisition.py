@@ -23,7 +23,8 @@ from magloc.measurement.pose import PoseErrors
 from magloc.tracking.chart.known_moment import KnownInWorld
 from magloc.tracking.measurement import RowMeasurement, RowMeasurements, step_of_errors
 from magloc.tracking.motion import N_SOURCE, MotionModel
-from magloc.tracking.results import Prediction, Row
+from magloc.tracking.results import Prediction
+from magloc.tracking.rows import Row
 
 START_RANGE_ERROR = 0.03
 """Standard deviation of the range over the range that a start may have: beyond it the posterior is no Gaussian in

@@ -27,10 +27,10 @@ from magloc.kalman import MeasurementFunction
 from magloc.measurement.differences import DifferenceMeasurement
 from magloc.measurement.nuisances import Drift, SensorErrors, without_lasting_errors
 from magloc.measurement.pose import N_POSE, ArrayPose, PoseErrors
-from magloc.tracking.chart.coordinates import Chart
+from magloc.tracking.coordinates import Chart
 from magloc.tracking.motion import N_SOURCE
-from magloc.tracking.results import Row
 from magloc.tracking.row_filter import Rows
+from magloc.tracking.rows import Row
 
 LEAST_SINGULAR = 1e-6
 """A row has no coordinates of its own if a column of its Jacobian, in units of what is known, is so near to others."""

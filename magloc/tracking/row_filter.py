@@ -1,6 +1,6 @@
 """Steps of a filter of several sources, compiled: predict, update by a row of readings, and how far readings bend.
 
-:mod:`magloc.tracking.chart.coordinates` explains the chart; tests/magloc/tracking/test_row_filter.py has the reference.
+:mod:`magloc.tracking.coordinates` explains the chart; tests/magloc/tracking/test_row_filter.py has the reference.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc import core
 from magloc.measurement.nuisances import SensorErrors
-from magloc.tracking.chart.coordinates import FIRM
+from magloc.tracking.coordinates import FIRM
 from magloc.tracking.motion import N_SOURCE, MotionModel, OrnsteinUhlenbeck
 
 TOLERANCE = 1e-3

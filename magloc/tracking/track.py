@@ -23,17 +23,17 @@ from magloc.measurement.nuisances import Drift
 from magloc.measurement.plausibility import usable_readings
 from magloc.measurement.pose import with_stated_pose
 from magloc.readings import Readings
-from magloc.tracking.consistency import Consistency, consistency
+from magloc.tracking.consistency import Consistency, InnovationTest, consistency, innovation_test
 from magloc.tracking.files import dataset_of_track, geojson_of_track, kml_of_track, lines_of_track
-from magloc.tracking.innovations import InnovationTest, innovation_test
 from magloc.tracking.motion import MotionModel, OrnsteinUhlenbeck, RandomWalk, known_motions
-from magloc.tracking.posterior_bound import posterior_bound, smoothing_bound
-from magloc.tracking.results import Row, SourcesPoint, TrackPoint, TrackResult, rows_of, stacked, warn_of_strengths
+from magloc.tracking.results import SourcesPoint, TrackPoint, TrackResult, stacked, warn_of_strengths
+from magloc.tracking.rows import Row, rows_of
 from magloc.tracking.settled import MOST_AT_ONCE
 from magloc.tracking.tracker import Tracker
 from magloc.tracking.whole_records.background import track_on_background
 from magloc.tracking.whole_records.body_errors import body_factor
 from magloc.tracking.whole_records.constants import constants_test
+from magloc.tracking.whole_records.posterior_bound import posterior_bound, smoothing_bound
 from magloc.tracking.whole_records.smoother import smoothed
 from magloc.truth import Truth, truth_of_rows
 

@@ -1,6 +1,6 @@
 r"""One dipole through time: an iterated extended Kalman filter from the first row in which the source is seen.
 
-What is known of the source is a mixture of Gaussians in the coordinates of :mod:`magloc.tracking.chart.coordinates`,
+What is known of the source is a mixture of Gaussians in the coordinates of :mod:`magloc.tracking.coordinates`,
 soon a single one (:mod:`magloc.tracking.chart.steps`), moved by a :class:`magloc.tracking.motion.MotionModel`. A track
 ends when the readings contradict it or its place is no longer known; then it starts anew. The state is in the world
 frame where the array's pose is known, else in the array's. Behind the states of the motion stand the lasting errors
@@ -34,17 +34,8 @@ from magloc.tracking.chart.steps import LARGEST_WIDTH, ChartFilter, Known, RowUp
 from magloc.tracking.chart.undetermined import Undetermined
 from magloc.tracking.measurement import RowMeasurement, RowMeasurements
 from magloc.tracking.motion import N_SOURCE, MotionModel
-from magloc.tracking.results import (
-    UNDETERMINED,
-    Innovation,
-    Prediction,
-    Row,
-    Step,
-    TrackPoint,
-    moving,
-    next_row,
-    of_mixture,
-)
+from magloc.tracking.results import UNDETERMINED, Innovation, Prediction, Step, TrackPoint, of_mixture
+from magloc.tracking.rows import Row, moving, next_row
 from magloc.tracking.sensor_health import SENSOR_LIMIT, SensorHealth, Suspects
 from magloc.tracking.settled import MOST_AT_ONCE, SettledTrack
 

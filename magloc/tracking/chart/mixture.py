@@ -11,7 +11,7 @@ from scipy.special import ndtr, ndtri
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.kalman import symmetric_square_root
 from magloc.localization.fit.results import Intervals
-from magloc.tracking.chart.coordinates import MOMENT_POWER, Chart
+from magloc.tracking.coordinates import MOMENT_POWER, Chart
 from magloc.tracking.motion import N_SOURCE
 
 MERGED_BELOW = 0.02

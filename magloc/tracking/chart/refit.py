@@ -17,10 +17,10 @@ from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.kalman import block_update
 from magloc.measurement.nuisances import SensorErrors
 from magloc.measurement.pose import PoseErrors
-from magloc.tracking.chart.coordinates import Chart
 from magloc.tracking.chart.known_moment import KnownInWorld
 from magloc.tracking.chart.mixture import Mixture
 from magloc.tracking.chart.start import first_root
+from magloc.tracking.coordinates import Chart
 from magloc.tracking.measurement import RowMeasurement, stacked, step_of_errors
 from magloc.tracking.motion import N_SOURCE, MotionModel
 from magloc.tracking.row_filter import Gaussians, Rows, Smoothed, smooth, steps_problem

@@ -20,10 +20,10 @@ from magloc.fields import dipole
 from magloc.measurement.differences import DifferenceMeasurement
 from magloc.measurement.nuisances import SensorErrors
 from magloc.measurement.pose import N_POSE, PoseErrors
-from magloc.tracking.chart.coordinates import Chart
+from magloc.tracking.coordinates import Chart
 from magloc.tracking.measurement import RowMeasurement, where_smooth
 from magloc.tracking.motion import N_SOURCE, MotionModel
-from magloc.tracking.results import Row
+from magloc.tracking.rows import Row
 
 FEWEST_MEANS, MOST_ROWS_OF_ONE = 16, 4
 """Means of successive rows that stand for them, at least, and how many rows have one at most."""

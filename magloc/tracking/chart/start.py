@@ -28,15 +28,15 @@ from magloc.localization.locator import Locator
 from magloc.measurement.nuisances import SensorErrors
 from magloc.measurement.rows import check_magnitudes, check_spans
 from magloc.tracking import row_filter
-from magloc.tracking.chart.coordinates import MOMENT_POWER, Chart, mirrored, source_root
 from magloc.tracking.chart.known_moment import UNIFORM_IN_SPACE, KnownInWorld
 from magloc.tracking.chart.mixture import DROPPED_BELOW, FARTHEST, NEAREST, Mixture
 from magloc.tracking.chart.stack import Measured
 from magloc.tracking.chart.update import Updated, updated
+from magloc.tracking.coordinates import MOMENT_POWER, Chart, mirrored, source_root
 from magloc.tracking.measurement import RowMeasurement, where_smooth, whitening
 from magloc.tracking.motion import N_SOURCE, MotionModel
-from magloc.tracking.results import Row
 from magloc.tracking.row_filter import Gaussians, RowUpdates
+from magloc.tracking.rows import Row
 
 OF_PITCH = 0.6
 """Standard deviations of a cell, in units of the grid's pitch: neighbours add up to an even density."""

@@ -27,13 +27,13 @@ from magloc.localization.fit.prior import SourcePrior
 from magloc.measurement.nuisances import SensorErrors
 from magloc.measurement.pose import PoseErrors
 from magloc.tracking import row_filter
-from magloc.tracking.chart.coordinates import mirrored
 from magloc.tracking.chart.known_moment import UNIFORM_IN_SPACE, KnownInWorld
 from magloc.tracking.chart.mixture import Mixture, root_of
 from magloc.tracking.chart.refit import Cells, Refitted, refitted
 from magloc.tracking.chart.split import split
 from magloc.tracking.chart.stack import Stack
 from magloc.tracking.chart.start import NO_DIPOLE, OF_PITCH, Start, once, with_errors
+from magloc.tracking.coordinates import mirrored
 from magloc.tracking.measurement import RowMeasurement, step_of_errors
 from magloc.tracking.motion import N_SOURCE, MotionModel
 from magloc.tracking.row_filter import Gaussians, steps_problem

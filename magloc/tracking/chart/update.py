@@ -1,6 +1,6 @@
 r"""An iterated update of many states side by side, which know next to nothing before it: for the start of a track.
 
-States are counted in the coordinates of :mod:`magloc.tracking.chart.coordinates`, and lasting errors of sensors are
+States are counted in the coordinates of :mod:`magloc.tracking.coordinates`, and lasting errors of sensors are
 noise. Later rows are updates of :mod:`magloc.tracking.row_filter`.
 """
 
@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from arrays.typing import BoolArray, FloatArray, IntArray
-from magloc.tracking.chart.coordinates import Chart
 from magloc.tracking.chart.known_moment import KnownInWorld
 from magloc.tracking.chart.stack import Measured, Stack
+from magloc.tracking.coordinates import Chart
 from magloc.tracking.row_filter import LEAST_GAIN, MOST_ITERATIONS, ROUNDING, TOLERANCE
 
 

@@ -15,7 +15,8 @@ from magloc.measurement.plausibility import usable_readings
 from magloc.readings import Readings
 from magloc.tracking.multi_target.motion import FreeMotion
 from magloc.tracking.multi_target.tracker import SourcesTracker
-from magloc.tracking.results import SourcesPoint, TrackPoint, TrackResult, rows_of, warn_of_strengths
+from magloc.tracking.results import SourcesPoint, TrackPoint, TrackResult, warn_of_strengths
+from magloc.tracking.rows import rows_of
 from magloc.tracking.track import TrackColumns, TrackRows, finished
 
 

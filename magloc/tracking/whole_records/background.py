@@ -22,11 +22,12 @@ from magloc.kalman import block_update, whitened_innovation
 from magloc.levels import CONTRADICTION
 from magloc.localization.uncertainty.range_interval import relative_range_sigma
 from magloc.readings import Readings
-from magloc.tracking.chart.coordinates import Chart
 from magloc.tracking.chart.steps import charted
+from magloc.tracking.coordinates import Chart
 from magloc.tracking.measurement import RowMeasurement
 from magloc.tracking.motion import N_SOURCE
-from magloc.tracking.results import Innovation, Prediction, Row, Step, TrackPoint, of_mixture, rows_of
+from magloc.tracking.results import Innovation, Prediction, Step, TrackPoint, of_mixture
+from magloc.tracking.rows import Row, rows_of
 from magloc.tracking.tracker import LARGEST_RANGE_ERROR, Tracker
 from magloc.tracking.whole_records.smoother import smoothed, smoothed_states
 

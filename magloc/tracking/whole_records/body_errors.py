@@ -18,7 +18,8 @@ from magloc.fields.multipole import DEFAULT_LENGTH, N_BODY_ERRORS, finite_body_e
 from magloc.measurement.differences import fields_at_sensors
 from magloc.tracking.measurement import RowMeasurement
 from magloc.tracking.motion import N_SOURCE
-from magloc.tracking.results import Row, TrackPoint
+from magloc.tracking.results import TrackPoint
+from magloc.tracking.rows import Row
 from magloc.tracking.tracker import Tracker
 from magloc.tracking.whole_records.background import steps_of
 from magloc.tracking.whole_records.constants import placed_rows

@@ -21,7 +21,8 @@ from magloc.chi_square import error_factor
 from magloc.localization.uncertainty.range_interval import relative_range_sigma
 from magloc.tracking.acquisition import START_RANGE_ERROR
 from magloc.tracking.motion import N_SOURCE
-from magloc.tracking.results import Row, TrackPoint
+from magloc.tracking.results import TrackPoint
+from magloc.tracking.rows import Row
 from magloc.tracking.tracker import Tracker
 from magloc.tracking.whole_records.background import settled_steps
 

@@ -31,10 +31,10 @@ from magloc.measurement.nuisances import (
     without_lasting_errors,
 )
 from magloc.tracking import row_filter
-from magloc.tracking.chart.coordinates import Chart
+from magloc.tracking.coordinates import Chart
 from magloc.tracking.motion import RandomWalk
-from magloc.tracking.results import Row, rows_of
 from magloc.tracking.row_filter import Gaussians
+from magloc.tracking.rows import Row, rows_of
 from magloc.tracking.tracker import Tracker
 from sims.magnetics.paths import Attitude, Steered
 from sims.magnetics.scenario import Carrier, MagneticScenario, Source

@@ -17,14 +17,15 @@ from arrays.differences import contrasts
 from magloc.chi_square import mean_bounds
 from magloc.kalman import symmetric_square_root
 from magloc.readings import Readings
-from magloc.tracking.chart.coordinates import Chart
 from magloc.tracking.chart.mixture import Mixture
 from magloc.tracking.consistency import consistency, nees_of
+from magloc.tracking.coordinates import Chart
 from magloc.tracking.measurement import RowMeasurement
 from magloc.tracking.motion import OrnsteinUhlenbeck, RandomWalk
-from magloc.tracking.posterior_bound import posterior_bound, smoothing_bound
-from magloc.tracking.results import Row, TrackPoint, rows_of
+from magloc.tracking.results import TrackPoint
+from magloc.tracking.rows import Row, rows_of
 from magloc.tracking.tracker import Tracker
+from magloc.tracking.whole_records.posterior_bound import posterior_bound, smoothing_bound
 from tests.oracles import derivative, magpylib_field
 
 FloatArray = NDArray[np.float64]

@@ -19,11 +19,12 @@ import magloc
 from arrays.pose import PoseUncertainty
 from magloc.ambient import in_world_field
 from magloc.tracking.chart.start import prior_root
-from magloc.tracking.innovations import THRESHOLD, innovation_test
-from magloc.tracking.posterior_bound import posterior_bound
-from magloc.tracking.results import TrackPoint, rows_of
+from magloc.tracking.consistency import THRESHOLD, innovation_test
+from magloc.tracking.results import TrackPoint
+from magloc.tracking.rows import rows_of
 from magloc.tracking.track import Track
 from magloc.tracking.tracker import Tracker
+from magloc.tracking.whole_records.posterior_bound import posterior_bound
 from sims.magnetics.paths import Steered
 from sims.magnetics.scenario import MagneticScenario
 from sims.magnetics.scenario_files import read_scenario

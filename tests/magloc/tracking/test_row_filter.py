@@ -23,12 +23,12 @@ from arrays.pose import PoseUncertainty
 from magloc import core
 from magloc.measurement.differences import predicted_channels
 from magloc.tracking import row_filter
-from magloc.tracking.chart.coordinates import Chart
 from magloc.tracking.chart.mixture import component_moments
+from magloc.tracking.coordinates import Chart
 from magloc.tracking.measurement import RowMeasurement
 from magloc.tracking.motion import CoordinatedTurn, KnownMotion, MotionModel, OrnsteinUhlenbeck, RandomWalk
-from magloc.tracking.results import Row
 from magloc.tracking.row_filter import LEAST_SHARE, Gaussians, Rows
+from magloc.tracking.rows import Row
 from magloc.tracking.tracker import Tracker
 from tests.passing_source import MOMENT, NOISE_T, POSITION
 

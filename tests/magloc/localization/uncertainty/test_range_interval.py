@@ -50,7 +50,8 @@ from magloc.measurement.differences import DifferenceMeasurement, predicted_chan
 from magloc.measurement.rows import whitened_rows
 from magloc.measurement.whitened import WhitenedModel
 from magloc.tracking.motion import RandomWalk
-from magloc.tracking.results import Row, TrackPoint
+from magloc.tracking.results import TrackPoint
+from magloc.tracking.rows import Row
 from magloc.tracking.tracker import Tracker
 from tests import oracles
 from tests.passing_source import ARRAY, MOMENT, POSITION, followed, readings_of

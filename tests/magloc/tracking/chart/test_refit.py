@@ -18,7 +18,7 @@ from magloc.tracking.chart.known_moment import KnownInWorld
 from magloc.tracking.chart.mixture import Mixture
 from magloc.tracking.chart.refit import Cells, refitted
 from magloc.tracking.motion import OrnsteinUhlenbeck, RandomWalk
-from magloc.tracking.results import Row
+from magloc.tracking.rows import Row
 from magloc.tracking.tracker import Tracker
 from tests.passing_source import ARRAY, MOMENT, POSITION
 

@@ -9,7 +9,7 @@ import pytest
 
 from magloc.tracking.chart.mixture import Mixture
 from magloc.tracking.chart.split import LARGEST_BEND, MOST_COMPONENTS, bends, split
-from magloc.tracking.results import Row
+from magloc.tracking.rows import Row
 from magloc.tracking.tracker import Tracker
 from tests.passing_source import ARRAY, MOMENT, POSITION, SLOW, readings_of
 

@@ -17,7 +17,7 @@ from arrays.geometries import axial, square
 from arrays.pose import PoseUncertainty
 from magloc.tracking.chart.stack import Stack, displacement
 from magloc.tracking.motion import MotionModel
-from magloc.tracking.results import Row, rows_of
+from magloc.tracking.rows import Row, rows_of
 from magloc.tracking.tracker import Tracker
 from sims.magnetics.paths import Attitude, Steered
 from sims.magnetics.scenario import Carrier, MagneticScenario, Source

@@ -17,8 +17,8 @@ from magloc.tracking import row_filter
 from magloc.tracking.chart.mixture import Mixture
 from magloc.tracking.chart.start import NO_AMBIENT, with_errors
 from magloc.tracking.chart.update import updated
-from magloc.tracking.results import rows_of
 from magloc.tracking.row_filter import Gaussians
+from magloc.tracking.rows import rows_of
 from magloc.tracking.tracker import Tracker
 from sims.magnetics.scenario_files import read_scenario
 from sims.magnetics.simulation import simulate

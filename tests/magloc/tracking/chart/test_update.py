@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from scipy.stats import multivariate_normal
 
 from magloc.tracking import row_filter
-from magloc.tracking.chart.coordinates import Chart
+from magloc.tracking.coordinates import Chart
 from magloc.tracking.motion import RandomWalk
-from magloc.tracking.results import Row
 from magloc.tracking.row_filter import Gaussians
+from magloc.tracking.rows import Row
 from magloc.tracking.tracker import Tracker
 from tests.passing_source import ARRAY, MOMENT, POSITION
 

@@ -10,7 +10,8 @@ import numpy as np
 
 from arrays.typing import FloatArray
 from magloc.tracking.chart.start import prior_root
-from magloc.tracking.results import Row, Step
+from magloc.tracking.results import Step
+from magloc.tracking.rows import Row
 from magloc.tracking.tracker import Tracker
 from magloc.tracking.whole_records.background import steps_of
 from magloc.tracking.whole_records.smoother import smoothed_states
