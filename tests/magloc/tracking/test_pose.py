@@ -20,6 +20,7 @@ from arrays.pose import PoseUncertainty
 from magloc.ambient import in_world_field
 from magloc.tracking.chart.start import prior_root
 from magloc.tracking.consistency import THRESHOLD, innovation_test
+from magloc.tracking.measurement import step_of_errors
 from magloc.tracking.results import TrackPoint
 from magloc.tracking.rows import rows_of
 from magloc.tracking.track import Track
@@ -172,8 +173,8 @@ class TestBound:
             moved = [state + side * step for step in np.diag(steps) for side in (0.5, -0.5)]
             h = np.array([measurement.predicted(x) for x in moved]).reshape(len(steps), 2, -1)
             by_state.append(((h[:, 0] - h[:, 1]) / steps[:, None]).T)
-        variance = [tracker.error_sigma**2]
-        kept, added = zip(*(tracker.error_step(b.time_s - a.time_s) for a, b in pairwise(rows)), strict=True)
+        variance, of = [tracker.error_sigma**2], (tracker.pose_errors, tracker.errors)
+        kept, added = zip(*(step_of_errors(*of, b.time_s - a.time_s) for a, b in pairwise(rows)), strict=True)
         for share, noise in zip(kept, added, strict=True):
             variance.append(share**2 * variance[-1] + noise**2)
         n, k = len(rows), len(by_state[0])
