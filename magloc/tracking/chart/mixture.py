@@ -24,6 +24,8 @@ narrow."""
 _OUTSIDE = 0.025
 # Standard deviation of the log-range beyond which the mean range tells of the prior alone.
 _WIDEST = 1.0
+# Range, in radii, far beyond all where sources are looked for, and the least logarithm of a component's weight there.
+_RUN_AWAY, _LEAST_RUN_AWAY = 20.0 * FARTHEST, -5.0
 # Logarithm of a range, in metres, that no quantile is beyond.
 _BEYOND, _N_BISECTIONS = 30.0, 60
 
@@ -107,8 +109,9 @@ class Mixture:
         return replace(self, x=self.x[:, :N_SOURCE], S=root_of(self.S[:, :N_SOURCE]), n_charted=N_SOURCE, n_pose=0)
 
     def likely(self) -> Mixture:
-        """Without components of no weight."""
-        return self.take(self.log_weight > self.log_weight.max() + DROPPED_BELOW)
+        """Return the components of some weight, of those that have run away only heavy ones: they would be the mean."""
+        least = np.where(self.chart.length > _RUN_AWAY * self.radius_m, _LEAST_RUN_AWAY, DROPPED_BELOW)
+        return self.take(self.log_weight >= self.log_weight.max() + least)
 
     def reduced(self) -> Mixture:
         """The likely components, and those that are as good as one merged."""

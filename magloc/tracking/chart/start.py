@@ -30,8 +30,8 @@ from magloc.measurement.rows import check_magnitudes, check_spans
 from magloc.tracking import row_filter
 from magloc.tracking.chart.known_moment import UNIFORM_IN_SPACE, KnownInWorld
 from magloc.tracking.chart.mixture import DROPPED_BELOW, FARTHEST, NEAREST, Mixture
-from magloc.tracking.chart.stack import Measured
-from magloc.tracking.chart.update import Updated, updated
+from magloc.tracking.chart.stack import Measured, Stack
+from magloc.tracking.chart.update import Updated, is_regular, updated
 from magloc.tracking.coordinates import MOMENT_POWER, Chart, mirrored, source_root
 from magloc.tracking.measurement import RowMeasurement, where_smooth, whitening
 from magloc.tracking.motion import N_SOURCE, MotionModel
@@ -246,9 +246,10 @@ def _components(
     chart, sigma = measurement.chart(x), np.tile(_CELL, (len(x), 1))
     sigma[:, 0] /= 2.0 ** seeds.cell[:, 2]
     S = chart.inverse_jacobian() @ _with_motion(chart, motion, sigma)
-    if known is None and isinstance(measurement, RowMeasurement):
-        return row_filter.update(Gaussians(x, S, n_nuisances=measurement.n_pose), measurement.compiled)
-    return updated(x, S, measurement, known)
+    if known is not None or isinstance(measurement, Stack):
+        return updated(x, S, measurement, known)
+    found = row_filter.update(Gaussians(x, S, n_nuisances=measurement.n_pose), measurement.compiled)
+    return replace(found, converged=found.converged & is_regular(found.S))
 
 
 def _mixture(found: Updated | RowUpdates, log_weight: FloatArray, measurement: Measured) -> Mixture:

@@ -86,11 +86,15 @@ def updated(x: FloatArray, S: FloatArray, measurement: Measured, known: KnownInW
     R = np.asarray(np.linalg.qr(J, mode="r"))
     log_N = 2.0 * np.sum(np.log(np.abs(np.diagonal(R, axis1=-2, axis2=-1))), axis=1)
     x_after, S_after = problem.posterior(zeta, R)
-    # A start that leads nowhere may end where nothing is a number.
-    with np.errstate(all="ignore"):
-        converged &= np.isfinite(S_after).all(axis=(1, 2)) & (np.abs(np.linalg.det(S_after)) > 0.0)
+    converged &= is_regular(S_after)
     chi2 = np.sum(residual[:, :k] ** 2, axis=1)
     return Updated(x_after, S_after, cost, chi2, -0.5 * (cost + log_N + problem.log_C), converged, residual)
+
+
+def is_regular(S: FloatArray) -> BoolArray:
+    """Return whether roots (K, n, n) are finite and of full rank: a start that leads nowhere may end anywhere."""
+    with np.errstate(all="ignore"):
+        return np.asarray(np.isfinite(S).all(axis=(1, 2)) & (np.abs(np.linalg.det(S)) > 0.0))
 
 
 def _whole_step(J: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
