@@ -32,7 +32,6 @@ from magloc.bounds.over_moments import (
     bounds_over_moments,
     sigma_table,
     spread_over,
-    table_and_spreads,
 )
 from magloc.directions import moments_on_sphere, sphere_directions
 from magloc.fields.multipole import finite_body_errors
@@ -566,15 +565,6 @@ class TestTable:
         parts = [sigma_table(array, positions, part) for part in (moments[:1], *np.array_split(moments[1:], 4))]
         assert_allclose(together, np.concatenate(parts, axis=-1), rtol=1e-10)
 
-    @each_array
-    def test_table_and_spreads_are_those_of_the_two(self, array):
-        positions, moments = places(array, 4), moments_over(array, 23)
-        table, spreads = table_and_spreads(array, positions, moments[:3], moments[3:])
-        for values, expected in zip(table, sigma_table(array, positions, moments[:3]), strict=True):
-            assert_allclose(values, expected, rtol=1e-10)
-        for values, expected in zip(spreads, bounds_over_moments(array, positions, moments[3:]), strict=True):
-            assert_allclose(np.array(values), np.array(expected), rtol=1e-10)
-
     def test_a_modulus_of_no_field_has_no_bound_and_leaves_the_others_theirs(self):
         array = cube(1.5, kind="scalar", noise_T=1e-11)
         positions, moments = places(array, 3), np.array([[0.0, 0.0, 0.0], [60.0, 50.0, 60.0]])
@@ -598,11 +588,6 @@ class TestTable:
             sigma_table(TETRAHEDRON, np.ones(shape), np.eye(3))
         with pytest.raises(ValueError, match="Input moments_Am2 must have shape"):
             bounds_over_moments(TETRAHEDRON, np.eye(3), np.ones(shape))
-
-    @pytest.mark.parametrize("shape", [(3,), (2, 2)])
-    def test_wrong_shape_of_moments_alone(self, shape):
-        with pytest.raises(ValueError, match="Input alone_Am2 must have shape"):
-            table_and_spreads(TETRAHEDRON, np.eye(3), np.ones(shape), np.eye(3))
 
 
 class TestSpread:

@@ -24,6 +24,7 @@ from magloc.grids.computed import computed_map
 from magloc.measurement.differences import DifferenceMeasurement
 from magloc.plots.maps import convergence
 from tests.arrays.test_differences import random_array
+from tests.magloc.convergence.readable_filters import run_one
 
 PAPER = StartsScenario()
 WIDE = replace(PAPER, array=tetrahedron(1.5, noise_T=1e-9))
@@ -162,7 +163,7 @@ class TestReadableTwins:
         _, measurement, z = simulated_measurement(scenario)
         ends = method.run(measurement, z, self.starts)
         for start, state in zip(self.starts, ends.states, strict=True):
-            twin = method.run_one(measurement, z, start)
+            twin = run_one(method, measurement, z, start)
             size = np.repeat([np.linalg.norm(twin.x[:3]), np.linalg.norm(twin.x[3:])], 3)
             assert_allclose(state / size, twin.x / size, atol=1e-6)
 
@@ -173,7 +174,7 @@ class TestReadableTwins:
         ends = method.run(measurement, z, starts)
         assert ends.stopped.all()
         for i, start in enumerate(starts):
-            twin = method.run_one(measurement, z, start)
+            twin = run_one(method, measurement, z, start)
             assert twin.converged
             assert ends.iterations[i] == twin.iterations
             assert_allclose(ends.states[i, :3], twin.x[:3], atol=1e-7)
