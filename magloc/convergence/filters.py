@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from arrays.typing import FloatArray
 from magloc.convergence.ends import DAMPED, ITERATED, RELINEARISED, REPEATED, Ends, ScaledDifferences, ends
-from magloc.kalman import IteratedUpdate, iterated_update, predict_square_root, scalar_update, sequential_update
 from magloc.localization.search.single_source import SingleSourceSearch
 from magloc.measurement.differences import DifferenceMeasurement
+from magloc.state_space import IteratedUpdate, iterated_update, predict, update
 
 # χ² above the maximum-likelihood χ² within which a stop counts as having reached it.
 CHI2_REACHED = 0.05
@@ -144,19 +144,21 @@ class RepeatedFilter(_LikelihoodFilter):
         return found._replace(chi2=inflation * found.chi2)
 
     def run_one(self, measurement: DifferenceMeasurement, z: FloatArray, start: FloatArray) -> IteratedUpdate:
-        """End of one start (6,), by the square-root filter of :mod:`magloc.kalman`."""
-        variance = self.noise_inflation * measurement.variance
+        """End of one start (6,), by the square-root filter of :mod:`magloc.state_space`."""
+        sigma = np.sqrt(self.noise_inflation * measurement.variance)
         x, S, S_q = start, np.diag(self.s_q), np.diag(self.s_q)
         predicted = measurement.predicted(x[:3], x[3:])
         innovation = z - predicted
         for iteration in range(1, self.max_iterations + 1):
-            S = predict_square_root(S, np.eye(6), S_q)
+            S = predict(S, np.eye(6), S_q)
             if self.relinearise_every_scalar:
                 for j in range(z.size):
                     nu = z[j] - measurement.predicted(x[:3], x[3:])[j]
-                    x, S = scalar_update(x, S, measurement.jacobian(x[:3], x[3:])[j], float(nu), float(variance[j]))
+                    h = measurement.jacobian(x[:3], x[3:])[j]
+                    x, S, _ = update(x, S, h[None] / sigma[j], nu[None] / sigma[j])
             else:
-                x, S = sequential_update(x, S, measurement.jacobian(x[:3], x[3:]), z - predicted, variance)
+                H = measurement.jacobian(x[:3], x[3:])
+                x, S, _ = update(x, S, H / sigma[:, None], (z - predicted) / sigma)
             predicted, before = measurement.predicted(x[:3], x[3:]), predicted
             change = float(np.linalg.norm(predicted - before))
             if not np.isfinite(change) or change < self.tolerance_T:
@@ -191,7 +193,7 @@ class IekfFilter(_PriorFilter):
         return ends(ITERATED, differences, starts, self.tolerance_T, self.max_iterations)
 
     def run_one(self, measurement: DifferenceMeasurement, z: FloatArray, start: FloatArray) -> IteratedUpdate:
-        """End of one start (6,), by :func:`magloc.kalman.iterated_update`."""
+        """End of one start (6,), by :func:`magloc.state_space.iterated_update`."""
         return iterated_update(
             start,
             np.diag(self.s_0),

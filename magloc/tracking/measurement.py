@@ -21,10 +21,10 @@ from arrays.differences import Differences, decorrelated_differences
 from arrays.noise import reading_covariance
 from arrays.typing import FloatArray
 from magloc.fields import dipole
-from magloc.kalman import MeasurementFunction
 from magloc.measurement.differences import DifferenceMeasurement
 from magloc.measurement.nuisances import Drift, SensorErrors, without_lasting_errors
 from magloc.measurement.pose import ArrayPose, PoseErrors
+from magloc.state_space import MeasurementFunction
 from magloc.tracking.motion import N_SOURCE
 from magloc.tracking.results import Row
 

@@ -51,7 +51,7 @@ from adcs.satellite import dynamics
 from adcs.satellite.sensors import StarTracker
 from magloc import core
 from magloc.chi_square import normalised_square
-from magloc.kalman import sequential_update, symmetric_square_root
+from magloc.state_space import symmetric_square_root, update
 from sims.attitude.scenario import AttitudeScenario, StartConditions
 from sims.attitude.simulation import AttitudeRuns, advance, prepare, sense, simulate
 from sims.experiments.accuracy import error_norm_deg, errors, last_rows, normalised_error_squared
@@ -185,11 +185,10 @@ def information_update(P: Array, H: Array, residual: Array) -> tuple[Array, Arra
 
 
 def square_root_update(P: Array, H: Array, residual: Array) -> tuple[Array, Array]:
-    """Update by Potter's square roots, one scalar after the other."""
+    """Update by square roots: magloc.state_space."""
     corrections, covariances = [], []
     for P_run, H_run, residual_run in zip(P, H, residual, strict=True):
-        S = symmetric_square_root(P_run)
-        dx, S = sequential_update(np.zeros(len(P_run)), S, H_run, residual_run, np.ones(len(residual_run)))
+        dx, S, _ = update(np.zeros(len(P_run)), symmetric_square_root(P_run), H_run, residual_run)
         corrections.append(dx)
         covariances.append(S @ S.T)
     return np.array(corrections), np.array(covariances)
