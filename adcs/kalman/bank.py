@@ -12,7 +12,7 @@ from adcs import quaternion
 from adcs.kalman.diagnostics import COLLINEAR, collinear_rows, unseen_torque_Nm, warnings_of
 from adcs.kalman.error_state import ALWAYS, AttitudeTracks, FilterSettings, Start, sensor_set, tuned_noise
 from adcs.kalman.initialisation import any_start, checked_start, first_told, vector_start
-from adcs.kalman.mekf import closed_loop_jacobian, run_filter, run_readable
+from adcs.kalman.mekf import run_filter
 from adcs.kalman.names import FILTERS, Filter, StartKind
 from adcs.kalman.results import sigma_by_state
 from adcs.kalman.smoother import smoothed
@@ -232,7 +232,5 @@ def _estimated(record: Record, chosen: EstimatorSettings, start: Start) -> Attit
         return run_reduced(record, settings, start)
     if chosen.filter == "self-tuning":
         return run_self_tuned(record, settings, start)
-    if chosen.closed_loop_F:
-        return run_readable(record, settings, start, jacobian=closed_loop_jacobian)
-    tracks = run_filter(record, settings, start)
+    tracks = run_filter(record, settings, start, closed_loop_F=chosen.closed_loop_F)
     return smoothed(record, tracks) if chosen.filter == "smoother" else tracks

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from adcs.kalman.error_state import ALWAYS, SIZES, STATES, AttitudeTracks, FilterSettings, SensorSet, State
-from adcs.kalman.gate.contest import patience
 from adcs.satellite.sensors import SENSORS
 from adcs.satellite.telemetry import Record
 from arrays.typing import FloatArray
@@ -15,9 +14,17 @@ from magloc import core
 
 _COVARIANCES_A_CALL = 400_000
 """Elements of covariances that one call computes: about ten milliseconds."""
+PATIENCE_S = 300.0
+"""A main hypothesis that has taken no reading of the sensor for so long loses against readings that agree, though no
+other sensor tells: what lasts as long is the truth."""
+PATIENT_READINGS = 10
+"""The same for a gyro's bias, which costs the attitude nothing, in instants. Also: a main hypothesis that takes as many
+readings of that sensor meanwhile is not wrong, and a sensor is back from a gap after as many of its intervals."""
 
 
-def filter_runs(record: Record, settings: FilterSettings, first: State, sigma: FloatArray) -> AttitudeTracks:
+def filter_runs(
+    record: Record, settings: FilterSettings, first: State, sigma: FloatArray, *, closed_loop_F: bool = False
+) -> AttitudeTracks:
     """Filter all runs of a record from their first states; sigma (4,) is the noise of a component of each reading."""
     used, around, readings = settings.sensors, record.environment, record.readings
     runs, n = record.momentum_Nms.shape[:2]
@@ -49,6 +56,8 @@ def filter_runs(record: Record, settings: FilterSettings, first: State, sigma: F
         "inertia": body.inertia_kgm2,
         "inverse_inertia": body.inverse,
         "residual_dipole": body.residual_dipole_Am2,
+        "attitude_gain": record.satellite.control.attitude_gain_Nm,
+        "rate_gain": record.satellite.control.rate_gain_Nms,
         "dt": record.steps_s,
         "first_q": first.q,
         "first_w": first.w,
@@ -64,6 +73,7 @@ def filter_runs(record: Record, settings: FilterSettings, first: State, sigma: F
         n_runs=runs,
         n_instants=n,
         n_states=used.size,
+        has_feedback=closed_loop_F,
         used=np.array([used.star, used.gyro, used.magnetometer, used.sun], dtype=np.uint8),
         place=np.array(places, dtype=np.int64),
         gate_limit=settings.gate_limit,
@@ -84,6 +94,11 @@ def filter_runs(record: Record, settings: FilterSettings, first: State, sigma: F
     return AttitudeTracks(
         settings, q, w, dict(zip(used.states, parts, strict=False)), covariance, nis, rejected, log_det
     )
+
+
+def patience(sensor: int, dt_s: float) -> int:
+    """Instants after which a hypothesis that a reading of a sensor began is believed though no other sensor tells."""
+    return PATIENT_READINGS if SENSORS[sensor] == "gyro" else round(PATIENCE_S / dt_s)
 
 
 def _begins(used: SensorSet, state: str, part: int) -> int:

@@ -6,10 +6,11 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from adcs import quaternion
-from adcs.kalman.mekf import run_filter, run_readable
+from adcs.kalman.mekf import run_filter
 from adcs.satellite import dynamics
 from sims.attitude.simulation import AttitudeRuns, advance, simulate
 from tests.adcs.filter_runs import ANY_START, settings, start_of, tabletsat
+from tests.adcs.kalman.readable import run_readable
 from tests.bench.table import Row
 from tests.bench.timing import Contestant, Size, interleaved
 

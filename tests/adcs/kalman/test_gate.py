@@ -1,4 +1,4 @@
-"""Tests of adcs.kalman.gate: what contradicts the filter is left out, and what was wrong is found.
+"""Tests of the gate of the error-state filter: what contradicts the filter is left out, and what was wrong is found.
 
 The oracle of a reading that is left out is the same record without it. Seeds were not chosen.
 """
@@ -18,9 +18,8 @@ import adcs
 from adcs import quaternion
 from adcs.kalman import mekf_runs
 from adcs.kalman.error_state import FilterSettings
-from adcs.kalman.gate import contest as gate
 from adcs.kalman.initialisation import any_start
-from adcs.kalman.mekf import run_filter, run_readable
+from adcs.kalman.mekf import run_filter
 from adcs.satellite.sensors import SENSORS
 from adcs.satellite.telemetry import is_read, part
 from magloc import core
@@ -29,6 +28,8 @@ from sims.attitude.simulation import AttitudeRuns, simulate
 from sims.experiments.accuracy import error_norm_deg
 from tests.adcs.attitudes import random_attitudes
 from tests.adcs.filter_runs import GYRO_BIAS_RAD_S, SEEDS, settings, start_of, tabletsat
+from tests.adcs.kalman import readable as gate
+from tests.adcs.kalman.readable import run_readable
 
 Array = NDArray[np.float64]
 NAMES = ("star", "gyro_rad_s", "field_T", "sun")

@@ -19,7 +19,6 @@ from scipy.linalg import expm
 from scipy.stats import chi2
 
 from adcs import quaternion
-from adcs.kalman import mekf as multiplicative
 from adcs.kalman.diagnostics import problems_of, warnings_of
 from adcs.kalman.error_state import (
     SIZES,
@@ -32,7 +31,6 @@ from adcs.kalman.error_state import (
     sensor_set,
 )
 from adcs.kalman.mekf import (
-    closed_loop_jacobian,
     collected,
     corrected,
     first_state,
@@ -42,7 +40,6 @@ from adcs.kalman.mekf import (
     predicted,
     residuals,
     run_filter,
-    run_readable,
     whole_start,
     with_error,
 )
@@ -69,6 +66,8 @@ from tests.adcs.filter_runs import (
     tabletsat,
     unlike_stars,
 )
+from tests.adcs.kalman import readable
+from tests.adcs.kalman.readable import run_readable
 from tests.adcs.kalman.test_error_state import TABLE_3
 from tests.calls import calls_of
 
@@ -210,7 +209,7 @@ class TestUpdates:
         chosen = settings("mag+sun+gyro", ["gyro-bias", "disturbance"])
         runs, start = runs_for(chosen.sensors, 60.0, range(2))
         joseph = run_readable(runs, chosen, start)
-        monkeypatch.setattr(multiplicative, "joseph_update", square_root_update)
+        monkeypatch.setattr(readable, "joseph_update", square_root_update)
         root = run_readable(runs, chosen, start)
         np.testing.assert_allclose(joseph.q, root.q, rtol=0, atol=1e-12)
         np.testing.assert_allclose(joseph.sigma, root.sigma, rtol=1e-8)
@@ -472,7 +471,7 @@ class TestAcceptance:
         chosen = settings("mag+sun")
         runs, start = runs_for(chosen.sensors, 200.0)
         right = evaluate(runs, run_filter(runs, chosen, start))
-        wrong = evaluate(runs, run_readable(runs, chosen, start, jacobian=closed_loop_jacobian))
+        wrong = evaluate(runs, run_filter(runs, chosen, start, closed_loop_F=True))
         assert (wrong["angle_rms_deg"] or 0.0) > 1.5 * (right["angle_rms_deg"] or 9.0)
         assert (wrong["nees_per_dimension"] or 0.0) > 3.0
 
