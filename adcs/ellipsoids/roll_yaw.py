@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adcs.ellipsoids.ellipsoid import Ellipsoid, quadratic_form, segment_shape
+from adcs.ellipsoids.names import StepRule
 from adcs.ellipsoids.observer import BoundedSystem, EllipsoidObserver
-from adcs.ellipsoids.strip import StepRule
 from arrays.io.errors import check_positive
 from arrays.typing import FloatArray
 from magloc.state_space import predict, update
