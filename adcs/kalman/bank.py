@@ -14,7 +14,6 @@ from adcs.kalman.error_state import ALWAYS, AttitudeTracks, FilterSettings, Star
 from adcs.kalman.initialisation import any_start, checked_start, first_told, vector_start
 from adcs.kalman.mekf import run_filter
 from adcs.kalman.names import FILTERS, Filter, StartKind
-from adcs.kalman.results import sigma_by_state
 from adcs.kalman.smoother import smoothed
 from adcs.kalman.variants.constant_gain import run_constant_gain
 from adcs.kalman.variants.gyro_driven import run_reduced
@@ -187,7 +186,7 @@ def _track(
         states={state: values[0] for state, values in tracks.states.items()},
         used=tuple(used.sensors.split("+")),
         seen={name: seen[0] for name, seen in record.readings.seen.items()},
-        sigma={state: sigma[0] for state, sigma in sigma_by_state(tracks).items()},
+        sigma={state: sigma[0] for state, sigma in tracks.sigma_by_state.items()},
         nis=dict(zip(SENSORS, tracks.nis[0].T, strict=True)),
         q_orbital=q,
         warnings=warnings_of(record, tracks)[0],

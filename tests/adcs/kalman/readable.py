@@ -17,16 +17,17 @@ from adcs import quaternion
 from adcs.kalman.error_state import AttitudeTracks, FilterSettings, SensorSet, Start, State
 from adcs.kalman.initialisation import turned_onto
 from adcs.kalman.mekf import (
+    PATIENT_READINGS,
     check_start,
     collected,
     deviations,
     first_state,
     joseph_update,
+    patience,
     predicted,
     residuals,
     with_error,
 )
-from adcs.kalman.mekf_runs import PATIENT_READINGS, patience
 from adcs.satellite.dynamics import RigidBody, WheelControl, error_jacobian
 from adcs.satellite.sensors import SENSORS
 from adcs.satellite.telemetry import Record, is_read, part

@@ -16,7 +16,7 @@ from scipy.stats import chi2
 
 import adcs
 from adcs import quaternion
-from adcs.kalman import mekf_runs
+from adcs.kalman import mekf
 from adcs.kalman.error_state import FilterSettings
 from adcs.kalman.initialisation import any_start
 from adcs.kalman.mekf import run_filter
@@ -106,7 +106,7 @@ class TestTwins:
         runs, chosen = eventful(), settings("st+gyro+mag+sun", ["gyro-bias", "disturbance"])
         start, threads = start_of(runs, math.radians(40.0)), core.threads()
         whole = run_filter(runs, chosen, start)
-        monkeypatch.setattr(mekf_runs, "_COVARIANCES_A_CALL", 7 * chosen.sensors.size**2)
+        monkeypatch.setattr(mekf, "_COVARIANCES_A_CALL", 7 * chosen.sensors.size**2)
         try:
             for n_threads in (1, 3):
                 core.set_threads(n_threads)

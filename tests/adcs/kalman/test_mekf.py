@@ -44,7 +44,6 @@ from adcs.kalman.mekf import (
     with_error,
 )
 from adcs.kalman.smoother import difference
-from adcs.satellite import dynamics
 from adcs.satellite.sensors import StarTracker
 from magloc import core
 from magloc.chi_square import normalised_square
@@ -52,7 +51,7 @@ from magloc.state_space import symmetric_square_root, update
 from sims.attitude.scenario import AttitudeScenario, StartConditions
 from sims.attitude.simulation import AttitudeRuns, advance, prepare, sense, simulate
 from sims.experiments.accuracy import error_norm_deg, errors, last_rows, normalised_error_squared
-from tests.adcs.attitudes import random_attitudes
+from tests.adcs.attitudes import commanded_torque, random_attitudes
 from tests.adcs.filter_runs import (
     ANY_START,
     GYRO_BIAS_RAD_S,
@@ -332,7 +331,7 @@ class TestClosedLoop:
                 state, _ = predicted(runs, row - 1, state, chosen)
             state, _ = corrected(runs, row, state, chosen)
             states.append(state)
-            runs.wheel_torque_Nm[:, row] = dynamics.commanded_torque(
+            runs.wheel_torque_Nm[:, row] = commanded_torque(
                 runs.satellite.body,
                 runs.satellite.control,
                 state.q,

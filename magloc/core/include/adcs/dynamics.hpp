@@ -88,7 +88,8 @@ MAGLOC_INLINE T clipped(T x, double limit) {
   return choose(x > limit, broadcast<T>(limit), choose(x < -limit, broadcast<T>(-limit), x));
 }
 
-// The torque of the wheels until the next instant, within the limits of torque and momentum.
+// The torque of the wheels until the next instant, within the limits of torque and momentum. The readable form is in
+// tests/adcs/attitudes.py.
 template <class T>
 MAGLOC_INLINE Vector<T> commanded_torque(const Body &body, const Control &control, const Motion<T> &motion,
                                          const Vector<T> &momentum, T orbital_rate, double dt) {
