@@ -15,7 +15,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "Fixes": "magloc.localization.fit.fixes",
         "FreeMotion": "magloc.tracking.multi_target.motion",
         "GradientTensor": "magloc.localization.gradient_tensor",
-        "IteratedExtendedKalmanFilter": "magloc.kalman",
+        "IteratedExtendedKalmanFilter": "magloc.state_space",
         "KnownMotion": "magloc.tracking.motion",
         "Locator": "magloc.localization.locator",
         "MatchedFilterDetector": "magloc.detection.matched_filter",

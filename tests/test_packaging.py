@@ -70,10 +70,7 @@ class TestImports:
     def test_all_is_every_extra_of_a_user(self) -> None:
         """But for a device that few have."""
         assert set(declared(["magloc[all]"])) == {
-            name
-            for extra in EXTRAS
-            if extra != "all"
-            for name in declared(EXTRAS[extra])
+            name for extra in EXTRAS if extra != "all" for name in declared(EXTRAS[extra])
         }
 
     @pytest.mark.parametrize("package", PACKAGES)

@@ -12,7 +12,6 @@ from scipy.special import chdtri
 
 from arrays.array import SensorArray
 from arrays.typing import FloatArray
-from magloc.kalman import block_update, normalised_innovation_squared, predict_square_root, symmetric_square_root
 from magloc.levels import CONTRADICTION, DISAGREEMENT
 from magloc.localization.fit.prior import SourcePrior
 from magloc.localization.fit.results import Fix, Solution
@@ -20,6 +19,7 @@ from magloc.localization.locator import fit_at_rest
 from magloc.localization.uncertainty.range_interval import relative_range_sigma
 from magloc.measurement.nuisances import SensorErrors, ambient_in_array, with_eddies_as_offsets
 from magloc.measurement.pose import PoseErrors
+from magloc.state_space import predict, symmetric_square_root, update
 from magloc.tracking.chart.known_moment import KnownInWorld
 from magloc.tracking.measurement import RowMeasurement, RowMeasurements, step_of_errors
 from magloc.tracking.motion import N_SOURCE, MotionModel
@@ -203,7 +203,7 @@ class CartesianFilter:
         F[:n, :n], S_q[:n, : S_q_motion.shape[1]] = F_motion, S_q_motion
         F[n + np.arange(n_errors), n + np.arange(n_errors)] = kept
         S_q[n + noisy, S_q_motion.shape[1] + np.arange(noisy.size)] = added[noisy]
-        return Prediction(np.concatenate([moved, kept * x[n:]]), predict_square_root(S, F, S_q), F)
+        return Prediction(np.concatenate([moved, kept * x[n:]]), predict(S, F, S_q), F)
 
     def state_before(
         self, centre: FloatArray, root: FloatArray, R_world_from_array: FloatArray | None = None
@@ -218,7 +218,7 @@ class CartesianFilter:
         if R_world_from_array is None or (known := KnownInWorld.of(self.prior, R_world_from_array)) is None:
             return x, S
         H = known.along(centre[None], np.eye(len(centre))[None])[0]
-        return block_update(x, S, H, known.residual(centre[None])[0] - H @ (x - centre), np.ones(len(H)))
+        return update(x, S, H, known.residual(centre[None])[0] - H @ (x - centre))[:2]
 
     def start(self, source: FloatArray, covariance: FloatArray, rows: Sequence[Row]) -> FilteredStart | None:
         """State at the last of the rows that a source (6,) was found from, as if at rest, with a covariance (6, 6).
@@ -254,9 +254,8 @@ class CartesianFilter:
             if j:
                 prediction = self.predicted(x, S, measurement.row.time_s - measurements[j - 1].row.time_s)
                 x, S = prediction.x, prediction.S
-            H, ones = measurement.jacobian(centre), np.ones(measurement.z.size)
-            innovation = measurement.z - measurement.predicted(centre) - H @ (x - centre)
-            chi2 += normalised_innovation_squared(S, H, innovation, ones)
-            x, S = block_update(x, S, H, innovation, ones)
+            H = measurement.jacobian(centre)
+            x, S, nis = update(x, S, H, measurement.z - measurement.predicted(centre) - H @ (x - centre))
+            chi2 += nis
             of_rows.append(x)
         return FilteredStart(x, S, chi2, of_rows)

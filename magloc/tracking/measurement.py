@@ -23,10 +23,10 @@ from arrays.noise import reading_covariance
 from arrays.typing import FloatArray
 from magloc.chi_square import energy_threshold
 from magloc.fields import dipole
-from magloc.kalman import MeasurementFunction
 from magloc.measurement.differences import DifferenceMeasurement
 from magloc.measurement.nuisances import Drift, SensorErrors, without_lasting_errors
 from magloc.measurement.pose import N_POSE, ArrayPose, PoseErrors
+from magloc.state_space import MeasurementFunction
 from magloc.tracking.coordinates import Chart
 from magloc.tracking.motion import N_SOURCE
 from magloc.tracking.row_filter import Rows

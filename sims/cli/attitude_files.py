@@ -20,7 +20,7 @@ from sims.experiments.attitude import Outcome, Part, errors_in_units
 
 if TYPE_CHECKING:
     import xarray as xr
-from adcs.kalman.results import SHOWN, STATE_COLUMNS, in_units, sigma_by_state
+from adcs.kalman.results import SHOWN, STATE_COLUMNS, in_units
 from arrays.typing import FloatArray
 
 
@@ -35,7 +35,7 @@ def write_attitude_files(
     time_s, name = first.runs.time_s, file.name
     # Truth minus estimate is what the filter's state is; an error is estimate minus truth.
     errors = -errors_in_units(first)[0]
-    sigma = in_units(sigma_by_state(first.estimates))[0]
+    sigma = in_units(first.estimates.sigma_by_state)[0]
     title = f"{name}: {estimate.in_words}"
     seen = {name: there[0] for name, there in first.runs.readings.seen.items()}
     used = estimate.settings.sensors
@@ -103,12 +103,12 @@ def dataset_of(parts: Sequence[Part], estimate: EstimatorSettings, title: str) -
         return (
             joined(lambda part: part.estimates.states[state]),
             joined(lambda part: part.runs.states[state]),
-            joined(lambda part: sigma_by_state(part.estimates)[state]),
+            joined(lambda part: part.estimates.sigma_by_state[state]),
         )
 
     axis, component = ("run", "time", "axis"), ("run", "time", "component")
     rate, true_rate, sigma_rate = of("rate")
-    sigma_attitude = joined(lambda part: sigma_by_state(part.estimates)["attitude"])
+    sigma_attitude = joined(lambda part: part.estimates.sigma_by_state["attitude"])
     nis = joined(lambda part: part.estimates.nis)
     rejected = joined(lambda part: part.estimates.rejected.astype(np.float64))
     listed: list[tuple[str, tuple[str, ...], FloatArray, str, str]] = [

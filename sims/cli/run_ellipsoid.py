@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Parameter
 
 from adcs.cli.options import tell
-from adcs.ellipsoids.strip import StepRule
+from adcs.ellipsoids.names import StepRule
 from arrays.io.arguments import Count, Flag, Seed
 from arrays.io.errors import LARGEST, InputError
 from arrays.io.outputs import make_folder, refuse_file

@@ -26,7 +26,7 @@ from adcs.satellite.satellite import Satellite
 from sims.attitude.scenario import AttitudeScenario, StartConditions
 from sims.attitude.simulation import AttitudeRuns, Prepared, prepare, simulate, start_estimates
 from sims.experiments.attitude import Part, outcome_of
-from tests.adcs.attitudes import random_attitudes
+from tests.adcs.attitudes import commanded_torque, random_attitudes
 
 Array = NDArray[np.float64]
 START_RAD, START_RAD_S = math.radians(5.0), math.radians(0.1)
@@ -89,7 +89,7 @@ def followed(prepared: Prepared) -> AttitudeRuns:
     for row in range(n):
         rate = around.orbital_rate_rad_s[:, row]
         torques.append(
-            dynamics.commanded_torque(
+            commanded_torque(
                 satellite.body, satellite.control, *states[row], quaternion.IDENTITY, rate, prepared.scenario.dt_s
             )
         )

@@ -9,8 +9,8 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 
 from arrays.typing import BoolArray, FloatArray, IntArray
-from magloc.kalman import symmetric_square_root
 from magloc.localization.fit.results import Intervals
+from magloc.state_space import symmetric_square_root
 from magloc.tracking.coordinates import MOMENT_POWER, Chart
 from magloc.tracking.motion import N_SOURCE
 

@@ -14,9 +14,9 @@ from functools import cached_property
 import numpy as np
 
 from arrays.typing import BoolArray, FloatArray, IntArray
-from magloc.kalman import block_update
 from magloc.measurement.nuisances import SensorErrors
 from magloc.measurement.pose import PoseErrors
+from magloc.state_space import update
 from magloc.tracking.chart.known_moment import KnownInWorld
 from magloc.tracking.chart.mixture import Mixture
 from magloc.tracking.chart.start import first_root
@@ -202,7 +202,7 @@ class _Rows:
         left = known.residual(x) - (H @ before.x[..., None])[..., 0]
         after, evidence = before.unfilled(), np.empty(len(x))
         for k, given in enumerate(zip(before.x, before.S, H, left, strict=True)):
-            after.x[k], after.S[k] = block_update(*given, np.ones(n_known))
+            after.x[k], after.S[k] = update(*given)[:2]
             covariance = np.eye(n_known) + (H[k] @ before.S[k]) @ (H[k] @ before.S[k]).T
             evidence[k] = -0.5 * (left[k] @ np.linalg.solve(covariance, left[k]) + np.linalg.slogdet(covariance)[1])
         return after, evidence

@@ -18,10 +18,10 @@ import numpy as np
 from scipy.special import chdtri
 
 from arrays.typing import BoolArray, FloatArray
-from magloc.kalman import block_update, whitened_innovation
 from magloc.levels import CONTRADICTION
 from magloc.localization.uncertainty.range_interval import relative_range_sigma
 from magloc.readings import Readings
+from magloc.state_space import update, whitened_innovation
 from magloc.tracking.chart.steps import charted
 from magloc.tracking.coordinates import Chart
 from magloc.tracking.measurement import RowMeasurement
@@ -242,13 +242,13 @@ def _passed(
         k = measurement.z.size
         innovations.append(None)
         if k:
-            H, ones = measurement.jacobian(state), np.ones(k)
+            H = measurement.jacobian(state)
             innovation = measurement.z - measurement.predicted(state) - H @ (x - state)
-            whitened = whitened_innovation(S, H, innovation, ones)
+            whitened = whitened_innovation(S, H, innovation)
             innovations[j] = Innovation(measurement.row.available, whitened)
             agrees[j] = whitened @ whitened <= chdtri(k, CONTRADICTION)
             if used[j]:
-                x, S = block_update(x, S, H, innovation, ones)
+                x, S, _ = update(x, S, H, innovation)
         steps.append(Step(j, prediction, x, S))
     return _Passed(begin, steps, innovations, agrees, used)
 

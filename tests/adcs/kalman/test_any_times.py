@@ -8,10 +8,11 @@ import pytest
 import adcs
 from adcs import quaternion
 from adcs.kalman.bank import EstimatorSettings
-from adcs.kalman.mekf import run_filter, run_readable
+from adcs.kalman.mekf import run_filter
 from adcs.satellite.telemetry import orbital_from_eci
 from sims.attitude.simulation import simulate
 from tests.adcs.filter_runs import start_of, tabletsat
+from tests.adcs.kalman.readable import run_readable
 
 FINE_S, EVERY = 0.05, 20
 SENSORS = ("mag+sun+gyro", "st+gyro")

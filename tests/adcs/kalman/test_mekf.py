@@ -19,7 +19,6 @@ from scipy.linalg import expm
 from scipy.stats import chi2
 
 from adcs import quaternion
-from adcs.kalman import mekf as multiplicative
 from adcs.kalman.diagnostics import problems_of, warnings_of
 from adcs.kalman.error_state import (
     SIZES,
@@ -32,7 +31,6 @@ from adcs.kalman.error_state import (
     sensor_set,
 )
 from adcs.kalman.mekf import (
-    closed_loop_jacobian,
     collected,
     corrected,
     first_state,
@@ -42,20 +40,18 @@ from adcs.kalman.mekf import (
     predicted,
     residuals,
     run_filter,
-    run_readable,
     whole_start,
     with_error,
 )
 from adcs.kalman.smoother import difference
-from adcs.satellite import dynamics
 from adcs.satellite.sensors import StarTracker
 from magloc import core
 from magloc.chi_square import normalised_square
-from magloc.kalman import sequential_update, symmetric_square_root
+from magloc.state_space import symmetric_square_root, update
 from sims.attitude.scenario import AttitudeScenario, StartConditions
 from sims.attitude.simulation import AttitudeRuns, advance, prepare, sense, simulate
 from sims.experiments.accuracy import error_norm_deg, errors, last_rows, normalised_error_squared
-from tests.adcs.attitudes import random_attitudes
+from tests.adcs.attitudes import commanded_torque, random_attitudes
 from tests.adcs.filter_runs import (
     ANY_START,
     GYRO_BIAS_RAD_S,
@@ -69,6 +65,8 @@ from tests.adcs.filter_runs import (
     tabletsat,
     unlike_stars,
 )
+from tests.adcs.kalman import readable
+from tests.adcs.kalman.readable import run_readable
 from tests.adcs.kalman.test_error_state import TABLE_3
 from tests.calls import calls_of
 
@@ -185,11 +183,10 @@ def information_update(P: Array, H: Array, residual: Array) -> tuple[Array, Arra
 
 
 def square_root_update(P: Array, H: Array, residual: Array) -> tuple[Array, Array]:
-    """Update by Potter's square roots, one scalar after the other."""
+    """Update by square roots: magloc.state_space."""
     corrections, covariances = [], []
     for P_run, H_run, residual_run in zip(P, H, residual, strict=True):
-        S = symmetric_square_root(P_run)
-        dx, S = sequential_update(np.zeros(len(P_run)), S, H_run, residual_run, np.ones(len(residual_run)))
+        dx, S, _ = update(np.zeros(len(P_run)), symmetric_square_root(P_run), H_run, residual_run)
         corrections.append(dx)
         covariances.append(S @ S.T)
     return np.array(corrections), np.array(covariances)
@@ -211,7 +208,7 @@ class TestUpdates:
         chosen = settings("mag+sun+gyro", ["gyro-bias", "disturbance"])
         runs, start = runs_for(chosen.sensors, 60.0, range(2))
         joseph = run_readable(runs, chosen, start)
-        monkeypatch.setattr(multiplicative, "joseph_update", square_root_update)
+        monkeypatch.setattr(readable, "joseph_update", square_root_update)
         root = run_readable(runs, chosen, start)
         np.testing.assert_allclose(joseph.q, root.q, rtol=0, atol=1e-12)
         np.testing.assert_allclose(joseph.sigma, root.sigma, rtol=1e-8)
@@ -334,7 +331,7 @@ class TestClosedLoop:
                 state, _ = predicted(runs, row - 1, state, chosen)
             state, _ = corrected(runs, row, state, chosen)
             states.append(state)
-            runs.wheel_torque_Nm[:, row] = dynamics.commanded_torque(
+            runs.wheel_torque_Nm[:, row] = commanded_torque(
                 runs.satellite.body,
                 runs.satellite.control,
                 state.q,
@@ -473,7 +470,7 @@ class TestAcceptance:
         chosen = settings("mag+sun")
         runs, start = runs_for(chosen.sensors, 200.0)
         right = evaluate(runs, run_filter(runs, chosen, start))
-        wrong = evaluate(runs, run_readable(runs, chosen, start, jacobian=closed_loop_jacobian))
+        wrong = evaluate(runs, run_filter(runs, chosen, start, closed_loop_F=True))
         assert (wrong["angle_rms_deg"] or 0.0) > 1.5 * (right["angle_rms_deg"] or 9.0)
         assert (wrong["nees_per_dimension"] or 0.0) > 3.0
 

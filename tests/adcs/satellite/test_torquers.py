@@ -10,12 +10,13 @@ import pytest
 import adcs
 from adcs.io.log_layout import STANDARD
 from adcs.io.telemetry_files import telemetry_columns
-from adcs.kalman.mekf import run_filter, run_readable
+from adcs.kalman.mekf import run_filter
 from adcs.satellite.telemetry import Telemetry
 from arrays.io.csv import write_columns
 from sims.attitude.simulation import AttitudeRuns, moved, prepare
 from sims.experiments import accuracy
 from tests.adcs.filter_runs import ANY_START, settings, start_of, tabletsat
+from tests.adcs.kalman.readable import run_readable
 
 SETTINGS = settings("st", ["disturbance"])
 

@@ -2,7 +2,7 @@
 
 | what | who checks it |
 |---|---|
-| compiled filters | their readable twins on magloc.kalman |
+| compiled filters | their readable twins on magloc.state_space |
 | the maximum-likelihood optimum | the truth, for noise-free readings |
 | the paper's figure and the filters' table | the specification's figures |
 """
@@ -139,7 +139,7 @@ class TestOtherRowsOfTheTable:
 
 
 class TestReadableTwins:
-    """Compiled filters take the same steps as the square-root filter of magloc.kalman.
+    """Compiled filters take the same steps as the square-root filter of magloc.state_space.
 
     Whole runs of a filter far from its optimum amplify rounding, so starts are compared over few passes, and whole runs
     where they converge.

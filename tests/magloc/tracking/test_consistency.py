@@ -15,8 +15,8 @@ from arrays import geometries
 from arrays.array import SensorArray
 from arrays.differences import contrasts
 from magloc.chi_square import mean_bounds
-from magloc.kalman import symmetric_square_root
 from magloc.readings import Readings
+from magloc.state_space import symmetric_square_root
 from magloc.tracking.chart.mixture import Mixture
 from magloc.tracking.consistency import consistency, nees_of
 from magloc.tracking.coordinates import Chart
