@@ -9,10 +9,9 @@ import numpy as np
 
 import adcs
 from adcs.cli.options import EstimateOptions, tell, warn
-from arrays.io.arguments import Flag
 from arrays.io.errors import naming
 from arrays.io.outputs import make_folder, refuse_file
-from magloc.cli.framework import QuietOptions, print_result
+from magloc.cli.framework import Flag, QuietOptions, print_result
 
 if TYPE_CHECKING:
     from adcs.io.scenario_files import AttitudeFile

@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import adcs
 from adcs.cli.options import tell, warn
 from adcs.complementary.names import Magnet
-from arrays.io.arguments import Flag
 from arrays.io.errors import naming
 from arrays.io.outputs import make_folder, refuse_file
-from magloc.cli.framework import QuietOptions, print_result
+from magloc.cli.framework import Flag, QuietOptions, print_result
 
 if TYPE_CHECKING:
     from adcs.io.imu_files import ImuLog

@@ -12,9 +12,9 @@ from cyclopts import Parameter
 
 import adcs
 from adcs.kalman.names import Filter, Noise, StartKind, is_measured
-from arrays.io.arguments import Flag
 from arrays.io.errors import InputError
 from magloc.cli import framework
+from magloc.cli.framework import Flag
 
 
 def print_note(text: str) -> None:

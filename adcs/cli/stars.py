@@ -12,10 +12,9 @@ import numpy as np
 
 import adcs
 from adcs.cli.options import tell
-from arrays.io.arguments import Flag
 from arrays.io.errors import InputError, naming
 from arrays.typing import FloatArray
-from magloc.cli.framework import QuietOptions, print_result, progress
+from magloc.cli.framework import Flag, QuietOptions, print_result, progress
 
 if TYPE_CHECKING:
     from adcs.stars.catalogue import StarCatalogue

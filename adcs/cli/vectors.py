@@ -7,10 +7,9 @@ from pathlib import Path
 import adcs
 from adcs.cli.options import tell
 from adcs.satellite.wahba import VectorMethod
-from arrays.io.arguments import Flag
 from arrays.io.errors import naming
 from arrays.io.outputs import make_folder, refuse_file
-from magloc.cli.framework import QuietOptions, print_result
+from magloc.cli.framework import Flag, QuietOptions, print_result
 
 
 def vectors(

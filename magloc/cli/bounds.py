@@ -11,12 +11,11 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 import magloc
-from arrays.io.arguments import Flag, whole_number
 from arrays.io.errors import InputError, naming, own_sentence
 from arrays.io.outputs import refuse_file
 from arrays.io.text import write_netcdf
 from arrays.typing import Vector
-from magloc.cli.framework import CommonOptions, print_json, progress
+from magloc.cli.framework import CommonOptions, Flag, print_json, progress, whole_number
 from magloc.cli.options import Grid, array_of_several, naming_options, print_note, refuse_not_positive
 
 if TYPE_CHECKING:

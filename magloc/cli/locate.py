@@ -12,11 +12,10 @@ from typing import TYPE_CHECKING, Literal
 from cyclopts import Parameter
 
 import magloc
-from arrays.io.arguments import Flag
 from arrays.io.errors import InputError, own_sentence
 from arrays.io.outputs import refuse_file
 from arrays.typing import Vector
-from magloc.cli.framework import CommonOptions, print_json_list, progress
+from magloc.cli.framework import CommonOptions, Flag, print_json_list, progress
 from magloc.cli.options import KnownOptions, ambient_field, number_of_sources, print_note
 
 if TYPE_CHECKING:

@@ -11,10 +11,9 @@ from cyclopts import Parameter
 
 import arrays
 import magloc
-from arrays.io.arguments import Flag
 from arrays.io.errors import InputError, naming
 from arrays.io.outputs import make_folder, refuse_file, refuse_one_for_two, refuse_unwritable
-from magloc.cli.framework import CommonOptions, print_report
+from magloc.cli.framework import CommonOptions, Flag, print_report
 from magloc.cli.options import (
     KnownOptions,
     MapOptions,

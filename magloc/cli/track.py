@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal  # noqa: F401 - of an 
 from cyclopts import Parameter
 
 import magloc
-from arrays.io.arguments import Flag
 from arrays.io.errors import InputError, naming
 from arrays.io.outputs import refuse_file, refuse_one_for_two
 from arrays.typing import Vector
-from magloc.cli.framework import CommonOptions, print_json_list, print_report, progress
+from magloc.cli.framework import CommonOptions, Flag, print_json_list, print_report, progress
 from magloc.cli.moments.known_path import (
     PathErrorOptions,
     TrackOutputs,

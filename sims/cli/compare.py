@@ -13,11 +13,10 @@ from cyclopts import Parameter
 import sims.experiments
 from adcs.cli.options import ScenarioOptions, tell, warn
 from adcs.kalman.names import FILTERS
-from arrays.io.arguments import Flag
 from arrays.io.csv import write_columns
 from arrays.io.errors import InputError
 from arrays.io.outputs import make_folder, refuse_file
-from magloc.cli.framework import QuietOptions, print_result, progress
+from magloc.cli.framework import Flag, QuietOptions, print_result, progress
 from sims.cli.run_tabletsat import RunOptions, wanted
 
 if TYPE_CHECKING:

@@ -12,10 +12,9 @@ from cyclopts import Parameter
 
 from adcs.cli.options import tell, warn
 from adcs.complementary.names import Method, Rule
-from arrays.io.arguments import Count, Flag, Seed
 from arrays.io.errors import LARGEST, InputError
 from arrays.io.outputs import make_folder, refuse_file
-from magloc.cli.framework import QuietOptions, print_result, progress
+from magloc.cli.framework import Count, Flag, QuietOptions, Seed, print_result, progress
 
 if TYPE_CHECKING:
     from adcs.complementary.explicit import Gains

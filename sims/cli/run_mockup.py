@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import sims.experiments
 from adcs.cli.options import naming_options, tell, warn
-from arrays.io.arguments import Flag
 from arrays.io.outputs import refuse_file
-from magloc.cli.framework import QuietOptions, print_result, progress
+from magloc.cli.framework import Flag, QuietOptions, print_result, progress
 from sims.cli.mockup_options import MockupOptions, value_or
 from sims.cli.mockup_replay import ReplayOptions
 from sims.experiments.mockup_settings import METHODS, SETTLED_S, Method

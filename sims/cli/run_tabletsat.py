@@ -13,10 +13,9 @@ from cyclopts import Parameter
 import adcs
 import sims.experiments
 from adcs.cli.options import ScenarioOptions, tell, warn
-from arrays.io.arguments import Count, Flag, Seed
 from arrays.io.errors import InputError
 from arrays.io.outputs import make_folder, refuse_file
-from magloc.cli.framework import QuietOptions, print_result, progress
+from magloc.cli.framework import Count, Flag, QuietOptions, Seed, print_result, progress
 
 if TYPE_CHECKING:
     from adcs.io.scenario_files import AttitudeFile

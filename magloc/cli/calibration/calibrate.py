@@ -11,11 +11,10 @@ from cyclopts import Parameter
 
 import arrays
 import magloc
-from arrays.io.arguments import Flag
 from arrays.io.errors import InputError, naming
 from arrays.io.outputs import make_folder, refuse_file, refuse_unwritable
 from arrays.io.tables import aligned
-from magloc.cli.framework import CommonOptions, print_result
+from magloc.cli.framework import CommonOptions, Flag, print_result
 from magloc.cli.options import array_of_several, print_note, refuse_not_positive
 
 if TYPE_CHECKING:
