@@ -61,8 +61,7 @@ def write_picture(
 
 def write_sources(found: SourcesTrack, folder: Path) -> None:
     """Write track.png, as :func:`sources_figure`, and track.csv with a row for every source in every row."""
-    known = [track for point in found for track in point.tracks]
-    _write(folder, {"track": found.plot()}, columns_of_track(known, ids=[track.id for track in known]))
+    _write(folder, {"track": found.plot()}, found.columns())
 
 
 def _write(folder: Path, figures: Mapping[str, Figure], columns: Mapping[str, Column]) -> None:
