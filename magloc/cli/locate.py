@@ -122,8 +122,7 @@ def locate(
         raise InputError(f"--position: found it together with {other}, expected one of them.")
     if truth is not None and out is None:
         raise InputError("--truth: found no --out, expected a folder for the figures with it.")
-    if out is not None:
-        refuse_file(out, "--out")
+    refuse_file(out, "--out")
     used = known.array(array)
     rows = magloc.read_readings(readings, used, sensors=known.ids, still=wanted.average)
     if position is not None:

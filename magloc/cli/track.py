@@ -11,7 +11,7 @@ from cyclopts import Parameter
 
 import magloc
 from arrays.io.errors import InputError, naming
-from arrays.io.outputs import refuse_file, refuse_one_for_two
+from arrays.io.outputs import refuse_file, refuse_one_for_two, write_files
 from arrays.typing import Vector
 from magloc.cli.framework import CommonOptions, Flag, print_json_list, print_report, progress
 from magloc.cli.moments.known_path import (
@@ -202,8 +202,7 @@ def track(
     """
     if json and jsonl:
         raise InputError("--json: found it together with --jsonl, expected one of them.")
-    if out is not None:
-        refuse_file(out, "--out")
+    refuse_file(out, "--out")
     refuse_one_for_two({"--out": out, **maps.outputs})
     maps.refuse(known.place)
     outputs = TrackOutputs(json, jsonl, maps, out, truth, common.quiet)
@@ -326,9 +325,7 @@ def _write_sources(found: SourcesTrack, name: str, outputs: TrackOutputs, *, sin
     if not found.ids:
         raise _no_track(name, {point.status for point in found})
     if outputs.out is not None:
-        from magloc.plots.tracks import write_sources
-
-        write_sources(found, outputs.out)
+        write_files(outputs.out, [("track.png", found.plot()), ("track.csv", found.columns())])
     is_table = not (outputs.json or outputs.jsonl)
     if is_table:
         print(found.table())

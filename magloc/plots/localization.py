@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,19 +11,16 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from arrays.array import SensorArray
-from arrays.io.outputs import make_folder
+from arrays.io.outputs import write_files
 from magloc.localization.fit.export import FixColumns, columns_of_fixes, distances_from_truth, fix_columns
 from magloc.localization.fit.fixes import Fixes
 from magloc.localization.residuals import fix_residuals
 from magloc.plots import style
-from magloc.plots.style import write
 from magloc.readings import Readings
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 from arrays.typing import FloatArray
-
-_LOG = logging.getLogger(__name__)
 
 
 def fixes(
@@ -91,17 +87,15 @@ def write_pictures(
     folder: Path,
 ) -> None:
     """Write fixes.png and residuals.png, and the data behind them as fixes.csv and residuals.csv."""
-    make_folder(folder, "--out")
     left = _residuals_of(array, rows, fixes, ambient_T)
-    figure = fix_figure(fix_columns(fixes), _sensors_of(fixes, array, rows), truth_m)
-    write(figure, folder / "fixes.png", columns_of_fixes(fixes, truth_m))
     names = (f"{name}_residual_sigmas" for name in array.channel_names)
-    write(
-        residual_figure(left, array.channel_names, array.ids, array.channel_sensor),
-        folder / "residuals.png",
-        {"time_s": rows.time_s, **dict(zip(names, left.T, strict=True))},
-    )
-    _LOG.info(f"wrote fixes.png, fixes.csv, residuals.png and residuals.csv into {folder}/")
+    files = {
+        "fixes.png": fix_figure(fix_columns(fixes), _sensors_of(fixes, array, rows), truth_m),
+        "fixes.csv": columns_of_fixes(fixes, truth_m),
+        "residuals.png": residual_figure(left, array.channel_names, array.ids, array.channel_sensor),
+        "residuals.csv": {"time_s": rows.time_s, **dict(zip(names, left.T, strict=True))},
+    }
+    write_files(folder, files.items())
 
 
 def _residuals_of(array: SensorArray, rows: Readings, fixes: Fixes, ambient_T: FloatArray | None) -> FloatArray:
