@@ -6,7 +6,7 @@
 | Jacobians | scipy.differentiate |
 | the optimum | scipy.optimize.least_squares on magpylib's field |
 | covariance | oracles.fisher_information; scipy.differentiate on magpylib's field; scatter of the fits |
-| range interval | the compiled Locator |
+
 """
 
 from __future__ import annotations
@@ -35,12 +35,10 @@ from magloc.localization.fit.gauss_newton import (
     refine_moments,
     tangents,
 )
-from magloc.localization.uncertainty.range_profile import ranges_within
 from magloc.measurement.differences import DifferenceMeasurement
 from magloc.measurement.rows import whitened_model, whitenings_of
 from tests import oracles
 from tests.arrays.test_differences import random_array
-from tests.plain_locator import plain_locator
 
 SEEDS = st.integers(0, 2**32 - 1)
 AMBIENT = (2e-5, -1e-6, 4.5e-5)
@@ -547,51 +545,9 @@ class TestCovariance:
         assert np.isnan(covariances(problem, fits)).all()
 
 
-class TestLocator:
-    """One source and vector sensors: the same as the compiled search has."""
-
-    @pytest.mark.parametrize("geometry", ["tetrahedron", "cube", "irregular"])
-    def test_same_solution(self, geometry):
-        array = {"tetrahedron": tetrahedron(1.5), "cube": cube(1.0), "irregular": random_array(61, 7)}[geometry]
-        rng = np.random.default_rng(61)
-        p, m = random_sources(rng, 12, 1)
-        readings = noisy_readings(array, p, m, rng)
-        solutions = [fix.solutions[0] for fix in plain_locator(array).fit_rows(readings)]
-        problem, y = problem_of(array, readings)
-        start = np.stack([s.position_m for s in solutions])[:, None]
-        moment = np.stack([s.moment_Am2 for s in solutions])[:, None]
-        fits = refined_from(problem, y, 1.01 * start, moment)
-        covariance = covariances(problem, fits)
-        ends = ranges_within(problem, y, fits, 0, covariance)
-        for i, s in enumerate(solutions):
-            sigma = np.sqrt(np.diagonal(s.covariance))
-            assert fits.chi2[i] == pytest.approx(s.chi2, rel=1e-6, abs=1e-6)
-            assert (np.abs(problem.position(fits.q)[i, 0] - s.position_m) < 0.01 * sigma[:3]).all()
-            assert (np.abs(problem.moment(fits.q, fits.mu)[i, 0] - s.moment_Am2) < 0.01 * sigma[3:]).all()
-            assert_allclose(covariance[i] / np.outer(sigma, sigma), s.covariance / np.outer(sigma, sigma), atol=0.02)
-            low, high = s.range_interval_m[0]
-            assert_allclose(ends[i], [low, np.inf if high is None else high], rtol=0.01)
-
-
+@pytest.mark.usefixtures("instruction_set")
 class TestCompiledTwin:
-    """The compiled refinements end where the readable one does."""
-
-    @pytest.mark.parametrize("n_sources", [1, 2, 3])
-    @pytest.mark.parametrize("held", [False, True])
-    def test_optima(self, n_sources, held):
-        """From 10 cm beside the truth, and with the first source held at a range that is wrong."""
-        array = replace(array_of("vector", 31), common_field_T=5e-8)
-        rng = np.random.default_rng(31)
-        p, m = random_sources(rng, 8, n_sources)
-        problem, y = problem_of(array, noisy_readings(array, p, m, rng))
-        q = problem.homogeneous(p + 0.1 * rng.normal(size=p.shape))
-        mu, free = problem.scaled_moment(q, m), np.ones((n_sources, 3), dtype=bool)
-        free[0, 2] = not held
-        ours, twin = refine(problem, y, q, mu, free=free), damped_gauss_newton(problem, y, q, mu, free, 200)
-        assert twin.converged.all()
-        assert_allclose(ours.chi2, twin.chi2, rtol=1e-9, atol=1e-7)
-        assert_allclose(ours.q, twin.q, atol=1e-5)
-        assert_allclose(ours.mu, twin.mu, rtol=1e-2, atol=1e-2 * np.abs(twin.mu).max())
+    """The compiled refinements of moduli end where the readable one does; those of vectors: test_refinement."""
 
     @pytest.mark.parametrize("kind", ["scalar", "scalar in ambient", "mixed in ambient"])
     @pytest.mark.parametrize("held", [False, True])
