@@ -7,7 +7,7 @@ import pytest
 
 from arrays.array import SensorArray
 from magloc.localization.search.single_source import SingleSourceSearch
-from magloc.localization.uncertainty.covariance import known_of_one, known_of_one_compiled
+from magloc.localization.uncertainty.covariance import known_of, known_of_one_compiled
 from magloc.measurement.rows import whitened_rows
 from tests.magloc.localization.search.test_candidates import regime
 
@@ -24,7 +24,7 @@ class TestCompiledForm:
         array = SensorArray(array.sensors, noise_fraction=noise_fraction)
         (rows,) = whitened_rows(array, readings, None, 150)
         (optima,) = SingleSourceSearch(array).optima(rows)
-        expected, known = known_of_one(optima), known_of_one_compiled(optima)
+        expected, known = known_of(optima, np.ones(len(optima.rows), bool)), known_of_one_compiled(optima)
         np.testing.assert_allclose(known.position_m, expected.position_m, rtol=1e-12, atol=1e-12)
         np.testing.assert_allclose(known.moment_Am2, expected.moment_Am2, rtol=1e-12)
         np.testing.assert_allclose(known.weight, expected.weight, atol=1e-6)
