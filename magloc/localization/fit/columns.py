@@ -124,11 +124,10 @@ class Solutions:
             ranges=stacked("ranges", (most, widest, 2), np.nan),
         )
 
-    def chosen(self, index: IntArray | BoolArray, of_row: IntArray | None = None) -> Solutions:
-        """Some of the solutions, of other rows if these are named."""
+    def chosen(self, index: IntArray | BoolArray) -> Solutions:
+        """Some of the solutions."""
         at = np.arange(len(self))[index]
-        chosen = Solutions(**{name: value[at] for name, value in vars(self).items()})
-        return chosen if of_row is None else chosen.of_rows(of_row)
+        return Solutions(**{name: value[at] for name, value in vars(self).items()})
 
     def of_rows(self, of_row: IntArray) -> Solutions:
         """The same solutions, of other rows."""

@@ -23,6 +23,7 @@ from magloc.measurement.whitened import WhitenedModel
 PROMISE_ABSOLUTE = 1e-8
 PROMISE_RELATIVE = 1e-11
 LARGEST_STEP_RAD, LARGEST_DAMPING = 0.5, 1e9
+_LEAST_SINGULAR = 1e-13
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,11 +169,9 @@ class _NormalEquations:
         return step / self.norm, promised
 
 
-def refine_moments(
-    problem: WhitenedModel, y: FloatArray, q: FloatArray, mu: FloatArray, *, max_iterations: int = 60
-) -> JointFits:
+def refine_moments(problem: WhitenedModel, y: FloatArray, q: FloatArray, mu: FloatArray) -> JointFits:
     """Moments (b, K, 3) of sources that stay at q (b, K, 4): damped Gauss-Newton on whitened readings (b, C)."""
-    return refine(problem, y, q, mu, free=np.zeros((q.shape[1], 3), dtype=bool), max_iterations=max_iterations)
+    return refine(problem, y, q, mu, free=np.zeros((q.shape[1], 3), dtype=bool))
 
 
 def refine(
@@ -366,7 +365,7 @@ def scaled_jacobian(problem: WhitenedModel, q: FloatArray, mu: FloatArray) -> Fl
     return np.concatenate([by_position, by_moment], axis=-1).reshape(n_fits, -1, 6 * n_sources)
 
 
-def inverse_information(jacobian: FloatArray, least_singular: float = 1e-13) -> FloatArray:
+def inverse_information(jacobian: FloatArray) -> FloatArray:
     """``(JᵀJ)⁻¹`` (b, n, n) of whitened Jacobians (b, C, n) by singular values, columns scaled; NaN where singular."""
     n_fits, n_rows, n = jacobian.shape
     norm = np.linalg.norm(jacobian, axis=1)
@@ -376,7 +375,7 @@ def inverse_information(jacobian: FloatArray, least_singular: float = 1e-13) -> 
     safe = np.where(good[:, None], norm, 1.0)
     unit = np.where(good[:, None, None], jacobian, 0.0) / safe[:, None]
     singular, vt = np.linalg.svd(unit, full_matrices=False)[1:]
-    good &= singular[:, -1] > least_singular * singular[:, 0]
+    good &= singular[:, -1] > _LEAST_SINGULAR * singular[:, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
         rooted = vt / singular[..., None] / safe[:, None]
         inverse: FloatArray = rooted.transpose(0, 2, 1) @ rooted
