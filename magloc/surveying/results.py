@@ -186,6 +186,26 @@ class Survey:
         """Positions of all targets (K, 3)."""
         return np.array([target.position_m for target in self]).reshape(-1, 3)
 
+    @property
+    def entries(self) -> list[dict[str, Any]]:
+        """The targets as JSON and GeoJSON have them."""
+        return [
+            {
+                "id": target.id,
+                "position_m": target.position_m.tolist(),
+                "moment_Am2": target.moment_Am2.tolist(),
+                "covariance": target.covariance.tolist(),
+                "depth_m": target.depth_m,
+                "depth_interval95_m": list(target.depth_interval95_m),
+                "ellipse95_m": list(target.ellipse95[:2]),
+                "ellipse95_bearing_deg": target.ellipse95[2],
+                "iron_kg": list(target.iron_kg),
+                "significance": target.significance,
+                "flags": list(target.flags),
+            }
+            for target in self
+        ]
+
     def plot(self) -> Figure:
         """The anomaly from above, what the targets leave of it, and the targets."""
         return by_name("magloc.plots.surveys:survey_figure")(self)
@@ -198,15 +218,28 @@ class Survey:
         place : tuple of 3 floats
             Latitude, longitude [deg] and height [m] of the origin of the world frame, which is east, north, up.
         """
-        from magloc.surveying.files import geojson_of_survey
+        from arrays.io.world_maps import feature, feature_collection, world_place
 
-        return geojson_of_survey(self, place)
+        return feature_collection(
+            feature("Point", world_place(target.position_m, place), entry)
+            for target, entry in zip(self, self.entries, strict=True)
+        )
 
     def to_kml(self, place: Vector) -> str:
         """A placemark for every target, for maps of the world; ``place`` as of :meth:`to_geojson`."""
-        from magloc.surveying.files import kml_of_survey
+        from arrays.io.world_maps import kml, placemark, world_place
 
-        return kml_of_survey(self, place)
+        marks = []
+        for target in self:
+            low, high = target.depth_interval95_m
+            least, most = target.iron_kg
+            words = (
+                f"{target.depth_m:.2f} m below ground (95 %: {low:.2f} to {high:.2f} m), {target.strength_Am2:.3g} A·m²:"
+                f" {least:.2g} to {most:.2g} kg of iron, if a kilogram has {IRON_Am2_PER_KG[0]:g} to "
+                f"{IRON_Am2_PER_KG[1]:g} A·m². {' '.join(target.flags)}"
+            )
+            marks.append(placemark(target.id, words, [world_place(target.position_m, place)]))
+        return kml(marks)
 
     def table(self) -> str:
         """The targets as text."""
