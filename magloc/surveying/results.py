@@ -234,9 +234,9 @@ class Survey:
             low, high = target.depth_interval95_m
             least, most = target.iron_kg
             words = (
-                f"{target.depth_m:.2f} m below ground (95 %: {low:.2f} to {high:.2f} m), {target.strength_Am2:.3g} A·m²:"
-                f" {least:.2g} to {most:.2g} kg of iron, if a kilogram has {IRON_Am2_PER_KG[0]:g} to "
-                f"{IRON_Am2_PER_KG[1]:g} A·m². {' '.join(target.flags)}"
+                f"{target.depth_m:.2f} m below ground (95 %: {low:.2f} to {high:.2f} m),"
+                f" {target.strength_Am2:.3g} A·m²: {least:.2g} to {most:.2g} kg of iron, if a kilogram has"
+                f" {IRON_Am2_PER_KG[0]:g} to {IRON_Am2_PER_KG[1]:g} A·m². {' '.join(target.flags)}"
             )
             marks.append(placemark(target.id, words, [world_place(target.position_m, place)]))
         return kml(marks)
