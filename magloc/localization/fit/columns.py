@@ -11,8 +11,6 @@ import numpy as np
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.localization.fit.results import Intervals, Solution, Source, intervals_of
 
-_NUMBERS = ("of_row", "n_sources", "chi2", "dof", "weight", "iterations", "known_chi2", "n_known")
-
 
 @dataclass(frozen=True, eq=False)
 class Solutions:
@@ -103,12 +101,11 @@ class Solutions:
             return filled[0] if filled else cls.none()
         of_row = np.concatenate([part.of_row for part in filled])
         order = None if (of_row[1:] >= of_row[:-1]).all() else np.argsort(of_row, kind="stable")
-        most = max(part.position_m.shape[1] for part in filled)
-        size = max(part.covariance.shape[1] for part in filled)
-        widest = max(part.ranges.shape[2] for part in filled)
 
-        def stacked(name: str, shape: tuple[int, ...], empty: float) -> Any:
+        def stacked(name: str) -> Any:
             values = [getattr(part, name) for part in filled]
+            shape = tuple(map(max, zip(*(value.shape[1:] for value in values), strict=True)))
+            empty = np.nan if values[0].dtype.kind == "f" else 0
             result = np.full((sum(map(len, filled)), *shape), empty, dtype=values[0].dtype)
             begin = 0
             for value in values:
@@ -116,13 +113,7 @@ class Solutions:
                 begin += len(value)
             return result if order is None else result[order]
 
-        return cls(
-            **{name: stacked(name, (), 0) for name in _NUMBERS},
-            **{name: stacked(name, (most, 3), np.nan) for name in ("position_m", "moment_Am2")},
-            **{name: stacked(name, (most,), False) for name in ("gaussian", "merged")},
-            covariance=stacked("covariance", (size, size), np.nan),
-            ranges=stacked("ranges", (most, widest, 2), np.nan),
-        )
+        return cls(**{name: stacked(name) for name in vars(filled[0])})
 
     def chosen(self, index: IntArray | BoolArray) -> Solutions:
         """Some of the solutions."""

@@ -7,16 +7,15 @@ Several sources have no common range: each has its own ranges in each solution, 
 
 from __future__ import annotations
 
-import math
 from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import chdtrc, chdtri
+from scipy.special import chdtrc
 
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc import core
-from magloc.chi_square import energy_threshold
+from magloc.chi_square import energy_threshold, quantile
 from magloc.fields.dipole import MU0_OVER_4PI
 from magloc.levels import CERTAIN_WEIGHT, DELTA_CHI2_95, MISFIT
 from magloc.localization.fit.columns import Solutions
@@ -216,7 +215,7 @@ def known_of_one_compiled(optima: Optima) -> _Known:
 def _detection(n_differences: int, dof: int) -> tuple[float, FloatArray, FloatArray]:
     """Return χ² of a misfit, and what the detection of a signal tells of its strength: both columns ascending."""
     strength, left = left_of_detected(n_differences)
-    return float(chdtri(dof, MISFIT)) if dof > 0 else math.inf, strength, np.ascontiguousarray(-left)
+    return quantile(dof, MISFIT), strength, np.ascontiguousarray(-left)
 
 
 def _best_chi2(optima: Optima) -> FloatArray:
