@@ -1,5 +1,6 @@
 """Attitude of satellites and of anything else that turns: error-state Kalman, complementary and set-valued filters."""
 
+import magloc  # noqa: F401 - it refuses foreign packages of our names
 from arrays.io.lazy import lazy_names
 
 __getattr__, __dir__, __all__ = lazy_names(

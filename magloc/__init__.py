@@ -1,6 +1,10 @@
 """Magnetic models, and the estimation of magnetic dipoles from the differences between sensors."""
 
-from arrays.io.lazy import lazy_names
+from magloc.own_packages import refuse_foreign_packages
+
+refuse_foreign_packages()
+
+from arrays.io.lazy import lazy_names  # noqa: E402 - a foreign package would be an ImportError that explains nothing
 
 __getattr__, __dir__, __all__ = lazy_names(
     __name__,
@@ -15,7 +19,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "Fixes": "magloc.localization.fit.fixes",
         "FreeMotion": "magloc.tracking.multi_target.motion",
         "GradientTensor": "magloc.localization.gradient_tensor",
-        "IteratedExtendedKalmanFilter": "magloc.kalman",
+        "IteratedExtendedKalmanFilter": "magloc.state_space",
         "KnownMotion": "magloc.tracking.motion",
         "Locator": "magloc.localization.locator",
         "MatchedFilterDetector": "magloc.detection.matched_filter",

@@ -20,7 +20,6 @@ from magloc.directions import moments_on_sphere as moments_on_sphere
 from magloc.fields import dipole as dipole
 from magloc.fields import geomagnetic as geomagnetic
 from magloc.fields.body import equivalent_dipole as equivalent_dipole
-from magloc.kalman import IteratedExtendedKalmanFilter as IteratedExtendedKalmanFilter
 from magloc.live.rest import subtract_rest as subtract_rest
 from magloc.localization.fit.fixes import Fixes as Fixes
 from magloc.localization.fit.prior import SourcePrior as SourcePrior
@@ -45,6 +44,7 @@ from magloc.signature.path import PathError as PathError
 from magloc.signature.path import read_object_path as read_object_path
 from magloc.signature.signature import Signature as Signature
 from magloc.signature.signature import fit_signature as fit_signature
+from magloc.state_space import IteratedExtendedKalmanFilter as IteratedExtendedKalmanFilter
 from magloc.surveying.results import Survey as Survey
 from magloc.surveying.results import Target as Target
 from magloc.surveying.survey import survey as survey

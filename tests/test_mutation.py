@@ -134,6 +134,6 @@ def test_a_change_is_one_that_can_be_read_and_differs() -> None:
 @pytest.mark.slow
 def test_the_mirror_comes_first() -> None:
     reach = Reach()
-    assert reach.tests("magloc/kalman.py")[0] == "tests/magloc/test_kalman.py"
+    assert reach.tests("magloc/state_space.py")[0] == "tests/magloc/test_state_space.py"
     assert reach.tests("adcs/kalman/mekf.py")[0] == "tests/adcs/kalman/test_mekf.py"
-    assert "tests/magloc/test_kalman.py" not in reach.tests("adcs/kalman/mekf.py")
+    assert "tests/magloc/test_state_space.py" not in reach.tests("adcs/kalman/mekf.py")

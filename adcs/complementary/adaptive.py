@@ -6,20 +6,18 @@ See docs/theory/complementary-filters.md.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from adcs import quaternion
-from adcs.complementary.explicit import BLOCK, first_attitude, record_problem, turned
+from adcs.complementary.explicit import BLOCK, first_attitude, record_problem
 from adcs.satellite.vector_record import VectorRecord
 from arrays.io.errors import check_positive
 from arrays.typing import FloatArray
 from magloc import core
 from magloc.chi_square import normalised_square
-from magloc.navigation.rotations import cross_matrix
 
 
 @dataclass(frozen=True)
@@ -122,56 +120,3 @@ def adaptive_track(
     )
     core.run("adaptive_filter", work, track.smoothed_nis.size, block=BLOCK, chain=len(record))
     return track
-
-
-def adaptive_steps(
-    record: VectorRecord,
-    tuning: AdaptiveTuning = AdaptiveTuning(),
-    *,
-    q_start: ArrayLike = quaternion.IDENTITY,
-    run: int = 0,
-) -> Iterator[tuple[FloatArray, FloatArray, FloatArray]]:
-    """Readable reference of :func:`adaptive_track`: attitude, bias and covariance of one run at every instant.
-
-    Yields ``q`` (4,), ``bias`` (3,), ``covariance`` (6, 6).
-    """
-    shared = 0 if record.first_reference.shape[0] == 1 else run
-    q, bias, P, smoothed, growth = first_attitude(q_start), np.zeros(3), tuning.start_covariance, 1.0, 0.0
-    for i in range(len(record)):
-        if i > 0:
-            h = float(record.dt_s[i])
-            w = record.rate_rad_s[run, i] - bias
-            Phi = np.eye(6)
-            Phi[:3, :3] = quaternion.matrix(quaternion.exp(w * h)).T
-            Phi[:3, 3:] = -h * np.eye(3)
-            noise = np.repeat([tuning.attitude_noise_rad**2, tuning.bias_noise_rad_s**2 + growth**2], 3)
-            P = Phi @ P @ Phi.T + np.diag(noise) * h / record.usual_dt_s
-            q = turned(q, w * h, record.frame_rate_rad_s[shared, i] * h)
-        rows, residuals, variances = [], [], []
-        first, second = record.first_body[run, i], record.second_body[run, i]
-        for measured, reference, sigma in (
-            (first, record.first_reference[shared, i], tuning.first_sigma / np.linalg.norm(first)),
-            (second, record.second_reference[shared, i], tuning.second_sigma_rad),
-        ):
-            if np.isnan(measured).any():
-                continue
-            predicted = quaternion.rotate_back(q, reference / np.linalg.norm(reference))
-            # Two axes across the predicted vector.
-            across = np.linalg.svd(predicted[None])[2][1:]
-            rows.append(across @ cross_matrix(predicted))
-            residuals.append(across @ (measured / np.linalg.norm(measured)))
-            variances.append(np.full(2, sigma**2))
-        if rows:
-            H = np.column_stack([np.concatenate(rows), np.zeros((2 * len(rows), 3))])
-            nu = np.concatenate(residuals)
-            S = H @ P @ H.T + np.diag(np.concatenate(variances))
-            K = np.linalg.solve(S, H @ P).T
-            x = K @ nu
-            P = P - K @ S @ K.T
-            q = quaternion.normalised(quaternion.multiply(q, quaternion.exp(x[:3])))
-            bias = bias + x[3:]
-            nis = float(nu @ np.linalg.solve(S, nu)) / len(nu)
-            smoothed = tuning.memory * smoothed + (1.0 - tuning.memory) * nis
-        # Only readings show that the bias changes.
-        growth = tuning.growth_rad_s if rows and smoothed > tuning.threshold else 0.0
-        yield q, bias, P

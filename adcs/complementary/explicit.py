@@ -7,14 +7,14 @@ satellite, by its equations. Ours: the rate of the frame, unit vectors, gains, f
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from adcs import quaternion
-from adcs.complementary.outage import NO_SUBSTITUTE, Substitute, Substitution, delay_steps
+from adcs.complementary.names import Method
+from adcs.complementary.outage import NO_SUBSTITUTE, Substitution, delay_steps
 from adcs.satellite.vector_record import VectorRecord
 from arrays.typing import FloatArray
 from magloc import core
@@ -23,6 +23,7 @@ LARGEST_EIGENVALUE = 2.0
 """Of e against the error angle, for unit vectors: the eigenvalues are 1 ± |cos| of their angle, and 2."""
 WARNING_FRACTION = 0.9
 """Of the stability limit."""
+_MU = 1e-6  # added to the diagonal of the normal equations of the measured quaternion
 BLOCK = 20_000
 """Instants that one call of a kernel computes: some milliseconds."""
 
@@ -115,47 +116,20 @@ class ComplementaryTrack:
     q_measured: FloatArray  # (R, n, 4): measured quaternions, of the instant's readings; NaN of the explicit filter
 
 
-def explicit_error(
-    q: FloatArray, vectors: list[tuple[FloatArray, FloatArray]], weights: tuple[float, ...] = (1.0, 1.0)
-) -> FloatArray:
-    """Error angle e = Σ weight · v × A(q̂) v_reference.
-
-    ``q`` (4,): estimate, reference from body. ``vectors``: unit vectors (3,), NaN where missing. Returns (3,): body
-    axes [rad]: for two unit vectors Σ (E - vvᵀ) δθ of a small error δθ.
-    """
-    e = np.zeros(3)
-    for (body, reference), weight in zip(vectors, weights, strict=True):
-        if np.isfinite(body).all():
-            e = e + weight * np.cross(body, quaternion.rotate_back(q, reference))
-    return e
-
-
-def explicit_track(
+def complementary_track(
     record: VectorRecord,
     gains: Gains = BEST_GAINS,
     *,
+    method: Method = "explicit",
     q_start: ArrayLike = quaternion.IDENTITY,
     substitution: Substitution = NO_SUBSTITUTE,
 ) -> ComplementaryTrack:
-    """The explicit filter over whole records, compiled.
+    """Filter whole records with fixed gains, compiled.
 
-    ``q_start`` (4,): first estimate. ``substitution``: in place of a second vector that is missing. Raises
-    ValueError: the gains are beyond the stability limit, or the first estimate has no length.
-    """
-    return compiled_track(record, gains, q_start, substitution)
-
-
-def compiled_track(
-    record: VectorRecord,
-    gains: Gains,
-    q_start: ArrayLike,
-    substitution: Substitution,
-    gauss_newton_mu: float | None = None,
-) -> ComplementaryTrack:
-    """Call the compiled filter.
-
-    See :func:`explicit_track` and, with ``gauss_newton_mu``,
-    :func:`adcs.complementary.gauss_newton.gauss_newton_track`.
+    ``method``: ``explicit``, by the error angle Σ weight · v × A(q̂) v_reference, or ``gauss-newton``, by the angle to a
+    measured quaternion, which does not use the weights of the gains. ``q_start`` (4,): first estimate, and where the
+    first measured quaternion starts. ``substitution``: in place of a second vector that is missing. Raises ValueError:
+    the gains are beyond the stability limit, or the first estimate has no length.
     """
     gains.check(record.usual_dt_s)
     shape = (record.n_runs, len(record))
@@ -166,8 +140,8 @@ def compiled_track(
     work = core.problem(
         "complementary",
         record=record_problem(record),
-        is_gauss_newton=gauss_newton_mu is not None,
-        mu=gauss_newton_mu or 0.0,
+        is_gauss_newton=method == "gauss-newton",
+        mu=_MU,
         weights=(gains.first_weight, gains.second_weight),
         gains=gains.during(False),
         outage_gains=gains.during(True),
@@ -215,58 +189,3 @@ def first_attitude(q_start: ArrayLike) -> FloatArray:
     if not np.isfinite(q).all():
         raise ValueError("Input q_start must be quaternions with a length; instead received one without.")
     return q
-
-
-Correction = Callable[[FloatArray, list[tuple[FloatArray, FloatArray]]], FloatArray]
-
-
-def steps(
-    record: VectorRecord,
-    correction: Correction,
-    gains: Gains = BEST_GAINS,
-    *,
-    q_start: ArrayLike = quaternion.IDENTITY,
-    substitution: Substitution = NO_SUBSTITUTE,
-    run: int = 0,
-) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Readable reference of the compiled filters: (q̂, I) of one run at every instant.
-
-    ``correction``: error angle e of an estimate and the instant's two unit vectors, such as :func:`explicit_error` or
-    :class:`adcs.complementary.gauss_newton.MeasuredQuaternion`. ``gains``, ``q_start``, ``substitution``: as
-    :func:`explicit_track`. Yields ``q`` (4,), ``integral`` (3,).
-    """
-    shared = 0 if record.first_reference.shape[0] == 1 else run
-    q, integral, smooth = first_attitude(q_start), np.zeros(3), np.zeros(3)
-    line = Substitute(substitution, delay_steps(substitution, record.usual_dt_s))
-    counted = counted_s(record, gains)
-    for i in range(len(record)):
-        if i > 0:
-            body_rad = (record.rate_rad_s[run, i] + integral) * record.dt_s[i]
-            frame_rad = record.frame_rate_rad_s[shared, i] * record.dt_s[i]
-            line.turn(body_rad, frame_rad)
-            q = turned(q, body_rad, frame_rad)
-        first = _unit(record.first_body[run, i]), _unit(record.first_reference[shared, i])
-        second = _unit(record.second_body[run, i]), _unit(record.second_reference[shared, i])
-        outage = bool(np.isnan(second[0]).any())
-        e = correction(q, [first, line.vector(first) if outage else second])
-        kp, ki = gains.during(outage)
-        smooth = gains.boost_memory * smooth + (1.0 - gains.boost_memory) * e
-        if np.linalg.norm(smooth) > gains.boost_level_rad:
-            ki *= gains.boost
-        integral = integral + ki * counted[i] * e
-        line.store(first)
-        q = quaternion.normalised(quaternion.multiply(q, quaternion.exp(kp * counted[i] * e)))
-        yield q, integral
-
-
-def turned(q: FloatArray, body_rad: FloatArray, frame_rad: FloatArray) -> FloatArray:
-    """Attitude after a turn of the body and one of the reference frame, both against inertial space, rotation vectors.
-
-    Shapes (4,), (3,), (3,) -> (4,).
-    """
-    of_frame = quaternion.multiply(quaternion.exp(-frame_rad), q)
-    return quaternion.normalised(quaternion.multiply(of_frame, quaternion.exp(body_rad)))
-
-
-def _unit(v: FloatArray) -> FloatArray:
-    return v / np.linalg.norm(v)

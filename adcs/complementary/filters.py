@@ -12,8 +12,7 @@ from numpy.typing import ArrayLike
 
 from adcs import quaternion
 from adcs.complementary.adaptive import AdaptiveTuning, adaptive_track
-from adcs.complementary.explicit import BEST_GAINS, Gains, explicit_track
-from adcs.complementary.gauss_newton import gauss_newton_track
+from adcs.complementary.explicit import BEST_GAINS, Gains, complementary_track
 from adcs.complementary.heading import HeadingModel, heading_track, relative_heading, turned_to_north
 from adcs.complementary.inertial_magnetic import InertialMagneticRecord, check_units, prepare
 from adcs.complementary.names import MAGNETS, METHODS, Magnet, Method
@@ -110,8 +109,7 @@ def complementary_filter(
         deviations = np.sqrt(np.diagonal(adapted.covariance[0], axis1=-2, axis2=-1))
         sigma = {"attitude": deviations[:, :3], "gyro-bias": deviations[:, 3:]}
     else:
-        run = explicit_track if method == "explicit" else gauss_newton_track
-        found = run(record, _of_kind(settings, BEST_GAINS), q_start=start)
+        found = complementary_track(record, _of_kind(settings, BEST_GAINS), method=method, q_start=start)
         q, bias = found.q[0], -found.integral_rad_s[0]
     return AttitudeTrack(
         title=f"complementary filter, {method}",

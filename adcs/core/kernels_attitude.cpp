@@ -49,9 +49,13 @@ inline SmallMotion slope(const Body &body, double orbital_rate, const SmallMotio
   return {x.w + orbital_rate * orbit, body.inverse_inertia * (torque - gyroscopic_torque(body, x.w, {})), x.w};
 }
 
-inline FilterModel model_of(const magloc_mekf &p) {
-  FilterModel model = {
-      {matrix_at(p.inertia), matrix_at(p.inverse_inertia)}, vector_at(p.residual_dipole), (int)p.n_states, {}, {}};
+inline FilterModel model_of(const magloc_mekf &p, const Control *feedback) {
+  FilterModel model = {{matrix_at(p.inertia), matrix_at(p.inverse_inertia)},
+                       vector_at(p.residual_dipole),
+                       (int)p.n_states,
+                       {},
+                       {},
+                       feedback};
   for (int k = 0; k < Optional::count; ++k) model.place[k] = (int)p.place[k];
   for (int k = 0; k < Sensor::count; ++k) model.variance[k] = p.sigma[k] * p.sigma[k];
   return model;
@@ -170,7 +174,8 @@ MAGLOC_KERNEL(mekf_runs, mekf) {
   Workspace room(workspace);
   auto *filter = room.take<GatedFilter>(1);
   if (!workspace) return room.size();
-  const FilterModel model = model_of(p);
+  const Control feedback = {vector_at(p.attitude_gain), vector_at(p.rate_gain), 0.0, 0.0, {}};
+  const FilterModel model = model_of(p, p.has_feedback ? &feedback : nullptr);
   Gate gate = {p.gate_limit, {}, p.open_variance};
   for (int k = 0; k < Sensor::count; ++k) gate.patience[k] = p.patience[k];
   for (int64_t row = begin; row < end; ++row) {

@@ -1,5 +1,5 @@
-// Guaranteed ellipsoids of many runs. The readable reference, with the formulas, is adcs/ellipsoids: observer.py,
-// ellipsoid.py and strip.py.
+// Guaranteed ellipsoids of many runs. The readable reference, with the formulas, is
+// tests/adcs/ellipsoids/readable.py.
 #include "magloc/kernel.hpp"
 
 MAGLOC_BEGIN

@@ -11,17 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from adcs.ellipsoids.ellipsoid import (
-    Ellipsoid,
-    Outcome,
-    intersect_strip,
-    measurement_direction,
-    minimum_trace_sum,
-    shape_matrix,
-    sum_with_ellipsoid,
-    transformed,
-)
-from adcs.ellipsoids.strip import STEP_RULES, StepRule
+from adcs.ellipsoids.ellipsoid import Ellipsoid, measurement_direction, shape_matrix
+from adcs.ellipsoids.names import STEP_RULES, StepRule
 from arrays.io.errors import check_positive
 from arrays.typing import FloatArray
 from magloc import core
@@ -94,69 +85,8 @@ class BoundedSystem:
         return len(self.directions)
 
 
-def predict(system: BoundedSystem, ellipsoid: Ellipsoid, known_input: ArrayLike = 0.0) -> Ellipsoid:
-    """Set of the next state: A x + u + w for all x and w of their ellipsoids.
-
-    Parameters
-    ----------
-    known_input : array_like, shape (n,)
-        u.
-    """
-    mapped = transformed(ellipsoid, system.A, known_input)
-    return Ellipsoid(mapped.centre, minimum_trace_sum(mapped.shape, system.disturbance))
-
-
-@dataclass(frozen=True, eq=False)
-class Correction:
-    """Result of the readings of one instant."""
-
-    ellipsoid: Ellipsoid
-    bounds: FloatArray  # (m,): bounds that the readings do not contradict: to be used from now on
-    resets: int  # channels that contradicted the set
-
-
-def correct(
-    system: BoundedSystem,
-    ellipsoid: Ellipsoid,
-    readings: ArrayLike,
-    bounds: FloatArray,
-    *,
-    rule: StepRule = "optimal",
-    reinflation: FloatArray | None = None,
-) -> Correction:
-    """Set of the states that the readings of one instant allow, channel after channel.
-
-    Parameters
-    ----------
-    ellipsoid : Ellipsoid
-        Predicted set.
-    readings : array_like, shape (m,)
-        NaN where missing.
-    bounds : ndarray, shape (m,)
-        Bounds in force: ``system.bounds`` at first, then those of the correction before.
-    rule : {'optimal', 'tightened', 'lemma'}
-        See :func:`adcs.ellipsoids.ellipsoid.intersect_strip`.
-    reinflation : ndarray, shape (n, n), optional
-        Shape of an ellipsoid that is added to the set where a reading contradicts it.
-    """
-    bounds, resets = bounds.copy(), 0
-    for channel, y in enumerate(np.atleast_1d(np.asarray(readings, dtype=np.float64))):
-        if np.isnan(y):
-            continue
-        h = system.directions[channel]
-        update = intersect_strip(ellipsoid, h, float(y), float(bounds[channel]), rule)
-        if update.outcome is Outcome.INCONSISTENT:
-            if reinflation is not None:
-                ellipsoid = sum_with_ellipsoid(ellipsoid, reinflation)
-            bounds[channel] = max(abs(float(y - h @ ellipsoid.centre)), INFLATION * bounds[channel])
-            resets += 1
-            update = intersect_strip(ellipsoid, h, float(y), float(bounds[channel]), rule)
-        ellipsoid = update.ellipsoid
-    return Correction(ellipsoid, bounds, resets)
-
-
 class EllipsoidObserver:
-    """Observers of many runs of one system, compiled; :func:`predict` and :func:`correct` for every run.
+    """Sets that contain the states of many runs of one system for certain, compiled.
 
     Parameters
     ----------
@@ -166,8 +96,11 @@ class EllipsoidObserver:
     n_runs : int
         By default one.
     rule : {'optimal', 'tightened', 'lemma'}
+        ``optimal`` has the least trace for the strip of a reading as it is; ``tightened`` first narrows the strip to
+        where it touches the ellipsoid, which usually gives the smallest set (2 % above the true minimum in the plane,
+        on average); ``lemma`` is the source paper's simplified step.
     reinflation : array_like, shape (n, n), optional
-        See :func:`correct`.
+        Shape of an ellipsoid that is added to the set where a reading contradicts it.
 
     Attributes
     ----------

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adcs.ellipsoids.ellipsoid import Ellipsoid, quadratic_form, segment_shape
+from adcs.ellipsoids.names import StepRule
 from adcs.ellipsoids.observer import BoundedSystem, EllipsoidObserver
-from adcs.ellipsoids.strip import StepRule
 from arrays.io.errors import check_positive
 from arrays.typing import FloatArray
-from magloc.kalman import predict_square_root, scalar_update
+from magloc.state_space import predict, update
 
 IntArray = NDArray[np.int64]
 EARTH_MU_M3_S2 = 3.986004418e14
@@ -189,16 +189,15 @@ def kalman_track(
     noise_rad = float(system.bounds[0])
     eigenvalue, eigenvector = np.linalg.eigh(system.disturbance / 3.0)
     S_q = eigenvector * np.sqrt(np.maximum(eigenvalue, 0.0))
-    x, S = np.zeros(2), noise_rad * np.eye(2)
+    x, S, sigma_rad = np.zeros(2), noise_rad * np.eye(2), noise_rad / math.sqrt(3.0)
     means, roots = [x], [S]
     inputs = np.zeros((len(readings_rad), 2))
     if increments_rad is not None:
         inputs = increments_rad[:, [0, 2]] @ input_matrix().T
     for y, known_input in zip(readings_rad, inputs, strict=True):
-        x, S = system.A @ x + known_input, predict_square_root(S, system.A, S_q)
+        x, S = system.A @ x + known_input, predict(S, system.A, S_q)
         if not np.isnan(y):
-            h = system.directions[0]
-            x, S = scalar_update(x, S, h, float(y - h @ x), noise_rad**2 / 3.0)
+            x, S, _ = update(x, S, system.directions / sigma_rad, (y - system.directions @ x) / sigma_rad)
         means.append(x)
         roots.append(S)
     S_all = np.array(roots)

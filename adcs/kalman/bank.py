@@ -12,9 +12,8 @@ from adcs import quaternion
 from adcs.kalman.diagnostics import COLLINEAR, collinear_rows, unseen_torque_Nm, warnings_of
 from adcs.kalman.error_state import ALWAYS, AttitudeTracks, FilterSettings, Start, sensor_set, tuned_noise
 from adcs.kalman.initialisation import any_start, checked_start, first_told, vector_start
-from adcs.kalman.mekf import closed_loop_jacobian, run_filter, run_readable
+from adcs.kalman.mekf import run_filter
 from adcs.kalman.names import FILTERS, Filter, StartKind
-from adcs.kalman.results import sigma_by_state
 from adcs.kalman.smoother import smoothed
 from adcs.kalman.variants.constant_gain import run_constant_gain
 from adcs.kalman.variants.gyro_driven import run_reduced
@@ -187,7 +186,7 @@ def _track(
         states={state: values[0] for state, values in tracks.states.items()},
         used=tuple(used.sensors.split("+")),
         seen={name: seen[0] for name, seen in record.readings.seen.items()},
-        sigma={state: sigma[0] for state, sigma in sigma_by_state(tracks).items()},
+        sigma={state: sigma[0] for state, sigma in tracks.sigma_by_state.items()},
         nis=dict(zip(SENSORS, tracks.nis[0].T, strict=True)),
         q_orbital=q,
         warnings=warnings_of(record, tracks)[0],
@@ -232,7 +231,5 @@ def _estimated(record: Record, chosen: EstimatorSettings, start: Start) -> Attit
         return run_reduced(record, settings, start)
     if chosen.filter == "self-tuning":
         return run_self_tuned(record, settings, start)
-    if chosen.closed_loop_F:
-        return run_readable(record, settings, start, jacobian=closed_loop_jacobian)
-    tracks = run_filter(record, settings, start)
+    tracks = run_filter(record, settings, start, closed_loop_F=chosen.closed_loop_F)
     return smoothed(record, tracks) if chosen.filter == "smoother" else tracks

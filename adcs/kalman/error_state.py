@@ -65,6 +65,11 @@ class SensorSet:
         first = ALWAYS + sum(SIZES[name] for name in before)
         return slice(first, first + SIZES[state])
 
+    def by_state(self, error: FloatArray) -> dict[str, FloatArray]:
+        """Errors (..., N) or their standard deviations as (..., k) of each state; that of the attitude is an angle."""
+        always = {"attitude": 2.0 * error[..., :3], "rate": error[..., 3:6]}
+        return always | {state: error[..., self.place(state)] for state in self.states}
+
     def without(self, state: str) -> SensorSet:
         """The set without an optional state."""
         return replace(self, states=tuple(name for name in self.states if name != state))
@@ -406,6 +411,11 @@ class AttitudeTracks:
     def sigma(self) -> FloatArray:
         """Standard deviations of the error state, shape (runs, n, N)."""
         return np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1))
+
+    @property
+    def sigma_by_state(self) -> dict[str, FloatArray]:
+        """Standard deviations of the states that there are, shape (runs, n, k)."""
+        return self.settings.sensors.by_state(self.sigma)
 
     @property
     def definite(self) -> BoolArray:

@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 
 from adcs import quaternion
 from adcs.kalman.error_state import OPEN_RAD, RATE_RAD_S, FilterSettings, SensorSet, Start, joined_starts
-from adcs.kalman.gate.contest import turned_onto
 from adcs.kalman.mekf import deviations, run_filter, whole_start
 from adcs.quaternion import rotate_back
 from adcs.satellite.dynamics import absolute_rate
@@ -92,6 +91,19 @@ def vector_start(record: Record, settings: FilterSettings, rate_rad_s: float = R
     covariance[:, :3, :3] = np.linalg.inv(information)
     covariance[:, 3:, 3:] = rate_variance[:, None, None] * np.eye(3)
     return Start(quaternion.normalised(q), w, covariance)
+
+
+def turned_onto(q: FloatArray, body: FloatArray, reference: FloatArray) -> FloatArray:
+    """Attitude (runs, 4) after the shortest turn that makes a direction in body axes that of the reference frame."""
+    length = np.linalg.norm(body, axis=-1, keepdims=True) * np.linalg.norm(reference, axis=-1, keepdims=True)
+    there = quaternion.rotate_back(q, reference)
+    cosine = np.sum(body * there, axis=-1, keepdims=True) / length
+    turn = np.concatenate([1.0 + cosine, np.cross(body, there) / length], axis=-1)
+    # Half a turn is one about any axis across.
+    opposite = 1.0 + cosine[..., 0] < 1e-12
+    across = np.cross(body[opposite], np.eye(3)[np.argmin(np.abs(body[opposite]), axis=-1)])
+    turn[opposite] = np.insert(across, 0, 0.0, axis=-1)
+    return quaternion.normalised(quaternion.multiply(q, quaternion.normalised(turn)))
 
 
 def _calibration_deviation(settings: FilterSettings, length_T: FloatArray) -> FloatArray:

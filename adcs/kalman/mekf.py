@@ -6,26 +6,30 @@ See docs/theory/attitude-kalman-filters.md. Source: Ivanov, Ivlev, Karpenko, Ovc
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
 from adcs import quaternion
 from adcs.frames import turned
-from adcs.kalman.error_state import ALWAYS, SIZES, AttitudeTracks, FilterSettings, SensorSet, Start, State
-from adcs.kalman.gate.contest import FIELD, GYRO, SUN, Contest, Fit, begun, eased
-from adcs.kalman.mekf_runs import filter_runs
+from adcs.kalman.error_state import ALWAYS, SIZES, STATES, AttitudeTracks, FilterSettings, SensorSet, Start, State
 from adcs.quaternion import rotate_back
 from adcs.satellite import dynamics
 from adcs.satellite.sensors import SENSORS
-from adcs.satellite.telemetry import Record, is_read, part
+from adcs.satellite.telemetry import Record, is_read
 from arrays.typing import BoolArray, FloatArray
+from magloc import core
 from magloc.navigation.rotations import cross_matrix
 
-Jacobian = Callable[[Record, int, State], FloatArray]
-"""F (runs, 6, 6) of attitude and rate from record, row and state."""
+_COVARIANCES_A_CALL = 400_000
+"""Elements of covariances that one call computes: about ten milliseconds."""
+PATIENCE_S = 300.0
+"""A main hypothesis that has taken no reading of the sensor for so long loses against readings that agree, though no
+other sensor tells: what lasts as long is the truth."""
+PATIENT_READINGS = 10
+"""The same for a gyro's bias, which costs the attitude nothing, in instants. Also: a main hypothesis that takes as many
+readings of that sensor meanwhile is not wrong, and a sensor is back from a gap after as many of its intervals."""
 
 
 def first_state(settings: FilterSettings, start: Start) -> State:
@@ -59,17 +63,6 @@ def known_torque_jacobian(record: Record, row: int, state: State) -> FloatArray:
         around.gravity_s2[:, row],
         around.b_orbital_T[:, row],
         state.of("dipole") + record.torquers_Am2[:, row],
-    )
-
-
-def closed_loop_jacobian(record: Record, row: int, state: State) -> FloatArray:
-    """F of the source paper (``closed_loop_F``), wrong.
-
-    See :func:`adcs.satellite.dynamics.closed_loop_error_jacobian`.
-    """
-    satellite = record.satellite
-    return dynamics.closed_loop_error_jacobian(
-        satellite.body, satellite.control, state.q, state.w, quaternion.IDENTITY, record.environment.gravity_s2[:, row]
     )
 
 
@@ -114,9 +107,7 @@ def moved(record: Record, row: int, state: State) -> tuple[FloatArray, FloatArra
     return q, w
 
 
-def predicted(
-    record: Record, row: int, state: State, settings: FilterSettings, jacobian: Jacobian = known_torque_jacobian
-) -> tuple[State, FloatArray]:
+def predicted(record: Record, row: int, state: State, settings: FilterSettings) -> tuple[State, FloatArray]:
     """State one step after instant ``row`` before its readings, and Φ (runs, N, N): decay, and then motion."""
     step_s = float(record.steps_s[row])
     kept = settings.kept(step_s)
@@ -124,7 +115,7 @@ def predicted(
     state = replace(state, optional={**state.optional, **own}, P=kept[:, None] * state.P * kept)
     q, w = moved(record, row, state)
     ahead = replace(state, q=q, w=w)
-    F = 0.5 * (jacobian(record, row, state) + jacobian(record, row + 1, ahead))
+    F = 0.5 * (known_torque_jacobian(record, row, state) + known_torque_jacobian(record, row + 1, ahead))
     by_dipole = 0.5 * (acceleration_by_dipole(record, row, state) + acceleration_by_dipole(record, row + 1, ahead))
     Phi = transition(F, by_dipole, settings, step_s)
     P = Phi @ state.P @ Phi.mT + np.diag(settings.process_variance(step_s, record.dt_s))
@@ -233,130 +224,6 @@ def with_error(state: State, dx: FloatArray, used: SensorSet) -> State:
     return replace(state, q=quaternion.normalised(q), w=state.w + dx[:, 3:6], optional=optional)
 
 
-class Hypothesis(NamedTuple):
-    """A state of one run, predicted, with the covariance after some of the readings, and the correction (1, N) by them.
-
-    All readings of an instant are linearised at the predicted state.
-    """
-
-    state: State
-    dx: FloatArray
-    attitude_variance: float  # trace of that of δq, as predicted
-
-    @classmethod
-    def of(cls, state: State, dx: FloatArray) -> Hypothesis:
-        """Hypothesis before the readings of an instant, or before some of them."""
-        return cls(state, dx, float(np.trace(state.P[0, :3, :3])))
-
-    def with_reading(
-        self, record: Record, row: int, settings: FilterSettings, sensor: int
-    ) -> tuple[Hypothesis, Fit] | None:
-        """The hypothesis with one more reading, and how that fits; None where there is no reading."""
-        parts = residuals(record, row, self.state, settings.sensors)
-        residual, rows = next((residual, rows) for place, residual, rows in parts if place == sensor)
-        if not is_read(residual).all():
-            return None
-        sigma = deviations(record, settings)[sensor]
-        H = rows / sigma
-        nu = residual / sigma - (H @ self.dx[..., None])[..., 0]
-        S = H @ self.state.P @ H.mT + np.eye(3)
-        nis = float((nu @ np.linalg.solve(S[0], nu[0]))[0])
-        dx, P = joseph_update(self.state.P, H, nu)
-        around = record.environment
-        model = {FIELD: around.b_orbital_T, SUN: around.sun_orbital}.get(sensor)
-        length = 0.0 if model is None else float(np.linalg.norm(model[0, row]))
-        fit = Fit(nis, eased(nis, sigma**2, length, self.attitude_variance), float(np.linalg.slogdet(S[0])[1]))
-        return self._replace(state=replace(self.state, P=P), dx=self.dx + dx), fit
-
-    def corrected(self, used: SensorSet) -> State:
-        """State with the correction in it."""
-        return with_error(self.state, self.dx, used)
-
-
-class _Readable:
-    """Filter of one run with its gate, instant by instant."""
-
-    def __init__(self, record: Record, settings: FilterSettings, start: Start, jacobian: Jacobian) -> None:
-        self.record, self.settings, self.jacobian = record, settings, jacobian
-        self.main, self.second = first_state(settings, start), None
-        self.contest = Contest(settings, record.dt_s)
-        n = record.momentum_Nms.shape[1]
-        self.nis, self.log_det = np.full((2, 1, n, len(SENSORS)), np.nan)
-        self.rejected = np.zeros((1, n, len(SENSORS)), dtype=np.bool_)
-
-    second: State | None
-
-    def state_of(self, row: int) -> State:
-        """State after the readings of an instant, from that of the instant before."""
-        if row:
-            ahead = self.record, row - 1
-            self.main = predicted(*ahead, self.main, self.settings, self.jacobian)[0]
-            if self.second is not None:
-                self.second = predicted(*ahead, self.second, self.settings, self.jacobian)[0]
-        self._correct(row)
-        return self.main
-
-    def _correct(self, row: int) -> None:
-        settings, used, contest = self.settings, self.settings.sensors, self.contest
-        contest.row = row
-        zero = np.zeros((1, used.size))
-        main = Hypothesis.of(self.main, zero)
-        second = None if self.second is None else Hypothesis.of(self.second, zero)
-        for name in used.sensors.split("+"):
-            sensor = SENSORS.index(name)
-            tried = main.with_reading(self.record, row, settings, sensor)
-            if tried is None:
-                continue
-            with_it, fits = tried
-            other = None if second is None else second.with_reading(self.record, row, settings, sensor)
-            use, use_second = contest.decided(sensor, fits, None if other is None else other[1])
-            self.nis[0, row, sensor], self.log_det[0, row, sensor] = fits.nis, fits.log_determinant
-            self.rejected[0, row, sensor] = not use
-            if not use and contest.may_begin(sensor, both=self._both(row)):
-                state = begun(self.record, row, main.state, settings, sensor)
-                first = Hypothesis.of(state, main.dx if sensor == GYRO else zero)
-                other, use_second = first.with_reading(self.record, row, settings, sensor), True
-                contest.begin(sensor)
-            contest.read(sensor)
-            main = with_it if use else main
-            second = other[0] if use_second and other is not None else second
-        self.main = main.corrected(used)
-        self.second = None if second is None else second.corrected(used)
-        if self.second is not None:
-            verdict = contest.verdict()
-            if verdict:
-                self.main = self.second
-            if verdict is not None:
-                contest.end(believed=verdict)
-                self.second = None
-
-    def _both(self, row: int) -> bool:
-        """Whether field and Sun are in use, and read at an instant."""
-        used, readings = self.settings.sensors, self.record.readings
-        read = is_read(readings.field_T[0, row]) and is_read(readings.sun[0, row])
-        return used.magnetometer and used.sun and bool(read)
-
-
-def run_readable(
-    record: Record, settings: FilterSettings, start: Start, jacobian: Jacobian = known_torque_jacobian
-) -> AttitudeTracks:
-    """Filter of whole runs in NumPy, the reference of :func:`run_filter`.
-
-    ``jacobian``: :func:`known_torque_jacobian`, or :func:`closed_loop_jacobian` to reproduce the source paper.
-    """
-    check_start(record, start)
-    tracks = []
-    for run in range(len(start.q)):
-        only = np.array([run])
-        one = _Readable(part(record, only), settings, start.of_runs(only), jacobian)
-        states = [one.state_of(row) for row in range(record.momentum_Nms.shape[1])]
-        tracks.append(collected(settings, states, one.nis, one.rejected, one.log_det))
-    names = ("q", "w", "covariance", "nis", "rejected", "log_det")
-    whole = {name: np.concatenate([getattr(one, name) for one in tracks]) for name in names}
-    optional = {name: np.concatenate([one.optional[name] for one in tracks]) for name in settings.sensors.states}
-    return AttitudeTracks(settings, optional=optional, **whole)
-
-
 def collected(
     settings: FilterSettings,
     states: list[State],
@@ -387,12 +254,93 @@ def check_start(record: Record, start: Start) -> None:
             raise ValueError(f"Input start.{name} must be finite with shape {shape}; instead received {values.shape}.")
 
 
-def run_filter(record: Record, settings: FilterSettings, start: Start) -> AttitudeTracks:
+def run_filter(
+    record: Record, settings: FilterSettings, start: Start, *, closed_loop_F: bool = False
+) -> AttitudeTracks:
     """Filter of whole runs, compiled; runs are shared out among threads.
 
     ``record``: of any number of runs, such as :class:`sims.attitude.simulation.AttitudeRuns`. ``start``: one for
-    every run: :func:`start_near`, or :mod:`adcs.kalman.initialisation`. Raises ValueError: the start does not have
-    as many runs as the record.
+    every run: :func:`start_near`, or :mod:`adcs.kalman.initialisation`. ``closed_loop_F``: the source paper's Jacobian,
+    as if the control saw the true state: its filters are overconfident. Raises ValueError: the start does not have as
+    many runs as the record.
     """
     check_start(record, start)
-    return filter_runs(record, settings, first_state(settings, start), deviations(record, settings))
+    used, around, readings = settings.sensors, record.environment, record.readings
+    first, sigma = first_state(settings, start), deviations(record, settings)
+    runs, n = record.momentum_Nms.shape[:2]
+    q, w, optional = np.empty((runs, n, 4)), np.empty((runs, n, 3)), np.empty((runs, n, used.size - ALWAYS))
+    covariance, (nis, log_det) = np.empty((runs, n, used.size, used.size)), np.full((2, runs, n, len(SENSORS)), np.nan)
+    rejected = np.zeros(nis.shape, dtype=np.bool_)
+    body = record.satellite.body
+    each_instant = {
+        "momentum": record.momentum_Nms,
+        "wheel_torque": record.wheel_torque_Nm,
+        "torquers": record.torquers_Am2,
+        "orbital_rate": around.orbital_rate_rad_s,
+        "gravity": around.gravity_s2,
+        "field_model": around.b_orbital_T,
+        "sun_model": around.sun_orbital,
+        "star": readings.star,
+        "star_whitening": readings.star_whitening,
+        "gyro": readings.gyro_rad_s,
+        "field": readings.field_T,
+        "sun": readings.sun,
+    }
+    for name, values in each_instant.items():
+        if values.shape[:2] != (runs, n) or len(around.time_s) != n:
+            raise ValueError(
+                f"Input record must have {name} of {runs} runs and {n} instants; instead received {values.shape}."
+            )
+    inputs = {
+        **each_instant,
+        "inertia": body.inertia_kgm2,
+        "inverse_inertia": body.inverse,
+        "residual_dipole": body.residual_dipole_Am2,
+        "attitude_gain": record.satellite.control.attitude_gain_Nm,
+        "rate_gain": record.satellite.control.rate_gain_Nms,
+        "dt": record.steps_s,
+        "first_q": first.q,
+        "first_w": first.w,
+        "first_optional": np.concatenate([np.zeros((runs, 0)), *first.optional.values()], axis=1),
+        "first_covariance": first.P,
+        "sigma": sigma,
+        "kept": settings.kept(record.steps_s[:, None]),
+        "added_variance": settings.process_variance(record.steps_s[:, None], record.dt_s),
+        "open_variance": settings.open_variance,
+    }
+    places = [_begins(used, state, part) for state in STATES for part in range(SIZES[state] // 3)]
+    fields: dict[str, Any] = dict(
+        n_runs=runs,
+        n_instants=n,
+        n_states=used.size,
+        has_feedback=closed_loop_F,
+        used=np.array([used.star, used.gyro, used.magnetometer, used.sun], dtype=np.uint8),
+        place=np.array(places, dtype=np.int64),
+        gate_limit=settings.gate_limit,
+        patience=np.array([patience(sensor, record.dt_s) for sensor in range(len(SENSORS))], dtype=np.int64),
+        q=q,
+        w=w,
+        optional=optional,
+        covariance=covariance,
+        nis=nis,
+        log_determinant=log_det,
+        rejected=rejected.view(np.uint8),
+        **{name: np.ascontiguousarray(values, dtype=np.float64) for name, values in inputs.items()},
+    )
+    work = core.problem("mekf", **fields)
+    block = _COVARIANCES_A_CALL // used.size**2
+    core.run("mekf_runs", work, runs * n, block=block, chain=n * max(1, block // max(1, n)))
+    parts = np.split(optional, np.cumsum([SIZES[state] for state in used.states]), axis=-1)
+    return AttitudeTracks(
+        settings, q, w, dict(zip(used.states, parts, strict=False)), covariance, nis, rejected, log_det
+    )
+
+
+def patience(sensor: int, dt_s: float) -> int:
+    """Instants after which a hypothesis that a reading of a sensor began is believed though no other sensor tells."""
+    return PATIENT_READINGS if SENSORS[sensor] == "gyro" else round(PATIENCE_S / dt_s)
+
+
+def _begins(used: SensorSet, state: str, part: int) -> int:
+    """Where three numbers of an optional state begin in the error state; -1 where the set does not have it."""
+    return used.place(state).start + 3 * part if state in used.states else -1

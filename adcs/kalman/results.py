@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from adcs.kalman.error_state import AttitudeTracks, SensorSet
 from arrays.typing import FloatArray
 
 
@@ -38,17 +37,6 @@ SHOWN = {
     "field-gain": Shown("field_gain_{}_percent", 100.0, "%", "gains of the magnetometer", _ELEMENTS),
 }
 STATE_COLUMNS = tuple(column for shown in SHOWN.values() for column in shown.columns)
-
-
-def by_state(error: FloatArray, used: SensorSet) -> dict[str, FloatArray]:
-    """Errors (..., N) or their standard deviations as (..., k) of each state; that of the attitude is of the angle."""
-    always = {"attitude": 2.0 * error[..., :3], "rate": error[..., 3:6]}
-    return always | {state: error[..., used.place(state)] for state in used.states}
-
-
-def sigma_by_state(tracks: AttitudeTracks) -> dict[str, FloatArray]:
-    """Standard deviations of the states that there are, shape (runs, n, k)."""
-    return by_state(tracks.sigma, tracks.settings.sensors)
 
 
 def in_units(states: Mapping[str, FloatArray]) -> FloatArray:

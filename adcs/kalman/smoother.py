@@ -11,23 +11,22 @@ import numpy as np
 
 from adcs import quaternion
 from adcs.kalman.error_state import AttitudeTracks, SensorSet, State
-from adcs.kalman.mekf import Jacobian, collected, known_torque_jacobian, predicted, with_error
+from adcs.kalman.mekf import collected, predicted, with_error
 from adcs.satellite.telemetry import Record
 from arrays.typing import FloatArray
 
 
-def smoothed(record: Record, estimates: AttitudeTracks, jacobian: Jacobian = known_torque_jacobian) -> AttitudeTracks:
+def smoothed(record: Record, estimates: AttitudeTracks) -> AttitudeTracks:
     """Smoothed estimates of whole runs.
 
-    ``estimates``: of :func:`adcs.kalman.mekf.run_filter`, or of its readable twin. ``jacobian``: that of the filter.
-    Returns: ``nis`` is that of the filter.
+    ``estimates``: of :func:`adcs.kalman.mekf.run_filter`. Returns: ``nis`` is that of the filter.
     """
     settings, n = estimates.settings, estimates.q.shape[1]
     later = estimates.at(n - 1)
     states = [later]
     for row in reversed(range(n - 1)):
         state = estimates.at(row)
-        ahead, Phi = predicted(record, row, state, settings, jacobian)
+        ahead, Phi = predicted(record, row, state, settings)
         # States of mixed units: solve with the correlations.
         scale = np.sqrt(np.diagonal(ahead.P, axis1=-2, axis2=-1))
         correlation = ahead.P / (scale[:, :, None] * scale[:, None, :])

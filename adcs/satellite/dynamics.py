@@ -201,37 +201,6 @@ def step(
     )
 
 
-def commanded_torque(
-    body: RigidBody,
-    control: WheelControl,
-    q: ArrayLike,
-    w: ArrayLike,
-    momentum_Nms: ArrayLike,
-    q_reference: ArrayLike,
-    orbital_rate_rad_s: ArrayLike,
-    dt_s: float,
-) -> FloatArray:
-    r"""Wheel torque :math:`\dot k = K_\lambda\lambda + K_\omega\omega_{rel} - \omega\times(J\omega + k)`, limited.
-
-    λ is the vector part of :math:`q_r^*\circ q`, with the sign of the shorter way, for a reference that rests in the
-    orbital frame. The torque is limited, and then the momentum after the step.
-
-    ``q``, ``w`` (..., 4), (..., 3): attitude and rate as the controller knows them: the estimate.
-    ``momentum_Nms`` (..., 3): k. ``q_reference`` (..., 4): wanted attitude, orbital from body.
-    ``orbital_rate_rad_s`` (...). ``dt_s``: how long the torque will be held. Returns (..., 3): [N·m].
-    """
-    k = np.asarray(momentum_Nms, dtype=np.float64)
-    w = np.asarray(w, dtype=np.float64)
-    wanted = (
-        control.attitude_gain_Nm * quaternion.error_vector(q_reference, q)
-        + control.rate_gain_Nms * relative_rate(q, w, orbital_rate_rad_s)
-        - np.cross(w, w @ body.inertia_kgm2 + k)
-    )
-    limited = np.clip(wanted, -control.torque_limit_Nm, control.torque_limit_Nm)
-    limit = control.momentum_limit_Nms
-    return (np.clip(k + limited * dt_s, -limit, limit) - k) / dt_s
-
-
 def error_jacobian(
     body: RigidBody,
     q: ArrayLike,
@@ -256,51 +225,14 @@ def error_jacobian(
     ``dipole_Am2`` (..., 3): besides the residual dipole of the body.
     """
     w = np.asarray(w, dtype=np.float64)
-    J = body.inertia_kgm2
-    b_body = rotate_back(q, b_orbital_T)
-    dipole: FloatArray = 2.0 * cross_matrix(body.residual_dipole_Am2 + np.asarray(dipole_Am2)) @ cross_matrix(b_body)
-    by_attitude = body.inverse @ (_gradient_part(body, q, gravity_s2) + dipole)
-    total = w @ J + np.asarray(momentum_Nms, dtype=np.float64)
-    return _error_matrix(w, by_attitude, body.inverse @ (cross_matrix(total) - cross_matrix(w) @ J))
-
-
-def closed_loop_error_jacobian(
-    body: RigidBody, control: WheelControl, q: ArrayLike, w: ArrayLike, q_reference: ArrayLike, gravity_s2: ArrayLike
-) -> FloatArray:
-    r"""F of the error as the source paper has it, as if the control saw the true state (``closed_loop_F``).
-
-    .. math:: F_{21} = J^{-1}\left(6\frac{\mu}{r^3}F_g - K_\lambda W_\lambda\right), \quad F_{22} = -J^{-1}K_\omega
-
-    with :math:`W_\lambda = \lambda_0 E + W(\lambda)`. The torque is computed from the estimate, so this is not the F of
-    an estimate's error, and filters with it are overconfident; even as the Jacobian of the closed loop it lacks
-    :math:`2J^{-1}K_\omega W(A\omega_o)` in F21. It is here to reproduce the paper; see :func:`error_jacobian`.
-
-    ``q`` (..., 4). ``w`` (..., 3). ``q_reference`` (..., 4): wanted attitude, orbital from body. ``gravity_s2`` (...).
-    Returns (..., 6, 6).
-    """
-    relative = quaternion.multiply(quaternion.conjugate(q_reference), q)
-    relative = np.where(relative[..., :1] < 0.0, -relative, relative)
-    W_lambda = relative[..., 0, None, None] * np.eye(3) + cross_matrix(relative[..., 1:])
-    feedback = control.attitude_gain_Nm[:, None] * W_lambda
-    return _error_matrix(
-        np.asarray(w, dtype=np.float64),
-        body.inverse @ (_gradient_part(body, q, gravity_s2) - feedback),
-        -body.inverse * control.rate_gain_Nms,
-    )
-
-
-def _gradient_part(body: RigidBody, q: ArrayLike, gravity_s2: ArrayLike) -> FloatArray:
-    """6 (μ/r³) F_g, torque of the gravity gradient by δq, shape (..., 3, 3)."""
-    eta = rotate_back(q, _E3)
+    J, eta, b_body = body.inertia_kgm2, rotate_back(q, _E3), rotate_back(q, b_orbital_T)
     W = cross_matrix(eta)
-    J = body.inertia_kgm2
-    return 6.0 * np.asarray(gravity_s2)[..., None, None] * (W @ J @ W - cross_matrix(turned(J, eta)) @ W)
-
-
-def _error_matrix(w: FloatArray, by_attitude: FloatArray, by_rate: FloatArray) -> FloatArray:
-    F = np.zeros((*np.broadcast_shapes(w.shape[:-1], by_attitude.shape[:-2], by_rate.shape[:-2]), 6, 6))
+    gradient = 6.0 * np.asarray(gravity_s2)[..., None, None] * (W @ J @ W - cross_matrix(turned(J, eta)) @ W)
+    dipole: FloatArray = 2.0 * cross_matrix(body.residual_dipole_Am2 + np.asarray(dipole_Am2)) @ cross_matrix(b_body)
+    total = w @ J + np.asarray(momentum_Nms, dtype=np.float64)
+    F = np.zeros((*np.broadcast_shapes(w.shape[:-1], gradient.shape[:-2], dipole.shape[:-2]), 6, 6))
     F[..., :3, :3] = -cross_matrix(w)
     F[..., :3, 3:] = 0.5 * np.eye(3)
-    F[..., 3:, :3] = by_attitude
-    F[..., 3:, 3:] = by_rate
+    F[..., 3:, :3] = body.inverse @ (gradient + dipole)
+    F[..., 3:, 3:] = body.inverse @ (cross_matrix(total) - cross_matrix(w) @ J)
     return F

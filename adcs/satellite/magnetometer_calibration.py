@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,12 +23,9 @@ from adcs.frames import turned
 from adcs.satellite.satellite import Satellite
 from adcs.satellite.telemetry import Telemetry
 from arrays.io.errors import check_not_negative, check_positive
-from arrays.io.lazy import by_name
+from arrays.io.results import Drawn
 from arrays.typing import BoolArray, FloatArray
 from magloc.least_squares import damped_step, minimise
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 Attitude = Literal["none", "orbital"]
 """What is known of the attitude: nothing, or that it is constant in the frame of the model's field."""
@@ -100,7 +97,7 @@ class MagnetometerPrior:
 
 
 @dataclass(frozen=True, eq=False)
-class MagnetometerCalibration:
+class MagnetometerCalibration(Drawn):
     """Calibration of a magnetometer.
 
     Attributes
@@ -124,6 +121,8 @@ class MagnetometerCalibration:
     used : ndarray of bool, shape (n,)
         Rows that are there and fit the others.
     """
+
+    figure = "adcs.plots.magnetometers:magnetometer_figure"
 
     bias_T: FloatArray
     gain: FloatArray
@@ -164,10 +163,6 @@ class MagnetometerCalibration:
     def applied(self, readings_T: ArrayLike) -> FloatArray:
         """Fields (..., 3) of readings (..., 3)."""
         return turned(np.linalg.inv(np.eye(3) + self.gain), np.asarray(readings_T, dtype=np.float64) - self.bias_T)
-
-    def plot(self) -> Figure:
-        """What is left of every row, and what is found of every number, against the prior."""
-        return by_name("adcs.plots.magnetometers:magnetometer_figure")(self)
 
 
 class _Rows(NamedTuple):

@@ -8,14 +8,13 @@ all that is not the source. A nuisance x that enters the readings as N x, with a
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from arrays.array import SensorArray
 from arrays.io.errors import _vectors
-from arrays.io.lazy import by_name
+from arrays.io.results import Drawn
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.fields.multipole import assumed_body_lengths, check_body_length
 from magloc.localization.model_errors import body_errors
@@ -25,15 +24,12 @@ from magloc.measurement.pose import pose_errors_at_rest
 from magloc.measurement.rows import ambient_fields, check_magnitudes, whitenings_of
 from magloc.measurement.whitened import WhitenedModel
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 LOST = 1e-6
 """A combination of parameters is not estimable if the readings tell of it so much less than of others."""
 
 
 @dataclass(frozen=True, eq=False)
-class Bounds:
+class Bounds(Drawn):
     """Least standard deviations of any unbiased estimate from one set of readings, over leading axes.
 
     Attributes
@@ -65,6 +61,8 @@ class Bounds:
     (array([0.08, 0.89]), (2, 6, 6))
     """
 
+    figure = "magloc.plots.bounds:bounds_figure"
+
     position_m: FloatArray
     moment_Am2: FloatArray
     range_m: FloatArray
@@ -74,10 +72,6 @@ class Bounds:
     sigma_position_m: FloatArray
     sigma_moment_Am2: FloatArray
     rank: IntArray
-
-    def plot(self) -> Figure:
-        """σ of range, bearing, position and moment over the distance of the sources."""
-        return by_name("magloc.plots.bounds:bounds_figure")(self)
 
     @property
     def is_regular(self) -> BoolArray:

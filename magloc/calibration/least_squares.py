@@ -18,6 +18,7 @@ from magloc.least_squares import Optimum, damped_step, minimise
 
 # Enough to hold what no reading shows, too little to be taken for information.
 _NO_DAMPING, _LAST_DAMPING = 1e-20, 1e-2
+_LEAST_SHARE = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,8 +125,12 @@ class Fit:
 
 
 def minimised(problem: Problem, start: State, *, tolerance: float = 1e-3, max_iterations: int = 100) -> Optimum[Fit]:
-    """Levenberg-Marquardt until a step promises to lower χ² by less than the tolerance."""
-    return minimise(Fit(problem, start), lambda _: tolerance, last_damping=_LAST_DAMPING, max_iterations=max_iterations)
+    """Levenberg-Marquardt until a step promises to lower χ² by less than the tolerance or a part in 10¹⁰."""
+
+    def least(fit: Fit) -> float:
+        return max(tolerance, _LEAST_SHARE * fit.cost)
+
+    return minimise(Fit(problem, start), least, last_damping=_LAST_DAMPING, max_iterations=max_iterations)
 
 
 def moved(problem: Problem, state: State, step: FloatArray, of_rows: FloatArray) -> State:

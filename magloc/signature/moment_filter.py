@@ -18,17 +18,10 @@ from scipy.special import chdtri
 
 from arrays.io.errors import InputError
 from arrays.typing import BoolArray, FloatArray
-from magloc.kalman import (
-    IteratedUpdate,
-    block_update,
-    iterated_update,
-    normalised_innovation_squared,
-    predict_square_root,
-    smoothing_gain,
-)
 from magloc.levels import CONTRADICTION
 from magloc.measurement.nuisances import SensorErrors
 from magloc.signature.path import PathError
+from magloc.state_space import IteratedUpdate, iterated_update, predict, smoothing_gain, update
 from magloc.tracking.measurement import RowMeasurement
 from magloc.tracking.motion import N_SOURCE
 
@@ -153,7 +146,7 @@ class MomentModel:
         H = np.zeros((row.z.size, x.size))
         for k, J in enumerate(self.sources_of_state(i, x)):
             others_T = np.delete(fields_T, k, axis=0).sum(axis=0) if fields_T else None
-            H += row.source_jacobian(sources[k], others_T) @ J
+            H += row.along(sources[k], J, others_T)
         H[:, self.moment.stop :] = row.effect
         return H
 
@@ -218,7 +211,7 @@ def filtered(model: MomentModel, *, at: Sequence[FloatArray] | None = None, gate
     scale, contradictions = UNKNOWN * model.scale, 0
     for i, row in enumerate(model.rows):
         F, S_q = model.step(x, i) if i else (np.ones(x.size), np.zeros((x.size, 0)))
-        x, S = F * x, predict_square_root(S, np.diag(F), S_q)
+        x, S = F * x, predict(S, np.diag(F), S_q)
         if not row.z.size:
             steps.append(MomentStep(x, S, x, S, F, S_q, math.nan, "predicted", 0))
             continue
@@ -230,7 +223,7 @@ def filtered(model: MomentModel, *, at: Sequence[FloatArray] | None = None, gate
                 unknown = np.zeros((x.size, model.n_parameters))
                 unknown[model.moment] = scale * np.eye(model.n_parameters)
                 S_q = np.concatenate([S_q, unknown], axis=1)
-                S = predict_square_root(S, np.eye(x.size), unknown)
+                S = predict(S, np.eye(x.size), unknown)
                 update, status = _updated(model, i, x, S, None if at is None else at[i]), "acquired"
         if status == "outlier":
             steps.append(MomentStep(x, S, x, S, F, S_q, update.nis, status, 0))
@@ -246,13 +239,12 @@ def filtered(model: MomentModel, *, at: Sequence[FloatArray] | None = None, gate
 def _updated(model: MomentModel, i: int, x: FloatArray, S: FloatArray, at: FloatArray | None) -> IteratedUpdate:
     """A row's update, linearised where it leads, or at a state."""
     z = model.rows[i].z
-    ones = np.ones(z.size)
     if at is None:
         return iterated_update(
             x,
             S,
             z,
-            ones,
+            np.ones(z.size),
             lambda state: model.predicted(i, state),
             lambda state: model.jacobian(i, state),
             tolerance=_TOLERANCE,
@@ -261,8 +253,8 @@ def _updated(model: MomentModel, i: int, x: FloatArray, S: FloatArray, at: Float
         )
     H = model.jacobian(i, at)
     innovation = z - model.predicted(i, at) - H @ (x - at)
-    nis = normalised_innovation_squared(S, H, innovation, ones)
-    return IteratedUpdate(*block_update(x, S, H, innovation, ones), 1, True, innovation, nis)
+    after, root, nis = update(x, S, H, innovation)
+    return IteratedUpdate(after, root, 1, True, innovation, nis)
 
 
 def smoothed(steps: Sequence[MomentStep]) -> list[tuple[FloatArray, FloatArray]]:
@@ -272,7 +264,7 @@ def smoothed(steps: Sequence[MomentStep]) -> list[tuple[FloatArray, FloatArray]]
     for step, after in zip(reversed(steps[:-1]), reversed(steps[1:]), strict=True):
         G, D = smoothing_gain(step.S, np.diag(after.F), after.S_q)
         x = step.x + G @ (x - after.x_predicted)
-        S = predict_square_root(S, G, D)
+        S = predict(S, G, D)
         found.append((x, S))
     return found[::-1]
 

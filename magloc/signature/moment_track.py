@@ -13,7 +13,6 @@ from arrays.array import SensorArray
 from arrays.io.errors import InputError
 from arrays.typing import FloatArray
 from magloc.chi_square import normalised_square
-from magloc.kalman import estimability
 from magloc.localization.fit.results import is_misfit
 from magloc.measurement.nuisances import Drift
 from magloc.measurement.plausibility import usable_readings
@@ -29,10 +28,12 @@ from magloc.signature.moment_filter import (
     smoothed,
 )
 from magloc.signature.path import ObjectPath, PathError
+from magloc.state_space import estimability
 from magloc.tracking.consistency import consistency_lines, mean_nis, root_mean
 from magloc.tracking.measurement import RowMeasurements
 from magloc.tracking.motion import N_SOURCE
-from magloc.tracking.results import TrackPoint, rows_of, warn_of_strengths
+from magloc.tracking.results import TrackPoint, warn_of_strengths
+from magloc.tracking.rows import rows_of
 from magloc.tracking.track import TURN_RAD_S, TrackColumns
 from magloc.truth import Truth, truth_of_rows
 

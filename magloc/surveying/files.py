@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from arrays.io.csv import Column
 from magloc.surveying.results import Survey
-from magloc.truth import TRUE_POSITION_COLUMNS, state_columns
+from magloc.truth import TRUE_POSITION_COLUMNS
 
 
 def json_of_survey(found: Survey) -> dict[str, Any]:
@@ -22,20 +20,6 @@ def json_of_survey(found: Survey) -> dict[str, Any]:
         "pose_assumed": found.pose_assumed,
         "lag_s": found.lag_s,
     }
-
-
-def columns_of_survey(found: Survey) -> dict[str, Column]:
-    """Columns of ``targets.csv``."""
-    covariance = np.array([t.covariance for t in found]).reshape(-1, 6, 6)
-    moment = np.array([t.moment_Am2 for t in found]).reshape(-1, 3)
-    low, high = np.array([t.depth_interval95_m for t in found]).reshape(-1, 2).T
-    columns: dict[str, Column] = {"id": [t.id for t in found]}
-    columns |= state_columns(found.position_m, moment, covariance)
-    columns |= {"depth_m": np.array([t.depth_m for t in found]), "depth_low_m": low, "depth_high_m": high}
-    columns |= {"strength_Am2": np.array([t.strength_Am2 for t in found])}
-    columns |= {"significance": np.array([t.significance for t in found])}
-    columns["flags"] = [" ".join(t.flags) for t in found]
-    return columns
 
 
 def residual_columns(found: Survey) -> dict[str, Column]:

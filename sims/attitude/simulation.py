@@ -262,7 +262,7 @@ def advance(prepared: Prepared, state: State, wheel_torque_Nm: FloatArray, row: 
     """True state (q, w, momentum) of all runs at instant ``row`` + 1 from that at ``row``, without rods.
 
     Shape ``state`` (runs, 4), (runs, 3), (runs, 3). ``wheel_torque_Nm`` (runs, 3): as set, by
-    :func:`adcs.satellite.dynamics.commanded_torque` of an estimate.
+    the control of an estimate.
     """
     around = prepared.environment
     return dynamics.step(

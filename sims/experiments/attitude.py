@@ -15,7 +15,7 @@ from adcs.io.scenario_files import AttitudeFile
 from adcs.kalman.bank import EstimatorSettings, estimated
 from adcs.kalman.diagnostics import Problem, problems_of, unseen_torque_Nm
 from adcs.kalman.error_state import AttitudeTracks, start_near
-from adcs.kalman.results import by_state, in_units, worst_axis
+from adcs.kalman.results import in_units, worst_axis
 from arrays.io.errors import InputError
 from arrays.typing import FloatArray
 from sims.attitude.files import simulation_of
@@ -223,7 +223,7 @@ def _largest(each: Iterable[Mapping[float, float]]) -> dict[float, float]:
 
 def errors_in_units(part: Part) -> FloatArray:
     """Truth minus estimate, shape (runs, n, 30), in the order and units of :attr:`Outcome.axis_rms`."""
-    return in_units(by_state(accuracy.errors(part.runs, part.estimates), part.estimates.settings.sensors))
+    return in_units(part.estimates.settings.sensors.by_state(accuracy.errors(part.runs, part.estimates)))
 
 
 def outcome_of(part: Part) -> Outcome:

@@ -8,8 +8,7 @@ import numpy as np
 
 from adcs import quaternion
 from adcs.complementary.adaptive import AdaptiveTuning, adaptive_track
-from adcs.complementary.explicit import Gains, explicit_track
-from adcs.complementary.gauss_newton import gauss_newton_track
+from adcs.complementary.explicit import Gains, complementary_track
 from adcs.complementary.names import Method, Rule
 from adcs.complementary.outage import Substitution
 from arrays.typing import FloatArray
@@ -24,8 +23,8 @@ def errors_deg(runs: SatelliteRuns, method: Method, gains: Gains, outage: Rule |
     if method == "adaptive":
         q = adaptive_track(runs.record, AdaptiveTuning(first_sigma=runs.scenario.sigma_T)).q
     else:
-        track = explicit_track if method == "explicit" else gauss_newton_track
-        q = track(runs.record, gains, substitution=Substitution(outage or "magnetometer-only")).q
+        substitution = Substitution(outage or "magnetometer-only")
+        q = complementary_track(runs.record, gains, method=method, substitution=substitution).q
     return np.degrees(2.0 * quaternion.error_vector(q, runs.q))
 
 

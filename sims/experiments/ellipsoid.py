@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from adcs.ellipsoids.names import StepRule
 from adcs.ellipsoids.roll_yaw import (
     STEP_S,
     YAW,
@@ -16,7 +17,6 @@ from adcs.ellipsoids.roll_yaw import (
     roll_yaw_system,
     violations,
 )
-from adcs.ellipsoids.strip import StepRule
 from arrays.typing import FloatArray
 from sims.attitude.roll_yaw import ErrorScenario, LoopScenario, error_runs, fly
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from adcs.io.scenario_files import read_scenario
 from adcs.kalman.names import Filter
-from adcs.kalman.results import SHOWN, in_units, sigma_by_state, worst_axis
+from adcs.kalman.results import SHOWN, in_units, worst_axis
 from arrays.typing import FloatArray
 from sims.experiments.attitude import Part, run_scenario
 
@@ -131,7 +131,7 @@ def compared_with_paper(row: PaperRow, seeds: Sequence[int], duration_s: float |
     last: list[FloatArray] = []
 
     def look(part: Part) -> None:
-        last.append(in_units(sigma_by_state(part.estimates))[:, -1])
+        last.append(in_units(part.estimates.sigma_by_state)[:, -1])
 
     outcome = run_scenario(file, file.estimator(file.path), seeds, look=look)
     sigma = worst_axis(np.concatenate(last)).mean(axis=0)

@@ -18,6 +18,15 @@ void jacobian(const double *inertia, const double *inverse, const double *dipole
   for (int i = 0; i < 6; ++i)
     for (int j = 0; j < 6; ++j) out[6 * j + i] = F[i][j];
 }
+void closed_loop_jacobian(const double *inertia, const double *inverse, const double *attitude_gain,
+                          const double *rate_gain, const double *q, const double *w, double gravity, double *out) {
+  double F[6][8];
+  transposed_closed_loop_jacobian({matrix_at(inertia), matrix_at(inverse)},
+                                  {vector_at(attitude_gain), vector_at(rate_gain), 0.0, 0.0, {}},
+                                  {quaternion_at(q), vector_at(w)}, gravity, F);
+  for (int i = 0; i < 6; ++i)
+    for (int j = 0; j < 6; ++j) out[6 * j + i] = F[i][j];
+}
 // One step of a filter, as a microcontroller calls it.
 void filter_step(Hypothesis *filter, const FilterModel *model, const Instant *now, const Instant *next,
                  const Readings *readings, const double *kept, const double *added_variance, double dt) {

@@ -18,10 +18,10 @@ import pytest
 from numpy.typing import NDArray
 
 from adcs import quaternion
-from adcs.kalman.gate import contest
 from adcs.satellite import dynamics
 from magloc import core
 from tests.adcs.attitudes import random_attitudes
+from tests.adcs.kalman import readable
 
 Array = NDArray[np.float64]
 COMPILER = shutil.which(os.environ.get("CXX", "c++"))
@@ -57,8 +57,8 @@ class TestReferences:
         vectors[0, 1] = -3.0 * vectors[0, 0]  # half a turn
         for q, (one, one_there, two, two_there) in zip(turns, vectors, strict=True):
             axis = one / np.linalg.norm(one)
-            onto = contest.turned_onto(q[None], one[None], one_there[None])
-            about = contest.turned_about(onto, axis[None], two[None], two_there[None])[0]
+            onto = readable.turned_onto(q[None], one[None], one_there[None])
+            about = readable.turned_about(onto, axis[None], two[None], two_there[None])[0]
             first = called(library.turn_onto, q, one, one_there, shape=(4,))
             second = called(library.turn_about, first, axis, two, two_there, shape=(4,))
             np.testing.assert_allclose(first, onto[0], rtol=0, atol=1e-12)
@@ -80,12 +80,23 @@ class TestReferences:
             found = called(library.jacobian, *known, shape=(6, 6))
             np.testing.assert_allclose(found, expected, rtol=0, atol=1e-16)
 
+    def test_closed_loop_jacobian(self, library: ctypes.CDLL) -> None:
+        rng = np.random.default_rng(26)
+        body = dynamics.RigidBody(np.array([[0.519, 0.002, 0.005], [0.002, 0.579, 0.009], [0.005, 0.009, 0.71]]))
+        control = dynamics.wheel_control(body)
+        for q in random_attitudes(20, rng):
+            w = 0.02 * rng.standard_normal(3)
+            known = body.inertia_kgm2, body.inverse, control.attitude_gain_Nm, control.rate_gain_Nms, q, w, 1.2e-6
+            found = called(library.closed_loop_jacobian, *known, shape=(6, 6))
+            expected = readable.closed_loop_error_jacobian(body, control, q, w, 1.2e-6)
+            np.testing.assert_allclose(found, expected, rtol=0, atol=1e-15)
+
     def test_the_gate_has_the_same_numbers(self) -> None:
         header = (core.include_dir() / "adcs/gate.hpp").read_text(encoding="utf-8")
         rules = re.search(r"struct ContestRules \{(.*?)\};", header, re.DOTALL)
         assert rules is not None
         found = {name.upper(): float(value) for name, value in re.findall(r"(\w+) = (-?[\d.]+)", rules[1])}
-        assert found == {name: getattr(contest, name) for name in found}
+        assert found == {name: getattr(readable, name) for name in found}
         assert len(found) == 8
 
 

@@ -6,10 +6,11 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from adcs import quaternion
-from adcs.kalman.mekf import run_filter, run_readable
-from adcs.satellite import dynamics
+from adcs.kalman.mekf import run_filter
 from sims.attitude.simulation import AttitudeRuns, advance, simulate
+from tests.adcs.attitudes import commanded_torque
 from tests.adcs.filter_runs import ANY_START, settings, start_of, tabletsat
+from tests.adcs.kalman.readable import run_readable
 from tests.bench.table import Row
 from tests.bench.timing import Contestant, Size, interleaved
 
@@ -47,7 +48,5 @@ def readable_truth(runs: AttitudeRuns) -> None:
     state = (prepared.q, prepared.w, prepared.momentum_Nms)
     for row in range(len(runs.time_s) - 1):
         rate = prepared.environment.orbital_rate_rad_s[:, row]
-        torque = dynamics.commanded_torque(
-            satellite.body, satellite.control, *state, quaternion.IDENTITY, rate, runs.dt_s
-        )
+        torque = commanded_torque(satellite.body, satellite.control, *state, quaternion.IDENTITY, rate, runs.dt_s)
         state = advance(prepared, state, torque, row)

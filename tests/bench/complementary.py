@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 
 from adcs.complementary.adaptive import adaptive_track
-from adcs.complementary.explicit import explicit_track
-from adcs.complementary.gauss_newton import gauss_newton_track
+from adcs.complementary.explicit import complementary_track
 from sims.attitude.complementary import SatelliteScenario, satellite_runs
 from tests.bench.table import Row
 from tests.bench.timing import Contestant, Size, interleaved
 
 TITLE = "complementary filters: one step, 1 thread"
 TRACKS = {
-    "explicit": explicit_track,
-    "with measured quaternion": gauss_newton_track,
+    "explicit": complementary_track,
+    "with measured quaternion": partial(complementary_track, method="gauss-newton"),
     "adaptive error-state": adaptive_track,
 }
 

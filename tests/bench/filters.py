@@ -13,12 +13,12 @@ import numpy as np
 from arrays.geometries import tetrahedron
 from magloc.convergence.filters import IekfFilter
 from magloc.convergence.over_starts import StartsScenario, simulated_measurement
-from magloc.kalman import IteratedExtendedKalmanFilter
 from magloc.measurement.differences import DifferenceMeasurement
 from magloc.readings import Readings
+from magloc.state_space import IteratedExtendedKalmanFilter
 from magloc.tracking.motion import RandomWalk
-from magloc.tracking.results import Row as TrackRow
-from magloc.tracking.results import rows_of
+from magloc.tracking.rows import Row as TrackRow
+from magloc.tracking.rows import rows_of
 from magloc.tracking.tracker import Tracker
 from sims.magnetics.scenario_files import read_scenario
 from sims.magnetics.simulation import simulate

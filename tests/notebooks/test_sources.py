@@ -92,7 +92,7 @@ def test_public_names_only_and_few_imports(path: Path) -> None:
         ("import magloc\nmagloc.plots.fixes, magloc.dipole.field, magloc.datasets.load, magloc.locate", []),
         ("from adcs import mockup\nmockup.Camera()", []),
         ("from magloc.fields import dipole", ["magloc.fields.dipole"]),
-        ("import magloc.kalman", ["magloc.kalman"]),
+        ("import magloc.state_space", ["magloc.state_space"]),
         ("from magloc import readings", ["magloc.readings"]),
         ("import magloc\nmagloc.plots.style.BLUE", ["magloc.plots.style"]),
         ("import magloc as m\nm.kalman, m.dipole.np", ["m.kalman", "m.dipole.np"]),

@@ -23,9 +23,8 @@ def gyro_attitudes(rate_rad_s: FloatArray, dt_s: FloatArray) -> FloatArray:
 def levelled(q_gyro: FloatArray, up: FloatArray, part: FloatArray, start: FloatArray) -> FloatArray:
     """Return the attitudes (n, 4) of the gyro, turned so that a vector (n, 3) in its frame goes up.
 
-    A part (n,) of the angle is corrected at each instant, as :func:`adcs.complementary.explicit.explicit_track` does
-    with one vector: the error is across the level, so that the correction is gathered in a quaternion of its own, from
-    ``start`` (4,) on.
+    A part (n,) of the angle is corrected at each instant, as the explicit filter does with one vector: the error is
+    across the level, so that the correction is gathered in a quaternion of its own, from ``start`` (4,) on.
     """
     q = np.empty_like(q_gyro)
     work = core.problem("level", start=tuple(start), q_gyro=q_gyro, up=up, part=part, q=q)

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from adcs.mockup.navigation.fixes import Fix, Outcome
 from adcs.mockup.navigation.strapdown import Gate, ImuRecord, PlanarState, PlanarTrack, held, turned, wrapped
 from arrays.typing import FloatArray
-from magloc.kalman import block_update, normalised_innovation_squared, symmetric_square_root
+from magloc.state_space import symmetric_square_root, update
 
 STATES = (
     *("X_m", "Y_m", "vX_m_s", "vY_m_s", "heading_rad"),
@@ -360,10 +360,8 @@ class DelayedFilter:
         """Estimate and covariance with a fix, and its normalised innovation²."""
         s = self.settings
         innovation = np.append(fix.position_m - x[0:2], wrapped(fix.heading_rad - x[4]))
-        variance = np.square([s.fix_m, s.fix_m, s.fix_rad] if fix.sigma is None else fix.sigma)
-        S = symmetric_square_root(P)
-        nis = normalised_innovation_squared(S, H_FIX, innovation, variance)
-        x, S = block_update(x, S, H_FIX, innovation, variance)
+        sigma = np.array([s.fix_m, s.fix_m, s.fix_rad] if fix.sigma is None else fix.sigma)
+        x, S, nis = update(x, symmetric_square_root(P), H_FIX / sigma[:, None], innovation / sigma)
         return x, S @ S.T, nis
 
     def _second(self, place: int) -> tuple[FloatArray, FloatArray] | None:

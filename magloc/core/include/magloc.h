@@ -242,6 +242,8 @@ typedef struct {
   int64_t n_runs, n_instants, n_states;
   const double *inertia, *inverse_inertia; /* (3, 3) */
   const double *residual_dipole;           /* (3,) */
+  int64_t has_feedback;                    /* whether the control's feedback is taken for dynamics, as in the paper */
+  const double *attitude_gain, *rate_gain; /* (3,), of the control */
   const double *dt;                        /* (n_instants - 1,), steps */
   const double *first_q, *first_w;         /* (n_runs, 4), (n_runs, 3): before the first reading */
   const double *first_optional;            /* (n_runs, n_states - 6) */

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from arrays.typing import BoolArray, FloatArray, IntArray
-from magloc.localization.fit.results import Intervals, Solution, Source, intervals_of
+from magloc.localization.fit.results import EVERYWHERE, Intervals, Solution, Source, intervals_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,24 +49,8 @@ class Solutions:
     @classmethod
     def none(cls) -> Solutions:
         """No solution of any row."""
-        whole, number = np.zeros(0, dtype=np.intp), np.zeros(0)
-        flags, vectors = np.zeros((0, 1), dtype=bool), np.zeros((0, 1, 3))
-        return cls(
-            whole,
-            whole,
-            vectors,
-            vectors,
-            np.zeros((0, 6, 6)),
-            number,
-            whole,
-            number,
-            whole,
-            np.zeros((0, 1, 1, 2)),
-            flags,
-            flags,
-            number,
-            whole,
-        )
+        one = Solution((Source(np.zeros(3), np.zeros(3), np.eye(6), EVERYWHERE),), np.eye(6), 0.0, 0)
+        return cls._of_one(0, one).chosen(np.zeros(0, dtype=np.intp))
 
     @classmethod
     def of(cls, solutions: Sequence[tuple[int, Solution]]) -> Solutions:
@@ -103,10 +87,11 @@ class Solutions:
         order = None if (of_row[1:] >= of_row[:-1]).all() else np.argsort(of_row, kind="stable")
 
         def stacked(name: str) -> Any:
+            """Values of all parts, padded to the most sources and intervals of any."""
             values = [getattr(part, name) for part in filled]
-            shape = tuple(map(max, zip(*(value.shape[1:] for value in values), strict=True)))
+            shape = np.max([value.shape[1:] for value in values], axis=0).astype(int)
             empty = np.nan if values[0].dtype.kind == "f" else 0
-            result = np.full((sum(map(len, filled)), *shape), empty, dtype=values[0].dtype)
+            result = np.full((len(of_row), *shape), empty, dtype=values[0].dtype)
             begin = 0
             for value in values:
                 result[(slice(begin, begin + len(value)), *map(slice, value.shape[1:]))] = value
@@ -115,10 +100,11 @@ class Solutions:
 
         return cls(**{name: stacked(name) for name in vars(filled[0])})
 
-    def chosen(self, index: IntArray | BoolArray) -> Solutions:
-        """Some of the solutions."""
+    def chosen(self, index: IntArray | BoolArray, of_row: IntArray | None = None) -> Solutions:
+        """Some of the solutions, of other rows if these are named."""
         at = np.arange(len(self))[index]
-        return Solutions(**{name: value[at] for name, value in vars(self).items()})
+        chosen = Solutions(**{name: value[at] for name, value in vars(self).items()})
+        return chosen if of_row is None else chosen.of_rows(of_row)
 
     def of_rows(self, of_row: IntArray) -> Solutions:
         """The same solutions, of other rows."""

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from adcs import quaternion
-from adcs.complementary.adaptive import AdaptiveTrack, AdaptiveTuning, adaptive_steps, adaptive_track
-from adcs.complementary.explicit import Gains, explicit_track
+from adcs.complementary.adaptive import AdaptiveTrack, AdaptiveTuning, adaptive_track
+from adcs.complementary.explicit import Gains, complementary_track
 from sims.attitude.complementary import ORBIT, SatelliteScenario, satellite_runs
+from tests.adcs.complementary.readable import adaptive_steps
 
 
 def errors_deg(track, runs):
@@ -87,7 +88,7 @@ class TestFigures:
         angle = np.linalg.norm(errors_deg(adaptive_track(runs.record), runs), axis=-1)
         assert angle[:, window(runs, 3.0, 3.5)].max() < 1.0
         assert angle[:, window(runs, 2.0, 2.3)].max(axis=1).min() > 3.0
-        frozen = errors_deg(explicit_track(runs.record, Gains(0.005, 6.25e-6)), runs)
+        frozen = errors_deg(complementary_track(runs.record, Gains(0.005, 6.25e-6)), runs)
         assert np.abs(frozen[:, window(runs, 3.0, 3.5)]).max(axis=(1, 2)).min() > 20.0
 
     def test_without_adaptation(self, paper):

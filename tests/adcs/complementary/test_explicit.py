@@ -1,28 +1,25 @@
-"""Tests of the complementary filters: scalar principle, error angle, compiled twin, the source's figures."""
+"""Tests of the complementary filters: low pass, error angle, compiled twin, the source's figures."""
 
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from scipy import signal
 from scipy.spatial.transform import Rotation
 
 from adcs import quaternion
 from adcs.complementary import explicit
-from adcs.complementary.explicit import Gains, explicit_error, explicit_track, steps
-from adcs.complementary.gauss_newton import MeasuredQuaternion, gauss_newton_track
+from adcs.complementary.explicit import Gains, complementary_track
 from adcs.complementary.names import RULES
 from adcs.complementary.outage import Substitution
 from adcs.satellite.vector_record import VectorRecord
 from magloc import core
 from sims.attitude.complementary import ORBIT, SatelliteScenario, attitude, satellite_runs
 from tests.adcs.attitudes import random_attitudes
+from tests.adcs.complementary.readable import MeasuredQuaternion, explicit_error, gauss_newton_track, steps
 from tests.calls import calls_of
 
-TRACKS = [explicit_track, gauss_newton_track]
+TRACKS = [complementary_track, gauss_newton_track]
 
 
 def errors_deg(track, runs):
@@ -51,33 +48,7 @@ def short_record(n=60, seed=0, runs=2, missing=()):
     )
 
 
-def low_pass(k, s):
-    """G_a(s) = k/(s + k), what the filter passes of the vectors' angle."""
-    return k / (s + k)
-
-
-def high_pass(k, s):
-    """G_g(s) = s/(s + k), what it passes of the gyro's integral."""
-    return s / (s + k)
-
-
 class TestPrinciple:
-    @given(k=st.floats(0.0, 1e6), real=st.floats(1e-6, 1e3), imaginary=st.floats(-1e6, 1e6))
-    def test_sum_is_one(self, k, real, imaginary):
-        """For every gain and every s to the right of the pole."""
-        s = complex(real, imaginary)
-        assert low_pass(k, s) + high_pass(k, s) == pytest.approx(1.0, abs=1e-12)
-
-    def test_against_scipy(self):
-        w = np.logspace(-4, 1, 50)
-        for ours, numerator in ((low_pass, [0.02]), (high_pass, [1.0, 0.0])):
-            np.testing.assert_allclose(ours(0.02, 1j * w), signal.freqs(numerator, [1.0, 0.02], w)[1], rtol=1e-12)
-
-    def test_limits(self):
-        """k = 0 trusts the gyro alone, a large one the vectors."""
-        assert low_pass(0.0, 1j) == 0.0
-        assert abs(high_pass(1e9, 1j)) < 1e-8
-
     @pytest.mark.parametrize("track", TRACKS)
     def test_low_pass_in_three_axes(self, track):
         """A small turn of both measured vectors, across both, comes through as k/(s+k): 1 - exp(-k t)."""
@@ -93,7 +64,7 @@ class TestPrinciple:
         )
         found = quaternion.log(track(record, Gains(k, 0.0)).q[0])[:, 2]
         # The eigenvalue of e is 2 about the axis across both vectors; the measured quaternion makes it 1.
-        eigenvalue = 2.0 if track is explicit_track else 1.0
+        eigenvalue = 2.0 if track is complementary_track else 1.0
         expected = angle * (1.0 - (1.0 - k * eigenvalue * 0.1) ** np.arange(1, n + 1))
         np.testing.assert_allclose(found, expected, atol=1e-5 * angle)
 
@@ -124,7 +95,7 @@ class TestTwins:
         record = short_record(missing=missing)
         gains = Gains(0.1, 1e-3, 0.05, 1e-4, boost=3.0, boost_level_rad=0.4, boost_memory=0.8)
         substitution = Substitution(rule, 5.0)
-        track = (explicit_track if method == "explicit" else gauss_newton_track)(
+        track = (complementary_track if method == "explicit" else gauss_newton_track)(
             record, gains, substitution=substitution
         )
 
@@ -148,7 +119,7 @@ class TestTwins:
         expected = Rotation.identity()
         for rate, frame in zip(record.rate_rad_s[0, 1:], record.frame_rate_rad_s[0, 1:], strict=True):
             expected = Rotation.from_rotvec(-0.5 * frame) * expected * Rotation.from_rotvec(0.5 * rate)
-        track = explicit_track(record, Gains(0.1))
+        track = complementary_track(record, Gains(0.1))
         assert quaternion.angle_between(track.q[0, -1], quaternion.from_rotation(expected)) < 1e-7
 
     def test_blocks_and_threads_change_nothing(self, monkeypatch):
@@ -159,14 +130,14 @@ class TestTwins:
         for block, threads in ((1000, 1), (7, 1), (13, 3)):
             monkeypatch.setattr(explicit, "BLOCK", block)
             core.set_threads(threads)
-            found.append(explicit_track(record, substitution=Substitution("transported", 5.0)))
+            found.append(complementary_track(record, substitution=Substitution("transported", 5.0)))
         core.set_threads(before)
         for other in found[1:]:
             np.testing.assert_array_equal(other.q, found[0].q)
 
     def test_runs_do_not_depend_on_each_other(self):
         record = short_record()
-        track = explicit_track(record)
+        track = complementary_track(record)
         alone = VectorRecord(
             record.dt_s,
             record.rate_rad_s[1],
@@ -176,10 +147,10 @@ class TestTwins:
             record.second_reference,
             record.frame_rate_rad_s,
         )
-        np.testing.assert_array_equal(explicit_track(alone).q[0], track.q[1])
+        np.testing.assert_array_equal(complementary_track(alone).q[0], track.q[1])
 
     def test_nothing_to_do(self):
-        assert explicit_track(short_record(n=0)).q.shape == (2, 0, 4)
+        assert complementary_track(short_record(n=0)).q.shape == (2, 0, 4)
 
 
 class TestSatellite:
@@ -277,9 +248,9 @@ class TestFigures:
 
         for value in pooled(gauss_newton_track, 0.005, 2.5e-6):
             assert 0.8 <= value <= 1.3
-        for value in pooled(explicit_track, 0.9, 8.1e-4):
+        for value in pooled(complementary_track, 0.9, 8.1e-4):
             assert 1.5 <= value <= 2.8
-        assert min(pooled(explicit_track, 1.0, 0.0)) > 3.0
+        assert min(pooled(complementary_track, 1.0, 0.0)) > 3.0
 
     def test_equal_gains_that_show_the_factor(self):
         """K_P = 0.97 at 850 nT, which hides the drift step in noise: ratio 2.69 of the source."""
@@ -296,7 +267,7 @@ class TestFigures:
         boosted = Gains(0.01, 2.5e-6, boost=10.0, boost_level_rad=math.radians(1.5))
         peaks, steady = [], []
         for gains in (slow, boosted):
-            errors = errors_deg(explicit_track(paper.record, gains), paper)
+            errors = errors_deg(complementary_track(paper.record, gains), paper)
             peaks.append(rms(errors[:, window(paper, 1.7, 2.4)]))
             steady.append(rms(errors[:, window(paper, 0.8, 1.7)]))
         assert peaks[1] < 0.7 * peaks[0]
@@ -307,7 +278,7 @@ class TestSpeed:
     def test_steps_are_compiled(self):
         """Fifty times the steps make not one interpreted call more."""
         short, long = (satellite_runs(SatelliteScenario(duration_s=s), [0]).record for s in (100.0, 5000.0))
-        assert calls_of(lambda: explicit_track(long)) == calls_of(lambda: explicit_track(short))
+        assert calls_of(lambda: complementary_track(long)) == calls_of(lambda: complementary_track(short))
 
 
 class TestInput:
@@ -330,10 +301,10 @@ class TestInput:
         vectors = [np.tile(v, (n, 1)) for v in ([1.0, 0.0, 0.0], [0.0, 1.0, 0.0])]
         record = VectorRecord(np.ones(n), np.zeros((n, 3)), *vectors, *vectors, np.zeros((n, 3)))
         start = quaternion.exp([0.0, 0.0, 1e-6])
-        track = explicit_track(record, Gains(0.99, 0.0), q_start=start)
+        track = complementary_track(record, Gains(0.99, 0.0), q_start=start)
         assert quaternion.angle_between(track.q[0, -1], quaternion.IDENTITY) < 1e-7
         # At the limit itself the sign changes and the error stays.
-        marginal = explicit_track(record, Gains(1.0, 0.0), q_start=start)
+        marginal = complementary_track(record, Gains(1.0, 0.0), q_start=start)
         assert quaternion.angle_between(marginal.q[0, -1], quaternion.IDENTITY) == pytest.approx(1e-6, rel=1e-3)
 
     @pytest.mark.parametrize("name", ["first_body", "second_body", "first_reference", "second_reference"])
@@ -359,7 +330,7 @@ class TestInput:
         with pytest.raises(ValueError, match=r"second_body must have shape \(R, n, 3\)"):
             VectorRecord(np.ones(4), **{**good, "second_body": np.ones(3)})
         with pytest.raises(ValueError, match="q_start must be quaternions with a length"):
-            explicit_track(VectorRecord(np.ones(4), **good), q_start=np.zeros(4))
+            complementary_track(VectorRecord(np.ones(4), **good), q_start=np.zeros(4))
 
     @pytest.mark.parametrize("value", [-0.1, math.nan])
     def test_gains(self, value):

@@ -7,16 +7,17 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from adcs import quaternion
-from adcs.complementary.explicit import Gains, explicit_error
-from adcs.complementary.gauss_newton import (
+from adcs.complementary.explicit import Gains
+from sims.attitude.complementary import SatelliteScenario, satellite_runs
+from tests.adcs.attitudes import random_attitudes
+from tests.adcs.complementary.readable import (
     MeasuredQuaternion,
+    explicit_error,
     gauss_newton_step,
     gauss_newton_track,
     homogeneous_rotation,
     rotation_derivative,
 )
-from sims.attitude.complementary import SatelliteScenario, satellite_runs
-from tests.adcs.attitudes import random_attitudes
 
 
 def pair(rng, q):

@@ -9,7 +9,7 @@ from scipy import signal
 from scipy.spatial.transform import Rotation
 
 from adcs import quaternion
-from adcs.complementary.explicit import Gains, explicit_track
+from adcs.complementary.explicit import Gains, complementary_track
 from adcs.complementary.filters import LEFT_OUT, SUBTRACTED, inertial_magnetic_filter
 from adcs.complementary.heading import heading_track
 from adcs.complementary.inertial.gaps import window_scatter
@@ -114,11 +114,11 @@ class TestIntegration:
         axes = np.tile([0.0, 1.0, 0.0], (500, 1)), np.tile(UP, (500, 1))
         q_gyro = gyro_attitudes(rate, dt_s)
         alone = VectorRecord(dt_s, rate, missing, missing, *axes, still)
-        np.testing.assert_allclose(q_gyro, explicit_track(alone, Gains(0.0, 0.0)).q[0], atol=1e-12)
+        np.testing.assert_allclose(q_gyro, complementary_track(alone, Gains(0.0, 0.0)).q[0], atol=1e-12)
         steady, start = UP + 0.2 * rng.standard_normal((500, 3)), quaternion.exp([0.3, -0.2, 0.1])
         record = VectorRecord(dt_s, rate, missing, quaternion.rotate_back(q_gyro, steady), *axes, still)
         gains = Gains(1.0, 0.0, second_weight=3.0)
-        expected = explicit_track(record, gains, q_start=start).q[0]
+        expected = complementary_track(record, gains, q_start=start).q[0]
         np.testing.assert_allclose(levelled(q_gyro, steady, 3.0 * dt_s, start), expected, atol=1e-12)
 
     @pytest.mark.parametrize("largest_rad", [1e-9, 0.3, 3.0, 300.0])

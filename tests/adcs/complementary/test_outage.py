@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from adcs import quaternion
-from adcs.complementary.explicit import Gains, explicit_track
-from adcs.complementary.gauss_newton import gauss_newton_track
+from adcs.complementary.explicit import Gains, complementary_track
 from adcs.complementary.names import RULES
-from adcs.complementary.outage import Substitute, Substitution, delay_steps
+from adcs.complementary.outage import Substitution, delay_steps
 from sims.attitude.complementary import ORBIT, SatelliteScenario, satellite_runs
+from tests.adcs.complementary.readable import Substitute, gauss_newton_track
 
 
 def outage_runs(seeds, amplitude_deg=5.0, duration_orbits=4.0):
@@ -86,7 +86,7 @@ class TestFigures:
 
     def test_raw_delay_shows_its_defect(self, eight):
         """Median over the seeds: the error is what the body turns in 500 s, which depends on its phases."""
-        largest = largest_deg(explicit_track(eight.record, gains(0.01), substitution=Substitution("raw")), eight)
+        largest = largest_deg(complementary_track(eight.record, gains(0.01), substitution=Substitution("raw")), eight)
         assert (np.median(largest, axis=0) <= [4.0, 3.0, 5.5]).all()
         assert (np.median(largest, axis=0) >= 1.0).all()
 
@@ -94,37 +94,37 @@ class TestFigures:
     def test_forty_seeds(self):
         runs = outage_runs(range(40))
         for rule in ("transported", "magnetometer-only"):
-            found = largest_deg(explicit_track(runs.record, gains(0.005), substitution=Substitution(rule)), runs)
+            found = largest_deg(complementary_track(runs.record, gains(0.005), substitution=Substitution(rule)), runs)
             assert found.max() <= 1.0
             assert np.mean(found.max(axis=1) <= 0.8) >= 0.95
 
     def test_raw_delay_of_larger_angles(self):
         runs = outage_runs(range(8), 10.0)
-        yaw = largest_deg(explicit_track(runs.record, gains(0.01), substitution=Substitution("raw")), runs)[:, 2]
+        yaw = largest_deg(complementary_track(runs.record, gains(0.01), substitution=Substitution("raw")), runs)[:, 2]
         assert 4.0 <= np.median(yaw) <= 14.0
         assert np.sort(yaw)[-2] <= 14.0
         assert yaw.max() <= 16.0
 
     @pytest.mark.parametrize("rule", ["transported", "magnetometer-only"])
-    @pytest.mark.parametrize("track", [explicit_track, gauss_newton_track])
+    @pytest.mark.parametrize("track", [complementary_track, gauss_newton_track])
     def test_without_the_defect(self, eight, track, rule):
         assert largest_deg(track(eight.record, gains(0.005), substitution=Substitution(rule)), eight).max() <= 0.8
 
     def test_integral_that_is_not_frozen(self, eight):
         """√K_I is close to the rate at which the field turns: the filter takes one for the other."""
         kept = gains(0.01, outage_ki_per_s2=0.01**2 / 4.0)
-        assert largest_deg(explicit_track(eight.record, kept), eight).max(axis=1).min() > 20.0
+        assert largest_deg(complementary_track(eight.record, kept), eight).max(axis=1).min() > 20.0
 
     def test_gain_scheduling(self, eight):
         """0.02 with the Sun, 0.003 without: better than 0.02 throughout."""
-        scheduled = largest_deg(explicit_track(eight.record, gains(0.02, outage_kp_per_s=0.003)), eight)
-        throughout = largest_deg(explicit_track(eight.record, gains(0.02)), eight)
+        scheduled = largest_deg(complementary_track(eight.record, gains(0.02, outage_kp_per_s=0.003)), eight)
+        throughout = largest_deg(complementary_track(eight.record, gains(0.02)), eight)
         assert np.median(scheduled) < 0.7 * np.median(throughout)
 
 
 class TestHandOver:
     @pytest.mark.parametrize("rule", RULES)
-    @pytest.mark.parametrize("track", [explicit_track, gauss_newton_track])
+    @pytest.mark.parametrize("track", [complementary_track, gauss_newton_track])
     def test_no_jump(self, track, rule):
         """Between two instants the error of the estimate changes by noise and the correction, at both ends."""
         scenario = SatelliteScenario(
@@ -146,5 +146,5 @@ class TestHandOver:
         settings = {"step_orbits": 9.0, "duration_s": 1.2 * ORBIT.period_s}
         with_outage = satellite_runs(SatelliteScenario(outage_orbits=0.5, outage_end_orbits=0.9, **settings), [0])
         without = satellite_runs(SatelliteScenario(**settings), [0])
-        q = [explicit_track(runs.record, Gains(0.02)).q[0, -1] for runs in (with_outage, without)]
+        q = [complementary_track(runs.record, Gains(0.02)).q[0, -1] for runs in (with_outage, without)]
         assert math.degrees(quaternion.angle_between(*q)) < 0.05

@@ -1,4 +1,4 @@
-"""Tests of adcs.ellipsoids.ellipsoid: one class per operation.
+"""Tests of adcs.ellipsoids.ellipsoid and of the readable operations: one class per operation.
 
 Against numerically minimal ellipses that we did not derive.
 
@@ -25,18 +25,16 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy import linalg, optimize
 
-from adcs.ellipsoids.ellipsoid import (
-    Ellipsoid,
+from adcs.ellipsoids.ellipsoid import Ellipsoid, quadratic_form, segment_shape
+from adcs.ellipsoids.names import STEP_RULES
+from tests.adcs.ellipsoids.readable import (
     Outcome,
     intersect_strip,
     minimum_trace_sum,
-    quadratic_form,
-    segment_shape,
     sum_with_ellipsoid,
     sum_with_segment,
     transformed,
 )
-from adcs.ellipsoids.strip import STEP_RULES
 
 seeds = st.integers(0, 2**32 - 1)
 dimensions = st.integers(1, 12)

@@ -6,9 +6,10 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from adcs.ellipsoids.ellipsoid import Ellipsoid
-from adcs.ellipsoids.observer import BoundedSystem, EllipsoidObserver, correct, predict
-from adcs.ellipsoids.strip import STEP_RULES
+from adcs.ellipsoids.names import STEP_RULES
+from adcs.ellipsoids.observer import BoundedSystem, EllipsoidObserver
 from tests.adcs.bounded_noise import containment, random_system, satellite, three_states
+from tests.adcs.ellipsoids.readable import correct, predict
 from tests.calls import calls_of
 
 SYSTEMS = {"satellite": (satellite(), 200), "three states": (three_states(), 120)}

@@ -16,7 +16,7 @@ from scipy.integrate import solve_ivp
 
 from adcs.ellipsoids import roll_yaw
 from adcs.ellipsoids.ellipsoid import Ellipsoid, quadratic_form
-from adcs.ellipsoids.observer import BoundedSystem, EllipsoidObserver, correct, predict
+from adcs.ellipsoids.observer import BoundedSystem, EllipsoidObserver
 from adcs.ellipsoids.roll_yaw import (
     ORBITAL_RATE,
     STEP_S,
@@ -32,6 +32,7 @@ from adcs.ellipsoids.roll_yaw import (
     violations,
 )
 from sims.attitude.roll_yaw import ErrorScenario, LoopScenario, advance, error_runs, fly
+from tests.adcs.ellipsoids.readable import correct, predict
 
 ORBIT = 2839  # steps of 2 s
 

@@ -12,9 +12,10 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from adcs.ellipsoids.ellipsoid import Ellipsoid, Outcome, intersect_strip, transformed
+from adcs.ellipsoids.ellipsoid import Ellipsoid
+from adcs.ellipsoids.names import STEP_RULES
 from adcs.ellipsoids.observer import BoundedSystem, EllipsoidObserver
-from adcs.ellipsoids.strip import STEP_RULES
+from tests.adcs.ellipsoids.readable import Outcome, intersect_strip, transformed
 
 N_CASES = 300
 

@@ -1,4 +1,4 @@
-"""Tests of adcs.ellipsoids.strip: the step against a grid, closed forms, and the table of the source paper's two steps.
+"""Tests of the readable step: the step against a grid, closed forms, and the table of the source paper's two steps.
 
 Random problems are g in (0, 1), δ log-uniform in [1e-3, 2] and |μ| < 1 + δ, all strips that touch the ellipsoid.
 """
@@ -10,8 +10,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from adcs.ellipsoids import strip as strip_steps
-from adcs.ellipsoids.strip import growth, is_informative, lemma_step, optimal_step, tightened_strip, trace_ratio
+from tests.adcs.ellipsoids import readable as strip_steps
+from tests.adcs.ellipsoids.readable import (
+    growth,
+    is_informative,
+    lemma_step,
+    optimal_step,
+    tightened_strip,
+    trace_ratio,
+)
 
 shares = st.floats(1e-6, 1.0)
 half_widths = st.floats(1e-3, 3.0)

@@ -1,4 +1,4 @@
-"""Tests of adcs.kalman.gate: what contradicts the filter is left out, and what was wrong is found.
+"""Tests of the gate of the error-state filter: what contradicts the filter is left out, and what was wrong is found.
 
 The oracle of a reading that is left out is the same record without it. Seeds were not chosen.
 """
@@ -16,11 +16,10 @@ from scipy.stats import chi2
 
 import adcs
 from adcs import quaternion
-from adcs.kalman import mekf_runs
+from adcs.kalman import mekf
 from adcs.kalman.error_state import FilterSettings
-from adcs.kalman.gate import contest as gate
 from adcs.kalman.initialisation import any_start
-from adcs.kalman.mekf import run_filter, run_readable
+from adcs.kalman.mekf import run_filter
 from adcs.satellite.sensors import SENSORS
 from adcs.satellite.telemetry import is_read, part
 from magloc import core
@@ -29,6 +28,8 @@ from sims.attitude.simulation import AttitudeRuns, simulate
 from sims.experiments.accuracy import error_norm_deg
 from tests.adcs.attitudes import random_attitudes
 from tests.adcs.filter_runs import GYRO_BIAS_RAD_S, SEEDS, settings, start_of, tabletsat
+from tests.adcs.kalman import readable as gate
+from tests.adcs.kalman.readable import run_readable
 
 Array = NDArray[np.float64]
 NAMES = ("star", "gyro_rad_s", "field_T", "sun")
@@ -105,7 +106,7 @@ class TestTwins:
         runs, chosen = eventful(), settings("st+gyro+mag+sun", ["gyro-bias", "disturbance"])
         start, threads = start_of(runs, math.radians(40.0)), core.threads()
         whole = run_filter(runs, chosen, start)
-        monkeypatch.setattr(mekf_runs, "_COVARIANCES_A_CALL", 7 * chosen.sensors.size**2)
+        monkeypatch.setattr(mekf, "_COVARIANCES_A_CALL", 7 * chosen.sensors.size**2)
         try:
             for n_threads in (1, 3):
                 core.set_threads(n_threads)

@@ -19,7 +19,8 @@ from adcs import quaternion
 from adcs.satellite import dynamics
 from adcs.satellite.dynamics import RigidBody, WheelControl, wheel_control
 from magloc.navigation.rotations import cross_matrix
-from tests.adcs.attitudes import random_attitudes
+from tests.adcs.attitudes import commanded_torque, random_attitudes
+from tests.adcs.kalman.readable import closed_loop_error_jacobian
 
 Array = NDArray[np.float64]
 J = np.array([[0.519, 0.002, 0.005], [0.002, 0.579, 0.009], [0.005, 0.009, 0.71]])
@@ -224,7 +225,7 @@ class TestControl:
         state = (quaternion.exp(np.array([0.01, 0.0, 0.0])), ZERO, ZERO)
         angles = []
         for _ in range(1000):
-            torque = dynamics.commanded_torque(body, control, *state, quaternion.IDENTITY, 0.0, 0.1)
+            torque = commanded_torque(body, control, *state, quaternion.IDENTITY, 0.0, 0.1)
             state = dynamics.step(body, *state, torque, ZERO, 0.0, 0.0, ZERO, 0.1)
             angles.append(quaternion.log(state[0])[0])
         time_s = 0.1 * np.arange(1, 1001)
@@ -236,7 +237,7 @@ class TestControl:
     def test_holds_the_orbital_frame_from_any_attitude(self) -> None:
         state = random_state(np.random.default_rng(9), 30)
         for _ in range(600):
-            torque = dynamics.commanded_torque(BODY, CONTROL, *state, quaternion.IDENTITY, RATE, 1.0)
+            torque = commanded_torque(BODY, CONTROL, *state, quaternion.IDENTITY, RATE, 1.0)
             state = dynamics.step(BODY, *state, torque, ZERO, RATE, GRAVITY, ZERO, 1.0)
         assert np.degrees(quaternion.angle_between(state[0], quaternion.IDENTITY)).max() < 0.3
 
@@ -246,7 +247,7 @@ class TestControl:
         state = (state[0], state[1], np.zeros((10, 3)))
         saturated = 0
         for _ in range(200):
-            torque = dynamics.commanded_torque(BODY, tight, *state, quaternion.IDENTITY, RATE, 1.0)
+            torque = commanded_torque(BODY, tight, *state, quaternion.IDENTITY, RATE, 1.0)
             state = dynamics.step(BODY, *state, torque, ZERO, RATE, GRAVITY, ZERO, 1.0)
             assert np.abs(torque).max() <= 1e-4 * (1 + 1e-9)
             assert np.abs(state[2]).max() <= 2e-3 * (1 + 1e-9)
@@ -311,16 +312,15 @@ class TestErrorJacobian:
     def test_closed_loop_lacks_one_term(self) -> None:
         q, w, k = self.STATE
         control = replace(CONTROL, torque_limit_Nm=1e9, momentum_limit_Nms=1e9)
-        reference = quaternion.multiply(q, quaternion.exp(np.array([0.3, -0.2, 0.1])))
 
         def rate_of(dx: Array) -> Array:
             q_true = quaternion.multiply(q, quaternion.from_error_vector(dx[:3]))
-            u = dynamics.commanded_torque(BODY, control, q, w, k, reference, RATE, 1.0)
-            u_true = dynamics.commanded_torque(BODY, control, q_true, w + dx[3:], k, reference, RATE, 1.0)
+            u = commanded_torque(BODY, control, q, w, k, quaternion.IDENTITY, RATE, 1.0)
+            u_true = commanded_torque(BODY, control, q_true, w + dx[3:], k, quaternion.IDENTITY, RATE, 1.0)
             fed_back = np.concatenate([np.zeros((len(q), 3)), -(u_true - u) @ BODY.inverse], axis=-1)
             return error_rate(BODY, self.STATE, ZERO, dx) + fed_back
 
-        printed = dynamics.closed_loop_error_jacobian(BODY, control, q, w, reference, GRAVITY)
+        printed = closed_loop_error_jacobian(BODY, control, q, w, GRAVITY)
         orbital = quaternion.rotate_back(q, [0.0, RATE, 0.0])
         missing = 2 * BODY.inverse @ np.diag(control.rate_gain_Nms) @ cross_matrix(orbital)
         measured = self.differences(rate_of)

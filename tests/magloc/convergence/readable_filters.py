@@ -6,8 +6,8 @@ import numpy as np
 
 from arrays.typing import FloatArray
 from magloc.convergence.filters import DampedFilter, IekfFilter, RepeatedFilter
-from magloc.kalman import IteratedUpdate, iterated_update, predict_square_root, scalar_update, sequential_update
 from magloc.measurement.differences import DifferenceMeasurement
+from magloc.state_space import IteratedUpdate, iterated_update, predict, update
 
 # A step that lowers the cost divides the damping, any other multiplies it.
 DAMPING_DECREASE, DAMPING_INCREASE = 5.0, 4.0
@@ -49,19 +49,21 @@ def run_one(
 def _repeated(
     method: RepeatedFilter, measurement: DifferenceMeasurement, z: FloatArray, start: FloatArray
 ) -> IteratedUpdate:
-    """By the square-root filter of :mod:`magloc.kalman`."""
-    variance = method.noise_inflation * measurement.variance
+    """By the square-root filter of :mod:`magloc.state_space`."""
+    sigma = np.sqrt(method.noise_inflation * measurement.variance)
     x, S, S_q = start, np.diag(s_q(method)), np.diag(s_q(method))
     predicted = measurement.predicted(x[:3], x[3:])
     innovation = z - predicted
     for iteration in range(1, method.max_iterations + 1):
-        S = predict_square_root(S, np.eye(6), S_q)
+        S = predict(S, np.eye(6), S_q)
         if method.relinearise_every_scalar:
             for j in range(z.size):
                 nu = z[j] - measurement.predicted(x[:3], x[3:])[j]
-                x, S = scalar_update(x, S, measurement.jacobian(x[:3], x[3:])[j], float(nu), float(variance[j]))
+                h = measurement.jacobian(x[:3], x[3:])[j]
+                x, S, _ = update(x, S, h[None] / sigma[j], nu[None] / sigma[j])
         else:
-            x, S = sequential_update(x, S, measurement.jacobian(x[:3], x[3:]), z - predicted, variance)
+            H = measurement.jacobian(x[:3], x[3:])
+            x, S, _ = update(x, S, H / sigma[:, None], (z - predicted) / sigma)
         predicted, before = measurement.predicted(x[:3], x[3:]), predicted
         change = float(np.linalg.norm(predicted - before))
         if not np.isfinite(change) or change < method.tolerance_T:

@@ -2,7 +2,7 @@
 
 | what | who checks it |
 |---|---|
-| one pass of `iekf` and `repeated`, ill-conditioned ones too | exact rational arithmetic, magloc.kalman |
+| one pass of `iekf` and `repeated`, ill-conditioned ones too | exact rational arithmetic, magloc.state_space |
 | several passes, the stop rule and the count | `run_one` of `readable_filters.py` |
 | `damped` | its cost, SciPy's least_squares, the twin |
 | what a stop promises | the gradient at the end, by an orthogonal factorisation |
@@ -33,8 +33,8 @@ from arrays.geometries import tetrahedron
 from arrays.sensor import Sensor
 from magloc.convergence.ends import Ends, ScaledDifferences
 from magloc.convergence.filters import DampedFilter, IekfFilter, RepeatedFilter, field_weights
-from magloc.kalman import predict_square_root, sequential_update
 from magloc.measurement.differences import DifferenceMeasurement
+from magloc.state_space import predict, update
 from tests.arrays.test_differences import random_array
 from tests.magloc.convergence.readable_filters import run_one
 
@@ -141,7 +141,7 @@ class TestOnePassIsTheExactUpdate:
         variance = measurement.variance
         S = np.diag(np.repeat(s, 3))
         if isinstance(method, RepeatedFilter):
-            S = predict_square_root(S, np.eye(6), S)
+            S = predict(S, np.eye(6), S)
         starts = starts_of(kind, 25)
         ends = method.run(measurement, z, starts)
         compared = 0
@@ -153,7 +153,8 @@ class TestOnePassIsTheExactUpdate:
                 continue
             compared += 1
             step, information = self.exact_step(H, innovation, variance, np.diagonal(S))
-            by_kalman, _ = sequential_update(start, S, H, innovation, variance)
+            sigma = np.sqrt(variance)
+            by_kalman = update(start, S, H / sigma[:, None], innovation / sigma)[0]
             for result in (end, by_kalman):
                 e = [Fraction(result[i]) - Fraction(start[i]) - step[i] for i in range(6)]
                 square = sum(e[i] * information[i][j] * e[j] for i in range(6) for j in range(6))

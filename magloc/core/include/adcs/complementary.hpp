@@ -1,5 +1,5 @@
 // Filters of a gyro and two vectors: complementary ones with fixed gains, and the adaptive error-state filter.
-// adcs/complementary/{explicit,gauss_newton,outage,adaptive}.py are the readable references and have the formulas.
+// tests/adcs/complementary/readable.py is the readable reference and has the formulas.
 #pragma once
 #include "adcs/rotation.hpp"
 #include "magloc.h"

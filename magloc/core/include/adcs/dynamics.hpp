@@ -88,7 +88,8 @@ MAGLOC_INLINE T clipped(T x, double limit) {
   return choose(x > limit, broadcast<T>(limit), choose(x < -limit, broadcast<T>(-limit), x));
 }
 
-// The torque of the wheels until the next instant, within the limits of torque and momentum.
+// The torque of the wheels until the next instant, within the limits of torque and momentum. The readable form is in
+// tests/adcs/attitudes.py.
 template <class T>
 MAGLOC_INLINE Vector<T> commanded_torque(const Body &body, const Control &control, const Motion<T> &motion,
                                          const Vector<T> &momentum, T orbital_rate, double dt) {
@@ -159,5 +160,20 @@ inline void transposed_error_jacobian(const Body &body, const Vector<double> &di
     }
   }
   for (auto &row : F) row[6] = row[7] = 0.0;
+}
+
+// The same as the source paper has it: the torque of the wheels is that of a control which sees the true attitude,
+// against the orbital frame, and rate. That is wrong, and here to reproduce the paper.
+inline void transposed_closed_loop_jacobian(const Body &body, const Control &control, const Motion<double> &motion,
+                                            double gravity, double (&F)[6][8]) {
+  transposed_error_jacobian(body, {}, motion, {}, {0.0, gravity, {}}, F);
+  const double sign = motion.q.scalar < 0.0 ? -1.0 : 1.0;
+  for (int i = 0; i < 3; ++i) {
+    const Vector<double> e = unit_vector<double>(i);
+    Vector<double> by_attitude = sign * (motion.q.scalar * e + cross(motion.q.vector, e)), by_rate = e;
+    for (int j = 0; j < 3; ++j) by_attitude[j] *= control.attitude_gain[j], by_rate[j] *= control.rate_gain[j];
+    by_attitude = body.inverse_inertia * by_attitude, by_rate = body.inverse_inertia * by_rate;
+    for (int j = 0; j < 3; ++j) F[i][3 + j] -= by_attitude[j], F[3 + i][3 + j] = -by_rate[j];
+  }
 }
 MAGLOC_END

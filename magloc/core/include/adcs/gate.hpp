@@ -1,10 +1,10 @@
-// Readings that contradict a filter, and the second hypothesis that they may begin. adcs/kalman/gate/contest.py is the
-// readable reference and says why the rules are as they are.
+// Readings that contradict a filter, and the second hypothesis that they may begin. The readable reference, which says
+// why the rules are as they are, is tests/adcs/kalman/readable.py.
 #pragma once
 #include "adcs/mekf.hpp"
 
 MAGLOC_BEGIN
-// The numbers of contest.py, which explains them.
+// The numbers of the readable reference, which explains them.
 struct ContestRules {
   static constexpr int agree = 3, strain = 4, open = 80, patient_readings = 10;
   static constexpr double clip = 25.0, better = 15.0, worse = -30.0, far = 6.0;

@@ -25,6 +25,7 @@ struct FilterModel {
   int n;                       // numbers of the error state: attitude, rate, and the optional states in use
   int place[Optional::count];  // in the error state of each optional state, or -1
   double variance[Sensor::count];
+  const Control *feedback;  // taken for dynamics as in the source paper, or null: the torque of the wheels is known
 
   bool has(int optional) const { return place[optional] >= 0; }
   int width() const { return (n + 3) / 4 * 4; }
@@ -188,12 +189,11 @@ class Hypothesis {
     const Vector<double> own_dipole = model.residual_dipole + x.optional[Optional::dipole];
     const Vector<double> dipole = own_dipole + now.torquers;
     double F[6][8], next_F[6][8];
-    transposed_error_jacobian(model.body, dipole, x.motion, now.wheels.momentum, now.around, F);
+    linearise(model, dipole, now, F);
     const Vector<double> b = rotate_back(x.motion.q, now.around.field);
     Wheels<double> wheels = now.wheels;
     step(model.body, dipole, x.motion, wheels, model.body.inertia * x.optional[Optional::disturbance], now.around, dt);
-    transposed_error_jacobian(model.body, own_dipole + next.torquers, x.motion, next.wheels.momentum, next.around,
-                              next_F);
+    linearise(model, own_dipole + next.torquers, next, next_F);
     for (int i = 0; i < 6; ++i)
       for (int j = 0; j < 8; ++j) F[i][j] = 0.5 * (F[i][j] + next_F[i][j]);
     const Vector<double> mean_b = 0.5 * (b + rotate_back(x.motion.q, next.around.field));
@@ -247,6 +247,14 @@ class Hypothesis {
   }
 
  private:
+  // The transposed Jacobian of the error's rate of change at an instant.
+  void linearise(const FilterModel &model, const Vector<double> &dipole, const Instant &at, double (&F)[6][8]) const {
+    if (model.feedback)
+      transposed_closed_loop_jacobian(model.body, *model.feedback, x.motion, at.around.gravity, F);
+    else
+      transposed_error_jacobian(model.body, dipole, x.motion, at.wheels.momentum, at.around, F);
+  }
+
   // Shrink the states that have a time constant.
   void decay(const FilterModel &model, const double *kept) {
     for (int k = 0; k < Optional::count; ++k)

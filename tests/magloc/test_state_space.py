@@ -2,9 +2,9 @@
 
 | what | who checks it |
 |---|---|
-| block_update | scalar_update, sequential_update, and an expansion in how little is learnt |
-| scalar_update, sequential_update | exact rational arithmetic, filterpy's batch update, information form |
-| predict_square_root | F P Fᵀ + Q |
+| update | exact rational arithmetic, filterpy's batch update, information form, an expansion in how little is learnt |
+| predict | F P Fᵀ + Q |
+| smoothing_gain | Rauch, Tung and Striebel's formulas with inverses, of each of a batch |
 | iterated_update | scipy's minimiser of the MAP cost, Stone Soup's IteratedKalmanUpdater, the affine closed form |
 | IteratedExtendedKalmanFilter | filterpy's ExtendedKalmanFilter where one linearisation is exact |
 """
@@ -22,18 +22,17 @@ from hypothesis import strategies as st
 from scipy.stats import chi2 as chi2_distribution
 
 from arrays.geometries import tetrahedron
-from magloc.kalman import (
+from magloc.measurement.differences import DifferenceMeasurement
+from magloc.state_space import (
     IteratedExtendedKalmanFilter,
-    block_update,
     estimability,
     iterated_update,
-    predict_square_root,
-    scalar_update,
-    sequential_update,
+    predict,
+    smoothing_gain,
     symmetric_square_root,
+    update,
     whitened_innovation,
 )
-from magloc.measurement.differences import DifferenceMeasurement
 from tests import oracles
 
 
@@ -46,6 +45,23 @@ def random_problem(seed, n=6, k=9):
         rng.normal(size=k),
         rng.uniform(0.1, 2, k),
     )
+
+
+def updated(x, S, H, innovation, variance):
+    """State and root after :func:`update`, from rows that are not in units of their noise yet."""
+    sigma = np.sqrt(variance)
+    return update(x, S, H / sigma[:, None], innovation / sigma)[:2]
+
+
+def in_turn(x, S, H, innovation, variance):
+    """The same by one scalar after the other, in Potter's form (Bierman, II.4)."""
+    x0 = x
+    for h, nu, r in zip(H, innovation, variance, strict=True):
+        phi = h @ S
+        alpha = 1.0 / (phi @ phi + r)
+        gain = alpha * (S @ phi)
+        x, S = x + gain * (nu - h @ (x - x0)), S - np.outer(gain, phi) / (1.0 + np.sqrt(alpha * r))
+    return x, S
 
 
 def dipole_problem(start, seed=0, prior=(3.0, 300.0), scale=1.0):
@@ -68,14 +84,14 @@ def dipole_problem(start, seed=0, prior=(3.0, 300.0), scale=1.0):
 START = [7.0, 1.0, 2.0, 0.0, 0.0, 0.0]
 
 
-class TestScalarUpdateIsBayes:
-    """One scalar measurement of a Gaussian state is conditioned exactly."""
+class TestUpdateIsBayes:
+    """A Gaussian state is conditioned exactly on all scalars of one linearisation."""
 
     @given(st.integers(0, 2**32 - 1))
     @settings(max_examples=30, deadline=None)
     def test_information_form(self, seed):
         x, S, H, nu, r = random_problem(seed)
-        x_new, S_new = sequential_update(x, S, H, nu, r)
+        x_new, S_new = updated(x, S, H, nu, r)
         prior, gain = np.linalg.inv(S @ S.T), H.T / r
         information = prior + gain @ H
         P = np.linalg.inv(information)
@@ -92,14 +108,27 @@ class TestScalarUpdateIsBayes:
         peer = filterpy.kalman.KalmanFilter(dim_x=6, dim_z=9)
         peer.x, peer.P, peer.H, peer.R = x[:, None], S @ S.T, H, np.diag(r)
         peer.update((H @ x + nu)[:, None])
-        x_new, S_new = sequential_update(x, S, H, nu, r)
+        x_new, S_new = updated(x, S, H, nu, r)
         np.testing.assert_allclose(x_new, peer.x.ravel(), rtol=1e-10)
         np.testing.assert_allclose(S_new @ S_new.T, peer.P, rtol=1e-9, atol=1e-12)
+
+    @given(st.integers(0, 2**32 - 1), st.integers(1, 8), st.integers(1, 12))
+    @settings(max_examples=30)
+    def test_is_the_update_in_turn(self, seed, n, k):
+        x, S, H, nu, r = random_problem(seed, n, k)
+        x_new, S_new = updated(x, S, H, nu, r)
+        x_turn, S_turn = in_turn(x, S, H, nu, r)
+        phi = np.linalg.norm(H / np.sqrt(r)[:, None] @ S, 2)
+        # Householder's reflections of n + k rows by n columns, and the sum with x.
+        size = np.finfo(np.float64).eps * (1.0 + phi**2) * n * (n + k) * np.linalg.norm(S)
+        off = size * np.linalg.norm(nu / np.sqrt(r)) + 2.0 * np.finfo(np.float64).eps * np.linalg.norm(x)
+        np.testing.assert_allclose(S_new @ S_new.T, S_turn @ S_turn.T, rtol=0.0, atol=size * np.linalg.norm(S))
+        np.testing.assert_allclose(x_new, x_turn, rtol=0.0, atol=off)
 
     def test_order_of_scalars_is_free(self):
         x, S, H, nu, r = random_problem(4)
         order = np.random.default_rng(0).permutation(9)
-        first, second = sequential_update(x, S, H, nu, r), sequential_update(x, S, H[order], nu[order], r[order])
+        first, second = updated(x, S, H, nu, r), updated(x, S, H[order], nu[order], r[order])
         np.testing.assert_allclose(first[0], second[0], rtol=1e-12)
         np.testing.assert_allclose(first[1] @ first[1].T, second[1] @ second[1].T, rtol=1e-11, atol=1e-14)
 
@@ -109,48 +138,23 @@ class TestScalarUpdateIsBayes:
         P, r = Fraction(10) ** 8, Fraction(1, 10**8)
         s = P * 25 + r
         exact = [[(P if i == j else 0) - P * h[i] * h[j] * P / s for j in range(2)] for i in range(2)]
-        _, S = scalar_update(np.zeros(2), 1e4 * np.eye(2), np.array([3.0, 4.0]), 0.0, 1e-8)
+        _, S = updated(np.zeros(2), 1e4 * np.eye(2), np.array([[3.0, 4.0]]), np.zeros(1), np.array([1e-8]))
         along = np.array([0.6, 0.8])
         exact_along = sum(Fraction(h[i], 5) * exact[i][j] * Fraction(h[j], 5) for i in range(2) for j in range(2))
         assert np.linalg.norm(S.T @ along) ** 2 == pytest.approx(float(exact_along), rel=1e-6)
         naive = 1e8 * np.eye(2) - np.outer([3e8, 4e8], [3e8, 4e8]) / (25e8 + 1e-8)
         assert abs(along @ naive @ along - float(exact_along)) > 0.5 * float(exact_along)
 
-
-class TestBlockUpdate:
-    """All scalars of one linearisation at once."""
-
-    @given(st.integers(0, 2**32 - 1), st.integers(1, 8), st.integers(1, 12))
-    @settings(max_examples=30)
-    def test_is_the_update_in_turn(self, seed, n, k):
-        x, S, H, nu, r = random_problem(seed, n, k)
-        x_new, S_new = block_update(x, S, H, nu, r)
-        x_turn, S_turn = sequential_update(x, S, H, nu, r)
-        phi = np.linalg.norm(H / np.sqrt(r)[:, None] @ S, 2)
-        size = np.finfo(np.float64).eps * (1.0 + phi**2) * n * k * np.linalg.norm(S)
-        np.testing.assert_allclose(S_new @ S_new.T, S_turn @ S_turn.T, rtol=0.0, atol=size * np.linalg.norm(S))
-        np.testing.assert_allclose(x_new, x_turn, rtol=0.0, atol=size * np.linalg.norm(nu / np.sqrt(r)))
-
-    @given(st.integers(0, 2**32 - 1), st.integers(1, 8))
-    @settings(max_examples=30)
-    def test_of_one_scalar_is_potters_root(self, seed, n):
-        """The root itself, not the covariance alone: of all that have its square, the one nearest to what was."""
-        x, S, H, nu, r = random_problem(seed, n, 1)
-        x_new, S_new = block_update(x, S, H, nu, r)
-        x_potter, S_potter = scalar_update(x, S, H[0], float(nu[0]), float(r[0]))
-        np.testing.assert_allclose(S_new, S_potter, rtol=0.0, atol=1e-13 * np.linalg.norm(S) ** 2)
-        np.testing.assert_allclose(x_new, x_potter, rtol=0.0, atol=1e-12 * np.linalg.norm(x_potter))
-
     @pytest.mark.parametrize("weight", [0.0, 1e-12, 1e-9, 1e-7, 1e-5, 1e-4])
     @pytest.mark.parametrize("k", [1, 3, 9])
     def test_readings_that_teach_next_to_nothing(self, weight, k):
-        """S⁺ = S (I - ΦᵀΦ/2) but for Φ⁴: a factor of the other sign would divide by the digits that 1 - L loses."""
+        """P⁺ = S (I - ΦᵀΦ) Sᵀ but for Φ⁴: nothing is divided by the digits that a difference from one loses."""
         x, S, H, nu, r = random_problem(5, k=k)
-        x_new, S_new = block_update(x, S, weight * H, nu, r)
+        x_new, S_new = updated(x, S, weight * H, nu, r)
         phi = weight * H / np.sqrt(r)[:, None] @ S
         size = np.linalg.norm(S)
-        off = 1e-14 * size + size * np.linalg.norm(phi) ** 4
-        np.testing.assert_allclose(S_new, S - S @ (phi.T @ phi) / 2.0, rtol=0.0, atol=off)
+        off = size**2 * (1e-14 + np.linalg.norm(phi) ** 4)
+        np.testing.assert_allclose(S_new @ S_new.T, S @ (np.eye(6) - phi.T @ phi) @ S.T, rtol=0.0, atol=off)
         first = S @ phi.T @ (nu / np.sqrt(r))
         np.testing.assert_allclose(
             x_new, x + first, rtol=0.0, atol=1e-14 + np.linalg.norm(phi) ** 2 * np.abs(first).max()
@@ -163,9 +167,28 @@ class TestPrediction:
     def test_covariance(self, seed):
         rng = np.random.default_rng(seed)
         S, F, S_q = rng.normal(size=(4, 4)), rng.normal(size=(4, 4)), rng.normal(size=(4, 2))
-        L = predict_square_root(S, F, S_q)
+        L = predict(S, F, S_q)
         np.testing.assert_allclose(L @ L.T, F @ S @ S.T @ F.T + S_q @ S_q.T, rtol=1e-10, atol=1e-12)
         np.testing.assert_array_equal(L, np.tril(L))
+
+
+class TestSmoothing:
+    def test_gain_and_rest_of_every_one_of_a_batch(self):
+        """G = P Fᵀ P₋⁻¹, and D Dᵀ = P - G P₋ Gᵀ, with P₋ = F P Fᵀ + Q."""
+        rng = np.random.default_rng(10)
+        S, F, S_q = rng.normal(size=(5, 4, 4)), rng.normal(size=(5, 4, 4)), rng.normal(size=(5, 4, 2))
+        P, Q = S @ S.mT, S_q @ S_q.mT
+        ahead = F @ P @ F.mT + Q
+        G, D = smoothing_gain(S, F, S_q)
+        np.testing.assert_allclose(G, P @ F.mT @ np.linalg.inv(ahead), rtol=1e-9, atol=1e-10)
+        np.testing.assert_allclose(D @ D.mT, P - G @ ahead @ G.mT, rtol=1e-8, atol=1e-9)
+
+
+class TestWhitenedInnovation:
+    def test_by_the_lower_cholesky_factor(self):
+        _, S, H, nu, _ = random_problem(11)
+        L = np.linalg.cholesky(H @ S @ S.T @ H.T + np.eye(9))
+        np.testing.assert_allclose(whitened_innovation(S, H, nu), np.linalg.solve(L, nu), rtol=1e-10)
 
 
 class TestIteratedUpdateIsMaximumAPosteriori:
@@ -194,14 +217,14 @@ class TestIteratedUpdateIsMaximumAPosteriori:
         x, S, H, nu, r = random_problem(5)
         z = H @ x + nu
         result = iterated_update(x, S, z, r, lambda y: H @ y, lambda _: H, tolerance=1e-8)
-        expected, _ = sequential_update(x, S, H, nu, r)
+        expected, _ = in_turn(x, S, H, nu, r)
         assert result.iterations == 2  # the second finds that nothing changes
         np.testing.assert_allclose(result.x, expected, rtol=1e-10)
 
     def test_square_root_form_equals_information_form_on_ill_conditioned_starts(self):
         """A prior of 300 m and 1e6 A·m² against 1 pT: the correlation of the posterior comes close to one."""
         x, S, z, r, h, H = dipole_problem([5.5, 0.5, 0.5, 50.0, 50.0, 50.0], prior=(300.0, 1e6), scale=1e-6)
-        linear, S_new = sequential_update(x, S, H(x), z - h(x), r)
+        linear, S_new = updated(x, S, H(x), z - h(x), r)
         # The information form in extended precision stands in for the exact one.
         unit = np.diag(S).astype(np.longdouble)
         W = (H(x) / np.sqrt(r)[:, None]).astype(np.longdouble) * unit
@@ -247,7 +270,7 @@ class TestOneLinearisationIsAnExtendedKalmanFilter:
         x, S, z, r, h, H = dipole_problem([5.2, 0.1, 0.4, 55.0, 50.0, 60.0], prior=prior)
         asked = []
         ours = iterated_update(x, S, z, r, lambda y: asked.append(y) or h(y), H, tolerance=0.0, max_iterations=1)
-        linear, S_turn = sequential_update(x, S, H(x), z - h(x), r)
+        linear, S_turn = in_turn(x, S, H(x), z - h(x), r)
         assert (len(asked), ours.iterations, ours.converged) == (1, 1, False)
         np.testing.assert_allclose((ours.x - x) / prior[0], (linear - x) / prior[0], rtol=0.0, atol=1e-7)
         P, scale = ours.S @ ours.S.T, np.linalg.norm(S_turn, axis=1)
@@ -270,7 +293,7 @@ class TestPlainFormIsUnchanged:
         x_k, predicted, change, iterations = x, h(x), np.inf, 0
         while change >= tolerance and iterations < 100:
             J = H(x_k)
-            x_k, S_k = sequential_update(x, S, J, z - predicted - J @ (x - x_k), r)
+            x_k, S_k = in_turn(x, S, J, z - predicted - J @ (x - x_k), r)
             before, predicted = predicted, h(x_k)
             change, iterations = np.linalg.norm(predicted - before), iterations + 1
         return x_k, S_k, iterations
@@ -375,18 +398,18 @@ class TestNothingMeasured:
     def test_every_update(self, capfd):
         x, S, H, nu, r = random_problem(9, k=0)
         iterated = iterated_update(x, S, nu, r, lambda y: H @ y, lambda _: H, tolerance=1e-9)
-        for x_new, S_new in (block_update(x, S, H, nu, r), (iterated.x, iterated.S), sequential_update(x, S, H, nu, r)):
+        for x_new, S_new in (updated(x, S, H, nu, r), (iterated.x, iterated.S)):
             np.testing.assert_array_equal(x_new, x)
             np.testing.assert_array_equal(S_new, S)
         assert (iterated.nis, iterated.converged) == (0.0, True)
-        assert whitened_innovation(S, H, nu, r).shape == (0,)
+        assert whitened_innovation(S, H, nu).shape == (0,)
         assert capfd.readouterr() == ("", "")
 
 
 class TestEstimability:
     def test_nothing_learned_and_fully_determined(self):
         S = np.diag([2.0, 3.0])
-        _, S_new = scalar_update(np.zeros(2), S, np.array([1.0, 0.0]), 0.0, 1e-12)
+        _, S_new = updated(np.zeros(2), S, np.array([[1.0, 0.0]]), np.zeros(1), np.array([1e-12]))
         np.testing.assert_allclose(estimability(S_new, S), [1.0, 0.0], atol=1e-6)
 
 

@@ -1,9 +1,9 @@
-"""Readings that contradict a filter, and the second hypothesis that they may begin: the rules, and its first state.
+"""The error-state filter with its gate, instant by instant in NumPy: the oracle of the compiled one.
 
 A reading whose normalised innovation squared is beyond its limit is not used. That alone never comes back from a wild
 first fix, and giving the estimate up after some rejections makes a lie the truth. So a rejected reading begins a second
 filter, which lives beside the main one until one of them is believed. See docs/theory/attitude-kalman-filters.md;
-adcs/gate.hpp of the core is its compiled form.
+adcs/gate.hpp of the core is the compiled form.
 """
 
 from __future__ import annotations
@@ -14,10 +14,25 @@ from typing import NamedTuple
 import numpy as np
 
 from adcs import quaternion
-from adcs.kalman.error_state import FilterSettings, State
+from adcs.kalman.error_state import AttitudeTracks, FilterSettings, SensorSet, Start, State
+from adcs.kalman.initialisation import turned_onto
+from adcs.kalman.mekf import (
+    PATIENT_READINGS,
+    check_start,
+    collected,
+    deviations,
+    first_state,
+    joseph_update,
+    patience,
+    predicted,
+    residuals,
+    with_error,
+)
+from adcs.satellite.dynamics import RigidBody, WheelControl, error_jacobian
 from adcs.satellite.sensors import SENSORS
-from adcs.satellite.telemetry import Record, is_read
+from adcs.satellite.telemetry import Record, is_read, part
 from arrays.typing import FloatArray
+from magloc.navigation.rotations import cross_matrix
 
 STAR, GYRO, FIELD, SUN = range(len(SENSORS))
 AGREE = 3
@@ -33,12 +48,6 @@ the sensor's readings are used: after twenty in a row, or where more than a fift
 FAR = 6.0
 """Twice the log of the odds by which a reading that fits both must fit the second better: two that are the same go on
 as one."""
-PATIENCE_S = 300.0
-"""A main hypothesis that has taken no reading of the sensor for so long loses against readings that agree, though no
-other sensor tells: what lasts as long is the truth."""
-PATIENT_READINGS = 10
-"""The same for a gyro's bias, which costs the attitude nothing, in instants. Also: a main hypothesis that takes as many
-readings of that sensor meanwhile is not wrong, and a sensor is back from a gap after as many of its intervals."""
 
 
 class Fit(NamedTuple):
@@ -149,11 +158,6 @@ class Contest:
         return self.row - self.last_taken[sensor] >= patience(sensor, self.dt_s)
 
 
-def patience(sensor: int, dt_s: float) -> int:
-    """Instants after which a hypothesis that a reading of a sensor began is believed though no other sensor tells."""
-    return PATIENT_READINGS if sensor == GYRO else round(PATIENCE_S / dt_s)
-
-
 def begun(record: Record, row: int, state: State, settings: FilterSettings, sensor: int) -> State:
     """First state of a hypothesis in which a reading is right, before that reading; one run.
 
@@ -181,19 +185,6 @@ def begun(record: Record, row: int, state: State, settings: FilterSettings, sens
     return replace(state, q=q, P=np.diag(variance)[None])
 
 
-def turned_onto(q: FloatArray, body: FloatArray, reference: FloatArray) -> FloatArray:
-    """Attitude (runs, 4) after the shortest turn that makes a direction in body axes that of the reference frame."""
-    length = np.linalg.norm(body, axis=-1, keepdims=True) * np.linalg.norm(reference, axis=-1, keepdims=True)
-    there = quaternion.rotate_back(q, reference)
-    cosine = np.sum(body * there, axis=-1, keepdims=True) / length
-    turn = np.concatenate([1.0 + cosine, np.cross(body, there) / length], axis=-1)
-    # Half a turn is one about any axis across.
-    opposite = 1.0 + cosine[..., 0] < 1e-12
-    across = np.cross(body[opposite], np.eye(3)[np.argmin(np.abs(body[opposite]), axis=-1)])
-    turn[opposite] = np.insert(across, 0, 0.0, axis=-1)
-    return quaternion.normalised(quaternion.multiply(q, quaternion.normalised(turn)))
-
-
 def turned_about(q: FloatArray, axis: FloatArray, body: FloatArray, reference: FloatArray) -> FloatArray:
     """Attitude (runs, 4) after the turn about a unit axis that brings a direction nearest to that of the frame."""
     there = quaternion.rotate_back(q, reference)
@@ -201,3 +192,141 @@ def turned_about(q: FloatArray, axis: FloatArray, body: FloatArray, reference: F
     along, along_there = (np.sum(axis * one, axis=-1) for one in (body, there))
     angle = np.arctan2(sine, np.sum(body * there, axis=-1) - along * along_there)
     return quaternion.normalised(quaternion.multiply(q, quaternion.exp(angle[:, None] * axis)))
+
+
+class Hypothesis(NamedTuple):
+    """A state of one run, predicted, with the covariance after some of the readings, and the correction (1, N) by them.
+
+    All readings of an instant are linearised at the predicted state.
+    """
+
+    state: State
+    dx: FloatArray
+    attitude_variance: float  # trace of that of δq, as predicted
+
+    @classmethod
+    def of(cls, state: State, dx: FloatArray) -> Hypothesis:
+        """Hypothesis before the readings of an instant, or before some of them."""
+        return cls(state, dx, float(np.trace(state.P[0, :3, :3])))
+
+    def with_reading(
+        self, record: Record, row: int, settings: FilterSettings, sensor: int
+    ) -> tuple[Hypothesis, Fit] | None:
+        """The hypothesis with one more reading, and how that fits; None where there is no reading."""
+        parts = residuals(record, row, self.state, settings.sensors)
+        residual, rows = next((residual, rows) for place, residual, rows in parts if place == sensor)
+        if not is_read(residual).all():
+            return None
+        sigma = deviations(record, settings)[sensor]
+        H = rows / sigma
+        nu = residual / sigma - (H @ self.dx[..., None])[..., 0]
+        S = H @ self.state.P @ H.mT + np.eye(3)
+        nis = float((nu @ np.linalg.solve(S[0], nu[0]))[0])
+        dx, P = joseph_update(self.state.P, H, nu)
+        around = record.environment
+        model = {FIELD: around.b_orbital_T, SUN: around.sun_orbital}.get(sensor)
+        length = 0.0 if model is None else float(np.linalg.norm(model[0, row]))
+        fit = Fit(nis, eased(nis, sigma**2, length, self.attitude_variance), float(np.linalg.slogdet(S[0])[1]))
+        return self._replace(state=replace(self.state, P=P), dx=self.dx + dx), fit
+
+    def corrected(self, used: SensorSet) -> State:
+        """State with the correction in it."""
+        return with_error(self.state, self.dx, used)
+
+
+class _Readable:
+    """Filter of one run with its gate, instant by instant."""
+
+    def __init__(self, record: Record, settings: FilterSettings, start: Start) -> None:
+        self.record, self.settings = record, settings
+        self.main, self.second = first_state(settings, start), None
+        self.contest = Contest(settings, record.dt_s)
+        n = record.momentum_Nms.shape[1]
+        self.nis, self.log_det = np.full((2, 1, n, len(SENSORS)), np.nan)
+        self.rejected = np.zeros((1, n, len(SENSORS)), dtype=np.bool_)
+
+    second: State | None
+
+    def state_of(self, row: int) -> State:
+        """State after the readings of an instant, from that of the instant before."""
+        if row:
+            ahead = self.record, row - 1
+            self.main = predicted(*ahead, self.main, self.settings)[0]
+            if self.second is not None:
+                self.second = predicted(*ahead, self.second, self.settings)[0]
+        self._correct(row)
+        return self.main
+
+    def _correct(self, row: int) -> None:
+        settings, used, contest = self.settings, self.settings.sensors, self.contest
+        contest.row = row
+        zero = np.zeros((1, used.size))
+        main = Hypothesis.of(self.main, zero)
+        second = None if self.second is None else Hypothesis.of(self.second, zero)
+        for name in used.sensors.split("+"):
+            sensor = SENSORS.index(name)
+            tried = main.with_reading(self.record, row, settings, sensor)
+            if tried is None:
+                continue
+            with_it, fits = tried
+            other = None if second is None else second.with_reading(self.record, row, settings, sensor)
+            use, use_second = contest.decided(sensor, fits, None if other is None else other[1])
+            self.nis[0, row, sensor], self.log_det[0, row, sensor] = fits.nis, fits.log_determinant
+            self.rejected[0, row, sensor] = not use
+            if not use and contest.may_begin(sensor, both=self._both(row)):
+                state = begun(self.record, row, main.state, settings, sensor)
+                first = Hypothesis.of(state, main.dx if sensor == GYRO else zero)
+                other, use_second = first.with_reading(self.record, row, settings, sensor), True
+                contest.begin(sensor)
+            contest.read(sensor)
+            main = with_it if use else main
+            second = other[0] if use_second and other is not None else second
+        self.main = main.corrected(used)
+        self.second = None if second is None else second.corrected(used)
+        if self.second is not None:
+            verdict = contest.verdict()
+            if verdict:
+                self.main = self.second
+            if verdict is not None:
+                contest.end(believed=verdict)
+                self.second = None
+
+    def _both(self, row: int) -> bool:
+        """Whether field and Sun are in use, and read at an instant."""
+        used, readings = self.settings.sensors, self.record.readings
+        read = is_read(readings.field_T[0, row]) and is_read(readings.sun[0, row])
+        return used.magnetometer and used.sun and bool(read)
+
+
+def run_readable(record: Record, settings: FilterSettings, start: Start) -> AttitudeTracks:
+    """Filter of whole runs in NumPy, the reference of :func:`adcs.kalman.mekf.run_filter`."""
+    check_start(record, start)
+    tracks = []
+    for run in range(len(start.q)):
+        only = np.array([run])
+        one = _Readable(part(record, only), settings, start.of_runs(only))
+        states = [one.state_of(row) for row in range(record.momentum_Nms.shape[1])]
+        tracks.append(collected(settings, states, one.nis, one.rejected, one.log_det))
+    names = ("q", "w", "covariance", "nis", "rejected", "log_det")
+    whole = {name: np.concatenate([getattr(one, name) for one in tracks]) for name in names}
+    optional = {name: np.concatenate([one.optional[name] for one in tracks]) for name in settings.sensors.states}
+    return AttitudeTracks(settings, optional=optional, **whole)
+
+
+def closed_loop_error_jacobian(
+    body: RigidBody, control: WheelControl, q: FloatArray, w: FloatArray, gravity_s2: float
+) -> FloatArray:
+    r"""F of the error as the source paper has it, as if the control saw the true state (``closed_loop_F``).
+
+    .. math:: F_{21} = J^{-1}\left(6\frac{\mu}{r^3}F_g - K_\lambda W_\lambda\right), \quad F_{22} = -J^{-1}K_\omega
+
+    with :math:`W_\lambda = \lambda_0 E + W(\lambda)`. The torque is computed from the estimate, so this is not the F of
+    an estimate's error, and filters with it are overconfident; even as the Jacobian of the closed loop it lacks
+    :math:`2J^{-1}K_\omega W(A\omega_o)` in F21.
+    """
+    F = error_jacobian(replace(body, residual_dipole_Am2=np.zeros(3)), q, w, np.zeros(3), gravity_s2, np.zeros(3))
+    turn = np.where(q[..., :1] < 0.0, -q, q)
+    W_lambda = turn[..., 0, None, None] * np.eye(3) + cross_matrix(turn[..., 1:])
+    F[..., 3:, :3] -= body.inverse @ (control.attitude_gain_Nm[:, None] * W_lambda)
+    F[..., 3:, 3:] = -body.inverse * control.rate_gain_Nms
+    return F

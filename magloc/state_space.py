@@ -1,4 +1,4 @@
-r"""Square-root Kalman filtering, one scalar measurement at a time, iterated.
+r"""State-space filtering with square roots of covariances: predict, update, iterate, smooth.
 
 Generic: no magnetics in here. The covariance is carried as a square root S with :math:`P = S S^T`, so that it stays
 symmetric and positive semidefinite however small a measurement's noise is against the prior.
@@ -6,8 +6,8 @@ symmetric and positive semidefinite however small a measurement's noise is again
 The names of the source paper (Pavlov, Karshakov, Goldin) and ours:
 
 ==============  =================================================================
-PrognosisFK     :func:`predict_square_root`
-ProcessingFK    :func:`scalar_update`
+PrognosisFK     :func:`predict`
+ProcessingFK    :func:`update`, of all scalars at once
 MeasureS        :func:`estimability`
 (19), (30)      stop rule of :func:`iterated_update`
 ==============  =================================================================
@@ -30,7 +30,7 @@ MeasurementFunction = Callable[[FloatArray], FloatArray]
 _ones_below = cache(np.tri)
 
 
-def predict_square_root(S: FloatArray, F: FloatArray, S_q: FloatArray) -> FloatArray:
+def predict(S: FloatArray, F: FloatArray, S_q: FloatArray) -> FloatArray:
     """Square root of ``F S Sᵀ Fᵀ + S_q S_qᵀ`` (the paper's PrognosisFK).
 
     Parameters
@@ -47,91 +47,60 @@ def predict_square_root(S: FloatArray, F: FloatArray, S_q: FloatArray) -> FloatA
     ndarray, shape (n, n)
         Lower triangular, by an orthogonal factorisation: the covariance itself is never formed.
     """
-    return _factored(np.concatenate([F @ S, S_q], axis=1)) * _ones_below(len(S))
-
-
-def _factored(rows: FloatArray) -> FloatArray:
-    """Lower root L (n, n) of ``L Lᵀ = rows rowsᵀ``, rows (n, m ≥ n), which it spoils; above its diagonal anything."""
     # LAPACK itself: the checks of NumPy's form take several times longer than so small a factorisation.
-    lower: FloatArray = dgeqrf(rows.T, overwrite_a=True)[0][: len(rows)].T
-    return lower
+    upper = dgeqrf(np.concatenate([F @ S, S_q], axis=1).T, overwrite_a=True)[0]
+    return upper[: len(S)].T * _ones_below(len(S))
 
 
-def scalar_update(
-    x: FloatArray, S: FloatArray, h: FloatArray, innovation: float, variance: float
-) -> tuple[FloatArray, FloatArray]:
-    r"""Update of the estimate and of its square root by one scalar measurement (ProcessingFK, in Potter's form).
+def update(x: FloatArray, S: FloatArray, H: FloatArray, innovation: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+    r"""Update by all scalars of one linearisation, in units of their noise (ProcessingFK, of all scalars at once).
 
-    With :math:`\varphi = S^T h`: :math:`\alpha = 1/(\varphi^T\varphi + r)`, :math:`K = \alpha S \varphi`,
-    :math:`x^+ = x + K\,\nu`, :math:`S^+ = S - K \varphi^T / (1 + \sqrt{\alpha r})`.
+    Least squares in units of the prior, :math:`x^+ = x + S e`: e minimises :math:`|Φ e - ν|^2 + |e|^2` with
+    :math:`Φ = H S`. The triangle :math:`[U, b; 0, ρ]` of the rows :math:`[Φ, ν; I, 0]` has it all:
+    :math:`S^+ = S U^{-1}`, :math:`x^+ = x + S^+ b`, NIS = :math:`ρ^2`.
 
     Parameters
     ----------
     x : ndarray, shape (n,)
     S : ndarray, shape (n, n)
-        Square root of the covariance, :math:`P = S S^T`.
-    h : ndarray, shape (n,)
-        Row of the measurement matrix.
-    innovation : float
-        Measured minus predicted value.
-    variance : float
-        Variance r of the measurement's noise, positive.
+        Square root of the covariance.
+    H : ndarray, shape (k, n)
+        Measurement matrix; every row over the standard deviation of its scalar, which are independent.
+    innovation : ndarray, shape (k,)
+        Measured minus predicted at x, over the same standard deviations.
 
     Returns
     -------
     x, S : ndarray
         Updated copies.
+    nis : float
+        Normalised innovation squared, a χ² of k numbers for a right prediction.
 
     Notes
     -----
-    J. E. Potter's update, in Bierman, "Factorization Methods for Discrete Sequential Estimation", II.4.
+    The square-root information filter of Bierman, "Factorization Methods for Discrete Sequential Estimation", V.
     """
-    phi = h @ S
-    alpha = 1.0 / (float(phi @ phi) + variance)
-    gain = S @ (alpha * phi)
-    return x + gain * innovation, S - gain[:, None] * (phi / (1.0 + math.sqrt(alpha * variance)))
+    k, n = H.shape
+    if not k:
+        return x, S, 0.0
+    rows = np.eye(k + n, n + 1, -k, order="F")
+    rows[:k, :n], rows[:k, n] = H @ S, innovation
+    triangle = dgeqrf(rows, overwrite_a=True)[0]
+    root = dtrtrs(triangle[:n, :n], S.T, trans=1)[0].T
+    return x + root @ triangle[:n, n], root, float(triangle[n, n]) ** 2
 
 
-def sequential_update(
-    x: FloatArray, S: FloatArray, H: FloatArray, innovation: FloatArray, variance: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Update of x (n,) and its root S by independent scalars (k,) of one linearisation H (k, n), in turn.
+def whitened_innovation(S: FloatArray, H: FloatArray, innovation: FloatArray) -> FloatArray:
+    """``L⁻¹ ν`` (k,) of an innovation ν with its covariance ``L Lᵀ = H S Sᵀ Hᵀ + I``, L lower triangular.
 
-    The innovations (k,) are those at x, before any of these scalars is used.
+    In units of the noise, as :func:`update`.
     """
-    x0 = x
-    for h, nu, r in zip(H, innovation, variance, strict=True):
-        x, S = scalar_update(x, S, h, float(nu - h @ (x - x0)), float(r))
-    return x, S
-
-
-def block_update(
-    x: FloatArray, S: FloatArray, H: FloatArray, innovation: FloatArray, variance: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    r"""Update by independent scalars of one linearisation at once: :func:`sequential_update` but for rounding.
-
-    With :math:`Φ = R^{-1/2} H S` and :math:`L L^T = I + Φ Φ^T` lower triangular,
-    :math:`S^+ = S (I - Φ^T L^{-T} (L + I)^{-1} Φ)`: A. Andrews, "A square root formulation of the Kalman covariance
-    equations", AIAA Journal 6 (1968) 1165. For one scalar it is Potter's.
-    """
-    phi, L = _scaled_innovation_root(S, H, variance)
-    solved = _solved(L, np.concatenate([phi, (innovation / np.sqrt(variance))[:, None]], axis=1))
-    spread, whitened = S @ solved[:, :-1].T, solved[:, -1]
-    return x + spread @ whitened, S - spread @ _solved(L + np.eye(len(L)), phi)
-
-
-def _scaled_innovation_root(S: FloatArray, H: FloatArray, variance: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """:math:`Φ = R^{-1/2} H S`, and the root L of :math:`L L^T = I + Φ Φ^T` in a lower triangle; above it anything."""
-    phi = (H / np.sqrt(variance)[:, None]) @ S
-    # I + Φ Φᵀ itself would lose the digits of a prediction that is hardly known.
-    L = _factored(np.concatenate([np.eye(len(phi)), phi], axis=1))
-    return phi, L * np.sign(L.diagonal())
-
-
-def _solved(L: FloatArray, columns: FloatArray) -> FloatArray:
-    """``L⁻¹`` columns, of the lower triangle of L alone. LAPACK complains in print of one without rows."""
-    solved: FloatArray = dtrtrs(L, columns, lower=True)[0] if len(L) else columns
-    return solved
+    k = len(H)
+    if not k:
+        return innovation
+    # A root of I + Φ Φᵀ without the sum, which would lose the digits of a prediction that is hardly known.
+    L = predict(np.eye(k), np.eye(k), H @ S)
+    return np.asarray(np.sign(L.diagonal()) * dtrtrs(L, innovation, lower=True)[0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,7 +183,7 @@ def iterated_update(
     while iteration < max_iterations and np.isfinite(predicted).all() and not change < tolerance:
         iteration += 1
         H = HJacobian(x_k)
-        optimum, S_k, nis = _least_squares_update(x, S, H, z - predicted - H @ (x - x_k), sigma)
+        optimum, S_k, nis = update(x, S, H / sigma[:, None], (z - predicted - H @ (x - x_k)) / sigma)
         x_k = optimum if length == 1.0 else x_k + length * (optimum - x_k)
         if iteration == max_iterations and not tolerance > 0.0:
             break  # nothing would be below it
@@ -226,39 +195,6 @@ def iterated_update(
     return IteratedUpdate(x_k, S_k, iteration, change < tolerance, innovation, nis)
 
 
-def _least_squares_update(
-    x: FloatArray, S: FloatArray, H: FloatArray, innovation: FloatArray, sigma: FloatArray
-) -> tuple[FloatArray, FloatArray, float]:
-    r"""Updated x (n,) and root S (n, n) by all scalars (k,) of one linearisation, and their NIS.
-
-    Least squares in units of the prior, :math:`x^+ = x + S e`: e minimises :math:`|Φ e - ν|^2 + |e|^2` with
-    :math:`Φ = R^{-1/2} H S`. The triangle :math:`[U, b; 0, ρ]` of the rows :math:`[Φ, ν; I, 0]` has it all:
-    :math:`S^+ = S U^{-1}`, :math:`x^+ = x + S^+ b`, NIS = :math:`ρ^2`. Bierman's square-root information filter; the
-    root is not that of :func:`block_update`, the covariance is.
-    """
-    k, n = H.shape
-    if not k:
-        return x, S, 0.0
-    rows = np.eye(k + n, n + 1, -k, order="F")
-    rows[:k, :n], rows[:k, n] = H @ S, innovation
-    rows[:k] /= sigma[:, None]
-    triangle = dgeqrf(rows, overwrite_a=True)[0]
-    root = dtrtrs(triangle[:n, :n], S.T, trans=1)[0].T
-    return x + root @ triangle[:n, n], root, float(triangle[n, n]) ** 2
-
-
-def whitened_innovation(S: FloatArray, H: FloatArray, innovation: FloatArray, variance: FloatArray) -> FloatArray:
-    """``L⁻¹ ν`` (k,) of an innovation ν with its covariance ``L Lᵀ = H S Sᵀ Hᵀ + R``, L lower triangular."""
-    _, L = _scaled_innovation_root(S, H, variance)
-    return _solved(L, innovation / np.sqrt(variance))
-
-
-def normalised_innovation_squared(S: FloatArray, H: FloatArray, innovation: FloatArray, variance: FloatArray) -> float:
-    """Innovation squared in units of its covariance: a χ² of k numbers for a right prediction."""
-    whitened = whitened_innovation(S, H, innovation, variance)
-    return float(whitened @ whitened)
-
-
 def smoothing_gain(S: FloatArray, F: FloatArray, S_q: FloatArray) -> tuple[FloatArray, FloatArray]:
     r"""Gain of a fixed-interval smoother over one step, and what it leaves unknown.
 
@@ -268,26 +204,27 @@ def smoothing_gain(S: FloatArray, F: FloatArray, S_q: FloatArray) -> tuple[Float
 
     Parameters
     ----------
-    S : ndarray, shape (n, n)
+    S : ndarray, shape (..., n, n)
         Square root of the filtered covariance.
-    F : ndarray, shape (n, n)
+    F : ndarray, shape (..., n, n)
         Transition matrix.
-    S_q : ndarray, shape (n, m)
+    S_q : ndarray, shape (..., n, m)
         Square root of the noise of the step.
 
     Returns
     -------
-    G, D : ndarray, shape (n, n)
+    G, D : ndarray, shape (..., n, n)
 
     Notes
     -----
     Rauch, Tung and Striebel's smoother in an array form: P. Park and T. Kailath, "New square-root smoothing
     algorithms", IEEE Transactions on Automatic Control 41 (1996) 727.
     """
-    n = len(S)
-    rows = np.block([[S.T @ F.T, S.T], [S_q.T, np.zeros((S_q.shape[1], n))]])
-    upper = np.asarray(np.linalg.qr(rows, mode="r"))
-    return np.linalg.solve(upper[:n, :n], upper[:n, n:]).T, upper[n:, n:].T.copy()
+    n = S.shape[-1]
+    before = np.concatenate([S.mT @ F.mT, S.mT], axis=-1)
+    noise = np.concatenate([S_q.mT, np.zeros((*S_q.shape[:-2], S_q.shape[-1], n))], axis=-1)
+    upper = np.asarray(np.linalg.qr(np.concatenate([before, noise], axis=-2), mode="r"))
+    return np.linalg.solve(upper[..., :n, :n], upper[..., :n, n:]).mT, upper[..., n:, n:].mT.copy()
 
 
 def estimability(S: FloatArray, S_predicted: FloatArray) -> FloatArray:
@@ -397,7 +334,7 @@ class IteratedExtendedKalmanFilter:
         key = np.asarray(self.Q, dtype=np.float64).tobytes()
         if key != self._factored_Q:
             self._S_q, self._factored_Q = symmetric_square_root(self.Q), key
-        self.S = predict_square_root(self.S, self.F, self._S_q)
+        self.S = predict(self.S, self.F, self._S_q)
         self.x_prior, self.S_prior = self.x.copy(), self.S.copy()
 
     def update(

@@ -1,0 +1,8 @@
+"""Words by which the step of an ellipsoid to a strip is chosen."""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+StepRule = Literal["lemma", "optimal", "tightened"]
+STEP_RULES: tuple[StepRule, ...] = get_args(StepRule)

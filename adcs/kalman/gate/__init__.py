@@ -1,1 +1,0 @@
-"""Readings that contradict a filter, and the second hypothesis that they begin."""
