@@ -36,14 +36,14 @@ def exceeds(chi2: FloatArray, dof: IntArray, probability: float) -> BoolArray:
     """Return whether each χ² is above the quantile that noise exceeds with a probability; False for dof = 0."""
     largest = np.full(dof.shape, np.inf)
     for n in set(dof.tolist()):  # inverse distributions take longer than all else of a test, and rows are alike
-        if n > 0:
-            largest[dof == n] = _quantile(n, probability)
+        largest[dof == n] = quantile(n, probability)
     return np.asarray(chi2 > largest)
 
 
 @lru_cache(maxsize=256)
-def _quantile(dof: int, probability: float) -> float:
-    return float(chdtri(dof, probability))
+def quantile(dof: int, probability: float) -> float:
+    """Return the χ² that noise exceeds with a probability; infinite where there is no degree of freedom."""
+    return float(chdtri(dof, probability)) if dof > 0 else math.inf
 
 
 def square_columns(name: str, square: FloatArray, dof: NDArray[np.int64]) -> dict[str, Column]:
@@ -101,13 +101,12 @@ class Detector(Protocol):
         """Energy of a signal, in units of the noise's variance, that is found with a probability."""
 
 
-@lru_cache(maxsize=256)
 def energy_threshold(n_differences: int, false_alarm_rate: float = FALSE_ALARM) -> float:
     r"""Quantile of :math:`\|z'\|^2 \sim \chi^2_k`: energy of k whitened differences that noise exceeds at a rate."""
     if n_differences < 1:
         raise ValueError(f"Input n_differences must be at least 1; instead received {n_differences}.")
     check_share("false_alarm_rate", false_alarm_rate)
-    return float(chdtri(n_differences, false_alarm_rate))
+    return quantile(n_differences, false_alarm_rate)
 
 
 @dataclass(frozen=True)

@@ -70,11 +70,6 @@ class _PriorFilter(_PositiveSettings):
     moment_sigma_Am2: float = 300.0
     pass_s: ClassVar[float] = _PASS_S
 
-    @property
-    def s_0(self) -> FloatArray:
-        """Diagonal of the square root of the prior covariance, shape (6,)."""
-        return np.repeat([self.position_sigma_m, self.moment_sigma_Am2], 3)
-
     def reached(self, ends: Ends, chi2_optimum: float, position_optimum: FloatArray) -> NDArray[np.bool_]:
         """Stopped at the prior's own optimum, near the maximum-likelihood position (the prior pulls, so χ² differs)."""
         distance = np.linalg.norm(ends.states[:, :3] - position_optimum, axis=1)
@@ -123,11 +118,6 @@ class RepeatedFilter(_LikelihoodFilter):
     def pass_s(self) -> float:
         """Seconds of one core that a pass takes, roughly, for the nine differences of four vector sensors."""
         return 2e-6 if self.relinearise_every_scalar else _PASS_S
-
-    @property
-    def s_q(self) -> FloatArray:
-        """Diagonal of the square root of the process noise, shape (6,)."""
-        return np.repeat([self.position_step_m, self.moment_step_Am2], 3)
 
     def run(self, measurement: DifferenceMeasurement, z: FloatArray, starts: FloatArray) -> Ends:
         """End of every start (n, 6), compiled."""

@@ -1,127 +1,88 @@
-"""What an array is designed for: its sensors, where they may stand, which sources it is to locate, and what counts."""
+"""What an array is designed for: its sensors, where they may stand, which sources it is to locate, and what counts.
+
+Built-in tasks are files beside this one. A task file (TOML)::
+
+    format_version = 1              # optional
+    name = "half-space-2m"          # optional, of the array too; by default that of the file
+
+    [sensors]
+    count = 4
+    kind = "vector"                 # or "scalar"
+    noise_nT = 1.0                  # 1 sigma, per axis and sample
+    ambient_nT = [20e3, 0.0, -45e3] # of scalar sensors
+    least_spacing_m = 0.05          # optional, 0 by default
+
+    [volume]                        # where sensors may stand
+    shape = "ball"                  # ball, box, cylinder: solid; surface: on a mesh
+    radius_m = 0.92                 # of a ball or a cylinder
+    height_m = 0.5                  # of a cylinder, which stands along z; 0 is a disc
+    size_m = [2.0, 1.0, 0.0]        # of a box along the axes; one or two zeros make a plate or a rod
+    file = "hull.stl"               # of a surface: STL, OBJ or PLY in metres, beside the task file
+    centre_m = [0.0, 0.0, 0.0]      # optional, not for a surface
+
+    [sources]
+    region = "half-space"           # shell, half-space, cap or box
+    nearest_m = 2.0                 # distances from the origin, evenly distributed; not for a box
+    farthest_m = 2.0
+    towards = [1.0, 0.0, 0.0]       # axis of a half-space or a cap
+    half_angle_deg = 30.0           # of a cap
+    low_m = [3.0, -2.0, -2.0]       # corners of a box
+    high_m = [5.0, 2.0, 2.0]
+    moment_Am2 = 100.0              # modulus; directions are evenly distributed
+
+    [criterion]                     # optional, of the standard deviation of the range (Cramér-Rao bound)
+    quantity = "quantile"           # or "mean"
+    level = 0.95                    # of a quantile
+
+    [search]                        # optional
+    starts = 16                     # shapes and random places
+    refined = 4                     # of them, which descend again on all sources
+    sources = 16_384                # a power of two; the starts descend on an eighth of them
+    iterations = 250                # of a descent, at most; a third of them of the starts
+    judged = 40_000                 # independent sources that the result is judged on
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import pi, radians
 from os import PathLike
-from typing import Protocol
+from pathlib import Path
+from typing import Annotated, Any, cast
 
+import msgspec
 import numpy as np
-from scipy.special import betainc
 
 from arrays.array import SensorArray
+from arrays.io.errors import InputError
+from arrays.io.toml import (
+    NOT_NEGATIVE,
+    BuiltIn,
+    File,
+    NotNegative,
+    Positive,
+    RefusalError,
+    Rule,
+    Table,
+    named_section,
+    one_of,
+    section_of,
+)
 from arrays.sensor import Sensor, SensorKind
-from arrays.typing import FloatArray
-from magloc.design.volumes import Volume
+from arrays.typing import FloatArray, Vector
+from magloc.design.regions import Block, Cap, Criterion, Mean, Quantile, Region, around
+from magloc.design.volumes import Ball, Box, Cylinder, Volume, read_surface
 
 N_UNKNOWNS = 6
 # Numbers that a source is drawn from: three for its position, two for the direction of its moment.
 N_DRAWN = 5
-
-
-class Region(Protocol):
-    """A distribution of positions."""
-
-    def positions(self, cube: FloatArray) -> FloatArray:
-        """Positions (n, 3) [m] of points (n, 3) of the unit cube."""
-
-
-@dataclass(frozen=True)
-class Cap:
-    """Sources within some angle of a direction: a shell around the origin, half of it, or less.
-
-    Distances are evenly distributed, directions evenly over the sphere.
-
-    Attributes
-    ----------
-    nearest_m, farthest_m : float
-        Distance from the origin of the array's frame.
-    towards : tuple, shape (3,)
-        Axis of the cap, of any length.
-    half_angle_rad : float
-        π for the whole shell, π/2 for a half-space.
-    """
-
-    nearest_m: float
-    farthest_m: float
-    towards: tuple[float, float, float] = (1.0, 0.0, 0.0)
-    half_angle_rad: float = np.pi
-
-    def positions(self, cube: FloatArray) -> FloatArray:
-        """Positions (n, 3) [m] of points (n, 3) of the unit cube."""
-        along = 1.0 - cube[:, :1] * (1.0 - np.cos(self.half_angle_rad))
-        directions = _around(np.array(self.towards), along, cube[:, 1:2])
-        return directions * (self.nearest_m + cube[:, 2:3] * (self.farthest_m - self.nearest_m))
-
-
-@dataclass(frozen=True)
-class Block:
-    """Sources evenly distributed over a box along the axes.
-
-    Attributes
-    ----------
-    low_m, high_m : tuple, shape (3,)
-        Corners.
-    """
-
-    low_m: tuple[float, float, float]
-    high_m: tuple[float, float, float]
-
-    def positions(self, cube: FloatArray) -> FloatArray:
-        """Positions (n, 3) [m] of points (n, 3) of the unit cube."""
-        low = np.array(self.low_m)
-        return low + cube * (np.array(self.high_m) - low)
-
-
-class Criterion(Protocol):
-    """What is made small, of the range deviations of many sources."""
-
-    def weights(self, n: int) -> FloatArray:
-        """Weights (n,) of n deviations in ascending order."""
-
-    def of(self, deviations: FloatArray) -> float:
-        """The criterion of deviations (n,), without any smoothing."""
-
-
-@dataclass(frozen=True)
-class Quantile:
-    """The deviation that a share of the sources stays below.
-
-    Attributes
-    ----------
-    level : float
-        That share.
-    """
-
-    level: float = 0.95
-
-    def weights(self, n: int) -> FloatArray:
-        """Harrell and Davis' weights of the order statistics (Biometrika 69, 1982), in which the quantile is smooth."""
-        edges = np.arange(n + 1) / n
-        return np.diff(betainc((n + 1) * self.level, (n + 1) * (1.0 - self.level), edges))
-
-    def of(self, deviations: FloatArray) -> float:
-        """Order statistic: an infinite neighbour does not spoil it."""
-        return float(np.quantile(deviations, self.level, method="inverted_cdf"))
-
-    def __str__(self) -> str:
-        return f"q{100.0 * self.level:g}"
-
-
-@dataclass(frozen=True)
-class Mean:
-    """The mean deviation."""
-
-    def weights(self, n: int) -> FloatArray:
-        """Equal weights."""
-        return np.full(n, 1.0 / n)
-
-    def of(self, deviations: FloatArray) -> float:
-        """Arithmetic mean."""
-        return float(np.mean(deviations))
-
-    def __str__(self) -> str:
-        return "mean"
+_ORIGIN = (0.0, 0.0, 0.0)
+_LEAST = {"vector": 3, "scalar": 7}
+_MOST_SENSORS = 64
+_LARGEST = 1e9
+_LEAST_LOG2, _MOST_LOG2 = 8, 20
+_MOST_OF_ANYTHING = 10_000_000
+_FILES = BuiltIn("magloc.design", "tasks", "task")
 
 
 @dataclass(frozen=True)
@@ -222,15 +183,13 @@ class DesignTask:
 
     @classmethod
     def read(cls, name_or_path: str | PathLike[str]) -> DesignTask:
-        """Task of a built-in name, such as "half-space-2m", or a TOML file (:mod:`magloc.design.task_files`).
+        """Task of a built-in name, such as "half-space-2m", or a TOML file (:mod:`magloc.design.task`).
 
         Raises
         ------
         InputError
             The file cannot be read or does not describe a task; the text says where and why.
         """
-        from magloc.design.task_files import read_task
-
         return read_task(str(name_or_path))
 
     def array(self, positions: FloatArray, name: str | None = None) -> SensorArray:
@@ -242,15 +201,198 @@ class DesignTask:
 
     def sources(self, cube: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Positions [m] and moments [A·m²], both (n, 3), of points (n, 5) of the unit cube."""
-        moments = _around(np.array([0.0, 0.0, 1.0]), 1.0 - 2.0 * cube[:, 3:4], cube[:, 4:5])
+        moments = around(np.array([0.0, 0.0, 1.0]), 1.0 - 2.0 * cube[:, 3:4], cube[:, 4:5])
         return self.region.positions(cube[:, :3]), self.moment_Am2 * moments
 
 
-def _around(axis: FloatArray, along: FloatArray, turn: FloatArray) -> FloatArray:
-    """Unit vectors with given cosines (n, 1) to an axis (3,), turned around it by shares (n, 1) of a revolution."""
-    n = axis / np.linalg.norm(axis)
-    first = np.cross(n, np.eye(3)[np.argmin(np.abs(n))])
-    first /= np.linalg.norm(first)
-    across = np.sqrt(np.maximum(0.0, 1.0 - along * along))
-    angle = 2.0 * np.pi * turn
-    return along * n + across * (np.cos(angle) * first + np.sin(angle) * np.cross(n, first))
+class _Sensors(Table, kw_only=True):
+    count: int
+    kind: Annotated[str, one_of(_LEAST)] = "vector"
+    noise_nT: Positive = 1.0
+    ambient_nT: Vector | None = None
+    least_spacing_m: NotNegative = 0.0
+
+    def check(self) -> None:
+        least = _LEAST[self.kind]
+        if not least <= self.count <= _MOST_SENSORS:
+            raise RefusalError(
+                "count",
+                f"found {self.count}, expected {least} to {_MOST_SENSORS} {self.kind} sensors,"
+                " which give the six differences that a position and a moment take",
+            )
+        if self.kind == "scalar" and not any(self.ambient_nT or ()):
+            raise RefusalError("ambient_nT", "found none, expected the ambient field of scalar sensors")
+
+
+class _Ball(Table, kw_only=True):
+    shape: str
+    radius_m: Positive
+    centre_m: Vector = _ORIGIN
+
+    def volume(self, folder: Path) -> Volume:
+        return Ball(self.centre_m, self.radius_m)
+
+
+class _Box(Table, kw_only=True):
+    shape: str
+    size_m: Annotated[Vector, NOT_NEGATIVE]
+    centre_m: Vector = _ORIGIN
+
+    def volume(self, folder: Path) -> Volume:
+        return Box(self.centre_m, self.size_m)
+
+
+class _Cylinder(Table, kw_only=True):
+    shape: str
+    radius_m: NotNegative
+    height_m: NotNegative
+    centre_m: Vector = _ORIGIN
+
+    def volume(self, folder: Path) -> Volume:
+        return Cylinder(self.centre_m, self.radius_m, self.height_m)
+
+
+class _Surface(Table, kw_only=True):
+    shape: str
+    file: str
+
+    def volume(self, folder: Path) -> Volume:
+        return read_surface(folder / self.file)
+
+
+class _Shell(Table, kw_only=True):
+    region: str
+    moment_Am2: Positive
+    nearest_m: Positive
+    farthest_m: Positive
+
+    def check(self) -> None:
+        if not self.nearest_m <= self.farthest_m < _LARGEST:
+            expected = f"nearest_m = {self.nearest_m:g} or more"
+            raise RefusalError("farthest_m", f"found {self.farthest_m:g}, expected {expected}")
+
+    def sources(self) -> Region:
+        return Cap(self.nearest_m, self.farthest_m)
+
+
+class _HalfSpace(_Shell, kw_only=True):
+    towards: Vector
+
+    def check(self) -> None:
+        super().check()
+        if not any(self.towards):
+            raise RefusalError("towards", "found zero, expected a direction")
+
+    def sources(self) -> Region:
+        return Cap(self.nearest_m, self.farthest_m, self.towards, 0.5 * pi)
+
+
+class _Cap(_HalfSpace, kw_only=True):
+    half_angle_deg: Annotated[Positive, Rule(lambda value: value <= 180.0, "180 or less")]
+
+    def sources(self) -> Region:
+        return Cap(self.nearest_m, self.farthest_m, self.towards, radians(self.half_angle_deg))
+
+
+class _Block(Table, kw_only=True):
+    region: str
+    moment_Am2: Positive
+    low_m: Vector
+    high_m: Vector
+
+    def check(self) -> None:
+        if not all(low <= high for low, high in zip(self.low_m, self.high_m, strict=True)):
+            raise RefusalError("high_m", "found a number below that of low_m, expected a box")
+
+    def sources(self) -> Region:
+        return Block(self.low_m, self.high_m)
+
+
+_BELOW_ONE = Rule(
+    lambda value: 0.0 < value < 1.0,
+    "a number between 0 and 1; the worst case, 1, is infinite for four vector sensors",
+)
+
+
+class _Criterion(Table, kw_only=True):
+    quantity: Annotated[str, one_of(("quantile", "mean"), "quantile or mean")] = "quantile"
+    level: Annotated[float, _BELOW_ONE] = 0.95
+
+
+def _up_to(least: int) -> Rule:
+    return Rule(lambda value: least <= value <= _MOST_OF_ANYTHING, f"{least} to {_MOST_OF_ANYTHING}")
+
+
+class _Search(Table, kw_only=True):
+    starts: int = DesignSearch.n_starts
+    refined: int = DesignSearch.n_refined
+    sources: int = 2**DesignSearch.log2_large
+    iterations: Annotated[int, _up_to(1)] = DesignSearch.large_iterations
+    judged: Annotated[int, _up_to(1000)] = DesignSearch.n_judged
+
+    def check(self) -> None:
+        if not 1 <= self.refined <= self.starts <= 10_000:
+            raise RefusalError(
+                "",
+                f"found {self.refined} refined of {self.starts} starts, expected 1 or more refined, and no more than"
+                " starts",
+            )
+        if not (_LEAST_LOG2 <= self.log2 <= _MOST_LOG2 and self.sources == 1 << self.log2):
+            expected = f"a power of two from {1 << _LEAST_LOG2} to {1 << _MOST_LOG2}"
+            raise RefusalError("sources", f"found {self.sources}, expected {expected}")
+
+    @property
+    def log2(self) -> int:
+        """Of the number of sources."""
+        return self.sources.bit_length() - 1
+
+
+class _File(File, kw_only=True):
+    sensors: _Sensors
+    volume: dict[str, Any]
+    sources: dict[str, Any]
+    criterion: _Criterion = msgspec.field(default_factory=_Criterion)
+    search: _Search = msgspec.field(default_factory=_Search)
+    name: str | None = None
+
+
+_VOLUMES: dict[str, Any] = {"ball": _Ball, "box": _Box, "cylinder": _Cylinder, "surface": _Surface}
+_REGIONS: dict[str, Any] = {"shell": _Shell, "half-space": _HalfSpace, "cap": _Cap, "box": _Block}
+
+
+def read_task(name_or_path: str) -> DesignTask:
+    """Task of a built-in name or a TOML file: :meth:`magloc.design.task.DesignTask.read`."""
+    path, table = _FILES.read(name_or_path)
+    file = section_of(path, table, _File)
+    sensors, search = file.sensors, file.search
+    ambient = sensors.ambient_nT
+    sources = named_section(f"{path}, table sources", file.sources, "region", _REGIONS)
+    return DesignTask(
+        name=file.name or Path(path).stem,
+        n_sensors=sensors.count,
+        kind=cast(SensorKind, sensors.kind),
+        noise_T=sensors.noise_nT / 1e9,
+        volume=_volume(f"{path}, table volume", file.volume, Path(path).parent),
+        region=sources.sources(),
+        moment_Am2=sources.moment_Am2,
+        criterion=Mean() if file.criterion.quantity == "mean" else Quantile(file.criterion.level),
+        ambient_T=None if ambient is None else (ambient[0] / 1e9, ambient[1] / 1e9, ambient[2] / 1e9),
+        least_spacing_m=sensors.least_spacing_m,
+        search=DesignSearch(
+            n_starts=search.starts,
+            n_refined=search.refined,
+            log2_small=search.log2 - 3,
+            log2_large=search.log2,
+            small_iterations=-(-search.iterations // 3),
+            large_iterations=search.iterations,
+            n_judged=search.judged,
+        ),
+    )
+
+
+def _volume(place: str, table: dict[str, Any], folder: Path) -> Volume:
+    volume: Volume = named_section(place, table, "shape", _VOLUMES).volume(folder)
+    reach = float(np.abs(volume.centre).max()) + volume.radius
+    if not (volume.radius > 0.0 and reach < _LARGEST):
+        raise InputError(f"{place}: found a volume that holds one point only or is too large, expected room to design.")
+    return volume

@@ -5,7 +5,6 @@ The patterns that are looked for, quadrupole and octupole, are derived in docs/t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,7 +23,6 @@ from magloc.measurement.rows import whitenings_of
 
 BODY_LENGTHS = 3.0
 _ORDERS = (2, 3)
-_NAMES = {2: "a quadrupole", 3: "an octupole"}
 # Columns whose part outside the earlier ones is smaller than this are not seen by the array.
 _UNSEEN_RTOL = 1e-6
 
@@ -73,8 +71,6 @@ class NearnessTest:
         Differences minus the unknowns of a dipole that the array sees.
     gains : tuple of MultipoleGain
         Each beyond the orders before it.
-    warning : str
-        A sentence for the user; empty if there is neither.
     """
 
     misfit: bool
@@ -82,7 +78,6 @@ class NearnessTest:
     chi2: float
     dof: int
     gains: tuple[MultipoleGain, ...]
-    warning: str
 
 
 def dipole_validity(distance_m: ArrayLike, body_length_m: ArrayLike) -> BoolArray:
@@ -153,7 +148,7 @@ def nearness_test(
     level = false_alarm / 3.0
     misfit = dof > 0 and bool(chdtrc(dof, chi2) < level)
     extended = any(gain.noise_probability < level and gain.misfit_probability < NO_OTHER_MISFIT for gain in gains)
-    return NearnessTest(misfit, extended, chi2, dof, gains, _warning(misfit, extended, chi2, dof, gains))
+    return NearnessTest(misfit, extended, chi2, dof, gains)
 
 
 def _tested(order: int, gain: float, n_parameters: int, rest: float, left: int) -> MultipoleGain:
@@ -166,21 +161,6 @@ def _tested(order: int, gain: float, n_parameters: int, rest: float, left: int) 
         noise_probability=float(chdtrc(n_parameters, gain)),
         misfit_probability=float(fdtrc(n_parameters, left, ratio)) if comparable else 1.0,
     )
-
-
-def _warning(misfit: bool, extended: bool, chi2: float, dof: int, gains: Sequence[MultipoleGain]) -> str:
-    if extended:
-        best = min(gains, key=lambda gain: gain.misfit_probability)
-        return (
-            f"The source is too near or too large for a dipole: {_NAMES[best.order]} explains {best.gain:.4g} of "
-            f"χ² {chi2:.4g}."
-        )
-    if misfit:
-        return (
-            f"The readings are not those of one dipole (χ² {chi2:.4g} for {dof} degrees of freedom): the source may be "
-            "too near, too large or one of several, or the noise or the calibration is wrong."
-        )
-    return ""
 
 
 def _orthonormal(columns: FloatArray, known: FloatArray) -> FloatArray:

@@ -21,7 +21,7 @@ from scipy.special import chdtri
 
 from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray, IntArray
-from magloc.chi_square import energy_threshold, exceeds
+from magloc.chi_square import energy_threshold, exceeds, quantile
 from magloc.levels import CREDIBLE_ROW, MISFIT, SENSOR_FALSE_ALARM
 from magloc.localization.fit.fixes import Fixes
 from magloc.localization.fit.gauss_newton import JointFits
@@ -107,13 +107,13 @@ def _doubtful(fixes: Fixes) -> BoolArray:
 
 def _is_credible(fix: Fix) -> bool:
     best = fix.solutions[0]
-    return best.dof <= 0 or best.chi2 <= _largest_credible(best.dof, fix.body_length_m)
+    return best.chi2 <= _largest_credible(best.dof, fix.body_length_m)
 
 
 def _largest_credible(dof: int, body_length_m: float) -> float:
     """Largest χ² that is credible."""
     # The prior of a body's shape is a coarse one, and no fault of a sensor.
-    return float(chdtri(dof, MISFIT if body_length_m > 0.0 else 1.0 - CREDIBLE_ROW))
+    return quantile(dof, MISFIT if body_length_m > 0.0 else 1.0 - CREDIBLE_ROW)
 
 
 def _is_worth_dropping_for(fix: Fix, plain: Fix) -> bool:

@@ -13,7 +13,7 @@ from scipy.spatial.distance import pdist
 from arrays.typing import FloatArray
 from magloc.design.evaluation import EVEN, Judgement, range_spread
 from magloc.design.optimise import BEST_START, Design, random_sample
-from magloc.design.task import Cap
+from magloc.design.regions import Cap
 from magloc.design.volumes import Ball, Box, Cylinder, Surface, Volume
 from magloc.plots import style
 

@@ -17,6 +17,7 @@ from arrays.io.results import Result
 from arrays.io.tables import aligned, by_sigma
 from arrays.typing import FloatArray, Vector
 from magloc.localization.fit.table import cells_of_strength
+from magloc.truth import state_columns
 
 IRON_Am2_PER_KG = (0.05, 0.3)
 """Moment of a kilogram of iron in the ground: a range, as its remanence and shape are not known."""
@@ -189,11 +190,38 @@ class Survey(Result):
         """Positions of all targets (K, 3)."""
         return np.array([target.position_m for target in self]).reshape(-1, 3)
 
+    @property
+    def entries(self) -> list[dict[str, Any]]:
+        """The targets as JSON and GeoJSON have them."""
+        return [
+            {
+                "id": target.id,
+                "position_m": target.position_m.tolist(),
+                "moment_Am2": target.moment_Am2.tolist(),
+                "covariance": target.covariance.tolist(),
+                "depth_m": target.depth_m,
+                "depth_interval95_m": list(target.depth_interval95_m),
+                "ellipse95_m": list(target.ellipse95[:2]),
+                "ellipse95_bearing_deg": target.ellipse95[2],
+                "iron_kg": list(target.iron_kg),
+                "significance": target.significance,
+                "flags": list(target.flags),
+            }
+            for target in self
+        ]
+
     def columns(self) -> dict[str, Column]:
         """Return the columns of targets.csv."""
-        from magloc.surveying.files import columns_of_survey
-
-        return columns_of_survey(self)
+        covariance = np.array([t.covariance for t in self]).reshape(-1, 6, 6)
+        moment = np.array([t.moment_Am2 for t in self]).reshape(-1, 3)
+        low, high = np.array([t.depth_interval95_m for t in self]).reshape(-1, 2).T
+        columns: dict[str, Column] = {"id": [t.id for t in self]}
+        columns |= state_columns(self.position_m, moment, covariance)
+        columns |= {"depth_m": np.array([t.depth_m for t in self]), "depth_low_m": low, "depth_high_m": high}
+        columns |= {"strength_Am2": np.array([t.strength_Am2 for t in self])}
+        columns |= {"significance": np.array([t.significance for t in self])}
+        columns["flags"] = [" ".join(t.flags) for t in self]
+        return columns
 
     def to_geojson(self, place: Vector) -> dict[str, Any]:
         """A FeatureCollection with a point for every target, as RFC 7946 has it.
@@ -203,15 +231,28 @@ class Survey(Result):
         place : tuple of 3 floats
             Latitude, longitude [deg] and height [m] of the origin of the world frame, which is east, north, up.
         """
-        from magloc.surveying.files import geojson_of_survey
+        from arrays.io.world_maps import feature, feature_collection, world_place
 
-        return geojson_of_survey(self, place)
+        return feature_collection(
+            feature("Point", world_place(target.position_m, place), entry)
+            for target, entry in zip(self, self.entries, strict=True)
+        )
 
     def to_kml(self, place: Vector) -> str:
         """A placemark for every target, for maps of the world; ``place`` as of :meth:`to_geojson`."""
-        from magloc.surveying.files import kml_of_survey
+        from arrays.io.world_maps import kml, placemark, world_place
 
-        return kml_of_survey(self, place)
+        marks = []
+        for target in self:
+            low, high = target.depth_interval95_m
+            least, most = target.iron_kg
+            words = (
+                f"{target.depth_m:.2f} m below ground (95 %: {low:.2f} to {high:.2f} m),"
+                f" {target.strength_Am2:.3g} A·m²: {least:.2g} to {most:.2g} kg of iron, if a kilogram has"
+                f" {IRON_Am2_PER_KG[0]:g} to {IRON_Am2_PER_KG[1]:g} A·m². {' '.join(target.flags)}"
+            )
+            marks.append(placemark(target.id, words, [world_place(target.position_m, place)]))
+        return kml(marks)
 
     def lines(self, most: int | None = None) -> list[str]:
         """Return the lines of the table, of at most `most` targets."""

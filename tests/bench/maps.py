@@ -17,7 +17,7 @@ from tests.bench.filters import TIME, functions, stonesoup_update
 from tests.bench.fixes import best_fit
 from tests.bench.table import Row
 from tests.bench.timing import Contestant, Size, installed, interleaved
-from tests.magloc.convergence.readable_filters import run_one
+from tests.magloc.convergence.readable_filters import run_one, s_0, s_q
 from tests.plain_locator import plain_locator
 
 TITLE = (
@@ -122,7 +122,7 @@ def filterpy_loop(measurement: DifferenceMeasurement, z: np.ndarray, method: Rep
 
     def loop(start: np.ndarray) -> tuple[np.ndarray, bool]:
         kalman = ExtendedKalmanFilter(6, z.size)
-        kalman.x, kalman.P, kalman.Q = start, np.diag(method.s_q**2), np.diag(method.s_q**2)
+        kalman.x, kalman.P, kalman.Q = start, np.diag(s_q(method) ** 2), np.diag(s_q(method) ** 2)
         kalman.R = np.diag(measurement.variance)
         predicted = Hx(start)
         for _ in range(method.max_iterations):
@@ -148,7 +148,7 @@ def stonesoup_loop(measurement: DifferenceMeasurement, z: np.ndarray, method: Ie
     update = stonesoup_update(measurement, z, tolerance, method.max_iterations - 2)
 
     def loop(start: np.ndarray) -> tuple[np.ndarray, bool]:
-        state = update(GaussianStatePrediction(start, np.diag(method.s_0**2), timestamp=TIME))
+        state = update(GaussianStatePrediction(start, np.diag(s_0(method) ** 2), timestamp=TIME))
         return state, True
 
     return loop
@@ -156,7 +156,7 @@ def stonesoup_loop(measurement: DifferenceMeasurement, z: np.ndarray, method: Ie
 
 def scipy_loop(measurement: DifferenceMeasurement, z: np.ndarray, method: RepeatedFilter | IekfFilter) -> Loop:
     """scipy.optimize.least_squares on the cost that the filter minimises where it stops."""
-    prior_sigma = method.s_0 if isinstance(method, IekfFilter) else None
+    prior_sigma = s_0(method) if isinstance(method, IekfFilter) else None
 
     def loop(start: np.ndarray) -> tuple[np.ndarray, bool]:
         fit = best_fit(measurement, z, start, prior_sigma)

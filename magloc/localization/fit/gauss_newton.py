@@ -23,6 +23,7 @@ from magloc.measurement.whitened import WhitenedModel
 PROMISE_ABSOLUTE = 1e-8
 PROMISE_RELATIVE = 1e-11
 LARGEST_STEP_RAD, LARGEST_DAMPING = 0.5, 1e9
+_LEAST_SINGULAR = 1e-13
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,22 +117,17 @@ def fit_moments(problem: WhitenedModel, y: FloatArray, q: FloatArray) -> FloatAr
     return _moment_step(problem.moment_jacobian(q, gain), y - problem.of_ambient)
 
 
-def _by_position(
-    problem: WhitenedModel, q: FloatArray, mu: FloatArray, gain: FloatArray, tangent: FloatArray
+def _jacobian(
+    problem: WhitenedModel, q: FloatArray, mu: FloatArray, gain: FloatArray, tangent: FloatArray | None = None
 ) -> FloatArray:
-    """Derivative of the predictions, and of what is known of the moments, along tangents of q."""
-    of_readings = problem.position_jacobian(q, mu, gain, tangent)
+    """Derivative of the predictions, and of what is known of the moments, by μ, or along tangents of q."""
+    if tangent is None:
+        of_readings = problem.moment_jacobian(q, gain)
+    else:
+        of_readings = problem.position_jacobian(q, mu, gain, tangent)
     if problem.known is None:
         return of_readings
     return np.concatenate([of_readings, problem.known_jacobian(q, mu, tangent)], axis=1)
-
-
-def _by_moment(problem: WhitenedModel, q: FloatArray, mu: FloatArray, gain: FloatArray) -> FloatArray:
-    """Derivative of the predictions, and of what is known of the moments, by μ."""
-    of_readings = problem.moment_jacobian(q, gain)
-    if problem.known is None:
-        return of_readings
-    return np.concatenate([of_readings, problem.known_jacobian(q, mu)], axis=1)
 
 
 def _moment_step(jacobian: FloatArray, residual: FloatArray) -> FloatArray:
@@ -168,11 +164,9 @@ class _NormalEquations:
         return step / self.norm, promised
 
 
-def refine_moments(
-    problem: WhitenedModel, y: FloatArray, q: FloatArray, mu: FloatArray, *, max_iterations: int = 60
-) -> JointFits:
+def refine_moments(problem: WhitenedModel, y: FloatArray, q: FloatArray, mu: FloatArray) -> JointFits:
     """Moments (b, K, 3) of sources that stay at q (b, K, 4): damped Gauss-Newton on whitened readings (b, C)."""
-    return refine(problem, y, q, mu, free=np.zeros((q.shape[1], 3), dtype=bool), max_iterations=max_iterations)
+    return refine(problem, y, q, mu, free=np.zeros((q.shape[1], 3), dtype=bool))
 
 
 def refine(
@@ -254,8 +248,8 @@ def damped_gauss_newton(
             at = sub if new.size == live.size else sub.rows(new)
             gain = at.linear_gain(fields[new])
             tangent[new] = tangents(q[live[new]])
-            along = _by_position(at, q[live[new]], mu[live[new]], gain, tangent[new])[..., columns]
-            jacobian[new] = np.concatenate([along, _by_moment(at, q[live[new]], mu[live[new]], gain)], axis=-1)
+            along = _jacobian(at, q[live[new]], mu[live[new]], gain, tangent[new])[..., columns]
+            jacobian[new] = np.concatenate([along, _jacobian(at, q[live[new]], mu[live[new]], gain)], axis=-1)
             iterations[live[new]] += 1
         normal = _NormalEquations.of(jacobian, residual)
         step, promised = normal.step(damping[:, None] * damped)
@@ -266,7 +260,7 @@ def damped_gauss_newton(
         new_chi2 = _squares(new_residual)
         if columns.size:
             gain = sub.linear_gain(new_fields)
-            better_mu = new_mu + _moment_step(_by_moment(sub, new_q, new_mu, gain), new_residual)
+            better_mu = new_mu + _moment_step(_jacobian(sub, new_q, new_mu, gain), new_residual)
             better_fields = sub.source_fields(new_q, better_mu)
             better_residual = sub.residual(y[live], new_q, better_mu, better_fields)
             better_chi2 = _squares(better_residual)
@@ -361,12 +355,12 @@ def scaled_jacobian(problem: WhitenedModel, q: FloatArray, mu: FloatArray) -> Fl
     mu = mu / np.abs(s) ** 3
     gain = problem.linear_gain(problem.source_fields(rho, mu))
     along = np.broadcast_to(np.eye(4)[:, :3], (n_fits, n_sources, 4, 3))
-    by_position = _by_position(problem, rho, mu, gain, along).reshape(n_fits, -1, n_sources, 3)
-    by_moment = _by_moment(problem, rho, mu, gain).reshape(n_fits, -1, n_sources, 3)
+    by_position = _jacobian(problem, rho, mu, gain, along).reshape(n_fits, -1, n_sources, 3)
+    by_moment = _jacobian(problem, rho, mu, gain).reshape(n_fits, -1, n_sources, 3)
     return np.concatenate([by_position, by_moment], axis=-1).reshape(n_fits, -1, 6 * n_sources)
 
 
-def inverse_information(jacobian: FloatArray, least_singular: float = 1e-13) -> FloatArray:
+def inverse_information(jacobian: FloatArray) -> FloatArray:
     """``(JᵀJ)⁻¹`` (b, n, n) of whitened Jacobians (b, C, n) by singular values, columns scaled; NaN where singular."""
     n_fits, n_rows, n = jacobian.shape
     norm = np.linalg.norm(jacobian, axis=1)
@@ -376,7 +370,7 @@ def inverse_information(jacobian: FloatArray, least_singular: float = 1e-13) -> 
     safe = np.where(good[:, None], norm, 1.0)
     unit = np.where(good[:, None, None], jacobian, 0.0) / safe[:, None]
     singular, vt = np.linalg.svd(unit, full_matrices=False)[1:]
-    good &= singular[:, -1] > least_singular * singular[:, 0]
+    good &= singular[:, -1] > _LEAST_SINGULAR * singular[:, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
         rooted = vt / singular[..., None] / safe[:, None]
         inverse: FloatArray = rooted.transpose(0, 2, 1) @ rooted

@@ -19,7 +19,7 @@ from scipy.special import chdtri
 
 from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray, IntArray
-from magloc.chi_square import energy_threshold
+from magloc.chi_square import energy_threshold, normalised_square
 from magloc.levels import CREDIBLE_FIT, FALSE_ALARM, SUSPICIOUS_FIT
 from magloc.localization.fit.gauss_newton import JointFits, covariances, refine
 from magloc.localization.fit.optima import Optima
@@ -301,8 +301,8 @@ class _Levels:
                 of_moment = covariance[:, i, 3:, i, 3:]
                 pair = [[covariance[:, a, :3, b, :3] for b in (i, j)] for a in (i, j)]
                 of_offset = pair[0][0] - pair[0][1] - pair[1][0] + pair[1][1]
-                faint = _squared_ratio(moment[:, i], of_moment) < _FAINT
-                near = _squared_ratio(position[:, i] - position[:, j], of_offset) < _NEAR
+                faint = ~(normalised_square(moment[:, i], of_moment) >= _FAINT)  # nor is what has no covariance
+                near = ~(normalised_square(position[:, i] - position[:, j], of_offset) >= _NEAR)
                 unresolved |= faint & near
         return unresolved
 
@@ -354,13 +354,3 @@ class _Levels:
         if not certain and not (stands_for_both and offsets[nearest] < 2.0 * distance[i, j]):
             return reason, nothing
         return f"{reason}: two are closer than the array resolves", np.arange(n) == nearest
-
-
-def _squared_ratio(values: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Squares of vectors (b, 3) in units of their covariance (b, 3, 3); 0 where that is not known."""
-    known = np.asarray(np.isfinite(covariance).all(axis=(1, 2)) & np.isfinite(values).all(axis=1))
-    scale = np.sqrt(np.abs(np.diagonal(covariance, axis1=1, axis2=2)))
-    safe = np.where(known[:, None], scale, 1.0)
-    correlation = np.where(known[:, None, None], covariance / (safe[:, :, None] * safe[:, None]), np.eye(3))
-    unit = np.where(known[:, None], values / safe, 0.0)
-    return np.sum(unit * (np.linalg.pinv(correlation) @ unit[..., None])[..., 0], axis=-1)

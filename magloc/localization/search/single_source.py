@@ -13,11 +13,11 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import chdtri
 
 from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray, IntArray
 from arrays.whitening import Whitening, whitening
+from magloc.chi_square import quantile
 from magloc.levels import CREDIBLE_FIT
 from magloc.localization.fit.gauss_newton import JointFits
 from magloc.localization.fit.optima import Optima
@@ -152,7 +152,7 @@ class SingleSourceSearch:
         everything = self._everything
         keep_within = DISTINCT_WITHIN if everything else math.inf
         found = self.ends(rows, np.arange(len(rows)), self.starts(rows), keep_within)
-        credible = found.chi2[:, 0] <= _largest_credible(rows.n_differences - N_UNKNOWNS)
+        credible = found.chi2[:, 0] <= quantile(rows.n_differences - N_UNKNOWNS, 1.0 - CREDIBLE_FIT)
         if np.count_nonzero(credible) < len(rows):
             doubtful = np.flatnonzero(~credible)
             some = rows.chosen(doubtful)
@@ -243,12 +243,6 @@ class SingleSourceSearch:
 def kept_search(array: SensorArray) -> SingleSourceSearch:
     """The search by one of the last arrays, where nothing is known: readings that come one by one have one."""
     return SingleSourceSearch(array)
-
-
-@lru_cache(maxsize=64)
-def _largest_credible(dof: int) -> float:
-    """Largest χ² of an optimum after which no other is looked for."""
-    return float(chdtri(dof, 1.0 - CREDIBLE_FIT)) if dof > 0 else math.inf
 
 
 def _why_unsolved(n_optima: int) -> str:

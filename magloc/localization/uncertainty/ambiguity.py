@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from arrays.typing import FloatArray
-from magloc.levels import CERTAIN_WEIGHT, DELTA_CHI2_95
-from magloc.localization.fit.results import is_observable, spans
-from magloc.localization.uncertainty.range_interval import levels, ranges_of, relative_range_sigma, rise, union
+from magloc.levels import DELTA_CHI2_95
+from magloc.localization.uncertainty.range_interval import relative_range_sigma
 
 LARGEST_GAUSSIAN_SIGMA = 0.04
 """Standard deviations of position and moment, over range and moment, up to which their errors are Gaussian."""
@@ -95,86 +93,3 @@ def widened(
         variance = np.sum(following[..., place] * offset_m, axis=-1) / distance
         missing = np.nan_to_num(np.maximum(wanted**2 - variance, 0.0) / variance**2, nan=0.0, posinf=0.0)
     return covariance + missing[..., None, None] * following[..., :, None] * following[..., None, :]
-
-
-@dataclass(frozen=True, eq=False)
-class Rivals:
-    """Solutions of b rows of readings, n of each at most, and what they say together.
-
-    Attributes
-    ----------
-    chi2 : ndarray, shape (b, n)
-        Infinite where there is no solution.
-    covariance : ndarray, shape (b, n, 6, 6)
-        Inverse information of position and moment; NaN where there is no solution.
-    offset_m, moment : ndarray, shape (b, n, 3)
-        Positions from the sensors' centroid.
-    weight : ndarray, shape (b, n)
-    rise : ndarray, shape (b,)
-        By how much the profile of χ² may rise above the best solution's within the set of ranges.
-    """
-
-    chi2: FloatArray
-    covariance: FloatArray
-    offset_m: FloatArray
-    moment: FloatArray
-    weight: FloatArray
-    rise: FloatArray
-
-    @classmethod
-    def of(
-        cls,
-        chi2: FloatArray,
-        covariance: FloatArray,
-        offset_m: FloatArray,
-        moment: FloatArray,
-        energy: FloatArray,
-        n_differences: int,
-        scale_m: float | None = None,
-    ) -> Rivals:
-        """From solutions, best first, and the energy (b,) of the rows' differences as they are without a source."""
-        determined = np.isfinite(covariance).all(axis=(-2, -1))
-        listed = np.where(determined, chi2, np.inf)
-        weight = weights(
-            listed, log_evidence_volume(covariance, moment[..., None, :], offset_m[..., None, :], scale_m=scale_m)
-        )
-        raised = rise(energy, chi2[:, 0], n_differences, levels(listed, weight))
-        return cls(listed, covariance, offset_m, moment, weight, raised)
-
-    def ranges(self, alpha: FloatArray, unit_m: float) -> RowRanges:
-        """What is known of the ranges, from the stretches of α (b, n, 2) that the solutions' profiles cover."""
-        bounded = np.isfinite(self.rise)
-        sets = union(np.where(bounded[:, None, None], ranges_of(alpha, unit_m), [0.0, np.inf]))
-        low, high = spans(sets).T
-        observable = is_observable(low, high)
-        single = np.isfinite(sets[..., 0]).sum(axis=1) == 1
-        sharp = relative_sigma(self.covariance, self.offset_m, self.moment) <= LARGEST_GAUSSIAN_SIGMA
-        sharp &= self.weight >= CERTAIN_WEIGHT
-        covariance, blurred = self.covariance, ~observable
-        if blurred.any():
-            covariance = covariance.copy()
-            covariance[blurred] = widened(
-                covariance[blurred], self.offset_m[blurred], low[blurred, None], high[blurred, None]
-            )
-        return RowRanges(sets, observable, covariance, (observable & single)[:, None] & sharp)
-
-
-@dataclass(frozen=True, eq=False)
-class RowRanges:
-    """What is known of the range in b rows of n solutions at most.
-
-    Attributes
-    ----------
-    sets : ndarray, shape (b, i, 2)
-        95 % sets of intervals [m], NaN where there are fewer.
-    observable : ndarray of bool, shape (b,)
-    covariance : ndarray, shape (b, n, 6, 6)
-        Of the solutions, :func:`widened` where the range is not observable.
-    gaussian : ndarray of bool, shape (b, n)
-        Whether a covariance describes the uncertainty.
-    """
-
-    sets: FloatArray
-    observable: NDArray[np.bool_]
-    covariance: FloatArray
-    gaussian: NDArray[np.bool_]

@@ -7,27 +7,25 @@ Several sources have no common range: each has its own ranges in each solution, 
 
 from __future__ import annotations
 
-import math
 from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import chdtrc, chdtri
+from scipy.special import chdtrc
 
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc import core
-from magloc.chi_square import energy_threshold
+from magloc.chi_square import energy_threshold, quantile
 from magloc.fields.dipole import MU0_OVER_4PI
 from magloc.levels import CERTAIN_WEIGHT, DELTA_CHI2_95, MISFIT
 from magloc.localization.fit.columns import Solutions
 from magloc.localization.fit.gauss_newton import covariances
 from magloc.localization.fit.optima import Optima
 from magloc.localization.fit.refinement import rows_a_block
-from magloc.localization.fit.results import is_misfit, is_observable
+from magloc.localization.fit.results import is_misfit, is_observable, spans
 from magloc.localization.uncertainty.ambiguity import (
     LARGEST_BEND,
     LARGEST_GAUSSIAN_SIGMA,
-    Rivals,
     log_evidence_volume,
     longest_axes,
     relative_sigma,
@@ -35,9 +33,16 @@ from magloc.localization.uncertainty.ambiguity import (
     widened,
 )
 from magloc.localization.uncertainty.moment_covariance import moment_covariances
-from magloc.localization.uncertainty.range_interval import OUTSIDE, left_of_detected, relative_range_sigma
+from magloc.localization.uncertainty.range_interval import (
+    OUTSIDE,
+    left_of_detected,
+    levels,
+    ranges_of,
+    relative_range_sigma,
+    rise,
+    union,
+)
 from magloc.localization.uncertainty.range_profile import profile_stretches, ranges_within
-from magloc.measurement.whitened import WhitenedModel
 
 # Linearisations that the profile of a fit takes, roughly.
 _LINEARISATIONS = 20
@@ -60,11 +65,10 @@ def solutions_of(optima: Optima, detected: BoolArray) -> Solutions:
     n_fits, n_sources = fits.q.shape[:2]
     if optima.position_m is not None:
         known = _of_known_position(optima, optima.position_m)
-    elif n_sources > 1:
-        known = _of_several(optima, detected)
+    elif n_sources > 1 or model.sees_moduli or model.known is not None:
+        known = known_of(optima, detected)
     else:
-        kernel = not model.sees_moduli and model.known is None
-        known = known_of_one_compiled(optima) if kernel else known_of_one(optima)
+        known = known_of_one_compiled(optima)
     of_moments, n_known = np.zeros(n_fits), np.zeros(n_fits, dtype=np.intp)
     if model.known is not None:
         moments = model.known.residual(known.moment_Am2)
@@ -109,48 +113,60 @@ def covariance_is_valid(optima: Optima, covariance: FloatArray, which: IntArray)
     return np.asarray(described)
 
 
-def known_of_one(optima: Optima) -> _Known:
-    """What is known of single sources, all solutions of a row together."""
+def known_of(optima: Optima, detected: BoolArray) -> _Known:
+    """What is known of sources at unknown places: a single one has its ranges from all solutions of a row together."""
     rows, fits, of_row = optima.rows, optima.fits, optima.of_row
-    model, shape, at = rows.model, *_places(of_row, len(rows))
-
-    def table(values: FloatArray, empty: float) -> FloatArray:
-        full = np.full((*shape, *values.shape[1:]), empty)
-        full[at] = values
-        return full
-
-    q, mu, chi2 = table(fits.q[:, 0], np.nan), table(fits.mu[:, 0], np.nan), table(fits.chi2, np.inf)
-    position, moment = model.position(q), model.moment(q, mu)
+    model = rows.model.rows(of_row)
+    understated = _understated(optima)[of_row]
+    covariance = covariances(model, fits) * understated[:, None, None]
+    position, moment = model.position(fits.q), model.moment(fits.q, fits.mu)
     offset = position - model.centroid
-    understated = _understated(chi2[:, 0], optima)
-    covariance = table(covariances(model.rows(of_row), fits), np.nan) * understated[:, None, None, None]
-    rivals = Rivals.of(
-        chi2 / understated[:, None],
-        covariance,
-        offset,
-        moment,
-        rows.energy / understated,
-        rows.n_differences,
-        _scale_m(model),
-    )
-    alpha = np.full((*shape, 2), np.nan)
-    left = (rivals.rise * understated)[of_row] - (fits.chi2 - chi2[of_row, 0])
-    inside = np.flatnonzero((left > 0.0) & np.isfinite(left))
-    sigma = relative_range_sigma(covariance[at], offset[at])
-    alpha[of_row[inside], at[1][inside]] = profile_stretches(
-        model.rows(of_row[inside]), rows.y[of_row[inside]], fits.rows(inside), 0, sigma[inside], left[inside]
-    )
-    ranges = rivals.ranges(alpha, model.radius)
-    gaussian = ranges.gaussian[at]
-    claimed = np.flatnonzero(gaussian)
+    # A known moment gives a length in whose units positions are uniform.
+    volume = log_evidence_volume(covariance, moment, offset, scale_m=None if model.known is None else rows.model.radius)
+    told = np.where(np.isfinite(covariance).all(axis=(1, 2)), fits.chi2 / understated, np.inf)
+    weight = _weights_of_rows(of_row, told, volume)
+    if fits.n_sources == 1:
+        sets = _sets_of_rows(optima, covariance, told, weight)[of_row, None]
+    else:
+        ends = [
+            ranges_within(model, rows.y[of_row], fits, k, covariance, DELTA_CHI2_95 * understated)
+            for k in range(fits.n_sources)
+        ]
+        sets = np.where(detected[of_row, None, None, None], np.stack(ends, axis=1)[:, :, None], [0.0, np.inf])
+    low, high = np.moveaxis(spans(sets), -1, 0)
+    observable = is_observable(low, high)
+    gaussian = observable & (np.isfinite(sets[..., 0]).sum(axis=-1) == 1) & (weight >= CERTAIN_WEIGHT)[:, None]
+    wide = covariance.copy()
+    for k in range(fits.n_sources):
+        sigma = relative_sigma(covariance[:, 6 * k :, 6 * k :], offset[:, k], moment[:, k])
+        gaussian[:, k] &= sigma <= LARGEST_GAUSSIAN_SIGMA
+        blurred = ~observable[:, k]
+        wide[blurred] = widened(wide[blurred], offset[blurred, k], low[blurred, k], high[blurred, k], k)
+    claimed = np.flatnonzero(gaussian.any(axis=1))
     if claimed.size:
-        gaussian[claimed] = covariance_is_valid(optima, covariance[at][claimed], claimed)
-    places = position[at][:, None], moment[at][:, None]
-    return _Known(*places, ranges.sets[of_row, None], ranges.covariance[at], gaussian[:, None], rivals.weight[at])
+        gaussian[claimed] &= covariance_is_valid(optima, covariance[claimed], claimed)[:, None]
+    return _Known(position, moment, sets, wide, gaussian, weight)
+
+
+def _sets_of_rows(optima: Optima, covariance: FloatArray, told: FloatArray, weight: FloatArray) -> FloatArray:
+    """95 % sets (b, i, 2) of the range of a single source in every row, all solutions together."""
+    rows, fits, of_row = optima.rows, optima.fits, optima.of_row
+    shape, at = _places(of_row, len(rows))
+    of_table, shares = np.full(shape, np.inf), np.zeros(shape)
+    of_table[at], shares[at] = told, weight
+    understated, best = _understated(optima), _best_chi2(optima)
+    raised = rise(rows.energy / understated, best / understated, rows.n_differences, levels(of_table, shares))
+    left = (raised * understated)[of_row] - (fits.chi2 - best[of_row])
+    inside = np.flatnonzero((left > 0.0) & np.isfinite(left))
+    model, some = rows.model.rows(of_row[inside]), fits.rows(inside)
+    sigma = relative_range_sigma(covariance[inside], model.position(some.q)[:, 0] - model.centroid)
+    alpha = np.full((*shape, 2), np.nan)
+    alpha[at[0][inside], at[1][inside]] = profile_stretches(model, rows.y[of_row[inside]], some, 0, sigma, left[inside])
+    return union(np.where(np.isfinite(raised)[:, None, None], ranges_of(alpha, model.radius), [0.0, np.inf]))
 
 
 def known_of_one_compiled(optima: Optima) -> _Known:
-    """Return :func:`known_of_one` of vector sensors, by the kernel."""
+    """Return :func:`known_of` of single sources, by the kernel of vector sensors."""
     rows, fits, model = optima.rows, optima.fits, optima.rows.model
     n_fits = len(optima.of_row)
     first_fit = optima.of_row.searchsorted(np.arange(len(rows) + 1))
@@ -199,56 +215,31 @@ def known_of_one_compiled(optima: Optima) -> _Known:
 def _detection(n_differences: int, dof: int) -> tuple[float, FloatArray, FloatArray]:
     """Return χ² of a misfit, and what the detection of a signal tells of its strength: both columns ascending."""
     strength, left = left_of_detected(n_differences)
-    return float(chdtri(dof, MISFIT)) if dof > 0 else math.inf, strength, np.ascontiguousarray(-left)
+    return quantile(dof, MISFIT), strength, np.ascontiguousarray(-left)
 
 
-def _understated(chi2: FloatArray, optima: Optima) -> FloatArray:
+def _best_chi2(optima: Optima) -> FloatArray:
+    """χ² (b,) of the best fit of every row; infinite where there is none."""
+    best = np.full(len(optima.rows), np.inf)
+    rows, first = np.unique(optima.of_row, return_index=True)
+    best[rows] = optima.fits.chi2[first]
+    return best
+
+
+def _understated(optima: Optima) -> FloatArray:
     """By how much the variance of noise is understated (b,): χ² per degree of freedom of rows that are misfits, else 1.
 
     What a wrong model leaves is no noise, but σ that knew only the noise would be worse.
     """
+    chi2 = _best_chi2(optima)
     return np.where(np.isfinite(chi2) & is_misfit(chi2, optima.dof), chi2 / max(optima.dof, 1), 1.0)
-
-
-def _scale_m(model: WhitenedModel) -> float | None:
-    """A length in whose units positions are uniform, where the moment is known and gives one."""
-    return model.radius if model.known is not None else None
-
-
-def _of_several(optima: Optima, detected: BoolArray) -> _Known:
-    """What is known of several sources: every one has a range of its own in every solution."""
-    rows, fits, of_row = optima.rows, optima.fits, optima.of_row
-    model, y = rows.model.rows(of_row), rows.y[of_row]
-    understated = _understated(fits.chi2[np.searchsorted(of_row, of_row)], optima)
-    covariance = covariances(model, fits) * understated[:, None, None]
-    position, moment = model.position(fits.q), model.moment(fits.q, fits.mu)
-    offset = position - model.centroid
-    n_fits, n_sources = offset.shape[:2]
-    wide = covariance.copy()
-    sets = np.empty((n_fits, n_sources, 1, 2))
-    gaussian = np.zeros((n_fits, n_sources), dtype=bool)
-    for k in range(n_sources):
-        ends = ranges_within(model, y, fits, k, covariance, DELTA_CHI2_95 * understated)
-        sets[:, k, 0] = np.where(detected[of_row, None], ends, [0.0, np.inf])
-        low, high = sets[:, k, 0].T
-        observable = is_observable(low, high)
-        sigma = relative_sigma(covariance[:, 6 * k :, 6 * k :], offset[:, k], moment[:, k])
-        gaussian[:, k] = observable & (sigma <= LARGEST_GAUSSIAN_SIGMA)
-        blurred = ~observable
-        wide[blurred] = widened(wide[blurred], offset[blurred, k], low[blurred], high[blurred], k)
-    chi2 = np.where(np.isfinite(covariance).all(axis=(1, 2)), fits.chi2 / understated, np.inf)
-    weight = _weights_of_rows(of_row, chi2, log_evidence_volume(covariance, moment, offset, scale_m=_scale_m(model)))
-    gaussian &= (weight >= CERTAIN_WEIGHT)[:, None]
-    claimed = np.flatnonzero(gaussian.any(axis=1))
-    gaussian[claimed] &= covariance_is_valid(optima, covariance[claimed], claimed)[:, None]
-    return _Known(position, moment, sets, wide, gaussian, weight)
 
 
 def _of_known_position(optima: Optima, position_m: FloatArray) -> _Known:
     """What is known of moments at known places (b, K, 3); the range is that of the place."""
     rows, fits, of_row = optima.rows, optima.fits, optima.of_row
     model, position, moment = rows.model, position_m[of_row], rows.model.moment(fits.q, fits.mu)
-    understated = _understated(fits.chi2[np.searchsorted(of_row, of_row)], optima)
+    understated = _understated(optima)[of_row]
     covariance = moment_covariances(model.rows(of_row), rows.y[of_row], fits) * understated[:, None, None]
     told = np.where(np.isfinite(covariance).all(axis=(1, 2)), fits.chi2 / understated, np.inf)
     weight = _weights_of_rows(of_row, told, log_evidence_volume(covariance, moment))

@@ -15,8 +15,8 @@ from arrays.array_file import read_array
 from arrays.io.errors import InputError
 from magloc.cli.design import _table
 from magloc.design.optimise import design_array
-from magloc.design.task import Block, Cap, DesignSearch, Mean, Quantile
-from magloc.design.task_files import read_task
+from magloc.design.regions import Block, Cap, Mean, Quantile
+from magloc.design.task import DesignSearch, read_task
 from magloc.design.volumes import Ball, Box, Cylinder
 from tests.command_line import Run, assert_refused
 from tests.conftest import REPOSITORY

@@ -13,6 +13,16 @@ from magloc.state_space import IteratedUpdate, iterated_update, predict, update
 DAMPING_DECREASE, DAMPING_INCREASE = 5.0, 4.0
 
 
+def s_0(method: IekfFilter | DampedFilter) -> FloatArray:
+    """Diagonal (6,) of the square root of the prior covariance."""
+    return np.repeat([method.position_sigma_m, method.moment_sigma_Am2], 3)
+
+
+def s_q(method: RepeatedFilter) -> FloatArray:
+    """Diagonal (6,) of the square root of the process noise."""
+    return np.repeat([method.position_step_m, method.moment_step_Am2], 3)
+
+
 def run_one(
     method: RepeatedFilter | IekfFilter | DampedFilter,
     measurement: DifferenceMeasurement,
@@ -26,7 +36,7 @@ def run_one(
         return _damped(method, measurement, z, start)
     return iterated_update(
         start,
-        np.diag(method.s_0),
+        np.diag(s_0(method)),
         z,
         measurement.variance,
         lambda x: measurement.predicted(x[:3], x[3:]),
@@ -41,7 +51,7 @@ def _repeated(
 ) -> IteratedUpdate:
     """By the square-root filter of :mod:`magloc.state_space`."""
     sigma = np.sqrt(method.noise_inflation * measurement.variance)
-    x, S, S_q = start, np.diag(method.s_q), np.diag(method.s_q)
+    x, S, S_q = start, np.diag(s_q(method)), np.diag(s_q(method))
     predicted = measurement.predicted(x[:3], x[3:])
     innovation = z - predicted
     for iteration in range(1, method.max_iterations + 1):
@@ -70,8 +80,8 @@ def _damped(
     def linearised(x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Predicted differences; residuals of readings and prior, and minus their Jacobian."""
         predicted = measurement.predicted(x[:3], x[3:])
-        residual = np.concatenate([(z - predicted) / sigma, (start - x) / method.s_0])
-        jacobian = measurement.jacobian(x[:3], x[3:]) * method.s_0 / sigma[:, None]
+        residual = np.concatenate([(z - predicted) / sigma, (start - x) / s_0(method)])
+        jacobian = measurement.jacobian(x[:3], x[3:]) * s_0(method) / sigma[:, None]
         return predicted, residual, np.concatenate([jacobian, np.eye(6)])
 
     x, damping, kept = start, method.first_damping, method.first_damping
@@ -82,7 +92,7 @@ def _damped(
         iteration += 1
         # The normal equations of M + λ diag M, without M: its diagonal is the columns' square norm.
         Q, R = np.linalg.qr(np.concatenate([J, np.diag(np.sqrt(damping) * np.linalg.norm(J, axis=0))]))
-        trial = x + method.s_0 * np.linalg.solve(R, Q[: residual.size].T @ residual)
+        trial = x + s_0(method) * np.linalg.solve(R, Q[: residual.size].T @ residual)
         at_trial = linearised(trial)
         change = float(np.linalg.norm(at_trial[0] - predicted))
         small = change < method.tolerance_T
@@ -95,5 +105,5 @@ def _damped(
         # Damping alone can make a step small: the stop rule is left to the step without it.
         damping = 0.0 if small else kept
         ended = stopped or iteration >= method.max_iterations or not np.all(np.isfinite(residual))
-    S: FloatArray = method.s_0[:, None] * np.linalg.inv(np.linalg.qr(J, mode="r"))
+    S: FloatArray = s_0(method)[:, None] * np.linalg.inv(np.linalg.qr(J, mode="r"))
     return IteratedUpdate(x, S, iteration, stopped, innovation, np.nan)

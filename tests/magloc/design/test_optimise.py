@@ -33,7 +33,8 @@ from magloc.bounds.crlb import cramer_rao_bounds
 from magloc.design.descent import Sample, descend, feasible, is_spaced
 from magloc.design.evaluation import references, worst_case
 from magloc.design.optimise import design_array, random_sample, sobol_sample, starts_of
-from magloc.design.task import Block, Cap, DesignSearch, DesignTask, Mean, Quantile
+from magloc.design.regions import Block, Cap, Mean, Quantile
+from magloc.design.task import DesignSearch, DesignTask
 from magloc.design.volumes import Ball, Box, Cylinder, Surface, even_grid
 from magloc.fields.dipole import field
 from magloc.plots.designs import clear_azimuth

@@ -3,7 +3,7 @@
 | what | who checks it |
 |---|---|
 | covariances | the singular values of the readable Jacobian |
-| weights, ranges, whether errors are Gaussian | known_of_one, the readable reference |
+| weights, ranges, whether errors are Gaussian | known_of, the readable reference |
 | blocks, threads, lanes | each other: bit for bit |
 """
 
@@ -23,7 +23,7 @@ from magloc.localization.fit.gauss_newton import covariances
 from magloc.localization.fit.optima import Optima
 from magloc.localization.fit.results import is_misfit, is_observable, spans
 from magloc.localization.search.single_source import SingleSourceSearch
-from magloc.localization.uncertainty.covariance import known_of_one, known_of_one_compiled
+from magloc.localization.uncertainty.covariance import known_of, known_of_one_compiled
 from magloc.measurement.rows import whitened_rows
 from tests.magloc.localization.search.test_candidates import CASES, regime
 
@@ -77,7 +77,7 @@ class TestAgainstReference:
     def test_all_together(self, case: str, name: str) -> None:
         """Ends of ranges are read from the profile at a rise of 3.84 to about 0.01."""
         optima = optima_of(ARRAYS[case], name)
-        found, expected = known_of_one_compiled(optima), known_of_one(optima)
+        found, expected = known_of_one_compiled(optima), known_of(optima, np.ones(len(optima.rows), bool))
         assert_allclose(found.position_m, expected.position_m, rtol=1e-12, atol=1e-12)
         assert_allclose(found.moment_Am2, expected.moment_Am2, rtol=1e-12)
         assert_allclose(found.weight, expected.weight, atol=1e-6)
@@ -106,7 +106,7 @@ class TestAnyRow:
         """Their weights raise the level within which 95 % of all of them are."""
         optima = optima_of(CASES["square 1 m"][0], "far")
         assert np.count_nonzero(np.bincount(optima.of_row) > 1) > 10
-        found, expected = known_of_one_compiled(optima), known_of_one(optima)
+        found, expected = known_of_one_compiled(optima), known_of(optima, np.ones(len(optima.rows), bool))
         assert_allclose(found.weight, expected.weight, atol=1e-6)
         assert np.count_nonzero((found.weight > 0.05) & (found.weight < 0.95)) > 10
         assert np.mean(same_ranges(found.ranges, expected.ranges)) > 0.9
