@@ -125,6 +125,7 @@ test-oldest: .venv-oldest/installed chromium
 	@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(MAKE_VENV) .venv >/dev/null 2>&1 || \
 		{ $(MAKE_VENV) --without-pip .venv && $(PYTHON) -m pip --python $(BIN)/python install --quiet pip; } >/dev/null 2>&1 || \
 		{ echo "magloc needs Python's venv and pip: on Debian and Ubuntu, apt-get install python3-venv" >&2; exit 1; }
+	@$(PIP) install 'pip>=25.1' || $(NOT_INSTALLED) # the first that installs dependency groups
 	@touch $@
 
 .venv/installed: .venv/made
@@ -134,20 +135,21 @@ test-oldest: .venv-oldest/installed chromium
 # All at once: one after the other, what both need would be looked up twice. A module is compiled when a test imports
 # it: pip would compile all of them, three quarters for nothing.
 .venv/installed-test: .venv/made
-	$(PIP) install --no-compile --constraint constraints.txt --editable '.[test]' || $(NOT_INSTALLED)
+	$(PIP) install --no-compile --constraint constraints.txt --editable '.[all]' --group test || $(NOT_INSTALLED)
 	@touch .venv/installed $@
 
 .venv/installed-bench: .venv/installed-test
-	$(PIP) install --constraint constraints.txt --editable '.[test,bench]'
+	$(PIP) install --constraint constraints.txt --editable '.[all]' --group test --group bench
 	@touch $@
 
 .venv/installed-docs: .venv/installed
-	$(PIP) install --constraint constraints.txt --editable '.[docs]'
+	$(PIP) install --constraint constraints.txt --editable '.[all]' --group docs
 	@touch $@
 
 .venv-oldest/installed: pyproject.toml constraints-oldest.txt
 	$(MAKE_VENV) .venv-oldest
-	.venv-oldest/bin/python -m pip --disable-pip-version-check --quiet install --constraint constraints-oldest.txt --editable '.[test]'
+	.venv-oldest/bin/python -m pip --disable-pip-version-check --quiet install 'pip>=25.1'
+	.venv-oldest/bin/python -m pip --disable-pip-version-check --quiet install --constraint constraints-oldest.txt --editable '.[all]' --group test
 	@touch $@
 
 .venv-supply/installed: constraints.txt

@@ -90,7 +90,7 @@ class SensorArray:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "sensors", tuple(self.sensors))
-        if not (isinstance(self.name, str) and self.name.isprintable()):
+        if not (isinstance(self.name, str) and self.name.isprintable()):  # type: ignore[redundant-expr]
             raise ValueError(f"Input name must be one line of printable text; instead received {self.name!r}.")
         for name in ("noise_fraction", "common_field_T", "ambient_uncertainty_T", "ambient_uncertainty_white_T"):
             value = getattr(self, name)

@@ -78,14 +78,12 @@ def _guard(module: ModuleType, name: str) -> None:
 
 
 def _guard_class(of: type) -> None:
-    """Guard the methods and properties of a class."""
+    """Guard the methods and cached properties of a class; other properties only look things up."""
     for name, value in list(vars(of).items()):
         if name.startswith("_") and name not in _SPECIAL:
             continue
         if isinstance(value, cached_property):
             value.func = _guarded_function(value.func)
-        elif isinstance(value, property) and value.fget is not None:
-            setattr(of, name, property(_guarded_function(value.fget), value.fset, value.fdel, value.__doc__))
         elif isinstance(value, classmethod | staticmethod):
             setattr(of, name, type(value)(_guarded_function(value.__func__)))
         elif inspect.isfunction(value):

@@ -196,7 +196,7 @@ class Sensor:
             )
         object.__setattr__(self, "rotation_xyzw", _unit_quaternion(self.rotation_xyzw))
         if self.calibration is None:
-            object.__setattr__(self, "calibration", Calibration.of(self.kind))
+            object.__setattr__(self, "calibration", Calibration.of(self.kind))  # type: ignore[unreachable]
         if len(self.calibration.offset_T) != n:
             raise ValueError(
                 f"Input calibration must have {n} channel{'s' if n > 1 else ''} for a {self.kind} sensor; "

@@ -114,7 +114,7 @@ class Readings:
             raise ValueError(f"Input values_T must have shape (n, C); instead received {self.values_T.shape}.")
         n = len(self.values_T)
         if self.time_s is None:
-            object.__setattr__(self, "time_s", np.arange(float(n)))
+            object.__setattr__(self, "time_s", np.arange(float(n)))  # type: ignore[unreachable]
         for name, shape in _ROW_SHAPES.items():
             if (value := getattr(self, name)) is not None and value.shape != (n, *shape):
                 raise ValueError(f"Input {name} must have shape {(n, *shape)}; instead received {value.shape}.")

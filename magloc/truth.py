@@ -12,12 +12,20 @@ import numpy as np
 
 from arrays.io.csv import Column, read_table
 from arrays.io.errors import InputError
+from arrays.io.results import Quantity
 from arrays.typing import FloatArray, IntArray
 from magloc.readings import Readings
 
 TRUE_POSITION_COLUMNS = ("x_m", "y_m", "z_m")
 TRUE_MOMENT_COLUMNS = ("mx_Am2", "my_Am2", "mz_Am2")
 STATE_COLUMNS = TRUE_POSITION_COLUMNS + TRUE_MOMENT_COLUMNS
+STATE_QUANTITIES = {
+    "time_s": Quantity("s", "time"),
+    "position_m": Quantity("m", "position of the source", ("axis",)),
+    "moment_Am2": Quantity("A m2", "magnetic moment of the source", ("axis",)),
+    "covariance": Quantity("m, A m2", "covariance of (position, moment)", ("component", "component_")),
+}
+"""What results with a source in every row have in common."""
 SAME_TIME_S = 1e-6
 # Of the truth's usual interval: over a longer one it is not interpolated.
 _LONGEST_STEP = 2.0

@@ -6,7 +6,7 @@ import re
 import sys
 from importlib import metadata
 
-from tests.test_packaging import EXTRAS, PROJECT, declared
+from tests.test_packaging import EXTRAS, GROUPS, PROJECT, declared
 
 # Licences that reach further than to the files that are under them.
 COPYLEFT = re.compile(r"\b[AL]?GPL|\bGeneral Public License|\bEUPL|\bCC-BY-SA", re.IGNORECASE)
@@ -55,7 +55,8 @@ def copyleft(names: set[str]) -> list[str]:
 def main() -> int:
     """List them."""
     base = required({installed(name) for name in declared(PROJECT["dependencies"])})
-    of_extras = {installed(name) for extra in EXTRAS.values() for name in declared(extra)} - {""}
+    optional = [*EXTRAS.values(), GROUPS["test"], GROUPS["bench"]]
+    of_extras = {installed(name) for some in optional for name in declared(some)} - {""}
     for title, names in (("base", base), ("extras", required(of_extras) - base)):
         print(f"{title}:")
         for name in sorted(names):

@@ -14,7 +14,8 @@ from arrays.array import SensorArray
 from magloc.measurement.differences import predicted_channels
 from magloc.readings import Readings
 from magloc.tracking.motion import RandomWalk
-from magloc.tracking.results import Row, TrackPoint, rows_of
+from magloc.tracking.results import TrackPoint
+from magloc.tracking.rows import Row, rows_of
 from magloc.tracking.track import Track
 from magloc.tracking.tracker import Tracker
 from sims.magnetics.simulation import Simulation

@@ -13,8 +13,10 @@ import pytest
 
 REPOSITORY = Path(__file__).parents[1]
 PACKAGES = ("arrays", "magloc", "adcs", "sims")
-PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
+PYPROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())
+PROJECT = PYPROJECT["project"]
 EXTRAS = PROJECT["optional-dependencies"]
+GROUPS = PYPROJECT["dependency-groups"]
 # Modules that are named otherwise than their distribution.
 DISTRIBUTIONS = {
     "IPython": "ipython",
@@ -62,16 +64,13 @@ class TestImports:
         assert imported(*PACKAGES) == {*declared(PROJECT["dependencies"]), *declared(["magloc[all]"])}
 
     def test_of_the_tests_are_declared(self) -> None:
-        everything = [*PROJECT["dependencies"], *EXTRAS["test"], *EXTRAS["bench"]]
+        everything = [*PROJECT["dependencies"], "magloc[all]", *GROUPS["test"], *GROUPS["bench"]]
         assert imported("tests") <= set(declared(everything))
 
     def test_all_is_every_extra_of_a_user(self) -> None:
         """But for a device that few have."""
         assert set(declared(["magloc[all]"])) == {
-            name
-            for extra in EXTRAS
-            if extra not in {"all", "test", "bench", "docs"}
-            for name in declared(EXTRAS[extra])
+            name for extra in EXTRAS if extra != "all" for name in declared(EXTRAS[extra])
         }
 
     @pytest.mark.parametrize("package", PACKAGES)

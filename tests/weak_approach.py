@@ -16,11 +16,11 @@ import time
 import numpy as np
 
 from arrays.typing import FloatArray
-from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.consistency import nees_of
-from magloc.tracking.posterior_bound import posterior_bound
-from magloc.tracking.results import TrackPoint, rows_of
+from magloc.tracking.results import TrackPoint
+from magloc.tracking.rows import rows_of
 from magloc.tracking.tracker import Tracker
+from magloc.tracking.whole_records.posterior_bound import posterior_bound
 from tests.passing_source import ARRAY
 from tests.tracked_sources import APPROACH, N_APPROACH, approach
 
@@ -36,7 +36,7 @@ def judged(seed: int) -> FloatArray:
     bounds = posterior_bound(tracker, rows, truth[:, :3], truth[:, 3:])
     result = np.full((N_APPROACH, 8), np.nan)
     for i, point in enumerate(tracker.run(rows)):
-        seen = ChartRow.of(tracker.measurements.of(rows[i])).is_detected(tracker.errors.sigma)
+        seen = tracker.measurements.of(rows[i]).is_detected(tracker.errors.sigma)
         result[i, :2] = seen, point.position_m is not None
         if point.position_m is None:
             continue

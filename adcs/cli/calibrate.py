@@ -12,11 +12,10 @@ from cyclopts import Parameter
 import adcs
 from adcs.cli.options import naming_options, tell, warn
 from adcs.satellite.magnetometer_calibration import NAMES, Attitude, MagnetometerCalibration
-from arrays.io.arguments import Flag
 from arrays.io.errors import naming
 from arrays.io.outputs import refuse_unwritable
 from arrays.io.tables import by_sigma
-from magloc.cli.framework import QuietOptions, print_result
+from magloc.cli.framework import Flag, QuietOptions, print_result
 
 _UNITS = {"bias": (1e9, "nT"), "gain": (100.0, "percent"), "time": (1.0, "s")}
 _MISFIT = 5.0

@@ -7,12 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import adcs
-from adcs.cli.options import tell, warn
+from adcs.cli.options import ReportOptions, warn
 from adcs.complementary.names import Magnet
-from arrays.io.arguments import Flag
 from arrays.io.errors import naming
-from arrays.io.outputs import make_folder, refuse_file
-from magloc.cli.framework import QuietOptions, print_result
+from magloc.cli.framework import Flag
 
 if TYPE_CHECKING:
     from adcs.io.imu_files import ImuLog
@@ -27,14 +25,13 @@ def imu(
     config: Path | None = None,
     method: Literal["auto", "plain", "reject", "subtract"] = "auto",
     offline: Flag = False,
-    out: Path | None = None,
-    json: Flag = False,
-    common: QuietOptions = QuietOptions(),  # noqa: B008 - frozen
+    report: ReportOptions = ReportOptions(),  # noqa: B008 - frozen
 ) -> None:
     """Attitude of an inertial unit, with iron and magnets near its magnetometer or not.
 
     The first second should be at rest, and its field is north. Without a magnetometer the heading is relative to the
-    first row. Within gaps σ grows, and they are named; a log with misread units or axes is refused.
+    first row. Within gaps σ grows, and they are named; a log with misread units or axes is refused. --out writes
+    attitude.csv and attitude.png.
 
     After D. Laidig and T. Seel (VQF, Information Fusion 91,
     2023), with a Kalman filter of the heading that knows what else changes a field.
@@ -53,31 +50,23 @@ def imu(
         moves with the sensor ("subtract"), or used as it is ("plain").
     offline : bool
         Use the whole log for every row.
-    out : Path, optional
-        Folder for attitude.csv and attitude.png.
-    json : bool
-        Print one JSON object.
-    common : QuietOptions
-        Common options.
+    report : ReportOptions
+        Where the result goes.
     """
     from adcs.io.imu_results import attitude_columns, imu_summary, summary_words
 
-    refuse_file(out, "--out")
+    report.check()
     data = adcs.read_imu(log, config)
     began = time.perf_counter()
     track = inertial_attitude(log, data, _MAGNETS[method], offline=offline)
     summary: dict[str, Any] = {**imu_summary(track, data), "seconds": time.perf_counter() - began}
-    warn(common, track.warnings)
-    if out is not None:
+    warn(report, track.warnings)
+    if report.out is not None:
         from adcs.plots.inertial import inertial_figure
-        from arrays.io.csv import write_columns
-        from magloc.plots import style
 
-        make_folder(out, "--out")
-        write_columns(attitude_columns(track), out / "attitude.csv")
-        style.save(inertial_figure(track, log.stem, data.q_true), out / "attitude.png")
-        tell(common, f"wrote attitude.csv and attitude.png into {out}")
-    print_result(summary, summary_words(summary), as_json=json)
+        picture = inertial_figure(track, log.stem, data.q_true)
+        report.write([("attitude.csv", attitude_columns(track)), ("attitude.png", picture)])
+    report.print(summary, summary_words(summary))
 
 
 def inertial_attitude(log: Path, data: ImuLog, magnet: Magnet = "auto", *, offline: bool = False) -> adcs.AttitudeTrack:

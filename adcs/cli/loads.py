@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Any
 import adcs
 import arrays
 from adcs.cli.options import tell, warn
-from arrays.io.arguments import Flag
 from arrays.io.errors import naming
 from arrays.io.outputs import refuse_unwritable
-from magloc.cli.framework import QuietOptions, print_result
+from magloc.cli.framework import Flag, QuietOptions, print_result
 
 if TYPE_CHECKING:
     from arrays.typing import FloatArray

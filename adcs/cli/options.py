@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
 import adcs
 from adcs.kalman.names import Filter, Noise, StartKind, is_measured
-from arrays.io.arguments import Flag
 from arrays.io.errors import InputError
+from arrays.io.outputs import refuse_file, write_files
 from magloc.cli import framework
+from magloc.cli.framework import Count, Flag, QuietOptions  # noqa: F401 - of an inherited option
 
 
 def print_note(text: str) -> None:
@@ -31,6 +33,39 @@ def tell(common: framework.QuietOptions, *texts: str) -> None:
 def warn(common: framework.QuietOptions, texts: Iterable[str]) -> None:
     """Print warnings on stderr, unless it is to be quiet there."""
     tell(common, *(f"warning: {text}" for text in texts))
+
+
+@Parameter(name="*", group="Common options")
+@dataclass(frozen=True)
+class ReportOptions(QuietOptions):
+    """Where a result goes.
+
+    Parameters
+    ----------
+    out : Path, optional
+        Folder for figures and the data behind them; made if it is not there.
+    json : bool
+        Print one JSON object.
+    threads : int
+        Threads at most; by default all cores. Results do not depend on it.
+    quiet : bool
+        No progress and no summary on stderr, only errors.
+    """
+
+    out: Path | None = None
+    json: Flag = False
+
+    def check(self) -> None:
+        """Refuse, before long work, what cannot become a folder."""
+        refuse_file(self.out, "--out")
+
+    def write(self, files: Iterable[tuple[str, Any]]) -> None:
+        """Write files by their names, as :func:`arrays.io.outputs.write_files`, if there is a folder for them."""
+        write_files(self.out, files)
+
+    def print(self, result: Mapping[str, Any], lines: Sequence[str]) -> None:
+        """Print a result as JSON or as text."""
+        framework.print_result(result, lines, as_json=self.json)
 
 
 @contextmanager

@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import adcs
-from adcs.cli.options import tell
-from arrays.io.arguments import Flag
+from adcs.cli.options import ReportOptions
 from arrays.io.errors import InputError, naming
 from arrays.typing import FloatArray
-from magloc.cli.framework import QuietOptions, print_result, progress
+from magloc.cli.framework import Flag, progress
 
 if TYPE_CHECKING:
     from adcs.stars.catalogue import StarCatalogue
@@ -36,14 +35,12 @@ def stars(
     year: float = 2015.0,
     aberration: Flag = False,
     dark: Path | None = None,
-    out: Path | None = None,
-    json: Flag = False,
-    common: QuietOptions = QuietOptions(),  # noqa: B008 - frozen
+    report: ReportOptions = ReportOptions(),  # noqa: B008 - frozen
 ) -> None:
     """Identify the stars of images by a catalogue, without knowing where the camera looked.
 
     Of frames with the true numbers of the stars (result.csv) it says how many were found and how many were wrong.
-    Mirrored images are solved too, and named.
+    Mirrored images are solved too, and named. --out writes the photographs with the names of their stars.
 
     Parameters
     ----------
@@ -68,12 +65,8 @@ def stars(
         is 0.0027 years and 0.35 arc seconds. Needs the extra "satellites".
     dark : Path, optional
         Photograph without a sky, which is subtracted.
-    out : Path, optional
-        Folder for the photographs with the names of their stars.
-    json : bool
-        Print one JSON object.
-    common : QuietOptions
-        Common options.
+    report : ReportOptions
+        Where the result goes.
     """
     from adcs.stars.files import read_star_catalogue
     from adcs.stars.hipparcos import hipparcos_catalogue
@@ -103,9 +96,9 @@ def stars(
         known = known.aberrated(earth_velocity_m_s(of_julian_year(year)))
     rad_per_px = None if scale_arcsec is None else math.radians(scale_arcsec / 3600.0)
     if of_pictures:
-        _pictures(images, known, rad_per_px, scale_tolerance or 0.05, noise_px or 0.5, dark, out, json, common)
+        _pictures(images, known, rad_per_px, scale_tolerance or 0.05, noise_px or 0.5, dark, report)
     else:
-        _frames(images[0], known, rad_per_px, scale_tolerance, noise_px or 1.0, json, common)
+        _frames(images[0], known, rad_per_px, scale_tolerance, noise_px or 1.0, report)
 
 
 def _pictures(
@@ -115,16 +108,12 @@ def _pictures(
     tolerance: float,
     noise_px: float,
     dark: Path | None,
-    out: Path | None,
-    json: bool,
-    common: QuietOptions,
+    report: ReportOptions,
 ) -> None:
     from adcs.plots.stars import picture_figure
     from adcs.stars.identification import NoFix
-    from arrays.io.outputs import make_folder, refuse_file
-    from magloc.plots import style
 
-    refuse_file(out, "--out")
+    report.check()
     off = None if dark is None else adcs.read_picture(dark)
     rows, solved = [], []
     for path in paths:
@@ -158,12 +147,12 @@ def _pictures(
             }
         rows.append({**row, "milliseconds": took_ms})
         solved.append((path, picture, lights, None if isinstance(found, NoFix) else found))
-    if out is not None:  # once all photographs are read: a later one may be refused
-        make_folder(out, "--out")
-        for path, picture, lights, fix in solved:
-            style.save(picture_figure(path.name, picture, lights, fix, known), out / f"{path.stem}-stars.png")
-        tell(common, f"wrote {len(rows)} pictures with names into {out}")
-    print_result({"pictures": rows}, [_picture_line(row) for row in rows], as_json=json)
+    # Once all photographs are read: a later one may be refused.
+    report.write(
+        (f"{path.stem}-stars.png", picture_figure(path.name, picture, lights, fix, known))
+        for path, picture, lights, fix in solved
+    )
+    report.print({"pictures": rows}, [_picture_line(row) for row in rows])
 
 
 def _mirrored(row: dict[str, Any]) -> str:
@@ -192,8 +181,7 @@ def _frames(
     rad_per_px: float | None,
     tolerance: float | None,
     noise_px: float,
-    json: bool,
-    common: QuietOptions,
+    report: ReportOptions,
 ) -> None:
     from adcs.stars.files import read_star_frames
     from adcs.stars.pose import UNKNOWN_LENS, LensPrior
@@ -209,7 +197,7 @@ def _frames(
         with naming("--scale-arcsec"):
             camera = replace(camera, rad_per_px=rad_per_px)
     ended = [time.perf_counter()]
-    with progress(len(images), "frames", quiet=common.quiet) as advance:
+    with progress(len(images), "frames", quiet=report.quiet) as advance:
 
         def done(frames: int) -> None:
             ended.append(time.perf_counter())
@@ -226,7 +214,7 @@ def _frames(
         "milliseconds_max": float(milliseconds.max()),
     }
     words = [*(_line(number, row) for number, row in enumerate(rows)), _in_words(totals)]
-    print_result({"frames": rows, **totals}, words, as_json=json)
+    report.print({"frames": rows, **totals}, words)
 
 
 def _row(catalogue: StarCatalogue, image: StarFrame, fix: StarFix | NoFix) -> dict[str, Any]:

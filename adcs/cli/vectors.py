@@ -5,12 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import adcs
-from adcs.cli.options import tell
+from adcs.cli.options import ReportOptions
 from adcs.satellite.wahba import VectorMethod
-from arrays.io.arguments import Flag
 from arrays.io.errors import naming
-from arrays.io.outputs import make_folder, refuse_file
-from magloc.cli.framework import QuietOptions, print_result
+from magloc.cli.framework import Flag
 
 
 def vectors(
@@ -20,11 +18,11 @@ def vectors(
     config: Path,
     method: VectorMethod = "quest",
     allow_old_elements: Flag = False,
-    out: Path | None = None,
-    json: Flag = False,
-    common: QuietOptions = QuietOptions(),  # noqa: B008 - frozen
+    report: ReportOptions = ReportOptions(),  # noqa: B008 - frozen
 ) -> None:
     """Attitude of every row that has magnetometer and Sun sensor, each row on its own: TRIAD, or Wahba's problem.
+
+    --out writes vectors.csv; --json has one entry for every such row.
 
     Parameters
     ----------
@@ -36,24 +34,16 @@ def vectors(
         Least squares of both vectors ("quest"), or the Sun exactly and the field for the turn around it ("triad").
     allow_old_elements : bool
         Take two-line elements 30 days or more from their epoch too.
-    out : Path, optional
-        Folder for vectors.csv.
-    json : bool
-        Print one JSON object with one entry for every such row.
-    common : QuietOptions
-        Common options.
+    report : ReportOptions
+        Where the result goes.
     """
-    from adcs.io.estimates import estimate_columns, rows_of, summary_lines
-    from arrays.io.csv import write_columns
+    from adcs.io.estimates import rows_of, summary_lines
 
-    refuse_file(out, "--out")
+    report.check()
     scenario = adcs.read_scenario(str(config), allow_old_elements=allow_old_elements)
     record = adcs.read_telemetry(telemetry, scenario.step_s, layout=scenario.log)
     with naming(str(telemetry)):
         track = adcs.vector_attitude(record, scenario.satellite, method=method)
-    columns = estimate_columns(track)
-    if out is not None:
-        make_folder(out, "--out")
-        write_columns(columns, out / "vectors.csv")
-        tell(common, f"wrote vectors.csv into {out}")
-    print_result({"results": rows_of(columns)}, summary_lines(track), as_json=json)
+    columns = track.columns()
+    report.write([("vectors.csv", columns)])
+    report.print({"results": rows_of(columns)}, summary_lines(track))

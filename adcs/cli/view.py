@@ -11,9 +11,8 @@ from adcs.cli.imu import inertial_attitude
 from adcs.cli.options import print_note, warn
 from adcs.io.imu_files import imu_log
 from adcs.io.scenario_files import scenario_of, scenario_table
-from arrays.io.arguments import Flag
 from arrays.io.errors import InputError, naming
-from magloc.cli.framework import QuietOptions
+from magloc.cli.framework import Flag, QuietOptions
 from magloc.cli.options import Port, naming_outputs
 
 if TYPE_CHECKING:

@@ -48,9 +48,9 @@ def summary_lines(track: AttitudeTrack) -> list[str]:
         return [f"no rows; {track.title}"]
     columns = estimate_columns(track)
     lines = [f"{len(track.rows)} rows from {track.time_s[0]:g} to {track.time_s[-1]:g} s; {track.title}"]
-    prefix, frame = ("eci_", "reference") if track.q_orbital is None else ("", "orbital")
+    prefix = "eci_" if track.q_orbital is None else ""
     q = ", ".join(f"{columns[f'{prefix}q{part}'][-1]:.6f}" for part in "wxyz")
-    lines.append(f"attitude at the end, {frame} from body (w, x, y, z)   {q}")
+    lines.append(f"attitude at the end, {track.frame} from body (w, x, y, z)   {q}")
     for state, shown in SHOWN.items():
         names = shown.columns
         if state not in track.sigma:

@@ -10,18 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adcs import quaternion
+from arrays.io.csv import Column
 from arrays.io.lazy import by_name
+from arrays.io.results import Result
 from arrays.typing import BoolArray, FloatArray
 
 _MOST_WARNINGS = 10
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
     from scipy.spatial.transform import Rotation
 
 
-@dataclass(frozen=True, eq=False)
-class AttitudeTrack:
+@dataclass(frozen=True, eq=False, repr=False)
+class AttitudeTrack(Result):
     """Attitude and what else a filter estimates, at n instants.
 
     Attributes
@@ -68,6 +69,9 @@ class AttitudeTrack:
     ((201, 4), ['attitude', 'rate'])
     """
 
+    figure = "adcs.plots.attitude:track_figure"
+    command = "estimate"
+
     title: str
     time_s: FloatArray
     rows: NDArray[np.int64]
@@ -106,14 +110,18 @@ class AttitudeTrack:
             for name, seen in self.seen.items()
         }
 
-    def __repr__(self) -> str:
-        """What ``adcs estimate`` prints, then the warnings."""
-        lines = by_name("adcs.io.estimates:summary_lines")(self)
-        return "\n".join((*lines, *(f"warning: {text}" for text in self.warnings)))
+    @property
+    def frame(self) -> str:
+        """Frame that the attitude is of, from body."""
+        return "reference" if self.q_orbital is None else "orbital"
 
-    def plot(self) -> Figure:
-        """Every state's three axes side by side, with the filter's ±3σ, and the gaps of its sensors."""
-        return by_name("adcs.plots.attitude:track_figure")(self)
+    def lines(self, most: int | None = None) -> list[str]:
+        """Return what ``adcs estimate`` prints, then the warnings."""
+        return [*by_name("adcs.io.estimates:summary_lines")(self), *(f"warning: {text}" for text in self.warnings)]
+
+    def columns(self) -> dict[str, Column]:
+        """Return the columns of estimates.csv."""
+        return by_name("adcs.io.estimates:estimate_columns")(self)
 
 
 def joined(tracks: Sequence[AttitudeTrack], warning: str) -> AttitudeTrack:

@@ -11,7 +11,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from functools import cached_property
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,11 +23,9 @@ from adcs.frames import turned
 from adcs.satellite.satellite import Satellite
 from adcs.satellite.telemetry import Telemetry
 from arrays.io.errors import check_not_negative, check_positive
-from arrays.io.lazy import by_name
+from arrays.io.results import Drawn
 from arrays.typing import BoolArray, FloatArray
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from magloc.least_squares import damped_step, minimise
 
 Attitude = Literal["none", "orbital"]
 """What is known of the attitude: nothing, or that it is constant in the frame of the model's field."""
@@ -98,7 +97,7 @@ class MagnetometerPrior:
 
 
 @dataclass(frozen=True, eq=False)
-class MagnetometerCalibration:
+class MagnetometerCalibration(Drawn):
     """Calibration of a magnetometer.
 
     Attributes
@@ -122,6 +121,8 @@ class MagnetometerCalibration:
     used : ndarray of bool, shape (n,)
         Rows that are there and fit the others.
     """
+
+    figure = "adcs.plots.magnetometers:magnetometer_figure"
 
     bias_T: FloatArray
     gain: FloatArray
@@ -162,10 +163,6 @@ class MagnetometerCalibration:
     def applied(self, readings_T: ArrayLike) -> FloatArray:
         """Fields (..., 3) of readings (..., 3)."""
         return turned(np.linalg.inv(np.eye(3) + self.gain), np.asarray(readings_T, dtype=np.float64) - self.bias_T)
-
-    def plot(self) -> Figure:
-        """What is left of every row, and what is found of every number, against the prior."""
-        return by_name("adcs.plots.magnetometers:magnetometer_figure")(self)
 
 
 class _Rows(NamedTuple):
@@ -254,9 +251,10 @@ def calibrated(
     used: BoolArray = np.isfinite(readings).all(axis=1)  # type: ignore[assignment]
     _check_enough(used)
     linearised = _modulus if attitude == "none" else _OfOrbital(_orbital_frame(rows.some(used), prior))
-    x, H = _started(rows.some(used), prior, linearised), np.eye(13)
+    x = _started(rows.some(used), prior, linearised)
     for _ in range(_ROUNDS):
-        x, H = _fitted(rows.some(used), prior, linearised, x)
+        fit = _fitted(rows.some(used), prior, linearised, x)
+        x = fit.x
         far = _far(linearised(rows.some(used), x, prior)[0], prior)
         if not far.any():
             break
@@ -273,7 +271,7 @@ def calibrated(
         bias_T=x[:3],
         gain=x[3:12].reshape(3, 3),
         time_shift_s=float(x[12]),
-        covariance=deviations[:, None] * np.linalg.inv(H + np.eye(13)) * deviations,
+        covariance=deviations[:, None] * np.linalg.inv(fit.information + np.eye(13)) * deviations,
         prior=prior,
         residual_T=all_of,
         raw_rms_T=float(np.sqrt(np.mean(raw**2))),
@@ -351,48 +349,59 @@ def _started(rows: _Rows, prior: MagnetometerPrior, linearised: _Linearised) -> 
     starts = []
     for shift in _grid(prior):
         x = np.concatenate([np.zeros(12), [shift]])
-        x, _ = _fitted(few, replace(prior, time_shift_s=0.0), linearised, x, most=4)
+        x = _fitted(few, replace(prior, time_shift_s=0.0), linearised, x, most=4).x
         residual = np.abs(linearised(few, x, prior)[0])
         starts.append((float(np.median(residual)), x))
     return min(starts, key=lambda start: start[0])[1]
 
 
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """Parameters (13,) with the prior about what is held of the first ones: a prior of zero holds a number."""
+
+    rows: _Rows
+    prior: MagnetometerPrior
+    linearised: _Linearised
+    x: FloatArray
+    first: FloatArray
+
+    @cached_property
+    def _white(self) -> FloatArray:
+        """Residuals (n,) and their derivatives (n, 13) in units of the prior's deviations."""
+        residual, by = self.linearised(self.rows, self.x, self.prior)
+        n = len(self.rows.time_s)
+        both = np.concatenate([residual.reshape(n, -1, 1), (by * self.prior.deviations).reshape(n, -1, 13)], axis=2)
+        return _whitened(self.rows.time_s, both.reshape(n, -1), self.prior).reshape(-1, 14)
+
+    @cached_property
+    def _off(self) -> FloatArray:
+        """Parameters from the prior's, in its deviations."""
+        deviations = self.prior.deviations
+        return np.divide(self.x - self.first, deviations, out=np.zeros(13), where=deviations > 0.0)
+
+    @property
+    def cost(self) -> float:
+        """Of rows and prior."""
+        return float(self._white[:, 0] @ self._white[:, 0] + self._off @ self._off)
+
+    @property
+    def information(self) -> FloatArray:
+        """H (13, 13) of the rows."""
+        return np.asarray(self._white[:, 1:].T @ self._white[:, 1:])
+
+    def step(self, damping: float) -> tuple[_Fit, float]:
+        """The parameters after a damped step."""
+        gradient = self._white[:, 1:].T @ self._white[:, 0] + self._off
+        step, promised = damped_step(self.information + np.eye(13), gradient, damping)
+        return replace(self, x=self.x + self.prior.deviations * step), promised
+
+
 def _fitted(
     rows: _Rows, prior: MagnetometerPrior, linearised: _Linearised, x: FloatArray, most: int = _ITERATIONS
-) -> tuple[FloatArray, FloatArray]:
-    """Parameters of the largest posterior by damped Gauss-Newton steps, and the information H (13, 13) of the rows.
-
-    Numbers are in units of their prior's deviations; one that is zero holds its number.
-    """
-    deviations = prior.deviations
-    first = x * (deviations == 0.0)
-
-    def cost_of(x: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-        residual, by = linearised(rows, x, prior)
-        n = len(rows.time_s)
-        both = np.concatenate([residual.reshape(n, -1, 1), (by * deviations).reshape(n, -1, 13)], axis=2)
-        white = _whitened(rows.time_s, both.reshape(n, -1), prior).reshape(-1, 14)
-        scaled = np.divide(x - first, deviations, out=np.zeros(13), where=deviations > 0.0)
-        gradient = white[:, 1:].T @ white[:, 0] + scaled
-        return float(white[:, 0] @ white[:, 0] + scaled @ scaled), gradient, white[:, 1:].T @ white[:, 1:]
-
-    cost, gradient, H = cost_of(x)
-    damping = 1e-3
-    for _ in range(most):
-        step = -np.linalg.solve(H + np.eye(13) + damping * np.diag(np.diagonal(H)), gradient)
-        trial = x + deviations * step
-        new_cost, new_gradient, new_H = cost_of(trial)
-        if new_cost <= cost:
-            x, damping = trial, 0.1 * damping
-            settled = cost - new_cost < _SETTLED
-            cost, gradient, H = new_cost, new_gradient, new_H
-            if settled:
-                break
-        else:
-            damping *= 10.0
-            if damping > 1e8:
-                break
-    return x, H
+) -> _Fit:
+    """Parameters of the largest posterior."""
+    start = _Fit(rows, prior, linearised, x, x * (prior.deviations == 0.0))
+    return minimise(start, lambda _: _SETTLED, max_iterations=most).point
 
 
 def _far(residual: FloatArray, prior: MagnetometerPrior) -> BoolArray:

@@ -19,7 +19,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,13 +27,10 @@ from scipy.special import chdtri
 from adcs import quaternion
 from arrays.array import SensorArray
 from arrays.io.errors import check_positive
-from arrays.io.lazy import by_name
+from arrays.io.results import Drawn
 from arrays.typing import BoolArray, FloatArray
 from magloc.localization.fit.results import Fix
 from magloc.localization.locator import Locator
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 WINDOW_S = 8.0
 """Before and after a switch: longer, and the ambient field is no parabola."""
@@ -111,7 +107,7 @@ class Lag:
 
 
 @dataclass(frozen=True, eq=False)
-class OwnFields:
+class OwnFields(Drawn):
     """Fields of K loads at the M vector magnetometers of a satellite.
 
     Attributes
@@ -142,6 +138,8 @@ class OwnFields:
     >>> own.names, own.vectors_T.shape
     (('heater', 'radio'), (2, 4, 3))
     """
+
+    figure = "adcs.plots.magnetometers:own_fields_figure"
 
     names: tuple[str, ...]
     array: SensorArray
@@ -205,10 +203,6 @@ class OwnFields:
             array = replace(self.array, sensors=tuple(sensors), common_field_T=float(noise.max()), ambient_T=None)
             fixes[name] = Locator(array, exclude_faulty=False).fit(array.readings_of(vectors))
         return fixes
-
-    def plot(self) -> Figure:
-        """What every load adds to every magnetometer, with ±3σ."""
-        return by_name("adcs.plots.magnetometers:own_fields_figure")(self)
 
 
 def find_own_fields(

@@ -70,5 +70,6 @@ class Satellite:
         body = RigidBody(np.asarray(self.inertia_kgm2, dtype=np.float64), np.asarray(self.residual_dipole_Am2))
         object.__setattr__(self, "body", body)
         if self.control is None:
-            object.__setattr__(self, "control", wheel_control(body))
-        object.__setattr__(self, "start", instants(self.orbit.epoch if self.start is None else self.start)[()])
+            object.__setattr__(self, "control", wheel_control(body))  # type: ignore[unreachable]
+        start = self.orbit.epoch if self.start is None else self.start  # type: ignore[redundant-expr]
+        object.__setattr__(self, "start", instants(start)[()])

@@ -368,12 +368,10 @@ def _is_number_or_empty(cell: str) -> bool:
     return True
 
 
-def write_table(path: Path, columns: tuple[str, ...], table: NDArray[np.float64]) -> None:
-    """Write a table (n, k) of numbers as CSV, to nine digits."""
-    from arrays.io.text import write_text
-
-    lines = [",".join(columns), *(",".join(f"{value:.9g}" for value in row) for row in table.tolist()), ""]
-    write_text("\n".join(lines), path)
+def table_text(columns: Mapping[str, FloatArray | IntArray]) -> str:
+    """Return the text of a CSV file of numbers, to nine digits."""
+    rows = np.column_stack(list(columns.values())).tolist()
+    return "\n".join([",".join(columns), *(",".join(f"{value:.9g}" for value in row) for row in rows), ""])
 
 
 Column = NDArray[np.float64] | NDArray[np.int64] | NDArray[np.bool_] | Sequence[str]

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 from arrays.io.closing import uninterrupted
 from arrays.io.errors import InputError
+from arrays.io.lazy import by_name
+
+_LOG = logging.getLogger(__name__)
 
 
 def refuse_file(folder: Path | None, option: str) -> None:
@@ -70,6 +75,39 @@ def make_folder(folder: Path, option: str) -> None:
     except OSError as error:
         raise InputError(f"{option} {folder} cannot be written ({error.strerror}).") from None
     _refuse_closed(folder, folder, option)
+
+
+def write_files(folder: Path | None, files: Iterable[tuple[str, Any]], option: str = "--out") -> None:
+    """Write files by their names into a folder, as :func:`write_file`, and log the names; nothing without a folder."""
+    if folder is None:
+        return
+    make_folder(folder, option)
+    names = []
+    for name, content in files:
+        write_file(content, folder / name)
+        names.append(name)
+    _LOG.info("wrote %s into %s", " and ".join(filter(None, (", ".join(names[:-1]), names[-1]))), folder)
+
+
+def write_file(content: Any, path: Path) -> None:
+    """Write a file whole or not at all.
+
+    A figure becomes a PNG file, a mapping of columns a CSV file, a dataset a netCDF file, a string a text file.
+    Anything else is called with the path.
+    """
+    from arrays.io.csv import write_columns
+    from arrays.io.text import write_netcdf, write_text
+
+    if hasattr(content, "savefig"):
+        by_name("magloc.plots.style:save")(content, path)
+    elif hasattr(content, "to_netcdf"):
+        write_netcdf(content, path)
+    elif isinstance(content, str):
+        write_text(content, path)
+    elif isinstance(content, Mapping):
+        write_columns(content, path)
+    else:
+        content(path)
 
 
 def installed_version() -> str:

@@ -14,6 +14,23 @@ from arrays.io.errors import InputError
 Number = int | Decimal
 """A number of a file, as it is written."""
 _SHIFT = Context(prec=1000, traps=[])
+_OF_ENDINGS = {
+    "_deg_s": "deg/s",
+    "_m_s": "m/s",
+    "_m_s2": "m/s2",
+    "_s2": "1/s2",
+    "_Am2": "A m2",
+    "_nT": "nT",
+    "_deg": "deg",
+    "_percent": "percent",
+    "_m": "m",
+    "_s": "s",
+}
+
+
+def unit_of_column(name: str) -> str:
+    """Return the unit that the name of a column ends in; "1" of a number without one."""
+    return next((unit for ending, unit in _OF_ENDINGS.items() if name.endswith(ending)), "1")
 
 
 def tesla(place: str, nanotesla: Number) -> float:

@@ -8,30 +8,28 @@ all that is not the source. A nuisance x that enters the readings as N x, with a
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from arrays.array import SensorArray
 from arrays.io.errors import _vectors
-from arrays.io.lazy import by_name
-from arrays.noise import reading_covariance
+from arrays.io.results import Drawn
 from arrays.typing import BoolArray, FloatArray, IntArray
-from magloc.fields.multipole import assumed_body_lengths, check_body_length, finite_body_errors
-from magloc.measurement.differences import channel_jacobian, fields_at_sensors, predicted_channels
+from magloc.fields.multipole import assumed_body_lengths, check_body_length
+from magloc.localization.model_errors import body_errors
+from magloc.measurement.differences import channel_jacobian, predicted_channels
+from magloc.measurement.known_moment import KnownMoment
 from magloc.measurement.pose import pose_errors_at_rest
-from magloc.measurement.rows import check_magnitudes
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from magloc.measurement.rows import ambient_fields, check_magnitudes, whitenings_of
+from magloc.measurement.whitened import WhitenedModel
 
 LOST = 1e-6
 """A combination of parameters is not estimable if the readings tell of it so much less than of others."""
 
 
 @dataclass(frozen=True, eq=False)
-class Bounds:
+class Bounds(Drawn):
     """Least standard deviations of any unbiased estimate from one set of readings, over leading axes.
 
     Attributes
@@ -63,6 +61,8 @@ class Bounds:
     (array([0.08, 0.89]), (2, 6, 6))
     """
 
+    figure = "magloc.plots.bounds:bounds_figure"
+
     position_m: FloatArray
     moment_Am2: FloatArray
     range_m: FloatArray
@@ -72,10 +72,6 @@ class Bounds:
     sigma_position_m: FloatArray
     sigma_moment_Am2: FloatArray
     rank: IntArray
-
-    def plot(self) -> Figure:
-        """σ of range, bearing, position and moment over the distance of the sources."""
-        return by_name("magloc.plots.bounds:bounds_figure")(self)
 
     @property
     def is_regular(self) -> BoolArray:
@@ -106,39 +102,35 @@ def whitened_jacobian(
     p, m = _sources(position_m, moment_Am2)
     check_uncertainty(ambient_uncertainty_T, known_moment_sigma_Am2)
     check_body_length(body_length_m)
-    ambient_uncertainty_T = ambient_uncertainty_T or array.row_ambient_uncertainty_T
-    root = _inverse_root(array, p, m)
-    # What the readings depend on, the source first: columns, and what is known of their numbers.
-    columns = [(channel_jacobian(array, p, m), np.inf)]
-    if array.pose is not None:
-        columns.append((pose_errors_at_rest(array, array.pose, p, m), 1.0))
     length_m = assumed_body_lengths(array.positions, p, array.circumradius, body_length_m)
-    has_length = np.any(length_m)
-    if ambient_uncertainty_T or has_length:
-        gain = array.linear_gain(fields_at_sensors(array, p, m))
-    if ambient_uncertainty_T:
-        columns.append((gain, ambient_uncertainty_T))
-    if has_length:
-        beyond = finite_body_errors(array.positions - p[..., None, :], m[..., None, :], length_m[..., None, None, None])
-        columns.append((np.einsum("...ci,...cij->...cj", gain, beyond[..., array.channel_sensor, :, :]), 1.0))
-    with np.errstate(invalid="ignore"):
-        left = [(root @ of, sigma) for of, sigma in columns]
-        common = root @ _common_field(array)
-    prior = np.inf if array.common_field_T is None else array.common_field_T
-    for group in _kinds(array):
-        # Written out for every kind: one of them has no effect on the readings of the other.
-        part = np.where(group[:, None], common[..., 3:] if array.channel_is_scalar[group][0] else common[..., :3], 0.0)
-        left = [(_marginalised(of, part, prior), sigma) for of, sigma in left]
-    while len(left) > 1:
-        nuisance, known = left.pop()
-        left = [(_marginalised(of, nuisance, known), sigma) for of, sigma in left]
-    ((W, _),) = left
-    if known_moment_sigma_Am2 == np.inf:
-        return W
-    with np.errstate(invalid="ignore"):
-        along = m / (np.linalg.norm(m, axis=-1, keepdims=True) * known_moment_sigma_Am2)
-    row = np.broadcast_to(np.concatenate([np.zeros_like(along), np.nan_to_num(along)], axis=-1), (*W.shape[:-2], 6))
-    return np.concatenate([W, row[..., None, :]], axis=-2)
+    shape = np.broadcast_shapes(p.shape[:-1], length_m.shape)
+    p, m = (np.broadcast_to(of, (*shape, 3)).reshape(-1, 3) for of in (p, m))
+    length_m = np.broadcast_to(length_m, shape).reshape(-1)
+    jacobian = channel_jacobian(array, p, m)
+    known: BoolArray = np.all(np.isfinite(jacobian), axis=(-2, -1))
+    W = np.full((len(p), array.n_channels + (known_moment_sigma_Am2 < np.inf), 6), np.nan)
+    if known.any():
+        p, m, jacobian = p[known], m[known], jacobian[known]
+        readings = predicted_channels(array, p, m) + array.channel_offset_T
+        whitening = whitenings_of(array, np.ones(array.n_channels, np.bool_), readings)
+        model = WhitenedModel.of(array, whitening, ambient_fields(array, len(p), None))
+        q = model.homogeneous(p)[:, None]
+        mu = model.scaled_moment(q, m[:, None])
+        ambient_T = ambient_uncertainty_T or array.row_ambient_uncertainty_T
+        errors = []
+        if ambient_T:
+            errors.append(ambient_T * model.linear_gain(model.source_fields(q, mu)))
+        if length_m.any():
+            errors.append(body_errors(model, q, mu, length_m[known, None]))
+        if array.pose is not None:
+            errors.append(whitening.root @ pose_errors_at_rest(array, array.pose, p, m))
+        if errors:
+            model = model.marginalised(np.concatenate(errors, axis=-1))
+        W[known, : array.n_channels] = model.whitened(whitening.root @ jacobian)
+        if known_moment_sigma_Am2 < np.inf:
+            W[known, -1, :3] = 0.0
+            W[known, -1, 3:] = KnownMoment((1.0,), known_moment_sigma_Am2).jacobian(m[:, None])[:, 0, 0]
+    return W.reshape(*shape, -1, 6)
 
 
 def cramer_rao_bounds(
@@ -245,46 +237,6 @@ def cramer_rao_bounds(
         sigma_moment_Am2=moment_unit * _root_of_sum(Vt.mT[..., 3:, :], inverse, lost) + blank,
         rank=np.where(known, (~lost).sum(axis=-1), 0),
     )
-
-
-def _inverse_root(array: SensorArray, position: FloatArray, moment: FloatArray) -> FloatArray:
-    """``L⁻¹`` of the readings' noise ``L Lᵀ``: (C, C), or (..., C, C) where it depends on the readings [1/T]."""
-    if not array.noise_depends_on_reading:
-        return np.diag(1.0 / array.channel_noise_T)
-    readings = predicted_channels(array, position, moment) + array.channel_offset_T
-    complete: BoolArray = np.all(np.isfinite(readings), axis=-1, keepdims=True)
-    known = complete[..., None]
-    covariance = reading_covariance(array, np.where(complete, readings, 0.0))
-    scale = 1.0 / array.channel_noise_T  # LAPACK's tolerances are absolute
-    unit = np.where(known, covariance * scale[:, None] * scale, np.eye(array.n_channels))
-    root: FloatArray = np.linalg.inv(np.linalg.cholesky(unit)) * scale
-    return np.where(known, root, np.nan)
-
-
-def _kinds(array: SensorArray) -> list[BoolArray]:
-    """Channels (C,) of the vector sensors, then of the scalar ones: each kind has a common field of its own."""
-    return [kind for kind in (~array.channel_is_scalar, array.channel_is_scalar) if kind.any()]
-
-
-def _common_field(array: SensorArray) -> FloatArray:
-    """How the common field enters the channels: its three components vector sensors, a common modulus scalar ones."""
-    scalar = array.channel_is_scalar[:, None]
-    gain = array.channel_gain
-    return np.concatenate([np.where(scalar, 0.0, gain), np.where(scalar, gain[:, :1], 0.0)], axis=1)
-
-
-def _marginalised(W: FloatArray, nuisance: FloatArray, sigma: float) -> FloatArray:
-    """Whitened rows (..., C, n) freed of nuisances (..., C, q) of prior σ: ``(I + σ² N Nᵀ)^(-1/2) W`` by an SVD of N.
-
-    An infinite σ projects the nuisances out.
-    """
-    known = np.isfinite(nuisance).all(axis=(-2, -1), keepdims=True)
-    Q, s, _ = np.linalg.svd(np.where(known, nuisance, 0.0), full_matrices=False)
-    present = s > 1e-10 * s.max(axis=-1, keepdims=True, initial=0.0)
-    with np.errstate(invalid="ignore"):
-        shrinkage = np.where(present, 1.0 - 1.0 / np.hypot(1.0, s * sigma), 0.0)
-    result: FloatArray = W - Q @ (shrinkage[..., None] * (Q.mT @ W))
-    return np.where(known, result, np.nan)
 
 
 def _sum_of_squares(rows: FloatArray, which: BoolArray) -> FloatArray:

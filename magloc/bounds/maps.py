@@ -23,7 +23,7 @@ from arrays.array import SensorArray
 from arrays.geometries import tetrahedron
 from arrays.io.errors import check_positive
 from arrays.typing import FloatArray
-from magloc.bounds.over_moments import table_and_spreads
+from magloc.bounds.over_moments import sigma_table, spread_over
 from magloc.directions import moments_on_sphere
 from magloc.fields.multipole import check_body_length
 from magloc.grids.computed import computed_map
@@ -137,18 +137,13 @@ class BoundScenario:
 def bounds_at(scenario: BoundScenario, positions_m: ArrayLike) -> dict[str, FloatArray]:
     """All bounds of a map at positions (..., 3) [m]: σ of range, bearing and position with each of :data:`CASES`."""
     positions = np.asarray(positions_m, dtype=np.float64)
-    flat = positions.reshape(-1, 3)
-    given, spreads = table_and_spreads(
-        scenario.array,
-        flat,
-        [scenario.moment_Am2],
-        scenario.moments_Am2,
-        **scenario.uncertain,
-    )
+    moments = np.vstack([scenario.moment_Am2, scenario.moments_Am2])
+    table = sigma_table(scenario.array, positions.reshape(-1, 3), moments, **scenario.uncertain)
     values = {}
-    for name, one, spread in zip(_UNITS, given, spreads, strict=True):
-        for case, sigma in zip(CASES, (one[:, 0], spread.median, spread.q95, spread.worst), strict=True):
-            values[f"sigma_{name}{case}"] = sigma.reshape(positions.shape[:-1])
+    for name, sigma in zip(_UNITS, table, strict=True):
+        spread = spread_over(sigma[:, 1:])
+        for case, of_case in zip(CASES, (sigma[:, 0], spread.median, spread.q95, spread.worst), strict=True):
+            values[f"sigma_{name}{case}"] = of_case.reshape(positions.shape[:-1])
     return values
 
 

@@ -6,7 +6,7 @@ docs/theory/cramer-rao-bounds.md.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,8 +17,6 @@ from magloc.bounds.crlb import check_uncertainty
 from magloc.bounds.sources import array_model, source_bounds
 from magloc.fields.multipole import assumed_body_lengths, check_body_length
 from magloc.levels import TYPICAL_AND_BAD
-
-_SOURCES_TOGETHER = 250_000  # places times moments that are computed at once
 
 
 class Spread(NamedTuple):
@@ -59,52 +57,15 @@ def bounds_over_moments(
 
     The other parameters are those of :func:`magloc.bounds.crlb.cramer_rao_bounds`.
     """
-    none = np.empty((0, 3))
-    uncertain: dict[str, Any] = {
-        "ambient_uncertainty_T": ambient_uncertainty_T,
-        "known_moment_sigma_Am2": known_moment_sigma_Am2,
-        "body_length_m": body_length_m,
-    }
-    return table_and_spreads(array, positions_m, none, moments_Am2, **uncertain)[1]
-
-
-def table_and_spreads(
-    array: SensorArray,
-    positions_m: ArrayLike,
-    alone_Am2: ArrayLike,
-    moments_Am2: ArrayLike,
-    *,
-    ambient_uncertainty_T: float = 0.0,
-    known_moment_sigma_Am2: float = np.inf,
-    body_length_m: float | None = 0.0,
-) -> tuple[SigmaTable, MomentBounds]:
-    """:func:`sigma_table` (P, K) of some moments and :func:`bounds_over_moments` (P,) of others, in one pass."""
-    positions, alone = _rows("positions_m", positions_m, least=1), _rows("alone_Am2", alone_Am2)
-    moments = _rows("moments_Am2", moments_Am2, least=0 if len(alone) else 1)
-    check_uncertainty(ambient_uncertainty_T, known_moment_sigma_Am2)
-    check_body_length(body_length_m)
-    lengths = assumed_body_lengths(array.positions, positions, array.circumradius, body_length_m)
-    table = np.empty((3, len(positions), len(alone)))
-    spreads = np.full((len(Spread._fields), 3, len(positions)), np.nan)
-    together = np.concatenate([alone, moments])
-    # Bodies have so many nuisances that points are not to pay for them.
-    for is_body in (False, True):
-        (places,) = np.nonzero((lengths > 0.0) == is_body)
-        model = array_model(
-            array,
-            ambient_uncertainty_T=ambient_uncertainty_T,
-            known_moment_sigma_Am2=known_moment_sigma_Am2,
-            bodies=is_body,
-        )
-        n_together = max(1, _SOURCES_TOGETHER // len(together))
-        for first in range(0, places.size, n_together):
-            of = places[first : first + n_together]
-            length_m = lengths[of] if is_body else None
-            sigma = source_bounds(model, array.positions, positions[of], together, length_m=length_m)
-            table[:, of] = sigma[..., : len(alone)]
-            if len(moments):
-                spreads[..., of] = spread_over(sigma[..., len(alone) :])
-    return SigmaTable(*table), MomentBounds(*(Spread(*spreads[:, i]) for i in range(3)))
+    table = sigma_table(
+        array,
+        positions_m,
+        moments_Am2,
+        ambient_uncertainty_T=ambient_uncertainty_T,
+        known_moment_sigma_Am2=known_moment_sigma_Am2,
+        body_length_m=body_length_m,
+    )
+    return MomentBounds(*map(spread_over, table))
 
 
 def sigma_table(
@@ -120,13 +81,25 @@ def sigma_table(
 
     Infinite where the information is singular, NaN for a source on a sensor or in the centroid.
     """
-    moments, none = _rows("moments_Am2", moments_Am2, least=1), np.empty((0, 3))
-    uncertain: dict[str, Any] = {
-        "ambient_uncertainty_T": ambient_uncertainty_T,
-        "known_moment_sigma_Am2": known_moment_sigma_Am2,
-        "body_length_m": body_length_m,
-    }
-    return table_and_spreads(array, positions_m, moments, none, **uncertain)[0]
+    positions, moments = _rows("positions_m", positions_m), _rows("moments_Am2", moments_Am2)
+    check_uncertainty(ambient_uncertainty_T, known_moment_sigma_Am2)
+    check_body_length(body_length_m)
+    lengths = assumed_body_lengths(array.positions, positions, array.circumradius, body_length_m)
+    table = np.empty((3, len(positions), len(moments)))
+    # Bodies have so many nuisances that points are not to pay for them.
+    for is_body in (False, True):
+        (places,) = np.nonzero((lengths > 0.0) == is_body)
+        if not places.size:
+            continue
+        model = array_model(
+            array,
+            ambient_uncertainty_T=ambient_uncertainty_T,
+            known_moment_sigma_Am2=known_moment_sigma_Am2,
+            bodies=is_body,
+        )
+        length_m = lengths[places] if is_body else None
+        table[:, places] = source_bounds(model, array.positions, positions[places], moments, length_m=length_m)
+    return SigmaTable(*table)
 
 
 def spread_over(sigma: ArrayLike) -> Spread:
@@ -138,9 +111,8 @@ def spread_over(sigma: ArrayLike) -> Spread:
     return Spread(ordered.mean(axis=-1), median + blank, q95 + blank, ordered[..., -1])
 
 
-def _rows(name: str, values: ArrayLike, least: int = 0) -> FloatArray:
+def _rows(name: str, values: ArrayLike) -> FloatArray:
     rows = np.ascontiguousarray(values, dtype=np.float64)
-    if rows.ndim != 2 or rows.shape[1] != 3 or len(rows) < least:
-        shape = "(n, 3), n at least 1" if least else "(n, 3)"
-        raise ValueError(f"Input {name} must have shape {shape}; instead received {rows.shape}.")
+    if rows.ndim != 2 or rows.shape[1] != 3 or not len(rows):
+        raise ValueError(f"Input {name} must have shape (n, 3), n at least 1; instead received {rows.shape}.")
     return rows

@@ -22,10 +22,11 @@ from arrays.typing import BoolArray, FloatArray
 from magloc.calibration import continuation as calibration_steps
 from magloc.calibration import least_squares as source_fit
 from magloc.calibration import model as moving_source
-from magloc.calibration.least_squares import Optimum
+from magloc.calibration.least_squares import Fit
 from magloc.calibration.model import AXES, GAINS, OFFSET, PER_SENSOR, POSITION, MomentModel, Problem
 from magloc.calibration.observability import unobservable
 from magloc.calibration.results import SourceCalibration
+from magloc.least_squares import Optimum
 from magloc.localization.locator import Locator
 from magloc.measurement.rows import checked_rows
 
@@ -232,9 +233,9 @@ def _check_counts(problem: Problem) -> None:
         )
 
 
-def _result(problem: Problem, fitted: tuple[Problem, Optimum], rows: BoolArray) -> SourceCalibration:
+def _result(problem: Problem, fitted: tuple[Problem, Optimum[Fit]], rows: BoolArray) -> SourceCalibration:
     problem, optimum = fitted
-    state = optimum.state
+    state = optimum.point.state
     nominal = replace(problem, free=np.zeros_like(problem.free))
     untouched = replace(state, sensors=np.zeros_like(state.sensors))
     before = source_fit.minimised(nominal, untouched, max_iterations=_ITERATIONS_BEFORE)
@@ -257,7 +258,7 @@ def _result(problem: Problem, fitted: tuple[Problem, Optimum], rows: BoolArray) 
         converged=optimum.converged,
         iterations=optimum.iterations,
         rows=rows,
-        chi2_before=moving_source.chi2(nominal, before.state),
+        chi2_before=moving_source.chi2(nominal, before.point.state),
         chi2=after,
         dof_before=_n_readings(problem) - problem.n_globals,
         dof=_n_readings(problem) - problem.n_globals - told_numbers,

@@ -17,8 +17,9 @@ from arrays.sensor import Calibration
 from arrays.typing import BoolArray, FloatArray
 from magloc.calibration import least_squares as source_fit
 from magloc.calibration import model as moving_source
-from magloc.calibration.least_squares import Optimum
+from magloc.calibration.least_squares import Fit
 from magloc.calibration.model import GAINS, OFFSET, POSITION, Problem, State
+from magloc.least_squares import Optimum
 from magloc.localization.fit.results import Fix
 from magloc.localization.locator import Locator
 
@@ -56,7 +57,7 @@ def source_on_path(problem: Problem, start: State) -> State:
     starts = [replace(start, height_m=centre + float(offset)) for offset in offsets]
     optima = [source_fit.minimised(linear, s, max_iterations=20) for s in starts]
     # A height at which the path runs through a sensor has no cost.
-    return min(optima, key=lambda optimum: np.nan_to_num(optimum.cost, nan=np.inf)).state
+    return min(optima, key=lambda optimum: np.nan_to_num(optimum.point.cost, nan=np.inf)).point.state
 
 
 def untouched(problem: Problem, position_m: FloatArray, moment_Am2: FloatArray) -> State:
@@ -129,26 +130,26 @@ def approached(problem: Problem, state: State, shares: Sequence[float] = SHARES)
         optimum = source_fit.minimised(lenient, state, tolerance=_ROUGHLY)
         if problem.unknown_position:
             optimum = _mended(lenient, optimum, share)
-        state = optimum.state
+        state = optimum.point.state
     return state
 
 
-def _mended(problem: Problem, optimum: Optimum, share: float) -> Optimum:
+def _mended(problem: Problem, optimum: Optimum[Fit], share: float) -> Optimum[Fit]:
     """The optimum with badly fitted rows looked for again: on the wrong side of the array they never come back."""
-    chi2 = np.sum(moving_source.residuals(problem, optimum.state) ** 2, axis=1)
+    chi2 = np.sum(moving_source.residuals(problem, optimum.point.state) ** 2, axis=1)
     bad = chi2 > _BADLY * np.median(chi2)
     if not bad.any():
         return optimum
-    again = looked_for_again(problem, optimum.state, bad, share)
+    again = looked_for_again(problem, optimum.point.state, bad, share)
     other = source_fit.minimised(problem, again, tolerance=_ROUGHLY)
-    return other if other.cost < optimum.cost else optimum
+    return other if other.point.cost < optimum.point.cost else optimum
 
 
-def fitted(problem: Problem, start: State) -> tuple[Problem, Optimum]:
+def fitted(problem: Problem, start: State) -> tuple[Problem, Optimum[Fit]]:
     """The optimum, and the problem with the noise that belongs to it."""
     state = approached(problem, start)
     for _ in range(_NOISE_PASSES if problem.array.noise_fractions.any() else 1):
         problem = doubted(problem, state, 0.0)
         optimum = source_fit.minimised(problem, state)
-        state = optimum.state
+        state = optimum.point.state
     return problem, optimum

@@ -7,18 +7,17 @@ the sensors and of the source alone.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from arrays.typing import FloatArray
 from magloc.calibration.model import PER_SENSOR, Linearisation, Problem, State, common_weight, cost, linearised
+from magloc.least_squares import Optimum, damped_step, minimise
 
 # Enough to hold what no reading shows, too little to be taken for information.
-_NO_DAMPING = 1e-20
-_LEAST_DAMPING = 1e-10
-_FIRST_DAMPING = 1e-3
-_LARGEST_DAMPING = 1e12
+_NO_DAMPING, _LAST_DAMPING = 1e-20, 1e-2
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,24 +39,6 @@ class Reduced:
     by_row: FloatArray
     row_gradient: FloatArray
     row_factor: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class Optimum:
-    """Where the iteration ended.
-
-    Attributes
-    ----------
-    cost : float
-        χ² of the readings and of all priors.
-    converged : bool
-        Whether a full step would lower the cost by less than the tolerance.
-    """
-
-    state: State
-    cost: float
-    iterations: int
-    converged: bool
 
 
 def reduced(problem: Problem, state: State, linear: Linearisation, damping: float = _NO_DAMPING) -> Reduced:
@@ -109,47 +90,42 @@ def information_of_sensors(problem: Problem, state: State) -> FloatArray:
     return information[:n, :n] - cross @ np.linalg.pinv(own, hermitian=True) @ cross.T
 
 
-def minimised(
-    problem: Problem,
-    start: State,
-    *,
-    tolerance: float = 1e-3,
-    max_iterations: int = 100,
-) -> Optimum:
-    """Levenberg-Marquardt until a full step promises to lower χ² by less than the tolerance or a part in 10¹⁰."""
-    state, value = start, cost(problem, start)
-    n_free = int(problem.free.sum())
-    # The priors of the sensors' unknowns, which are counted in prior deviations; the source has none.
-    prior = np.diag((np.arange(n_free + problem.n_globals) < n_free).astype(np.float64))
-    damping = _FIRST_DAMPING
-    for iteration in range(1, max_iterations + 1):
-        linear = linearised(problem, state)
-        while True:
-            equations = reduced(problem, state, linear, damping)
-            gradient = equations.gradient.copy()
-            gradient[:n_free] += (state.sensors / problem.prior)[problem.free]
-            information = equations.information + prior
-            size = np.maximum(np.diagonal(information), np.finfo(np.float64).tiny)
-            step = -np.asarray(np.linalg.solve(information + np.diag(damping * size), gradient), dtype=np.float64)
-            promised = float(-gradient @ step + np.sum(equations.row_gradient**2))
-            # No step goes farther than the prior: the field is far from linear in the positions.
-            step /= max(1.0, float(np.abs(step[:n_free]).max(initial=0.0)))
-            of_rows = row_step(equations, step)
-            candidate = moved(problem, state, step, of_rows)
-            with np.errstate(over="ignore", invalid="ignore"):
-                candidate_value = cost(problem, candidate)
-            if candidate_value <= value or promised <= tolerance:
-                break
-            damping *= 8.0
-            if damping > _LARGEST_DAMPING:
-                return Optimum(state, value, iteration, False)
-        decrease = value - candidate_value
-        if decrease >= 0.0:
-            state, value = candidate, candidate_value
-        if damping <= 1e-2 and (promised <= tolerance or decrease <= 1e-10 * value):
-            return Optimum(state, value, iteration, True)
-        damping = max(damping / 8.0, _LEAST_DAMPING)
-    return Optimum(state, value, max_iterations, False)
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A state of a problem, as an iterate of :func:`magloc.least_squares.minimise`."""
+
+    problem: Problem
+    state: State
+
+    @cached_property
+    def cost(self) -> float:
+        """χ² of the readings and of all priors."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            return cost(self.problem, self.state)
+
+    @cached_property
+    def _linear(self) -> Linearisation:
+        return linearised(self.problem, self.state)
+
+    def step(self, damping: float) -> tuple[Fit, float]:
+        """The state after a damped step; the unknowns of the rows are damped, too."""
+        problem, state = self.problem, self.state
+        equations = reduced(problem, state, self._linear, damping)
+        # The priors of the sensors' unknowns, which are counted in prior deviations; the source has none.
+        n_free = int(problem.free.sum())
+        information, gradient = equations.information.copy(), equations.gradient.copy()
+        information[range(n_free), range(n_free)] += 1.0
+        gradient[:n_free] += (state.sensors / problem.prior)[problem.free]
+        step, promised = damped_step(information, gradient, damping)
+        # No step goes farther than the prior: the field is far from linear in the positions.
+        step /= max(1.0, float(np.abs(step[:n_free]).max(initial=0.0)))
+        trial = replace(self, state=moved(problem, state, step, row_step(equations, step)))
+        return trial, promised + float(np.sum(equations.row_gradient**2))
+
+
+def minimised(problem: Problem, start: State, *, tolerance: float = 1e-3, max_iterations: int = 100) -> Optimum[Fit]:
+    """Levenberg-Marquardt until a step promises to lower χ² by less than the tolerance."""
+    return minimise(Fit(problem, start), lambda _: tolerance, last_damping=_LAST_DAMPING, max_iterations=max_iterations)
 
 
 def moved(problem: Problem, state: State, step: FloatArray, of_rows: FloatArray) -> State:

@@ -9,6 +9,7 @@ the relation to TWOSTEP.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -20,14 +21,13 @@ from arrays.io.errors import check_positive
 from arrays.io.values import fields
 from arrays.sensor import Calibration
 from arrays.typing import FloatArray
+from magloc.least_squares import minimise
 from magloc.levels import MISFIT
 from magloc.measurement.rows import checked_rows
 
 N_PARAMETERS = 9
 """Three of the offset, six of the symmetric scale matrix."""
 _ROW, _COLUMN = np.array([0, 1, 2, 0, 0, 1]), np.array([0, 1, 2, 1, 2, 2])
-_MAX_ITERATIONS = 100
-_LARGEST_DAMPING = 1e12
 # A step that changes the fit by less than this, in standard deviations or relative to the rounding of the readings.
 _SETTLED = 1e-9
 _SETTLED_RTOL = 1e-13
@@ -94,11 +94,28 @@ class _Problem:
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
+    problem: _Problem
     offset: FloatArray
     scale: FloatArray
     residual: FloatArray
     jacobian: FloatArray
-    chi2: float
+    cost: float
+
+    @cached_property
+    def _factors(self) -> tuple[FloatArray, FloatArray]:
+        return np.linalg.qr(self.jacobian)
+
+    def moved(self, step: FloatArray) -> _Fit:
+        """The fit after a step (9,) of offset and scale."""
+        return _linearised(self.problem, self.offset + step[:3], self.scale + symmetric(step[3:]))
+
+    def step(self, damping: float) -> tuple[_Fit, float]:
+        """By orthogonal transformations: normal equations would square the condition of a poor coverage."""
+        q, triangle = self._factors
+        weights = np.diag(np.sqrt(damping) * np.linalg.norm(triangle, axis=0))
+        right = np.concatenate([q.T @ self.residual, np.zeros(N_PARAMETERS)])
+        step = -np.linalg.lstsq(np.concatenate([triangle, weights]), right, rcond=None)[0]
+        return self.moved(step), float(np.sum((triangle @ step) ** 2))
 
 
 def ellipsoid_calibration(readings_T: ArrayLike, modulus_T: ArrayLike, noise_T: float) -> EllipsoidCalibration:
@@ -118,9 +135,11 @@ def ellipsoid_calibration(readings_T: ArrayLike, modulus_T: ArrayLike, noise_T: 
     if unit == 0.0:
         return _failure("all readings are the same", len(readings), 0)
     problem = _Problem((readings - centre) / unit, modulus / field_unit, noise_T / unit)
-    fits = [_minimised(problem, offset, scale) for offset, scale in _starts(problem)]
-    fit, iterations, converged = min(fits, key=lambda fit: (not fit[2], fit[0].chi2))
-    if not converged:
+    least = max(_SETTLED, _SETTLED_RTOL * np.sqrt(len(readings)) / problem.noise) ** 2
+    optima = [minimise(_linearised(problem, *start), lambda _: least) for start in _starts(problem)]
+    best = min(optima, key=lambda optimum: (not optimum.converged, optimum.point.cost))
+    fit, iterations = best.point, best.iterations
+    if not best.converged:
         return _failure("the iteration did not converge", len(readings), iterations)
     if problem.noise > _LARGEST_NOISE * _least_radius_of_curvature(problem, fit):
         return _failure("the noise is not small against the ellipsoid's radii of curvature", len(readings), iterations)
@@ -133,7 +152,7 @@ def ellipsoid_calibration(readings_T: ArrayLike, modulus_T: ArrayLike, noise_T: 
         scale=fit.scale * (unit / field_unit),
         offset_T=centre + unit * fit.offset,
         covariance=root @ root.T,
-        chi2=fit.chi2,
+        chi2=fit.cost,
         dof=len(readings) - N_PARAMETERS,
         iterations=iterations,
         converged=True,
@@ -237,35 +256,11 @@ def _starts(problem: _Problem) -> list[tuple[FloatArray, FloatArray]]:
     return starts
 
 
-def _minimised(problem: _Problem, offset: FloatArray, scale: FloatArray) -> tuple[_Fit, int, bool]:
-    """Damped Gauss-Newton on the squared distances."""
-    fit = _linearised(problem, offset, scale)
-    rounding = _SETTLED_RTOL * np.sqrt(len(problem.readings)) / problem.noise
-    damping = 1e-3
-    for iteration in range(1, _MAX_ITERATIONS + 1):
-        q, triangle = np.linalg.qr(fit.jacobian)
-        right = np.concatenate([q.T @ fit.residual, np.zeros(N_PARAMETERS)])
-        weights = np.diag(np.linalg.norm(triangle, axis=0))
-        while True:
-            # By orthogonal transformations, because normal equations would square the condition of a poor coverage.
-            step = -np.linalg.lstsq(np.concatenate([triangle, np.sqrt(damping) * weights]), right, rcond=None)[0]
-            trial = _linearised(problem, fit.offset + step[:3], fit.scale + symmetric(step[3:]))
-            settled = float(np.linalg.norm(fit.jacobian @ step)) <= max(_SETTLED, rounding)
-            if trial.chi2 <= fit.chi2 or settled or damping > _LARGEST_DAMPING:
-                break
-            damping = max(10.0 * damping, 1e-6)
-        if trial.chi2 <= fit.chi2:
-            fit, damping = trial, 0.0 if damping < 1e-9 else 0.1 * damping
-        if settled or damping > _LARGEST_DAMPING:
-            return fit, iteration, bool(settled)
-    return fit, _MAX_ITERATIONS, False
-
-
 def _linearised(problem: _Problem, offset: FloatArray, scale: FloatArray) -> _Fit:
     """Distances over the noise, bias removed, and their derivatives by (offset, P); χ² is infinite without P > 0."""
     size, axes = np.linalg.eigh(scale)
     if size[0] <= 0.0:
-        return _Fit(offset, scale, np.empty(0), np.empty((0, N_PARAMETERS)), np.inf)
+        return _Fit(problem, offset, scale, np.empty(0), np.empty((0, N_PARAMETERS)), np.inf)
     semi_axes = problem.modulus[:, None] * size
     points = (problem.readings - offset) @ axes
     nearest = _nearest(points, semi_axes)
@@ -285,7 +280,7 @@ def _linearised(problem: _Problem, offset: FloatArray, scale: FloatArray) -> _Fi
         normal[:, _ROW] * moved[:, _COLUMN] + normal[:, _COLUMN] * moved[:, _ROW],
     )
     jacobian = -np.concatenate([normal, by_scale], axis=1) / problem.noise
-    return _Fit(offset, scale, residual, jacobian, float(residual @ residual))
+    return _Fit(problem, offset, scale, residual, jacobian, float(residual @ residual))
 
 
 def _nearest(points: FloatArray, semi_axes: FloatArray) -> FloatArray:
@@ -329,7 +324,7 @@ def _root_covariance(problem: _Problem, fit: _Fit) -> FloatArray | None:
     for deviations in (-2.0, 2.0):
         # χ² must rise by four there, or the uncertainty is bent and no covariance describes it.
         step = deviations * root[:, -1]
-        rise = _linearised(problem, fit.offset + step[:3], fit.scale + symmetric(step[3:])).chi2 - fit.chi2
+        rise = fit.moved(step).cost - fit.cost
         if not 4.0 / _LARGEST_BEND < rise < 4.0 * _LARGEST_BEND:
             return None
     return root

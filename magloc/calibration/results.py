@@ -4,23 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from arrays.array import SensorArray
-from arrays.io.lazy import by_name
+from arrays.io.results import Drawn
 from arrays.typing import BoolArray, FloatArray
 from magloc.calibration.modulus import EllipsoidCalibration
 from magloc.calibration.observability import Unobservable
 from magloc.fields import dipole
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Calibration:
+class Calibration(Drawn):
     """A calibrated array, and how far it can be trusted.
 
     Attributes
@@ -51,6 +47,8 @@ class Calibration:
     (True, 1.02)
     """
 
+    figure = "magloc.plots.calibrations:calibration"
+
     nominal: SensorArray
     array: SensorArray
     converged: bool
@@ -59,10 +57,6 @@ class Calibration:
     chi2: float
     dof: float
     unobservable: tuple[Unobservable, ...]
-
-    def plot(self) -> Figure:
-        """What is left of the readings before and after, and what the calibration changes."""
-        return by_name("magloc.plots.calibrations:calibration")(self)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

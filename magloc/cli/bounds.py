@@ -11,12 +11,10 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 import magloc
-from arrays.io.arguments import Flag, whole_number
 from arrays.io.errors import InputError, naming, own_sentence
-from arrays.io.outputs import refuse_file
-from arrays.io.text import write_netcdf
+from arrays.io.outputs import refuse_file, write_file
 from arrays.typing import Vector
-from magloc.cli.framework import CommonOptions, print_json, progress
+from magloc.cli.framework import CommonOptions, Flag, print_json, progress, whole_number
 from magloc.cli.options import Grid, array_of_several, naming_options, print_note, refuse_not_positive
 
 if TYPE_CHECKING:
@@ -323,15 +321,15 @@ def _pictures(
     spheres = bound_spheres(task, np.union1d(ranges, [range_m]).tolist(), _STEP_DEG)
     if detector is not None:
         spheres = with_detection_ranges(spheres, task, detector, probability)
-    write_netcdf(slices, folder / "slices.nc")
-    write_netcdf(spheres, folder / "spheres.nc")
-    figures = {
+    files = {
+        "slices.nc": slices,
+        "spheres.nc": spheres,
         "bounds-slices.png": magloc.plots.bound_slices(slices, task),
         "bounds-sphere.png": magloc.plots.bound_sphere(spheres, task, range_m),
         "bounds-reach.png": magloc.plots.bound_reach(spheres, task),
     }
-    for name, figure in figures.items():
-        magloc.plots.write(figure, folder / name)
+    for name, content in files.items():
+        write_file(content, folder / name)
     if gif:
         frames = spheres.sel(range=ranges)
         with progress(_FRAMES, "pictures", quiet=quiet) as advance:

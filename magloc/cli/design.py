@@ -14,10 +14,9 @@ from cyclopts.validators import Number
 
 import arrays
 import magloc
-from arrays.io.arguments import Flag, whole_number
 from arrays.io.errors import naming
 from arrays.io.outputs import refuse_one_for_two, refuse_unwritable
-from magloc.cli.framework import CommonOptions, print_json, progress
+from magloc.cli.framework import CommonOptions, Flag, print_json, progress, whole_number
 from magloc.cli.options import print_note
 
 Sensors = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=1, lte=1000))]

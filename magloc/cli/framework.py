@@ -21,10 +21,11 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
-from cyclopts import App, CycloptsError, MissingArgumentError, Parameter, UnknownCommandError
+from cyclopts import App, CycloptsError, MissingArgumentError, Parameter, Token, UnknownCommandError
+from cyclopts.validators import Number
 
-from arrays.io.arguments import Count, Flag, Seed
 from arrays.io.errors import PACKAGES, InputError
 from arrays.io.outputs import make_folder
 from magloc.cli.entry import INTERRUPTED
@@ -41,6 +42,24 @@ _warnings: list[str] = []
 _ENDLESS = {"live", "view"}
 _FIRST_SIGN_S = 10.0
 _bars: list[object] = []
+_TOO_LARGE = 10**18
+
+
+def whole_number(_: type, tokens: Sequence[Token]) -> int:
+    """Convert one argument; cyclopts alone would round 1.5, and pass what no float or int64 can hold."""
+    try:
+        number = int(tokens[0].value)
+        if abs(number) < _TOO_LARGE:
+            return number
+    except ValueError:
+        pass
+    raise ValueError(f"found {tokens[0].value!r}, expected a whole number of at most 18 digits.")
+
+
+Flag = Annotated[bool, Parameter(show_default=False)]
+# Ten million of anything would never end.
+Count = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=1, lt=10_000_000))]
+Seed = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=0))]
 
 
 @Parameter(name="*", group="Common options")

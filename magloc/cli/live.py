@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from arrays.io.arguments import Flag
 from arrays.io.errors import LARGEST, InputError, naming
 from arrays.io.outputs import refuse_unwritable
-from magloc.cli.framework import QuietOptions
+from magloc.cli.framework import Flag, QuietOptions
 from magloc.cli.options import STREAM, KnownOptions, MotionOptions, Port, naming_options, naming_place, print_note
 
 if TYPE_CHECKING:

@@ -12,11 +12,10 @@ from typing import TYPE_CHECKING, Literal
 from cyclopts import Parameter
 
 import magloc
-from arrays.io.arguments import Flag
 from arrays.io.errors import InputError, own_sentence
 from arrays.io.outputs import refuse_file
 from arrays.typing import Vector
-from magloc.cli.framework import CommonOptions, print_json_list, progress
+from magloc.cli.framework import CommonOptions, Flag, print_json_list, progress
 from magloc.cli.options import KnownOptions, ambient_field, number_of_sources, print_note
 
 if TYPE_CHECKING:
@@ -123,8 +122,7 @@ def locate(
         raise InputError(f"--position: found it together with {other}, expected one of them.")
     if truth is not None and out is None:
         raise InputError("--truth: found no --out, expected a folder for the figures with it.")
-    if out is not None:
-        refuse_file(out, "--out")
+    refuse_file(out, "--out")
     used = known.array(array)
     rows = magloc.read_readings(readings, used, sensors=known.ids, still=wanted.average)
     if position is not None:

@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import magloc
-from arrays.io.arguments import Flag
 from arrays.io.errors import InputError, naming
 from arrays.io.outputs import refuse_file
 from arrays.io.text import write_netcdf
-from magloc.cli.framework import CommonOptions, print_result, progress
+from magloc.cli.framework import CommonOptions, Flag, print_result, progress
 from magloc.cli.options import Grid, naming_options, naming_scheduler, print_note
 
 if TYPE_CHECKING:

@@ -16,13 +16,13 @@ from cyclopts.validators import Number
 
 import arrays
 import magloc
-from arrays.io.arguments import whole_number
 from arrays.io.errors import LARGEST, InputError, naming
 from arrays.io.outputs import refuse_unwritable
 from arrays.io.text import write_text
 from arrays.typing import Vector
 from magloc.ambient import Place
 from magloc.cli import framework
+from magloc.cli.framework import whole_number
 
 if TYPE_CHECKING:
     import numpy as np

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
 import arrays
 import magloc
-from arrays.io.arguments import Flag
 from arrays.io.errors import InputError, naming
-from arrays.io.outputs import make_folder, refuse_file, refuse_one_for_two, refuse_unwritable
-from magloc.cli.framework import CommonOptions, print_report
+from arrays.io.outputs import refuse_file, refuse_one_for_two, refuse_unwritable, write_files
+from magloc.cli.framework import CommonOptions, Flag, print_report
 from magloc.cli.options import (
     KnownOptions,
     MapOptions,
@@ -104,8 +104,7 @@ def survey(
         Common options.
     """
     maps.refuse(known.place)
-    if out is not None:
-        refuse_file(out, "--out")
+    refuse_file(out, "--out")
     refuse_one_for_two({"--out": out, "--html": html, **maps.outputs})
     if html is not None:
         refuse_unwritable(html, "--html")
@@ -137,8 +136,7 @@ def survey(
             progress=None if common.quiet or json else print_note,
         )
     maps.write(found, known.place)
-    if out is not None:
-        _write(found, out)
+    write_files(out, _files(found))
     if html is not None:
         magloc.view(None, found, html=html, title="survey")
     if json:
@@ -155,18 +153,13 @@ def survey(
         print_note(f"nothing is stated of the pose's errors: as the rows show them{size}")
 
 
-def _write(found: Survey, folder: Path) -> None:
-    """targets.csv, residual.csv, reach.csv, the map, and the lines past the targets."""
-    from arrays.io.csv import write_columns
-    from magloc.plots import save
+def _files(found: Survey) -> Iterator[tuple[str, Any]]:
+    """Yield targets.csv, residual.csv, reach.csv, the map, and the lines past the targets."""
     from magloc.plots.profiles import survey_profiles
-    from magloc.plots.surveys import survey_figure
-    from magloc.surveying.files import columns_of_survey, reach_columns, residual_columns
+    from magloc.surveying.files import reach_columns, residual_columns
 
-    make_folder(folder, "--out")
-    write_columns(columns_of_survey(found), folder / "targets.csv")
-    write_columns(residual_columns(found), folder / "residual.csv")
-    write_columns(reach_columns(found), folder / "reach.csv")
-    save(survey_figure(found), folder / "survey.png")
-    save(survey_profiles(found), folder / "profiles.png")
-    print_note(f"wrote targets.csv, residual.csv, reach.csv, survey.png and profiles.png into {folder}/")
+    yield "targets.csv", found.columns()
+    yield "residual.csv", residual_columns(found)
+    yield "reach.csv", reach_columns(found)
+    yield "survey.png", found.plot()
+    yield "profiles.png", survey_profiles(found)

@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal  # noqa: F401 - of an 
 from cyclopts import Parameter
 
 import magloc
-from arrays.io.arguments import Flag
 from arrays.io.errors import InputError, naming
-from arrays.io.outputs import refuse_file, refuse_one_for_two
+from arrays.io.outputs import refuse_file, refuse_one_for_two, write_files
 from arrays.typing import Vector
-from magloc.cli.framework import CommonOptions, print_json_list, print_report, progress
+from magloc.cli.framework import CommonOptions, Flag, print_json_list, print_report, progress
 from magloc.cli.moments.known_path import (
     PathErrorOptions,
     TrackOutputs,
@@ -203,8 +202,7 @@ def track(
     """
     if json and jsonl:
         raise InputError("--json: found it together with --jsonl, expected one of them.")
-    if out is not None:
-        refuse_file(out, "--out")
+    refuse_file(out, "--out")
     refuse_one_for_two({"--out": out, **maps.outputs})
     maps.refuse(known.place)
     outputs = TrackOutputs(json, jsonl, maps, out, truth, common.quiet)
@@ -327,9 +325,7 @@ def _write_sources(found: SourcesTrack, name: str, outputs: TrackOutputs, *, sin
     if not found.ids:
         raise _no_track(name, {point.status for point in found})
     if outputs.out is not None:
-        from magloc.plots.tracks import write_sources
-
-        write_sources(found, outputs.out)
+        write_files(outputs.out, [("track.png", found.plot()), ("track.csv", found.columns())])
     is_table = not (outputs.json or outputs.jsonl)
     if is_table:
         print(found.table())

@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Parameter
 
 import arrays
-from arrays.io.arguments import Flag
 from arrays.io.errors import InputError, naming
-from magloc.cli.framework import CommonOptions, progress
+from magloc.cli.framework import CommonOptions, Flag, progress
 from magloc.cli.options import STREAM, Port, naming_outputs, print_note
 
 if TYPE_CHECKING:

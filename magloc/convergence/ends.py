@@ -1,6 +1,6 @@
 """Ends of filters from many starts, by compiled kernels.
 
-The filters of :mod:`magloc.convergence.filters` are the reference; docs/theory/lanes.md says how the kernels differ.
+The tests have readable filters, the reference; docs/theory/lanes.md says how the kernels differ.
 """
 
 from __future__ import annotations

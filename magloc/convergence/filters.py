@@ -12,14 +12,11 @@ from arrays.typing import FloatArray
 from magloc.convergence.ends import DAMPED, ITERATED, RELINEARISED, REPEATED, Ends, ScaledDifferences, ends
 from magloc.localization.search.single_source import SingleSourceSearch
 from magloc.measurement.differences import DifferenceMeasurement
-from magloc.state_space import IteratedUpdate, iterated_update, predict, update
 
 # χ² above the maximum-likelihood χ² within which a stop counts as having reached it.
 CHI2_REACHED = 0.05
 # Distance from the maximum-likelihood position that a filter with a prior may keep.
 PRIOR_REACHED_M = 0.5
-# A step that lowers the cost divides the damping, any other multiplies it.
-DAMPING_DECREASE, DAMPING_INCREASE = 5.0, 4.0
 _PASS_S = 4e-8
 
 
@@ -133,7 +130,7 @@ class RepeatedFilter(_LikelihoodFilter):
         return np.repeat([self.position_step_m, self.moment_step_Am2], 3)
 
     def run(self, measurement: DifferenceMeasurement, z: FloatArray, starts: FloatArray) -> Ends:
-        """End of every start (n, 6), compiled; :meth:`run_one` is the readable twin."""
+        """End of every start (n, 6), compiled."""
         z, variance, sensors, weights = _inputs(measurement, z)
         inflation = self.noise_inflation
         each = self.relinearise_every_scalar
@@ -142,28 +139,6 @@ class RepeatedFilter(_LikelihoodFilter):
         method = RELINEARISED if each else REPEATED
         found = ends(method, differences, starts, self.tolerance_T, self.max_iterations)
         return found._replace(chi2=inflation * found.chi2)
-
-    def run_one(self, measurement: DifferenceMeasurement, z: FloatArray, start: FloatArray) -> IteratedUpdate:
-        """End of one start (6,), by the square-root filter of :mod:`magloc.state_space`."""
-        sigma = np.sqrt(self.noise_inflation * measurement.variance)
-        x, S, S_q = start, np.diag(self.s_q), np.diag(self.s_q)
-        predicted = measurement.predicted(x[:3], x[3:])
-        innovation = z - predicted
-        for iteration in range(1, self.max_iterations + 1):
-            S = predict(S, np.eye(6), S_q)
-            if self.relinearise_every_scalar:
-                for j in range(z.size):
-                    nu = z[j] - measurement.predicted(x[:3], x[3:])[j]
-                    h = measurement.jacobian(x[:3], x[3:])[j]
-                    x, S, _ = update(x, S, h[None] / sigma[j], nu[None] / sigma[j])
-            else:
-                H = measurement.jacobian(x[:3], x[3:])
-                x, S, _ = update(x, S, H / sigma[:, None], (z - predicted) / sigma)
-            predicted, before = measurement.predicted(x[:3], x[3:]), predicted
-            change = float(np.linalg.norm(predicted - before))
-            if not np.isfinite(change) or change < self.tolerance_T:
-                return IteratedUpdate(x, S, iteration, change < self.tolerance_T, innovation, np.nan)
-        return IteratedUpdate(x, S, self.max_iterations, False, innovation, np.nan)
 
 
 @dataclass(frozen=True)
@@ -188,22 +163,9 @@ class IekfFilter(_PriorFilter):
     device: str = "cpu"
 
     def run(self, measurement: DifferenceMeasurement, z: FloatArray, starts: FloatArray) -> Ends:
-        """End of every start (n, 6), compiled; :meth:`run_one` is the readable twin."""
+        """End of every start (n, 6), compiled."""
         differences = ScaledDifferences.of(*_inputs(measurement, z), self.position_sigma_m, self.moment_sigma_Am2)
         return ends(ITERATED, differences, starts, self.tolerance_T, self.max_iterations)
-
-    def run_one(self, measurement: DifferenceMeasurement, z: FloatArray, start: FloatArray) -> IteratedUpdate:
-        """End of one start (6,), by :func:`magloc.state_space.iterated_update`."""
-        return iterated_update(
-            start,
-            np.diag(self.s_0),
-            z,
-            measurement.variance,
-            lambda x: measurement.predicted(x[:3], x[3:]),
-            lambda x: measurement.jacobian(x[:3], x[3:]),
-            tolerance=self.tolerance_T,
-            max_iterations=self.max_iterations,
-        )
 
 
 @dataclass(frozen=True)
@@ -241,44 +203,9 @@ class DampedFilter(_PriorFilter):
     device: str = "cpu"
 
     def run(self, measurement: DifferenceMeasurement, z: FloatArray, starts: FloatArray) -> Ends:
-        """End of every start (n, 6), compiled; :meth:`run_one` is the readable twin."""
+        """End of every start (n, 6), compiled."""
         differences = ScaledDifferences.of(*_inputs(measurement, z), self.position_sigma_m, self.moment_sigma_Am2)
         return ends(DAMPED, differences, starts, self.tolerance_T, self.max_iterations, self.first_damping)
-
-    def run_one(self, measurement: DifferenceMeasurement, z: FloatArray, start: FloatArray) -> IteratedUpdate:
-        """End of one start (6,), in units of the standard deviations of readings and prior."""
-        sigma = np.sqrt(measurement.variance)
-
-        def linearised(x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-            """Predicted differences; residuals of readings and prior, and minus their Jacobian."""
-            predicted = measurement.predicted(x[:3], x[3:])
-            residual = np.concatenate([(z - predicted) / sigma, (start - x) / self.s_0])
-            jacobian = measurement.jacobian(x[:3], x[3:]) * self.s_0 / sigma[:, None]
-            return predicted, residual, np.concatenate([jacobian, np.eye(6)])
-
-        x, damping, kept = start, self.first_damping, self.first_damping
-        predicted, residual, J = linearised(x)
-        innovation = z - predicted
-        iteration, ended = 0, False
-        while not ended:
-            iteration += 1
-            # The normal equations of M + λ diag M, without M: its diagonal is the columns' square norm.
-            Q, R = np.linalg.qr(np.concatenate([J, np.diag(np.sqrt(damping) * np.linalg.norm(J, axis=0))]))
-            trial = x + self.s_0 * np.linalg.solve(R, Q[: residual.size].T @ residual)
-            at_trial = linearised(trial)
-            change = float(np.linalg.norm(at_trial[0] - predicted))
-            small = change < self.tolerance_T
-            stopped = small and damping == 0.0
-            if at_trial[1] @ at_trial[1] < residual @ residual:
-                x, kept = trial, kept / DAMPING_DECREASE
-                predicted, residual, J = at_trial
-            else:
-                kept *= DAMPING_INCREASE
-            # Damping alone can make a step small: the stop rule is left to the step without it.
-            damping = 0.0 if small else kept
-            ended = stopped or iteration >= self.max_iterations or not np.all(np.isfinite(residual))
-        S: FloatArray = self.s_0[:, None] * np.linalg.inv(np.linalg.qr(J, mode="r"))
-        return IteratedUpdate(x, S, iteration, stopped, innovation, np.nan)
 
 
 @dataclass(frozen=True)

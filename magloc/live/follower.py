@@ -28,7 +28,8 @@ from magloc.readings import EXPECTED_HEADER, Readings, log_format, without_satur
 from magloc.tracking.motion import MotionModel, RandomWalk
 from magloc.tracking.multi_target.motion import FreeMotion
 from magloc.tracking.multi_target.tracker import SourcesTracker
-from magloc.tracking.results import Row, SourcesPoint, TrackPoint, rows_of, warn_of_strengths
+from magloc.tracking.results import SourcesPoint, TrackPoint, warn_of_strengths
+from magloc.tracking.rows import Row, rows_of
 from magloc.tracking.settled import MOST_AT_ONCE
 from magloc.tracking.track import SPEED_M_S, TURN_RAD_S
 from magloc.tracking.tracker import Tracker

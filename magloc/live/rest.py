@@ -17,7 +17,7 @@ from arrays.array import SensorArray
 from arrays.io.errors import InputError, check_positive
 from arrays.typing import FloatArray
 from magloc.readings import Readings, without_saturated
-from magloc.tracking.results import Row, rows_of
+from magloc.tracking.rows import Row, rows_of
 
 _LOG = logging.getLogger(__name__)
 _OUTLIER = 5.0

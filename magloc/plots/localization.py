@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,22 +11,16 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from arrays.array import SensorArray
-from arrays.io.csv import Column
-from arrays.io.outputs import make_folder
-from magloc.chi_square import square_columns
+from arrays.io.outputs import write_files
+from magloc.localization.fit.export import FixColumns, columns_of_fixes, distances_from_truth, fix_columns
 from magloc.localization.fit.fixes import Fixes
-from magloc.localization.fit.results import is_observable, spans
 from magloc.localization.residuals import fix_residuals
 from magloc.plots import style
-from magloc.plots.style import write
 from magloc.readings import Readings
-from magloc.truth import state_columns
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 from arrays.typing import FloatArray
-
-_LOG = logging.getLogger(__name__)
 
 
 def fixes(
@@ -95,29 +87,15 @@ def write_pictures(
     folder: Path,
 ) -> None:
     """Write fixes.png and residuals.png, and the data behind them as fixes.csv and residuals.csv."""
-    make_folder(folder, "--out")
     left = _residuals_of(array, rows, fixes, ambient_T)
-    found = fix_columns(fixes)
-    columns: dict[str, Column] = {"time_s": found.time_s, "source": found.source}
-    columns |= state_columns(found.position_m, found.moment_Am2, found.covariance)
-    columns |= square_columns("chi2", found.chi2, found.dof)
-    columns |= {"range95_low_m": found.range95_m[:, 0], "range95_high_m": found.range95_m[:, 1]}
-    columns["range_observable"] = found.range_observable
-    if truth_m is not None:
-        columns |= style.truth_columns(truth_m[found.row])
-        columns["error_m"] = distances_from_truth(found, truth_m)
-    columns |= {name: getattr(fixes, name)[found.row] for name in ("detected", "misfit", "too_near", "body_length_m")}
-    columns["dropped_sensors"] = [" ".join(fixes.dropped_sensors[row]) for row in found.row]
-    columns["reason"] = [fixes.reason[row] for row in found.row]
-    columns["body_factor"] = fixes.body_factor[found.row]
-    write(fix_figure(found, _sensors_of(fixes, array, rows), truth_m), folder / "fixes.png", columns)
     names = (f"{name}_residual_sigmas" for name in array.channel_names)
-    write(
-        residual_figure(left, array.channel_names, array.ids, array.channel_sensor),
-        folder / "residuals.png",
-        {"time_s": rows.time_s, **dict(zip(names, left.T, strict=True))},
-    )
-    _LOG.info(f"wrote fixes.png, fixes.csv, residuals.png and residuals.csv into {folder}/")
+    files = {
+        "fixes.png": fix_figure(fix_columns(fixes), _sensors_of(fixes, array, rows), truth_m),
+        "fixes.csv": columns_of_fixes(fixes, truth_m),
+        "residuals.png": residual_figure(left, array.channel_names, array.ids, array.channel_sensor),
+        "residuals.csv": {"time_s": rows.time_s, **dict(zip(names, left.T, strict=True))},
+    }
+    write_files(folder, files.items())
 
 
 def _residuals_of(array: SensorArray, rows: Readings, fixes: Fixes, ambient_T: FloatArray | None) -> FloatArray:
@@ -142,82 +120,6 @@ _OPEN = 3.0
 # Quantiles of the boxes: half and nine tenths of the rows; of a normal distribution in σ.
 _HALF, _MOST = (0.25, 0.75), (0.05, 0.95)
 _MOST_OF_NOISE = 1.6448536269514722
-
-
-@dataclass(frozen=True, eq=False)
-class FixColumns:
-    """Sources of the best solutions of all rows, k of them; NaN where a row has none.
-
-    Attributes
-    ----------
-    row : ndarray of int, shape (k,)
-        Which row a source belongs to.
-    source : ndarray of int, shape (k,)
-        Its number in the row, from 1; 0 where a row has no solution.
-    time_s, chi2 : ndarray, shape (k,)
-    dof : ndarray of int, shape (k,)
-    position_m, moment_Am2 : ndarray, shape (k, 3)
-    covariance : ndarray, shape (k, 6, 6)
-        Of (position, moment); zero for a position that is known beforehand.
-    range_observable : ndarray of bool, shape (k,)
-    range95_m : ndarray, shape (k, 2)
-        Least and largest distance from the sensors' centroid within the 95 % interval; infinite where it is open.
-    """
-
-    row: NDArray[np.intp]
-    source: NDArray[np.intp]
-    time_s: FloatArray
-    chi2: FloatArray
-    dof: NDArray[np.int64]
-    position_m: FloatArray
-    moment_Am2: FloatArray
-    covariance: FloatArray
-    range_observable: NDArray[np.bool_]
-    range95_m: FloatArray
-
-    @property
-    def first(self) -> NDArray[np.bool_]:
-        """One source of every row, for what belongs to the row."""
-        return self.source <= 1
-
-
-def fix_columns(fixes: Fixes) -> FixColumns:
-    """Sources of the best solutions of all rows."""
-    columns, best = fixes.solutions, fixes.best
-    number = np.where(fixes.solved, columns.n_sources[best] if len(columns) else 0, 1)
-    row = np.repeat(np.arange(len(fixes)), number)
-    solved = fixes.solved[row]
-    place = np.arange(len(row)) - np.repeat(np.cumsum(number) - number, number)
-    at = best[row][solved], place[solved]
-    n = len(row)
-    position, moment, intervals = np.full((n, 3), np.nan), np.full((n, 3), np.nan), np.full((n, 2), np.nan)
-    covariance = np.full((n, 6, 6), np.nan)
-    position[solved], moment[solved] = columns.position_m[at], columns.moment_Am2[at]
-    of_source = columns.covariance_of_source[at]
-    n_known = 6 - of_source.shape[1]  # a position that is known is exact
-    covariance[solved] = 0.0
-    covariance[solved, n_known:, n_known:] = of_source
-    intervals[solved] = spans(columns.ranges[at])
-    return FixColumns(
-        row=row,
-        source=np.where(solved, place + 1, 0),
-        time_s=fixes.time_s[row],
-        chi2=fixes.chi2[row],
-        dof=fixes.dof[row],
-        position_m=position,
-        moment_Am2=moment,
-        covariance=covariance,
-        range_observable=is_observable(*intervals.T),
-        range95_m=intervals,
-    )
-
-
-def distances_from_truth(columns: FixColumns, truth_m: FloatArray) -> FloatArray:
-    """Distance of every source from the truth (n, 3) of its row, in the coordinates that are known of it (k,) [m]."""
-    offset = columns.position_m - truth_m[columns.row]
-    known = np.isfinite(truth_m[columns.row])
-    distance = np.sqrt(np.where(known, offset**2, 0.0).sum(axis=1))
-    return np.where(known.any(axis=1), distance, np.nan)
 
 
 def fix_figure(columns: FixColumns, sensors_m: FloatArray, truth_m: FloatArray | None = None) -> Figure:

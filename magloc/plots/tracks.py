@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,22 +9,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.figure import Figure
 
-from arrays.io.csv import Column, write_columns
-from arrays.io.outputs import make_folder
+from arrays.io.outputs import write_files
 from arrays.typing import FloatArray, IntArray
 from magloc.chi_square import square_columns
 from magloc.plots import style
-from magloc.plots.style import save
 from magloc.tracking.files import columns_of_track, states_of
 from magloc.tracking.results import TrackPoint, TrackResult, on_track, stacked
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
-
-    from magloc.tracking.multi_target.track import SourcesTrack
-
-_LOG = logging.getLogger(__name__)
 
 
 def write_picture(
@@ -53,25 +46,10 @@ def write_picture(
     if bound_m is not None:
         columns["bound_m"] = bound_m
     figures = {
-        "track": track_figure(points, truth_m, array_m),
-        "consistency": consistency_figure(points, truth_m, nees, bound_m),
+        "track.png": track_figure(points, truth_m, array_m),
+        "consistency.png": consistency_figure(points, truth_m, nees, bound_m),
     }
-    _write(folder, figures, columns | {"status": status})
-
-
-def write_sources(found: SourcesTrack, folder: Path) -> None:
-    """Write track.png, as :func:`sources_figure`, and track.csv with a row for every source in every row."""
-    known = [track for point in found for track in point.tracks]
-    _write(folder, {"track": found.plot()}, columns_of_track(known, ids=[track.id for track in known]))
-
-
-def _write(folder: Path, figures: Mapping[str, Figure], columns: Mapping[str, Column]) -> None:
-    """Write figures by name and track.csv into a folder, which is made if it is not there."""
-    make_folder(folder, "--out")
-    write_columns(columns, folder / "track.csv")
-    for name, figure in figures.items():
-        save(figure, folder / f"{name}.png")
-    _LOG.info(f"wrote {', '.join(f'{name}.png' for name in figures)} and track.csv into {folder}/")
+    write_files(folder, [*figures.items(), ("track.csv", columns | {"status": status})])
 
 
 # Least and largest height of the plan, and its width [in].

@@ -146,7 +146,7 @@ class MomentModel:
         H = np.zeros((row.z.size, x.size))
         for k, J in enumerate(self.sources_of_state(i, x)):
             others_T = np.delete(fields_T, k, axis=0).sum(axis=0) if fields_T else None
-            H += row.source_jacobian(sources[k], others_T) @ J
+            H += row.along(sources[k], J, others_T)
         H[:, self.moment.stop :] = row.effect
         return H
 

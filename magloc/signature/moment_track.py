@@ -32,7 +32,8 @@ from magloc.state_space import estimability
 from magloc.tracking.consistency import consistency_lines, mean_nis, root_mean
 from magloc.tracking.measurement import RowMeasurements
 from magloc.tracking.motion import N_SOURCE
-from magloc.tracking.results import TrackPoint, rows_of, warn_of_strengths
+from magloc.tracking.results import TrackPoint, warn_of_strengths
+from magloc.tracking.rows import rows_of
 from magloc.tracking.track import TURN_RAD_S, TrackColumns
 from magloc.truth import Truth, truth_of_rows
 

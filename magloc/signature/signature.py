@@ -14,15 +14,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from html import escape
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from arrays.array import SensorArray
+from arrays.io.csv import Column
 from arrays.io.errors import InputError
-from arrays.io.lazy import by_name
+from arrays.io.results import Result
 from arrays.typing import FloatArray
 from magloc.fields import dipole
 from magloc.localization.fit.results import is_misfit
@@ -32,9 +32,6 @@ from magloc.signature.files import lines_of_signature
 from magloc.signature.moment_filter import Basis, settled
 from magloc.signature.moment_track import EXACT, goodness, known_rows, moment_model, turning_basis
 from magloc.signature.path import ObjectPath, PathError
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 Induced = Literal["none", "diagonal", "symmetric"]
 AXES = {"none": (), "diagonal": ("xx", "yy", "zz"), "symmetric": ("xx", "yy", "zz", "yz", "xz", "xy")}
@@ -111,7 +108,7 @@ def _indices(induced: Induced) -> list[tuple[int, int]]:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Signature:
+class Signature(Result):
     """Permanent, induced and eddy-current moment of an object, with what is not known of them.
 
     Attributes
@@ -144,6 +141,11 @@ class Signature:
     >>> signature.undetermined
     ('permanent z against induced zz',)
     """
+
+    figure = "magloc.plots.signatures:signature_figure"
+    command = "signature"
+    dimension = "parameter"
+    frame = "forward, left, up"
 
     components: Components
     parameters_Am2: FloatArray
@@ -194,10 +196,6 @@ class Signature:
     def misfit(self) -> bool:
         """Whether no such moment on these paths explains the readings: χ² is beyond noise by one in a million."""
         return bool(is_misfit(self.chi2, self.dof))
-
-    def plot(self) -> Figure:
-        """Its parts with 95 % intervals, and the moment over the heading."""
-        return by_name("magloc.plots.signatures:signature_figure")(self)
 
     def moment(self, heading_deg: ArrayLike, ambient_T: ArrayLike | None = None) -> tuple[FloatArray, FloatArray]:
         """Moment on a level keel and a steady course, and its covariance.
@@ -252,15 +250,13 @@ class Signature:
         M = self.components.moment_matrix(flat, field_body, np.zeros_like(field_body))
         return M.reshape(*R.shape[:-1], -1)
 
-    def table(self) -> str:
-        """The table that ``magloc signature`` prints."""
-        return "\n".join(lines_of_signature(self))
+    def lines(self, most: int | None = None) -> list[str]:
+        """Return the lines of the table, which is never long."""
+        return lines_of_signature(self)
 
-    def __repr__(self) -> str:
-        return self.table()
-
-    def _repr_html_(self) -> str:
-        return f"<pre>{escape(repr(self))}</pre>"
+    def columns(self) -> dict[str, Column]:
+        """Return the parameters and their standard deviations, NaN where they are not determined."""
+        return {"part": list(self.names), "moment_Am2": self.determined, "sigma_Am2": self.sigma_Am2}
 
 
 @np.errstate(over="ignore", divide="ignore", invalid="ignore")

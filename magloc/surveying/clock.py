@@ -124,8 +124,8 @@ def trial(piece_at: Callable[[float], Piece], lag_s: float, start: Sources | Non
     model = piece.model()
     group = piece.groups(model.record, WHILE_SEARCHING * model.nearest_m)
     fit, background = model.refitted(start, group)
-    cost = fit.chi2 + background.noise_log_determinant + model.threshold * len(fit.sources)
-    return Trial(lag_s, fit.sources, cost, fit.chi2 / fit.residual.size)
+    cost = fit.cost + background.noise_log_determinant + model.threshold * len(fit.sources)
+    return Trial(lag_s, fit.sources, cost, fit.cost / fit.residual.size)
 
 
 @dataclass(frozen=True, eq=False)

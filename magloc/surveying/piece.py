@@ -195,6 +195,6 @@ def targets_in(piece: Piece) -> Arrays:
         "reach_Am2": moments,
         **targets_of(model, fit, background, groups, piece.ground.ground_m, which),
         **{name: values[own] for name, values in zip(OF_ROWS, lines, strict=True)},
-        "chi2": np.array(fit.chi2),
+        "chi2": np.array(fit.cost),
         "size": np.array(fit.residual.size),
     }

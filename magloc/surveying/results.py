@@ -6,19 +6,17 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple, overload
+from typing import Any, NamedTuple, overload
 
 import numpy as np
 from scipy.special import chdtri
 
 from arrays.array import SensorArray
-from arrays.io.lazy import by_name
+from arrays.io.csv import Column
+from arrays.io.results import Result
 from arrays.io.tables import aligned, by_sigma
 from arrays.typing import FloatArray, Vector
 from magloc.localization.fit.table import cells_of_strength
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 IRON_Am2_PER_KG = (0.05, 0.3)
 """Moment of a kilogram of iron in the ground: a range, as its remanence and shape are not known."""
@@ -117,7 +115,7 @@ class Reach(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Survey:
+class Survey(Result):
     """What a survey found.
 
     Attributes
@@ -154,6 +152,11 @@ class Survey:
     Survey: 3 targets, 1921 rows
     """
 
+    figure = "magloc.plots.surveys:survey_figure"
+    command = "survey"
+    dimension = "target"
+    frame = "world"
+
     targets: tuple[Target, ...]
     array: SensorArray
     rows: SurveyRows
@@ -186,9 +189,11 @@ class Survey:
         """Positions of all targets (K, 3)."""
         return np.array([target.position_m for target in self]).reshape(-1, 3)
 
-    def plot(self) -> Figure:
-        """The anomaly from above, what the targets leave of it, and the targets."""
-        return by_name("magloc.plots.surveys:survey_figure")(self)
+    def columns(self) -> dict[str, Column]:
+        """Return the columns of targets.csv."""
+        from magloc.surveying.files import columns_of_survey
+
+        return columns_of_survey(self)
 
     def to_geojson(self, place: Vector) -> dict[str, Any]:
         """A FeatureCollection with a point for every target, as RFC 7946 has it.
@@ -208,13 +213,13 @@ class Survey:
 
         return kml_of_survey(self, place)
 
-    def table(self) -> str:
-        """The targets as text."""
+    def lines(self, most: int | None = None) -> list[str]:
+        """Return the lines of the table, of at most `most` targets."""
         rows = [
             ["id", "x", "y", "depth", "95 %", "|m|", "± xy", "χ²", "flags"],
             ["", "m", "m", "m", "m", "A·m²", "cm", "", ""],
         ]
-        for t in self:
+        for t in self[:most]:
             sigma = np.sqrt(np.diagonal(t.covariance)).tolist()
             x, y, depth, *interval = (
                 by_sigma(float(value), s)[0]
@@ -226,4 +231,4 @@ class Survey:
             across = f"{100.0 * t.ellipse95[0]:.2g}"
             size = [strength, across, f"{t.significance:.4g}"]
             rows.append([t.id, x, y, depth, "–".join(interval), *size, ", ".join(t.flags)])
-        return "\n".join(aligned(rows))
+        return aligned(rows)

@@ -11,7 +11,7 @@ import numpy as np
 
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.measurement.pose import PoseErrors
-from magloc.surveying.fit.joint_fit import Background, Bounds, JointFit, Layer, Sources, fit_jointly, residual_of
+from magloc.surveying.fit.joint_fit import Background, Bounds, JointFit, Layer, Sources, fit_jointly
 from magloc.surveying.fit.record import SurveyRecord
 from magloc.surveying.fit.whitening import Drift
 from magloc.surveying.search import Candidates, SearchGrid, peaks, search, sources_at
@@ -74,11 +74,7 @@ class Model:
     def misfit(self, sources: Sources, group: IntArray) -> float:
         """Minus twice the log-likelihood of some sources, but for a constant; the ground is Gaussian."""
         background = self.background(sources, group)
-        fields = sources.fields(self.record)
-        residual = residual_of(self.record, background, fields)
-        of_layer = background.Q.T @ residual
-        square = float(residual @ residual - of_layer @ of_layer)
-        return square + background.noise_log_determinant
+        return JointFit(self.record, background, self.bounds, sources).cost + background.noise_log_determinant
 
     def _around(self, sources: Sources) -> Bounds:
         """Bounds within which sources stay what they are: one that leaps takes the place of one not found yet."""
@@ -194,16 +190,16 @@ def found_in(
     for number in range(most):
         fit, background = wide.fitted(sources, group, _SETTLED_COARSELY)
         at_once = _MOST_AT_ONCE
-        if fit.chi2 > _WORSE * least:
+        if fit.cost > _WORSE * least:
             # Too many at a time led away: back, and one by one from there.
             fit, background = wide.fitted(best, group, _SETTLED_COARSELY)
             at_once = 1
-        elif fit.chi2 < min(_PROGRESS * least, least - model.threshold):
+        elif fit.cost < min(_PROGRESS * least, least - model.threshold):
             tried, in_vain = np.zeros((0, 3)), 0
         in_vain += 1
-        if in_vain > (_MOST_OF_MISFITS if fit.chi2 > _MISFIT * fit.residual.size else _MOST_IN_VAIN):
+        if in_vain > (_MOST_OF_MISFITS if fit.cost > _MISFIT * fit.residual.size else _MOST_IN_VAIN):
             break
-        best, least = fit.sources, min(least, fit.chi2)
+        best, least = fit.sources, min(least, fit.cost)
         if number == most - 1:
             break
         candidates = searched.again(fit.sources, background)

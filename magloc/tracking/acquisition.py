@@ -21,9 +21,10 @@ from magloc.measurement.nuisances import SensorErrors, ambient_in_array, with_ed
 from magloc.measurement.pose import PoseErrors
 from magloc.state_space import predict, symmetric_square_root, update
 from magloc.tracking.chart.known_moment import KnownInWorld
-from magloc.tracking.measurement import RowMeasurement, RowMeasurements
+from magloc.tracking.measurement import RowMeasurement, RowMeasurements, step_of_errors
 from magloc.tracking.motion import N_SOURCE, MotionModel
-from magloc.tracking.results import Prediction, Row
+from magloc.tracking.results import Prediction
+from magloc.tracking.rows import Row
 
 START_RANGE_ERROR = 0.03
 """Standard deviation of the range over the range that a start may have: beyond it the posterior is no Gaussian in
@@ -167,9 +168,9 @@ class CartesianFilter:
     measurements : RowMeasurements
         What rows say of the state.
     errors : SensorErrors
-        The lasting errors of the array's sensors, whose states follow those of the motion.
+        The lasting errors of the array's sensors: the last states.
     pose_errors : PoseErrors
-        Those of its pose, behind them.
+        Those of its pose, between the states of the motion and them.
     """
 
     prior: SourcePrior
@@ -184,24 +185,19 @@ class CartesianFilter:
 
     @property
     def n_errors(self) -> int:
-        """States behind those of the motion: errors of sensors and of the pose."""
+        """States behind those of the motion: errors of the pose and of sensors."""
         return self.errors.n_states + self.pose_errors.n_states
 
     @property
     def error_sigma(self) -> FloatArray:
         """Their standard deviations before anything is known (n_errors,)."""
-        return np.concatenate([self.errors.sigma, np.ones(self.pose_errors.n_states)])
-
-    def error_step(self, dt_s: float) -> tuple[FloatArray, FloatArray]:
-        """Return the share of each error that a step keeps, and the σ that it adds: (n_errors,) each."""
-        of_sensors, of_pose = self.errors.step(dt_s), self.pose_errors.step(dt_s)
-        return np.concatenate([of_sensors[0], of_pose[0]]), np.concatenate([of_sensors[1], of_pose[1]])
+        return np.concatenate([np.ones(self.pose_errors.n_states), self.errors.sigma])
 
     def predicted(self, x: FloatArray, S: FloatArray, dt_s: float) -> Prediction:
         """State, square root of its covariance and transition after a step without readings."""
         n, n_errors = self.motion.n_states, self.n_errors
         moved, F_motion, S_q_motion = self.motion.step(x[:n], dt_s)
-        kept, added = self.error_step(dt_s)
+        kept, added = step_of_errors(self.pose_errors, self.errors, dt_s)
         noisy = np.flatnonzero(added)
         F, S_q = np.zeros((n + n_errors,) * 2), np.zeros((n + n_errors, S_q_motion.shape[1] + noisy.size))
         F[:n, :n], S_q[:n, : S_q_motion.shape[1]] = F_motion, S_q_motion
@@ -238,7 +234,7 @@ class CartesianFilter:
         n, n_errors = self.motion.n_states, self.n_errors
         centres = [np.concatenate([source, np.zeros(n - N_SOURCE + n_errors)])] * len(rows)
         # Errors of the pose that change are linearised as each row knows them, everything else as all rows together.
-        own = np.concatenate([np.zeros(n + self.errors.n_states, dtype=bool), self.pose_errors.changes])
+        own = np.concatenate([np.full(n, False), self.pose_errors.changes, np.full(self.errors.n_states, False)])
         for _ in range(_MOST_START_STEPS):
             found = self.filtered_start(centres, covariance, measurements)
             step = (found.x - centres[-1])[:N_SOURCE]

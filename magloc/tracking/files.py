@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,6 +15,7 @@ from scipy.special import chdtri
 from arrays.io.closing import garbage_waits
 from arrays.io.csv import Column
 from arrays.io.errors import LARGEST, InputError
+from arrays.io.results import Quantity
 from arrays.io.tables import aligned, by_sigma
 from arrays.io.text import read_text
 from arrays.io.world_maps import feature, feature_collection, kml, placemark, world_place
@@ -24,13 +24,10 @@ from magloc.chi_square import square_columns
 from magloc.levels import FALSE_ALARM
 from magloc.localization.fit.table import cells_of_strength, cells_of_vector
 from magloc.tracking.results import SourcePoint, SourcesPoint, TrackPoint, TrackResult, stacked
-from magloc.truth import STATE_COLUMNS, state_columns
+from magloc.truth import STATE_COLUMNS, STATE_QUANTITIES, state_columns
 
 if TYPE_CHECKING:
-    import xarray as xr
-
     from magloc.tracking.consistency import Consistency
-    from magloc.tracking.track import TrackColumns
 
 _SAME_PLACE_M = 1e-9
 _RIVAL_KEYS = ("position_m", "moment_Am2", "chi2", "dof", "weight")
@@ -52,17 +49,15 @@ _READ: dict[str, tuple[Any, str]] = {
     "dropped_sensors": (list[str] | None, "a list of names"),
 }
 
-_COLUMNS = {
-    "position_m": (("axis",), "m", "position of the source"),
-    "moment_Am2": (("axis",), "A m2", "magnetic moment of the source"),
-    "covariance": (("component", "component_"), "m, A m2", "covariance of (position, moment)"),
-    "estimability": (("component",), "1", "estimability: 1 - sigma / sigma without any readings"),
-    "nis": ((), "1", "normalised innovation squared"),
-    "nis_dof": ((), "1", "degrees of freedom of nis"),
-    "weight": ((), "1", "probability that the track is the right one"),
-    "tracked": ((), "1", "whether the source is tracked"),
-    "status": ((), "1", "how the row was used, or why there is no track"),
+QUANTITIES = STATE_QUANTITIES | {
+    "estimability": Quantity("1", "estimability: 1 - sigma / sigma without any readings", ("component",)),
+    "nis": Quantity("1", "normalised innovation squared"),
+    "nis_dof": Quantity("1", "degrees of freedom of nis"),
+    "weight": Quantity("1", "probability that the track is the right one"),
+    "tracked": Quantity("1", "whether the source is tracked"),
+    "status": Quantity("1", "how the row was used, or why there is no track"),
 }
+"""Variables of :meth:`magloc.tracking.track.TrackColumns.to_xarray`."""
 
 
 def lines_of_track(points: Sequence[TrackPoint | SourcesPoint], *, most: int | None = None) -> list[str]:
@@ -240,19 +235,6 @@ def _placemark(name: str, point: TrackPoint, origin: Vector) -> str:
 def _known(point: TrackPoint) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return position, moment and standard deviations (6,) of a row with a source."""
     return np.asarray(point.position_m), np.asarray(point.moment_Am2), np.sqrt(np.diagonal(point.covariance))  # type: ignore[arg-type]
-
-
-def dataset_of_track(track: TrackColumns) -> xr.Dataset:
-    """Return a track as a dataset, see :meth:`magloc.tracking.track.TrackColumns.to_xarray`."""
-    import xarray as xr
-
-    dataset = xr.Dataset(coords={"time_s": ("row", track.time_s), "axis": list("xyz")})
-    for name, (dimensions, unit, words) in _COLUMNS.items():
-        attributes = {"units": unit, "long_name": words}
-        dataset[name] = (("row", *dimensions), np.asarray(getattr(track, name)), attributes)
-    dataset["time_s"].attrs = {"units": "s", "long_name": "time"}
-    dataset.attrs = {"frame": track.frame, "source": f"magloc {metadata.version('magloc')}, track"}
-    return dataset
 
 
 @garbage_waits()

@@ -11,6 +11,7 @@ with the predicted differences h of the source in units of their noise, their Ja
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -20,13 +21,16 @@ from arrays.array import SensorArray
 from arrays.differences import Differences, decorrelated_differences
 from arrays.noise import reading_covariance
 from arrays.typing import FloatArray
+from magloc.chi_square import energy_threshold
 from magloc.fields import dipole
 from magloc.measurement.differences import DifferenceMeasurement
 from magloc.measurement.nuisances import Drift, SensorErrors, without_lasting_errors
-from magloc.measurement.pose import ArrayPose, PoseErrors
+from magloc.measurement.pose import N_POSE, ArrayPose, PoseErrors
 from magloc.state_space import MeasurementFunction
+from magloc.tracking.coordinates import Chart
 from magloc.tracking.motion import N_SOURCE
-from magloc.tracking.results import Row
+from magloc.tracking.row_filter import Rows
+from magloc.tracking.rows import Row
 
 LEAST_SINGULAR = 1e-6
 """A row has no coordinates of its own if a column of its Jacobian, in units of what is known, is so near to others."""
@@ -42,7 +46,10 @@ def whitening(effect: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class RowMeasurement:
-    """Differences of one row, in units of their noise, as a function of the state in the world frame.
+    """Differences of one row, in units of their noise, as a function of states (..., n) in the world frame.
+
+    A state is that of the motion, behind it errors of the pose and of the ambient field, and behind these the errors of
+    sensors, in which readings are linear. The first two are counted in a chart, where a prediction bends as a whole.
 
     Attributes
     ----------
@@ -52,7 +59,7 @@ class RowMeasurement:
         Standard deviations of the differences [T].
     row : Row
     n_motion : int
-        States of the motion; behind them stand the sensors' errors, then those of the pose.
+        States of the motion.
     effect : ndarray, shape (k, n_errors)
         Of the sensors' errors on the differences, in units of their noise.
     pose : ArrayPose
@@ -74,70 +81,143 @@ class RowMeasurement:
         """Measured differences, shape (k,)."""
         return self.model.measured(self.row.readings_T) / self.sigma
 
-    def pose_error(self, state: FloatArray) -> FloatArray | None:
-        """Error (12,) of the pose that a state (n,) stands for, None where none is stated."""
-        states = state[self.n_motion + self.effect.shape[1] :]
-        return self.pose_effect @ states if states.size else None
+    @property
+    def n_differences(self) -> int:
+        """Number of differences k."""
+        return self.sigma.size
 
-    def of_source(
-        self, source: FloatArray, error: FloatArray | None = None, others_T: FloatArray | None = None
-    ) -> FloatArray:
-        """Predicted differences (k,) of a source (6,) where the pose has an error (12,) and no sensor has any.
+    @property
+    def n_pose(self) -> int:
+        """Number of the pose's errors."""
+        return self.pose_effect.shape[1]
 
-        `others_T` (N, 3) is the field of other sources at the sensors.
-        """
-        in_array = self.pose.in_array(source, error)
-        return self.model.predicted(in_array[:3], in_array[3:], self._ambient_T(error, others_T)) / self.sigma
+    @property
+    def n_charted(self) -> int:
+        """States of the motion and errors of the pose."""
+        return self.n_motion + self.n_pose
 
-    def source_jacobian(self, source: FloatArray, others_T: FloatArray | None = None) -> FloatArray:
-        """Their Jacobian (k, 6) where the pose has no error."""
-        return self._by_source(self._by_array(self.pose.in_array(source), others_T=others_T))
+    @property
+    def n_states(self) -> int:
+        """Of the motion, of the errors of the pose and of those of the sensors."""
+        return self.n_charted + self.effect.shape[1]
+
+    @cached_property
+    def centroid_m(self) -> FloatArray:
+        """Of the sensors in the world frame, shape (3,)."""
+        return self.row.origin_m + self.row.R_world_from_array @ self.model.array.centroid
+
+    @property
+    def radius_m(self) -> float:
+        """Largest distance of a sensor from it."""
+        return self.model.array.circumradius
+
+    @cached_property
+    def compiled(self) -> Rows:
+        """The row as kernels take it."""
+        return stacked([self])
+
+    def chart(self, x: FloatArray) -> Chart:
+        """Return the charts about states (..., n_charted)."""
+        return Chart.at(x, self.centroid_m, self.radius_m, self.n_pose)
+
+    def padded(self, k: int) -> RowMeasurement:
+        """Return the row with k differences: those behind its own are zero, of unit noise, and see no source."""
+        more = k - self.n_differences
+        differences = Differences(
+            np.pad(self.model.differences.transform, ((0, more), (0, 0))),
+            np.pad(self.model.differences.variance, (0, more), constant_values=1.0),
+        )
+        padded = replace(
+            self,
+            model=replace(self.model, differences=differences),
+            sigma=np.pad(self.sigma, (0, more), constant_values=1.0),
+            effect=np.pad(self.effect, ((0, more), (0, 0))),
+        )
+        return padded if more else self
 
     def with_errors_as_noise(self, sigma: FloatArray) -> RowMeasurement:
-        """The row alone: the sensors' errors, known by their σ (n_errors,), are part of the differences' noise."""
-        lasting, k = self.effect * sigma, len(self.sigma)
-        whiten = whitening(lasting)
+        """Return the row alone: the sensors' errors, known by their σ (n_errors,), are part of its noise."""
+        if not sigma.size:
+            return self
+        whiten, k = whitening(self.effect * sigma), self.n_differences
         differences = Differences(whiten @ (self.model.differences.transform / self.sigma[:, None]), np.ones(k))
         model = replace(self.model, differences=differences)
         return replace(self, model=model, sigma=np.ones(k), effect=np.zeros((k, 0)))
 
+    def of_source(self, state: FloatArray, others_T: FloatArray | None = None) -> FloatArray:
+        """Return the predicted differences (..., k) of sources (..., 6) or states, sensors being without errors.
+
+        `others_T` (N, 3) is the field of other sources at the sensors.
+        """
+        error = self._pose_error(state)
+        in_array = self.pose.in_array(state[..., :N_SOURCE], error)
+        return self.model.predicted(in_array[..., :3], in_array[..., 3:], self._ambient_T(error, others_T)) / self.sigma
+
+    def along(self, state: FloatArray, directions: FloatArray, others_T: FloatArray | None = None) -> FloatArray:
+        """Return their derivative (..., k, m) along directions (..., n, m) in sources or states."""
+        error = self._pose_error(state)
+        in_array = self.pose.in_array(state[..., :N_SOURCE], error)
+        H = self.model.jacobian(in_array[..., :3], in_array[..., 3:], self._ambient_T(error, others_T))
+        H = H / self.sigma[:, None]
+        of_source = self._by_source(H, error) @ directions[..., :N_SOURCE, :]
+        if error is None:
+            return np.asarray(of_source)
+        of_pose = self._by_pose(H, in_array, error) @ directions[..., self.n_motion : self.n_charted, :]
+        return np.asarray(of_source + of_pose)
+
+    def moment_columns(self, position_m: FloatArray) -> FloatArray:
+        """Return the derivative (..., k, 3) of the differences by the moment of a weak source at (..., 3)."""
+        array, R = self.model.array, self.row.R_world_from_array
+        matrix = dipole.field_matrix(array.positions, ((position_m - self.row.origin_m) @ R)[..., None, :])
+        of_channels = self.model.differences.transform / self.sigma[:, None]
+        of_sensors = of_channels[:, :, None] * array.linear_gain(array.ambient_fields)
+        sensors = array.channel_sensor == np.arange(array.n_sensors)[:, None]
+        of_fields = (sensors @ of_sensors).reshape(self.n_differences, -1)
+        return np.asarray(of_fields @ matrix.reshape(*matrix.shape[:-3], -1, 3) @ R.T)
+
     def field_T(self, source: FloatArray) -> FloatArray:
-        """Field (N, 3) of a source (6,) at the sensors, in the array's axes, where the pose has no error."""
+        """Return the field (N, 3) of a source (6,) at the sensors, in the array's axes."""
         in_array = self.pose.in_array(source)
         return dipole.field(self.model.array.positions, in_array[:3], in_array[3:])
 
     def predicted(self, state: FloatArray) -> FloatArray:
-        """Predicted differences (k,) of a state (n,)."""
-        of_source = self.of_source(state[:N_SOURCE], self.pose_error(state))
-        return of_source + self.effect @ state[self.n_motion : self.n_motion + self.effect.shape[1]]
+        """Return the predicted differences (k,) of a state (n,) with its errors of sensors."""
+        return self.of_source(state) + self.effect @ state[self.n_charted :]
 
     def jacobian(self, state: FloatArray) -> FloatArray:
-        """Their Jacobian (k, n)."""
-        first, behind = self.n_motion, self.n_motion + self.effect.shape[1]
-        error = self.pose_error(state)
-        in_array = self.pose.in_array(state[:N_SOURCE], error)
-        H = self._by_array(in_array, error)
-        full = np.zeros((len(self.sigma), state.size))
-        full[:, :N_SOURCE] = self._by_source(H, error)
-        full[:, first:behind] = self.effect
-        if error is not None:
-            array, whiten = self.model.array, self.model.differences.transform / self.sigma[:, None]
-            by_error = H @ self.pose.error_jacobian(in_array, error)
-            by_error += whiten @ self.pose.ambient_jacobian(array, in_array, error, array.ambient_fields)
-            full[:, behind:] = by_error @ self.pose_effect
-        return full
-
-    @property
-    def n_states(self) -> int:
-        """Of the motion, of the sensors' errors and of those of the pose."""
-        return self.n_motion + self.effect.shape[1] + self.pose_effect.shape[1]
+        """Return their Jacobian (k, n)."""
+        return np.concatenate([self.along(state, np.eye(self.n_charted)), self.effect], axis=1)
 
     def without_errors(self, source: FloatArray) -> FloatArray:
-        """The state (n,) of a source (6,) at rest where nothing has an error."""
+        """Return the state (n,) of a source (6,) at rest where nothing has an error."""
         return np.concatenate([source, np.zeros(self.n_states - N_SOURCE)])
 
+    @cached_property
+    def without_source(self) -> FloatArray:
+        """What is left of the measured differences (k,) when the ambient field's own are taken out."""
+        array = self.model.array
+        ambient = array.readings_of(array.ambient_fields) - array.channel_offset_T
+        return self.z - (self.model.differences.transform @ ambient) / self.sigma
+
+    @cached_property
+    def whitening(self) -> FloatArray:
+        """``C^{-1/2}`` (k, k) of a row without a source: what its pose's errors make of the ambient field is noise."""
+        if not self.n_pose:
+            return np.eye(self.n_differences)
+        # Sources without a moment: what is left is the ambient field, turned by the pose's errors.
+        nowhere = self.pose.in_array(np.zeros(N_SOURCE))
+        return whitening(where_smooth(self._by_pose(np.zeros((len(self.sigma), N_SOURCE)), nowhere, np.zeros(N_POSE))))
+
+    def is_detected(self, sigma_errors: FloatArray) -> bool:
+        """Return whether the differences stand out of noise and of what errors of sensors and pose may make of them."""
+        if not self.z.size:
+            return False
+        alone = self.with_errors_as_noise(sigma_errors)
+        left = alone.whitening @ alone.without_source
+        return bool(left @ left > energy_threshold(left.size))
+
     def coordinates(self, state: FloatArray, unit: FloatArray, *, of_readings: bool = True) -> Coordinates:
-        """Coordinates about a state (n,), where `unit` (6,) is what is known of position and moment.
+        """Return coordinates about a state (n,), where `unit` (6,) is what is known of position and moment.
 
         They bend as the readings do, if these determine a source; else, or if not `of_readings`, as its place in the
         array's axes does with the errors of the pose.
@@ -154,7 +234,7 @@ class RowMeasurement:
         return Coordinates(state, self._in_array, self._in_array_jacobian, M, self._in_array(state), M @ G)
 
     def place_in_array(self, state: FloatArray, S: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Offset (3,) of the source from the sensors' centroid in the array's axes, and a square root (3, n) of its P.
+        """Return the offset (3,) of the source from the centroid in the array's axes, and a root (3, n) of its P.
 
         An error of the pose moves the source in the world, not from the array.
         """
@@ -162,39 +242,66 @@ class RowMeasurement:
 
     def _in_array(self, state: FloatArray) -> FloatArray:
         """Position and moment (6,) of a state in the true axes of the array."""
-        return self.pose.in_array(state[:N_SOURCE], self.pose_error(state))
+        return self.pose.in_array(state[:N_SOURCE], self._pose_error(state))
 
     def _in_array_jacobian(self, state: FloatArray) -> FloatArray:
         """Their Jacobian (6, n)."""
-        error = self.pose_error(state)
+        error = self._pose_error(state)
         full = np.zeros((N_SOURCE, state.size))
         full[:, :N_SOURCE] = self._by_source(np.eye(N_SOURCE), error)
         if error is not None:
-            behind = self.n_motion + self.effect.shape[1]
-            full[:, behind:] = self.pose.error_jacobian(self._in_array(state), error) @ self.pose_effect
+            of_errors = self.pose.error_jacobian(self._in_array(state), error)
+            full[:, self.n_motion : self.n_charted] = of_errors @ self.pose_effect
         return full
 
-    def _by_array(
-        self, in_array: FloatArray, error: FloatArray | None = None, others_T: FloatArray | None = None
-    ) -> FloatArray:
-        """Jacobian (k, 6) by a source in the array's axes."""
-        ambient_T = self._ambient_T(error, others_T)
-        return self.model.jacobian(in_array[:3], in_array[3:], ambient_T) / self.sigma[:, None]
+    def _pose_error(self, state: FloatArray) -> FloatArray | None:
+        """Errors (..., 12) of the pose that states stand for, None where they are of a source alone."""
+        if not self.n_pose or state.shape[-1] == N_SOURCE:
+            return None
+        return np.asarray(state[..., self.n_motion : self.n_charted] @ self.pose_effect.T)
 
-    def _by_source(self, H: FloatArray, error: FloatArray | None = None) -> FloatArray:
-        """That by a source of the world."""
-        R = self.pose.turned(error)
-        return (H.reshape(-1, 2, 3) @ R.T).reshape(-1, N_SOURCE)
+    def _by_source(self, H: FloatArray, error: FloatArray | None) -> FloatArray:
+        """Jacobian (..., k, 6) by sources of the world, from that by sources in the array's axes."""
+        RT = np.swapaxes(self.pose.turned(error), -1, -2)
+        return np.concatenate([H[..., :3] @ RT, H[..., 3:] @ RT], axis=-1)
 
-    def _ambient_T(self, error: FloatArray | None, others_T: FloatArray | None = None) -> FloatArray | None:
-        """Field at the sensors (N, 3) besides the source's where the pose and that field have an error.
+    def _by_pose(self, H: FloatArray, in_array: FloatArray, error: FloatArray) -> FloatArray:
+        """Jacobian (..., k, n_pose) by the pose's errors."""
+        array, whiten = self.model.array, self.model.differences.transform / self.sigma[:, None]
+        by_error = H @ self.pose.error_jacobian(in_array, error)
+        by_error += whiten @ self.pose.ambient_jacobian(array, in_array, error, array.ambient_fields)
+        return np.asarray(by_error @ self.pose_effect)
 
-        None: the array's own ambient field, unturned.
-        """
+    def _ambient_T(self, error: FloatArray | None, others_T: FloatArray | None) -> FloatArray | None:
+        """Fields at the sensors (..., N, 3) besides the sources'; None: the array's own ambient field, unturned."""
         if error is None:
             return None if others_T is None else self.model.array.ambient_fields + others_T
         ambient_T = self.pose.ambient(self.model.array.ambient_fields, error)
         return ambient_T if others_T is None else ambient_T + others_T
+
+
+def stacked(rows: Sequence[RowMeasurement]) -> Rows:
+    """Return rows of one array as kernels take them."""
+    k = max(row.n_differences for row in rows)
+    padded = [row.padded(k) for row in rows]
+    return Rows(
+        rows[0].model.array,
+        np.stack([row.z for row in padded]),
+        np.array([row.n_differences for row in rows]),
+        np.stack([row.model.differences.transform / row.sigma[:, None] for row in padded]),
+        np.arange(len(rows)),
+        np.stack([row.effect for row in padded]),
+        np.stack([row.row.origin_m for row in rows]),
+        np.stack([row.row.R_world_from_array for row in rows]),
+        np.stack([row.model.array.ambient_fields for row in rows]),
+        np.stack([row.pose_effect for row in rows]) if rows[0].n_pose else None,
+        tuple(rows[0].pose.lever_arm_m.tolist()),
+    )
+
+
+def where_smooth(derivative: FloatArray) -> FloatArray:
+    """Zero in place of NaN: differences of moduli in no ambient field, which have a corner where the source is none."""
+    return np.where(np.isnan(derivative), 0.0, derivative)
 
 
 class RowMeasurements:
@@ -211,9 +318,9 @@ class RowMeasurements:
     Attributes
     ----------
     errors : SensorErrors
-        The lasting errors of the array's sensors, and the background.
+        The lasting errors of the array's sensors, and the background: the last states.
     pose_errors : PoseErrors
-        Those of its pose and of the ambient field, behind them.
+        Those of its pose and of the ambient field, before them.
     """
 
     def __init__(self, array: SensorArray, n_motion: int, background: Drift | None = None) -> None:
@@ -279,3 +386,10 @@ class Coordinates:
         if np.array_equal(state, self.centre):
             return np.zeros(N_SOURCE), self.J
         return self.M @ (self.function(state) - self.value), self.M @ self.jacobian(state)
+
+
+def step_of_errors(pose_errors: PoseErrors, errors: SensorErrors, dt_s: float) -> tuple[FloatArray, FloatArray]:
+    """Return the share of each error of pose and sensors that a step keeps, and the σ that it adds: (n,) each."""
+    of_errors = zip(pose_errors.step(dt_s), errors.step(dt_s), strict=True)
+    kept, added = (np.concatenate(parts) for parts in of_errors)
+    return kept, added

@@ -8,14 +8,15 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
-from html import escape
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from arrays.array import SensorArray
+from arrays.io.csv import Column
 from arrays.io.lazy import by_name
+from arrays.io.results import Result
 from arrays.typing import BoolArray, FloatArray, IntArray, Vector
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import EVERYWHERE, Intervals
@@ -23,22 +24,21 @@ from magloc.measurement.nuisances import Drift
 from magloc.measurement.plausibility import usable_readings
 from magloc.measurement.pose import with_stated_pose
 from magloc.readings import Readings
-from magloc.tracking.consistency import Consistency, consistency
-from magloc.tracking.files import dataset_of_track, geojson_of_track, kml_of_track, lines_of_track
-from magloc.tracking.innovations import InnovationTest, innovation_test
+from magloc.tracking.consistency import Consistency, InnovationTest, consistency, innovation_test
+from magloc.tracking.files import QUANTITIES, columns_of_track, geojson_of_track, kml_of_track, lines_of_track
 from magloc.tracking.motion import MotionModel, OrnsteinUhlenbeck, RandomWalk, known_motions
-from magloc.tracking.posterior_bound import posterior_bound, smoothing_bound
-from magloc.tracking.results import Row, SourcesPoint, TrackPoint, TrackResult, rows_of, stacked, warn_of_strengths
+from magloc.tracking.results import SourcesPoint, TrackPoint, TrackResult, stacked, warn_of_strengths
+from magloc.tracking.rows import Row, rows_of
 from magloc.tracking.settled import MOST_AT_ONCE
 from magloc.tracking.tracker import Tracker
 from magloc.tracking.whole_records.background import track_on_background
 from magloc.tracking.whole_records.body_errors import body_factor
 from magloc.tracking.whole_records.constants import constants_test
+from magloc.tracking.whole_records.posterior_bound import posterior_bound, smoothing_bound
 from magloc.tracking.whole_records.smoother import smoothed
 from magloc.truth import Truth, truth_of_rows
 
 if TYPE_CHECKING:
-    import xarray as xr
     from matplotlib.figure import Figure
 
 SPEED_M_S = 0.5
@@ -50,8 +50,10 @@ TURN_RAD_S = math.radians(5.0)
 _Row = TypeVar("_Row", TrackPoint, SourcesPoint)
 
 
-class TrackRows(Sequence[_Row]):
+class TrackRows(Result, Sequence[_Row]):
     """Rows of a tracked record: a sequence of points with one source or several."""
+
+    command = "track"
 
     points: tuple[_Row, ...]
     readings: Readings
@@ -85,19 +87,19 @@ class TrackRows(Sequence[_Row]):
         """Draw the tracks from above with 95 % ellipses, and their coordinates and strengths through time."""
         return by_name("magloc.plots.tracks:sources_figure")(self.as_result, self.readings.array_position_m)
 
-    def table(self) -> str:
-        """Return the table that ``magloc track`` prints."""
-        return "\n".join(lines_of_track(self))
-
-    def __repr__(self) -> str:
-        return "\n".join(lines_of_track(self, most=10))
-
-    def _repr_html_(self) -> str:
-        return f"<pre>{escape(repr(self))}</pre>"
+    def lines(self, most: int | None = None) -> list[str]:
+        """Return the lines of the table, of at most `most` rows."""
+        return lines_of_track(self, most=most)
 
 
 class TrackColumns(TrackRows[TrackPoint]):
     """Columns of one source through a record, NaN where it is not tracked."""
+
+    quantities = QUANTITIES
+
+    def columns(self) -> dict[str, Column]:
+        """Return the columns of track.csv."""
+        return columns_of_track(self, self.readings.array_position_m)
 
     @cached_property
     def position_m(self) -> FloatArray:
@@ -158,10 +160,6 @@ class TrackColumns(TrackRows[TrackPoint]):
     def as_result(self) -> TrackResult:
         """Track of the source, for pictures and the viewer."""
         return TrackResult(self.points, is_truth=False)
-
-    def to_xarray(self) -> xr.Dataset:
-        """Return the columns as a dataset with units and names, along `row`."""
-        return dataset_of_track(self)
 
     def to_geojson(self, place: Vector) -> dict[str, Any]:
         """Return a GeoJSON FeatureCollection of the track.

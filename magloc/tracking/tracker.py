@@ -1,12 +1,12 @@
 r"""One dipole through time: an iterated extended Kalman filter from the first row in which the source is seen.
 
-What is known of the source is a mixture of Gaussians in the coordinates of :mod:`magloc.tracking.chart.coordinates`,
+What is known of the source is a mixture of Gaussians in the coordinates of :mod:`magloc.tracking.coordinates`,
 soon a single one (:mod:`magloc.tracking.chart.steps`), moved by a :class:`magloc.tracking.motion.MotionModel`. A track
 ends when the readings contradict it or its place is no longer known; then it starts anew. The state is in the world
 frame where the array's pose is known, else in the array's. Behind the states of the motion stand the lasting errors
-that the array states of its sensors (:mod:`magloc.measurement.nuisances`), and those of its pose
-(:mod:`magloc.measurement.pose`): also those that are new in every row, so that the readings are modelled at the pose
-that they tell of. Positions, moments and steps for smoothing are Cartesian.
+of the array's pose (:mod:`magloc.measurement.pose`) and those of its sensors (:mod:`magloc.measurement.nuisances`).
+Errors of the pose that are new in every row are states, too: the readings are modelled at the pose that they tell of.
+Positions, moments and steps for smoothing are Cartesian.
 
 Rows of a settled track are stepped by :mod:`magloc.tracking.settled` in one compiled call, all others here; a test
 holds the two together.
@@ -29,23 +29,13 @@ from magloc.tracking.acquisition import STACKED_POSITION_ERROR, Acquisition, Car
 from magloc.tracking.acquisition import Start as RowsStart
 from magloc.tracking.chart.known_moment import KeptModulus
 from magloc.tracking.chart.mixture import Mixture
-from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.chart.start import NO_DIPOLE, prior_root
 from magloc.tracking.chart.steps import LARGEST_WIDTH, ChartFilter, Known, RowUpdate, cartesian, charted, width_of
 from magloc.tracking.chart.undetermined import Undetermined
-from magloc.tracking.measurement import RowMeasurements
+from magloc.tracking.measurement import RowMeasurement, RowMeasurements
 from magloc.tracking.motion import N_SOURCE, MotionModel
-from magloc.tracking.results import (
-    UNDETERMINED,
-    Innovation,
-    Prediction,
-    Row,
-    Step,
-    TrackPoint,
-    moving,
-    next_row,
-    of_mixture,
-)
+from magloc.tracking.results import UNDETERMINED, Innovation, Prediction, Step, TrackPoint, of_mixture
+from magloc.tracking.rows import Row, moving, next_row
 from magloc.tracking.sensor_health import SENSOR_LIMIT, SensorHealth, Suspects
 from magloc.tracking.settled import MOST_AT_ONCE, SettledTrack
 
@@ -74,9 +64,9 @@ class Tracker(CartesianFilter):
     measurements : RowMeasurements
         What rows say of the state.
     errors : SensorErrors
-        The lasting errors of the array's sensors, whose states follow those of the motion.
+        The lasting errors of the array's sensors: the last states.
     pose_errors : PoseErrors
-        Those of its pose, behind them.
+        Those of its pose, between the states of the motion and them.
     steps : list of Step
         Of all tracks so far, if `keep_steps`.
 
@@ -205,7 +195,7 @@ class Tracker(CartesianFilter):
         self._n_rows += n_rows
         self.steps += steps
 
-    def known_before(self, seen: ChartRow, x: FloatArray) -> FloatArray:
+    def known_before(self, seen: RowMeasurement, x: FloatArray) -> FloatArray:
         """Covariance (n, n) of the motion's states of a source at x before its first row."""
         _, S = self.motion.start(x[:N_SOURCE], prior_root(seen.chart(x[:N_SOURCE])))
         return S @ S.T
@@ -239,10 +229,10 @@ class Tracker(CartesianFilter):
         known = self.filter.refitted(Known(mixture, open_loop, young=young))
         return out, self._kept(seen.row, index, known, None, status="acquired")
 
-    def _seen(self, row: Row, out: BoolArray) -> ChartRow:
+    def _seen(self, row: Row, out: BoolArray) -> RowMeasurement:
         """What a row says without some of its sensors (N,)."""
         readings = np.where(out[self.array.channel_sensor], np.nan, row.readings_T)
-        return ChartRow.of(self.measurements.of(replace(row, readings_T=readings) if out.any() else row))
+        return self.measurements.of(replace(row, readings_T=readings) if out.any() else row)
 
     def _followed(self, before: Known, row: Row, index: int, dt_s: float) -> tuple[BoolArray, TrackPoint]:
         """A track after one more row, and the sensors (N,) that were left out of it."""
@@ -261,7 +251,7 @@ class Tracker(CartesianFilter):
                 return self._started(row, index, predicted.matched())
             return dead, self._kept(seen.row, index, known, prediction, status="predicted")
 
-        def updated(of_row: ChartRow) -> RowUpdate:
+        def updated(of_row: RowMeasurement) -> RowUpdate:
             return self.filter.updated(before, predicted, dt_s, of_row)
 
         update, out, of_sensor = updated(seen), dead, False
@@ -300,7 +290,7 @@ class Tracker(CartesianFilter):
             is_lost=is_open and known.has_range and not is_detected,
         )
 
-    def _judge(self, row: Row, out: BoolArray, excess: Callable[[ChartRow], float]) -> None:
+    def _judge(self, row: Row, out: BoolArray, excess: Callable[[RowMeasurement], float]) -> None:
         """Count a row without some sensors (N,), and the χ² that each dead one with readings would add to it."""
         if self._health.is_well and not out.any():
             return
@@ -349,7 +339,7 @@ class Tracker(CartesianFilter):
         point = of_mixture(row.time_s, mixture, np.diagonal(known.open_loop))
         return replace(point, status=status, iterations=iterations, **told)
 
-    def _acquired(self, seen: ChartRow, index: int) -> TrackPoint:
+    def _acquired(self, seen: RowMeasurement, index: int) -> TrackPoint:
         """A new track from several rows of which one alone does not determine the source; else what this one says."""
         mixture, reason = self._undetermined.after(seen, self.motion)
         start = self._acquisition.start(seen.row, self._undetermined.position_error)
@@ -361,18 +351,18 @@ class Tracker(CartesianFilter):
         point = self._kept(seen.row, index, known, None, status="acquired", iterations=start.solution.iterations)
         return replace(point, weight=start.solution.weight, rivals=start.rivals)
 
-    def _found(self, start: RowsStart, seen: ChartRow) -> Known | None:
+    def _found(self, start: RowsStart, seen: RowMeasurement) -> Known | None:
         """What is known of a source that several rows show, the last of them as it is seen, if it is known well."""
         source = np.concatenate([start.solution.position_m, start.solution.moment_Am2])
         found = self.start(source, start.solution.covariance, start.rows)
         if found is None:
             return None
-        offset, root = seen.measurement.place_in_array(found.x, found.S)
+        offset, root = seen.place_in_array(found.x, found.S)
         if float(np.linalg.norm(root)) > STACKED_POSITION_ERROR * float(np.linalg.norm(offset)):
             return None
         return Known(charted(found.x, found.S, seen), self.known_before(seen, found.x))
 
-    def _of_rows(self, mixture: Mixture | None, reason: str, seen: ChartRow) -> TrackPoint:
+    def _of_rows(self, mixture: Mixture | None, reason: str, seen: RowMeasurement) -> TrackPoint:
         """What rows say that show a source, of which one alone does not determine it."""
         if mixture is None:
             return self._lost(seen.row, reason)

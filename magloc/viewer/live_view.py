@@ -10,7 +10,8 @@ import viser
 from arrays.array import SensorArray
 from magloc.live.follower import LivePoint
 from magloc.readings import Readings
-from magloc.tracking.results import SourcesPoint, TrackPoint, rows_of
+from magloc.tracking.results import SourcesPoint, TrackPoint
+from magloc.tracking.rows import rows_of
 from magloc.viewer.pages.live import Controls, LivePage
 from magloc.viewer.pages.pages import Page, live_page
 from magloc.viewer.server import FIRST_PORT

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,8 +13,6 @@ from adcs.kalman.bank import EstimatorSettings
 from adcs.kalman.diagnostics import COLLINEAR, collinear_rows
 from adcs.satellite.sensors import SENSORS
 from adcs.satellite.telemetry import Telemetry
-from arrays.io.csv import write_columns
-from arrays.io.text import write_netcdf, write_text
 from sims.experiments.attitude import Outcome, Part, errors_in_units
 
 if TYPE_CHECKING:
@@ -24,12 +21,11 @@ from adcs.kalman.results import SHOWN, STATE_COLUMNS, in_units
 from arrays.typing import FloatArray
 
 
-def write_attitude_files(
-    out: Path, file: AttitudeFile, estimate: EstimatorSettings, parts: Sequence[Part], outcome: Outcome
-) -> list[str]:
-    """Write everything of some runs into a folder."""
+def attitude_files(
+    file: AttitudeFile, estimate: EstimatorSettings, parts: Sequence[Part], outcome: Outcome
+) -> Iterator[tuple[str, Any]]:
+    """Yield the names and the contents of all files of some runs."""
     from adcs.plots.attitude import consistency_figure, gaps_of, states_figure
-    from magloc.plots import style
 
     first = parts[0]
     time_s, name = first.runs.time_s, file.name
@@ -42,31 +38,28 @@ def write_attitude_files(
     degraded = {COLLINEAR: collinear_rows(first.runs, used, 0)}
     gaps = gaps_of(seen, used.sensors.split("+"), degraded)
     seed = int(outcome.seeds[0])
-    figure = states_figure(f"{title}; seed {seed}", time_s, errors, sigma, are_errors=True, gaps=gaps)
-    style.save(figure, out / f"{name}-errors.png")
+    states = states_figure(f"{title}; seed {seed}", time_s, errors, sigma, are_errors=True, gaps=gaps)
+    yield f"{name}-errors.png", states
     sigma_deg = np.sqrt(np.sum(sigma[:, :3] ** 2, axis=1))
-    figure = consistency_figure(title, time_s, outcome.error_deg, sigma_deg, outcome.nees, outcome.size, outcome.nis)
-    style.save(figure, out / f"{name}-consistency.png")
+    nees = outcome.nees, outcome.size, outcome.nis
+    yield f"{name}-consistency.png", consistency_figure(title, time_s, outcome.error_deg, sigma_deg, *nees)
     columns: dict[str, Any] = {"time_s": time_s}
     columns |= {f"error_{key}": errors[:, i] for i, key in enumerate(STATE_COLUMNS) if not np.isnan(errors[:, i]).all()}
     columns |= {f"sigma_{key}": sigma[:, i] for i, key in enumerate(STATE_COLUMNS) if not np.isnan(sigma[:, i]).all()}
-    columns |= {
-        "attitude_error_deg_median": np.median(outcome.error_deg, axis=0),
-        "nees_per_dimension_mean": outcome.nees.mean(axis=0),
-    }
-    write_columns(columns, out / f"{name}.csv")
-    write_columns(_runs_table(outcome), out / f"{name}-runs.csv")
-    write_netcdf(dataset_of(parts, estimate, title), out / f"{name}.nc")
+    yield (
+        f"{name}.csv",
+        columns
+        | {
+            "attitude_error_deg_median": np.median(outcome.error_deg, axis=0),
+            "nees_per_dimension_mean": outcome.nees.mean(axis=0),
+        },
+    )
+    yield f"{name}-runs.csv", _runs_table(outcome)
+    yield f"{name}.nc", dataset_of(parts, estimate, title)
     log = Telemetry.of(first.runs, file.satellite.start)
-    write_columns(telemetry_columns(log), out / "telemetry.csv")
-    write_columns(_truth_columns(first, log.time_s), out / "truth.csv")
-    write_text(scenario_text(file), out / "scenario.toml")
-    return [
-        *(f"{name}{ending}" for ending in ("-errors.png", "-consistency.png", ".csv", "-runs.csv", ".nc")),
-        "telemetry.csv",
-        "truth.csv",
-        "scenario.toml",
-    ]
+    yield "telemetry.csv", telemetry_columns(log)
+    yield "truth.csv", _truth_columns(first, log.time_s)
+    yield "scenario.toml", scenario_text(file)
 
 
 def _runs_table(outcome: Outcome) -> dict[str, Any]:

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import product
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from cyclopts import Parameter
 
 import sims.experiments
-from adcs.cli.options import ScenarioOptions, tell, warn
+from adcs.cli.options import ReportOptions, ScenarioOptions, warn
 from adcs.kalman.names import FILTERS
-from arrays.io.arguments import Flag
-from arrays.io.csv import write_columns
 from arrays.io.errors import InputError
-from arrays.io.outputs import make_folder, refuse_file
-from magloc.cli.framework import QuietOptions, print_result, progress
+from magloc.cli.framework import Flag, progress
 from sims.cli.run_tabletsat import RunOptions, wanted
 
 if TYPE_CHECKING:
@@ -91,11 +88,11 @@ def compare(
     *scenarios: str,
     options: CompareOptions = CompareOptions(),
     runs: RunOptions = RunOptions(),  # noqa: B008 - frozen
-    out: Path | None = None,
-    json: Flag = False,
-    common: QuietOptions = QuietOptions(),  # noqa: B008 - frozen
+    report: ReportOptions = ReportOptions(),  # noqa: B008 - frozen
 ) -> None:
     """Run several scenarios, sets of sensors or filters on the same seeds and show them side by side.
+
+    --out writes compare.png, with the median errors through time, and compare.csv.
 
     Parameters
     ----------
@@ -105,33 +102,25 @@ def compare(
         Sensors, states and filters.
     runs : RunOptions
         Runs.
-    out : Path, optional
-        Folder for compare.png, with the median errors through time, and compare.csv.
-    json : bool
-        Print one JSON object.
-    common : QuietOptions
-        Common options.
+    report : ReportOptions
+        Where the result goes.
     """
     if not scenarios:
         raise InputError("adcs compare: found no scenario, expected one or more, such as tabletsat eclipse.")
-    refuse_file(out, "--out")
+    report.check()
     pairs = [wanted(name, chosen, runs.duration) for name, chosen in product(scenarios, options.combinations())]
     rows = []
-    with progress(len(pairs) * runs.seeds, "runs", quiet=common.quiet) as advance:
+    with progress(len(pairs) * runs.seeds, "runs", quiet=report.quiet) as advance:
         for file, estimate in pairs:
             outcome = sims.experiments.run_scenario(
-                file, estimate, runs.numbers, through_time=out is not None, advance=advance
+                file, estimate, runs.numbers, through_time=report.out is not None, advance=advance
             )
             rows.append(Row(file, estimate, outcome))
     reports = [row.report() for row in rows]
-    if out is not None:
-        make_folder(out, "--out")
-        _write(out, rows, reports)
-        tell(common, f"wrote compare.png and compare.csv into {out}")
-    print_result({"rows": reports}, compare_lines(reports), as_json=json)
-    if not json:
-        for report in reports:
-            warn(common, (f"{report['scenario']}, {report['sensors']}: {line}" for line in report["warnings"]))
+    report.write(_files(rows, reports))
+    report.print({"rows": reports}, compare_lines(reports))
+    for of_row in [] if report.json else reports:
+        warn(report, (f"{of_row['scenario']}, {of_row['sensors']}: {line}" for line in of_row["warnings"]))
 
 
 _COLUMNS = (
@@ -166,17 +155,17 @@ def label_of(report: dict[str, Any]) -> str:
     return " ".join(parts if report["filter"] == "mekf" else [*parts, report["filter"]])
 
 
-def _write(out: Path, rows: list[Row], reports: list[dict[str, Any]]) -> None:
+def _files(rows: list[Row], reports: list[dict[str, Any]]) -> Iterator[tuple[str, Any]]:
+    """Yield the numbers of all rows, and their median errors through time as a figure."""
     from adcs.plots.attitude import compare_figure
-    from magloc.plots import style
 
-    columns: dict[str, Any] = {"row": [label_of(report) for report in reports]}
+    names = [label_of(report) for report in reports]
+    columns: dict[str, Any] = {"row": names}
     for key, _ in _COLUMNS:
-        values = [report[key] for report in reports]
-        columns[key] = np.array([np.nan if value is None else value for value in values], dtype=np.float64)
-    write_columns(columns, out / "compare.csv")
+        columns[key] = np.array([report[key] for report in reports], dtype=np.float64)  # None becomes NaN
+    yield "compare.csv", columns
     lines: list[tuple[str, FloatArray, FloatArray]] = []
-    for row, report in zip(rows, reports, strict=True):
+    for name, row in zip(names, rows, strict=True):
         error: FloatArray = np.median(row.outcome.error_deg, axis=0)
-        lines.append((label_of(report), row.file.step_s * np.arange(len(error), dtype=np.float64), error))
-    style.save(compare_figure(lines), out / "compare.png")
+        lines.append((name, row.file.step_s * np.arange(len(error), dtype=np.float64), error))
+    yield "compare.png", compare_figure(lines)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,10 +18,8 @@ from adcs.mockup.navigation.strapdown import ImuRecord, PlanarTrack
 from adcs.mockup.vision.camera import Pose
 from adcs.mockup.vision.sky import LedSky, write_sky
 from adcs.plots import mockup_navigation, mockup_vision
-from arrays.io.csv import Column, write_columns, write_table
-from arrays.io.outputs import make_folder
+from arrays.io.csv import table_text
 from arrays.typing import FloatArray
-from magloc.plots import style
 from sims.experiments.mockup_navigation import FusionRuns, ZerosRuns
 from sims.experiments.mockup_recording import RecordRun
 from sims.experiments.mockup_settings import METHOD_WORDS, SETTLED_S
@@ -32,25 +30,16 @@ from sims.mockup.table_run import TableScenario, table_run
 if TYPE_CHECKING:
     from sims.cli.mockup_options import MockupOptions
 
-File = tuple[str, Callable[[Path], None]]
-"""A name, and what writes the file at a path."""
+File = tuple[str, Any]
+"""A name, and what is written into the file, as :func:`arrays.io.outputs.write_file` takes it."""
 _DRIVE_S, _DRIVE_STEP_S = 150.0, 1.8
 _REST_FRAMES, _REST_STEP_S = 40, 0.6
 _REST_M, _REST_RAD = (-1.2228, 0.3), 0.5
 """About where the source's figure 10 is."""
 
 
-def write_files(options: MockupOptions, run: Any, out: Path) -> list[str]:
-    """Write what belongs to a run of some kind into a folder; the names of the files."""
-    make_folder(out, "--out")
-    names = []
-    for name, write in _files(options, run):
-        write(out / name)
-        names.append(name)
-    return names
-
-
-def _files(options: MockupOptions, run: Any) -> Iterator[File]:
+def files_of(options: MockupOptions, run: Any) -> Iterator[File]:
+    """Yield what belongs to a run of some kind."""
     match run:
         case SkyRun():
             return sky_files(options, run)
@@ -65,19 +54,6 @@ def _files(options: MockupOptions, run: Any) -> Iterator[File]:
     return frame_files(options, run)
 
 
-def _picture(name: str, figure: Figure) -> File:
-    return name, partial(style.save, figure)
-
-
-def _columns(name: str, columns: Mapping[str, Column]) -> File:
-    return name, partial(write_columns, columns)
-
-
-def _table(name: str, columns: Mapping[str, FloatArray]) -> File:
-    """The same of numbers, to nine digits."""
-    return name, partial(write_table, columns=tuple(columns), table=np.column_stack(list(columns.values())))
-
-
 def sky_files(options: MockupOptions, run: SkyRun) -> Iterator[File]:
     """Frames' results: figures, a table, the sky, and a frame of the kind."""
     sky, setup, seeds = options.led_sky, options.sky_setup(), options.runs(1)
@@ -87,15 +63,15 @@ def sky_files(options: MockupOptions, run: SkyRun) -> Iterator[File]:
     picture = mockup_vision.SkyPicture(
         title, sky.positions_m, run.truth[:, :2], errors_mm, run.good, run.false_fixes, n_stars
     )
-    yield _picture("mockup-sky.png", mockup_vision.sky_figure(picture))
+    yield "mockup-sky.png", mockup_vision.sky_figure(picture)
     # The first frame with a good fix, or the first one; once more, as a first time may have been that of a compiler.
     seed, row = divmod(int(np.argmax(run.good)), setup.poses)
     image = random_frame(sky, setup, seeds[seed], row)[1].image
     result = frame_result(image, setup.believed_camera, options.sky_matcher(), options.finder())
     title = f"{result.matched} of {len(result.stars)} stars identified in {1e3 * result.identify_s:.1f} ms"
-    yield _picture("mockup-frame.png", _frame_figure(options, title, image, result))
-    yield _picture("mockup-drive.png", _drive_figure(options, sky))
-    yield _columns(
+    yield "mockup-frame.png", _frame_figure(options, title, image, result)
+    yield "mockup-drive.png", _drive_figure(options, sky)
+    yield (
         "mockup-sky.csv",
         {
             "seed": np.repeat(np.array(seeds, dtype=np.int64), setup.poses),
@@ -150,9 +126,9 @@ def frame_files(options: MockupOptions, results: Mapping[Path, FrameResult]) -> 
     """A figure of every frame that was read, and a table."""
     for path, result in results.items():
         image = read_frame(path, options.camera())
-        yield _picture(f"{path.stem}-stars.png", _frame_figure(options, path.name, image, result))
+        yield f"{path.stem}-stars.png", _frame_figure(options, path.name, image, result)
     every = list(results.values())
-    yield _columns(
+    yield (
         "mockup-frames.csv",
         {
             "file": [path.name for path in results],
@@ -164,9 +140,13 @@ def frame_files(options: MockupOptions, results: Mapping[Path, FrameResult]) -> 
     )
 
 
+def _named(names: str, *values: FloatArray) -> dict[str, FloatArray]:
+    """Return columns by their names; values have shape (n,), or (n, k) for k names."""
+    return dict(zip(names.split(), np.column_stack(values).T, strict=True))
+
+
 def _pose_columns(prefix: str, poses: FloatArray) -> dict[str, FloatArray]:
-    x, y, heading = poses.T
-    return {f"{prefix}x_m": x, f"{prefix}y_m": y, f"{prefix}heading_deg": np.degrees(heading)}
+    return _named(f"{prefix}x_m {prefix}y_m {prefix}heading_deg", poses[:, :2], np.degrees(poses[:, 2]))
 
 
 def zeros_files(runs: ZerosRuns) -> Iterator[File]:
@@ -183,24 +163,22 @@ def zeros_files(runs: ZerosRuns) -> Iterator[File]:
     ).replace("-", "\N{MINUS SIGN}")
     rms_mm = first.position_before_mm, first.position_rms_mm
     figure = mockup_navigation.zeros_figure(title, first.run.imu, first.run.fixes, first.before, first.after, *rms_mm)
-    yield _picture("mockup-zeros.png", figure)
+    yield "mockup-zeros.png", figure
     samples = _imu_columns(first.run.imu)
     for prefix, track in (("true_", first.run.truth), ("before_", first.before), ("after_", first.after)):
-        samples |= {f"{prefix}x_m": track.position_m[:, 0], f"{prefix}y_m": track.position_m[:, 1]}
-    yield _table("mockup-zeros.csv", samples | {"after_heading_deg": np.degrees(first.after.heading_rad)})
-    yield _table(
-        "mockup-zeros-runs.csv",
-        {
-            "seed": np.array([each.seed for each in runs.results]),
-            "zero_x_m_s2": np.array([each.fit.zero_m_s2[0] for each in runs.results]),
-            "zero_y_m_s2": np.array([each.fit.zero_m_s2[1] for each in runs.results]),
-            "zero_error_m_s2": np.array([each.zero_error_m_s2 for each in runs.results]),
-            "before_rms_mm": np.array([each.position_before_mm for each in runs.results]),
-            "after_rms_mm": np.array([each.position_rms_mm for each in runs.results]),
-            "fit_rms_mm": np.array([1e3 * each.fit.residual_rms_m for each in runs.results]),
-        },
-    )
-    yield _columns("mockup-fixes.csv", _fix_columns(first.run.fixes))
+        samples |= _named(f"{prefix}x_m {prefix}y_m", track.position_m)
+    yield "mockup-zeros.csv", table_text(samples | {"after_heading_deg": np.degrees(first.after.heading_rad)})
+    runs_columns = {
+        "seed": np.array([each.seed for each in runs.results]),
+        "zero_x_m_s2": np.array([each.fit.zero_m_s2[0] for each in runs.results]),
+        "zero_y_m_s2": np.array([each.fit.zero_m_s2[1] for each in runs.results]),
+        "zero_error_m_s2": np.array([each.zero_error_m_s2 for each in runs.results]),
+        "before_rms_mm": np.array([each.position_before_mm for each in runs.results]),
+        "after_rms_mm": np.array([each.position_rms_mm for each in runs.results]),
+        "fit_rms_mm": np.array([1e3 * each.fit.residual_rms_m for each in runs.results]),
+    }
+    yield "mockup-zeros-runs.csv", table_text(runs_columns)
+    yield "mockup-fixes.csv", _fix_columns(first.run.fixes)
 
 
 def fusion_files(runs: FusionRuns) -> Iterator[File]:
@@ -220,16 +198,16 @@ def fusion_files(runs: FusionRuns) -> Iterator[File]:
         None if sigma is None else sigma[:, 4],
         SETTLED_S,
     )
-    yield _picture("mockup-fusion.png", mockup_navigation.fusion_figure(picture))
-    yield _picture("mockup-fusion-errors.png", mockup_navigation.errors_figure(picture))
+    yield "mockup-fusion.png", mockup_navigation.fusion_figure(picture)
+    yield "mockup-fusion-errors.png", mockup_navigation.errors_figure(picture)
     samples = _imu_columns(run.imu) | _track_columns("true_", run.truth) | _track_columns("", track)
     # The gyro's zero stands in the file of a recording alone.
     samples.pop("zero_rate_deg_s", None)
-    yield _table("mockup-fusion.csv", samples)
+    yield "mockup-fusion.csv", table_text(samples)
     errors = {name: np.array([getattr(each.errors, name) for each in runs.results]) for name in _ERRORS}
-    yield _table("mockup-fusion-runs.csv", {"seed": np.array([each.seed for each in runs.results])} | errors)
+    yield "mockup-fusion-runs.csv", table_text({"seed": np.array([each.seed for each in runs.results])} | errors)
     used = first.fused.used
-    yield _columns("mockup-fixes.csv", _fix_columns(fixes) | {"false": run.false[: len(used)], "used": used})
+    yield "mockup-fixes.csv", _fix_columns(fixes) | {"false": run.false[: len(used)], "used": used}
 
 
 def method_files(every: Sequence[FusionRuns]) -> Iterator[File]:
@@ -240,9 +218,9 @@ def method_files(every: Sequence[FusionRuns]) -> Iterator[File]:
         distance = np.linalg.norm(result.fused.track.position_m - result.run.truth.position_m, axis=1)
         label = f"{runs.method}: {result.errors.position_rms_mm:.1f} mm rms"
         lines.append((label, result.run.truth.time_s, 1e3 * distance))
-    yield _picture("mockup-methods.png", mockup_navigation.methods_figure(lines, SETTLED_S))
+    yield "mockup-methods.png", mockup_navigation.methods_figure(lines, SETTLED_S)
     each = [(runs.method, one.seed, one.errors) for runs in every for one in runs.results]
-    yield _columns(
+    yield (
         "mockup-methods.csv",
         {
             "fusion": [method for method, _, _ in each],
@@ -264,47 +242,29 @@ def record_files(run: RecordRun) -> Iterator[File]:
         run.fused.outcomes,
         begin_s=run.imu.begin_s + SETTLED_S,
     )
-    yield _picture("mockup-fusion.png", mockup_navigation.fusion_figure(picture))
-    yield _table("mockup-estimate.csv", {"time_s": track.time_s} | _track_columns("", track))
+    yield "mockup-fusion.png", mockup_navigation.fusion_figure(picture)
+    yield "mockup-estimate.csv", table_text({"time_s": track.time_s} | _track_columns("", track))
 
 
 _ERRORS = ("position_rms_mm", "position_p95_mm", "position_max_mm", "velocity_rms_mm_s", "heading_rms_deg")
 
 
 def _imu_columns(imu: ImuRecord) -> dict[str, FloatArray]:
-    return {
-        "time_s": imu.time_s,
-        "acceleration_x_m_s2": imu.acceleration_m_s2[:, 0],
-        "acceleration_y_m_s2": imu.acceleration_m_s2[:, 1],
-        "rate_deg_s": np.degrees(imu.rate_rad_s),
-    }
+    names = "time_s acceleration_x_m_s2 acceleration_y_m_s2 rate_deg_s"
+    return _named(names, imu.time_s, imu.acceleration_m_s2, np.degrees(imu.rate_rad_s))
 
 
-def _track_columns(prefix: str, track: PlanarTrack) -> dict[str, FloatArray]:
-    columns = {
-        f"{prefix}x_m": track.position_m[:, 0],
-        f"{prefix}y_m": track.position_m[:, 1],
-        f"{prefix}vx_m_s": track.velocity_m_s[:, 0],
-        f"{prefix}vy_m_s": track.velocity_m_s[:, 1],
-        f"{prefix}heading_deg": np.degrees(track.heading_rad),
-    }
+def _track_columns(p: str, track: PlanarTrack) -> dict[str, FloatArray]:
+    """Return the columns of a track, their names behind a prefix."""
+    names = f"{p}x_m {p}y_m {p}vx_m_s {p}vy_m_s {p}heading_deg"
+    columns = _named(names, track.position_m, track.velocity_m_s, np.degrees(track.heading_rad))
     if isinstance(track, FilterTrack):
-        columns |= {
-            "zero_x_m_s2": track.zero_m_s2[:, 0],
-            "zero_y_m_s2": track.zero_m_s2[:, 1],
-            "zero_rate_deg_s": np.degrees(track.zero_rad_s),
-            "sigma_x_mm": 1e3 * track.sigma[:, 0],
-            "sigma_y_mm": 1e3 * track.sigma[:, 1],
-            "sigma_heading_deg": np.degrees(track.sigma[:, 4]),
-        }
+        columns |= _named("zero_x_m_s2 zero_y_m_s2 zero_rate_deg_s", track.zero_m_s2, np.degrees(track.zero_rad_s))
+        sigma = 1e3 * track.sigma[:, :2], np.degrees(track.sigma[:, 4])
+        columns |= _named("sigma_x_mm sigma_y_mm sigma_heading_deg", *sigma)
     return columns
 
 
-def _fix_columns(fixes: FixRecord) -> dict[str, Column]:
-    return {
-        "exposure_s": fixes.time_s,
-        "arrival_s": fixes.arrival_s,
-        "x_m": fixes.position_m[:, 0],
-        "y_m": fixes.position_m[:, 1],
-        "heading_deg": np.degrees(fixes.heading_rad),
-    }
+def _fix_columns(fixes: FixRecord) -> dict[str, FloatArray]:
+    names = "exposure_s arrival_s x_m y_m heading_deg"
+    return _named(names, fixes.time_s, fixes.arrival_s, fixes.position_m, np.degrees(fixes.heading_rad))

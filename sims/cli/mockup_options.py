@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from arrays.io.arguments import Count, Seed, whole_number
 from arrays.io.errors import InputError, naming
+from magloc.cli.framework import Count, Seed, whole_number
 from sims.experiments.mockup_settings import SETTLED_S, Method, Unknowns
 
 if TYPE_CHECKING:

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING
 from cyclopts import Parameter
 
 from adcs.cli.options import print_note
-from arrays.io.arguments import Flag
 from arrays.io.errors import InputError
-from magloc.cli.framework import QuietOptions
+from magloc.cli.framework import Flag, QuietOptions
 from magloc.cli.options import Port, naming_outputs
 from sims.cli.mockup_options import MockupOptions
 from sims.experiments.mockup_settings import METHOD_WORDS

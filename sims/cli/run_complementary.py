@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from adcs.cli.options import tell, warn
+from adcs.cli.options import ReportOptions, warn
 from adcs.complementary.names import Method, Rule
-from arrays.io.arguments import Count, Flag, Seed
 from arrays.io.errors import LARGEST, InputError
-from arrays.io.outputs import make_folder, refuse_file
-from magloc.cli.framework import QuietOptions, print_result, progress
+from arrays.io.outputs import refuse_file, write_files
+from magloc.cli.framework import Count, Seed, progress
+from sims.cli.run_tabletsat import seed_batches
 
 if TYPE_CHECKING:
     from adcs.complementary.explicit import Gains
@@ -158,27 +158,27 @@ def run_complementary(
     """
     import numpy as np
 
-    from arrays.io.csv import write_table
+    from arrays.io.csv import table_text
     from sims.attitude.complementary import satellite_runs
     from sims.experiments.complementary import RUN_COLUMNS, errors_deg, row_of_each
 
     options.check()
     refuse_file(out, "--out")
     rows: list[FloatArray] = []
-    last = options.seed + options.seeds
-    for begin in range(options.seed, last, _RUNS_AT_ONCE):
-        seeds = range(begin, min(begin + _RUNS_AT_ONCE, last))
+    files: list[tuple[str, Any]] = []
+    for seeds in seed_batches(options.seed, options.seeds, _RUNS_AT_ONCE):
         runs = satellite_runs(options.scenario, seeds)
         rows.append(row_of_each(runs.scenario, errors_deg(runs, options.filter, options.gains, options.outage)))
-        if out is not None and begin == options.seed:
-            make_folder(out, "--out")
-            _write_picture(options, runs, out)
+        if out is not None and not files:
+            files += _files_of_first(options, runs)
         if progress is not None:
             progress(len(seeds))
     table = np.concatenate(rows)
-    if out is not None:
-        numbers = np.arange(options.seed, last)
-        write_table(out / "complementary-runs.csv", ("seed", *RUN_COLUMNS), np.column_stack([numbers, table]))
+    numbers = np.arange(options.seed, options.seed + options.seeds)
+    files.append(
+        ("complementary-runs.csv", table_text({"seed": numbers, **dict(zip(RUN_COLUMNS, table.T, strict=True))}))
+    )
+    write_files(out, files)
     means = [float(value) for value in table[:, :3].mean(axis=0)]
     return {
         "rms_deg": means[0],
@@ -188,31 +188,28 @@ def run_complementary(
     }
 
 
-def _write_picture(options: ComplementaryOptions, runs: SatelliteRuns, out: Path) -> None:
-    import numpy as np
-
+def _files_of_first(options: ComplementaryOptions, runs: SatelliteRuns) -> Iterator[tuple[str, Any]]:
+    """Yield the figure and the errors of the first run, by all filters."""
     from adcs.plots.complementary import ComplementaryPicture, complementary_figure
-    from arrays.io.csv import write_table
-    from magloc.plots import style
+    from arrays.io.csv import table_text
     from sims.experiments.complementary import errors_deg
 
     names: tuple[Method, ...] = ("gauss-newton", "explicit", "adaptive")
     errors: dict[str, FloatArray] = {name: errors_deg(runs, name, options.gains, options.outage)[0] for name in names}
-    orbits = runs.scenario.orbits
-    picture = ComplementaryPicture(
-        f"{options.gains_text}; {options.surroundings}",
-        orbits,
-        errors,
-        runs.scenario.step_orbits,
-        runs.scenario.outage_orbits,
+    scenario = runs.scenario
+    title = f"{options.gains_text}; {options.surroundings}"
+    yield (
+        "complementary.png",
+        complementary_figure(
+            ComplementaryPicture(title, scenario.orbits, errors, scenario.step_orbits, scenario.outage_orbits)
+        ),
     )
-    style.save(complementary_figure(picture), out / "complementary.png")
-    columns = [f"{name.replace('-', '_')}_{axis}_deg" for name in names for axis in ("roll", "pitch", "yaw")]
-    write_table(
-        out / "complementary.csv",
-        ("time_s", "orbits", *columns),
-        np.column_stack([runs.scenario.time_s, orbits, *(errors[name] for name in names)]),
-    )
+    columns = {"time_s": scenario.time_s, "orbits": scenario.orbits}
+    for name, of_filter in errors.items():
+        columns |= dict(
+            zip((f"{name.replace('-', '_')}_{axis}_deg" for axis in ("roll", "pitch", "yaw")), of_filter.T, strict=True)
+        )
+    yield "complementary.csv", table_text(columns)
 
 
 def summary_lines(options: ComplementaryOptions, result: dict[str, Any]) -> list[str]:
@@ -235,30 +232,22 @@ def summary_lines(options: ComplementaryOptions, result: dict[str, Any]) -> list
 def complementary(
     *,
     options: ComplementaryOptions = ComplementaryOptions(),
-    out: Path | None = None,
-    json: Flag = False,
-    common: QuietOptions = QuietOptions(),  # noqa: B008 - frozen
+    report: ReportOptions = ReportOptions(),  # noqa: B008 - frozen
 ) -> None:
     """Attitude of a satellite from magnetometer, Sun sensor and gyro by complementary filters.
 
-    The gyro's bias steps, or the Sun sensor fails.
+    The gyro's bias steps, or the Sun sensor fails. --out writes the figure and the data behind it.
 
     Parameters
     ----------
     options : ComplementaryOptions
         What is run.
-    out : Path, optional
-        Folder for the figure and the data behind it.
-    json : bool
-        Print one JSON object.
-    common : QuietOptions
-        Common options.
+    report : ReportOptions
+        Where the result goes.
     """
     options.check()
     if options.filter != "adaptive":
-        warn(common, options.gains.warnings(1.0))
-    with progress(options.seeds, "runs", quiet=common.quiet) as advance:
-        result = run_complementary(options, out, advance)
-    print_result(result, summary_lines(options, result), as_json=json)
-    if out is not None:
-        tell(common, f"wrote complementary.png, complementary.csv and complementary-runs.csv into {out}")
+        warn(report, options.gains.warnings(1.0))
+    with progress(options.seeds, "runs", quiet=report.quiet) as advance:
+        result = run_complementary(options, report.out, advance)
+    report.print(result, summary_lines(options, result))

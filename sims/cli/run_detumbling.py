@@ -7,9 +7,8 @@ from typing import Annotated, Literal
 import numpy as np
 from cyclopts import Parameter
 
-from arrays.io.arguments import Count, Flag, Seed
 from arrays.io.errors import InputError
-from magloc.cli.framework import QuietOptions, print_result, progress
+from magloc.cli.framework import Count, Flag, QuietOptions, Seed, print_result, progress
 
 _LONGEST_S, _MOST_S = 200_000.0, 2_000_000.0
 _STRONGEST_AM2 = 10.0

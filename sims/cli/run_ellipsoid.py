@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from adcs.cli.options import tell
+from adcs.cli.options import ReportOptions
 from adcs.ellipsoids.names import StepRule
-from arrays.io.arguments import Count, Flag, Seed
 from arrays.io.errors import LARGEST, InputError
-from arrays.io.outputs import make_folder, refuse_file
-from magloc.cli.framework import QuietOptions, print_result, progress
+from arrays.io.outputs import refuse_file, write_files
+from magloc.cli.framework import Count, Flag, Seed, progress
+from sims.cli.run_tabletsat import seed_batches
 
 if TYPE_CHECKING:
     from arrays.typing import FloatArray
@@ -55,8 +56,8 @@ class EllipsoidOptions:
     noise_deg: float = 1.0
     drift_deg_s: float = 0.02
     step: StepRule = "tightened"
-    jump: Annotated[bool, Parameter(negative=(), show_default=False)] = False
-    closed_loop: Annotated[bool, Parameter(negative=(), show_default=False)] = False
+    jump: Flag = False
+    closed_loop: Flag = False
     seeds: Annotated[Count, Parameter(name=["--seeds", "--runs"])] = 300
     seed: Seed = 0
     duration: float = 5678.0
@@ -108,24 +109,22 @@ def run_ellipsoid(
     """
     import numpy as np
 
-    from arrays.io.csv import write_table
+    from arrays.io.csv import table_text
     from sims.experiments.ellipsoid import RUN_COLUMNS, ellipsoid_runs, row_of_each
 
     options.check()
     refuse_file(out, "--out")
     rows: list[FloatArray] = []
-    last = options.seed + options.seeds
-    for begin in range(options.seed, last, _RUNS_AT_ONCE):
-        runs = ellipsoid_runs(options.settings, range(begin, min(begin + _RUNS_AT_ONCE, last)))
+    files: list[tuple[str, Any]] = []
+    for seeds in seed_batches(options.seed, options.seeds, _RUNS_AT_ONCE):
+        runs = ellipsoid_runs(options.settings, seeds)
         rows.append(row_of_each(runs))
-        if out is not None and begin == options.seed:
-            make_folder(out, "--out")
-            _write_picture(options, runs, out)
+        if out is not None and not files:
+            files += _files_of_first(options, runs)
         if progress is not None:
-            progress(len(runs.seeds))
+            progress(len(seeds))
     table = np.concatenate(rows)
-    if out is not None:
-        write_table(out / "ellipsoid-runs.csv", RUN_COLUMNS, table)
+    write_files(out, [*files, ("ellipsoid-runs.csv", table_text(dict(zip(RUN_COLUMNS, table.T, strict=True))))])
     error, half_width, resets, outside = table[:, 1], table[:, 2], table[:, 4], table[:, 5]
     return {
         "final_error_mean_deg": float(error.mean()),
@@ -138,12 +137,13 @@ def run_ellipsoid(
     }
 
 
-def _write_picture(options: EllipsoidOptions, runs: EllipsoidRuns, out: Path) -> None:
+def _files_of_first(options: EllipsoidOptions, runs: EllipsoidRuns) -> Iterator[tuple[str, Any]]:
+    """Yield the figure, and the first run through time."""
     import numpy as np
 
     from adcs.ellipsoids.roll_yaw import STEP_S, kalman_track, roll_yaw_system
     from adcs.plots.ellipsoids import RollYawPicture, roll_yaw_figure
-    from arrays.io.csv import write_table
+    from arrays.io.csv import table_text
     from magloc.plots import style
 
     system = roll_yaw_system(math.radians(options.noise_deg), math.radians(options.drift_deg_s))
@@ -159,7 +159,7 @@ def _write_picture(options: EllipsoidOptions, runs: EllipsoidRuns, out: Path) ->
     ]
     jump_s = JUMP_S if options.jump else None
     picture = RollYawPicture("; ".join(parts), time_s, runs.states_rad, runs.track, kalman, options.closed_loop, jump_s)
-    style.save(roll_yaw_figure(picture), out / "ellipsoid.png", dpi=130)
+    yield "ellipsoid.png", partial(style.save, roll_yaw_figure(picture), dpi=130)
     track, H, P = runs.track, runs.track.shapes[0], kalman.covariances
     columns = {
         "time_s": time_s,
@@ -171,7 +171,7 @@ def _write_picture(options: EllipsoidOptions, runs: EllipsoidRuns, out: Path) ->
         **_of_axes("kalman_", kalman.means),
         **_of_matrix("kalman_", P),
     }
-    write_table(out / "ellipsoid.csv", tuple(columns), np.stack(list(columns.values()), axis=1))
+    yield "ellipsoid.csv", table_text(columns)
 
 
 def _of_axes(name: str, angles_rad: FloatArray) -> dict[str, FloatArray]:
@@ -201,28 +201,20 @@ def summary_lines(options: EllipsoidOptions, result: dict[str, Any]) -> list[str
 def ellipsoid(
     *,
     options: EllipsoidOptions = EllipsoidOptions(),
-    out: Path | None = None,
-    json: Flag = False,
-    common: QuietOptions = QuietOptions(),  # noqa: B008 - frozen
+    report: ReportOptions = ReportOptions(),  # noqa: B008 - frozen
 ) -> None:
     """Yaw of a satellite from a horizon sensor and gyros, in guaranteed ellipsoids.
 
     Nothing measures yaw: the orbit turns it into roll and back. Of the errors only bounds are known, and the sets hold
-    the true attitude for certain.
+    the true attitude for certain. --out writes the figure and the data behind it.
 
     Parameters
     ----------
     options : EllipsoidOptions
         What is run.
-    out : Path, optional
-        Folder for the figure and the data behind it.
-    json : bool
-        Print one JSON object.
-    common : QuietOptions
-        Common options.
+    report : ReportOptions
+        Where the result goes.
     """
-    with progress(options.seeds, "runs", quiet=common.quiet) as advance:
-        result = run_ellipsoid(options, out, advance)
-    print_result(result, summary_lines(options, result), as_json=json)
-    if out is not None:
-        tell(common, f"wrote ellipsoid.png, ellipsoid.csv and ellipsoid-runs.csv into {out}")
+    with progress(options.seeds, "runs", quiet=report.quiet) as advance:
+        result = run_ellipsoid(options, report.out, advance)
+    report.print(result, summary_lines(options, result))

@@ -9,10 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import sims.experiments
-from adcs.cli.options import naming_options, tell, warn
-from arrays.io.arguments import Flag
-from arrays.io.outputs import refuse_file
-from magloc.cli.framework import QuietOptions, print_result, progress
+from adcs.cli.options import ReportOptions, naming_options, warn
+from magloc.cli.framework import progress
 from sims.cli.mockup_options import MockupOptions, value_or
 from sims.cli.mockup_replay import ReplayOptions
 from sims.experiments.mockup_settings import METHODS, SETTLED_S, Method
@@ -140,9 +138,7 @@ def mockup(
     *,
     options: MockupOptions = MockupOptions(),  # noqa: B008 - frozen
     replay: ReplayOptions = ReplayOptions(),  # noqa: B008 - frozen
-    out: Path | None = None,
-    json: Flag = False,
-    common: QuietOptions = QuietOptions(),  # noqa: B008 - frozen
+    report: ReportOptions = ReportOptions(),  # noqa: B008 - frozen
 ) -> None:
     """Table-top satellite that looks up at a sky of LEDs: star identification, zeros, and fusion of late fixes.
 
@@ -152,16 +148,12 @@ def mockup(
         What is run.
     replay : ReplayOptions
         Replay of the first drive.
-    out : Path, optional
-        Folder for figures and the data behind them.
-    json : bool
-        Print one JSON object.
-    common : QuietOptions
-        Common options.
+    report : ReportOptions
+        Where the result goes.
     """
     options.check()
-    replay.check(options, json=json)
-    refuse_file(out, "--out")
+    replay.check(options, json=report.json)
+    report.check()
     if replay.wanted:
         from sims.cli.mockup_replay import check_places, show_replay
 
@@ -169,20 +161,17 @@ def mockup(
     if options.frames is not None:
         told = _frames(options, options.frames)
     elif options.samples is not None and options.fixes is not None:
-        told = _recording(options.samples, options.fixes, options, common)
+        told = _recording(options.samples, options.fixes, options, report)
     else:
         kinds = {"sky": _sky, "zeros": _zeros, "fusion": _drives, "all": _drives}
-        told = kinds[options.part](options, common)
-    written = []
-    if out is not None:
-        from sims.cli.mockup_files import write_files
+        told = kinds[options.part](options, report)
+    if report.out is not None:
+        from sims.cli.mockup_files import files_of
 
-        written = write_files(options, told.run, out)
-    print_result(told.result, told.lines, as_json=json)
-    if written:
-        tell(common, f"wrote {', '.join(written)} into {out}")
+        report.write(files_of(options, told.run))
+    report.print(told.result, told.lines)
     if replay.wanted:
-        show_replay(told.run[0], options.table_camera(), replay, common)
+        show_replay(told.run[0], options.table_camera(), replay, report)
 
 
 class Told(NamedTuple):
@@ -203,37 +192,37 @@ def _frames(options: MockupOptions, frames: Path) -> Told:
     return Told(results, {"frames": entries, "identified": fixed}, frame_lines(entries))
 
 
-def _recording(samples: Path, fixes: Path, options: MockupOptions, common: QuietOptions) -> Told:
+def _recording(samples: Path, fixes: Path, options: MockupOptions, report: ReportOptions) -> Told:
     from sims.experiments.mockup_recording import record_lines
 
     run = sims.experiments.fused_record(samples, fixes, value_or(options.fusion, "ekf"))
-    warn(common, run.warnings)
+    warn(report, run.warnings)
     return Told(run, run.summary(), record_lines(run))
 
 
-def _sky(options: MockupOptions, common: QuietOptions) -> Told:
+def _sky(options: MockupOptions, report: ReportOptions) -> Told:
     setup, seeds = options.sky_setup(), options.runs(1)
     sky, matcher, finder = options.led_sky, options.sky_matcher(), options.finder()
-    with progress(setup.poses * len(seeds), "frames", quiet=common.quiet) as advance:
+    with progress(setup.poses * len(seeds), "frames", quiet=report.quiet) as advance:
         run = sims.experiments.sky_run(sky, matcher, setup, seeds, advance, finder)
     result = run.summary()
     return Told(run, result, sky_lines(options, result))
 
 
-def _zeros(options: MockupOptions, common: QuietOptions) -> Told:
+def _zeros(options: MockupOptions, report: ReportOptions) -> Told:
     seeds, unknowns, start_fixes = options.runs(6), value_or(options.unknowns, "six"), value_or(options.start_fixes, 4)
-    with progress(len(seeds), "runs", quiet=common.quiet) as advance, naming_options():
+    with progress(len(seeds), "runs", quiet=report.quiet) as advance, naming_options():
         runs = sims.experiments.zeros_run(
             unknowns, seeds, options.duration_s, start_fixes=start_fixes, progress=advance
         )
     return Told(runs, runs.summary(), zeros_lines(runs, options.duration_s))
 
 
-def _drives(options: MockupOptions, common: QuietOptions) -> Told:
+def _drives(options: MockupOptions, report: ReportOptions) -> Told:
     scenario, seeds = options.table_scenario(), options.runs(6)
     wanted = value_or(options.fusion, "ekf")
     methods: tuple[Method, ...] = METHODS if wanted == "all" else (wanted,)
-    with progress(len(seeds) * len(methods), "runs", quiet=common.quiet) as advance:
+    with progress(len(seeds) * len(methods), "runs", quiet=report.quiet) as advance:
         simulate = lru_cache(maxsize=len(seeds))(options.table_camera().run) if options.part == "all" else None
         every = [sims.experiments.fused_runs(method, scenario, seeds, advance, simulate) for method in methods]
     if wanted == "all":

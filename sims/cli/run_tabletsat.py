@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,11 +12,9 @@ from cyclopts import Parameter
 
 import adcs
 import sims.experiments
-from adcs.cli.options import ScenarioOptions, tell, warn
-from arrays.io.arguments import Count, Flag, Seed
+from adcs.cli.options import ReportOptions, ScenarioOptions, warn
 from arrays.io.errors import InputError
-from arrays.io.outputs import make_folder, refuse_file
-from magloc.cli.framework import QuietOptions, print_result, progress
+from magloc.cli.framework import Count, Seed, progress
 
 if TYPE_CHECKING:
     from adcs.io.scenario_files import AttitudeFile
@@ -52,6 +50,13 @@ class RunOptions:
         return range(self.seed, self.seed + self.seeds)
 
 
+def seed_batches(seed: int, runs: int, at_once: int) -> Iterator[range]:
+    """Yield the seeds of all runs, in batches that memory has room for."""
+    last = seed + runs
+    for first in range(seed, last, at_once):
+        yield range(first, min(first + at_once, last))
+
+
 def wanted(scenario: str, options: ScenarioOptions, duration_s: float | None) -> tuple[AttitudeFile, EstimatorSettings]:
     """The scenario with the options in it, and its filter."""
     from adcs.io.scenario_tables import MOST_STEPS
@@ -82,9 +87,7 @@ def run_attitude(
     *,
     options: ScenarioOptions = ScenarioOptions(),
     runs: RunOptions = RunOptions(),
-    out: Path | None = None,
-    json: Flag = False,
-    common: QuietOptions = QuietOptions(),  # noqa: B008 - frozen
+    report: ReportOptions = ReportOptions(),  # noqa: B008 - frozen
 ) -> None:
     """Simulate a satellite, estimate its attitude with a Kalman filter, and say how good that is.
 
@@ -102,12 +105,8 @@ def run_attitude(
         What differs from the scenario file.
     runs : RunOptions
         Runs.
-    out : Path, optional
-        Folder for figures and data.
-    json : bool
-        Print one JSON object.
-    common : QuietOptions
-        Common options.
+    report : ReportOptions
+        Where the result goes.
     """
     from adcs.io.scenario_files import built_in_scenarios
     from arrays.io.text import check_netcdf
@@ -122,28 +121,26 @@ def run_attitude(
             f"(the nearest is {nearest})."
         )
     file, estimate = wanted(scenario, options, runs.duration)
-    if out is not None:
-        refuse_file(out, "--out")
+    if report.out is not None:
+        report.check()
         check_netcdf()
     parts: list[Part] = []
-    with progress(runs.seeds, "runs", quiet=common.quiet) as advance:
+    with progress(runs.seeds, "runs", quiet=report.quiet) as advance:
         outcome = sims.experiments.run_scenario(
             file,
             estimate,
             runs.numbers,
-            through_time=out is not None,
-            look=None if out is None else parts.append,
+            through_time=report.out is not None,
+            look=None if report.out is None else parts.append,
             advance=advance,
         )
-    warn(common, outcome.warning_lines())
+    warn(report, outcome.warning_lines())
     numbers = outcome.numbers()
-    if out is not None:
-        from sims.cli.attitude_files import write_attitude_files
+    if report.out is not None:
+        from sims.cli.attitude_files import attitude_files
 
-        make_folder(out, "--out")
-        written = write_attitude_files(out, file, estimate, parts, outcome)
-        tell(common, f"wrote {', '.join(written)} into {out}")
-    print_result(numbers, summary_lines(file, estimate, numbers), as_json=json)
+        report.write(attitude_files(file, estimate, parts, outcome))
+    report.print(numbers, summary_lines(file, estimate, numbers))
 
 
 def summary_lines(file: AttitudeFile, estimate: EstimatorSettings, numbers: dict[str, Any]) -> Sequence[str]:

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from arrays.io.arguments import Flag
 from arrays.io.errors import InputError, naming
-from magloc.cli.framework import CommonOptions, print_json
+from magloc.cli.framework import CommonOptions, Flag, print_json
 from magloc.cli.options import naming_options, print_note
 
 

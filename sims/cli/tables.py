@@ -4,16 +4,12 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from itertools import groupby
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import sims.experiments
-from adcs.cli.options import tell
-from arrays.io.arguments import Flag
-from arrays.io.csv import write_columns
+from adcs.cli.options import ReportOptions
 from arrays.io.errors import InputError
-from arrays.io.outputs import make_folder, refuse_file
-from magloc.cli.framework import QuietOptions, print_result, progress
+from magloc.cli.framework import progress
 from sims.cli.run_tabletsat import RunOptions
 
 if TYPE_CHECKING:
@@ -23,9 +19,7 @@ if TYPE_CHECKING:
 def tables(
     *,
     options: RunOptions = RunOptions(),  # noqa: B008 - frozen
-    out: Path | None = None,
-    json: Flag = False,
-    common: QuietOptions = QuietOptions(),  # noqa: B008 - frozen
+    report: ReportOptions = ReportOptions(),  # noqa: B008 - frozen
 ) -> None:
     """Tables 3, 4 and 5 of Ivanov et al. (Keldysh Institute preprint 64, 2014): their value, ours, and the ratio.
 
@@ -33,33 +27,28 @@ def tables(
     deviation that the filter gives at the end, worst axis, the mean of the runs, and beside it the rms of its errors in
     the last minute. The attitude is half of the angle, as there. A number of ours that is more than three times off has
     a star, and below it is why. Runs of Table 3 take 200 s and all others 600 s, unless ``--duration`` says otherwise.
+    --out writes tables.csv.
 
     Parameters
     ----------
     options : RunOptions
         Runs of every row.
-    out : Path, optional
-        Folder for tables.csv.
-    json : bool
-        Print one JSON object.
-    common : QuietOptions
-        Common options.
+    report : ReportOptions
+        Where the result goes.
     """
-    refuse_file(out, "--out")
+    report.check()
     if options.duration is not None and not 1.0 <= options.duration <= 1e7:
         raise InputError(f"--duration: found {options.duration:g} s, expected 1 to 1e7 s.")
     rows = sims.experiments.PAPER_ROWS
     compared: list[Comparison] = []
-    with progress(len(rows), "rows", quiet=common.quiet) as advance:
+    with progress(len(rows), "rows", quiet=report.quiet) as advance:
         for row in rows:
             compared += sims.experiments.compared_with_paper(row, options.numbers, options.duration)
             advance(1)
-    if out is not None:
-        make_folder(out, "--out")
-        names = list(asdict(compared[0]))
-        write_columns({name: [getattr(one, name) for one in compared] for name in names}, out / "tables.csv")
-        tell(common, f"wrote tables.csv into {out}")
-    print_result({"rows": [asdict(one) for one in compared]}, table_lines(compared), as_json=json)
+    rows_as_dicts = [asdict(one) for one in compared]
+    columns = {name: [row[name] for row in rows_as_dicts] for name in rows_as_dicts[0]}
+    report.write([("tables.csv", columns)])
+    report.print({"rows": rows_as_dicts}, table_lines(compared))
 
 
 _TITLES = {3: "Table 3", 4: "Table 4, disturbance in the state", 5: "Table 5, constant gain"}

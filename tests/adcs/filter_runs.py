@@ -21,12 +21,15 @@ from adcs.kalman.error_state import (
     start_near,
     tuned_noise,
 )
+from adcs.kalman.mekf import run_filter
 from adcs.satellite import dynamics
 from adcs.satellite.satellite import Satellite
+from adcs.satellite.telemetry import Record
 from sims.attitude.scenario import AttitudeScenario, StartConditions
 from sims.attitude.simulation import AttitudeRuns, Prepared, prepare, simulate, start_estimates
 from sims.experiments.attitude import Part, outcome_of
 from tests.adcs.attitudes import commanded_torque, random_attitudes
+from tests.adcs.kalman.readable import run_readable
 
 Array = NDArray[np.float64]
 START_RAD, START_RAD_S = math.radians(5.0), math.radians(0.1)
@@ -79,6 +82,21 @@ def runs_for(used: SensorSet, duration_s: float, seeds: Iterable[int] = SEEDS) -
 def evaluate(runs: AttitudeRuns, estimates: AttitudeTracks) -> dict[str, Any]:
     """Accuracy over the last minute, as ``adcs run --json`` prints it."""
     return outcome_of(Part(runs, estimates)).numbers()
+
+
+def assert_as_readable(record: Record, chosen: FilterSettings, start: Start) -> AttitudeTracks:
+    """Tracks by the kernel, which must be those of the readable filter."""
+    fast, slow = run_filter(record, chosen, start), run_readable(record, chosen, start)
+    np.testing.assert_allclose(fast.q, slow.q, rtol=0, atol=1e-13)
+    assert list(fast.states) == list(slow.states)
+    scales = {"field-bias": 1e-6, "disturbance": 1e-6, "field-model": 1e-6, "dipole": 0.1}
+    for name, values in slow.states.items():
+        np.testing.assert_allclose(fast.states[name], values, rtol=0, atol=1e-10 * scales.get(name, 1e-3))
+    by_deviations = slow.sigma[..., :, None] * slow.sigma[..., None, :]
+    np.testing.assert_allclose(fast.covariance / by_deviations, slow.covariance / by_deviations, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(fast.nis, slow.nis, rtol=1e-7, atol=1e-7)
+    np.testing.assert_allclose(fast.log_det, slow.log_det, rtol=1e-7, atol=1e-9)
+    return fast
 
 
 def followed(prepared: Prepared) -> AttitudeRuns:

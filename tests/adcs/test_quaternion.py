@@ -146,12 +146,3 @@ class TestDerivative:
         central = (quat.multiply(Q[0], quat.exp(step * w)) - quat.multiply(Q[0], quat.exp(-step * w))) / (2 * step)
         np.testing.assert_allclose(quat.derivative(Q[0], w), central, rtol=0, atol=1e-9)
         np.testing.assert_allclose(quat.matrix(quat.exp(w)), expm(cross_matrix(w)), rtol=0, atol=1e-14)
-
-
-class TestRandomAttitudes:
-    def test_uniform(self) -> None:
-        # The mean of R over all rotations is zero; each entry has variance 1/3. Five standard deviations of nine
-        # entries fail by chance once in 200,000.
-        n = 3000
-        mean = quat.matrix(random_attitudes(n, np.random.default_rng(0))).mean(axis=0)
-        assert np.abs(mean).max() < 5.0 / np.sqrt(3 * n)

@@ -205,9 +205,6 @@ class TestGeometryForm:
             for sensor in tetrahedron(1.5).sensors
         )
 
-    def test_empty_name(self, write: WriteFile) -> None:
-        assert read_array(write(f'name = ""\n{GEOMETRY}')).name == ""
-
     @pytest.mark.parametrize("text", [b"\xef\xbb\xbf" + GEOMETRY.encode(), GEOMETRY.replace("\n", "\r\n")])
     def test_byte_order_mark_and_line_ends(self, write: WriteFile, text: str | bytes) -> None:
         assert read_array(write(text)) == tetrahedron(1.5)
@@ -299,18 +296,6 @@ class TestRoundTrip:
         path = tmp_path_factory.getbasetemp() / "any.toml"
         write_array(path, array)
         assert read_array(path) == array
-
-    @given(positive)
-    def test_any_noise(self, tmp_path_factory: pytest.TempPathFactory, noise_T: float) -> None:
-        path = tmp_path_factory.getbasetemp() / "noise.toml"
-        write_array(path, tetrahedron(1.0, noise_T=noise_T))
-        assert read_array(path).sensors[0].noise_T == noise_T
-
-    @pytest.mark.parametrize("name", GEOMETRIES)
-    def test_geometries(self, tmp_path: Path, name: str) -> None:
-        array = GEOMETRIES[name].make(1.1)
-        write_array(tmp_path / "array.toml", array)
-        assert read_array(tmp_path / "array.toml") == array
 
     def test_defaults_are_left_out(self) -> None:
         assert set(tomllib.loads(array_toml(tetrahedron(1.5)))) == {"format_version", "name", "sensor"}
@@ -421,9 +406,6 @@ class TestRefused:
             ("edge_m", "arm_m", ("key arm_m", "the size of another geometry", "expected edge_m")),
             ("edge_m", "edge_cm", ("key edge_cm", "unknown key", "nearest is edge_m")),
             ("edge_m = 1.5", "edge_m = 0", ("edge_m must be a positive finite number", "received 0.0")),
-            ("edge_m = 1.5", "edge_m = -1.5", ("edge_m must be a positive finite number", "-1.5")),
-            ("edge_m = 1.5", "edge_m = inf", ("edge_m must be a positive finite number", "inf")),
-            ("edge_m = 1.5", "edge_m = nan", ("edge_m must be a positive finite number", "nan")),
             ("edge_m = 1.5", 'edge_m = "1.5"', ("key edge_m", "found text, expected a number")),
             ("edge_m = 1.5", "edge_m = true", ("key edge_m", "found a truth value, expected a number")),
             ('kind = "vector"', 'kind = "vektor"', ("kind must be 'vector' or 'scalar'", "'vektor'")),
@@ -431,17 +413,13 @@ class TestRefused:
             ("noise_nT = 1.0", "", ("found no key noise_nT",)),
             ("noise_nT", "noise_T", ("key noise_T", "nearest is noise_nT")),
             ("noise_nT = 1.0", "noise_nT = 0.0", ("key noise_nT", "found 0.0, expected a positive number")),
-            ("noise_nT = 1.0", "noise_nT = -1", ("key noise_nT", "found -1, expected a positive number")),
             ("noise_nT = 1.0", "noise_nT = inf", ("key noise_nT", "expected a finite number")),
-            ("noise_nT = 1.0", "noise_nT = nan", ("key noise_nT", "expected a finite number")),
-            ("noise_nT = 1.0", "noise_nT = 1e400", ("key noise_nT", "expected a finite number")),
             ("noise_nT = 1.0", 'noise_nT = "1"', ("key noise_nT", "found text, expected a number")),
             ("noise_nT = 1.0", "noise_nT = 1.0\nname = 1", ("key name", "found a whole number, expected text")),
             ("noise_nT = 1.0", 'noise_nT = 1.0\nname = "a\\nb"', ("name must be one line", "'a\\nb'")),
             ("noise_nT = 1.0", "noise_nT = 1.0\nformat_version = 2", ("key format_version", "found 2, expected 1")),
             ("noise_nT = 1.0", "noise_nT = 1.0\nnoise_fraction = -0.1", ("noise_fraction must not be negative",)),
             ("noise_nT = 1.0", "noise_nT = 1.0\ncommon_field_nT = -1", ("key common_field_nT", "not negative")),
-            ("noise_nT = 1.0", "noise_nT = 1.0\ncommon_field_nT = inf", ("key common_field_nT", "finite")),
             (
                 "noise_nT = 1.0",
                 "noise_nT = 1.0\nambient_nT = 5",
@@ -453,11 +431,6 @@ class TestRefused:
                 "noise_nT = 1.0",
                 "noise_nT = 1.0\nambient_gradient_nT_m = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]",
                 ("ambient_gradient_T_m must be traceless",),
-            ),
-            (
-                "noise_nT = 1.0",
-                "noise_nT = 1.0\nambient_gradient_nT_m = [[0, 1, 0], [2, 0, 0], [0, 0, 0]]",
-                ("ambient_gradient_T_m must be symmetric",),
             ),
             (
                 "noise_nT = 1.0",
@@ -480,7 +453,6 @@ class TestRefused:
                 "noise_nT = 1.0\nmisalignment_mrad = 1000",
                 ("key misalignment_mrad", "found 1000, expected a number from 0 to below 1000"),
             ),
-            ("noise_nT = 1.0", "noise_nT = 1.0\nmisalignment_mrad = -1", ("key misalignment_mrad", "found -1")),
             (
                 "noise_nT = 1.0",
                 "noise_nT = 1.0\noffset_uncertainty_nT = -0.5",
@@ -488,9 +460,7 @@ class TestRefused:
             ),
             ("noise_nT = 1.0", "noise_nT = 1.0\nflicker_nT = -1", ("key flicker_nT", "found -1")),
             ("noise_nT = 1.0", "noise_nT = 1.0\ndrift_nT_rth = inf", ("key drift_nT_rth", "finite")),
-            ("noise_nT = 1.0", "noise_nT = 1.0\nflicker_nt = 1", ("nearest is flicker_nT",)),
             ("noise_nT = 1.0", "noise_nT = 1.0\ngain_uncertainty = 2", ("gain_uncertainty must be from 0 to below 1",)),
-            ("noise_nT = 1.0", "noise_nT = 1.0\ngain_uncertainity = 2", ("nearest is gain_uncertainty",)),
             ("noise_nT = 1.0", "noise_nT = 1.0\n[[sensor]]", ("keys geometry and sensor", "found both")),
         ],
     )
@@ -501,27 +471,20 @@ class TestRefused:
         ("old", "new", "parts"),
         [
             ('id = "s1"', "", ("sensor number 1", "found no key id")),
-            ('id = "s1"', 'id = ""', ("sensor number 1", "id must be printable text", "''")),
-            ('id = "s1"', 'id = "a,b"', ("id must be printable text without commas", "'a,b'")),
             ('id = "s1"', 'id = "a\\nb"', ("sensor number 1", "id must be printable text", "'a\\nb'")),
             ('id = "s1"', "id = 1", ("sensor number 1", "key id", "found a whole number, expected text")),
             ('id = "s1"', 'id = "s2"', ("sensors must have different ids", "'s2' 2 times")),
             ('id = "s2"', 'id = "s1_x"', ("sensors must have different columns", "s1_x_nT")),
-            ('id = "s1"', 'id = "ambient"', ("sensors must have different columns", "ambient_x_nT")),
             ('kind = "vector"', 'kind = "tensor"', ("sensor s1", "kind must be 'vector' or 'scalar'", "'tensor'")),
             ('kind = "vector"', "", ("sensor s1", "found no key kind")),
             ("[0.0, 0.0, 0.918]", "[0.0, 0.918]", ("sensor s1, key position_m", "length 2", "length 3")),
             ("[0.0, 0.0, 0.918]", "0.918", ("sensor s1, key position_m", "found a number, expected a list")),
             ("[0.0, 0.0, 0.918]", '[0.0, 0.0, "up"]', ("sensor s1, key position_m[2]", "found text")),
-            ("[0.0, 0.0, 0.918]", "[0.0, 0.0, nan]", ("sensor s1", "position_m must be finite")),
             ("[0.0, 0.0, 0.918]", "[0.0, 0.0, 1e300]", ("sensor s1", "position_m must be 1e+30 at most")),
             ("[0.0, 0.0, 0.918]", "[0.0, 0.0, 2e9]", ("sensors must stand within 1e+09 m",)),
-            ("[0.0, 0.0, 0.918]", "[1.0, 0.0, 0.0]", ("sensors must stand in two places at least",)),
             ("noise_nT = 1.0", "noise_nT = 0", ("sensor s1, key noise_nT", "expected a positive number")),
-            ("noise_nT = 1.0", "noise_nT = nan", ("sensor s1, key noise_nT", "expected a finite number")),
             ("noise_nT = 1.0", "nose_nT = 1.0", ("sensor s1, key nose_nT", "nearest is noise_nT")),
             ("[[sensor]]", "kind = 'vector'\n[[sensor]]", ("key kind", "found at the top", "each [[sensor]]")),
-            ("[[sensor]]", "saturation_nT = 5\n[[sensor]]", ("key saturation_nT", "found at the top")),
             ("[[sensor]]", "nmae = 'x'\n[[sensor]]", ("key nmae", "unknown key", "nearest is name")),
             (SENSORS, "name = 'x'", ("found neither the key geometry nor [[sensor]] tables",)),
             (SENSORS, "sensor = []", ("sensors must be at least 1; instead received 0",)),
@@ -542,19 +505,13 @@ class TestRefused:
         ("kind", "line", "parts"),
         [
             ("vector", "rotation_xyzw = [0, 0, 0, 2]", ("rotation_xyzw must be a quaternion of norm 1", "norm 2")),
-            ("vector", "rotation_xyzw = [0, 0, 0, 0.99999]", ("rotation_xyzw must be a quaternion of norm 1",)),
             ("vector", "rotation_xyzw = [0, 0, 1]", ("key rotation_xyzw", "length 3", "length 4")),
             ("scalar", "misalignment_mrad = 1.0", ("misalignment_rad must be 0 for a scalar sensor",)),
-            ("vector", "misalignment_mrad = inf", ("key misalignment_mrad", "finite")),
             ("vector", "saturation_nT = -5", ("key saturation_nT", "found -5, expected a positive number")),
             ("vector", "calibration = 2.0", ("key calibration", "found a number, expected a table")),
             ("vector", "calibration.scal = 1", ("key calibration.scal", "nearest is calibration.scale")),
             ("vector", "calibration.scale = 'x'", ("key calibration.scale", "expected a number or a list")),
             ("vector", "calibration.scale = 0", ("scale must be a regular matrix",)),
-            ("vector", "calibration.scale = [1, 2]", ("scale must be a number, 3 numbers or a 3×3 matrix",)),
-            ("vector", "calibration.scale = [[1, 2], [1]]", ("scale must be an array of numbers",)),
-            ("vector", "calibration.scale = inf", ("scale must be finite",)),
-            ("scalar", "calibration.scale = [1, 1, 1]", ("scale must be a number",)),
             (
                 "vector",
                 "calibration.offset_nT = 1",
@@ -600,11 +557,6 @@ rotation_xyzw = [1, 0, 0, 0]
         assert [sensor.noise_T for sensor in array.sensors] == [15e-9, 1e-10, 15e-9]
         np.testing.assert_allclose(array.sensors[0].rotation_xyzw, [0, 0, np.sqrt(0.5), np.sqrt(0.5)], rtol=1e-15)
         assert array.sensors[2].rotation_xyzw == (1.0, 0.0, 0.0, 0.0)
-
-    def test_survive_writing(self, write: WriteFile, tmp_path: Path) -> None:
-        array = read_array(write(self.BOARD))
-        write_array(tmp_path / "again.toml", array)
-        assert read_array(tmp_path / "again.toml") == array
 
     @pytest.mark.parametrize(
         ("old", "new", "fragments"),

@@ -10,6 +10,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cached_property
 from pathlib import Path
 from threading import Thread
 from types import FrameType
@@ -124,7 +125,7 @@ class TestGuard:
         def method(self) -> set[int]:
             return threads()
 
-        @property
+        @cached_property
         def seen(self) -> set[int]:
             return threads()
 
@@ -139,7 +140,7 @@ class TestGuard:
         def fails(self) -> None:
             raise ZeroDivisionError
 
-    def test_methods_properties_and_steps(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_methods_cached_properties_and_steps(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(magloc, "Thing", self.Thing, raising=False)
         guard_public({"Thing": "magloc"})
         thing = self.Thing()

@@ -66,9 +66,6 @@ class TestTetrahedron:
         assert positions[0, 1] == 0.0
         assert positions[1, 1] > 0.0
 
-    def test_circumradius(self) -> None:
-        assert_allclose(tetrahedron(2.0).circumradius, 2.0 * np.sqrt(3 / 8), rtol=1e-15)
-
 
 class TestPlanar:
     """Shapes in the x-y plane, counter-clockwise."""

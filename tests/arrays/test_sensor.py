@@ -351,11 +351,6 @@ class TestSensorArray:
             assert_allclose(mixed.channel_gain[3, 0], response[3], rtol=1e-15)
         assert_array_equal(mixed.channel_gain[3, 1:], 0.0)
 
-    def test_rotation_matrices_are_rotations(self) -> None:
-        matrices = random_array(11).rotation_matrices
-        assert_allclose(matrices @ matrices.transpose(0, 2, 1), np.tile(np.eye(3), (3, 1, 1)), rtol=0.0, atol=1e-15)
-        assert_allclose(np.linalg.det(matrices), 1.0, rtol=1e-15)
-
     @pytest.mark.parametrize("name", ARRAY_PROPERTIES)
     def test_read_only(self, mixed: SensorArray, name: str) -> None:
         value: NDArray[np.float64] = getattr(mixed, name)

@@ -17,8 +17,8 @@ from magloc.measurement.differences import DifferenceMeasurement
 from magloc.readings import Readings
 from magloc.state_space import IteratedExtendedKalmanFilter
 from magloc.tracking.motion import RandomWalk
-from magloc.tracking.results import Row as TrackRow
-from magloc.tracking.results import rows_of
+from magloc.tracking.rows import Row as TrackRow
+from magloc.tracking.rows import rows_of
 from magloc.tracking.tracker import Tracker
 from sims.magnetics.scenario_files import read_scenario
 from sims.magnetics.simulation import simulate

@@ -17,6 +17,7 @@ from tests.bench.filters import TIME, functions, stonesoup_update
 from tests.bench.fixes import best_fit
 from tests.bench.table import Row
 from tests.bench.timing import Contestant, Size, installed, interleaved
+from tests.magloc.convergence.readable_filters import run_one
 from tests.plain_locator import plain_locator
 
 TITLE = (
@@ -107,7 +108,7 @@ def our_loop(measurement: DifferenceMeasurement, z: np.ndarray, method: Repeated
     """The readable twin."""
 
     def loop(start: np.ndarray) -> tuple[np.ndarray, bool]:
-        update = method.run_one(measurement, z, start)
+        update = run_one(method, measurement, z, start)
         return update.x, update.converged
 
     return loop

@@ -7,7 +7,7 @@ import random
 import pytest
 from cyclopts import Token
 
-from arrays.io.arguments import whole_number
+from magloc.cli.framework import whole_number
 from tests.fuzz.cases import LINES, SELDOM, STREAM, commands, parsed_arguments
 from tests.fuzz.extremes import extremes
 from tests.fuzz.runner import Case, extreme_case, judged, read_files, report, run_case, verdict

@@ -6,6 +6,7 @@ See docs/theory/tabletop-vision.md.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -91,7 +92,8 @@ class Camera:
                 raise ValueError(f"Input {name} must be a positive whole number; instead received {value}.")
         check_positive(m_per_px=self.m_per_px)
         check_not_negative(exposure_s=self.exposure_s)
-        centre = self.centre_px or (0.5 * (self.width_px - 1), 0.5 * (self.height_px - 1))
+        middle = 0.5 * (self.width_px - 1), 0.5 * (self.height_px - 1)
+        centre: Sequence[float] = middle if self.centre_px is None else self.centre_px
         if len(centre) != 2 or not all(map(math.isfinite, centre)):
             raise ValueError(f"Input centre_px must be two finite numbers; instead received {self.centre_px}.")
         object.__setattr__(self, "centre_px", (float(centre[0]), float(centre[1])))

@@ -11,11 +11,10 @@ from cyclopts import Parameter
 
 import arrays
 import magloc
-from arrays.io.arguments import Flag
 from arrays.io.errors import InputError, naming
-from arrays.io.outputs import make_folder, refuse_file, refuse_unwritable
+from arrays.io.outputs import refuse_file, refuse_unwritable, write_files
 from arrays.io.tables import aligned
-from magloc.cli.framework import CommonOptions, print_result
+from magloc.cli.framework import CommonOptions, Flag, print_result
 from magloc.cli.options import array_of_several, print_note, refuse_not_positive
 
 if TYPE_CHECKING:
@@ -149,7 +148,7 @@ def calibrate(
     arrays.write_array(out, result.array)
     print_result(report, lines, as_json=json)
     if figures is not None:
-        _draw(result, figures, quiet=common.quiet)
+        _draw(result, figures)
     if not (json or common.quiet):
         for note in notes:
             print_note(note)
@@ -166,15 +165,13 @@ def _check_converged(result: SourceCalibration, readings: Path, out: Path) -> No
         )
 
 
-def _draw(result: SourceCalibration | TurningCalibration, folder: Path, *, quiet: bool) -> None:
+def _draw(result: SourceCalibration | TurningCalibration, folder: Path) -> None:
     from magloc.calibration.results import TurningCalibration
     from magloc.plots.calibrations import columns_of_calibration
 
-    make_folder(folder, "--figures")
     name = "turning" if isinstance(result, TurningCalibration) else "calibration"
-    magloc.plots.write(result.plot(), folder / f"{name}.png", columns_of_calibration(result))
-    if not quiet:
-        print_note(f"wrote {name}.png and {name}.csv into {folder}/")
+    files = {f"{name}.png": result.plot(), f"{name}.csv": columns_of_calibration(result)}
+    write_files(folder, files.items(), "--figures")
 
 
 def _prior(options: PriorOptions, array: SensorArray, path: Path) -> CalibrationPrior:

@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 import arrays
-from arrays.io.arguments import Count
 from arrays.io.errors import InputError, naming
 from arrays.io.outputs import refuse_unwritable
 from arrays.io.text import write_text
-from magloc.cli.framework import QuietOptions
+from magloc.cli.framework import Count, QuietOptions
 from magloc.cli.options import print_note, refuse_not_positive
 
 if TYPE_CHECKING:

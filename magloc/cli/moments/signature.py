@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 import magloc
-from arrays.io.arguments import Flag
 from arrays.io.errors import LARGEST, InputError, naming
-from magloc.cli.framework import CommonOptions, print_result
+from magloc.cli.framework import CommonOptions, Flag, print_result
 from magloc.cli.moments.known_path import PathErrorOptions, refuse_bounds
 from magloc.cli.options import KnownOptions, ambient_field, print_note
 

@@ -9,9 +9,7 @@ from typing import Any
 import numpy as np
 
 from arrays.typing import BoolArray, FloatArray, IntArray
-from magloc.localization.fit.results import Intervals, Solution, Source, intervals_of
-
-_NUMBERS = ("of_row", "n_sources", "chi2", "dof", "weight", "iterations", "known_chi2", "n_known")
+from magloc.localization.fit.results import EVERYWHERE, Intervals, Solution, Source, intervals_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,24 +49,8 @@ class Solutions:
     @classmethod
     def none(cls) -> Solutions:
         """No solution of any row."""
-        whole, number = np.zeros(0, dtype=np.intp), np.zeros(0)
-        flags, vectors = np.zeros((0, 1), dtype=bool), np.zeros((0, 1, 3))
-        return cls(
-            whole,
-            whole,
-            vectors,
-            vectors,
-            np.zeros((0, 6, 6)),
-            number,
-            whole,
-            number,
-            whole,
-            np.zeros((0, 1, 1, 2)),
-            flags,
-            flags,
-            number,
-            whole,
-        )
+        one = Solution((Source(np.zeros(3), np.zeros(3), np.eye(6), EVERYWHERE),), np.eye(6), 0.0, 0)
+        return cls._of_one(0, one).chosen(np.zeros(0, dtype=np.intp))
 
     @classmethod
     def of(cls, solutions: Sequence[tuple[int, Solution]]) -> Solutions:
@@ -103,26 +85,20 @@ class Solutions:
             return filled[0] if filled else cls.none()
         of_row = np.concatenate([part.of_row for part in filled])
         order = None if (of_row[1:] >= of_row[:-1]).all() else np.argsort(of_row, kind="stable")
-        most = max(part.position_m.shape[1] for part in filled)
-        size = max(part.covariance.shape[1] for part in filled)
-        widest = max(part.ranges.shape[2] for part in filled)
 
-        def stacked(name: str, shape: tuple[int, ...], empty: float) -> Any:
+        def stacked(name: str) -> Any:
+            """Values of all parts, padded to the most sources and intervals of any."""
             values = [getattr(part, name) for part in filled]
-            result = np.full((sum(map(len, filled)), *shape), empty, dtype=values[0].dtype)
+            shape = np.max([value.shape[1:] for value in values], axis=0).astype(int)
+            empty = np.nan if values[0].dtype.kind == "f" else 0
+            result = np.full((len(of_row), *shape), empty, dtype=values[0].dtype)
             begin = 0
             for value in values:
                 result[(slice(begin, begin + len(value)), *map(slice, value.shape[1:]))] = value
                 begin += len(value)
             return result if order is None else result[order]
 
-        return cls(
-            **{name: stacked(name, (), 0) for name in _NUMBERS},
-            **{name: stacked(name, (most, 3), np.nan) for name in ("position_m", "moment_Am2")},
-            **{name: stacked(name, (most,), False) for name in ("gaussian", "merged")},
-            covariance=stacked("covariance", (size, size), np.nan),
-            ranges=stacked("ranges", (most, widest, 2), np.nan),
-        )
+        return cls(**{name: stacked(name) for name in vars(filled[0])})
 
     def chosen(self, index: IntArray | BoolArray, of_row: IntArray | None = None) -> Solutions:
         """Some of the solutions, of other rows if these are named."""

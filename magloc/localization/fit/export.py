@@ -1,46 +1,144 @@
-"""Fixes for other programs: xarray datasets and GeoJSON."""
+"""Fixes for other programs: columns, xarray datasets and GeoJSON."""
 
 from __future__ import annotations
 
-from importlib import metadata
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import xarray as xr
 
-from arrays.typing import IntArray
-from magloc.localization.fit.results import spans
+from arrays.io.csv import Column
+from arrays.io.results import Quantity
+from arrays.io.world_maps import feature, feature_collection
+from arrays.typing import BoolArray, FloatArray, IntArray
+from magloc.chi_square import square_columns
+from magloc.localization.fit.results import is_observable, spans
+from magloc.truth import STATE_COLUMNS, STATE_QUANTITIES, state_columns
 
 if TYPE_CHECKING:
+    import xarray as xr
+
     from magloc.localization.fit.fixes import Fixes
 
-_UNITS = {
-    "position_m": ("m", "position of the source"),
-    "moment_Am2": ("A m2", "magnetic moment of the source"),
-    "covariance": ("m, A m2", "covariance of (position, moment)"),
-    "range_low_m": ("m", "least distance from the sensors' centroid, 95 % set"),
-    "range_high_m": ("m", "largest distance from the sensors' centroid, 95 % set; infinite where it is open"),
-    "gaussian": ("1", "whether the covariance describes the uncertainty"),
-    "merged": ("1", "whether the source stands for two"),
-    "chi2": ("1", "sum of squared residuals of the decorrelated differences"),
-    "dof": ("1", "differences minus unknowns"),
-    "weight": ("1", "probability that the solution is the right one"),
-    "n_sources": ("1", "sources of the solution"),
-    "detected": ("1", "whether the readings stand out of noise"),
-    "misfit": ("1", "whether χ² is far beyond noise"),
-    "body_length_m": ("m", "length of the object that was taken into account, 0 for a point"),
-    "body_factor": ("1", "errors over their standard deviations, rms, if a point were a quarter of its distance long"),
-    "too_near": ("1", "whether the source is too near for a dipole"),
-    "dropped_sensors": ("1", "sensors that contradict all others"),
-    "saturated_channels": ("1", "channels whose reading saturates"),
-    "reason": ("1", "why there is no solution"),
+QUANTITIES = STATE_QUANTITIES | {
+    "range_low_m": Quantity("m", "least distance from the sensors' centroid, 95 % set"),
+    "range_high_m": Quantity("m", "largest distance from the sensors' centroid, 95 % set; infinite where open"),
+    "gaussian": Quantity("1", "whether the covariance describes the uncertainty"),
+    "merged": Quantity("1", "whether the source stands for two"),
+    "chi2": Quantity("1", "sum of squared residuals of the decorrelated differences"),
+    "dof": Quantity("1", "differences minus unknowns"),
+    "weight": Quantity("1", "probability that the solution is the right one"),
+    "n_sources": Quantity("1", "sources of the solution"),
+    "detected": Quantity("1", "whether the readings stand out of noise"),
+    "misfit": Quantity("1", "whether χ² is far beyond noise"),
+    "body_length_m": Quantity("m", "length of the object that was taken into account, 0 for a point"),
+    "body_factor": Quantity(
+        "1", "errors over standard deviations, rms, if a point were a quarter of its distance long"
+    ),
+    "too_near": Quantity("1", "whether the source is too near for a dipole"),
+    "dropped_sensors": Quantity("1", "sensors that contradict all others"),
+    "saturated_channels": Quantity("1", "channels whose reading saturates"),
+    "reason": Quantity("1", "why there is no solution"),
 }
-
+"""Variables of :meth:`magloc.localization.fit.fixes.Fixes.to_xarray`."""
 _OF_ROWS = ("detected", "misfit", "too_near", "body_length_m", "body_factor")
 
 
+@dataclass(frozen=True, eq=False)
+class FixColumns:
+    """Sources of the best solutions of all rows, k of them; NaN where a row has none.
+
+    Attributes
+    ----------
+    row : ndarray of int, shape (k,)
+        Which row a source belongs to.
+    source : ndarray of int, shape (k,)
+        Its number in the row, from 1; 0 where a row has no solution.
+    time_s, chi2 : ndarray, shape (k,)
+    dof : ndarray of int, shape (k,)
+    position_m, moment_Am2 : ndarray, shape (k, 3)
+    covariance : ndarray, shape (k, 6, 6)
+        Of (position, moment); zero for a position that is known beforehand.
+    range_observable : ndarray of bool, shape (k,)
+    range95_m : ndarray, shape (k, 2)
+        Least and largest distance from the sensors' centroid within the 95 % interval; infinite where it is open.
+    """
+
+    row: IntArray
+    source: IntArray
+    time_s: FloatArray
+    chi2: FloatArray
+    dof: IntArray
+    position_m: FloatArray
+    moment_Am2: FloatArray
+    covariance: FloatArray
+    range_observable: BoolArray
+    range95_m: FloatArray
+
+    @property
+    def first(self) -> BoolArray:
+        """One source of every row, for what belongs to the row."""
+        return self.source <= 1
+
+
+def fix_columns(fixes: Fixes) -> FixColumns:
+    """Sources of the best solutions of all rows."""
+    columns, best = fixes.solutions, fixes.best
+    number = np.where(fixes.solved, columns.n_sources[best] if len(columns) else 0, 1)
+    row = np.repeat(np.arange(len(fixes)), number)
+    solved = fixes.solved[row]
+    place = np.arange(len(row)) - np.repeat(np.cumsum(number) - number, number)
+    at = best[row][solved], place[solved]
+    n = len(row)
+    position, moment, intervals = np.full((n, 3), np.nan), np.full((n, 3), np.nan), np.full((n, 2), np.nan)
+    covariance = np.full((n, 6, 6), np.nan)
+    position[solved], moment[solved] = columns.position_m[at], columns.moment_Am2[at]
+    of_source = columns.covariance_of_source[at]
+    n_known = 6 - of_source.shape[1]  # a position that is known is exact
+    covariance[solved] = 0.0
+    covariance[solved, n_known:, n_known:] = of_source
+    intervals[solved] = spans(columns.ranges[at])
+    return FixColumns(
+        row=row,
+        source=np.where(solved, place + 1, 0),
+        time_s=fixes.time_s[row],
+        chi2=fixes.chi2[row],
+        dof=fixes.dof[row],
+        position_m=position,
+        moment_Am2=moment,
+        covariance=covariance,
+        range_observable=is_observable(*intervals.T),
+        range95_m=intervals,
+    )
+
+
+def distances_from_truth(columns: FixColumns, truth_m: FloatArray) -> FloatArray:
+    """Distance of every source from the truth (n, 3) of its row, in the coordinates that are known of it (k,) [m]."""
+    offset = columns.position_m - truth_m[columns.row]
+    known = np.isfinite(truth_m[columns.row])
+    distance = np.sqrt(np.where(known, offset**2, 0.0).sum(axis=1))
+    return np.where(known.any(axis=1), distance, np.nan)
+
+
+def columns_of_fixes(fixes: Fixes, truth_m: FloatArray | None = None) -> dict[str, Column]:
+    """Return the columns of fixes.csv, with the errors against a truth (n, 3) [m]."""
+    found = fix_columns(fixes)
+    columns: dict[str, Column] = {"time_s": found.time_s, "source": found.source}
+    columns |= state_columns(found.position_m, found.moment_Am2, found.covariance)
+    columns |= square_columns("chi2", found.chi2, found.dof)
+    columns |= {"range95_low_m": found.range95_m[:, 0], "range95_high_m": found.range95_m[:, 1]}
+    columns["range_observable"] = found.range_observable
+    if truth_m is not None:
+        columns |= dict(zip((f"true_{name}" for name in STATE_COLUMNS), truth_m[found.row].T, strict=False))
+        columns["error_m"] = distances_from_truth(found, truth_m)
+    columns |= {name: getattr(fixes, name)[found.row] for name in ("detected", "misfit", "too_near", "body_length_m")}
+    columns["dropped_sensors"] = [" ".join(fixes.dropped_sensors[row]) for row in found.row]
+    columns["reason"] = [fixes.reason[row] for row in found.row]
+    return columns | {"body_factor": fixes.body_factor[found.row]}
+
+
 def dataset_of_fixes(fixes: Fixes, which: Literal["best", "all"]) -> xr.Dataset:
-    """:meth:`magloc.localization.fit.fixes.Fixes.to_xarray`."""
+    """Return fixes as a dataset, see :meth:`magloc.localization.fit.fixes.Fixes.to_xarray`."""
     columns = fixes.solutions
     n = len(fixes)
     at: tuple[IntArray, ...]
@@ -62,37 +160,35 @@ def dataset_of_fixes(fixes: Fixes, which: Literal["best", "all"]) -> xr.Dataset:
         full[at] = values
         return full
 
-    blocks = columns.covariance_of_source[chosen]
-    source = (*leading, "source")
-    variables = {
-        "position_m": ((*source, "axis"), table(columns.position_m[chosen], np.nan)),
-        "moment_Am2": ((*source, "axis"), table(columns.moment_Am2[chosen], np.nan)),
-        "covariance": ((*source, "component", "component_"), table(blocks, np.nan)),
-        "range_low_m": (source, table(ends[..., 0], np.nan)),
-        "range_high_m": (source, table(ends[..., 1], np.nan)),
-        "gaussian": (source, table(columns.gaussian[chosen], False)),
-        "merged": (source, table(columns.merged[chosen], False)),
-        **{name: (leading, table(getattr(columns, name)[chosen], np.nan)) for name in ("chi2", "weight")},
-        **{name: (leading, table(getattr(columns, name)[chosen], 0)) for name in ("dof", "n_sources")},
-        **{name: ("row", getattr(fixes, name)) for name in _OF_ROWS},
-        **{
-            name: ("row", np.array([" ".join(names) for names in getattr(fixes, name)], dtype=str))
-            for name in ("dropped_sensors", "saturated_channels")
-        },
-        "reason": ("row", np.array(fixes.reason, dtype=str)),
+    of_source = {
+        "position_m": columns.position_m[chosen],
+        "moment_Am2": columns.moment_Am2[chosen],
+        "covariance": columns.covariance_of_source[chosen],
+        "range_low_m": ends[..., 0],
+        "range_high_m": ends[..., 1],
     }
-    dataset = xr.Dataset(variables, coords={"time_s": ("row", fixes.time_s), "axis": list("xyz")})
-    for name, (unit, words) in _UNITS.items():
-        dataset[name].attrs = {"units": unit, "long_name": words}
-    dataset["time_s"].attrs = {"units": "s", "long_name": "time"}
-    dataset.attrs = {"frame": fixes.frame, "source": f"magloc {metadata.version('magloc')}, locate"}
+    of_rows: dict[str, Any] = {"time_s": fixes.time_s} | {name: getattr(fixes, name) for name in _OF_ROWS}
+    for name in ("dropped_sensors", "saturated_channels"):
+        of_rows[name] = np.array([" ".join(names) for names in getattr(fixes, name)], dtype=str)
+    of_rows["reason"] = np.array(fixes.reason, dtype=str)
+    source = (*leading, "source")
+    dataset = fixes.dataset(
+        {
+            name: ((*source, *fixes.quantities[name].dimensions), table(values, np.nan))
+            for name, values in of_source.items()
+        }
+        | {name: (source, table(getattr(columns, name)[chosen], False)) for name in ("gaussian", "merged")}
+        | {name: (leading, table(getattr(columns, name)[chosen], np.nan)) for name in ("chi2", "weight")}
+        | {name: (leading, table(getattr(columns, name)[chosen], 0)) for name in ("dof", "n_sources")}
+        | {name: (("row",), values) for name, values in of_rows.items()}
+    )
     if which == "all":
         dataset.attrs["solution"] = "best χ² first; rows with fewer solutions are padded with NaN"
     return dataset
 
 
 def geojson_of_fixes(fixes: Fixes) -> dict[str, Any]:
-    """:meth:`magloc.localization.fit.fixes.Fixes.to_geojson`."""
+    """Return fixes as GeoJSON, see :meth:`magloc.localization.fit.fixes.Fixes.to_geojson`."""
     features = []
     for fix in fixes:
         for k, source in enumerate(fix.best.sources if fix.solutions else ()):
@@ -105,6 +201,5 @@ def geojson_of_fixes(fixes: Fixes) -> dict[str, Any]:
                 "detected": fix.detected,
                 "range_observable": source.range_observable,
             }
-            geometry = {"type": "Point", "coordinates": source.position_m.tolist()}
-            features.append({"type": "Feature", "geometry": geometry, "properties": properties})
-    return {"type": "FeatureCollection", "frame": fixes.frame, "features": features}
+            features.append(feature("Point", source.position_m.tolist(), properties))
+    return feature_collection(features) | {"frame": fixes.frame}

@@ -5,21 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from html import escape
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, overload
 
 import numpy as np
 
-from arrays.io.lazy import by_name
+from arrays.io.csv import Column
+from arrays.io.results import Result
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.chi_square import error_factor
 from magloc.localization.fit.columns import Solutions
+from magloc.localization.fit.export import QUANTITIES, columns_of_fixes, dataset_of_fixes, geojson_of_fixes
 from magloc.localization.fit.results import EVERYWHERE, Fix, Intervals, intervals_of, is_misfit
 from magloc.localization.fit.table import lines_of_fixes
 
 if TYPE_CHECKING:
     import xarray as xr
-    from matplotlib.figure import Figure
     from scipy.spatial.transform import Rotation
 
 _Column = TypeVar("_Column")
@@ -28,7 +28,7 @@ BODY_MATTERS = 1.5
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Fixes(Sequence[Fix]):
+class Fixes(Result, Sequence[Fix]):
     """The fixes of many rows: columns first, a :class:`Fix` where one row is asked for.
 
     Attributes
@@ -55,6 +55,10 @@ class Fixes(Sequence[Fix]):
     >>> fixes.position_m.shape, fixes.covariance.shape, fixes.frame
     ((5, 3), (5, 6, 6), 'array')
     """
+
+    figure = "magloc.plots.localization:fixes"
+    command = "locate"
+    quantities = QUANTITIES
 
     solutions: Solutions
     time_s: FloatArray
@@ -278,13 +282,17 @@ class Fixes(Sequence[Fix]):
                 columns[name][row] = getattr(fix, name)
         return replace(self, solutions=Solutions.joined([kept, come]), **columns)
 
-    def table(self) -> str:
-        """The table that ``magloc locate`` prints, and what may be wrong with it."""
-        return "\n".join([*lines_of_fixes(self), *filter(None, [self.caution])])
+    def lines(self, most: int | None = None) -> list[str]:
+        """Return the lines of the table, of at most `most` rows."""
+        return lines_of_fixes(self, most=most)
 
-    def plot(self) -> Figure:
-        """Fixes in three planes with 95 % ellipses, their standard deviations and their χ²."""
-        return by_name("magloc.plots.localization:fixes")(self)
+    def columns(self) -> dict[str, Column]:
+        """Return the columns of fixes.csv: a row for each source of the best solutions, or for a row without any."""
+        return columns_of_fixes(self)
+
+    def table(self) -> str:
+        """Return the table that ``magloc locate`` prints, and what may be wrong with it."""
+        return "\n".join([super().table(), *filter(None, [self.caution])])
 
     def to_xarray(self, which: Literal["best", "all"] = "best") -> xr.Dataset:
         """Columns with units and names, along `row`, for "all" also along `solution`, and along `source`.
@@ -294,21 +302,11 @@ class Fixes(Sequence[Fix]):
         which : {"best", "all"}
             The heaviest solution of every row, or all of them, padded with NaN.
         """
-        from magloc.localization.fit.export import dataset_of_fixes
-
         return dataset_of_fixes(self, which)
 
     def to_geojson(self) -> dict[str, Any]:
         """The best solutions as points, a FeatureCollection in the frame of the fixes: x, y, z in metres."""
-        from magloc.localization.fit.export import geojson_of_fixes
-
         return geojson_of_fixes(self)
-
-    def __repr__(self) -> str:
-        return "\n".join(lines_of_fixes(self, most=10))
-
-    def _repr_html_(self) -> str:
-        return f"<pre>{escape(repr(self))}</pre>"
 
 
 def _turned(covariance: FloatArray, R: FloatArray) -> FloatArray:

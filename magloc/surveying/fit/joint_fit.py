@@ -4,7 +4,7 @@ The ground is an equivalent layer: poles below it, whose strengths are Gaussian 
 
 .. math:: \min_a |r - L a|^2 + |a|^2 = r^T (1 - L (L^T L + 1)^{-1} L^T) r
 
-in white units, and so are their columns in the Jacobian of the sources: Levenberg-Marquardt on what is left.
+in white units, and so are their columns in the Jacobian of the sources: damped least squares on what is left.
 """
 
 from __future__ import annotations
@@ -12,11 +12,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import cho_factor, solve_triangular
 
 from arrays.typing import BoolArray, FloatArray, IntArray
+from magloc.least_squares import damped_step, minimise
 from magloc.measurement.pose import PoseErrors
 from magloc.surveying.fit.kernels import MeasuredRows
 from magloc.surveying.fit.record import SurveyRecord
@@ -194,50 +196,6 @@ def _times_root_of_inverse(L: FloatArray, square: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True, eq=False)
-class JointFit:
-    """Sources fitted together.
-
-    Attributes
-    ----------
-    sources : Sources
-    chi2 : float
-        Of the white residual, the layer's own prior included.
-    information : ndarray, shape (6 K, 6 K)
-        Of positions and moments, everything else eliminated.
-    residual : ndarray, shape (g·k,)
-        White, the layer not yet taken out.
-    """
-
-    sources: Sources
-    chi2: float
-    information: FloatArray
-    residual: FloatArray
-
-    @property
-    def covariance(self) -> FloatArray:
-        """Of positions and moments (6 K, 6 K)."""
-        scale = 1.0 / np.sqrt(np.diagonal(self.information))
-        scaled = scale[:, None] * self.information * scale
-        return np.asarray(scale[:, None] * np.linalg.inv(scaled + _RIDGE * np.eye(len(scale))) * scale)
-
-    @property
-    def significance(self) -> FloatArray:
-        """What χ² would grow by without each source (K,), the others free to move in its place."""
-        H, K = self.information, len(self.sources)
-        found = np.empty(K)
-        for j in range(K):
-            own = np.arange(6 * j + 3, 6 * j + 6)
-            others = np.delete(np.arange(6 * K), np.arange(6 * j, 6 * j + 6))
-            scale = 1.0 / np.sqrt(np.diagonal(H)[others])
-            among = scale[:, None] * H[np.ix_(others, others)] * scale + _RIDGE * np.eye(len(others))
-            shared = scale[:, None] * H[np.ix_(others, own)]
-            left = H[np.ix_(own, own)] - shared.T @ np.linalg.solve(among, shared)
-            m = self.sources.moment_Am2[j]
-            found[j] = m @ left @ m
-        return found
-
-
-@dataclass(frozen=True, eq=False)
 class Bounds:
     """Where a source may be, and how strong."""
 
@@ -261,6 +219,87 @@ class Bounds:
     def clipped(self, sources: Sources) -> Sources:
         """Sources moved within."""
         return replace(sources, position_m=np.clip(sources.position_m, self.low_m, self.high_m))
+
+
+@dataclass(frozen=True, eq=False)
+class JointFit:
+    """Sources fitted together, with the noise held.
+
+    Attributes
+    ----------
+    record : SurveyRecord
+    background : Background
+    bounds : Bounds
+        Where steps may lead.
+    sources : Sources
+    """
+
+    record: SurveyRecord
+    background: Background
+    bounds: Bounds
+    sources: Sources
+
+    @cached_property
+    def _fields(self) -> FloatArray:
+        return self.sources.fields(self.record)
+
+    @cached_property
+    def residual(self) -> FloatArray:
+        """White (g·k,), the layer not yet taken out."""
+        return residual_of(self.record, self.background, self._fields)
+
+    @cached_property
+    def _of_layer(self) -> FloatArray:
+        return np.asarray(self.background.Q.T @ self.residual)
+
+    @cached_property
+    def cost(self) -> float:
+        """χ² of the white residual, the layer's own prior included."""
+        return float(self.residual @ self.residual - self._of_layer @ self._of_layer)
+
+    @cached_property
+    def _jacobian(self) -> tuple[FloatArray, FloatArray]:
+        """White columns (g·k, 6 K) of the sources, and what the layer's columns take of them."""
+        J = jacobian_of(self.record, self.background, self.sources, self._fields)
+        return J, self.background.Q.T @ J
+
+    @cached_property
+    def information(self) -> FloatArray:
+        """Of positions and moments (6 K, 6 K), everything else eliminated."""
+        if not len(self.sources):
+            return np.zeros((0, 0))
+        J, J_layer = self._jacobian
+        return np.asarray(J.T @ J - J_layer.T @ J_layer)
+
+    def step(self, damping: float) -> tuple[JointFit, float]:
+        """The sources after a damped step, within the bounds."""
+        J, J_layer = self._jacobian
+        gradient = J_layer.T @ self._of_layer - J.T @ self.residual
+        step, promised = damped_step(self.information, gradient, damping)
+        return replace(self, sources=self.bounds.clipped(self.sources.moved(step.reshape(-1, 6)))), promised
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Of positions and moments (6 K, 6 K)."""
+        scale = 1.0 / np.sqrt(np.diagonal(self.information))
+        scaled = scale[:, None] * self.information * scale
+        return np.asarray(scale[:, None] * np.linalg.inv(scaled + _RIDGE * np.eye(len(scale))) * scale)
+
+    @property
+    def significance(self) -> FloatArray:
+        """What χ² would grow by without each source (K,), the others free to move in its place."""
+        H, K = self.information, len(self.sources)
+        found = np.empty(K)
+        for j in range(K):
+            own = np.arange(6 * j + 3, 6 * j + 6)
+            others = np.delete(np.arange(6 * K), np.arange(6 * j, 6 * j + 6))
+            scale = 1.0 / np.sqrt(np.diagonal(H)[others])
+            among = scale[:, None] * H[np.ix_(others, others)] * scale + _RIDGE * np.eye(len(others))
+            shared = scale[:, None] * H[np.ix_(others, own)]
+            left = H[np.ix_(own, own)] - shared.T @ np.linalg.solve(among, shared)
+            m = self.sources.moment_Am2[j]
+            found[j] = m @ left @ m
+        return found
 
 
 def residual_of(record: SurveyRecord, background: Background, fields_T: FloatArray) -> FloatArray:
@@ -290,38 +329,7 @@ def fit_jointly(
     damping: float = _DAMPING,
 ) -> JointFit:
     """Levenberg-Marquardt from some sources, the noise held."""
-
-    def cost_of(sources: Sources) -> tuple[float, FloatArray, FloatArray, FloatArray]:
-        fields = sources.fields(record)
-        residual = residual_of(record, background, fields)
-        of_layer = background.Q.T @ residual
-        return float(residual @ residual - of_layer @ of_layer), residual, of_layer, fields
-
-    def linearised(sources: Sources, fields_T: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        J = jacobian_of(record, background, sources, fields_T)
-        J_layer = background.Q.T @ J
-        return J, J_layer, J.T @ J - J_layer.T @ J_layer
-
-    cost, residual, of_layer, fields = cost_of(sources)
-    if not len(sources):
-        return JointFit(sources, cost, np.zeros((0, 0)), residual)
-    J, J_layer, H = linearised(sources, fields)
-    for _ in range(most):
-        gradient = J.T @ residual - J_layer.T @ of_layer
-        scale = 1.0 / np.sqrt(np.diagonal(H))
-        gain = 0.0
-        while damping < 1e8:
-            scaled = scale[:, None] * H * scale + damping * np.eye(len(H))
-            step = scale * np.linalg.solve(scaled, scale * gradient)
-            trial = bounds.clipped(sources.moved(step.reshape(-1, 6)))
-            trial_cost, *of_trial = cost_of(trial)
-            if trial_cost < cost:
-                gain = cost - trial_cost
-                sources, cost, (residual, of_layer, fields) = trial, trial_cost, of_trial
-                damping = max(0.1 * damping, 1e-9)
-                break
-            damping *= 10.0
-        J, J_layer, H = linearised(sources, fields)
-        if gain < settled * max(1.0, cost / residual.size):  # while much is missing, little is settled
-            break
-    return JointFit(sources, cost, H, residual)
+    start = JointFit(record, background, bounds, sources)
+    # While much is missing, little is settled.
+    least = lambda fit: settled * max(1.0, fit.cost / fit.residual.size)  # noqa: E731
+    return minimise(start, least, damping=damping, max_iterations=most if len(sources) else 0).point

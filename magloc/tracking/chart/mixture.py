@@ -11,7 +11,7 @@ from scipy.special import ndtr, ndtri
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.localization.fit.results import Intervals
 from magloc.state_space import symmetric_square_root
-from magloc.tracking.chart.coordinates import MOMENT_POWER, Chart
+from magloc.tracking.coordinates import MOMENT_POWER, Chart
 from magloc.tracking.motion import N_SOURCE
 
 MERGED_BELOW = 0.02
@@ -24,6 +24,8 @@ narrow."""
 _OUTSIDE = 0.025
 # Standard deviation of the log-range beyond which the mean range tells of the prior alone.
 _WIDEST = 1.0
+# Range, in radii, far beyond all where sources are looked for, and the least logarithm of a component's weight there.
+_RUN_AWAY, _LEAST_RUN_AWAY = 20.0 * FARTHEST, -5.0
 # Logarithm of a range, in metres, that no quantile is beyond.
 _BEYOND, _N_BISECTIONS = 30.0, 60
 
@@ -40,7 +42,7 @@ class Mixture:
         Roots of their covariances, in the chart about each; of a point of a track (K, 6, N) until :meth:`of_source`.
     log_weight : ndarray, shape (K,)
         Logarithms of their weights, which add up to one.
-    n_motion : int
+    n_charted : int
         Length of the states without the sensors' errors.
     centroid_m : ndarray, shape (3,)
         Of the sensors, in the world frame.
@@ -55,7 +57,7 @@ class Mixture:
     x: FloatArray
     S: FloatArray
     log_weight: FloatArray
-    n_motion: int
+    n_charted: int
     centroid_m: FloatArray
     radius_m: float
     n_pose: int = 0
@@ -78,7 +80,7 @@ class Mixture:
     @property
     def chart(self) -> Chart:
         """About every component."""
-        return Chart.at(self.x[:, : self.n_motion], self.centroid_m, self.radius_m, self.n_pose)
+        return Chart.at(self.x[:, : self.n_charted], self.centroid_m, self.radius_m, self.n_pose)
 
     @property
     def widths(self) -> FloatArray:
@@ -104,11 +106,12 @@ class Mixture:
         """Position and moment alone."""
         if self.S.shape[1:] == (N_SOURCE, N_SOURCE):
             return self
-        return replace(self, x=self.x[:, :N_SOURCE], S=root_of(self.S[:, :N_SOURCE]), n_motion=N_SOURCE, n_pose=0)
+        return replace(self, x=self.x[:, :N_SOURCE], S=root_of(self.S[:, :N_SOURCE]), n_charted=N_SOURCE, n_pose=0)
 
     def likely(self) -> Mixture:
-        """Without components of no weight."""
-        return self.take(self.log_weight > self.log_weight.max() + DROPPED_BELOW)
+        """Return the components of some weight, of those that have run away only heavy ones: they would be the mean."""
+        least = np.where(self.chart.length > _RUN_AWAY * self.radius_m, _LEAST_RUN_AWAY, DROPPED_BELOW)
+        return self.take(self.log_weight >= self.log_weight.max() + least)
 
     def reduced(self) -> Mixture:
         """The likely components, and those that are as good as one merged."""
@@ -132,7 +135,7 @@ class Mixture:
         """The one Gaussian of the same mean and covariance, in the chart of the heaviest component."""
         if len(self) == 1:
             return self
-        n, best = self.n_motion, int(np.argmax(self.log_weight))
+        n, best = self.n_charted, int(np.argmax(self.log_weight))
         about = self.take(np.array([best])).chart
         offset, roots = _in_chart(about, self)
         mean = self.weight @ offset
@@ -195,7 +198,7 @@ def component_moments(chart: Chart, S: FloatArray) -> tuple[FloatArray, FloatArr
 
 def _in_chart(about: Chart, mixture: Mixture) -> tuple[FloatArray, FloatArray]:
     """Means (K, N) and roots (K, N, N) of components in the chart of one."""
-    n, K = mixture.n_motion, len(mixture)
+    n, K = mixture.n_charted, len(mixture)
     chart = about.take(np.zeros(K, dtype=np.intp))
     offset, roots = np.zeros_like(mixture.x), mixture.S.copy()
     best = int(np.argmax(mixture.log_weight))
@@ -238,7 +241,7 @@ def _divergences(mixture: Mixture, first: IntArray, others: IntArray) -> FloatAr
     """Kullback and Leibler's divergences (m,) of source and motion of some components from others, pair by pair."""
     if not first.size:
         return np.zeros(0)
-    n, about, chart = mixture.n_motion, mixture.chart.take(first), mixture.chart.take(others)
+    n, about, chart = mixture.n_charted, mixture.chart.take(first), mixture.chart.take(others)
     d, unit = about.coordinates(chart.x), root_of(mixture.S[first, :n])
     # In units of the first ones' standard deviations.
     of_others = chart.jacobian(np.zeros_like(d)) @ mixture.S[others, :n]

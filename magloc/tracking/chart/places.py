@@ -23,10 +23,10 @@ from scipy.special import chdtri, ndtri
 from arrays.typing import FloatArray, IntArray
 from magloc.levels import CONTRADICTION
 from magloc.localization.fit.prior import SourcePrior
-from magloc.tracking.chart.coordinates import MOMENT_POWER, Chart
 from magloc.tracking.chart.known_moment import UNIFORM_IN_SPACE
 from magloc.tracking.chart.mixture import FARTHEST, NEAREST, Mixture, root_of
 from magloc.tracking.chart.stack import Stack
+from magloc.tracking.coordinates import MOMENT_POWER, Chart
 from magloc.tracking.motion import N_SOURCE
 
 N_PLACES = 300

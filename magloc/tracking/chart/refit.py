@@ -17,13 +17,13 @@ from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.measurement.nuisances import SensorErrors
 from magloc.measurement.pose import PoseErrors
 from magloc.state_space import update
-from magloc.tracking.chart.coordinates import Chart
 from magloc.tracking.chart.known_moment import KnownInWorld
 from magloc.tracking.chart.mixture import Mixture
-from magloc.tracking.chart.row import ChartRow, Rows, stacked
 from magloc.tracking.chart.start import first_root
+from magloc.tracking.coordinates import Chart
+from magloc.tracking.measurement import RowMeasurement, stacked, step_of_errors
 from magloc.tracking.motion import N_SOURCE, MotionModel
-from magloc.tracking.row_filter import Gaussians, Smoothed, smooth, steps_problem
+from magloc.tracking.row_filter import Gaussians, Rows, Smoothed, smooth, steps_problem
 
 _MOST_PASSES = 15
 # After how many passes a component is given up whose evidence is so much less, as a logarithm, than that of another.
@@ -76,7 +76,7 @@ class Refitted:
 
 def refitted(
     mixture: Mixture,
-    measurements: Sequence[ChartRow],
+    measurements: Sequence[RowMeasurement],
     motions: Sequence[MotionModel],
     errors: SensorErrors,
     pose_errors: PoseErrors,
@@ -85,7 +85,7 @@ def refitted(
 ) -> Refitted:
     """Components fitted to the rows, each on its own, and given up where it is far less likely than the best one."""
     rows, K, N = _Rows(measurements, motions, errors, pose_errors, known), len(mixture), mixture.x.shape[1]
-    n = measurements[0].n_motion
+    n = measurements[0].n_charted
     x, S = np.zeros((K, N)), np.zeros((K, N, N))
     nis, log_evidence = np.full(K, np.inf), np.full(K, -np.inf)
     converged, decided = np.zeros((2, K), dtype=bool)
@@ -128,7 +128,7 @@ def refitted(
 class _Rows:
     """Rows of a track, and how the source moves between them."""
 
-    measurements: Sequence[ChartRow]
+    measurements: Sequence[RowMeasurement]
     motions: Sequence[MotionModel]
     errors: SensorErrors
     pose_errors: PoseErrors
@@ -155,7 +155,7 @@ class _Rows:
 
     def backwards(self, x: FloatArray) -> FloatArray:
         """Trajectories (rows, K, n) without noise, and without errors of the pose, that end at states (K, N)."""
-        m, track = self.motions[0].n_states, np.zeros((len(self.motions), len(x), self.measurements[0].n_motion))
+        m, track = self.motions[0].n_states, np.zeros((len(self.motions), len(x), self.measurements[0].n_charted))
         track[-1] = x[:, : track.shape[2]]
         for row in range(len(track) - 1, 0, -1):
             after = track[row, :, :m]
@@ -170,17 +170,13 @@ class _Rows:
         trajectories, evidence = np.ascontiguousarray(np.swapaxes(track, 0, 1)), np.zeros(track.shape[1])
         if self.known is not None:
             before, evidence = self._with_known(trajectories[:, 0], before, self.known)
-        of_errors = [np.stack(part) for part in zip(*map(self._kept_and_added, self._steps_s), strict=True)]
+        every = (step_of_errors(self.pose_errors, self.errors, dt_s) for dt_s in self._steps_s)
+        of_errors = [np.stack(part) for part in zip(*every, strict=True)]
         states = np.roll(trajectories, 1, axis=1)[:, :, :m].reshape(-1, m)
         order = np.arange(len(track))
         steps = steps_problem(self.motions, self._steps_s, order, (of_errors[0], of_errors[1]), states)
         found = smooth(trajectories, before, steps, self._compiled)
         return replace(found, log_evidence=found.log_evidence + evidence)
-
-    def _kept_and_added(self, dt_s: float) -> tuple[FloatArray, FloatArray]:
-        of_errors = zip(self.pose_errors.step(dt_s), self.errors.step(dt_s), strict=True)
-        kept, added = (np.concatenate(parts) for parts in of_errors)
-        return kept, added
 
     def _prior(self, chart: Chart, cells: Cells | None) -> Gaussians:
         """Return what is known before the first row, in charts about states there (K, n)."""

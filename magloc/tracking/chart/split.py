@@ -28,7 +28,7 @@ import numpy as np
 from arrays.typing import FloatArray, IntArray
 from magloc.tracking import row_filter
 from magloc.tracking.chart.mixture import Mixture, root_of
-from magloc.tracking.chart.row import ChartRow
+from magloc.tracking.measurement import RowMeasurement
 from magloc.tracking.motion import N_SOURCE
 from magloc.tracking.row_filter import Gaussians
 
@@ -47,7 +47,7 @@ _LIGHT = -7.0
 _MOST_ROUNDS = 4
 
 
-def split(mixture: Mixture, row: ChartRow) -> tuple[Mixture, IntArray]:
+def split(mixture: Mixture, row: RowMeasurement) -> tuple[Mixture, IntArray]:
     """Divide the components of a prediction over which a row's readings bend.
 
     Returns
@@ -72,7 +72,7 @@ def split(mixture: Mixture, row: ChartRow) -> tuple[Mixture, IntArray]:
     return mixture, origin
 
 
-def bends(mixture: Mixture, row: ChartRow) -> tuple[FloatArray, FloatArray]:
+def bends(mixture: Mixture, row: RowMeasurement) -> tuple[FloatArray, FloatArray]:
     """Return the bends (K, 6) of a row's readings, and one standard deviation (K, 6, N) along each axis."""
     gaussians, memory = Gaussians(mixture.x, mixture.S), min(mixture.n_rows, MOST_ROWS)
     bend, directions = row_filter.bends(gaussians, row.compiled, memory)
@@ -82,7 +82,7 @@ def bends(mixture: Mixture, row: ChartRow) -> tuple[FloatArray, FloatArray]:
 
 def _divided(mixture: Mixture, index: IntArray, v: FloatArray) -> Mixture:
     """Replace some components by three each, along axes of the source, one σ of the state (k, N) long."""
-    n, S, kept = mixture.n_motion, root_of(mixture.S[index]), np.delete(np.arange(len(mixture)), index)
+    n, S, kept = mixture.n_charted, root_of(mixture.S[index]), np.delete(np.arange(len(mixture)), index)
     # In standard numbers, of which a lower root has those of the source first, v is a unit vector.
     axis = np.linalg.solve(S[:, :N_SOURCE, :N_SOURCE], v[:, :N_SOURCE, None])
     narrow = S.copy()

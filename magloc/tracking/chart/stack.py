@@ -20,10 +20,10 @@ from magloc.fields import dipole
 from magloc.measurement.differences import DifferenceMeasurement
 from magloc.measurement.nuisances import SensorErrors
 from magloc.measurement.pose import N_POSE, PoseErrors
-from magloc.tracking.chart.coordinates import Chart
-from magloc.tracking.chart.row import ChartRow, where_smooth
+from magloc.tracking.coordinates import Chart
+from magloc.tracking.measurement import RowMeasurement, where_smooth
 from magloc.tracking.motion import N_SOURCE, MotionModel
-from magloc.tracking.results import Row
+from magloc.tracking.rows import Row
 
 FEWEST_MEANS, MOST_ROWS_OF_ONE = 16, 4
 """Means of successive rows that stand for them, at least, and how many rows have one at most."""
@@ -33,11 +33,11 @@ MOST_CHANGES = 32
 
 @dataclass(frozen=True, eq=False)
 class Stack:
-    """Rows in the order of time, as :class:`ChartRow` of the last one.
+    """Rows in the order of time, as :class:`RowMeasurement` of the last one.
 
     Attributes
     ----------
-    rows : sequence of ChartRow
+    rows : sequence of RowMeasurement
         With equally many differences, see :meth:`of`.
     errors, pose_errors : SensorErrors, PoseErrors
         That the rows have, and how long they last.
@@ -45,15 +45,17 @@ class Stack:
         How the source moves from row to row.
     """
 
-    rows: Sequence[ChartRow]
+    rows: Sequence[RowMeasurement]
     errors: SensorErrors
     pose_errors: PoseErrors
     motion: MotionModel
-    n_motion: int = N_SOURCE
+    n_charted: int = N_SOURCE
     n_pose: int = 0
 
     @classmethod
-    def of(cls, rows: Sequence[ChartRow], errors: SensorErrors, pose_errors: PoseErrors, motion: MotionModel) -> Stack:
+    def of(
+        cls, rows: Sequence[RowMeasurement], errors: SensorErrors, pose_errors: PoseErrors, motion: MotionModel
+    ) -> Stack:
         """Return the latest of some rows, each of any number of differences."""
         changes = _changes(rows)
         latest = rows[changes[-MOST_CHANGES] :] if changes.size >= MOST_CHANGES else rows
@@ -112,7 +114,7 @@ class Stack:
         return np.diff(np.append(self._begin, len(self.rows)))
 
     @cached_property
-    def _middle(self) -> list[ChartRow]:
+    def _middle(self) -> list[RowMeasurement]:
         """One row for each."""
         return [self.rows[i] for i in (self._begin + self._size // 2).tolist()]
 
@@ -191,9 +193,9 @@ class Stack:
         predicted = self._means(channels @ np.swapaxes(self._transform, -1, -2))
         return predicted, np.swapaxes(self._means(np.swapaxes(by_world, -1, -2)), -1, -2)
 
-    def source_jacobian(self, source: FloatArray) -> FloatArray:
-        """Their Jacobian (K, k, 6) by sources (K, 6), of the rows in the middle of the means."""
-        return self._middles([row.source_jacobian(source) for row in self._middle])
+    def moment_columns(self, position_m: FloatArray) -> FloatArray:
+        """Return the derivative (K, k, 3) of rows in the middle of the means by the moment of a weak source."""
+        return self._middles([row.moment_columns(position_m) for row in self._middle])
 
     @cached_property
     def without_source(self) -> FloatArray:
@@ -219,7 +221,9 @@ class Stack:
         by_source, by_pose, error = [], [], np.zeros((len(state), N_POSE))
         for row in self._middle:
             in_array = row.pose.in_array(state)
-            by_array = np.zeros((len(state), row.z.size, N_SOURCE)) if far else row._by_array(in_array, None)
+            by_array = np.zeros((len(state), row.z.size, N_SOURCE))
+            if not far:
+                by_array = row.model.jacobian(in_array[:, :3], in_array[:, 3:]) / row.sigma[:, None]
             by_source.append(row._by_source(by_array, None))
             if row.n_pose:
                 by_pose.append(where_smooth(row._by_pose(by_array, in_array, error)))
@@ -309,7 +313,7 @@ class Stack:
         return self._root_of_means(place), self._root_of_means(moment)
 
 
-def _changes(rows: Sequence[ChartRow]) -> IntArray:
+def _changes(rows: Sequence[RowMeasurement]) -> IntArray:
     """Rows that miss other channels than the row before."""
     available = np.stack([row.row.available for row in rows])
     return 1 + np.flatnonzero((available[1:] != available[:-1]).any(axis=1))
@@ -329,5 +333,5 @@ def displacement(motion: MotionModel, dt_s: float) -> tuple[float, float]:
     return float(np.sqrt(variance[:3].mean())), float(np.sqrt(variance[3:6].max()))
 
 
-Measured = ChartRow | Stack
+Measured = RowMeasurement | Stack
 """What a mixture is updated by: one row, or rows together."""

@@ -27,15 +27,16 @@ from magloc.localization.fit.prior import SourcePrior
 from magloc.localization.locator import Locator
 from magloc.measurement.nuisances import SensorErrors
 from magloc.measurement.rows import check_magnitudes, check_spans
-from magloc.tracking.chart.coordinates import MOMENT_POWER, Chart, mirrored, source_root
+from magloc.tracking import row_filter
 from magloc.tracking.chart.known_moment import UNIFORM_IN_SPACE, KnownInWorld
 from magloc.tracking.chart.mixture import DROPPED_BELOW, FARTHEST, NEAREST, Mixture
-from magloc.tracking.chart.row import ChartRow, where_smooth
-from magloc.tracking.chart.stack import Measured
-from magloc.tracking.chart.update import Updated, updated
-from magloc.tracking.measurement import whitening
+from magloc.tracking.chart.stack import Measured, Stack
+from magloc.tracking.chart.update import Updated, is_regular, updated
+from magloc.tracking.coordinates import MOMENT_POWER, Chart, mirrored, source_root
+from magloc.tracking.measurement import RowMeasurement, where_smooth, whitening
 from magloc.tracking.motion import N_SOURCE, MotionModel
-from magloc.tracking.results import Row
+from magloc.tracking.row_filter import Gaussians, RowUpdates
+from magloc.tracking.rows import Row
 
 OF_PITCH = 0.6
 """Standard deviations of a cell, in units of the grid's pitch: neighbours add up to an even density."""
@@ -180,7 +181,7 @@ class Start:
         dof = measurement.n_differences - N_SOURCE + (0 if known is None else known.n_known)
         if dof > 0 and found.chi2[sound].min() > chdtri(dof, CONTRADICTION):
             best = int(np.argmin(np.where(sound, found.chi2, np.inf)))
-            self.misfit = found.residual[best, : measurement.z.size]
+            self.misfit = measurement.z - measurement.of_source(found.x[best])
             return None, NO_DIPOLE
         log_weight = found.log_evidence + _EVEN * ((seeds.cell < 0) @ np.array([1.0, 2.0, 0.0]))
         log_weight -= math.log(2.0) * seeds.cell[:, 2]
@@ -198,7 +199,7 @@ class Start:
         """Chosen cells, and the row's best fits."""
         cells, row = self._grid.position_m, measurement.row
         world = row.origin_m + cells @ row.R_world_from_array.T
-        columns = measurement.source_jacobian(np.concatenate([world, np.zeros_like(world)], axis=1))[..., 3:]
+        columns = measurement.moment_columns(world)
         # Moduli in no ambient field are linear in no moment: their cells explain nothing, and their best fits start.
         whiten = measurement.whitening
         columns, left = whiten @ where_smooth(columns), whiten @ measurement.without_source
@@ -237,7 +238,7 @@ def _images(source: FloatArray, measurement: Measured) -> tuple[FloatArray, IntA
 
 def _components(
     measurement: Measured, motion: MotionModel, seeds: _Seeds, known: KnownInWorld | None = None
-) -> Updated:
+) -> Updated | RowUpdates:
     """What the row makes of cells about seeds."""
     state, _ = motion.start(np.zeros(N_SOURCE), np.zeros((N_SOURCE, N_SOURCE)))
     x = np.tile(np.append(state, np.zeros(measurement.n_pose)), (len(seeds.cell), 1))
@@ -245,15 +246,18 @@ def _components(
     chart, sigma = measurement.chart(x), np.tile(_CELL, (len(x), 1))
     sigma[:, 0] /= 2.0 ** seeds.cell[:, 2]
     S = chart.inverse_jacobian() @ _with_motion(chart, motion, sigma)
-    return updated(x, S, measurement, known)
+    if known is not None or isinstance(measurement, Stack):
+        return updated(x, S, measurement, known)
+    found = row_filter.update(Gaussians(x, S, n_nuisances=measurement.n_pose), measurement.compiled)
+    return replace(found, converged=found.converged & is_regular(found.S))
 
 
-def _mixture(found: Updated, log_weight: FloatArray, measurement: Measured) -> Mixture:
-    n, centroid_m, radius_m = measurement.n_motion, measurement.centroid_m, measurement.radius_m
+def _mixture(found: Updated | RowUpdates, log_weight: FloatArray, measurement: Measured) -> Mixture:
+    n, centroid_m, radius_m = measurement.n_charted, measurement.centroid_m, measurement.radius_m
     return Mixture(found.x, found.S, log_weight, n, centroid_m, radius_m, measurement.n_pose)
 
 
-def _centred(seeds: _Seeds, found: Updated, measurement: Measured) -> _Seeds:
+def _centred(seeds: _Seeds, found: Updated | RowUpdates, measurement: Measured) -> _Seeds:
     """Seeds that stand where the row puts them, along the coordinates in which it tells more than their cells do."""
     sigma = np.sqrt(np.sum(found.S[:, :3] ** 2, axis=2))
     narrow = sigma < _NARROW * _CELL
@@ -275,12 +279,12 @@ def _centred(seeds: _Seeds, found: Updated, measurement: Measured) -> _Seeds:
     )
 
 
-def _along_valleys(seeds: _Seeds, found: Updated, measurement: Measured) -> _Seeds:
+def _along_valleys(seeds: _Seeds, found: Updated | RowUpdates, measurement: Measured) -> _Seeds:
     """The seeds, and instead of such as found a valley of ranges that bends others along it, as dense as it bends.
 
     A row that tells much leaves a source in a narrow valley, and a Gaussian in the middle says nothing of its ends.
     """
-    n = measurement.n_motion
+    n = measurement.n_charted
     sound = np.isfinite(found.log_evidence) & found.converged
     likely = sound & (found.log_evidence > found.log_evidence[sound].max(initial=-np.inf) + DROPPED_BELOW)
     own = np.flatnonzero(likely & (seeds.cell[:, 0] < 0))
@@ -307,7 +311,7 @@ def _along_valleys(seeds: _Seeds, found: Updated, measurement: Measured) -> _See
     return _Seeds(np.vstack(position), np.vstack(moment), np.vstack(cell))
 
 
-def with_errors(mixture: Mixture, measurement: ChartRow, sigma: FloatArray) -> Mixture:
+def with_errors(mixture: Mixture, measurement: RowMeasurement, sigma: FloatArray) -> Mixture:
     r"""The same, and behind the states the sensors' errors, known by their σ (n_errors,) before the row alone.
 
     What the row leaves over where a component stands is of them and of the noise: with :math:`\Phi` of unit errors,
@@ -315,7 +319,7 @@ def with_errors(mixture: Mixture, measurement: ChartRow, sigma: FloatArray) -> M
     """
     if not sigma.size:
         return mixture
-    n, chart, unit = measurement.n_motion, mixture.chart, measurement.effect * sigma
+    n, chart, unit = measurement.n_charted, mixture.chart, measurement.effect * sigma
     gain = sigma[:, None] * np.linalg.solve(np.eye(len(unit)) + unit @ unit.T, unit).T
     left = measurement.z - measurement.of_source(mixture.x)
     H = measurement.along(mixture.x, chart.jacobian(np.zeros_like(mixture.x)))

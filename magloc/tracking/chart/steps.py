@@ -21,20 +21,20 @@ from scipy.special import chdtri
 
 from arrays.array import SensorArray
 from arrays.differences import decorrelated_differences
-from arrays.typing import BoolArray, FloatArray, IntArray
+from arrays.typing import BoolArray, FloatArray
 from magloc.levels import CONTRADICTION
 from magloc.localization.fit.prior import SourcePrior
 from magloc.measurement.nuisances import SensorErrors
 from magloc.measurement.pose import PoseErrors
 from magloc.tracking import row_filter
-from magloc.tracking.chart.coordinates import mirrored
 from magloc.tracking.chart.known_moment import UNIFORM_IN_SPACE, KnownInWorld
 from magloc.tracking.chart.mixture import Mixture, root_of
 from magloc.tracking.chart.refit import Cells, Refitted, refitted
-from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.chart.split import split
 from magloc.tracking.chart.stack import Stack
 from magloc.tracking.chart.start import NO_DIPOLE, OF_PITCH, Start, once, with_errors
+from magloc.tracking.coordinates import mirrored
+from magloc.tracking.measurement import RowMeasurement, step_of_errors
 from magloc.tracking.motion import N_SOURCE, MotionModel
 from magloc.tracking.row_filter import Gaussians, steps_problem
 from magloc.tracking.sensor_health import OFFSETS, Misfits
@@ -82,7 +82,7 @@ class Known:
         Contradicting rows before the next one.
     has_range : bool
         Whether the range was once known since the track began.
-    young : tuple of (ChartRow, MotionModel)
+    young : tuple of (RowMeasurement, MotionModel)
         Rows of a track that are still fitted together, and the motion that led to each; `next_refit`, after how many.
     nis : float
         Of all of them but the first, as the filter found it row by row.
@@ -94,7 +94,7 @@ class Known:
     open_loop: FloatArray
     contradictions: int = 0
     has_range: bool = False
-    young: tuple[tuple[ChartRow, MotionModel], ...] = ()
+    young: tuple[tuple[RowMeasurement, MotionModel], ...] = ()
     next_refit: int = FIRST_REFIT
     nis: float = 0.0
     used: Mixture | None = None
@@ -140,7 +140,9 @@ class ChartFilter:
         self._noise_T = float(np.median(array.channel_noise_T))
         self._misfits = Misfits()
 
-    def started(self, row: ChartRow, motion: MotionModel, near: Mixture | None = None) -> tuple[Mixture | None, str]:
+    def started(
+        self, row: RowMeasurement, motion: MotionModel, near: Mixture | None = None
+    ) -> tuple[Mixture | None, str]:
         """What one row says of a source, weighed by a prediction of its place if there is one, or why there is none."""
         if self._misfits.waits:
             self._misfits = self._misfits.passed_over
@@ -154,7 +156,7 @@ class ChartFilter:
         mixture = with_errors(mixture.likely(), row, self.errors.sigma)
         return (mixture if near is None else _near(mixture.reduced(), near)).reduced(), ""
 
-    def of_row(self, row: ChartRow, motion: MotionModel) -> tuple[Mixture | None, str]:
+    def of_row(self, row: RowMeasurement, motion: MotionModel) -> tuple[Mixture | None, str]:
         """What one row alone says of a source and the pose, by every cell that explains it, or why it says nothing."""
         return self._start.mixture(row, motion)
 
@@ -162,21 +164,20 @@ class ChartFilter:
         """What rows say together of a source alone, that is where it is in the last of them."""
         return self._start.mixture(stack, at_rest)
 
-    def faulty(self, row: ChartRow) -> BoolArray:
+    def faulty(self, row: RowMeasurement) -> BoolArray:
         """Sensors (N,) that contradict all others in a row that no dipole fits; none where rows misfit alike."""
         if self._misfits.are_alike:
             return np.zeros(self.errors.array.n_sensors, dtype=bool)
         return self._start.faulty(row.row)
 
-    def is_detected(self, row: ChartRow) -> bool:
+    def is_detected(self, row: RowMeasurement) -> bool:
         """Whether a row shows that there is a source."""
         return row.is_detected(self.errors.sigma)
 
-    def predicted(self, mixture: Mixture, motion: MotionModel, dt_s: float, row: ChartRow) -> Mixture:
+    def predicted(self, mixture: Mixture, motion: MotionModel, dt_s: float, row: RowMeasurement) -> Mixture:
         """What is known after a time without readings, as seen from a row's array."""
-        of_errors = zip(self.pose_errors.step(dt_s), self.errors.step(dt_s), strict=True)
-        kept, added = (np.concatenate(parts)[None] for parts in of_errors)
-        nuisances = (kept, added) if kept.size else None
+        kept, added = step_of_errors(self.pose_errors, self.errors, dt_s)
+        nuisances = (kept[None], added[None]) if kept.size else None
         step = steps_problem(motion, [dt_s], np.zeros(1, dtype=np.int64), nuisances, mixture.x[:, : motion.n_states])
         found = row_filter.predict(self._gaussians(mixture), mixture.centroid_m, step, row.compiled)
         return replace(mixture, x=found.x, S=found.S, centroid_m=row.centroid_m)
@@ -185,7 +186,7 @@ class ChartFilter:
         """Return components as kernels take them."""
         return Gaussians(mixture.x, mixture.S, n_nuisances=self.errors.n_states + self.pose_errors.n_states)
 
-    def updated(self, known: Known, predicted: Mixture, dt_s: float, row: ChartRow) -> RowUpdate:
+    def updated(self, known: Known, predicted: Mixture, dt_s: float, row: RowMeasurement) -> RowUpdate:
         """Return what a row makes of a prediction from what was known before it."""
         # Where errors of sensors bend as well, rows that were not used count as a part of the step.
         before = known.used if self.has_lasting_errors and known.used is not None else known.mixture
@@ -243,7 +244,7 @@ class ChartFilter:
         if not fit.decided[:n_seeds].all() or not _believed(fit.mixture, fit.nis, rows):
             return known
         found = fit.mixture.take(once(fit.mixture)).reduced()
-        n, heaviest = mixture.n_motion, np.repeat(np.argmax(mixture.log_weight), len(found))
+        n, heaviest = mixture.n_charted, np.repeat(np.argmax(mixture.log_weight), len(found))
         elsewhere = _offset(found, mixture.x[heaviest]).min() > chdtri(n, CONTRADICTION)
         if elsewhere and fit.nis.min() > known.nis:
             # The iteration has left the filter's place for one that explains the rows less well.
@@ -262,7 +263,7 @@ class ChartFilter:
         return replace(known, mixture=found)
 
     def _fitted(
-        self, seeds: Mixture, rows: Sequence[ChartRow], motions: Sequence[MotionModel], cells: Cells | None = None
+        self, seeds: Mixture, rows: Sequence[RowMeasurement], motions: Sequence[MotionModel], cells: Cells | None = None
     ) -> Refitted:
         """Components fitted to all rows, with what was known before them."""
         known = KnownInWorld.of(self.prior, rows[0].row.R_world_from_array)
@@ -272,7 +273,9 @@ class ChartFilter:
         of_space = UNIFORM_IN_SPACE * np.log(fit.mixture.chart.length)
         return replace(fit, mixture=replace(fit.mixture, log_weight=fit.mixture.log_weight + of_space))
 
-    def _along_the_range(self, found: Mixture, rows: Sequence[ChartRow], motions: Sequence[MotionModel]) -> Mixture:
+    def _along_the_range(
+        self, found: Mixture, rows: Sequence[RowMeasurement], motions: Sequence[MotionModel]
+    ) -> Mixture:
         """Where ranges are open, components fitted anew in cells of the range, as at the start, each with its evidence.
 
         The valley of ranges is bent, and how much room there is beside it differs along it: one mode would be too near.
@@ -296,12 +299,12 @@ class ChartFilter:
 
 def _offset(mixture: Mixture, x: FloatArray) -> FloatArray:
     """Squared distances (K,) of states (K, N) from components, each of its own, in units of their covariances."""
-    n = mixture.n_motion
+    n = mixture.n_charted
     e = mixture.chart.coordinates(x[:, :n])
     return np.asarray(np.sum(np.linalg.solve(root_of(mixture.S[:, :n]), e[..., None])[..., 0] ** 2, axis=1))
 
 
-def _believed(found: Mixture, nis: FloatArray, rows: Sequence[ChartRow]) -> bool:
+def _believed(found: Mixture, nis: FloatArray, rows: Sequence[RowMeasurement]) -> bool:
     """Whether sources that were fitted to rows explain them, and are determined by them."""
     if not len(found):
         return False
@@ -316,26 +319,18 @@ def width_of(mixture: Mixture) -> float:
 
 
 def cartesian(mixture: Mixture) -> tuple[FloatArray, FloatArray]:
-    """State (N,) and root (N, N) of a Gaussian of the same mean and covariance, errors of sensors before the pose's."""
+    """Return the state (N,) and root (N, N) of a Gaussian of the same mean and covariance."""
     one = mixture.matched()
-    n, root = one.n_motion, one.S[0].copy()
+    n, root = one.n_charted, one.S[0].copy()
     root[:n] = one.chart.jacobian(np.zeros((1, n)))[0] @ root[:n]
-    order = _sensors_first(one.x.shape[1], n, one.n_pose)
-    return one.x[0, order], root[order]
+    return one.x[0], root
 
 
-def charted(x: FloatArray, S: FloatArray, row: ChartRow) -> Mixture:
+def charted(x: FloatArray, S: FloatArray, row: RowMeasurement) -> Mixture:
     """The inverse of :func:`cartesian`, as seen from a row's array."""
-    n, order = row.n_motion, _sensors_first(len(x), row.n_motion, row.n_pose)
-    state, root = np.empty_like(x), np.empty_like(S)
-    state[order], root[order] = x, S
-    root[:n] = row.chart(state[None, :n]).inverse_jacobian()[0] @ root[:n]
-    return Mixture(state[None], root[None], np.zeros(1), n, row.centroid_m, row.radius_m, row.n_pose)
-
-
-def _sensors_first(n_all: int, n_motion: int, n_pose: int) -> IntArray:
-    """Order of the states in which errors of sensors stand before those of the pose."""
-    return np.r_[: n_motion - n_pose, n_motion:n_all, n_motion - n_pose : n_motion]
+    n, root = row.n_charted, S.copy()
+    root[:n] = row.chart(x[None, :n]).inverse_jacobian()[0] @ root[:n]
+    return Mixture(x[None], root[None], np.zeros(1), n, row.centroid_m, row.radius_m, row.n_pose)
 
 
 def _near(mixture: Mixture, prediction: Mixture) -> Mixture:

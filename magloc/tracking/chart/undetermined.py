@@ -9,9 +9,9 @@ import numpy as np
 
 from magloc.tracking.chart.mixture import Mixture, root_of
 from magloc.tracking.chart.places import ENOUGH, Places, effective_number, weighed
-from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.chart.stack import Stack, displacement
 from magloc.tracking.chart.steps import ChartFilter
+from magloc.tracking.measurement import RowMeasurement
 from magloc.tracking.motion import N_SOURCE, MotionModel, RandomWalk
 
 MOST_ROWS = 256
@@ -34,7 +34,7 @@ class Undetermined:
 
     def forget(self) -> None:
         """Begin anew."""
-        self._rows: deque[ChartRow] = deque(maxlen=MOST_ROWS)
+        self._rows: deque[RowMeasurement] = deque(maxlen=MOST_ROWS)
         self._told: Mixture | None = None
         self._n_rows, self._next_fit, self._next_search = 0, 2, 2
 
@@ -47,7 +47,7 @@ class Undetermined:
         distance = float(np.linalg.norm(mean[:3] - self._told.centroid_m))
         return float(np.sqrt(np.trace(covariance[:3, :3]))) / distance if distance > 0.0 else np.inf
 
-    def after(self, row: ChartRow, motion: MotionModel) -> tuple[Mixture | None, str]:
+    def after(self, row: RowMeasurement, motion: MotionModel) -> tuple[Mixture | None, str]:
         """What is known of the source after one more row, or why that is nothing."""
         is_detected = self.filter.is_detected(row)
         if is_detected or self._rows:
@@ -56,7 +56,7 @@ class Undetermined:
             return self.filter.of_row(row, motion)
         return self._told, ""
 
-    def _add(self, row: ChartRow, motion: MotionModel) -> None:
+    def _add(self, row: RowMeasurement, motion: MotionModel) -> None:
         """One row more."""
         if not row.n_differences or _leads(motion):
             return
@@ -95,7 +95,7 @@ def _leads(motion: MotionModel) -> bool:
     return not np.allclose(motion.step(x, 1.0)[0], x, rtol=1e-9)
 
 
-def _predicted(mixture: Mixture, row: ChartRow, motion: MotionModel, dt_s: float) -> Mixture:
+def _predicted(mixture: Mixture, row: RowMeasurement, motion: MotionModel, dt_s: float) -> Mixture:
     """What is known of the source after a time without readings, as seen from a row's array."""
     of_place, of_moment = displacement(motion, dt_s)
     strength = np.linalg.norm(mixture.x[:, 3:6], axis=1)

@@ -1,6 +1,6 @@
 r"""An iterated update of many states side by side, which know next to nothing before it: for the start of a track.
 
-States are counted in the coordinates of :mod:`magloc.tracking.chart.coordinates`, and lasting errors of sensors are
+States are counted in the coordinates of :mod:`magloc.tracking.coordinates`, and lasting errors of sensors are
 noise. Later rows are updates of :mod:`magloc.tracking.row_filter`.
 """
 
@@ -11,20 +11,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from arrays.typing import BoolArray, FloatArray, IntArray
-from magloc.tracking.chart.coordinates import Chart
 from magloc.tracking.chart.known_moment import KnownInWorld
 from magloc.tracking.chart.stack import Measured, Stack
-
-TOLERANCE = 1e-3
-"""Stop of the iteration: length of the next step in posterior standard deviations."""
-LEAST_GAIN = 0.25
-"""Of the decrease that a linear problem would show, below which a step is halved: it leads across a valley."""
-MOST_ITERATIONS = 50
-# Steps that make the fit worse by more than rounding are halved.
-ROUNDING = 1e-9
-LEAST_SHARE = 0.02
-"""A prediction bends as a row's readings do along what the row tells, in standard deviations of the prediction, more
-than this: of less the other rows told, which may bend otherwise."""
+from magloc.tracking.coordinates import Chart
+from magloc.tracking.row_filter import LEAST_GAIN, MOST_ITERATIONS, ROUNDING, TOLERANCE
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,11 +86,15 @@ def updated(x: FloatArray, S: FloatArray, measurement: Measured, known: KnownInW
     R = np.asarray(np.linalg.qr(J, mode="r"))
     log_N = 2.0 * np.sum(np.log(np.abs(np.diagonal(R, axis1=-2, axis2=-1))), axis=1)
     x_after, S_after = problem.posterior(zeta, R)
-    # A start that leads nowhere may end where nothing is a number.
-    with np.errstate(all="ignore"):
-        converged &= np.isfinite(S_after).all(axis=(1, 2)) & (np.abs(np.linalg.det(S_after)) > 0.0)
+    converged &= is_regular(S_after)
     chi2 = np.sum(residual[:, :k] ** 2, axis=1)
     return Updated(x_after, S_after, cost, chi2, -0.5 * (cost + log_N + problem.log_C), converged, residual)
+
+
+def is_regular(S: FloatArray) -> BoolArray:
+    """Return whether roots (K, n, n) are finite and of full rank: a start that leads nowhere may end anywhere."""
+    with np.errstate(all="ignore"):
+        return np.asarray(np.isfinite(S).all(axis=(1, 2)) & (np.abs(np.linalg.det(S)) > 0.0))
 
 
 def _whole_step(J: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -16,7 +16,7 @@ from magloc.tracking.multi_target.measurement import Cells, Channels, JointRow
 from magloc.tracking.multi_target.motion import FreeMotion
 from magloc.tracking.multi_target.state import JointState
 from magloc.tracking.multi_target.update import JointUpdate, joint_update
-from magloc.tracking.results import Row
+from magloc.tracking.rows import Row
 from magloc.tracking.sensor_health import SENSOR_LIMIT, SensorHealth
 
 BIRTH_LIMIT = 45.0

@@ -13,9 +13,9 @@ from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.fields import dipole
 from magloc.localization.search.candidates import candidate_positions
 from magloc.measurement.rows import ambient_fields, channels_above_ambient, whitenings_of
-from magloc.tracking.chart.row import Rows
 from magloc.tracking.multi_target.state import JointState
-from magloc.tracking.results import Row
+from magloc.tracking.row_filter import Rows
+from magloc.tracking.rows import Row
 
 # Sets of channels that are kept: rows miss the same ones more often than not.
 _MOST_MASKS = 16

@@ -14,7 +14,7 @@ import numpy as np
 
 from arrays.typing import FloatArray
 from magloc.tracking import row_filter
-from magloc.tracking.chart.coordinates import Chart
+from magloc.tracking.coordinates import Chart
 from magloc.tracking.multi_target.measurement import JointRow, stacked
 from magloc.tracking.multi_target.motion import stepped, steps_problem
 from magloc.tracking.multi_target.state import N_COMMON, N_OF_SOURCE, N_SEEN, JointState, chart_at

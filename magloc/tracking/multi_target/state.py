@@ -1,7 +1,7 @@
 """State of several sources that one filter follows together, as one Gaussian in the chart of each source.
 
 Of every source it has position p, moment m, velocity v and rate of turn ω, and of all together the common field. The
-errors are Gaussian in the coordinates of :mod:`magloc.tracking.chart.coordinates`, where errors of a moment are those
+errors are Gaussian in the coordinates of :mod:`magloc.tracking.coordinates`, where errors of a moment are those
 of its strength and direction however large they are: in Cartesian coordinates the filter would be too sure of moments,
 because |m| is known better than its direction.
 """
@@ -15,8 +15,8 @@ from functools import cached_property
 import numpy as np
 
 from arrays.typing import FloatArray
-from magloc.tracking.chart.coordinates import Chart
 from magloc.tracking.chart.mixture import root_of
+from magloc.tracking.coordinates import Chart
 from magloc.tracking.row_filter import Gaussians
 
 N_SEEN = 6

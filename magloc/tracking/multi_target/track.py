@@ -10,12 +10,15 @@ from typing import Literal
 from numpy.typing import ArrayLike
 
 from arrays.array import SensorArray
+from arrays.io.csv import Column
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.measurement.plausibility import usable_readings
 from magloc.readings import Readings
+from magloc.tracking.files import columns_of_track
 from magloc.tracking.multi_target.motion import FreeMotion
 from magloc.tracking.multi_target.tracker import SourcesTracker
-from magloc.tracking.results import SourcesPoint, TrackPoint, TrackResult, rows_of, warn_of_strengths
+from magloc.tracking.results import SourcesPoint, TrackPoint, TrackResult, warn_of_strengths
+from magloc.tracking.rows import rows_of
 from magloc.tracking.track import TrackColumns, TrackRows, finished
 
 
@@ -78,6 +81,11 @@ class SourcesTrack(TrackRows[SourcesPoint]):
             own = [track for track in point.tracks if track.id == id]
             points.append(own[0] if own else TrackPoint(point.time_s, status=point.status))
         return SourceTrack(tuple(points), self.readings, id)
+
+    def columns(self) -> dict[str, Column]:
+        """Return the columns of track.csv: a row for each source of each row."""
+        known = [track for point in self for track in point.tracks]
+        return columns_of_track(known, ids=[track.id for track in known])
 
     @property
     def as_result(self) -> TrackResult:

@@ -43,7 +43,8 @@ from magloc.tracking.multi_target.motion import FreeMotion, stepped
 from magloc.tracking.multi_target.smoothing import YoungTrack
 from magloc.tracking.multi_target.state import N_COMMON, N_SEEN, JointState
 from magloc.tracking.multi_target.update import innovation_chi2
-from magloc.tracking.results import Row, SourcePoint, SourcesPoint, next_row
+from magloc.tracking.results import SourcePoint, SourcesPoint
+from magloc.tracking.rows import Row, next_row
 from magloc.tracking.sensor_health import SENSOR_LIMIT, Misfits, SensorHealth
 
 ROWS_TO_REPORT = 10

@@ -22,12 +22,12 @@ from magloc.levels import CONTRADICTION
 from magloc.localization.uncertainty.range_interval import relative_range_sigma
 from magloc.readings import Readings
 from magloc.state_space import update, whitened_innovation
-from magloc.tracking.chart.coordinates import Chart
-from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.chart.steps import charted
+from magloc.tracking.coordinates import Chart
 from magloc.tracking.measurement import RowMeasurement
 from magloc.tracking.motion import N_SOURCE
-from magloc.tracking.results import Innovation, Prediction, Row, Step, TrackPoint, of_mixture, rows_of
+from magloc.tracking.results import Innovation, Prediction, Step, TrackPoint, of_mixture
+from magloc.tracking.rows import Row, rows_of
 from magloc.tracking.tracker import LARGEST_RANGE_ERROR, Tracker
 from magloc.tracking.whole_records.smoother import smoothed, smoothed_states
 
@@ -144,10 +144,10 @@ def _warn_of_a_pull(tracker: Tracker, measurements: Sequence[RowMeasurement], pa
 
 def _farther(state: FloatArray, measurement: RowMeasurement, log_range: float) -> FloatArray:
     """A state (n,) whose source is farther and stronger and moves more, so that it reads alike."""
-    n, row = measurement.n_motion, ChartRow.of(measurement)
+    n = measurement.n_motion
     e = np.zeros(n)
     e[0] = log_range
-    moved = Chart.at(state[:n], row.centroid_m, row.radius_m).retracted(e)
+    moved = Chart.at(state[:n], measurement.centroid_m, measurement.radius_m).retracted(e)
     return np.concatenate([moved, state[n:]])
 
 
@@ -257,7 +257,7 @@ def _points(tracker: Tracker, measurements: Sequence[RowMeasurement], passed: _P
     """What is known of every row, from the first one on that knows the range."""
     points: list[TrackPoint] = []
     tracked, last = False, None
-    open_loop = tracker.known_before(ChartRow.of(measurements[0]), passed.steps[0].x)
+    open_loop = tracker.known_before(measurements[0], passed.steps[0].x)
     for j, (measurement, step) in enumerate(zip(measurements, passed.steps, strict=True)):
         row, innovation = measurement.row, passed.innovations[j]
         if j:
@@ -270,7 +270,7 @@ def _points(tracker: Tracker, measurements: Sequence[RowMeasurement], passed: _P
         status = "predicted" if innovation is None else "tracked" if passed.used[j] else "outlier"
         told = {} if innovation is None or not tracked else innovation.after(last)
         last = innovation if status == "tracked" else None
-        mixture = charted(step.x, step.S, ChartRow.of(measurement))
+        mixture = charted(step.x, step.S, measurement)
         point = of_mixture(row.time_s, mixture, np.diagonal(open_loop))
         points.append(replace(point, iterations=1, status=status if tracked else "acquired", **told))
         tracked = True

@@ -18,7 +18,8 @@ from magloc.fields.multipole import DEFAULT_LENGTH, N_BODY_ERRORS, finite_body_e
 from magloc.measurement.differences import fields_at_sensors
 from magloc.tracking.measurement import RowMeasurement
 from magloc.tracking.motion import N_SOURCE
-from magloc.tracking.results import Row, TrackPoint
+from magloc.tracking.results import TrackPoint
+from magloc.tracking.rows import Row
 from magloc.tracking.tracker import Tracker
 from magloc.tracking.whole_records.background import steps_of
 from magloc.tracking.whole_records.constants import placed_rows
@@ -46,7 +47,7 @@ def body_factor(tracker: Tracker, rows: Sequence[Row], points: Sequence[TrackPoi
     if not any(np.sum(columns**2) * len(errors) > _NEGLIGIBLE for columns in errors.values()):
         return 1.0
     wider, own = copy.copy(tracker), tracker.errors
-    none, n = np.zeros(N_BODY_ERRORS), tracker.motion.n_states + own.n_states
+    none, n = np.zeros(N_BODY_ERRORS), tracker.motion.n_states + tracker.n_errors
     wider.errors = replace(
         own,
         sigma=np.concatenate([own.sigma, none + 1.0]),

@@ -21,7 +21,8 @@ from magloc.chi_square import error_factor
 from magloc.localization.uncertainty.range_interval import relative_range_sigma
 from magloc.tracking.acquisition import START_RANGE_ERROR
 from magloc.tracking.motion import N_SOURCE
-from magloc.tracking.results import Row, TrackPoint
+from magloc.tracking.results import TrackPoint
+from magloc.tracking.rows import Row
 from magloc.tracking.tracker import Tracker
 from magloc.tracking.whole_records.background import settled_steps
 
@@ -59,7 +60,8 @@ def constants_test(tracker: Tracker, rows: Sequence[Row], points: Sequence[Track
     if steps is None:
         return ConstantsTest()
     errors, own = wider.pose_errors, tracker.pose_errors
-    of_errors = steps[-1].x[-errors.n_states :], steps[-1].S[-errors.n_states :]
+    at = slice(wider.motion.n_states, wider.motion.n_states + errors.n_states)
+    of_errors = steps[-1].x[at], steps[-1].S[at]
     mounting = math.nan if own.of_mounting.any() else _score(*of_errors, errors.of_mounting)
     if own.of_field.any() or not errors.of_field.any():
         return ConstantsTest(mounting)

@@ -21,7 +21,8 @@ from arrays.typing import FloatArray
 from magloc.live.follower import LivePoint
 from magloc.live.tally import Tally
 from magloc.readings import Readings
-from magloc.tracking.results import Row, SourcesPoint, TrackPoint, stacked
+from magloc.tracking.results import SourcesPoint, TrackPoint, stacked
+from magloc.tracking.rows import Row
 from magloc.viewer.pages import words
 from magloc.viewer.pages.track_player import SOURCE_COLOURS, point_words
 from magloc.viewer.panels.readings_plot import ReadingsPlot, residuals_of

@@ -1,13 +1,10 @@
-"""Tests of the complementary filters: scalar principle, error angle, compiled twin, the source's figures."""
+"""Tests of the complementary filters: low pass, error angle, compiled twin, the source's figures."""
 
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from scipy import signal
 from scipy.spatial.transform import Rotation
 
 from adcs import quaternion
@@ -51,33 +48,7 @@ def short_record(n=60, seed=0, runs=2, missing=()):
     )
 
 
-def low_pass(k, s):
-    """G_a(s) = k/(s + k), what the filter passes of the vectors' angle."""
-    return k / (s + k)
-
-
-def high_pass(k, s):
-    """G_g(s) = s/(s + k), what it passes of the gyro's integral."""
-    return s / (s + k)
-
-
 class TestPrinciple:
-    @given(k=st.floats(0.0, 1e6), real=st.floats(1e-6, 1e3), imaginary=st.floats(-1e6, 1e6))
-    def test_sum_is_one(self, k, real, imaginary):
-        """For every gain and every s to the right of the pole."""
-        s = complex(real, imaginary)
-        assert low_pass(k, s) + high_pass(k, s) == pytest.approx(1.0, abs=1e-12)
-
-    def test_against_scipy(self):
-        w = np.logspace(-4, 1, 50)
-        for ours, numerator in ((low_pass, [0.02]), (high_pass, [1.0, 0.0])):
-            np.testing.assert_allclose(ours(0.02, 1j * w), signal.freqs(numerator, [1.0, 0.02], w)[1], rtol=1e-12)
-
-    def test_limits(self):
-        """k = 0 trusts the gyro alone, a large one the vectors."""
-        assert low_pass(0.0, 1j) == 0.0
-        assert abs(high_pass(1e9, 1j)) < 1e-8
-
     @pytest.mark.parametrize("track", TRACKS)
     def test_low_pass_in_three_axes(self, track):
         """A small turn of both measured vectors, across both, comes through as k/(s+k): 1 - exp(-k t)."""

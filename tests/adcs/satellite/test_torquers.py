@@ -15,8 +15,7 @@ from adcs.satellite.telemetry import Telemetry
 from arrays.io.csv import write_columns
 from sims.attitude.simulation import AttitudeRuns, moved, prepare
 from sims.experiments import accuracy
-from tests.adcs.filter_runs import ANY_START, settings, start_of, tabletsat
-from tests.adcs.kalman.readable import run_readable
+from tests.adcs.filter_runs import ANY_START, assert_as_readable, settings, start_of, tabletsat
 
 SETTINGS = settings("st", ["disturbance"])
 
@@ -46,9 +45,7 @@ class TestKnownInput:
         scenario = replace(commanded.scenario, duration_s=60.0)
         runs = moved(replace(prepare(scenario, range(2)), torquers_Am2=commanded.torquers_Am2[:2, 20:81]))
         start, used = start_of(runs), settings("mag+sun", ["disturbance", "dipole"])
-        compiled, readable = (run(runs, used, start) for run in (run_filter, run_readable))
-        np.testing.assert_allclose(compiled.q, readable.q, rtol=0, atol=1e-12)
-        np.testing.assert_allclose(compiled.covariance, readable.covariance, rtol=1e-8, atol=1e-18)
+        assert_as_readable(runs, used, start)
 
 
 class TestLog:

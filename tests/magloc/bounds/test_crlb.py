@@ -24,7 +24,6 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from arrays.array import SensorArray
-from arrays.differences import decorrelated_differences
 from arrays.geometries import cube, grid, hexagon, square, tetrahedron
 from arrays.pose import PoseUncertainty
 from magloc.bounds.crlb import cramer_rao_bounds, whitened_jacobian
@@ -32,12 +31,10 @@ from magloc.bounds.over_moments import (
     bounds_over_moments,
     sigma_table,
     spread_over,
-    table_and_spreads,
 )
 from magloc.directions import moments_on_sphere, sphere_directions
 from magloc.fields.multipole import finite_body_errors
 from magloc.measurement.differences import DifferenceMeasurement, predicted_channels
-from tests import oracles
 from tests.arrays.test_differences import random_array
 from tests.magloc.bounds.hyper_dual import Model
 from tests.plain_locator import plain_locator
@@ -180,18 +177,6 @@ class TestBodies:
 class TestInvariance:
     @given(SEEDS)
     @settings(max_examples=10, deadline=None)
-    def test_base_sensor(self, seed):
-        array = random_array(seed, 5)
-        position, moment = random_source(seed)
-        information = fisher_information(array, position, moment)
-        for base in range(5):
-            model = DifferenceMeasurement(array, decorrelated_differences(array, base=base))
-            scale = np.sqrt(np.diagonal(information))
-            other = oracles.fisher_information(model, position, moment)
-            assert_allclose(other / scale / scale[:, None], information / scale / scale[:, None], atol=1e-9)
-
-    @given(SEEDS)
-    @settings(max_examples=10, deadline=None)
     def test_rotation_of_the_frame(self, seed):
         array = replace(random_array(seed, 8, kinds=("vector", "scalar"), uncertain=True), ambient_T=AMBIENT)
         position, moment = random_source(seed)
@@ -207,27 +192,6 @@ class TestInvariance:
         turned_covariance = R @ before.covariance @ R.T
         assert_allclose(
             after.covariance / sigma / sigma[:, None], turned_covariance / sigma / sigma[:, None], atol=1e-6
-        )
-
-    @given(SEEDS)
-    @settings(max_examples=10, deadline=None)
-    def test_order_of_the_sensors_and_origin_of_the_frame(self, seed):
-        array = random_array(seed, 5)
-        position, moment = random_source(seed)
-        shift = np.array([3.0, -2.0, 1.0])
-        other = replace(
-            array, sensors=tuple(replace(s, position_m=s.position_m + shift) for s in reversed(array.sensors))
-        )
-        before, after = cramer_rao_bounds(array, position, moment), cramer_rao_bounds(other, position + shift, moment)
-        assert_allclose(after.covariance, before.covariance, rtol=1e-6, atol=1e-6 * np.min(before.sigma) ** 2)
-        assert_allclose(after.sigma_range_m, before.sigma_range_m, rtol=1e-9)
-        assert_allclose(after.sigma_bearing_rad, before.sigma_bearing_rad, rtol=1e-9)
-
-    def test_sign_of_the_moment_for_vector_sensors(self):
-        position, moment = random_source(0)
-        assert_allclose(
-            cramer_rao_bounds(TETRAHEDRON, position, moment).sigma,
-            cramer_rao_bounds(TETRAHEDRON, position, -moment).sigma,
         )
 
 
@@ -422,13 +386,14 @@ class TestBatches:
 
 
 POSE = PoseUncertainty(0.02, 0.005, 0.02, 10.0, 0.05, 0.01, 0.0, (0.3, -0.2, 0.5))
+MIXED = replace(random_array(13, 9, kinds=("vector", "scalar")), ambient_T=AMBIENT)
 ARRAYS = {
     "tetrahedron": TETRAHEDRON,
     "any vector sensors": random_array(11, 6),
     "common field of 30 nT": random_array(12, 5, common_field_T=30e-9),
     "planar": square(1.0, noise_T=1e-9),
     "scalar": SCALARS,
-    "mixed": replace(random_array(13, 9, kinds=("vector", "scalar")), ambient_T=AMBIENT),
+    "mixed": MIXED,
     "noise that depends on the readings": replace(random_array(14, 5), noise_fraction=1e-2),
     "noise of one sensor that depends on its reading": replace(
         SCALARS, sensors=(replace(SCALARS.sensors[0], noise_fraction=0.1), *SCALARS.sensors[1:])
@@ -438,6 +403,10 @@ ARRAYS = {
         ambient_T=AMBIENT,
         noise_fraction=1e-2,
     ),
+    "fields that the ambient one induces": replace(
+        MIXED, sensors=tuple(replace(s, induced_uncertainty=1e-4 * (i + 1)) for i, s in enumerate(MIXED.sensors))
+    ),
+    "uncertain ambient field": replace(MIXED, ambient_uncertainty_T=3e-8),
     "a pose that errs": replace(random_array(16, 6), pose=POSE),
     "a pose that errs, mixed": replace(
         random_array(17, 9, kinds=("vector", "scalar"), common_field_T=50e-9), ambient_T=AMBIENT, pose=POSE
@@ -485,31 +454,14 @@ class TestTable:
     @each_array
     @pytest.mark.usefixtures("instruction_set")
     def test_equals_the_reference(self, array):
-        positions, moments = places(array), moments_over(array, 9)
+        # Lanes have sources of two places, and some are idle at the end.
+        positions, moments = places(array, 21), moments_over(array, 65)
         reference = cramer_rao_bounds(array, positions[:, None], moments)
         for name, values in sigma_table(array, positions, moments)._asdict().items():
             expected = {"range_m": reference.sigma_range_m, "bearing_rad": reference.sigma_bearing_rad}.get(
                 name, reference.sigma_position_m
             )
             assert_allclose(values, expected, rtol=1e-10, err_msg=name)
-
-    def test_equals_the_reference_where_the_field_induces_another(self):
-        array = ARRAYS["mixed"]
-        sensors = (replace(s, induced_uncertainty=1e-4 * (i + 1)) for i, s in enumerate(array.sensors))
-        array = replace(array, sensors=tuple(sensors))
-        positions, moments = places(array), moments_over(array, 5)
-        reference = cramer_rao_bounds(array, positions[:, None], moments)
-        table = sigma_table(array, positions, moments)
-        assert_allclose(table.range_m, reference.sigma_range_m, rtol=1e-10)
-        assert_allclose(table.bearing_rad, reference.sigma_bearing_rad, rtol=1e-10)
-
-    def test_equals_the_reference_with_an_uncertain_ambient_field(self):
-        array = ARRAYS["mixed"]
-        positions, moments = places(array), moments_over(array, 5)
-        reference = cramer_rao_bounds(array, positions[:, None], moments, ambient_uncertainty_T=3e-8)
-        table = sigma_table(array, positions, moments, ambient_uncertainty_T=3e-8)
-        assert_allclose(table.range_m, reference.sigma_range_m, rtol=1e-10)
-        assert_allclose(table.bearing_rad, reference.sigma_bearing_rad, rtol=1e-10)
 
     @each_array
     @pytest.mark.parametrize("length_m", [None, 0.3])
@@ -566,15 +518,6 @@ class TestTable:
         parts = [sigma_table(array, positions, part) for part in (moments[:1], *np.array_split(moments[1:], 4))]
         assert_allclose(together, np.concatenate(parts, axis=-1), rtol=1e-10)
 
-    @each_array
-    def test_table_and_spreads_are_those_of_the_two(self, array):
-        positions, moments = places(array, 4), moments_over(array, 23)
-        table, spreads = table_and_spreads(array, positions, moments[:3], moments[3:])
-        for values, expected in zip(table, sigma_table(array, positions, moments[:3]), strict=True):
-            assert_allclose(values, expected, rtol=1e-10)
-        for values, expected in zip(spreads, bounds_over_moments(array, positions, moments[3:]), strict=True):
-            assert_allclose(np.array(values), np.array(expected), rtol=1e-10)
-
     def test_a_modulus_of_no_field_has_no_bound_and_leaves_the_others_theirs(self):
         array = cube(1.5, kind="scalar", noise_T=1e-11)
         positions, moments = places(array, 3), np.array([[0.0, 0.0, 0.0], [60.0, 50.0, 60.0]])
@@ -598,11 +541,6 @@ class TestTable:
             sigma_table(TETRAHEDRON, np.ones(shape), np.eye(3))
         with pytest.raises(ValueError, match="Input moments_Am2 must have shape"):
             bounds_over_moments(TETRAHEDRON, np.eye(3), np.ones(shape))
-
-    @pytest.mark.parametrize("shape", [(3,), (2, 2)])
-    def test_wrong_shape_of_moments_alone(self, shape):
-        with pytest.raises(ValueError, match="Input alone_Am2 must have shape"):
-            table_and_spreads(TETRAHEDRON, np.eye(3), np.ones(shape), np.eye(3))
 
 
 class TestSpread:

@@ -146,15 +146,6 @@ class TestResult:
         assert "--body-length-m must be from 0 to 10000 m" in capsys.readouterr().err
 
     @with_plain_pictures
-    def test_threads_do_not_matter(self, tmp_path, capsys):
-        results = [
-            run_json("--threads", threads, "--out", tmp_path / str(threads), capsys=capsys) for threads in (1, 2)
-        ]
-        for result in results:
-            del result["seconds"], result["out"]
-        assert results[0] == results[1]
-
-    @with_plain_pictures
     def test_the_same_again_computes_nothing_anew_and_something_else_is_refused(self, tmp_path, capsys):
         first = run_json("--out", tmp_path, capsys=capsys)
         again = run_json("--out", tmp_path, capsys=capsys)

@@ -77,16 +77,6 @@ class TestResult:
         assert err == ""
 
     @with_plain_pictures
-    def test_threads_do_not_matter(self, tmp_path, capsys):
-        results = []
-        for threads in ("1", "2"):
-            main(["map", "--grid", "7", "--threads", threads, "--out", str(tmp_path / threads), "--json"])
-            results.append(json.loads(capsys.readouterr().out))
-        for result in results:
-            del result["seconds"], result["out"]
-        assert results[0] == results[1]
-
-    @with_plain_pictures
     def test_noise_is_drawn_with_the_seed(self, tmp_path, capsys):
         optima = []
         for i, options in enumerate(([], ["--noise"], ["--noise", "--seed", "1"], ["--noise", "--seed", "1"])):

@@ -22,9 +22,9 @@ from arrays import geometries
 from arrays.array_file import read_array
 from magloc.readings import Readings, read_readings
 from magloc.tracking.motion import OrnsteinUhlenbeck, RandomWalk
-from magloc.tracking.posterior_bound import posterior_bound, smoothing_bound
-from magloc.tracking.results import rows_of
+from magloc.tracking.rows import rows_of
 from magloc.tracking.tracker import Tracker
+from magloc.tracking.whole_records.posterior_bound import posterior_bound, smoothing_bound
 from magloc.tracking.whole_records.smoother import smoothed
 from magloc.truth import Truth, truth_of_rows
 from tests.command_line import Outcome, Run, assert_refused, refuse_constant, results_of

@@ -3,7 +3,7 @@
 | what | who checks it |
 |---|---|
 | one pass of `iekf` and `repeated`, ill-conditioned ones too | exact rational arithmetic, magloc.state_space |
-| several passes, the stop rule and the count | the readable twins `run_one` |
+| several passes, the stop rule and the count | `run_one` of `readable_filters.py` |
 | `damped` | its cost, SciPy's least_squares, the twin |
 | what a stop promises | the gradient at the end, by an orthogonal factorisation |
 | lanes and threads | the same starts in another order, alone, on one thread: to the last bit |
@@ -36,6 +36,7 @@ from magloc.convergence.filters import DampedFilter, IekfFilter, RepeatedFilter,
 from magloc.measurement.differences import DifferenceMeasurement
 from magloc.state_space import predict, update
 from tests.arrays.test_differences import random_array
+from tests.magloc.convergence.readable_filters import run_one
 
 Array = NDArray[np.float64]
 Filter = IekfFilter | RepeatedFilter | DampedFilter
@@ -242,7 +243,7 @@ class TestReadableTwins:
     ) -> Ends:
         ends = method.run(measurement, z, starts)
         for i, start in enumerate(starts):
-            twin = method.run_one(measurement, z, start)
+            twin = run_one(method, measurement, z, start)
             near = tolerance
             if isinstance(method, DampedFilter):
                 # A step that lowers the cost by less than the cost's rounding may be taken by one and not by the other.
@@ -278,7 +279,7 @@ class TestTwoFormsOfTheDifferences:
         starts = starts_of("cube with moment", 40)
         contrasts, rows = once.run(measurement, z, starts), once.run(scaled, factor * z, starts)
         for i, start in enumerate(starts):
-            S = once.run_one(measurement, z, start).S
+            S = run_one(once, measurement, z, start).S
             assert in_sigmas(contrasts.states[i] - rows.states[i], S) < ROUNDING
         assert_allclose(contrasts.chi2, rows.chi2, rtol=1e-6)
 
@@ -459,7 +460,7 @@ class TestLanes:
     def test_nor_does_the_readable_twin_say_that_it_stopped(self, method: Filter) -> None:
         (start,) = starts_of("cube", 1)
         for tolerance_T, stops in ((0.0, False), (np.inf, True)):
-            end = replace(method, tolerance_T=tolerance_T, max_iterations=3).run_one(self.measurement, self.z, start)
+            end = run_one(replace(method, tolerance_T=tolerance_T, max_iterations=3), self.measurement, self.z, start)
             assert (end.converged, end.iterations < 3) == (stops, stops)
 
     @each_filter

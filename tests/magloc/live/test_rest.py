@@ -16,7 +16,7 @@ from arrays.sensor import Calibration
 from magloc.live.follower import RESTING, Follower
 from magloc.live.rest import Background
 from magloc.readings import Readings
-from magloc.tracking.results import Row
+from magloc.tracking.rows import Row
 from tests.passing_source import ARRAY, NOISE_T, SLOW, moving_source, readings_of
 
 N_REST = 40

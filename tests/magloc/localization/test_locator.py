@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 from scipy.stats import chi2 as chi2_distribution
 
 from arrays.array import SensorArray
-from arrays.geometries import cube, tetrahedron
+from arrays.geometries import tetrahedron
 from magloc.localization.fit.prior import SourcePrior
 from tests.magloc.localization.fit.test_gauss_newton import (
     AMBIENT,
@@ -177,24 +177,6 @@ class TestBestFit:
             assert best.chi2 < scipy_optimum(array, row, *truth)[0] + 0.01
             expected = chi2_by_magpylib(array, row, best.position_m[None], best.moment_Am2[None])
             assert best.chi2 == pytest.approx(expected, rel=1e-5, abs=1e-4)
-
-    def test_vector_sensors_as_the_locator_has_them(self):
-        array = cube(1.0)
-        rng = np.random.default_rng(10)
-        p, m = sources_anywhere(rng, 12)
-        readings = noisy_readings(array, p, m, rng)
-        for ours, other in zip(
-            plain_locator(array).fit_rows(readings),
-            plain_locator(array).fit_rows(readings),
-            strict=True,
-        ):
-            a, b = ours.solutions[0], other.solutions[0]
-            assert a.chi2 == pytest.approx(b.chi2, rel=1e-5, abs=1e-5)
-            assert_allclose(a.position_m, b.position_m, rtol=1e-3)
-            assert a.dof == b.dof
-            assert a.range_observable == b.range_observable
-            ends = [[np.inf if end is None else end for end in s.range_interval_m[0]] for s in (a, b)]
-            assert_allclose(ends[0], ends[1], rtol=0.01)
 
 
 class TestRows:

@@ -31,6 +31,7 @@ from magloc.grids.cube import Box
 from magloc.measurement.differences import DifferenceMeasurement, channel_jacobian, predicted_channels
 from tests import oracles
 from tests.arrays.test_differences import random_array
+from tests.magloc.convergence.readable_filters import run_one
 from tests.plain_locator import plain_locator
 
 SOURCE = np.array([5.0, 0.0, 0.306])
@@ -135,7 +136,7 @@ class TestGradientOfTheAmbientField:
         ends = method.run(measurement, z, starts)
         assert ends.stopped.all()
         for start, end in zip(starts, ends.states, strict=True):
-            twin = method.run_one(measurement, z, start)
+            twin = run_one(method, measurement, z, start)
             assert_allclose(end[:3], twin.x[:3], atol=1e-6)
 
     def test_maps_of_sources(self):

@@ -31,11 +31,10 @@ from magloc.measurement.nuisances import (
     without_lasting_errors,
 )
 from magloc.tracking import row_filter
-from magloc.tracking.chart.coordinates import Chart
-from magloc.tracking.chart.row import ChartRow
+from magloc.tracking.coordinates import Chart
 from magloc.tracking.motion import RandomWalk
-from magloc.tracking.results import Row, rows_of
 from magloc.tracking.row_filter import Gaussians
+from magloc.tracking.rows import Row, rows_of
 from magloc.tracking.tracker import Tracker
 from sims.magnetics.paths import Attitude, Steered
 from sims.magnetics.scenario import Carrier, MagneticScenario, Source
@@ -308,7 +307,7 @@ class TestUpdate:
         _, true = uncalibrated(array, rng)
         readings = predicted_channels(true, SOURCE[:3], SOURCE[3:]) + 2e-10 * rng.normal(size=12)
         tracker = Tracker(array, RandomWalk(1e-6, 1e-6))
-        measurement = ChartRow.of(tracker.measurements.of(Row(0.0, readings)))
+        measurement = tracker.measurements.of(Row(0.0, readings))
         chart = Chart.at(SOURCE[None] * 1.01, array.centroid, array.circumradius)
         N = 6 + tracker.errors.n_states
         x, S = np.zeros((1, N)), np.zeros((1, N, N))

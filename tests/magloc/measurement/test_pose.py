@@ -32,7 +32,7 @@ from magloc.measurement.pose import (
 )
 from magloc.readings import Readings
 from magloc.tracking.motion import RandomWalk
-from magloc.tracking.results import Row
+from magloc.tracking.rows import Row
 from magloc.tracking.tracker import Tracker
 from tests.oracles import derivative, magpylib_field
 

@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 
 import magloc
 from arrays.geometries import tetrahedron
+from magloc.localization.fit.export import fix_columns
 from magloc.localization.fit.fixes import Fixes
 from magloc.localization.locator import locate
 from magloc.measurement.differences import predicted_channels
-from magloc.plots.localization import fix_columns
 from magloc.readings import Readings
 
 ARRAY = tetrahedron(1.5)

@@ -37,12 +37,13 @@ from arrays.sensor import Calibration
 from magloc.bounds.maps import BoundScenario, bound_slices
 from magloc.chi_square import square_columns
 from magloc.convergence.over_starts import Status
+from magloc.localization.fit.export import distances_from_truth, fix_columns
 from magloc.localization.fit.results import Fix, Solution
 from magloc.plots import style
 from magloc.plots.bounds import _palette
 from magloc.plots.bounds import bound_slices as bound_slices_figure
 from magloc.plots.calibrations import calibration_figure, turning_figure
-from magloc.plots.localization import distances_from_truth, fix_columns, fix_figure, residual_figure
+from magloc.plots.localization import fix_figure, residual_figure
 from magloc.plots.maps import _SOURCE_ENDS, convergence
 from magloc.plots.style import save
 from magloc.plots.tracks import consistency_figure, track_figure

@@ -88,7 +88,7 @@ class TestKalmanFilter:
         for i, row in enumerate(track.model.rows):
             change = (0.02 * np.linalg.norm(peer.x)) ** 2 * np.eye(3) if i else np.zeros((3, 3))
             peer.predict(Q=change)
-            H = row.source_jacobian(np.concatenate([PASS.position_m[i], np.zeros(3)]))[:, 3:]
+            H = row.moment_columns(PASS.position_m[i])
             peer.update(row.z, H=H)
             means.append(peer.x.copy())
             covariances.append(peer.P.copy())

@@ -110,10 +110,10 @@ def test_at_its_ends_a_depth_interval_costs_what_chance_does() -> None:
         return np.asarray(r - kept @ ((background.Q @ V).T @ r))
 
     found = np.concatenate([fit.sources.position_m, fit.sources.moment_Am2], axis=1)
-    assert np.sum(residual(np.delete(found, 2), -found[0, 2]) ** 2) == pytest.approx(fit.chi2)
+    assert np.sum(residual(np.delete(found, 2), -found[0, 2]) ** 2) == pytest.approx(fit.cost)
     for depth in profile_of(model, fit, background, 0, 0.0).depth_interval95_m:
         there = least_squares(residual, np.delete(found, 2), x_scale="jac", args=(depth,))
-        assert 2.0 * there.cost - fit.chi2 == pytest.approx(3.84, abs=0.5)
+        assert 2.0 * there.cost - fit.cost == pytest.approx(3.84, abs=0.5)
 
 
 class TestMisfit:
@@ -245,7 +245,7 @@ class TestSecondSource:
         directions = model.record.directions(fit.sources.fields(model.record))
         Q = with_free_sources(model.record, background, fit.sources)
         left = fit.residual - Q @ (Q.T @ fit.residual)
-        return second_source_chi2(model, background, directions, Q, left, fit.sources.position_m[0]), fit.chi2
+        return second_source_chi2(model, background, directions, Q, left, fit.sources.position_m[0]), fit.cost
 
     @pytest.mark.parametrize("gap_m", [0.3, 0.6])
     def test_explains_what_one_dipole_leaves(self, gap_m: float) -> None:

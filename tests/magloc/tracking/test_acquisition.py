@@ -8,7 +8,7 @@ import pytest
 import magloc
 from magloc.localization.fit.prior import NOTHING_KNOWN
 from magloc.tracking.acquisition import Acquisition
-from magloc.tracking.results import rows_of
+from magloc.tracking.rows import rows_of
 from magloc.tracking.tracker import Tracker
 from sims.magnetics.scenario_files import read_scenario
 from sims.magnetics.simulation import simulate

@@ -16,7 +16,7 @@ from scipy import stats
 import magloc
 from arrays.array import SensorArray
 from arrays.sensor import Sensor
-from magloc.tracking.innovations import THRESHOLD
+from magloc.tracking.consistency import THRESHOLD
 from magloc.tracking.track import Track
 from sims.magnetics.paths import Attitude, Steered
 from sims.magnetics.scenario import Carrier, MagneticScenario, Source

@@ -17,14 +17,15 @@ from arrays.differences import contrasts
 from magloc.chi_square import mean_bounds
 from magloc.readings import Readings
 from magloc.state_space import symmetric_square_root
-from magloc.tracking.chart.coordinates import Chart
 from magloc.tracking.chart.mixture import Mixture
 from magloc.tracking.consistency import consistency, nees_of
+from magloc.tracking.coordinates import Chart
 from magloc.tracking.measurement import RowMeasurement
 from magloc.tracking.motion import OrnsteinUhlenbeck, RandomWalk
-from magloc.tracking.posterior_bound import posterior_bound, smoothing_bound
-from magloc.tracking.results import Row, TrackPoint, rows_of
+from magloc.tracking.results import TrackPoint
+from magloc.tracking.rows import Row, rows_of
 from magloc.tracking.tracker import Tracker
+from magloc.tracking.whole_records.posterior_bound import posterior_bound, smoothing_bound
 from tests.oracles import derivative, magpylib_field
 
 FloatArray = NDArray[np.float64]
@@ -121,7 +122,7 @@ class TestNeesOfACurvedEstimate:
             estimate = self.solved(measurement, measurement.of_source(self.TRUTH) + noise)
             if estimate is None:
                 continue
-            H = measurement.source_jacobian(estimate)
+            H = measurement.along(estimate, np.eye(6))
             point = self.point(array, estimate, np.linalg.inv(H.T @ H))
             expected.append(noise @ noise)
             found.append(nees_of(point, self.TRUTH, measurement)[0])
@@ -142,7 +143,7 @@ class TestNeesOfACurvedEstimate:
         fit = least_squares(
             lambda y: measurement.of_source(y * self.UNIT) - z,
             self.TRUTH / self.UNIT,
-            lambda y: measurement.source_jacobian(y * self.UNIT) * self.UNIT,
+            lambda y: measurement.along(y * self.UNIT, np.diag(self.UNIT)),
             xtol=1e-15,
             ftol=1e-15,
             gtol=1e-15,

@@ -22,9 +22,9 @@ from magloc.measurement.nuisances import without_lasting_errors
 from magloc.tracking.consistency import nees_of
 from magloc.tracking.files import json_entry
 from magloc.tracking.motion import MotionModel
-from magloc.tracking.posterior_bound import posterior_bound
-from magloc.tracking.results import Row, rows_of
+from magloc.tracking.rows import Row, rows_of
 from magloc.tracking.tracker import Tracker
+from magloc.tracking.whole_records.posterior_bound import posterior_bound
 from tests.passing_source import ARRAY, followed
 from tests.tracked_sources import VELOCITY, WALK, drawn
 

@@ -13,7 +13,7 @@ import magloc
 from arrays.geometries import axial
 from magloc.measurement.differences import predicted_channels
 from magloc.tracking.chart.known_moment import KeptModulus
-from magloc.tracking.results import Row
+from magloc.tracking.rows import Row
 from magloc.tracking.tracker import Tracker
 from tests.passing_source import ARRAY
 from tests.tracked_sources import MODULUS_AM2 as MODULUS

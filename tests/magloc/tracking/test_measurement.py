@@ -21,7 +21,7 @@ from arrays import geometries
 from arrays.array import SensorArray
 from magloc.tracking.measurement import RowMeasurement
 from magloc.tracking.motion import RandomWalk
-from magloc.tracking.results import Row, rows_of
+from magloc.tracking.rows import Row, rows_of
 from magloc.tracking.tracker import Tracker
 from tests.oracles import derivative, magpylib_field
 

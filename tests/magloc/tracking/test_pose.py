@@ -18,13 +18,14 @@ from scipy.spatial.transform import Rotation
 import magloc
 from arrays.pose import PoseUncertainty
 from magloc.ambient import in_world_field
-from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.chart.start import prior_root
-from magloc.tracking.innovations import THRESHOLD, innovation_test
-from magloc.tracking.posterior_bound import posterior_bound
-from magloc.tracking.results import TrackPoint, rows_of
+from magloc.tracking.consistency import THRESHOLD, innovation_test
+from magloc.tracking.measurement import step_of_errors
+from magloc.tracking.results import TrackPoint
+from magloc.tracking.rows import rows_of
 from magloc.tracking.track import Track
 from magloc.tracking.tracker import Tracker
+from magloc.tracking.whole_records.posterior_bound import posterior_bound
 from sims.magnetics.paths import Steered
 from sims.magnetics.scenario import MagneticScenario
 from sims.magnetics.scenario_files import read_scenario
@@ -172,8 +173,8 @@ class TestBound:
             moved = [state + side * step for step in np.diag(steps) for side in (0.5, -0.5)]
             h = np.array([measurement.predicted(x) for x in moved]).reshape(len(steps), 2, -1)
             by_state.append(((h[:, 0] - h[:, 1]) / steps[:, None]).T)
-        variance = [tracker.error_sigma**2]
-        kept, added = zip(*(tracker.error_step(b.time_s - a.time_s) for a, b in pairwise(rows)), strict=True)
+        variance, of = [tracker.error_sigma**2], (tracker.pose_errors, tracker.errors)
+        kept, added = zip(*(step_of_errors(*of, b.time_s - a.time_s) for a, b in pairwise(rows)), strict=True)
         for share, noise in zip(kept, added, strict=True):
             variance.append(share**2 * variance[-1] + noise**2)
         n, k = len(rows), len(by_state[0])
@@ -184,7 +185,7 @@ class TestBound:
             C[i, :, j] += between
             C[j, :, i] += between.T if i != j else 0.0
         J = np.concatenate(by_state)[:, :6]
-        root = prior_root(ChartRow.of(tracker.measurements.of(rows[0])).chart(state[:6]))
+        root = prior_root(tracker.measurements.of(rows[0]).chart(state[:6]))
         information = J.T @ np.linalg.solve(C.reshape(n * k, n * k), J) + np.linalg.inv(root @ root.T)
         dense_m = math.sqrt(float(np.trace(np.linalg.inv(information)[:3, :3])))
         assert bound[-1] == pytest.approx(dense_m, rel=5e-3)

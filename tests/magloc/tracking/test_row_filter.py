@@ -23,13 +23,12 @@ from arrays.pose import PoseUncertainty
 from magloc import core
 from magloc.measurement.differences import predicted_channels
 from magloc.tracking import row_filter
-from magloc.tracking.chart.coordinates import Chart
 from magloc.tracking.chart.mixture import component_moments
-from magloc.tracking.chart.row import ChartRow, Rows
-from magloc.tracking.chart.update import LEAST_SHARE
+from magloc.tracking.coordinates import Chart
+from magloc.tracking.measurement import RowMeasurement
 from magloc.tracking.motion import CoordinatedTurn, KnownMotion, MotionModel, OrnsteinUhlenbeck, RandomWalk
-from magloc.tracking.results import Row
-from magloc.tracking.row_filter import Gaussians
+from magloc.tracking.row_filter import LEAST_SHARE, Gaussians, Rows
+from magloc.tracking.rows import Row
 from magloc.tracking.tracker import Tracker
 from tests.passing_source import MOMENT, NOISE_T, POSITION
 
@@ -59,7 +58,7 @@ WALKING = replace(NEW_IN_EVERY_ROW, correlation_s=10.0, position_constant_m=0.05
 class Case:
     """A row, and predictions of the source that it shows."""
 
-    row: ChartRow
+    row: RowMeasurement
     x: FloatArray
     S: FloatArray
 
@@ -83,7 +82,7 @@ def case(
     readings[rng.choice(array.n_channels, missing, replace=False)] = np.nan
     sensors = tuple(replace(one, offset_uncertainty_T=offset_T) for one in array.sensors)
     measurements = Tracker(replace(array, sensors=sensors, pose=pose), motion).measurements
-    row = ChartRow.of(measurements.of(Row(0.5, readings, origin, R.as_matrix())))
+    row = measurements.of(Row(0.5, readings, origin, R.as_matrix()))
     n, p, e = motion.n_states, row.n_pose, row.effect.shape[1]
     x = np.zeros((3, n + p + e))
     of_array = SOURCE * (1.0 + 0.05 * rng.normal(size=(3, 6)))
@@ -143,7 +142,7 @@ def fitted(at: Case, i: int, bends: bool, shares: FloatArray) -> Fit:
     With bends, s = ζ + M (h(ζ) - h(0) - J ζ) of what is seen is normal in place of ζ, where errors of the pose have
     shares, and of errors of sensors ζ + M' (h(ζ) - h(0) - J s).
     """
-    row, n, m, x = at.row, at.row.n_motion, at.row.measurement.n_motion, at.x[i]
+    row, n, m, x = at.row, at.row.n_charted, at.row.n_motion, at.x[i]
     seen, errors = np.r_[:6, m:n], np.arange(n, len(x))
     order = np.r_[seen, errors, 6:m]
     s, d = len(seen), len(seen) + len(errors)
@@ -152,7 +151,7 @@ def fitted(at: Case, i: int, bends: bool, shares: FloatArray) -> Fit:
     chart = row.chart(x[None, :n]).firmly(at.S[i : i + 1, :n])
     lasting = replace(row, pose_effect=row.pose_effect * shares)
 
-    def h(zeta: FloatArray, of_row: ChartRow = lasting) -> FloatArray:
+    def h(zeta: FloatArray, of_row: RowMeasurement = lasting) -> FloatArray:
         return of_row.of_source(chart.retracted((U @ zeta)[None, :n])[0])
 
     nowhere = np.zeros(len(x))
@@ -252,7 +251,7 @@ class TestOneSource:
         """Offsets of 20 µT beside 0.2 nT of noise, by the same formula with fifty digits."""
         at = case(ARRAYS[0], RandomWalk(0.1, 0.02), 3, offset_T)
         found = row_filter.update(at.gaussians, at.row.compiled).after
-        n = at.row.n_motion
+        n = at.row.n_charted
         for before, x, S_before, S in zip(at.x, found.x, at.S, found.S, strict=True):
             chart = at.row.chart(before[None, :n]).firmly(S_before[None])
             after = at.row.chart(x[None, :n])

@@ -15,9 +15,10 @@ from arrays import geometries
 from arrays.array import SensorArray
 from magloc.readings import Readings
 from magloc.tracking import settled
-from magloc.tracking.innovations import innovation_test
+from magloc.tracking.consistency import innovation_test
 from magloc.tracking.motion import CoordinatedTurn, MotionModel, OrnsteinUhlenbeck, RandomWalk
-from magloc.tracking.results import Row, TrackPoint, rows_of
+from magloc.tracking.results import TrackPoint
+from magloc.tracking.rows import Row, rows_of
 from magloc.tracking.tracker import Tracker
 from magloc.tracking.whole_records.smoother import smoothed
 from tests.oracles import magpylib_field

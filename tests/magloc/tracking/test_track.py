@@ -23,9 +23,10 @@ from scipy.spatial.transform import Rotation
 import magloc
 from arrays.io.errors import InputError
 from magloc.tracking.files import at_rest
-from magloc.tracking.posterior_bound import posterior_bound, smoothing_bound
-from magloc.tracking.results import TrackPoint, rows_of
+from magloc.tracking.results import TrackPoint
+from magloc.tracking.rows import rows_of
 from magloc.tracking.track import SPEED_M_S, TURN_RAD_S
+from magloc.tracking.whole_records.posterior_bound import posterior_bound, smoothing_bound
 from magloc.tracking.whole_records.smoother import smoothed
 from tests.passing_source import ARRAY, SLOW, moving_source, readings_of
 

@@ -15,11 +15,12 @@ from scipy.stats import chi2
 import sims
 from magloc.measurement.differences import predicted_channels
 from magloc.readings import Readings
-from magloc.tracking.chart.coordinates import Chart
 from magloc.tracking.chart.mixture import Mixture, root_of
 from magloc.tracking.consistency import consistency
+from magloc.tracking.coordinates import Chart
 from magloc.tracking.motion import CoordinatedTurn, MotionModel, OrnsteinUhlenbeck, RandomWalk
-from magloc.tracking.results import Row, TrackPoint, rows_of
+from magloc.tracking.results import TrackPoint
+from magloc.tracking.rows import Row, rows_of
 from magloc.tracking.tracker import Known, Tracker
 from magloc.tracking.whole_records.smoother import smoothed
 from tests.oracles import magpylib_field

@@ -16,7 +16,7 @@ from arrays.array import SensorArray
 from magloc.measurement.differences import predicted_channels
 from magloc.tracking.chart.start import Start
 from magloc.tracking.multi_target.tracker import SourcesTracker
-from magloc.tracking.results import Row
+from magloc.tracking.rows import Row
 from magloc.tracking.sensor_health import OFFSETS, Misfits
 from magloc.tracking.tracker import Tracker
 

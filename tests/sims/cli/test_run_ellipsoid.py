@@ -9,6 +9,7 @@ import pytest
 from cyclopts import App, CycloptsError
 from matplotlib import image
 
+from adcs.cli.app import main
 from arrays.io.errors import InputError
 from sims.cli.run_ellipsoid import EllipsoidOptions, ellipsoid, run_ellipsoid, summary_lines
 
@@ -76,9 +77,7 @@ class TestCommand:
     """The command as ``adcs run`` registers it."""
 
     def run(self, capsys, *arguments):
-        app = App(name="run")
-        app.command(ellipsoid)
-        app(["ellipsoid", *arguments], result_action="return_value")
+        assert main(["run", "ellipsoid", *arguments]) == 0
         return capsys.readouterr()
 
     def test_json(self, capsys):

@@ -25,9 +25,9 @@ from scipy.stats import chi2
 from magloc.chi_square import mean_bounds
 from magloc.tracking.consistency import consistency, nees_of
 from magloc.tracking.motion import MotionModel, OrnsteinUhlenbeck, RandomWalk
-from magloc.tracking.posterior_bound import posterior_bound
-from magloc.tracking.results import rows_of
+from magloc.tracking.rows import rows_of
 from magloc.tracking.tracker import Tracker
+from magloc.tracking.whole_records.posterior_bound import posterior_bound
 from sims.magnetics.scenario import MagneticScenario
 from sims.magnetics.scenario_files import read_scenario
 from sims.magnetics.simulation import Simulation

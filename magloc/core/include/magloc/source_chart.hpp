@@ -1,5 +1,5 @@
 // Coordinates in which a tracked source is Gaussian: log-range, direction, the moment as it is seen and, where there
-// are any, the velocity and further numbers. magloc/tracking/chart/coordinates.py explains them and is the reference.
+// are any, the velocity and further numbers. magloc/tracking/coordinates.py explains them and is the reference.
 #pragma once
 #include "elementary.hpp"
 #include "linear.hpp"

@@ -6,12 +6,13 @@
 | Jacobians | scipy.differentiate |
 | the optimum | scipy.optimize.least_squares on magpylib's field |
 | covariance | oracles.fisher_information; scipy.differentiate on magpylib's field; scatter of the fits |
-| range interval | the compiled Locator |
+
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -35,12 +36,11 @@ from magloc.localization.fit.gauss_newton import (
     refine_moments,
     tangents,
 )
-from magloc.localization.uncertainty.range_profile import ranges_within
 from magloc.measurement.differences import DifferenceMeasurement
 from magloc.measurement.rows import whitened_model, whitenings_of
+from magloc.measurement.whitened import WhitenedModel
 from tests import oracles
 from tests.arrays.test_differences import random_array
-from tests.plain_locator import plain_locator
 
 SEEDS = st.integers(0, 2**32 - 1)
 AMBIENT = (2e-5, -1e-6, 4.5e-5)
@@ -93,6 +93,24 @@ def problem_of(array, readings, ambient=None):
     mask = np.isfinite(readings[0])
     problem, raw = whitened_model(array, mask, readings, whitenings_of(array, mask, readings), ambient)
     return problem, problem.whitened(raw)
+
+
+class Drawn(NamedTuple):
+    """Sources drawn at random, noisy readings of them, and the joint problem and whitened readings of these."""
+
+    problem: WhitenedModel
+    y: np.ndarray
+    p: np.ndarray
+    m: np.ndarray
+    readings: np.ndarray
+    rng: np.random.Generator
+
+
+def drawn(array, seed, n_rows, n_sources, *between):
+    rng = np.random.default_rng(seed)
+    p, m = random_sources(rng, n_rows, n_sources, *between)
+    readings = noisy_readings(array, p, m, rng)
+    return Drawn(*problem_of(array, readings), p, m, readings, rng)
 
 
 def whitened_residuals(array, readings, positions, moments):
@@ -152,10 +170,7 @@ class TestPredictions:
     @settings(max_examples=20, deadline=None)
     def test_one_source_is_the_measurement_model(self, seed, kind):
         array = array_of(kind, seed)
-        rng = np.random.default_rng(seed)
-        p, m = random_sources(rng, 1, 1)
-        readings = noisy_readings(array, p, m, rng)
-        problem, y = problem_of(array, readings)
+        problem, y, p, m, readings, *_ = drawn(array, seed, 1, 1)
         q = problem.homogeneous(p)
         measurement = DifferenceMeasurement.of(array)
         residual = measurement.measured(readings[0]) - measurement.predicted(p[0, 0], m[0, 0])
@@ -164,10 +179,7 @@ class TestPredictions:
 
     def test_a_prior_of_the_common_field(self):
         array = replace(array_of("vector", 3), common_field_T=3e-9)
-        rng = np.random.default_rng(3)
-        p, m = random_sources(rng, 1, 2)
-        readings = noisy_readings(array, p, m, rng)
-        problem, y = problem_of(array, readings)
+        problem, y, p, m, readings, *_ = drawn(array, 3, 1, 2)
         q = problem.homogeneous(p)
         chi2 = chi2_at(problem, y, q, problem.scaled_moment(q, m))[0]
         assert_allclose(chi2, chi2_by_magpylib(array, readings[0], p[0], m[0]), rtol=1e-9)
@@ -211,10 +223,7 @@ class TestCoordinates:
 
     @pytest.mark.parametrize("kind", KINDS)
     def test_q_and_minus_q_are_the_same_source(self, kind):
-        array = array_of(kind, 7)
-        rng = np.random.default_rng(7)
-        p, m = random_sources(rng, 3, 2)
-        problem, y = problem_of(array, noisy_readings(array, p, m, rng))
+        problem, y, p, m, *_ = drawn(array_of(kind, 7), 7, 3, 2)
         q = problem.homogeneous(p)
         mu = problem.scaled_moment(q, m)
         assert_allclose(problem.source_fields(-q, mu), problem.source_fields(q, mu), rtol=1e-12)
@@ -236,10 +245,7 @@ class TestCoordinates:
     @pytest.mark.parametrize("kind", KINDS)
     def test_infinity_is_an_ordinary_point(self, kind):
         """A source infinitely far away has a uniform field: predicted as nothing but its share in the moduli."""
-        array = array_of(kind, 8)
-        rng = np.random.default_rng(8)
-        p, m = random_sources(rng, 2, 1)
-        problem, _ = problem_of(array, noisy_readings(array, p, m, rng))
+        problem, _, p, m, *_ = drawn(array_of(kind, 8), 8, 2, 1)
         mu = problem.scaled_moment(problem.homogeneous(p), m)
         fields = []
         for s in (0.0, 1e-9):
@@ -249,10 +255,7 @@ class TestCoordinates:
         assert_allclose(fields[1], fields[0], rtol=1e-6)
 
     def test_a_start_far_away_comes_back(self):
-        array = array_of("vector", 8)
-        rng = np.random.default_rng(8)
-        p, m = random_sources(rng, 5, 1)
-        problem, y = problem_of(array, noisy_readings(array, p, m, rng))
+        problem, y, p, m, *_ = drawn(array_of("vector", 8), 8, 5, 1)
         far = problem.homogeneous(30.0 * p)
         fits = refine(problem, y, far, fit_moments(problem, y, far))
         best = refined_from(problem, y, p, m)
@@ -265,10 +268,7 @@ class TestJacobians:
     @pytest.mark.parametrize("kind", KINDS)
     @pytest.mark.parametrize("n_sources", [1, 2])
     def test_along_tangents_and_moments(self, kind, n_sources):
-        array = array_of(kind, 11)
-        rng = np.random.default_rng(11)
-        p, m = random_sources(rng, 1, n_sources)
-        problem, _ = problem_of(array, noisy_readings(array, p, m, rng))
+        problem, _, p, m, *_ = drawn(array_of(kind, 11), 11, 1, n_sources)
         q = problem.homogeneous(p)
         mu = problem.scaled_moment(q, m)
         tangent = tangents(q)
@@ -293,10 +293,7 @@ class TestMoments:
 
     def test_linear_channels_by_least_squares(self):
         array = array_of("vector", 12)
-        rng = np.random.default_rng(12)
-        p, m = random_sources(rng, 3, 2)
-        readings = noisy_readings(array, p, m, rng)
-        problem, y = problem_of(array, readings)
+        problem, y, p, _, readings, *_ = drawn(array, 12, 3, 2)
         q = problem.homogeneous(p)
         moments = problem.moment(q, fit_moments(problem, y, q))
         for i in range(3):
@@ -312,10 +309,7 @@ class TestMoments:
     @pytest.mark.parametrize("kind", ["scalar", "scalar in ambient", "mixed"])
     def test_moduli_by_scipy_from_the_same_start(self, kind):
         array = array_of(kind, 13)
-        rng = np.random.default_rng(13)
-        p, m = random_sources(rng, 4, 1)
-        readings = noisy_readings(array, p, m, rng)
-        problem, y = problem_of(array, readings)
+        problem, y, p, m, readings, rng = drawn(array, 13, 4, 1)
         q = problem.homogeneous(p)
         start = m + 30.0 * rng.normal(size=m.shape)
         fits = refine_moments(problem, y, q, problem.scaled_moment(q, start))
@@ -337,10 +331,7 @@ class TestOptimum:
     @pytest.mark.parametrize(("n_sources", "n"), [(1, 3), (2, 1), pytest.param(2, 3, marks=pytest.mark.slow)])
     def test_scipy_on_magpylib_fields(self, kind, n_sources, n):
         array = array_of(kind, 21, 16 if "vector" in kind else 22)
-        rng = np.random.default_rng(21)
-        p, m = random_sources(rng, n, n_sources)
-        readings = noisy_readings(array, p, m, rng)
-        problem, y = problem_of(array, readings)
+        problem, y, p, m, readings, rng = drawn(array, 21, n, n_sources)
         start_p, start_m = p + 0.05 * rng.normal(size=p.shape), m + 10.0 * rng.normal(size=m.shape)
         fits = refined_from(problem, y, start_p, start_m)
         position, moment = problem.position(fits.q), problem.moment(fits.q, fits.mu)
@@ -355,10 +346,7 @@ class TestOptimum:
     @settings(max_examples=40, deadline=None)
     def test_chi2_never_rises(self, seed, kind, n_sources, max_iterations):
         """From anywhere, converged or not."""
-        array = array_of(kind, seed)
-        rng = np.random.default_rng(seed)
-        p, m = random_sources(rng, 6, n_sources)
-        problem, y = problem_of(array, noisy_readings(array, p, m, rng))
+        problem, y, _, m, _, rng = drawn(array_of(kind, seed), seed, 6, n_sources)
         q = rng.normal(size=(6, n_sources, 4))
         q /= np.linalg.norm(q, axis=-1, keepdims=True)
         mu = problem.scaled_moment(q, 300.0 * rng.normal(size=m.shape))
@@ -369,20 +357,14 @@ class TestOptimum:
         assert_allclose(fits.chi2[fits.converged], after[fits.converged], rtol=1e-7, atol=1e-6)
 
     def test_iterations_that_run_out_are_no_optimum(self):
-        array = array_of("vector", 22)
-        rng = np.random.default_rng(22)
-        p, m = random_sources(rng, 5, 1)
-        problem, y = problem_of(array, noisy_readings(array, p, m, rng))
+        problem, y, p, m, *_ = drawn(array_of("vector", 22), 22, 5, 1)
         fits = refined_from(problem, y, 2.0 * p, m, max_iterations=1)
         assert np.isinf(fits.chi2).all()
         assert not fits.converged.any()
         assert (fits.iterations == 1).all()
 
     def test_starts_are_left_as_they_are(self):
-        array = array_of("vector", 23)
-        rng = np.random.default_rng(23)
-        p, m = random_sources(rng, 2, 1)
-        problem, y = problem_of(array, noisy_readings(array, p, m, rng))
+        problem, y, p, m, *_ = drawn(array_of("vector", 23), 23, 2, 1)
         q = problem.homogeneous(1.2 * p)
         mu = problem.scaled_moment(q, m)
         before = q.copy(), mu.copy()
@@ -393,9 +375,7 @@ class TestOptimum:
     @pytest.mark.parametrize("kind", KINDS)
     def test_a_batch_gives_what_single_fits_give(self, kind):
         array = array_of(kind, 24)
-        rng = np.random.default_rng(24)
-        p, m = random_sources(rng, 6, 2)
-        problem, y = problem_of(array, noisy_readings(array, p, m, rng))
+        problem, y, p, m, _, rng = drawn(array, 24, 6, 2)
         start = p + 0.1 * rng.normal(size=p.shape)
         together = refined_from(problem, y, start, m)
         for i in range(6):
@@ -404,10 +384,7 @@ class TestOptimum:
             assert_allclose(alone.q[0], together.q[i], atol=1e-7)
 
     def test_order_of_the_fits_does_not_matter(self):
-        array = array_of("mixed in ambient", 25)
-        rng = np.random.default_rng(25)
-        p, m = random_sources(rng, 6, 2)
-        problem, y = problem_of(array, noisy_readings(array, p, m, rng))
+        problem, y, p, m, _, rng = drawn(array_of("mixed in ambient", 25), 25, 6, 2)
         order = rng.permutation(6)
         one, other = refined_from(problem, y, p, m), refined_from(problem.rows(order), y[order], p[order], m[order])
         assert_allclose(other.chi2, one.chi2[order], rtol=1e-8)
@@ -446,10 +423,7 @@ class TestRotation:
 class TestHeldRange:
     @pytest.mark.parametrize("kind", ["vector", "scalar in ambient"])
     def test_without_the_third_tangent_the_range_stays(self, kind):
-        array = array_of(kind, 41, 16)
-        rng = np.random.default_rng(41)
-        p, m = random_sources(rng, 4, 2)
-        problem, y = problem_of(array, noisy_readings(array, p, m, rng))
+        problem, y, p, m, _, rng = drawn(array_of(kind, 41, 16), 41, 4, 2)
         free = np.ones((2, 3), dtype=bool)
         free[0, 2] = False
         start = 1.05 * p + 0.05 * rng.normal(size=p.shape)
@@ -466,9 +440,7 @@ class TestCovariance:
     @pytest.mark.parametrize("kind", KINDS)
     def test_one_source_against_the_information_of_the_measurement(self, kind):
         array = array_of(kind, 51)
-        rng = np.random.default_rng(51)
-        p, m = random_sources(rng, 4, 1)
-        problem, y = problem_of(array, noisy_readings(array, p, m, rng))
+        problem, y, p, m, *_ = drawn(array, 51, 4, 1)
         fits = refined_from(problem, y, p, m)
         position, moment = problem.position(fits.q), problem.moment(fits.q, fits.mu)
         information = oracles.fisher_information(DifferenceMeasurement.of(array), position[:, 0], moment[:, 0])
@@ -479,9 +451,7 @@ class TestCovariance:
     @pytest.mark.parametrize("kind", ["vector", "scalar in ambient"])
     def test_two_sources_against_differences_of_magpylib_fields(self, kind):
         array = array_of(kind, 52, 18)
-        rng = np.random.default_rng(52)
-        p, m = random_sources(rng, 1, 2)
-        problem, _ = problem_of(array, noisy_readings(array, p, m, rng))
+        problem, _, p, m, *_ = drawn(array, 52, 1, 2)
         q = problem.homogeneous(p)
         fits = JointFits(q, problem.scaled_moment(q, m), np.zeros(1), np.zeros(1, dtype=np.int64))
         unit = np.tile(np.repeat([1.0, 300.0], 3), 2)
@@ -517,19 +487,14 @@ class TestCovariance:
 
     def test_chi2_of_the_fits(self):
         """Sum of χ² of 200 fixes of two sources, 9 degrees of freedom each; two-sided false-alarm rate 1e-4."""
-        array = cube(2.0, noise_T=1e-10)
-        rng = np.random.default_rng(54)
-        p, m = random_sources(rng, 200, 2, 2.8, 3.5)
-        problem, y = problem_of(array, noisy_readings(array, p, m, rng))
+        problem, y, p, m, *_ = drawn(cube(2.0, noise_T=1e-10), 54, 200, 2, 2.8, 3.5)
         low, high = chi2_distribution.ppf([0.5e-4, 1 - 0.5e-4], (24 - 3 - 12) * 200)
         assert low < refined_from(problem, y, p, m).chi2.sum() < high
 
     def test_moduli_without_ambient_field_of_both_signs(self):
         """The opposite moment is as good, with the same covariance up to the sign of the moment."""
         array = scalar_cloud(55, ambient_T=None)
-        rng = np.random.default_rng(55)
-        p, m = random_sources(rng, 2, 1)
-        problem, y = problem_of(array, noisy_readings(array, p, m, rng))
+        problem, y, p, m, *_ = drawn(array, 55, 2, 1)
         assert problem.is_even
         both = refined_from(problem, y, p, m).with_opposite_moments(2)
         assert_allclose(chi2_at(problem.rows(np.array([0, 0, 1, 1])), y[[0, 0, 1, 1]], both.q, both.mu), both.chi2)
@@ -547,51 +512,9 @@ class TestCovariance:
         assert np.isnan(covariances(problem, fits)).all()
 
 
-class TestLocator:
-    """One source and vector sensors: the same as the compiled search has."""
-
-    @pytest.mark.parametrize("geometry", ["tetrahedron", "cube", "irregular"])
-    def test_same_solution(self, geometry):
-        array = {"tetrahedron": tetrahedron(1.5), "cube": cube(1.0), "irregular": random_array(61, 7)}[geometry]
-        rng = np.random.default_rng(61)
-        p, m = random_sources(rng, 12, 1)
-        readings = noisy_readings(array, p, m, rng)
-        solutions = [fix.solutions[0] for fix in plain_locator(array).fit_rows(readings)]
-        problem, y = problem_of(array, readings)
-        start = np.stack([s.position_m for s in solutions])[:, None]
-        moment = np.stack([s.moment_Am2 for s in solutions])[:, None]
-        fits = refined_from(problem, y, 1.01 * start, moment)
-        covariance = covariances(problem, fits)
-        ends = ranges_within(problem, y, fits, 0, covariance)
-        for i, s in enumerate(solutions):
-            sigma = np.sqrt(np.diagonal(s.covariance))
-            assert fits.chi2[i] == pytest.approx(s.chi2, rel=1e-6, abs=1e-6)
-            assert (np.abs(problem.position(fits.q)[i, 0] - s.position_m) < 0.01 * sigma[:3]).all()
-            assert (np.abs(problem.moment(fits.q, fits.mu)[i, 0] - s.moment_Am2) < 0.01 * sigma[3:]).all()
-            assert_allclose(covariance[i] / np.outer(sigma, sigma), s.covariance / np.outer(sigma, sigma), atol=0.02)
-            low, high = s.range_interval_m[0]
-            assert_allclose(ends[i], [low, np.inf if high is None else high], rtol=0.01)
-
-
+@pytest.mark.usefixtures("instruction_set")
 class TestCompiledTwin:
-    """The compiled refinements end where the readable one does."""
-
-    @pytest.mark.parametrize("n_sources", [1, 2, 3])
-    @pytest.mark.parametrize("held", [False, True])
-    def test_optima(self, n_sources, held):
-        """From 10 cm beside the truth, and with the first source held at a range that is wrong."""
-        array = replace(array_of("vector", 31), common_field_T=5e-8)
-        rng = np.random.default_rng(31)
-        p, m = random_sources(rng, 8, n_sources)
-        problem, y = problem_of(array, noisy_readings(array, p, m, rng))
-        q = problem.homogeneous(p + 0.1 * rng.normal(size=p.shape))
-        mu, free = problem.scaled_moment(q, m), np.ones((n_sources, 3), dtype=bool)
-        free[0, 2] = not held
-        ours, twin = refine(problem, y, q, mu, free=free), damped_gauss_newton(problem, y, q, mu, free, 200)
-        assert twin.converged.all()
-        assert_allclose(ours.chi2, twin.chi2, rtol=1e-9, atol=1e-7)
-        assert_allclose(ours.q, twin.q, atol=1e-5)
-        assert_allclose(ours.mu, twin.mu, rtol=1e-2, atol=1e-2 * np.abs(twin.mu).max())
+    """The compiled refinements of moduli end where the readable one does; those of vectors: test_refinement."""
 
     @pytest.mark.parametrize("kind", ["scalar", "scalar in ambient", "mixed in ambient"])
     @pytest.mark.parametrize("held", [False, True])
@@ -627,9 +550,7 @@ class TestCompiledTwin:
     def test_rows_that_differ_in_their_common_field_alone(self):
         """Errors that are marginalised row by row leave the gains of all rows the same ones."""
         array = array_of("vector", 32)
-        rng = np.random.default_rng(32)
-        p, m = random_sources(rng, 4, 1)
-        problem, y = problem_of(array, noisy_readings(array, p, m, rng))
+        problem, y, p, m, _, rng = drawn(array, 32, 4, 1)
         problem = problem.marginalised(rng.normal(size=(4, array.n_channels, 2)))
         y = problem.whitened(y)
         q = problem.homogeneous(p)

@@ -31,6 +31,7 @@ from magloc.localization.search.candidates import (
 )
 from tests.magloc.localization.fit.test_gauss_newton import (
     array_of,
+    drawn,
     noisy_readings,
     problem_of,
     random_sources,
@@ -100,10 +101,7 @@ class TestModulusScores:
     @pytest.mark.parametrize("kind", ["scalar", "mixed"])
     def test_against_plain_projections(self, kind):
         array = array_of(kind, 3)
-        rng = np.random.default_rng(3)
-        p, m = random_sources(rng, 2, 1)
-        readings = noisy_readings(array, p, m, rng)
-        problem, y = problem_of(array, readings)
+        problem, y, _, _, readings, rng = drawn(array, 3, 2, 1)
         places, _ = random_sources(rng, 15, 1)
         directions = hemisphere(8)
         templates = modulus_templates(problem, 0, problem.homogeneous(places[:, 0]), directions)
@@ -218,9 +216,7 @@ class TestFirstSource:
     @pytest.mark.parametrize("kind", ["vector", "scalar", "scalar in ambient", "mixed", "mixed in ambient"])
     def test_no_worse_than_from_the_truth(self, kind):
         array = array_of(kind, 7)
-        rng = np.random.default_rng(7)
-        p, m = random_sources(rng, 20, 1)
-        problem, y = problem_of(array, noisy_readings(array, p, m, rng))
+        problem, y, p, m, *_ = drawn(array, 7, 20, 1)
         beam = search_for(array, problem).first(problem, y)
         best = refined_from(problem, y, p, m)
         assert (beam.chi2[:, 0] < best.chi2 + 1e-3).all()
@@ -239,9 +235,7 @@ class TestFirstSource:
 
     def test_moduli_without_ambient_field_come_with_both_signs(self):
         array = scalar_cloud(8, ambient_T=None)
-        rng = np.random.default_rng(8)
-        p, m = random_sources(rng, 5, 1)
-        problem, y = problem_of(array, noisy_readings(array, p, m, rng))
+        problem, y, *_ = drawn(array, 8, 5, 1)
         beam = search_for(array, problem).first(problem, y)
         assert_allclose(beam.chi2[:, 1], beam.chi2[:, 0], rtol=1e-9)
         assert_allclose(beam.mu[:, 1], -beam.mu[:, 0], rtol=1e-9)

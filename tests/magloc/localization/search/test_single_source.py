@@ -3,9 +3,8 @@
 | what | who checks it |
 |---|---|
 | the optimum | scipy.optimize.least_squares from the truth; noise-free readings from magpylib |
-| kernels | magloc.measurement.whitened, their readable reference |
-| covariance | oracles.fisher_information; scatter of the fixes |
-| range interval | scipy's minimiser of χ² on spheres |
+
+| covariance, range interval | test_range_interval, test_kernels |
 """
 
 from __future__ import annotations
@@ -23,18 +22,13 @@ from arrays.differences import decorrelated_differences
 from arrays.geometries import axial, cross, grid, square, tetrahedron
 from arrays.noise import proportional_noise
 from arrays.sensor import Sensor
-from arrays.whitening import whitening
 from magloc import core
-from magloc.levels import DELTA_CHI2_95
 from magloc.localization.fit.prior import SourcePrior
-from magloc.localization.search.candidates import candidate_positions, linear_bases
+from magloc.localization.search.candidates import candidate_positions
 from magloc.localization.search.single_source import SingleSourceSearch
 from magloc.measurement.differences import DifferenceMeasurement, predicted_channels
-from magloc.measurement.whitened import WhitenedModel
-from tests import oracles
 from tests.arrays.test_differences import random_array
 from tests.plain_locator import plain_locator
-from tests.variable_projection import best_moment, projected_chi2, refined, unit_basis
 
 SEEDS = st.integers(0, 2**32 - 1)
 TETRAHEDRON = tetrahedron(1.5, noise_T=1e-9)
@@ -83,13 +77,6 @@ class TestNoiseFreeReadings:
         assert_allclose(best.position_m, p[0], atol=1e-4 * np.linalg.norm(p))
         assert_allclose(best.moment_Am2, m[0], atol=1e-3 * np.linalg.norm(m))
         assert best.chi2 < 1e-6
-
-    def test_readings_that_magpylib_made(self):
-        p, m = np.array([3.0, -2.0, 1.0]), np.array([100.0, 50.0, -80.0])
-        readings = oracles.magpylib_field(TETRAHEDRON.positions, p, m).ravel()
-        best = plain_locator(TETRAHEDRON).fit(readings).solutions[0]
-        assert_allclose(best.position_m, p, rtol=1e-6)
-        assert_allclose(best.moment_Am2, m, rtol=1e-6)
 
     def test_a_uniform_field_adds_nothing(self):
         p, m = np.array([3.0, -2.0, 1.0]), np.array([100.0, 50.0, -80.0])
@@ -173,72 +160,6 @@ class TestSolutionsAreRanked:
             assert any(abs(s.chi2 - local) < 0.05 or s.chi2 < local for s in fix.solutions)
             mirrored += fix.solutions[0].chi2 < local - 0.05
         assert mirrored < 100
-
-
-class TestUncertainty:
-    def test_covariance_is_the_inverse_information(self):
-        rng = np.random.default_rng(6)
-        p, m = random_sources(rng, 5, 2.0, 6.0)
-        for fix in plain_locator(TETRAHEDRON).fit_rows(noisy_readings(TETRAHEDRON, p, m, rng)):
-            s = fix.solutions[0]
-            information = oracles.fisher_information(DifferenceMeasurement.of(TETRAHEDRON), s.position_m, s.moment_Am2)
-            sigma = np.sqrt(np.diagonal(s.covariance))
-            assert_allclose(
-                np.linalg.inv(information) / np.outer(sigma, sigma), s.covariance / np.outer(sigma, sigma), atol=1e-5
-            )
-
-    def test_scatter_of_fixes(self):
-        """NEES of 300 fixes of one strong source, two-sided false-alarm rate 1e-4."""
-        rng = np.random.default_rng(7)
-        p, m = np.array([2.0, 0.5, 0.3]), np.array([300.0, 200.0, -100.0])
-        readings = noisy_readings(TETRAHEDRON, np.tile(p, (300, 1)), np.tile(m, (300, 1)), rng)
-        nees = 0.0
-        for fix in plain_locator(TETRAHEDRON).fit_rows(readings):
-            s = fix.solutions[0]
-            error = np.concatenate([s.position_m - p, s.moment_Am2 - m])
-            nees += error @ np.linalg.solve(s.covariance, error)
-        low, high = chi2_distribution.ppf([0.5e-4, 1 - 0.5e-4], 6 * 300)
-        assert low < nees < high
-
-    def test_range_interval_against_scipy_on_spheres(self):
-        rng = np.random.default_rng(8)
-        p, m = random_sources(rng, 4, 3.0, 6.0)
-        readings = noisy_readings(TETRAHEDRON, p, m, rng)
-        problem = WhitenedModel.of(TETRAHEDRON, whitening(TETRAHEDRON), TETRAHEDRON.ambient_fields[None])
-        for row, fix in zip(readings, plain_locator(TETRAHEDRON).fit_rows(readings), strict=True):
-            y = whitening(TETRAHEDRON).apply(row)
-            s = fix.solutions[0]
-            radius = np.linalg.norm(s.position_m - problem.centroid)
-            for end in s.range_interval_m[0]:
-                if end is None:
-                    continue
-
-                def chi2(angles, end=end, y=y):
-                    theta, phi = angles
-                    u = [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)]
-                    return float(projected_chi2(problem, problem.homogeneous(problem.centroid + end * np.array(u)), y))
-
-                u = (s.position_m - problem.centroid) / radius
-                start = [np.arccos(u[2]), np.arctan2(u[1], u[0])]
-                profile = scipy.optimize.minimize(chi2, start, method="Nelder-Mead", options={"xatol": 1e-7}).fun
-                assert profile - s.chi2 == pytest.approx(DELTA_CHI2_95, abs=0.05)
-
-    def test_far_sources_have_no_observable_range(self):
-        rng = np.random.default_rng(9)
-        p, m = random_sources(rng, 20, 20.0, 30.0, moment=3000.0)
-        for fix in plain_locator(TETRAHEDRON).fit_rows(noisy_readings(TETRAHEDRON, p, m, rng)):
-            for s in fix.solutions:
-                low, high = s.range_interval_m[0][0], s.range_interval_m[-1][1]
-                assert s.range_observable == (high is not None and low > 0 and high <= 2 * low)
-        assert not any(s.range_observable for s in fix.solutions)
-
-    def test_covariance_scales_with_noise(self):
-        p, m = np.array([3.0, 1.0, 0.5]), np.array([100.0, 200.0, 50.0])
-        covariances = []
-        for noise in (1e-9, 3e-9):
-            array = tetrahedron(1.5, noise_T=noise)
-            covariances.append(plain_locator(array).fit(predicted_channels(array, p, m)).solutions[0].covariance)
-        assert_allclose(covariances[1], 9.0 * covariances[0], rtol=1e-5)
 
 
 class TestMissingReadings:
@@ -361,99 +282,11 @@ class TestIndependence:
             # BLAS may sum the scores of one row and of many in another order.
             assert_allclose(one.solutions[0].position_m, other.solutions[0].position_m, rtol=1e-9)
 
-    def test_rotation_of_the_frame(self):
-        rng = np.random.default_rng(13)
-        p, m = random_sources(rng, 1, 3.0, 6.0)
-        R = np.linalg.qr(rng.normal(size=(3, 3))).Q
-        R *= np.linalg.det(R)
-        readings = noisy_readings(TETRAHEDRON, p, m, rng)[0]
-        turned = SensorArray(
-            tuple(
-                Sensor(id=s.id, kind=s.kind, position_m=R @ s.position_m, noise_T=s.noise_T)
-                for s in TETRAHEDRON.sensors
-            )
-        )
-        one = plain_locator(TETRAHEDRON).fit(readings).solutions[0]
-        other = plain_locator(turned).fit((readings.reshape(4, 3) @ R.T).ravel()).solutions[0]
-        assert other.chi2 == pytest.approx(one.chi2, rel=1e-6)
-        assert_allclose(other.position_m, R @ one.position_m, rtol=1e-4, atol=1e-4)
-
-
-class TestReadableReference:
-    """The kernels and the model against its unit readings."""
-
-    problem = WhitenedModel.of(
-        random_array(2, 6), whitening(random_array(2, 6)), random_array(2, 6).ambient_fields[None]
-    )
-
-    white = whitening(random_array(2, 6))
-
-    @given(SEEDS)
-    @settings(max_examples=25, deadline=None)
-    def test_basis_and_cost(self, seed):
-        rng = np.random.default_rng(seed)
-        q = rng.normal(size=4)
-        q /= np.linalg.norm(q)
-        y = self.white.apply(1e-9 * rng.normal(size=18))
-        bases = linear_bases(self.problem, self.problem.gain[0], 0, q[None])
-        assert y @ y - np.sum((y @ bases) ** 2) == pytest.approx(  # in single precision
-            float(projected_chi2(self.problem, q, y)), abs=1e-5 * (y @ y)
-        )
-
-    @given(SEEDS)
-    @settings(max_examples=25, deadline=None)
-    def test_homogeneous_jacobian(self, seed):
-        rng = np.random.default_rng(seed)
-        q, mu = rng.normal(size=4), rng.normal(size=3)
-        scale = np.abs(unit_basis(self.problem, q) @ mu).max()
-        expected = oracles.derivative(lambda x: unit_basis(self.problem, x) @ mu / scale, q, 1e-2, 1e-9)
-        for axes in ([0, 1, 2], [1, 2, 3]):
-            tangent = np.eye(4)[None, None, :, axes]
-            jacobian = self.problem.position_jacobian(q[None, None], mu[None, None], self.problem.gain, tangent)[0]
-            assert_allclose(jacobian / scale, expected[:, axes], rtol=1e-5, atol=1e-6 * np.abs(expected).max())
-
-    @given(SEEDS)
-    @settings(max_examples=25, deadline=None)
-    def test_every_refinement_ends_at_a_stationary_point(self, seed):
-        rng = np.random.default_rng(seed)
-        array = random_array(2, 6)
-        p, m = random_sources(rng, 1, 3.0, 6.0, moment=3000.0)
-        y = self.white.apply(noisy_readings(array, p, m, rng)[0] - array.channel_offset_T)
-        q = self.problem.homogeneous(p[0] + 0.1 * rng.normal(size=3))
-        before = float(projected_chi2(self.problem, q, y))
-        end = refined(self.problem, y[None], q[None])
-        q, mu, chi2 = end.q[0], end.mu[0], end.chi2[0]
-        assert end.converged
-        assert chi2 <= before
-        assert chi2 == pytest.approx(float(projected_chi2(self.problem, q, y)), rel=1e-9)
-        assert_allclose(mu, best_moment(self.problem, q, y), rtol=1e-6, atol=1e-9 * np.linalg.norm(mu))
-        for tangent in np.linalg.svd(q[None])[2][1:]:
-            step = 1e-4
-            around = [float(projected_chi2(self.problem, q + s * tangent, y)) for s in (-step, step)]
-            curvature = (sum(around) - 2 * chi2) / step**2
-            gradient = (around[1] - around[0]) / (2 * step)
-            assert abs(gradient) < 1e-3 * max(1.0, abs(curvature)) + 1e-6 * chi2 / step
-
-    def test_homogeneous_coordinates_return(self):
-        p = np.random.default_rng(0).normal(size=(5, 3)) * 10
-        assert_allclose(self.problem.position(self.problem.homogeneous(p)), p, rtol=1e-12)
-
 
 class TestCandidates:
     def test_scale_with_the_array(self):
         small, large = candidate_positions(cross(0.03)), candidate_positions(cross(30.0))
         assert_allclose(1000.0 * small, large, rtol=1e-9, atol=1e-9)
-
-    def test_reach_the_sensors_of_a_large_array(self):
-        positions = np.stack(np.meshgrid(range(5), range(6), [0.0]), axis=-1).reshape(-1, 3) * 0.016
-        array = SensorArray(
-            tuple(Sensor(id=f"s{i}", kind="vector", position_m=p, noise_T=1e-8) for i, p in enumerate(positions))
-        )
-        rng = np.random.default_rng(0)
-        p = np.column_stack([rng.uniform(0, 0.064, 50), rng.uniform(0, 0.08, 50), rng.uniform(0.005, 0.04, 50)])
-        m = rng.normal(size=(50, 3))
-        for source, fix in zip(p, plain_locator(array).fit_rows(noisy_readings(array, p, m, rng)), strict=True):
-            assert np.linalg.norm(fix.solutions[0].position_m - source) < 1e-3
 
 
 class TestNeighbouringOptima:

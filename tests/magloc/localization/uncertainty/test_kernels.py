@@ -42,6 +42,7 @@ pytestmark = pytest.mark.usefixtures("instruction_set")
 
 def optima_of(array: SensorArray, name: str = "product", n_rows: int = N_ROWS) -> Optima:
     _, _, readings = regime(name, n_rows, np.random.default_rng(12), array)
+    readings[5:8, 3] += 30.0 * array.channel_noise_T[3]  # misfits
     (rows,) = whitened_rows(array, readings, None, n_rows)
     (optima,) = SingleSourceSearch(array).optima(rows)
     return optima

@@ -17,9 +17,8 @@ from magloc.tracking.chart import refit
 from magloc.tracking.chart.known_moment import KnownInWorld
 from magloc.tracking.chart.mixture import Mixture
 from magloc.tracking.chart.refit import Cells, refitted
-from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.motion import OrnsteinUhlenbeck, RandomWalk
-from magloc.tracking.results import Row
+from magloc.tracking.rows import Row
 from magloc.tracking.tracker import Tracker
 from tests.passing_source import ARRAY, MOMENT, POSITION
 
@@ -35,7 +34,7 @@ def rows_of(at_m: FloatArray) -> list[Row]:
 
 def seed_of(tracker: Tracker, row: Row) -> Mixture:
     state, _ = tracker.motion.start(SOURCE, np.zeros((6, 6)))
-    n, last = len(state), ChartRow.of(tracker.measurements.of(row))
+    n, last = len(state), tracker.measurements.of(row)
     return Mixture(state[None], np.zeros((1, n, n)), np.zeros(1), n, last.centroid_m, last.radius_m)
 
 
@@ -44,7 +43,7 @@ class TestRefitted:
         """Rows without noise have their least χ² at the source; to 0.05 σ, where the passes stop."""
         tracker = Tracker(ARRAY, RandomWalk(1e-9, 1e-9))
         rows = rows_of(np.linspace([-3.0, 0.0, 0.0], [0.0, 0.0, 0.0], 5))
-        measurements = [ChartRow.of(tracker.measurements.of(row)) for row in rows]
+        measurements = [tracker.measurements.of(row) for row in rows]
         seed = seed_of(tracker, rows[-1])
         beside = replace(seed, x=seed.x * np.repeat([1.05, 0.9], 3))
         found = refitted(beside, measurements, [tracker.motion] * 5, tracker.errors, tracker.pose_errors)
@@ -58,7 +57,7 @@ class TestRefitted:
         """A source turned round: it is decided, and it is not among those that are fitted."""
         tracker = Tracker(ARRAY, RandomWalk(1e-9, 1e-9))
         rows = rows_of(np.linspace([-3.0, 0.0, 0.0], [0.0, 0.0, 0.0], 5))
-        measurements = [ChartRow.of(tracker.measurements.of(row)) for row in rows]
+        measurements = [tracker.measurements.of(row) for row in rows]
         seed = seed_of(tracker, rows[-1])
         both = replace(seed, x=np.vstack([seed.x, -seed.x]), S=np.zeros((2, 6, 6)), log_weight=np.zeros(2))
         found = refitted(both, measurements, [tracker.motion] * 5, tracker.errors, tracker.pose_errors)
@@ -73,7 +72,7 @@ class TestCells:
         """Where the readings are nearly linear: 15 cells, 0.6 of their pitch wide, are even to 1 %, and so are sums."""
         tracker = Tracker(ARRAY, RandomWalk(1e-9, 1e-9))
         rows = rows_of(np.linspace([-3.0, 0.0, 0.0], [0.0, 0.0, 0.0], 5))
-        measurements = [ChartRow.of(tracker.measurements.of(row)) for row in rows]
+        measurements = [tracker.measurements.of(row) for row in rows]
         motions = [tracker.motion] * 5
         mode = refitted(seed_of(tracker, rows[-1]), measurements, motions, tracker.errors, tracker.pose_errors).mixture
         sigma = np.linalg.norm(mode.S[0, 0])
@@ -96,7 +95,7 @@ class TestPrior:
         tracker = Tracker(ARRAY, motion)
         rows = rows_of(np.array([[0.0, 0.0, 0.0], [0.01, 0.0, 0.0]]))
         still = [replace(row, origin_m=np.zeros(3)) for row in rows]
-        measurements = [ChartRow.of(tracker.measurements.of(row)) for row in still]
+        measurements = [tracker.measurements.of(row) for row in still]
         seeds = seed_of(tracker, still[-1])
         fast = replace(seeds, x=seeds.x + np.array([0.0] * 6 + [-0.01, 0.0, 0.0] + [0.0] * 3))
         found = refitted(fast, measurements, [motion] * 2, tracker.errors, tracker.pose_errors).mixture
@@ -112,7 +111,7 @@ class TestPrior:
         """
         tracker = Tracker(ARRAY, OrnsteinUhlenbeck(0.5, 0.1, correlation_s=10.0))
         rows = rows_of(np.linspace([-3.0, 0.0, 0.0], [0.0, 0.0, 0.0], 5))
-        measurements = [ChartRow.of(tracker.measurements.of(row)) for row in rows]
+        measurements = [tracker.measurements.of(row) for row in rows]
         seed = seed_of(tracker, rows[-1])
         seed.x[0, 6:9] = 0.5
         cells = Cells(np.linspace(-0.1, 0.1, 3), np.full(3, 0.1))
@@ -144,8 +143,8 @@ class TestLastingErrors:
             replace(row, readings_T=row.readings_T + of_sensors + array.channel_noise_T * rng.normal(size=12))
             for row in rows_of(np.linspace([-3.0, 0.0, 0.0], [0.0, 0.0, 0.0], 5))
         ]
-        measurements = [ChartRow.of(tracker.measurements.of(row)) for row in rows]
-        n, e, last = measurements[0].n_motion, tracker.errors.n_states, measurements[-1]
+        measurements = [tracker.measurements.of(row) for row in rows]
+        n, e, last = measurements[0].n_charted, tracker.errors.n_states, measurements[-1]
         x = np.concatenate([SOURCE, np.zeros(n - 6 + e)])[None]
         seed = Mixture(x, np.eye(n + e)[None], np.zeros(1), n, last.centroid_m, last.radius_m, last.n_pose)
         in_world = KnownInWorld.of(tracker.prior, np.eye(3))

@@ -8,16 +8,14 @@ import numpy as np
 import pytest
 
 from magloc.tracking.chart.mixture import Mixture
-from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.chart.split import LARGEST_BEND, MOST_COMPONENTS, bends, split
-from magloc.tracking.results import Row
+from magloc.tracking.rows import Row
 from magloc.tracking.tracker import Tracker
 from tests.passing_source import ARRAY, MOMENT, POSITION, SLOW, readings_of
 
 SOURCE = np.concatenate([4.0 * POSITION, MOMENT / 100.0])
-ROW = ChartRow.of(
-    Tracker(ARRAY, SLOW).measurements.of(Row(0.0, readings_of(ARRAY, SOURCE[None, :3], SOURCE[None, 3:])[0]))
-)
+READINGS_T = readings_of(ARRAY, SOURCE[None, :3], SOURCE[None, 3:])[0]
+ROW = Tracker(ARRAY, SLOW).measurements.of(Row(0.0, READINGS_T))
 
 
 def component(sigma: float, n_rows: int = 1, seed: int = 0) -> Mixture:

@@ -15,11 +15,10 @@ from arrays.pose import PoseUncertainty
 from magloc.ambient import in_world_field
 from magloc.tracking import row_filter
 from magloc.tracking.chart.mixture import Mixture
-from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.chart.start import NO_AMBIENT, with_errors
 from magloc.tracking.chart.update import updated
-from magloc.tracking.results import rows_of
 from magloc.tracking.row_filter import Gaussians
+from magloc.tracking.rows import rows_of
 from magloc.tracking.tracker import Tracker
 from sims.magnetics.scenario_files import read_scenario
 from sims.magnetics.simulation import simulate
@@ -31,7 +30,7 @@ class TestErrorsOfSensors:
         """A diver's fluxgates, near the source: components found alone, and with sixty errors as states throughout."""
         simulation = simulate(read_scenario("diver"), 0)
         tracker, truth = Tracker(simulation.array, REST), simulation.truth
-        row = ChartRow.of(tracker.measurements.of(list(rows_of(simulation.readings))[120]))
+        row = tracker.measurements.of(list(rows_of(simulation.readings))[120])
         assert truth.moment_Am2 is not None
         x = np.concatenate([truth.position_m[120], truth.moment_Am2[120]]) * np.array([[1.0], [1.02], [0.99]])
         sigma = tracker.errors.sigma
@@ -63,7 +62,7 @@ class TestValleyOfRangesThatBends:
         simulation = simulate(replace(SCENARIO, duration_s=1.0), seed)
         tracker, truth = Tracker(simulation.array, REST), simulation.truth
         row = next(iter(rows_of(in_world_field(simulation.readings, simulation.array))))
-        mixture, _ = tracker.filter.started(ChartRow.of(tracker.measurements.of(row)), REST)
+        mixture, _ = tracker.filter.started(tracker.measurements.of(row), REST)
         assert mixture is not None
         assert truth.moment_Am2 is not None
         true = np.concatenate([truth.position_m[0], truth.moment_Am2[0]])

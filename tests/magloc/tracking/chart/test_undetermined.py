@@ -11,12 +11,13 @@ from scipy import stats
 import magloc
 from arrays.geometries import axial
 from magloc.measurement.differences import predicted_channels
-from magloc.tracking.chart.coordinates import Chart
 from magloc.tracking.chart.places import Places
 from magloc.tracking.chart.undetermined import _leads
 from magloc.tracking.consistency import nees_of
+from magloc.tracking.coordinates import Chart
 from magloc.tracking.motion import KnownMotion
-from magloc.tracking.results import Row, TrackPoint
+from magloc.tracking.results import TrackPoint
+from magloc.tracking.rows import Row
 from magloc.tracking.tracker import Tracker
 
 PAIR = axial(1.5, "vector", 2e-10)

@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 from scipy.stats import multivariate_normal
 
 from magloc.tracking import row_filter
-from magloc.tracking.chart.coordinates import Chart
-from magloc.tracking.chart.row import ChartRow
+from magloc.tracking.coordinates import Chart
 from magloc.tracking.motion import RandomWalk
-from magloc.tracking.results import Row
 from magloc.tracking.row_filter import Gaussians
+from magloc.tracking.rows import Row
 from magloc.tracking.tracker import Tracker
 from tests.passing_source import ARRAY, MOMENT, POSITION
 
@@ -32,11 +31,11 @@ def far_update(shift: FloatArray) -> tuple[float, FloatArray, FloatArray, FloatA
     strength = float(np.linalg.norm(MOMENT)) / float(chart.length[0]) ** 4
     S = np.diag([0.1, 0.1, 0.1, *[0.1 * strength] * 3])
     there = chart.retracted((S @ shift)[None])[0]
-    blank = ChartRow.of(measurements.of(Row(0.0, np.zeros(THREE.n_channels))))
+    blank = measurements.of(Row(0.0, np.zeros(THREE.n_channels)))
     h = blank.of_source(SOURCE)
-    J = blank.source_jacobian(SOURCE) @ chart.jacobian(np.zeros((1, 6)))[0] @ S
+    J = blank.along(SOURCE, chart.jacobian(np.zeros((1, 6)))[0]) @ S
     readings = np.linalg.lstsq(blank.model.differences.transform / blank.sigma[:, None], blank.of_source(there))[0]
-    measurement = ChartRow.of(measurements.of(Row(0.0, readings)))
+    measurement = measurements.of(Row(0.0, readings))
     gaussian = Gaussians(SOURCE[None], S[None])
     found = row_filter.update(gaussian, measurement.compiled, bends=np.ones(1, dtype=bool))
     assert found.converged.all()

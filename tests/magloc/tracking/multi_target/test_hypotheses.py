@@ -11,7 +11,7 @@ from magloc.tracking.multi_target.hypotheses import LARGEST_BEND, split
 from magloc.tracking.multi_target.measurement import JointRow
 from magloc.tracking.multi_target.state import JointState
 from magloc.tracking.multi_target.update import joint_update
-from magloc.tracking.results import Row
+from magloc.tracking.rows import Row
 from tests.magloc.tracking.multi_target.test_update import BOARD, MOTION, known, readings
 
 ROW = JointRow.of(BOARD, Row(0.0, readings(np.random.default_rng(0))))

@@ -13,7 +13,7 @@ from magloc.tracking.motion import OrnsteinUhlenbeck
 from magloc.tracking.multi_target.measurement import JointRow
 from magloc.tracking.multi_target.motion import stepped
 from magloc.tracking.multi_target.state import JointState
-from magloc.tracking.results import Row
+from magloc.tracking.rows import Row
 from tests.magloc.tracking.multi_target.test_state import CENTROID_M, RADIUS_M, state_of
 
 ARRAY = arrays.grid(2, 2, 0.1, noise_T=1e-9)

@@ -15,7 +15,7 @@ from magloc.tracking.multi_target.motion import stepped
 from magloc.tracking.multi_target.smoothing import MOST_ROWS, YoungTrack
 from magloc.tracking.multi_target.state import N_SEEN, JointState
 from magloc.tracking.multi_target.update import joint_update
-from magloc.tracking.results import Row
+from magloc.tracking.rows import Row
 from magloc.tracking.sensor_health import SensorHealth
 from tests.magloc.tracking.multi_target.test_update import BOARD, MOTION, known, predicted, readings
 

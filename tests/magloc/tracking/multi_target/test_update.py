@@ -14,7 +14,7 @@ from magloc.tracking.multi_target.measurement import Channels, JointRow
 from magloc.tracking.multi_target.motion import FreeMotion, stepped
 from magloc.tracking.multi_target.state import JointState
 from magloc.tracking.multi_target.update import innovation_chi2, joint_update
-from magloc.tracking.results import Row
+from magloc.tracking.rows import Row
 
 NOISE_T = 5e-7
 BOARD = arrays.grid(5, 4, 0.02, noise_T=NOISE_T)

@@ -28,8 +28,8 @@ from arrays.geometries import tetrahedron
 from arrays.typing import FloatArray
 from magloc.measurement.nuisances import Drift
 from magloc.readings import Readings
-from magloc.tracking.innovations import THRESHOLD
-from magloc.tracking.results import rows_of
+from magloc.tracking.consistency import THRESHOLD
+from magloc.tracking.rows import rows_of
 from magloc.tracking.track import Track
 from magloc.tracking.tracker import Tracker
 from magloc.tracking.whole_records.background import settled_steps

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from magloc.fields import dipole
-from magloc.tracking.chart.coordinates import Chart, mirrored
+from magloc.tracking.coordinates import Chart, mirrored
 from tests.oracles import derivative
 
 FloatArray = NDArray[np.float64]

@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 
 from arrays.typing import FloatArray
-from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.chart.start import prior_root
-from magloc.tracking.results import Row, Step
+from magloc.tracking.results import Step
+from magloc.tracking.rows import Row
 from magloc.tracking.tracker import Tracker
 from magloc.tracking.whole_records.background import steps_of
 from magloc.tracking.whole_records.smoother import smoothed_states
@@ -62,11 +62,11 @@ def _steps_at_truth(
     measurements = [tracker.measurements.of(row) for row in rows]
     if tracker.background is not None:
         return steps_of(tracker, measurements, states)
-    seen = (i for i, row in enumerate(map(ChartRow.of, measurements)) if row.is_detected(tracker.errors.sigma))
+    seen = (i for i, row in enumerate(measurements) if row.is_detected(tracker.errors.sigma))
     first = next(seen, None)
     if first is None:
         return []
-    root = prior_root(ChartRow.of(measurements[first]).chart(truth[first]))
+    root = prior_root(measurements[first].chart(truth[first]))
     start = tracker.state_before(states[first], root, rows[first].R_world_from_array)
     steps = steps_of(tracker, measurements[first:], states[first:], start)
     return [replace(step, row=first + step.row) for step in steps]

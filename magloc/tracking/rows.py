@@ -1,0 +1,99 @@
+"""Rows of readings for a tracker."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from arrays.array import SensorArray
+from arrays.typing import BoolArray, FloatArray
+from magloc.ambient import in_world_field
+from magloc.measurement.pose import ArrayPose, rates_of
+from magloc.readings import Readings, without_saturated
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """Readings at one instant.
+
+    Attributes
+    ----------
+    time_s : float
+    readings_T : ndarray, shape (C,)
+        Raw readings, NaN where missing.
+    origin_m, R_world_from_array : ndarray, shapes (3,) and (3, 3)
+        Pose of the array.
+    ambient_T : ndarray, shape (3,), optional
+        Ambient field in the array's frame, in place of the array's own.
+    velocity_m_s, rate_rad_s : ndarray, shape (3,), optional
+        Velocity of the array in the world and its rate about its own axes; by default from the row before.
+    pose_sigma : ndarray, shape (2,), optional
+        Standard deviations of position [m] and attitude [rad], in place of the array's own.
+    """
+
+    time_s: float
+    readings_T: FloatArray
+    origin_m: FloatArray = field(default_factory=lambda: np.zeros(3))
+    R_world_from_array: FloatArray = field(default_factory=lambda: np.eye(3))
+    ambient_T: FloatArray | None = None
+    velocity_m_s: FloatArray | None = None
+    rate_rad_s: FloatArray | None = None
+    pose_sigma: FloatArray | None = None
+
+    @property
+    def available(self) -> BoolArray:
+        """Channels that have a reading (C,)."""
+        return np.isfinite(self.readings_T)
+
+    def pose(self, lever_arm_m: FloatArray) -> ArrayPose:
+        """Return the array's pose; an array without a velocity or rate is at rest."""
+        velocity, rate = (np.zeros(3) if value is None else value for value in (self.velocity_m_s, self.rate_rad_s))
+        return ArrayPose(self.origin_m, self.R_world_from_array, velocity, rate, lever_arm_m)
+
+
+def moving(row: Row, before: Row | None) -> Row:
+    """Return a row with the array's velocity and rate, from the row before if the row has none."""
+    if before is None or row.velocity_m_s is not None:
+        return row
+    time_s, origins_m = np.array([before.time_s, row.time_s]), np.stack([before.origin_m, row.origin_m])
+    velocity, rate = rates_of(time_s, origins_m, np.stack([before.R_world_from_array, row.R_world_from_array]))
+    return replace(row, velocity_m_s=velocity[1], rate_rad_s=rate[1])
+
+
+def rows_of(readings: Readings) -> Iterator[Row]:
+    """Yield the rows of readings for a tracker."""
+    columns: dict[str, FloatArray] = {}
+    if readings.ambient_T is not None:
+        columns["ambient_T"] = readings.ambient_T
+    if readings.pose_sigma is not None:
+        columns["pose_sigma"] = readings.pose_sigma
+    if readings.pose is not None:
+        position_m, R = readings.pose[0], readings.pose[1].as_matrix()
+        columns |= {"origin_m": position_m, "R_world_from_array": R}
+        if len(readings) > 1:
+            velocity_m_s, rate_rad_s = rates_of(readings.time_s, position_m, R)
+            columns |= {"velocity_m_s": velocity_m_s, "rate_rad_s": rate_rad_s}
+    for i, time in enumerate(readings.time_s.tolist()):
+        yield Row(time, readings.values_T[i], **{name: column[i] for name, column in columns.items()})
+
+
+def next_row(row: Row | Readings, array: SensorArray, after_s: float) -> Row:
+    """Return the next row after a time; of readings, without saturated ones.
+
+    Raises
+    ------
+    ValueError
+        Time goes backwards, or the readings are not one row.
+    """
+    if isinstance(row, Readings):
+        if len(row) != 1:
+            raise ValueError(f"Input row must be readings of length one; instead received {len(row)} rows.")
+        row = next(rows_of(in_world_field(without_saturated(row, array), array)))
+    if not math.isfinite(row.time_s):
+        raise ValueError(f"Input time_s must be finite; instead received {row.time_s}.")
+    if row.time_s <= after_s:
+        raise ValueError(f"Input time_s must increase; instead {row.time_s} s follows {after_s} s.")
+    return row
