@@ -118,6 +118,22 @@ def from_error_vector(delta: ArrayLike) -> FloatArray:
     return np.concatenate([scalar, delta / np.sqrt(np.maximum(squared, 1.0))], axis=-1)
 
 
+def turned_onto(q: FloatArray, body: FloatArray, reference: FloatArray) -> FloatArray:
+    """Attitude after the shortest turn that makes a direction in body axes that of the "to" frame.
+
+    Shapes ``q`` (..., 4), ``body`` and ``reference`` (..., 3), of any lengths. Returns (..., 4).
+    """
+    length = np.linalg.norm(body, axis=-1, keepdims=True) * np.linalg.norm(reference, axis=-1, keepdims=True)
+    there = rotate_back(q, reference)
+    cosine = np.sum(body * there, axis=-1, keepdims=True) / length
+    turn = np.concatenate([1.0 + cosine, np.cross(body, there) / length], axis=-1)
+    # Half a turn is one about any axis across.
+    opposite = 1.0 + cosine[..., 0] < 1e-12
+    across = np.cross(body[opposite], np.eye(3)[np.argmin(np.abs(body[opposite]), axis=-1)])
+    turn[opposite] = np.insert(across, 0, 0.0, axis=-1)
+    return normalised(multiply(q, normalised(turn)))
+
+
 def angle_between(p: ArrayLike, q: ArrayLike) -> FloatArray:
     """Angle of the rotation between two attitudes, 0 to π [rad]. Shapes (..., 4) -> (...)."""
     error = multiply(conjugate(p), q)

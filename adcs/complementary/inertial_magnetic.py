@@ -268,10 +268,7 @@ def _levelled(q_gyro: FloatArray, up: Up, part: FloatArray) -> FloatArray:
         start = _attitude(v, _across(v))
         if begin > 0:
             start = quaternion.multiply(q_level[begin - 1], quaternion.conjugate(q_gyro[begin - 1]))
-            x, y, z = quaternion.rotate(start, v)
-            across = math.hypot(x, y)
-            turn = np.array([y, -x, 0.0]) * (math.atan2(across, z) / across if across > 0.0 else 0.0)
-            start = quaternion.multiply(quaternion.exp(turn), start)
+            start = quaternion.turned_onto(start, v, np.array([0.0, 0.0, 1.0]))
         q_level[begin:end] = levelled(q_gyro[begin:end], up.up[begin:end], part[begin:end], start)
     return q_level
 

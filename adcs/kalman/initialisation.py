@@ -67,7 +67,7 @@ def vector_start(record: Record, settings: FilterSettings, rate_rad_s: float = R
     q = attitude_of_vectors(*directions, [sigma[3], np.hypot(sigma[2], constant_T) / length_T]).q
     for body, reference in zip(*directions, strict=True):  # one of them, or both on one line
         open_runs = np.isnan(q[:, 0]) & is_read(body)
-        q[open_runs] = turned_onto(quaternion.IDENTITY, body[open_runs], reference[open_runs])
+        q[open_runs] = quaternion.turned_onto(quaternion.IDENTITY, body[open_runs], reference[open_runs])
     q[np.isnan(q[:, 0])] = quaternion.IDENTITY
     seen_star = is_read(readings.star[:, 0]) & used.star
     q[seen_star] = readings.star[seen_star, 0]
@@ -91,19 +91,6 @@ def vector_start(record: Record, settings: FilterSettings, rate_rad_s: float = R
     covariance[:, :3, :3] = np.linalg.inv(information)
     covariance[:, 3:, 3:] = rate_variance[:, None, None] * np.eye(3)
     return Start(quaternion.normalised(q), w, covariance)
-
-
-def turned_onto(q: FloatArray, body: FloatArray, reference: FloatArray) -> FloatArray:
-    """Attitude (runs, 4) after the shortest turn that makes a direction in body axes that of the reference frame."""
-    length = np.linalg.norm(body, axis=-1, keepdims=True) * np.linalg.norm(reference, axis=-1, keepdims=True)
-    there = quaternion.rotate_back(q, reference)
-    cosine = np.sum(body * there, axis=-1, keepdims=True) / length
-    turn = np.concatenate([1.0 + cosine, np.cross(body, there) / length], axis=-1)
-    # Half a turn is one about any axis across.
-    opposite = 1.0 + cosine[..., 0] < 1e-12
-    across = np.cross(body[opposite], np.eye(3)[np.argmin(np.abs(body[opposite]), axis=-1)])
-    turn[opposite] = np.insert(across, 0, 0.0, axis=-1)
-    return quaternion.normalised(quaternion.multiply(q, quaternion.normalised(turn)))
 
 
 def _calibration_deviation(settings: FilterSettings, length_T: FloatArray) -> FloatArray:

@@ -57,7 +57,7 @@ class TestReferences:
         vectors[0, 1] = -3.0 * vectors[0, 0]  # half a turn
         for q, (one, one_there, two, two_there) in zip(turns, vectors, strict=True):
             axis = one / np.linalg.norm(one)
-            onto = readable.turned_onto(q[None], one[None], one_there[None])
+            onto = quaternion.turned_onto(q[None], one[None], one_there[None])
             about = readable.turned_about(onto, axis[None], two[None], two_there[None])[0]
             first = called(library.turn_onto, q, one, one_there, shape=(4,))
             second = called(library.turn_about, first, axis, two, two_there, shape=(4,))

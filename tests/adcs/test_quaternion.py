@@ -119,6 +119,26 @@ class TestErrorVector:
         np.testing.assert_allclose(quat.from_error_vector([0.0, 3.0, 4.0]), [0.0, 0.0, 0.6, 0.8], atol=1e-15)
 
 
+class TestShortestTurn:
+    @pytest.mark.parametrize("shape", [(), (5,)])
+    def test_brings_the_direction_there_by_the_angle_between(self, shape: tuple[int, ...]) -> None:
+        rng = np.random.default_rng(3)
+        q = quat.normalised(rng.standard_normal((*shape, 4)))
+        body, reference = rng.standard_normal((2, *shape, 3))
+        found = quat.turned_onto(q, body, reference)
+        units = [v / np.linalg.norm(v, axis=-1, keepdims=True) for v in (quat.rotate(found, body), reference)]
+        np.testing.assert_allclose(*units, rtol=0, atol=1e-14)
+        before = quat.rotate(q, body)
+        cosine = np.sum(before * reference, axis=-1) / (
+            np.linalg.norm(body, axis=-1) * np.linalg.norm(reference, axis=-1)
+        )
+        np.testing.assert_allclose(quat.angle_between(q, found), np.arccos(cosine), rtol=0, atol=1e-12)
+
+    def test_half_a_turn(self) -> None:
+        found = quat.turned_onto(Q, V, -2.0 * quat.rotate(Q, V))
+        np.testing.assert_allclose(quat.rotate(found, V), -quat.rotate(Q, V), rtol=0, atol=1e-14)
+
+
 class TestDerivative:
     def test_constant_rate_turns_as_the_matrix_exponential(self) -> None:
         w = np.array([0.1, -0.2, 0.3])

@@ -15,7 +15,6 @@ import numpy as np
 
 from adcs import quaternion
 from adcs.kalman.error_state import AttitudeTracks, FilterSettings, SensorSet, Start, State
-from adcs.kalman.initialisation import turned_onto
 from adcs.kalman.mekf import (
     PATIENT_READINGS,
     check_start,
@@ -177,11 +176,11 @@ def begun(record: Record, row: int, state: State, settings: FilterSettings, sens
     else:
         there = used.magnetometer and bool(is_read(readings.field_T[:, row]).all())
         if used.sun and is_read(readings.sun[:, row]).all():
-            q = turned_onto(q, readings.sun[:, row], around.sun_orbital[:, row])
+            q = quaternion.turned_onto(q, readings.sun[:, row], around.sun_orbital[:, row])
             if there:
                 q = turned_about(q, readings.sun[:, row], readings.field_T[:, row], around.b_orbital_T[:, row])
         else:
-            q = turned_onto(q, readings.field_T[:, row], around.b_orbital_T[:, row])
+            q = quaternion.turned_onto(q, readings.field_T[:, row], around.b_orbital_T[:, row])
     return replace(state, q=q, P=np.diag(variance)[None])
 
 

@@ -129,7 +129,7 @@ class TestTwins:
         turns[0] = quaternion.IDENTITY
         for q, (one, one_there, two, two_there) in zip(turns, vectors, strict=True):
             axis = one / np.linalg.norm(one)
-            onto = gate.turned_onto(q[None], one[None], one_there[None])
+            onto = quaternion.turned_onto(q[None], one[None], one_there[None])
             about = gate.turned_about(onto, axis[None], two[None], two_there[None])[0]
             # Wahba's problem with the first direction infinitely weighted.
             expected, _ = Rotation.align_vectors([one_there, two_there], [one, two], weights=[np.inf, 1.0])
