@@ -193,7 +193,7 @@ class CartesianFilter:
         """Their standard deviations before anything is known (n_errors,)."""
         return np.concatenate([np.ones(self.pose_errors.n_states), self.errors.sigma])
 
-    def predicted(self, x: FloatArray, S: FloatArray, dt_s: float) -> Prediction:
+    def predict(self, x: FloatArray, S: FloatArray, dt_s: float) -> Prediction:
         """State, square root of its covariance and transition after a step without readings."""
         n, n_errors = self.motion.n_states, self.n_errors
         moved, F_motion, S_q_motion = self.motion.step(x[:n], dt_s)
@@ -217,7 +217,7 @@ class CartesianFilter:
         x[:n], S[:n, :n] = self.motion.start(centre[:N_SOURCE], root)
         if R_world_from_array is None or (known := KnownInWorld.of(self.prior, R_world_from_array)) is None:
             return x, S
-        H = known.along(centre[None], np.eye(len(centre))[None])[0]
+        H = known.directional_derivative(centre[None], np.eye(len(centre))[None])[0]
         return block_update(x, S, H, known.residual(centre[None])[0] - H @ (x - centre), np.ones(len(H)))
 
     def start(self, source: FloatArray, covariance: FloatArray, rows: Sequence[Row]) -> FilteredStart | None:
@@ -252,10 +252,10 @@ class CartesianFilter:
         chi2, of_rows = 0.0, []
         for j, (measurement, centre) in enumerate(zip(measurements, centres, strict=True)):
             if j:
-                prediction = self.predicted(x, S, measurement.row.time_s - measurements[j - 1].row.time_s)
+                prediction = self.predict(x, S, measurement.row.time_s - measurements[j - 1].row.time_s)
                 x, S = prediction.x, prediction.S
             H, ones = measurement.jacobian(centre), np.ones(measurement.z.size)
-            innovation = measurement.z - measurement.predicted(centre) - H @ (x - centre)
+            innovation = measurement.z - measurement.predict(centre) - H @ (x - centre)
             chi2 += normalised_innovation_squared(S, H, innovation, ones)
             x, S = block_update(x, S, H, innovation, ones)
             of_rows.append(x)

@@ -206,14 +206,14 @@ class OrnsteinUhlenbeck(_MovingState):
 
     def turning_step(self, dt_s: float) -> FloatArray:
         """Return the numbers (12,) of a step for the C++ kernel."""
-        moved, kept, root = wandering_step(self._correlation_s, dt_s)
+        moved, kept, root = ornstein_uhlenbeck_step(self._correlation_s, dt_s)
         lower = root[[0, 1, 1], [0, 0, 1]]
         change = self.moment_change * math.sqrt(dt_s)
         return np.array([moved, kept, moved, kept, *self.speed_m_s * lower, *self.turn_rad_s * lower, change, change])
 
     def step(self, x: FloatArray, dt_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the prediction, see :class:`MotionModel`."""
-        moved, kept, root = wandering_step(self._correlation_s, dt_s)
+        moved, kept, root = ornstein_uhlenbeck_step(self._correlation_s, dt_s)
         p, m, v, rate = x[:3], x[3:6], x[6:9], x[9:]
         turn = rotation_matrix(moved * rate)
         turned = turn @ m
@@ -311,7 +311,7 @@ def known_motions(measured: MeasuredMotion, unknown: RandomWalk) -> list[KnownMo
 
 
 @lru_cache(maxsize=64)
-def wandering_step(correlation_s: float, dt_s: float) -> tuple[float, float, FloatArray]:
+def ornstein_uhlenbeck_step(correlation_s: float, dt_s: float) -> tuple[float, float, FloatArray]:
     """Return the entries of F of (value, rate), and the square root of its noise for a rate with σ = 1."""
     if dt_s == 0.0:
         return 0.0, 1.0, np.zeros((2, 2))

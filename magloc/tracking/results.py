@@ -189,21 +189,21 @@ class SourcesPoint:
     dropped_sensors: tuple[str, ...] = ()
 
 
-def learned(variance: FloatArray, open_loop: FloatArray) -> FloatArray:
+def estimability(variance: FloatArray, open_loop: FloatArray) -> FloatArray:
     """Return the estimability 1 - σ / σ₀ from the variances with readings and without any."""
     return 1.0 - np.sqrt(np.minimum(variance / open_loop, 1.0))
 
 
-def of_mixture(time_s: float, mixture: Mixture, open_loop: FloatArray) -> TrackPoint:
+def point_of_mixture(time_s: float, mixture: Mixture, open_loop: FloatArray) -> TrackPoint:
     """Return the point of a mixture; open_loop (n,) are the variances without any readings."""
-    source = mixture.of_source()
+    source = mixture.source_marginal()
     mean, covariance = source.moments()
     return TrackPoint(
         time_s,
         mean[:3],
         mean[3:],
         covariance,
-        learned(np.diagonal(covariance), open_loop[:N_SOURCE]),
+        estimability(np.diagonal(covariance), open_loop[:N_SOURCE]),
         weight=float(source.weight.max()),
         centroid_m=source.centroid_m,
         radius_m=source.radius_m,
@@ -249,11 +249,13 @@ def warn_of_strengths(points: Iterable[TrackPoint]) -> None:
     """Warn if most points of a track have a moment that no object at their distance has."""
     known = [point for point in points if point.is_on_track and point.centroid_m is not None]
     if known:
-        places, moments, centroids = (stacked(known, name, 3) for name in ("position_m", "moment_Am2", "centroid_m"))
+        places, moments, centroids = (
+            track_column(known, name, 3) for name in ("position_m", "moment_Am2", "centroid_m")
+        )
         warn_of_moments(np.linalg.norm(places - centroids, axis=1), moments)
 
 
-def stacked(points: Sequence[TrackPoint], name: str, *shape: int) -> FloatArray:
+def track_column(points: Sequence[TrackPoint], name: str, *shape: int) -> FloatArray:
     """Return a column of a track (n, ...), NaN where there is no track."""
     empty = np.full(shape, np.nan)
     values = [empty if value is None else value for value in (getattr(point, name) for point in points)]

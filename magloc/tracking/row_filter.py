@@ -75,7 +75,7 @@ class Gaussians:
             roots=np.ascontiguousarray(self.S),
         )
 
-    def unfilled(self) -> Gaussians:
+    def empty_like(self) -> Gaussians:
         """Return as many, to be filled."""
         return replace(self, x=np.empty_like(self.x, order="C"), S=np.empty_like(self.S, order="C"))
 
@@ -271,7 +271,7 @@ def refill_step(steps: core.Problem, slot: int, motion: MotionModel, errors: Sen
 
 def predict(before: Gaussians, centroid_m: FloatArray, steps: core.Problem, rows: Rows, row: int = 0) -> Gaussians:
     """Return Gaussians after the step to a row; the sensors' centroid stood at `centroid_m` before."""
-    after = before.unfilled()
+    after = before.empty_like()
     work = core.problem(
         "row_prediction",
         before=before.problem,
@@ -318,7 +318,7 @@ def update(
     tolerance : float
         Length of the next step, in standard deviations, below which it ends.
     """
-    after, n = before.unfilled(), len(before.x)
+    after, n = before.empty_like(), len(before.x)
     nis, chi2, log_evidence = np.empty((3, n))
     iterations, converged = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.uint8)
     whitened = np.empty((n, rows.readings.shape[1])) if innovation else None
@@ -389,7 +389,7 @@ def bends(gaussians: Gaussians, rows: Rows, memory: float, row: int = 0) -> tupl
 
 
 @dataclass(frozen=True, eq=False)
-class Smoothed:
+class SmootherPass:
     """A pass of a filter and a smoother along trajectories.
 
     Attributes
@@ -408,7 +408,7 @@ class Smoothed:
     log_evidence: FloatArray
 
 
-def smooth(trajectories: FloatArray, prior: Gaussians, steps: core.Problem, rows: Rows) -> Smoothed:
+def smooth(trajectories: FloatArray, prior: Gaussians, steps: core.Problem, rows: Rows) -> SmootherPass:
     """Return a pass along trajectories, at which motion and readings are linearised.
 
     Parameters
@@ -422,7 +422,7 @@ def smooth(trajectories: FloatArray, prior: Gaussians, steps: core.Problem, rows
         Steps of the motion, from :func:`steps_problem`.
     rows : Rows
     """
-    n, last, offsets = len(trajectories), prior.unfilled(), np.empty_like(trajectories, order="C")
+    n, last, offsets = len(trajectories), prior.empty_like(), np.empty_like(trajectories, order="C")
     nis, log_evidence = np.empty((2, n))
     work = core.problem(
         "smoothing",
@@ -437,4 +437,4 @@ def smooth(trajectories: FloatArray, prior: Gaussians, steps: core.Problem, rows
         log_evidence=log_evidence,
     )
     core.run("smooth_rows", work, n, block=max(1, _ROWS_A_CALL // trajectories.shape[1]))
-    return Smoothed(offsets, last, nis, log_evidence)
+    return SmootherPass(offsets, last, nis, log_evidence)

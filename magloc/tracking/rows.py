@@ -54,7 +54,7 @@ class Row:
         return ArrayPose(self.origin_m, self.R_world_from_array, velocity, rate, lever_arm_m)
 
 
-def moving(row: Row, before: Row | None) -> Row:
+def with_array_motion(row: Row, before: Row | None) -> Row:
     """Return a row with the array's velocity and rate, from the row before if the row has none."""
     if before is None or row.velocity_m_s is not None:
         return row

@@ -26,7 +26,7 @@ from magloc.readings import Readings
 from magloc.tracking.consistency import Consistency, InnovationTest, consistency, innovation_test
 from magloc.tracking.files import dataset_of_track, geojson_of_track, kml_of_track, lines_of_track
 from magloc.tracking.motion import MotionModel, OrnsteinUhlenbeck, RandomWalk, known_motions
-from magloc.tracking.results import SourcesPoint, TrackPoint, TrackResult, stacked, warn_of_strengths
+from magloc.tracking.results import SourcesPoint, TrackPoint, TrackResult, track_column, warn_of_strengths
 from magloc.tracking.rows import Row, rows_of
 from magloc.tracking.settled import MOST_AT_ONCE
 from magloc.tracking.tracker import Tracker
@@ -102,27 +102,27 @@ class TrackColumns(TrackRows[TrackPoint]):
     @cached_property
     def position_m(self) -> FloatArray:
         """Positions (n, 3) [m]."""
-        return stacked(self, "position_m", 3)
+        return track_column(self, "position_m", 3)
 
     @cached_property
     def moment_Am2(self) -> FloatArray:
         """Moments (n, 3) [A·m²]."""
-        return stacked(self, "moment_Am2", 3)
+        return track_column(self, "moment_Am2", 3)
 
     @cached_property
     def covariance(self) -> FloatArray:
         """Covariances (n, 6, 6) of position and moment."""
-        return stacked(self, "covariance", 6, 6)
+        return track_column(self, "covariance", 6, 6)
 
     @cached_property
     def estimability(self) -> FloatArray:
         """Estimability (n, 6): 1 - σ / σ₀, where σ₀ is the standard deviation without any readings."""
-        return stacked(self, "estimability", 6)
+        return track_column(self, "estimability", 6)
 
     @cached_property
     def nis(self) -> FloatArray:
         """Normalised innovations squared (n,)."""
-        return stacked(self, "nis")
+        return track_column(self, "nis")
 
     @cached_property
     def nis_dof(self) -> IntArray:
@@ -132,7 +132,7 @@ class TrackColumns(TrackRows[TrackPoint]):
     @cached_property
     def weight(self) -> FloatArray:
         """Probability that the track is the right one (n,)."""
-        return stacked(self, "weight")
+        return track_column(self, "weight")
 
     @property
     def range_interval_m(self) -> list[Intervals]:

@@ -34,8 +34,8 @@ from magloc.tracking.chart.steps import LARGEST_WIDTH, ChartFilter, Known, RowUp
 from magloc.tracking.chart.undetermined import Undetermined
 from magloc.tracking.measurement import RowMeasurement, RowMeasurements
 from magloc.tracking.motion import N_SOURCE, MotionModel
-from magloc.tracking.results import UNDETERMINED, Innovation, Prediction, Step, TrackPoint, of_mixture
-from magloc.tracking.rows import Row, moving, next_row
+from magloc.tracking.results import UNDETERMINED, Innovation, Prediction, Step, TrackPoint, point_of_mixture
+from magloc.tracking.rows import Row, next_row, with_array_motion
 from magloc.tracking.sensor_health import SENSOR_LIMIT, SensorHealth, Suspects
 from magloc.tracking.settled import MOST_AT_ONCE, SettledTrack
 
@@ -150,7 +150,7 @@ class Tracker(CartesianFilter):
     def _advanced(self, row: Row) -> TrackPoint:
         """The point of a row by the readable steps."""
         if self.n_errors:
-            row, self._row_before = moving(row, self._row_before), row
+            row, self._row_before = with_array_motion(row, self._row_before), row
         dt_s, self._time_s = row.time_s - self._time_s, row.time_s
         index, self._n_rows = self._n_rows, self._n_rows + 1
         if self._known is None:
@@ -238,11 +238,11 @@ class Tracker(CartesianFilter):
         """A track after one more row, and the sensors (N,) that were left out of it."""
         dead = self._health.dead
         seen = self._seen(row, dead)
-        predicted = self.filter.predicted(before.mixture, self.motion, dt_s, seen)
+        predicted = self.filter.predict(before.mixture, self.motion, dt_s, seen)
         x = before.mixture.x[np.argmax(before.mixture.log_weight)]
         open_loop = self.open_loop(before.open_loop, x, dt_s)
         known = replace(before, mixture=predicted, open_loop=open_loop, used=before.used or before.mixture)
-        prediction = self.predicted(*cartesian(before.mixture), dt_s) if self.keep_steps else None
+        prediction = self.predict(*cartesian(before.mixture), dt_s) if self.keep_steps else None
         if not seen.z.size:
             return dead, self._kept(seen.row, index, known, prediction, status="predicted")
         if width_of(predicted) > LARGEST_WIDTH:
@@ -336,7 +336,7 @@ class Tracker(CartesianFilter):
         self._known = known
         if self.keep_steps:
             self.steps.append(Step(index, prediction, *cartesian(mixture)))
-        point = of_mixture(row.time_s, mixture, np.diagonal(known.open_loop))
+        point = point_of_mixture(row.time_s, mixture, np.diagonal(known.open_loop))
         return replace(point, status=status, iterations=iterations, **told)
 
     def _acquired(self, seen: RowMeasurement, index: int) -> TrackPoint:
@@ -367,5 +367,5 @@ class Tracker(CartesianFilter):
         if mixture is None:
             return self._lost(seen.row, reason)
         heaviest = mixture.x[np.argmax(mixture.log_weight)]
-        point = of_mixture(seen.row.time_s, mixture, np.diagonal(self.known_before(seen, heaviest)))
+        point = point_of_mixture(seen.row.time_s, mixture, np.diagonal(self.known_before(seen, heaviest)))
         return replace(point, status=UNDETERMINED)

@@ -36,7 +36,7 @@ class KnownInWorld:
         """What is known less what states (K, n) have, in standard deviations: (K, n_known)."""
         return self.moment.residual((state[:, 3:6] @ self.R_world_from_array)[:, None])
 
-    def along(self, state: FloatArray, directions: FloatArray) -> FloatArray:
+    def directional_derivative(self, state: FloatArray, directions: FloatArray) -> FloatArray:
         """Derivative (K, n_known, m) of what they have along directions (K, n, m)."""
         by_moment = self.moment.jacobian((state[:, 3:6] @ self.R_world_from_array)[:, None])[:, 0]
         return np.asarray(by_moment @ self.R_world_from_array.T @ directions[:, 3:6])

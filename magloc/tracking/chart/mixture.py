@@ -37,7 +37,8 @@ class Mixture:
     x : ndarray, shape (K, N)
         Cartesian states: source, motion, and the sensors' lasting errors.
     S : ndarray, shape (K, N, N)
-        Roots of their covariances, in the chart about each; of a point of a track (K, 6, N) until :meth:`of_source`.
+        Roots of their covariances, in the chart about each; of a point of a track (K, 6, N) until
+        :meth:`source_marginal`.
     log_weight : ndarray, shape (K,)
         Logarithms of their weights, which add up to one.
     n_charted : int
@@ -100,7 +101,7 @@ class Mixture:
         log_weight = log_weight - np.logaddexp.reduce(log_weight)
         return replace(self, x=self.x[index], S=self.S[index], log_weight=log_weight)
 
-    def of_source(self) -> Mixture:
+    def source_marginal(self) -> Mixture:
         """Position and moment alone."""
         if self.S.shape[1:] == (N_SOURCE, N_SOURCE):
             return self
@@ -138,7 +139,7 @@ class Mixture:
         mean = self.weight @ offset
         spread = np.sqrt(self.weight)[:, None, None] * np.concatenate([roots, (offset - mean)[:, :, None]], axis=2)
         x = self.x[best] + mean
-        x[:n] = about.retracted(mean[None, :n])[0]
+        x[:n] = about.retract(mean[None, :n])[0]
         after = Chart.at(x[None, :n], self.centroid_m, self.radius_m, self.n_pose)
         rows = np.concatenate(list(spread), axis=1)
         turn = after.inverse_jacobian()[0] @ about.jacobian(mean[None, :n])[0]

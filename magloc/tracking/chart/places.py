@@ -85,7 +85,7 @@ class Places:
         k = _stratified(np.exp(self.log_weight - np.logaddexp.reduce(self.log_weight)), n)
         e = np.zeros((n, N_SOURCE))
         e[:, :3] = (self.root[k] @ _normal(n)[..., None])[..., 0]
-        return self.chart.take(k).retracted(e)
+        return self.chart.take(k).retract(e)
 
     def log_density(self, x: FloatArray) -> FloatArray:
         """Of log-range and direction, at states (n, 6)."""

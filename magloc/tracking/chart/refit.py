@@ -21,9 +21,9 @@ from magloc.tracking.chart.known_moment import KnownInWorld
 from magloc.tracking.chart.mixture import Mixture
 from magloc.tracking.chart.start import first_root
 from magloc.tracking.coordinates import Chart
-from magloc.tracking.measurement import RowMeasurement, stacked, step_of_errors
+from magloc.tracking.measurement import RowMeasurement, stack_rows, step_of_errors
 from magloc.tracking.motion import N_SOURCE, MotionModel
-from magloc.tracking.row_filter import Gaussians, Rows, Smoothed, smooth, steps_problem
+from magloc.tracking.row_filter import Gaussians, Rows, SmootherPass, smooth, steps_problem
 
 _MOST_PASSES = 15
 # After how many passes a component is given up whose evidence is so much less, as a logarithm, than that of another.
@@ -105,7 +105,7 @@ def refitted(
             square, bent = np.sum(before * before, axis=1), np.sum(before * (before - last), axis=1)
             share = np.clip(np.divide(share * square, bent, out=np.ones_like(share), where=bent > 0.0), *_SHARES)
         step = np.where(alive, share * length, 0.0)[:, None] * np.nan_to_num(offset)
-        track = rows.chart(track).retracted(step)
+        track = rows.chart(track).retract(step)
         there = (change < _TOLERANCE) & alive
         ended = live[there]
         x[ended], S[ended] = np.concatenate([track[-1], found.last.x[:, n:]], axis=1)[there], found.last.S[there]
@@ -136,7 +136,7 @@ class _Rows:
 
     @cached_property
     def _compiled(self) -> Rows:
-        return stacked(self.measurements)
+        return stack_rows(self.measurements)
 
     @cached_property
     def _steps_s(self) -> list[float]:
@@ -164,7 +164,7 @@ class _Rows:
             track[row - 1, :, :m] = after - np.linalg.solve(F, (moved - after)[..., None])[..., 0]
         return track
 
-    def passed(self, track: FloatArray, prior: Cells | None) -> Smoothed:
+    def passed(self, track: FloatArray, prior: Cells | None) -> SmootherPass:
         """A filter and a smoother that linearise along trajectories (rows, K, n)."""
         m, before = self.motions[0].n_states, self._prior(self.measurements[0].chart(track[0]), prior)
         trajectories, evidence = np.ascontiguousarray(np.swapaxes(track, 0, 1)), np.zeros(track.shape[1])
@@ -198,9 +198,9 @@ class _Rows:
         n, n_known = x.shape[1], known.n_known
         chart = self.measurements[0].chart(x)
         H = np.zeros((len(x), n_known, before.x.shape[1]))
-        H[..., :n] = known.along(x, chart.jacobian(np.zeros_like(x)))
+        H[..., :n] = known.directional_derivative(x, chart.jacobian(np.zeros_like(x)))
         left = known.residual(x) - (H @ before.x[..., None])[..., 0]
-        after, evidence = before.unfilled(), np.empty(len(x))
+        after, evidence = before.empty_like(), np.empty(len(x))
         for k, given in enumerate(zip(before.x, before.S, H, left, strict=True)):
             after.x[k], after.S[k] = block_update(*given, np.ones(n_known))
             covariance = np.eye(n_known) + (H[k] @ before.S[k]) @ (H[k] @ before.S[k]).T

@@ -75,7 +75,7 @@ def split(mixture: Mixture, row: RowMeasurement) -> tuple[Mixture, IntArray]:
 def bends(mixture: Mixture, row: RowMeasurement) -> tuple[FloatArray, FloatArray]:
     """Return the bends (K, 6) of a row's readings, and one standard deviation (K, 6, N) along each axis."""
     gaussians, memory = Gaussians(mixture.x, mixture.S), min(mixture.n_rows, MOST_ROWS)
-    bend, directions = row_filter.bends(gaussians, row.compiled, memory)
+    bend, directions = row_filter.bends(gaussians, row.kernel_rows, memory)
     # A wide component may reach beyond all numbers.
     return np.where(np.isfinite(bend), bend, 0.0), directions
 
@@ -87,11 +87,11 @@ def _divided(mixture: Mixture, index: IntArray, v: FloatArray) -> Mixture:
     axis = np.linalg.solve(S[:, :N_SOURCE, :N_SOURCE], v[:, :N_SOURCE, None])
     narrow = S.copy()
     narrow[:, :, :N_SOURCE] -= (1.0 - _SIGMA) * v[:, :, None] * np.swapaxes(axis, 1, 2)
-    chart = mixture.chart.take(index).firmly(S[:, :n])
+    chart = mixture.chart.take(index).with_firm_moments(S[:, :n])
     x, roots, log_weight = [mixture.x[kept]], [mixture.S[kept]], [mixture.log_weight[kept]]
     for weight, mean in zip(_WEIGHTS, _MEANS, strict=True):
         state, root = mixture.x[index] + mean * v, narrow.copy()
-        state[:, :n], L = chart.linearised(mean * v[:, :n])
+        state[:, :n], L = chart.linearise(mean * v[:, :n])
         root[:, :n] = replace(mixture, x=state).chart.inverse_jacobian() @ L @ root[:, :n]
         x.append(state)
         roots.append(root_of(root))

@@ -21,7 +21,7 @@ from magloc.measurement.differences import DifferenceMeasurement
 from magloc.measurement.nuisances import SensorErrors
 from magloc.measurement.pose import N_POSE, PoseErrors
 from magloc.tracking.coordinates import Chart
-from magloc.tracking.measurement import RowMeasurement, where_smooth
+from magloc.tracking.measurement import RowMeasurement, zero_if_nan
 from magloc.tracking.motion import N_SOURCE, MotionModel
 from magloc.tracking.rows import Row
 
@@ -60,7 +60,7 @@ class Stack:
         changes = _changes(rows)
         latest = rows[changes[-MOST_CHANGES] :] if changes.size >= MOST_CHANGES else rows
         k = max(row.n_differences for row in latest)
-        return cls(tuple(row.padded(k) for row in latest), errors, pose_errors, motion)
+        return cls(tuple(row.pad(k) for row in latest), errors, pose_errors, motion)
 
     @cached_property
     def n_differences(self) -> int:
@@ -158,7 +158,7 @@ class Stack:
         place, moment = (state[:, :3] - origin) @ R, state[:, 3:6] @ R
         return place[:, :, None], moment[:, :, None]
 
-    def of_source(self, state: FloatArray) -> FloatArray:
+    def predict_source(self, state: FloatArray) -> FloatArray:
         """Predicted differences (..., k) of sources (..., 6)."""
         states = state.reshape(-1, N_SOURCE)
         array = self.model.array
@@ -167,7 +167,7 @@ class Stack:
         predicted = self._means(channels @ np.swapaxes(self._transform, -1, -2))
         return predicted.reshape(*state.shape[:-1], predicted.shape[-1])
 
-    def along(self, state: FloatArray, directions: FloatArray) -> FloatArray:
+    def directional_derivative(self, state: FloatArray, directions: FloatArray) -> FloatArray:
         """Their derivative (K, k, m) along directions (K, 6, m) in states (K, 6)."""
         array, (_, R) = self.model.array, self._pose
         in_arrays = self._in_arrays(state)
@@ -226,7 +226,7 @@ class Stack:
                 by_array = row.model.jacobian(in_array[:, :3], in_array[:, 3:]) / row.sigma[:, None]
             by_source.append(row._by_source(by_array, None))
             if row.n_pose:
-                by_pose.append(where_smooth(row._by_pose(by_array, in_array, error)))
+                by_pose.append(zero_if_nan(row._by_pose(by_array, in_array, error)))
         if by_pose:
             E = self._middles(by_pose)
             for lasts_s, share in self._of_pose.items():

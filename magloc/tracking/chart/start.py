@@ -32,8 +32,8 @@ from magloc.tracking.chart.known_moment import UNIFORM_IN_SPACE, KnownInWorld
 from magloc.tracking.chart.mixture import DROPPED_BELOW, FARTHEST, NEAREST, Mixture
 from magloc.tracking.chart.stack import Measured
 from magloc.tracking.chart.update import Updated, updated
-from magloc.tracking.coordinates import MOMENT_POWER, Chart, mirrored, source_root
-from magloc.tracking.measurement import RowMeasurement, where_smooth, whitening
+from magloc.tracking.coordinates import MOMENT_POWER, Chart, mirror_images, source_root
+from magloc.tracking.measurement import RowMeasurement, whitening, zero_if_nan
 from magloc.tracking.motion import N_SOURCE, MotionModel
 from magloc.tracking.row_filter import Gaussians, RowUpdates
 from magloc.tracking.rows import Row
@@ -181,7 +181,7 @@ class Start:
         dof = measurement.n_differences - N_SOURCE + (0 if known is None else known.n_known)
         if dof > 0 and found.chi2[sound].min() > chdtri(dof, CONTRADICTION):
             best = int(np.argmin(np.where(sound, found.chi2, np.inf)))
-            self.misfit = measurement.z - measurement.of_source(found.x[best])
+            self.misfit = measurement.z - measurement.predict_source(found.x[best])
             return None, NO_DIPOLE
         log_weight = found.log_evidence + _EVEN * ((seeds.cell < 0) @ np.array([1.0, 2.0, 0.0]))
         log_weight -= math.log(2.0) * seeds.cell[:, 2]
@@ -202,7 +202,7 @@ class Start:
         columns = measurement.moment_columns(world)
         # Moduli in no ambient field are linear in no moment: their cells explain nothing, and their best fits start.
         whiten = measurement.whitening
-        columns, left = whiten @ where_smooth(columns), whiten @ measurement.without_source
+        columns, left = whiten @ zero_if_nan(columns), whiten @ measurement.without_source
         moments = (np.linalg.pinv(columns, rcond=1e-6) @ left[:, None])[..., 0]
         explained = np.sum((columns @ moments[..., None])[..., 0] ** 2, axis=1)
         explained[~self.prior.allows_position(cells) | ~(explained > 0.0)] = -np.inf
@@ -225,7 +225,7 @@ class Start:
 
 def _images(source: FloatArray, measurement: Measured) -> tuple[FloatArray, IntArray]:
     """Return sources (n, 6) of the gradient tensor of a source, in the cells of range (n,) next to it, and these."""
-    images = mirrored(source[None], measurement.centroid_m)[1:, 0]
+    images = mirror_images(source[None], measurement.centroid_m)[1:, 0]
     chart = measurement.chart(images)
     below = math.floor(math.log(float(chart.length[0]) / measurement.radius_m / NEAREST) / _PITCH)
     of_range = np.repeat(np.clip([below, below + 1], 0, _N_RANGES - 1), len(images))
@@ -247,7 +247,7 @@ def _components(
     sigma[:, 0] /= 2.0 ** seeds.cell[:, 2]
     S = chart.inverse_jacobian() @ _with_motion(chart, motion, sigma)
     if known is None and isinstance(measurement, RowMeasurement):
-        return row_filter.update(Gaussians(x, S, n_nuisances=measurement.n_pose), measurement.compiled)
+        return row_filter.update(Gaussians(x, S, n_nuisances=measurement.n_pose), measurement.kernel_rows)
     return updated(x, S, measurement, known)
 
 
@@ -290,7 +290,7 @@ def _along_valleys(seeds: _Seeds, found: Updated | RowUpdates, measurement: Meas
     chart, S = measurement.chart(found.x[own, :n]), found.S[own, :n]
     sigma, log_range = np.linalg.norm(S[:, 0], axis=1), np.log(chart.length / measurement.radius_m)
     along = (S @ S[:, 0, :, None])[..., 0] / sigma[:, None]
-    ends = [measurement.of_source(chart.retracted(share * along)) for share in (-1.0, 0.0, 1.0)]
+    ends = [measurement.predict_source(chart.retract(share * along)) for share in (-1.0, 0.0, 1.0)]
     bend = np.minimum(np.linalg.norm(0.5 * (ends[0] + ends[2]) - ends[1], axis=1), _MOST_BENT)
     bent = np.flatnonzero((bend > LARGEST_BEND) & (log_range > _VALLEY * sigma))
     if not bent.size:
@@ -303,7 +303,7 @@ def _along_valleys(seeds: _Seeds, found: Updated | RowUpdates, measurement: Meas
         ranges = np.arange(round((log_range[k] - reach) / pitch), round((log_range[k] + reach) / pitch) + 1)
         every = np.full(len(ranges), k)
         e = ((ranges * pitch - log_range[k]) / sigma[k])[:, None] * along[k]
-        state, of_direction = chart.take(every).retracted(e), seeds.cell[own[every], 1]
+        state, of_direction = chart.take(every).retract(e), seeds.cell[own[every], 1]
         position.append(state[:, :3])
         moment.append(state[:, 3:6])
         cell.append(np.stack([_N_RANGES + ranges, of_direction, np.full_like(ranges, halvings)], axis=1))
@@ -320,8 +320,8 @@ def with_errors(mixture: Mixture, measurement: RowMeasurement, sigma: FloatArray
         return mixture
     n, chart, unit = measurement.n_charted, mixture.chart, measurement.effect * sigma
     gain = sigma[:, None] * np.linalg.solve(np.eye(len(unit)) + unit @ unit.T, unit).T
-    left = measurement.z - measurement.of_source(mixture.x)
-    H = measurement.along(mixture.x, chart.jacobian(np.zeros_like(mixture.x)))
+    left = measurement.z - measurement.predict_source(mixture.x)
+    H = measurement.directional_derivative(mixture.x, chart.jacobian(np.zeros_like(mixture.x)))
     rows = np.zeros((len(mixture), n + sigma.size, n + sigma.size))
     rows[:, :n, :n], rows[:, n:, :n] = mixture.S, -gain @ (H @ mixture.S)
     rows[:, n:, n:] = sigma[:, None] * whitening(unit.T).T
@@ -330,7 +330,7 @@ def with_errors(mixture: Mixture, measurement: RowMeasurement, sigma: FloatArray
 
 def once(mixture: Mixture, cell: IntArray | None = None) -> IntArray:
     """Components, heaviest first, without those that another one with the same share of the even density has found."""
-    source = mixture.of_source()
+    source = mixture.source_marginal()
     cell = np.zeros((len(source), 1), dtype=np.intp) if cell is None else cell.reshape(len(source), -1)
     _, share, n_alike = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
     share = share.ravel()  # numpy 2.0.0 gives a column

@@ -33,7 +33,7 @@ from magloc.tracking.chart.refit import Cells, Refitted, refitted
 from magloc.tracking.chart.split import split
 from magloc.tracking.chart.stack import Stack
 from magloc.tracking.chart.start import NO_DIPOLE, OF_PITCH, Start, once, with_errors
-from magloc.tracking.coordinates import mirrored
+from magloc.tracking.coordinates import mirror_images
 from magloc.tracking.measurement import RowMeasurement, step_of_errors
 from magloc.tracking.motion import N_SOURCE, MotionModel
 from magloc.tracking.row_filter import Gaussians, steps_problem
@@ -174,12 +174,12 @@ class ChartFilter:
         """Whether a row shows that there is a source."""
         return row.is_detected(self.errors.sigma)
 
-    def predicted(self, mixture: Mixture, motion: MotionModel, dt_s: float, row: RowMeasurement) -> Mixture:
+    def predict(self, mixture: Mixture, motion: MotionModel, dt_s: float, row: RowMeasurement) -> Mixture:
         """What is known after a time without readings, as seen from a row's array."""
         kept, added = step_of_errors(self.pose_errors, self.errors, dt_s)
         nuisances = (kept[None], added[None]) if kept.size else None
         step = steps_problem(motion, [dt_s], np.zeros(1, dtype=np.int64), nuisances, mixture.x[:, : motion.n_states])
-        found = row_filter.predict(self._gaussians(mixture), mixture.centroid_m, step, row.compiled)
+        found = row_filter.predict(self._gaussians(mixture), mixture.centroid_m, step, row.kernel_rows)
         return replace(mixture, x=found.x, S=found.S, centroid_m=row.centroid_m)
 
     def _gaussians(self, mixture: Mixture) -> Gaussians:
@@ -199,7 +199,7 @@ class ChartFilter:
         lasts = self.pose_errors.step(dt_s)[0] ** 2
         after = row_filter.update(
             self._gaussians(predicted),
-            row.compiled,
+            row.kernel_rows,
             bends=bends,
             pose_lasts=lasts if (lasts < 1.0).any() else None,
             innovation=True,
@@ -234,7 +234,7 @@ class ChartFilter:
         seeds = mixture.take(once(mixture)[:SEEDS])
         n_seeds = len(seeds)
         if known.next_refit == FIRST_REFIT:
-            x = mirrored(seeds.x, seeds.centroid_m).reshape(-1, seeds.x.shape[1])
+            x = mirror_images(seeds.x, seeds.centroid_m).reshape(-1, seeds.x.shape[1])
             seeds = replace(seeds, x=x, S=np.tile(seeds.S, (4, 1, 1)), log_weight=np.zeros(len(x)))
         rows = [row for row, _ in known.young]
         motions = [motion for _, motion in known.young]

@@ -54,7 +54,7 @@ def updated(x: FloatArray, S: FloatArray, measurement: Measured, known: KnownInW
 
     What is `known` of the moment is measured with the row.
     """
-    problem = _Problem.of(measurement.chart(x).firmly(S), S, measurement, known)
+    problem = _Problem.of(measurement.chart(x).with_firm_moments(S), S, measurement, known)
     (K, n), k = x.shape, measurement.z.size + (0 if known is None else known.n_known)
     zeta = np.zeros((K, n))
     residual = problem.residual(zeta)
@@ -133,22 +133,22 @@ class _Problem:
 
     def residual(self, zeta: FloatArray) -> FloatArray:
         """Whitened misfits of the readings and of the prediction (K, k + n)."""
-        state = self.chart.retracted(self.e(zeta))
-        left = (self.whiten @ (self.measurement.z - self.measurement.of_source(state))[..., None])[..., 0]
+        state = self.chart.retract(self.e(zeta))
+        left = (self.whiten @ (self.measurement.z - self.measurement.predict_source(state))[..., None])[..., 0]
         if self.known is not None:
             left = np.concatenate([left, self.known.residual(state)], axis=1)
         return np.concatenate([left, -zeta], axis=1)
 
     def jacobian(self, zeta: FloatArray) -> FloatArray:
         """Minus its derivative (K, k + n, n) by ζ."""
-        state, L = self.chart.linearised(self.e(zeta))
-        J = self.whiten @ self.measurement.along(state, L)
+        state, L = self.chart.linearise(self.e(zeta))
+        J = self.whiten @ self.measurement.directional_derivative(state, L)
         if self.known is not None:
-            J = np.concatenate([J, self.known.along(state, L)], axis=1)
+            J = np.concatenate([J, self.known.directional_derivative(state, L)], axis=1)
         return np.concatenate([J @ self.S, np.broadcast_to(np.eye(zeta.shape[1]), self.S.shape)], axis=1)
 
     def posterior(self, zeta: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray]:
         """States and roots, by the upper root R (K, n, n) of the information about ζ."""
-        x, L = self.chart.linearised(self.e(zeta))
+        x, L = self.chart.linearise(self.e(zeta))
         root = np.linalg.solve(np.swapaxes(R, -1, -2), np.swapaxes(self.S, -1, -2))
         return x, self.measurement.chart(x).inverse_jacobian() @ L @ np.swapaxes(root, -1, -2)

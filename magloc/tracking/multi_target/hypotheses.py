@@ -104,7 +104,7 @@ def is_straight(state: JointState, row: JointRow) -> bool:
 
 def _bends(state: JointState, row: JointRow) -> tuple[FloatArray, FloatArray]:
     """Return the bends (3 K,) of a row's readings, and one standard deviation (3 K, n) along each axis."""
-    bends, directions = row_filter.bends(state.gaussians, row.compiled, 1.0)
+    bends, directions = row_filter.bends(state.gaussians, row.kernel_rows, 1.0)
     return bends[0], directions[0]
 
 

@@ -73,9 +73,9 @@ class JointRow:
         return np.asarray(self.row.origin_m + self.row.R_world_from_array @ self.array.centroid)
 
     @cached_property
-    def compiled(self) -> Rows:
+    def kernel_rows(self) -> Rows:
         """The row for kernels."""
-        return stacked([self])
+        return stack_joint_rows([self])
 
     def without(self, out: BoolArray) -> JointRow:
         """Return the row without some of the sensors (N,)."""
@@ -85,7 +85,7 @@ class JointRow:
         z, transform = np.where(used, self.z, 0.0), np.where(used[:, None], self.transform, 0.0)
         return replace(self, z=z, transform=transform, used=used)
 
-    def linearised(self, state: JointState) -> tuple[FloatArray, FloatArray]:
+    def linearise(self, state: JointState) -> tuple[FloatArray, FloatArray]:
         """Return derivatives (K, C, 6) of the readings by each source's position and moment, and the readings (C,)."""
         by_source = dipole.field_jacobian(self.positions_m, state.position_m[:, None], state.moment_Am2[:, None])
         sensor, gain = self.array.channel_sensor, self.array.channel_gain @ self.row.R_world_from_array.T
@@ -101,7 +101,7 @@ class JointRow:
         return energy
 
 
-def stacked(rows: Sequence[JointRow]) -> Rows:
+def stack_joint_rows(rows: Sequence[JointRow]) -> Rows:
     """Return rows of one array for kernels."""
     array, distinct = rows[0].array, {id(row.transform): row.transform for row in rows}
     index = {key: i for i, key in enumerate(distinct)}

@@ -10,7 +10,7 @@ import numpy as np
 from arrays.typing import FloatArray
 from magloc import core
 from magloc.tracking import row_filter
-from magloc.tracking.motion import wandering_step
+from magloc.tracking.motion import ornstein_uhlenbeck_step
 from magloc.tracking.multi_target.measurement import JointRow
 from magloc.tracking.multi_target.state import N_COMMON, N_OF_SOURCE, JointState
 
@@ -63,8 +63,8 @@ class FreeMotion:
 
     def numbers(self, dt_s: float, *, agility: float = 1.0) -> FloatArray:
         """Return the numbers (13,) of a step; `agility` multiplies the noise of velocity and turn."""
-        lasts_s, kept, root_v = wandering_step(self.correlation_s, dt_s)
-        turn_lasts_s, turn_kept, root_w = wandering_step(self.turn_correlation_s, dt_s)
+        lasts_s, kept, root_v = ornstein_uhlenbeck_step(self.correlation_s, dt_s)
+        turn_lasts_s, turn_kept, root_w = ornstein_uhlenbeck_step(self.turn_correlation_s, dt_s)
         lower = [0, 1, 1], [0, 0, 1]
         of_v, of_w = agility * self.speed_m_s * root_v[lower], agility * self.turn_rad_s * root_w[lower]
         walks = self.strength_change * math.sqrt(dt_s), self.common_walk_T * math.sqrt(dt_s)
@@ -101,5 +101,5 @@ def steps_problem(numbers: FloatArray) -> core.Problem:
 
 def stepped(state: JointState, step: FloatArray, row: JointRow) -> JointState:
     """Return the state after a step (13,) to a row, without its readings."""
-    found = row_filter.predict(state.gaussians, state.centroid_m, steps_problem(step[None]), row.compiled)
+    found = row_filter.predict(state.gaussians, state.centroid_m, steps_problem(step[None]), row.kernel_rows)
     return state.after(found, row.centroid_m)

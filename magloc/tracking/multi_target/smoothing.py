@@ -15,7 +15,7 @@ import numpy as np
 from arrays.typing import FloatArray
 from magloc.tracking import row_filter
 from magloc.tracking.coordinates import Chart
-from magloc.tracking.multi_target.measurement import JointRow, stacked
+from magloc.tracking.multi_target.measurement import JointRow, stack_joint_rows
 from magloc.tracking.multi_target.motion import stepped, steps_problem
 from magloc.tracking.multi_target.state import N_COMMON, N_OF_SOURCE, N_SEEN, JointState, chart_at
 from magloc.tracking.row_filter import Gaussians
@@ -78,7 +78,7 @@ class YoungTrack:
 
         It is given up after the most passes, and early where the rows stay far less likely than a limit (a score).
         """
-        rows = stacked([row for row, _ in self.rows])
+        rows = stack_joint_rows([row for row, _ in self.rows])
         steps = steps_problem(np.stack([step for _, step in self.rows]))
         centroids = np.stack([row.centroid_m for row, _ in self.rows])
         track, best = np.stack([state.sources for state in self.states]), limit
@@ -102,7 +102,7 @@ class YoungTrack:
             # Barzilai and Borwein's length: steps that lead back are made shorter.
             bent = float(before @ (before - last))
             share = min(max(share * float(before @ before) / bent, _SHORTEST), 1.0) if bent > 0.0 else 1.0
-            track = chart.retracted(share * length * offsets)
+            track = chart.retract(share * length * offsets)
             if float(np.abs(last).max(initial=0.0)) < _TOLERANCE:
                 return replace(self, states=self._states(track, found.last), score=score)
         return None
@@ -110,7 +110,7 @@ class YoungTrack:
     def _prior_about(self, chart: Chart) -> Gaussians:
         """Return the prior as offsets from states (K, 12), in the charts about them."""
         e = self.prior.chart.coordinates(chart.x)
-        turn = chart.inverse_jacobian() @ self.prior.chart.linearised(e)[1]
+        turn = chart.inverse_jacobian() @ self.prior.chart.linearise(e)[1]
         n, S = e.size, self.prior.S.copy()
         S[:n] = (turn @ S[:n].reshape(*e.shape, len(S))).reshape(n, len(S))
         offset = np.concatenate([-(turn @ e[..., None]).ravel(), self.prior.common_T])

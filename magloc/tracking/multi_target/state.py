@@ -160,7 +160,7 @@ class JointState:
     def moved(self, error: FloatArray, S: FloatArray) -> JointState:
         """Return the state at an error (n,), with a root S of errors in the charts here brought into those there."""
         K, n = self.n_sources, len(self.x) - N_COMMON
-        sources, L = self.chart.linearised(error[:n].reshape(K, N_OF_SOURCE))
+        sources, L = self.chart.linearise(error[:n].reshape(K, N_OF_SOURCE))
         x = np.concatenate([sources.ravel(), self.common_T + error[n:]])
         after = replace(self, x=x, S=S.copy())
         turn = chart_at(sources, self.centroid_m, self.radius_m).inverse_jacobian() @ L

@@ -66,7 +66,7 @@ class JointUpdate:
 
 def joint_update(prior: JointState, row: JointRow, most: int = MOST_TRIALS) -> JointUpdate:
     """Return a predicted state after a row's readings."""
-    found = row_filter.update(prior.gaussians, row.compiled, linearisations=True, most=most, tolerance=_TOLERANCE)
+    found = row_filter.update(prior.gaussians, row.kernel_rows, linearisations=True, most=most, tolerance=_TOLERANCE)
     assert found.misfits is not None
     assert found.projectors is not None
     assert found.standardised is not None
@@ -91,7 +91,7 @@ def innovation_chi2(state: JointState, row: JointRow, sensors: BoolArray) -> Flo
     if not asked.any():
         return chi2
     n = N_OF_SOURCE * state.n_sources
-    by_source, h = row.linearised(state)
+    by_source, h = row.linearise(state)
     L = state.chart.jacobian(np.zeros((state.n_sources, N_OF_SOURCE)))
     H = np.concatenate([*(by_source @ L[:, :6]), row.effect], axis=1) if n else row.effect
     seen = H @ np.concatenate([state.S[:n], state.S[-N_COMMON:]])

@@ -26,7 +26,7 @@ from magloc.tracking.chart.steps import charted
 from magloc.tracking.coordinates import Chart
 from magloc.tracking.measurement import RowMeasurement
 from magloc.tracking.motion import N_SOURCE
-from magloc.tracking.results import Innovation, Prediction, Step, TrackPoint, of_mixture
+from magloc.tracking.results import Innovation, Prediction, Step, TrackPoint, point_of_mixture
 from magloc.tracking.rows import Row, rows_of
 from magloc.tracking.tracker import LARGEST_RANGE_ERROR, Tracker
 from magloc.tracking.whole_records.smoother import smoothed, smoothed_states
@@ -147,7 +147,7 @@ def _farther(state: FloatArray, measurement: RowMeasurement, log_range: float) -
     n = measurement.n_motion
     e = np.zeros(n)
     e[0] = log_range
-    moved = Chart.at(state[:n], measurement.centroid_m, measurement.radius_m).retracted(e)
+    moved = Chart.at(state[:n], measurement.centroid_m, measurement.radius_m).retract(e)
     return np.concatenate([moved, state[n:]])
 
 
@@ -236,14 +236,14 @@ def _passed(
         prediction = None
         if j:
             before = states[j - 1]
-            at = tracker.predicted(before, S, measurement.row.time_s - measurements[j - 1].row.time_s)
+            at = tracker.predict(before, S, measurement.row.time_s - measurements[j - 1].row.time_s)
             prediction = Prediction(at.x + at.F @ (x - before), at.S, at.F)
             x, S = prediction.x, prediction.S
         k = measurement.z.size
         innovations.append(None)
         if k:
             H, ones = measurement.jacobian(state), np.ones(k)
-            innovation = measurement.z - measurement.predicted(state) - H @ (x - state)
+            innovation = measurement.z - measurement.predict(state) - H @ (x - state)
             whitened = whitened_innovation(S, H, innovation, ones)
             innovations[j] = Innovation(measurement.row.available, whitened)
             agrees[j] = whitened @ whitened <= chdtri(k, CONTRADICTION)
@@ -271,7 +271,7 @@ def _points(tracker: Tracker, measurements: Sequence[RowMeasurement], passed: _P
         told = {} if innovation is None or not tracked else innovation.after(last)
         last = innovation if status == "tracked" else None
         mixture = charted(step.x, step.S, measurement)
-        point = of_mixture(row.time_s, mixture, np.diagonal(open_loop))
+        point = point_of_mixture(row.time_s, mixture, np.diagonal(open_loop))
         points.append(replace(point, iterations=1, status=status if tracked else "acquired", **told))
         tracked = True
     return points

@@ -89,7 +89,7 @@ def drawn_state(rng: np.random.Generator, motion: MotionModel, deviation: FloatA
     known = known_of(tracker, x, S)
     tracker.resume(known, 0.0, 0)
     # Drawn in the chart, in which the tracker takes it to be Gaussian.
-    state = known.mixture.chart.retracted(known.mixture.S @ rng.normal(size=x.size))[0]
+    state = known.mixture.chart.retract(known.mixture.S @ rng.normal(size=x.size))[0]
     return state, tracker
 
 

@@ -161,7 +161,7 @@ class TestLastingErrors:
             states, errors = (scale * y)[: 5 * n].reshape(5, n), (scale * y)[5 * n :]
             parts = [states[0, 6:], y[5 * n :]]
             parts += [
-                row.z - row.of_source(x) - row.effect @ errors for row, x in zip(measurements, states, strict=True)
+                row.z - row.predict_source(x) - row.effect @ errors for row, x in zip(measurements, states, strict=True)
             ]
             for before, after in pairwise(states):
                 parts += [np.linalg.solve(S_q, (after - before)[:6]), (after[6:] - kept * before[6:]) / added]

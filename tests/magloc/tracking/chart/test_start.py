@@ -43,7 +43,7 @@ class TestErrorsOfSensors:
         zero = np.zeros((3, sigma.size))
         S_joint = np.stack([block_diag(S[0], np.diag(sigma))] * 3)
         together = Gaussians(np.concatenate([x, zero], axis=1), S_joint, n_nuisances=sigma.size)
-        joint = row_filter.update(together, row.compiled)
+        joint = row_filter.update(together, row.kernel_rows)
         unit = np.maximum(np.linalg.norm(joint.S, axis=2), 1e-100)  # drift has not begun
         offset = np.concatenate([found.chart.coordinates(joint.x[:, :6]), (joint.x - found.x)[:, 6:]], axis=1)
         np.testing.assert_allclose(offset / unit, 0.0, atol=3e-3)  # both end within 1e-3 σ of the optimum

@@ -17,7 +17,7 @@ from magloc.tracking.multi_target.state import N_SEEN, JointState
 from magloc.tracking.multi_target.update import joint_update
 from magloc.tracking.rows import Row
 from magloc.tracking.sensor_health import SensorHealth
-from tests.magloc.tracking.multi_target.test_update import BOARD, MOTION, known, predicted, readings
+from tests.magloc.tracking.multi_target.test_update import BOARD, MOTION, known, predict, readings
 
 DT_S = 0.05
 
@@ -65,7 +65,7 @@ def test_is_the_minimum_of_all_squares(n_sources: int, seed: int) -> None:
         for before, after in pairwise(states):
             ahead = stepped(replace(before, S=np.zeros((n, n))), step, row)
             parts.append(np.linalg.solve(ahead.S, difference(ahead, after)))
-        parts += [row.z - predicted(row, state) for (row, _), state in zip(track.rows, states, strict=True)]
+        parts += [row.z - predict(row, state) for (row, _), state in zip(track.rows, states, strict=True)]
         return np.concatenate(parts)
 
     best = least_squares(residual, np.zeros(4 * n), method="lm")

@@ -29,7 +29,7 @@ def drawn(state: JointState, n: int, seed: int = 1) -> np.ndarray:
     chart = state.chart
     everywhere = replace(chart, **{name: np.stack([getattr(chart, name)] * n) for name in ("x", "length", "u", "E")})
     firm = np.ones((n, state.n_sources), dtype=bool)
-    return replace(everywhere, firm=firm).retracted(errors[:, :-3].reshape(n, state.n_sources, 12))
+    return replace(everywhere, firm=firm).retract(errors[:, :-3].reshape(n, state.n_sources, 12))
 
 
 class TestBookkeeping:

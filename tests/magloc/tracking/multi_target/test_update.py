@@ -47,9 +47,9 @@ def drawn(state: JointState, rng: np.random.Generator) -> JointState:
     return state.moved(state.S @ rng.normal(size=len(state.x)), state.S)
 
 
-def predicted(row: JointRow, state: JointState) -> np.ndarray:
+def predict(row: JointRow, state: JointState) -> np.ndarray:
     """The readings that a state predicts, in units of their noise."""
-    return row.linearised(state)[1]
+    return row.linearise(state)[1]
 
 
 def test_readings_and_their_derivatives():
@@ -59,13 +59,13 @@ def test_readings_and_their_derivatives():
     row, state = JointRow.of(BOARD, Row(0.0, readings(rng), np.array([0.01, 0.0, 0.02]), R)), known(2, 0.1)
     at = row.positions_m
     fields = state.common_T + sum(dipole.field(at, x[:3], x[3:6]) for x in state.sources)
-    np.testing.assert_allclose(predicted(row, state), BOARD.readings_of(fields @ R) / NOISE_T, rtol=1e-9)
-    H = row.linearised(state)[0]
+    np.testing.assert_allclose(predict(row, state), BOARD.readings_of(fields @ R) / NOISE_T, rtol=1e-9)
+    H = row.linearise(state)[0]
     for k in range(2):
         for i in range(6):
             step = np.zeros(len(state.x))
             step[12 * k + i] = 1e-6 * np.linalg.norm(state.sources[k, 3 * (i // 3) : 3 * (i // 3) + 3])
-            ahead, behind = (predicted(row, replace(state, x=state.x + sign * step)) for sign in (1.0, -1.0))
+            ahead, behind = (predict(row, replace(state, x=state.x + sign * step)) for sign in (1.0, -1.0))
             slope = (ahead - behind) / (2.0 * step.sum())
             np.testing.assert_allclose(H[k, :, i], slope, rtol=1e-6, atol=1e-6 * np.abs(slope).max())
 
@@ -79,14 +79,14 @@ def test_linearisations_before_and_after():
 
     def information(state: JointState) -> np.ndarray:
         L = state.chart.jacobian(np.zeros((2, 12)))[:, :6]
-        H = np.concatenate([*(row.linearised(state)[0] @ L), row.effect], axis=1)
+        H = np.concatenate([*(row.linearise(state)[0] @ L), row.effect], axis=1)
         return np.linalg.inv(np.eye(len(H)) + H @ state.S @ state.S.T @ H.T)
 
     one = np.eye(len(row.z))
-    np.testing.assert_allclose(found.innovation, row.z - predicted(row, state), atol=1e-7)
+    np.testing.assert_allclose(found.innovation, row.z - predict(row, state), atol=1e-7)
     np.testing.assert_allclose(one - found.seen_before.T @ found.seen_before, information(state), atol=1e-6)
     np.testing.assert_allclose(found.surprise, information(state) @ found.innovation, atol=1e-6)
-    np.testing.assert_allclose(found.residual, row.z - predicted(row, found.state), atol=0.02)
+    np.testing.assert_allclose(found.residual, row.z - predict(row, found.state), atol=0.02)
     left = one - found.seen.T @ found.seen
     expected = [r @ np.linalg.solve(left[at, at] + 1e-3 * np.eye(3), r) for at, r in blocks(found.residual)]
     np.testing.assert_allclose(found.sensor_chi2, expected, rtol=0.02, atol=0.02)
@@ -106,7 +106,7 @@ def test_ends_in_the_minimum(seed):
     assert found.converged
 
     def residual(y: np.ndarray) -> np.ndarray:
-        return np.concatenate([row.z - predicted(row, state.moved(state.S @ y, state.S)), y])
+        return np.concatenate([row.z - predict(row, state.moved(state.S @ y, state.S)), y])
 
     best = least_squares(residual, np.zeros(len(state.x)), x_scale="jac", method="lm")
     assert found.cost == pytest.approx(2.0 * best.cost, abs=0.01)
