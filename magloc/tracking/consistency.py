@@ -168,7 +168,7 @@ def nees_of(point: TrackPoint, truth: FloatArray, measurement: RowMeasurement) -
     if not known.any():
         return math.nan, 0
     if known[:3].all() and point.mixture is not None:
-        return _young_nees(point.mixture.source_marginal().matched(), truth, measurement)
+        return _young_nees(point.mixture.source_marginal().match_moments(), truth, measurement)
     estimate = np.concatenate([point.position_m, point.moment_Am2])
     error, covariance = truth - estimate, point.covariance
     if known.all():
@@ -316,12 +316,12 @@ def innovation_test(points: Sequence[TrackPoint]) -> InnovationTest:
     paired, corrected = np.isfinite(lag1), np.isfinite(lag1 + correction)
     return InnovationTest(
         int(known.sum()),
-        _standardised(float(np.sum(limited - dof[known])), 2.0 * float(dof[known].sum())),
-        _standardised(float(lag1[paired].sum()), float(dof[paired].sum())),
+        _standard_score(float(np.sum(limited - dof[known])), 2.0 * float(dof[known].sum())),
+        _standard_score(float(lag1[paired].sum()), float(dof[paired].sum())),
         excess=float((lag1 + correction)[corrected].sum()) if corrected.any() else math.nan,
         starts=sum(point.status == "acquired" for point in points),
     )
 
 
-def _standardised(total: float, variance: float) -> float:
+def _standard_score(total: float, variance: float) -> float:
     return total / math.sqrt(variance) if variance > 0.0 else math.nan

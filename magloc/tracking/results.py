@@ -1,4 +1,4 @@
-"""Points of tracks of one source or several, and what led to them."""
+"""Points of tracks of one source or several, and the steps of the filter."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ UNDETERMINED = "undetermined"
 
 @dataclass(frozen=True, eq=False)
 class Innovation:
-    """Whitened innovations (k,) of a row, the channels (C,) that it has, and :attr:`TrackPoint.correction`."""
+    """Whitened innovations (k,) of a row, its available channels (C,), and :attr:`TrackPoint.correction`."""
 
     available: BoolArray
     whitened: FloatArray
     correction: float = math.nan
 
-    def after(self, before: Innovation | None) -> dict[str, Any]:
-        """Return NIS, its degrees of freedom, and the product with the innovation before, if of the same channels."""
+    def statistics(self, before: Innovation | None) -> dict[str, Any]:
+        """Return NIS, its degrees of freedom, the correction, and the product with the innovation before."""
         same = before is not None and np.array_equal(before.available, self.available)
         return {
             "nis": float(self.whitened @ self.whitened),
@@ -73,9 +73,9 @@ class TrackPoint:
         Product of the whitened innovations of this row and the one before: mean zero and variance `nis_dof` for a right
         model. NaN if the row before has none, or other channels.
     correction : float
-        Squared correction of the prediction by the readings, in its standard deviations, less its mean: mean zero for a
-        right model, and less if predictions are better than is claimed. NaN without a prediction, and if errors of
-        sensors or pose are states.
+        Squared correction of the prediction by the readings, in its standard deviations, minus its mean: zero on
+        average for a right model, and less if predictions are better than their covariance. NaN without a prediction,
+        and if errors of sensors or pose are states.
     dropped_sensors : tuple of str
         Sensors left out because they contradict the others.
     mixture : Mixture, optional
@@ -190,7 +190,7 @@ class SourcesPoint:
 
 
 def estimability(variance: FloatArray, open_loop: FloatArray) -> FloatArray:
-    """Return the estimability 1 - σ / σ₀ from the variances with readings and without any."""
+    """Return the estimability 1 - σ / σ₀ from the variances with and without readings."""
     return 1.0 - np.sqrt(np.minimum(variance / open_loop, 1.0))
 
 
@@ -213,7 +213,7 @@ def point_of_mixture(time_s: float, mixture: Mixture, open_loop: FloatArray) -> 
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """Predicted state, square root of its covariance, and the transition that led there."""
+    """Predicted state, square root of its covariance, and transition matrix."""
 
     x: FloatArray
     S: FloatArray
@@ -222,7 +222,7 @@ class Prediction:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """Step of a track, for the smoother.
+    """One step of a filter, as the smoother needs it.
 
     Attributes
     ----------

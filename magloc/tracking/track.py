@@ -34,7 +34,7 @@ from magloc.tracking.whole_records.background import track_on_background
 from magloc.tracking.whole_records.body_errors import body_factor
 from magloc.tracking.whole_records.constants import constants_test
 from magloc.tracking.whole_records.posterior_bound import posterior_bound, smoothing_bound
-from magloc.tracking.whole_records.smoother import smoothed
+from magloc.tracking.whole_records.smoother import smooth_points
 from magloc.truth import Truth, truth_of_rows
 
 if TYPE_CHECKING:
@@ -332,16 +332,16 @@ def track(
     if background is not None:
         if used.motion is not None:
             raise ValueError("Input readings must have measured velocities and rates or a background, not both.")
-        points = finished(track_on_background(tracker, used, smooth=smooth, progress=progress), told)
+        points = collect_points(track_on_background(tracker, used, smooth=smooth, progress=progress), told)
     elif smooth:
-        points = finished(smoothed(list(_followed(tracker, used, motion, progress)), tracker.steps), told)
+        points = collect_points(smooth_points(list(_follow(tracker, used, motion, progress)), tracker.steps), told)
     else:
-        points = finished(_followed(tracker, used, motion, progress), told)
+        points = collect_points(_follow(tracker, used, motion, progress), told)
     warn_of_strengths(points)
     return Track(points, used, tracker, smooth)
 
 
-def finished(points: Iterable[_Row], told: Callable[[_Row], object] | None) -> tuple[_Row, ...]:
+def collect_points(points: Iterable[_Row], told: Callable[[_Row], object] | None) -> tuple[_Row, ...]:
     """Report each point of a record, and return all of them."""
     found = []
     for point in points:
@@ -351,7 +351,7 @@ def finished(points: Iterable[_Row], told: Callable[[_Row], object] | None) -> t
     return tuple(found)
 
 
-def _followed(
+def _follow(
     tracker: Tracker,
     readings: Readings,
     unmeasured: MotionModel,

@@ -43,7 +43,7 @@ class KnownInWorld:
 
 
 @dataclass(frozen=True, eq=False)
-class KeptModulus:
+class ConstantModulus:
     """A motion of which the noise turns the moment, and does not change its modulus: that is known."""
 
     motion: MotionModel

@@ -107,13 +107,13 @@ class Mixture:
             return self
         return replace(self, x=self.x[:, :N_SOURCE], S=root_of(self.S[:, :N_SOURCE]), n_charted=N_SOURCE, n_pose=0)
 
-    def likely(self) -> Mixture:
+    def drop_unlikely(self) -> Mixture:
         """Without components of no weight."""
         return self.take(self.log_weight > self.log_weight.max() + DROPPED_BELOW)
 
-    def reduced(self) -> Mixture:
+    def reduce(self) -> Mixture:
         """The likely components, and those that are as good as one merged."""
-        kept = self.likely()
+        kept = self.drop_unlikely()
         if len(kept) == 1:
             return kept
         kept = kept.take(np.argsort(-kept.log_weight, kind="stable"))
@@ -124,12 +124,12 @@ class Mixture:
         found, log_weight = kept.take(first), kept.log_weight[first]
         for i, group in enumerate(groups):
             if len(group) > 1:
-                one = kept.take(group).matched()
+                one = kept.take(group).match_moments()
                 found.x[i], found.S[i] = one.x[0], one.S[0]
                 log_weight[i] = np.logaddexp.reduce(kept.log_weight[group])
         return replace(found, log_weight=log_weight - np.logaddexp.reduce(log_weight))
 
-    def matched(self) -> Mixture:
+    def match_moments(self) -> Mixture:
         """The one Gaussian of the same mean and covariance, in the chart of the heaviest component."""
         if len(self) == 1:
             return self

@@ -69,7 +69,7 @@ class Places:
     @classmethod
     def about(cls, drawn: Mixture) -> Places:
         """Kernels about places that were drawn, by their weights, each as wide as its neighbours are spread."""
-        k = _stratified(drawn.weight, N_PLACES)
+        k = _resample(drawn.weight, N_PLACES)
         chart = drawn.chart.take(k)
         log_range, u = np.log(chart.length), chart.u
         apart = (log_range[:, None] - log_range) ** 2 + 2.0 - 2.0 * u @ u.T
@@ -80,9 +80,9 @@ class Places:
         spread = np.swapaxes(left, -1, -2) @ left / N_NEIGHBOURS + _POINT**2 * np.eye(3)
         return cls(chart, KERNEL * np.linalg.cholesky(spread), np.full(N_PLACES, -math.log(N_PLACES)))
 
-    def drawn(self, n: int) -> FloatArray:
+    def draw(self, n: int) -> FloatArray:
         """States (n, 6) from all of them, by their weights: the moment looks as that of the component."""
-        k = _stratified(np.exp(self.log_weight - np.logaddexp.reduce(self.log_weight)), n)
+        k = _resample(np.exp(self.log_weight - np.logaddexp.reduce(self.log_weight)), n)
         e = np.zeros((n, N_SOURCE))
         e[:, :3] = (self.root[k] @ _normal(n)[..., None])[..., 0]
         return self.chart.take(k).retract(e)
@@ -104,7 +104,7 @@ class Places:
         return np.asarray(np.logaddexp.reduce(np.where(cosine > _LEAST_COSINE, each, -np.inf), axis=1))
 
 
-def _stratified(weight: FloatArray, n: int) -> IntArray:
+def _resample(weight: FloatArray, n: int) -> IntArray:
     """Which of weighted things n draws are of."""
     return np.minimum(np.searchsorted(np.cumsum(weight), (0.5 + np.arange(n)) / n), len(weight) - 1)
 
@@ -122,38 +122,38 @@ def _normal(n: int) -> FloatArray:
     return np.asarray(ndtri(uniform))
 
 
-def effective_number(drawn: Mixture) -> float:
+def effective_sample_size(drawn: Mixture) -> float:
     """Of places, by their weights."""
     return float(1.0 / np.sum(drawn.weight**2))
 
 
-def weighed(stack: Stack, places: Sequence[Places], prior: SourcePrior) -> Mixture | None:
+def sample_places(stack: Stack, places: Sequence[Places], prior: SourcePrior) -> Mixture | None:
     """Places drawn until enough of them count, weighed by what all rows say; None where none is possible."""
     drawn: Mixture | None = None
     every = list(places)
     for _ in range(_MOST_ROUNDS if places else 0):
-        found = _of_places(stack, every, prior)
+        found = _importance_sample(stack, every, prior)
         if found is None:
             break
         drawn = found
-        if effective_number(drawn) > ENOUGH:
+        if effective_sample_size(drawn) > ENOUGH:
             break
         # What was drawn from before stays: a place that is drawn by chance alone takes no other's part.
         every = [*places, Places.about(drawn)]
     return drawn
 
 
-def _of_places(stack: Stack, places: Sequence[Places], prior: SourcePrior) -> Mixture | None:
+def _importance_sample(stack: Stack, places: Sequence[Places], prior: SourcePrior) -> Mixture | None:
     """States drawn from several kinds of places, from each as many, with the moments that fit best, weighed."""
     n_each = N_PLACES // len(places)
-    x = np.concatenate([one.drawn(n_each) for one in places])
+    x = np.concatenate([one.draw(n_each) for one in places])
     log_density = np.logaddexp.reduce([one.log_density(x) for one in places], axis=0)
     order = np.argsort(np.linalg.norm(x[:, :3] - stack.centroid_m, axis=1))
     x, log_density = x[order], log_density[order]
     # Of places at like ranges the errors of the rows do alike.
     blocks = np.array_split(np.arange(len(x)), _N_BLOCKS)
     roots = np.linalg.cholesky(stack.covariance(x[[block[len(block) // 2] for block in blocks]]))
-    predicted, by_moment = stack.by_moment(x)
+    predicted, by_moment = stack.linearise_in_moment(x)
     left = stack.z - predicted + (by_moment @ x[:, 3:6, None])[..., 0]
     both = np.concatenate([by_moment, left[..., None]], axis=-1)
     log_C = np.empty(len(x))

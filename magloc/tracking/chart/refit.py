@@ -37,23 +37,23 @@ _LONGEST = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Cells:
+class RangeCells:
     """What is known of the log-range of components before the first row: mean and standard deviation (K,)."""
 
     log_range: FloatArray
     sigma: FloatArray
 
-    def about(self, chart: Chart) -> Cells:
+    def about(self, chart: Chart) -> RangeCells:
         """Means counted from the ranges of components in the first row."""
         return replace(self, log_range=self.log_range + np.log(chart.length))
 
-    def take(self, index: BoolArray) -> Cells:
+    def take(self, index: BoolArray) -> RangeCells:
         """Of some of the components."""
-        return Cells(self.log_range[index], self.sigma[index])
+        return RangeCells(self.log_range[index], self.sigma[index])
 
 
 @dataclass(frozen=True, eq=False)
-class Refitted:
+class RefitResult:
     """Components fitted to all rows of a track.
 
     Attributes
@@ -74,27 +74,27 @@ class Refitted:
     decided: BoolArray
 
 
-def refitted(
+def refit_components(
     mixture: Mixture,
     measurements: Sequence[RowMeasurement],
     motions: Sequence[MotionModel],
     errors: SensorErrors,
     pose_errors: PoseErrors,
-    cells: Cells | None = None,
+    cells: RangeCells | None = None,
     known: KnownInWorld | None = None,
-) -> Refitted:
+) -> RefitResult:
     """Components fitted to the rows, each on its own, and given up where it is far less likely than the best one."""
-    rows, K, N = _Rows(measurements, motions, errors, pose_errors, known), len(mixture), mixture.x.shape[1]
+    rows, K, N = _YoungRows(measurements, motions, errors, pose_errors, known), len(mixture), mixture.x.shape[1]
     n = measurements[0].n_charted
     x, S = np.zeros((K, N)), np.zeros((K, N, N))
     nis, log_evidence = np.full(K, np.inf), np.full(K, -np.inf)
     converged, decided = np.zeros((2, K), dtype=bool)
-    live, track = np.arange(K), rows.backwards(mixture.x)
+    live, track = np.arange(K), rows.propagate_backward(mixture.x)
     prior = None if cells is None else cells.about(measurements[0].chart(track[0]))
     share, last = np.ones(K), np.zeros((K, n))
     for passes in range(_MOST_PASSES):
         with np.errstate(all="ignore"):  # a trajectory may lead out of double precision: it is not kept
-            found = rows.passed(track, prior)
+            found = rows.smooth_rows(track, prior)
             offset = np.swapaxes(found.offsets, 0, 1)
             largest = np.abs(offset[:, :, :3]).max(axis=(0, 2))
             length = np.minimum(1.0, _LONGEST / np.maximum(largest, _LONGEST))
@@ -121,11 +121,11 @@ def refitted(
             break
     end = measurements[-1]
     after = Mixture(x[converged], S[converged], log_evidence[converged], n, end.centroid_m, end.radius_m, end.n_pose)
-    return Refitted(after, nis[converged], np.flatnonzero(converged), converged | decided)
+    return RefitResult(after, nis[converged], np.flatnonzero(converged), converged | decided)
 
 
 @dataclass(frozen=True, eq=False)
-class _Rows:
+class _YoungRows:
     """Rows of a track, and how the source moves between them."""
 
     measurements: Sequence[RowMeasurement]
@@ -153,7 +153,7 @@ class _Rows:
         first = self.measurements[0]
         return Chart.at(track, self._centroids_m, first.radius_m, first.n_pose)
 
-    def backwards(self, x: FloatArray) -> FloatArray:
+    def propagate_backward(self, x: FloatArray) -> FloatArray:
         """Trajectories (rows, K, n) without noise, and without errors of the pose, that end at states (K, N)."""
         m, track = self.motions[0].n_states, np.zeros((len(self.motions), len(x), self.measurements[0].n_charted))
         track[-1] = x[:, : track.shape[2]]
@@ -164,7 +164,7 @@ class _Rows:
             track[row - 1, :, :m] = after - np.linalg.solve(F, (moved - after)[..., None])[..., 0]
         return track
 
-    def passed(self, track: FloatArray, prior: Cells | None) -> SmootherPass:
+    def smooth_rows(self, track: FloatArray, prior: RangeCells | None) -> SmootherPass:
         """A filter and a smoother that linearise along trajectories (rows, K, n)."""
         m, before = self.motions[0].n_states, self._prior(self.measurements[0].chart(track[0]), prior)
         trajectories, evidence = np.ascontiguousarray(np.swapaxes(track, 0, 1)), np.zeros(track.shape[1])
@@ -178,7 +178,7 @@ class _Rows:
         found = smooth(trajectories, before, steps, self._compiled)
         return replace(found, log_evidence=found.log_evidence + evidence)
 
-    def _prior(self, chart: Chart, cells: Cells | None) -> Gaussians:
+    def _prior(self, chart: Chart, cells: RangeCells | None) -> Gaussians:
         """Return what is known before the first row, in charts about states there (K, n)."""
         motion, n, n_errors = self.motions[0], chart.x.shape[1], self.errors.n_states
         m = motion.n_states

@@ -67,7 +67,7 @@ def split(mixture: Mixture, row: RowMeasurement) -> tuple[Mixture, IntArray]:
         index = index[: max(0, (MOST_COMPONENTS - len(mixture)) // 2)]
         if not index.size:
             break
-        mixture = _divided(mixture, index, directions[index, worst[index]])
+        mixture = _divide(mixture, index, directions[index, worst[index]])
         origin = np.concatenate([np.delete(origin, index), np.tile(origin[index], len(_WEIGHTS))])
     return mixture, origin
 
@@ -80,7 +80,7 @@ def bends(mixture: Mixture, row: RowMeasurement) -> tuple[FloatArray, FloatArray
     return np.where(np.isfinite(bend), bend, 0.0), directions
 
 
-def _divided(mixture: Mixture, index: IntArray, v: FloatArray) -> Mixture:
+def _divide(mixture: Mixture, index: IntArray, v: FloatArray) -> Mixture:
     """Replace some components by three each, along axes of the source, one σ of the state (k, N) long."""
     n, S, kept = mixture.n_charted, root_of(mixture.S[index]), np.delete(np.arange(len(mixture)), index)
     # In standard numbers, of which a lower root has those of the source first, v is a unit vector.

@@ -65,7 +65,7 @@ class Stack:
     @cached_property
     def n_differences(self) -> int:
         """Number of differences without those that only pad rows."""
-        return int(self._transform[self._begin].any(axis=2).sum())
+        return int(self._transform[self._first_rows].any(axis=2).sum())
 
     @property
     def row(self) -> Row:
@@ -101,7 +101,7 @@ class Stack:
         return self
 
     @cached_property
-    def _begin(self) -> IntArray:
+    def _first_rows(self) -> IntArray:
         """First rows of the means."""
         n = len(self.rows)
         n_means = min(n, max(FEWEST_MEANS, -(-n // MOST_ROWS_OF_ONE)))
@@ -109,25 +109,27 @@ class Stack:
         return np.union1d(even, _changes(self.rows))
 
     @cached_property
-    def _size(self) -> IntArray:
+    def _row_counts(self) -> IntArray:
         """Rows of each of them."""
-        return np.diff(np.append(self._begin, len(self.rows)))
+        return np.diff(np.append(self._first_rows, len(self.rows)))
 
     @cached_property
-    def _middle(self) -> list[RowMeasurement]:
+    def _middle_rows(self) -> list[RowMeasurement]:
         """One row for each."""
-        return [self.rows[i] for i in (self._begin + self._size // 2).tolist()]
+        return [self.rows[i] for i in (self._first_rows + self._row_counts // 2).tolist()]
 
     def _means(self, values: FloatArray) -> FloatArray:
         """Of rows (n, ..., k), of unit noise: (..., k means)."""
-        of_each = np.add.reduceat(values, self._begin, axis=0)
-        of_each /= np.sqrt(self._size).reshape(-1, *[1] * (values.ndim - 1))
+        of_each = np.add.reduceat(values, self._first_rows, axis=0)
+        of_each /= np.sqrt(self._row_counts).reshape(-1, *[1] * (values.ndim - 1))
         ahead = np.moveaxis(of_each, 0, -2)
         return ahead.reshape(*ahead.shape[:-2], ahead.shape[-2] * ahead.shape[-1])
 
-    def _middles(self, values: Sequence[FloatArray]) -> FloatArray:
+    def _middle_derivatives(self, values: Sequence[FloatArray]) -> FloatArray:
         """Derivatives (..., k, m) of rows in the middle as those of means (..., k means, m), of unit noise."""
-        of_each = np.stack([np.sqrt(size) * value for size, value in zip(self._size, values, strict=True)], axis=-3)
+        of_each = np.stack(
+            [np.sqrt(size) * value for size, value in zip(self._row_counts, values, strict=True)], axis=-3
+        )
         return of_each.reshape(*of_each.shape[:-3], of_each.shape[-3] * of_each.shape[-2], of_each.shape[-1])
 
     @cached_property
@@ -180,7 +182,7 @@ class Stack:
         means = self._means(np.swapaxes(by_world, -1, -2))  # (K, 6, k)
         return np.asarray(np.swapaxes(means, -1, -2) @ directions)
 
-    def by_moment(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def linearise_in_moment(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Predicted differences (K, k) of sources (K, 6), and their derivative (K, k, 3) by the moments."""
         array, (_, R) = self.model.array, self._pose
         place, moment = self._in_arrays(state)
@@ -195,7 +197,7 @@ class Stack:
 
     def moment_columns(self, position_m: FloatArray) -> FloatArray:
         """Return the derivative (K, k, 3) of rows in the middle of the means by the moment of a weak source."""
-        return self._middles([row.moment_columns(position_m) for row in self._middle])
+        return self._middle_derivatives([row.moment_columns(position_m) for row in self._middle_rows])
 
     @cached_property
     def without_source(self) -> FloatArray:
@@ -216,10 +218,10 @@ class Stack:
     def covariance(self, state: FloatArray, *, far: bool = False) -> FloatArray:
         """Of the differences (K, k, k) where the source is at states (K, 6), or so far that there is none."""
         k = self.z.size
-        C = np.eye(k) + self._of_sensors
+        C = np.eye(k) + self._sensor_covariance
         parts = []
         by_source, by_pose, error = [], [], np.zeros((len(state), N_POSE))
-        for row in self._middle:
+        for row in self._middle_rows:
             in_array = row.pose.in_array(state)
             by_array = np.zeros((len(state), row.z.size, N_SOURCE))
             if not far:
@@ -228,19 +230,19 @@ class Stack:
             if row.n_pose:
                 by_pose.append(zero_if_nan(row._by_pose(by_array, in_array, error)))
         if by_pose:
-            E = self._middles(by_pose)
-            for lasts_s, share in self._of_pose.items():
-                parts.append(self._spread(E[..., self.pose_errors.lasts_s == lasts_s], share))
+            E = self._middle_derivatives(by_pose)
+            for lasts_s, share in self._pose_roots.items():
+                parts.append(self._error_columns(E[..., self.pose_errors.lasts_s == lasts_s], share))
         if not far:
-            H = self._middles(by_source)
-            of_place, of_moment = self._of_motion
+            H = self._middle_derivatives(by_source)
+            of_place, of_moment = self._motion_roots
             strength = np.linalg.norm(state[:, 3:6], axis=1)[:, None, None]
-            parts += [self._spread(H[..., :3], of_place), self._spread(strength * H[..., 3:], of_moment)]
+            parts += [self._error_columns(H[..., :3], of_place), self._error_columns(strength * H[..., 3:], of_moment)]
         for part in parts:
             C = C + part @ np.swapaxes(part, -1, -2)
         return np.broadcast_to(C, (len(state), k, k))
 
-    def _spread(self, E: FloatArray, share: FloatArray) -> FloatArray:
+    def _error_columns(self, E: FloatArray, share: FloatArray) -> FloatArray:
         """Columns (K, k, m means) of errors with an effect E (K, k, m), whose root over the means is share."""
         n_means, m = len(share), E.shape[-1]
         of_each = E.reshape(len(E), n_means, -1, m)
@@ -253,13 +255,13 @@ class Stack:
 
     def _root_of_means(self, T: FloatArray) -> FloatArray:
         """Root (means, means) of a covariance of rows (n, n)."""
-        of_means = np.add.reduceat(np.add.reduceat(T, self._begin, axis=0), self._begin, axis=1)
-        of_means /= np.outer(self._size, self._size)
+        of_means = np.add.reduceat(np.add.reduceat(T, self._first_rows, axis=0), self._first_rows, axis=1)
+        of_means /= np.outer(self._row_counts, self._row_counts)
         value, axes = np.linalg.eigh(of_means)
         return np.asarray(axes * np.sqrt(np.maximum(value, 0.0)))
 
     @cached_property
-    def _of_pose(self) -> dict[float, FloatArray]:
+    def _pose_roots(self) -> dict[float, FloatArray]:
         """Roots over the means of the pose's errors, by how long they last."""
         apart_s = np.abs(self._time_s[:, None] - self._time_s)
         lasting = np.unique(self.pose_errors.lasts_s).tolist()
@@ -269,10 +271,10 @@ class Stack:
         }
 
     @cached_property
-    def _of_sensors(self) -> FloatArray:
+    def _sensor_covariance(self) -> FloatArray:
         """What the sensors' errors add to the covariance (k, k)."""
         k, n = self.z.size, len(self.rows)
-        E = self._middles([row.effect[None] for row in self._middle])
+        E = self._middle_derivatives([row.effect[None] for row in self._middle_rows])
         added = np.zeros((k, k))
         if not E.shape[-1]:
             return added
@@ -287,18 +289,18 @@ class Stack:
                 T[i, :i] = kept[s] * T[i - 1, :i]
                 T[:i, i] = T[i, :i]
                 T[i, i] = kept[s] ** 2 * T[i - 1, i - 1] + noise[s] ** 2
-            part = self._spread(E[..., states], self._root_of_means(T))[0]
+            part = self._error_columns(E[..., states], self._root_of_means(T))[0]
             added += part @ part.T
         return added
 
     @cached_property
-    def _of_motion(self) -> tuple[FloatArray, FloatArray]:
+    def _motion_roots(self) -> tuple[FloatArray, FloatArray]:
         """Roots over the means of how far the source was from where it is, in m, and its moment, over its modulus.
 
         A motion that is stationary is the same backwards.
         """
         n = len(self.rows)
-        x, P = _of_unit_strength(self.motion)
+        x, P = _unit_moment_state(self.motion)
         place, moment = np.zeros((2, n, n))
         crossed = np.zeros((n, len(x), len(x)))
         for j, dt_s in enumerate(np.diff(self._time_s)[::-1].tolist(), start=1):
@@ -319,7 +321,7 @@ def _changes(rows: Sequence[RowMeasurement]) -> IntArray:
     return 1 + np.flatnonzero((available[1:] != available[:-1]).any(axis=1))
 
 
-def _of_unit_strength(motion: MotionModel) -> tuple[FloatArray, FloatArray]:
+def _unit_moment_state(motion: MotionModel) -> tuple[FloatArray, FloatArray]:
     """State of a source of unit moment whose place is known, and the covariance of what else moves."""
     x, S = motion.start(np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0]), np.zeros((N_SOURCE, N_SOURCE)))
     return x, S @ S.T
@@ -327,11 +329,11 @@ def _of_unit_strength(motion: MotionModel) -> tuple[FloatArray, FloatArray]:
 
 def displacement(motion: MotionModel, dt_s: float) -> tuple[float, float]:
     """How far a source moves in a time, along each axis [m], and its moment, over its modulus: 1 σ."""
-    x, P = _of_unit_strength(motion)
+    x, P = _unit_moment_state(motion)
     _, F, S_q = motion.step(x, dt_s)
     variance = np.diagonal(F @ P @ F.T + S_q @ S_q.T)
     return float(np.sqrt(variance[:3].mean())), float(np.sqrt(variance[3:6].max()))
 
 
-Measured = RowMeasurement | Stack
+RowOrStack = RowMeasurement | Stack
 """What a mixture is updated by: one row, or rows together."""

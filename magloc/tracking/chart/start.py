@@ -30,8 +30,8 @@ from magloc.measurement.rows import check_magnitudes, check_spans
 from magloc.tracking import row_filter
 from magloc.tracking.chart.known_moment import UNIFORM_IN_SPACE, KnownInWorld
 from magloc.tracking.chart.mixture import DROPPED_BELOW, FARTHEST, NEAREST, Mixture
-from magloc.tracking.chart.stack import Measured
-from magloc.tracking.chart.update import Updated, updated
+from magloc.tracking.chart.stack import RowOrStack
+from magloc.tracking.chart.update import StateUpdates, update_states
 from magloc.tracking.coordinates import MOMENT_POWER, Chart, mirror_images, source_root
 from magloc.tracking.measurement import RowMeasurement, whitening, zero_if_nan
 from magloc.tracking.motion import N_SOURCE, MotionModel
@@ -111,7 +111,7 @@ class _Grid:
         position = array.centroid + ranges[:, None, None] * directions
         return cls(position.reshape(-1, 3), np.arccos(np.clip(directions @ directions.T, -1, 1)) < _NEIGHBOURS)
 
-    def chosen(self, explained: FloatArray) -> BoolArray:
+    def select(self, explained: FloatArray) -> BoolArray:
         """Cells (n,) from which to start, by the energy that each explains, -inf where it is not allowed."""
         table = explained.reshape(_N_RANGES, _N_DIRECTIONS)
         around = np.where(self.neighbours, table[:, None, :], -np.inf).max(axis=2)
@@ -138,7 +138,7 @@ class _Seeds:
     cell: IntArray
 
 
-class Start:
+class TrackStarter:
     """Starts tracks of one array."""
 
     def __init__(self, array: SensorArray, errors: SensorErrors, prior: SourcePrior) -> None:
@@ -153,7 +153,7 @@ class Start:
             self._locator = Locator(array, prior=prior, body_length_m=0.0, exclude_faulty=False)
             self._examiner = Locator(array, prior=prior)
 
-    def mixture(self, measurement: Measured, motion: MotionModel) -> tuple[Mixture | None, str]:
+    def mixture(self, measurement: RowOrStack, motion: MotionModel) -> tuple[Mixture | None, str]:
         """What one row says of a source and of the pose's errors, or why there is none."""
         if not measurement.is_detected(self.errors.sigma):
             return None, "not acquired: no signal stands out of noise"
@@ -166,8 +166,8 @@ class Start:
             is_linear = array.ambient_fields.any() or not array.channel_is_scalar.any()
             return None, NOT_ALLOWED if is_linear or alone.n_differences >= N_SOURCE else NO_AMBIENT
         found = _components(alone, motion, seeds, known)
-        for refined in (_centred, _along_valleys):
-            finer = refined(seeds, found, measurement)
+        for refine in (_recentre, _subdivide_valleys):
+            finer = refine(seeds, found, measurement)
             if not len(finer.cell):
                 return None, NOT_ALLOWED
             if finer is not seeds:
@@ -188,14 +188,14 @@ class Start:
         if known is not None:
             log_weight += UNIFORM_IN_SPACE * np.log(measurement.chart(found.x).length)
         mixture = _mixture(found, log_weight, measurement)
-        return mixture.take(sound).take(once(mixture.take(sound), seeds.cell[sound])), ""
+        return mixture.take(sound).take(unique_components(mixture.take(sound), seeds.cell[sound])), ""
 
-    def faulty(self, row: Row) -> BoolArray:
+    def faulty_sensors(self, row: Row) -> BoolArray:
         """Sensors (N,) that contradict all others, as a fix of the row names them."""
         dropped = () if self._examiner is None else self._examiner.fit(row.readings_T, row.ambient_T).dropped_sensors
         return np.isin(self.errors.array.ids, dropped)
 
-    def _seeds(self, measurement: Measured) -> _Seeds:
+    def _seeds(self, measurement: RowOrStack) -> _Seeds:
         """Chosen cells, and the row's best fits."""
         cells, row = self._grid.position_m, measurement.row
         world = row.origin_m + cells @ row.R_world_from_array.T
@@ -206,7 +206,7 @@ class Start:
         moments = (np.linalg.pinv(columns, rcond=1e-6) @ left[:, None])[..., 0]
         explained = np.sum((columns @ moments[..., None])[..., 0] ** 2, axis=1)
         explained[~self.prior.allows_position(cells) | ~(explained > 0.0)] = -np.inf
-        chosen = np.flatnonzero(self._grid.chosen(explained))
+        chosen = np.flatnonzero(self._grid.select(explained))
         position, moment = [world[chosen]], [moments[chosen]]
         cell = [np.stack([*np.divmod(chosen, _N_DIRECTIONS), np.zeros_like(chosen)], axis=1)]
         if self._locator is not None and measurement.z.size >= N_SOURCE:
@@ -223,7 +223,7 @@ class Start:
         return _Seeds(np.vstack(position), np.vstack(moment), np.vstack(cell))
 
 
-def _images(source: FloatArray, measurement: Measured) -> tuple[FloatArray, IntArray]:
+def _images(source: FloatArray, measurement: RowOrStack) -> tuple[FloatArray, IntArray]:
     """Return sources (n, 6) of the gradient tensor of a source, in the cells of range (n,) next to it, and these."""
     images = mirror_images(source[None], measurement.centroid_m)[1:, 0]
     chart = measurement.chart(images)
@@ -237,8 +237,8 @@ def _images(source: FloatArray, measurement: Measured) -> tuple[FloatArray, IntA
 
 
 def _components(
-    measurement: Measured, motion: MotionModel, seeds: _Seeds, known: KnownInWorld | None = None
-) -> Updated | RowUpdates:
+    measurement: RowOrStack, motion: MotionModel, seeds: _Seeds, known: KnownInWorld | None = None
+) -> StateUpdates | RowUpdates:
     """What the row makes of cells about seeds."""
     state, _ = motion.start(np.zeros(N_SOURCE), np.zeros((N_SOURCE, N_SOURCE)))
     x = np.tile(np.append(state, np.zeros(measurement.n_pose)), (len(seeds.cell), 1))
@@ -248,15 +248,15 @@ def _components(
     S = chart.inverse_jacobian() @ _with_motion(chart, motion, sigma)
     if known is None and isinstance(measurement, RowMeasurement):
         return row_filter.update(Gaussians(x, S, n_nuisances=measurement.n_pose), measurement.kernel_rows)
-    return updated(x, S, measurement, known)
+    return update_states(x, S, measurement, known)
 
 
-def _mixture(found: Updated | RowUpdates, log_weight: FloatArray, measurement: Measured) -> Mixture:
+def _mixture(found: StateUpdates | RowUpdates, log_weight: FloatArray, measurement: RowOrStack) -> Mixture:
     n, centroid_m, radius_m = measurement.n_charted, measurement.centroid_m, measurement.radius_m
     return Mixture(found.x, found.S, log_weight, n, centroid_m, radius_m, measurement.n_pose)
 
 
-def _centred(seeds: _Seeds, found: Updated | RowUpdates, measurement: Measured) -> _Seeds:
+def _recentre(seeds: _Seeds, found: StateUpdates | RowUpdates, measurement: RowOrStack) -> _Seeds:
     """Seeds that stand where the row puts them, along the coordinates in which it tells more than their cells do."""
     sigma = np.sqrt(np.sum(found.S[:, :3] ** 2, axis=2))
     narrow = sigma < _NARROW * _CELL
@@ -278,7 +278,7 @@ def _centred(seeds: _Seeds, found: Updated | RowUpdates, measurement: Measured) 
     )
 
 
-def _along_valleys(seeds: _Seeds, found: Updated | RowUpdates, measurement: Measured) -> _Seeds:
+def _subdivide_valleys(seeds: _Seeds, found: StateUpdates | RowUpdates, measurement: RowOrStack) -> _Seeds:
     """The seeds, and instead of such as found a valley of ranges that bends others along it, as dense as it bends.
 
     A row that tells much leaves a source in a narrow valley, and a Gaussian in the middle says nothing of its ends.
@@ -328,7 +328,7 @@ def with_errors(mixture: Mixture, measurement: RowMeasurement, sigma: FloatArray
     return replace(mixture, x=np.concatenate([mixture.x, left @ gain.T], axis=1), S=rows)
 
 
-def once(mixture: Mixture, cell: IntArray | None = None) -> IntArray:
+def unique_components(mixture: Mixture, cell: IntArray | None = None) -> IntArray:
     """Components, heaviest first, without those that another one with the same share of the even density has found."""
     source = mixture.source_marginal()
     cell = np.zeros((len(source), 1), dtype=np.intp) if cell is None else cell.reshape(len(source), -1)

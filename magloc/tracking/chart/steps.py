@@ -29,10 +29,10 @@ from magloc.measurement.pose import PoseErrors
 from magloc.tracking import row_filter
 from magloc.tracking.chart.known_moment import UNIFORM_IN_SPACE, KnownInWorld
 from magloc.tracking.chart.mixture import Mixture, root_of
-from magloc.tracking.chart.refit import Cells, Refitted, refitted
+from magloc.tracking.chart.refit import RangeCells, RefitResult, refit_components
 from magloc.tracking.chart.split import split
 from magloc.tracking.chart.stack import Stack
-from magloc.tracking.chart.start import NO_DIPOLE, OF_PITCH, Start, once, with_errors
+from magloc.tracking.chart.start import NO_DIPOLE, OF_PITCH, TrackStarter, unique_components, with_errors
 from magloc.tracking.coordinates import mirror_images
 from magloc.tracking.measurement import RowMeasurement, step_of_errors
 from magloc.tracking.motion import N_SOURCE, MotionModel
@@ -70,7 +70,7 @@ FIRST_REFIT, REFITS_GROW = 3, 1.6
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
+class TrackState:
     """What a tracker knows between rows.
 
     Attributes
@@ -134,41 +134,41 @@ class ChartFilter:
 
     def __init__(self, array: SensorArray, errors: SensorErrors, pose_errors: PoseErrors, prior: SourcePrior) -> None:
         self.errors, self.pose_errors, self.prior = errors, pose_errors, prior
-        self._start = Start(array, errors, prior)
+        self._start = TrackStarter(array, errors, prior)
         self.n_differences = decorrelated_differences(array).n_differences
         self.has_lasting_errors = errors.n_states + pose_errors.n_states > 0
         self._noise_T = float(np.median(array.channel_noise_T))
         self._misfits = Misfits()
 
-    def started(
+    def start(
         self, row: RowMeasurement, motion: MotionModel, near: Mixture | None = None
     ) -> tuple[Mixture | None, str]:
         """What one row says of a source, weighed by a prediction of its place if there is one, or why there is none."""
         if self._misfits.waits:
-            self._misfits = self._misfits.passed_over
+            self._misfits = self._misfits.skip_row()
             return None, OFFSETS
-        mixture, reason = self.of_row(row, motion)
+        mixture, reason = self.row_mixture(row, motion)
         if mixture is None:
             if reason == NO_DIPOLE:
                 self._misfits = self._misfits.after(self._start.misfit, self._noise_T)
             return None, reason
         self._misfits = Misfits(pause=self._misfits.pause)
-        mixture = with_errors(mixture.likely(), row, self.errors.sigma)
-        return (mixture if near is None else _near(mixture.reduced(), near)).reduced(), ""
+        mixture = with_errors(mixture.drop_unlikely(), row, self.errors.sigma)
+        return (mixture if near is None else _reweight(mixture.reduce(), near)).reduce(), ""
 
-    def of_row(self, row: RowMeasurement, motion: MotionModel) -> tuple[Mixture | None, str]:
+    def row_mixture(self, row: RowMeasurement, motion: MotionModel) -> tuple[Mixture | None, str]:
         """What one row alone says of a source and the pose, by every cell that explains it, or why it says nothing."""
         return self._start.mixture(row, motion)
 
-    def of_stack(self, stack: Stack, at_rest: MotionModel) -> tuple[Mixture | None, str]:
+    def stack_mixture(self, stack: Stack, at_rest: MotionModel) -> tuple[Mixture | None, str]:
         """What rows say together of a source alone, that is where it is in the last of them."""
         return self._start.mixture(stack, at_rest)
 
-    def faulty(self, row: RowMeasurement) -> BoolArray:
+    def faulty_sensors(self, row: RowMeasurement) -> BoolArray:
         """Sensors (N,) that contradict all others in a row that no dipole fits; none where rows misfit alike."""
         if self._misfits.are_alike:
             return np.zeros(self.errors.array.n_sensors, dtype=bool)
-        return self._start.faulty(row.row)
+        return self._start.faulty_sensors(row.row)
 
     def is_detected(self, row: RowMeasurement) -> bool:
         """Whether a row shows that there is a source."""
@@ -186,7 +186,7 @@ class ChartFilter:
         """Return components as kernels take them."""
         return Gaussians(mixture.x, mixture.S, n_nuisances=self.errors.n_states + self.pose_errors.n_states)
 
-    def updated(self, known: Known, predicted: Mixture, dt_s: float, row: RowMeasurement) -> RowUpdate:
+    def update(self, known: TrackState, predicted: Mixture, dt_s: float, row: RowMeasurement) -> RowUpdate:
         """Return what a row makes of a prediction from what was known before it."""
         # Where errors of sensors bend as well, rows that were not used count as a part of the step.
         before = known.used if self.has_lasting_errors and known.used is not None else known.mixture
@@ -211,7 +211,7 @@ class ChartFilter:
         log_weight = predicted.log_weight + np.where(sound, after.log_evidence, -np.inf)
         best = int(np.argmax(log_weight))
         found = replace(predicted, x=after.x, S=after.S, log_weight=log_weight, n_rows=predicted.n_rows + 1)
-        mixture = found.take(sound).reduced()
+        mixture = found.take(sound).reduce()
         correction = None if self.has_lasting_errors else after.correction
         return RowUpdate(
             mixture,
@@ -221,7 +221,7 @@ class ChartFilter:
             math.nan if correction is None else float(correction[best]),
         )
 
-    def refitted(self, known: Known) -> Known:
+    def refit(self, known: TrackState) -> TrackState:
         """What is known when all rows of a young track are fitted together, if it is time to."""
         mixture, n_rows = known.mixture, len(known.young)
         if not n_rows:
@@ -231,7 +231,7 @@ class ChartFilter:
             return replace(known, young=())
         if n_rows < known.next_refit or mixture.widths.max() > LARGEST_REFIT_WIDTH:
             return known
-        seeds = mixture.take(once(mixture)[:SEEDS])
+        seeds = mixture.take(unique_components(mixture)[:SEEDS])
         n_seeds = len(seeds)
         if known.next_refit == FIRST_REFIT:
             x = mirror_images(seeds.x, seeds.centroid_m).reshape(-1, seeds.x.shape[1])
@@ -239,11 +239,11 @@ class ChartFilter:
         rows = [row for row, _ in known.young]
         motions = [motion for _, motion in known.young]
         known = replace(known, next_refit=int(REFITS_GROW * n_rows))
-        fit = self._fitted(seeds, rows, motions)
+        fit = self._fit_rows(seeds, rows, motions)
         # A component that is not fitted to its end may be the true one: then the filter goes on with all of them.
-        if not fit.decided[:n_seeds].all() or not _believed(fit.mixture, fit.nis, rows):
+        if not fit.decided[:n_seeds].all() or not _is_credible(fit.mixture, fit.nis, rows):
             return known
-        found = fit.mixture.take(once(fit.mixture)).reduced()
+        found = fit.mixture.take(unique_components(fit.mixture)).reduce()
         n, heaviest = mixture.n_charted, np.repeat(np.argmax(mixture.log_weight), len(found))
         elsewhere = _offset(found, mixture.x[heaviest]).min() > chdtri(n, CONTRADICTION)
         if elsewhere and fit.nis.min() > known.nis:
@@ -257,23 +257,27 @@ class ChartFilter:
                 # The mode of all states together stands nearer than the source does on average: the filter's own stays,
                 # unless it claims to know more than all rows together tell.
                 return known
-        found = self._along_the_range(found, rows, motions)
+        found = self._refit_by_range(found, rows, motions)
         if self.errors.n_states and found.log_range_sigma < NARROWER * mixture.log_range_sigma:
             return known
         return replace(known, mixture=found)
 
-    def _fitted(
-        self, seeds: Mixture, rows: Sequence[RowMeasurement], motions: Sequence[MotionModel], cells: Cells | None = None
-    ) -> Refitted:
+    def _fit_rows(
+        self,
+        seeds: Mixture,
+        rows: Sequence[RowMeasurement],
+        motions: Sequence[MotionModel],
+        cells: RangeCells | None = None,
+    ) -> RefitResult:
         """Components fitted to all rows, with what was known before them."""
         known = KnownInWorld.of(self.prior, rows[0].row.R_world_from_array)
-        fit = refitted(seeds, rows, motions, self.errors, self.pose_errors, cells, known)
+        fit = refit_components(seeds, rows, motions, self.errors, self.pose_errors, cells, known)
         if known is None:
             return fit
         of_space = UNIFORM_IN_SPACE * np.log(fit.mixture.chart.length)
         return replace(fit, mixture=replace(fit.mixture, log_weight=fit.mixture.log_weight + of_space))
 
-    def _along_the_range(
+    def _refit_by_range(
         self, found: Mixture, rows: Sequence[RowMeasurement], motions: Sequence[MotionModel]
     ) -> Mixture:
         """Where ranges are open, components fitted anew in cells of the range, as at the start, each with its evidence.
@@ -289,12 +293,12 @@ class ChartFilter:
             return found
         k, cell = np.divmod(np.arange(len(sigma) * N_CELLS), N_CELLS)
         pitch = CELL_PITCH * sigma[k]
-        cells = Cells((cell - N_CELLS // 2) * pitch, OF_PITCH * pitch)
-        fit = self._fitted(found.take(k), rows, motions, cells)
+        cells = RangeCells((cell - N_CELLS // 2) * pitch, OF_PITCH * pitch)
+        fit = self._fit_rows(found.take(k), rows, motions, cells)
         if not fit.decided.all() or not len(fit.mixture):
             return found
         spread = replace(fit.mixture, log_weight=fit.mixture.log_weight + np.log(pitch[fit.origin]))
-        return spread.take(once(spread, cell[fit.origin])).reduced()
+        return spread.take(unique_components(spread, cell[fit.origin])).reduce()
 
 
 def _offset(mixture: Mixture, x: FloatArray) -> FloatArray:
@@ -304,7 +308,7 @@ def _offset(mixture: Mixture, x: FloatArray) -> FloatArray:
     return np.asarray(np.sum(np.linalg.solve(root_of(mixture.S[:, :n]), e[..., None])[..., 0] ** 2, axis=1))
 
 
-def _believed(found: Mixture, nis: FloatArray, rows: Sequence[RowMeasurement]) -> bool:
+def _is_credible(found: Mixture, nis: FloatArray, rows: Sequence[RowMeasurement]) -> bool:
     """Whether sources that were fitted to rows explain them, and are determined by them."""
     if not len(found):
         return False
@@ -318,22 +322,22 @@ def width_of(mixture: Mixture) -> float:
     return float(mixture.widths[np.argmax(mixture.log_weight)])
 
 
-def cartesian(mixture: Mixture) -> tuple[FloatArray, FloatArray]:
+def to_cartesian(mixture: Mixture) -> tuple[FloatArray, FloatArray]:
     """Return the state (N,) and root (N, N) of a Gaussian of the same mean and covariance."""
-    one = mixture.matched()
+    one = mixture.match_moments()
     n, root = one.n_charted, one.S[0].copy()
     root[:n] = one.chart.jacobian(np.zeros((1, n)))[0] @ root[:n]
     return one.x[0], root
 
 
-def charted(x: FloatArray, S: FloatArray, row: RowMeasurement) -> Mixture:
-    """The inverse of :func:`cartesian`, as seen from a row's array."""
+def from_cartesian(x: FloatArray, S: FloatArray, row: RowMeasurement) -> Mixture:
+    """The inverse of :func:`to_cartesian`, as seen from a row's array."""
     n, root = row.n_charted, S.copy()
     root[:n] = row.chart(x[None, :n]).inverse_jacobian()[0] @ root[:n]
     return Mixture(x[None], root[None], np.zeros(1), n, row.centroid_m, row.radius_m, row.n_pose)
 
 
-def _near(mixture: Mixture, prediction: Mixture) -> Mixture:
+def _reweight(mixture: Mixture, prediction: Mixture) -> Mixture:
     """Components weighed by what a prediction says of their places."""
     mean, covariance = prediction.moments()
     offset, log_density = mixture.x[:, :3] - mean[:3], np.empty(len(mixture))

@@ -12,13 +12,13 @@ import numpy as np
 
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.tracking.chart.known_moment import KnownInWorld
-from magloc.tracking.chart.stack import Measured, Stack
+from magloc.tracking.chart.stack import RowOrStack, Stack
 from magloc.tracking.coordinates import Chart
 from magloc.tracking.row_filter import LEAST_GAIN, MOST_ITERATIONS, ROUNDING, TOLERANCE
 
 
 @dataclass(frozen=True, eq=False)
-class Updated:
+class StateUpdates:
     """States after a row's readings.
 
     Attributes
@@ -44,7 +44,9 @@ class Updated:
     residual: FloatArray
 
 
-def updated(x: FloatArray, S: FloatArray, measurement: Measured, known: KnownInWorld | None = None) -> Updated:
+def update_states(
+    x: FloatArray, S: FloatArray, measurement: RowOrStack, known: KnownInWorld | None = None
+) -> StateUpdates:
     r"""Iterated update of states (K, n) with roots (K, n, n), each on its own.
 
     Gauss-Newton's steps in the source's coordinates e, halved where they make the fit worse: with the covariance C of
@@ -54,7 +56,7 @@ def updated(x: FloatArray, S: FloatArray, measurement: Measured, known: KnownInW
 
     What is `known` of the moment is measured with the row.
     """
-    problem = _Problem.of(measurement.chart(x).with_firm_moments(S), S, measurement, known)
+    problem = _UpdateProblem.of(measurement.chart(x).with_firm_moments(S), S, measurement, known)
     (K, n), k = x.shape, measurement.z.size + (0 if known is None else known.n_known)
     zeta = np.zeros((K, n))
     residual = problem.residual(zeta)
@@ -90,7 +92,7 @@ def updated(x: FloatArray, S: FloatArray, measurement: Measured, known: KnownInW
     with np.errstate(all="ignore"):
         converged &= np.isfinite(S_after).all(axis=(1, 2)) & (np.abs(np.linalg.det(S_after)) > 0.0)
     chi2 = np.sum(residual[:, :k] ** 2, axis=1)
-    return Updated(x_after, S_after, cost, chi2, -0.5 * (cost + log_N + problem.log_C), converged, residual)
+    return StateUpdates(x_after, S_after, cost, chi2, -0.5 * (cost + log_N + problem.log_C), converged, residual)
 
 
 def _whole_step(J: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -101,18 +103,18 @@ def _whole_step(J: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatA
 
 
 @dataclass(frozen=True, eq=False)
-class _Problem:
+class _UpdateProblem:
     """A row in standard numbers ζ, e = S ζ, whitened by ``C^{-1/2} = whiten``."""
 
     chart: Chart
     S: FloatArray
-    measurement: Measured
+    measurement: RowOrStack
     whiten: FloatArray
     log_C: FloatArray
     known: KnownInWorld | None
 
     @classmethod
-    def of(cls, chart: Chart, S: FloatArray, measurement: Measured, known: KnownInWorld | None) -> _Problem:
+    def of(cls, chart: Chart, S: FloatArray, measurement: RowOrStack, known: KnownInWorld | None) -> _UpdateProblem:
         K, k = len(S), measurement.z.size
         if not isinstance(measurement, Stack):
             return cls(chart, S, measurement, np.broadcast_to(np.eye(k), (K, k, k)), np.zeros(K), known)
@@ -120,7 +122,7 @@ class _Problem:
         log_C = 2.0 * np.sum(np.log(np.diagonal(root, axis1=-2, axis2=-1)), axis=1)
         return cls(chart, S, measurement, np.linalg.inv(root), log_C, known)
 
-    def take(self, index: IntArray) -> _Problem:
+    def take(self, index: IntArray) -> _UpdateProblem:
         """Some of the states."""
         if len(index) == len(self.S):
             return self

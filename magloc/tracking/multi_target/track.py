@@ -17,7 +17,7 @@ from magloc.tracking.multi_target.motion import FreeMotion
 from magloc.tracking.multi_target.tracker import SourcesTracker
 from magloc.tracking.results import SourcesPoint, TrackPoint, TrackResult, warn_of_strengths
 from magloc.tracking.rows import rows_of
-from magloc.tracking.track import TrackColumns, TrackRows, finished
+from magloc.tracking.track import TrackColumns, TrackRows, collect_points
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -152,6 +152,6 @@ def track_sources(
             if progress is not None:
                 progress(1)
 
-    points = finished(followed(), told)
+    points = collect_points(followed(), told)
     warn_of_strengths(track for point in points for track in point.tracks)
     return SourcesTrack(points, used)

@@ -165,7 +165,7 @@ class SourcesTracker:
                 replace(one, state=stepped(one.state, step, problem.measured), young=None) for one in self._hypotheses
             ]
             if self._misfits.waits and self._hypotheses:
-                self._misfits = self._misfits.passed_over
+                self._misfits = self._misfits.skip_row()
                 return self._point(problem, "misfit", math.nan)
             return self._point(problem, "no readings", math.nan)
         if not self._hypotheses:
@@ -196,7 +196,7 @@ class SourcesTracker:
             self._last_restart, self._next_restart = self._n_rows, self._n_rows + self._pause
             restarts = self._restarts(problem, best, found)
             if poor:  # whether the suspect is at fault, they are to tell
-                self._hypotheses[0] = replace(best, health=best.health.forgetful)
+                self._hypotheses[0] = replace(best, health=best.health.forget_residuals())
             self._hypotheses += restarts
         if left is None or energy < 0.5 * LEFT_LIMIT:
             self._late_pause = _LATE_PAUSE
@@ -308,7 +308,7 @@ class SourcesTracker:
         without = rows.smoothed()
         if without is None:
             return []
-        known, health = [one.state for one in self._hypotheses], best.health.forgetful
+        known, health = [one.state for one in self._hypotheses], best.health.forget_residuals()
         born: list[Hypothesis] = []
         starts = problem.starts(rows.prior, found, left)
         tried = [rows.joined(prior).smoothed(_LATE_PASSES, without.score) for prior in starts]
@@ -356,7 +356,7 @@ class SourcesTracker:
         tried = [one for one in tried if len(one.ids) <= known][:_MOST_RESTARTS] + more[:_MOST_RESTARTS]
         # What the sources' motion tells is still to be learned by them, and was by the best one.
         learned = 2.0 * (np.linalg.slogdet(again.update.state.S)[1] - np.linalg.slogdet(best.state.S)[1])
-        score, health = best.score - max(0.0, float(learned)), best.health.forgetful
+        score, health = best.score - max(0.0, float(learned)), best.health.forget_residuals()
         restarts = [
             replace(self._after(problem, best, one), score=score + BIRTH * (len(one.ids) - known), health=health)
             for one in tried

@@ -78,7 +78,7 @@ class TestSplit:
         assert 3 <= len(parts) <= MOST_COMPONENTS
         assert (origin == 0).all()
         assert parts.weight.sum() == pytest.approx(1.0, abs=1e-6)
-        together, sigma = parts.matched(), np.linalg.norm(one.S[0], axis=1)
+        together, sigma = parts.match_moments(), np.linalg.norm(one.S[0], axis=1)
         np.testing.assert_allclose(one.chart.coordinates(together.x)[0] / sigma, 0.0, atol=0.01)
         found, expected = together.S[0] @ together.S[0].T, one.S[0] @ one.S[0].T
         np.testing.assert_allclose(found / np.outer(sigma, sigma), expected / np.outer(sigma, sigma), atol=0.01)

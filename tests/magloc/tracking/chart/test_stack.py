@@ -70,7 +70,7 @@ class TestPredictions:
         np.testing.assert_allclose(
             stack.directional_derivative(x, L), np.concatenate(by_rows, axis=1), rtol=1e-6, atol=1e-9
         )
-        predicted, by_moment = stack.by_moment(x)
+        predicted, by_moment = stack.linearise_in_moment(x)
         np.testing.assert_allclose(predicted, stack.predict_source(x), rtol=1e-9)
         np.testing.assert_allclose(by_moment, stack.directional_derivative(x, L)[..., 3:], rtol=1e-6, atol=1e-9)
         weak = x * np.array([1.0, 1.0, 1.0, 1e-12, 1e-12, 1e-12])

@@ -16,7 +16,7 @@ from magloc.ambient import in_world_field
 from magloc.tracking import row_filter
 from magloc.tracking.chart.mixture import Mixture
 from magloc.tracking.chart.start import NO_AMBIENT, with_errors
-from magloc.tracking.chart.update import updated
+from magloc.tracking.chart.update import update_states
 from magloc.tracking.row_filter import Gaussians
 from magloc.tracking.rows import rows_of
 from magloc.tracking.tracker import Tracker
@@ -37,7 +37,7 @@ class TestErrorsOfSensors:
         S = np.broadcast_to(
             np.diag([0.3, 0.2, 0.2, *np.full(3, np.linalg.norm(x[0, 3:]) / row.radius_m**4)]), (3, 6, 6)
         )
-        alone = updated(x, S, row.with_errors_as_noise(sigma))
+        alone = update_states(x, S, row.with_errors_as_noise(sigma))
         mixture = Mixture(alone.x, alone.S, np.zeros(3), 6, row.centroid_m, row.radius_m)
         found = with_errors(mixture, row, sigma)
         zero = np.zeros((3, sigma.size))
@@ -62,7 +62,7 @@ class TestValleyOfRangesThatBends:
         simulation = simulate(replace(SCENARIO, duration_s=1.0), seed)
         tracker, truth = Tracker(simulation.array, REST), simulation.truth
         row = next(iter(rows_of(in_world_field(simulation.readings, simulation.array))))
-        mixture, _ = tracker.filter.started(tracker.measurements.of(row), REST)
+        mixture, _ = tracker.filter.start(tracker.measurements.of(row), REST)
         assert mixture is not None
         assert truth.moment_Am2 is not None
         true = np.concatenate([truth.position_m[0], truth.moment_Am2[0]])
