@@ -29,8 +29,8 @@ MOST_ITERATIONS = 50
 ROUNDING = 1e-9
 """Relative increase of the cost that counts as rounding; a step with more is halved."""
 LEAST_SHARE = 0.02
-"""Least reduction of σ by a row, over that of the prediction, for a direction to be as nonlinear as the row's readings.
-Directions with less were measured by other rows, whose nonlinearity may differ."""
+"""Change of whitened readings over one σ of the prediction, above which a direction is as nonlinear as the readings of
+the row. Directions with less were measured by other rows, whose nonlinearity may differ."""
 _ROWS_A_CALL = 1000
 """Rows of trajectories that one call of the kernel smooths: some 10 ms."""
 _FOLLOWED = 1e-3

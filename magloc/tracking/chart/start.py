@@ -1,13 +1,13 @@
-"""Where a track starts: a mixture over all directions and ranges that the first row allows.
+"""Start of a track: a mixture over all directions and ranges that the first row allows.
 
-The start is a grid of cells, equal in direction and in the logarithm of the range, each a Gaussian in the chart about
-its centre whose moment is hardly known, so that all together they are an even density. The filter's own update makes of
-them what the row tells. Cells that explain the row as well as the best one does are taken, and those that explain it
-better than all around them, and the optima that :class:`magloc.localization.locator.Locator` finds between them.
+The prior is a grid of cells, uniform in direction and in the logarithm of the range. Each is a Gaussian in the chart
+about its centre with a nearly unknown moment, and their sum is nearly constant. The filter updates them by the row. The
+cells used are those that explain the row nearly as well as the best one, those that explain it better than their
+neighbours, and the optima that :class:`magloc.localization.locator.Locator` finds between them.
 
-Where a row tells more than a cell does, the cell's own Gaussian would pull the component and its weight: there it is
-centred anew where the row puts it, and what several cells have found alike counts once. Where the valley of ranges that
-it finds bends, it is divided along the range by halves of the grid's pitch.
+If a row determines a component better than its cell does, the cell's Gaussian would bias the component and its weight.
+Then the cell is centred again at the component, and equal components of several cells count once. A component along a
+curved valley of ranges is divided along the range by halving the pitch of the grid.
 """
 
 from __future__ import annotations
@@ -39,24 +39,24 @@ from magloc.tracking.row_filter import Gaussians, RowUpdates
 from magloc.tracking.rows import Row
 
 OF_PITCH = 0.6
-"""Standard deviations of a cell, in units of the grid's pitch: neighbours add up to an even density."""
+"""Standard deviation of a cell over the grid's pitch, with which neighbours sum to a nearly constant density."""
 _N_DIRECTIONS, _N_RANGES = 100, 14
 _PITCH = math.log(FARTHEST / NEAREST) / (_N_RANGES - 1)
 _SPACING = math.sqrt(4.0 * math.pi / _N_DIRECTIONS)
-# Cells that explain so much less than the best one, as a rise of χ², are taken only where they are local peaks.
+# Largest excess of χ² over the best cell for a cell to be used; cells with more are used only if they are local peaks.
 _WITHIN = 20.0
 _NEIGHBOURS = 1.6 * _SPACING
-# The moment before anything is known, in units of what the row says of it at a cell's centre.
+# Prior σ of the moment over the best moment at a cell's centre.
 _UNKNOWN_MOMENT = 10.0
-# Of a cell's standard deviation: a component that is narrower is the row's own.
+# Share of a cell's σ below which the row determines a component.
 _NARROW = 0.5
-# The even density of all cells over the density of one at its centre, as a logarithm, along one coordinate.
+# Logarithm of the density of all cells over that of one at its centre, along one coordinate.
 _EVEN = math.log(OF_PITCH * math.sqrt(2.0 * math.pi))
 _CELL = OF_PITCH * np.array([_PITCH, _SPACING, _SPACING])
 LARGEST_BEND = 0.5
-"""By how much a valley of ranges may bend in a component's standard deviation, in that of the readings' noise."""
+"""Largest nonlinearity of the readings over a component's σ along a valley of ranges, in σ of their noise."""
 _MOST_BENT = 100.0
-# How far along a valley components stand, in standard deviations of its log-range.
+# Extent of the components along a valley, in standard deviations of its log-range.
 _VALLEY = 4.0
 _SIGMA_PRIOR = (math.log(FARTHEST / NEAREST) / math.sqrt(12.0), 1.0, 1.0)
 NOT_ALLOWED = "not acquired: no source of the stated region and moment explains the readings"
@@ -65,20 +65,19 @@ NO_DIPOLE = "not acquired: no dipole fits the readings"
 
 
 def prior_root(chart: Chart) -> FloatArray:
-    r"""Cartesian root (6, 6) of what is known of a source at x (n,) before its first row.
+    r"""Return the Cartesian root (6, 6) of the prior covariance of a source at x (n,).
 
-    A Gaussian of the information that the start has of it: log-range and direction uniform, density
-    :math:`\propto |\mu|^{-3}` of the moment as it is seen, whose mean information along an axis is
-    :math:`1 / |\mu|^2`.
+    It is a Gaussian with the information of the start's prior: log-range and direction uniform, and the density
+    :math:`\propto |\mu|^{-3}` of the scaled moment, whose mean information along an axis is :math:`1 / |\mu|^2`.
     """
     strength = float(np.linalg.norm(chart.x[3:6])) / float(chart.length) ** MOMENT_POWER
     return source_root(chart, np.array([*_SIGMA_PRIOR, *[strength] * 3]))
 
 
 def first_root(chart: Chart, motion: MotionModel, sigma_range: FloatArray | None = None) -> FloatArray:
-    """Cartesian roots (K, n, n) of sources of which hardly more is known than that they are at x (K, n).
+    """Return Cartesian roots (K, n, n) of nearly flat priors about states x (K, n).
 
-    `sigma_range` (K,) are standard deviations of their log-ranges, if more is known of these.
+    `sigma_range` (K,) are standard deviations of the log-ranges, by default those of the whole search.
     """
     sigma = np.tile(_SIGMA_PRIOR, (len(chart.x), 1))
     if sigma_range is not None:
@@ -87,7 +86,7 @@ def first_root(chart: Chart, motion: MotionModel, sigma_range: FloatArray | None
 
 
 def _with_motion(chart: Chart, motion: MotionModel, sigma: FloatArray) -> FloatArray:
-    """Cartesian roots (K, n, n) from standard deviations (K, 3) of range and direction; the moment is hardly known."""
+    """Return Cartesian roots (K, n, n) from σ (K, 3) of log-range and direction, with an unknown moment."""
     strength = np.linalg.norm(chart.x[:, 3:6], axis=1) / chart.length**MOMENT_POWER
     _, rest = motion.start(np.zeros(N_SOURCE), np.zeros((N_SOURCE, N_SOURCE)))
     root = np.tile(np.eye(chart.x.shape[1]), (len(chart.x), 1, 1))  # of the pose's errors, behind the motion
@@ -99,7 +98,7 @@ def _with_motion(chart: Chart, motion: MotionModel, sigma: FloatArray) -> FloatA
 
 @dataclass(frozen=True, eq=False)
 class _Grid:
-    """Cells in the array's frame: positions (n, 3), and which are neighbours (directions, directions)."""
+    """Cells in the array's frame: positions (n, 3), and pairs of directions that are neighbours."""
 
     position_m: FloatArray
     neighbours: BoolArray
@@ -112,7 +111,7 @@ class _Grid:
         return cls(position.reshape(-1, 3), np.arccos(np.clip(directions @ directions.T, -1, 1)) < _NEIGHBOURS)
 
     def select(self, explained: FloatArray) -> BoolArray:
-        """Cells (n,) from which to start, by the energy that each explains, -inf where it is not allowed."""
+        """Return the cells (n,) to start from, by the energy that each explains, -inf if it is not allowed."""
         table = explained.reshape(_N_RANGES, _N_DIRECTIONS)
         around = np.where(self.neighbours, table[:, None, :], -np.inf).max(axis=2)
         padded = np.pad(table, ((1, 1), (0, 0)), constant_values=-np.inf)
@@ -122,15 +121,15 @@ class _Grid:
 
 @dataclass(frozen=True, eq=False)
 class _Seeds:
-    """Where components start.
+    """Initial states of components.
 
     Attributes
     ----------
     position_m, moment_Am2 : ndarray, shape (n, 3)
-        In the world frame.
+        Position and moment in the world frame.
     cell : ndarray of int, shape (n, 3)
-        Range and direction on the grid whose share of the even density each stands for, -1 where it is the row's own,
-        and how often the pitch of its ranges was halved.
+        Range and direction of the cell on the grid, -1 along coordinates that the row determines, and the number of
+        halvings of its pitch.
     """
 
     position_m: FloatArray
@@ -139,7 +138,7 @@ class _Seeds:
 
 
 class TrackStarter:
-    """Starts tracks of one array."""
+    """Estimator of a source from the first row, for one array."""
 
     def __init__(self, array: SensorArray, errors: SensorErrors, prior: SourcePrior) -> None:
         check_magnitudes(array)
@@ -154,10 +153,10 @@ class TrackStarter:
             self._examiner = Locator(array, prior=prior)
 
     def mixture(self, measurement: RowOrStack, motion: MotionModel) -> tuple[Mixture | None, str]:
-        """What one row says of a source and of the pose's errors, or why there is none."""
+        """Return the mixture of source and errors of the pose by one row, or None and the reason."""
         if not measurement.is_detected(self.errors.sigma):
             return None, "not acquired: no signal stands out of noise"
-        # Before it nothing is known of source and sensors together: the sensors' errors are noise.
+        # Source and errors of sensors have no correlation yet, so that the errors are noise.
         alone = measurement.with_errors_as_noise(self.errors.sigma)
         known = KnownInWorld.of(self.prior, measurement.row.R_world_from_array)
         seeds = self._seeds(alone)
@@ -191,16 +190,16 @@ class TrackStarter:
         return mixture.take(sound).take(unique_components(mixture.take(sound), seeds.cell[sound])), ""
 
     def faulty_sensors(self, row: Row) -> BoolArray:
-        """Sensors (N,) that contradict all others, as a fix of the row names them."""
+        """Return the sensors (N,) that a fix of the row excludes."""
         dropped = () if self._examiner is None else self._examiner.fit(row.readings_T, row.ambient_T).dropped_sensors
         return np.isin(self.errors.array.ids, dropped)
 
     def _seeds(self, measurement: RowOrStack) -> _Seeds:
-        """Chosen cells, and the row's best fits."""
+        """Return the selected cells and the best fits of the row."""
         cells, row = self._grid.position_m, measurement.row
         world = row.origin_m + cells @ row.R_world_from_array.T
         columns = measurement.moment_columns(world)
-        # Moduli in no ambient field are linear in no moment: their cells explain nothing, and their best fits start.
+        # Moduli without an ambient field are not linear in the moment: their cells explain nothing, only fits remain.
         whiten = measurement.whitening
         columns, left = whiten @ zero_if_nan(columns), whiten @ measurement.without_source
         moments = (np.linalg.pinv(columns, rcond=1e-6) @ left[:, None])[..., 0]
@@ -224,7 +223,7 @@ class TrackStarter:
 
 
 def _images(source: FloatArray, measurement: RowOrStack) -> tuple[FloatArray, IntArray]:
-    """Return sources (n, 6) of the gradient tensor of a source, in the cells of range (n,) next to it, and these."""
+    """Return mirror images (n, 6) of a source at the two nearest ranges of the grid, and these ranges (n,)."""
     images = mirror_images(source[None], measurement.centroid_m)[1:, 0]
     chart = measurement.chart(images)
     below = math.floor(math.log(float(chart.length[0]) / measurement.radius_m / NEAREST) / _PITCH)
@@ -239,7 +238,7 @@ def _images(source: FloatArray, measurement: RowOrStack) -> tuple[FloatArray, In
 def _components(
     measurement: RowOrStack, motion: MotionModel, seeds: _Seeds, known: KnownInWorld | None = None
 ) -> StateUpdates | RowUpdates:
-    """What the row makes of cells about seeds."""
+    """Return the update by a row of the cells about seeds."""
     state, _ = motion.start(np.zeros(N_SOURCE), np.zeros((N_SOURCE, N_SOURCE)))
     x = np.tile(np.append(state, np.zeros(measurement.n_pose)), (len(seeds.cell), 1))
     x[:, :3], x[:, 3:6] = seeds.position_m, seeds.moment_Am2
@@ -257,7 +256,7 @@ def _mixture(found: StateUpdates | RowUpdates, log_weight: FloatArray, measureme
 
 
 def _recentre(seeds: _Seeds, found: StateUpdates | RowUpdates, measurement: RowOrStack) -> _Seeds:
-    """Seeds that stand where the row puts them, along the coordinates in which it tells more than their cells do."""
+    """Return seeds moved to their components, along coordinates that the row determines better than the cell."""
     sigma = np.sqrt(np.sum(found.S[:, :3] ** 2, axis=2))
     narrow = sigma < _NARROW * _CELL
     narrow = np.stack([narrow[:, 0], narrow[:, 1] & narrow[:, 2]], axis=1)
@@ -271,7 +270,7 @@ def _recentre(seeds: _Seeds, found: StateUpdates | RowUpdates, measurement: RowO
     length = np.maximum(r, measurement.radius_m)
     cell = seeds.cell.copy()
     cell[:, :2][narrow] = -1
-    # A best fit has no cell whose share it could stand for.
+    # A best fit has no cell, so that it counts only if the row determines it.
     sound = np.isfinite(found.log_evidence) & found.converged & ((seeds.cell[:, :2] >= 0) | narrow).all(axis=1)
     return _Seeds(
         (measurement.centroid_m + r[:, None] * offset)[sound], (seen * length[:, None] ** 4)[sound], cell[sound]
@@ -279,9 +278,9 @@ def _recentre(seeds: _Seeds, found: StateUpdates | RowUpdates, measurement: RowO
 
 
 def _subdivide_valleys(seeds: _Seeds, found: StateUpdates | RowUpdates, measurement: RowOrStack) -> _Seeds:
-    """The seeds, and instead of such as found a valley of ranges that bends others along it, as dense as it bends.
+    """Replace seeds in a curved valley of ranges by several along it, with a pitch by its curvature.
 
-    A row that tells much leaves a source in a narrow valley, and a Gaussian in the middle says nothing of its ends.
+    A precise row leaves a narrow valley, and a Gaussian at its middle does not cover its ends.
     """
     n = measurement.n_charted
     sound = np.isfinite(found.log_evidence) & found.converged
@@ -311,10 +310,10 @@ def _subdivide_valleys(seeds: _Seeds, found: StateUpdates | RowUpdates, measurem
 
 
 def with_errors(mixture: Mixture, measurement: RowMeasurement, sigma: FloatArray) -> Mixture:
-    r"""The same, and behind the states the sensors' errors, known by their σ (n_errors,) before the row alone.
+    r"""Return the mixture with the sensors' errors as further states, with prior standard deviations (n_errors,).
 
-    What the row leaves over where a component stands is of them and of the noise: with :math:`\Phi` of unit errors,
-    :math:`\varepsilon = \sigma \Phi^T (1 + \Phi \Phi^T)^{-1} (z - h(x))`, and its covariance that of a linear model.
+    They are estimated from the residual at each component. With the effect :math:`\Phi` of unit errors it is
+    :math:`\varepsilon = \sigma \Phi^T (1 + \Phi \Phi^T)^{-1} (z - h(x))`, with the covariance of a linear model.
     """
     if not sigma.size:
         return mixture
@@ -329,21 +328,21 @@ def with_errors(mixture: Mixture, measurement: RowMeasurement, sigma: FloatArray
 
 
 def unique_components(mixture: Mixture, cell: IntArray | None = None) -> IntArray:
-    """Components, heaviest first, without those that another one with the same share of the even density has found."""
+    """Return indices of components, heaviest first, without duplicates of the same cell."""
     source = mixture.source_marginal()
     cell = np.zeros((len(source), 1), dtype=np.intp) if cell is None else cell.reshape(len(source), -1)
     _, share, n_alike = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
     share = share.ravel()  # numpy 2.0.0 gives a column
     chart, left = source.chart, np.argsort(-mixture.log_weight, kind="stable")
     alone = n_alike[share[left]] == 1
-    kept, left = left[alone].tolist(), left[~alone]
+    unique, left = left[alone].tolist(), left[~alone]
     limit = chdtri(N_SOURCE, 1.0 - CREDIBLE_ROW)
     while left.size:
         first, others = left[0], left[1:]
-        kept.append(first)
+        unique.append(first)
         same = others[share[others] == share[first]]
         about = chart.take(same)
         e = about.coordinates(np.repeat(source.x[first][None], len(same), axis=0))
         square = np.sum(np.linalg.solve(source.S[same], e[..., None])[..., 0] ** 2, axis=1)
         left = others[~np.isin(others, same[square < limit])]
-    return np.array(sorted(kept, key=lambda k: -mixture.log_weight[k]))
+    return np.array(sorted(unique, key=lambda k: -mixture.log_weight[k]))

@@ -146,12 +146,12 @@ def track_sources(
         raise ValueError("Input readings must have neither a background nor measured velocities for several sources.")
     tracker = SourcesTracker(array, sources=sources, motion=motion, prior=prior)
 
-    def followed() -> Iterator[SourcesPoint]:
+    def follow() -> Iterator[SourcesPoint]:
         for row in rows_of(used):
             yield tracker.update(row)
             if progress is not None:
                 progress(1)
 
-    points = collect_points(followed(), told)
+    points = collect_points(follow(), told)
     warn_of_strengths(track for point in points for track in point.tracks)
     return SourcesTrack(points, used)

@@ -11,7 +11,7 @@ import arrays
 import magloc
 from magloc.tracking.motion import OrnsteinUhlenbeck
 from magloc.tracking.multi_target.measurement import JointRow
-from magloc.tracking.multi_target.motion import stepped
+from magloc.tracking.multi_target.motion import predict_state
 from magloc.tracking.multi_target.state import JointState
 from magloc.tracking.rows import Row
 from tests.magloc.tracking.multi_target.test_state import CENTROID_M, RADIUS_M, state_of
@@ -28,7 +28,7 @@ def known(k: int) -> JointState:
 
 def predict(state: JointState, dt_s: float, motion: magloc.FreeMotion = MOTION, agility: float = 1.0) -> JointState:
     """Return the state after a step."""
-    return stepped(state, motion.numbers(dt_s, agility=agility), ROW)
+    return predict_state(state, motion.numbers(dt_s, agility=agility), ROW)
 
 
 def covariance(state: JointState) -> np.ndarray:
