@@ -14,7 +14,7 @@ from arrays.typing import FloatArray, IntArray
 from magloc.chi_square import square_columns
 from magloc.plots import style
 from magloc.tracking.files import columns_of_track, states_of
-from magloc.tracking.results import TrackPoint, TrackResult, on_track, stacked
+from magloc.tracking.results import TrackPoint, TrackResult, on_track, track_column
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -202,7 +202,7 @@ def consistency_figure(
     nis = np.array([point.nis for point in points])
     nis_dof = np.array([point.nis_dof for point in points])
     style.squares_panel(axes[-3], time, nis, nis_dof, "NIS")
-    estimability = stacked(points, "estimability", 6)
+    estimability = track_column(points, "estimability", 6)
     for ax, first, what in ((axes[-2], 0, "position"), (axes[-1], 3, "moment")):
         for i, (name, colour, _, line) in enumerate(style.COMPONENTS):
             label = name if first == 0 else f"m{name}"

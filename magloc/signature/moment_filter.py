@@ -137,7 +137,7 @@ class MomentModel:
         """Differences (k,) of row i in units of their noise."""
         row, (first, *others) = self.rows[i], self.sources(i, x)
         others_T = np.sum([row.field_T(source) for source in others], axis=0) if others else None
-        return row.of_source(first, others_T=others_T) + row.effect @ x[self.moment.stop :]
+        return row.predict_source(first, others_T=others_T) + row.effect @ x[self.moment.stop :]
 
     def jacobian(self, i: int, x: FloatArray) -> FloatArray:
         """Their Jacobian (k, n)."""
@@ -146,7 +146,7 @@ class MomentModel:
         H = np.zeros((row.z.size, x.size))
         for k, J in enumerate(self.sources_of_state(i, x)):
             others_T = np.delete(fields_T, k, axis=0).sum(axis=0) if fields_T else None
-            H += row.along(sources[k], J, others_T)
+            H += row.directional_derivative(sources[k], J, others_T)
         H[:, self.moment.stop :] = row.effect
         return H
 

@@ -1,4 +1,4 @@
-"""Where a track starts whose rows do not determine a source one by one: from several rows, as if it were at rest."""
+"""Start of a track from several rows that are individually insufficient, for a source nearly at rest."""
 
 from __future__ import annotations
 
@@ -27,38 +27,38 @@ from magloc.tracking.results import Prediction
 from magloc.tracking.rows import Row
 
 START_RANGE_ERROR = 0.03
-"""Standard deviation of the range over the range that a start may have: beyond it the posterior is no Gaussian in
-Cartesian coordinates."""
+"""Largest σ of the range over the range for a start. With more, the posterior is not Gaussian in Cartesian
+coordinates."""
 STACKED_POSITION_ERROR = 0.01
-"""Standard deviation of the whole position over the range, for a start from several rows of which one alone does not
-determine the source: the prediction is then Gaussian in Cartesian coordinates, so that it must be as good as linear."""
+"""Largest σ of the position over the range for a start from several rows. Its prediction is a Cartesian Gaussian, over
+which readings must be nearly linear."""
 # Another solution within this Δχ² forbids a start.
 _RIVAL_WITHIN = 9.0
-# Rows that together may determine a source at rest: how far back, how many, how often it is tried.
+# Rows for a fit at rest: the latest considered, the number used, and the rows between two fits.
 _WINDOW_ROWS = 64
 _STACKED_ROWS = 16
 _TRY_EVERY = 4
-# Of the error that a start may have, as all rows so far tell it: with more of it none is tried.
+# A fit is not tried if the position error by all rows so far exceeds the largest one of a start by this factor.
 _MOST_HOPEFUL = 1.2
-# How often the rows that a track starts from are linearised anew, until they move it by less than a share of its σ.
+# Largest number of passes that linearise the rows of a start again, and the step, over its σ, that ends them.
 _MOST_START_STEPS = 30
 _START_TOLERANCE = 1e-3
-# How much less is known of a source before them than after, in standard deviations.
+# Prior standard deviations of the source over the posterior ones.
 _UNKNOWN = 1e4
 
 
 @dataclass(frozen=True, eq=False)
-class Start:
-    """Where a track starts.
+class AcquiredSource:
+    """A source found from several rows, from which a track starts.
 
     Attributes
     ----------
     solution : Solution
-        In the world frame; its weight is that among all solutions.
+        Solution in the world frame, with its weight among all solutions.
     rows : sequence of Row
-        All that were kept, in the order of time: a few of them found it, what they leave open the others tell.
+        All recent rows in the order of time; the solution is a fit to some of them.
     rivals : tuple of Solution
-        The other solutions that explain these readings.
+        Other solutions that explain the same readings.
     """
 
     solution: Solution
@@ -67,7 +67,7 @@ class Start:
 
 
 class Acquisition:
-    """Looks for a source in the latest rows together, of which one alone does not determine it."""
+    """Combine rows that are individually insufficient until they determine a source."""
 
     def __init__(self, array: SensorArray, prior: SourcePrior) -> None:
         self.array = array
@@ -79,15 +79,15 @@ class Acquisition:
         self.forget()
 
     def forget(self) -> None:
-        """Start to look anew."""
+        """Discard all rows."""
         self._recent: deque[Row] = deque(maxlen=_WINDOW_ROWS)
         self._n_rows = 0
         self._proposed: Solution | None = None
 
-    def start(self, row: Row, position_error: float = 0.0) -> Start | None:
-        """A start with one more row, where the array moves enough for it, and the source is as good as at rest.
+    def start(self, row: Row, position_error: float = 0.0) -> AcquiredSource | None:
+        """Return a source with one more row, if the array has moved enough and the source is nearly at rest.
 
-        `position_error`: standard deviation of the position over the range, as far as it is known otherwise.
+        `position_error` is the standard deviation of the position over the range by other estimates, 0 without any.
         """
         self._recent.append(row)
         self._n_rows += 1
@@ -117,10 +117,10 @@ class Acquisition:
         before, self._proposed = self._proposed, _certain_solution(fix, centroid)
         if self._proposed is None or not _agree(before, self._proposed):
             return None
-        return Start(self._proposed, recent, fix.solutions[1:])
+        return AcquiredSource(self._proposed, recent, fix.solutions[1:])
 
     def _array_of(self, rows: Sequence[Row]) -> SensorArray:
-        """The array where eddy currents are errors of its offsets."""
+        """Return the array with eddy currents as errors of its offsets."""
         if not any(sensor.eddy_uncertainty_s for sensor in self.array.sensors):
             return self.array
         ambient_T = [ambient_in_array(self.array, row.readings_T, row.ambient_T) for row in rows]
@@ -129,7 +129,7 @@ class Acquisition:
 
 
 def _certain_solution(fix: Fix, centroid: FloatArray) -> Solution | None:
-    """The first solution, if a track may start from it and no other one fits alike."""
+    """Return the first solution if it is certain enough for a start and no other one fits as well."""
     if not fix.solutions:
         return None
     best = fix.solutions[0]
@@ -140,7 +140,7 @@ def _certain_solution(fix: Fix, centroid: FloatArray) -> Solution | None:
 
 
 def _agree(before: Solution | None, after: Solution) -> bool:
-    """Whether two successive proposals for a start are one: a wrong basin seldom stays where it is as rows come in."""
+    """Return True if two successive proposals agree; a wrong optimum usually moves as rows are added."""
     if before is None:
         return False
     offset = after.position_m - before.position_m
@@ -149,8 +149,8 @@ def _agree(before: Solution | None, after: Solution) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class FilteredStart:
-    """State at the start of a track, square root of its covariance, χ² of the rows, and the state at each of them."""
+class StartState:
+    """State at the start of a track, square root of its covariance, χ² of the rows, and the state after each row."""
 
     x: FloatArray
     S: FloatArray
@@ -159,18 +159,18 @@ class FilteredStart:
 
 
 class CartesianFilter:
-    """A filter of Cartesian states, linearised where they are known: for starts from several rows, and smoothing.
+    """Filter of Cartesian states, linearised at given states: for starts from several rows, and smoothing.
 
     Attributes
     ----------
     prior : SourcePrior
-        What is known of the source's moment, in the array's frame.
+        Prior knowledge of the source's moment, in the array's frame.
     measurements : RowMeasurements
-        What rows say of the state.
+        Measurement models of the rows.
     errors : SensorErrors
-        The lasting errors of the array's sensors: the last states.
+        Lasting errors of the array's sensors: the last states.
     pose_errors : PoseErrors
-        Those of its pose, between the states of the motion and them.
+        Errors of the array's pose: the states between those of the motion and `errors`.
     """
 
     prior: SourcePrior
@@ -181,81 +181,81 @@ class CartesianFilter:
     @property
     @abstractmethod
     def motion(self) -> MotionModel:
-        """How the source moves."""
+        """Motion of the source."""
 
     @property
     def n_errors(self) -> int:
-        """States behind those of the motion: errors of the pose and of sensors."""
+        """Number of states after those of the motion: errors of the pose and of sensors."""
         return self.errors.n_states + self.pose_errors.n_states
 
     @property
     def error_sigma(self) -> FloatArray:
-        """Their standard deviations before anything is known (n_errors,)."""
+        """Prior standard deviations (n_errors,) of the errors of the pose and of sensors."""
         return np.concatenate([np.ones(self.pose_errors.n_states), self.errors.sigma])
 
-    def predicted(self, x: FloatArray, S: FloatArray, dt_s: float) -> Prediction:
-        """State, square root of its covariance and transition after a step without readings."""
+    def predict(self, x: FloatArray, S: FloatArray, dt_s: float) -> Prediction:
+        """Return the state, square root of its covariance and transition after a step without readings."""
         n, n_errors = self.motion.n_states, self.n_errors
-        moved, F_motion, S_q_motion = self.motion.step(x[:n], dt_s)
-        kept, added = step_of_errors(self.pose_errors, self.errors, dt_s)
-        noisy = np.flatnonzero(added)
+        x_motion, F_motion, S_q_motion = self.motion.step(x[:n], dt_s)
+        decay, noise = step_of_errors(self.pose_errors, self.errors, dt_s)
+        noisy = np.flatnonzero(noise)
         F, S_q = np.zeros((n + n_errors,) * 2), np.zeros((n + n_errors, S_q_motion.shape[1] + noisy.size))
         F[:n, :n], S_q[:n, : S_q_motion.shape[1]] = F_motion, S_q_motion
-        F[n + np.arange(n_errors), n + np.arange(n_errors)] = kept
-        S_q[n + noisy, S_q_motion.shape[1] + np.arange(noisy.size)] = added[noisy]
-        return Prediction(np.concatenate([moved, kept * x[n:]]), predict(S, F, S_q), F)
+        F[n + np.arange(n_errors), n + np.arange(n_errors)] = decay
+        S_q[n + noisy, S_q_motion.shape[1] + np.arange(noisy.size)] = noise[noisy]
+        return Prediction(np.concatenate([x_motion, decay * x[n:]]), predict(S, F, S_q), F)
 
-    def state_before(
+    def initial_state(
         self, centre: FloatArray, root: FloatArray, R_world_from_array: FloatArray | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the state before the first row, and its root, from that (6, 6) of position and moment about a centre.
+        """Return the state before the first row and its root, from a root (6, 6) of position and moment.
 
-        With the array's rotation a moment that is known counts, linearised at the centre.
+        With the array's rotation, a known moment is a measurement, linearised at the centre.
         """
         n = self.motion.n_states
         x, S = np.zeros(centre.size), np.diag(np.concatenate([np.zeros(n), self.error_sigma]))
         x[:n], S[:n, :n] = self.motion.start(centre[:N_SOURCE], root)
         if R_world_from_array is None or (known := KnownInWorld.of(self.prior, R_world_from_array)) is None:
             return x, S
-        H = known.along(centre[None], np.eye(len(centre))[None])[0]
+        H = known.directional_derivative(centre[None], np.eye(len(centre))[None])[0]
         return update(x, S, H, known.residual(centre[None])[0] - H @ (x - centre))[:2]
 
-    def start(self, source: FloatArray, covariance: FloatArray, rows: Sequence[Row]) -> FilteredStart | None:
-        """State at the last of the rows that a source (6,) was found from, as if at rest, with a covariance (6, 6).
+    def start(self, source: FloatArray, covariance: FloatArray, rows: Sequence[Row]) -> StartState | None:
+        """Return the state at the last of the rows from which a source (6,) at rest was fitted.
 
-        The rows are filtered once more, from a source that is hardly known, until they are linearised where they lead:
-        what moves between them, and the errors of sensors that they have in common, are counted as in the rows to come.
-        None where that does not converge, or they contradict each other then.
+        `covariance` (6, 6) is that of the fit. A filter passes over the rows from a nearly flat prior, and linearises
+        them at its last result until this converges. So motion between the rows and their common errors of sensors
+        count as in later rows. Return None if it does not converge, or if the rows contradict each other.
         """
         if len(rows) == 1 and not self.n_errors:
-            return FilteredStart(*self.motion.start(source, symmetric_square_root(covariance)), 0.0)
+            return StartState(*self.motion.start(source, symmetric_square_root(covariance)), 0.0)
         measurements = [self.measurements.of(row) for row in rows]
         dof = sum(measurement.z.size for measurement in measurements) - N_SOURCE
         n, n_errors = self.motion.n_states, self.n_errors
         centres = [np.concatenate([source, np.zeros(n - N_SOURCE + n_errors)])] * len(rows)
-        # Errors of the pose that change are linearised as each row knows them, everything else as all rows together.
+        # Errors of the pose that change are linearised at each row's estimate, all other states at the last one.
         own = np.concatenate([np.full(n, False), self.pose_errors.changes, np.full(self.errors.n_states, False)])
         for _ in range(_MOST_START_STEPS):
-            found = self.filtered_start(centres, covariance, measurements)
+            found = self.filter_start(centres, covariance, measurements)
             step = (found.x - centres[-1])[:N_SOURCE]
             centres = [np.where(own, of_row, found.x) for of_row in found.of_rows]
             if np.all(np.abs(step) < _START_TOLERANCE * np.linalg.norm(found.S[:N_SOURCE], axis=1)):
                 return found if dof <= 0 or found.chi2 < chdtri(dof, CONTRADICTION) else None
         return None
 
-    def filtered_start(
+    def filter_start(
         self, centres: Sequence[FloatArray], covariance: FloatArray, measurements: Sequence[RowMeasurement]
-    ) -> FilteredStart:
-        """One pass of :meth:`start`, with the readings of every row linearised at a state (n,)."""
+    ) -> StartState:
+        """Return the result of one pass of :meth:`start`, with every row linearised at a given state (n,)."""
         unknown = np.diag(_UNKNOWN * np.sqrt(np.diagonal(covariance)))
-        x, S = self.state_before(centres[0], unknown, measurements[0].row.R_world_from_array)
+        x, S = self.initial_state(centres[0], unknown, measurements[0].row.R_world_from_array)
         chi2, of_rows = 0.0, []
         for j, (measurement, centre) in enumerate(zip(measurements, centres, strict=True)):
             if j:
-                prediction = self.predicted(x, S, measurement.row.time_s - measurements[j - 1].row.time_s)
+                prediction = self.predict(x, S, measurement.row.time_s - measurements[j - 1].row.time_s)
                 x, S = prediction.x, prediction.S
             H = measurement.jacobian(centre)
-            x, S, nis = update(x, S, H, measurement.z - measurement.predicted(centre) - H @ (x - centre))
+            x, S, nis = update(x, S, H, measurement.z - measurement.predict(centre) - H @ (x - centre))
             chi2 += nis
             of_rows.append(x)
-        return FilteredStart(x, S, chi2, of_rows)
+        return StartState(x, S, chi2, of_rows)

@@ -22,7 +22,7 @@ from magloc.chi_square import mean_bounds, normalised_square
 from magloc.levels import CONTRADICTION
 from magloc.tracking.chart.mixture import Mixture
 from magloc.tracking.measurement import RowMeasurement
-from magloc.tracking.results import TrackPoint, stacked
+from magloc.tracking.results import TrackPoint, track_column
 from magloc.tracking.row_filter import LEAST_SHARE
 from magloc.tracking.rows import Row
 from magloc.tracking.tracker import Tracker
@@ -119,7 +119,7 @@ def consistency(
     bound_m: FloatArray | None = None,
 ) -> Consistency:
     """Return the errors of a track against true positions and moments (n, 3), NaN where not known."""
-    error = stacked(points, "position_m", 3) - position_m
+    error = track_column(points, "position_m", 3) - position_m
     answered = np.isfinite(error).any(axis=1)
     moments = np.full_like(position_m, np.nan) if moment_Am2 is None else moment_Am2
     measurements = map(tracker.measurements.of, rows)
@@ -168,7 +168,7 @@ def nees_of(point: TrackPoint, truth: FloatArray, measurement: RowMeasurement) -
     if not known.any():
         return math.nan, 0
     if known[:3].all() and point.mixture is not None:
-        return _young_nees(point.mixture.of_source().matched(), truth, measurement)
+        return _young_nees(point.mixture.source_marginal().match_moments(), truth, measurement)
     estimate = np.concatenate([point.position_m, point.moment_Am2])
     error, covariance = truth - estimate, point.covariance
     if known.all():
@@ -195,9 +195,9 @@ def _young_nees(source: Mixture, truth: FloatArray, row: RowMeasurement) -> tupl
 def standard_error(source: Mixture, truth: FloatArray, row: RowMeasurement) -> FloatArray:
     """Return the error (6,) of a component in standard numbers, bent as a row's readings bend."""
     L = source.chart.jacobian(np.zeros((1, truth.size)))[0]
-    J = row.along(source.x[0], L @ source.S[0])
+    J = row.directional_derivative(source.x[0], L @ source.S[0])
     standard = np.linalg.solve(source.S[0], source.chart.coordinates(truth[None])[0])
-    difference = row.of_source(truth) - row.of_source(source.x[0])
+    difference = row.predict_source(truth) - row.predict_source(source.x[0])
     # Bent numbers along what J tells of, in standard deviations of the prediction, more than a share.
     Q, R = np.linalg.qr(np.concatenate([J, LEAST_SHARE * np.eye(J.shape[1])]))
     return np.asarray(standard + np.linalg.solve(R, Q[: len(J)].T @ (difference - J @ standard)))
@@ -316,12 +316,12 @@ def innovation_test(points: Sequence[TrackPoint]) -> InnovationTest:
     paired, corrected = np.isfinite(lag1), np.isfinite(lag1 + correction)
     return InnovationTest(
         int(known.sum()),
-        _standardised(float(np.sum(limited - dof[known])), 2.0 * float(dof[known].sum())),
-        _standardised(float(lag1[paired].sum()), float(dof[paired].sum())),
+        _standard_score(float(np.sum(limited - dof[known])), 2.0 * float(dof[known].sum())),
+        _standard_score(float(lag1[paired].sum()), float(dof[paired].sum())),
         excess=float((lag1 + correction)[corrected].sum()) if corrected.any() else math.nan,
         starts=sum(point.status == "acquired" for point in points),
     )
 
 
-def _standardised(total: float, variance: float) -> float:
+def _standard_score(total: float, variance: float) -> float:
     return total / math.sqrt(variance) if variance > 0.0 else math.nan

@@ -1,21 +1,21 @@
-r"""The coordinates in which a tracked source is Gaussian: log-range, direction, and the moment as it is seen.
+r"""Coordinates in which a tracked source is Gaussian: log-range, direction and scaled moment.
 
-From the sensors' centroid a source stands at the range r in the direction u, and its differences are nearly linear in
-:math:`\mu = m / r^4`. An error of the state is :math:`e = (\delta\lambda, a, \delta\mu, \delta w, \ldots)` with
+A source has the range r and the direction u from the sensors' centroid. Its differences are nearly linear in the scaled
+moment :math:`\mu = m / r^4`. An error of the state is :math:`e = (\delta\lambda, a, \delta\mu, \delta w, \ldots)` with
 
 .. math::
 
     r' = r e^{\delta\lambda}, \qquad u' = \frac{u + E a}{|u + E a|}, \qquad m' = r'^4 (\mu + \delta\mu), \qquad
     v' = r' (w + \delta w)
 
-where E (3, 2) are two directions at right angles to u, and w = v / r. A state that only follows along the valley of
-ranges does so along a straight line, and a constant velocity is free of scale. All further states are plain sums. Means
-are kept as Cartesian states, covariances in these coordinates; :math:`L = \partial x / \partial e`.
+where the columns of E (3, 2) are orthogonal to u, and w = v / r. The valley of sources that readings do not distinguish
+is a straight line in these coordinates, and w does not depend on the scale. All further states are added. Means are
+Cartesian states, covariances are in these coordinates; :math:`L = \partial x / \partial e`.
 
-Within the array's own radius R the range is known and r is no measure of anything: there the chart's origin stands back
-from the centroid, so that the source is R away from it.
+Within the radius R of the array the range is known and is no useful scale. There the origin of the chart moves back
+from the centroid, so that its distance from the source is R.
 
-All functions take leading axes.
+All functions broadcast over leading axes.
 """
 
 from __future__ import annotations
@@ -28,32 +28,32 @@ from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.tracking.motion import N_SOURCE
 
 MOMENT_POWER = 4.0
-"""How differences fall with the range."""
+"""Power of the range with which differences decrease."""
 FIRM = 0.2
-"""σ of a moment as it is seen, over its size, below which its error is one of strength and direction."""
-# Directions at right angles to the chart's own lie at infinity: they are taken as this near to it.
+"""Relative σ of the scaled moment below which its error is one of strength and direction."""
+# A direction orthogonal to that of the chart has infinite coordinates: this bounds the cosine between them.
 _LEAST_COSINE = 0.05
 _VELOCITY = slice(6, 9)
 
 
 @dataclass(frozen=True, eq=False)
 class Chart:
-    """Coordinates about states.
+    """Local coordinates about states.
 
     Attributes
     ----------
     x : ndarray, shape (..., n)
-        States: position, moment, where there is one the velocity, and what else.
+        States: position, moment, the velocity if there is one, and others.
     length : ndarray, shape (...)
-        The range r [m].
+        Range r [m].
     u : ndarray, shape (..., 3)
         Direction from the origin.
     E : ndarray, shape (..., 3, 2)
-        At right angles to it.
+        Two unit vectors orthogonal to `u` and to each other.
     firm : ndarray of bool, shape (...)
-        Whose moment is moved by its strength and its direction: see :meth:`firmly`.
+        States whose moment has strength and direction as coordinates: see :meth:`with_firm_moments`.
     n_pose : int
-        How many of the last numbers of the states are errors of the array's pose.
+        Number of errors of the array's pose, the last numbers of the states.
     power : float
         Power of the range with which moments grow along the chart.
     """
@@ -68,46 +68,48 @@ class Chart:
 
     @classmethod
     def at(cls, x: FloatArray, centroid_m: FloatArray, radius_m: float, n_pose: int = 0) -> Chart:
-        """About states (..., n), from the sensors' centroid (..., 3)."""
+        """Return the chart about states (..., n), with ranges from the sensors' centroid (..., 3)."""
         offset = x[..., :3] - centroid_m
         r = np.sqrt(np.sum(offset * offset, axis=-1))
         safe = np.where(r > 0.0, r, 1.0)[..., None]
         u = np.where(r[..., None] > 0.0, offset / safe, np.array([0.0, 0.0, 1.0]))
         return cls(x, np.maximum(r, radius_m), u, _tangents(u), np.zeros(r.shape, dtype=bool), n_pose)
 
-    def firmly(self, S: FloatArray) -> Chart:
-        r"""The same where the roots (..., n, m) leave little of the moment open: with :math:`n = \delta\mu/|\mu|`,
+    def with_firm_moments(self, S: FloatArray) -> Chart:
+        r"""Return the chart with strength and direction as coordinates of moments that are known well.
+
+        These are the moments whose σ by the roots S (..., n, m) is small. With :math:`n = \delta\mu/|\mu|`,
 
         .. math:: m' = (r'/r)^4 |m| e^{\hat m \cdot n} b/|b|, \qquad b = \hat m + (1 - \hat m \hat m^T) n.
 
-        The derivative at e = 0 is the same. A moment that stays what it is while its range wanders is a straight line
-        here, while :math:`r'^4 (\mu + \delta\mu)` loses the square of each step.
+        The derivative at e = 0 is unchanged. A constant moment at a varying range is a straight line here, while
+        :math:`r'^4 (\mu + \delta\mu)` loses the square of each step.
         """
         size = np.linalg.norm(self.x[..., 3:6], axis=-1) / self.length**self.power
         sigma = np.sqrt(np.sum(S[..., 3:6, :] ** 2, axis=(-2, -1)))
         return replace(self, firm=sigma < FIRM * size)
 
     def take(self, index: IntArray | BoolArray) -> Chart:
-        """About some of the states."""
+        """Return the chart about some of the states."""
         own = self.x[index], self.length[index], self.u[index], self.E[index], self.firm[index]
         return Chart(*own, self.n_pose, self.power)
 
     @property
     def has_velocity(self) -> bool:
-        """Whether the state has one."""
+        """True if the state has a velocity."""
         return self.x.shape[-1] - self.n_pose >= _VELOCITY.stop
 
-    def retracted(self, e: FloatArray) -> FloatArray:
-        """States (..., n) at coordinates (..., n)."""
-        return self._moved(e)[0]
+    def retract(self, e: FloatArray) -> FloatArray:
+        """Return the states (..., n) at coordinates (..., n)."""
+        return self._retract(e)[0]
 
     def jacobian(self, e: FloatArray) -> FloatArray:
-        """L (..., n, n): the derivative of :meth:`retracted`."""
-        return self.linearised(e)[1]
+        """Return L (..., n, n), the derivative of :meth:`retract`."""
+        return self.linearise(e)[1]
 
-    def linearised(self, e: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """States at coordinates, and L there."""
-        x, growth, u, slope, by_moment = self._moved(e)
+    def linearise(self, e: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the states at coordinates, and L there."""
+        x, growth, u, slope, by_moment = self._retract(e)
         n = x.shape[-1]
         L = np.zeros((*x.shape, n))
         L[..., np.arange(n), np.arange(n)] = 1.0
@@ -123,8 +125,8 @@ class Chart:
             L[..., _VELOCITY, _VELOCITY] = reach[..., None, None] * np.eye(3)
         return x, L
 
-    def _moved(self, e: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-        """States, r'/r, u' and its derivative (..., 3, 2) by a, and that of firm moments by r⁴ δμ."""
+    def _retract(self, e: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return states, r'/r, u', ∂u'/∂a (..., 3, 2), and the derivative of firm moments by r⁴ δμ."""
         growth, length = np.exp(e[..., 0]), self.length
         b = self.u + (self.E @ e[..., 1:3, None])[..., 0]
         norm = np.sqrt(np.sum(b * b, axis=-1))
@@ -136,15 +138,15 @@ class Chart:
         x[..., 3:6] = scale[..., None] * (self.x[..., 3:6] + unit[..., None] * e[..., 3:6])
         by_moment = np.zeros((0, 3, 3))
         if self.firm.any():
-            of_strength, by_moment = self._of_strength(e)
-            x[self.firm, 3:6] = scale[self.firm, None] * of_strength
+            firm_moment, by_moment = self._firm_moments(e)
+            x[self.firm, 3:6] = scale[self.firm, None] * firm_moment
         if self.has_velocity:
-            of_unit = self.x[..., _VELOCITY] + length[..., None] * e[..., _VELOCITY]
-            x[..., _VELOCITY] = growth[..., None] * of_unit
+            velocity = self.x[..., _VELOCITY] + length[..., None] * e[..., _VELOCITY]
+            x[..., _VELOCITY] = growth[..., None] * velocity
         return x, growth, u, slope, by_moment
 
-    def _of_strength(self, e: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Firm moments at r' = r (f, 3), and their derivative by r⁴ δμ."""
+    def _firm_moments(self, e: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return firm moments (f, 3) at r' = r, and their derivative by r⁴ δμ."""
         m = self.x[self.firm, 3:6]
         size = np.linalg.norm(m, axis=-1, keepdims=True)
         along = m / size
@@ -154,16 +156,16 @@ class Chart:
         norm = np.linalg.norm(b, axis=-1, keepdims=True)
         b /= norm
         strength = size * np.exp(nu)
-        moved: FloatArray = strength * b
+        moment: FloatArray = strength * b
         one = np.eye(3)
         across = (one - b[:, :, None] * b[:, None, :]) @ (one - along[:, :, None] * along[:, None, :])
-        derivative = (moved[:, :, None] * along[:, None, :] + (strength / norm)[..., None] * across) / size[..., None]
-        return moved, derivative
+        derivative = (moment[:, :, None] * along[:, None, :] + (strength / norm)[..., None] * across) / size[..., None]
+        return moment, derivative
 
     def coordinates(self, x: FloatArray) -> FloatArray:
-        """Return the coordinates (..., n) of states (..., n): the inverse of :meth:`retracted`.
+        """Return the coordinates (..., n) of states (..., n), the inverse of :meth:`retract`.
 
-        Directions of firm moments at right angles to the chart's own lie at infinity.
+        A firm moment orthogonal to that of the chart has infinite coordinates.
         """
         length = self.length[..., None]
         offset = x[..., :3] - self.x[..., :3] + length * self.u
@@ -177,14 +179,14 @@ class Chart:
         moment = x[..., 3:6] / growth**self.power
         change = moment - self.x[..., 3:6]
         if self.firm.any():
-            change[self.firm] = _change_of_strength(self.x[self.firm, 3:6], moment[self.firm])
+            change[self.firm] = _firm_coordinates(self.x[self.firm, 3:6], moment[self.firm])
         e[..., 3:6] = change / length**self.power
         if self.has_velocity:
             e[..., _VELOCITY] = (x[..., _VELOCITY] / growth - self.x[..., _VELOCITY]) / length
         return e
 
     def inverse_jacobian(self) -> FloatArray:
-        """L⁻¹ (..., n, n) at e = 0."""
+        """Return L⁻¹ (..., n, n) at e = 0."""
         n = self.x.shape[-1]
         inverse = np.zeros((*self.x.shape, n))
         inverse[..., np.arange(n), np.arange(n)] = 1.0
@@ -201,8 +203,8 @@ class Chart:
         return inverse
 
 
-def _change_of_strength(before: FloatArray, after: FloatArray) -> FloatArray:
-    """Return n |m| of firm moments (f, 3) that become others: the inverse of what :meth:`Chart.firmly` states."""
+def _firm_coordinates(before: FloatArray, after: FloatArray) -> FloatArray:
+    """Return n |m| of changes of firm moments (f, 3); :meth:`Chart.with_firm_moments` has the inverse."""
     size, strength = (np.linalg.norm(m, axis=-1, keepdims=True) for m in (before, after))
     along, direction = before / size, after / strength
     cosine = np.maximum(np.sum(along * direction, axis=-1, keepdims=True), _LEAST_COSINE)
@@ -211,7 +213,7 @@ def _change_of_strength(before: FloatArray, after: FloatArray) -> FloatArray:
 
 
 def _tangents(u: FloatArray) -> FloatArray:
-    """Two unit vectors (..., 3, 2) at right angles to u and to each other.
+    """Return two unit vectors (..., 3, 2) orthogonal to u and to each other.
 
     Duff et al., "Building an orthonormal basis, revisited".
     """
@@ -225,16 +227,17 @@ def _tangents(u: FloatArray) -> FloatArray:
 
 
 def source_root(chart: Chart, sigma: FloatArray) -> FloatArray:
-    """Root (..., 6, 6) of a Cartesian covariance from standard deviations (..., 6) of a source's coordinates."""
+    """Return Cartesian roots (..., 6, 6) of covariances from σ (..., 6) of a source's coordinates."""
     return chart.jacobian(np.zeros_like(chart.x))[..., :N_SOURCE, :N_SOURCE] * sigma[..., None, :]
 
 
-def mirrored(x: FloatArray, centroid_m: FloatArray) -> FloatArray:
-    r"""States (4, K, n) whose gradient tensor at the sensors' centroid is that of states (K, n); the first are they.
+def mirror_images(x: FloatArray, centroid_m: FloatArray) -> FloatArray:
+    r"""Return states (4, K, n) with the same gradient tensor at the sensors' centroid as states (K, n).
 
-    A far source shows little but its gradient tensor, and that belongs to four sources at one range: with u at the
-    angle 0 and m at β in their common plane, u' stands at :math:`\mathrm{atan2}(s, -\tfrac32 c)` and m' at -β from it,
-    where :math:`(c, s) = |m| (\cos β, \sin β)`; and both may be turned round.
+    The first of the four are the states themselves. Readings of a far source show little more than its gradient tensor,
+    which four sources at one range share. With u at the angle 0 and m at β in their common plane, u' is at
+    :math:`\mathrm{atan2}(s, -\tfrac32 c)` and m' at -β from it, where :math:`(c, s) = |m| (\cos β, \sin β)`. Both may
+    be reversed.
     """
     offset, m = x[:, :3] - centroid_m, x[:, 3:6]
     r = np.linalg.norm(offset, axis=1, keepdims=True)

@@ -23,7 +23,7 @@ from arrays.typing import FloatArray, Vector
 from magloc.chi_square import square_columns
 from magloc.levels import FALSE_ALARM
 from magloc.localization.fit.table import cells_of_strength, cells_of_vector
-from magloc.tracking.results import SourcePoint, SourcesPoint, TrackPoint, TrackResult, stacked
+from magloc.tracking.results import SourcePoint, SourcesPoint, TrackPoint, TrackResult, track_column
 from magloc.truth import STATE_COLUMNS, STATE_QUANTITIES, state_columns
 
 if TYPE_CHECKING:
@@ -116,10 +116,10 @@ def _values(of: object, keys: Sequence[str]) -> dict[str, object]:
 def states_of(points: Sequence[TrackPoint]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return times (n,), positions, moments (n, 3) and covariances (n, 6, 6) of a track, NaN where there is none."""
     return (
-        stacked(points, "time_s"),
-        stacked(points, "position_m", 3),
-        stacked(points, "moment_Am2", 3),
-        stacked(points, "covariance", 6, 6),
+        track_column(points, "time_s"),
+        track_column(points, "position_m", 3),
+        track_column(points, "moment_Am2", 3),
+        track_column(points, "covariance", 6, 6),
     )
 
 
@@ -139,7 +139,7 @@ def columns_of_track(
         nis, nis_dof = np.array([point.nis for point in points]), np.array([point.nis_dof for point in points])
         columns |= square_columns("nis", nis, nis_dof)
         components = (name.split("_")[0] for name in STATE_COLUMNS)
-        estimability = stacked(points, "estimability", 6)
+        estimability = track_column(points, "estimability", 6)
         columns |= dict(zip((f"estimability_{name}" for name in components), estimability.T, strict=True))
     if array_m is not None:
         columns |= dict(zip(("array_x_m", "array_y_m", "array_z_m"), array_m.T, strict=True))
@@ -198,7 +198,7 @@ def at_rest(points: Sequence[TrackPoint]) -> TrackPoint | None:
     known = [point for point in points if point.is_on_track and point.covariance is not None]
     if len(known) < 2:
         return None
-    position, covariance = stacked(known, "position_m", 3), stacked(known, "covariance", 6, 6)[:, :3, :3]
+    position, covariance = track_column(known, "position_m", 3), track_column(known, "covariance", 6, 6)[:, :3, :3]
     best = int(np.argmin(np.trace(covariance, axis1=1, axis2=2)))
     # Places that are known beforehand have no covariance: these are at rest to a nanometre.
     both = covariance + covariance[best] + _SAME_PLACE_M**2 * np.eye(3)

@@ -1,12 +1,12 @@
-r"""What one row measures of a tracked source, and coordinates that bend as its readings do.
+r"""Measurement model of one row for a tracked source, and coordinates in which its posterior is Gaussian.
 
-What rows told of a source is nearly Gaussian in what they measured, not in position and moment: of a weak source the
-direction and the moment are known only together, along a curve. Errors are counted in
+The posterior of a source is nearly Gaussian in the predicted readings, not in position and moment: direction and moment
+of a weak source are correlated along a curve. Errors are counted in the coordinates
 
 .. math:: c(x) = M (h(x) - h(x_0)), \qquad M H(x_0) = I
 
 with the predicted differences h of the source in units of their noise, their Jacobian H, and the estimate
-:math:`x_0`: to first order c is position and moment, and to second order it bends as the readings do.
+:math:`x_0`. To first order c is position and moment; to second order it is as nonlinear as the readings.
 """
 
 from __future__ import annotations
@@ -33,23 +33,23 @@ from magloc.tracking.row_filter import Rows
 from magloc.tracking.rows import Row
 
 LEAST_SINGULAR = 1e-6
-"""A row has no coordinates of its own if a column of its Jacobian, in units of what is known, is so near to others."""
+"""Least ratio of the diagonal of R of a scaled Jacobian (QR) for which a row determines coordinates."""
 
 
 def whitening(effect: FloatArray) -> FloatArray:
-    r"""Matrix (k, k) that whitens unit noise and errors of unit variance with an effect :math:`\Phi` (k, n) on it.
+    r"""Return the matrix (k, k) that whitens unit noise plus errors of unit variance with an effect (k, n).
 
-    :math:`L^{-1}` of :math:`L L^T = 1 + \Phi \Phi^T`.
+    With the effect :math:`\Phi` it is :math:`L^{-1}`, where :math:`L L^T = 1 + \Phi \Phi^T`.
     """
     return np.linalg.inv(np.linalg.cholesky(np.eye(len(effect)) + effect @ effect.T))
 
 
 @dataclass(frozen=True, eq=False)
 class RowMeasurement:
-    """Differences of one row, in units of their noise, as a function of states (..., n) in the world frame.
+    """Model of one row's differences, in units of their noise, for states (..., n) in the world frame.
 
-    A state is that of the motion, behind it errors of the pose and of the ambient field, and behind these the errors of
-    sensors, in which readings are linear. The first two are counted in a chart, where a prediction bends as a whole.
+    A state has the states of the motion first, then errors of the pose and of the ambient field, then errors of the
+    sensors, in which readings are linear. The first two have coordinates in a chart.
 
     Attributes
     ----------
@@ -59,13 +59,13 @@ class RowMeasurement:
         Standard deviations of the differences [T].
     row : Row
     n_motion : int
-        States of the motion.
+        Number of states of the motion.
     effect : ndarray, shape (k, n_errors)
-        Of the sensors' errors on the differences, in units of their noise.
+        Effect of the sensors' errors on the differences, in units of their noise.
     pose : ArrayPose
-        As the row states it.
+        Pose that the row states.
     pose_effect : ndarray, shape (12, n_pose)
-        Of the errors of the pose and of the ambient field on it.
+        Effect of the errors of the pose and of the ambient field on the pose.
     """
 
     model: DifferenceMeasurement
@@ -88,40 +88,40 @@ class RowMeasurement:
 
     @property
     def n_pose(self) -> int:
-        """Number of the pose's errors."""
+        """Number of errors of the pose."""
         return self.pose_effect.shape[1]
 
     @property
     def n_charted(self) -> int:
-        """States of the motion and errors of the pose."""
+        """Number of states with coordinates in a chart: those of the motion and errors of the pose."""
         return self.n_motion + self.n_pose
 
     @property
     def n_states(self) -> int:
-        """Of the motion, of the errors of the pose and of those of the sensors."""
+        """Number of states: motion, errors of the pose, errors of the sensors."""
         return self.n_charted + self.effect.shape[1]
 
     @cached_property
     def centroid_m(self) -> FloatArray:
-        """Of the sensors in the world frame, shape (3,)."""
+        """Centroid of the sensors in the world frame, shape (3,)."""
         return self.row.origin_m + self.row.R_world_from_array @ self.model.array.centroid
 
     @property
     def radius_m(self) -> float:
-        """Largest distance of a sensor from it."""
+        """Largest distance of a sensor from the centroid."""
         return self.model.array.circumradius
 
     @cached_property
-    def compiled(self) -> Rows:
-        """The row as kernels take it."""
-        return stacked([self])
+    def kernel_rows(self) -> Rows:
+        """The row as an argument of kernels."""
+        return stack_rows([self])
 
     def chart(self, x: FloatArray) -> Chart:
         """Return the charts about states (..., n_charted)."""
         return Chart.at(x, self.centroid_m, self.radius_m, self.n_pose)
 
-    def padded(self, k: int) -> RowMeasurement:
-        """Return the row with k differences: those behind its own are zero, of unit noise, and see no source."""
+    def pad(self, k: int) -> RowMeasurement:
+        """Return the row padded to k differences, with zeros of unit noise that do not depend on the source."""
         more = k - self.n_differences
         differences = Differences(
             np.pad(self.model.differences.transform, ((0, more), (0, 0))),
@@ -136,7 +136,7 @@ class RowMeasurement:
         return padded if more else self
 
     def with_errors_as_noise(self, sigma: FloatArray) -> RowMeasurement:
-        """Return the row alone: the sensors' errors, known by their σ (n_errors,), are part of its noise."""
+        """Return the row with the sensors' errors, of standard deviations (n_errors,), as part of its noise."""
         if not sigma.size:
             return self
         whiten, k = whitening(self.effect * sigma), self.n_differences
@@ -144,8 +144,8 @@ class RowMeasurement:
         model = replace(self.model, differences=differences)
         return replace(self, model=model, sigma=np.ones(k), effect=np.zeros((k, 0)))
 
-    def of_source(self, state: FloatArray, others_T: FloatArray | None = None) -> FloatArray:
-        """Return the predicted differences (..., k) of sources (..., 6) or states, sensors being without errors.
+    def predict_source(self, state: FloatArray, others_T: FloatArray | None = None) -> FloatArray:
+        """Return the predicted differences (..., k) of sources (..., 6) or states, without errors of sensors.
 
         `others_T` (N, 3) is the field of other sources at the sensors.
         """
@@ -153,8 +153,10 @@ class RowMeasurement:
         in_array = self.pose.in_array(state[..., :N_SOURCE], error)
         return self.model.predicted(in_array[..., :3], in_array[..., 3:], self._ambient_T(error, others_T)) / self.sigma
 
-    def along(self, state: FloatArray, directions: FloatArray, others_T: FloatArray | None = None) -> FloatArray:
-        """Return their derivative (..., k, m) along directions (..., n, m) in sources or states."""
+    def directional_derivative(
+        self, state: FloatArray, directions: FloatArray, others_T: FloatArray | None = None
+    ) -> FloatArray:
+        """Return the derivative (..., k, m) of :meth:`predict_source` along directions (..., n, m)."""
         error = self._pose_error(state)
         in_array = self.pose.in_array(state[..., :N_SOURCE], error)
         H = self.model.jacobian(in_array[..., :3], in_array[..., 3:], self._ambient_T(error, others_T))
@@ -180,36 +182,36 @@ class RowMeasurement:
         in_array = self.pose.in_array(source)
         return dipole.field(self.model.array.positions, in_array[:3], in_array[3:])
 
-    def predicted(self, state: FloatArray) -> FloatArray:
-        """Return the predicted differences (k,) of a state (n,) with its errors of sensors."""
-        return self.of_source(state) + self.effect @ state[self.n_charted :]
+    def predict(self, state: FloatArray) -> FloatArray:
+        """Return the predicted differences (k,) of a state (n,), with its errors of sensors."""
+        return self.predict_source(state) + self.effect @ state[self.n_charted :]
 
     def jacobian(self, state: FloatArray) -> FloatArray:
-        """Return their Jacobian (k, n)."""
-        return np.concatenate([self.along(state, np.eye(self.n_charted)), self.effect], axis=1)
+        """Return the Jacobian (k, n) of the predicted differences."""
+        return np.concatenate([self.directional_derivative(state, np.eye(self.n_charted)), self.effect], axis=1)
 
     def without_errors(self, source: FloatArray) -> FloatArray:
-        """Return the state (n,) of a source (6,) at rest where nothing has an error."""
+        """Return the state (n,) of a source (6,) at rest, with all errors zero."""
         return np.concatenate([source, np.zeros(self.n_states - N_SOURCE)])
 
     @cached_property
     def without_source(self) -> FloatArray:
-        """What is left of the measured differences (k,) when the ambient field's own are taken out."""
+        """Measured differences (k,) minus those of the ambient field."""
         array = self.model.array
         ambient = array.readings_of(array.ambient_fields) - array.channel_offset_T
         return self.z - (self.model.differences.transform @ ambient) / self.sigma
 
     @cached_property
     def whitening(self) -> FloatArray:
-        """``C^{-1/2}`` (k, k) of a row without a source: what its pose's errors make of the ambient field is noise."""
+        """``C^{-1/2}`` (k, k) of a row without a source; errors of the pose act on the ambient field as noise."""
         if not self.n_pose:
             return np.eye(self.n_differences)
-        # Sources without a moment: what is left is the ambient field, turned by the pose's errors.
+        # Without a moment the rest is the ambient field, rotated by the errors of the pose.
         nowhere = self.pose.in_array(np.zeros(N_SOURCE))
-        return whitening(where_smooth(self._by_pose(np.zeros((len(self.sigma), N_SOURCE)), nowhere, np.zeros(N_POSE))))
+        return whitening(zero_if_nan(self._by_pose(np.zeros((len(self.sigma), N_SOURCE)), nowhere, np.zeros(N_POSE))))
 
     def is_detected(self, sigma_errors: FloatArray) -> bool:
-        """Return whether the differences stand out of noise and of what errors of sensors and pose may make of them."""
+        """Return True if the differences exceed noise and the effects of errors of sensors and pose."""
         if not self.z.size:
             return False
         alone = self.with_errors_as_noise(sigma_errors)
@@ -217,10 +219,10 @@ class RowMeasurement:
         return bool(left @ left > energy_threshold(left.size))
 
     def coordinates(self, state: FloatArray, unit: FloatArray, *, of_readings: bool = True) -> Coordinates:
-        """Return coordinates about a state (n,), where `unit` (6,) is what is known of position and moment.
+        """Return coordinates about a state (n,); `unit` (6,) are standard deviations of position and moment.
 
-        They bend as the readings do, if these determine a source; else, or if not `of_readings`, as its place in the
-        array's axes does with the errors of the pose.
+        They are as nonlinear as the readings, if these determine a source. Otherwise, or if not `of_readings`, they are
+        as nonlinear as position and moment in the array's axes are in the errors of the pose.
         """
         if of_readings and len(self.sigma) >= N_SOURCE:
             G = self.jacobian(state)
@@ -228,24 +230,24 @@ class RowMeasurement:
             diagonal = np.abs(np.diagonal(R))
             if diagonal.min() > LEAST_SINGULAR * diagonal.max():
                 M = unit[:, None] * np.linalg.solve(R, Q.T)
-                return Coordinates(state, self.predicted, self.jacobian, M, self.predicted(state), M @ G)
+                return Coordinates(state, self.predict, self.jacobian, M, self.predict(state), M @ G)
         G = self._in_array_jacobian(state)
         M = G[:, :N_SOURCE].T
         return Coordinates(state, self._in_array, self._in_array_jacobian, M, self._in_array(state), M @ G)
 
     def place_in_array(self, state: FloatArray, S: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the offset (3,) of the source from the centroid in the array's axes, and a root (3, n) of its P.
+        """Return the source's offset (3,) from the centroid in the array's axes, and a root (3, n) of its covariance.
 
-        An error of the pose moves the source in the world, not from the array.
+        An error of the pose moves the source in the world, not relative to the array.
         """
         return self._in_array(state)[:3] - self.model.array.centroid, (self._in_array_jacobian(state) @ S)[:3]
 
     def _in_array(self, state: FloatArray) -> FloatArray:
-        """Position and moment (6,) of a state in the true axes of the array."""
+        """Return position and moment (6,) of a state in the true axes of the array."""
         return self.pose.in_array(state[:N_SOURCE], self._pose_error(state))
 
     def _in_array_jacobian(self, state: FloatArray) -> FloatArray:
-        """Their Jacobian (6, n)."""
+        """Return the Jacobian (6, n) of position and moment in the true axes of the array."""
         error = self._pose_error(state)
         full = np.zeros((N_SOURCE, state.size))
         full[:, :N_SOURCE] = self._by_source(np.eye(N_SOURCE), error)
@@ -255,35 +257,35 @@ class RowMeasurement:
         return full
 
     def _pose_error(self, state: FloatArray) -> FloatArray | None:
-        """Errors (..., 12) of the pose that states stand for, None where they are of a source alone."""
+        """Return the errors (..., 12) of the pose in states, or None if these are of a source alone."""
         if not self.n_pose or state.shape[-1] == N_SOURCE:
             return None
         return np.asarray(state[..., self.n_motion : self.n_charted] @ self.pose_effect.T)
 
     def _by_source(self, H: FloatArray, error: FloatArray | None) -> FloatArray:
-        """Jacobian (..., k, 6) by sources of the world, from that by sources in the array's axes."""
+        """Return the Jacobian (..., k, 6) by sources in the world, from that by sources in the array's axes."""
         RT = np.swapaxes(self.pose.turned(error), -1, -2)
         return np.concatenate([H[..., :3] @ RT, H[..., 3:] @ RT], axis=-1)
 
     def _by_pose(self, H: FloatArray, in_array: FloatArray, error: FloatArray) -> FloatArray:
-        """Jacobian (..., k, n_pose) by the pose's errors."""
+        """Return the Jacobian (..., k, n_pose) by the errors of the pose."""
         array, whiten = self.model.array, self.model.differences.transform / self.sigma[:, None]
         by_error = H @ self.pose.error_jacobian(in_array, error)
         by_error += whiten @ self.pose.ambient_jacobian(array, in_array, error, array.ambient_fields)
         return np.asarray(by_error @ self.pose_effect)
 
     def _ambient_T(self, error: FloatArray | None, others_T: FloatArray | None) -> FloatArray | None:
-        """Fields at the sensors (..., N, 3) besides the sources'; None: the array's own ambient field, unturned."""
+        """Return the field (..., N, 3) at the sensors without the source, or None for the array's own ambient field."""
         if error is None:
             return None if others_T is None else self.model.array.ambient_fields + others_T
         ambient_T = self.pose.ambient(self.model.array.ambient_fields, error)
         return ambient_T if others_T is None else ambient_T + others_T
 
 
-def stacked(rows: Sequence[RowMeasurement]) -> Rows:
-    """Return rows of one array as kernels take them."""
+def stack_rows(rows: Sequence[RowMeasurement]) -> Rows:
+    """Return rows of one array as an argument of kernels."""
     k = max(row.n_differences for row in rows)
-    padded = [row.padded(k) for row in rows]
+    padded = [row.pad(k) for row in rows]
     return Rows(
         rows[0].model.array,
         np.stack([row.z for row in padded]),
@@ -299,28 +301,31 @@ def stacked(rows: Sequence[RowMeasurement]) -> Rows:
     )
 
 
-def where_smooth(derivative: FloatArray) -> FloatArray:
-    """Zero in place of NaN: differences of moduli in no ambient field, which have a corner where the source is none."""
+def zero_if_nan(derivative: FloatArray) -> FloatArray:
+    """Return a derivative with zeros in place of NaN.
+
+    Moduli without an ambient field have no derivative at a moment of zero.
+    """
     return np.where(np.isnan(derivative), 0.0, derivative)
 
 
 class RowMeasurements:
-    """What the rows of an array measure, without the noise that lasts: that is the states behind those of the motion.
+    """Measurement models of the rows of an array, with lasting errors as states in place of noise.
 
     Parameters
     ----------
     array : SensorArray
     n_motion : int
-        States of the motion.
+        Number of states of the motion.
     background : Drift, optional
-        What all channels have besides.
+        Drift of every channel.
 
     Attributes
     ----------
     errors : SensorErrors
-        The lasting errors of the array's sensors, and the background: the last states.
+        Lasting errors of the array's sensors, and the background: the last states.
     pose_errors : PoseErrors
-        Those of its pose and of the ambient field, before them.
+        Errors of the pose and of the ambient field: the states before `errors`.
     """
 
     def __init__(self, array: SensorArray, n_motion: int, background: Drift | None = None) -> None:
@@ -333,7 +338,7 @@ class RowMeasurements:
         self._differences: dict[bytes, Differences] = {}
 
     def of(self, row: Row) -> RowMeasurement:
-        """What a row's readings say of the state."""
+        """Return the measurement model of a row."""
         array = self._array
         if row.ambient_T is not None:
             array = array.in_ambient_field(row.ambient_T)
@@ -347,7 +352,7 @@ class RowMeasurements:
         return RowMeasurement(model, sigma, row, self._n_motion, effect, pose, of_pose)
 
     def differences(self, row: Row) -> Differences:
-        """The independent differences that a row's readings give."""
+        """Return the independent differences of a row's readings."""
         available = np.isfinite(row.readings_T)
         if self._noise_varies:
             covariance = reading_covariance(self._array, row.readings_T)
@@ -360,18 +365,18 @@ class RowMeasurements:
 
 @dataclass(frozen=True, eq=False)
 class Coordinates:
-    """Six coordinates of a state, to first order its position and moment where errors are held; the others stay.
+    """Six coordinates of a state: to first order its position and moment, if the errors are held.
 
     Attributes
     ----------
     centre : ndarray, shape (n,)
-        The state that they are counted from.
+        State at the origin of the coordinates.
     function, jacobian : callable
-        What bends as they do: (n,) -> (k,), and its derivative (k, n).
+        Function (n,) -> (k,) that is as nonlinear as the coordinates, and its derivative (k, n).
     M : ndarray, shape (6, k)
-        They are M times its change.
+        The coordinates are M times the change of the function.
     value, J : ndarray, shapes (k,) and (6, n)
-        At the centre: of the function, and the derivative of the coordinates.
+        Value of the function at the centre, and derivative of the coordinates there.
     """
 
     centre: FloatArray
@@ -382,7 +387,7 @@ class Coordinates:
     J: FloatArray
 
     def at(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Coordinates (6,) of a state (n,), and their derivative (6, n)."""
+        """Return the coordinates (6,) of a state (n,), and their derivative (6, n)."""
         if np.array_equal(state, self.centre):
             return np.zeros(N_SOURCE), self.J
         return self.M @ (self.function(state) - self.value), self.M @ self.jacobian(state)

@@ -98,7 +98,7 @@ class MotionModel(Protocol):
 
 @runtime_checkable
 class LinearMotion(MotionModel, Protocol):
-    """Motion whose step depends on the state only by the strength of the moment; it has compiled steps."""
+    """Motion whose step is linear but for noise proportional to the moment's strength; it has compiled steps."""
 
     def linear_step(self, dt_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return F, and A and B (n, m) of the noise ``S_q = A + |m| B``."""
@@ -164,7 +164,7 @@ class RandomWalk(_MovingState):
 
 @dataclass(frozen=True)
 class OrnsteinUhlenbeck(_MovingState):
-    r"""Velocity and rate of turn as Ornstein-Uhlenbeck processes: they wander about zero and last for a time τ.
+    r"""Velocity and rate of turn as Ornstein-Uhlenbeck processes of mean zero and correlation time τ.
 
     State (p, m, v, ω), with
 
@@ -206,14 +206,14 @@ class OrnsteinUhlenbeck(_MovingState):
 
     def turning_step(self, dt_s: float) -> FloatArray:
         """Return the numbers (12,) of a step for the C++ kernel."""
-        moved, kept, root = wandering_step(self._correlation_s, dt_s)
+        moved, kept, root = ornstein_uhlenbeck_step(self._correlation_s, dt_s)
         lower = root[[0, 1, 1], [0, 0, 1]]
         change = self.moment_change * math.sqrt(dt_s)
         return np.array([moved, kept, moved, kept, *self.speed_m_s * lower, *self.turn_rad_s * lower, change, change])
 
     def step(self, x: FloatArray, dt_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the prediction, see :class:`MotionModel`."""
-        moved, kept, root = wandering_step(self._correlation_s, dt_s)
+        moved, kept, root = ornstein_uhlenbeck_step(self._correlation_s, dt_s)
         p, m, v, rate = x[:3], x[3:6], x[6:9], x[9:]
         turn = rotation_matrix(moved * rate)
         turned = turn @ m
@@ -311,8 +311,8 @@ def known_motions(measured: MeasuredMotion, unknown: RandomWalk) -> list[KnownMo
 
 
 @lru_cache(maxsize=64)
-def wandering_step(correlation_s: float, dt_s: float) -> tuple[float, float, FloatArray]:
-    """Return the entries of F of (value, rate), and the square root of its noise for a rate with σ = 1."""
+def ornstein_uhlenbeck_step(correlation_s: float, dt_s: float) -> tuple[float, float, FloatArray]:
+    """Return the entries of F of (value, rate), and a square root (2, 2) of the noise for a rate with σ = 1."""
     if dt_s == 0.0:
         return 0.0, 1.0, np.zeros((2, 2))
     if dt_s > correlation_s:
@@ -334,16 +334,16 @@ def wandering_step(correlation_s: float, dt_s: float) -> tuple[float, float, Flo
 
 @dataclass(frozen=True)
 class CoordinatedTurn(_MovingState):
-    r"""Steady turn about the vertical, as of a vehicle: velocity and moment turn with one rate, which wanders.
+    r"""Turn of a vehicle about the vertical: velocity and moment turn at one rate, a random walk.
 
     State (p, m, v, ω): :math:`\dot p = v`, :math:`\dot v = ω e_z × v`, :math:`\dot m = ω e_z × m`.
 
     Attributes
     ----------
     speed_m_s, turn_rad_s : float
-        Standard deviations of the velocity along each axis, and of the turn rate, before anything is known.
+        Prior standard deviations of the velocity along each axis, and of the turn rate.
     acceleration_m_s2 : float
-        Random walk of the velocity beside the turn [m/s/√s].
+        Random walk of the velocity besides the turn [m/s/√s].
     turn_change_rad_s : float
         Random walk of the turn rate [rad/s/√s].
     moment_change : float

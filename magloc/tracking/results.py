@@ -1,4 +1,4 @@
-"""Points of tracks of one source or several, and what led to them."""
+"""Points of tracks of one source or several, and the steps of the filter."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ UNDETERMINED = "undetermined"
 
 @dataclass(frozen=True, eq=False)
 class Innovation:
-    """Whitened innovations (k,) of a row, the channels (C,) that it has, and :attr:`TrackPoint.correction`."""
+    """Whitened innovations (k,) of a row, its available channels (C,), and :attr:`TrackPoint.correction`."""
 
     available: BoolArray
     whitened: FloatArray
     correction: float = math.nan
 
-    def after(self, before: Innovation | None) -> dict[str, Any]:
-        """Return NIS, its degrees of freedom, and the product with the innovation before, if of the same channels."""
+    def statistics(self, before: Innovation | None) -> dict[str, Any]:
+        """Return NIS, its degrees of freedom, the correction, and the product with the innovation before."""
         same = before is not None and np.array_equal(before.available, self.available)
         return {
             "nis": float(self.whitened @ self.whitened),
@@ -73,9 +73,9 @@ class TrackPoint:
         Product of the whitened innovations of this row and the one before: mean zero and variance `nis_dof` for a right
         model. NaN if the row before has none, or other channels.
     correction : float
-        Squared correction of the prediction by the readings, in its standard deviations, less its mean: mean zero for a
-        right model, and less if predictions are better than is claimed. NaN without a prediction, and if errors of
-        sensors or pose are states.
+        Squared correction of the prediction by the readings, in its standard deviations, minus its mean: zero on
+        average for a right model, and less if predictions are better than their covariance. NaN without a prediction,
+        and if errors of sensors or pose are states.
     dropped_sensors : tuple of str
         Sensors left out because they contradict the others.
     mixture : Mixture, optional
@@ -189,21 +189,21 @@ class SourcesPoint:
     dropped_sensors: tuple[str, ...] = ()
 
 
-def learned(variance: FloatArray, open_loop: FloatArray) -> FloatArray:
-    """Return the estimability 1 - σ / σ₀ from the variances with readings and without any."""
+def estimability(variance: FloatArray, open_loop: FloatArray) -> FloatArray:
+    """Return the estimability 1 - σ / σ₀ from the variances with and without readings."""
     return 1.0 - np.sqrt(np.minimum(variance / open_loop, 1.0))
 
 
-def of_mixture(time_s: float, mixture: Mixture, open_loop: FloatArray) -> TrackPoint:
+def point_of_mixture(time_s: float, mixture: Mixture, open_loop: FloatArray) -> TrackPoint:
     """Return the point of a mixture; open_loop (n,) are the variances without any readings."""
-    source = mixture.of_source()
+    source = mixture.source_marginal()
     mean, covariance = source.moments()
     return TrackPoint(
         time_s,
         mean[:3],
         mean[3:],
         covariance,
-        learned(np.diagonal(covariance), open_loop[:N_SOURCE]),
+        estimability(np.diagonal(covariance), open_loop[:N_SOURCE]),
         weight=float(source.weight.max()),
         centroid_m=source.centroid_m,
         radius_m=source.radius_m,
@@ -213,7 +213,7 @@ def of_mixture(time_s: float, mixture: Mixture, open_loop: FloatArray) -> TrackP
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """Predicted state, square root of its covariance, and the transition that led there."""
+    """Predicted state, square root of its covariance, and transition matrix."""
 
     x: FloatArray
     S: FloatArray
@@ -222,7 +222,7 @@ class Prediction:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """Step of a track, for the smoother.
+    """One step of a filter, as the smoother needs it.
 
     Attributes
     ----------
@@ -249,11 +249,13 @@ def warn_of_strengths(points: Iterable[TrackPoint]) -> None:
     """Warn if most points of a track have a moment that no object at their distance has."""
     known = [point for point in points if point.is_on_track and point.centroid_m is not None]
     if known:
-        places, moments, centroids = (stacked(known, name, 3) for name in ("position_m", "moment_Am2", "centroid_m"))
+        places, moments, centroids = (
+            track_column(known, name, 3) for name in ("position_m", "moment_Am2", "centroid_m")
+        )
         warn_of_moments(np.linalg.norm(places - centroids, axis=1), moments)
 
 
-def stacked(points: Sequence[TrackPoint], name: str, *shape: int) -> FloatArray:
+def track_column(points: Sequence[TrackPoint], name: str, *shape: int) -> FloatArray:
     """Return a column of a track (n, ...), NaN where there is no track."""
     empty = np.full(shape, np.nan)
     values = [empty if value is None else value for value in (getattr(point, name) for point in points)]

@@ -1,4 +1,4 @@
-"""Steps of a filter of several sources, compiled: predict, update by a row of readings, and how far readings bend.
+"""Compiled steps of a filter of several sources: predict, update, smooth, and the nonlinearity of readings.
 
 :mod:`magloc.tracking.coordinates` explains the chart; tests/magloc/tracking/test_row_filter.py has the reference.
 """
@@ -22,19 +22,19 @@ from magloc.tracking.coordinates import FIRM
 from magloc.tracking.motion import N_SOURCE, MotionModel, OrnsteinUhlenbeck
 
 TOLERANCE = 1e-3
-"""Stop of the iteration: length of the next step in posterior standard deviations."""
+"""Length of the next step, in posterior standard deviations, at which the iteration stops."""
 LEAST_GAIN = 0.25
-"""Of the decrease that a linear problem would show, below which a step is halved: it leads across a valley."""
+"""Least share of the decrease of a linear problem; a step with less is halved, because it leads across a valley."""
 MOST_ITERATIONS = 50
 ROUNDING = 1e-9
-"""Steps that make the fit worse by more are halved."""
+"""Relative increase of the cost that counts as rounding; a step with more is halved."""
 LEAST_SHARE = 0.02
-"""A prediction bends as a row's readings do along what the row tells, in standard deviations of the prediction, more
-than this: of less the other rows told, which may bend otherwise."""
+"""Change of whitened readings over one σ of the prediction, above which a direction is as nonlinear as the readings of
+the row. Directions with less were measured by other rows, whose nonlinearity may differ."""
 _ROWS_A_CALL = 1000
 """Rows of trajectories that one call of the kernel smooths: some 10 ms."""
 _FOLLOWED = 1e-3
-"""Variance of readings beside their noise in the test of sensors: one that the fit follows wholly tells nothing."""
+"""Added variance of residuals in the test of sensors, so that a reading that the fit follows exactly does not count."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,14 +44,14 @@ class Gaussians:
     Attributes
     ----------
     x : ndarray, shape (C, N)
-        Means: the Cartesian state of every source, and behind them nuisances that are linear in the readings.
+        Means: the Cartesian states of the sources, then nuisances in which readings are linear.
     S : ndarray, shape (C, N, N)
         Roots of the covariances, in the charts about the means.
     n_sources, n_nuisances : int
     power : int
-        Power of the range with which moments grow along the chart: 4 as differences fall, or 0.
+        Power of the range with which moments grow along the chart: 4, with which differences decrease, or 0.
     firm : float
-        Share of a moment that is open, below which its strength and direction are its coordinates.
+        Relative σ of a moment below which its strength and direction are its coordinates.
     """
 
     x: FloatArray
@@ -63,7 +63,7 @@ class Gaussians:
 
     @property
     def problem(self) -> core.Problem:
-        """Return the arguments of kernels."""
+        """Arguments of kernels."""
         return core.problem(
             "sources",
             n_sources=self.n_sources,
@@ -75,8 +75,8 @@ class Gaussians:
             roots=np.ascontiguousarray(self.S),
         )
 
-    def unfilled(self) -> Gaussians:
-        """Return as many, to be filled."""
+    def empty_like(self) -> Gaussians:
+        """Return as many Gaussians without values."""
         return replace(self, x=np.empty_like(self.x, order="C"), S=np.empty_like(self.S, order="C"))
 
 
@@ -88,11 +88,11 @@ class Rows:
     ----------
     array : SensorArray
     readings : ndarray, shape (n, k)
-        Differences in units of their noise, zero behind the last one of a row.
+        Differences in units of their noise, padded by zeros.
     counts : ndarray of int, shape (n,)
         Number of differences of each row.
     transforms, transform_of_row : ndarray, shapes (m, k, n_channels) and (n,)
-        From channels to differences.
+        Matrices from channels to differences, and the index of that of each row.
     effects : ndarray, shape (n or 1, k, n_nuisances)
         Effects of nuisances on the readings.
     origins_m, rotations : ndarray, shapes (n, 3) and (n, 3, 3)
@@ -100,9 +100,9 @@ class Rows:
     ambients_T : ndarray, shape (n or 1, n_sensors, 3)
         Field at the sensors without a source.
     pose_effects : ndarray, shape (n, 12, n_pose), optional
-        Effects on the pose and the ambient field of errors of theirs.
+        Effects of errors of the pose and of the ambient field.
     lever_arm_m : tuple of 3 floats
-        From the pose's reference point to the array's origin, in the array's axes.
+        Vector from the pose's reference point to the array's origin, in the array's axes.
     """
 
     array: SensorArray
@@ -124,7 +124,7 @@ class Rows:
 
     @cached_property
     def problem(self) -> core.Problem:
-        """Return the arguments of kernels."""
+        """Arguments of kernels."""
         array, order = self.array, np.arange(len(self.readings))
         return core.problem(
             "rows",
@@ -156,17 +156,17 @@ class Rows:
 
 @dataclass(frozen=True, eq=False)
 class RowUpdates:
-    """Gaussians after a row's readings; see :class:`magloc.tracking.chart.update.Updated`.
+    """Gaussians after a row's readings; see :class:`magloc.tracking.chart.update.StateUpdates`.
 
     Attributes
     ----------
     correction : ndarray, shape (C,), optional
-        Square by which the readings move the prediction, in its standard deviations, less its mean.
+        Squared correction of the prediction by the readings, in its standard deviations, minus its mean.
     standardised : ndarray, shape (C, n_sensors, 3), optional
-        Residuals of each sensor's channels, of unit covariance. Their square is by how much less `nis` would be if the
-        readings of the sensor were free.
+        Residuals of each sensor's channels, of unit covariance. Their sum of squares is the decrease of `nis` if the
+        readings of the sensor are left out.
     misfits : ndarray, shape (C, 2, k), optional
-        Readings less predicted ones, at the prediction and after the update.
+        Readings minus predicted ones, at the prediction and after the update.
     projectors : ndarray, shape (C, 2, d, k), optional
         Q at the same states: I - Qᵀ Q is the inverse of the readings' covariance in units of their noise.
     """
@@ -185,23 +185,23 @@ class RowUpdates:
 
     @property
     def x(self) -> FloatArray:
-        """Return the means (C, N)."""
+        """Means (C, N)."""
         return self.after.x
 
     @property
     def S(self) -> FloatArray:
-        """Return the roots (C, N, N)."""
+        """Roots (C, N, N)."""
         return self.after.S
 
     def whitened_innovation(self, index: int) -> FloatArray:
-        """Return the innovation of one of them."""
+        """Return the whitened innovation of one Gaussian."""
         assert self.innovation is not None
         return np.asarray(self.innovation[index])
 
 
 @cache
 def convergence(most: int = MOST_ITERATIONS, tolerance: float = TOLERANCE) -> core.Problem:
-    """Return when an iterated update ends, at the latest after some trials."""
+    """Return the stopping rule of an iterated update, with the largest number of trials."""
     return core.problem(
         "convergence", tolerance=tolerance, least_gain=LEAST_GAIN, rounding=ROUNDING, max_iterations=most
     )
@@ -214,20 +214,20 @@ def steps_problem(
     nuisances: tuple[FloatArray, FloatArray] | None = None,
     states: FloatArray | None = None,
 ) -> core.Problem:
-    """Return how sources move in steps of some lengths.
+    """Return the motion of sources in steps of given lengths, as an argument of kernels.
 
     Parameters
     ----------
     motions : MotionModel, or sequence of them
-        Of all steps, or of each; of one class.
+        Motion of all steps, or of each step; of one class.
     steps_s : sequence of float
     step_of_row : ndarray of int, shape (n_rows,)
         Index of the step that leads to each row.
     nuisances : tuple of ndarray, optional
-        Part of nuisances that each step keeps, and standard deviation of what it adds, (n_steps, n_nuisances) each.
+        Factor of each nuisance in each step, and σ of the added noise, (n_steps, n_nuisances) each.
     states : ndarray, shape (n, n_states), optional
-        States before each step of every source of every Gaussian, for a motion that is neither linear nor a lasting
-        rate of turn.
+        States before each step of every source of every Gaussian, for a motion that is neither linear nor
+        :class:`OrnsteinUhlenbeck`.
     """
     F = A = B = moved = turning = None
     n_noise = 15
@@ -259,7 +259,7 @@ def steps_problem(
 
 
 def refill_step(steps: core.Problem, slot: int, motion: MotionModel, errors: SensorErrors, dt_s: float) -> None:
-    """Replace one of the steps of :func:`steps_problem`, without states, by that of another length."""
+    """Replace one step of :func:`steps_problem`, made without states, by one of another length."""
     kept = steps.kept
     if kept["added"] is not None:
         kept["kept"][slot], kept["added"][slot] = errors.step(dt_s)
@@ -270,8 +270,8 @@ def refill_step(steps: core.Problem, slot: int, motion: MotionModel, errors: Sen
 
 
 def predict(before: Gaussians, centroid_m: FloatArray, steps: core.Problem, rows: Rows, row: int = 0) -> Gaussians:
-    """Return Gaussians after the step to a row; the sensors' centroid stood at `centroid_m` before."""
-    after = before.unfilled()
+    """Return Gaussians after the step to a row, from charts with the sensors' centroid at `centroid_m`."""
+    after = before.empty_like()
     work = core.problem(
         "row_prediction",
         before=before.problem,
@@ -297,7 +297,7 @@ def update(
     most: int = MOST_ITERATIONS,
     tolerance: float = TOLERANCE,
 ) -> RowUpdates:
-    """Return Gaussians after a row's readings, each by an iterated update of its own.
+    """Return Gaussians after a row's readings, each by its own iterated update.
 
     Parameters
     ----------
@@ -307,18 +307,17 @@ def update(
     row : int
         Index of the row.
     bends : ndarray of bool, shape (C,), optional
-        Predictions that bend as the readings do: those of sources and pose by what they are told to, nuisances by the
-        rest.
+        Predictions whose states of sources and pose are as nonlinear as the readings; nuisances take the rest.
     pose_lasts : ndarray, shape (n_pose,), optional
-        Share of each error of the pose with which they do; not given, all of it.
+        Share of each error of the pose for which this holds; by default 1.
     innovation, linearisations : bool
-        Whether to find the whitened innovations, and the optional attributes of the result.
+        Whether to return the whitened innovations, and the other optional attributes of the result.
     most : int
         Number of trials after which the iteration ends.
     tolerance : float
         Length of the next step, in standard deviations, below which it ends.
     """
-    after, n = before.unfilled(), len(before.x)
+    after, n = before.empty_like(), len(before.x)
     nis, chi2, log_evidence = np.empty((3, n))
     iterations, converged = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.uint8)
     whitened = np.empty((n, rows.readings.shape[1])) if innovation else None
@@ -354,7 +353,7 @@ def update(
 
 
 def bends(gaussians: Gaussians, rows: Rows, memory: float, row: int = 0) -> tuple[FloatArray, FloatArray]:
-    """Return how far readings bend over one σ along axes of position and moment of the sources.
+    """Return the nonlinearity of readings over one σ along axes of position and moment of the sources.
 
     Parameters
     ----------
@@ -362,14 +361,14 @@ def bends(gaussians: Gaussians, rows: Rows, memory: float, row: int = 0) -> tupl
         Predictions.
     rows : Rows
     memory : float
-        Number of rows in whose readings the bend is counted, as far as these made the σ as small as it is.
+        Largest number of rows over which the nonlinearity is counted: those that determine the σ.
     row : int
         Index of the row.
 
     Returns
     -------
     bends : ndarray, shape (C, 6 n_sources)
-        In σ of the readings.
+        Nonlinearity in σ of the readings.
     directions : ndarray, shape (C, 6 n_sources, N)
         One σ of the whole state along each axis, a right singular vector of the readings, in its chart.
     """
@@ -389,15 +388,15 @@ def bends(gaussians: Gaussians, rows: Rows, memory: float, row: int = 0) -> tupl
 
 
 @dataclass(frozen=True, eq=False)
-class Smoothed:
-    """A pass of a filter and a smoother along trajectories.
+class SmootherPass:
+    """Result of one pass of a filter and a smoother along trajectories.
 
     Attributes
     ----------
     offsets : ndarray, shape (C, n_rows, n)
-        From the trajectories to the smoothed ones, in the charts about the former.
+        Offsets of the smoothed trajectories, in the charts about the given ones.
     last : Gaussians
-        After the last row; means are offsets, too, and those of nuisances behind them.
+        State after the last row. Means are offsets, followed by the nuisances.
     nis, log_evidence : ndarray, shape (C,)
         NIS of all rows but the first, and the evidence of all rows.
     """
@@ -408,8 +407,8 @@ class Smoothed:
     log_evidence: FloatArray
 
 
-def smooth(trajectories: FloatArray, prior: Gaussians, steps: core.Problem, rows: Rows) -> Smoothed:
-    """Return a pass along trajectories, at which motion and readings are linearised.
+def smooth(trajectories: FloatArray, prior: Gaussians, steps: core.Problem, rows: Rows) -> SmootherPass:
+    """Filter and smooth with motion and readings linearised along trajectories.
 
     Parameters
     ----------
@@ -422,7 +421,7 @@ def smooth(trajectories: FloatArray, prior: Gaussians, steps: core.Problem, rows
         Steps of the motion, from :func:`steps_problem`.
     rows : Rows
     """
-    n, last, offsets = len(trajectories), prior.unfilled(), np.empty_like(trajectories, order="C")
+    n, last, offsets = len(trajectories), prior.empty_like(), np.empty_like(trajectories, order="C")
     nis, log_evidence = np.empty((2, n))
     work = core.problem(
         "smoothing",
@@ -437,4 +436,4 @@ def smooth(trajectories: FloatArray, prior: Gaussians, steps: core.Problem, rows
         log_evidence=log_evidence,
     )
     core.run("smooth_rows", work, n, block=max(1, _ROWS_A_CALL // trajectories.shape[1]))
-    return Smoothed(offsets, last, nis, log_evidence)
+    return SmootherPass(offsets, last, nis, log_evidence)

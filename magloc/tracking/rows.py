@@ -54,8 +54,8 @@ class Row:
         return ArrayPose(self.origin_m, self.R_world_from_array, velocity, rate, lever_arm_m)
 
 
-def moving(row: Row, before: Row | None) -> Row:
-    """Return a row with the array's velocity and rate, from the row before if the row has none."""
+def with_array_motion(row: Row, before: Row | None) -> Row:
+    """Return a row with the array's velocity and rate, by differences from the row before if it has none."""
     if before is None or row.velocity_m_s is not None:
         return row
     time_s, origins_m = np.array([before.time_s, row.time_s]), np.stack([before.origin_m, row.origin_m])

@@ -1,4 +1,4 @@
-"""Sensors that fail during a track are named, left out and taken back; offsets of all sensors are noticed."""
+"""Detection and exclusion of sensors that fail during a track; detection of offsets of all sensors."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ _LOG = logging.getLogger(__name__)
 SENSOR_LIMIT = 32.0
 """χ² of a sensor's residual above which it contradicts the others (3 degrees of freedom, probability 5e-7)."""
 RIVAL_WITHIN = 9.0
-"""Least difference of χ² to the rows without any other sensor for which a sensor is at fault."""
+"""Least difference of χ² between leaving out a sensor and leaving out any other, for which it is at fault."""
 ROWS_TO_DIE = 3.0
-"""Rows in which a sensor is left out before it is named, so that single spikes do not count."""
+"""Rows in which a sensor is left out before it counts as dead, so that single spikes do not count."""
 ROWS_TO_RETURN = 50
-"""Successive good rows after which a sensor is taken back."""
+"""Successive good rows after which a dead sensor is used again."""
 DRIFT_LIMIT = 40.0
 """χ² of a sensor's mean residual over some rows above which it drifts (3 degrees of freedom, probability 1e-8)."""
 MOST_DRIFTING = 2
 """Most sensors that may drift at a time: if more do, the model is wrong."""
 _GOOD = 16.27  # one good row in a thousand is worse
-# How much a row that is well undoes of one that is not.
+# Strikes that a good row removes.
 _FORGIVEN = 0.25
-# What a row that needs no sensor at fault leaves of a suspicion.
+# Factor of the excess χ² of suspects for each row without a fault.
 _REMEMBERED = 0.9
 # Rows over which residuals are averaged.
 _MEMORIES = np.array([4.0, 16.0, 64.0, 256.0])
 
-# Share of the squared misfit that is the same in all rows from which on it lasts; of independent rows it is 1/n.
+# Least share of the squared misfit that is common to all rows of a lasting misfit; of independent rows it is 1/n.
 _LASTING = 0.5
-# Rows from which on that is asked, and from which on it is told.
+# Fewest rows for this test, and for its warning.
 _FEWEST_ALIKE, _ROWS_TO_TELL = 3, 10
 OFFSETS = "not acquired: no dipole fits the readings, which have offsets that are not stated"
 
@@ -48,9 +48,9 @@ class Misfits:
     energy : float
         Mean of the squared length.
     pause : int
-        Rows between two searches once a warning was given, 0 before.
+        Rows between two searches after a warning, 0 before.
     waits : int
-        Rows that are still passed over.
+        Rows to skip before the next search.
     """
 
     rows: int = 0
@@ -61,16 +61,15 @@ class Misfits:
 
     @property
     def are_alike(self) -> bool:
-        """True if most of the misfit is the same in all rows, as offsets cause it."""
+        """True if most of the misfit is the same in all rows, which offsets cause."""
         return self.rows >= _FEWEST_ALIKE and float(self.mean @ self.mean) > _LASTING * self.energy
 
-    @property
-    def passed_over(self) -> Misfits:
-        """State after a row that was not searched."""
+    def skip_row(self) -> Misfits:
+        """Return the state after a row without a search."""
         return replace(self, waits=self.waits - 1)
 
     def after(self, misfit: FloatArray, noise_T: float) -> Misfits:
-        """Return the state after one more row; warn once if the misfit lasts, and search later rows less often."""
+        """Return the state after one more row. If the misfit lasts, warn once and search later rows less often."""
         if len(misfit) < len(self.mean):
             return self  # a row without some sensors
         before = self if len(misfit) == len(self.mean) else Misfits(0, np.zeros(len(misfit)), pause=self.pause)
@@ -99,7 +98,7 @@ class SensorHealth:
     Attributes
     ----------
     dead : ndarray of bool, shape (N,)
-        Sensors that are left out until they are well.
+        Sensors that are left out until they recover.
     drifting : ndarray of bool, shape (N,)
         Dead sensors that drifted.
     strikes : ndarray, shape (N,)
@@ -121,7 +120,7 @@ class SensorHealth:
 
     @classmethod
     def of(cls, n_sensors: int) -> SensorHealth:
-        """Return the state of sensors that are all well."""
+        """Return the state of sensors without a fault."""
         none = np.zeros(n_sensors, dtype=bool)
         memories = (len(_MEMORIES), n_sensors)
         return cls(
@@ -135,65 +134,70 @@ class SensorHealth:
 
     @property
     def means(self) -> FloatArray:
-        """Means (4, N, 3) of residuals, of unit variance where nothing is wrong."""
+        """Means (4, N, 3) of residuals, of unit variance without a fault."""
         return self.sums / np.sqrt(np.maximum(self.weight, 1e-300))[..., None]
 
     @property
     def suspect(self) -> int | None:
-        """Index of the sensor whose mean residual is the farthest beyond noise; None without one."""
+        """Index of the sensor whose mean residual is most significant; None if none is."""
         chi2 = np.max(np.vecdot(self.sums, self.sums) / np.maximum(self.weight, 1e-300), axis=0)
         worst = int(np.argmax(chi2))
         return worst if chi2[worst] > DRIFT_LIMIT else None
 
     @property
     def may_drift(self) -> bool:
-        """True if one more sensor may be named as drifting."""
+        """True if one more sensor may count as drifting."""
         return int(np.count_nonzero(self.drifting)) < MOST_DRIFTING
 
-    def after(self, residuals: FloatArray, out: BoolArray, of_dead: FloatArray) -> SensorHealth:
+    def after(self, residuals: FloatArray, out: BoolArray, dead_chi2: FloatArray) -> SensorHealth:
         """Return the state after one more row.
 
-        Parameters are the standardised residuals (N, 3), NaN without a reading, the sensors (N,) left out of the row,
-        and χ² (N,) of the dead sensors given the others.
+        Parameters
+        ----------
+        residuals : ndarray, shape (N, 3)
+            Standardised residuals, NaN without a reading.
+        out : ndarray of bool, shape (N,)
+            Sensors left out of the row.
+        dead_chi2 : ndarray, shape (N,)
+            χ² of the dead sensors given the others.
         """
         read = np.isfinite(residuals[:, 0])
         keep = (1.0 - 1.0 / _MEMORIES)[:, None]
         sums = np.where(read[:, None], keep[..., None] * self.sums + residuals, self.sums)
         weight = np.where(read, keep**2 * self.weight + 1.0, self.weight)
         strikes = np.where(out & ~self.dead, self.strikes + 1.0, np.maximum(0.0, self.strikes - _FORGIVEN))
-        good = np.where(self.dead & (of_dead < _GOOD), self.good + 1, 0)
-        well = good >= ROWS_TO_RETURN
-        died = ~self.dead & (strikes >= ROWS_TO_DIE)
-        kept: FloatArray = np.where(well | died, 0.0, 1.0)
+        good = np.where(self.dead & (dead_chi2 < _GOOD), self.good + 1, 0)
+        recovers = good >= ROWS_TO_RETURN
+        dies = ~self.dead & (strikes >= ROWS_TO_DIE)
+        factor: FloatArray = np.where(recovers | dies, 0.0, 1.0)
         return replace(
             self,
-            dead=(self.dead & ~well) | died,
-            drifting=self.drifting & ~well,
-            strikes=kept * strikes,
-            good=np.where(well, 0, good),
-            sums=kept[:, None] * sums,
-            weight=kept * weight,
+            dead=(self.dead & ~recovers) | dies,
+            drifting=self.drifting & ~recovers,
+            strikes=factor * strikes,
+            good=np.where(recovers, 0, good),
+            sums=factor[:, None] * sums,
+            weight=factor * weight,
         )
 
     def without(self, sensor: int) -> SensorHealth:
-        """Return the state after a sensor is named as drifting; forget residuals, which it has bent."""
-        named = np.arange(len(self.dead)) == sensor
-        return replace(self.forgetful, dead=self.dead | named, drifting=self.drifting | named)
+        """Return the state with a sensor as drifting, and without residuals, which its drift has biased."""
+        drifts = np.arange(len(self.dead)) == sensor
+        return replace(self.forget_residuals(), dead=self.dead | drifts, drifting=self.drifting | drifts)
 
-    @property
-    def forgetful(self) -> SensorHealth:
-        """State without a memory of residuals, which belong to another state of the sources."""
+    def forget_residuals(self) -> SensorHealth:
+        """Return the state without residuals, which belong to another state of the sources."""
         return replace(self, sums=np.zeros_like(self.sums), weight=np.zeros_like(self.weight))
 
 
 @dataclass(frozen=True, eq=False)
 class Suspects:
-    """Sensors that may be at fault in rows that several sensors alone could explain.
+    """Candidates for the sensor at fault, in rows that several single faults could explain.
 
     Attributes
     ----------
     excess : ndarray, shape (N,)
-        χ² of recent rows without each sensor, above that without the likeliest one.
+        χ² of recent rows without each sensor, above the least of them.
     """
 
     excess: FloatArray
@@ -207,13 +211,13 @@ class Suspects:
         """Return the state after a row, by its χ² (N,) without each sensor."""
         return Suspects(self.excess + chi2 - chi2.min())
 
-    def forgotten(self, n_rows: int) -> Suspects:
-        """Return the state after rows that need no sensor at fault."""
+    def decay(self, n_rows: int) -> Suspects:
+        """Return the state after rows without a fault."""
         return Suspects(_REMEMBERED**n_rows * self.excess)
 
     @property
-    def culprit(self) -> int | None:
-        """Index of the sensor at fault, if it is far likelier than all others."""
+    def faulty_sensor(self) -> int | None:
+        """Index of the sensor at fault, if it is far likelier than all others; otherwise None."""
         first = int(np.argmin(self.excess))
         others = np.delete(self.excess, first)
         return first if others.size and others.min() - self.excess[first] > RIVAL_WITHIN else None

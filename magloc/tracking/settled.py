@@ -1,7 +1,7 @@
-"""Rows of a settled track in one compiled call: one source at one place, without errors of the pose.
+"""Rows of a settled track in one compiled call: one Gaussian of one source, without errors of the pose.
 
-Offsets of sensors are further numbers of the state, linear in the readings. With them predictions are straight, while
-those of the readable steps bend. Rows whose readings bend noticeably are left to the readable steps.
+Offsets of sensors are further states, in which readings are linear. With them the kernel's predictions are linear,
+unlike those of the Python steps. Rows whose readings are noticeably nonlinear are left to the Python steps.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from magloc.measurement.rows import ambient_fields
 from magloc.readings import Readings
 from magloc.tracking.chart.mixture import Mixture, root_of
 from magloc.tracking.chart.split import LARGEST_BEND, MOST_ROWS
-from magloc.tracking.chart.steps import LARGEST_GROWTH, LARGEST_WIDTH, Known
+from magloc.tracking.chart.steps import LARGEST_GROWTH, LARGEST_WIDTH, TrackState
 from magloc.tracking.coordinates import Chart
 from magloc.tracking.measurement import RowMeasurements
 from magloc.tracking.motion import N_SOURCE, MotionModel, OrnsteinUhlenbeck
@@ -31,39 +31,39 @@ from magloc.tracking.row_filter import LEAST_SHARE, Gaussians, Rows, convergence
 from magloc.tracking.rows import Row
 
 MOST_AT_ONCE = 64
-"""Rows that one call takes."""
+"""Largest number of rows of one call."""
 _TERMS_A_CALL = 10_000_000
-"""Approximate number of products that the kernel computes without looking for Ctrl-C: some 50 ms."""
+"""Approximate number of products that the kernel computes between checks for Ctrl-C: some 50 ms."""
 _TERMS_OF_STEPS = 3000
 """Products of a row that do not depend on the number of its differences."""
 _MOST_ERRORS, _MOST_NUMBERS = 100, 500_000
-"""Errors of sensors that the kernel estimates in less time than NumPy, and numbers of all roots of a call."""
+"""Largest number of errors of sensors for which the kernel is faster than NumPy, and of numbers in a call's roots."""
 _LARGEST_STRAIGHT = 0.05
-"""Bend of the readings, as LARGEST_BEND, up to which errors of sensors are estimated by straight predictions."""
+"""Nonlinearity of the readings, as LARGEST_BEND, up to which errors of sensors have linear predictions."""
 
 
 @dataclass(frozen=True, eq=False)
 class SettledRows:
-    """Points of rows, the last of them, what is known after it, its innovation, and steps for a smoother if wanted."""
+    """Points of rows; the last row, the state after it and its innovation; steps for a smoother, if requested."""
 
     points: list[TrackPoint]
     last: Row
-    known: Known
+    known: TrackState
     innovation: Innovation | None
     steps: list[Step]
 
 
 class SettledTrack:
-    """The problem of the kernel, whose arrays are filled anew for every call.
+    """Arguments of the kernel, whose arrays are filled again for every call.
 
     Parameters
     ----------
     array : SensorArray
     motion : MotionModel
-        Linear, or a lasting rate of turn.
+        A linear motion, or :class:`OrnsteinUhlenbeck`.
     measurements : RowMeasurements
     full_count : int
-        Differences of a row in which nothing is missing.
+        Number of differences of a row without missing readings.
     """
 
     def __init__(self, array: SensorArray, motion: MotionModel, measurements: RowMeasurements, full_count: int) -> None:
@@ -133,17 +133,17 @@ class SettledTrack:
     def of(
         array: SensorArray, motion: MotionModel, measurements: RowMeasurements, full_count: int
     ) -> SettledTrack | None:
-        """Return the problem, or None if the kernel lacks the steps of the motion or some of the errors."""
+        """Return the arguments, or None if the kernel lacks the steps of the motion or some of the errors."""
         errors = measurements.errors
         has_errors = not errors.is_constant or measurements.pose_errors.n_states or errors.n_states > _MOST_ERRORS
-        # Not by isinstance of a protocol, which looks through all of its attributes for every motion.
+        # isinstance of a protocol is slow: it tests all of its attributes.
         if has_errors or not (isinstance(motion, OrnsteinUhlenbeck) or hasattr(motion, "linear_step")):
             return None
         return SettledTrack(array, motion, measurements, full_count)
 
     def follow(
         self,
-        known: Known,
+        known: TrackState,
         time_s: float,
         last: Innovation | None,
         rows: Sequence[Row | Readings],
@@ -154,21 +154,21 @@ class SettledTrack:
         Parameters
         ----------
         known : Known
-            A settled track before them.
+            A settled track before the rows.
         time_s : float
             Time of the row before.
         last : Innovation, optional
-            Of that row.
+            Innovation of the row before.
         rows : sequence of Row
-            Readings among them end what is followed.
+            Rows after the first :class:`Readings` among them are not used.
         first_index : int, optional
-            Index of the first row, where steps for a smoother are wanted.
+            Index of the first row, if steps for a smoother are requested.
 
         Returns
         -------
         SettledRows or None
-            Up to the first row that misses other channels, goes back in time, or does not continue the track; None if
-            that is the first one. The readable steps take that row.
+            Results up to the first row that misses other channels, goes back in time, or does not continue the track;
+            None if that is the first one. The Python steps take that row.
         """
         taken, mixture = self._fill(rows[: self._most], time_s), known.mixture
         n = len(taken)
@@ -191,7 +191,7 @@ class SettledTrack:
         return SettledRows(self._points(taken[:end], dof, lag1, centroids), taken[end - 1], known, innovation, steps)
 
     def _fill(self, rows: Sequence[Row | Readings], time_s: float) -> list[Row]:
-        """Take up rows as long as they have the first one's differences, and return them."""
+        """Copy rows into the arguments as long as they have the first one's differences, and return them."""
         differences, given, taken = None, self._rows, list[Row]()
         if len(self._slot_of_step) + len(rows) > self._most:
             self._slot_of_step.clear()
@@ -227,18 +227,18 @@ class SettledTrack:
                 given.effects[0] = given.transforms[0] @ errors.effect(self._array, self._values[0])
         values = self._values[: len(taken)] - self._array.channel_offset_T
         values[np.isnan(values)] = 0.0  # of no weight
-        # One by one, so that a row that comes alone is rounded alike.
+        # One product for each row, so that rounding does not depend on the number of rows.
         given.readings[: len(taken)] = (given.transforms @ values[..., None])[..., 0]
         return taken
 
     def _lag1(self, rows: Sequence[Row], dof: int, last: Innovation | None) -> tuple[list[float], Innovation | None]:
-        """Products of each row's innovation with that of the row before, and the innovation of the last row."""
+        """Return the products of each innovation with the one before, and the innovation of the last row."""
         if not dof:
             return [math.nan] * len(rows), None
         whitened = self._innovation[: len(rows), :dof].copy()
         if self._measurements.errors.n_states:
             self._correction[: len(rows)] = np.nan
-        first = Innovation(rows[0].available, whitened[0]).after(last)["lag1"]
+        first = Innovation(rows[0].available, whitened[0]).statistics(last)["lag1"]
         return [first, *(whitened[1:] * whitened[:-1]).sum(axis=1).tolist()], Innovation(
             rows[-1].available, whitened[-1]
         )
@@ -251,7 +251,7 @@ class SettledTrack:
         x, rows_of_S = self._updated.x[:end, None, :N_SOURCE].copy(), self._updated.S[:end, None, :N_SOURCE]
         S = root_of(rows_of_S) if self._measurements.errors.n_states else rows_of_S.copy()
         columns = (some[:end].tolist() for some in (self._iterations, self._nis, self._correction))
-        told = zip(*columns, lag1, strict=True)
+        statistics = zip(*columns, lag1, strict=True)
         return [
             TrackPoint(
                 row.time_s,
@@ -270,11 +270,11 @@ class SettledTrack:
                 correction=correction,
                 mixture=Mixture(x[i], S[i], single, N_SOURCE, centroids[i], radius_m),
             )
-            for i, (row, (iterations, nis, correction, product)) in enumerate(zip(rows, told, strict=True))
+            for i, (row, (iterations, nis, correction, product)) in enumerate(zip(rows, statistics, strict=True))
         ]
 
     def _steps(self, first_index: int, end: int, centroids: FloatArray, x_before: FloatArray) -> list[Step]:
-        """Steps for a smoother of the rows, from the state (n,) before them."""
+        """Return the rows' steps for a smoother, from the state (n,) before them."""
         steps, radius_m = [], self._array.circumradius
         before, after = (
             Chart.at(some.x[:end], centroids, radius_m).jacobian(np.zeros_like(some.x[:end])) @ some.S[:end]

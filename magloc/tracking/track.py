@@ -27,7 +27,7 @@ from magloc.readings import Readings
 from magloc.tracking.consistency import Consistency, InnovationTest, consistency, innovation_test
 from magloc.tracking.files import QUANTITIES, columns_of_track, geojson_of_track, kml_of_track, lines_of_track
 from magloc.tracking.motion import MotionModel, OrnsteinUhlenbeck, RandomWalk, known_motions
-from magloc.tracking.results import SourcesPoint, TrackPoint, TrackResult, stacked, warn_of_strengths
+from magloc.tracking.results import SourcesPoint, TrackPoint, TrackResult, track_column, warn_of_strengths
 from magloc.tracking.rows import Row, rows_of
 from magloc.tracking.settled import MOST_AT_ONCE
 from magloc.tracking.tracker import Tracker
@@ -35,7 +35,7 @@ from magloc.tracking.whole_records.background import track_on_background
 from magloc.tracking.whole_records.body_errors import body_factor
 from magloc.tracking.whole_records.constants import constants_test
 from magloc.tracking.whole_records.posterior_bound import posterior_bound, smoothing_bound
-from magloc.tracking.whole_records.smoother import smoothed
+from magloc.tracking.whole_records.smoother import smooth_points
 from magloc.truth import Truth, truth_of_rows
 
 if TYPE_CHECKING:
@@ -104,27 +104,27 @@ class TrackColumns(TrackRows[TrackPoint]):
     @cached_property
     def position_m(self) -> FloatArray:
         """Positions (n, 3) [m]."""
-        return stacked(self, "position_m", 3)
+        return track_column(self, "position_m", 3)
 
     @cached_property
     def moment_Am2(self) -> FloatArray:
         """Moments (n, 3) [A·m²]."""
-        return stacked(self, "moment_Am2", 3)
+        return track_column(self, "moment_Am2", 3)
 
     @cached_property
     def covariance(self) -> FloatArray:
         """Covariances (n, 6, 6) of position and moment."""
-        return stacked(self, "covariance", 6, 6)
+        return track_column(self, "covariance", 6, 6)
 
     @cached_property
     def estimability(self) -> FloatArray:
         """Estimability (n, 6): 1 - σ / σ₀, where σ₀ is the standard deviation without any readings."""
-        return stacked(self, "estimability", 6)
+        return track_column(self, "estimability", 6)
 
     @cached_property
     def nis(self) -> FloatArray:
         """Normalised innovations squared (n,)."""
-        return stacked(self, "nis")
+        return track_column(self, "nis")
 
     @cached_property
     def nis_dof(self) -> IntArray:
@@ -134,7 +134,7 @@ class TrackColumns(TrackRows[TrackPoint]):
     @cached_property
     def weight(self) -> FloatArray:
         """Probability that the track is the right one (n,)."""
-        return stacked(self, "weight")
+        return track_column(self, "weight")
 
     @property
     def range_interval_m(self) -> list[Intervals]:
@@ -330,16 +330,16 @@ def track(
     if background is not None:
         if used.motion is not None:
             raise ValueError("Input readings must have measured velocities and rates or a background, not both.")
-        points = finished(track_on_background(tracker, used, smooth=smooth, progress=progress), told)
+        points = collect_points(track_on_background(tracker, used, smooth=smooth, progress=progress), told)
     elif smooth:
-        points = finished(smoothed(list(_followed(tracker, used, motion, progress)), tracker.steps), told)
+        points = collect_points(smooth_points(list(_follow(tracker, used, motion, progress)), tracker.steps), told)
     else:
-        points = finished(_followed(tracker, used, motion, progress), told)
+        points = collect_points(_follow(tracker, used, motion, progress), told)
     warn_of_strengths(points)
     return Track(points, used, tracker, smooth)
 
 
-def finished(points: Iterable[_Row], told: Callable[[_Row], object] | None) -> tuple[_Row, ...]:
+def collect_points(points: Iterable[_Row], told: Callable[[_Row], object] | None) -> tuple[_Row, ...]:
     """Report each point of a record, and return all of them."""
     found = []
     for point in points:
@@ -349,7 +349,7 @@ def finished(points: Iterable[_Row], told: Callable[[_Row], object] | None) -> t
     return tuple(found)
 
 
-def _followed(
+def _follow(
     tracker: Tracker,
     readings: Readings,
     unmeasured: MotionModel,

@@ -1,15 +1,15 @@
-r"""One dipole through time: an iterated extended Kalman filter from the first row in which the source is seen.
+r"""Iterated extended Kalman filter of one dipole, from the first row that shows the source.
 
-What is known of the source is a mixture of Gaussians in the coordinates of :mod:`magloc.tracking.coordinates`,
-soon a single one (:mod:`magloc.tracking.chart.steps`), moved by a :class:`magloc.tracking.motion.MotionModel`. A track
-ends when the readings contradict it or its place is no longer known; then it starts anew. The state is in the world
-frame where the array's pose is known, else in the array's. Behind the states of the motion stand the lasting errors
-of the array's pose (:mod:`magloc.measurement.pose`) and those of its sensors (:mod:`magloc.measurement.nuisances`).
-Errors of the pose that are new in every row are states, too: the readings are modelled at the pose that they tell of.
-Positions, moments and steps for smoothing are Cartesian.
+The state is a mixture of Gaussians in the coordinates of :mod:`magloc.tracking.coordinates`, soon a single one
+(:mod:`magloc.tracking.chart.steps`). A :class:`magloc.tracking.motion.MotionModel` predicts it. A track ends if the
+readings contradict it or its place is no longer known; then a new one starts. The state is in the world frame if the
+array's pose is known, otherwise in the array's frame. The states of the motion are followed by the lasting errors of
+the array's pose (:mod:`magloc.measurement.pose`) and of its sensors (:mod:`magloc.measurement.nuisances`). Errors of
+the pose that are new in every row are states too, so that readings are modelled at the estimated pose. Positions,
+moments and steps for smoothing are Cartesian.
 
-Rows of a settled track are stepped by :mod:`magloc.tracking.settled` in one compiled call, all others here; a test
-holds the two together.
+Rows of a settled track are stepped by :mod:`magloc.tracking.settled` in one compiled call, all others here. A test
+compares the two.
 """
 
 from __future__ import annotations
@@ -25,24 +25,31 @@ from arrays.typing import BoolArray, FloatArray
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.measurement.nuisances import Drift
 from magloc.readings import Readings
-from magloc.tracking.acquisition import STACKED_POSITION_ERROR, Acquisition, CartesianFilter
-from magloc.tracking.acquisition import Start as RowsStart
-from magloc.tracking.chart.known_moment import KeptModulus
+from magloc.tracking.acquisition import STACKED_POSITION_ERROR, AcquiredSource, Acquisition, CartesianFilter
+from magloc.tracking.chart.known_moment import ConstantModulus
 from magloc.tracking.chart.mixture import Mixture
 from magloc.tracking.chart.start import NO_DIPOLE, prior_root
-from magloc.tracking.chart.steps import LARGEST_WIDTH, ChartFilter, Known, RowUpdate, cartesian, charted, width_of
+from magloc.tracking.chart.steps import (
+    LARGEST_WIDTH,
+    ChartFilter,
+    RowUpdate,
+    TrackState,
+    from_cartesian,
+    to_cartesian,
+    width_of,
+)
 from magloc.tracking.chart.undetermined import Undetermined
 from magloc.tracking.measurement import RowMeasurement, RowMeasurements
 from magloc.tracking.motion import N_SOURCE, MotionModel
-from magloc.tracking.results import UNDETERMINED, Innovation, Prediction, Step, TrackPoint, of_mixture
-from magloc.tracking.rows import Row, moving, next_row
+from magloc.tracking.results import UNDETERMINED, Innovation, Prediction, Step, TrackPoint, point_of_mixture
+from magloc.tracking.rows import Row, next_row, with_array_motion
 from magloc.tracking.sensor_health import SENSOR_LIMIT, SensorHealth, Suspects
 from magloc.tracking.settled import MOST_AT_ONCE, SettledTrack
 
 ROWS_TO_LOSE = 3
-"""Contradicting rows in a row that end a track."""
+"""Successive contradicting rows that end a track."""
 LARGEST_RANGE_ERROR = LARGEST_WIDTH
-"""A track whose range is less certain, σ over range, is lost."""
+"""Largest σ of the range over the range; a track with more is lost."""
 
 
 class Tracker(CartesianFilter):
@@ -53,22 +60,22 @@ class Tracker(CartesianFilter):
     array : SensorArray
     motion : MotionModel
     prior : SourcePrior
-        Bounds of the first row's source, and what its moment is known to be, in the array's frame.
+        Bounds of the source where a track starts, and its known moment, in the array's frame.
     keep_steps : bool
-        Keep what a smoother needs, in `steps`.
+        Whether to collect the steps for a smoother in `steps`.
     background : Drift, optional
-        States of every channel beside the source; rows do not start a track then, but :func:`magloc.track` does.
+        Drift of every channel, as states. Then rows do not start a track, but :func:`magloc.track` does.
 
     Attributes
     ----------
     measurements : RowMeasurements
-        What rows say of the state.
+        Measurement models of the rows.
     errors : SensorErrors
-        The lasting errors of the array's sensors: the last states.
+        Lasting errors of the array's sensors: the last states.
     pose_errors : PoseErrors
-        Those of its pose, between the states of the motion and them.
+        Errors of the array's pose: the states between those of the motion and `errors`.
     steps : list of Step
-        Of all tracks so far, if `keep_steps`.
+        Steps of all tracks so far, if `keep_steps`.
 
     Examples
     --------
@@ -97,19 +104,19 @@ class Tracker(CartesianFilter):
         self.filter = ChartFilter(array, self.errors, self.pose_errors, prior)
         self.motion = motion
         self._undetermined = Undetermined(self.filter)
-        self._known: Known | None = None
+        self._known: TrackState | None = None
         self._time_s, self._n_rows = math.nan, 0
         self._last: Innovation | None = None
         self._row_before: Row | None = None
         self._health, self._suspects = SensorHealth.of(array.n_sensors), Suspects.of(array.n_sensors)
 
     def update(self, row: Row | Readings) -> TrackPoint:
-        """What is known of the source after one more row.
+        """Update the track by one more row.
 
         Parameters
         ----------
         row : Row or Readings of length one
-            Later than the one before. Of readings those that saturate are not used.
+            A row later than the one before. Saturated readings are not used.
 
         Raises
         ------
@@ -121,7 +128,7 @@ class Tracker(CartesianFilter):
     def run(
         self, rows: Iterable[Row | Readings], progress: Callable[[int], None] | None = None
     ) -> Iterator[TrackPoint]:
-        """Points of successive rows; those of a sequence some at once, see :meth:`advance`."""
+        """Yield the points of successive rows; of a sequence, several rows at once by :meth:`advance`."""
         for part in [rows] if isinstance(rows, Sequence) else ([row] for row in rows):
             done = 0
             while done < len(part):
@@ -132,7 +139,10 @@ class Tracker(CartesianFilter):
                     progress(len(points))
 
     def advance(self, rows: Sequence[Row | Readings]) -> list[TrackPoint]:
-        """Points of the first of some rows: of as many as one compiled call takes, else of one; see :meth:`update`."""
+        """Return the points of the first rows: as many as one compiled call takes, otherwise one.
+
+        See :meth:`update`.
+        """
         row = next_row(rows[0], self.array, self._time_s)
         if self._known is not None and self.is_compiled:
             assert self._settled is not None
@@ -143,143 +153,145 @@ class Tracker(CartesianFilter):
                 self.resume(found.known, points[-1].time_s, len(points), found.steps)
                 self._last, self._row_before = found.innovation, found.last
                 if found.innovation is not None:
-                    self._suspects = self._suspects.forgotten(len(points))
+                    self._suspects = self._suspects.decay(len(points))
                 return points
-        return [self._advanced(row)]
+        return [self._step_row(row)]
 
-    def _advanced(self, row: Row) -> TrackPoint:
-        """The point of a row by the readable steps."""
+    def _step_row(self, row: Row) -> TrackPoint:
+        """Return the point of one row, without compiled steps."""
         if self.n_errors:
-            row, self._row_before = moving(row, self._row_before), row
+            row, self._row_before = with_array_motion(row, self._row_before), row
         dt_s, self._time_s = row.time_s - self._time_s, row.time_s
         index, self._n_rows = self._n_rows, self._n_rows + 1
         if self._known is None:
-            out, point = self._started(row, index)
+            out, point = self._start_track(row, index)
         else:
-            out, point = self._followed(self._known, row, index, dt_s)
+            out, point = self._follow_track(self._known, row, index, dt_s)
         return replace(point, dropped_sensors=tuple(np.array(self.array.ids)[out].tolist())) if out.any() else point
 
     @property
     def motion(self) -> MotionModel:
-        """How the source moves: a modulus that is known stays."""
+        """Motion of the source; a known modulus of the moment stays constant."""
         return self._motion
 
     @motion.setter
     def motion(self, motion: MotionModel) -> None:
-        self._motion = KeptModulus.of(motion, self.prior)
+        self._motion = ConstantModulus.of(motion, self.prior)
         self._settled = SettledTrack.of(self.array, self._motion, self.measurements, self.filter.n_differences)
 
     @property
-    def known(self) -> Known | None:
-        """What is known of the source before the next row; None without a track."""
+    def known(self) -> TrackState | None:
+        """State of the track before the next row; None without a track."""
         return self._known
 
     @property
     def time_s(self) -> float:
-        """Of the last row, NaN before the first."""
+        """Time of the last row, NaN before the first."""
         return self._time_s
 
     @property
     def is_tracking(self) -> bool:
-        """Whether the next row continues a track that is no longer young, of one place and with all sensors."""
+        """True if the track is settled, with all sensors in use."""
         return (known := self._known) is not None and known.is_settled and self._health.is_well
 
     @property
     def is_compiled(self) -> bool:
-        """Whether the next row is stepped by compiled code, if it continues the track."""
+        """True if compiled code steps the next row, provided that it continues the track."""
         return self.is_tracking and self._settled is not None and not (self.keep_steps and self.n_errors)
 
-    def resume(self, known: Known, time_s: float, n_rows: int = 0, steps: Sequence[Step] = ()) -> None:
-        """Go on from what is known at a time, after so many rows more."""
+    def resume(self, known: TrackState, time_s: float, n_rows: int = 0, steps: Sequence[Step] = ()) -> None:
+        """Resume from a saved state at a time, `n_rows` rows later."""
         self._known, self._time_s, self._last = known, time_s, None
         self._n_rows += n_rows
         self.steps += steps
 
-    def known_before(self, seen: RowMeasurement, x: FloatArray) -> FloatArray:
-        """Covariance (n, n) of the motion's states of a source at x before its first row."""
+    def prior_covariance(self, seen: RowMeasurement, x: FloatArray) -> FloatArray:
+        """Return the prior covariance (n, n) of the motion's states of a source at x."""
         _, S = self.motion.start(x[:N_SOURCE], prior_root(seen.chart(x[:N_SOURCE])))
         return S @ S.T
 
-    def open_loop(self, covariance: FloatArray, x: FloatArray, dt_s: float) -> FloatArray:
-        """What becomes of it in a step from a state x in which no readings are taken."""
+    def propagate(self, covariance: FloatArray, x: FloatArray, dt_s: float) -> FloatArray:
+        """Return a covariance after a step from a state x without readings."""
         _, F, S_q = self.motion.step(x[: self.motion.n_states], dt_s)
         return F @ covariance @ F.T + S_q @ S_q.T
 
-    def _lost(self, row: Row, reason: str) -> TrackPoint:
-        """What is known of a row without a track."""
+    def untracked_point(self, row: Row, reason: str) -> TrackPoint:
+        """Return the point of a row without a track."""
         centroid_m = row.origin_m + row.R_world_from_array @ self.array.centroid
         return TrackPoint(row.time_s, status=reason, centroid_m=centroid_m, radius_m=self.array.circumradius)
 
-    def _started(self, row: Row, index: int, near: Mixture | None = None) -> tuple[BoolArray, TrackPoint]:
-        """A new track, if one can be started, and the sensors (N,) that were left out of the row."""
+    def _start_track(self, row: Row, index: int, near: Mixture | None = None) -> tuple[BoolArray, TrackPoint]:
+        """Start a new track if possible; return the sensors (N,) left out of the row, and its point."""
         self._known, out = None, self._health.dead
-        seen = self._seen(row, out)
+        seen = self._measure(row, out)
         if seen.z.size < N_SOURCE:
-            return out, self._acquired(seen, index)
-        mixture, reason = self.filter.started(seen, self.motion, near)
-        if reason == NO_DIPOLE and (faulty := self.filter.faulty(seen)).sum() == 1:
-            seen = self._seen(row, out | faulty)
-            mixture, _ = self.filter.started(seen, self.motion, near)
+            return out, self._acquire(seen, index)
+        mixture, reason = self.filter.start(seen, self.motion, near)
+        if reason == NO_DIPOLE and (faulty := self.filter.faulty_sensors(seen)).sum() == 1:
+            seen = self._measure(row, out | faulty)
+            mixture, _ = self.filter.start(seen, self.motion, near)
             out = out if mixture is None else out | faulty
         if mixture is None:
-            return out, self._lost(seen.row, reason)
-        self._judge(row, out, lambda row: math.inf if self.filter.of_row(row, self.motion)[0] is None else 0.0)
-        open_loop = self.known_before(seen, mixture.x[np.argmax(mixture.log_weight)])
+            return out, self.untracked_point(seen.row, reason)
+        self._update_health(
+            row, out, lambda row: math.inf if self.filter.row_mixture(row, self.motion)[0] is None else 0.0
+        )
+        open_loop = self.prior_covariance(seen, mixture.x[np.argmax(mixture.log_weight)])
         young = ((seen, self.motion),) if self.filter.has_lasting_errors else ()
-        known = self.filter.refitted(Known(mixture, open_loop, young=young))
-        return out, self._kept(seen.row, index, known, None, status="acquired")
+        known = self.filter.refit(TrackState(mixture, open_loop, young=young))
+        return out, self._tracked_point(seen.row, index, known, None, status="acquired")
 
-    def _seen(self, row: Row, out: BoolArray) -> RowMeasurement:
-        """What a row says without some of its sensors (N,)."""
+    def _measure(self, row: Row, out: BoolArray) -> RowMeasurement:
+        """Return the measurement model of a row without some of its sensors (N,)."""
         readings = np.where(out[self.array.channel_sensor], np.nan, row.readings_T)
         return self.measurements.of(replace(row, readings_T=readings) if out.any() else row)
 
-    def _followed(self, before: Known, row: Row, index: int, dt_s: float) -> tuple[BoolArray, TrackPoint]:
-        """A track after one more row, and the sensors (N,) that were left out of it."""
+    def _follow_track(self, before: TrackState, row: Row, index: int, dt_s: float) -> tuple[BoolArray, TrackPoint]:
+        """Continue a track by one more row; return the sensors (N,) left out of the row, and its point."""
         dead = self._health.dead
-        seen = self._seen(row, dead)
-        predicted = self.filter.predicted(before.mixture, self.motion, dt_s, seen)
+        seen = self._measure(row, dead)
+        predicted = self.filter.predict(before.mixture, self.motion, dt_s, seen)
         x = before.mixture.x[np.argmax(before.mixture.log_weight)]
-        open_loop = self.open_loop(before.open_loop, x, dt_s)
+        open_loop = self.propagate(before.open_loop, x, dt_s)
         known = replace(before, mixture=predicted, open_loop=open_loop, used=before.used or before.mixture)
-        prediction = self.predicted(*cartesian(before.mixture), dt_s) if self.keep_steps else None
+        prediction = self.predict(*to_cartesian(before.mixture), dt_s) if self.keep_steps else None
         if not seen.z.size:
-            return dead, self._kept(seen.row, index, known, prediction, status="predicted")
+            return dead, self._tracked_point(seen.row, index, known, prediction, status="predicted")
         if width_of(predicted) > LARGEST_WIDTH:
-            # The prediction says too little for an iteration to start from it.
+            # The prediction is too uncertain for an iteration to start from it.
             if self.filter.is_detected(seen):
-                return self._started(row, index, predicted.matched())
-            return dead, self._kept(seen.row, index, known, prediction, status="predicted")
+                return self._start_track(row, index, predicted.match_moments())
+            return dead, self._tracked_point(seen.row, index, known, prediction, status="predicted")
 
-        def updated(of_row: RowMeasurement) -> RowUpdate:
-            return self.filter.updated(before, predicted, dt_s, of_row)
+        def update_by(measurement: RowMeasurement) -> RowUpdate:
+            return self.filter.update(before, predicted, dt_s, measurement)
 
-        update, out, of_sensor = updated(seen), dead, False
+        update, out, may_be_fault = update_by(seen), dead, False
         if update.mixture is None:
-            out, update, of_sensor = self._without_one(update, lambda out: updated(self._seen(row, out)))
-            seen = self._seen(row, out)
+            out, update, may_be_fault = self._exclude_sensor(update, lambda out: update_by(self._measure(row, out)))
+            seen = self._measure(row, out)
         else:
-            self._suspects = self._suspects.forgotten(1)
+            self._suspects = self._suspects.decay(1)
         innovation = Innovation(seen.row.available, update.innovation, update.correction)
         if update.mixture is None:
-            contradictions = before.contradictions + (not of_sensor)
+            contradictions = before.contradictions + (not may_be_fault)
             if contradictions >= ROWS_TO_LOSE:
-                return self._started(row, index)
+                return self._start_track(row, index)
             known = replace(known, contradictions=contradictions)
-            point = self._kept(seen.row, index, known, prediction, status="outlier", innovation=innovation)
+            point = self._tracked_point(seen.row, index, known, prediction, status="outlier", innovation=innovation)
             return dead, replace(point, nis=update.nis)
-        self._judge(row, out, lambda with_it: updated(with_it).nis - update.nis)
+        self._update_health(row, out, lambda with_sensor: update_by(with_sensor).nis - update.nis)
         known = replace(known, mixture=update.mixture, contradictions=0, used=None)
         if before.young:
             young = (*before.young, (seen, self.motion))
-            known = self.filter.refitted(replace(known, young=young, nis=before.nis + update.nis))
-        # A range that was known may be open again although every component is narrow.
+            known = self.filter.refit(replace(known, young=young, nis=before.nis + update.nis))
+        # The range of all components together may be open again although every component is narrow.
         is_wide, is_open = width_of(known.mixture) > LARGEST_WIDTH, known.mixture.log_range_sigma > LARGEST_WIDTH
         is_detected = (is_wide or (is_open and known.has_range)) and self.filter.is_detected(seen)
         if is_wide and is_detected:
-            return self._started(row, index, predicted.matched())
+            return self._start_track(row, index, predicted.match_moments())
         known = replace(known, has_range=known.has_range or not is_open)
-        return out, self._kept(
+        return out, self._tracked_point(
             seen.row,
             index,
             known,
@@ -290,35 +302,38 @@ class Tracker(CartesianFilter):
             is_lost=is_open and known.has_range and not is_detected,
         )
 
-    def _judge(self, row: Row, out: BoolArray, excess: Callable[[RowMeasurement], float]) -> None:
-        """Count a row without some sensors (N,), and the χ² that each dead one with readings would add to it."""
+    def _update_health(self, row: Row, out: BoolArray, excess: Callable[[RowMeasurement], float]) -> None:
+        """Update the sensors' health by the sensors (N,) left out, and the χ² that each dead one would add."""
         if self._health.is_well and not out.any():
             return
-        of_dead, read = np.full(len(out), np.inf), np.unique(self.array.channel_sensor[row.available])
-        for sensor in np.intersect1d(np.flatnonzero(self._health.dead), read):
-            of_dead[sensor] = excess(self._seen(row, out & (np.arange(len(out)) != sensor)))
-        self._health = self._health.after(np.full((len(out), 3), np.nan), out, of_dead)
+        dead_chi2, available = np.full(len(out), np.inf), np.unique(self.array.channel_sensor[row.available])
+        for sensor in np.intersect1d(np.flatnonzero(self._health.dead), available):
+            dead_chi2[sensor] = excess(self._measure(row, out & (np.arange(len(out)) != sensor)))
+        self._health = self._health.after(np.full((len(out), 3), np.nan), out, dead_chi2)
 
-    def _without_one(
-        self, update: RowUpdate, updated: Callable[[BoolArray], RowUpdate]
+    def _exclude_sensor(
+        self, update: RowUpdate, update_without: Callable[[BoolArray], RowUpdate]
     ) -> tuple[BoolArray, RowUpdate, bool]:
-        """A row that contradicts a track without the one sensor that is at fault, and whether one may be."""
+        """Repeat a contradicting update without the sensor at fault.
+
+        Return the sensors (N,) left out, the update, and whether a single sensor may be at fault.
+        """
         dead, own = self._health.dead, np.eye(self.array.n_sensors, dtype=bool)
-        found = {sensor: updated(dead | own[sensor]) for sensor in np.flatnonzero(~dead).tolist()}
+        found = {sensor: update_without(dead | own[sensor]) for sensor in np.flatnonzero(~dead).tolist()}
         if all(one.mixture is None for one in found.values()):
             return dead, update, False
         chi2 = np.array([found[sensor].nis if sensor in found else np.inf for sensor in range(len(dead))])
         self._suspects = self._suspects.after(chi2)
-        sensor = self._suspects.culprit
+        sensor = self._suspects.faulty_sensor
         if sensor is None or found[sensor].mixture is None or found[sensor].nis > update.nis - SENSOR_LIMIT:
             return dead, update, True
         return dead | own[sensor], found[sensor], True
 
-    def _kept(
+    def _tracked_point(
         self,
         row: Row,
         index: int,
-        known: Known,
+        known: TrackState,
         prediction: Prediction | None,
         *,
         status: str,
@@ -326,33 +341,36 @@ class Tracker(CartesianFilter):
         iterations: int = 0,
         is_lost: bool = False,
     ) -> TrackPoint:
+        """Store the state after a row, and return its point."""
         mixture = known.mixture
         tracked = status == "tracked"
-        told = {} if innovation is None else innovation.after(self._last if tracked else None)
+        statistics = {} if innovation is None else innovation.statistics(self._last if tracked else None)
         self._last = innovation if tracked else None
         if is_lost or (status != "acquired" and width_of(mixture) > LARGEST_WIDTH):
             self._known = None
-            return replace(self._lost(row, "lost: the place is no longer known"), **told)
+            return replace(self.untracked_point(row, "lost: the place is no longer known"), **statistics)
         self._known = known
         if self.keep_steps:
-            self.steps.append(Step(index, prediction, *cartesian(mixture)))
-        point = of_mixture(row.time_s, mixture, np.diagonal(known.open_loop))
-        return replace(point, status=status, iterations=iterations, **told)
+            self.steps.append(Step(index, prediction, *to_cartesian(mixture)))
+        point = point_of_mixture(row.time_s, mixture, np.diagonal(known.open_loop))
+        return replace(point, status=status, iterations=iterations, **statistics)
 
-    def _acquired(self, seen: RowMeasurement, index: int) -> TrackPoint:
-        """A new track from several rows of which one alone does not determine the source; else what this one says."""
+    def _acquire(self, seen: RowMeasurement, index: int) -> TrackPoint:
+        """Start a track from several rows that are individually insufficient, or return an undetermined point."""
         mixture, reason = self._undetermined.after(seen, self.motion)
         start = self._acquisition.start(seen.row, self._undetermined.position_error)
-        known = None if start is None else self._found(start, seen)
+        known = None if start is None else self._filter_acquired(start, seen)
         if start is None or known is None:
-            return self._of_rows(mixture, reason, seen)
+            return self._undetermined_point(mixture, reason, seen)
         self._acquisition.forget()
         self._undetermined.forget()
-        point = self._kept(seen.row, index, known, None, status="acquired", iterations=start.solution.iterations)
+        point = self._tracked_point(
+            seen.row, index, known, None, status="acquired", iterations=start.solution.iterations
+        )
         return replace(point, weight=start.solution.weight, rivals=start.rivals)
 
-    def _found(self, start: RowsStart, seen: RowMeasurement) -> Known | None:
-        """What is known of a source that several rows show, the last of them as it is seen, if it is known well."""
+    def _filter_acquired(self, start: AcquiredSource, seen: RowMeasurement) -> TrackState | None:
+        """Return the state of a track that starts from several rows, or None if it is not certain enough."""
         source = np.concatenate([start.solution.position_m, start.solution.moment_Am2])
         found = self.start(source, start.solution.covariance, start.rows)
         if found is None:
@@ -360,12 +378,12 @@ class Tracker(CartesianFilter):
         offset, root = seen.place_in_array(found.x, found.S)
         if float(np.linalg.norm(root)) > STACKED_POSITION_ERROR * float(np.linalg.norm(offset)):
             return None
-        return Known(charted(found.x, found.S, seen), self.known_before(seen, found.x))
+        return TrackState(from_cartesian(found.x, found.S, seen), self.prior_covariance(seen, found.x))
 
-    def _of_rows(self, mixture: Mixture | None, reason: str, seen: RowMeasurement) -> TrackPoint:
-        """What rows say that show a source, of which one alone does not determine it."""
+    def _undetermined_point(self, mixture: Mixture | None, reason: str, seen: RowMeasurement) -> TrackPoint:
+        """Return the point of a row that shows a source and does not determine it."""
         if mixture is None:
-            return self._lost(seen.row, reason)
+            return self.untracked_point(seen.row, reason)
         heaviest = mixture.x[np.argmax(mixture.log_weight)]
-        point = of_mixture(seen.row.time_s, mixture, np.diagonal(self.known_before(seen, heaviest)))
+        point = point_of_mixture(seen.row.time_s, mixture, np.diagonal(self.prior_covariance(seen, heaviest)))
         return replace(point, status=UNDETERMINED)

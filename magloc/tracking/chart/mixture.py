@@ -1,4 +1,4 @@
-"""Where a source may be: a mixture of Gaussians in log-range, direction, and the moment as it is seen."""
+"""Gaussian mixture of a source's state in log-range, direction and scaled moment."""
 
 from __future__ import annotations
 
@@ -15,43 +15,44 @@ from magloc.tracking.coordinates import MOMENT_POWER, Chart
 from magloc.tracking.motion import N_SOURCE
 
 MERGED_BELOW = 0.02
-"""Kullback and Leibler's divergence below which two components are one."""
+"""Kullback-Leibler divergence below which two components are merged."""
 DROPPED_BELOW = -12.0
-"""Logarithm of a component's weight, against the heaviest one, below which it is forgotten."""
+"""Logarithm of a component's weight over the largest one below which it is dropped."""
 NEAREST, FARTHEST = 0.6, 60.0
-"""Ranges between which a source is looked for, in radii of the array. A set that reaches there is open, unless it is
+"""Range of the search for a source, in radii of the array. A set that reaches the upper bound is open, unless it is
 narrow."""
 _OUTSIDE = 0.025
-# Standard deviation of the log-range beyond which the mean range tells of the prior alone.
+# Largest standard deviation of the log-range in the mean of a log-normal range: with more, the prior dominates.
 _WIDEST = 1.0
-# Range, in radii, far beyond all where sources are looked for, and the least logarithm of a component's weight there.
+# Range in radii beyond which a component has run away, and the least logarithm of its weight over the largest one then.
 _RUN_AWAY, _LEAST_RUN_AWAY = 20.0 * FARTHEST, -5.0
-# Logarithm of a range, in metres, that no quantile is beyond.
+# Bounds of the logarithm of quantiles of the range in metres.
 _BEYOND, _N_BISECTIONS = 30.0, 60
 
 
 @dataclass(frozen=True, eq=False)
 class Mixture:
-    """Components of what is known of a source.
+    """Gaussian mixture of the states of a source and of its array's lasting errors.
 
     Attributes
     ----------
     x : ndarray, shape (K, N)
-        Cartesian states: source, motion, and the sensors' lasting errors.
+        Cartesian means: source, motion, errors of the pose, lasting errors of the sensors.
     S : ndarray, shape (K, N, N)
-        Roots of their covariances, in the chart about each; of a point of a track (K, 6, N) until :meth:`of_source`.
+        Roots of the covariances, in the chart about each mean; of a point of a track (K, 6, N) until
+        :meth:`source_marginal`.
     log_weight : ndarray, shape (K,)
-        Logarithms of their weights, which add up to one.
+        Logarithms of the weights, which sum to one.
     n_charted : int
         Length of the states without the sensors' errors.
     centroid_m : ndarray, shape (3,)
-        Of the sensors, in the world frame.
+        Centroid of the sensors, in the world frame.
     radius_m : float
-        Largest distance of a sensor from it.
+        Largest distance of a sensor from the centroid.
     n_pose : int
-        How many of the last of them are errors of the array's pose.
+        Number of errors of the array's pose, the last of the `n_charted` states.
     n_rows : int
-        Number of rows that led to it.
+        Number of rows used.
     """
 
     x: FloatArray
@@ -65,7 +66,7 @@ class Mixture:
 
     @classmethod
     def of_gaussian(cls, x: FloatArray, P: FloatArray, centroid_m: FloatArray, radius_m: float) -> Mixture:
-        """A source alone, of a Cartesian state (6,) and covariance (6, 6)."""
+        """Return the mixture of one source with a Cartesian state (6,) and covariance (6, 6)."""
         root = Chart.at(x, centroid_m, radius_m).inverse_jacobian() @ symmetric_square_root(P)
         return cls(x[None], root_of(root)[None], np.zeros(1), x.size, centroid_m, radius_m)
 
@@ -79,17 +80,17 @@ class Mixture:
 
     @property
     def chart(self) -> Chart:
-        """About every component."""
+        """Charts about the components."""
         return Chart.at(self.x[:, : self.n_charted], self.centroid_m, self.radius_m, self.n_pose)
 
     @property
     def widths(self) -> FloatArray:
-        """Larger one of the standard deviations of log-range and direction (K,)."""
+        """Largest standard deviation (K,) of log-range and direction."""
         return np.sqrt(np.max(np.sum(self.S[:, :3] ** 2, axis=2), axis=1))
 
     @property
     def log_range_sigma(self) -> float:
-        """Standard deviation of the log-range of all components together."""
+        """Standard deviation of the log-range of the whole mixture."""
         if len(self) == 1:
             return float(np.linalg.norm(self.S[0, 0]))
         log_range, weight = np.log(self.chart.length), self.weight
@@ -97,42 +98,45 @@ class Mixture:
         return float(np.sqrt(weight @ (apart**2 + np.sum(self.S[:, 0] ** 2, axis=1))))
 
     def take(self, index: IntArray | BoolArray) -> Mixture:
-        """Some of the components, their weights adding up to one."""
+        """Return some of the components, with normalised weights."""
         log_weight = self.log_weight[index]
         log_weight = log_weight - np.logaddexp.reduce(log_weight)
         return replace(self, x=self.x[index], S=self.S[index], log_weight=log_weight)
 
-    def of_source(self) -> Mixture:
-        """Position and moment alone."""
+    def source_marginal(self) -> Mixture:
+        """Return the marginal of position and moment."""
         if self.S.shape[1:] == (N_SOURCE, N_SOURCE):
             return self
         return replace(self, x=self.x[:, :N_SOURCE], S=root_of(self.S[:, :N_SOURCE]), n_charted=N_SOURCE, n_pose=0)
 
-    def likely(self) -> Mixture:
-        """Return the components of some weight, of those that have run away only heavy ones: they would be the mean."""
+    def drop_unlikely(self) -> Mixture:
+        """Return the mixture without components of negligible weight: more is asked of those that have run away.
+
+        A light component at an absurd range would be the mean of all.
+        """
         least = np.where(self.chart.length > _RUN_AWAY * self.radius_m, _LEAST_RUN_AWAY, DROPPED_BELOW)
         return self.take(self.log_weight >= self.log_weight.max() + least)
 
-    def reduced(self) -> Mixture:
-        """The likely components, and those that are as good as one merged."""
-        kept = self.likely()
-        if len(kept) == 1:
-            return kept
-        kept = kept.take(np.argsort(-kept.log_weight, kind="stable"))
-        groups = _groups(kept)
-        if len(groups) == len(kept):
-            return kept
+    def reduce(self) -> Mixture:
+        """Drop unlikely components, and merge those that are nearly equal."""
+        likely = self.drop_unlikely()
+        if len(likely) == 1:
+            return likely
+        likely = likely.take(np.argsort(-likely.log_weight, kind="stable"))
+        groups = _groups(likely)
+        if len(groups) == len(likely):
+            return likely
         first = np.array([group[0] for group in groups])
-        found, log_weight = kept.take(first), kept.log_weight[first]
+        merged, log_weight = likely.take(first), likely.log_weight[first]
         for i, group in enumerate(groups):
             if len(group) > 1:
-                one = kept.take(group).matched()
-                found.x[i], found.S[i] = one.x[0], one.S[0]
-                log_weight[i] = np.logaddexp.reduce(kept.log_weight[group])
-        return replace(found, log_weight=log_weight - np.logaddexp.reduce(log_weight))
+                one = likely.take(group).match_moments()
+                merged.x[i], merged.S[i] = one.x[0], one.S[0]
+                log_weight[i] = np.logaddexp.reduce(likely.log_weight[group])
+        return replace(merged, log_weight=log_weight - np.logaddexp.reduce(log_weight))
 
-    def matched(self) -> Mixture:
-        """The one Gaussian of the same mean and covariance, in the chart of the heaviest component."""
+    def match_moments(self) -> Mixture:
+        """Return the Gaussian of the same mean and covariance, in the chart of the heaviest component."""
         if len(self) == 1:
             return self
         n, best = self.n_charted, int(np.argmax(self.log_weight))
@@ -141,7 +145,7 @@ class Mixture:
         mean = self.weight @ offset
         spread = np.sqrt(self.weight)[:, None, None] * np.concatenate([roots, (offset - mean)[:, :, None]], axis=2)
         x = self.x[best] + mean
-        x[:n] = about.retracted(mean[None, :n])[0]
+        x[:n] = about.retract(mean[None, :n])[0]
         after = Chart.at(x[None, :n], self.centroid_m, self.radius_m, self.n_pose)
         rows = np.concatenate(list(spread), axis=1)
         turn = after.inverse_jacobian()[0] @ about.jacobian(mean[None, :n])[0]
@@ -149,22 +153,21 @@ class Mixture:
         return replace(self, x=x[None], S=root_of(rows)[None], log_weight=np.zeros(1))
 
     def moments(self) -> tuple[FloatArray, FloatArray]:
-        """Cartesian mean (6,) and covariance (6, 6) of position and moment; a range is log-normal."""
+        """Return the Cartesian mean (6,) and covariance (6, 6) of position and moment; ranges are log-normal."""
         mean, covariance = component_moments(self.chart, self.S)
         if len(self) == 1:
             return mean[0], covariance[0]
         weight = self.weight
         centre = weight @ mean
         off = mean - centre
-        of_all = np.einsum("k,kij->ij", weight, covariance) + (weight[:, None] * off).T @ off
-        return centre, of_all
+        return centre, np.einsum("k,kij->ij", weight, covariance) + (weight[:, None] * off).T @ off
 
     def range_interval_m(self) -> Intervals:
-        """95 % set of the distance from the centroid [m]: quantiles of the mixture."""
+        """Return the 95 % set of the distance from the centroid [m], by quantiles of the mixture."""
         chart = self.chart
         r = np.linalg.norm(self.x[:, :3] - self.centroid_m, axis=1)
         sigma, weight = np.linalg.norm(self.S[:, 0], axis=1), self.weight
-        # The chart's origin stands back from the centroid where the source is nearer than the array's radius.
+        # The chart's origin is behind the centroid if the source is nearer than the array's radius.
         back = chart.length - r
 
         def quantile(share: float) -> float:
@@ -185,7 +188,7 @@ class Mixture:
 
 
 def component_moments(chart: Chart, S: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Cartesian means (K, 6) and covariances (K, 6, 6) of single components with roots (K, N, N) in the chart."""
+    """Return Cartesian means (K, 6) and covariances (K, 6, 6) of components with roots S in the chart."""
     reach = chart.length[:, None, None]
     of_position = reach * (chart.u[:, :, None] * S[:, :1] + chart.E @ S[:, 1:3])
     of_moment = MOMENT_POWER * chart.x[:, 3:6, None] * S[:, :1] + reach**MOMENT_POWER * S[:, 3:6]
@@ -197,7 +200,7 @@ def component_moments(chart: Chart, S: FloatArray) -> tuple[FloatArray, FloatArr
 
 
 def _in_chart(about: Chart, mixture: Mixture) -> tuple[FloatArray, FloatArray]:
-    """Means (K, N) and roots (K, N, N) of components in the chart of one."""
+    """Return means (K, N) and roots (K, N, N) of all components in the chart of one."""
     n, K = mixture.n_charted, len(mixture)
     chart = about.take(np.zeros(K, dtype=np.intp))
     offset, roots = np.zeros_like(mixture.x), mixture.S.copy()
@@ -210,16 +213,16 @@ def _in_chart(about: Chart, mixture: Mixture) -> tuple[FloatArray, FloatArray]:
 
 
 def root_of(rows: FloatArray) -> FloatArray:
-    """Lower root (..., n, n) of ``rows rowsᵀ``, by an orthogonal factorisation of rows (..., n, m), m ≥ n."""
+    """Return the lower root (..., n, n) of ``rows rowsᵀ``, by a QR factorisation of rows (..., n, m), m ≥ n."""
     return np.swapaxes(np.linalg.qr(np.swapaxes(rows, -1, -2), mode="r"), -1, -2)
 
 
 def _groups(mixture: Mixture) -> list[IntArray]:
-    """Components in groups of such as are as good as the group's first, heaviest first."""
+    """Return groups of components that are nearly equal to the group's first, heaviest first."""
     chart, S, K = mixture.chart, mixture.S, len(mixture)
     variance = np.sum(S[:, :3] ** 2, axis=2)
     log_range, log_variance = np.log(chart.length), np.log(variance[:, 0])
-    # A divergence is at least that of the log-range alone, and half the square of an offset in any one coordinate.
+    # The divergence of the log-range alone, and half the squared offset in any coordinate, are lower bounds.
     square = (log_range - log_range[:, None]) ** 2 + variance[:, 0]
     of_range = square / variance[:, :1] - 1.0 + log_variance[:, None] - log_variance
     angle = np.sum((chart.u - chart.u[:, None]) ** 2, axis=2)
@@ -238,7 +241,7 @@ def _groups(mixture: Mixture) -> list[IntArray]:
 
 
 def _divergences(mixture: Mixture, first: IntArray, others: IntArray) -> FloatArray:
-    """Kullback and Leibler's divergences (m,) of source and motion of some components from others, pair by pair."""
+    """Return the Kullback-Leibler divergences (m,) of pairs of components, in source and motion."""
     if not first.size:
         return np.zeros(0)
     n, about, chart = mixture.n_charted, mixture.chart.take(first), mixture.chart.take(others)

@@ -1,13 +1,13 @@
-r"""Where a source may be that rows together do not determine yet: places drawn, and weighed by importance sampling.
+r"""Importance sampling of the place of a source that several rows do not determine yet.
 
-The valley of places that rows leave open bends in log-range and direction, and the moment that belongs to a place is
-known far better than the place: Gaussians in all six numbers miss what lies between them. So places are drawn, and the
-moment of each is fitted, in which readings are nearly linear. With the information :math:`A^T C^{-1} A` of the moment
-as it is seen, :math:`\mu`, the density of log-range and direction is
+The likely places are a curved valley in log-range and direction, and the moment given a place is known far better than
+the place, so that a mixture of Gaussians in all six numbers leaves gaps. Therefore places are sampled, and the moment
+of each is fitted, in which readings are nearly linear. With the information :math:`A^T C^{-1} A` of the scaled moment
+:math:`\mu`, the density of log-range and direction is
 
 .. math:: |C|^{-1/2} e^{-\chi^2/2} |A^T C^{-1} A|^{-1/2} |\mu|^{-3},
 
-which is that of the start's cells (:mod:`magloc.tracking.chart.start`).
+the same as for the cells of :mod:`magloc.tracking.chart.start`.
 """
 
 from __future__ import annotations
@@ -31,24 +31,24 @@ from magloc.tracking.motion import N_SOURCE
 
 N_PLACES = 300
 N_NEIGHBOURS, KERNEL = 30, 0.7
-"""Places of whose spread a kernel is, and its width over it."""
+"""Number of neighbours that determine the width of a kernel, and the width over their spread."""
 ENOUGH = 40.0
-"""Effective number of places from which on no more are drawn."""
+"""Effective sample size at which the sampling ends."""
 _MOST_ROUNDS = 4
 _INFLATED = 1.5
-"""Standard deviations of what places are first drawn from, over what is known: their tails are to be seen."""
-# Places that are linearised together, in the order of their ranges.
+"""Standard deviations of the first proposal over those of the mixture, to cover its tails."""
+# Blocks of places, in the order of their ranges, that share one covariance of the readings.
 _N_BLOCKS = 12
 _PRIMES = (2, 3, 5)
-# Cosine of the angle between a place and a component beyond which it cannot have come from there.
+# Least cosine of the angle between a place and a component that may have proposed it.
 _LEAST_COSINE = 1e-3
 _POINT = 1e-6
-"""Standard deviation of log-range and direction of a drawn place."""
+"""Standard deviation of log-range and direction of a sampled place."""
 
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """Gaussians of log-range and direction about states (K, 6), from which places are drawn.
+    """Proposal density: Gaussians of log-range and direction about states (K, 6).
 
     Attributes
     ----------
@@ -63,13 +63,13 @@ class Places:
 
     @classmethod
     def of(cls, mixture: Mixture) -> Places:
-        """The components of a mixture, wider."""
+        """Return the components of a mixture with inflated covariances."""
         return cls(mixture.chart, _INFLATED * root_of(mixture.S[:, :3]), mixture.log_weight)
 
     @classmethod
     def about(cls, drawn: Mixture) -> Places:
-        """Kernels about places that were drawn, by their weights, each as wide as its neighbours are spread."""
-        k = _stratified(drawn.weight, N_PLACES)
+        """Return kernels about resampled places, each with the spread of its neighbours."""
+        k = _resample(drawn.weight, N_PLACES)
         chart = drawn.chart.take(k)
         log_range, u = np.log(chart.length), chart.u
         apart = (log_range[:, None] - log_range) ** 2 + 2.0 - 2.0 * u @ u.T
@@ -80,15 +80,15 @@ class Places:
         spread = np.swapaxes(left, -1, -2) @ left / N_NEIGHBOURS + _POINT**2 * np.eye(3)
         return cls(chart, KERNEL * np.linalg.cholesky(spread), np.full(N_PLACES, -math.log(N_PLACES)))
 
-    def drawn(self, n: int) -> FloatArray:
-        """States (n, 6) from all of them, by their weights: the moment looks as that of the component."""
-        k = _stratified(np.exp(self.log_weight - np.logaddexp.reduce(self.log_weight)), n)
+    def draw(self, n: int) -> FloatArray:
+        """Return n states (n, 6) drawn by the weights, with the scaled moments of their components."""
+        k = _resample(np.exp(self.log_weight - np.logaddexp.reduce(self.log_weight)), n)
         e = np.zeros((n, N_SOURCE))
         e[:, :3] = (self.root[k] @ _normal(n)[..., None])[..., 0]
-        return self.chart.take(k).retracted(e)
+        return self.chart.take(k).retract(e)
 
     def log_density(self, x: FloatArray) -> FloatArray:
-        """Of log-range and direction, at states (n, 6)."""
+        """Return the log-density (n,) of log-range and direction at states (n, 6)."""
         chart = self.chart
         offset = x[:, None, :3] - (chart.x[:, :3] - chart.length[:, None] * chart.u)
         r = np.linalg.norm(offset, axis=-1)
@@ -99,19 +99,19 @@ class Places:
         inverse = np.linalg.inv(self.root)
         standard = (inverse @ e[..., None])[..., 0]
         each = self.log_weight + np.linalg.slogdet(inverse)[1] - 0.5 * np.sum(standard**2, axis=-1)
-        # The plane that touches the sphere of directions at a component is farther away, and aslant, beside it.
+        # Jacobian of the projection from the sphere of directions to its tangent plane at the component.
         each += 1.5 * np.log1p(np.sum(across**2, axis=-1)) - 1.5 * math.log(2.0 * math.pi)
         return np.asarray(np.logaddexp.reduce(np.where(cosine > _LEAST_COSINE, each, -np.inf), axis=1))
 
 
-def _stratified(weight: FloatArray, n: int) -> IntArray:
-    """Which of weighted things n draws are of."""
+def _resample(weight: FloatArray, n: int) -> IntArray:
+    """Return the indices (n,) of a systematic resampling by weights."""
     return np.minimum(np.searchsorted(np.cumsum(weight), (0.5 + np.arange(n)) / n), len(weight) - 1)
 
 
 @cache
 def _normal(n: int) -> FloatArray:
-    """Quasi-random normal numbers (n, 3): Halton's sequence."""
+    """Return quasi-random normal numbers (n, 3) by Halton's sequence."""
     uniform = np.zeros((n, len(_PRIMES)))
     for axis, base in enumerate(_PRIMES):
         left, share = np.arange(1, n + 1), 1.0
@@ -122,38 +122,38 @@ def _normal(n: int) -> FloatArray:
     return np.asarray(ndtri(uniform))
 
 
-def effective_number(drawn: Mixture) -> float:
-    """Of places, by their weights."""
+def effective_sample_size(drawn: Mixture) -> float:
+    """Return the effective number of samples by their weights."""
     return float(1.0 / np.sum(drawn.weight**2))
 
 
-def weighed(stack: Stack, places: Sequence[Places], prior: SourcePrior) -> Mixture | None:
-    """Places drawn until enough of them count, weighed by what all rows say; None where none is possible."""
+def sample_places(stack: Stack, places: Sequence[Places], prior: SourcePrior) -> Mixture | None:
+    """Sample places by all rows until the effective sample size is large enough; None if none is possible."""
     drawn: Mixture | None = None
     every = list(places)
     for _ in range(_MOST_ROUNDS if places else 0):
-        found = _of_places(stack, every, prior)
+        found = _importance_sample(stack, every, prior)
         if found is None:
             break
         drawn = found
-        if effective_number(drawn) > ENOUGH:
+        if effective_sample_size(drawn) > ENOUGH:
             break
-        # What was drawn from before stays: a place that is drawn by chance alone takes no other's part.
+        # Earlier proposals stay, so that one improbable sample cannot take all of the weight.
         every = [*places, Places.about(drawn)]
     return drawn
 
 
-def _of_places(stack: Stack, places: Sequence[Places], prior: SourcePrior) -> Mixture | None:
-    """States drawn from several kinds of places, from each as many, with the moments that fit best, weighed."""
+def _importance_sample(stack: Stack, places: Sequence[Places], prior: SourcePrior) -> Mixture | None:
+    """Return weighted states sampled equally from several proposals, with the best moment of each."""
     n_each = N_PLACES // len(places)
-    x = np.concatenate([one.drawn(n_each) for one in places])
+    x = np.concatenate([one.draw(n_each) for one in places])
     log_density = np.logaddexp.reduce([one.log_density(x) for one in places], axis=0)
     order = np.argsort(np.linalg.norm(x[:, :3] - stack.centroid_m, axis=1))
     x, log_density = x[order], log_density[order]
-    # Of places at like ranges the errors of the rows do alike.
+    # At similar ranges the covariance of the readings is similar.
     blocks = np.array_split(np.arange(len(x)), _N_BLOCKS)
     roots = np.linalg.cholesky(stack.covariance(x[[block[len(block) // 2] for block in blocks]]))
-    predicted, by_moment = stack.by_moment(x)
+    predicted, by_moment = stack.linearise_in_moment(x)
     left = stack.z - predicted + (by_moment @ x[:, 3:6, None])[..., 0]
     both = np.concatenate([by_moment, left[..., None]], axis=-1)
     log_C = np.empty(len(x))
@@ -185,7 +185,7 @@ def _of_places(stack: Stack, places: Sequence[Places], prior: SourcePrior) -> Mi
 
 
 def _moments(stack: Stack, prior: SourcePrior, R: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Moments (n, 3) that fit best, upper roots (n, 3, 3) of their information, and χ² (n,), by roots (n, 4, 4)."""
+    """Return best moments (n, 3), upper roots (n, 3, 3) of their information, and χ² (n,), by R (n, 4, 4)."""
     chi2 = R[:, 3, 3] ** 2
     known, turn = prior.known_moment, stack.row.R_world_from_array
     of_moment, y = R[:, :3, :3], R[:, :3, 3]
@@ -193,7 +193,7 @@ def _moments(stack: Stack, prior: SourcePrior, R: FloatArray) -> tuple[FloatArra
     of_moment = np.where(regular[:, None, None], of_moment, np.nan)
     if known is None:
         return np.asarray(np.linalg.solve(of_moment, y[..., None])[..., 0]), of_moment, chi2
-    # In the array's axes, in which it is known.
+    # The moment is known in the array's axes.
     of_moment = of_moment @ turn
     information, pull = (
         np.swapaxes(of_moment, -1, -2) @ of_moment,

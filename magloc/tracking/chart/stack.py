@@ -1,9 +1,9 @@
-"""Rows of which one alone does not determine a source, all together: as one row with the errors of all as its noise.
+"""Several rows that are individually insufficient, as one measurement with correlated noise.
 
-Until a track begins nothing is known that could be predicted, and rows that are alike bend over a cell of the start by
-more than their noise: a filter from row to row becomes too sure of itself. Here the source is where it is in the last
-row, and how it moved before, the errors of the pose and those of the sensors are noise that rows have in common. It is
-linearised at every component. Successive rows count as their mean, so that there are few however many there are.
+Before a track starts there is no prediction, and similar rows are nonlinear over a cell of the start by more than their
+noise, so that a recursive filter becomes overconfident. Here the state is the source in the last row. Its earlier
+motion, the errors of the pose and those of the sensors are noise that is correlated between rows, linearised at every
+component. Successive rows are averaged, so that the number of means is bounded.
 """
 
 from __future__ import annotations
@@ -21,28 +21,28 @@ from magloc.measurement.differences import DifferenceMeasurement
 from magloc.measurement.nuisances import SensorErrors
 from magloc.measurement.pose import N_POSE, PoseErrors
 from magloc.tracking.coordinates import Chart
-from magloc.tracking.measurement import RowMeasurement, where_smooth
+from magloc.tracking.measurement import RowMeasurement, zero_if_nan
 from magloc.tracking.motion import N_SOURCE, MotionModel
 from magloc.tracking.rows import Row
 
 FEWEST_MEANS, MOST_ROWS_OF_ONE = 16, 4
-"""Means of successive rows that stand for them, at least, and how many rows have one at most."""
+"""Least number of means of successive rows, and largest number of rows in one mean."""
 MOST_CHANGES = 32
-"""Rows at most, the latest, that miss other channels than the row before: each begins a mean of its own."""
+"""Largest number of changes of the missing channels, each of which begins a new mean; earlier rows are dropped."""
 
 
 @dataclass(frozen=True, eq=False)
 class Stack:
-    """Rows in the order of time, as :class:`RowMeasurement` of the last one.
+    """Rows in the order of time as one measurement, with the interface of :class:`RowMeasurement`.
 
     Attributes
     ----------
     rows : sequence of RowMeasurement
-        With equally many differences, see :meth:`of`.
+        Rows with equally many differences, see :meth:`of`.
     errors, pose_errors : SensorErrors, PoseErrors
-        That the rows have, and how long they last.
+        Errors of the rows, and their correlation times.
     motion : MotionModel
-        How the source moves from row to row.
+        Motion of the source between rows.
     """
 
     rows: Sequence[RowMeasurement]
@@ -56,78 +56,80 @@ class Stack:
     def of(
         cls, rows: Sequence[RowMeasurement], errors: SensorErrors, pose_errors: PoseErrors, motion: MotionModel
     ) -> Stack:
-        """Return the latest of some rows, each of any number of differences."""
+        """Return the stack of the latest rows, each with any number of differences."""
         changes = _changes(rows)
         latest = rows[changes[-MOST_CHANGES] :] if changes.size >= MOST_CHANGES else rows
         k = max(row.n_differences for row in latest)
-        return cls(tuple(row.padded(k) for row in latest), errors, pose_errors, motion)
+        return cls(tuple(row.pad(k) for row in latest), errors, pose_errors, motion)
 
     @cached_property
     def n_differences(self) -> int:
-        """Number of differences without those that only pad rows."""
-        return int(self._transform[self._begin].any(axis=2).sum())
+        """Number of differences without padding."""
+        return int(self._transform[self._first_rows].any(axis=2).sum())
 
     @property
     def row(self) -> Row:
-        """The last of its rows."""
+        """Last row."""
         return self.rows[-1].row
 
     @property
     def model(self) -> DifferenceMeasurement:
-        """Of the last row."""
+        """Measurement model of the last row."""
         return self.rows[-1].model
 
     @property
     def centroid_m(self) -> FloatArray:
-        """Of the sensors in the world frame, in the last row."""
+        """Centroid of the sensors in the world frame, in the last row."""
         return self.rows[-1].centroid_m
 
     @property
     def radius_m(self) -> float:
-        """Largest distance of a sensor from it."""
+        """Largest distance of a sensor from the centroid."""
         return self.rows[-1].radius_m
 
     @property
     def effect(self) -> FloatArray:
-        """No sensor has errors besides the noise (k, 0)."""
+        """Empty effect (k, 0), because errors of sensors are part of the noise."""
         return np.zeros((self.z.size, 0))
 
     def chart(self, x: FloatArray) -> Chart:
-        """About states (..., 6)."""
+        """Return the charts about states (..., 6)."""
         return Chart.at(x, self.centroid_m, self.radius_m)
 
     def with_errors_as_noise(self, sigma: FloatArray) -> Stack:
-        """Itself: they are."""
+        """Return the stack unchanged, because the errors are already part of the noise."""
         return self
 
     @cached_property
-    def _begin(self) -> IntArray:
-        """First rows of the means."""
+    def _first_rows(self) -> IntArray:
+        """Index of the first row of each mean."""
         n = len(self.rows)
         n_means = min(n, max(FEWEST_MEANS, -(-n // MOST_ROWS_OF_ONE)))
         even = np.linspace(0, n, n_means, endpoint=False).astype(np.intp)
         return np.union1d(even, _changes(self.rows))
 
     @cached_property
-    def _size(self) -> IntArray:
-        """Rows of each of them."""
-        return np.diff(np.append(self._begin, len(self.rows)))
+    def _row_counts(self) -> IntArray:
+        """Number of rows of each mean."""
+        return np.diff(np.append(self._first_rows, len(self.rows)))
 
     @cached_property
-    def _middle(self) -> list[RowMeasurement]:
-        """One row for each."""
-        return [self.rows[i] for i in (self._begin + self._size // 2).tolist()]
+    def _middle_rows(self) -> list[RowMeasurement]:
+        """Middle row of each mean."""
+        return [self.rows[i] for i in (self._first_rows + self._row_counts // 2).tolist()]
 
     def _means(self, values: FloatArray) -> FloatArray:
-        """Of rows (n, ..., k), of unit noise: (..., k means)."""
-        of_each = np.add.reduceat(values, self._begin, axis=0)
-        of_each /= np.sqrt(self._size).reshape(-1, *[1] * (values.ndim - 1))
-        ahead = np.moveaxis(of_each, 0, -2)
-        return ahead.reshape(*ahead.shape[:-2], ahead.shape[-2] * ahead.shape[-1])
+        """Return the means (..., k means) of rows (n, ..., k), scaled to unit noise."""
+        means = np.add.reduceat(values, self._first_rows, axis=0)
+        means /= np.sqrt(self._row_counts).reshape(-1, *[1] * (values.ndim - 1))
+        means = np.moveaxis(means, 0, -2)
+        return means.reshape(*means.shape[:-2], means.shape[-2] * means.shape[-1])
 
-    def _middles(self, values: Sequence[FloatArray]) -> FloatArray:
-        """Derivatives (..., k, m) of rows in the middle as those of means (..., k means, m), of unit noise."""
-        of_each = np.stack([np.sqrt(size) * value for size, value in zip(self._size, values, strict=True)], axis=-3)
+    def _middle_derivatives(self, values: Sequence[FloatArray]) -> FloatArray:
+        """Return derivatives (..., k, m) of the middle rows as those of the means (..., k means, m)."""
+        of_each = np.stack(
+            [np.sqrt(size) * value for size, value in zip(self._row_counts, values, strict=True)], axis=-3
+        )
         return of_each.reshape(*of_each.shape[:-3], of_each.shape[-3] * of_each.shape[-2], of_each.shape[-1])
 
     @cached_property
@@ -137,7 +139,7 @@ class Stack:
 
     @cached_property
     def _pose(self) -> tuple[FloatArray, FloatArray]:
-        """Places (n, 1, 3) and attitudes (n, 3, 3)."""
+        """Positions (n, 1, 3) and rotations (n, 3, 3) of the array."""
         poses = [row.pose for row in self.rows]
         origins = np.stack([pose.origin_m for pose in poses])
         return origins[:, None], np.stack([pose.R_world_from_array for pose in poses])
@@ -149,17 +151,17 @@ class Stack:
 
     @cached_property
     def _transform(self) -> FloatArray:
-        """Of channels to differences of unit noise (n, k, C)."""
+        """Matrices (n, k, C) from channels to differences of unit noise."""
         return np.stack([row.model.differences.transform / row.sigma[:, None] for row in self.rows])
 
     def _in_arrays(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Places and moments (n, K, 1, 3) of sources in every array's axes."""
+        """Return positions and moments (n, K, 1, 3) of sources in the array's axes of each row."""
         origin, R = self._pose
         place, moment = (state[:, :3] - origin) @ R, state[:, 3:6] @ R
         return place[:, :, None], moment[:, :, None]
 
-    def of_source(self, state: FloatArray) -> FloatArray:
-        """Predicted differences (..., k) of sources (..., 6)."""
+    def predict_source(self, state: FloatArray) -> FloatArray:
+        """Return the predicted differences (..., k) of sources (..., 6)."""
         states = state.reshape(-1, N_SOURCE)
         array = self.model.array
         fields = dipole.field(array.positions, *self._in_arrays(states)) + self._ambient_T
@@ -167,8 +169,8 @@ class Stack:
         predicted = self._means(channels @ np.swapaxes(self._transform, -1, -2))
         return predicted.reshape(*state.shape[:-1], predicted.shape[-1])
 
-    def along(self, state: FloatArray, directions: FloatArray) -> FloatArray:
-        """Their derivative (K, k, m) along directions (K, 6, m) in states (K, 6)."""
+    def directional_derivative(self, state: FloatArray, directions: FloatArray) -> FloatArray:
+        """Return the derivative (K, k, m) of :meth:`predict_source` along directions (K, 6, m)."""
         array, (_, R) = self.model.array, self._pose
         in_arrays = self._in_arrays(state)
         gain = array.linear_gain(dipole.field(array.positions, *in_arrays) + self._ambient_T)
@@ -180,8 +182,8 @@ class Stack:
         means = self._means(np.swapaxes(by_world, -1, -2))  # (K, 6, k)
         return np.asarray(np.swapaxes(means, -1, -2) @ directions)
 
-    def by_moment(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Predicted differences (K, k) of sources (K, 6), and their derivative (K, k, 3) by the moments."""
+    def linearise_in_moment(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the predicted differences (K, k) of sources (K, 6), and their derivative by the moments."""
         array, (_, R) = self.model.array, self._pose
         place, moment = self._in_arrays(state)
         matrix = dipole.field_matrix(array.positions, place)
@@ -194,12 +196,12 @@ class Stack:
         return predicted, np.swapaxes(self._means(np.swapaxes(by_world, -1, -2)), -1, -2)
 
     def moment_columns(self, position_m: FloatArray) -> FloatArray:
-        """Return the derivative (K, k, 3) of rows in the middle of the means by the moment of a weak source."""
-        return self._middles([row.moment_columns(position_m) for row in self._middle])
+        """Return the derivative (K, k, 3) of the middle rows by the moment of a weak source."""
+        return self._middle_derivatives([row.moment_columns(position_m) for row in self._middle_rows])
 
     @cached_property
     def without_source(self) -> FloatArray:
-        """What is left of the measured differences (k,) when the ambient field's own are taken out."""
+        """Measured differences (k,) minus those of the ambient field."""
         return self._means(np.stack([row.without_source for row in self.rows]))
 
     @cached_property
@@ -209,58 +211,57 @@ class Stack:
         return np.linalg.inv(np.linalg.cholesky(self.covariance(nowhere, far=True)[0]))
 
     def is_detected(self, sigma_errors: FloatArray) -> bool:
-        """Whether the differences stand out of noise and of what all errors may make of them."""
+        """Return True if the differences exceed noise and the effects of all errors."""
         left = self.whitening @ self.without_source
         return bool(left @ left > energy_threshold(self.n_differences))
 
     def covariance(self, state: FloatArray, *, far: bool = False) -> FloatArray:
-        """Of the differences (K, k, k) where the source is at states (K, 6), or so far that there is none."""
+        """Return the covariance (K, k, k) of the differences for states (K, 6), or without a source if `far`."""
         k = self.z.size
-        C = np.eye(k) + self._of_sensors
+        C = np.eye(k) + self._sensor_covariance
         parts = []
         by_source, by_pose, error = [], [], np.zeros((len(state), N_POSE))
-        for row in self._middle:
+        for row in self._middle_rows:
             in_array = row.pose.in_array(state)
             by_array = np.zeros((len(state), row.z.size, N_SOURCE))
             if not far:
                 by_array = row.model.jacobian(in_array[:, :3], in_array[:, 3:]) / row.sigma[:, None]
             by_source.append(row._by_source(by_array, None))
             if row.n_pose:
-                by_pose.append(where_smooth(row._by_pose(by_array, in_array, error)))
+                by_pose.append(zero_if_nan(row._by_pose(by_array, in_array, error)))
         if by_pose:
-            E = self._middles(by_pose)
-            for lasts_s, share in self._of_pose.items():
-                parts.append(self._spread(E[..., self.pose_errors.lasts_s == lasts_s], share))
+            E = self._middle_derivatives(by_pose)
+            for lasts_s, share in self._pose_roots.items():
+                parts.append(self._error_columns(E[..., self.pose_errors.lasts_s == lasts_s], share))
         if not far:
-            H = self._middles(by_source)
-            of_place, of_moment = self._of_motion
+            H = self._middle_derivatives(by_source)
+            of_place, of_moment = self._motion_roots
             strength = np.linalg.norm(state[:, 3:6], axis=1)[:, None, None]
-            parts += [self._spread(H[..., :3], of_place), self._spread(strength * H[..., 3:], of_moment)]
+            parts += [self._error_columns(H[..., :3], of_place), self._error_columns(strength * H[..., 3:], of_moment)]
         for part in parts:
             C = C + part @ np.swapaxes(part, -1, -2)
         return np.broadcast_to(C, (len(state), k, k))
 
-    def _spread(self, E: FloatArray, share: FloatArray) -> FloatArray:
-        """Columns (K, k, m means) of errors with an effect E (K, k, m), whose root over the means is share."""
+    def _error_columns(self, E: FloatArray, share: FloatArray) -> FloatArray:
+        """Return columns (K, k, m means) of errors with an effect E (K, k, m) and a root `share` over the means."""
         n_means, m = len(share), E.shape[-1]
-        of_each = E.reshape(len(E), n_means, -1, m)
-        spread = of_each[..., None] * share[:, None, None, :]
-        return spread.reshape(len(E), E.shape[1], -1)
+        columns = E.reshape(len(E), n_means, -1, m)[..., None] * share[:, None, None, :]
+        return columns.reshape(len(E), E.shape[1], -1)
 
     @cached_property
     def _time_s(self) -> FloatArray:
         return np.array([row.row.time_s for row in self.rows])
 
     def _root_of_means(self, T: FloatArray) -> FloatArray:
-        """Root (means, means) of a covariance of rows (n, n)."""
-        of_means = np.add.reduceat(np.add.reduceat(T, self._begin, axis=0), self._begin, axis=1)
-        of_means /= np.outer(self._size, self._size)
-        value, axes = np.linalg.eigh(of_means)
+        """Return the root (means, means) of the means' covariance, from that of rows (n, n)."""
+        covariance = np.add.reduceat(np.add.reduceat(T, self._first_rows, axis=0), self._first_rows, axis=1)
+        covariance /= np.outer(self._row_counts, self._row_counts)
+        value, axes = np.linalg.eigh(covariance)
         return np.asarray(axes * np.sqrt(np.maximum(value, 0.0)))
 
     @cached_property
-    def _of_pose(self) -> dict[float, FloatArray]:
-        """Roots over the means of the pose's errors, by how long they last."""
+    def _pose_roots(self) -> dict[float, FloatArray]:
+        """Roots over the means of errors of the pose, by their correlation time."""
         apart_s = np.abs(self._time_s[:, None] - self._time_s)
         lasting = np.unique(self.pose_errors.lasts_s).tolist()
         return {
@@ -269,10 +270,10 @@ class Stack:
         }
 
     @cached_property
-    def _of_sensors(self) -> FloatArray:
-        """What the sensors' errors add to the covariance (k, k)."""
+    def _sensor_covariance(self) -> FloatArray:
+        """Covariance (k, k) of the differences by the sensors' errors."""
         k, n = self.z.size, len(self.rows)
-        E = self._middles([row.effect[None] for row in self._middle])
+        E = self._middle_derivatives([row.effect[None] for row in self._middle_rows])
         added = np.zeros((k, k))
         if not E.shape[-1]:
             return added
@@ -287,18 +288,18 @@ class Stack:
                 T[i, :i] = kept[s] * T[i - 1, :i]
                 T[:i, i] = T[i, :i]
                 T[i, i] = kept[s] ** 2 * T[i - 1, i - 1] + noise[s] ** 2
-            part = self._spread(E[..., states], self._root_of_means(T))[0]
+            part = self._error_columns(E[..., states], self._root_of_means(T))[0]
             added += part @ part.T
         return added
 
     @cached_property
-    def _of_motion(self) -> tuple[FloatArray, FloatArray]:
-        """Roots over the means of how far the source was from where it is, in m, and its moment, over its modulus.
+    def _motion_roots(self) -> tuple[FloatArray, FloatArray]:
+        """Roots over the means of the source's displacement since each row [m], and of its moment's relative change.
 
-        A motion that is stationary is the same backwards.
+        A stationary motion is the same backwards in time.
         """
         n = len(self.rows)
-        x, P = _of_unit_strength(self.motion)
+        x, P = _unit_moment_state(self.motion)
         place, moment = np.zeros((2, n, n))
         crossed = np.zeros((n, len(x), len(x)))
         for j, dt_s in enumerate(np.diff(self._time_s)[::-1].tolist(), start=1):
@@ -314,24 +315,24 @@ class Stack:
 
 
 def _changes(rows: Sequence[RowMeasurement]) -> IntArray:
-    """Rows that miss other channels than the row before."""
+    """Return the indices of rows that miss other channels than the row before."""
     available = np.stack([row.row.available for row in rows])
     return 1 + np.flatnonzero((available[1:] != available[:-1]).any(axis=1))
 
 
-def _of_unit_strength(motion: MotionModel) -> tuple[FloatArray, FloatArray]:
-    """State of a source of unit moment whose place is known, and the covariance of what else moves."""
+def _unit_moment_state(motion: MotionModel) -> tuple[FloatArray, FloatArray]:
+    """Return the state of a source of unit moment at a known place, and the covariance of its velocity and rates."""
     x, S = motion.start(np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0]), np.zeros((N_SOURCE, N_SOURCE)))
     return x, S @ S.T
 
 
 def displacement(motion: MotionModel, dt_s: float) -> tuple[float, float]:
-    """How far a source moves in a time, along each axis [m], and its moment, over its modulus: 1 σ."""
-    x, P = _of_unit_strength(motion)
+    """Return σ of a source's displacement in a time along each axis [m], and of its moment's relative change."""
+    x, P = _unit_moment_state(motion)
     _, F, S_q = motion.step(x, dt_s)
     variance = np.diagonal(F @ P @ F.T + S_q @ S_q.T)
     return float(np.sqrt(variance[:3].mean())), float(np.sqrt(variance[3:6].max()))
 
 
-Measured = RowMeasurement | Stack
-"""What a mixture is updated by: one row, or rows together."""
+RowOrStack = RowMeasurement | Stack
+"""Measurement that updates a mixture: one row, or several together."""

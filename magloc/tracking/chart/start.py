@@ -1,13 +1,13 @@
-"""Where a track starts: a mixture over all directions and ranges that the first row allows.
+"""Start of a track: a mixture over all directions and ranges that the first row allows.
 
-The start is a grid of cells, equal in direction and in the logarithm of the range, each a Gaussian in the chart about
-its centre whose moment is hardly known, so that all together they are an even density. The filter's own update makes of
-them what the row tells. Cells that explain the row as well as the best one does are taken, and those that explain it
-better than all around them, and the optima that :class:`magloc.localization.locator.Locator` finds between them.
+The prior is a grid of cells, uniform in direction and in the logarithm of the range. Each is a Gaussian in the chart
+about its centre with a nearly unknown moment, and their sum is nearly constant. The filter updates them by the row. The
+cells used are those that explain the row nearly as well as the best one, those that explain it better than their
+neighbours, and the optima that :class:`magloc.localization.locator.Locator` finds between them.
 
-Where a row tells more than a cell does, the cell's own Gaussian would pull the component and its weight: there it is
-centred anew where the row puts it, and what several cells have found alike counts once. Where the valley of ranges that
-it finds bends, it is divided along the range by halves of the grid's pitch.
+If a row determines a component better than its cell does, the cell's Gaussian would bias the component and its weight.
+Then the cell is centred again at the component, and equal components of several cells count once. A component along a
+curved valley of ranges is divided along the range by halving the pitch of the grid.
 """
 
 from __future__ import annotations
@@ -30,33 +30,33 @@ from magloc.measurement.rows import check_magnitudes, check_spans
 from magloc.tracking import row_filter
 from magloc.tracking.chart.known_moment import UNIFORM_IN_SPACE, KnownInWorld
 from magloc.tracking.chart.mixture import DROPPED_BELOW, FARTHEST, NEAREST, Mixture
-from magloc.tracking.chart.stack import Measured, Stack
-from magloc.tracking.chart.update import Updated, is_regular, updated
-from magloc.tracking.coordinates import MOMENT_POWER, Chart, mirrored, source_root
-from magloc.tracking.measurement import RowMeasurement, where_smooth, whitening
+from magloc.tracking.chart.stack import RowOrStack, Stack
+from magloc.tracking.chart.update import StateUpdates, is_regular, update_states
+from magloc.tracking.coordinates import MOMENT_POWER, Chart, mirror_images, source_root
+from magloc.tracking.measurement import RowMeasurement, whitening, zero_if_nan
 from magloc.tracking.motion import N_SOURCE, MotionModel
 from magloc.tracking.row_filter import Gaussians, RowUpdates
 from magloc.tracking.rows import Row
 
 OF_PITCH = 0.6
-"""Standard deviations of a cell, in units of the grid's pitch: neighbours add up to an even density."""
+"""Standard deviation of a cell over the grid's pitch, with which neighbours sum to a nearly constant density."""
 _N_DIRECTIONS, _N_RANGES = 100, 14
 _PITCH = math.log(FARTHEST / NEAREST) / (_N_RANGES - 1)
 _SPACING = math.sqrt(4.0 * math.pi / _N_DIRECTIONS)
-# Cells that explain so much less than the best one, as a rise of χ², are taken only where they are local peaks.
+# Largest excess of χ² over the best cell for a cell to be used; cells with more are used only if they are local peaks.
 _WITHIN = 20.0
 _NEIGHBOURS = 1.6 * _SPACING
-# The moment before anything is known, in units of what the row says of it at a cell's centre.
+# Prior σ of the moment over the best moment at a cell's centre.
 _UNKNOWN_MOMENT = 10.0
-# Of a cell's standard deviation: a component that is narrower is the row's own.
+# Share of a cell's σ below which the row determines a component.
 _NARROW = 0.5
-# The even density of all cells over the density of one at its centre, as a logarithm, along one coordinate.
+# Logarithm of the density of all cells over that of one at its centre, along one coordinate.
 _EVEN = math.log(OF_PITCH * math.sqrt(2.0 * math.pi))
 _CELL = OF_PITCH * np.array([_PITCH, _SPACING, _SPACING])
 LARGEST_BEND = 0.5
-"""By how much a valley of ranges may bend in a component's standard deviation, in that of the readings' noise."""
+"""Largest nonlinearity of the readings over a component's σ along a valley of ranges, in σ of their noise."""
 _MOST_BENT = 100.0
-# How far along a valley components stand, in standard deviations of its log-range.
+# Extent of the components along a valley, in standard deviations of its log-range.
 _VALLEY = 4.0
 _SIGMA_PRIOR = (math.log(FARTHEST / NEAREST) / math.sqrt(12.0), 1.0, 1.0)
 NOT_ALLOWED = "not acquired: no source of the stated region and moment explains the readings"
@@ -65,20 +65,19 @@ NO_DIPOLE = "not acquired: no dipole fits the readings"
 
 
 def prior_root(chart: Chart) -> FloatArray:
-    r"""Cartesian root (6, 6) of what is known of a source at x (n,) before its first row.
+    r"""Return the Cartesian root (6, 6) of the prior covariance of a source at x (n,).
 
-    A Gaussian of the information that the start has of it: log-range and direction uniform, density
-    :math:`\propto |\mu|^{-3}` of the moment as it is seen, whose mean information along an axis is
-    :math:`1 / |\mu|^2`.
+    It is a Gaussian with the information of the start's prior: log-range and direction uniform, and the density
+    :math:`\propto |\mu|^{-3}` of the scaled moment, whose mean information along an axis is :math:`1 / |\mu|^2`.
     """
     strength = float(np.linalg.norm(chart.x[3:6])) / float(chart.length) ** MOMENT_POWER
     return source_root(chart, np.array([*_SIGMA_PRIOR, *[strength] * 3]))
 
 
 def first_root(chart: Chart, motion: MotionModel, sigma_range: FloatArray | None = None) -> FloatArray:
-    """Cartesian roots (K, n, n) of sources of which hardly more is known than that they are at x (K, n).
+    """Return Cartesian roots (K, n, n) of nearly flat priors about states x (K, n).
 
-    `sigma_range` (K,) are standard deviations of their log-ranges, if more is known of these.
+    `sigma_range` (K,) are standard deviations of the log-ranges, by default those of the whole search.
     """
     sigma = np.tile(_SIGMA_PRIOR, (len(chart.x), 1))
     if sigma_range is not None:
@@ -87,7 +86,7 @@ def first_root(chart: Chart, motion: MotionModel, sigma_range: FloatArray | None
 
 
 def _with_motion(chart: Chart, motion: MotionModel, sigma: FloatArray) -> FloatArray:
-    """Cartesian roots (K, n, n) from standard deviations (K, 3) of range and direction; the moment is hardly known."""
+    """Return Cartesian roots (K, n, n) from σ (K, 3) of log-range and direction, with an unknown moment."""
     strength = np.linalg.norm(chart.x[:, 3:6], axis=1) / chart.length**MOMENT_POWER
     _, rest = motion.start(np.zeros(N_SOURCE), np.zeros((N_SOURCE, N_SOURCE)))
     root = np.tile(np.eye(chart.x.shape[1]), (len(chart.x), 1, 1))  # of the pose's errors, behind the motion
@@ -99,7 +98,7 @@ def _with_motion(chart: Chart, motion: MotionModel, sigma: FloatArray) -> FloatA
 
 @dataclass(frozen=True, eq=False)
 class _Grid:
-    """Cells in the array's frame: positions (n, 3), and which are neighbours (directions, directions)."""
+    """Cells in the array's frame: positions (n, 3), and pairs of directions that are neighbours."""
 
     position_m: FloatArray
     neighbours: BoolArray
@@ -111,8 +110,8 @@ class _Grid:
         position = array.centroid + ranges[:, None, None] * directions
         return cls(position.reshape(-1, 3), np.arccos(np.clip(directions @ directions.T, -1, 1)) < _NEIGHBOURS)
 
-    def chosen(self, explained: FloatArray) -> BoolArray:
-        """Cells (n,) from which to start, by the energy that each explains, -inf where it is not allowed."""
+    def select(self, explained: FloatArray) -> BoolArray:
+        """Return the cells (n,) to start from, by the energy that each explains, -inf if it is not allowed."""
         table = explained.reshape(_N_RANGES, _N_DIRECTIONS)
         around = np.where(self.neighbours, table[:, None, :], -np.inf).max(axis=2)
         padded = np.pad(table, ((1, 1), (0, 0)), constant_values=-np.inf)
@@ -122,15 +121,15 @@ class _Grid:
 
 @dataclass(frozen=True, eq=False)
 class _Seeds:
-    """Where components start.
+    """Initial states of components.
 
     Attributes
     ----------
     position_m, moment_Am2 : ndarray, shape (n, 3)
-        In the world frame.
+        Position and moment in the world frame.
     cell : ndarray of int, shape (n, 3)
-        Range and direction on the grid whose share of the even density each stands for, -1 where it is the row's own,
-        and how often the pitch of its ranges was halved.
+        Range and direction of the cell on the grid, -1 along coordinates that the row determines, and the number of
+        halvings of its pitch.
     """
 
     position_m: FloatArray
@@ -138,8 +137,8 @@ class _Seeds:
     cell: IntArray
 
 
-class Start:
-    """Starts tracks of one array."""
+class TrackStarter:
+    """Estimator of a source from the first row, for one array."""
 
     def __init__(self, array: SensorArray, errors: SensorErrors, prior: SourcePrior) -> None:
         check_magnitudes(array)
@@ -153,11 +152,11 @@ class Start:
             self._locator = Locator(array, prior=prior, body_length_m=0.0, exclude_faulty=False)
             self._examiner = Locator(array, prior=prior)
 
-    def mixture(self, measurement: Measured, motion: MotionModel) -> tuple[Mixture | None, str]:
-        """What one row says of a source and of the pose's errors, or why there is none."""
+    def mixture(self, measurement: RowOrStack, motion: MotionModel) -> tuple[Mixture | None, str]:
+        """Return the mixture of source and errors of the pose by one row, or None and the reason."""
         if not measurement.is_detected(self.errors.sigma):
             return None, "not acquired: no signal stands out of noise"
-        # Before it nothing is known of source and sensors together: the sensors' errors are noise.
+        # Source and errors of sensors have no correlation yet, so that the errors are noise.
         alone = measurement.with_errors_as_noise(self.errors.sigma)
         known = KnownInWorld.of(self.prior, measurement.row.R_world_from_array)
         seeds = self._seeds(alone)
@@ -166,8 +165,8 @@ class Start:
             is_linear = array.ambient_fields.any() or not array.channel_is_scalar.any()
             return None, NOT_ALLOWED if is_linear or alone.n_differences >= N_SOURCE else NO_AMBIENT
         found = _components(alone, motion, seeds, known)
-        for refined in (_centred, _along_valleys):
-            finer = refined(seeds, found, measurement)
+        for refine in (_recentre, _subdivide_valleys):
+            finer = refine(seeds, found, measurement)
             if not len(finer.cell):
                 return None, NOT_ALLOWED
             if finer is not seeds:
@@ -181,32 +180,32 @@ class Start:
         dof = measurement.n_differences - N_SOURCE + (0 if known is None else known.n_known)
         if dof > 0 and found.chi2[sound].min() > chdtri(dof, CONTRADICTION):
             best = int(np.argmin(np.where(sound, found.chi2, np.inf)))
-            self.misfit = measurement.z - measurement.of_source(found.x[best])
+            self.misfit = measurement.z - measurement.predict_source(found.x[best])
             return None, NO_DIPOLE
         log_weight = found.log_evidence + _EVEN * ((seeds.cell < 0) @ np.array([1.0, 2.0, 0.0]))
         log_weight -= math.log(2.0) * seeds.cell[:, 2]
         if known is not None:
             log_weight += UNIFORM_IN_SPACE * np.log(measurement.chart(found.x).length)
         mixture = _mixture(found, log_weight, measurement)
-        return mixture.take(sound).take(once(mixture.take(sound), seeds.cell[sound])), ""
+        return mixture.take(sound).take(unique_components(mixture.take(sound), seeds.cell[sound])), ""
 
-    def faulty(self, row: Row) -> BoolArray:
-        """Sensors (N,) that contradict all others, as a fix of the row names them."""
+    def faulty_sensors(self, row: Row) -> BoolArray:
+        """Return the sensors (N,) that a fix of the row excludes."""
         dropped = () if self._examiner is None else self._examiner.fit(row.readings_T, row.ambient_T).dropped_sensors
         return np.isin(self.errors.array.ids, dropped)
 
-    def _seeds(self, measurement: Measured) -> _Seeds:
-        """Chosen cells, and the row's best fits."""
+    def _seeds(self, measurement: RowOrStack) -> _Seeds:
+        """Return the selected cells and the best fits of the row."""
         cells, row = self._grid.position_m, measurement.row
         world = row.origin_m + cells @ row.R_world_from_array.T
         columns = measurement.moment_columns(world)
-        # Moduli in no ambient field are linear in no moment: their cells explain nothing, and their best fits start.
+        # Moduli without an ambient field are not linear in the moment: their cells explain nothing, only fits remain.
         whiten = measurement.whitening
-        columns, left = whiten @ where_smooth(columns), whiten @ measurement.without_source
+        columns, left = whiten @ zero_if_nan(columns), whiten @ measurement.without_source
         moments = (np.linalg.pinv(columns, rcond=1e-6) @ left[:, None])[..., 0]
         explained = np.sum((columns @ moments[..., None])[..., 0] ** 2, axis=1)
         explained[~self.prior.allows_position(cells) | ~(explained > 0.0)] = -np.inf
-        chosen = np.flatnonzero(self._grid.chosen(explained))
+        chosen = np.flatnonzero(self._grid.select(explained))
         position, moment = [world[chosen]], [moments[chosen]]
         cell = [np.stack([*np.divmod(chosen, _N_DIRECTIONS), np.zeros_like(chosen)], axis=1)]
         if self._locator is not None and measurement.z.size >= N_SOURCE:
@@ -223,9 +222,9 @@ class Start:
         return _Seeds(np.vstack(position), np.vstack(moment), np.vstack(cell))
 
 
-def _images(source: FloatArray, measurement: Measured) -> tuple[FloatArray, IntArray]:
-    """Return sources (n, 6) of the gradient tensor of a source, in the cells of range (n,) next to it, and these."""
-    images = mirrored(source[None], measurement.centroid_m)[1:, 0]
+def _images(source: FloatArray, measurement: RowOrStack) -> tuple[FloatArray, IntArray]:
+    """Return mirror images (n, 6) of a source at the two nearest ranges of the grid, and these ranges (n,)."""
+    images = mirror_images(source[None], measurement.centroid_m)[1:, 0]
     chart = measurement.chart(images)
     below = math.floor(math.log(float(chart.length[0]) / measurement.radius_m / NEAREST) / _PITCH)
     of_range = np.repeat(np.clip([below, below + 1], 0, _N_RANGES - 1), len(images))
@@ -237,9 +236,9 @@ def _images(source: FloatArray, measurement: Measured) -> tuple[FloatArray, IntA
 
 
 def _components(
-    measurement: Measured, motion: MotionModel, seeds: _Seeds, known: KnownInWorld | None = None
-) -> Updated | RowUpdates:
-    """What the row makes of cells about seeds."""
+    measurement: RowOrStack, motion: MotionModel, seeds: _Seeds, known: KnownInWorld | None = None
+) -> StateUpdates | RowUpdates:
+    """Return the update by a row of the cells about seeds."""
     state, _ = motion.start(np.zeros(N_SOURCE), np.zeros((N_SOURCE, N_SOURCE)))
     x = np.tile(np.append(state, np.zeros(measurement.n_pose)), (len(seeds.cell), 1))
     x[:, :3], x[:, 3:6] = seeds.position_m, seeds.moment_Am2
@@ -247,18 +246,18 @@ def _components(
     sigma[:, 0] /= 2.0 ** seeds.cell[:, 2]
     S = chart.inverse_jacobian() @ _with_motion(chart, motion, sigma)
     if known is not None or isinstance(measurement, Stack):
-        return updated(x, S, measurement, known)
-    found = row_filter.update(Gaussians(x, S, n_nuisances=measurement.n_pose), measurement.compiled)
+        return update_states(x, S, measurement, known)
+    found = row_filter.update(Gaussians(x, S, n_nuisances=measurement.n_pose), measurement.kernel_rows)
     return replace(found, converged=found.converged & is_regular(found.S))
 
 
-def _mixture(found: Updated | RowUpdates, log_weight: FloatArray, measurement: Measured) -> Mixture:
+def _mixture(found: StateUpdates | RowUpdates, log_weight: FloatArray, measurement: RowOrStack) -> Mixture:
     n, centroid_m, radius_m = measurement.n_charted, measurement.centroid_m, measurement.radius_m
     return Mixture(found.x, found.S, log_weight, n, centroid_m, radius_m, measurement.n_pose)
 
 
-def _centred(seeds: _Seeds, found: Updated | RowUpdates, measurement: Measured) -> _Seeds:
-    """Seeds that stand where the row puts them, along the coordinates in which it tells more than their cells do."""
+def _recentre(seeds: _Seeds, found: StateUpdates | RowUpdates, measurement: RowOrStack) -> _Seeds:
+    """Return seeds moved to their components, along coordinates that the row determines better than the cell."""
     sigma = np.sqrt(np.sum(found.S[:, :3] ** 2, axis=2))
     narrow = sigma < _NARROW * _CELL
     narrow = np.stack([narrow[:, 0], narrow[:, 1] & narrow[:, 2]], axis=1)
@@ -272,17 +271,17 @@ def _centred(seeds: _Seeds, found: Updated | RowUpdates, measurement: Measured) 
     length = np.maximum(r, measurement.radius_m)
     cell = seeds.cell.copy()
     cell[:, :2][narrow] = -1
-    # A best fit has no cell whose share it could stand for.
+    # A best fit has no cell, so that it counts only if the row determines it.
     sound = np.isfinite(found.log_evidence) & found.converged & ((seeds.cell[:, :2] >= 0) | narrow).all(axis=1)
     return _Seeds(
         (measurement.centroid_m + r[:, None] * offset)[sound], (seen * length[:, None] ** 4)[sound], cell[sound]
     )
 
 
-def _along_valleys(seeds: _Seeds, found: Updated | RowUpdates, measurement: Measured) -> _Seeds:
-    """The seeds, and instead of such as found a valley of ranges that bends others along it, as dense as it bends.
+def _subdivide_valleys(seeds: _Seeds, found: StateUpdates | RowUpdates, measurement: RowOrStack) -> _Seeds:
+    """Replace seeds in a curved valley of ranges by several along it, with a pitch by its curvature.
 
-    A row that tells much leaves a source in a narrow valley, and a Gaussian in the middle says nothing of its ends.
+    A precise row leaves a narrow valley, and a Gaussian at its middle does not cover its ends.
     """
     n = measurement.n_charted
     sound = np.isfinite(found.log_evidence) & found.converged
@@ -291,7 +290,7 @@ def _along_valleys(seeds: _Seeds, found: Updated | RowUpdates, measurement: Meas
     chart, S = measurement.chart(found.x[own, :n]), found.S[own, :n]
     sigma, log_range = np.linalg.norm(S[:, 0], axis=1), np.log(chart.length / measurement.radius_m)
     along = (S @ S[:, 0, :, None])[..., 0] / sigma[:, None]
-    ends = [measurement.of_source(chart.retracted(share * along)) for share in (-1.0, 0.0, 1.0)]
+    ends = [measurement.predict_source(chart.retract(share * along)) for share in (-1.0, 0.0, 1.0)]
     bend = np.minimum(np.linalg.norm(0.5 * (ends[0] + ends[2]) - ends[1], axis=1), _MOST_BENT)
     bent = np.flatnonzero((bend > LARGEST_BEND) & (log_range > _VALLEY * sigma))
     if not bent.size:
@@ -304,7 +303,7 @@ def _along_valleys(seeds: _Seeds, found: Updated | RowUpdates, measurement: Meas
         ranges = np.arange(round((log_range[k] - reach) / pitch), round((log_range[k] + reach) / pitch) + 1)
         every = np.full(len(ranges), k)
         e = ((ranges * pitch - log_range[k]) / sigma[k])[:, None] * along[k]
-        state, of_direction = chart.take(every).retracted(e), seeds.cell[own[every], 1]
+        state, of_direction = chart.take(every).retract(e), seeds.cell[own[every], 1]
         position.append(state[:, :3])
         moment.append(state[:, 3:6])
         cell.append(np.stack([_N_RANGES + ranges, of_direction, np.full_like(ranges, halvings)], axis=1))
@@ -312,39 +311,39 @@ def _along_valleys(seeds: _Seeds, found: Updated | RowUpdates, measurement: Meas
 
 
 def with_errors(mixture: Mixture, measurement: RowMeasurement, sigma: FloatArray) -> Mixture:
-    r"""The same, and behind the states the sensors' errors, known by their σ (n_errors,) before the row alone.
+    r"""Return the mixture with the sensors' errors as further states, with prior standard deviations (n_errors,).
 
-    What the row leaves over where a component stands is of them and of the noise: with :math:`\Phi` of unit errors,
-    :math:`\varepsilon = \sigma \Phi^T (1 + \Phi \Phi^T)^{-1} (z - h(x))`, and its covariance that of a linear model.
+    They are estimated from the residual at each component. With the effect :math:`\Phi` of unit errors it is
+    :math:`\varepsilon = \sigma \Phi^T (1 + \Phi \Phi^T)^{-1} (z - h(x))`, with the covariance of a linear model.
     """
     if not sigma.size:
         return mixture
     n, chart, unit = measurement.n_charted, mixture.chart, measurement.effect * sigma
     gain = sigma[:, None] * np.linalg.solve(np.eye(len(unit)) + unit @ unit.T, unit).T
-    left = measurement.z - measurement.of_source(mixture.x)
-    H = measurement.along(mixture.x, chart.jacobian(np.zeros_like(mixture.x)))
+    left = measurement.z - measurement.predict_source(mixture.x)
+    H = measurement.directional_derivative(mixture.x, chart.jacobian(np.zeros_like(mixture.x)))
     rows = np.zeros((len(mixture), n + sigma.size, n + sigma.size))
     rows[:, :n, :n], rows[:, n:, :n] = mixture.S, -gain @ (H @ mixture.S)
     rows[:, n:, n:] = sigma[:, None] * whitening(unit.T).T
     return replace(mixture, x=np.concatenate([mixture.x, left @ gain.T], axis=1), S=rows)
 
 
-def once(mixture: Mixture, cell: IntArray | None = None) -> IntArray:
-    """Components, heaviest first, without those that another one with the same share of the even density has found."""
-    source = mixture.of_source()
+def unique_components(mixture: Mixture, cell: IntArray | None = None) -> IntArray:
+    """Return indices of components, heaviest first, without duplicates of the same cell."""
+    source = mixture.source_marginal()
     cell = np.zeros((len(source), 1), dtype=np.intp) if cell is None else cell.reshape(len(source), -1)
     _, share, n_alike = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
     share = share.ravel()  # numpy 2.0.0 gives a column
     chart, left = source.chart, np.argsort(-mixture.log_weight, kind="stable")
     alone = n_alike[share[left]] == 1
-    kept, left = left[alone].tolist(), left[~alone]
+    unique, left = left[alone].tolist(), left[~alone]
     limit = chdtri(N_SOURCE, 1.0 - CREDIBLE_ROW)
     while left.size:
         first, others = left[0], left[1:]
-        kept.append(first)
+        unique.append(first)
         same = others[share[others] == share[first]]
         about = chart.take(same)
         e = about.coordinates(np.repeat(source.x[first][None], len(same), axis=0))
         square = np.sum(np.linalg.solve(source.S[same], e[..., None])[..., 0] ** 2, axis=1)
         left = others[~np.isin(others, same[square < limit])]
-    return np.array(sorted(kept, key=lambda k: -mixture.log_weight[k]))
+    return np.array(sorted(unique, key=lambda k: -mixture.log_weight[k]))

@@ -1,7 +1,7 @@
-"""Hypotheses of what has happened to several sources: kept, narrowed where readings bend, fitted anew, and told.
+"""Hypotheses of births, deaths and faults of several sources.
 
-A Gaussian that is too wide for readings that bend is split into three narrower ones, which rows then weigh; and while a
-hypothesis is young, all of its rows are linearised together now and then (:mod:`.smoothing`).
+A Gaussian over which readings are nonlinear is split into three narrower ones, which later rows weigh. All rows of a
+young hypothesis are fitted together at growing intervals (:mod:`.smoothing`).
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from magloc.tracking.multi_target.state import JointState
 from magloc.tracking.sensor_health import SensorHealth
 
 LARGEST_BEND = 0.5
-"""By how many standard deviations of noise the readings may bend within one of the state."""
+"""Largest nonlinearity of the readings within one σ of the state, in σ of their noise."""
 STRAIGHT = 2.0
-"""By how many they may bend within one of the optimum of all rows of a young track together."""
+"""Largest nonlinearity within one σ of a refit of all rows of a young track."""
 REFITS = (3, 5, 8, 12, 18, 27, 40, 60, MOST_ROWS)
-"""Rows since the last birth after which they are fitted together; behind the last of them a track is old."""
+"""Numbers of rows since the last birth after which they are refitted; after the last one a track is old."""
 MERGED_GAP = 1.0 / 3.0
-"""Standard deviation of a gap over the gap above which two sources are merged."""
-# By how much all rows together may be less likely than one after the other were, as -2 ln.
+"""Largest standard deviation of a distance between two sources over the distance; with more they are merged."""
+# Largest increase of the score by a refit over that of successive updates.
 _WORSE = 10.0
-# Squared distance, in units of its covariance, below which two places may be of one source.
+# Squared Mahalanobis distance below which two places may be of one source.
 _ANOTHER_SIGMA2 = 25.0
-# Farther than any two sources are apart.
+# A distance larger than that of any two sources.
 _BEYOND_M = 1e6
 
 
@@ -43,16 +43,16 @@ class Hypothesis:
     ----------
     state : JointState
     ids : tuple of int
-        Of the sources, by the rows in which they were born.
+        Ids of the sources, by the rows of their birth.
     health : SensorHealth
     score : float
-        -2 ln of how likely it is, up to a constant.
+        -2 ln of the posterior probability, up to a constant.
     excess : ndarray, shape (2,)
-        Mean excess of χ² over some last rows, and over more of them.
+        Mean excess of χ² over recent rows, with a short and a long memory.
     judged : int
-        Rows in which a restart is still judged, the last one counted; 0: it is believed.
+        Number of rows for which a restart is still on probation; 0 after it is accepted.
     young : YoungTrack, optional
-        The rows since its last birth, while they are fitted together now and then, and later the last ones.
+        Rows since the last birth while the hypothesis is young, later the last rows.
     """
 
     state: JointState
@@ -63,21 +63,22 @@ class Hypothesis:
     judged: int = 0
     young: YoungTrack | None = None
 
-    def refitted(self, row: JointRow) -> Hypothesis:
-        """The same with all of its young rows linearised together, if it is time to, and they have one optimum near.
+    def refit(self, row: JointRow) -> Hypothesis:
+        """Refit all young rows together if due, and return the hypothesis.
 
-        Where readings bend far within what is not known there, the optimum is no mean, and its curvature no variance.
+        A refit is rejected if readings are strongly nonlinear over its covariance, because then the optimum is not the
+        mean, and its curvature does not give the variance.
         """
         young = self.young
         if young is None or not young.is_young or len(young.rows) not in REFITS:
             return self
-        found = young.smoothed()
+        found = young.smooth()
         if found is None or found.score > young.score + _WORSE or not is_straight(found.states[-1], row):
             return self
         return replace(self, state=found.states[-1], young=found, score=self.score + found.score - young.score)
 
-    def narrowed(self, share: float, state: JointState) -> Hypothesis:
-        """A part of it, of some weight."""
+    def take_part(self, share: float, state: JointState) -> Hypothesis:
+        """Return the part of the hypothesis with another state, with a share of its weight."""
         if share == 1.0:
             return self
         young = self.young and replace(self.young, states=(*self.young.states[:-1], state))
@@ -85,36 +86,36 @@ class Hypothesis:
 
 
 def split(state: JointState, row: JointRow) -> list[tuple[float, JointState]]:
-    """Return weights and parts of a state, along the axis of its covariance on which a row's readings bend most.
+    """Split a state along the axis of its covariance on which a row's readings are most nonlinear.
 
-    Of a standard normal density, two parts of weight 1/4 at ±1 and one of 1/2 at 0, all of variance 1/2, keep mean and
-    variance. A state along none of whose axes they bend is its own only part.
+    Return weights and parts. For a standard normal density, parts at -1, 0 and 1 with the weights 1/4, 1/2 and 1/4 and
+    the variance 1/2 have the same mean and variance. A state over which readings are nearly linear is not split.
     """
     bends, directions = _bends(state, row)
     if not bends.size or not bends.max() > LARGEST_BEND:
         return [(1.0, state)]
     along = directions[np.argmax(bends)]
-    return [(share, state.narrowed(along, 0.5, offset)) for share, offset in ((0.5, 0.0), (0.25, 1.0), (0.25, -1.0))]
+    return [(share, state.narrow(along, 0.5, offset)) for share, offset in ((0.5, 0.0), (0.25, 1.0), (0.25, -1.0))]
 
 
 def is_straight(state: JointState, row: JointRow) -> bool:
-    """Return whether a row's readings hardly bend within a state's covariance."""
+    """Return True if a row's readings are nearly linear within a state's covariance."""
     return bool(_bends(state, row)[0].max(initial=0.0) <= STRAIGHT)
 
 
 def _bends(state: JointState, row: JointRow) -> tuple[FloatArray, FloatArray]:
-    """Return the bends (3 K,) of a row's readings, and one standard deviation (3 K, n) along each axis."""
-    bends, directions = row_filter.bends(state.gaussians, row.compiled, 1.0)
+    """Return the nonlinearity (6 K,) of a row's readings, and one standard deviation (6 K, n) along each axis."""
+    bends, directions = row_filter.bends(state.gaussians, row.kernel_rows, 1.0)
     return bends[0], directions[0]
 
 
 def by_score(hypothesis: Hypothesis) -> float:
-    """The likeliest first."""
+    """Return the score, as the sort key of the likeliest first."""
     return hypothesis.score
 
 
-def mates(best: Hypothesis, other: Hypothesis) -> dict[int, int]:
-    """Which source of another hypothesis each of the best one's is: that of its name, or else the nearest one."""
+def match_sources(best: Hypothesis, other: Hypothesis) -> dict[int, int]:
+    """Return the source of another hypothesis for each of the best one: of the same id, otherwise the nearest."""
     if other.ids == best.ids:
         return {k: k for k in range(len(best.ids))}
     apart_m = np.linalg.norm(best.state.position_m[:, None] - other.state.position_m, axis=-1)
@@ -122,10 +123,10 @@ def mates(best: Hypothesis, other: Hypothesis) -> dict[int, int]:
     return {int(k): int(j) for k, j in zip(*linear_sum_assignment(apart_m), strict=True)}
 
 
-def moments(
+def mixture_moments(
     states: list[JointState], weights: FloatArray, sources: list[int | None]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Position, moment and covariance of a source in a mixture of states, of those that have it."""
+    """Return position, moment and covariance of a source in the mixture of those states that have it."""
     parts = [(w, one, k) for w, one, k in zip(weights, states, sources, strict=True) if k is not None]
     if len(parts) == 1:
         ((_, one, k),) = parts
@@ -138,24 +139,24 @@ def moments(
     return mean[:3], mean[3:], covariance + (share[:, None] * (x - mean)).T @ (x - mean)
 
 
-def old_names(restart: Hypothesis, before: Hypothesis) -> tuple[int, ...]:
-    """Names of a restart's sources: those of the nearest ones before it, where they may be the same.
+def inherit_ids(restart: Hypothesis, before: Hypothesis) -> tuple[int, ...]:
+    """Return the ids of a restart's sources: those of the nearest earlier ones that may be the same.
 
-    One that was taken for somewhere else is another source to whoever followed it.
+    A source at another place gets a new id.
     """
     offset = restart.state.position_m[:, None] - before.state.position_m
     P, Q = (one.state.covariances[:, :3, :3] for one in (restart, before))
     apart = np.vecdot(offset, np.linalg.solve(P[:, None] + Q, offset[..., None])[..., 0])
-    names = list(restart.ids)
+    ids = list(restart.ids)
     for new, old in zip(*linear_sum_assignment(np.linalg.norm(offset, axis=-1)), strict=True):
         if apart[new, old] < _ANOTHER_SIGMA2:
-            names[new] = before.ids[old]
-    return tuple(names)
+            ids[new] = before.ids[old]
+    return tuple(ids)
 
 
 def merged_pairs(state: JointState) -> list[tuple[int, int]]:
-    """Pairs of sources that are too near to each other for their gap to be known."""
-    # A gap is no less certain than both places together.
+    """Return the pairs of sources whose distance is uncertain."""
+    # The sum of both position errors bounds the error of the distance, so that most pairs need no more.
     spread = np.sqrt(np.trace(state.covariances[:, :3, :3], axis1=1, axis2=2))
     apart_m = np.linalg.norm(state.position_m[:, None] - state.position_m, axis=-1)
     close = np.argwhere(np.triu(np.add.outer(spread, spread) > MERGED_GAP * apart_m, 1))

@@ -1,4 +1,4 @@
-"""What one row of readings says of several sources and the common field."""
+"""Measurement model of one row for several sources and the common field."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from magloc.tracking.multi_target.state import JointState
 from magloc.tracking.row_filter import Rows
 from magloc.tracking.rows import Row
 
-# Sets of channels that are kept: rows miss the same ones more often than not.
+# Size of the cache of whitenings by available channels.
 _MOST_MASKS = 16
 
 
@@ -29,11 +29,11 @@ class JointRow:
     ----------
     array : SensorArray
     row : Row
-        Its pose.
+        The row, with the array's pose.
     z : ndarray, shape (C,)
-        Readings above the known ambient field.
+        Whitened readings minus those of the known ambient field.
     transform : ndarray, shape (C, C)
-        From channels to whitened readings.
+        Matrix from channels to whitened readings.
     used : ndarray of bool, shape (C,)
     """
 
@@ -45,7 +45,7 @@ class JointRow:
 
     @classmethod
     def of(cls, array: SensorArray, row: Row, root: FloatArray | None = None) -> JointRow:
-        """Return a row with all of its readings; `root` (C, C) is their whitening, where that is known already."""
+        """Return a row with all of its readings; `root` (C, C) is their whitening, if already known."""
         used = row.available
         root = whitenings_of(array, used, row.readings_T).root if root is None else root
         ambient = ambient_fields(array, 1, None if row.ambient_T is None else row.ambient_T[None])
@@ -73,9 +73,9 @@ class JointRow:
         return np.asarray(self.row.origin_m + self.row.R_world_from_array @ self.array.centroid)
 
     @cached_property
-    def compiled(self) -> Rows:
-        """The row for kernels."""
-        return stacked([self])
+    def kernel_rows(self) -> Rows:
+        """The row as an argument of kernels."""
+        return stack_joint_rows([self])
 
     def without(self, out: BoolArray) -> JointRow:
         """Return the row without some of the sensors (N,)."""
@@ -85,8 +85,8 @@ class JointRow:
         z, transform = np.where(used, self.z, 0.0), np.where(used[:, None], self.transform, 0.0)
         return replace(self, z=z, transform=transform, used=used)
 
-    def linearised(self, state: JointState) -> tuple[FloatArray, FloatArray]:
-        """Return derivatives (K, C, 6) of the readings by each source's position and moment, and the readings (C,)."""
+    def linearise(self, state: JointState) -> tuple[FloatArray, FloatArray]:
+        """Return derivatives (K, C, 6) by each source's position and moment, and the predicted readings (C,)."""
         by_source = dipole.field_jacobian(self.positions_m, state.position_m[:, None], state.moment_Am2[:, None])
         sensor, gain = self.array.channel_sensor, self.array.channel_gain @ self.row.R_world_from_array.T
         H = self.transform @ (gain[None, :, None] @ by_source[:, sensor])[:, :, 0]
@@ -94,15 +94,15 @@ class JointRow:
         return H, h + self.effect @ state.common_T
 
     def energy_of(self, position_m: FloatArray, moment_Am2: FloatArray) -> FloatArray:
-        """Return the energy (N,) of a source in each sensor."""
+        """Return the energy (N,) of a source's readings in each sensor."""
         fields = dipole.field(self.positions_m, position_m, moment_Am2)[self.array.channel_sensor]
         seen = np.vecdot(self.effect, fields) ** 2
         energy: FloatArray = np.bincount(self.array.channel_sensor, seen).astype(np.float64)
         return energy
 
 
-def stacked(rows: Sequence[JointRow]) -> Rows:
-    """Return rows of one array for kernels."""
+def stack_joint_rows(rows: Sequence[JointRow]) -> Rows:
+    """Return rows of one array as an argument of kernels."""
     array, distinct = rows[0].array, {id(row.transform): row.transform for row in rows}
     index = {key: i for i, key in enumerate(distinct)}
     return Rows(
@@ -120,18 +120,18 @@ def stacked(rows: Sequence[JointRow]) -> Rows:
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """Places where another source may be, and what it could explain there.
+    """Grid of places for a further source, with the readings of a dipole at each.
 
     Attributes
     ----------
     position_m : ndarray, shape (n, 3)
-        In the array's frame.
+        Positions in the array's frame.
     columns : ndarray, shape (n, C, 3)
-        Readings of unit moments at each of them.
+        Readings of unit moments at each cell.
     bases : ndarray, shape (C, 3 n)
-        Orthonormal ones, the common field projected out: by axis, then by cell.
+        Orthonormal bases of `columns` with the common field projected out, ordered by axis, then by cell.
     near : ndarray of bool, shape (n, n)
-        Which cells are nearer to one than half its distance from the array's centre.
+        Cells nearer to each than half its distance from the array's centre.
     """
 
     position_m: FloatArray
@@ -141,7 +141,7 @@ class Cells:
 
     @classmethod
     def of(cls, array: SensorArray, root: FloatArray) -> Cells:
-        """Cells of rows whose channels are whitened by a root (C, C)."""
+        """Return the cells of rows whose channels are whitened by a root (C, C)."""
         positions = candidate_positions(
             array, n_directions=60, ranges=np.geomspace(0.6, 60.0, 10), n_near_directions=4, n_inner_directions=0
         )
@@ -157,13 +157,13 @@ class Cells:
         return cls(positions, columns, bases.transpose(1, 2, 0).reshape(len(gain), -1).astype(np.float32), near)
 
     def energy(self, residual: FloatArray) -> FloatArray:
-        """Energy (n,) of residuals (C,) that a source at each cell explains: χ² with three degrees of freedom."""
+        """Return the energy (n,) of residuals (C,) explained by each cell: χ² with three degrees of freedom."""
         components = (residual.astype(np.float32) @ self.bases).reshape(3, -1)
         energy: FloatArray = np.sum(np.square(components), axis=0, dtype=np.float64)
         return energy
 
     def moment(self, cell: int, innovation: FloatArray, seen: FloatArray, used: BoolArray) -> FloatArray:
-        """Return the moment (3,) in the array's frame of a source in a cell that explains most of an innovation (C,).
+        """Return the best moment (3,) in the array's frame of a source in a cell, for an innovation (C,).
 
         The inverse of the innovation's covariance is I - Qᵀ Q, with Q = `seen` (d, C).
         """
@@ -175,7 +175,7 @@ class Cells:
         return found
 
     def best(self, energy: FloatArray, n: int) -> IntArray:
-        """The `n` best cells, half their distance from the array's centre apart from each other."""
+        """Return the `n` cells of most energy that are not near to each other."""
         left, chosen = energy.copy(), []
         for _ in range(n):
             chosen.append(int(np.argmax(left)))
@@ -184,16 +184,19 @@ class Cells:
 
 
 class Channels:
-    """Whitening and cells of an array's rows, made once for all that have the same channels."""
+    """Cache of whitenings and cells of an array's rows, by available channels."""
 
     def __init__(self, array: SensorArray) -> None:
         self.array = array
         self._known: dict[bytes, tuple[FloatArray, Cells]] = {}
-        if not array.noise_depends_on_reading:  # before the first row comes
+        if not array.noise_depends_on_reading:  # so that the first row is not delayed
             self.of(Row(0.0, np.zeros(array.n_channels)))
 
     def of(self, row: Row) -> tuple[FloatArray, Cells]:
-        """Whitening (C, C) and cells of a row; where the noise depends on the readings, those of the first such row."""
+        """Return whitening (C, C) and cells of a row.
+
+        If the noise depends on the readings, they are those of the first row with the same channels.
+        """
         key = row.available.tobytes()
         if key not in self._known:
             if len(self._known) == _MOST_MASKS:
@@ -202,6 +205,6 @@ class Channels:
             self._known[key] = root, Cells.of(self.array, root)
         return self._known[key]
 
-    def measured(self, row: Row) -> JointRow:
-        """A row with all of its readings."""
+    def joint_row(self, row: Row) -> JointRow:
+        """Return the measurement model of a row with all of its readings."""
         return JointRow.of(self.array, row, None if self.array.noise_depends_on_reading else self.of(row)[0])

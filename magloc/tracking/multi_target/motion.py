@@ -1,4 +1,4 @@
-"""How sources move that are followed together: speeds and rates of turn that are forgotten."""
+"""Motion of several sources: Ornstein-Uhlenbeck velocities and rates of turn."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import numpy as np
 from arrays.typing import FloatArray
 from magloc import core
 from magloc.tracking import row_filter
-from magloc.tracking.motion import wandering_step
+from magloc.tracking.motion import ornstein_uhlenbeck_step
 from magloc.tracking.multi_target.measurement import JointRow
 from magloc.tracking.multi_target.state import N_COMMON, N_OF_SOURCE, JointState
 
 _N_TURNING = 12
-"""Numbers of a step of the sources; behind them stands the noise of the common field."""
+"""Length of a step without its last number, the noise of the common field."""
 
 
 @dataclass(frozen=True)
 class FreeMotion:
-    r"""Sources that move and turn freely and independently of each other: Ornstein-Uhlenbeck velocity and rate of turn.
+    r"""Independent free motion of sources: Ornstein-Uhlenbeck velocity and rate of turn.
 
     :math:`\dot p = v`, :math:`\dot v = -v/τ_v + w_v`, :math:`\dot m = ω × m`, :math:`\dot ω = -ω/τ_ω + w_ω`; the
     logarithm of the strength and the common field are random walks.
@@ -30,7 +30,7 @@ class FreeMotion:
     speed_m_s, turn_rad_s : float
         Standard deviations of v and ω along each axis.
     correlation_s, turn_correlation_s : float
-        How long a velocity and a rate of turn last: τ_v and τ_ω.
+        Correlation times of velocity and rate of turn: τ_v and τ_ω.
     strength_change : float
         Noise of ln |m| [1/√s].
     common_walk_T : float
@@ -63,15 +63,15 @@ class FreeMotion:
 
     def numbers(self, dt_s: float, *, agility: float = 1.0) -> FloatArray:
         """Return the numbers (13,) of a step; `agility` multiplies the noise of velocity and turn."""
-        lasts_s, kept, root_v = wandering_step(self.correlation_s, dt_s)
-        turn_lasts_s, turn_kept, root_w = wandering_step(self.turn_correlation_s, dt_s)
+        gain_s, decay, root_v = ornstein_uhlenbeck_step(self.correlation_s, dt_s)
+        turn_gain_s, turn_decay, root_w = ornstein_uhlenbeck_step(self.turn_correlation_s, dt_s)
         lower = [0, 1, 1], [0, 0, 1]
         of_v, of_w = agility * self.speed_m_s * root_v[lower], agility * self.turn_rad_s * root_w[lower]
         walks = self.strength_change * math.sqrt(dt_s), self.common_walk_T * math.sqrt(dt_s)
-        return np.array([lasts_s, kept, turn_lasts_s, turn_kept, *of_v, *of_w, 0.0, *walks])
+        return np.array([gain_s, decay, turn_gain_s, turn_decay, *of_v, *of_w, 0.0, *walks])
 
     def start(self, moment_Am2: FloatArray, position_m: FloatArray, turn_rad: float, log_strength: float) -> FloatArray:
-        """Return roots (j, 12, 12) of Cartesian covariances of sources (j, 3) of which so much is known."""
+        """Return Cartesian roots (j, 12, 12) of sources (j, 3) with given standard deviations."""
         one = np.eye(3)
         strength = np.sqrt(np.vecdot(moment_Am2, moment_Am2))[:, None, None]
         along = moment_Am2[:, :, None] * moment_Am2[:, None] / strength**2
@@ -83,7 +83,7 @@ class FreeMotion:
 
 
 def steps_problem(numbers: FloatArray) -> core.Problem:
-    """Return how sources move in the steps (m, 13) to m rows."""
+    """Return the motion of sources in the steps (m, 13) to m rows, as an argument of kernels."""
     added = np.repeat(numbers[:, _N_TURNING:], N_COMMON, axis=1)
     return core.problem(
         "motion",
@@ -99,7 +99,7 @@ def steps_problem(numbers: FloatArray) -> core.Problem:
     )
 
 
-def stepped(state: JointState, step: FloatArray, row: JointRow) -> JointState:
-    """Return the state after a step (13,) to a row, without its readings."""
-    found = row_filter.predict(state.gaussians, state.centroid_m, steps_problem(step[None]), row.compiled)
+def predict_state(state: JointState, step: FloatArray, row: JointRow) -> JointState:
+    """Return the predicted state after a step (13,) to a row."""
+    found = row_filter.predict(state.gaussians, state.centroid_m, steps_problem(step[None]), row.kernel_rows)
     return state.after(found, row.centroid_m)

@@ -1,8 +1,8 @@
-"""All rows of a young joint track together, linearised where they are after all.
+"""Refit of all rows of a young joint track together.
 
-A filter linearises every row where its prediction stood, and while little is known that is far from where the sources
-are: it becomes too sure of itself. Gauss and Newton's iteration over all rows since the last birth is a filter and a
-smoother along the last trajectory, until that stays.
+A filter linearises each row at its prediction, which is far from the sources while they are uncertain, so that it
+becomes overconfident. A Gauss-Newton iteration over all rows since the last birth is a filter and a smoother linearised
+along the last trajectory, repeated until it converges.
 """
 
 from __future__ import annotations
@@ -15,21 +15,21 @@ import numpy as np
 from arrays.typing import FloatArray
 from magloc.tracking import row_filter
 from magloc.tracking.coordinates import Chart
-from magloc.tracking.multi_target.measurement import JointRow, stacked
-from magloc.tracking.multi_target.motion import stepped, steps_problem
+from magloc.tracking.multi_target.measurement import JointRow, stack_joint_rows
+from magloc.tracking.multi_target.motion import predict_state, steps_problem
 from magloc.tracking.multi_target.state import N_COMMON, N_OF_SOURCE, N_SEEN, JointState, chart_at
 from magloc.tracking.row_filter import Gaussians
 
 MOST_ROWS = 90
-"""Rows that are kept of a track."""
-# Passes, and the change of the last state, in its standard deviations, below which the trajectory stays.
+"""Largest number of rows of a track."""
+# Largest number of passes, and change of the last state, in its standard deviations, at convergence.
 _MOST_PASSES = 20
 _TOLERANCE = 0.05
-# After how many passes a track is given up whose rows are less likely by so much, as -2 ln, than in the best pass.
+# Passes after which a track is given up if its score exceeds the best one by the second number.
 _LEAST_PASSES, _HOPELESS = 4, 60.0
-# Longest step of the log-range, the direction, and the moment over its size in a pass.
+# Largest step of the log-range, the direction, and the moment over its size in a pass.
 _LONGEST = 0.5
-# Shortest part of Gauss and Newton's step that is taken.
+# Least step length over that of Gauss-Newton.
 _SHORTEST = 0.1
 
 
@@ -40,15 +40,15 @@ class YoungTrack:
     Attributes
     ----------
     prior : JointState
-        Before the first of them.
+        State before the first row.
     rows : tuple of (JointRow, ndarray)
-        And the motion's step that led to each.
+        Rows, and the step of the motion to each.
     states : tuple of JointState
-        After each of them, as far as it is known.
+        Estimate after each row.
     score : float
-        -2 ln of how likely the rows are, as successive updates have it, while it is young.
+        -2 ln of the likelihood of the rows by successive updates, while the track is young.
     is_young : bool
-        Whether they are all rows since the number changed.
+        Whether the rows are all since the number of sources changed.
     """
 
     prior: JointState
@@ -58,27 +58,27 @@ class YoungTrack:
     is_young: bool = True
 
     def after(self, row: JointRow, step: FloatArray, state: JointState, score: float) -> YoungTrack:
-        """Return the track after one more row; where that are too many the older half is dropped."""
+        """Return the track after one more row; drop the older half if there are too many rows."""
         if len(self.rows) == MOST_ROWS:
             n = MOST_ROWS // 2
             first, to_first = self.rows[n]
-            prior = stepped(self.states[n - 1], to_first, first)
+            prior = predict_state(self.states[n - 1], to_first, first)
             return YoungTrack(prior, self.rows[n:], self.states[n:], is_young=False).after(row, step, state, score)
         return replace(self, rows=(*self.rows, (row, step)), states=(*self.states, state), score=self.score + score)
 
-    def joined(self, prior: JointState) -> YoungTrack:
-        """Return the same rows with the last sources of another prior all along, which rest there."""
+    def add_sources(self, prior: JointState) -> YoungTrack:
+        """Return the track with further sources of another prior at rest in all rows."""
         new = slice(self.prior.n_sources, None)
         known = np.zeros((prior.n_sources - self.prior.n_sources, N_OF_SOURCE, N_OF_SOURCE))
         states = (state.with_sources(prior.position_m[new], prior.moment_Am2[new], known) for state in self.states)
         return YoungTrack(prior, self.rows, tuple(states))
 
-    def smoothed(self, most: int = _MOST_PASSES, limit: float = math.inf) -> YoungTrack | None:
-        """Return the track with all rows linearised along the trajectory that they lead to, or None.
+    def smooth(self, most: int = _MOST_PASSES, limit: float = math.inf) -> YoungTrack | None:
+        """Return the track with all rows linearised along the smoothed trajectory, or None without convergence.
 
-        It is given up after the most passes, and early where the rows stay far less likely than a limit (a score).
+        The iteration stops after `most` passes, and early if the score stays far above `limit`.
         """
-        rows = stacked([row for row, _ in self.rows])
+        rows = stack_joint_rows([row for row, _ in self.rows])
         steps = steps_problem(np.stack([step for _, step in self.rows]))
         centroids = np.stack([row.centroid_m for row, _ in self.rows])
         track, best = np.stack([state.sources for state in self.states]), limit
@@ -102,22 +102,22 @@ class YoungTrack:
             # Barzilai and Borwein's length: steps that lead back are made shorter.
             bent = float(before @ (before - last))
             share = min(max(share * float(before @ before) / bent, _SHORTEST), 1.0) if bent > 0.0 else 1.0
-            track = chart.retracted(share * length * offsets)
+            track = chart.retract(share * length * offsets)
             if float(np.abs(last).max(initial=0.0)) < _TOLERANCE:
                 return replace(self, states=self._states(track, found.last), score=score)
         return None
 
     def _prior_about(self, chart: Chart) -> Gaussians:
-        """Return the prior as offsets from states (K, 12), in the charts about them."""
+        """Return the prior as offsets from states (K, 12), in the charts about these."""
         e = self.prior.chart.coordinates(chart.x)
-        turn = chart.inverse_jacobian() @ self.prior.chart.linearised(e)[1]
+        turn = chart.inverse_jacobian() @ self.prior.chart.linearise(e)[1]
         n, S = e.size, self.prior.S.copy()
         S[:n] = (turn @ S[:n].reshape(*e.shape, len(S))).reshape(n, len(S))
         offset = np.concatenate([-(turn @ e[..., None]).ravel(), self.prior.common_T])
         return replace(self.prior.gaussians, x=offset[None], S=S[None])
 
     def _states(self, track: FloatArray, last: Gaussians) -> tuple[JointState, ...]:
-        """Return the states of a trajectory (m, K, 12), with the common field and the covariance of its end."""
+        """Return the states of a trajectory (m, K, 12), with the common field and the covariance at its end."""
         common_T = last.x[0, -N_COMMON:]
         return tuple(
             replace(state, x=np.concatenate([sources.ravel(), common_T]), S=last.S[0])

@@ -1,9 +1,8 @@
-"""State of several sources that one filter follows together, as one Gaussian in the chart of each source.
+"""Joint state of several sources: one Gaussian in the charts of the sources.
 
-Of every source it has position p, moment m, velocity v and rate of turn ω, and of all together the common field. The
-errors are Gaussian in the coordinates of :mod:`magloc.tracking.coordinates`, where errors of a moment are those
-of its strength and direction however large they are: in Cartesian coordinates the filter would be too sure of moments,
-because |m| is known better than its direction.
+Each source has position p, moment m, velocity v and rate of turn ω; the common field is shared. Errors are Gaussian in
+the coordinates of :mod:`magloc.tracking.coordinates`, always with strength and direction for a moment. In Cartesian
+coordinates the filter would be overconfident of moments, because |m| is known better than its direction.
 """
 
 from __future__ import annotations
@@ -20,11 +19,11 @@ from magloc.tracking.coordinates import Chart
 from magloc.tracking.row_filter import Gaussians
 
 N_SEEN = 6
-"""Numbers of a source that a row sees: position and moment."""
+"""Number of states of a source that readings depend on: position and moment."""
 N_OF_SOURCE = 12
 N_COMMON = 3
 _POWER = 0
-"""Power of the range with which moments grow along the chart: near an array, strengths are known apart from ranges."""
+"""Power of the range with which moments grow along the chart: near an array, strength and range are uncorrelated."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,9 +37,9 @@ class JointState:
     S : ndarray, shape (12 K + 3, 12 K + 3)
         Root of the covariance in the charts about x.
     centroid_m : ndarray, shape (3,)
-        Of the sensors, from where the charts count ranges.
+        Centroid of the sensors, the origin of ranges.
     radius_m : float
-        Of the array, below which they do not.
+        Radius of the array, the least scale of the charts.
     """
 
     x: FloatArray
@@ -55,7 +54,7 @@ class JointState:
 
     @property
     def n_sources(self) -> int:
-        """K."""
+        """Number of sources K."""
         return (len(self.x) - N_COMMON) // N_OF_SOURCE
 
     @property
@@ -80,11 +79,11 @@ class JointState:
 
     @property
     def gaussians(self) -> Gaussians:
-        """The state as the only one that a kernel is given."""
+        """The state as an argument of kernels."""
         return Gaussians(self.x[None], self.S[None], self.n_sources, N_COMMON, _POWER, math.inf)
 
     def after(self, found: Gaussians, centroid_m: FloatArray) -> JointState:
-        """Return the state that a kernel has found."""
+        """Return the state with the result of a kernel."""
         return replace(self, x=found.x[0], S=found.S[0], centroid_m=centroid_m)
 
     @cached_property
@@ -102,8 +101,8 @@ class JointState:
     def covariances(self) -> FloatArray:
         """Second moments (K, 6, 6) of the Cartesian errors of the sources' positions and moments.
 
-        Where |m| is known better than its direction, what turns leave of a moment's length is more than the error of
-        |m| itself: 1 - cos δ ≈ δ²/2, whose mean square is (tr² Σ + 2 tr Σ²)/4 for turns of covariance Σ.
+        A rotation by δ shortens the projection of a moment on its mean by 1 - cos δ ≈ δ²/2, which may exceed the error
+        of |m| itself. Its mean square is (tr² Σ + 2 tr Σ²)/4 for rotations of covariance Σ.
         """
         m, root = self.moment_Am2, self._roots[:, :N_SEEN]
         covariances: FloatArray = root @ np.swapaxes(root, 1, 2)
@@ -128,17 +127,17 @@ class JointState:
         return distance, float(np.linalg.norm(direction @ (self._roots[first, :3] - self._roots[second, :3])))
 
     @property
-    def common_alone(self) -> JointState:
-        """What is known of the common field, and no source."""
+    def without_sources(self) -> JointState:
+        """The marginal state of the common field, without sources."""
         return replace(self, x=self.common_T, S=root_of(self.S[-N_COMMON:]))
 
     def without(self, source: int) -> JointState:
-        """Return the state of the others."""
+        """Return the state without one source."""
         own = slice(N_OF_SOURCE * source, N_OF_SOURCE * (source + 1))
         return replace(self, x=np.delete(self.x, own), S=root_of(np.delete(self.S, own, 0)))
 
     def with_sources(self, position_m: FloatArray, moment_Am2: FloatArray, roots: FloatArray) -> JointState:
-        """Return the state with other sources (j, 3), last, at rest: roots (j, 12, 12) of Cartesian covariances."""
+        """Return the state with further sources (j, 3) at rest, with Cartesian roots (j, 12, 12)."""
         n, j = len(self.x) - N_COMMON, len(position_m)
         new = np.concatenate([position_m, moment_Am2, np.zeros((j, N_OF_SOURCE - N_SEEN))], axis=1)
         in_chart = chart_at(new, self.centroid_m, self.radius_m).inverse_jacobian() @ roots
@@ -150,17 +149,17 @@ class JointState:
             S[at, at.start + N_COMMON : at.stop + N_COMMON] = root
         return replace(self, x=x, S=S)
 
-    def narrowed(self, along: FloatArray, share: float, offset: float) -> JointState:
-        """Return the state with a share of the variance along one σ (n,) taken away, and moved along it."""
-        # In standard numbers `along` is a unit vector.
+    def narrow(self, along: FloatArray, share: float, offset: float) -> JointState:
+        """Return the state shifted along one σ (n,), with a share of the variance along it removed."""
+        # In standardised coordinates `along` is a unit vector.
         axis = np.linalg.solve(self.S, along)
         S = self.S - (1.0 - math.sqrt(1.0 - share)) * np.outer(along, axis)
-        return self.moved(offset * along, S)
+        return self.shift(offset * along, S)
 
-    def moved(self, error: FloatArray, S: FloatArray) -> JointState:
-        """Return the state at an error (n,), with a root S of errors in the charts here brought into those there."""
+    def shift(self, error: FloatArray, S: FloatArray) -> JointState:
+        """Return the state shifted by an error (n,), with a root S transformed into the charts there."""
         K, n = self.n_sources, len(self.x) - N_COMMON
-        sources, L = self.chart.linearised(error[:n].reshape(K, N_OF_SOURCE))
+        sources, L = self.chart.linearise(error[:n].reshape(K, N_OF_SOURCE))
         x = np.concatenate([sources.ravel(), self.common_T + error[n:]])
         after = replace(self, x=x, S=S.copy())
         turn = chart_at(sources, self.centroid_m, self.radius_m).inverse_jacobian() @ L

@@ -19,7 +19,7 @@ from magloc.tracking.multi_target.motion import FreeMotion
 from magloc.tracking.multi_target.tracker import SourcesTracker
 from magloc.tracking.results import SourcesPoint, TrackPoint, TrackResult, warn_of_strengths
 from magloc.tracking.rows import rows_of
-from magloc.tracking.track import TrackColumns, TrackRows, finished
+from magloc.tracking.track import TrackColumns, TrackRows, collect_points
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -153,12 +153,12 @@ def track_sources(
         raise ValueError("Input readings must have neither a background nor measured velocities for several sources.")
     tracker = SourcesTracker(array, sources=sources, motion=motion, prior=prior)
 
-    def followed() -> Iterator[SourcesPoint]:
+    def follow() -> Iterator[SourcesPoint]:
         for row in rows_of(used):
             yield tracker.update(row)
             if progress is not None:
                 progress(1)
 
-    points = finished(followed(), told)
+    points = collect_points(follow(), told)
     warn_of_strengths(track for point in points for track in point.tracks)
     return SourcesTrack(points, used)

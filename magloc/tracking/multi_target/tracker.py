@@ -24,22 +24,22 @@ from magloc.tracking.multi_target.explanations import (
     Explanation,
     RowProblem,
     Scene,
-    apart,
     are_same,
-    distinct,
+    drop_duplicates,
+    drop_same_places,
     far_sources,
 )
 from magloc.tracking.multi_target.hypotheses import (
     Hypothesis,
     by_score,
-    mates,
+    inherit_ids,
+    match_sources,
     merged_pairs,
-    moments,
-    old_names,
+    mixture_moments,
     split,
 )
 from magloc.tracking.multi_target.measurement import Channels
-from magloc.tracking.multi_target.motion import FreeMotion, stepped
+from magloc.tracking.multi_target.motion import FreeMotion, predict_state
 from magloc.tracking.multi_target.smoothing import YoungTrack
 from magloc.tracking.multi_target.state import N_COMMON, N_SEEN, JointState
 from magloc.tracking.multi_target.update import innovation_chi2
@@ -162,18 +162,19 @@ class SourcesTracker:
         if not row.available.any() or self._misfits.waits:
             step = problem.step
             self._hypotheses = [
-                replace(one, state=stepped(one.state, step, problem.measured), young=None) for one in self._hypotheses
+                replace(one, state=predict_state(one.state, step, problem.joint_row), young=None)
+                for one in self._hypotheses
             ]
             if self._misfits.waits and self._hypotheses:
-                self._misfits = self._misfits.passed_over
+                self._misfits = self._misfits.skip_row()
                 return self._point(problem, "misfit", math.nan)
             return self._point(problem, "no readings", math.nan)
         if not self._hypotheses:
-            self._hypotheses = [self._begun(problem)]
-        children = [child for one in self._hypotheses for child in self._continued(problem, one, dt_s)]
-        measured = problem.measured
-        known = [(one.refitted(measured), found, one.state is found.update.state) for one, found in children]
-        self._hypotheses = self._pruned([hypothesis for hypothesis, _, _ in known])
+            self._hypotheses = [self._initial_hypothesis(problem)]
+        children = [child for one in self._hypotheses for child in self._extend(problem, one, dt_s)]
+        joint_row = problem.joint_row
+        known = [(one.refit(joint_row), found, one.state is found.update.state) for one, found in children]
+        self._hypotheses = self._prune([hypothesis for hypothesis, _, _ in known])
         best = self._hypotheses[0]
         found, explained = next((found, fits) for one, found, fits in known if one.state is best.state)
         status = "misfit" if not explained else "tracked" if best.ids else "no source"
@@ -182,12 +183,12 @@ class SourcesTracker:
         else:
             self._misfits = self._misfits.after(found.update.standardised.ravel(), self._noise_T)
         is_poor = bool((best.excess > _POOR).any())
-        left, energy = problem.left(best.health) if best.ids else (None, 0.0)
+        left, energy = problem.mean_residual(best.health) if best.ids else (None, 0.0)
         if status == "tracked" and (is_poor or energy > SENSOR_LIMIT):
             status = "doubtful"
         poor = is_poor or best.health.suspect is not None
         if len(best.ids) > 1 and self._n_rows % _DOUBT_EVERY == 0:
-            self._hypotheses += self._superfluous(problem, best, found)
+            self._hypotheses += self._removals(problem, best, found)
         if best.ids != self._ids:
             self._ids, self._pause = best.ids, _FIRST_PAUSE
             self._next_restart = self._n_rows + _FIRST_PAUSE
@@ -196,12 +197,12 @@ class SourcesTracker:
             self._last_restart, self._next_restart = self._n_rows, self._n_rows + self._pause
             restarts = self._restarts(problem, best, found)
             if poor:  # whether the suspect is at fault, they are to tell
-                self._hypotheses[0] = replace(best, health=best.health.forgetful)
+                self._hypotheses[0] = replace(best, health=best.health.forget_residuals())
             self._hypotheses += restarts
         if left is None or energy < 0.5 * LEFT_LIMIT:
             self._late_pause = _LATE_PAUSE
         elif energy > LEFT_LIMIT and self._n_rows >= self._next_late:
-            born = self._born_late(problem, best, found, left)
+            born = self._late_births(problem, best, found, left)
             self._hypotheses += born
             self._late_pause = _LATE_PAUSE if born else min(2 * self._late_pause, _LONGEST_PAUSE)
             self._next_late = self._n_rows + self._late_pause
@@ -209,9 +210,9 @@ class SourcesTracker:
         self._hypotheses = self._split(problem)
         return point
 
-    def _begun(self, problem: RowProblem) -> Hypothesis:
+    def _initial_hypothesis(self, problem: RowProblem) -> Hypothesis:
         """No source; where there may be many, those that a search finds in the row: one by one they are not told."""
-        nothing, scene, row = self._nothing_yet(problem), self.scene, problem.row
+        nothing, scene, row = self._no_source(problem), self.scene, problem.row
         if scene.most_sources <= MOST_BY_ITSELF:
             return nothing
         R, best = row.R_world_from_array, None
@@ -229,14 +230,14 @@ class SourcesTracker:
                 continue
             positions_m = np.array([row.origin_m + R @ source.position_m for source in fix.best.sources])
             moments_Am2 = np.array([R @ source.moment_Am2 for source in fix.best.sources])
-            found = problem.found_anew(nothing.state, positions_m, moments_Am2, nothing.health.dead)
+            found = problem.explain_sources(nothing.state, positions_m, moments_Am2, nothing.health.dead)
             if best is None or found.score < best.score:
                 best = found
             if best.excess < COST_LIMIT:
                 break
         return nothing if best is None else replace(nothing, state=best.prior, ids=best.ids)
 
-    def _nothing_yet(self, problem: RowProblem) -> Hypothesis:
+    def _no_source(self, problem: RowProblem) -> Hypothesis:
         """No source, and a common field that may be as large as the readings."""
         array = self.scene.array
         sigma_T = array.common_field_T
@@ -244,32 +245,32 @@ class SourcesTracker:
             largest = np.nanmax(np.abs(problem.row.readings_T - array.channel_offset_T))
             sigma_T = 3.0 * float(largest) + 100.0 * float(array.channel_noise_T.max())
         return Hypothesis(
-            JointState.empty(np.zeros(3), sigma_T, problem.measured.centroid_m, array.circumradius),
+            JointState.empty(np.zeros(3), sigma_T, problem.joint_row.centroid_m, array.circumradius),
             (),
             SensorHealth.of(array.n_sensors),
         )
 
-    def _continued(self, problem: RowProblem, before: Hypothesis, dt_s: float) -> list[tuple[Hypothesis, Explanation]]:
+    def _extend(self, problem: RowProblem, before: Hypothesis, dt_s: float) -> list[tuple[Hypothesis, Explanation]]:
         """What becomes of a hypothesis: one for every explanation of the row, or the prediction if there is none."""
-        prior = stepped(before.state, problem.step, problem.measured)
-        plain = problem.updated(prior, before.ids, before.health.dead)
-        if problem.holds(plain) or (before.judged > 0 and plain.update.converged):
+        prior = predict_state(before.state, problem.step, problem.joint_row)
+        plain = problem.update(prior, before.ids, before.health.dead)
+        if problem.is_consistent(plain) or (before.judged > 0 and plain.update.converged):
             explanations = [plain]
         else:
             agile = self.scene.motion.numbers(dt_s, agility=MANOEUVRE_AGILITY)
-            manoeuvring = stepped(before.state, agile, problem.measured)
+            manoeuvring = predict_state(before.state, agile, problem.joint_row)
             explanations = problem.explanations(plain, manoeuvring)
         if not explanations:
             kept = replace(before, state=prior, young=None, score=before.score + min(plain.score, _UNBEARABLE))
             return [(self._with_excess(kept, plain), plain)]
         after = [self._after(problem, before, found) for found in explanations]
         if not before.ids:  # a source has one name wherever it may be the same
-            after[1:] = [replace(one, ids=old_names(one, after[0])) for one in after[1:]]
+            after[1:] = [replace(one, ids=inherit_ids(one, after[0])) for one in after[1:]]
         return list(zip(after, explanations, strict=True))
 
     def _after(self, problem: RowProblem, before: Hypothesis, found: Explanation) -> Hypothesis:
         """A hypothesis after an explanation of the row."""
-        of_dead = innovation_chi2(found.update.state, problem.measured, before.health.dead)
+        of_dead = innovation_chi2(found.update.state, problem.joint_row, before.health.dead)
         used = found.update.row.used.reshape(-1, 3)
         residuals = np.where(used.all(axis=1, keepdims=True), found.update.standardised, np.nan)
         young = before.young
@@ -294,7 +295,7 @@ class SourcesTracker:
         excess = min(found.excess, 2.0 * COST_LIMIT)
         return replace(after, excess=after.excess + (excess - after.excess) / _MEMORIES)
 
-    def _born_late(
+    def _late_births(
         self, problem: RowProblem, best: Hypothesis, found: Explanation, left: FloatArray
     ) -> list[Hypothesis]:
         """Hypotheses of a source more all along the last rows, where their mean residuals (C,) may be of one.
@@ -305,22 +306,22 @@ class SourcesTracker:
         rows, ids = best.young, (*best.ids, problem.first_id + NAMES_A_ROW - 1)
         if rows is None or len(rows.rows) < _FEWEST_ROWS or len(ids) > self.scene.most_sources:
             return []
-        without = rows.smoothed()
+        without = rows.smooth()
         if without is None:
             return []
-        known, health = [one.state for one in self._hypotheses], best.health.forgetful
+        known, health = [one.state for one in self._hypotheses], best.health.forget_residuals()
         born: list[Hypothesis] = []
-        starts = problem.starts(rows.prior, found, left)
-        tried = [rows.joined(prior).smoothed(_LATE_PASSES, without.score) for prior in starts]
+        starts = problem.late_birth_priors(rows.prior, found, left)
+        tried = [rows.add_sources(prior).smooth(_LATE_PASSES, without.score) for prior in starts]
         for young in sorted((one for one in tried if one is not None), key=lambda one: one.score):
             state, score = young.states[-1], best.score + young.score - without.score + BIRTH
             new = score < best.score + _LATE_WORSE and not any(are_same(state, other) for other in known)
-            if new and problem.allows(state, problem.measured.without(found.out), slice(-1, None)):
+            if new and problem.allows(state, problem.joint_row.without(found.out), slice(-1, None)):
                 known.append(state)
                 born.append(replace(best, state=state, ids=ids, young=young, score=score, health=health))
         return born
 
-    def _superfluous(self, problem: RowProblem, best: Hypothesis, found: Explanation) -> list[Hypothesis]:
+    def _removals(self, problem: RowProblem, best: Hypothesis, found: Explanation) -> list[Hypothesis]:
         """Hypotheses of a source less, where the row does not miss it; they are to be judged.
 
         It is taken away, or one with another that it is not told apart from: the two may be a single one, and their
@@ -328,13 +329,13 @@ class SourcesTracker:
         taken away without being judged.
         """
         state = best.state
-        far = problem.one_less(found, far_sources(state), [])
-        gone = [self._after(problem, best, one) for one in far if problem.holds(one)]
+        far = problem.remove_sources(found, far_sources(state), [])
+        gone = [self._after(problem, best, one) for one in far if problem.is_consistent(one)]
         if gone:
             return [replace(one, score=best.score - _MUST_GAIN) for one in gone]
         doubtful = [k for k in range(state.n_sources) if state.log_strength_sigma(k) > _CERTAIN_STRENGTH]
-        fewer = problem.one_less(found, doubtful, merged_pairs(state))
-        held = [self._after(problem, best, one) for one in fewer if problem.holds(one)]
+        fewer = problem.remove_sources(found, doubtful, merged_pairs(state))
+        held = [self._after(problem, best, one) for one in fewer if problem.is_consistent(one)]
         return [replace(one, score=best.score, excess=np.zeros(2), judged=_JUDGED_ROWS) for one in held]
 
     def _restarts(self, problem: RowProblem, best: Hypothesis, found: Explanation) -> list[Hypothesis]:
@@ -343,20 +344,20 @@ class SourcesTracker:
         Of that either all is, or all but where the sources are. Fewer sources than there are may explain the first
         rows, in a wrong place, and χ² agree: so they are tried at growing intervals where nothing seems wrong, too.
         """
-        common, dead, known = best.state.common_alone, best.health.dead, len(best.ids)
-        again = problem.found_anew(common, best.state.position_m, best.state.moment_Am2, dead)
-        anew, nothing = [again], problem.updated(common, (), dead)
+        common, dead, known = best.state.without_sources, best.health.dead, len(best.ids)
+        again = problem.explain_sources(common, best.state.position_m, best.state.moment_Am2, dead)
+        anew, nothing = [again], problem.update(common, (), dead)
         for number in (known, known - 1, known + 1):  # of many, one by one takes seconds and leads nowhere
             if 0 < number <= min(self.scene.most_sources, MOST_BY_ITSELF):
-                anew += problem.of_more_sources(nothing, number)
+                anew += problem.explain_with_at_least(nothing, number)
         if known < self.scene.most_sources:
-            anew += distinct(one for start in (found, again) for one in problem.births(start))
-        tried = apart(one for one in anew if one.update.converged)
+            anew += drop_duplicates(one for start in (found, again) for one in problem.births(start))
+        tried = drop_same_places(one for one in anew if one.update.converged)
         more = [one for one in tried if len(one.ids) > known]
         tried = [one for one in tried if len(one.ids) <= known][:_MOST_RESTARTS] + more[:_MOST_RESTARTS]
         # What the sources' motion tells is still to be learned by them, and was by the best one.
         learned = 2.0 * (np.linalg.slogdet(again.update.state.S)[1] - np.linalg.slogdet(best.state.S)[1])
-        score, health = best.score - max(0.0, float(learned)), best.health.forgetful
+        score, health = best.score - max(0.0, float(learned)), best.health.forget_residuals()
         restarts = [
             replace(self._after(problem, best, one), score=score + BIRTH * (len(one.ids) - known), health=health)
             for one in tried
@@ -366,14 +367,14 @@ class SourcesTracker:
             restarts.append(replace(best, health=best.health.without(suspect)))
         return [replace(one, excess=np.zeros(2), judged=_JUDGED_ROWS) for one in restarts]
 
-    def _pruned(self, hypotheses: list[Hypothesis]) -> list[Hypothesis]:
+    def _prune(self, hypotheses: list[Hypothesis]) -> list[Hypothesis]:
         """The likeliest ones, the best first; behind them restarts while they are judged."""
         believed = sorted((one for one in hypotheses if not one.judged), key=by_score)
         judged = []
         for one in (one for one in hypotheses if one.judged):
             gain = believed[0].score - one.score
             if gain > (_MUST_GAIN if one.judged == 1 else _CLEAR_GAIN):
-                ids = old_names(one, believed[0])
+                ids = inherit_ids(one, believed[0])
                 believed.append(replace(one, ids=ids, score=believed[0].score - _MUST_GAIN, judged=0))
             elif one.judged > 1:
                 judged.append(one)
@@ -392,14 +393,14 @@ class SourcesTracker:
         parts: list[Hypothesis] = []
         for i, one in enumerate(self._hypotheses):
             room = _MOST_HYPOTHESES - len(parts) - sum(not other.judged for other in self._hypotheses[i:])
-            of_one = split(one.state, problem.measured) if room > 1 and not one.judged else [(1.0, one.state)]
-            parts += [one.narrowed(share, state) for share, state in of_one]
+            of_one = split(one.state, problem.joint_row) if room > 1 and not one.judged else [(1.0, one.state)]
+            parts += [one.take_part(share, state) for share, state in of_one]
         return parts
 
     def _point(self, problem: RowProblem, status: str, chi2: float) -> SourcesPoint:
         """What is told of the best hypothesis."""
         array, row = self.scene.array, problem.row
-        best = self._hypotheses[0] if self._hypotheses else self._nothing_yet(problem)
+        best = self._hypotheses[0] if self._hypotheses else self._no_source(problem)
         told = [k for k, name in enumerate(best.ids) if self._n_rows - name // NAMES_A_ROW >= ROWS_TO_REPORT]
         told = told or list(range(len(best.ids)))
         for k in told:
@@ -407,11 +408,11 @@ class SourcesTracker:
         merged = np.isin(np.arange(len(best.ids)), merged_pairs(best.state))
         believed = [one for one in self._hypotheses if not one.judged]
         likely = np.exp(-0.5 * np.array([one.score - best.score for one in believed]))
-        of_others = [mates(best, one) for one in believed]
+        of_others = [match_sources(best, one) for one in believed]
         tracks = [
             SourcePoint(
                 row.time_s,
-                *moments([one.state for one in believed], likely, [of_one.get(k) for of_one in of_others]),
+                *mixture_moments([one.state for one in believed], likely, [of_one.get(k) for of_one in of_others]),
                 nis=chi2,
                 nis_dof=int(np.count_nonzero(row.available)),
                 status="predicted" if status in ("misfit", "no readings") else "merged" if merged[k] else status,

@@ -1,4 +1,4 @@
-"""One row's readings put into a joint state: an iterated update, and what of the row contradicts it."""
+"""Iterated update of a joint state by one row, and the residuals of its sensors."""
 
 from __future__ import annotations
 
@@ -12,31 +12,31 @@ from magloc.tracking.multi_target.measurement import JointRow
 from magloc.tracking.multi_target.state import N_COMMON, N_OF_SOURCE, JointState
 
 MOST_TRIALS = 60
-"""Steps of an update that are tried."""
+"""Largest number of steps of an update."""
 _TOLERANCE = 0.1
-"""Step, in standard deviations, below which an update ends: what it would gain is no more than 0.01 of χ²."""
+"""Step, in standard deviations, below which an update ends: it would change χ² by at most 0.01."""
 
 
 @dataclass(frozen=True, eq=False)
 class JointUpdate:
-    r"""What a row's readings make of a prediction.
+    r"""Update of a prediction by a row's readings.
 
     Attributes
     ----------
     row : JointRow
     state : JointState
-        After the row.
+        State after the row.
     cost : float
         :math:`J = |r|^2 + e^T P^{-1} e`, χ² of the innovation with the number of readings as degrees of freedom.
     score : float
-        -2 ln of how likely the row is, up to a constant: J and the logarithm of :math:`|I + P H^T H|`.
+        -2 ln of the likelihood of the row, up to a constant: J plus the logarithm of :math:`|I + P H^T H|`.
     converged : bool
     innovation, residual : ndarray, shape (C,)
-        Whitened readings less predicted ones, before and after the update.
+        Whitened readings minus predicted ones, before and after the update.
     seen_before, seen : ndarray, shape (d, C)
-        Q at both: :math:`I - Q^T Q` is the inverse of the covariance of the innovation.
+        Q before and after the update: :math:`I - Q^T Q` is the inverse of the covariance of the innovation.
     standardised : ndarray, shape (N, 3)
-        Residuals of every sensor's channels, of unit covariance; zero for those not used.
+        Residuals of every sensor's channels, of unit covariance; zero for unused sensors.
     """
 
     row: JointRow
@@ -52,21 +52,21 @@ class JointUpdate:
 
     @property
     def sensor_chi2(self) -> FloatArray:
-        """χ² (N,) with three degrees of freedom that every sensor's readings would explain if they were free."""
+        """Decrease of χ² (N,) if each sensor is left out, with three degrees of freedom."""
         return np.vecdot(self.standardised, self.standardised)
 
     @property
     def surprise(self) -> FloatArray:
-        """Innovation (C,) less what the prediction's uncertainty explains, to first order.
+        """Innovation (C,) minus the part explained by the prediction's uncertainty, to first order.
 
-        Where something new is strong, the iterated update moves what is known onto it, and the residual tells little.
+        The iterated update shifts known sources towards a strong new one, so that the residual shows little of it.
         """
         return self.innovation - (self.seen_before @ self.innovation) @ self.seen_before
 
 
 def joint_update(prior: JointState, row: JointRow, most: int = MOST_TRIALS) -> JointUpdate:
-    """Return a predicted state after a row's readings."""
-    found = row_filter.update(prior.gaussians, row.compiled, linearisations=True, most=most, tolerance=_TOLERANCE)
+    """Update a predicted state by a row's readings."""
+    found = row_filter.update(prior.gaussians, row.kernel_rows, linearisations=True, most=most, tolerance=_TOLERANCE)
     assert found.misfits is not None
     assert found.projectors is not None
     assert found.standardised is not None
@@ -85,17 +85,17 @@ def joint_update(prior: JointState, row: JointRow, most: int = MOST_TRIALS) -> J
 
 
 def innovation_chi2(state: JointState, row: JointRow, sensors: BoolArray) -> FloatArray:
-    """Return χ² (N,) with three degrees of freedom of sensors that a state does not know of; infinite of all others."""
+    """Return χ² (N,) of sensors that were left out of a state, with three degrees of freedom; infinite for others."""
     chi2 = np.full(len(sensors), np.inf)
-    asked = sensors & row.used.reshape(-1, 3).all(axis=1)
-    if not asked.any():
+    available = sensors & row.used.reshape(-1, 3).all(axis=1)
+    if not available.any():
         return chi2
     n = N_OF_SOURCE * state.n_sources
-    by_source, h = row.linearised(state)
+    by_source, h = row.linearise(state)
     L = state.chart.jacobian(np.zeros((state.n_sources, N_OF_SOURCE)))
     H = np.concatenate([*(by_source @ L[:, :6]), row.effect], axis=1) if n else row.effect
     seen = H @ np.concatenate([state.S[:n], state.S[-N_COMMON:]])
-    for sensor in np.flatnonzero(asked):
+    for sensor in np.flatnonzero(available):
         at = np.flatnonzero(row.array.channel_sensor == sensor)
         r = (row.z - h)[at]
         chi2[sensor] = float(r @ np.linalg.solve(np.eye(3) + seen[at] @ seen[at].T, r))

@@ -22,14 +22,14 @@ from magloc.levels import CONTRADICTION
 from magloc.localization.uncertainty.range_interval import relative_range_sigma
 from magloc.readings import Readings
 from magloc.state_space import update, whitened_innovation
-from magloc.tracking.chart.steps import charted
+from magloc.tracking.chart.steps import from_cartesian
 from magloc.tracking.coordinates import Chart
 from magloc.tracking.measurement import RowMeasurement
 from magloc.tracking.motion import N_SOURCE
-from magloc.tracking.results import Innovation, Prediction, Step, TrackPoint, of_mixture
+from magloc.tracking.results import Innovation, Prediction, Step, TrackPoint, point_of_mixture
 from magloc.tracking.rows import Row, rows_of
 from magloc.tracking.tracker import LARGEST_RANGE_ERROR, Tracker
-from magloc.tracking.whole_records.smoother import smoothed, smoothed_states
+from magloc.tracking.whole_records.smoother import smooth_points, smooth_states
 
 _LOG = logging.getLogger(__name__)
 TAKES_MUCH = 3.0
@@ -50,7 +50,7 @@ _NOTHING = "not acquired: no dipole on this background fits the rows"
 
 
 @dataclass(frozen=True, eq=False)
-class _Passed:
+class _ForwardPass:
     """A forward pass over rows from one on: steps, innovations, and which rows agree with those before and are used."""
 
     begin: int
@@ -71,18 +71,18 @@ def track_on_background(
     """Points of a record whose background is in the states of a tracker."""
     rows = list(rows_of(readings))
     measurements = [tracker.measurements.of(row) for row in rows]
-    points = [tracker._lost(row, _NOTHING) for row in rows]
-    near = (_settled(tracker, measurements, *states) for states in _plain_tracks(tracker, readings))
+    points = [tracker.untracked_point(row, _NOTHING) for row in rows]
+    near = (_iterate_passes(tracker, measurements, *states) for states in _plain_tracks(tracker, readings))
     passed = next((found for found in near if found is not None), None)
     if progress is not None:
         progress(len(rows))
     if passed is None:
         return points
-    passed = _extended(tracker, measurements, passed)
+    passed = _extend(tracker, measurements, passed)
     of_rows = _points(tracker, measurements[passed.rows], passed)
-    points[passed.rows] = smoothed(of_rows, passed.steps) if smooth else of_rows
-    _warn_of_what_it_takes(tracker, rows[passed.rows], passed, of_rows)
-    _warn_of_a_pull(tracker, measurements[passed.rows], passed)
+    points[passed.rows] = smooth_points(of_rows, passed.steps) if smooth else of_rows
+    _warn_of_lost_information(tracker, rows[passed.rows], passed, of_rows)
+    _warn_of_biased_mode(tracker, measurements[passed.rows], passed)
     return points
 
 
@@ -108,13 +108,13 @@ def _plain_tracks(tracker: Tracker, readings: Readings) -> Iterator[tuple[int, l
             yield int(known[0]), [np.concatenate([state, rest]) for state in between]
 
 
-def _warn_of_what_it_takes(
-    tracker: Tracker, rows: Sequence[Row], passed: _Passed, points: Sequence[TrackPoint]
+def _warn_of_lost_information(
+    tracker: Tracker, rows: Sequence[Row], passed: _ForwardPass, points: Sequence[TrackPoint]
 ) -> None:
     """Warn where positions are much more certain if there is no background."""
     plain, n = Tracker(tracker.array, tracker.motion), tracker.motion.n_states
     states = [np.concatenate([step.x[:n], np.zeros(plain.n_errors)]) for step in passed.steps]
-    alone = _passed(plain, [plain.measurements.of(row) for row in rows], 0, states, passed.used)
+    alone = _forward_pass(plain, [plain.measurements.of(row) for row in rows], 0, states, passed.used)
     known = [j for j, point in enumerate(points) if point.position_m is not None]
     of_both = [sum(float(np.sum(steps[j].S[:3] ** 2)) for j in known) for steps in (passed.steps, alone.steps)]
     if of_both[0] > TAKES_MUCH**2 * of_both[1]:
@@ -122,18 +122,18 @@ def _warn_of_what_it_takes(
         _LOG.warning(f"the background looks like the source: positions are {factor:.0f} times as uncertain as without")
 
 
-def _warn_of_a_pull(tracker: Tracker, measurements: Sequence[RowMeasurement], passed: _Passed) -> None:
+def _warn_of_biased_mode(tracker: Tracker, measurements: Sequence[RowMeasurement], passed: _ForwardPass) -> None:
     """Warn where the likeliest trajectory need not be in the middle of those that are likely.
 
     It leaves out how many there are about it, which the determinants of the innovations' covariances tell. They change
     where a source is farther and stronger, moves more and reads alike: it matters if the range went by more than its σ.
     """
-    states = [x for x, _ in smoothed_states(passed.steps)]
+    states = [x for x, _ in smooth_states(passed.steps)]
     sigma = [_range_error(step.x, step.S, m) for step, m in zip(passed.steps, measurements, strict=True)]
     log_number = []
     for apart in (-_APART, _APART):
-        moved = [_farther(state, m, apart) for state, m in zip(states, measurements, strict=True)]
-        steps = _passed(tracker, measurements, 0, moved, passed.used).steps
+        moved = [_scale_range(state, m, apart) for state, m in zip(states, measurements, strict=True)]
+        steps = _forward_pass(tracker, measurements, 0, moved, passed.used).steps
         log_number.append(
             sum(_log_volume(step.prediction.S) - _log_volume(step.S) for step in steps if step.prediction)
         )
@@ -142,12 +142,12 @@ def _warn_of_a_pull(tracker: Tracker, measurements: Sequence[RowMeasurement], pa
         _LOG.warning("how the source moves tells where it is: errors may be several times their standard deviations")
 
 
-def _farther(state: FloatArray, measurement: RowMeasurement, log_range: float) -> FloatArray:
+def _scale_range(state: FloatArray, measurement: RowMeasurement, log_range: float) -> FloatArray:
     """A state (n,) whose source is farther and stronger and moves more, so that it reads alike."""
     n = measurement.n_motion
     e = np.zeros(n)
     e[0] = log_range
-    moved = Chart.at(state[:n], measurement.centroid_m, measurement.radius_m).retracted(e)
+    moved = Chart.at(state[:n], measurement.centroid_m, measurement.radius_m).retract(e)
     return np.concatenate([moved, state[n:]])
 
 
@@ -163,40 +163,40 @@ def steps_of(
     start: tuple[FloatArray, FloatArray] | None = None,
 ) -> list[Step]:
     """Return the steps of a forward pass that linearises all rows at some states."""
-    return _passed(tracker, measurements, 0, states, np.ones(len(measurements), dtype=bool), start).steps
+    return _forward_pass(tracker, measurements, 0, states, np.ones(len(measurements), dtype=bool), start).steps
 
 
-def settled_steps(tracker: Tracker, rows: Sequence[Row], states: Sequence[FloatArray]) -> list[Step] | None:
+def iterate_steps(tracker: Tracker, rows: Sequence[Row], states: Sequence[FloatArray]) -> list[Step] | None:
     """Steps of the last pass over rows that are linearised where passes lead, from some states; None if nowhere."""
-    passed = _settled(tracker, [tracker.measurements.of(row) for row in rows], 0, states)
+    passed = _iterate_passes(tracker, [tracker.measurements.of(row) for row in rows], 0, states)
     return None if passed is None else passed.steps
 
 
-def _extended(tracker: Tracker, measurements: Sequence[RowMeasurement], passed: _Passed) -> _Passed:
+def _extend(tracker: Tracker, measurements: Sequence[RowMeasurement], passed: _ForwardPass) -> _ForwardPass:
     """The same with the rows before and after, as far as passes settle with them."""
     while len(passed.steps) < len(measurements):
-        states = [x for x, _ in smoothed_states(passed.steps)]
+        states = [x for x, _ in smooth_states(passed.steps)]
         more = _FEWEST_ROWS + len(states) // 4
         before, after = min(more, passed.begin), min(more, len(measurements) - passed.begin - len(states))
         states = [states[0]] * before + states + [states[-1]] * after
-        wider = _settled(tracker, measurements, passed.begin - before, states)
+        wider = _iterate_passes(tracker, measurements, passed.begin - before, states)
         if wider is None:
             return passed
         passed = wider
     return passed
 
 
-def _settled(
+def _iterate_passes(
     tracker: Tracker, measurements: Sequence[RowMeasurement], begin: int, states: Sequence[FloatArray]
-) -> _Passed | None:
+) -> _ForwardPass | None:
     """The last forward pass from a row on; None where the passes do not settle, or too many rows contradict it."""
     measurements = measurements[begin : begin + len(states)]
     used = np.ones(len(measurements), dtype=bool)
     for _ in range(_MOST_PASSES):
         try:
             with np.errstate(all="ignore"):  # passes may lead out of double precision
-                passed = _passed(tracker, measurements, begin, states, used)
-                later = smoothed_states(passed.steps)
+                passed = _forward_pass(tracker, measurements, begin, states, used)
+                later = smooth_states(passed.steps)
                 sigma = np.array([np.sqrt(np.diagonal(P)[:N_SOURCE]) for _, P in later])
         except np.linalg.LinAlgError:
             return None
@@ -215,19 +215,19 @@ def _settled(
     return None
 
 
-def _passed(
+def _forward_pass(
     tracker: Tracker,
     measurements: Sequence[RowMeasurement],
     begin: int,
     states: Sequence[FloatArray],
     used: BoolArray,
     start: tuple[FloatArray, FloatArray] | None = None,
-) -> _Passed:
+) -> _ForwardPass:
     """One forward pass over rows that are linearised at some states; by default from a source that is hardly known."""
     if start is None:
         offset = measurements[0].place_in_array(states[0], np.eye(states[0].size))[0]
         sigma = _UNKNOWN * np.repeat([np.linalg.norm(offset), np.linalg.norm(states[0][3:6])], 3)
-        start = tracker.state_before(states[0], np.diag(sigma))
+        start = tracker.initial_state(states[0], np.diag(sigma))
     x, S = start
     steps: list[Step] = []
     innovations: list[Innovation | None] = []
@@ -236,42 +236,42 @@ def _passed(
         prediction = None
         if j:
             before = states[j - 1]
-            at = tracker.predicted(before, S, measurement.row.time_s - measurements[j - 1].row.time_s)
+            at = tracker.predict(before, S, measurement.row.time_s - measurements[j - 1].row.time_s)
             prediction = Prediction(at.x + at.F @ (x - before), at.S, at.F)
             x, S = prediction.x, prediction.S
         k = measurement.z.size
         innovations.append(None)
         if k:
             H = measurement.jacobian(state)
-            innovation = measurement.z - measurement.predicted(state) - H @ (x - state)
+            innovation = measurement.z - measurement.predict(state) - H @ (x - state)
             whitened = whitened_innovation(S, H, innovation)
             innovations[j] = Innovation(measurement.row.available, whitened)
             agrees[j] = whitened @ whitened <= chdtri(k, CONTRADICTION)
             if used[j]:
                 x, S, _ = update(x, S, H, innovation)
         steps.append(Step(j, prediction, x, S))
-    return _Passed(begin, steps, innovations, agrees, used)
+    return _ForwardPass(begin, steps, innovations, agrees, used)
 
 
-def _points(tracker: Tracker, measurements: Sequence[RowMeasurement], passed: _Passed) -> list[TrackPoint]:
+def _points(tracker: Tracker, measurements: Sequence[RowMeasurement], passed: _ForwardPass) -> list[TrackPoint]:
     """What is known of every row, from the first one on that knows the range."""
     points: list[TrackPoint] = []
     tracked, last = False, None
-    open_loop = tracker.known_before(measurements[0], passed.steps[0].x)
+    open_loop = tracker.prior_covariance(measurements[0], passed.steps[0].x)
     for j, (measurement, step) in enumerate(zip(measurements, passed.steps, strict=True)):
         row, innovation = measurement.row, passed.innovations[j]
         if j:
-            open_loop = tracker.open_loop(open_loop, passed.steps[j - 1].x, row.time_s - measurements[j - 1].row.time_s)
+            open_loop = tracker.propagate(open_loop, passed.steps[j - 1].x, row.time_s - measurements[j - 1].row.time_s)
         range_error = _range_error(step.x, step.S, measurement)
         if not range_error <= (LARGEST_RANGE_ERROR if tracked else _FIRST_RANGE_ERROR):
             tracked, last = False, None
-            points.append(tracker._lost(row, "not acquired: the range is not certain enough"))
+            points.append(tracker.untracked_point(row, "not acquired: the range is not certain enough"))
             continue
         status = "predicted" if innovation is None else "tracked" if passed.used[j] else "outlier"
-        told = {} if innovation is None or not tracked else innovation.after(last)
+        told = {} if innovation is None or not tracked else innovation.statistics(last)
         last = innovation if status == "tracked" else None
-        mixture = charted(step.x, step.S, measurement)
-        point = of_mixture(row.time_s, mixture, np.diagonal(open_loop))
+        mixture = from_cartesian(step.x, step.S, measurement)
+        point = point_of_mixture(row.time_s, mixture, np.diagonal(open_loop))
         points.append(replace(point, iterations=1, status=status if tracked else "acquired", **told))
         tracked = True
     return points

@@ -24,7 +24,7 @@ from magloc.tracking.motion import N_SOURCE
 from magloc.tracking.results import TrackPoint
 from magloc.tracking.rows import Row
 from magloc.tracking.tracker import Tracker
-from magloc.tracking.whole_records.background import settled_steps
+from magloc.tracking.whole_records.background import iterate_steps
 
 _LEAST_KNOWN = 1e-6
 """A direction of the constants counts of which the rows tell a variance of more."""
@@ -56,7 +56,7 @@ def constants_test(tracker: Tracker, rows: Sequence[Row], points: Sequence[Track
     wider = Tracker(array, tracker.motion, background=tracker.background)
     rest = np.zeros(wider.motion.n_states - N_SOURCE + wider.n_errors)
     states = [np.concatenate([points[i].position_m, points[i].moment_Am2, rest]) for i, _ in used]
-    steps = settled_steps(wider, [rows[i] for i, _ in used], states)
+    steps = iterate_steps(wider, [rows[i] for i, _ in used], states)
     if steps is None:
         return ConstantsTest()
     errors, own = wider.pose_errors, tracker.pose_errors

@@ -14,7 +14,7 @@ from magloc.tracking.results import Step
 from magloc.tracking.rows import Row
 from magloc.tracking.tracker import Tracker
 from magloc.tracking.whole_records.background import steps_of
-from magloc.tracking.whole_records.smoother import smoothed_states
+from magloc.tracking.whole_records.smoother import smooth_states
 
 
 def posterior_bound(
@@ -44,7 +44,7 @@ def smoothing_bound(
     """
     bounds = np.full(len(rows), np.inf)
     steps = _steps_at_truth(tracker, rows, position_m, moment_Am2)
-    for step, (_, P) in zip(steps, smoothed_states(steps), strict=True):
+    for step, (_, P) in zip(steps, smooth_states(steps), strict=True):
         bounds[step.row] = math.sqrt(float(np.trace(P[:3, :3])))
     return bounds
 
@@ -67,7 +67,7 @@ def _steps_at_truth(
     if first is None:
         return []
     root = prior_root(measurements[first].chart(truth[first]))
-    start = tracker.state_before(states[first], root, rows[first].R_world_from_array)
+    start = tracker.initial_state(states[first], root, rows[first].R_world_from_array)
     steps = steps_of(tracker, measurements[first:], states[first:], start)
     return [replace(step, row=first + step.row) for step in steps]
 

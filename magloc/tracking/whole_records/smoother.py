@@ -12,13 +12,13 @@ from magloc.tracking.motion import N_SOURCE
 from magloc.tracking.results import Step, TrackPoint
 
 
-def smoothed(points: list[TrackPoint], steps: list[Step]) -> list[TrackPoint]:
+def smooth_points(points: list[TrackPoint], steps: list[Step]) -> list[TrackPoint]:
     """Points of a finished record with what later rows tell as well: a fixed-interval smoother over every track.
 
     Rauch, Tung and Striebel's recursion on the filter's steps: its gain is :math:`P F^T P_{pred}^{-1}`.
     """
     result = list(points)
-    for step, (x, P) in zip(steps, smoothed_states(steps), strict=True):
+    for step, (x, P) in zip(steps, smooth_states(steps), strict=True):
         point = points[step.row]
         if point.position_m is not None:
             assert point.centroid_m is not None
@@ -30,7 +30,7 @@ def smoothed(points: list[TrackPoint], steps: list[Step]) -> list[TrackPoint]:
     return result
 
 
-def smoothed_states(steps: list[Step]) -> list[tuple[FloatArray, FloatArray]]:
+def smooth_states(steps: list[Step]) -> list[tuple[FloatArray, FloatArray]]:
     """State and covariance of every step with what later ones tell."""
     result: list[tuple[FloatArray, FloatArray]] = []
     x, P = np.empty(0), np.empty((0, 0))

@@ -21,7 +21,7 @@ from arrays.typing import FloatArray
 from magloc.live.follower import LivePoint
 from magloc.live.tally import Tally
 from magloc.readings import Readings
-from magloc.tracking.results import SourcesPoint, TrackPoint, stacked
+from magloc.tracking.results import SourcesPoint, TrackPoint, track_column
 from magloc.tracking.rows import Row
 from magloc.viewer.pages import words
 from magloc.viewer.pages.track_player import SOURCE_COLOURS, point_words
@@ -88,7 +88,7 @@ class Marks:
         self.dipole.show(NOWHERE if position is None else position, NOWHERE if moment is None else moment)
         covariance = None if point is None else point.covariance
         self._region.show(None if position is None or covariance is None else ellipsoid(position, covariance[:3, :3]))
-        segments = line_segments(stacked(recent, "position_m", 3)) if len(recent) > 1 else np.zeros((0, 2, 3))
+        segments = line_segments(track_column(recent, "position_m", 3)) if len(recent) > 1 else np.zeros((0, 2, 3))
         self._tail.visible = bool(len(segments))
         if len(segments):
             self._tail.points = segments.astype(np.float32)
@@ -250,7 +250,7 @@ class LivePage:
         for id in set().union(*of_rows):
             there = np.array([id in sources for sources in of_rows])
             points = [sources[id] for sources in of_rows if id in sources]
-            source = stacked(points, "position_m", 3), stacked(points, "moment_Am2", 3)
+            source = track_column(points, "position_m", 3), track_column(points, "moment_Am2", 3)
             left[there] += residuals_of(self._array, readings[there], *source) - values[there]
         self._plot.take(readings, left)
 

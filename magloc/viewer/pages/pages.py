@@ -15,7 +15,7 @@ from arrays.typing import FloatArray
 from magloc.localization.fit.results import Fix
 from magloc.readings import Readings
 from magloc.surveying.results import Survey
-from magloc.tracking.results import TrackPoint, TrackResult, on_track, stacked
+from magloc.tracking.results import TrackPoint, TrackResult, on_track, track_column
 from magloc.truth import nearest_rows
 from magloc.viewer.pages import words
 from magloc.viewer.pages.field_panel import FieldPanel
@@ -197,7 +197,7 @@ def track_page(
     """Tracks, with the array that found them and its readings, if they are given."""
     result = replace(result, points=tuple(on_track(result.points)))
     points, gui = result.points, server.gui
-    each = [stacked(track, "position_m", 3) for track in result.tracks]
+    each = [track_column(track, "position_m", 3) for track in result.tracks]
     positions = np.concatenate(each)
     legend = gui.add_folder("Legend")
     name = "true path" if result.is_truth else "track"
@@ -226,12 +226,12 @@ def track_page(
         of_point = _nearest_rows(rows, points)
         left = None if result.ids else np.full_like(rows.values_T, np.nan)
         if left is not None:
-            left[of_point] = residuals_of(array, rows[of_point], positions, stacked(points, "moment_Am2", 3))
+            left[of_point] = residuals_of(array, rows[of_point], positions, track_column(points, "moment_Am2", 3))
         plot = ReadingsPlot(server, rows, array, left)
         show_row = plot.show_row
         show_row(int(of_point[player.index]))
         followers.append(lambda index: show_row(int(of_point[index])))
-        times_s = stacked(points, "time_s")
+        times_s = track_column(points, "time_s")
         plot.when_pointed(lambda row: player.choose(int(nearest_rows(rows.time_s[[row]], times_s)[0])))
     nodes = [f"/times/of-{id}" for id in result.ids] or ["/times"]
     for node, place in zip(nodes, each, strict=True):
@@ -242,7 +242,9 @@ def track_page(
     drops = [trail.drop for trail in player.trails]
     playing = None
     if len(points) > 1:
-        playing = Playing.of(stacked(points, "time_s"), player.show_row, player.index, lambda: player.row_panel.content)
+        playing = Playing.of(
+            track_column(points, "time_s"), player.show_row, player.index, lambda: player.row_panel.content
+        )
     return _finished(server, legend, ball, name, entries, close=player.pause, drops=drops, playing=playing, plot=plot)
 
 
@@ -360,7 +362,7 @@ def _centroids(array: SensorArray, rows: Readings | None, n: int) -> FloatArray:
 def _nearest_rows(rows: Readings, points: Sequence[TrackPoint]) -> NDArray[np.intp]:
     """The row of the readings that is nearest in time, for every point of a track."""
     order = np.argsort(rows.time_s, kind="stable")
-    return order[nearest_rows(stacked(points, "time_s"), rows.time_s[order])]
+    return order[nearest_rows(track_column(points, "time_s"), rows.time_s[order])]
 
 
 def _not_far(positions_m: FloatArray, centroids_m: FloatArray) -> FloatArray:

@@ -27,7 +27,7 @@ from matplotlib import colormaps
 from numpy.typing import NDArray
 
 from arrays.typing import BoolArray, ByteArray, FloatArray
-from magloc.tracking.results import TrackPoint, TrackResult, stacked
+from magloc.tracking.results import TrackPoint, TrackResult, track_column
 from magloc.viewer.pages import words
 from magloc.viewer.panels.events import EventButtons, rows_of_change
 from magloc.viewer.panels.played_time import PlayedTime, time_strip
@@ -71,13 +71,13 @@ class Trail:
     def __init__(
         self, scene: viser.SceneApi, name: str, points: Sequence[TrackPoint], size_m: float, colour: Colour | None
     ) -> None:
-        positions, self._moments = stacked(points, "position_m", 3), stacked(points, "moment_Am2", 3)
+        positions, self._moments = track_column(points, "position_m", 3), track_column(points, "moment_Am2", 3)
         self.tracked: BoolArray = np.array(np.isfinite(positions).all(axis=1))
         self._whole_m = positions[track_segments(positions, 0, len(positions) - 1)]
         self.whole = screen_lines(scene, f"{name}/whole", self._whole_m, _WHOLE_COLOUR, 1.0)
         has_any = any(point.covariance is not None for point in points)
-        covariances = stacked(points, "covariance", 6, 6)[:, :3, :3] if has_any else None
-        shades = time_colours(stacked(points, "time_s")) if colour is None else None
+        covariances = track_column(points, "covariance", 6, 6)[:, :3, :3] if has_any else None
+        shades = time_colours(track_column(points, "time_s")) if colour is None else None
         self.glyph = TrackGlyph(
             scene,
             f"{name}/tail",
@@ -149,7 +149,7 @@ class TrackPlayer(PlayedTime):
     ) -> None:
         self._server, self._result, points = server, result, result.points
         self._poses, self._on_pose, self._on_row = array_poses, on_pose, on_row
-        time = stacked(points, "time_s")
+        time = track_column(points, "time_s")
         self._since_first_s = time - time[0]
         self._span_s = float(self._since_first_s[-1])
         nodes = [f"/track-{id}" for id in result.ids] or ["/track"]

@@ -25,7 +25,7 @@ from magloc.tracking.motion import OrnsteinUhlenbeck, RandomWalk
 from magloc.tracking.rows import rows_of
 from magloc.tracking.tracker import Tracker
 from magloc.tracking.whole_records.posterior_bound import posterior_bound, smoothing_bound
-from magloc.tracking.whole_records.smoother import smoothed
+from magloc.tracking.whole_records.smoother import smooth_points
 from magloc.truth import Truth, truth_of_rows
 from tests.command_line import Outcome, Run, assert_refused, refuse_constant, results_of
 from tests.oracles import magpylib_field
@@ -208,7 +208,7 @@ class TestSmooth:
         tracker = Tracker(read_array(array), OrnsteinUhlenbeck(0.1, float(np.deg2rad(1.2))), keep_steps=True)
         table = read_readings(readings, tracker.array)
         points = followed(tracker, list(rows_of(table)))
-        for entry, point in zip(results, smoothed(points, tracker.steps), strict=True):
+        for entry, point in zip(results, smooth_points(points, tracker.steps), strict=True):
             assert entry["position_m"] == (None if point.position_m is None else point.position_m.tolist())
 
     def test_is_nearer_to_the_truth(self, run: Run, array: Path, readings: Path) -> None:

@@ -317,14 +317,14 @@ class TestUpdate:
         scale = np.concatenate([np.diagonal(S[0, :6, :6]), tracker.errors.sigma])
 
         def residuals(y: FloatArray) -> FloatArray:
-            source = chart.retracted((y * scale)[None, :6])[0]
-            misfit = measurement.z - measurement.of_source(source) - measurement.effect @ (y * scale)[6:]
+            source = chart.retract((y * scale)[None, :6])[0]
+            misfit = measurement.z - measurement.predict_source(source) - measurement.effect @ (y * scale)[6:]
             return np.concatenate([misfit, y])
 
         fit = least_squares(residuals, np.zeros(N), xtol=1e-15, ftol=1e-15, gtol=1e-15)
         J = np.asarray(fit.jac)
         P = np.linalg.inv(J.T @ J) * np.outer(scale, scale)
-        found = row_filter.update(Gaussians(x, S, n_nuisances=N - 6), measurement.compiled)
+        found = row_filter.update(Gaussians(x, S, n_nuisances=N - 6), measurement.kernel_rows)
         deviation = np.sqrt(np.diagonal(P))
         assert found.nis[0] == pytest.approx(2.0 * fit.cost, rel=1e-6)
         offset = np.concatenate([chart.coordinates(found.x[:, :6])[0], found.x[0, 6:]])

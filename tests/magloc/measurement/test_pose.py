@@ -98,7 +98,7 @@ class TestTrueReadings:
         fields = magpylib_field(sensors, SOURCE[:3], SOURCE[3:]) + ambient_T
         readings = array.readings_of(fields @ true_R)
         expected = measurement.model.measured(readings) / measurement.sigma
-        found = measurement.predicted(np.concatenate([SOURCE, u]))
+        found = measurement.predict(np.concatenate([SOURCE, u]))
         np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-7 * float(np.abs(expected).max()))
 
 
@@ -138,7 +138,7 @@ class TestDerivatives:
         unit = np.concatenate([UNIT, np.ones(n)])
         state = np.concatenate([SOURCE, np.random.default_rng(1).normal(size=n)])
         expected = derivative(
-            lambda y: np.apply_along_axis(lambda x: measurement.predicted(x * unit), -1, y), state / unit, 1e-2, 1e-7
+            lambda y: np.apply_along_axis(lambda x: measurement.predict(x * unit), -1, y), state / unit, 1e-2, 1e-7
         )
         self.agree(measurement.jacobian(state) * unit, expected)
 

@@ -119,10 +119,10 @@ class TestNeesOfACurvedEstimate:
         expected, found, cartesian = [], [], []
         for _ in range(200):
             noise = rng.normal(size=6)
-            estimate = self.solved(measurement, measurement.of_source(self.TRUTH) + noise)
+            estimate = self.solved(measurement, measurement.predict_source(self.TRUTH) + noise)
             if estimate is None:
                 continue
-            H = measurement.along(estimate, np.eye(6))
+            H = measurement.directional_derivative(estimate, np.eye(6))
             point = self.point(array, estimate, np.linalg.inv(H.T @ H))
             expected.append(noise @ noise)
             found.append(nees_of(point, self.TRUTH, measurement)[0])
@@ -141,9 +141,9 @@ class TestNeesOfACurvedEstimate:
     def solved(self, measurement: RowMeasurement, z: FloatArray) -> FloatArray | None:
         """The source whose six differences are z, if scipy finds it."""
         fit = least_squares(
-            lambda y: measurement.of_source(y * self.UNIT) - z,
+            lambda y: measurement.predict_source(y * self.UNIT) - z,
             self.TRUTH / self.UNIT,
-            lambda y: measurement.along(y * self.UNIT, np.diag(self.UNIT)),
+            lambda y: measurement.directional_derivative(y * self.UNIT, np.diag(self.UNIT)),
             xtol=1e-15,
             ftol=1e-15,
             gtol=1e-15,

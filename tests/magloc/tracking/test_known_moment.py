@@ -12,7 +12,7 @@ from scipy import stats
 import magloc
 from arrays.geometries import axial
 from magloc.measurement.differences import predicted_channels
-from magloc.tracking.chart.known_moment import KeptModulus
+from magloc.tracking.chart.known_moment import ConstantModulus
 from magloc.tracking.rows import Row
 from magloc.tracking.tracker import Tracker
 from tests.passing_source import ARRAY
@@ -122,7 +122,7 @@ class TestTrack:
 class TestKeptModulus:
     def test_noise_turns_the_moment_alone(self) -> None:
         x = np.array([1.0, 2.0, 3.0, 4.0, -5.0, 6.0])
-        kept = KeptModulus.of(WALK, KNOWN)
+        kept = ConstantModulus.of(WALK, KNOWN)
         moved, F, S_q = kept.step(x, 0.5)
         plain = WALK.step(x, 0.5)
         np.testing.assert_array_equal(moved, plain[0])
@@ -133,4 +133,4 @@ class TestKeptModulus:
         np.testing.assert_allclose(across @ S_q[3:], across @ plain[2][3:], atol=1e-12)
 
     def test_nothing_known_is_the_motion_itself(self) -> None:
-        assert KeptModulus.of(WALK, magloc.SourcePrior()) is WALK
+        assert ConstantModulus.of(WALK, magloc.SourcePrior()) is WALK

@@ -52,7 +52,7 @@ class TestDerivatives:
 
     def test_of_the_readings(self, measurement: RowMeasurement) -> None:
         expected = derivative(
-            lambda y: np.apply_along_axis(lambda x: measurement.predicted(x * UNIT), -1, y), SOURCE / UNIT, 1e-2
+            lambda y: np.apply_along_axis(lambda x: measurement.predict(x * UNIT), -1, y), SOURCE / UNIT, 1e-2
         )
         self.agree(measurement.jacobian(SOURCE) * UNIT, expected)
 
@@ -83,8 +83,8 @@ class TestCoordinates:
         three = measurement_of(np.zeros(9), ARRAY.subset(["s1", "s2", "s3"]))
         coordinates = three.coordinates(SOURCE, 0.1 * UNIT)
         elsewhere = SOURCE * np.array([1.2, 0.8, 1.1, 0.5, 1.4, 0.7])
-        expected = three.predicted(SOURCE) + three.jacobian(SOURCE) @ coordinates.at(elsewhere)[0]
-        np.testing.assert_allclose(three.predicted(elsewhere), expected, rtol=1e-8, atol=1e-8 * np.abs(expected).max())
+        expected = three.predict(SOURCE) + three.jacobian(SOURCE) @ coordinates.at(elsewhere)[0]
+        np.testing.assert_allclose(three.predict(elsewhere), expected, rtol=1e-8, atol=1e-8 * np.abs(expected).max())
 
     @pytest.mark.parametrize("missing", [slice(0, 6), slice(0, 12)], ids=["two sensors", "none"])
     def test_a_row_that_does_not_determine_a_source_has_none(self, missing: slice) -> None:

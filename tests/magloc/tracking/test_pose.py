@@ -171,7 +171,7 @@ class TestBound:
         by_state = []
         for measurement in map(tracker.measurements.of, rows):
             moved = [state + side * step for step in np.diag(steps) for side in (0.5, -0.5)]
-            h = np.array([measurement.predicted(x) for x in moved]).reshape(len(steps), 2, -1)
+            h = np.array([measurement.predict(x) for x in moved]).reshape(len(steps), 2, -1)
             by_state.append(((h[:, 0] - h[:, 1]) / steps[:, None]).T)
         variance, of = [tracker.error_sigma**2], (tracker.pose_errors, tracker.errors)
         kept, added = zip(*(step_of_errors(*of, b.time_s - a.time_s) for a, b in pairwise(rows)), strict=True)

@@ -148,14 +148,17 @@ def fitted(at: Case, i: int, bends: bool, shares: FloatArray) -> Fit:
     s, d = len(seen), len(seen) + len(errors)
     U = np.zeros_like(at.S[i])
     U[order] = np.linalg.qr(at.S[i][order].T, mode="r").T
-    chart = row.chart(x[None, :n]).firmly(at.S[i : i + 1, :n])
+    chart = row.chart(x[None, :n]).with_firm_moments(at.S[i : i + 1, :n])
     lasting = replace(row, pose_effect=row.pose_effect * shares)
 
     def h(zeta: FloatArray, of_row: RowMeasurement = lasting) -> FloatArray:
-        return of_row.of_source(chart.retracted((U @ zeta)[None, :n])[0])
+        return of_row.predict_source(chart.retract((U @ zeta)[None, :n])[0])
 
     nowhere = np.zeros(len(x))
-    J, of_errors = lasting.along(*chart.linearised(np.zeros((1, n))))[0] @ U[:n, :s], row.effect @ U[errors]
+    J, of_errors = (
+        lasting.directional_derivative(*chart.linearise(np.zeros((1, n))))[0] @ U[:n, :s],
+        row.effect @ U[errors],
+    )
     whiten = np.linalg.cholesky(np.linalg.inv(np.eye(len(row.z)) + of_errors[:, s:d] @ of_errors[:, s:d].T)).T
     Q, R = np.linalg.qr(np.concatenate([whiten @ J, LEAST_SHARE * np.eye(s)]))
     M = bends * np.linalg.solve(R, Q[: len(whiten)].T @ whiten)
@@ -183,7 +186,7 @@ def fitted(at: Case, i: int, bends: bool, shares: FloatArray) -> Fit:
     e, along = U @ zeta, U.copy()
     e[errors], along[errors] = U[errors] @ bent(zeta), U[errors] @ slope(bent, zeta)
     after = x + e
-    after[:n] = chart.retracted(e[None, :n])[0]
+    after[:n] = chart.retract(e[None, :n])[0]
     along[:n] = (row.chart(after[None, :n]).inverse_jacobian() @ chart.jacobian(e[None, :n]))[0] @ along[:n]
     P = along @ np.linalg.solve(H.T @ H, along.T)
     innovation2 = float(innovation @ np.linalg.solve(np.eye(k) + G @ G.T, innovation))
@@ -207,7 +210,7 @@ class TestOneSource:
         at = case(array, MOTIONS[seed], seed, offset_T, seed % 3, pose)
         shares = np.linspace(0.0, 1.0, at.row.n_pose)
         found = row_filter.update(
-            at.gaussians, at.row.compiled, bends=np.full(3, bends), pose_lasts=shares, innovation=True
+            at.gaussians, at.row.kernel_rows, bends=np.full(3, bends), pose_lasts=shares, innovation=True
         )
         assert found.innovation is not None
         assert found.converged.any()
@@ -234,7 +237,7 @@ class TestOneSource:
         steps = row_filter.steps_problem(
             motion, [0.5], np.zeros(1, dtype=np.intp), (kept[None], added[None]), at.x[:, :n]
         )
-        found = row_filter.predict(at.gaussians, centroid, steps, at.row.compiled)
+        found = row_filter.predict(at.gaussians, centroid, steps, at.row.kernel_rows)
         for x, S, x_found, S_found in zip(at.x, at.S, found.x, found.S, strict=True):
             moved, F, S_q = motion.step(x[:n], 0.5)
             expected = np.append(moved, kept * x[n:])
@@ -250,16 +253,16 @@ class TestOneSource:
     def test_covariance_keeps_what_is_known_a_million_times_better(self, offset_T: float) -> None:
         """Offsets of 20 µT beside 0.2 nT of noise, by the same formula with fifty digits."""
         at = case(ARRAYS[0], RandomWalk(0.1, 0.02), 3, offset_T)
-        found = row_filter.update(at.gaussians, at.row.compiled).after
+        found = row_filter.update(at.gaussians, at.row.kernel_rows).after
         n = at.row.n_charted
         for before, x, S_before, S in zip(at.x, found.x, at.S, found.S, strict=True):
-            chart = at.row.chart(before[None, :n]).firmly(S_before[None])
+            chart = at.row.chart(before[None, :n]).with_firm_moments(S_before[None])
             after = at.row.chart(x[None, :n])
             fit = least_squares(
-                lambda e, chart=chart, x=x: chart.retracted(e[None])[0] - x[:n], np.zeros(n), xtol=1e-15, x_scale=0.1
+                lambda e, chart=chart, x=x: chart.retract(e[None])[0] - x[:n], np.zeros(n), xtol=1e-15, x_scale=0.1
             )
             e = fit.x
-            H = at.row.along(*chart.linearised(e[None]))[0]
+            H = at.row.directional_derivative(*chart.linearise(e[None]))[0]
             J = np.concatenate([H, at.row.effect], axis=1) @ S_before
             turn = np.eye(len(x))
             turn[:n, :n] = (after.inverse_jacobian() @ chart.jacobian(e[None]))[0]
@@ -273,10 +276,10 @@ class TestOneSource:
     def test_a_source_on_a_sensor_does_not_converge(self) -> None:
         at = case(ARRAYS[0], RandomWalk(0.1, 0.02), 0)
         at.x[:, :3] = at.row.row.origin_m + at.row.row.R_world_from_array @ ARRAYS[0].positions[1]
-        assert not row_filter.update(at.gaussians, at.row.compiled).converged.any()
+        assert not row_filter.update(at.gaussians, at.row.kernel_rows).converged.any()
 
 
-def retracted(
+def retract(
     x: FloatArray, e: FloatArray, centroid: FloatArray, radius: float, q: int, *, firm: bool = True
 ) -> FloatArray:
     """One source's state (n,) at coordinates (n,) about x, by the chart's formulas, its moment being firm or not."""
@@ -349,20 +352,20 @@ class Board:
         many = {name: np.repeat(getattr(self.rows, name), len(readings), axis=0) for name in same}
         return replace(self.rows, readings=readings, **many)
 
-    def retracted(self, x: FloatArray, e: FloatArray, *, firm: bool = True) -> FloatArray:
+    def retract(self, x: FloatArray, e: FloatArray, *, firm: bool = True) -> FloatArray:
         """A whole state at coordinates."""
         there = x + e
         for k in range(self.K):
             of_source = slice(self.n * k, self.n * (k + 1))
-            there[of_source] = retracted(x[of_source], e[of_source], self.centroid, self.radius, 0, firm=firm)
+            there[of_source] = retract(x[of_source], e[of_source], self.centroid, self.radius, 0, firm=firm)
         return there
 
     def coordinates(self, x: FloatArray, there: FloatArray) -> FloatArray:
         """The inverse of it near by, for moments that are not firm: Newton's steps."""
         e = np.zeros(len(x))
         for _ in range(6):
-            by_e = slope(lambda e: self.retracted(x, e, firm=False), e)
-            e += np.linalg.solve(by_e, there - self.retracted(x, e, firm=False))
+            by_e = slope(lambda e: self.retract(x, e, firm=False), e)
+            e += np.linalg.solve(by_e, there - self.retract(x, e, firm=False))
         return e
 
     def h(self, x: FloatArray) -> FloatArray:
@@ -396,24 +399,24 @@ class TestSeveralSources:
         for c, (x, S) in enumerate(zip(board.gaussians.x, board.gaussians.S, strict=True)):
 
             def misfit(zeta: FloatArray, x: FloatArray = x, S: FloatArray = S) -> FloatArray:
-                return np.concatenate([board.z - board.h(board.retracted(x, S @ zeta)), -zeta])
+                return np.concatenate([board.z - board.h(board.retract(x, S @ zeta)), -zeta])
 
             fit = least_squares(misfit, np.zeros(len(x)), jac="3-point", xtol=1e-12, ftol=1e-14, gtol=1e-12)
             J = -slope(misfit, fit.x)
-            k, there = len(board.z), board.retracted(x, S @ fit.x)
+            k, there = len(board.z), board.retract(x, S @ fit.x)
             assert found.nis[c] == pytest.approx(2.0 * fit.cost, abs=1e-5)
             assert found.chi2[c] == pytest.approx(float(np.sum(fit.fun[:k] ** 2)), abs=1e-2)
             log_N = float(np.linalg.slogdet(J.T @ J)[1])
             assert found.log_evidence[c] == pytest.approx(-fit.cost - 0.5 * log_N, abs=1e-2)
             # Coordinates about the mode, of small changes of the coordinates about the prediction.
             turn = np.linalg.solve(
-                slope(lambda e, there=there: board.retracted(there, e), np.zeros(len(x))),
-                slope(lambda e, x=x: board.retracted(x, e), S @ fit.x),
+                slope(lambda e, there=there: board.retract(there, e), np.zeros(len(x))),
+                slope(lambda e, x=x: board.retract(x, e), S @ fit.x),
             )
             root = turn @ S @ np.linalg.inv(np.linalg.qr(J, mode="r"))
             assert_same_covariances(found.after.S[c : c + 1], root[None], 1e-2)
             off = np.linalg.solve(
-                slope(lambda e, there=there: board.retracted(there, e), np.zeros(len(x))) @ root,
+                slope(lambda e, there=there: board.retract(there, e), np.zeros(len(x))) @ root,
                 found.after.x[c] - there,
             )
             assert np.linalg.norm(off) < 2e-3
@@ -449,7 +452,7 @@ class TestSeveralSources:
                 Q[at, at] = S_q @ S_q.T
                 for of_chart, state, origin in ((L, x, centroid), (L_after, expected, board.centroid)):
                     of_chart[at, at] = slope(
-                        lambda e, x=state[at], c=origin: retracted(x, e, c, board.radius, 0), np.zeros(12)
+                        lambda e, x=state[at], c=origin: retract(x, e, c, board.radius, 0), np.zeros(12)
                     )
             np.testing.assert_allclose(x_found, expected, rtol=1e-12)
             moved = np.linalg.solve(L_after, F @ L @ S)
@@ -468,7 +471,7 @@ class TestSeveralSources:
             # Standard numbers of the sources first.
             root = np.zeros_like(S)
             root[order] = np.linalg.qr(S[order].T, mode="r").T
-            J = slope(lambda e, x=x: board.h(board.retracted(x, e)), np.zeros(len(x))) @ root[:, : 6 * n_sources]
+            J = slope(lambda e, x=x: board.h(board.retract(x, e)), np.zeros(len(x))) @ root[:, : 6 * n_sources]
             axes = np.linalg.svd(J)[2]
             standard = np.linalg.solve(root, directions[c].T).T
             told = np.linalg.norm(J @ standard[:, : 6 * n_sources].T, axis=0)
@@ -476,7 +479,7 @@ class TestSeveralSources:
                 found, v = standard[one], directions[c, one]
                 assert float(np.linalg.norm(found)) == pytest.approx(1.0, abs=1e-9)
                 assert abs(float(found[: 6 * n_sources] @ axis)) == pytest.approx(1.0, abs=1e-6)
-                ahead, behind = board.h(board.retracted(x, v)), board.h(board.retracted(x, -v))
+                ahead, behind = board.h(board.retract(x, v)), board.h(board.retract(x, -v))
                 bend, gradient = 0.5 * (ahead + behind) - board.h(x), 0.5 * (ahead - behind)
                 g2 = float(gradient @ gradient)
                 share = math.sqrt(min(max(1.0 / g2, 1.0), 3.0)) / (1.0 + g2)
@@ -500,10 +503,10 @@ class TestSeveralSources:
             shift, D = np.zeros(m * N), np.zeros((m * N, m * N))
             shift[:N], D[:N, :N] = prior.x[c], S[c] @ S[c].T
             z = readings.ravel() - np.concatenate([board.h(x) for x in track])
-            L = [slope(lambda e, x=x: board.retracted(x, e), np.zeros(N)) for x in track]
+            L = [slope(lambda e, x=x: board.retract(x, e), np.zeros(N)) for x in track]
             for row, x in enumerate(track):
                 at = slice(N * row, N * (row + 1))
-                H[k * row : k * (row + 1), at] = slope(lambda e, x=x: board.h(board.retracted(x, e)), np.zeros(N))
+                H[k * row : k * (row + 1), at] = slope(lambda e, x=x: board.h(board.retract(x, e)), np.zeros(N))
                 if not row:
                     continue
                 F, Q, moved = np.diag(np.r_[np.zeros(n), kept[0]]), np.diag(np.r_[np.zeros(n), added[0] ** 2]), x.copy()

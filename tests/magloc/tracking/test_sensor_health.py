@@ -69,9 +69,9 @@ class TestFaultySensor:
 
     def test_which_of_several_it_is_later_rows_tell(self) -> None:
         suspects = Suspects.of(3).after(np.array([4.0, 3.0, 60.0]))
-        assert suspects.culprit is None
-        assert suspects.after(np.array([3.0, 20.0, 50.0])).culprit == 0
-        assert suspects.forgotten(1).excess[0] < suspects.excess[0]
+        assert suspects.faulty_sensor is None
+        assert suspects.after(np.array([3.0, 20.0, 50.0])).faulty_sensor == 0
+        assert suspects.decay(1).excess[0] < suspects.excess[0]
 
     @pytest.mark.slow
     @pytest.mark.parametrize("fault", FAULTS)

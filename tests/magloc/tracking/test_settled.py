@@ -20,7 +20,7 @@ from magloc.tracking.motion import CoordinatedTurn, MotionModel, OrnsteinUhlenbe
 from magloc.tracking.results import TrackPoint
 from magloc.tracking.rows import Row, rows_of
 from magloc.tracking.tracker import Tracker
-from magloc.tracking.whole_records.smoother import smoothed
+from magloc.tracking.whole_records.smoother import smooth_points
 from tests.oracles import magpylib_field
 from tests.passing_source import (
     ARRAY,
@@ -98,13 +98,13 @@ def assert_same_points(some: list[TrackPoint], others: list[TrackPoint]) -> None
 def readable_rows(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """Times of rows that take the readable steps."""
     times: list[float] = []
-    advanced = Tracker._advanced
+    advanced = Tracker._step_row
 
     def counted(tracker: Tracker, row: Row) -> TrackPoint:
         times.append(row.time_s)
         return advanced(tracker, row)
 
-    monkeypatch.setattr(Tracker, "_advanced", counted)
+    monkeypatch.setattr(Tracker, "_step_row", counted)
     return times
 
 
@@ -117,7 +117,7 @@ class TestCompiledRecord:
         assert_same_points(points, expected)
         assert [step.row for step in compiled.steps] == [step.row for step in readable.steps]
         assert innovation_test(points).flagged == innovation_test(expected).flagged
-        for a, b in zip(smoothed(points, compiled.steps), smoothed(expected, readable.steps), strict=True):
+        for a, b in zip(smooth_points(points, compiled.steps), smooth_points(expected, readable.steps), strict=True):
             if a.position_m is not None and b.position_m is not None:
                 np.testing.assert_allclose(a.position_m, b.position_m, rtol=0.0, atol=1e-8)
         return points

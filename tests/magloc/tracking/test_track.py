@@ -27,7 +27,7 @@ from magloc.tracking.results import TrackPoint
 from magloc.tracking.rows import rows_of
 from magloc.tracking.track import SPEED_M_S, TURN_RAD_S
 from magloc.tracking.whole_records.posterior_bound import posterior_bound, smoothing_bound
-from magloc.tracking.whole_records.smoother import smoothed
+from magloc.tracking.whole_records.smoother import smooth_points
 from tests.passing_source import ARRAY, SLOW, moving_source, readings_of
 
 N_ROWS, N_EMPTY = 24, 3
@@ -85,7 +85,7 @@ class TestDecisions:
     def test_smoothed(self) -> None:
         motion = magloc.OrnsteinUhlenbeck(0.1, 0.02)
         tracker = magloc.Tracker(ARRAY, motion, keep_steps=True)
-        points = smoothed(list(tracker.run(rows_of(READINGS))), tracker.steps)
+        points = smooth_points(list(tracker.run(rows_of(READINGS))), tracker.steps)
         track = magloc.track(ARRAY, READINGS, motion=motion, smooth=True)
         expected = [point.position_m for point in points[N_EMPTY:]]
         np.testing.assert_allclose(track.position_m[N_EMPTY:], expected, rtol=1e-6)

@@ -21,8 +21,8 @@ from magloc.tracking.coordinates import Chart
 from magloc.tracking.motion import CoordinatedTurn, MotionModel, OrnsteinUhlenbeck, RandomWalk
 from magloc.tracking.results import TrackPoint
 from magloc.tracking.rows import Row, rows_of
-from magloc.tracking.tracker import Known, Tracker
-from magloc.tracking.whole_records.smoother import smoothed
+from magloc.tracking.tracker import Tracker, TrackState
+from magloc.tracking.whole_records.smoother import smooth_points
 from tests.oracles import magpylib_field
 from tests.passing_source import (
     ARRAY,
@@ -74,12 +74,12 @@ class TestStationarySource:
         np.testing.assert_allclose(np.sqrt(np.diagonal(last.covariance)), deviation, rtol=0.01)
 
 
-def known_of(tracker: Tracker, x: FloatArray, S: FloatArray) -> Known:
+def known_of(tracker: Tracker, x: FloatArray, S: FloatArray) -> TrackState:
     """What a tracker knows of a state (n,) from a Cartesian root (n, n) of its covariance, without lasting errors."""
     chart = Chart.at(x[None], ARRAY.centroid, ARRAY.circumradius)
     root = root_of(chart.inverse_jacobian() @ S)
     mixture = Mixture(x[None], root, np.zeros(1), x.size, tracker.array.centroid, tracker.array.circumradius)
-    return Known(mixture, S @ S.T)
+    return TrackState(mixture, S @ S.T)
 
 
 def drawn_state(rng: np.random.Generator, motion: MotionModel, deviation: FloatArray) -> tuple[FloatArray, Tracker]:
@@ -89,7 +89,7 @@ def drawn_state(rng: np.random.Generator, motion: MotionModel, deviation: FloatA
     known = known_of(tracker, x, S)
     tracker.resume(known, 0.0, 0)
     # Drawn in the chart, in which the tracker takes it to be Gaussian.
-    state = known.mixture.chart.retracted(known.mixture.S @ rng.normal(size=x.size))[0]
+    state = known.mixture.chart.retract(known.mixture.S @ rng.normal(size=x.size))[0]
     return state, tracker
 
 
@@ -142,7 +142,7 @@ class TestMatchedModel:
             error = mixture.chart.coordinates(truth[-1:])[0]
             nees += float(np.sum(np.linalg.solve(mixture.S[0], error) ** 2))
             before += float(np.sum((positions(points) - truth[:, :3]) ** 2))
-            after += float(np.sum((positions(smoothed(points, tracker.steps)) - truth[:, :3]) ** 2))
+            after += float(np.sum((positions(smooth_points(points, tracker.steps)) - truth[:, :3]) ** 2))
         assert nis_dof == 9 * self.N_ROWS * n_runs
         assert chi2.ppf(0.005, nis_dof) < nis < chi2.ppf(0.995, nis_dof)
         nees_dof = motion.n_states * n_runs
@@ -166,7 +166,7 @@ def weaving_errors(
     truth = simulation.truth
     assert truth.moment_Am2 is not None
     late = np.flatnonzero(truth.time_s >= 20.0)
-    finished = smoothed(points, tracker.steps)
+    finished = smooth_points(points, tracker.steps)
     filtered_m = np.linalg.norm((positions(points) - truth.position_m)[late], axis=1)
     smoothed_m = np.linalg.norm((positions(finished) - truth.position_m)[late], axis=1)
     late_points, late_rows = [points[i] for i in late], [rows[i] for i in late]

@@ -14,7 +14,7 @@ import magloc
 from arrays import geometries
 from arrays.array import SensorArray
 from magloc.measurement.differences import predicted_channels
-from magloc.tracking.chart.start import Start
+from magloc.tracking.chart.start import TrackStarter
 from magloc.tracking.multi_target.tracker import SourcesTracker
 from magloc.tracking.rows import Row
 from magloc.tracking.sensor_health import OFFSETS, Misfits
@@ -96,8 +96,8 @@ class TestTracks:
 
     def test_most_rows_are_not_searched(self, monkeypatch) -> None:
         searched = []
-        search, array = Start.mixture, board(3)
-        monkeypatch.setattr(Start, "mixture", lambda *given: searched.append(1) or search(*given))
+        search, array = TrackStarter.mixture, board(3)
+        monkeypatch.setattr(TrackStarter, "mixture", lambda *given: searched.append(1) or search(*given))
         tracker = Tracker(array, MOTION)
         for row in rows_of(array, 2e-5, 4, n_rows=300):
             tracker.update(row)

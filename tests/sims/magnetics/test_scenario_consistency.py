@@ -205,7 +205,7 @@ def linear_filter(simulation: Simulation, _: None) -> dict[str, Any]:
     assert truth.moment_Am2 is not None
     source = np.concatenate([truth.position_m[-1], truth.moment_Am2[-1]])
     hardly_known = np.diag(np.repeat([0.01, 0.1], 3)) ** 2  # of position and moment: a filtered start is from far less
-    found = tracker.filtered_start(
+    found = tracker.filter_start(
         [measurements[0].without_errors(source)] * len(measurements), hardly_known, measurements
     )
     whitened = np.linalg.lstsq(found.S[:6], found.x[:6] - source)[0]

@@ -18,9 +18,9 @@ def with_another(factor: float, weight: float) -> Mixture:
     return replace(one, x=x, S=np.tile(one.S, (2, 1, 1)), log_weight=np.log([1.0 - weight, weight]))
 
 
-class TestLikely:
+class TestDropUnlikely:
     @pytest.mark.parametrize(("factor", "weight", "n"), [(1e8, 1e-4, 1), (1e8, 0.1, 2), (3.0, 1e-4, 2), (3.0, 1e-8, 1)])
     def test_a_light_component_that_has_run_away_is_no_part_of_the_mean(
         self, factor: float, weight: float, n: int
     ) -> None:
-        assert len(with_another(factor, weight).likely()) == n
+        assert len(with_another(factor, weight).drop_unlikely()) == n

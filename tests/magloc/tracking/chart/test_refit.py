@@ -16,7 +16,7 @@ from magloc.measurement.differences import predicted_channels
 from magloc.tracking.chart import refit
 from magloc.tracking.chart.known_moment import KnownInWorld
 from magloc.tracking.chart.mixture import Mixture
-from magloc.tracking.chart.refit import Cells, refitted
+from magloc.tracking.chart.refit import RangeCells, refit_components
 from magloc.tracking.motion import OrnsteinUhlenbeck, RandomWalk
 from magloc.tracking.rows import Row
 from magloc.tracking.tracker import Tracker
@@ -46,7 +46,7 @@ class TestRefitted:
         measurements = [tracker.measurements.of(row) for row in rows]
         seed = seed_of(tracker, rows[-1])
         beside = replace(seed, x=seed.x * np.repeat([1.05, 0.9], 3))
-        found = refitted(beside, measurements, [tracker.motion] * 5, tracker.errors, tracker.pose_errors)
+        found = refit_components(beside, measurements, [tracker.motion] * 5, tracker.errors, tracker.pose_errors)
         assert found.decided.all()
         mixture = found.mixture
         offset = mixture.chart.coordinates(SOURCE[None])[0]
@@ -60,7 +60,7 @@ class TestRefitted:
         measurements = [tracker.measurements.of(row) for row in rows]
         seed = seed_of(tracker, rows[-1])
         both = replace(seed, x=np.vstack([seed.x, -seed.x]), S=np.zeros((2, 6, 6)), log_weight=np.zeros(2))
-        found = refitted(both, measurements, [tracker.motion] * 5, tracker.errors, tracker.pose_errors)
+        found = refit_components(both, measurements, [tracker.motion] * 5, tracker.errors, tracker.pose_errors)
         assert found.decided.all()
         assert len(found.mixture) == 1
 
@@ -74,16 +74,18 @@ class TestCells:
         rows = rows_of(np.linspace([-3.0, 0.0, 0.0], [0.0, 0.0, 0.0], 5))
         measurements = [tracker.measurements.of(row) for row in rows]
         motions = [tracker.motion] * 5
-        mode = refitted(seed_of(tracker, rows[-1]), measurements, motions, tracker.errors, tracker.pose_errors).mixture
+        mode = refit_components(
+            seed_of(tracker, rows[-1]), measurements, motions, tracker.errors, tracker.pose_errors
+        ).mixture
         sigma = np.linalg.norm(mode.S[0, 0])
         pitch = 0.7 * sigma
         seeds = mode.take(np.zeros(15, dtype=np.intp))
-        cells = Cells(pitch * np.arange(-7, 8), np.full(15, 0.6 * pitch))
-        found = refitted(seeds, measurements, motions, tracker.errors, tracker.pose_errors, cells)
+        cells = RangeCells(pitch * np.arange(-7, 8), np.full(15, 0.6 * pitch))
+        found = refit_components(seeds, measurements, motions, tracker.errors, tracker.pose_errors, cells)
         assert found.decided.all()
         np.testing.assert_array_equal(found.origin, np.arange(15))
         assert np.all(np.diff(found.mixture.chart.length) > 0.0)
-        one = found.mixture.take(np.arange(15)).matched()
+        one = found.mixture.take(np.arange(15)).match_moments()
         assert np.linalg.norm(np.linalg.solve(mode.S[0], mode.chart.coordinates(one.x)[0])) < 0.05
         np.testing.assert_allclose(one.S[0] @ one.S[0].T, mode.S[0] @ mode.S[0].T, rtol=0.05, atol=1e-3 * sigma**2)
 
@@ -98,7 +100,7 @@ class TestPrior:
         measurements = [tracker.measurements.of(row) for row in still]
         seeds = seed_of(tracker, still[-1])
         fast = replace(seeds, x=seeds.x + np.array([0.0] * 6 + [-0.01, 0.0, 0.0] + [0.0] * 3))
-        found = refitted(fast, measurements, [motion] * 2, tracker.errors, tracker.pose_errors).mixture
+        found = refit_components(fast, measurements, [motion] * 2, tracker.errors, tracker.pose_errors).mixture
         assert len(found) == 1
         sigma = np.sqrt(np.diagonal(found.S[0] @ found.S[0].T))[6:9] * found.chart.length[0]
         assert np.abs(found.x[0, 6:9]).max() < 4e-3
@@ -114,8 +116,8 @@ class TestPrior:
         measurements = [tracker.measurements.of(row) for row in rows]
         seed = seed_of(tracker, rows[-1])
         seed.x[0, 6:9] = 0.5
-        cells = Cells(np.linspace(-0.1, 0.1, 3), np.full(3, 0.1))
-        found = refitted(
+        cells = RangeCells(np.linspace(-0.1, 0.1, 3), np.full(3, 0.1))
+        found = refit_components(
             seed.take(np.zeros(3, dtype=np.intp)),
             measurements,
             [tracker.motion] * 5,
@@ -149,7 +151,9 @@ class TestLastingErrors:
         seed = Mixture(x, np.eye(n + e)[None], np.zeros(1), n, last.centroid_m, last.radius_m, last.n_pose)
         in_world = KnownInWorld.of(tracker.prior, np.eye(3))
         motions = [tracker.motion] * 5
-        found = refitted(seed, measurements, motions, tracker.errors, tracker.pose_errors, None, in_world).mixture
+        found = refit_components(
+            seed, measurements, motions, tracker.errors, tracker.pose_errors, None, in_world
+        ).mixture
         kept, added = tracker.pose_errors.step(1.0)
         _, _, S_q = tracker.motion.step(found.x[0, :6], 1.0)
         Q = S_q @ S_q.T
@@ -161,7 +165,7 @@ class TestLastingErrors:
             states, errors = (scale * y)[: 5 * n].reshape(5, n), (scale * y)[5 * n :]
             parts = [states[0, 6:], y[5 * n :]]
             parts += [
-                row.z - row.of_source(x) - row.effect @ errors for row, x in zip(measurements, states, strict=True)
+                row.z - row.predict_source(x) - row.effect @ errors for row, x in zip(measurements, states, strict=True)
             ]
             for before, after in pairwise(states):
                 parts += [np.linalg.solve(S_q, (after - before)[:6]), (after[6:] - kept * before[6:]) / added]

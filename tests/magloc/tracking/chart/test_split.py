@@ -49,14 +49,14 @@ class TestBends:
         u = POSITION / np.linalg.norm(POSITION)
         x = np.concatenate([8.0 * u, 50.0 * u])
         chart = ROW.chart(x[None])
-        J = ROW.along(x[None], chart.jacobian(np.zeros((1, 6))))[0] / 5.0
+        J = ROW.directional_derivative(x[None], chart.jacobian(np.zeros((1, 6))))[0] / 5.0
         before = 0.3 * np.array([1.0, 1.0, 1.0, *[50.0 / float(chart.length[0]) ** 4] * 3])
         P = np.linalg.inv(J.T @ J + np.diag(before**-2.0))
         S = np.linalg.cholesky(P)
         variances, axes = np.linalg.eigh(P[:3, :3])
-        firm = chart.firmly(S[None])
+        firm = chart.with_firm_moments(S[None])
         for v in (P[:, :3] @ axes / np.sqrt(variances)).T:
-            behind, here, ahead = (ROW.of_source(firm.retracted(share * v[None]))[0] for share in (-1.0, 0.0, 1.0))
+            behind, here, ahead = (ROW.predict_source(firm.retract(share * v[None]))[0] for share in (-1.0, 0.0, 1.0))
             g2 = float(np.sum((0.5 * (ahead - behind)) ** 2))
             assert np.linalg.norm(0.5 * (ahead + behind) - here) / (1.0 + g2) < 0.3 * LARGEST_BEND
         one = Mixture(x[None], S[None], np.zeros(1), 6, ROW.centroid_m, ROW.radius_m)
@@ -78,7 +78,7 @@ class TestSplit:
         assert 3 <= len(parts) <= MOST_COMPONENTS
         assert (origin == 0).all()
         assert parts.weight.sum() == pytest.approx(1.0, abs=1e-6)
-        together, sigma = parts.matched(), np.linalg.norm(one.S[0], axis=1)
+        together, sigma = parts.match_moments(), np.linalg.norm(one.S[0], axis=1)
         np.testing.assert_allclose(one.chart.coordinates(together.x)[0] / sigma, 0.0, atol=0.01)
         found, expected = together.S[0] @ together.S[0].T, one.S[0] @ one.S[0].T
         np.testing.assert_allclose(found / np.outer(sigma, sigma), expected / np.outer(sigma, sigma), atol=0.01)

@@ -64,15 +64,17 @@ class TestPredictions:
     def test_of_few_rows_are_those_of_the_rows(self, array: SensorArray) -> None:
         stack, x = stack_of(array, passing(array, 12)), states(5)
         L = np.broadcast_to(np.eye(6), (5, 6, 6))
-        of_rows = [row.of_source(x) for row in stack.rows]
-        by_rows = [row.along(x, L) for row in stack.rows]
-        np.testing.assert_allclose(stack.of_source(x), np.concatenate(of_rows, axis=1), rtol=1e-9)
-        np.testing.assert_allclose(stack.along(x, L), np.concatenate(by_rows, axis=1), rtol=1e-6, atol=1e-9)
-        predicted, by_moment = stack.by_moment(x)
-        np.testing.assert_allclose(predicted, stack.of_source(x), rtol=1e-9)
-        np.testing.assert_allclose(by_moment, stack.along(x, L)[..., 3:], rtol=1e-6, atol=1e-9)
+        of_rows = [row.predict_source(x) for row in stack.rows]
+        by_rows = [row.directional_derivative(x, L) for row in stack.rows]
+        np.testing.assert_allclose(stack.predict_source(x), np.concatenate(of_rows, axis=1), rtol=1e-9)
+        np.testing.assert_allclose(
+            stack.directional_derivative(x, L), np.concatenate(by_rows, axis=1), rtol=1e-6, atol=1e-9
+        )
+        predicted, by_moment = stack.linearise_in_moment(x)
+        np.testing.assert_allclose(predicted, stack.predict_source(x), rtol=1e-9)
+        np.testing.assert_allclose(by_moment, stack.directional_derivative(x, L)[..., 3:], rtol=1e-6, atol=1e-9)
         weak = x * np.array([1.0, 1.0, 1.0, 1e-12, 1e-12, 1e-12])
-        columns, expected = stack.moment_columns(x[:, :3]), stack.along(weak, L)[..., 3:]
+        columns, expected = stack.moment_columns(x[:, :3]), stack.directional_derivative(weak, L)[..., 3:]
         np.testing.assert_allclose(columns, expected, rtol=1e-6, atol=1e-9 * np.abs(expected).max())
 
     def test_of_many_are_means_of_unit_noise(self, array: SensorArray) -> None:
@@ -80,7 +82,7 @@ class TestPredictions:
         rows = passing(array, 70)
         stack, rng = stack_of(array, rows), np.random.default_rng(1)
         assert len(rows) / 4 * 3 <= stack.z.size < len(rows)
-        np.testing.assert_allclose(stack.of_source(TRUTH), stack.z, rtol=1e-6)
+        np.testing.assert_allclose(stack.predict_source(TRUTH), stack.z, rtol=1e-6)
         noise_T = array.channel_noise_T
         noisy = [replace(row, readings_T=row.readings_T + noise_T * rng.normal(size=noise_T.size)) for row in rows]
         left = stack_of(array, noisy).z - stack.z
@@ -111,7 +113,7 @@ class TestCovariance:
             stack = stack_of(simulation.array, list(rows_of(simulation.readings)))
             assert simulation.truth.moment_Am2 is not None
             truth = np.concatenate([simulation.truth.position_m[0], simulation.truth.moment_Am2[0]])[None]
-            left = (stack.z - stack.of_source(truth))[0]
+            left = (stack.z - stack.predict_source(truth))[0]
             square_sum += float(left @ np.linalg.solve(stack.covariance(truth)[0], left))
             n += left.size
         # A constant of a simulation is one draw for all its rows: the spread is that of far fewer numbers.
@@ -124,7 +126,7 @@ class TestCovariance:
         stack, still = stack_of(PAIR, rows, walk), stack_of(PAIR, rows)
         x = TRUTH[None]
         added = stack.covariance(x)[0] - still.covariance(x)[0]
-        J = np.concatenate([row.along(x, np.eye(6)[None]) for row in still.rows], axis=1)[0]
+        J = np.concatenate([row.directional_derivative(x, np.eye(6)[None]) for row in still.rows], axis=1)[0]
         later = np.minimum.outer(np.arange(n_rows)[::-1], np.arange(n_rows)[::-1])
         Q = np.diag(np.repeat([0.05**2, (0.01 * np.linalg.norm(TRUTH[3:])) ** 2], 3))
         of_rows = np.einsum("iax,xy,jby,ij->iajb", J.reshape(n_rows, 3, 6), Q, J.reshape(n_rows, 3, 6), later)

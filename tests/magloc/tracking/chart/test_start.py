@@ -16,7 +16,7 @@ from magloc.ambient import in_world_field
 from magloc.tracking import row_filter
 from magloc.tracking.chart.mixture import Mixture
 from magloc.tracking.chart.start import NO_AMBIENT, with_errors
-from magloc.tracking.chart.update import updated
+from magloc.tracking.chart.update import update_states
 from magloc.tracking.row_filter import Gaussians
 from magloc.tracking.rows import rows_of
 from magloc.tracking.tracker import Tracker
@@ -37,13 +37,13 @@ class TestErrorsOfSensors:
         S = np.broadcast_to(
             np.diag([0.3, 0.2, 0.2, *np.full(3, np.linalg.norm(x[0, 3:]) / row.radius_m**4)]), (3, 6, 6)
         )
-        alone = updated(x, S, row.with_errors_as_noise(sigma))
+        alone = update_states(x, S, row.with_errors_as_noise(sigma))
         mixture = Mixture(alone.x, alone.S, np.zeros(3), 6, row.centroid_m, row.radius_m)
         found = with_errors(mixture, row, sigma)
         zero = np.zeros((3, sigma.size))
         S_joint = np.stack([block_diag(S[0], np.diag(sigma))] * 3)
         together = Gaussians(np.concatenate([x, zero], axis=1), S_joint, n_nuisances=sigma.size)
-        joint = row_filter.update(together, row.compiled)
+        joint = row_filter.update(together, row.kernel_rows)
         unit = np.maximum(np.linalg.norm(joint.S, axis=2), 1e-100)  # drift has not begun
         offset = np.concatenate([found.chart.coordinates(joint.x[:, :6]), (joint.x - found.x)[:, 6:]], axis=1)
         np.testing.assert_allclose(offset / unit, 0.0, atol=3e-3)  # both end within 1e-3 σ of the optimum
@@ -62,7 +62,7 @@ class TestValleyOfRangesThatBends:
         simulation = simulate(replace(SCENARIO, duration_s=1.0), seed)
         tracker, truth = Tracker(simulation.array, REST), simulation.truth
         row = next(iter(rows_of(in_world_field(simulation.readings, simulation.array))))
-        mixture, _ = tracker.filter.started(tracker.measurements.of(row), REST)
+        mixture, _ = tracker.filter.start(tracker.measurements.of(row), REST)
         assert mixture is not None
         assert truth.moment_Am2 is not None
         true = np.concatenate([truth.position_m[0], truth.moment_Am2[0]])

@@ -12,7 +12,7 @@ import magloc
 from arrays.geometries import axial
 from magloc.measurement.differences import predicted_channels
 from magloc.tracking.chart.places import Places
-from magloc.tracking.chart.undetermined import _leads
+from magloc.tracking.chart.undetermined import _moves_a_source_at_rest
 from magloc.tracking.consistency import nees_of
 from magloc.tracking.coordinates import Chart
 from magloc.tracking.motion import KnownMotion
@@ -92,9 +92,9 @@ class TestTogether:
         assert low < range_m < high < 2.0 * low
 
     def test_in_the_axes_of_an_array_that_moves_each_row_speaks_for_itself(self) -> None:
-        assert not any(_leads(motion) for motion in (REST, WALK, magloc.OrnsteinUhlenbeck(0.5, 0.1)))
-        assert _leads(KnownMotion(0.0, 0.0, array_velocity_m_s=(1.0, 0.0, 0.0)))
-        assert _leads(KnownMotion(0.0, 0.0, array_rate_rad_s=(0.0, 0.0, 0.1)))
+        assert not any(_moves_a_source_at_rest(motion) for motion in (REST, WALK, magloc.OrnsteinUhlenbeck(0.5, 0.1)))
+        assert _moves_a_source_at_rest(KnownMotion(0.0, 0.0, array_velocity_m_s=(1.0, 0.0, 0.0)))
+        assert _moves_a_source_at_rest(KnownMotion(0.0, 0.0, array_rate_rad_s=(0.0, 0.0, 0.1)))
 
 
 class TestPlaces:
@@ -117,7 +117,7 @@ class TestPlaces:
     def test_draws_are_of_the_density(self) -> None:
         """Mean of the density over its own draws, beside that over even ones: of both within 15 %."""
         places = self.places()
-        x = places.drawn(300)
+        x = places.draw(300)
         r = np.linalg.norm(x[:, :3], axis=1)
         near = np.linalg.norm(x[:, :3] / r[:, None] - self.X[0, :3] / np.linalg.norm(self.X[0, :3]), axis=1) < 0.7
         assert near.mean() == pytest.approx(0.3, abs=0.02)

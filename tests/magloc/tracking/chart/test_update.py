@@ -30,14 +30,14 @@ def far_update(shift: FloatArray) -> tuple[float, FloatArray, FloatArray, FloatA
     chart = Chart.at(SOURCE[None], centroid, radius)
     strength = float(np.linalg.norm(MOMENT)) / float(chart.length[0]) ** 4
     S = np.diag([0.1, 0.1, 0.1, *[0.1 * strength] * 3])
-    there = chart.retracted((S @ shift)[None])[0]
+    there = chart.retract((S @ shift)[None])[0]
     blank = measurements.of(Row(0.0, np.zeros(THREE.n_channels)))
-    h = blank.of_source(SOURCE)
-    J = blank.along(SOURCE, chart.jacobian(np.zeros((1, 6)))[0]) @ S
-    readings = np.linalg.lstsq(blank.model.differences.transform / blank.sigma[:, None], blank.of_source(there))[0]
+    h = blank.predict_source(SOURCE)
+    J = blank.directional_derivative(SOURCE, chart.jacobian(np.zeros((1, 6)))[0]) @ S
+    readings = np.linalg.lstsq(blank.model.differences.transform / blank.sigma[:, None], blank.predict_source(there))[0]
     measurement = measurements.of(Row(0.0, readings))
     gaussian = Gaussians(SOURCE[None], S[None])
-    found = row_filter.update(gaussian, measurement.compiled, bends=np.ones(1, dtype=bool))
+    found = row_filter.update(gaussian, measurement.kernel_rows, bends=np.ones(1, dtype=bool))
     assert found.converged.all()
     return float(found.log_evidence[0]), h, J, measurement.z
 

@@ -60,6 +60,6 @@ def test_the_parts_bend_less():
     """Along the axis that is divided, whose bend is beyond the limit."""
     state = valley()
     parts = [one for _, one in split(state, ROW)]
-    bends = [row_filter.bends(one.gaussians, ROW.compiled, 1.0)[0].max() for one in (state, parts[0])]
+    bends = [row_filter.bends(one.gaussians, ROW.kernel_rows, 1.0)[0].max() for one in (state, parts[0])]
     assert bends[0] > LARGEST_BEND
     assert bends[1] < 0.8 * bends[0]

@@ -11,7 +11,7 @@ import arrays
 import magloc
 from magloc.tracking.motion import OrnsteinUhlenbeck
 from magloc.tracking.multi_target.measurement import JointRow
-from magloc.tracking.multi_target.motion import stepped
+from magloc.tracking.multi_target.motion import predict_state
 from magloc.tracking.multi_target.state import JointState
 from magloc.tracking.rows import Row
 from tests.magloc.tracking.multi_target.test_state import CENTROID_M, RADIUS_M, state_of
@@ -26,9 +26,9 @@ def known(k: int) -> JointState:
     return replace(state_of(k), radius_m=ARRAY.circumradius)
 
 
-def predicted(state: JointState, dt_s: float, motion: magloc.FreeMotion = MOTION, agility: float = 1.0) -> JointState:
+def predict(state: JointState, dt_s: float, motion: magloc.FreeMotion = MOTION, agility: float = 1.0) -> JointState:
     """Return the state after a step."""
-    return stepped(state, motion.numbers(dt_s, agility=agility), ROW)
+    return predict_state(state, motion.numbers(dt_s, agility=agility), ROW)
 
 
 def covariance(state: JointState) -> np.ndarray:
@@ -43,7 +43,7 @@ def test_each_source_moves_as_one_alone(k):
     state, dt_s = known(k), 0.3
     motion = magloc.FreeMotion(0.4, 0.7, correlation_s=2.0, turn_correlation_s=2.0, strength_change=1e-9)
     single = OrnsteinUhlenbeck(3.0 * 0.4, 3.0 * 0.7, 2.0, moment_change=0.0)
-    found = predicted(state, dt_s, motion, agility=3.0)
+    found = predict(state, dt_s, motion, agility=3.0)
     P, before, after = covariance(state), state.chart, found.chart
     for j in range(k):
         moved, F, S_q = single.step(state.sources[j], dt_s)
@@ -61,8 +61,8 @@ def test_strength_and_rate_of_turn():
     """The noise of a strength is along the moment, and speed and turn last for times of their own."""
     state, dt_s = known(1), 0.1
     weak, strong = (replace(MOTION, strength_change=change) for change in (1e-9, 0.2))
-    after = predicted(state, dt_s, weak)
-    more = covariance(predicted(state, dt_s, strong)) - covariance(after)
+    after = predict(state, dt_s, weak)
+    more = covariance(predict(state, dt_s, strong)) - covariance(after)
     change = 0.2 * np.sqrt(dt_s) * after.moment_Am2[0]
     np.testing.assert_allclose(more[3:6, 3:6], np.outer(change, change), rtol=1e-6, atol=1e-9 * change @ change)
     np.testing.assert_allclose(after.sources[0, 6:9], np.exp(-dt_s / 1.5) * state.sources[0, 6:9])
@@ -74,7 +74,7 @@ def test_two_half_steps_are_one(dt_s):
     """Of a source that does not turn: the noise of a step is that of two halves."""
     state = known(2)
     state.sources[:, 9:] = 0.0
-    halves, whole = predicted(predicted(state, 0.5 * dt_s), 0.5 * dt_s), predicted(state, dt_s)
+    halves, whole = predict(predict(state, 0.5 * dt_s), 0.5 * dt_s), predict(state, dt_s)
     np.testing.assert_allclose(covariance(halves), covariance(whole), rtol=1e-6, atol=1e-8)
     np.testing.assert_allclose(halves.position_m, whole.position_m)
 

@@ -11,13 +11,13 @@ from scipy.optimize import least_squares
 
 from magloc.tracking.multi_target.hypotheses import REFITS, Hypothesis
 from magloc.tracking.multi_target.measurement import JointRow
-from magloc.tracking.multi_target.motion import stepped
+from magloc.tracking.multi_target.motion import predict_state
 from magloc.tracking.multi_target.smoothing import MOST_ROWS, YoungTrack
 from magloc.tracking.multi_target.state import N_SEEN, JointState
 from magloc.tracking.multi_target.update import joint_update
 from magloc.tracking.rows import Row
 from magloc.tracking.sensor_health import SensorHealth
-from tests.magloc.tracking.multi_target.test_update import BOARD, MOTION, known, predicted, readings
+from tests.magloc.tracking.multi_target.test_update import BOARD, MOTION, known, predict_readings, readings
 
 DT_S = 0.05
 
@@ -31,7 +31,7 @@ def filtered(n_rows: int, n_sources: int, seed: int, share: float = 0.2) -> tupl
         row = JointRow.of(BOARD, Row(DT_S * i, readings(rng, n_sources)))
         update = joint_update(predictions[-1], row)
         track = track.after(row, MOTION.numbers(DT_S if i else 0.0), update.state, update.score)
-        predictions.append(stepped(update.state, MOTION.numbers(DT_S), row))
+        predictions.append(predict_state(update.state, MOTION.numbers(DT_S), row))
     return track, predictions
 
 
@@ -50,22 +50,22 @@ def sigma(state: JointState) -> np.ndarray:
 def test_is_the_minimum_of_all_squares(n_sources: int, seed: int) -> None:
     """Prior, noise of the motion and readings of four rows: no general minimiser finds less, and it ends there too."""
     track, _ = filtered(4, n_sources, seed)
-    found = track.smoothed()
+    found = track.smooth()
     assert found is not None
     n, scales = len(track.prior.x), [sigma(state) for state in track.states]
     step, row = MOTION.numbers(DT_S), track.rows[0][0]
 
     def states_at(x: np.ndarray) -> list[JointState]:
         errors = zip(track.states, scales, x.reshape(-1, n), strict=True)
-        return [state.moved(scale * error, state.S) for state, scale, error in errors]
+        return [state.shift(scale * error, state.S) for state, scale, error in errors]
 
     def residual(x: np.ndarray) -> np.ndarray:
         states = states_at(x)
         parts = [np.linalg.solve(track.prior.S, difference(track.prior, states[0]))]
         for before, after in pairwise(states):
-            ahead = stepped(replace(before, S=np.zeros((n, n))), step, row)
+            ahead = predict_state(replace(before, S=np.zeros((n, n))), step, row)
             parts.append(np.linalg.solve(ahead.S, difference(ahead, after)))
-        parts += [row.z - predicted(row, state) for (row, _), state in zip(track.rows, states, strict=True)]
+        parts += [row.z - predict_readings(row, state) for (row, _), state in zip(track.rows, states, strict=True)]
         return np.concatenate(parts)
 
     best = least_squares(residual, np.zeros(4 * n), method="lm")
@@ -77,7 +77,7 @@ def test_is_the_minimum_of_all_squares(n_sources: int, seed: int) -> None:
 def test_the_score_is_that_of_a_filter_where_readings_are_linear() -> None:
     """-2 ln of how likely all rows are, of which little is unknown but the velocity: updates bend by less than 0.5."""
     track, _ = filtered(6, 2, 0, 0.01)
-    found = track.smoothed()
+    found = track.smooth()
     assert found is not None
     assert found.score == pytest.approx(track.score, abs=0.5)
 
@@ -90,7 +90,7 @@ def test_nees_of_the_last_row() -> None:
     """
     nees, truth = [], known(1, 1e-3)
     for seed in range(40):
-        found = filtered(10, 1, seed, 0.3)[0].smoothed()
+        found = filtered(10, 1, seed, 0.3)[0].smooth()
         if found is not None:
             last, error = found.states[-1], difference(found.states[-1], truth)[:N_SEEN]
             nees.append(error @ np.linalg.solve((last.S @ last.S.T)[:N_SEEN, :N_SEEN], error) / N_SEEN)
@@ -103,12 +103,12 @@ def test_a_hypothesis_is_fitted_anew_after_some_rows() -> None:
     track, _ = filtered(REFITS[1], 2, 0, 0.05)
     health, state, row = SensorHealth.of(BOARD.n_sensors), track.states[-1], track.rows[-1][0]
     before = Hypothesis(state, (1, 2), health, score=7.0, young=track)
-    after, found = before.refitted(row), track.smoothed()
+    after, found = before.refit(row), track.smooth()
     assert found is not None
     assert after.score == pytest.approx(7.0 + found.score - track.score)
     np.testing.assert_array_equal(after.state.position_m, found.states[-1].position_m)
     other = replace(before, young=replace(track, rows=track.rows[:-1], states=track.states[:-1]))
-    assert other.refitted(row) is other
+    assert other.refit(row) is other
 
 
 def test_a_source_that_joins_is_in_all_rows() -> None:
@@ -119,16 +119,16 @@ def test_a_source_that_joins_is_in_all_rows() -> None:
     both, _ = filtered(8, 2, 3, 0.05)
     prior = both.prior
     alone = YoungTrack(prior.without(1), both.rows, tuple(state.without(1) for state in both.states))
-    joined = alone.joined(prior)
+    joined = alone.add_sources(prior)
     np.testing.assert_array_equal(joined.states[-1].position_m[0], both.states[-1].position_m[0])
     np.testing.assert_array_equal(joined.states[-1].position_m[1], prior.position_m[1])
-    found, expected = joined.smoothed(), both.smoothed()
+    found, expected = joined.smooth(), both.smooth()
     assert found is not None
     assert expected is not None
     error = difference(expected.states[-1], found.states[-1]) / sigma(expected.states[-1])
     assert np.abs(error).max() < 0.15
     assert found.score == pytest.approx(expected.score, abs=0.5)  # both stop within a tenth of a deviation
-    fewer = alone.smoothed()
+    fewer = alone.smooth()
     assert fewer is None or fewer.score > found.score + 1000.0
 
 

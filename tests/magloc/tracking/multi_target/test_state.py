@@ -29,7 +29,7 @@ def drawn(state: JointState, n: int, seed: int = 1) -> np.ndarray:
     chart = state.chart
     everywhere = replace(chart, **{name: np.stack([getattr(chart, name)] * n) for name in ("x", "length", "u", "E")})
     firm = np.ones((n, state.n_sources), dtype=bool)
-    return replace(everywhere, firm=firm).retracted(errors[:, :-3].reshape(n, state.n_sources, 12))
+    return replace(everywhere, firm=firm).retract(errors[:, :-3].reshape(n, state.n_sources, 12))
 
 
 class TestBookkeeping:
@@ -54,7 +54,7 @@ class TestBookkeeping:
         left = state.without(1)
         np.testing.assert_allclose(left.covariances, state.covariances[[0, 2]], rtol=1e-10, atol=1e-14)
         np.testing.assert_array_equal(left.sources, state.sources[[0, 2]])
-        common = state.common_alone
+        common = state.without_sources
         assert common.n_sources == 0
         np.testing.assert_allclose(common.S @ common.S.T, (state.S @ state.S.T)[-3:, -3:], rtol=1e-10, atol=1e-14)
 
@@ -99,8 +99,8 @@ def test_a_moved_state_has_the_same_draws():
     """Small errors about another state: their Cartesian covariance stays, to first order in a move of 1 %."""
     state = state_of(2)
     error = state.S @ np.random.default_rng(3).normal(size=len(state.x))
-    moved = state.moved(error, state.S)
+    moved = state.shift(error, state.S)
     scale = np.sqrt(np.diagonal(state.covariances[0]))
     difference = (moved.covariances[0] - state.covariances[0]) / np.outer(scale, scale)
     assert np.abs(difference).max() < 0.2
-    assert np.abs(state.moved(1e-4 * error, state.S).covariances - state.covariances).max() < 1e-4 * scale.max() ** 2
+    assert np.abs(state.shift(1e-4 * error, state.S).covariances - state.covariances).max() < 1e-4 * scale.max() ** 2

@@ -146,7 +146,7 @@ class TestSlidesIn:
         empty = JointState.empty(np.zeros(3), 1e-6, BOARD.centroid, BOARD.circumradius)
         state = empty.with_sources(np.eye(3), strengths[:, None] * np.eye(3), np.stack([np.eye(12)] * 3))
         assert far_sources(state) == [2]
-        assert far_sources(state.without(2)) == far_sources(state.common_alone) == []
+        assert far_sources(state.without(2)) == far_sources(state.without_sources) == []
 
     @pytest.mark.slow
     def test_the_other_stays_where_it_is(self):

@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 import arrays
 from magloc.fields import dipole
 from magloc.tracking.multi_target.measurement import Channels, JointRow
-from magloc.tracking.multi_target.motion import FreeMotion, stepped
+from magloc.tracking.multi_target.motion import FreeMotion, predict_state
 from magloc.tracking.multi_target.state import JointState
 from magloc.tracking.multi_target.update import innovation_chi2, joint_update
 from magloc.tracking.rows import Row
@@ -36,7 +36,7 @@ def known(n_sources: int, share: float, rng: np.random.Generator | None = None, 
     places, moments = PLACES[:n_sources], MOMENTS[:n_sources]
     state = state.with_sources(places, moments, MOTION.start(moments, np.full(n_sources, 0.03 * share), share, share))
     # Positions and velocities go together, or a row would say nothing of the latter.
-    state = stepped(state, MOTION.numbers(dt_s), JointRow.of(BOARD, Row(0.0, np.zeros(BOARD.n_channels))))
+    state = predict_state(state, MOTION.numbers(dt_s), JointRow.of(BOARD, Row(0.0, np.zeros(BOARD.n_channels))))
     if rng is None:
         return state
     return drawn(state, rng)
@@ -44,12 +44,12 @@ def known(n_sources: int, share: float, rng: np.random.Generator | None = None, 
 
 def drawn(state: JointState, rng: np.random.Generator) -> JointState:
     """A state of the same covariance whose mean is drawn from it."""
-    return state.moved(state.S @ rng.normal(size=len(state.x)), state.S)
+    return state.shift(state.S @ rng.normal(size=len(state.x)), state.S)
 
 
-def predicted(row: JointRow, state: JointState) -> np.ndarray:
+def predict_readings(row: JointRow, state: JointState) -> np.ndarray:
     """The readings that a state predicts, in units of their noise."""
-    return row.linearised(state)[1]
+    return row.linearise(state)[1]
 
 
 def test_readings_and_their_derivatives():
@@ -59,13 +59,13 @@ def test_readings_and_their_derivatives():
     row, state = JointRow.of(BOARD, Row(0.0, readings(rng), np.array([0.01, 0.0, 0.02]), R)), known(2, 0.1)
     at = row.positions_m
     fields = state.common_T + sum(dipole.field(at, x[:3], x[3:6]) for x in state.sources)
-    np.testing.assert_allclose(predicted(row, state), BOARD.readings_of(fields @ R) / NOISE_T, rtol=1e-9)
-    H = row.linearised(state)[0]
+    np.testing.assert_allclose(predict_readings(row, state), BOARD.readings_of(fields @ R) / NOISE_T, rtol=1e-9)
+    H = row.linearise(state)[0]
     for k in range(2):
         for i in range(6):
             step = np.zeros(len(state.x))
             step[12 * k + i] = 1e-6 * np.linalg.norm(state.sources[k, 3 * (i // 3) : 3 * (i // 3) + 3])
-            ahead, behind = (predicted(row, replace(state, x=state.x + sign * step)) for sign in (1.0, -1.0))
+            ahead, behind = (predict_readings(row, replace(state, x=state.x + sign * step)) for sign in (1.0, -1.0))
             slope = (ahead - behind) / (2.0 * step.sum())
             np.testing.assert_allclose(H[k, :, i], slope, rtol=1e-6, atol=1e-6 * np.abs(slope).max())
 
@@ -79,14 +79,14 @@ def test_linearisations_before_and_after():
 
     def information(state: JointState) -> np.ndarray:
         L = state.chart.jacobian(np.zeros((2, 12)))[:, :6]
-        H = np.concatenate([*(row.linearised(state)[0] @ L), row.effect], axis=1)
+        H = np.concatenate([*(row.linearise(state)[0] @ L), row.effect], axis=1)
         return np.linalg.inv(np.eye(len(H)) + H @ state.S @ state.S.T @ H.T)
 
     one = np.eye(len(row.z))
-    np.testing.assert_allclose(found.innovation, row.z - predicted(row, state), atol=1e-7)
+    np.testing.assert_allclose(found.innovation, row.z - predict_readings(row, state), atol=1e-7)
     np.testing.assert_allclose(one - found.seen_before.T @ found.seen_before, information(state), atol=1e-6)
     np.testing.assert_allclose(found.surprise, information(state) @ found.innovation, atol=1e-6)
-    np.testing.assert_allclose(found.residual, row.z - predicted(row, found.state), atol=0.02)
+    np.testing.assert_allclose(found.residual, row.z - predict_readings(row, found.state), atol=0.02)
     left = one - found.seen.T @ found.seen
     expected = [r @ np.linalg.solve(left[at, at] + 1e-3 * np.eye(3), r) for at, r in blocks(found.residual)]
     np.testing.assert_allclose(found.sensor_chi2, expected, rtol=0.02, atol=0.02)
@@ -106,11 +106,11 @@ def test_ends_in_the_minimum(seed):
     assert found.converged
 
     def residual(y: np.ndarray) -> np.ndarray:
-        return np.concatenate([row.z - predicted(row, state.moved(state.S @ y, state.S)), y])
+        return np.concatenate([row.z - predict_readings(row, state.shift(state.S @ y, state.S)), y])
 
     best = least_squares(residual, np.zeros(len(state.x)), x_scale="jac", method="lm")
     assert found.cost == pytest.approx(2.0 * best.cost, abs=0.01)
-    expected = state.moved(state.S @ best.x, state.S)
+    expected = state.shift(state.S @ best.x, state.S)
     sigma = np.sqrt(np.diagonal(found.state.covariances[:, :3, :3], axis1=1, axis2=2))
     assert (np.abs(found.state.position_m - expected.position_m) < 0.1 * sigma).all()
 

@@ -32,7 +32,7 @@ from magloc.tracking.consistency import THRESHOLD
 from magloc.tracking.rows import rows_of
 from magloc.tracking.track import Track
 from magloc.tracking.tracker import Tracker
-from magloc.tracking.whole_records.background import settled_steps
+from magloc.tracking.whole_records.background import iterate_steps
 from tests.tracked_sources import BACKGROUND_NOISE_T as NOISE_T
 from tests.tracked_sources import CORNER_HZ, REST, lines, no_drift, walks
 from tests.tracked_sources import PASSING_SLOWLY as SCENARIO
@@ -128,7 +128,7 @@ class TestTrack:
         tracker = Tracker(SCENARIO.nominal_array, REST, background=Drift.of(readings.background, readings.time_s))
         rows = list(rows_of(readings))
         nowhere = np.concatenate([[1.0, 0.0, 0.0], [0.0, 0.0, 1e200], np.zeros(tracker.n_errors)])
-        assert settled_steps(tracker, rows, [nowhere] * len(rows)) is None
+        assert iterate_steps(tracker, rows, [nowhere] * len(rows)) is None
 
     def test_without_a_source_there_is_none(self) -> None:
         readings = sims.simulate(SCENARIO, 3).readings

@@ -8,7 +8,7 @@ from filterpy.kalman import KalmanFilter
 from magloc.tracking.motion import OrnsteinUhlenbeck
 from magloc.tracking.results import Prediction, Step
 from magloc.tracking.tracker import Tracker
-from magloc.tracking.whole_records.smoother import smoothed, smoothed_states
+from magloc.tracking.whole_records.smoother import smooth_points, smooth_states
 from tests.passing_source import ARRAY, SLOW, followed, moving_source, positions, readings_of, rows_from
 
 
@@ -34,7 +34,7 @@ class TestSmoother:
             Ps.append(P)
             steps.append(Step(i, prediction, x, np.linalg.cholesky(P)))
         expected_x, expected_P, _, _ = reference.rts_smoother(np.array(xs)[..., None], np.array(Ps))
-        for i, (x, P) in enumerate(smoothed_states(steps)):
+        for i, (x, P) in enumerate(smooth_states(steps)):
             np.testing.assert_allclose(x, expected_x[i].ravel(), rtol=1e-8, atol=1e-9)
             np.testing.assert_allclose(P, expected_P[i], rtol=1e-8, atol=1e-9)
 
@@ -45,7 +45,7 @@ class TestSmoother:
         tracker = Tracker(ARRAY, SLOW, keep_steps=True)
         points = followed(tracker, rows_from(time_s, readings_of(ARRAY, p, m)))
         again = points.index(next(point for point in points[1:] if point.status == "acquired"))
-        finished = smoothed(points, tracker.steps)
+        finished = smooth_points(points, tracker.steps)
         np.testing.assert_allclose(positions(finished)[again - 1], positions(points)[again - 1], rtol=1e-9)
         np.testing.assert_allclose(positions(finished)[-1], positions(points)[-1], rtol=1e-9)
         assert np.abs(positions(finished)[5] - positions(points)[5]).max() > 0.0
@@ -54,7 +54,7 @@ class TestSmoother:
         time_s, p, m = moving_source(40)
         tracker = Tracker(ARRAY, OrnsteinUhlenbeck(0.1, 0.02), keep_steps=True)
         points = followed(tracker, rows_from(time_s, readings_of(ARRAY, p, m)))
-        for before, after in zip(points, smoothed(points, tracker.steps), strict=True):
+        for before, after in zip(points, smooth_points(points, tracker.steps), strict=True):
             assert before.covariance is not None
             assert after.covariance is not None
             assert (np.diagonal(after.covariance) <= np.diagonal(before.covariance) * (1.0 + 1e-9)).all()
