@@ -11,6 +11,7 @@ import difflib
 import errno
 import io
 import logging
+import math
 import os
 import shlex
 import sys
@@ -54,6 +55,17 @@ def whole_number(_: type, tokens: Sequence[Token]) -> int:
     except ValueError:
         pass
     raise ValueError(f"found {tokens[0].value!r}, expected a whole number of at most 18 digits.")
+
+
+ABOVE_ZERO = math.ulp(0.0)
+"""Least positive number: the limit of options that must be positive."""
+
+
+def refuse_outside(low: float, high: float, expected: str, *, unit: str = "", **options: float | None) -> None:
+    """Refuse options, by their names in Python, that are given and not within limits."""
+    for name, value in options.items():
+        if value is not None and not low <= value <= high:
+            raise InputError(f"--{name.replace('_', '-')}: found {value:g}{unit}, expected {expected}.")
 
 
 Flag = Annotated[bool, Parameter(show_default=False)]
