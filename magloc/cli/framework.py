@@ -22,13 +22,13 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from cyclopts import App, CycloptsError, MissingArgumentError, Parameter, Token, UnknownCommandError
 from cyclopts.validators import Number
 
 from arrays.io.errors import PACKAGES, InputError
-from arrays.io.outputs import make_folder
+from arrays.io.outputs import installed_version, make_folder
 from magloc.cli.entry import INTERRUPTED
 
 DONE = 0
@@ -117,6 +117,22 @@ class CommonOptions(QuietOptions):
     """
 
     seed: Seed = 0
+
+
+def new_app(name: str, help: str, commands: Iterable[tuple[str, str, str]], **options: Any) -> App:
+    """Return a command line; commands are given by name, as ``module:function``, and with their lines of help.
+
+    Each loads when it is called. By name those of a package on a higher floor can be had too.
+    """
+    app = App(name=name, help=help, **options)
+    for command, where, line in commands:
+        app.command(where, name=command, help=line)
+    return app
+
+
+def new_program(name: str, help: str, commands: Iterable[tuple[str, str, str]]) -> App:
+    """Return the command line of a program."""
+    return new_app(name, help, commands, version=installed_version, default_parameter=Parameter(negative=()))
 
 
 def run(app: App, arguments: Sequence[str] | None = None) -> int:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from arrays.io.csv import Column
 from arrays.io.world_maps import feature, feature_collection, kml, placemark, world_place
 from arrays.typing import Vector
-from magloc.surveying.results import IRON_Am2_PER_KG, Survey
 from magloc.truth import TRUE_POSITION_COLUMNS, state_columns
+
+if TYPE_CHECKING:
+    from magloc.surveying.results import Survey
 
 
 def json_of_survey(found: Survey) -> dict[str, Any]:
@@ -83,14 +85,5 @@ def geojson_of_survey(found: Survey, origin: Vector) -> dict[str, Any]:
 
 def kml_of_survey(found: Survey, origin: Vector) -> str:
     """:meth:`magloc.surveying.results.Survey.to_kml`."""
-    marks = []
-    for target in found:
-        low, high = target.depth_interval95_m
-        least, most = target.iron_kg
-        words = (
-            f"{target.depth_m:.2f} m below ground (95 %: {low:.2f} to {high:.2f} m), {target.strength_Am2:.3g} A·m²: "
-            f"{least:.2g} to {most:.2g} kg of iron, if a kilogram has {IRON_Am2_PER_KG[0]:g} to "
-            f"{IRON_Am2_PER_KG[1]:g} A·m². {' '.join(target.flags)}"
-        )
-        marks.append(placemark(target.id, words, [world_place(target.position_m, origin)]))
-    return kml(marks)
+    places = ((target, [world_place(target.position_m, origin)]) for target in found)
+    return kml(placemark(target.id, target.in_words, place) for target, place in places)

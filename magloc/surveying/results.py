@@ -17,6 +17,7 @@ from arrays.io.results import Result
 from arrays.io.tables import aligned, by_sigma
 from arrays.typing import FloatArray, Vector
 from magloc.localization.fit.table import cells_of_strength
+from magloc.surveying.files import columns_of_survey, geojson_of_survey, kml_of_survey
 
 IRON_Am2_PER_KG = (0.05, 0.3)
 """Moment of a kilogram of iron in the ground: a range, as its remanence and shape are not known."""
@@ -78,6 +79,17 @@ class Target:
         """Mass of iron with such a moment, from the most to the least magnetic."""
         least, most = IRON_Am2_PER_KG
         return self.strength_Am2 / most, self.strength_Am2 / least
+
+    @property
+    def in_words(self) -> str:
+        """Depth, strength and mass of iron in a sentence."""
+        low, high = self.depth_interval95_m
+        least, most = self.iron_kg
+        return (
+            f"{self.depth_m:.2f} m below ground (95 %: {low:.2f} to {high:.2f} m), {self.strength_Am2:.3g} A·m²: "
+            f"{least:.2g} to {most:.2g} kg of iron, if a kilogram has {IRON_Am2_PER_KG[0]:g} to "
+            f"{IRON_Am2_PER_KG[1]:g} A·m². {' '.join(self.flags)}"
+        )
 
     @property
     def ellipse95(self) -> tuple[float, float, float]:
@@ -191,8 +203,6 @@ class Survey(Result):
 
     def columns(self) -> dict[str, Column]:
         """Return the columns of targets.csv."""
-        from magloc.surveying.files import columns_of_survey
-
         return columns_of_survey(self)
 
     def to_geojson(self, place: Vector) -> dict[str, Any]:
@@ -203,14 +213,10 @@ class Survey(Result):
         place : tuple of 3 floats
             Latitude, longitude [deg] and height [m] of the origin of the world frame, which is east, north, up.
         """
-        from magloc.surveying.files import geojson_of_survey
-
         return geojson_of_survey(self, place)
 
     def to_kml(self, place: Vector) -> str:
         """A placemark for every target, for maps of the world; ``place`` as of :meth:`to_geojson`."""
-        from magloc.surveying.files import kml_of_survey
-
         return kml_of_survey(self, place)
 
     def lines(self, most: int | None = None) -> list[str]:
