@@ -117,9 +117,10 @@ def write_moment_tracks(
 
 def _entry_of_several(points: Sequence[TrackPoint]) -> dict[str, object]:
     """One row of several sources, in the keys of one and of fixes of several."""
-    first, keys = points[0], ("position_m", "moment_Am2", "covariance")
-    of_row = {key: getattr(first, key) for key in ("time_s", "nis", "nis_dof", "status")}
-    return of_row | {"sources": [{key: getattr(point, key) for key in keys} for point in points]}
+    from magloc.localization.fit.results import values_of
+
+    sources = [values_of(point, ("position_m", "moment_Am2", "covariance")) for point in points]
+    return values_of(points[0], ("time_s", "nis", "nis_dof", "status")) | {"sources": sources}
 
 
 def _note(found: MomentTrack, determined: BoolArray, readings: Path, outputs: TrackOutputs) -> None:
