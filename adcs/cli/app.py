@@ -8,19 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from cyclopts import App, Parameter
-
-from arrays.io import outputs
 from magloc.cli import framework
 
-app = App(
-    name="adcs",
-    help="Determine the attitude of satellites.",
-    version=outputs.installed_version,
-    default_parameter=Parameter(negative=()),
-)
-# By name, so that a command loads when it is called, and its help line is here; sims stands above this package.
-for _name, _where, _help in (
+COMMANDS = (
     ("run", "sims.cli.run:run", "Simulate a scenario, estimate its attitude, and say how good that is."),
     (
         "compare",
@@ -69,8 +59,8 @@ for _name, _where, _help in (
         "magloc.cli.first_steps.warm_up:warm_up",
         "Do nothing: no command compiles anything any more. The next release removes it.",
     ),
-):
-    app.command(_where, name=_name, help=_help)
+)
+app = framework.new_program("adcs", "Determine the attitude of satellites.", COMMANDS)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -12,9 +12,9 @@ import numpy as np
 
 import adcs
 from adcs.cli.options import ReportOptions
-from arrays.io.errors import InputError, naming
+from arrays.io.errors import LARGEST, InputError, naming
 from arrays.typing import FloatArray
-from magloc.cli.framework import Flag, progress
+from magloc.cli.framework import ABOVE_ZERO, Flag, progress, refuse_outside
 
 if TYPE_CHECKING:
     from adcs.stars.catalogue import StarCatalogue
@@ -72,17 +72,9 @@ def stars(
     from adcs.stars.hipparcos import hipparcos_catalogue
     from adcs.stars.pictures import SUFFIXES
 
-    for option, value in (
-        ("--noise-px", noise_px),
-        ("--scale-arcsec", scale_arcsec),
-        ("--scale-tolerance", scale_tolerance),
-    ):
-        if value is not None and not 0.0 < value < math.inf:
-            raise InputError(f"{option}: found {value:g}, expected a positive number.")
-    if scale_tolerance is not None and scale_tolerance > 0.1:
-        raise InputError(f"--scale-tolerance: found {scale_tolerance:g}, expected 0.1 at most.")
-    if not 1900.0 <= year <= 2100.0:
-        raise InputError(f"--year: found {year:g}, expected 1900 to 2100.")
+    refuse_outside(ABOVE_ZERO, LARGEST, "a positive number", noise_px=noise_px, scale_arcsec=scale_arcsec)
+    refuse_outside(ABOVE_ZERO, 0.1, "a positive number, 0.1 at most", scale_tolerance=scale_tolerance)
+    refuse_outside(1900.0, 2100.0, "1900 to 2100", year=year)
     if not images:
         raise InputError("IMAGES: found none, expected photographs, or a folder of frames.")
     of_pictures = images[0].suffix.lower() in SUFFIXES

@@ -6,6 +6,7 @@ import numpy as np
 import trimesh
 import viser
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from adcs.mockup.navigation.fixes import Outcome
 from adcs.mockup.vision.camera import Pose, footprint
@@ -226,7 +227,7 @@ ENLARGEMENTS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
 def stand(frame: viser.FrameHandle, pose: Pose) -> None:
     """Put a frame on the table."""
     frame.position = np.array([pose.x_m, pose.y_m, 0.0])
-    frame.wxyz = turn_about_z(float(pose.heading_rad))
+    frame.wxyz = Rotation.from_rotvec([0.0, 0.0, pose.heading_rad]).as_quat(scalar_first=True)
 
 
 def show_at(frame: viser.FrameHandle, place_m: FloatArray, heading_rad: float) -> None:
@@ -234,11 +235,6 @@ def show_at(frame: viser.FrameHandle, place_m: FloatArray, heading_rad: float) -
     x, y = place_m.tolist()
     stand(frame, Pose(x, y, heading_rad))
     frame.visible = True
-
-
-def turn_about_z(angle_rad: float) -> FloatArray:
-    """Quaternion (w, x, y, z)."""
-    return np.array([np.cos(0.5 * angle_rad), 0.0, 0.0, np.sin(0.5 * angle_rad)])
 
 
 def satellite_body() -> Surface:

@@ -11,10 +11,10 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 import magloc
-from arrays.io.errors import InputError, naming, own_sentence
+from arrays.io.errors import LARGEST, InputError, naming, own_sentence
 from arrays.io.outputs import refuse_file, write_file
 from arrays.typing import Vector
-from magloc.cli.framework import CommonOptions, Flag, print_json, progress, whole_number
+from magloc.cli.framework import CommonOptions, Flag, print_json, progress, refuse_outside, whole_number
 from magloc.cli.options import Grid, array_of_several, naming_options, print_note, refuse_not_positive
 
 if TYPE_CHECKING:
@@ -206,8 +206,7 @@ def _checked(array: SensorArray, place: FloatArray, of: SourceOptions, task: Tas
         )
     if not task.false_alarm_rate < task.probability < 1.0:
         raise InputError(f"--probability: found {task.probability:g}, expected it between the false-alarm rate and 1.")
-    if not 0.0 <= of.ambient_uncertainty_nT < math.inf:
-        raise InputError(f"--ambient-uncertainty-nT: found {of.ambient_uncertainty_nT:g}, expected zero or more.")
+    refuse_outside(0.0, LARGEST, "zero or more", ambient_uncertainty_nT=of.ambient_uncertainty_nT)
     refuse_not_positive(of, "known_moment_sigma_Am2")
     _check_place(array, place)
     radius = float(np.linalg.norm(place - array.centroid)) if task.range_m is None else task.range_m

@@ -11,6 +11,7 @@ import difflib
 import errno
 import io
 import logging
+import math
 import os
 import shlex
 import sys
@@ -21,13 +22,13 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from cyclopts import App, CycloptsError, MissingArgumentError, Parameter, Token, UnknownCommandError
 from cyclopts.validators import Number
 
 from arrays.io.errors import PACKAGES, InputError
-from arrays.io.outputs import make_folder
+from arrays.io.outputs import installed_version, make_folder
 from magloc.cli.entry import INTERRUPTED
 
 DONE = 0
@@ -54,6 +55,17 @@ def whole_number(_: type, tokens: Sequence[Token]) -> int:
     except ValueError:
         pass
     raise ValueError(f"found {tokens[0].value!r}, expected a whole number of at most 18 digits.")
+
+
+ABOVE_ZERO = math.ulp(0.0)
+"""Least positive number: the limit of options that must be positive."""
+
+
+def refuse_outside(low: float, high: float, expected: str, *, unit: str = "", **options: float | None) -> None:
+    """Refuse options, by their names in Python, that are given and not within limits."""
+    for name, value in options.items():
+        if value is not None and not low <= value <= high:
+            raise InputError(f"--{name.replace('_', '-')}: found {value:g}{unit}, expected {expected}.")
 
 
 Flag = Annotated[bool, Parameter(show_default=False)]
@@ -105,6 +117,22 @@ class CommonOptions(QuietOptions):
     """
 
     seed: Seed = 0
+
+
+def new_app(name: str, help: str, commands: Iterable[tuple[str, str, str]], **options: Any) -> App:
+    """Return a command line; commands are given by name, as ``module:function``, and with their lines of help.
+
+    Each loads when it is called. By name those of a package on a higher floor can be had too.
+    """
+    app = App(name=name, help=help, **options)
+    for command, where, line in commands:
+        app.command(where, name=command, help=line)
+    return app
+
+
+def new_program(name: str, help: str, commands: Iterable[tuple[str, str, str]]) -> App:
+    """Return the command line of a program."""
+    return new_app(name, help, commands, version=installed_version, default_parameter=Parameter(negative=()))
 
 
 def run(app: App, arguments: Sequence[str] | None = None) -> int:

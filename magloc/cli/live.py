@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from arrays.io.errors import LARGEST, InputError, naming
+from arrays.io.errors import LARGEST, naming
 from arrays.io.outputs import refuse_unwritable
-from magloc.cli.framework import Flag, QuietOptions
+from magloc.cli.framework import ABOVE_ZERO, Flag, QuietOptions, refuse_outside
 from magloc.cli.options import STREAM, KnownOptions, MotionOptions, Port, naming_options, naming_place, print_note
 
 if TYPE_CHECKING:
@@ -88,10 +88,8 @@ def live(
     """
     from arrays.io.csv import GrowingTable
 
-    if not 0.0 <= rest_s <= LARGEST:
-        raise InputError(f"--rest-s: found {rest_s:g}, expected 0 or a positive number.")
-    if not 0.0 < replay_speed <= LARGEST:
-        raise InputError(f"--replay-speed: found {replay_speed:g}, expected a positive number.")
+    refuse_outside(0.0, LARGEST, "0 or a positive number", rest_s=rest_s)
+    refuse_outside(ABOVE_ZERO, LARGEST, "a positive number", replay_speed=replay_speed)
     if out is not None:
         refuse_unwritable(out, "--out", ".csv")
     used = known.array(array)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -12,10 +11,10 @@ from typing import TYPE_CHECKING, Literal
 from cyclopts import Parameter
 
 import magloc
-from arrays.io.errors import InputError, own_sentence
+from arrays.io.errors import LARGEST, InputError, own_sentence
 from arrays.io.outputs import refuse_file
 from arrays.typing import Vector
-from magloc.cli.framework import CommonOptions, Flag, print_json_list, progress
+from magloc.cli.framework import CommonOptions, Flag, print_json_list, progress, refuse_outside
 from magloc.cli.options import KnownOptions, ambient_field, number_of_sources, print_note
 
 if TYPE_CHECKING:
@@ -115,8 +114,7 @@ def locate(
     where, prior, n_sources = known.where, known.prior, wanted.n_sources
     length_m, position = wanted.body_length_m, wanted.position
     joint = wanted.sources is not None or (position is not None and len(position) > 1)
-    if length_m is not None and not 0.0 <= length_m < math.inf:
-        raise InputError(f"--body-length-m: found {length_m:g}, expected a length, or 0 for a point.")
+    refuse_outside(0.0, LARGEST, "a length, or 0 for a point", body_length_m=length_m)
     if position is not None and (wanted.sources is not None or known.region is not None):
         other = "--sources" if wanted.sources is not None else "--region"
         raise InputError(f"--position: found it together with {other}, expected one of them.")

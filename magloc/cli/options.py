@@ -22,7 +22,7 @@ from arrays.io.text import write_text
 from arrays.typing import Vector
 from magloc.ambient import Place
 from magloc.cli import framework
-from magloc.cli.framework import whole_number
+from magloc.cli.framework import ABOVE_ZERO, refuse_outside, whole_number
 
 if TYPE_CHECKING:
     import numpy as np
@@ -60,10 +60,7 @@ def number_of_sources(sources: str) -> int | Literal["auto"]:
 
 def refuse_not_positive(options: object, *names: str, expected: str = "a positive number") -> None:
     """Refuse an option that is given and not positive, or endless, by the names of the fields that hold them."""
-    for name in names:
-        value = getattr(options, name)
-        if value is not None and not 1.0 / LARGEST <= value <= LARGEST:
-            raise InputError(f"--{name.replace('_', '-')}: found {value:g}, expected {expected}.")
+    refuse_outside(1.0 / LARGEST, LARGEST, expected, **{name: getattr(options, name) for name in names})
 
 
 def array_of_several(path: Path, why: str = "") -> SensorArray:
@@ -295,8 +292,7 @@ class KnownOptions:
                 raise InputError(
                     f"--region: found {self.region!r}, expected bounds that leave some room along {bounds['axis']}."
                 )
-        if self.max_moment_Am2 is not None and not self.max_moment_Am2 > 0.0:
-            raise InputError(f"--max-moment-Am2: found {self.max_moment_Am2:g}, expected a positive number.")
+        refuse_outside(ABOVE_ZERO, math.inf, "a positive number", max_moment_Am2=self.max_moment_Am2)
         with naming_options("known_moment_Am2", "known_moment_sigma_Am2"):
             return magloc.SourcePrior(
                 (low[0], low[1], low[2]),

@@ -12,14 +12,12 @@ import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import CancelledError
 from contextlib import contextmanager
-from functools import partial
 from itertools import islice
 from typing import Any, TypeVar
 
 from arrays.blas_threads import one_blas_thread
 from arrays.io.errors import InputError, of_extra
 from magloc import core
-from magloc.grids.cube import Box, Chunk, CubeMap, computed
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -41,11 +39,6 @@ def check_address(scheduler: str) -> None:
     address = _ADDRESS.fullmatch(scheduler)
     if address is None or not 0 < int(address["port"]) <= _LARGEST_PORT:
         raise SchedulerError(f"scheduler: found {scheduler!r}, expected tcp://HOST:PORT or HOST:PORT.")
-
-
-def computed_by(scheduler: str, cube: CubeMap, wanted: Iterable[Box], timeout_s: float = 10.0) -> Iterator[Chunk]:
-    """Values of boxes, as they become ready, from the workers of a dask scheduler."""
-    return worked_by(scheduler, partial(computed, cube), wanted, timeout_s)
 
 
 def worked_by(

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
+from functools import partial
 from typing import TYPE_CHECKING
 
 from arrays.io.errors import InputError
-from magloc.grids.cluster import check_address, computed_by
-from magloc.grids.cube import Box, Chunk, CubeMap, boxes, computed_here, in_memory
+from magloc.grids.cube import Chunk, CubeMap, boxes, computed, in_memory
 from magloc.grids.store import Sweep, open_map
+from magloc.grids.work import runner
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -30,12 +31,7 @@ def computed_map(
     piece. `progress` is called with the number of points finished since the last call, at first with those in the
     store.
     """
-    if scheduler is not None:
-        check_address(scheduler)
-
-    def chunks(wanted: Iterable[Box]) -> Iterator[Chunk]:
-        return computed_here(cube, wanted) if scheduler is None else computed_by(scheduler, cube, wanted)
-
+    chunks = partial(runner(scheduler), partial(computed, cube))
     if out is None:
         return in_memory(cube, progress, chunks(boxes(cube)))
     with Sweep(cube, out) as sweep:

@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
+from functools import partial
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
@@ -275,12 +276,6 @@ def computed(cube: CubeMap, box: Box) -> Chunk:
     return Chunk(box, values, time.perf_counter() - began)
 
 
-def computed_here(cube: CubeMap, wanted: Iterable[Box]) -> Iterator[Chunk]:
-    """Values of some boxes, one after the other, in this process."""
-    for box in wanted:
-        yield computed(cube, box)
-
-
 def coordinates(cube: CubeMap) -> dict[str, tuple[FloatArray, dict[str, str]]]:
     """Coordinates of a cube's points along every dimension, with CF attributes."""
     return {
@@ -313,7 +308,7 @@ def in_memory(
     shape = (cube.grid,) * 3
     whole = {name: np.full(shape, variable.not_done, variable.dtype) for name, variable in cube.variables.items()}
     seconds = 0.0
-    for chunk in computed_here(cube, boxes(cube)) if chunks is None else chunks:
+    for chunk in map(partial(computed, cube), boxes(cube)) if chunks is None else chunks:
         for name, values in chunk.values.items():
             whole[name][chunk.box.region] = values
         seconds += chunk.seconds

@@ -32,6 +32,14 @@ Each = Callable[[Work, Iterable[Any]], Iterator[tuple[int, Arrays]]]
 _PER_PROCESS = 2  # items sent ahead: one that it computes, one that it has ready
 
 
+def runner(scheduler: str | None) -> Callable[[Callable[[Any], Any], Iterable[Any]], Iterator[Any]]:
+    """Return `map`, or what does the same by the workers of a dask scheduler, in any order."""
+    if scheduler is None:
+        return map
+    check_address(scheduler)
+    return partial(worked_by, scheduler)
+
+
 @contextmanager
 def workers(processes: int, scheduler: str | None, folder: Path | None) -> Iterator[Each]:
     """What does work on many items: in processes, or by the workers of a dask scheduler.
@@ -39,11 +47,8 @@ def workers(processes: int, scheduler: str | None, folder: Path | None) -> Itera
     What is done is kept in a folder; what is there of the same work on the same item is not done again.
     """
     with ExitStack() as stack:
-        run: Callable[[Callable[[Any], Any], Iterable[Any]], Iterator[Any]] = map
-        if scheduler is not None:
-            check_address(scheduler)
-            run = partial(worked_by, scheduler)
-        elif processes > 1:
+        run = runner(scheduler)
+        if scheduler is None and processes > 1:
             run = partial(_pooled, stack.enter_context(process_pool(processes)), _PER_PROCESS * processes)
         yield partial(_each, run, folder)
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from arrays.io.tables import aligned, by_sigma
 from arrays.typing import FloatArray
+from magloc.localization.fit.results import values_of
 
 if TYPE_CHECKING:
     from magloc.signature.signature import Signature
@@ -69,20 +70,14 @@ def json_of_signature(signature: Signature, depths_m: Sequence[float]) -> dict[s
         for i, heading in enumerate(HEADINGS.values()):
             of_heading = {"depth_m": depth, "heading_deg": heading, "forward_m": x}
             predicted.append(of_heading | {"field_nT": 1e9 * field[i], "sigma_nT": 1e9 * sigma[i]})
-    return {
-        "permanent_Am2": signature.permanent_Am2,
-        "polarisability_m3": signature.polarisability_m3,
+    return values_of(signature, ("permanent_Am2", "polarisability_m3")) | {
         "eddy_m3_s": signature.eddy_m3_s if signature.components.eddy else None,
         "parameters": list(signature.names),
         "parameters_Am2": signature.determined,
         "sigma_Am2": np.where(np.isfinite(signature.determined), signature.sigma_Am2, np.nan),
         "covariance": signature.covariance,
         "ambient_nT": 1e9 * signature.ambient_T,
-        "undetermined": list(signature.undetermined),
-        "chi2": signature.chi2,
-        "dof": signature.dof,
-        "misfit": signature.misfit,
-        "rows": signature.rows,
+        **values_of(signature, ("undetermined", "chi2", "dof", "misfit", "rows")),
         "predicted": predicted,
     }
 

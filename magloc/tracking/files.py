@@ -22,6 +22,7 @@ from arrays.io.world_maps import feature, feature_collection, kml, placemark, wo
 from arrays.typing import FloatArray, Vector
 from magloc.chi_square import square_columns
 from magloc.levels import FALSE_ALARM
+from magloc.localization.fit.results import values_of
 from magloc.localization.fit.table import cells_of_strength, cells_of_vector
 from magloc.tracking.results import SourcePoint, SourcesPoint, TrackPoint, TrackResult, track_column
 from magloc.truth import STATE_COLUMNS, STATE_QUANTITIES, state_columns
@@ -103,14 +104,11 @@ def json_entry(point: TrackPoint | SourcesPoint, *, single: bool = False) -> dic
     """
     if isinstance(point, SourcesPoint):
         entry = json_entry(point.tracks[0]) if single and point.tracks else {}
-        return entry | _values(point, _ROW_KEYS) | {"tracks": [_values(track, _SOURCE_KEYS) for track in point.tracks]}
-    entry = _values(point, _POINT_KEYS) | {"rivals": [_values(rival, _RIVAL_KEYS) for rival in point.rivals]}
+        return (
+            entry | values_of(point, _ROW_KEYS) | {"tracks": [values_of(track, _SOURCE_KEYS) for track in point.tracks]}
+        )
+    entry = values_of(point, _POINT_KEYS) | {"rivals": [values_of(rival, _RIVAL_KEYS) for rival in point.rivals]}
     return entry if point.tracks else entry | {"iterations": None, "gaussian": None}
-
-
-def _values(of: object, keys: Sequence[str]) -> dict[str, object]:
-    """Return attributes of an object by their keys in JSON."""
-    return {key: getattr(of, key.replace("interval95", "interval")) for key in keys}
 
 
 def states_of(points: Sequence[TrackPoint]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:

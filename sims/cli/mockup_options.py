@@ -13,7 +13,7 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from arrays.io.errors import InputError, naming
-from magloc.cli.framework import Count, Seed, whole_number
+from magloc.cli.framework import Count, Seed, refuse_outside, whole_number
 from sims.experiments.mockup_settings import SETTLED_S, Method, Unknowns
 
 if TYPE_CHECKING:
@@ -172,14 +172,13 @@ class MockupOptions:
             self._check_frames()
         if self.samples is not None or self.fixes is not None:
             self._check_record()
-        for name in ("lost", "false_fixes", "failed", "overtaken", "repeated"):
-            self._check_range(name, 0.0, 1.0, "a fraction between 0 and 1")
-        for name in ("noise_dn", "speed_m_s", "turn_deg_s"):
-            self._check_range(name, 0.0, 1e6, "0 or more")
-        self._check_range("hot_pixels", 0, 640 * 480, f"0 to {640 * 480}, all pixels of the frame")
-        self._check_range("delay_s", 0.0, 10.0, "0 to 10 s, as long as samples are kept")
-        if self.footprint_m is not None and not 0.01 <= self.footprint_m <= 100.0:
-            raise InputError(f"--footprint-m: found {self.footprint_m:g}, expected 0.01 to 100 m.")
+        fractions = self._known("lost", "false_fixes", "failed", "overtaken", "repeated")
+        refuse_outside(0.0, 1.0, "a fraction between 0 and 1", **fractions)
+        refuse_outside(0.0, 1e6, "0 or more", **self._known("noise_dn", "speed_m_s", "turn_deg_s"))
+        pixels = 640 * 480
+        refuse_outside(0.0, pixels, f"0 to {pixels}, all pixels of the frame", hot_pixels=self.hot_pixels)
+        refuse_outside(0.0, 10.0, "0 to 10 s, as long as samples are kept", delay_s=self.delay_s)
+        refuse_outside(0.01, 100.0, "0.01 to 100 m", footprint_m=self.footprint_m)
         if self.start_fixes is not None and self.unknowns != "two":
             raise InputError("--start-fixes: found it without --unknowns two, expected it with that.")
         if self.outage is not None and not 0.0 <= self.outage[0] < self.outage[1]:
@@ -208,11 +207,6 @@ class MockupOptions:
         for name in self.given():
             if name not in names:
                 raise InputError(f"{option_name(name)}: {fault}")
-
-    def _check_range(self, name: str, low: float, high: float, expected: str) -> None:
-        value = getattr(self, name)
-        if value is not None and not low <= value <= high:
-            raise InputError(f"{option_name(name)}: found {value:g}, expected {expected}.")
 
     def runs(self, default: int) -> range:
         """Seeds of the runs."""

@@ -10,7 +10,7 @@ from cyclopts import Parameter
 
 from adcs.cli.options import print_note
 from arrays.io.errors import InputError
-from magloc.cli.framework import Flag, QuietOptions
+from magloc.cli.framework import Flag, QuietOptions, refuse_outside
 from magloc.cli.options import Port, naming_outputs
 from sims.cli.mockup_options import MockupOptions
 from sims.experiments.mockup_settings import METHOD_WORDS
@@ -126,5 +126,4 @@ class ReplayOptions:
             raise InputError("--view: found it with --html or --png, expected one or the other.")
         if self.view and json:
             raise InputError("--view: found it with --json, expected one or the other: the address is printed too.")
-        if self.at is not None and not 0.0 <= self.at <= options.duration_s:
-            raise InputError(f"--at: found {self.at:g} s, expected 0 to {options.duration_s:g} s.")
+        refuse_outside(0.0, options.duration_s, f"0 to {options.duration_s:g} s", unit=" s", at=self.at)

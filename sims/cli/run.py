@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from cyclopts import App
-
+from magloc.cli.framework import new_app
 from sims.cli.run_tabletsat import run_attitude
 
-run = App(name="run", help="Simulate a scenario, estimate its attitude, and say how good that is.", version_flags=[])
-run.default(run_attitude)
-for _name, _where, _help in (
+_COMMANDS = (
     (
         "complementary",
         "sims.cli.run_complementary:complementary",
@@ -29,5 +26,8 @@ for _name, _where, _help in (
         "sims.cli.run_mockup:mockup",
         "Table-top satellite that looks up at a sky of LEDs: star identification, zeros, and fusion of late fixes.",
     ),
-):
-    run.command(_where, name=_name, help=_help)
+)
+run = new_app(
+    "run", "Simulate a scenario, estimate its attitude, and say how good that is.", _COMMANDS, version_flags=[]
+)
+run.default(run_attitude)

@@ -14,7 +14,7 @@ from adcs.cli.options import ReportOptions, warn
 from adcs.complementary.names import Method, Rule
 from arrays.io.errors import LARGEST, InputError
 from arrays.io.outputs import refuse_file, write_files
-from magloc.cli.framework import Count, Seed, progress
+from magloc.cli.framework import ABOVE_ZERO, Count, Seed, progress, refuse_outside
 from sims.cli.run_tabletsat import seed_batches
 
 if TYPE_CHECKING:
@@ -70,13 +70,11 @@ class ComplementaryOptions:
 
     def check(self) -> None:
         """Raise InputError for what cannot be run."""
+        refuse_outside(0.0, LARGEST, "0 or more", kp=self.kp, ki=self.ki)
         for name, value in (("--kp", self.kp), ("--ki", self.ki)):
-            if value is not None and not 0.0 <= value <= LARGEST:
-                raise InputError(f"{name}: found {value:g}, expected 0 or more.")
             if value is not None and self.filter == "adaptive":
                 raise InputError(f"{name}: found {value:g}, expected no gain: --filter adaptive has none.")
-        if not 0.0 < self.sigma_nT <= LARGEST:
-            raise InputError(f"--sigma-nT: found {self.sigma_nT:g}, expected a positive number.")
+        refuse_outside(ABOVE_ZERO, LARGEST, "a positive number", sigma_nT=self.sigma_nT)
         if not 0.0 <= self.amplitude_deg < 90.0:
             raise InputError(f"--amplitude-deg: found {self.amplitude_deg:g}, expected 0 to less than 90.")
         from sims.attitude.complementary import ORBIT
@@ -84,10 +82,8 @@ class ComplementaryOptions:
 
         least = (RMS_ORBITS[0] if self.outage is None else OUTAGE_MAX_FROM_ORBITS) * ORBIT.period_s
         most = _LONGEST_ORBITS * ORBIT.period_s
-        if not least + 1.0 <= self.duration_s <= most:
-            raise InputError(
-                f"--duration: found {self.duration_s:g} s, expected {math.ceil(least + 1.0)} to {int(most)} s."
-            )
+        expected = f"{math.ceil(least + 1.0)} to {int(most)} s"
+        refuse_outside(least + 1.0, most, expected, unit=" s", duration=self.duration_s)
         try:
             self.gains.check(1.0)
         except ValueError:

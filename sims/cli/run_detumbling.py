@@ -7,8 +7,7 @@ from typing import Annotated, Literal
 import numpy as np
 from cyclopts import Parameter
 
-from arrays.io.errors import InputError
-from magloc.cli.framework import Count, Flag, QuietOptions, Seed, print_result, progress
+from magloc.cli.framework import ABOVE_ZERO, Count, Flag, QuietOptions, Seed, print_result, progress, refuse_outside
 
 _LONGEST_S, _MOST_S = 200_000.0, 2_000_000.0
 _STRONGEST_AM2 = 10.0
@@ -59,17 +58,11 @@ def detumbling(
     from sims import experiments
 
     longest_s = min(_LONGEST_S, _MOST_S / seeds)
-    if not 1.0 <= duration <= longest_s:
-        raise InputError(f"--duration: found {duration:g}, expected 1 to {longest_s:g} of {seeds} runs.")
-    for name, value, most in (
-        ("--rate-deg-s", rate_deg_s, 30.0),
-        ("--moment-Am2", moment_Am2, 100.0),
-        ("--duty", duty, 1.0),
-    ):
-        if not 0.0 < value <= most:
-            raise InputError(f"{name}: found {value:g}, expected more than 0 and at most {most:g}.")
-    if not 0.0 <= magnet_Am2 <= _STRONGEST_AM2:
-        raise InputError(f"--magnet-Am2: found {magnet_Am2:g}, expected 0 to {_STRONGEST_AM2:g}.")
+    refuse_outside(1.0, longest_s, f"1 to {longest_s:g} of {seeds} runs", duration=duration)
+    refuse_outside(ABOVE_ZERO, 30.0, "more than 0 and at most 30", rate_deg_s=rate_deg_s)
+    refuse_outside(ABOVE_ZERO, 100.0, "more than 0 and at most 100", moment_Am2=moment_Am2)
+    refuse_outside(ABOVE_ZERO, 1.0, "more than 0 and at most 1", duty=duty)
+    refuse_outside(0.0, _STRONGEST_AM2, f"0 to {_STRONGEST_AM2:g}", magnet_Am2=magnet_Am2)
     with progress(round(duration) + 1, "seconds", quiet=common.quiet) as advanced:
         found = experiments.detumbling(
             range(seed, seed + seeds),

@@ -15,7 +15,7 @@ from adcs.cli.options import ReportOptions
 from adcs.ellipsoids.names import StepRule
 from arrays.io.errors import LARGEST, InputError
 from arrays.io.outputs import refuse_file, write_files
-from magloc.cli.framework import Count, Flag, Seed, progress
+from magloc.cli.framework import Count, Flag, Seed, progress, refuse_outside
 from sims.cli.run_tabletsat import seed_batches
 
 if TYPE_CHECKING:
@@ -66,11 +66,9 @@ class EllipsoidOptions:
         """Raise InputError for what cannot be run."""
         from adcs.ellipsoids.roll_yaw import STEP_S
 
-        for name, value in (("--noise-deg", self.noise_deg), ("--drift-deg-s", self.drift_deg_s)):
-            if not _LEAST_DEG <= value <= LARGEST:
-                raise InputError(f"{name}: found {value:g}, expected {_LEAST_DEG:g} or more.")
-        if not STEP_S <= self.duration <= 1e7:
-            raise InputError(f"--duration: found {self.duration:g} s, expected {STEP_S:g} to 1e7 s.")
+        least = f"{_LEAST_DEG:g} or more"
+        refuse_outside(_LEAST_DEG, LARGEST, least, noise_deg=self.noise_deg, drift_deg_s=self.drift_deg_s)
+        refuse_outside(STEP_S, 1e7, f"{STEP_S:g} to 1e7 s", unit=" s", duration=self.duration)
         if self.jump and self.duration <= JUMP_S:
             raise InputError(f"--duration: found {self.duration:g} s, expected more than the {JUMP_S:g} s of --jump.")
 

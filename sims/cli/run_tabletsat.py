@@ -14,7 +14,7 @@ import adcs
 import sims.experiments
 from adcs.cli.options import ReportOptions, ScenarioOptions, warn
 from arrays.io.errors import InputError
-from magloc.cli.framework import Count, Seed, progress
+from magloc.cli.framework import ABOVE_ZERO, Count, Seed, progress, refuse_outside
 
 if TYPE_CHECKING:
     from adcs.io.scenario_files import AttitudeFile
@@ -66,10 +66,8 @@ def wanted(scenario: str, options: ScenarioOptions, duration_s: float | None) ->
     if duration_s is not None and not 1.0 <= duration_s / file.step_s <= MOST_STEPS:
         longest_s = MOST_STEPS * file.step_s
         raise InputError(f"--duration: found {duration_s:g} s, expected {file.step_s:g} to {longest_s:g} s.")
-    if options.start_error_deg is not None and not 0.0 < options.start_error_deg <= 180.0:
-        raise InputError(f"--start-error-deg: found {options.start_error_deg:g}, expected more than 0 and at most 180.")
-    if options.field_error_nT is not None and not 0.0 <= options.field_error_nT <= 1e9:
-        raise InputError(f"--field-error-nT: found {options.field_error_nT:g}, expected 0 to 1e9.")
+    refuse_outside(ABOVE_ZERO, 180.0, "more than 0 and at most 180", start_error_deg=options.start_error_deg)
+    refuse_outside(0.0, 1e9, "0 to 1e9", field_error_nT=options.field_error_nT)
     if options.share is not None and not 0.0 <= options.share < 1.0:
         raise InputError(f"--share: found {options.share:g}, expected 0 to less than 1.")
     file = file.changed(changes)

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 
 import sims.experiments
 from adcs.cli.options import ReportOptions
-from arrays.io.errors import InputError
-from magloc.cli.framework import progress
+from magloc.cli.framework import progress, refuse_outside
 from sims.cli.run_tabletsat import RunOptions
 
 if TYPE_CHECKING:
@@ -37,8 +36,7 @@ def tables(
         Where the result goes.
     """
     report.check()
-    if options.duration is not None and not 1.0 <= options.duration <= 1e7:
-        raise InputError(f"--duration: found {options.duration:g} s, expected 1 to 1e7 s.")
+    refuse_outside(1.0, 1e7, "1 to 1e7 s", unit=" s", duration=options.duration)
     rows = sims.experiments.PAPER_ROWS
     compared: list[Comparison] = []
     with progress(len(rows), "rows", quiet=report.quiet) as advance:

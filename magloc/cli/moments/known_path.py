@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from cyclopts import Parameter
 
 from arrays.io.errors import LARGEST, InputError
-from magloc.cli.framework import print_json, print_report
+from magloc.cli.framework import print_json, print_report, refuse_outside
 from magloc.cli.options import KnownOptions, MapOptions, print_note
 
 if TYPE_CHECKING:
@@ -66,11 +66,7 @@ class PathErrorOptions:
         """The errors that the options state."""
         from magloc.signature.path import PathError
 
-        for name in ("path_sigma_m", "path_correlation_s", "attitude_sigma_deg", "attitude_correlation_s"):
-            value = getattr(self, name)
-            if value is not None and not 0.0 <= value <= LARGEST:
-                option = name.replace("_", "-")
-                raise InputError(f"--{option}: found {value:g}, expected a number that is not negative.")
+        refuse_outside(0.0, LARGEST, "a number that is not negative", **asdict(self))
         for sigma, correlation in (
             ("path-sigma-m", "path-correlation-s"),
             ("attitude-sigma-deg", "attitude-correlation-s"),
@@ -121,9 +117,10 @@ def write_moment_tracks(
 
 def _entry_of_several(points: Sequence[TrackPoint]) -> dict[str, object]:
     """One row of several sources, in the keys of one and of fixes of several."""
-    first, keys = points[0], ("position_m", "moment_Am2", "covariance")
-    of_row = {key: getattr(first, key) for key in ("time_s", "nis", "nis_dof", "status")}
-    return of_row | {"sources": [{key: getattr(point, key) for key in keys} for point in points]}
+    from magloc.localization.fit.results import values_of
+
+    sources = [values_of(point, ("position_m", "moment_Am2", "covariance")) for point in points]
+    return values_of(points[0], ("time_s", "nis", "nis_dof", "status")) | {"sources": sources}
 
 
 def _note(found: MomentTrack, determined: BoolArray, readings: Path, outputs: TrackOutputs) -> None:

@@ -10,7 +10,7 @@ from cyclopts import Parameter
 
 import magloc
 from arrays.io.errors import LARGEST, InputError, naming
-from magloc.cli.framework import CommonOptions, Flag, print_result
+from magloc.cli.framework import ABOVE_ZERO, CommonOptions, Flag, print_result, refuse_outside
 from magloc.cli.moments.known_path import PathErrorOptions, refuse_bounds
 from magloc.cli.options import KnownOptions, ambient_field, print_note
 
@@ -70,8 +70,7 @@ def signature(
         )
     depths = depth_m or []
     for depth in depths:
-        if not 0.0 < depth <= LARGEST:
-            raise InputError(f"--depth-m: found {depth:g}, expected a positive number.")
+        refuse_outside(ABOVE_ZERO, LARGEST, "a positive number", depth_m=depth)
     refuse_bounds(known)
     nominal, used = known.array(array), None
     passes: list[Readings] = []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -234,6 +235,11 @@ class Fix:
         others = len(self.solutions) - 1
         more = f" and {others} other solution{'s' if others > 1 else ''}" if others else ""
         return f"Fix({self.best!r}{more}{'' if self.detected else ', not detected'})"
+
+
+def values_of(of: object, keys: Iterable[str]) -> dict[str, Any]:
+    """Return attributes of a source, a solution or a point of a track by their keys in JSON."""
+    return {key: getattr(of, key.replace("interval95", "interval")) for key in keys}
 
 
 def is_misfit(chi2: ArrayLike, dof: ArrayLike) -> Any:

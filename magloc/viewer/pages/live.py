@@ -17,7 +17,6 @@ from scipy.spatial.transform import Rotation
 
 from arrays.array import SensorArray
 from arrays.io.errors import InputError
-from arrays.typing import FloatArray
 from magloc.live.follower import LivePoint
 from magloc.live.tally import Tally
 from magloc.readings import Readings
@@ -204,8 +203,7 @@ class LivePage:
         """The newest row in the scene and in words."""
         point, row = newest.point, newest.row
         if row is not None:
-            x, y, z, w = _quaternion(row.R_world_from_array)
-            self._glyphs.set_pose(row.origin_m, (x, y, z, w))
+            self._glyphs.set_pose(row.origin_m, Rotation.from_matrix(row.R_world_from_array).as_quat())
         recent = [seen.point for seen in window if seen.point.time_s >= point.time_s - WINDOW_S]
         now = sources_of(point)
         for id in now:
@@ -272,8 +270,3 @@ def words_of(point: TrackPoint | SourcesPoint) -> str:
         return point_words(sources[ALONE], when)
     known = [point_words(source, f"source {id}") for id, source in sources.items()]
     return "".join([words.panel([when, escape(point.status)], warning=not known), *known])
-
-
-def _quaternion(R: FloatArray) -> FloatArray:
-    """The unit quaternion xyzw of a rotation matrix (3, 3)."""
-    return Rotation.from_matrix(R).as_quat()

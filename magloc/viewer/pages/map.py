@@ -12,6 +12,7 @@ from arrays.typing import ByteArray, FloatArray
 from magloc.viewer.pages.open_result import MapResult
 from magloc.viewer.panels.inputs import set_value
 from magloc.viewer.panels.latest import Latest
+from magloc.viewer.scene.fields import PICTURE_AXES, picture_axes
 from magloc.viewer.scene.glyphs import (
     REGION_COLOUR,
     Colour,
@@ -121,8 +122,6 @@ _PIXELS_OF_SLICE = 400
 _SLICE_ALPHA = 225
 _FAILED_ALPHA = 120
 _CUT_AXIS = 1  # the first camera looks along y
-# Axes of the picture (across, down) that together with its normal are right-handed.
-_PICTURE_AXES = ((1, 2), (2, 0), (0, 1))
 
 
 class MapView:
@@ -174,7 +173,7 @@ class MapView:
                 side,
                 side,
                 format="png",
-                wxyz=_picture_wxyz(i),
+                wxyz=Rotation.from_matrix(picture_axes(i).T).as_quat(scalar_first=True),
                 position=self._place(i),
                 cast_shadow=False,
                 receive_shadow=False,
@@ -309,7 +308,7 @@ class MapView:
 
     def _picture(self, i: int) -> ByteArray:
         """The plane across an axis, with cells of several pixels so that their edges stay sharp."""
-        across, down = _PICTURE_AXES[i]
+        across, down = PICTURE_AXES[i]
         plane = np.take(self._colour_cube, self.indices[i], axis=i)
         if across < down:  # the plane's axes are in their order; rows go down
             plane = plane.swapaxes(0, 1)
@@ -331,9 +330,3 @@ def _limits(result: MapResult) -> tuple[float, float]:
     if not result.logarithmic:
         high = float(np.ceil(high))
     return low, high if high > low else low + 1.0
-
-
-def _picture_wxyz(i: int) -> FloatArray:
-    across, down = _PICTURE_AXES[i]
-    R = np.stack([np.eye(3)[across], np.eye(3)[down], np.eye(3)[i]], axis=1)
-    return np.roll(Rotation.from_matrix(R).as_quat(), 1)

@@ -85,7 +85,7 @@ class FieldSlice:
         Three decades, up to the field that one pixel in a hundred exceeds.
         """
         positions, moments = np.atleast_2d(positions_m), np.atleast_2d(moments_Am2)
-        R = _picture_axes(axis)
+        R = picture_axes(axis)
         steps = self._side_m * (np.arange(_PIXELS) + 0.5 - 0.5 * _PIXELS) / _PIXELS
         points = positions[0] + steps[None, :, None] * R[0] + steps[:, None, None] * R[1]
         B = np.linalg.norm(field(points[..., None, :], positions, moments).sum(axis=-2), axis=-1)
@@ -93,14 +93,18 @@ class FieldSlice:
         low = high * 10.0**-_DECADES
         self._image.image = _coloured(np.log10(B / low) / _DECADES)
         self._image.position = positions[0]
-        self._image.wxyz = np.roll(Rotation.from_matrix(R.T).as_quat(), 1)
+        self._image.wxyz = Rotation.from_matrix(R.T).as_quat(scalar_first=True)
         self._image.visible = True
         return low, high
 
 
-def _picture_axes(axis: int) -> FloatArray:
-    """Across, down and out of a picture (3, 3), one a row; right-handed."""
-    across, down = ((1, 2), (2, 0), (0, 1))[axis]
+PICTURE_AXES = ((1, 2), (2, 0), (0, 1))
+"""Axes of the scene across and down a picture that is across an axis."""
+
+
+def picture_axes(axis: int) -> FloatArray:
+    """Return the directions across, down and out of a picture (3, 3), one a row; right-handed."""
+    across, down = PICTURE_AXES[axis]
     return np.eye(3)[[across, down, axis]]
 
 

@@ -310,7 +310,7 @@ class TestCommand:
         [
             (["--scale-arcsec", "0"], "--scale-arcsec: found 0, expected a positive number"),
             (["--year", "1e9"], "--year: found 1e+09, expected 1900 to 2100"),
-            (["--scale-tolerance", "0.5"], "--scale-tolerance: found 0.5, expected 0.1 at most"),
+            (["--scale-tolerance", "0.5"], "--scale-tolerance: found 0.5, expected a positive number, 0.1 at most"),
             (["--dark", "none.png"], "none.png does not exist"),
         ],
     )

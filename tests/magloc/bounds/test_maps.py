@@ -10,6 +10,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -33,7 +34,7 @@ from magloc.bounds.maps import (
 from magloc.bounds.spheres import accuracy_ranges, bound_spheres
 from magloc.directions import sphere_directions
 from magloc.grids.computed import computed_map
-from magloc.grids.cube import boxes, computed_here
+from magloc.grids.cube import boxes, computed
 from magloc.grids.store import Sweep, open_map
 
 SCENARIO = BoundScenario(moment_Am2=(60.0, 50.0, 60.0), half_width_m=8.0, n_moments=21)
@@ -103,7 +104,7 @@ class TestCube:
         cube_map = InBoxes(small, 40)
         assert len(list(boxes(cube_map))) == 8
         with Sweep(cube_map, tmp_path / "map.zarr") as sweep:
-            sweep.write(computed_here(cube_map, sweep.unfinished()))
+            sweep.write(map(partial(computed, cube_map), sweep.unfinished()))
         with open_map(tmp_path / "map.zarr") as stored:
             # All at once, without boxes.
             places = np.stack(np.meshgrid(*3 * [cube_map.axis], indexing="ij"), axis=-1)

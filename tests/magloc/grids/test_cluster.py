@@ -12,6 +12,7 @@ import subprocess
 import sys
 import threading
 import time
+from functools import partial
 
 import numpy as np
 import pytest
@@ -21,8 +22,8 @@ from arrays.io.errors import InputError
 from magloc.cli.app import main
 from magloc.convergence.filters import DampedFilter, IekfFilter
 from magloc.convergence.over_starts import StartsMap, StartsScenario
-from magloc.grids.cluster import check_address, computed_by
-from magloc.grids.cube import boxes, computed_here, in_memory
+from magloc.grids.cluster import check_address, worked_by
+from magloc.grids.cube import boxes, computed, in_memory
 from magloc.grids.store import Sweep, open_map
 from magloc.grids.work import workers
 from tests.conftest import REPOSITORY
@@ -126,7 +127,7 @@ class TestCluster:
         address, _ = cluster
         broken = StartsMap(cube.scenario, cube.grid, None, cube.z, cube.optimum)
         with pytest.raises(InputError, match=r"a worker failed \(AttributeError: "):
-            list(computed_by(address, broken, boxes(cube)))
+            list(worked_by(address, partial(computed, broken), boxes(cube)))
 
     @pytest.mark.slow
     def test_same_values_and_then_death(self, cluster, tmp_path, cube):
@@ -135,7 +136,7 @@ class TestCluster:
         path = tmp_path / "map.zarr"
 
         def until_the_scheduler_dies():
-            for i, chunk in enumerate(computed_by(address, cube, sweep.unfinished())):
+            for i, chunk in enumerate(worked_by(address, partial(computed, cube), sweep.unfinished())):
                 if i == 6:
                     scheduler.kill()
                 yield chunk
@@ -148,7 +149,7 @@ class TestCluster:
         marks = marks_of(path)
         assert len(marks) == by_workers
         with Sweep(cube, path) as sweep:
-            sweep.write(computed_here(cube, sweep.unfinished()))
+            sweep.write(map(partial(computed, cube), sweep.unfinished()))
         assert {mark: written for mark, written in marks_of(path).items() if mark in marks} == marks
         expected = in_memory(cube)
         with open_map(path) as stored:
@@ -163,28 +164,28 @@ class TestTls:
         assert tls_scheduler.startswith("tls://127.0.0.1:")
         cube = StartsMap.of(StartsScenario(method=IekfFilter(max_iterations=5)), 5)
         with dask.config.set(tls):
-            (chunk,) = computed_by(tls_scheduler, cube, boxes(cube))
-        (expected,) = computed_here(cube, boxes(cube))
+            (chunk,) = worked_by(tls_scheduler, partial(computed, cube), boxes(cube))
+        (expected,) = map(partial(computed, cube), boxes(cube))
         for name, values in expected.values.items():
             np.testing.assert_array_equal(chunk.values[name], values)
 
     def test_nobody_without_a_certificate(self, tls_scheduler, cube):
         with pytest.raises(InputError, match="found no certificates in dask's configuration"):
-            list(computed_by(tls_scheduler, cube, boxes(cube)))
+            list(worked_by(tls_scheduler, partial(computed, cube), boxes(cube)))
         plain = tls_scheduler.replace("tls:", "tcp:")
         with pytest.raises(InputError, match=f"scheduler {plain}: found (no scheduler|another service) there"):
-            list(computed_by(plain, cube, boxes(cube), timeout_s=2.0))
+            list(worked_by(plain, partial(computed, cube), boxes(cube), timeout_s=2.0))
 
     def test_certificates_that_are_not_there(self, tls_scheduler, tls, tmp_path, cube):
         wrong = tls | {"distributed.comm.tls.ca-file": str(tmp_path / "none.pem")}
         with dask.config.set(wrong), pytest.raises(InputError, match="dask's certificates cannot be read"):
-            list(computed_by(tls_scheduler, cube, boxes(cube)))
+            list(worked_by(tls_scheduler, partial(computed, cube), boxes(cube)))
 
 
 class TestNoCluster:
     def test_nobody_there(self, cube):
         with pytest.raises(InputError, match=r"scheduler tcp://127\.0\.0\.1:9: found no scheduler there"):
-            list(computed_by("tcp://127.0.0.1:9", cube, boxes(cube), timeout_s=0.2))
+            list(worked_by("tcp://127.0.0.1:9", partial(computed, cube), boxes(cube), timeout_s=0.2))
 
     @pytest.mark.parametrize("address", ["foo", "nonsense:::", "", "http://x", "tcp://x", "x:0", "x:65536", "a b:1"])
     def test_not_an_address(self, address, tmp_path, capsys):
@@ -218,13 +219,13 @@ class TestNoCluster:
                 dask.config.set({f"distributed.comm.timeouts.{name}": "1 day" for name in ("connect", "tcp")}),
                 pytest.raises(InputError, match=f"scheduler {address}: found (no scheduler|another service) there"),
             ):
-                list(computed_by(address, cube, boxes(cube), timeout_s=0.3))
+                list(worked_by(address, partial(computed, cube), boxes(cube), timeout_s=0.3))
             gc.collect()
 
     def test_not_installed(self, monkeypatch, cube):
         monkeypatch.setitem(sys.modules, "distributed", None)
         with pytest.raises(InputError, match=r'needs the extra "cluster": pip install "magloc\[cluster\]"'):
-            list(computed_by("tcp://127.0.0.1:9", cube, boxes(cube)))
+            list(worked_by("tcp://127.0.0.1:9", partial(computed, cube), boxes(cube)))
 
 
 def marks_of(path):

@@ -18,6 +18,7 @@ import subprocess
 import sys
 import time
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ import xarray as xr
 from arrays.io.errors import InputError
 from magloc.convergence.filters import IekfFilter
 from magloc.convergence.over_starts import StartsMap, StartsScenario, summary
-from magloc.grids.cube import Box, Tally, Variable, boxes, computed_here, in_memory
+from magloc.grids.cube import Box, Tally, Variable, boxes, computed, in_memory
 from magloc.grids.store import Sweep, chunk_seconds, open_map
 from tests.conftest import REPOSITORY
 from tests.waiting import wait_for
@@ -80,7 +81,7 @@ def waves(tmp_path):
 
 def run(cube, path):
     with Sweep(cube, path) as sweep:
-        sweep.write(computed_here(cube, sweep.unfinished()))
+        sweep.write(map(partial(computed, cube), sweep.unfinished()))
         return sweep
 
 
@@ -162,7 +163,7 @@ class TestInterruption:
 
         monkeypatch.setattr(Waves, "values", values)
         with pytest.raises(KeyboardInterrupt):
-            next(computed_here(waves, boxes(waves)))
+            next(map(partial(computed, waves), boxes(waves)))
         assert parts == [(6, 16, 16)]
 
     @pytest.mark.parametrize("passes", [100, 500])
@@ -184,7 +185,7 @@ class TestResume:
 
     def test_after_an_error(self, waves, tmp_path):
         def broken():
-            yield from list(computed_here(waves, boxes(waves)))[:5]
+            yield from list(map(partial(computed, waves), boxes(waves)))[:5]
             raise KeyboardInterrupt
 
         with Sweep(waves, tmp_path / "map.zarr") as sweep, pytest.raises(KeyboardInterrupt):
@@ -215,7 +216,7 @@ class TestResume:
         before = computed_boxes(waves)
         with Sweep(waves, tmp_path / "map.zarr") as sweep:
             assert sweep.chunks_done == len(done) / 3
-            sweep.write(computed_here(waves, sweep.unfinished()))
+            sweep.write(map(partial(computed, waves), sweep.unfinished()))
         assert {path: path.stat().st_mtime_ns for path in done} == done
         # The one that was being computed or written is computed again, no other.
         assert len(computed_boxes(waves)) <= 28
@@ -226,7 +227,7 @@ class TestResume:
     def test_a_store_with_other_chunks(self, waves, tmp_path):
         """How large new chunks are may change; a store goes on with its own."""
         with Sweep(waves, tmp_path / "map.zarr") as sweep:
-            sweep.write(itertools.islice(computed_here(waves, sweep.unfinished()), 5))
+            sweep.write(itertools.islice(map(partial(computed, waves), sweep.unfinished()), 5))
         assert run(replace(waves, edge=20), tmp_path / "map.zarr").chunks_done == 27
         assert_same(tmp_path / "map.zarr", in_memory(waves))
 
@@ -381,14 +382,14 @@ class TestFullDisk:
         try:
             with Sweep(waves, disk / "map.zarr") as sweep:
                 with pytest.raises(OSError, match="No space left on device"):
-                    sweep.write(computed_here(waves, sweep.unfinished()))
+                    sweep.write(map(partial(computed, waves), sweep.unfinished()))
                 done = sweep.chunks_done
             assert 0 < done < 27
             subprocess.run(["mount", "-o", "remount,size=20m", str(disk)], check=True)
             with Sweep(waves, disk / "map.zarr") as sweep:
                 assert sweep.chunks_done == done
                 assert sweep.unreadable == []
-                sweep.write(computed_here(waves, sweep.unfinished()))
+                sweep.write(map(partial(computed, waves), sweep.unfinished()))
             assert_same(disk / "map.zarr", in_memory(waves))
         finally:
             subprocess.run(["umount", str(disk)], check=True)
