@@ -31,7 +31,6 @@ from adcs.kalman.error_state import (
     sensor_set,
 )
 from adcs.kalman.mekf import (
-    closed_loop_jacobian,
     collected,
     corrected,
     first_state,
@@ -41,7 +40,6 @@ from adcs.kalman.mekf import (
     predicted,
     residuals,
     run_filter,
-    run_readable,
     whole_start,
     with_error,
 )
@@ -434,16 +432,6 @@ class TestAcceptance:
         estimates = run_filter(runs, chosen, start_of(runs))
         assert (evaluate(runs, estimates)["angle_rms_deg"] or 0.0) > 5.0
         assert all("a bias of the gyro is not in the state" in one[0] for one in warnings_of(runs, estimates))
-
-    @pytest.mark.slow
-    def test_closed_loop_jacobian_is_overconfident(self) -> None:
-        """Negative: the F of the source, which takes the torque for a feedback of the truth."""
-        chosen = settings("mag+sun")
-        runs, start = runs_for(chosen.sensors, 200.0)
-        right = evaluate(runs, run_filter(runs, chosen, start))
-        wrong = evaluate(runs, run_readable(runs, chosen, start, jacobian=closed_loop_jacobian))
-        assert (wrong["angle_rms_deg"] or 0.0) > 1.5 * (right["angle_rms_deg"] or 9.0)
-        assert (wrong["nees_per_dimension"] or 0.0) > 3.0
 
 
 class TestConsistency:
