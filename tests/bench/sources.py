@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from scipy.optimize import least_squares
 
 from arrays.array import SensorArray
 from arrays.sensor import Sensor
+from magloc.localization.locator import Locator
 from magloc.measurement.differences import DifferenceMeasurement, predicted_channels
 from tests.bench.fixes import REACHED, best_fit, multi_start, random_directions
 from tests.bench.table import Row
@@ -47,23 +48,8 @@ def scalar_sensors(size: Size) -> Row:
     def peer(problems: np.ndarray) -> list[float]:
         return [2.0 * multi_start(measurement, row, starts).cost for row in problems]
 
-    locator = plain_locator(array)
-    ours = [fix.solutions[0].chi2 if fix.solutions else np.inf for fix in locator.fit_rows(readings)]
-    timed = size.timed(z)
-    timings = interleaved(
-        {
-            "ours": Contestant(lambda: locator.fit_rows(readings), 1, n),
-            "scipy": Contestant(lambda: peer(timed), 1, len(timed)),
-        },
-        size.rounds,
-    )
-    return Row(
-        f"a fix by 12 scalar sensors, {n} at once",
-        timings["ours"],
-        "scipy, 6 starts",
-        timings["scipy"],
-        f"optimum found: ours {reached(ours, best)}, peer {reached(peer(z), best)}",
-    )
+    what = f"a fix by 12 scalar sensors, {n} at once"
+    return compared(what, "scipy, 6 starts", size, plain_locator(array), readings, peer, z, best)
 
 
 def two_sources(size: Size) -> Row:
@@ -104,23 +90,32 @@ def two_sources(size: Size) -> Row:
     def peer(problems: np.ndarray) -> list[float]:
         return [min(fit(row, start_at(row, pair)) for pair in pairs) for row in problems]
 
-    locator = plain_locator(array, sources=2)
+    what = f"two sources by 16 vector sensors, {n} at once"
+    return compared(what, "scipy, 20 starts", size, plain_locator(array, sources=2), readings, peer, z, best)
+
+
+def compared(
+    what: str,
+    of_peer: str,
+    size: Size,
+    locator: Locator,
+    readings: np.ndarray,
+    peer: Callable[[np.ndarray], list[float]],
+    z: np.ndarray,
+    best: list[float],
+) -> Row:
+    """Our fixes of readings against the peer's of their differences, and how many of both are the optimum."""
     ours = [fix.solutions[0].chi2 if fix.solutions else np.inf for fix in locator.fit_rows(readings)]
     timed = size.timed(z)
     timings = interleaved(
         {
-            "ours": Contestant(lambda: locator.fit_rows(readings), 1, n),
+            "ours": Contestant(lambda: locator.fit_rows(readings), 1, len(readings)),
             "scipy": Contestant(lambda: peer(timed), 1, len(timed)),
         },
         size.rounds,
     )
-    return Row(
-        f"two sources by 16 vector sensors, {n} at once",
-        timings["ours"],
-        "scipy, 20 starts",
-        timings["scipy"],
-        f"optimum found: ours {reached(ours, best)}, peer {reached(peer(z), best)}",
-    )
+    found = f"optimum found: ours {reached(ours, best)}, peer {reached(peer(z), best)}"
+    return Row(what, timings["ours"], of_peer, timings["scipy"], found)
 
 
 def reached(chi2: list[float], best: list[float]) -> str:

@@ -166,11 +166,6 @@ class TestBounds:
         variances = np.diagonal(bounds.covariance, axis1=-2, axis2=-1)
         np.testing.assert_allclose(bounds.sigma_position_m**2, variances[..., :3].sum(axis=-1))
 
-    def test_moments_on_sphere(self):
-        moments = magloc.moments_on_sphere(3.0, 100)
-        np.testing.assert_allclose(np.linalg.norm(moments, axis=1), 3.0)
-        np.testing.assert_allclose(moments.mean(axis=0), 0.0, atol=0.05)
-
     @pytest.mark.slow
     def test_detection_range(self):
         """A quantile over directions and moments; it grows with the fourth root of the moment, as differences fall."""

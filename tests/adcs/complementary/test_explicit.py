@@ -135,20 +135,6 @@ class TestTwins:
         for other in found[1:]:
             np.testing.assert_array_equal(other.q, found[0].q)
 
-    def test_runs_do_not_depend_on_each_other(self):
-        record = short_record()
-        track = complementary_track(record)
-        alone = VectorRecord(
-            record.dt_s,
-            record.rate_rad_s[1],
-            record.first_body[1],
-            record.second_body[1],
-            record.first_reference,
-            record.second_reference,
-            record.frame_rate_rad_s,
-        )
-        np.testing.assert_array_equal(complementary_track(alone).q[0], track.q[1])
-
     def test_nothing_to_do(self):
         assert complementary_track(short_record(n=0)).q.shape == (2, 0, 4)
 

@@ -48,12 +48,11 @@ def follow(
     rate: float = 0.0,
     gravity: float = 0.0,
     field: Array = ZERO,
-    torque: Array = ZERO,
 ) -> list[tuple[Array, Array, Array]]:
     """States every dt with resting wheels."""
     states = [(q, w, momentum)]
     for _ in range(round(seconds / dt)):
-        states.append(dynamics.step(body, *states[-1], ZERO, torque, rate, gravity, field, dt))
+        states.append(dynamics.step(body, *states[-1], ZERO, ZERO, rate, gravity, field, dt))
     return states
 
 
@@ -154,11 +153,6 @@ class TestClosedForms:
         states = follow(needle, quaternion.exp(np.array([0.0, 0.0, 1e-3])), ZERO, seconds=600.0, field=field)
         yaw = [quaternion.log(q)[2] for q, _, _ in states]
         np.testing.assert_allclose(yaw, 1e-3 * np.cos(frequency * np.arange(601.0)), rtol=0, atol=1e-8)
-
-    def test_constant_torque(self) -> None:
-        states = follow(BODY, quaternion.IDENTITY, ZERO, seconds=10.0, torque=np.array([1e-7, 0.0, 0.0]))
-        # The gyroscopic torque is of second order in the rate of 2e-6 rad/s.
-        np.testing.assert_allclose(states[-1][1], 10.0 * BODY.inverse @ [1e-7, 0, 0], rtol=0, atol=1e-12)
 
     def test_rest_in_the_orbital_frame_is_a_turn_in_space(self) -> None:
         w = dynamics.absolute_rate(quaternion.IDENTITY, ZERO, RATE)
@@ -299,15 +293,8 @@ class TestErrorJacobian:
     def test_known_torque(self, body: RigidBody) -> None:
         F = dynamics.error_jacobian(body, *self.STATE, GRAVITY, B)
         measured = self.differences(lambda dx: error_rate(body, self.STATE, ZERO, dx))
-        np.testing.assert_allclose(F, measured, rtol=0, atol=1e-4)
         np.testing.assert_allclose(F[:, 3:, :3], measured[:, 3:, :3], rtol=0, atol=1e-9)
         np.testing.assert_allclose(F, measured, rtol=0, atol=1e-8)
-
-    def test_sign_of_the_rate_matters(self) -> None:
-        # The source's scan shows +W(ω) in F11.
-        F = dynamics.error_jacobian(BODY, *self.STATE, GRAVITY, B)
-        measured = self.differences(lambda dx: error_rate(BODY, self.STATE, ZERO, dx))
-        assert np.abs(-F[:, :3, :3] - measured[:, :3, :3]).max() > 1e-2
 
     def test_closed_loop_lacks_one_term(self) -> None:
         q, w, k = self.STATE

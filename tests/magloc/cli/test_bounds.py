@@ -18,6 +18,7 @@ from magloc.bounds.crlb import cramer_rao_bounds
 from magloc.cli.app import main
 from magloc.grids.store import Sweep, open_map
 from magloc.plots import style
+from tests.command_line import assert_refused
 
 KEYS = [
     "position_m",
@@ -266,20 +267,18 @@ class TestBadInput:
             (["--nonsense"], "--nonsense"),
         ],
     )
-    def test_is_one_line_and_writes_nothing(self, options, expected, tmp_path, capsys, monkeypatch):
+    def test_is_one_line_and_writes_nothing(self, options, expected, tmp_path, run, monkeypatch):
         monkeypatch.chdir(tmp_path)
-        assert main(["bounds", *options, "--out", str(tmp_path / "out")]) == 2
-        out, err = capsys.readouterr()
-        assert out == ""
-        assert len(err.splitlines()) == 1
-        assert expected in err
+        outcome = run("bounds", *options, "--out", tmp_path / "out")
+        assert outcome.out == ""
+        assert_refused(outcome, expected)
         assert not list(tmp_path.iterdir())
 
-    def test_a_sensor_alone_knows_no_place(self, tmp_path, capsys):
+    def test_a_sensor_alone_knows_no_place(self, tmp_path, run):
         path = tmp_path / "one.toml"
         write_array(path, SensorArray(tetrahedron(1.0).sensors[:1], common_field_T=1e-9))
-        assert main(["bounds", "--array", str(path), "--out", str(tmp_path / "out")]) == 2
-        assert "received 1, which knows no place: magloc locate --position" in capsys.readouterr().err
+        outcome = run("bounds", "--array", path, "--out", tmp_path / "out")
+        assert_refused(outcome, "received 1, which knows no place: magloc locate --position")
 
     @with_plain_pictures
     def test_an_interruption_says_what_is_done(self, tmp_path, capsys, monkeypatch):
@@ -290,9 +289,8 @@ class TestBadInput:
         assert main(["bounds", *QUICK, "--out", str(tmp_path)]) == 130
         assert "0 of 1 chunks are done, the same command goes on" in capsys.readouterr().err
 
-    def test_a_file_in_place_of_the_folder(self, tmp_path, capsys):
+    def test_a_file_in_place_of_the_folder(self, tmp_path, run):
         path = tmp_path / "file"
         path.write_text("mine")
-        assert main(["bounds", *QUICK, "--out", str(path)]) == 2
-        assert "found a file, expected a folder" in capsys.readouterr().err
+        assert_refused(run("bounds", *QUICK, "--out", path), "found a file, expected a folder")
         assert path.read_text() == "mine"

@@ -18,7 +18,7 @@ from arrays.array_file import read_array, read_sensors, write_array
 from arrays.sensor import Calibration, Sensor
 from magloc.calibration import calibrate as calibration
 from magloc.readings import Readings, write_readings
-from tests.command_line import Outcome, Run, assert_refused
+from tests.command_line import Outcome, Run, assert_refused, refuse_constant
 from tests.oracles import magpylib_field
 
 FloatArray = NDArray[np.float64]
@@ -114,6 +114,19 @@ def assert_recovered(files: Files, *, but_gain: bool = False, within_m: float = 
     np.testing.assert_allclose(found.channel_gain / factor, true.channel_gain, rtol=0, atol=2e-3)
 
 
+def calibrate(run: Run, files: Files, *flags: str, **options: str | Path) -> Outcome:
+    """Run the command with the files and with further options."""
+    given: dict[str, str | Path] = {"array": files.array, "out": files.out, **options}
+    return run("calibrate", files.readings, *(word for name in given for word in (f"--{name}", given[name])), *flags)
+
+
+def calibrated(run: Run, files: Files, *flags: str, **options: str | Path) -> Outcome:
+    """Run it where it must not fail."""
+    outcome = calibrate(run, files, *flags, **options)
+    assert outcome.status == 0, outcome.err
+    return outcome
+
+
 def assert_nothing_written(outcome: Outcome, files: Files, *fragments: str) -> None:
     """Refused, and no array file nor a part of one."""
     assert_refused(outcome, *fragments)
@@ -122,8 +135,7 @@ def assert_nothing_written(outcome: Outcome, files: Files, *fragments: str) -> N
 
 class TestArrayFile:
     def test_known_path(self, run: Run, files: Files) -> None:
-        outcome = run("calibrate", files.readings, "--array", files.array, "--truth", files.truth(), "--out", files.out)
-        assert outcome.status == 0, outcome.err
+        outcome = calibrated(run, files, truth=files.truth())
         assert_recovered(files, but_gain=True)
         assert outcome.out.splitlines()[0].split()[:2] == ["sensor", "position"]
         assert len(outcome.out.splitlines()) == 7
@@ -131,19 +143,13 @@ class TestArrayFile:
         assert "not told by the readings" in outcome.err
         assert "common gain against the moment" in outcome.err
 
-    def test_known_moment(self, run: Run, files: Files) -> None:
-        truth = files.truth(moment=True)
-        outcome = run("calibrate", files.readings, "--array", files.array, "--truth", truth, "--out", files.out)
-        assert outcome.status == 0, outcome.err
+    @pytest.mark.parametrize("posed", [False, True])
+    def test_known_moment(self, run: Run, tmp_path: Path, posed: bool) -> None:
+        """By an array that stands, and by one that moves."""
+        files = made(tmp_path, posed=posed)
+        outcome = calibrated(run, files, truth=files.truth(moment=True))
         assert_recovered(files)
         assert "not told" not in outcome.err
-
-    def test_moving_array(self, run: Run, tmp_path: Path) -> None:
-        files = made(tmp_path, posed=True)
-        truth = files.truth(moment=True)
-        outcome = run("calibrate", files.readings, "--array", files.array, "--truth", truth, "--out", files.out)
-        assert outcome.status == 0, outcome.err
-        assert_recovered(files)
 
     def test_self_calibration_with_trusted_sensors(self, run: Run, files: Files) -> None:
         nominal = read_array(files.array)
@@ -157,12 +163,8 @@ class TestArrayFile:
             for s, t in zip(nominal.sensors, files.true.sensors, strict=True)
         ]
         write_array(files.array, replace(nominal, sensors=tuple(sensors)))
-        outcome = run(
-            "calibrate", files.readings, "--array", files.array, "--out", files.out,
-            "--trust-position", ",".join(trusted), "--trust-scale", "s4", "--quiet",
-        )  # fmt: skip
-        assert outcome.status == 0, outcome.err
-        assert outcome.err == ""
+        options = {"trust-position": ",".join(trusted), "trust-scale": "s4"}
+        assert calibrated(run, files, "--quiet", **options).err == ""
         assert_recovered(files)
         written = read_array(files.out)
         assert [s.position_m for s in written.sensors[:3]] == [s.position_m for s in files.true.sensors[:3]]
@@ -173,11 +175,7 @@ class TestArrayFile:
         truth = files.truth()
         lines = truth.read_text(encoding="utf-8").splitlines()
         truth.write_text("\n".join([lines[0], *lines[6:], "1000.5,0,0,0", ""]), encoding="utf-8")
-        outcome = run(
-            "calibrate", files.readings, "--array", files.array, "--truth", truth, "--out", files.out, "--json"
-        )
-        assert outcome.status == 0, outcome.err
-        assert json.loads(outcome.out)["rows_used"] == 35
+        assert json.loads(calibrated(run, files, "--json", truth=truth).out)["rows_used"] == 35
         assert_recovered(files, but_gain=True)
 
     def test_height(self, run: Run, files: Files) -> None:
@@ -187,30 +185,13 @@ class TestArrayFile:
         fields = np.stack([magpylib_field(files.true.positions, p, MOMENT) for p in flat.position_m])
         values = files.true.readings_of(fields) + NOISE_T * rng.normal(size=(40, 18))
         write_readings(files.readings, Readings(values), files.true)
-        arguments = (
-            "calibrate",
-            files.readings,
-            "--array",
-            files.array,
-            "--truth",
-            flat.truth("xy"),
-            "--out",
-            files.out,
-        )
-        unknown = run(*arguments)
-        assert unknown.status == 0, unknown.err
-        assert "translation along z" in unknown.err
-        given = run(*arguments, "--height-m", "0.25")
-        assert given.status == 0, given.err
-        assert "translation along z" not in given.err
+        truth = flat.truth("xy")
+        assert "translation along z" in calibrated(run, files, truth=truth).err
+        assert "translation along z" not in calibrated(run, files, truth=truth, **{"height-m": "0.25"}).err
         assert_recovered(files, but_gain=True, within_m=2e-4)
 
     def test_estimate(self, run: Run, files: Files) -> None:
-        outcome = run(
-            "calibrate", files.readings, "--array", files.array, "--truth", files.truth(), "--out", files.out,
-            "--estimate", "gains, offsets",
-        )  # fmt: skip
-        assert outcome.status == 0, outcome.err
+        calibrated(run, files, truth=files.truth(), estimate="gains, offsets")
         before, after = read_array(files.array), read_array(files.out)
         np.testing.assert_array_equal(after.positions, before.positions)
         scales = np.array([sensor.calibration.scale for sensor in after.sensors])
@@ -218,15 +199,10 @@ class TestArrayFile:
 
 
 class TestJson:
-    def refuse_constant(self, name: str) -> None:
-        raise AssertionError(f"{name} is not JSON")
-
     def test_keys(self, run: Run, files: Files) -> None:
-        outcome = run(
-            "calibrate", files.readings, "--array", files.array, "--truth", files.truth(), "--out", files.out, "--json"
-        )
+        outcome = calibrated(run, files, "--json", truth=files.truth())
         assert outcome.err == ""
-        report: dict[str, Any] = json.loads(outcome.out, parse_constant=self.refuse_constant)
+        report: dict[str, Any] = json.loads(outcome.out, parse_constant=refuse_constant)
         assert set(report) == {
             "out", "rows", "rows_used", "chi2_before", "dof_before", "chi2_after", "dof_after", "iterations",
             "converged", "moment_Am2", "sensors", "unobservable",
@@ -248,10 +224,6 @@ class TestJson:
 
 
 class TestRefusals:
-    def arguments(self, files: Files, **changed: str | Path) -> list[str | Path]:
-        options: dict[str, str | Path] = {"array": files.array, "out": files.out, **changed}
-        return ["calibrate", files.readings, *(x for name, value in options.items() for x in (f"--{name}", value))]
-
     @pytest.mark.parametrize(
         ("option", "value", "message"),
         [
@@ -266,42 +238,40 @@ class TestRefusals:
         ],
     )
     def test_options(self, run: Run, files: Files, option: str, value: str, message: str) -> None:
-        assert_nothing_written(run(*self.arguments(files, **{option: value})), files, message)
+        assert_nothing_written(calibrate(run, files, **{option: value}), files, message)
 
     def test_height_twice(self, run: Run, files: Files) -> None:
         truth = files.truth()
-        outcome = run(*self.arguments(files, truth=truth, **{"height-m": "0.1"}))
+        outcome = calibrate(run, files, truth=truth, **{"height-m": "0.1"})
         assert_nothing_written(outcome, files, "--height-m: found z_m in", "expected a truth file without it")
 
     def test_times_that_do_not_match(self, run: Run, files: Files) -> None:
         truth = files.truth(shift_s=0.5)
-        outcome = run(*self.arguments(files, truth=truth))
+        outcome = calibrate(run, files, truth=truth)
         assert_nothing_written(outcome, files, "truth.csv: found none of the times of", "0 s to 39 s")
 
     @pytest.mark.parametrize("with_truth", [False, True])
     def test_too_few_rows(self, run: Run, tmp_path: Path, with_truth: bool) -> None:
         files = made(tmp_path, n=4)
         extra = {"truth": files.truth()} if with_truth else {}
-        assert_nothing_written(
-            run(*self.arguments(files, **extra)), files, "readings.csv", "more readings than unknowns"
-        )
+        assert_nothing_written(calibrate(run, files, **extra), files, "readings.csv", "more readings than unknowns")
 
     def test_no_folder(self, run: Run, files: Files) -> None:
-        outcome = run(*self.arguments(files, out=files.folder / "nowhere" / "out.toml"))
+        outcome = calibrate(run, files, out=files.folder / "nowhere" / "out.toml")
         assert_nothing_written(outcome, files, "nowhere", "found no folder")
 
     @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
     def test_folder_that_cannot_be_written(self, run: Run, files: Files) -> None:
         files.folder.chmod(0o500)
         try:
-            outcome = run(*self.arguments(files))
+            outcome = calibrate(run, files)
         finally:
             files.folder.chmod(0o700)
         assert_nothing_written(outcome, files, "out.toml: Permission denied")
 
     def test_out_is_a_folder(self, run: Run, files: Files, tmp_path_factory: pytest.TempPathFactory) -> None:
         folder = tmp_path_factory.mktemp("taken")
-        assert_nothing_written(run(*self.arguments(files, truth=files.truth(), out=folder)), files, f"{folder}: ")
+        assert_nothing_written(calibrate(run, files, truth=files.truth(), out=folder), files, f"{folder}: ")
         assert list(folder.iterdir()) == []
 
     def test_scalar_sensors(self, run: Run, files: Files) -> None:
@@ -309,7 +279,7 @@ class TestRefusals:
         array = SensorArray(tuple(sensors))
         write_array(files.array, array)
         write_readings(files.readings, Readings(np.ones((4, 3))), array)
-        assert_nothing_written(run(*self.arguments(files)), files, "must have vector sensors only")
+        assert_nothing_written(calibrate(run, files), files, "must have vector sensors only")
 
     def test_what_does_not_converge_is_not_written(
         self, run: Run, files: Files, monkeypatch: pytest.MonkeyPatch
@@ -319,7 +289,7 @@ class TestRefusals:
             calibration, "self_calibrate", lambda *args, **options: replace(honest(*args, **options), converged=False)
         )
         assert_nothing_written(
-            run(*self.arguments(files)), files, "the calibration did not converge within", "is not written"
+            calibrate(run, files), files, "the calibration did not converge within", "is not written"
         )
 
 
@@ -328,6 +298,11 @@ class TestTurnedInAKnownModulus:
 
     SCALE = np.array([[1.05, 0.02, -0.01], [0.0, 0.97, 0.03], [0.0, 0.0, 1.01]])
     OFFSET_T = np.array([300e-9, -150e-9, 80e-9])
+
+    @staticmethod
+    def directions(n: int) -> np.ndarray:
+        directions = np.random.default_rng(1).normal(size=(n, 3))
+        return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
     def write(self, folder: Path, directions: np.ndarray) -> tuple[str, ...]:
         (folder / "one.toml").write_text(
@@ -343,9 +318,7 @@ class TestTurnedInAKnownModulus:
         )  # fmt: skip
 
     def test_single_sensor(self, run: Run, tmp_path: Path) -> None:
-        directions = np.random.default_rng(1).normal(size=(400, 3))
-        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        outcome = run(*self.write(tmp_path, directions), "--json")
+        outcome = run(*self.write(tmp_path, self.directions(400)), "--json")
         assert outcome.status == 0, outcome.err
         (sensor,) = read_sensors(tmp_path / "out.toml").sensors
         np.testing.assert_allclose(sensor.calibration.offset_T, self.OFFSET_T, atol=3e-9)
@@ -358,11 +331,8 @@ class TestTurnedInAKnownModulus:
 
     def changing(self, folder: Path) -> tuple[tuple[str, ...], np.ndarray]:
         """A record in a field that changes, and its modulus."""
-        rng = np.random.default_rng(1)
-        directions = rng.normal(size=(400, 3))
-        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         modulus = 48e3 + 300.0 * np.sin(np.arange(400) / 40.0)
-        return self.write(folder, directions * modulus[:, None] / 48e3), modulus
+        return self.write(folder, self.directions(400) * modulus[:, None] / 48e3), modulus
 
     def test_modulus_through_time(self, run: Run, tmp_path: Path) -> None:
         command, modulus = self.changing(tmp_path)
@@ -402,9 +372,7 @@ class TestTurnedInAKnownModulus:
         assert not (tmp_path / "out.toml").exists()
 
     def test_modulus_in_another_unit(self, run: Run, tmp_path: Path) -> None:
-        directions = np.random.default_rng(1).normal(size=(100, 3))
-        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        command = self.write(tmp_path, directions)
+        command = self.write(tmp_path, self.directions(100))
         assert_refused(run(*command[:-1], "48"), "--modulus-nT", "in nT", "not written")
         assert not (tmp_path / "out.toml").exists()
 

@@ -25,6 +25,7 @@ from magloc.convergence.scenario_files import built_in_scenarios, read_sources_s
 from magloc.grids.cube import Summary
 from magloc.grids.store import open_map
 from magloc.plots import style
+from tests.command_line import assert_refused
 from tests.conftest import REPOSITORY
 
 SOURCE = "[source]\nposition_m = [5, 0, 0.3]\nmoment_Am2 = [100, 0, 0]\n"
@@ -153,9 +154,9 @@ class TestOverSources:
                 assert dataset.attrs["known_moment_sigma_Am2"] == 30.0
                 assert dataset.attrs["body_length_m"] == length_m
 
-    def test_starts_are_no_bodies(self, tmp_path, capsys):
-        assert main(["map", "--grid", "3", "--body-length-m", "1", "--out", str(tmp_path / "out")]) == 2
-        assert "--body-length-m: found 1, expected none over starts" in capsys.readouterr().err
+    def test_starts_are_no_bodies(self, tmp_path, run):
+        outcome = run("map", "--grid", "3", "--body-length-m", "1", "--out", tmp_path / "out")
+        assert_refused(outcome, "--body-length-m: found 1, expected none over starts")
 
     def test_the_paper_file_has_the_defaults(self):
         default = SourcesScenario()
@@ -176,13 +177,10 @@ class TestOverSources:
             (ARRAY, ["--over", "moments"], "--over"),
         ],
     )
-    def test_bad_input(self, text, options, expected, tmp_path, capsys):
-        path = tmp_path / "bad.toml"
+    def test_bad_input(self, text, options, expected, tmp_path, run):
+        path, out = tmp_path / "bad.toml", tmp_path / "out"
         path.write_text(text)
-        out = tmp_path / "out"
-        assert main(["map", str(path), "--over", "sources", "--grid", "3", "--out", str(out), *options]) == 2
-        (line,) = capsys.readouterr().err.splitlines()
-        assert expected in line
+        assert_refused(run("map", path, "--over", "sources", "--grid", 3, "--out", out, *options), expected)
         assert not out.exists()
 
 
@@ -259,16 +257,13 @@ class TestInterrupted:
         assert main(arguments) == 0
         assert "was complete, nothing was computed again" in capsys.readouterr().err
 
-    def test_another_map_in_the_folder(self, tmp_path, capsys):
-        assert main(["map", "--grid", "5", "--out", str(tmp_path), "--quiet"]) == 0
+    def test_another_map_in_the_folder(self, tmp_path, run):
+        assert run("map", "--grid", "5", "--out", tmp_path, "--quiet").status == 0
         before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
-        capsys.readouterr()
         for options in (["--grid", "6"], ["--grid", "5", "--method", "iekf"], ["--grid", "5", "--over", "sources"]):
-            assert main(["map", *options, "--out", str(tmp_path)]) == 2
-            out, err = capsys.readouterr()
-            assert out == ""
-            assert len(err.splitlines()) == 1
-            assert "found another map, with" in err
+            outcome = run("map", *options, "--out", tmp_path)
+            assert outcome.out == ""
+            assert_refused(outcome, "found another map, with")
         assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
 
     @pytest.mark.slow
@@ -328,15 +323,12 @@ class TestBadInput:
             ("[array\n", "line 1"),
         ],
     )
-    def test_scenario_files(self, text, expected, tmp_path, capsys):
-        path = tmp_path / "bad.toml"
+    def test_scenario_files(self, text, expected, tmp_path, run):
+        path, out = tmp_path / "bad.toml", tmp_path / "out"
         path.write_text(text)
-        out = tmp_path / "out"
-        assert main(["map", str(path), "--grid", "3", "--out", str(out)]) == 2
-        lines = capsys.readouterr().err.splitlines()
-        assert len(lines) == 1
-        assert expected in lines[0]
-        assert "bad.toml" in lines[0] or "nowhere.toml" in lines[0]
+        outcome = run("map", path, "--grid", "3", "--out", out)
+        assert_refused(outcome, expected)
+        assert "bad.toml" in outcome.err or "nowhere.toml" in outcome.err
         assert not out.exists() or not any(out.iterdir())
 
     @pytest.mark.parametrize(
@@ -350,17 +342,13 @@ class TestBadInput:
             (["--over", "sources", "--device", "cuda"], "--device: found cuda, expected cpu"),
         ],
     )
-    def test_options(self, arguments, expected, tmp_path, capsys):
-        assert main(["map", *arguments, "--out", str(tmp_path / "out")]) == 2
+    def test_options(self, arguments, expected, tmp_path, run):
+        assert_refused(run("map", *arguments, "--out", tmp_path / "out"), expected)
         assert not (tmp_path / "out").exists()
-        lines = capsys.readouterr().err.splitlines()
-        assert len(lines) == 1
-        assert expected in lines[0]
 
-    def test_out_is_a_file(self, tmp_path, capsys):
+    def test_out_is_a_file(self, tmp_path, run):
         (tmp_path / "file").write_text("kept")
-        assert main(["map", "--grid", "3", "--out", str(tmp_path / "file")]) == 2
-        assert "found a file, expected a folder" in capsys.readouterr().err
+        assert_refused(run("map", "--grid", "3", "--out", tmp_path / "file"), "found a file, expected a folder")
         assert (tmp_path / "file").read_text() == "kept"
 
 

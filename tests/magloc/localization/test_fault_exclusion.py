@@ -33,19 +33,12 @@ from magloc.measurement.rows import whitened_rows
 from magloc.readings import Readings, read_readings
 from magloc.truth import read_truth
 from tests.passing_source import readings_of
-from tests.plain_locator import plain_locator
+from tests.plain_locator import plain_locator, random_sources
 
 AMBIENT = np.array([2e-5, 0.0, 4.5e-5])
 NOISE = 1e-9
 SLOW = pytest.mark.slow
 CUBE = cube(1.0, "vector", NOISE)
-
-
-def random_sources(rng, n, nearest, farthest, modulus):
-    direction, m = rng.normal(size=(2, n, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    m *= modulus / np.linalg.norm(m, axis=1, keepdims=True)
-    return direction * rng.uniform(nearest, farthest, (n, 1)), m
 
 
 def readings_in_ambient_field(array, position, moment, rng):

@@ -16,7 +16,7 @@ import magloc
 from arrays.array import SensorArray
 from arrays.geometries import grid, square, tetrahedron
 from magloc.localization.locator import fit_at_rest
-from tests.plain_locator import plain_locator
+from tests.plain_locator import plain_locator, random_sources
 
 MODULUS_AM2 = 100.0
 EARTH_T = (2e-5, 1e-6, 4.5e-5)
@@ -25,9 +25,7 @@ EARTH_T = (2e-5, 1e-6, 4.5e-5)
 def sources(n: int, range_m: tuple[float, float], seed: int):
     """Places all around, and moments of one modulus."""
     rng = np.random.default_rng(seed)
-    directions, moments = rng.normal(size=(2, n, 3))
-    directions *= (rng.uniform(*range_m, size=n) / np.linalg.norm(directions, axis=1))[:, None]
-    return directions, MODULUS_AM2 * moments / np.linalg.norm(moments, axis=1, keepdims=True), rng
+    return *random_sources(rng, n, *range_m, MODULUS_AM2), rng
 
 
 def readings_of(array: SensorArray, position, moment, rng):

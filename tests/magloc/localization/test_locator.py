@@ -24,15 +24,13 @@ from tests.magloc.localization.fit.test_gauss_newton import (
     scalar_cloud,
     scipy_optimum,
 )
-from tests.plain_locator import plain_locator
+from tests.plain_locator import plain_locator, random_sources
 
 
 def sources_anywhere(rng, n, nearest=2.8, farthest=5.0, moment=300.0):
     """Positions and moments (n, 1, 3) in any direction."""
-    direction, m = rng.normal(size=(2, n, 1, 3))
-    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
-    m *= moment / np.linalg.norm(m, axis=-1, keepdims=True)
-    return direction * rng.uniform(nearest, farthest, (n, 1, 1)), m
+    position, m = random_sources(rng, n, nearest, farthest, moment)
+    return position[:, None], m[:, None]
 
 
 def position_errors(fixes, positions):

@@ -24,7 +24,6 @@ from arrays.array_file import read_array, write_array
 from arrays.geometries import cube, tetrahedron
 from magloc.viewer.origin import MOST_BYTES, guarded_server
 from magloc.viewer.pages.array_editor import ArrayEditor
-from magloc.viewer.server import opened
 from tests.conftest import REPOSITORY
 from tests.waiting import WAIT_S, wait_for
 
@@ -41,12 +40,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "work").mkdir()
     monkeypatch.chdir(tmp_path / "work")
     return tmp_path / "work"
-
-
-@pytest.fixture
-def server() -> Iterator[viser.ViserServer]:
-    with opened(0, "test") as server:
-        yield server
 
 
 @contextmanager

@@ -6,12 +6,11 @@ import math
 
 import numpy as np
 import pytest
-from cyclopts import App, CycloptsError
 from matplotlib import image
 
-from adcs.cli.app import main
 from arrays.io.errors import InputError
-from sims.cli.run_complementary import ComplementaryOptions, complementary, run_complementary, summary_lines
+from sims.cli.run_complementary import ComplementaryOptions, run_complementary, summary_lines
+from tests.adcs.refusals import assert_refused
 
 KEYS = ["rms_deg", "steady_rms_deg", "peak_deg", "outage_max_deg"]
 
@@ -67,39 +66,30 @@ class TestResult:
 
 
 class TestCommand:
-    """The command as ``adcs run`` registers it."""
-
-    def run(self, capsys, *arguments):
-        assert main(["run", "complementary", *arguments]) == 0
-        return capsys.readouterr()
-
-    def test_json(self, capsys):
+    def test_json(self, adcs):
         arguments = ("--json", "--filter", "gauss-newton", "--kp", "0.01", "--ki", "1e-5", "--sigma-nT", "500")
         more = ("--runs", "2", "--seed", "3", "--amplitude-deg", "8", "--outage", "transported")
-        out, err = self.run(capsys, *arguments, *more)
+        _, out, err = adcs("run", "complementary", *arguments, *more)
         options = ComplementaryOptions("gauss-newton", 0.01, 1e-5, 500.0, "transported", 8.0, 2, 3)
         assert json.loads(out) == run_complementary(options)
         assert err == ""
 
-    def test_text_and_files(self, capsys, tmp_path):
-        out, err = self.run(capsys, "--duration", "3000", "--out", str(tmp_path))
+    def test_text_and_files(self, adcs, tmp_path):
+        _, out, err = adcs("run", "complementary", "--duration", "3000", "--out", str(tmp_path))
         assert out.startswith("explicit filter, K_P 1/(50 s), K_I 1/(100 s)²\nmagnetometer 1000 nT")
         assert "wrote complementary.png" in err
-        assert self.run(capsys, "--duration", "3000", "--out", str(tmp_path), "--quiet").err == ""
+        assert adcs("run", "complementary", "--duration", "3000", "--out", str(tmp_path), "--quiet").err == ""
 
-    def test_a_gain_close_to_the_limit(self, capsys):
-        _, err = self.run(capsys, "--duration", "3000", "--kp", "0.95", "--ki", "0")
+    def test_a_gain_close_to_the_limit(self, adcs):
+        err = adcs("run", "complementary", "--duration", "3000", "--kp", "0.95", "--ki", "0").err
         assert err == (
             "adcs: warning: K_P = 0.95 1/s is close to 1 1/s, where a filter with steps of 1 s becomes unstable: it "
             "amplifies noise.\n"
         )
 
     @pytest.mark.parametrize("arguments", [("--filter", "best"), ("--outage", "sun")])
-    def test_unknown_names(self, arguments):
-        app = App(name="run")
-        app.command(complementary)
-        with pytest.raises(CycloptsError, match=arguments[0]):
-            app.parse_args(["complementary", *arguments], print_error=False, exit_on_error=False)
+    def test_unknown_names(self, adcs, arguments):
+        assert_refused(adcs("run", "complementary", *arguments), arguments[0])
 
 
 class TestFiles:

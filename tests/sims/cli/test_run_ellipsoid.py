@@ -6,12 +6,11 @@ import math
 
 import numpy as np
 import pytest
-from cyclopts import App, CycloptsError
 from matplotlib import image
 
-from adcs.cli.app import main
 from arrays.io.errors import InputError
-from sims.cli.run_ellipsoid import EllipsoidOptions, ellipsoid, run_ellipsoid, summary_lines
+from sims.cli.run_ellipsoid import EllipsoidOptions, run_ellipsoid, summary_lines
+from tests.adcs.refusals import assert_refused
 
 KEYS = [
     "final_error_mean_deg",
@@ -74,46 +73,26 @@ class TestResult:
 
 
 class TestCommand:
-    """The command as ``adcs run`` registers it."""
-
-    def run(self, capsys, *arguments):
-        assert main(["run", "ellipsoid", *arguments]) == 0
-        return capsys.readouterr()
-
-    def test_json(self, capsys):
-        out, err = self.run(
-            capsys,
-            "--json",
-            "--runs",
-            "3",
-            "--seed",
-            "7",
-            "--duration",
-            "200",
-            "--noise-deg",
-            "4",
-            "--drift-deg-s",
-            "0.0001",
-            "--step",
-            "lemma",
-            "--closed-loop",
-        )
+    def test_json(self, adcs):
+        arguments = ("--json", "--runs", "3", "--seed", "7", "--duration", "200", "--noise-deg", "4")
+        more = ("--drift-deg-s", "0.0001", "--step", "lemma", "--closed-loop")
+        _, out, err = adcs("run", "ellipsoid", *arguments, *more)
         options = EllipsoidOptions(4.0, 0.0001, "lemma", closed_loop=True, seeds=3, seed=7, duration=200.0)
         assert json.loads(out) == run_ellipsoid(options)
         assert err == ""
 
-    def test_text_and_files(self, capsys, tmp_path):
-        out, err = self.run(capsys, "--seeds", "2", "--duration", "100", "--out", str(tmp_path))
+    def test_text_and_files(self, adcs, tmp_path):
+        command = ("run", "ellipsoid", "--seeds", "2", "--duration", "100", "--out", tmp_path)
+        _, out, err = adcs(*command)
         assert len(out.splitlines()) == 5
         assert "wrote ellipsoid.png" in err
-        assert self.run(capsys, "--seeds", "2", "--duration", "100", "--out", str(tmp_path), "--quiet").err == ""
+        assert (
+            adcs("run", "ellipsoid", "--seeds", "2", "--duration", "100", "--out", str(tmp_path), "--quiet").err == ""
+        )
 
     @pytest.mark.parametrize(("option", "value"), [("--step", "best"), ("--seed", "-1"), ("--seeds", "0")])
-    def test_a_value_that_is_none(self, option, value):
-        app = App(name="run")
-        app.command(ellipsoid)
-        with pytest.raises(CycloptsError, match=option):
-            app.parse_args(["ellipsoid", option, value], print_error=False, exit_on_error=False)
+    def test_a_value_that_is_none(self, adcs, option, value):
+        assert_refused(adcs("run", "ellipsoid", option, value), option)
 
 
 class TestFiles:

@@ -26,7 +26,6 @@ from sims.magnetics.sensors import SensorModel
 from sims.magnetics.simulation import MU0, Simulation, simulate
 from sims.noise import stream
 from tests.oracles import magpylib_field
-from tests.sims.magnetics.white_noise import with_white_noise_only
 
 FloatArray = NDArray[np.float64]
 FALSE_ALARM = 1e-4
@@ -156,10 +155,6 @@ class TestCommonFields:
         coefficients, residual, *_ = np.linalg.lstsq(design, wave, rcond=None)
         assert residual[0] < 1e-20
         assert np.hypot(*coefficients) == pytest.approx(1.0)
-
-    def test_another_seed_has_another_phase(self) -> None:
-        one, two = (simulate(scenario(pulsations=self.PULSATIONS, sources=()), k).readings.values_T for k in (1, 2))
-        assert not np.allclose(one, two)
 
     def test_differences_of_a_moving_array_do_not_see_them(self) -> None:
         quiet, loud = (
@@ -479,18 +474,6 @@ class TestScenario:
     @pytest.mark.parametrize(("duration_s", "rate_Hz", "rows"), [(0.1, 30.0, 4), (160.0, 2.0, 321), (1.05, 2.0, 3)])
     def test_rows_end_with_the_duration(self, duration_s: float, rate_Hz: float, rows: int) -> None:
         assert len(scenario(duration_s=duration_s, rate_Hz=rate_Hz).time_s) == rows
-
-    def test_white_noise_only_keeps_the_noise_of_a_sample(self) -> None:
-        full = TestRandomNumbers.FULL
-        white = with_white_noise_only(full)
-        for before, after in zip(full.nominal_array.sensors, white.nominal_array.sensors, strict=True):
-            assert after.noise_T == pytest.approx(before.noise_T, rel=1e-11)
-            assert after.misalignment_rad == after.gain_uncertainty == 0.0
-            assert after.saturation_T == before.saturation_T
-        result = simulate(replace(white, sources=(), ambient_T=None, pulsations=(), missing=Missing()), 1)
-        normalised = result.readings.values_T / white.nominal_array.channel_noise_T
-        low, high = bounds(normalised.size)
-        assert low < (normalised**2).sum() < high
 
     def test_a_simulation_without_a_source_has_no_truth(self) -> None:
         with pytest.raises(ValueError, match="source"):

@@ -10,7 +10,6 @@ import pytest
 from adcs.mockup.navigation.imu import G_M_S2, Inclinometer, RateGyro
 
 GYRO = RateGyro(zero_rad_s=math.radians(0.3))
-ACCELEROMETER = Inclinometer(zero_m_s2=np.array([0.01, -0.02]), tilt_rad=np.radians([0.2, -0.1]))
 
 
 class TestReadings:

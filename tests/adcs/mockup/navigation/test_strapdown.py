@@ -51,10 +51,6 @@ class TestSign:
         np.testing.assert_allclose(track.position_m[-1], [0.0, 0.02], atol=1e-15)
         np.testing.assert_allclose(track.velocity_m_s[-1], [0.0, 0.04], atol=1e-15)
 
-    def test_at_a_heading_of_90_degrees_thrust_along_y_moves_against_x(self) -> None:
-        track = strapdown(constant(100, [0.0, 0.04], 0.0), PlanarState(np.zeros(2), np.zeros(2), math.pi / 2))
-        np.testing.assert_allclose(track.position_m[-1], [-0.02, 0.0], atol=1e-15)
-
     def test_a_positive_rate_turns_thrust_from_x_towards_y(self) -> None:
         turn = strapdown(constant(100, [0.0, 0.0], math.pi / 2), REST).state(-1)
         assert turn.heading_rad == pytest.approx(math.pi / 2)
@@ -103,10 +99,6 @@ class TestIntegration:
         np.testing.assert_allclose(end.position_m, start.position_m + start.velocity_m_s * t + 0.5 * a * t**2)
         np.testing.assert_allclose(end.velocity_m_s, start.velocity_m_s + a * t)
 
-    def test_the_old_velocity_moves_it(self) -> None:
-        one = step(PlanarState(np.zeros(2), np.array([1.0, 0.0]), 0.0), 0.1, [2.0, 0.0], 0.0)
-        assert one.position_m[0] == pytest.approx(1.0 * 0.1 + 2.0 * 0.1**2 / 2.0, abs=1e-16)
-
     def test_a_turning_thrust_is_that_of_the_differential_equation(self) -> None:
         a, w = np.array([0.03, 0.01]), 0.7
 
@@ -121,10 +113,6 @@ class TestIntegration:
             assert end.heading_rad == pytest.approx(exact[4])
         assert errors[0] < 2e-6
         assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.05)  # the middle heading makes it of second order
-
-    def test_a_zero_of_1_mm_s2_is_5_cm_after_10_s(self) -> None:
-        track = strapdown(constant(1000, [0.001, 0.0], 0.0), REST)
-        assert track.position_m[-1, 0] == pytest.approx(0.05)
 
 
 class TestCutting:

@@ -27,7 +27,6 @@ from tests.adcs.mockup.stars_of_poses import (
     projected,
     projected_set,
     random_points,
-    random_pose,
     rendered_set,
     score,
 )
@@ -207,10 +206,3 @@ class TestLongestCloseSubset:
 
     def test_nothing(self):
         assert len(longest_close_subset(np.empty(0, dtype=complex), 0.02)) == 0
-
-
-def test_random_poses_stay_in_reach():
-    """The frames of all these tests: within the range of the source's figures."""
-    poses = [random_pose(np.random.default_rng(i)) for i in range(200)]
-    assert max(abs(pose.x_m) for pose in poses) <= 1.25
-    assert max(abs(pose.y_m) for pose in poses) <= 1.0

@@ -23,8 +23,7 @@ from magloc.localization.search.candidates import (
 from magloc.localization.search.single_source import SingleSourceSearch
 from magloc.measurement.differences import channel_jacobian
 from magloc.measurement.rows import whitened_rows
-from tests.magloc.localization.search.test_single_source import noisy_readings
-from tests.plain_locator import plain_locator
+from tests.plain_locator import noisy_readings, plain_locator
 from tests.variable_projection import best_moment, projected_chi2, refined
 
 

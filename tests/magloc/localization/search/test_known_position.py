@@ -28,7 +28,7 @@ from magloc.fields import dipole
 from magloc.localization.fit.prior import SourcePrior
 from magloc.measurement.differences import DifferenceMeasurement, predicted_channels
 from tests.arrays.test_differences import random_array
-from tests.plain_locator import plain_locator
+from tests.plain_locator import noisy_readings, plain_locator
 
 SEEDS = st.integers(0, 2**32 - 1)
 PLACE = np.array([5.0, 0.0, 0.306])
@@ -43,11 +43,6 @@ def scalar_tetrahedron(noise_T, ambient_T=None):
 def random_moments(rng, n, modulus=300.0):
     m = rng.normal(size=(n, 3))
     return m * modulus / np.linalg.norm(m, axis=1, keepdims=True)
-
-
-def noisy_readings(array, position, moment, rng):
-    clean = predicted_channels(array, position, moment) + array.channel_offset_T
-    return clean + rng.normal(size=clean.shape) * array.channel_noise_T
 
 
 def moments_of(fix):

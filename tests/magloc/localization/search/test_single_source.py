@@ -28,22 +28,10 @@ from magloc.localization.search.candidates import candidate_positions
 from magloc.localization.search.single_source import SingleSourceSearch
 from magloc.measurement.differences import DifferenceMeasurement, predicted_channels
 from tests.arrays.test_differences import random_array
-from tests.plain_locator import plain_locator
+from tests.plain_locator import noisy_readings, plain_locator, random_sources
 
 SEEDS = st.integers(0, 2**32 - 1)
 TETRAHEDRON = tetrahedron(1.5, noise_T=1e-9)
-
-
-def random_sources(rng, n, nearest, farthest, moment=300.0):
-    direction, m = rng.normal(size=(2, n, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    m *= moment / np.linalg.norm(m, axis=1, keepdims=True)
-    return direction * rng.uniform(nearest, farthest, (n, 1)), m
-
-
-def noisy_readings(array, position, moment, rng):
-    clean = predicted_channels(array, position, moment) + array.channel_offset_T
-    return clean + rng.normal(size=clean.shape) * array.channel_noise_T
 
 
 def scipy_chi2(array, readings, position, moment):
@@ -69,7 +57,7 @@ class TestNoiseFreeReadings:
     @settings(max_examples=25, deadline=None)
     def test_any_array(self, seed, n):
         array = random_array(seed, n)
-        p, m = random_sources(np.random.default_rng(seed), 1, 3.0, 8.0, moment=1e4)
+        p, m = random_sources(np.random.default_rng(seed), 1, 3.0, 8.0, moment_Am2=1e4)
         readings = predicted_channels(array, p[0], m[0]) + array.channel_offset_T
         found = plain_locator(array).fit(readings).solutions
         distance = [np.linalg.norm(s.position_m - p[0]) for s in found]
@@ -120,7 +108,7 @@ class TestBestFit:
     def test_chi_square_of_good_fits(self):
         """Sum of 200 χ² of 3 degrees of freedom at high signal; two-sided false-alarm rate 1e-4."""
         rng = np.random.default_rng(2)
-        p, m = random_sources(rng, 200, 1.5, 4.0, moment=1000.0)
+        p, m = random_sources(rng, 200, 1.5, 4.0, moment_Am2=1000.0)
         fixes = plain_locator(TETRAHEDRON).fit_rows(noisy_readings(TETRAHEDRON, p, m, rng))
         assert {fix.solutions[0].dof for fix in fixes} == {3}
         low, high = chi2_distribution.ppf([0.5e-4, 1 - 0.5e-4], 3 * 200)
@@ -166,7 +154,7 @@ class TestMissingReadings:
     def test_the_rest_of_the_row_is_used(self):
         array = random_array(1, 6)
         rng = np.random.default_rng(10)
-        p, m = random_sources(rng, 3, 3.0, 5.0, moment=1e4)
+        p, m = random_sources(rng, 3, 3.0, 5.0, moment_Am2=1e4)
         readings = noisy_readings(array, p, m, rng)
         readings[0, 4] = readings[1, [0, 7, 9]] = np.nan
         fixes = plain_locator(array).fit_rows(readings)

@@ -55,7 +55,7 @@ from magloc.tracking.rows import Row
 from magloc.tracking.tracker import Tracker
 from tests import oracles
 from tests.passing_source import ARRAY, MOMENT, POSITION, followed, readings_of
-from tests.plain_locator import plain_locator
+from tests.plain_locator import plain_locator, random_sources
 from tests.variable_projection import projected_chi2
 
 FloatArray = NDArray[np.float64]
@@ -104,10 +104,8 @@ class Problems:
     @classmethod
     def around(cls, array: SensorArray, nearest: float, farthest: float, n: int, seed: int) -> Problems:
         rng = np.random.default_rng(seed)
-        direction, moment = rng.normal(size=(2, n, 3))
-        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-        moment *= 300.0 / np.linalg.norm(moment, axis=1, keepdims=True)
-        position = array.centroid + direction * rng.uniform(nearest, farthest, (n, 1))
+        offset, moment = random_sources(rng, n, nearest, farthest)
+        position = array.centroid + offset
         clean = predicted_channels(array, position, moment)
         readings = clean + rng.normal(size=clean.shape) * array.channel_noise_T
         return cls(array, position, moment, readings, plain_locator(array).fit_rows(readings))
@@ -401,10 +399,8 @@ class TestProfileOfModuli:
     def stretches(self, rise: float) -> FloatArray:
         """Of the best fits of sources at 1.5 to 8 m, from clearly observable to hopeless."""
         array, rng = scalar_array((2e-5, 1e-6, 4e-5)), np.random.default_rng(11)
-        direction, moment = rng.normal(size=(2, self.N, 3))
-        direction *= rng.uniform(1.5, 8.0, (self.N, 1)) / np.linalg.norm(direction, axis=1, keepdims=True)
-        moment *= 100.0 / np.linalg.norm(moment, axis=1, keepdims=True)
-        readings = predicted_channels(array, array.centroid + direction, moment) + rng.normal(0.0, 1e-9, (self.N, 9))
+        offset, moment = random_sources(rng, self.N, 1.5, 8.0, 100.0)
+        readings = predicted_channels(array, array.centroid + offset, moment) + rng.normal(0.0, 1e-9, (self.N, 9))
         (rows,) = whitened_rows(array, readings, None, self.N)
         (optima,) = plain_locator(array)._search.optima(rows)
         solved, best = np.unique(optima.of_row, return_index=True)

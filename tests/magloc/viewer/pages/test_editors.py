@@ -8,7 +8,6 @@ three unknowns more, while the project takes differences.
 import asyncio
 import threading
 import time
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -37,20 +36,12 @@ from magloc.viewer.pages.words import panel
 from magloc.viewer.panels.inputs import set_value
 from magloc.viewer.panels.latest import Latest
 from magloc.viewer.scene.glyphs import turned_to
-from magloc.viewer.server import free_port, opened
+from tests.magloc.viewer.conftest import node
 from tests.oracles import derivative, magpylib_field
 from tests.plain_locator import plain_locator
 from tests.waiting import WAIT_S, wait_for
 
 SMALL, LARGE = tetrahedron(0.03), cube(30.0)
-
-
-@pytest.fixture
-def server() -> Iterator[viser.ViserServer]:
-    before = set(threading.enumerate())
-    with opened(free_port(0), "test") as server:
-        yield server
-    wait_for(lambda: set(threading.enumerate()) <= before)
 
 
 def drag(server: viser.ViserServer, control: viser.TransformControlsHandle, position_m, wxyz=None) -> None:
@@ -61,12 +52,6 @@ def drag(server: viser.ViserServer, control: viser.TransformControlsHandle, posi
     )
     handle = server.scene._handle_transform_controls_updates(0, message)
     asyncio.run_coroutine_threadsafe(handle, server.get_event_loop()).result(WAIT_S)
-
-
-def node(server: viser.ViserServer, name: str) -> viser.SceneNodeHandle:
-    handle = server.scene.get_handle_by_name(name)
-    assert handle is not None
-    return handle
 
 
 def bound_with_unknown_common_field(array: SensorArray, position, moment) -> np.ndarray:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 import viser
@@ -17,16 +15,9 @@ from magloc.viewer.pages.pages import _nearest_rows
 from magloc.viewer.panels.inputs import set_value
 from magloc.viewer.panels.readings_plot import ALL, RAW, ReadingsPlot, residuals_of
 from magloc.viewer.scene.track_glyph import linear, track_segments
-from magloc.viewer.server import opened
 from tests.waiting import wait_for
 
 ARRAY = tetrahedron(1.5)
-
-
-@pytest.fixture
-def server() -> Iterator[viser.ViserServer]:
-    with opened(0, "test") as opened_server:
-        yield opened_server
 
 
 def rows_of(n: int, rng: np.random.Generator) -> Readings:

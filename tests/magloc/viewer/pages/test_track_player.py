@@ -9,7 +9,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import viser
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -33,7 +32,7 @@ from magloc.viewer.panels.readings_plot import (
     thinned,
 )
 from magloc.viewer.scene.glyphs import FIELD_LINE_COLOUR, TRACK_COLOUR, ArrayGlyphs
-from magloc.viewer.server import free_port, opened
+from tests.magloc.viewer.conftest import node
 from tests.waiting import wait_for
 
 ARRAY = tetrahedron(0.3)
@@ -76,14 +75,6 @@ def readings(n: int = N, start_s: float = 1000.0) -> Readings:
     return Readings(values, time_s=start_s + STEP_S * np.arange(n))
 
 
-@pytest.fixture
-def server() -> Iterator[viser.ViserServer]:
-    before = set(threading.enumerate())
-    with opened(free_port(0), "test") as server:
-        yield server
-    wait_for(lambda: set(threading.enumerate()) <= before)
-
-
 def of_one(points: list[TrackPoint]) -> TrackResult:
     return TrackResult(tuple(points), is_truth=False)
 
@@ -93,12 +84,6 @@ def player(server) -> Iterator[TrackPlayer]:
     player = TrackPlayer(server, of_one(track()), 0.5)
     yield player
     player.pause()
-
-
-def node(server: viser.ViserServer, name: str) -> viser.SceneNodeHandle:
-    handle = server.scene.get_handle_by_name(name)
-    assert handle is not None
-    return handle
 
 
 class TestTrackPlayer:

@@ -2,21 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 import viser
 
 from magloc.viewer.scene import framing
 from magloc.viewer.scene.ruler import DropLines, add_ruler
-from magloc.viewer.server import opened
-
-
-@pytest.fixture
-def server() -> Iterator[viser.ViserServer]:
-    with opened(0, "test") as opened_server:
-        yield opened_server
 
 
 class TestRuler:
