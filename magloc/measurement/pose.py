@@ -293,12 +293,6 @@ class PoseErrors:
         return PosesOfRows(array, poses, [np.hstack(part) for part in parts])
 
 
-def pose_covariance(errors: PoseErrors, pose: ArrayPose, in_array: FloatArray, sigma: FloatArray | None) -> FloatArray:
-    """What errors of the pose add to the covariance (6, 6) of a source of the world that the array knows, (6,)."""
-    J = pose.world_jacobian(in_array) @ errors.effect(pose, sigma)
-    return J @ J.T
-
-
 def channel_errors(
     array: SensorArray, pose: ArrayPose, source: FloatArray, effect: FloatArray, ambient_T: FloatArray
 ) -> FloatArray:
