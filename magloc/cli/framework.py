@@ -132,7 +132,9 @@ def new_app(name: str, help: str, commands: Iterable[tuple[str, str, str]], **op
 
 def new_program(name: str, help: str, commands: Iterable[tuple[str, str, str]]) -> App:
     """Return the command line of a program."""
-    return new_app(name, help, commands, version=installed_version, default_parameter=Parameter(negative=()))
+    app = new_app(name, help, commands, version=installed_version, default_parameter=Parameter(negative=()))
+    app.register_install_completion_command(help="Let the Tab key complete commands and options (bash, zsh, fish).")
+    return app
 
 
 def run(app: App, arguments: Sequence[str] | None = None) -> int:
@@ -324,19 +326,17 @@ def _notes_of_the_library(program: str) -> Iterator[None]:
             logger.propagate = True
 
 
-def demonstrate(
-    app: App, out: Path, calls: Sequence[Sequence[str]], common: QuietOptions, first: int = 4, last: int = 6
-) -> None:
-    """Run commands that write into a folder, each shown as a user types it, with some lines that it prints."""
+def demonstrate(app: App, out: Path, calls: Sequence[Sequence[str]], common: QuietOptions) -> list[str]:
+    """Run commands that write into a folder, each shown as a user types it, and return what each prints."""
     make_folder(out, "OUT")
-    for tokens in [[*call, "--quiet"] if common.quiet else call for call in calls]:
-        print(f"\n$ {' '.join([app.name[0], *map(shlex.quote, tokens)])}", flush=True)
+    every = []
+    for tokens in calls:
+        if not common.quiet:
+            print(f"$ {' '.join([app.name[0], *map(shlex.quote, tokens)])}", flush=True)
         with contextlib.redirect_stdout(io.StringIO()) as printed:
-            call(app, tokens)
-        lines = printed.getvalue().splitlines()
-        if len(lines) > first + last:
-            lines[first:-last] = [f"… {len(lines) - first - last} more lines …"]
-        print("".join(f"{line}\n" for line in lines), end="", flush=True)
+            call(app, [*tokens, "--quiet"])
+        every.append(printed.getvalue())
+    return every
 
 
 def json_text(value: object) -> str:

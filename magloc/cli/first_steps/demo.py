@@ -2,26 +2,32 @@
 
 from __future__ import annotations
 
+import json
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 from magloc.cli import framework
-from magloc.cli.framework import QuietOptions
-from magloc.cli.options import print_note
+from magloc.cli.framework import Flag, QuietOptions
+
+_VIEWER = ("viser", "trimesh")
 
 
 def demo(
     out: Path = Path("magloc-demo"),
     /,
     *,
+    view: Flag = False,
     common: QuietOptions = QuietOptions(),  # noqa: B008 - frozen
 ) -> None:
-    """Simulate, locate and track a source, and draw what comes out: four commands, each shown as it is typed.
+    """Simulate, locate and track a magnet: four commands, each shown as it is typed, and what they found.
 
     Parameters
     ----------
     out : Path
         Folder for what they write.
+    view : bool
+        Open the scene in the browser at the end. Ctrl-C ends it.
     common : QuietOptions
         Common options.
     """
@@ -31,17 +37,39 @@ def demo(
     motion = ("--speed-m-s", "0.1", "--turn-deg-s", "1.2")
     calls = [
         ("simulate", "weaving", "--out", readings),
-        ("locate", readings, "--array", array),
-        ("track", readings, "--array", array, *motion, "--truth", truth, "--out", str(out / "track")),
+        ("locate", readings, "--array", array, "--json"),
+        ("track", readings, "--array", array, *motion, "--json", "--out", str(out / "track")),
         ("view", readings, "--html", str(out / "target.html")),
     ]
-    seen = calls if find_spec("viser") and find_spec("trimesh") else calls[:-1]
-    framework.demonstrate(app, out, seen, common)
+    has_viewer = all(map(find_spec, _VIEWER))
+    _, fixes, track, *_ = framework.demonstrate(app, out, calls if has_viewer else calls[:-1], common)
     if not common.quiet:
-        print_note(f"the picture is {out / 'track' / 'track.png'}")
-        page = (
-            "magloc[view] has a scene to turn as well"
-            if len(seen) < len(calls)
-            else f"a scene is {out / 'target.html'}"
-        )
-        print_note(page)
+        page = f"{out / 'target.html'}, in a browser" if has_viewer else 'pip install "magloc[view]" brings one'
+        seen = f"Picture:  {out / 'track' / 'track.png'}\n3-D page: {page}"
+        print(_story(json.loads(fixes), json.loads(track), truth), seen, _NEXT, sep="\n")
+    if view:
+        framework.call(app, ["view", readings])
+
+
+def _story(fixes: dict[str, Any], track: dict[str, Any], truth_file: str) -> str:
+    """Return what the commands have found, beside the truth."""
+    import numpy as np
+
+    truth = np.genfromtxt(truth_file, delimiter=",", names=True)
+    expected = np.stack([truth["x_m"], truth["y_m"], truth["z_m"]], axis=1)
+    last = track["results"][-1]
+    places = ([row["solutions"][0] for row in fixes["results"]], track["results"])
+    errors = [np.linalg.norm([row["position_m"] for row in rows] - expected, axis=1) for rows in places]
+    rms_m = [float(np.sqrt(np.mean(error**2))) for error in errors]
+    at = ", ".join(f"{x:.2f}" for x in last["position_m"])
+    claimed_m = float(np.sqrt(np.trace(np.array(last["covariance"])[:3, :3])))
+    duration_s = truth["time_s"][-1]
+    return f"""
+Simulated: a magnet that weaves past four magnetometers with 0.2 nT of noise, {len(truth)} rows in {duration_s:.0f} s.
+Found:     `locate` takes each row alone and is {rms_m[0]:.2f} m off (rms); `track` joins the rows, {rms_m[1]:.2f} m.
+At the end the magnet is at ({at}) m. The track is {errors[1][-1]:.2f} m off, and says ±{claimed_m:.2f} m (1 σ)."""
+
+
+_NEXT = """Next, with sensors and a log of your own:
+  magloc new-array                               describes your sensors in a file
+  magloc locate LOG.csv --array ARRAY.toml       finds the magnet in every row of your log"""

@@ -293,3 +293,17 @@ class TestSignsOfLife:
         assert self.told(monkeypatch, watched=False) == []
         assert self.told(monkeypatch, "--quiet", watched=True) == []
         assert self.told(monkeypatch, watched=True, bar=True) == []
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh"])
+@pytest.mark.parametrize("program", ["magloc", "adcs"])
+def test_completion_of_commands_and_options(
+    program: str, shell: str, request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("HOME", "XDG_DATA_HOME", "ZDOTDIR"):
+        monkeypatch.setenv(name, str(tmp_path))
+    run: Run = request.getfixturevalue("run" if program == "magloc" else program)
+    done = run("--install-completion", "--shell", shell)
+    assert done.status == 0, done.err
+    scripts = [path.read_text() for path in tmp_path.rglob("*") if path.is_file()]
+    assert any("--json" in script and "demo" in script for script in scripts)
