@@ -19,7 +19,7 @@ from magloc.tracking.chart.mixture import Mixture
 from magloc.tracking.motion import N_SOURCE
 
 UNDETERMINED = "undetermined"
-"""Status of a row before a track that shows a source and does not determine it: what is known by the rows so far."""
+"""Status of a row before a track that shows a source and does not determine it; the point is by all rows so far."""
 
 
 @dataclass(frozen=True, eq=False)

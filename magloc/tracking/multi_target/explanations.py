@@ -29,7 +29,7 @@ SENSOR_OUT, BIRTH, DEATH, MANOEUVRE = 32.0, 16.0, 14.0, 12.0
 """Penalty of an event: -2 ln of its prior probability."""
 MANOEUVRE_AGILITY = 10.0
 """Factor of the noise of velocity and turn in the step of a manoeuvre."""
-NAMES_A_ROW = 100
+IDS_PER_ROW = 100
 """The id of a source is this times the row of its birth, plus a number."""
 MOST_BY_ITSELF = 5
 """Largest number of sources that are searched for one by one; a search for more takes seconds and fails."""
@@ -321,7 +321,7 @@ class RowProblem:
     @property
     def first_id(self) -> int:
         """Lower bound of the ids of sources born in this row."""
-        return self.index * NAMES_A_ROW
+        return self.index * IDS_PER_ROW
 
     def mean_residual(self, health: SensorHealth) -> tuple[FloatArray, float]:
         """Return the mean residual (C,) of recent rows, and its energy in the best cell."""

@@ -49,7 +49,7 @@ class Hypothesis:
         -2 ln of the posterior probability, up to a constant.
     excess : ndarray, shape (2,)
         Mean excess of χ² over recent rows, with a short and a long memory.
-    judged : int
+    probation : int
         Number of rows for which a restart is still on probation; 0 after it is accepted.
     young : YoungTrack, optional
         Rows since the last birth while the hypothesis is young, later the last rows.
@@ -60,7 +60,7 @@ class Hypothesis:
     health: SensorHealth
     score: float = 0.0
     excess: FloatArray = field(default_factory=lambda: np.zeros(2))
-    judged: int = 0
+    probation: int = 0
     young: YoungTrack | None = None
 
     def refit(self, row: JointRow) -> Hypothesis:

@@ -70,7 +70,7 @@ class SourcesTrack(TrackRows[SourcesPoint]):
         Raises
         ------
         KeyError
-            There is none of that id.
+            No source has that id.
         """
         if id not in self.ids:
             raise KeyError(f"Input id must be one of {self.ids}; instead received {id}.")

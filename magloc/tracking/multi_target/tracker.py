@@ -17,10 +17,10 @@ from magloc.readings import Readings
 from magloc.tracking.multi_target.explanations import (
     BIRTH,
     COST_LIMIT,
+    IDS_PER_ROW,
     LEFT_LIMIT,
     MANOEUVRE_AGILITY,
     MOST_BY_ITSELF,
-    NAMES_A_ROW,
     Explanation,
     RowProblem,
     Scene,
@@ -56,7 +56,7 @@ _MOST_HYPOTHESES = 8
 _LESS_LIKELY = 25.0
 # Rows of a restart's probation, and rows between restarts while χ² is poor. Otherwise the first restart comes a few
 # rows after a change of the number of sources, and each next one after twice as many.
-_JUDGED_ROWS = 11
+_PROBATION_ROWS = 11
 _RESTART_PAUSE, _FIRST_PAUSE = 15, 4
 # Largest number of restarts with an additional source, and of others.
 _MOST_RESTARTS = 3
@@ -253,7 +253,7 @@ class SourcesTracker:
         """Return a hypothesis for each explanation of the row, or the prediction without any."""
         prior = predict_state(before.state, problem.step, problem.joint_row)
         plain = problem.update(prior, before.ids, before.health.dead)
-        if problem.is_consistent(plain) or (before.judged > 0 and plain.update.converged):
+        if problem.is_consistent(plain) or (before.probation > 0 and plain.update.converged):
             explanations = [plain]
         else:
             agile = self.scene.motion.numbers(dt_s, agility=MANOEUVRE_AGILITY)
@@ -286,7 +286,7 @@ class SourcesTracker:
             ids=found.ids,
             health=before.health.after(residuals, found.out, dead_chi2),
             score=before.score + found.score,
-            judged=max(0, before.judged - 1),
+            probation=max(0, before.probation - 1),
         )
         return self._with_excess(after, found)
 
@@ -302,7 +302,7 @@ class SourcesTracker:
         A source that approaches slowly biases the others row by row, and no single row shows it. A refit of all recent
         rows with and without it gives its likelihood, and corrects the others.
         """
-        rows, ids = best.young, (*best.ids, problem.first_id + NAMES_A_ROW - 1)
+        rows, ids = best.young, (*best.ids, problem.first_id + IDS_PER_ROW - 1)
         if rows is None or len(rows.rows) < _FEWEST_ROWS or len(ids) > self.scene.most_sources:
             return []
         without = rows.smooth()
@@ -335,7 +335,7 @@ class SourcesTracker:
         doubtful = [k for k in range(state.n_sources) if state.log_strength_sigma(k) > _CERTAIN_STRENGTH]
         fewer = problem.remove_sources(found, doubtful, merged_pairs(state))
         consistent = [self._after(problem, best, one) for one in fewer if problem.is_consistent(one)]
-        return [replace(one, score=best.score, excess=np.zeros(2), judged=_JUDGED_ROWS) for one in consistent]
+        return [replace(one, score=best.score, excess=np.zeros(2), probation=_PROBATION_ROWS) for one in consistent]
 
     def _restarts(self, problem: RowProblem, best: Hypothesis, found: Explanation) -> list[Hypothesis]:
         """Return hypotheses on probation: a drifting sensor, an additional source, or a restart.
@@ -346,7 +346,7 @@ class SourcesTracker:
         common, dead, known = best.state.without_sources, best.health.dead, len(best.ids)
         again = problem.explain_sources(common, best.state.position_m, best.state.moment_Am2, dead)
         anew, nothing = [again], problem.update(common, (), dead)
-        for number in (known, known - 1, known + 1):  # of many, one by one takes seconds and leads nowhere
+        for number in (known, known - 1, known + 1):  # a beam search for many takes seconds and fails
             if 0 < number <= min(self.scene.most_sources, MOST_BY_ITSELF):
                 anew += problem.explain_with_at_least(nothing, number)
         if known < self.scene.most_sources:
@@ -364,18 +364,18 @@ class SourcesTracker:
         suspect = best.health.suspect
         if suspect is not None and best.health.may_drift:
             restarts.append(replace(best, health=best.health.without(suspect)))
-        return [replace(one, excess=np.zeros(2), judged=_JUDGED_ROWS) for one in restarts]
+        return [replace(one, excess=np.zeros(2), probation=_PROBATION_ROWS) for one in restarts]
 
     def _prune(self, hypotheses: list[Hypothesis]) -> list[Hypothesis]:
         """Return the likeliest hypotheses, the best first, followed by those on probation."""
-        accepted = sorted((one for one in hypotheses if not one.judged), key=by_score)
+        accepted = sorted((one for one in hypotheses if not one.probation), key=by_score)
         on_probation = []
-        for one in (one for one in hypotheses if one.judged):
+        for one in (one for one in hypotheses if one.probation):
             gain = accepted[0].score - one.score
-            if gain > (_MUST_GAIN if one.judged == 1 else _CLEAR_GAIN):
+            if gain > (_MUST_GAIN if one.probation == 1 else _CLEAR_GAIN):
                 ids = inherit_ids(one, accepted[0])
-                accepted.append(replace(one, ids=ids, score=accepted[0].score - _MUST_GAIN, judged=0))
-            elif one.judged > 1:
+                accepted.append(replace(one, ids=ids, score=accepted[0].score - _MUST_GAIN, probation=0))
+            elif one.probation > 1:
                 on_probation.append(one)
         likely: list[Hypothesis] = []
         for one in sorted(accepted, key=by_score):
@@ -391,8 +391,8 @@ class SourcesTracker:
         """Return hypotheses split where readings are nonlinear, up to their largest number."""
         parts: list[Hypothesis] = []
         for i, one in enumerate(self._hypotheses):
-            room = _MOST_HYPOTHESES - len(parts) - sum(not other.judged for other in self._hypotheses[i:])
-            of_one = split(one.state, problem.joint_row) if room > 1 and not one.judged else [(1.0, one.state)]
+            room = _MOST_HYPOTHESES - len(parts) - sum(not other.probation for other in self._hypotheses[i:])
+            of_one = split(one.state, problem.joint_row) if room > 1 and not one.probation else [(1.0, one.state)]
             parts += [one.take_part(share, state) for share, state in of_one]
         return parts
 
@@ -400,12 +400,12 @@ class SourcesTracker:
         """Return the point of the best hypothesis."""
         array, row = self.scene.array, problem.row
         best = self._hypotheses[0] if self._hypotheses else self._no_source(problem)
-        reported = [k for k, id in enumerate(best.ids) if self._n_rows - id // NAMES_A_ROW >= ROWS_TO_REPORT]
+        reported = [k for k, id in enumerate(best.ids) if self._n_rows - id // IDS_PER_ROW >= ROWS_TO_REPORT]
         reported = reported or list(range(len(best.ids)))
         for k in reported:
             self._numbers.setdefault(best.ids[k], len(self._numbers) + 1)
         merged = np.isin(np.arange(len(best.ids)), merged_pairs(best.state))
-        accepted = [one for one in self._hypotheses if not one.judged]
+        accepted = [one for one in self._hypotheses if not one.probation]
         weights = np.exp(-0.5 * np.array([one.score - best.score for one in accepted]))
         matches = [match_sources(best, one) for one in accepted]
         tracks = [
