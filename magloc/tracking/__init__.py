@@ -1,1 +1,1 @@
-"""A source followed through time."""
+"""Tracking of one source or several through time."""

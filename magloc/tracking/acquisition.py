@@ -1,4 +1,4 @@
-"""Start of a track from several rows that are individually insufficient, for a source nearly at rest."""
+"""Start of a track from several rows that are individually insufficient."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class Acquisition:
         self._proposed: Solution | None = None
 
     def start(self, row: Row, position_error: float = 0.0) -> AcquiredSource | None:
-        """Return a source with one more row, if the array has moved enough and the source is nearly at rest.
+        """Return a source by one more row, if the array has moved enough and the source has not.
 
         `position_error` is the standard deviation of the position over the range by other estimates, 0 without any.
         """
@@ -129,7 +129,7 @@ class Acquisition:
 
 
 def _certain_solution(fix: Fix, centroid: FloatArray) -> Solution | None:
-    """Return the first solution if it is certain enough for a start and no other one fits as well."""
+    """Return the first solution if it is certain and unique enough for a start."""
     if not fix.solutions:
         return None
     best = fix.solutions[0]
@@ -140,7 +140,7 @@ def _certain_solution(fix: Fix, centroid: FloatArray) -> Solution | None:
 
 
 def _agree(before: Solution | None, after: Solution) -> bool:
-    """Return True if two successive proposals agree; a wrong optimum usually moves as rows are added."""
+    """Return True if two successive proposals agree; wrong optima usually move with new rows."""
     if before is None:
         return False
     offset = after.position_m - before.position_m
@@ -150,7 +150,7 @@ def _agree(before: Solution | None, after: Solution) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class StartState:
-    """State at the start of a track, square root of its covariance, χ² of the rows, and the state after each row."""
+    """State at the start of a track, root of its covariance, χ², and state after each row."""
 
     x: FloatArray
     S: FloatArray
@@ -159,7 +159,7 @@ class StartState:
 
 
 class CartesianFilter:
-    """Filter of Cartesian states, linearised at given states: for starts from several rows, and smoothing.
+    """Filter of Cartesian states, for starts from several rows and for smoothing.
 
     Attributes
     ----------
@@ -194,7 +194,7 @@ class CartesianFilter:
         return np.concatenate([np.ones(self.pose_errors.n_states), self.errors.sigma])
 
     def predict(self, x: FloatArray, S: FloatArray, dt_s: float) -> Prediction:
-        """Return the state, square root of its covariance and transition after a step without readings."""
+        """Return the predicted state, square root of its covariance, and transition."""
         n, n_errors = self.motion.n_states, self.n_errors
         x_motion, F_motion, S_q_motion = self.motion.step(x[:n], dt_s)
         decay, noise = step_of_errors(self.pose_errors, self.errors, dt_s)
@@ -208,7 +208,7 @@ class CartesianFilter:
     def initial_state(
         self, centre: FloatArray, root: FloatArray, R_world_from_array: FloatArray | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the state before the first row and its root, from a root (6, 6) of position and moment.
+        """Return the prior state and its root, from a root (6, 6) of position and moment.
 
         With the array's rotation, a known moment is a measurement, linearised at the centre.
         """
@@ -246,7 +246,7 @@ class CartesianFilter:
     def filter_start(
         self, centres: Sequence[FloatArray], covariance: FloatArray, measurements: Sequence[RowMeasurement]
     ) -> StartState:
-        """Return the result of one pass of :meth:`start`, with every row linearised at a given state (n,)."""
+        """Return one pass of :meth:`start`, with each row linearised at a given state (n,)."""
         unknown = np.diag(_UNKNOWN * np.sqrt(np.diagonal(covariance)))
         x, S = self.initial_state(centres[0], unknown, measurements[0].row.R_world_from_array)
         chi2, of_rows = 0.0, []

@@ -1,11 +1,11 @@
-r"""Consistency of a track: its errors beside its covariance and beside the posterior Cramér-Rao bound.
+r"""Errors of a track against its covariance and the posterior Cramér-Rao bound.
 
 The normalised estimation error squared, NEES, of an estimate of n numbers with covariance P is
 :math:`e^T P^{-1} e`; over independent rows its mean times their number is a χ² of n numbers each. The posterior
-Cramér-Rao bound is the least covariance that any estimator can reach with a motion model: of a filter by the recursion
-of Tichavský, Muravchik and Nehorai (1998), for linear motion
-:math:`J_{j+1} = (Q + F J_j^{-1} F^T)^{-1} + H^T R^{-1} H` at the truth, and of a smoother, which knows later rows too,
-by the same information carried backwards.
+Cramér-Rao bound is the least covariance of any estimator with a motion model. That of a filter follows from the
+recursion of Tichavský, Muravchik and Nehorai (1998), for linear motion
+:math:`J_{j+1} = (Q + F J_j^{-1} F^T)^{-1} + H^T R^{-1} H` at the truth. That of a smoother, which uses later rows too,
+follows from the same information by a backward recursion.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from magloc.tracking.rows import Row
 from magloc.tracking.tracker import Tracker
 
 THRESHOLD = 3.3
-"""Largest sum of a right track, in standard deviations above its mean; 1 track in 2,000 exceeds it."""
+"""Largest statistic of a right track, in standard deviations above its mean; 1 track in 2,000 exceeds it."""
 
 MATTERS = 2.0
 """Ratio of errors to their standard deviations, by unstated causes, above which a caution is given."""
 
 FEWEST_STARTS = 3
-"""Fewest starts of tracks that tell of the record, and not of its end."""
+"""Fewest starts of tracks for which a record counts as disjoint; fewer may be due to its end."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +104,7 @@ def consistency_lines(nees: float, nis: float, nis_bounds: tuple[float, float]) 
     """Return lines that state the mean NEES and NIS per dimension and their expected values."""
     low, high = nis_bounds
     return [
-        # Errors of neighbouring rows are alike: how far from 1 one record may be by chance, many seeds tell.
+        # Errors of neighbouring rows are correlated, so that only many seeds show the spread about 1.
         f"  NEES per dimension {nees:.3f}, 1 on average over many records of a right filter",
         f"  NIS per dimension {nis:.3f}, 99 % bounds {low:.3f} to {high:.3f}",
     ]
@@ -118,7 +118,7 @@ def consistency(
     moment_Am2: FloatArray | None,
     bound_m: FloatArray | None = None,
 ) -> Consistency:
-    """Return the errors of a track against true positions and moments (n, 3), NaN where not known."""
+    """Return the errors of a track against true positions and moments, NaN if unknown."""
     error = track_column(points, "position_m", 3) - position_m
     answered = np.isfinite(error).any(axis=1)
     moments = np.full_like(position_m, np.nan) if moment_Am2 is None else moment_Am2
@@ -143,12 +143,12 @@ def consistency(
 
 
 def root_mean(squares: FloatArray) -> float:
-    """Return the root of the mean of squares, NaN of none."""
+    """Return the root of the mean of squares, NaN without any."""
     return math.sqrt(float(np.mean(squares))) if len(squares) else math.nan
 
 
 def mean_nis(points: Sequence[TrackPoint]) -> tuple[float, tuple[float, float]]:
-    """Return the mean NIS of the tracked rows over its degrees of freedom, and two-sided 99 % bounds of it."""
+    """Return the mean NIS of tracked rows per degree of freedom, and its two-sided 99 % bounds."""
     used = [point for point in points if point.tracks and point.status == "tracked" and math.isfinite(point.nis)]
     dof = sum(point.nis_dof for point in used)
     return sum(point.nis for point in used) / dof if dof else math.nan, mean_bounds(dof)
@@ -157,9 +157,9 @@ def mean_nis(points: Sequence[TrackPoint]) -> tuple[float, tuple[float, float]]:
 def nees_of(point: TrackPoint, truth: FloatArray, measurement: RowMeasurement) -> tuple[float, int]:
     """Return the normalised estimation error squared of a point, and its number of dimensions.
 
-    The truth (6,) is NaN where it is not known, and these numbers do not count. With all six known, the error counts
-    in coordinates in which it is Gaussian: those of the chart, bent as the row's readings bend, or, without a mixture,
-    those of :mod:`magloc.tracking.measurement`.
+    Unknown numbers of the truth (6,) are NaN and do not count. With all six known, the error is in coordinates in which
+    it is Gaussian: those of the chart, as nonlinear as the row's readings, or, without a mixture, those of
+    :mod:`magloc.tracking.measurement`.
     """
     if point.position_m is None or point.moment_Am2 is None or point.covariance is None:
         return math.nan, 0
@@ -172,7 +172,7 @@ def nees_of(point: TrackPoint, truth: FloatArray, measurement: RowMeasurement) -
     estimate = np.concatenate([point.position_m, point.moment_Am2])
     error, covariance = truth - estimate, point.covariance
     if known.all():
-        # Where poses have errors, most of the covariance may be of them, which the readings do not bend.
+        # Errors of the pose may dominate the covariance, and the readings are linear in them.
         posed = measurement.pose_effect.shape[1] > 0
         coordinates = measurement.coordinates(
             measurement.without_errors(estimate), np.sqrt(np.diagonal(covariance)), of_readings=not posed
@@ -193,19 +193,19 @@ def _young_nees(source: Mixture, truth: FloatArray, row: RowMeasurement) -> tupl
 
 
 def standard_error(source: Mixture, truth: FloatArray, row: RowMeasurement) -> FloatArray:
-    """Return the error (6,) of a component in standard numbers, bent as a row's readings bend."""
+    """Return the standardised error (6,) of a component, as nonlinear as a row's readings."""
     L = source.chart.jacobian(np.zeros((1, truth.size)))[0]
     J = row.directional_derivative(source.x[0], L @ source.S[0])
     standard = np.linalg.solve(source.S[0], source.chart.coordinates(truth[None])[0])
     difference = row.predict_source(truth) - row.predict_source(source.x[0])
-    # Bent numbers along what J tells of, in standard deviations of the prediction, more than a share.
+    # Nonlinear in directions in which the readings change by more than LEAST_SHARE over one σ.
     Q, R = np.linalg.qr(np.concatenate([J, LEAST_SHARE * np.eye(J.shape[1])]))
     return np.asarray(standard + np.linalg.solve(R, Q[: len(J)].T @ (difference - J @ standard)))
 
 
 @dataclass(frozen=True)
 class InnovationTest:
-    """Sums over a track, each in standard deviations from its mean: standard normal for a right model.
+    """Test statistics of a track's innovations, standard normal for a right model.
 
     Attributes
     ----------
@@ -248,7 +248,7 @@ class InnovationTest:
 
     @property
     def is_disjoint(self) -> bool:
-        """True if tracks begin in more rows than they go on in, so that no row predicts the next."""
+        """True if tracks start in more rows than they continue, so that no row predicts the next."""
         return self.starts >= FEWEST_STARTS and self.starts > self.rows
 
     @property
@@ -258,7 +258,7 @@ class InnovationTest:
 
     @property
     def flagged(self) -> bool:
-        """True if a sum is beyond the threshold, or if no row predicts the next."""
+        """True if a statistic exceeds the threshold, or if no row predicts the next."""
         return self.is_disjoint or any(z > THRESHOLD for z in self._sums)
 
     @property
@@ -287,7 +287,7 @@ class InnovationTest:
 
     @property
     def caution(self) -> str:
-        """Sentence that names a possible fault that the tests cannot see; empty if it would not matter."""
+        """Sentence that names a possible fault that no test shows; empty if it would not matter."""
         cautions = []
         if self.ambient_factor > MATTERS:
             cautions.append(
@@ -308,7 +308,7 @@ class InnovationTest:
 
 
 def innovation_test(points: Sequence[TrackPoint]) -> InnovationTest:
-    """Return the test of all rows of a track; a row that contradicts it counts as one at the limit."""
+    """Return the test of a track; contradicting rows count with χ² at the limit."""
     of_rows = [(p.nis, p.nis_dof, p.lag1, p.correction) for p in points]
     nis, dof, lag1, correction = np.array(of_rows, dtype=np.float64).reshape(-1, 4).T
     known = np.isfinite(nis) & (dof > 0.0)

@@ -76,7 +76,7 @@ class Chart:
         return cls(x, np.maximum(r, radius_m), u, _tangents(u), np.zeros(r.shape, dtype=bool), n_pose)
 
     def with_firm_moments(self, S: FloatArray) -> Chart:
-        r"""Return the chart with strength and direction as coordinates of moments that are known well.
+        r"""Return the chart with strength and direction as coordinates of well-known moments.
 
         These are the moments whose σ by the roots S (..., n, m) is small. With :math:`n = \delta\mu/|\mu|`,
 
@@ -204,7 +204,7 @@ class Chart:
 
 
 def _firm_coordinates(before: FloatArray, after: FloatArray) -> FloatArray:
-    """Return n |m| of changes of firm moments (f, 3); :meth:`Chart.with_firm_moments` has the inverse."""
+    """Return n |m| of changes of firm moments (f, 3), see :meth:`Chart.with_firm_moments`."""
     size, strength = (np.linalg.norm(m, axis=-1, keepdims=True) for m in (before, after))
     along, direction = before / size, after / strength
     cosine = np.maximum(np.sum(along * direction, axis=-1, keepdims=True), _LEAST_COSINE)
@@ -227,12 +227,12 @@ def _tangents(u: FloatArray) -> FloatArray:
 
 
 def source_root(chart: Chart, sigma: FloatArray) -> FloatArray:
-    """Return Cartesian roots (..., 6, 6) of covariances from σ (..., 6) of a source's coordinates."""
+    """Return Cartesian roots (..., 6, 6) from σ (..., 6) of a source's coordinates."""
     return chart.jacobian(np.zeros_like(chart.x))[..., :N_SOURCE, :N_SOURCE] * sigma[..., None, :]
 
 
 def mirror_images(x: FloatArray, centroid_m: FloatArray) -> FloatArray:
-    r"""Return states (4, K, n) with the same gradient tensor at the sensors' centroid as states (K, n).
+    r"""Return states (4, K, n) with the gradient tensor of states (K, n) at the centroid.
 
     The first of the four are the states themselves. Readings of a far source show little more than its gradient tensor,
     which four sources at one range share. With u at the angle 0 and m at β in their common plane, u' is at

@@ -62,7 +62,7 @@ QUANTITIES = STATE_QUANTITIES | {
 
 
 def lines_of_track(points: Sequence[TrackPoint | SourcesPoint], *, most: int | None = None) -> list[str]:
-    """Return aligned lines: a header and one for each source of each row, or of at most `most` rows."""
+    """Return aligned lines: a header and one for each source of at most `most` rows."""
     shown = list(points)
     if most is not None and len(shown) > most:
         shown = shown[: most // 2] + shown[-(most // 2) :]
@@ -100,7 +100,7 @@ def json_entry(point: TrackPoint | SourcesPoint, *, single: bool = False) -> dic
     """Return the JSON object of one row, with null where there is no answer.
 
     Without a track the range is that of the row alone, and its solutions are the rivals. A row of several sources has a
-    list of tracks; with `single`, for at most one source, the keys of that source stand beside it.
+    list of tracks; with `single`, for at most one source, the row has the keys of that source too.
     """
     if isinstance(point, SourcesPoint):
         entry = json_entry(point.tracks[0]) if single and point.tracks else {}
@@ -112,7 +112,7 @@ def json_entry(point: TrackPoint | SourcesPoint, *, single: bool = False) -> dic
 
 
 def states_of(points: Sequence[TrackPoint]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return times (n,), positions, moments (n, 3) and covariances (n, 6, 6) of a track, NaN where there is none."""
+    """Return times, positions, moments and covariances of a track, NaN without a source."""
     return (
         track_column(points, "time_s"),
         track_column(points, "position_m", 3),
@@ -168,9 +168,9 @@ def kml_of_track(points: Sequence[TrackPoint], origin: Vector) -> str:
 def _on_the_map(
     points: Sequence[TrackPoint], origin: Vector
 ) -> tuple[list[list[list[float]]], list[tuple[str, TrackPoint]]]:
-    """Return the unbroken lines of a track and its points by name; of a source at rest the best point alone.
+    """Return the unbroken lines of a track, and its points by name.
 
-    A line has two rows at least and no row without the source.
+    A line has at least two rows, all with the source. A source at rest has no line, and only its best point.
     """
     rest = at_rest(points)
     if rest is not None:
@@ -198,7 +198,7 @@ def at_rest(points: Sequence[TrackPoint]) -> TrackPoint | None:
         return None
     position, covariance = track_column(known, "position_m", 3), track_column(known, "covariance", 6, 6)[:, :3, :3]
     best = int(np.argmin(np.trace(covariance, axis1=1, axis2=2)))
-    # Places that are known beforehand have no covariance: these are at rest to a nanometre.
+    # Known places have a covariance of zero: they are at rest if they are equal to a nanometre.
     both = covariance + covariance[best] + _SAME_PLACE_M**2 * np.eye(3)
     offset = position - position[best]
     chi2 = np.einsum("ni,ni->n", offset, np.linalg.solve(both, offset[..., None])[..., 0])
@@ -327,7 +327,7 @@ def _values_of(path: Path, rows: Sequence[dict[str, Any]], key: str) -> list[Any
 
 
 def _arrays(values: list[Any]) -> list[FloatArray | None]:
-    """Return lists of numbers as arrays, by one conversion: one by one they take five times as long."""
+    """Return lists of numbers as arrays, by one conversion because single ones are slow."""
     known = [i for i, value in enumerate(values) if value is not None]
     arrays = iter(np.array([values[i] for i in known], dtype=np.float64))
     return [None if value is None else next(arrays) for value in values]

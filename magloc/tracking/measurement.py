@@ -1,4 +1,4 @@
-r"""Measurement model of one row for a tracked source, and coordinates in which its posterior is Gaussian.
+r"""Measurement model of one row, and coordinates in which its posterior is Gaussian.
 
 The posterior of a source is nearly Gaussian in the predicted readings, not in position and moment: direction and moment
 of a weak source are correlated along a curve. Errors are counted in the coordinates
@@ -37,7 +37,7 @@ LEAST_SINGULAR = 1e-6
 
 
 def whitening(effect: FloatArray) -> FloatArray:
-    r"""Return the matrix (k, k) that whitens unit noise plus errors of unit variance with an effect (k, n).
+    r"""Return the matrix (k, k) that whitens unit noise plus errors with an effect (k, n).
 
     With the effect :math:`\Phi` it is :math:`L^{-1}`, where :math:`L L^T = 1 + \Phi \Phi^T`.
     """
@@ -46,7 +46,7 @@ def whitening(effect: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class RowMeasurement:
-    """Model of one row's differences, in units of their noise, for states (..., n) in the world frame.
+    """Model of one row's whitened differences for states (..., n) in the world frame.
 
     A state has the states of the motion first, then errors of the pose and of the ambient field, then errors of the
     sensors, in which readings are linear. The first two have coordinates in a chart.
@@ -121,7 +121,7 @@ class RowMeasurement:
         return Chart.at(x, self.centroid_m, self.radius_m, self.n_pose)
 
     def pad(self, k: int) -> RowMeasurement:
-        """Return the row padded to k differences, with zeros of unit noise that do not depend on the source."""
+        """Return the row padded to k differences by zeros that do not depend on the source."""
         more = k - self.n_differences
         differences = Differences(
             np.pad(self.model.differences.transform, ((0, more), (0, 0))),
@@ -136,7 +136,7 @@ class RowMeasurement:
         return padded if more else self
 
     def with_errors_as_noise(self, sigma: FloatArray) -> RowMeasurement:
-        """Return the row with the sensors' errors, of standard deviations (n_errors,), as part of its noise."""
+        """Return the row with the sensors' errors, of σ (n_errors,), as part of its noise."""
         if not sigma.size:
             return self
         whiten, k = whitening(self.effect * sigma), self.n_differences
@@ -145,7 +145,7 @@ class RowMeasurement:
         return replace(self, model=model, sigma=np.ones(k), effect=np.zeros((k, 0)))
 
     def predict_source(self, state: FloatArray, others_T: FloatArray | None = None) -> FloatArray:
-        """Return the predicted differences (..., k) of sources (..., 6) or states, without errors of sensors.
+        """Return the differences (..., k) of sources or states, without errors of sensors.
 
         `others_T` (N, 3) is the field of other sources at the sensors.
         """
@@ -168,7 +168,7 @@ class RowMeasurement:
         return np.asarray(of_source + of_pose)
 
     def moment_columns(self, position_m: FloatArray) -> FloatArray:
-        """Return the derivative (..., k, 3) of the differences by the moment of a weak source at (..., 3)."""
+        """Return the derivative (..., k, 3) by the moment of a weak source at (..., 3)."""
         array, R = self.model.array, self.row.R_world_from_array
         matrix = dipole.field_matrix(array.positions, ((position_m - self.row.origin_m) @ R)[..., None, :])
         of_channels = self.model.differences.transform / self.sigma[:, None]
@@ -203,7 +203,7 @@ class RowMeasurement:
 
     @cached_property
     def whitening(self) -> FloatArray:
-        """``C^{-1/2}`` (k, k) of a row without a source; errors of the pose act on the ambient field as noise."""
+        """``C^{-1/2}`` (k, k) of a row without a source, with errors of the pose as noise."""
         if not self.n_pose:
             return np.eye(self.n_differences)
         # Without a moment the rest is the ambient field, rotated by the errors of the pose.
@@ -219,7 +219,7 @@ class RowMeasurement:
         return bool(left @ left > energy_threshold(left.size))
 
     def coordinates(self, state: FloatArray, unit: FloatArray, *, of_readings: bool = True) -> Coordinates:
-        """Return coordinates about a state (n,); `unit` (6,) are standard deviations of position and moment.
+        """Return coordinates about a state (n,); `unit` (6,) are σ of position and moment.
 
         They are as nonlinear as the readings, if these determine a source. Otherwise, or if not `of_readings`, they are
         as nonlinear as position and moment in the array's axes are in the errors of the pose.
@@ -236,7 +236,7 @@ class RowMeasurement:
         return Coordinates(state, self._in_array, self._in_array_jacobian, M, self._in_array(state), M @ G)
 
     def place_in_array(self, state: FloatArray, S: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the source's offset (3,) from the centroid in the array's axes, and a root (3, n) of its covariance.
+        """Return the source's offset (3,) from the centroid in array axes, and its root (3, n).
 
         An error of the pose moves the source in the world, not relative to the array.
         """
@@ -263,7 +263,7 @@ class RowMeasurement:
         return np.asarray(state[..., self.n_motion : self.n_charted] @ self.pose_effect.T)
 
     def _by_source(self, H: FloatArray, error: FloatArray | None) -> FloatArray:
-        """Return the Jacobian (..., k, 6) by sources in the world, from that by sources in the array's axes."""
+        """Return the Jacobian (..., k, 6) by sources in the world, from that in the array's axes."""
         RT = np.swapaxes(self.pose.turned(error), -1, -2)
         return np.concatenate([H[..., :3] @ RT, H[..., 3:] @ RT], axis=-1)
 
@@ -275,7 +275,7 @@ class RowMeasurement:
         return np.asarray(by_error @ self.pose_effect)
 
     def _ambient_T(self, error: FloatArray | None, others_T: FloatArray | None) -> FloatArray | None:
-        """Return the field (..., N, 3) at the sensors without the source, or None for the array's own ambient field."""
+        """Return the field (..., N, 3) without the source, or None for the array's own one."""
         if error is None:
             return None if others_T is None else self.model.array.ambient_fields + others_T
         ambient_T = self.pose.ambient(self.model.array.ambient_fields, error)
@@ -310,7 +310,7 @@ def zero_if_nan(derivative: FloatArray) -> FloatArray:
 
 
 class RowMeasurements:
-    """Measurement models of the rows of an array, with lasting errors as states in place of noise.
+    """Measurement models of an array's rows, with lasting errors as states.
 
     Parameters
     ----------
@@ -365,7 +365,7 @@ class RowMeasurements:
 
 @dataclass(frozen=True, eq=False)
 class Coordinates:
-    """Six coordinates of a state: to first order its position and moment, if the errors are held.
+    """Six coordinates of a state: to first order its position and moment.
 
     Attributes
     ----------
@@ -394,7 +394,7 @@ class Coordinates:
 
 
 def step_of_errors(pose_errors: PoseErrors, errors: SensorErrors, dt_s: float) -> tuple[FloatArray, FloatArray]:
-    """Return the share of each error of pose and sensors that a step keeps, and the σ that it adds: (n,) each."""
+    """Return the decay factor (n,) of each error of pose and sensors, and σ (n,) of its noise."""
     of_errors = zip(pose_errors.step(dt_s), errors.step(dt_s), strict=True)
-    kept, added = (np.concatenate(parts) for parts in of_errors)
-    return kept, added
+    decay, noise = (np.concatenate(parts) for parts in of_errors)
+    return decay, noise

@@ -1,4 +1,4 @@
-r"""Motion of sources and arrays between rows: transition matrices and square roots of the noise.
+r"""Motion of sources and arrays: transition matrices and square roots of the noise.
 
 A model has a state and its step over Δt. Position and moment come first in every state. With the array's pose known
 the state is in the world frame, which does not turn. :func:`array_axes_transition` is model (17) of the source paper,
@@ -39,7 +39,7 @@ def array_axes_transition(
     array_velocity_m_s: ArrayLike = (0.0, 0.0, 0.0),
     array_rate_rad_s: ArrayLike = (0.0, 0.0, 0.0),
 ) -> tuple[FloatArray, FloatArray]:
-    r"""Return one step of position and moment in the axes of a moving array, equations (17) and (29).
+    r"""Return a step of position and moment in the axes of a moving array, (17) and (29).
 
     .. math::
 
@@ -87,10 +87,10 @@ class MotionModel(Protocol):
         """Length of the state, of which the first six are position [m] and moment [A·m²]."""
 
     def start(self, source: FloatArray, S: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the state and the square root of its covariance from those of (p, m), (6,) and (6, 6)."""
+        """Return the state and root of its covariance from those of (p, m), (6,) and (6, 6)."""
 
     def step(self, x: FloatArray, dt_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the predicted state (n,), its Jacobian F (n, n), and a square root S_q (n, m) of the noise."""
+        """Return the predicted state (n,), its Jacobian F (n, n), and a noise root S_q (n, m)."""
 
     def state_of(self, source: FloatArray, velocity_m_s: FloatArray, rate_rad_s: FloatArray) -> FloatArray:
         """Return the state (n,) of a source (6,) with a velocity and a rate of turn, (3,) each."""
@@ -98,7 +98,7 @@ class MotionModel(Protocol):
 
 @runtime_checkable
 class LinearMotion(MotionModel, Protocol):
-    """Motion whose step is linear but for noise proportional to the moment's strength; it has compiled steps."""
+    """Linear motion with noise proportional to the moment's strength; it has compiled steps."""
 
     def linear_step(self, dt_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return F, and A and B (n, m) of the noise ``S_q = A + |m| B``."""
@@ -125,7 +125,7 @@ class _MovingState:
 
 @dataclass(frozen=True)
 class RandomWalk(_MovingState):
-    """Random walk of position and moment with a characteristic speed and rate of turn: S_q of Pavlov et al.
+    """Random walk of position and moment with the S_q of Pavlov et al.
 
     ``S_q = diag(V Δt, V Δt, V Δt, |m| W Δt, …)``: the step has the length that the object may move in that time.
 
@@ -164,7 +164,7 @@ class RandomWalk(_MovingState):
 
 @dataclass(frozen=True)
 class OrnsteinUhlenbeck(_MovingState):
-    r"""Velocity and rate of turn as Ornstein-Uhlenbeck processes of mean zero and correlation time τ.
+    r"""Velocity and rate of turn as Ornstein-Uhlenbeck processes of correlation time τ.
 
     State (p, m, v, ω), with
 
@@ -180,7 +180,7 @@ class OrnsteinUhlenbeck(_MovingState):
     correlation_s : float, optional
         Correlation time τ; by default 1/W, the time in which the course changes.
     moment_change : float
-        Random walk of the moment beside its turn, relative to its modulus [1/√s].
+        Random walk of the moment besides its turn, relative to its modulus [1/√s].
     n_states : int
         12: position, moment, velocity and turn rates; not to be changed.
 
@@ -206,34 +206,36 @@ class OrnsteinUhlenbeck(_MovingState):
 
     def turning_step(self, dt_s: float) -> FloatArray:
         """Return the numbers (12,) of a step for the C++ kernel."""
-        moved, kept, root = ornstein_uhlenbeck_step(self._correlation_s, dt_s)
+        gain_s, decay, root = ornstein_uhlenbeck_step(self._correlation_s, dt_s)
         lower = root[[0, 1, 1], [0, 0, 1]]
         change = self.moment_change * math.sqrt(dt_s)
-        return np.array([moved, kept, moved, kept, *self.speed_m_s * lower, *self.turn_rad_s * lower, change, change])
+        return np.array(
+            [gain_s, decay, gain_s, decay, *self.speed_m_s * lower, *self.turn_rad_s * lower, change, change]
+        )
 
     def step(self, x: FloatArray, dt_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the prediction, see :class:`MotionModel`."""
-        moved, kept, root = ornstein_uhlenbeck_step(self._correlation_s, dt_s)
+        gain_s, decay, root = ornstein_uhlenbeck_step(self._correlation_s, dt_s)
         p, m, v, rate = x[:3], x[3:6], x[6:9], x[9:]
-        turn = rotation_matrix(moved * rate)
-        turned = turn @ m
-        by_rate = -cross_matrix(turned) @ turn_of_change(moved * rate)
+        turn = rotation_matrix(gain_s * rate)
+        m_next = turn @ m
+        by_rate = -cross_matrix(m_next) @ turn_of_change(gain_s * rate)
         F = np.eye(12)
-        F[:3, 6:9] = moved * np.eye(3)
-        F[3:6, 3:6], F[3:6, 9:] = turn, moved * by_rate
-        F[6:, 6:] = kept * np.eye(6)
+        F[:3, 6:9] = gain_s * np.eye(3)
+        F[3:6, 3:6], F[3:6, 9:] = turn, gain_s * by_rate
+        F[6:, 6:] = decay * np.eye(6)
         S_q = np.zeros((12, 15))
         of_speed, of_rate = self.speed_m_s * np.eye(3), self.turn_rad_s * np.eye(3)
         S_q[:3, :3], S_q[6:9, :3], S_q[6:9, 6:9] = root[0, 0] * of_speed, root[1, 0] * of_speed, root[1, 1] * of_speed
         S_q[3:6, 3:6] = root[0, 0] * self.turn_rad_s * by_rate
         S_q[9:, 3:6], S_q[9:, 9:12] = root[1, 0] * of_rate, root[1, 1] * of_rate
         S_q[3:6, 12:] = self.moment_change * math.sqrt(dt_s * float(m @ m)) * np.eye(3)
-        return np.concatenate([p + moved * v, turned, kept * v, kept * rate]), F, S_q
+        return np.concatenate([p + gain_s * v, m_next, decay * v, decay * rate]), F, S_q
 
 
 @dataclass(frozen=True)
 class KnownMotion(_MovingState):
-    r"""Position and moment with measured velocities and rates of array and object: MotionMT, equation (17).
+    r"""Motion with measured velocities and rates of array and object: MotionMT, equation (17).
 
     .. math:: p_j = p_{j-1} + (v_{object} - v_{array} - ω_{array} × p_{j-1}) Δt, \qquad
         m_j = m_{j-1} + (ω_{object} - ω_{array}) × m_{j-1} Δt
@@ -283,15 +285,15 @@ class KnownMotion(_MovingState):
             array_velocity_m_s=self.array_velocity_m_s,
             array_rate_rad_s=self.array_rate_rad_s,
         )
-        moved = F @ x + shift
+        x_next = F @ x + shift
         strength = math.sqrt(float(x[3:] @ x[3:]))
         S_q = np.zeros((N_SOURCE, 12))
         S_q[:3, :3] = math.hypot(self.speed_m_s, self.velocity_sigma_m_s) * dt_s * np.eye(3)
         S_q[3:, 3:6] = self.turn_rad_s * dt_s * strength * np.eye(3)
-        turned = np.concatenate([cross_matrix(moved[:3]), cross_matrix(moved[3:])])
-        S_q[:, 6:9] = self.array_rate_sigma_rad_s * dt_s * turned
-        S_q[3:, 9:] = self.object_rate_sigma_rad_s * dt_s * turned[3:]
-        return moved, F, S_q
+        by_rate = np.concatenate([cross_matrix(x_next[:3]), cross_matrix(x_next[3:])])
+        S_q[:, 6:9] = self.array_rate_sigma_rad_s * dt_s * by_rate
+        S_q[3:, 9:] = self.object_rate_sigma_rad_s * dt_s * by_rate[3:]
+        return x_next, F, S_q
 
 
 def known_motions(measured: MeasuredMotion, unknown: RandomWalk) -> list[KnownMotion]:
@@ -312,16 +314,16 @@ def known_motions(measured: MeasuredMotion, unknown: RandomWalk) -> list[KnownMo
 
 @lru_cache(maxsize=64)
 def ornstein_uhlenbeck_step(correlation_s: float, dt_s: float) -> tuple[float, float, FloatArray]:
-    """Return the entries of F of (value, rate), and a square root (2, 2) of the noise for a rate with σ = 1."""
+    """Return F[0, 1] and F[1, 1] of (value, rate), and the root (2, 2) of its noise for σ = 1."""
     if dt_s == 0.0:
         return 0.0, 1.0, np.zeros((2, 2))
     if dt_s > correlation_s:
         # Van Loan's exponential grows with exp(Δt/τ) and loses Q over long gaps; the closed form cancels in short ones.
-        kept = math.exp(-dt_s / correlation_s)
-        Q_vv, Q_pv = 1.0 - kept**2, correlation_s * (1.0 - kept) ** 2
-        Q_pp = correlation_s**2 * (2.0 * dt_s / correlation_s - 3.0 + 4.0 * kept - kept**2)
+        decay = math.exp(-dt_s / correlation_s)
+        Q_vv, Q_pv = 1.0 - decay**2, correlation_s * (1.0 - decay) ** 2
+        Q_pp = correlation_s**2 * (2.0 * dt_s / correlation_s - 3.0 + 4.0 * decay - decay**2)
         root = np.linalg.cholesky(np.array([[Q_pp, Q_pv], [Q_pv, Q_vv]]))
-        return correlation_s * (1.0 - kept), kept, root
+        return correlation_s * (1.0 - decay), decay, root
     from filterpy.common import van_loan_discretization  # it brings matplotlib and scipy.stats
 
     drift = np.array([[0.0, 1.0], [0.0, -1.0 / correlation_s]])
@@ -347,7 +349,7 @@ class CoordinatedTurn(_MovingState):
     turn_change_rad_s : float
         Random walk of the turn rate [rad/s/√s].
     moment_change : float
-        Random walk of the moment beside its turn, relative to its modulus [1/√s].
+        Random walk of the moment besides its turn, relative to its modulus [1/√s].
     n_states : int
         10: position, moment, velocity and turn rate; not to be changed.
 

@@ -19,19 +19,19 @@ from magloc.tracking.chart.mixture import Mixture
 from magloc.tracking.motion import N_SOURCE
 
 UNDETERMINED = "undetermined"
-"""Status of a row before a track that shows a source and does not determine it: what is known by the rows so far."""
+"""Status of a row before a track that shows a source and does not determine it; the point is by all rows so far."""
 
 
 @dataclass(frozen=True, eq=False)
 class Innovation:
-    """Whitened innovations (k,) of a row, its available channels (C,), and :attr:`TrackPoint.correction`."""
+    """Whitened innovations (k,) of a row, its available channels (C,), and the correction."""
 
     available: BoolArray
     whitened: FloatArray
     correction: float = math.nan
 
     def statistics(self, before: Innovation | None) -> dict[str, Any]:
-        """Return NIS, its degrees of freedom, the correction, and the product with the innovation before."""
+        """Return NIS, degrees of freedom, correction, and product with the innovation before."""
         same = before is not None and np.array_equal(before.available, self.available)
         return {
             "nis": float(self.whitened @ self.whitened),
@@ -112,7 +112,7 @@ class TrackPoint:
 
     @cached_property
     def range_interval_m(self) -> Intervals | None:
-        """95 % set of the distance from the sensors' centroid [m], None if the sensors are not known.
+        """95 % set of the distance from the sensors' centroid [m], None without sensors.
 
         Quantiles of the mixture; without one,
         :func:`magloc.localization.uncertainty.range_interval.gaussian_ranges` of the covariance. Without a track, every
@@ -134,7 +134,7 @@ class TrackPoint:
 
     @property
     def gaussian(self) -> bool:
-        """True if the standard deviations are small enough for the covariance to describe the uncertainty."""
+        """True if standard deviations are small enough for the covariance to be meaningful."""
         if self.position_m is None or self.moment_Am2 is None or self.covariance is None or self.centroid_m is None:
             return False
         sigma = relative_sigma(self.covariance, self.position_m - self.centroid_m, self.moment_Am2)

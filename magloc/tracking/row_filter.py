@@ -1,4 +1,4 @@
-"""Compiled steps of a filter of several sources: predict, update, smooth, and the nonlinearity of readings.
+"""Compiled steps of a filter of several sources: predict, update, smooth.
 
 :mod:`magloc.tracking.coordinates` explains the chart; tests/magloc/tracking/test_row_filter.py has the reference.
 """
@@ -270,7 +270,7 @@ def refill_step(steps: core.Problem, slot: int, motion: MotionModel, errors: Sen
 
 
 def predict(before: Gaussians, centroid_m: FloatArray, steps: core.Problem, rows: Rows, row: int = 0) -> Gaussians:
-    """Return Gaussians after the step to a row, from charts with the sensors' centroid at `centroid_m`."""
+    """Return Gaussians after the step to a row, from charts about `centroid_m`."""
     after = before.empty_like()
     work = core.problem(
         "row_prediction",
@@ -353,7 +353,7 @@ def update(
 
 
 def bends(gaussians: Gaussians, rows: Rows, memory: float, row: int = 0) -> tuple[FloatArray, FloatArray]:
-    """Return the nonlinearity of readings over one σ along axes of position and moment of the sources.
+    """Return the nonlinearity of readings over one σ along axes of the sources.
 
     Parameters
     ----------

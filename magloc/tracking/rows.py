@@ -55,7 +55,7 @@ class Row:
 
 
 def with_array_motion(row: Row, before: Row | None) -> Row:
-    """Return a row with the array's velocity and rate, by differences from the row before if it has none."""
+    """Return a row with the array's velocity and rate, by differences if it has none."""
     if before is None or row.velocity_m_s is not None:
         return row
     time_s, origins_m = np.array([before.time_s, row.time_s]), np.stack([before.origin_m, row.origin_m])

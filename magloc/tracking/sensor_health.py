@@ -1,4 +1,4 @@
-"""Detection and exclusion of sensors that fail during a track; detection of offsets of all sensors."""
+"""Detection and exclusion of sensors that fail during a track."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class Misfits:
         return replace(self, waits=self.waits - 1)
 
     def after(self, misfit: FloatArray, noise_T: float) -> Misfits:
-        """Return the state after one more row. If the misfit lasts, warn once and search later rows less often."""
+        """Return the state after one more row; warn once if the misfit lasts."""
         if len(misfit) < len(self.mean):
             return self  # a row without some sensors
         before = self if len(misfit) == len(self.mean) else Misfits(0, np.zeros(len(misfit)), pause=self.pause)
@@ -181,7 +181,7 @@ class SensorHealth:
         )
 
     def without(self, sensor: int) -> SensorHealth:
-        """Return the state with a sensor as drifting, and without residuals, which its drift has biased."""
+        """Return the state with a sensor as drifting, and without residuals, which are biased."""
         drifts = np.arange(len(self.dead)) == sensor
         return replace(self.forget_residuals(), dead=self.dead | drifts, drifting=self.drifting | drifts)
 

@@ -1,4 +1,6 @@
-"""Rows of a settled track in one compiled call: one Gaussian of one source, without errors of the pose.
+"""Rows of a settled track in one compiled call.
+
+The state is one Gaussian of one source, without errors of the pose.
 
 Offsets of sensors are further states, in which readings are linear. With them the kernel's predictions are linear,
 unlike those of the Python steps. Rows whose readings are noticeably nonlinear are left to the Python steps.
@@ -44,7 +46,7 @@ _LARGEST_STRAIGHT = 0.05
 
 @dataclass(frozen=True, eq=False)
 class SettledRows:
-    """Points of rows; the last row, the state after it and its innovation; steps for a smoother, if requested."""
+    """Points of rows, the last row, the state after it, its innovation, and smoother steps."""
 
     points: list[TrackPoint]
     last: Row
@@ -133,7 +135,7 @@ class SettledTrack:
     def of(
         array: SensorArray, motion: MotionModel, measurements: RowMeasurements, full_count: int
     ) -> SettledTrack | None:
-        """Return the arguments, or None if the kernel lacks the steps of the motion or some of the errors."""
+        """Return the arguments, or None if the kernel lacks the motion or some of the errors."""
         errors = measurements.errors
         has_errors = not errors.is_constant or measurements.pose_errors.n_states or errors.n_states > _MOST_ERRORS
         # isinstance of a protocol is slow: it tests all of its attributes.
@@ -191,7 +193,7 @@ class SettledTrack:
         return SettledRows(self._points(taken[:end], dof, lag1, centroids), taken[end - 1], known, innovation, steps)
 
     def _fill(self, rows: Sequence[Row | Readings], time_s: float) -> list[Row]:
-        """Copy rows into the arguments as long as they have the first one's differences, and return them."""
+        """Copy rows with the first one's differences into the arguments, and return them."""
         differences, given, taken = None, self._rows, list[Row]()
         if len(self._slot_of_step) + len(rows) > self._most:
             self._slot_of_step.clear()
@@ -232,7 +234,7 @@ class SettledTrack:
         return taken
 
     def _lag1(self, rows: Sequence[Row], dof: int, last: Innovation | None) -> tuple[list[float], Innovation | None]:
-        """Return the products of each innovation with the one before, and the innovation of the last row."""
+        """Return products of successive innovations, and the innovation of the last row."""
         if not dof:
             return [math.nan] * len(rows), None
         whitened = self._innovation[: len(rows), :dof].copy()

@@ -42,9 +42,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SPEED_M_S = 0.5
-"""Characteristic speed of a source of which nothing is said."""
+"""Default characteristic speed of a source."""
 TURN_RAD_S = math.radians(5.0)
-"""Characteristic rate at which its moment turns."""
+"""Default characteristic rate of turn of its moment."""
 
 
 _Row = TypeVar("_Row", TrackPoint, SourcesPoint)
@@ -84,7 +84,7 @@ class TrackRows(Result, Sequence[_Row]):
         """Tracks of all sources, for pictures and the viewer."""
 
     def plot(self) -> Figure:
-        """Draw the tracks from above with 95 % ellipses, and their coordinates and strengths through time."""
+        """Draw the tracks from above with 95 % ellipses, and coordinates and strengths over time."""
         return by_name("magloc.plots.tracks:sources_figure")(self.as_result, self.readings.array_position_m)
 
     def lines(self, most: int | None = None) -> list[str]:
@@ -182,7 +182,7 @@ class TrackColumns(TrackRows[TrackPoint]):
         return geojson_of_track(self, place)
 
     def to_kml(self, place: Vector) -> str:
-        """Return the track as KML: one placemark of a source at rest, otherwise the line and its two ends.
+        """Return the track as KML: a placemark of a source at rest, otherwise a line and its ends.
 
         Parameters
         ----------
@@ -231,7 +231,7 @@ class Track(TrackColumns):
     def innovations(self) -> InnovationTest:
         """Test of the readings against the stated sensors, pose and motion."""
         test = innovation_test(self)
-        if self.readings.motion is not None:  # whose steps the test does not have
+        if self.readings.motion is not None:  # the tests below lack its steps
             return test
         exact = constants_test(self.tracker, self._rows, self.points)
         return replace(
@@ -248,7 +248,7 @@ class Track(TrackColumns):
         return "\n".join([super().table(), *filter(None, (test.reason, test.caution))])
 
     def consistency(self, truth: Truth) -> Consistency:
-        """Return the errors against a truth, NEES, NIS, and the posterior Cramér-Rao bound if the moment is known.
+        """Return errors against a truth, NEES, NIS, and the posterior Cramér-Rao bound.
 
         Raises
         ------
@@ -257,14 +257,14 @@ class Track(TrackColumns):
         """
         position_m, moment_Am2 = truth_of_rows(self.readings, truth)
         bound = None
-        # The bound's own walk over the rows knows of one motion alone.
+        # The bound is for a constant motion model.
         known = self.readings.motion is None
         if known and moment_Am2 is not None and np.isfinite(position_m).all() and np.isfinite(moment_Am2).all():
-            # Later rows make less error possible.
+            # Later rows lower the bound.
             bound_of = smoothing_bound if self.is_smoothed else posterior_bound
             with suppress(np.linalg.LinAlgError), np.errstate(over="ignore", divide="ignore", invalid="ignore"):
                 bound = bound_of(self.tracker, self._rows, position_m, moment_Am2)
-            if bound is not None and np.isnan(bound).any():  # the truth leads out of double precision
+            if bound is not None and np.isnan(bound).any():  # overflow at the truth
                 bound = None
         return consistency(self, self.tracker, self._rows, position_m, moment_Am2, bound)
 
@@ -355,7 +355,7 @@ def _follow(
     unmeasured: MotionModel,
     progress: Callable[[int], None] | None,
 ) -> Iterator[TrackPoint]:
-    """Yield the points of a record as soon as they are known; set a measured motion before each row."""
+    """Yield the points of a record as they are found; set a measured motion before each row."""
     rows, motions = list(rows_of(readings)), None
     if readings.motion is not None:
         if not isinstance(unmeasured, RandomWalk):

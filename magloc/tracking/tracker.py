@@ -128,7 +128,7 @@ class Tracker(CartesianFilter):
     def run(
         self, rows: Iterable[Row | Readings], progress: Callable[[int], None] | None = None
     ) -> Iterator[TrackPoint]:
-        """Yield the points of successive rows; of a sequence, several rows at once by :meth:`advance`."""
+        """Yield the points of successive rows; of a sequence, several at once by :meth:`advance`."""
         for part in [rows] if isinstance(rows, Sequence) else ([row] for row in rows):
             done = 0
             while done < len(part):
@@ -205,9 +205,9 @@ class Tracker(CartesianFilter):
         self._n_rows += n_rows
         self.steps += steps
 
-    def prior_covariance(self, seen: RowMeasurement, x: FloatArray) -> FloatArray:
+    def prior_covariance(self, measurement: RowMeasurement, x: FloatArray) -> FloatArray:
         """Return the prior covariance (n, n) of the motion's states of a source at x."""
-        _, S = self.motion.start(x[:N_SOURCE], prior_root(seen.chart(x[:N_SOURCE])))
+        _, S = self.motion.start(x[:N_SOURCE], prior_root(measurement.chart(x[:N_SOURCE])))
         return S @ S.T
 
     def propagate(self, covariance: FloatArray, x: FloatArray, dt_s: float) -> FloatArray:
@@ -223,23 +223,23 @@ class Tracker(CartesianFilter):
     def _start_track(self, row: Row, index: int, near: Mixture | None = None) -> tuple[BoolArray, TrackPoint]:
         """Start a new track if possible; return the sensors (N,) left out of the row, and its point."""
         self._known, out = None, self._health.dead
-        seen = self._measure(row, out)
-        if seen.z.size < N_SOURCE:
-            return out, self._acquire(seen, index)
-        mixture, reason = self.filter.start(seen, self.motion, near)
-        if reason == NO_DIPOLE and (faulty := self.filter.faulty_sensors(seen)).sum() == 1:
-            seen = self._measure(row, out | faulty)
-            mixture, _ = self.filter.start(seen, self.motion, near)
+        measurement = self._measure(row, out)
+        if measurement.z.size < N_SOURCE:
+            return out, self._acquire(measurement, index)
+        mixture, reason = self.filter.start(measurement, self.motion, near)
+        if reason == NO_DIPOLE and (faulty := self.filter.faulty_sensors(measurement)).sum() == 1:
+            measurement = self._measure(row, out | faulty)
+            mixture, _ = self.filter.start(measurement, self.motion, near)
             out = out if mixture is None else out | faulty
         if mixture is None:
-            return out, self.untracked_point(seen.row, reason)
+            return out, self.untracked_point(measurement.row, reason)
         self._update_health(
             row, out, lambda row: math.inf if self.filter.row_mixture(row, self.motion)[0] is None else 0.0
         )
-        open_loop = self.prior_covariance(seen, mixture.x[np.argmax(mixture.log_weight)])
-        young = ((seen, self.motion),) if self.filter.has_lasting_errors else ()
+        open_loop = self.prior_covariance(measurement, mixture.x[np.argmax(mixture.log_weight)])
+        young = ((measurement, self.motion),) if self.filter.has_lasting_errors else ()
         known = self.filter.refit(TrackState(mixture, open_loop, young=young))
-        return out, self._tracked_point(seen.row, index, known, None, status="acquired")
+        return out, self._tracked_point(measurement.row, index, known, None, status="acquired")
 
     def _measure(self, row: Row, out: BoolArray) -> RowMeasurement:
         """Return the measurement model of a row without some of its sensors (N,)."""
@@ -247,52 +247,54 @@ class Tracker(CartesianFilter):
         return self.measurements.of(replace(row, readings_T=readings) if out.any() else row)
 
     def _follow_track(self, before: TrackState, row: Row, index: int, dt_s: float) -> tuple[BoolArray, TrackPoint]:
-        """Continue a track by one more row; return the sensors (N,) left out of the row, and its point."""
+        """Continue a track by one row; return the sensors (N,) left out, and the point."""
         dead = self._health.dead
-        seen = self._measure(row, dead)
-        predicted = self.filter.predict(before.mixture, self.motion, dt_s, seen)
+        measurement = self._measure(row, dead)
+        predicted = self.filter.predict(before.mixture, self.motion, dt_s, measurement)
         x = before.mixture.x[np.argmax(before.mixture.log_weight)]
         open_loop = self.propagate(before.open_loop, x, dt_s)
         known = replace(before, mixture=predicted, open_loop=open_loop, used=before.used or before.mixture)
         prediction = self.predict(*to_cartesian(before.mixture), dt_s) if self.keep_steps else None
-        if not seen.z.size:
-            return dead, self._tracked_point(seen.row, index, known, prediction, status="predicted")
+        if not measurement.z.size:
+            return dead, self._tracked_point(measurement.row, index, known, prediction, status="predicted")
         if width_of(predicted) > LARGEST_WIDTH:
             # The prediction is too uncertain for an iteration to start from it.
-            if self.filter.is_detected(seen):
+            if self.filter.is_detected(measurement):
                 return self._start_track(row, index, predicted.match_moments())
-            return dead, self._tracked_point(seen.row, index, known, prediction, status="predicted")
+            return dead, self._tracked_point(measurement.row, index, known, prediction, status="predicted")
 
-        def update_by(measurement: RowMeasurement) -> RowUpdate:
-            return self.filter.update(before, predicted, dt_s, measurement)
+        def update_by(row_measurement: RowMeasurement) -> RowUpdate:
+            return self.filter.update(before, predicted, dt_s, row_measurement)
 
-        update, out, may_be_fault = update_by(seen), dead, False
+        update, out, may_be_fault = update_by(measurement), dead, False
         if update.mixture is None:
             out, update, may_be_fault = self._exclude_sensor(update, lambda out: update_by(self._measure(row, out)))
-            seen = self._measure(row, out)
+            measurement = self._measure(row, out)
         else:
             self._suspects = self._suspects.decay(1)
-        innovation = Innovation(seen.row.available, update.innovation, update.correction)
+        innovation = Innovation(measurement.row.available, update.innovation, update.correction)
         if update.mixture is None:
             contradictions = before.contradictions + (not may_be_fault)
             if contradictions >= ROWS_TO_LOSE:
                 return self._start_track(row, index)
             known = replace(known, contradictions=contradictions)
-            point = self._tracked_point(seen.row, index, known, prediction, status="outlier", innovation=innovation)
+            point = self._tracked_point(
+                measurement.row, index, known, prediction, status="outlier", innovation=innovation
+            )
             return dead, replace(point, nis=update.nis)
         self._update_health(row, out, lambda with_sensor: update_by(with_sensor).nis - update.nis)
         known = replace(known, mixture=update.mixture, contradictions=0, used=None)
         if before.young:
-            young = (*before.young, (seen, self.motion))
+            young = (*before.young, (measurement, self.motion))
             known = self.filter.refit(replace(known, young=young, nis=before.nis + update.nis))
         # The range of all components together may be open again although every component is narrow.
         is_wide, is_open = width_of(known.mixture) > LARGEST_WIDTH, known.mixture.log_range_sigma > LARGEST_WIDTH
-        is_detected = (is_wide or (is_open and known.has_range)) and self.filter.is_detected(seen)
+        is_detected = (is_wide or (is_open and known.has_range)) and self.filter.is_detected(measurement)
         if is_wide and is_detected:
             return self._start_track(row, index, predicted.match_moments())
         known = replace(known, has_range=known.has_range or not is_open)
         return out, self._tracked_point(
-            seen.row,
+            measurement.row,
             index,
             known,
             prediction,
@@ -303,7 +305,7 @@ class Tracker(CartesianFilter):
         )
 
     def _update_health(self, row: Row, out: BoolArray, excess: Callable[[RowMeasurement], float]) -> None:
-        """Update the sensors' health by the sensors (N,) left out, and the χ² that each dead one would add."""
+        """Update the sensors' health by those left out (N,), and the χ² of each dead one."""
         if self._health.is_well and not out.any():
             return
         dead_chi2, available = np.full(len(out), np.inf), np.unique(self.array.channel_sensor[row.available])
@@ -355,35 +357,37 @@ class Tracker(CartesianFilter):
         point = point_of_mixture(row.time_s, mixture, np.diagonal(known.open_loop))
         return replace(point, status=status, iterations=iterations, **statistics)
 
-    def _acquire(self, seen: RowMeasurement, index: int) -> TrackPoint:
-        """Start a track from several rows that are individually insufficient, or return an undetermined point."""
-        mixture, reason = self._undetermined.after(seen, self.motion)
-        start = self._acquisition.start(seen.row, self._undetermined.position_error)
-        known = None if start is None else self._filter_acquired(start, seen)
+    def _acquire(self, measurement: RowMeasurement, index: int) -> TrackPoint:
+        """Start a track from several insufficient rows, or return an undetermined point."""
+        mixture, reason = self._undetermined.after(measurement, self.motion)
+        start = self._acquisition.start(measurement.row, self._undetermined.position_error)
+        known = None if start is None else self._filter_acquired(start, measurement)
         if start is None or known is None:
-            return self._undetermined_point(mixture, reason, seen)
+            return self._undetermined_point(mixture, reason, measurement)
         self._acquisition.forget()
         self._undetermined.forget()
         point = self._tracked_point(
-            seen.row, index, known, None, status="acquired", iterations=start.solution.iterations
+            measurement.row, index, known, None, status="acquired", iterations=start.solution.iterations
         )
         return replace(point, weight=start.solution.weight, rivals=start.rivals)
 
-    def _filter_acquired(self, start: AcquiredSource, seen: RowMeasurement) -> TrackState | None:
-        """Return the state of a track that starts from several rows, or None if it is not certain enough."""
+    def _filter_acquired(self, start: AcquiredSource, measurement: RowMeasurement) -> TrackState | None:
+        """Return the state of a track that starts from several rows, None if uncertain."""
         source = np.concatenate([start.solution.position_m, start.solution.moment_Am2])
         found = self.start(source, start.solution.covariance, start.rows)
         if found is None:
             return None
-        offset, root = seen.place_in_array(found.x, found.S)
+        offset, root = measurement.place_in_array(found.x, found.S)
         if float(np.linalg.norm(root)) > STACKED_POSITION_ERROR * float(np.linalg.norm(offset)):
             return None
-        return TrackState(from_cartesian(found.x, found.S, seen), self.prior_covariance(seen, found.x))
+        return TrackState(from_cartesian(found.x, found.S, measurement), self.prior_covariance(measurement, found.x))
 
-    def _undetermined_point(self, mixture: Mixture | None, reason: str, seen: RowMeasurement) -> TrackPoint:
+    def _undetermined_point(self, mixture: Mixture | None, reason: str, measurement: RowMeasurement) -> TrackPoint:
         """Return the point of a row that shows a source and does not determine it."""
         if mixture is None:
-            return self.untracked_point(seen.row, reason)
+            return self.untracked_point(measurement.row, reason)
         heaviest = mixture.x[np.argmax(mixture.log_weight)]
-        point = point_of_mixture(seen.row.time_s, mixture, np.diagonal(self.prior_covariance(seen, heaviest)))
+        point = point_of_mixture(
+            measurement.row.time_s, mixture, np.diagonal(self.prior_covariance(measurement, heaviest))
+        )
         return replace(point, status=UNDETERMINED)

@@ -18,8 +18,8 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from fnmatch import fnmatch
 
 from arrays.io.tables import aligned
-from tests.tracking_figures.figures import Comparison, Figures, compared
-from tests.tracking_figures.scenarios import QUICK, SCENARIOS, store, stored
+from tests.tracking_figures.figures import Comparison, Figures, compare
+from tests.tracking_figures.scenarios import QUICK, SCENARIOS, read_stored, store
 
 
 def main() -> int:
@@ -38,7 +38,7 @@ def main() -> int:
     if given.list:
         print("\n".join(f"{name}: seeds {SCENARIOS[name].seeds}" for name in names))
         return 0
-    old = stored() if given.compare or len(names) < len(SCENARIOS) else {}
+    old = read_stored() if given.compare or len(names) < len(SCENARIOS) else {}
     new: dict[str, Figures] = {}
     begin = time.perf_counter()
     for name, figures in figures_of(names, given.jobs):
@@ -47,7 +47,7 @@ def main() -> int:
     if not given.compare:
         store(old | new)
         return 0
-    return int(printed({name: compared(old[name], new[name]) for name in names if name in old}, old, new))
+    return int(print_comparisons({name: compare(old[name], new[name]) for name in names if name in old}, old, new))
 
 
 def figures_of(names: Sequence[str], jobs: int) -> Iterator[tuple[str, Figures]]:
@@ -65,7 +65,9 @@ def _figures(name: str) -> tuple[str, Figures]:
     return name, SCENARIOS[name].figures()
 
 
-def printed(comparisons: dict[str, list[Comparison]], old: dict[str, Figures], new: dict[str, Figures]) -> bool:
+def print_comparisons(
+    comparisons: dict[str, list[Comparison]], old: dict[str, Figures], new: dict[str, Figures]
+) -> bool:
     """Print a table of all figures, and whether one of them is worse."""
     rows = [["scenario", "figure", "old", "new", "allowed", ""]]
     for name, of_name in comparisons.items():

@@ -161,7 +161,7 @@ class Comparison:
     limit: str = ""
 
 
-def compared(old: Figures, new: Figures) -> list[Comparison]:
+def compare(old: Figures, new: Figures) -> list[Comparison]:
     """All figures of a scenario."""
     late, of_median = 1.0 - 1.0 / FIRST_ROWS, math.sqrt(0.5 * math.pi)
     of_nees = math.sqrt(2.0 / max(old.nees_numbers, 1))

@@ -32,7 +32,7 @@ class Clock:
     cpu_s: float = 0.0
 
     @contextmanager
-    def timed(self) -> Iterator[None]:
+    def measure(self) -> Iterator[None]:
         begin = time.process_time()
         yield
         self.cpu_s += time.process_time() - begin
@@ -72,12 +72,12 @@ def run_of(
 ) -> Run:
     """One record through :func:`magloc.track`."""
     clock = Clock()
-    with clock.timed():
+    with clock.measure():
         track = magloc.track(array, readings, **options)
-    return judged(seed, track, truth, expected, clock)
+    return judge(seed, track, truth, expected, clock)
 
 
-def judged(seed: int, track: magloc.Track, truth: Truth, expected: Expected, clock: Clock) -> Run:
+def judge(seed: int, track: magloc.Track, truth: Truth, expected: Expected, clock: Clock) -> Run:
     """A track against the truth."""
     result = track.consistency(truth)
     late = slice(len(track) // FIRST_ROWS, None)
@@ -161,7 +161,7 @@ def run_of_sources(
 ) -> Run:
     """Magnets over a board through :func:`magloc.track_sources`."""
     clock = Clock()
-    with clock.timed():
+    with clock.measure():
         points = list(magloc.track_sources(array, readings, **options))
     there, first = truth.present.sum(axis=0), len(points) // FIRST_ROWS
     tracked = sum(min(len(point.tracks), int(n)) for point, n in zip(points, there, strict=True))

@@ -45,7 +45,7 @@ from tests.tracked_sources import (
     with_fault,
 )
 from tests.tracking_figures.figures import Run
-from tests.tracking_figures.judging import Clock, Expected, judged, run_of
+from tests.tracking_figures.judging import Clock, Expected, judge, run_of
 
 # What docs/guide/tracking.md tells of the built-in scenarios.
 AT_REST = magloc.RandomWalk(1e-6, math.radians(1e-5))
@@ -168,17 +168,17 @@ def posed(
 def ambient(constant_T: float, white_T: float, stated: bool, seed: int) -> Run:
     """Moduli in an ambient field that errs."""
     clock = Clock()
-    with clock.timed():
+    with clock.measure():
         simulation, track = test_ambient_uncertainty.run(seed, constant_T, white_T, stated=stated)
-    return judged(seed, track, simulation.truth, Expected(flagged=not stated), clock)
+    return judge(seed, track, simulation.truth, Expected(flagged=not stated), clock)
 
 
 def carrier(scenario: MagneticScenario, seed: int) -> Run:
     """An array whose carrier the ambient field magnetises."""
     clock = Clock()
-    with clock.timed():
+    with clock.measure():
         simulation, track = test_carrier.run(scenario, seed)
-    return judged(seed, track, simulation.truth, Expected(), clock)
+    return judge(seed, track, simulation.truth, Expected(), clock)
 
 
 def known_modulus(range_m: float, seed: int) -> Run:
@@ -208,7 +208,7 @@ def known_path(smooth: bool, seed: int) -> Run:
     ship = sims.simulate(sims.read_scenario("ship-headings"), seed)  # type: ignore[arg-type]
     error = ship.scenario.sources[0].path_error
     clock = Clock()
-    with clock.timed():
+    with clock.measure():
         track = magloc.track_moment(
             ship.array, ship.readings, ship.paths[0], turn_rad_s=math.radians(3.0), path_error=error, smooth=smooth
         )
@@ -231,7 +231,7 @@ def signature(seed: int) -> Run:
     assert isinstance(scenario, MagneticScenario)
     ship, source = sims.simulate(scenario, seed), scenario.sources[0]
     clock = Clock()
-    with clock.timed():
+    with clock.measure():
         found = magloc.fit_signature(ship.array, ship.readings, ship.paths[0], path_error=source.path_error)
     induced = np.diag(source.polarisability_m3) * found.components.ambient_T / passing_ship.MU0
     error = found.parameters_Am2 - np.concatenate([source.moment_Am2, induced])

@@ -45,7 +45,7 @@ SCENARIOS = {
 }
 
 
-def stored() -> dict[str, Figures]:
+def read_stored() -> dict[str, Figures]:
     """Figures that are stored."""
     return {name: Figures.read(entry) for name, entry in json.loads(STORED.read_text(encoding="utf-8")).items()}
 

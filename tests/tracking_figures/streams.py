@@ -26,11 +26,11 @@ from tests.tracking_figures.judging import Clock, differing_rows
 from tests.tracking_figures.one_source import FAULT, MOTIONS, N_FAULT, WANDERING
 
 
-def compared(seed: int, array: SensorArray, readings: Readings, motion: MotionModel) -> Run:
+def compare_streams(seed: int, array: SensorArray, readings: Readings, motion: MotionModel) -> Run:
     """Points of :func:`magloc.track` against those of :class:`magloc.Tracker`, row by row."""
     whole = magloc.track(array, readings, motion=motion)
     tracker, clock = magloc.Tracker(array, motion), Clock()
-    with clock.timed():
+    with clock.measure():
         points = [tracker.update(row) for row in rows_of(readings)]
     return Run(
         seed,
@@ -48,11 +48,11 @@ def built_in(name: str, duration_s: float, seed: int, *, motion: MotionModel | N
     scenario = sims.read_scenario(name)
     assert isinstance(scenario, MagneticScenario)
     simulation = sims.simulate(replace(scenario, duration_s=duration_s), seed)
-    return compared(seed, simulation.array, simulation.readings, motion or MOTIONS[name])
+    return compare_streams(seed, simulation.array, simulation.readings, motion or MOTIONS[name])
 
 
 def first_rows(seed: int) -> Run:
-    return compared(seed, ARRAY, drawn(WALK, 40, seed)[1], WALK)
+    return compare_streams(seed, ARRAY, drawn(WALK, 40, seed)[1], WALK)
 
 
 def faulty(seed: int) -> Run:
@@ -60,19 +60,19 @@ def faulty(seed: int) -> Run:
     _, readings, rng = walk_from_5_m(ARRAY, N_FAULT, seed)
     values_T = with_fault("stuck", readings.values_T, FAULT, slice(3, 6), rng)
     values_T[150:155] = np.nan
-    return compared(seed, ARRAY, replace(readings, values_T=values_T), SLOW)
+    return compare_streams(seed, ARRAY, replace(readings, values_T=values_T), SLOW)
 
 
 def pair_of_sensors(seed: int) -> Run:
     pair = replace(PASSING, array=axial(1.2, "vector"), models=PASSING.models[:2])
     simulation = sims.simulate(pair, seed)
-    return compared(seed, simulation.array, simulation.readings, REST)
+    return compare_streams(seed, simulation.array, simulation.readings, REST)
 
 
 def posed(seed: int) -> Run:
     """Without errors of the clock: how fast the array moves, a stream knows from the rows before alone."""
     simulation = sims.simulate(replace(PASSING, pose=replace(WHITE, time_s=0.0)), seed)
-    return compared(seed, simulation.array, simulation.readings, REST)
+    return compare_streams(seed, simulation.array, simulation.readings, REST)
 
 
 def two_magnets(seed: int) -> Run:
@@ -81,7 +81,7 @@ def two_magnets(seed: int) -> Run:
     values_T = Magnets.drawn(2, 200, 0.02, rng, come_and_go=True).readings_T(array, rng)
     readings = Readings(values_T, time_s=np.arange(len(values_T)) / RATE_HZ)
     whole, tracker, clock = magloc.track_sources(array, readings), magloc.SourcesTracker(array), Clock()
-    with clock.timed():
+    with clock.measure():
         points = [tracker.update(row) for row in rows_of(readings)]
     same = [
         (a.status, a.dropped_sensors, [track.id for track in a.tracks])

@@ -1,1 +1,1 @@
-"""What is known of a tracked source: coordinates, mixtures of Gaussians in them, and how rows change these."""
+"""Mixture filter of one source: start, split, update, merge, refit."""

@@ -17,7 +17,7 @@ UNIFORM_IN_SPACE = 3.0
 
 @dataclass(frozen=True, eq=False)
 class KnownInWorld:
-    """A known moment as a measurement of states in the world frame; the array has the rotation R (3, 3)."""
+    """A known moment in the array's axes as a measurement of states in the world frame."""
 
     moment: KnownMoment
     R_world_from_array: FloatArray

@@ -136,7 +136,7 @@ class Mixture:
         return replace(merged, log_weight=log_weight - np.logaddexp.reduce(log_weight))
 
     def match_moments(self) -> Mixture:
-        """Return the Gaussian of the same mean and covariance, in the chart of the heaviest component."""
+        """Return the Gaussian of equal mean and covariance in the heaviest component's chart."""
         if len(self) == 1:
             return self
         n, best = self.n_charted, int(np.argmax(self.log_weight))
@@ -153,7 +153,7 @@ class Mixture:
         return replace(self, x=x[None], S=root_of(rows)[None], log_weight=np.zeros(1))
 
     def moments(self) -> tuple[FloatArray, FloatArray]:
-        """Return the Cartesian mean (6,) and covariance (6, 6) of position and moment; ranges are log-normal."""
+        """Return Cartesian mean (6,) and covariance (6, 6); ranges are log-normal."""
         mean, covariance = component_moments(self.chart, self.S)
         if len(self) == 1:
             return mean[0], covariance[0]
@@ -188,7 +188,7 @@ class Mixture:
 
 
 def component_moments(chart: Chart, S: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return Cartesian means (K, 6) and covariances (K, 6, 6) of components with roots S in the chart."""
+    """Return Cartesian means (K, 6) and covariances (K, 6, 6) of components with roots S."""
     reach = chart.length[:, None, None]
     of_position = reach * (chart.u[:, :, None] * S[:, :1] + chart.E @ S[:, 1:3])
     of_moment = MOMENT_POWER * chart.x[:, 3:6, None] * S[:, :1] + reach**MOMENT_POWER * S[:, 3:6]
@@ -213,7 +213,7 @@ def _in_chart(about: Chart, mixture: Mixture) -> tuple[FloatArray, FloatArray]:
 
 
 def root_of(rows: FloatArray) -> FloatArray:
-    """Return the lower root (..., n, n) of ``rows rowsᵀ``, by a QR factorisation of rows (..., n, m), m ≥ n."""
+    """Return the lower root (..., n, n) of ``rows rowsᵀ`` by QR of rows (..., n, m), m ≥ n."""
     return np.swapaxes(np.linalg.qr(np.swapaxes(rows, -1, -2), mode="r"), -1, -2)
 
 

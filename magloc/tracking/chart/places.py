@@ -128,7 +128,7 @@ def effective_sample_size(drawn: Mixture) -> float:
 
 
 def sample_places(stack: Stack, places: Sequence[Places], prior: SourcePrior) -> Mixture | None:
-    """Sample places by all rows until the effective sample size is large enough; None if none is possible."""
+    """Sample places by all rows until enough of them count; None if none is possible."""
     drawn: Mixture | None = None
     every = list(places)
     for _ in range(_MOST_ROUNDS if places else 0):
@@ -144,7 +144,7 @@ def sample_places(stack: Stack, places: Sequence[Places], prior: SourcePrior) ->
 
 
 def _importance_sample(stack: Stack, places: Sequence[Places], prior: SourcePrior) -> Mixture | None:
-    """Return weighted states sampled equally from several proposals, with the best moment of each."""
+    """Return weighted states from several proposals, with the best moment of each place."""
     n_each = N_PLACES // len(places)
     x = np.concatenate([one.draw(n_each) for one in places])
     log_density = np.logaddexp.reduce([one.log_density(x) for one in places], axis=0)
@@ -185,7 +185,7 @@ def _importance_sample(stack: Stack, places: Sequence[Places], prior: SourcePrio
 
 
 def _moments(stack: Stack, prior: SourcePrior, R: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return best moments (n, 3), upper roots (n, 3, 3) of their information, and χ² (n,), by R (n, 4, 4)."""
+    """Return best moments (n, 3), roots (n, 3, 3) of their information, and χ² (n,)."""
     chi2 = R[:, 3, 3] ** 2
     known, turn = prior.known_moment, stack.row.R_world_from_array
     of_moment, y = R[:, :3, :3], R[:, :3, 3]

@@ -154,7 +154,7 @@ class _YoungRows:
         return Chart.at(track, self._centroids_m, first.radius_m, first.n_pose)
 
     def propagate_backward(self, x: FloatArray) -> FloatArray:
-        """Return trajectories (rows, K, n) without noise and errors of the pose that end at states (K, N)."""
+        """Return trajectories (rows, K, n) without noise that end at states (K, N)."""
         m, track = self.motions[0].n_states, np.zeros((len(self.motions), len(x), self.measurements[0].n_charted))
         track[-1] = x[:, : track.shape[2]]
         for row in range(len(track) - 1, 0, -1):
@@ -194,7 +194,7 @@ class _YoungRows:
         return Gaussians(mean, root, n_nuisances=n - m + n_errors)
 
     def _with_known(self, x: FloatArray, before: Gaussians, known: KnownInWorld) -> tuple[Gaussians, FloatArray]:
-        """Return a prior about states (K, n) updated by the known moment, and the evidence (K,) of that."""
+        """Return a prior about states (K, n) updated by the known moment, and its evidence (K,)."""
         n, n_known = x.shape[1], known.n_known
         chart = self.measurements[0].chart(x)
         H = np.zeros((len(x), n_known, before.x.shape[1]))

@@ -71,7 +71,7 @@ def split(mixture: Mixture, row: RowMeasurement) -> tuple[Mixture, IntArray]:
 
 
 def bends(mixture: Mixture, row: RowMeasurement) -> tuple[FloatArray, FloatArray]:
-    """Return the nonlinearity (K, 6) of a row's readings, and one standard deviation (K, 6, N) along each axis."""
+    """Return the nonlinearity (K, 6) of a row's readings, and one σ (K, 6, N) along each axis."""
     gaussians, memory = Gaussians(mixture.x, mixture.S), min(mixture.n_rows, MOST_ROWS)
     bend, directions = row_filter.bends(gaussians, row.kernel_rows, memory)
     # A wide component may overflow.

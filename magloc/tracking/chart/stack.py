@@ -33,7 +33,7 @@ MOST_CHANGES = 32
 
 @dataclass(frozen=True, eq=False)
 class Stack:
-    """Rows in the order of time as one measurement, with the interface of :class:`RowMeasurement`.
+    """Rows as one measurement, with the interface of :class:`RowMeasurement`.
 
     Attributes
     ----------
@@ -183,7 +183,7 @@ class Stack:
         return np.asarray(np.swapaxes(means, -1, -2) @ directions)
 
     def linearise_in_moment(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the predicted differences (K, k) of sources (K, 6), and their derivative by the moments."""
+        """Return predicted differences (K, k), and their derivative (K, k, 3) by the moments."""
         array, (_, R) = self.model.array, self._pose
         place, moment = self._in_arrays(state)
         matrix = dipole.field_matrix(array.positions, place)
@@ -216,7 +216,7 @@ class Stack:
         return bool(left @ left > energy_threshold(self.n_differences))
 
     def covariance(self, state: FloatArray, *, far: bool = False) -> FloatArray:
-        """Return the covariance (K, k, k) of the differences for states (K, 6), or without a source if `far`."""
+        """Return the covariance (K, k, k) for states (K, 6), or without a source if `far`."""
         k = self.z.size
         C = np.eye(k) + self._sensor_covariance
         parts = []
@@ -243,7 +243,7 @@ class Stack:
         return np.broadcast_to(C, (len(state), k, k))
 
     def _error_columns(self, E: FloatArray, share: FloatArray) -> FloatArray:
-        """Return columns (K, k, m means) of errors with an effect E (K, k, m) and a root `share` over the means."""
+        """Return columns (K, k, m means) of errors with an effect E and a root `share`."""
         n_means, m = len(share), E.shape[-1]
         columns = E.reshape(len(E), n_means, -1, m)[..., None] * share[:, None, None, :]
         return columns.reshape(len(E), E.shape[1], -1)
@@ -284,17 +284,17 @@ class Stack:
             s = states[0]
             T = np.zeros((n, n))
             T[0, 0] = self.errors.sigma[s] ** 2
-            for i, (kept, noise) in enumerate(steps, start=1):
-                T[i, :i] = kept[s] * T[i - 1, :i]
+            for i, (decay, noise) in enumerate(steps, start=1):
+                T[i, :i] = decay[s] * T[i - 1, :i]
                 T[:i, i] = T[i, :i]
-                T[i, i] = kept[s] ** 2 * T[i - 1, i - 1] + noise[s] ** 2
+                T[i, i] = decay[s] ** 2 * T[i - 1, i - 1] + noise[s] ** 2
             part = self._error_columns(E[..., states], self._root_of_means(T))[0]
             added += part @ part.T
         return added
 
     @cached_property
     def _motion_roots(self) -> tuple[FloatArray, FloatArray]:
-        """Roots over the means of the source's displacement since each row [m], and of its moment's relative change.
+        """Roots of the covariance of displacements [m] and of relative changes of the moment.
 
         A stationary motion is the same backwards in time.
         """
@@ -321,13 +321,13 @@ def _changes(rows: Sequence[RowMeasurement]) -> IntArray:
 
 
 def _unit_moment_state(motion: MotionModel) -> tuple[FloatArray, FloatArray]:
-    """Return the state of a source of unit moment at a known place, and the covariance of its velocity and rates."""
+    """Return the state of a unit moment at a known place, and its prior covariance."""
     x, S = motion.start(np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0]), np.zeros((N_SOURCE, N_SOURCE)))
     return x, S @ S.T
 
 
 def displacement(motion: MotionModel, dt_s: float) -> tuple[float, float]:
-    """Return σ of a source's displacement in a time along each axis [m], and of its moment's relative change."""
+    """Return σ of displacement along each axis [m], and of relative change of the moment."""
     x, P = _unit_moment_state(motion)
     _, F, S_q = motion.step(x, dt_s)
     variance = np.diagonal(F @ P @ F.T + S_q @ S_q.T)

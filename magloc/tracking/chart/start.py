@@ -86,7 +86,7 @@ def first_root(chart: Chart, motion: MotionModel, sigma_range: FloatArray | None
 
 
 def _with_motion(chart: Chart, motion: MotionModel, sigma: FloatArray) -> FloatArray:
-    """Return Cartesian roots (K, n, n) from σ (K, 3) of log-range and direction, with an unknown moment."""
+    """Return Cartesian roots (K, n, n) from σ (K, 3) of log-range and direction."""
     strength = np.linalg.norm(chart.x[:, 3:6], axis=1) / chart.length**MOMENT_POWER
     _, rest = motion.start(np.zeros(N_SOURCE), np.zeros((N_SOURCE, N_SOURCE)))
     root = np.tile(np.eye(chart.x.shape[1]), (len(chart.x), 1, 1))  # of the pose's errors, behind the motion
@@ -111,7 +111,7 @@ class _Grid:
         return cls(position.reshape(-1, 3), np.arccos(np.clip(directions @ directions.T, -1, 1)) < _NEIGHBOURS)
 
     def select(self, explained: FloatArray) -> BoolArray:
-        """Return the cells (n,) to start from, by the energy that each explains, -inf if it is not allowed."""
+        """Return the cells (n,) to start from, by the energy explained, -inf if not allowed."""
         table = explained.reshape(_N_RANGES, _N_DIRECTIONS)
         around = np.where(self.neighbours, table[:, None, :], -np.inf).max(axis=2)
         padded = np.pad(table, ((1, 1), (0, 0)), constant_values=-np.inf)
@@ -223,7 +223,7 @@ class TrackStarter:
 
 
 def _images(source: FloatArray, measurement: RowOrStack) -> tuple[FloatArray, IntArray]:
-    """Return mirror images (n, 6) of a source at the two nearest ranges of the grid, and these ranges (n,)."""
+    """Return mirror images (n, 6) of a source at the nearest ranges (n,) of the grid."""
     images = mirror_images(source[None], measurement.centroid_m)[1:, 0]
     chart = measurement.chart(images)
     below = math.floor(math.log(float(chart.length[0]) / measurement.radius_m / NEAREST) / _PITCH)
@@ -257,7 +257,7 @@ def _mixture(found: StateUpdates | RowUpdates, log_weight: FloatArray, measureme
 
 
 def _recentre(seeds: _Seeds, found: StateUpdates | RowUpdates, measurement: RowOrStack) -> _Seeds:
-    """Return seeds moved to their components, along coordinates that the row determines better than the cell."""
+    """Return seeds at their components, along coordinates that the row determines."""
     sigma = np.sqrt(np.sum(found.S[:, :3] ** 2, axis=2))
     narrow = sigma < _NARROW * _CELL
     narrow = np.stack([narrow[:, 0], narrow[:, 1] & narrow[:, 2]], axis=1)
@@ -279,7 +279,7 @@ def _recentre(seeds: _Seeds, found: StateUpdates | RowUpdates, measurement: RowO
 
 
 def _subdivide_valleys(seeds: _Seeds, found: StateUpdates | RowUpdates, measurement: RowOrStack) -> _Seeds:
-    """Replace seeds in a curved valley of ranges by several along it, with a pitch by its curvature.
+    """Replace seeds in a curved valley of ranges by several along it.
 
     A precise row leaves a narrow valley, and a Gaussian at its middle does not cover its ends.
     """
@@ -311,7 +311,7 @@ def _subdivide_valleys(seeds: _Seeds, found: StateUpdates | RowUpdates, measurem
 
 
 def with_errors(mixture: Mixture, measurement: RowMeasurement, sigma: FloatArray) -> Mixture:
-    r"""Return the mixture with the sensors' errors as further states, with prior standard deviations (n_errors,).
+    r"""Return the mixture with the sensors' errors, of prior σ (n_errors,), as further states.
 
     They are estimated from the residual at each component. With the effect :math:`\Phi` of unit errors it is
     :math:`\varepsilon = \sigma \Phi^T (1 + \Phi \Phi^T)^{-1} (z - h(x))`, with the covariance of a linear model.

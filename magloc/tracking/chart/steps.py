@@ -143,7 +143,7 @@ class ChartFilter:
     def start(
         self, row: RowMeasurement, motion: MotionModel, near: Mixture | None = None
     ) -> tuple[Mixture | None, str]:
-        """Return a new track's mixture by one row, weighted by a predicted place, or None and the reason."""
+        """Return a new track's mixture by one row, or None and the reason."""
         if self._misfits.waits:
             self._misfits = self._misfits.skip_row()
             return None, OFFSETS
@@ -161,11 +161,11 @@ class ChartFilter:
         return self._start.mixture(row, motion)
 
     def stack_mixture(self, stack: Stack, at_rest: MotionModel) -> tuple[Mixture | None, str]:
-        """Return the mixture of the source in the last of several rows by all of them, or None and the reason."""
+        """Return the mixture of the source by several rows, or None and the reason."""
         return self._start.mixture(stack, at_rest)
 
     def faulty_sensors(self, row: RowMeasurement) -> BoolArray:
-        """Return the sensors (N,) that contradict the others in a row; none if the misfit lasts over rows."""
+        """Return the sensors (N,) that contradict the others; none if the misfit lasts over rows."""
         if self._misfits.are_alike:
             return np.zeros(self.errors.array.n_sensors, dtype=bool)
         return self._start.faulty_sensors(row.row)
@@ -280,7 +280,7 @@ class ChartFilter:
     def _refit_by_range(
         self, found: Mixture, rows: Sequence[RowMeasurement], motions: Sequence[MotionModel]
     ) -> Mixture:
-        """Refit components with an uncertain range in several cells of the range, each with its evidence.
+        """Refit components of uncertain range in several cells of the range.
 
         The valley of ranges is curved, and its width varies along it, so that its mode is biased towards the array.
         This does not apply to a source that moves by more than the σ of its range: then each row has another valley.
@@ -323,7 +323,7 @@ def width_of(mixture: Mixture) -> float:
 
 
 def to_cartesian(mixture: Mixture) -> tuple[FloatArray, FloatArray]:
-    """Return the Cartesian state (N,) and root (N, N) of the same mean and covariance as a mixture."""
+    """Return the Cartesian state (N,) and root (N, N) that match a mixture's moments."""
     one = mixture.match_moments()
     n, root = one.n_charted, one.S[0].copy()
     root[:n] = one.chart.jacobian(np.zeros((1, n)))[0] @ root[:n]
@@ -331,7 +331,7 @@ def to_cartesian(mixture: Mixture) -> tuple[FloatArray, FloatArray]:
 
 
 def from_cartesian(x: FloatArray, S: FloatArray, row: RowMeasurement) -> Mixture:
-    """Return the mixture of a Cartesian state and root, in the chart of a row: inverse of :func:`to_cartesian`."""
+    """Return the mixture of a Cartesian state and root: the inverse of :func:`to_cartesian`."""
     n, root = row.n_charted, S.copy()
     root[:n] = row.chart(x[None, :n]).inverse_jacobian()[0] @ root[:n]
     return Mixture(x[None], root[None], np.zeros(1), n, row.centroid_m, row.radius_m, row.n_pose)

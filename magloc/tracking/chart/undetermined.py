@@ -1,4 +1,4 @@
-"""Estimate of a source from several rows that are individually insufficient, until a track starts."""
+"""Estimate of a source from rows that are individually insufficient."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class Undetermined:
             self._fit(Stack.of(tuple(self._rows), self.filter.errors, self.filter.pose_errors, motion))
 
     def _fit(self, stack: Stack) -> None:
-        """Sample places from the last estimate, and from a search if one is due or if too few of them count."""
+        """Sample places from the last estimate, and from a search if necessary."""
         if stack.n_differences <= _OF_A_MOMENT:
             return
         places = [] if self._mixture is None else [Places.about(self._mixture)]
@@ -90,7 +90,7 @@ class Undetermined:
 
 
 def _moves_a_source_at_rest(motion: MotionModel) -> bool:
-    """Return True if a source at rest moves in the state's frame, which is that of a moving array."""
+    """Return True if a source at rest moves in the state's frame, that of a moving array."""
     x, _ = motion.start(np.arange(1.0, 1.0 + N_SOURCE), np.zeros((N_SOURCE, N_SOURCE)))
     return not np.allclose(motion.step(x, 1.0)[0], x, rtol=1e-9)
 

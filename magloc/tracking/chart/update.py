@@ -99,7 +99,7 @@ def is_regular(S: FloatArray) -> BoolArray:
 
 
 def _whole_step(J: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the Gauss-Newton step (K, n) that minimises |residual - J step|², and the decrease (K,)."""
+    """Return the step (K, n) that minimises |residual - J step|², and the decrease (K,)."""
     R = np.asarray(np.linalg.qr(np.concatenate([J, residual[..., None]], axis=2), mode="r"))
     n = J.shape[-1]
     return np.asarray(np.linalg.solve(R[:, :n, :n], R[:, :n, n:])[..., 0]), np.sum(R[:, :n, n] ** 2, axis=1)
@@ -107,7 +107,7 @@ def _whole_step(J: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatA
 
 @dataclass(frozen=True, eq=False)
 class _UpdateProblem:
-    """Least-squares problem of a row in standardised coordinates ζ, e = S ζ, with ``C^{-1/2} = whiten``."""
+    """Least-squares problem of a row in standardised coordinates ζ, e = S ζ."""
 
     chart: Chart
     S: FloatArray

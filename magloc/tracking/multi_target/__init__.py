@@ -1,1 +1,1 @@
-"""Several moving sources in one filter."""
+"""Joint filter of several moving sources."""

@@ -1,4 +1,4 @@
-"""Explanations of a row that contradicts its prediction: a beam search over births, deaths and faults."""
+"""Beam search over births, deaths and faults that explain a row."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SENSOR_OUT, BIRTH, DEATH, MANOEUVRE = 32.0, 16.0, 14.0, 12.0
 """Penalty of an event: -2 ln of its prior probability."""
 MANOEUVRE_AGILITY = 10.0
 """Factor of the noise of velocity and turn in the step of a manoeuvre."""
-NAMES_A_ROW = 100
+IDS_PER_ROW = 100
 """The id of a source is this times the row of its birth, plus a number."""
 MOST_BY_ITSELF = 5
 """Largest number of sources that are searched for one by one; a search for more takes seconds and fails."""
@@ -164,7 +164,7 @@ class RowProblem:
         return full or float(self._cells.energy(found.update.residual).max()) < BIRTH_LIMIT
 
     def explanations(self, plain: Explanation, manoeuvring: JointState) -> list[Explanation]:
-        """Return the likeliest consistent explanations, from an inconsistent one; empty if there are none.
+        """Return the likeliest consistent explanations, starting from an inconsistent one.
 
         A manoeuvre of the known sources is tried last; otherwise a known source would jump to a new one.
         """
@@ -177,7 +177,7 @@ class RowProblem:
         return [moved] if self.is_consistent(moved) else self._beam(moved, 1)
 
     def explain_from_nothing(self, common: JointState, out: BoolArray) -> list[Explanation]:
-        """Return consistent explanations without known sources, the likeliest first, of several numbers of sources.
+        """Return consistent explanations without known sources, the likeliest first.
 
         Two sources at wrong places may explain the readings of three, and leave no residual for a birth. Therefore
         sources are also split in two, and all are refined together.
@@ -224,7 +224,7 @@ class RowProblem:
         return found
 
     def explain_with_at_least(self, nothing: Explanation, least: int) -> list[Explanation]:
-        """Return explanations with at least some number of sources; fewer may be consistent and wrong."""
+        """Return explanations with a least number of sources; fewer may be consistent and wrong."""
         return self._beam(nothing, least + 1, least)
 
     def _beam(self, plain: Explanation, most_events: int, least: int = 0) -> list[Explanation]:
@@ -265,7 +265,7 @@ class RowProblem:
     def remove_sources(
         self, found: Explanation, sources: Sequence[int], pairs: Sequence[tuple[int, int]]
     ) -> Iterator[Explanation]:
-        """Yield explanations without each of some sources, and with one source in place of each of some pairs."""
+        """Yield explanations without each of some sources, and with each of some pairs merged."""
         prior, state, ids, penalty = found.prior, found.update.state, found.ids, found.penalty - BIRTH
         for k in sources:
             yield self.update(prior.without(k), ids[:k] + ids[k + 1 :], found.out, penalty)
@@ -307,7 +307,7 @@ class RowProblem:
             update = found.update
             ids = (*found.ids, self.first_id + born)
             prior = self.with_sources(
-                found.prior, *self._cell_source(cell, update.innovation, update.seen_before, update.row.used)
+                found.prior, *self._cell_source(cell, update.innovation, update.projector_before, update.row.used)
             )
             start = joint_update(prior, update.row, _START_TRIALS).state
             if not 0.0 < np.linalg.norm(start.moment_Am2[-1]) < np.inf:
@@ -321,30 +321,30 @@ class RowProblem:
     @property
     def first_id(self) -> int:
         """Lower bound of the ids of sources born in this row."""
-        return self.index * NAMES_A_ROW
+        return self.index * IDS_PER_ROW
 
     def mean_residual(self, health: SensorHealth) -> tuple[FloatArray, float]:
-        """Return the mean residual (C,) of recent rows, of unit variance, and its largest energy in a cell."""
+        """Return the mean residual (C,) of recent rows, and its energy in the best cell."""
         mean = health.means[_LEFT_MEMORY].ravel()
         return mean, float(self._cells.energy(mean).max())
 
     def late_birth_priors(self, prior: JointState, found: Explanation, left: FloatArray) -> Iterator[JointState]:
-        """Yield predictions with another source at the cells that explain most of a mean residual (C,)."""
+        """Yield predictions with another source at the best cells of a mean residual (C,)."""
         update = found.update
         for cell in self._cells.best(self._cells.energy(left), _LATE_STARTS):
-            source = self._cell_source(cell, _LEFT_SHARE * left, update.seen, update.row.used)
+            source = self._cell_source(cell, _LEFT_SHARE * left, update.projector, update.row.used)
             yield self.with_sources(prior, *source, _LATE_SPREAD)
 
     def _cell_source(
-        self, cell: int, left: FloatArray, seen: FloatArray, used: BoolArray
+        self, cell: int, left: FloatArray, projector: FloatArray, used: BoolArray
     ) -> tuple[FloatArray, FloatArray]:
         """Return position and best moment (1, 3) of a source in a cell, for a residual (C,)."""
         R = self.row.R_world_from_array
         place_m = self.row.origin_m + R @ self._cells.position_m[cell]
-        return place_m[None], (R @ self._cells.moment(cell, left, seen, used))[None]
+        return place_m[None], (R @ self._cells.moment(cell, left, projector, used))[None]
 
     def allows(self, state: JointState, row: JointRow, born: slice = slice(None)) -> bool:
-        """Return True if sources agree with the prior, and differ from a fault and from the ambient field.
+        """Return True if sources agree with the prior, and are neither faults nor ambient field.
 
         A source in the readings of a single sensor may be a fault of that sensor. A far source that is much stronger
         than the others may be a gradient of the ambient field.
@@ -395,7 +395,7 @@ class RowProblem:
 
 
 def drop_duplicates(found: Iterable[Explanation]) -> list[Explanation]:
-    """Return explanations without equal ones, the likeliest first; several cells often lead to the same source."""
+    """Return explanations without duplicates, which several cells may find, the likeliest first."""
     unique: list[Explanation] = []
     for one in sorted(found, key=_score):
         if not any(abs(one.score - other.score) < _SAME_SCORE and len(one.ids) == len(other.ids) for other in unique):
@@ -413,7 +413,7 @@ def drop_same_places(found: Iterable[Explanation]) -> list[Explanation]:
 
 
 def far_sources(state: JointState) -> list[int]:
-    """Return indices of sources much stronger than another one: far sources, which look like a field gradient."""
+    """Return indices of sources so strong, thus far, that they look like a field gradient."""
     strength = np.linalg.norm(state.moment_Am2, axis=1)
     return np.flatnonzero(strength > _MUCH_STRONGER * strength.min(initial=np.inf)).tolist()
 

@@ -49,7 +49,7 @@ class Hypothesis:
         -2 ln of the posterior probability, up to a constant.
     excess : ndarray, shape (2,)
         Mean excess of χ² over recent rows, with a short and a long memory.
-    judged : int
+    probation : int
         Number of rows for which a restart is still on probation; 0 after it is accepted.
     young : YoungTrack, optional
         Rows since the last birth while the hypothesis is young, later the last rows.
@@ -60,7 +60,7 @@ class Hypothesis:
     health: SensorHealth
     score: float = 0.0
     excess: FloatArray = field(default_factory=lambda: np.zeros(2))
-    judged: int = 0
+    probation: int = 0
     young: YoungTrack | None = None
 
     def refit(self, row: JointRow) -> Hypothesis:
@@ -86,7 +86,7 @@ class Hypothesis:
 
 
 def split(state: JointState, row: JointRow) -> list[tuple[float, JointState]]:
-    """Split a state along the axis of its covariance on which a row's readings are most nonlinear.
+    """Split a state along the axis on which a row's readings are most nonlinear.
 
     Return weights and parts. For a standard normal density, parts at -1, 0 and 1 with the weights 1/4, 1/2 and 1/4 and
     the variance 1/2 have the same mean and variance. A state over which readings are nearly linear is not split.
@@ -104,7 +104,7 @@ def is_straight(state: JointState, row: JointRow) -> bool:
 
 
 def _bends(state: JointState, row: JointRow) -> tuple[FloatArray, FloatArray]:
-    """Return the nonlinearity (6 K,) of a row's readings, and one standard deviation (6 K, n) along each axis."""
+    """Return the nonlinearity (6 K,) of a row's readings, and one σ (6 K, n) along each axis."""
     bends, directions = row_filter.bends(state.gaussians, row.kernel_rows, 1.0)
     return bends[0], directions[0]
 
@@ -115,7 +115,7 @@ def by_score(hypothesis: Hypothesis) -> float:
 
 
 def match_sources(best: Hypothesis, other: Hypothesis) -> dict[int, int]:
-    """Return the source of another hypothesis for each of the best one: of the same id, otherwise the nearest."""
+    """Match the sources of two hypotheses by their ids, otherwise by distance."""
     if other.ids == best.ids:
         return {k: k for k in range(len(best.ids))}
     apart_m = np.linalg.norm(best.state.position_m[:, None] - other.state.position_m, axis=-1)
@@ -126,7 +126,7 @@ def match_sources(best: Hypothesis, other: Hypothesis) -> dict[int, int]:
 def mixture_moments(
     states: list[JointState], weights: FloatArray, sources: list[int | None]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return position, moment and covariance of a source in the mixture of those states that have it."""
+    """Return position, moment and covariance of a source in a mixture of states."""
     parts = [(w, one, k) for w, one, k in zip(weights, states, sources, strict=True) if k is not None]
     if len(parts) == 1:
         ((_, one, k),) = parts
@@ -140,7 +140,7 @@ def mixture_moments(
 
 
 def inherit_ids(restart: Hypothesis, before: Hypothesis) -> tuple[int, ...]:
-    """Return the ids of a restart's sources: those of the nearest earlier ones that may be the same.
+    """Return the ids of a restart's sources, from the nearest earlier ones that may be the same.
 
     A source at another place gets a new id.
     """

@@ -86,7 +86,7 @@ class JointRow:
         return replace(self, z=z, transform=transform, used=used)
 
     def linearise(self, state: JointState) -> tuple[FloatArray, FloatArray]:
-        """Return derivatives (K, C, 6) by each source's position and moment, and the predicted readings (C,)."""
+        """Return derivatives (K, C, 6) by each source, and the predicted readings (C,)."""
         by_source = dipole.field_jacobian(self.positions_m, state.position_m[:, None], state.moment_Am2[:, None])
         sensor, gain = self.array.channel_sensor, self.array.channel_gain @ self.row.R_world_from_array.T
         H = self.transform @ (gain[None, :, None] @ by_source[:, sensor])[:, :, 0]
@@ -96,8 +96,8 @@ class JointRow:
     def energy_of(self, position_m: FloatArray, moment_Am2: FloatArray) -> FloatArray:
         """Return the energy (N,) of a source's readings in each sensor."""
         fields = dipole.field(self.positions_m, position_m, moment_Am2)[self.array.channel_sensor]
-        seen = np.vecdot(self.effect, fields) ** 2
-        energy: FloatArray = np.bincount(self.array.channel_sensor, seen).astype(np.float64)
+        channel_energy = np.vecdot(self.effect, fields) ** 2
+        energy: FloatArray = np.bincount(self.array.channel_sensor, channel_energy).astype(np.float64)
         return energy
 
 
@@ -157,19 +157,19 @@ class Cells:
         return cls(positions, columns, bases.transpose(1, 2, 0).reshape(len(gain), -1).astype(np.float32), near)
 
     def energy(self, residual: FloatArray) -> FloatArray:
-        """Return the energy (n,) of residuals (C,) explained by each cell: χ² with three degrees of freedom."""
+        """Return the energy (n,) of residuals (C,) explained by each cell, χ² of 3 dimensions."""
         components = (residual.astype(np.float32) @ self.bases).reshape(3, -1)
         energy: FloatArray = np.sum(np.square(components), axis=0, dtype=np.float64)
         return energy
 
-    def moment(self, cell: int, innovation: FloatArray, seen: FloatArray, used: BoolArray) -> FloatArray:
-        """Return the best moment (3,) in the array's frame of a source in a cell, for an innovation (C,).
+    def moment(self, cell: int, innovation: FloatArray, projector: FloatArray, used: BoolArray) -> FloatArray:
+        """Return the best moment (3,) of a source in a cell, in the array's frame.
 
-        The inverse of the innovation's covariance is I - Qᵀ Q, with Q = `seen` (d, C).
+        The inverse of the innovation's covariance is I - Qᵀ Q, with Q = `projector` (d, C).
         """
         A = self.columns[cell] * used[:, None]
         A = np.concatenate([A, innovation[:, None]], axis=1)
-        of_errors = seen @ A
+        of_errors = projector @ A
         left = A[:, :3].T @ A - of_errors[:, :3].T @ of_errors
         found: FloatArray = np.linalg.lstsq(left[:, :3], left[:, 3], rcond=None)[0]
         return found

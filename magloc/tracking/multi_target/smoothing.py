@@ -74,7 +74,7 @@ class YoungTrack:
         return YoungTrack(prior, self.rows, tuple(states))
 
     def smooth(self, most: int = _MOST_PASSES, limit: float = math.inf) -> YoungTrack | None:
-        """Return the track with all rows linearised along the smoothed trajectory, or None without convergence.
+        """Smooth with rows linearised along the smoothed trajectory; None without convergence.
 
         The iteration stops after `most` passes, and early if the score stays far above `limit`.
         """
@@ -117,7 +117,7 @@ class YoungTrack:
         return replace(self.prior.gaussians, x=offset[None], S=S[None])
 
     def _states(self, track: FloatArray, last: Gaussians) -> tuple[JointState, ...]:
-        """Return the states of a trajectory (m, K, 12), with the common field and the covariance at its end."""
+        """Return the states of a trajectory (m, K, 12), with common field and covariance of its end."""
         common_T = last.x[0, -N_COMMON:]
         return tuple(
             replace(state, x=np.concatenate([sources.ravel(), common_T]), S=last.S[0])

@@ -157,7 +157,7 @@ class JointState:
         return self.shift(offset * along, S)
 
     def shift(self, error: FloatArray, S: FloatArray) -> JointState:
-        """Return the state shifted by an error (n,), with a root S transformed into the charts there."""
+        """Return the state shifted by an error (n,), with a root S moved to the charts there."""
         K, n = self.n_sources, len(self.x) - N_COMMON
         sources, L = self.chart.linearise(error[:n].reshape(K, N_OF_SOURCE))
         x = np.concatenate([sources.ravel(), self.common_T + error[n:]])

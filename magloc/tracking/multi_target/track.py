@@ -38,7 +38,7 @@ class SourcesTrack(TrackRows[SourcesPoint]):
     Attributes
     ----------
     points : tuple of SourcesPoint
-        One of every row.
+        One for each row.
     readings : Readings
         Readings that were used.
 
@@ -72,7 +72,7 @@ class SourcesTrack(TrackRows[SourcesPoint]):
         Raises
         ------
         KeyError
-            There is none of that id.
+            No source has that id.
         """
         if id not in self.ids:
             raise KeyError(f"Input id must be one of {self.ids}; instead received {id}.")
@@ -89,7 +89,7 @@ class SourcesTrack(TrackRows[SourcesPoint]):
 
     @property
     def as_result(self) -> TrackResult:
-        """The tracks of all sources, as they are drawn."""
+        """Tracks of all sources, for pictures and the viewer."""
         tracks = [self.of(id).points for id in self.ids] or [tuple(TrackPoint(point.time_s) for point in self)]
         ids = self.ids if len(tracks) > 1 else ()
         return TrackResult(tracks[0], is_truth=False, ids=ids, others=tuple(tracks[1:]))
@@ -107,38 +107,38 @@ def track_sources(
 ) -> SourcesTrack:
     """Follow several moving sources through the rows of readings, in one joint filter.
 
-    Every sensor sees all sources, so that nothing is associated: it is their motion alone that keeps them apart where
-    they cross. Sources are born where the readings support another, and lost where they support one less; a sensor that
-    dies is named and left out until it is well.
+    Each reading is a sum over all sources, so that there is no data association; crossing sources are distinguished by
+    their motion. A source is added if the readings support another, and removed if they support one fewer. A sensor
+    that fails is reported, and left out until it recovers.
 
     Parameters
     ----------
     array : SensorArray
-        Vector sensors.
+        Array of vector sensors.
     readings : Readings or array_like, shape (n, C)
         Raw readings [T], NaN where missing, in the order of time. Those that saturate are not used.
     sources : int or "auto"
-        How many sources there are at most; "auto": five, or as many as the array can tell. More than five are searched
-        for in the first row as :func:`locate` does, in seconds, and followed from there.
+        Largest number of sources; "auto": five, or as many as the array can determine. More than five are searched for
+        in the first row, as by :func:`locate`, which takes seconds.
     motion : FreeMotion
-        How each of them moves.
+        Motion of each source.
     prior : SourcePrior
-        Bounds of every source in the array's frame, and its strength, if that is known.
+        Bounds of every source in the array's frame, and its strength, if known.
     progress : callable, optional
         Called with the number of rows finished since the last call.
     told : callable, optional
-        Called with what is known after every row, as soon as it is.
+        Called with the point of each row at once.
 
     Returns
     -------
     SourcesTrack
-        In the world frame where the readings have the array's pose, else in the array's.
+        In the world frame if the readings have the array's pose, otherwise in the array's frame.
 
     Raises
     ------
     ValueError
         Time does not increase from row to row, the readings have a background, or the array has a scalar sensor or
-        cannot tell that many sources.
+        cannot determine that many sources.
 
     Examples
     --------

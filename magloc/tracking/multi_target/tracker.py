@@ -1,4 +1,4 @@
-"""Several moving sources through time: one filter of all of them, and a few hypotheses of what has happened."""
+"""Tracker of several moving sources: a joint filter with a few hypotheses."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from magloc.readings import Readings
 from magloc.tracking.multi_target.explanations import (
     BIRTH,
     COST_LIMIT,
+    IDS_PER_ROW,
     LEFT_LIMIT,
     MANOEUVRE_AGILITY,
     MOST_BY_ITSELF,
-    NAMES_A_ROW,
     Explanation,
     RowProblem,
     Scene,
@@ -48,57 +48,56 @@ from magloc.tracking.rows import Row, next_row
 from magloc.tracking.sensor_health import SENSOR_LIMIT, Misfits, SensorHealth
 
 ROWS_TO_REPORT = 10
-"""Rows after its birth in which a source is not yet told, unless there is no other: one taken for two dies sooner."""
-# How often many sources are searched for in the first row, with other random numbers, until they explain it.
+"""Rows after its birth before a source is reported, unless it is the only one; a wrong division dies sooner."""
+# Largest number of searches for many sources in the first row, each with other random numbers.
 _SEARCHES = 4
-# Hypotheses that are kept, and by how much they may be less likely (-2 ln).
+# Largest number of hypotheses, and largest difference of their scores.
 _MOST_HYPOTHESES = 8
 _LESS_LIKELY = 25.0
-# A restart is judged by its predictions of so many rows; the next one comes so many rows later. Where χ² is not poor,
-# the first one comes so many rows after the number of sources has changed, and each next one after twice as many.
-_JUDGED_ROWS = 11
+# Rows of a restart's probation, and rows between restarts while χ² is poor. Otherwise the first restart comes a few
+# rows after a change of the number of sources, and each next one after twice as many.
+_PROBATION_ROWS = 11
 _RESTART_PAUSE, _FIRST_PAUSE = 15, 4
-# Restarts with a source more, and others.
+# Largest number of restarts with an additional source, and of others.
 _MOST_RESTARTS = 3
-# Rows after which it is asked whether a source is one too many.
+# Rows between tests for redundant sources.
 _DOUBT_EVERY = 12
-# Memories of the excess of χ² [rows], and five times the deviation of its mean with each.
+# Memories of the excess of χ² [rows], and five standard deviations of its mean with each.
 _MEMORIES = np.array([10.0, 80.0])
 _POOR = 5.0 / np.sqrt(2.0 * _MEMORIES - 1.0)
-# By how much it must be likelier in the end, or at once.
+# Gain of the score for which a restart is accepted at the end of its probation, and at once.
 _MUST_GAIN, _CLEAR_GAIN = 20.0, 60.0
-# Standard deviation of ln |m| below which a source is none too many by itself.
+# Standard deviation of ln |m| below which a source is not redundant by itself.
 _CERTAIN_STRENGTH = 0.05
-# What a row costs at most that nothing explains.
+# Largest score of a row without an explanation.
 _UNBEARABLE = 1000.0
-# Rows from one try of a late birth to the next, at least and at most, fewest rows for one, and by how much it may be
-# less likely than none. What leaves such residuals and is no source, as gains do, stays: each try in vain is followed
-# by a pause that is twice as long.
+# Least and largest number of rows between late births, fewest rows for one, and largest increase of its score. Other
+# causes of such residuals, as errors of gains, persist: each failure doubles the pause.
 _LATE_PAUSE, _LONGEST_PAUSE, _FEWEST_ROWS = 5, 160, 10
 _LATE_WORSE = 10.0
-# Passes over all rows from each start of a late birth.
+# Largest number of smoothing passes for a late birth.
 _LATE_PASSES = 8
 
 
 class SourcesTracker:
-    """Follows several sources, row by row.
+    """Tracker of several sources, row by row.
 
     Parameters
     ----------
     array : SensorArray
-        Vector sensors.
+        Array of vector sensors.
     sources : int or "auto"
-        How many sources there are at most; "auto": five, or as many as the array can tell. More than five are searched
-        for in the first row as :func:`locate` does, in seconds, and followed from there.
+        Largest number of sources; "auto": five, or as many as the array can determine. More than five are searched for
+        in the first row, as by :func:`locate`, which takes seconds.
     motion : FreeMotion
-        How each of them moves.
+        Motion of each source.
     prior : SourcePrior
-        Bounds of every source in the array's frame, and its strength, if that is known.
+        Bounds of every source in the array's frame, and its strength, if known.
 
     Raises
     ------
     ValueError
-        The array has a scalar sensor, or cannot tell that many sources.
+        The array has a scalar sensor, or cannot determine that many sources.
 
     Examples
     --------
@@ -142,12 +141,12 @@ class SourcesTracker:
         self._noise_T, self._misfits = float(np.median(array.channel_noise_T)), Misfits()
 
     def update(self, row: Row | Readings) -> SourcesPoint:
-        """What is known of all sources after one more row.
+        """Update all sources by one more row.
 
         Parameters
         ----------
         row : Row or Readings of length one
-            Later than the one before. Of readings those that saturate are not used.
+            A row later than the one before. Saturated readings are not used.
 
         Raises
         ------
@@ -196,7 +195,7 @@ class SourcesTracker:
             self._pause *= 2
             self._last_restart, self._next_restart = self._n_rows, self._n_rows + self._pause
             restarts = self._restarts(problem, best, found)
-            if poor:  # whether the suspect is at fault, they are to tell
+            if poor:  # the restarts test the suspect
                 self._hypotheses[0] = replace(best, health=best.health.forget_residuals())
             self._hypotheses += restarts
         if left is None or energy < 0.5 * LEFT_LIMIT:
@@ -211,7 +210,7 @@ class SourcesTracker:
         return point
 
     def _initial_hypothesis(self, problem: RowProblem) -> Hypothesis:
-        """No source; where there may be many, those that a search finds in the row: one by one they are not told."""
+        """Return the first hypothesis: no source, or those of a search if there may be many."""
         nothing, scene, row = self._no_source(problem), self.scene, problem.row
         if scene.most_sources <= MOST_BY_ITSELF:
             return nothing
@@ -238,7 +237,7 @@ class SourcesTracker:
         return nothing if best is None else replace(nothing, state=best.prior, ids=best.ids)
 
     def _no_source(self, problem: RowProblem) -> Hypothesis:
-        """No source, and a common field that may be as large as the readings."""
+        """Return the hypothesis of no source and a common field as large as the readings."""
         array = self.scene.array
         sigma_T = array.common_field_T
         if sigma_T is None:
@@ -251,26 +250,26 @@ class SourcesTracker:
         )
 
     def _extend(self, problem: RowProblem, before: Hypothesis, dt_s: float) -> list[tuple[Hypothesis, Explanation]]:
-        """What becomes of a hypothesis: one for every explanation of the row, or the prediction if there is none."""
+        """Return a hypothesis for each explanation of the row, or the prediction without any."""
         prior = predict_state(before.state, problem.step, problem.joint_row)
         plain = problem.update(prior, before.ids, before.health.dead)
-        if problem.is_consistent(plain) or (before.judged > 0 and plain.update.converged):
+        if problem.is_consistent(plain) or (before.probation > 0 and plain.update.converged):
             explanations = [plain]
         else:
             agile = self.scene.motion.numbers(dt_s, agility=MANOEUVRE_AGILITY)
             manoeuvring = predict_state(before.state, agile, problem.joint_row)
             explanations = problem.explanations(plain, manoeuvring)
         if not explanations:
-            kept = replace(before, state=prior, young=None, score=before.score + min(plain.score, _UNBEARABLE))
-            return [(self._with_excess(kept, plain), plain)]
+            predicted = replace(before, state=prior, young=None, score=before.score + min(plain.score, _UNBEARABLE))
+            return [(self._with_excess(predicted, plain), plain)]
         after = [self._after(problem, before, found) for found in explanations]
-        if not before.ids:  # a source has one name wherever it may be the same
+        if not before.ids:  # the same source has the same id in all hypotheses
             after[1:] = [replace(one, ids=inherit_ids(one, after[0])) for one in after[1:]]
         return list(zip(after, explanations, strict=True))
 
     def _after(self, problem: RowProblem, before: Hypothesis, found: Explanation) -> Hypothesis:
-        """A hypothesis after an explanation of the row."""
-        of_dead = innovation_chi2(found.update.state, problem.joint_row, before.health.dead)
+        """Return a hypothesis after an explanation of the row."""
+        dead_chi2 = innovation_chi2(found.update.state, problem.joint_row, before.health.dead)
         used = found.update.row.used.reshape(-1, 3)
         residuals = np.where(used.all(axis=1, keepdims=True), found.update.standardised, np.nan)
         young = before.young
@@ -285,9 +284,9 @@ class SourcesTracker:
             young=young,
             state=found.update.state,
             ids=found.ids,
-            health=before.health.after(residuals, found.out, of_dead),
+            health=before.health.after(residuals, found.out, dead_chi2),
             score=before.score + found.score,
-            judged=max(0, before.judged - 1),
+            probation=max(0, before.probation - 1),
         )
         return self._with_excess(after, found)
 
@@ -298,12 +297,12 @@ class SourcesTracker:
     def _late_births(
         self, problem: RowProblem, best: Hypothesis, found: Explanation, left: FloatArray
     ) -> list[Hypothesis]:
-        """Hypotheses of a source more all along the last rows, where their mean residuals (C,) may be of one.
+        """Return hypotheses with another source in all recent rows, from a mean residual (C,).
 
-        One that comes slowly bends what is known of the others, row by row, and no row alone shows it. All of these
-        rows fitted together, with it and without, say how likely it is, and where the others are then.
+        A source that approaches slowly biases the others row by row, and no single row shows it. A refit of all recent
+        rows with and without it gives its likelihood, and corrects the others.
         """
-        rows, ids = best.young, (*best.ids, problem.first_id + NAMES_A_ROW - 1)
+        rows, ids = best.young, (*best.ids, problem.first_id + IDS_PER_ROW - 1)
         if rows is None or len(rows.rows) < _FEWEST_ROWS or len(ids) > self.scene.most_sources:
             return []
         without = rows.smooth()
@@ -322,32 +321,32 @@ class SourcesTracker:
         return born
 
     def _removals(self, problem: RowProblem, best: Hypothesis, found: Explanation) -> list[Hypothesis]:
-        """Hypotheses of a source less, where the row does not miss it; they are to be judged.
+        """Return hypotheses with one source fewer that explain the row, on probation.
 
-        It is taken away, or one with another that it is not told apart from: the two may be a single one, and their
-        moments then grow against each other. One that has gone so far that it is a gradient of the ambient field is
-        taken away without being judged.
+        They remove an uncertain source, or replace two merged ones by one, since two sources with opposite moments
+        may stand for a single one. A far source, like a gradient of the ambient field, is removed without
+        probation.
         """
         state = best.state
         far = problem.remove_sources(found, far_sources(state), [])
-        gone = [self._after(problem, best, one) for one in far if problem.is_consistent(one)]
-        if gone:
-            return [replace(one, score=best.score - _MUST_GAIN) for one in gone]
+        without_far = [self._after(problem, best, one) for one in far if problem.is_consistent(one)]
+        if without_far:
+            return [replace(one, score=best.score - _MUST_GAIN) for one in without_far]
         doubtful = [k for k in range(state.n_sources) if state.log_strength_sigma(k) > _CERTAIN_STRENGTH]
         fewer = problem.remove_sources(found, doubtful, merged_pairs(state))
-        held = [self._after(problem, best, one) for one in fewer if problem.is_consistent(one)]
-        return [replace(one, score=best.score, excess=np.zeros(2), judged=_JUDGED_ROWS) for one in held]
+        consistent = [self._after(problem, best, one) for one in fewer if problem.is_consistent(one)]
+        return [replace(one, score=best.score, excess=np.zeros(2), probation=_PROBATION_ROWS) for one in consistent]
 
     def _restarts(self, problem: RowProblem, best: Hypothesis, found: Explanation) -> list[Hypothesis]:
-        """Hypotheses that are to be judged: a sensor drifts, there is a source more, or the past is forgotten.
+        """Return hypotheses on probation: a drifting sensor, an additional source, or a restart.
 
-        Of that either all is, or all but where the sources are. Fewer sources than there are may explain the first
-        rows, in a wrong place, and χ² agree: so they are tried at growing intervals where nothing seems wrong, too.
+        A restart forgets all, or all but the positions and moments. Too few sources at wrong places may explain the
+        first rows with a good χ², so that restarts are also tried without a sign of an error, at growing intervals.
         """
         common, dead, known = best.state.without_sources, best.health.dead, len(best.ids)
         again = problem.explain_sources(common, best.state.position_m, best.state.moment_Am2, dead)
         anew, nothing = [again], problem.update(common, (), dead)
-        for number in (known, known - 1, known + 1):  # of many, one by one takes seconds and leads nowhere
+        for number in (known, known - 1, known + 1):  # a beam search for many takes seconds and fails
             if 0 < number <= min(self.scene.most_sources, MOST_BY_ITSELF):
                 anew += problem.explain_with_at_least(nothing, number)
         if known < self.scene.most_sources:
@@ -355,9 +354,9 @@ class SourcesTracker:
         tried = drop_same_places(one for one in anew if one.update.converged)
         more = [one for one in tried if len(one.ids) > known]
         tried = [one for one in tried if len(one.ids) <= known][:_MOST_RESTARTS] + more[:_MOST_RESTARTS]
-        # What the sources' motion tells is still to be learned by them, and was by the best one.
-        learned = 2.0 * (np.linalg.slogdet(again.update.state.S)[1] - np.linalg.slogdet(best.state.S)[1])
-        score, health = best.score - max(0.0, float(learned)), best.health.forget_residuals()
+        # Restarts have yet to learn the sources' motion, which the best hypothesis knows.
+        information = 2.0 * (np.linalg.slogdet(again.update.state.S)[1] - np.linalg.slogdet(best.state.S)[1])
+        score, health = best.score - max(0.0, float(information)), best.health.forget_residuals()
         restarts = [
             replace(self._after(problem, best, one), score=score + BIRTH * (len(one.ids) - known), health=health)
             for one in tried
@@ -365,64 +364,64 @@ class SourcesTracker:
         suspect = best.health.suspect
         if suspect is not None and best.health.may_drift:
             restarts.append(replace(best, health=best.health.without(suspect)))
-        return [replace(one, excess=np.zeros(2), judged=_JUDGED_ROWS) for one in restarts]
+        return [replace(one, excess=np.zeros(2), probation=_PROBATION_ROWS) for one in restarts]
 
     def _prune(self, hypotheses: list[Hypothesis]) -> list[Hypothesis]:
-        """The likeliest ones, the best first; behind them restarts while they are judged."""
-        believed = sorted((one for one in hypotheses if not one.judged), key=by_score)
-        judged = []
-        for one in (one for one in hypotheses if one.judged):
-            gain = believed[0].score - one.score
-            if gain > (_MUST_GAIN if one.judged == 1 else _CLEAR_GAIN):
-                ids = inherit_ids(one, believed[0])
-                believed.append(replace(one, ids=ids, score=believed[0].score - _MUST_GAIN, judged=0))
-            elif one.judged > 1:
-                judged.append(one)
-        kept: list[Hypothesis] = []
-        for one in sorted(believed, key=by_score):
-            same = (i for i, other in enumerate(kept) if are_same(one.state, other.state))
+        """Return the likeliest hypotheses, the best first, followed by those on probation."""
+        accepted = sorted((one for one in hypotheses if not one.probation), key=by_score)
+        on_probation = []
+        for one in (one for one in hypotheses if one.probation):
+            gain = accepted[0].score - one.score
+            if gain > (_MUST_GAIN if one.probation == 1 else _CLEAR_GAIN):
+                ids = inherit_ids(one, accepted[0])
+                accepted.append(replace(one, ids=ids, score=accepted[0].score - _MUST_GAIN, probation=0))
+            elif one.probation > 1:
+                on_probation.append(one)
+        likely: list[Hypothesis] = []
+        for one in sorted(accepted, key=by_score):
+            same = (i for i, other in enumerate(likely) if are_same(one.state, other.state))
             if (i := next(same, None)) is not None:
-                score = -2.0 * np.logaddexp(-0.5 * one.score, -0.5 * kept[i].score)
-                kept[i] = replace(kept[i], score=float(score))
-            elif not kept or (len(kept) < _MOST_HYPOTHESES and one.score < kept[0].score + _LESS_LIKELY):
-                kept.append(one)
-        return kept + judged
+                score = -2.0 * np.logaddexp(-0.5 * one.score, -0.5 * likely[i].score)
+                likely[i] = replace(likely[i], score=float(score))
+            elif not likely or (len(likely) < _MOST_HYPOTHESES and one.score < likely[0].score + _LESS_LIKELY):
+                likely.append(one)
+        return likely + on_probation
 
     def _split(self, problem: RowProblem) -> list[Hypothesis]:
-        """Hypotheses as narrow as the readings want them, the likeliest first, as long as there is room for parts."""
+        """Return hypotheses split where readings are nonlinear, up to their largest number."""
         parts: list[Hypothesis] = []
         for i, one in enumerate(self._hypotheses):
-            room = _MOST_HYPOTHESES - len(parts) - sum(not other.judged for other in self._hypotheses[i:])
-            of_one = split(one.state, problem.joint_row) if room > 1 and not one.judged else [(1.0, one.state)]
+            room = _MOST_HYPOTHESES - len(parts) - sum(not other.probation for other in self._hypotheses[i:])
+            of_one = split(one.state, problem.joint_row) if room > 1 and not one.probation else [(1.0, one.state)]
             parts += [one.take_part(share, state) for share, state in of_one]
         return parts
 
     def _point(self, problem: RowProblem, status: str, chi2: float) -> SourcesPoint:
-        """What is told of the best hypothesis."""
+        """Return the point of the best hypothesis."""
         array, row = self.scene.array, problem.row
         best = self._hypotheses[0] if self._hypotheses else self._no_source(problem)
-        told = [k for k, name in enumerate(best.ids) if self._n_rows - name // NAMES_A_ROW >= ROWS_TO_REPORT]
-        told = told or list(range(len(best.ids)))
-        for k in told:
+        reported = [k for k, id in enumerate(best.ids) if self._n_rows - id // IDS_PER_ROW >= ROWS_TO_REPORT]
+        reported = reported or list(range(len(best.ids)))
+        for k in reported:
             self._numbers.setdefault(best.ids[k], len(self._numbers) + 1)
         merged = np.isin(np.arange(len(best.ids)), merged_pairs(best.state))
-        believed = [one for one in self._hypotheses if not one.judged]
-        likely = np.exp(-0.5 * np.array([one.score - best.score for one in believed]))
-        of_others = [match_sources(best, one) for one in believed]
+        accepted = [one for one in self._hypotheses if not one.probation]
+        weights = np.exp(-0.5 * np.array([one.score - best.score for one in accepted]))
+        matches = [match_sources(best, one) for one in accepted]
         tracks = [
             SourcePoint(
                 row.time_s,
-                *mixture_moments([one.state for one in believed], likely, [of_one.get(k) for of_one in of_others]),
+                *mixture_moments([one.state for one in accepted], weights, [match.get(k) for match in matches]),
                 nis=chi2,
                 nis_dof=int(np.count_nonzero(row.available)),
                 status="predicted" if status in ("misfit", "no readings") else "merged" if merged[k] else status,
-                weight=float(likely @ [best.ids[k] in one.ids for one in believed] / likely.sum()),
+                weight=float(weights @ [best.ids[k] in one.ids for one in accepted] / weights.sum()),
                 centroid_m=row.origin_m + row.R_world_from_array @ array.centroid,
                 radius_m=array.circumradius,
                 id=self._numbers[best.ids[k]],
                 merged=bool(merged[k]),
             )
-            for k in told
+            for k in reported
         ]
         return SourcesPoint(
             row.time_s,

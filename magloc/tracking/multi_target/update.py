@@ -33,7 +33,7 @@ class JointUpdate:
     converged : bool
     innovation, residual : ndarray, shape (C,)
         Whitened readings minus predicted ones, before and after the update.
-    seen_before, seen : ndarray, shape (d, C)
+    projector_before, projector : ndarray, shape (d, C)
         Q before and after the update: :math:`I - Q^T Q` is the inverse of the covariance of the innovation.
     standardised : ndarray, shape (N, 3)
         Residuals of every sensor's channels, of unit covariance; zero for unused sensors.
@@ -46,8 +46,8 @@ class JointUpdate:
     converged: bool
     innovation: FloatArray
     residual: FloatArray
-    seen_before: FloatArray
-    seen: FloatArray
+    projector_before: FloatArray
+    projector: FloatArray
     standardised: FloatArray
 
     @property
@@ -61,7 +61,7 @@ class JointUpdate:
 
         The iterated update shifts known sources towards a strong new one, so that the residual shows little of it.
         """
-        return self.innovation - (self.seen_before @ self.innovation) @ self.seen_before
+        return self.innovation - (self.projector_before @ self.innovation) @ self.projector_before
 
 
 def joint_update(prior: JointState, row: JointRow, most: int = MOST_TRIALS) -> JointUpdate:
@@ -78,14 +78,14 @@ def joint_update(prior: JointState, row: JointRow, most: int = MOST_TRIALS) -> J
         bool(found.converged[0]),
         innovation=found.misfits[0, 0],
         residual=found.misfits[0, 1],
-        seen_before=found.projectors[0, 0],
-        seen=found.projectors[0, 1],
+        projector_before=found.projectors[0, 0],
+        projector=found.projectors[0, 1],
         standardised=found.standardised[0],
     )
 
 
 def innovation_chi2(state: JointState, row: JointRow, sensors: BoolArray) -> FloatArray:
-    """Return χ² (N,) of sensors that were left out of a state, with three degrees of freedom; infinite for others."""
+    """Return χ² (N,) of sensors left out of a state, of 3 dimensions; infinite for others."""
     chi2 = np.full(len(sensors), np.inf)
     available = sensors & row.used.reshape(-1, 3).all(axis=1)
     if not available.any():
@@ -94,9 +94,9 @@ def innovation_chi2(state: JointState, row: JointRow, sensors: BoolArray) -> Flo
     by_source, h = row.linearise(state)
     L = state.chart.jacobian(np.zeros((state.n_sources, N_OF_SOURCE)))
     H = np.concatenate([*(by_source @ L[:, :6]), row.effect], axis=1) if n else row.effect
-    seen = H @ np.concatenate([state.S[:n], state.S[-N_COMMON:]])
+    root = H @ np.concatenate([state.S[:n], state.S[-N_COMMON:]])
     for sensor in np.flatnonzero(available):
         at = np.flatnonzero(row.array.channel_sensor == sensor)
         r = (row.z - h)[at]
-        chi2[sensor] = float(r @ np.linalg.solve(np.eye(3) + seen[at] @ seen[at].T, r))
+        chi2[sensor] = float(r @ np.linalg.solve(np.eye(3) + root[at] @ root[at].T, r))
     return chi2

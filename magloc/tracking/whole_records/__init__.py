@@ -1,1 +1,1 @@
-"""Tracks of whole records: what later rows tell, too."""
+"""Tracks of whole records: smoother, background, bounds and tests."""

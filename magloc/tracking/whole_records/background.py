@@ -1,10 +1,10 @@
-r"""Tracks of readings with a background that drifts, such as ``--detrend`` and ``--high-pass-hz`` speak of.
+r"""Tracks of readings with a drifting background: ``--detrend``, ``--high-pass-hz``.
 
-The background is a state of every channel beside the source, on the rows as they were read: a filter would take signal
-out that the model still predicts. No row alone tells the source from it, so that a track cannot start from one; it
-starts from a track of filtered readings, which is near enough to linearise all rows about. They are filtered and
-smoothed until that leads nowhere else: Gauss-Newton over the whole record. What a row then knows is what rows before it
-tell, as of any filter.
+The background is a state of every channel besides the source, for readings without a filter: a filter would remove
+signal that the model still predicts. A single row does not separate source and background, so that a track cannot start
+from one. It starts from a track of filtered readings, about which all rows are linearised. A Kalman filter and smoother
+repeat until they converge: Gauss-Newton over the whole record. The points are those of the last filter pass, so that
+each depends on earlier rows only.
 """
 
 from __future__ import annotations
@@ -33,25 +33,25 @@ from magloc.tracking.whole_records.smoother import smooth_points, smooth_states
 
 _LOG = logging.getLogger(__name__)
 TAKES_MUCH = 3.0
-"""A background is warned of that makes positions this many times as uncertain."""
-# Standard deviations of a source before its first row, over its distance and its moment.
+"""Factor of the position's σ by the background above which a warning is given."""
+# Prior standard deviations of a source over its distance and its moment.
 _UNKNOWN = 10.0
 _MOST_PASSES = 30
 _SETTLED = 1e-2
 _MOST_AGREE = 0.9
-# Standard deviation of the range over the range, with which a track on a background begins.
+# Largest σ of the range over the range in the first row of a track.
 _FIRST_RANGE_ERROR = 0.06
-# Noise that plain tracks are tried with, in that of the sensors, and rows that they must have.
+# Factors of the sensors' noise for plain tracks, and their fewest rows.
 _NOISIER = (1.0, 10.0, 100.0)
 _FEWEST_ROWS = 5
-# How far apart, in the logarithm of the range, trajectories are that are compared.
+# Difference of the log-range of trajectories that are compared.
 _APART = 0.01
 _NOTHING = "not acquired: no dipole on this background fits the rows"
 
 
 @dataclass(frozen=True, eq=False)
 class _ForwardPass:
-    """A forward pass over rows from one on: steps, innovations, and which rows agree with those before and are used."""
+    """Forward pass: first row, steps, innovations, rows that are consistent, rows used."""
 
     begin: int
     steps: list[Step]
@@ -61,14 +61,14 @@ class _ForwardPass:
 
     @property
     def rows(self) -> slice:
-        """Of the record."""
+        """Rows of the record."""
         return slice(self.begin, self.begin + len(self.steps))
 
 
 def track_on_background(
     tracker: Tracker, readings: Readings, *, smooth: bool, progress: Callable[[int], None] | None = None
 ) -> list[TrackPoint]:
-    """Points of a record whose background is in the states of a tracker."""
+    """Return the points of a record with the background as states of the tracker."""
     rows = list(rows_of(readings))
     measurements = [tracker.measurements.of(row) for row in rows]
     points = [tracker.untracked_point(row, _NOTHING) for row in rows]
@@ -87,9 +87,9 @@ def track_on_background(
 
 
 def _plain_tracks(tracker: Tracker, readings: Readings) -> Iterator[tuple[int, list[FloatArray]]]:
-    """States that rows are linearised about first, from some row on: of tracks of readings without a background.
+    """Yield first rows and states for the first linearisation, from tracks without a background.
 
-    Of the readings as they are, with ever more noise, and of what filters leave of them.
+    They are tracks of the raw and of the filtered readings, with increasing noise.
     """
     background, n_motion = readings.background, tracker.motion.n_states
     filtered = replace(readings, values_T=background.taken_out(readings.time_s, readings.values_T))
@@ -111,29 +111,32 @@ def _plain_tracks(tracker: Tracker, readings: Readings) -> Iterator[tuple[int, l
 def _warn_of_lost_information(
     tracker: Tracker, rows: Sequence[Row], passed: _ForwardPass, points: Sequence[TrackPoint]
 ) -> None:
-    """Warn where positions are much more certain if there is no background."""
+    """Warn if positions would be much more certain without the background."""
     plain, n = Tracker(tracker.array, tracker.motion), tracker.motion.n_states
     states = [np.concatenate([step.x[:n], np.zeros(plain.n_errors)]) for step in passed.steps]
     alone = _forward_pass(plain, [plain.measurements.of(row) for row in rows], 0, states, passed.used)
     known = [j for j, point in enumerate(points) if point.position_m is not None]
-    of_both = [sum(float(np.sum(steps[j].S[:3] ** 2)) for j in known) for steps in (passed.steps, alone.steps)]
-    if of_both[0] > TAKES_MUCH**2 * of_both[1]:
-        factor = math.sqrt(of_both[0] / of_both[1])
+    variance, plain_variance = (
+        sum(float(np.sum(steps[j].S[:3] ** 2)) for j in known) for steps in (passed.steps, alone.steps)
+    )
+    if variance > TAKES_MUCH**2 * plain_variance:
+        factor = math.sqrt(variance / plain_variance)
         _LOG.warning(f"the background looks like the source: positions are {factor:.0f} times as uncertain as without")
 
 
 def _warn_of_biased_mode(tracker: Tracker, measurements: Sequence[RowMeasurement], passed: _ForwardPass) -> None:
-    """Warn where the likeliest trajectory need not be in the middle of those that are likely.
+    """Warn if the likeliest trajectory may be far from the mean one.
 
-    It leaves out how many there are about it, which the determinants of the innovations' covariances tell. They change
-    where a source is farther and stronger, moves more and reads alike: it matters if the range went by more than its σ.
+    The mode neglects the posterior's volume about it, which the determinants of the innovations' covariances give. They
+    differ for a source that is farther, stronger and faster with the same readings. This matters if it would shift the
+    range by more than its σ.
     """
     states = [x for x, _ in smooth_states(passed.steps)]
     sigma = [_range_error(step.x, step.S, m) for step, m in zip(passed.steps, measurements, strict=True)]
     log_number = []
     for apart in (-_APART, _APART):
-        moved = [_scale_range(state, m, apart) for state, m in zip(states, measurements, strict=True)]
-        steps = _forward_pass(tracker, measurements, 0, moved, passed.used).steps
+        scaled = [_scale_range(state, m, apart) for state, m in zip(states, measurements, strict=True)]
+        steps = _forward_pass(tracker, measurements, 0, scaled, passed.used).steps
         log_number.append(
             sum(_log_volume(step.prediction.S) - _log_volume(step.S) for step in steps if step.prediction)
         )
@@ -143,16 +146,16 @@ def _warn_of_biased_mode(tracker: Tracker, measurements: Sequence[RowMeasurement
 
 
 def _scale_range(state: FloatArray, measurement: RowMeasurement, log_range: float) -> FloatArray:
-    """A state (n,) whose source is farther and stronger and moves more, so that it reads alike."""
+    """Return a state (n,) at another range, with moment and velocity scaled to match readings."""
     n = measurement.n_motion
     e = np.zeros(n)
     e[0] = log_range
-    moved = Chart.at(state[:n], measurement.centroid_m, measurement.radius_m).retract(e)
-    return np.concatenate([moved, state[n:]])
+    scaled = Chart.at(state[:n], measurement.centroid_m, measurement.radius_m).retract(e)
+    return np.concatenate([scaled, state[n:]])
 
 
 def _log_volume(S: FloatArray) -> float:
-    """Logarithm of the determinant of a root."""
+    """Return the logarithm of the determinant of a root."""
     return float(np.linalg.slogdet(S)[1])
 
 
@@ -162,18 +165,18 @@ def steps_of(
     states: Sequence[FloatArray],
     start: tuple[FloatArray, FloatArray] | None = None,
 ) -> list[Step]:
-    """Return the steps of a forward pass that linearises all rows at some states."""
+    """Return the steps of a forward pass with all rows linearised at given states."""
     return _forward_pass(tracker, measurements, 0, states, np.ones(len(measurements), dtype=bool), start).steps
 
 
 def iterate_steps(tracker: Tracker, rows: Sequence[Row], states: Sequence[FloatArray]) -> list[Step] | None:
-    """Steps of the last pass over rows that are linearised where passes lead, from some states; None if nowhere."""
+    """Return the steps of the last of repeated passes over rows, or None without convergence."""
     passed = _iterate_passes(tracker, [tracker.measurements.of(row) for row in rows], 0, states)
     return None if passed is None else passed.steps
 
 
 def _extend(tracker: Tracker, measurements: Sequence[RowMeasurement], passed: _ForwardPass) -> _ForwardPass:
-    """The same with the rows before and after, as far as passes settle with them."""
+    """Extend a pass by the rows before and after it, as long as passes converge."""
     while len(passed.steps) < len(measurements):
         states = [x for x, _ in smooth_states(passed.steps)]
         more = _FEWEST_ROWS + len(states) // 4
@@ -189,12 +192,15 @@ def _extend(tracker: Tracker, measurements: Sequence[RowMeasurement], passed: _F
 def _iterate_passes(
     tracker: Tracker, measurements: Sequence[RowMeasurement], begin: int, states: Sequence[FloatArray]
 ) -> _ForwardPass | None:
-    """The last forward pass from a row on; None where the passes do not settle, or too many rows contradict it."""
+    """Repeat forward pass and smoother until they converge, and return the last pass.
+
+    Return None without convergence, or if too many rows contradict it.
+    """
     measurements = measurements[begin : begin + len(states)]
     used = np.ones(len(measurements), dtype=bool)
     for _ in range(_MOST_PASSES):
         try:
-            with np.errstate(all="ignore"):  # passes may lead out of double precision
+            with np.errstate(all="ignore"):  # passes may overflow
                 passed = _forward_pass(tracker, measurements, begin, states, used)
                 later = smooth_states(passed.steps)
                 sigma = np.array([np.sqrt(np.diagonal(P)[:N_SOURCE]) for _, P in later])
@@ -203,9 +209,9 @@ def _iterate_passes(
         new = [x for x, _ in later]
         if not np.isfinite(new).all():
             return None
-        moved = np.abs(np.array(new) - np.array(states))[:, :N_SOURCE]
+        change = np.abs(np.array(new) - np.array(states))[:, :N_SOURCE]
         states = new
-        if np.all(moved <= _SETTLED * sigma):
+        if np.all(change <= _SETTLED * sigma):
             agrees = used & passed.agrees
             if np.mean(agrees) < _MOST_AGREE:
                 return None
@@ -223,7 +229,7 @@ def _forward_pass(
     used: BoolArray,
     start: tuple[FloatArray, FloatArray] | None = None,
 ) -> _ForwardPass:
-    """One forward pass over rows that are linearised at some states; by default from a source that is hardly known."""
+    """Return a forward pass over rows linearised at given states, from a flat prior by default."""
     if start is None:
         offset = measurements[0].place_in_array(states[0], np.eye(states[0].size))[0]
         sigma = _UNKNOWN * np.repeat([np.linalg.norm(offset), np.linalg.norm(states[0][3:6])], 3)
@@ -254,7 +260,7 @@ def _forward_pass(
 
 
 def _points(tracker: Tracker, measurements: Sequence[RowMeasurement], passed: _ForwardPass) -> list[TrackPoint]:
-    """What is known of every row, from the first one on that knows the range."""
+    """Return the points of a pass, from the first row with a known range."""
     points: list[TrackPoint] = []
     tracked, last = False, None
     open_loop = tracker.prior_covariance(measurements[0], passed.steps[0].x)
@@ -268,16 +274,16 @@ def _points(tracker: Tracker, measurements: Sequence[RowMeasurement], passed: _F
             points.append(tracker.untracked_point(row, "not acquired: the range is not certain enough"))
             continue
         status = "predicted" if innovation is None else "tracked" if passed.used[j] else "outlier"
-        told = {} if innovation is None or not tracked else innovation.statistics(last)
+        statistics = {} if innovation is None or not tracked else innovation.statistics(last)
         last = innovation if status == "tracked" else None
         mixture = from_cartesian(step.x, step.S, measurement)
         point = point_of_mixture(row.time_s, mixture, np.diagonal(open_loop))
-        points.append(replace(point, iterations=1, status=status if tracked else "acquired", **told))
+        points.append(replace(point, iterations=1, status=status if tracked else "acquired", **statistics))
         tracked = True
     return points
 
 
 def _range_error(x: FloatArray, S: FloatArray, measurement: RowMeasurement) -> float:
-    """Standard deviation of the range over the range."""
+    """Return the standard deviation of the range over the range."""
     offset_m, root = measurement.place_in_array(x, S)
     return float(relative_range_sigma(root @ root.T, offset_m))

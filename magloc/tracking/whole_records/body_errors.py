@@ -1,6 +1,6 @@
-"""By how much the track of a point would err if the object were none: a body of the default length.
+"""Error of a track of a point source if the object is a body of the default length.
 
-What a dipole leaves out of a body's field lasts from row to row, and χ² does not see it.
+The field of a body beyond that of its dipole is similar in successive rows, so that χ² does not show it.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from magloc.tracking.tracker import Tracker
 from magloc.tracking.whole_records.background import steps_of
 from magloc.tracking.whole_records.constants import placed_rows
 
-# Rows of which the error is told, the last ones: more of them err alike.
+# Largest number of rows, the latest: more rows change the error little.
 _MOST_ROWS = 200
-# Sum of squares of what a body adds to the last row, in units of the noise, below which it does not matter.
+# Sum of squares of the body's readings, in units of the noise, below which it does not matter.
 _NEGLIGIBLE = 1e-2
 
 
 def body_factor(tracker: Tracker, rows: Sequence[Row], points: Sequence[TrackPoint]) -> float:
-    """How many times their standard deviations errors of the last row would be, rms; NaN where the range is not known.
+    """Return the ratio of the rms error of the last row, for a body, to its standard deviation.
 
-    The body does not turn, and is a quarter as long as the source was from the nearest sensor in the row in which it
-    was nearest.
+    It is NaN if the range is not known. The body does not turn. Its length is a quarter of the least distance of the
+    source from a sensor.
     """
     used = placed_rows(points)[-_MOST_ROWS:]
     source = {i: np.concatenate([points[i].position_m, points[i].moment_Am2]) for i, _ in used}
@@ -66,13 +66,16 @@ def body_factor(tracker: Tracker, rows: Sequence[Row], points: Sequence[TrackPoi
 
 
 def _nearest_m(measurement: RowMeasurement, source: FloatArray) -> float:
-    """Distance of a source from the nearest sensor."""
+    """Return the distance of a source from the nearest sensor."""
     in_array = measurement.pose.in_array(source)
     return float(np.linalg.norm(measurement.model.array.positions - in_array[:3], axis=1).min())
 
 
 def _errors(measurement: RowMeasurement, source: FloatArray, length_m: float) -> FloatArray:
-    """What a body adds to a row (k, 14), of one σ, in units of the noise; its axes are those of the world."""
+    """Return the effect (k, 14) of a body's errors of one σ on a row, in units of the noise.
+
+    The axes of the body are those of the world.
+    """
     array, R = measurement.model.array, measurement.pose.R_world_from_array
     in_array = measurement.pose.in_array(source)
     fields = finite_body_errors((array.positions - in_array[:3]) @ R.T, source[3:], length_m)

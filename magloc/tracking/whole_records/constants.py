@@ -1,7 +1,7 @@
-r"""Whether a track that counts its mounting, or the ambient field of its moduli, as exact has one that is not.
+r"""Test of a mounting, or of the ambient field of moduli, that counts as exact.
 
-The record is fitted once more with their constant errors as unknowns c of unit prior variance. Were they zero, what is
-found of them would be spread by :math:`P - P^2`, with their covariance P after all rows: a Wald test.
+The record is fitted again with their constant errors as unknowns c of unit prior variance. If the true errors are zero,
+the estimate has the covariance :math:`P - P^2`, with the posterior covariance P: a Wald test.
 """
 
 from __future__ import annotations
@@ -27,16 +27,22 @@ from magloc.tracking.tracker import Tracker
 from magloc.tracking.whole_records.background import iterate_steps
 
 _LEAST_KNOWN = 1e-6
-"""A direction of the constants counts of which the rows tell a variance of more."""
+"""Least variance of the estimate in a direction of the constants that counts."""
 _USUAL_AMBIENT_T = 300e-9
-"""Of an ambient field that is called exact: crust and storms make it wrong by some 100 nT."""
+"""Usual error of an ambient field that counts as exact: crust and storms cause some 100 nT."""
 
 
 class ConstantsTest(NamedTuple):
-    """How far beyond zero constants are that count as exact, as standard normal numbers; NaN of what does not.
+    """Standard normal statistics of constants that count as exact; NaN for others.
 
-    Those of lever arm and mounting, and those of the ambient field of moduli; and how many times their standard
-    deviations errors of the last row would be, rms, if it were as wrong as it may be.
+    Attributes
+    ----------
+    mounting : float
+        Statistic of lever arm and mounting.
+    field : float
+        Statistic of the ambient field of moduli.
+    field_factor : float
+        Ratio of the rms error of the last row to its standard deviation, for the usual error of that field.
     """
 
     mounting: float = math.nan
@@ -45,9 +51,9 @@ class ConstantsTest(NamedTuple):
 
 
 def constants_test(tracker: Tracker, rows: Sequence[Row], points: Sequence[TrackPoint]) -> ConstantsTest:
-    """The test of a track; of NaN where nothing counts as exact, or where the rows of the last track do not settle.
+    """Return the test of a track, NaN if nothing counts as exact or without convergence.
 
-    Its first rows do not count, until the range is known: states from which nothing settles.
+    Rows of the last track before the range is known are not used, because the fit would not converge.
     """
     array = _with_constants(tracker.array)
     used = [] if array is tracker.array else placed_rows(points)
@@ -66,12 +72,12 @@ def constants_test(tracker: Tracker, rows: Sequence[Row], points: Sequence[Track
     if own.of_field.any() or not errors.of_field.any():
         return ConstantsTest(mounting)
     claimed, source, field = used[-1][1], steps[-1].S[:N_SOURCE], of_errors[1][errors.of_field]
-    shift = source @ np.linalg.pinv(field)  # of the source by errors of unit variance that are taken for zero
+    shift = source @ np.linalg.pinv(field)  # of the source by neglected errors of unit variance
     return ConstantsTest(mounting, _score(*of_errors, errors.of_field), float(error_factor(claimed, shift @ shift.T)))
 
 
 def _with_constants(array: SensorArray) -> SensorArray:
-    """The array where what counts as exact has its usual errors; itself where nothing does."""
+    """Return the array with usual errors of what counts as exact, unchanged if nothing does."""
     pose, usual = array.pose, PoseUncertainty()
     if pose is not None and not pose.position_constant_m and not pose.attitude_constant_rad:
         constants = {key: getattr(usual, key) for key in ("position_constant_m", "attitude_constant_rad")}
@@ -82,26 +88,29 @@ def _with_constants(array: SensorArray) -> SensorArray:
 
 
 def _score(x: FloatArray, S: FloatArray, which: BoolArray) -> float:
-    """Of some states of unit prior variance, found with a covariance S Sᵀ; NaN where the rows tell nothing of them."""
-    found, root = x[which], S[which]
-    left, axes = np.linalg.eigh(root @ root.T)
-    spread = left * (1.0 - left)
-    told = spread > _LEAST_KNOWN
-    if not told.any():
+    """Return the Wald statistic of states of unit prior variance, NaN if undetermined.
+
+    The states have the estimate x and the posterior covariance S Sᵀ.
+    """
+    estimate, root = x[which], S[which]
+    posterior, axes = np.linalg.eigh(root @ root.T)
+    variance = posterior * (1.0 - posterior)
+    known = variance > _LEAST_KNOWN
+    if not known.any():
         return math.nan
-    square = float(np.sum((axes.T @ found)[told] ** 2 / spread[told]))
-    return float(min(-ndtri(max(chdtrc(int(told.sum()), square), 1e-300)), 37.0))
+    square = float(np.sum((axes.T @ estimate)[known] ** 2 / variance[known]))
+    return float(min(-ndtri(max(chdtrc(int(known.sum()), square), 1e-300)), 37.0))
 
 
 def placed_rows(points: Sequence[TrackPoint]) -> list[tuple[int, FloatArray]]:
-    """Rows of the last track that know the range so well that P (6, 6) is Cartesian, and P."""
+    """Return the rows of the last track with a Cartesian Gaussian, and its covariance (6, 6)."""
     known = [i for i, point in enumerate(points) if point.is_on_track]
     begin = max((i for i in known if points[i].status == "acquired" or i == known[0]), default=0)
     return [(i, P) for i in known if i >= begin and (P := _placed_covariance(points[i])) is not None]
 
 
 def _placed_covariance(point: TrackPoint) -> FloatArray | None:
-    """Of a source whose range is known so well that it is Gaussian in Cartesian coordinates, None of another."""
+    """Return the covariance of a point that is a Cartesian Gaussian, otherwise None."""
     if point.covariance is None or point.position_m is None or point.centroid_m is None:
         return None
     error = relative_range_sigma(point.covariance, point.position_m - point.centroid_m)

@@ -20,7 +20,7 @@ from magloc.tracking.whole_records.smoother import smooth_states
 def posterior_bound(
     tracker: Tracker, rows: Sequence[Row], position_m: FloatArray, moment_Am2: FloatArray
 ) -> FloatArray:
-    """Return the posterior Cramér-Rao bound of the position error for each row, by this row and those before.
+    """Return the posterior Cramér-Rao bound of each row's position, by rows up to it.
 
     The bound (n,) [m] is the root of the trace for the position. It begins with the first row that shows a source, and
     is infinite before. The prior is that of a tracker (:func:`magloc.tracking.chart.start.prior_root`). Lasting errors
@@ -35,7 +35,7 @@ def posterior_bound(
 def smoothing_bound(
     tracker: Tracker, rows: Sequence[Row], position_m: FloatArray, moment_Am2: FloatArray
 ) -> FloatArray:
-    r"""Return the posterior Cramér-Rao bound of the position error for each row, by all rows.
+    r"""Return the posterior Cramér-Rao bound of each row's position, by all rows.
 
     It is the diagonal block of the inverse information of all states together (Šimandl, Královec and Tichavský 2001),
     by the recursion of Rauch, Tung and Striebel from the last row backwards:
@@ -52,7 +52,7 @@ def smoothing_bound(
 def _steps_at_truth(
     tracker: Tracker, rows: Sequence[Row], position_m: FloatArray, moment_Am2: FloatArray
 ) -> list[Step]:
-    """Return the steps of a filter that linearises at the truth, from the first row that shows the source."""
+    """Return filter steps linearised at the truth, from the first row that shows the source."""
     motion, n_errors = tracker.motion, tracker.n_errors
     truth = np.concatenate([position_m, moment_Am2], axis=1)
     velocity, rate = _velocities(np.array([row.time_s for row in rows]), truth)
@@ -73,7 +73,7 @@ def _steps_at_truth(
 
 
 def _velocities(time_s: FloatArray, truth: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return velocities and turn rates (n, 3) of true positions and moments (n, 6), by differences of the rows."""
+    """Return velocities and turn rates (n, 3) by differences of true states (n, 6)."""
     if len(time_s) < 2:
         return np.zeros((len(time_s), 3)), np.zeros((len(time_s), 3))
     derivative = np.gradient(truth, time_s, axis=0)

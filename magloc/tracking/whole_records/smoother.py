@@ -1,4 +1,4 @@
-"""A finished track with what later rows tell as well."""
+"""Fixed-interval smoother of a track."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from magloc.tracking.results import Step, TrackPoint
 
 
 def smooth_points(points: list[TrackPoint], steps: list[Step]) -> list[TrackPoint]:
-    """Points of a finished record with what later rows tell as well: a fixed-interval smoother over every track.
+    """Return the smoothed points of a record: a fixed-interval smoother over every track.
 
-    Rauch, Tung and Striebel's recursion on the filter's steps: its gain is :math:`P F^T P_{pred}^{-1}`.
+    It is the Rauch-Tung-Striebel recursion on the filter's steps, with the gain :math:`P F^T P_{pred}^{-1}`.
     """
     result = list(points)
     for step, (x, P) in zip(steps, smooth_states(steps), strict=True):
@@ -31,7 +31,7 @@ def smooth_points(points: list[TrackPoint], steps: list[Step]) -> list[TrackPoin
 
 
 def smooth_states(steps: list[Step]) -> list[tuple[FloatArray, FloatArray]]:
-    """State and covariance of every step with what later ones tell."""
+    """Return the smoothed state and covariance of every step."""
     result: list[tuple[FloatArray, FloatArray]] = []
     x, P = np.empty(0), np.empty((0, 0))
     after: Step | None = None

@@ -119,7 +119,7 @@ class TestNeesOfACurvedEstimate:
         expected, found, cartesian = [], [], []
         for _ in range(200):
             noise = rng.normal(size=6)
-            estimate = self.solved(measurement, measurement.predict_source(self.TRUTH) + noise)
+            estimate = self.solve(measurement, measurement.predict_source(self.TRUTH) + noise)
             if estimate is None:
                 continue
             H = measurement.directional_derivative(estimate, np.eye(6))
@@ -138,7 +138,7 @@ class TestNeesOfACurvedEstimate:
         mixture = Mixture(estimate[None], S, np.zeros(1), 6, array.centroid, array.circumradius)
         return replace(point_of(estimate[:3], estimate[3:], covariance), mixture=mixture)
 
-    def solved(self, measurement: RowMeasurement, z: FloatArray) -> FloatArray | None:
+    def solve(self, measurement: RowMeasurement, z: FloatArray) -> FloatArray | None:
         """The source whose six differences are z, if scipy finds it."""
         fit = least_squares(
             lambda y: measurement.predict_source(y * self.UNIT) - z,

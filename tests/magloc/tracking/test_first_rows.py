@@ -29,7 +29,7 @@ from tests.passing_source import ARRAY, followed
 from tests.tracked_sources import VELOCITY, WALK, drawn
 
 
-def judged(
+def judge(
     motion: MotionModel,
     n: int,
     seeds: range,
@@ -68,7 +68,7 @@ def test_the_true_place_is_kept_beside_another() -> None:
 class TestFromTheFirstRow:
     def test_every_row_has_an_answer_that_holds_the_truth(self, motion: MotionModel) -> None:
         """Six runs of 12 rows: 5 σ in the filter's coordinates, once in 600,000 of each row."""
-        result = judged(motion, 12, range(6))
+        result = judge(motion, 12, range(6))
         assert (6.0 * result[..., 2] < 41.4).all()
         assert result[..., 3].mean() > 0.8
 
@@ -79,7 +79,7 @@ class TestFromTheFirstRow:
         The ratio's standard error is 0.07 to 0.09, as a few runs near two optima carry most of it, and that of NEES
         0.06 where no such run is among them. docs/validation/tracks.md has 200 runs of other seeds.
         """
-        result = judged(motion, 40, range(1000, 1100))
+        result = judge(motion, 40, range(1000, 1100))
         ratio = np.sqrt(result[..., 0].mean(axis=0) / result[..., 1].mean(axis=0))
         inside = result[..., 3]
         assert ratio[2:].max() <= 1.4
@@ -95,7 +95,7 @@ def test_weak_signals_are_consistent(motion: MotionModel) -> None:
 
     Limits are 4 σ from 1 and 3 σ from 95 %, as a run's rows are alike: once in some hundred sets of seeds.
     """
-    result = judged(motion, 60, range(2000, 2060), tetrahedron(1.5, "vector", 1e-9))[:, 29:]
+    result = judge(motion, 60, range(2000, 2060), tetrahedron(1.5, "vector", 1e-9))[:, 29:]
     assert result[..., 2].mean(axis=0).min() > 0.68
     assert result[..., 2].mean(axis=0).max() < 1.32
     assert result[..., 3].mean(axis=0).min() > 0.86
@@ -112,9 +112,9 @@ def test_unknown_offsets_are_consistent() -> None:
     """
     sensors = tuple(replace(sensor, offset_uncertainty_T=20.0 * sensor.noise_T) for sensor in ARRAY.sensors)
     array, errors = replace(ARRAY, sensors=sensors), np.random.default_rng(76000)
-    result = judged(
-        WALK, 60, range(76000, 76030), array, lambda: 20.0 * ARRAY.channel_noise_T * errors.normal(size=12)
-    )[:, 29:]
+    result = judge(WALK, 60, range(76000, 76030), array, lambda: 20.0 * ARRAY.channel_noise_T * errors.normal(size=12))[
+        :, 29:
+    ]
     assert result[..., 2].mean() < 1.5
     assert result[..., 3].mean() > 0.85
 

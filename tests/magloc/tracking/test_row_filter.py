@@ -111,7 +111,7 @@ def _decimals(matrix: FloatArray) -> NDArray[np.object_]:
     return np.vectorize(Decimal, otypes=[object])(matrix)
 
 
-def _solved(matrix: NDArray[np.object_], right: NDArray[np.object_]) -> NDArray[np.object_]:
+def _solve(matrix: NDArray[np.object_], right: NDArray[np.object_]) -> NDArray[np.object_]:
     """Gauss and Jordan's elimination with pivots."""
     n, rows = len(matrix), np.concatenate([matrix, right], axis=1)
     for i in range(n):
@@ -136,7 +136,7 @@ class Fit:
     P: FloatArray
 
 
-def fitted(at: Case, i: int, bends: bool, shares: FloatArray) -> Fit:
+def minimise(at: Case, i: int, bends: bool, shares: FloatArray) -> Fit:
     """Fit of one prediction: standard numbers ζ of what is seen, of errors of sensors, and of what else moves, in turn.
 
     With bends, s = ζ + M (h(ζ) - h(0) - J ζ) of what is seen is normal in place of ζ, where errors of the pose have
@@ -215,7 +215,7 @@ class TestOneSource:
         assert found.innovation is not None
         assert found.converged.any()
         i = int(np.argmax(found.converged))
-        expected = fitted(at, i, bends, shares)
+        expected = minimise(at, i, bends, shares)
         assert found.nis[i] == pytest.approx(expected.nis, rel=1e-6, abs=5e-6)
         assert np.sum(found.innovation[i] ** 2) == pytest.approx(expected.innovation2, rel=1e-5, abs=1e-5)
         assert found.chi2[i] == pytest.approx(expected.chi2, rel=2e-3, abs=2e-3)
@@ -268,7 +268,7 @@ class TestOneSource:
             turn[:n, :n] = (after.inverse_jacobian() @ chart.jacobian(e[None]))[0]
             with localcontext() as context:
                 context.prec = 50
-                left = _solved(_decimals(turn @ S_before), _decimals(S))
+                left = _solve(_decimals(turn @ S_before), _decimals(S))
                 of_zeta = _decimals(np.eye(len(x))) + _decimals(J.T) @ _decimals(J)
                 square = (left.T @ of_zeta @ left).astype(float)
             np.testing.assert_allclose(square, np.eye(len(x)), atol=1e-5)
@@ -346,7 +346,7 @@ class Board:
         S = np.concatenate([sigma, np.full(3, 1e-4)])[:, None] * rng.normal(size=(2, N, N)) / math.sqrt(N)
         self.gaussians = Gaussians(x, S, n_sources, 3, power=0)
 
-    def repeated(self, readings: FloatArray) -> Rows:
+    def repeat(self, readings: FloatArray) -> Rows:
         """Rows (n) of readings (n, k) where the array stands."""
         same = ("counts", "effects", "origins_m", "rotations", "transform_of_row")
         many = {name: np.repeat(getattr(self.rows, name), len(readings), axis=0) for name in same}
@@ -496,7 +496,7 @@ class TestSeveralSources:
         prior = replace(board.gaussians, x=0.3 * np.linalg.norm(S, axis=2) * rng.normal(size=(2, N)))
         kept, added = np.full((1, 3), 0.9), np.full((1, 3), 1e-6)
         steps = row_filter.steps_problem(motion, [dt_s], np.zeros(m, dtype=np.intp), (kept, added))
-        found = row_filter.smooth(tracks, prior, steps, board.repeated(readings))
+        found = row_filter.smooth(tracks, prior, steps, board.repeat(readings))
         for c, track in enumerate(np.pad(tracks, ((0, 0), (0, 0), (0, 3)))):
             # B (e_0, e_1, ...) = (e_0, shift_1 + noise_1, ...)
             B, H = np.eye(m * N), np.zeros((m * k, m * N))
@@ -540,7 +540,7 @@ class TestSeveralSources:
         state = Gaussians(board.gaussians.x[:1].copy(), board.gaussians.S[:1].copy(), n_sources, 3, power=0)
         readings = board.exact + np.random.default_rng(n_sources).normal(size=(n_rows, len(board.z)))
         readings[3, 7] += 100.0
-        rows = board.repeated(readings)
+        rows = board.repeat(readings)
         steps = row_filter.steps_problem(
             motion, [0.02], np.zeros(n_rows, dtype=np.intp), (np.ones((1, 3)), np.full((1, 3), 1e-7))
         )

@@ -23,7 +23,7 @@ def state_of(k: int, seed: int = 0) -> JointState:
     return state
 
 
-def drawn(state: JointState, n: int, seed: int = 1) -> np.ndarray:
+def draw(state: JointState, n: int, seed: int = 1) -> np.ndarray:
     """Draw sources (n, K, 12) of a state."""
     errors = np.random.default_rng(seed).normal(size=(n, len(state.x))) @ state.S.T
     chart = state.chart
@@ -64,7 +64,7 @@ class TestBookkeeping:
         distance, sigma = state.gap(0, 1)
         offset = state.position_m[0] - state.position_m[1]
         assert distance == pytest.approx(np.linalg.norm(offset))
-        draws = drawn(state, 50_000)[:, :, :3]
+        draws = draw(state, 50_000)[:, :, :3]
         along = (draws[:, 0] - draws[:, 1]) @ offset / distance
         assert np.std(along) == pytest.approx(sigma, rel=0.03)
 
@@ -72,7 +72,7 @@ class TestBookkeeping:
 def test_covariances_are_those_of_draws():
     """50,000 draws, within 5 σ."""
     state = state_of(2)
-    draws = drawn(state, 50_000)[:, :, :6]
+    draws = draw(state, 50_000)[:, :, :6]
     for k in range(2):
         scale = np.sqrt(np.diagonal(state.covariances[k]))
         found, expected = np.cov(draws[:, k].T), state.covariances[k]
@@ -88,7 +88,7 @@ def test_second_moments_of_a_moment():
     u = moment[0] / np.linalg.norm(moment)
     empty = JointState.empty(np.zeros(3), 1e-6, np.zeros(3), RADIUS_M)
     state = empty.with_sources(np.ones((1, 3)), moment, FreeMotion().start(moment, np.array([1e-4]), 0.1, 1e-3))
-    error = drawn(state, 200_000)[:, 0, 3:6] - moment
+    error = draw(state, 200_000)[:, 0, 3:6] - moment
     expected = error.T @ error / len(error)
     found = state.covariances[0][3:, 3:]
     assert u @ found @ u == pytest.approx(u @ expected @ u, rel=0.15)

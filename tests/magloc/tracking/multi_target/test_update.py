@@ -39,10 +39,10 @@ def known(n_sources: int, share: float, rng: np.random.Generator | None = None, 
     state = predict_state(state, MOTION.numbers(dt_s), JointRow.of(BOARD, Row(0.0, np.zeros(BOARD.n_channels))))
     if rng is None:
         return state
-    return drawn(state, rng)
+    return draw(state, rng)
 
 
-def drawn(state: JointState, rng: np.random.Generator) -> JointState:
+def draw(state: JointState, rng: np.random.Generator) -> JointState:
     """A state of the same covariance whose mean is drawn from it."""
     return state.shift(state.S @ rng.normal(size=len(state.x)), state.S)
 
@@ -84,10 +84,10 @@ def test_linearisations_before_and_after():
 
     one = np.eye(len(row.z))
     np.testing.assert_allclose(found.innovation, row.z - predict_readings(row, state), atol=1e-7)
-    np.testing.assert_allclose(one - found.seen_before.T @ found.seen_before, information(state), atol=1e-6)
+    np.testing.assert_allclose(one - found.projector_before.T @ found.projector_before, information(state), atol=1e-6)
     np.testing.assert_allclose(found.surprise, information(state) @ found.innovation, atol=1e-6)
     np.testing.assert_allclose(found.residual, row.z - predict_readings(row, found.state), atol=0.02)
-    left = one - found.seen.T @ found.seen
+    left = one - found.projector.T @ found.projector
     expected = [r @ np.linalg.solve(left[at, at] + 1e-3 * np.eye(3), r) for at, r in blocks(found.residual)]
     np.testing.assert_allclose(found.sensor_chi2, expected, rtol=0.02, atol=0.02)
 
@@ -120,7 +120,7 @@ def test_cost_and_residuals_are_chi_squared():
     rng = np.random.default_rng(2)
     truth = known(2, 0.02)
     rows = [JointRow.of(BOARD, Row(0.0, readings(rng))) for _ in range(100)]
-    found = [joint_update(drawn(truth, rng), row) for row in rows]
+    found = [joint_update(draw(truth, rng), row) for row in rows]
     n = BOARD.n_channels
     assert abs(np.mean([one.cost for one in found]) - n) < 5.0 * np.sqrt(2.0 * n / 100)
     chi2 = np.array([one.sensor_chi2 for one in found])
