@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +13,7 @@ import numpy as np
 
 import adcs
 from adcs.cli.options import ReportOptions
-from arrays.io.errors import LARGEST, InputError, naming
+from arrays.io.errors import InputError, naming
 from arrays.typing import FloatArray
 from magloc.cli.framework import ABOVE_ZERO, Flag, progress, refuse_outside
 
@@ -72,7 +73,8 @@ def stars(
     from adcs.stars.hipparcos import hipparcos_catalogue
     from adcs.stars.pictures import SUFFIXES
 
-    refuse_outside(ABOVE_ZERO, LARGEST, "a positive number", noise_px=noise_px, scale_arcsec=scale_arcsec)
+    largest = sys.float_info.max  # how large they may be depends on the images
+    refuse_outside(ABOVE_ZERO, largest, "a positive number", noise_px=noise_px, scale_arcsec=scale_arcsec)
     refuse_outside(ABOVE_ZERO, 0.1, "a positive number, 0.1 at most", scale_tolerance=scale_tolerance)
     refuse_outside(1900.0, 2100.0, "1900 to 2100", year=year)
     if not images:

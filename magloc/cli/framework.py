@@ -27,7 +27,7 @@ from typing import Annotated, Any
 from cyclopts import App, CycloptsError, MissingArgumentError, Parameter, Token, UnknownCommandError
 from cyclopts.validators import Number
 
-from arrays.io.errors import PACKAGES, InputError
+from arrays.io.errors import LARGEST, PACKAGES, InputError
 from arrays.io.outputs import installed_version, make_folder
 from magloc.cli.entry import INTERRUPTED
 
@@ -65,7 +65,8 @@ def refuse_outside(low: float, high: float, expected: str, *, unit: str = "", **
     """Refuse options, by their names in Python, that are given and not within limits."""
     for name, value in options.items():
         if value is not None and not low <= value <= high:
-            raise InputError(f"--{name.replace('_', '-')}: found {value:g}{unit}, expected {expected}.")
+            most = f", at most {LARGEST:g}" if LARGEST == high < value < math.inf else ""
+            raise InputError(f"--{name.replace('_', '-')}: found {value:g}{unit}, expected {expected}{most}.")
 
 
 Flag = Annotated[bool, Parameter(show_default=False)]
