@@ -1,4 +1,4 @@
-r"""Damped least squares: the Levenberg-Marquardt iteration, for every problem that is not a compiled kernel's.
+r"""Damped least squares: the Levenberg-Marquardt iteration, for problems solved one at a time.
 
 The iteration is here, the problem is its user's: an iterate knows its cost, and what a damped step from it leads to.
 So a problem may eliminate nuisances, have priors and bounds, and limit its steps.

@@ -235,7 +235,7 @@ def total_field(points: ArrayLike, sources: ArrayLike, moments: ArrayLike) -> Ar
 
     See Also
     --------
-    magloc.fields.dipole_compiled.field_at_points : the same, compiled and parallel, for many points.
+    magloc.fields.points.field_at_points : the same, compiled and parallel, for many points.
     """
     return _sum_over_dipoles(field, (3,), points, sources, moments)
 

@@ -1,4 +1,6 @@
-"""Hypotheses of births, deaths and faults of several sources.
+"""One hypothesis of births, deaths and faults: its state, score, sources' ids, and how two are compared.
+
+What may have happened in a row is found in :mod:`.explanations`; the tracker extends and prunes hypotheses.
 
 A Gaussian over which readings are nonlinear is split into three narrower ones, which later rows weigh. All rows of a
 young hypothesis are fitted together at growing intervals (:mod:`.smoothing`).
