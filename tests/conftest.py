@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import gc
 import os
+import shutil
 import signal
+import time
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
@@ -138,8 +140,22 @@ def data_folder() -> Path:
 @pytest.fixture(scope="session")
 def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What the lines of `tests.fuzz.cases` read: for copies, as it takes seconds to write."""
-    folder = tmp_path_factory.mktemp("files")
-    write_files(folder)
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "files"
+    written = folder.with_name("files-written")
+    # The first worker writes them, the others wait.
+    while not written.exists():
+        try:
+            folder.mkdir()
+        except FileExistsError:
+            time.sleep(0.1)
+            continue
+        try:
+            write_files(folder)
+            written.touch()
+        except BaseException:
+            shutil.rmtree(folder)
+            raise
     return folder
 
 

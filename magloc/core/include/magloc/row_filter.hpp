@@ -4,8 +4,8 @@
 // linear in the readings. Inside, what readings depend on comes first: what is seen - position and moment of each
 // source, and the pose -, nuisances, then further numbers of each source. A prediction's root is lower triangular, so
 // that the readings depend on the first d of the standard numbers zeta alone; coordinates are the root times zeta. Of
-// more nuisances than readings, reflections leave as many columns of the root that the row sees. Orthogonal steps keep
-// what normal equations would lose where a nuisance is known 1e5 times less well than a reading.
+// far more nuisances than readings, reflections leave as many columns of the root that the row sees. Orthogonal steps
+// keep what normal equations would lose where a nuisance is known 1e5 times less well than a reading.
 #pragma once
 #include "bent_prediction.hpp"
 #include "row_readings.hpp"
@@ -20,7 +20,7 @@ class RowFilter {
   Workspace &space_;
   const int64_t K_ = p_.n_sources, ns_ = p_.n_states, n_pose_ = given_.n_pose, behind_ = p_.n_nuisances;
   const int64_t measured_ = n_measured * K_, seen_ = measured_ + n_pose_, e_ = behind_ - n_pose_;
-  const int64_t h_ = e_ < given_.n_readings ? e_ : given_.n_readings, d_ = seen_ + h_;
+  const int64_t h_ = 2 * e_ < 3 * given_.n_readings ? e_ : given_.n_readings, d_ = seen_ + h_;
   RowReadings<T> readings_{given_, K_, space_};
   const int64_t k_ = readings_.width();                        // registers that the readings fill
   SourceChart *const charts_ = space_.take<SourceChart>(K_);   // about the mean
