@@ -26,7 +26,12 @@ ROTATION_COLUMNS = ("array_qx", "array_qy", "array_qz", "array_qw")
 NANOTESLA = {"nT": 1.0, "uT": 1e3, "µT": 1e3, "mT": 1e6, "T": 1e9, "mG": 1e2, "G": 1e5}
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "iso": 1.0, "hhmmss": 1.0}
 SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t", "space": " "}
-_CHOICES = {"separator": SEPARATORS, "decimal": (".", ","), "time_unit": SECONDS}
+_CHOICES = {
+    "separator": SEPARATORS,
+    "decimal": (".", ","),
+    "time_unit": SECONDS,
+    "height_is": ("ellipsoid", "geoid", "ground"),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,12 +85,19 @@ class LogColumns:
         Columns of the array's place [m], in a world frame whose z points up; two with `height_m`.
     geodetic : tuple of 2 or 3 str, optional
         In its place: those of latitude, longitude [deg] and, without `height_m`, height [m].
+    crs : str, optional
+        System of coordinates, such as "EPSG:32633": `position` has easting and northing in it, or `geodetic` latitude
+        and longitude. The world is east, north, up of the origin, whatever the grid's convergence and scale.
     height_m : float, optional
-        Height of all places, in the world frame.
+        Height of all places above the ground, which is at the height of the origin.
+    height_is : str
+        "ellipsoid", "geoid" (that of the origin is the same), or "ground": heights above ground.
+    antenna_m : tuple of 3 floats, optional
+        Place of the receiver's antenna in the array's frame [m].
     fix : ValidRows, optional
         Rows whose places count; by default all. Others, and those without a place, are interpolated.
     origin : tuple of 3 floats, optional
-        With `geodetic`: latitude, longitude [deg] and height [m] of the world's origin, one for all logs.
+        With `geodetic` or `crs`: latitude, longitude [deg] and height [m] of the world's origin, one for all logs.
     quaternion : tuple of 4 str, optional
         Columns of the attitude, from the array's frame to the world, x, y, z, w.
     angles : tuple of str, optional
@@ -127,7 +139,10 @@ class LogColumns:
     position: tuple[str, ...] | None = None
     geodetic: tuple[str, ...] | None = None
     origin: Vector | None = None
+    crs: str | None = None
     height_m: float | None = None
+    height_is: str = "ellipsoid"
+    antenna_m: Vector | None = None
     fix: ValidRows | None = None
     quaternion: tuple[str, str, str, str] | None = None
     angles: tuple[str, ...] | None = None
@@ -162,11 +177,12 @@ class LogColumns:
             raise ValueError(
                 "Inputs position or geodetic must come with an attitude or a latency; instead received none."
             )
-        if (self.geodetic is None) != (self.origin is None):
+        if (self.geodetic is None) != (self.origin is None) and self.crs is None:
             raise ValueError("Inputs geodetic and origin must come together; instead received one of them.")
-        numbers = (self.pose_latency_s, self.height_m or 0.0, *(self.origin or ()))
+        numbers = (self.pose_latency_s, self.height_m or 0.0, *(self.origin or ()), *(self.antenna_m or ()))
         if not np.isfinite(numbers).all():
-            raise ValueError(f"Inputs origin, height_m and pose_latency_s must be finite; instead received {numbers}.")
+            names = "origin, height_m, antenna_m and pose_latency_s"
+            raise ValueError(f"Inputs {names} must be finite; instead received {numbers}.")
 
     def _refuse_places(self) -> None:
         n = 3 if self.height_m is None else 2
@@ -174,8 +190,10 @@ class LogColumns:
             if (names := getattr(self, name)) is not None and len(names) != n:
                 why = "without height_m" if n == 3 else "with height_m"
                 raise ValueError(f"Input {name} must have {n} names {why}; instead received {len(names)}.")
-        if not self.place and (self.height_m is not None or self.fix is not None):
-            raise ValueError("Inputs height_m and fix must come with position or geodetic; instead received neither.")
+        of_places = (self.height_m, self.fix, self.crs, self.antenna_m)
+        if not self.place and of_places != (None,) * len(of_places):
+            names = "height_m, fix, crs and antenna_m"
+            raise ValueError(f"Inputs {names} must come with position or geodetic; instead received neither.")
 
     def _refuse_text(self) -> None:
         if self.date is not None:
@@ -205,6 +223,11 @@ class LogColumns:
     def place(self) -> tuple[str, ...]:
         """Columns of the array's place."""
         return self.position or self.geodetic or ()
+
+    @property
+    def above_ground(self) -> bool:
+        """Whether heights are above the ground."""
+        return self.height_m is not None or self.height_is == "ground"
 
     @property
     def attitude(self) -> tuple[str, ...]:
@@ -245,7 +268,10 @@ class ColumnsTable(Table, kw_only=True):
     position: list[str] | None = None
     geodetic: list[str] | None = None
     origin: Vector | None = None
+    crs: str | None = None
     height_m: float | None = None
+    height_is: str = "ellipsoid"
+    antenna_m: Vector | None = None
     fix: ValidTable | None = None
     quaternion: tuple[str, str, str, str] | None = None
     angles: list[str] | None = None

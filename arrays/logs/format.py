@@ -15,7 +15,7 @@ from arrays.io.dummies import dummy_cells, may_be_dummies
 from arrays.io.errors import InputError
 from arrays.logs.clock import seconds_of_cell, seconds_of_rows
 from arrays.logs.lines import cells_of, header_and_rows
-from arrays.logs.places import positions, quaternions
+from arrays.logs.places import array_origins, positions, quaternions
 from arrays.typing import FloatArray
 
 _LOG = logging.getLogger(__name__)
@@ -150,6 +150,13 @@ class LogFormat:
             found |= zip(POSITION_COLUMNS, positions(logged, columns, is_file=is_file).T, strict=True)
         if columns.attitude or (columns.place and not set(ROTATION_COLUMNS) & found.keys()):
             found |= zip(ROTATION_COLUMNS, quaternions(logged, columns).T, strict=True)
+        if columns.antenna_m is not None:
+            if np.any(columns.antenna_m[:2]) and not (columns.attitude or set(ROTATION_COLUMNS) <= index.keys()):
+                raise InputError(
+                    f"{logged.path}: found no attitude, expected one beside an antenna that is off to a side."
+                )
+            place, turn = (np.stack([found[name] for name in of], 1) for of in (POSITION_COLUMNS, ROTATION_COLUMNS))
+            found |= zip(POSITION_COLUMNS, array_origins(place, turn, columns).T, strict=True)
         values = np.stack([*found.values()], axis=1)
         return Table(logged.path, tuple(found), logged.header_line, values, logged.line_numbers)
 
