@@ -23,14 +23,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from arrays.array import AMBIENT_CHANNELS, SensorArray
-from arrays.columns import POSITION_COLUMNS, ROTATION_COLUMNS, LogFormat, without_dummies
+from arrays.columns import POSITION_COLUMNS, ROTATION_COLUMNS
 from arrays.io.csv import Columns, Table, table_of_columns
 from arrays.io.errors import InputError
 from arrays.io.text import read_text, write_text
 from arrays.io.values import LARGEST_T, fields, numbers, seconds
+from arrays.logs.format import LogFormat, without_dummies
 from arrays.sensor import Sensor
 from arrays.typing import FloatArray, IntArray
 from magloc.conditioning import NO_BACKGROUND, Background, without_hum
+from magloc.navigation.fixes import without_gaps
 from magloc.navigation.measured_motion import MOTION_COLUMNS, MeasuredMotion, motion_columns, motion_of_table
 from magloc.navigation.poses import rotations_at, unit_rotation, vectors_at
 
@@ -280,8 +282,9 @@ def read_readings(
     >>> magloc.read_readings(board.path, board.array).values_T.shape
     (101, 90)
     """
-    table = log_format(array, sensors).table(read_text(path, "a CSV file"), str(path))
-    readings = readings_of_table(table, array, sensors)
+    form = log_format(array, sensors)
+    table, error_m = without_gaps(form.table(read_text(path, "a CSV file", form.encoding), str(path)))
+    readings = replace(readings_of_table(table, array, sensors), interpolated_m=error_m)
     if array.columns is not None and array.columns.pose_latency_s:
         readings = readings.posed_later(array.columns.pose_latency_s)
     if ordered:
@@ -393,16 +396,13 @@ def without_saturated(readings: Readings, array: SensorArray) -> Readings:
 
 
 def _check_channels(readings: Readings, array: SensorArray) -> None:
-    if readings.values_T.shape[1] != array.n_channels:
-        raise ValueError(
-            f"Input readings must have the {array.n_channels} channels of the array; "
-            f"instead received {readings.values_T.shape[1]}."
-        )
+    if (n := readings.values_T.shape[1]) != array.n_channels:
+        expected = f"the {array.n_channels} channels of the array"
+        raise ValueError(f"Input readings must have {expected}; instead received {n}.")
 
 
 def _check_sensor_columns(table: Table, array: SensorArray, channels: Sequence[str], *, ignore_others: bool) -> None:
-    known = ("time_s", *channels, *_OPTIONAL_COLUMNS)
-    called = f"array {array.name!r}" if array.name else "the array"
+    known, called = ("time_s", *channels, *_OPTIONAL_COLUMNS), f"array {array.name!r}" if array.name else "the array"
     table.require("time_s", known)
     for sensor in array.sensors:
         for name in _columns_of_other_kind(sensor):

@@ -7,14 +7,13 @@ any line ends, blank lines and spaces around cells are tolerated.
 from __future__ import annotations
 
 import csv
-import datetime
 import difflib
 import io
 import itertools
+import logging
 import math
-import re
 from array import array as packed
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from io import FileIO
@@ -27,12 +26,12 @@ from numpy.typing import NDArray
 
 from arrays.io.errors import LARGEST, InputError
 from arrays.io.text import read_text, write_text
-from arrays.io.values import numbers, seconds
+from arrays.io.values import SHOWN_CHARACTERS, numbers, seconds, unix_seconds
 from arrays.typing import FloatArray, IntArray
 
+_LOG = logging.getLogger(__name__)
 LATEST_S = 1e11
 """Latest time of a row, and earliest below zero: of microseconds since 1970 a row would be beyond it."""
-_SHOWN_CHARACTERS = 40
 _HEAD_CHARACTERS = 2**16
 _MOST_LINES_ABOVE = 100
 _SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs", " ": "blanks"}
@@ -223,11 +222,14 @@ def table_of_text(
     decimal: str = ".",
     head: Table | None = None,
     dummy: Collection[str] = (),
+    ragged: bool = False,
+    seconds_of: Callable[[str, str], str] = unix_seconds,
 ) -> Table:
     """As :func:`read_table`, from text that errors call `name` and whose rows begin at `first_line` of a longer one.
 
     ``head``: the table whose header the rows have; the text has none then. ``dummy``: words that become `DUMMY`, as
-    ``*`` does.
+    ``*`` does. ``ragged``: rows may have more empty cells than the header has columns, or end behind the last column
+    that is read; the last one may be cut. ``seconds_of``: what reads an instant, as :func:`unix_seconds` does.
     """
     text = text.replace("\r\n", "\n").replace("\r", "\n")
     if "\0" in text:
@@ -249,17 +251,25 @@ def table_of_text(
     timed = [chosen.index(column) for column in instant if column in chosen]
     values, line_numbers = packed("d"), packed("q")
     shift = 0 if first_line is None else first_line - header_line - 1
+    last, wrong = max(kept, default=-1), ""
     for row_line, cells in rows:
         line = row_line + shift
+        if wrong:
+            raise InputError(wrong)
+        if ragged and len(cells) != len(header):
+            cells = _fitted(cells, len(header), last)
         if len(cells) != len(header):
-            raise InputError(f"{name}, line {line}: found {len(cells)} cells, expected {len(header)} as in the header.")
+            wrong = f"{name}, line {line}: found {len(cells)} cells, expected {len(header)} as in the header."
+            if not ragged:
+                raise InputError(wrong)
+            continue
         if only is not None:
             cells = [cells[i] for i in kept]
         if decimal != ".":
             cells = [cell if i in timed else cell.replace(decimal, ".") for i, cell in enumerate(cells)]
         if timed:
             place = f"{name}, line {line}, column {', '.join(instant)}"
-            cells[timed[0]] = unix_seconds(place, "T".join(cells[i].strip() for i in timed))
+            cells[timed[0]] = seconds_of(place, "T".join(cells[i].strip() for i in timed))
             cells[timed[-1]] = cells[timed[0]]
         try:
             found = [read(cell or "nan") for cell in cells]
@@ -267,10 +277,21 @@ def table_of_text(
             found = _careful_numbers(f"{name}, line {line}", chosen, cells, dummy)
         values.extend(found)
         line_numbers.append(line)
+    if wrong and (not line_numbers or len(cells) > len(header)):
+        raise InputError(wrong)
+    if wrong:
+        _LOG.warning(f"{name}: the last row is cut and is left out")
     if not line_numbers:
         raise InputError(f"{name}, line {header_line}: found a header without rows, expected a row below it.")
     table = np.array(values).reshape(len(line_numbers), len(chosen))
     return Table(name, chosen, header_line, table, np.array(line_numbers, dtype=np.int64))
+
+
+def _fitted(cells: list[str], n: int, last: int) -> list[str]:
+    """Return a row without empty cells that are too many, or with those that it lacks behind the last one in use."""
+    while len(cells) > n and not cells[-1].strip():
+        cells = cells[:-1]
+    return cells + [""] * (n - len(cells)) if len(cells) > last + 1 else cells
 
 
 def table_of_header(line: str, name: str, expected_header: str, *, number: int = 1, separator: str = ",") -> Table:
@@ -278,16 +299,6 @@ def table_of_header(line: str, name: str, expected_header: str, *, number: int =
     _, cells = next(_csv_rows(name, line, separator), (1, [""]))
     header = _checked_header(f"{name}, line {number}", cells, expected_header, separator)
     return Table(name, header, number, np.zeros((0, len(header))), np.zeros(0, dtype=np.int64))
-
-
-def unix_seconds(place: str, cell: str) -> str:
-    """Seconds since 1970 of an instant, as text; 2026/11/21T7:00:00 is taken too."""
-    try:
-        instant = datetime.datetime.fromisoformat(re.sub(r"T(?=\d:)", "T0", cell.strip().replace("/", "-")))
-    except ValueError:
-        found = repr(cell.strip()[:_SHOWN_CHARACTERS])
-        raise InputError(f"{place}: found {found}, expected a time such as 2026-11-21T12:00:00.5 (UTC).") from None
-    return repr((instant if instant.tzinfo else instant.replace(tzinfo=datetime.UTC)).timestamp())
 
 
 def _csv_rows(path: str, text: str, separator: str = ",") -> Iterator[tuple[int, list[str]]]:
@@ -307,8 +318,8 @@ def _refuse_preamble(name: str, head: str, separator: str) -> None:
     """Raise an InputError for lines of text above the first row of names that has a row of numbers below it."""
     rows = itertools.islice(_csv_rows(name, head, separator), _MOST_LINES_ABOVE)
     for k, ((line, names), (_, below)) in enumerate(itertools.pairwise(rows)):
-        numbers = sum(map(_is_number_or_empty, below))
-        if len(names) == len(below) < 2 * numbers and len(names) > 1 and not any(map(_is_number_or_empty, names)):
+        numbers = sum(map(is_number_or_empty, below))
+        if len(names) == len(below) < 2 * numbers and len(names) > 1 and not any(map(is_number_or_empty, names)):
             if k:
                 raise InputError(
                     f"{name}: found {line - 1} line{'s' * (line > 2)} of text before the header on line {line},"
@@ -326,7 +337,7 @@ def _checked_header(place: str, cells: Sequence[str], expected: str, separator: 
             raise InputError(f"{place}: found columns separated by {called}, expected {wanted}.")
     seen: set[str] = set()
     for position, name in enumerate(header, start=1):
-        if _is_number_or_empty(name):
+        if is_number_or_empty(name):
             found = f"{name!r} in place of a name" if name else "no name"
             raise InputError(f"{place}, column {position}: found {found}, expected {expected}.")
         if name in seen:
@@ -346,7 +357,7 @@ def _careful_numbers(place: str, header: Sequence[str], cells: Sequence[str], du
             else:
                 found_numbers.append(DUMMY if word in _DUMMY_WORDS or word in dummy else _number(cell))
         except ValueError:
-            found = repr(cell.strip()[:_SHOWN_CHARACTERS])
+            found = repr(cell.strip()[:SHOWN_CHARACTERS])
             raise InputError(
                 f"{place}, column {_clipped(name)}: found {found}, expected a number or an empty cell."
             ) from None
@@ -360,7 +371,8 @@ def _number(cell: str) -> float:
     return float(cell) if cell else math.nan
 
 
-def _is_number_or_empty(cell: str) -> bool:
+def is_number_or_empty(cell: str) -> bool:
+    """Whether a cell is no word."""
     try:
         _number(cell)
     except ValueError:
@@ -423,7 +435,7 @@ class GrowingTable:
 
 def _clipped(name: str) -> str:
     """Shorten a column's name for a sentence: a header of another separator is one long name."""
-    return name if len(name) <= _SHOWN_CHARACTERS else f"{name[: _SHOWN_CHARACTERS - 1]}…"
+    return name if len(name) <= SHOWN_CHARACTERS else f"{name[: SHOWN_CHARACTERS - 1]}…"
 
 
 def _cell(value: object) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import os
 import stat
 from collections.abc import Callable, Iterator
@@ -21,6 +22,8 @@ MOST_BYTES, MOST_PIPED_BYTES = 4 * 10**9, 10**9
 LONGEST_LINE = 2**26
 """Bytes of a pipe or device without the end of a line."""
 _CHUNK = 2**24
+UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+"""First bytes of a text of two bytes a character."""
 
 
 def read_bytes(path: str | PathLike[str], expected: str, *, text: bool = False) -> bytes:
@@ -39,7 +42,7 @@ def read_bytes(path: str | PathLike[str], expected: str, *, text: bool = False) 
                 chunks.append(chunk)
                 size, end = size + len(chunk), chunk.rfind(b"\n")
                 line = line + len(chunk) if end < 0 else len(chunk) - end
-                if text and b"\0" in chunk:
+                if text and b"\0" in chunk and not chunks[0].startswith(UTF_16):
                     break
                 if not is_file and (size > MOST_PIPED_BYTES or line > LONGEST_LINE):
                     end_of = "a line" if line > LONGEST_LINE else "the data"
@@ -59,15 +62,21 @@ def read_bytes(path: str | PathLike[str], expected: str, *, text: bool = False) 
         raise InputError(f"{path} cannot be read ({reason}), expected {expected}.") from None
 
 
-def read_text(path: str | PathLike[str], expected: str) -> str:
-    """Return the text of a UTF-8 file, with or without a byte order mark, as :func:`read_bytes`."""
-    data = read_bytes(path, expected, text=True)
+def read_text(path: str | PathLike[str], expected: str, encoding: str | None = None) -> str:
+    """Return the text of a file, as :func:`read_bytes`.
+
+    It is UTF-8, with or without a byte order mark, or UTF-16 with one, unless an `encoding` is stated.
+    """
+    data = read_bytes(path, expected, text=not (encoding or "").lower().startswith(("utf-16", "utf_16", "utf16")))
+    used = "utf-16" if data.startswith(UTF_16) else encoding or "utf-8-sig"
     try:
-        return data.decode("utf-8-sig")
+        return data.decode(used).removeprefix("\ufeff")
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
+        called = "UTF-8" if used == "utf-8-sig" else used
         raise InputError(
-            f"{path}, line {line}: found the byte 0x{data[error.start]:02x}, which is not UTF-8, expected UTF-8 text."
+            f"{path}, line {line}: found the byte 0x{data[error.start]:02x}, which is not {called}, expected {called}"
+            " text."
         ) from None
 
 

@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import datetime
+import re
 from typing import TYPE_CHECKING, Any
 
+from arrays.io.errors import InputError
+
+SHOWN_CHARACTERS = 40
+"""Of a cell, in a sentence."""
 LARGEST_T = 1e6
 """Readings beyond it are those of something else, or of a broken line."""
 
@@ -67,3 +72,13 @@ def _of_object(time: Any) -> Any:
     if isinstance(time, datetime.datetime):
         return np.datetime64(time.astimezone(datetime.UTC).replace(tzinfo=None) if time.tzinfo else time)
     return time
+
+
+def unix_seconds(place: str, cell: str) -> str:
+    """Seconds since 1970 of an instant, as text; 2026/11/21T7:00:00 is taken too."""
+    try:
+        instant = datetime.datetime.fromisoformat(re.sub(r"T(?=\d:)", "T0", cell.strip().replace("/", "-")))
+    except ValueError:
+        found = repr(cell.strip()[:SHOWN_CHARACTERS])
+        raise InputError(f"{place}: found {found}, expected a time such as 2026-11-21T12:00:00.5 (UTC).") from None
+    return repr((instant if instant.tzinfo else instant.replace(tzinfo=datetime.UTC)).timestamp())

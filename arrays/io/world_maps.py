@@ -34,7 +34,7 @@ def check_near(farthest_m: float) -> None:
         raise ValueError(
             f"Input places must lie within {FARTHEST_M / 1e3:.0f} km of the origin of their frame, which is put at one"
             f" place of the Earth; instead received one {farthest_m / 1e3:.5g} km away. If they are eastings and"
-            " northings of a grid (such as UTM), subtract those of the origin, or give latitude and longitude instead."
+            " northings of a grid (such as UTM), name it by the key crs of the table columns, or subtract the origin's."
         )
 
 

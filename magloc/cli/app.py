@@ -47,6 +47,11 @@ COMMANDS = (
         "Write an array file: a shape, a size and a sensor, by options or by answering questions.",
     ),
     (
+        "columns",
+        "magloc.cli.first_steps.columns:columns",
+        "Propose the table [columns] of an array file for the log of another program.",
+    ),
+    (
         "survey",
         "magloc.cli.survey:survey",
         "Find targets at rest in the ground that sensors moved over.",

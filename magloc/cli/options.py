@@ -7,7 +7,7 @@ import re
 import sys
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
 
@@ -262,8 +262,10 @@ class KnownOptions:
         return self.reduced(arrays.read_array(path), path)
 
     def reduced(self, array: SensorArray, path: Path) -> SensorArray:
-        """An array of a file, reduced to them."""
-        ids = self.ids
+        """An array of a file, reduced to them; a grid without an origin of its own has that of --place."""
+        ids, columns = self.ids, array.columns
+        if columns is not None and columns.crs is not None and columns.origin is None and self.place is not None:
+            array = replace(array, columns=replace(columns, origin=self.place))
         if ids is None:
             return array
         for name in ids:

@@ -12,9 +12,9 @@ import msgspec
 import numpy as np
 
 from arrays.array import SensorArray
-from arrays.columns import without_dummies
 from arrays.io.csv import Table
 from arrays.io.errors import InputError
+from arrays.logs.format import without_dummies
 from arrays.typing import FloatArray
 from magloc.live.tally import Tally
 from magloc.readings import EXPECTED_HEADER, Readings, log_format, readings_of_checked, readings_of_table
@@ -127,7 +127,7 @@ class RowParser:
     def _row_of(self, line: bytes) -> str | None:
         """A line as one of CSV, None where it is empty."""
         try:
-            text = line.decode().strip(self._around)
+            text = line.decode(self._format.encoding or "utf-8").strip(self._around)
         except UnicodeDecodeError as error:
             raise GarbledError(f"the byte 0x{line[error.start]:02x} is not UTF-8") from None
         if text.startswith("{"):

@@ -16,9 +16,9 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from urllib.parse import SplitResult, urlsplit
 
-from arrays.columns import READINGS_FILE, LogFormat
 from arrays.io.errors import InputError, check_positive, of_extra
 from arrays.io.text import read_bytes
+from arrays.logs.format import READINGS_FILE, LogFormat
 from magloc.live.senders import Batch, Senders
 
 STANDARD_INPUT = "-"
@@ -245,7 +245,8 @@ def _of_serial(port: serial.Serial) -> Iterator[bytes]:  # type: ignore[name-def
 
 def _in_own_time(lines: list[bytes], speed: float, form: LogFormat) -> Iterator[Batch]:
     """Lines of a readings file, each when its time has come; nobody waits for long pauses."""
-    seconds_of = form.clock(lines[0].removeprefix(b"\xef\xbb\xbf").decode(errors="replace") if lines else "")
+    texts = (line.removeprefix(b"\xef\xbb\xbf").decode(errors="replace") for line in lines)
+    seconds_of = form.clock(next(filter(form.begins, texts), ""))
     due_s, last_s = time.monotonic(), math.inf
     waiting: list[bytes] = []
     for line in lines:

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import logging
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from arrays.columns import POSITION_COLUMNS
+from arrays.io.csv import Table
+from arrays.io.errors import InputError
 from arrays.typing import FloatArray, IntArray
 from magloc.navigation.poses import rotations_at, vectors_at
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
+_LOG = logging.getLogger(__name__)
 _FEWEST_PLACES = 4
 _LOST = 3  # rows: where places are new in every row, the next one that changes leaps if so many were held
 _AS_FAST = 0.5  # of the usual speed, over all of a run: it was held, and the carrier did not rest
@@ -58,6 +64,40 @@ def between_fixes(time_s: FloatArray, position_m: FloatArray, rotation: Rotation
         end,
         (len(fixes_s) - 1) / float(fixes_s[-1] - fixes_s[0]),
     )
+
+
+def without_gaps(table: Table) -> tuple[Table, FloatArray | None]:
+    """Return the table of a log with places in all rows, and the standard deviations (n,) that interpolation adds [m].
+
+    Rows before the first place or after the last one are left out. None: no place was missing.
+    """
+    if not set(POSITION_COLUMNS) <= set(table.header):
+        return table, None
+    at = [table.header.index(name) for name in POSITION_COLUMNS]
+    time_s, place = table.values[:, table.header.index("time_s")], table.values[:, at]
+    known = [np.isfinite(place[:, :2]).all(axis=1), np.isfinite(place[:, 2])]
+    whole = known[0] & known[1]
+    if whole.all():
+        return table, None
+    if not (known[0].any() and known[1].any()):
+        missing = "place" if not known[0].any() else "height"
+        raise InputError(f"{table.path}: found no row with a {missing}, expected some rows with one.")
+    first_s, last_s = max(time_s[one].min() for one in known), min(time_s[one].max() for one in known)
+    inside = (time_s >= first_s) & (time_s <= last_s)
+    if not inside.any():
+        raise InputError(f"{table.path}: found heights and places at different times, expected them in the same rows.")
+    values, error_m = table.values.copy(), np.zeros(len(time_s))
+    for columns, is_known in ((at[:2], known[0]), (at[2:], known[1])):
+        fixes = np.flatnonzero(is_known)[np.argsort(time_s[is_known], kind="stable")]
+        for column in columns:
+            values[:, column] = np.interp(time_s, time_s[fixes], values[fixes, column])
+        if len(fixes) > 1:
+            error_m = np.maximum(error_m, _errors_m(place[:, [at.index(each) for each in columns]], time_s, fixes))
+    found = [f"{(inside & ~whole).sum()} are interpolated"] * bool((inside & ~whole).any())
+    found += [f"{(~inside).sum()} before the first or after the last one are left out"] * bool((~inside).any())
+    _LOG.warning(f"{table.path}: {(~whole).sum()} of {len(time_s)} rows have no whole place: {', '.join(found)}")
+    table = replace(table, values=values[inside], line_numbers=table.line_numbers[inside])
+    return table, error_m[inside] if (inside & ~whole).any() else None
 
 
 def interval_of_fixes(time_s: FloatArray, error_m: FloatArray | None) -> float:

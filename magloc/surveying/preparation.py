@@ -83,7 +83,8 @@ def with_places_between_fixes(array: SensorArray, readings: Readings) -> tuple[S
         f"places stand still in {found.held} of {n} rows, between fixes that come {found.rate_Hz:.3g} times a second:"
         " interpolated between fixes" + (f", and the last {n - found.end} rows left out" if found.end < n else "")
     )
-    poses = {"array_position_m": found.position_m, "array_rotation": found.rotation, "interpolated_m": found.error_m}
+    error_m = found.error_m if readings.interpolated_m is None else np.maximum(found.error_m, readings.interpolated_m)
+    poses = {"array_position_m": found.position_m, "array_rotation": found.rotation, "interpolated_m": error_m}
     readings = replace(readings, **poses)[: found.end]  # type: ignore[arg-type]
     pose, interval_s = array.pose, 1.0 / found.rate_Hz
     if pose is not None and pose.correlation_s < interval_s:  # a fix errs as long as it counts

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 import arrays
 import magloc
 from arrays.array_file import array_toml
+from arrays.logs.format import LogFormat
 
 HEADER = '[[sensor]]\nid = "low"\nkind = "scalar"\nposition_m = [0.0, 0.0, 0.0]\nnoise_nT = 0.1\n'
 SECOND = '[[sensor]]\nid = "high"\nkind = "{}"\nposition_m = [0.0, 0.0, 1.0]\nnoise_nT = 0.1\n'
@@ -52,7 +53,8 @@ class TestMissing:
         assert f"dummy values are left out: 4 in all, {each}" in caplog.text
 
     def test_the_array_file_keeps_them(self, tmp_path: Path) -> None:
-        columns = '[columns]\ndummy = [-7.5, "*"]\nvalid = {column = "V", equals = [1, 4]}\n'
+        columns = '[columns]\ndummy = [-7.5, "*"]\nvalid = {column = "V", equals = [1, 4]}\ncomment = ["#", "/"]\n'
+        columns += 'skip = "Line"\ndate = "2026-05-12"\nday_first = true\nencoding = "windows-1252"\n'
         array = array_of(tmp_path, columns)
         arrays.write_array(tmp_path / "again.toml", array)
         assert arrays.read_array(tmp_path / "again.toml").columns == array.columns
@@ -199,7 +201,7 @@ class TestPose:
         [
             ("0,1,2,0,0,1,0\n0,1,2,1,0,1,0", "line 3, column time_s: found 0 as on line 2"),
             (",1,2,0,0,1,0", "line 2, column time_s: found no value"),
-            ("0,1,2,0,,1,0", "line 2, column N: found no value"),
+            ("0,1,2,0,,1,0", "log.csv: found no row with a place"),
             ("0,1,2,0,0,1,", "line 2, column Yaw: found no value"),
         ],
     )
@@ -238,6 +240,15 @@ class TestFile:
             ('time_unit = "h"', "time_unit"),
             ('time = ["D", "T"]', "time_unit must be iso"),
             ('angles = ["Yaw"]', "position or geodetic"),
+            ("height_m = 0.4", "position or geodetic"),
+            ('crs = "EPSG:32633"', "position or geodetic"),
+            ("antenna_m = [0.0, 0.0, 1.0]", "position or geodetic"),
+            ('height_is = "sea"', "height_is"),
+            ('position = ["a", "b"]', "position must have 3 names"),
+            ('position = ["a", "b", "c"]\nheight_m = 0.4', "position must have 2 names"),
+            ('date = "12.5.2026"', "date must be such as"),
+            ('encoding = "ansi-7"', "encoding"),
+            ('comment = ""', "comment and skip"),
             ('position = ["a", "b", "c"]\ngeodetic = ["a", "b", "c"]', "geodetic"),
             ('position = ["a", "b", "c"]\nangles = ["a", "b"]', "angles"),
             ('latitude = "Lat"', "latitude"),
@@ -279,7 +290,51 @@ class TestFile:
         with pytest.raises(arrays.InputError, match=word):
             read(tmp_path, array, f"{header}\n0,1,2\n1,1,2\n")
 
-    def test_a_row_without_a_place(self, tmp_path: Path) -> None:
-        text = "time_s,low_nT,high_nT,Lat,Lon,Alt\n0,1,2,50,8,100\n1,1,2,,8,100\n"
-        with pytest.raises(arrays.InputError, match="line 3, column Lat"):
-            read(tmp_path, array_of(tmp_path, TestPose.GEODETIC), text)
+    def test_a_stream_without_a_place(self) -> None:
+        columns = arrays.LogColumns(position=("E", "N", "U"))
+        form = LogFormat({"low": ["low_nT"]}, columns, "a header", ())
+        head = form.header("time_s,low_nT,E,N,U", "the stream", 1)
+        with pytest.raises(arrays.InputError, match="line 7, column N: found no value"):
+            form.table("0,1,2,,4", "the stream", first_line=7, head=head)
+
+
+class TestGaps:
+    """Rows without a place, between others on a way that is straight and even: they are where it was."""
+
+    HEADER = "time_s,low_nT,high_nT,E,N,U,Fix\n"
+
+    def test_are_filled(self, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+        columns = '[columns]\nposition = ["E", "N", "U"]\nfix = {column = "Fix", equals = [4, 5]}\n'
+        rows = [f"{t},1,2,{3 * t},{-t},{7 if t in (2, 7) else ''},{1 if t in (4, 9) else 5}" for t in range(10)]
+        found = read(tmp_path, array_of(tmp_path, columns), self.HEADER + "\n".join(rows))
+        time_s = np.arange(2.0, 8.0)
+        np.testing.assert_allclose(found.time_s, time_s)
+        assert found.array_position_m is not None
+        np.testing.assert_allclose(found.array_position_m, np.stack([3 * time_s, -time_s, 7 + 0 * time_s], axis=1))
+        assert "8 of 10 rows have no whole place: 4 are interpolated, 4 before" in caplog.text
+
+    def test_have_an_error(self, tmp_path: Path) -> None:
+        """At most what is known of the bend: on a circle the chord of half a turn is off by its radius."""
+        columns = '[columns]\nposition = ["E", "N", "U"]\nfix = {column = "Fix", equals = [4, 5]}\n'
+        angle = 0.1 * np.arange(63)
+        errors = []
+        for gap in (4, 8, 16):
+            fix = np.where((np.arange(63) > 20) & (np.arange(63) < 20 + gap), 0, 4)
+            rows = [f"{k},1,2,{np.cos(a)},{np.sin(a)},0,{f}" for k, (a, f) in enumerate(zip(angle, fix, strict=True))]
+            found = read(tmp_path, array_of(tmp_path, columns), self.HEADER + "\n".join(rows))
+            assert found.array_position_m is not None
+            assert found.interpolated_m is not None
+            assert (found.interpolated_m[fix == 4] == 0.0).all()
+            off = np.linalg.norm(found.array_position_m[:, :2] - np.stack([np.cos(angle), np.sin(angle)], 1), axis=1)
+            assert (off <= 1.05 * found.interpolated_m + 1e-12).all()
+            errors.append(found.interpolated_m.max())
+        assert errors[0] < errors[1] < errors[2]
+
+    def test_a_constant_height_and_no_fix_at_zero(self, tmp_path: Path) -> None:
+        pytest.importorskip("pymap3d")
+        columns = '[columns]\ngeodetic = ["N", "E"]\norigin = [50.0, 8.0, 100.0]\nheight_m = 0.4\n'
+        rows = "0,1,2,8,50,,4\n1,1,2,0,0,,4\n2,1,2,8,50.00001,,4\n"
+        found = read(tmp_path, array_of(tmp_path, columns), self.HEADER + rows)
+        assert found.array_position_m is not None
+        np.testing.assert_allclose(found.array_position_m[:, 2], 0.4)
+        np.testing.assert_allclose(found.array_position_m[1, 1], 1.112 / 2, atol=1e-3)

@@ -226,7 +226,6 @@ BAD_FILES = {
         ["line 2", "column ambient_y_nT", "no value"],
     ),
     "not UTF-8": (f"{HEADER}\n{ROW}\n".encode() + b"1,\xb5,3,4,5,6,7,8\n", ["line 3", "0xb5", "UTF-8"]),
-    "UTF-16": (f"{HEADER}\n{ROW}\n".encode("utf-16"), ["line 1", "UTF-8"]),
     "binary": (f"{HEADER}\n".encode() + bytes(range(128)), ["line 2", "NUL", "UTF-8"]),
     "cell without end": (f"{HEADER}\n0,{'x' * 200_000},2,3,4,5,6,7\n", ["line 2", "not CSV"]),
     "unclosed quote": (f'{HEADER}\n{ROW}\n"1{ROW[1:]}\n{ROW}\n', ["line 3", "found 1 cells"]),

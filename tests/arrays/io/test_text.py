@@ -62,3 +62,27 @@ def piped(folder: Path, data: bytes) -> Path:
 
     threading.Thread(target=write, daemon=True).start()
     return path
+
+
+class TestEncodings:
+    TEXT = "Zeit,Höhe\n1,2\n"
+
+    @pytest.mark.parametrize(
+        ("written", "stated"),
+        [
+            ("utf-8", None),
+            ("utf-8-sig", None),
+            ("utf-16", None),
+            ("windows-1252", "windows-1252"),
+            ("utf-16-le", "utf-16-le"),
+            ("utf-16", "windows-1252"),  # a mark says more than a file of settings
+        ],
+    )
+    def test_are_read(self, written: str, stated: str | None, tmp_path: Path) -> None:
+        (tmp_path / "log.csv").write_bytes(self.TEXT.encode(written))
+        assert read_text(tmp_path / "log.csv", "a CSV file", stated) == self.TEXT
+
+    def test_one_that_it_is_not(self, tmp_path: Path) -> None:
+        (tmp_path / "log.csv").write_bytes(self.TEXT.encode("windows-1252"))
+        with pytest.raises(InputError, match=r"log.csv, line 1: found the byte 0xf6, which is not UTF-8"):
+            read_text(tmp_path / "log.csv", "a CSV file")

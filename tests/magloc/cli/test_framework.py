@@ -36,6 +36,7 @@ COMMANDS = (
     "bounds",
     "design",
     "new-array",
+    "columns",
     "survey",
     "demo",
     "simulate",

@@ -13,8 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from arrays.columns import READINGS_FILE, LogColumns, LogFormat
+from arrays.columns import LogColumns
 from arrays.io.errors import InputError
+from arrays.logs.format import READINGS_FILE, LogFormat
 from magloc.live import transports
 from magloc.live.transports import opened
 

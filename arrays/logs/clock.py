@@ -1,0 +1,84 @@
+"""Clocks of logs: instants, dates of either order, times of day, and stamps of whole seconds."""
+
+from __future__ import annotations
+
+import logging
+import re
+
+import numpy as np
+
+from arrays.columns import SECONDS, LogColumns
+from arrays.io.csv import Table
+from arrays.io.errors import InputError
+from arrays.io.values import unix_seconds
+from arrays.typing import FloatArray
+
+_LOG = logging.getLogger(__name__)
+_TIME_OF_DAY = re.compile(r"(\d{1,2}):(\d{2})(?::(\d{2}(?:[.,]\d*)?))?")
+_OTHER_DATE = re.compile(r"(\d{1,2})[./-](\d{1,2})[./-](\d{4})[T ]?")
+_DAY_S = 86400.0
+
+
+def seconds_of_cell(place: str, cell: str, columns: LogColumns) -> str:
+    """Return the seconds of an instant, since 1970, or of a time of day, since midnight, as text."""
+    text = cell.strip()
+    if found := _TIME_OF_DAY.fullmatch(text):
+        hours, minutes, seconds = int(found[1]), int(found[2]), float((found[3] or "0").replace(",", "."))
+        if hours < 24 and minutes < 60 and seconds < 61.0:
+            return repr(3600.0 * hours + 60.0 * minutes + seconds)
+    if found := _OTHER_DATE.match(text):
+        if columns.day_first is None:
+            raise InputError(
+                f"{place}: found {text!r}, which may begin with the day or the month, expected day_first = true or"
+                " false in the table columns of the array file."
+            )
+        day, month = (found[1], found[2]) if columns.day_first else (found[2], found[1])
+        text = f"{found[3]}-{int(month):02d}-{int(day):02d}T{text[found.end() :]}"
+    return unix_seconds(place, text)
+
+
+def seconds_of_rows(table: Table, columns: LogColumns, *, is_file: bool) -> FloatArray:
+    """Return the times (n,) [s] of the rows of a log; those of a file may pass midnight, and share whole seconds."""
+    name = columns.clock[0]
+    stamps = table.complete([name])[:, 0]
+    if columns.time_unit == "hhmmss":
+        hours, minutes, seconds = stamps // 1e4, stamps // 1e2 % 1e2, stamps % 1e2
+        bad = (stamps < 0.0) | (hours >= 24.0) | (minutes >= 60.0) | (seconds >= 61.0)
+        table.refuse(bad[:, None], [name], "found no time of day, expected hours, minutes, seconds such as 091403.0")
+        time_s = 3600.0 * hours + 60.0 * minutes + seconds
+    else:
+        time_s = SECONDS[columns.time_unit] * stamps
+    of_day = bool(columns.time_unit in ("iso", "hhmmss") and (np.abs(time_s) < _DAY_S + 1.0).all())
+    if columns.date is not None and not of_day:
+        place = table.header_place(name)
+        raise InputError(f"{place}: found dates, expected times of day beside date = {columns.date!r}.")
+    date_s = float(unix_seconds("", columns.date)) if columns.date is not None else 0.0
+    if not is_file:
+        return time_s + date_s
+    days = np.cumsum(np.diff(time_s, prepend=time_s[:1]) < -_DAY_S / 2.0) if of_day else np.zeros(len(time_s))
+    if days.any():
+        _LOG.info(f"{table.path}: the clock passes midnight")
+    whole = _spread(time_s + _DAY_S * days)
+    if whole is not None:
+        _LOG.warning(f"{table.path}: times are whole seconds that rows share: these are spread over their second")
+        return whole + date_s
+    if not days.any():
+        table.complete_and_distinct(name)
+    return time_s + _DAY_S * days + date_s
+
+
+def _spread(time_s: FloatArray) -> FloatArray | None:
+    """Return times of rows at equal steps within their second, None unless most are of whole seconds that rows share.
+
+    The first second may have begun before its first row, and the last one goes on: their rows have the usual step.
+    """
+    if len(time_s) < 2 or (time_s % 1.0).any() or (np.diff(time_s) < 0.0).any():
+        return None
+    first, counts = np.unique(time_s, return_index=True, return_counts=True)[1:]
+    usual = int(np.median(counts[1:-1])) if len(counts) > 2 else 1
+    if usual < 2:
+        return None
+    within = np.arange(len(time_s)) - np.repeat(first, counts)
+    sizes = np.maximum(counts, np.where(np.isin(np.arange(len(counts)), (0, len(counts) - 1)), usual, 0))
+    within[: counts[0]] += sizes[0] - counts[0]
+    return np.asarray(time_s + within / np.repeat(sizes, counts))

@@ -1,0 +1,219 @@
+"""How the text of a readings file, or of a log, becomes a table, and which of its numbers are dummies."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from arrays.columns import POSITION_COLUMNS, ROTATION_COLUMNS, SECONDS, SEPARATORS, LogColumns
+from arrays.io.csv import DUMMY, Table, table_of_header, table_of_text
+from arrays.io.dummies import dummy_cells, may_be_dummies
+from arrays.io.errors import InputError
+from arrays.logs.clock import seconds_of_cell, seconds_of_rows
+from arrays.logs.lines import cells_of, header_and_rows
+from arrays.logs.places import array_origins, positions, quaternions
+from arrays.typing import FloatArray
+
+_LOG = logging.getLogger(__name__)
+_FEW_ROWS = 20  # whose cells are screened before columns are
+
+
+@dataclass(frozen=True)
+class LogFormat:
+    """How the text of a readings file, or of a log, becomes a table with the names and units of a readings file.
+
+    Attributes
+    ----------
+    channels : dict
+        Columns of a readings file for every sensor, by its id.
+    columns : LogColumns, optional
+        Of a log; None: of a readings file.
+    expected : str
+        What the header should have, in words.
+    others : collection of str
+        Further columns of a readings file that are taken as they are.
+    """
+
+    channels: Mapping[str, Sequence[str]]
+    columns: LogColumns | None
+    expected: str
+    others: Collection[str]
+
+    @property
+    def separator(self) -> str:
+        """Between the cells of a row."""
+        return "," if self.columns is None else SEPARATORS[self.columns.separator]
+
+    @property
+    def encoding(self) -> str | None:
+        """Of the text, where it is stated."""
+        return None if self.columns is None else self.columns.encoding
+
+    def begins(self, line: str) -> bool:
+        """Whether a line names columns, the time among them."""
+        if self.columns is None:
+            return "time_s" in line
+        return self.columns.clock[0] in cells_of(line, self.columns)
+
+    def clock(self, header: str) -> Callable[[str], float]:
+        """What tells the time [s] of a row below a header; ValueError or IndexError where it has none."""
+        columns = self.columns
+        if columns is None:
+            at = [cell.strip().strip('"') for cell in header.split(",")].index("time_s") if "time_s" in header else 0
+            return lambda row: float(row.split(",")[at])
+        names = cells_of(header, columns)
+        ats = [names.index(name) for name in columns.clock if name in names] or [0]
+
+        def seconds(row: str) -> float:
+            cells = cells_of(row, columns)
+            told = "T".join(cells[i].strip() for i in ats)
+            if columns.time_unit == "iso":
+                return float(seconds_of_cell("", told, columns))
+            return SECONDS[columns.time_unit] * float(told.replace(columns.decimal, "."))
+
+        return seconds
+
+    def header(self, line: str, name: str, number: int) -> Table:
+        """Table without rows, as the log names its columns, from its first line."""
+        if self.columns is None:
+            return table_of_header(line, name, self.expected, number=number)
+        text = self.separator.join(cells_of(line, self.columns))
+        return table_of_header(text, name, self.expected, number=number, separator=self.separator)
+
+    def table(self, text: str, name: str, *, first_line: int | None = None, head: Table | None = None) -> Table:
+        """Table of a text; rows that begin at a line below a header `head` have none of their own."""
+        columns = self.columns
+        if columns is None:
+            return table_of_text(text, name, self.expected, first_line=first_line, head=head)
+        if columns.separator == "space":
+            text = text.replace("\t", " ")
+        line = 0
+        if head is None:
+            text = text.replace("\r\n", "\n").replace("\r", "\n").removeprefix("\ufeff")
+            head, text = header_and_rows(text, name, columns, self._theirs(columns), self._is_time)
+            line = head.header_line or 0
+            first_line = line + 1
+        table = table_of_text(
+            text,
+            name,
+            self.expected,
+            first_line=first_line,
+            only={*self._theirs(columns), *self._own, *self.others},
+            instant=columns.clock if columns.time_unit == "iso" else (),
+            seconds_of=partial(seconds_of_cell, columns=columns),
+            separator=self.separator,
+            decimal=columns.decimal,
+            head=head,
+            dummy=[each for each in columns.dummy if isinstance(each, str)],
+            ragged=True,
+        )
+        return self.translated(replace(table, header_line=line))
+
+    def _is_time(self, cells: list[str]) -> bool:
+        """Whether one of a row's cells may be an instant."""
+        assert self.columns is not None
+        for cell in cells:
+            try:
+                seconds_of_cell("", cell, self.columns)
+            except InputError:
+                continue
+            return True
+        return False
+
+    def translated(self, logged: Table) -> Table:
+        """The table with the names and units of a readings file."""
+        columns = self.columns
+        if columns is None:
+            return logged
+        theirs, own = self._theirs(columns), self._own
+        for name in theirs:
+            logged.require(name, theirs)
+        is_file = bool(logged.header_line)  # and no stream
+        index = {name: i for i, name in enumerate(logged.header)}
+        found = {name: logged.values[:, i] for name, i in index.items() if name in own or name in self.others}
+        named = columns.of_sensors(self.channels)
+        found |= {ours: logged.values[:, index[in_log]] for ours, in_log in named.items()}
+        unusable = np.zeros(len(logged.values), np.bool_)
+        if columns.valid is not None:
+            unusable = ~np.isin(logged.values[:, index[columns.valid.column]], columns.valid.equals)
+            if unusable.any() and is_file:
+                fault = f"{columns.valid.column} that is not {' or '.join(map('{:g}'.format, columns.valid.equals))}"
+                _LOG.warning(f"{logged.path}: the readings of {unusable.sum()} rows have {fault} and are left out")
+        readings = {name: np.where(unusable, np.nan, columns.unit_nT * found[name]) for name in own & found.keys()}
+        found |= {name: np.where(found[name] == DUMMY, DUMMY, of) for name, of in readings.items()}
+        found["time_s"] = seconds_of_rows(logged, columns, is_file=is_file)
+        if columns.place:
+            found |= zip(POSITION_COLUMNS, positions(logged, columns, is_file=is_file).T, strict=True)
+        if columns.attitude or (columns.place and not set(ROTATION_COLUMNS) & found.keys()):
+            found |= zip(ROTATION_COLUMNS, quaternions(logged, columns).T, strict=True)
+        if columns.antenna_m is not None:
+            if np.any(columns.antenna_m[:2]) and not (columns.attitude or set(ROTATION_COLUMNS) <= index.keys()):
+                raise InputError(
+                    f"{logged.path}: found no attitude, expected one beside an antenna that is off to a side."
+                )
+            place, turn = (np.stack([found[name] for name in of], 1) for of in (POSITION_COLUMNS, ROTATION_COLUMNS))
+            found |= zip(POSITION_COLUMNS, array_origins(place, turn, columns).T, strict=True)
+        values = np.stack([*found.values()], axis=1)
+        return Table(logged.path, tuple(found), logged.header_line, values, logged.line_numbers)
+
+    @property
+    def _own(self) -> set[str]:
+        return {name for of_sensor in self.channels.values() for name in of_sensor}
+
+    def _theirs(self, columns: LogColumns) -> tuple[str, ...]:
+        flags = [rows.column for rows in (columns.valid, columns.fix) if rows is not None]
+        named = columns.of_sensors(self.channels).values()
+        return tuple(dict.fromkeys((*columns.clock, *named, *columns.place, *columns.attitude, *flags)))
+
+
+READINGS_FILE = LogFormat({}, None, "", ())
+"""Of a readings file, of whatever sensors."""
+
+
+def without_dummies(
+    table: Table, form: LogFormat, name: Callable[[str, int], None] | None = None, before: FloatArray | None = None
+) -> Table:
+    """Return a table of readings with NaN in place of dummy values, which are counted and named.
+
+    Parameters
+    ----------
+    table : Table
+        With the columns of a readings file.
+    form : LogFormat
+        Its sensors, and which dummies are declared.
+    name : callable, optional
+        Called with a sentence and the number of dummies; by default a warning is logged.
+    before : ndarray, shape (m, columns), optional
+        Rows that came before.
+    """
+    columns = form.columns or LogColumns()
+    declared = [columns.unit_nT * each for each in columns.dummy if not isinstance(each, str)]
+    values = table.values.copy()
+    earlier = values[:0] if before is None else before
+    all_rows, units = np.concatenate([earlier, values]), sorted({1.0, columns.unit_nT})
+    is_quick = 0 < len(values) <= _FEW_ROWS
+    suspected = may_be_dummies(all_rows, len(values), declared, units).tolist() if is_quick else None
+    found: dict[str, int] = {}
+    index = {name: i for i, name in enumerate(table.header)}
+    for sensor, channels in form.channels.items():
+        own = [index[channel] for channel in channels]
+        if suspected is not None and not any(suspected[i] for i in own):
+            continue
+        cells = dummy_cells(all_rows[:, own], declared, units)[len(earlier) :]
+        if cells.any():
+            numbers = ", ".join("*" if n == DUMMY else f"{n:.10g}" for n in np.unique(values[:, own][cells]))
+            found[f"of sensor {sensor} ({numbers})"] = int(cells.any(axis=1).sum())
+            values[:, own] = np.where(cells, np.nan, values[:, own])
+    if found:
+        total = sum(found.values())
+        each = ", ".join(f"{count} {where}" for where, count in found.items())
+        words = f"{table.path}: dummy values are left out: {total} in all, {each}"
+        if name is None:
+            _LOG.warning(words)
+        else:
+            name(words, total)
+    return replace(table, values=values)

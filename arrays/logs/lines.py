@@ -1,0 +1,110 @@
+"""Lines of a log: which one is the header, and which ones below it are no rows."""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import logging
+import re
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+
+from arrays.columns import SEPARATORS, LogColumns
+from arrays.io.csv import Table, is_number_or_empty, table_of_header
+from arrays.io.errors import InputError
+
+_LOG = logging.getLogger(__name__)
+_MOST_LINES_ABOVE = 1000
+_NOT_WORDS = "(?!N/?A)"  # "#N/A" is a missing cell and no remark
+
+
+def cells_of(line: str, columns: LogColumns) -> list[str]:
+    """Return the cells of a line that may name columns, without a mark of comments and empty cells at its end."""
+    separator = SEPARATORS[columns.separator]
+    text = line.strip(" \r\n" if separator == "\t" else " \t\r\n").removeprefix("\ufeff")
+    for mark in columns.comment:
+        text = text.removeprefix(mark).lstrip(" ")
+    if separator == " ":
+        text = text.replace("\t", " ")
+    try:
+        cells = next(csv.reader([text], delimiter=separator, skipinitialspace=separator == " "), [])
+    except csv.Error:
+        return []
+    return without_empty_end([cell.strip() for cell in cells])
+
+
+def without_empty_end(cells: list[str]) -> list[str]:
+    """Return the cells of a row up to the last one that is not empty."""
+    while cells and not cells[-1]:
+        cells = cells[:-1]
+    return cells
+
+
+def header_and_rows(
+    text: str, name: str, columns: LogColumns, wanted: Sequence[str], is_time: Callable[[list[str]], bool]
+) -> tuple[Table, str]:
+    """Return the table of a log's header, the first line with all wanted columns, and the text of the rows below it.
+
+    Lines of that text that are no rows are empty, so that the others keep their numbers.
+    """
+    number, header, start = _header(text, name, columns, wanted)
+    rows = text[start:]
+    line = text[:start].rstrip("\n").rpartition("\n")[2]
+    found = [f"the header is on line {number}"] if number > 1 else []
+    marks = [re.escape(mark) + (_NOT_WORDS if mark == "#" else "") for mark in (*columns.comment, *columns.skip)]
+    for called, pattern in (("repeated headers", re.escape(line) + "$"), ("remarks and names", "|".join(marks))):
+        if pattern:
+            rows, n = re.subn(rf"^[ \t]*(?:{pattern}).*", "", rows, flags=re.MULTILINE)
+            found += [f"{n} lines of {called} are left out"] * (n > 0)
+    below = re.search(r"^.*\S.*$", rows, flags=re.MULTILINE)
+    if below is not None and _are_units(cells_of(below[0], columns), header, is_time):
+        rows = rows[: below.start()] + rows[below.end() :]
+        found.append("the row of units below it is left out")
+    if not rows.strip():
+        raise InputError(f"{name}, line {number}: found a header without rows, expected a row below it.")
+    if found:
+        _LOG.info(f"{name}: {', '.join(found)}")
+    return Table(name, header, number, np.zeros((0, len(header))), np.zeros(0, dtype=np.int64)), rows
+
+
+def _header(text: str, name: str, columns: LogColumns, wanted: Sequence[str]) -> tuple[int, tuple[str, ...], int]:
+    """Return the number of the header's line, its cells, and where the next line begins."""
+    best: tuple[int, int, str] = (-1, 1, "")
+    start = 0
+    for number, line in enumerate(itertools.islice(_lines(text), _MOST_LINES_ABOVE), start=1):
+        start += len(line)
+        cells = cells_of(line, columns)
+        named = len(set(wanted).intersection(cells))
+        if named == len(set(wanted)):
+            for column in wanted:
+                if cells.count(column) > 1:
+                    raise InputError(f"{name}, line {number}, column {column}: found a second time, expected once.")
+            return number, tuple(cells), start
+        is_comment = line.lstrip().startswith(columns.comment)
+        if cells and named > best[0] and not (is_comment and not named):
+            best = (named, number, line.rstrip("\n"))
+    expected = f"a header with {', '.join(wanted)}"
+    if not best[2]:
+        raise InputError(f"{name} is empty, expected {expected}.")
+    if best[0]:
+        head = Table(name, tuple(cells_of(best[2], columns)), best[1], np.zeros((0, 0)), np.zeros(0, dtype=np.int64))
+    else:
+        head = table_of_header(best[2], name, expected, number=best[1], separator=SEPARATORS[columns.separator])
+    for column in wanted:
+        head.require(column, wanted)
+    raise InputError(f"{name}, line {best[1]}: found no header in {_MOST_LINES_ABOVE} lines, expected {expected}.")
+
+
+def _lines(text: str) -> Iterator[str]:
+    start = 0
+    while start < len(text):
+        end = text.find("\n", start) + 1 or len(text)
+        yield text[start:end]
+        start = end
+
+
+def _are_units(cells: list[str], header: Sequence[str], is_time: Callable[[list[str]], bool]) -> bool:
+    """Whether the first row below a header has no number and no time."""
+    is_row = any(map(is_number_or_empty, filter(None, cells)))
+    return len(cells) <= len(header) and not is_row and not is_time(cells)

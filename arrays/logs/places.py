@@ -1,0 +1,103 @@
+"""Places and attitudes of a log in the world frame."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from arrays.columns import LogColumns
+from arrays.io.csv import Table
+from arrays.io.errors import InputError, of_extra
+from arrays.typing import FloatArray
+
+_ENU_FROM_NED = ((0, 1, 0), (1, 0, 0), (0, 0, -1))
+_BODY_FROM_ARRAY = ((1, 0, 0), (0, -1, 0), (0, 0, -1))
+_RIM_deg = 1.0  # a system is of use a little beyond its area
+
+
+def positions(table: Table, columns: LogColumns, *, is_file: bool) -> FloatArray:
+    """Return the places (n, 3) [m] in the world, NaN in the rows of a file that have none."""
+    place = table.finite_or_missing(columns.place) if is_file else table.complete(columns.place)
+    if columns.fix is not None:
+        place[~np.isin(table.values[:, table.header.index(columns.fix.column)], columns.fix.equals)] = np.nan
+    if columns.geodetic is not None:
+        place[(place[:, :2] == 0.0).all(axis=1)] = np.nan  # a receiver without a fix
+    if columns.crs is not None:
+        place[:, :2] = _latitudes_and_longitudes(table, columns, columns.crs, place[:, :2])
+    height = place[:, 2] if columns.height_m is None else np.full(len(place), columns.height_m)
+    if columns.origin is None:
+        if columns.crs is not None:
+            _refuse_no_origin(table, place)
+        return np.column_stack([place[:, :2], height])
+    with of_extra("geo", "latitude and longitude"):
+        from pymap3d import geodetic2enu
+    above_m = height if columns.above_ground else None
+    if above_m is not None:
+        height = height + columns.origin[2]
+    # Where the height alone is missing the rest is as if it were that of the other rows: the Earth is nearly plane.
+    known = height[np.isfinite(height)]
+    usual = float(np.median(known)) if len(known) else columns.origin[2]
+    east, north, up = geodetic2enu(*place[:, :2].T, np.where(np.isnan(height), usual, height), *columns.origin)
+    up = np.where(np.isnan(height), np.nan, up) if above_m is None else np.where(np.isnan(east), np.nan, above_m)
+    return np.column_stack([east, north, up])
+
+
+def array_origins(antenna_m: FloatArray, quaternion: FloatArray, columns: LogColumns) -> FloatArray:
+    """Return the origins of the array's frame (n, 3) [m] from the places of an antenna on it."""
+    from scipy.spatial.transform import Rotation
+
+    if columns.antenna_m is None or not len(antenna_m):
+        return antenna_m
+    return np.asarray(antenna_m - Rotation.from_quat(quaternion).apply(columns.antenna_m))
+
+
+def _latitudes_and_longitudes(table: Table, columns: LogColumns, crs: str, place: FloatArray) -> FloatArray:
+    """Return latitude and longitude (n, 2) [deg] of places in a system of coordinates."""
+    with of_extra("geo", "a system of coordinates (crs)"):
+        import pyproj
+    try:
+        system = pyproj.CRS.from_user_input(crs)
+    except pyproj.exceptions.CRSError:
+        expected = "one that PROJ knows, such as EPSG:32633"
+        raise InputError(f"{table.path}: found the system crs = {crs!r}, expected {expected}.") from None
+    is_grid = columns.geodetic is None
+    if not (system.is_projected if is_grid else system.is_geographic):
+        kind, key = ("eastings and northings", "position") if is_grid else ("latitude and longitude", "geodetic")
+        raise InputError(f"{table.path}: found {crs} ({system.name}), expected a system of {kind} for the key {key}.")
+    transformer = pyproj.Transformer.from_crs(system, "EPSG:4326", always_xy=True)
+    known = np.isfinite(place).all(axis=1)
+    longitude, latitude = transformer.transform(*(place if is_grid else place[:, ::-1])[known].T)
+    found = np.full(place.shape, np.nan)
+    found[known] = np.column_stack([latitude, longitude])
+    area = system.area_of_use
+    if area is not None:
+        low, high = np.array([area.south, area.west]) - _RIM_deg, np.array([area.north, area.east]) + _RIM_deg
+        outside = ~np.isnan(found) & ~((found >= low) & (found <= high))
+        fault = f"found a place outside the area of {crs} ({area.name}), expected one in it"
+        table.refuse(np.asarray(outside), columns.place[:2], fault)
+    return found
+
+
+def _refuse_no_origin(table: Table, place: FloatArray) -> None:
+    known = place[np.isfinite(place[:, :2]).all(axis=1)]
+    if len(known):
+        near = f"[{known[0, 0]:.6f}, {known[0, 1]:.6f}, 0.0]"
+        raise InputError(
+            f"{table.path}: found a grid without an origin of the world frame, expected its latitude, longitude and"
+            f" height: origin = {near} in the table columns of the array file is where the log begins."
+        )
+
+
+def quaternions(table: Table, columns: LogColumns) -> FloatArray:
+    """Return the attitudes (n, 4), from the array's axes to the world's, which they are where nothing is known."""
+    from scipy.spatial.transform import Rotation
+
+    logged = table.complete(columns.attitude)
+    if columns.quaternion is not None:
+        return logged
+    if not columns.attitude:
+        return np.tile([0.0, 0.0, 0.0, 1.0], (len(logged), 1))
+    angles = np.zeros((len(logged), 3))
+    angles[:, : logged.shape[1]] = logged
+    enu_from_ned, body_from_array = map(Rotation.from_matrix, (_ENU_FROM_NED, _BODY_FROM_ARRAY))
+    turn = enu_from_ned * Rotation.from_euler("ZYX", angles, degrees=True) * body_from_array
+    return np.asarray(turn.as_quat())

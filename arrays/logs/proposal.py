@@ -1,0 +1,276 @@
+"""A proposal of the table ``columns`` from a log itself: what its names and numbers say, and what it leaves open."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from os import PathLike
+
+import numpy as np
+
+from arrays.columns import NANOTESLA, LogColumns
+from arrays.io.csv import is_number_or_empty
+from arrays.io.errors import InputError
+from arrays.io.text import read_text
+from arrays.logs.lines import cells_of
+from arrays.typing import FloatArray
+
+_HEAD_LINES, _ROWS = 1000, 200
+_MARKS = ("#", "/", "!", "%")
+_LINE_NAME = re.compile(r"(/?(?:line|tie|l|t))\s*-?\d+\s*$", re.IGNORECASE)
+_EARTH_nT = (20e3, 70e3)
+_NAMES = {
+    "date": r"date|datum|gps ?date|utc ?date",
+    "time": r"(gps|utc|system)?[ _]?(time|timestamp|uhrzeit|zeit|clock|counter|utc)|t",
+    "latitude": r"lat(itude)?|breite|gps ?lat(itude)?",
+    "longitude": r"lon(g|gitude)?|lng|länge|gps ?lon(gitude)?",
+    "height": r"alt(itude)?|height|elev(ation)?|höhe|z|h|u|up",
+    "east": r"x|e|east(ing)?|rechtswert|rw|utm[ _]?(e|x|east(ing)?)",
+    "north": r"y|n|north(ing)?|hochwert|hw|utm[ _]?(n|y|north(ing)?)",
+    "valid": r"(mag)?[ _]?valid",
+    "fix": r"fix([ _]?(quality|type))?|gps ?fix|quality",
+}
+_UNIT = re.compile(r"\[.*\]|\(.*\)|nT|[uµ]T|m?T|m?G|[mu]?s|h|m|deg|°C?|V|Hz|-")
+_FIELD = re.compile(r"mag|^b\d*[xyz]?$|field|feld|tmi|^nt", re.IGNORECASE)
+_UNIT_OF_NAME = re.compile(r"^(.*?)[ _]*(?:\[([^\]]*)\]|\(([^)]*)\)|_(nT|uT|mT|T|ms|us|s|m|deg))?$")
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """What a log says of its columns.
+
+    Attributes
+    ----------
+    channels : dict of str to str
+        Its columns, with the first cell of each that is not empty.
+    keys : dict
+        Keys of the table ``columns`` that the log determines.
+    sensors : dict
+        By an id the columns of what reads like a magnetic field.
+    asked : list of str
+        What the log does not say.
+    header_line : int
+        Line of its header.
+    """
+
+    channels: dict[str, str]
+    keys: dict[str, object]
+    sensors: dict[str, str | tuple[str, ...]]
+    asked: list[str]
+    header_line: int
+
+    def toml(self) -> str:
+        """Return the text of an array file with the table, and remarks on what is asked."""
+        lines = [f"# The header is on line {self.header_line}. Columns, with their first values:"]
+        lines += [f"#   {name}: {cell}" for name, cell in self.channels.items()]
+        lines += [f"# Asked: {question}" for question in self.asked]
+        for name, of in self.sensors.items():
+            kind = "scalar" if isinstance(of, str) else "vector"
+            lines += ["", "[[sensor]]", f'id = "{name}"', f'kind = "{kind}"', "position_m = [0.0, 0.0, 0.0]  # asked"]
+            lines += ["noise_nT = 1.0  # asked"]
+        lines += ["", "[columns]", *(f"{key} = {_toml(value)}" for key, value in self.keys.items())]
+        lines += ["", "[columns.sensors]", *(f"{name} = {_toml(of)}" for name, of in self.sensors.items())]
+        return "\n".join([*lines, ""])
+
+
+def _toml(value: object) -> str:
+    return json.dumps(list(value) if isinstance(value, tuple) else value, ensure_ascii=False)
+
+
+def propose_columns(path: str | PathLike[str]) -> Proposal:
+    """Return a proposal of how a log of another program is read.
+
+    Parameters
+    ----------
+    path : str or path-like
+        A text file with a header and rows of numbers.
+
+    Returns
+    -------
+    Proposal
+        What is certain, and what has to be answered by its owner.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, or has no header with rows of numbers below it.
+    """
+    keys: dict[str, object] = {}
+    asked = ["places and noise of the sensors, in the tables below"]
+    try:
+        text = read_text(path, "a text file of a logger")
+    except InputError as error:
+        if "is not UTF-8" not in str(error):
+            raise
+        text = read_text(path, "a text file of a logger", "windows-1252")
+        keys["encoding"] = "windows-1252"
+        asked.append("is the text Windows-1252? Letters such as ä in the names below are wrong if not")
+    lines = text.splitlines()[:_HEAD_LINES]
+    columns, number, header, rows = _layout(str(path), lines)
+    keys |= _text_keys(columns, lines, number)
+    cells = {name: [row[i] for row in rows if len(row) > i] for i, name in enumerate(header)}
+    channels = {name: next(filter(None, of), "") for name, of in cells.items()}
+    values = {name: _numbers(of, columns.decimal) for name, of in cells.items()}
+    _propose_time(header, channels, values, keys, asked)
+    _propose_places(header, values, keys, asked)
+    sensors = _sensors(header, values, keys, asked)
+    for key in ("valid", "fix"):
+        if (flag := _find(header, key)) is not None:
+            seen = ", ".join(f"{value:g}" for value in np.unique(values[flag][np.isfinite(values[flag])])[:6])
+            asked.append(f'which values of {flag} count (seen: {seen})? {key} = {{column = "{flag}", equals = [...]}}')
+    return Proposal(channels, keys, sensors, asked, number)
+
+
+def _layout(name: str, lines: Sequence[str]) -> tuple[LogColumns, int, list[str], list[list[str]]]:
+    """Return separator and decimal, the number of the header's line, its cells, and rows: of the best separator."""
+    best: tuple[int, LogColumns, int, list[str], list[list[str]]] | None = None
+    for separator in ("semicolon", "tab", "comma", "space"):
+        for decimal in (".", ",") if separator != "comma" else (".",):
+            columns = LogColumns(separator=separator, decimal=decimal, comment=_MARKS)
+            split = [cells_of(line, columns) for line in lines]
+            for k, header in enumerate(split):
+                if len(header) < 2 or not _are_names(header, decimal) or (best is not None and header == best[3]):
+                    continue
+                rows = [row for row in split[k + 1 : k + 1 + _ROWS] if len(header) / 2 <= len(row) <= len(header)]
+                counts = [int(np.isfinite(_numbers(row, decimal)).sum()) for row in rows]
+                score = int(np.median(counts)) if counts else 0
+                is_lower = best is not None and best[1] is columns and score == best[0]  # than a line of the preamble
+                if score > 1 and (best is None or score > best[0] or is_lower):
+                    best = (score, columns, k + 1, header, [row for row, n in zip(rows, counts, strict=True) if n])
+    if best is None:
+        raise InputError(f"{name}: found no names with rows of numbers below them, expected the text of a logger.")
+    return best[1:]
+
+
+def _are_names(cells: Sequence[str], decimal: str) -> bool:
+    """Whether no cell is a number, and not all are units."""
+    filled = [cell for cell in cells if cell]
+    is_number = any(is_number_or_empty(cell.replace(decimal, ".")) for cell in filled)
+    return not is_number and not all(map(_UNIT.fullmatch, filled))
+
+
+def _text_keys(columns: LogColumns, lines: Sequence[str], number: int) -> dict[str, object]:
+    keys: dict[str, object] = {} if columns.separator == "comma" else {"separator": columns.separator}
+    keys |= {} if columns.decimal == "." else {"decimal": columns.decimal}
+    below = [line.strip() for line in lines[number:]]
+    marks = [mark for mark in _MARKS if any(line.startswith(mark) for line in (lines[number - 1].strip(), *below))]
+    if marks and marks != ["#"]:
+        keys["comment"] = tuple(marks)
+    names = {found[1] for line in below if (found := _LINE_NAME.match(line)) and not line.startswith(tuple(marks))}
+    return keys | ({"skip": tuple(sorted(names))} if names else {})
+
+
+def _numbers(cells: Sequence[str], decimal: str) -> FloatArray:
+    texts = [cell.replace(decimal, ".") for cell in cells]
+    return np.array([float(text) if text and is_number_or_empty(text) else np.nan for text in texts])
+
+
+def _find(header: Sequence[str], kind: str) -> str | None:
+    """Return the first column whose name, without a unit, is one of a kind."""
+    for name in header:
+        found = _UNIT_OF_NAME.match(name)
+        if found and re.fullmatch(_NAMES[kind], found[1].strip(), re.IGNORECASE):
+            return name
+    return None
+
+
+def _unit(name: str) -> str:
+    found = _UNIT_OF_NAME.match(name)
+    return next(filter(None, found.groups()[1:]), "") if found else ""
+
+
+def _propose_time(
+    header: Sequence[str],
+    channels: dict[str, str],
+    values: dict[str, FloatArray],
+    keys: dict[str, object],
+    asked: list[str],
+) -> None:
+    time, date = _find(header, "time"), _find(header, "date")
+    if time is None:
+        asked.append('which column is the time? time = "…"')
+        return
+    keys["time"] = time
+    if ":" in channels[time]:
+        keys["time_unit"] = "iso"
+        if date is not None:
+            keys["time"] = (date, time)
+        instant = channels[date] if date is not None else channels[time]
+        if re.match(r"\d{1,2}[./-]\d{1,2}[./-]\d{4}", instant):
+            asked.append(f"does {instant} begin with the day? day_first = true or false")
+        elif not re.match(r"\d{4}", instant):
+            asked.append('the date of the first row, if it matters: date = "2026-05-12"')
+    elif _unit(time) in ("s", "ms", "us"):
+        keys["time_unit"] = _unit(time)
+    else:
+        step = float(np.nanmedian(np.diff(values[time]))) if len(values[time]) > 1 else np.nan
+        choice = "time_unit = s, ms, us, or hhmmss"
+        asked.append(f"the unit of {time}, which begins with {channels[time]} and grows by {step:g} a row: {choice}")
+
+
+def _propose_places(
+    header: Sequence[str], values: dict[str, FloatArray], keys: dict[str, object], asked: list[str]
+) -> None:
+    height = _find(header, "height")
+    for key, kinds in (("geodetic", ("latitude", "longitude")), ("position", ("east", "north"))):
+        names = [_find(header, kind) for kind in kinds]
+        if None in names:
+            continue
+        place = np.array([values[name] for name in names if name is not None])
+        place = place[:, (np.isfinite(place) & (place != 0.0)).all(axis=0)]
+        keys[key] = tuple(name for name in (*names, height) if name is not None)
+        if height is None:
+            asked.append("the height of the array above the ground: height_m = 0.4")
+        if key == "geodetic" and place.size:
+            keys["origin"] = (round(float(place[0, 0]), 5), round(float(place[1, 0]), 5), 0.0)
+            asked.append("the origin of the world's frame is put at the first place: its height, the third number")
+        elif place.size and np.abs(place).max() > 1e4:
+            asked.append('which grid are these places of? crs = "EPSG:32633" for UTM zone 33 north; and an origin')
+        return
+    asked.append("no columns of a place were found: position or geodetic")
+
+
+def _sensors(
+    header: Sequence[str], values: dict[str, FloatArray], keys: dict[str, object], asked: list[str]
+) -> dict[str, str | tuple[str, ...]]:
+    """Return columns whose moduli are those of the Earth's field, in the unit of their names or in the likely one."""
+    taken: list[object] = []
+    for key in ("time", "position", "geodetic"):
+        named = keys.get(key, ())
+        taken += named if isinstance(named, tuple) else [named]
+    free = [name for name in header if name not in taken]
+    groups: list[tuple[str, ...]] = []
+    for name in free:
+        for at in [found.start() for found in re.finditer("[xX]", name)]:
+            xyz = tuple(name[:at] + letter + name[at + 1 :] for letter in ("xyz" if name[at] == "x" else "XYZ"))
+            if set(xyz) <= set(free):
+                groups.append(xyz)
+                break
+    groups += [(name,) for name in free if not any(name in group for group in groups)]
+    units: dict[tuple[str, ...], str] = {}
+    for group in groups:
+        modulus = _modulus(values, group)
+        stated = _unit(group[0])
+        likely = ("nT", "uT", "G", "mG") if not stated and _FIELD.search(group[0]) else ()
+        for unit in (stated,) if stated in NANOTESLA else likely:
+            if _EARTH_nT[0] < modulus * NANOTESLA[unit] < _EARTH_nT[1]:
+                units[group] = unit
+                break
+    if not units:
+        asked.append("no column reads like the Earth's field: name those of the sensors")
+        return {}
+    unit = next(iter(units.values()))
+    if any(not _unit(group[0]) for group in units):
+        asked.append(f"are the readings in {unit}? Their moduli are then those of the Earth's field")
+    if unit != "nT":
+        keys["unit"] = unit
+    same = [group for group, of in units.items() if of == unit]
+    return {f"s{k}": group[0] if len(group) == 1 else group for k, group in enumerate(same, start=1)}
+
+
+def _modulus(values: dict[str, FloatArray], group: Sequence[str]) -> float:
+    n = min(len(values[name]) for name in group)
+    moduli = np.linalg.norm([values[name][:n] for name in group], axis=0)
+    return float(np.median(moduli[np.isfinite(moduli)])) if np.isfinite(moduli).any() else 0.0
