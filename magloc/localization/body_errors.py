@@ -72,8 +72,8 @@ def _covariances(
     distance = np.linalg.norm(position[:, :, None] - model.centroid - model.radius * model.sensors, axis=-1)
     errors = body_errors(model, q, mu, DEFAULT_LENGTH * distance.min(axis=-1))
     if ambient_sigma_T and model.sees_moduli:
-        model = model.marginalised(ambient_errors(model, q, mu, ambient_sigma_T))
-    jacobian, errors = scaled_jacobian(model, q, mu), model.whitened(errors)
+        model = model.marginalise(ambient_errors(model, q, mu, ambient_sigma_T))
+    jacobian, errors = scaled_jacobian(model, q, mu), model.whiten(errors)
     unit = np.tile(np.repeat([model.radius, model.radius**3 / MU0_OVER_4PI], 3), n_sources)
     if known_place:
         of_moments = np.tile(np.repeat([False, True], 3), n_sources)

@@ -190,7 +190,7 @@ class _Examination:
             every = np.zeros((len(plain), self.raw.shape[1], max(columns.shape[2] for _, columns in errors)))
             for rows, columns in errors:
                 every[rows, :, : columns.shape[2]] = columns
-            self.fits = replace(self.fits, problem=self.problem.marginalised(every))
+            self.fits = replace(self.fits, problem=self.problem.marginalise(every))
 
     def without_lonely_sources(self, plain: Sequence[Fix]) -> list[Fix]:
         """Fixes without sources that a single sensor sees: nothing tells such a source from a fault of the sensor."""
@@ -209,8 +209,8 @@ class _Examination:
     def _seers_of_lonely_sources(self, row: int, fix: Fix) -> frozenset[int]:
         q, mu = self._scaled(fix)
         problem = self.problem.rows(np.full(len(q), row))
-        seen = problem.predicted(problem.source_fields(q[:, None], mu[:, None]))
-        seen -= problem.predicted(np.zeros_like(problem.ambient))
+        seen = problem.predict(problem.source_fields(q[:, None], mu[:, None]))
+        seen -= problem.predict(np.zeros_like(problem.ambient))
         energy = np.stack([np.bincount(self.array.channel_sensor, of**2, self.array.n_sensors) for of in seen])
         lonely = energy.max(axis=1) > _LONELY * energy.sum(axis=1)
         return frozenset(np.argmax(energy[lonely], axis=1).tolist())
@@ -264,7 +264,7 @@ class _Examination:
 
     def _as_noise(self, plain: Sequence[Fix]) -> BoolArray:
         """Rows without a source whose energy is one of noise: there is nothing that a bad sensor would explain."""
-        without = self.problem.whitened(self.raw) - self.problem.predicted(np.zeros_like(self.problem.ambient))
+        without = self.problem.whiten(self.raw) - self.problem.predict(np.zeros_like(self.problem.ambient))
         energy = np.einsum("bc,bc->b", without, without)
         alone = np.array([fix.reason == NOISE_ALONE for fix in plain], dtype=bool)
         return alone & (energy <= energy_threshold(max(1, self.n_differences)))

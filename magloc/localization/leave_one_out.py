@@ -34,7 +34,7 @@ def falls_without_sensors(
     :math:`I - H = [W (I - Q Q^T) W]_{ss}`. The least eigenvalue of that says what the others check of its readings: 0
     where it alone decides what they ought to be. Channels (N, 3) are negative where a sensor has none.
     """
-    y = problem.whitened(raw)
+    y = problem.whiten(raw)
     residual = problem.residual(y, q, mu, problem.source_fields(q, mu))
     jacobian = scaled_jacobian(problem, q, mu)
     if not free_position:
@@ -43,10 +43,10 @@ def falls_without_sensors(
     explained, _ = np.linalg.qr(jacobian / np.where(norm > 0.0, norm, 1.0))
     n_channels = y.shape[1]
     seen = problem.basis * np.sqrt(problem.shrinkage * (2.0 - problem.shrinkage))[:, None]
-    taken = np.concatenate([seen, problem.whitened(explained[:, :n_channels])], axis=2)
+    taken = np.concatenate([seen, problem.whiten(explained[:, :n_channels])], axis=2)
     used = sensor_channels >= 0
     taken = np.where(used[..., None], taken[:, sensor_channels], 0.0)
-    gradient = np.where(used, problem.whitened(residual[:, :n_channels])[:, sensor_channels], 0.0)
+    gradient = np.where(used, problem.whiten(residual[:, :n_channels])[:, sensor_channels], 0.0)
     checked, axes = np.linalg.eigh(np.eye(3) - taken @ taken.swapaxes(-1, -2))
     along = (axes.swapaxes(-1, -2) @ gradient[..., None])[..., 0]
     falls: FloatArray = np.sum(np.where(checked > _CHECKED, along**2 / np.maximum(checked, _CHECKED), 0.0), axis=-1)
@@ -68,5 +68,5 @@ def weighted(problem: WhitenedModel, raw: FloatArray, weight: FloatArray) -> Wei
     if not flat.all():
         with np.errstate(divide="ignore"):
             deviation = np.where(flat, 0.0, np.sqrt(1.0 / (1.0 - problem.shrinkage) ** 2 - 1.0))
-        lighter = lighter.marginalised(root * (problem.basis * deviation[:, None])[..., known])
+        lighter = lighter.marginalise(root * (problem.basis * deviation[:, None])[..., known])
     return lighter, root[..., 0] * raw

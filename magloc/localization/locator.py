@@ -226,7 +226,7 @@ class _Rows:
         loud, silent = rows, rows.silent
         if np.count_nonzero(silent):
             self.refuse(rows.index[silent], NO_SIGNAL)
-            loud = rows.chosen(~silent)
+            loud = rows.select(~silent)
             if not len(loud):
                 return
         self.detected[loud.index] = is_detected(loud.energy, loud.n_differences)
@@ -253,7 +253,7 @@ class _Rows:
     def fixes(self) -> Fixes:
         """All of it."""
         n = len(self.reason)
-        solutions = Solutions.joined(self.parts)
+        solutions = Solutions.concatenate(self.parts)
         return Fixes(
             solutions,
             np.arange(n, dtype=np.float64),

@@ -76,20 +76,20 @@ def with_model_errors(
         lengths[solved] = assumed_lengths(rows.model, best.q, body_length_m)
         near = np.flatnonzero(lengths[solved].any(axis=1))
         errors = body_errors(model.rows(near), best.q[near], best.mu[near], lengths[solved[near]])
-        negligible = np.sum(model.rows(near).whitened(errors) ** 2, axis=(1, 2)) <= _NEGLIGIBLE
+        negligible = np.sum(model.rows(near).whiten(errors) ** 2, axis=(1, 2)) <= _NEGLIGIBLE
         lengths[solved[near[negligible]]] = 0.0
         known = None if ambient_sigma_T else errors[~negligible]
     matters: BoolArray = np.asarray(lengths.any(axis=1))
     matters[solved] |= ambient_sigma_T > 0.0
     if not matters.any():
         return [(optima, none)]
-    refined = _refined(optima.chosen(matters), lengths[matters], ambient_sigma_T, known)
+    refined = _refined(optima.select(matters), lengths[matters], ambient_sigma_T, known)
     # A row of which no fit converged again stays that of a point in a known field.
     lost = np.bincount(refined.of_row, minlength=len(refined.rows)) == 0
     matters[np.flatnonzero(matters)[lost]] = False
-    result = [(refined.chosen(~lost), lengths[matters].max(axis=1))] if matters.any() else []
+    result = [(refined.select(~lost), lengths[matters].max(axis=1))] if matters.any() else []
     if not matters.all():
-        result.append((optima.chosen(~matters), none[~matters]))
+        result.append((optima.select(~matters), none[~matters]))
     return result
 
 
@@ -110,7 +110,7 @@ def _refined(optima: Optima, lengths: FloatArray, ambient_sigma_T: float, errors
         if errors is None:
             best = fits.rows(np.searchsorted(optima.of_row, np.arange(len(rows))))
             errors = model_errors(optima.rows.model, best.q, best.mu, lengths, ambient_sigma_T)
-        rows, errors = optima.rows.marginalised(errors), None
+        rows, errors = optima.rows.marginalise(errors), None
         start = fits
         fits = refine(rows.model.rows(optima.of_row), rows.y[optima.of_row], start.q, start.mu)
         fits = replace(fits, iterations=fits.iterations + start.iterations)

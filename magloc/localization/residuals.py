@@ -32,7 +32,7 @@ def fix_residuals(
     for rows in whitened_rows(array, used, ambient_T, _ROWS_AT_ONCE):
         if rows.mask.any():
             fields = np.stack([_fields(array, fixes[row]) for row in rows.index])
-            residual = rows.y - rows.model.predicted(fields)
+            residual = rows.y - rows.model.predict(fields)
             result[np.ix_(rows.index, np.flatnonzero(rows.mask))] = residual[:, rows.mask]
     return result
 

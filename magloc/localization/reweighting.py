@@ -75,7 +75,7 @@ class WeightedFits:
         """Fits of weighted rows (f,) from sources (f, K, …)."""
         problem, raw = lighter
         free = np.full((q.shape[1], 3), self.free_position)
-        return refine(problem, problem.whitened(raw), q, mu, free=free, max_iterations=max_iterations)
+        return refine(problem, problem.whiten(raw), q, mu, free=free, max_iterations=max_iterations)
 
     def falls(
         self, row: IntArray, q: FloatArray, mu: FloatArray, weight: FloatArray | None = None
@@ -91,7 +91,7 @@ class WeightedFits:
     def _squares(self, lighter: Weighted, q: FloatArray, mu: FloatArray, weight: FloatArray) -> FloatArray:
         """Squared residuals (f, N) of the sensors of some weighted rows."""
         owner, (problem, raw) = self.problem.channel_sensor, lighter
-        residual = problem.whitened(raw) - problem.predicted(problem.source_fields(q, mu))
+        residual = problem.whiten(raw) - problem.predict(problem.source_fields(q, mu))
         of_sensor = owner[:, None] == np.arange(self.n_sensors)
         squares: FloatArray = (residual**2 / weight[:, owner]) @ of_sensor
         return squares

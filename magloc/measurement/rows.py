@@ -52,7 +52,7 @@ class WhitenedRows:
     def __len__(self) -> int:
         return len(self.index)
 
-    def chosen(self, rows: IntArray | BoolArray) -> WhitenedRows:
+    def select(self, rows: IntArray | BoolArray) -> WhitenedRows:
         """Some of the rows."""
         at = np.arange(len(self))[rows]
         return replace(
@@ -64,12 +64,12 @@ class WhitenedRows:
             y=self.y[at],
         )
 
-    def marginalised(self, columns: FloatArray) -> WhitenedRows:
+    def marginalise(self, columns: FloatArray) -> WhitenedRows:
         """The same where errors of unit variance along columns (b, C, n), in units of the noise, count as noise."""
-        model = self.model.marginalised(columns)
-        return replace(self, model=model, y=model.whitened(self.raw))
+        model = self.model.marginalise(columns)
+        return replace(self, model=model, y=model.whiten(self.raw))
 
-    def knowing(self, moment: KnownMoment | None) -> WhitenedRows:
+    def with_known_moment(self, moment: KnownMoment | None) -> WhitenedRows:
         """The same where the moment of every source is known."""
         return replace(self, model=replace(self.model, known=moment)) if moment is not None else self
 
@@ -101,7 +101,7 @@ def whitened_rows(
             readings, ambient = readings_T[index], None if ambient_T is None else ambient_T[index]
             of_rows = whitenings_of(array, mask, readings)
             model, raw = whitened_model(array, mask, readings, of_rows, ambient)
-            yield WhitenedRows(index, mask, readings, model, raw, model.whitened(raw), of_rows.n_differences)
+            yield WhitenedRows(index, mask, readings, model, raw, model.whiten(raw), of_rows.n_differences)
 
 
 def checked_rows(array: SensorArray, readings_T: ArrayLike) -> FloatArray:
@@ -165,7 +165,7 @@ def whitened_model(
 ) -> tuple[WhitenedModel, FloatArray]:
     """Exact model of rows of readings (n, C), and their channels (n, C) divided by the noise.
 
-    :meth:`WhitenedModel.whitened` frees these from the common field. The whitening is that of every row or of all, and
+    :meth:`WhitenedModel.whiten` frees these from the common field. The whitening is that of every row or of all, and
     `ambient_T` (n, 3) stands in place of the array's ambient field.
     """
     if len(readings_T) == 1 and ambient_T is None and whitening.roots.ndim == 3:

@@ -136,7 +136,7 @@ class WhitenedModel(ScaledSensors):
     def of_ambient(self) -> FloatArray:
         """Whitened readings without a source: (b, C), or (1, C) where all rows have the same."""
         alone = self.rows(np.arange(min(1, len(self)))) if self.shares_whitening and self.shares_ambient else self
-        return alone.predicted(np.zeros(alone.ambient.shape))
+        return alone.predict(np.zeros(alone.ambient.shape))
 
     @cached_property
     def channels(self) -> core.Problem:
@@ -168,7 +168,7 @@ class WhitenedModel(ScaledSensors):
         """The same without an ambient field."""
         return replace(self, ambient=np.zeros_like(self.ambient))
 
-    def whitened(self, channels: FloatArray) -> FloatArray:
+    def whiten(self, channels: FloatArray) -> FloatArray:
         """Channels (b, C) or columns of them (b, C, n), divided by the noise, without their common field."""
         if channels.ndim == 2 and len(channels) and self.shares_whitening:
             basis = self.basis[0]
@@ -178,7 +178,7 @@ class WhitenedModel(ScaledSensors):
         free: FloatArray = columns - self.basis @ common
         return free if channels.ndim == 3 else free[..., 0]
 
-    def marginalised(self, columns: FloatArray) -> WhitenedModel:
+    def marginalise(self, columns: FloatArray) -> WhitenedModel:
         """The same where errors of unit variance along columns (b, C, n), in units of the noise, count as noise."""
         flat, unknown = self.shrinkage >= 1.0, self.basis
         bounded = ~flat.all(axis=0)
@@ -213,7 +213,7 @@ class WhitenedModel(ScaledSensors):
         with np.errstate(divide="ignore", invalid="ignore"):
             return v / r, 1.0 / r**3
 
-    def predicted(self, source_fields: FloatArray) -> FloatArray:
+    def predict(self, source_fields: FloatArray) -> FloatArray:
         """Whitened predictions (b, C) of the fields of the sources at the sensors (b, N, 3)."""
         channels = np.ascontiguousarray(np.sum(source_fields[:, self.channel_sensor] * self.gain, axis=-1))
         scalar = self.channel_is_scalar
@@ -221,11 +221,11 @@ class WhitenedModel(ScaledSensors):
             owner = self.channel_sensor[scalar]
             total = source_fields[:, owner] + self.ambient[:, owner]
             channels[:, scalar] = self.gain[:, scalar, 0] * np.sqrt(np.sum(total * total, axis=-1))
-        return self.whitened(channels)
+        return self.whiten(channels)
 
     def residual(self, y: FloatArray, q: FloatArray, mu: FloatArray, source_fields: FloatArray) -> FloatArray:
         """What sources leave of whitened readings (b, C), and behind them of what is known of their moments."""
-        of_readings = y - self.predicted(source_fields)
+        of_readings = y - self.predict(source_fields)
         if self.known is None:
             return of_readings
         return np.concatenate([of_readings, self.known.residual(self.moment(q, mu))], axis=1)
@@ -265,7 +265,7 @@ class WhitenedModel(ScaledSensors):
         n, inverse3 = (x[:, :, self.channel_sensor] for x in self._directions(q))
         along = np.sum(n * gain[:, None], axis=-1, keepdims=True)
         columns = (3.0 * along * n - gain[:, None]) * inverse3
-        return self.whitened(columns.transpose(0, 2, 1, 3).reshape(len(q), gain.shape[1], -1))
+        return self.whiten(columns.transpose(0, 2, 1, 3).reshape(len(q), gain.shape[1], -1))
 
     def position_jacobian(self, q: FloatArray, mu: FloatArray, gain: FloatArray, tangent: FloatArray) -> FloatArray:
         """Derivative of the predictions along tangents (b, K, 4, 3) of q: (b, C, 3 K)."""
@@ -278,7 +278,7 @@ class WhitenedModel(ScaledSensors):
             slope = (3.0 * np.cbrt(inverse3) * inverse3) * (n_m * g + n_g * m + (g_m - 5.0 * n_m * n_g) * n)
         along_s = np.sum(slope * self.sensors[self.channel_sensor], axis=-1, keepdims=True)
         columns = np.concatenate([-slope, along_s], axis=-1) @ tangent
-        return self.whitened(columns.transpose(0, 2, 1, 3).reshape(len(q), gain.shape[1], -1))
+        return self.whiten(columns.transpose(0, 2, 1, 3).reshape(len(q), gain.shape[1], -1))
 
 
 def _left_singular(columns: FloatArray) -> tuple[FloatArray, FloatArray]:

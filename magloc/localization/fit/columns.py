@@ -50,15 +50,15 @@ class Solutions:
     def none(cls) -> Solutions:
         """No solution of any row."""
         one = Solution((Source(np.zeros(3), np.zeros(3), np.eye(6), EVERYWHERE),), np.eye(6), 0.0, 0)
-        return cls._of_one(0, one).chosen(np.zeros(0, dtype=np.intp))
+        return cls._from_solution(0, one).select(np.zeros(0, dtype=np.intp))
 
     @classmethod
     def of(cls, solutions: Sequence[tuple[int, Solution]]) -> Solutions:
         """From solutions and their rows."""
-        return cls.joined([cls._of_one(row, solution) for row, solution in solutions])
+        return cls.concatenate([cls._from_solution(row, solution) for row, solution in solutions])
 
     @classmethod
-    def _of_one(cls, row: int, solution: Solution) -> Solutions:
+    def _from_solution(cls, row: int, solution: Solution) -> Solutions:
         sources = solution.sources
         return cls(
             of_row=np.array([row]),
@@ -70,7 +70,7 @@ class Solutions:
             dof=np.array([solution.dof]),
             weight=np.array([solution.weight]),
             iterations=np.array([solution.iterations]),
-            ranges=_sets_of([source.range_interval_m for source in sources])[None],
+            ranges=_range_sets([source.range_interval_m for source in sources])[None],
             gaussian=np.array([[source.gaussian for source in sources]]),
             merged=np.array([[source.merged for source in sources]]),
             known_chi2=np.array([solution.known_chi2]),
@@ -78,7 +78,7 @@ class Solutions:
         )
 
     @classmethod
-    def joined(cls, parts: Sequence[Solutions]) -> Solutions:
+    def concatenate(cls, parts: Sequence[Solutions]) -> Solutions:
         """All solutions of parts with different rows, in the order of their rows."""
         filled = [part for part in parts if len(part)]
         if len(filled) <= 1:
@@ -100,7 +100,7 @@ class Solutions:
 
         return cls(**{name: stacked(name) for name in vars(filled[0])})
 
-    def chosen(self, index: IntArray | BoolArray, of_row: IntArray | None = None) -> Solutions:
+    def select(self, index: IntArray | BoolArray, of_row: IntArray | None = None) -> Solutions:
         """Some of the solutions, of other rows if these are named."""
         at = np.arange(len(self))[index]
         chosen = Solutions(**{name: value[at] for name, value in vars(self).items()})
@@ -145,7 +145,7 @@ class Solutions:
         )
 
 
-def _sets_of(intervals: Sequence[Intervals]) -> FloatArray:
+def _range_sets(intervals: Sequence[Intervals]) -> FloatArray:
     """Sets of several sources (K, i, 2)."""
     sets = np.full((len(intervals), max(1, *map(len, intervals)), 2), np.nan)
     for k, of_source in enumerate(intervals):

@@ -235,7 +235,7 @@ class Fixes(Result, Sequence[Fix]):
             part.solutions.of_rows(begin + part.solutions.of_row) for begin, part in zip(begins, parts, strict=False)
         ]
         return cls(
-            Solutions.joined(solutions),
+            Solutions.concatenate(solutions),
             np.concatenate([np.zeros(0), *(part.time_s for part in parts)]),
             np.concatenate([np.zeros(0, dtype=bool), *(part.detected for part in parts)]),
             [reason for part in parts for reason in part.reason],
@@ -271,7 +271,7 @@ class Fixes(Result, Sequence[Fix]):
 
     def replaced(self, rows: IntArray, fixes: Sequence[Fix]) -> Fixes:
         """With the fixes of some rows replaced by others."""
-        kept = self.solutions.chosen(~np.isin(self.solutions.of_row, rows))
+        kept = self.solutions.select(~np.isin(self.solutions.of_row, rows))
         come = Solutions.of(
             [(int(row), solution) for row, fix in zip(rows, fixes, strict=True) for solution in fix.solutions]
         )
@@ -280,7 +280,7 @@ class Fixes(Result, Sequence[Fix]):
             columns[name] = getattr(self, name).copy()
             for row, fix in zip(rows, fixes, strict=True):
                 columns[name][row] = getattr(fix, name)
-        return replace(self, solutions=Solutions.joined([kept, come]), **columns)
+        return replace(self, solutions=Solutions.concatenate([kept, come]), **columns)
 
     def lines(self, most: int | None = None) -> list[str]:
         """Return the lines of the table, of at most `most` rows."""

@@ -65,7 +65,7 @@ class JointFits:
         """Some of the fits, by an index of the leading axes."""
         return JointFits(*(values[index] for values in vars(self).values()))
 
-    def shaped(self, *shape: int) -> JointFits:
+    def reshape(self, *shape: int) -> JointFits:
         """The same fits with other leading axes."""
         n_axes = self.chi2.ndim
         return JointFits(*(values.reshape(*shape, *values.shape[n_axes:]) for values in vars(self).values()))
@@ -75,7 +75,7 @@ class JointFits:
         for values, others in zip(vars(self).values(), vars(fits).values(), strict=True):
             values[index] = others
 
-    def replaced(self, index: Any, fits: JointFits) -> JointFits:
+    def replace(self, index: Any, fits: JointFits) -> JointFits:
         """With some of the fits replaced."""
         result = JointFits(*(values.copy() for values in vars(self).values()))
         result.put(index, fits)
@@ -131,12 +131,12 @@ def _jacobian(
 
 
 def _moment_step(jacobian: FloatArray, residual: FloatArray) -> FloatArray:
-    step, _ = _NormalEquations.of(jacobian, residual).step()
+    step, _ = _FitNormalEquations.of(jacobian, residual).step()
     return step.reshape(len(residual), -1, 3)
 
 
 @dataclass(frozen=True, eq=False)
-class _NormalEquations:
+class _FitNormalEquations:
     """Normal equations of many fits, in columns of unit norm."""
 
     norm: FloatArray
@@ -144,7 +144,7 @@ class _NormalEquations:
     information: FloatArray
 
     @classmethod
-    def of(cls, jacobian: FloatArray, residual: FloatArray) -> _NormalEquations:
+    def of(cls, jacobian: FloatArray, residual: FloatArray) -> _FitNormalEquations:
         """From Jacobians (b, C, n) and residuals (b, C)."""
         norm = np.linalg.norm(jacobian, axis=1)
         norm = np.where(norm > 0.0, norm, 1.0)
@@ -251,10 +251,10 @@ def damped_gauss_newton(
             along = _jacobian(at, q[live[new]], mu[live[new]], gain, tangent[new])[..., columns]
             jacobian[new] = np.concatenate([along, _jacobian(at, q[live[new]], mu[live[new]], gain)], axis=-1)
             iterations[live[new]] += 1
-        normal = _NormalEquations.of(jacobian, residual)
+        normal = _FitNormalEquations.of(jacobian, residual)
         step, promised = normal.step(damping[:, None] * damped)
         _, reachable = normal.step()
-        new_q, new_mu, step_share = _moved(q[live], mu[live], step, tangent, columns)
+        new_q, new_mu, step_share = _take_step(q[live], mu[live], step, tangent, columns)
         new_fields = sub.source_fields(new_q, new_mu)
         new_residual = sub.residual(y[live], new_q, new_mu, new_fields)
         new_chi2 = _squares(new_residual)
@@ -306,7 +306,7 @@ def _squares(residual: FloatArray) -> FloatArray:
     return np.sum(residual * residual, axis=-1)
 
 
-def _moved(
+def _take_step(
     q: FloatArray, mu: FloatArray, step: FloatArray, tangent: FloatArray, columns: NDArray[np.intp]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Coordinates and moments after a step, shortened where it would turn q too far, and the share that was taken."""

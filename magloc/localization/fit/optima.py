@@ -44,12 +44,12 @@ class Optima:
     undetermined: str = UNDETERMINED
     bent: BoolArray | bool = False
 
-    def chosen(self, which: BoolArray) -> Optima:
+    def select(self, which: BoolArray) -> Optima:
         """Those of some of the rows (b,)."""
         kept = which[self.of_row]
         return replace(
             self,
-            rows=self.rows.chosen(which),
+            rows=self.rows.select(which),
             fits=self.fits.rows(kept),
             of_row=(np.cumsum(which) - 1)[self.of_row[kept]],
             reason=[reason for reason, chosen in zip(self.reason, which, strict=True) if chosen],

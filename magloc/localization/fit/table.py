@@ -34,7 +34,7 @@ def lines_of_fixes(fixes: Fixes, *, joint: bool | None = None, most: int | None 
     shown = list(range(len(fixes)))
     if most is not None and len(shown) > most:
         shown = shown[: most // 2] + shown[-(most // 2) :]
-    solved = fixes.solutions.chosen(fixes.best[fixes.solved])
+    solved = fixes.solutions.select(fixes.best[fixes.solved])
     if joint is None:
         joint = bool((solved.n_sources > 1).any())
     distances = np.linalg.norm(solved.position_m, axis=-1)
@@ -81,7 +81,7 @@ def lines_of_fixes(fixes: Fixes, *, joint: bool | None = None, most: int | None 
 def _cells_of_rows(fixes: Fixes, shown: list[int], per_m: float) -> Iterator[list[list[str]]]:
     """Cells of the sources of the best solution of some rows."""
     solved = [i for i in shown if fixes.solved[i]]
-    best = fixes.solutions.chosen(fixes.best[solved])
+    best = fixes.solutions.select(fixes.best[solved])
     blocks = best.covariance_of_source
     deviations = np.sqrt(np.einsum("fkii->fki", blocks))
     of_position = deviations[..., :3] if deviations.shape[-1] == 6 else np.zeros(best.position_m.shape)

@@ -48,7 +48,7 @@ def best_distinct(fits: JointFits, n_rows: int, width: int) -> JointFits:
     """The `width` best fits of every row that differ, from the same number of fits for every row, row after row."""
     # q and -q are the same source.
     sign = np.where(fits.q[..., 3:] < 0.0, -1.0, 1.0)
-    every = replace(fits, q=fits.q * sign, chi2=fits.chi2.copy()).shaped(n_rows, -1)
+    every = replace(fits, q=fits.q * sign, chi2=fits.chi2.copy()).reshape(n_rows, -1)
     chi2, rows = every.chi2, np.arange(n_rows)
     kept = JointFits.none((n_rows, width), fits.n_sources)
     for k in range(width):
@@ -153,7 +153,7 @@ class Search:
         signals = signals_of(problem, y - problem.of_ambient)
         found = search_optima(problem, signals, np.arange(len(y)), q, mu, self.within, _MOST_ITERATIONS)
         chi2 = np.where(np.arange(q.shape[1]) < found.counts[:, :1], found.chi2, np.inf)
-        return JointFits(found.q[:, :, None], found.mu[:, :, None], chi2, found.iterations).shaped(-1)
+        return JointFits(found.q[:, :, None], found.mu[:, :, None], chi2, found.iterations).reshape(-1)
 
     def _needs_templates(self, problem: WhitenedModel, y: FloatArray) -> NDArray[np.bool_]:
         """Rows (b,) with moduli far from linear: their source's field is not small against the ambient field."""
@@ -180,7 +180,7 @@ class Search:
         at = problem.rows(row)
         # The length of the moment, as if there were no ambient field.
         fields = at.source_fields(q.reshape(-1, 1, 4), direction.reshape(-1, 1, 3))
-        unit = at.without_ambient().predicted(fields)
+        unit = at.without_ambient().predict(fields)
         length = np.sum(unit * y[row], axis=-1) / np.maximum(np.sum(unit * unit, axis=-1), 1e-300)
         return q, direction * np.maximum(length, 1e-30).reshape(len(y), n_starts, 1)
 
@@ -206,7 +206,7 @@ class Search:
     ) -> NDArray[np.intp]:
         """Those that explain most of what the sources (b, K, …) leave."""
         fields = problem.source_fields(q, mu)
-        return self._chosen(problem, problem.linear_gain(fields), y - problem.predicted(fields), n_starts, apart_rad)
+        return self._chosen(problem, problem.linear_gain(fields), y - problem.predict(fields), n_starts, apart_rad)
 
     def bases_of(self, problem: WhitenedModel, gain: FloatArray, row: int) -> SingleArray:
         """:func:`linear_bases` of the candidates."""
@@ -236,7 +236,7 @@ class Search:
     def left_scores(self, problem: WhitenedModel, y: FloatArray, q: FloatArray, mu: FloatArray) -> FloatArray:
         """Energy that every candidate explains of what the sources (b, K, …) leave: (b, n)."""
         fields = problem.source_fields(q, mu)
-        return self._linear_scores(problem, problem.linear_gain(fields), y - problem.predicted(fields))
+        return self._linear_scores(problem, problem.linear_gain(fields), y - problem.predict(fields))
 
     def _extended(
         self,
@@ -253,7 +253,7 @@ class Search:
         at, y_each = problem.rows(row), y[row]
         new = self.candidates[chosen.ravel()][:, None]
         fields = at.source_fields(q[each], mu[each])
-        gain, residual = at.linear_gain(fields), y_each - at.predicted(fields)
+        gain, residual = at.linear_gain(fields), y_each - at.predict(fields)
         jacobian = at.moment_jacobian(new, gain)
         normal = jacobian.transpose(0, 2, 1) @ jacobian
         trace = np.trace(normal, axis1=1, axis2=2)
@@ -269,7 +269,7 @@ class Search:
         limit = np.where(lowest <= credible, lowest + DISTINCT_WITHIN, np.inf)
         too_high = np.repeat(limit, place.shape[1] - _MORE_STARTS)
         more = refine(at.rows(others), y_each[others], q[others], mu[others], too_high=too_high)
-        return JointFits.none((len(q),), q.shape[1]).replaced(first, fits).replaced(others, more)
+        return JointFits.none((len(q),), q.shape[1]).replace(first, fits).replace(others, more)
 
     def one_less(self, problem: WhitenedModel, y: FloatArray, beam: JointFits) -> JointFits:
         """Beam without one source: every source of the best fit is left out in turn."""
@@ -305,7 +305,7 @@ def merged(first: JointFits, second: JointFits) -> JointFits:
     n_rows, width = first.chi2.shape
     pairs = zip(vars(first).values(), vars(second).values(), strict=True)
     both = JointFits(*(np.concatenate(pair, axis=1) for pair in pairs))
-    return best_distinct(both.shaped(-1), n_rows, width)
+    return best_distinct(both.reshape(-1), n_rows, width)
 
 
 def _filled(beam: JointFits) -> tuple[FloatArray, FloatArray]:

@@ -153,7 +153,7 @@ def modulus_templates(problem: WhitenedModel, row: int, candidates: FloatArray, 
         at = problem.rows(np.full(len(block) * n_directions, row)).without_ambient()
         q = np.repeat(block, n_directions, axis=0)[:, None]
         mu = np.tile(directions, (len(block), 1))[:, None]
-        predicted = at.predicted(at.source_fields(q, mu))
+        predicted = at.predict(at.source_fields(q, mu))
         norm = np.linalg.norm(predicted, axis=-1, keepdims=True)
         unit = predicted / np.where(norm > 0.0, norm, np.inf)
         templates[begin : begin + len(block)] = np.nan_to_num(unit).reshape(len(block), n_directions, -1)

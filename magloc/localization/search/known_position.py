@@ -75,7 +75,7 @@ class MomentSearch:
 
     def optima(self, rows: WhitenedRows) -> list[Optima]:
         """Every distinct optimum of every row."""
-        rows = rows.knowing(self.prior.known_moment)
+        rows = rows.with_known_moment(self.prior.known_moment)
         model, place = rows.model, self.position_m if len(self.position_m) == 1 else self.position_m[rows.index]
         position = np.broadcast_to(place, (len(rows), *place.shape[1:]))
         beam = _all_moments(model, rows.y, model.homogeneous(position))
@@ -98,7 +98,7 @@ def _all_moments(problem: WhitenedModel, y: FloatArray, q: FloatArray) -> JointF
         row = np.repeat(np.arange(n), _N_DIRECTIONS)
         alone = problem.rows(row).without_ambient()
         around = np.tile(directions, (n, 1, 1))
-        unit = alone.predicted(alone.source_fields(q[row], around))
+        unit = alone.predict(alone.source_fields(q[row], around))
         # As long as the readings ask for if there were no ambient field: the scale of the moduli.
         length = np.linalg.norm(y[row], axis=-1) / np.maximum(np.linalg.norm(unit, axis=-1), 1e-300)
         starts.append((length[:, None, None] * around).reshape(n, _N_DIRECTIONS, n_sources, 3))
@@ -111,7 +111,7 @@ def _all_moments(problem: WhitenedModel, y: FloatArray, q: FloatArray) -> JointF
 def _distinct(problem: WhitenedModel, y: FloatArray, q: FloatArray, fits: JointFits) -> JointFits:
     """The best optima of every row that χ² rises between, and their opposites where χ² is even in the moment."""
     n = len(y)
-    every = replace(fits, chi2=fits.chi2.copy()).shaped(n, -1)
+    every = replace(fits, chi2=fits.chi2.copy()).reshape(n, -1)
     mu, chi2 = every.mu, every.chi2
     row, rows = np.repeat(np.arange(n), mu.shape[1]), np.arange(n)
     each = problem.rows(row)
@@ -130,7 +130,7 @@ def _distinct(problem: WhitenedModel, y: FloatArray, q: FloatArray, fits: JointF
         between = np.sum(residual**2, axis=-1).reshape(n, -1)
         chi2[between < np.where(np.isfinite(chi2), chi2, 0.0) + _BARRIER] = np.inf
         chi2[rows, best] = np.inf
-    both = kept.shaped(-1).with_opposite_moments(n).shaped(n, -1)
+    both = kept.reshape(-1).with_opposite_moments(n).reshape(n, -1)
     both.chi2[~even, 1::2] = np.inf
     return both
 

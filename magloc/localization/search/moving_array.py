@@ -41,14 +41,14 @@ def optima_at_rest(
     `errors`, columns (b, C, n) in units of the noise for a source (6,), count as noise: they are linearised at the best
     optimum, for a search of its own and then until they stay.
     """
-    rows = rows.knowing(prior.known_moment)
+    rows = rows.with_known_moment(prior.known_moment)
     optima = _found(rows, prior)
     for step in range(_ROUNDS if errors is not None else 0):
         if errors is None or not np.isfinite(optima.fits.chi2[:1]).any():
             break
         best = optima.fits.rows(np.zeros(1, dtype=np.intp))
         place = [rows.model.position(best.q)[0, 0], rows.model.moment(best.q, best.mu)[0, 0]]
-        noisy = rows.marginalised(errors(np.concatenate(place)))
+        noisy = rows.marginalise(errors(np.concatenate(place)))
         if step == 0:
             optima = _found(noisy, prior)
             continue
@@ -126,7 +126,7 @@ def stacked_rows(
         readings_T.reshape(1, -1),
         model,
         raw[None],
-        model.whitened(raw[None]),
+        model.whiten(raw[None]),
         sum(w.n_differences for w in whitenings),
     )
 

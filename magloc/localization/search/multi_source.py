@@ -101,7 +101,7 @@ class MultiSourceSearch:
 
     def optima(self, rows: WhitenedRows) -> list[Optima]:
         """Distinct optima with the chosen number of sources: one entry for every number."""
-        return _Levels(self, rows.knowing(self.prior.known_moment)).optima()
+        return _Levels(self, rows.with_known_moment(self.prior.known_moment)).optima()
 
     def threshold_of(self, levels: _Levels) -> float:
         """The threshold for another source, drawn once for every number of differences."""
@@ -154,11 +154,11 @@ class _Levels:
             # Where no number of sources is credible so far, the search failed, at this number or at an earlier one.
             failed = np.flatnonzero(~(wider.chi2[:, 0] <= credible) & (last | ~gained))
             if failed.size:
-                wider = wider.replaced(failed, self._restarted(rows[failed], wider.rows(failed)))
+                wider = wider.replace(failed, self._restarted(rows[failed], wider.rows(failed)))
                 gained = self._stands_out(before.chi2[:, 0], wider.chi2[:, 0])
             # The other rows have no fit.
             nowhere = JointFits.none((len(self.y), wider.chi2.shape[1]), wider.n_sources)
-            beams.append(nowhere.replaced(rows, wider))
+            beams.append(nowhere.replace(rows, wider))
             rows = rows if self.asked is not None else rows[gained]
             level[rows] = len(beams) - 1
         wanted = level.copy()
@@ -172,8 +172,8 @@ class _Levels:
             )
             close = np.flatnonzero(fewer.chi2[:, 0] < beams[n].chi2[at, 0] + _FAR_BEYOND * _BEYOND_NOISE)
             if n > 1 and close.size:
-                fewer = fewer.replaced(close, self._restarted(at[close], fewer.rows(close), rounds=2))
-            beams[n - 1] = beams[n - 1].replaced(at, fewer)
+                fewer = fewer.replace(close, self._restarted(at[close], fewer.rows(close), rounds=2))
+            beams[n - 1] = beams[n - 1].replace(at, fewer)
             superfluous = ~self._stands_out(fewer.chi2[:, 0], beams[n].chi2[at, 0])
             unresolved = self._has_unresolved_pair(at, beams[n].rows(at))
             level[at[superfluous | unresolved]] = n - 1
@@ -202,7 +202,7 @@ class _Levels:
         if doubtful.size and self.most == 1:
             wide = replace(self.search, n_starts=5 * self.search.n_starts, apart_rad=0.4 * self.search.apart_rad)
             again = wide.first(self.problem.rows(doubtful), self.y[doubtful])
-            beam = beam.replaced(doubtful, merged(beam.rows(doubtful), again))
+            beam = beam.replace(doubtful, merged(beam.rows(doubtful), again))
         return beam
 
     def _stands_out(self, before: FloatArray, after: FloatArray) -> BoolArray:
@@ -244,7 +244,7 @@ class _Levels:
             if not bad.size:
                 break
             again = self.search.restarted(self.problem.rows(rows[bad]), self.y[rows[bad]], beam.rows(bad), self.rng)
-            beam = beam.replaced(bad, again)
+            beam = beam.replace(bad, again)
         return beam
 
     def _quantile(self, n_sources: int, level: float) -> float:
@@ -268,7 +268,7 @@ class _Levels:
         q, mu = beam.q[row[:1], 0], beam.mu[row[:1], 0]
         fields = at.source_fields(q, mu)
         noise = rng.normal(size=(_N_DRAWS, self.y.shape[1])) * np.any(at.gain[0] != 0.0, axis=-1)
-        draws = at.predicted(fields) + problem.whitened(noise)
+        draws = at.predict(fields) + problem.whiten(noise)
         bases = self.search.bases_of(at, at.linear_gain(fields)[0], 0)
         loudness = np.concatenate([linear_scores(bases, part).max(axis=1) for part in np.array_split(noise, 20)])
         loud = np.argsort(-loudness)[: int(40 * FALSE_ALARM * _N_DRAWS)]
@@ -331,7 +331,7 @@ class _Levels:
                 reason[i], merged[best] = self._merged(
                     fits.q[best], fits.mu[best], beams[n + 1], row, bool(certain[row])
                 )
-        return Optima(self.rows.chosen(rows), fits, of_row, reason, merged)
+        return Optima(self.rows.select(rows), fits, of_row, reason, merged)
 
     def _merged(self, q: FloatArray, mu: FloatArray, more: JointFits, row: int, certain: bool) -> tuple[str, BoolArray]:
         """Why a row has fewer sources, and which of them stands for the closest pair of the larger fit."""

@@ -94,7 +94,7 @@ class _Ranking:
         common: SingleArray = self.whitening.basis.T.astype(np.float32) @ self.bases
         return common
 
-    def whitened(self, channels: FloatArray) -> FloatArray:
+    def whiten(self, channels: FloatArray) -> FloatArray:
         """Readings (b, C) above the ambient field as they are ranked."""
         whole = self.whitening.apply(channels)
         return whole if self.lost is None else whole - (whole @ self.lost) @ self.lost.T
@@ -155,7 +155,7 @@ class SingleSourceSearch:
         credible = found.chi2[:, 0] <= quantile(rows.n_differences - N_UNKNOWNS, 1.0 - CREDIBLE_FIT)
         if np.count_nonzero(credible) < len(rows):
             doubtful = np.flatnonzero(~credible)
-            some = rows.chosen(doubtful)
+            some = rows.select(doubtful)
             more = self.ends(some, np.arange(len(some)), self.starts(some, _MORE * self.n_starts), keep_within)
             for values, others in zip(found, more, strict=True):
                 values[doubtful] = others[:, : values.shape[1]]
@@ -211,7 +211,7 @@ class SingleSourceSearch:
         ranked = rows.y
         if self.array.noise_depends_on_reading or ranking.lost is not None:
             channels = channels_above_ambient(self.array, rows.mask, rows.readings_T, rows.model.ambient)
-            ranked = ranking.whitened(channels)
+            ranked = ranking.whiten(channels)
         number = self.n_starts if n_starts is None else n_starts
         chosen = chosen_candidates(
             ranking.bases, ranked, ranking.candidates, number, self.apart_rad, ranking.orthonormal

@@ -90,7 +90,7 @@ def solutions_of(optima: Optima, detected: BoolArray) -> Solutions:
         n_known=n_known,
     )
     finite = np.isfinite(known.covariance)
-    return every if np.count_nonzero(finite) == finite.size else every.chosen(np.asarray(finite.all(axis=(1, 2))))
+    return every if np.count_nonzero(finite) == finite.size else every.select(np.asarray(finite.all(axis=(1, 2))))
 
 
 def covariance_is_valid(optima: Optima, covariance: FloatArray, which: IntArray) -> BoolArray:

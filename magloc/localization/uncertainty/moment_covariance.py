@@ -24,7 +24,7 @@ def moment_covariances(problem: WhitenedModel, y: FloatArray, fits: JointFits) -
     scalar = problem.channel_is_scalar
     if scalar.any():
         owner = problem.channel_sensor[scalar]
-        residual = problem.whitened(y - problem.predicted(fields))[:, scalar]
+        residual = problem.whiten(y - problem.predict(fields))[:, scalar]
         total = (fields + problem.ambient)[:, owner]
         modulus = np.linalg.norm(total, axis=-1, keepdims=True)
         units = np.eye(3 * fits.n_sources).reshape(-1, *fits.mu.shape[1:])

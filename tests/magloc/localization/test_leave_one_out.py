@@ -52,7 +52,7 @@ class TestFallsWithoutSensors:
 
         def fitted(mask, q, mu):
             problem, raw = whitened_model(array, mask, readings, whitenings_of(array, mask, readings), None)
-            return problem, raw, refine(problem, problem.whitened(raw), q, mu, free=free)
+            return problem, raw, refine(problem, problem.whiten(raw), q, mu, free=free)
 
         every = np.ones(array.n_channels, dtype=bool)
         start, _ = whitened_model(array, every, readings, whitenings_of(array, every, readings), None)
@@ -76,12 +76,12 @@ class TestFallsWithoutSensors:
         every = np.ones(array.n_channels, dtype=bool)
         problem, raw = whitened_model(array, every, readings, whitenings_of(array, every, readings), None)
         q = problem.homogeneous(place)[None]
-        fit = refine(problem, problem.whitened(raw), q, problem.scaled_moment(q, moment[None]))
+        fit = refine(problem, problem.whiten(raw), q, problem.scaled_moment(q, moment[None]))
         falls, _ = falls_without_sensors(problem, raw, fit.q, fit.mu, array.sensor_channels)
         for sensor in range(array.n_sensors):
             mask = array.channel_sensor != sensor
             other, other_raw = whitened_model(array, mask, readings, whitenings_of(array, mask, readings), None)
-            without = refine(other, other.whitened(other_raw), fit.q, fit.mu)
+            without = refine(other, other.whiten(other_raw), fit.q, fit.mu)
             assert_allclose(falls[0, sensor], fit.chi2[0] - without.chi2[0], rtol=0.01, atol=1e-3)
 
     def test_what_the_others_check(self):
@@ -134,7 +134,7 @@ class TestWeightedProblem:
         q = problem.homogeneous(np.array([[[2.0, 1.0, 0.5]]] * 4))
         mu = problem.scaled_moment(q, rng.normal(size=(4, 1, 3)))
         chi2 = [
-            np.sum((p.whitened(y) - p.predicted(p.source_fields(q, mu))) ** 2, axis=1)
+            np.sum((p.whiten(y) - p.predict(p.source_fields(q, mu))) ** 2, axis=1)
             for p, y in ((lighter, lighter_raw), (other, other_raw))
         ]
         assert_allclose(chi2[0], chi2[1], rtol=1e-6)
@@ -145,4 +145,4 @@ class TestWeightedProblem:
         mask = np.ones(24, dtype=bool)
         problem, raw = whitened_model(array, mask, clean, whitenings_of(array, mask, clean), None)
         same, same_raw = weighted(problem, raw, np.ones_like(raw))
-        assert_allclose(same.whitened(same_raw), problem.whitened(raw), rtol=1e-9, atol=1e-9)
+        assert_allclose(same.whiten(same_raw), problem.whiten(raw), rtol=1e-9, atol=1e-9)

@@ -169,7 +169,7 @@ class TestIndependence:
             threads(n_threads)
             monkeypatch.setattr(refinement, "_CHANNELS_A_BLOCK", numbers)
             results.append(search.ends(rows, np.arange(150), starts, 20.0))
-        alone = search.ends(rows.chosen(np.array([77])), np.zeros(1, dtype=np.int64), starts[[77]], 20.0)
+        alone = search.ends(rows.select(np.array([77])), np.zeros(1, dtype=np.int64), starts[[77]], 20.0)
         for result in results[1:]:
             for values, others in zip(result, results[0], strict=True):
                 assert_array_equal(values, others)

@@ -73,7 +73,7 @@ class TestLinearScores:
         candidates = problem.homogeneous(places[:, 0])
         silent = np.zeros_like(problem.ambient)
         gain = problem.linear_gain(silent)
-        residual = y - problem.predicted(silent)
+        residual = y - problem.predict(silent)
         scores = linear_scores(linear_bases(problem, gain[0], 0, candidates), residual)
         nothing = np.zeros((0, 3))
         for i in range(3):
@@ -205,7 +205,7 @@ class TestBeams:
 
     def test_rows_are_replaced_in_a_copy(self):
         beam = best_distinct(fits_of(self.q, self.mu, np.arange(6.0)), 3, 2)
-        other = beam.replaced(np.array([1]), beam.rows(np.array([0])))
+        other = beam.replace(np.array([1]), beam.rows(np.array([0])))
         assert other.chi2.tolist() == [[0.0, 1.0], [0.0, 1.0], [4.0, 5.0]]
         assert beam.chi2.tolist() == [[0.0, 1.0], [2.0, 3.0], [4.0, 5.0]]
 

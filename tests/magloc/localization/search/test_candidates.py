@@ -247,7 +247,7 @@ class TestMissingChannels:
         ranking, channels = search._ranking(rows.mask), np.nan_to_num(readings - array.channel_offset_T)
         assert ranking.lost is not None
         assert ranking.orthonormal is not None
-        parts = (ranking.whitened(channels).astype(np.float32) @ ranking.bases).reshape(20, 3, -1)
+        parts = (ranking.whiten(channels).astype(np.float32) @ ranking.bases).reshape(20, 3, -1)
         triangle = np.zeros((parts.shape[2], 3, 3))
         triangle[:, *np.diag_indices(3)] = ranking.orthonormal[:3].T
         triangle[:, [1, 2, 2], [0, 0, 1]] = ranking.orthonormal[3:].T
@@ -270,7 +270,7 @@ class TestLanes:
         (rows,) = whitened_rows(array, readings, None, 50)
         q = rows.model.homogeneous(1.2 * p)
         together = refined(rows.model, rows.y, q)
-        alone = rows.chosen(np.array([3, 40]))
+        alone = rows.select(np.array([3, 40]))
         for name, of_two in zip(together._fields, refined(alone.model, alone.y, q[[3, 40]]), strict=True):
             np.testing.assert_array_equal(of_two, getattr(together, name)[[3, 40]])
 

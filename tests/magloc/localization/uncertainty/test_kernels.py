@@ -145,7 +145,7 @@ class TestIndependence:
         of_77 = optima.of_row == 77
         alone = replace(
             optima,
-            rows=optima.rows.chosen(np.array([77])),
+            rows=optima.rows.select(np.array([77])),
             fits=optima.fits.rows(np.flatnonzero(of_77)),
             of_row=np.zeros(np.count_nonzero(of_77), dtype=np.int64),
         )
