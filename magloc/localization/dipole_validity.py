@@ -144,14 +144,14 @@ def nearness_test(
         steps.append((order, float(np.sum((new.T @ residual) ** 2)), new.shape[1]))
         known, left = np.concatenate([known, new], axis=1), left - new.shape[1]
     rest = max(chi2 - sum(gain for _, gain, _ in steps), 0.0)
-    gains = tuple(_tested(order, gain, n, rest, left) for order, gain, n in steps)
+    gains = tuple(_test_pattern(order, gain, n, rest, left) for order, gain, n in steps)
     level = false_alarm / 3.0
     misfit = dof > 0 and bool(chdtrc(dof, chi2) < level)
     extended = any(gain.noise_probability < level and gain.misfit_probability < NO_OTHER_MISFIT for gain in gains)
     return NearnessTest(misfit, extended, chi2, dof, gains)
 
 
-def _tested(order: int, gain: float, n_parameters: int, rest: float, left: int) -> MultipoleGain:
+def _test_pattern(order: int, gain: float, n_parameters: int, rest: float, left: int) -> MultipoleGain:
     comparable = left > 0 and rest > 0.0
     ratio = (gain / n_parameters) / (rest / left) if comparable else 0.0
     return MultipoleGain(
@@ -172,7 +172,7 @@ def _orthonormal(columns: FloatArray, known: FloatArray) -> FloatArray:
     return basis[:, size > _UNSEEN_RTOL]
 
 
-def too_near(
+def is_too_near(
     array: SensorArray,
     fixes: Fixes,
     readings_T: FloatArray,

@@ -18,7 +18,7 @@ _CHECKED = 1e-6
 Weighted = tuple[WhitenedModel, FloatArray]
 
 
-def falls_without_sensors(
+def chi2_falls_without_sensors(
     problem: WhitenedModel,
     raw: FloatArray,
     q: FloatArray,
@@ -53,7 +53,7 @@ def falls_without_sensors(
     return falls, checked[..., 0]
 
 
-def weighted(problem: WhitenedModel, raw: FloatArray, weight: FloatArray) -> Weighted:
+def weight_channels(problem: WhitenedModel, raw: FloatArray, weight: FloatArray) -> Weighted:
     """A problem and its raw readings (b, C) with the variance of every channel divided by a weight (b, C)."""
     root = np.sqrt(weight)[..., None]
     flat = problem.shrinkage >= 1.0

@@ -112,7 +112,7 @@ def fit_source_line(
     >>> round(float(np.linalg.norm(line.moment_Am2)), 3), line.converged
     (1.0, True)
     """
-    distance, field, sigma = _checked(distance_m, field_T, noise_T, noise_fraction)
+    distance, field, sigma = _check_readings(distance_m, field_T, noise_T, noise_fraction)
     starts = _starts(distance, field)
     if coil:
         starts = [np.append(start, share * np.linalg.norm(start[:3])) for start in starts for share in _RADII]
@@ -187,7 +187,7 @@ def distance_along_line(
     return found, sigma / slope
 
 
-def _checked(
+def _check_readings(
     distance_m: ArrayLike, field_T: ArrayLike, noise_T: float, noise_fraction: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     distance, field = np.asarray(distance_m, dtype=np.float64), np.asarray(field_T, dtype=np.float64)

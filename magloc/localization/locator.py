@@ -24,8 +24,8 @@ from magloc.averages import averaging_array, complete_rows
 from magloc.conditioning import NO_BACKGROUND
 from magloc.fields.multipole import check_body_length
 from magloc.localization.body_errors import body_covariances
-from magloc.localization.dipole_validity import too_near
-from magloc.localization.fault_exclusion import without_faulty_sensors
+from magloc.localization.dipole_validity import is_too_near
+from magloc.localization.fault_exclusion import exclude_faulty_sensors
 from magloc.localization.fit.columns import Solutions, in_stable_order
 from magloc.localization.fit.fixes import Fixes
 from magloc.localization.fit.optima import Optima
@@ -35,14 +35,14 @@ from magloc.localization.model_errors import with_model_errors
 from magloc.localization.search.known_position import MomentSearch
 from magloc.localization.search.moving_array import optima_at_rest, stacked_errors, stacked_rows
 from magloc.localization.search.multi_source import NOISE_ALONE, MultiSourceSearch
-from magloc.localization.search.single_source import N_UNKNOWNS, SingleSourceSearch, kept_search
+from magloc.localization.search.single_source import N_UNKNOWNS, SingleSourceSearch, cached_search
 from magloc.localization.uncertainty.covariance import solutions_of
 from magloc.localization.uncertainty.pose_covariance import pose_covariances
 from magloc.localization.uncertainty.range_interval import is_detected
 from magloc.measurement.nuisances import ambient_in_array, with_eddies_as_offsets
 from magloc.measurement.plausibility import warn_of_doubts, warn_of_moments
 from magloc.measurement.pose import PosesOfRows, rates_of, with_stated_pose
-from magloc.measurement.rows import NO_SIGNAL, WhitenedRows, checked_rows, whitened_rows
+from magloc.measurement.rows import NO_SIGNAL, WhitenedRows, check_rows, whitened_rows
 from magloc.readings import Readings, as_readings, without_saturated
 
 if TYPE_CHECKING:
@@ -118,7 +118,7 @@ class Locator:
             self._fewest = 3 * self._search.position_m.shape[1]
         elif free and not array.channel_is_scalar.any():
             alike = prior == NOTHING_KNOWN
-            self._search, self._fewest = kept_search(array) if alike else SingleSourceSearch(array, prior=prior), 6
+            self._search, self._fewest = cached_search(array) if alike else SingleSourceSearch(array, prior=prior), 6
         else:
             number = None if sources == "auto" else int(sources)
             self._search = MultiSourceSearch(array, n_sources=number, prior=prior, seed=seed)
@@ -156,43 +156,43 @@ class Locator:
             In the order of the rows, in the array's frame. Several sources keep their number from row to row where
             they can be followed, at first the strongest comes first.
         """
-        readings = checked_rows(self.array, readings_T)
+        readings = check_rows(self.array, readings_T)
         ambient = None if ambient_T is None else np.asarray(ambient_T, dtype=np.float64)
         times = np.arange(len(readings), dtype=np.float64) if time_s is None else time_s
         parts = []
         for begin in range(0, len(readings), self._at_once):
             some = slice(begin, begin + self._at_once)
             index = np.arange(len(readings))[some]
-            parts.append(self._credible(index, readings[some], None if ambient is None else ambient[some]))
+            parts.append(self._fit_without_faults(index, readings[some], None if ambient is None else ambient[some]))
             if progress is not None:
                 progress(len(index))
         fixes = Fixes.joined(parts)
         if fixes.solutions.position_m.shape[1] > 1 and not isinstance(self._search, MomentSearch):
             fixes = replace(fixes, solutions=in_stable_order(fixes.solutions))
-        near, bodies = too_near(self.array, fixes, readings, ambient, self.body_length_m), None
+        near, bodies = is_too_near(self.array, fixes, readings, ambient, self.body_length_m), None
         if self.body_length_m is None:
             known_place = isinstance(self._search, MomentSearch)
             bodies = partial(body_covariances, self.array, fixes, readings, ambient, known_place=known_place)
         return replace(fixes, time_s=times, too_near=near, bodies=bodies)
 
-    def _credible(self, index: IntArray, readings: FloatArray, ambient: FloatArray | None) -> Fixes:
+    def _fit_without_faults(self, index: IntArray, readings: FloatArray, ambient: FloatArray | None) -> Fixes:
         """Fixes of some of the rows, without the sensors that contradict all others."""
 
         def refit(rows: IntArray, other: FloatArray) -> Fixes:
-            return self._plain(index[rows], other, None if ambient is None else ambient[rows])
+            return self._fit_with_all_sensors(index[rows], other, None if ambient is None else ambient[rows])
 
-        fixes = self._plain(index, readings, ambient)
+        fixes = self._fit_with_all_sensors(index, readings, ambient)
         if not self.exclude_faulty:
             return fixes
         free = not isinstance(self._search, MomentSearch)
-        return without_faulty_sensors(self.array, fixes, refit, readings, ambient, free_position=free)
+        return exclude_faulty_sensors(self.array, fixes, refit, readings, ambient, free_position=free)
 
-    def _plain(self, index: IntArray, readings: FloatArray, ambient: FloatArray | None) -> Fixes:
+    def _fit_with_all_sensors(self, index: IntArray, readings: FloatArray, ambient: FloatArray | None) -> Fixes:
         """Fixes of some of the rows with all sensors: detection, search, uncertainty."""
         search = self._search
         if isinstance(search, MomentSearch):
-            search = search.of_rows(index)
-        found = _Rows(len(readings), self.body_length_m, self.array.row_ambient_uncertainty_T)
+            search = search.select(index)
+        found = _FixCollector(len(readings), self.body_length_m, self.array.row_ambient_uncertainty_T)
         for rows in whitened_rows(self.array, readings, ambient, self._searched_at_once):
             if rows.n_differences < self._fewest:
                 found.refuse(
@@ -205,7 +205,7 @@ class Locator:
         return found.fixes()
 
 
-class _Rows:
+class _FixCollector:
     """Collects what is found of n rows, block by block."""
 
     def __init__(self, n: int, body_length_m: float | None = 0.0, ambient_sigma_T: float = 0.0) -> None:
@@ -223,7 +223,7 @@ class _Rows:
 
     def fill(self, rows: WhitenedRows, search: Callable[[WhitenedRows], list[Optima]]) -> None:
         """Detection, search and uncertainty of a block."""
-        loud, silent = rows, rows.silent
+        loud, silent = rows, rows.is_silent
         if np.count_nonzero(silent):
             self.refuse(rows.index[silent], NO_SIGNAL)
             loud = rows.select(~silent)
@@ -282,7 +282,7 @@ def fit_at_rest(
     in the world frame. `poses`: with their errors, which count as noise.
     """
     rows = stacked_rows(array, readings_T, origins_m, R_world_from_array, ambient_T)
-    found = _Rows(1)
+    found = _FixCollector(1)
     if rows.n_differences < N_UNKNOWNS:
         reason = f"{len(readings_T)} rows give {rows.n_differences} independent differences, {N_UNKNOWNS} are needed"
         found.refuse(rows.index, reason)
@@ -364,7 +364,7 @@ def locate(
     stated = with_stated_pose(array, rows).pose
     array = _with_eddies(array, rows)
     locator = Locator(
-        array if stated is None else _seeing_turned_field(array, stated, rows, ambient),
+        array if stated is None else _with_attitude_as_field_error(array, stated, rows, ambient),
         sources=sources,
         position_m=place,
         prior=prior,
@@ -400,7 +400,7 @@ def _with_eddies(array: SensorArray, rows: Readings) -> SensorArray:
     return with_eddies_as_offsets(array, ambient_in_array(array, rows.values_T, rows.ambient_T), rate_rad_s)
 
 
-def _seeing_turned_field(
+def _with_attitude_as_field_error(
     array: SensorArray, pose: PoseUncertainty, rows: Readings, ambient_T: FloatArray | None
 ) -> SensorArray:
     """The array where errors of the attitude, rms over the rows, make the ambient field uncertain for moduli."""

@@ -63,7 +63,7 @@ def with_model_errors(
 ) -> list[tuple[Optima, FloatArray]]:
     """Optima refined with the errors that matter, and the lengths (b,) of their rows' bodies, 0 where none does."""
     rows, none = optima.rows, np.zeros(len(optima.rows))
-    point = body_length_m == 0.0 or (body_length_m is None and _all_far(optima.fits.q))
+    point = body_length_m == 0.0 or (body_length_m is None and _is_far(optima.fits.q))
     ambient_sigma_T = ambient_sigma_T if rows.model.sees_moduli else 0.0
     if (point and not ambient_sigma_T) or optima.position_m is not None or not len(optima.of_row):
         return [(optima, none)]
@@ -83,7 +83,7 @@ def with_model_errors(
     matters[solved] |= ambient_sigma_T > 0.0
     if not matters.any():
         return [(optima, none)]
-    refined = _refined(optima.select(matters), lengths[matters], ambient_sigma_T, known)
+    refined = _refine(optima.select(matters), lengths[matters], ambient_sigma_T, known)
     # A row of which no fit converged again stays that of a point in a known field.
     lost = np.bincount(refined.of_row, minlength=len(refined.rows)) == 0
     matters[np.flatnonzero(matters)[lost]] = False
@@ -93,13 +93,13 @@ def with_model_errors(
     return result
 
 
-def _all_far(q: FloatArray) -> bool:
+def _is_far(q: FloatArray) -> bool:
     """Whether all sources are so far from the centroid that they are near to no sensor: most of them, cheaply."""
     s = q[..., 3]
     return np.count_nonzero(np.abs(s) < _FAR_S) == s.size
 
 
-def _refined(optima: Optima, lengths: FloatArray, ambient_sigma_T: float, errors: FloatArray | None) -> Optima:
+def _refine(optima: Optima, lengths: FloatArray, ambient_sigma_T: float, errors: FloatArray | None) -> Optima:
     """Optima with errors linearised at the best fit of every row, refined, linearised there again.
 
     The errors at the first best fits may be known.
@@ -123,7 +123,7 @@ def _refined(optima: Optima, lengths: FloatArray, ambient_sigma_T: float, errors
         fits=fits.rows(kept),
         of_row=optima.of_row[kept],
         merged=merged[kept],
-        bent=_is_bent(rows.model, fits, optima.of_row, ambient_sigma_T)[kept],
+        bent=_is_nonlinear(rows.model, fits, optima.of_row, ambient_sigma_T)[kept],
     )
 
 
@@ -137,7 +137,7 @@ def model_errors(
     return np.concatenate(parts, axis=-1)
 
 
-def _is_bent(model: WhitenedModel, fits: JointFits, of_row: IntArray, ambient_sigma_T: float) -> BoolArray:
+def _is_nonlinear(model: WhitenedModel, fits: JointFits, of_row: IntArray, ambient_sigma_T: float) -> BoolArray:
     """Whether moduli follow an error of the ambient field along a curve: second order beyond noise, (f,)."""
     if not ambient_sigma_T:
         return np.zeros(len(of_row), dtype=bool)

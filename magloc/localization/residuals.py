@@ -10,7 +10,7 @@ from arrays.typing import FloatArray
 from magloc.fields import dipole
 from magloc.localization.fit.fixes import Fixes
 from magloc.localization.fit.results import Fix
-from magloc.measurement.rows import checked_rows, whitened_rows
+from magloc.measurement.rows import check_rows, whitened_rows
 
 _ROWS_AT_ONCE = 256
 
@@ -24,7 +24,7 @@ def fix_residuals(
     the χ² of its solution; a fitted channel's own variance is therefore a little below 1. NaN where there is no reading
     or no solution, and for sensors that the fix left out.
     """
-    readings = checked_rows(array, readings_T)
+    readings = check_rows(array, readings_T)
     dropped = np.array([[name in names for name in array.ids] for names in fixes.dropped_sensors], dtype=bool)
     unused = ~fixes.solved[:, None] | dropped.reshape(-1, array.n_sensors)[:, array.channel_sensor]
     used = np.where(unused, np.nan, readings)

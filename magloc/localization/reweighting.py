@@ -13,8 +13,8 @@ from scipy.special import fdtri
 
 from arrays.typing import FloatArray, IntArray
 from magloc.levels import SENSOR_FALSE_ALARM
-from magloc.localization.fit.gauss_newton import JointFits, first_alike, refine
-from magloc.localization.leave_one_out import Weighted, falls_without_sensors, weighted
+from magloc.localization.fit.gauss_newton import JointFits, first_equal, refine
+from magloc.localization.leave_one_out import Weighted, chi2_falls_without_sensors, weight_channels
 from magloc.measurement.whitened import WhitenedModel
 
 DEGREES_OF_FREEDOM = 4.0
@@ -64,29 +64,29 @@ class WeightedFits:
             of_fit[list(some)] = LEAST_WEIGHT
         return weight
 
-    def _weighted(self, row: IntArray, weight: FloatArray) -> Weighted:
-        return weighted(self.problem.rows(row), self.raw[row], weight[:, self.problem.channel_sensor])
+    def _weight(self, row: IntArray, weight: FloatArray) -> Weighted:
+        return weight_channels(self.problem.rows(row), self.raw[row], weight[:, self.problem.channel_sensor])
 
-    def refined(self, row: IntArray, q: FloatArray, mu: FloatArray, weight: FloatArray) -> JointFits:
+    def refine(self, row: IntArray, q: FloatArray, mu: FloatArray, weight: FloatArray) -> JointFits:
         """Weighted fits of rows (f,) from sources (f, K, …)."""
-        return self._refined(self._weighted(row, weight), q, mu, max_iterations=60)
+        return self._refine_rows(self._weight(row, weight), q, mu, max_iterations=60)
 
-    def _refined(self, lighter: Weighted, q: FloatArray, mu: FloatArray, max_iterations: int) -> JointFits:
+    def _refine_rows(self, lighter: Weighted, q: FloatArray, mu: FloatArray, max_iterations: int) -> JointFits:
         """Fits of weighted rows (f,) from sources (f, K, …)."""
         problem, raw = lighter
         free = np.full((q.shape[1], 3), self.free_position)
         return refine(problem, problem.whiten(raw), q, mu, free=free, max_iterations=max_iterations)
 
-    def falls(
+    def chi2_falls(
         self, row: IntArray, q: FloatArray, mu: FloatArray, weight: FloatArray | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """:func:`falls_without_sensors` of fits of rows (f,)."""
-        at = (self.problem.rows(row), self.raw[row]) if weight is None else self._weighted(row, weight)
-        return falls_without_sensors(*at, q, mu, self.sensor_channels, free_position=self.free_position)
+        """:func:`chi2_falls_without_sensors` of fits of rows (f,)."""
+        at = (self.problem.rows(row), self.raw[row]) if weight is None else self._weight(row, weight)
+        return chi2_falls_without_sensors(*at, q, mu, self.sensor_channels, free_position=self.free_position)
 
     def misfit(self, row: IntArray, q: FloatArray, mu: FloatArray, weight: FloatArray) -> FloatArray:
         """Squared residuals (f, N) of the sensors of some rows, the common field being that of the weighted fit."""
-        return self._squares(self._weighted(row, weight), q, mu, weight)
+        return self._squares(self._weight(row, weight), q, mu, weight)
 
     def _squares(self, lighter: Weighted, q: FloatArray, mu: FloatArray, weight: FloatArray) -> FloatArray:
         """Squared residuals (f, N) of the sensors of some weighted rows."""
@@ -105,7 +105,7 @@ class WeightedFits:
         ratio = np.median(misfit[:, standing] / self.count[standing], axis=1) / _MEDIAN_RATIO
         return np.maximum(1.0, ratio)
 
-    def limits_of(self, scale2: float, n_sources: int) -> FloatArray:
+    def square_limits(self, scale2: float, n_sources: int) -> FloatArray:
         """Limits (N,) of the squared residuals over the variance of the noise; wider where that is a guess."""
         if scale2 < _UNDERSTATED:
             return self.limits
@@ -115,7 +115,7 @@ class WeightedFits:
         quantile: FloatArray = fdtri(count, spare, 1.0 - SENSOR_FALSE_ALARM / self.n_sensors)
         return np.array(count * quantile, dtype=np.float64)
 
-    def reweighted(
+    def reweight(
         self, row: IntArray, q: FloatArray, mu: FloatArray, weight: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Squared residuals (f, N) of the sensors after reweighting from starts, and the scale of the noise."""
@@ -124,9 +124,9 @@ class WeightedFits:
         live = twin = np.arange(len(row))
         for n in range(_N_REWEIGHTINGS + 1):
             for some in np.array_split(live, -(-live.size // _FITS_AT_ONCE)):
-                lighter = self._weighted(row[some], weight[some])
+                lighter = self._weight(row[some], weight[some])
                 if n:
-                    fits = self._refined(lighter, q[some], mu[some], max_iterations=8)
+                    fits = self._refine_rows(lighter, q[some], mu[some], max_iterations=8)
                     q[some], mu[some] = fits.q, fits.mu
                 misfit[some] = self._squares(lighter, q[some], mu[some], weight[some])
             scale2[live] = self.scale2(misfit[live])
@@ -135,7 +135,7 @@ class WeightedFits:
             moved = np.any(np.abs(new - weight[live]) >= 1e-3 * weight[live], axis=1)
             live = live[moved]
             weight[live] = new[moved]
-            twin = np.minimum(twin, first_alike(row, q, weight, _SAME_PLACE, _SAME_WEIGHT))
+            twin = np.minimum(twin, first_equal(row, q, weight, _SAME_PLACE, _SAME_WEIGHT))
             live = live[twin[live] == live]
             if not live.size:
                 break

@@ -113,12 +113,12 @@ def suitable_dipole(array: SensorArray) -> tuple[FloatArray, FloatArray]:
     direction = np.array([2.0, 1.0, 2.0]) / 3.0
     distance = _NICE_RANGE * array.circumradius
     field_T = _NICE_SIGNAL * float(np.median(array.channel_noise_T))
-    moment = rounded(field_T * distance**3 / dipole.MU0_OVER_4PI)
+    moment = one_digit(field_T * distance**3 / dipole.MU0_OVER_4PI)
     step = 10.0 ** np.floor(np.log10(array.circumradius) - 1.0)
     position = np.round((array.centroid + distance * direction) / step) * step
     return position, np.array([0.0, 0.0, moment])
 
 
-def rounded(value: float) -> float:
+def one_digit(value: float) -> float:
     """A positive number to one significant digit."""
     return float(f"{value:.0e}")

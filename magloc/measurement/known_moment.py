@@ -41,7 +41,7 @@ class KnownMoment:
         """Modulus that is expected."""
         return float(np.linalg.norm(self.value_Am2))
 
-    def widened(self, share: float) -> KnownMoment:
+    def widen(self, share: float) -> KnownMoment:
         """The same with σ of some share of the modulus at least."""
         return replace(self, sigma_Am2=max(self.sigma_Am2, share * self.modulus_Am2))
 

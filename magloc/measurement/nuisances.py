@@ -31,7 +31,7 @@ _TURN, _GAIN, _FIELD, _INDUCED, _EDDY = 0, 3, 6, 9, 18
 
 
 @dataclass(frozen=True)
-class Drift:
+class BackgroundDrift:
     """A background of every channel that is no signal, in units of the noise of its readings.
 
     Attributes
@@ -48,7 +48,7 @@ class Drift:
     about_s: float = 0.0
 
     @classmethod
-    def of(cls, background: Background, time_s: FloatArray) -> Drift | None:
+    def of(cls, background: Background, time_s: FloatArray) -> BackgroundDrift | None:
         r"""What a background is over rows at some times.
 
         A random walk that adds :math:`2π f_c Δt` of the noise in every row leaves in its steady state what a high-pass
@@ -97,9 +97,9 @@ class SensorErrors:
     about_s: float = 0.0
 
     @classmethod
-    def of(cls, array: SensorArray, background: Drift | None = None) -> SensorErrors:
+    def of(cls, array: SensorArray, background: BackgroundDrift | None = None) -> SensorErrors:
         """All lasting errors that an array states, and a background that drifts."""
-        background = background or Drift()
+        background = background or BackgroundDrift()
         of_sensor: list[tuple[int, int]] = []
         sigma: list[float] = []
         for i, sensor in enumerate(array.sensors):
@@ -170,7 +170,7 @@ class SensorErrors:
             sensor, column = self.of_sensor.T
             known = (column >= _FIELD).all()
             of_axes = np.zeros((array.n_sensors, 3, _FIELD)) if known else calibration_errors(array, readings_T)
-            of_field = _of_fields(array)
+            of_field = _field_jacobian(array)
             of_axes = np.concatenate([of_axes, of_field], axis=-1)
             if (column >= _INDUCED).any():
                 ambient_T = ambient_in_array(array, readings_T)
@@ -211,7 +211,7 @@ def with_eddies_as_offsets(array: SensorArray, ambient_T: FloatArray, rate_rad_s
     return replace(array, sensors=sensors)
 
 
-def _of_fields(array: SensorArray) -> FloatArray:
+def _field_jacobian(array: SensorArray) -> FloatArray:
     """Derivative (N, 3, 3) of readings by a field in the array's frame; a modulus sees it along the ambient field."""
     rows = np.nan_to_num(array.linear_gain(array.ambient_fields))
     return np.where(array.sensor_channels[..., None] >= 0, rows[array.sensor_channels], 0.0)

@@ -50,37 +50,37 @@ _MOMENTS_Am2 = (1e-9, 1e7)  # a grain of magnetite, the largest ships
 def usable_readings(array: SensorArray, values: Readings | ArrayLike) -> Readings:
     """Readings without those that saturate, in their ambient field; warns of what is hardly as stated."""
     readings = as_readings(values)
-    used = _usable(array, readings)
-    _warn_of(doubts(array, readings, used))
+    used = _drop_saturated(array, readings)
+    _warn(doubts(array, readings, used))
     return used
 
 
 def warn_of_doubts(array: SensorArray, readings: Readings) -> None:
     """Warn of what in readings is hardly as stated."""
-    _warn_of(doubts(array, readings))
+    _warn(doubts(array, readings))
 
 
 def warn_of_array(array: SensorArray, readings: Readings | None = None) -> None:
     """Warn of an array whose size is hardly in metres."""
-    _warn_of(array_doubts(array, readings))
+    _warn(array_doubts(array, readings))
 
 
 def warn_of_record(array: SensorArray, readings: Readings) -> None:
     """Warn of what in readings alone is hardly as stated."""
-    _warn_of(record_doubts(array, readings))
+    _warn(record_doubts(array, readings))
 
 
 def warn_of_moments(distance_m: ArrayLike, moment_Am2: ArrayLike) -> None:
     """Warn of moments (n, 3) that no object has at such distances (n,) from the sensors, NaN where there is none."""
-    _warn_of(moment_doubts(distance_m, moment_Am2))
+    _warn(moment_doubts(distance_m, moment_Am2))
 
 
-def _warn_of(sentences: Iterator[str]) -> None:
+def _warn(sentences: Iterator[str]) -> None:
     for doubt in sentences:
         _LOG.warning(doubt)
 
 
-def _usable(array: SensorArray, readings: Readings) -> Readings:
+def _drop_saturated(array: SensorArray, readings: Readings) -> Readings:
     return in_world_field(without_saturated(readings, array), array)
 
 
@@ -95,10 +95,10 @@ def doubts(array: SensorArray, readings: Readings, used: Readings | None = None)
 
 def record_doubts(array: SensorArray, readings: Readings, used: Readings | None = None) -> Iterator[str]:
     """Sentences on readings alone, of units and clocks for twenty rows or more."""
-    yield from _of_origin(readings)
-    used = _usable(array, readings) if used is None else used
+    yield from _origin_doubts(readings)
+    used = _drop_saturated(array, readings) if used is None else used
     if len(readings) < FEWEST_ROWS:
-        yield from _of_ambient(array, used)
+        yield from _ambient_doubts(array, used)
         return
     read = np.isfinite(readings.values_T)
     saturated = 1.0 - np.isfinite(used.values_T).sum() / max(int(read.sum()), 1)
@@ -112,11 +112,13 @@ def record_doubts(array: SensorArray, readings: Readings, used: Readings | None 
                 f" {unit}: are they in nT, is noise_nT right, were they filtered?"
             )
     ambient_T = array.ambient_fields if used.ambient_T is None else used.ambient_T
-    of_unit = list(_of_moduli(used.values_T[:, array.channel_is_scalar], _median(np.linalg.norm(ambient_T, axis=-1))))
-    yield from of_unit or _of_ambient(array, used)
+    of_unit = list(
+        _moduli_doubts(used.values_T[:, array.channel_is_scalar], _median(np.linalg.norm(ambient_T, axis=-1)))
+    )
+    yield from of_unit or _ambient_doubts(array, used)
     if used.pose is not None:
-        yield from _of_path(used.time_s, used.pose[0])
-        yield from _of_attitude(array, used, used.pose[1])
+        yield from _path_doubts(used.time_s, used.pose[0])
+        yield from _attitude_doubts(array, used, used.pose[1])
 
 
 def array_doubts(array: SensorArray, readings: Readings | None = None) -> Iterator[str]:
@@ -155,7 +157,7 @@ def moment_doubts(distance_m: ArrayLike, moment_Am2: ArrayLike) -> Iterator[str]
     )
 
 
-def _of_origin(readings: Readings) -> Iterator[str]:
+def _origin_doubts(readings: Readings) -> Iterator[str]:
     farthest_m = farthest_place(readings)
     if farthest_m > FARTHEST_M:
         yield (
@@ -208,7 +210,7 @@ def _sixth_difference(values: FloatArray, lag: int) -> FloatArray:
     return values / np.sqrt(924.0)  # 1² + 6² + 15² + 20² + 15² + 6² + 1²
 
 
-def _of_moduli(moduli_T: FloatArray, ambient_T: float) -> Iterator[str]:
+def _moduli_doubts(moduli_T: FloatArray, ambient_T: float) -> Iterator[str]:
     """Whether scalar sensors read about the ambient field; what has both signs is left of it where it was taken off."""
     read = _median(moduli_T)
     unlike = read < ambient_T / _OTHER_UNIT or read > ambient_T * _OTHER_UNIT
@@ -219,7 +221,7 @@ def _of_moduli(moduli_T: FloatArray, ambient_T: float) -> Iterator[str]:
         )
 
 
-def _of_ambient(array: SensorArray, used: Readings) -> Iterator[str]:
+def _ambient_doubts(array: SensorArray, used: Readings) -> Iterator[str]:
     """Whether the moduli that sensors read are those of the stated ambient field, in rows where no source is near.
 
     An error of that field is the same in most rows and for all sensors, unlike the field of a source.
@@ -268,7 +270,7 @@ def _shortest_half(values: FloatArray) -> tuple[float, float]:
     return float(ordered[k] + ordered[k + n - 1]) / 2.0, float(widths[k]) / 2.0
 
 
-def _of_path(time_s: FloatArray, position_m: FloatArray) -> Iterator[str]:
+def _path_doubts(time_s: FloatArray, position_m: FloatArray) -> Iterator[str]:
     known = np.isfinite(time_s) & np.isfinite(position_m).all(axis=1)
     time_s, position_m = time_s[known], position_m[known]
     dt_s = np.diff(time_s)
@@ -285,7 +287,7 @@ def _of_path(time_s: FloatArray, position_m: FloatArray) -> Iterator[str]:
         yield f"the array moves at {wrong:.2g} m/s by its poses: are times in s, and places in m?"
 
 
-def _of_attitude(array: SensorArray, readings: Readings, rotation: Rotation) -> Iterator[str]:
+def _attitude_doubts(array: SensorArray, readings: Readings, rotation: Rotation) -> Iterator[str]:
     """Whether a field of steady modulus, which is the Earth's, stands still in the world.
 
     It is what vector sensors read on average, else the ambient field of the rows.

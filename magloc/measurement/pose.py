@@ -67,27 +67,27 @@ class ArrayPose:
         """Velocity of the reference point in the world."""
         return self.velocity_m_s - self.R_world_from_array @ np.cross(self.rate_rad_s, self.lever_arm_m)
 
-    def turned(self, error: FloatArray | None = None) -> FloatArray:
+    def true_attitude(self, error: FloatArray | None = None) -> FloatArray:
         """True attitude, array to world (..., 3, 3), where the pose has errors (..., 12)."""
         R = self.R_world_from_array
         return R if error is None else R @ rotation_matrix(error[..., TURN])
 
-    def in_array(self, source: FloatArray, error: FloatArray | None = None) -> FloatArray:
+    def to_array(self, source: FloatArray, error: FloatArray | None = None) -> FloatArray:
         """Position and moment (..., 6) of sources (..., 6) of the world, in the true axes of the array."""
         if error is None:
             R = self.R_world_from_array
             return np.concatenate([(source[..., :3] - self.origin_m) @ R, source[..., 3:6] @ R], axis=-1)
-        R = self.turned(error)
+        R = self.true_attitude(error)
         offset = source[..., :3] - self.reference_m - error[..., SHIFT]
         position = (offset[..., None, :] @ R)[..., 0, :] - self.lever_arm_m - error[..., LEVER]
         return np.concatenate([position, (source[..., None, 3:6] @ R)[..., 0, :]], axis=-1)
 
     def error_jacobian(self, in_array: FloatArray, error: FloatArray) -> FloatArray:
-        """Derivative (..., 6, 12) of :meth:`in_array`, which is given, by the errors."""
+        """Derivative (..., 6, 12) of :meth:`to_array`, which is given, by the errors."""
         right = turn_of_change(-error[..., TURN])
         D = np.zeros((*in_array.shape, N_POSE))
         D[..., :3, TURN] = cross_matrix(in_array[..., :3] + self.lever_arm_m + error[..., LEVER]) @ right
-        D[..., :3, SHIFT] = -np.swapaxes(self.turned(error), -1, -2)
+        D[..., :3, SHIFT] = -np.swapaxes(self.true_attitude(error), -1, -2)
         D[..., :3, LEVER] = -np.eye(3)
         D[..., 3:, TURN] = cross_matrix(in_array[..., 3:]) @ right
         return D
@@ -220,19 +220,19 @@ class PoseErrors:
         return self.of_pose.size
 
     @property
-    def changes(self) -> BoolArray:
+    def is_changing(self) -> BoolArray:
         """Whether every one changes (n,)."""
         return np.isfinite(self.lasts_s)
 
     @property
-    def of_mounting(self) -> BoolArray:
+    def is_of_mounting(self) -> BoolArray:
         """Whether every one is a constant of the mounting or of the lever arm (n,)."""
-        return np.asarray(~self.changes & (self.of_pose < FIELD.start))
+        return np.asarray(~self.is_changing & (self.of_pose < FIELD.start))
 
     @property
-    def of_field(self) -> BoolArray:
+    def is_of_field(self) -> BoolArray:
         """Whether every one is a constant of the ambient field (n,)."""
-        return np.asarray(~self.changes & (self.of_pose >= FIELD.start) & (self.of_pose < N_POSE))
+        return np.asarray(~self.is_changing & (self.of_pose >= FIELD.start) & (self.of_pose < N_POSE))
 
     def step(self, dt_s: float | FloatArray) -> tuple[FloatArray, FloatArray]:
         """What remains of every error after steps (...), and the standard deviation of what is added: (..., n) each."""
@@ -269,7 +269,7 @@ class PoseErrors:
         constant = np.repeat(
             [known.attitude_constant_rad, 0.0, arm_m, constant_T, known.time_constant_s], [3, 3, 3, 3, 1]
         )
-        size = np.where(self.changes, changing[..., self.of_pose], constant[self.of_pose])
+        size = np.where(self.is_changing, changing[..., self.of_pose], constant[self.of_pose])
         shifts = np.flatnonzero((self.of_pose >= SHIFT.start) & (self.of_pose < SHIFT.stop))
         if known.position_white_m:
             size[..., shifts[3:6]] = known.position_white_m
@@ -277,7 +277,7 @@ class PoseErrors:
             size[..., shifts[-3:]] = between_m[..., None]
         return unit[..., self.of_pose] * size[..., None, :]
 
-    def of_rows(
+    def over_rows(
         self, array: SensorArray, time_s: FloatArray, poses: Sequence[ArrayPose], sigmas: Sequence[FloatArray | None]
     ) -> PosesOfRows | None:
         """Errors of several rows together, as they last between these; None where there are none."""
@@ -285,8 +285,8 @@ class PoseErrors:
             return None
         apart_s = np.abs(time_s[:, None] - time_s)
         of_all = [self.effect(pose, sigma) for pose, sigma in zip(poses, sigmas, strict=True)]
-        parts: list[list[FloatArray]] = [[own[:, ~self.changes]] for own in of_all]
-        for lasts_s in np.unique(self.lasts_s[self.changes]).tolist():
+        parts: list[list[FloatArray]] = [[own[:, ~self.is_changing]] for own in of_all]
+        for lasts_s in np.unique(self.lasts_s[self.is_changing]).tolist():
             share = np.linalg.cholesky(np.exp(-apart_s / lasts_s) if lasts_s else np.eye(len(time_s)))
             for i, own in enumerate(of_all):
                 parts[i].append(np.kron(share[i], own[:, self.lasts_s == lasts_s]))
@@ -300,7 +300,7 @@ def channel_errors(
 
     The source (6,) stands in the world, the ambient field (N, 3) in the array's axes.
     """
-    in_array = pose.in_array(source)
+    in_array = pose.to_array(source)
     position, moment = in_array[:3], in_array[3:]
     H = channel_jacobian(array, position, moment, ambient_T) @ pose.error_jacobian(in_array, _NO_ERROR)
     return np.asarray((H + pose.ambient_jacobian(array, in_array, _NO_ERROR, ambient_T)) @ effect)

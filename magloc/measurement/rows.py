@@ -79,7 +79,7 @@ class WhitenedRows:
         return signals_of(self.model, self.y)
 
     @property
-    def silent(self) -> BoolArray:
+    def is_silent(self) -> BoolArray:
         """Whether the differences (b,) are rounding errors."""
         squares = np.vecdot(self.y, self.y) if self.model.sees_moduli else self.energy
         return np.asarray(squares < _SILENT * self.n_differences)
@@ -87,7 +87,7 @@ class WhitenedRows:
     @cached_property
     def energy(self) -> FloatArray:
         """Sums of squared differences (b,), as they are without a source."""
-        without = self.y - self.model.of_ambient if self.model.sees_moduli else self.y
+        without = self.y - self.model.ambient_signals if self.model.sees_moduli else self.y
         return np.asarray(np.vecdot(without, without))
 
 
@@ -104,7 +104,7 @@ def whitened_rows(
             yield WhitenedRows(index, mask, readings, model, raw, model.whiten(raw), of_rows.n_differences)
 
 
-def checked_rows(array: SensorArray, readings_T: ArrayLike) -> FloatArray:
+def check_rows(array: SensorArray, readings_T: ArrayLike) -> FloatArray:
     """Raw readings (n, C) of an array [T] as numbers; ValueError where they have another shape."""
     readings = fields(readings_T)
     if readings.ndim != 2 or readings.shape[1] != array.n_channels:
@@ -182,7 +182,7 @@ def _model_of_one_row(array: SensorArray, whitening: Whitening) -> WhitenedModel
     return WhitenedModel.of(array, whitening, array.ambient_fields[None])
 
 
-def joined(parts: Sequence[Readings]) -> Readings:
+def concatenate_readings(parts: Sequence[Readings]) -> Readings:
     """Readings of several files, one after the other.
 
     Raises ValueError where some have what others lack.
@@ -193,15 +193,15 @@ def joined(parts: Sequence[Readings]) -> Readings:
     return Readings(
         np.concatenate([part.values_T for part in parts]),
         time_s=np.concatenate([part.time_s for part in parts]),
-        array_position_m=_all_or_none([part.array_position_m for part in parts]),
+        array_position_m=_concatenate_columns([part.array_position_m for part in parts]),
         array_rotation=Rotation.concatenate(rotations) if rotations else None,
-        ambient_T=_all_or_none([part.ambient_T for part in parts]),
-        pose_sigma=_all_or_none([part.pose_sigma for part in parts]),
-        interpolated_m=_all_or_none([part.interpolated_m for part in parts]),
+        ambient_T=_concatenate_columns([part.ambient_T for part in parts]),
+        pose_sigma=_concatenate_columns([part.pose_sigma for part in parts]),
+        interpolated_m=_concatenate_columns([part.interpolated_m for part in parts]),
     )
 
 
-def _all_or_none(parts: Sequence[FloatArray | None]) -> FloatArray | None:
+def _concatenate_columns(parts: Sequence[FloatArray | None]) -> FloatArray | None:
     given = [part for part in parts if part is not None]
     if given and len(given) < len(parts):
         raise ValueError("Input readings must have the same columns; instead received some with more than others.")

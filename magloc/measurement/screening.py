@@ -105,12 +105,12 @@ class _Scene:
         pieces = np.split(np.arange(n), cuts)
         kept = np.zeros(0, np.intp)
         for start in sorted(pieces, key=len, reverse=True)[:_STARTS]:
-            grown = self._grown(start, [piece for piece in pieces if piece is not start])
+            grown = self._grow(start, [piece for piece in pieces if piece is not start])
             kept = grown if len(grown) > len(kept) else kept
             if len(kept) > n // 2:
                 break
-        kept = self._without_outliers(kept)
-        kept = self._grown(kept, [np.array([row]) for row in np.setdiff1d(np.arange(n), kept)])
+        kept = self._drop_outliers(kept)
+        kept = self._grow(kept, [np.array([row]) for row in np.setdiff1d(np.arange(n), kept)])
         wild = np.ones(n, np.bool_)
         wild[kept] = False
         for piece in pieces:
@@ -127,7 +127,7 @@ class _Scene:
         away, back = values[piece[0]] - values[before[-1]], values[piece[-1]] - values[after[0]]
         return bool(away * back > 0.5 * max(away**2, back**2))
 
-    def _grown(self, kept: IntArray, others: Sequence[IntArray]) -> IntArray:
+    def _grow(self, kept: IntArray, others: Sequence[IntArray]) -> IntArray:
         """The rows kept, with the other pieces that agree with them, those first that are predicted best."""
         while others:
             rest = np.concatenate(others)
@@ -157,7 +157,7 @@ class _Scene:
             others = [piece for k, piece in enumerate(others) if k not in more]
         return kept
 
-    def _without_outliers(self, kept: IntArray) -> IntArray:
+    def _drop_outliers(self, kept: IntArray) -> IntArray:
         """The rows kept, without those that the others do not predict, the worst first."""
         while len(kept) > _SUPPORTS:
             weights, values = self._inverse(kept), self._values[kept]

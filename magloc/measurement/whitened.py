@@ -133,7 +133,7 @@ class WhitenedModel(ScaledSensors):
         return len(self) == 1 or self.ambient.strides[0] == 0
 
     @cached_property
-    def of_ambient(self) -> FloatArray:
+    def ambient_signals(self) -> FloatArray:
         """Whitened readings without a source: (b, C), or (1, C) where all rows have the same."""
         alone = self.rows(np.arange(min(1, len(self)))) if self.shares_whitening and self.shares_ambient else self
         return alone.predict(np.zeros(alone.ambient.shape))

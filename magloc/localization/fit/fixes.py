@@ -130,7 +130,7 @@ class Fixes(Result, Sequence[Fix]):
         column[~self.solved] = empty
         return column
 
-    def _of_one(self, values: _Column) -> _Column:
+    def _require_one_source(self, values: _Column) -> _Column:
         if (self.solutions.n_sources[self.best[self.solved]] > 1).any():
             raise ValueError("Some rows have several sources: see fixes[row].best.sources, or to_xarray().")
         return values
@@ -143,17 +143,17 @@ class Fixes(Result, Sequence[Fix]):
     @property
     def position_m(self) -> FloatArray:
         """Positions (n, 3) of the best solutions of one source [m]; NaN where there is none."""
-        return self._column(self._of_one(self.solutions.position_m[:, 0]), np.nan)
+        return self._column(self._require_one_source(self.solutions.position_m[:, 0]), np.nan)
 
     @property
     def moment_Am2(self) -> FloatArray:
         """Moments (n, 3) of the best solutions of one source [A·m²]."""
-        return self._column(self._of_one(self.solutions.moment_Am2[:, 0]), np.nan)
+        return self._column(self._require_one_source(self.solutions.moment_Am2[:, 0]), np.nan)
 
     @property
     def covariance(self) -> FloatArray:
         """Covariances (n, 6, 6) of the best solutions of one source; (n, 3, 3) of moments where the place is known."""
-        return self._column(self._of_one(self.solutions.covariance[:, :6, :6]), np.nan)
+        return self._column(self._require_one_source(self.solutions.covariance[:, :6, :6]), np.nan)
 
     @property
     def chi2(self) -> FloatArray:
@@ -173,7 +173,7 @@ class Fixes(Result, Sequence[Fix]):
     @property
     def range_interval_m(self) -> list[Intervals]:
         """95 % sets of the range of every row with one source [m]."""
-        self._of_one(None)
+        self._require_one_source(None)
         return [intervals_of(self.solutions.ranges[i, 0]) if i >= 0 else EVERYWHERE for i in self.best]
 
     @property
@@ -259,9 +259,9 @@ class Fixes(Result, Sequence[Fix]):
             columns,
             position_m=position_m[row][:, None] + np.einsum("fab,fkb->fka", R, columns.position_m),
             moment_Am2=np.einsum("fab,fkb->fka", R, columns.moment_Am2),
-            covariance=_turned(columns.covariance, R) + added_covariance,
+            covariance=_rotate_covariances(columns.covariance, R) + added_covariance,
         )
-        bodies = None if self.bodies is None else partial(_turned_bodies, self, rotation)
+        bodies = None if self.bodies is None else partial(_rotate_body_covariances, self, rotation)
         return replace(self, solutions=moved, frame=frame, bodies=bodies)
 
     @property
@@ -309,14 +309,14 @@ class Fixes(Result, Sequence[Fix]):
         return geojson_of_fixes(self)
 
 
-def _turned(covariance: FloatArray, R: FloatArray) -> FloatArray:
+def _rotate_covariances(covariance: FloatArray, R: FloatArray) -> FloatArray:
     """Covariances (f, 3 n, 3 n) of 3-vectors that are turned by rotations (f, 3, 3)."""
     n = covariance.shape[1] // 3
     turned = np.einsum("fab,fibjc,fdc->fiajd", R, covariance.reshape(-1, n, 3, n, 3), R, optimize=True)
     return np.asarray(turned.reshape(covariance.shape))
 
 
-def _turned_bodies(fixes: Fixes, rotation: Rotation) -> FloatArray:
+def _rotate_body_covariances(fixes: Fixes, rotation: Rotation) -> FloatArray:
     """Their `body_covariance` where every row is turned."""
     of_rows = fixes.body_covariance
-    return _turned(of_rows, rotation.as_matrix()) if len(of_rows) else of_rows
+    return _rotate_covariances(of_rows, rotation.as_matrix()) if len(of_rows) else of_rows

@@ -114,7 +114,7 @@ def tangents(q: FloatArray) -> FloatArray:
 def fit_moments(problem: WhitenedModel, y: FloatArray, q: FloatArray) -> FloatArray:
     """Scaled moments (b, K, 3) that fit y (b, C) best at q, the channels linearised about the ambient field alone."""
     gain = problem.linear_gain(np.zeros_like(problem.ambient))
-    return _moment_step(problem.moment_jacobian(q, gain), y - problem.of_ambient)
+    return _moment_step(problem.moment_jacobian(q, gain), y - problem.ambient_signals)
 
 
 def _jacobian(
@@ -195,7 +195,7 @@ def refine(
     several = len(free) > 1
     found = refine_starts(
         problem,
-        y - problem.of_ambient if moduli else y,
+        y - problem.ambient_signals if moduli else y,
         q,
         mu if moduli else None,
         free=None if free.all() else free,
@@ -327,7 +327,7 @@ def _take_step(
     return moved / norm, new_mu / norm**3, share
 
 
-def first_alike(row: IntArray, q: FloatArray, weight: FloatArray, same_place: float, same_weight: float) -> IntArray:
+def first_equal(row: IntArray, q: FloatArray, weight: FloatArray, same_place: float, same_weight: float) -> IntArray:
     """The first of all fits (f,), row after row, of the same row, sources (f, K, 4) and weights (f, N) as each one."""
     first = np.arange(len(row))
     for apart in range(1, int(np.bincount(row).max(initial=0))):

@@ -103,7 +103,7 @@ def _cells_of_rows(fixes: Fixes, shown: list[int], per_m: float) -> Iterator[lis
             intervals = intervals_of(best.ranges[j, k])
             uncertain = ["weak"]
             if fixes.detected[i]:
-                uncertain = _of_uncertainty(is_observable_set(intervals), bool(best.gaussian[j, k] or misfit[i]))
+                uncertain = _uncertainty_notes(is_observable_set(intervals), bool(best.gaussian[j, k] or misfit[i]))
             flags = [*uncertain, *of_row, *(["merged"] if best.merged[j, k] else []), *behind]
             cells.append(
                 [
@@ -145,7 +145,7 @@ def _strengths(moment_Am2: FloatArray, covariance: FloatArray) -> tuple[FloatArr
     return np.where(has_direction, strength, 0.0), np.where(has_direction, sigma, spread)
 
 
-def _of_uncertainty(observable: bool, described: bool) -> list[str]:
+def _uncertainty_notes(observable: bool, described: bool) -> list[str]:
     """What has to be said of the standard deviations: described is a misfit, too, of which that alone is said."""
     if not observable:
         return ["range?"]

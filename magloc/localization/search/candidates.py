@@ -47,20 +47,20 @@ class LastBases:
     def __init__(self) -> None:
         self._kept: dict[str, tuple[bytes, SingleArray]] = {}
 
-    def of(self, problem: WhitenedModel, gain: FloatArray, row: int, candidates: FloatArray) -> SingleArray:
+    def linear(self, problem: WhitenedModel, gain: FloatArray, row: int, candidates: FloatArray) -> SingleArray:
         """Bases of one row."""
-        return self._last("bases", problem, gain, row, lambda: linear_bases(problem, gain, row, candidates))
+        return self._reuse("bases", problem, gain, row, lambda: linear_bases(problem, gain, row, candidates))
 
     def templates(
         self, problem: WhitenedModel, row: int, candidates: FloatArray, directions: FloatArray
     ) -> SingleArray:
         """Templates of one row."""
         gain = problem.gain[row]
-        return self._last(
+        return self._reuse(
             "templates", problem, gain, row, lambda: modulus_templates(problem, row, candidates, directions)
         )
 
-    def _last(
+    def _reuse(
         self, what: str, problem: WhitenedModel, gain: FloatArray, row: int, make: Callable[[], SingleArray]
     ) -> SingleArray:
         key = b"".join(values.tobytes() for values in (gain, problem.basis[row], problem.shrinkage[row]))
@@ -78,7 +78,7 @@ def linear_scores(bases: SingleArray, residual: FloatArray) -> FloatArray:
     return np.nan_to_num(scores, copy=False, nan=-1.0)
 
 
-def orthonormal_without(lost: SingleArray) -> SingleArray:
+def orthonormalisation_without(lost: SingleArray) -> SingleArray:
     """What makes components along :func:`linear_bases` Q orthonormal where orthonormal directions count no more.
 
     These have the components `lost` (k, 3 n), B of every candidate. Those that are left, ``Qᵀ r`` of readings r without
@@ -97,7 +97,7 @@ def orthonormal_without(lost: SingleArray) -> SingleArray:
     return np.array([1.0 / l00, 1.0 / l11, 1.0 / l22, i10, i20, i21], dtype=np.float32)
 
 
-def chosen_candidates(
+def best_candidates(
     bases: SingleArray,
     residual: FloatArray,
     candidates: FloatArray,
@@ -107,7 +107,7 @@ def chosen_candidates(
 ) -> NDArray[np.intp]:
     """:func:`distinct_best` of the :func:`linear_scores` of residuals (b, C), compiled.
 
-    `orthonormal`: of residuals without some directions, :func:`orthonormal_without` these.
+    `orthonormal`: of residuals without some directions, :func:`orthonormalisation_without` these.
     """
     chosen = np.zeros((len(residual), n_starts), dtype=np.intp)
     # The order of candidates does not depend on the size of a row, whose squares single precision must hold.

@@ -21,7 +21,7 @@ SAME_COSINE, SAME_CHI2 = 0.99995, 0.01
 _ROWS_TO_CHOOSE_FOR = 512
 
 
-class Ends(NamedTuple):
+class LocalOptima(NamedTuple):
     """Distinct optima of rows, best first: q (rows, starts, 4), mu (…, 3), χ², linearisations; NaN and 0 behind them.
 
     Counts (rows, 3) are the optima kept, the starts that did not converge, and all linearisations.
@@ -83,7 +83,7 @@ def search_optima(
     moments: FloatArray | None,
     keep_within: float,
     max_iterations: int,
-) -> Ends:
+) -> LocalOptima:
     """
     Return the distinct optima that starts lead to.
 
@@ -108,7 +108,7 @@ def search_optima(
     Ends
     """
     shape = starts.shape[:2]
-    out = Ends(
+    out = LocalOptima(
         np.empty((*shape, 4)),
         np.empty((*shape, 3)),
         np.empty(shape),

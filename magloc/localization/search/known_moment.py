@@ -27,7 +27,7 @@ def starts_of_known_moment(
     least, which explains nearly as much. The channels are linearised about the ambient field.
     """
     gain = problem.linear_gain(np.zeros_like(problem.ambient))
-    wide = known.widened(_PITCH)
+    wide = known.widen(_PITCH)
     unit = problem.moment(candidates, np.ones((len(candidates), 3)))[:, 0]
     q, mu = np.empty((len(residual), n_starts, 4)), np.empty((len(residual), 2 * n_starts, 3))
     for rows in rows_of_equal_gain(gain):

@@ -63,7 +63,7 @@ class MomentSearch:
         self.position_m = position
         self.prior = prior
 
-    def of_rows(self, index: IntArray) -> MomentSearch:
+    def select(self, index: IntArray) -> MomentSearch:
         """The search in some of the rows."""
         if len(self.position_m) == 1:
             return self
@@ -105,10 +105,10 @@ def _all_moments(problem: WhitenedModel, y: FloatArray, q: FloatArray) -> JointF
     mu = np.concatenate(starts, axis=1)
     row = np.repeat(np.arange(n), mu.shape[1])
     fits = refine_moments(problem.rows(row), y[row], q[row], mu.reshape(-1, n_sources, 3))
-    return _distinct(problem, y, q, fits)
+    return _distinct_optima(problem, y, q, fits)
 
 
-def _distinct(problem: WhitenedModel, y: FloatArray, q: FloatArray, fits: JointFits) -> JointFits:
+def _distinct_optima(problem: WhitenedModel, y: FloatArray, q: FloatArray, fits: JointFits) -> JointFits:
     """The best optima of every row that χ² rises between, and their opposites where χ² is even in the moment."""
     n = len(y)
     every = replace(fits, chi2=fits.chi2.copy()).reshape(n, -1)

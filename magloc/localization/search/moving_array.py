@@ -20,7 +20,7 @@ from magloc.localization.fit.gauss_newton import refine
 from magloc.localization.fit.optima import Optima
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import DISTINCT_WITHIN
-from magloc.localization.search.beam_search import Search
+from magloc.localization.search.beam_search import BeamSearch
 from magloc.measurement.pose import PosesOfRows
 from magloc.measurement.rows import WhitenedRows, ambient_fields, channels_above_ambient, whitenings_of
 from magloc.measurement.whitened import WhitenedModel
@@ -42,7 +42,7 @@ def optima_at_rest(
     optimum, for a search of its own and then until they stay.
     """
     rows = rows.with_known_moment(prior.known_moment)
-    optima = _found(rows, prior)
+    optima = _search(rows, prior)
     for step in range(_ROUNDS if errors is not None else 0):
         if errors is None or not np.isfinite(optima.fits.chi2[:1]).any():
             break
@@ -50,7 +50,7 @@ def optima_at_rest(
         place = [rows.model.position(best.q)[0, 0], rows.model.moment(best.q, best.mu)[0, 0]]
         noisy = rows.marginalise(errors(np.concatenate(place)))
         if step == 0:
-            optima = _found(noisy, prior)
+            optima = _search(noisy, prior)
             continue
         start = optima.fits
         every = np.zeros(len(start.chi2), dtype=np.intp)
@@ -59,10 +59,10 @@ def optima_at_rest(
     return optima
 
 
-def _found(rows: WhitenedRows, prior: SourcePrior) -> Optima:
+def _search(rows: WhitenedRows, prior: SourcePrior) -> Optima:
     """The optima of one search."""
     model, allowed = rows.model, partial(prior.allows, rows.model)
-    beam = Search(model.homogeneous(_candidates(model)), allowed, width=_WIDTH).first(model, rows.y)
+    beam = BeamSearch(model.homogeneous(_candidates(model)), allowed, width=_WIDTH).first_sources(model, rows.y)
     fits = beam.rows(0)
     listed = np.flatnonzero(np.isfinite(fits.chi2) & (fits.chi2 <= fits.chi2[0] + DISTINCT_WITHIN))
     of_row = np.zeros(len(listed), dtype=np.intp)

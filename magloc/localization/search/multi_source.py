@@ -25,7 +25,7 @@ from magloc.localization.fit.gauss_newton import JointFits, covariances, refine
 from magloc.localization.fit.optima import Optima
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import DISTINCT_WITHIN
-from magloc.localization.search.beam_search import Search, best_distinct, merged
+from magloc.localization.search.beam_search import BeamSearch, best_distinct, merge
 from magloc.localization.search.candidates import LastBases, allowed_positions, fine_positions, linear_scores
 from magloc.measurement.rows import WhitenedRows, check_magnitudes, whitenings_of
 
@@ -122,7 +122,7 @@ class _Levels:
         self.penalty = N_UNKNOWNS * math.log(self.n_differences)
 
         # A single source is listed with all its solutions, several ones with those of the beam.
-        self.search = Search(
+        self.search = BeamSearch(
             rows.model.homogeneous(locator._candidates),
             partial(locator.prior.allows, rows.model),
             width=8 if self.most == 1 else 3,
@@ -136,25 +136,25 @@ class _Levels:
         self.one = self._first(everything)
         beams: list[JointFits] = [self.one]
         level = np.zeros(len(self.y), dtype=np.intp)
-        weak = self._weak()
+        weak = self._is_weak()
         rows = everything[~weak]
         while len(beams) < self.most:
             if self.asked is None:
-                rows = rows[self._worth_another(rows, beams[-1].rows(rows))]
+                rows = rows[self._may_have_another(rows, beams[-1].rows(rows))]
             if not rows.size:
                 break
             before = beams[-1].rows(rows)
             last = len(beams) + 1 == self.most
             credible = self._quantile(len(beams) + 1, CREDIBLE_FIT)
             ends = last and self.locator.prior == NOTHING_KNOWN
-            wider = self.search.one_more(
+            wider = self.search.add_source(
                 self.problem.rows(rows), self.y[rows], before, credible=credible if ends else 0.0
             )
             gained = self._stands_out(before.chi2[:, 0], wider.chi2[:, 0])
             # Where no number of sources is credible so far, the search failed, at this number or at an earlier one.
             failed = np.flatnonzero(~(wider.chi2[:, 0] <= credible) & (last | ~gained))
             if failed.size:
-                wider = wider.replace(failed, self._restarted(rows[failed], wider.rows(failed)))
+                wider = wider.replace(failed, self._restart(rows[failed], wider.rows(failed)))
                 gained = self._stands_out(before.chi2[:, 0], wider.chi2[:, 0])
             # The other rows have no fit.
             nowhere = JointFits.none((len(self.y), wider.chi2.shape[1]), wider.n_sources)
@@ -167,12 +167,12 @@ class _Levels:
             at = np.flatnonzero(level == n)
             if not at.size:
                 continue
-            fewer = merged(
-                beams[n - 1].rows(at), self.search.one_less(self.problem.rows(at), self.y[at], beams[n].rows(at))
+            fewer = merge(
+                beams[n - 1].rows(at), self.search.remove_source(self.problem.rows(at), self.y[at], beams[n].rows(at))
             )
             close = np.flatnonzero(fewer.chi2[:, 0] < beams[n].chi2[at, 0] + _FAR_BEYOND * _BEYOND_NOISE)
             if n > 1 and close.size:
-                fewer = fewer.replace(close, self._restarted(at[close], fewer.rows(close), rounds=2))
+                fewer = fewer.replace(close, self._restart(at[close], fewer.rows(close), rounds=2))
             beams[n - 1] = beams[n - 1].replace(at, fewer)
             superfluous = ~self._stands_out(fewer.chi2[:, 0], beams[n].chi2[at, 0])
             unresolved = self._has_unresolved_pair(at, beams[n].rows(at))
@@ -184,7 +184,7 @@ class _Levels:
             chosen = np.array([beams[n].chi2[row, 0] for row, n in enumerate(level)])
             alone = weak | (np.isfinite(chosen) & ~self._stands_out(self.rows.energy, chosen))
         return [
-            self._listed(
+            self._list_optima(
                 n,
                 np.flatnonzero(level == n),
                 beams,
@@ -197,12 +197,12 @@ class _Levels:
         ]
 
     def _first(self, rows: IntArray) -> JointFits:
-        beam = self.search.first(self.problem, self.y)
+        beam = self.search.first_sources(self.problem, self.y)
         doubtful = rows[beam.chi2[:, 0] > self._quantile(1, CREDIBLE_FIT)]
         if doubtful.size and self.most == 1:
             wide = replace(self.search, n_starts=5 * self.search.n_starts, apart_rad=0.4 * self.search.apart_rad)
-            again = wide.first(self.problem.rows(doubtful), self.y[doubtful])
-            beam = beam.replace(doubtful, merged(beam.rows(doubtful), again))
+            again = wide.first_sources(self.problem.rows(doubtful), self.y[doubtful])
+            beam = beam.replace(doubtful, merge(beam.rows(doubtful), again))
         return beam
 
     def _stands_out(self, before: FloatArray, after: FloatArray) -> BoolArray:
@@ -215,7 +215,7 @@ class _Levels:
             found[near] = fall[near] > self.locator.threshold_of(self)
         return found
 
-    def _weak(self) -> BoolArray:
+    def _is_weak(self) -> BoolArray:
         """Rows decided without a search for more: neither their energy nor the best source stands out of noise."""
         if self.asked is not None or self.most == 1:
             return np.zeros(len(self.y), dtype=bool)
@@ -225,25 +225,25 @@ class _Levels:
         weak[faint] = ~self._stands_out(energy[faint], self.one.chi2[faint, 0])
         return weak
 
-    def _worth_another(self, rows: IntArray, beam: JointFits) -> BoolArray:
+    def _may_have_another(self, rows: IntArray, beam: JointFits) -> BoolArray:
         """Whether another source might pay: a suspicious χ², or a candidate that explains much of what is left."""
         suspicious = ~(beam.chi2[:, 0] <= self._quantile(beam.n_sources, SUSPICIOUS_FIT))
         clean = np.flatnonzero(~suspicious)
         if clean.size:
-            scores = self.search.left_scores(
+            scores = self.search.residual_scores(
                 self.problem.rows(rows[clean]), self.y[rows[clean]], beam.q[clean, 0], beam.mu[clean, 0]
             )
             suspicious[clean] = scores.max(axis=1) > 0.5 * self.penalty
         return suspicious
 
-    def _restarted(self, rows: IntArray, beam: JointFits, rounds: int = _MOST_RESTARTS) -> JointFits:
+    def _restart(self, rows: IntArray, beam: JointFits, rounds: int = _MOST_RESTARTS) -> JointFits:
         """Beams of rows, with random sources replaced until the best fit is credible."""
         credible = self._quantile(beam.n_sources, CREDIBLE_FIT)
         for _ in range(rounds):
             bad = np.flatnonzero(~(beam.chi2[:, 0] <= credible))
             if not bad.size:
                 break
-            again = self.search.restarted(self.problem.rows(rows[bad]), self.y[rows[bad]], beam.rows(bad), self.rng)
+            again = self.search.restart(self.problem.rows(rows[bad]), self.y[rows[bad]], beam.rows(bad), self.rng)
             beam = beam.replace(bad, again)
         return beam
 
@@ -277,7 +277,7 @@ class _Levels:
         one = refine(problem, draws, q[np.zeros(loud.size, dtype=np.intp)], mu[np.zeros(loud.size, dtype=np.intp)])
         first = best_distinct(one, loud.size, 1)
         with np.errstate(invalid="ignore"):  # where neither has converged
-            fall = first.chi2[:, 0] - search.one_more(problem, draws, first).chi2[:, 0]
+            fall = first.chi2[:, 0] - search.add_source(problem, draws, first).chi2[:, 0]
         fall = np.sort(fall[np.isfinite(fall)])
         # Another draw falls by more than the k-th largest of n with probability k / (n + 1).
         k = int(FALSE_ALARM * (_N_DRAWS + 1))
@@ -306,7 +306,7 @@ class _Levels:
                 unresolved |= faint & near
         return unresolved
 
-    def _listed(
+    def _list_optima(
         self,
         n: int,
         rows: IntArray,
@@ -328,12 +328,14 @@ class _Levels:
                 reason[i] = NOISE_ALONE
             elif fewer[row] and listed[i].any():
                 best = int(np.searchsorted(of_row, i))
-                reason[i], merged[best] = self._merged(
+                reason[i], merged[best] = self._closest_pair(
                     fits.q[best], fits.mu[best], beams[n + 1], row, bool(certain[row])
                 )
         return Optima(self.rows.select(rows), fits, of_row, reason, merged)
 
-    def _merged(self, q: FloatArray, mu: FloatArray, more: JointFits, row: int, certain: bool) -> tuple[str, BoolArray]:
+    def _closest_pair(
+        self, q: FloatArray, mu: FloatArray, more: JointFits, row: int, certain: bool
+    ) -> tuple[str, BoolArray]:
         """Why a row has fewer sources, and which of them stands for the closest pair of the larger fit."""
         n = len(q)
         reason = f"the readings support {n} source{'s' if n > 1 else ''}"

@@ -26,12 +26,12 @@ from magloc.localization.fit.results import DISTINCT_WITHIN
 from magloc.localization.search.candidates import (
     SingleArray,
     allowed_positions,
-    chosen_candidates,
+    best_candidates,
     linear_bases,
-    orthonormal_without,
+    orthonormalisation_without,
     start_separation,
 )
-from magloc.localization.search.kernels import Ends, search_optima
+from magloc.localization.search.kernels import LocalOptima, search_optima
 from magloc.measurement.rows import WhitenedRows, channels_above_ambient, check_magnitudes, check_spans, whitened_rows
 from magloc.measurement.whitened import WhitenedModel
 
@@ -86,7 +86,7 @@ class _Ranking:
         bases = turned[:, touched].astype(np.float32) @ self.bases[touched]
         if not (shrinkage >= 1.0).all():  # bases are orthogonal to a common field that is unknown
             bases -= (turned @ basis * shrinkage).astype(np.float32) @ self.common
-        return replace(self, lost=lost[seen].T, orthonormal=orthonormal_without(bases))
+        return replace(self, lost=lost[seen].T, orthonormal=orthonormalisation_without(bases))
 
     @cached_property
     def common(self) -> SingleArray:
@@ -151,18 +151,18 @@ class SingleSourceSearch:
         """Distinct optima of every row within Δχ² = 20 of its best one that the prior allows."""
         everything = self._everything
         keep_within = DISTINCT_WITHIN if everything else math.inf
-        found = self.ends(rows, np.arange(len(rows)), self.starts(rows), keep_within)
+        found = self.refine_starts(rows, np.arange(len(rows)), self.starts(rows), keep_within)
         credible = found.chi2[:, 0] <= quantile(rows.n_differences - N_UNKNOWNS, 1.0 - CREDIBLE_FIT)
         if np.count_nonzero(credible) < len(rows):
             doubtful = np.flatnonzero(~credible)
             some = rows.select(doubtful)
-            more = self.ends(some, np.arange(len(some)), self.starts(some, _MORE * self.n_starts), keep_within)
+            more = self.refine_starts(some, np.arange(len(some)), self.starts(some, _MORE * self.n_starts), keep_within)
             for values, others in zip(found, more, strict=True):
                 values[doubtful] = others[:, : values.shape[1]]
             np.minimum(found.counts[:, 0], self.n_starts, out=found.counts[:, 0])
         unknown = found.counts[:, 0]
         if not everything:
-            found = self._known(rows.model, found)
+            found = self._apply_prior(rows.model, found)
         kept = found.counts[:, 0].tolist()
         of_row = np.arange(len(rows)).repeat(kept)
         # Of a row alone a slice: a table of what is listed takes longer than all else here.
@@ -180,7 +180,7 @@ class SingleSourceSearch:
         first = rows.model.homogeneous(np.asarray(starts_m, dtype=np.float64))[:, None]
         reading_of_row = np.zeros(len(first), dtype=np.intp)
         starts = np.concatenate([first, self.starts(rows)[reading_of_row]], axis=1)
-        found = self.ends(rows, reading_of_row, starts, DISTINCT_WITHIN)
+        found = self.refine_starts(rows, reading_of_row, starts, DISTINCT_WITHIN)
         return BestFits(
             position_m=rows.model.position(found.q[:, 0]),
             moment_Am2=rows.model.moment(found.q[:, 0], found.mu[:, 0]),
@@ -213,24 +213,24 @@ class SingleSourceSearch:
             channels = channels_above_ambient(self.array, rows.mask, rows.readings_T, rows.model.ambient)
             ranked = ranking.whiten(channels)
         number = self.n_starts if n_starts is None else n_starts
-        chosen = chosen_candidates(
-            ranking.bases, ranked, ranking.candidates, number, self.apart_rad, ranking.orthonormal
-        )
+        chosen = best_candidates(ranking.bases, ranked, ranking.candidates, number, self.apart_rad, ranking.orthonormal)
         best: FloatArray = ranking.candidates[chosen]
         return best
 
-    def ends(self, rows: WhitenedRows, reading_of_row: IntArray, starts: FloatArray, keep_within: float) -> Ends:
+    def refine_starts(
+        self, rows: WhitenedRows, reading_of_row: IntArray, starts: FloatArray, keep_within: float
+    ) -> LocalOptima:
         """Distinct optima that starts (n, k, 4) lead to, each of the reading of some row."""
         return search_optima(rows.model, rows.signals, reading_of_row, starts, None, keep_within, self.max_iterations)
 
-    def _known(self, model: WhitenedModel, found: Ends) -> Ends:
+    def _apply_prior(self, model: WhitenedModel, found: LocalOptima) -> LocalOptima:
         """Optima that agree with what is known, again those within Δχ² of the best of them."""
         chi2 = np.where(self.prior.allows(model, found.q, found.mu), found.chi2, np.inf)
         order = np.argsort(chi2, axis=1, kind="stable")
         chi2 = np.take_along_axis(chi2, order, axis=1)
         counts = found.counts.copy()
         counts[:, 0] = (np.isfinite(chi2) & (chi2 <= chi2[:, :1] + DISTINCT_WITHIN)).sum(axis=1)
-        return Ends(
+        return LocalOptima(
             np.take_along_axis(found.q, order[..., None], axis=1),
             np.take_along_axis(found.mu, order[..., None], axis=1),
             chi2,
@@ -240,7 +240,7 @@ class SingleSourceSearch:
 
 
 @lru_cache(maxsize=2)  # candidates' bases, which are large, take longer than a fix
-def kept_search(array: SensorArray) -> SingleSourceSearch:
+def cached_search(array: SensorArray) -> SingleSourceSearch:
     """The search by one of the last arrays, where nothing is known: readings that come one by one have one."""
     return SingleSourceSearch(array)
 

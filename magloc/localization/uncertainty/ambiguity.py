@@ -75,7 +75,7 @@ def longest_axes(covariance: FloatArray, offset_m: FloatArray, moment: FloatArra
     return unit * axis[..., -1] * np.sqrt(np.maximum(variance[..., -1:], 0.0))
 
 
-def widened(
+def widen(
     covariance: FloatArray, offset_m: FloatArray, low_m: FloatArray, high_m: FloatArray, source: int = 0
 ) -> FloatArray:
     """Covariances (..., 6 K, 6 K) that are as long as the set of ranges of one source, where that is not observable.

@@ -39,7 +39,7 @@ def rise(energy: ArrayLike, chi2: ArrayLike, n_differences: int, level: ArrayLik
     """
     of_energy, wanted_rise = np.asarray(energy, dtype=np.float64), np.asarray(level, dtype=np.float64)
     explained = np.maximum(of_energy - np.asarray(chi2, dtype=np.float64), 0.0)
-    strength, left = left_of_detected(n_differences)
+    strength, left = detection_statistic(n_differences)
     best = np.sqrt(explained)
     wanted = np.asarray(np.interp(best, strength, left)) + wanted_rise
     # The table falls: turned round it gives the strength that leaves so much.
@@ -50,7 +50,7 @@ def rise(energy: ArrayLike, chi2: ArrayLike, n_differences: int, level: ArrayLik
 
 
 @lru_cache(maxsize=64)
-def left_of_detected(n_differences: int) -> tuple[FloatArray, FloatArray]:
+def detection_statistic(n_differences: int) -> tuple[FloatArray, FloatArray]:
     """Strengths a, and D(a) of the module's docstring: it falls strictly, but for ties at the weakest."""
     threshold = energy_threshold(n_differences)
     largest = np.sqrt(threshold) + _CERTAIN

@@ -14,8 +14,8 @@ from arrays.array import SensorArray
 from arrays.geometries import square, tetrahedron
 from arrays.sensor import Sensor
 from magloc.localization.search.candidates import (
+    best_candidates,
     candidate_positions,
-    chosen_candidates,
     distinct_best,
     linear_bases,
     linear_scores,
@@ -225,7 +225,7 @@ class TestChoiceOfStarts:
         (rows,) = whitened_rows(array, readings, None, n_rows)
         candidates = rows.model.homogeneous(candidate_positions(array))
         bases = linear_bases(rows.model, rows.model.gain[0], 0, candidates)
-        chosen = chosen_candidates(bases, rows.y, candidates, 12, apart_rad)
+        chosen = best_candidates(bases, rows.y, candidates, 12, apart_rad)
         scores = linear_scores(bases, rows.y)
         expected = distinct_best(scores, candidates, 12, apart_rad)
         each = np.arange(n_rows)[:, None]
