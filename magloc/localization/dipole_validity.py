@@ -1,4 +1,4 @@
-"""Whether a source is so near that it can be told from a dipole: by its length, or by what a fix leaves.
+"""Validity of the dipole model: by the body's length, or by the residuals of a fix.
 
 The patterns that are looked for, quadrupole and octupole, are derived in docs/theory/extended-sources.md.
 """
@@ -29,7 +29,7 @@ _UNSEEN_RTOL = 1e-6
 
 @dataclass(frozen=True)
 class MultipoleGain:
-    """What one more order of the multipole expansion explains of the readings.
+    """Decrease of χ² by one more order of the multipole expansion.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class MultipoleGain:
 
 @dataclass(frozen=True)
 class NearnessTest:
-    """Whether a fix leaves residuals that a dipole does not, and whether they have the pattern of an extended source.
+    """Result of the test for residuals with the pattern of an extended source.
 
     Attributes
     ----------
@@ -164,7 +164,7 @@ def _test_pattern(order: int, gain: float, n_parameters: int, rest: float, left:
 
 
 def _orthonormal(columns: FloatArray, known: FloatArray) -> FloatArray:
-    """Orthonormal basis of what columns (k, n) add to the orthonormal ones that are known."""
+    """Return an orthonormal basis of the part of columns (k, n) outside a known basis."""
     length = np.linalg.norm(columns, axis=0)
     unit = columns / np.where(length > 0.0, length, 1.0)
     new = unit - known @ (known.T @ unit)
@@ -179,7 +179,10 @@ def is_too_near(
     ambient_T: FloatArray | None = None,
     body_length_m: float | None = None,
 ) -> BoolArray:
-    """Whether each row's source is too near for a dipole, by length or misfit; fixes are in the array's frame."""
+    """Return whether each row's source is too near for a dipole, by length or misfit.
+
+    Fixes are in the array's frame.
+    """
     near = np.zeros(len(fixes), dtype=bool)
     best, solutions = fixes.first[fixes.solved], fixes.solutions
     if solutions.position_m.shape[1] > 1:

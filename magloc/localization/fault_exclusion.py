@@ -1,4 +1,4 @@
-r"""Fixes that a bad sensor does not ruin.
+r"""Exclusion of faulty sensors from fixes.
 
 A row whose χ² is not credible is fitted again with Student-t scores (:mod:`magloc.localization.reweighting`), iterated
 from the plain fit and from the best fits without one sensor each. These are refined from the plain fit, which a single
@@ -57,10 +57,10 @@ _ROWS_AT_ONCE = 64  # whose numbers a processor's cache holds
 
 
 class Refit(Protocol):
-    """Fixes some rows anew."""
+    """Protocol of a function that fits some rows again."""
 
     def __call__(self, rows: IntArray, readings_T: FloatArray, /) -> Sequence[Fix]:
-        """Fixes of rows of these indices with other readings (n, C), NaN where missing."""
+        """Return the fixes of these rows with other readings (n, C), NaN where missing."""
 
 
 def exclude_faulty_sensors(
@@ -72,7 +72,7 @@ def exclude_faulty_sensors(
     *,
     free_position: bool = True,
 ) -> Fixes:
-    """Fixes without the sensors that contradict all others, which `dropped_sensors` names.
+    """Return fixes without sensors that contradict all others, named in `dropped_sensors`.
 
     No sensor is dropped from a row whose χ² is credible, nor where too few would be left to tell which of them is
     wrong.
@@ -95,7 +95,7 @@ def exclude_faulty_sensors(
 
 
 def _is_doubtful(fixes: Fixes) -> BoolArray:
-    """Rows (n,) to be looked at: those whose χ² is not credible, that have several sources, or no solution."""
+    """Whether rows (n,) are doubtful: χ² not credible, several sources, or no solution."""
     result = ~fixes.solved
     for row in np.flatnonzero(result).tolist():
         result[row] = fixes.reason[row] != NO_SIGNAL
@@ -111,13 +111,13 @@ def _is_credible(fix: Fix) -> bool:
 
 
 def _largest_credible(dof: int, body_length_m: float) -> float:
-    """Largest χ² that is credible."""
+    """Return the largest credible χ²."""
     # The prior of a body's shape is a coarse one, and no fault of a sensor.
     return quantile(dof, MISFIT if body_length_m > 0.0 else 1.0 - CREDIBLE_ROW)
 
 
 def _is_worth_dropping_for(fix: Fix, plain: Fix) -> bool:
-    """Whether a fix without some sensors explains all others, or all but incomparably better than with them.
+    """Whether a fix without some sensors explains the others, or fits incomparably better.
 
     Where it does not, it is the model, or what is known of the source, that is wrong.
     """
@@ -132,7 +132,7 @@ def _is_worth_dropping_for(fix: Fix, plain: Fix) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class _Start:
-    """A fit q (K, 4), mu (K, 3) to reweight from, the sensors that it was made without, and whether it is credible.
+    """Fit q (K, 4), mu (K, 3) to reweight from: sensors left out, and whether it is credible.
 
     A fit is not for lack of degrees of freedom.
     """
@@ -147,7 +147,7 @@ _StartOfRow = tuple[int, _Start]
 
 
 class _Examination:
-    """Rows that miss the same channels and have a doubtful fix."""
+    """Examination of rows that miss the same channels and have a doubtful fix."""
 
     def __init__(
         self,
@@ -174,11 +174,11 @@ class _Examination:
 
     @property
     def problem(self) -> WhitenedModel:
-        """The rows' model, with the errors that are allowed for."""
+        """Model of the rows, with the model errors that are allowed for."""
         return self.fits.problem
 
     def allow_for_model_errors(self, plain: Sequence[Fix]) -> None:
-        """Count as noise what bodies and the ambient field add to the fixes: no sensor is to be accused of it."""
+        """Count errors by bodies and the ambient field as noise, so that no sensor is blamed."""
         sigma_T = self.array.row_ambient_uncertainty_T if self.array.channel_is_scalar.any() else 0.0
         length_m = np.array([fix.body_length_m for fix in plain])
         errors = []
@@ -193,7 +193,7 @@ class _Examination:
             self.fits = replace(self.fits, problem=self.problem.marginalise(every))
 
     def drop_lonely_sources(self, plain: Sequence[Fix]) -> list[Fix]:
-        """Fixes without sources that a single sensor sees: nothing tells such a source from a fault of the sensor."""
+        """Drop sources that only one sensor sees: they look the same as a fault of that sensor."""
         found = list(plain)
         for row, fix in enumerate(plain):
             if not fix.solutions or len(self._scale(fix)[0]) < 2:
@@ -216,7 +216,7 @@ class _Examination:
         return frozenset(np.argmax(energy[lonely], axis=1).tolist())
 
     def fixes(self, plain: Sequence[Fix]) -> list[Fix]:
-        """The plain fix, or that without the sensors that stand out."""
+        """Return the plain fixes, or those without the outlying sensors."""
         found = list(plain)
         suspected = self._suspect_rows(plain)
         if not suspected.size:
@@ -246,7 +246,7 @@ class _Examination:
         return found
 
     def _suspect_rows(self, plain: Sequence[Fix]) -> IntArray:
-        """Rows where a sensor may stand out: it does so from the plain fix, or nothing fits and the fit is spoilt."""
+        """Return rows with an outlier in the plain fix, or with a fit too poor to tell."""
         solved = np.array([bool(fix.solutions) for fix in plain])
         credible = np.array([bool(fix.solutions) and _is_credible(fix) for fix in plain])
         # What a fit of so many unknowns leaves of a sensor's residual on average.
@@ -263,14 +263,14 @@ class _Examination:
         return np.flatnonzero(spoilt & ~credible & ~self._is_noise(plain))
 
     def _is_noise(self, plain: Sequence[Fix]) -> BoolArray:
-        """Rows without a source whose energy is one of noise: there is nothing that a bad sensor would explain."""
+        """Whether rows (n,) have no source and no more energy than noise."""
         without = self.problem.whiten(self.raw) - self.problem.predict(np.zeros_like(self.problem.ambient))
         energy = np.einsum("bc,bc->b", without, without)
         alone = np.array([fix.reason == NOISE_ALONE for fix in plain], dtype=bool)
         return alone & (energy <= energy_threshold(max(1, self.n_differences)))
 
     def _starts(self, fixes: Iterable[tuple[int, Fix]], without: frozenset[int] = frozenset()) -> list[_StartOfRow]:
-        """The fits of fixes of rows, where there is one."""
+        """Return the fits of those fixes that have a solution."""
         solved = [(row, fix) for row, fix in fixes if fix.solutions]
         explains = [fix.solutions[0].dof > 0 and _is_credible(fix) for _, fix in solved]
         return [
@@ -278,7 +278,7 @@ class _Examination:
         ]
 
     def _refine_without_one(self, plain: Sequence[Fix], rows: IntArray) -> dict[int, list[_Start]]:
-        """The plain fits of rows, and the best of those without one sensor, refined from them, best first.
+        """Return the plain fits and the best fits without one sensor, best first.
 
         Rows are left out where no sensor stands out of what all others leave, and each is checked by them.
         """
@@ -303,7 +303,7 @@ class _Examination:
         return starts
 
     def _exclude_gross_faults(self, plain: Sequence[Fix], tried: Sequence[_StartOfRow]) -> list[_StartOfRow]:
-        """Fits that explain rows without two sensors or three, each of which is beyond doubt without the others.
+        """Return fits that explain rows without two or three sensors, each beyond doubt.
 
         From one without a sensor, the next one is that which lowers χ² most.
         """
@@ -330,14 +330,14 @@ class _Examination:
         return found
 
     def _limits(self, misfit: FloatArray, q: FloatArray) -> FloatArray:
-        """Limits (f, N) of squared residuals, of fits of sources q (f, K, 4), as large as their noise makes them."""
+        """Return limits (f, N) of squared residuals, scaled by the noise of fits q (f, K, 4)."""
         scale2 = self.fits.scale2(misfit)
         return np.array([scale * self.fits.square_limits(float(scale), q.shape[1]) for scale in scale2])
 
     def _stack(
         self, starts: Sequence[_StartOfRow]
     ) -> Iterator[tuple[list[_StartOfRow], IntArray, FloatArray, FloatArray, FloatArray]]:
-        """Starts of equally many sources: rows, sources (f, K, …), and weights (f, N) without what they leave out."""
+        """Yield starts with equally many sources: rows, sources (f, K, …), weights (f, N)."""
         for count in sorted({len(start.q) for _, start in starts}):
             some = [(row, start) for row, start in starts if len(start.q) == count]
             q, mu = np.stack([start.q for _, start in some]), np.stack([start.mu for _, start in some])
@@ -345,7 +345,7 @@ class _Examination:
             yield some, rows, q, mu, self.fits.weights_without([start.without for _, start in some])
 
     def _start_of_fit(self, plain: Fix, fits: JointFits, k: int, without: frozenset[int]) -> _Start | None:
-        """Fit k of a row without some sensors, none where it did not converge."""
+        """Return fit k without some sensors as a start; None if it did not converge."""
         if not fits.converged[k]:
             return None
         dof = plain.solutions[0].dof - int(self.count[list(without)].sum())
@@ -354,7 +354,7 @@ class _Examination:
         return _Start(fits.q[k], fits.mu[k], without, bool(credible))
 
     def _exclusion_candidates(self, rows: IntArray, q: FloatArray, mu: FloatArray) -> BoolArray:
-        """Sensors (f, N) without which fits of rows might be much better: they stand out, or bend the fit unseen.
+        """Return sensors (f, N) that are outliers, or that may bend the fits unseen.
 
         None where all of many leave evenly much, so that the noise is larger than stated.
         """
@@ -370,7 +370,7 @@ class _Examination:
     def _plan_searches(
         self, plain: Sequence[Fix], starts: dict[int, list[_Start]], unexplained: Sequence[int]
     ) -> list[dict[frozenset[int], list[int]]]:
-        """Rows in which to search anew, by the sensors that are left out, one after another.
+        """Return rows to search again, by the sensors that are left out, one set after another.
 
         Of a small array every one and every two, of a large one the nearest to every source and those that the
         refinements blame most.
@@ -398,7 +398,7 @@ class _Examination:
         return chosen
 
     def _scale_or_none(self, fix: Fix) -> tuple[FloatArray, FloatArray]:
-        """Sources of a fix, or nothing far away where it has none."""
+        """Return the sources of a fix, or a zero source far away if it has none."""
         return self._scale(fix) if fix.solutions else (np.array([[0.0, 0.0, 1.0, 1e-3]]), np.zeros((1, 3)))
 
     def _refit_without(self, sensors: set[int] | frozenset[int], rows: IntArray) -> list[Fix]:
@@ -414,7 +414,7 @@ class _Examination:
         return q, self.problem.scaled_moment(q, np.stack([source.moment_Am2 for source in sources]))
 
     def _certain_faults(self, starts: dict[int, list[_Start]]) -> dict[int, frozenset[int]]:
-        """Sensors that reweighting would leave out for certain: the only fit that explains a row does without them.
+        """Return sensors that are certainly faulty: the only credible fit leaves them out.
 
         To it they are beyond doubt, and none of the others would stand out even if it did not count.
         """
@@ -428,7 +428,7 @@ class _Examination:
         return found
 
     def _outlying_sensors(self, starts: dict[int, list[_Start]]) -> dict[int, frozenset[int]]:
-        """Sensors of every row that stand out from the best of its robust fits."""
+        """Return the outlying sensors of every row in the best of its robust fits."""
         best = dict.fromkeys(starts, np.inf)
         found = dict.fromkeys(starts, frozenset[int]())
         every = [(row, start) for row, of_row in starts.items() for start in of_row]

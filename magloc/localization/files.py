@@ -1,4 +1,4 @@
-"""What fixes look like in JSON."""
+"""Fixes as JSON."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ _SOURCE_KEYS = ("position_m", "moment_Am2", "covariance", "range_observable", "r
 
 
 def entries_of_fixes(fixes: Fixes, *, joint: bool) -> Iterator[dict[str, object]]:
-    """Results that ``magloc locate --json`` prints; `joint`: every solution has a list of its sources, also for one."""
+    """Return the results that ``magloc locate --json`` prints.
+
+    `joint`: every solution has a list of its sources, also for one.
+    """
     for fix, misfit, factor in zip(fixes, fixes.misfit.tolist(), fixes.body_factor.tolist(), strict=True):
         yield _fix_entry(fix, joint=joint, misfit=misfit, body_factor=factor)
 

@@ -1,4 +1,4 @@
-"""Fits without some sensors: least squares with other weights, and what every sensor's deletion would do to a fit."""
+"""Fits without some sensors: weighted least squares, and first-order deletion of sensors."""
 
 from __future__ import annotations
 
@@ -27,7 +27,9 @@ def chi2_falls_without_sensors(
     *,
     free_position: bool = True,
 ) -> tuple[FloatArray, FloatArray]:
-    r"""By how much χ² of fits (b, K, …) would fall without each sensor, to first order, and how it is checked: (b, N).
+    r"""Return the first-order decrease of χ² without each sensor, and how it is checked.
+
+    Both are (b, N), for fits (b, K, …).
 
     Deleting channels adds their readings to the unknowns. With the readings' whitening W, residuals r and an
     orthonormal basis Q of the derivatives, sensor s takes :math:`g^T (I - H)^{-1} g`, where :math:`g = (W r)_s` and
@@ -54,7 +56,7 @@ def chi2_falls_without_sensors(
 
 
 def weight_channels(problem: WhitenedModel, raw: FloatArray, weight: FloatArray) -> Weighted:
-    """A problem and its raw readings (b, C) with the variance of every channel divided by a weight (b, C)."""
+    """Return a problem and its raw readings (b, C) with variances divided by weights (b, C)."""
     root = np.sqrt(weight)[..., None]
     flat = problem.shrinkage >= 1.0
     # A flat prior needs only the span of its columns; of the others the variance along each of them counts.

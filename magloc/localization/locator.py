@@ -1,4 +1,4 @@
-"""The one door to a fix, and the only place that knows the order of what makes one.
+"""Locator of sources: the order of the steps that make a fix.
 
 Detection → search → uncertainty → exclusion of faulty sensors → validity of the dipole → result.
 """
@@ -56,7 +56,7 @@ _MOST_NUMBERS = 8_000_000
 
 
 class Locator:
-    """Start-free fixes with one array of any sensors.
+    """Fixes without a start value, with one array of any sensors.
 
     Parameters
     ----------
@@ -125,7 +125,10 @@ class Locator:
             self._fewest = 6 * (number or 1)
 
     def fit(self, readings_T: ArrayLike, ambient_T: ArrayLike | None = None) -> Fix:
-        """Fix from one set of readings (C,) [T], NaN where missing, and the ambient field (3,) [T]."""
+        """Return the fix of one set of readings (C,) [T], NaN where missing.
+
+        `ambient_T` (3,) [T] is the ambient field.
+        """
         ambient = None if ambient_T is None else np.asarray(ambient_T, dtype=np.float64)[None]
         return self.fit_rows(numbers(readings_T)[None], ambient)[0]
 
@@ -137,7 +140,7 @@ class Locator:
         time_s: FloatArray | None = None,
         progress: Callable[[int], None] | None = None,
     ) -> Fixes:
-        """Fixes of many sets of readings, each on its own.
+        """Return the fixes of many sets of readings, each on its own.
 
         Parameters
         ----------
@@ -176,7 +179,7 @@ class Locator:
         return replace(fixes, time_s=times, too_near=near, bodies=bodies)
 
     def _fit_without_faults(self, index: IntArray, readings: FloatArray, ambient: FloatArray | None) -> Fixes:
-        """Fixes of some of the rows, without the sensors that contradict all others."""
+        """Return fixes of some rows without the sensors that contradict all others."""
 
         def refit(rows: IntArray, other: FloatArray) -> Fixes:
             return self._fit_with_all_sensors(index[rows], other, None if ambient is None else ambient[rows])
@@ -188,7 +191,7 @@ class Locator:
         return exclude_faulty_sensors(self.array, fixes, refit, readings, ambient, free_position=free)
 
     def _fit_with_all_sensors(self, index: IntArray, readings: FloatArray, ambient: FloatArray | None) -> Fixes:
-        """Fixes of some of the rows with all sensors: detection, search, uncertainty."""
+        """Return fixes of some rows with all sensors: detection, search, uncertainty."""
         search = self._search
         if isinstance(search, MomentSearch):
             search = search.select(index)
@@ -206,7 +209,7 @@ class Locator:
 
 
 class _FixCollector:
-    """Collects what is found of n rows, block by block."""
+    """Collect the results of n rows, block by block."""
 
     def __init__(self, n: int, body_length_m: float | None = 0.0, ambient_sigma_T: float = 0.0) -> None:
         self.body_length_m, self.ambient_sigma_T = body_length_m, ambient_sigma_T
@@ -217,12 +220,12 @@ class _FixCollector:
         self.parts: list[Solutions] = []
 
     def refuse(self, rows: IntArray, reason: str) -> None:
-        """Say why some rows have no solution."""
+        """Record why some rows have no solution."""
         for row in rows.tolist():
             self.reason[row] = reason
 
     def fill(self, rows: WhitenedRows, search: Callable[[WhitenedRows], list[Optima]]) -> None:
-        """Detection, search and uncertainty of a block."""
+        """Detect, search and estimate uncertainty in a block of rows."""
         loud, silent = rows, rows.is_silent
         if np.count_nonzero(silent):
             self.refuse(rows.index[silent], NO_SIGNAL)
@@ -251,7 +254,7 @@ class _FixCollector:
             self.parts.append(found)
 
     def fixes(self) -> Fixes:
-        """All of it."""
+        """Return the fixes of all rows."""
         n = len(self.reason)
         solutions = Solutions.concatenate(self.parts)
         return Fixes(
@@ -275,7 +278,7 @@ def fit_at_rest(
     prior: SourcePrior = NOTHING_KNOWN,
     poses: PosesOfRows | None = None,
 ) -> Fix:
-    """Fix of one source at rest from several rows of an array that moves, all together, in the world frame.
+    """Fit one source at rest to several rows of a moving array, in the world frame.
 
     A few scalar sensors do not locate a source in one row, but they do while they pass it. Every row keeps a common
     field of its own. Parameters are those of :func:`magloc.localization.search.moving_array.stacked_rows`, and a prior
@@ -384,7 +387,10 @@ def locate(
 
 
 def _places_in_array(position_m: ArrayLike, pose: tuple[FloatArray, Rotation] | None) -> FloatArray:
-    """Known places (3,) or (K, 3) of the results' frame in the array's axes of every row: (n, K, 3), n is 1 at rest."""
+    """Return known positions (n, K, 3) in the array's axes of every row; n is 1 at rest.
+
+    `position_m` (3,) or (K, 3) is in the frame of the results.
+    """
     place = np.asarray(position_m, dtype=np.float64)
     if place.shape != (3,) and (place.ndim != 2 or place.shape[1] != 3 or not len(place)):
         raise ValueError(f"Input position_m must have shape (3,) or (K, 3); instead received {place.shape}.")
@@ -393,7 +399,10 @@ def _places_in_array(position_m: ArrayLike, pose: tuple[FloatArray, Rotation] | 
 
 
 def _with_eddies(array: SensorArray, rows: Readings) -> SensorArray:
-    """The array where eddy currents are errors of its offsets, as its turns between the rows tell of them."""
+    """Return the array with eddy currents as errors of its offsets.
+
+    Their size follows from the turns between the rows.
+    """
     if rows.pose is None or not any(sensor.eddy_uncertainty_s for sensor in array.sensors):
         return array
     _, rate_rad_s = rates_of(rows.time_s, rows.pose[0], rows.pose[1].as_matrix())
@@ -403,7 +412,10 @@ def _with_eddies(array: SensorArray, rows: Readings) -> SensorArray:
 def _with_attitude_as_field_error(
     array: SensorArray, pose: PoseUncertainty, rows: Readings, ambient_T: FloatArray | None
 ) -> SensorArray:
-    """The array where errors of the attitude, rms over the rows, make the ambient field uncertain for moduli."""
+    """Return the array with attitude errors as errors of the ambient field.
+
+    Errors are rms over the rows; only moduli see them.
+    """
     attitude_rad = pose.attitude_rad if rows.pose_sigma is None else np.sqrt(np.mean(rows.pose_sigma[:, 1] ** 2))
     field_T = array.ambient_fields if ambient_T is None else ambient_T
     size_T = float(np.sqrt(np.mean(np.sum(field_T**2, axis=-1))))
@@ -414,7 +426,7 @@ def _with_attitude_as_field_error(
 def used_rows(
     readings: Readings, array: SensorArray, *, average: bool = False
 ) -> tuple[Readings, SensorArray, list[tuple[str, ...]]]:
-    """Rows that fixes are made of, with the array of their noise, and names of the channels that saturate in each."""
+    """Return the rows to fit, the array with their noise, and saturated channels of each row."""
     rows = in_world_field(without_saturated(readings, array), array)
     if rows.background:
         _LOG.warning("a row on its own has no background: filters take it out, and with it some of the signal")
@@ -426,7 +438,7 @@ def used_rows(
 
 
 def _saturated_channels(measured: Readings, rows: Readings, array: SensorArray) -> list[tuple[str, ...]]:
-    """Names of the channels that saturate, for every row."""
+    """Return names of the saturated channels of every row."""
     lost = np.isfinite(measured.values_T) & ~np.isfinite(rows.values_T)
     names: list[tuple[str, ...]] = [()] * len(lost)
     for row in np.flatnonzero(lost.any(axis=1)).tolist():

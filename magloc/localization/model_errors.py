@@ -1,4 +1,4 @@
-r"""Errors of the model that a fit allows for: bodies that are no points, and an ambient field that is not exact.
+r"""Model errors that a fit allows for: extended bodies and an inexact ambient field.
 
 What they add to the readings at the fit counts as noise, and the fit is refined with it held. A modulus sees an error
 of the ambient field along the field at its sensor: differences keep what the source turns there. A body's second and
@@ -30,7 +30,10 @@ _BENT = 0.3
 
 
 def body_errors(model: WhitenedModel, q: FloatArray, mu: FloatArray, length_m: FloatArray) -> FloatArray:
-    """What bodies (b, K) of some lengths add to the readings, of one σ: (b, C, 14 K) in units of the noise."""
+    """Return errors (b, C, 14 K) of readings by bodies (b, K), in units of the noise.
+
+    Columns are of one σ.
+    """
     sensors = model.centroid + model.radius * model.sensors
     separation = sensors - model.position(q)[:, :, None]
     moment = np.broadcast_to(model.moment(q, mu)[:, :, None], separation.shape)
@@ -47,13 +50,16 @@ def body_errors(model: WhitenedModel, q: FloatArray, mu: FloatArray, length_m: F
 
 
 def assumed_lengths(model: WhitenedModel, q: FloatArray, body_length_m: float | None) -> FloatArray:
-    """Lengths (b, K) of the bodies at q (b, K, 4): what is said, else a share of the distance near the array."""
+    """Return the lengths (b, K) of bodies at q (b, K, 4): stated, or a share of the distance."""
     sensors = model.centroid + model.radius * model.sensors
     return assumed_body_lengths(sensors, model.position(q), model.radius, body_length_m)
 
 
 def ambient_errors(model: WhitenedModel, q: FloatArray, mu: FloatArray, sigma_T: float) -> FloatArray:
-    """What an error of the ambient field, of one σ per axis, adds to moduli: (b, C, 3) in units of the noise."""
+    """Return errors (b, C, 3) of moduli by the ambient field, one σ per axis.
+
+    In units of the noise.
+    """
     gain = model.linear_gain(model.source_fields(q, mu))
     return sigma_T * np.where(model.channel_is_scalar[:, None], gain, 0.0)
 
@@ -61,7 +67,7 @@ def ambient_errors(model: WhitenedModel, q: FloatArray, mu: FloatArray, sigma_T:
 def with_model_errors(
     optima: Optima, body_length_m: float | None, ambient_sigma_T: float = 0.0
 ) -> list[tuple[Optima, FloatArray]]:
-    """Optima refined with the errors that matter, and the lengths (b,) of their rows' bodies, 0 where none does."""
+    """Return optima refined with model errors, and body lengths (b,), 0 where none matters."""
     rows, none = optima.rows, np.zeros(len(optima.rows))
     point = body_length_m == 0.0 or (body_length_m is None and _is_far(optima.fits.q))
     ambient_sigma_T = ambient_sigma_T if rows.model.sees_moduli else 0.0
@@ -94,13 +100,13 @@ def with_model_errors(
 
 
 def _is_far(q: FloatArray) -> bool:
-    """Whether all sources are so far from the centroid that they are near to no sensor: most of them, cheaply."""
+    """Whether all sources are far from every sensor, by a cheap test of the centroid."""
     s = q[..., 3]
     return np.count_nonzero(np.abs(s) < _FAR_S) == s.size
 
 
 def _refine(optima: Optima, lengths: FloatArray, ambient_sigma_T: float, errors: FloatArray | None) -> Optima:
-    """Optima with errors linearised at the best fit of every row, refined, linearised there again.
+    """Refine optima with errors linearised at the best fit of every row, twice.
 
     The errors at the first best fits may be known.
     """
@@ -130,7 +136,7 @@ def _refine(optima: Optima, lengths: FloatArray, ambient_sigma_T: float, errors:
 def model_errors(
     model: WhitenedModel, q: FloatArray, mu: FloatArray, length_m: FloatArray, ambient_sigma_T: float
 ) -> FloatArray:
-    """Both kinds of errors together: (b, C, n) in units of the noise."""
+    """Return errors by bodies and by the ambient field, (b, C, n) in units of the noise."""
     parts = [body_errors(model, q, mu, length_m)] if length_m.any() else []
     if ambient_sigma_T:
         parts.append(ambient_errors(model, q, mu, ambient_sigma_T))
@@ -138,7 +144,10 @@ def model_errors(
 
 
 def _is_nonlinear(model: WhitenedModel, fits: JointFits, of_row: IntArray, ambient_sigma_T: float) -> BoolArray:
-    """Whether moduli follow an error of the ambient field along a curve: second order beyond noise, (f,)."""
+    """Return whether moduli are nonlinear (f,) in an error of the ambient field.
+
+    Their second order is beyond noise.
+    """
     if not ambient_sigma_T:
         return np.zeros(len(of_row), dtype=bool)
     at = model.rows(of_row)

@@ -1,4 +1,4 @@
-"""What fixes leave of the readings, channel by channel."""
+"""Residuals of fixes, channel by channel."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _ROWS_AT_ONCE = 256
 def fix_residuals(
     array: SensorArray, readings_T: ArrayLike, fixes: Fixes, ambient_T: FloatArray | None = None
 ) -> FloatArray:
-    """Residuals (n, C) of the best solution of every row, in standard deviations of the noise.
+    """Return residuals (n, C) of the best solution of every row, over the noise's σ.
 
     The field common to all sensors, of which nothing is known, is fitted and taken out. The sum of squares of a row is
     the χ² of its solution; a fitted channel's own variance is therefore a little below 1. NaN where there is no reading
@@ -38,7 +38,7 @@ def fix_residuals(
 
 
 def _fields(array: SensorArray, fix: Fix) -> FloatArray:
-    """Field of all sources of the best solution at the sensors (N, 3) [T]."""
+    """Return the field (N, 3) [T] of all sources of the best solution at the sensors."""
     sources = fix.best.sources
     moments = np.stack([source.moment_Am2 for source in sources])
     return dipole.total_field(array.positions, np.stack([source.position_m for source in sources]), moments)

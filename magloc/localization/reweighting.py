@@ -1,4 +1,4 @@
-r"""Fits of rows with weights of whole sensors: without some of them, or reweighted by Student-t scores.
+r"""Fits with weights of whole sensors: without some of them, or by Student-t scores.
 
 A sensor whose squared residual is :math:`\rho_s` has the weight :math:`(\nu + n_s)/(\nu + \rho_s)`, iterated.
 """
@@ -31,7 +31,7 @@ _MEDIAN_RATIO = 0.789
 
 @dataclass(frozen=True, eq=False)
 class WeightedFits:
-    """Fits of rows of a problem, whose readings (b, C) are raw, with weights of sensors (f, N).
+    """Fits of rows with weights of sensors (f, N); the readings (b, C) are raw.
 
     Attributes
     ----------
@@ -58,7 +58,7 @@ class WeightedFits:
         return len(self.count)
 
     def weights_without(self, sensors: Sequence[Collection[int]]) -> FloatArray:
-        """Weights (f, N) of fits without some sensors."""
+        """Return weights (f, N) of fits without some sensors."""
         weight = np.ones((len(sensors), self.n_sensors))
         for of_fit, some in zip(weight, sensors, strict=True):
             of_fit[list(some)] = LEAST_WEIGHT
@@ -68,11 +68,11 @@ class WeightedFits:
         return weight_channels(self.problem.rows(row), self.raw[row], weight[:, self.problem.channel_sensor])
 
     def refine(self, row: IntArray, q: FloatArray, mu: FloatArray, weight: FloatArray) -> JointFits:
-        """Weighted fits of rows (f,) from sources (f, K, …)."""
+        """Return weighted fits of rows (f,) from sources (f, K, …)."""
         return self._refine_rows(self._weight(row, weight), q, mu, max_iterations=60)
 
     def _refine_rows(self, lighter: Weighted, q: FloatArray, mu: FloatArray, max_iterations: int) -> JointFits:
-        """Fits of weighted rows (f,) from sources (f, K, …)."""
+        """Return fits of weighted rows (f,) from sources (f, K, …)."""
         problem, raw = lighter
         free = np.full((q.shape[1], 3), self.free_position)
         return refine(problem, problem.whiten(raw), q, mu, free=free, max_iterations=max_iterations)
@@ -80,16 +80,19 @@ class WeightedFits:
     def chi2_falls(
         self, row: IntArray, q: FloatArray, mu: FloatArray, weight: FloatArray | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """:func:`chi2_falls_without_sensors` of fits of rows (f,)."""
+        """Return :func:`chi2_falls_without_sensors` of fits of rows (f,)."""
         at = (self.problem.rows(row), self.raw[row]) if weight is None else self._weight(row, weight)
         return chi2_falls_without_sensors(*at, q, mu, self.sensor_channels, free_position=self.free_position)
 
     def misfit(self, row: IntArray, q: FloatArray, mu: FloatArray, weight: FloatArray) -> FloatArray:
-        """Squared residuals (f, N) of the sensors of some rows, the common field being that of the weighted fit."""
+        """Return squared residuals (f, N) of the sensors of some rows.
+
+        The common field is that of the weighted fit.
+        """
         return self._squares(self._weight(row, weight), q, mu, weight)
 
     def _squares(self, lighter: Weighted, q: FloatArray, mu: FloatArray, weight: FloatArray) -> FloatArray:
-        """Squared residuals (f, N) of the sensors of some weighted rows."""
+        """Return squared residuals (f, N) of the sensors of some weighted rows."""
         owner, (problem, raw) = self.problem.channel_sensor, lighter
         residual = problem.whiten(raw) - problem.predict(problem.source_fields(q, mu))
         of_sensor = owner[:, None] == np.arange(self.n_sensors)
@@ -97,7 +100,9 @@ class WeightedFits:
         return squares
 
     def scale2(self, misfit: FloatArray) -> FloatArray:
-        """Variance of the noise (f,) in units of what is stated, one at least, from the median sensor.
+        """Return the variance of the noise (f,) over the stated one, one at least.
+
+        It is estimated from the median sensor.
 
         Where everything fits badly it is the model or the stated noise that is wrong, not a sensor.
         """
@@ -106,7 +111,10 @@ class WeightedFits:
         return np.maximum(1.0, ratio)
 
     def square_limits(self, scale2: float, n_sources: int) -> FloatArray:
-        """Limits (N,) of the squared residuals over the variance of the noise; wider where that is a guess."""
+        """Return limits (N,) of squared residuals over the noise variance.
+
+        They are wider where that is an estimate.
+        """
         if scale2 < _UNDERSTATED:
             return self.limits
         count = np.maximum(self.count, 1)
@@ -118,7 +126,7 @@ class WeightedFits:
     def reweight(
         self, row: IntArray, q: FloatArray, mu: FloatArray, weight: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Squared residuals (f, N) of the sensors after reweighting from starts, and the scale of the noise."""
+        """Return squared residuals (f, N) of the sensors after reweighting, and the noise scale."""
         q, mu, weight = q.copy(), mu.copy(), weight.copy()
         misfit, scale2 = np.empty(weight.shape), np.empty(len(row))
         live = twin = np.arange(len(row))

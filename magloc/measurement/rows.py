@@ -1,4 +1,4 @@
-"""Rows of readings that miss the same channels, whitened together."""
+"""Whitened rows of readings that miss the same channels."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _SILENT = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class WhitenedRows:
-    """Rows of readings that miss the same channels, whitened together.
+    """Whitened rows of readings that miss the same channels.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class WhitenedRows:
         return len(self.index)
 
     def select(self, rows: IntArray | BoolArray) -> WhitenedRows:
-        """Some of the rows."""
+        """Return some of the rows."""
         at = np.arange(len(self))[rows]
         return replace(
             self,
@@ -65,17 +65,20 @@ class WhitenedRows:
         )
 
     def marginalise(self, columns: FloatArray) -> WhitenedRows:
-        """The same where errors of unit variance along columns (b, C, n), in units of the noise, count as noise."""
+        """Return the rows with errors along columns (b, C, n) counted as noise.
+
+        The errors have unit variance, the columns are in units of the noise.
+        """
         model = self.model.marginalise(columns)
         return replace(self, model=model, y=model.whiten(self.raw))
 
     def with_known_moment(self, moment: KnownMoment | None) -> WhitenedRows:
-        """The same where the moment of every source is known."""
+        """Return the rows with a prior of the moment of every source."""
         return replace(self, model=replace(self.model, known=moment)) if moment is not None else self
 
     @cached_property
     def signals(self) -> FloatArray:
-        """Whitened readings for the kernels of fits: (b, C + k)."""
+        """Whitened readings for the kernels of fits (b, C + k)."""
         return signals_of(self.model, self.y)
 
     @property
@@ -86,7 +89,7 @@ class WhitenedRows:
 
     @cached_property
     def energy(self) -> FloatArray:
-        """Sums of squared differences (b,), as they are without a source."""
+        """Sums of squared differences (b,), that is χ² without a source."""
         without = self.y - self.model.ambient_signals if self.model.sees_moduli else self.y
         return np.asarray(np.vecdot(without, without))
 
@@ -94,7 +97,10 @@ class WhitenedRows:
 def whitened_rows(
     array: SensorArray, readings_T: FloatArray, ambient_T: FloatArray | None, at_once: int
 ) -> Iterator[WhitenedRows]:
-    """All rows of readings (n, C), those together that miss the same channels, `at_once` of them at most."""
+    """Yield whitened rows of readings (n, C), grouped by missing channels.
+
+    A group has at most `at_once` rows.
+    """
     for mask, rows in rows_of_equal_mask(np.isfinite(readings_T)):
         for begin in range(0, rows.size, at_once):
             index = rows[begin : begin + at_once]
@@ -105,7 +111,7 @@ def whitened_rows(
 
 
 def check_rows(array: SensorArray, readings_T: ArrayLike) -> FloatArray:
-    """Raw readings (n, C) of an array [T] as numbers; ValueError where they have another shape."""
+    """Return raw readings (n, C) [T] as numbers; raise ValueError for another shape."""
     readings = fields(readings_T)
     if readings.ndim != 2 or readings.shape[1] != array.n_channels:
         raise ValueError(
@@ -115,7 +121,7 @@ def check_rows(array: SensorArray, readings_T: ArrayLike) -> FloatArray:
 
 
 def rows_of_equal_mask(available: NDArray[np.bool_]) -> Iterator[tuple[NDArray[np.bool_], NDArray[np.intp]]]:
-    """Every distinct row of available channels (n, C), and the rows that have it."""
+    """Yield every distinct row of available channels (n, C), and the rows that have it."""
     if len(available) == 1 or (len(available) and (available == available[0]).all()):
         yield available[0], np.arange(len(available))
         return
@@ -125,14 +131,20 @@ def rows_of_equal_mask(available: NDArray[np.bool_]) -> Iterator[tuple[NDArray[n
 
 
 def whitenings_of(array: SensorArray, mask: NDArray[np.bool_], readings_T: FloatArray) -> Whitening:
-    """Whitening of rows of readings (..., C) with the channels of a mask: that of all where the noise is constant."""
+    """Return the whitening of rows (..., C) with the channels of a mask.
+
+    All rows share one where the noise is constant.
+    """
     if not array.noise_depends_on_reading:
         return whitening(array, mask)
     return whitenings(array, mask, covariance_blocks(array, readings_T))
 
 
 def ambient_fields(array: SensorArray, n_rows: int, ambient_T: FloatArray | None) -> FloatArray:
-    """Ambient field at every sensor in every row, (n, N, 3) [T]: the array's, or that of each row (n, 3) instead."""
+    """Return the ambient field at every sensor in every row, (n, N, 3) [T].
+
+    Fields of rows (n, 3) replace the array's own.
+    """
     fields = np.broadcast_to(array.ambient_fields, (n_rows, array.n_sensors, 3))
     if ambient_T is None:
         return fields
@@ -143,7 +155,7 @@ def ambient_fields(array: SensorArray, n_rows: int, ambient_T: FloatArray | None
 def channels_above_ambient(
     array: SensorArray, mask: BoolArray, readings_T: FloatArray, ambient_T: FloatArray | None
 ) -> FloatArray:
-    """What vector channels (n, C) read above the ambient field at the sensors (n, N, 3), and all that scalars read.
+    """Return readings (n, C) less the ambient field (n, N, 3); those of scalar sensors stay.
 
     None stands for the array's own field. Zero where the mask (n, C) or (C,) has no reading.
     """
@@ -163,7 +175,7 @@ def whitened_model(
     whitening: Whitening,
     ambient_T: FloatArray | None,
 ) -> tuple[WhitenedModel, FloatArray]:
-    """Exact model of rows of readings (n, C), and their channels (n, C) divided by the noise.
+    """Return the exact model of rows of readings (n, C), and their channels over the noise.
 
     :meth:`WhitenedModel.whiten` frees these from the common field. The whitening is that of every row or of all, and
     `ambient_T` (n, 3) stands in place of the array's ambient field.
@@ -183,7 +195,7 @@ def _model_of_one_row(array: SensorArray, whitening: Whitening) -> WhitenedModel
 
 
 def concatenate_readings(parts: Sequence[Readings]) -> Readings:
-    """Readings of several files, one after the other.
+    """Concatenate readings of several files.
 
     Raises ValueError where some have what others lack.
     """
@@ -209,13 +221,13 @@ def _concatenate_columns(parts: Sequence[FloatArray | None]) -> FloatArray | Non
 
 
 def check_spans(array: SensorArray) -> None:
-    """Refuse a sensor alone, which knows no place."""
+    """Raise ValueError for a single sensor, which cannot tell a position."""
     if array.n_sensors < 2:
         raise ValueError("Input array must have two sensors at least where no place is known; instead received one.")
 
 
 def check_magnitudes(array: SensorArray) -> None:
-    """Refuse what double precision cannot square."""
+    """Raise ValueError for numbers whose squares exceed double precision."""
     noise = array.channel_noise_T
     if noise.min() < 1e-20 or noise.max() > 1e3:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""Optima of the likelihood: what every search returns, and nothing else."""
+"""Optima of the likelihood, the common result of all searches."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ UNDETERMINED = "the differences between the sensors do not determine the source:
 
 @dataclass(frozen=True, eq=False)
 class Optima:
-    """Optima of b rows: f fits of K sources, row after row, of every row best χ² first.
+    """Optima of b rows: f fits of K sources, sorted by row and then by χ².
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ class Optima:
     bent: BoolArray | bool = False
 
     def select(self, which: BoolArray) -> Optima:
-        """Those of some of the rows (b,)."""
+        """Return the optima of some of the rows (b,)."""
         kept = which[self.of_row]
         return replace(
             self,

@@ -1,4 +1,4 @@
-"""Fits of dipoles from starts by compiled kernels: damped Gauss-Newton with the moments eliminated.
+"""Compiled fits of dipoles from starts: damped Gauss-Newton, moments eliminated.
 
 :func:`magloc.localization.fit.gauss_newton.damped_gauss_newton` is the readable reference.
 """
@@ -24,7 +24,9 @@ _CHANNELS_A_BLOCK = 100_000
 
 
 class Refinements(NamedTuple):
-    """Ends of n refinements of K sources: q (n, K, 4), scaled moments (n, K, 3), χ² (n,), linearisations (n,).
+    """Results of n refinements of K sources.
+
+    q (n, K, 4), scaled moments (n, K, 3), χ² (n,), linearisations (n,).
 
     The last item tells which converged, or were given up because they would not come below a useful χ².
     """

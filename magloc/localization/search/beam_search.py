@@ -1,4 +1,4 @@
-"""Search for several dipoles at once: beams of the best distinct fits, one more source at a time, and random restarts.
+"""Beam search for several dipoles, one more source at a time, with random restarts.
 
 Everything works on b sets of readings of one :class:`magloc.measurement.whitened.WhitenedModel` at once.
 """
@@ -45,7 +45,10 @@ _MOST_ITERATIONS = 60
 
 
 def best_distinct(fits: JointFits, n_rows: int, width: int) -> JointFits:
-    """The `width` best fits of every row that differ, from the same number of fits for every row, row after row."""
+    """Return the `width` best distinct fits of every row.
+
+    Every row has the same number of fits.
+    """
     # q and -q are the same source.
     sign = np.where(fits.q[..., 3:] < 0.0, -1.0, 1.0)
     every = replace(fits, q=fits.q * sign, chi2=fits.chi2.copy()).reshape(n_rows, -1)
@@ -68,7 +71,7 @@ def best_distinct(fits: JointFits, n_rows: int, width: int) -> JointFits:
 
 
 def _same_sources(q: FloatArray, mu: FloatArray, other_q: FloatArray, other_mu: FloatArray) -> NDArray[np.bool_]:
-    """Whether two sets of sources are the same in some order."""
+    """Return whether two sets of sources are equal in some order."""
     angle = np.abs(np.einsum("...kd,...ld->...kl", q, other_q)) > np.cos(_SAME_RAD)
     apart = np.linalg.norm(mu[..., :, None, :] - other_mu[..., None, :, :], axis=-1)
     near = angle & (apart < _SAME_MOMENT * np.linalg.norm(mu, axis=-1)[..., None])
@@ -77,7 +80,7 @@ def _same_sources(q: FloatArray, mu: FloatArray, other_q: FloatArray, other_mu: 
 
 @dataclass(frozen=True, eq=False)
 class BeamSearch:
-    """How to search; the same for all readings of a problem.
+    """Beam search with settings that hold for all readings of a problem.
 
     Attributes
     ----------
@@ -106,7 +109,7 @@ class BeamSearch:
     bases: LastBases = field(default_factory=LastBases)
 
     def first_sources(self, problem: WhitenedModel, y: FloatArray) -> JointFits:
-        """One source, from the candidates that explain most."""
+        """Return fits of one source, from the candidates that explain most."""
         bent = self._needs_templates(problem, y)
         if not bent.any() or bent.all():
             return self._first_sources(problem, y, bool(bent.any()))
@@ -117,7 +120,7 @@ class BeamSearch:
         return fits
 
     def _first_sources(self, problem: WhitenedModel, y: FloatArray, templates: bool) -> JointFits:
-        """:meth:`first_sources` of rows all of which start from templates too, or none."""
+        """Return :meth:`first_sources` of rows that all use templates, or all do not."""
         gain = problem.linear_gain(np.zeros_like(problem.ambient))
         residual = y - problem.ambient_signals
         starts: list[tuple[FloatArray, FloatArray]] = []
@@ -149,14 +152,17 @@ class BeamSearch:
         return best_distinct(self._apply_prior(fits), len(y), self.width)
 
     def _ends(self, problem: WhitenedModel, y: FloatArray, q: FloatArray, mu: FloatArray) -> JointFits:
-        """Distinct fits of one source by moduli, as many as there are starts (b, k, …); the others have no χ²."""
+        """Return distinct fits of one source by moduli (b, k, …); empty places have no χ²."""
         signals = signals_of(problem, y - problem.ambient_signals)
         found = search_optima(problem, signals, np.arange(len(y)), q, mu, self.within, _MOST_ITERATIONS)
         chi2 = np.where(np.arange(q.shape[1]) < found.counts[:, :1], found.chi2, np.inf)
         return JointFits(found.q[:, :, None], found.mu[:, :, None], chi2, found.iterations).reshape(-1)
 
     def _needs_templates(self, problem: WhitenedModel, y: FloatArray) -> NDArray[np.bool_]:
-        """Rows (b,) with moduli far from linear: their source's field is not small against the ambient field."""
+        """Return whether moduli are far from linear in rows (b,).
+
+        The source's field is then not small against the ambient field.
+        """
         scalar = problem.channel_is_scalar
         ambient = np.linalg.norm(problem.ambient[:, problem.channel_sensor[scalar]], axis=-1)
         signal = np.abs(y[:, scalar])
@@ -194,7 +200,7 @@ class BeamSearch:
     def _choose(
         self, problem: WhitenedModel, gain: FloatArray, residual: FloatArray, n_starts: int, apart_rad: float
     ) -> NDArray[np.intp]:
-        """Distinct candidates (b, n_starts) that explain most of residuals."""
+        """Return distinct candidates (b, n_starts) that explain most of the residuals."""
         chosen = np.empty((len(residual), n_starts), dtype=np.intp)
         for rows in rows_of_equal_gain(gain):
             bases = self.bases_of(problem, gain[rows[0]], int(rows[0]))
@@ -204,21 +210,21 @@ class BeamSearch:
     def _choose_for_residual(
         self, problem: WhitenedModel, y: FloatArray, q: FloatArray, mu: FloatArray, n_starts: int, apart_rad: float
     ) -> NDArray[np.intp]:
-        """Those that explain most of what the sources (b, K, …) leave."""
+        """Return the candidates that explain most of the residual of sources (b, K, …)."""
         fields = problem.source_fields(q, mu)
         return self._choose(problem, problem.linear_gain(fields), y - problem.predict(fields), n_starts, apart_rad)
 
     def bases_of(self, problem: WhitenedModel, gain: FloatArray, row: int) -> SingleArray:
-        """:func:`linear_bases` of the candidates."""
+        """Return :func:`linear_bases` of the candidates."""
         return self.bases.linear(problem, gain, row, self.candidates)
 
     def _apply_prior(self, fits: JointFits) -> JointFits:
-        """Fits that agree with what is known of the sources; the others count as none."""
+        """Return the fits with infinite χ² where they contradict the prior."""
         allowed = np.all(self.allowed(fits.q, fits.mu), axis=1)
         return replace(fits, chi2=np.where(allowed, fits.chi2, np.inf))
 
     def add_source(self, problem: WhitenedModel, y: FloatArray, beam: JointFits, credible: float = 0.0) -> JointFits:
-        """Beam with another source: every fit is extended by the candidates that explain most of what it leaves.
+        """Return the beam with one more source, from candidates that explain most of the residual.
 
         Where the first of them lead to a χ² that is credible, others are given up that will stay far above it.
         """
@@ -234,7 +240,7 @@ class BeamSearch:
         return best_distinct(fits, len(y), self.width)
 
     def residual_scores(self, problem: WhitenedModel, y: FloatArray, q: FloatArray, mu: FloatArray) -> FloatArray:
-        """Energy that every candidate explains of what the sources (b, K, …) leave: (b, n)."""
+        """Return the energy (b, n) that candidates explain of the residual of sources (b, K, …)."""
         fields = problem.source_fields(q, mu)
         return self._linear_scores(problem, problem.linear_gain(fields), y - problem.predict(fields))
 
@@ -248,7 +254,10 @@ class BeamSearch:
         chosen: NDArray[np.intp],
         credible: float = 0.0,
     ) -> JointFits:
-        """Refined fits of sources (f, K, …) and one of the chosen candidates (f, n) each; row is that of every fit."""
+        """Refine sources (f, K, …) with each of the chosen candidates (f, n) added.
+
+        `row` is that of every fit.
+        """
         each = np.repeat(np.arange(len(q)), chosen.shape[1])
         at, y_each = problem.rows(row), y[row]
         new = self.candidates[chosen.ravel()][:, None]
@@ -272,7 +281,7 @@ class BeamSearch:
         return JointFits.none((len(q),), q.shape[1]).replace(first, fits).replace(others, more)
 
     def remove_source(self, problem: WhitenedModel, y: FloatArray, beam: JointFits) -> JointFits:
-        """Beam without one source: every source of the best fit is left out in turn."""
+        """Return the beam with one source less, each source of the best fit removed in turn."""
         n_sources = beam.n_sources
         q, mu = _fill_missing(beam.rows((slice(None), slice(0, 1))))
         others = np.array([[k for k in range(n_sources) if k != out] for out in range(n_sources)])
@@ -282,7 +291,7 @@ class BeamSearch:
         return best_distinct(self._apply_prior(refine(problem.rows(row), y[row], q, mu)), len(y), self.width)
 
     def restart(self, problem: WhitenedModel, y: FloatArray, beam: JointFits, rng: np.random.Generator) -> JointFits:
-        """Beam after a random source of random fits is replaced by a random one of the best candidates."""
+        """Return the beam after random sources are replaced by random good candidates."""
         n_rows, width = beam.chi2.shape
         n_sources, n_tries = beam.n_sources, self.n_starts * self.width
         q, mu = _fill_missing(beam)
@@ -301,7 +310,7 @@ class BeamSearch:
 
 
 def merge(first: JointFits, second: JointFits) -> JointFits:
-    """The best distinct fits of two beams of equally many sources."""
+    """Return the best distinct fits of two beams with equally many sources."""
     n_rows, width = first.chi2.shape
     pairs = zip(vars(first).values(), vars(second).values(), strict=True)
     both = JointFits(*(np.concatenate(pair, axis=1) for pair in pairs))
@@ -309,7 +318,7 @@ def merge(first: JointFits, second: JointFits) -> JointFits:
 
 
 def _fill_missing(beam: JointFits) -> tuple[FloatArray, FloatArray]:
-    """Sources (b·w, K, …) with the best fit in place of those that there are not."""
+    """Return sources (b·w, K, …), with the best fit in empty places."""
     missing = ~np.isfinite(beam.chi2)
     q = np.where(missing[..., None, None], beam.q[:, :1], beam.q)
     mu = np.where(missing[..., None, None], beam.mu[:, :1], beam.mu)

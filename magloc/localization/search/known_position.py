@@ -1,4 +1,4 @@
-"""The moments of dipoles whose places are known: the vector gradiometer of the source paper, by any sensors.
+"""Moments of dipoles at known positions, by any sensors (the paper's vector gradiometer).
 
 Differences of moduli without an ambient field are even in the moment: m and -m fit exactly alike, and three of them
 usually have four exact solutions. All of them are returned. A known ambient field makes the differences nearly linear
@@ -32,7 +32,7 @@ _TOO_LARGE = "the differences between the sensors do not determine a moment that
 
 
 class MomentSearch:
-    """Optima of the moments of K sources at known places.
+    """Search for the moments of K sources at known positions.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ class MomentSearch:
         self.prior = prior
 
     def select(self, index: IntArray) -> MomentSearch:
-        """The search in some of the rows."""
+        """Return the search for some of the rows."""
         if len(self.position_m) == 1:
             return self
         if len(self.position_m) <= index.max(initial=-1):
@@ -74,7 +74,7 @@ class MomentSearch:
         return MomentSearch(self.array, self.position_m[index], prior=self.prior)
 
     def optima(self, rows: WhitenedRows) -> list[Optima]:
-        """Every distinct optimum of every row."""
+        """Return all distinct optima of every row."""
         rows = rows.with_known_moment(self.prior.known_moment)
         model, place = rows.model, self.position_m if len(self.position_m) == 1 else self.position_m[rows.index]
         position = np.broadcast_to(place, (len(rows), *place.shape[1:]))
@@ -89,7 +89,10 @@ class MomentSearch:
 
 
 def _all_moments(problem: WhitenedModel, y: FloatArray, q: FloatArray) -> JointFits:
-    """Every distinct optimum of the moments at q (b, K, 4), from the linear solution and from moments all around."""
+    """Return all distinct optima of the moments at q (b, K, 4).
+
+    They start from the linear solution and from moments all around.
+    """
     n, n_sources = q.shape[:2]
     starts = [fit_moments(problem, y, q)[:, None]]
     if problem.channel_is_scalar.any():
@@ -109,7 +112,10 @@ def _all_moments(problem: WhitenedModel, y: FloatArray, q: FloatArray) -> JointF
 
 
 def _distinct_optima(problem: WhitenedModel, y: FloatArray, q: FloatArray, fits: JointFits) -> JointFits:
-    """The best optima of every row that χ² rises between, and their opposites where χ² is even in the moment."""
+    """Return the best optima of every row that a rise of χ² separates.
+
+    Opposite moments are added where χ² is even.
+    """
     n = len(y)
     every = replace(fits, chi2=fits.chi2.copy()).reshape(n, -1)
     mu, chi2 = every.mu, every.chi2
@@ -136,7 +142,10 @@ def _distinct_optima(problem: WhitenedModel, y: FloatArray, q: FloatArray, fits:
 
 
 def _is_even(problem: WhitenedModel) -> NDArray[np.bool_]:
-    """Whether the readings (b,) stay as they are if the moment is reversed: moduli alone, without an ambient field."""
+    """Return whether readings (b,) stay if the moment is reversed.
+
+    So do moduli alone without an ambient field.
+    """
     silent = ~np.any(problem.gain, axis=-1)
     lone = problem.channel_is_scalar & ~np.any(problem.ambient, axis=-1)[:, problem.channel_sensor]
     return np.all(silent | lone, axis=-1)

@@ -1,4 +1,4 @@
-"""One source at rest from several rows of an array that moves: all its readings as those of one large array.
+"""Search for one source at rest from several rows of a moving array.
 
 A few scalar sensors do not locate a source in one row, but they do while they pass it. Every row keeps its own common
 field, so that what changes from row to row in the ambient field does not matter.
@@ -36,7 +36,9 @@ _UNSEEN = "the rows together do not determine the source"
 def optima_at_rest(
     rows: WhitenedRows, prior: SourcePrior = NOTHING_KNOWN, errors: Callable[[FloatArray], FloatArray] | None = None
 ) -> Optima:
-    """Distinct optima of a source at rest by :func:`stacked_rows`; `prior` bounds its position in the world frame.
+    """Return distinct optima of a source at rest, by :func:`stacked_rows`.
+
+    `prior` bounds its position in the world frame.
 
     `errors`, columns (b, C, n) in units of the noise for a source (6,), count as noise: they are linearised at the best
     optimum, for a search of its own and then until they stay.
@@ -60,7 +62,7 @@ def optima_at_rest(
 
 
 def _search(rows: WhitenedRows, prior: SourcePrior) -> Optima:
-    """The optima of one search."""
+    """Return the optima of one search."""
     model, allowed = rows.model, partial(prior.allows, rows.model)
     beam = BeamSearch(model.homogeneous(_candidates(model)), allowed, width=_WIDTH).first_sources(model, rows.y)
     fits = beam.rows(0)
@@ -72,7 +74,10 @@ def _search(rows: WhitenedRows, prior: SourcePrior) -> Optima:
 def stacked_errors(
     poses: PosesOfRows, readings_T: FloatArray, ambient_T: FloatArray | None
 ) -> Callable[[FloatArray], FloatArray]:
-    """What errors of the poses add to :func:`stacked_rows`: columns (1, C n, k) in units of the noise, of a source."""
+    """Return a function for the effect (1, C n, k) of pose errors on :func:`stacked_rows`.
+
+    In units of the noise, for a source.
+    """
     array = poses.array
     fields = ambient_fields(array, len(readings_T), ambient_T)
     masks = np.isfinite(readings_T)
@@ -92,7 +97,7 @@ def stacked_rows(
     R_world_from_array: FloatArray,
     ambient_T: FloatArray | None = None,
 ) -> WhitenedRows:
-    """Rows (n, C) of an array whose pose in the world is known as one row of a large array in the world frame."""
+    """Return rows (n, C) of a moving array as one row of a large array in the world frame."""
     n, available = len(readings_T), np.isfinite(readings_T)
     whitenings = [whitenings_of(array, mask, row) for mask, row in zip(available, readings_T, strict=True)]
     fields = ambient_fields(array, n, ambient_T)
@@ -132,7 +137,7 @@ def stacked_rows(
 
 
 def _candidates(problem: WhitenedModel) -> FloatArray:
-    """Positions around the track of the array: along directions from the centroid, and near every place of it."""
+    """Return positions along the array's track: by direction, and near every place."""
     ranges = problem.radius * np.geomspace(0.3, 20.0, _N_RANGES)
     outer = problem.centroid + (ranges[:, None, None] * fibonacci_directions(_N_DIRECTIONS)).reshape(-1, 3)
     places = problem.centroid + problem.radius * problem.sensors

@@ -1,4 +1,4 @@
-"""Search for several dipoles at once, by any sensors: how many there are, and where.
+"""Search for several dipoles by any sensors: their number and positions.
 
 One source is searched for, then another in what the first leaves, and so on; all sources are refined together and the
 best three distinct fits go on. A source is only added where it lowers χ² by more than a threshold: the larger one of
@@ -45,12 +45,12 @@ NOISE_ALONE = "noise alone explains the readings: no source stands out of it"
 
 
 def most_sources(n_differences: int) -> int:
-    """Largest number of sources that leaves a degree of freedom."""
+    """Return the largest number of sources that leaves a degree of freedom."""
     return (n_differences - 1) // N_UNKNOWNS
 
 
 class MultiSourceSearch:
-    """Optima of several sources, by any sensors, without a start.
+    """Search for several sources, by any sensors, without a start.
 
     Parameters
     ----------
@@ -100,18 +100,18 @@ class MultiSourceSearch:
         self._candidates = allowed_positions(array, prior, fine_positions(array))
 
     def optima(self, rows: WhitenedRows) -> list[Optima]:
-        """Distinct optima with the chosen number of sources: one entry for every number."""
+        """Return distinct optima, one entry for every chosen number of sources."""
         return _Levels(self, rows.with_known_moment(self.prior.known_moment)).optima()
 
     def threshold_of(self, levels: _Levels) -> float:
-        """The threshold for another source, drawn once for every number of differences."""
+        """Return the threshold for another source, cached by the number of differences."""
         if levels.n_differences not in self._thresholds:
             self._thresholds[levels.n_differences] = levels.threshold()
         return self._thresholds[levels.n_differences]
 
 
 class _Levels:
-    """The search over numbers of sources for one block of rows."""
+    """Search over the number of sources for one block of rows."""
 
     def __init__(self, locator: MultiSourceSearch, rows: WhitenedRows) -> None:
         self.locator, self.rows, self.n_differences = locator, rows, rows.n_differences
@@ -131,7 +131,7 @@ class _Levels:
         )
 
     def optima(self) -> list[Optima]:
-        """Optima with the chosen number of sources of every row: one entry for every number."""
+        """Return optima with the chosen number of sources, one entry for every number."""
         everything = np.arange(len(self.y))
         self.one = self._first(everything)
         beams: list[JointFits] = [self.one]
@@ -206,7 +206,10 @@ class _Levels:
         return beam
 
     def _stands_out(self, before: FloatArray, after: FloatArray) -> BoolArray:
-        """Whether χ² falls by more than the threshold for another source, which is drawn where some are near to it."""
+        """Return whether χ² falls by more than the threshold for another source.
+
+        The threshold is drawn only if some falls are near to it.
+        """
         with np.errstate(invalid="ignore"):
             fall = before - after
             found: BoolArray = fall > max(self.penalty, _BEYOND_NOISE)
@@ -216,7 +219,7 @@ class _Levels:
         return found
 
     def _is_weak(self) -> BoolArray:
-        """Rows decided without a search for more: neither their energy nor the best source stands out of noise."""
+        """Return whether rows need no search for more: only noise is left."""
         if self.asked is not None or self.most == 1:
             return np.zeros(len(self.y), dtype=bool)
         energy = self.rows.energy
@@ -226,7 +229,10 @@ class _Levels:
         return weak
 
     def _may_have_another(self, rows: IntArray, beam: JointFits) -> BoolArray:
-        """Whether another source might pay: a suspicious χ², or a candidate that explains much of what is left."""
+        """Return whether another source might pay.
+
+        χ² is suspicious, or a candidate explains much of the residual.
+        """
         suspicious = ~(beam.chi2[:, 0] <= self._quantile(beam.n_sources, SUSPICIOUS_FIT))
         clean = np.flatnonzero(~suspicious)
         if clean.size:
@@ -237,7 +243,7 @@ class _Levels:
         return suspicious
 
     def _restart(self, rows: IntArray, beam: JointFits, rounds: int = _MOST_RESTARTS) -> JointFits:
-        """Beams of rows, with random sources replaced until the best fit is credible."""
+        """Return beams with random sources replaced until the best fit is credible."""
         credible = self._quantile(beam.n_sources, CREDIBLE_FIT)
         for _ in range(rounds):
             bad = np.flatnonzero(~(beam.chi2[:, 0] <= credible))
@@ -252,7 +258,9 @@ class _Levels:
         return float(chdtri(dof, 1.0 - level)) if dof > 0 else 1e-6
 
     def threshold(self) -> float:
-        """By how much χ² must fall for another source: what noise reaches in one of a thousand rows, or BIC's penalty.
+        """Return the decrease of χ² that another source needs.
+
+        The larger one of BIC's penalty and of what noise reaches in one of a thousand rows.
 
         Noise is drawn around the best fit of all rows; only the loudest draws, where a candidate explains most, are
         searched for a second source: many more than stay above the threshold, as candidates stand far apart.
@@ -284,7 +292,7 @@ class _Levels:
         return max(self.penalty, float(fall[-k])) if fall.size >= k else self.penalty
 
     def _has_unresolved_pair(self, rows: IntArray, beam: JointFits) -> BoolArray:
-        """Whether a source of the best fit is hardly known beside another one, so that other pairs would do as well.
+        """Return whether the best fit has a pair of sources that cannot be resolved.
 
         Its moment is not far from nothing, and its place not far from the other's, both by their own covariance. In
         such a fit χ² has curved valleys and several optima, and the covariance of one of them says far too little.
@@ -315,7 +323,10 @@ class _Levels:
         certain: BoolArray,
         noise_alone: BoolArray,
     ) -> Optima:
-        """What is listed of the rows with n + 1 sources; `fewer`: that is fewer than were asked for, or seen."""
+        """Return the listed optima of the rows with n + 1 sources.
+
+        `fewer`: whether that is fewer than were asked for, or seen.
+        """
         beam = beams[n].rows(rows)
         listed = np.isfinite(beam.chi2) & (beam.chi2 <= beam.chi2[:, :1] + DISTINCT_WITHIN)
         listed[noise_alone[rows]] = False
@@ -336,7 +347,7 @@ class _Levels:
     def _closest_pair(
         self, q: FloatArray, mu: FloatArray, more: JointFits, row: int, certain: bool
     ) -> tuple[str, BoolArray]:
-        """Why a row has fewer sources, and which of them stands for the closest pair of the larger fit."""
+        """Return why a row has fewer sources, and which one stands for the closest pair."""
         n = len(q)
         reason = f"the readings support {n} source{'s' if n > 1 else ''}"
         reason += "" if self.asked is None else f", {self.asked} were asked for"

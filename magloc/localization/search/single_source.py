@@ -45,7 +45,7 @@ _UNSEEN = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class BestFits:
-    """The best optima found from many starts, without their uncertainty.
+    """Best optima from many starts, without uncertainty.
 
     Attributes
     ----------
@@ -64,7 +64,7 @@ class BestFits:
 
 @dataclass(frozen=True, eq=False)
 class _Ranking:
-    """All candidates, and their bases (C, 3 n) under the whitening of a mask, by which its rows rank them.
+    """Candidates and their bases (C, 3 n) under the whitening of a mask.
 
     Of a mask that lacks few channels the whitening and the bases are those of all channels. What the others read counts
     as unknown: the candidates' components are made `orthonormal` (6, n) without the directions `lost` (C, k).
@@ -77,7 +77,7 @@ class _Ranking:
     orthonormal: SingleArray | None = None
 
     def without(self, missing: BoolArray) -> _Ranking:
-        """The ranking of rows that miss some channels (C,), from that of all."""
+        """Return the ranking for rows that miss some channels (C,)."""
         basis, shrinkage, root = self.whitening.basis, self.whitening.shrinkage, self.whitening.root[:, missing]
         unit = (root / np.linalg.norm(root, axis=0)).T
         left, singular, lost = np.linalg.svd(unit - ((unit @ basis) * shrinkage) @ basis.T, full_matrices=False)
@@ -95,13 +95,13 @@ class _Ranking:
         return common
 
     def whiten(self, channels: FloatArray) -> FloatArray:
-        """Readings (b, C) above the ambient field as they are ranked."""
+        """Whiten readings (b, C) above the ambient field for the ranking."""
         whole = self.whitening.apply(channels)
         return whole if self.lost is None else whole - (whole @ self.lost) @ self.lost.T
 
 
 class SingleSourceSearch:
-    """Distinct optima of one source, by an array of vector sensors.
+    """Search for one source, by an array of vector sensors.
 
     Parameters
     ----------
@@ -148,7 +148,7 @@ class SingleSourceSearch:
         self._kept: tuple[bytes, _Ranking] | None = None
 
     def optima(self, rows: WhitenedRows) -> list[Optima]:
-        """Distinct optima of every row within Δχ² = 20 of its best one that the prior allows."""
+        """Return all allowed optima of every row within Δχ² = 20 of its best one."""
         everything = self._everything
         keep_within = DISTINCT_WITHIN if everything else math.inf
         found = self.refine_starts(rows, np.arange(len(rows)), self.starts(rows), keep_within)
@@ -175,7 +175,10 @@ class SingleSourceSearch:
         return [Optima(rows, fits, of_row, reason, failed_starts=found.counts[:, 1])]
 
     def optima_from(self, readings_T: ArrayLike, starts_m: ArrayLike) -> BestFits:
-        """Best optimum of readings (C,) for every start (n, 3) [m], refined beside the candidates; without prior."""
+        """Return the best optimum of readings (C,) for every start (n, 3) [m].
+
+        Starts are refined beside the candidates, without prior.
+        """
         (rows,) = whitened_rows(self.array, np.asarray(readings_T, dtype=np.float64)[None], None, 1)
         first = rows.model.homogeneous(np.asarray(starts_m, dtype=np.float64))[:, None]
         reading_of_row = np.zeros(len(first), dtype=np.intp)
@@ -189,7 +192,7 @@ class SingleSourceSearch:
         )
 
     def _ranking(self, mask: BoolArray) -> _Ranking:
-        """Bases are large, and dear: those of all channels are kept, and the last of what is made of them."""
+        """Return the ranking under a mask; the large bases are cached."""
         key, few = mask.tobytes(), np.count_nonzero(~mask) <= _MOST_MISSING * mask.size
         if few and self._of_all is None:
             self._of_all = self._ranking_by(np.ones_like(mask))
@@ -206,7 +209,7 @@ class SingleSourceSearch:
         return _Ranking(of_mask, candidates, linear_bases(model, model.gain[0], 0, candidates))
 
     def starts(self, rows: WhitenedRows, n_starts: int | None = None) -> FloatArray:
-        """Distinct candidates (b, n_starts, 4) that explain most of every row."""
+        """Return distinct candidates (b, n_starts, 4) that explain most of every row."""
         ranking = self._ranking(rows.mask)
         ranked = rows.y
         if self.array.noise_depends_on_reading or ranking.lost is not None:
@@ -220,11 +223,11 @@ class SingleSourceSearch:
     def refine_starts(
         self, rows: WhitenedRows, reading_of_row: IntArray, starts: FloatArray, keep_within: float
     ) -> LocalOptima:
-        """Distinct optima that starts (n, k, 4) lead to, each of the reading of some row."""
+        """Return distinct optima from starts (n, k, 4), each for the reading of some row."""
         return search_optima(rows.model, rows.signals, reading_of_row, starts, None, keep_within, self.max_iterations)
 
     def _apply_prior(self, model: WhitenedModel, found: LocalOptima) -> LocalOptima:
-        """Optima that agree with what is known, again those within Δχ² of the best of them."""
+        """Return the optima that agree with the prior, within Δχ² of the best of them."""
         chi2 = np.where(self.prior.allows(model, found.q, found.mu), found.chi2, np.inf)
         order = np.argsort(chi2, axis=1, kind="stable")
         chi2 = np.take_along_axis(chi2, order, axis=1)
@@ -241,7 +244,7 @@ class SingleSourceSearch:
 
 @lru_cache(maxsize=2)  # candidates' bases, which are large, take longer than a fix
 def cached_search(array: SensorArray) -> SingleSourceSearch:
-    """The search by one of the last arrays, where nothing is known: readings that come one by one have one."""
+    """Return the cached search of a recent array without prior, for readings one by one."""
     return SingleSourceSearch(array)
 
 

@@ -1,4 +1,4 @@
-"""How well the sources of optima are known: covariances, sets of ranges, and weights of the solutions.
+"""Uncertainty of sources: covariances, sets of ranges, and weights of the solutions.
 
 Of a single source all solutions of a row are taken together (:mod:`magloc.localization.uncertainty.range_interval`).
 Several sources have no common range: each has its own ranges in each solution, where the profile of χ² stays within
@@ -49,7 +49,7 @@ _LINEARISATIONS = 20
 
 
 class _FitColumns(NamedTuple):
-    """What is known of f fits of K sources: the columns of :class:`Solutions` of these names."""
+    """Columns of :class:`Solutions` for f fits of K sources."""
 
     position_m: FloatArray
     moment_Am2: FloatArray
@@ -60,7 +60,7 @@ class _FitColumns(NamedTuple):
 
 
 def solutions_of(optima: Optima, detected: BoolArray) -> Solutions:
-    """Solutions of the rows of optima: those whose covariance is finite, with what is known of them."""
+    """Return the solutions of optima with a finite covariance."""
     model, fits = optima.rows.model, optima.fits
     n_fits, n_sources = fits.q.shape[:2]
     if optima.position_m is not None:
@@ -94,7 +94,7 @@ def solutions_of(optima: Optima, detected: BoolArray) -> Solutions:
 
 
 def covariance_is_valid(optima: Optima, covariance: FloatArray, which: IntArray) -> BoolArray:
-    """Whether covariances (f, 6 K, 6 K) of some fits describe their errors, as far as the model tells.
+    """Return whether covariances (f, 6 K, 6 K) describe the errors of some fits.
 
     They do where χ² is one of noise, and rises by one, give or take a half, at one standard deviation along the longest
     axis, to either side: not where the errors follow a curve. With no degrees of freedom every χ² is as it must be.
@@ -114,7 +114,10 @@ def covariance_is_valid(optima: Optima, covariance: FloatArray, which: IntArray)
 
 
 def fit_columns(optima: Optima, detected: BoolArray) -> _FitColumns:
-    """What is known of sources at unknown places: a single one has its ranges from all solutions of a row together."""
+    """Return the columns of fits at unknown positions.
+
+    The range of a single source comes from all solutions of its row together.
+    """
     rows, fits, of_row = optima.rows, optima.fits, optima.of_row
     model = rows.model.rows(of_row)
     understated = _noise_factor(optima)[of_row]
@@ -149,7 +152,7 @@ def fit_columns(optima: Optima, detected: BoolArray) -> _FitColumns:
 
 
 def _range_sets(optima: Optima, covariance: FloatArray, told: FloatArray, weight: FloatArray) -> FloatArray:
-    """95 % sets (b, i, 2) of the range of a single source in every row, all solutions together."""
+    """Return the 95 % range sets (b, i, 2) of single sources, over all solutions of a row."""
     rows, fits, of_row = optima.rows, optima.fits, optima.of_row
     shape, at = _places(of_row, len(rows))
     of_table, shares = np.full(shape, np.inf), np.zeros(shape)
@@ -213,13 +216,13 @@ def single_source_columns(optima: Optima) -> _FitColumns:
 
 @lru_cache(maxsize=64)
 def _detection(n_differences: int, dof: int) -> tuple[float, FloatArray, FloatArray]:
-    """Return χ² of a misfit, and what the detection of a signal tells of its strength: both columns ascending."""
+    """Return χ² of a misfit, and the detection statistic over strengths, both ascending."""
     strength, left = detection_statistic(n_differences)
     return quantile(dof, MISFIT), strength, np.ascontiguousarray(-left)
 
 
 def _best_chi2(optima: Optima) -> FloatArray:
-    """χ² (b,) of the best fit of every row; infinite where there is none."""
+    """Return χ² (b,) of the best fit of every row; infinite where there is none."""
     best = np.full(len(optima.rows), np.inf)
     rows, first = np.unique(optima.of_row, return_index=True)
     best[rows] = optima.fits.chi2[first]
@@ -227,7 +230,7 @@ def _best_chi2(optima: Optima) -> FloatArray:
 
 
 def _noise_factor(optima: Optima) -> FloatArray:
-    """By how much the variance of noise is understated (b,): χ² per degree of freedom of rows that are misfits, else 1.
+    """Return the factor (b,) of the noise variance: χ²/dof of rows that are misfits, else 1.
 
     What a wrong model leaves is no noise, but σ that knew only the noise would be worse.
     """
@@ -236,7 +239,10 @@ def _noise_factor(optima: Optima) -> FloatArray:
 
 
 def _known_position_columns(optima: Optima, position_m: FloatArray) -> _FitColumns:
-    """What is known of moments at known places (b, K, 3); the range is that of the place."""
+    """Return the columns of moments at known positions (b, K, 3).
+
+    The range is that of the position.
+    """
     rows, fits, of_row = optima.rows, optima.fits, optima.of_row
     model, position, moment = rows.model, position_m[of_row], rows.model.moment(fits.q, fits.mu)
     understated = _noise_factor(optima)[of_row]
@@ -253,13 +259,13 @@ def _known_position_columns(optima: Optima, position_m: FloatArray) -> _FitColum
 
 
 def _places(of_row: IntArray, n_rows: int) -> tuple[tuple[int, int], tuple[IntArray, IntArray]]:
-    """Shape of a table of the fits of every row, and the places of the fits in it."""
+    """Return the shape of a table of the fits of every row, and the indices of fits in it."""
     place = np.arange(len(of_row)) - np.searchsorted(of_row, of_row)
     return (n_rows, int(place.max(initial=0)) + 1), (of_row, place)
 
 
 def _weights_of_rows(of_row: IntArray, chi2: FloatArray, volume: FloatArray) -> FloatArray:
-    """:func:`weights` (f,) among the fits of every row."""
+    """Return :func:`weights` (f,) among the fits of every row."""
     shape, at = _places(of_row, int(of_row.max(initial=-1)) + 1)
     of_table, volumes = np.full(shape, np.inf), np.zeros(shape)
     of_table[at], volumes[at] = chi2, volume

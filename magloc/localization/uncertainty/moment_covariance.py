@@ -1,4 +1,4 @@
-"""Covariances of moments at known places."""
+"""Covariances of moments at known positions."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ _LEAST_EIGENVALUE = 1e-13
 
 
 def moment_covariances(problem: WhitenedModel, y: FloatArray, fits: JointFits) -> FloatArray:
-    """Inverse of half the second derivative of χ² (b, 3 K, 3 K) [A·m²], NaN where it is not positive.
+    """Return the inverse of half the Hessian of χ² (b, 3 K, 3 K) [A·m²].
+
+    NaN where it is not positive definite.
 
     Where two exact solutions are about to meet, the first derivative of the readings alone would say nothing.
     """
