@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from arrays.typing import FloatArray
-from magloc.localization.fit.refinement import Refined, refine_starts
+from magloc.localization.fit.refinement import Refinements, refine_starts
 from magloc.measurement.whitened import WhitenedModel
 
 
@@ -33,7 +33,7 @@ def best_moment(model: WhitenedModel, q: FloatArray, y: FloatArray) -> FloatArra
     return mu
 
 
-def refined(model: WhitenedModel, y: FloatArray, q: FloatArray, max_iterations: int = 100) -> Refined:
+def refined(model: WhitenedModel, y: FloatArray, q: FloatArray, max_iterations: int = 100) -> Refinements:
     """Refinements of one source from a start (b, 4) for each row of whitened readings (b, C), by the kernel."""
     ends = refine_starts(model, y, q[:, None], max_iterations=max_iterations)
     return ends._replace(q=ends.q[:, 0], mu=ends.mu[:, 0])

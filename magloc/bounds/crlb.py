@@ -125,8 +125,8 @@ def whitened_jacobian(
         if array.pose is not None:
             errors.append(whitening.root @ pose_errors_at_rest(array, array.pose, p, m))
         if errors:
-            model = model.marginalised(np.concatenate(errors, axis=-1))
-        W[known, : array.n_channels] = model.whitened(whitening.root @ jacobian)
+            model = model.marginalise(np.concatenate(errors, axis=-1))
+        W[known, : array.n_channels] = model.whiten(whitening.root @ jacobian)
         if known_moment_sigma_Am2 < np.inf:
             W[known, -1, :3] = 0.0
             W[known, -1, 3:] = KnownMoment((1.0,), known_moment_sigma_Am2).jacobian(m[:, None])[:, 0, 0]

@@ -28,7 +28,7 @@ from magloc.calibration.observability import unobservable
 from magloc.calibration.results import SourceCalibration
 from magloc.least_squares import Optimum
 from magloc.localization.locator import Locator
-from magloc.measurement.rows import checked_rows
+from magloc.measurement.rows import check_rows
 
 Quantity = Literal["positions", "gains", "axes", "offsets"]
 QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
@@ -166,7 +166,7 @@ def _checked(
 ) -> tuple[FloatArray, FloatArray]:
     if array.channel_is_scalar.any():
         raise ValueError("Input array must have vector sensors only; instead received one with scalar sensors.")
-    readings = checked_rows(array, readings_T)
+    readings = check_rows(array, readings_T)
     attitude = np.eye(3) if world_from_array is None else np.asarray(world_from_array, dtype=np.float64)
     if attitude.shape not in ((3, 3), (len(readings), 3, 3)):
         raise ValueError(

@@ -23,7 +23,7 @@ from arrays.sensor import Calibration
 from arrays.typing import FloatArray
 from magloc.least_squares import minimise
 from magloc.levels import MISFIT
-from magloc.measurement.rows import checked_rows
+from magloc.measurement.rows import check_rows
 
 N_PARAMETERS = 9
 """Three of the offset, six of the symmetric scale matrix."""
@@ -173,7 +173,7 @@ def calibrated_in_modulus(
     Returns the array with the calibrations of the sensors whose fit converged, and the fits by the sensors' ids.
     Raises ValueError: the shapes do not agree, a modulus is not positive and finite, or the array has no vector sensor.
     """
-    readings = checked_rows(array, readings_T)
+    readings = check_rows(array, readings_T)
     if array.channel_is_scalar.all():
         raise ValueError("Input array must have a vector sensor; instead received scalar sensors only.")
     sensors, results = list(array.sensors), {}

@@ -308,7 +308,7 @@ class SourcesMap(CubeMap):
         """Ends of the refinements that start at the truth (n, 3); χ² is infinite where one has not converged."""
         scenario = self.scenario
         (rows,) = whitened_rows(scenario.array, readings, None, len(readings))
-        rows, q = rows.knowing(scenario.prior.known_moment), rows.model.homogeneous(position)[:, None]
+        rows, q = rows.with_known_moment(scenario.prior.known_moment), rows.model.homogeneous(position)[:, None]
         mu = rows.model.scaled_moment(q, moment[:, None])
         fits = refine(rows.model, rows.y, q, mu, max_iterations=_MAX_ITERATIONS)
         of_row = np.flatnonzero(fits.converged)

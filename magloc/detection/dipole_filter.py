@@ -20,8 +20,8 @@ from magloc.chi_square import check_differences
 from magloc.fields import dipole
 from magloc.localization.search.candidates import (
     SingleArray,
+    best_candidates,
     candidate_positions,
-    chosen_candidates,
     linear_bases,
     linear_scores,
 )
@@ -133,7 +133,7 @@ class DipoleFilter:
             gain=np.broadcast_to(self._gain, (n, *self._gain.shape)),
             channel_is_scalar=np.zeros_like(self.array.channel_is_scalar),
         )
-        chosen = chosen_candidates(self._bases, whitened, self._candidates, _N_STARTS, _APART_RAD)
+        chosen = best_candidates(self._bases, whitened, self._candidates, _N_STARTS, _APART_RAD)
         signals, starts = signals_of(problem, whitened), self._candidates[chosen]
         found = search_optima(problem, signals, np.arange(n), starts, None, np.inf, _MOST_ITERATIONS)
         return self.energy(whitened) - np.where(found.counts[:, 0] > 0, found.chi2[:, 0], np.inf)

@@ -23,7 +23,7 @@ from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.measurement.differences import predicted_channels, suitable_dipole
 from magloc.measurement.plausibility import FEWEST_ROWS, warn_of_array, warn_of_record
 from magloc.measurement.pose import with_stated_pose
-from magloc.measurement.rows import joined
+from magloc.measurement.rows import concatenate_readings
 from magloc.readings import EXPECTED_HEADER, Readings, log_format, without_saturated
 from magloc.tracking.motion import MotionModel, RandomWalk
 from magloc.tracking.multi_target.motion import FreeMotion
@@ -282,7 +282,7 @@ class Follower:
             if (first.pose is None, first.ambient_T is None) == (readings.pose is None, readings.ambient_T is None):
                 self._first_rows.append(readings)
             if sum(map(len, self._first_rows)) >= FEWEST_ROWS:
-                warn_of_record(self._in_field, joined(self._first_rows))
+                warn_of_record(self._in_field, concatenate_readings(self._first_rows))
         if self._in_field.pose is None:
             return list(rows_of(used))
         return [row for one in used for row in rows_of(one)]  # whose motion is that since the row before

@@ -1,4 +1,4 @@
-"""By how much fixes of points would err if the objects were none: bodies of the default length.
+"""Errors of point fixes if the objects were bodies of the default length.
 
 χ² does not see a body that is farther away than two of its lengths: what a dipole leaves out of its field looks like a
 shift and a turn. Where noise is small against the field, that is far more than the standard deviations of a point.
@@ -33,7 +33,9 @@ def body_covariances(
     *,
     known_place: bool,
 ) -> FloatArray:
-    """What bodies would add to the covariance (n, D, D) of the best solutions of points, in the array's frame.
+    """Return the covariance (n, D, D) that bodies would add to fixes of points.
+
+    Best solutions, in the array's frame.
 
     (0, D, D) where no row stands out of noise enough for it to matter.
     """
@@ -65,15 +67,15 @@ def _covariances(
     *,
     known_place: bool,
 ) -> FloatArray:
-    """Those (b, n, n) of some solutions of K sources each."""
+    """Return the added covariances (b, n, n) of solutions of K sources each."""
     position, moment = solutions.position_m[at, :n_sources], solutions.moment_Am2[at, :n_sources]
     q = model.homogeneous(position)
     mu = model.scaled_moment(q, moment)
     distance = np.linalg.norm(position[:, :, None] - model.centroid - model.radius * model.sensors, axis=-1)
     errors = body_errors(model, q, mu, DEFAULT_LENGTH * distance.min(axis=-1))
     if ambient_sigma_T and model.sees_moduli:
-        model = model.marginalised(ambient_errors(model, q, mu, ambient_sigma_T))
-    jacobian, errors = scaled_jacobian(model, q, mu), model.whitened(errors)
+        model = model.marginalise(ambient_errors(model, q, mu, ambient_sigma_T))
+    jacobian, errors = scaled_jacobian(model, q, mu), model.whiten(errors)
     unit = np.tile(np.repeat([model.radius, model.radius**3 / MU0_OVER_4PI], 3), n_sources)
     if known_place:
         of_moments = np.tile(np.repeat([False, True], 3), n_sources)

@@ -1,4 +1,4 @@
-"""Whether a source is so near that it can be told from a dipole: by its length, or by what a fix leaves.
+"""Validity of the dipole model: by the body's length, or by the residuals of a fix.
 
 The patterns that are looked for, quadrupole and octupole, are derived in docs/theory/extended-sources.md.
 """
@@ -29,7 +29,7 @@ _UNSEEN_RTOL = 1e-6
 
 @dataclass(frozen=True)
 class MultipoleGain:
-    """What one more order of the multipole expansion explains of the readings.
+    """Decrease of χ² by one more order of the multipole expansion.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class MultipoleGain:
 
 @dataclass(frozen=True)
 class NearnessTest:
-    """Whether a fix leaves residuals that a dipole does not, and whether they have the pattern of an extended source.
+    """Result of the test for residuals with the pattern of an extended source.
 
     Attributes
     ----------
@@ -144,14 +144,14 @@ def nearness_test(
         steps.append((order, float(np.sum((new.T @ residual) ** 2)), new.shape[1]))
         known, left = np.concatenate([known, new], axis=1), left - new.shape[1]
     rest = max(chi2 - sum(gain for _, gain, _ in steps), 0.0)
-    gains = tuple(_tested(order, gain, n, rest, left) for order, gain, n in steps)
+    gains = tuple(_test_pattern(order, gain, n, rest, left) for order, gain, n in steps)
     level = false_alarm / 3.0
     misfit = dof > 0 and bool(chdtrc(dof, chi2) < level)
     extended = any(gain.noise_probability < level and gain.misfit_probability < NO_OTHER_MISFIT for gain in gains)
     return NearnessTest(misfit, extended, chi2, dof, gains)
 
 
-def _tested(order: int, gain: float, n_parameters: int, rest: float, left: int) -> MultipoleGain:
+def _test_pattern(order: int, gain: float, n_parameters: int, rest: float, left: int) -> MultipoleGain:
     comparable = left > 0 and rest > 0.0
     ratio = (gain / n_parameters) / (rest / left) if comparable else 0.0
     return MultipoleGain(
@@ -164,7 +164,7 @@ def _tested(order: int, gain: float, n_parameters: int, rest: float, left: int) 
 
 
 def _orthonormal(columns: FloatArray, known: FloatArray) -> FloatArray:
-    """Orthonormal basis of what columns (k, n) add to the orthonormal ones that are known."""
+    """Return an orthonormal basis of the part of columns (k, n) outside a known basis."""
     length = np.linalg.norm(columns, axis=0)
     unit = columns / np.where(length > 0.0, length, 1.0)
     new = unit - known @ (known.T @ unit)
@@ -172,14 +172,17 @@ def _orthonormal(columns: FloatArray, known: FloatArray) -> FloatArray:
     return basis[:, size > _UNSEEN_RTOL]
 
 
-def too_near(
+def is_too_near(
     array: SensorArray,
     fixes: Fixes,
     readings_T: FloatArray,
     ambient_T: FloatArray | None = None,
     body_length_m: float | None = None,
 ) -> BoolArray:
-    """Whether each row's source is too near for a dipole, by length or misfit; fixes are in the array's frame."""
+    """Return whether each row's source is too near for a dipole, by length or misfit.
+
+    Fixes are in the array's frame.
+    """
     near = np.zeros(len(fixes), dtype=bool)
     best, solutions = fixes.first[fixes.solved], fixes.solutions
     if solutions.position_m.shape[1] > 1:

@@ -1,4 +1,4 @@
-r"""Fixes that a bad sensor does not ruin.
+r"""Exclusion of faulty sensors from fixes.
 
 A row whose χ² is not credible is fitted again with Student-t scores (:mod:`magloc.localization.reweighting`), iterated
 from the plain fit and from the best fits without one sensor each. These are refined from the plain fit, which a single
@@ -32,38 +32,38 @@ from magloc.localization.search.multi_source import NOISE_ALONE
 from magloc.measurement.rows import NO_SIGNAL, rows_of_equal_mask, whitened_model, whitenings_of
 from magloc.measurement.whitened import WhitenedModel
 
-# Above this χ² per degree of freedom a bad sensor may have bent the fit so much that it does not stand out.
+# χ² per degree of freedom above which a faulty sensor may have bent the fit and hide in it.
 _SPOILT = 4.0
-# Squared residuals, in limits, above which a larger one says nothing more.
+# Squared residuals, in limits, are cut here: a larger one is no stronger evidence.
 _BEYOND_DOUBT = 10.0
 # A fix that explains the other sensors badly must be better by this factor in χ² per degree of freedom.
 _INCOMPARABLE = 1000.0
 # Sensors of an array of which every two are left out in turn, and every one: of a larger one where a fit blames them.
 _MOST_IN_PAIRS, _MOST_ONE_BY_ONE = 8, 16
-# Fits without one sensor that are refined, of those that should have the lowest χ², and that are kept of a row.
+# Fits without one sensor, of lowest expected χ²: how many are refined, and how many are kept for a row.
 _MOST_REFINED, _MOST_KEPT = 6, 3
-# Sensors that are left out one after another where each is beyond doubt.
+# Largest number of gross faults that are excluded one after another.
 _MOST_GROSS = 3
-# Share of the largest fall of χ² below which that without another sensor does not matter beside it.
+# Share of the largest fall of χ² below which the falls without other sensors are negligible.
 _MATTERS = 0.05
 # Share of a sensor's readings, along any direction, that the others check: below the larger one a fit without it is
 # refined, whatever it promises; one that bends a fit, and draws a source to itself, leaves less than the smaller one.
 _HALF_CHECKED, _LEAST_CHECKED = 0.5, 0.1
-# Sensors of a larger array without which an optimum is searched for anew, of those that a fit blames.
+# Suspect sensors of a larger array, each of which is left out of a new search.
 _MOST_SEARCHED = 2
 # Share of a source's energy in one sensor above which no other sensor sees it.
 _LONELY = 0.9
-_ROWS_AT_ONCE = 64  # whose numbers a processor's cache holds
+_ROWS_AT_ONCE = 64  # fits in the processor's cache
 
 
 class Refit(Protocol):
-    """Fixes some rows anew."""
+    """Protocol of a function that fits some rows again."""
 
     def __call__(self, rows: IntArray, readings_T: FloatArray, /) -> Sequence[Fix]:
-        """Fixes of rows of these indices with other readings (n, C), NaN where missing."""
+        """Return the fixes of these rows with other readings (n, C), NaN where missing."""
 
 
-def without_faulty_sensors(
+def exclude_faulty_sensors(
     array: SensorArray,
     fixes: Fixes,
     refit: Refit,
@@ -72,12 +72,12 @@ def without_faulty_sensors(
     *,
     free_position: bool = True,
 ) -> Fixes:
-    """Fixes without the sensors that contradict all others, which `dropped_sensors` names.
+    """Return fixes without sensors that contradict all others, named in `dropped_sensors`.
 
     No sensor is dropped from a row whose χ² is credible, nor where too few would be left to tell which of them is
     wrong.
     """
-    doubtful = _doubtful(fixes)
+    doubtful = _is_doubtful(fixes)
     examined, found = [], []
     for mask, rows in rows_of_equal_mask(np.isfinite(readings_T)):
         of_mask = rows[doubtful[rows]]
@@ -87,15 +87,15 @@ def without_faulty_sensors(
             examination = _Examination(array, refit, mask, block, readings_T[block], ambient, free_position)
             plain = [fixes[row] for row in block]
             examination.allow_for_model_errors(plain)
-            found += examination.fixes(examination.without_lonely_sources(plain) if free_position else plain)
+            found += examination.fixes(examination.drop_lonely_sources(plain) if free_position else plain)
             examined.append(block)
     if not examined:
         return fixes
     return fixes.replaced(np.concatenate(examined), found)
 
 
-def _doubtful(fixes: Fixes) -> BoolArray:
-    """Rows (n,) to be looked at: those whose χ² is not credible, that have several sources, or no solution."""
+def _is_doubtful(fixes: Fixes) -> BoolArray:
+    """Whether rows (n,) are doubtful: χ² not credible, several sources, or no solution."""
     result = ~fixes.solved
     for row in np.flatnonzero(result).tolist():
         result[row] = fixes.reason[row] != NO_SIGNAL
@@ -111,13 +111,13 @@ def _is_credible(fix: Fix) -> bool:
 
 
 def _largest_credible(dof: int, body_length_m: float) -> float:
-    """Largest χ² that is credible."""
+    """Return the largest credible χ²."""
     # The prior of a body's shape is a coarse one, and no fault of a sensor.
     return quantile(dof, MISFIT if body_length_m > 0.0 else 1.0 - CREDIBLE_ROW)
 
 
 def _is_worth_dropping_for(fix: Fix, plain: Fix) -> bool:
-    """Whether a fix without some sensors explains all others, or all but incomparably better than with them.
+    """Whether a fix without some sensors explains the others, or fits incomparably better.
 
     Where it does not, it is the model, or what is known of the source, that is wrong.
     """
@@ -132,7 +132,7 @@ def _is_worth_dropping_for(fix: Fix, plain: Fix) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class _Start:
-    """A fit q (K, 4), mu (K, 3) to reweight from, the sensors that it was made without, and whether it is credible.
+    """Fit q (K, 4), mu (K, 3) to reweight from: sensors left out, and whether it is credible.
 
     A fit is not for lack of degrees of freedom.
     """
@@ -147,7 +147,7 @@ _StartOfRow = tuple[int, _Start]
 
 
 class _Examination:
-    """Rows that miss the same channels and have a doubtful fix."""
+    """Examination of rows that miss the same channels and have a doubtful fix."""
 
     def __init__(
         self,
@@ -169,141 +169,141 @@ class _Examination:
         self.limits = np.array(chdtri(np.maximum(self.count, 1), 1.0 - level), dtype=np.float64)
         channels = array.sensor_channels
         self.fits = WeightedFits(problem, self.raw, channels, self.count, self.limits, free_position)
-        # By few sensors each says so much of the source that what is cheap to tell decides nothing.
+        # With few sensors each is so informative that first-order tests do not decide.
         self.many = np.count_nonzero(self.count) > _MOST_ONE_BY_ONE
 
     @property
     def problem(self) -> WhitenedModel:
-        """The rows' model, with the errors that are allowed for."""
+        """Model of the rows, with the model errors that are allowed for."""
         return self.fits.problem
 
     def allow_for_model_errors(self, plain: Sequence[Fix]) -> None:
-        """Count as noise what bodies and the ambient field add to the fixes: no sensor is to be accused of it."""
+        """Count errors by bodies and the ambient field as noise, so that no sensor is blamed."""
         sigma_T = self.array.row_ambient_uncertainty_T if self.array.channel_is_scalar.any() else 0.0
         length_m = np.array([fix.body_length_m for fix in plain])
         errors = []
         counted = [(row, fix) for row, fix in enumerate(plain) if length_m[row] or sigma_T]
-        for _, rows, q, mu, _ in self._stacked(self._starts(counted)):
+        for _, rows, q, mu, _ in self._stack(self._starts(counted)):
             lengths = np.tile(length_m[rows, None], q.shape[1])
             errors.append((rows, model_errors(self.problem.rows(rows), q, mu, lengths, sigma_T)))
         if errors:
             every = np.zeros((len(plain), self.raw.shape[1], max(columns.shape[2] for _, columns in errors)))
             for rows, columns in errors:
                 every[rows, :, : columns.shape[2]] = columns
-            self.fits = replace(self.fits, problem=self.problem.marginalised(every))
+            self.fits = replace(self.fits, problem=self.problem.marginalise(every))
 
-    def without_lonely_sources(self, plain: Sequence[Fix]) -> list[Fix]:
-        """Fixes without sources that a single sensor sees: nothing tells such a source from a fault of the sensor."""
+    def drop_lonely_sources(self, plain: Sequence[Fix]) -> list[Fix]:
+        """Drop sources that only one sensor sees: they look the same as a fault of that sensor."""
         found = list(plain)
         for row, fix in enumerate(plain):
-            if not fix.solutions or len(self._scaled(fix)[0]) < 2:
+            if not fix.solutions or len(self._scale(fix)[0]) < 2:
                 continue
-            sensors = self._seers_of_lonely_sources(row, fix)
+            sensors = self._sensors_of_lonely_sources(row, fix)
             if not sensors:
                 continue
-            (other,) = self._without(sensors, np.array([row]))
-            if other.solutions and _is_credible(other) and len(self._scaled(other)[0]) < len(self._scaled(fix)[0]):
+            (other,) = self._refit_without(sensors, np.array([row]))
+            if other.solutions and _is_credible(other) and len(self._scale(other)[0]) < len(self._scale(fix)[0]):
                 found[row] = replace(other, dropped_sensors=tuple(self.array.ids[sensor] for sensor in sorted(sensors)))
         return found
 
-    def _seers_of_lonely_sources(self, row: int, fix: Fix) -> frozenset[int]:
-        q, mu = self._scaled(fix)
+    def _sensors_of_lonely_sources(self, row: int, fix: Fix) -> frozenset[int]:
+        q, mu = self._scale(fix)
         problem = self.problem.rows(np.full(len(q), row))
-        seen = problem.predicted(problem.source_fields(q[:, None], mu[:, None]))
-        seen -= problem.predicted(np.zeros_like(problem.ambient))
+        seen = problem.predict(problem.source_fields(q[:, None], mu[:, None]))
+        seen -= problem.predict(np.zeros_like(problem.ambient))
         energy = np.stack([np.bincount(self.array.channel_sensor, of**2, self.array.n_sensors) for of in seen])
         lonely = energy.max(axis=1) > _LONELY * energy.sum(axis=1)
         return frozenset(np.argmax(energy[lonely], axis=1).tolist())
 
     def fixes(self, plain: Sequence[Fix]) -> list[Fix]:
-        """The plain fix, or that without the sensors that stand out."""
+        """Return the plain fixes, or those without the outlying sensors."""
         found = list(plain)
-        suspected = self._suspected(plain)
+        suspected = self._suspect_rows(plain)
         if not suspected.size:
             return found
-        starts = self._refined_without_one(plain, suspected)
+        starts = self._refine_without_one(plain, suspected)
         unexplained = [row for row, tried in starts.items() if not any(start.explains for start in tried)]
         if self.many:
             best = [(row, starts[row][1]) for row in unexplained if len(starts[row]) > 1]
-            for row, start in self._without_gross_faults(plain, best):
+            for row, start in self._exclude_gross_faults(plain, best):
                 starts[row].append(start)
-        for searched in self._searched(plain, starts, unexplained):
+        for searched in self._plan_searches(plain, starts, unexplained):
             for sensors, of_set in searched.items():
                 unsolved = [row for row in of_set if not (self.many and any(start.explains for start in starts[row]))]
-                fixes = self._without(sensors, np.array(unsolved, dtype=np.intp))
+                fixes = self._refit_without(sensors, np.array(unsolved, dtype=np.intp))
                 anew = self._starts(zip(unsolved, fixes, strict=True), sensors)
-                for row, start in anew + (self._without_gross_faults(plain, anew) if self.many else []):
+                for row, start in anew + (self._exclude_gross_faults(plain, anew) if self.many else []):
                     starts[row].append(start)
         starts = {row: [start for start in tried if start.explains] or tried for row, tried in starts.items()}
-        certain = self._certain(starts)
-        standing_out = certain | self._standing_out({row: starts[row] for row in starts.keys() - certain.keys()})
+        certain = self._certain_faults(starts)
+        standing_out = certain | self._outlying_sensors({row: starts[row] for row in starts.keys() - certain.keys()})
         for dropped in set(standing_out.values()) - {frozenset()}:
             rows = np.array([row for row, sensors in standing_out.items() if sensors == dropped], dtype=np.intp)
             names = tuple(self.array.ids[sensor] for sensor in sorted(dropped))
-            for row, fix in zip(rows, self._without(dropped, rows), strict=True):
+            for row, fix in zip(rows, self._refit_without(dropped, rows), strict=True):
                 if _is_worth_dropping_for(fix, plain[row]):
                     found[row] = replace(fix, dropped_sensors=names)
         return found
 
-    def _suspected(self, plain: Sequence[Fix]) -> IntArray:
-        """Rows where a sensor may stand out: it does so from the plain fix, or nothing fits and the fit is spoilt."""
+    def _suspect_rows(self, plain: Sequence[Fix]) -> IntArray:
+        """Return rows with an outlier in the plain fix, or with a fit too poor to tell."""
         solved = np.array([bool(fix.solutions) for fix in plain])
         credible = np.array([bool(fix.solutions) and _is_credible(fix) for fix in plain])
-        # What a fit of so many unknowns leaves of a sensor's residual on average.
-        unknowns = np.array([3.0 + 6.0 * (len(self._scaled(fix)[0]) if fix.solutions else 1) for fix in plain])
+        # Mean share of a sensor's residual that a fit of so many unknowns leaves.
+        unknowns = np.array([3.0 + 6.0 * (len(self._scale(fix)[0]) if fix.solutions else 1) for fix in plain])
         unseen = np.clip(1.0 - unknowns / max(1, self.count.sum()), 0.2, 1.0)
         spoilt = ~solved
         spoilt[solved] = [fix.solutions[0].chi2 > _SPOILT * fix.solutions[0].dof for fix in plain if fix.solutions]
         judged = np.flatnonzero(~spoilt & ~credible).tolist()
-        for _, of_count, q, mu, weight in self._stacked(self._starts([(row, plain[row]) for row in judged])):
+        for _, of_count, q, mu, weight in self._stack(self._starts([(row, plain[row]) for row in judged])):
             misfit = self.fits.misfit(of_count, q, mu, weight)
             spoilt[of_count] = np.any(
                 misfit > unseen[of_count, None] * self.limits * self.fits.scale2(misfit)[:, None], axis=1
             )
-        return np.flatnonzero(spoilt & ~credible & ~self._as_noise(plain))
+        return np.flatnonzero(spoilt & ~credible & ~self._is_noise(plain))
 
-    def _as_noise(self, plain: Sequence[Fix]) -> BoolArray:
-        """Rows without a source whose energy is one of noise: there is nothing that a bad sensor would explain."""
-        without = self.problem.whitened(self.raw) - self.problem.predicted(np.zeros_like(self.problem.ambient))
+    def _is_noise(self, plain: Sequence[Fix]) -> BoolArray:
+        """Whether rows (n,) have no source and no more energy than noise."""
+        without = self.problem.whiten(self.raw) - self.problem.predict(np.zeros_like(self.problem.ambient))
         energy = np.einsum("bc,bc->b", without, without)
         alone = np.array([fix.reason == NOISE_ALONE for fix in plain], dtype=bool)
         return alone & (energy <= energy_threshold(max(1, self.n_differences)))
 
     def _starts(self, fixes: Iterable[tuple[int, Fix]], without: frozenset[int] = frozenset()) -> list[_StartOfRow]:
-        """The fits of fixes of rows, where there is one."""
+        """Return the fits of those fixes that have a solution."""
         solved = [(row, fix) for row, fix in fixes if fix.solutions]
         explains = [fix.solutions[0].dof > 0 and _is_credible(fix) for _, fix in solved]
         return [
-            (row, _Start(*self._scaled(fix), without, good)) for (row, fix), good in zip(solved, explains, strict=True)
+            (row, _Start(*self._scale(fix), without, good)) for (row, fix), good in zip(solved, explains, strict=True)
         ]
 
-    def _refined_without_one(self, plain: Sequence[Fix], rows: IntArray) -> dict[int, list[_Start]]:
-        """The plain fits of rows, and the best of those without one sensor, refined from them, best first.
+    def _refine_without_one(self, plain: Sequence[Fix], rows: IntArray) -> dict[int, list[_Start]]:
+        """Return the plain fits and the best fits without one sensor, best first.
 
         Rows are left out where no sensor stands out of what all others leave, and each is checked by them.
         """
         every = self._starts([(row, plain[row]) for row in rows.tolist()])
         starts: dict[int, list[_Start]] = {row: [] for row in rows.tolist()} | {row: [start] for row, start in every}
-        for _, of_count, q, mu, _ in self._stacked(every):
-            chosen = self._to_leave_out(of_count, q, mu)
+        for _, of_count, q, mu, _ in self._stack(every):
+            chosen = self._exclusion_candidates(of_count, q, mu)
             of_fit, sensor = np.nonzero(chosen)
             for row in of_count[~chosen.any(axis=1)].tolist():
                 del starts[row]
             if not of_fit.size:
                 continue
             of_row, weight = of_count[of_fit], self.fits.weights_without(sensor[:, None].tolist())
-            fits = self.fits.refined(of_row, q[of_fit], mu[of_fit], weight)
+            fits = self.fits.refine(of_row, q[of_fit], mu[of_fit], weight)
             kept = dict.fromkeys(of_count.tolist(), _MOST_KEPT)
             for k in np.argsort(fits.chi2, kind="stable").tolist():
                 row = int(of_row[k])
-                start = self._fitted(plain[row], fits, k, frozenset({int(sensor[k])}))
+                start = self._start_of_fit(plain[row], fits, k, frozenset({int(sensor[k])}))
                 if kept[row] and start is not None:
                     kept[row] -= 1
                     starts[row].append(start)
         return starts
 
-    def _without_gross_faults(self, plain: Sequence[Fix], tried: Sequence[_StartOfRow]) -> list[_StartOfRow]:
-        """Fits that explain rows without two sensors or three, each of which is beyond doubt without the others.
+    def _exclude_gross_faults(self, plain: Sequence[Fix], tried: Sequence[_StartOfRow]) -> list[_StartOfRow]:
+        """Return fits that explain rows without two or three sensors, each beyond doubt.
 
         From one without a sensor, the next one is that which lowers χ² most.
         """
@@ -311,18 +311,18 @@ class _Examination:
         left = [(row, start) for row, start in tried if plain[row].solutions and not start.explains]
         while left:
             starts, left = left, []
-            for some, rows, q, mu, weight in self._stacked(starts):
-                fall, _ = self.fits.falls(rows, q, mu, weight)
+            for some, rows, q, mu, weight in self._stack(starts):
+                fall, _ = self.fits.chi2_falls(rows, q, mu, weight)
                 fall[weight < 1.0] = 0.0
                 each, worst = np.arange(len(rows)), np.argmax(fall, axis=1)
                 gross = np.flatnonzero(fall[each, worst] > _BEYOND_DOUBT * self._limits(fall, q)[each, worst])
                 if not gross.size:
                     continue
                 weight[each, worst] = LEAST_WEIGHT
-                fits = self.fits.refined(rows[gross], q[gross], mu[gross], weight[gross])
+                fits = self.fits.refine(rows[gross], q[gross], mu[gross], weight[gross])
                 for k, i in enumerate(gross.tolist()):
                     row, last = some[i]
-                    start = self._fitted(plain[row], fits, k, last.without | {int(worst[i])})
+                    start = self._start_of_fit(plain[row], fits, k, last.without | {int(worst[i])})
                     if start is not None and start.explains:
                         found.append((row, start))
                     elif start is not None and len(start.without) < _MOST_GROSS:
@@ -330,22 +330,22 @@ class _Examination:
         return found
 
     def _limits(self, misfit: FloatArray, q: FloatArray) -> FloatArray:
-        """Limits (f, N) of squared residuals, of fits of sources q (f, K, 4), as large as their noise makes them."""
+        """Return limits (f, N) of squared residuals, scaled by the noise of fits q (f, K, 4)."""
         scale2 = self.fits.scale2(misfit)
-        return np.array([scale * self.fits.limits_of(float(scale), q.shape[1]) for scale in scale2])
+        return np.array([scale * self.fits.square_limits(float(scale), q.shape[1]) for scale in scale2])
 
-    def _stacked(
+    def _stack(
         self, starts: Sequence[_StartOfRow]
     ) -> Iterator[tuple[list[_StartOfRow], IntArray, FloatArray, FloatArray, FloatArray]]:
-        """Starts of equally many sources: rows, sources (f, K, …), and weights (f, N) without what they leave out."""
+        """Yield starts with equally many sources: rows, sources (f, K, …), weights (f, N)."""
         for count in sorted({len(start.q) for _, start in starts}):
             some = [(row, start) for row, start in starts if len(start.q) == count]
             q, mu = np.stack([start.q for _, start in some]), np.stack([start.mu for _, start in some])
             rows = np.array([row for row, _ in some], dtype=np.intp)
             yield some, rows, q, mu, self.fits.weights_without([start.without for _, start in some])
 
-    def _fitted(self, plain: Fix, fits: JointFits, k: int, without: frozenset[int]) -> _Start | None:
-        """Fit k of a row without some sensors, none where it did not converge."""
+    def _start_of_fit(self, plain: Fix, fits: JointFits, k: int, without: frozenset[int]) -> _Start | None:
+        """Return fit k without some sensors as a start; None if it did not converge."""
         if not fits.converged[k]:
             return None
         dof = plain.solutions[0].dof - int(self.count[list(without)].sum())
@@ -353,12 +353,12 @@ class _Examination:
         credible = dof > 0 and fits.chi2[k] <= _largest_credible(dof, plain.body_length_m)
         return _Start(fits.q[k], fits.mu[k], without, bool(credible))
 
-    def _to_leave_out(self, rows: IntArray, q: FloatArray, mu: FloatArray) -> BoolArray:
-        """Sensors (f, N) without which fits of rows might be much better: they stand out, or bend the fit unseen.
+    def _exclusion_candidates(self, rows: IntArray, q: FloatArray, mu: FloatArray) -> BoolArray:
+        """Return sensors (f, N) that are outliers, or that may bend the fits unseen.
 
         None where all of many leave evenly much, so that the noise is larger than stated.
         """
-        fall, checked = self.fits.falls(rows, q, mu)
+        fall, checked = self.fits.chi2_falls(rows, q, mu)
         fall = np.where(self.count, fall, 0.0)
         last = np.partition(fall, -_MOST_REFINED, axis=1)[:, -_MOST_REFINED:] if fall.shape[1] > _MOST_REFINED else fall
         least = np.maximum(last.min(axis=1), _MATTERS * fall.max(axis=1) * self.many)
@@ -367,10 +367,10 @@ class _Examination:
             chosen &= np.any((fall > self._limits(fall, q)) | (checked < _LEAST_CHECKED), axis=1)[:, None]
         return chosen
 
-    def _searched(
+    def _plan_searches(
         self, plain: Sequence[Fix], starts: dict[int, list[_Start]], unexplained: Sequence[int]
     ) -> list[dict[frozenset[int], list[int]]]:
-        """Rows in which to search anew, by the sensors that are left out, one after another.
+        """Return rows to search again, by the sensors that are left out, one set after another.
 
         Of a small array every one and every two, of a large one the nearest to every source and those that the
         refinements blame most.
@@ -383,7 +383,7 @@ class _Examination:
         for row in unexplained:
             sets = every.copy()
             if len(standing) > _MOST_IN_PAIRS:
-                q, mu = self._fit_of(plain[row])
+                q, mu = self._scale_or_none(plain[row])
                 distance = np.linalg.norm(self.array.positions[standing] - self.problem.position(q)[:, None], axis=-1)
                 misfit = self.fits.misfit(np.array([row]), q[None], mu[None], np.ones((1, self.array.n_sensors)))[0]
                 near = [standing[k] for k in np.argmin(distance, axis=1)] if plain[row].solutions else []
@@ -397,43 +397,43 @@ class _Examination:
                 chosen[turn].setdefault(sensors, []).append(row)
         return chosen
 
-    def _fit_of(self, fix: Fix) -> tuple[FloatArray, FloatArray]:
-        """Sources of a fix, or nothing far away where it has none."""
-        return self._scaled(fix) if fix.solutions else (np.array([[0.0, 0.0, 1.0, 1e-3]]), np.zeros((1, 3)))
+    def _scale_or_none(self, fix: Fix) -> tuple[FloatArray, FloatArray]:
+        """Return the sources of a fix, or a zero source far away if it has none."""
+        return self._scale(fix) if fix.solutions else (np.array([[0.0, 0.0, 1.0, 1e-3]]), np.zeros((1, 3)))
 
-    def _without(self, sensors: set[int] | frozenset[int], rows: IntArray) -> list[Fix]:
+    def _refit_without(self, sensors: set[int] | frozenset[int], rows: IntArray) -> list[Fix]:
         if not rows.size:
             return []
         readings = self.readings[rows].copy()
         readings[:, np.isin(self.array.channel_sensor, list(sensors))] = np.nan
         return list(self.refit(self.of_all[rows], readings))
 
-    def _scaled(self, fix: Fix) -> tuple[FloatArray, FloatArray]:
+    def _scale(self, fix: Fix) -> tuple[FloatArray, FloatArray]:
         sources = fix.solutions[0].sources
         q = self.problem.homogeneous(np.stack([source.position_m for source in sources]))
         return q, self.problem.scaled_moment(q, np.stack([source.moment_Am2 for source in sources]))
 
-    def _certain(self, starts: dict[int, list[_Start]]) -> dict[int, frozenset[int]]:
-        """Sensors that reweighting would leave out for certain: the only fit that explains a row does without them.
+    def _certain_faults(self, starts: dict[int, list[_Start]]) -> dict[int, frozenset[int]]:
+        """Return sensors that are certainly faulty: the only credible fit leaves them out.
 
         To it they are beyond doubt, and none of the others would stand out even if it did not count.
         """
         only = [(row, tried[0]) for row, tried in starts.items() if len(tried) == 1 and tried[0].explains]
         found: dict[int, frozenset[int]] = {}
-        for some, rows, q, mu, weight in self._stacked([of for of in only if of[1].without] if self.many else []):
-            fall, _ = self.fits.falls(rows, q, mu, weight)
+        for some, rows, q, mu, weight in self._stack([of for of in only if of[1].without] if self.many else []):
+            fall, _ = self.fits.chi2_falls(rows, q, mu, weight)
             beyond = fall / weight > _BEYOND_DOUBT * self.limits
             certain = np.all(np.where(weight < 1.0, beyond, fall <= self.limits), axis=1)
             found |= {row: start.without for (row, start), of_row in zip(some, certain, strict=True) if of_row}
         return found
 
-    def _standing_out(self, starts: dict[int, list[_Start]]) -> dict[int, frozenset[int]]:
-        """Sensors of every row that stand out from the best of its robust fits."""
+    def _outlying_sensors(self, starts: dict[int, list[_Start]]) -> dict[int, frozenset[int]]:
+        """Return the outlying sensors of every row in the best of its robust fits."""
         best = dict.fromkeys(starts, np.inf)
         found = dict.fromkeys(starts, frozenset[int]())
         every = [(row, start) for row, of_row in starts.items() for start in of_row]
-        for _, rows, q, mu, weight in self._stacked(every):
-            misfit, scale2 = self.fits.reweighted(rows, q, mu, weight)
+        for _, rows, q, mu, weight in self._stack(every):
+            misfit, scale2 = self.fits.reweight(rows, q, mu, weight)
             # Beyond doubt is beyond doubt: two sensors that are far off must not cost less than one that is farther.
             bounded = np.minimum(misfit / scale2[:, None], _BEYOND_DOUBT * self.limits)
             score = 0.5 * np.sum(
@@ -442,7 +442,7 @@ class _Examination:
             for f, r in enumerate(rows.tolist()):
                 if score[f] < best[r]:
                     best[r] = score[f]
-                    out = np.flatnonzero(misfit[f] > self.fits.limits_of(float(scale2[f]), q.shape[1]) * scale2[f])
+                    out = np.flatnonzero(misfit[f] > self.fits.square_limits(float(scale2[f]), q.shape[1]) * scale2[f])
                     few = 2 * out.size < np.count_nonzero(self.count)
                     found[r] = frozenset(out.tolist()) if few else frozenset()
         return found

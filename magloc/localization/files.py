@@ -1,4 +1,4 @@
-"""What fixes look like in JSON."""
+"""Fixes as JSON."""
 
 from __future__ import annotations
 
@@ -11,13 +11,16 @@ _SOURCE_KEYS = ("position_m", "moment_Am2", "covariance", "range_observable", "r
 
 
 def entries_of_fixes(fixes: Fixes, *, joint: bool) -> Iterator[dict[str, object]]:
-    """Results that ``magloc locate --json`` prints; `joint`: every solution has a list of its sources, also for one."""
+    """Return the results that ``magloc locate --json`` prints.
+
+    `joint`: every solution has a list of its sources, also for one.
+    """
     for fix, misfit, factor in zip(fixes, fixes.misfit.tolist(), fixes.body_factor.tolist(), strict=True):
-        yield _entry(fix, joint=joint, misfit=misfit, body_factor=factor)
+        yield _fix_entry(fix, joint=joint, misfit=misfit, body_factor=factor)
 
 
-def _entry(fix: Fix, *, joint: bool, misfit: bool, body_factor: float) -> dict[str, object]:
-    solutions = [_of_solution(solution, joint) for solution in fix.solutions]
+def _fix_entry(fix: Fix, *, joint: bool, misfit: bool, body_factor: float) -> dict[str, object]:
+    solutions = [_solution_entry(solution, joint) for solution in fix.solutions]
     flags = values_of(fix, ("reason", "dropped_sensors", "saturated_channels", "too_near"))
     flags |= {"misfit": misfit, "body_length_m": fix.body_length_m}
     flags["body_factor"] = body_factor if body_factor > BODY_MATTERS else None
@@ -25,7 +28,7 @@ def _entry(fix: Fix, *, joint: bool, misfit: bool, body_factor: float) -> dict[s
     return entry | {name: value for name, value in flags.items() if value}
 
 
-def _of_solution(solution: Solution, joint: bool) -> dict[str, object]:
+def _solution_entry(solution: Solution, joint: bool) -> dict[str, object]:
     whole = values_of(solution, ("chi2", "dof", "iterations")) | {"converged": True, "weight": solution.weight}
     if not joint:
         return values_of(solution.source, _SOURCE_KEYS) | whole

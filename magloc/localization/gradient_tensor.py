@@ -1,4 +1,4 @@
-"""A dipole from the gradient tensor of its field, in closed form: what estimating derivatives costs.
+"""Dipole from field and gradient tensor in closed form, to show the cost of derivatives.
 
 Vector sensors at the offsets δ from their centroid see B + G δ, as long as the field is linear across the array; B and
 the five numbers of the symmetric, traceless G follow by least squares. A dipole's field is homogeneous of degree -3 in
@@ -41,7 +41,7 @@ _TENSORS = np.array(
 
 @dataclass(frozen=True, eq=False)
 class GradientTensor:
-    """Field and gradient tensor at the centroid of an array, and the dipole that they stand for.
+    """Field and gradient tensor at the centroid of an array, and their dipole.
 
     Attributes
     ----------
@@ -68,12 +68,15 @@ class GradientTensor:
 
     @property
     def position_m(self) -> FloatArray:
-        """Where the dipole is, shape (..., 3); not finite where the tensor has no inverse (moment across the line)."""
+        """Position of the dipole, shape (..., 3); not finite where the tensor is singular.
+
+        It is singular for a moment across the line of sight.
+        """
         return self.centroid_m - self._offset
 
     @property
     def moment_Am2(self) -> FloatArray:
-        """Its moment, shape (..., 3)."""
+        """Moment of the dipole, shape (..., 3)."""
         r = np.linalg.norm(self._offset, axis=-1, keepdims=True)
         n = self._offset / r
         along = np.sum(n * self.field_T, axis=-1, keepdims=True)
@@ -81,7 +84,10 @@ class GradientTensor:
 
     @property
     def _offset(self) -> FloatArray:
-        """The centroid from the dipole, -3 G⁻¹ B, by Cramer's rule: a tensor without an inverse is no error."""
+        """Centroid relative to the dipole, -3 G⁻¹ B, by Cramer's rule.
+
+        A singular tensor is no error.
+        """
         a, b, c = np.moveaxis(self.tensor_T_m, -2, 0)
         adjugate = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=-2)
         determinant = np.sum(a * adjugate[..., 0, :], axis=-1)
@@ -90,7 +96,7 @@ class GradientTensor:
 
 
 def fit_gradient_tensor(array: SensorArray, readings_T: ArrayLike) -> GradientTensor:
-    """Field and gradient tensor of a source at the centroid of an array, by least squares.
+    """Fit field and gradient tensor at the centroid of an array by least squares.
 
     The array's ambient field, where it states one, is taken out first: the closed form needs the field of the source
     alone.

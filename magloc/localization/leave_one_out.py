@@ -1,4 +1,4 @@
-"""Fits without some sensors: least squares with other weights, and what every sensor's deletion would do to a fit."""
+"""Fits without some sensors: weighted least squares, and first-order deletion of sensors."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from arrays.typing import FloatArray, IntArray
 from magloc.localization.fit.gauss_newton import scaled_jacobian
 from magloc.measurement.whitened import WhitenedModel
 
-# Columns of the common field whose squares are smaller than this against the largest are none.
+# Relative square below which a column of the common field counts as zero.
 _UNSEEN = 1e-13
 # Share of a direction of a sensor's readings that the others must check.
 _CHECKED = 1e-6
@@ -18,7 +18,7 @@ _CHECKED = 1e-6
 Weighted = tuple[WhitenedModel, FloatArray]
 
 
-def falls_without_sensors(
+def chi2_falls_without_sensors(
     problem: WhitenedModel,
     raw: FloatArray,
     q: FloatArray,
@@ -27,14 +27,16 @@ def falls_without_sensors(
     *,
     free_position: bool = True,
 ) -> tuple[FloatArray, FloatArray]:
-    r"""By how much χ² of fits (b, K, …) would fall without each sensor, to first order, and how it is checked: (b, N).
+    r"""Return the first-order decrease of χ² without each sensor, and how it is checked.
+
+    Both are (b, N), for fits (b, K, …).
 
     Deleting channels adds their readings to the unknowns. With the readings' whitening W, residuals r and an
     orthonormal basis Q of the derivatives, sensor s takes :math:`g^T (I - H)^{-1} g`, where :math:`g = (W r)_s` and
-    :math:`I - H = [W (I - Q Q^T) W]_{ss}`. The least eigenvalue of that says what the others check of its readings: 0
-    where it alone decides what they ought to be. Channels (N, 3) are negative where a sensor has none.
+    :math:`I - H = [W (I - Q Q^T) W]_{ss}`. Its least eigenvalue tells how well the other sensors check its readings:
+    0 where they do not. Channels (N, 3) are negative where a sensor has none.
     """
-    y = problem.whitened(raw)
+    y = problem.whiten(raw)
     residual = problem.residual(y, q, mu, problem.source_fields(q, mu))
     jacobian = scaled_jacobian(problem, q, mu)
     if not free_position:
@@ -43,21 +45,21 @@ def falls_without_sensors(
     explained, _ = np.linalg.qr(jacobian / np.where(norm > 0.0, norm, 1.0))
     n_channels = y.shape[1]
     seen = problem.basis * np.sqrt(problem.shrinkage * (2.0 - problem.shrinkage))[:, None]
-    taken = np.concatenate([seen, problem.whitened(explained[:, :n_channels])], axis=2)
+    taken = np.concatenate([seen, problem.whiten(explained[:, :n_channels])], axis=2)
     used = sensor_channels >= 0
     taken = np.where(used[..., None], taken[:, sensor_channels], 0.0)
-    gradient = np.where(used, problem.whitened(residual[:, :n_channels])[:, sensor_channels], 0.0)
+    gradient = np.where(used, problem.whiten(residual[:, :n_channels])[:, sensor_channels], 0.0)
     checked, axes = np.linalg.eigh(np.eye(3) - taken @ taken.swapaxes(-1, -2))
     along = (axes.swapaxes(-1, -2) @ gradient[..., None])[..., 0]
     falls: FloatArray = np.sum(np.where(checked > _CHECKED, along**2 / np.maximum(checked, _CHECKED), 0.0), axis=-1)
     return falls, checked[..., 0]
 
 
-def weighted(problem: WhitenedModel, raw: FloatArray, weight: FloatArray) -> Weighted:
-    """A problem and its raw readings (b, C) with the variance of every channel divided by a weight (b, C)."""
+def weight_channels(problem: WhitenedModel, raw: FloatArray, weight: FloatArray) -> Weighted:
+    """Return a problem and its raw readings (b, C) with variances divided by weights (b, C)."""
     root = np.sqrt(weight)[..., None]
     flat = problem.shrinkage >= 1.0
-    # A flat prior needs only the span of its columns; of the others the variance along each of them counts.
+    # A flat prior needs only the span of its columns, another one also the variance along each of them.
     some, known = flat.any(axis=0), ~flat.all(axis=0)
     span = root * (problem.basis * flat[:, None])[..., some]
     for _ in range(2):  # once more, for the digits that squares lose
@@ -68,5 +70,5 @@ def weighted(problem: WhitenedModel, raw: FloatArray, weight: FloatArray) -> Wei
     if not flat.all():
         with np.errstate(divide="ignore"):
             deviation = np.where(flat, 0.0, np.sqrt(1.0 / (1.0 - problem.shrinkage) ** 2 - 1.0))
-        lighter = lighter.marginalised(root * (problem.basis * deviation[:, None])[..., known])
+        lighter = lighter.marginalise(root * (problem.basis * deviation[:, None])[..., known])
     return lighter, root[..., 0] * raw

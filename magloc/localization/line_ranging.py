@@ -1,4 +1,4 @@
-"""Distance of a source that recedes or approaches along a straight line, from one vector sensor.
+"""Distance of a source on a straight line, from one vector sensor.
 
 The source keeps its moment and its attitude, and does not pass the sensor. The field of a dipole is the same on both
 sides of it, so that the line may as well be inverted through the sensor: distances are not affected.
@@ -27,7 +27,7 @@ _RADII = (0.3, 0.8)
 
 @dataclass(frozen=True, eq=False)
 class SourceLine:
-    """A source on a straight line, as a vector sensor at the origin sees it.
+    """Source on a straight line, seen by a vector sensor at the origin.
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ class SourceLine:
     converged: bool
 
     def field(self, distance_m: ArrayLike) -> FloatArray:
-        """Field at the sensor, (..., 3) [T], for distances (...) [m]."""
+        """Return the field at the sensor, (..., 3) [T], for distances (...) [m]."""
         distance = np.asarray(distance_m, dtype=np.float64)
         source = self.start_m + distance[..., None] * self.direction
         return loop_field(np.zeros(3), source, self.moment_Am2, self.radius_m)
@@ -112,7 +112,7 @@ def fit_source_line(
     >>> round(float(np.linalg.norm(line.moment_Am2)), 3), line.converged
     (1.0, True)
     """
-    distance, field, sigma = _checked(distance_m, field_T, noise_T, noise_fraction)
+    distance, field, sigma = _check_readings(distance_m, field_T, noise_T, noise_fraction)
     starts = _starts(distance, field)
     if coil:
         starts = [np.append(start, share * np.linalg.norm(start[:3])) for start in starts for share in _RADII]
@@ -127,7 +127,7 @@ def distance_along_line(
     noise_fraction: float = 0.0,
     within_m: tuple[float, float],
 ) -> tuple[FloatArray, FloatArray]:
-    """Distance of the source along its line, of every reading on its own.
+    """Return the distance of the source along its line for every reading.
 
     Parameters
     ----------
@@ -187,7 +187,7 @@ def distance_along_line(
     return found, sigma / slope
 
 
-def _checked(
+def _check_readings(
     distance_m: ArrayLike, field_T: ArrayLike, noise_T: float, noise_fraction: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     distance, field = np.asarray(distance_m, dtype=np.float64), np.asarray(field_T, dtype=np.float64)
@@ -207,7 +207,9 @@ def _checked(
 
 
 def _starts(distance: FloatArray, field: FloatArray) -> list[FloatArray]:
-    """Lines through or near the sensor, in directions all over a hemisphere, at the range that the decay tells.
+    """Return lines near the sensor, in many directions, at the range of the decay.
+
+    The directions cover a hemisphere.
 
     Along a line through the sensor |B|^(-1/3) is linear in the distance, and zero at the sensor.
     """
@@ -226,7 +228,7 @@ def _starts(distance: FloatArray, field: FloatArray) -> list[FloatArray]:
 
 
 def _best_line(distance: FloatArray, field: FloatArray, sigma: FloatArray, starts: list[FloatArray]) -> SourceLine:
-    """Best of the fits of (start, angles of the direction, moment) or, with a ninth number, of the radius too."""
+    """Return the best fit of (start, angles of the direction, moment[, radius])."""
 
     def residuals(x: FloatArray) -> FloatArray:
         return ((_line(x, np.nan, 0, False).field(distance) - field) / sigma[:, None]).ravel()

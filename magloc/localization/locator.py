@@ -1,4 +1,4 @@
-"""The one door to a fix, and the only place that knows the order of what makes one.
+"""Locator of sources: the order of the steps that make a fix.
 
 Detection → search → uncertainty → exclusion of faulty sensors → validity of the dipole → result.
 """
@@ -24,8 +24,8 @@ from magloc.averages import averaging_array, complete_rows
 from magloc.conditioning import NO_BACKGROUND
 from magloc.fields.multipole import check_body_length
 from magloc.localization.body_errors import body_covariances
-from magloc.localization.dipole_validity import too_near
-from magloc.localization.fault_exclusion import without_faulty_sensors
+from magloc.localization.dipole_validity import is_too_near
+from magloc.localization.fault_exclusion import exclude_faulty_sensors
 from magloc.localization.fit.columns import Solutions, in_stable_order
 from magloc.localization.fit.fixes import Fixes
 from magloc.localization.fit.optima import Optima
@@ -35,14 +35,14 @@ from magloc.localization.model_errors import with_model_errors
 from magloc.localization.search.known_position import MomentSearch
 from magloc.localization.search.moving_array import optima_at_rest, stacked_errors, stacked_rows
 from magloc.localization.search.multi_source import NOISE_ALONE, MultiSourceSearch
-from magloc.localization.search.single_source import N_UNKNOWNS, SingleSourceSearch, kept_search
+from magloc.localization.search.single_source import N_UNKNOWNS, SingleSourceSearch, cached_search
 from magloc.localization.uncertainty.covariance import solutions_of
 from magloc.localization.uncertainty.pose_covariance import pose_covariances
 from magloc.localization.uncertainty.range_interval import is_detected
 from magloc.measurement.nuisances import ambient_in_array, with_eddies_as_offsets
 from magloc.measurement.plausibility import warn_of_doubts, warn_of_moments
 from magloc.measurement.pose import PosesOfRows, rates_of, with_stated_pose
-from magloc.measurement.rows import NO_SIGNAL, WhitenedRows, checked_rows, whitened_rows
+from magloc.measurement.rows import NO_SIGNAL, WhitenedRows, check_rows, whitened_rows
 from magloc.readings import Readings, as_readings, without_saturated
 
 if TYPE_CHECKING:
@@ -51,12 +51,12 @@ if TYPE_CHECKING:
 _LOG = logging.getLogger(__name__)
 # A search for several sources, or with known moments, takes its rows in smaller blocks.
 _ROWS_AT_ONCE, _ROWS_OF_SEVERAL = 1024, 64
-# Numbers of the whitenings of a block, where each row has its own.
+# Size of the whitenings of a block, where each row has its own.
 _MOST_NUMBERS = 8_000_000
 
 
 class Locator:
-    """Start-free fixes with one array of any sensors.
+    """Fixes without a start value, with one array of any sensors.
 
     Parameters
     ----------
@@ -118,14 +118,17 @@ class Locator:
             self._fewest = 3 * self._search.position_m.shape[1]
         elif free and not array.channel_is_scalar.any():
             alike = prior == NOTHING_KNOWN
-            self._search, self._fewest = kept_search(array) if alike else SingleSourceSearch(array, prior=prior), 6
+            self._search, self._fewest = cached_search(array) if alike else SingleSourceSearch(array, prior=prior), 6
         else:
             number = None if sources == "auto" else int(sources)
             self._search = MultiSourceSearch(array, n_sources=number, prior=prior, seed=seed)
             self._fewest = 6 * (number or 1)
 
     def fit(self, readings_T: ArrayLike, ambient_T: ArrayLike | None = None) -> Fix:
-        """Fix from one set of readings (C,) [T], NaN where missing, and the ambient field (3,) [T]."""
+        """Return the fix of one set of readings (C,) [T], NaN where missing.
+
+        `ambient_T` (3,) [T] is the ambient field.
+        """
         ambient = None if ambient_T is None else np.asarray(ambient_T, dtype=np.float64)[None]
         return self.fit_rows(numbers(readings_T)[None], ambient)[0]
 
@@ -137,7 +140,7 @@ class Locator:
         time_s: FloatArray | None = None,
         progress: Callable[[int], None] | None = None,
     ) -> Fixes:
-        """Fixes of many sets of readings, each on its own.
+        """Return the fixes of many sets of readings, each on its own.
 
         Parameters
         ----------
@@ -156,43 +159,43 @@ class Locator:
             In the order of the rows, in the array's frame. Several sources keep their number from row to row where
             they can be followed, at first the strongest comes first.
         """
-        readings = checked_rows(self.array, readings_T)
+        readings = check_rows(self.array, readings_T)
         ambient = None if ambient_T is None else np.asarray(ambient_T, dtype=np.float64)
         times = np.arange(len(readings), dtype=np.float64) if time_s is None else time_s
         parts = []
         for begin in range(0, len(readings), self._at_once):
             some = slice(begin, begin + self._at_once)
             index = np.arange(len(readings))[some]
-            parts.append(self._credible(index, readings[some], None if ambient is None else ambient[some]))
+            parts.append(self._fit_without_faults(index, readings[some], None if ambient is None else ambient[some]))
             if progress is not None:
                 progress(len(index))
         fixes = Fixes.joined(parts)
         if fixes.solutions.position_m.shape[1] > 1 and not isinstance(self._search, MomentSearch):
             fixes = replace(fixes, solutions=in_stable_order(fixes.solutions))
-        near, bodies = too_near(self.array, fixes, readings, ambient, self.body_length_m), None
+        near, bodies = is_too_near(self.array, fixes, readings, ambient, self.body_length_m), None
         if self.body_length_m is None:
             known_place = isinstance(self._search, MomentSearch)
             bodies = partial(body_covariances, self.array, fixes, readings, ambient, known_place=known_place)
         return replace(fixes, time_s=times, too_near=near, bodies=bodies)
 
-    def _credible(self, index: IntArray, readings: FloatArray, ambient: FloatArray | None) -> Fixes:
-        """Fixes of some of the rows, without the sensors that contradict all others."""
+    def _fit_without_faults(self, index: IntArray, readings: FloatArray, ambient: FloatArray | None) -> Fixes:
+        """Return fixes of some rows without the sensors that contradict all others."""
 
         def refit(rows: IntArray, other: FloatArray) -> Fixes:
-            return self._plain(index[rows], other, None if ambient is None else ambient[rows])
+            return self._fit_with_all_sensors(index[rows], other, None if ambient is None else ambient[rows])
 
-        fixes = self._plain(index, readings, ambient)
+        fixes = self._fit_with_all_sensors(index, readings, ambient)
         if not self.exclude_faulty:
             return fixes
         free = not isinstance(self._search, MomentSearch)
-        return without_faulty_sensors(self.array, fixes, refit, readings, ambient, free_position=free)
+        return exclude_faulty_sensors(self.array, fixes, refit, readings, ambient, free_position=free)
 
-    def _plain(self, index: IntArray, readings: FloatArray, ambient: FloatArray | None) -> Fixes:
-        """Fixes of some of the rows with all sensors: detection, search, uncertainty."""
+    def _fit_with_all_sensors(self, index: IntArray, readings: FloatArray, ambient: FloatArray | None) -> Fixes:
+        """Return fixes of some rows with all sensors: detection, search, uncertainty."""
         search = self._search
         if isinstance(search, MomentSearch):
-            search = search.of_rows(index)
-        found = _Rows(len(readings), self.body_length_m, self.array.row_ambient_uncertainty_T)
+            search = search.select(index)
+        found = _FixCollector(len(readings), self.body_length_m, self.array.row_ambient_uncertainty_T)
         for rows in whitened_rows(self.array, readings, ambient, self._searched_at_once):
             if rows.n_differences < self._fewest:
                 found.refuse(
@@ -205,8 +208,8 @@ class Locator:
         return found.fixes()
 
 
-class _Rows:
-    """Collects what is found of n rows, block by block."""
+class _FixCollector:
+    """Collect the results of n rows, block by block."""
 
     def __init__(self, n: int, body_length_m: float | None = 0.0, ambient_sigma_T: float = 0.0) -> None:
         self.body_length_m, self.ambient_sigma_T = body_length_m, ambient_sigma_T
@@ -217,16 +220,16 @@ class _Rows:
         self.parts: list[Solutions] = []
 
     def refuse(self, rows: IntArray, reason: str) -> None:
-        """Say why some rows have no solution."""
+        """Record why some rows have no solution."""
         for row in rows.tolist():
             self.reason[row] = reason
 
     def fill(self, rows: WhitenedRows, search: Callable[[WhitenedRows], list[Optima]]) -> None:
-        """Detection, search and uncertainty of a block."""
-        loud, silent = rows, rows.silent
+        """Detect, search and estimate uncertainty in a block of rows."""
+        loud, silent = rows, rows.is_silent
         if np.count_nonzero(silent):
             self.refuse(rows.index[silent], NO_SIGNAL)
-            loud = rows.chosen(~silent)
+            loud = rows.select(~silent)
             if not len(loud):
                 return
         self.detected[loud.index] = is_detected(loud.energy, loud.n_differences)
@@ -251,9 +254,9 @@ class _Rows:
             self.parts.append(found)
 
     def fixes(self) -> Fixes:
-        """All of it."""
+        """Return the fixes of all rows."""
         n = len(self.reason)
-        solutions = Solutions.joined(self.parts)
+        solutions = Solutions.concatenate(self.parts)
         return Fixes(
             solutions,
             np.arange(n, dtype=np.float64),
@@ -275,14 +278,14 @@ def fit_at_rest(
     prior: SourcePrior = NOTHING_KNOWN,
     poses: PosesOfRows | None = None,
 ) -> Fix:
-    """Fix of one source at rest from several rows of an array that moves, all together, in the world frame.
+    """Fit one source at rest to several rows of a moving array, in the world frame.
 
     A few scalar sensors do not locate a source in one row, but they do while they pass it. Every row keeps a common
     field of its own. Parameters are those of :func:`magloc.localization.search.moving_array.stacked_rows`, and a prior
     in the world frame. `poses`: with their errors, which count as noise.
     """
     rows = stacked_rows(array, readings_T, origins_m, R_world_from_array, ambient_T)
-    found = _Rows(1)
+    found = _FixCollector(1)
     if rows.n_differences < N_UNKNOWNS:
         reason = f"{len(readings_T)} rows give {rows.n_differences} independent differences, {N_UNKNOWNS} are needed"
         found.refuse(rows.index, reason)
@@ -364,7 +367,7 @@ def locate(
     stated = with_stated_pose(array, rows).pose
     array = _with_eddies(array, rows)
     locator = Locator(
-        array if stated is None else _seeing_turned_field(array, stated, rows, ambient),
+        array if stated is None else _with_attitude_as_field_error(array, stated, rows, ambient),
         sources=sources,
         position_m=place,
         prior=prior,
@@ -384,7 +387,10 @@ def locate(
 
 
 def _places_in_array(position_m: ArrayLike, pose: tuple[FloatArray, Rotation] | None) -> FloatArray:
-    """Known places (3,) or (K, 3) of the results' frame in the array's axes of every row: (n, K, 3), n is 1 at rest."""
+    """Return known positions (n, K, 3) in the array's axes of every row; n is 1 at rest.
+
+    `position_m` (3,) or (K, 3) is in the frame of the results.
+    """
     place = np.asarray(position_m, dtype=np.float64)
     if place.shape != (3,) and (place.ndim != 2 or place.shape[1] != 3 or not len(place)):
         raise ValueError(f"Input position_m must have shape (3,) or (K, 3); instead received {place.shape}.")
@@ -393,17 +399,23 @@ def _places_in_array(position_m: ArrayLike, pose: tuple[FloatArray, Rotation] | 
 
 
 def _with_eddies(array: SensorArray, rows: Readings) -> SensorArray:
-    """The array where eddy currents are errors of its offsets, as its turns between the rows tell of them."""
+    """Return the array with eddy currents as errors of its offsets.
+
+    Their size follows from the turns between the rows.
+    """
     if rows.pose is None or not any(sensor.eddy_uncertainty_s for sensor in array.sensors):
         return array
     _, rate_rad_s = rates_of(rows.time_s, rows.pose[0], rows.pose[1].as_matrix())
     return with_eddies_as_offsets(array, ambient_in_array(array, rows.values_T, rows.ambient_T), rate_rad_s)
 
 
-def _seeing_turned_field(
+def _with_attitude_as_field_error(
     array: SensorArray, pose: PoseUncertainty, rows: Readings, ambient_T: FloatArray | None
 ) -> SensorArray:
-    """The array where errors of the attitude, rms over the rows, make the ambient field uncertain for moduli."""
+    """Return the array with attitude errors as errors of the ambient field.
+
+    Errors are rms over the rows; only moduli see them.
+    """
     attitude_rad = pose.attitude_rad if rows.pose_sigma is None else np.sqrt(np.mean(rows.pose_sigma[:, 1] ** 2))
     field_T = array.ambient_fields if ambient_T is None else ambient_T
     size_T = float(np.sqrt(np.mean(np.sum(field_T**2, axis=-1))))
@@ -414,7 +426,7 @@ def _seeing_turned_field(
 def used_rows(
     readings: Readings, array: SensorArray, *, average: bool = False
 ) -> tuple[Readings, SensorArray, list[tuple[str, ...]]]:
-    """Rows that fixes are made of, with the array of their noise, and names of the channels that saturate in each."""
+    """Return the rows to fit, the array with their noise, and saturated channels of each row."""
     rows = in_world_field(without_saturated(readings, array), array)
     if rows.background:
         _LOG.warning("a row on its own has no background: filters take it out, and with it some of the signal")
@@ -426,7 +438,7 @@ def used_rows(
 
 
 def _saturated_channels(measured: Readings, rows: Readings, array: SensorArray) -> list[tuple[str, ...]]:
-    """Names of the channels that saturate, for every row."""
+    """Return names of the saturated channels of every row."""
     lost = np.isfinite(measured.values_T) & ~np.isfinite(rows.values_T)
     names: list[tuple[str, ...]] = [()] * len(lost)
     for row in np.flatnonzero(lost.any(axis=1)).tolist():

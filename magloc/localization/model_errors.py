@@ -1,4 +1,4 @@
-r"""Errors of the model that a fit allows for: bodies that are no points, and an ambient field that is not exact.
+r"""Model errors that a fit allows for: extended bodies and an inexact ambient field.
 
 What they add to the readings at the fit counts as noise, and the fit is refined with it held. A modulus sees an error
 of the ambient field along the field at its sensor: differences keep what the source turns there. A body's second and
@@ -20,22 +20,25 @@ from magloc.localization.fit.gauss_newton import JointFits, refine
 from magloc.localization.fit.optima import Optima
 from magloc.measurement.whitened import WhitenedModel
 
-# |s| of q = (u, s), of unit norm, whose |u| is farther than NEAR from every sensor.
+# |s| of unit q = (u, s) below which the source is farther than NEAR from every sensor.
 _FAR_S = 1.0 / math.hypot(1.0, 1.0 + NEAR)
-# Variance of what a dipole leaves out, summed over the channels in units of the noise, that does not matter.
+# Negligible variance of the field that a dipole leaves out, summed over the channels in units of the noise.
 _NEGLIGIBLE = 0.1
 _ROUNDS = 3
-# Second order of an error of the ambient field, in σ of a reading, from which errors are no Gaussian's.
+# Second-order effect of the ambient field's error, in σ of a reading, from which errors are not Gaussian.
 _BENT = 0.3
 
 
 def body_errors(model: WhitenedModel, q: FloatArray, mu: FloatArray, length_m: FloatArray) -> FloatArray:
-    """What bodies (b, K) of some lengths add to the readings, of one σ: (b, C, 14 K) in units of the noise."""
+    """Return errors (b, C, 14 K) of readings by bodies (b, K), in units of the noise.
+
+    Columns are of one σ.
+    """
     sensors = model.centroid + model.radius * model.sensors
     separation = sensors - model.position(q)[:, :, None]
     moment = np.broadcast_to(model.moment(q, mu)[:, :, None], separation.shape)
     fields = finite_body_errors(separation, moment, length_m[..., None, None, None])
-    # In threes, those of a sensor.
+    # Three columns for each sensor.
     gain = np.zeros((len(q), 1, 3 * len(sensors), 3))
     owner = model.channel_sensor
     place = 3 * owner + np.arange(owner.size) - np.searchsorted(owner, owner)
@@ -47,13 +50,16 @@ def body_errors(model: WhitenedModel, q: FloatArray, mu: FloatArray, length_m: F
 
 
 def assumed_lengths(model: WhitenedModel, q: FloatArray, body_length_m: float | None) -> FloatArray:
-    """Lengths (b, K) of the bodies at q (b, K, 4): what is said, else a share of the distance near the array."""
+    """Return the lengths (b, K) of bodies at q (b, K, 4): stated, or a share of the distance."""
     sensors = model.centroid + model.radius * model.sensors
     return assumed_body_lengths(sensors, model.position(q), model.radius, body_length_m)
 
 
 def ambient_errors(model: WhitenedModel, q: FloatArray, mu: FloatArray, sigma_T: float) -> FloatArray:
-    """What an error of the ambient field, of one σ per axis, adds to moduli: (b, C, 3) in units of the noise."""
+    """Return errors (b, C, 3) of moduli by the ambient field, one σ per axis.
+
+    In units of the noise.
+    """
     gain = model.linear_gain(model.source_fields(q, mu))
     return sigma_T * np.where(model.channel_is_scalar[:, None], gain, 0.0)
 
@@ -61,9 +67,9 @@ def ambient_errors(model: WhitenedModel, q: FloatArray, mu: FloatArray, sigma_T:
 def with_model_errors(
     optima: Optima, body_length_m: float | None, ambient_sigma_T: float = 0.0
 ) -> list[tuple[Optima, FloatArray]]:
-    """Optima refined with the errors that matter, and the lengths (b,) of their rows' bodies, 0 where none does."""
+    """Return optima refined with model errors, and body lengths (b,), 0 where none matters."""
     rows, none = optima.rows, np.zeros(len(optima.rows))
-    point = body_length_m == 0.0 or (body_length_m is None and _all_far(optima.fits.q))
+    point = body_length_m == 0.0 or (body_length_m is None and _is_far(optima.fits.q))
     ambient_sigma_T = ambient_sigma_T if rows.model.sees_moduli else 0.0
     if (point and not ambient_sigma_T) or optima.position_m is not None or not len(optima.of_row):
         return [(optima, none)]
@@ -76,31 +82,31 @@ def with_model_errors(
         lengths[solved] = assumed_lengths(rows.model, best.q, body_length_m)
         near = np.flatnonzero(lengths[solved].any(axis=1))
         errors = body_errors(model.rows(near), best.q[near], best.mu[near], lengths[solved[near]])
-        negligible = np.sum(model.rows(near).whitened(errors) ** 2, axis=(1, 2)) <= _NEGLIGIBLE
+        negligible = np.sum(model.rows(near).whiten(errors) ** 2, axis=(1, 2)) <= _NEGLIGIBLE
         lengths[solved[near[negligible]]] = 0.0
         known = None if ambient_sigma_T else errors[~negligible]
     matters: BoolArray = np.asarray(lengths.any(axis=1))
     matters[solved] |= ambient_sigma_T > 0.0
     if not matters.any():
         return [(optima, none)]
-    refined = _refined(optima.chosen(matters), lengths[matters], ambient_sigma_T, known)
-    # A row of which no fit converged again stays that of a point in a known field.
+    refined = _refine(optima.select(matters), lengths[matters], ambient_sigma_T, known)
+    # A row whose refined fits did not converge keeps those of a point in a known field.
     lost = np.bincount(refined.of_row, minlength=len(refined.rows)) == 0
     matters[np.flatnonzero(matters)[lost]] = False
-    result = [(refined.chosen(~lost), lengths[matters].max(axis=1))] if matters.any() else []
+    result = [(refined.select(~lost), lengths[matters].max(axis=1))] if matters.any() else []
     if not matters.all():
-        result.append((optima.chosen(~matters), none[~matters]))
+        result.append((optima.select(~matters), none[~matters]))
     return result
 
 
-def _all_far(q: FloatArray) -> bool:
-    """Whether all sources are so far from the centroid that they are near to no sensor: most of them, cheaply."""
+def _is_far(q: FloatArray) -> bool:
+    """Whether all sources are far from every sensor, by a cheap test of the centroid."""
     s = q[..., 3]
     return np.count_nonzero(np.abs(s) < _FAR_S) == s.size
 
 
-def _refined(optima: Optima, lengths: FloatArray, ambient_sigma_T: float, errors: FloatArray | None) -> Optima:
-    """Optima with errors linearised at the best fit of every row, refined, linearised there again.
+def _refine(optima: Optima, lengths: FloatArray, ambient_sigma_T: float, errors: FloatArray | None) -> Optima:
+    """Refine optima with errors linearised at the best fit of every row, twice.
 
     The errors at the first best fits may be known.
     """
@@ -110,7 +116,7 @@ def _refined(optima: Optima, lengths: FloatArray, ambient_sigma_T: float, errors
         if errors is None:
             best = fits.rows(np.searchsorted(optima.of_row, np.arange(len(rows))))
             errors = model_errors(optima.rows.model, best.q, best.mu, lengths, ambient_sigma_T)
-        rows, errors = optima.rows.marginalised(errors), None
+        rows, errors = optima.rows.marginalise(errors), None
         start = fits
         fits = refine(rows.model.rows(optima.of_row), rows.y[optima.of_row], start.q, start.mu)
         fits = replace(fits, iterations=fits.iterations + start.iterations)
@@ -123,22 +129,25 @@ def _refined(optima: Optima, lengths: FloatArray, ambient_sigma_T: float, errors
         fits=fits.rows(kept),
         of_row=optima.of_row[kept],
         merged=merged[kept],
-        bent=_is_bent(rows.model, fits, optima.of_row, ambient_sigma_T)[kept],
+        bent=_is_nonlinear(rows.model, fits, optima.of_row, ambient_sigma_T)[kept],
     )
 
 
 def model_errors(
     model: WhitenedModel, q: FloatArray, mu: FloatArray, length_m: FloatArray, ambient_sigma_T: float
 ) -> FloatArray:
-    """Both kinds of errors together: (b, C, n) in units of the noise."""
+    """Return errors by bodies and by the ambient field, (b, C, n) in units of the noise."""
     parts = [body_errors(model, q, mu, length_m)] if length_m.any() else []
     if ambient_sigma_T:
         parts.append(ambient_errors(model, q, mu, ambient_sigma_T))
     return np.concatenate(parts, axis=-1)
 
 
-def _is_bent(model: WhitenedModel, fits: JointFits, of_row: IntArray, ambient_sigma_T: float) -> BoolArray:
-    """Whether moduli follow an error of the ambient field along a curve: second order beyond noise, (f,)."""
+def _is_nonlinear(model: WhitenedModel, fits: JointFits, of_row: IntArray, ambient_sigma_T: float) -> BoolArray:
+    """Return whether moduli are nonlinear (f,) in an error of the ambient field.
+
+    Their second order is beyond noise.
+    """
     if not ambient_sigma_T:
         return np.zeros(len(of_row), dtype=bool)
     at = model.rows(of_row)

@@ -1,4 +1,4 @@
-"""What fixes leave of the readings, channel by channel."""
+"""Residuals of fixes, channel by channel."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from arrays.typing import FloatArray
 from magloc.fields import dipole
 from magloc.localization.fit.fixes import Fixes
 from magloc.localization.fit.results import Fix
-from magloc.measurement.rows import checked_rows, whitened_rows
+from magloc.measurement.rows import check_rows, whitened_rows
 
 _ROWS_AT_ONCE = 256
 
@@ -18,13 +18,13 @@ _ROWS_AT_ONCE = 256
 def fix_residuals(
     array: SensorArray, readings_T: ArrayLike, fixes: Fixes, ambient_T: FloatArray | None = None
 ) -> FloatArray:
-    """Residuals (n, C) of the best solution of every row, in standard deviations of the noise.
+    """Return residuals (n, C) of the best solution of every row, over the noise's σ.
 
     The field common to all sensors, of which nothing is known, is fitted and taken out. The sum of squares of a row is
     the χ² of its solution; a fitted channel's own variance is therefore a little below 1. NaN where there is no reading
     or no solution, and for sensors that the fix left out.
     """
-    readings = checked_rows(array, readings_T)
+    readings = check_rows(array, readings_T)
     dropped = np.array([[name in names for name in array.ids] for names in fixes.dropped_sensors], dtype=bool)
     unused = ~fixes.solved[:, None] | dropped.reshape(-1, array.n_sensors)[:, array.channel_sensor]
     used = np.where(unused, np.nan, readings)
@@ -32,13 +32,13 @@ def fix_residuals(
     for rows in whitened_rows(array, used, ambient_T, _ROWS_AT_ONCE):
         if rows.mask.any():
             fields = np.stack([_fields(array, fixes[row]) for row in rows.index])
-            residual = rows.y - rows.model.predicted(fields)
+            residual = rows.y - rows.model.predict(fields)
             result[np.ix_(rows.index, np.flatnonzero(rows.mask))] = residual[:, rows.mask]
     return result
 
 
 def _fields(array: SensorArray, fix: Fix) -> FloatArray:
-    """Field of all sources of the best solution at the sensors (N, 3) [T]."""
+    """Return the field (N, 3) [T] of all sources of the best solution at the sensors."""
     sources = fix.best.sources
     moments = np.stack([source.moment_Am2 for source in sources])
     return dipole.total_field(array.positions, np.stack([source.position_m for source in sources]), moments)

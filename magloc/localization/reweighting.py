@@ -1,4 +1,4 @@
-r"""Fits of rows with weights of whole sensors: without some of them, or reweighted by Student-t scores.
+r"""Fits with weights of whole sensors: without some of them, or by Student-t scores.
 
 A sensor whose squared residual is :math:`\rho_s` has the weight :math:`(\nu + n_s)/(\nu + \rho_s)`, iterated.
 """
@@ -13,25 +13,25 @@ from scipy.special import fdtri
 
 from arrays.typing import FloatArray, IntArray
 from magloc.levels import SENSOR_FALSE_ALARM
-from magloc.localization.fit.gauss_newton import JointFits, first_alike, refine
-from magloc.localization.leave_one_out import Weighted, falls_without_sensors, weighted
+from magloc.localization.fit.gauss_newton import JointFits, first_equal, refine
+from magloc.localization.leave_one_out import Weighted, chi2_falls_without_sensors, weight_channels
 from magloc.measurement.whitened import WhitenedModel
 
 DEGREES_OF_FREEDOM = 4.0
 LEAST_WEIGHT = 1e-16
-# Above this variance, in units of what is stated, the noise is taken to be larger than stated.
+# Ratio to the stated variance above which the noise counts as understated.
 _UNDERSTATED = 2.0
 _N_REWEIGHTINGS = 30
-# Fits of a row of which this is the difference, of the weights in themselves, end as one.
+# Fits of a row that differ less in position and (relatively) in weights are merged.
 _SAME_PLACE, _SAME_WEIGHT = 0.01, 0.05
-_FITS_AT_ONCE = 64  # whose numbers a processor's cache holds
+_FITS_AT_ONCE = 64  # fit in the processor's cache
 # Median of χ²/n of three degrees of freedom.
 _MEDIAN_RATIO = 0.789
 
 
 @dataclass(frozen=True, eq=False)
 class WeightedFits:
-    """Fits of rows of a problem, whose readings (b, C) are raw, with weights of sensors (f, N).
+    """Fits of rows with weights of sensors (f, N); the readings (b, C) are raw.
 
     Attributes
     ----------
@@ -58,46 +58,51 @@ class WeightedFits:
         return len(self.count)
 
     def weights_without(self, sensors: Sequence[Collection[int]]) -> FloatArray:
-        """Weights (f, N) of fits without some sensors."""
+        """Return weights (f, N) of fits without some sensors."""
         weight = np.ones((len(sensors), self.n_sensors))
         for of_fit, some in zip(weight, sensors, strict=True):
             of_fit[list(some)] = LEAST_WEIGHT
         return weight
 
-    def _weighted(self, row: IntArray, weight: FloatArray) -> Weighted:
-        return weighted(self.problem.rows(row), self.raw[row], weight[:, self.problem.channel_sensor])
+    def _weight(self, row: IntArray, weight: FloatArray) -> Weighted:
+        return weight_channels(self.problem.rows(row), self.raw[row], weight[:, self.problem.channel_sensor])
 
-    def refined(self, row: IntArray, q: FloatArray, mu: FloatArray, weight: FloatArray) -> JointFits:
-        """Weighted fits of rows (f,) from sources (f, K, …)."""
-        return self._refined(self._weighted(row, weight), q, mu, max_iterations=60)
+    def refine(self, row: IntArray, q: FloatArray, mu: FloatArray, weight: FloatArray) -> JointFits:
+        """Return weighted fits of rows (f,) from sources (f, K, …)."""
+        return self._refine_rows(self._weight(row, weight), q, mu, max_iterations=60)
 
-    def _refined(self, lighter: Weighted, q: FloatArray, mu: FloatArray, max_iterations: int) -> JointFits:
-        """Fits of weighted rows (f,) from sources (f, K, …)."""
+    def _refine_rows(self, lighter: Weighted, q: FloatArray, mu: FloatArray, max_iterations: int) -> JointFits:
+        """Return fits of weighted rows (f,) from sources (f, K, …)."""
         problem, raw = lighter
         free = np.full((q.shape[1], 3), self.free_position)
-        return refine(problem, problem.whitened(raw), q, mu, free=free, max_iterations=max_iterations)
+        return refine(problem, problem.whiten(raw), q, mu, free=free, max_iterations=max_iterations)
 
-    def falls(
+    def chi2_falls(
         self, row: IntArray, q: FloatArray, mu: FloatArray, weight: FloatArray | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """:func:`falls_without_sensors` of fits of rows (f,)."""
-        at = (self.problem.rows(row), self.raw[row]) if weight is None else self._weighted(row, weight)
-        return falls_without_sensors(*at, q, mu, self.sensor_channels, free_position=self.free_position)
+        """Return :func:`chi2_falls_without_sensors` of fits of rows (f,)."""
+        at = (self.problem.rows(row), self.raw[row]) if weight is None else self._weight(row, weight)
+        return chi2_falls_without_sensors(*at, q, mu, self.sensor_channels, free_position=self.free_position)
 
     def misfit(self, row: IntArray, q: FloatArray, mu: FloatArray, weight: FloatArray) -> FloatArray:
-        """Squared residuals (f, N) of the sensors of some rows, the common field being that of the weighted fit."""
-        return self._squares(self._weighted(row, weight), q, mu, weight)
+        """Return squared residuals (f, N) of the sensors of some rows.
+
+        The common field is that of the weighted fit.
+        """
+        return self._squares(self._weight(row, weight), q, mu, weight)
 
     def _squares(self, lighter: Weighted, q: FloatArray, mu: FloatArray, weight: FloatArray) -> FloatArray:
-        """Squared residuals (f, N) of the sensors of some weighted rows."""
+        """Return squared residuals (f, N) of the sensors of some weighted rows."""
         owner, (problem, raw) = self.problem.channel_sensor, lighter
-        residual = problem.whitened(raw) - problem.predicted(problem.source_fields(q, mu))
+        residual = problem.whiten(raw) - problem.predict(problem.source_fields(q, mu))
         of_sensor = owner[:, None] == np.arange(self.n_sensors)
         squares: FloatArray = (residual**2 / weight[:, owner]) @ of_sensor
         return squares
 
     def scale2(self, misfit: FloatArray) -> FloatArray:
-        """Variance of the noise (f,) in units of what is stated, one at least, from the median sensor.
+        """Return the variance of the noise (f,) over the stated one, one at least.
+
+        It is estimated from the median sensor.
 
         Where everything fits badly it is the model or the stated noise that is wrong, not a sensor.
         """
@@ -105,28 +110,31 @@ class WeightedFits:
         ratio = np.median(misfit[:, standing] / self.count[standing], axis=1) / _MEDIAN_RATIO
         return np.maximum(1.0, ratio)
 
-    def limits_of(self, scale2: float, n_sources: int) -> FloatArray:
-        """Limits (N,) of the squared residuals over the variance of the noise; wider where that is a guess."""
+    def square_limits(self, scale2: float, n_sources: int) -> FloatArray:
+        """Return limits (N,) of squared residuals over the noise variance.
+
+        They are wider where that is an estimate.
+        """
         if scale2 < _UNDERSTATED:
             return self.limits
         count = np.maximum(self.count, 1)
-        # A median is about as good as the mean of half as many.
+        # A median is about as accurate as the mean of half as many values.
         spare = 0.5 * max(2.0, self.count.sum() - 6.0 * n_sources - 6.0)
         quantile: FloatArray = fdtri(count, spare, 1.0 - SENSOR_FALSE_ALARM / self.n_sensors)
         return np.array(count * quantile, dtype=np.float64)
 
-    def reweighted(
+    def reweight(
         self, row: IntArray, q: FloatArray, mu: FloatArray, weight: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Squared residuals (f, N) of the sensors after reweighting from starts, and the scale of the noise."""
+        """Return squared residuals (f, N) of the sensors after reweighting, and the noise scale."""
         q, mu, weight = q.copy(), mu.copy(), weight.copy()
         misfit, scale2 = np.empty(weight.shape), np.empty(len(row))
         live = twin = np.arange(len(row))
         for n in range(_N_REWEIGHTINGS + 1):
             for some in np.array_split(live, -(-live.size // _FITS_AT_ONCE)):
-                lighter = self._weighted(row[some], weight[some])
+                lighter = self._weight(row[some], weight[some])
                 if n:
-                    fits = self._refined(lighter, q[some], mu[some], max_iterations=8)
+                    fits = self._refine_rows(lighter, q[some], mu[some], max_iterations=8)
                     q[some], mu[some] = fits.q, fits.mu
                 misfit[some] = self._squares(lighter, q[some], mu[some], weight[some])
             scale2[live] = self.scale2(misfit[live])
@@ -135,7 +143,7 @@ class WeightedFits:
             moved = np.any(np.abs(new - weight[live]) >= 1e-3 * weight[live], axis=1)
             live = live[moved]
             weight[live] = new[moved]
-            twin = np.minimum(twin, first_alike(row, q, weight, _SAME_PLACE, _SAME_WEIGHT))
+            twin = np.minimum(twin, first_equal(row, q, weight, _SAME_PLACE, _SAME_WEIGHT))
             live = live[twin[live] == live]
             if not live.size:
                 break

@@ -17,7 +17,7 @@ from magloc import core
 if TYPE_CHECKING:
     from magloc.measurement.whitened import WhitenedModel
 
-# By how much the weights of a sensor's axes may differ.
+# Largest difference of the weights of a sensor's axes.
 _SAME_WEIGHT = 1e-12
 
 
@@ -36,7 +36,9 @@ def channels_of(model: WhitenedModel) -> core.Problem:
 
 
 def problem(model: WhitenedModel, gain: FloatArray, columns: FloatArray, *, moduli: bool = False) -> core.Problem:
-    """Return the channels of a model's sensors with gains (sets, C, 3) and columns (sets, C, c) to project out.
+    """Return the channels of a model with gains (sets, C, 3) and columns (sets, C, c).
+
+    The columns are projected out.
 
     Channels behind those of the sensors are known parts of the common field. Without moduli all channels are linear.
     """
@@ -63,7 +65,7 @@ def problem(model: WhitenedModel, gain: FloatArray, columns: FloatArray, *, modu
 
 
 def signals_of(model: WhitenedModel, y: FloatArray) -> FloatArray:
-    """Return whitened readings (b, C) with those of the known parts of the common field behind them."""
+    """Return whitened readings (b, C), followed by those of known parts of the common field."""
     known = _known_columns(model)
     if not known.size:
         return np.ascontiguousarray(y)
@@ -79,7 +81,7 @@ def _known_columns(model: WhitenedModel) -> NDArray[np.intp]:
 
 
 def _is_isotropic(model: WhitenedModel, gain: FloatArray) -> bool:
-    """Return whether all sensors are vectors whose gains (C, 3) are a turned unit matrix times a weight."""
+    """Return whether all gains (C, 3) of vector sensors are scaled rotations."""
     n_sensors = len(model.sensors)
     if not np.array_equal(model.channel_sensor, np.arange(3 * n_sensors) // 3):
         return False

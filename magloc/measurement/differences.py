@@ -1,4 +1,4 @@
-r"""What an array measures of a dipole: predicted decorrelated differences and their Jacobian.
+r"""Measurement model of an array: decorrelated differences of a dipole and their Jacobian.
 
 The predictions of all channels are formed first, vector sensors as components of the field in their own axes, scalar
 sensors as the exact modulus :math:`|B_a + B|`, then combined to the independent differences of
@@ -28,7 +28,7 @@ _NICE_RANGE = 3.0
 def predicted_channels(
     array: SensorArray, position_m: ArrayLike, moment_Am2: ArrayLike, ambient_T: FloatArray | None = None
 ) -> FloatArray:
-    """Noise-free readings (..., C) [T] of a source at (..., 3) in the array's frame, offset removed.
+    """Return noise-free readings (..., C) [T] of a source in the array's frame, without offset.
 
     ``a_c · (B_a + B)`` for a component, ``g |B_a + B|`` for a modulus, with the ambient field B_a at each sensor: of
     ``ambient_T`` and, where it is not uniform, ``ambient_gradient_T_m``, which differences of either kind see. The
@@ -41,7 +41,7 @@ def predicted_channels(
 def channel_jacobian(
     array: SensorArray, position_m: ArrayLike, moment_Am2: ArrayLike, ambient_T: FloatArray | None = None
 ) -> FloatArray:
-    """Derivative (..., C, 6) of :func:`predicted_channels` with respect to (p, m) [T/m], [T/(A·m²)].
+    """Return the Jacobian (..., C, 6) of the channels by (p, m) [T/m], [T/(A·m²)].
 
     A modulus has the gradient of its field along the direction of the sum, equation (4).
     """
@@ -57,7 +57,7 @@ def channel_jacobian(
 def fields_at_sensors(
     array: SensorArray, position_m: ArrayLike, moment_Am2: ArrayLike, ambient_T: FloatArray | None = None
 ) -> FloatArray:
-    """Field at every sensor, the ambient field included: (..., N, 3) [T]."""
+    """Return the field at every sensor (..., N, 3) [T], the ambient field included."""
     p = np.asarray(position_m, dtype=np.float64)[..., None, :]
     m = np.asarray(moment_Am2, dtype=np.float64)[..., None, :]
     return dipole.field(array.positions, p, m) + (array.ambient_fields if ambient_T is None else ambient_T)
@@ -79,7 +79,7 @@ class DifferenceMeasurement:
 
     @classmethod
     def of(cls, array: SensorArray) -> DifferenceMeasurement:
-        """All channels of an array, with its own noise."""
+        """Return the measurement of all channels of an array with its own noise."""
         return cls(array, decorrelated_differences(array))
 
     @property
@@ -88,7 +88,9 @@ class DifferenceMeasurement:
         return self.differences.variance
 
     def measured(self, readings_T: ArrayLike) -> FloatArray:
-        """Decorrelated differences (..., k) [T] of raw readings (..., C), equations (16) and (28).
+        """Return decorrelated differences (..., k) [T] of raw readings (..., C).
+
+        Equations (16) and (28) of the source paper.
 
         What the differences leave out may be NaN.
         """
@@ -100,25 +102,31 @@ class DifferenceMeasurement:
     def predicted(
         self, position_m: ArrayLike, moment_Am2: ArrayLike, ambient_T: FloatArray | None = None
     ) -> FloatArray:
-        """Predicted decorrelated differences (..., k) [T] of a source in the array's frame (ForwardMT, ForwardMV)."""
+        """Return the predicted decorrelated differences (..., k) [T] of a source.
+
+        The source is in the array's frame (ForwardMT, ForwardMV).
+        """
         return predicted_channels(self.array, position_m, moment_Am2, ambient_T) @ self.differences.transform.T
 
     def jacobian(self, position_m: ArrayLike, moment_Am2: ArrayLike, ambient_T: FloatArray | None = None) -> FloatArray:
-        """Jacobian (..., k, 6) of :meth:`predicted` (JacobianH), columns (p, m): [T/m] and [T/(A·m²)]."""
+        """Return the Jacobian (..., k, 6) by (p, m) [T/m], [T/(A·m²)] (JacobianH)."""
         return self.differences.transform @ channel_jacobian(self.array, position_m, moment_Am2, ambient_T)
 
 
 def suitable_dipole(array: SensorArray) -> tuple[FloatArray, FloatArray]:
-    """Place and moment of a dipole that an array locates well: three radii away, a few hundred times the noise."""
+    """Return position and moment of a dipole that an array locates well.
+
+    It is three radii away, and its field a few hundred times the noise.
+    """
     direction = np.array([2.0, 1.0, 2.0]) / 3.0
     distance = _NICE_RANGE * array.circumradius
     field_T = _NICE_SIGNAL * float(np.median(array.channel_noise_T))
-    moment = rounded(field_T * distance**3 / dipole.MU0_OVER_4PI)
+    moment = one_digit(field_T * distance**3 / dipole.MU0_OVER_4PI)
     step = 10.0 ** np.floor(np.log10(array.circumradius) - 1.0)
     position = np.round((array.centroid + distance * direction) / step) * step
     return position, np.array([0.0, 0.0, moment])
 
 
-def rounded(value: float) -> float:
-    """A positive number to one significant digit."""
+def one_digit(value: float) -> float:
+    """Round a positive number to one significant digit."""
     return float(f"{value:.0e}")

@@ -1,4 +1,4 @@
-r"""A moment that is known beforehand: a pseudo-measurement of its modulus, or of its three components.
+r"""Prior of a moment: a pseudo-measurement of its modulus or of its three components.
 
 The modulus makes the moment no linear unknown, but a fit of it stays cheap: what minimises
 :math:`\|y - A\mu\|^2 + (|\mu| - M)^2/\sigma^2` solves :math:`(A^T A + \nu I)\mu = A^T y` with
@@ -19,7 +19,7 @@ _N_NEWTON = 12
 
 @dataclass(frozen=True)
 class KnownMoment:
-    """What is known of every source's moment m: (h(m) - value)/σ is a number of unit variance.
+    """Prior of every source's moment m: (h(m) - value)/σ has unit variance.
 
     Attributes
     ----------
@@ -33,26 +33,29 @@ class KnownMoment:
 
     @property
     def n_known(self) -> int:
-        """Numbers that are known of one moment."""
+        """Number of known components of one moment."""
         return len(self.value_Am2)
 
     @property
     def modulus_Am2(self) -> float:
-        """Modulus that is expected."""
+        """Expected modulus of the moment."""
         return float(np.linalg.norm(self.value_Am2))
 
-    def widened(self, share: float) -> KnownMoment:
-        """The same with σ of some share of the modulus at least."""
+    def widen(self, share: float) -> KnownMoment:
+        """Return the prior with σ not less than a share of the modulus."""
         return replace(self, sigma_Am2=max(self.sigma_Am2, share * self.modulus_Am2))
 
     def residual(self, moment_Am2: FloatArray) -> FloatArray:
-        """Of moments (..., K, 3): (..., K k), in standard deviations, the value less what moments have."""
+        """Return the residuals (..., K k) of moments (..., K, 3), in standard deviations.
+
+        Prior value minus moment.
+        """
         has = moment_Am2 if self.n_known == 3 else np.linalg.norm(moment_Am2, axis=-1, keepdims=True)
         left = np.asarray((np.array(self.value_Am2) - has) / self.sigma_Am2, dtype=np.float64)
         return left.reshape(*moment_Am2.shape[:-2], -1)
 
     def information(self, moment_Am2: FloatArray) -> FloatArray:
-        """Half the second derivative of the squared residual (..., 3, 3), at moments (..., 3)."""
+        """Return half the Hessian (..., 3, 3) of the squared residual at moments (..., 3)."""
         if self.n_known == 3:
             return np.broadcast_to(np.eye(3) / self.sigma_Am2**2, (*moment_Am2.shape, 3))
         length = np.linalg.norm(moment_Am2, axis=-1)[..., None, None]
@@ -61,7 +64,7 @@ class KnownMoment:
         return (along + across) / self.sigma_Am2**2
 
     def best_moments(self, information: FloatArray, pull: FloatArray, unit_Am2: FloatArray) -> FloatArray:
-        """Scaled moments μ (..., 3) that minimise ``μᵀ I μ - 2 pᵀ μ`` and the square of the residual together.
+        """Return the scaled moments μ (..., 3) that minimise ``μᵀ I μ - 2 pᵀ μ + |residual|²``.
 
         I (..., 3, 3) is their information, unit (...) the size in A·m² of a scaled moment of one.
         """
@@ -77,7 +80,7 @@ class KnownMoment:
         return np.einsum("...ij,...j->...i", axes, x)
 
     def jacobian(self, moment_Am2: FloatArray) -> FloatArray:
-        """Derivative (b, K, k, 3) of what is known by the moments (b, K, 3)."""
+        """Return the derivative (b, K, k, 3) of the known quantities by the moments (b, K, 3)."""
         if self.n_known == 3:
             return np.broadcast_to(np.eye(3) / self.sigma_Am2, (*moment_Am2.shape, 3))
         length = np.linalg.norm(moment_Am2, axis=-1, keepdims=True)
@@ -85,7 +88,9 @@ class KnownMoment:
 
 
 def moments_of_modulus(eigenvalue: FloatArray, along: FloatArray, modulus: FloatArray, sigma: FloatArray) -> FloatArray:
-    r"""What minimises :math:`\sum_i (\lambda_i x_i^2 - 2 b_i x_i) + (|x| - M)^2/\sigma^2`, by the secular equation.
+    r"""Return the moments of an expected modulus, by the secular equation.
+
+    They minimise :math:`\sum_i (\lambda_i x_i^2 - 2 b_i x_i) + (|x| - M)^2/\sigma^2`.
 
     λ and b (..., 3) are eigenvalues of ``AᵀA``, the least one first, and ``Aᵀy`` along its eigenvectors; the result
     has their shape. Newton's iteration on 1/|x|, which is concave in ν, comes from the left and never passes the root.

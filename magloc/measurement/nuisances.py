@@ -1,4 +1,4 @@
-r"""Errors of sensors that last from row to row, as states that are estimated along with a source.
+r"""Lasting errors of sensors, as states that are estimated along with a source.
 
 Turned axes, gains, the platform's fields, 1/f noise and drift do not average out as noise does. Every one of them is a
 first-order Markov process :math:`\dot e = -e/τ + w`: constant for the calibration, a random walk for drift, one
@@ -26,13 +26,13 @@ _SECONDS_PER_HOUR = 3600.0
 _UNKNOWN = 1e5
 """Standard deviation, in that of a reading's noise, of a background of which nothing is known."""
 
-# Where they start among the errors of a sensor: turns, gains, a field, and what the ambient field and its rate induce.
+# First index of each kind of error of a sensor: turns, gains, a field, fields induced by the ambient field and its rate.
 _TURN, _GAIN, _FIELD, _INDUCED, _EDDY = 0, 3, 6, 9, 18
 
 
 @dataclass(frozen=True)
-class Drift:
-    """A background of every channel that is no signal, in units of the noise of its readings.
+class BackgroundDrift:
+    """Background of every channel that is no signal, in units of the noise.
 
     Attributes
     ----------
@@ -48,8 +48,8 @@ class Drift:
     about_s: float = 0.0
 
     @classmethod
-    def of(cls, background: Background, time_s: FloatArray) -> Drift | None:
-        r"""What a background is over rows at some times.
+    def of(cls, background: Background, time_s: FloatArray) -> BackgroundDrift | None:
+        r"""Return the drift that a background leaves over rows at these times.
 
         A random walk that adds :math:`2π f_c Δt` of the noise in every row leaves in its steady state what a high-pass
         of first order with the corner :math:`f_c` leaves.
@@ -68,7 +68,7 @@ class Drift:
 
 @dataclass(frozen=True, eq=False)
 class SensorErrors:
-    """The lasting errors of an array's sensors.
+    """Lasting errors of the sensors of an array.
 
     Attributes
     ----------
@@ -97,9 +97,9 @@ class SensorErrors:
     about_s: float = 0.0
 
     @classmethod
-    def of(cls, array: SensorArray, background: Drift | None = None) -> SensorErrors:
-        """All lasting errors that an array states, and a background that drifts."""
-        background = background or Drift()
+    def of(cls, array: SensorArray, background: BackgroundDrift | None = None) -> SensorErrors:
+        """Return all lasting errors that an array states, and a background that drifts."""
+        background = background or BackgroundDrift()
         of_sensor: list[tuple[int, int]] = []
         sigma: list[float] = []
         for i, sensor in enumerate(array.sensors):
@@ -142,17 +142,17 @@ class SensorErrors:
 
     @property
     def n_states(self) -> int:
-        """Number of errors."""
+        """Number of error states."""
         return self.sigma.size
 
     @property
     def is_constant(self) -> bool:
-        """Whether the effect is that of offsets, the same in every row, whatever is read."""
+        """Whether the effect is the same in every row, as of offsets."""
         fields = (self.of_sensor[:, 1] >= _FIELD) & (self.of_sensor[:, 1] < _INDUCED)
         return bool(fields.all() and not self.is_slope.any() and not self.array.channel_is_scalar.any())
 
     def step(self, dt_s: float) -> tuple[FloatArray, FloatArray]:
-        """What remains of every error after a step, and the standard deviation of what is added: (n,) each."""
+        """Return decay factors and added standard deviations, (n,) each, over a time step."""
         kept = np.exp(-self.decay_Hz * dt_s)
         stationary = self.sigma * np.sqrt(-np.expm1(-2.0 * self.decay_Hz * dt_s))
         return kept, np.hypot(stationary, self.walk * math.sqrt(dt_s))
@@ -160,7 +160,9 @@ class SensorErrors:
     def effect(
         self, array: SensorArray, readings_T: FloatArray, time_s: float = 0.0, rate_rad_s: FloatArray | None = None
     ) -> FloatArray:
-        """Derivative (C, n) of one row's readings (C,) [T] by the errors; finite also for missing readings.
+        """Return the derivative (C, n) of one row's readings (C,) [T] by the errors.
+
+        It is finite also for missing readings.
 
         The array turns at a rate (3,) about its own axes.
         """
@@ -170,7 +172,7 @@ class SensorErrors:
             sensor, column = self.of_sensor.T
             known = (column >= _FIELD).all()
             of_axes = np.zeros((array.n_sensors, 3, _FIELD)) if known else calibration_errors(array, readings_T)
-            of_field = _of_fields(array)
+            of_field = _field_jacobian(array)
             of_axes = np.concatenate([of_axes, of_field], axis=-1)
             if (column >= _INDUCED).any():
                 ambient_T = ambient_in_array(array, readings_T)
@@ -187,7 +189,9 @@ class SensorErrors:
 
 
 def ambient_in_array(array: SensorArray, readings_T: FloatArray, ambient_T: FloatArray | None = None) -> FloatArray:
-    """The ambient field (..., 3) in the middle of the sensors: what is known of it, else what vector sensors read.
+    """Return the ambient field (..., 3) at the middle of the sensors.
+
+    It is the known field, else the mean of what vector sensors read.
 
     Of rows (..., C); that of each of them (..., 3) stands in place of the array's own.
     """
@@ -198,7 +202,10 @@ def ambient_in_array(array: SensorArray, readings_T: FloatArray, ambient_T: Floa
 
 
 def with_eddies_as_offsets(array: SensorArray, ambient_T: FloatArray, rate_rad_s: FloatArray) -> SensorArray:
-    """The array where eddy currents count as fields of their own, of their rms over rows that turn: (n, 3) each."""
+    """Return the array with eddy currents as offset errors of the same rms.
+
+    Ambient fields and rates (n, 3) are those of rows that turn.
+    """
     change_T_s = math.sqrt(np.mean(np.sum(np.cross(ambient_T, rate_rad_s) ** 2, axis=-1)))
     sensors = tuple(
         replace(
@@ -211,14 +218,17 @@ def with_eddies_as_offsets(array: SensorArray, ambient_T: FloatArray, rate_rad_s
     return replace(array, sensors=sensors)
 
 
-def _of_fields(array: SensorArray) -> FloatArray:
-    """Derivative (N, 3, 3) of readings by a field in the array's frame; a modulus sees it along the ambient field."""
+def _field_jacobian(array: SensorArray) -> FloatArray:
+    """Return the derivative (N, 3, 3) of readings by a field in the array's frame.
+
+    A modulus sees it along the ambient field.
+    """
     rows = np.nan_to_num(array.linear_gain(array.ambient_fields))
     return np.where(array.sensor_channels[..., None] >= 0, rows[array.sensor_channels], 0.0)
 
 
 def without_lasting_errors(array: SensorArray) -> SensorArray:
-    """The array with noise that is independent from row to row alone."""
+    """Return the array with noise that is independent from row to row alone."""
     sensors = tuple(
         replace(
             sensor,

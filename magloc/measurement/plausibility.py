@@ -1,4 +1,4 @@
-"""What of a record cannot be so: a unit, a clock or an attitude other than the one that its columns stand for.
+"""Plausibility of a record: units, clocks and attitudes that contradict the readings.
 
 Every doubt is a sentence. None is a refusal: the numbers could be true, of a laboratory that is not imagined here.
 """
@@ -48,44 +48,47 @@ _MOMENTS_Am2 = (1e-9, 1e7)  # a grain of magnetite, the largest ships
 
 
 def usable_readings(array: SensorArray, values: Readings | ArrayLike) -> Readings:
-    """Readings without those that saturate, in their ambient field; warns of what is hardly as stated."""
+    """Return readings without saturated ones, in their ambient field; warn of implausible input."""
     readings = as_readings(values)
-    used = _usable(array, readings)
-    _warn_of(doubts(array, readings, used))
+    used = _drop_saturated(array, readings)
+    _warn(doubts(array, readings, used))
     return used
 
 
 def warn_of_doubts(array: SensorArray, readings: Readings) -> None:
-    """Warn of what in readings is hardly as stated."""
-    _warn_of(doubts(array, readings))
+    """Warn of implausible readings."""
+    _warn(doubts(array, readings))
 
 
 def warn_of_array(array: SensorArray, readings: Readings | None = None) -> None:
     """Warn of an array whose size is hardly in metres."""
-    _warn_of(array_doubts(array, readings))
+    _warn(array_doubts(array, readings))
 
 
 def warn_of_record(array: SensorArray, readings: Readings) -> None:
-    """Warn of what in readings alone is hardly as stated."""
-    _warn_of(record_doubts(array, readings))
+    """Warn of implausible readings, without a look at the array."""
+    _warn(record_doubts(array, readings))
 
 
 def warn_of_moments(distance_m: ArrayLike, moment_Am2: ArrayLike) -> None:
-    """Warn of moments (n, 3) that no object has at such distances (n,) from the sensors, NaN where there is none."""
-    _warn_of(moment_doubts(distance_m, moment_Am2))
+    """Warn of moments (n, 3) that no object has at distances (n,) from the sensors.
+
+    NaN are left out.
+    """
+    _warn(moment_doubts(distance_m, moment_Am2))
 
 
-def _warn_of(sentences: Iterator[str]) -> None:
+def _warn(sentences: Iterator[str]) -> None:
     for doubt in sentences:
         _LOG.warning(doubt)
 
 
-def _usable(array: SensorArray, readings: Readings) -> Readings:
+def _drop_saturated(array: SensorArray, readings: Readings) -> Readings:
     return in_world_field(without_saturated(readings, array), array)
 
 
 def doubts(array: SensorArray, readings: Readings, used: Readings | None = None) -> Iterator[str]:
-    """Sentences on an array and on readings that are hardly as stated.
+    """Yield sentences on an array and readings that are implausible.
 
     `used` are those that do not saturate, in their ambient field, where they are known.
     """
@@ -94,11 +97,11 @@ def doubts(array: SensorArray, readings: Readings, used: Readings | None = None)
 
 
 def record_doubts(array: SensorArray, readings: Readings, used: Readings | None = None) -> Iterator[str]:
-    """Sentences on readings alone, of units and clocks for twenty rows or more."""
-    yield from _of_origin(readings)
-    used = _usable(array, readings) if used is None else used
+    """Yield sentences on readings alone; units and clocks need twenty rows or more."""
+    yield from _origin_doubts(readings)
+    used = _drop_saturated(array, readings) if used is None else used
     if len(readings) < FEWEST_ROWS:
-        yield from _of_ambient(array, used)
+        yield from _ambient_doubts(array, used)
         return
     read = np.isfinite(readings.values_T)
     saturated = 1.0 - np.isfinite(used.values_T).sum() / max(int(read.sum()), 1)
@@ -112,15 +115,17 @@ def record_doubts(array: SensorArray, readings: Readings, used: Readings | None 
                 f" {unit}: are they in nT, is noise_nT right, were they filtered?"
             )
     ambient_T = array.ambient_fields if used.ambient_T is None else used.ambient_T
-    of_unit = list(_of_moduli(used.values_T[:, array.channel_is_scalar], _median(np.linalg.norm(ambient_T, axis=-1))))
-    yield from of_unit or _of_ambient(array, used)
+    of_unit = list(
+        _moduli_doubts(used.values_T[:, array.channel_is_scalar], _median(np.linalg.norm(ambient_T, axis=-1)))
+    )
+    yield from of_unit or _ambient_doubts(array, used)
     if used.pose is not None:
-        yield from _of_path(used.time_s, used.pose[0])
-        yield from _of_attitude(array, used, used.pose[1])
+        yield from _path_doubts(used.time_s, used.pose[0])
+        yield from _attitude_doubts(array, used, used.pose[1])
 
 
 def array_doubts(array: SensorArray, readings: Readings | None = None) -> Iterator[str]:
-    """Sentences on an array whose size is hardly that of one with such noise, or of one that moves by its poses."""
+    """Yield a sentence on an array of implausible size, given its noise and motion."""
     if array.n_sensors < 2:
         return
     place_m = None if readings is None else readings.array_position_m
@@ -138,7 +143,10 @@ def array_doubts(array: SensorArray, readings: Readings | None = None) -> Iterat
 
 
 def moment_doubts(distance_m: ArrayLike, moment_Am2: ArrayLike) -> Iterator[str]:
-    """A sentence on moments (n, 3) that no object has at distances (n,) from the sensors; NaN are left out."""
+    """Yield a sentence on moments (n, 3) that no object has at distances (n,).
+
+    Distances are from the sensors; NaN are left out.
+    """
     distance, strength = np.asarray(distance_m, np.float64), np.linalg.norm(moment_Am2, axis=-1)
     known = np.isfinite(distance) & np.isfinite(strength)
     if not known.any():
@@ -155,7 +163,7 @@ def moment_doubts(distance_m: ArrayLike, moment_Am2: ArrayLike) -> Iterator[str]
     )
 
 
-def _of_origin(readings: Readings) -> Iterator[str]:
+def _origin_doubts(readings: Readings) -> Iterator[str]:
     farthest_m = farthest_place(readings)
     if farthest_m > FARTHEST_M:
         yield (
@@ -165,7 +173,7 @@ def _of_origin(readings: Readings) -> Iterator[str]:
 
 
 def farthest_place(readings: Readings) -> float:
-    """Greatest distance of the array from the origin of the world frame [m], 0 where it has no pose."""
+    """Return the largest distance [m] of the array from the world's origin; 0 without a pose."""
     if readings.array_position_m is None:
         return 0.0
     far_m = np.linalg.norm(readings.array_position_m, axis=1)
@@ -173,7 +181,7 @@ def farthest_place(readings: Readings) -> float:
 
 
 def noise_ratio(array: SensorArray, values_T: FloatArray) -> float:
-    """White noise that rows (n, C) show over that which is stated, 1 where it is right; NaN where they show none.
+    """Return the white noise of rows (n, C) over the stated one; NaN where they show none.
 
     From differences of sixth order in time, in which little is left of fields that last. White noise is as large in
     those of every other row; filtered noise, and a source too fast for the rows, are several times larger there.
@@ -184,7 +192,7 @@ def noise_ratio(array: SensorArray, values_T: FloatArray) -> float:
 
 
 def _beyond_each_other(array: SensorArray, values_T: FloatArray) -> FloatArray:
-    """What sensors of a kind read beyond their mean, over the noise that is stated: (n, ...).
+    """Return readings less the mean of their kind of sensor, over the stated noise (n, ...).
 
     A sensor alone of its kind tells it by its modulus, which no attitude changes.
     """
@@ -202,14 +210,17 @@ def _beyond_each_other(array: SensorArray, values_T: FloatArray) -> FloatArray:
 
 
 def _sixth_difference(values: FloatArray, lag: int) -> FloatArray:
-    """Difference of sixth order over rows that lie `lag` apart, of the variance of white noise."""
+    """Return sixth differences of rows `lag` apart, scaled to keep the variance of white noise."""
     for _ in range(6):
         values = values[lag:] - values[:-lag]
     return values / np.sqrt(924.0)  # 1² + 6² + 15² + 20² + 15² + 6² + 1²
 
 
-def _of_moduli(moduli_T: FloatArray, ambient_T: float) -> Iterator[str]:
-    """Whether scalar sensors read about the ambient field; what has both signs is left of it where it was taken off."""
+def _moduli_doubts(moduli_T: FloatArray, ambient_T: float) -> Iterator[str]:
+    """Yield a sentence if scalar sensors do not read about the ambient field.
+
+    Values of both signs are residuals after the field was subtracted.
+    """
     read = _median(moduli_T)
     unlike = read < ambient_T / _OTHER_UNIT or read > ambient_T * _OTHER_UNIT
     if ambient_T > 0.0 and unlike and not (moduli_T < 0.0).any():
@@ -219,8 +230,10 @@ def _of_moduli(moduli_T: FloatArray, ambient_T: float) -> Iterator[str]:
         )
 
 
-def _of_ambient(array: SensorArray, used: Readings) -> Iterator[str]:
-    """Whether the moduli that sensors read are those of the stated ambient field, in rows where no source is near.
+def _ambient_doubts(array: SensorArray, used: Readings) -> Iterator[str]:
+    """Yield a sentence if moduli disagree with the stated ambient field.
+
+    Only rows without a source nearby count.
 
     An error of that field is the same in most rows and for all sensors, unlike the field of a source.
     """
@@ -260,7 +273,7 @@ def _of_ambient(array: SensorArray, used: Readings) -> Iterator[str]:
 
 
 def _shortest_half(values: FloatArray) -> tuple[float, float]:
-    """Middle and half of the width of the shortest interval that holds half of some values."""
+    """Return centre and half width of the shortest interval with half of the values."""
     ordered = np.sort(values)
     n = len(ordered) // 2 + 1
     widths = ordered[n - 1 :] - ordered[: len(ordered) - n + 1]
@@ -268,7 +281,7 @@ def _shortest_half(values: FloatArray) -> tuple[float, float]:
     return float(ordered[k] + ordered[k + n - 1]) / 2.0, float(widths[k]) / 2.0
 
 
-def _of_path(time_s: FloatArray, position_m: FloatArray) -> Iterator[str]:
+def _path_doubts(time_s: FloatArray, position_m: FloatArray) -> Iterator[str]:
     known = np.isfinite(time_s) & np.isfinite(position_m).all(axis=1)
     time_s, position_m = time_s[known], position_m[known]
     dt_s = np.diff(time_s)
@@ -285,8 +298,8 @@ def _of_path(time_s: FloatArray, position_m: FloatArray) -> Iterator[str]:
         yield f"the array moves at {wrong:.2g} m/s by its poses: are times in s, and places in m?"
 
 
-def _of_attitude(array: SensorArray, readings: Readings, rotation: Rotation) -> Iterator[str]:
-    """Whether a field of steady modulus, which is the Earth's, stands still in the world.
+def _attitude_doubts(array: SensorArray, readings: Readings, rotation: Rotation) -> Iterator[str]:
+    """Yield a sentence if a field of steady modulus, the Earth's, turns in the world.
 
     It is what vector sensors read on average, else the ambient field of the rows.
     """

@@ -1,4 +1,4 @@
-r"""Errors of an array's pose and of the ambient field: what they do to its readings, how they last from row to row.
+r"""Errors of pose and ambient field: their effect on readings and their correlation in time.
 
 With the true attitude :math:`R e^{[θ]_×}`, the true place of the pose's reference point moved by δx in the world, and
 the lever arm l from there to the array's origin wrong by δl, a source at p with the moment m stands in the array's axes
@@ -40,7 +40,7 @@ _NO_ERROR = np.zeros(N_POSE)
 
 @dataclass(frozen=True, eq=False)
 class ArrayPose:
-    """Where an array is, how it is turned and how it moves, as its readings state it.
+    """Position, attitude and motion of an array, as its readings state them.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class ArrayPose:
 
     @cached_property
     def reference_m(self) -> FloatArray:
-        """The pose's reference point in the world."""
+        """Position of the pose's reference point in the world."""
         return self.origin_m - self.R_world_from_array @ self.lever_arm_m
 
     @cached_property
@@ -67,33 +67,39 @@ class ArrayPose:
         """Velocity of the reference point in the world."""
         return self.velocity_m_s - self.R_world_from_array @ np.cross(self.rate_rad_s, self.lever_arm_m)
 
-    def turned(self, error: FloatArray | None = None) -> FloatArray:
-        """True attitude, array to world (..., 3, 3), where the pose has errors (..., 12)."""
+    def true_attitude(self, error: FloatArray | None = None) -> FloatArray:
+        """Return the true attitude, array to world (..., 3, 3), for pose errors (..., 12)."""
         R = self.R_world_from_array
         return R if error is None else R @ rotation_matrix(error[..., TURN])
 
-    def in_array(self, source: FloatArray, error: FloatArray | None = None) -> FloatArray:
-        """Position and moment (..., 6) of sources (..., 6) of the world, in the true axes of the array."""
+    def to_array(self, source: FloatArray, error: FloatArray | None = None) -> FloatArray:
+        """Transform sources (..., 6) from the world to the true axes of the array."""
         if error is None:
             R = self.R_world_from_array
             return np.concatenate([(source[..., :3] - self.origin_m) @ R, source[..., 3:6] @ R], axis=-1)
-        R = self.turned(error)
+        R = self.true_attitude(error)
         offset = source[..., :3] - self.reference_m - error[..., SHIFT]
         position = (offset[..., None, :] @ R)[..., 0, :] - self.lever_arm_m - error[..., LEVER]
         return np.concatenate([position, (source[..., None, 3:6] @ R)[..., 0, :]], axis=-1)
 
     def error_jacobian(self, in_array: FloatArray, error: FloatArray) -> FloatArray:
-        """Derivative (..., 6, 12) of :meth:`in_array`, which is given, by the errors."""
+        """Return the derivative (..., 6, 12) of :meth:`to_array` by the errors.
+
+        `in_array` (..., 6) is its result.
+        """
         right = turn_of_change(-error[..., TURN])
         D = np.zeros((*in_array.shape, N_POSE))
         D[..., :3, TURN] = cross_matrix(in_array[..., :3] + self.lever_arm_m + error[..., LEVER]) @ right
-        D[..., :3, SHIFT] = -np.swapaxes(self.turned(error), -1, -2)
+        D[..., :3, SHIFT] = -np.swapaxes(self.true_attitude(error), -1, -2)
         D[..., :3, LEVER] = -np.eye(3)
         D[..., 3:, TURN] = cross_matrix(in_array[..., 3:]) @ right
         return D
 
     def world_jacobian(self, in_array: FloatArray) -> FloatArray:
-        """Derivative (6, 12) by the error at zero of a source of the world that is known in the array's axes, (6,)."""
+        """Return the derivative (6, 12) of a source in the world by the errors, at zero.
+
+        The source (6,) is known in the array's axes.
+        """
         R = self.R_world_from_array
         J = np.zeros((6, N_POSE))
         J[:3, TURN] = -R @ cross_matrix(in_array[:3] + self.lever_arm_m)
@@ -103,7 +109,7 @@ class ArrayPose:
         return J
 
     def ambient(self, fields_T: FloatArray, error: FloatArray) -> FloatArray:
-        """Ambient fields (..., N, 3) in the true axes of the array, of which some (N, 3) are stated."""
+        """Return the ambient fields (..., N, 3) in the true axes, from stated ones (N, 3)."""
         mean_T = fields_T.mean(axis=0)
         true_T, _ = _field_with_error(mean_T, error[..., FIELD] @ self.R_world_from_array)
         return np.asarray((fields_T + (true_T - mean_T)[..., None, :]) @ rotation_matrix(error[..., TURN]))
@@ -111,7 +117,9 @@ class ArrayPose:
     def ambient_jacobian(
         self, array: SensorArray, in_array: FloatArray, error: FloatArray, fields_T: FloatArray
     ) -> FloatArray:
-        """Derivative (..., C, 12) of channels by what errors do to the ambient fields that are stated (N, 3) [T].
+        """Return the derivative (..., C, 12) of channels by the errors, through the ambient field.
+
+        Ambient fields (N, 3) are the stated ones [T].
 
         The sources (..., 6) stay in the true axes of the array.
         """
@@ -127,7 +135,10 @@ class ArrayPose:
 
 
 def _field_with_error(field_T: FloatArray, error_T: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """A field (3,) with errors (..., 3) of its modulus and direction, and the derivative (..., 3, 3) by these."""
+    """Return a field (3,) with errors (..., 3), and its derivative (..., 3, 3) by them.
+
+    Errors are those of modulus and direction.
+    """
     modulus_T, one = float(np.linalg.norm(field_T)), np.eye(3)
     if modulus_T == 0.0:
         return error_T, np.broadcast_to(one, (*error_T.shape, 3))
@@ -143,7 +154,7 @@ def _field_with_error(field_T: FloatArray, error_T: FloatArray) -> tuple[FloatAr
 
 @dataclass(frozen=True, eq=False)
 class PosesOfRows:
-    """The poses of several rows of one array, and what errors of unit variance do to each of them.
+    """Poses of several rows of one array, and the effects of errors of unit variance on them.
 
     Attributes
     ----------
@@ -157,14 +168,17 @@ class PosesOfRows:
     effects: Sequence[FloatArray]
 
     def channel_errors(self, source: FloatArray, ambient_T: FloatArray) -> list[FloatArray]:
-        """What they add to the channels (C, n) of every row [T], of a source (6,) and ambient fields (rows, N, 3)."""
+        """Return the errors (C, n) [T] of the channels of every row.
+
+        For a source (6,) and ambient fields (rows, N, 3).
+        """
         rows = zip(self.poses, self.effects, ambient_T, strict=True)
         return [channel_errors(self.array, pose, source, effect, field) for pose, effect, field in rows]
 
 
 @dataclass(frozen=True, eq=False)
 class PoseErrors:
-    """The errors of an array's poses and of the ambient field, as states of unit variance.
+    """Errors of an array's poses and of the ambient field, as states of unit variance.
 
     Attributes
     ----------
@@ -189,7 +203,10 @@ class PoseErrors:
     def of(
         cls, uncertainty: PoseUncertainty | None, ambient_T: tuple[float, float] = (0.0, 0.0), between_s: float = 0.0
     ) -> PoseErrors:
-        """All errors that are stated; what changes of place and attitude always is, a row may say how much."""
+        """Return all stated errors.
+
+        Errors of position and attitude that change are always states, since a row may state their size.
+        """
         turn, shift, lever, field = (list(range(N_POSE)[part]) for part in (TURN, SHIFT, LEVER, FIELD))
         clock, known = [N_POSE], uncertainty or PoseUncertainty()
         parts: list[tuple[list[int], float, float]] = []
@@ -209,39 +226,45 @@ class PoseErrors:
 
     @classmethod
     def of_array(cls, array: SensorArray) -> PoseErrors:
-        """All that an array states; its vector sensors' differences do not see an error of the ambient field."""
+        """Return all errors that an array states.
+
+        Differences of vector sensors do not see an error of the ambient field.
+        """
         moduli = bool(array.channel_is_scalar.any())
         known = (array.ambient_uncertainty_T, array.ambient_uncertainty_white_T) if moduli else (0.0, 0.0)
         return cls.of(array.pose, known)
 
     @property
     def n_states(self) -> int:
-        """Number of errors."""
+        """Number of error states."""
         return self.of_pose.size
 
     @property
-    def changes(self) -> BoolArray:
-        """Whether every one changes (n,)."""
+    def is_changing(self) -> BoolArray:
+        """Whether each error changes with time (n,)."""
         return np.isfinite(self.lasts_s)
 
     @property
-    def of_mounting(self) -> BoolArray:
-        """Whether every one is a constant of the mounting or of the lever arm (n,)."""
-        return np.asarray(~self.changes & (self.of_pose < FIELD.start))
+    def is_of_mounting(self) -> BoolArray:
+        """Whether each error is a constant of the mounting or of the lever arm (n,)."""
+        return np.asarray(~self.is_changing & (self.of_pose < FIELD.start))
 
     @property
-    def of_field(self) -> BoolArray:
-        """Whether every one is a constant of the ambient field (n,)."""
-        return np.asarray(~self.changes & (self.of_pose >= FIELD.start) & (self.of_pose < N_POSE))
+    def is_of_field(self) -> BoolArray:
+        """Whether each error is a constant of the ambient field (n,)."""
+        return np.asarray(~self.is_changing & (self.of_pose >= FIELD.start) & (self.of_pose < N_POSE))
 
     def step(self, dt_s: float | FloatArray) -> tuple[FloatArray, FloatArray]:
-        """What remains of every error after steps (...), and the standard deviation of what is added: (..., n) each."""
+        """Return decay factors and added standard deviations, (..., n) each, over steps (...)."""
         lasts = self.lasts_s > 0.0
         kept = np.where(lasts, np.exp(-np.asarray(dt_s)[..., None] / np.where(lasts, self.lasts_s, 1.0)), 0.0)
         return kept, np.sqrt(1.0 - kept**2)
 
     def effect(self, pose: ArrayPose, sigma: FloatArray | None = None) -> FloatArray:
-        """The error (12, n) of a pose by every state; `sigma` (2,) of place and attitude stands for the array's own."""
+        """Return the pose error (12, n) by every state.
+
+        `sigma` (2,) of position and attitude replaces the array's own.
+        """
         if not self.n_states:
             return np.zeros((N_POSE, 0))
         return self.effects(pose.rate_rad_s, pose.reference_velocity_m_s, sigma)
@@ -253,7 +276,7 @@ class PoseErrors:
         sigma: FloatArray | None = None,
         between_m: FloatArray | None = None,
     ) -> FloatArray:
-        """Those (..., 12, n) of arrays that turn and whose reference points move so, (..., 3) each.
+        """Return the pose errors (..., 12, n) by every state, for rates and velocities (..., 3).
 
         Places that were interpolated have errors of `between_m` (...,) beside those that are stated.
         """
@@ -269,7 +292,7 @@ class PoseErrors:
         constant = np.repeat(
             [known.attitude_constant_rad, 0.0, arm_m, constant_T, known.time_constant_s], [3, 3, 3, 3, 1]
         )
-        size = np.where(self.changes, changing[..., self.of_pose], constant[self.of_pose])
+        size = np.where(self.is_changing, changing[..., self.of_pose], constant[self.of_pose])
         shifts = np.flatnonzero((self.of_pose >= SHIFT.start) & (self.of_pose < SHIFT.stop))
         if known.position_white_m:
             size[..., shifts[3:6]] = known.position_white_m
@@ -277,16 +300,16 @@ class PoseErrors:
             size[..., shifts[-3:]] = between_m[..., None]
         return unit[..., self.of_pose] * size[..., None, :]
 
-    def of_rows(
+    def over_rows(
         self, array: SensorArray, time_s: FloatArray, poses: Sequence[ArrayPose], sigmas: Sequence[FloatArray | None]
     ) -> PosesOfRows | None:
-        """Errors of several rows together, as they last between these; None where there are none."""
+        """Return the errors of several rows, with their correlation in time; None if there are none."""
         if not self.n_states:
             return None
         apart_s = np.abs(time_s[:, None] - time_s)
         of_all = [self.effect(pose, sigma) for pose, sigma in zip(poses, sigmas, strict=True)]
-        parts: list[list[FloatArray]] = [[own[:, ~self.changes]] for own in of_all]
-        for lasts_s in np.unique(self.lasts_s[self.changes]).tolist():
+        parts: list[list[FloatArray]] = [[own[:, ~self.is_changing]] for own in of_all]
+        for lasts_s in np.unique(self.lasts_s[self.is_changing]).tolist():
             share = np.linalg.cholesky(np.exp(-apart_s / lasts_s) if lasts_s else np.eye(len(time_s)))
             for i, own in enumerate(of_all):
                 parts[i].append(np.kron(share[i], own[:, self.lasts_s == lasts_s]))
@@ -296,11 +319,11 @@ class PoseErrors:
 def channel_errors(
     array: SensorArray, pose: ArrayPose, source: FloatArray, effect: FloatArray, ambient_T: FloatArray
 ) -> FloatArray:
-    """Derivative (C, n) of the channels by errors of the pose, of some effect (12, n) on it, at zero [T].
+    """Return the errors (C, n) [T] of the channels for pose errors (12, n), at zero.
 
     The source (6,) stands in the world, the ambient field (N, 3) in the array's axes.
     """
-    in_array = pose.in_array(source)
+    in_array = pose.to_array(source)
     position, moment = in_array[:3], in_array[3:]
     H = channel_jacobian(array, position, moment, ambient_T) @ pose.error_jacobian(in_array, _NO_ERROR)
     return np.asarray((H + pose.ambient_jacobian(array, in_array, _NO_ERROR, ambient_T)) @ effect)
@@ -309,7 +332,9 @@ def channel_errors(
 def pose_errors_at_rest(
     array: SensorArray, uncertainty: PoseUncertainty, position_m: FloatArray, moment_Am2: FloatArray
 ) -> FloatArray:
-    """What errors of unit variance of the pose of an array at rest add to its channels (..., C, n) [T].
+    """Return the errors (..., C, n) [T] of the channels by pose errors of an array at rest.
+
+    Errors have unit variance; sources (..., 3) are in the axes of the stated pose.
 
     Of sources (..., 3) in the axes of the stated pose.
     """
@@ -321,7 +346,10 @@ def pose_errors_at_rest(
 
 
 def with_stated_pose(array: SensorArray, readings: Readings) -> SensorArray:
-    """The array with the uncertainty of the pose that counts for some readings: none where they have no pose."""
+    """Return the array with the pose uncertainty that holds for some readings.
+
+    There is none where the readings have no pose.
+    """
     if readings.pose is None:
         return array if array.pose is None else replace(array, pose=None)
     if readings.pose_sigma is None or array.pose is not None:
@@ -330,7 +358,10 @@ def with_stated_pose(array: SensorArray, readings: Readings) -> SensorArray:
 
 
 def rates_of(time_s: FloatArray, position_m: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Velocities (n, 3) in the world and rates (n, 3) in the array's axes, from the rows about each; zero of one."""
+    """Return velocities in the world and rates in the array's axes, (n, 3) each.
+
+    Both are differences of the neighbouring rows; zero for a single row.
+    """
     n = len(time_s)
     before, after = np.maximum(np.arange(n) - 1, 0), np.minimum(np.arange(n) + 1, n - 1)
     dt = (time_s[after] - time_s[before])[:, None]

@@ -1,4 +1,4 @@
-"""Rows of readings that miss the same channels, whitened together."""
+"""Whitened rows of readings that miss the same channels."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _SILENT = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class WhitenedRows:
-    """Rows of readings that miss the same channels, whitened together.
+    """Whitened rows of readings that miss the same channels.
 
     Attributes
     ----------
@@ -52,8 +52,8 @@ class WhitenedRows:
     def __len__(self) -> int:
         return len(self.index)
 
-    def chosen(self, rows: IntArray | BoolArray) -> WhitenedRows:
-        """Some of the rows."""
+    def select(self, rows: IntArray | BoolArray) -> WhitenedRows:
+        """Return some of the rows."""
         at = np.arange(len(self))[rows]
         return replace(
             self,
@@ -64,48 +64,54 @@ class WhitenedRows:
             y=self.y[at],
         )
 
-    def marginalised(self, columns: FloatArray) -> WhitenedRows:
-        """The same where errors of unit variance along columns (b, C, n), in units of the noise, count as noise."""
-        model = self.model.marginalised(columns)
-        return replace(self, model=model, y=model.whitened(self.raw))
+    def marginalise(self, columns: FloatArray) -> WhitenedRows:
+        """Return the rows with errors along columns (b, C, n) counted as noise.
 
-    def knowing(self, moment: KnownMoment | None) -> WhitenedRows:
-        """The same where the moment of every source is known."""
+        The errors have unit variance, the columns are in units of the noise.
+        """
+        model = self.model.marginalise(columns)
+        return replace(self, model=model, y=model.whiten(self.raw))
+
+    def with_known_moment(self, moment: KnownMoment | None) -> WhitenedRows:
+        """Return the rows with a prior of the moment of every source."""
         return replace(self, model=replace(self.model, known=moment)) if moment is not None else self
 
     @cached_property
     def signals(self) -> FloatArray:
-        """Whitened readings for the kernels of fits: (b, C + k)."""
+        """Whitened readings for the kernels of fits (b, C + k)."""
         return signals_of(self.model, self.y)
 
     @property
-    def silent(self) -> BoolArray:
+    def is_silent(self) -> BoolArray:
         """Whether the differences (b,) are rounding errors."""
         squares = np.vecdot(self.y, self.y) if self.model.sees_moduli else self.energy
         return np.asarray(squares < _SILENT * self.n_differences)
 
     @cached_property
     def energy(self) -> FloatArray:
-        """Sums of squared differences (b,), as they are without a source."""
-        without = self.y - self.model.of_ambient if self.model.sees_moduli else self.y
+        """Sums of squared differences (b,), that is χ² without a source."""
+        without = self.y - self.model.ambient_signals if self.model.sees_moduli else self.y
         return np.asarray(np.vecdot(without, without))
 
 
 def whitened_rows(
     array: SensorArray, readings_T: FloatArray, ambient_T: FloatArray | None, at_once: int
 ) -> Iterator[WhitenedRows]:
-    """All rows of readings (n, C), those together that miss the same channels, `at_once` of them at most."""
+    """Yield whitened rows of readings (n, C), grouped by missing channels.
+
+    A group has at most `at_once` rows.
+    """
     for mask, rows in rows_of_equal_mask(np.isfinite(readings_T)):
         for begin in range(0, rows.size, at_once):
             index = rows[begin : begin + at_once]
             readings, ambient = readings_T[index], None if ambient_T is None else ambient_T[index]
             of_rows = whitenings_of(array, mask, readings)
             model, raw = whitened_model(array, mask, readings, of_rows, ambient)
-            yield WhitenedRows(index, mask, readings, model, raw, model.whitened(raw), of_rows.n_differences)
+            yield WhitenedRows(index, mask, readings, model, raw, model.whiten(raw), of_rows.n_differences)
 
 
-def checked_rows(array: SensorArray, readings_T: ArrayLike) -> FloatArray:
-    """Raw readings (n, C) of an array [T] as numbers; ValueError where they have another shape."""
+def check_rows(array: SensorArray, readings_T: ArrayLike) -> FloatArray:
+    """Return raw readings (n, C) [T] as numbers; raise ValueError for another shape."""
     readings = fields(readings_T)
     if readings.ndim != 2 or readings.shape[1] != array.n_channels:
         raise ValueError(
@@ -115,7 +121,7 @@ def checked_rows(array: SensorArray, readings_T: ArrayLike) -> FloatArray:
 
 
 def rows_of_equal_mask(available: NDArray[np.bool_]) -> Iterator[tuple[NDArray[np.bool_], NDArray[np.intp]]]:
-    """Every distinct row of available channels (n, C), and the rows that have it."""
+    """Yield every distinct row of available channels (n, C), and the rows that have it."""
     if len(available) == 1 or (len(available) and (available == available[0]).all()):
         yield available[0], np.arange(len(available))
         return
@@ -125,14 +131,20 @@ def rows_of_equal_mask(available: NDArray[np.bool_]) -> Iterator[tuple[NDArray[n
 
 
 def whitenings_of(array: SensorArray, mask: NDArray[np.bool_], readings_T: FloatArray) -> Whitening:
-    """Whitening of rows of readings (..., C) with the channels of a mask: that of all where the noise is constant."""
+    """Return the whitening of rows (..., C) with the channels of a mask.
+
+    All rows share one where the noise is constant.
+    """
     if not array.noise_depends_on_reading:
         return whitening(array, mask)
     return whitenings(array, mask, covariance_blocks(array, readings_T))
 
 
 def ambient_fields(array: SensorArray, n_rows: int, ambient_T: FloatArray | None) -> FloatArray:
-    """Ambient field at every sensor in every row, (n, N, 3) [T]: the array's, or that of each row (n, 3) instead."""
+    """Return the ambient field at every sensor in every row, (n, N, 3) [T].
+
+    Fields of rows (n, 3) replace the array's own.
+    """
     fields = np.broadcast_to(array.ambient_fields, (n_rows, array.n_sensors, 3))
     if ambient_T is None:
         return fields
@@ -143,7 +155,7 @@ def ambient_fields(array: SensorArray, n_rows: int, ambient_T: FloatArray | None
 def channels_above_ambient(
     array: SensorArray, mask: BoolArray, readings_T: FloatArray, ambient_T: FloatArray | None
 ) -> FloatArray:
-    """What vector channels (n, C) read above the ambient field at the sensors (n, N, 3), and all that scalars read.
+    """Return readings (n, C) less the ambient field (n, N, 3); those of scalar sensors stay.
 
     None stands for the array's own field. Zero where the mask (n, C) or (C,) has no reading.
     """
@@ -163,9 +175,9 @@ def whitened_model(
     whitening: Whitening,
     ambient_T: FloatArray | None,
 ) -> tuple[WhitenedModel, FloatArray]:
-    """Exact model of rows of readings (n, C), and their channels (n, C) divided by the noise.
+    """Return the exact model of rows of readings (n, C), and their channels over the noise.
 
-    :meth:`WhitenedModel.whitened` frees these from the common field. The whitening is that of every row or of all, and
+    :meth:`WhitenedModel.whiten` frees these from the common field. The whitening is that of every row or of all, and
     `ambient_T` (n, 3) stands in place of the array's ambient field.
     """
     if len(readings_T) == 1 and ambient_T is None and whitening.roots.ndim == 3:
@@ -182,8 +194,8 @@ def _model_of_one_row(array: SensorArray, whitening: Whitening) -> WhitenedModel
     return WhitenedModel.of(array, whitening, array.ambient_fields[None])
 
 
-def joined(parts: Sequence[Readings]) -> Readings:
-    """Readings of several files, one after the other.
+def concatenate_readings(parts: Sequence[Readings]) -> Readings:
+    """Concatenate readings of several files.
 
     Raises ValueError where some have what others lack.
     """
@@ -193,15 +205,15 @@ def joined(parts: Sequence[Readings]) -> Readings:
     return Readings(
         np.concatenate([part.values_T for part in parts]),
         time_s=np.concatenate([part.time_s for part in parts]),
-        array_position_m=_all_or_none([part.array_position_m for part in parts]),
+        array_position_m=_concatenate_columns([part.array_position_m for part in parts]),
         array_rotation=Rotation.concatenate(rotations) if rotations else None,
-        ambient_T=_all_or_none([part.ambient_T for part in parts]),
-        pose_sigma=_all_or_none([part.pose_sigma for part in parts]),
-        interpolated_m=_all_or_none([part.interpolated_m for part in parts]),
+        ambient_T=_concatenate_columns([part.ambient_T for part in parts]),
+        pose_sigma=_concatenate_columns([part.pose_sigma for part in parts]),
+        interpolated_m=_concatenate_columns([part.interpolated_m for part in parts]),
     )
 
 
-def _all_or_none(parts: Sequence[FloatArray | None]) -> FloatArray | None:
+def _concatenate_columns(parts: Sequence[FloatArray | None]) -> FloatArray | None:
     given = [part for part in parts if part is not None]
     if given and len(given) < len(parts):
         raise ValueError("Input readings must have the same columns; instead received some with more than others.")
@@ -209,13 +221,13 @@ def _all_or_none(parts: Sequence[FloatArray | None]) -> FloatArray | None:
 
 
 def check_spans(array: SensorArray) -> None:
-    """Refuse a sensor alone, which knows no place."""
+    """Raise ValueError for a single sensor, which cannot tell a position."""
     if array.n_sensors < 2:
         raise ValueError("Input array must have two sensors at least where no place is known; instead received one.")
 
 
 def check_magnitudes(array: SensorArray) -> None:
-    """Refuse what double precision cannot square."""
+    """Raise ValueError for numbers whose squares exceed double precision."""
     noise = array.channel_noise_T
     if noise.min() < 1e-20 or noise.max() > 1e3:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""Wild readings: they leap away and come back as the field of no source can, for its flanks would be seen beside it.
+"""Wild readings: leaps that no source makes, since rows beside them show no flanks.
 
 Rows are cut where neighbours differ by far more than usual. Of the pieces, the largest set is kept whose members agree:
 each is predicted from the others by a Gaussian process whose covariance is that of sources below a depth, and the size
@@ -67,7 +67,7 @@ def wild_readings(values: FloatArray, place_m: FloatArray, depth_m: float, noise
 
 
 def _cuts(values: FloatArray, noise: float) -> BoolArray:
-    """Rows (n,) that differ from the row before more than the lines through two rows on either side usually do."""
+    """Return rows (n,) whose step is unusual beside lines through the rows on either side."""
     leap = np.zeros(len(values))
     step = np.diff(values, prepend=values[0])
     leap[1], leap[-1] = step[1], step[-1]
@@ -77,7 +77,7 @@ def _cuts(values: FloatArray, noise: float) -> BoolArray:
 
 
 class _Scene:
-    """Some successive rows, and the covariance of sources' fields there, of unit size.
+    """Successive rows, and the covariance of sources' fields there, of unit size.
 
     Parameters
     ----------
@@ -100,17 +100,20 @@ class _Scene:
         self._covariance = smooth + nugget * np.eye(len(values))
 
     def wild(self, cuts: IntArray) -> BoolArray:
-        """Rows (n,) that do not agree with the largest set of pieces that agree; pieces begin at the cuts."""
+        """Return rows (n,) that disagree with the largest consistent set of pieces.
+
+        Pieces begin at the cuts.
+        """
         n = len(self._values)
         pieces = np.split(np.arange(n), cuts)
         kept = np.zeros(0, np.intp)
         for start in sorted(pieces, key=len, reverse=True)[:_STARTS]:
-            grown = self._grown(start, [piece for piece in pieces if piece is not start])
+            grown = self._grow(start, [piece for piece in pieces if piece is not start])
             kept = grown if len(grown) > len(kept) else kept
             if len(kept) > n // 2:
                 break
-        kept = self._without_outliers(kept)
-        kept = self._grown(kept, [np.array([row]) for row in np.setdiff1d(np.arange(n), kept)])
+        kept = self._drop_outliers(kept)
+        kept = self._grow(kept, [np.array([row]) for row in np.setdiff1d(np.arange(n), kept)])
         wild = np.ones(n, np.bool_)
         wild[kept] = False
         for piece in pieces:
@@ -119,7 +122,7 @@ class _Scene:
         return wild
 
     def _comes_back(self, piece: IntArray, kept: IntArray) -> bool:
-        """Whether many smooth rows are a leap; without the way back they are another level."""
+        """Whether many smooth rows are a leap; without a return they are another level."""
         before, after = kept[kept < piece[0]], kept[kept > piece[-1]]
         if not (len(before) and len(after)):
             return False
@@ -127,8 +130,8 @@ class _Scene:
         away, back = values[piece[0]] - values[before[-1]], values[piece[-1]] - values[after[0]]
         return bool(away * back > 0.5 * max(away**2, back**2))
 
-    def _grown(self, kept: IntArray, others: Sequence[IntArray]) -> IntArray:
-        """The rows kept, with the other pieces that agree with them, those first that are predicted best."""
+    def _grow(self, kept: IntArray, others: Sequence[IntArray]) -> IntArray:
+        """Return the kept rows with all pieces that agree, best predicted first."""
         while others:
             rest = np.concatenate(others)
             weights, size = self._inverse(kept), self._size(kept)
@@ -157,8 +160,8 @@ class _Scene:
             others = [piece for k, piece in enumerate(others) if k not in more]
         return kept
 
-    def _without_outliers(self, kept: IntArray) -> IntArray:
-        """The rows kept, without those that the others do not predict, the worst first."""
+    def _drop_outliers(self, kept: IntArray) -> IntArray:
+        """Return the kept rows without those that the others do not predict, worst first."""
         while len(kept) > _SUPPORTS:
             weights, values = self._inverse(kept), self._values[kept]
             variance = 1.0 / weights.diagonal()
@@ -176,19 +179,24 @@ class _Scene:
         return np.asarray(np.linalg.inv(self._covariance[np.ix_(rows, rows)]))
 
     def _size(self, rows: IntArray) -> float:
-        """Standard deviation of the process as some rows show it, not below the noise."""
+        """Return the standard deviation of the process in some rows, not below the noise."""
         values = self._values[rows] - np.median(self._values[rows])
         return math.sqrt(max(float(values @ self._inverse(rows) @ values) / len(rows), self._least))
 
     def _scores(self, errors: FloatArray, covariance: FloatArray) -> float:
-        """Largest error of a prediction over its limit, along the axes of its covariance, for a process of size one."""
+        """Return the largest prediction error over its limit, for a process of size one.
+
+        Errors are along the axes of their covariance.
+        """
         variances, axes = np.linalg.eigh(covariance)
         along = np.abs(axes.T @ errors) / np.sqrt(np.maximum(variances, self._nugget))
         return float((along / _limits(variances - self._nugget)).max())
 
 
 def _limits(unknown: FloatArray) -> FloatArray:
-    """Largest error that one source makes, over its standard deviation; `unknown` is its variance, of a process of one.
+    """Return the largest error by one source, over its standard deviation.
+
+    `unknown` is its variance, for a process of one.
 
     Sources are few, and their peaks are higher than a normal process makes them, the more so the coarser the rows.
     """

@@ -1,4 +1,4 @@
-r"""Whitened model: dipoles in homogeneous coordinates, and what an array reads of them with unit noise.
+r"""Whitened model: readings of dipoles in homogeneous coordinates, with unit noise.
 
 Positions are :math:`q = (u, s)` on the unit sphere of :math:`R^4`, :math:`p = c + \rho_0 \, u / s` with the sensors'
 centroid c and circumradius :math:`\rho_0`; moments are :math:`\mu = k |s|^3 m / \rho_0^3`, so that infinity (s = 0) is
@@ -21,13 +21,13 @@ from magloc.fields.dipole import MU0_OVER_4PI
 from magloc.measurement.channels import channels_of
 from magloc.measurement.known_moment import KnownMoment
 
-# Squares of columns of whose errors of rounding nothing is seen, in units of the noise; those of a column that is none.
+# Largest squares, over the noise, with negligible rounding errors; relative size of a column that counts as zero.
 _MOST_SQUARES, _UNSEEN = 1e8, 1e-7
 
 
 @dataclass(frozen=True, eq=False)
 class ScaledSensors:
-    """Sensors in units of their array's size, and what homogeneous coordinates mean there.
+    """Sensors in units of the array's size, and their homogeneous coordinates.
 
     Attributes
     ----------
@@ -47,25 +47,25 @@ class ScaledSensors:
     channel_sensor: NDArray[np.intp]
 
     def homogeneous(self, position_m: ArrayLike) -> FloatArray:
-        """Homogeneous coordinates (..., 4), of unit norm and s > 0, of positions (..., 3) [m]."""
+        """Return homogeneous coordinates (..., 4), with unit norm and s > 0, of positions [m]."""
         rho = (np.asarray(position_m, dtype=np.float64) - self.centroid) / self.radius
         q = np.concatenate([rho, np.ones_like(rho[..., :1])], axis=-1)
         return q / np.linalg.norm(q, axis=-1, keepdims=True)
 
     def position(self, q: FloatArray) -> FloatArray:
-        """Positions (..., 3) [m] of homogeneous coordinates (..., 4); not finite at s = 0."""
+        """Return positions (..., 3) [m] of coordinates q (..., 4); not finite at s = 0."""
         with np.errstate(divide="ignore", invalid="ignore"):
             position: FloatArray = self.centroid + self.radius * q[..., :3] / q[..., 3:]
         return position
 
     def moment(self, q: FloatArray, mu: FloatArray) -> FloatArray:
-        """Moments (..., 3) [A·m²] of scaled moments μ (..., 3) [T] at q (..., 4); not finite at s = 0."""
+        """Return moments (..., 3) [A·m²] of scaled moments μ (..., 3) [T]; not finite at s = 0."""
         with np.errstate(divide="ignore", invalid="ignore"):
             moment: FloatArray = mu * (self.radius**3 / MU0_OVER_4PI) / np.abs(q[..., 3:]) ** 3
         return moment
 
     def scaled_moment(self, q: FloatArray, moment_Am2: ArrayLike) -> FloatArray:
-        """The inverse of :meth:`moment`."""
+        """Return scaled moments (..., 3) [T], the inverse of :meth:`moment`."""
         return np.asarray(moment_Am2) * (MU0_OVER_4PI / self.radius**3) * np.abs(q[..., 3:]) ** 3
 
 
@@ -96,7 +96,10 @@ class WhitenedModel(ScaledSensors):
 
     @classmethod
     def of(cls, array: SensorArray, whitening: Whitening, ambient_T: FloatArray) -> WhitenedModel:
-        """Model of b sets of readings with their ambient fields (b, N, 3); the whitening is that of each or of all."""
+        """Return the model of b rows with ambient fields (b, N, 3).
+
+        The whitening is that of each row or of all.
+        """
         radius = array.circumradius or 1.0  # of one sensor alone any length will do
 
         def of_rows(values: FloatArray, n_axes: int) -> FloatArray:
@@ -124,19 +127,19 @@ class WhitenedModel(ScaledSensors):
 
     @property
     def shares_whitening(self) -> bool:
-        """Whether all rows have one whitening, kept once."""
+        """Whether all rows share one whitening, which is stored once."""
         return len(self) == 1 or self.gain.strides[0] == self.basis.strides[0] == 0
 
     @property
     def shares_ambient(self) -> bool:
-        """Whether all rows have one ambient field, kept once."""
+        """Whether all rows share one ambient field, which is stored once."""
         return len(self) == 1 or self.ambient.strides[0] == 0
 
     @cached_property
-    def of_ambient(self) -> FloatArray:
-        """Whitened readings without a source: (b, C), or (1, C) where all rows have the same."""
+    def ambient_signals(self) -> FloatArray:
+        """Whitened readings without a source (b, C), or (1, C) if equal in all rows."""
         alone = self.rows(np.arange(min(1, len(self)))) if self.shares_whitening and self.shares_ambient else self
-        return alone.predicted(np.zeros(alone.ambient.shape))
+        return alone.predict(np.zeros(alone.ambient.shape))
 
     @cached_property
     def channels(self) -> core.Problem:
@@ -144,7 +147,7 @@ class WhitenedModel(ScaledSensors):
         return channels_of(self)
 
     def rows(self, index: NDArray[np.intp]) -> WhitenedModel:
-        """Model of some of the readings, repeated at will."""
+        """Return the model of some rows, which may be repeated."""
 
         def chosen(values: FloatArray) -> FloatArray:
             if values.strides[0] == 0:
@@ -161,15 +164,18 @@ class WhitenedModel(ScaledSensors):
 
     @property
     def is_even(self) -> bool:
-        """Whether moments m and -m give the same readings: moduli without an ambient field, and nothing else."""
+        """Whether moments m and -m give the same readings.
+
+        So they do for moduli alone without an ambient field.
+        """
         return bool(self.channel_is_scalar.all()) and not np.any(self.ambient)
 
     def without_ambient(self) -> WhitenedModel:
-        """The same without an ambient field."""
+        """Return the model without an ambient field."""
         return replace(self, ambient=np.zeros_like(self.ambient))
 
-    def whitened(self, channels: FloatArray) -> FloatArray:
-        """Channels (b, C) or columns of them (b, C, n), divided by the noise, without their common field."""
+    def whiten(self, channels: FloatArray) -> FloatArray:
+        """Remove the common field from channels (b, C) or columns (b, C, n) of unit noise."""
         if channels.ndim == 2 and len(channels) and self.shares_whitening:
             basis = self.basis[0]
             return channels - (self.shrinkage[0] * (channels @ basis)) @ basis.T
@@ -178,12 +184,15 @@ class WhitenedModel(ScaledSensors):
         free: FloatArray = columns - self.basis @ common
         return free if channels.ndim == 3 else free[..., 0]
 
-    def marginalised(self, columns: FloatArray) -> WhitenedModel:
-        """The same where errors of unit variance along columns (b, C, n), in units of the noise, count as noise."""
+    def marginalise(self, columns: FloatArray) -> WhitenedModel:
+        """Return the model with errors along columns (b, C, n) counted as noise.
+
+        The errors have unit variance, the columns are in units of the noise.
+        """
         flat, unknown = self.shrinkage >= 1.0, self.basis
         bounded = ~flat.all(axis=0)
         if bounded.any():
-            # Columns that are of a kind in no row cost time, and are none.
+            # Columns that no row uses cost time, so leave them out.
             with np.errstate(divide="ignore"):
                 variance = np.where(flat, 0.0, 1.0 / (1.0 - self.shrinkage) ** 2 - 1.0)
             known = (unknown * np.sqrt(variance)[:, None])[..., bounded]
@@ -201,37 +210,40 @@ class WhitenedModel(ScaledSensors):
         )
 
     def source_fields(self, q: FloatArray, mu: FloatArray) -> FloatArray:
-        """Field of all sources (b, K, ...) at the sensors: (b, N, 3) [T]."""
+        """Return the summed field of all sources (b, K, ...) at the sensors, (b, N, 3) [T]."""
         n, inverse3 = self._directions(q)
         along = np.sum(n * mu[:, :, None], axis=-1, keepdims=True)
         return np.sum((3.0 * along * n - mu[:, :, None]) * inverse3, axis=1)
 
     def _directions(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Unit vectors from the sources to the sensors (b, K, N, 3) and the inverse cubes of the distances."""
+        """Return unit vectors from sources to sensors (b, K, N, 3), and inverse cubed distances."""
         v = q[:, :, None, 3:] * self.sensors - q[:, :, None, :3]
         r = np.sqrt(np.sum(v * v, axis=-1, keepdims=True))
         with np.errstate(divide="ignore", invalid="ignore"):
             return v / r, 1.0 / r**3
 
-    def predicted(self, source_fields: FloatArray) -> FloatArray:
-        """Whitened predictions (b, C) of the fields of the sources at the sensors (b, N, 3)."""
+    def predict(self, source_fields: FloatArray) -> FloatArray:
+        """Return whitened predictions (b, C) for fields of the sources at the sensors (b, N, 3)."""
         channels = np.ascontiguousarray(np.sum(source_fields[:, self.channel_sensor] * self.gain, axis=-1))
         scalar = self.channel_is_scalar
         if scalar.any():
             owner = self.channel_sensor[scalar]
             total = source_fields[:, owner] + self.ambient[:, owner]
             channels[:, scalar] = self.gain[:, scalar, 0] * np.sqrt(np.sum(total * total, axis=-1))
-        return self.whitened(channels)
+        return self.whiten(channels)
 
     def residual(self, y: FloatArray, q: FloatArray, mu: FloatArray, source_fields: FloatArray) -> FloatArray:
-        """What sources leave of whitened readings (b, C), and behind them of what is known of their moments."""
-        of_readings = y - self.predicted(source_fields)
+        """Return residuals of whitened readings (b, C), followed by those of known moments."""
+        of_readings = y - self.predict(source_fields)
         if self.known is None:
             return of_readings
         return np.concatenate([of_readings, self.known.residual(self.moment(q, mu))], axis=1)
 
     def known_jacobian(self, q: FloatArray, mu: FloatArray, tangent: FloatArray | None = None) -> FloatArray:
-        """Derivative of what is known of the moments by μ, or along tangents (b, K, 4, 3) of q: (b, K k, 3 K)."""
+        """Return the derivative (b, K k, 3 K) of known moments by μ, or along tangents of q.
+
+        Tangents are (b, K, 4, 3).
+        """
         if self.known is None:
             return np.empty((len(q), 0, 3 * q.shape[1]))
         moment = self.moment(q, mu)
@@ -248,7 +260,10 @@ class WhitenedModel(ScaledSensors):
         return every.reshape(n_fits, n_sources * n_known, 3 * n_sources)
 
     def linear_gain(self, source_fields: FloatArray) -> FloatArray:
-        """What every channel reads of a small change of the field: (b, C, 3), the direction of the sum for moduli."""
+        """Return the gain (b, C, 3) of every channel for a small change of the field.
+
+        A modulus has the direction of the total field.
+        """
         scalar = self.channel_is_scalar
         if not scalar.any():
             return self.gain
@@ -261,14 +276,14 @@ class WhitenedModel(ScaledSensors):
         return gain
 
     def moment_jacobian(self, q: FloatArray, gain: FloatArray) -> FloatArray:
-        """Derivative of the predictions with respect to μ: (b, C, 3 K)."""
+        """Return the derivative (b, C, 3 K) of the predictions by μ."""
         n, inverse3 = (x[:, :, self.channel_sensor] for x in self._directions(q))
         along = np.sum(n * gain[:, None], axis=-1, keepdims=True)
         columns = (3.0 * along * n - gain[:, None]) * inverse3
-        return self.whitened(columns.transpose(0, 2, 1, 3).reshape(len(q), gain.shape[1], -1))
+        return self.whiten(columns.transpose(0, 2, 1, 3).reshape(len(q), gain.shape[1], -1))
 
     def position_jacobian(self, q: FloatArray, mu: FloatArray, gain: FloatArray, tangent: FloatArray) -> FloatArray:
-        """Derivative of the predictions along tangents (b, K, 4, 3) of q: (b, C, 3 K)."""
+        """Return the derivative (b, C, 3 K) of the predictions along tangents (b, K, 4, 3) of q."""
         n, inverse3 = (x[:, :, self.channel_sensor] for x in self._directions(q))
         g, m = gain[:, None], mu[:, :, None]
         n_m, n_g = np.sum(n * m, axis=-1, keepdims=True), np.sum(n * g, axis=-1, keepdims=True)
@@ -278,13 +293,15 @@ class WhitenedModel(ScaledSensors):
             slope = (3.0 * np.cbrt(inverse3) * inverse3) * (n_m * g + n_g * m + (g_m - 5.0 * n_m * n_g) * n)
         along_s = np.sum(slope * self.sensors[self.channel_sensor], axis=-1, keepdims=True)
         columns = np.concatenate([-slope, along_s], axis=-1) @ tangent
-        return self.whitened(columns.transpose(0, 2, 1, 3).reshape(len(q), gain.shape[1], -1))
+        return self.whiten(columns.transpose(0, 2, 1, 3).reshape(len(q), gain.shape[1], -1))
 
 
 def _left_singular(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Left singular vectors (b, C, k) of columns (b, C, n), k being n or C, and singular values (b, k).
+    """Return left singular vectors (b, C, k) and values (b, k) of columns (b, C, n).
 
-    By the squares of few columns that are not large, where those whose values are rounding errors are zero instead.
+    k is n or C.
+
+    Few columns that are not large go by their squares; singular values that are rounding errors are then zero.
     """
     n = columns.shape[2]
     square = columns.transpose(0, 2, 1) @ columns if 2 * n < columns.shape[1] else np.array(np.inf)

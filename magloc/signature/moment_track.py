@@ -14,7 +14,7 @@ from arrays.io.errors import InputError
 from arrays.typing import FloatArray
 from magloc.chi_square import normalised_square
 from magloc.localization.fit.results import is_misfit
-from magloc.measurement.nuisances import Drift
+from magloc.measurement.nuisances import BackgroundDrift
 from magloc.measurement.plausibility import usable_readings
 from magloc.measurement.rows import check_magnitudes
 from magloc.navigation.rotations import cross_matrix, rotation_matrix
@@ -331,7 +331,7 @@ def moment_model(
 ) -> MomentModel:
     """Model of records that follow each other in time, each with places (n, K, 3) of its own."""
     check_magnitudes(array)
-    background = Drift.of(passes[0].background, np.concatenate([of_pass.time_s for of_pass in passes]))
+    background = BackgroundDrift.of(passes[0].background, np.concatenate([of_pass.time_s for of_pass in passes]))
     measurements = RowMeasurements(array, N_SOURCE, background)
     rows = tuple(measurements.of(row) for of_pass in passes for row in rows_of(of_pass))
     times = np.array([row.row.time_s for row in rows])

@@ -19,7 +19,7 @@ from magloc import core
 from magloc.grids.work import Arrays, Work, workers
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.measurement.plausibility import warn_of_doubts
-from magloc.measurement.rows import joined
+from magloc.measurement.rows import concatenate_readings
 from magloc.readings import Readings
 from magloc.surveying.piece import OF_ROWS, Ground, sources_in, strongest_in, targets_in
 from magloc.surveying.preparation import whole_rows, with_places_between_fixes
@@ -127,7 +127,7 @@ def survey(
         raise ValueError(
             f"Input body_length_m must be from 0 to {_LONGEST_BODY_M:g} m; instead received {body_length_m:g}."
         )
-    rows = readings if isinstance(readings, Readings) else joined(readings)
+    rows = readings if isinstance(readings, Readings) else concatenate_readings(readings)
     warn_of_doubts(array, rows[:_MOST_DOUBTED])
     assumed = array.pose is None and rows.pose_sigma is None
     array, rows = with_places_between_fixes(array, rows)

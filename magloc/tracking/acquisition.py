@@ -106,7 +106,7 @@ class Acquisition:
             np.stack([earlier.R_world_from_array for earlier in chosen]),
             np.stack(known) if len(known) == len(chosen) else None,
             prior=self._prior,
-            poses=errors.of_rows(
+            poses=errors.over_rows(
                 self.array,
                 np.array([earlier.time_s for earlier in chosen]),
                 [earlier.pose(lever_arm_m) for earlier in chosen],
@@ -234,7 +234,7 @@ class CartesianFilter:
         n, n_errors = self.motion.n_states, self.n_errors
         centres = [np.concatenate([source, np.zeros(n - N_SOURCE + n_errors)])] * len(rows)
         # Errors of the pose that change are linearised at each row's estimate, all other states at the last one.
-        own = np.concatenate([np.full(n, False), self.pose_errors.changes, np.full(self.errors.n_states, False)])
+        own = np.concatenate([np.full(n, False), self.pose_errors.is_changing, np.full(self.errors.n_states, False)])
         for _ in range(_MOST_START_STEPS):
             found = self.filter_start(centres, covariance, measurements)
             step = (found.x - centres[-1])[:N_SOURCE]

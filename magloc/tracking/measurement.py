@@ -24,7 +24,7 @@ from arrays.typing import FloatArray
 from magloc.chi_square import energy_threshold
 from magloc.fields import dipole
 from magloc.measurement.differences import DifferenceMeasurement
-from magloc.measurement.nuisances import Drift, SensorErrors, without_lasting_errors
+from magloc.measurement.nuisances import BackgroundDrift, SensorErrors, without_lasting_errors
 from magloc.measurement.pose import N_POSE, ArrayPose, PoseErrors
 from magloc.state_space import MeasurementFunction
 from magloc.tracking.coordinates import Chart
@@ -150,7 +150,7 @@ class RowMeasurement:
         `others_T` (N, 3) is the field of other sources at the sensors.
         """
         error = self._pose_error(state)
-        in_array = self.pose.in_array(state[..., :N_SOURCE], error)
+        in_array = self.pose.to_array(state[..., :N_SOURCE], error)
         return self.model.predicted(in_array[..., :3], in_array[..., 3:], self._ambient_T(error, others_T)) / self.sigma
 
     def directional_derivative(
@@ -158,7 +158,7 @@ class RowMeasurement:
     ) -> FloatArray:
         """Return the derivative (..., k, m) of :meth:`predict_source` along directions (..., n, m)."""
         error = self._pose_error(state)
-        in_array = self.pose.in_array(state[..., :N_SOURCE], error)
+        in_array = self.pose.to_array(state[..., :N_SOURCE], error)
         H = self.model.jacobian(in_array[..., :3], in_array[..., 3:], self._ambient_T(error, others_T))
         H = H / self.sigma[:, None]
         of_source = self._by_source(H, error) @ directions[..., :N_SOURCE, :]
@@ -179,7 +179,7 @@ class RowMeasurement:
 
     def field_T(self, source: FloatArray) -> FloatArray:
         """Return the field (N, 3) of a source (6,) at the sensors, in the array's axes."""
-        in_array = self.pose.in_array(source)
+        in_array = self.pose.to_array(source)
         return dipole.field(self.model.array.positions, in_array[:3], in_array[3:])
 
     def predict(self, state: FloatArray) -> FloatArray:
@@ -207,7 +207,7 @@ class RowMeasurement:
         if not self.n_pose:
             return np.eye(self.n_differences)
         # Without a moment the rest is the ambient field, rotated by the errors of the pose.
-        nowhere = self.pose.in_array(np.zeros(N_SOURCE))
+        nowhere = self.pose.to_array(np.zeros(N_SOURCE))
         return whitening(zero_if_nan(self._by_pose(np.zeros((len(self.sigma), N_SOURCE)), nowhere, np.zeros(N_POSE))))
 
     def is_detected(self, sigma_errors: FloatArray) -> bool:
@@ -244,7 +244,7 @@ class RowMeasurement:
 
     def _in_array(self, state: FloatArray) -> FloatArray:
         """Return position and moment (6,) of a state in the true axes of the array."""
-        return self.pose.in_array(state[:N_SOURCE], self._pose_error(state))
+        return self.pose.to_array(state[:N_SOURCE], self._pose_error(state))
 
     def _in_array_jacobian(self, state: FloatArray) -> FloatArray:
         """Return the Jacobian (6, n) of position and moment in the true axes of the array."""
@@ -264,7 +264,7 @@ class RowMeasurement:
 
     def _by_source(self, H: FloatArray, error: FloatArray | None) -> FloatArray:
         """Return the Jacobian (..., k, 6) by sources in the world, from that in the array's axes."""
-        RT = np.swapaxes(self.pose.turned(error), -1, -2)
+        RT = np.swapaxes(self.pose.true_attitude(error), -1, -2)
         return np.concatenate([H[..., :3] @ RT, H[..., 3:] @ RT], axis=-1)
 
     def _by_pose(self, H: FloatArray, in_array: FloatArray, error: FloatArray) -> FloatArray:
@@ -328,7 +328,7 @@ class RowMeasurements:
         Errors of the pose and of the ambient field: the states before `errors`.
     """
 
-    def __init__(self, array: SensorArray, n_motion: int, background: Drift | None = None) -> None:
+    def __init__(self, array: SensorArray, n_motion: int, background: BackgroundDrift | None = None) -> None:
         self.errors = SensorErrors.of(array, background)
         self.pose_errors = PoseErrors.of_array(array)
         self._lever_arm_m = np.array(self.pose_errors.uncertainty.lever_arm_m)

@@ -20,7 +20,7 @@ from arrays.io.results import Result
 from arrays.typing import BoolArray, FloatArray, IntArray, Vector
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import EVERYWHERE, Intervals
-from magloc.measurement.nuisances import Drift
+from magloc.measurement.nuisances import BackgroundDrift
 from magloc.measurement.plausibility import usable_readings
 from magloc.measurement.pose import with_stated_pose
 from magloc.readings import Readings
@@ -325,7 +325,7 @@ def track(
     if motion is None:
         lasting = (smooth or used.background) and used.motion is None
         motion = (OrnsteinUhlenbeck if lasting else RandomWalk)(SPEED_M_S, TURN_RAD_S)
-    background = Drift.of(used.background, used.time_s)
+    background = BackgroundDrift.of(used.background, used.time_s)
     tracker = Tracker(with_stated_pose(array, used), motion, prior=prior, keep_steps=smooth, background=background)
     if background is not None:
         if used.motion is not None:

@@ -23,7 +23,7 @@ import numpy as np
 from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
-from magloc.measurement.nuisances import Drift
+from magloc.measurement.nuisances import BackgroundDrift
 from magloc.readings import Readings
 from magloc.tracking.acquisition import STACKED_POSITION_ERROR, AcquiredSource, Acquisition, CartesianFilter
 from magloc.tracking.chart.known_moment import ConstantModulus
@@ -94,7 +94,7 @@ class Tracker(CartesianFilter):
         *,
         prior: SourcePrior = NOTHING_KNOWN,
         keep_steps: bool = False,
-        background: Drift | None = None,
+        background: BackgroundDrift | None = None,
     ) -> None:
         self.array, self.prior, self.background, self.keep_steps = array, prior, background, keep_steps
         self.measurements = RowMeasurements(array, motion.n_states, background)

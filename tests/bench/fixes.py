@@ -117,7 +117,7 @@ def stages(array: SensorArray, readings: np.ndarray, candidates: np.ndarray | No
     return {
         "whitening": Contestant(lambda: list(whitened_rows(array, readings, None, n)), 1, n),
         "choice of starts": Contestant(lambda: search.starts(rows), 1, n),
-        "refinement": Contestant(lambda: search.ends(rows, np.arange(n), starts, math.inf), 1, n),
+        "refinement": Contestant(lambda: search.refine_starts(rows, np.arange(n), starts, math.inf), 1, n),
         "uncertainty": Contestant(lambda: solutions_of(optima, np.ones(n, dtype=bool)), 1, n),
         "a fix": Contestant(lambda: locator.fit_rows(readings), 1, n),
     }

@@ -1,1 +1,1 @@
-"""What a fit is, and the iterations that lead to one."""
+"""Fits of dipoles: iterations, results and their columns."""

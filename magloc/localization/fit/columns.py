@@ -14,7 +14,7 @@ from magloc.localization.fit.results import EVERYWHERE, Intervals, Solution, Sou
 
 @dataclass(frozen=True, eq=False)
 class Solutions:
-    """Solutions of many rows as columns: f of them, row after row, of every row best χ² first.
+    """Solutions of many rows as columns, sorted by row and then by χ².
 
     Attributes
     ----------
@@ -48,17 +48,17 @@ class Solutions:
 
     @classmethod
     def none(cls) -> Solutions:
-        """No solution of any row."""
+        """Return an empty set of solutions."""
         one = Solution((Source(np.zeros(3), np.zeros(3), np.eye(6), EVERYWHERE),), np.eye(6), 0.0, 0)
-        return cls._of_one(0, one).chosen(np.zeros(0, dtype=np.intp))
+        return cls._from_solution(0, one).select(np.zeros(0, dtype=np.intp))
 
     @classmethod
     def of(cls, solutions: Sequence[tuple[int, Solution]]) -> Solutions:
-        """From solutions and their rows."""
-        return cls.joined([cls._of_one(row, solution) for row, solution in solutions])
+        """Return the columns of solutions and their rows."""
+        return cls.concatenate([cls._from_solution(row, solution) for row, solution in solutions])
 
     @classmethod
-    def _of_one(cls, row: int, solution: Solution) -> Solutions:
+    def _from_solution(cls, row: int, solution: Solution) -> Solutions:
         sources = solution.sources
         return cls(
             of_row=np.array([row]),
@@ -70,7 +70,7 @@ class Solutions:
             dof=np.array([solution.dof]),
             weight=np.array([solution.weight]),
             iterations=np.array([solution.iterations]),
-            ranges=_sets_of([source.range_interval_m for source in sources])[None],
+            ranges=_range_sets([source.range_interval_m for source in sources])[None],
             gaussian=np.array([[source.gaussian for source in sources]]),
             merged=np.array([[source.merged for source in sources]]),
             known_chi2=np.array([solution.known_chi2]),
@@ -78,8 +78,8 @@ class Solutions:
         )
 
     @classmethod
-    def joined(cls, parts: Sequence[Solutions]) -> Solutions:
-        """All solutions of parts with different rows, in the order of their rows."""
+    def concatenate(cls, parts: Sequence[Solutions]) -> Solutions:
+        """Concatenate solutions of different rows, sorted by row."""
         filled = [part for part in parts if len(part)]
         if len(filled) <= 1:
             return filled[0] if filled else cls.none()
@@ -87,7 +87,7 @@ class Solutions:
         order = None if (of_row[1:] >= of_row[:-1]).all() else np.argsort(of_row, kind="stable")
 
         def stacked(name: str) -> Any:
-            """Values of all parts, padded to the most sources and intervals of any."""
+            """Concatenate one column, padded to the largest number of sources and intervals."""
             values = [getattr(part, name) for part in filled]
             shape = np.max([value.shape[1:] for value in values], axis=0).astype(int)
             empty = np.nan if values[0].dtype.kind == "f" else 0
@@ -100,26 +100,26 @@ class Solutions:
 
         return cls(**{name: stacked(name) for name in vars(filled[0])})
 
-    def chosen(self, index: IntArray | BoolArray, of_row: IntArray | None = None) -> Solutions:
-        """Some of the solutions, of other rows if these are named."""
+    def select(self, index: IntArray | BoolArray, of_row: IntArray | None = None) -> Solutions:
+        """Return some of the solutions, with other row numbers if given."""
         at = np.arange(len(self))[index]
         chosen = Solutions(**{name: value[at] for name, value in vars(self).items()})
         return chosen if of_row is None else chosen.of_rows(of_row)
 
     def of_rows(self, of_row: IntArray) -> Solutions:
-        """The same solutions, of other rows."""
+        """Return the same solutions with other row numbers."""
         return Solutions(**(vars(self) | {"of_row": of_row}))
 
     @property
     def covariance_of_source(self) -> FloatArray:
-        """Covariances (f, K, n, n) of every source, all others being unknown too."""
+        """Marginal covariances (f, K, n, n) of every source."""
         n_sources = self.position_m.shape[1]
         n = self.covariance.shape[1] // n_sources
         blocks = self.covariance.reshape(len(self), n_sources, n, n_sources, n)
         return np.einsum("fkikj->fkij", blocks)
 
     def solution(self, i: int) -> Solution:
-        """One of them as an object."""
+        """Return one solution as an object."""
         n, covariance = int(self.n_sources[i]), self.covariance[i]
         size = len(covariance) // self.position_m.shape[1]
         sources = tuple(
@@ -145,8 +145,8 @@ class Solutions:
         )
 
 
-def _sets_of(intervals: Sequence[Intervals]) -> FloatArray:
-    """Sets of several sources (K, i, 2)."""
+def _range_sets(intervals: Sequence[Intervals]) -> FloatArray:
+    """Return range sets of several sources as an array (K, i, 2)."""
     sets = np.full((len(intervals), max(1, *map(len, intervals)), 2), np.nan)
     for k, of_source in enumerate(intervals):
         for i, (low, high) in enumerate(of_source):
@@ -155,7 +155,10 @@ def _sets_of(intervals: Sequence[Intervals]) -> FloatArray:
 
 
 def in_stable_order(solutions: Solutions) -> Solutions:
-    """Solutions whose sources are numbered as in the row before; at first the strongest comes first."""
+    """Return solutions whose sources keep their number from row to row.
+
+    In the first row the strongest source comes first.
+    """
     order = np.tile(np.arange(solutions.position_m.shape[1]), (len(solutions), 1))
     before: FloatArray | None = None
     last = -1

@@ -1,4 +1,4 @@
-"""Fixes for other programs: columns, xarray datasets and GeoJSON."""
+"""Export of fixes: columns, xarray datasets and GeoJSON."""
 
 from __future__ import annotations
 
@@ -77,12 +77,12 @@ class FixColumns:
 
     @property
     def first(self) -> BoolArray:
-        """One source of every row, for what belongs to the row."""
+        """Mask with one source of every row, for values that belong to the row."""
         return self.source <= 1
 
 
 def fix_columns(fixes: Fixes) -> FixColumns:
-    """Sources of the best solutions of all rows."""
+    """Return the sources of the best solutions of all rows."""
     columns, best = fixes.solutions, fixes.best
     number = np.where(fixes.solved, columns.n_sources[best] if len(columns) else 0, 1)
     row = np.repeat(np.arange(len(fixes)), number)
@@ -113,7 +113,10 @@ def fix_columns(fixes: Fixes) -> FixColumns:
 
 
 def distances_from_truth(columns: FixColumns, truth_m: FloatArray) -> FloatArray:
-    """Distance of every source from the truth (n, 3) of its row, in the coordinates that are known of it (k,) [m]."""
+    """Return distances (k,) [m] of sources from the truth (n, 3) of their rows.
+
+    Only known coordinates of the truth count.
+    """
     offset = columns.position_m - truth_m[columns.row]
     known = np.isfinite(truth_m[columns.row])
     distance = np.sqrt(np.where(known, offset**2, 0.0).sum(axis=1))

@@ -1,4 +1,4 @@
-"""The fixes of many rows: columns first."""
+"""Fixes of many rows, stored as columns."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ BODY_MATTERS = 1.5
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Fixes(Result, Sequence[Fix]):
-    """The fixes of many rows: columns first, a :class:`Fix` where one row is asked for.
+    """Fixes of many rows, stored as columns; indexing returns a :class:`Fix`.
 
     Attributes
     ----------
@@ -105,24 +105,24 @@ class Fixes(Result, Sequence[Fix]):
         )
 
     def of_row(self, row: int) -> range:
-        """Which of `solutions` are those of a row."""
+        """Return the indices in `solutions` of the solutions of a row."""
         return range(int(self._edges[row]), int(self._edges[row + 1]))
 
     @cached_property
     def _edges(self) -> IntArray:
-        """First solution of every row (n + 1,)."""
+        """Index of the first solution of every row (n + 1,)."""
         return self.solutions.of_row.searchsorted(np.arange(len(self) + 1))
 
     @cached_property
     def best(self) -> IntArray:
-        """Index (n,) of the heaviest solution of every row in `solutions`; -1 where there is none."""
+        """Index (n,) in `solutions` of the solution with the largest weight; -1 for none."""
         result = np.full(len(self), -1, dtype=np.intp)
         order = np.lexsort((-np.arange(len(self.solutions)), self.solutions.weight, self.solutions.of_row))
         result[self.solutions.of_row[order]] = order
         return result
 
     def _column(self, values: _Column, empty: float) -> _Column:
-        """Values of the best solutions (n, ...), `empty` where there is none."""
+        """Return values of the best solutions (n, ...), `empty` where there is none."""
         every: Any = values
         if not len(self.solutions):
             every = np.full((1, *every.shape[1:]), empty)
@@ -130,7 +130,7 @@ class Fixes(Result, Sequence[Fix]):
         column[~self.solved] = empty
         return column
 
-    def _of_one(self, values: _Column) -> _Column:
+    def _require_one_source(self, values: _Column) -> _Column:
         if (self.solutions.n_sources[self.best[self.solved]] > 1).any():
             raise ValueError("Some rows have several sources: see fixes[row].best.sources, or to_xarray().")
         return values
@@ -142,18 +142,21 @@ class Fixes(Result, Sequence[Fix]):
 
     @property
     def position_m(self) -> FloatArray:
-        """Positions (n, 3) of the best solutions of one source [m]; NaN where there is none."""
-        return self._column(self._of_one(self.solutions.position_m[:, 0]), np.nan)
+        """Positions (n, 3) [m] of the best solutions with one source; NaN for none."""
+        return self._column(self._require_one_source(self.solutions.position_m[:, 0]), np.nan)
 
     @property
     def moment_Am2(self) -> FloatArray:
-        """Moments (n, 3) of the best solutions of one source [A·m²]."""
-        return self._column(self._of_one(self.solutions.moment_Am2[:, 0]), np.nan)
+        """Moments (n, 3) [A·m²] of the best solutions with one source; NaN for none."""
+        return self._column(self._require_one_source(self.solutions.moment_Am2[:, 0]), np.nan)
 
     @property
     def covariance(self) -> FloatArray:
-        """Covariances (n, 6, 6) of the best solutions of one source; (n, 3, 3) of moments where the place is known."""
-        return self._column(self._of_one(self.solutions.covariance[:, :6, :6]), np.nan)
+        """Covariances (n, 6, 6) of the best solutions with one source.
+
+        (n, 3, 3) of moments where the position is known.
+        """
+        return self._column(self._require_one_source(self.solutions.covariance[:, :6, :6]), np.nan)
 
     @property
     def chi2(self) -> FloatArray:
@@ -172,8 +175,8 @@ class Fixes(Result, Sequence[Fix]):
 
     @property
     def range_interval_m(self) -> list[Intervals]:
-        """95 % sets of the range of every row with one source [m]."""
-        self._of_one(None)
+        """95 % sets of the range [m] of every row with one source."""
+        self._require_one_source(None)
         return [intervals_of(self.solutions.ranges[i, 0]) if i >= 0 else EVERYWHERE for i in self.best]
 
     @property
@@ -188,7 +191,9 @@ class Fixes(Result, Sequence[Fix]):
 
     @cached_property
     def body_covariance(self) -> FloatArray:
-        """What an object of a quarter of its distance would add to the covariance of the best solution (n, D, D).
+        """Covariance (n, D, D) that an object of a quarter of its distance would add.
+
+        It is that of the best solution.
 
         Zero where the object counts as a point by what is said, or stands not far out of noise; (0, D, D) where all do.
         """
@@ -196,7 +201,10 @@ class Fixes(Result, Sequence[Fix]):
 
     @cached_property
     def body_factor(self) -> FloatArray:
-        """How many times their standard deviations errors would be (n,), rms, of objects of `body_covariance`."""
+        """Factor (n,) by which errors would exceed their standard deviations, rms.
+
+        For objects of `body_covariance`.
+        """
         factor, added, columns = np.ones(len(self)), self.body_covariance, self.solutions
         matter = np.flatnonzero(added.any(axis=(1, 2)))
         size = columns.covariance.shape[1] // columns.position_m.shape[1]  # of one source
@@ -208,7 +216,7 @@ class Fixes(Result, Sequence[Fix]):
 
     @property
     def caution(self) -> str:
-        """What may be wrong and could not be seen, in a sentence; empty where it would not matter."""
+        """Warning of errors that the fixes cannot show; empty where they would not matter."""
         matters = self.body_factor > BODY_MATTERS
         if not matters.any():
             return ""
@@ -220,14 +228,14 @@ class Fixes(Result, Sequence[Fix]):
 
     @classmethod
     def unsolved(cls, time_s: FloatArray, reason: str) -> Fixes:
-        """Rows without a solution, all for one reason."""
+        """Return fixes of rows without a solution, all for one reason."""
         n = len(time_s)
         nothing = np.zeros(n, dtype=bool)
         return cls(Solutions.none(), time_s, nothing, [reason] * n, np.zeros(n, dtype=np.intp), [()] * n)
 
     @classmethod
     def joined(cls, parts: Sequence[Fixes]) -> Fixes:
-        """The fixes of parts, row after row."""
+        """Concatenate fixes, row after row."""
         if len(parts) == 1:
             return parts[0]
         begins = np.cumsum([0, *map(len, parts)])
@@ -235,7 +243,7 @@ class Fixes(Result, Sequence[Fix]):
             part.solutions.of_rows(begin + part.solutions.of_row) for begin, part in zip(begins, parts, strict=False)
         ]
         return cls(
-            Solutions.joined(solutions),
+            Solutions.concatenate(solutions),
             np.concatenate([np.zeros(0), *(part.time_s for part in parts)]),
             np.concatenate([np.zeros(0, dtype=bool), *(part.detected for part in parts)]),
             [reason for part in parts for reason in part.reason],
@@ -252,26 +260,26 @@ class Fixes(Result, Sequence[Fix]):
         frame: Literal["array", "world"],
         added_covariance: FloatArray | float = 0.0,
     ) -> Fixes:
-        """The same in another frame: places are turned and moved by the pose (n, 3) of every row, moments turned."""
+        """Return the fixes in another frame, by the pose (n, 3) of every row."""
         row, columns = self.solutions.of_row, self.solutions
         R = rotation.as_matrix()[row]
         moved = replace(
             columns,
             position_m=position_m[row][:, None] + np.einsum("fab,fkb->fka", R, columns.position_m),
             moment_Am2=np.einsum("fab,fkb->fka", R, columns.moment_Am2),
-            covariance=_turned(columns.covariance, R) + added_covariance,
+            covariance=_rotate_covariances(columns.covariance, R) + added_covariance,
         )
-        bodies = None if self.bodies is None else partial(_turned_bodies, self, rotation)
+        bodies = None if self.bodies is None else partial(_rotate_body_covariances, self, rotation)
         return replace(self, solutions=moved, frame=frame, bodies=bodies)
 
     @property
     def first(self) -> IntArray:
-        """Index (n,) of the solution of the smallest χ² of every row in `solutions`, where it is solved."""
+        """Index (n,) in `solutions` of the smallest χ² of every row, where it is solved."""
         return self._edges[:-1]
 
     def replaced(self, rows: IntArray, fixes: Sequence[Fix]) -> Fixes:
-        """With the fixes of some rows replaced by others."""
-        kept = self.solutions.chosen(~np.isin(self.solutions.of_row, rows))
+        """Return the fixes with those of some rows replaced."""
+        kept = self.solutions.select(~np.isin(self.solutions.of_row, rows))
         come = Solutions.of(
             [(int(row), solution) for row, fix in zip(rows, fixes, strict=True) for solution in fix.solutions]
         )
@@ -280,14 +288,17 @@ class Fixes(Result, Sequence[Fix]):
             columns[name] = getattr(self, name).copy()
             for row, fix in zip(rows, fixes, strict=True):
                 columns[name][row] = getattr(fix, name)
-        return replace(self, solutions=Solutions.joined([kept, come]), **columns)
+        return replace(self, solutions=Solutions.concatenate([kept, come]), **columns)
 
     def lines(self, most: int | None = None) -> list[str]:
         """Return the lines of the table, of at most `most` rows."""
         return lines_of_fixes(self, most=most)
 
     def columns(self) -> dict[str, Column]:
-        """Return the columns of fixes.csv: a row for each source of the best solutions, or for a row without any."""
+        """Return the columns of fixes.csv, one row for each source of the best solutions.
+
+        A row without a solution has one line.
+        """
         return columns_of_fixes(self)
 
     def table(self) -> str:
@@ -295,7 +306,7 @@ class Fixes(Result, Sequence[Fix]):
         return "\n".join([super().table(), *filter(None, [self.caution])])
 
     def to_xarray(self, which: Literal["best", "all"] = "best") -> xr.Dataset:
-        """Columns with units and names, along `row`, for "all" also along `solution`, and along `source`.
+        """Return a dataset of columns with units along `row`, `source` and, for "all", `solution`.
 
         Parameters
         ----------
@@ -305,18 +316,21 @@ class Fixes(Result, Sequence[Fix]):
         return dataset_of_fixes(self, which)
 
     def to_geojson(self) -> dict[str, Any]:
-        """The best solutions as points, a FeatureCollection in the frame of the fixes: x, y, z in metres."""
+        """Return the best solutions as a FeatureCollection of points x, y, z [m].
+
+        They are in the frame of the fixes.
+        """
         return geojson_of_fixes(self)
 
 
-def _turned(covariance: FloatArray, R: FloatArray) -> FloatArray:
-    """Covariances (f, 3 n, 3 n) of 3-vectors that are turned by rotations (f, 3, 3)."""
+def _rotate_covariances(covariance: FloatArray, R: FloatArray) -> FloatArray:
+    """Rotate covariances (f, 3 n, 3 n) of 3-vectors by rotations (f, 3, 3)."""
     n = covariance.shape[1] // 3
     turned = np.einsum("fab,fibjc,fdc->fiajd", R, covariance.reshape(-1, n, 3, n, 3), R, optimize=True)
     return np.asarray(turned.reshape(covariance.shape))
 
 
-def _turned_bodies(fixes: Fixes, rotation: Rotation) -> FloatArray:
-    """Their `body_covariance` where every row is turned."""
+def _rotate_body_covariances(fixes: Fixes, rotation: Rotation) -> FloatArray:
+    """Return `body_covariance` of fixes, rotated in every row."""
     of_rows = fixes.body_covariance
-    return _turned(of_rows, rotation.as_matrix()) if len(of_rows) else of_rows
+    return _rotate_covariances(of_rows, rotation.as_matrix()) if len(of_rows) else of_rows

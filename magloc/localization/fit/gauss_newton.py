@@ -1,4 +1,4 @@
-"""Any number of dipoles seen by any sensors: damped Gauss-Newton fits of the exact model, many at once.
+"""Damped Gauss-Newton fits of several dipoles to any sensors, many fits at once.
 
 In the coordinates of :mod:`magloc.measurement.whitened`. Positions are damped, moments are not: after every step of
 the positions the moments are fitted anew, which for vector sensors makes the iteration that of variable projection.
@@ -19,7 +19,7 @@ from magloc.fields.dipole import MU0_OVER_4PI
 from magloc.localization.fit.refinement import MOST_SOURCES, OPTIMUM_TOLERANCE, RELATIVE_TOLERANCE, refine_starts
 from magloc.measurement.whitened import WhitenedModel
 
-# A refinement has converged where the linearised model promises to lower χ² by less than this, absolute and relative.
+# Converged where the linearised model predicts a smaller decrease of χ² than this, absolute and relative.
 PROMISE_ABSOLUTE = 1e-8
 PROMISE_RELATIVE = 1e-11
 LARGEST_STEP_RAD, LARGEST_DAMPING = 0.5, 1e9
@@ -28,7 +28,7 @@ _LEAST_SINGULAR = 1e-13
 
 @dataclass(frozen=True, eq=False)
 class JointFits:
-    """Fits of K sources each, over leading axes: b of them, or of every row of a search the best ones, best first.
+    """Fits of K sources each, over any leading axes.
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class JointFits:
 
     @classmethod
     def none(cls, shape: tuple[int, ...], n_sources: int) -> JointFits:
-        """Places for fits of some sources, all empty."""
+        """Return an array of empty fits."""
         q, mu = np.full((*shape, n_sources, 4), np.nan), np.full((*shape, n_sources, 3), np.nan)
         return cls(q, mu, np.full(shape, np.inf), np.zeros(shape, dtype=np.int64))
 
@@ -62,11 +62,11 @@ class JointFits:
         return np.isfinite(self.chi2)
 
     def rows(self, index: Any) -> JointFits:
-        """Some of the fits, by an index of the leading axes."""
+        """Return some of the fits, by an index of the leading axes."""
         return JointFits(*(values[index] for values in vars(self).values()))
 
-    def shaped(self, *shape: int) -> JointFits:
-        """The same fits with other leading axes."""
+    def reshape(self, *shape: int) -> JointFits:
+        """Return the fits with other leading axes."""
         n_axes = self.chi2.ndim
         return JointFits(*(values.reshape(*shape, *values.shape[n_axes:]) for values in vars(self).values()))
 
@@ -75,14 +75,14 @@ class JointFits:
         for values, others in zip(vars(self).values(), vars(fits).values(), strict=True):
             values[index] = others
 
-    def replaced(self, index: Any, fits: JointFits) -> JointFits:
-        """With some of the fits replaced."""
+    def replace(self, index: Any, fits: JointFits) -> JointFits:
+        """Return the fits with some of them replaced."""
         result = JointFits(*(values.copy() for values in vars(self).values()))
         result.put(index, fits)
         return result
 
     def with_opposite_moments(self, n_rows: int) -> JointFits:
-        """The fits of n rows, equally many each, and beside every fit that of the opposite moment."""
+        """Return the fits of n rows, each followed by that of the opposite moments."""
         both = np.repeat(np.arange(len(self.q)).reshape(n_rows, -1), 2, axis=1).ravel()
         fits = self.rows(both)
         fits.mu[1::2] *= -1.0
@@ -90,7 +90,7 @@ class JointFits:
 
 
 def tangents(q: FloatArray) -> FloatArray:
-    """Orthonormal tangents of the unit sphere at q (..., 4): (..., 4, 3).
+    """Return orthonormal tangents (..., 4, 3) of the unit sphere at q (..., 4).
 
     The first two turn the direction u at one range, the third changes the range alone.
     """
@@ -112,15 +112,18 @@ def tangents(q: FloatArray) -> FloatArray:
 
 
 def fit_moments(problem: WhitenedModel, y: FloatArray, q: FloatArray) -> FloatArray:
-    """Scaled moments (b, K, 3) that fit y (b, C) best at q, the channels linearised about the ambient field alone."""
+    """Return scaled moments (b, K, 3) that fit y (b, C) best at q.
+
+    The channels are linearised about the ambient field alone.
+    """
     gain = problem.linear_gain(np.zeros_like(problem.ambient))
-    return _moment_step(problem.moment_jacobian(q, gain), y - problem.of_ambient)
+    return _moment_step(problem.moment_jacobian(q, gain), y - problem.ambient_signals)
 
 
 def _jacobian(
     problem: WhitenedModel, q: FloatArray, mu: FloatArray, gain: FloatArray, tangent: FloatArray | None = None
 ) -> FloatArray:
-    """Derivative of the predictions, and of what is known of the moments, by μ, or along tangents of q."""
+    """Return the Jacobian of predictions and known moments by μ, or along tangents of q."""
     if tangent is None:
         of_readings = problem.moment_jacobian(q, gain)
     else:
@@ -131,12 +134,12 @@ def _jacobian(
 
 
 def _moment_step(jacobian: FloatArray, residual: FloatArray) -> FloatArray:
-    step, _ = _NormalEquations.of(jacobian, residual).step()
+    step, _ = _FitNormalEquations.of(jacobian, residual).step()
     return step.reshape(len(residual), -1, 3)
 
 
 @dataclass(frozen=True, eq=False)
-class _NormalEquations:
+class _FitNormalEquations:
     """Normal equations of many fits, in columns of unit norm."""
 
     norm: FloatArray
@@ -144,8 +147,8 @@ class _NormalEquations:
     information: FloatArray
 
     @classmethod
-    def of(cls, jacobian: FloatArray, residual: FloatArray) -> _NormalEquations:
-        """From Jacobians (b, C, n) and residuals (b, C)."""
+    def of(cls, jacobian: FloatArray, residual: FloatArray) -> _FitNormalEquations:
+        """Return the normal equations of Jacobians (b, C, n) and residuals (b, C)."""
         norm = np.linalg.norm(jacobian, axis=1)
         norm = np.where(norm > 0.0, norm, 1.0)
         unit = jacobian / norm[:, None]
@@ -153,7 +156,10 @@ class _NormalEquations:
         return cls(norm, (transposed @ residual[..., None])[..., 0], transposed @ unit)
 
     def step(self, damping: FloatArray | float = 0.0) -> tuple[FloatArray, FloatArray]:
-        """The step (b, n) with a damping of every column, and by how much it promises to lower χ² (b,)."""
+        """Return the damped step (b, n) and the predicted decrease of χ² (b,).
+
+        Every column has its damping.
+        """
         diagonal = np.arange(self.norm.shape[-1])
         system = self.information.copy()
         system[:, diagonal, diagonal] += 1e-13 + damping
@@ -165,7 +171,7 @@ class _NormalEquations:
 
 
 def refine_moments(problem: WhitenedModel, y: FloatArray, q: FloatArray, mu: FloatArray) -> JointFits:
-    """Moments (b, K, 3) of sources that stay at q (b, K, 4): damped Gauss-Newton on whitened readings (b, C)."""
+    """Fit moments (b, K, 3) of sources fixed at q (b, K, 4) to whitened readings (b, C)."""
     return refine(problem, y, q, mu, free=np.zeros((q.shape[1], 3), dtype=bool))
 
 
@@ -180,7 +186,7 @@ def refine(
     promise: float = PROMISE_ABSOLUTE,
     too_high: FloatArray | None = None,
 ) -> JointFits:
-    """Positions and moments from starts (b, K, 4) and (b, K, 3): damped Gauss-Newton that never raises χ².
+    """Fit positions and moments from starts (b, K, 4) and (b, K, 3); χ² never rises.
 
     y (b, C) are whitened readings, `free` (K, 3) says which :func:`tangents` of a source may change: without the third
     its range stays. It has converged where the linearised model promises to lower χ² by less than `promise`, of one
@@ -195,7 +201,7 @@ def refine(
     several = len(free) > 1
     found = refine_starts(
         problem,
-        y - problem.of_ambient if moduli else y,
+        y - problem.ambient_signals if moduli else y,
         q,
         mu if moduli else None,
         free=None if free.all() else free,
@@ -209,7 +215,10 @@ def refine(
 
 
 def _has_kernel(problem: WhitenedModel, free: NDArray[np.bool_]) -> bool:
-    """Whether kernels refine: sources of free moments by vector sensors, or one of free direction by any sensors."""
+    """Whether kernels can refine this problem.
+
+    They refine sources of free moments by vector sensors, and one of free direction by any sensors.
+    """
     if problem.known is not None or not free.any() or len(free) > MOST_SOURCES:
         return False
     return not problem.sees_moduli or (len(free) == 1 and bool(free[0, :2].all()))
@@ -224,10 +233,10 @@ def damped_gauss_newton(
     max_iterations: int = 60,
     promise: float = PROMISE_ABSOLUTE,
 ) -> JointFits:
-    """:func:`refine` of any sensors, and of moments that are known."""
+    """Fit as :func:`refine` does, for any sensors and known moments, without kernels."""
     n_fits, n_sources = q.shape[:2]
     columns = np.flatnonzero(free.ravel())
-    # Without free positions the moments themselves are what has to be damped.
+    # Without free positions the moments are damped.
     damped = np.repeat([1.0, 0.0 if columns.size else 1.0], [columns.size, 3 * n_sources])
     q, mu = q.copy(), mu.copy()
     chi2, iterations = np.full(n_fits, np.inf), np.zeros(n_fits, dtype=np.int64)
@@ -251,10 +260,10 @@ def damped_gauss_newton(
             along = _jacobian(at, q[live[new]], mu[live[new]], gain, tangent[new])[..., columns]
             jacobian[new] = np.concatenate([along, _jacobian(at, q[live[new]], mu[live[new]], gain)], axis=-1)
             iterations[live[new]] += 1
-        normal = _NormalEquations.of(jacobian, residual)
+        normal = _FitNormalEquations.of(jacobian, residual)
         step, promised = normal.step(damping[:, None] * damped)
         _, reachable = normal.step()
-        new_q, new_mu, step_share = _moved(q[live], mu[live], step, tangent, columns)
+        new_q, new_mu, step_share = _take_step(q[live], mu[live], step, tangent, columns)
         new_fields = sub.source_fields(new_q, new_mu)
         new_residual = sub.residual(y[live], new_q, new_mu, new_fields)
         new_chi2 = _squares(new_residual)
@@ -273,7 +282,7 @@ def damped_gauss_newton(
             accepted = new_chi2 < current
             gained = current - new_chi2
             small = np.abs(reachable) < promise + PROMISE_RELATIVE * current
-            # A step that rounding refuses is the end too, if next to nothing was promised.
+            # A step refused because of rounding ends the fit too, if almost no decrease was predicted.
             ended = small | (~accepted & (damping > LARGEST_DAMPING))
             at_optimum = small | (np.abs(reachable) < 1e-6 * (1.0 + current))
             well = gained > 0.75 * promised
@@ -306,10 +315,13 @@ def _squares(residual: FloatArray) -> FloatArray:
     return np.sum(residual * residual, axis=-1)
 
 
-def _moved(
+def _take_step(
     q: FloatArray, mu: FloatArray, step: FloatArray, tangent: FloatArray, columns: NDArray[np.intp]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Coordinates and moments after a step, shortened where it would turn q too far, and the share that was taken."""
+    """Return coordinates and moments after a step, and the share of it that was taken.
+
+    A step that would turn q too far is shortened.
+    """
     n_fits, n_sources = q.shape[:2]
     along = np.zeros((n_fits, 3 * n_sources))
     along[:, columns] = step[:, : columns.size]
@@ -327,8 +339,11 @@ def _moved(
     return moved / norm, new_mu / norm**3, share
 
 
-def first_alike(row: IntArray, q: FloatArray, weight: FloatArray, same_place: float, same_weight: float) -> IntArray:
-    """The first of all fits (f,), row after row, of the same row, sources (f, K, 4) and weights (f, N) as each one."""
+def first_equal(row: IntArray, q: FloatArray, weight: FloatArray, same_place: float, same_weight: float) -> IntArray:
+    """Return the index of the first equal fit of the same row, for every fit (f,).
+
+    Fits are sorted by row; sources (f, K, 4) and weights (f, N) are compared.
+    """
     first = np.arange(len(row))
     for apart in range(1, int(np.bincount(row).max(initial=0))):
         alike = row[apart:] == row[:-apart]
@@ -339,7 +354,7 @@ def first_alike(row: IntArray, q: FloatArray, weight: FloatArray, same_place: fl
 
 
 def covariances(problem: WhitenedModel, fits: JointFits) -> FloatArray:
-    """Inverse information of (p₁, m₁, p₂, m₂, …) of every fit: (b, 6 K, 6 K) [m, A·m²], NaN where it is singular."""
+    """Return covariances (b, 6 K, 6 K) of (p₁, m₁, p₂, m₂, …) [m, A·m²]; NaN if singular."""
     n_sources = fits.n_sources
     if not len(fits.q):
         return np.empty((0, 6 * n_sources, 6 * n_sources))
@@ -348,7 +363,7 @@ def covariances(problem: WhitenedModel, fits: JointFits) -> FloatArray:
 
 
 def scaled_jacobian(problem: WhitenedModel, q: FloatArray, mu: FloatArray) -> FloatArray:
-    """Derivative of what is measured and known by (p₁, m₁, …): (b, C + K k, 6 K), in radii and tesla of a moment."""
+    """Return the Jacobian (b, C + K k, 6 K) by (p₁, m₁, …), in radii and tesla of a moment."""
     n_fits, n_sources = q.shape[:2]
     s = q[..., 3:]
     rho = np.concatenate([q[..., :3] / s, np.ones_like(s)], axis=-1)
@@ -361,7 +376,10 @@ def scaled_jacobian(problem: WhitenedModel, q: FloatArray, mu: FloatArray) -> Fl
 
 
 def inverse_information(jacobian: FloatArray) -> FloatArray:
-    """``(JᵀJ)⁻¹`` (b, n, n) of whitened Jacobians (b, C, n) by singular values, columns scaled; NaN where singular."""
+    """Return ``(JᵀJ)⁻¹`` (b, n, n) of whitened Jacobians (b, C, n); NaN where singular.
+
+    By singular values of scaled columns.
+    """
     n_fits, n_rows, n = jacobian.shape
     norm = np.linalg.norm(jacobian, axis=1)
     good = np.isfinite(norm).all(axis=-1) & (norm > 0.0).all(axis=-1) & (n_rows >= n)

@@ -1,4 +1,4 @@
-"""Optima of the likelihood: what every search returns, and nothing else."""
+"""Optima of the likelihood, the common result of all searches."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ UNDETERMINED = "the differences between the sensors do not determine the source:
 
 @dataclass(frozen=True, eq=False)
 class Optima:
-    """Optima of b rows: f fits of K sources, row after row, of every row best χ² first.
+    """Optima of b rows: f fits of K sources, sorted by row and then by χ².
 
     Attributes
     ----------
@@ -44,12 +44,12 @@ class Optima:
     undetermined: str = UNDETERMINED
     bent: BoolArray | bool = False
 
-    def chosen(self, which: BoolArray) -> Optima:
-        """Those of some of the rows (b,)."""
+    def select(self, which: BoolArray) -> Optima:
+        """Return the optima of some of the rows (b,)."""
         kept = which[self.of_row]
         return replace(
             self,
-            rows=self.rows.chosen(which),
+            rows=self.rows.select(which),
             fits=self.fits.rows(kept),
             of_row=(np.cumsum(which) - 1)[self.of_row[kept]],
             reason=[reason for reason, chosen in zip(self.reason, which, strict=True) if chosen],

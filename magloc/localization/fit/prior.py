@@ -1,4 +1,4 @@
-"""What is known of a source beforehand."""
+"""Prior knowledge of a source."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _DEFAULT_SIGMA = 0.1
 
 @dataclass(frozen=True)
 class SourcePrior:
-    """What is known of the source beforehand; solutions that contradict it are left out.
+    """Prior knowledge of a source; solutions that contradict it are left out.
 
     Attributes
     ----------
@@ -84,7 +84,7 @@ class SourcePrior:
 
     @property
     def known_moment(self) -> KnownMoment | None:
-        """The known moment as a measurement."""
+        """Known moment as a pseudo-measurement."""
         if self.known_moment_Am2 is None:
             return None
         value = tuple(np.atleast_1d(self.known_moment_Am2).tolist())
@@ -92,15 +92,15 @@ class SourcePrior:
         return KnownMoment(value, _DEFAULT_SIGMA * float(np.linalg.norm(value)) if sigma is None else sigma)
 
     def allows_position(self, position_m: FloatArray) -> Any:
-        """Whether positions (..., 3) lie within the bounds."""
+        """Return whether positions (..., 3) lie within the bounds."""
         return np.all((position_m >= np.asarray(self.low_m)) & (position_m <= np.asarray(self.high_m)), axis=-1)
 
     def allows_moment(self, moment_Am2: FloatArray) -> Any:
-        """Whether moments (..., 3) are small enough."""
+        """Return whether moments (..., 3) are small enough."""
         return np.linalg.norm(moment_Am2, axis=-1) <= self.largest_moment_Am2
 
     def allows(self, sensors: ScaledSensors, q: FloatArray, mu: FloatArray) -> BoolArray:
-        """Whether sources at q (..., 4) with scaled moments μ (..., 3) agree with both."""
+        """Return whether sources at q (..., 4) with moments μ (..., 3) agree with both bounds."""
         with np.errstate(invalid="ignore"):
             allowed = self.allows_position(sensors.position(q)) & self.allows_moment(sensors.moment(q, mu))
         return np.asarray(allowed)

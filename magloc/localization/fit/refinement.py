@@ -1,4 +1,4 @@
-"""Fits of dipoles from starts by compiled kernels: damped Gauss-Newton with the moments eliminated.
+"""Compiled fits of dipoles from starts: damped Gauss-Newton, moments eliminated.
 
 :func:`magloc.localization.fit.gauss_newton.damped_gauss_newton` is the readable reference.
 """
@@ -23,8 +23,10 @@ RELATIVE_TOLERANCE = 1e-14
 _CHANNELS_A_BLOCK = 100_000
 
 
-class Refined(NamedTuple):
-    """Ends of n refinements of K sources: q (n, K, 4), scaled moments (n, K, 3), χ² (n,), linearisations (n,).
+class Refinements(NamedTuple):
+    """Results of n refinements of K sources.
+
+    q (n, K, 4), scaled moments (n, K, 3), χ² (n,), linearisations (n,).
 
     The last item tells which converged, or were given up because they would not come below a useful χ².
     """
@@ -47,7 +49,7 @@ def refine_starts(
     tolerance: float = OPTIMUM_TOLERANCE,
     relative_tolerance: float = RELATIVE_TOLERANCE,
     too_high: FloatArray | None = None,
-) -> Refined:
+) -> Refinements:
     """
     Refine one start for each row of whitened readings.
 
@@ -75,7 +77,7 @@ def refine_starts(
     """
     n, n_sources = q.shape[:2]
     channels = model.channels
-    out = Refined(
+    out = Refinements(
         np.empty((n, n_sources, 4)), np.empty((n, n_sources, 3)), np.empty(n), np.empty(n, np.int64), np.empty(n, bool)
     )
     work = core.problem(

@@ -1,4 +1,4 @@
-"""What a fix is: its solutions, and their sources."""
+"""Results of a fix: solutions and their sources."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ DISTINCT_WITHIN = 20.0
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Source:
-    """A magnetic dipole, and how well it is known.
+    """Magnetic dipole and its uncertainty.
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ class Source:
 
     @property
     def range_observable(self) -> bool:
-        """Whether the 95 % set of ranges is closed, and its ends differ by a factor of two at most."""
+        """Whether the 95 % set of ranges is closed, with ends within a factor of two."""
         return is_observable_set(self.range_interval_m)
 
     def __repr__(self) -> str:
@@ -123,12 +123,12 @@ class Solution:
 
     @property
     def misfit(self) -> bool:
-        """Whether χ², with what is known of the moments, is far beyond noise."""
+        """Whether χ², known moments included, is far beyond noise."""
         return bool(is_misfit(self.chi2 + self.known_chi2, self.dof + self.n_known))
 
     @property
     def source(self) -> Source:
-        """The only source; a ValueError where there are several."""
+        """Only source; a ValueError where there are several."""
         if len(self.sources) != 1:
             raise ValueError(f"The solution has {len(self.sources)} sources: see its attribute sources.")
         return self.sources[0]
@@ -164,7 +164,7 @@ class Solution:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Fix:
-    """Every distinct solution of one set of readings.
+    """All distinct solutions of one set of readings.
 
     Attributes
     ----------
@@ -211,7 +211,9 @@ class Fix:
 
     @property
     def body_factor(self) -> float:
-        """How many times their standard deviations errors would be, rms, were a point a quarter of its distance long.
+        """Factor by which errors would exceed their standard deviations, rms.
+
+        For a body of a quarter of its distance instead of a point.
 
         1 where that does not matter, or where something is said of its length.
         """
@@ -219,14 +221,14 @@ class Fix:
 
     @property
     def best(self) -> Solution:
-        """The solution of the largest weight; a ValueError with the reason where there is none."""
+        """Solution of the largest weight; a ValueError with the reason where there is none."""
         if not self.solutions:
             raise ValueError(f"The readings have no solution: {self.reason}.")
         return max(self.solutions, key=lambda solution: solution.weight)
 
     @property
     def misfit(self) -> bool:
-        """Whether χ² is far beyond noise: then neither the position nor its standard deviations are to be trusted."""
+        """Whether χ² is far beyond noise, so that neither position nor σ can be trusted."""
         return bool(self.solutions) and self.solutions[0].misfit
 
     def __repr__(self) -> str:
@@ -243,12 +245,12 @@ def values_of(of: object, keys: Iterable[str]) -> dict[str, Any]:
 
 
 def is_misfit(chi2: ArrayLike, dof: ArrayLike) -> Any:
-    """Whether χ² (...) is far beyond noise."""
+    """Return whether χ² (...) is far beyond noise."""
     return (np.asarray(dof) > 0) & (chdtrc(np.maximum(dof, 1), chi2) < MISFIT)
 
 
 def is_observable(low: Any, high: Any) -> Any:
-    """Whether intervals of the range (...) are closed and their ends differ by a factor of two at most."""
+    """Return whether range intervals (...) are closed, with ends within a factor of two."""
     return (low > 0.0) & (high <= 2.0 * low)
 
 
@@ -258,7 +260,7 @@ def open_ended(low: float, high: float) -> tuple[float, float | None]:
 
 
 def span(intervals: Intervals) -> tuple[float, float]:
-    """Least and largest range of a set; NaN if it is empty."""
+    """Return the least and largest range of a set; NaN if it is empty."""
     if not intervals:
         return math.nan, math.nan
     high = intervals[-1][1]
@@ -266,15 +268,15 @@ def span(intervals: Intervals) -> tuple[float, float]:
 
 
 def intervals_of(ranges: FloatArray) -> Intervals:
-    """A set of ranges (i, 2), NaN where there are fewer, as pairs."""
+    """Return a set of ranges (i, 2) as pairs; NaN pads it."""
     return tuple(open_ended(low, high) for low, high in ranges.tolist() if not math.isnan(low))
 
 
 def spans(ranges: FloatArray) -> FloatArray:
-    """Least and largest range (..., 2) of sets (..., i, 2); NaN if they are empty."""
+    """Return the least and largest range (..., 2) of sets (..., i, 2); NaN if empty."""
     return np.stack([ranges[..., 0, 0], np.fmax.reduce(ranges[..., 1], axis=-1)], axis=-1)
 
 
 def is_observable_set(intervals: Intervals) -> bool:
-    """Whether a set of ranges is closed, and its ends differ by a factor of two at most."""
+    """Return whether a set of ranges is closed, with ends within a factor of two."""
     return bool(is_observable(*span(intervals)))

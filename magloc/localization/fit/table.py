@@ -1,4 +1,4 @@
-"""Fixes as a table for people."""
+"""Fixes as a text table."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _MEANINGS = {
 
 
 def lines_of_fixes(fixes: Fixes, *, joint: bool | None = None, most: int | None = None) -> list[str]:
-    """Aligned lines of a table: a header, then one for every source of the best solution of every fix.
+    """Return aligned lines: a header, then one per source of the best solution of every fix.
 
     Lengths are in mm if most positions are within a metre, else in m. `joint` adds the number of the source, by default
     where some row has several; `most` keeps the first and the last rows.
@@ -34,7 +34,7 @@ def lines_of_fixes(fixes: Fixes, *, joint: bool | None = None, most: int | None 
     shown = list(range(len(fixes)))
     if most is not None and len(shown) > most:
         shown = shown[: most // 2] + shown[-(most // 2) :]
-    solved = fixes.solutions.chosen(fixes.best[fixes.solved])
+    solved = fixes.solutions.select(fixes.best[fixes.solved])
     if joint is None:
         joint = bool((solved.n_sources > 1).any())
     distances = np.linalg.norm(solved.position_m, axis=-1)
@@ -79,9 +79,9 @@ def lines_of_fixes(fixes: Fixes, *, joint: bool | None = None, most: int | None 
 
 
 def _cells_of_rows(fixes: Fixes, shown: list[int], per_m: float) -> Iterator[list[list[str]]]:
-    """Cells of the sources of the best solution of some rows."""
+    """Return the cells of the sources of the best solution of some rows."""
     solved = [i for i in shown if fixes.solved[i]]
-    best = fixes.solutions.chosen(fixes.best[solved])
+    best = fixes.solutions.select(fixes.best[solved])
     blocks = best.covariance_of_source
     deviations = np.sqrt(np.einsum("fkii->fki", blocks))
     of_position = deviations[..., :3] if deviations.shape[-1] == 6 else np.zeros(best.position_m.shape)
@@ -103,7 +103,7 @@ def _cells_of_rows(fixes: Fixes, shown: list[int], per_m: float) -> Iterator[lis
             intervals = intervals_of(best.ranges[j, k])
             uncertain = ["weak"]
             if fixes.detected[i]:
-                uncertain = _of_uncertainty(is_observable_set(intervals), bool(best.gaussian[j, k] or misfit[i]))
+                uncertain = _uncertainty_notes(is_observable_set(intervals), bool(best.gaussian[j, k] or misfit[i]))
             flags = [*uncertain, *of_row, *(["merged"] if best.merged[j, k] else []), *behind]
             cells.append(
                 [
@@ -118,25 +118,28 @@ def _cells_of_rows(fixes: Fixes, shown: list[int], per_m: float) -> Iterator[lis
 
 
 def legend(lines: Iterable[str]) -> list[str]:
-    """Explain the flags in the lines of a table that no other note explains."""
+    """Return explanations of the flags in a table that no other note explains."""
     text = "\n".join(lines)
     return [meaning for flag, meaning in _MEANINGS.items() if re.search(flag, text)]
 
 
 def cells_of_strength(moment_Am2: FloatArray, covariance: FloatArray) -> tuple[str, str]:
-    """Modulus of a moment, and its standard deviation by the covariance (3, 3) of the moment."""
+    """Return the modulus of a moment and its standard deviation, from its covariance (3, 3)."""
     strength, sigma = _strengths(moment_Am2, covariance)
     return by_sigma(float(strength), float(sigma))
 
 
 def cells_of_vector(values: FloatArray, sigma: FloatArray) -> list[str]:
-    """Components (n,), and then their standard deviations (n,), by whose digits they are rounded."""
+    """Return components (n,) and standard deviations (n,), rounded by the latter's digits."""
     pairs = [by_sigma(*pair) for pair in zip(values.tolist(), sigma.tolist(), strict=True)]
     return [cell for cells in zip(*pairs, strict=True) for cell in cells]
 
 
 def _strengths(moment_Am2: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Moduli (...) of moments (..., 3), and their standard deviations; 0 for the mean of two that differ in sign."""
+    """Return moduli (...) of moments (..., 3) and their standard deviations.
+
+    0 for the mean of two that differ in sign.
+    """
     strength = np.linalg.norm(moment_Am2, axis=-1)
     spread = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1))
     has_direction = strength > 1e-6 * spread
@@ -145,8 +148,8 @@ def _strengths(moment_Am2: FloatArray, covariance: FloatArray) -> tuple[FloatArr
     return np.where(has_direction, strength, 0.0), np.where(has_direction, sigma, spread)
 
 
-def _of_uncertainty(observable: bool, described: bool) -> list[str]:
-    """What has to be said of the standard deviations: described is a misfit, too, of which that alone is said."""
+def _uncertainty_notes(observable: bool, described: bool) -> list[str]:
+    """Return notes on the standard deviations; for a misfit only that it is one."""
     if not observable:
         return ["range?"]
     return [] if described else ["bent"]

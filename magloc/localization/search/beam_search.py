@@ -1,4 +1,4 @@
-"""Search for several dipoles at once: beams of the best distinct fits, one more source at a time, and random restarts.
+"""Beam search for several dipoles, one more source at a time, with random restarts.
 
 Everything works on b sets of readings of one :class:`magloc.measurement.whitened.WhitenedModel` at once.
 """
@@ -19,7 +19,7 @@ from magloc.localization.fit.results import DISTINCT_WITHIN
 from magloc.localization.search.candidates import (
     LastBases,
     SingleArray,
-    chosen_candidates,
+    best_candidates,
     distinct_best,
     linear_scores,
     modulus_scores,
@@ -45,10 +45,13 @@ _MOST_ITERATIONS = 60
 
 
 def best_distinct(fits: JointFits, n_rows: int, width: int) -> JointFits:
-    """The `width` best fits of every row that differ, from the same number of fits for every row, row after row."""
+    """Return the `width` best distinct fits of every row.
+
+    Every row has the same number of fits.
+    """
     # q and -q are the same source.
     sign = np.where(fits.q[..., 3:] < 0.0, -1.0, 1.0)
-    every = replace(fits, q=fits.q * sign, chi2=fits.chi2.copy()).shaped(n_rows, -1)
+    every = replace(fits, q=fits.q * sign, chi2=fits.chi2.copy()).reshape(n_rows, -1)
     chi2, rows = every.chi2, np.arange(n_rows)
     kept = JointFits.none((n_rows, width), fits.n_sources)
     for k in range(width):
@@ -68,7 +71,7 @@ def best_distinct(fits: JointFits, n_rows: int, width: int) -> JointFits:
 
 
 def _same_sources(q: FloatArray, mu: FloatArray, other_q: FloatArray, other_mu: FloatArray) -> NDArray[np.bool_]:
-    """Whether two sets of sources are the same in some order."""
+    """Return whether two sets of sources are equal in some order."""
     angle = np.abs(np.einsum("...kd,...ld->...kl", q, other_q)) > np.cos(_SAME_RAD)
     apart = np.linalg.norm(mu[..., :, None, :] - other_mu[..., None, :, :], axis=-1)
     near = angle & (apart < _SAME_MOMENT * np.linalg.norm(mu, axis=-1)[..., None])
@@ -76,8 +79,8 @@ def _same_sources(q: FloatArray, mu: FloatArray, other_q: FloatArray, other_mu: 
 
 
 @dataclass(frozen=True, eq=False)
-class Search:
-    """How to search; the same for all readings of a problem.
+class BeamSearch:
+    """Beam search with settings that hold for all readings of a problem.
 
     Attributes
     ----------
@@ -105,27 +108,27 @@ class Search:
     apart_rad: float = 0.25
     bases: LastBases = field(default_factory=LastBases)
 
-    def first(self, problem: WhitenedModel, y: FloatArray) -> JointFits:
-        """One source, from the candidates that explain most."""
+    def first_sources(self, problem: WhitenedModel, y: FloatArray) -> JointFits:
+        """Return fits of one source, from the candidates that explain most."""
         bent = self._needs_templates(problem, y)
         if not bent.any() or bent.all():
-            return self._first(problem, y, bool(bent.any()))
+            return self._first_sources(problem, y, bool(bent.any()))
         fits = JointFits.none((len(y), self.width), 1)
         for templates in (False, True):
             rows = np.flatnonzero(bent == templates)
-            fits.put(rows, self._first(problem.rows(rows), y[rows], templates))
+            fits.put(rows, self._first_sources(problem.rows(rows), y[rows], templates))
         return fits
 
-    def _first(self, problem: WhitenedModel, y: FloatArray, templates: bool) -> JointFits:
-        """:meth:`first` of rows all of which start from templates too, or none."""
+    def _first_sources(self, problem: WhitenedModel, y: FloatArray, templates: bool) -> JointFits:
+        """Return :meth:`first_sources` of rows that all use templates, or all do not."""
         gain = problem.linear_gain(np.zeros_like(problem.ambient))
-        residual = y - problem.of_ambient
+        residual = y - problem.ambient_signals
         starts: list[tuple[FloatArray, FloatArray]] = []
         if np.any(gain):
             n_starts = 3 * self.n_starts // 2
-            q = self.candidates[self._chosen(problem, gain, residual, n_starts, self.apart_rad)]
+            q = self.candidates[self._choose(problem, gain, residual, n_starts, self.apart_rad)]
             row = np.repeat(np.arange(len(y)), n_starts)
-            # From none the first step leads to the moments that fit best, but by steps to what is known of them.
+            # A zero moment suffices: the first step finds the best one. Known moments need a real start.
             mu = np.zeros((len(y), n_starts, 3))
             if problem.known is not None:
                 mu = fit_moments(problem.rows(row), y[row], q.reshape(-1, 1, 4)).reshape(mu.shape)
@@ -146,17 +149,20 @@ class Search:
             fits = refine(problem.rows(row), y[row], q.reshape(-1, 1, 4), mu.reshape(-1, 1, 3))
         if problem.is_even:
             fits = fits.with_opposite_moments(len(y))
-        return best_distinct(self._known(fits), len(y), self.width)
+        return best_distinct(self._apply_prior(fits), len(y), self.width)
 
     def _ends(self, problem: WhitenedModel, y: FloatArray, q: FloatArray, mu: FloatArray) -> JointFits:
-        """Distinct fits of one source by moduli, as many as there are starts (b, k, …); the others have no χ²."""
-        signals = signals_of(problem, y - problem.of_ambient)
+        """Return distinct fits of one source by moduli (b, k, …); empty places have no χ²."""
+        signals = signals_of(problem, y - problem.ambient_signals)
         found = search_optima(problem, signals, np.arange(len(y)), q, mu, self.within, _MOST_ITERATIONS)
         chi2 = np.where(np.arange(q.shape[1]) < found.counts[:, :1], found.chi2, np.inf)
-        return JointFits(found.q[:, :, None], found.mu[:, :, None], chi2, found.iterations).shaped(-1)
+        return JointFits(found.q[:, :, None], found.mu[:, :, None], chi2, found.iterations).reshape(-1)
 
     def _needs_templates(self, problem: WhitenedModel, y: FloatArray) -> NDArray[np.bool_]:
-        """Rows (b,) with moduli far from linear: their source's field is not small against the ambient field."""
+        """Return whether moduli are far from linear in rows (b,).
+
+        The source's field is then not small against the ambient field.
+        """
         scalar = problem.channel_is_scalar
         ambient = np.linalg.norm(problem.ambient[:, problem.channel_sensor[scalar]], axis=-1)
         signal = np.abs(y[:, scalar])
@@ -180,7 +186,7 @@ class Search:
         at = problem.rows(row)
         # The length of the moment, as if there were no ambient field.
         fields = at.source_fields(q.reshape(-1, 1, 4), direction.reshape(-1, 1, 3))
-        unit = at.without_ambient().predicted(fields)
+        unit = at.without_ambient().predict(fields)
         length = np.sum(unit * y[row], axis=-1) / np.maximum(np.sum(unit * unit, axis=-1), 1e-300)
         return q, direction * np.maximum(length, 1e-30).reshape(len(y), n_starts, 1)
 
@@ -191,54 +197,54 @@ class Search:
             scores[rows] = linear_scores(bases, residual[rows])
         return scores
 
-    def _chosen(
+    def _choose(
         self, problem: WhitenedModel, gain: FloatArray, residual: FloatArray, n_starts: int, apart_rad: float
     ) -> NDArray[np.intp]:
-        """Distinct candidates (b, n_starts) that explain most of residuals."""
+        """Return distinct candidates (b, n_starts) that explain most of the residuals."""
         chosen = np.empty((len(residual), n_starts), dtype=np.intp)
         for rows in rows_of_equal_gain(gain):
             bases = self.bases_of(problem, gain[rows[0]], int(rows[0]))
-            chosen[rows] = chosen_candidates(bases, residual[rows], self.candidates, n_starts, apart_rad)
+            chosen[rows] = best_candidates(bases, residual[rows], self.candidates, n_starts, apart_rad)
         return chosen
 
-    def _chosen_for_left(
+    def _choose_for_residual(
         self, problem: WhitenedModel, y: FloatArray, q: FloatArray, mu: FloatArray, n_starts: int, apart_rad: float
     ) -> NDArray[np.intp]:
-        """Those that explain most of what the sources (b, K, …) leave."""
+        """Return the candidates that explain most of the residual of sources (b, K, …)."""
         fields = problem.source_fields(q, mu)
-        return self._chosen(problem, problem.linear_gain(fields), y - problem.predicted(fields), n_starts, apart_rad)
+        return self._choose(problem, problem.linear_gain(fields), y - problem.predict(fields), n_starts, apart_rad)
 
     def bases_of(self, problem: WhitenedModel, gain: FloatArray, row: int) -> SingleArray:
-        """:func:`linear_bases` of the candidates."""
-        return self.bases.of(problem, gain, row, self.candidates)
+        """Return :func:`linear_bases` of the candidates."""
+        return self.bases.linear(problem, gain, row, self.candidates)
 
-    def _known(self, fits: JointFits) -> JointFits:
-        """Fits that agree with what is known of the sources; the others count as none."""
+    def _apply_prior(self, fits: JointFits) -> JointFits:
+        """Return the fits with infinite χ² where they contradict the prior."""
         allowed = np.all(self.allowed(fits.q, fits.mu), axis=1)
         return replace(fits, chi2=np.where(allowed, fits.chi2, np.inf))
 
-    def one_more(self, problem: WhitenedModel, y: FloatArray, beam: JointFits, credible: float = 0.0) -> JointFits:
-        """Beam with another source: every fit is extended by the candidates that explain most of what it leaves.
+    def add_source(self, problem: WhitenedModel, y: FloatArray, beam: JointFits, credible: float = 0.0) -> JointFits:
+        """Return the beam with one more source, from candidates that explain most of the residual.
 
         Where the first of them lead to a χ² that is credible, others are given up that will stay far above it.
         """
         width = beam.chi2.shape[1]
         row = np.repeat(np.arange(len(y)), width)
-        q, mu = _filled(beam)
-        chosen = self._chosen_for_left(problem.rows(row), y[row], q, mu, width * _MORE_STARTS, self.apart_rad)
-        # The best fit, where it stands in for one that there is not, goes on from the candidates that come next.
+        q, mu = _fill_missing(beam)
+        chosen = self._choose_for_residual(problem.rows(row), y[row], q, mu, width * _MORE_STARTS, self.apart_rad)
+        # Copies of the best fit in empty places continue from the next candidates.
         chosen = chosen.reshape(len(y), width, width, _MORE_STARTS)
         turn = np.where(np.isfinite(beam.chi2), 0, np.arange(width))
         chosen = np.take_along_axis(chosen, turn[:, :, None, None], axis=2).reshape(-1, _MORE_STARTS)
-        fits = self._extended(problem, y, np.repeat(row, _MORE_STARTS), q, mu, chosen, credible)
+        fits = self._extend(problem, y, np.repeat(row, _MORE_STARTS), q, mu, chosen, credible)
         return best_distinct(fits, len(y), self.width)
 
-    def left_scores(self, problem: WhitenedModel, y: FloatArray, q: FloatArray, mu: FloatArray) -> FloatArray:
-        """Energy that every candidate explains of what the sources (b, K, …) leave: (b, n)."""
+    def residual_scores(self, problem: WhitenedModel, y: FloatArray, q: FloatArray, mu: FloatArray) -> FloatArray:
+        """Return the energy (b, n) that candidates explain of the residual of sources (b, K, …)."""
         fields = problem.source_fields(q, mu)
-        return self._linear_scores(problem, problem.linear_gain(fields), y - problem.predicted(fields))
+        return self._linear_scores(problem, problem.linear_gain(fields), y - problem.predict(fields))
 
-    def _extended(
+    def _extend(
         self,
         problem: WhitenedModel,
         y: FloatArray,
@@ -248,12 +254,15 @@ class Search:
         chosen: NDArray[np.intp],
         credible: float = 0.0,
     ) -> JointFits:
-        """Refined fits of sources (f, K, …) and one of the chosen candidates (f, n) each; row is that of every fit."""
+        """Refine sources (f, K, …) with each of the chosen candidates (f, n) added.
+
+        `row` is that of every fit.
+        """
         each = np.repeat(np.arange(len(q)), chosen.shape[1])
         at, y_each = problem.rows(row), y[row]
         new = self.candidates[chosen.ravel()][:, None]
         fields = at.source_fields(q[each], mu[each])
-        gain, residual = at.linear_gain(fields), y_each - at.predicted(fields)
+        gain, residual = at.linear_gain(fields), y_each - at.predict(fields)
         jacobian = at.moment_jacobian(new, gain)
         normal = jacobian.transpose(0, 2, 1) @ jacobian
         trace = np.trace(normal, axis1=1, axis2=2)
@@ -261,7 +270,7 @@ class Search:
         new_mu = np.linalg.solve(normal, jacobian.transpose(0, 2, 1) @ residual[..., None])[:, None, :, 0]
         q, mu = np.concatenate([q[each], new], axis=1), np.concatenate([mu[each], new_mu], axis=1)
         if not credible:
-            return self._known(refine(at, y_each, q, mu))
+            return self._apply_prior(refine(at, y_each, q, mu))
         place = np.arange(len(q)).reshape(len(y), -1)
         first, others = place[:, :_MORE_STARTS].ravel(), place[:, _MORE_STARTS:].ravel()
         fits = refine(at.rows(first), y_each[first], q[first], mu[first])
@@ -269,23 +278,23 @@ class Search:
         limit = np.where(lowest <= credible, lowest + DISTINCT_WITHIN, np.inf)
         too_high = np.repeat(limit, place.shape[1] - _MORE_STARTS)
         more = refine(at.rows(others), y_each[others], q[others], mu[others], too_high=too_high)
-        return JointFits.none((len(q),), q.shape[1]).replaced(first, fits).replaced(others, more)
+        return JointFits.none((len(q),), q.shape[1]).replace(first, fits).replace(others, more)
 
-    def one_less(self, problem: WhitenedModel, y: FloatArray, beam: JointFits) -> JointFits:
-        """Beam without one source: every source of the best fit is left out in turn."""
+    def remove_source(self, problem: WhitenedModel, y: FloatArray, beam: JointFits) -> JointFits:
+        """Return the beam with one source less, each source of the best fit removed in turn."""
         n_sources = beam.n_sources
-        q, mu = _filled(beam.rows((slice(None), slice(0, 1))))
+        q, mu = _fill_missing(beam.rows((slice(None), slice(0, 1))))
         others = np.array([[k for k in range(n_sources) if k != out] for out in range(n_sources)])
         q = q[:, others].reshape(-1, n_sources - 1, 4)
         mu = mu[:, others].reshape(-1, n_sources - 1, 3)
         row = np.repeat(np.arange(len(y)), n_sources)
-        return best_distinct(self._known(refine(problem.rows(row), y[row], q, mu)), len(y), self.width)
+        return best_distinct(self._apply_prior(refine(problem.rows(row), y[row], q, mu)), len(y), self.width)
 
-    def restarted(self, problem: WhitenedModel, y: FloatArray, beam: JointFits, rng: np.random.Generator) -> JointFits:
-        """Beam after a random source of random fits is replaced by a random one of the best candidates."""
+    def restart(self, problem: WhitenedModel, y: FloatArray, beam: JointFits, rng: np.random.Generator) -> JointFits:
+        """Return the beam after random sources are replaced by random good candidates."""
         n_rows, width = beam.chi2.shape
         n_sources, n_tries = beam.n_sources, self.n_starts * self.width
-        q, mu = _filled(beam)
+        q, mu = _fill_missing(beam)
         q, mu = q.reshape(n_rows, width, n_sources, 4), mu.reshape(n_rows, width, n_sources, 3)
         which = rng.integers(width, size=(n_rows, n_tries))
         order = np.argsort(rng.random((n_rows, n_tries, n_sources)), axis=-1)[..., : n_sources - 1]
@@ -294,22 +303,22 @@ class Search:
         kept_mu = mu[rows, which[..., None], order].reshape(-1, n_sources - 1, 3)
         row = np.repeat(np.arange(n_rows), n_tries)
         half = 0.5 * self.apart_rad
-        best = self._chosen_for_left(problem.rows(row), y[row], kept_q, kept_mu, _RESTART_CANDIDATES, half)
+        best = self._choose_for_residual(problem.rows(row), y[row], kept_q, kept_mu, _RESTART_CANDIDATES, half)
         chosen = best[np.arange(len(row)), rng.integers(_RESTART_CANDIDATES, size=len(row))][:, None]
-        fits = self._extended(problem, y, row, kept_q, kept_mu, chosen)
-        return merged(beam, best_distinct(fits, n_rows, self.width))
+        fits = self._extend(problem, y, row, kept_q, kept_mu, chosen)
+        return merge(beam, best_distinct(fits, n_rows, self.width))
 
 
-def merged(first: JointFits, second: JointFits) -> JointFits:
-    """The best distinct fits of two beams of equally many sources."""
+def merge(first: JointFits, second: JointFits) -> JointFits:
+    """Return the best distinct fits of two beams with equally many sources."""
     n_rows, width = first.chi2.shape
     pairs = zip(vars(first).values(), vars(second).values(), strict=True)
     both = JointFits(*(np.concatenate(pair, axis=1) for pair in pairs))
-    return best_distinct(both.shaped(-1), n_rows, width)
+    return best_distinct(both.reshape(-1), n_rows, width)
 
 
-def _filled(beam: JointFits) -> tuple[FloatArray, FloatArray]:
-    """Sources (b·w, K, …) with the best fit in place of those that there are not."""
+def _fill_missing(beam: JointFits) -> tuple[FloatArray, FloatArray]:
+    """Return sources (b·w, K, …), with the best fit in empty places."""
     missing = ~np.isfinite(beam.chi2)
     q = np.where(missing[..., None, None], beam.q[:, :1], beam.q)
     mu = np.where(missing[..., None, None], beam.mu[:, :1], beam.mu)

@@ -1,4 +1,4 @@
-r"""Where to start: positions on a grid, scored by how much of the readings they explain.
+r"""Candidate positions on a grid, scored by how much of the readings they explain.
 
 Where the channels are linear in the moment (vector sensors, and moduli in an ambient field that is large against the
 source's), a position is scored by the energy of the readings in the space of its three unit moments. Moduli without an
@@ -32,7 +32,9 @@ _LARGEST_SINGLE = 1e15  # of residuals in units of noise
 
 
 def linear_bases(problem: WhitenedModel, gain: FloatArray, row: int, candidates: FloatArray) -> SingleArray:
-    """Orthonormal whitened bases (C, 3 n) of the unit moments at candidates (n, 4), for linear channels.
+    """Return whitened orthonormal bases (C, 3 n) of unit moments at candidates (n, 4).
+
+    The channels are linear.
 
     By moment axis, then by candidate, under the whitening of `row`; `gain` (C, 3) is in units of the noise. Single
     precision ranks the candidates as well.
@@ -42,25 +44,25 @@ def linear_bases(problem: WhitenedModel, gain: FloatArray, row: int, candidates:
 
 
 class LastBases:
-    """:func:`linear_bases` and :func:`modulus_templates` of the same candidates, kept while rows are whitened alike."""
+    """Cache of bases and templates of the same candidates, while the whitening stays."""
 
     def __init__(self) -> None:
         self._kept: dict[str, tuple[bytes, SingleArray]] = {}
 
-    def of(self, problem: WhitenedModel, gain: FloatArray, row: int, candidates: FloatArray) -> SingleArray:
-        """Bases of one row."""
-        return self._last("bases", problem, gain, row, lambda: linear_bases(problem, gain, row, candidates))
+    def linear(self, problem: WhitenedModel, gain: FloatArray, row: int, candidates: FloatArray) -> SingleArray:
+        """Return the bases of one row."""
+        return self._reuse("bases", problem, gain, row, lambda: linear_bases(problem, gain, row, candidates))
 
     def templates(
         self, problem: WhitenedModel, row: int, candidates: FloatArray, directions: FloatArray
     ) -> SingleArray:
-        """Templates of one row."""
+        """Return the templates of one row."""
         gain = problem.gain[row]
-        return self._last(
+        return self._reuse(
             "templates", problem, gain, row, lambda: modulus_templates(problem, row, candidates, directions)
         )
 
-    def _last(
+    def _reuse(
         self, what: str, problem: WhitenedModel, gain: FloatArray, row: int, make: Callable[[], SingleArray]
     ) -> SingleArray:
         key = b"".join(values.tobytes() for values in (gain, problem.basis[row], problem.shrinkage[row]))
@@ -70,7 +72,7 @@ class LastBases:
 
 
 def linear_scores(bases: SingleArray, residual: FloatArray) -> FloatArray:
-    """Energy of whitened residuals (b, C) that every candidate's moments explain: (b, n)."""
+    """Return the energy (b, n) of residuals (b, C) that moments at candidates explain."""
     components = residual.astype(np.float32) @ bases
     x, y, z = np.square(components, out=components).reshape(len(residual), 3, -1).swapaxes(0, 1)
     scores: FloatArray = np.add(x, y, dtype=np.float64)
@@ -78,8 +80,10 @@ def linear_scores(bases: SingleArray, residual: FloatArray) -> FloatArray:
     return np.nan_to_num(scores, copy=False, nan=-1.0)
 
 
-def orthonormal_without(lost: SingleArray) -> SingleArray:
-    """What makes components along :func:`linear_bases` Q orthonormal where orthonormal directions count no more.
+def orthonormalisation_without(lost: SingleArray) -> SingleArray:
+    """Return factors (6, n) that make components orthonormal without some directions.
+
+    The components are along :func:`linear_bases` Q.
 
     These have the components `lost` (k, 3 n), B of every candidate. Those that are left, ``Qᵀ r`` of readings r without
     these directions, are along an orthonormal basis again times the inverse of the lower Cholesky factor of
@@ -97,7 +101,7 @@ def orthonormal_without(lost: SingleArray) -> SingleArray:
     return np.array([1.0 / l00, 1.0 / l11, 1.0 / l22, i10, i20, i21], dtype=np.float32)
 
 
-def chosen_candidates(
+def best_candidates(
     bases: SingleArray,
     residual: FloatArray,
     candidates: FloatArray,
@@ -105,12 +109,12 @@ def chosen_candidates(
     apart_rad: float,
     orthonormal: SingleArray | None = None,
 ) -> NDArray[np.intp]:
-    """:func:`distinct_best` of the :func:`linear_scores` of residuals (b, C), compiled.
+    """Return :func:`distinct_best` of :func:`linear_scores` of residuals (b, C), compiled.
 
-    `orthonormal`: of residuals without some directions, :func:`orthonormal_without` these.
+    `orthonormal`: of residuals without some directions, :func:`orthonormalisation_without` these.
     """
     chosen = np.zeros((len(residual), n_starts), dtype=np.intp)
-    # The order of candidates does not depend on the size of a row, whose squares single precision must hold.
+    # Rows are scaled, since single precision must hold their squares; the order of candidates stays.
     largest = np.abs(residual).max(axis=1, keepdims=True, initial=0.0)
     of_rows = (residual / np.where(largest > _LARGEST_SINGLE, largest, 1.0)).astype(np.float32)
     cos_apart = math.cos(apart_rad)
@@ -130,7 +134,7 @@ def chosen_candidates(
 
 
 def rows_of_equal_gain(gain: FloatArray) -> Iterator[NDArray[np.intp]]:
-    """Rows whose gains (b, C, 3) agree well enough to rank candidates alike."""
+    """Yield rows whose gains (b, C, 3) are near enough to rank candidates alike."""
     scale = np.max(np.abs(gain), axis=(1, 2), keepdims=True)
     rounded = np.round(gain / np.where(scale > 0.0, scale, 1.0) / _SAME_GAIN)
     if np.all(rounded == rounded[:1]):
@@ -142,7 +146,7 @@ def rows_of_equal_gain(gain: FloatArray) -> Iterator[NDArray[np.intp]]:
 
 
 def modulus_templates(problem: WhitenedModel, row: int, candidates: FloatArray, directions: FloatArray) -> SingleArray:
-    """Whitened readings of unit length of moments along directions (d, 3) at candidates (n, 4): (n, d, C).
+    """Return unit templates (n, d, C) of moments along directions (d, 3) at candidates (n, 4).
 
     Without ambient field all channels, moduli too, are proportional to the length of the moment.
     """
@@ -153,7 +157,7 @@ def modulus_templates(problem: WhitenedModel, row: int, candidates: FloatArray, 
         at = problem.rows(np.full(len(block) * n_directions, row)).without_ambient()
         q = np.repeat(block, n_directions, axis=0)[:, None]
         mu = np.tile(directions, (len(block), 1))[:, None]
-        predicted = at.predicted(at.source_fields(q, mu))
+        predicted = at.predict(at.source_fields(q, mu))
         norm = np.linalg.norm(predicted, axis=-1, keepdims=True)
         unit = predicted / np.where(norm > 0.0, norm, np.inf)
         templates[begin : begin + len(block)] = np.nan_to_num(unit).reshape(len(block), n_directions, -1)
@@ -161,7 +165,7 @@ def modulus_templates(problem: WhitenedModel, row: int, candidates: FloatArray, 
 
 
 def modulus_scores(templates: SingleArray, residual: FloatArray) -> tuple[FloatArray, NDArray[np.intp]]:
-    """Energy of residuals (b, C) along the best template of every candidate, and which direction that is: (b, n)."""
+    """Return the energy (b, n) along every candidate's best template, and its direction."""
     n, n_directions, n_channels = templates.shape
     flat = residual.astype(np.float32) @ templates.reshape(-1, n_channels).T
     along = np.maximum(flat, 0.0).reshape(len(residual), n, n_directions)
@@ -170,7 +174,10 @@ def modulus_scores(templates: SingleArray, residual: FloatArray) -> tuple[FloatA
 
 
 def distinct_best(scores: FloatArray, candidates: FloatArray, n_starts: int, apart_rad: float) -> NDArray[np.intp]:
-    """The best candidates (b, n_starts) by scores (b, n) that are some angle apart; the best again if none is left."""
+    """Return the best candidates (b, n_starts) by scores (b, n), some angle apart.
+
+    The best is repeated if none is left.
+    """
     left = scores.copy()
     chosen = np.empty((len(scores), n_starts), dtype=np.intp)
     for k in range(n_starts):
@@ -190,7 +197,7 @@ def candidate_positions(
     n_near_directions: int = 12,
     n_inner_directions: int = 60,
 ) -> FloatArray:
-    """Positions (n, 3) [m] that a search scores before it refines the best of them.
+    """Return positions (n, 3) [m] that a search scores.
 
     Directions times geometric ranges of 0.6 to 60 circumradii around the centroid, shells of 0.35, 0.7 and 1.4 times
     the distance of the next sensor around every sensor, for sources close to a large array, and inner ones of 0.2 and
@@ -208,13 +215,16 @@ def candidate_positions(
 
 
 def start_separation(array: SensorArray) -> float:
-    """Least angle [rad] of two starts: less where sensors stand close together, for several have to be near one."""
+    """Return the least angle [rad] between two starts.
+
+    It is smaller where sensors are close together, since several starts must be near one.
+    """
     apart = _APART_RAD * float(np.median(_to_next_sensor(array))) / array.circumradius
     return min(max(apart, _LEAST_APART_RAD), _APART_RAD)
 
 
 def _to_next_sensor(array: SensorArray) -> FloatArray:
-    """Distance (N,) [m] of the next sensor from every one."""
+    """Return the distance (N,) [m] of every sensor to its nearest neighbour."""
     distances: FloatArray = np.linalg.norm(array.positions[:, None] - array.positions, axis=-1)
     np.fill_diagonal(distances, np.inf)
     nearest: FloatArray = distances.min(axis=1)
@@ -222,12 +232,15 @@ def _to_next_sensor(array: SensorArray) -> FloatArray:
 
 
 def fine_positions(array: SensorArray) -> FloatArray:
-    """More of :func:`candidate_positions` around the array: a search for several sources refines few of them."""
+    """Return a finer grid around the array, for a search that refines few candidates."""
     return candidate_positions(array, n_directions=200, ranges=np.geomspace(0.6, 60.0, 10), n_inner_directions=0)
 
 
 def allowed_positions(array: SensorArray, prior: SourcePrior, candidates: FloatArray | None = None) -> FloatArray:
-    """Those of candidates, by default :func:`candidate_positions`, that a prior allows; ValueError if none is left."""
+    """Return the candidates that a prior allows; ValueError if none.
+
+    By default :func:`candidate_positions`.
+    """
     candidates = candidate_positions(array) if candidates is None else candidates
     allowed: FloatArray = candidates[prior.allows_position(candidates)]
     if not len(allowed):

@@ -1,4 +1,4 @@
-"""Compiled kernels of the search for one source: candidates' bases, the choice of starts, and the optima they lead to.
+"""Compiled kernels of the search for one source: bases, choice of starts, optima.
 
 The readable references are :mod:`magloc.localization.search.candidates` and ``tests/variable_projection.py``.
 """
@@ -21,8 +21,10 @@ SAME_COSINE, SAME_CHI2 = 0.99995, 0.01
 _ROWS_TO_CHOOSE_FOR = 512
 
 
-class Ends(NamedTuple):
-    """Distinct optima of rows, best first: q (rows, starts, 4), mu (…, 3), χ², linearisations; NaN and 0 behind them.
+class LocalOptima(NamedTuple):
+    """Distinct optima of rows, best first: q (rows, starts, 4), mu (…, 3), χ², iterations.
+
+    NaN and 0 fill the places behind them.
 
     Counts (rows, 3) are the optima kept, the starts that did not converge, and all linearisations.
     """
@@ -56,7 +58,9 @@ def candidate_bases(
 def choose_candidates(
     components: NDArray[np.float32], candidates: FloatArray, cosine: float, n_chosen: int
 ) -> NDArray[np.intp]:
-    """Return the candidates (rows, n_chosen) that explain most of each row, some angle apart, best first.
+    """Return the candidates (rows, n_chosen) that explain most of each row, best first.
+
+    They are some angle apart.
 
     Components (rows, 3, n) are those of the rows along the bases of the candidates (n, 4). Where too few candidates are
     left, the first one is chosen again.
@@ -83,9 +87,8 @@ def search_optima(
     moments: FloatArray | None,
     keep_within: float,
     max_iterations: int,
-) -> Ends:
-    """
-    Return the distinct optima that starts lead to.
+) -> LocalOptima:
+    """Return the distinct optima that starts lead to.
 
     Parameters
     ----------
@@ -108,7 +111,7 @@ def search_optima(
     Ends
     """
     shape = starts.shape[:2]
-    out = Ends(
+    out = LocalOptima(
         np.empty((*shape, 4)),
         np.empty((*shape, 3)),
         np.empty(shape),

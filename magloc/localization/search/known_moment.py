@@ -1,4 +1,4 @@
-"""Where to start if the moment is known: candidates that fit best with it, the moment by the secular equation."""
+"""Starts for a known moment: best candidates, with moments by the secular equation."""
 
 from __future__ import annotations
 
@@ -21,13 +21,15 @@ def starts_of_known_moment(
     n_starts: int,
     apart_rad: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """Starts q (b, 2 n, 4) and μ (b, 2 n, 3) of one source from whitened readings (b, C) without ambient field.
+    """Return starts q (b, 2 n, 4) and μ (b, 2 n, 3) of one source.
+
+    The whitened readings (b, C) are without ambient field.
 
     Every candidate comes with two moments: the best one, and its mirror image across the axis that the readings see
     least, which explains nearly as much. The channels are linearised about the ambient field.
     """
     gain = problem.linear_gain(np.zeros_like(problem.ambient))
-    wide = known.widened(_PITCH)
+    wide = known.widen(_PITCH)
     unit = problem.moment(candidates, np.ones((len(candidates), 3)))[:, 0]
     q, mu = np.empty((len(residual), n_starts, 4)), np.empty((len(residual), 2 * n_starts, 3))
     for rows in rows_of_equal_gain(gain):

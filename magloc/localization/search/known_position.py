@@ -1,4 +1,4 @@
-"""The moments of dipoles whose places are known: the vector gradiometer of the source paper, by any sensors.
+"""Moments of dipoles at known positions, by any sensors (the paper's vector gradiometer).
 
 Differences of moduli without an ambient field are even in the moment: m and -m fit exactly alike, and three of them
 usually have four exact solutions. All of them are returned. A known ambient field makes the differences nearly linear
@@ -26,13 +26,13 @@ N_UNKNOWNS = 3
 _N_DIRECTIONS = 60
 # Up to the sign.
 _MOST_SOLUTIONS = 8
-# By how much χ² must rise halfway between two optima for them to count as two.
+# Rise of χ² halfway between two optima that makes them distinct.
 _BARRIER = 0.01
 _TOO_LARGE = "the differences between the sensors do not determine a moment that is small enough"
 
 
 class MomentSearch:
-    """Optima of the moments of K sources at known places.
+    """Search for the moments of K sources at known positions.
 
     Parameters
     ----------
@@ -63,8 +63,8 @@ class MomentSearch:
         self.position_m = position
         self.prior = prior
 
-    def of_rows(self, index: IntArray) -> MomentSearch:
-        """The search in some of the rows."""
+    def select(self, index: IntArray) -> MomentSearch:
+        """Return the search for some of the rows."""
         if len(self.position_m) == 1:
             return self
         if len(self.position_m) <= index.max(initial=-1):
@@ -74,8 +74,8 @@ class MomentSearch:
         return MomentSearch(self.array, self.position_m[index], prior=self.prior)
 
     def optima(self, rows: WhitenedRows) -> list[Optima]:
-        """Every distinct optimum of every row."""
-        rows = rows.knowing(self.prior.known_moment)
+        """Return all distinct optima of every row."""
+        rows = rows.with_known_moment(self.prior.known_moment)
         model, place = rows.model, self.position_m if len(self.position_m) == 1 else self.position_m[rows.index]
         position = np.broadcast_to(place, (len(rows), *place.shape[1:]))
         beam = _all_moments(model, rows.y, model.homogeneous(position))
@@ -89,29 +89,35 @@ class MomentSearch:
 
 
 def _all_moments(problem: WhitenedModel, y: FloatArray, q: FloatArray) -> JointFits:
-    """Every distinct optimum of the moments at q (b, K, 4), from the linear solution and from moments all around."""
+    """Return all distinct optima of the moments at q (b, K, 4).
+
+    They start from the linear solution and from moments all around.
+    """
     n, n_sources = q.shape[:2]
     starts = [fit_moments(problem, y, q)[:, None]]
     if problem.channel_is_scalar.any():
-        # Of several sources each start has other directions.
+        # With several sources each start has other directions.
         directions = np.stack([np.roll(fibonacci_directions(_N_DIRECTIONS), 17 * k, 0) for k in range(n_sources)], 1)
         row = np.repeat(np.arange(n), _N_DIRECTIONS)
         alone = problem.rows(row).without_ambient()
         around = np.tile(directions, (n, 1, 1))
-        unit = alone.predicted(alone.source_fields(q[row], around))
+        unit = alone.predict(alone.source_fields(q[row], around))
         # As long as the readings ask for if there were no ambient field: the scale of the moduli.
         length = np.linalg.norm(y[row], axis=-1) / np.maximum(np.linalg.norm(unit, axis=-1), 1e-300)
         starts.append((length[:, None, None] * around).reshape(n, _N_DIRECTIONS, n_sources, 3))
     mu = np.concatenate(starts, axis=1)
     row = np.repeat(np.arange(n), mu.shape[1])
     fits = refine_moments(problem.rows(row), y[row], q[row], mu.reshape(-1, n_sources, 3))
-    return _distinct(problem, y, q, fits)
+    return _distinct_optima(problem, y, q, fits)
 
 
-def _distinct(problem: WhitenedModel, y: FloatArray, q: FloatArray, fits: JointFits) -> JointFits:
-    """The best optima of every row that χ² rises between, and their opposites where χ² is even in the moment."""
+def _distinct_optima(problem: WhitenedModel, y: FloatArray, q: FloatArray, fits: JointFits) -> JointFits:
+    """Return the best optima of every row that a rise of χ² separates.
+
+    Opposite moments are added where χ² is even.
+    """
     n = len(y)
-    every = replace(fits, chi2=fits.chi2.copy()).shaped(n, -1)
+    every = replace(fits, chi2=fits.chi2.copy()).reshape(n, -1)
     mu, chi2 = every.mu, every.chi2
     row, rows = np.repeat(np.arange(n), mu.shape[1]), np.arange(n)
     each = problem.rows(row)
@@ -130,13 +136,16 @@ def _distinct(problem: WhitenedModel, y: FloatArray, q: FloatArray, fits: JointF
         between = np.sum(residual**2, axis=-1).reshape(n, -1)
         chi2[between < np.where(np.isfinite(chi2), chi2, 0.0) + _BARRIER] = np.inf
         chi2[rows, best] = np.inf
-    both = kept.shaped(-1).with_opposite_moments(n).shaped(n, -1)
+    both = kept.reshape(-1).with_opposite_moments(n).reshape(n, -1)
     both.chi2[~even, 1::2] = np.inf
     return both
 
 
 def _is_even(problem: WhitenedModel) -> NDArray[np.bool_]:
-    """Whether the readings (b,) stay as they are if the moment is reversed: moduli alone, without an ambient field."""
+    """Return whether readings (b,) stay if the moment is reversed.
+
+    So do moduli alone without an ambient field.
+    """
     silent = ~np.any(problem.gain, axis=-1)
     lone = problem.channel_is_scalar & ~np.any(problem.ambient, axis=-1)[:, problem.channel_sensor]
     return np.all(silent | lone, axis=-1)

@@ -1,4 +1,4 @@
-"""One source at rest from several rows of an array that moves: all its readings as those of one large array.
+"""Search for one source at rest from several rows of a moving array.
 
 A few scalar sensors do not locate a source in one row, but they do while they pass it. Every row keeps its own common
 field, so that what changes from row to row in the ambient field does not matter.
@@ -20,7 +20,7 @@ from magloc.localization.fit.gauss_newton import refine
 from magloc.localization.fit.optima import Optima
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import DISTINCT_WITHIN
-from magloc.localization.search.beam_search import Search
+from magloc.localization.search.beam_search import BeamSearch
 from magloc.measurement.pose import PosesOfRows
 from magloc.measurement.rows import WhitenedRows, ambient_fields, channels_above_ambient, whitenings_of
 from magloc.measurement.whitened import WhitenedModel
@@ -36,21 +36,23 @@ _UNSEEN = "the rows together do not determine the source"
 def optima_at_rest(
     rows: WhitenedRows, prior: SourcePrior = NOTHING_KNOWN, errors: Callable[[FloatArray], FloatArray] | None = None
 ) -> Optima:
-    """Distinct optima of a source at rest by :func:`stacked_rows`; `prior` bounds its position in the world frame.
+    """Return distinct optima of a source at rest, by :func:`stacked_rows`.
+
+    `prior` bounds its position in the world frame.
 
     `errors`, columns (b, C, n) in units of the noise for a source (6,), count as noise: they are linearised at the best
     optimum, for a search of its own and then until they stay.
     """
-    rows = rows.knowing(prior.known_moment)
-    optima = _found(rows, prior)
+    rows = rows.with_known_moment(prior.known_moment)
+    optima = _search(rows, prior)
     for step in range(_ROUNDS if errors is not None else 0):
         if errors is None or not np.isfinite(optima.fits.chi2[:1]).any():
             break
         best = optima.fits.rows(np.zeros(1, dtype=np.intp))
         place = [rows.model.position(best.q)[0, 0], rows.model.moment(best.q, best.mu)[0, 0]]
-        noisy = rows.marginalised(errors(np.concatenate(place)))
+        noisy = rows.marginalise(errors(np.concatenate(place)))
         if step == 0:
-            optima = _found(noisy, prior)
+            optima = _search(noisy, prior)
             continue
         start = optima.fits
         every = np.zeros(len(start.chi2), dtype=np.intp)
@@ -59,10 +61,10 @@ def optima_at_rest(
     return optima
 
 
-def _found(rows: WhitenedRows, prior: SourcePrior) -> Optima:
-    """The optima of one search."""
+def _search(rows: WhitenedRows, prior: SourcePrior) -> Optima:
+    """Return the optima of one search."""
     model, allowed = rows.model, partial(prior.allows, rows.model)
-    beam = Search(model.homogeneous(_candidates(model)), allowed, width=_WIDTH).first(model, rows.y)
+    beam = BeamSearch(model.homogeneous(_candidates(model)), allowed, width=_WIDTH).first_sources(model, rows.y)
     fits = beam.rows(0)
     listed = np.flatnonzero(np.isfinite(fits.chi2) & (fits.chi2 <= fits.chi2[0] + DISTINCT_WITHIN))
     of_row = np.zeros(len(listed), dtype=np.intp)
@@ -72,7 +74,10 @@ def _found(rows: WhitenedRows, prior: SourcePrior) -> Optima:
 def stacked_errors(
     poses: PosesOfRows, readings_T: FloatArray, ambient_T: FloatArray | None
 ) -> Callable[[FloatArray], FloatArray]:
-    """What errors of the poses add to :func:`stacked_rows`: columns (1, C n, k) in units of the noise, of a source."""
+    """Return a function for the effect (1, C n, k) of pose errors on :func:`stacked_rows`.
+
+    In units of the noise, for a source.
+    """
     array = poses.array
     fields = ambient_fields(array, len(readings_T), ambient_T)
     masks = np.isfinite(readings_T)
@@ -92,7 +97,7 @@ def stacked_rows(
     R_world_from_array: FloatArray,
     ambient_T: FloatArray | None = None,
 ) -> WhitenedRows:
-    """Rows (n, C) of an array whose pose in the world is known as one row of a large array in the world frame."""
+    """Return rows (n, C) of a moving array as one row of a large array in the world frame."""
     n, available = len(readings_T), np.isfinite(readings_T)
     whitenings = [whitenings_of(array, mask, row) for mask, row in zip(available, readings_T, strict=True)]
     fields = ambient_fields(array, n, ambient_T)
@@ -126,13 +131,13 @@ def stacked_rows(
         readings_T.reshape(1, -1),
         model,
         raw[None],
-        model.whitened(raw[None]),
+        model.whiten(raw[None]),
         sum(w.n_differences for w in whitenings),
     )
 
 
 def _candidates(problem: WhitenedModel) -> FloatArray:
-    """Positions around the track of the array: along directions from the centroid, and near every place of it."""
+    """Return positions along the array's track: by direction, and near every place."""
     ranges = problem.radius * np.geomspace(0.3, 20.0, _N_RANGES)
     outer = problem.centroid + (ranges[:, None, None] * fibonacci_directions(_N_DIRECTIONS)).reshape(-1, 3)
     places = problem.centroid + problem.radius * problem.sensors

@@ -1,4 +1,4 @@
-"""Search for several dipoles at once, by any sensors: how many there are, and where.
+"""Search for several dipoles by any sensors: their number and positions.
 
 One source is searched for, then another in what the first leaves, and so on; all sources are refined together and the
 best three distinct fits go on. A source is only added where it lowers χ² by more than a threshold: the larger one of
@@ -25,7 +25,7 @@ from magloc.localization.fit.gauss_newton import JointFits, covariances, refine
 from magloc.localization.fit.optima import Optima
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import DISTINCT_WITHIN
-from magloc.localization.search.beam_search import Search, best_distinct, merged
+from magloc.localization.search.beam_search import BeamSearch, best_distinct, merge
 from magloc.localization.search.candidates import LastBases, allowed_positions, fine_positions, linear_scores
 from magloc.measurement.rows import WhitenedRows, check_magnitudes, whitenings_of
 
@@ -34,9 +34,9 @@ _N_DRAWS = 5_000
 _MOST_RESTARTS = 20
 # What noise never lowers χ² by: with six degrees of freedom once in 10¹¹ places, of which an array has not a million.
 _BEYOND_NOISE = 60.0
-# Where a source less costs so many times that, restarts do not find a fit that does without it.
+# Where removing a source costs so many times that, restarts find no fit without it.
 _FAR_BEYOND = 10.0
-# Squares, in units of their covariance, of a moment that is hardly known and of an offset that hardly is one.
+# Squared moment and squared offset, over their covariance, below which they are hardly significant.
 _FAINT = 40.0
 _NEAR = 150.0
 _MOST_BY_ITSELF = 5
@@ -45,12 +45,12 @@ NOISE_ALONE = "noise alone explains the readings: no source stands out of it"
 
 
 def most_sources(n_differences: int) -> int:
-    """Largest number of sources that leaves a degree of freedom."""
+    """Return the largest number of sources that leaves a degree of freedom."""
     return (n_differences - 1) // N_UNKNOWNS
 
 
 class MultiSourceSearch:
-    """Optima of several sources, by any sensors, without a start.
+    """Search for several sources, by any sensors, without a start.
 
     Parameters
     ----------
@@ -100,18 +100,18 @@ class MultiSourceSearch:
         self._candidates = allowed_positions(array, prior, fine_positions(array))
 
     def optima(self, rows: WhitenedRows) -> list[Optima]:
-        """Distinct optima with the chosen number of sources: one entry for every number."""
-        return _Levels(self, rows.knowing(self.prior.known_moment)).optima()
+        """Return distinct optima, one entry for every chosen number of sources."""
+        return _Levels(self, rows.with_known_moment(self.prior.known_moment)).optima()
 
     def threshold_of(self, levels: _Levels) -> float:
-        """The threshold for another source, drawn once for every number of differences."""
+        """Return the threshold for another source, cached by the number of differences."""
         if levels.n_differences not in self._thresholds:
             self._thresholds[levels.n_differences] = levels.threshold()
         return self._thresholds[levels.n_differences]
 
 
 class _Levels:
-    """The search over numbers of sources for one block of rows."""
+    """Search over the number of sources for one block of rows."""
 
     def __init__(self, locator: MultiSourceSearch, rows: WhitenedRows) -> None:
         self.locator, self.rows, self.n_differences = locator, rows, rows.n_differences
@@ -122,7 +122,7 @@ class _Levels:
         self.penalty = N_UNKNOWNS * math.log(self.n_differences)
 
         # A single source is listed with all its solutions, several ones with those of the beam.
-        self.search = Search(
+        self.search = BeamSearch(
             rows.model.homogeneous(locator._candidates),
             partial(locator.prior.allows, rows.model),
             width=8 if self.most == 1 else 3,
@@ -131,34 +131,34 @@ class _Levels:
         )
 
     def optima(self) -> list[Optima]:
-        """Optima with the chosen number of sources of every row: one entry for every number."""
+        """Return optima with the chosen number of sources, one entry for every number."""
         everything = np.arange(len(self.y))
         self.one = self._first(everything)
         beams: list[JointFits] = [self.one]
         level = np.zeros(len(self.y), dtype=np.intp)
-        weak = self._weak()
+        weak = self._is_weak()
         rows = everything[~weak]
         while len(beams) < self.most:
             if self.asked is None:
-                rows = rows[self._worth_another(rows, beams[-1].rows(rows))]
+                rows = rows[self._may_have_another(rows, beams[-1].rows(rows))]
             if not rows.size:
                 break
             before = beams[-1].rows(rows)
             last = len(beams) + 1 == self.most
             credible = self._quantile(len(beams) + 1, CREDIBLE_FIT)
             ends = last and self.locator.prior == NOTHING_KNOWN
-            wider = self.search.one_more(
+            wider = self.search.add_source(
                 self.problem.rows(rows), self.y[rows], before, credible=credible if ends else 0.0
             )
             gained = self._stands_out(before.chi2[:, 0], wider.chi2[:, 0])
-            # Where no number of sources is credible so far, the search failed, at this number or at an earlier one.
+            # No number of sources is credible so far: the search failed at this number or an earlier one.
             failed = np.flatnonzero(~(wider.chi2[:, 0] <= credible) & (last | ~gained))
             if failed.size:
-                wider = wider.replaced(failed, self._restarted(rows[failed], wider.rows(failed)))
+                wider = wider.replace(failed, self._restart(rows[failed], wider.rows(failed)))
                 gained = self._stands_out(before.chi2[:, 0], wider.chi2[:, 0])
             # The other rows have no fit.
             nowhere = JointFits.none((len(self.y), wider.chi2.shape[1]), wider.n_sources)
-            beams.append(nowhere.replaced(rows, wider))
+            beams.append(nowhere.replace(rows, wider))
             rows = rows if self.asked is not None else rows[gained]
             level[rows] = len(beams) - 1
         wanted = level.copy()
@@ -167,13 +167,13 @@ class _Levels:
             at = np.flatnonzero(level == n)
             if not at.size:
                 continue
-            fewer = merged(
-                beams[n - 1].rows(at), self.search.one_less(self.problem.rows(at), self.y[at], beams[n].rows(at))
+            fewer = merge(
+                beams[n - 1].rows(at), self.search.remove_source(self.problem.rows(at), self.y[at], beams[n].rows(at))
             )
             close = np.flatnonzero(fewer.chi2[:, 0] < beams[n].chi2[at, 0] + _FAR_BEYOND * _BEYOND_NOISE)
             if n > 1 and close.size:
-                fewer = fewer.replaced(close, self._restarted(at[close], fewer.rows(close), rounds=2))
-            beams[n - 1] = beams[n - 1].replaced(at, fewer)
+                fewer = fewer.replace(close, self._restart(at[close], fewer.rows(close), rounds=2))
+            beams[n - 1] = beams[n - 1].replace(at, fewer)
             superfluous = ~self._stands_out(fewer.chi2[:, 0], beams[n].chi2[at, 0])
             unresolved = self._has_unresolved_pair(at, beams[n].rows(at))
             level[at[superfluous | unresolved]] = n - 1
@@ -184,7 +184,7 @@ class _Levels:
             chosen = np.array([beams[n].chi2[row, 0] for row, n in enumerate(level)])
             alone = weak | (np.isfinite(chosen) & ~self._stands_out(self.rows.energy, chosen))
         return [
-            self._listed(
+            self._list_optima(
                 n,
                 np.flatnonzero(level == n),
                 beams,
@@ -197,16 +197,19 @@ class _Levels:
         ]
 
     def _first(self, rows: IntArray) -> JointFits:
-        beam = self.search.first(self.problem, self.y)
+        beam = self.search.first_sources(self.problem, self.y)
         doubtful = rows[beam.chi2[:, 0] > self._quantile(1, CREDIBLE_FIT)]
         if doubtful.size and self.most == 1:
             wide = replace(self.search, n_starts=5 * self.search.n_starts, apart_rad=0.4 * self.search.apart_rad)
-            again = wide.first(self.problem.rows(doubtful), self.y[doubtful])
-            beam = beam.replaced(doubtful, merged(beam.rows(doubtful), again))
+            again = wide.first_sources(self.problem.rows(doubtful), self.y[doubtful])
+            beam = beam.replace(doubtful, merge(beam.rows(doubtful), again))
         return beam
 
     def _stands_out(self, before: FloatArray, after: FloatArray) -> BoolArray:
-        """Whether χ² falls by more than the threshold for another source, which is drawn where some are near to it."""
+        """Return whether χ² falls by more than the threshold for another source.
+
+        The threshold is drawn only if some falls are near to it.
+        """
         with np.errstate(invalid="ignore"):
             fall = before - after
             found: BoolArray = fall > max(self.penalty, _BEYOND_NOISE)
@@ -215,8 +218,8 @@ class _Levels:
             found[near] = fall[near] > self.locator.threshold_of(self)
         return found
 
-    def _weak(self) -> BoolArray:
-        """Rows decided without a search for more: neither their energy nor the best source stands out of noise."""
+    def _is_weak(self) -> BoolArray:
+        """Return whether rows need no search for more: only noise is left."""
         if self.asked is not None or self.most == 1:
             return np.zeros(len(self.y), dtype=bool)
         energy = self.rows.energy
@@ -225,26 +228,29 @@ class _Levels:
         weak[faint] = ~self._stands_out(energy[faint], self.one.chi2[faint, 0])
         return weak
 
-    def _worth_another(self, rows: IntArray, beam: JointFits) -> BoolArray:
-        """Whether another source might pay: a suspicious χ², or a candidate that explains much of what is left."""
+    def _may_have_another(self, rows: IntArray, beam: JointFits) -> BoolArray:
+        """Return whether another source might pay.
+
+        χ² is suspicious, or a candidate explains much of the residual.
+        """
         suspicious = ~(beam.chi2[:, 0] <= self._quantile(beam.n_sources, SUSPICIOUS_FIT))
         clean = np.flatnonzero(~suspicious)
         if clean.size:
-            scores = self.search.left_scores(
+            scores = self.search.residual_scores(
                 self.problem.rows(rows[clean]), self.y[rows[clean]], beam.q[clean, 0], beam.mu[clean, 0]
             )
             suspicious[clean] = scores.max(axis=1) > 0.5 * self.penalty
         return suspicious
 
-    def _restarted(self, rows: IntArray, beam: JointFits, rounds: int = _MOST_RESTARTS) -> JointFits:
-        """Beams of rows, with random sources replaced until the best fit is credible."""
+    def _restart(self, rows: IntArray, beam: JointFits, rounds: int = _MOST_RESTARTS) -> JointFits:
+        """Return beams with random sources replaced until the best fit is credible."""
         credible = self._quantile(beam.n_sources, CREDIBLE_FIT)
         for _ in range(rounds):
             bad = np.flatnonzero(~(beam.chi2[:, 0] <= credible))
             if not bad.size:
                 break
-            again = self.search.restarted(self.problem.rows(rows[bad]), self.y[rows[bad]], beam.rows(bad), self.rng)
-            beam = beam.replaced(bad, again)
+            again = self.search.restart(self.problem.rows(rows[bad]), self.y[rows[bad]], beam.rows(bad), self.rng)
+            beam = beam.replace(bad, again)
         return beam
 
     def _quantile(self, n_sources: int, level: float) -> float:
@@ -252,7 +258,9 @@ class _Levels:
         return float(chdtri(dof, 1.0 - level)) if dof > 0 else 1e-6
 
     def threshold(self) -> float:
-        """By how much χ² must fall for another source: what noise reaches in one of a thousand rows, or BIC's penalty.
+        """Return the decrease of χ² that another source needs.
+
+        The larger one of BIC's penalty and of what noise reaches in one of a thousand rows.
 
         Noise is drawn around the best fit of all rows; only the loudest draws, where a candidate explains most, are
         searched for a second source: many more than stay above the threshold, as candidates stand far apart.
@@ -268,7 +276,7 @@ class _Levels:
         q, mu = beam.q[row[:1], 0], beam.mu[row[:1], 0]
         fields = at.source_fields(q, mu)
         noise = rng.normal(size=(_N_DRAWS, self.y.shape[1])) * np.any(at.gain[0] != 0.0, axis=-1)
-        draws = at.predicted(fields) + problem.whitened(noise)
+        draws = at.predict(fields) + problem.whiten(noise)
         bases = self.search.bases_of(at, at.linear_gain(fields)[0], 0)
         loudness = np.concatenate([linear_scores(bases, part).max(axis=1) for part in np.array_split(noise, 20)])
         loud = np.argsort(-loudness)[: int(40 * FALSE_ALARM * _N_DRAWS)]
@@ -277,14 +285,14 @@ class _Levels:
         one = refine(problem, draws, q[np.zeros(loud.size, dtype=np.intp)], mu[np.zeros(loud.size, dtype=np.intp)])
         first = best_distinct(one, loud.size, 1)
         with np.errstate(invalid="ignore"):  # where neither has converged
-            fall = first.chi2[:, 0] - search.one_more(problem, draws, first).chi2[:, 0]
+            fall = first.chi2[:, 0] - search.add_source(problem, draws, first).chi2[:, 0]
         fall = np.sort(fall[np.isfinite(fall)])
         # Another draw falls by more than the k-th largest of n with probability k / (n + 1).
         k = int(FALSE_ALARM * (_N_DRAWS + 1))
         return max(self.penalty, float(fall[-k])) if fall.size >= k else self.penalty
 
     def _has_unresolved_pair(self, rows: IntArray, beam: JointFits) -> BoolArray:
-        """Whether a source of the best fit is hardly known beside another one, so that other pairs would do as well.
+        """Return whether the best fit has a pair of sources that cannot be resolved.
 
         Its moment is not far from nothing, and its place not far from the other's, both by their own covariance. In
         such a fit χ² has curved valleys and several optima, and the covariance of one of them says far too little.
@@ -306,7 +314,7 @@ class _Levels:
                 unresolved |= faint & near
         return unresolved
 
-    def _listed(
+    def _list_optima(
         self,
         n: int,
         rows: IntArray,
@@ -315,7 +323,10 @@ class _Levels:
         certain: BoolArray,
         noise_alone: BoolArray,
     ) -> Optima:
-        """What is listed of the rows with n + 1 sources; `fewer`: that is fewer than were asked for, or seen."""
+        """Return the listed optima of the rows with n + 1 sources.
+
+        `fewer`: whether that is fewer than were asked for, or seen.
+        """
         beam = beams[n].rows(rows)
         listed = np.isfinite(beam.chi2) & (beam.chi2 <= beam.chi2[:, :1] + DISTINCT_WITHIN)
         listed[noise_alone[rows]] = False
@@ -328,13 +339,15 @@ class _Levels:
                 reason[i] = NOISE_ALONE
             elif fewer[row] and listed[i].any():
                 best = int(np.searchsorted(of_row, i))
-                reason[i], merged[best] = self._merged(
+                reason[i], merged[best] = self._closest_pair(
                     fits.q[best], fits.mu[best], beams[n + 1], row, bool(certain[row])
                 )
-        return Optima(self.rows.chosen(rows), fits, of_row, reason, merged)
+        return Optima(self.rows.select(rows), fits, of_row, reason, merged)
 
-    def _merged(self, q: FloatArray, mu: FloatArray, more: JointFits, row: int, certain: bool) -> tuple[str, BoolArray]:
-        """Why a row has fewer sources, and which of them stands for the closest pair of the larger fit."""
+    def _closest_pair(
+        self, q: FloatArray, mu: FloatArray, more: JointFits, row: int, certain: bool
+    ) -> tuple[str, BoolArray]:
+        """Return why a row has fewer sources, and which one stands for the closest pair."""
         n = len(q)
         reason = f"the readings support {n} source{'s' if n > 1 else ''}"
         reason += "" if self.asked is None else f", {self.asked} were asked for"

@@ -26,26 +26,26 @@ from magloc.localization.fit.results import DISTINCT_WITHIN
 from magloc.localization.search.candidates import (
     SingleArray,
     allowed_positions,
-    chosen_candidates,
+    best_candidates,
     linear_bases,
-    orthonormal_without,
+    orthonormalisation_without,
     start_separation,
 )
-from magloc.localization.search.kernels import Ends, search_optima
+from magloc.localization.search.kernels import LocalOptima, search_optima
 from magloc.measurement.rows import WhitenedRows, channels_above_ambient, check_magnitudes, check_spans, whitened_rows
 from magloc.measurement.whitened import WhitenedModel
 
 N_UNKNOWNS = 6
 _MORE = 3  # times the starts where none of them explains a row
-# Share of the channels up to which a mask without them ranks candidates by the bases of all.
+# Largest share of missing channels for which candidates are ranked by the bases of all channels.
 _MOST_MISSING = 0.4
-# What the common field leaves of directions of missing channels that tell nothing else.
+# Singular value below which a direction of missing channels only sees the common field.
 _UNSEEN = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class BestFits:
-    """The best optima found from many starts, without their uncertainty.
+    """Best optima from many starts, without uncertainty.
 
     Attributes
     ----------
@@ -64,10 +64,10 @@ class BestFits:
 
 @dataclass(frozen=True, eq=False)
 class _Ranking:
-    """All candidates, and their bases (C, 3 n) under the whitening of a mask, by which its rows rank them.
+    """Candidates and their bases (C, 3 n) under the whitening of a mask.
 
-    Of a mask that lacks few channels the whitening and the bases are those of all channels. What the others read counts
-    as unknown: the candidates' components are made `orthonormal` (6, n) without the directions `lost` (C, k).
+    If few channels are missing, the whitening and the bases are those of all channels, and missing readings count as
+    unknown: `orthonormal` (6, n) makes the candidates' components orthonormal without the directions `lost` (C, k).
     """
 
     whitening: Whitening
@@ -77,7 +77,7 @@ class _Ranking:
     orthonormal: SingleArray | None = None
 
     def without(self, missing: BoolArray) -> _Ranking:
-        """The ranking of rows that miss some channels (C,), from that of all."""
+        """Return the ranking for rows that miss some channels (C,)."""
         basis, shrinkage, root = self.whitening.basis, self.whitening.shrinkage, self.whitening.root[:, missing]
         unit = (root / np.linalg.norm(root, axis=0)).T
         left, singular, lost = np.linalg.svd(unit - ((unit @ basis) * shrinkage) @ basis.T, full_matrices=False)
@@ -86,7 +86,7 @@ class _Ranking:
         bases = turned[:, touched].astype(np.float32) @ self.bases[touched]
         if not (shrinkage >= 1.0).all():  # bases are orthogonal to a common field that is unknown
             bases -= (turned @ basis * shrinkage).astype(np.float32) @ self.common
-        return replace(self, lost=lost[seen].T, orthonormal=orthonormal_without(bases))
+        return replace(self, lost=lost[seen].T, orthonormal=orthonormalisation_without(bases))
 
     @cached_property
     def common(self) -> SingleArray:
@@ -94,14 +94,14 @@ class _Ranking:
         common: SingleArray = self.whitening.basis.T.astype(np.float32) @ self.bases
         return common
 
-    def whitened(self, channels: FloatArray) -> FloatArray:
-        """Readings (b, C) above the ambient field as they are ranked."""
+    def whiten(self, channels: FloatArray) -> FloatArray:
+        """Whiten readings (b, C) above the ambient field for the ranking."""
         whole = self.whitening.apply(channels)
         return whole if self.lost is None else whole - (whole @ self.lost) @ self.lost.T
 
 
 class SingleSourceSearch:
-    """Distinct optima of one source, by an array of vector sensors.
+    """Search for one source, by an array of vector sensors.
 
     Parameters
     ----------
@@ -148,21 +148,21 @@ class SingleSourceSearch:
         self._kept: tuple[bytes, _Ranking] | None = None
 
     def optima(self, rows: WhitenedRows) -> list[Optima]:
-        """Distinct optima of every row within Δχ² = 20 of its best one that the prior allows."""
+        """Return all allowed optima of every row within Δχ² = 20 of its best one."""
         everything = self._everything
         keep_within = DISTINCT_WITHIN if everything else math.inf
-        found = self.ends(rows, np.arange(len(rows)), self.starts(rows), keep_within)
+        found = self.refine_starts(rows, np.arange(len(rows)), self.starts(rows), keep_within)
         credible = found.chi2[:, 0] <= quantile(rows.n_differences - N_UNKNOWNS, 1.0 - CREDIBLE_FIT)
         if np.count_nonzero(credible) < len(rows):
             doubtful = np.flatnonzero(~credible)
-            some = rows.chosen(doubtful)
-            more = self.ends(some, np.arange(len(some)), self.starts(some, _MORE * self.n_starts), keep_within)
+            some = rows.select(doubtful)
+            more = self.refine_starts(some, np.arange(len(some)), self.starts(some, _MORE * self.n_starts), keep_within)
             for values, others in zip(found, more, strict=True):
                 values[doubtful] = others[:, : values.shape[1]]
             np.minimum(found.counts[:, 0], self.n_starts, out=found.counts[:, 0])
         unknown = found.counts[:, 0]
         if not everything:
-            found = self._known(rows.model, found)
+            found = self._apply_prior(rows.model, found)
         kept = found.counts[:, 0].tolist()
         of_row = np.arange(len(rows)).repeat(kept)
         # Of a row alone a slice: a table of what is listed takes longer than all else here.
@@ -175,12 +175,15 @@ class SingleSourceSearch:
         return [Optima(rows, fits, of_row, reason, failed_starts=found.counts[:, 1])]
 
     def optima_from(self, readings_T: ArrayLike, starts_m: ArrayLike) -> BestFits:
-        """Best optimum of readings (C,) for every start (n, 3) [m], refined beside the candidates; without prior."""
+        """Return the best optimum of readings (C,) for every start (n, 3) [m].
+
+        Starts are refined beside the candidates, without prior.
+        """
         (rows,) = whitened_rows(self.array, np.asarray(readings_T, dtype=np.float64)[None], None, 1)
         first = rows.model.homogeneous(np.asarray(starts_m, dtype=np.float64))[:, None]
         reading_of_row = np.zeros(len(first), dtype=np.intp)
         starts = np.concatenate([first, self.starts(rows)[reading_of_row]], axis=1)
-        found = self.ends(rows, reading_of_row, starts, DISTINCT_WITHIN)
+        found = self.refine_starts(rows, reading_of_row, starts, DISTINCT_WITHIN)
         return BestFits(
             position_m=rows.model.position(found.q[:, 0]),
             moment_Am2=rows.model.moment(found.q[:, 0], found.mu[:, 0]),
@@ -189,7 +192,7 @@ class SingleSourceSearch:
         )
 
     def _ranking(self, mask: BoolArray) -> _Ranking:
-        """Bases are large, and dear: those of all channels are kept, and the last of what is made of them."""
+        """Return the ranking under a mask; the large bases are cached."""
         key, few = mask.tobytes(), np.count_nonzero(~mask) <= _MOST_MISSING * mask.size
         if few and self._of_all is None:
             self._of_all = self._ranking_by(np.ones_like(mask))
@@ -206,31 +209,31 @@ class SingleSourceSearch:
         return _Ranking(of_mask, candidates, linear_bases(model, model.gain[0], 0, candidates))
 
     def starts(self, rows: WhitenedRows, n_starts: int | None = None) -> FloatArray:
-        """Distinct candidates (b, n_starts, 4) that explain most of every row."""
+        """Return distinct candidates (b, n_starts, 4) that explain most of every row."""
         ranking = self._ranking(rows.mask)
         ranked = rows.y
         if self.array.noise_depends_on_reading or ranking.lost is not None:
             channels = channels_above_ambient(self.array, rows.mask, rows.readings_T, rows.model.ambient)
-            ranked = ranking.whitened(channels)
+            ranked = ranking.whiten(channels)
         number = self.n_starts if n_starts is None else n_starts
-        chosen = chosen_candidates(
-            ranking.bases, ranked, ranking.candidates, number, self.apart_rad, ranking.orthonormal
-        )
+        chosen = best_candidates(ranking.bases, ranked, ranking.candidates, number, self.apart_rad, ranking.orthonormal)
         best: FloatArray = ranking.candidates[chosen]
         return best
 
-    def ends(self, rows: WhitenedRows, reading_of_row: IntArray, starts: FloatArray, keep_within: float) -> Ends:
-        """Distinct optima that starts (n, k, 4) lead to, each of the reading of some row."""
+    def refine_starts(
+        self, rows: WhitenedRows, reading_of_row: IntArray, starts: FloatArray, keep_within: float
+    ) -> LocalOptima:
+        """Return distinct optima from starts (n, k, 4), each for the reading of some row."""
         return search_optima(rows.model, rows.signals, reading_of_row, starts, None, keep_within, self.max_iterations)
 
-    def _known(self, model: WhitenedModel, found: Ends) -> Ends:
-        """Optima that agree with what is known, again those within Δχ² of the best of them."""
+    def _apply_prior(self, model: WhitenedModel, found: LocalOptima) -> LocalOptima:
+        """Return the optima that agree with the prior, within Δχ² of the best of them."""
         chi2 = np.where(self.prior.allows(model, found.q, found.mu), found.chi2, np.inf)
         order = np.argsort(chi2, axis=1, kind="stable")
         chi2 = np.take_along_axis(chi2, order, axis=1)
         counts = found.counts.copy()
         counts[:, 0] = (np.isfinite(chi2) & (chi2 <= chi2[:, :1] + DISTINCT_WITHIN)).sum(axis=1)
-        return Ends(
+        return LocalOptima(
             np.take_along_axis(found.q, order[..., None], axis=1),
             np.take_along_axis(found.mu, order[..., None], axis=1),
             chi2,
@@ -240,8 +243,8 @@ class SingleSourceSearch:
 
 
 @lru_cache(maxsize=2)  # candidates' bases, which are large, take longer than a fix
-def kept_search(array: SensorArray) -> SingleSourceSearch:
-    """The search by one of the last arrays, where nothing is known: readings that come one by one have one."""
+def cached_search(array: SensorArray) -> SingleSourceSearch:
+    """Return the cached search of a recent array without prior, for readings one by one."""
     return SingleSourceSearch(array)
 
 

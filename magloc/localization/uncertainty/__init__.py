@@ -1,1 +1,1 @@
-"""How certain an optimum is: covariance, other optima, range."""
+"""Uncertainty of an optimum: covariance, other optima, range."""

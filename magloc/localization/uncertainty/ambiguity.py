@@ -1,4 +1,4 @@
-"""All solutions of a row together: how likely each one is, and what their covariances are worth."""
+"""Ambiguity of a row: weights of all its solutions, and their covariances."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from magloc.localization.uncertainty.range_interval import relative_range_sigma
 LARGEST_GAUSSIAN_SIGMA = 0.04
 """Standard deviations of position and moment, over range and moment, up to which their errors are Gaussian."""
 LARGEST_BEND = 0.5
-"""By how much the rise of χ² at one standard deviation may differ from one where errors are Gaussian."""
+"""Largest deviation from one of the rise of χ² at one standard deviation, for Gaussian errors."""
 
 
 def log_evidence_volume(
     covariance: FloatArray, moment: FloatArray, offset_m: FloatArray | None = None, *, scale_m: float | None = None
 ) -> FloatArray:
-    r"""Logarithm of how much of what may be thought of beforehand a solution stands for, up to a constant: (...).
+    r"""Return the log of the prior volume (...) that a solution represents, up to a constant.
 
     Nothing is known beforehand of the scale: direction, orientation and the logarithms of range and moment are uniform,
     a density :math:`\propto r^{-3} |m|^{-3}` of position and moment. By Laplace's method a solution then stands for the
@@ -44,13 +44,19 @@ def log_evidence_volume(
 
 
 def _units(*vectors: FloatArray) -> FloatArray:
-    """Lengths of the vectors (..., K, 3) of every source, in the order of a state (..., 6 K) or (..., 3 K)."""
+    """Return lengths of the vectors (..., K, 3) of every source, in the order of a state.
+
+    States are (..., 6 K) or (..., 3 K).
+    """
     lengths = np.stack([np.linalg.norm(vector, axis=-1) for vector in vectors], axis=-1)
     return np.repeat(lengths.reshape(*lengths.shape[:-2], lengths.shape[-2] * len(vectors)), 3, axis=-1)
 
 
 def weights(chi2: ArrayLike, volume: ArrayLike) -> FloatArray:
-    r"""How likely each of the solutions (..., n) is, :math:`\propto V \exp(-\chi^2/2)`; all zero where none is."""
+    r"""Return the weights of solutions (..., n), :math:`\propto V \exp(-\chi^2/2)`.
+
+    All are zero where no solution is.
+    """
     values = np.asarray(volume, dtype=np.float64) - 0.5 * np.asarray(chi2, dtype=np.float64)
     best = values.max(axis=-1, keepdims=True)
     relative = np.exp(values - np.where(np.isfinite(best), best, 0.0))
@@ -58,7 +64,7 @@ def weights(chi2: ArrayLike, volume: ArrayLike) -> FloatArray:
 
 
 def relative_sigma(covariance: FloatArray, offset_m: FloatArray, moment: FloatArray) -> FloatArray:
-    """Larger one of the standard deviations of position and moment (..., 6, 6), over the range and the moment."""
+    """Return the larger relative σ of position over range and moment, of (..., 6, 6)."""
     variance = np.diagonal(covariance, axis1=-2, axis2=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
         parts = [
@@ -69,16 +75,18 @@ def relative_sigma(covariance: FloatArray, offset_m: FloatArray, moment: FloatAr
 
 
 def longest_axes(covariance: FloatArray, offset_m: FloatArray, moment: FloatArray) -> FloatArray:
-    """Longest half axes (..., 6 K) of ellipsoids of one σ, lengths being in units of ranges and moments."""
+    """Return the longest semi-axes (..., 6 K) of 1σ ellipsoids, scaled by range and moment."""
     unit = _units(offset_m, moment)
     variance, axis = np.linalg.eigh(covariance / (unit[..., :, None] * unit[..., None, :]))
     return unit * axis[..., -1] * np.sqrt(np.maximum(variance[..., -1:], 0.0))
 
 
-def widened(
+def widen(
     covariance: FloatArray, offset_m: FloatArray, low_m: FloatArray, high_m: FloatArray, source: int = 0
 ) -> FloatArray:
-    """Covariances (..., 6 K, 6 K) that are as long as the set of ranges of one source, where that is not observable.
+    """Return covariances (..., 6 K, 6 K) as long as the set of ranges of one source.
+
+    For ranges that are not observable.
 
     The state follows the range along :math:`w = C e / e^T C e`, with e the gradient of the range: it is there that
     variance is added. Given the range, all else is as certain as before. The 95 % interval then reaches the farther end

@@ -1,4 +1,4 @@
-"""How well the sources of optima are known: covariances, sets of ranges, and weights of the solutions.
+"""Uncertainty of sources: covariances, sets of ranges, and weights of the solutions.
 
 Of a single source all solutions of a row are taken together (:mod:`magloc.localization.uncertainty.range_interval`).
 Several sources have no common range: each has its own ranges in each solution, where the profile of χ² stays within
@@ -30,12 +30,12 @@ from magloc.localization.uncertainty.ambiguity import (
     longest_axes,
     relative_sigma,
     weights,
-    widened,
+    widen,
 )
 from magloc.localization.uncertainty.moment_covariance import moment_covariances
 from magloc.localization.uncertainty.range_interval import (
     OUTSIDE,
-    left_of_detected,
+    detection_statistic,
     levels,
     ranges_of,
     relative_range_sigma,
@@ -48,8 +48,8 @@ from magloc.localization.uncertainty.range_profile import profile_stretches, ran
 _LINEARISATIONS = 20
 
 
-class _Known(NamedTuple):
-    """What is known of f fits of K sources: the columns of :class:`Solutions` of these names."""
+class _FitColumns(NamedTuple):
+    """Columns of :class:`Solutions` for f fits of K sources."""
 
     position_m: FloatArray
     moment_Am2: FloatArray
@@ -60,15 +60,15 @@ class _Known(NamedTuple):
 
 
 def solutions_of(optima: Optima, detected: BoolArray) -> Solutions:
-    """Solutions of the rows of optima: those whose covariance is finite, with what is known of them."""
+    """Return the solutions of optima with a finite covariance."""
     model, fits = optima.rows.model, optima.fits
     n_fits, n_sources = fits.q.shape[:2]
     if optima.position_m is not None:
-        known = _of_known_position(optima, optima.position_m)
+        known = _known_position_columns(optima, optima.position_m)
     elif n_sources > 1 or model.sees_moduli or model.known is not None:
-        known = known_of(optima, detected)
+        known = fit_columns(optima, detected)
     else:
-        known = known_of_one_compiled(optima)
+        known = single_source_columns(optima)
     of_moments, n_known = np.zeros(n_fits), np.zeros(n_fits, dtype=np.intp)
     if model.known is not None:
         moments = model.known.residual(known.moment_Am2)
@@ -90,14 +90,14 @@ def solutions_of(optima: Optima, detected: BoolArray) -> Solutions:
         n_known=n_known,
     )
     finite = np.isfinite(known.covariance)
-    return every if np.count_nonzero(finite) == finite.size else every.chosen(np.asarray(finite.all(axis=(1, 2))))
+    return every if np.count_nonzero(finite) == finite.size else every.select(np.asarray(finite.all(axis=(1, 2))))
 
 
 def covariance_is_valid(optima: Optima, covariance: FloatArray, which: IntArray) -> BoolArray:
-    """Whether covariances (f, 6 K, 6 K) of some fits describe their errors, as far as the model tells.
+    """Return whether covariances (f, 6 K, 6 K) describe the errors of some fits.
 
-    They do where χ² is one of noise, and rises by one, give or take a half, at one standard deviation along the longest
-    axis, to either side: not where the errors follow a curve. With no degrees of freedom every χ² is as it must be.
+    They do where χ² agrees with noise and rises by about one (0.5 to 1.5) at one standard deviation along the longest
+    axis, on both sides: not where the errors follow a curve. Without degrees of freedom χ² is not tested.
     """
     fits, of_row = optima.fits.rows(which), optima.of_row[which]
     problem, y = optima.rows.model.rows(of_row), optima.rows.y[of_row]
@@ -113,11 +113,14 @@ def covariance_is_valid(optima: Optima, covariance: FloatArray, which: IntArray)
     return np.asarray(described)
 
 
-def known_of(optima: Optima, detected: BoolArray) -> _Known:
-    """What is known of sources at unknown places: a single one has its ranges from all solutions of a row together."""
+def fit_columns(optima: Optima, detected: BoolArray) -> _FitColumns:
+    """Return the columns of fits at unknown positions.
+
+    The range of a single source comes from all solutions of its row together.
+    """
     rows, fits, of_row = optima.rows, optima.fits, optima.of_row
     model = rows.model.rows(of_row)
-    understated = _understated(optima)[of_row]
+    understated = _noise_factor(optima)[of_row]
     covariance = covariances(model, fits) * understated[:, None, None]
     position, moment = model.position(fits.q), model.moment(fits.q, fits.mu)
     offset = position - model.centroid
@@ -126,7 +129,7 @@ def known_of(optima: Optima, detected: BoolArray) -> _Known:
     told = np.where(np.isfinite(covariance).all(axis=(1, 2)), fits.chi2 / understated, np.inf)
     weight = _weights_of_rows(of_row, told, volume)
     if fits.n_sources == 1:
-        sets = _sets_of_rows(optima, covariance, told, weight)[of_row, None]
+        sets = _range_sets(optima, covariance, told, weight)[of_row, None]
     else:
         ends = [
             ranges_within(model, rows.y[of_row], fits, k, covariance, DELTA_CHI2_95 * understated)
@@ -141,20 +144,20 @@ def known_of(optima: Optima, detected: BoolArray) -> _Known:
         sigma = relative_sigma(covariance[:, 6 * k :, 6 * k :], offset[:, k], moment[:, k])
         gaussian[:, k] &= sigma <= LARGEST_GAUSSIAN_SIGMA
         blurred = ~observable[:, k]
-        wide[blurred] = widened(wide[blurred], offset[blurred, k], low[blurred, k], high[blurred, k], k)
+        wide[blurred] = widen(wide[blurred], offset[blurred, k], low[blurred, k], high[blurred, k], k)
     claimed = np.flatnonzero(gaussian.any(axis=1))
     if claimed.size:
         gaussian[claimed] &= covariance_is_valid(optima, covariance[claimed], claimed)[:, None]
-    return _Known(position, moment, sets, wide, gaussian, weight)
+    return _FitColumns(position, moment, sets, wide, gaussian, weight)
 
 
-def _sets_of_rows(optima: Optima, covariance: FloatArray, told: FloatArray, weight: FloatArray) -> FloatArray:
-    """95 % sets (b, i, 2) of the range of a single source in every row, all solutions together."""
+def _range_sets(optima: Optima, covariance: FloatArray, told: FloatArray, weight: FloatArray) -> FloatArray:
+    """Return the 95 % range sets (b, i, 2) of single sources, over all solutions of a row."""
     rows, fits, of_row = optima.rows, optima.fits, optima.of_row
     shape, at = _places(of_row, len(rows))
     of_table, shares = np.full(shape, np.inf), np.zeros(shape)
     of_table[at], shares[at] = told, weight
-    understated, best = _understated(optima), _best_chi2(optima)
+    understated, best = _noise_factor(optima), _best_chi2(optima)
     raised = rise(rows.energy / understated, best / understated, rows.n_differences, levels(of_table, shares))
     left = (raised * understated)[of_row] - (fits.chi2 - best[of_row])
     inside = np.flatnonzero((left > 0.0) & np.isfinite(left))
@@ -165,8 +168,8 @@ def _sets_of_rows(optima: Optima, covariance: FloatArray, told: FloatArray, weig
     return union(np.where(np.isfinite(raised)[:, None, None], ranges_of(alpha, model.radius), [0.0, np.inf]))
 
 
-def known_of_one_compiled(optima: Optima) -> _Known:
-    """Return :func:`known_of` of single sources, by the kernel of vector sensors."""
+def single_source_columns(optima: Optima) -> _FitColumns:
+    """Return :func:`fit_columns` of single sources, by the kernel of vector sensors."""
     rows, fits, model = optima.rows, optima.fits, optima.rows.model
     n_fits = len(optima.of_row)
     first_fit = optima.of_row.searchsorted(np.arange(len(rows) + 1))
@@ -208,38 +211,41 @@ def known_of_one_compiled(optima: Optima) -> _Known:
     covariance *= unit[:, None]
     ranges *= model.radius
     position, moment = model.position(fits.q), model.moment(fits.q, fits.mu)
-    return _Known(position, moment, ranges, covariance, gaussian, weight)
+    return _FitColumns(position, moment, ranges, covariance, gaussian, weight)
 
 
 @lru_cache(maxsize=64)
 def _detection(n_differences: int, dof: int) -> tuple[float, FloatArray, FloatArray]:
-    """Return χ² of a misfit, and what the detection of a signal tells of its strength: both columns ascending."""
-    strength, left = left_of_detected(n_differences)
+    """Return χ² of a misfit, and the detection statistic over strengths, both ascending."""
+    strength, left = detection_statistic(n_differences)
     return quantile(dof, MISFIT), strength, np.ascontiguousarray(-left)
 
 
 def _best_chi2(optima: Optima) -> FloatArray:
-    """χ² (b,) of the best fit of every row; infinite where there is none."""
+    """Return χ² (b,) of the best fit of every row; infinite where there is none."""
     best = np.full(len(optima.rows), np.inf)
     rows, first = np.unique(optima.of_row, return_index=True)
     best[rows] = optima.fits.chi2[first]
     return best
 
 
-def _understated(optima: Optima) -> FloatArray:
-    """By how much the variance of noise is understated (b,): χ² per degree of freedom of rows that are misfits, else 1.
+def _noise_factor(optima: Optima) -> FloatArray:
+    """Return the factor (b,) of the noise variance: χ²/dof of rows that are misfits, else 1.
 
-    What a wrong model leaves is no noise, but σ that knew only the noise would be worse.
+    Residuals of a wrong model are no noise, but σ from the stated noise alone would be worse.
     """
     chi2 = _best_chi2(optima)
     return np.where(np.isfinite(chi2) & is_misfit(chi2, optima.dof), chi2 / max(optima.dof, 1), 1.0)
 
 
-def _of_known_position(optima: Optima, position_m: FloatArray) -> _Known:
-    """What is known of moments at known places (b, K, 3); the range is that of the place."""
+def _known_position_columns(optima: Optima, position_m: FloatArray) -> _FitColumns:
+    """Return the columns of moments at known positions (b, K, 3).
+
+    The range is that of the position.
+    """
     rows, fits, of_row = optima.rows, optima.fits, optima.of_row
     model, position, moment = rows.model, position_m[of_row], rows.model.moment(fits.q, fits.mu)
-    understated = _understated(optima)[of_row]
+    understated = _noise_factor(optima)[of_row]
     covariance = moment_covariances(model.rows(of_row), rows.y[of_row], fits) * understated[:, None, None]
     told = np.where(np.isfinite(covariance).all(axis=(1, 2)), fits.chi2 / understated, np.inf)
     weight = _weights_of_rows(of_row, told, log_evidence_volume(covariance, moment))
@@ -249,17 +255,17 @@ def _of_known_position(optima: Optima, position_m: FloatArray) -> _Known:
         sigma = np.sqrt(variance) / np.linalg.norm(moment, axis=2)
     gaussian = (sigma <= LARGEST_GAUSSIAN_SIGMA) | (not model.channel_is_scalar.any())
     distances = np.linalg.norm(position - model.centroid, axis=-1)
-    return _Known(position, moment, np.tile(distances[:, :, None, None], 2), covariance, gaussian, weight)
+    return _FitColumns(position, moment, np.tile(distances[:, :, None, None], 2), covariance, gaussian, weight)
 
 
 def _places(of_row: IntArray, n_rows: int) -> tuple[tuple[int, int], tuple[IntArray, IntArray]]:
-    """Shape of a table of the fits of every row, and the places of the fits in it."""
+    """Return the shape of a table of the fits of every row, and the indices of fits in it."""
     place = np.arange(len(of_row)) - np.searchsorted(of_row, of_row)
     return (n_rows, int(place.max(initial=0)) + 1), (of_row, place)
 
 
 def _weights_of_rows(of_row: IntArray, chi2: FloatArray, volume: FloatArray) -> FloatArray:
-    """:func:`weights` (f,) among the fits of every row."""
+    """Return :func:`weights` (f,) among the fits of every row."""
     shape, at = _places(of_row, int(of_row.max(initial=-1)) + 1)
     of_table, volumes = np.full(shape, np.inf), np.zeros(shape)
     of_table[at], volumes[at] = chi2, volume

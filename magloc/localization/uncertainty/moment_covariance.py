@@ -1,4 +1,4 @@
-"""Covariances of moments at known places."""
+"""Covariances of moments at known positions."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ _LEAST_EIGENVALUE = 1e-13
 
 
 def moment_covariances(problem: WhitenedModel, y: FloatArray, fits: JointFits) -> FloatArray:
-    """Inverse of half the second derivative of χ² (b, 3 K, 3 K) [A·m²], NaN where it is not positive.
+    """Return the inverse of half the Hessian of χ² (b, 3 K, 3 K) [A·m²].
+
+    NaN where it is not positive definite.
 
     Where two exact solutions are about to meet, the first derivative of the readings alone would say nothing.
     """
@@ -24,7 +26,7 @@ def moment_covariances(problem: WhitenedModel, y: FloatArray, fits: JointFits) -
     scalar = problem.channel_is_scalar
     if scalar.any():
         owner = problem.channel_sensor[scalar]
-        residual = problem.whitened(y - problem.predicted(fields))[:, scalar]
+        residual = problem.whiten(y - problem.predict(fields))[:, scalar]
         total = (fields + problem.ambient)[:, owner]
         modulus = np.linalg.norm(total, axis=-1, keepdims=True)
         units = np.eye(3 * fits.n_sources).reshape(-1, *fits.mu.shape[1:])

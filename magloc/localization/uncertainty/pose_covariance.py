@@ -1,4 +1,4 @@
-"""What errors of the array's pose add to the covariance of fixes in the world frame."""
+"""Covariance of fixes in the world frame by errors of the array's pose."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from magloc.readings import Readings
 
 
 def pose_covariances(uncertainty: PoseUncertainty, rows: Readings, solutions: Solutions) -> FloatArray:
-    """Covariances (F, n, n) to be added to those of solutions in the array's axes once they are moved to the world.
+    """Return covariances (F, n, n) by pose errors, to add to solutions moved to the world.
 
     All sources of a row share the row's errors. Of a source at a known place the moment turns.
     """

@@ -1,4 +1,4 @@
-r"""What one row of readings says of the range: the set of ranges that it allows.
+r"""Set of ranges that one row of readings allows.
 
 The 95 % set is where the profile of χ² over the range, all solutions together, is within a rise of its least value. It
 is followed as the angle :math:`\alpha = \mathrm{atan2}(s, |u|)` of homogeneous coordinates: π/2 at the sensors'
@@ -19,7 +19,7 @@ from arrays.typing import FloatArray
 from magloc.chi_square import energy_threshold
 from magloc.levels import DELTA_CHI2_95
 
-# Signals so many standard deviations above the root of the threshold are seen for certain.
+# Signals so many standard deviations above the root of the threshold are always detected.
 _CERTAIN = 8.0
 _N_STRENGTHS = 1200
 OUTSIDE = 0.05
@@ -28,18 +28,21 @@ _N_BISECTIONS = 24
 
 
 def is_detected(energy: ArrayLike, n_differences: int) -> NDArray[np.bool_]:
-    """Whether an energy stands out of noise, which alone makes readings do so in one of a thousand rows."""
+    """Return whether an energy is significant.
+
+    Noise alone reaches that in one of a thousand rows.
+    """
     return np.asarray(np.asarray(energy) > energy_threshold(n_differences))
 
 
 def rise(energy: ArrayLike, chi2: ArrayLike, n_differences: int, level: ArrayLike = DELTA_CHI2_95) -> FloatArray:
-    """By how much the profile of χ² may rise above the best solution's within the set of ranges.
+    """Return the rise of the χ² profile over the best solution within the set of ranges.
 
     The level of :func:`levels` for strong signals, more for weak ones; infinite where nothing is detected.
     """
     of_energy, wanted_rise = np.asarray(energy, dtype=np.float64), np.asarray(level, dtype=np.float64)
     explained = np.maximum(of_energy - np.asarray(chi2, dtype=np.float64), 0.0)
-    strength, left = left_of_detected(n_differences)
+    strength, left = detection_statistic(n_differences)
     best = np.sqrt(explained)
     wanted = np.asarray(np.interp(best, strength, left)) + wanted_rise
     # The table falls: turned round it gives the strength that leaves so much.
@@ -50,8 +53,11 @@ def rise(energy: ArrayLike, chi2: ArrayLike, n_differences: int, level: ArrayLik
 
 
 @lru_cache(maxsize=64)
-def left_of_detected(n_differences: int) -> tuple[FloatArray, FloatArray]:
-    """Strengths a, and D(a) of the module's docstring: it falls strictly, but for ties at the weakest."""
+def detection_statistic(n_differences: int) -> tuple[FloatArray, FloatArray]:
+    """Return strengths a, and D(a) of the module's docstring.
+
+    D falls strictly, but for ties at the weakest.
+    """
     threshold = energy_threshold(n_differences)
     largest = np.sqrt(threshold) + _CERTAIN
     strength = np.linspace(0.0, largest, _N_STRENGTHS)
@@ -61,7 +67,7 @@ def left_of_detected(n_differences: int) -> tuple[FloatArray, FloatArray]:
 
 
 def levels(chi2: FloatArray, weight: FloatArray) -> FloatArray:
-    """Rise (b,) above the best of solutions (b, n) within which 95 % of all of them are; 3.84 for a single one."""
+    """Return the rise (b,) over the best of solutions (b, n) for 95 % of all; 3.84 for one."""
     result = np.full(len(chi2), DELTA_CHI2_95)
     several = np.flatnonzero((weight > 0.0).sum(axis=1) > 1)
     if not several.size:
@@ -80,7 +86,10 @@ def levels(chi2: FloatArray, weight: FloatArray) -> FloatArray:
 
 
 def ranges_of(alpha: FloatArray, unit_m: float = 1.0) -> FloatArray:
-    """Ranges (..., 2) [m] that stretches (..., 2) of α cover; a stretch through infinity has two sides."""
+    """Return ranges (..., 2) [m] of stretches (..., 2) of α.
+
+    A stretch through infinity has two sides.
+    """
     first, last = alpha[..., 0], alpha[..., 1]
     with np.errstate(invalid="ignore", divide="ignore"):
         nearest = np.where(np.maximum(last, -first) < 0.5 * np.pi, 1.0 / np.tan(np.maximum(last, -first)), 0.0)
@@ -91,7 +100,9 @@ def ranges_of(alpha: FloatArray, unit_m: float = 1.0) -> FloatArray:
 
 
 def gaussian_ranges(covariance: FloatArray, offset_m: FloatArray, unit_m: float) -> FloatArray:
-    """95 % intervals (..., 2) [m] of the range from a covariance that begins with the position, symmetric in α.
+    """Return 95 % intervals (..., 2) [m] of the range from a covariance, symmetric in α.
+
+    The covariance begins with the position.
 
     χ² is nearly a parabola in α and not at all one in the range: so does the interval open where the source is far, to
     0 and infinity.
@@ -104,7 +115,7 @@ def gaussian_ranges(covariance: FloatArray, offset_m: FloatArray, unit_m: float)
 
 
 def union(ends: FloatArray) -> FloatArray:
-    """Disjoint intervals (b, i, 2) in ascending order from pairs (b, n, 2) that may overlap; NaN for none."""
+    """Return disjoint ascending intervals (b, i, 2) of pairs (b, n, 2); NaN for none."""
     n_rows, n = ends.shape[:2]
     each = np.arange(n_rows)[:, None]
     low, high = ends[each, np.argsort(ends[..., 0], axis=1)].transpose(2, 0, 1)
@@ -122,7 +133,10 @@ def union(ends: FloatArray) -> FloatArray:
 
 
 def relative_range_sigma(covariance: FloatArray, offset_m: FloatArray) -> FloatArray:
-    """Standard deviation of the range over the range, (...): of covariances (..., n, n) and offsets (..., 3)."""
+    """Return σ of the range over the range, (...).
+
+    From covariances (..., n, n) and offsets (..., 3).
+    """
     with np.errstate(invalid="ignore", divide="ignore"):
         variance = np.einsum("...i,...ij,...j->...", offset_m, covariance[..., :3, :3], offset_m)
         sigma: FloatArray = np.sqrt(variance) / np.sum(offset_m * offset_m, axis=-1)

@@ -1,4 +1,4 @@
-r"""How far the range of a source may be off: the profile of χ² over the range, all else fitted anew, for any sensors.
+r"""Profile of χ² over the range of a source, for any sensors; all else is fitted again.
 
 The range is followed as :math:`\alpha = \mathrm{atan2}(s, |u|)`: π/2 at the sensors' centroid, 0 at infinity, negative
 beyond it, on the other side.
@@ -19,7 +19,7 @@ _SMALLEST_ALPHA = 1e-6
 # Steps outwards in standard deviations of a Gaussian profile, about the one where it would have risen enough.
 _STEPS = np.array([1.0, 1.5, 2.2, 4.0, 9.0, 25.0, 80.0])
 _ROUNDS = 3
-# By how much χ² of a point of the profile may be too high.
+# Tolerance of χ² at a point of the profile.
 _PROMISE = 1e-4
 
 
@@ -31,7 +31,7 @@ def profile_stretches(
     sigma_over_range: FloatArray,
     rise: FloatArray,
 ) -> FloatArray:
-    """Stretches (b, 2) of α of one source, of b fits, in which the profile of χ² stays within a rise (b,).
+    """Return intervals (b, 2) of α of one source in which χ² stays within a rise (b,).
 
     -π/2 and π/2 where χ² does not rise so much. The relative σ of the range as the covariance has it, NaN if unknown,
     serves for the first steps.
@@ -88,7 +88,7 @@ def ranges_within(
     covariance: FloatArray,
     rise: FloatArray | float = DELTA_CHI2_95,
 ) -> FloatArray:
-    """Ends (b, 2) of the ranges [m] of one source in which χ² stays within a rise (b,) of each fit."""
+    """Return range limits (b, 2) [m] of one source in which χ² stays within a rise (b,)."""
     offset = problem.position(fits.q)[:, source] - problem.centroid
     sigma = relative_range_sigma(covariance[:, 6 * source :, 6 * source :], offset)
     return ranges_of(profile_stretches(problem, y, fits, source, sigma, np.broadcast_to(rise, len(y))), problem.radius)
@@ -102,7 +102,7 @@ def _rises(
     row: NDArray[np.intp],
     alpha: FloatArray,
 ) -> FloatArray:
-    """Rise of χ² above the optima of rows (r,) at ranges (r,), everything else fitted anew from the optimum."""
+    """Return the rise of χ² (r,) over the optima at ranges (r,), all else fitted again."""
     q, mu = fits.q[row].copy(), fits.mu[row].copy()
     u = q[:, source, :3]
     length = np.linalg.norm(u, axis=-1, keepdims=True)

@@ -214,7 +214,7 @@ class SurveyRecord:
         the attitude does, and one of the eddy currents, which is new in every row: a difference of attitudes makes
         their rate. There is none of channels where it is below some field.
         """
-        turn = np.sqrt(np.sum(self.pose_effects[:, TURN, errors.changes] ** 2, axis=(1, 2)) / 3.0)
+        turn = np.sqrt(np.sum(self.pose_effects[:, TURN, errors.is_changing] ** 2, axis=(1, 2)) / 3.0)
         body = np.einsum("nji,nj->ni", self.R_world_from_array, self.ambient_T)
         b, rate = (np.linalg.norm(each, axis=1) for each in (body, np.gradient(body, self.time_s, axis=0)))
         dt_s = 2.0 * float(np.median(np.diff(self.time_s)))

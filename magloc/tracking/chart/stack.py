@@ -222,7 +222,7 @@ class Stack:
         parts = []
         by_source, by_pose, error = [], [], np.zeros((len(state), N_POSE))
         for row in self._middle_rows:
-            in_array = row.pose.in_array(state)
+            in_array = row.pose.to_array(state)
             by_array = np.zeros((len(state), row.z.size, N_SOURCE))
             if not far:
                 by_array = row.model.jacobian(in_array[:, :3], in_array[:, 3:]) / row.sigma[:, None]

@@ -67,7 +67,7 @@ def body_factor(tracker: Tracker, rows: Sequence[Row], points: Sequence[TrackPoi
 
 def _nearest_m(measurement: RowMeasurement, source: FloatArray) -> float:
     """Return the distance of a source from the nearest sensor."""
-    in_array = measurement.pose.in_array(source)
+    in_array = measurement.pose.to_array(source)
     return float(np.linalg.norm(measurement.model.array.positions - in_array[:3], axis=1).min())
 
 
@@ -77,7 +77,7 @@ def _errors(measurement: RowMeasurement, source: FloatArray, length_m: float) ->
     The axes of the body are those of the world.
     """
     array, R = measurement.model.array, measurement.pose.R_world_from_array
-    in_array = measurement.pose.in_array(source)
+    in_array = measurement.pose.to_array(source)
     fields = finite_body_errors((array.positions - in_array[:3]) @ R.T, source[3:], length_m)
     gain = array.linear_gain(fields_at_sensors(array, in_array[:3], in_array[3:]))
     columns = np.einsum("cj,ij,cin->cn", gain, R, fields[array.channel_sensor])

@@ -68,12 +68,14 @@ def constants_test(tracker: Tracker, rows: Sequence[Row], points: Sequence[Track
     errors, own = wider.pose_errors, tracker.pose_errors
     at = slice(wider.motion.n_states, wider.motion.n_states + errors.n_states)
     of_errors = steps[-1].x[at], steps[-1].S[at]
-    mounting = math.nan if own.of_mounting.any() else _score(*of_errors, errors.of_mounting)
-    if own.of_field.any() or not errors.of_field.any():
+    mounting = math.nan if own.is_of_mounting.any() else _score(*of_errors, errors.is_of_mounting)
+    if own.is_of_field.any() or not errors.is_of_field.any():
         return ConstantsTest(mounting)
-    claimed, source, field = used[-1][1], steps[-1].S[:N_SOURCE], of_errors[1][errors.of_field]
+    claimed, source, field = used[-1][1], steps[-1].S[:N_SOURCE], of_errors[1][errors.is_of_field]
     shift = source @ np.linalg.pinv(field)  # of the source by neglected errors of unit variance
-    return ConstantsTest(mounting, _score(*of_errors, errors.of_field), float(error_factor(claimed, shift @ shift.T)))
+    return ConstantsTest(
+        mounting, _score(*of_errors, errors.is_of_field), float(error_factor(claimed, shift @ shift.T))
+    )
 
 
 def _with_constants(array: SensorArray) -> SensorArray:

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from arrays.array import SensorArray
 from arrays.typing import FloatArray
 from magloc.localization.fit.results import Fix
-from magloc.measurement.differences import rounded, suitable_dipole
+from magloc.measurement.differences import one_digit, suitable_dipole
 from magloc.viewer.pages import words
 from magloc.viewer.pages.fixes import heaviest_first
 from magloc.viewer.pages.live_fit import Forecast, LiveFit
@@ -154,7 +154,7 @@ class DipoleEditor:
         with gui.add_folder("Dipole"):
             gui.add_html(words.panel(["Drag its arrows in the scene, turn it by its rings, or type."]))
             self.position_input = gui.add_vector3("Position [m]", (0.0, 0.0, 0.0), step=self._step_m)
-            self.moment_input = gui.add_number("Moment [A·m²]", 0.0, min=0.0, step=rounded(0.1 * self._magnitude))
+            self.moment_input = gui.add_number("Moment [A·m²]", 0.0, min=0.0, step=one_digit(0.1 * self._magnitude))
             self.decades_slider = gui.add_slider(
                 "log₁₀ moment",
                 decade - _DECADES,

@@ -282,8 +282,8 @@ class TestStartsThatMeet:
         readings += 1e3 * NOISE * np.isin(CUBE.channel_sensor, [0, 3]) * (1.0 + np.arange(24) % 5)
         readings += 50.0 * NOISE * (CUBE.channel_sensor == which[:, None])
         refined = Locator(CUBE).fit_rows(readings)
-        plain, fits = WeightedFits._refined, []
-        monkeypatch.setattr(WeightedFits, "_refined", lambda *of, **to: fits.append(len(of[2])) or plain(*of, **to))
+        plain, fits = WeightedFits._refine_rows, []
+        monkeypatch.setattr(WeightedFits, "_refine_rows", lambda *of, **to: fits.append(len(of[2])) or plain(*of, **to))
         Locator(CUBE).fit_rows(readings)
         met = sum(fits)
         fits.clear()
@@ -303,7 +303,7 @@ class TestWithoutOneSensor:
         locator = Locator(CUBE, exclude_faulty=False)
         plain, mask, rows = locator.fit_rows(clean), np.ones(24, dtype=bool), np.arange(5)
         examination = _Examination(CUBE, lambda _, other: locator.fit_rows(other), mask, rows, clean, None, True)
-        for row, starts in examination._refined_without_one(list(plain), rows).items():
+        for row, starts in examination._refine_without_one(list(plain), rows).items():
             assert len(starts) == 4
             assert [start.without for start in starts].count(frozenset()) == 1
             for start in starts[1:]:
@@ -372,8 +372,8 @@ class TestManySensors:
         """Each search is of all rows: no sensor stands out, and nothing is looked for without one."""
         clean, noise = board
         asked = []
-        whole = Locator.__dict__["_plain"]
-        monkeypatch.setattr(Locator, "_plain", lambda *args: asked.append(len(args[1])) or whole(*args))
+        whole = Locator.__dict__["_fit_with_all_sensors"]
+        monkeypatch.setattr(Locator, "_fit_with_all_sensors", lambda *args: asked.append(len(args[1])) or whole(*args))
         fixes = Locator(self.BOARD, body_length_m=0.0).fit_rows(clean + 2.0 * noise)
         assert fixes.misfit.all()
         assert not any(fixes.dropped_sensors)
@@ -414,8 +414,8 @@ class TestNoiseAlone:
 
     def test_no_sensor_is_left_out(self, monkeypatch):
         asked = []
-        whole = Locator.__dict__["_plain"]
-        monkeypatch.setattr(Locator, "_plain", lambda *args: asked.append(len(args[1])) or whole(*args))
+        whole = Locator.__dict__["_fit_with_all_sensors"]
+        monkeypatch.setattr(Locator, "_fit_with_all_sensors", lambda *args: asked.append(len(args[1])) or whole(*args))
         noise = np.random.default_rng(5).normal(size=(20, CUBE.n_channels)) * NOISE
         (rows,) = whitened_rows(CUBE, noise, None, 20)
         assert np.all(rows.energy <= energy_threshold(self.N_DIFFERENCES))

@@ -163,7 +163,7 @@ class TestRounds:
         (rows,) = whitened_rows(self.ARRAY, bars, None, len(bars))
         q = rows.model.homogeneous(fixes.position_m)[:, None]
         mu = rows.model.scaled_moment(q, fixes.moment_Am2[:, None])
-        noisy = rows.marginalised(body_errors(rows.model, q, mu, fixes.body_length_m[:, None]))
+        noisy = rows.marginalise(body_errors(rows.model, q, mu, fixes.body_length_m[:, None]))
         moved = noisy.model.position(refine(noisy.model, noisy.y, q, mu).q)[:, 0] - fixes.position_m
         squares = np.einsum("ni,nij,nj->n", moved, np.linalg.inv(fixes.covariance[:, :3, :3]), moved)
         assert np.sqrt(squares.max()) < 1e-3

@@ -20,7 +20,7 @@ from arrays.array import SensorArray
 from arrays.geometries import cube, grid
 from magloc.fields import dipole
 from magloc.localization.fit.gauss_newton import refine
-from magloc.localization.leave_one_out import falls_without_sensors, weighted
+from magloc.localization.leave_one_out import chi2_falls_without_sensors, weight_channels
 from magloc.measurement.rows import whitened_model, whitenings_of
 
 AMBIENT = np.array([2e-5, 0.0, 4.5e-5])
@@ -52,13 +52,13 @@ class TestFallsWithoutSensors:
 
         def fitted(mask, q, mu):
             problem, raw = whitened_model(array, mask, readings, whitenings_of(array, mask, readings), None)
-            return problem, raw, refine(problem, problem.whitened(raw), q, mu, free=free)
+            return problem, raw, refine(problem, problem.whiten(raw), q, mu, free=free)
 
         every = np.ones(array.n_channels, dtype=bool)
         start, _ = whitened_model(array, every, readings, whitenings_of(array, every, readings), None)
         q = start.homogeneous(place[None, None])
         problem, raw, fit = fitted(every, q, start.scaled_moment(q, moment[None, None]))
-        falls, checked = falls_without_sensors(
+        falls, checked = chi2_falls_without_sensors(
             problem, raw, fit.q, fit.mu, array.sensor_channels, free_position=free_position
         )
         for sensor in range(array.n_sensors):
@@ -76,12 +76,12 @@ class TestFallsWithoutSensors:
         every = np.ones(array.n_channels, dtype=bool)
         problem, raw = whitened_model(array, every, readings, whitenings_of(array, every, readings), None)
         q = problem.homogeneous(place)[None]
-        fit = refine(problem, problem.whitened(raw), q, problem.scaled_moment(q, moment[None]))
-        falls, _ = falls_without_sensors(problem, raw, fit.q, fit.mu, array.sensor_channels)
+        fit = refine(problem, problem.whiten(raw), q, problem.scaled_moment(q, moment[None]))
+        falls, _ = chi2_falls_without_sensors(problem, raw, fit.q, fit.mu, array.sensor_channels)
         for sensor in range(array.n_sensors):
             mask = array.channel_sensor != sensor
             other, other_raw = whitened_model(array, mask, readings, whitenings_of(array, mask, readings), None)
-            without = refine(other, other.whitened(other_raw), fit.q, fit.mu)
+            without = refine(other, other.whiten(other_raw), fit.q, fit.mu)
             assert_allclose(falls[0, sensor], fit.chi2[0] - without.chi2[0], rtol=0.01, atol=1e-3)
 
     def test_what_the_others_check(self):
@@ -103,7 +103,7 @@ class TestFallsWithoutSensors:
         problem, raw = whitened_model(array, every, readings, whitenings_of(array, every, readings), None)
         q = problem.homogeneous(place)[None]
         mu = problem.scaled_moment(q, moment[None])
-        _, checked = falls_without_sensors(problem, raw, q, mu, array.sensor_channels)
+        _, checked = chi2_falls_without_sensors(problem, raw, q, mu, array.sensor_channels)
         assert_allclose(checked[0], expected, atol=1e-5)
         assert checked[0, 14] < 0.01
         assert np.median(checked) > 0.9
@@ -129,12 +129,12 @@ class TestWeightedProblem:
         mask = np.ones(array.n_channels, dtype=bool)
         problem, raw = whitened_model(array, mask, readings, whitenings_of(array, mask, readings), None)
         per_channel = np.broadcast_to(weight[array.channel_sensor], raw.shape)
-        lighter, lighter_raw = weighted(problem, raw, per_channel)
+        lighter, lighter_raw = weight_channels(problem, raw, per_channel)
         other, other_raw = whitened_model(noisier, mask, readings, whitenings_of(noisier, mask, readings), None)
         q = problem.homogeneous(np.array([[[2.0, 1.0, 0.5]]] * 4))
         mu = problem.scaled_moment(q, rng.normal(size=(4, 1, 3)))
         chi2 = [
-            np.sum((p.whitened(y) - p.predicted(p.source_fields(q, mu))) ** 2, axis=1)
+            np.sum((p.whiten(y) - p.predict(p.source_fields(q, mu))) ** 2, axis=1)
             for p, y in ((lighter, lighter_raw), (other, other_raw))
         ]
         assert_allclose(chi2[0], chi2[1], rtol=1e-6)
@@ -144,5 +144,5 @@ class TestWeightedProblem:
         clean = AMBIENT[np.arange(24) % 3] + 1e-8 * np.random.default_rng(15).normal(size=(2, 24))
         mask = np.ones(24, dtype=bool)
         problem, raw = whitened_model(array, mask, clean, whitenings_of(array, mask, clean), None)
-        same, same_raw = weighted(problem, raw, np.ones_like(raw))
-        assert_allclose(same.whitened(same_raw), problem.whitened(raw), rtol=1e-9, atol=1e-9)
+        same, same_raw = weight_channels(problem, raw, np.ones_like(raw))
+        assert_allclose(same.whiten(same_raw), problem.whiten(raw), rtol=1e-9, atol=1e-9)

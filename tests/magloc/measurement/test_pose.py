@@ -110,22 +110,22 @@ class TestDerivatives:
 
     def test_of_the_source_in_the_array(self) -> None:
         expected = derivative(
-            lambda y: np.apply_along_axis(lambda e: POSE.in_array(SOURCE, e) / UNIT, -1, y), ERROR, 1e-2, 1e-9
+            lambda y: np.apply_along_axis(lambda e: POSE.to_array(SOURCE, e) / UNIT, -1, y), ERROR, 1e-2, 1e-9
         )
-        J = POSE.error_jacobian(POSE.in_array(SOURCE, ERROR), ERROR)
+        J = POSE.error_jacobian(POSE.to_array(SOURCE, ERROR), ERROR)
         self.agree(J[:, :9] / UNIT[:, None], expected)
         assert not np.any(J[:, 9:])
 
     def test_of_the_source_in_the_world(self) -> None:
         """Of what the array knows: where in_array gives the same again."""
-        in_array = POSE.in_array(SOURCE, np.zeros(9))
+        in_array = POSE.to_array(SOURCE, np.zeros(9))
 
         def world(error: FloatArray) -> FloatArray:
-            turned = POSE.turned(error)
+            turned = POSE.true_attitude(error)
             arm = in_array[:3] + POSE.lever_arm_m + error[6:9]
             return np.concatenate([POSE.reference_m + error[3:6] + turned @ arm, turned @ in_array[3:]])
 
-        np.testing.assert_allclose(POSE.in_array(world(ERROR), ERROR), in_array, rtol=1e-12)
+        np.testing.assert_allclose(POSE.to_array(world(ERROR), ERROR), in_array, rtol=1e-12)
         expected = derivative(lambda y: np.apply_along_axis(lambda e: world(e) / UNIT, -1, y), np.zeros(9), 1e-2, 1e-9)
         self.agree(POSE.world_jacobian(in_array)[:, :9] / UNIT[:, None], expected)
 
@@ -173,10 +173,10 @@ class TestErrors:
     def test_of_several_rows_have_their_covariance(self) -> None:
         errors, time_s = PoseErrors.of(STATED), np.array([0.0, 1.0, 7.0])
         array = geometries.tetrahedron(1.5)
-        rows = errors.of_rows(array, time_s, [POSE] * 3, [None] * 3)
+        rows = errors.over_rows(array, time_s, [POSE] * 3, [None] * 3)
         assert rows is not None
         own = errors.effect(POSE)
-        changing, constant = own[:, errors.changes], own[:, ~errors.changes]
+        changing, constant = own[:, errors.is_changing], own[:, ~errors.is_changing]
         for i in range(3):
             for j in range(3):
                 share = math.exp(-abs(time_s[i] - time_s[j]) / 10.0)
@@ -186,7 +186,7 @@ class TestErrors:
     def test_of_the_ambient_field_are_constant_or_new_in_every_row(self) -> None:
         errors = PoseErrors.of_array(replace(uncertain("scalar"), pose=None))
         np.testing.assert_array_equal(errors.step(3.0)[0], np.repeat([1.0, 0.0], 3))
-        rows = errors.of_rows(uncertain("scalar"), np.arange(2.0), [POSE] * 2, [None] * 2)
+        rows = errors.over_rows(uncertain("scalar"), np.arange(2.0), [POSE] * 2, [None] * 2)
         assert rows is not None
         first, second = rows.effects
         np.testing.assert_allclose((first @ first.T)[9:, 9:], (2e-7**2 + 1e-7**2) * np.eye(3), rtol=1e-9, atol=1e-30)

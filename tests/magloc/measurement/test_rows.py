@@ -87,7 +87,7 @@ class TestMarginalised:
             known = np.eye(every.shape[1])[3 if common_field_T is None else 0 :]
             whole, y = np.vstack([every, known]), np.concatenate([raw, np.zeros(len(known))])
             left.append(float(np.sum((y - whole @ np.linalg.lstsq(whole, y)[0]) ** 2)))
-        return np.sum(rows.marginalised(columns).y ** 2, axis=1).tolist(), left
+        return np.sum(rows.marginalise(columns).y ** 2, axis=1).tolist(), left
 
     @pytest.mark.parametrize("common_field_T", [None, 2e-9])
     @pytest.mark.parametrize("size", [1e-3, 1.0, 1e3, 1e5])

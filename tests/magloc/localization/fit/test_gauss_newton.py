@@ -92,7 +92,7 @@ def problem_of(array, readings, ambient=None):
     """Joint problem and whitened readings of rows (n, C) that miss the same channels."""
     mask = np.isfinite(readings[0])
     problem, raw = whitened_model(array, mask, readings, whitenings_of(array, mask, readings), ambient)
-    return problem, problem.whitened(raw)
+    return problem, problem.whiten(raw)
 
 
 class Drawn(NamedTuple):
@@ -147,7 +147,7 @@ def refined_from(problem, y, positions, moments, **options):
 
 
 def chi2_at(problem, y, q, mu):
-    return np.sum((y - problem.predicted(problem.source_fields(q, mu))) ** 2, axis=-1)
+    return np.sum((y - problem.predict(problem.source_fields(q, mu))) ** 2, axis=-1)
 
 
 class TestPredictions:
@@ -278,7 +278,7 @@ class TestJacobians:
             moved = q + (tangent @ flat[:, 0, ..., None])[..., 0]
             moments = mu + np.linalg.norm(mu) * flat[:, 1]
             at = problem.rows(np.zeros(len(flat), dtype=np.intp))
-            return at.predicted(at.source_fields(moved, moments)).reshape(*x.shape[:-1], -1)
+            return at.predict(at.source_fields(moved, moments)).reshape(*x.shape[:-1], -1)
 
         expected = oracles.derivative(predicted, np.zeros(6 * n_sources), 0.05)
         gain = problem.linear_gain(problem.source_fields(q, mu))
@@ -534,7 +534,7 @@ class TestCompiledTwin:
         )
         mask = np.ones(array.n_channels, dtype=bool)
         problem, raw = whitened_model(array, mask, readings, whitenings_of(array, mask, readings), ambient)
-        y = problem.whitened(raw)
+        y = problem.whiten(raw)
         q = problem.homogeneous(p + 0.1 * rng.normal(size=p.shape))
         mu, free = problem.scaled_moment(q, m), np.array([[True, True, not held]])
         ours, twin = refine(problem, y, q, mu, free=free), damped_gauss_newton(problem, y, q, mu, free, 400)
@@ -551,8 +551,8 @@ class TestCompiledTwin:
         """Errors that are marginalised row by row leave the gains of all rows the same ones."""
         array = array_of("vector", 32)
         problem, y, p, m, _, rng = drawn(array, 32, 4, 1)
-        problem = problem.marginalised(rng.normal(size=(4, array.n_channels, 2)))
-        y = problem.whitened(y)
+        problem = problem.marginalise(rng.normal(size=(4, array.n_channels, 2)))
+        y = problem.whiten(y)
         q = problem.homogeneous(p)
         mu = problem.scaled_moment(q, m)
         ours, twin = refine(problem, y, q, mu), damped_gauss_newton(problem, y, q, mu, np.ones((1, 3), dtype=bool))

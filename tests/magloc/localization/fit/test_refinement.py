@@ -124,11 +124,11 @@ class TestSumsOfProducts:
         search = SingleSourceSearch(array)
         (rows,) = whitened_rows(array, readings, None, 200)
         starts, every = search.starts(rows), np.arange(200)
-        fast = search.ends(rows, every, starts, 20.0)
+        fast = search.refine_starts(rows, every, starts, 20.0)
         assert rows.model.channels.struct.is_isotropic
         monkeypatch.setattr(channels, "_is_isotropic", lambda *_: False)
         (rows,) = whitened_rows(array, readings, None, 200)
-        slow = search.ends(rows, every, starts, 20.0)
+        slow = search.refine_starts(rows, every, starts, 20.0)
         assert not rows.model.channels.struct.is_isotropic
         assert np.isfinite(slow.chi2[:, 0]).all()
         close = np.abs(fast.chi2[:, 0] - slow.chi2[:, 0]) <= 1e-9 * (1.0 + slow.chi2[:, 0])
@@ -168,8 +168,8 @@ class TestIndependence:
         for n_threads, numbers in ((1, 10**9), (1, 0), (2, 0)):
             threads(n_threads)
             monkeypatch.setattr(refinement, "_CHANNELS_A_BLOCK", numbers)
-            results.append(search.ends(rows, np.arange(150), starts, 20.0))
-        alone = search.ends(rows.chosen(np.array([77])), np.zeros(1, dtype=np.int64), starts[[77]], 20.0)
+            results.append(search.refine_starts(rows, np.arange(150), starts, 20.0))
+        alone = search.refine_starts(rows.select(np.array([77])), np.zeros(1, dtype=np.int64), starts[[77]], 20.0)
         for result in results[1:]:
             for values, others in zip(result, results[0], strict=True):
                 assert_array_equal(values, others)

@@ -19,7 +19,7 @@ from numpy.testing import assert_allclose
 from arrays.geometries import cube
 from magloc.directions import hemisphere
 from magloc.localization.fit.gauss_newton import JointFits
-from magloc.localization.search.beam_search import Search, best_distinct, merged
+from magloc.localization.search.beam_search import BeamSearch, best_distinct, merge
 from magloc.localization.search.candidates import (
     candidate_positions,
     distinct_best,
@@ -50,7 +50,7 @@ def everywhere(q, mu):
 
 
 def search_for(array, problem, **options):
-    return Search(problem.homogeneous(candidate_positions(array)), options.pop("allowed", everywhere), **options)
+    return BeamSearch(problem.homogeneous(candidate_positions(array)), options.pop("allowed", everywhere), **options)
 
 
 def fits_of(q, mu, chi2):
@@ -73,7 +73,7 @@ class TestLinearScores:
         candidates = problem.homogeneous(places[:, 0])
         silent = np.zeros_like(problem.ambient)
         gain = problem.linear_gain(silent)
-        residual = y - problem.predicted(silent)
+        residual = y - problem.predict(silent)
         scores = linear_scores(linear_bases(problem, gain[0], 0, candidates), residual)
         nothing = np.zeros((0, 3))
         for i in range(3):
@@ -201,11 +201,11 @@ class TestBeams:
     def test_two_beams_together(self):
         first = best_distinct(fits_of(self.q[:3], self.mu[:3], np.array([3.0, 5.0, 1.0])), 1, 3)
         second = best_distinct(fits_of(self.q[2:], self.mu[2:], np.array([1.0, 2.0, 4.0, 6.0])), 1, 3)
-        assert merged(first, second).chi2.tolist() == [[1.0, 2.0, 3.0]]
+        assert merge(first, second).chi2.tolist() == [[1.0, 2.0, 3.0]]
 
     def test_rows_are_replaced_in_a_copy(self):
         beam = best_distinct(fits_of(self.q, self.mu, np.arange(6.0)), 3, 2)
-        other = beam.replaced(np.array([1]), beam.rows(np.array([0])))
+        other = beam.replace(np.array([1]), beam.rows(np.array([0])))
         assert other.chi2.tolist() == [[0.0, 1.0], [0.0, 1.0], [4.0, 5.0]]
         assert beam.chi2.tolist() == [[0.0, 1.0], [2.0, 3.0], [4.0, 5.0]]
 
@@ -217,7 +217,7 @@ class TestFirstSource:
     def test_no_worse_than_from_the_truth(self, kind):
         array = array_of(kind, 7)
         problem, y, p, m, *_ = drawn(array, 7, 20, 1)
-        beam = search_for(array, problem).first(problem, y)
+        beam = search_for(array, problem).first_sources(problem, y)
         best = refined_from(problem, y, p, m)
         assert (beam.chi2[:, 0] < best.chi2 + 1e-3).all()
 
@@ -228,15 +228,15 @@ class TestFirstSource:
         p, m = random_sources(rng, 4, 1)
         m[2] *= 1000.0
         problem, y = problem_of(array, noisy_readings(array, p, m, rng))
-        together, others = search_for(array, problem).first(problem, y), np.array([0, 1, 3])
-        alone = search_for(array, problem).first(problem.rows(others), y[others])
+        together, others = search_for(array, problem).first_sources(problem, y), np.array([0, 1, 3])
+        alone = search_for(array, problem).first_sources(problem.rows(others), y[others])
         np.testing.assert_array_equal(together.chi2[others], alone.chi2)
         assert together.chi2[2, 0] < refined_from(problem, y, p, m).chi2[2] + 1e-3
 
     def test_moduli_without_ambient_field_come_with_both_signs(self):
         array = scalar_cloud(8, ambient_T=None)
         problem, y, *_ = drawn(array, 8, 5, 1)
-        beam = search_for(array, problem).first(problem, y)
+        beam = search_for(array, problem).first_sources(problem, y)
         assert_allclose(beam.chi2[:, 1], beam.chi2[:, 0], rtol=1e-9)
         assert_allclose(beam.mu[:, 1], -beam.mu[:, 0], rtol=1e-9)
 
@@ -246,7 +246,7 @@ class TestMoreAndFewerSources:
     p, m = random_sources(rng, 12, 2, 2.2, 3.2)
     problem, y = problem_of(CUBE, noisy_readings(CUBE, p, m, rng))
     search = search_for(CUBE, problem)
-    two = search.one_more(problem, y, search.first(problem, y))
+    two = search.add_source(problem, y, search.first_sources(problem, y))
     best = refined_from(problem, y, p, m).chi2
 
     def test_a_second_source_is_found_in_what_the_first_leaves(self):
@@ -255,16 +255,16 @@ class TestMoreAndFewerSources:
         assert found.mean() > 0.5
         beam, rng = self.two, np.random.default_rng(0)
         for _ in range(10):
-            beam = self.search.restarted(self.problem, self.y, beam, rng)
+            beam = self.search.restart(self.problem, self.y, beam, rng)
         assert (beam.chi2[:, 0] < self.best + 1e-3).all()
 
     def test_restarts_never_lose_the_best(self):
-        again = self.search.restarted(self.problem, self.y, self.two, np.random.default_rng(1))
+        again = self.search.restart(self.problem, self.y, self.two, np.random.default_rng(1))
         assert (again.chi2[:, 0] <= self.two.chi2[:, 0]).all()
 
     def test_restarts_are_those_of_their_seed(self):
         one, same = (
-            self.search.restarted(self.problem, self.y, self.two, np.random.default_rng(2)).chi2 for _ in range(2)
+            self.search.restart(self.problem, self.y, self.two, np.random.default_rng(2)).chi2 for _ in range(2)
         )
         assert np.array_equal(one, same)
 
@@ -272,12 +272,12 @@ class TestMoreAndFewerSources:
         p, m = self.p[:, :1], self.m[:, :1]
         readings = noisy_readings(CUBE, p, m, np.random.default_rng(3))
         problem, y = problem_of(CUBE, readings)
-        one = self.search.first(problem, y)
-        fewer = self.search.one_less(problem, y, self.search.one_more(problem, y, one))
+        one = self.search.first_sources(problem, y)
+        fewer = self.search.remove_source(problem, y, self.search.add_source(problem, y, one))
         assert (fewer.chi2[:, 0] < refined_from(problem, y, p, m).chi2 + 1e-3).all()
 
     def test_more_sources_never_fit_worse(self):
-        one = self.search.first(self.problem, self.y)
+        one = self.search.first_sources(self.problem, self.y)
         assert (self.two.chi2[:, 0] <= one.chi2[:, 0] + 1e-6).all()
 
     def test_only_what_is_known_to_be_possible_is_kept(self):
@@ -285,7 +285,7 @@ class TestMoreAndFewerSources:
             return self.problem.position(q)[..., 2] > 0.0
 
         search = replace(self.search, allowed=above)
-        beam = search.one_more(self.problem, self.y, search.first(self.problem, self.y))
+        beam = search.add_source(self.problem, self.y, search.first_sources(self.problem, self.y))
         listed = beam.q[np.isfinite(beam.chi2)]
         assert len(listed)
         assert (self.problem.position(listed)[..., 2] > 0.0).all()

@@ -14,8 +14,8 @@ from arrays.array import SensorArray
 from arrays.geometries import square, tetrahedron
 from arrays.sensor import Sensor
 from magloc.localization.search.candidates import (
+    best_candidates,
     candidate_positions,
-    chosen_candidates,
     distinct_best,
     linear_bases,
     linear_scores,
@@ -225,7 +225,7 @@ class TestChoiceOfStarts:
         (rows,) = whitened_rows(array, readings, None, n_rows)
         candidates = rows.model.homogeneous(candidate_positions(array))
         bases = linear_bases(rows.model, rows.model.gain[0], 0, candidates)
-        chosen = chosen_candidates(bases, rows.y, candidates, 12, apart_rad)
+        chosen = best_candidates(bases, rows.y, candidates, 12, apart_rad)
         scores = linear_scores(bases, rows.y)
         expected = distinct_best(scores, candidates, 12, apart_rad)
         each = np.arange(n_rows)[:, None]
@@ -247,7 +247,7 @@ class TestMissingChannels:
         ranking, channels = search._ranking(rows.mask), np.nan_to_num(readings - array.channel_offset_T)
         assert ranking.lost is not None
         assert ranking.orthonormal is not None
-        parts = (ranking.whitened(channels).astype(np.float32) @ ranking.bases).reshape(20, 3, -1)
+        parts = (ranking.whiten(channels).astype(np.float32) @ ranking.bases).reshape(20, 3, -1)
         triangle = np.zeros((parts.shape[2], 3, 3))
         triangle[:, *np.diag_indices(3)] = ranking.orthonormal[:3].T
         triangle[:, [1, 2, 2], [0, 0, 1]] = ranking.orthonormal[3:].T
@@ -270,7 +270,7 @@ class TestLanes:
         (rows,) = whitened_rows(array, readings, None, 50)
         q = rows.model.homogeneous(1.2 * p)
         together = refined(rows.model, rows.y, q)
-        alone = rows.chosen(np.array([3, 40]))
+        alone = rows.select(np.array([3, 40]))
         for name, of_two in zip(together._fields, refined(alone.model, alone.y, q[[3, 40]]), strict=True):
             np.testing.assert_array_equal(of_two, getattr(together, name)[[3, 40]])
 

@@ -3,7 +3,7 @@
 | what | who checks it |
 |---|---|
 | covariances | the singular values of the readable Jacobian |
-| weights, ranges, whether errors are Gaussian | known_of, the readable reference |
+| weights, ranges, whether errors are Gaussian | fit_columns, the readable reference |
 | blocks, threads, lanes | each other: bit for bit |
 """
 
@@ -23,7 +23,7 @@ from magloc.localization.fit.gauss_newton import covariances
 from magloc.localization.fit.optima import Optima
 from magloc.localization.fit.results import is_misfit, is_observable, spans
 from magloc.localization.search.single_source import SingleSourceSearch
-from magloc.localization.uncertainty.covariance import known_of, known_of_one_compiled
+from magloc.localization.uncertainty.covariance import fit_columns, single_source_columns
 from magloc.measurement.rows import whitened_rows
 from tests.magloc.localization.search.test_candidates import CASES, regime
 
@@ -61,7 +61,7 @@ class TestAgainstReference:
     def test_covariances(self, case: str, name: str) -> None:
         """Where the range is observable: all others are made longer."""
         optima = optima_of(ARRAYS[case], name)
-        found = known_of_one_compiled(optima)
+        found = single_source_columns(optima)
         expected = covariances(optima.rows.model.rows(optima.of_row), optima.fits)
         assert np.isfinite(expected).all()
         best = optima.fits.chi2[np.searchsorted(optima.of_row, optima.of_row)]
@@ -77,7 +77,7 @@ class TestAgainstReference:
     def test_all_together(self, case: str, name: str) -> None:
         """Ends of ranges are read from the profile at a rise of 3.84 to about 0.01."""
         optima = optima_of(ARRAYS[case], name)
-        found, expected = known_of_one_compiled(optima), known_of(optima, np.ones(len(optima.rows), bool))
+        found, expected = single_source_columns(optima), fit_columns(optima, np.ones(len(optima.rows), bool))
         assert_allclose(found.position_m, expected.position_m, rtol=1e-12, atol=1e-12)
         assert_allclose(found.moment_Am2, expected.moment_Am2, rtol=1e-12)
         assert_allclose(found.weight, expected.weight, atol=1e-6)
@@ -97,7 +97,7 @@ class TestAnyRow:
         readings = np.random.default_rng(10).normal(scale=1e-9, size=(N_ROWS, array.n_channels))
         (rows,) = whitened_rows(array, readings, None, N_ROWS)
         (optima,) = SingleSourceSearch(array).optima(rows)
-        found = known_of_one_compiled(optima)
+        found = single_source_columns(optima)
         assert_array_equal(found.ranges[:, 0, 0], np.tile([0.0, np.inf], (len(optima.of_row), 1)))
         assert np.isnan(found.ranges[:, 0, 1:]).all()
         assert not found.gaussian.any()
@@ -106,7 +106,7 @@ class TestAnyRow:
         """Their weights raise the level within which 95 % of all of them are."""
         optima = optima_of(CASES["square 1 m"][0], "far")
         assert np.count_nonzero(np.bincount(optima.of_row) > 1) > 10
-        found, expected = known_of_one_compiled(optima), known_of(optima, np.ones(len(optima.rows), bool))
+        found, expected = single_source_columns(optima), fit_columns(optima, np.ones(len(optima.rows), bool))
         assert_allclose(found.weight, expected.weight, atol=1e-6)
         assert np.count_nonzero((found.weight > 0.05) & (found.weight < 0.95)) > 10
         assert np.mean(same_ranges(found.ranges, expected.ranges)) > 0.9
@@ -117,14 +117,14 @@ class TestAnyRow:
         (rows,) = whitened_rows(array, np.random.default_rng(1).normal(scale=1e-7, size=(1, 6)), None, 1)
         whole = optima_of(ARRAYS["isotropic"])
         optima = replace(whole, rows=rows, fits=whole.fits.rows(np.arange(1)), of_row=np.zeros(1, dtype=np.int64))
-        found = known_of_one_compiled(optima)
+        found = single_source_columns(optima)
         assert np.isnan(found.covariance).all()
         assert_array_equal(found.weight, [0.0])
 
     def test_rows_without_any_fit(self) -> None:
         whole = optima_of(ARRAYS["isotropic"])
         none = np.arange(0)
-        found = known_of_one_compiled(replace(whole, fits=whole.fits.rows(none), of_row=none))
+        found = single_source_columns(replace(whole, fits=whole.fits.rows(none), of_row=none))
         assert found.covariance.shape == (0, 6, 6)
 
 
@@ -136,19 +136,19 @@ class TestIndependence:
         self, case: str, threads: Callable[[int], None], monkeypatch: pytest.MonkeyPatch
     ) -> None:
         optima = optima_of(ARRAYS[case], n_rows=150)
-        expected = known_of_one_compiled(optima)
+        expected = single_source_columns(optima)
         monkeypatch.setattr(refinement, "_CHANNELS_A_BLOCK", 0)
         for n_threads in (1, 2):
             threads(n_threads)
-            for values, others in zip(known_of_one_compiled(optima), expected, strict=True):
+            for values, others in zip(single_source_columns(optima), expected, strict=True):
                 assert_array_equal(values, others)
         of_77 = optima.of_row == 77
         alone = replace(
             optima,
-            rows=optima.rows.chosen(np.array([77])),
+            rows=optima.rows.select(np.array([77])),
             fits=optima.fits.rows(np.flatnonzero(of_77)),
             of_row=np.zeros(np.count_nonzero(of_77), dtype=np.int64),
         )
-        for values, others in zip(known_of_one_compiled(alone), expected, strict=True):
+        for values, others in zip(single_source_columns(alone), expected, strict=True):
             n = values.shape[2] if values.ndim == 4 else None
             assert_array_equal(values, others[of_77][:, :, :n] if n else others[of_77])

@@ -12,7 +12,7 @@ import arrays
 from arrays.typing import FloatArray
 from magloc.fields import dipole
 from magloc.measurement.pose import PoseErrors
-from magloc.measurement.rows import joined
+from magloc.measurement.rows import concatenate_readings
 from magloc.readings import Readings
 from magloc.surveying.fit.record import SurveyRecord, shortest_turns
 
@@ -211,8 +211,8 @@ class TestSeveralFiles:
 
     def test_one_after_the_other(self) -> None:
         later = replace(self.ROWS, time_s=self.ROWS.time_s + 3.0)
-        assert joined([self.ROWS, later]).time_s.tolist() == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
+        assert concatenate_readings([self.ROWS, later]).time_s.tolist() == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
 
     def test_other_columns(self) -> None:
         with pytest.raises(ValueError, match="same columns"):
-            joined([self.ROWS, replace(self.ROWS, ambient_T=None)])
+            concatenate_readings([self.ROWS, replace(self.ROWS, ambient_T=None)])

@@ -26,7 +26,7 @@ import sims
 from arrays.differences import decorrelated_differences
 from arrays.geometries import tetrahedron
 from arrays.typing import FloatArray
-from magloc.measurement.nuisances import Drift
+from magloc.measurement.nuisances import BackgroundDrift
 from magloc.readings import Readings
 from magloc.tracking.consistency import THRESHOLD
 from magloc.tracking.rows import rows_of
@@ -125,7 +125,9 @@ class TestTrack:
     def test_passes_that_lead_nowhere_are_none(self) -> None:
         """From sources beyond double precision; without an error."""
         readings = high_passed(sims.simulate(SCENARIO, 0).readings[:20])
-        tracker = Tracker(SCENARIO.nominal_array, REST, background=Drift.of(readings.background, readings.time_s))
+        tracker = Tracker(
+            SCENARIO.nominal_array, REST, background=BackgroundDrift.of(readings.background, readings.time_s)
+        )
         rows = list(rows_of(readings))
         nowhere = np.concatenate([[1.0, 0.0, 0.0], [0.0, 0.0, 1e200], np.zeros(tracker.n_errors)])
         assert iterate_steps(tracker, rows, [nowhere] * len(rows)) is None
@@ -167,7 +169,7 @@ class TestMoments:
 class TestDrift:
     def test_a_corner_is_that_of_a_first_order_filter(self) -> None:
         """In its steady state a filter of the walk leaves half the power at the corner."""
-        drift = Drift.of(
+        drift = BackgroundDrift.of(
             Readings(np.zeros((50, 3)), time_s=0.1 * np.arange(50)).high_passed(0.05).background, 0.1 * np.arange(50)
         )
         assert drift is not None
@@ -178,4 +180,4 @@ class TestDrift:
         assert left == pytest.approx(0.5, abs=0.03)
 
     def test_nothing_said_is_none(self) -> None:
-        assert Drift.of(Readings(np.zeros((5, 3))).background, np.arange(5.0)) is None
+        assert BackgroundDrift.of(Readings(np.zeros((5, 3))).background, np.arange(5.0)) is None
