@@ -21,7 +21,7 @@ import magloc
 import sims
 from arrays.typing import FloatArray
 from magloc.localization.fit.prior import NOTHING_KNOWN
-from magloc.surveying.fit.joint_fit import Bounds, Sources, fit_jointly
+from magloc.surveying.fit.joint_fit import SourceBounds, Sources, fit_jointly
 from magloc.surveying.piece import Ground
 from magloc.surveying.preparation import whole_rows
 from magloc.surveying.rounds import AT_LAST
@@ -110,11 +110,11 @@ def at_truth(field: Simulation, found: magloc.Survey) -> tuple[FloatArray, Float
     truth = Sources(field.target_position_m, field.target_moment_Am2)
     ground = Ground(NOTHING_KNOWN, found.ground_m, 15.0, found.threshold)
     tiled = replace(TiledSurvey.of(found.array, whole_rows(field.array, field.readings)[1], ground), sources=truth)
-    everywhere = Bounds(np.full(3, -np.inf), np.full(3, np.inf), np.inf)
+    everywhere = SourceBounds(np.full(3, -np.inf), np.full(3, np.inf), np.inf)
     significance, bound = np.zeros(len(truth)), np.zeros(len(truth))
     for number, tile in enumerate(tiled.tiles):
         piece, inside_m = tiled.piece(number), tile.inside_m(truth.position_m)
-        held = tile.holds(truth.position_m)
+        held = tile.contains(truth.position_m)
         if not (inside_m > 0.0).any():
             continue
         model = piece.model()

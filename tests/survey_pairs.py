@@ -36,7 +36,7 @@ def fitted_as_one(scenario: MagneticScenario, seed: int) -> tuple[bool, bool] | 
     start = Sources((size @ places / size.sum())[None], moments.sum(axis=0)[None])
     piece = replace(tiled, sources=start).piece(0)
     model = piece.model()
-    fit, background = model.fitted(start, piece.groups(model.record, AT_LAST * model.nearest_m), 1e-3)
+    fit, background = model.fit(start, piece.groups(model.record, AT_LAST * model.nearest_m), 1e-3)
     if not len(fit.sources):
         return None
     # A dipole has its own middle: that of the moments' components along it.

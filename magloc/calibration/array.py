@@ -1,9 +1,9 @@
-"""Calibration of an array of vector sensors from readings of a source that moves past it.
+"""Calibration of an array of vector sensors by a source that moves past it.
 
-Positions, gains, axes and offsets of the sensors are estimated together with the source, by least squares over all
-rows (:mod:`magloc.calibration.least_squares`), with the nominal array as a prior. :func:`calibrate_on_path` needs the
-path of the source; :func:`self_calibrate` finds it as well. What the readings do not tell is listed
-(:mod:`magloc.calibration.observability`): there the nominal array speaks alone.
+Least squares over all rows (:mod:`magloc.calibration.least_squares`) estimates positions, gains, axes and offsets of
+the sensors together with the source; the nominal array is the prior. :func:`calibrate_on_path` needs the path of the
+source; :func:`self_calibrate` estimates it too. :mod:`magloc.calibration.observability` lists what the readings do not
+determine; there the estimate stays at the nominal array.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from arrays.typing import BoolArray, FloatArray
 from magloc.calibration import continuation as calibration_steps
 from magloc.calibration import least_squares as source_fit
 from magloc.calibration import model as moving_source
-from magloc.calibration.least_squares import Fit
-from magloc.calibration.model import AXES, GAINS, OFFSET, PER_SENSOR, POSITION, MomentModel, Problem
-from magloc.calibration.observability import unobservable
+from magloc.calibration.least_squares import CalibrationIterate
+from magloc.calibration.model import AXES, GAINS, OFFSET, PER_SENSOR, POSITION, CalibrationProblem, MomentKind
+from magloc.calibration.observability import unobservable_directions
 from magloc.calibration.results import SourceCalibration
 from magloc.least_squares import Optimum
 from magloc.localization.locator import Locator
@@ -32,14 +32,14 @@ from magloc.measurement.rows import check_rows
 
 Quantity = Literal["positions", "gains", "axes", "offsets"]
 QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
-# Of the source to the nominal array, whose χ² is a comparison only.
+# For the source with the nominal array, whose χ² is only a comparison.
 _ITERATIONS_BEFORE = 10
 _PLACES = {"positions": POSITION, "gains": GAINS, "axes": AXES, "offsets": OFFSET}
 
 
 @dataclass(frozen=True)
 class CalibrationPrior:
-    """How well the nominal array is known, and what of it is estimated.
+    """Uncertainty of the nominal array, and which of its quantities are estimated.
 
     Attributes
     ----------
@@ -47,9 +47,9 @@ class CalibrationPrior:
         Standard deviations: of a position along each axis [m], of a channel's gain (relative), of the direction in
         which a channel looks, along each of the two other axes [rad], and of an offset [T].
     estimate : tuple of str
-        Which of positions, gains, axes and offsets are estimated; the others are exactly the nominal ones.
+        Which of positions, gains, axes and offsets are estimated; the others stay nominal.
     trusted_positions, trusted_scales : tuple of str
-        Ids of sensors whose position is exactly the nominal one, or whose gains and axes are.
+        Ids of sensors with exact nominal positions, and of those with exact nominal gains and axes.
 
     Raises
     ------
@@ -83,13 +83,13 @@ class CalibrationPrior:
             raise ValueError(f"Input estimate must be some of {', '.join(QUANTITIES)}; instead received none.")
 
     def deviations(self, n_sensors: int) -> FloatArray:
-        """Standard deviations of all unknowns of the sensors, shape (N, 15)."""
+        """Return the standard deviations of all unknowns of the sensors, shape (N, 15)."""
         row = np.empty(PER_SENSOR)
         row[POSITION], row[GAINS], row[AXES], row[OFFSET] = self.position_m, self.gain, self.axes_rad, self.offset_T
         return np.tile(row, (n_sensors, 1))
 
     def free(self, array: SensorArray) -> BoolArray:
-        """Which unknowns of an array's sensors are estimated, shape (N, 15)."""
+        """Return which unknowns of an array's sensors are estimated, shape (N, 15)."""
         free = np.zeros((array.n_sensors, PER_SENSOR), dtype=np.bool_)
         for quantity in self.estimate:
             free[:, _PLACES[quantity]] = True
@@ -113,22 +113,24 @@ def calibrate_on_path(
     prior: CalibrationPrior = CalibrationPrior(),
     world_from_array: ArrayLike | None = None,
 ) -> SourceCalibration:
-    """Calibrate by a source of known or unknown moment at positions (n, 3) in the array's frame.
+    """Calibrate by a source at known positions (n, 3) in the array's frame.
 
     With `unknown_height` a constant is added to all positions along the world's z, and estimated.
     """
-    readings, attitude = _checked(array, readings_T, world_from_array)
-    position = _rows_of_3("position_m", position_m, len(readings))
-    known = None if moment_Am2 is None else _rows_of_3("moment_Am2", moment_Am2, len(readings))
-    model: MomentModel = moment if known is None else "known"
+    readings, attitude = _check_inputs(array, readings_T, world_from_array)
+    position = _check_vectors("position_m", position_m, len(readings))
+    known = None if moment_Am2 is None else _check_vectors("moment_Am2", moment_Am2, len(readings))
+    model: MomentKind = moment if known is None else "known"
     problem = _problem(array, readings, attitude, prior, False, unknown_height, model)
-    rows = _usable(problem)
-    problem = _of_rows(problem, rows)
+    rows = _usable_rows(problem)
+    problem = _select_rows(problem, rows)
     _check_counts(problem)
-    start = calibration_steps.untouched(
+    start = calibration_steps.nominal_state(
         problem, position[rows], np.zeros_like(position[rows]) if known is None else known[rows]
     )
-    return _result(problem, calibration_steps.fitted(problem, calibration_steps.source_on_path(problem, start)), rows)
+    return _result(
+        problem, calibration_steps.fit_calibration(problem, calibration_steps.fit_source_on_path(problem, start)), rows
+    )
 
 
 def self_calibrate(
@@ -139,29 +141,31 @@ def self_calibrate(
     prior: CalibrationPrior = CalibrationPrior(),
     world_from_array: ArrayLike | None = None,
 ) -> SourceCalibration:
-    """Calibrate an array by a source whose path is found as well, starting from fixes with the nominal array."""
-    readings, attitude = _checked(array, readings_T, world_from_array)
+    """Calibrate by a source on an unknown path, from fixes with the nominal array."""
+    readings, attitude = _check_inputs(array, readings_T, world_from_array)
     problem = _problem(array, readings, attitude, prior, True, False, moment)
     nowhere = np.zeros((len(readings), 3))
-    doubtful = calibration_steps.with_doubted_fields(problem, calibration_steps.untouched(problem, nowhere, nowhere))
+    doubtful = calibration_steps.inflate_field_noise(
+        problem, calibration_steps.nominal_state(problem, nowhere, nowhere)
+    )
     fixes = Locator(doubtful, body_length_m=0.0, exclude_faulty=False).fit_rows(readings)
-    rows = fixes.solved & _usable(problem)
+    rows = fixes.solved & _usable_rows(problem)
     if not rows.any():
         raise ValueError(
             "Input readings_T must have rows that can be located with the nominal array; instead none can."
         )
-    problem = _of_rows(problem, rows)
+    problem = _select_rows(problem, rows)
     _check_counts(problem)
-    start = calibration_steps.located(problem, [fixes[row] for row in np.flatnonzero(rows).tolist()])
-    # Rows whose sources each have a moment of their own are independent and find their optimum from rough fixes.
-    start = calibration_steps.approached(replace(problem, moment="free"), start, calibration_steps.SHARES[:1])
+    start = calibration_steps.state_from_fixes(problem, [fixes[row] for row in np.flatnonzero(rows).tolist()])
+    # With a moment for each row the rows are independent and converge from rough fixes.
+    start = calibration_steps.approach_optimum(replace(problem, moment="free"), start, calibration_steps.SHARES[:1])
     if moment == "constant":
-        # A row on the wrong side of the array would drag the common moment with it: all are looked for once more.
-        start = calibration_steps.with_one_moment(problem, start)
-    return _result(problem, calibration_steps.fitted(problem, start), rows)
+        # A row on the wrong side of the array would bias the common moment, so all rows are fixed again.
+        start = calibration_steps.with_common_moment(problem, start)
+    return _result(problem, calibration_steps.fit_calibration(problem, start), rows)
 
 
-def _checked(
+def _check_inputs(
     array: SensorArray, readings_T: ArrayLike, world_from_array: ArrayLike | None
 ) -> tuple[FloatArray, FloatArray]:
     if array.channel_is_scalar.any():
@@ -175,7 +179,7 @@ def _checked(
     return readings, np.broadcast_to(attitude, (len(readings), 3, 3))
 
 
-def _rows_of_3(name: str, value: ArrayLike, n: int) -> FloatArray:
+def _check_vectors(name: str, value: ArrayLike, n: int) -> FloatArray:
     rows = np.asarray(value, dtype=np.float64)
     if rows.shape != (n, 3) or not np.isfinite(rows).all():
         raise ValueError(f"Input {name} must be finite and have shape ({n}, 3); instead received shape {rows.shape}.")
@@ -189,9 +193,9 @@ def _problem(
     prior: CalibrationPrior,
     unknown_position: bool,
     unknown_height: bool,
-    moment: MomentModel,
-) -> Problem:
-    return Problem(
+    moment: MomentKind,
+) -> CalibrationProblem:
+    return CalibrationProblem(
         array=array,
         readings_T=readings,
         noise_T=proportional_noise(array, readings),
@@ -204,12 +208,12 @@ def _problem(
     )
 
 
-def _usable(problem: Problem) -> BoolArray:
-    """Rows with more readings than unknowns of their own."""
+def _usable_rows(problem: CalibrationProblem) -> BoolArray:
+    """Return which rows have more readings than unknowns of their own."""
     return np.isfinite(problem.readings_T).sum(axis=1) > problem.n_row_unknowns
 
 
-def _of_rows(problem: Problem, rows: BoolArray) -> Problem:
+def _select_rows(problem: CalibrationProblem, rows: BoolArray) -> CalibrationProblem:
     return replace(
         problem,
         readings_T=problem.readings_T[rows],
@@ -218,13 +222,13 @@ def _of_rows(problem: Problem, rows: BoolArray) -> Problem:
     )
 
 
-def _n_readings(problem: Problem) -> int:
-    """Readings minus the unknowns of the rows."""
+def _n_readings(problem: CalibrationProblem) -> int:
+    """Return the number of readings minus the unknowns of the rows."""
     unknown = problem.n_row_unknowns - 3 * (problem.array.common_field_T is not None)
     return int(np.isfinite(problem.readings_T).sum()) - unknown * len(problem.readings_T)
 
 
-def _check_counts(problem: Problem) -> None:
+def _check_counts(problem: CalibrationProblem) -> None:
     unknowns, left = len(problem.estimated), _n_readings(problem)
     if left < unknowns:
         raise ValueError(
@@ -233,17 +237,19 @@ def _check_counts(problem: Problem) -> None:
         )
 
 
-def _result(problem: Problem, fitted: tuple[Problem, Optimum[Fit]], rows: BoolArray) -> SourceCalibration:
+def _result(
+    problem: CalibrationProblem, fitted: tuple[CalibrationProblem, Optimum[CalibrationIterate]], rows: BoolArray
+) -> SourceCalibration:
     problem, optimum = fitted
     state = optimum.point.state
     nominal = replace(problem, free=np.zeros_like(problem.free))
-    untouched = replace(state, sensors=np.zeros_like(state.sensors))
-    before = source_fit.minimised(nominal, untouched, max_iterations=_ITERATIONS_BEFORE)
+    nominal_sensors = replace(state, sensors=np.zeros_like(state.sensors))
+    before = source_fit.fit_state(nominal, nominal_sensors, max_iterations=_ITERATIONS_BEFORE)
     after = moving_source.chi2(problem, state)
     told = source_fit.information_of_sensors(problem, state)
     n = len(told)
     values, vectors = np.linalg.eigh(told)
-    relative = (vectors / (1.0 + np.maximum(values, 0.0))) @ vectors.T  # never negative, whatever was rounded
+    relative = (vectors / (1.0 + np.maximum(values, 0.0))) @ vectors.T  # no rounding makes it negative
     covariance = relative * np.outer(problem.prior[problem.free], problem.prior[problem.free])
     deviation = np.zeros(problem.prior.shape)
     deviation[problem.free] = np.sqrt(np.diagonal(covariance))
@@ -254,7 +260,7 @@ def _result(problem: Problem, fitted: tuple[Problem, Optimum[Fit]], rows: BoolAr
     array_from_world = np.swapaxes(problem.world_from_array, -1, -2)
     return SourceCalibration(
         nominal=problem.array,
-        array=calibration_steps.calibrated_array(problem.array, state.sensors),
+        array=calibration_steps.apply_calibration(problem.array, state.sensors),
         converged=optimum.converged,
         iterations=optimum.iterations,
         rows=rows,
@@ -267,7 +273,7 @@ def _result(problem: Problem, fitted: tuple[Problem, Optimum[Fit]], rows: BoolAr
         sigma=deviation,
         estimated=problem.free,
         covariance=covariance,
-        unobservable=unobservable(problem, state, told),
+        unobservable=unobservable_directions(problem, state, told),
         position_m=state.position_m + state.height_m * array_from_world[..., 2],
         moment_Am2=np.array(state.moment_Am2),
         readings_T=problem.readings_T,

@@ -1,4 +1,4 @@
-"""The door of calibration: by a source on a known path or an unknown one, or by turning in a field of known modulus."""
+"""Calibration by a source on any path, or by turning in a field of known modulus."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from arrays.array import SensorArray
 from arrays.typing import FloatArray
 from magloc.calibration.array import CalibrationPrior, calibrate_on_path, self_calibrate
 from magloc.calibration.model import GAINS, PER_SENSOR, unknowns
-from magloc.calibration.modulus import EllipsoidCalibration, calibrated_in_modulus, symmetric
+from magloc.calibration.modulus import EllipsoidCalibration, calibrate_in_modulus, symmetric
 from magloc.calibration.observability import Unobservable
 from magloc.calibration.results import SourceCalibration, TurningCalibration
 from magloc.measurement.plausibility import warn_of_array, warn_of_moments
@@ -29,13 +29,13 @@ def calibrate(
     moment: Literal["constant", "free"] | None = None,
     prior: CalibrationPrior = CalibrationPrior(),
 ) -> SourceCalibration | TurningCalibration:
-    """Calibrate vector sensors by a source that moves past them, or by turning them in a field of known modulus.
+    """Calibrate vector sensors by a moving source, or by turning them in a known modulus.
 
-    With `truth` the path of the source is known. Without it the path is found with the sensors; the array as a whole
-    can then be moved, turned and scaled without any effect on the readings: there the prior decides, or the trusted
-    sensors do. A mirror image, all sensors and the path inverted through one point, fits equally well too; the nominal
-    array tells which of the two it is. With `modulus_T` there is no source: every sensor was turned in a uniform field,
-    which tells its gains, the angles between its axes and its offsets, not how it is mounted.
+    With `truth` the path of the source is known. Without it the path is estimated with the sensors. A displacement, a
+    rotation or another scale of the whole array then has no effect on the readings; there the prior or the trusted
+    sensors decide. A mirror image, all sensors and the path inverted through one point, fits equally well; the nominal
+    array decides between the two. With `modulus_T` there is no source: every sensor was turned in a uniform field,
+    which determines its gains, the angles between its axes and its offsets, but not how it is mounted.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ def calibrate(
         Path of the source in the readings' frame; rows of the same time are used. A missing z is one unknown height for
         all rows. Moments, where it has them, are taken as known.
     modulus_T : array_like, shape () or (n,), optional
-        Modulus of the field that the sensors were turned in [T].
+        Modulus of the field in which the sensors were turned [T].
     moment : {"constant", "free"}, optional
         Whether the unknown moment of the source is one vector in the world frame, of a source that does not turn, or
         free in every row; moments of the truth are not used then. Constant by default.
@@ -57,13 +57,13 @@ def calibrate(
     Returns
     -------
     SourceCalibration or TurningCalibration
-        The latter with `modulus_T`. Not converged where nothing in it counts.
+        The latter with `modulus_T`. If it did not converge, no number in it is a result.
 
     Raises
     ------
     ValueError
-        The shapes do not agree, the array has scalar sensors (with `modulus_T`: no vector sensor), no time of the truth
-        is one of the readings, no row can be located with the nominal array, or there are fewer readings than unknowns.
+        The shapes do not agree, the array has scalar sensors (with `modulus_T`: no vector sensor), truth and readings
+        have no common time, no row can be located with the nominal array, or there are fewer readings than unknowns.
 
     Examples
     --------
@@ -81,9 +81,9 @@ def calibrate(
     if modulus_T is not None:
         if truth is not None or moment is not None:
             raise ValueError("Input modulus_T must come without truth and moment: there is no source.")
-        return _turned(array, rows, np.asarray(modulus_T, dtype=np.float64))
+        return _calibrate_by_turning(array, rows, np.asarray(modulus_T, dtype=np.float64))
     try:
-        result = _by_source(array, rows, truth, moment, prior)
+        result = _calibrate_by_source(array, rows, truth, moment, prior)
     except np.linalg.LinAlgError:
         raise ValueError(
             "Input readings must be those of a source that passes the sensors at a distance; instead the model cannot"
@@ -93,7 +93,7 @@ def calibrate(
     return result
 
 
-def _by_source(
+def _calibrate_by_source(
     array: SensorArray,
     rows: Readings,
     truth: Truth | None,
@@ -125,14 +125,14 @@ def _by_source(
 
 
 def _world_from_array(readings: Readings) -> FloatArray:
-    """Attitude of the array in every row (n, 3, 3); without a pose its axes are the world's."""
+    """Return the attitude of the array in every row (n, 3, 3); identity without a pose."""
     if readings.pose is None:
         return np.broadcast_to(np.eye(3), (len(readings), 3, 3))
     return readings.pose[1].as_matrix()
 
 
-def _turned(nominal: SensorArray, rows: Readings, modulus_T: FloatArray) -> TurningCalibration:
-    array, fits = calibrated_in_modulus(nominal, rows.values_T, modulus_T)
+def _calibrate_by_turning(nominal: SensorArray, rows: Readings, modulus_T: FloatArray) -> TurningCalibration:
+    array, fits = calibrate_in_modulus(nominal, rows.values_T, modulus_T)
     change, sigma = np.zeros((2, nominal.n_sensors, PER_SENSOR))
     for i, (before, after) in enumerate(zip(nominal.sensors, array.sensors, strict=True)):
         if before.id not in fits:
@@ -161,7 +161,10 @@ def _turned(nominal: SensorArray, rows: Readings, modulus_T: FloatArray) -> Turn
 
 
 def _sigma(fit: EllipsoidCalibration, old: FloatArray, new: FloatArray) -> FloatArray:
-    """Standard deviations (15,): with S = P R the change E = S S₀⁻¹ - 1 moves by dP R S₀⁻¹."""
+    """Return the standard deviations (15,) of a sensor's change.
+
+    With S = P R the change E = S S₀⁻¹ - 1 varies by dP R S₀⁻¹.
+    """
     by_entry = np.stack([symmetric(unit) for unit in np.eye(6)]) @ (np.linalg.inv(fit.scale) @ new @ np.linalg.inv(old))
     variance = np.einsum("eab,ef,fab->ab", by_entry, fit.covariance[3:, 3:], by_entry)
     return unknowns(1, response=np.sqrt(variance), offset=np.sqrt(np.diagonal(fit.covariance)[:3]))[0]

@@ -1,4 +1,4 @@
-"""Least squares for an array and a source that moves past it, the unknowns of the rows eliminated.
+"""Least squares for an array and a moving source, with the unknowns of the rows eliminated.
 
 The unknowns of a row touch no other row. They are eliminated by a QR factorisation of their own few columns, batched
 over the rows (the Schur complement in its orthogonal form), so that a step solves one linear system in the unknowns of
@@ -13,26 +13,34 @@ from functools import cached_property
 import numpy as np
 
 from arrays.typing import FloatArray
-from magloc.calibration.model import PER_SENSOR, Linearisation, Problem, State, common_weight, cost, linearised
+from magloc.calibration.model import (
+    PER_SENSOR,
+    CalibrationProblem,
+    CalibrationState,
+    Linearisation,
+    common_weight,
+    cost,
+    linearise,
+)
 from magloc.least_squares import Optimum, damped_step, minimise
 
-# Enough to hold what no reading shows, too little to be taken for information.
+# Enough to keep unknowns without information in place, too little to count as information.
 _NO_DAMPING, _LAST_DAMPING = 1e-20, 1e-2
 _LEAST_SHARE = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
-class Reduced:
-    """Normal equations of the unknowns of sensors and source that are estimated, those of the rows eliminated.
+class ReducedEquations:
+    """Normal equations of sensors and source after elimination of the rows' unknowns.
 
     Attributes
     ----------
     information : ndarray, shape (P, P)
-        Of the readings alone; P counts the F free unknowns of the sensors, then those of the source.
+        Information of the readings alone; P counts the F free unknowns of the sensors, then those of the source.
     gradient : ndarray, shape (P,)
-        Of half of χ².
+        Gradient of half of χ².
     by_row, row_gradient, row_factor : ndarray, shapes (T, n, P), (T, n), (T, n, n)
-        What :func:`row_step` needs.
+        Factors for :func:`row_step`.
     """
 
     information: FloatArray
@@ -42,8 +50,12 @@ class Reduced:
     row_factor: FloatArray
 
 
-def reduced(problem: Problem, state: State, linear: Linearisation, damping: float = _NO_DAMPING) -> Reduced:
-    """Normal equations of sensors and source; the damping is that of the rows' unknowns, relative to their information.
+def eliminate_rows(
+    problem: CalibrationProblem, state: CalibrationState, linear: Linearisation, damping: float = _NO_DAMPING
+) -> ReducedEquations:
+    """Return the normal equations of sensors and source, with the rows' unknowns eliminated.
+
+    The damping is that of the rows' unknowns, relative to their information.
 
     With the rows' columns ``J = Q R`` (priors and damping appended as further rows) what remains of the other columns
     is their part orthogonal to Q.
@@ -53,7 +65,7 @@ def reduced(problem: Problem, state: State, linear: Linearisation, damping: floa
     prior = np.zeros((3, n))
     prior[:, -3:] = common_weight(problem) * np.eye(3)
     size = np.sqrt(np.einsum("tcn,tcn->tn", linear.by_row, linear.by_row) + np.sum(prior**2, axis=0))
-    # An unknown that no reading shows keeps a column of its own: it stays where it is.
+    # An unknown without information keeps a column of its own, so that it does not change.
     damped = np.sqrt(damping) * np.where(size > 0.0, size, 1.0)[..., None] * np.eye(n)
     stacked = np.concatenate([linear.by_row, np.broadcast_to(prior, (n_rows, 3, n)), damped], axis=1)
     q, r = np.linalg.qr(stacked)
@@ -70,33 +82,36 @@ def reduced(problem: Problem, state: State, linear: Linearisation, damping: floa
         axis=-1,
     )
     flat = by_row.reshape(n_rows * n, by_row.shape[-1])
-    information, gradient = _not_reduced(linear)
+    information, gradient = _normal_equations(linear)
     information = information[np.ix_(problem.estimated, problem.estimated)] - flat.T @ flat
     gradient = gradient[problem.estimated] - flat.T @ row_gradient.ravel()
-    return Reduced(information, gradient, by_row, row_gradient, r)
+    return ReducedEquations(information, gradient, by_row, row_gradient, r)
 
 
-def row_step(equations: Reduced, step: FloatArray) -> FloatArray:
-    """Step of the rows' unknowns (T, n) that goes with a step of those of sensors and source (P,)."""
+def row_step(equations: ReducedEquations, step: FloatArray) -> FloatArray:
+    """Return the step of the rows' unknowns (T, n) that goes with a step (P,) of the others."""
     right = equations.row_gradient + equations.by_row @ step
     return np.asarray(-np.linalg.solve(equations.row_factor, right[..., None])[..., 0], dtype=np.float64)
 
 
-def information_of_sensors(problem: Problem, state: State) -> FloatArray:
-    """What the readings alone tell of the sensors' free unknowns, all else eliminated: (F, F), in prior deviations."""
-    information = reduced(problem, state, linearised(problem, state)).information
+def information_of_sensors(problem: CalibrationProblem, state: CalibrationState) -> FloatArray:
+    """Return the information (F, F) of the readings on the sensors' free unknowns.
+
+    All other unknowns are eliminated. The unit of an unknown is its prior standard deviation.
+    """
+    information = eliminate_rows(problem, state, linearise(problem, state)).information
     n = int(problem.free.sum())
     cross, own = information[:n, n:], information[n:, n:]
-    # A constant of the source that no reading shows has no information to eliminate.
+    # The pseudo-inverse allows constants of the source without information.
     return information[:n, :n] - cross @ np.linalg.pinv(own, hermitian=True) @ cross.T
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class CalibrationIterate:
     """A state of a problem, as an iterate of :func:`magloc.least_squares.minimise`."""
 
-    problem: Problem
-    state: State
+    problem: CalibrationProblem
+    state: CalibrationState
 
     @cached_property
     def cost(self) -> float:
@@ -106,13 +121,13 @@ class Fit:
 
     @cached_property
     def _linear(self) -> Linearisation:
-        return linearised(self.problem, self.state)
+        return linearise(self.problem, self.state)
 
-    def step(self, damping: float) -> tuple[Fit, float]:
-        """The state after a damped step; the unknowns of the rows are damped, too."""
+    def step(self, damping: float) -> tuple[CalibrationIterate, float]:
+        """Return the state after a damped step; the unknowns of the rows are damped too."""
         problem, state = self.problem, self.state
-        equations = reduced(problem, state, self._linear, damping)
-        # The priors of the sensors' unknowns, which are counted in prior deviations; the source has none.
+        equations = eliminate_rows(problem, state, self._linear, damping)
+        # Priors of the sensors' unknowns, whose unit is the prior deviation; the source has none.
         n_free = int(problem.free.sum())
         information, gradient = equations.information.copy(), equations.gradient.copy()
         information[range(n_free), range(n_free)] += 1.0
@@ -120,27 +135,36 @@ class Fit:
         step, promised = damped_step(information, gradient, damping)
         # No step goes farther than the prior: the field is far from linear in the positions.
         step /= max(1.0, float(np.abs(step[:n_free]).max(initial=0.0)))
-        trial = replace(self, state=moved(problem, state, step, row_step(equations, step)))
+        trial = replace(self, state=apply_step(problem, state, step, row_step(equations, step)))
         return trial, promised + float(np.sum(equations.row_gradient**2))
 
 
-def minimised(problem: Problem, start: State, *, tolerance: float = 1e-3, max_iterations: int = 100) -> Optimum[Fit]:
-    """Levenberg-Marquardt until a step promises to lower χ² by less than the tolerance or a part in 10¹⁰."""
+def fit_state(
+    problem: CalibrationProblem, start: CalibrationState, *, tolerance: float = 1e-3, max_iterations: int = 100
+) -> Optimum[CalibrationIterate]:
+    """Minimise χ² by Levenberg-Marquardt steps.
 
-    def least(fit: Fit) -> float:
+    Stop when a step promises to lower χ² by less than the tolerance or a part in 10¹⁰.
+    """
+
+    def least(fit: CalibrationIterate) -> float:
         return max(tolerance, _LEAST_SHARE * fit.cost)
 
-    return minimise(Fit(problem, start), least, last_damping=_LAST_DAMPING, max_iterations=max_iterations)
+    return minimise(
+        CalibrationIterate(problem, start), least, last_damping=_LAST_DAMPING, max_iterations=max_iterations
+    )
 
 
-def moved(problem: Problem, state: State, step: FloatArray, of_rows: FloatArray) -> State:
-    """A state after a step of the unknowns of sensors and source (P,) and of the rows (T, n)."""
+def apply_step(
+    problem: CalibrationProblem, state: CalibrationState, step: FloatArray, of_rows: FloatArray
+) -> CalibrationState:
+    """Return a state after a step (P,) of sensors and source, and (T, n) of the rows."""
     n = int(problem.free.sum())
     sensors = state.sensors.copy()
     sensors[problem.free] += problem.prior[problem.free] * step[:n]
     position, height, moment = state.position_m, state.height_m, state.moment_Am2
     if problem.unknown_position:
-        # A source that is thrown far away would not come back: its field, and with it every slope, is gone.
+        # A source that leaps far away would not return, because its field and all derivatives vanish.
         length = np.linalg.norm(of_rows[:, :3], axis=1, keepdims=True)
         radius = problem.array.circumradius
         of_rows = of_rows * (radius / np.maximum(length, radius))
@@ -151,11 +175,11 @@ def moved(problem: Problem, state: State, step: FloatArray, of_rows: FloatArray)
         moment = moment + of_rows[:, -6:-3]
     elif problem.moment == "constant":
         moment = moment + step[n : n + 3]
-    return State(sensors, position, height, moment, state.common_T + of_rows[:, -3:])
+    return CalibrationState(sensors, position, height, moment, state.common_T + of_rows[:, -3:])
 
 
-def _not_reduced(linear: Linearisation) -> tuple[FloatArray, FloatArray]:
-    """Information and gradient before the rows' unknowns are eliminated."""
+def _normal_equations(linear: Linearisation) -> tuple[FloatArray, FloatArray]:
+    """Return information and gradient before the rows' unknowns are eliminated."""
     n_rows, n_sensors = linear.by_sensor.shape[:2]
     n, g = n_sensors * PER_SENSOR, linear.by_source.shape[-1]
     information, gradient = np.zeros((n + g, n + g)), np.zeros(n + g)

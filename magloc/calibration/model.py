@@ -1,10 +1,10 @@
-r"""What an array of vector sensors reads of a source that moves past it, as a function of every unknown.
+r"""Model of the readings of an array of vector sensors when a source moves past it.
 
 In row t (one instant) sensor i reads, with the names of docs/theory/calibration.md,
 
 .. math:: y_{ti} = (I + E_i) K_i \left( B(s_i + d_i;\, p_t, m_t) + c_t \right) + o_i + h_i.
 
-Unknowns of the sensors are counted in units of their prior standard deviations.
+The unit of the sensors' unknowns is their prior standard deviation.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray
 from magloc.fields import dipole
 
-MomentModel = Literal["constant", "free", "known"]
+MomentKind = Literal["constant", "free", "known"]
 """The moment in the world frame: one unknown vector for all rows, one for every row, or known."""
 PER_SENSOR = 15
 POSITION, GAINS, AXES, OFFSET = slice(0, 3), slice(3, 6), slice(6, 12), slice(12, 15)
@@ -29,7 +29,7 @@ _CHANNEL, _COMPONENT = (list(places) for places in zip(*AXIS_PAIRS, strict=True)
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class CalibrationState:
     """Values of all unknowns.
 
     Attributes
@@ -39,7 +39,7 @@ class State:
     position_m : ndarray, shape (T, 3)
         Source in the array's frame, without the unknown height.
     height_m : float
-        Added along the world's z.
+        Height to add along the world's z.
     moment_Am2 : ndarray, shape (T, 3)
         Moment in the world frame; equal rows if it is constant.
     common_T : ndarray, shape (T, 3)
@@ -54,13 +54,13 @@ class State:
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
-    """Readings, and what is unknown of sensors, source and rows.
+class CalibrationProblem:
+    """Readings, and which quantities of sensors, source and rows are unknown.
 
     Attributes
     ----------
     array : SensorArray
-        Nominal; vector sensors only.
+        Nominal array of vector sensors.
     readings_T : ndarray, shape (T, C)
         Raw readings; NaN where missing.
     noise_T : ndarray, shape (T, C)
@@ -68,7 +68,7 @@ class Problem:
     prior : ndarray, shape (N, 15)
         Standard deviations of the sensors' unknowns around the nominal array.
     free : ndarray of bool, shape (N, 15)
-        Which of them are estimated.
+        Which of the sensors' unknowns are estimated.
     world_from_array : ndarray, shape (T, 3, 3)
         Attitude of the array in every row.
     unknown_position : bool
@@ -86,16 +86,16 @@ class Problem:
     world_from_array: FloatArray
     unknown_position: bool
     unknown_height: bool
-    moment: MomentModel
+    moment: MomentKind
 
     @property
     def n_globals(self) -> int:
-        """Unknowns of the source as a whole."""
+        """Number of unknowns that all rows share."""
         return 3 * (self.moment == "constant") + self.unknown_height
 
     @property
     def n_row_unknowns(self) -> int:
-        """Unknowns of one row."""
+        """Number of unknowns of one row."""
         return 3 * self.unknown_position + 3 * (self.moment == "free") + 3
 
     @property
@@ -114,11 +114,11 @@ class Linearisation:
     residual : ndarray, shape (T, C)
         (prediction - reading) / noise; zero where missing.
     by_sensor : ndarray, shape (T, N, 3, 15)
-        By the unknowns of the channel's sensor, in prior standard deviations.
+        Derivatives by the unknowns of the channel's sensor, in prior standard deviations.
     by_source : ndarray, shape (T, C, g)
-        By the constant moment and the height.
+        Derivatives by the constant moment and the height.
     by_row : ndarray, shape (T, C, n)
-        By the row's position, moment and common field.
+        Derivatives by the row's position, moment and common field.
     """
 
     residual: FloatArray
@@ -127,13 +127,13 @@ class Linearisation:
     by_row: FloatArray
 
 
-def responses(problem: Problem, state: State) -> FloatArray:
-    """(I + E) K of every sensor, shape (N, 3, 3): from fields in the array's frame to readings."""
+def responses(problem: CalibrationProblem, state: CalibrationState) -> FloatArray:
+    """Return (I + E) K of every sensor, (N, 3, 3): from fields in the array's frame to readings."""
     return response_factors(state.sensors) @ problem.array.channel_gain.reshape(-1, 3, 3)
 
 
 def response_factors(sensors: FloatArray) -> FloatArray:
-    """I + E of every sensor, shape (N, 3, 3), from its unknowns (N, 15)."""
+    """Return I + E of every sensor, shape (N, 3, 3), from its unknowns (N, 15)."""
     factors = np.tile(np.eye(3), (len(sensors), 1, 1))
     factors[:, range(3), range(3)] += sensors[:, GAINS]
     factors[:, _CHANNEL, _COMPONENT] = sensors[:, AXES]
@@ -147,7 +147,7 @@ def unknowns(
     response: FloatArray | None = None,
     offset: FloatArray | float = 0.0,
 ) -> FloatArray:
-    """Changes of positions (N, 3), of responses, E (N, 3, 3), and of offsets (N, 3) as unknowns (N, 15)."""
+    """Return changes of positions (N, 3), responses E (N, 3, 3) and offsets (N, 3) as (N, 15)."""
     result = np.zeros((n_sensors, PER_SENSOR))
     result[:, POSITION], result[:, OFFSET] = position, offset
     if response is not None:
@@ -156,33 +156,33 @@ def unknowns(
     return result
 
 
-def predicted_T(problem: Problem, state: State) -> FloatArray:
-    """Predicted readings, shape (T, C) [T]."""
+def prediction_T(problem: CalibrationProblem, state: CalibrationState) -> FloatArray:
+    """Return the predicted readings, shape (T, C) [T]."""
     points, sources, moments = _geometry(problem, state)
     fields = dipole.field(points, sources, moments) + state.common_T[:, None, :]
     readings = np.einsum("iab,tib->tia", responses(problem, state), fields) + state.sensors[:, OFFSET]
     return readings.reshape(len(fields), -1) + problem.array.channel_offset_T
 
 
-def residuals(problem: Problem, state: State) -> FloatArray:
-    """Whitened residuals of all readings, shape (T, C); zero where a reading is missing."""
-    difference = predicted_T(problem, state) - problem.readings_T
+def residuals(problem: CalibrationProblem, state: CalibrationState) -> FloatArray:
+    """Return the whitened residuals of all readings, (T, C); zero where a reading is missing."""
+    difference = prediction_T(problem, state) - problem.readings_T
     return np.where(np.isfinite(problem.readings_T), difference / problem.noise_T, 0.0)
 
 
-def chi2(problem: Problem, state: State) -> float:
-    """χ² of the readings, the prior of the common field included if there is one."""
+def chi2(problem: CalibrationProblem, state: CalibrationState) -> float:
+    """Return χ² of the readings, and of the prior of the common field if there is one."""
     common = state.common_T * common_weight(problem)
     return float(np.sum(residuals(problem, state) ** 2) + np.sum(common**2))
 
 
-def cost(problem: Problem, state: State) -> float:
-    """χ² of the readings and of all priors."""
+def cost(problem: CalibrationProblem, state: CalibrationState) -> float:
+    """Return χ² of the readings and of all priors."""
     return chi2(problem, state) + float(np.sum((state.sensors / problem.prior)[problem.free] ** 2))
 
 
-def linearised(problem: Problem, state: State) -> Linearisation:
-    """Residuals of a state and their derivatives by every unknown."""
+def linearise(problem: CalibrationProblem, state: CalibrationState) -> Linearisation:
+    """Return the residuals of a state and their derivatives by every unknown."""
     array = problem.array
     n_rows, n_sensors = len(state.position_m), array.n_sensors
     points, sources, moments = _geometry(problem, state)
@@ -223,8 +223,8 @@ def linearised(problem: Problem, state: State) -> Linearisation:
     )
 
 
-def _geometry(problem: Problem, state: State) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Sensors (N, 3), sources and moments (T, 1, 3), all in the array's frame."""
+def _geometry(problem: CalibrationProblem, state: CalibrationState) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return sensors (N, 3), sources and moments (T, 1, 3), all in the array's frame."""
     points = problem.array.positions + state.sensors[:, POSITION]
     array_from_world = np.swapaxes(problem.world_from_array, -1, -2)
     sources = state.position_m + state.height_m * array_from_world[..., 2]
@@ -232,7 +232,7 @@ def _geometry(problem: Problem, state: State) -> tuple[FloatArray, FloatArray, F
     return points, sources[:, None, :], moments[:, None, :]
 
 
-def common_weight(problem: Problem) -> float:
-    """1/σ of the common field [1/T]; zero if nothing is known of it."""
+def common_weight(problem: CalibrationProblem) -> float:
+    """Return 1/σ of the common field [1/T], zero if nothing is known of it."""
     sigma = problem.array.common_field_T
     return 0.0 if sigma is None else 1.0 / max(sigma, 1e-15)

@@ -1,9 +1,9 @@
-"""Calibration of one vector sensor from the modulus of the field alone, while the sensor is turned in it.
+"""Calibration of one vector sensor that is turned in a field of known modulus.
 
-The readings lie on an ellipsoid :math:`r = o + M P u + n`, :math:`|u| = 1`, of which the offset o and the symmetric P
-are estimated by maximum likelihood with every direction u unknown, the bias :math:`σ^2 (κ_1 + κ_2) / 2` of the distance
-by the curvatures κ subtracted; a turn of the sensor's axes is not observable. See docs/theory/calibration.md, also for
-the relation to TWOSTEP.
+The readings lie on an ellipsoid :math:`r = o + M P u + n`, :math:`|u| = 1`. The offset o and the symmetric P are
+estimated by maximum likelihood with every direction u unknown. The curvatures κ bias the distance by
+:math:`σ^2 (κ_1 + κ_2) / 2`, which is subtracted. A rotation of the sensor's axes is not observable. See
+docs/theory/calibration.md, also for the relation to TWOSTEP.
 """
 
 from __future__ import annotations
@@ -26,31 +26,31 @@ from magloc.levels import MISFIT
 from magloc.measurement.rows import check_rows
 
 N_PARAMETERS = 9
-"""Three of the offset, six of the symmetric scale matrix."""
+"""Three numbers of the offset and six of the symmetric scale matrix."""
 _ROW, _COLUMN = np.array([0, 1, 2, 0, 0, 1]), np.array([0, 1, 2, 1, 2, 2])
 # A step that changes the fit by less than this, in standard deviations or relative to the rounding of the readings.
 _SETTLED = 1e-9
 _SETTLED_RTOL = 1e-13
 _NEAREST_ITERATIONS = 50
-# Where the algebraic fit looks for the squared distance of the readings' mean from the offset, in squared mean moduli.
+# Search range of the algebraic fit: squared distance of the mean reading from the offset, in squared mean moduli.
 _LARGEST_SHIFT = 2.0
 _SHIFTS = 81
 _BISECTIONS = 40
-# Relative standard deviation beyond which a linearised fit is none.
+# Relative standard deviation beyond which a linearised covariance is not valid.
 _LARGEST_UNCERTAINTY = 0.02
-# Factor by which χ² two standard deviations along the least known direction may be off.
+# Allowed factor between χ² and its parabola, two standard deviations along the least known direction.
 _LARGEST_BEND = 2.0
-# Noise over the least radius of curvature beyond which the distance's bias is no longer that of second order.
+# Noise over the least radius of curvature beyond which the second-order bias of the distance is not valid.
 _LARGEST_NOISE = 0.2
-# Noise spreads the readings by σ/M and feigns information of that size about what they do not cover.
+# Noise spreads the readings by σ/M, which looks like information about directions that they do not cover.
 _FEIGNED = 4.0
 
 
 @dataclass(frozen=True, eq=False)
 class EllipsoidCalibration:
-    """Scale and offset of a sensor, as far as the modulus of the field tells them.
+    """Scale and offset of a sensor, as far as the modulus of the field determines them.
 
-    Where `converged` is false, nothing is known: `reason` says why, and all numbers are NaN.
+    If `converged` is false, `reason` says why, and all numbers are NaN.
 
     Attributes
     ----------
@@ -59,13 +59,13 @@ class EllipsoidCalibration:
     offset_T : ndarray, shape (3,)
         Reading in zero field [T].
     covariance : ndarray, shape (9, 9)
-        Of (offset x y z [T], scale xx yy zz xy xz yz), from the stated noise and an exactly known modulus.
+        Covariance of (offset x y z [T], scale xx yy zz xy xz yz), for the stated noise and an exact modulus.
     chi2 : float
         Sum of squared distances from the ellipsoid, bias removed, over the noise squared.
     dof : int
         Readings minus nine.
     reason : str
-        Empty if it converged.
+        Empty string if it converged.
     """
 
     scale: FloatArray
@@ -79,12 +79,15 @@ class EllipsoidCalibration:
 
     @property
     def misfit(self) -> bool:
-        """Whether χ² is beyond noise: the modulus, its noise or the sensor are not as stated, nor is the covariance."""
+        """Whether χ² is beyond noise; then the covariance is wrong too.
+
+        The modulus, its noise or the sensor are not as stated.
+        """
         return self.converged and self.dof > 0 and bool(chdtrc(self.dof, self.chi2) < MISFIT)
 
 
 @dataclass(frozen=True, eq=False)
-class _Problem:
+class _EllipsoidProblem:
     """Readings and moduli in units of their own size, so that P is about 1."""
 
     readings: FloatArray
@@ -93,8 +96,8 @@ class _Problem:
 
 
 @dataclass(frozen=True, eq=False)
-class _Fit:
-    problem: _Problem
+class _EllipsoidIterate:
+    problem: _EllipsoidProblem
     offset: FloatArray
     scale: FloatArray
     residual: FloatArray
@@ -105,17 +108,20 @@ class _Fit:
     def _factors(self) -> tuple[FloatArray, FloatArray]:
         return np.linalg.qr(self.jacobian)
 
-    def moved(self, step: FloatArray) -> _Fit:
-        """The fit after a step (9,) of offset and scale."""
-        return _linearised(self.problem, self.offset + step[:3], self.scale + symmetric(step[3:]))
+    def retract(self, step: FloatArray) -> _EllipsoidIterate:
+        """Return the fit after a step (9,) of offset and scale."""
+        return _linearise(self.problem, self.offset + step[:3], self.scale + symmetric(step[3:]))
 
-    def step(self, damping: float) -> tuple[_Fit, float]:
-        """By orthogonal transformations: normal equations would square the condition of a poor coverage."""
+    def step(self, damping: float) -> tuple[_EllipsoidIterate, float]:
+        """Return the fit after a damped step, and the decrease of χ² that it promises.
+
+        The step uses orthogonal transformations: normal equations would square the condition number.
+        """
         q, triangle = self._factors
         weights = np.diag(np.sqrt(damping) * np.linalg.norm(triangle, axis=0))
         right = np.concatenate([q.T @ self.residual, np.zeros(N_PARAMETERS)])
         step = -np.linalg.lstsq(np.concatenate([triangle, weights]), right, rcond=None)[0]
-        return self.moved(step), float(np.sum((triangle @ step) ** 2))
+        return self.retract(step), float(np.sum((triangle @ step) ** 2))
 
 
 def ellipsoid_calibration(readings_T: ArrayLike, modulus_T: ArrayLike, noise_T: float) -> EllipsoidCalibration:
@@ -127,16 +133,16 @@ def ellipsoid_calibration(readings_T: ArrayLike, modulus_T: ArrayLike, noise_T: 
     parameters: readings in one plane, in one small cap or along a few directions. Raises ValueError: the shapes do not
     agree, or a modulus or the noise is not positive and finite.
     """
-    readings, modulus = _checked(readings_T, modulus_T, noise_T)
+    readings, modulus = _check_inputs(readings_T, modulus_T, noise_T)
     if len(readings) < N_PARAMETERS:
         return _failure(f"{len(readings)} complete readings are fewer than the nine unknowns", len(readings), 0)
     centre, field_unit = readings.mean(axis=0), float(np.sqrt(np.mean(modulus**2)))
     unit = float(np.sqrt(np.mean(np.sum((readings - centre) ** 2, axis=1))))
     if unit == 0.0:
         return _failure("all readings are the same", len(readings), 0)
-    problem = _Problem((readings - centre) / unit, modulus / field_unit, noise_T / unit)
+    problem = _EllipsoidProblem((readings - centre) / unit, modulus / field_unit, noise_T / unit)
     least = max(_SETTLED, _SETTLED_RTOL * np.sqrt(len(readings)) / problem.noise) ** 2
-    optima = [minimise(_linearised(problem, *start), lambda _: least) for start in _starts(problem)]
+    optima = [minimise(_linearise(problem, *start), lambda _: least) for start in _starts(problem)]
     best = min(optima, key=lambda optimum: (not optimum.converged, optimum.point.cost))
     fit, iterations = best.point, best.iterations
     if not best.converged:
@@ -159,16 +165,16 @@ def ellipsoid_calibration(readings_T: ArrayLike, modulus_T: ArrayLike, noise_T: 
     )
 
 
-def calibrated_in_modulus(
+def calibrate_in_modulus(
     array: SensorArray, readings_T: ArrayLike, modulus_T: ArrayLike
 ) -> tuple[SensorArray, dict[str, EllipsoidCalibration]]:
     """Calibrate every vector sensor of an array that was turned in a field of known modulus.
 
-    Of all scale matrices P Q that the readings allow, the one nearest to the sensor's previous scale matrix is taken,
-    because the readings do not tell how the sensor's axes are turned. What is not known of that belongs into the
+    The readings do not determine the rotation Q of the sensor's axes. Of all scale matrices P Q that they allow, the
+    result is the one nearest to the sensor's previous scale matrix. State the uncertainty of the rotation as the
     sensor's ``misalignment_rad``.
 
-    ``array``: its noise is that of the readings. ``readings_T`` (n, C): raw readings in channel order [T]; NaN
+    ``array``: states the noise of the readings. ``readings_T`` (n, C): raw readings in channel order [T]; NaN
     where missing. ``modulus_T`` () or (n,): modulus of the field in every row, the same at all sensors [T].
     Returns the array with the calibrations of the sensors whose fit converged, and the fits by the sensors' ids.
     Raises ValueError: the shapes do not agree, a modulus is not positive and finite, or the array has no vector sensor.
@@ -190,7 +196,7 @@ def calibrated_in_modulus(
     return replace(array, sensors=tuple(sensors)), results
 
 
-def _checked(readings_T: ArrayLike, modulus_T: ArrayLike, noise_T: float) -> tuple[FloatArray, FloatArray]:
+def _check_inputs(readings_T: ArrayLike, modulus_T: ArrayLike, noise_T: float) -> tuple[FloatArray, FloatArray]:
     readings = fields(readings_T)
     if readings.ndim != 2 or readings.shape[1] != 3:
         raise ValueError(f"Input readings_T must have shape (n, 3); instead received {readings.shape}.")
@@ -221,10 +227,10 @@ def _failure(reason: str, n_readings: int, iterations: int) -> EllipsoidCalibrat
     )
 
 
-def _starts(problem: _Problem) -> list[tuple[FloatArray, FloatArray]]:
-    """A sphere about the readings' mean, and every algebraic fit that is an ellipsoid.
+def _starts(problem: _EllipsoidProblem) -> list[tuple[FloatArray, FloatArray]]:
+    """Return a sphere about the mean reading, and every algebraic fit that is an ellipsoid.
 
-    ``rᵀ A r - 2 bᵀ r = M² - c`` is linear in A = P⁻² and b = A o but for c = oᵀ A o, which is found by bisection.
+    ``rᵀ A r - 2 bᵀ r = M² - c`` is linear in A = P⁻² and b = A o except for c = oᵀ A o, which is found by bisection.
     """
     r = problem.readings
     columns = np.concatenate([r[:, _ROW] * r[:, _COLUMN] * np.where(_ROW == _COLUMN, 1.0, 2.0), -2.0 * r], axis=1)
@@ -256,11 +262,14 @@ def _starts(problem: _Problem) -> list[tuple[FloatArray, FloatArray]]:
     return starts
 
 
-def _linearised(problem: _Problem, offset: FloatArray, scale: FloatArray) -> _Fit:
-    """Distances over the noise, bias removed, and their derivatives by (offset, P); χ² is infinite without P > 0."""
+def _linearise(problem: _EllipsoidProblem, offset: FloatArray, scale: FloatArray) -> _EllipsoidIterate:
+    """Linearise the distances from an ellipsoid by (offset, P).
+
+    Distances are in units of the noise, with the bias removed; χ² is infinite unless P is positive definite.
+    """
     size, axes = np.linalg.eigh(scale)
     if size[0] <= 0.0:
-        return _Fit(problem, offset, scale, np.empty(0), np.empty((0, N_PARAMETERS)), np.inf)
+        return _EllipsoidIterate(problem, offset, scale, np.empty(0), np.empty((0, N_PARAMETERS)), np.inf)
     semi_axes = problem.modulus[:, None] * size
     points = (problem.readings - offset) @ axes
     nearest = _nearest(points, semi_axes)
@@ -280,11 +289,11 @@ def _linearised(problem: _Problem, offset: FloatArray, scale: FloatArray) -> _Fi
         normal[:, _ROW] * moved[:, _COLUMN] + normal[:, _COLUMN] * moved[:, _ROW],
     )
     jacobian = -np.concatenate([normal, by_scale], axis=1) / problem.noise
-    return _Fit(problem, offset, scale, residual, jacobian, float(residual @ residual))
+    return _EllipsoidIterate(problem, offset, scale, residual, jacobian, float(residual @ residual))
 
 
 def _nearest(points: FloatArray, semi_axes: FloatArray) -> FloatArray:
-    """Nearest point of the ellipsoid Σ (x_i/a_i)² = 1 to each point, both (n, 3).
+    """Return the nearest points of the ellipsoid Σ (x_i/a_i)² = 1 to points, both (n, 3).
 
     ``x_i = a_i² q_i / (a_i² + t)``, where t is the largest root of ``|s(t)| = 1``, ``s_i = a_i q_i / (a_i² + t)``. The
     function 1/|s| is concave in t, so that Newton's method from below climbs to the root.
@@ -304,13 +313,16 @@ def _nearest(points: FloatArray, semi_axes: FloatArray) -> FloatArray:
     return semi_axes * product / (square + t[:, None])
 
 
-def _least_radius_of_curvature(problem: _Problem, fit: _Fit) -> float:
+def _least_radius_of_curvature(problem: _EllipsoidProblem, fit: _EllipsoidIterate) -> float:
     size = np.linalg.eigvalsh(fit.scale)
     return float(problem.modulus.min() * size[0] ** 2 / size[-1])
 
 
-def _root_covariance(problem: _Problem, fit: _Fit) -> FloatArray | None:
-    """A root of the covariance of (offset, P); None where the readings do not determine it."""
+def _root_covariance(problem: _EllipsoidProblem, fit: _EllipsoidIterate) -> FloatArray | None:
+    """Return a square root of the covariance of (offset, P).
+
+    None if the readings do not determine it.
+    """
     # In units in which every parameter shifts a reading by about the radius of the ellipsoid.
     radius = float(np.linalg.det(fit.scale)) ** (1.0 / 3.0)
     _, singular, right = np.linalg.svd(fit.jacobian * (radius * problem.noise), full_matrices=False)
@@ -324,14 +336,14 @@ def _root_covariance(problem: _Problem, fit: _Fit) -> FloatArray | None:
     for deviations in (-2.0, 2.0):
         # χ² must rise by four there, or the uncertainty is bent and no covariance describes it.
         step = deviations * root[:, -1]
-        rise = fit.moved(step).cost - fit.cost
+        rise = fit.retract(step).cost - fit.cost
         if not 4.0 / _LARGEST_BEND < rise < 4.0 * _LARGEST_BEND:
             return None
     return root
 
 
 def symmetric(entries: FloatArray) -> FloatArray:
-    """Symmetric matrix of its entries xx yy zz xy xz yz."""
+    """Return the symmetric matrix with entries xx yy zz xy xz yz."""
     matrix = np.zeros((3, 3))
     matrix[_ROW, _COLUMN] = matrix[_COLUMN, _ROW] = entries
     return matrix

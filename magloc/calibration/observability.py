@@ -1,9 +1,9 @@
-"""What readings of a moving source cannot tell about an array: directions in which its unknowns change unseen.
+"""Directions in which the unknowns of an array change without effect on the readings.
 
-Without a known path the array may be moved and turned as a whole, and with the source's moment unknown it may be
-scaled, or all of its gains may; a common offset of all sensors is a common field. These are the gauges. A path in a
-plane or along a line, sensors that are trusted and unknowns that are not estimated change the list, so that it is found
-from the information matrix: its null space, described by the gauges where they span it.
+Without a known path the array may move and turn as a whole. With an unknown moment the size of the array or all of its
+gains may change. A common offset of all sensors is a common field. These directions are the gauges. A path in a plane
+or along a line, trusted sensors and unknowns that are not estimated change the list. Therefore it is derived from the
+null space of the information matrix, which is described by the gauges where they span it.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from magloc.calibration.model import (
     OFFSET,
     PER_SENSOR,
     POSITION,
-    Problem,
-    State,
+    CalibrationProblem,
+    CalibrationState,
     responses,
     unknowns,
 )
@@ -35,22 +35,22 @@ _MIRRORED_WITHIN = 20.0
 
 @dataclass(frozen=True)
 class Unobservable:
-    """A direction in which the unknowns of the sensors may change without any effect on the readings.
+    """A direction in which the sensors' unknowns do not affect the readings.
 
     Attributes
     ----------
     name : str
         What changes: one gauge, a combination of gauges, or the unknowns that change most.
     information : float
-        What the readings tell of it, relative to the prior; 0 is nothing.
+        Information of the readings, relative to the prior; 0 if they do not depend on it.
     """
 
     name: str
     information: float
 
 
-def gauge_vectors(problem: Problem, state: State) -> dict[str, FloatArray]:
-    """How the sensors' unknowns change along every gauge at a state, each (N, 15) in prior standard deviations."""
+def gauge_vectors(problem: CalibrationProblem, state: CalibrationState) -> dict[str, FloatArray]:
+    """Return the sensors' unknowns along every gauge, (N, 15) in prior standard deviations."""
     array, n = problem.array, problem.array.n_sensors
     relative = array.positions + state.sensors[:, POSITION]
     relative = relative - relative.mean(axis=0)
@@ -70,8 +70,10 @@ def gauge_vectors(problem: Problem, state: State) -> dict[str, FloatArray]:
     return {name: vector / problem.prior for name, vector in vectors.items()}
 
 
-def unobservable(problem: Problem, state: State, information: FloatArray) -> tuple[Unobservable, ...]:
-    """Directions that the information (F, F) about the sensors' free unknowns does not tell, the gauges first."""
+def unobservable_directions(
+    problem: CalibrationProblem, state: CalibrationState, information: FloatArray
+) -> tuple[Unobservable, ...]:
+    """Return the directions without information in (F, F), the gauges first."""
     if not len(information):
         return ()
     value, vector = np.linalg.eigh(information)
@@ -92,14 +94,14 @@ def unobservable(problem: Problem, state: State, information: FloatArray) -> tup
     left, size, _ = np.linalg.svd(null, full_matrices=False)
     for direction in left[:, size > 0.5].T:
         told = float(direction @ information @ direction)
-        found.append(Unobservable(_described(problem, direction, seen), max(0.0, told)))
-    if _mirrored_cost(problem, state) < _MIRRORED_WITHIN:
+        found.append(Unobservable(_describe(problem, direction, seen), max(0.0, told)))
+    if _mirror_cost(problem, state) < _MIRRORED_WITHIN:
         found.append(Unobservable("mirror image: every position inverted through one point", 0.0))
     return tuple(found)
 
 
-def _described(problem: Problem, direction: FloatArray, gauges: dict[str, FloatArray]) -> str:
-    """A direction as a combination of gauges that moves nothing that is held, or by the unknowns that change most."""
+def _describe(problem: CalibrationProblem, direction: FloatArray, gauges: dict[str, FloatArray]) -> str:
+    """Describe a direction by gauges, else by the unknowns that change most."""
     whole = np.zeros(problem.free.size)
     whole[problem.free.ravel()] = direction
     if gauges:
@@ -113,8 +115,8 @@ def _described(problem: Problem, direction: FloatArray, gauges: dict[str, FloatA
     return "mostly " + ", ".join(unknown_name(problem, int(k)) for k in largest)
 
 
-def unknown_name(problem: Problem, index: int) -> str:
-    """Name of one of the 15 N unknowns of the sensors, as ``s1 position x``."""
+def unknown_name(problem: CalibrationProblem, index: int) -> str:
+    """Return the name of one of the sensors' 15 N unknowns, as ``s1 position x``."""
     sensor, k = divmod(index, PER_SENSOR)
     name = problem.array.ids[sensor]
     if k < AXES.start:
@@ -125,8 +127,11 @@ def unknown_name(problem: Problem, index: int) -> str:
     return f"{name} axis {'xyz'[channel]} towards {'xyz'[component]}"
 
 
-def _mirrored_cost(problem: Problem, state: State) -> float:
-    """Rise of the priors' χ² when sensors and path are inverted through a point, which no reading shows."""
+def _mirror_cost(problem: CalibrationProblem, state: CalibrationState) -> float:
+    """Return how much the priors' χ² rises if sensors and path are inverted through a point.
+
+    No reading shows such an inversion.
+    """
     if not (problem.unknown_position and problem.free[:, POSITION].all()):
         return np.inf
     nominal = problem.array.positions

@@ -1,4 +1,4 @@
-"""What a calibration finds, and how far it can be trusted."""
+"""Results of a calibration, with their uncertainty."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from magloc.fields import dipole
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Calibration(Drawn):
-    """A calibrated array, and how far it can be trusted.
+    """A calibrated array, with its uncertainty.
 
     Attributes
     ----------
     nominal, array : SensorArray
-        Before and after: with the estimated positions, scale matrices and offsets; all else as in the nominal array.
+        Before and after; the latter has the estimated positions, scale matrices and offsets.
     converged : bool
-        Whether the iteration ended at an optimum; else nothing here is a result.
+        Whether the iteration ended at an optimum; otherwise no number here is a result.
     change, sigma : ndarray, shape (N, 15)
         What the estimate adds to the nominal array, and its posterior standard deviation: position x y z [m], relative
         gain of channel x y z, axes [rad] (x towards y, x towards z, y towards x, …), offset x y z [T]. The standard
         deviation is 0 where nothing is estimated, infinite where the readings do not determine a sensor.
     chi2, dof : float
-        Σ ((reading - prediction)/noise)² with the calibrated sensors, and the readings minus the unknowns that they
-        tell.
+        Σ ((reading - prediction)/noise)² with the calibrated sensors, and the number of readings minus that of the
+        unknowns that they determine.
     unobservable : tuple of Unobservable
-        What the readings do not tell: there the nominal array speaks alone.
+        Directions that the readings do not determine; there the estimate is the nominal array.
 
     Examples
     --------
@@ -70,11 +70,11 @@ class SourceCalibration(Calibration):
     rows : ndarray of bool, shape (n,)
         Rows that were used.
     chi2_before, dof_before : float
-        With the nominal sensors, the source fitted to them; with the noise of the calibrated array. With
-        ``common_field_T`` and its prior's term, as `chi2`. In `dof` an unknown of a sensor counts by how much of it the
-        readings tell and not the prior.
+        The same for the nominal sensors, with the source fitted again and the noise of the calibrated array. Both χ²
+        include the prior of ``common_field_T``. In `dof` an unknown of a sensor counts by the share that the readings,
+        not the prior, determine.
     residual_rms_T : ndarray, shape (N,)
-        Root mean square of the calibrated array's residuals, of every sensor [T].
+        Root mean square of every sensor's residuals with the calibrated array [T].
     estimated : ndarray of bool, shape (N, 15)
         Which of the unknowns were estimated.
     covariance : ndarray, shape (F, F)
@@ -99,7 +99,7 @@ class SourceCalibration(Calibration):
 
     @cached_property
     def rms_T(self) -> tuple[FloatArray, FloatArray]:
-        """What the source and the best common field leave of every sensor's readings, (N,) before and after [T]."""
+        """Residual RMS (N,) of the sensors before and after [T], with the best common field."""
         attitude = self.world_from_array
         moment = np.einsum("tba,tb->ta", attitude, np.broadcast_to(self.moment_Am2, (len(attitude), 3)))
         before, after = (
@@ -119,7 +119,7 @@ class TurningCalibration(Calibration):
     time_s, readings_T : ndarray, shape (n,), (n, C)
         The rows.
     modulus_T : float or ndarray, shape (n,)
-        Of the field.
+        Modulus of the field.
     """
 
     fits: dict[str, EllipsoidCalibration]
@@ -129,7 +129,7 @@ class TurningCalibration(Calibration):
 
     @cached_property
     def moduli_T(self) -> tuple[FloatArray, FloatArray]:
-        """Modulus that every vector sensor reads, shape (n, V) before and after [T]."""
+        """Moduli that the vector sensors read, shape (n, V), before and after [T]."""
         vector = [i for i, sensor in enumerate(self.nominal.sensors) if sensor.kind == "vector"]
         before, after = (
             np.linalg.norm(array.calibrated_field(self.readings_T)[:, vector], axis=-1)
@@ -141,7 +141,10 @@ class TurningCalibration(Calibration):
 def residual_rms(
     array: SensorArray, readings_T: FloatArray, position_m: FloatArray, moment_Am2: FloatArray
 ) -> FloatArray:
-    """Root mean square (N,) [T] of what a known source and the best common field leave of every sensor's readings."""
+    """Return the residual RMS (N,) of the sensors [T].
+
+    The residuals are those of a known source and the common field that fits best.
+    """
     fields = dipole.field(array.positions, position_m[:, None], moment_Am2[:, None])
     residual = readings_T - array.readings_of(fields)
     noise, gain = array.channel_noise_T, array.channel_gain

@@ -50,7 +50,7 @@ def survey_figure(found: Survey) -> Figure:
     x, y, _ = found.rows.place_m.T
     height = style.WIDTH_IN * 0.5 * float(np.clip(np.ptp(y) / max(np.ptp(x), 1e-9), 0.12, 1.6)) + 1.0
     figure = style.new_figure(2.0 * height)
-    rows = found.rows.thinned()
+    rows = found.rows.decimate()
     both, reach = figure.subplots(2, 2, sharex=True, sharey=True)
     for ax, values_T, title in zip(
         both, (rows.anomaly_T, rows.residual_T), ("anomaly", "less the targets' fields"), strict=True

@@ -21,7 +21,7 @@ _POINTS = 61
 
 
 def lines_of_signature(signature: Signature) -> list[str]:
-    """Parameters with their σ, what is not determined, and how well all of it fits."""
+    """Return the parameters with σ, what is not determined, and the goodness of fit."""
     determined = signature.determined
     cells = [["part", "A·m²", "σ", ""]]
     for name, value, sigma in zip(signature.names, determined, signature.sigma_Am2, strict=True):
@@ -39,7 +39,10 @@ def lines_of_signature(signature: Signature) -> list[str]:
 
 
 def along_keel(signature: Signature, depth_m: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Places along the keel (k,) [m], field (4, k, 3) there below the object on four headings, and its covariance."""
+    """Return places along the keel (k,) [m], the field there and its covariance.
+
+    The field (4, k, 3) is at a depth below the object, on four headings.
+    """
     x = depth_m * np.linspace(-_REACH, _REACH, _POINTS)
     offset = np.stack([x, np.zeros_like(x), np.full_like(x, -depth_m)], axis=-1)
     headings = np.tile(np.array(list(HEADINGS.values()))[:, None], (1, _POINTS))
@@ -47,7 +50,7 @@ def along_keel(signature: Signature, depth_m: float) -> tuple[FloatArray, FloatA
 
 
 def lines_of_depths(signature: Signature, depths_m: Sequence[float]) -> list[str]:
-    """The largest field below the object at some depths, on four headings."""
+    """Return a table of the largest field below the object at some depths, on four headings."""
     rows = [["depth_m", "heading", "largest_nT", "σ_nT", "forward_m", ""]]
     for depth in depths_m:
         x, field, covariance = along_keel(signature, depth)
@@ -62,7 +65,7 @@ def lines_of_depths(signature: Signature, depths_m: Sequence[float]) -> list[str
 
 
 def json_of_signature(signature: Signature, depths_m: Sequence[float]) -> dict[str, object]:
-    """What ``magloc signature --json`` prints."""
+    """Return what ``magloc signature --json`` prints."""
     predicted = []
     for depth in depths_m:
         x, field, covariance = along_keel(signature, depth)
@@ -83,5 +86,5 @@ def json_of_signature(signature: Signature, depths_m: Sequence[float]) -> dict[s
 
 
 def _sigma(variance: FloatArray) -> FloatArray:
-    """Standard deviations, NaN where rounding has left nothing of a variance."""
+    """Return standard deviations, NaN where rounding has made a variance negative."""
     return np.sqrt(np.where(variance >= 0.0, variance, np.nan))

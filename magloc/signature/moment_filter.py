@@ -1,4 +1,4 @@
-r"""A Kalman filter of the moment alone, of an object whose path is known: MotionMV and MeasureS of the source paper.
+r"""Kalman filter of the moment of an object on a known path: MotionMV and MeasureS.
 
 The moment is linear in a few parameters, :math:`m_j = M_j θ`: those of the object's axes (M turns with it, equation
 (29) with its known rate), or permanent and induced parts. With the path exact and vector sensors the readings are
@@ -26,13 +26,13 @@ from magloc.tracking.measurement import RowMeasurement
 from magloc.tracking.motion import N_SOURCE
 
 UNKNOWN = 1e3
-"""How little is known of a moment before the first row: σ over what the strongest row can tell."""
+"""Initial σ of the moment, in units of the moment that explains the strongest row."""
 ROWS_TO_START_ANEW = 3
-"""Contradicting rows in a row after which the moment is taken to have changed at once."""
+"""Number of successive contradicting rows after which the moment starts anew."""
 _TOLERANCE = 1e-4
 _SHRINK = 0.5
 _MOST_ITERATIONS = 50
-# How often a record is linearised anew, until its last state moves by less than a share of its σ.
+# Passes over a record, until its last state changes by less than a share of its σ.
 _MOST_PASSES = 20
 _SETTLED = 1e-2
 
@@ -42,14 +42,14 @@ _OVERFLOW = "the readings: found values whose squares exceed double precision, e
 
 @dataclass(frozen=True, eq=False)
 class Basis:
-    """What the moment is in its parameters, in every row.
+    """Matrices of the moment's dependence on its parameters, in every row.
 
     Attributes
     ----------
     M : ndarray, shape (n, 3 K, q)
         Moments of K sources in the frame of the results per parameter.
     by_turn : ndarray, shape (n, 3, 3 K, q)
-        Its change by a turn of the object about each axis (the second) of that frame.
+        Derivative of M by a rotation of the object about each axis (second index) of that frame.
     """
 
     M: FloatArray
@@ -58,23 +58,23 @@ class Basis:
 
 @dataclass(frozen=True, eq=False)
 class MomentModel:
-    """What the rows of a record say of an object on a known path.
+    """Measurement and process model of an object on a known path.
 
-    The state is the path's error (position and attitude, none of what is exact), θ (q), and the lasting errors of the
-    sensors.
+    The state is the path's error (position and attitude, without parts that are exact), θ (q), and the correlated
+    errors of the sensors.
 
     Attributes
     ----------
     rows : tuple of RowMeasurement
     position_m : ndarray, shape (n, K, 3)
-        Of the object, or of several sources, in the frame of the results.
+        Positions of the object, or of several sources, in the frame of the results.
     basis : Basis
     errors : SensorErrors
     path_error : PathError
     turn_rad_s : float
-        Characteristic rate at which θ changes, by its modulus: S_q.
+        Characteristic rate of change of θ, relative to its modulus; it gives S_q.
     begins : ndarray of bool, shape (n,)
-        Rows at which a path begins, with an error of its own.
+        Rows at which a path begins; each path has an error of its own.
     """
 
     rows: tuple[RowMeasurement, ...]
@@ -92,7 +92,7 @@ class MomentModel:
 
     @cached_property
     def moment(self) -> slice:
-        """Where θ is in the state."""
+        """Slice of θ in the state."""
         first = self.path_error.sigma.size
         return slice(first, first + self.n_parameters)
 
@@ -103,22 +103,22 @@ class MomentModel:
 
     @cached_property
     def scale(self) -> float:
-        """Size of the parameters that the largest signal asks for at the object's nearest."""
+        """Parameter size that explains the largest signal at the object's nearest position."""
         at_rest = np.zeros(self.moment.stop + self.errors.n_states)
         strength = [np.linalg.norm(self.jacobian(i, at_rest)[:, self.moment]) for i in range(len(self.rows))]
-        signal = [np.linalg.norm(row.z - self.predicted(i, at_rest)) for i, row in enumerate(self.rows)]
-        # No row has a difference where nothing has any strength: any size will do.
+        signal = [np.linalg.norm(row.z - self.predict(i, at_rest)) for i, row in enumerate(self.rows)]
+        # Without any signal the scale has no effect.
         return max(1.0, float(np.max(signal))) / (float(np.max(strength)) or 1.0)
 
     def sources(self, i: int, x: FloatArray) -> FloatArray:
-        """Positions and moments (K, 6) of a state in row i."""
-        p, m = self.position_m[i], (self._turned(i, x) @ x[self.moment]).reshape(-1, 3)
+        """Return positions and moments (K, 6) of a state in row i."""
+        p, m = self.position_m[i], (self._moment_matrix(i, x) @ x[self.moment]).reshape(-1, 3)
         return np.concatenate([p + x[:3] if self.path_error.position_m else p, m], axis=1)
 
-    def sources_of_state(self, i: int, x: FloatArray) -> FloatArray:
-        """Their derivative (K, 6, n) by the state."""
+    def sources_jacobian(self, i: int, x: FloatArray) -> FloatArray:
+        """Return the derivative (K, 6, n) of positions and moments by the state."""
         J = np.zeros((self.position_m.shape[1], N_SOURCE, x.size))
-        J[:, 3:, self.moment] = self._turned(i, x).reshape(len(J), 3, -1)
+        J[:, 3:, self.moment] = self._moment_matrix(i, x).reshape(len(J), 3, -1)
         if self.path_error.position_m:
             J[:, :3, :3] = np.eye(3)
         if self.path_error.attitude_rad:
@@ -126,38 +126,38 @@ class MomentModel:
             J[:, 3:, self.moment.start - 3 : self.moment.start] = by_turn.reshape(len(J), 3, 3)
         return J
 
-    def _turned(self, i: int, x: FloatArray) -> FloatArray:
-        """M (3 K, q) with the attitude's error."""
+    def _moment_matrix(self, i: int, x: FloatArray) -> FloatArray:
+        """Return M (3 K, q) with the attitude's error."""
         M: FloatArray = self.basis.M[i]
         if self.path_error.attitude_rad:
             M = M + np.einsum("k,kij->ij", x[self.moment.start - 3 : self.moment.start], self.basis.by_turn[i])
         return M
 
-    def predicted(self, i: int, x: FloatArray) -> FloatArray:
-        """Differences (k,) of row i in units of their noise."""
+    def predict(self, i: int, x: FloatArray) -> FloatArray:
+        """Return the differences (k,) of row i in units of their noise."""
         row, (first, *others) = self.rows[i], self.sources(i, x)
         others_T = np.sum([row.field_T(source) for source in others], axis=0) if others else None
         return row.predict_source(first, others_T=others_T) + row.effect @ x[self.moment.stop :]
 
     def jacobian(self, i: int, x: FloatArray) -> FloatArray:
-        """Their Jacobian (k, n)."""
+        """Return the Jacobian (k, n) of the differences of row i."""
         row, sources = self.rows[i], self.sources(i, x)
         fields_T = [row.field_T(source) for source in sources] if len(sources) > 1 else []
         H = np.zeros((row.z.size, x.size))
-        for k, J in enumerate(self.sources_of_state(i, x)):
+        for k, J in enumerate(self.sources_jacobian(i, x)):
             others_T = np.delete(fields_T, k, axis=0).sum(axis=0) if fields_T else None
             H += row.directional_derivative(sources[k], J, others_T)
         H[:, self.moment.stop :] = row.effect
         return H
 
     def start(self) -> tuple[FloatArray, FloatArray]:
-        """State (n,) before the first row, and the square root of its covariance."""
+        """Return the state (n,) before the first row, and the square root of its covariance."""
         unknown = np.full(self.n_parameters, UNKNOWN * self.scale)
         sigma = np.concatenate([self.path_error.sigma, unknown, self.errors.sigma])
         return np.zeros(sigma.size), np.diag(sigma)
 
     def step(self, x: FloatArray, i: int) -> tuple[FloatArray, FloatArray]:
-        """Diagonal F of the step to row i, and square root S_q of its noise."""
+        """Return the diagonal F of the step to row i, and the square root S_q of its noise."""
         dt_s = self.rows[i].row.time_s - self.rows[i - 1].row.time_s
         kept_path = np.zeros(self.moment.start) if self.begins[i] else self.path_error.kept(dt_s)
         kept_errors, added = self.errors.step(dt_s)
@@ -182,11 +182,11 @@ class MomentStep:
     x_predicted, S_predicted, x, S : ndarray
         State and square root of its covariance before and after the row's readings.
     F, S_q : ndarray
-        Diagonal of the transition that led here, and square root of its noise.
+        Diagonal of the transition to this row, and square root of its noise.
     nis : float
         Normalised innovation squared of the row.
     status : str
-        As of a :class:`magloc.tracking.results.TrackPoint`.
+        Status as in :class:`magloc.tracking.results.TrackPoint`.
     """
 
     x_predicted: FloatArray
@@ -200,11 +200,11 @@ class MomentStep:
     iterations: int
 
 
-def filtered(model: MomentModel, *, at: Sequence[FloatArray] | None = None, gate: bool = True) -> list[MomentStep]:
-    """The filter's steps over all rows.
+def filter_rows(model: MomentModel, *, at: Sequence[FloatArray] | None = None, gate: bool = True) -> list[MomentStep]:
+    """Return the filter's steps over all rows.
 
-    ``at``: states that the rows are linearised at; without them each is iterated. ``gate``: rows that contradict the
-    prediction are not used, but the third in a row is, of a moment that has changed at once.
+    ``at``: states at which the rows are linearised; without them each row is iterated. ``gate``: do not use rows that
+    contradict the prediction; the third in succession starts the moment anew.
     """
     steps: list[MomentStep] = []
     x, S = model.start()
@@ -215,7 +215,7 @@ def filtered(model: MomentModel, *, at: Sequence[FloatArray] | None = None, gate
         if not row.z.size:
             steps.append(MomentStep(x, S, x, S, F, S_q, math.nan, "predicted", 0))
             continue
-        update = _updated(model, i, x, S, None if at is None else at[i])
+        update = _update_row(model, i, x, S, None if at is None else at[i])
         status = "tracked"
         if gate and not (update.converged and update.nis < chdtri(row.z.size, CONTRADICTION)):
             contradictions, status = contradictions + 1, "outlier"
@@ -224,7 +224,7 @@ def filtered(model: MomentModel, *, at: Sequence[FloatArray] | None = None, gate
                 unknown[model.moment] = scale * np.eye(model.n_parameters)
                 S_q = np.concatenate([S_q, unknown], axis=1)
                 S = predict(S, np.eye(x.size), unknown)
-                update, status = _updated(model, i, x, S, None if at is None else at[i]), "acquired"
+                update, status = _update_row(model, i, x, S, None if at is None else at[i]), "acquired"
         if status == "outlier":
             steps.append(MomentStep(x, S, x, S, F, S_q, update.nis, status, 0))
             continue
@@ -236,8 +236,8 @@ def filtered(model: MomentModel, *, at: Sequence[FloatArray] | None = None, gate
     return steps
 
 
-def _updated(model: MomentModel, i: int, x: FloatArray, S: FloatArray, at: FloatArray | None) -> IteratedUpdate:
-    """A row's update, linearised where it leads, or at a state."""
+def _update_row(model: MomentModel, i: int, x: FloatArray, S: FloatArray, at: FloatArray | None) -> IteratedUpdate:
+    """Update by a row, iterated, or linearised at a given state."""
     z = model.rows[i].z
     if at is None:
         return iterated_update(
@@ -245,20 +245,20 @@ def _updated(model: MomentModel, i: int, x: FloatArray, S: FloatArray, at: Float
             S,
             z,
             np.ones(z.size),
-            lambda state: model.predicted(i, state),
+            lambda state: model.predict(i, state),
             lambda state: model.jacobian(i, state),
             tolerance=_TOLERANCE,
             max_iterations=_MOST_ITERATIONS,
             shrink=_SHRINK,
         )
     H = model.jacobian(i, at)
-    innovation = z - model.predicted(i, at) - H @ (x - at)
+    innovation = z - model.predict(i, at) - H @ (x - at)
     after, root, nis = update(x, S, H, innovation)
     return IteratedUpdate(after, root, 1, True, innovation, nis)
 
 
-def smoothed(steps: Sequence[MomentStep]) -> list[tuple[FloatArray, FloatArray]]:
-    """State of every row with what all rows tell, and the square root of its covariance."""
+def smooth_steps(steps: Sequence[MomentStep]) -> list[tuple[FloatArray, FloatArray]]:
+    """Return the smoothed state of every row, and the square root of its covariance."""
     x, S = steps[-1].x, steps[-1].S
     found = [(x, S)]
     for step, after in zip(reversed(steps[:-1]), reversed(steps[1:]), strict=True):
@@ -269,14 +269,17 @@ def smoothed(steps: Sequence[MomentStep]) -> list[tuple[FloatArray, FloatArray]]
     return found[::-1]
 
 
-def settled(model: MomentModel, *, gate: bool) -> list[MomentStep]:
-    """Steps of a filter whose rows are linearised at what all rows tell: Gauss-Newton over the whole record."""
-    steps = filtered(model, gate=gate)
+def relinearise(model: MomentModel, *, gate: bool) -> list[MomentStep]:
+    """Filter with all rows linearised at the smoothed states.
+
+    This is Gauss-Newton over the whole record.
+    """
+    steps = filter_rows(model, gate=gate)
     if model.is_linear:
         return steps
     for _ in range(_MOST_PASSES):
-        states = smoothed(steps)
-        steps = filtered(model, at=[x for x, _ in states], gate=gate)
+        states = smooth_steps(steps)
+        steps = filter_rows(model, at=[x for x, _ in states], gate=gate)
         change, S = steps[-1].x - states[-1][0], states[-1][1]
         if np.all(np.abs(change) < _SETTLED * np.linalg.norm(S, axis=1)):
             break

@@ -1,4 +1,4 @@
-"""The one door to the moment of an object whose path is known, through the rows of readings."""
+"""Tracks of the moment of an object whose path is known."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from magloc.signature.moment_filter import (
     Basis,
     MomentModel,
     MomentStep,
-    filtered,
-    settled,
-    smoothed,
+    filter_rows,
+    relinearise,
+    smooth_steps,
 )
 from magloc.signature.path import ObjectPath, PathError
 from magloc.state_space import estimability
@@ -40,8 +40,8 @@ from magloc.truth import Truth, truth_of_rows
 EXACT = PathError()
 """A path without errors."""
 _UNDETERMINED = 0.1
-"""A moment is not yet known while a direction of it is less certain than this share of what was known before."""
-# Distance from a sensor, in radii of the array, at which an object is in it.
+"""Share of the initial σ: a moment counts as known when the σ of every direction is smaller."""
+# Distance from a sensor, in radii of the array, at which an object counts as inside it.
 _TOUCHING = 1e-9
 _SIGN_UNKNOWN = (
     "Input array must have a vector sensor, or an ambient field for its scalar ones; instead received moduli alone,"
@@ -51,7 +51,7 @@ _SIGN_UNKNOWN = (
 
 @dataclass(frozen=True)
 class MomentConsistency:
-    """A moment through time against the truth.
+    """Errors of a moment track against the truth.
 
     Attributes
     ----------
@@ -61,9 +61,9 @@ class MomentConsistency:
         Root of the mean squared distance from the true moment, and the least that is possible (posterior Cramér-Rao
         bound, of a smoother where later rows are used).
     nees_per_dimension, nis_per_dimension : float
-        1 if the covariance is right, and if the readings are those of the model.
+        1 if the covariance is right, and if the model explains the readings.
     nis_bounds : tuple of 2 floats
-        Two-sided 99 % bounds of it; errors of successive rows are not independent, so that NEES has none.
+        Two-sided 99 % bounds of the NIS; NEES has none because errors of successive rows are correlated.
     """
 
     rows: int
@@ -74,7 +74,7 @@ class MomentConsistency:
     nis_bounds: tuple[float, float]
 
     def lines(self) -> list[str]:
-        """Errors against the truth, and what they should be."""
+        """Return the errors against the truth, and their expected values."""
         return [
             f"against the truth, {self.rows} rows:",
             f"  moment rms {self.moment_rms_Am2:.4g} A·m², least possible {self.moment_bound_Am2:.4g} A·m² (posterior"
@@ -85,18 +85,18 @@ class MomentConsistency:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MomentTrack(TrackColumns):
-    """The moment of an object on a known path: columns first, a :class:`TrackPoint` where one row is asked for.
+    """Moment of an object on a known path: columns, and a :class:`TrackPoint` per row.
 
     Attributes
     ----------
     points : tuple of TrackPoint
-        Of every row; their positions are the path's, corrected where it is uncertain.
+        One point per row. Positions are those of the path, corrected if it is uncertain.
     readings : Readings
-        That they were found from.
+        Readings of the track.
     model : MomentModel
-        What the rows say of the moment.
+        Model of the rows.
     chi2 : float
-        Sum of the normalised innovations squared of all rows, also of those that were not used.
+        Sum of the normalised innovations squared of all rows, including rows that were not used.
     dof : int
         Its degrees of freedom.
     is_smoothed : bool
@@ -121,12 +121,12 @@ class MomentTrack(TrackColumns):
 
     @property
     def misfit(self) -> bool:
-        """Whether no dipole on this path explains the readings: χ² is beyond noise by one in a million."""
+        """Whether χ² is so large that noise explains it once in a million (no such dipole)."""
         return bool(is_misfit(self.chi2, self.dof))
 
     @np.errstate(over="ignore", divide="ignore", invalid="ignore")
     def consistency(self, truth: Truth) -> MomentConsistency:
-        """Errors of the moment, their NEES and NIS, and the least error that is possible.
+        """Return the errors of the moment, NEES, NIS, and the least possible error.
 
         Raises
         ------
@@ -169,22 +169,22 @@ def track_moment(
     array : SensorArray
         Three independent differences are enough.
     readings : Readings or array_like, shape (n, C)
-        Raw readings [T], NaN where missing, in the order of time. Those that saturate are not used.
+        Raw readings [T] in the order of time, NaN where missing. Saturated readings are not used.
     path : ObjectPath or array_like, shape (3,) or (n, 3)
-        Where the object is, in the frame of the results [m]: at rest, in every row, or a path whose times enclose those
-        of the readings; rows outside it are left out. Where it has the attitude, the moment turns with it, else with
-        the rates that the readings have.
+        Position of the object in the frame of the results [m]: one place, one for every row, or a path whose times
+        enclose those of the readings; rows outside it are left out. The moment turns with the attitude of the path if
+        there is one, otherwise with the rates of the readings.
     turn_rad_s : float
-        Characteristic rate at which the moment turns or changes otherwise.
+        Characteristic rate at which the moment turns, or changes in another way.
     path_error : PathError
-        How wrong the path may be; exact by default.
+        Uncertainty of the path; exact by default.
     smooth : bool
-        Use later rows too: a fixed-interval smoother.
+        Use later rows too (fixed-interval smoother).
 
     Returns
     -------
     MomentTrack
-        In the world frame where the readings have the array's pose, else in the array's.
+        In the world frame if the readings have the array's pose, otherwise in the array's frame.
 
     Raises
     ------
@@ -204,8 +204,8 @@ def track_moment(
     array([ 10., 300.])
     """
     used = usable_readings(array, readings)
-    position_m, rotations, used = known_rows(used, path)
-    (found,) = _tracks(array, used, position_m[:, None], rotations, turn_rad_s, path_error, smooth=smooth)
+    position_m, rotations, used = rows_on_path(used, path)
+    (found,) = _track_sources(array, used, position_m[:, None], rotations, turn_rad_s, path_error, smooth=smooth)
     return found
 
 
@@ -218,26 +218,26 @@ def track_moments(
     turn_rad_s: float = TURN_RAD_S,
     smooth: bool = False,
 ) -> tuple[MomentTrack, ...]:
-    """Follow the moments of several sources at known places together, such as the cells of a sample.
+    """Follow the moments of several sources at known places, such as the cells of a sample.
 
     Parameters
     ----------
     array : SensorArray
         Three independent differences for every source are enough.
     readings, turn_rad_s, smooth
-        As of :func:`magloc.track_moment`.
+        As in :func:`magloc.track_moment`.
     positions_m : array_like, shape (K, 3)
-        Where the sources are at rest, in the frame of the results [m].
+        Positions of the sources, at rest in the frame of the results [m].
 
     Returns
     -------
     tuple of MomentTrack
-        One of every source, with the covariance that it has while the others are unknown too; χ² is of all together.
+        One track per source. Covariances allow for the other unknown moments; χ² is that of all sources together.
 
     Raises
     ------
     ValueError
-        As of :func:`magloc.track_moment`, or two sources are at one place.
+        As in :func:`magloc.track_moment`, or two sources are at one place.
 
     Examples
     --------
@@ -259,10 +259,10 @@ def track_moments(
     if len(np.unique(places, axis=0)) < len(places):
         raise ValueError(f"Input positions_m must be different places; instead received {places.tolist()}.")
     position_m = np.broadcast_to(places, (len(used), *places.shape))
-    return _tracks(array, used, position_m, None, turn_rad_s, EXACT, smooth=smooth)
+    return _track_sources(array, used, position_m, None, turn_rad_s, EXACT, smooth=smooth)
 
 
-def _tracks(
+def _track_sources(
     array: SensorArray,
     used: Readings,
     position_m: FloatArray,
@@ -272,26 +272,26 @@ def _tracks(
     *,
     smooth: bool,
 ) -> tuple[MomentTrack, ...]:
-    """Tracks of all sources at places (n, K, 3)."""
+    """Return the tracks of all sources at places (n, K, 3)."""
     if array.channel_is_scalar.all() and used.ambient_T is None and array.ambient_T is None:
         raise ValueError(_SIGN_UNKNOWN)
     if rotations is None:
-        rotations = _turned(used)
+        rotations = _integrate_rates(used)
         if used.motion is not None:
             rates = used.motion.rate_sigma_rad_s
             turn_rad_s = math.hypot(turn_rad_s, math.sqrt(float(np.mean(np.sum(rates**2, axis=1)))))
     n_sources = position_m.shape[1]
     basis = turning_basis(np.kron(np.eye(n_sources), rotations).astype(np.float64))
     model = moment_model(array, [used], [position_m], basis, path_error, turn_rad_s)
-    steps = settled(model, gate=True) if smooth else filtered(model)
-    chi2, dof = goodness(model, steps)
+    steps = relinearise(model, gate=True) if smooth else filter_rows(model)
+    chi2, dof = goodness_of_fit(model, steps)
     found = [tuple(_points(model, steps, k, smooth=smooth)) for k in range(n_sources)]
     warn_of_strengths(point for points in found for point in points)
     return tuple(MomentTrack(points, used, model, chi2, dof, smooth) for points in found)
 
 
-def known_rows(readings: Readings, path: ObjectPath | ArrayLike) -> tuple[FloatArray, FloatArray | None, Readings]:
-    """Positions of the object (n, 3), its rotations (n, 3, 3) if known, and the readings, of the rows on the path."""
+def rows_on_path(readings: Readings, path: ObjectPath | ArrayLike) -> tuple[FloatArray, FloatArray | None, Readings]:
+    """Return positions (n, 3), rotations (n, 3, 3) if known, and readings of rows on the path."""
     if isinstance(path, ObjectPath):
         position_m, rotations = path.at(readings.time_s)
         on = np.flatnonzero(np.isfinite(position_m).all(axis=1))
@@ -302,8 +302,11 @@ def known_rows(readings: Readings, path: ObjectPath | ArrayLike) -> tuple[FloatA
     return np.broadcast_to(given, (len(readings), 3)), None, readings
 
 
-def _turned(readings: Readings) -> FloatArray:
-    """Rotations (n, 3, 3) of the object since the first row by measured rates, in the array's axes without its pose."""
+def _integrate_rates(readings: Readings) -> FloatArray:
+    """Return the object's rotations (n, 3, 3) since the first row, from measured rates.
+
+    They are in the array's axes, without its pose.
+    """
     R = np.tile(np.eye(3), (len(readings), 1, 1))
     if readings.motion is None:
         return R
@@ -315,7 +318,7 @@ def _turned(readings: Readings) -> FloatArray:
 
 
 def turning_basis(M: FloatArray) -> Basis:
-    """Basis of moments that turn with the object as a whole: M (n, 3 K, q)."""
+    """Return the basis of moments M (n, 3 K, q) that turn with the object as a whole."""
     n, size, q = M.shape
     by_turn = np.einsum("aij,nkjq->nakiq", cross_matrix(np.eye(3)), M.reshape(n, -1, 3, q))
     return Basis(M, by_turn.reshape(n, 3, size, q))
@@ -329,7 +332,7 @@ def moment_model(
     path_error: PathError,
     turn_rad_s: float,
 ) -> MomentModel:
-    """Model of records that follow each other in time, each with places (n, K, 3) of its own."""
+    """Return the model of successive records, each with places (n, K, 3) of its own."""
     check_magnitudes(array)
     background = BackgroundDrift.of(passes[0].background, np.concatenate([of_pass.time_s for of_pass in passes]))
     measurements = RowMeasurements(array, N_SOURCE, background)
@@ -352,18 +355,18 @@ def moment_model(
     return MomentModel(rows, np.concatenate(positions_m), basis, measurements.errors, path_error, turn_rad_s, begins)
 
 
-def goodness(model: MomentModel, steps: Sequence[MomentStep]) -> tuple[float, int]:
-    """χ² of all rows that a moment was predicted for, and its degrees of freedom."""
+def goodness_of_fit(model: MomentModel, steps: Sequence[MomentStep]) -> tuple[float, int]:
+    """Return χ² of all rows that have a prediction, and its degrees of freedom."""
     judged = [(step.nis, row.z.size) for step, row in zip(steps, model.rows, strict=True) if step.status != "acquired"]
     chi2 = sum(nis for nis, _ in judged if math.isfinite(nis))
     return chi2, sum(size for nis, size in judged if math.isfinite(nis)) - model.n_parameters
 
 
 def _points(model: MomentModel, steps: Sequence[MomentStep], k: int, *, smooth: bool) -> list[TrackPoint]:
-    """Points of the track of source k, from the filter or from the smoother."""
-    states = smoothed(steps) if smooth else [(step.x, step.S) for step in steps]
+    """Return the points of the track of source k, from the filter or from the smoother."""
+    states = smooth_steps(steps) if smooth else [(step.x, step.S) for step in steps]
     array = model.rows[0].model.array
-    # S_0, the covariance that is propagated without any measurement from the start, of which MeasureS is the share.
+    # S_0: covariance propagated from the start without measurements; MeasureS is relative to it.
     x_0, open_loop = model.start()
     unknown = float(open_loop[model.moment.start, model.moment.start])
     points = []
@@ -371,7 +374,7 @@ def _points(model: MomentModel, steps: Sequence[MomentStep], k: int, *, smooth: 
         if i:
             F, S_q = model.step(x_0, i)
             open_loop = np.diag(np.linalg.norm(np.concatenate([np.diag(F) @ open_loop, S_q], axis=1), axis=1))
-        row, J = model.rows[i].row, model.sources_of_state(i, x)[k]
+        row, J = model.rows[i].row, model.sources_jacobian(i, x)[k]
         source, root = model.sources(i, x)[k], J @ S
         known = np.linalg.norm(root[3:], ord=2) < _UNDETERMINED * unknown
         with np.errstate(invalid="ignore"):
@@ -395,13 +398,13 @@ def _points(model: MomentModel, steps: Sequence[MomentStep], k: int, *, smooth: 
 
 
 def _covariances_at(model: MomentModel, moment_Am2: FloatArray, *, smooth: bool) -> FloatArray:
-    """Covariances (n, 3, 3) of the moment of a filter or a smoother that linearises at the true moments."""
+    """Return the moment's covariances (n, 3, 3) for a filter linearised at the true moments."""
     at = []
     for i, moment in enumerate(np.nan_to_num(moment_Am2)):
         state = np.zeros(model.moment.stop + model.errors.n_states)
         state[model.moment] = np.linalg.lstsq(model.basis.M[i], moment, rcond=None)[0]
         at.append(state)
-    steps = filtered(model, at=at, gate=False)
-    states = smoothed(steps) if smooth else [(step.x, step.S) for step in steps]
-    roots = [(model.sources_of_state(i, x)[0] @ S)[3:] for i, (x, S) in enumerate(states)]
+    steps = filter_rows(model, at=at, gate=False)
+    states = smooth_steps(steps) if smooth else [(step.x, step.S) for step in steps]
+    roots = [(model.sources_jacobian(i, x)[0] @ S)[3:] for i, (x, S) in enumerate(states)]
     return np.array([root @ root.T for root in roots])

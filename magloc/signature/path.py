@@ -1,8 +1,8 @@
-"""Where an object is known to be: its path and its attitude, and the files of them.
+"""Known paths and attitudes of objects, and their files.
 
-A path file is CSV with ``time_s, x_m, y_m, z_m[, qx, qy, qz, qw]``, one row per instant, in the frame of the readings'
-results: the world's where they have the array's pose, else the array's. The quaternion turns from the object's axes
-(forward, left, up) to that frame, its scalar last.
+A path file is CSV with ``time_s, x_m, y_m, z_m[, qx, qy, qz, qw]``, one row per instant, in the frame of the results:
+the world's if the readings have the array's pose, otherwise the array's. The quaternion (scalar last) turns from the
+object's axes (forward, left, up) to that frame.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _EXPECTED = "a header with time_s, x_m, y_m and z_m"
 
 @dataclass(frozen=True, eq=False)
 class ObjectPath:
-    """A known path.
+    """Known path of an object.
 
     Attributes
     ----------
@@ -43,7 +43,7 @@ class ObjectPath:
     rotation : Rotation of k, optional
         From the object's axes (forward, left, up) to that frame.
     name : str
-        What errors call it: the file that it was read from.
+        Name in error messages: the file of the path.
 
     Examples
     --------
@@ -61,7 +61,7 @@ class ObjectPath:
     name: str = "path"
 
     def at(self, time_s: FloatArray) -> tuple[FloatArray, FloatArray | None]:
-        """Positions (n, 3) at some instants, and rotations (n, 3, 3) where they are known.
+        """Return positions (n, 3) at some instants, and rotations (n, 3, 3) if known.
 
         Between the rows of the path positions run straight and attitudes turn evenly; outside them, and in gaps,
         positions are NaN.
@@ -78,12 +78,12 @@ class ObjectPath:
         return position, rotations_at(time_s, self.time_s, self.rotation).as_matrix()
 
     def along_course(self) -> ObjectPath:
-        """The path with its attitude: as it is, or level with the bow along the horizontal velocity.
+        """Return the path with an attitude; by default level, the bow along the course.
 
         Raises
         ------
         InputError
-            It has no attitude and does not move.
+            The path has no attitude and does not move.
         """
         if self.rotation is not None:
             return self
@@ -98,7 +98,7 @@ class ObjectPath:
             raise InputError(
                 f"{self.name}: found neither an attitude nor a horizontal velocity, expected columns qx, qy, qz, qw."
             )
-        # At rest the bow stays where it was, before the first movement where that goes.
+        # At rest the bow keeps its heading; before the first movement it has the heading of that movement.
         last = np.maximum.accumulate(np.where(moves, np.arange(len(order)), -1))
         yaw = np.arctan2(velocity[:, 1], velocity[:, 0])[np.where(last >= 0, last, np.argmax(moves))]
         back = np.argsort(order, kind="stable")
@@ -107,16 +107,16 @@ class ObjectPath:
 
 @dataclass(frozen=True)
 class PathError:
-    """How wrong a path may be: first-order Markov processes along each axis, and about each.
+    """Uncertainty of a path: first-order Markov processes along and about each axis.
 
     Attributes
     ----------
     position_m : float
-        Standard deviation of the position; 0: it is exact.
+        Standard deviation of the position; 0 if it is exact.
     position_correlation_s : float
-        How long its error lasts: infinite for a constant offset, 0 for a new one in every row.
+        Correlation time of its error: infinite for a constant offset, 0 for independent rows.
     attitude_rad, attitude_correlation_s : float
-        The same of small turns about the axes of the results' frame.
+        The same for small rotations about the axes of the frame of the results.
 
     Examples
     --------
@@ -132,11 +132,11 @@ class PathError:
 
     @property
     def sigma(self) -> FloatArray:
-        """Standard deviations of the states that the error has: (0,), (3,) or (6,)."""
+        """Standard deviations of the error's states: (0,), (3,) or (6,)."""
         return np.repeat([sigma for sigma in (self.position_m, self.attitude_rad) if sigma], 3)
 
     def kept(self, dt_s: float) -> FloatArray:
-        """What remains of them after a step."""
+        """Return the share of each error that remains after a step."""
         processes = (
             (self.position_m, self.position_correlation_s),
             (self.attitude_rad, self.attitude_correlation_s),
@@ -146,7 +146,7 @@ class PathError:
 
 
 def read_object_path(path: str | PathLike[str]) -> ObjectPath:
-    r"""A known path from a CSV file.
+    r"""Read a known path from a CSV file.
 
     Parameters
     ----------
@@ -177,7 +177,7 @@ def read_object_path(path: str | PathLike[str]) -> ObjectPath:
 
 
 def write_object_path(path: str | PathLike[str], known: ObjectPath) -> None:
-    """Write a path file, with exact numbers."""
+    """Write a path file at full precision."""
     header = ["time_s", *TRUE_POSITION_COLUMNS]
     columns = [known.time_s[:, None], known.position_m]
     if known.rotation is not None:

@@ -1,12 +1,13 @@
-r"""The signature of a ship on a known course: permanent, induced and eddy-current moment, from several headings.
+r"""Signature of a ship: permanent, induced and eddy-current moment, from several headings.
 
 In the axes of the body (forward, left, up) the moment is
 
 .. math:: R^T m = m_p + α B_b - β \dot B_b, \qquad B_b = R^T B_a
 
-with the ambient field B_a. All of it is linear in m_p, α and β, so that a constant θ of them is estimated over all
-rows of all passes by :mod:`magloc.signature.moment_filter`. What the headings do not tell apart stays as little known
-as before: on a level keel the vertical permanent moment and the vertical induced one are a single number.
+with the ambient field B_a. The moment is linear in m_p, α and β, which form a constant parameter vector θ;
+:mod:`magloc.signature.moment_filter` estimates it over all rows of all passes. Combinations that the headings do not
+determine keep their prior uncertainty: on a level keel the readings contain only the sum of the vertical permanent and
+the vertical induced moment.
 """
 
 from __future__ import annotations
@@ -29,8 +30,8 @@ from magloc.localization.fit.results import is_misfit
 from magloc.measurement.plausibility import usable_readings, warn_of_moments
 from magloc.readings import Readings, as_readings
 from magloc.signature.files import lines_of_signature
-from magloc.signature.moment_filter import Basis, settled
-from magloc.signature.moment_track import EXACT, goodness, known_rows, moment_model, turning_basis
+from magloc.signature.moment_filter import Basis, relinearise
+from magloc.signature.moment_track import EXACT, goodness_of_fit, moment_model, rows_on_path, turning_basis
 from magloc.signature.path import ObjectPath, PathError
 
 Induced = Literal["none", "diagonal", "symmetric"]
@@ -38,24 +39,23 @@ AXES = {"none": (), "diagonal": ("xx", "yy", "zz"), "symmetric": ("xx", "yy", "z
 """Components of α that are estimated."""
 MU0 = 4.0 * math.pi * dipole.MU0_OVER_4PI
 LEAST_KNOWN = 0.5
-"""σ of a combination of parameters, as a share of the object's moment, above which it counts as not determined."""
-# Share of the largest component of such a combination below which one is not named.
+"""Share of the object's moment above which the σ of a combination of parameters means "not determined"."""
+# Share of the largest component of a combination below which a parameter is not named.
 _NAMED = 0.1
-# An ambient field that does not change is divided by this in place of its rate [T/s].
+# Smallest divisor in place of the rate of an ambient field that does not change [T/s].
 _NO_RATE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class Components:
-    """What the moment is made of.
+    """Parts of the moment, and the units of its parameters.
 
     Attributes
     ----------
     induced : {"none", "diagonal", "symmetric"}
     eddy : bool
     ambient_T, rate_T_s : float
-        Modulus of the ambient field, and largest of its rates in the body, that parameters are counted at: all of
-        them are in A·m².
+        Modulus of the ambient field and its largest rate in the body, at which parameters have the unit A·m².
     """
 
     induced: Induced
@@ -65,36 +65,39 @@ class Components:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of all parameters."""
+        """Names of all parameters."""
         eddies = ("eddy xx", "eddy yy", "eddy zz") if self.eddy else ()
         return ("permanent x", "permanent y", "permanent z", *(f"induced {a}" for a in AXES[self.induced]), *eddies)
 
     def moment_matrix(self, R: FloatArray, field_T: FloatArray, rate_T_s: FloatArray) -> FloatArray:
-        """Moment per parameter (n, 3, q) in the frame of the results.
+        """Return the moment per parameter (n, 3, q) in the frame of the results.
 
         R (n, 3, 3): from the body to that frame; field and its rate (n, 3) in the body's axes.
         """
-        columns = [np.broadcast_to(np.eye(3), R.shape), self._induced(field_T)]
+        columns = [np.broadcast_to(np.eye(3), R.shape), self._induced_moment(field_T)]
         if self.eddy:
             columns.append(-rate_T_s[:, :, None] * np.eye(3) / self.rate_T_s)
         return R @ np.concatenate(columns, axis=2)
 
     def basis(self, R: FloatArray, field_T: FloatArray, rate_T_s: FloatArray) -> Basis:
-        """The same, and its change by a turn, which turns the ambient field the other way in the body."""
+        """Return the moment matrix and its change by a turn of the object.
+
+        A turn of the object turns the ambient field the other way in the body.
+        """
         turning = turning_basis(self.moment_matrix(R, field_T, rate_T_s))
         axes = np.swapaxes(R, 1, 2)  # of the frame, in the body, as columns
         for k in range(3):
             turned = -np.cross(axes[:, :, k], field_T)
-            turning.by_turn[:, k, :, self.induced_columns] += R @ self._induced(turned)
+            turning.by_turn[:, k, :, self.induced_columns] += R @ self._induced_moment(turned)
         return turning
 
     @property
     def induced_columns(self) -> slice:
-        """Where the induced parameters are."""
+        """Slice of the induced parameters."""
         return slice(3, 3 + len(AXES[self.induced]))
 
-    def _induced(self, field_T: FloatArray) -> FloatArray:
-        """Induced moment per parameter (n, 3, a) in the body's axes."""
+    def _induced_moment(self, field_T: FloatArray) -> FloatArray:
+        """Return the induced moment per parameter (n, 3, a) in the body's axes."""
         matrix = np.zeros((len(field_T), 3, len(AXES[self.induced])))
         for column, (i, j) in enumerate(_indices(self.induced)):
             matrix[:, i, column] = field_T[:, j]
@@ -103,22 +106,22 @@ class Components:
 
 
 def _indices(induced: Induced) -> list[tuple[int, int]]:
-    """Row and column in α of every component that is estimated."""
+    """Return row and column in α of every component that is estimated."""
     return [("xyz".index(axes[0]), "xyz".index(axes[1])) for axes in AXES[induced]]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Signature(Result):
-    """Permanent, induced and eddy-current moment of an object, with what is not known of them.
+    """Permanent, induced and eddy-current moment of an object, with their uncertainty.
 
     Attributes
     ----------
     components : Components
-        What the parameters are.
+        Parts of the moment.
     parameters_Am2 : ndarray, shape (q,)
-        Of which combinations that are not determined are as near to zero as the others allow.
+        Combinations that are not determined are as near to zero as the others allow.
     covariance : ndarray, shape (q, q)
-        [(A·m²)²]
+        Covariance of the parameters [(A·m²)²].
     ambient_T : ndarray, shape (3,)
         Mean ambient field [T], in the frame of the results.
     moment_rms_Am2 : float
@@ -126,11 +129,11 @@ class Signature(Result):
     rows : int
         Rows that were used.
     chi2 : float
-        Of what is left of the readings.
+        χ² of the residuals.
     dof : int
         Its degrees of freedom.
     undetermined : tuple of str
-        What the headings leave open, in words: parameters, or several of which only a combination is known.
+        Names of parameters, or combinations of them, that the headings do not determine.
 
     Examples
     --------
@@ -159,7 +162,7 @@ class Signature(Result):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of all parameters: part and axes of the body, x forward, y left, z up."""
+        """Names of all parameters: part and axes of the body, x forward, y left, z up."""
         return self.components.names
 
     @property
@@ -179,7 +182,10 @@ class Signature(Result):
 
     @property
     def polarisability_m3(self) -> FloatArray:
-        """Induced moment per ambient field, times µ0, body axes (3, 3) [m³]; NaN where it is not determined."""
+        """Induced moment per ambient field, times µ0 (3, 3) [m³].
+
+        In the body's axes; NaN where it is not determined.
+        """
         alpha = np.zeros((3, 3))
         values = self.determined[self.components.induced_columns]
         for (i, j), value in zip(_indices(self.components.induced), values, strict=True):
@@ -188,24 +194,27 @@ class Signature(Result):
 
     @property
     def eddy_m3_s(self) -> FloatArray:
-        """Eddy-current moment per rate of the ambient field, times -µ0, in the body's axes (3,) [m³·s]."""
+        """Eddy-current moment per rate of the ambient field, times -µ0 (3,) [m³·s].
+
+        In the body's axes.
+        """
         own = self.determined[-3:] if self.components.eddy else np.zeros(3)
         return MU0 * own / self.components.rate_T_s
 
     @property
     def misfit(self) -> bool:
-        """Whether no such moment on these paths explains the readings: χ² is beyond noise by one in a million."""
+        """Whether χ² is so large that noise explains it once in a million (no such moment)."""
         return bool(is_misfit(self.chi2, self.dof))
 
     def moment(self, heading_deg: ArrayLike, ambient_T: ArrayLike | None = None) -> tuple[FloatArray, FloatArray]:
-        """Moment on a level keel and a steady course, and its covariance.
+        """Return the moment on a level keel and a steady course, and its covariance.
 
         Parameters
         ----------
         heading_deg : array_like, shape (...)
-            Clockwise from the frame's y axis, which is north where the frame is east, north, up.
+            Clockwise from the frame's y axis, which is north if the frame is east, north, up.
         ambient_T : array_like, shape (3,), optional
-            Ambient field in that frame [T]; by default that of the passes.
+            Ambient field in the frame of the results [T]; by default that of the passes.
 
         Returns
         -------
@@ -218,18 +227,18 @@ class Signature(Result):
     def field(
         self, offset_m: ArrayLike, heading_deg: ArrayLike = 0.0, ambient_T: ArrayLike | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """Field of the object on a level keel and a steady course, and its covariance.
+        """Return the field on a level keel and a steady course, and its covariance.
 
-        That of a dipole: nearer than some three lengths of the body it is another one.
+        The field is that of a dipole, which is wrong nearer than about three lengths of the body.
 
         Parameters
         ----------
         offset_m : array_like, shape (..., 3)
-            From the object to where the field is wanted, along its axes forward, left, up [m].
+            Offset from the object to the point of the field, along its axes forward, left, up [m].
         heading_deg : array_like, shape (...)
-            As of :meth:`moment`.
+            As in :meth:`moment`.
         ambient_T : array_like, shape (3,), optional
-            As there.
+            As in :meth:`moment`.
 
         Returns
         -------
@@ -270,26 +279,26 @@ def fit_signature(
     path_error: PathError = EXACT,
     ambient_T: ArrayLike | None = None,
 ) -> Signature:
-    r"""Permanent and induced moment of an object that passes an array on known courses.
+    r"""Fit permanent and induced moment of an object that passes an array on known courses.
 
     .. math:: m = R (m_p + α R^T B_a - β \frac{d}{dt} R^T B_a)
 
     Parameters
     ----------
     array : SensorArray
-        Three independent differences are enough. The lasting errors that it states are estimated along.
+        Three independent differences are enough. Correlated errors that it states are estimated too.
     readings : Readings, or a sequence of them
-        Of every pass, of one clock and in the order of time. Those that saturate are not used.
+        Readings of every pass, with one clock, in the order of time. Saturated readings are not used.
     path : ObjectPath, or a sequence of them
-        Of every pass, or one for all. Without an attitude the object is level, its bow along the course.
+        Path of every pass, or one for all. Without an attitude the object is level, its bow along the course.
     induced : {"diagonal", "symmetric", "none"}
         Which components of α are estimated.
     eddy : bool
-        Estimate β, diagonal: it needs passes on which the object turns.
+        Estimate the diagonal β. It needs passes on which the object turns.
     path_error : PathError
-        How wrong the path of every pass may be; exact by default. An attitude is taken as exact.
+        Uncertainty of the path of every pass; exact by default. Attitudes count as exact.
     ambient_T : array_like, shape (3,), optional
-        Ambient field in the frame of the results [T], where the readings and the array do not have it.
+        Ambient field in the frame of the results [T], if the readings and the array do not have it.
 
     Returns
     -------
@@ -321,7 +330,7 @@ def fit_signature(
     used, positions, rotations, fields, rates, distances = [], [], [], [], [], []
     for measured, of_part in zip(passes, paths, strict=True):
         part = usable_readings(array, measured)
-        position, rotation, rows = known_rows(part, of_part.along_course())
+        position, rotation, rows = rows_on_path(part, of_part.along_course())
         if rotation is None:
             raise ValueError("Input path must have an attitude; instead it has none.")  # along_course gives one
         field = np.einsum("nij,ni->nj", rotation, _ambient(array, rows, ambient_T, needed=induced != "none" or eddy))
@@ -336,12 +345,12 @@ def fit_signature(
     modulus = float(np.linalg.norm(field, axis=1).mean()) or 1.0
     components = Components(induced, eddy, modulus, max(_NO_RATE, float(np.linalg.norm(rate, axis=1).max())))
     model = moment_model(array, used, positions, components.basis(R, field, rate), path_error, 0.0)
-    steps = settled(model, gate=False)
+    steps = relinearise(model, gate=False)
     theta, root = steps[-1].x[model.moment], steps[-1].S[model.moment]
     moment_rms = math.sqrt(float(np.mean(np.sum((model.basis.M @ theta) ** 2, axis=1))))
     warn_of_moments([np.concatenate(distances).min()], [[moment_rms, 0.0, 0.0]])
-    open_ = _undetermined(components.names, root, LEAST_KNOWN * moment_rms)
-    chi2, dof = goodness(model, steps)
+    open_ = _undetermined_combinations(components.names, root, LEAST_KNOWN * moment_rms)
+    chi2, dof = goodness_of_fit(model, steps)
     return Signature(
         components,
         theta,
@@ -350,23 +359,26 @@ def fit_signature(
         moment_rms,
         len(model.rows),
         chi2,
-        dof + len(open_),  # what is not determined took no degree of freedom
+        dof + len(open_),  # combinations that are not determined use no degree of freedom
         open_,
     )
 
 
-def _undetermined(names: Sequence[str], root: FloatArray, limit: float) -> tuple[str, ...]:
-    """Combinations of parameters whose σ is beyond a limit, by the square root (q, n) of their covariance."""
+def _undetermined_combinations(names: Sequence[str], root: FloatArray, limit: float) -> tuple[str, ...]:
+    """Return the names of combinations of parameters whose σ is beyond a limit.
+
+    ``root`` is the square root (q, n) of the parameters' covariance.
+    """
     vectors, sigma, _ = np.linalg.svd(root, full_matrices=False)
     words = []
-    for direction in _simplest(vectors[:, sigma > limit].T):
+    for direction in _row_echelon(vectors[:, sigma > limit].T):
         share = np.abs(direction) / np.abs(direction).max()
         words.append(" against ".join(name for name, part in zip(names, share, strict=True) if part > _NAMED))
     return tuple(words)
 
 
 def _ambient(array: SensorArray, readings: Readings, ambient_T: ArrayLike | None, *, needed: bool) -> FloatArray:
-    """Ambient field (n, 3) in the frame of the results."""
+    """Return the ambient field (n, 3) in the frame of the results."""
     n = len(readings)
     if ambient_T is not None:
         return np.broadcast_to(np.asarray(ambient_T, dtype=np.float64), (n, 3))
@@ -381,15 +393,18 @@ def _ambient(array: SensorArray, readings: Readings, ambient_T: ArrayLike | None
 
 
 def _level_rotation(heading_deg: ArrayLike) -> FloatArray:
-    """Rotations (..., 3, 3) from the axes forward, left, up to the frame, on a level keel."""
+    """Return rotations (..., 3, 3) from forward, left, up to the frame, on a level keel."""
     yaw = np.radians(90.0 - np.asarray(heading_deg, dtype=np.float64))
     sine, cosine, zero, one = np.sin(yaw), np.cos(yaw), np.zeros_like(yaw), np.ones_like(yaw)
     rows = [[cosine, -sine, zero], [sine, cosine, zero], [zero, zero, one]]
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def _simplest(directions: FloatArray) -> FloatArray:
-    """Directions (d, q) that span the same, with as many zeros as possible: the reduced row echelon form."""
+def _row_echelon(directions: FloatArray) -> FloatArray:
+    """Return directions (d, q) of the same span with as many zeros as possible.
+
+    This is the reduced row echelon form.
+    """
     rows = directions.copy()
     for k in range(len(rows)):
         i, j = np.unravel_index(int(np.argmax(np.abs(rows[k:]))), rows[k:].shape)

@@ -1,4 +1,4 @@
-"""How much later than their poses the readings of a survey are, as targets that are passed both ways show."""
+"""Delay of the readings of a survey after their poses, estimated from its targets."""
 
 from __future__ import annotations
 
@@ -17,28 +17,28 @@ from arrays.typing import FloatArray, IntArray
 from magloc.navigation.poses import vectors_at
 from magloc.readings import Readings
 from magloc.surveying.fit.joint_fit import Sources
-from magloc.surveying.piece import Piece, sources_after
+from magloc.surveying.piece import Piece, search_rounds
 from magloc.surveying.rounds import WHILE_SEARCHING
 
-_STEP_M = 0.05  # of the way, for the curvature of the likelihood
+_STEP_M = 0.05  # step along the path for the curvature of the likelihood
 _MOST_S = 1.2
-_TOLERANCE = 0.1  # of a step, until the likelihood is a parabola
-_APART, _ROUNDS = 0.6, 3  # of lags that are searched anew, in distances to the nearest sources; and how long
-_WRONG = 1.5  # χ² per reading from which on sources may be those of another lag
-_SETTLING = 8  # times that a claimed lag is looked for anew
-_MISFIT, _SHARE = 2.0, 0.5  # per reading, and of the misfit without a lag
-_ROWS = 6  # that a smooth track follows together
+_TOLERANCE = 0.1  # share of a step
+_APART, _ROUNDS = 0.6, 3  # spacing of lags with a new search, in distances to the nearest sources, and rounds of each
+_WRONG = 1.5  # χ² per reading above which sources may belong to another lag
+_SETTLING = 8  # most repetitions of the search for a lag
+_MISFIT, _SHARE = 2.0, 0.5  # largest χ² per reading, or share of that without a lag
+_ROWS = 6  # rows per knot of a smooth track
 
 
-class Lag(NamedTuple):
-    """Seconds by which readings are late, and their standard deviation."""
+class ClockLag(NamedTuple):
+    """Delay of the readings in seconds, and its standard deviation."""
 
     s: float
     sigma_s: float
 
 
 class Trial(NamedTuple):
-    """Sources that fit best at some lag, minus twice the log-likelihood, and χ² per reading."""
+    """Best sources at a lag, minus twice the log-likelihood, and χ² per reading."""
 
     lag_s: float
     sources: Sources
@@ -51,40 +51,40 @@ def by_cost(one: Trial) -> float:
     return one.cost
 
 
-def lag_of(piece_at: Callable[[float], Piece], here: Trial | None = None, near: Trial | None = None) -> Lag:
-    """Return the likeliest lag of a piece, 0 where it explains no more than chance does.
+def estimate_lag(piece_at: Callable[[float], Piece], here: Trial | None = None, near: Trial | None = None) -> ClockLag:
+    """Return the likeliest lag of a piece, 0 if it explains no more than chance does.
 
-    ``piece_at`` has the readings with the poses of some time earlier. A lag is compared with ``here``, by default the
-    same piece without one; it is looked for near some trial, by default everywhere.
+    ``piece_at`` returns the piece with the poses of an earlier time. ``here``: trial without a lag for comparison.
+    ``near``: trial to search around; by default the search covers all lags.
     """
     piece = piece_at(0.0)
     model = piece.model()
     way = np.linalg.norm(np.diff(model.record.middles_m, axis=0), axis=1)
     speed = float(np.median(way / np.diff(model.record.time_s)))
     if not len(piece.known) or speed * _MOST_S < _STEP_M:
-        return Lag(0.0, math.inf)
+        return ClockLag(0.0, math.inf)
     step, apart = _STEP_M / speed, _APART * model.nearest_m / speed
 
     def best_near(lag: Trial) -> Trial:
-        """Return the likeliest trial beside some trial, from its sources."""
+        """Return the likeliest trial near another one, starting from its sources."""
         found = minimize_scalar(
-            lambda lag_s: trial(piece_at, float(lag_s), lag.sources).cost,
+            lambda lag_s: fit_at_lag(piece_at, float(lag_s), lag.sources).cost,
             bounds=(lag.lag_s - apart, lag.lag_s + apart),
             method="bounded",
             options={"xatol": _TOLERANCE * step},
         )
-        return trial(piece_at, float(found.x), lag.sources)
+        return fit_at_lag(piece_at, float(found.x), lag.sources)
 
     def sides(lag: Trial) -> list[Trial]:
-        """Return the trials a step before and after one."""
-        return [trial(piece_at, lag.lag_s + sign * step, lag.sources) for sign in (-1.0, 1.0)]
+        """Return the trials one step before and after a trial."""
+        return [fit_at_lag(piece_at, lag.lag_s + sign * step, lag.sources) for sign in (-1.0, 1.0)]
 
     def beside(lag: Trial) -> tuple[float, float]:
         """Return slope and curvature of the cost."""
         before, after = (side.cost for side in sides(lag))
         return (after - before) / (2.0 * step), (before - 2.0 * lag.cost + after) / step**2
 
-    here = trial(piece_at, 0.0, piece.known) if here is None else here
+    here = fit_at_lag(piece_at, 0.0, piece.known) if here is None else here
     if near is None:
         slope, curvature = beside(here)
         if (
@@ -92,48 +92,48 @@ def lag_of(piece_at: Callable[[float], Piece], here: Trial | None = None, near: 
             and curvature > 0.0
             and slope**2 < 2.0 * curvature * model.threshold * max(1.0, here.chi2)
         ):
-            return Lag(0.0, math.sqrt(2.0 / curvature))
+            return ClockLag(0.0, math.sqrt(2.0 / curvature))
         at = best_near(here)
-        if at.chi2 > _WRONG:  # the sources may be two images of each, one from either way
+        if at.chi2 > _WRONG:  # each source may be found twice, once for each direction of travel
             n = math.ceil(_MOST_S / apart)
             lags = np.linspace(-_MOST_S, _MOST_S, 2 * n + 1).tolist()
-            new = [trial(piece_at, lag_s, None) for lag_s in lags]
+            new = [fit_at_lag(piece_at, lag_s, None) for lag_s in lags]
             here = min(here, new[n], key=by_cost)
             at = min(at, best_near(min(new, key=by_cost)), key=by_cost)
     else:
         at = best_near(near)
-    here = min(here, trial(piece_at, 0.0, at.sources), key=by_cost)  # a search may have found more
-    explained = at.chi2 < max(_MISFIT, _SHARE * here.chi2)  # else something is wrong that a lag imitates
+    here = min(here, fit_at_lag(piece_at, 0.0, at.sources), key=by_cost)  # a search may have found more
+    explained = at.chi2 < max(_MISFIT, _SHARE * here.chi2)  # otherwise a lag imitates another error
     if not explained or here.cost - at.cost < model.threshold * max(1.0, at.chi2):
-        return Lag(0.0, math.inf)
-    for _ in range(_SETTLING):  # sources of another lag hold the search back
-        again = best_near(min([trial(piece_at, at.lag_s, None), *sides(at)], key=by_cost))
+        return ClockLag(0.0, math.inf)
+    for _ in range(_SETTLING):  # sources found at another lag bias the search
+        again = best_near(min([fit_at_lag(piece_at, at.lag_s, None), *sides(at)], key=by_cost))
         settled = again.cost > at.cost - 1.0
         at = min(at, again, key=by_cost)
         if settled:
             break
     slope, curvature = beside(at)
     lag_s = at.lag_s - slope / curvature if curvature > 0.0 else math.inf
-    return Lag(lag_s, math.sqrt(2.0 / curvature)) if abs(lag_s) < _MOST_S else Lag(0.0, math.inf)
+    return ClockLag(lag_s, math.sqrt(2.0 / curvature)) if abs(lag_s) < _MOST_S else ClockLag(0.0, math.inf)
 
 
-def trial(piece_at: Callable[[float], Piece], lag_s: float, start: Sources | None) -> Trial:
-    """Fit sources at a lag, from some, or from those of a new search."""
+def fit_at_lag(piece_at: Callable[[float], Piece], lag_s: float, start: Sources | None) -> Trial:
+    """Fit sources at a lag, from given sources or from those of a new search."""
     piece = replace(piece_at(lag_s), known=Sources.none() if start is None else start)
-    start = sources_after(piece, _ROUNDS) if start is None else start
+    start = search_rounds(piece, _ROUNDS) if start is None else start
     model = piece.model()
     group = piece.groups(model.record, WHILE_SEARCHING * model.nearest_m)
-    fit, background = model.refitted(start, group)
+    fit, background = model.refit(start, group)
     cost = fit.cost + background.noise_log_determinant + model.threshold * len(fit.sources)
     return Trial(lag_s, fit.sources, cost, fit.cost / fit.residual.size)
 
 
 @dataclass(frozen=True, eq=False)
 class SmoothTrack:
-    """The track of some readings, smoothed: least-squares cubic splines with a knot at every sixth row.
+    """Smoothed track: least-squares cubic splines with a knot at every sixth row.
 
-    Each piece without gaps has its own. A spline is a projection: what it keeps of white errors and what it leaves are
-    independent, so that rows which the one moves and not the other err as before.
+    Each piece without gaps has its own spline. A spline is a projection: the white errors that it keeps and those that
+    it removes are independent, so that moving only the smooth part does not change the size of the errors.
 
     Attributes
     ----------
@@ -141,7 +141,7 @@ class SmoothTrack:
     first : ndarray of int
         First row of every piece.
     splines : list of BSpline
-        Of places and quaternions against time, one of every piece.
+        Splines of places and quaternions against time, one per piece.
     """
 
     readings: Readings
@@ -156,7 +156,7 @@ class SmoothTrack:
         assert readings.array_rotation is not None
         quaternion = readings.array_rotation.as_quat()
         same = np.concatenate([[1.0], np.sum(quaternion[1:] * quaternion[:-1], axis=1)])
-        quaternion = quaternion * np.cumprod(np.where(same < 0.0, -1.0, 1.0))[:, None]  # -q turns as q does
+        quaternion = quaternion * np.cumprod(np.where(same < 0.0, -1.0, 1.0))[:, None]  # -q and q are the same rotation
         rows = np.hstack([readings.array_position_m, quaternion])
         ends = np.flatnonzero(step_s > _ROWS * np.median(step_s)) + 1
         splines = []
@@ -172,12 +172,12 @@ class SmoothTrack:
         ambient, turn = self.readings.ambient_T, self.readings.array_rotation
         return None if ambient is None or turn is None else np.asarray(turn.apply(ambient))
 
-    def taken_earlier(self, lag_s: float, rows: IntArray | None = None) -> Readings:
-        """Return some readings with the poses of some time before their own, and the ambient field as these have it.
+    def with_earlier_poses(self, lag_s: float, rows: IntArray | None = None) -> Readings:
+        """Return readings with the poses of an earlier time, and the ambient field to match.
 
-        Each pose is moved by what the smooth track does in that time. A pose between two rows would average their
-        errors, and seem likelier for that alone. The modulus of the ambient field stays that of the row's own time, as
-        a base station at the clock of the readings has it.
+        Each pose changes by as much as the smooth track does in that time. Interpolation between two rows would average
+        their errors and seem likelier for that reason alone. The modulus of the ambient field stays that of the row's
+        own time, because a base station uses the clock of the readings.
         """
         rows = np.arange(len(self.readings)) if rows is None else rows
         own = self.readings[rows]
@@ -191,14 +191,17 @@ class SmoothTrack:
         posed = replace(own, array_position_m=place + earlier[:, :3] - now[:, :3], array_rotation=turned)
         if own.ambient_T is None or self._ambient_in_world_T is None:
             return posed
-        # In the world it hardly turns between two rows.
+        # In the world frame the ambient field hardly changes between two rows.
         in_world = vectors_at(own.time_s - lag_s, self.readings.time_s, self._ambient_in_world_T)
         ambient = turned.inv().apply(in_world)
         as_read, then = (np.linalg.norm(field, axis=1, keepdims=True) for field in (own.ambient_T, ambient))
         return replace(posed, ambient_T=ambient * (as_read / then))
 
     def _at(self, wanted_s: FloatArray, rows: IntArray) -> FloatArray:
-        """Places and quaternions (m, 7) at other times; the pieces of the rows go straight on at their ends."""
+        """Return places and quaternions (m, 7) at other times.
+
+        Beyond its ends a piece continues along a straight line.
+        """
         out = np.empty((len(rows), 7))
         which = np.searchsorted(self.first, rows, "right") - 1
         ends = np.append(self.first[1:], len(self.readings)) - 1

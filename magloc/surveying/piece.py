@@ -1,4 +1,4 @@
-"""A tile of a survey, or all of a small one, with what is known of it: what one process works on."""
+"""One tile of a survey, or all of a small one: the unit of work of one process."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from arrays.typing import FloatArray, IntArray
 from magloc.grids.work import Arrays
 from magloc.localization.fit.prior import SourcePrior
 from magloc.readings import Readings
-from magloc.surveying.fit.joint_fit import Bounds, Layer, Sources
+from magloc.surveying.fit.joint_fit import Layer, SourceBounds, Sources
 from magloc.surveying.fit.record import SurveyRecord
-from magloc.surveying.fit.whitening import Drift
+from magloc.surveying.fit.whitening import SurveyDrift
 from magloc.surveying.preparation import record_of
 from magloc.surveying.reach import least_moments
-from magloc.surveying.rounds import AT_LAST, MOST_ROUNDS, Model, found_in
+from magloc.surveying.rounds import AT_LAST, MOST_ROUNDS, SurveyModel, find_sources
 from magloc.surveying.search import PITCH, SearchGrid
 from magloc.surveying.targets import targets_of
 from magloc.surveying.tiles import Tile
 
-OF_ROWS = ("place_m", "anomaly_T", "residual_T")
-_FIRST_ROUNDS = 4  # until the clock is looked at
+ROW_ENTRIES = ("place_m", "anomaly_T", "residual_T")
+_FIRST_ROUNDS = 4  # before the lag is estimated
 _BESIDE = 0.6  # of the distance to the deepest sources
 _SHALLOWEST_M, _DEEPEST = 0.05, 4.0
 _MARGIN_M = 1.0
@@ -35,11 +35,11 @@ _MOST_PLACES = 1e6
 
 
 HIGHEST_M = 25.0
-"""Above the ground: from higher up no target of a survey is seen."""
+"""Height above the ground from which no target of a survey is visible."""
 
 
 def high_above(height_m: float, ground_m: float) -> str:
-    """Say that sensors are so high above the stated ground that their heights are hardly counted from it."""
+    """Return the warning that sensors are far above the stated ground."""
     return (
         f"the sensors are {height_m:.3g} m above the ground, which is stated at a height of {ground_m:g} m: if their"
         " heights are above the sea, or above an ellipsoid, state the height of the ground there too (ground_m)"
@@ -48,16 +48,16 @@ def high_above(height_m: float, ground_m: float) -> str:
 
 @dataclass(frozen=True)
 class Ground:
-    """What is known of the ground, and what is looked for in it.
+    """Settings of the ground and of the search in it.
 
     Attributes
     ----------
     prior : SourcePrior
     ground_m, shortest_geology_m : float
     threshold : float
-        χ² of 3 degrees of freedom that a target must exceed.
+        χ² with 3 degrees of freedom that a target must exceed.
     body_length_m : float
-        Longest edge of what may be buried, 0 of points.
+        Longest edge of buried bodies; 0 for points.
     """
 
     prior: SourcePrior
@@ -72,8 +72,8 @@ class Ground:
         given = float(self.prior.high_m[2])
         return given if math.isfinite(given) else self.ground_m - _SHALLOWEST_M
 
-    def bounds(self, record: SurveyRecord) -> Bounds:
-        """Where sources may be that rows show, and how strong."""
+    def bounds(self, record: SurveyRecord) -> SourceBounds:
+        """Return limits of positions and moments of sources that the rows show."""
         low, high = record.sensors_m.min(axis=(0, 1)), record.sensors_m.max(axis=(0, 1))
         if low[2] <= self.ground_m:
             raise ValueError(
@@ -88,12 +88,12 @@ class Ground:
         )
         if not (low_m < high_m).all():
             raise ValueError("Input prior must leave room below the ground; instead received bounds that do not.")
-        return Bounds(low_m, high_m, min(self.prior.largest_moment_Am2, _LARGEST_MOMENT_Am2))
+        return SourceBounds(low_m, high_m, min(self.prior.largest_moment_Am2, _LARGEST_MOMENT_Am2))
 
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """Rows of one tile, and what is known of the sources.
+    """Rows of one tile, and the sources that are known.
 
     Attributes
     ----------
@@ -101,13 +101,13 @@ class Piece:
     readings : Readings
     ground : Ground
     tile : Tile
-        Whose rows they are.
+        Tile of the rows.
     offset_T : ndarray, shape (C,)
-        Of the anomalies.
+        Offsets of the anomalies.
     geology_T : float
-        How strong the field of the ground is expected to be.
+        Expected strength of the field of the ground.
     known, beside, outside : Sources
-        Of the tile, of its margin, and others whose field reaches it.
+        Sources of the tile, of its margin, and others whose field reaches it.
     """
 
     array: SensorArray
@@ -120,8 +120,8 @@ class Piece:
     beside: Sources
     outside: Sources
 
-    def model(self) -> Model:
-        """Of the rows, with the field of sources that are not of the tile."""
+    def model(self) -> SurveyModel:
+        """Return the model of the rows, with the field of sources outside the tile."""
         record, errors = record_of(self.array, self.readings)
         record = replace(record, values_T=record.values_T - self.offset_T)
         others = self.beside.with_more(self.outside)
@@ -131,7 +131,7 @@ class Piece:
         layer = Layer.below(record, self.ground.shortest_geology_m, self.geology_T)
         x, y = (bounds.high_m - bounds.low_m)[:2]
         known = self.ground.threshold, self.ground.body_length_m, self.beside
-        model = Model(record, errors, layer, Drift(), bounds, *known)
+        model = SurveyModel(record, errors, layer, SurveyDrift(), bounds, *known)
         height = model.nearest_m
         measurements = (self.groups(record, AT_LAST * height)[-1] + 1) * record.array.n_channels
         numbers = max(measurements, len(layer.places_m)) * len(layer.places_m)
@@ -145,56 +145,56 @@ class Piece:
         return model
 
     def groups(self, record: SurveyRecord, length_m: float) -> IntArray:
-        """Group of every row (n,): neighbours that pass within a length count as one."""
+        """Return the group of every row (n,): neighbours within a length count as one."""
         steps = np.linalg.norm(np.diff(record.middles_m, axis=0), axis=1)[np.diff(self.tile.rows) == 1]
         step = float(np.median(steps)) if steps.size else 0.0
         together = max(1, math.floor(length_m / step)) if step > 0.0 else 1
         return np.unique(self.tile.rows // together, return_inverse=True)[1]
 
 
-def strongest_in(piece: Piece) -> Arrays:
-    """The strongest sources, after some rounds."""
-    return dict(vars(sources_after(piece, _FIRST_ROUNDS)))
+def strongest_sources(piece: Piece) -> Arrays:
+    """Search for the strongest sources in a few rounds."""
+    return dict(vars(search_rounds(piece, _FIRST_ROUNDS)))
 
 
-def sources_in(piece: Piece) -> Arrays:
-    """All sources that are significant; of those beside the tile its neighbours tell."""
-    return dict(vars(sources_after(piece, MOST_ROUNDS)))
+def significant_sources(piece: Piece) -> Arrays:
+    """Search for all significant sources; neighbouring tiles report those in the margin."""
+    return dict(vars(search_rounds(piece, MOST_ROUNDS)))
 
 
-def sources_after(piece: Piece, most: int) -> Sources:
-    """Return the sources of a tile after some rounds.
+def search_rounds(piece: Piece, most: int) -> Sources:
+    """Search for the sources of a tile in some rounds.
 
-    They are looked for beside it, too: what is strong there makes skirts here.
+    The search includes the surroundings, because strong sources there disturb the tile.
     """
     model = piece.model()
     reach = _BESIDE * (model.record.height_m - model.bounds.low_m[2])
     low, high = np.append(piece.tile.low_m - reach, -math.inf), np.append(piece.tile.high_m + reach, math.inf)
     grid = SearchGrid.below(model.record, np.maximum(model.bounds.low_m, low), np.minimum(model.bounds.high_m, high))
     groups = partial(piece.groups, model.record)
-    return found_in(model, groups, grid, piece.known, most, piece.tile.holds)
+    return find_sources(model, groups, grid, piece.known, most, piece.tile.contains)
 
 
-def targets_in(piece: Piece) -> Arrays:
-    """The sources that are known, fitted to all rows: targets of the tile, reach, and what is left of its rows."""
+def measure_targets(piece: Piece) -> Arrays:
+    """Fit the known sources to all rows; return targets, reach and residuals of the tile."""
     model = piece.model()
     groups = partial(piece.groups, model.record)
-    fit, background = model.fitted(piece.known, groups(AT_LAST * model.nearest_m), _SETTLED)
+    fit, background = model.fit(piece.known, groups(AT_LAST * model.nearest_m), _SETTLED)
     record = model.record
-    left = record.values_T - record.predicted(fit.sources.fields(record))
+    left = record.values_T - record.predict(fit.sources.fields(record))
     lines = (
         record.middles_m,
         record.along_ambient(record.values_T),
         record.along_ambient(left),
     )
-    own, which = piece.tile.own, piece.tile.holds(fit.sources.position_m)
+    own, which = piece.tile.own, piece.tile.contains(fit.sources.position_m)
     extent = piece.tile.extent_m(lines[0][own, :2])
     places, moments = least_moments(model, fit.sources, groups, *extent, piece.ground.ground_m)
     return {
         "reach_m": places,
         "reach_Am2": moments,
         **targets_of(model, fit, background, groups, piece.ground.ground_m, which),
-        **{name: values[own] for name, values in zip(OF_ROWS, lines, strict=True)},
+        **{name: values[own] for name, values in zip(ROW_ENTRIES, lines, strict=True)},
         "chi2": np.array(fit.cost),
         "size": np.array(fit.residual.size),
     }

@@ -1,4 +1,4 @@
-"""What a survey takes of readings: whole rows of sensors that tell something, as anomalies in the world frame."""
+"""Preparation of readings for a survey: whole rows, as anomalies in the world frame."""
 
 from __future__ import annotations
 
@@ -21,22 +21,24 @@ from magloc.surveying.pose_components import UNSTATED
 
 _LOG = logging.getLogger(__name__)
 FEWEST_ROWS = 20
-_MOST_APART = 2.0  # ratio of the fields at two places a day trip apart: more is another unit
+_MOST_APART = 2.0  # ratio of fields of places on one survey; more means another unit
 _LEAST_DEPTH_M, _LOWEST = 0.1, 0.1  # from the sensor to the shallowest sources: least, and quantile of its heights
 _LEAST_JITTER_M = 0.01
-_BASE_STEP, _BASE_NOISE_T = 0.4, 1e-10  # usual step of a base's rows over the depth of what it sees, and its noise
+_BASE_STEP, _BASE_NOISE_T = 0.4, 1e-10  # usual step of a base's rows over the depth of its sources, and its noise
 _LONG_GAP, _LONG_GAP_S = 5.0, 30.0  # of a base: over its usual step, and at least
 _FASTEST_M_S = 300.0
-_BLOCK = 2**18  # rows that are looked at together
-_LONGEST_RUN = 25  # of the same reading, over what the liveliest sensor repeats
+_BLOCK = 2**18  # rows per block
+_LONGEST_RUN = 25  # equal readings in a run, relative to the mean run of the best sensor
 
 
 def whole_rows(
     array: SensorArray, readings: Readings, base: Readings | None = None, shallowest_m: float = 0.0
 ) -> tuple[SensorArray, Readings]:
-    """Return rows where all sensors read, without the sensors that would cost more rows than they are worth.
+    """Return the rows with readings of all sensors.
 
-    Their ambient field varies as the modulus at a base station. No source is higher than `shallowest_m`.
+    Sensors that would cost too many rows are left out.
+
+    Their ambient field varies like the modulus at a base station. No source is above `shallowest_m`.
     """
     if readings.array_rotation is None:
         raise ValueError("Input readings must have the pose of the array in every row; instead received none.")
@@ -68,11 +70,13 @@ def whole_rows(
     array = with_stated_pose(array, readings)
     array = replace(array, pose=UNSTATED) if array.pose is None else array
     ambient = _ambient_T(array, readings)
-    return array, replace(readings, ambient_T=ambient if base is None else varying(ambient, readings.time_s, base))
+    return array, replace(
+        readings, ambient_T=ambient if base is None else vary_with_base(ambient, readings.time_s, base)
+    )
 
 
 def with_places_between_fixes(array: SensorArray, readings: Readings) -> tuple[SensorArray, Readings]:
-    """Return readings whose places move between fixes, and the array whose errors last as long as these."""
+    """Interpolate places between fixes; the array's pose errors last at least one interval."""
     if readings.array_position_m is None or readings.array_rotation is None:
         return array, readings
     found = between_fixes(readings.time_s, readings.array_position_m, readings.array_rotation)
@@ -87,7 +91,7 @@ def with_places_between_fixes(array: SensorArray, readings: Readings) -> tuple[S
     poses = {"array_position_m": found.position_m, "array_rotation": found.rotation, "interpolated_m": error_m}
     readings = replace(readings, **poses)[: found.end]  # type: ignore[arg-type]
     pose, interval_s = array.pose, 1.0 / found.rate_Hz
-    if pose is not None and pose.correlation_s < interval_s:  # a fix errs as long as it counts
+    if pose is not None and pose.correlation_s < interval_s:  # the error of a fix lasts until the next one
         array = replace(array, pose=replace(pose, correlation_s=interval_s))
     return array, readings
 
@@ -97,7 +101,7 @@ def _some(readings: Readings, which: BoolArray) -> Readings:
 
 
 def _unusable(array: SensorArray, readings: Readings, shallowest_m: float) -> tuple[BoolArray, BoolArray, BoolArray]:
-    """Readings (n, N) that stick, those that leap, and all that tell nothing."""
+    """Return readings (n, N) that stick, those that leap, and all that are unusable."""
     assert readings.array_position_m is not None
     assert readings.array_rotation is not None
     blocks = [readings.values_T[first : first + _BLOCK] for first in range(0, max(len(readings), 1), _BLOCK)]
@@ -122,7 +126,7 @@ def _moduli(array: SensorArray, values: FloatArray) -> FloatArray:
 
 
 def _jitter_m(array: SensorArray, readings: Readings) -> float:
-    """Error of the place from one row to the next [m]."""
+    """Return the error of the place from one row to the next [m]."""
     pose = with_stated_pose(array, readings).pose
     if pose is None:
         return _LEAST_JITTER_M
@@ -133,7 +137,7 @@ def _jitter_m(array: SensorArray, readings: Readings) -> float:
 
 
 def stuck_readings(array: SensorArray, values: FloatArray) -> BoolArray:
-    """Rows and sensors (n, N) of long runs of the same reading, while what other sensors read changes."""
+    """Return rows and sensors (n, N) in long runs of one reading while others change."""
     n = len(values)
     lengths = np.empty((n, array.n_sensors))
     for i in range(array.n_sensors):
@@ -146,7 +150,7 @@ def stuck_readings(array: SensorArray, values: FloatArray) -> BoolArray:
 
 
 def leaping_rows(readings: Readings) -> BoolArray:
-    """Rows (n,) whose place is far from that of the row before and of the one after."""
+    """Return the rows (n,) whose place is far from those before and after."""
     assert readings.array_position_m is not None
     way, time_s = np.linalg.norm(np.diff(readings.array_position_m, axis=0), axis=1), readings.time_s
     leaps = way > _FASTEST_M_S * np.diff(time_s)
@@ -164,15 +168,18 @@ def leaping_rows(readings: Readings) -> BoolArray:
 
 
 def record_of(array: SensorArray, readings: Readings) -> tuple[SurveyRecord, PoseErrors]:
-    """Anomalies of whole rows in the world frame, offsets of the sensors with them, and the errors of their pose."""
+    """Return the anomalies of whole rows in the world frame, and their pose errors."""
     assert array.pose is not None
     errors = PoseErrors.of(array.pose, between_s=interval_of_fixes(readings.time_s, readings.interpolated_m))
     assert readings.ambient_T is not None
     return SurveyRecord.of(array, readings, readings.ambient_T, errors), errors
 
 
-def varying(ambient_T: FloatArray, time_s: FloatArray, base: Readings) -> FloatArray:
-    """Ambient field (n, 3) whose modulus changes as that at a base station about its median over them."""
+def vary_with_base(ambient_T: FloatArray, time_s: FloatArray, base: Readings) -> FloatArray:
+    """Return the ambient field (n, 3) with the variation of its modulus at a base station.
+
+    The variation is relative to the median of the base's readings during the survey.
+    """
     if base.values_T.shape[1] != 1:
         raise ValueError(f"Input base must have one channel; instead received {base.values_T.shape[1]}.")
     read = _usable_base(base)
@@ -194,7 +201,7 @@ def varying(ambient_T: FloatArray, time_s: FloatArray, base: Readings) -> FloatA
 
 
 def _usable_base(base: Readings) -> Readings:
-    """Return the readings of a base station without wild ones, and name these and long gaps."""
+    """Return a base station's readings without outliers; log these and long gaps."""
     base = base[np.argsort(base.time_s, kind="stable")]
     read = base[np.isfinite(base.values_T[:, 0])]
     step_s = float(np.median(np.abs(np.diff(read.time_s)))) if len(read) > 1 else 1.0
@@ -207,7 +214,7 @@ def _usable_base(base: Readings) -> Readings:
 
 
 def _warn_of_gap(time_s: FloatArray, read: Readings) -> None:
-    """Name the longest gap of a base station during a survey."""
+    """Log the longest gap of a base station during a survey."""
     gaps = np.diff(read.time_s)
     gaps[(read.time_s[1:] < time_s[0]) | (read.time_s[:-1] > time_s[-1])] = 0.0
     k = int(gaps.argmax()) if len(gaps) else 0
@@ -219,7 +226,10 @@ def _warn_of_gap(time_s: FloatArray, read: Readings) -> None:
 
 
 def _ambient_T(array: SensorArray, readings: Readings) -> FloatArray:
-    """Ambient field of every row (n, 3) in the array's frame; of vector sensors it is what they read on average."""
+    """Return the ambient field of every row (n, 3) in the array's frame.
+
+    For vector sensors it is their median reading.
+    """
     if readings.ambient_T is not None:
         if not (np.linalg.norm(readings.ambient_T, axis=1) > 0.0).all():
             raise ValueError(

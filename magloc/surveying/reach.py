@@ -1,4 +1,4 @@
-"""What could have been found where: the least moment that the rows of a survey show."""
+"""Least moment that the rows of a survey can detect, at places in the ground."""
 
 from __future__ import annotations
 
@@ -7,21 +7,23 @@ from scipy.special import chndtrinc
 
 from arrays.typing import FloatArray
 from magloc.surveying.fit.joint_fit import Sources, with_free_sources
-from magloc.surveying.rounds import WHILE_SEARCHING, Groups, Model
+from magloc.surveying.rounds import WHILE_SEARCHING, Groups, SurveyModel
 from magloc.surveying.search import WINDOW, SearchGrid, groups_near, normal_equations
 
 DEPTHS_M = (0.5, 1.0, 2.0)
 SEEN = 0.95
-_ROUNDING = 1e-12  # of what rows say of all three axes
+_ROUNDING = 1e-12  # of the information on all three axes
 
 
 def least_moments(
-    model: Model, sources: Sources, groups: Groups, low_m: FloatArray, high_m: FloatArray, ground_m: float
+    model: SurveyModel, sources: Sources, groups: Groups, low_m: FloatArray, high_m: FloatArray, ground_m: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Places (k, 3) below a rectangle (2,), and the moments (k,) that are found there with 95 %, however they point.
+    """Return places (k, 3) below a rectangle, and the moments (k,) that are found with 95 %.
 
-    What is found is a noncentral χ² of 3 degrees of freedom, moment·information·moment, above the threshold. Where rows
-    show none, however strong, there is no place.
+    The moments hold for the worst direction.
+
+    A moment is found if a noncentral χ² with 3 degrees of freedom, moment·information·moment, exceeds the threshold.
+    Places where the rows have no information are left out.
     """
     record = model.record
     directions = record.directions(sources.fields(record))

@@ -33,20 +33,20 @@ class Target:
     ----------
     id : str
     position_m, moment_Am2 : ndarray, shape (3,)
-        World frame.
+        In the world frame.
     covariance : ndarray, shape (6, 6)
-        Of position and moment, everything else in the survey eliminated.
+        Covariance of position and moment, everything else in the survey eliminated.
     depth_m : float
-        Below the ground.
+        Depth below the ground.
     depth_interval95_m : tuple of 2 floats
-        From the profile of χ² where the target is weak, whose depth is not Gaussian.
+        For a weak target from the profile of χ², because its depth is not Gaussian.
     significance : float
-        χ² that is lost without it, of 3 degrees of freedom.
+        Increase of χ² without the target, with 3 degrees of freedom.
     flags : tuple of str
         ``weak``: the ellipse is not Gaussian. ``near``: another target is so near that one of the two may be spurious.
-        ``merged``: the rows hold more than one there, too near to be told apart. ``edge``: at the rim of what was
-        searched. ``misfit``: the rows above it do not fit a dipole within what is stated of noise and pose, so that its
-        errors are larger than its covariance says.
+        ``merged``: there is more than one target, too near to be separated. ``edge``: at the edge of the searched
+        volume. ``misfit``: the rows above it do not fit a dipole within the stated errors of noise and pose, so that
+        its errors are larger than its covariance says.
 
     Examples
     --------
@@ -89,27 +89,36 @@ class Target:
 
 
 class SurveyRows(NamedTuple):
-    """Of n rows: time, place (n, 3), anomaly along the ambient field, mean of the sensors, and what targets leave."""
+    """Time, place (n, 3), anomaly along the ambient field, and residual of n rows.
+
+    Anomaly and residual are means over the sensors.
+    """
 
     time_s: FloatArray
     place_m: FloatArray
     anomaly_T: FloatArray
     residual_T: FloatArray
 
-    def thinned(self) -> SurveyRows:
-        """Evenly as many as a picture shows."""
+    def decimate(self) -> SurveyRows:
+        """Return evenly spaced rows, as many as a picture shows."""
         return SurveyRows(*(column[:: -(-len(self.time_s) // _MOST_POINTS)] for column in self))
 
 
 def linear_and_most(values: FloatArray) -> tuple[float, float]:
-    """Ends of a scale of values of either sign: linear up to the first, where most of them are, logarithmic beyond."""
+    """Return the linear threshold and the largest value of a symmetric logarithmic scale.
+
+    Most values lie in the linear range.
+    """
     size = np.abs(values)
     most = float(size.max()) or 1.0
     return max(float(np.quantile(size, _MOST)), _LEAST_LINEAR * most), most
 
 
 class Reach(NamedTuple):
-    """What could have been found: places (k, 3), and the moments (k,) seen there with 95 %, however they point."""
+    """Places (k, 3), and the least moments (k,) that are found there with 95 %.
+
+    The moments hold for the worst direction.
+    """
 
     place_m: FloatArray
     moment_Am2: FloatArray
@@ -117,29 +126,28 @@ class Reach(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Survey(Result):
-    """What a survey found.
+    """Targets, rows and reach of a survey.
 
     Attributes
     ----------
     targets : tuple of Target
         The most significant one first.
     array : SensorArray
-        The sensors that were used, and what their pose was taken for.
+        The sensors that were used, with the assumed pose errors.
     rows : SurveyRows
-        Every row's anomaly, and what the targets leave of it.
+        Anomaly and residual of every row.
     reach : Reach
-        The least moments that the lines as flown show, 0.5, 1 and 2 m below the ground.
+        Least moments that the lines as flown detect, 0.5, 1 and 2 m below the ground.
     ground_m : float
         Height of the ground in the world frame.
     threshold : float
-        χ² of 3 degrees of freedom that a target exceeds.
+        χ² with 3 degrees of freedom that a target exceeds.
     chi2_per_dof : float
-        Of all white residuals: 1 where what is stated of the errors is right.
+        χ² of all white residuals per degree of freedom: 1 if the stated errors are right.
     pose_assumed : bool
-        Whether nothing was stated of the pose's errors, so that they are what the rows tell: `array.pose`.
+        Whether the pose errors (`array.pose`) are estimated from the rows because none were stated.
     lag_s : float
-        How much later the readings were taken for than they were, as the targets showed and as was corrected: 0 where
-        they showed nothing.
+        Delay of the readings after their poses, estimated from the targets and corrected; 0 if the targets show none.
     seconds : float
 
     Examples
@@ -192,7 +200,7 @@ class Survey(Result):
 
     @property
     def entries(self) -> list[dict[str, Any]]:
-        """The targets as JSON and GeoJSON have them."""
+        """Targets as JSON and GeoJSON write them."""
         return [
             {
                 "id": target.id,
@@ -224,7 +232,7 @@ class Survey(Result):
         return columns
 
     def to_geojson(self, place: Vector) -> dict[str, Any]:
-        """A FeatureCollection with a point for every target, as RFC 7946 has it.
+        """Return a FeatureCollection with a point for every target (RFC 7946).
 
         Parameters
         ----------
@@ -239,7 +247,7 @@ class Survey(Result):
         )
 
     def to_kml(self, place: Vector) -> str:
-        """A placemark for every target, for maps of the world; ``place`` as of :meth:`to_geojson`."""
+        """Return a placemark for every target as KML; ``place`` as in :meth:`to_geojson`."""
         from arrays.io.world_maps import kml, placemark, world_place
 
         marks = []

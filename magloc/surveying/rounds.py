@@ -1,4 +1,4 @@
-"""Greedy rounds: look for sources in what is left, fit all of them together, leave out what is not significant."""
+"""Greedy rounds: search residuals for sources, fit all together, drop insignificant ones."""
 
 from __future__ import annotations
 
@@ -11,42 +11,42 @@ import numpy as np
 
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.measurement.pose import PoseErrors
-from magloc.surveying.fit.joint_fit import Background, Bounds, JointFit, Layer, Sources, fit_jointly
+from magloc.surveying.fit.joint_fit import JointFit, Layer, SourceBounds, Sources, SurveyBackground, fit_jointly
 from magloc.surveying.fit.record import SurveyRecord
-from magloc.surveying.fit.whitening import Drift
+from magloc.surveying.fit.whitening import SurveyDrift
 from magloc.surveying.search import Candidates, SearchGrid, peaks, search, sources_at
 
 MOST_ROUNDS = 60
-_MOST_IN_VAIN = 4  # rounds: beside strong sources, and at the rims of tiles, there is always something left to try
-_MOST_OF_MISFITS, _MISFIT = 8, 1.5  # and as long as χ² per reading says that something is missing
+_MOST_IN_VAIN = 4  # rounds: near strong sources and the edges of tiles some candidates always remain
+_MOST_OF_MISFITS, _MISFIT = 8, 1.5  # rounds while χ² per reading is too large
 _PROGRESS, _WORSE = 0.999, 1.02
 _MOST_AT_ONCE = 8
 _SAME_PLACE_M = 1e-6
-_FELT = 0.3  # of the noise of a group of rows: sources that change it by less are the same
-_REACH = 0.6  # of a fit, over the distance from the sensors
-_TWINS = 0.15  # over the distance from the sensors: sources that are nearer to each other are one
+_FELT = 0.3  # of the noise of a group of rows: smaller changes of sources do not count
+_REACH = 0.6  # largest shift in a fit, over the distance from the sensors
+_TWINS = 0.15  # over the distance from the sensors: sources nearer to each other are merged
 _MOST_WEIGHINGS = 4
 _SETTLED_COARSELY = 0.5
-# Steps of a fit whose weights follow it, and χ² that the last one may change by.
+# Steps of a fit with new weights at each, and the change of χ² in the last one.
 _MOST_STEPS, _FEW_STEPS, _SMALL_STEP = 6, 3, 0.1
 _HARDLY_DAMPED = 1e-9
 # Rows that pass within such a part of the distance to a source count as one.
 WHILE_SEARCHING, AT_LAST = 0.33, 0.15
 Groups = Callable[[float], IntArray]
 """Group of every row (n,), of neighbours within a length."""
-# While sources are missing, what they leave of each other's field counts as errors of the place.
+# While sources are missing, errors of the known ones count as errors of the place.
 _POSE_WHILE_SEARCHING_M = 0.04
 
 
 @dataclass(frozen=True, eq=False)
-class Model:
-    """What a survey's rows hold beside its sources."""
+class SurveyModel:
+    """Model of a survey's rows apart from its sources."""
 
     record: SurveyRecord
     errors: PoseErrors
     layer: Layer
-    drift: Drift
-    bounds: Bounds
+    drift: SurveyDrift
+    bounds: SourceBounds
     threshold: float
     body_length_m: float = 0.0
     beside: Sources | None = None
@@ -56,59 +56,65 @@ class Model:
         """Distance from the sensors to the shallowest sources."""
         return self.record.height_m - float(self.bounds.high_m[2])
 
-    def background(self, sources: Sources, group: IntArray) -> Background:
-        """Where some sources are, for groups of rows."""
+    def background(self, sources: Sources, group: IntArray) -> SurveyBackground:
+        """Return the background at some sources, for groups of rows."""
         return next(self.backgrounds(sources, [group]))
 
-    def backgrounds(self, sources: Sources, groups: Iterable[IntArray]) -> Iterator[Background]:
-        """Where some sources are, for several ways to group the rows."""
+    def backgrounds(self, sources: Sources, groups: Iterable[IntArray]) -> Iterator[SurveyBackground]:
+        """Return the backgrounds at some sources, for several ways to group the rows."""
         what = self.layer, self.errors, self.drift
-        return Background.of_each(self.record, sources, *what, groups, self.body_length_m, self.beside)
+        return SurveyBackground.of_each(self.record, sources, *what, groups, self.body_length_m, self.beside)
 
-    def refitted(self, sources: Sources, group: IntArray) -> tuple[JointFit, Background]:
-        """The same sources where they fit best, within their reach."""
+    def refit(self, sources: Sources, group: IntArray) -> tuple[JointFit, SurveyBackground]:
+        """Refit sources within their reach."""
         background = self.background(sources, group)
         fit = fit_jointly(self.record, background, sources, self._around(sources), settled=_SETTLED_COARSELY)
-        return self.relinearised(fit, background, group, _FEW_STEPS)
+        return self.relinearise(fit, background, group, _FEW_STEPS)
 
     def misfit(self, sources: Sources, group: IntArray) -> float:
-        """Minus twice the log-likelihood of some sources, but for a constant; the ground is Gaussian."""
+        """Return minus twice the log-likelihood of sources, up to a constant.
+
+        The ground is Gaussian.
+        """
         background = self.background(sources, group)
         return JointFit(self.record, background, self.bounds, sources).cost + background.noise_log_determinant
 
-    def _around(self, sources: Sources) -> Bounds:
-        """Bounds within which sources stay what they are: one that leaps takes the place of one not found yet."""
+    def _around(self, sources: Sources) -> SourceBounds:
+        """Return bounds around sources that keep their identity.
+
+        A source that leaps would replace one that is not found yet.
+        """
         return self.bounds.around(sources, _REACH * self._distances(sources))
 
     def _distances(self, sources: Sources) -> FloatArray:
-        """From the sensors down to sources (K,)."""
+        """Return the distances (K,) from the sensors down to sources."""
         return np.asarray(np.median(self.record.sensors_m[..., 2]) - sources.position_m[:, 2])
 
-    def fitted(self, sources: Sources, group: IntArray, settled: float) -> tuple[JointFit, Background]:
-        """Sources fitted and weighed anew until none is left out that is not significant or not within the bounds."""
+    def fit(self, sources: Sources, group: IntArray, settled: float) -> tuple[JointFit, SurveyBackground]:
+        """Fit sources and drop those that are not significant or out of bounds, until none is left."""
         for weighing in range(_MOST_WEIGHINGS):
             background = self.background(sources, group)
             fit = fit_jointly(self.record, background, sources, self._around(sources), settled=settled)
             if not len(sources):
                 break
             kept = fit.significance > self.threshold
-            if weighing:  # where a source starts its errors of the pose hide what keeps it from a rim
-                kept &= self.bounds.hold(fit.sources)
+            if weighing:  # at its start the pose errors of a source hide what keeps it off an edge
+                kept &= self.bounds.contains(fit.sources)
             sources = fit.sources.some(kept).without_twins(_TWINS * self._distances(fit.sources.some(kept)))
             if len(sources) == len(kept) and weighing:
                 break
         if len(sources) < len(fit.sources):
             background = self.background(sources, group)
             fit = fit_jointly(self.record, background, sources, self.bounds, settled=settled)
-        return self.relinearised(fit, background, group) if settled < _SETTLED_COARSELY else (fit, background)
+        return self.relinearise(fit, background, group) if settled < _SETTLED_COARSELY else (fit, background)
 
-    def relinearised(
-        self, fit: JointFit, background: Background, group: IntArray, most: int = _MOST_STEPS
-    ) -> tuple[JointFit, Background]:
-        """Return the fit where sources and errors of the pose are linear about the same place, step by step.
+    def relinearise(
+        self, fit: JointFit, background: SurveyBackground, group: IntArray, most: int = _MOST_STEPS
+    ) -> tuple[JointFit, SurveyBackground]:
+        """Return the fit with sources and pose errors linear about the same place.
 
-        A fit holds the weights of where it begins. An error that all places share is then told from a shift of all
-        sources by the curvature of their fields alone, which is noise.
+        A fit keeps the weights of its start. Then only the curvature of the fields, which is noise, would separate an
+        error that all places share from a shift of all sources.
         """
         for _ in range(most if len(fit.sources) else 0):
             before, background = fit.sources, self.background(fit.sources, group)
@@ -120,7 +126,10 @@ class Model:
         return fit, background
 
     def candidates(self, sources: Sources, grid: SearchGrid, groups: Groups) -> list[Candidates]:
-        """What one more source would explain in each tile; the deeper, the longer the averages of rows that show it."""
+        """Return candidates for one more source in each tile.
+
+        Deeper tiles average over longer groups of rows.
+        """
         of_levels = self.backgrounds(sources, (groups(WHILE_SEARCHING * distance) for distance in grid.levels))
         return [
             candidates
@@ -130,8 +139,8 @@ class Model:
 
 
 @dataclass
-class Searched:
-    """The places of a grid, and where the sources were when each of its tiles was searched last.
+class SearchState:
+    """Candidates of a grid, and the sources at the last search of each tile.
 
     Attributes
     ----------
@@ -139,14 +148,14 @@ class Searched:
     groups : Groups
     grid : SearchGrid
     candidates : list of Candidates
-        Of every tile.
+        Candidates of every tile.
     predicted : list of ndarray
-        What sources made the channels (n, C) read, once a search.
+        Predictions of the channels (n, C), one per search.
     of : ndarray of int
-        Which of them each tile was searched with.
+        Index of the prediction at the last search of each tile.
     """
 
-    model: Model
+    model: SurveyModel
     groups: Groups
     grid: SearchGrid
     candidates: list[Candidates]
@@ -154,30 +163,41 @@ class Searched:
     of: IntArray
 
     @classmethod
-    def nowhere(cls, model: Model, groups: Groups, grid: SearchGrid) -> Searched:
-        """No tile is searched yet."""
+    def empty(cls, model: SurveyModel, groups: Groups, grid: SearchGrid) -> SearchState:
+        """Return a state without searched tiles."""
         return cls(model, groups, grid, [], [], np.full(len(grid.tiles), -1))
 
-    def again(self, sources: Sources, background: Background) -> Candidates:
-        """All of them, those anew that look at rows where the sources have changed more than noise and ground hide."""
+    def update(self, sources: Sources, background: SurveyBackground) -> Candidates:
+        """Search again the tiles whose rows have changed, and return all candidates.
+
+        A change counts if it exceeds what noise and ground hide.
+        """
         record, white, Q = self.model.record, background.white, background.Q
-        now = record.predicted(sources.fields(record))
+        now = record.predict(sources.fields(record))
         due = self.of < 0
         for then in set(self.of[~due].tolist()):
             change = white((now - self.predicted[then])[..., None])[:, 0]
             change = np.abs(change - Q @ (Q.T @ change)).reshape(white.n_groups, -1).max(axis=1)
-            due |= (self.of == then) & self.grid.seeing(record.middles_m[white.starts[:-1]][change > _FELT])
+            due |= (self.of == then) & self.grid.tiles_near(record.middles_m[white.starts[:-1]][change > _FELT])
         found = iter(self.model.candidates(sources, self.grid.some(due), self.groups) if due.any() else [])
         self.candidates = [next(found) if new else old for new, old in zip_longest(due, self.candidates)]
         self.of[due] = len(self.predicted)
         self.predicted.append(now)
-        return Candidates.joined(self.candidates)
+        return Candidates.concatenate(self.candidates)
 
 
-def found_in(
-    model: Model, groups: Groups, grid: SearchGrid, known: Sources, most: int, own: Callable[[FloatArray], BoolArray]
+def find_sources(
+    model: SurveyModel,
+    groups: Groups,
+    grid: SearchGrid,
+    known: Sources,
+    most: int,
+    own: Callable[[FloatArray], BoolArray],
 ) -> Sources:
-    """Sources of a record after some rounds, new ones only where places (m, 3) are its own."""
+    """Find the sources of a record in some rounds.
+
+    New ones start only where places (m, 3) are the record's own.
+    """
     group = groups(WHILE_SEARCHING * model.nearest_m)
     stated = model.errors.uncertainty.position_m
     share = max(1.0, _POSE_WHILE_SEARCHING_M / stated) if stated else 1.0
@@ -186,13 +206,13 @@ def found_in(
     in_vain = 0
     tried: FloatArray = np.zeros((0, 3))
     least = math.inf
-    searched = Searched.nowhere(wide, groups, grid)
+    searched = SearchState.empty(wide, groups, grid)
     for number in range(most):
-        fit, background = wide.fitted(sources, group, _SETTLED_COARSELY)
+        fit, background = wide.fit(sources, group, _SETTLED_COARSELY)
         at_once = _MOST_AT_ONCE
         if fit.cost > _WORSE * least:
-            # Too many at a time led away: back, and one by one from there.
-            fit, background = wide.fitted(best, group, _SETTLED_COARSELY)
+            # Too many at once made the fit worse: return to the best one and add one at a time.
+            fit, background = wide.fit(best, group, _SETTLED_COARSELY)
             at_once = 1
         elif fit.cost < min(_PROGRESS * least, least - model.threshold):
             tried, in_vain = np.zeros((0, 3)), 0
@@ -202,8 +222,8 @@ def found_in(
         best, least = fit.sources, min(least, fit.cost)
         if number == most - 1:
             break
-        candidates = searched.again(fit.sources, background)
-        # What was left out again is not tried twice, unless something else was found meanwhile.
+        candidates = searched.update(fit.sources, background)
+        # A dropped source is not tried again until another one is found.
         tried_before = (np.linalg.norm(candidates.place_m[:, None] - tried, axis=-1) < _SAME_PLACE_M).any(axis=1)
         strongest = peaks(candidates.without(tried_before), model.threshold)
         chosen = sources_at(candidates, strongest[own(candidates.place_m[strongest])][:at_once])

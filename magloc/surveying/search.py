@@ -1,4 +1,4 @@
-"""Matched filter over a grid of places: where one more source would explain most of what the sources so far leave."""
+"""Matched filter over a grid: places where one more source explains most of the residuals."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ import numpy as np
 
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc import core
-from magloc.surveying.fit.joint_fit import Background, Sources, residual_of, with_free_sources
+from magloc.surveying.fit.joint_fit import Sources, SurveyBackground, residual_of, with_free_sources
 from magloc.surveying.fit.record import SurveyRecord
-from magloc.surveying.fit.whitening import Whitening
+from magloc.surveying.fit.whitening import RecordWhitening
 
 N_DISTANCES = 5
 PITCH = 1.8
 """Distance of a source from the sensors over the pitch of the grid: 91 % of its energy is found in the median."""
 WINDOW = 4.0
-"""Of rows that count, in distances from the sensors."""
+"""Size of the window of rows, in distances from the sensors."""
 _CHUNK = 6  # places along each side of a tile
 _LEAST_SEEN, _TINY = 1e-3, 1e-30
-# Peaks start sources if they have a share of the strongest one's χ²; within some distances of a stronger one a larger
-# share, as they may be its skirts; and none within fewer, where they are the same.
+# A peak starts a source if it has a share of the strongest one's χ². Near a stronger peak, whose skirt it may be, the
+# share is larger; very near they are the same peak.
 _LEAST_SHARE = 0.05
 _SKIRT, _SKIRT_SHARE = 6.0, 0.6
 _SAME = 1.5
@@ -31,7 +31,7 @@ _SAME = 1.5
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """Places (m, 3) of a grid, their distances from the sensors, χ² that a source there explains, and its moment."""
+    """Grid places (m, 3), distances from the sensors, explained χ² and moments."""
 
     place_m: FloatArray
     distance_m: FloatArray
@@ -39,38 +39,38 @@ class Candidates:
     moment_Am2: FloatArray
 
     @classmethod
-    def joined(cls, parts: Iterable[Candidates]) -> Candidates:
-        """Those of several tiles of grids."""
+    def concatenate(cls, parts: Iterable[Candidates]) -> Candidates:
+        """Return the candidates of several tiles together."""
         return cls(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
 
     def without(self, which: BoolArray) -> Candidates:
-        """The same with some places explaining nothing."""
+        """Return candidates with χ² of zero at some places."""
         return replace(self, chi2=np.where(which, 0.0, self.chi2))
 
 
 @dataclass(frozen=True, eq=False)
 class SearchGrid:
-    """Places under the sensors, in tiles of one distance."""
+    """Places under the sensors, in tiles of one distance each."""
 
     tiles: list[tuple[float, FloatArray]]
 
     @property
     def levels(self) -> dict[float, SearchGrid]:
-        """The grid of every distance alone."""
+        """Grids of each distance alone."""
         distances = dict.fromkeys(distance for distance, _ in self.tiles)
         return {at: SearchGrid([tile for tile in self.tiles if tile[0] == at]) for at in distances}
 
     def some(self, which: BoolArray) -> SearchGrid:
-        """Some of its tiles."""
+        """Return the grid of some tiles."""
         return SearchGrid([tile for tile, kept in zip(self.tiles, which, strict=True) if kept])
 
-    def seeing(self, places_m: FloatArray) -> BoolArray:
-        """Which tiles look at rows at some places (n, 3)."""
+    def tiles_near(self, places_m: FloatArray) -> BoolArray:
+        """Return which tiles use rows at some places (n, 3)."""
         return np.array([near(places_m, places, WINDOW * distance).any() for distance, places in self.tiles], np.bool_)
 
     @classmethod
     def below(cls, record: SurveyRecord, low_m: FloatArray, high_m: FloatArray) -> SearchGrid:
-        """Of a box, at distances from the lowest sensors in geometric steps."""
+        """Return the grid of a box, with distances from the lowest sensors in geometric steps."""
         height = record.height_m
         nearest, farthest = max(height - high_m[2], 0.3), height - low_m[2]
         distances = np.geomspace(nearest * 1.1, max(farthest, nearest * 1.2), N_DISTANCES)
@@ -78,7 +78,7 @@ class SearchGrid:
 
     @classmethod
     def of(cls, low_m: FloatArray, high_m: FloatArray, height_m: float, distances_m: Sequence[float]) -> SearchGrid:
-        """Of a rectangle, or of a line along an axis, at some distances below a height."""
+        """Return the grid of a rectangle, or a line along an axis, at distances below a height."""
         tiles = []
         for distance in distances_m:
             pitch = distance / PITCH
@@ -91,29 +91,32 @@ class SearchGrid:
         return cls(tiles)
 
 
-def search(record: SurveyRecord, background: Background, sources: Sources, grid: SearchGrid) -> list[Candidates]:
-    """χ² of one more source at every place of each tile of a grid, with the sources so far free to move."""
+def search(record: SurveyRecord, background: SurveyBackground, sources: Sources, grid: SearchGrid) -> list[Candidates]:
+    """Return χ² and moment of one more source at every place of each tile.
+
+    The sources so far are free to move.
+    """
     white = background.white
     fields = sources.fields(record)
     directions = record.directions(fields)
     Q = with_free_sources(record, background, sources)
     residual = residual_of(record, background, fields)
     left = residual - Q @ (Q.T @ residual)
-    Q = Q.astype(np.float32)  # of what is projected out rounding does not count
+    Q = Q.astype(np.float32)  # rounding does not matter for what is projected out
 
-    def explained(tile: tuple[float, FloatArray]) -> Candidates:
+    def explain(tile: tuple[float, FloatArray]) -> Candidates:
         distance, places = tile
         used = groups_near(record, white, places, WINDOW * distance)
         moment, chi2 = likeliest_moments(*normal_equations(record, white, directions, places, used, Q, left))
         return Candidates(places, np.full(len(places), distance), chi2, moment)
 
     with ThreadPoolExecutor(core.threads()) as pool:
-        return list(pool.map(explained, grid.tiles))
+        return list(pool.map(explain, grid.tiles))
 
 
 def likeliest_moments(alone: FloatArray, projected: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Moments (m, 3) of normal equations, and the χ² (m,) that they explain."""
-    # Of a source that others nearly imitate rounding and the window's edge are left, which must not count.
+    """Return moments (m, 3) from normal equations, and the χ² (m,) that they explain."""
+    # If others nearly imitate a source, only rounding and the window's edge remain; they must not count.
     least = np.maximum(_LEAST_SEEN * np.trace(alone, axis1=1, axis2=2), _TINY)[:, None, None] * np.eye(3)
     moment = np.linalg.solve(projected + least, v[..., None])[..., 0]
     return moment, np.sum(v * moment, axis=1)
@@ -121,16 +124,19 @@ def likeliest_moments(alone: FloatArray, projected: FloatArray, v: FloatArray) -
 
 def normal_equations(
     record: SurveyRecord,
-    white: Whitening,
+    white: RecordWhitening,
     directions: FloatArray,
     places: FloatArray,
     used: IntArray,
     Q: FloatArray,
     left: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Of the moments at places (m, 3), seen by some groups of rows: matrices (m, 3, 3) and right sides (m, 3).
+    """Return matrices (m, 3, 3), twice, and right sides (m, 3) for moments at places (m, 3).
 
-    The matrix of the moments alone, then that with everything else projected out by Q from what is ``left``.
+    Some groups of rows take part.
+
+    The first matrix is that of the moments alone, the second has everything else projected out by Q; ``left`` is the
+    residual.
     """
     A = white.of_moments(record, directions, places, used)
     of = white.entries(used)
@@ -140,7 +146,7 @@ def normal_equations(
 
 
 def peaks(found: Candidates, threshold: float) -> IntArray:
-    """Places to start sources from, strongest first: peaks that are no skirt of a stronger one."""
+    """Return places to start sources from, strongest first, without skirts of stronger peaks."""
     order = np.argsort(-found.chi2)
     kept: list[int] = []
     for i in order:
@@ -160,16 +166,16 @@ def _stands_beside(found: Candidates, i: int, stronger: int) -> bool:
 
 
 def near(rows_m: FloatArray, places: FloatArray, window_m: float) -> BoolArray:
-    """Which rows at (n, 3) are within some distance of places (m, 3), on the map."""
+    """Return which rows at (n, 3) are within a distance of places (m, 3) on the map."""
     low, high = places[:, :2].min(axis=0) - window_m, places[:, :2].max(axis=0) + window_m
     return np.asarray(np.all((rows_m[:, :2] >= low) & (rows_m[:, :2] <= high), axis=1))
 
 
-def groups_near(record: SurveyRecord, white: Whitening, places: FloatArray, window_m: float) -> IntArray:
-    """Groups of rows within some distance of places (m, 3), on the map."""
+def groups_near(record: SurveyRecord, white: RecordWhitening, places: FloatArray, window_m: float) -> IntArray:
+    """Return the groups of rows within a distance of places (m, 3) on the map."""
     return np.flatnonzero(near(record.middles_m[white.starts[:-1]], places, window_m))
 
 
 def sources_at(found: Candidates, which: IntArray) -> Sources:
-    """Sources that some places start with."""
+    """Return the sources of some candidates."""
     return Sources(found.place_m[which], found.moment_Am2[which])

@@ -1,4 +1,4 @@
-"""A survey: static sources from sensors that move, from all rows together."""
+"""Surveys: static sources located by moving sensors, from all rows together."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.measurement.plausibility import warn_of_doubts
 from magloc.measurement.rows import concatenate_readings
 from magloc.readings import Readings
-from magloc.surveying.piece import OF_ROWS, Ground, sources_in, strongest_in, targets_in
+from magloc.surveying.piece import ROW_ENTRIES, Ground, measure_targets, significant_sources, strongest_sources
 from magloc.surveying.preparation import whole_rows, with_places_between_fixes
 from magloc.surveying.results import Reach, Survey, SurveyRows, Target
-from magloc.surveying.targets import OF_TARGETS
+from magloc.surveying.targets import TARGET_ENTRIES
 from magloc.surveying.tiled import TiledSurvey
-from magloc.surveying.tiles import owned
+from magloc.surveying.tiles import assign_sources
 
 _LOG = logging.getLogger(__name__)
-_TRIALS = 1.25  # independent ones of a map, over its area in distances to the shallowest sources: 1.0 to 1.4
+_TRIALS = 1.25  # independent trials of a map, over its area in squared distances to the shallowest sources: 1.0 to 1.4
 _HECTARE_M2 = 1e4
 _MOST_SWEEPS = 5
 _MISFIT = 2.0
@@ -54,42 +54,42 @@ def survey(
 ) -> Survey:
     r"""Find all dipoles at rest in the ground that sensors moved over.
 
-    Every row is used at once, and an unknown number of sources: a matched filter over places below the sensors with
-    everything else projected out, greedy rounds with joint fits, and a significance test. Projected out are slow
+    The number of sources is unknown, and all rows are used together: a matched filter over places below the sensors
+    with everything else projected out, greedy rounds with joint fits, and a significance test. Projected out are slow
     changes of the ambient field and of the sensors' offsets (a Kalman filter along time, with the errors of the pose as
-    states), and the geology, as an equivalent layer of poles at the depth λ/2.5. Moving sensors do not need to be many:
-    one, of either kind, is enough.
+    states), and the geology, as an equivalent layer of poles at the depth λ/2.5. One moving sensor, of either kind, is
+    enough.
 
-    A large survey is cut into tiles with margins, which are surveys of their own. What is found in one is taken from
-    the readings of others that it reaches, and these are searched again, until nothing changes.
+    A large survey is cut into tiles with margins, which are surveys of their own. The field of sources in one tile is
+    subtracted from the readings of others that it reaches, and these are searched again, until nothing changes.
 
     Parameters
     ----------
     array : SensorArray
-        Its noise counts, and what it states of its pose (:class:`arrays.PoseUncertainty`); if it states nothing, how
-        large the errors of the pose are and how long they last is estimated from the targets' own fields.
+        States the noise and the uncertainty of the pose (:class:`arrays.PoseUncertainty`). Without the latter, size and
+        correlation time of the pose errors are estimated from the targets' own fields.
     readings : Readings or sequence of them
         In order of time, with the pose of the array, and for scalar sensors with the ambient field.
     base : Readings, optional
-        The modulus of the field at a base station, one channel, at the same clock and for as long: the ambient field
-        varies as it does. Without it slow variations are estimated from the survey itself.
+        Modulus of the field at a base station: one channel, with the same clock, during the whole survey. The ambient
+        field varies like it. Without it slow variations are estimated from the survey itself.
     prior : SourcePrior
-        Where sources may be, in the world frame, and how strong; by default from 5 cm to 4 m below the ground, up to
-        1 m beside the sensors, and up to 300 A·m².
+        Limits of positions in the world frame and of moments; by default from 5 cm to 4 m below the ground, up to 1 m
+        beside the sensors, and up to 300 A·m².
     ground_m : float
         Height of the ground in the world frame [m].
     shortest_geology_m : float
-        Shortest wavelength in the field of the ground itself [m]: smaller ones are taken for targets.
+        Shortest wavelength in the field of the ground itself [m]; shorter ones count as targets.
     false_per_hectare : float
-        False targets that noise alone may make in a hectare, on average: decides how significant one must be.
+        Mean number of false targets per hectare by noise alone; it sets the threshold of significance.
     body_length_m : float
-        Longest edge of what may be buried [m]: what a dipole leaves out of its field counts as noise. 0 of points.
+        Longest edge of buried bodies [m]; the deviation of their field from a dipole counts as noise. 0 for points.
     processes : int, optional
-        That work on tiles beside each other; by default as many as compiled code has threads.
+        Number of processes for tiles; by default the number of threads of compiled code.
     scheduler : str, optional
-        Address of a dask scheduler, ``tcp://HOST:PORT``, whose workers do it instead.
+        Address of a dask scheduler, ``tcp://HOST:PORT``, whose workers process the tiles instead.
     unfinished : str or path-like, optional
-        Folder that keeps what is done of tiles until all are: after an interruption the same call goes on.
+        Folder for finished tiles; after an interruption the same call continues from it.
     progress : callable, optional
         Called with a sentence after every tile.
 
@@ -142,30 +142,30 @@ def survey(
     at_once = min(core.threads() if processes is None else processes, len(every))
     with workers(at_once, scheduler, folder) as each:
 
-        def settled(tiled: TiledSurvey, work: Work) -> tuple[TiledSurvey, Sequence[int]]:
-            """After searches of all tiles, and again of those that differ from what others tell them."""
+        def settle(tiled: TiledSurvey, work: Work) -> tuple[TiledSurvey, Sequence[int]]:
+            """Search all tiles, then again those whose neighbours report changes."""
             due: Sequence[int] = every
             for _ in range(_MOST_SWEEPS):
-                tiled = tiled.searched(work, due, each, tell)
-                due = tiled.changed()
+                tiled = tiled.search(work, due, each, tell)
+                due = tiled.changes()
                 if not due:
                     break
             return tiled, due
 
-        # What is strong beside a tile is in the way of all else, until it is told.
-        tiled, lag = settled(tiled, strongest_in)[0].on_time(assumed)
+        # Strong sources beside a tile hide all others until they are known.
+        tiled, lag = settle(tiled, strongest_sources)[0].correct_lag(assumed)
         if lag.s:
             _LOG.warning(
                 f"the readings are {lag.s:.3f} ± {lag.sigma_s:.3f} s later than their poses, as the targets show: taken"
                 " into account"
             )
-            tiled, _ = settled(tiled, strongest_in)
-        tiled, due = settled(tiled, sources_in)
+            tiled, _ = settle(tiled, strongest_sources)
+        tiled, due = settle(tiled, significant_sources)
         if due:
             _LOG.warning(f"{len(due)} of {len(every)} tiles do not agree with others on what lies beside them")
         if assumed:
             tiled = tiled.with_likeliest_pose()
-        results = tiled.measured(targets_in, each, tell)
+        results = tiled.map_tiles(measure_targets, each, tell)
     if folder is not None:
         shutil.rmtree(folder, ignore_errors=True)
     chi2_per_dof = float(sum(result["chi2"] for result in results) / sum(result["size"] for result in results))
@@ -189,12 +189,12 @@ def survey(
 
 
 def _targets(tiled: TiledSurvey, results: Sequence[Arrays]) -> tuple[Target, ...]:
-    """Targets of all tiles, the most significant one first."""
-    kept = owned(tiled.tiles, [result["position_m"] for result in results], tiled.same_m)
+    """Return the targets of all tiles, the most significant one first."""
+    kept = assign_sources(tiled.tiles, [result["position_m"] for result in results], tiled.same_m)
     kept.sort(key=lambda where: -results[where[0]]["significance"][where[1]])
     targets = []
     for number, (t, k) in enumerate(kept, start=1):
-        position, moment, covariance, interval, significance, flags = (results[t][name][k] for name in OF_TARGETS)
+        position, moment, covariance, interval, significance, flags = (results[t][name][k] for name in TARGET_ENTRIES)
         depth = tiled.ground.ground_m - float(position[2])
         chi2, words = float(significance), tuple(str(flags).split())
         interval95 = (float(interval[0]), float(interval[1]))
@@ -203,8 +203,8 @@ def _targets(tiled: TiledSurvey, results: Sequence[Arrays]) -> tuple[Target, ...
 
 
 def _rows(tiled: TiledSurvey, results: Sequence[Arrays]) -> SurveyRows:
-    """Rows of all tiles in order of time."""
+    """Return the rows of all tiles in order of time."""
     which = np.concatenate([tile.rows[tile.own] for tile in tiled.tiles])
     order = np.argsort(which)
-    place, anomaly, residual = (np.concatenate([result[name] for result in results])[order] for name in OF_ROWS)
+    place, anomaly, residual = (np.concatenate([result[name] for result in results])[order] for name in ROW_ENTRIES)
     return SurveyRows(tiled.readings.time_s[which[order]], place, anomaly, residual)

@@ -1,4 +1,4 @@
-"""What a fitted source needs to be a target: covariance, interval of the depth, flags."""
+"""Properties of targets from fitted sources: covariance, interval of the depth, flags."""
 
 from __future__ import annotations
 
@@ -11,42 +11,45 @@ from scipy.special import chdtri
 
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.fields.multipole import multipole_field_matrix
-from magloc.surveying.fit.joint_fit import Background, JointFit, jacobian_of, residual_of, with_free_sources
-from magloc.surveying.rounds import WHILE_SEARCHING, Groups, Model
+from magloc.surveying.fit.joint_fit import JointFit, SurveyBackground, jacobian_of, residual_of, with_free_sources
+from magloc.surveying.rounds import WHILE_SEARCHING, Groups, SurveyModel
 from magloc.surveying.search import WINDOW, groups_near, likeliest_moments, normal_equations
 
-OF_TARGETS = ("position_m", "moment_Am2", "covariance", "depth_interval95_m", "significance", "flags")
+TARGET_ENTRIES = ("position_m", "moment_Am2", "covariance", "depth_interval95_m", "significance", "flags")
 _WEAK = 200.0
 _NEAR = 1.5
 _MISFIT = 1.5  # χ² per reading
 _LASTING = 3.72  # standard deviations, one-sided
 _N_DEPTHS = 16
 _SPAN = 3.0  # over and under the depth, as a factor
-_N_SECOND = 9  # degrees of freedom
+_N_SECOND = 9  # degrees of freedom of a second source
 _FALSE_MERGED = 0.01  # of single sources
-_WITHIN, _N_BESIDE, _DEEPER, _N_BELOW = 1.0, 7, 1.6, 5  # of the distance: where a second source may be
+_WITHIN, _N_BESIDE, _DEEPER, _N_BELOW = 1.0, 7, 1.6, 5  # places of a second source, over the distance
 _SIGMAS, _STEPS = 3.0, 9  # places on the map, in standard deviations of the position
 
 
 class Profile(NamedTuple):
-    """Of χ² over the places of a source: 95 % interval of its depth, and scatter (2, 2) on the map about the fit."""
+    """95 % interval of the depth, and scatter (2, 2) on the map, from a profile of χ²."""
 
     depth_interval95_m: tuple[float, float]
     scatter_m2: FloatArray
 
 
-def profile_of(model: Model, fit: JointFit, background: Background, which: int, ground_m: float) -> Profile:
-    """Of a weak source, whose place and moment are free, the others linear: places weigh as their likelihood."""
+def profile_of(model: SurveyModel, fit: JointFit, background: SurveyBackground, which: int, ground_m: float) -> Profile:
+    """Return the profile of a weak source over its place and moment.
+
+    The others are linear; places weigh by their likelihood.
+    """
     record, white = model.record, background.white
     source = fit.sources.some(np.array([which]))
     others = fit.sources.some(np.delete(np.arange(len(fit.sources)), which))
     position = source.position_m[0]
-    # Twice as far as a search looks: what the ground imitates is told from a target by its farthest tail.
+    # Twice the range of a search, because the far tail distinguishes a target from the ground.
     reach = 2.0 * WINDOW * (record.height_m - position[2])
     used = groups_near(record, white, source.position_m, reach)
     near = np.linalg.norm(others.position_m[:, :2] - position[:2], axis=1) < reach
     Q = with_free_sources(record, background, others.some(near))
-    # What the source explains itself is put back, to first order: it is weak.
+    # The source is weak, so its own part is added back to first order.
     own_field, fields = source.fields(record), fit.sources.fields(record)
     own = jacobian_of(record, background, source, own_field)[:, 3:] @ source.moment_Am2[0]
     left = residual_of(record, background, fields) + own
@@ -72,24 +75,31 @@ def profile_of(model: Model, fit: JointFit, background: Background, which: int, 
         math.exp(np.interp(level, explained[[beyond, last]], np.log(depths[[beyond, last]])))
         for beyond, last in ((max(inside[0] - 1, 0), inside[0]), (min(inside[-1] + 1, _N_DEPTHS - 1), inside[-1]))
     )
-    # The profile is linear in all other sources, so that its peak may be beside the fit, which counts, too.
+    # The profile is linear in the other sources, so its peak may differ from the fit; include both.
     return Profile((min(low, depth), max(high, depth)), scatter)
 
 
-def _scattered(covariance: FloatArray, scatter_m2: FloatArray) -> FloatArray:
-    """Covariance (6, 6) of a source whose place on the map scatters otherwise; all else follows it as before."""
+def _with_scatter(covariance: FloatArray, scatter_m2: FloatArray) -> FloatArray:
+    """Return the covariance (6, 6) of a source with another scatter on the map."""
     on_map = covariance[:2, :2]
     follows = np.linalg.solve(on_map, covariance[:2]).T
     return np.asarray(covariance + follows @ (scatter_m2 - on_map) @ follows.T)
 
 
 def second_source_chi2(
-    model: Model, background: Background, directions: FloatArray, Q: FloatArray, left: FloatArray, position: FloatArray
+    model: SurveyModel,
+    background: SurveyBackground,
+    directions: FloatArray,
+    Q: FloatArray,
+    left: FloatArray,
+    position: FloatArray,
 ) -> float:
-    """χ² that the quadrupole and the octupole of sources around a position would explain of what is left, a score test.
+    """Return χ² of a score test for a second source near a position.
 
-    Two dipoles near each other are one at their middle with these, to third order of the gap. Q projects everything
-    else out, the source's own place too, so that 9 degrees of freedom are left of their 12.
+    It is what quadrupole and octupole at the position would explain of the residuals.
+
+    Two dipoles near each other equal one dipole, quadrupole and octupole at their middle, to third order of the gap. Q
+    projects out everything else, including the source's position, so that 9 of 12 degrees of freedom remain.
     """
     record, white = model.record, background.white
     near = groups_near(record, white, position[None], WINDOW * (record.height_m - position[2]))
@@ -101,17 +111,17 @@ def second_source_chi2(
     A = white.of_some(seen, near)
     A = A / np.linalg.norm(A, axis=0)
     lost = Q[of].T @ A
-    # 1 - QQᵀ is a weight, no projector: it stands once in the information, and ``left`` has it already.
+    # 1 - QQᵀ is a weight, not a projector: apply it once; ``left`` already includes it.
     size, axes = np.linalg.eigh(A.T @ A - lost.T @ lost)
     return float(np.sum((axes.T @ (A.T @ left[of]))[-_N_SECOND:] ** 2 / size[-_N_SECOND:]))
 
 
-def moved_by_second(
-    model: Model, fit: JointFit, background: Background, Q: FloatArray, left: FloatArray, which: int
+def shift_by_second(
+    model: SurveyModel, fit: JointFit, background: SurveyBackground, Q: FloatArray, left: FloatArray, which: int
 ) -> FloatArray:
-    """How position and moment (6,) of a source would change by a second one, where such a one explains most.
+    """Return how position and moment (6,) would change by the likeliest second source.
 
-    To first order; Q projects all sources out, and ``left`` is what they leave.
+    The result is of first order. Q projects out all sources; ``left`` is the residual.
     """
     record, white = model.record, background.white
     fields = fit.sources.fields(record)
@@ -135,9 +145,9 @@ def moved_by_second(
 
 
 def targets_of(
-    model: Model, fit: JointFit, background: Background, groups: Groups, ground_m: float, which: BoolArray
+    model: SurveyModel, fit: JointFit, background: SurveyBackground, groups: Groups, ground_m: float, which: BoolArray
 ) -> dict[str, NDArray[Any]]:
-    """Of some sources (K,) of a fit: the parts of targets, an entry for each."""
+    """Return the entries of targets for some sources (K,) of a fit."""
     sources, K = fit.sources, len(fit.sources)
     covariance = fit.covariance.reshape(K, 6, K, 6)[np.arange(K), :, np.arange(K)]
     significance = fit.significance
@@ -147,7 +157,7 @@ def targets_of(
     for j in np.flatnonzero(weak & which):
         coarse = model.background(sources, groups(WHILE_SEARCHING * (model.record.height_m - sources.position_m[j, 2])))
         interval[j], scatter = profile_of(model, fit, coarse, int(j), ground_m)
-        covariance[j] = _scattered(covariance[j], scatter)
+        covariance[j] = _with_scatter(covariance[j], scatter)
     apart = np.linalg.norm(sources.position_m[:, None] - sources.position_m, axis=-1) + np.diag(np.full(K, np.inf))
     rim = np.minimum(sources.position_m - model.bounds.low_m, model.bounds.high_m - sources.position_m)
     left = (fit.residual - background.Q @ (background.Q.T @ fit.residual)).reshape(background.white.n_groups, -1)
@@ -162,8 +172,8 @@ def targets_of(
     above = np.linalg.norm(sources.position_m[:, None, :2] - middles[:, :2], axis=-1) < reach
     merged = second > chdtri(_N_SECOND, _FALSE_MERGED)
     for j in np.flatnonzero(merged):
-        moved = moved_by_second(model, fit, background, Q, free, int(j))
-        # Where the second one is is hardly known, and so where it would move the first.
+        moved = shift_by_second(model, fit, background, Q, free, int(j))
+        # The direction of the shift is hardly known, because the place of the second source is not.
         square = np.repeat(np.sum(moved.reshape(2, 3) ** 2, axis=1), 3)
         covariance[j] += np.diag(square)
         low, high = interval[j] - depth[j]
@@ -178,14 +188,16 @@ def targets_of(
     }
     words = np.array([" ".join(name for name, set_ in flags.items() if set_[j]) for j in range(K)], np.str_)
     parts = (sources.position_m, sources.moment_Am2, covariance, interval, significance, words)
-    return {name: part[which] for name, part in zip(OF_TARGETS, parts, strict=True)}
+    return {name: part[which] for name, part in zip(TARGET_ENTRIES, parts, strict=True)}
 
 
 def is_misfit(left: FloatArray, at: IntArray) -> bool:
-    """Whether groups `at` of what is left (g, k) fit worse than one of 10,000 right models, and by more than a half.
+    """Return whether residuals of groups fit much worse than noise, or are correlated in time.
 
-    Or whether what is left of successive groups goes together, more than one of 10,000 right models has it, as where a
-    target moves to and fro: the sum of the products over its standard deviation, which the products tell themselves.
+    The first: groups `at` of the residuals (g, k) fit worse than one of 10,000 right models, and χ² is 50 % too large.
+
+    The second: residuals of successive groups are correlated, as if a target moves to and fro, more than in one of
+    10,000 right models. The test is the sum of their products over its standard deviation, estimated from them.
     """
     near, after = left[at], np.diff(at) == 1
     products = near[1:][after] * near[:-1][after]

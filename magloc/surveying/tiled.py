@@ -1,4 +1,4 @@
-"""A survey as tiles that exchange what they find."""
+"""Surveys in tiles that exchange the sources they find."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ from magloc.fields.points import field_at_points
 from magloc.grids.work import Arrays, Each, Work
 from magloc.localization.fit.prior import SourcePrior
 from magloc.readings import Readings
-from magloc.surveying.clock import Lag, SmoothTrack, Trial, lag_of, trial
+from magloc.surveying.clock import ClockLag, SmoothTrack, Trial, estimate_lag, fit_at_lag
 from magloc.surveying.fit.joint_fit import Sources
 from magloc.surveying.piece import HIGHEST_M, Ground, Piece, high_above
 from magloc.surveying.pose_components import with_likeliest_pose
 from magloc.surveying.preparation import FEWEST_ROWS, record_of
 from magloc.surveying.rounds import AT_LAST
-from magloc.surveying.tiles import Tile, owned, tiles_of
+from magloc.surveying.tiles import Tile, assign_sources, tiles_of
 
 _LOG = logging.getLogger(__name__)
-_SAMPLE = 20_000  # rows that tell what is the same everywhere
+_SAMPLE = 20_000  # rows for properties that all tiles share
 _LEAST_GEOLOGY_T, _MOST_GEOLOGY_T = 1e-10, 5e-9
-_SAME = 0.5  # over the distance to the nearest sources: what two tiles find at a seam is one source
+_SAME = 0.5  # over the distance to the nearest sources: two finds at a seam within it are one source
 _FELT, _CHANGED = 0.1, 1.0  # of the noise
 _MOVED_M = 0.15
 _NARROW, _NEARLY_ALL = 0.2, 0.95  # of the distance to the nearest sources, and of the rows
 _BESIDE_M = 1.0
-_POSES = 2  # times that errors of the pose and the lag are estimated in turn
+_POSES = 2  # alternating estimates of pose errors and lag
 Tell = Callable[[str], None]
 
 
 @dataclass(frozen=True, eq=False)
 class TiledSurvey:
-    """All rows, in tiles, and the sources that are known so far.
+    """All rows in tiles, and the sources that are known so far.
 
     Attributes
     ----------
@@ -49,11 +49,11 @@ class TiledSurvey:
         Width of the tiles' margins, and distance from the sensors to the shallowest sources.
     offset_T : ndarray, shape (C,)
     geology_T : float
-        Of the anomalies: their medians, and how large they are.
+        Median and typical size of the anomalies.
     sources : Sources
     found, known, outside : sequence of Sources
-        What every tile found last, its margin included, what it had been told of these, and what had been taken from
-        its readings.
+        Sources that every tile found last, including its margin; those that it started with; and those whose field was
+        subtracted from its readings.
     """
 
     array: SensorArray
@@ -71,7 +71,7 @@ class TiledSurvey:
 
     @classmethod
     def of(cls, array: SensorArray, readings: Readings, ground: Ground) -> TiledSurvey:
-        """Nothing is known yet."""
+        """Return a survey in tiles without any known source."""
         sample = record_of(array, readings[:: -(-len(readings) // _SAMPLE)])[0]
         bounds = ground.bounds(sample)
         offset = np.median(sample.values_T, axis=0)
@@ -83,7 +83,7 @@ class TiledSurvey:
         if alone:
             rows = sum(int(tile.own.sum()) for tile in alone)
             _LOG.warning(f"rows that are far from all others are left out: {rows}")
-        tiles = [t for t in tiles if len(t.rows) >= FEWEST_ROWS and _narrowed(ground.prior, t, margin_m) is not None]
+        tiles = [t for t in tiles if len(t.rows) >= FEWEST_ROWS and _narrow(ground.prior, t, margin_m) is not None]
         if not tiles:
             raise ValueError(f"Input readings must have {FEWEST_ROWS} rows near each other; instead received none.")
         nearest_m = sample.height_m - float(bounds.high_m[2])
@@ -111,21 +111,23 @@ class TiledSurvey:
 
     @property
     def same_m(self) -> float:
-        """Distance within which what two tiles find is one source."""
+        """Distance within which sources of two tiles count as one."""
         return _SAME * self.nearest_m
 
     def piece(self, number: int) -> Piece:
-        """A tile with the sources of all."""
+        """Return one tile with the sources of all."""
         tile = self.tiles[number]
-        prior = _narrowed(self.ground.prior, tile, self.margin_m)
+        prior = _narrow(self.ground.prior, tile, self.margin_m)
         assert prior is not None
         readings, ground = self.readings[tile.rows], replace(self.ground, prior=prior)
-        return Piece(self.array, readings, ground, tile, self.offset_T, self.geology_T, *self._told(tile))
+        return Piece(
+            self.array, readings, ground, tile, self.offset_T, self.geology_T, *self._neighbouring_sources(tile)
+        )
 
-    def _told(self, tile: Tile) -> tuple[Sources, Sources, Sources]:
-        """Sources of a tile, of its margin, and others whose field is felt there."""
+    def _neighbouring_sources(self, tile: Tile) -> tuple[Sources, Sources, Sources]:
+        """Return sources of a tile, of its margin, and others with a noticeable field there."""
         position, strength = self.sources.position_m, np.linalg.norm(self.sources.moment_Am2, axis=1)
-        own, near = tile.holds(position), tile.inside_m(position) > -self.margin_m - _BESIDE_M
+        own, near = tile.contains(position), tile.inside_m(position) > -self.margin_m - _BESIDE_M
         places = self._places(tile)
         apart = np.linalg.norm(position - np.clip(position, places.min(axis=0), places.max(axis=0)), axis=1)
         felt = 2e-7 * strength > _FELT * self.array.channel_noise_T.min() * apart**3
@@ -135,8 +137,8 @@ class TiledSurvey:
         assert self.readings.array_position_m is not None
         return self.readings.array_position_m[tile.rows]
 
-    def searched(self, work: Work, which: Sequence[int], each: Each, tell: Tell) -> TiledSurvey:
-        """After a search of some tiles, one colour after the other: each is told what those before it found."""
+    def search(self, work: Work, which: Sequence[int], each: Each, tell: Tell) -> TiledSurvey:
+        """Search some tiles, one colour after the other, with the sources found before."""
         tiled, done = self, 0
         for colour in sorted({self.tiles[number].colour for number in which}):
             some = [number for number in which if self.tiles[number].colour == colour]
@@ -144,32 +146,32 @@ class TiledSurvey:
             for index, result in each(work, map(tiled.piece, some)):
                 number = some[index]
                 found[number] = Sources(**result)
-                known[number], *others = tiled._told(self.tiles[number])
-                outside[number] = Sources.joined(others)
+                known[number], *others = tiled._neighbouring_sources(self.tiles[number])
+                outside[number] = Sources.concatenate(others)
                 done += 1
                 tell(f"{done} of {len(which)} tiles searched: {sum(map(len, found))} sources")
-            kept = owned(self.tiles, [sources.position_m for sources in found], self.same_m)
-            sources = Sources.joined([found[number].some(np.array([k])) for number, k in kept])
+            kept = assign_sources(self.tiles, [sources.position_m for sources in found], self.same_m)
+            sources = Sources.concatenate([found[number].some(np.array([k])) for number, k in kept])
             tiled = replace(tiled, sources=sources, found=found, known=known, outside=outside)
         return tiled
 
-    def changed(self) -> list[int]:
-        """Tiles for which others found something else than they had been told and found themselves."""
+    def changes(self) -> list[int]:
+        """Return the tiles whose surroundings changed since their last search."""
         return [number for number in range(len(self.tiles)) if self._is_changed(number)]
 
     def _is_changed(self, number: int) -> bool:
-        """Whether sources are felt among a tile's own rows that it did not have, or others that it had are none."""
+        """Return whether sources that are new or gone have a noticeable field at a tile's rows."""
         tile, found = self.tiles[number], self.found[number]
-        now, *others = self._told(tile)
-        beside, before = Sources.joined(others), self.outside[number]
-        # What two tiles find at a seam is the same, if hardly elsewhere; beside it they are told.
-        new = Sources.joined(
+        now, *others = self._neighbouring_sources(tile)
+        beside, before = Sources.concatenate(others), self.outside[number]
+        # Finds of two tiles at a seam are one source if they are near; outside, neighbours report sources.
+        new = Sources.concatenate(
             [
                 now.some(~_same(now, found.with_more(self.known[number]).with_more(before), self.same_m)),
                 beside.some(~_same(beside, before, _MOVED_M) & ~_same(beside, found, self.same_m)),
             ]
         )
-        gone = Sources.joined(
+        gone = Sources.concatenate(
             [
                 found.some(~_same(found, now.with_more(beside), self.same_m)),
                 before.some(~_same(before, beside, _MOVED_M) & ~_same(before, now, self.same_m)),
@@ -180,14 +182,14 @@ class TiledSurvey:
         return bool(np.linalg.norm(field, axis=1).max() > _CHANGED * self.array.channel_noise_T.min())
 
     def _richest(self) -> int:
-        """The tile with most sources, which tells most of what all tiles have in common."""
+        """Return the tile with most sources, which determines common parameters best."""
         return int(np.argmax([len(sources) for sources in self.found]))
 
-    def on_time(self, pose_assumed: bool) -> tuple[TiledSurvey, Lag]:
-        """Readings that belong to their poses, and by how much they did not, as a tile without its margin tells.
+    def correct_lag(self, pose_assumed: bool) -> tuple[TiledSurvey, ClockLag]:
+        """Return the survey without lag, and the lag, estimated from one tile without its margin.
 
-        Where there is a lag nothing else is known then. Errors of places that last a line are like one, so that those
-        that are assumed are those likeliest with it, and without.
+        If there is a lag, the sources are unknown again. Position errors that last a whole line resemble a lag, so that
+        assumed pose errors are estimated both with and without it.
         """
         number = self._richest()
         tile = self.tiles[number]
@@ -204,13 +206,13 @@ class TiledSurvey:
         track = SmoothTrack.of(self.readings)
 
         def piece_at(lag_s: float) -> Piece:
-            return replace(piece, readings=track.taken_earlier(lag_s, rows))
+            return replace(piece, readings=track.with_earlier_poses(lag_s, rows))
 
         def at_likeliest_pose(lag_s: float, start: Sources | None) -> tuple[Callable[[float], Piece], Trial]:
-            sources = trial(piece_at, lag_s, start).sources
+            sources = fit_at_lag(piece_at, lag_s, start).sources
             array = with_likeliest_pose(piece_at(lag_s).model(), sources).record.array
             posed = lambda lag_s: replace(piece_at(lag_s), array=array)  # noqa: E731
-            return posed, trial(posed, lag_s, sources)
+            return posed, fit_at_lag(posed, lag_s, sources)
 
         if pose_assumed and len(piece.known):
             posed, here = at_likeliest_pose(0.0, piece.known)
@@ -218,31 +220,31 @@ class TiledSurvey:
             assert pose is not None
             size_m = math.hypot(pose.position_m, pose.position_white_m)
             white = replace(self.array, pose=replace(pose, position_m=size_m, correlation_s=0.0, position_white_m=0.0))
-            lag = lag_of(lambda lag_s: replace(piece_at(lag_s), array=white))  # errors that do not look like one
+            lag = estimate_lag(lambda lag_s: replace(piece_at(lag_s), array=white))  # white errors resemble no lag
             for _ in range(_POSES if lag.s else 0):
                 posed, near = at_likeliest_pose(lag.s, None)
-                lag = lag_of(posed, here, near)
+                lag = estimate_lag(posed, here, near)
                 if not lag.s:
                     break
         else:
-            lag = lag_of(piece_at)
+            lag = estimate_lag(piece_at)
         if not lag.s:
             return self, lag
         nothing = [Sources.none()] * len(self.tiles)
         unknown = replace(self, sources=Sources.none(), found=nothing, known=nothing, outside=nothing)
-        return replace(unknown, readings=track.taken_earlier(lag.s)), lag
+        return replace(unknown, readings=track.with_earlier_poses(lag.s)), lag
 
     def with_likeliest_pose(self) -> TiledSurvey:
-        """With the errors of the pose that the sources of a tile tell."""
+        """Return the survey with the pose errors estimated from the sources of one tile."""
         piece = self.piece(self._richest())
         model = piece.model()
-        fit, _ = model.fitted(piece.known, piece.groups(model.record, AT_LAST * model.nearest_m), 1e-3)
+        fit, _ = model.fit(piece.known, piece.groups(model.record, AT_LAST * model.nearest_m), 1e-3)
         if not len(fit.sources):
             return self
         return replace(self, array=with_likeliest_pose(model, fit.sources).record.array)
 
-    def measured(self, work: Work, each: Each, tell: Tell) -> list[Arrays]:
-        """What some work makes of every tile."""
+    def map_tiles(self, work: Work, each: Each, tell: Tell) -> list[Arrays]:
+        """Return the results of some work on every tile."""
         results: list[Arrays] = [{}] * len(self.tiles)
         for done, (number, result) in enumerate(each(work, map(self.piece, range(len(self.tiles)))), start=1):
             results[number] = result
@@ -251,13 +253,13 @@ class TiledSurvey:
 
 
 def _same(sources: Sources, others: Sources, same_m: float) -> BoolArray:
-    """Which sources (K,) are among others, hardly elsewhere."""
+    """Return which sources (K,) are among others, within a distance."""
     apart = np.linalg.norm(sources.position_m[:, None] - others.position_m, axis=-1)
     return np.asarray(apart.min(axis=1, initial=np.inf) < same_m)
 
 
-def _narrowed(prior: SourcePrior, tile: Tile, margin_m: float) -> SourcePrior | None:
-    """Where sources of a tile and its margin may be; None if nowhere."""
+def _narrow(prior: SourcePrior, tile: Tile, margin_m: float) -> SourcePrior | None:
+    """Return the prior within a tile and its margin, None if it is empty."""
     margin = margin_m + _BESIDE_M
     low = np.maximum(prior.low_m, [*(tile.low_m - margin), -np.inf])
     high = np.minimum(prior.high_m, [*(tile.high_m + margin), np.inf])

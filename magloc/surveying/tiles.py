@@ -1,4 +1,4 @@
-"""A large survey in tiles: squares with a margin of rows around them, so that each is a survey of its own."""
+"""Tiles of a large survey: squares with a margin of rows, each a survey of its own."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from arrays.typing import BoolArray, FloatArray, IntArray
 
 _CORE, _MARGIN = 4.0, 1.2  # over the distance from the sensors to the deepest sources
-SEAM_M = 1.2  # more than a source may stand beside the rows
+SEAM_M = 1.2  # more than the margin of sources beside the rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,12 +20,12 @@ class Tile:
     Attributes
     ----------
     low_m, high_m : ndarray, shape (2,)
-        Without an end where there is no other tile.
+        Infinite where there is no other tile.
     rows : ndarray of int
     own : ndarray of bool
-        Which of them are in the rectangle, not in the margin.
+        Which rows are in the rectangle, not in the margin.
     colour : int
-        0 to 3; no two that touch have the same.
+        0 to 3; adjacent tiles differ.
     """
 
     low_m: FloatArray
@@ -35,22 +35,25 @@ class Tile:
     colour: int = 0
 
     def extent_m(self, places_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Ends of the rectangle, where it is open those of places (n, 2) in it."""
+        """Return the ends of the rectangle; on open sides those of places (n, 2) in it."""
         low = np.where(np.isfinite(self.low_m), self.low_m, places_m.min(axis=0))
         return low, np.where(np.isfinite(self.high_m), self.high_m, places_m.max(axis=0))
 
     def inside_m(self, position_m: FloatArray) -> FloatArray:
-        """How far within the rectangle positions (K, 3) are, negative beside it."""
+        """Return how far positions (K, 3) are inside the rectangle, negative outside."""
         xy = position_m[:, :2]
         return np.asarray(np.minimum(xy - self.low_m, self.high_m - xy).min(axis=1, initial=np.inf))
 
-    def holds(self, position_m: FloatArray) -> BoolArray:
-        """Which positions (K, 3) are within, or hardly beside it."""
+    def contains(self, position_m: FloatArray) -> BoolArray:
+        """Return which positions (K, 3) are inside, or on the seam."""
         return self.inside_m(position_m) > -SEAM_M
 
 
 def tiles_of(places_m: FloatArray, reach_m: float) -> tuple[list[Tile], float]:
-    """Tiles of rows at places (n, 2), and the width of their margins: sources are no farther from rows than a reach."""
+    """Return the tiles of rows at places (n, 2), and the width of their margins.
+
+    Sources are no farther from rows than the reach.
+    """
     margin = _MARGIN * reach_m
     low, high = places_m.min(axis=0), places_m.max(axis=0)
     number = np.maximum(1, np.round((high - low) / (_CORE * reach_m))).astype(np.intp)
@@ -73,15 +76,18 @@ def tiles_of(places_m: FloatArray, reach_m: float) -> tuple[list[Tile], float]:
     return tiles, margin
 
 
-def owned(tiles: Sequence[Tile], position_m: Sequence[FloatArray], same_m: float) -> list[tuple[int, int]]:
-    """Tile and index of every source that tiles found in (K, 3); one on a seam once, of the tile it lies deeper in."""
+def assign_sources(tiles: Sequence[Tile], position_m: Sequence[FloatArray], same_m: float) -> list[tuple[int, int]]:
+    """Return tile and index of every source that tiles found in (K, 3).
+
+    A source on a seam counts once, for the tile in which it lies deeper.
+    """
     found = []
     for t, (tile, places) in enumerate(zip(tiles, position_m, strict=True)):
         inside = tile.inside_m(places)
         found += [(float(inside[k]), t, int(k)) for k in np.flatnonzero(inside > -SEAM_M)]
     found.sort(key=lambda entry: (-entry[0], entry[1:]))
     kept: list[tuple[int, int]] = []
-    on_seam: list[set[int]] = []  # which tiles have them
+    on_seam: list[set[int]] = []  # tiles of each source on a seam
     places = np.empty((len(found), 3))
     for inside_m, t, k in found:
         if inside_m <= SEAM_M:

@@ -17,8 +17,7 @@ _TERMS_A_BLOCK = 100_000
 
 
 class WhiteningFilter:
-    """
-    A Kalman filter over measurements of unit noise, one after the other, and its gains.
+    """Kalman filter over measurements of unit noise, one after the other, and its gains.
 
     The last two states are a value and its slope.
 
@@ -56,7 +55,7 @@ class WhiteningFilter:
         core.run("survey_gains", self._filter, n, block=1 + _TERMS_A_BLOCK // (S * S * (k + 1)), chain=n)
 
     def whiten(self, columns: FloatArray, rows: IntArray) -> None:
-        """Replace columns (g, k, m) at some rows by innovations over their deviation; at the others they are zero."""
+        """Replace columns (g, k, m) at some rows by normalised innovations; others are zero."""
         work = core.problem(
             "survey_whitening",
             filter=self._filter,
@@ -69,8 +68,7 @@ class WhiteningFilter:
 
 
 class MeasuredRows(NamedTuple):
-    """
-    How groups of rows are measured: what a source adds to their measurements.
+    """Measurement model of groups of rows: what a source adds to them.
 
     Attributes
     ----------
@@ -82,7 +80,7 @@ class MeasuredRows(NamedTuple):
         From channels to measurements.
     channel_sensor : ndarray of int, shape (C,)
     first_row : ndarray of int, shape (g + 1,)
-        Of each group. A group's measurement is the sum over its rows, divided by the root of their number.
+        First row of each group. A group's measurement is the sum over its rows, divided by the root of their number.
     """
 
     sensors_m: FloatArray
@@ -92,15 +90,15 @@ class MeasuredRows(NamedTuple):
     first_row: IntArray
 
     def moment_columns(self, places_m: FloatArray, groups: IntArray) -> FloatArray:
-        """Return what unit moments at places (m, 3) add to some groups: (g, k, 3 m), by axis, then by place."""
+        """Return columns (g, k, 3 m) of unit moments at places (m, 3), by axis, then by place."""
         return self._columns("survey_moments", 3, places_m, groups)
 
     def source_columns(self, positions_m: FloatArray, moments_Am2: FloatArray) -> FloatArray:
-        """Return the derivatives of all groups by position and moment of sources (K, 3): (g, k, 6 K), by source."""
+        """Return derivatives (g, k, 6 K) by position and moment of sources (K, 3), by source."""
         return self._columns("survey_sources", 6, positions_m, None, np.ascontiguousarray(moments_Am2))
 
     def pole_columns(self, poles_m: FloatArray) -> FloatArray:
-        """Return what unit poles (P, 3), whose field is away/|away|³, add to all groups: (g, k, P)."""
+        """Return columns (g, k, P) of unit poles (P, 3), whose field is away/|away|³."""
         return self._columns("survey_poles", 1, poles_m, None)
 
     def _columns(

@@ -1,12 +1,12 @@
-r"""The rows of a survey as measurements of static sources in the world frame.
+r"""Rows of a survey as measurements of static sources in the world frame.
 
 A scalar sensor measures the anomaly of the modulus, without cancelling,
 
 .. math:: |b + B| - |b| = \frac{2 b·B + B^2}{|b + B| + |b|}
 
-Vector sensors are turned, row by row, so that their mean field lies along the ambient field b, and so is what is
-predicted of them: an attitude that is 0.5° off would move 50,000 nT by 440 nT. What is across b of their mean is zero
-then on both sides, and is projected out.
+Readings of vector sensors and their predictions are both rotated, row by row, so that their mean field lies along the
+ambient field b: an attitude error of 0.5° would change 50,000 nT by 440 nT. The mean field across b is then zero in
+both, and is projected out.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _SECOND_ORDER = 2.4e-6  # field times distance⁵ over moment and squared shift,
 
 @dataclass(frozen=True, eq=False)
 class SurveyRecord:
-    """Rows of sensors that move, in the world frame.
+    """Rows of moving sensors in the world frame.
 
     Attributes
     ----------
@@ -44,13 +44,13 @@ class SurveyRecord:
         Attitude as stated.
     ambient_T : ndarray, shape (n, 3)
     values_T : ndarray, shape (n, C)
-        Anomalies: calibrated, less what the ambient field alone gives.
+        Anomalies: calibrated readings minus those of the ambient field alone.
     pose_effects : ndarray, shape (n, 9, q)
-        Of errors of the pose, of unit variance, on turn, shift and lever arm.
+        Effects of pose errors of unit variance on turn, shift and lever arm.
     interpolated_m : ndarray, shape (n,), optional
-        Standard deviation of the shift where places were interpolated between fixes.
+        Standard deviation of the shift for places that are interpolated between fixes.
     beside_T, gradient_beside_T_m : ndarray, shapes (n, N, 3) and (n, N, 3, 3), or 0
-        Field and its gradient of sources that are known: what is fitted adds to them.
+        Field of known sources and its gradient; fitted sources add to them.
     """
 
     array: SensorArray
@@ -66,7 +66,7 @@ class SurveyRecord:
 
     @classmethod
     def of(cls, array: SensorArray, readings: Readings, ambient_T: FloatArray, errors: PoseErrors) -> SurveyRecord:
-        """Rows of readings with a pose; ambient field (n, 3) in the array's frame."""
+        """Return the record of readings with a pose; ambient field (n, 3) in the array's frame."""
         assert readings.array_position_m is not None
         assert readings.array_rotation is not None
         R = readings.array_rotation.as_matrix()
@@ -91,33 +91,33 @@ class SurveyRecord:
         return len(self.time_s)
 
     def with_pose(self, errors: PoseErrors) -> SurveyRecord:
-        """The same rows where other errors of the pose are stated, without one of the clock."""
+        """Return the record with other stated pose errors, without one of the clock."""
         still = np.zeros((len(self), 3))
         effects = errors.effects(still, still, None, self.interpolated_m)
         return replace(self, array=replace(self.array, pose=errors.uncertainty), pose_effects=effects)
 
     @cached_property
     def is_vector(self) -> BoolArray:
-        """Channels of vector sensors, three by three."""
+        """Channels of vector sensors, in groups of three."""
         return ~self.array.channel_is_scalar
 
     def beside(self, position_m: FloatArray, moment_Am2: FloatArray) -> SurveyRecord:
-        """The same rows where more sources (K, 3) are known."""
+        """Return the record with more known sources (K, 3)."""
         field = self.fields(position_m, moment_Am2)
         return replace(self, beside_T=field, gradient_beside_T_m=self.gradients(position_m, moment_Am2))
 
     def fields(self, position_m: FloatArray, moment_Am2: FloatArray) -> FloatArray:
-        """Field (n, N, 3) of sources (K, 3) together at the sensors, and of those that are known."""
+        """Return the field (n, N, 3) of sources (K, 3) and of known ones at the sensors."""
         own = field_at_points(self.sensors_m.reshape(-1, 3), position_m, moment_Am2).reshape(self.sensors_m.shape)
         return np.asarray(own + self.beside_T)
 
     def gradients(self, position_m: FloatArray, moment_Am2: FloatArray) -> FloatArray:
-        """Gradients (n, N, 3, 3) of the same."""
+        """Return the gradients (n, N, 3, 3) of the same field."""
         own = gradient_at_points(self.sensors_m.reshape(-1, 3), position_m, moment_Am2)
         return np.asarray(own.reshape(*self.sensors_m.shape, 3) + self.gradient_beside_T_m)
 
-    def predicted(self, fields_T: FloatArray) -> FloatArray:
-        """Anomalies (n, C) of fields (n, N, 3) beside the ambient one."""
+    def predict(self, fields_T: FloatArray) -> FloatArray:
+        """Return the anomalies (n, C) of fields (n, N, 3) that add to the ambient one."""
         b = self.ambient_T[:, None]
         out = np.empty_like(self.values_T)
         scalar = ~self.is_vector
@@ -133,7 +133,7 @@ class SurveyRecord:
 
     @cached_property
     def middles_m(self) -> FloatArray:
-        """Means of the sensors' places (n, 3)."""
+        """Mean places of the sensors (n, 3)."""
         return np.asarray(self.sensors_m.mean(axis=1))
 
     @property
@@ -143,18 +143,18 @@ class SurveyRecord:
 
     @cached_property
     def along(self) -> FloatArray:
-        """What each channel (n, C) reads of a small change of the ambient field along itself."""
+        """Derivative of each channel (n, C) by the ambient field along itself."""
         unit = self.ambient_T / np.linalg.norm(self.ambient_T, axis=1, keepdims=True)
         weights = np.ones_like(self.values_T)
         weights[:, self.is_vector] = np.tile(unit, (1, int(self.is_vector.sum()) // 3))
         return weights
 
     def along_ambient(self, channels_T: FloatArray) -> FloatArray:
-        """Mean over the sensors (n,) of what channels (n, C) are along the ambient field."""
+        """Return the mean over the sensors (n,) of channels (n, C) along the ambient field."""
         return np.sum(self.along * channels_T, axis=1) / self.array.n_sensors
 
     def directions(self, fields_T: FloatArray) -> FloatArray:
-        """What each channel reads of a small change of the field at its sensor, (n, C, 3), where fields are."""
+        """Return the derivatives (n, C, 3) of the channels by the field at their sensors."""
         out = np.empty((*self.values_T.shape, 3))
         total = self.ambient_T[:, None] + fields_T
         unit = total / np.linalg.norm(total, axis=-1, keepdims=True)
@@ -163,10 +163,10 @@ class SurveyRecord:
         return out
 
     def by_sensors(self, directions: FloatArray) -> FloatArray:
-        """Derivative (n, C, q) of the channels by what is wrong with the sensors, of unit variance.
+        """Return the derivative (n, C, q) of the channels by sensor errors of unit variance.
 
-        Stray fields that turn with the array, what the ambient field induces in its carrier, and gains and axes of
-        vector sensors in that field: Tolles and Lawson's terms among them, of every sensor.
+        The errors are, for every sensor, stray fields that turn with the array, fields that the ambient field induces
+        in its carrier, and gains and axes of vector sensors. Tolles and Lawson's terms are among them.
         """
         R, owner = self.R_world_from_array, self.array.channel_sensor
         by_field = directions @ R  # of a field in the array's axes
@@ -190,7 +190,7 @@ class SurveyRecord:
         return np.concatenate(columns, axis=2) if columns else np.zeros((len(self), len(owner), 0))
 
     def by_pose(self, directions: FloatArray, fields_T: FloatArray, gradients: FloatArray) -> FloatArray:
-        """Derivative (n, C, q) of the channels by the errors of the pose: the sensors are not where they should be."""
+        """Return the derivative (n, C, q) of the channels by the errors of the pose."""
         R, n = self.R_world_from_array, len(self)
         lever = np.zeros(3) if self.array.pose is None else np.array(self.array.pose.lever_arm_m)
         arms = np.einsum("nij,sj->nsi", R, self.array.positions + lever)
@@ -199,7 +199,7 @@ class SurveyRecord:
         moved[..., TURN] = -cross_matrix(arms) @ R[:, None]
         moved[..., LEVER] = R[:, None]
         changed = gradients @ moved
-        # Of vector sensors only a turn about the ambient field is left; it turns the sources' field.
+        # For vector sensors only a turn about the ambient field remains; it turns the sources' field.
         unit = self.ambient_T / np.linalg.norm(self.ambient_T, axis=1, keepdims=True)
         about = np.einsum("ni,nj->nij", unit, np.einsum("ni,nij->nj", unit, R))
         turned = cross_matrix(fields_T) @ about[:, None]
@@ -208,11 +208,13 @@ class SurveyRecord:
         return np.einsum("nci,ncij->ncj", directions, whole) @ self.pose_effects
 
     def by_turned_carrier(self, errors: PoseErrors, least_T: float) -> tuple[FloatArray, FloatArray]:
-        """What errors of the attitude leave of its carrier's fields in the channels, (n, C, q) of unit variance.
+        """Return the effect (n, C, q) of attitude errors on the fields of the carrier.
 
-        Those fields are known as the stated attitude has them. Each channel has its own error, which lasts as that of
-        the attitude does, and one of the eddy currents, which is new in every row: a difference of attitudes makes
-        their rate. There is none of channels where it is below some field.
+        Errors have unit variance.
+
+        The stated attitude gives the fields of the carrier. Each channel has one error with the correlation time of the
+        attitude, and one of the eddy currents that is new in every row, because their rate is a difference of
+        attitudes. Channels with effects below ``least_T`` have no column.
         """
         turn = np.sqrt(np.sum(self.pose_effects[:, TURN, errors.is_changing] ** 2, axis=(1, 2)) / 3.0)
         body = np.einsum("nji,nj->ni", self.R_world_from_array, self.ambient_T)
@@ -234,14 +236,16 @@ class SurveyRecord:
     def by_squared_shift(
         self, directions: FloatArray, position_m: FloatArray, moment_Am2: FloatArray, least_T: float
     ) -> FloatArray:
-        r"""Derivative (n, C, 5) of the channels by the square of the pose's shift δ, of unit variance.
+        r"""Return the derivative (n, C, 5) of the channels by the pose's squared shift δ.
 
-        Its share is :math:`δ^T \nabla\nabla B δ / 2`, of the traceless part of δδᵀ alone, whose 5 components have the
-        variance 2σ⁴; no columns where it is below some field everywhere.
+        Its components have unit variance.
+
+        The effect :math:`δ^T \nabla\nabla B δ / 2` depends only on the traceless part of δδᵀ, whose 5 components have
+        the variance 2σ⁴. There are no columns if it is below ``least_T`` everywhere.
         """
         variance = np.sum(self.pose_effects[:, SHIFT] ** 2, axis=(1, 2)) / 3.0
         fields = np.zeros((*self.sensors_m.shape, 5))
-        for near, away, moment in self._bent(position_m, moment_Am2, variance.max(initial=0.0), least_T):
+        for near, away, moment in self._curved_sources(position_m, moment_Am2, variance.max(initial=0.0), least_T):
             fields[near] += finite_body_fields(away, moment, 2)
         if not fields.any():
             return np.zeros((*directions.shape[:2], 0))
@@ -251,21 +255,26 @@ class SurveyRecord:
     def by_bodies(
         self, directions: FloatArray, position_m: FloatArray, moment_Am2: FloatArray, length_m: float, least_T: float
     ) -> FloatArray:
-        """Derivative (n, C, 14 K') of the channels by what bodies of some length are beside their dipoles, of one σ.
+        """Return the derivative (n, C, 14 K') of the channels by the extent of bodies.
 
-        Of those K' for which it exceeds some field anywhere.
+        The unit is one σ of the deviation from a dipole, for bodies of some length.
+
+        K' counts the sources with a deviation above ``least_T`` anywhere.
         """
         columns = [np.zeros((*directions.shape[:2], 0))]
-        for near, away, moment in self._bent(position_m, moment_Am2, 0.05 * length_m**2, least_T):
+        for near, away, moment in self._curved_sources(position_m, moment_Am2, 0.05 * length_m**2, least_T):
             fields = np.zeros((*self.sensors_m.shape, 14))
             fields[near] = finite_body_errors(away, moment, length_m)
             columns.append(np.einsum("nci,ncij->ncj", directions, fields[:, self.array.channel_sensor]))
         return np.concatenate(columns, axis=2)
 
-    def _bent(
+    def _curved_sources(
         self, position_m: FloatArray, moment_Am2: FloatArray, square_m2: float, least_T: float
     ) -> Iterator[tuple[BoolArray, FloatArray, FloatArray]]:
-        """Sources whose second derivatives, times a square, exceed some field: where (n, N), from there, and moment."""
+        """Yield sources whose second derivatives, times a square, exceed some field.
+
+        Each has a mask (n, N) of rows and sensors, the offsets of these, and the moment.
+        """
         reach_m = (_SECOND_ORDER * np.linalg.norm(moment_Am2, axis=-1) * square_m2 / least_T) ** 0.2
         felt = self.sensors_m[..., 2].min() - position_m[..., 2] < reach_m
         for position, moment, reach in zip(position_m[felt], moment_Am2[felt], reach_m[felt], strict=True):
@@ -276,7 +285,10 @@ class SurveyRecord:
 
 
 def shortest_turns(vectors: FloatArray, onto: FloatArray) -> FloatArray:
-    """Smallest rotations (n, 3, 3) that lay vectors (n, 3) along others, which are not opposite to them."""
+    """Return the smallest rotations (n, 3, 3) of vectors (n, 3) onto others.
+
+    The others must not be opposite to them.
+    """
     a, b = (v / np.linalg.norm(v, axis=-1, keepdims=True) for v in (vectors, onto))
     K = cross_matrix(np.cross(a, b))
     cosine = np.sum(a * b, axis=-1)[..., None, None]

@@ -1,11 +1,11 @@
-r"""What disturbs a survey in time: errors of the pose that last, offsets that walk, and the variation of the field.
+r"""Whitening of a survey in time: correlated pose errors, offset walks, field variation.
 
-All of it is a linear model of states that change from row to row,
+These disturbances are a linear model of states that change from row to row,
 
 .. math:: y_i = H_i x_i + ν_i, \qquad x_{i+1} = F_i x_i + w_i
 
-so that the innovations of a Kalman filter, over their deviations, are white; and as the filter is linear, columns of a
-Jacobian pass through it as the readings do. What is left is an ordinary least-squares problem in the sources.
+so that the normalised innovations of a Kalman filter are white. The filter is linear, so columns of a Jacobian pass
+through it as the readings do. The result is an ordinary least-squares problem in the sources.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ from magloc.surveying.fit.kernels import MeasuredRows, WhiteningFilter
 from magloc.surveying.fit.record import SurveyRecord
 
 OFFSET_T = 1e-6
-"""Standard deviation of what a sensor's offset may be at first."""
+"""Initial standard deviation of a sensor's offset."""
 _HOUR_S = 3600.0
-_LONGEST_GAP_S = _HOUR_S  # nothing is left of what was known of the ambient field; more would cost digits alone
+_LONGEST_GAP_S = _HOUR_S  # after an hour the ambient field is unknown again; a longer gap would only lose digits
 
 
 @dataclass(frozen=True)
-class Drift:
-    """What changes slowly at all sensors.
+class SurveyDrift:
+    """Spectral densities of slow changes at all sensors.
 
     Attributes
     ----------
     common_T2_s3 : float
-        Of the ambient field: its second derivative is white noise of this density.
+        Density of the white noise that is the second derivative of the ambient field.
     sensor_T2_s : float
-        Of every sensor's offset, which walks.
+        Density of the random walk of every sensor's offset.
     """
 
     common_T2_s3: float = (0.05e-9) ** 2
@@ -44,15 +44,15 @@ class Drift:
 
 
 @dataclass(frozen=True, eq=False)
-class Whitening:
-    """Linear map that makes a record's noise white, where some fields of sources are.
+class RecordWhitening:
+    """Linear map that makes a record's noise white, at given fields of sources.
 
     Attributes
     ----------
     U : ndarray, shape (k, C)
-        From channels to independent measurements, in units of their noise.
+        Matrix from channels to independent measurements, in units of their noise.
     group : ndarray of int, shape (n,)
-        Rows that count as one, their mean.
+        Group of each row; the mean of a group counts as one row.
     filter : WhiteningFilter
         Kalman filter over the groups.
     """
@@ -69,13 +69,13 @@ class Whitening:
         by_turn: tuple[FloatArray, FloatArray],
         by_square: FloatArray,
         errors: PoseErrors,
-        drift: Drift,
+        drift: SurveyDrift,
         group: IntArray,
-    ) -> Whitening:
-        """Where errors of the pose change the channels by (n, C, q).
+    ) -> RecordWhitening:
+        """Return the map for derivatives (n, C, q) of the channels by pose errors.
 
-        Those of its turn by more (n, C, ...), in two ways, of which one is new in every row, and squares of its shift
-        by (n, C, 5) or none.
+        ``by_turn``: derivatives (n, C, ...) by attitude errors of the carrier's fields that last, and by those that are
+        new in every row. ``by_square``: derivative (n, C, 5) by squares of the shift, or none.
         """
         U = independent_measurements(record)
         scale = np.sqrt(1.0 / np.bincount(group))
@@ -95,14 +95,15 @@ class Whitening:
         # Errors of rates count as alike in a group: central differences of successive rows share a step.
         white[by_pose.shape[2] + by_turn[0].shape[2] :][: by_turn[1].shape[2]] = False
         seen = np.concatenate(
-            [_summed(seen[..., ~white], group, scale), _roots_of_summed_squares(seen[..., white], group, scale)], axis=2
+            [_sum_groups(seen[..., ~white], group, scale), _mean_covariance_roots(seen[..., white], group, scale)],
+            axis=2,
         )
         C, q = record.array.n_channels, seen.shape[2]
         # Offsets of the channels, and what is common to them: along the ambient field.
         H = np.zeros((len(time_s), len(U), q + C + 2))
         H[..., :q] = seen
         H[..., q : q + C] = U / scale[:, None, None]
-        H[..., q + C] = _summed((record.along @ U.T)[..., None], group, scale)[..., 0]
+        H[..., q + C] = _sum_groups((record.along @ U.T)[..., None], group, scale)[..., 0]
         kept, added = np.ones((len(dt_s), q + C + 2)), np.zeros((len(dt_s), q + C + 2))
         kept[:, :q] = 0.0
         kept[:, : (~white).sum()] = of_pose[:, ~white]
@@ -116,37 +117,43 @@ class Whitening:
         return cls(U, group, WhiteningFilter(H, kept, added, dt_s, start))
 
     def __call__(self, channels: FloatArray) -> FloatArray:
-        """White columns (g·k, m) of columns (n, C, m) of the channels."""
-        summed = _summed(self.U @ channels, self.group, np.sqrt(1.0 / np.bincount(self.group)))
+        """Return white columns (g·k, m) of columns (n, C, m) of the channels."""
+        summed = _sum_groups(self.U @ channels, self.group, np.sqrt(1.0 / np.bincount(self.group)))
         return self.of_groups(np.ascontiguousarray(summed))
 
     def entries(self, groups: IntArray) -> IntArray:
-        """Where the measurements of some groups are in white columns."""
+        """Return the indices of some groups' measurements in white columns."""
         k = len(self.U)
         return np.asarray((groups[:, None] * k + np.arange(k)).ravel())
 
     def of_some(self, channels: FloatArray, groups: IntArray) -> FloatArray:
-        """White columns (g'·k, m) of columns (n', C, m) of all rows of some groups; nothing is elsewhere."""
+        """Return white columns (g'·k, m) of columns (n', C, m) of some groups.
+
+        The columns are zero in other groups.
+        """
         count = np.diff(self.starts)[groups]
-        Y = _summed(self.U @ channels, np.repeat(np.arange(len(groups)), count), np.sqrt(1.0 / count))
+        Y = _sum_groups(self.U @ channels, np.repeat(np.arange(len(groups)), count), np.sqrt(1.0 / count))
         self.filter.whiten(Y, groups)
         return Y.reshape(-1, Y.shape[2])
 
     def measured_rows(self, record: SurveyRecord, directions: FloatArray) -> MeasuredRows:
-        """Return a record's groups of rows, whose channels read directions (n, C, 3) of a small change of the field."""
+        """Return a record's groups of rows, given the directions (n, C, 3) of the channels."""
         return MeasuredRows(record.sensors_m, directions, self.U, record.array.channel_sensor, self.starts)
 
     def of_moments(
         self, record: SurveyRecord, directions: FloatArray, places_m: FloatArray, groups: IntArray
     ) -> FloatArray:
-        """White columns (g·k, 3 m) of what unit moments at places (m, 3) add to some groups; nothing is elsewhere."""
+        """Return white columns (g·k, 3 m) of unit moments at places (m, 3) in some groups.
+
+        The columns are zero in other groups.
+        """
         columns = self.measured_rows(record, directions).moment_columns(places_m, groups)
         self.filter.whiten(columns, groups)
         return columns.reshape(-1, columns.shape[2])
 
     @property
     def log_determinant(self) -> float:
-        """Of the noise's covariance."""
+        """Log-determinant of the noise's covariance."""
         return float(-2.0 * np.log(self.filter.gains[..., -1]).sum())
 
     @cached_property
@@ -160,13 +167,16 @@ class Whitening:
         return len(self.filter.gains)
 
     def of_groups(self, Y: FloatArray) -> FloatArray:
-        """White columns (g·k, m) of columns (g, k, m) of the independent measurements of the groups; they are lost."""
+        """Whiten columns (g, k, m) of independent measurements in place; return (g·k, m)."""
         self.filter.whiten(Y, np.arange(len(Y)))
         return Y.reshape(len(Y) * Y.shape[1], Y.shape[2])
 
 
 def independent_measurements(record: SurveyRecord) -> FloatArray:
-    """Rows (k, C) that make channels independent and of unit variance; what attitude errors move is projected out."""
+    """Return rows (k, C) that make channels independent, with unit variance.
+
+    The directions that attitude errors change are projected out.
+    """
     sigma = without_lasting_errors(record.array).channel_noise_T
     unit = record.ambient_T.mean(axis=0)
     unit = unit / np.linalg.norm(unit)
@@ -178,17 +188,20 @@ def independent_measurements(record: SurveyRecord) -> FloatArray:
     return np.asarray(kept.T / sigma)
 
 
-def _summed(rows: FloatArray, group: IntArray, scale: FloatArray) -> FloatArray:
-    """Sums of the rows (n, ...) of every group, over the root of their number."""
+def _sum_groups(rows: FloatArray, group: IntArray, scale: FloatArray) -> FloatArray:
+    """Return sums of the rows (n, ...) of every group, over the root of their number."""
     if len(scale) == len(rows):
         return rows
     starts = np.flatnonzero(np.diff(group, prepend=-1))
     return np.add.reduceat(rows, starts, axis=0) * scale.reshape(-1, *[1] * (rows.ndim - 1))
 
 
-def _roots_of_summed_squares(rows: FloatArray, group: IntArray, scale: FloatArray) -> FloatArray:
-    """Columns (g, k, q) whose products are the mean covariance of columns (n, k, q) that are new in every row."""
+def _mean_covariance_roots(rows: FloatArray, group: IntArray, scale: FloatArray) -> FloatArray:
+    """Return roots (g, k, q) of the mean covariance of columns (n, k, q) in each group.
+
+    The columns' errors are new in every row.
+    """
     if not rows.shape[2] or (len(scale) == len(rows) and rows.shape[2] <= rows.shape[1]):
         return rows[: len(scale)]
-    square, axes = np.linalg.eigh(_summed(rows @ rows.mT, group, scale**2))
+    square, axes = np.linalg.eigh(_sum_groups(rows @ rows.mT, group, scale**2))
     return np.asarray(axes * np.sqrt(np.maximum(square, 0.0))[:, None])[..., -rows.shape[2] :]

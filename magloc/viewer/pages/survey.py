@@ -33,7 +33,7 @@ _SHADES = 9
 def add_survey(server: viser.ViserServer, found: Survey) -> tuple[list[Entry], FloatArray]:
     """Rows, ground and targets in a scene; lines of the legend, and points (k, 3) that should be in view."""
     scene = server.scene
-    rows = found.rows.thinned()
+    rows = found.rows.decimate()
     places, anomaly_nT = rows.place_m, 1e9 * rows.anomaly_T
     linear, most = linear_and_most(anomaly_nT)
     low, high = places.min(axis=0), places.max(axis=0)

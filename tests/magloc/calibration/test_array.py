@@ -20,8 +20,8 @@ from arrays.sensor import Calibration, Sensor
 from magloc.calibration import least_squares as source_fit
 from magloc.calibration import model as moving_source
 from magloc.calibration.array import CalibrationPrior, calibrate_on_path, self_calibrate
-from magloc.calibration.continuation import calibrated_array
-from magloc.calibration.model import AXES, GAINS, OFFSET, POSITION, Problem, State
+from magloc.calibration.continuation import apply_calibration
+from magloc.calibration.model import AXES, GAINS, OFFSET, POSITION, CalibrationProblem, CalibrationState
 from magloc.calibration.observability import gauge_vectors
 from magloc.calibration.results import SourceCalibration
 from magloc.readings import read_readings
@@ -51,7 +51,7 @@ class Passage:
 
     @property
     def true_array(self) -> SensorArray:
-        return calibrated_array(self.array, self.change)
+        return apply_calibration(self.array, self.change)
 
 
 def nominal_array(noise_T: float, common_field_T: float | None, rng: np.random.Generator) -> SensorArray:
@@ -94,7 +94,7 @@ def passage(
     array = nominal_array(noise_T, common_field_T, rng)
     deviations = np.where(prior.free(array), prior.deviations(array.n_sensors), 0.0)
     change = deviations * rng.normal(size=deviations.shape)
-    true = calibrated_array(array, change)
+    true = apply_calibration(array, change)
     position = sphere_of_positions(n, rng) if path is None else path
     world_from_array = np.broadcast_to(np.eye(3), (len(position), 3, 3)) if attitude is None else attitude
     sigma = 5e-5 if common_field_T is None else common_field_T
@@ -123,9 +123,9 @@ def assert_recovered(result: SourceCalibration, case: Passage, *, within: float)
 
 
 def problem_of(
-    case: Passage, *, unknown_position: bool, unknown_height: bool, moment: moving_source.MomentModel
-) -> Problem:
-    return Problem(
+    case: Passage, *, unknown_position: bool, unknown_height: bool, moment: moving_source.MomentKind
+) -> CalibrationProblem:
+    return CalibrationProblem(
         array=case.array,
         readings_T=case.readings_T,
         noise_T=np.full(case.readings_T.shape, 1e-8),
@@ -138,10 +138,10 @@ def problem_of(
     )
 
 
-def state_of(case: Passage) -> State:
+def state_of(case: Passage) -> CalibrationState:
     rng = np.random.default_rng(99)
     shape = case.position_m.shape
-    return State(
+    return CalibrationState(
         sensors=case.change,
         position_m=case.position_m + rng.normal(0, 1e-3, shape),
         height_m=2e-3,
@@ -172,11 +172,11 @@ class TestDerivatives:
         state = state_of(turning)
         estimated, g, k = problem.estimated.tolist(), problem.n_globals, problem.n_row_unknowns
         n = problem.free.size
-        linear = moving_source.linearised(problem, state)
+        linear = moving_source.linearise(problem, state)
         n_rows, n_channels = linear.residual.shape
 
         def residual(step: FloatArray, rows: FloatArray) -> FloatArray:
-            return moving_source.residuals(problem, source_fit.moved(problem, state, step, rows))
+            return moving_source.residuals(problem, source_fit.apply_step(problem, state, step, rows))
 
         def slope(along: Callable[[float], FloatArray], h: float) -> FloatArray:
             return (along(h) - along(-h)) / (2.0 * h)
@@ -211,7 +211,7 @@ class TestDerivatives:
         case = replace(turning, array=replace(turning.array, common_field_T=common_field_T))
         problem = problem_of(case, unknown_position=unknown_position, unknown_height=unknown_height, moment=moment)
         state = state_of(case)
-        linear = moving_source.linearised(problem, state)
+        linear = moving_source.linearise(problem, state)
         n_rows, n_channels, k = linear.by_row.shape
         n, g = problem.free.size, problem.n_globals
         dense = np.zeros((n_rows, n_channels, n + g + n_rows * k))
@@ -355,7 +355,7 @@ class TestSelfCalibration:
         """A finite rotation, scaling and translation of everything changes no reading."""
         case = passage(12)
         problem = problem_of(case, unknown_position=True, unknown_height=False, moment="constant")
-        state = State(case.change, case.position_m, 0.0, np.tile(MOMENT, (60, 1)), np.zeros((60, 3)))
+        state = CalibrationState(case.change, case.position_m, 0.0, np.tile(MOMENT, (60, 1)), np.zeros((60, 3)))
         turn, scale, shift = Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix(), 1.1, np.array([0.02, 0.03, -0.01])
         true = case.true_array
         sensors = tuple(
@@ -367,7 +367,7 @@ class TestSelfCalibration:
             for sensor in true.sensors
         )
         moved = replace(problem, array=replace(true, sensors=sensors))
-        other = State(
+        other = CalibrationState(
             np.zeros_like(case.change),
             scale * case.position_m @ turn.T + shift,
             0.0,
@@ -375,7 +375,7 @@ class TestSelfCalibration:
             np.zeros((60, 3)),
         )
         np.testing.assert_allclose(
-            moving_source.predicted_T(moved, other), moving_source.predicted_T(problem, state), rtol=1e-9, atol=1e-16
+            moving_source.prediction_T(moved, other), moving_source.prediction_T(problem, state), rtol=1e-9, atol=1e-16
         )
         names = set(gauge_vectors(problem, state))
         assert names == TRANSLATIONS | ROTATIONS | SIZE | GAIN | COMMON_OFFSETS
@@ -388,15 +388,15 @@ class TestSelfCalibration:
             self_calibrate(case.array, case.readings_T, prior=vague)
         )
         # Its readings are the same: the field of a dipole is even.
-        state = State(case.change, case.position_m, 0.0, np.tile(MOMENT, (60, 1)), np.zeros((60, 3)))
+        state = CalibrationState(case.change, case.position_m, 0.0, np.tile(MOMENT, (60, 1)), np.zeros((60, 3)))
         inverted = tuple(
             replace(sensor, position_m=tuple((-np.array(sensor.position_m)).tolist()))
             for sensor in case.true_array.sensors
         )
         mirrored = replace(problem, array=replace(case.true_array, sensors=inverted))
         np.testing.assert_allclose(
-            moving_source.predicted_T(mirrored, replace(state, sensors=0 * case.change, position_m=-case.position_m)),
-            moving_source.predicted_T(problem, state),
+            moving_source.prediction_T(mirrored, replace(state, sensors=0 * case.change, position_m=-case.position_m)),
+            moving_source.prediction_T(problem, state),
             rtol=1e-9,
             atol=1e-16,
         )

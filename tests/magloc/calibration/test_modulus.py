@@ -22,7 +22,7 @@ from scipy.stats import chi2
 from arrays.array import SensorArray
 from arrays.geometries import tetrahedron
 from arrays.sensor import Calibration, Sensor
-from magloc.calibration.modulus import calibrated_in_modulus, ellipsoid_calibration
+from magloc.calibration.modulus import calibrate_in_modulus, ellipsoid_calibration
 
 ROW, COLUMN = np.array([0, 1, 2, 0, 0, 1]), np.array([0, 1, 2, 1, 2, 2])
 MODULUS = 5e-5
@@ -329,7 +329,7 @@ class TestArray:
         fields = np.repeat((MODULUS * directions(rng, 80))[:, None], 4, axis=1)
         readings = true.readings_of(fields) + 1e-9 * rng.normal(size=(80, 10))
         readings[5:, 6:9] = np.nan
-        calibrated, results = calibrated_in_modulus(nominal, readings, MODULUS)
+        calibrated, results = calibrate_in_modulus(nominal, readings, MODULUS)
         assert [name for name, result in results.items() if result.converged] == list(true.ids[:2])
         assert list(results) == list(true.ids[:3])
         assert calibrated.sensors[2:] == nominal.sensors[2:]
@@ -342,7 +342,7 @@ class TestArray:
         rng = np.random.default_rng(1)
         nominal, true = self.array(rng), self.array(rng)
         fields = np.repeat((MODULUS * directions(rng, 80))[:, None], 4, axis=1)
-        calibrated, results = calibrated_in_modulus(nominal, true.readings_of(fields), MODULUS)
+        calibrated, results = calibrate_in_modulus(nominal, true.readings_of(fields), MODULUS)
         for before, after in zip(nominal.sensors[:3], calibrated.sensors[:3], strict=True):
             old, new = np.array(before.calibration.scale), np.array(after.calibration.scale)
             assert_allclose(new @ new.T, results[after.id].scale @ results[after.id].scale, rtol=1e-9)
@@ -353,6 +353,6 @@ class TestArray:
     def test_misuse(self):
         array = tetrahedron(1.0, kind="scalar")
         with pytest.raises(ValueError, match="Input array must have a vector sensor"):
-            calibrated_in_modulus(array, np.ones((20, 4)), MODULUS)
+            calibrate_in_modulus(array, np.ones((20, 4)), MODULUS)
         with pytest.raises(ValueError, match=r"Input readings_T must have shape \(n, 12\)"):
-            calibrated_in_modulus(tetrahedron(1.0), np.ones((20, 4)), MODULUS)
+            calibrate_in_modulus(tetrahedron(1.0), np.ones((20, 4)), MODULUS)

@@ -54,14 +54,14 @@ class TestTakenEarlier:
     def test_white_errors_stay_as_large(self, lag_s: float) -> None:
         """Of 2,310 the variance differs by 12 % once in 20,000 times; means of two lose a half. Not beyond the ends."""
         still = replace(walked(0.0, 0.0), array_position_m=white_errors())
-        moved = SmoothTrack.of(still).taken_earlier(lag_s).array_position_m
+        moved = SmoothTrack.of(still).with_earlier_poses(lag_s).array_position_m
         assert moved is not None
         inside = np.abs(np.arange(770) % 110 - 54.5) < 45.0
         assert np.mean(moved[inside] ** 2) == pytest.approx(np.mean(white_errors()[inside] ** 2), rel=0.12)
 
     def test_a_smooth_way_moves_along_itself(self) -> None:
         readings = walked(0.0, 0.0)
-        moved = SmoothTrack.of(readings).taken_earlier(0.2).array_position_m
+        moved = SmoothTrack.of(readings).with_earlier_poses(0.2).array_position_m
         place = readings.array_position_m
         assert moved is not None
         assert place is not None
@@ -71,7 +71,7 @@ class TestTakenEarlier:
 
     def test_some_rows_move_as_all(self) -> None:
         track, rows = SmoothTrack.of(walked(0.0, 0.0)), np.arange(150, 400, 3)
-        own, of_all = track.taken_earlier(0.33, rows), track.taken_earlier(0.33)[rows]
+        own, of_all = track.with_earlier_poses(0.33, rows), track.with_earlier_poses(0.33)[rows]
         np.testing.assert_array_equal(own.array_position_m, of_all.array_position_m)
         np.testing.assert_array_equal(own.ambient_T, of_all.ambient_T)
 
@@ -80,7 +80,7 @@ class TestTakenEarlier:
         turn, before = (
             Rotation.from_rotvec(np.outer(0.7 * (readings.time_s - late_s), [0.0, 0.0, 1.0])) for late_s in (0.0, 0.1)
         )
-        moved = SmoothTrack.of(replace(readings, array_rotation=turn)).taken_earlier(0.1).array_rotation
+        moved = SmoothTrack.of(replace(readings, array_rotation=turn)).with_earlier_poses(0.1).array_rotation
         assert moved is not None
         assert np.all((moved * before.inv()).magnitude()[np.arange(770) % 110 > 0] < 1e-5)
 
@@ -89,8 +89,10 @@ class TestTakenEarlier:
         readings = walked(0.0, 0.0)
         assert readings.ambient_T is not None
         storm = 1.0 + 1e-3 * np.sin(readings.time_s)[:, None]
-        quiet = SmoothTrack.of(readings).taken_earlier(0.5).ambient_T
-        stormy = SmoothTrack.of(replace(readings, ambient_T=readings.ambient_T * storm)).taken_earlier(0.5).ambient_T
+        quiet = SmoothTrack.of(readings).with_earlier_poses(0.5).ambient_T
+        stormy = (
+            SmoothTrack.of(replace(readings, ambient_T=readings.ambient_T * storm)).with_earlier_poses(0.5).ambient_T
+        )
         assert quiet is not None
         np.testing.assert_allclose(stormy, quiet * storm, rtol=1e-6)
 

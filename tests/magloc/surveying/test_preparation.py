@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from arrays.typing import FloatArray
 from magloc.readings import Readings
-from magloc.surveying.preparation import leaping_rows, varying
+from magloc.surveying.preparation import leaping_rows, vary_with_base
 
 
 class TestBaseStation:
@@ -18,7 +18,7 @@ class TestBaseStation:
     def varying(self, time_s: FloatArray) -> FloatArray:
         """With a base station that drifts by a nanotesla a second and reads at some times."""
         base = Readings(47e-6 + 1e-9 * time_s[:, None], time_s=time_s)
-        return varying(self.AMBIENT_T, self.TIME_S, base)
+        return vary_with_base(self.AMBIENT_T, self.TIME_S, base)
 
     def test_the_modulus_varies_about_the_given(self) -> None:
         change = np.linalg.norm(self.varying(self.TIME_S), axis=1) - np.linalg.norm(self.AMBIENT_T, axis=1)
@@ -33,7 +33,7 @@ class TestBaseStation:
     def test_wild_readings_are_left_out(self, rows: list[int], caplog: pytest.LogCaptureFixture) -> None:
         base_T = 47e-6 + 1e-9 * self.TIME_S
         base_T[rows] -= 3e-7
-        found = varying(self.AMBIENT_T, self.TIME_S, Readings(base_T[:, None], time_s=self.TIME_S))
+        found = vary_with_base(self.AMBIENT_T, self.TIME_S, Readings(base_T[:, None], time_s=self.TIME_S))
         np.testing.assert_allclose(found, self.varying(self.TIME_S), rtol=0.0, atol=2e-9)
         assert f"{len(rows)} readings of the base station leap" in caplog.text
 
@@ -46,7 +46,7 @@ class TestBaseStation:
     def test_another_unit_is_refused(self, unit: float) -> None:
         base = Readings(unit * np.full((100, 1), 47e-6), time_s=self.TIME_S)
         with pytest.raises(ValueError, match="Input base must read the modulus of the Earth's field, about 44721 nT"):
-            varying(self.AMBIENT_T, self.TIME_S, base)
+            vary_with_base(self.AMBIENT_T, self.TIME_S, base)
 
 
 class TestPlaces:

@@ -18,10 +18,10 @@ import sims
 from arrays.typing import FloatArray, IntArray
 from magloc.fields import dipole
 from magloc.surveying.fit.joint_fit import (
-    Background,
-    Bounds,
     JointFit,
+    SourceBounds,
     Sources,
+    SurveyBackground,
     fit_jointly,
     jacobian_of,
     residual_of,
@@ -30,15 +30,15 @@ from magloc.surveying.fit.joint_fit import (
 from magloc.surveying.piece import Ground, Piece
 from magloc.surveying.preparation import whole_rows
 from magloc.surveying.reach import DEPTHS_M, least_moments
-from magloc.surveying.rounds import AT_LAST, WHILE_SEARCHING, Model, Searched
+from magloc.surveying.rounds import AT_LAST, WHILE_SEARCHING, SearchState, SurveyModel
 from magloc.surveying.search import PITCH, WINDOW, SearchGrid
-from magloc.surveying.targets import is_misfit, moved_by_second, profile_of, second_source_chi2
+from magloc.surveying.targets import is_misfit, profile_of, second_source_chi2, shift_by_second
 from magloc.surveying.tiled import TiledSurvey
 from sims.magnetics.paths import Lawnmower, Steered
 from sims.magnetics.scenario import Carrier, MagneticScenario, Source
 
 WEAK = ((-1.0, 1.0, -1.1), (0.1, 0.2, -0.3))
-Fitted = tuple[Model, JointFit, Background]
+Fitted = tuple[SurveyModel, JointFit, SurveyBackground]
 STRONG = ((3.0, -2.0, -0.6), (6.0, 5.0, -8.0))
 DRAWS = 50
 
@@ -69,7 +69,7 @@ def fitted() -> Fitted:
     """The two fitted where they are."""
     piece = plot()
     model = piece.model()
-    return model, *model.fitted(piece.known, piece.groups(model.record, AT_LAST * model.nearest_m), 1e-3)
+    return model, *model.fit(piece.known, piece.groups(model.record, AT_LAST * model.nearest_m), 1e-3)
 
 
 def test_free_sources_leave_nothing_of_themselves() -> None:
@@ -89,7 +89,7 @@ def test_errors_of_sources_beside_are_projected_out() -> None:
     beside = replace(model, record=record.beside(strong.position_m, strong.moment_Am2), beside=strong)
     background = beside.background(weak, groups(AT_LAST * model.nearest_m))
     moved = Sources(strong.position_m + np.array([0.015, -0.015, 0.015]), 1.05 * strong.moment_Am2)
-    change = record.predicted(moved.fields(record)) - record.predicted(strong.fields(record))
+    change = record.predict(moved.fields(record)) - record.predict(strong.fields(record))
     wrong = background.white(change[..., None])[:, 0]
     assert wrong @ wrong > 50.0
     # A tenth of a metre and a fifth of the moment are one σ.
@@ -158,28 +158,28 @@ class TestSearchedAgain:
     """Only where sources have changed more than noise hides."""
 
     @staticmethod
-    def searched() -> tuple[Searched, Sources, Background]:
+    def searched() -> tuple[SearchState, Sources, SurveyBackground]:
         model, fit, _ = fitted()
         grid = SearchGrid.of(model.bounds.low_m, model.bounds.high_m, model.record.height_m, [1.0])
         background = model.background(fit.sources, groups(WHILE_SEARCHING * model.nearest_m))
-        return Searched.nowhere(model, groups, grid), fit.sources, background
+        return SearchState.empty(model, groups, grid), fit.sources, background
 
     def test_nowhere_where_nothing_has(self) -> None:
         searched, sources, background = self.searched()
-        first = searched.again(sources, background)
+        first = searched.update(sources, background)
         assert (searched.of == 0).all()
-        again = searched.again(sources.moved(np.full((2, 6), 1e-6)), background)
+        again = searched.update(sources.apply_step(np.full((2, 6), 1e-6)), background)
         assert (searched.of == 0).all()
         np.testing.assert_array_equal(again.chi2, first.chi2)
 
     def test_as_from_the_start_beside_a_new_one(self) -> None:
         """In a corner: 0.02 A·m² that nobody feels in the other."""
         searched, sources, background = self.searched()
-        searched.again(sources, background)
+        searched.update(sources, background)
         more = sources.with_more(Sources(np.array([[4.5, 4.5, -0.2]]), np.array([[0.0, 0.0, 0.02]])))
-        found = searched.again(more, background)
+        found = searched.update(more, background)
         anew, *_ = self.searched()
-        whole = anew.again(more, background)
+        whole = anew.update(more, background)
         new = np.repeat(searched.of == 1, [len(places) for _, places in searched.grid.tiles])
         assert 0 < new.sum() < len(new)
         np.testing.assert_array_equal(found.chi2[new], whole.chi2[new])
@@ -194,7 +194,7 @@ def test_the_least_moment_is_seen_with_95_percent() -> None:
     assert sorted(set((-places[:, 2]).round(6))) == list(DEPTHS_M)
     directions = np.random.default_rng(1).normal(size=(300, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    everywhere = Bounds(np.full(3, -np.inf), np.full(3, np.inf))
+    everywhere = SourceBounds(np.full(3, -np.inf), np.full(3, np.inf))
     for at in np.linspace(0, len(places) - 1, 5).astype(int):
         with_one = fit.sources.with_more(Sources(places[[at]], moments[at] * directions[:1]))
         there = fit_jointly(model.record, background, with_one, everywhere, most=0)
@@ -210,7 +210,7 @@ def test_the_least_moment_is_seen_with_95_percent() -> None:
 def test_no_place_where_no_row_is_near() -> None:
     """Of a rectangle that goes on for 300 m: places beside the rows, where little is seen, and none far from them."""
     model, fit, _ = fitted()
-    far = replace(model, bounds=Bounds(model.bounds.low_m, model.bounds.high_m + 300.0 * np.eye(3)[0]))
+    far = replace(model, bounds=SourceBounds(model.bounds.low_m, model.bounds.high_m + 300.0 * np.eye(3)[0]))
     low, high = far.bounds.low_m[:2], far.bounds.high_m[:2]
     places, moments = least_moments(far, fit.sources, groups, low, high, 0.0)
     beside_m = places[:, 0] - model.bounds.high_m[0]
@@ -224,7 +224,7 @@ def test_no_place_where_no_row_is_near() -> None:
 def plot_of(seen: Callable[[FloatArray], FloatArray], start: Sources, body_length_m: float = 0.0) -> Fitted:
     """A source fitted to what fields (n, N, 3) at the sensors of a small plot look like, without noise."""
     model, _, _ = fitted()
-    values = model.record.predicted(seen(model.record.sensors_m))
+    values = model.record.predict(seen(model.record.sensors_m))
     model = replace(model, record=replace(model.record, values_T=values), body_length_m=body_length_m)
     group = np.arange(len(model.record)) // 2
     background = model.background(start, group)
@@ -262,7 +262,7 @@ class TestSecondSource:
             lambda sensors: dipole.total_field(sensors, places, moments), Sources(place[None], moment[None])
         )
         Q = with_free_sources(model.record, background, fit.sources)
-        moved = moved_by_second(model, fit, background, Q, fit.residual - Q @ (Q.T @ fit.residual), 0)
+        moved = shift_by_second(model, fit, background, Q, fit.residual - Q @ (Q.T @ fit.residual), 0)
         wrong = np.linalg.norm(fit.sources.position_m[0] - place)
         assert 0.3 * wrong < np.linalg.norm(moved[:3]) < 3.0 * wrong
 

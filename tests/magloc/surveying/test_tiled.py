@@ -13,7 +13,7 @@ import magloc
 import sims
 from magloc.grids.work import workers
 from magloc.surveying.fit.joint_fit import Sources
-from magloc.surveying.piece import Ground, strongest_in, targets_in
+from magloc.surveying.piece import Ground, measure_targets, strongest_sources
 from magloc.surveying.preparation import whole_rows
 from magloc.surveying.tiled import TiledSurvey
 from sims.magnetics.paths import Lawnmower, Steered
@@ -85,8 +85,8 @@ class TestTwoTiles:
         first = tiled()
         assert len(first.piece(0).outside) == 0
         with workers(1, None, None) as each:
-            then = first.searched(strongest_in, [1], each, lambda _: None)
-        assert then.changed() == [0]
+            then = first.search(strongest_sources, [1], each, lambda _: None)
+        assert then.changes() == [0]
         strongest = np.argmax(np.linalg.norm(then.piece(0).outside.moment_Am2, axis=1))
         np.testing.assert_allclose(then.piece(0).outside.position_m[strongest], TARGETS[2][0], atol=0.2)
 
@@ -129,14 +129,14 @@ class TestChanged:
         then = self.told(5.6, moment_Am2)
         outside = then.piece(0).outside
         assert len(outside) == 1
-        assert (0 in then.changed()) == changed
+        assert (0 in then.changes()) == changed
 
     def test_one_that_is_new_is_sought_once(self) -> None:
         """Told of it, and not finding it, a tile would say the same again."""
         then = self.told(-0.5, 1.0)
-        assert 0 in then.changed()
-        assert 0 not in replace(then, known=[then.sources] * 2).changed()
-        assert 0 not in replace(then, found=[then.sources] * 2).changed()
+        assert 0 in then.changes()
+        assert 0 not in replace(then, known=[then.sources] * 2).changes()
+        assert 0 not in replace(then, found=[then.sources] * 2).changes()
 
 
 class TestGround:
@@ -156,7 +156,7 @@ class TestReach:
         assert rows.array_position_m is not None
         apart = rows[np.abs(rows.array_position_m[:, 0]) > 6.0]
         west = TiledSurvey.of(array, apart, Ground(SHALLOW, 0.0, 15.0, 25.0)).piece(0)
-        places = targets_in(west)["reach_m"]
+        places = measure_targets(west)["reach_m"]
         for depth in set(places[:, 2]):
             assert abs(places[places[:, 2] == depth, 0].max()) < 1.0  # half a step between places
 

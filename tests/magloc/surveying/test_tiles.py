@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magloc.surveying.tiles import Tile, owned, tiles_of
+from magloc.surveying.tiles import Tile, assign_sources, tiles_of
 
 RNG = np.random.default_rng(8)
 REACH_M = 2.0
@@ -67,7 +67,7 @@ class TestOwned:
 
     def owned(self, west: list[list[float]], east: list[list[float]]) -> list[tuple[int, int]]:
         found = [np.reshape(np.array(places, dtype=float), (-1, 3)) for places in (west, east)]
-        return sorted(owned([self.WEST, self.EAST], found, 0.5))
+        return sorted(assign_sources([self.WEST, self.EAST], found, 0.5))
 
     def test_each_its_own(self) -> None:
         assert self.owned([[-5.0, 0.0, -1.0], [5.0, 0.0, -1.0]], [[5.0, 0.0, -1.0]]) == [(0, 0), (1, 0)]

@@ -51,13 +51,13 @@ class TestPredictions:
     @pytest.mark.parametrize("array", [SCALAR, VECTOR], ids=["scalar", "vector"])
     def test_exact_pose(self, array: arrays.SensorArray) -> None:
         record = record_of(array, readings_of(array, PLACES, TURNS))
-        np.testing.assert_allclose(record.predicted(record.fields(*SOURCE)), record.values_T, atol=1e-17)
+        np.testing.assert_allclose(record.predict(record.fields(*SOURCE)), record.values_T, atol=1e-17)
 
     def test_attitude_of_vector_sensors_hardly_matters(self) -> None:
         """Half a degree moves the ambient field by 400 nT; what is left is a turn of the source's field."""
         wrong = TURNS * Rotation.from_rotvec([0.005, -0.006, 0.0])
         record = record_of(VECTOR, readings_of(VECTOR, PLACES, wrong))
-        left = record.predicted(record.fields(*SOURCE)) - record.values_T
+        left = record.predict(record.fields(*SOURCE)) - record.values_T
         # The lever arms of the sensors move too, by 2 mm.
         assert np.abs(left).max() < 0.02 * np.abs(record.values_T).max()
 
@@ -67,7 +67,7 @@ class TestPredictions:
         small = record.fields(SOURCE[0], 1e-6 * SOURCE[1])
         b = np.longdouble(1.0) * record.ambient_T[:, None]
         exact = np.sqrt(np.sum((b + small) ** 2, axis=-1)) - np.sqrt(np.sum(b**2, axis=-1))
-        np.testing.assert_allclose(record.predicted(small), exact.astype(float), rtol=2e-5)
+        np.testing.assert_allclose(record.predict(small), exact.astype(float), rtol=2e-5)
 
 
 class TestDerivatives:
@@ -81,7 +81,7 @@ class TestDerivatives:
         for axis in range(3):
             step = np.zeros(3)
             step[axis] = 1e-11
-            numeric = (record.predicted(fields + step) - record.predicted(fields - step)) / 2e-11
+            numeric = (record.predict(fields + step) - record.predict(fields - step)) / 2e-11
             np.testing.assert_allclose(record.directions(fields)[..., axis], numeric, atol=1e-6)
 
     @pytest.mark.parametrize("axis", range(3))
