@@ -16,8 +16,8 @@ import arrays
 import magloc
 from adcs.environment.environment import Environment
 from adcs.frames import instants
-from adcs.kalman.error_state import FilterSettings, ProcessNoise, Start, sensor_set
-from adcs.kalman.mekf import corrected, first_state, predicted
+from adcs.kalman.error_state import FilterSettings, FilterStart, ProcessNoise, sensor_set
+from adcs.kalman.mekf import initial_state, predict, update_state
 from adcs.quaternion import IDENTITY
 from adcs.satellite.satellite import Satellite
 from adcs.satellite.sensors import Gyro, Magnetometer, SunSensor
@@ -88,9 +88,9 @@ class TestCpp:
         readings = Readings(none, twice(1e-3, 2e-3, -1e-3), twice(1.9e-5, 2.1e-6, -3.1e-5), twice(0.61, 0.02, 0.79))
         record = Record(satellite, 1.0, around, readings, twice(1e-3, -2e-3, 5e-4), twice(0, 0, 0), twice(0, 0, 0))
         settings = FilterSettings(sensor_set("gyro+mag+sun"), ProcessNoise(1e-6, 1e-6))
-        start = Start(IDENTITY[None], np.array([[0.0, 1.1e-3, 0.0]]), np.diag([1e-3] * 3 + [1e-5] * 3)[None])
-        state = predicted(record, 0, first_state(settings, start), settings)[0]
-        state, nis = corrected(record, 1, state, settings)
+        start = FilterStart(IDENTITY[None], np.array([[0.0, 1.1e-3, 0.0]]), np.diag([1e-3] * 3 + [1e-5] * 3)[None])
+        state = predict(record, 0, initial_state(settings, start), settings)[0]
+        state, nis = update_state(record, 1, state, settings)
         assert np.nanmax(nis) < settings.gate_limit
         np.testing.assert_allclose(numbers["attitude"], state.q[0], rtol=0, atol=1e-12)
         np.testing.assert_allclose(numbers["rate"], state.w[0], rtol=0, atol=1e-12)

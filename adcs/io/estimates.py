@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from adcs.kalman.results import SHOWN
+from adcs.kalman.results import STATE_UNITS
 from adcs.satellite.attitude_track import AttitudeTrack
 from adcs.satellite.sensors import NIS_SIZES
 from arrays.io.tables import by_sigma
@@ -22,7 +22,7 @@ def estimate_columns(track: AttitudeTrack) -> dict[str, Any]:
     for prefix, q in (("", track.q_orbital), ("eci_", track.q)):
         if q is not None:
             columns |= dict(zip((f"{prefix}q{part}" for part in "wxyz"), q.T, strict=True))
-    for state, shown in SHOWN.items():
+    for state, shown in STATE_UNITS.items():
         for i, name in enumerate(shown.columns):
             for prefix, values in (("", track.states), ("sigma_", track.sigma)):
                 if state in values:
@@ -51,7 +51,7 @@ def summary_lines(track: AttitudeTrack) -> list[str]:
     prefix = "eci_" if track.q_orbital is None else ""
     q = ", ".join(f"{columns[f'{prefix}q{part}'][-1]:.6f}" for part in "wxyz")
     lines.append(f"attitude at the end, {track.frame} from body (w, x, y, z)   {q}")
-    for state, shown in SHOWN.items():
+    for state, shown in STATE_UNITS.items():
         names = shown.columns
         if state not in track.sigma:
             continue

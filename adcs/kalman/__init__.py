@@ -1,1 +1,1 @@
-"""Kalman filters of the attitude: the multiplicative filter, its reduced relatives, their starts and their results."""
+"""Kalman filters of the attitude: MEKF, its variants, initialisation and results."""

@@ -1,4 +1,4 @@
-"""The bank of filters: picks the filter that is asked for, and runs it."""
+"""Selection and run of an attitude filter, and the function estimate."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from adcs import quaternion
-from adcs.kalman.diagnostics import COLLINEAR, collinear_rows, unseen_torque_Nm, warnings_of
-from adcs.kalman.error_state import ALWAYS, AttitudeTracks, FilterSettings, Start, sensor_set, tuned_noise
-from adcs.kalman.initialisation import any_start, checked_start, first_told, vector_start
+from adcs.kalman.diagnostics import COLLINEAR, collinear_rows, unseen_torque_Nm, warning_sentences
+from adcs.kalman.error_state import ALWAYS, AttitudeTracks, FilterSettings, FilterStart, sensor_set, tuned_noise
+from adcs.kalman.initialisation import any_start, choose_start, first_observed_row, vector_start
 from adcs.kalman.mekf import run_filter
 from adcs.kalman.names import FILTERS, Filter, StartKind
-from adcs.kalman.smoother import smoothed
+from adcs.kalman.smoother import smooth
 from adcs.kalman.variants.constant_gain import run_constant_gain
 from adcs.kalman.variants.gyro_driven import run_reduced
 from adcs.kalman.variants.self_tuning import run_self_tuned
@@ -27,30 +27,30 @@ from adcs.satellite.telemetry import Record, Telemetry, orbital_from_eci, part
 from arrays.io.errors import InputError, naming
 
 IMPLIED_STATES = {"parallel-disturbance": ("disturbance",), "reduced": ("gyro-bias",), "self-tuning": ("disturbance",)}
-"""What a filter estimates whether it is asked to or not."""
+"""States that a filter always estimates."""
 
 
 @dataclass(frozen=True, eq=False)
 class EstimatorSettings:
-    """What is estimated, from what, and how.
+    """Filter, its sensors and states, and its start.
 
     Attributes
     ----------
     settings : FilterSettings
-        Sensors, states and what the filter believes of their noise.
+        Sensors, states and noise of the filter.
     filter : str
         One of :data:`adcs.kalman.names.FILTERS`.
     start : str
         One of :data:`adcs.kalman.names.STARTS`, for simulations; :func:`estimate` starts from any attitude. With a
-        magnetometer alone any other attitude is taken that explains the readings better.
+        magnetometer alone, another attitude is used if it explains the readings better.
     start_attitude_rad, start_rate_rad_s : float
-        Standard deviations per axis of what it starts from.
+        Initial standard deviations per axis.
     forgetting : float
-        Of the parallel filter of the disturbance.
+        Forgetting factor of the parallel filter of the disturbance.
     closed_loop_F : bool
-        The source paper's Jacobian.
+        Use the Jacobian of the source paper.
     longest_gap_s : float
-        Through which the filter coasts on the dynamics, where a log has no row; after a longer one it starts anew.
+        Longest gap of a log that the filter bridges by the dynamics; after a longer one it starts anew.
 
     Examples
     --------
@@ -70,7 +70,7 @@ class EstimatorSettings:
 
     @classmethod
     def of(cls, sensors: str, states: Iterable[str] = (), filter: Filter = "mekf") -> EstimatorSettings:
-        """Settings by names, with the process noise that we found."""
+        """Return settings by names, with tuned process noise."""
         if filter not in FILTERS:
             raise ValueError(f"Input filter must be one of {', '.join(FILTERS)}; instead received {filter!r}.")
         used = sensor_set(sensors, dict.fromkeys((*states, *IMPLIED_STATES.get(filter, ()))))
@@ -78,7 +78,7 @@ class EstimatorSettings:
 
     @property
     def in_words(self) -> str:
-        """Sensors, states and filter."""
+        """Sensors, states and filter in words."""
         used = self.settings.sensors
         states = f", estimating {', '.join(used.states)}" if used.states else ""
         return f"{used.sensors}{states}; filter {self.filter}"
@@ -92,28 +92,28 @@ def estimate(
     states: Iterable[str] = (),
     filter: Filter = "mekf",
 ) -> AttitudeTrack:
-    """Attitude and rate of a satellite from its log, by an error-state Kalman filter.
+    """Estimate attitude and rate of a satellite from its log by an error-state Kalman filter.
 
-    Field and Sun are computed along the orbit. The filter starts from the first readings; where they leave a turn
-    open, from the turn that fits the readings of five minutes, or fifty of a magnetometer alone. After a gap of more
-    than ten minutes, or what the settings say, it starts anew.
+    Field and Sun are computed along the orbit. The filter starts from the first readings. If these leave a rotation
+    open, it starts from the angle that fits the readings of five minutes best; with a magnetometer alone, of fifty
+    minutes. After a gap of more than ten minutes, or of ``longest_gap_s`` of the settings, it starts anew.
 
     Parameters
     ----------
     telemetry : Telemetry
-        The log: of :func:`adcs.read_telemetry`, or of arrays.
+        The log, from :func:`adcs.read_telemetry` or from arrays.
     satellite : Satellite
-        Inertia, orbit, sensors and their noise, as its user knows them.
+        Inertia, orbit, sensors and their noise.
     sensors : str or EstimatorSettings
-        Sensors in use, ``st``, ``gyro``, ``mag`` and ``sun`` with + between them, such as ``"mag+sun+gyro"``; or
-        everything that a filter may be told, in place of states and filter too.
+        Sensors in use, ``st``, ``gyro``, ``mag`` and ``sun`` with + between them, such as ``"mag+sun+gyro"``; or all
+        settings, which then replace ``states`` and ``filter`` too.
     states : iterable of str
-        What is estimated besides attitude and rate: ``gyro-bias``, ``field-bias``, ``disturbance``,
-        ``field-model``, ``dipole``, ``field-gain``.
+        States besides attitude and rate: ``gyro-bias``, ``field-bias``, ``disturbance``, ``field-model``, ``dipole``,
+        ``field-gain``.
     filter : str
-        ``mekf``; with its converged gain (``constant-gain``); with a filter of the disturbance beside it
-        (``parallel-disturbance``); of attitude and gyro bias alone (``reduced``); with a smoother after it
-        (``smoother``); a bank that finds how large the disturbance is (``self-tuning``).
+        ``mekf``; ``constant-gain``, with its converged gain; ``parallel-disturbance``, with a separate filter of the
+        disturbance; ``reduced``, of attitude and gyro bias alone; ``smoother``, with a smoother after it;
+        ``self-tuning``, a bank that estimates the size of the disturbance.
 
     Returns
     -------
@@ -123,9 +123,8 @@ def estimate(
     Raises
     ------
     ValueError
-        The sensors cannot observe attitude or have no reading, one misreading of a sensor (its unit, axes or
-        quaternion) explains why they contradict each other, a date is outside of the model of the field, or the filter
-        fails.
+        The sensors cannot observe attitude or have no reading, they contradict each other because the unit, the axes
+        or the quaternion of one is wrong, a date is outside of the model of the field, or the filter fails.
 
     Examples
     --------
@@ -155,7 +154,7 @@ def estimate(
 
 
 def _estimate(telemetry: Telemetry, satellite: Satellite, chosen: EstimatorSettings) -> AttitudeTrack:
-    """Track of a log without a long gap."""
+    """Estimate the track of a log without a long gap."""
     used = chosen.settings.sensors
     record = telemetry.record(satellite)
     for name in used.sensors.split("+"):
@@ -165,9 +164,9 @@ def _estimate(telemetry: Telemetry, satellite: Satellite, chosen: EstimatorSetti
                 f"{used.sensors}."
             )
     check_conventions(telemetry, record, used.sensors.split("+"))
-    first = first_told(record, used, with_gyro=chosen.filter == "reduced")
+    first = first_observed_row(record, used, with_gyro=chosen.filter == "reduced")
     record = part(record, np.array([0]), slice(first, None))
-    tracks = estimated(record, chosen, any_start)
+    tracks = estimate_tracks(record, chosen, any_start)
     if not (np.isfinite(tracks.q).all() and tracks.definite.all()):
         raise ValueError("Input found readings that no attitude explains: the filter has failed.")
     return _track(telemetry, first, record, chosen, tracks)
@@ -176,7 +175,7 @@ def _estimate(telemetry: Telemetry, satellite: Satellite, chosen: EstimatorSetti
 def _track(
     telemetry: Telemetry, first: int, record: Record, chosen: EstimatorSettings, tracks: AttitudeTracks
 ) -> AttitudeTrack:
-    """The only run of some tracks, from an instant of its log on."""
+    """Return the only run as a track, which begins at row ``first`` of the log."""
     used, q = chosen.settings.sensors, tracks.q[0]
     return AttitudeTrack(
         title=chosen.in_words,
@@ -189,7 +188,7 @@ def _track(
         sigma={state: sigma[0] for state, sigma in tracks.sigma_by_state.items()},
         nis=dict(zip(SENSORS, tracks.nis[0].T, strict=True)),
         q_orbital=q,
-        warnings=warnings_of(record, tracks)[0],
+        warnings=warning_sentences(record, tracks)[0],
         gated=dict(zip(SENSORS, tracks.rejected[0].T, strict=True)),
         degraded={COLLINEAR: collinear_rows(record, used, 0)},
         unseen_torque_Nm=unseen_torque_Nm(record, tracks, 0),
@@ -197,20 +196,25 @@ def _track(
     )
 
 
-def estimated(
-    record: Record, chosen: EstimatorSettings, start: Start | Callable[[Record, FilterSettings], Start] | None = None
+def estimate_tracks(
+    record: Record,
+    chosen: EstimatorSettings,
+    start: FilterStart | Callable[[Record, FilterSettings], FilterStart] | None = None,
 ) -> AttitudeTracks:
-    """Tracks of the filter that is wanted, from a start or what finds one; by default as the settings say."""
+    """Run the chosen filter from a start, or from a function that finds one.
+
+    By default the settings choose that function.
+    """
     start = start or (vector_start if chosen.start == "vectors" else any_start)
     with naming(f"filter {chosen.filter}"):
         try:
-            # What leaves double precision is not finite in the end, which is for the caller to tell.
+            # Overflow makes the result not finite, which the caller reports.
             with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
-                if isinstance(start, Start):
-                    first = checked_start(record, chosen.settings, start)
+                if isinstance(start, FilterStart):
+                    first = choose_start(record, chosen.settings, start)
                 else:
                     first = start(record, chosen.settings)
-                return _estimated(record, chosen, first)
+                return _run_chosen(record, chosen, first)
         except np.linalg.LinAlgError:
             raise InputError(
                 f"filter {chosen.filter}: found a covariance that is not positive definite any more, expected noise of "
@@ -218,13 +222,13 @@ def estimated(
             ) from None
 
 
-def _estimated(record: Record, chosen: EstimatorSettings, start: Start) -> AttitudeTracks:
+def _run_chosen(record: Record, chosen: EstimatorSettings, start: FilterStart) -> AttitudeTracks:
     settings = chosen.settings
     if chosen.filter == "constant-gain":
         return run_constant_gain(record, settings, start)
     if chosen.filter in ("parallel-disturbance", "self-tuning"):
-        # Their disturbance is not that of the filter by which the start was found.
-        start = Start(start.q, start.w, start.covariance[:, :ALWAYS, :ALWAYS])
+        # The filter that found the start has another disturbance state.
+        start = FilterStart(start.q, start.w, start.covariance[:, :ALWAYS, :ALWAYS])
     if chosen.filter == "parallel-disturbance":
         return run_parallel(record, settings, start, forgetting=chosen.forgetting)
     if chosen.filter == "reduced":
@@ -232,4 +236,4 @@ def _estimated(record: Record, chosen: EstimatorSettings, start: Start) -> Attit
     if chosen.filter == "self-tuning":
         return run_self_tuned(record, settings, start)
     tracks = run_filter(record, settings, start, closed_loop_F=chosen.closed_loop_F)
-    return smoothed(record, tracks) if chosen.filter == "smoother" else tracks
+    return smooth(record, tracks) if chosen.filter == "smoother" else tracks

@@ -1,7 +1,7 @@
-"""Named problems of attitude determination, found in a record and what a filter made of it.
+"""Problems of attitude determination, found in a record and its estimates.
 
 Each is one sentence that says what is degraded or cannot be observed, and for how long. The covariance of the estimates
-tells how much, except where the model itself is wrong: there the readings must be compared with it.
+says by how much, unless the model itself is wrong: then readings must be compared with the model.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
-from adcs.kalman.error_state import AttitudeTracks, FilterSettings, SensorSet, State
+from adcs.kalman.error_state import AttitudeState, AttitudeTracks, FilterSettings, SensorSet
 from adcs.kalman.mekf import deviations, residuals
 from adcs.quaternion import rotate_back
 from adcs.satellite.sensors import NIS_SIZES, SENSOR_WORDS
@@ -23,85 +23,85 @@ from magloc.navigation.rotations import cross_matrix
 
 COLLINEAR = "Sun and field on one line"
 COLLINEAR_RAD = math.radians(20.0)
-"""Sun and field nearer to one line than this leave the turn about it badly known: its noise is three times as large."""
+"""Angle of Sun and field from one line below which the rotation about it has three times the noise."""
 GROWS = 1.5
-"""Growth of the attitude's deviation, with one direction left, of which it is worth while to speak."""
+"""Growth of the attitude's standard deviation, with one direction left, that is reported."""
 FALSE_ALARM = 1e-6
-"""Probability with which readings that fit their model are called wrong."""
+"""Probability of reporting readings that fit their model."""
 BLOCK = 64
-"""Readings over which residuals are summed: what lasts as long as that does not average out."""
+"""Readings per sum of residuals: white noise averages out within it, errors that last do not."""
 SEEN = 0.7
-"""Amplitude of an attitude, in deviations of one instant's readings, from which on a filter can tell what moves it."""
+"""Smallest observable amplitude of the attitude, in standard deviations of the readings of one instant."""
 PERIODS_S = (100.0, 300.0, 1000.0)
-"""Of torques, for which the filter is asked what it would not see."""
+"""Periods of the torques for which the smallest observable amplitude is reported."""
 
 
-class Problem(NamedTuple):
-    """What is degraded or cannot be observed, and the instants (n,) at which it is."""
+class AttitudeProblem(NamedTuple):
+    """Sentence about what is degraded or not observable, and the instants (n,) concerned."""
 
     text: str
     rows: BoolArray
 
 
-def problems_of(record: Record, estimates: AttitudeTracks) -> tuple[tuple[Problem, ...], ...]:
-    """Problems of every run, in the order of the list below; none where nothing is wrong.
+def find_problems(record: Record, estimates: AttitudeTracks) -> tuple[tuple[AttitudeProblem, ...], ...]:
+    """Find the problems of each run, in the order of this list.
 
     - eclipse, no star tracker reading (over-rate or blinded),
     - Sun and field on one line,
     - one direction with a biased gyro,
     - readings that contradict the rest,
     - a field that does not fit its model: an error of the model, or the satellite's own field,
-    - an error of the field's model that is stated, and taken for noise of single readings,
-    - innovations that the covariance does not explain,
-    - residuals that last: something turns the satellite that is not in the model.
+    - a stated error of the field model that is treated as white noise,
+    - innovations larger than their covariance,
+    - correlated residuals: a torque that is not in the model.
     """
     used = estimates.settings.sensors
     always = np.ones(estimates.q.shape[1], dtype=np.bool_)
     return tuple(
         (
-            *_lost_sun(record, used, run),
-            *_lost_stars(record, estimates, run),
-            *_collinear(record, used, run),
+            *_sun_gaps(record, used, run),
+            *_star_gaps(record, estimates, run),
+            *_collinearity(record, used, run),
             *_one_vector(record, estimates, run),
-            # The estimate is none the worse for a reading that is left out.
-            *(Problem(text, ~always) for text in _rejected(estimates, run)),
-            *(Problem(text, always) for text in _field_model(record, estimates, run)),
-            *(Problem(text, ~always) for text in _error_as_noise(estimates.settings)),
-            *(Problem(text, always) for text in _innovations(estimates, run)),
-            *(Problem(text, always) for text in _lasting(record, estimates, run)),
+            # A rejected reading does not degrade the estimate.
+            *(AttitudeProblem(text, ~always) for text in _rejections(estimates, run)),
+            *(AttitudeProblem(text, always) for text in _field_model(record, estimates, run)),
+            *(AttitudeProblem(text, ~always) for text in _error_as_noise(estimates.settings)),
+            *(AttitudeProblem(text, always) for text in _innovations(estimates, run)),
+            *(AttitudeProblem(text, always) for text in _correlated_residuals(record, estimates, run)),
         )
         for run in range(len(estimates.q))
     )
 
 
-def warnings_of(record: Record, estimates: AttitudeTracks) -> tuple[tuple[str, ...], ...]:
-    """Sentences of the problems of every run."""
-    return tuple(tuple(problem.text for problem in of_run) for of_run in problems_of(record, estimates))
+def warning_sentences(record: Record, estimates: AttitudeTracks) -> tuple[tuple[str, ...], ...]:
+    """Return the sentences of the problems of each run."""
+    return tuple(tuple(problem.text for problem in of_run) for of_run in find_problems(record, estimates))
 
 
 def collinear_rows(record: Record, used: SensorSet, run: int) -> BoolArray:
-    """Where Sun and field, which alone tell the attitude, are on one line, shape (n,)."""
+    """Return the instants (n,) at which Sun and field, the only directions, are on one line."""
     if used.star or not (used.magnetometer and used.sun):
         return np.zeros(record.momentum_Nms.shape[1], dtype=np.bool_)
     near = record.environment.separation_rad[run] < COLLINEAR_RAD
     return np.asarray(near & is_read(record.readings.sun[run]))
 
 
-def _lost_sun(record: Record, used: SensorSet, run: int) -> list[Problem]:
+def _sun_gaps(record: Record, used: SensorSet, run: int) -> list[AttitudeProblem]:
     if not used.sun:
         return []
     missing = ~is_read(record.readings.sun[run])
     dark = missing & ~record.environment.sunlit[run]
     problems = []
     if dark.any():
-        problems.append(Problem(f"eclipse: no Sun for {_seconds(dark, record)}; attitude is degraded", dark))
+        problems.append(AttitudeProblem(f"eclipse: no Sun for {_seconds(dark, record)}; attitude is degraded", dark))
     if (missing & ~dark).any():
         outside = missing & ~dark
-        problems.append(Problem(f"Sun outside of all heads' fields for {_seconds(outside, record)}", outside))
+        problems.append(AttitudeProblem(f"Sun outside of all heads' fields for {_seconds(outside, record)}", outside))
     return problems
 
 
-def _lost_stars(record: Record, estimates: AttitudeTracks, run: int) -> list[Problem]:
+def _star_gaps(record: Record, estimates: AttitudeTracks, run: int) -> list[AttitudeProblem]:
     if not estimates.settings.sensors.star:
         return []
     missing = ~is_read(record.readings.star[run])
@@ -111,24 +111,24 @@ def _lost_stars(record: Record, estimates: AttitudeTracks, run: int) -> list[Pro
     problems = []
     if fast.any():
         text = f"star tracker over-rate: above {math.degrees(limit):g}°/s for {_seconds(fast, record)}"
-        problems.append(Problem(text, fast))
+        problems.append(AttitudeProblem(text, fast))
     if blind.any():
-        problems.append(Problem(f"star tracker blinded by Sun or Earth for {_seconds(blind, record)}", blind))
+        problems.append(AttitudeProblem(f"star tracker blinded by Sun or Earth for {_seconds(blind, record)}", blind))
     return problems
 
 
-def _collinear(record: Record, used: SensorSet, run: int) -> list[Problem]:
+def _collinearity(record: Record, used: SensorSet, run: int) -> list[AttitudeProblem]:
     near = collinear_rows(record, used, run)
     if not near.any():
         return []
     least = math.degrees(float(record.environment.separation_rad[run, near].min()))
     known = "known by the gyro only" if used.gyro else "not observable there"
     text = f"{COLLINEAR} within {least:.0f}° for {_seconds(near, record)}: the turn about it is {known}"
-    return [Problem(text, near)]
+    return [AttitudeProblem(text, near)]
 
 
-def _one_vector(record: Record, estimates: AttitudeTracks, run: int) -> list[Problem]:
-    """Compare the deviation of the attitude where one direction is left with that before, if its bias is a state."""
+def _one_vector(record: Record, estimates: AttitudeTracks, run: int) -> list[AttitudeProblem]:
+    """Compare the attitude's deviation before and during gaps that leave one direction."""
     used = estimates.settings.sensors
     if used.star or not used.gyro:
         return []
@@ -143,24 +143,24 @@ def _one_vector(record: Record, estimates: AttitudeTracks, run: int) -> list[Pro
         return []
     begins = f"one direction and a gyro for {_seconds(alone, record)}"
     if "gyro-bias" not in used.states:
-        return [Problem(f"{begins}: a bias of the gyro is not in the state and would accumulate", alone)]
+        return [AttitudeProblem(f"{begins}: a bias of the gyro is not in the state and would accumulate", alone)]
     sigma_deg = np.degrees(2.0 * estimates.sigma[run, :, :3].max(axis=-1))
     firsts = np.flatnonzero(alone & ~np.concatenate([[False], alone[:-1]]))
-    growth = [(_next_largest(sigma_deg, alone, first), sigma_deg[max(first - 1, 0)]) for first in firsts.tolist()]
+    growth = [(_largest_in_gap(sigma_deg, alone, first), sigma_deg[max(first - 1, 0)]) for first in firsts.tolist()]
     largest, before = max(growth, key=lambda pair: pair[0] / pair[1])
     if largest < GROWS * before:
         return []
     text = f"{begins}: the turn about it is known by the gyro only, 1σ grows from {before:.2g}° to {largest:.2g}°"
-    return [Problem(text, alone)]
+    return [AttitudeProblem(text, alone)]
 
 
-def _next_largest(sigma: FloatArray, alone: BoolArray, first: int) -> float:
-    """Largest deviation from an instant to the last of its gap."""
+def _largest_in_gap(sigma: FloatArray, alone: BoolArray, first: int) -> float:
+    """Return the largest deviation from an instant to the end of its gap."""
     ends = np.flatnonzero(~alone[first:])
     return float(sigma[first : first + ends[0] if ends.size else None].max())
 
 
-def _rejected(estimates: AttitudeTracks, run: int) -> list[str]:
+def _rejections(estimates: AttitudeTracks, run: int) -> list[str]:
     sentences = []
     for rejected, nis, word in zip(estimates.rejected[run].T, estimates.nis[run].T, SENSOR_WORDS.values(), strict=True):
         if rejected.any():
@@ -172,7 +172,7 @@ def _rejected(estimates: AttitudeTracks, run: int) -> list[str]:
 
 
 def _field_model(record: Record, estimates: AttitudeTracks, run: int) -> list[str]:
-    """Compare what does not depend on the attitude: the field's modulus, and its angle with the Sun."""
+    """Compare the field's modulus and its angle with the Sun, which need no attitude, with the model."""
     settings = estimates.settings
     used = settings.sensors
     if not used.magnetometer or {"field-bias", "field-model", "field-gain"} & set(used.states):
@@ -217,7 +217,7 @@ def _error_as_noise(settings: FilterSettings) -> list[str]:
 
 
 def _innovations(estimates: AttitudeTracks, run: int) -> list[str]:
-    """Compare the sum of NIS of what is used over the second half of the run, after the start, with its χ²."""
+    """Compare the sum of NIS over the second half of the run, after convergence, with its χ²."""
     used = np.where(estimates.rejected[run], np.nan, estimates.nis[run])
     nis = used[len(used) // 2 :]
     numbers = int((np.isfinite(nis) * list(NIS_SIZES.values())).sum())
@@ -227,20 +227,20 @@ def _innovations(estimates: AttitudeTracks, run: int) -> list[str]:
     return [f"innovations are {math.sqrt(total / numbers):.1f} times what the covariance explains: the model is wrong"]
 
 
-def _lasting(record: Record, estimates: AttitudeTracks, run: int) -> list[str]:
-    """Compare sums of residuals over blocks of readings with what white ones would have.
+def _correlated_residuals(record: Record, estimates: AttitudeTracks, run: int) -> list[str]:
+    """Compare sums of residuals over blocks of readings with those of white noise.
 
-    After its update a filter's residual is RS⁻¹ times the innovation, as white as that; a torque that the process noise
-    does not allow leaves a part that lasts, far below the noise of one reading, where NIS is blind to it.
+    The post-fit residual is RS⁻¹ times the innovation, and as white. A torque larger than the process noise leaves a
+    correlated part far below the noise of one reading, which NIS does not show.
     """
     total, numbers = 0.0, 0
-    for sensor, of_sensor in residuals_after(record, estimates, run).items():
-        rows = of_sensor[len(of_sensor) // 2 :]
+    for sensor, values in postfit_residuals(record, estimates, run).items():
+        rows = values[len(values) // 2 :]
         rows = rows[~(np.isnan(rows[:, 0]) | estimates.rejected[run, -len(rows) :, sensor])]
         blocks = rows[: len(rows) // BLOCK * BLOCK].reshape(-1, BLOCK, 3)
         if len(blocks) < 2:
             continue
-        # What is constant throughout, process noise can allow for.
+        # Process noise can explain a constant part.
         sums = blocks.sum(axis=1) - blocks.sum(axis=1).mean(axis=0)
         variance = np.var(blocks, axis=(0, 1))
         told = variance > 0.0
@@ -254,20 +254,20 @@ def _lasting(record: Record, estimates: AttitudeTracks, run: int) -> list[str]:
     ]
 
 
-def residuals_after(record: Record, estimates: AttitudeTracks, run: int) -> dict[int, FloatArray]:
-    """Residuals (n, 3) of a run's readings from its estimates, by the sensor's place; NaN without a reading."""
+def postfit_residuals(record: Record, estimates: AttitudeTracks, run: int) -> dict[int, FloatArray]:
+    """Return post-fit residuals (n, 3) of a run by index of the sensor; NaN without a reading."""
     each = instants_as_runs(record, run)
     optional = {name: values[run] for name, values in estimates.optional.items()}
-    state = State(estimates.q[run], estimates.w[run], optional, estimates.covariance[run])
+    state = AttitudeState(estimates.q[run], estimates.w[run], optional, estimates.covariance[run])
     return {sensor: residual for sensor, residual, _ in residuals(each, 0, state, estimates.settings.sensors)}
 
 
 def unseen_torque_Nm(record: Record, estimates: AttitudeTracks, run: int) -> Mapping[float, float]:
-    """Largest amplitude [N·m] of a torque of each of some periods that the readings do not show.
+    """Return the largest unobservable torque amplitude [N·m] by period [s].
 
-    A torque of amplitude J·d and period T moves the attitude by d (T/2π)² and the rate by d T/2π. Below 0.7 deviations
-    of one instant's readings, about the axis that they tell worst, no filter can say what moves the satellite, and
-    none can know how wrong it is.
+    A torque of amplitude J·d and period T changes the attitude by d (T/2π)² and the rate by d T/2π. Below 0.7 standard
+    deviations of the readings of one instant, about the axis that they measure worst, no filter can estimate the
+    torque, nor the error that it causes.
     """
     sigma, used = deviations(record, estimates.settings), estimates.settings.sensors
     q, around = estimates.q[run], record.environment

@@ -1,8 +1,8 @@
-"""Which sensors a filter has, what it estimates besides attitude and rate, and the process noise that suits them.
+"""Sensors, optional states and process noise of an attitude filter.
 
 See docs/theory/attitude-kalman-filters.md. Source: Ivanov, Ivlev, Karpenko, Ovchinnikov, Keldysh Institute preprint 64,
-2014, Tables 3 to 5. Its exponents are lost or unsure: those of :func:`paper_noise` are ours, found from what the filter
-then reaches.
+2014, Tables 3 to 5. Its exponents are missing or uncertain: those of :func:`paper_noise` are ours, chosen so that the
+filter is as accurate as the tables say.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from arrays.typing import BoolArray, FloatArray
 from magloc.levels import CONTRADICTION
 
 SIZES = {"field-bias": 3, "gyro-bias": 3, "disturbance": 3, "field-model": 3, "dipole": 3, "field-gain": 9}
-"""Optional states in the order of the error state, and how many numbers they have."""
+"""Optional states in the order of the error state, with their numbers of components."""
 STATES = tuple(SIZES)
 FIELD_ERROR_T = 150e-9
-"""Error of a component of a model of the core's field: crust, currents around the Earth, and the model's own."""
+"""Error of each component of a model of the core field: crust, currents around the Earth, and the model itself."""
 OPEN_RAD = 2.0
-"""Standard deviation of an axis of which nothing is known, about that of a uniform turn."""
+"""Standard deviation of the angle about an unknown axis, close to that of a uniform distribution."""
 RATE_RAD_S = math.radians(0.5)
-"""Standard deviation of the rate against the orbital frame, where there is no gyro."""
+"""Standard deviation of the rate against the orbital frame without a gyro."""
 ALWAYS = 6
-"""Numbers of attitude and rate, which every filter has."""
+"""Components of attitude and rate, which every filter has."""
 
 
 @dataclass(frozen=True)
@@ -56,27 +56,27 @@ class SensorSet:
 
     @property
     def size(self) -> int:
-        """Numbers of the error state."""
+        """Number of components of the error state."""
         return ALWAYS + sum(SIZES[state] for state in self.states)
 
-    def place(self, state: str) -> slice:
-        """Where an optional state of the set stands in the error state."""
+    def slice_of(self, state: str) -> slice:
+        """Return the slice of an optional state in the error state."""
         before = self.states[: self.states.index(state)]
         first = ALWAYS + sum(SIZES[name] for name in before)
         return slice(first, first + SIZES[state])
 
-    def by_state(self, error: FloatArray) -> dict[str, FloatArray]:
-        """Errors (..., N) or their standard deviations as (..., k) of each state; that of the attitude is an angle."""
+    def split(self, error: FloatArray) -> dict[str, FloatArray]:
+        """Split errors or standard deviations (..., N) by state, (..., k); attitude becomes an angle."""
         always = {"attitude": 2.0 * error[..., :3], "rate": error[..., 3:6]}
-        return always | {state: error[..., self.place(state)] for state in self.states}
+        return always | {state: error[..., self.slice_of(state)] for state in self.states}
 
-    def without(self, state: str) -> SensorSet:
-        """The set without an optional state."""
+    def drop(self, state: str) -> SensorSet:
+        """Return the set without an optional state."""
         return replace(self, states=tuple(name for name in self.states if name != state))
 
 
 def sensor_set(sensors: str, states: Iterable[str] = ()) -> SensorSet:
-    """Set of sensors and states by their names.
+    """Return a set of sensors and states by their names.
 
     ``sensors``: names of :data:`SENSORS` in any order with + between them. ``states``: names of :data:`STATES` in any
     order, or of :data:`adcs.kalman.names.TOGETHER`.
@@ -102,10 +102,11 @@ def sensor_set(sensors: str, states: Iterable[str] = ()) -> SensorSet:
 
 
 def check_observable(used: SensorSet) -> None:
-    """Raise where a set cannot observe attitude, or a state that it has.
+    """Raise ValueError if a set cannot observe the attitude, or one of its states.
 
-    A direction leaves the rotation about it open. The field turns along the orbit, and the motion, by a gyro or by the
-    equations of motion alone, closes the gap; the Sun stays where it is, so that no time helps there.
+    One direction leaves the rotation about it open. The field changes its direction along the orbit: with a gyro, or
+    with the equations of motion, its readings then observe that rotation too. The direction of the Sun stays constant,
+    so a Sun sensor alone never does.
     """
     for state in used.states:
         if not is_measured(state, used.sensors):
@@ -124,7 +125,7 @@ def check_observable(used: SensorSet) -> None:
 
 @dataclass(frozen=True)
 class ProcessNoise:
-    """Standard deviations that every step of the filter adds to each component of the error state.
+    """Standard deviations that each step adds to each component of the error state.
 
     Attributes
     ----------
@@ -141,7 +142,7 @@ class ProcessNoise:
     dipole_Am2 : float
         q_m.
     field_gain : float
-        q_D, of each of the nine numbers.
+        q_D, of each of the nine components.
 
     Raises
     ------
@@ -162,28 +163,29 @@ class ProcessNoise:
 
 
 def tuned_noise(used: SensorSet) -> ProcessNoise:
-    """Process noise with which the filter is accurate and its covariance true, for a constant torque of 8e-7 N·m.
+    """Return process noise that makes the filter accurate and consistent.
 
-    With the state ``dipole`` and without ``disturbance`` it is for constant torques up to 1e-8 N·m besides.
+    It is tuned for a constant torque of 8e-7 N·m; with the state ``dipole`` and without ``disturbance``, for one of up
+    to 1e-8 N·m besides that of the dipole.
     """
     if "dipole" in used.states:
-        # A dipole is told from other torques by orbits: what is not white must not be as large as tells it.
+        # Only whole orbits separate a dipole from other torques, so that larger process noise would hide it.
         if "disturbance" in used.states:
             return ProcessNoise(1e-8, 1e-8, disturbance_s2=3e-10)
         return ProcessNoise(1e-8, 2e-7)
     if "disturbance" in used.states:
-        # The torque is in the state: what is left for the rate is almost nothing.
+        # The torque is a state, so the rate needs almost no noise of its own.
         if used.star and "gyro-bias" not in used.states:
             return ProcessNoise(1e-8, 1e-8, disturbance_s2=3e-8)
         return ProcessNoise(1e-8, 1e-7, disturbance_s2=1e-8)
-    # The torque moves the rate by up to 1.5e-6 rad/s a step. A star tracker sees that within seconds; vectors average
-    # over minutes, in which a constant torque is far from white: ten times as much keeps the covariance true.
+    # The torque changes the rate by up to 1.5e-6 rad/s a step. A star tracker observes that within seconds; vectors
+    # average over minutes, in which a constant torque is far from white: ten times the noise keeps NEES consistent.
     return ProcessNoise(1e-8, 1.5e-6) if used.star else ProcessNoise(1e-8, 1.5e-5)
 
 
 PAPER_NOISE: dict[tuple[str, tuple[str, ...]], ProcessNoise] = {
-    # Table 3. Mantissas are printed, exponents ours. Biases of the field are printed for a field of unit length: they
-    # are multiplied by 40 µT here.
+    # Table 3. Mantissas are printed, exponents are ours. Field biases are printed for a field of unit length: they are
+    # multiplied by 40 µT here.
     ("st+gyro+mag+sun", ()): ProcessNoise(1e-5, 1.2e-6),
     ("st+gyro+mag", ()): ProcessNoise(1e-5, 1.2e-6),
     ("st+gyro", ()): ProcessNoise(1e-5, 1.2e-6),
@@ -205,7 +207,7 @@ PAPER_NOISE: dict[tuple[str, tuple[str, ...]], ProcessNoise] = {
 
 
 def paper_noise(used: SensorSet) -> ProcessNoise:
-    """Process noise of the source's tables."""
+    """Return the process noise of the source's tables."""
     try:
         return PAPER_NOISE[used.sensors, used.states]
     except KeyError:
@@ -217,26 +219,26 @@ def paper_noise(used: SensorSet) -> ProcessNoise:
 
 @dataclass(frozen=True)
 class FilterSettings:
-    """What a filter is.
+    """Settings of an attitude filter.
 
     Attributes
     ----------
     field_error_T : float
-        Standard deviation of each component of the field model's error: added to the magnetometer's noise, or that of
-        the state ``field-model``, for which :data:`FIELD_ERROR_T` stands in place of 0.
+        Standard deviation of each component of the field model's error. It is added to the magnetometer's noise, or is
+        that of the state ``field-model``, which takes :data:`FIELD_ERROR_T` in place of 0.
     field_correlation_s : float
         Time constant of the state ``field-model``; 1,000 km of a low orbit.
     disturbance_correlation_s : float
-        Time constant of the state ``disturbance``, whose standard deviation then stays that of the start; without one
-        it walks.
+        Time constant of the state ``disturbance``, which keeps its initial standard deviation; if infinite, the state
+        is a random walk.
     field_bias_sigma_T, gyro_bias_sigma_rad_s, disturbance_sigma_s2, dipole_sigma_Am2 : float
-        Standard deviations of those states at the start, where they are zero: the dipole is that besides the residual
-        dipole which the satellite is known to have.
+        Initial standard deviations of those states, whose initial values are zero. The dipole is added to the known
+        residual dipole of the satellite.
     field_gain_sigma, field_axes_sigma_rad : float
-        The same of the magnetometer's gains, and of the angles by which its axes are off; state ``field-gain``.
+        The same of the magnetometer's gains, and of the misalignment of its axes; state ``field-gain``.
     gate : float
-        Probability with which a good reading is taken for one that contradicts the filter, which is then not used; with
-        0 all readings are used.
+        Probability of rejecting a good reading, because it seems to contradict the filter; with 0 all readings are
+        used.
     """
 
     sensors: SensorSet
@@ -268,19 +270,22 @@ class FilterSettings:
         """Standard deviation of the state ``field-model``."""
         return self.field_error_T or FIELD_ERROR_T
 
-    def kept(self, step_s: float | FloatArray) -> FloatArray:
-        """What a step leaves of the error state, (N,), or (k, N) of steps (k, 1): not all with a time constant."""
+    def decay(self, step_s: float | FloatArray) -> FloatArray:
+        """Return the factors by which a step multiplies the error state.
+
+        Shape (N,), or (k, N) for steps (k, 1); below 1 for states with a time constant.
+        """
         rate = np.zeros(self.sensors.size)
         for state, time_s in (
             ("field-model", self.field_correlation_s),
             ("disturbance", self.disturbance_correlation_s),
         ):
             if state in self.sensors.states:
-                rate[self.sensors.place(state)] = 1.0 / time_s
+                rate[self.sensors.slice_of(state)] = 1.0 / time_s
         return np.exp(-np.asarray(step_s) * rate)
 
     def process_variance(self, step_s: float | FloatArray, usual_s: float) -> FloatArray:
-        """Diagonal of Q of steps, (N,), or (k, N) of steps (k, 1); ``noise`` is that of a usual one."""
+        """Return the diagonal of Q, (N,), or (k, N) for steps (k, 1); ``noise`` holds for a usual step."""
         noise = self.noise
         walks = {
             "field-bias": noise.field_bias_T,
@@ -292,11 +297,11 @@ class FilterSettings:
         }
         always = np.repeat(np.square([noise.attitude, noise.rate_rad_s]), 3)
         variance = np.concatenate([always, self._variances(walks)]) * (np.asarray(step_s) / usual_s)
-        return variance + np.concatenate([np.zeros(ALWAYS), self.start_variance]) * (1.0 - self.kept(step_s) ** 2)
+        return variance + np.concatenate([np.zeros(ALWAYS), self.start_variance]) * (1.0 - self.decay(step_s) ** 2)
 
     @property
     def start_variance(self) -> FloatArray:
-        """Variances of the optional states at the start, shape (N - 6,)."""
+        """Initial variances of the optional states, shape (N - 6,)."""
         return self._variances(
             {
                 "field-bias": self.field_bias_sigma_T,
@@ -309,58 +314,62 @@ class FilterSettings:
         )
 
     def _variances(self, deviation: Mapping[str, ArrayLike]) -> FloatArray:
-        """Variances of the numbers of the optional states, from the deviations of each state."""
+        """Return the variance of each component of the optional states, from standard deviations."""
         each = [np.broadcast_to(deviation[state], SIZES[state]) for state in self.sensors.states]
         return np.square(np.concatenate([np.zeros(0), *each]))
 
     @property
     def open_variance(self) -> FloatArray:
-        """Variances of an error state of which nothing is known, shape (N,)."""
+        """Variances of an unknown error state, shape (N,)."""
         return np.concatenate([np.repeat(np.square([0.5 * OPEN_RAD, RATE_RAD_S]), 3), self.start_variance])
 
     @property
     def gate_limit(self) -> float:
-        """Largest NIS of a reading that is used, by a χ² of three numbers."""
+        """Largest NIS of an accepted reading, from χ² with three degrees of freedom."""
         return float(chdtri(3, self.gate)) if self.gate > 0.0 else math.inf
 
 
 @dataclass(frozen=True, eq=False)
-class Start:
-    """Estimates before the first reading; optional states are zero with the settings' deviations unless it has them."""
+class FilterStart:
+    """Estimates before the first reading.
+
+    Optional states that it lacks are zero, with the standard deviations of the settings.
+    """
 
     q: FloatArray  # (runs, 4)
     w: FloatArray  # (runs, 3)
     covariance: FloatArray  # (runs, 6, 6) of (δq, δω), δq being half of the angle, or (runs, N, N) of all states
     optional: Mapping[str, FloatArray] = field(default_factory=dict)  # (runs, k), by name
 
-    def of_runs(self, runs: NDArray[np.intp]) -> Start:
-        """Return the start of some runs, each as often as its index comes."""
+    def select_runs(self, runs: NDArray[np.intp]) -> FilterStart:
+        """Return the start of the runs with these indices, which may repeat."""
         optional = {name: values[runs] for name, values in self.optional.items()}
-        return Start(self.q[runs], self.w[runs], self.covariance[runs], optional)
+        return FilterStart(self.q[runs], self.w[runs], self.covariance[runs], optional)
 
 
-def start_near(q: FloatArray, w: FloatArray, attitude_rad: float, rate_rad_s: float) -> Start:
-    """Start from estimates with independent errors.
+def start_near(q: FloatArray, w: FloatArray, attitude_rad: float, rate_rad_s: float) -> FilterStart:
+    """Return a start from estimates with independent errors.
 
-    Shapes ``q`` (runs, 4), ``w`` (runs, 3). ``attitude_rad``, ``rate_rad_s``: standard deviations per axis, of the
-    angle and of the rate.
+    Shapes ``q`` (runs, 4), ``w`` (runs, 3). ``attitude_rad``, ``rate_rad_s``: standard deviations per axis.
     """
     variance = np.repeat(np.square([0.5 * attitude_rad, rate_rad_s]), 3)
-    return Start(np.array(q), np.array(w), np.tile(np.diag(variance), (len(q), 1, 1)))
+    return FilterStart(np.array(q), np.array(w), np.tile(np.diag(variance), (len(q), 1, 1)))
 
 
-def joined_starts(starts: Sequence[Start]) -> Start:
-    """Return one start of the runs of several, which have the same optional states."""
+def concatenate_starts(starts: Sequence[FilterStart]) -> FilterStart:
+    """Join starts, which have the same optional states, into one of all their runs."""
     q, w, covariance = (np.concatenate([getattr(one, of) for one in starts]) for of in ("q", "w", "covariance"))
     names = starts[0].optional
-    return Start(q, w, covariance, {name: np.concatenate([one.optional[name] for one in starts]) for name in names})
+    return FilterStart(
+        q, w, covariance, {name: np.concatenate([one.optional[name] for one in starts]) for name in names}
+    )
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class AttitudeState:
     """Estimate of all runs at one instant.
 
-    ``q`` (runs, 4), ``w`` (runs, 3), ``optional``: the optional states of the filter by their names, (runs, k).
+    ``q`` (runs, 4), ``w`` (runs, 3), ``optional``: optional states (runs, k) by name.
     """
 
     q: FloatArray
@@ -368,8 +377,8 @@ class State:
     optional: Mapping[str, FloatArray]
     P: FloatArray  # (runs, N, N): covariance of the error state
 
-    def of(self, state: str) -> FloatArray:
-        """An optional state (runs, k); zero of one that the filter does not have."""
+    def optional_state(self, state: str) -> FloatArray:
+        """Return an optional state (runs, k); zero if the filter does not have it."""
         return self.optional[state] if state in self.optional else np.zeros((len(self.q), SIZES[state]))
 
 
@@ -382,19 +391,18 @@ class AttitudeTracks:
     q, w : ndarray, shape (runs, n, 4), (runs, n, 3)
         Attitude (orbital from body), rate against inertial space.
     optional : mapping of str to ndarray, shape (runs, n, k)
-        The optional states of the filter by their names.
+        Optional states by name.
     covariance : ndarray, shape (runs, n, N, N)
-        Of the error state, see :mod:`adcs.kalman.error_state`; δq is half of the angle.
+        Covariance of the error state; δq is half of the angle.
     nis : ndarray, shape (runs, n, 4)
         Normalised innovation squared of star tracker, gyro, magnetometer and Sun sensor, each given those before it;
-        NaN where there was no reading. It is a χ² of 3 numbers, of 2 for the Sun sensor.
+        NaN where there was no reading. It is χ² with 3 degrees of freedom, 2 for the Sun sensor.
     rejected : ndarray of bool, shape (runs, n, 4)
-        Readings that contradicted the estimate and were not used; none of a filter without a gate.
+        Readings that failed the gate and were not used.
     log_det : ndarray, shape (runs, n, 4)
-        Logarithm of the determinant of the innovations' covariance over that of the noise; NaN of other filters than
-        the error-state filter itself.
+        Logarithm of the determinant of the innovation covariance over that of the noise; NaN except for the MEKF.
     tuned_disturbance_s2 : ndarray, shape (runs, n), or None
-        Standard deviation that a bank of filters has found for the disturbance; None of one filter.
+        Standard deviation of the disturbance as estimated by a bank of filters; None for a single filter.
     """
 
     settings: FilterSettings
@@ -414,21 +422,21 @@ class AttitudeTracks:
 
     @property
     def sigma_by_state(self) -> dict[str, FloatArray]:
-        """Standard deviations of the states that there are, shape (runs, n, k)."""
-        return self.settings.sensors.by_state(self.sigma)
+        """Standard deviations (runs, n, k) by name of the state."""
+        return self.settings.sensors.split(self.sigma)
 
     @property
     def definite(self) -> BoolArray:
-        """Whether every variance of a run is positive, shape (runs,): a filter that lost one has diverged."""
+        """Whether all variances of a run are positive, shape (runs,); if not, it has diverged."""
         variances = np.diagonal(self.covariance, axis1=-2, axis2=-1)
         return np.asarray((variances > 0.0).all(axis=(1, 2)))
 
     @property
     def states(self) -> dict[str, FloatArray]:
-        """Rate [rad/s] and the optional states that there are, by their names, shape (runs, n, k)."""
+        """Rate [rad/s] and optional states by name, shape (runs, n, k)."""
         return {"rate": self.w, **self.optional}
 
-    def at(self, row: int) -> State:
-        """Estimate of all runs at one instant."""
+    def at(self, row: int) -> AttitudeState:
+        """Return the estimate of all runs at one instant."""
         optional = {state: values[:, row] for state, values in self.optional.items()}
-        return State(self.q[:, row], self.w[:, row], optional, self.covariance[:, row])
+        return AttitudeState(self.q[:, row], self.w[:, row], optional, self.covariance[:, row])

@@ -1,4 +1,4 @@
-"""Words by which a filter, its noise and its start are chosen."""
+"""Names of filters, of their noise and of their starts."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ FILTERS: tuple[str, ...] = get_args(Filter)
 NOISES: tuple[str, ...] = get_args(Noise)
 STARTS: tuple[str, ...] = get_args(StartKind)
 TOGETHER = {"magnetometer": ("field-bias", "field-gain")}
-"""What several states are called together."""
+"""Names of groups of states."""
 MEASURED_BY = {
     "field-bias": "mag",
     "gyro-bias": "gyro",
@@ -19,9 +19,9 @@ MEASURED_BY = {
     "field-gain": "mag",
     "magnetometer": "mag",
 }
-"""States that belong to a sensor: without it they cannot be estimated."""
+"""Sensor without which a state cannot be estimated."""
 
 
 def is_measured(state: str, sensors: str) -> bool:
-    """Whether sensors, joined by plus signs, have the one that measures a state, if it is one's own."""
+    """Return whether sensors, joined by plus signs, include the one that a state needs, if any."""
     return state not in MEASURED_BY or MEASURED_BY[state] in sensors.split("+")

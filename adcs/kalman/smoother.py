@@ -1,4 +1,4 @@
-"""Estimates of a finished record with what later readings tell as well: a fixed-interval smoother of the error state.
+"""Fixed-interval smoother of the error state.
 
 See docs/theory/attitude-kalman-filters.md.
 """
@@ -10,35 +10,40 @@ from dataclasses import replace
 import numpy as np
 
 from adcs import quaternion
-from adcs.kalman.error_state import AttitudeTracks, SensorSet, State
-from adcs.kalman.mekf import collected, predicted, with_error
+from adcs.kalman.error_state import AttitudeState, AttitudeTracks, SensorSet
+from adcs.kalman.mekf import apply_error, collect_tracks, predict
 from adcs.satellite.telemetry import Record
 from arrays.typing import FloatArray
 
 
-def smoothed(record: Record, estimates: AttitudeTracks) -> AttitudeTracks:
-    """Smoothed estimates of whole runs.
+def smooth(record: Record, estimates: AttitudeTracks) -> AttitudeTracks:
+    """Smooth the estimates of whole runs.
 
-    ``estimates``: of :func:`adcs.kalman.mekf.run_filter`. Returns: ``nis`` is that of the filter.
+    ``estimates``: from :func:`adcs.kalman.mekf.run_filter`. Returns: ``nis`` is that of the filter.
     """
     settings, n = estimates.settings, estimates.q.shape[1]
     later = estimates.at(n - 1)
     states = [later]
     for row in reversed(range(n - 1)):
         state = estimates.at(row)
-        ahead, Phi = predicted(record, row, state, settings)
-        # States of mixed units: solve with the correlations.
+        ahead, Phi = predict(record, row, state, settings)
+        # States have different units: solving with correlations is better conditioned.
         scale = np.sqrt(np.diagonal(ahead.P, axis1=-2, axis2=-1))
         correlation = ahead.P / (scale[:, :, None] * scale[:, None, :])
         C = np.linalg.solve(correlation, (Phi @ state.P) / scale[:, :, None]).mT / scale[:, None, :]
-        dx = (C @ difference(later, ahead, settings.sensors)[..., None])[..., 0]
+        dx = (C @ error_between(later, ahead, settings.sensors)[..., None])[..., 0]
         P = state.P + C @ (later.P - ahead.P) @ C.mT
-        later = replace(with_error(state, dx, settings.sensors), P=0.5 * (P + P.mT))
+        later = replace(apply_error(state, dx, settings.sensors), P=0.5 * (P + P.mT))
         states.append(later)
-    return collected(settings, states[::-1], estimates.nis, estimates.rejected)
+    return collect_tracks(settings, states[::-1], estimates.nis, estimates.rejected)
 
 
-def difference(state: State | AttitudeTracks, other: State | AttitudeTracks, used: SensorSet) -> FloatArray:
-    """Error state (..., N) that :func:`adcs.kalman.mekf.with_error` puts into ``other`` to make it ``state``."""
+def error_between(
+    state: AttitudeState | AttitudeTracks, other: AttitudeState | AttitudeTracks, used: SensorSet
+) -> FloatArray:
+    """Return the error state (..., N) by which ``state`` differs from ``other``.
+
+    :func:`adcs.kalman.mekf.apply_error` is its inverse.
+    """
     always = [quaternion.error_vector(other.q, state.q), state.w - other.w]
     return np.concatenate([*always, *(state.optional[name] - other.optional[name] for name in used.states)], axis=-1)

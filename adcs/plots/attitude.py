@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from adcs import quaternion
-from adcs.kalman.results import SHOWN, in_units
+from adcs.kalman.results import STATE_UNITS, state_table
 from adcs.satellite.attitude_track import AttitudeTrack
 from adcs.satellite.sensors import NIS_SIZES, SENSOR_WORDS, SENSORS
 from arrays.typing import BoolArray, FloatArray
@@ -37,8 +37,8 @@ def gaps_of(
 def track_figure(track: AttitudeTrack, name: str = "") -> Figure:
     """States of a track; the attitude is a rotation vector from the orbital frame, or from that of its vectors."""
     attitude = quaternion.log(track.q if track.q_orbital is None else track.q_orbital)
-    values = in_units({"attitude": attitude} | dict(track.states))
-    sigma = in_units(track.sigma) if track.sigma else np.full_like(values, np.nan)
+    values = state_table({"attitude": attitude} | dict(track.states))
+    sigma = state_table(track.sigma) if track.sigma else np.full_like(values, np.nan)
     gaps = gaps_of(track.seen, track.used, track.degraded)
     title = f"{name}: {track.title}" if name else track.title
     return states_figure(
@@ -63,13 +63,13 @@ def states_figure(
     missing, and whether it was there (n,).
     """
     # Nine numbers of one state are three rows.
-    states = [state for state, shown in SHOWN.items() for _ in range(len(shown.axes) // 3)]
+    states = [state for state, shown in STATE_UNITS.items() for _ in range(len(shown.axes) // 3)]
     rows = [row for row in range(len(states)) if not np.isnan(values[:, 3 * row]).all()]
     figure = style.new_figure(1.25 * len(rows) + 0.75)
     axes = figure.subplots(len(rows), 3, sharex=True, sharey="row", squeeze=False)
     settled = time_s >= time_s[0] + _SETTLED * np.ptp(time_s)
     for across, row in zip(axes, rows, strict=True):
-        state, shown = states[row], SHOWN[states[row]]
+        state, shown = states[row], STATE_UNITS[states[row]]
         scale, unit = (1e6, f"1e-6{shown.unit.removeprefix('1')}") if state == _MILLIONTHS else (1.0, shown.unit)
         part = f" {'xyz'[row - states.index(state)]}" if states.count(state) > 1 else ""
         label = f"{state.replace('-', ' ')}{part} [{unit}]"

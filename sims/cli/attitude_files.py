@@ -17,7 +17,7 @@ from sims.experiments.attitude import Outcome, Part, errors_in_units
 
 if TYPE_CHECKING:
     import xarray as xr
-from adcs.kalman.results import SHOWN, STATE_COLUMNS, in_units
+from adcs.kalman.results import STATE_COLUMNS, STATE_UNITS, state_table
 from arrays.typing import FloatArray
 
 
@@ -31,7 +31,7 @@ def attitude_files(
     time_s, name = first.runs.time_s, file.name
     # Truth minus estimate is what the filter's state is; an error is estimate minus truth.
     errors = -errors_in_units(first)[0]
-    sigma = in_units(first.estimates.sigma_by_state)[0]
+    sigma = state_table(first.estimates.sigma_by_state)[0]
     title = f"{name}: {estimate.in_words}"
     seen = {name: there[0] for name, there in first.runs.readings.seen.items()}
     used = estimate.settings.sensors
@@ -77,7 +77,7 @@ def _runs_table(outcome: Outcome) -> dict[str, Any]:
 def _truth_columns(part: Part, time_s: FloatArray) -> dict[str, Any]:
     """What the estimates of the telemetry may be compared with."""
     runs = part.runs
-    states = in_units({state: values[0] for state, values in runs.states.items()})
+    states = state_table({state: values[0] for state, values in runs.states.items()})
     columns: dict[str, Any] = {"time_s": time_s} | dict(zip(("qw", "qx", "qy", "qz"), runs.q[0].T, strict=True))
     return columns | dict(zip(STATE_COLUMNS[3:], states.T[3:], strict=True))
 
@@ -120,7 +120,7 @@ def dataset_of(parts: Sequence[Part], estimate: EstimatorSettings, title: str) -
         if state in estimate.settings.sensors.states:
             name, (values, true, sigma), axes = state.replace("-", "_"), of(state), axis
             if state == "field-gain":
-                axes, elements = ("run", "time", "element"), {"element": list(SHOWN[state].axes)}
+                axes, elements = ("run", "time", "element"), {"element": list(STATE_UNITS[state].axes)}
             listed += [
                 (name, axes, values, units, state.replace("-", " ")),
                 (f"{name}_true", axes, true, units, f"true {name}"),

@@ -145,12 +145,12 @@ def summary_lines(file: AttitudeFile, estimate: EstimatorSettings, numbers: dict
     """The result as text."""
     from adcs.io.estimates import unseen_line
     from adcs.kalman.diagnostics import PERIODS_S
-    from adcs.kalman.results import SHOWN
+    from adcs.kalman.results import STATE_UNITS
 
     runs = "1 run" if numbers["runs"] == 1 else f"{numbers['runs']} runs"
     lines = [f"{file.name}: {runs} of {file.duration_s:g} s; {estimate.in_words}"]
     # The first numbers are those of the states, in this order.
-    for (state, shown), number in zip(SHOWN.items(), numbers.values(), strict=False):
+    for (state, shown), number in zip(STATE_UNITS.items(), numbers.values(), strict=False):
         if number is not None:
             words = "angle, rms of the last minute" if state == "attitude" else shown.words
             lines.append(f"{words:34s}{number:.3g} {shown.unit}")

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adcs.io.scenario_files import AttitudeFile
-from adcs.kalman.bank import EstimatorSettings, estimated
-from adcs.kalman.diagnostics import Problem, problems_of, unseen_torque_Nm
+from adcs.kalman.bank import EstimatorSettings, estimate_tracks
+from adcs.kalman.diagnostics import AttitudeProblem, find_problems, unseen_torque_Nm
 from adcs.kalman.error_state import AttitudeTracks, start_near
-from adcs.kalman.results import in_units, worst_axis
+from adcs.kalman.results import largest_by_state, state_table
 from arrays.io.errors import InputError
 from arrays.typing import FloatArray
 from sims.attitude.files import simulation_of
@@ -104,7 +104,7 @@ class Outcome:
 
     def numbers(self) -> dict[str, Any]:
         """What ``--json`` prints: every axis' mean over the runs, and of these the worst axis."""
-        mean, tuned = worst_axis(self.axis_rms.mean(axis=0)), np.median(self.tuned_disturbance_s2)
+        mean, tuned = largest_by_state(self.axis_rms.mean(axis=0)), np.median(self.tuned_disturbance_s2)
         names = (
             *("angle_rms_deg", "rate_rms_deg_s", "gyro_bias_rms_deg_s"),
             *(
@@ -141,7 +141,7 @@ def _part(file: AttitudeFile, estimate: EstimatorSettings, scenario: AttitudeSce
     if estimate.start == "near":
         errors = estimate.start_attitude_rad, estimate.start_rate_rad_s
         start = start_near(*start_estimates(runs.prepared, *errors), *errors)
-    return Part(runs, estimated(runs, estimate, start))
+    return Part(runs, estimate_tracks(runs, estimate, start))
 
 
 def _simulated(file: AttitudeFile, scenario: AttitudeScenario, seeds: Sequence[int]) -> AttitudeRuns:
@@ -223,7 +223,7 @@ def _largest(each: Iterable[Mapping[float, float]]) -> dict[float, float]:
 
 def errors_in_units(part: Part) -> FloatArray:
     """Truth minus estimate, shape (runs, n, 30), in the order and units of :attr:`Outcome.axis_rms`."""
-    return in_units(part.estimates.settings.sensors.by_state(accuracy.errors(part.runs, part.estimates)))
+    return state_table(part.estimates.settings.sensors.split(accuracy.errors(part.runs, part.estimates)))
 
 
 def outcome_of(part: Part) -> Outcome:
@@ -234,7 +234,7 @@ def outcome_of(part: Part) -> Outcome:
     errors = errors_in_units(part)
     size = estimates.settings.sensors.size
     wild = np.stack(list(runs.prepared.wild.values()), axis=-1)
-    problems, first = problems_of(runs, estimates), round(accuracy.LAST_S / runs.dt_s)
+    problems, first = find_problems(runs, estimates), round(accuracy.LAST_S / runs.dt_s)
     return Outcome(
         seeds=np.array(runs.prepared.seeds),
         axis_rms=np.sqrt(np.mean(errors[:, late] ** 2, axis=1)),
@@ -255,7 +255,7 @@ def outcome_of(part: Part) -> Outcome:
     )
 
 
-def _worst(error_deg: FloatArray, problems: Sequence[Problem], first: int) -> float:
+def _worst(error_deg: FloatArray, problems: Sequence[AttitudeProblem], first: int) -> float:
     """Largest error at the instants of some problems, from the instant ``first`` on; NaN where there are none."""
     rows = np.zeros(len(error_deg), dtype=np.bool_)
     for problem in problems:

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from adcs import quaternion
 from adcs.environment.orbit import circular_orbit
-from adcs.kalman.error_state import FilterSettings, State, sensor_set, tuned_noise
+from adcs.kalman.error_state import AttitudeState, FilterSettings, sensor_set, tuned_noise
 from adcs.kalman.initialisation import vector_start
-from adcs.kalman.mekf import corrected, first_state, predicted
+from adcs.kalman.mekf import initial_state, predict, update_state
 from adcs.satellite.dynamics import WheelControl, relative_rate
 from adcs.satellite.magnetic_control import BDot, HysteresisRods, b_dot_gain, detumbled
 from adcs.satellite.satellite import Satellite
@@ -181,9 +181,9 @@ class _OnBoard:
     def __init__(self, settings: FilterSettings) -> None:
         self.settings = settings
         self.started: BoolArray | None = None
-        self.state: State | None = None
+        self.state: AttitudeState | None = None
 
-    def take(self, record: Record, row: int) -> tuple[State, BoolArray]:
+    def take(self, record: Record, row: int) -> tuple[AttitudeState, BoolArray]:
         """Estimate after the readings of an instant, of which none may be left out, and which runs have started."""
         settings, readings = self.settings, record.readings
         both = is_read(readings.field_T[:, row]) & is_read(readings.sun[:, row])
@@ -191,18 +191,18 @@ class _OnBoard:
             state, begins = self._begun(record, row, np.arange(len(both))), both
             self.started = both
         else:
-            state, begins = predicted(record, row - 1, self.state, settings)[0], both & ~self.started
+            state, begins = predict(record, row - 1, self.state, settings)[0], both & ~self.started
             self.started = self.started | both
         if begins.any():
             fresh = self._begun(record, row, np.flatnonzero(begins))
             state.q[begins], state.w[begins], state.P[begins] = fresh.q, fresh.w, fresh.P
             for name, values in fresh.optional.items():
                 state.optional[name][begins] = values
-        self.state, _ = corrected(record, row, state, settings)
+        self.state, _ = update_state(record, row, state, settings)
         return self.state, self.started
 
-    def _begun(self, record: Record, row: int, runs: NDArray[np.intp]) -> State:
-        return first_state(self.settings, vector_start(part(record, runs, slice(row, row + 1)), self.settings))
+    def _begun(self, record: Record, row: int, runs: NDArray[np.intp]) -> AttitudeState:
+        return initial_state(self.settings, vector_start(part(record, runs, slice(row, row + 1)), self.settings))
 
 
 def _time_below(rate: FloatArray, step_s: float) -> FloatArray:

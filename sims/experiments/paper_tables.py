@@ -16,11 +16,11 @@ import numpy as np
 
 from adcs.io.scenario_files import read_scenario
 from adcs.kalman.names import Filter
-from adcs.kalman.results import SHOWN, in_units, worst_axis
+from adcs.kalman.results import STATE_UNITS, largest_by_state, state_table
 from arrays.typing import FloatArray
 from sims.experiments.attitude import Part, run_scenario
 
-QUANTITIES = {state: state.replace("-", " ") for state in SHOWN}  # as the tables call them
+QUANTITIES = {state: state.replace("-", " ") for state in STATE_UNITS}  # as the tables call them
 
 
 @dataclass(frozen=True)
@@ -131,13 +131,13 @@ def compared_with_paper(row: PaperRow, seeds: Sequence[int], duration_s: float |
     last: list[FloatArray] = []
 
     def look(part: Part) -> None:
-        last.append(in_units(part.estimates.sigma_by_state)[:, -1])
+        last.append(state_table(part.estimates.sigma_by_state)[:, -1])
 
     outcome = run_scenario(file, file.estimator(file.path), seeds, look=look)
-    sigma = worst_axis(np.concatenate(last)).mean(axis=0)
-    rms = worst_axis(outcome.axis_rms.mean(axis=0))
+    sigma = largest_by_state(np.concatenate(last)).mean(axis=0)
+    rms = largest_by_state(outcome.axis_rms.mean(axis=0))
     found = []
-    for place, (state, shown) in enumerate(SHOWN.items()):
+    for place, (state, shown) in enumerate(STATE_UNITS.items()):
         quantity = QUANTITIES[state]
         if quantity not in row.numbers:
             continue

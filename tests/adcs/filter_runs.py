@@ -15,8 +15,8 @@ from adcs.environment.orbit import circular_orbit
 from adcs.kalman.error_state import (
     AttitudeTracks,
     FilterSettings,
+    FilterStart,
     SensorSet,
-    Start,
     sensor_set,
     start_near,
     tuned_noise,
@@ -69,12 +69,12 @@ def scenario_for(used: SensorSet, duration_s: float) -> AttitudeScenario:
     )
 
 
-def start_of(runs: AttitudeRuns, attitude_rad: float = START_RAD, rate_rad_s: float = START_RAD_S) -> Start:
+def start_of(runs: AttitudeRuns, attitude_rad: float = START_RAD, rate_rad_s: float = START_RAD_S) -> FilterStart:
     q, w = start_estimates(runs.prepared, attitude_rad, rate_rad_s)
     return start_near(q, w, attitude_rad, rate_rad_s)
 
 
-def runs_for(used: SensorSet, duration_s: float, seeds: Iterable[int] = SEEDS) -> tuple[AttitudeRuns, Start]:
+def runs_for(used: SensorSet, duration_s: float, seeds: Iterable[int] = SEEDS) -> tuple[AttitudeRuns, FilterStart]:
     runs = simulate(scenario_for(used, duration_s), list(seeds))
     return runs, start_of(runs)
 
@@ -84,7 +84,7 @@ def evaluate(runs: AttitudeRuns, estimates: AttitudeTracks) -> dict[str, Any]:
     return outcome_of(Part(runs, estimates)).numbers()
 
 
-def assert_as_readable(record: Record, chosen: FilterSettings, start: Start) -> AttitudeTracks:
+def assert_as_readable(record: Record, chosen: FilterSettings, start: FilterStart) -> AttitudeTracks:
     """Tracks by the kernel, which must be those of the readable filter."""
     fast, slow = run_filter(record, chosen, start), run_readable(record, chosen, start)
     np.testing.assert_allclose(fast.q, slow.q, rtol=0, atol=1e-13)

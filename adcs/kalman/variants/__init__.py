@@ -1,1 +1,1 @@
-"""Filters besides the error-state filter itself: of one gain, of fewer states, of two parts, of a bank."""
+"""Variants of the MEKF: constant gain, gyro as input, separate bias, and a bank of filters."""

@@ -1,4 +1,4 @@
-r"""Filters whose gain is not computed on board: :math:`x^+ = x^- + K \tilde z` with one K.
+r"""Filter with a constant gain: :math:`x^+ = x^- + K \tilde z` with one K.
 
 See docs/theory/attitude-kalman-filters.md. Source: Ivanov, Ivlev, Karpenko, Ovchinnikov, Keldysh Institute preprint 64,
 2014, Table 5.
@@ -10,26 +10,26 @@ from dataclasses import replace
 
 import numpy as np
 
-from adcs.kalman.error_state import AttitudeTracks, FilterSettings, Start
+from adcs.kalman.error_state import AttitudeTracks, FilterSettings, FilterStart
 from adcs.kalman.mekf import (
+    apply_error,
     check_start,
-    collected,
-    first_state,
-    nis_of,
-    predicted,
+    collect_tracks,
+    initial_state,
+    predict,
     run_filter,
+    sensor_nis,
     stacked_residuals,
-    with_error,
 )
 from adcs.satellite.telemetry import Record
 from arrays.typing import FloatArray
 
 
-def converged_gain(record: Record, settings: FilterSettings, start: Start, row: int = -1) -> FloatArray:
-    """Gain of the filter at an instant, by default the last, in units of the sensors' noise.
+def converged_gain(record: Record, settings: FilterSettings, start: FilterStart, row: int = -1) -> FloatArray:
+    """Return the gain of the MEKF at an instant, by default the last, in units of the sensors' noise.
 
-    Returns (runs, N, k): for the k residuals of :func:`adcs.kalman.mekf.stacked_residuals`; columns of a sensor without
-    a reading at that instant are zero.
+    Shape (runs, N, k) for the k residuals of :func:`adcs.kalman.mekf.stacked_residuals`; columns of a sensor without a
+    reading at that instant are zero.
     """
     state = run_filter(record, settings, start).at(row)
     H, _ = stacked_residuals(record, row, state, settings)
@@ -38,28 +38,28 @@ def converged_gain(record: Record, settings: FilterSettings, start: Start, row: 
 
 
 def run_constant_gain(
-    record: Record, settings: FilterSettings, start: Start, gain: FloatArray | None = None
+    record: Record, settings: FilterSettings, start: FilterStart, gain: FloatArray | None = None
 ) -> AttitudeTracks:
-    """Filter of whole runs with one gain.
+    """Filter whole runs with one gain.
 
-    ``gain`` (runs, N, k): that of :func:`converged_gain` at the last instant, unless given.
+    ``gain`` (runs, N, k): by default that of :func:`converged_gain` at the last instant.
     """
     check_start(record, start)
     if (record.steps_s != record.dt_s).any():
         raise ValueError("Input record must have equal steps for a constant gain; instead received others.")
     K = converged_gain(record, settings, start) if gain is None else gain
-    state = first_state(settings, start)
+    state = initial_state(settings, start)
     states, nis = [], []
     for row in range(record.momentum_Nms.shape[1]):
         if row:
-            state, _ = predicted(record, row - 1, state, settings)
+            state, _ = predict(record, row - 1, state, settings)
         H, residual = stacked_residuals(record, row, state, settings)
         noise = H @ state.P @ H.mT + np.eye(H.shape[1])
-        nis.append(nis_of(noise, H, residual, settings.sensors))
+        nis.append(sensor_nis(noise, H, residual, settings.sensors))
         # A sensor without a reading has rows of zeros in H, and must add no noise.
         K_now = K * (H != 0.0).any(axis=-1)[:, None, :]
         rest = np.eye(settings.sensors.size) - K_now @ H
         P = rest @ state.P @ rest.mT + K_now @ K_now.mT
-        state = replace(with_error(state, (K_now @ residual[..., None])[..., 0], settings.sensors), P=P)
+        state = replace(apply_error(state, (K_now @ residual[..., None])[..., 0], settings.sensors), P=P)
         states.append(state)
-    return collected(settings, states, np.stack(nis, axis=1))
+    return collect_tracks(settings, states, np.stack(nis, axis=1))

@@ -1,4 +1,4 @@
-"""Filter of attitude and gyro bias alone, (δq, δΔω): the gyro is its input, not a measurement.
+"""Filter of attitude and gyro bias, (δq, δΔω), with the gyro as an input in place of a measurement.
 
 See docs/theory/attitude-kalman-filters.md. Source: Ivanov, Ivlev, Karpenko, Ovchinnikov, Keldysh Institute preprint 64,
 2014, Table 5, row [λ, Δω].
@@ -11,20 +11,20 @@ from dataclasses import replace
 import numpy as np
 
 from adcs import quaternion
-from adcs.kalman.error_state import AttitudeTracks, FilterSettings, Start, State
-from adcs.kalman.mekf import check_start, collected, joseph_update, nis_of, stacked_residuals
+from adcs.kalman.error_state import AttitudeState, AttitudeTracks, FilterSettings, FilterStart
+from adcs.kalman.mekf import check_start, collect_tracks, joseph_update, sensor_nis, stacked_residuals
 from adcs.satellite.dynamics import relative_rate
 from adcs.satellite.telemetry import Record, is_read
 from arrays.typing import FloatArray
 from magloc.navigation.rotations import cross_matrix
 
 
-def run_reduced(record: Record, settings: FilterSettings, start: Start) -> AttitudeTracks:
-    """Reduced filter of whole runs.
+def run_reduced(record: Record, settings: FilterSettings, start: FilterStart) -> AttitudeTracks:
+    """Run the reduced filter over whole runs.
 
-    ``settings``: of a set with a gyro, the state ``gyro-bias`` and no other. Its q_λ and q_g are used, the gyro's noise
-    is added to the attitude. ``start``: its attitude; the rate is the gyro's. Returns: of the set (δq, δω, δΔω): δω is
-    minus the error of the bias, with the gyro's noise.
+    ``settings``: a set with a gyro, the state ``gyro-bias`` and no other. Its q_λ and q_g are used; the gyro's noise is
+    added to the attitude. ``start``: only its attitude is used, the rate is the gyro's. Returns: covariance of (δq, δω,
+    δΔω), in which δω is minus the error of the bias, with the gyro's noise.
     """
     used = settings.sensors
     if not used.gyro or used.states != ("gyro-bias",):
@@ -33,7 +33,7 @@ def run_reduced(record: Record, settings: FilterSettings, start: Start) -> Attit
             f"instead received {used.sensors!r} with the states {list(used.states)}."
         )
     check_start(record, start)
-    rates = _filled(record.readings.gyro_rad_s)
+    rates = _fill_gaps(record.readings.gyro_rad_s)
     gyro_rad_s = record.satellite.gyro.sigma_rad_s
     runs, n = rates.shape[:2]
     walk = np.square([settings.noise.attitude, settings.noise.gyro_bias_rad_s]) / record.dt_s
@@ -47,24 +47,24 @@ def run_reduced(record: Record, settings: FilterSettings, start: Start) -> Attit
             h = float(record.steps_s[row - 1])
             Q = np.diag(np.repeat(walk * h + [(0.5 * gyro_rad_s * h) ** 2, 0.0], 3))
             w = 0.5 * (rates[:, row - 1] + rates[:, row]) - bias
-            q, Phi = _moved(q, w, record.environment.orbital_rate_rad_s[:, row - 1], h)
+            q, Phi = _propagate(q, w, record.environment.orbital_rate_rad_s[:, row - 1], h)
             P = Phi @ P @ Phi.mT + Q
-        state = State(q, rates[:, row] - bias, {}, P)
+        state = AttitudeState(q, rates[:, row] - bias, {}, P)
         H, residual = stacked_residuals(record, row, state, others)
         noise = H @ P @ H.mT + np.eye(H.shape[1])
-        nis.append(nis_of(noise, H, residual, others.sensors))
+        nis.append(sensor_nis(noise, H, residual, others.sensors))
         dx, P = joseph_update(P, H, residual)
         q = quaternion.normalised(quaternion.multiply(q, quaternion.from_error_vector(dx[:, :3])))
         bias = bias + dx[:, 3:]
-        whole = _with_rate(P, gyro_rad_s)
+        whole = _covariance_with_rate(P, gyro_rad_s)
         states.append(replace(state, q=q, w=rates[:, row] - bias, optional={"gyro-bias": bias}, P=whole))
-    return collected(settings, states, np.stack(nis, axis=1))
+    return collect_tracks(settings, states, np.stack(nis, axis=1))
 
 
-def _moved(q: FloatArray, w: FloatArray, orbital_rate: FloatArray, h: float) -> tuple[FloatArray, FloatArray]:
-    """Attitude after a step at a constant rate, and Φ (runs, 6, 6)."""
+def _propagate(q: FloatArray, w: FloatArray, orbital_rate: FloatArray, h: float) -> tuple[FloatArray, FloatArray]:
+    """Propagate the attitude by a step at a constant rate; also return Φ (runs, 6, 6)."""
     relative = relative_rate(q, w, orbital_rate)
-    # The orbital frame turns on in the middle of the step.
+    # The rate of the orbital frame is that in body axes at the middle of the step.
     half = quaternion.multiply(q, quaternion.exp(0.5 * h * relative))
     turned = quaternion.multiply(q, quaternion.exp(h * relative_rate(half, w, orbital_rate)))
     F = np.zeros((len(q), 6, 6))
@@ -75,8 +75,8 @@ def _moved(q: FloatArray, w: FloatArray, orbital_rate: FloatArray, h: float) -> 
     return quaternion.normalised(turned), np.eye(6) + step + squared / 2.0 + squared @ step / 6.0
 
 
-def _with_rate(P: FloatArray, gyro_rad_s: float) -> FloatArray:
-    """Covariance (runs, 9, 9) of (δq, δω, δΔω) from that of (δq, δΔω): δω = noise - δΔω."""
+def _covariance_with_rate(P: FloatArray, gyro_rad_s: float) -> FloatArray:
+    """Return the covariance (runs, 9, 9) of (δq, δω, δΔω) from that of (δq, δΔω): δω = noise - δΔω."""
     full = np.zeros((9, 6))
     full[:3, :3], full[3:6, 3:], full[6:, 3:] = np.eye(3), -np.eye(3), np.eye(3)
     noise = np.zeros((9, 9))
@@ -84,8 +84,8 @@ def _with_rate(P: FloatArray, gyro_rad_s: float) -> FloatArray:
     return full @ P @ full.T + noise
 
 
-def _filled(values: FloatArray) -> FloatArray:
-    """Readings (runs, n, 3) whose gaps hold the last one before them."""
+def _fill_gaps(values: FloatArray) -> FloatArray:
+    """Fill the gaps of readings (runs, n, 3) by the last one before them."""
     seen = is_read(values)
     if not seen[:, 0].all():
         raise ValueError("Input record must have a reading of the gyro at the first instant of every run.")

@@ -1,12 +1,12 @@
-r"""A bank of error-state filters that differ in how large a disturbance they expect, weighed by how each predicts.
+r"""Multiple-model adaptive estimation: a bank of MEKFs with different standard deviations of the disturbance.
 
 The disturbance is an Ornstein-Uhlenbeck process of 300 s with a standard deviation of 1e-8 to 1e-4 s⁻², by half
 decades. With the innovations ν of each filter and their covariance S, the weights are
 
 .. math:: w \propto \exp\left(-\tfrac12 \sum (\nu^T S^{-1} \nu + \ln |S|)\, e^{-\mathrm{age} / 1000\,\mathrm{s}}\right)
 
-and the estimate is the mean of the mixture, with its covariance: multiple-model adaptive estimation. The source
-proposes to estimate elements of Q: Ivanov, Ivlev, Karpenko, Ovchinnikov, Keldysh Institute preprint 64, 2014.
+and the estimate is the mean of the mixture, with its covariance. The source proposes to estimate elements of Q: Ivanov,
+Ivlev, Karpenko, Ovchinnikov, Keldysh Institute preprint 64, 2014.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ import numpy as np
 from scipy.special import softmax
 
 from adcs import quaternion
-from adcs.kalman.error_state import ALWAYS, AttitudeTracks, FilterSettings, Start
+from adcs.kalman.error_state import ALWAYS, AttitudeTracks, FilterSettings, FilterStart
 from adcs.kalman.mekf import run_filter
-from adcs.kalman.smoother import difference
+from adcs.kalman.smoother import error_between
 from adcs.satellite.telemetry import Record
 from arrays.typing import FloatArray
 
 DISTURBANCES_S2 = 10.0 ** np.arange(-8.0, -3.75, 0.5)
 CORRELATION_S = 300.0
 MEMORY_S = 1000.0
-_RATE_NOISE_RAD_S = 1e-8  # of a step: what moves the rate is in the state
+_RATE_NOISE_RAD_S = 1e-8  # per step: small, as the disturbance is a state
 
 
-def run_self_tuned(record: Record, settings: FilterSettings, start: Start) -> AttitudeTracks:
-    """Mixture of the bank's estimates of whole runs.
+def run_self_tuned(record: Record, settings: FilterSettings, start: FilterStart) -> AttitudeTracks:
+    """Run the bank over whole runs and return its mixture.
 
-    ``settings``: of a set with the state ``disturbance``, whose deviation and process noise the bank takes the place
-    of. Returns: ``nis`` is the mean of the bank's, ``rejected`` that of the filter of the largest weight.
+    ``settings``: a set with the state ``disturbance``, whose deviation and process noise the bank replaces. Returns:
+    ``nis`` is the weighted mean, ``rejected`` that of the filter with the largest weight.
     """
     if "disturbance" not in settings.sensors.states:
         raise ValueError("Input settings must have the state disturbance; instead received a set without it.")
@@ -44,7 +44,7 @@ def run_self_tuned(record: Record, settings: FilterSettings, start: Start) -> At
 
 
 def weights(bank: list[AttitudeTracks], record: Record) -> FloatArray:
-    """Weight (filters, runs, n) of every filter after the readings of every instant; all are alike before."""
+    """Return the weights (filters, runs, n) after the readings of each instant; equal before the first."""
     limit = bank[0].settings.gate_limit
     fits = np.stack([np.nansum(np.minimum(one.nis, limit) + one.log_det, axis=-1) for one in bank])
     log_weight = -0.5 * fits
@@ -54,13 +54,13 @@ def weights(bank: list[AttitudeTracks], record: Record) -> FloatArray:
 
 
 def mixture(bank: list[AttitudeTracks], weight: FloatArray, deviations_s2: FloatArray) -> AttitudeTracks:
-    """Mean and covariance of the estimates of filters with weights (filters, runs, n).
+    """Return mean and covariance of the mixture of filters with weights (filters, runs, n).
 
-    ``deviations_s2`` (filters,): of the disturbance that each expects.
+    ``deviations_s2`` (filters,): standard deviation of the disturbance in each filter.
     """
     settings, first = bank[0].settings, bank[len(bank) // 2]
     names = settings.sensors.states
-    off = np.stack([difference(one, first, settings.sensors) for one in bank])
+    off = np.stack([error_between(one, first, settings.sensors) for one in bank])
     mean = np.sum(weight[..., None] * off, axis=0)
     covariance = np.zeros_like(first.covariance)
     for one, each, share in zip(bank, off - mean, weight, strict=True):
@@ -72,11 +72,11 @@ def mixture(bank: list[AttitudeTracks], weight: FloatArray, deviations_s2: Float
         settings,
         quaternion.normalised(q),
         first.w + mean[..., 3:ALWAYS],
-        {name: first.optional[name] + mean[..., settings.sensors.place(name)] for name in names},
+        {name: first.optional[name] + mean[..., settings.sensors.slice_of(name)] for name in names},
         covariance,
         np.sum(weight[..., None] * nis, axis=0),
         np.take_along_axis(np.stack([one.rejected for one in bank]), best, axis=0)[0],
         np.full(nis.shape[1:], np.nan),
-        # The weighted mean of the decades, as the bank's steps are alike in them.
+        # The mean of logarithms, as the deviations of the bank are equally spaced in them.
         np.exp(np.tensordot(np.log(deviations_s2), weight, axes=1)),
     )

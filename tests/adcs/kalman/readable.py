@@ -14,18 +14,18 @@ from typing import NamedTuple
 import numpy as np
 
 from adcs import quaternion
-from adcs.kalman.error_state import AttitudeTracks, FilterSettings, SensorSet, Start, State
+from adcs.kalman.error_state import AttitudeState, AttitudeTracks, FilterSettings, FilterStart, SensorSet
 from adcs.kalman.mekf import (
     PATIENT_READINGS,
+    apply_error,
     check_start,
-    collected,
+    collect_tracks,
     deviations,
-    first_state,
+    initial_state,
     joseph_update,
     patience,
-    predicted,
+    predict,
     residuals,
-    with_error,
 )
 from adcs.satellite.dynamics import RigidBody, WheelControl, error_jacobian
 from adcs.satellite.sensors import SENSORS
@@ -157,7 +157,7 @@ class Contest:
         return self.row - self.last_taken[sensor] >= patience(sensor, self.dt_s)
 
 
-def begun(record: Record, row: int, state: State, settings: FilterSettings, sensor: int) -> State:
+def begun(record: Record, row: int, state: AttitudeState, settings: FilterSettings, sensor: int) -> AttitudeState:
     """First state of a hypothesis in which a reading is right, before that reading; one run.
 
     Of a gyro its bias is open; else the attitude is that of the readings, and everything is as open as at the start.
@@ -165,7 +165,7 @@ def begun(record: Record, row: int, state: State, settings: FilterSettings, sens
     used, variance = settings.sensors, settings.open_variance
     if sensor == GYRO:
         P = state.P.copy()
-        of_bias = used.place("gyro-bias")
+        of_bias = used.slice_of("gyro-bias")
         P[:, of_bias], P[:, :, of_bias] = 0.0, 0.0
         P[:, of_bias, of_bias] = np.diag(variance[of_bias])
         return replace(state, P=P)
@@ -199,12 +199,12 @@ class Hypothesis(NamedTuple):
     All readings of an instant are linearised at the predicted state.
     """
 
-    state: State
+    state: AttitudeState
     dx: FloatArray
     attitude_variance: float  # trace of that of δq, as predicted
 
     @classmethod
-    def of(cls, state: State, dx: FloatArray) -> Hypothesis:
+    def of(cls, state: AttitudeState, dx: FloatArray) -> Hypothesis:
         """Hypothesis before the readings of an instant, or before some of them."""
         return cls(state, dx, float(np.trace(state.P[0, :3, :3])))
 
@@ -228,31 +228,31 @@ class Hypothesis(NamedTuple):
         fit = Fit(nis, eased(nis, sigma**2, length, self.attitude_variance), float(np.linalg.slogdet(S[0])[1]))
         return self._replace(state=replace(self.state, P=P), dx=self.dx + dx), fit
 
-    def corrected(self, used: SensorSet) -> State:
+    def corrected(self, used: SensorSet) -> AttitudeState:
         """State with the correction in it."""
-        return with_error(self.state, self.dx, used)
+        return apply_error(self.state, self.dx, used)
 
 
 class _Readable:
     """Filter of one run with its gate, instant by instant."""
 
-    def __init__(self, record: Record, settings: FilterSettings, start: Start) -> None:
+    def __init__(self, record: Record, settings: FilterSettings, start: FilterStart) -> None:
         self.record, self.settings = record, settings
-        self.main, self.second = first_state(settings, start), None
+        self.main, self.second = initial_state(settings, start), None
         self.contest = Contest(settings, record.dt_s)
         n = record.momentum_Nms.shape[1]
         self.nis, self.log_det = np.full((2, 1, n, len(SENSORS)), np.nan)
         self.rejected = np.zeros((1, n, len(SENSORS)), dtype=np.bool_)
 
-    second: State | None
+    second: AttitudeState | None
 
-    def state_of(self, row: int) -> State:
+    def state_of(self, row: int) -> AttitudeState:
         """State after the readings of an instant, from that of the instant before."""
         if row:
             ahead = self.record, row - 1
-            self.main = predicted(*ahead, self.main, self.settings)[0]
+            self.main = predict(*ahead, self.main, self.settings)[0]
             if self.second is not None:
-                self.second = predicted(*ahead, self.second, self.settings)[0]
+                self.second = predict(*ahead, self.second, self.settings)[0]
         self._correct(row)
         return self.main
 
@@ -297,15 +297,15 @@ class _Readable:
         return used.magnetometer and used.sun and bool(read)
 
 
-def run_readable(record: Record, settings: FilterSettings, start: Start) -> AttitudeTracks:
+def run_readable(record: Record, settings: FilterSettings, start: FilterStart) -> AttitudeTracks:
     """Filter of whole runs in NumPy, the reference of :func:`adcs.kalman.mekf.run_filter`."""
     check_start(record, start)
     tracks = []
     for run in range(len(start.q)):
         only = np.array([run])
-        one = _Readable(part(record, only), settings, start.of_runs(only))
+        one = _Readable(part(record, only), settings, start.select_runs(only))
         states = [one.state_of(row) for row in range(record.momentum_Nms.shape[1])]
-        tracks.append(collected(settings, states, one.nis, one.rejected, one.log_det))
+        tracks.append(collect_tracks(settings, states, one.nis, one.rejected, one.log_det))
     names = ("q", "w", "covariance", "nis", "rejected", "log_det")
     whole = {name: np.concatenate([getattr(one, name) for one in tracks]) for name in names}
     optional = {name: np.concatenate([one.optional[name] for one in tracks]) for name in settings.sensors.states}

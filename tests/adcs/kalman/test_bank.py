@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import adcs
-from adcs.kalman.bank import EstimatorSettings, estimated
+from adcs.kalman.bank import EstimatorSettings, estimate_tracks
 from adcs.kalman.names import FILTERS, Filter
 from adcs.satellite.sensors import StarTracker
 from arrays.io.errors import InputError
@@ -49,7 +49,7 @@ class TestDivergence:
         """However good the attitude."""
         runs = simulate(SCENARIO, [0, 1])
         chosen = EstimatorSettings.of(SENSORS)
-        tracks = estimated(runs, chosen, start_of(runs))
+        tracks = estimate_tracks(runs, chosen, start_of(runs))
         assert not outcome_of(Part(runs, tracks)).diverged.any()
         covariance = tracks.covariance.copy()
         covariance[1, -1, 4, 4] *= -1.0
@@ -62,7 +62,7 @@ class TestDivergence:
             raise np.linalg.LinAlgError("Eigenvalues did not converge")
 
         with pytest.raises(InputError, match="filter mekf: found a covariance that is not positive definite any more"):
-            estimated(simulate(SCENARIO, [0]), EstimatorSettings.of(SENSORS), start)  # type: ignore[arg-type]
+            estimate_tracks(simulate(SCENARIO, [0]), EstimatorSettings.of(SENSORS), start)  # type: ignore[arg-type]
 
 
 def test_directions_on_one_line_are_a_start() -> None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from adcs.kalman.diagnostics import residuals_after, unseen_torque_Nm, warnings_of
+from adcs.kalman.diagnostics import postfit_residuals, unseen_torque_Nm, warning_sentences
 from adcs.kalman.error_state import AttitudeTracks
 from adcs.kalman.mekf import run_filter, stacked_residuals
 from sims.attitude.simulation import AttitudeRuns, simulate
@@ -18,7 +18,7 @@ SETTINGS = settings("mag+sun+gyro", ["gyro-bias", "disturbance"])
 
 def lasting(runs: AttitudeRuns, tracks: AttitudeTracks) -> list[bool]:
     """Which runs have the warning."""
-    return [any(text.startswith("residuals last") for text in texts) for texts in warnings_of(runs, tracks)]
+    return [any(text.startswith("residuals last") for text in texts) for texts in warning_sentences(runs, tracks)]
 
 
 def swinging(period_s: float, torque_Nm: float = 8e-7) -> tuple[AttitudeRuns, AttitudeTracks]:
@@ -43,7 +43,7 @@ class TestResidualsThatLast:
     def test_they_are_those_of_the_filter(self) -> None:
         runs = believed_runs(SETTINGS, 60.0, range(2))
         tracks = run_filter(runs, SETTINGS, start_of(runs))
-        after = residuals_after(runs, tracks, run=1)
+        after = postfit_residuals(runs, tracks, run=1)
         _, stacked = stacked_residuals(runs, 40, tracks.at(40), SETTINGS)
         sigma = [
             runs.satellite.gyro.sigma_rad_s,

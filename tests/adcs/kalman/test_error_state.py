@@ -51,7 +51,7 @@ class TestNames:
     def test_layout_of_the_error_state(self) -> None:
         used = sensor_set("st+gyro+mag", ["disturbance", "gyro-bias", "field-bias"])
         assert used.states == ("field-bias", "gyro-bias", "disturbance")
-        assert [used.place(state).start for state in used.states] == [6, 9, 12]
+        assert [used.slice_of(state).start for state in used.states] == [6, 9, 12]
         assert used.size == 15
 
 

@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import chi2
 
 from adcs import quaternion
-from adcs.kalman.error_state import joined_starts, start_near
+from adcs.kalman.error_state import concatenate_starts, start_near
 from adcs.kalman.initialisation import AGAIN, KNOWN_RAD, any_start, largest_deviation_rad, vector_start
 from adcs.kalman.mekf import run_filter
 from adcs.satellite.telemetry import part
@@ -106,7 +106,7 @@ class TestAnyStart:
         # A few runs at once: 36 hypotheses of each, with all their covariances, are large.
         few = np.array_split(np.arange(100), 10)
         starts = [any_start(part(runs, some), chosen) for some in few]
-        estimates = run_filter(runs, chosen, joined_starts(starts))
+        estimates = run_filter(runs, chosen, concatenate_starts(starts))
         assert np.mean(error_norm_deg(runs, estimates)[:, -60:].max(axis=-1) < 1.5) >= 0.95
 
     def test_plain_start_fails_where_this_one_works(self) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from adcs import quaternion
 from adcs.kalman.error_state import start_near
-from adcs.kalman.initialisation import any_start, checked_start, vector_start
+from adcs.kalman.initialisation import any_start, choose_start, vector_start
 from adcs.kalman.mekf import run_filter
 from adcs.satellite.dynamics import absolute_rate
 from magloc.chi_square import normalised_square
@@ -61,7 +61,7 @@ class TestUnknownTorque:
         chosen = settings("mag", self.STATES)
         runs = simulate(replace(SCENARIO, torque_Nm=8e-7), seeds)
         given = start_of(runs)
-        tracks = run_filter(runs, chosen, checked_start(runs, chosen, given))
+        tracks = run_filter(runs, chosen, choose_start(runs, chosen, given))
         assert error_norm_deg(runs, tracks)[:, -60:].max() < 0.2
         assert 0.2 < np.mean(normalised_error_squared(runs, tracks)[:, 6000:] / chosen.sensors.size) < 1.6
 
@@ -77,14 +77,14 @@ class TestCheckedStart:
     def test_a_start_that_is_right_is_taken(self) -> None:
         runs = simulate(replace(SCENARIO, duration_s=1500.0), range(1))
         right = start_near(runs.q[:, 0], runs.w[:, 0], math.radians(0.01), math.radians(1e-4))
-        taken = checked_start(runs, settings("mag", STATES), right)
+        taken = choose_start(runs, settings("mag", STATES), right)
         np.testing.assert_array_equal(taken.q, right.q)
         np.testing.assert_array_equal(taken.covariance[:, :6, :6], right.covariance)
 
     def test_other_sensors_start_where_they_are_told(self) -> None:
         runs = simulate(replace(SCENARIO, duration_s=5.0), range(1))
         given = start_of(runs)
-        assert checked_start(runs, settings("mag+sun", STATES), given) is given
+        assert choose_start(runs, settings("mag+sun", STATES), given) is given
 
 
 class TestStart:

@@ -19,31 +19,31 @@ from scipy.linalg import expm
 from scipy.stats import chi2
 
 from adcs import quaternion
-from adcs.kalman.diagnostics import problems_of, warnings_of
+from adcs.kalman.diagnostics import find_problems, warning_sentences
 from adcs.kalman.error_state import (
     SIZES,
+    AttitudeState,
     AttitudeTracks,
     FilterSettings,
+    FilterStart,
     ProcessNoise,
-    Start,
-    State,
     paper_noise,
     sensor_set,
 )
 from adcs.kalman.mekf import (
-    collected,
-    corrected,
-    first_state,
+    apply_error,
+    collect_tracks,
+    complete_start,
+    initial_state,
     joseph_update,
     known_torque_jacobian,
-    moved,
-    predicted,
+    predict,
+    propagate,
     residuals,
     run_filter,
-    whole_start,
-    with_error,
+    update_state,
 )
-from adcs.kalman.smoother import difference
+from adcs.kalman.smoother import error_between
 from adcs.satellite.sensors import StarTracker
 from magloc import core
 from magloc.chi_square import normalised_square
@@ -92,9 +92,9 @@ def runs() -> AttitudeRuns:
 
 
 @pytest.fixture(scope="module")
-def state(runs: AttitudeRuns) -> State:
+def state(runs: AttitudeRuns) -> AttitudeState:
     rng = np.random.default_rng(2)
-    first = first_state(settings(*EVERYTHING), start_of(runs))
+    first = initial_state(settings(*EVERYTHING), start_of(runs))
     sizes = {"disturbance": 1e-6, "dipole": 0.05, "field-model": 2e-7, "field-gain": 0.03}
     optional = {state: size * rng.standard_normal((6, SIZES[state])) for state, size in sizes.items()}
     return replace(
@@ -108,12 +108,12 @@ class TestJacobians:
     STEP = 1e-4
     CHOSEN = settings(*EVERYTHING)
 
-    def perturbed(self, state: State, column: int, sign: float, size: float) -> State:
+    def perturbed(self, state: AttitudeState, column: int, sign: float, size: float) -> AttitudeState:
         dx = np.zeros((6, SIZE))
         dx[:, column] = sign * size
-        return with_error(state, dx, self.CHOSEN.sensors)
+        return apply_error(state, dx, self.CHOSEN.sensors)
 
-    def test_measurements(self, runs: AttitudeRuns, state: State) -> None:
+    def test_measurements(self, runs: AttitudeRuns, state: AttitudeState) -> None:
         # Where a star tracker reads no error: its residual is the error itself, not linear in a small change of it.
         star = np.repeat(state.q[:, None], runs.q.shape[1], axis=1)
         runs = replace(runs, readings=replace(runs.readings, star=star))
@@ -129,7 +129,7 @@ class TestJacobians:
                 scale = np.abs(H).max()
                 np.testing.assert_allclose(-(above - below) / (2.0 * size), H[..., column], rtol=0, atol=1e-7 * scale)
 
-    def test_star_tracker_reads_the_error(self, runs: AttitudeRuns, state: State) -> None:
+    def test_star_tracker_reads_the_error(self, runs: AttitudeRuns, state: AttitudeState) -> None:
         # Exactly, for any size: it is why one reading corrects any attitude.
         error = np.array([0.5, -0.3, 0.4])
         readings = replace(runs.readings, star=np.repeat(runs.readings.star[:, :1], 11, axis=1))
@@ -137,13 +137,13 @@ class TestJacobians:
         _, residual, _ = residuals(replace(runs, readings=readings), 3, state, self.CHOSEN.sensors)[0]
         np.testing.assert_allclose(residual, np.tile(error, (6, 1)), rtol=0, atol=1e-14)
 
-    def test_transition(self, runs: AttitudeRuns, state: State) -> None:
+    def test_transition(self, runs: AttitudeRuns, state: AttitudeState) -> None:
         """Against differences of whole steps.
 
         The mean of F over a step leaves 1/12 of the commutator of F at its ends (Magnus' series), and Φ ends with the
         third power: its difference to scipy's exponential is less than the fourth.
         """
-        ahead, Phi = predicted(runs, 3, state, self.CHOSEN)
+        ahead, Phi = predict(runs, 3, state, self.CHOSEN)
         ends = np.zeros((2, 6, SIZE, SIZE))
         ends[:, :, 15:18, 15:18] = -np.eye(3) / self.CHOSEN.field_correlation_s
         for end, row, at in ((0, 3, state), (1, 4, ahead)):
@@ -163,16 +163,16 @@ class TestJacobians:
             measured = (self.error(ahead, one) - self.error(ahead, other)) / (2.0 * self.STEP)
             np.testing.assert_allclose(measured, exact[..., column], rtol=0, atol=3e-6)
 
-    def after(self, runs: AttitudeRuns, state: State) -> State:
-        q, w = moved(runs, 3, state)
+    def after(self, runs: AttitudeRuns, state: AttitudeState) -> AttitudeState:
+        q, w = propagate(runs, 3, state)
         model = {
-            "field-model": self.CHOSEN.kept(runs.dt_s)[self.CHOSEN.sensors.place("field-model")]
-            * state.of("field-model")
+            "field-model": self.CHOSEN.decay(runs.dt_s)[self.CHOSEN.sensors.slice_of("field-model")]
+            * state.optional_state("field-model")
         }
         return replace(state, q=q, w=w, optional={**state.optional, **model})
 
-    def error(self, state: State, other: State) -> Array:
-        return difference(other, state, self.CHOSEN.sensors)
+    def error(self, state: AttitudeState, other: AttitudeState) -> Array:
+        return error_between(other, state, self.CHOSEN.sensors)
 
 
 def information_update(P: Array, H: Array, residual: Array) -> tuple[Array, Array]:
@@ -210,8 +210,8 @@ class TestUpdates:
             name: np.full_like(getattr(runs.readings, name), np.nan) for name in ("gyro_rad_s", "field_T", "sun")
         }
         blind = replace(runs, readings=replace(runs.readings, **nothing))
-        before = first_state(chosen, start)
-        after, nis = corrected(blind, 0, before, chosen)
+        before = initial_state(chosen, start)
+        after, nis = update_state(blind, 0, before, chosen)
         np.testing.assert_array_equal(after.P, before.P)
         np.testing.assert_allclose(after.q, before.q, rtol=0, atol=1e-15)
         assert np.isnan(nis).all()
@@ -243,7 +243,7 @@ class TestCompiledTwin:
         runs, start = runs_for(chosen.sensors, 40.0, range(2))
         rng = np.random.default_rng(8)
         own = {name: size * rng.standard_normal((2, 3)) for name, size in (("disturbance", 1e-6), ("dipole", 0.05))}
-        whole = whole_start(chosen, start)
+        whole = complete_start(chosen, start)
         whole = replace(whole, covariance=0.1 * whole.covariance, optional=own)
         fast = assert_as_readable(runs, chosen, whole)
         for name in own:
@@ -266,7 +266,10 @@ class TestCompiledTwin:
     def test_bad_start(self) -> None:
         chosen = settings("st")
         runs, start = runs_for(chosen.sensors, 5.0, range(2))
-        for bad in (Start(start.q[:1], start.w, start.covariance), Start(start.q * np.nan, start.w, start.covariance)):
+        for bad in (
+            FilterStart(start.q[:1], start.w, start.covariance),
+            FilterStart(start.q * np.nan, start.w, start.covariance),
+        ):
             with pytest.raises(ValueError, match=r"Input start\.q must be finite with shape \(2, 4\)"):
                 run_filter(runs, chosen, bad)
 
@@ -288,15 +291,15 @@ class TestClosedLoop:
         for values in (runs.q, runs.w, runs.momentum_Nms, runs.wheel_torque_Nm):
             values[:, 1:] = np.nan
         start = start_of(runs)
-        state = first_state(chosen, start)
+        state = initial_state(chosen, start)
         states = []
         for row in range(301):
             now = sense(prepared, runs.q[:, row : row + 1], runs.w[:, row : row + 1], slice(row, row + 1))
             for name in ("star", "gyro_rad_s", "field_T", "sun"):
                 getattr(runs.readings, name)[:, row] = getattr(now, name)[:, 0]
             if row:
-                state, _ = predicted(runs, row - 1, state, chosen)
-            state, _ = corrected(runs, row, state, chosen)
+                state, _ = predict(runs, row - 1, state, chosen)
+            state, _ = update_state(runs, row, state, chosen)
             states.append(state)
             runs.wheel_torque_Nm[:, row] = commanded_torque(
                 runs.satellite.body,
@@ -312,7 +315,7 @@ class TestClosedLoop:
                 true = (runs.q[:, row], runs.w[:, row], runs.momentum_Nms[:, row])
                 after = advance(prepared, true, runs.wheel_torque_Nm[:, row], row)
                 runs.q[:, row + 1], runs.w[:, row + 1], runs.momentum_Nms[:, row + 1] = after
-        estimates = collected(chosen, states, np.full((10, 301, 4), np.nan))
+        estimates = collect_tracks(chosen, states, np.full((10, 301, 4), np.nan))
         reached = evaluate(runs, estimates)
         assert (reached["angle_rms_deg"] or 9.0) <= 4e-2
         assert 0.3 <= (reached["nees_per_dimension"] or 9.0) <= 1.3
@@ -429,7 +432,7 @@ class TestAcceptance:
         runs = simulate(replace(tabletsat(300.0), gyro_bias_rad_s=GYRO_BIAS_RAD_S), SEEDS)
         estimates = run_filter(runs, chosen, start_of(runs))
         assert (evaluate(runs, estimates)["angle_rms_deg"] or 0.0) > 5.0
-        assert all("a bias of the gyro is not in the state" in one[0] for one in warnings_of(runs, estimates))
+        assert all("a bias of the gyro is not in the state" in one[0] for one in warning_sentences(runs, estimates))
 
     @pytest.mark.slow
     def test_closed_loop_jacobian_is_overconfident(self) -> None:
@@ -523,8 +526,8 @@ class TestFieldModel:
     def test_transition(self, runs: AttitudeRuns) -> None:
         """The variance stays what it is, and the state decays."""
         chosen = replace(settings("mag+sun", ["field-model"]), field_error_T=2e-7, field_correlation_s=50.0)
-        state = replace(first_state(chosen, start_of(runs)), optional={"field-model": np.full((6, 3), 1e-7)})
-        after, Phi = predicted(runs, 0, state, chosen)
+        state = replace(initial_state(chosen, start_of(runs)), optional={"field-model": np.full((6, 3), 1e-7)})
+        after, Phi = predict(runs, 0, state, chosen)
         np.testing.assert_allclose(after.optional["field-model"], 1e-7 * math.exp(-1.0 / 50.0))
         np.testing.assert_allclose(np.diagonal(after.P[:, 6:, 6:], axis1=1, axis2=2), 4e-14)
         np.testing.assert_allclose(Phi[:, 6:, 6:], np.tile(math.exp(-1.0 / 50.0) * np.eye(3), (6, 1, 1)))
@@ -534,7 +537,7 @@ class TestProblems:
     def test_nothing_is_wrong(self) -> None:
         for sensors in ("st+gyro", "mag+sun+gyro", "mag+sun"):
             runs, estimates = filtered(sensors, (), 200.0)
-            assert warnings_of(runs, estimates) == ((),) * 10
+            assert warning_sentences(runs, estimates) == ((),) * 10
 
     def test_eclipse(self) -> None:
         """What an eclipse of half an hour costs, and that it is named.
@@ -552,7 +555,7 @@ class TestProblems:
         for run in range(10):
             after = np.flatnonzero(dark[run])[-1] + 1
             assert norm[run, after : after + 240].min() < 0.06
-        sentences = warnings_of(runs, estimates)[0]
+        sentences = warning_sentences(runs, estimates)[0]
         assert any(sentence.startswith("eclipse: no Sun for 18") for sentence in sentences)
         assert any("known by the gyro only, 1σ grows from" in sentence for sentence in sentences)
 
@@ -562,14 +565,14 @@ class TestProblems:
         runs = simulate(replace(tabletsat(12_000.0), conditions=conditions, gyro_bias_rad_s=GYRO_BIAS_RAD_S), range(2))
         estimates = run_filter(runs, settings("mag+gyro", ["gyro-bias", "disturbance"]), start_of(runs))
         assert error_norm_deg(runs, estimates)[:, -60:].max() < 1.0
-        assert not any("one direction" in text for of_run in warnings_of(runs, estimates) for text in of_run)
+        assert not any("one direction" in text for of_run in warning_sentences(runs, estimates) for text in of_run)
 
     def test_rows_of_a_problem(self) -> None:
         """Where it is: the shadow, neither more nor less."""
         conditions = StartConditions(False, 0.0, math.radians(90.0), 0.0, eclipse_after_s=100.0)
         runs = simulate(replace(tabletsat(300.0), conditions=conditions), range(2))
         estimates = run_filter(runs, settings("mag+sun+gyro"), start_of(runs))
-        for run, (first, *_) in enumerate(problems_of(runs, estimates)):
+        for run, (first, *_) in enumerate(find_problems(runs, estimates)):
             assert first.text.startswith("eclipse")
             assert 0 < first.rows.sum() < first.rows.size
             assert (first.rows == ~runs.environment.sunlit[run]).all()
@@ -583,7 +586,7 @@ class TestProblems:
             estimates = run_filter(runs, settings(sensors), start_of(runs))
             norm = error_norm_deg(runs, estimates)[:, 120:]
             reached[sensors] = [np.sqrt(np.mean(norm[near] ** 2)) for near in (separation < 12.0, separation > 25.0)]
-            assert all("Sun and field on one line" in sentences[0] for sentences in warnings_of(runs, estimates))
+            assert all("Sun and field on one line" in sentences[0] for sentences in warning_sentences(runs, estimates))
         assert reached["mag+sun"][0] > 2.0 * reached["mag+sun"][1]
         assert reached["mag+sun+gyro"][0] < 0.5 * reached["mag+sun"][0]
 
@@ -594,19 +597,21 @@ class TestProblems:
         estimates = run_filter(runs, chosen, start_of(runs))
         reached = evaluate(runs, estimates)
         assert (reached["nees_per_dimension"] or 0.0) > 5.0
-        named = ["field differs from its model" in " ".join(sentences) for sentences in warnings_of(runs, estimates)]
+        named = [
+            "field differs from its model" in " ".join(sentences) for sentences in warning_sentences(runs, estimates)
+        ]
         assert np.mean(named) > 0.9
         inflated = run_filter(runs, replace(chosen, field_error_T=400e-9), start_of(runs))
         assert (evaluate(runs, inflated)["nees_per_dimension"] or 9e9) < 0.5 * (reached["nees_per_dimension"] or 0.0)
         sentence = "an error of the field's model of 400 nT is taken for noise"
-        assert all(any(sentence in one for one in of_run) for of_run in warnings_of(runs, inflated))
-        assert not any(sentence in one for of_run in warnings_of(runs, estimates) for one in of_run)
+        assert all(any(sentence in one for one in of_run) for of_run in warning_sentences(runs, inflated))
+        assert not any(sentence in one for of_run in warning_sentences(runs, estimates) for one in of_run)
 
     def test_star_tracker_over_rate_and_blinded(self) -> None:
         fast = replace(tabletsat(100.0), start_rate_rad_s=math.radians(2.5))
         runs = simulate(with_star_tracker(fast, sun_exclusion_rad=math.radians(70.0)), range(20))
         estimates = run_filter(runs, settings("st+gyro"), start_of(runs))
-        sentences = warnings_of(runs, estimates)
+        sentences = warning_sentences(runs, estimates)
         assert any("star tracker over-rate: above 2°/s" in " ".join(one) for one in sentences)
         assert any("star tracker blinded" in " ".join(one) for one in sentences)
         missing = ~runs.readings.seen["st"].all(axis=-1)
@@ -616,7 +621,7 @@ class TestProblems:
         """Innovations tell of a model that is wrong: a torque of 1e-4 N·m that no state can take."""
         runs = simulate(replace(tabletsat(), torque_Nm=1e-4), SEEDS)
         estimates = run_filter(runs, settings("st"), start_of(runs))
-        assert all("the model is wrong" in " ".join(one) for one in warnings_of(runs, estimates))
+        assert all("the model is wrong" in " ".join(one) for one in warning_sentences(runs, estimates))
 
 
 class TestAccuracy:

@@ -10,9 +10,9 @@ import pytest
 from numpy.typing import NDArray
 
 from adcs import quaternion
-from adcs.kalman.error_state import FilterSettings, ProcessNoise, Start
-from adcs.kalman.mekf import first_state, predicted, run_filter, stacked_residuals
-from adcs.kalman.smoother import smoothed
+from adcs.kalman.error_state import FilterSettings, FilterStart, ProcessNoise
+from adcs.kalman.mekf import initial_state, predict, run_filter, stacked_residuals
+from adcs.kalman.smoother import smooth
 from sims.attitude.simulation import AttitudeRuns, simulate
 from sims.experiments.accuracy import errors, normalised_error_squared
 from tests.adcs.filter_runs import runs_for, settings, start_of, tabletsat
@@ -21,15 +21,15 @@ Array = NDArray[np.float64]
 CASES = [("st", ("disturbance",)), ("mag+sun", ("disturbance",)), ("mag+sun+gyro", ("gyro-bias", "disturbance"))]
 
 
-def least_squares(runs: AttitudeRuns, chosen: FilterSettings, start: Start) -> tuple[Array, Array]:
+def least_squares(runs: AttitudeRuns, chosen: FilterSettings, start: FilterStart) -> tuple[Array, Array]:
     """Errors of the best estimates against the truth, (n, N), and their covariance (n, N, N), of the first run.
 
     All rows at once, linearised at the truth: unknown is what an estimate is away from it. Without disturbances the
     truth follows the equations of motion exactly, so that Φ alone connects the rows.
     """
     n, size = runs.q.shape[1], chosen.sensors.size
-    true = replace(first_state(chosen, start), q=runs.q[:, 0], w=runs.w[:, 0])
-    prior = first_state(chosen, start)
+    true = replace(initial_state(chosen, start), q=runs.q[:, 0], w=runs.w[:, 0])
+    prior = initial_state(chosen, start)
     offset = np.zeros(size)
     # The estimate is the truth with the error -(truth - estimate) put in.
     offset[:3] = -quaternion.error_vector(start.q[0], runs.q[0, 0])
@@ -49,7 +49,7 @@ def least_squares(runs: AttitudeRuns, chosen: FilterSettings, start: Start) -> t
         H, residual = stacked_residuals(runs, i, at, chosen)
         add({i: H[0]}, residual[0], np.eye(len(residual[0])))
         if i < n - 1:
-            _, Phi = predicted(runs, i, at, chosen)
+            _, Phi = predict(runs, i, at, chosen)
             root = np.diag(1.0 / np.sqrt(chosen.process_variance(runs.dt_s, runs.dt_s)))
             add({i: -Phi[0], i + 1: np.eye(size)}, np.zeros(size), root)
     A, b = np.concatenate(rows), np.concatenate(values)
@@ -68,7 +68,7 @@ class TestLeastSquares:
         chosen = FilterSettings(settings(sensors, states).sensors, noise, gyro_bias_sigma_rad_s=1e-4)
         runs = simulate(replace(tabletsat(12.0), torque_Nm=0.0), [7])
         start = start_of(runs, math.radians(0.02), math.radians(0.01))
-        estimates = smoothed(runs, run_filter(runs, chosen, start))
+        estimates = smooth(runs, run_filter(runs, chosen, start))
         solution, covariance = least_squares(runs, chosen, start)
         sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
         # Errors of 0.02° are linear to 1e-7; the smoother's are against the estimate, hence the sign.
@@ -83,7 +83,7 @@ class TestGain:
         chosen = settings(sensors, states)
         runs, start = runs_for(chosen.sensors, 300.0)
         estimates = run_filter(runs, chosen, start)
-        better = smoothed(runs, estimates)
+        better = smooth(runs, estimates)
         middle = slice(120, 180)
         rms = [
             np.sqrt(np.mean(errors(runs, one)[:, middle, :3] ** 2, axis=1)).mean(axis=0).max()

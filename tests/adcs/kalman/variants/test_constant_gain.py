@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
-from adcs.kalman.mekf import predicted, run_filter, stacked_residuals
+from adcs.kalman.mekf import predict, run_filter, stacked_residuals
 from adcs.kalman.variants.constant_gain import converged_gain, run_constant_gain
 from adcs.kalman.variants.gyro_driven import run_reduced
 from tests.adcs.filter_runs import evaluate, runs_for, settings
@@ -38,7 +38,7 @@ class TestConstantGain:
         runs, start = runs_for(chosen.sensors, 300.0, range(2))
         K = converged_gain(runs, chosen, start)
         state = run_filter(runs, chosen, start).at(-1)
-        _, Phi = predicted(runs, 299, state, chosen)
+        _, Phi = predict(runs, 299, state, chosen)
         H, _ = stacked_residuals(runs, 300, state, chosen)
         for run in range(2):
             P = solve_discrete_are(

@@ -43,7 +43,7 @@ class TestParallelFilter:
         chosen = settings(sensors, ["disturbance"])
         runs, start = runs_for(chosen.sensors, duration_s)
         right = evaluate(runs, run_parallel(runs, chosen, start))
-        monkeypatch.setattr(separate_bias, "by_sensitivity", lambda S, _: np.zeros(S.shape[:-1]))
+        monkeypatch.setattr(separate_bias, "sensitivity_correction", lambda S, _: np.zeros(S.shape[:-1]))
         printed = evaluate(runs, run_parallel(runs, chosen, start))
         assert (printed["disturbance_rms_s2"] or 0.0) > 10.0 * (right["disturbance_rms_s2"] or 9.0)
         assert (printed["nees_per_dimension"] or 0.0) > 100.0
