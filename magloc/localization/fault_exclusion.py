@@ -32,28 +32,28 @@ from magloc.localization.search.multi_source import NOISE_ALONE
 from magloc.measurement.rows import NO_SIGNAL, rows_of_equal_mask, whitened_model, whitenings_of
 from magloc.measurement.whitened import WhitenedModel
 
-# Above this χ² per degree of freedom a bad sensor may have bent the fit so much that it does not stand out.
+# χ² per degree of freedom above which a faulty sensor may have bent the fit and hide in it.
 _SPOILT = 4.0
-# Squared residuals, in limits, above which a larger one says nothing more.
+# Squared residuals, in limits, are cut here: a larger one is no stronger evidence.
 _BEYOND_DOUBT = 10.0
 # A fix that explains the other sensors badly must be better by this factor in χ² per degree of freedom.
 _INCOMPARABLE = 1000.0
 # Sensors of an array of which every two are left out in turn, and every one: of a larger one where a fit blames them.
 _MOST_IN_PAIRS, _MOST_ONE_BY_ONE = 8, 16
-# Fits without one sensor that are refined, of those that should have the lowest χ², and that are kept of a row.
+# Fits without one sensor, of lowest expected χ²: how many are refined, and how many are kept for a row.
 _MOST_REFINED, _MOST_KEPT = 6, 3
-# Sensors that are left out one after another where each is beyond doubt.
+# Largest number of gross faults that are excluded one after another.
 _MOST_GROSS = 3
-# Share of the largest fall of χ² below which that without another sensor does not matter beside it.
+# Share of the largest fall of χ² below which the falls without other sensors are negligible.
 _MATTERS = 0.05
 # Share of a sensor's readings, along any direction, that the others check: below the larger one a fit without it is
 # refined, whatever it promises; one that bends a fit, and draws a source to itself, leaves less than the smaller one.
 _HALF_CHECKED, _LEAST_CHECKED = 0.5, 0.1
-# Sensors of a larger array without which an optimum is searched for anew, of those that a fit blames.
+# Suspect sensors of a larger array, each of which is left out of a new search.
 _MOST_SEARCHED = 2
 # Share of a source's energy in one sensor above which no other sensor sees it.
 _LONELY = 0.9
-_ROWS_AT_ONCE = 64  # whose numbers a processor's cache holds
+_ROWS_AT_ONCE = 64  # fits in the processor's cache
 
 
 class Refit(Protocol):
@@ -169,7 +169,7 @@ class _Examination:
         self.limits = np.array(chdtri(np.maximum(self.count, 1), 1.0 - level), dtype=np.float64)
         channels = array.sensor_channels
         self.fits = WeightedFits(problem, self.raw, channels, self.count, self.limits, free_position)
-        # By few sensors each says so much of the source that what is cheap to tell decides nothing.
+        # With few sensors each is so informative that first-order tests do not decide.
         self.many = np.count_nonzero(self.count) > _MOST_ONE_BY_ONE
 
     @property
@@ -249,7 +249,7 @@ class _Examination:
         """Return rows with an outlier in the plain fix, or with a fit too poor to tell."""
         solved = np.array([bool(fix.solutions) for fix in plain])
         credible = np.array([bool(fix.solutions) and _is_credible(fix) for fix in plain])
-        # What a fit of so many unknowns leaves of a sensor's residual on average.
+        # Mean share of a sensor's residual that a fit of so many unknowns leaves.
         unknowns = np.array([3.0 + 6.0 * (len(self._scale(fix)[0]) if fix.solutions else 1) for fix in plain])
         unseen = np.clip(1.0 - unknowns / max(1, self.count.sum()), 0.2, 1.0)
         spoilt = ~solved

@@ -10,7 +10,7 @@ from arrays.typing import FloatArray, IntArray
 from magloc.localization.fit.gauss_newton import scaled_jacobian
 from magloc.measurement.whitened import WhitenedModel
 
-# Columns of the common field whose squares are smaller than this against the largest are none.
+# Relative square below which a column of the common field counts as zero.
 _UNSEEN = 1e-13
 # Share of a direction of a sensor's readings that the others must check.
 _CHECKED = 1e-6
@@ -33,8 +33,8 @@ def chi2_falls_without_sensors(
 
     Deleting channels adds their readings to the unknowns. With the readings' whitening W, residuals r and an
     orthonormal basis Q of the derivatives, sensor s takes :math:`g^T (I - H)^{-1} g`, where :math:`g = (W r)_s` and
-    :math:`I - H = [W (I - Q Q^T) W]_{ss}`. The least eigenvalue of that says what the others check of its readings: 0
-    where it alone decides what they ought to be. Channels (N, 3) are negative where a sensor has none.
+    :math:`I - H = [W (I - Q Q^T) W]_{ss}`. Its least eigenvalue tells how well the other sensors check its readings:
+    0 where they do not. Channels (N, 3) are negative where a sensor has none.
     """
     y = problem.whiten(raw)
     residual = problem.residual(y, q, mu, problem.source_fields(q, mu))
@@ -59,7 +59,7 @@ def weight_channels(problem: WhitenedModel, raw: FloatArray, weight: FloatArray)
     """Return a problem and its raw readings (b, C) with variances divided by weights (b, C)."""
     root = np.sqrt(weight)[..., None]
     flat = problem.shrinkage >= 1.0
-    # A flat prior needs only the span of its columns; of the others the variance along each of them counts.
+    # A flat prior needs only the span of its columns, another one also the variance along each of them.
     some, known = flat.any(axis=0), ~flat.all(axis=0)
     span = root * (problem.basis * flat[:, None])[..., some]
     for _ in range(2):  # once more, for the digits that squares lose

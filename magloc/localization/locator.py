@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 _LOG = logging.getLogger(__name__)
 # A search for several sources, or with known moments, takes its rows in smaller blocks.
 _ROWS_AT_ONCE, _ROWS_OF_SEVERAL = 1024, 64
-# Numbers of the whitenings of a block, where each row has its own.
+# Size of the whitenings of a block, where each row has its own.
 _MOST_NUMBERS = 8_000_000
 
 

@@ -20,12 +20,12 @@ from magloc.localization.fit.gauss_newton import JointFits, refine
 from magloc.localization.fit.optima import Optima
 from magloc.measurement.whitened import WhitenedModel
 
-# |s| of q = (u, s), of unit norm, whose |u| is farther than NEAR from every sensor.
+# |s| of unit q = (u, s) below which the source is farther than NEAR from every sensor.
 _FAR_S = 1.0 / math.hypot(1.0, 1.0 + NEAR)
-# Variance of what a dipole leaves out, summed over the channels in units of the noise, that does not matter.
+# Negligible variance of the field that a dipole leaves out, summed over the channels in units of the noise.
 _NEGLIGIBLE = 0.1
 _ROUNDS = 3
-# Second order of an error of the ambient field, in σ of a reading, from which errors are no Gaussian's.
+# Second-order effect of the ambient field's error, in σ of a reading, from which errors are not Gaussian.
 _BENT = 0.3
 
 
@@ -38,7 +38,7 @@ def body_errors(model: WhitenedModel, q: FloatArray, mu: FloatArray, length_m: F
     separation = sensors - model.position(q)[:, :, None]
     moment = np.broadcast_to(model.moment(q, mu)[:, :, None], separation.shape)
     fields = finite_body_errors(separation, moment, length_m[..., None, None, None])
-    # In threes, those of a sensor.
+    # Three columns for each sensor.
     gain = np.zeros((len(q), 1, 3 * len(sensors), 3))
     owner = model.channel_sensor
     place = 3 * owner + np.arange(owner.size) - np.searchsorted(owner, owner)
@@ -90,7 +90,7 @@ def with_model_errors(
     if not matters.any():
         return [(optima, none)]
     refined = _refine(optima.select(matters), lengths[matters], ambient_sigma_T, known)
-    # A row of which no fit converged again stays that of a point in a known field.
+    # A row whose refined fits did not converge keeps those of a point in a known field.
     lost = np.bincount(refined.of_row, minlength=len(refined.rows)) == 0
     matters[np.flatnonzero(matters)[lost]] = False
     result = [(refined.select(~lost), lengths[matters].max(axis=1))] if matters.any() else []

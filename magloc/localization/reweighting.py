@@ -19,12 +19,12 @@ from magloc.measurement.whitened import WhitenedModel
 
 DEGREES_OF_FREEDOM = 4.0
 LEAST_WEIGHT = 1e-16
-# Above this variance, in units of what is stated, the noise is taken to be larger than stated.
+# Ratio to the stated variance above which the noise counts as understated.
 _UNDERSTATED = 2.0
 _N_REWEIGHTINGS = 30
-# Fits of a row of which this is the difference, of the weights in themselves, end as one.
+# Fits of a row that differ less in position and (relatively) in weights are merged.
 _SAME_PLACE, _SAME_WEIGHT = 0.01, 0.05
-_FITS_AT_ONCE = 64  # whose numbers a processor's cache holds
+_FITS_AT_ONCE = 64  # fit in the processor's cache
 # Median of χ²/n of three degrees of freedom.
 _MEDIAN_RATIO = 0.789
 
@@ -118,7 +118,7 @@ class WeightedFits:
         if scale2 < _UNDERSTATED:
             return self.limits
         count = np.maximum(self.count, 1)
-        # A median is about as good as the mean of half as many.
+        # A median is about as accurate as the mean of half as many values.
         spare = 0.5 * max(2.0, self.count.sum() - 6.0 * n_sources - 6.0)
         quantile: FloatArray = fdtri(count, spare, 1.0 - SENSOR_FALSE_ALARM / self.n_sensors)
         return np.array(count * quantile, dtype=np.float64)

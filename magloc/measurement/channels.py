@@ -17,7 +17,7 @@ from magloc import core
 if TYPE_CHECKING:
     from magloc.measurement.whitened import WhitenedModel
 
-# By how much the weights of a sensor's axes may differ.
+# Largest difference of the weights of a sensor's axes.
 _SAME_WEIGHT = 1e-12
 
 

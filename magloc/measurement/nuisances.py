@@ -26,7 +26,7 @@ _SECONDS_PER_HOUR = 3600.0
 _UNKNOWN = 1e5
 """Standard deviation, in that of a reading's noise, of a background of which nothing is known."""
 
-# Where they start among the errors of a sensor: turns, gains, a field, and what the ambient field and its rate induce.
+# First index of each kind of error: turns, gains, a field, fields induced by the ambient field and by its rate.
 _TURN, _GAIN, _FIELD, _INDUCED, _EDDY = 0, 3, 6, 9, 18
 
 

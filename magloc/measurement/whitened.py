@@ -21,7 +21,7 @@ from magloc.fields.dipole import MU0_OVER_4PI
 from magloc.measurement.channels import channels_of
 from magloc.measurement.known_moment import KnownMoment
 
-# Squares of columns of whose errors of rounding nothing is seen, in units of the noise; those of a column that is none.
+# Largest squares, over the noise, with negligible rounding errors; relative size of a column that counts as zero.
 _MOST_SQUARES, _UNSEEN = 1e8, 1e-7
 
 
@@ -192,7 +192,7 @@ class WhitenedModel(ScaledSensors):
         flat, unknown = self.shrinkage >= 1.0, self.basis
         bounded = ~flat.all(axis=0)
         if bounded.any():
-            # Columns that are of a kind in no row cost time, and are none.
+            # Columns that no row uses cost time, so leave them out.
             with np.errstate(divide="ignore"):
                 variance = np.where(flat, 0.0, 1.0 / (1.0 - self.shrinkage) ** 2 - 1.0)
             known = (unknown * np.sqrt(variance)[:, None])[..., bounded]
@@ -301,7 +301,7 @@ def _left_singular(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
 
     k is n or C.
 
-    By the squares of few columns that are not large, where those whose values are rounding errors are zero instead.
+    Few columns that are not large go by their squares; singular values that are rounding errors are then zero.
     """
     n = columns.shape[2]
     square = columns.transpose(0, 2, 1) @ columns if 2 * n < columns.shape[1] else np.array(np.inf)

@@ -19,7 +19,7 @@ from magloc.fields.dipole import MU0_OVER_4PI
 from magloc.localization.fit.refinement import MOST_SOURCES, OPTIMUM_TOLERANCE, RELATIVE_TOLERANCE, refine_starts
 from magloc.measurement.whitened import WhitenedModel
 
-# A refinement has converged where the linearised model promises to lower χ² by less than this, absolute and relative.
+# Converged where the linearised model predicts a smaller decrease of χ² than this, absolute and relative.
 PROMISE_ABSOLUTE = 1e-8
 PROMISE_RELATIVE = 1e-11
 LARGEST_STEP_RAD, LARGEST_DAMPING = 0.5, 1e9
@@ -236,7 +236,7 @@ def damped_gauss_newton(
     """Fit as :func:`refine` does, for any sensors and known moments, without kernels."""
     n_fits, n_sources = q.shape[:2]
     columns = np.flatnonzero(free.ravel())
-    # Without free positions the moments themselves are what has to be damped.
+    # Without free positions the moments are damped.
     damped = np.repeat([1.0, 0.0 if columns.size else 1.0], [columns.size, 3 * n_sources])
     q, mu = q.copy(), mu.copy()
     chi2, iterations = np.full(n_fits, np.inf), np.zeros(n_fits, dtype=np.int64)
@@ -282,7 +282,7 @@ def damped_gauss_newton(
             accepted = new_chi2 < current
             gained = current - new_chi2
             small = np.abs(reachable) < promise + PROMISE_RELATIVE * current
-            # A step that rounding refuses is the end too, if next to nothing was promised.
+            # A step refused because of rounding ends the fit too, if almost no decrease was predicted.
             ended = small | (~accepted & (damping > LARGEST_DAMPING))
             at_optimum = small | (np.abs(reachable) < 1e-6 * (1.0 + current))
             well = gained > 0.75 * promised

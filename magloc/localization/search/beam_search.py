@@ -128,7 +128,7 @@ class BeamSearch:
             n_starts = 3 * self.n_starts // 2
             q = self.candidates[self._choose(problem, gain, residual, n_starts, self.apart_rad)]
             row = np.repeat(np.arange(len(y)), n_starts)
-            # From none the first step leads to the moments that fit best, but by steps to what is known of them.
+            # A zero moment suffices: the first step finds the best one. Known moments need a real start.
             mu = np.zeros((len(y), n_starts, 3))
             if problem.known is not None:
                 mu = fit_moments(problem.rows(row), y[row], q.reshape(-1, 1, 4)).reshape(mu.shape)
@@ -232,7 +232,7 @@ class BeamSearch:
         row = np.repeat(np.arange(len(y)), width)
         q, mu = _fill_missing(beam)
         chosen = self._choose_for_residual(problem.rows(row), y[row], q, mu, width * _MORE_STARTS, self.apart_rad)
-        # The best fit, where it stands in for one that there is not, goes on from the candidates that come next.
+        # Copies of the best fit in empty places continue from the next candidates.
         chosen = chosen.reshape(len(y), width, width, _MORE_STARTS)
         turn = np.where(np.isfinite(beam.chi2), 0, np.arange(width))
         chosen = np.take_along_axis(chosen, turn[:, :, None, None], axis=2).reshape(-1, _MORE_STARTS)

@@ -114,7 +114,7 @@ def best_candidates(
     `orthonormal`: of residuals without some directions, :func:`orthonormalisation_without` these.
     """
     chosen = np.zeros((len(residual), n_starts), dtype=np.intp)
-    # The order of candidates does not depend on the size of a row, whose squares single precision must hold.
+    # Rows are scaled, since single precision must hold their squares; the order of candidates stays.
     largest = np.abs(residual).max(axis=1, keepdims=True, initial=0.0)
     of_rows = (residual / np.where(largest > _LARGEST_SINGLE, largest, 1.0)).astype(np.float32)
     cos_apart = math.cos(apart_rad)

@@ -26,7 +26,7 @@ N_UNKNOWNS = 3
 _N_DIRECTIONS = 60
 # Up to the sign.
 _MOST_SOLUTIONS = 8
-# By how much χ² must rise halfway between two optima for them to count as two.
+# Rise of χ² halfway between two optima that makes them distinct.
 _BARRIER = 0.01
 _TOO_LARGE = "the differences between the sensors do not determine a moment that is small enough"
 
@@ -96,7 +96,7 @@ def _all_moments(problem: WhitenedModel, y: FloatArray, q: FloatArray) -> JointF
     n, n_sources = q.shape[:2]
     starts = [fit_moments(problem, y, q)[:, None]]
     if problem.channel_is_scalar.any():
-        # Of several sources each start has other directions.
+        # With several sources each start has other directions.
         directions = np.stack([np.roll(fibonacci_directions(_N_DIRECTIONS), 17 * k, 0) for k in range(n_sources)], 1)
         row = np.repeat(np.arange(n), _N_DIRECTIONS)
         alone = problem.rows(row).without_ambient()

@@ -34,9 +34,9 @@ _N_DRAWS = 5_000
 _MOST_RESTARTS = 20
 # What noise never lowers χ² by: with six degrees of freedom once in 10¹¹ places, of which an array has not a million.
 _BEYOND_NOISE = 60.0
-# Where a source less costs so many times that, restarts do not find a fit that does without it.
+# Where removing a source costs so many times that, restarts find no fit without it.
 _FAR_BEYOND = 10.0
-# Squares, in units of their covariance, of a moment that is hardly known and of an offset that hardly is one.
+# Squared moment and squared offset, over their covariance, below which they are hardly significant.
 _FAINT = 40.0
 _NEAR = 150.0
 _MOST_BY_ITSELF = 5
@@ -151,7 +151,7 @@ class _Levels:
                 self.problem.rows(rows), self.y[rows], before, credible=credible if ends else 0.0
             )
             gained = self._stands_out(before.chi2[:, 0], wider.chi2[:, 0])
-            # Where no number of sources is credible so far, the search failed, at this number or at an earlier one.
+            # No number of sources is credible so far: the search failed at this number or an earlier one.
             failed = np.flatnonzero(~(wider.chi2[:, 0] <= credible) & (last | ~gained))
             if failed.size:
                 wider = wider.replace(failed, self._restart(rows[failed], wider.rows(failed)))

@@ -37,9 +37,9 @@ from magloc.measurement.whitened import WhitenedModel
 
 N_UNKNOWNS = 6
 _MORE = 3  # times the starts where none of them explains a row
-# Share of the channels up to which a mask without them ranks candidates by the bases of all.
+# Largest share of missing channels for which candidates are ranked by the bases of all channels.
 _MOST_MISSING = 0.4
-# What the common field leaves of directions of missing channels that tell nothing else.
+# Singular value below which a direction of missing channels only sees the common field.
 _UNSEEN = 1e-3
 
 
@@ -66,8 +66,8 @@ class BestFits:
 class _Ranking:
     """Candidates and their bases (C, 3 n) under the whitening of a mask.
 
-    Of a mask that lacks few channels the whitening and the bases are those of all channels. What the others read counts
-    as unknown: the candidates' components are made `orthonormal` (6, n) without the directions `lost` (C, k).
+    If few channels are missing, the whitening and the bases are those of all channels, and missing readings count as
+    unknown: `orthonormal` (6, n) makes the candidates' components orthonormal without the directions `lost` (C, k).
     """
 
     whitening: Whitening

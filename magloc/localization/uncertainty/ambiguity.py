@@ -14,7 +14,7 @@ from magloc.localization.uncertainty.range_interval import relative_range_sigma
 LARGEST_GAUSSIAN_SIGMA = 0.04
 """Standard deviations of position and moment, over range and moment, up to which their errors are Gaussian."""
 LARGEST_BEND = 0.5
-"""By how much the rise of χ² at one standard deviation may differ from one where errors are Gaussian."""
+"""Largest deviation from one of the rise of χ² at one standard deviation, for Gaussian errors."""
 
 
 def log_evidence_volume(

@@ -96,8 +96,8 @@ def solutions_of(optima: Optima, detected: BoolArray) -> Solutions:
 def covariance_is_valid(optima: Optima, covariance: FloatArray, which: IntArray) -> BoolArray:
     """Return whether covariances (f, 6 K, 6 K) describe the errors of some fits.
 
-    They do where χ² is one of noise, and rises by one, give or take a half, at one standard deviation along the longest
-    axis, to either side: not where the errors follow a curve. With no degrees of freedom every χ² is as it must be.
+    They do where χ² agrees with noise and rises by about one (0.5 to 1.5) at one standard deviation along the longest
+    axis, on both sides: not where the errors follow a curve. Without degrees of freedom χ² is not tested.
     """
     fits, of_row = optima.fits.rows(which), optima.of_row[which]
     problem, y = optima.rows.model.rows(of_row), optima.rows.y[of_row]
@@ -232,7 +232,7 @@ def _best_chi2(optima: Optima) -> FloatArray:
 def _noise_factor(optima: Optima) -> FloatArray:
     """Return the factor (b,) of the noise variance: χ²/dof of rows that are misfits, else 1.
 
-    What a wrong model leaves is no noise, but σ that knew only the noise would be worse.
+    Residuals of a wrong model are no noise, but σ from the stated noise alone would be worse.
     """
     chi2 = _best_chi2(optima)
     return np.where(np.isfinite(chi2) & is_misfit(chi2, optima.dof), chi2 / max(optima.dof, 1), 1.0)

@@ -19,7 +19,7 @@ from arrays.typing import FloatArray
 from magloc.chi_square import energy_threshold
 from magloc.levels import DELTA_CHI2_95
 
-# Signals so many standard deviations above the root of the threshold are seen for certain.
+# Signals so many standard deviations above the root of the threshold are always detected.
 _CERTAIN = 8.0
 _N_STRENGTHS = 1200
 OUTSIDE = 0.05

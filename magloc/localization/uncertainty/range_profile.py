@@ -19,7 +19,7 @@ _SMALLEST_ALPHA = 1e-6
 # Steps outwards in standard deviations of a Gaussian profile, about the one where it would have risen enough.
 _STEPS = np.array([1.0, 1.5, 2.2, 4.0, 9.0, 25.0, 80.0])
 _ROUNDS = 3
-# By how much χ² of a point of the profile may be too high.
+# Tolerance of χ² at a point of the profile.
 _PROMISE = 1e-4
 
 
