@@ -149,17 +149,17 @@ class WhitenedModel(ScaledSensors):
     def rows(self, index: NDArray[np.intp]) -> WhitenedModel:
         """Return the model of some rows, which may be repeated."""
 
-        def chosen(values: FloatArray) -> FloatArray:
+        def select(values: FloatArray) -> FloatArray:
             if values.strides[0] == 0:
                 return np.broadcast_to(values[:1], (len(index), *values.shape[1:]))
             return values[index]
 
         return replace(
             self,
-            gain=chosen(self.gain),
-            ambient=chosen(self.ambient),
-            basis=chosen(self.basis),
-            shrinkage=chosen(self.shrinkage),
+            gain=select(self.gain),
+            ambient=select(self.ambient),
+            basis=select(self.basis),
+            shrinkage=select(self.shrinkage),
         )
 
     @property

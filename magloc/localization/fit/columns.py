@@ -86,7 +86,7 @@ class Solutions:
         of_row = np.concatenate([part.of_row for part in filled])
         order = None if (of_row[1:] >= of_row[:-1]).all() else np.argsort(of_row, kind="stable")
 
-        def stacked(name: str) -> Any:
+        def concatenate_column(name: str) -> Any:
             """Concatenate one column, padded to the largest number of sources and intervals."""
             values = [getattr(part, name) for part in filled]
             shape = np.max([value.shape[1:] for value in values], axis=0).astype(int)
@@ -98,7 +98,7 @@ class Solutions:
                 begin += len(value)
             return result if order is None else result[order]
 
-        return cls(**{name: stacked(name) for name in vars(filled[0])})
+        return cls(**{name: concatenate_column(name) for name in vars(filled[0])})
 
     def select(self, index: IntArray | BoolArray, of_row: IntArray | None = None) -> Solutions:
         """Return some of the solutions, with other row numbers if given."""

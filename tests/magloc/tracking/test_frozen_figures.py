@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from tests.tracking_figures.figures import Comparison, Figures, Run, compared
+from tests.tracking_figures.figures import Comparison, Figures, Run, compare
 from tests.tracking_figures.scenarios import QUICK, SCENARIOS, stored
 
 OLD = stored()
@@ -17,7 +17,7 @@ LIKE = Run(1, 100, 1.2, 1.1, 600, 96, 100, 1.1, 1.0, 1.1, 1.0, {"swaps": 0}, ("s
 def worse(**changes: object) -> list[str]:
     """Names of figures that are worse where a run is changed."""
     old, new = (Figures.of([run]) for run in (LIKE, replace(LIKE, **changes)))  # type: ignore[arg-type]
-    return [one.name for one in compared(old, new) if one.worse]
+    return [one.name for one in compare(old, new) if one.worse]
 
 
 @pytest.mark.parametrize(
@@ -26,7 +26,7 @@ def worse(**changes: object) -> list[str]:
 def test_none_is_worse(name: str) -> None:
     """The same readings as those of the stored figures; what is allowed, tests/tracking_figures/figures.py derives."""
     assert OLD[name].seeds == tuple(SCENARIOS[name].seeds)
-    found: list[Comparison] = compared(OLD[name], SCENARIOS[name].figures())
+    found: list[Comparison] = compare(OLD[name], SCENARIOS[name].figures())
     assert [one for one in found if one.worse] == []
 
 
@@ -72,7 +72,7 @@ class TestComparison:
 
     def test_without_a_bound_the_error_itself_counts(self) -> None:
         old, new = (Figures.of([replace(LIKE, bound_m=math.nan, rms_m=rms_m)]) for rms_m in (1.0, 1.15))
-        assert [one.name for one in compared(old, new) if one.worse] == ["rms_m"]
+        assert [one.name for one in compare(old, new) if one.worse] == ["rms_m"]
 
     def test_figures_are_stored_as_they_are(self) -> None:
         figures = Figures.of([LIKE, replace(LIKE, seed=2, nees=math.nan)])
