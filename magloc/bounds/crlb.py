@@ -1,8 +1,8 @@
-"""Cramér-Rao bounds: how well one set of readings can tell where a dipole is, and what it is, whatever the method.
+"""Cramér-Rao bounds of a dipole's position and moment from one set of readings.
 
-The information about (p, m) is :math:`I = H^T C^{-1} H` with the Jacobian H of the readings and the covariance C of
-all that is not the source. A nuisance x that enters the readings as N x, with a Gaussian prior of covariance Λ, adds
-:math:`N Λ N^T` to C. Which nuisances there are, and where a bound is infinite: docs/theory/cramer-rao-bounds.md.
+The information on (p, m) is :math:`I = H^T C^{-1} H` with the Jacobian H of the readings and the covariance C of all
+other contributions. A nuisance x that enters the readings as N x, with a Gaussian prior of covariance Λ, adds
+:math:`N Λ N^T` to C. docs/theory/cramer-rao-bounds.md lists the nuisances and the cases of infinite bounds.
 """
 
 from __future__ import annotations
@@ -25,30 +25,32 @@ from magloc.measurement.rows import ambient_fields, check_magnitudes, whitenings
 from magloc.measurement.whitened import WhitenedModel
 
 LOST = 1e-6
-"""A combination of parameters is not estimable if the readings tell of it so much less than of others."""
+"""Relative singular value below which a combination of parameters is not estimable."""
 
 
 @dataclass(frozen=True, eq=False)
 class Bounds(Drawn):
-    """Least standard deviations of any unbiased estimate from one set of readings, over leading axes.
+    """Least standard deviations of unbiased estimates from one set of readings.
+
+    Leading axes are batches.
 
     Attributes
     ----------
     position_m, moment_Am2 : ndarray, shape (..., 3)
         The source, in the array's frame.
     range_m : ndarray, shape (...)
-        Its distance from the sensors' centroid.
+        Distance of the source from the sensors' centroid.
     covariance : ndarray, shape (..., 6, 6)
-        Of (p, m) [m, A·m²]. A parameter that is not estimable has an infinite variance and NaN beside it.
+        Covariance of (p, m) [m, A·m²]. A parameter that is not estimable has an infinite variance and NaN beside it.
     sigma_range_m : ndarray, shape (...)
         Along the line from the centroid to the source.
     sigma_bearing_rad : ndarray, shape (...)
-        Of the direction of that line: root of the sum of the variances of its two angles, taken about any two axes at
+        σ of the direction of that line: root of the sum of the variances of its two angles, taken about any two axes at
         right angles to each other and to the line. So ``σ_position² = σ_range² + (range · σ_bearing)²``.
     sigma_position_m, sigma_moment_Am2 : ndarray, shape (...)
         Roots of the sum of the variances of the three components.
     rank : ndarray of int, shape (...)
-        Independent combinations of the six parameters that are estimable.
+        Number of independent estimable combinations of the six parameters.
 
     Examples
     --------
@@ -84,7 +86,7 @@ class Bounds(Drawn):
         return np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1))
 
 
-def whitened_jacobian(
+def nuisance_free_jacobian(
     array: SensorArray,
     position_m: ArrayLike,
     moment_Am2: ArrayLike,
@@ -93,9 +95,11 @@ def whitened_jacobian(
     known_moment_sigma_Am2: float = np.inf,
     body_length_m: ArrayLike | None = 0.0,
 ) -> FloatArray:
-    """Jacobian W (..., C, 6) of readings freed of all nuisances, of unit variance: the information is ``Wᵀ W``.
+    """Return the whitened Jacobian W (..., C, 6), with all nuisances projected out.
 
-    A known modulus of the moment is one row more.
+    The information is ``Wᵀ W``.
+
+    A known modulus of the moment adds one row.
 
     Columns (p, m) in 1/m and 1/(A·m²); NaN for a source on a sensor. Parameters are those of :func:`cramer_rao_bounds`.
     """
@@ -147,18 +151,18 @@ def cramer_rao_bounds(
     Parameters
     ----------
     array : SensorArray
-        Whose noise and uncertainties count, that of its pose too: the bounds are then those of a source in the world,
-        in axes that stand where the pose says that the array is. It does not move, so that clocks do not matter.
+        Array with its noise and uncertainties. With an uncertain pose the bounds are those of a source in the world,
+        in the axes of the stated pose. The array does not move, so that clocks have no effect.
     position_m, moment_Am2 : array_like, shape (..., 3)
         Source in the array's frame [m], its moment [A·m²].
     ambient_uncertainty_T : float
-        Standard deviation, per axis, of the error of ``array.ambient_T``, the same for all sensors, in place of the
-        array's own [T].
+        Standard deviation per axis of the error of ``array.ambient_T``, the same for all sensors [T]. It replaces
+        that of the array.
     known_moment_sigma_Am2 : float
-        Standard deviation of what is known beforehand of the moment's modulus [A·m²]; nothing is by default.
+        Standard deviation of a known modulus of the moment [A·m²]; unknown by default.
     body_length_m : array_like, shape (...), optional
-        Lengths of the sources: what a dipole leaves out of the field of such a body counts as noise. 0 of points; None:
-        a quarter of the distance near the array, as :func:`magloc.locate` assumes.
+        Lengths of the sources; the deviation of their field from a dipole counts as noise. 0 for points; None for a
+        quarter of the distance near the array, as in :func:`magloc.locate`.
 
     Returns
     -------
@@ -181,7 +185,7 @@ def cramer_rao_bounds(
     """
     check_magnitudes(array)
     p, m = _sources(position_m, moment_Am2)
-    W = whitened_jacobian(
+    W = nuisance_free_jacobian(
         array,
         p,
         m,
@@ -192,7 +196,7 @@ def cramer_rao_bounds(
     line = p - array.centroid
     distance = np.linalg.norm(line, axis=-1)
     known: BoolArray = np.all(np.isfinite(W), axis=(-2, -1))
-    # In units of the distance and the moment's size the singular values compare.
+    # These units make the singular values comparable.
     size = np.linalg.norm(m, axis=-1)
     unit = np.concatenate(
         [
@@ -240,12 +244,15 @@ def cramer_rao_bounds(
 
 
 def _sum_of_squares(rows: FloatArray, which: BoolArray) -> FloatArray:
-    """Over the last axis (..., r, n), of those entries that count (..., n): (..., r)."""
+    """Return sums of squares (..., r) over the selected entries (..., n) of (..., r, n)."""
     return np.sum(np.where(which[..., None, :], rows, 0.0) ** 2, axis=-1)
 
 
 def _root_of_sum(rows: FloatArray, inverse: FloatArray, lost: BoolArray) -> FloatArray:
-    """σ of quantities by their parts (..., r, n) in the singular vectors; infinite with a part in a lost one."""
+    """Return σ of quantities from their parts (..., r, n) in the singular vectors.
+
+    It is infinite if a part is in a lost one.
+    """
     sigma = np.sqrt(np.sum((rows * inverse[..., None, :]) ** 2, axis=(-2, -1)))
     hidden = np.sum(_sum_of_squares(rows, lost), axis=-1) > LOST**2
     return np.where(hidden, np.inf, sigma)
@@ -257,7 +264,7 @@ def _sources(position_m: ArrayLike, moment_Am2: ArrayLike) -> tuple[FloatArray, 
 
 
 def check_uncertainty(ambient_uncertainty_T: float, known_moment_sigma_Am2: float = np.inf) -> None:
-    """Raise ValueError for uncertainties of the ambient field and of the moment's modulus that are none."""
+    """Raise ValueError for invalid uncertainties of ambient field or moment."""
     if not 0.0 <= ambient_uncertainty_T < np.inf:
         raise ValueError(
             f"Input ambient_uncertainty_T must be finite and not negative; instead received {ambient_uncertainty_T}."

@@ -1,9 +1,9 @@
-"""Maps of Cramér-Rao bounds: where around an array, and how far from it, can a source be told how well?
+"""Maps of Cramér-Rao bounds: accuracy of a source at places around an array.
 
-A cube around the array (:class:`BoundMap`) and planes through its centroid; spheres: :mod:`magloc.bounds.spheres`.
-Every bound comes as four variables, ``sigma_range`` for the given moment, and over the directions of a moment of that
-size its ``_median``, the value ``_q95`` that 95 % of them stay below, and the ``_worst`` of those sampled (that of all
-may be infinite: docs/theory/cramer-rao-bounds.md).
+The places are a cube around the array (:class:`BoundMap`), or planes through its centroid; for spheres see
+:mod:`magloc.bounds.spheres`. Every bound has four variables: ``sigma_range`` is for the given moment; ``_median``,
+``_q95`` (95 % quantile) and ``_worst`` are over sampled directions of a moment of that size. The worst of all
+directions may be infinite: docs/theory/cramer-rao-bounds.md.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ CASES_IN_WORDS = {
     "_q95": "95 % quantile over the directions of the moment",
     "_worst": "worst of the sampled directions of the moment",
 }
-"""What each ending of the variables stands for."""
+"""Meaning of each ending of the variables."""
 CASES = tuple(CASES_IN_WORDS)
 """Endings of the variables: the given moment, and the statistics over the directions of the moment."""
 PLANES = ("xy", "xz", "yz")
@@ -48,8 +48,8 @@ _UNITS = {"range": "m", "bearing": "rad", "position": "m"}
 _TITLE = "Cramer-Rao bounds of a magnetic dipole"
 
 
-class Reached(IntEnum):
-    """For which moments the range is as accurate as required."""
+class AccuracyReach(IntEnum):
+    """Share of the moments whose range is as accurate as required."""
 
     UNDEFINED = -1
     FEW = 0
@@ -60,12 +60,12 @@ class Reached(IntEnum):
 
 @dataclass(frozen=True)
 class BoundScenario:
-    """An array, and the source that it is to see.
+    """An array and a source for maps of bounds.
 
     Attributes
     ----------
     array : SensorArray
-        Of any sensors.
+        Array of any sensors.
     moment_Am2 : tuple of 3 floats
         Moment of the source; its size is that of the moments of other directions, too.
     half_width_m : float
@@ -77,7 +77,7 @@ class BoundScenario:
     ambient_uncertainty_T, known_moment_sigma_Am2 : float
         See :func:`magloc.bounds.crlb.cramer_rao_bounds`.
     body_length_m : float, optional
-        Of the source; by default a quarter of its distance near the array. 0: a point.
+        Length of the source; by default a quarter of its distance near the array. 0 for a point.
 
     Raises
     ------
@@ -110,14 +110,14 @@ class BoundScenario:
         return moments_on_sphere(size, self.n_moments, half=half)
 
     @property
-    def uncertain(self) -> dict[str, Any]:
-        """What is uncertain beside the array, as arguments of bounds."""
+    def uncertainties(self) -> dict[str, Any]:
+        """Uncertainties apart from the array's, as arguments of bounds."""
         names = ("ambient_uncertainty_T", "known_moment_sigma_Am2", "body_length_m")
         return {name: getattr(self, name) for name in names}
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What determines the bounds beside the array, for a dataset."""
+        """Settings that determine the bounds apart from the array, for a dataset."""
         known = {"known_moment_sigma_Am2": self.known_moment_sigma_Am2}
         return {
             "moment_Am2": np.asarray(self.moment_Am2, dtype=np.float64),
@@ -130,15 +130,15 @@ class BoundScenario:
 
     @property
     def attributes(self) -> dict[str, Any]:
-        """All of it, for a dataset."""
+        """Attributes of a dataset, with the array."""
         return {**described(_TITLE, self.array), **self.settings}
 
 
 def bounds_at(scenario: BoundScenario, positions_m: ArrayLike) -> dict[str, FloatArray]:
-    """All bounds of a map at positions (..., 3) [m]: σ of range, bearing and position with each of :data:`CASES`."""
+    """Return σ of range, bearing and position at (..., 3) [m], for each of :data:`CASES`."""
     positions = np.asarray(positions_m, dtype=np.float64)
     moments = np.vstack([scenario.moment_Am2, scenario.moments_Am2])
-    table = sigma_table(scenario.array, positions.reshape(-1, 3), moments, **scenario.uncertain)
+    table = sigma_table(scenario.array, positions.reshape(-1, 3), moments, **scenario.uncertainties)
     values = {}
     for name, sigma in zip(_UNITS, table, strict=True):
         spread = spread_over(sigma[:, 1:])
@@ -159,7 +159,7 @@ VARIABLES: dict[str, Variable] = {
         np.int8,
         {
             "long_name": "for which directions of the moment the range is as accurate as required",
-            **flags(Reached),
+            **flags(AccuracyReach),
         },
     )
 }
@@ -167,7 +167,7 @@ VARIABLES: dict[str, Variable] = {
 
 @dataclass(frozen=True, eq=False)
 class BoundMap(CubeMap):
-    """Bounds over a cube of sources."""
+    """Bounds of a cube of sources."""
 
     title = _TITLE
     variables = VARIABLES
@@ -176,18 +176,18 @@ class BoundMap(CubeMap):
 
     @property
     def point_s(self) -> float:
-        """Seconds of one core that the bounds of a point with all moments take, roughly."""
+        """Approximate time of one core for a point with all moments [s]."""
         return (1e-5 if self.scenario.body_length_m else 3e-7) * self.scenario.n_moments
 
     @property
     def settings(self) -> Mapping[str, Any]:
-        """Moment, and what is required."""
+        """Moment, and required accuracy."""
         return self.scenario.settings
 
     def values_at(self, box: Box) -> Mapping[str, Any]:
-        """Bounds of the sources of a box."""
+        """Return the bounds of the sources of a box."""
         sigma = bounds_at(self.scenario, self.scenario.array.centroid + box.points(self.axis))
-        return {**sigma, "reached": _reached(sigma, self.scenario.accuracy_m)}
+        return {**sigma, "reached": _accuracy_reach(sigma, self.scenario.accuracy_m)}
 
 
 @dataclass(frozen=True)
@@ -199,9 +199,9 @@ class BoundsSummary:
     points, accurate : int
         Points that have a bound, and those of them with the required accuracy for 95 % of the moments.
     fraction : float
-        Of the latter.
+        Share of the latter.
     seconds : float
-        Duration of the computation alone; that of all machines together.
+        Duration of the computation, the sum of all machines.
     """
 
     points: int
@@ -225,12 +225,12 @@ def bound_map(
     scheduler: str | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> xr.Dataset:
-    """Cramér-Rao bounds of sources in a cube around an array: where can it know a source how well?
+    """Compute Cramér-Rao bounds of sources in a cube around an array.
 
     Parameters
     ----------
     array : SensorArray
-        Whose noise and uncertainties count.
+        Array with its noise and uncertainties.
     moment_Am2 : tuple of 3 floats
         Moment of the source; its size is that of the moments of other directions, too [A·m²].
     edge_m : float
@@ -244,8 +244,8 @@ def bound_map(
     ambient_uncertainty_T, known_moment_sigma_Am2 : float
         See :func:`magloc.bounds.crlb.cramer_rao_bounds`.
     body_length_m : float, optional
-        Length of every source: what a dipole leaves out of its field counts as noise. By default a quarter of its
-        distance near the array, as :func:`magloc.locate` assumes; 0 for points.
+        Length of every source; the deviation of its field from a dipole counts as noise. By default a quarter of its
+        distance near the array, as in :func:`magloc.locate`; 0 for points.
     out, scheduler, progress
         See :func:`magloc.grids.computed.computed_map`: a zarr folder that streams and resumes, the address of a dask
         scheduler, and a call with the number of sources finished.
@@ -253,8 +253,8 @@ def bound_map(
     Returns
     -------
     xarray.Dataset
-        Over the source's (x, y, z) relative to the centroid [m]: the variables of :func:`bounds_at`, and ``reached``:
-        for which moments σ of the range is as small as required.
+        Dimensions are the source's (x, y, z) relative to the centroid [m]. Variables are those of :func:`bounds_at`,
+        and ``reached``: for which moments σ of the range is as small as required.
 
     Raises
     ------
@@ -278,7 +278,7 @@ def bound_map(
 
 
 def summary(dataset: xr.Dataset) -> BoundsSummary:
-    """Counts of a map made by :func:`bound_map`, which need not fit into memory."""
+    """Return the counts of a map by :func:`bound_map`, which need not fit into memory."""
     tally = tallied(dataset, ("reached",), _tally)
     accurate, points = tally.counts["accurate"], tally.counts["points"]
     return BoundsSummary(points, accurate, tally.fraction("accurate", "points"), float(dataset.attrs["seconds"]))
@@ -286,14 +286,16 @@ def summary(dataset: xr.Dataset) -> BoundsSummary:
 
 def _tally(values: Values) -> Tally:
     reached = values["reached"]
-    counts = {"points": reached != Reached.UNDEFINED, "accurate": reached >= Reached.MOST}
+    counts = {"points": reached != AccuracyReach.UNDEFINED, "accurate": reached >= AccuracyReach.MOST}
     return Tally(Counter({name: int(mask.sum()) for name, mask in counts.items()}))
 
 
 def bound_slices(scenario: BoundScenario, grid: int = 121) -> xr.Dataset:
-    """Bounds on the planes xy, xz and yz through the array's centroid, with `grid` points along either axis.
+    """Compute bounds on the planes xy, xz and yz through the array's centroid.
 
-    Over (plane, up, across) with the axes of :data:`PLANES`, across first, relative to the centroid [m].
+    There are `grid` points along either axis.
+
+    Dimensions are (plane, up, across) with the axes of :data:`PLANES`, across first, relative to the centroid [m].
     """
     import xarray as xr
 
@@ -318,7 +320,7 @@ def bound_slices(scenario: BoundScenario, grid: int = 121) -> xr.Dataset:
     )
 
 
-def _reached(sigma: Mapping[str, FloatArray], accuracy_m: float) -> Any:
+def _accuracy_reach(sigma: Mapping[str, FloatArray], accuracy_m: float) -> Any:
     undefined = np.isnan(sigma["sigma_range"])
     count = sum((sigma[f"sigma_range{case}"] <= accuracy_m).astype(np.int8) for case in CASES[1:])
-    return np.where(undefined, Reached.UNDEFINED, count)
+    return np.where(undefined, AccuracyReach.UNDEFINED, count)

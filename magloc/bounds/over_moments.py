@@ -1,4 +1,4 @@
-"""Cramér-Rao bounds of many sources, each with many moments: tables, and statistics over the directions of the moment.
+"""Cramér-Rao bounds of many sources with many moments: tables and statistics.
 
 The readable reference of every entry is :func:`magloc.bounds.crlb.cramer_rao_bounds`; for when they are infinite see
 docs/theory/cramer-rao-bounds.md.
@@ -20,7 +20,7 @@ from magloc.levels import TYPICAL_AND_BAD
 
 
 class Spread(NamedTuple):
-    """A σ over the directions of the moment, each of shape (...)."""
+    """Statistics of a σ over the directions of the moment, each of shape (...)."""
 
     mean: FloatArray
     median: FloatArray
@@ -29,7 +29,7 @@ class Spread(NamedTuple):
 
 
 class MomentBounds(NamedTuple):
-    """Bounds over moments of one size; the worst is that of the sampled directions, see :mod:`magloc.bounds.crlb`."""
+    """Bounds over sampled moments of one size (:mod:`magloc.bounds.crlb`)."""
 
     sigma_range_m: Spread
     sigma_bearing_rad: Spread
@@ -53,7 +53,9 @@ def bounds_over_moments(
     known_moment_sigma_Am2: float = np.inf,
     body_length_m: float | None = 0.0,
 ) -> MomentBounds:
-    """Mean, median, 95 % quantile and worst (P,) of the bounds of positions (P, 3) over moments (M, 3) [A·m²].
+    """Return statistics (P,) of the bounds of positions (P, 3) over moments (M, 3) [A·m²].
+
+    They are mean, median, 95 % quantile and worst.
 
     The other parameters are those of :func:`magloc.bounds.crlb.cramer_rao_bounds`.
     """
@@ -77,7 +79,7 @@ def sigma_table(
     known_moment_sigma_Am2: float = np.inf,
     body_length_m: float | None = 0.0,
 ) -> SigmaTable:
-    """Bounds (P, M) of range, bearing and position for every pair of positions (P, 3) and moments (M, 3).
+    """Return bounds (P, M) for every pair of positions (P, 3) and moments (M, 3).
 
     Infinite where the information is singular, NaN for a source on a sensor or in the centroid.
     """
@@ -86,7 +88,7 @@ def sigma_table(
     check_body_length(body_length_m)
     lengths = assumed_body_lengths(array.positions, positions, array.circumradius, body_length_m)
     table = np.empty((3, len(positions), len(moments)))
-    # Bodies have so many nuisances that points are not to pay for them.
+    # Points are computed without the many nuisances of bodies, which are slow.
     for is_body in (False, True):
         (places,) = np.nonzero((lengths > 0.0) == is_body)
         if not places.size:
@@ -103,7 +105,7 @@ def sigma_table(
 
 
 def spread_over(sigma: ArrayLike) -> Spread:
-    """Statistics of σ over its last axis, by order statistics: an infinite neighbour does not spoil a quantile."""
+    """Return order statistics of σ over its last axis; infinite neighbours do not matter."""
     ordered = np.sort(np.asarray(sigma, dtype=np.float64), axis=-1)
     n = ordered.shape[-1]
     median, q95 = (ordered[..., int(np.ceil(q * n)) - 1] for q in TYPICAL_AND_BAD)

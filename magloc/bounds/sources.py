@@ -1,4 +1,7 @@
-"""Cramér-Rao bounds of many sources by a compiled kernel; :mod:`magloc.bounds.crlb` is the readable reference."""
+"""Cramér-Rao bounds of many sources by a compiled kernel.
+
+:mod:`magloc.bounds.crlb` is the readable reference.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ from arrays.typing import FloatArray
 from magloc import core
 from magloc.fields.multipole import N_BODY_ERRORS, finite_body_errors
 
-# Information about a parameter that is less than this part of what it would be were the others known is none.
+# Share of the information with all other parameters known below which a parameter counts as unknown.
 _LOST_INFORMATION = 1e-12
 _PRODUCTS_A_BLOCK = 10_000_000  # of columns, in one call: about two milliseconds
 
@@ -23,24 +26,23 @@ def array_model(
     bodies: bool = False,
     lost: float = _LOST_INFORMATION,
 ) -> core.Problem:
-    """
-    Describe an array at rest to the kernel.
+    """Describe an array at rest to the kernel.
 
     Parameters
     ----------
     array : SensorArray
-        Whose noise and uncertainties count.
+        Array with its noise and uncertainties.
     ambient_uncertainty_T, known_moment_sigma_Am2 : float
         See :func:`magloc.bounds.crlb.cramer_rao_bounds`.
     bodies : bool
         Whether sources are bodies, not points.
     lost : float
-        The range is not known where the other parameters leave less than this part of the information about it.
+        The range is unknown if the other parameters leave less than this share of its information.
 
     Returns
     -------
     Problem
-        The struct magloc_bound_array of magloc.h: all of the array but where its sensors stand.
+        The struct magloc_bound_array of magloc.h: the array without the positions of its sensors.
     """
     is_modulus = np.array([sensor.kind == "scalar" for sensor in array.sensors])
     common = np.inf if array.common_field_T is None else array.common_field_T
@@ -91,15 +93,16 @@ def source_bounds(
     length_m: FloatArray | None = None,
     slopes: FloatArray | None = None,
 ) -> FloatArray:
-    """
-    Return the σ of range [m], bearing [rad] and position [m] of M moments at each of P places, shape (3, P, M).
+    """Return σ of range [m], bearing [rad] and position [m], shape (3, P, M).
+
+    There are M moments at each of P places.
 
     Parameters
     ----------
     model : Problem
-        Of :func:`array_model`.
+        Model from :func:`array_model`.
     sensors_m : ndarray, shape (N, 3)
-        Where the sensors stand [m].
+        Positions of the sensors [m].
     positions_m : ndarray, shape (P, 3)
         Positions of the sources [m].
     moments_Am2 : ndarray, shape (M, 3) or (P, M, 3)
@@ -139,7 +142,7 @@ def source_bounds(
 
 
 def _body_errors(sensors: FloatArray, positions: FloatArray, length_m: FloatArray) -> FloatArray:
-    """Return upper triangles (P, N, 14, 6) of the matrices that give one σ of each body error of the field."""
+    """Return matrices (P, N, 14, 6) of one σ of each body error, as upper triangles."""
     separation = sensors - positions[:, None]
     matrices = finite_body_errors(separation[:, :, None], np.eye(3), length_m[:, None, None, None, None])
     return np.ascontiguousarray(np.swapaxes(matrices[(..., *np.triu_indices(3), slice(None))], -1, -2))

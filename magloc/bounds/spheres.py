@@ -1,6 +1,6 @@
-"""Cramér-Rao bounds on spheres about an array, and how far it reaches in every direction.
+"""Cramér-Rao bounds on spheres about an array, and its reach in every direction.
 
-Reach means two things: how far away the range is known as well as required, and how far away a source is found at all.
+The reach is the distance at which the range is as accurate as required, or at which a source is detected.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ if TYPE_CHECKING:
 
 ANGLES = ("elevation", "azimuth")
 """Dimensions of a sphere."""
-# Distances, in circumradii, at which the reach is looked for before it is refined, and their ratio.
+# Distances of the search for the reach before refinement: the nearest, in circumradii, and their ratio.
 _NEAREST, _STEP = 1.1, 1.12
 _FARTHEST = 1e6
 _REFINEMENTS = 2
-_ALL_DONE = 8  # distances without a single direction in reach, after which no farther ones are tried
+_ALL_DONE = 8  # number of distances without any direction in reach that ends the search
 
 
 def bound_spheres(scenario: BoundScenario, ranges_m: Sequence[float], step_deg: float = 5.0) -> xr.Dataset:
-    """Bounds on spheres about the array's centroid, and the reach in every direction.
+    """Compute bounds on spheres about the array's centroid, and the reach by direction.
 
     Parameters
     ----------
     ranges_m : sequence of float
         Radii of the spheres [m].
     step_deg : float
-        Between directions along either angle, a part of 90.
+        Step of either angle; it divides 90.
 
     Returns
     -------
@@ -79,16 +79,18 @@ def bound_spheres(scenario: BoundScenario, ranges_m: Sequence[float], step_deg: 
 
 
 def accuracy_ranges(scenario: BoundScenario, directions: ArrayLike) -> FloatArray:
-    """Largest distances (D, 4) [m] along directions (D, 3) with the required σ of the range, for each of :data:`CASES`.
+    """Return the largest distances (D, 4) [m] with the required σ of the range.
 
-    0 where no distance will do. It is looked for at distances from 1.1 circumradii on, each 12 % more than the one
-    before, and interpolated to a part in 10⁴; what happens between two of them that are both in reach is not seen.
+    They are along directions (D, 3), for each of :data:`CASES`.
+
+    The result is 0 if there is none. The search starts at 1.1 circumradii with steps of 12 %, and interpolates to a
+    part in 10⁴. It does not notice gaps between two distances that are both in reach.
     """
     directions = np.asarray(directions, dtype=np.float64)
     centroid, nearest = scenario.array.centroid, _NEAREST * scenario.array.circumradius
 
     def excess(distance_m: FloatArray) -> FloatArray:
-        """Logarithm of σ over what is required, shape (D, 4): far away straight over that of the distance."""
+        """Return log(σ / required σ), (D, 4); far away linear in the logarithm of distance."""
         sigma = bounds_at(scenario, centroid + distance_m[:, None] * directions)
         of_cases = np.stack([sigma[f"sigma_range{case}"] for case in CASES], axis=-1)
         return np.log(of_cases / scenario.accuracy_m)
@@ -114,7 +116,7 @@ def accuracy_ranges(scenario: BoundScenario, directions: ArrayLike) -> FloatArra
 
 
 def _crossing(low: FloatArray, at_low: FloatArray, high: FloatArray, at_high: FloatArray) -> FloatArray:
-    """Where a line through both ends, over the logarithm of the distance, is zero; zero where low is."""
+    """Return the zero of a line in the logarithm of the distance; zero where low is zero."""
     present = low > 0.0
     rise = np.where(present, at_high - at_low, 1.0)
     share = np.where(np.isfinite(rise) & (rise > 0.0), -at_low / np.where(rise > 0.0, rise, 1.0), 0.0)
@@ -123,7 +125,7 @@ def _crossing(low: FloatArray, at_low: FloatArray, high: FloatArray, at_high: Fl
 
 
 def sphere_grid(elevation_deg: FloatArray, azimuth_deg: FloatArray) -> FloatArray:
-    """Unit vectors (elevations, azimuths, 3) of angles [°]."""
+    """Return unit vectors (elevations, azimuths, 3) of angles [°]."""
     e, a = np.meshgrid(np.radians(elevation_deg), np.radians(azimuth_deg), indexing="ij")
     return np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], axis=-1)
 
@@ -138,7 +140,7 @@ def _reach_attributes(case: str) -> dict[str, str]:
 def with_detection_ranges(
     spheres: xr.Dataset, scenario: BoundScenario, detector: Detector, probability: float = 0.9
 ) -> xr.Dataset:
-    """Spheres of :func:`bound_spheres` with the distances at which a source is detected with a probability.
+    """Return spheres of :func:`bound_spheres` with the ranges of detection.
 
     ``detection_range`` over (elevation, azimuth), for each of :data:`magloc.bounds.maps.CASES`, is the greatest
     distance from the centroid [m] at which the given moment is found, a half and 95 % of the directions of the moment
@@ -148,7 +150,7 @@ def with_detection_ranges(
     once = directions[:, :-1]  # the last azimuth is the first one again
     moments = np.vstack([np.asarray(scenario.moment_Am2), scenario.moments_Am2])
     found = detection_ranges(scenario.array, once.reshape(-1, 3), moments, detector, probability=probability)
-    # The quantiles of a distance are those of its opposite, as large is good.
+    # Large distances are good, so take quantiles of the negative distance.
     over_moments = spread_over(-found[:, 1:])
     cases = (found[:, 0], -over_moments.median, -over_moments.q95, -over_moments.worst)
     variables = {}

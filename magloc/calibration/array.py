@@ -229,7 +229,7 @@ def _n_readings(problem: CalibrationProblem) -> int:
 
 
 def _check_counts(problem: CalibrationProblem) -> None:
-    unknowns, left = len(problem.estimated), _n_readings(problem)
+    unknowns, left = len(problem.estimated_indices), _n_readings(problem)
     if left < unknowns:
         raise ValueError(
             f"Input readings_T must have more readings than unknowns; instead {len(problem.readings_T)} usable rows "

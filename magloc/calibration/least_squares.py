@@ -83,8 +83,8 @@ def eliminate_rows(
     )
     flat = by_row.reshape(n_rows * n, by_row.shape[-1])
     information, gradient = _normal_equations(linear)
-    information = information[np.ix_(problem.estimated, problem.estimated)] - flat.T @ flat
-    gradient = gradient[problem.estimated] - flat.T @ row_gradient.ravel()
+    information = information[np.ix_(problem.estimated_indices, problem.estimated_indices)] - flat.T @ flat
+    gradient = gradient[problem.estimated_indices] - flat.T @ row_gradient.ravel()
     return ReducedEquations(information, gradient, by_row, row_gradient, r)
 
 

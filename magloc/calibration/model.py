@@ -99,7 +99,7 @@ class CalibrationProblem:
         return 3 * self.unknown_position + 3 * (self.moment == "free") + 3
 
     @property
-    def estimated(self) -> NDArray[np.intp]:
+    def estimated_indices(self) -> NDArray[np.intp]:
         """Indices of the estimated unknowns among the 15 N of the sensors and the g of the source."""
         n = self.free.size
         return np.concatenate([np.flatnonzero(self.free.ravel()), np.arange(n, n + self.n_globals)])

@@ -167,8 +167,8 @@ def bounds(
             f"note: the source is so near that its size matters: a quarter of its distance, {length_m:.3g} m, is taken;"
             " --body-length-m says it, 0 a point"
         )
-    of_source = magloc.cramer_rao_bounds(array, place, wanted.moment_Am2, **wanted.uncertain)
-    over_moments = bounds_over_moments(array, place[None], wanted.moments_Am2, **wanted.uncertain)
+    of_source = magloc.cramer_rao_bounds(array, place, wanted.moment_Am2, **wanted.uncertainties)
+    over_moments = bounds_over_moments(array, place[None], wanted.moments_Am2, **wanted.uncertainties)
     name = Path(scenario).stem if of.array is None else of.array.stem
     moment = "" if of.moment_Am2 is None else "-" + "_".join(f"{value:g}" for value in of.moment_Am2)
     folder = Path(f"bounds-{name}-{task.grid}{moment}") if out is None else out
@@ -289,7 +289,7 @@ def _cube(task: BoundScenario, grid: int, folder: Path, *, quiet: bool) -> Bound
             n=grid,
             accuracy_m=task.accuracy_m,
             n_moments=task.n_moments,
-            **task.uncertain,
+            **task.uncertainties,
             out=folder / "map.zarr",
             progress=advance,
         )

@@ -20,8 +20,8 @@ _BLOCK_S, _FEWEST = 0.05, 8
 _TERM_S = 4e-9  # a weighted field in a difference; a contrast takes five times as long, relinearisation four times
 
 
-class Ends(NamedTuple):
-    """Ends of many starts.
+class FilterEnds(NamedTuple):
+    """Final states of a filter from many starts.
 
     Attributes
     ----------
@@ -41,7 +41,7 @@ class Ends(NamedTuple):
 
 
 class ScaledDifferences(NamedTuple):
-    """Differences of an array's fields, as magloc.h describes them, in units of given lengths and moments.
+    """Differences of an array's fields in units of a length and a moment (magloc.h).
 
     The arrays of one of the two forms are empty.
     """
@@ -64,11 +64,10 @@ class ScaledDifferences(NamedTuple):
         return MU0_OVER_4PI * self.moment / self.length**3
 
     @classmethod
-    def weighted(
+    def from_weights(
         cls, z: FloatArray, variance: FloatArray, sensors: FloatArray, weights: FloatArray, length: float, moment: float
     ) -> ScaledDifferences:
-        """
-        Return the differences as sums of weighted fields.
+        """Return the differences as sums of weighted fields.
 
         Parameters
         ----------
@@ -93,10 +92,13 @@ class ScaledDifferences(NamedTuple):
     def of(
         cls, z: FloatArray, variance: FloatArray, sensors: FloatArray, weights: FloatArray, length: float, moment: float
     ) -> ScaledDifferences:
-        """Return the differences as contrasts if their noise allows it; arguments of :meth:`weighted`."""
+        """Return the differences as contrasts if their noise allows it.
+
+        Arguments are those of :meth:`from_weights`.
+        """
         base, noise = _base_and_noise(weights, variance)
         if noise is None:
-            return cls.weighted(z, variance, sensors, weights, length, moment)
+            return cls.from_weights(z, variance, sensors, weights, length, moment)
         order = np.argsort(np.arange(len(sensors)) != base, kind="stable")
         scaled = cls(length, moment, sensors[order] / length)
         noise = noise[order] / scaled.field**2
@@ -112,7 +114,9 @@ class ScaledDifferences(NamedTuple):
 
 
 def _base_and_noise(weights: FloatArray, variance: FloatArray) -> tuple[int, FloatArray | None]:
-    """Return the base sensor and the sensors' variances (N,), or None unless the differences are such contrasts.
+    """Return the base sensor and the sensors' variances (N,).
+
+    The latter are None unless the differences are such contrasts.
 
     The information of the differences about the sensors' fields must be ``(diag(c) - c cᵀ / Σc) ⊗ I₃`` with c the
     inverse variances, and the plain sum of their squares that of the differences against the base sensor.
@@ -150,9 +154,8 @@ def ends(
     tolerance_T: float,
     max_iterations: int,
     first_damping: float = 0.0,
-) -> Ends:
-    """
-    Return the end of every start.
+) -> FilterEnds:
+    """Return the end of every start.
 
     Parameters
     ----------
@@ -170,7 +173,7 @@ def ends(
         Damping of the first step of DAMPED.
     """
     n, unit = len(starts), np.repeat([differences.length, differences.moment], 3)
-    out = Ends(np.empty((n, 6)), np.empty(n), np.empty(n, np.int64), np.empty(n, np.uint8))
+    out = FilterEnds(np.empty((n, 6)), np.empty(n), np.empty(n, np.int64), np.empty(n, np.uint8))
     _, _, *arrays = differences
     work = core.problem(
         "starts",

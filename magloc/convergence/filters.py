@@ -1,4 +1,4 @@
-"""The filters whose convergence is mapped."""
+"""Filters of the convergence maps."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arrays.typing import FloatArray
-from magloc.convergence.ends import DAMPED, ITERATED, RELINEARISED, REPEATED, Ends, ScaledDifferences, ends
+from magloc.convergence.ends import DAMPED, ITERATED, RELINEARISED, REPEATED, FilterEnds, ScaledDifferences, ends
 from magloc.localization.search.single_source import SingleSourceSearch
 from magloc.measurement.differences import DifferenceMeasurement
 
-# χ² above the maximum-likelihood χ² within which a stop counts as having reached it.
+# Largest excess over the maximum-likelihood χ² of an end that counts as converged.
 CHI2_REACHED = 0.05
-# Distance from the maximum-likelihood position that a filter with a prior may keep.
+# Largest distance from the maximum-likelihood position for a filter with a prior.
 PRIOR_REACHED_M = 0.5
 _PASS_S = 4e-8
 
 
 class Filter(Protocol):
-    """What a map needs of a filter."""
+    """Interface of a filter for convergence maps."""
 
     @property
     def name(self) -> str:
@@ -29,21 +29,21 @@ class Filter(Protocol):
 
     @property
     def max_iterations(self) -> int:
-        """Passes at most."""
+        """Largest number of passes."""
 
     @property
     def pass_s(self) -> float:
-        """Seconds of one core that a pass takes, roughly, for the nine differences of four vector sensors."""
+        """Approximate time of one core for a pass over nine differences [s]."""
 
-    def run(self, measurement: DifferenceMeasurement, z: FloatArray, starts: FloatArray) -> Ends:
-        """End of every start (n, 6) for the decorrelated differences z (k,)."""
+    def run(self, measurement: DifferenceMeasurement, z: FloatArray, starts: FloatArray) -> FilterEnds:
+        """Return the end of every start (n, 6) for the decorrelated differences z (k,)."""
 
-    def reached(self, ends: Ends, chi2_optimum: float, position_optimum: FloatArray) -> NDArray[np.bool_]:
-        """Which of the ends are the maximum-likelihood optimum."""
+    def reached(self, ends: FilterEnds, chi2_optimum: float, position_optimum: FloatArray) -> NDArray[np.bool_]:
+        """Return which ends are the maximum-likelihood optimum."""
 
 
 class _PositiveSettings:
-    """A dataclass whose numbers are positive; a tolerance may be zero: all passes are made."""
+    """Dataclass with positive numbers; a tolerance of zero makes all passes."""
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -55,23 +55,26 @@ class _PositiveSettings:
 
 
 class _LikelihoodFilter(_PositiveSettings):
-    """A filter that ends where the likelihood is largest."""
+    """Filter that maximises the likelihood."""
 
-    def reached(self, ends: Ends, chi2_optimum: float, position_optimum: FloatArray) -> NDArray[np.bool_]:
-        """Stopped with the χ² of the maximum-likelihood optimum."""
+    def reached(self, ends: FilterEnds, chi2_optimum: float, position_optimum: FloatArray) -> NDArray[np.bool_]:
+        """Return which ends stopped with the χ² of the maximum-likelihood optimum."""
         return ends.stopped & (ends.chi2 < chi2_optimum + CHI2_REACHED)
 
 
 @dataclass(frozen=True)
 class _PriorFilter(_PositiveSettings):
-    """A filter with the start as the mean of its prior, of these standard deviations per axis."""
+    """Filter with a Gaussian prior around the start, with standard deviations per axis."""
 
     position_sigma_m: float = 3.0
     moment_sigma_Am2: float = 300.0
     pass_s: ClassVar[float] = _PASS_S
 
-    def reached(self, ends: Ends, chi2_optimum: float, position_optimum: FloatArray) -> NDArray[np.bool_]:
-        """Stopped at the prior's own optimum, near the maximum-likelihood position (the prior pulls, so χ² differs)."""
+    def reached(self, ends: FilterEnds, chi2_optimum: float, position_optimum: FloatArray) -> NDArray[np.bool_]:
+        """Return which ends stopped near the maximum-likelihood position.
+
+        The prior biases its optimum, so that χ² differs.
+        """
         distance = np.linalg.norm(ends.states[:, :3] - position_optimum, axis=1)
         return ends.stopped & (distance < PRIOR_REACHED_M)
 
@@ -83,7 +86,7 @@ class RepeatedFilter(_LikelihoodFilter):
     Attributes
     ----------
     position_step_m, moment_step_Am2 : float
-        Diagonal of :math:`S_q`, which is added before every pass; the first covariance is :math:`S_q S_q^T` as well.
+        Diagonal of :math:`S_q`; :math:`S_q S_q^T` is the first covariance, and is added before every pass.
     noise_inflation : float
         Factor on the variances of the readings inside the filter.
     relinearise_every_scalar : bool
@@ -116,15 +119,15 @@ class RepeatedFilter(_LikelihoodFilter):
 
     @property
     def pass_s(self) -> float:
-        """Seconds of one core that a pass takes, roughly, for the nine differences of four vector sensors."""
+        """Approximate time of one core for a pass over nine differences [s]."""
         return 2e-6 if self.relinearise_every_scalar else _PASS_S
 
-    def run(self, measurement: DifferenceMeasurement, z: FloatArray, starts: FloatArray) -> Ends:
-        """End of every start (n, 6), compiled."""
+    def run(self, measurement: DifferenceMeasurement, z: FloatArray, starts: FloatArray) -> FilterEnds:
+        """Return the end of every start (n, 6)."""
         z, variance, sensors, weights = _inputs(measurement, z)
         inflation = self.noise_inflation
         each = self.relinearise_every_scalar
-        scaled = ScaledDifferences.weighted if each else ScaledDifferences.of
+        scaled = ScaledDifferences.from_weights if each else ScaledDifferences.of
         differences = scaled(z, inflation * variance, sensors, weights, self.position_step_m, self.moment_step_Am2)
         method = RELINEARISED if each else REPEATED
         found = ends(method, differences, starts, self.tolerance_T, self.max_iterations)
@@ -152,15 +155,15 @@ class IekfFilter(_PriorFilter):
     max_iterations: int = 200
     device: str = "cpu"
 
-    def run(self, measurement: DifferenceMeasurement, z: FloatArray, starts: FloatArray) -> Ends:
-        """End of every start (n, 6), compiled."""
+    def run(self, measurement: DifferenceMeasurement, z: FloatArray, starts: FloatArray) -> FilterEnds:
+        """Return the end of every start (n, 6)."""
         differences = ScaledDifferences.of(*_inputs(measurement, z), self.position_sigma_m, self.moment_sigma_Am2)
         return ends(ITERATED, differences, starts, self.tolerance_T, self.max_iterations)
 
 
 @dataclass(frozen=True)
 class DampedFilter(_PriorFilter):
-    r"""Levenberg-Marquardt iteration on the cost of :class:`IekfFilter`: no accepted step raises it.
+    r"""Levenberg-Marquardt iteration that lowers the cost of :class:`IekfFilter` in each step.
 
     A step solves :math:`(M + \lambda\,\mathrm{diag} M)\,\delta = -\nabla` with :math:`M = H^T R^{-1} H + P_0^{-1}` and
     the gradient of half the cost. One that lowers the cost is taken and divides the damping λ by 5; any other is not,
@@ -177,7 +180,7 @@ class DampedFilter(_PriorFilter):
         A step that changes the predicted differences by less than this [T] is followed by one without damping; if that
         changes them by less as well, stop.
     max_iterations : int
-        Linearisations at most, at states that are not taken as well.
+        Largest number of linearisations, including those at rejected states.
     device : str
         "cpu"; the next release will not have this setting.
 
@@ -192,17 +195,17 @@ class DampedFilter(_PriorFilter):
     max_iterations: int = 200
     device: str = "cpu"
 
-    def run(self, measurement: DifferenceMeasurement, z: FloatArray, starts: FloatArray) -> Ends:
-        """End of every start (n, 6), compiled."""
+    def run(self, measurement: DifferenceMeasurement, z: FloatArray, starts: FloatArray) -> FilterEnds:
+        """Return the end of every start (n, 6)."""
         differences = ScaledDifferences.of(*_inputs(measurement, z), self.position_sigma_m, self.moment_sigma_Am2)
         return ends(DAMPED, differences, starts, self.tolerance_T, self.max_iterations, self.first_damping)
 
 
 @dataclass(frozen=True)
 class GlobalFilter(_LikelihoodFilter):
-    """The start-free search of :class:`magloc.localization.search.single_source.SingleSourceSearch`.
+    """Start-free search (:class:`~magloc.localization.search.single_source.SingleSourceSearch`).
 
-    With the map's start refined before its candidates.
+    It refines the map's start before its candidates.
 
     Attributes
     ----------
@@ -214,16 +217,16 @@ class GlobalFilter(_LikelihoodFilter):
     max_iterations: int = 100
     pass_s: ClassVar[float] = 5e-7
 
-    def run(self, measurement: DifferenceMeasurement, z: FloatArray, starts: FloatArray) -> Ends:
-        """Best end of every start (n, 6), compiled.
+    def run(self, measurement: DifferenceMeasurement, z: FloatArray, starts: FloatArray) -> FilterEnds:
+        """Return the best end of every start (n, 6).
 
-        The readable twin of its cost is :mod:`magloc.measurement.whitened`.
+        :mod:`magloc.measurement.whitened` is the readable reference of its cost.
         """
         array = measurement.array
         # Any readings with these differences have the same likelihood.
         readings = np.linalg.lstsq(measurement.differences.transform, z, rcond=None)[0] + array.channel_offset_T
         ends = SingleSourceSearch(array, max_iterations=self.max_iterations).optima_from(readings, starts[:, :3])
-        return Ends(
+        return FilterEnds(
             states=np.concatenate([ends.position_m, ends.moment_Am2], axis=1),
             chi2=ends.chi2,
             iterations=ends.linearisations,
@@ -243,14 +246,14 @@ def settings(method: Filter) -> dict[str, Any]:
 
 
 def _inputs(measurement: DifferenceMeasurement, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Differences, their variances, sensors and weights; the known ambient field, which no model has, is taken out."""
+    """Return differences without the ambient field, variances, sensors and weights."""
     array = measurement.array
     of_source = z - measurement.measured(array.readings_of(array.ambient_fields))
     return of_source, measurement.variance, array.positions, field_weights(measurement)
 
 
 def field_weights(measurement: DifferenceMeasurement) -> FloatArray:
-    """Weight of the field at every sensor in every decorrelated difference, shape (k, N, 3), for vector sensors."""
+    """Return the weights (k, N, 3) of vector sensors' fields in the decorrelated differences."""
     array = measurement.array
     weights = np.zeros((measurement.variance.size, array.n_sensors, 3))
     for c, sensor in enumerate(array.channel_sensor):

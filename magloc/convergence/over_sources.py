@@ -1,9 +1,8 @@
-"""Maps over sources: where around an array does one start-free fix find the source?
+"""Maps over sources: where around an array one start-free fix finds the source.
 
-A cube of positions; at each a source whose moment has a given size and a random direction, one set of readings with the
-array's noise and with errors of all that is stated to be uncertain, and one fix. It succeeds if no better solution than
-the fix's best one is found by searching from the truth. Whether that solution is any good is physics, not search: the
-Cramér-Rao bound is part of the map.
+Each position of a cube has a source whose moment has a given size and a random direction, one set of readings with the
+array's noise and stated errors, and one fix. The fix succeeds if a search from the truth finds no better solution. The
+accuracy of that solution depends on physics, not on the search, so that the map includes the Cramér-Rao bound.
 """
 
 from __future__ import annotations
@@ -55,16 +54,16 @@ from magloc.measurement.whitened import WhitenedModel
 if TYPE_CHECKING:
     import xarray as xr
 
-# χ² above that of the optimum searched from the truth within which a fix has found it.
+# Largest excess of χ² over the optimum from the truth for a fix that found it.
 CHI2_FOUND = 0.05
-# From the truth: valleys of far sources take some hundred.
+# Searches from the truth in the valleys of far sources take some hundred.
 _MAX_ITERATIONS = 1000
 # Seconds of one core that a fix takes, roughly: by vector sensors, of bodies, by moduli.
 _FIX_S, _BODY_S, _SCALAR_S = 5e-5, 5e-4, 5e-3
 
 
 class SourceStatus(IntEnum):
-    """How the fix of a source ended."""
+    """Result of the fix of a source."""
 
     FOUND = 0
     MISSED = 1
@@ -79,7 +78,7 @@ class SourcesScenario:
     Attributes
     ----------
     array : SensorArray
-        With six independent differences at least. Its ambient field errs by what it states.
+        Array with at least six independent differences. Its ambient field has the stated error.
     half_width_m : float
         The cube reaches from -half_width to +half_width along every axis, around the array's centroid.
     nearest_m, farthest_m : float
@@ -87,13 +86,13 @@ class SourcesScenario:
     moment_Am2 : float
         Size of every source's moment.
     known_moment_sigma_Am2 : float
-        1 σ of that, by which moments differ from it and which the fixes know; infinite: all are alike, and nothing is
-        known.
+        Standard deviation of the moments' size, which fixes know; if infinite, all moments have the same size, and
+        fixes know nothing.
     body_length_m : float, optional
-        Length of every source: its moments of rank 2 and 4 are drawn, and count as noise in fixes and bounds. As in
-        :class:`magloc.Locator` a quarter of its distance near the array by default, 0 of points.
+        Length of every source. Its multipole moments are random, and count as noise in fixes and bounds. By default a
+        quarter of its distance near the array, as in :class:`magloc.Locator`; 0 for points.
     seed : int
-        Of the moments' directions and all errors. Those of a source depend on the seed and its place in the cube alone.
+        Seed of the moments' directions and all errors. Those of a source depend only on it and the place in the cube.
     """
 
     array: SensorArray = field(default_factory=lambda: tetrahedron(1.5, noise_T=1e-9))
@@ -115,7 +114,7 @@ class SourcesScenario:
 
     @property
     def prior(self) -> SourcePrior:
-        """What fixes know of a source."""
+        """Prior of the fixes."""
         if self.known_moment_sigma_Am2 == np.inf:
             return NOTHING_KNOWN
         return SourcePrior(known_moment_Am2=self.moment_Am2, known_moment_sigma_Am2=self.known_moment_sigma_Am2)
@@ -180,7 +179,7 @@ class SourcesMap(CubeMap):
             raise ValueError(f"Input array gives {n_differences} independent differences, {N_UNKNOWNS} are needed.")
 
     def __getstate__(self) -> dict[str, Any]:
-        return {"scenario": self.scenario, "grid": self.grid}  # the rest is large, and soon made again
+        return {"scenario": self.scenario, "grid": self.grid}  # the rest is large and cheap to compute again
 
     @cached_property
     def _locator(self) -> Locator:
@@ -194,13 +193,13 @@ class SourcesMap(CubeMap):
 
     @property
     def point_s(self) -> float:
-        """Seconds of one core that a fix takes, roughly."""
+        """Approximate time of one core for a fix [s]."""
         scalar = self.scenario.array.channel_is_scalar.any()
         return _SCALAR_S if scalar else _BODY_S if self.scenario.body_length_m else _FIX_S
 
     @property
     def settings(self) -> Mapping[str, Any]:
-        """Which sources, and how they are found."""
+        """Selection of sources, and method."""
         scenario = self.scenario
         return {
             "method": "global",
@@ -213,7 +212,7 @@ class SourcesMap(CubeMap):
         }
 
     def values_at(self, box: Box) -> Mapping[str, Any]:
-        """Fixes of the sources of a box."""
+        """Return the fixes of the sources of a box."""
         relative = box.points(self.axis)
         distance = np.linalg.norm(relative, axis=1)
         used = (distance >= self.scenario.nearest_m) & (distance <= self.scenario.farthest_m)
@@ -230,9 +229,9 @@ class SourcesMap(CubeMap):
         return values
 
     def _values_of(self, position: FloatArray, moment: FloatArray, readings: FloatArray) -> Mapping[str, Any]:
-        """Fixes of sources (n, 3) by raw readings (n, C) of them."""
+        """Return fixes of sources (n, 3) from their raw readings (n, C)."""
         fixes = self._locator.fit_rows(readings)
-        from_truth = self._searched_from(position, moment, readings)
+        from_truth = self._search_from(position, moment, readings)
         solved, every = fixes.solved, fixes.solutions
         first = fixes.first[solved]
 
@@ -261,14 +260,17 @@ class SourcesMap(CubeMap):
             "distance": of_first(np.linalg.norm(error[:, :3], axis=1), np.nan),
             "nees": of_first(nees / N_UNKNOWNS, np.nan),
             "solutions": np.bincount(every.of_row, minlength=len(fixes)),
-            "truth_listed": self._listed(fixes, from_truth),
+            "truth_listed": self._includes_truth(fixes, from_truth),
             "range_observable": of_first(is_observable(*spans(every.ranges[first, 0]).T), False),
             "sigma_range": bounds.sigma_range_m,
             "sigma_position": bounds.sigma_position_m,
         }
 
     def _random(self, box: Box) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Moments (n, 3) [A·m²] of a box, noise (n, C) and model errors (n, 17) as standard normal numbers."""
+        """Return moments (n, 3) [A·m²] of a box, noise (n, C) and model errors (n, 17).
+
+        Noise and errors are standard normal numbers.
+        """
         known = self.scenario.known_moment_sigma_Am2 < np.inf
         normal = self._normal(box, 3 + self.scenario.array.n_channels + known, 0)
         direction = normal[:, :3] / np.linalg.norm(normal[:, :3], axis=1, keepdims=True)
@@ -277,7 +279,10 @@ class SourcesMap(CubeMap):
         return size * direction, noise, self._normal(box, N_BODY_ERRORS + 3, 1)
 
     def _normal(self, box: Box, n_numbers: int, stream: int) -> FloatArray:
-        """Standard normal numbers (n, n_numbers) of a box, the same in whatever boxes, of independent streams."""
+        """Return standard normal numbers (n, n_numbers) of a box, independent by stream.
+
+        They do not depend on the division into boxes.
+        """
         key = np.random.SeedSequence(self.scenario.seed).generate_state(2, np.uint64)
         x, y, z = box.region
         lines = []
@@ -288,12 +293,12 @@ class SourcesMap(CubeMap):
         return np.concatenate(lines)
 
     def _lengths(self, position: FloatArray) -> FloatArray:
-        """Lengths (n,) of the bodies at some places (n, 3) [m]."""
+        """Return the lengths (n,) of the bodies at places (n, 3) [m]."""
         q = self._model.homogeneous(position)[:, None]
         return assumed_lengths(self._model, q, self.scenario.body_length_m)[:, 0]
 
     def _readings(self, position: FloatArray, moment: FloatArray, noise: FloatArray, errors: FloatArray) -> FloatArray:
-        """Raw readings (n, C) [T]; noise and errors of the model as standard normal numbers."""
+        """Return raw readings (n, C) [T] from standard normal noise and model errors."""
         array = self.scenario.array
         of_body, of_ambient = np.split(errors[:, None], [N_BODY_ERRORS], axis=-1)
         fields = fields_at_sensors(array, position, moment) + array.row_ambient_uncertainty_T * of_ambient
@@ -304,8 +309,8 @@ class SourcesMap(CubeMap):
         exact = array.readings_of(fields)
         return exact + reading_errors(array, exact, noise)
 
-    def _searched_from(self, position: FloatArray, moment: FloatArray, readings: FloatArray) -> JointFits:
-        """Ends of the refinements that start at the truth (n, 3); χ² is infinite where one has not converged."""
+    def _search_from(self, position: FloatArray, moment: FloatArray, readings: FloatArray) -> JointFits:
+        """Refine from the truth (n, 3); χ² is infinite where it has not converged."""
         scenario = self.scenario
         (rows,) = whitened_rows(scenario.array, readings, None, len(readings))
         rows, q = rows.with_known_moment(scenario.prior.known_moment), rows.model.homogeneous(position)[:, None]
@@ -317,8 +322,8 @@ class SourcesMap(CubeMap):
             fits.put(of_some.rows.index[of_some.of_row], of_some.fits)
         return fits
 
-    def _listed(self, fixes: Fixes, ends: JointFits) -> BoolArray:
-        """Whether the optima (n,) that the search from the truth ended at are among the solutions."""
+    def _includes_truth(self, fixes: Fixes, ends: JointFits) -> BoolArray:
+        """Return whether solutions (n,) include the optimum of the search from the truth."""
         every = fixes.solutions
         cosine = np.sum(self._model.homogeneous(every.position_m[:, 0]) * ends.q[every.of_row, 0], axis=1)
         chi2 = every.chi2 + every.known_chi2
@@ -333,16 +338,16 @@ class SourcesSummary(Summary):
     Attributes
     ----------
     truth_listed : float
-        Those whose solutions have the end of the search from the truth.
+        Share of sources whose solutions include the optimum from the truth.
     not_converged : float
-        Those whose search from the truth has no end: no better solution than the fix's is known of them.
+        Share of sources whose search from the truth did not converge, so that their fixes count as found.
     """
 
     truth_listed: float
     not_converged: float
 
     def lines(self) -> list[str]:
-        """The counts in words."""
+        """Return the counts in words."""
         return [
             f"{self.converged} of {self.starts} sources found ({self.fraction:.2%}), "
             f"truth listed {self.truth_listed:.2%}, median {self.median_iterations:.0f} iterations"
@@ -351,7 +356,7 @@ class SourcesSummary(Summary):
 
 
 def _tally(values: Values) -> Tally:
-    """Counts of ``status``, ``truth_listed`` and so on of a part of a map over sources."""
+    """Return the counts of ``status``, ``truth_listed`` and so on of a part of a map."""
     used = values["status"] != SourceStatus.LEFT_OUT
     points = {
         "starts": used,
@@ -377,12 +382,12 @@ def source_map(
     scheduler: str | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> xr.Dataset:
-    r"""Fix every source of a cube once, with a random moment and noise: which of them does a fix find?
+    r"""Fix every source of a cube once, with random moments and noise.
 
     Parameters
     ----------
     array : SensorArray
-        With six independent differences at least. Its ambient field errs by what it states, once for every source.
+        Array with at least six independent differences. Its ambient field has the stated error, new for every source.
     moment_Am2 : float
         Size of every source's moment [A·m²].
     edge_m : float
@@ -392,13 +397,13 @@ def source_map(
     nearest_m, farthest_m : float
         Sources nearer to the centroid, or farther from it, are left out [m].
     seed : int
-        Of the moments' directions and all errors.
+        Seed of the moments' directions and all errors.
     known_moment_sigma_Am2 : float
-        1 σ of the moments' modulus [A·m²]: they are drawn with it, and fixes and bounds know it. Infinite: all are
-        alike, and nothing is known.
+        Standard deviation of the moments' modulus [A·m²], which fixes and bounds know. If infinite, all moments have
+        the same modulus, and fixes and bounds know nothing.
     body_length_m : float, optional
-        Length of every source [m]: how its field differs from a dipole's is drawn, and counts as noise in fixes and
-        bounds. A quarter of its distance near the array by default, as in :func:`magloc.locate`; 0 of points.
+        Length of every source [m]. The deviation of its field from a dipole is random, and counts as noise in fixes
+        and bounds. By default a quarter of its distance near the array, as in :func:`magloc.locate`; 0 for points.
     out, scheduler, progress
         See :func:`magloc.grids.computed.computed_map`: a zarr folder that streams and resumes, the address of a dask
         scheduler, and a call with the number of sources finished.
@@ -433,7 +438,7 @@ def source_map(
 
 
 def summary(dataset: xr.Dataset) -> SourcesSummary:
-    """Counts of a map made by :func:`source_map`, which need not fit into memory."""
+    """Return the counts of a map by :func:`source_map`, which need not fit into memory."""
     tally = tallied(dataset, ("status", "truth_listed", "iterations", "chi2_from_truth"), _tally)
     return SourcesSummary(
         **common_counts(dataset, tally),

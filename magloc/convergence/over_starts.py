@@ -49,12 +49,12 @@ from magloc.measurement.differences import DifferenceMeasurement, predicted_chan
 if TYPE_CHECKING:
     import xarray as xr
 from arrays.typing import FloatArray
-from magloc.convergence.ends import Ends
+from magloc.convergence.ends import FilterEnds
 from magloc.convergence.filters import FILTERS, Filter, RepeatedFilter, settings
 
 
-class Status(IntEnum):
-    """How a start ended."""
+class StartStatus(IntEnum):
+    """Result of a start."""
 
     CONVERGED = 0
     OTHER_OPTIMUM = 1
@@ -66,7 +66,7 @@ class Status(IntEnum):
 class StartsScenario:
     """One source in front of an array, and a cube of starts around it.
 
-    The defaults are the paper's figure, completed where the paper prints no number.
+    The defaults are those of the paper's figure, with our values where the paper gives none.
 
     Attributes
     ----------
@@ -88,8 +88,8 @@ class StartsScenario:
     noise_seed: int | None = None
 
 
-def simulated_measurement(scenario: StartsScenario) -> tuple[FloatArray, DifferenceMeasurement, FloatArray]:
-    """Readings (C,) [T] of a scenario, and what the filters make of them: the measurement, and z (k,) [T]."""
+def simulate_measurement(scenario: StartsScenario) -> tuple[FloatArray, DifferenceMeasurement, FloatArray]:
+    """Return readings (C,) [T], the measurement, and z (k,) [T] of a scenario."""
     array = scenario.array
     readings = predicted_channels(array, scenario.position_m, scenario.moment_Am2) + array.channel_offset_T
     if scenario.noise_seed is not None:
@@ -108,7 +108,7 @@ _VARIABLES = {
         np.int8,
         {
             "long_name": "how the start ended",
-            **flags(Status),
+            **flags(StartStatus),
         },
     ),
     "half": Variable(
@@ -129,9 +129,9 @@ class StartsMap(CubeMap):
     Attributes
     ----------
     z : ndarray, shape (k,)
-        Decorrelated differences that every start is given [T].
+        Decorrelated differences for every start [T].
     optimum : Solution
-        The best one for them.
+        Best solution for them.
     """
 
     title = "Convergence of a dipole filter over its starts"
@@ -145,11 +145,11 @@ class StartsMap(CubeMap):
 
     @classmethod
     def of(cls, scenario: StartsScenario, grid: int) -> StartsMap:
-        """Map of a scenario; the errors of :func:`convergence_map`."""
+        """Return the map of a scenario; errors as in :func:`convergence_map`."""
         if scenario.array.channel_is_scalar.any():
             raise ValueError("Input array must have vector sensors only; instead received one with scalar sensors.")
         locator = Locator(scenario.array, body_length_m=0.0, exclude_faulty=False)
-        readings, measurement, z = simulated_measurement(scenario)
+        readings, measurement, z = simulate_measurement(scenario)
         fix = locator.fit(readings)
         if not fix.solutions:
             raise ValueError(f"Input scenario has readings with no maximum-likelihood solution: {fix.reason}.")
@@ -157,7 +157,7 @@ class StartsMap(CubeMap):
 
     @property
     def point_s(self) -> float:
-        """Seconds of one core that a start takes which never stops, roughly."""
+        """Approximate time of one core for a start that never stops [s]."""
         method = self.scenario.method
         return method.pass_s * method.max_iterations * self.z.size / 9
 
@@ -176,7 +176,7 @@ class StartsMap(CubeMap):
 
     @property
     def findings(self) -> Mapping[str, Any]:
-        """The maximum-likelihood solution that the ends are compared with."""
+        """Maximum-likelihood solution, to compare the ends with."""
         return {
             "optimum_position_m": self.optimum.position_m,
             "optimum_moment_Am2": self.optimum.moment_Am2,
@@ -184,12 +184,12 @@ class StartsMap(CubeMap):
         }
 
     def values_at(self, box: Box) -> Mapping[str, Any]:
-        """Ends of the starts of a box."""
+        """Return the ends of the starts of a box."""
         scenario, centroid = self.scenario, self.scenario.array.centroid
         positions = box.points(self.axis)
         starts = np.concatenate([positions, np.zeros_like(positions)], axis=1)
         ends = scenario.method.run(self.measurement, self.z, starts)
-        # On a grid the plane itself is hit to rounding only.
+        # Points of the grid lie on the plane only to rounding.
         depth = (positions - centroid) @ (np.asarray(scenario.position_m) - centroid)
         half = np.sign(np.where(np.abs(depth) < 1e-9 * scenario.half_width_m**2, 0.0, depth))
         return {
@@ -203,7 +203,9 @@ class StartsMap(CubeMap):
 
 @dataclass(frozen=True)
 class StartsSummary(Summary):
-    """Counts of a map over starts, with the fractions of its parts that converged; NaN of a part without a start.
+    """Counts of a map over starts, and fractions of its parts that converged.
+
+    The fraction is NaN for a part without starts.
 
     Attributes
     ----------
@@ -219,7 +221,7 @@ class StartsSummary(Summary):
     beyond_20m_fraction: float
 
     def lines(self) -> list[str]:
-        """The counts in words."""
+        """Return the counts in words."""
         fractions = {
             "front half": self.front_fraction,
             "back half": self.back_fraction,
@@ -234,8 +236,8 @@ class StartsSummary(Summary):
 
 
 def _tally(centroid_m: FloatArray, values: Values) -> Tally:
-    """Counts of a part of a map over starts."""
-    converged = values["status"] == Status.CONVERGED
+    """Return the counts of a part of a map over starts."""
+    converged = values["status"] == StartStatus.CONVERGED
     front = values["half"] == 1
     offsets = np.meshgrid(
         *(values[name] - centre for name, centre in zip("xyz", centroid_m, strict=True)), indexing="ij"
@@ -264,7 +266,7 @@ def convergence_map(
     scheduler: str | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> xr.Dataset:
-    """Run a filter from every start of a cube: from where does it find the source?
+    """Run a filter from every start of a cube around the origin of the array's frame.
 
     Parameters
     ----------
@@ -315,10 +317,10 @@ def convergence_map(
     return computed_map(StartsMap.of(scenario, n), out, scheduler, progress)
 
 
-def _status(ends: Ends, reached: NDArray[np.bool_]) -> NDArray[np.int8]:
-    status = np.where(ends.stopped, Status.OTHER_OPTIMUM, Status.NOT_STOPPED)
-    status = np.where(np.isfinite(ends.chi2), status, Status.DIVERGED)
-    return np.where(reached, Status.CONVERGED, status).astype(np.int8)
+def _status(ends: FilterEnds, reached: NDArray[np.bool_]) -> NDArray[np.int8]:
+    status = np.where(ends.stopped, StartStatus.OTHER_OPTIMUM, StartStatus.NOT_STOPPED)
+    status = np.where(np.isfinite(ends.chi2), status, StartStatus.DIVERGED)
+    return np.where(reached, StartStatus.CONVERGED, status).astype(np.int8)
 
 
 def _attribute(value: Any) -> Any:
@@ -326,7 +328,7 @@ def _attribute(value: Any) -> Any:
 
 
 def summary(dataset: xr.Dataset) -> StartsSummary:
-    """Counts of a map made by :func:`convergence_map`, which need not fit into memory."""
+    """Return the counts of a map by :func:`convergence_map`, which need not fit into memory."""
     centroid_m = np.asarray(dataset.attrs["centroid_m"])
     tally = tallied(dataset, ("status", "half", "iterations", "x", "y", "z"), partial(_tally, centroid_m))
     return StartsSummary(

@@ -1,4 +1,4 @@
-"""Scenario files of maps, and the built-in ones beside this file."""
+"""Scenario files of maps, and the built-in scenarios."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class _Sources(Table, kw_only=True):
             raise RefusalError("nearest_m", f"found {self.nearest_m:g}, expected {expected}")
 
 
-class _File(File, kw_only=True):
+class _ScenarioFile(File, kw_only=True):
     array: dict[str, Any] | str
     source: _Source | None = None
     sources: _Sources = msgspec.field(default_factory=_Sources)
@@ -65,7 +65,7 @@ class _File(File, kw_only=True):
 
 
 def _table_of(method: Filter) -> type[msgspec.Struct]:
-    """The table of a filter: its fields, tolerances in nT."""
+    """Return the table of a filter: its fields, tolerances in nT."""
     fields = [
         (_key(name), Annotated[type(value), POSITIVE, _SENSIBLE] if not isinstance(value, bool) else bool, value)
         for name, value in settings(method).items()
@@ -84,7 +84,7 @@ _FileWithFilters: Any = msgspec.defstruct(
         (name, table, msgspec.field(default_factory=table))
         for name, table in ((name, _table_of(method)) for name, method in FILTERS.items())
     ],
-    bases=(_File,),
+    bases=(_ScenarioFile,),
     kw_only=True,
 )
 
@@ -92,7 +92,10 @@ _FileWithFilters: Any = msgspec.defstruct(
 def read_starts_scenario(
     name_or_path: str, *, method: str | None = None, noise_seed: int | None = None
 ) -> StartsScenario:
-    """Scenario of a map over starts: a built-in name or a TOML file; `method` and `noise_seed` in place of its own."""
+    """Read the scenario of a map over starts: a built-in name or a TOML file.
+
+    `method` and `noise_seed` replace those of the file.
+    """
     path, table, file = _read(name_or_path)
     chosen = file.method if method is None else method
     if chosen not in FILTERS:
@@ -110,7 +113,7 @@ def read_starts_scenario(
 
 
 def read_sources_scenario(name_or_path: str, *, seed: int = 0) -> SourcesScenario:
-    """Scenario of a map over sources: a scenario file's array, and its table ``sources`` if it has one."""
+    """Read the scenario of a map over sources: array, and table ``sources`` if there is one."""
     path, _, file = _read(name_or_path)
     given = {key: value for key in _Sources.__struct_fields__ if (value := getattr(file.sources, key)) is not None}
     with naming(path):
@@ -118,13 +121,13 @@ def read_sources_scenario(name_or_path: str, *, seed: int = 0) -> SourcesScenari
 
 
 def _read(name_or_path: str) -> tuple[str, dict[str, Any], Any]:
-    """Path, table and checked values of a scenario file."""
+    """Return path, table and checked values of a scenario file."""
     path, table = _FILES.read(name_or_path)
     return path, table, section_of(path, table, _FileWithFilters)
 
 
 def _filter(default: Filter, table: Any, given: dict[str, Any]) -> Filter:
-    """A filter with the settings that its table gives."""
+    """Return a filter with the settings of its table."""
     values = {}
     for key in given:
         name, exponent = in_si(key)

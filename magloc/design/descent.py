@@ -1,11 +1,11 @@
-"""Descent of a design criterion over the places of the sensors, within a volume or on a surface.
+"""Descent of a design criterion over sensor positions, within a volume or on a surface.
 
-The criterion is that of a fixed sample of sources, and its slope is exact. Steps are those of a spectral projected
-gradient: the gradient, as long as its change since the last step suggests, brought back into the volume, and shortened
-until the criterion is below the worst of the last few ones.
+The criterion is that of a fixed sample of sources, with an exact gradient. Steps are those of a spectral projected
+gradient: the change of the gradient in the last step gives the length, the step is projected into the volume, and is
+shortened until the criterion is below the worst of the last few ones.
 
 Source: E. G. Birgin, J. M. Martínez, M. Raydan, "Nonmonotone spectral projected gradient methods on convex sets",
-SIAM Journal on Optimization 10 (2000); on a surface, which is not convex, every trial is brought back to it.
+SIAM Journal on Optimization 10 (2000); on a surface, which is not convex, every trial is projected onto it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from magloc import core
 from magloc.bounds.sources import array_model, source_bounds
 from magloc.design.task import DesignTask
 
-# Weights of order statistics below this share of the largest do not move the slope.
+# Share of the largest weight below which order statistics do not affect the gradient.
 _NEGLIGIBLE = 1e-6
 # Part of the information about a parameter below which the range has no bound.
 _SINGULAR = 1e-14
@@ -30,7 +30,7 @@ _MEMORY = 8
 _SUFFICIENT = 1e-4
 _SHORTEST = 1e-8
 _FIRST_STEP = 0.05
-# It has converged where so many steps have gained less than this share of the criterion.
+# A descent has converged if a number of steps gained less than a share of the criterion.
 _PATIENCE, _LEAST_GAIN = 30, 2e-4
 _MOST_SPACING_ROUNDS = 300
 
@@ -49,18 +49,24 @@ class Sample:
     moments: FloatArray
 
     def deviations(self, task: DesignTask, sensors: FloatArray) -> FloatArray:
-        """Cramér-Rao bounds of the range (n,) [m] for sensors (N, 3) of the task's kind; infinite where none is."""
+        """Return Cramér-Rao bounds of the range (n,) [m] for sensors (N, 3).
+
+        They are infinite if there is no bound.
+        """
         return self._deviations_and_slopes(task, sensors, with_slopes=False)[0]
 
     def value(self, task: DesignTask, sensors: FloatArray) -> float:
-        """The criterion [m], smoothed as it is for the descent."""
+        """Return the criterion [m], smoothed as in the descent."""
         deviations = np.sort(self.deviations(task, sensors))
         weights = task.criterion.weights(deviations.size)
         used = weights > _NEGLIGIBLE * weights.max()
         return float(weights[used] @ deviations[used] / weights[used].sum())
 
     def log_value_and_slope(self, task: DesignTask, sensors: FloatArray) -> tuple[float, FloatArray]:
-        """Logarithm of :meth:`value`, and its derivative (N, 3) by the places of the sensors [1/m]."""
+        """Return the logarithm of :meth:`value`, and its derivative (N, 3) [1/m].
+
+        The derivative is by the positions of the sensors.
+        """
         deviations = self.deviations(task, sensors)
         order = np.argsort(deviations, kind="stable")
         weights = task.criterion.weights(order.size)
@@ -89,22 +95,22 @@ class Sample:
 
 @lru_cache(maxsize=8)
 def _model(task: DesignTask, n_sensors: int) -> core.Problem:
-    """Return the kernel's model of so many sensors of a task, wherever they stand."""
+    """Return the kernel's model of a number of sensors, for any positions."""
     return array_model(task.array(np.arange(3.0 * n_sensors).reshape(-1, 3)), lost=_SINGULAR)
 
 
 @dataclass(frozen=True, eq=False)
 class Descent:
-    """Where a descent ended.
+    """End of a descent.
 
     Attributes
     ----------
     sensors : ndarray, shape (N, 3)
-        The best places that it came to [m].
+        Best positions [m].
     value : float
-        Criterion of its sample there [m].
+        Criterion of its sample at these positions [m].
     converged : bool
-        Whether the criterion had stopped falling; else the iterations were used up.
+        Whether the criterion stopped falling; otherwise the iterations ran out.
     """
 
     sensors: FloatArray
@@ -113,8 +119,8 @@ class Descent:
     converged: bool
 
 
-def feasible(task: DesignTask, sensors: FloatArray) -> FloatArray:
-    """Sensors (N, 3) brought into the task's volume and apart from each other [m]."""
+def move_into_volume(task: DesignTask, sensors: FloatArray) -> FloatArray:
+    """Move sensors (N, 3) into the task's volume and apart from each other [m]."""
     inside = task.volume.nearest(sensors)
     if not task.least_spacing_m:
         return inside
@@ -125,7 +131,7 @@ def feasible(task: DesignTask, sensors: FloatArray) -> FloatArray:
         close = distance[:, 0] < task.least_spacing_m * (1.0 - 1e-9)
         if not close.any():
             break
-        # Sensors in one place have no direction to part in; the axes of their numbers serve as well as any.
+        # Sensors in one place have no direction of separation; use an axis by their numbers.
         parting = np.where(distance > 1e-12, apart / np.maximum(distance, 1e-12), np.eye(3)[(i + j) % 3])
         push = 0.5 * (1.0 + 1e-6) * np.maximum(0.0, task.least_spacing_m - distance) * parting
         moved = inside.copy()
@@ -136,7 +142,7 @@ def feasible(task: DesignTask, sensors: FloatArray) -> FloatArray:
 
 
 def is_spaced(task: DesignTask, sensors: FloatArray) -> bool:
-    """Whether no two sensors are closer than the task's least spacing, to a part in a million."""
+    """Return whether no two sensors are closer than the least spacing, to a part in a million."""
     return bool(pdist(sensors).min() >= task.least_spacing_m * (1.0 - 1e-6))
 
 
@@ -148,8 +154,8 @@ def descend(
     max_iterations: int,
     step_done: Callable[[int], None] = lambda _: None,
 ) -> Descent:
-    """Move sensors (N, 3) [m], first into the volume, until a sample's criterion falls no more or the steps end."""
-    x = feasible(task, start)
+    """Descend from sensors (N, 3) [m], moved into the volume, until the criterion stops falling."""
+    x = move_into_volume(task, start)
     value, slope = sample.log_value_and_slope(task, x)
     best, best_x = value, x
     history, bests = [value], [value]
@@ -180,12 +186,12 @@ def descend(
 def _step(
     task: DesignTask, sample: Sample, x: FloatArray, slope: FloatArray, length: float, bar: float
 ) -> tuple[FloatArray, float, FloatArray] | None:
-    """Next places with their value and slope; None where no step is short enough."""
-    direction = feasible(task, x - length * slope) - x
+    """Return the next positions with value and slope; None if no step is short enough."""
+    direction = move_into_volume(task, x - length * slope) - x
     steepness = float(np.sum(slope * direction))
     share = 1.0
     while share > _SHORTEST:
-        trial = feasible(task, x + share * direction)
+        trial = move_into_volume(task, x + share * direction)
         value, new_slope = sample.log_value_and_slope(task, trial)
         if value <= bar + _SUFFICIENT * share * min(steepness, 0.0) and is_spaced(task, trial):
             return trial, value, new_slope

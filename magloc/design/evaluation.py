@@ -1,4 +1,4 @@
-"""How good an array is for a task, judged on sources that it was not designed on, and the arrays to compare it with."""
+"""Evaluation of designs on independent sources, and reference arrays for comparison."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from magloc.levels import TYPICAL_AND_BAD
 
 REFERENCES = ("tetrahedron", "cube", "cross")
 EVEN = "even grid"
-"""As many sensors as the design has, spread evenly over the same volume."""
+"""Name of the reference with as many sensors as the design, spread evenly over its volume."""
 _N_ATTITUDES = 24
 _N_RESAMPLES = 200
 _N_BEARINGS, _N_BEARING_MOMENTS = 1000, 16
@@ -31,7 +31,10 @@ _INFINITE = 1e300
 
 
 class RangeSpread(NamedTuple):
-    """Median, 95 % quantile and mean of the σ of the range over sources [m], each of shape (k,) or a number."""
+    """Median, 95 % quantile and mean of the σ of the range over sources [m].
+
+    Each has shape (k,) or is a number.
+    """
 
     q50_m: FloatArray
     q95_m: FloatArray
@@ -40,7 +43,7 @@ class RangeSpread(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """How well an array does at several distances.
+    """Accuracy of an array at several distances.
 
     Attributes
     ----------
@@ -54,7 +57,7 @@ class Judgement:
     distance_m : ndarray, shape (k,)
         Distance of the sources from the origin, in the directions of the task's region.
     sigma_range : RangeSpread
-        At these distances.
+        Spread at these distances.
     bearing_q95_rad : ndarray, shape (k,)
         95 % quantile of the σ of the bearing.
     """
@@ -71,9 +74,11 @@ class Judgement:
 
 
 def references(task: DesignTask, sample: Sample, rng: np.random.Generator) -> list[SensorArray]:
-    """Tetrahedron, cube, cross of the volume's span, each in the best of 24 random attitudes for a sample; even grid.
+    """Return tetrahedron, cube and cross of the volume's span, and an even grid.
 
-    The shapes need not fit into the volume: what they share with it is the enclosing ball. The grid is in it.
+    Each shape has the best of 24 random attitudes for a sample.
+
+    The shapes have the enclosing ball of the volume, and may not fit into it. The grid does.
     """
     arrays = []
     for name in REFERENCES:
@@ -85,11 +90,11 @@ def references(task: DesignTask, sample: Sample, rng: np.random.Generator) -> li
     return [*arrays, task.array(even_grid(task.volume, task.n_sensors, rng), EVEN)]
 
 
-def judged(
+def judge(
     task: DesignTask, arrays: Sequence[SensorArray], sources: Sample, rng: np.random.Generator
 ) -> tuple[Judgement, ...]:
-    """Arrays of the task's kind on independent sources, compared with the first one; errors by resampling."""
-    distances = judged_distances(sources)
+    """Compare arrays with the first one on independent sources; errors by resampling."""
+    distances = comparison_distances(sources)
     own = sources.deviations(task, arrays[0].positions)
     result = []
     for array in arrays:
@@ -111,8 +116,8 @@ def judged(
     return tuple(result)
 
 
-def judged_distances(sources: Sample) -> FloatArray:
-    """Distances [m] at which arrays are compared: those of the sources, and twice and four times as far."""
+def comparison_distances(sources: Sample) -> FloatArray:
+    """Return distances [m] for comparisons: those of the sources, two and four times as far."""
     distance = np.linalg.norm(sources.positions, axis=1)
     near, middle, far = np.quantile(distance, [0.05, 0.5, 0.95])
     rounded = [float(f"{d:.3g}") for d in (near, middle, far, 2.0 * far, 4.0 * far)]
@@ -120,16 +125,19 @@ def judged_distances(sources: Sample) -> FloatArray:
 
 
 def worst_case(task: DesignTask, sensors: FloatArray, sample: Sample) -> float:
-    """Largest σ of the range [m] that a simplex search over sources finds, from the worst of a sample.
+    """Return the largest σ of the range [m] that a simplex search over sources finds.
 
-    It is no bound, only a lower one of the worst case: where the Jacobian loses rank, it grows until rounding stops it.
+    It is only a lower bound of the worst case. If the Jacobian loses rank, it grows until rounding stops it.
     """
     worst = np.argsort(sample.deviations(task, sensors))[-_N_WORST:]
     return max(_worst_near(task, sensors, sample.positions[i], sample.moments[i]) for i in worst)
 
 
 def _worst_near(task: DesignTask, sensors: FloatArray, position: FloatArray, moment: FloatArray) -> float:
-    """Largest σ of the range [m] near a source, at its distance: farther ones are worse without any loss of rank."""
+    """Return the largest σ of the range [m] near a source, at its distance.
+
+    Farther sources are worse even without a loss of rank.
+    """
     distance, size = np.linalg.norm(position), np.linalg.norm(moment)
 
     def deviation(x: FloatArray) -> float:
@@ -146,7 +154,7 @@ def _worst_near(task: DesignTask, sensors: FloatArray, position: FloatArray, mom
 
 
 def _gain(task: DesignTask, own: FloatArray, theirs: FloatArray, rng: np.random.Generator) -> tuple[float, float]:
-    """Gain over another array, and its standard error from resampled pairs."""
+    """Return the gain over another array, and its standard error from resampled pairs."""
     value = task.criterion.of(theirs)
     if not np.isfinite(value):
         return 1.0, 0.0
@@ -158,18 +166,18 @@ def _gain(task: DesignTask, own: FloatArray, theirs: FloatArray, rng: np.random.
 
 
 def fits(task: DesignTask, array: SensorArray) -> bool:
-    """Whether all sensors are within the task's volume."""
+    """Return whether all sensors are within the task's volume."""
     inside = task.volume.nearest(array.positions)
     return bool(np.abs(inside - array.positions).max() <= _FITS_RTOL * task.volume.radius)
 
 
 def _at(sources: Sample, distance: float) -> FloatArray:
-    """Positions of sources moved to one distance from the origin."""
+    """Return positions of sources, moved to one distance from the origin."""
     return distance * sources.positions / np.linalg.norm(sources.positions, axis=1, keepdims=True)
 
 
 def range_spread(task: DesignTask, array: SensorArray, sources: Sample, distance_m: FloatArray) -> RangeSpread:
-    """How the σ of the range is distributed over sources that are moved to given distances (k,) from the origin [m]."""
+    """Return the spread of σ of the range over sources at distances (k,) from the origin [m]."""
     spreads = []
     for distance in distance_m:
         deviations = Sample(_at(sources, distance), sources.moments).deviations(task, array.positions)
@@ -179,17 +187,17 @@ def range_spread(task: DesignTask, array: SensorArray, sources: Sample, distance
 
 
 def _bearing_q95(array: SensorArray, sources: Sample, distance: float) -> float:
-    """95 % quantile of the σ of the bearing at one distance, over some of the sources."""
+    """Return the 95 % quantile of the σ of the bearing at one distance, over some sources."""
     sigma = sigma_table(array, _at(sources, distance)[:_N_BEARINGS], sources.moments[:_N_BEARING_MOMENTS]).bearing_rad
     return float(np.quantile(sigma, 0.95, method="inverted_cdf"))
 
 
 def random_rotation(rng: np.random.Generator) -> Rotation:
-    """An evenly distributed rotation."""
+    """Return a uniformly distributed rotation."""
     return Rotation.from_quat(rng.normal(size=4))
 
 
 def unit_shape(name: str) -> FloatArray:
-    """Points (n, 3) of a named geometry of circumradius 1 around its centroid."""
+    """Return points (n, 3) of a named geometry of circumradius 1 around its centroid."""
     array = GEOMETRIES[name].make(1.0)
     return (array.positions - array.centroid) / array.circumradius

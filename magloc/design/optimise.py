@@ -1,13 +1,13 @@
-r"""Better places for the sensors of an array, for a task (:class:`magloc.design.task.DesignTask`).
+r"""Optimisation of sensor positions for a task (:class:`magloc.design.task.DesignTask`).
 
 The criterion is a quantile or the mean, over sources and directions of the moment, of the Cramér-Rao bound of the
-range: range is what an array knows least about. It is never the worst case, for that is infinite for every array of
-four vector sensors: their nine differences lose rank at isolated combinations of direction and moment
-(:func:`magloc.design.evaluation.worst_case` comes to them).
+range, which is the least accurate quantity. It is never the worst case, which is infinite for every array of four
+vector sensors: their nine differences lose rank at isolated combinations of direction and moment
+(:func:`magloc.design.evaluation.worst_case` approaches them).
 
-Many starts, the references and other shapes among them, descend on a small sample of sources, the best of them on a
-large one. Then everything, starts and references too, is judged on sources of its own, so that what a design gains is
-no accident of the sample that it was fitted to.
+Many starts, among them the references and other shapes, descend on a small sample of sources, the best of them on a
+large one. Then design, starts and references are compared on independent sources, so that the gain of a design does
+not depend on the sample of its optimisation.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from arrays.array import SensorArray
 from arrays.geometries import GEOMETRIES
 from arrays.io.lazy import by_name
 from arrays.typing import FloatArray
-from magloc.design.descent import Descent, Sample, descend, feasible, is_spaced
-from magloc.design.evaluation import Judgement, fits, judged, random_rotation, references, unit_shape, worst_case
+from magloc.design.descent import Descent, Sample, descend, is_spaced, move_into_volume
+from magloc.design.evaluation import Judgement, fits, judge, random_rotation, references, unit_shape, worst_case
 from magloc.design.task import N_DRAWN, DesignTask
 from magloc.directions import fibonacci_directions
 
@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 
 BEST_START = "best start"
 NEAR_OPTIMAL = 0.1
-"""A reference that a design betters by less than this share is near-optimal."""
-# A σ that exceeds the criterion by this much is a loss of rank.
+"""Largest gain over a reference that counts as near-optimal."""
+# Factor over the criterion above which a σ means a loss of rank.
 _UNBOUNDED = 1e3
 
 
@@ -45,15 +45,15 @@ class Design:
     Attributes
     ----------
     task : DesignTask
-        What it was designed for.
+        Task of the design.
     array : SensorArray
         The design.
     fitted_m, start_m : float
         Criterion on the large sample: of the design, and of the best of its starts.
     converged : bool
-        Whether the descent to the design had stopped falling.
+        Whether the descent to the design converged.
     n_converged, n_descents : int
-        The same, counted over all refined starts.
+        Numbers of converged and of all descents from refined starts.
     judged : tuple of Judgement
         The design first, then the best of its starts, then the references.
     worst_m : float
@@ -79,7 +79,7 @@ class Design:
 
     @property
     def gain(self) -> float:
-        """Share by which its criterion is below that of the best reference.
+        """Share by which the criterion is below that of the best reference.
 
         These are a tetrahedron, a cube and a cross of its span, and an even grid of as many sensors in its volume.
         """
@@ -87,12 +87,12 @@ class Design:
 
     @property
     def worst_is_bounded(self) -> bool:
-        """Whether the worst case that was found is of the size of the others, not a loss of rank."""
+        """Whether the worst case found is of the size of the others, not a loss of rank."""
         return self.worst_m < _UNBOUNDED * self.judged[0].criterion_m
 
     @property
     def near_optimal(self) -> tuple[str, ...]:
-        """References that could be built, and that the design betters by less than :data:`NEAR_OPTIMAL`."""
+        """Buildable references that the design improves by less than :data:`NEAR_OPTIMAL`."""
         return tuple(
             other.name
             for other in self.judged[2:]
@@ -100,7 +100,10 @@ class Design:
         )
 
     def plot(self, seed: int = 0) -> Figure:
-        """The sensors in their volume, and the range's σ over the distance; `seed` of the sources it is drawn from."""
+        """Plot the sensors in their volume, and σ of the range over the distance.
+
+        `seed`: seed of the sources of the plot.
+        """
         return by_name("magloc.plots.designs:design")(self, seed)
 
 
@@ -117,20 +120,20 @@ def design_array(
     Parameters
     ----------
     task : DesignTask
-        Sensors and their noise, where they may stand, and the sources; :meth:`DesignTask.read` reads one.
+        Sensors, their noise and volume, and the sources; :meth:`DesignTask.read` reads one.
     starts : int, optional
-        Shapes and random places to start from, in place of those of ``task.search``.
+        Number of shapes and random places to start from; by default that of ``task.search``.
     seed : int
-        Of the starts and of all samples; the same seed gives the same array, whatever the number of threads.
+        Seed of starts and samples; the same seed gives the same array for any number of threads.
     progress : callable, optional
         Called with steps done, of ``task.search.n_steps``.
     better : callable, optional
-        Called with every array that is better, on the large sample, than all before.
+        Called with every array that is better than all before on the large sample.
 
     Returns
     -------
     Design
-        The array, and its σ of the range [m] beside those of its starts and of the references.
+        The array, and σ of the range [m] for it, its best start and the references.
 
     Raises
     ------
@@ -152,7 +155,7 @@ def design_array(
     known = references(task, large, np.random.default_rng(of_references))
     buildable = [array.positions for array in known if array.n_sensors == task.n_sensors and fits(task, array)]
     shapes = starts_of(task, search.n_starts, np.random.default_rng(of_starts))
-    places = [feasible(task, start) for start in [*buildable, *shapes][: search.n_starts]]
+    places = [move_into_volume(task, start) for start in [*buildable, *shapes][: search.n_starts]]
     places = [start for start in places if is_spaced(task, start) and np.isfinite(small.value(task, start))]
     if not places:
         raise ValueError(
@@ -164,8 +167,8 @@ def design_array(
     best = Descent(places[first], values[first], 0, False)
     better(task.array(best.sensors))
 
-    def descended(sample: Sample, start: FloatArray, max_iterations: int) -> Descent:
-        """A descent; its end is kept if it is the best one on the large sample so far."""
+    def run_descent(sample: Sample, start: FloatArray, max_iterations: int) -> Descent:
+        """Run a descent, and keep its end if it is the best so far on the large sample."""
         nonlocal best
         end = descend(task, sample, start, max_iterations=max_iterations, step_done=step_done)
         value = large.value(task, end.sensors)
@@ -174,10 +177,10 @@ def design_array(
             better(task.array(best.sensors))
         return end
 
-    rough = [descended(small, start, search.small_iterations) for start in places]
+    rough = [run_descent(small, start, search.small_iterations) for start in places]
     step_done((search.n_starts - len(places)) * search.small_iterations)
     chosen = sorted(rough, key=lambda end: end.value)[: search.n_refined]
-    fine = [descended(large, end.sensors, search.large_iterations) for end in chosen]
+    fine = [run_descent(large, end.sensors, search.large_iterations) for end in chosen]
     array = task.array(best.sensors)
     return Design(
         task=task,
@@ -187,7 +190,7 @@ def design_array(
         converged=best.converged,
         n_converged=sum(end.converged for end in fine),
         n_descents=len(fine),
-        judged=judged(
+        judged=judge(
             task,
             (array, task.array(places[first], BEST_START), *known),
             random_sample(task, search.n_judged, np.random.default_rng(of_judge)),
@@ -198,17 +201,17 @@ def design_array(
 
 
 def sobol_sample(task: DesignTask, log2_n: int, rng: np.random.Generator) -> Sample:
-    """Sources of a task on scrambled Sobol points, which fill its region more evenly than random ones."""
+    """Return sources of a task on scrambled Sobol points, which fill its region evenly."""
     return Sample(*task.sources(qmc.Sobol(N_DRAWN, rng=rng).random_base2(log2_n)))
 
 
 def random_sample(task: DesignTask, n: int, rng: np.random.Generator) -> Sample:
-    """Independent random sources of a task."""
+    """Return independent random sources of a task."""
     return Sample(*task.sources(rng.random((n, N_DRAWN))))
 
 
 def starts_of(task: DesignTask, n: int, rng: np.random.Generator) -> list[FloatArray]:
-    """Places to start from (N, 3) [m]: known shapes of the volume's span in random attitudes, then random places."""
+    """Return starts (N, 3) [m]: known shapes in random attitudes, then random places."""
     volume = task.volume
     shapes = [*_shapes(task.n_sensors), *_shapes(task.n_sensors)][: max(1, n // 2)]
     turned = [volume.centre + volume.radius * random_rotation(rng).apply(shape) for shape in shapes]
@@ -216,7 +219,7 @@ def starts_of(task: DesignTask, n: int, rng: np.random.Generator) -> list[FloatA
 
 
 def _shapes(n: int) -> list[FloatArray]:
-    """Shapes (n, 3) of n points within the unit ball."""
+    """Return shapes (n, 3) of n points within the unit ball."""
     named = [unit_shape(name) for name in GEOMETRIES]
     ring = 2.0 * np.pi * np.arange(n) / n
     flat = np.stack([np.cos(ring), np.sin(ring), np.zeros(n)], axis=1)

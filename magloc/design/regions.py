@@ -1,4 +1,4 @@
-"""Where the sources of a design task are, and what is made small of what an array knows of them."""
+"""Regions of the sources of a design task, and criteria to minimise."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from arrays.typing import FloatArray
 
 
 class Region(Protocol):
-    """A distribution of positions."""
+    """Distribution of positions."""
 
     def positions(self, cube: FloatArray) -> FloatArray:
-        """Positions (n, 3) [m] of points (n, 3) of the unit cube."""
+        """Return positions (n, 3) [m] for points (n, 3) of the unit cube."""
 
 
 @dataclass(frozen=True)
 class Cap:
-    """Sources within some angle of a direction: a shell around the origin, half of it, or less.
+    """Sources within an angle of a direction: a shell around the origin, or a part of it.
 
     Distances are evenly distributed, directions evenly over the sphere.
 
@@ -40,7 +40,7 @@ class Cap:
     half_angle_rad: float = np.pi
 
     def positions(self, cube: FloatArray) -> FloatArray:
-        """Positions (n, 3) [m] of points (n, 3) of the unit cube."""
+        """Return positions (n, 3) [m] for points (n, 3) of the unit cube."""
         along = 1.0 - cube[:, :1] * (1.0 - np.cos(self.half_angle_rad))
         directions = around(np.array(self.towards), along, cube[:, 1:2])
         return directions * (self.nearest_m + cube[:, 2:3] * (self.farthest_m - self.nearest_m))
@@ -60,40 +60,43 @@ class Block:
     high_m: tuple[float, float, float]
 
     def positions(self, cube: FloatArray) -> FloatArray:
-        """Positions (n, 3) [m] of points (n, 3) of the unit cube."""
+        """Return positions (n, 3) [m] for points (n, 3) of the unit cube."""
         low = np.array(self.low_m)
         return low + cube * (np.array(self.high_m) - low)
 
 
 class Criterion(Protocol):
-    """What is made small, of the range deviations of many sources."""
+    """Criterion to minimise, a function of the range deviations of many sources."""
 
     def weights(self, n: int) -> FloatArray:
-        """Weights (n,) of n deviations in ascending order."""
+        """Return the weights (n,) of n deviations in ascending order."""
 
     def of(self, deviations: FloatArray) -> float:
-        """The criterion of deviations (n,), without any smoothing."""
+        """Return the criterion of deviations (n,), without smoothing."""
 
 
 @dataclass(frozen=True)
 class Quantile:
-    """The deviation that a share of the sources stays below.
+    """Deviation that a share of the sources stays below.
 
     Attributes
     ----------
     level : float
-        That share.
+        Share of the sources.
     """
 
     level: float = 0.95
 
     def weights(self, n: int) -> FloatArray:
-        """Harrell and Davis' weights of the order statistics (Biometrika 69, 1982), in which the quantile is smooth."""
+        """Return Harrell and Davis' weights of the order statistics, a smooth quantile.
+
+        Source: Biometrika 69 (1982).
+        """
         edges = np.arange(n + 1) / n
         return np.diff(betainc((n + 1) * self.level, (n + 1) * (1.0 - self.level), edges))
 
     def of(self, deviations: FloatArray) -> float:
-        """Order statistic: an infinite neighbour does not spoil it."""
+        """Return the order statistic; an infinite neighbour does not change it."""
         return float(np.quantile(deviations, self.level, method="inverted_cdf"))
 
     def __str__(self) -> str:
@@ -102,14 +105,14 @@ class Quantile:
 
 @dataclass(frozen=True)
 class Mean:
-    """The mean deviation."""
+    """Mean deviation."""
 
     def weights(self, n: int) -> FloatArray:
-        """Equal weights."""
+        """Return equal weights."""
         return np.full(n, 1.0 / n)
 
     def of(self, deviations: FloatArray) -> float:
-        """Arithmetic mean."""
+        """Return the arithmetic mean."""
         return float(np.mean(deviations))
 
     def __str__(self) -> str:
@@ -117,7 +120,10 @@ class Mean:
 
 
 def around(axis: FloatArray, along: FloatArray, turn: FloatArray) -> FloatArray:
-    """Unit vectors with given cosines (n, 1) to an axis (3,), turned around it by shares (n, 1) of a revolution."""
+    """Return unit vectors with given cosines (n, 1) to an axis (3,).
+
+    They are turned around it by shares (n, 1) of a revolution.
+    """
     n = axis / np.linalg.norm(axis)
     first = np.cross(n, np.eye(3)[np.argmin(np.abs(n))])
     first /= np.linalg.norm(first)

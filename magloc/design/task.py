@@ -1,4 +1,4 @@
-"""What an array is designed for: its sensors, where they may stand, which sources it is to locate, and what counts.
+"""Design tasks: sensors, their volume, sources and criterion.
 
 Built-in tasks are files beside this one. A task file (TOML)::
 
@@ -71,10 +71,10 @@ from arrays.io.toml import (
 from arrays.sensor import Sensor, SensorKind
 from arrays.typing import FloatArray, Vector
 from magloc.design.regions import Block, Cap, Criterion, Mean, Quantile, Region, around
-from magloc.design.volumes import Ball, Box, Cylinder, Volume, read_surface
+from magloc.design.volumes import Ball, BoxVolume, Cylinder, Volume, read_surface
 
 N_UNKNOWNS = 6
-# Numbers that a source is drawn from: three for its position, two for the direction of its moment.
+# Random numbers per source: three for its position, two for the direction of its moment.
 N_DRAWN = 5
 _ORIGIN = (0.0, 0.0, 0.0)
 _LEAST = {"vector": 3, "scalar": 7}
@@ -87,7 +87,7 @@ _FILES = BuiltIn("magloc.design", "tasks", "task")
 
 @dataclass(frozen=True)
 class DesignSearch:
-    """How hard to search.
+    """Effort of a search.
 
     Attributes
     ----------
@@ -100,7 +100,7 @@ class DesignSearch:
     small_iterations, large_iterations : int
         Steps of a descent at most.
     n_judged : int
-        Independent sources that everything is judged on.
+        Number of independent sources of the comparison.
     """
 
     n_starts: int = 16
@@ -113,37 +113,37 @@ class DesignSearch:
 
     @property
     def n_steps(self) -> int:
-        """Steps of all descents together, at most."""
+        """Largest number of steps of all descents together."""
         return self.n_starts * self.small_iterations + self.n_refined * self.large_iterations
 
 
 @dataclass(frozen=True, eq=False)
 class DesignTask:
-    """What an array is designed for.
+    """Task of a design: sensors, their volume, sources and criterion.
 
     Attributes
     ----------
     name : str
-        Of the task, and of the array.
+        Name of the task, and of the array.
     n_sensors : int
     kind : {"vector", "scalar"}
         Scalar sensors need an ambient field.
     noise_T : float
-        Of every reading [T].
+        Noise of every reading [T].
     volume : Volume
-        Where the sensors may stand.
+        Allowed positions of the sensors.
     region : Region
-        Where the sources are.
+        Distribution of the sources.
     moment_Am2 : float
         Modulus of their moments, whose directions are evenly distributed.
     criterion : Criterion
-        Of the Cramér-Rao bound of the range, the distance from the sensors' centroid.
+        Criterion on the Cramér-Rao bound of the range, the distance from the sensors' centroid.
     ambient_T : tuple, shape (3,), optional
         Uniform ambient field [T].
     least_spacing_m : float
         Least distance of two sensors.
     search : DesignSearch
-        How hard to search.
+        Effort of the search.
 
     Raises
     ------
@@ -183,7 +183,7 @@ class DesignTask:
 
     @classmethod
     def read(cls, name_or_path: str | PathLike[str]) -> DesignTask:
-        """Task of a built-in name, such as "half-space-2m", or a TOML file (:mod:`magloc.design.task`).
+        """Read a task: a built-in name, such as "half-space-2m", or a TOML file.
 
         Raises
         ------
@@ -193,14 +193,14 @@ class DesignTask:
         return read_task(str(name_or_path))
 
     def array(self, positions: FloatArray, name: str | None = None) -> SensorArray:
-        """Array of the task's sensors at positions (n, 3) [m]."""
+        """Return the array of the task's sensors at positions (n, 3) [m]."""
         sensors = (
             Sensor(f"s{i}", self.kind, tuple(place), self.noise_T) for i, place in enumerate(positions.tolist(), 1)
         )
         return SensorArray(tuple(sensors), self.name if name is None else name, ambient_T=self.ambient_T)
 
     def sources(self, cube: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Positions [m] and moments [A·m²], both (n, 3), of points (n, 5) of the unit cube."""
+        """Return positions [m] and moments [A·m²], (n, 3), for points (n, 5) of the unit cube."""
         moments = around(np.array([0.0, 0.0, 1.0]), 1.0 - 2.0 * cube[:, 3:4], cube[:, 4:5])
         return self.region.positions(cube[:, :3]), self.moment_Am2 * moments
 
@@ -239,7 +239,7 @@ class _Box(Table, kw_only=True):
     centre_m: Vector = _ORIGIN
 
     def volume(self, folder: Path) -> Volume:
-        return Box(self.centre_m, self.size_m)
+        return BoxVolume(self.centre_m, self.size_m)
 
 
 class _Cylinder(Table, kw_only=True):
@@ -343,11 +343,11 @@ class _Search(Table, kw_only=True):
 
     @property
     def log2(self) -> int:
-        """Of the number of sources."""
+        """Binary logarithm of the number of sources."""
         return self.sources.bit_length() - 1
 
 
-class _File(File, kw_only=True):
+class _TaskFile(File, kw_only=True):
     sensors: _Sensors
     volume: dict[str, Any]
     sources: dict[str, Any]
@@ -361,9 +361,9 @@ _REGIONS: dict[str, Any] = {"shell": _Shell, "half-space": _HalfSpace, "cap": _C
 
 
 def read_task(name_or_path: str) -> DesignTask:
-    """Task of a built-in name or a TOML file: :meth:`magloc.design.task.DesignTask.read`."""
+    """Read a task: see :meth:`magloc.design.task.DesignTask.read`."""
     path, table = _FILES.read(name_or_path)
-    file = section_of(path, table, _File)
+    file = section_of(path, table, _TaskFile)
     sensors, search = file.sensors, file.search
     ambient = sensors.ambient_nT
     sources = named_section(f"{path}, table sources", file.sources, "region", _REGIONS)

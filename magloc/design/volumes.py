@@ -1,4 +1,4 @@
-"""Where the sensors of a design may stand: solid bodies, or the surface of a mesh."""
+"""Volumes for the sensors of a design: solid bodies, or the surface of a mesh."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _N_EVEN, _N_EVEN_TRIES, _EVEN_RTOL = 4096, 32, 1e-9
 
 
 class Volume(Protocol):
-    """A set of points to which others can be brought."""
+    """Set of allowed sensor positions."""
 
     @property
     def centre(self) -> FloatArray:
@@ -36,21 +36,21 @@ class Volume(Protocol):
         """Radius of the enclosing ball [m]."""
 
     def nearest(self, points: FloatArray) -> FloatArray:
-        """The nearest points of the set to points (n, 3) [m]."""
+        """Return the points of the set nearest to points (n, 3) [m]."""
 
     def random(self, n: int, rng: np.random.Generator) -> FloatArray:
-        """Points of the set, evenly distributed, (n, 3) [m]."""
+        """Return uniformly distributed points of the set, (n, 3) [m]."""
 
 
 @dataclass(frozen=True)
 class _Solid:
-    """What solid bodies have in common."""
+    """Base of solid bodies."""
 
     centre_m: tuple[float, float, float]
 
     @property
     def centre(self) -> FloatArray:
-        """Its centre [m]."""
+        """Centre [m]."""
         return np.array(self.centre_m)
 
 
@@ -67,24 +67,24 @@ class Ball(_Solid):
 
     @property
     def radius(self) -> float:
-        """Its radius [m]."""
+        """Radius [m]."""
         return self.radius_m
 
     def nearest(self, points: FloatArray) -> FloatArray:
-        """The nearest points of the ball to points (n, 3) [m]."""
+        """Return the points of the ball nearest to points (n, 3) [m]."""
         offset = points - self.centre
         length = np.linalg.norm(offset, axis=-1, keepdims=True)
         return self.centre + offset * np.minimum(1.0, self.radius_m / np.maximum(length, 1e-300))
 
     def random(self, n: int, rng: np.random.Generator) -> FloatArray:
-        """Evenly distributed points (n, 3) [m]."""
+        """Return uniformly distributed points (n, 3) [m]."""
         direction = rng.normal(size=(n, 3))
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         return self.centre + self.radius_m * np.cbrt(rng.uniform(size=(n, 1))) * direction
 
 
 @dataclass(frozen=True)
-class Box(_Solid):
+class BoxVolume(_Solid):
     """A solid box along the axes.
 
     Attributes
@@ -98,16 +98,16 @@ class Box(_Solid):
 
     @property
     def radius(self) -> float:
-        """Half of its diagonal [m]."""
+        """Half of the diagonal [m]."""
         return 0.5 * float(np.linalg.norm(self.size_m))
 
     def nearest(self, points: FloatArray) -> FloatArray:
-        """The nearest points of the box to points (n, 3) [m]."""
+        """Return the points of the box nearest to points (n, 3) [m]."""
         half = 0.5 * np.array(self.size_m)
         return np.clip(points, self.centre - half, self.centre + half)
 
     def random(self, n: int, rng: np.random.Generator) -> FloatArray:
-        """Evenly distributed points (n, 3) [m]."""
+        """Return uniformly distributed points (n, 3) [m]."""
         return self.centre + rng.uniform(-0.5, 0.5, (n, 3)) * np.array(self.size_m)
 
 
@@ -127,11 +127,11 @@ class Cylinder(_Solid):
 
     @property
     def radius(self) -> float:
-        """Distance of its rims from its centre [m]."""
+        """Distance of the rims from the centre [m]."""
         return float(np.hypot(self.radius_m, 0.5 * self.height_m))
 
     def nearest(self, points: FloatArray) -> FloatArray:
-        """The nearest points of the cylinder to points (n, 3) [m]."""
+        """Return the points of the cylinder nearest to points (n, 3) [m]."""
         offset = points - self.centre
         across = np.linalg.norm(offset[..., :2], axis=-1, keepdims=True)
         in_plane = offset[..., :2] * np.minimum(1.0, self.radius_m / np.maximum(across, 1e-300))
@@ -139,26 +139,26 @@ class Cylinder(_Solid):
         return self.centre + np.concatenate([in_plane, height], axis=-1)
 
     def random(self, n: int, rng: np.random.Generator) -> FloatArray:
-        """Evenly distributed points (n, 3) [m]."""
+        """Return uniformly distributed points (n, 3) [m]."""
         across, angle = self.radius_m * np.sqrt(rng.uniform(size=n)), rng.uniform(0.0, 2.0 * np.pi, n)
         height = self.height_m * rng.uniform(-0.5, 0.5, n)
         return self.centre + np.stack([across * np.cos(angle), across * np.sin(angle), height], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
-    """The surface of a triangle mesh.
+class MeshSurface:
+    """Surface of a triangle mesh.
 
     Attributes
     ----------
     mesh : trimesh.Trimesh
-        In metres, array frame.
+        Mesh in metres, in the array's frame.
     """
 
     mesh: trimesh.Trimesh
 
     @cached_property
-    def _enclosing(self) -> tuple[FloatArray, float]:
+    def _enclosing_ball(self) -> tuple[FloatArray, float]:
         from trimesh import nsphere
 
         centre, radius = nsphere.minimum_nsphere(self.mesh)  # type: ignore[no-untyped-call]
@@ -167,27 +167,27 @@ class Surface:
     @property
     def centre(self) -> FloatArray:
         """Centre of the smallest enclosing ball [m]."""
-        return self._enclosing[0]
+        return self._enclosing_ball[0]
 
     @property
     def radius(self) -> float:
         """Radius of the smallest enclosing ball [m]."""
-        return self._enclosing[1]
+        return self._enclosing_ball[1]
 
     @cached_property
     def _triangles(self) -> tuple[FloatArray, cKDTree, float]:
-        """Corners (f, 3, 3), a tree of their centroids, and the largest distance of a corner from its centroid."""
+        """Corners (f, 3, 3), a tree of their centroids, and the largest distance between both."""
         corners = np.asarray(self.mesh.triangles, dtype=np.float64)
         centroids = corners.mean(axis=1)
         largest = np.linalg.norm(corners - centroids[:, None], axis=-1).max()
         return corners, cKDTree(centroids), float(largest)
 
     def nearest(self, points: FloatArray) -> FloatArray:
-        """The nearest points of the surface to points (n, 3) [m]."""
+        """Return the points of the surface nearest to points (n, 3) [m]."""
         from trimesh import triangles
 
         corners, tree, largest = self._triangles
-        # No triangle whose centroid is farther than the nearest centroid and the largest triangle together is nearest.
+        # The nearest triangle's centroid is at most the largest triangle farther than the nearest centroid.
         reach = tree.query(points)[0] + largest
         found = np.empty_like(points)
         for i, faces in enumerate(tree.query_ball_point(points, reach * (1.0 + 1e-9))):
@@ -197,7 +197,7 @@ class Surface:
         return found
 
     def random(self, n: int, rng: np.random.Generator) -> FloatArray:
-        """Evenly distributed points (n, 3) [m]."""
+        """Return uniformly distributed points (n, 3) [m]."""
         corners = self._triangles[0]
         area = np.asarray(self.mesh.area_faces)
         a, b, c = np.moveaxis(corners[rng.choice(len(corners), size=n, p=area / area.sum())], 1, 0)
@@ -205,8 +205,8 @@ class Surface:
         return (1.0 - s) * a + s * (1.0 - t) * b + s * t * c
 
 
-def read_surface(path: str | PathLike[str]) -> Surface:
-    """Surface of an STL, OBJ or PLY file, its numbers in metres."""
+def read_surface(path: str | PathLike[str]) -> MeshSurface:
+    """Read the surface of an STL, OBJ or PLY file with numbers in metres."""
     expected = f"a mesh ({', '.join(MESH_FORMATS).upper()})"
     if Path(path).suffix.lower().lstrip(".") not in MESH_FORMATS:
         raise InputError(f"{path}: found the name of another kind of file, expected {expected}.")
@@ -221,30 +221,30 @@ def read_surface(path: str | PathLike[str]) -> Surface:
     faces = np.asarray(getattr(mesh, "faces", ()))
     if not faces.size or not np.isfinite(mesh.triangles).all() or not mesh.area > 0.0:
         raise InputError(f"{path}: found no triangles with an area, expected {expected}.")
-    return Surface(mesh)
+    return MeshSurface(mesh)
 
 
 def even_grid(volume: Volume, n: int, rng: np.random.Generator) -> FloatArray:
-    """Points (n, 3) [m] spread evenly over a volume, out to its rim: where sensors go of which nothing is computed.
+    """Return points (n, 3) [m] spread evenly over a volume, out to its rim.
 
-    In a box the lattice of n points whose least spacing is largest. In other volumes, and where points spread so are
-    farther apart, the middles of n equal parts (Lloyd's centroidal Voronoi cells, by k-means of random points, the
-    best of several), stretched from the centre as far as all stay inside; on a surface the nearest points of it.
+    Candidates are the means of n equal parts (Lloyd's centroidal Voronoi cells, by k-means of random points, the best
+    of several), stretched from the centre as far as all stay inside, or moved to the nearest points of a surface. In a
+    box the lattices of n points are candidates too. The result is the candidate with the largest least spacing.
     """
-    spread = _stretched(volume, _middles(volume.random(_N_EVEN, rng), n, rng))
-    lattices = _lattices(volume, n) if isinstance(volume, Box) else []
+    spread = _stretch(volume, _middles(volume.random(_N_EVEN, rng), n, rng))
+    lattices = _lattices(volume, n) if isinstance(volume, BoxVolume) else []
     return max([*lattices, spread], key=lambda points: float(pdist(points).min()))
 
 
 def _middles(points: FloatArray, n: int, rng: np.random.Generator) -> FloatArray:
-    """Means (n, 3) of the parts of points (k, 3) with the least sum of squares."""
+    """Return means (n, 3) of the parts of points (k, 3) with the least sum of squares."""
     tries = [kmeans2(points, n, minit="++", rng=rng) for _ in range(_N_EVEN_TRIES)]
     middles, _ = min(tries, key=lambda tried: float(np.sum((points - tried[0][tried[1]]) ** 2)))
     return np.asarray(middles)
 
 
-def _stretched(volume: Volume, points: FloatArray) -> FloatArray:
-    """Points (n, 3) moved from the centre by the largest factor that leaves all of them in a volume."""
+def _stretch(volume: Volume, points: FloatArray) -> FloatArray:
+    """Stretch points (n, 3) from the centre by the largest factor that keeps all inside."""
 
     def outside(factor: float) -> float:
         moved = volume.centre + factor * (points - volume.centre)
@@ -257,8 +257,11 @@ def _stretched(volume: Volume, points: FloatArray) -> FloatArray:
     return volume.nearest(volume.centre + factor * (points - volume.centre))
 
 
-def _lattices(box: Box, n: int) -> list[FloatArray]:
-    """All lattices of n points that reach the faces of a box; one layer lies in its middle."""
+def _lattices(box: BoxVolume, n: int) -> list[FloatArray]:
+    """Return all lattices of n points that reach the faces of a box.
+
+    One layer lies in its middle.
+    """
     counts = [(i, j, n // (i * j)) for i in range(1, n + 1) for j in range(1, n // i + 1) if n % (i * j) == 0]
     ends = 0.5 * np.array(box.size_m)
     lattices = []

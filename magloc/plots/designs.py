@@ -14,7 +14,7 @@ from arrays.typing import FloatArray
 from magloc.design.evaluation import EVEN, Judgement, range_spread
 from magloc.design.optimise import BEST_START, Design, random_sample
 from magloc.design.regions import Cap
-from magloc.design.volumes import Ball, Box, Cylinder, Surface, Volume
+from magloc.design.volumes import Ball, BoxVolume, Cylinder, MeshSurface, Volume
 from magloc.plots import style
 
 _N_SOURCES = 8000
@@ -178,7 +178,7 @@ def _scene(ax: Any, result: Design) -> None:
     volume, sensors = result.task.volume, result.array.positions
     for line in _outline(volume):
         ax.plot(*line.T, color=style.PALE_GREY, lw=0.6, zorder=1)
-    if isinstance(volume, Surface):
+    if isinstance(volume, MeshSurface):
         ax.plot_trisurf(
             *volume.mesh.vertices.T,
             triangles=volume.mesh.faces,
@@ -260,7 +260,7 @@ def _outline(volume: Volume) -> list[FloatArray]:
         half = np.array([0.0, 0.0, 0.5 * volume.height_m])
         sides = [np.stack([ring[i] - half, ring[i] + half]) for i in range(0, 72, 9)]
         return [volume.centre + line for line in (ring - half, ring + half, *sides)]
-    if isinstance(volume, Box):
+    if isinstance(volume, BoxVolume):
         corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
         corners = volume.centre + corners * np.array(volume.size_m)
         edges = [(i, i | bit) for i in range(8) for bit in (1, 2, 4) if not i & bit]

@@ -12,7 +12,7 @@ from matplotlib.patches import Patch
 
 from magloc.convergence.over_sources import SourceStatus
 from magloc.convergence.over_sources import summary as source_summary
-from magloc.convergence.over_starts import Status, summary
+from magloc.convergence.over_starts import StartStatus, summary
 from magloc.plots import style
 
 if TYPE_CHECKING:
@@ -24,9 +24,9 @@ _SLICES = (("x", "y", "z"), ("x", "z", "y"), ("y", "z", "x"))
 _WHITE = "#ffffff"
 # Colour, hatching and name: the hatching tells them from the values in a grey print too.
 _NOT_CONVERGED = {
-    Status.OTHER_OPTIMUM: (_WHITE, "", "stopped elsewhere"),
-    Status.NOT_STOPPED: (_WHITE, "////", "did not stop"),
-    Status.DIVERGED: (_WHITE, "xxxx", "diverged"),
+    StartStatus.OTHER_OPTIMUM: (_WHITE, "", "stopped elsewhere"),
+    StartStatus.NOT_STOPPED: (_WHITE, "////", "did not stop"),
+    StartStatus.DIVERGED: (_WHITE, "xxxx", "diverged"),
 }
 _STARTS_COLOURS = ListedColormap([_WHITE, *(colour for colour, _, _ in _NOT_CONVERGED.values())])
 _SOURCE_ENDS = {
@@ -67,7 +67,7 @@ def convergence(dataset: xr.Dataset) -> Figure:
     places = {"left": 0.07, "right": 0.895, "bottom": 0.25, "top": 0.8, "wspace": 0.34}
     axes = figure.subplots(1, 3, gridspec_kw=places)
     parts = _slices(dataset[["status", "iterations"]], source)
-    shown = [part["iterations"].where(part["status"] == Status.CONVERGED) for part in parts]
+    shown = [part["iterations"].where(part["status"] == StartStatus.CONVERGED) for part in parts]
     converged = np.concatenate([values.to_numpy()[np.isfinite(values)] for values in shown])
     top = float(np.percentile(converged, 99)) if converged.size else 1.0
     for ax, part, values, (across, up, through) in zip(axes, parts, shown, _SLICES, strict=True):

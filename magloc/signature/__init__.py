@@ -1,1 +1,1 @@
-"""An object whose path is known: its moment through time, and what of it is permanent, induced or of eddy currents."""
+"""Moments of objects on known paths: tracks, and permanent, induced and eddy parts."""

@@ -162,7 +162,9 @@ def track_moment(
     path_error: PathError = EXACT,
     smooth: bool = False,
 ) -> MomentTrack:
-    """Follow the moment of an object whose path is known: equation (29), MotionMV of Pavlov et al.
+    """Follow the moment of an object whose path is known.
+
+    This is equation (29), MotionMV of Pavlov et al.
 
     Parameters
     ----------

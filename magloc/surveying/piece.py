@@ -25,12 +25,12 @@ from magloc.surveying.tiles import Tile
 
 ROW_ENTRIES = ("place_m", "anomaly_T", "residual_T")
 _FIRST_ROUNDS = 4  # before the lag is estimated
-_BESIDE = 0.6  # of the distance to the deepest sources
+_BESIDE = 0.6  # margin of the search, over the distance to the deepest sources
 _SHALLOWEST_M, _DEEPEST = 0.05, 4.0
 _MARGIN_M = 1.0
 _LARGEST_MOMENT_Am2 = 300.0
 _SETTLED = 1e-3
-_MOST_NUMBERS = 2.5e8  # of the columns of the ground: 2 GB
+_MOST_NUMBERS = 2.5e8  # largest size of the columns of the ground: 2 GB
 _MOST_PLACES = 1e6
 
 

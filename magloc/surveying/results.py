@@ -82,7 +82,10 @@ class Target:
 
     @property
     def ellipse95(self) -> tuple[float, float, float]:
-        """Half axes [m] of the 95 % ellipse on the map, and the bearing of the longer one, clockwise from north."""
+        """Half axes [m] of the 95 % ellipse on the map, and bearing of the longer one.
+
+        The bearing counts clockwise from north.
+        """
         values, vectors = np.linalg.eigh(self.covariance[:2, :2])
         minor, major = np.sqrt(chdtri(2, 0.05) * values)
         return float(major), float(minor), math.degrees(math.atan2(vectors[0, 1], vectors[1, 1])) % 180.0

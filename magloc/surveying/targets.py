@@ -23,7 +23,7 @@ _LASTING = 3.72  # standard deviations, one-sided
 _N_DEPTHS = 16
 _SPAN = 3.0  # over and under the depth, as a factor
 _N_SECOND = 9  # degrees of freedom of a second source
-_FALSE_MERGED = 0.01  # of single sources
+_FALSE_MERGED = 0.01  # false alarms among single sources
 _WITHIN, _N_BESIDE, _DEEPER, _N_BELOW = 1.0, 7, 1.6, 5  # places of a second source, over the distance
 _SIGMAS, _STEPS = 3.0, 9  # places on the map, in standard deviations of the position
 

@@ -84,10 +84,10 @@ def _map(name: str) -> Work:
     import numpy as np
 
     from magloc.convergence import filters
-    from magloc.convergence.over_starts import StartsScenario, simulated_measurement
+    from magloc.convergence.over_starts import StartsScenario, simulate_measurement
 
     scenario = StartsScenario()
-    _, measurement, z = simulated_measurement(scenario)
+    _, measurement, z = simulate_measurement(scenario)
     axis = np.linspace(-20.0, 20.0, 13)
     starts = np.zeros((13**3, 6))
     starts[:, :3] = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)

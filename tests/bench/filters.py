@@ -12,7 +12,7 @@ import numpy as np
 
 from arrays.geometries import tetrahedron
 from magloc.convergence.filters import IekfFilter
-from magloc.convergence.over_starts import StartsScenario, simulated_measurement
+from magloc.convergence.over_starts import StartsScenario, simulate_measurement
 from magloc.measurement.differences import DifferenceMeasurement
 from magloc.readings import Readings
 from magloc.state_space import IteratedExtendedKalmanFilter
@@ -38,7 +38,7 @@ def rows(size: Size) -> Iterator[Row]:
     The last rows compare an iteration of the compiled filter of the convergence map, over a map of starts.
     """
     scenario = StartsScenario(array=tetrahedron(1.5, noise_T=1e-9), noise_seed=5)
-    _, measurement, z = simulated_measurement(scenario)
+    _, measurement, z = simulate_measurement(scenario)
     x = np.array([*scenario.position_m, *scenario.moment_Am2]) + np.repeat([0.3, -20.0], 3)
     method = IekfFilter(tolerance_T=0.0, max_iterations=ITERATIONS)
     starts = np.tile(x, (size.grid**3, 1))

@@ -9,9 +9,9 @@ import numpy as np
 
 from arrays.geometries import tetrahedron
 from magloc import core
-from magloc.convergence.ends import Ends
+from magloc.convergence.ends import FilterEnds
 from magloc.convergence.filters import IekfFilter, RepeatedFilter
-from magloc.convergence.over_starts import StartsScenario, simulated_measurement
+from magloc.convergence.over_starts import StartsScenario, simulate_measurement
 from magloc.measurement.differences import DifferenceMeasurement
 from tests.bench.filters import TIME, functions, stonesoup_update
 from tests.bench.fixes import best_fit
@@ -42,7 +42,7 @@ def rows_of(
 ) -> Iterator[Row]:
     """One filter, against its twin, its peers (package and loop by name) and scipy."""
     scenario = StartsScenario(array=tetrahedron(1.5, noise_T=1e-9))
-    readings, measurement, z = simulated_measurement(scenario)
+    readings, measurement, z = simulate_measurement(scenario)
     optimum = plain_locator(scenario.array).fit(readings).solutions[0]
     starts = starts_of(scenario, size.grid)
     sampled = np.random.default_rng(6).permutation(len(starts))[: size.sample]
@@ -51,13 +51,13 @@ def rows_of(
     loops = {name: make(measurement, z, method) for name, (package, make) in candidates.items() if installed(package)}
     found: dict[str, list[tuple[np.ndarray, bool]]] = {}
 
-    def run_all() -> Ends:
+    def run_all() -> FilterEnds:
         return method.run(measurement, z, starts)
 
     def run_sample(name: str) -> None:
         found[name] = [loops[name](starts[i]) for i in sampled]
 
-    def reached(ends: Ends) -> np.ndarray:
+    def reached(ends: FilterEnds) -> np.ndarray:
         return method.reached(ends, optimum.chi2, optimum.position_m)
 
     ends = run_all()
@@ -92,11 +92,11 @@ def starts_of(scenario: StartsScenario, grid: int) -> np.ndarray:
     return np.concatenate([positions, np.zeros_like(positions)], axis=1)
 
 
-def ends_of(measurement: DifferenceMeasurement, z: np.ndarray, found: list[tuple[np.ndarray, bool]]) -> Ends:
+def ends_of(measurement: DifferenceMeasurement, z: np.ndarray, found: list[tuple[np.ndarray, bool]]) -> FilterEnds:
     """What the loops return, as the map's own ends."""
     states = np.array([state for state, _ in found])
     residual = (z - measurement.predicted(states[:, :3], states[:, 3:])) / np.sqrt(measurement.variance)
-    return Ends(
+    return FilterEnds(
         states=states,
         chi2=np.einsum("ij,ij->i", residual, residual),
         iterations=np.zeros(len(found), dtype=np.int64),

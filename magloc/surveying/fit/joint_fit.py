@@ -117,7 +117,7 @@ class Layer:
 
 @dataclass(frozen=True, eq=False)
 class SurveyBackground:
-    """What is projected out: noise in time, the layer, errors of sensors, bodies.
+    """Nuisances to project out: noise in time, the layer, errors of sensors, bodies.
 
     Attributes
     ----------

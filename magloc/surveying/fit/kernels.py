@@ -1,4 +1,4 @@
-"""Compiled kernels of a survey: the filter that makes its noise white, and what sources add to its measurements.
+"""Compiled kernels of a survey: whitening filter, and columns of sources.
 
 The tests have the readable references: the whole covariance matrix, and the fields of :mod:`magloc.fields.dipole`.
 """

@@ -26,7 +26,7 @@ from scipy.stats import chi2
 from arrays.array import SensorArray
 from arrays.geometries import cube, grid, hexagon, square, tetrahedron
 from arrays.pose import PoseUncertainty
-from magloc.bounds.crlb import cramer_rao_bounds, whitened_jacobian
+from magloc.bounds.crlb import cramer_rao_bounds, nuisance_free_jacobian
 from magloc.bounds.over_moments import (
     bounds_over_moments,
     sigma_table,
@@ -53,7 +53,7 @@ def random_source(seed, distance_m=4.0, moment_Am2=200.0):
 
 def fisher_information(array, position, moment, **uncertain):
     """Information (6, 6) about (p, m), all nuisances marginalised."""
-    W = whitened_jacobian(array, position, moment, **uncertain)
+    W = nuisance_free_jacobian(array, position, moment, **uncertain)
     return W.mT @ W
 
 
@@ -303,7 +303,7 @@ class TestSingular:
             return [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
 
         def least_singular_value(angles, array):
-            W = whitened_jacobian(array, 4.0 * np.array(unit(*angles[:2])), unit(*angles[2:]))
+            W = nuisance_free_jacobian(array, 4.0 * np.array(unit(*angles[:2])), unit(*angles[2:]))
             return float(np.linalg.svd(W / np.linalg.norm(W, axis=0), compute_uv=False)[-1])
 
         starts = np.random.default_rng(1).uniform(-1.5, 1.5, size=(200, 4))
@@ -426,7 +426,7 @@ class TestKnownModulus:
     @each_array
     def test_adds_its_information(self, array):
         position, moment = random_source(4)
-        W, sigma = whitened_jacobian(array, position, moment), 3.0
+        W, sigma = nuisance_free_jacobian(array, position, moment), 3.0
         along = np.concatenate([np.zeros(3), moment / np.linalg.norm(moment)])
         expected = np.linalg.inv(W.T @ W + np.outer(along, along) / sigma**2)
         bounds = cramer_rao_bounds(array, position, moment, known_moment_sigma_Am2=sigma)

@@ -23,9 +23,9 @@ from arrays.geometries import cube, tetrahedron
 from magloc.bounds.crlb import cramer_rao_bounds
 from magloc.bounds.maps import (
     CASES,
+    AccuracyReach,
     BoundMap,
     BoundScenario,
-    Reached,
     bound_map,
     bound_slices,
     bounds_at,
@@ -93,7 +93,7 @@ class TestCube:
     def test_reached_counts_the_moments_that_are_accurate_enough(self):
         dataset = computed_map(BoundMap(SCENARIO, 9))
         ranks = [(dataset[f"sigma_range{case}"] <= SCENARIO.accuracy_m).astype(int) for case in CASES[1:]]
-        defined = dataset.reached != Reached.UNDEFINED
+        defined = dataset.reached != AccuracyReach.UNDEFINED
         assert_array_equal(dataset.reached.to_numpy()[defined], sum(ranks).to_numpy()[defined])
         assert set(np.unique(dataset.reached)) == {-1, 0, 1, 2, 3}
         assert int((~defined).sum()) == 1  # the centroid, which has no direction
@@ -113,7 +113,7 @@ class TestCube:
                 assert_array_equal(stored[name], values)
             counts = summary(stored)
             assert counts.points == 40**3
-            assert counts.fraction == (stored.reached >= Reached.MOST).mean()
+            assert counts.fraction == (stored.reached >= AccuracyReach.MOST).mean()
 
     def test_describes_itself(self):
         dataset = computed_map(BoundMap(SCENARIO, 2))

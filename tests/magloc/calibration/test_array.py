@@ -170,7 +170,7 @@ class TestDerivatives:
     def test_jacobian(self, turning, unknown_position, unknown_height, moment):
         problem = problem_of(turning, unknown_position=unknown_position, unknown_height=unknown_height, moment=moment)
         state = state_of(turning)
-        estimated, g, k = problem.estimated.tolist(), problem.n_globals, problem.n_row_unknowns
+        estimated, g, k = problem.estimated_indices.tolist(), problem.n_globals, problem.n_row_unknowns
         n = problem.free.size
         linear = moving_source.linearise(problem, state)
         n_rows, n_channels = linear.residual.shape

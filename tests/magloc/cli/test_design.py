@@ -17,7 +17,7 @@ from magloc.cli.design import _table
 from magloc.design.optimise import design_array
 from magloc.design.regions import Block, Cap, Mean, Quantile
 from magloc.design.task import DesignSearch, read_task
-from magloc.design.volumes import Ball, Box, Cylinder
+from magloc.design.volumes import Ball, BoxVolume, Cylinder
 from tests.command_line import Run, assert_refused
 from tests.conftest import REPOSITORY
 
@@ -148,7 +148,7 @@ class TestTaskFile:
     @pytest.mark.parametrize(
         ("text", "volume"),
         [
-            ('shape = "box"\nsize_m = [2, 1, 0]\ncentre_m = [0, 0, 1]', Box((0.0, 0.0, 1.0), (2.0, 1.0, 0.0))),
+            ('shape = "box"\nsize_m = [2, 1, 0]\ncentre_m = [0, 0, 1]', BoxVolume((0.0, 0.0, 1.0), (2.0, 1.0, 0.0))),
             ('shape = "cylinder"\nradius_m = 1\nheight_m = 0', Cylinder((0.0, 0.0, 0.0), 1.0, 0.0)),
         ],
     )
@@ -254,7 +254,7 @@ class TestInterruption:
         raise KeyboardInterrupt
 
     def test_best_array_so_far_is_written(self, run, task, tmp_path, monkeypatch):
-        monkeypatch.setattr("magloc.design.optimise.judged", self.interrupted)
+        monkeypatch.setattr("magloc.design.optimise.judge", self.interrupted)
         out = tmp_path / "out.toml"
         outcome = run("design", task, "--out", out)
         assert outcome.status == 130

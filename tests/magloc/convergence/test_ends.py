@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from arrays.array import SensorArray
 from arrays.geometries import tetrahedron
 from arrays.sensor import Sensor
-from magloc.convergence.ends import Ends, ScaledDifferences
+from magloc.convergence.ends import FilterEnds, ScaledDifferences
 from magloc.convergence.filters import DampedFilter, IekfFilter, RepeatedFilter, field_weights
 from magloc.measurement.differences import DifferenceMeasurement
 from magloc.state_space import predict, update
@@ -240,7 +240,7 @@ class TestReadableTwins:
         starts: Array,
         tolerance: float,
         counts: bool = False,
-    ) -> Ends:
+    ) -> FilterEnds:
         ends = method.run(measurement, z, starts)
         for i, start in enumerate(starts):
             twin = run_one(method, measurement, z, start)
@@ -378,7 +378,7 @@ class TestNoWrongFix:
             assert np.isnan(ends.chi2).all()
             assert not ends.stopped.any()
 
-    def assert_optima(self, method: Filter, starts: Array, ends: Ends) -> None:
+    def assert_optima(self, method: Filter, starts: Array, ends: FilterEnds) -> None:
         """The next Gauss-Newton step, by an orthogonal factorisation, is less than a tenth of a standard deviation.
 
         The repeated filter is at the optimum when its χ² is, within 0.05: that is 0.22 standard deviations.
@@ -415,7 +415,7 @@ class TestLanes:
         monkeypatch.setattr("magloc.convergence.ends._BLOCK_S", 0.0)
 
     @staticmethod
-    def assert_same(a: Ends, b: Ends) -> None:
+    def assert_same(a: FilterEnds, b: FilterEnds) -> None:
         assert_array_equal(a.states, b.states)
         assert_array_equal(a.chi2, b.chi2)
         assert_array_equal(a.iterations, b.iterations)
@@ -428,7 +428,7 @@ class TestLanes:
         starts = np.concatenate([starts_of("cube", 150), starts_of("at a sensor", 50, array)])
         order = np.random.default_rng(0).permutation(len(starts))
         ends = method.run(measurement, z, starts)
-        permuted = Ends(ends.states[order], ends.chi2[order], ends.iterations[order], ends.stopped[order])
+        permuted = FilterEnds(ends.states[order], ends.chi2[order], ends.iterations[order], ends.stopped[order])
         self.assert_same(method.run(measurement, z, starts[order]), permuted)
 
     @each_filter
@@ -447,7 +447,7 @@ class TestLanes:
     def test_any_number_of_starts(self, method: Filter, n: int) -> None:
         starts = starts_of("cube", 100)
         ends = method.run(self.measurement, self.z, starts)
-        first = Ends(ends.states[:n], ends.chi2[:n], ends.iterations[:n], ends.stopped[:n])
+        first = FilterEnds(ends.states[:n], ends.chi2[:n], ends.iterations[:n], ends.stopped[:n])
         self.assert_same(method.run(self.measurement, self.z, starts[:n]), first)
 
     @each_filter

@@ -18,7 +18,7 @@ from numpy.testing import assert_allclose
 from arrays.array import SensorArray
 from arrays.geometries import axial, tetrahedron
 from magloc.convergence.filters import GlobalFilter, IekfFilter, RepeatedFilter, field_weights
-from magloc.convergence.over_starts import StartsMap, StartsScenario, Status, summary
+from magloc.convergence.over_starts import StartsMap, StartsScenario, StartStatus, summary
 from magloc.grids.computed import computed_map
 from magloc.measurement.differences import DifferenceMeasurement
 from magloc.plots.maps import convergence
@@ -43,7 +43,7 @@ def fractions(scenario):
     dataset = computed_map(StartsMap.of(scenario, 21))
     counts = summary(dataset)
     near = np.sqrt(dataset.x**2 + dataset.y**2 + dataset.z**2) <= 15.0
-    converged = dataset.status == Status.CONVERGED
+    converged = dataset.status == StartStatus.CONVERGED
     front_near = float(converged.where(near & (dataset.half == 1)).mean())
     return counts.front_fraction, front_near, counts.back_fraction, counts.median_iterations
 
@@ -63,16 +63,16 @@ class TestThePapersFigure:
     def test_its_surface(self, inner_m, outer_m, share, paper_map):
         r = np.sqrt(paper_map.x**2 + paper_map.y**2 + paper_map.z**2)
         shell = (paper_map.half == 1) & (r > inner_m) & (r <= outer_m)
-        converged = paper_map.status == Status.CONVERGED
+        converged = paper_map.status == StartStatus.CONVERGED
         assert float(converged.where(shell).mean()) == pytest.approx(share, abs=0.02)
 
     def test_converged_starts_are_at_the_optimum(self, paper_map):
-        converged = paper_map.status == Status.CONVERGED
+        converged = paper_map.status == StartStatus.CONVERGED
         assert float(paper_map.chi2.where(converged).max()) < 0.05
 
     def test_what_does_not_converge_is_flagged(self, paper_map):
-        assert not np.isin(paper_map.status, [s.value for s in Status], invert=True).any()
-        not_stopped = paper_map.status == Status.NOT_STOPPED
+        assert not np.isin(paper_map.status, [s.value for s in StartStatus], invert=True).any()
+        not_stopped = paper_map.status == StartStatus.NOT_STOPPED
         assert bool((paper_map.iterations.where(not_stopped) == PAPER.method.max_iterations).where(not_stopped).all())
 
     def test_parts_without_a_start_have_no_share(self):
@@ -94,7 +94,7 @@ class TestAWideArray:
         assert summary(wide_map).back_fraction <= 0.12
 
     def test_converged_starts_are_at_the_source(self, wide_map):
-        converged = wide_map.status == Status.CONVERGED
+        converged = wide_map.status == StartStatus.CONVERGED
         assert float(wide_map.distance.where(converged).max()) < 0.1
 
     def test_with_noise_the_same(self):

@@ -30,12 +30,12 @@ from scipy.stats.mstats import hdquantiles
 
 from arrays.geometries import cube, tetrahedron
 from magloc.bounds.crlb import cramer_rao_bounds
-from magloc.design.descent import Sample, descend, feasible, is_spaced
+from magloc.design.descent import Sample, descend, is_spaced, move_into_volume
 from magloc.design.evaluation import references, worst_case
 from magloc.design.optimise import design_array, random_sample, sobol_sample, starts_of
 from magloc.design.regions import Block, Cap, Mean, Quantile
 from magloc.design.task import DesignSearch, DesignTask
-from magloc.design.volumes import Ball, Box, Cylinder, Surface, even_grid
+from magloc.design.volumes import Ball, BoxVolume, Cylinder, MeshSurface, even_grid
 from magloc.fields.dipole import field
 from magloc.plots.designs import clear_azimuth
 from tests.plain_locator import plain_locator
@@ -168,10 +168,10 @@ class TestSources:
         assert np.all((block >= [1.0, 2.0, 3.0]) & (block <= [2.0, 2.0, 5.0]))
 
 
-HULL = Surface(trimesh.creation.icosphere(subdivisions=2, radius=0.5).apply_translation([0.1, -0.2, 0.3]))
+HULL = MeshSurface(trimesh.creation.icosphere(subdivisions=2, radius=0.5).apply_translation([0.1, -0.2, 0.3]))
 VOLUMES = [
     BALL,
-    Box((0.1, 0.2, 0.3), (1.0, 2.0, 0.0)),
+    BoxVolume((0.1, 0.2, 0.3), (1.0, 2.0, 0.0)),
     Cylinder((0.0, -0.3, 0.1), 0.5, 1.0),
     HULL,
 ]
@@ -201,7 +201,7 @@ class TestVolumes:
     def test_spacing(self, volume):
         task = replace(TASK, n_sensors=6, volume=volume, least_spacing_m=0.3)
         together = np.tile(volume.random(1, rng(22)), (6, 1))
-        apart = feasible(task, together)
+        apart = move_into_volume(task, together)
         assert is_spaced(task, apart)
         assert pdist(apart).min() >= 0.3 * (1.0 - 1e-6)
         np.testing.assert_allclose(volume.nearest(apart), apart, atol=1e-9)
@@ -260,14 +260,14 @@ class TestEvenGrid:
     """As many sensors in the same volume, of which nothing is computed."""
 
     def test_nine_on_a_plate_are_three_by_three(self):
-        plate = Box((1.0, 2.0, 3.0), (0.6, 0.6, 0.001))
+        plate = BoxVolume((1.0, 2.0, 3.0), (0.6, 0.6, 0.001))
         points = even_grid(plate, 9, rng(40)) - plate.centre
         places = np.stack(np.meshgrid([-0.3, 0.0, 0.3], [-0.3, 0.0, 0.3], [0.0]), axis=-1).reshape(-1, 3)
         assert cdist(points, places).min(axis=0).max() < 1e-9
 
     def test_seven_in_a_cube_are_no_line(self):
         """Which is the only lattice that they have."""
-        assert np.linalg.matrix_rank(even_grid(Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), 7, rng(43))) == 3
+        assert np.linalg.matrix_rank(even_grid(BoxVolume((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), 7, rng(43))) == 3
 
     def test_four_in_a_ball_are_a_regular_tetrahedron(self):
         points = even_grid(BALL, 4, rng(41))

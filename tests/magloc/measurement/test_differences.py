@@ -25,7 +25,7 @@ from arrays.geometries import tetrahedron
 from arrays.noise import reading_covariance, reading_errors
 from magloc.convergence.filters import DampedFilter, IekfFilter, RepeatedFilter
 from magloc.convergence.over_sources import SourcesMap, SourcesScenario
-from magloc.convergence.over_starts import StartsScenario, simulated_measurement
+from magloc.convergence.over_starts import StartsScenario, simulate_measurement
 from magloc.grids.cube import Box
 from magloc.measurement.differences import DifferenceMeasurement, channel_jacobian, predicted_channels
 from tests import oracles
@@ -130,7 +130,7 @@ class TestGradientOfTheAmbientField:
     @pytest.mark.parametrize("method", [RepeatedFilter(), IekfFilter(), DampedFilter()], ids=lambda m: m.name)
     def test_compiled_filters(self, method):
         scenario = StartsScenario(array=with_gradient(tetrahedron(1.5)), noise_seed=1)
-        _, measurement, z = simulated_measurement(scenario)
+        _, measurement, z = simulate_measurement(scenario)
         starts = np.array([[6.0, 1.0, 1.0, 0, 0, 0], [4.0, -1.0, 0.5, 0, 0, 0]])
         ends = method.run(measurement, z, starts)
         assert ends.stopped.all()

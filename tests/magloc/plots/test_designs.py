@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from magloc.design.volumes import Ball, Box, Cylinder
+from magloc.design.volumes import Ball, BoxVolume, Cylinder
 from magloc.plots.designs import _outline, design_counts
 
 CENTRE = (0.3, -0.2, 0.7)
@@ -19,10 +19,10 @@ CENTRE = (0.3, -0.2, 0.7)
     [
         (Ball(CENTRE, 0.4), (0.4, 0.4, 0.4)),
         (Cylinder(CENTRE, 0.3, 1.2), (0.3, 0.3, 0.6)),
-        (Box(CENTRE, (1.0, 0.4, 0.6)), (0.5, 0.2, 0.3)),
+        (BoxVolume(CENTRE, (1.0, 0.4, 0.6)), (0.5, 0.2, 0.3)),
     ],
 )
-def test_outlines(volume: Ball | Cylinder | Box, half: tuple[float, float, float]) -> None:
+def test_outlines(volume: Ball | Cylinder | BoxVolume, half: tuple[float, float, float]) -> None:
     points = np.concatenate(_outline(volume))
     np.testing.assert_allclose(volume.nearest(points), points, atol=1e-12)  # in the solid
     beyond = volume.centre + 1.01 * (points - volume.centre)

@@ -36,7 +36,7 @@ from arrays.geometries import grid, tetrahedron
 from arrays.sensor import Calibration
 from magloc.bounds.maps import BoundScenario, bound_slices
 from magloc.chi_square import square_columns
-from magloc.convergence.over_starts import Status
+from magloc.convergence.over_starts import StartStatus
 from magloc.localization.fit.export import distances_from_truth, fix_columns
 from magloc.localization.fit.results import Fix, Solution
 from magloc.plots import style
@@ -227,7 +227,7 @@ class TestMaps:
     def dataset(self) -> xr.Dataset:
         axis = np.array([-1.0, 0.0, 1.0])
         status, passes = np.zeros((3, 3, 3), dtype=np.int8), np.full((3, 3, 3), 10, dtype=np.int32)
-        status[:, 0, 1] = Status.OTHER_OPTIMUM, Status.NOT_STOPPED, Status.DIVERGED
+        status[:, 0, 1] = StartStatus.OTHER_OPTIMUM, StartStatus.NOT_STOPPED, StartStatus.DIVERGED
         passes[2, 2, 1] = 40
         return xr.Dataset(
             {
