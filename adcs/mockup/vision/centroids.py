@@ -86,7 +86,7 @@ def find_stars(frame: ArrayLike) -> Stars:
     >>> stars.positions_px.shape == (len(stars), 2)
     True
     """
-    image = checked_frame(frame)
+    image = check_frame(frame)
     background, sigma = _background(image)
     return _stars_above(image, background, THRESHOLD_SIGMAS * sigma)
 
@@ -99,7 +99,7 @@ def find_faint_stars(frame: ArrayLike) -> Stars:
     is below the threshold. A hot pixel has nine sums, so a star needs more of them.
     Shape ``frame`` (height, width). Returns: intensities, background and threshold are those of the sums.
     """
-    image = checked_frame(frame).astype(np.uint16)
+    image = check_frame(frame).astype(np.uint16)
     if min(image.shape) < 3:
         raise ValueError(f"Input frame must have 3 pixels each way at least; instead received shape {image.shape}.")
     rows = image[:-2] + image[1:-1] + image[2:]
@@ -116,12 +116,12 @@ def find_stars_between_extremes(frame: ArrayLike, level: float = 0.3) -> Stars:
     """
     if not 0.0 < level < 1.0:
         raise ValueError(f"Input level must be between 0 and 1; instead received {level}.")
-    image = checked_frame(frame)
+    image = check_frame(frame)
     darkest, brightest = int(image.min()), int(image.max())
     return _stars_above(image, darkest, level * (brightest - darkest))
 
 
-def checked_frame(frame: ArrayLike) -> ByteArray:
+def check_frame(frame: ArrayLike) -> ByteArray:
     """A grey image in which lights can be looked for: ``frame`` (height, width) -> (height, width)."""
     image = np.asarray(frame)
     if image.ndim != 2 or image.size == 0:
