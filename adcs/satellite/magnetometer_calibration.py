@@ -91,7 +91,7 @@ class MagnetometerPrior:
 
     @property
     def deviations(self) -> FloatArray:
-        """Of :data:`NAMES`, shape (13,)."""
+        """Standard deviations of :data:`NAMES`, shape (13,)."""
         D = np.where(np.eye(3), self.gain, self.axes_rad).ravel()
         return np.concatenate([np.full(3, self.bias_T), D, [self.time_shift_s]])
 

@@ -12,7 +12,7 @@ from arrays.io.errors import check_positive
 from arrays.typing import FloatArray
 
 MOST_PIXELS = 100_000
-"""Of either side of an image."""
+"""Largest number of pixels of either side of an image."""
 SCALE_ARCSEC = (0.01, 3600.0)
 """Of a pixel: from the largest telescopes to a degree."""
 WIDEST_RAD = math.radians(150.0)

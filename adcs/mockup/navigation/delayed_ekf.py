@@ -123,7 +123,7 @@ class StartSigma:
 
 
 LOST = StartSigma(position_m=10.0, velocity_m_s=0.5, heading_rad=math.pi)
-"""Of position, velocity and heading of a second hypothesis, before the fix that begins it."""
+"""Initial deviations of position, velocity and heading of a second hypothesis, before its first fix."""
 
 
 @dataclass(frozen=True, eq=False)

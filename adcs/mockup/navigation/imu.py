@@ -37,7 +37,7 @@ class RateGyro:
         _check_noise_and_range(self.sigma_rad_s, self.range_rad_s)
 
     def readings(self, rate_rad_s: ArrayLike, noise: ArrayLike, temperature_C: ArrayLike = 20.0) -> FloatArray:
-        """What it reads, NaN beyond its range.
+        """Return the readings, NaN beyond the range.
 
         Shapes ``rate_rad_s`` (...), ``temperature_C`` (...) -> (...). ``noise`` (...): standard normal numbers.
         """
@@ -72,7 +72,7 @@ class Inclinometer:
             object.__setattr__(self, name, vector)
 
     def readings(self, acceleration_m_s2: ArrayLike, noise: ArrayLike, temperature_C: ArrayLike = 20.0) -> FloatArray:
-        """What it reads, NaN beyond its range.
+        """Return the readings, NaN beyond the range.
 
         Shapes ``temperature_C`` (...) -> (..., 2). ``acceleration_m_s2`` (..., 2): along body x and y. ``noise``
         (..., 2): standard normal numbers.
