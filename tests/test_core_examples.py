@@ -21,7 +21,7 @@ from adcs.kalman.mekf import initial_state, predict, update_state
 from adcs.quaternion import IDENTITY
 from adcs.satellite.satellite import Satellite
 from adcs.satellite.sensors import Gyro, Magnetometer, SunSensor
-from adcs.satellite.telemetry import Readings, Record
+from adcs.satellite.telemetry import AttitudeReadings, Record
 from magloc import core
 from magloc.fields.dipole import field
 from tests.conftest import REPOSITORY
@@ -85,7 +85,9 @@ class TestCpp:
             twice(2e-5, 1e-6, -3e-5), twice(0.6, 0.0, 0.8), one, 1.1e-3 * one, 1.2e-6 * one,
         )  # fmt: skip
         none = np.full((1, 2, 4), np.nan)
-        readings = Readings(none, twice(1e-3, 2e-3, -1e-3), twice(1.9e-5, 2.1e-6, -3.1e-5), twice(0.61, 0.02, 0.79))
+        readings = AttitudeReadings(
+            none, twice(1e-3, 2e-3, -1e-3), twice(1.9e-5, 2.1e-6, -3.1e-5), twice(0.61, 0.02, 0.79)
+        )
         record = Record(satellite, 1.0, around, readings, twice(1e-3, -2e-3, 5e-4), twice(0, 0, 0), twice(0, 0, 0))
         settings = FilterSettings(sensor_set("gyro+mag+sun"), ProcessNoise(1e-6, 1e-6))
         start = FilterStart(IDENTITY[None], np.array([[0.0, 1.1e-3, 0.0]]), np.diag([1e-3] * 3 + [1e-5] * 3)[None])

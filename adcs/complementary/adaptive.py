@@ -1,4 +1,4 @@
-"""Adaptive error-state filter: field, Sun and gyro, with a bias whose steps it finds by itself.
+"""Adaptive error-state filter of field, Sun and gyro, which detects steps of the gyro's bias.
 
 See docs/theory/complementary-filters.md.
 """
@@ -22,24 +22,24 @@ from magloc.chi_square import normalised_square
 
 @dataclass(frozen=True)
 class AdaptiveTuning:
-    """What the filter assumes.
+    """Noise and limits of the adaptive filter.
 
     Attributes
     ----------
     first_sigma : float
-        Noise of the first vector, each axis, in its own unit: tesla.
+        Noise per axis of the first vector, in its own unit: tesla.
     second_sigma_rad : float
-        Of the direction of the second one.
+        Noise of the direction of the second vector.
     attitude_noise_rad, bias_noise_rad_s : float
-        Growth of the errors of attitude and bias in a usual step; a longer one has more, as a random walk has.
+        Random walk of attitude and bias in a usual step.
     memory : float
-        Of the smoothed NIS.
+        Factor of the exponential mean of NIS.
     threshold : float
-        Smoothed NIS for each degree of freedom, 1 on average, above which the bias is taken to change.
+        Smoothed NIS per degree of freedom, 1 on average, above which the bias is assumed to change.
     growth_rad_s : float
-        By which the bias's standard deviation then grows in a usual step, in the root of the sum of squares.
+        Random walk of the bias in a usual step while it is assumed to change.
     start_attitude_rad, start_bias_rad_s : float
-        Standard deviations at the start, each axis.
+        Initial standard deviations per axis.
 
     Raises
     ------
@@ -67,13 +67,13 @@ class AdaptiveTuning:
 
     @property
     def start_covariance(self) -> FloatArray:
-        """Of attitude and bias, shape (6, 6)."""
+        """Initial covariance of attitude and bias, shape (6, 6)."""
         return np.diag(np.repeat([self.start_attitude_rad, self.start_bias_rad_s], 3) ** 2)
 
 
 @dataclass(frozen=True, eq=False)
 class AdaptiveTrack:
-    """Estimates of every run at every instant, with its readings."""
+    """Estimates of each run at each instant, with its readings."""
 
     q: FloatArray  # (R, n, 4): reference from body
     bias_rad_s: FloatArray  # (R, n, 3): of the gyro
@@ -81,7 +81,7 @@ class AdaptiveTrack:
     smoothed_nis: FloatArray  # (R, n): for each degree of freedom
 
     def nees(self, q_true: ArrayLike, bias_true_rad_s: ArrayLike) -> FloatArray:
-        """Squared errors in units of the covariance, 6 on average where it is right, shape (R, n).
+        """Return the normalised estimation error squared (R, n), 6 on average if consistent.
 
         Shape ``q_true`` (R, n, 4). ``bias_true_rad_s``: broadcasts to (R, n, 3).
         """
@@ -93,7 +93,7 @@ class AdaptiveTrack:
 def adaptive_track(
     record: VectorRecord, tuning: AdaptiveTuning = AdaptiveTuning(), *, q_start: ArrayLike = quaternion.IDENTITY
 ) -> AdaptiveTrack:
-    """The adaptive filter over whole records, compiled.
+    """Run the adaptive filter over whole records in compiled code.
 
     ``q_start`` (4,): first estimate. Raises ValueError: the first estimate has no length.
     """

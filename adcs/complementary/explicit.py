@@ -1,4 +1,4 @@
-"""Complementary filters: a gyro's rate, corrected by two measured vectors, such as field and Sun.
+"""Complementary filters of a gyro and two measured vectors, such as field and Sun.
 
 See docs/theory/complementary-filters.md. Source: a Ukrainian paper on the attitude of a magnetically stabilised
 satellite, by its equations. Ours: the rate of the frame, unit vectors, gains, frozen integral.
@@ -20,12 +20,12 @@ from arrays.typing import FloatArray
 from magloc import core
 
 LARGEST_EIGENVALUE = 2.0
-"""Of e against the error angle, for unit vectors: the eigenvalues are 1 ± |cos| of their angle, and 2."""
+"""Largest eigenvalue of e against the error angle, for unit vectors; the others are 1 ± |cos| of their angle."""
 WARNING_FRACTION = 0.9
-"""Of the stability limit."""
+"""Fraction of the stability limit from which on there is a warning."""
 _MU = 1e-6  # added to the diagonal of the normal equations of the measured quaternion
 BLOCK = 20_000
-"""Instants that one call of a kernel computes: some milliseconds."""
+"""Number of instants per call of a kernel: some milliseconds."""
 
 
 @dataclass(frozen=True)
@@ -37,12 +37,12 @@ class Gains:
     kp_per_s, ki_per_s2 : float
         K_P sets the crossover between vectors and gyro, K_I removes the gyro's bias.
     outage_kp_per_s, outage_ki_per_s2 : float
-        The same while the second vector is missing; by default K_P stays and the integral is frozen.
+        The same while the second vector is missing; by default K_P stays the same and the integral is frozen.
     boost, boost_level_rad, boost_memory : float
-        K_I is multiplied by ``boost`` while the smoothed error (``boost_memory`` of it, the rest of e) is longer than
-        the level: three times what noise makes of it finds a step of the bias soon.
+        K_I is multiplied by ``boost`` while the smoothed error is longer than the level; ``boost_memory`` is the factor
+        of its exponential mean. A level of three times its noise detects a step of the bias soon.
     first_weight, second_weight : float
-        Of the two vectors in the explicit filter's e.
+        Weights of the two vectors in the error e of the explicit filter.
 
     Raises
     ------
@@ -71,8 +71,8 @@ class Gains:
             if value is not None and not value >= 0.0:
                 raise ValueError(f"Input {name} must be 0 or more; instead received {value}.")
 
-    def during(self, outage: bool) -> tuple[float, float]:
-        """(K_P, K_I)."""
+    def active_gains(self, outage: bool) -> tuple[float, float]:
+        """Return K_P and K_I, with the second vector or without."""
         if not outage:
             return self.kp_per_s, self.ki_per_s2
         kp = self.kp_per_s if self.outage_kp_per_s is None else self.outage_kp_per_s
@@ -80,8 +80,8 @@ class Gains:
 
     @property
     def largest_kp_per_s(self) -> float:
-        """The larger one of the two K_P, times the larger weight."""
-        return max(self.kp_per_s, self.during(outage=True)[0]) * max(self.first_weight, self.second_weight)
+        """Larger of the two K_P, times the larger weight."""
+        return max(self.kp_per_s, self.active_gains(outage=True)[0]) * max(self.first_weight, self.second_weight)
 
     def check(self, dt_s: float) -> None:
         """Raise ValueError beyond the stability limit K_P·h·2 = 2."""
@@ -93,7 +93,7 @@ class Gains:
             )
 
     def warnings(self, dt_s: float) -> tuple[str, ...]:
-        """One sentence if the gains are within a tenth of the stability limit."""
+        """Return a sentence if the gains are within a tenth of the stability limit."""
         limit = 2.0 / (LARGEST_EIGENVALUE * dt_s)
         if self.largest_kp_per_s < WARNING_FRACTION * limit:
             return ()
@@ -104,12 +104,12 @@ class Gains:
 
 
 BEST_GAINS = Gains()
-"""Of a magnetometer of 1000 nT."""
+"""Best gains for a magnetometer of 1000 nT."""
 
 
 @dataclass(frozen=True, eq=False)
 class ComplementaryTrack:
-    """Estimates of every run at every instant, with its readings."""
+    """Estimates of each run at each instant, with its readings."""
 
     q: FloatArray  # (R, n, 4): reference from body
     integral_rad_s: FloatArray  # (R, n, 3): I; minus the bias of the gyro
@@ -124,12 +124,12 @@ def complementary_track(
     q_start: ArrayLike = quaternion.IDENTITY,
     substitution: Substitution = NO_SUBSTITUTE,
 ) -> ComplementaryTrack:
-    """Filter whole records with fixed gains, compiled.
+    """Filter whole records with fixed gains in compiled code.
 
     ``method``: ``explicit``, by the error angle Σ weight · v × A(q̂) v_reference, or ``gauss-newton``, by the angle to a
-    measured quaternion, which does not use the weights of the gains. ``q_start`` (4,): first estimate, and where the
-    first measured quaternion starts. ``substitution``: in place of a second vector that is missing. Raises ValueError:
-    the gains are beyond the stability limit, or the first estimate has no length.
+    measured quaternion, which does not use the weights of the gains. ``q_start`` (4,): first estimate, also the initial
+    value of the first measured quaternion. ``substitution``: replacement of a missing second vector. Raises
+    ValueError: the gains are beyond the stability limit, or the first estimate has no length.
     """
     gains.check(record.usual_dt_s)
     shape = (record.n_runs, len(record))
@@ -143,15 +143,15 @@ def complementary_track(
         is_gauss_newton=method == "gauss-newton",
         mu=_MU,
         weights=(gains.first_weight, gains.second_weight),
-        gains=gains.during(False),
-        outage_gains=gains.during(True),
+        gains=gains.active_gains(False),
+        outage_gains=gains.active_gains(True),
         boost=gains.boost,
         boost_level=gains.boost_level_rad,
         boost_memory=gains.boost_memory,
         is_substituted=substitution.rule != "magnetometer-only",
         is_transported=substitution.rule == "transported",
         delay=delay_steps(substitution, record.usual_dt_s),
-        counted=counted_s(record, gains),
+        counted=correction_times_s(record, gains),
         q=q,
         integral=integral,
         q_measured=measured,
@@ -161,7 +161,7 @@ def complementary_track(
 
 
 def record_problem(record: VectorRecord) -> core.Problem:
-    """Describe a record to a kernel."""
+    """Return the fields of a record for a kernel."""
     return core.problem(
         "vector_record",
         n_runs=record.n_runs,
@@ -177,14 +177,17 @@ def record_problem(record: VectorRecord) -> core.Problem:
     )
 
 
-def counted_s(record: VectorRecord, gains: Gains) -> FloatArray:
-    """How long the vectors of each instant count, (n,): the step before it, after a gap what makes K_P·h·2 = 1."""
+def correction_times_s(record: VectorRecord, gains: Gains) -> FloatArray:
+    """Return the time (n,) for which the vectors of each instant correct.
+
+    The step before it, but after a gap at most the time with K_P·h·2 = 1.
+    """
     after_gap = 0.5 / gains.largest_kp_per_s if gains.largest_kp_per_s else math.inf
     return np.minimum(record.dt_s, max(record.usual_dt_s, after_gap))
 
 
 def first_attitude(q_start: ArrayLike) -> FloatArray:
-    """Unit quaternions (..., 4); raise ValueError if one is not finite or has no length."""
+    """Return unit quaternions (..., 4); raise ValueError if one is not finite or has no length."""
     q = quaternion.normalised(q_start)
     if not np.isfinite(q).all():
         raise ValueError("Input q_start must be quaternions with a length; instead received one without.")

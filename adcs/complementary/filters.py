@@ -1,4 +1,4 @@
-"""The doors to the complementary filters: attitude of any record of a gyro and two vectors."""
+"""Public functions of the complementary filters: attitude from a gyro and two vectors."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from adcs import quaternion
 from adcs.complementary.adaptive import AdaptiveTuning, adaptive_track
 from adcs.complementary.explicit import BEST_GAINS, Gains, complementary_track
-from adcs.complementary.heading import HeadingModel, heading_track, relative_heading, turned_to_north
+from adcs.complementary.heading import HeadingModel, heading_track, relative_heading, rotate_to_north
 from adcs.complementary.inertial_magnetic import InertialMagneticRecord, check_units, prepare
 from adcs.complementary.names import MAGNETS, METHODS, Magnet, Method
 from adcs.satellite.attitude_track import AttitudeTrack
@@ -24,16 +24,16 @@ from arrays.io.values import numbers, seconds
 from arrays.typing import BoolArray, FloatArray
 
 LEFT_OUT, SUBTRACTED = "field left out", "magnet subtracted"
-"""What an inertial unit's field is where it is not the room's."""
+"""Names of rows in which the field of an inertial unit is disturbed."""
 LOST = "heading lost"
-"""Name of the rows in which the heading of an inertial unit is hardly known."""
+"""Name of rows in which the heading of an inertial unit is hardly known."""
 LOST_RAD = 0.5
 _RELATIVE = (
     "there is no magnetometer: the heading is that of gyro and accelerometer alone, against the first row, "
     "and its σ grows to {:.2g}°"
 )
 _NAMES = ("first vector", "second vector")
-_MAGNET = 5.0  # σ of the sensor's own offset: a larger one is a magnet's
+_MAGNET = 5.0  # a larger offset, in σ of the sensor's own, is that of a magnet
 
 
 def complementary_filter(
@@ -46,9 +46,9 @@ def complementary_filter(
     settings: Gains | AdaptiveTuning | None = None,
     gyro_samples: GyroSamples = "mean",
 ) -> AttitudeTrack:
-    """Attitude from a gyro and two vectors, such as those of an IMU, in a frame that does not turn.
+    """Estimate the attitude from a gyro and two vectors, such as those of an IMU, in a fixed frame.
 
-    It starts where the first readings of both vectors put it, and has used all that was read up to each instant.
+    It starts from the first readings of both vectors. Each estimate uses all readings up to its instant.
 
     Parameters
     ----------
@@ -104,12 +104,12 @@ def complementary_filter(
     start = _first_attitude(body, frame)
     sigma: dict[str, FloatArray] = {}
     if method == "adaptive":
-        adapted = adaptive_track(record, _of_kind(settings, AdaptiveTuning()), q_start=start)
+        adapted = adaptive_track(record, _check_settings(settings, AdaptiveTuning()), q_start=start)
         q, bias = adapted.q[0], adapted.bias_rad_s[0]
         deviations = np.sqrt(np.diagonal(adapted.covariance[0], axis1=-2, axis2=-1))
         sigma = {"attitude": deviations[:, :3], "gyro-bias": deviations[:, 3:]}
     else:
-        found = complementary_track(record, _of_kind(settings, BEST_GAINS), method=method, q_start=start)
+        found = complementary_track(record, _check_settings(settings, BEST_GAINS), method=method, q_start=start)
         q, bias = found.q[0], -found.integral_rad_s[0]
     return AttitudeTrack(
         title=f"complementary filter, {method}",
@@ -134,44 +134,44 @@ def inertial_magnetic_filter(
     offline: bool = False,
     model: HeadingModel = HeadingModel(),
 ) -> AttitudeTrack:
-    """Attitude of an inertial unit with a magnetometer that is moved by hand, with magnets near it or not.
+    """Estimate the attitude of a hand-held inertial unit with a magnetometer, also near magnets.
 
-    The acceleration is smoothed in a frame that does not turn, the gyro's bias is that of rests, and the
-    magnetometer's lag is found. The field of the first second, which should be at rest, is north. A Kalman filter of
-    the heading has as states what else changes a field: the gyro's scale and drift, the sensor's offset, and how the
-    room's field differs from that of the start. Without a field the heading is that of the gyro, against the first row.
+    The acceleration is smoothed in a frame that does not turn, the gyro's bias is measured at rest, and the
+    magnetometer's lag is estimated. The field of the first second, in which the unit should rest, is north. A Kalman
+    filter of the heading has as further states the gyro's scale and drift, the sensor's offset, and the difference of
+    the room's field from that of the start. Without a field the heading is that of the gyro, relative to the first row.
 
     Parameters
     ----------
     time_s : array_like, shape (n,)
         Ascending, in any steps.
     gyro_rad_s, acceleration_m_s2, field_T : array_like, shape (n, 3)
-        Body axes; at rest the acceleration is upwards. NaN where a sensor has no reading; within a gap of the gyro σ
-        grows by what a hand may have turned. The field is None, or NaN everywhere, of a unit without a magnetometer.
+        Body axes; at rest the acceleration is upwards. NaN without a reading; within a gap of the gyro σ grows by the
+        possible rotation of a hand. Without a magnetometer the field is None, or NaN everywhere.
     magnet : str
-        A field that contradicts the filter is left out (``rejected``) or taken for a magnet that moves with the sensor
-        (``subtracted``); ``auto`` leaves it out until the turns that were made have shown that it moves with the
-        sensor, and subtracts it then. All readings are ``kept``, whatever they say.
+        Treatment of a field that contradicts the filter: it is left out (``rejected``), or attributed to a magnet that
+        moves with the sensor and subtracted (``subtracted``). ``auto`` leaves it out until turns have shown that it
+        moves with the sensor, and then subtracts it. With ``kept`` all readings are used.
     gyro_samples : str
-        As of :func:`adcs.complementary_filter`.
+        As in :func:`adcs.complementary_filter`.
     offline : bool
-        Use the whole log for every instant, not only what was read up to it.
+        Use the whole log for each instant, not only the readings up to it.
     model : HeadingModel
-        Noise and limits of the heading's filter.
+        Noise and limits of the heading filter.
 
     Returns
     -------
     AttitudeTrack
-        East, north, up from body. ``sigma["level"]`` (n, 3) is about east, north and up [rad]: the first two are those
-        of the tilt, the third that of the heading. ``degraded`` says where the field was left out, where a magnet
-        was subtracted, and where the heading is lost. ``warnings`` name gaps, a start that is not at rest, a missing
-        magnetometer, and minutes in which the gyro alone held the heading.
+        East, north, up from body. ``sigma["level"]`` (n, 3) is about east, north and up [rad]: σ of the tilt in the
+        first two, of the heading in the third. ``degraded`` marks the rows in which the field is left out, a magnet is
+        subtracted, or the heading is lost. ``warnings`` name gaps, a start that is not at rest, a missing
+        magnetometer, and minutes in which the gyro alone holds the heading.
 
     Raises
     ------
     ValueError
-        A shape does not match, the times do not ascend, a sensor has no first reading, a vector is zero, or a sensor or
-        the time is misread: its unit or its axes are not those that the other sensors show.
+        A shape does not match, the times do not ascend, a sensor has no first reading, a vector is zero, or the unit or
+        the axes of a sensor, or the unit of time, contradict the other sensors.
 
     Examples
     --------
@@ -195,14 +195,14 @@ def inertial_magnetic_filter(
         heading = heading_track(
             *turns,
             prepared.field_T,
-            _for(magnet, model),
+            _limit_model(magnet, model),
             offline=offline,
             hidden_rad2=prepared.hidden_rad2,
             start_tilt_rad=prepared.start_tilt_rad,
         )
     else:
         heading = relative_heading(*turns, model, hidden_rad2=prepared.hidden_rad2)
-    q = turned_to_north(prepared.q_level, heading.heading_rad)
+    q = rotate_to_north(prepared.q_level, heading.heading_rad)
     of_tilt = prepared.tilt_sigma_rad / math.sqrt(2.0)
     changed = heading.changes.size > 0
     subtracted = changed & (np.linalg.norm(heading.offset_T, axis=1) > _MAGNET * model.offset_T)
@@ -224,14 +224,14 @@ def inertial_magnetic_filter(
         warnings=(
             *prepared.warnings,
             *(() if record.has_field else (_RELATIVE.format(math.degrees(heading.sigma_rad[-1])),)),
-            *_minutes(times, heading.left_out),
+            *_gyro_only_minutes(times, heading.left_out),
         ),
         degraded={LEFT_OUT: heading.left_out, SUBTRACTED: subtracted, LOST: heading.sigma_rad > LOST_RAD},
     )
 
 
-def _for(magnet: Magnet, model: HeadingModel) -> HeadingModel:
-    """The model with the limits that a way to treat a magnet has."""
+def _limit_model(magnet: Magnet, model: HeadingModel) -> HeadingModel:
+    """Return the model with the limits of a treatment of magnets."""
     if magnet == "auto":
         return model
     if magnet == "kept":
@@ -240,15 +240,15 @@ def _for(magnet: Magnet, model: HeadingModel) -> HeadingModel:
 
 
 def _body_sigma(q: FloatArray, of_tilt: FloatArray, of_heading: FloatArray) -> FloatArray:
-    """Standard deviations (n, 3) about the body's axes."""
+    """Return standard deviations (n, 3) about the axes of the body."""
     w, x, y, z = q.T
     up = np.stack([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)], axis=-1)
     tilt = (of_tilt * of_tilt)[:, None]
     return np.sqrt(tilt + ((of_heading * of_heading)[:, None] - tilt) * up * up)
 
 
-def _minutes(time_s: FloatArray, left_out: BoolArray) -> tuple[str, ...]:
-    """One sentence for each minute in which the gyro alone held the heading for a second or more."""
+def _gyro_only_minutes(time_s: FloatArray, left_out: BoolArray) -> tuple[str, ...]:
+    """Return a sentence for each minute in which the gyro alone holds the heading for a second or more."""
     minutes, which = np.unique((time_s[left_out] - time_s[0]) // 60.0, return_inverse=True)
     seconds = np.bincount(which, weights=steps_s(time_s)[left_out], minlength=len(minutes))
     return tuple(
@@ -261,8 +261,8 @@ def _minutes(time_s: FloatArray, left_out: BoolArray) -> tuple[str, ...]:
 _Settings = TypeVar("_Settings", Gains, AdaptiveTuning)
 
 
-def _of_kind(settings: Gains | AdaptiveTuning | None, default: _Settings) -> _Settings:
-    """Settings of the filter that is asked for."""
+def _check_settings(settings: Gains | AdaptiveTuning | None, default: _Settings) -> _Settings:
+    """Return settings of the type of ``default``, which is used without any."""
     if settings is None:
         return default
     if not isinstance(settings, type(default)):
@@ -273,7 +273,7 @@ def _of_kind(settings: Gains | AdaptiveTuning | None, default: _Settings) -> _Se
 
 
 def _first_attitude(body: list[FloatArray], frame: list[FloatArray]) -> FloatArray:
-    """Quaternion (4,) of the first instant that has both vectors; the identity without one."""
+    """Return the quaternion (4,) of the first instant with both vectors, or the identity."""
     both = np.flatnonzero(is_read(body[0]) & is_read(body[1]))[:1]
     q = attitude_of_vectors([v[both] for v in body], [v[both] for v in frame], [1.0, 1.0]).q
     return q[0] if np.isfinite(q).all() and both.size else quaternion.IDENTITY

@@ -1,8 +1,8 @@
-"""Heading from gyro and magnetometer: a Kalman filter that knows what else changes a field, and how much it may.
+"""Heading from gyro and magnetometer: a Kalman filter with the disturbances of the field as states.
 
-A field differs from that of the start because the sensor has turned, because it has come to another place, or because
-something moves with it. The first is a turn, the second a vector in the room, the third one in the sensor's axes. Which
-it was shows in the turns that were made, and only there: where they do not tell, the covariance says so.
+The measured field changes when the sensor turns, when it moves to another place, or when an object moves with it. The
+first is a rotation, the second a vector in the room, the third a vector in the sensor's axes. Only turns of the sensor
+separate them; without turns the covariance stays large.
 """
 
 from __future__ import annotations
@@ -22,49 +22,51 @@ from arrays.typing import BoolArray, FloatArray
 from magloc import core
 
 _BLOCK_S = 0.035
-"""How long readings are averaged: within it a hand turns by a few degrees."""
+"""Time over which readings are averaged; a hand turns by a few degrees within it."""
 _START_S = 1.0
 _BLOCK = 4000
-"""Means that one call of a kernel computes: some milliseconds."""
+"""Number of means per call of a kernel: some milliseconds."""
 _LONG_STEP_S = 1.0  # a longer time without a field is one of the gyro alone
 
 
 @dataclass(frozen=True)
 class HeadingModel:
-    """What the filter takes for granted, one standard deviation each.
+    """Standard deviations, time constants and limits of the heading filter.
 
     Attributes
     ----------
     noise_T : float
-        Of a reading, or of the mean of those within 35 ms, with what is left of lag and calibration, each axis.
+        Standard deviation per axis of a mean over 35 ms, with errors of lag and calibration.
     offset_T, offset_T_rts : float
-        Of the sensor's own offset at the start, each axis, and by how much that grows in the root of a second.
+        Initial standard deviation of the sensor's offset per axis, and its growth per square root of a second.
     room_T, room_s : float
-        Of the field's difference between places a reach apart, each axis, and for how long a hand stays near one.
+        Standard deviation per axis of the difference of the room's field between places an arm's length apart, and the
+        time for which a hand stays near one place.
     local_T, local_s : float
-        The same between places that a hand passes at once, with the vertical field that an error of the tilt turns
-        into a horizontal one; half of it upwards.
+        The same over short distances, and the time in which a hand covers them. It includes the horizontal field that
+        an error of the tilt makes of the vertical one; the vertical component is half as large.
     gyro_drift_rad_s, gyro_drift_s : float
-        Of the bias that turning adds to that at rest, and how long it lasts.
+        Standard deviation of the gyro's bias in motion against that at rest, and its time constant.
     gyro_scale : float
-        Of each axis' gain.
+        Standard deviation of each axis' gain.
     gyro_walk_rad_rts : float
-        Growth of the heading's deviation.
+        Growth of the heading's standard deviation per square root of a second.
     start_rad : float
-        Of the heading at the start.
+        Initial standard deviation of the heading.
     turning_rad_s : float
-        The rate from which on the sensor counts as moved: while it lies still, neither place nor drift changes.
+        Smallest rate of a sensor in motion; below it, neither the room's field nor the drift changes.
     gap_rad_s, long_gap_rad_s : float
-        Of the mean rate within a gap of the gyro, against that of its ends: in a short one, and in one beyond a second,
-        which is that of the whole log where that is higher.
+        Standard deviation of the mean rate within a gap of the gyro against that of its ends, in a short gap and in one
+        beyond a second; the rms rate of the whole log replaces the latter if it is higher.
     jump_T : float
-        Of the field of a magnet, each axis.
+        Standard deviation of the field of a magnet, each axis.
     gate, mean_nis, memory : float
-        Limits of the normalised innovation squared of a reading and, each axis, of the mean of the last ones.
+        Limits of the normalised innovation squared of a reading and, per axis, of its running mean, and the memory of
+        that mean.
     patience_s, trial_s : float
-        How long readings contradict before a change of the offset is tried, and for how long it is.
+        Time for which readings must contradict before a change of the offset is tried, and duration of the trial.
     evidence : float
-        Logarithm of the odds of a changed offset, against a changed room, from which on it is believed.
+        Smallest logarithm of the odds of a changed offset against a changed room for which it is accepted.
 
     Examples
     --------
@@ -97,7 +99,7 @@ class HeadingModel:
     evidence: float = 10.0
 
     def deviations(self) -> FloatArray:
-        """Of the state at the start (14,): nothing is known of the room but that its field there points north."""
+        """Return the initial standard deviations of the state (14,); the initial field points north."""
         return np.array(
             [
                 self.start_rad,
@@ -113,7 +115,7 @@ class HeadingModel:
 
 
 class Blocks(NamedTuple):
-    """Means over short times (m of them), in the frame that is level and whose heading is the gyro's."""
+    """Means over m short times, in a level frame with the heading of the gyro."""
 
     field_T: FloatArray  # (m, 3)
     R_level: FloatArray  # (m, 3, 3): level from body
@@ -126,14 +128,14 @@ class Blocks(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class HeadingTrack:
-    """Heading at n instants, and what the magnetometer told of it."""
+    """Heading and offset of the magnetometer at n instants."""
 
     heading_rad: FloatArray  # (n,): turn about the vertical from east and north to the axes of the level frame
     sigma_rad: FloatArray  # (n,)
     offset_T: FloatArray  # (n, 3): of the sensor, body axes
     offset_sigma_T: FloatArray  # (n, 3)
-    left_out: BoolArray  # (n,): where the field contradicted all of this
-    changes: NDArray[np.intp]  # instants from which on the offset is another one
+    left_out: BoolArray  # (n,): rejected readings of the field
+    changes: NDArray[np.intp]  # instants at which the offset changes
 
 
 def heading_track(
@@ -147,7 +149,7 @@ def heading_track(
     hidden_rad2: FloatArray | None = None,
     start_tilt_rad: float = 0.0,
 ) -> HeadingTrack:
-    """Filter, or smoother, of the field in the level frame.
+    """Estimate the heading by a filter, or a smoother, of the field in the level frame.
 
     ``rate_rad_s`` (n, 3): mean over the step that ends at each instant. ``q_level`` (n, 4): level from body, of gyro
     and accelerometer alone. ``field_T`` (n, 3): NaN where there is no reading. ``hidden_rad2`` (n,): growth of the
@@ -161,12 +163,12 @@ def heading_track(
     x[0] = math.atan2(-start[0], start[1])
     blocks = blocks._replace(start_T=np.array([0.0, math.hypot(start[0], start[1]), start[2]]))
     P = np.diag(model.deviations() ** 2)
-    # A tilt that is wrong turns the vertical field into a horizontal one, and that into a vertical one.
+    # An error of the tilt mixes the vertical and the horizontal field.
     _, north, up = start_tilt_rad * blocks.start_T
     P[[0, 9, 10], [0, 9, 10]] += [min((up / blocks.start_T[1]) ** 2, UNKNOWN_RAD**2), up**2, north**2]
-    told, variances, used, changed = filtered(x, P, blocks, model, offline=offline)
+    told, variances, used, changed = run_heading_filter(x, P, blocks, model, offline=offline)
     m = len(ends)
-    # A block is known at its end; before the first one there is the start.
+    # The estimate of a block holds from its end on; before the first one, the start holds.
     ended = np.zeros(len(time_s), np.intp)
     ended[ends] = 1
     after = np.cumsum(ended)
@@ -176,7 +178,7 @@ def heading_track(
     hidden = np.cumsum(hidden)
     hidden = np.abs(hidden - hidden[ends[last]]) * np.where(gap, HELD_VARIANCE, 1.0)
     since = np.maximum(time_s - time_s[ends[last]], 0.0)
-    variance = variances[last, 0] + _drifted(time_s, rate_rad_s, ends[last], since, model) + hidden
+    variance = variances[last, 0] + _drift_variance(time_s, rate_rad_s, ends[last], since, model) + hidden
     return HeadingTrack(
         heading_rad=told[last, 0],
         sigma_rad=np.minimum(np.sqrt(variance), UNKNOWN_RAD),
@@ -187,12 +189,12 @@ def heading_track(
     )
 
 
-def filtered(
+def run_heading_filter(
     x: FloatArray, P: FloatArray, blocks: Blocks, model: HeadingModel, *, offline: bool
 ) -> tuple[FloatArray, FloatArray, BoolArray, BoolArray]:
-    """Return heading and offset (m, 4) and their variances, which blocks are used, and where the offset changed.
+    """Return heading and offset (m, 4), their variances, the used blocks and changes of the offset.
 
-    ``x`` (14,), ``P`` (14, 14): at the start.
+    ``x`` (14,), ``P`` (14, 14): initial state and covariance.
     """
     m = len(blocks.dt_s)
     told, variances, used, known = np.empty((m, 4)), np.empty((m, 4)), np.zeros(m, np.int64), np.zeros(m, np.int64)
@@ -230,10 +232,10 @@ def filtered(
 
 
 def transitions(blocks: Blocks, model: HeadingModel) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return how the state (14,) moves on in each of m blocks, of which Φ and Q are made.
+    """Return the parts of Φ and Q of the state (14,) in each of m blocks.
 
-    Of drift and scales what they add to the heading (m, 4), and of each state the part that is kept and the growth of
-    its variance (m, 14).
+    The Jacobian of the heading with respect to drift and scales (m, 4), and the diagonal factor and the growth of the
+    variance of each state (m, 14).
     """
     h, turns = blocks.dt_s[:, None], blocks.turns[:, None]
     turn = h * np.concatenate([turns, blocks.R_level[:, 2] * blocks.rate_rad_s], axis=1)
@@ -258,13 +260,16 @@ def relative_heading(
     *,
     hidden_rad2: FloatArray | None = None,
 ) -> HeadingTrack:
-    """Heading of gyro and accelerometer alone, against that of the first instant; arguments as of heading_track."""
+    """Return the heading of gyro and accelerometer alone, relative to the first instant.
+
+    Arguments as of :func:`heading_track`.
+    """
     n = len(time_s)
     zero = np.zeros(n, np.intp)
     turned = rate_rad_s * quaternion.matrix(q_level)[:, 2] * steps_s(time_s)[:, None]
     turned[0] = 0.0
     scale = np.square(model.gyro_scale * np.cumsum(turned, axis=0)).sum(axis=1)
-    drifted = _drifted(time_s, rate_rad_s, zero, time_s - time_s[0], model)
+    drifted = _drift_variance(time_s, rate_rad_s, zero, time_s - time_s[0], model)
     hidden = 0.0 if hidden_rad2 is None else np.cumsum(hidden_rad2)
     none = np.full((n, 3), np.nan)
     sigma = np.minimum(np.sqrt(scale + drifted + hidden), UNKNOWN_RAD)
@@ -279,7 +284,7 @@ def _blocks(
     model: HeadingModel,
     hidden_rad2: FloatArray | None = None,
 ) -> tuple[Blocks, NDArray[np.intp]]:
-    """Means over short times, and the instants (m,) that end them; ``start_T`` is in the level frame still."""
+    """Return means over short times and their last instants (m,); ``start_T`` is in the level frame."""
     growth = np.zeros(len(time_s)) if hidden_rad2 is None else hidden_rad2
     level = quaternion.rotate(q_level, field_T)
     rows = np.flatnonzero(is_read(level))
@@ -287,7 +292,7 @@ def _blocks(
         raise ValueError("Input field_T must be there within the first second; instead received none.")
     start_T = level[rows[time_s[rows] < time_s[rows[0]] + _START_S]].mean(axis=0)
     size = instants_within(_BLOCK_S, time_s[rows])
-    # No block begins before a gap and ends after it.
+    # No block extends over a gap.
     pieces = np.split(rows, np.searchsorted(rows, np.flatnonzero(growth > 0.0)))
     rows = np.concatenate([piece[: len(piece) // size * size] for piece in pieces])
     if not rows.size:
@@ -301,7 +306,7 @@ def _blocks(
     begins = np.concatenate([[0], ends[:-1]])
     long = steps > _LONG_STEP_S
     gap_rad2 = np.diff(np.cumsum(growth)[ends], prepend=0.0)
-    gap_rad2[long] += _drifted(time_s, rate_rad_s, begins, steps, model, until=ends)[long]
+    gap_rad2[long] += _drift_variance(time_s, rate_rad_s, begins, steps, model, until=ends)[long]
     blocks = Blocks(
         field_T=level[rows].reshape(-1, size, 3).mean(axis=1),
         R_level=np.ascontiguousarray(quaternion.matrix(q_level[of_block[:, size // 2]])),
@@ -314,7 +319,7 @@ def _blocks(
     return blocks, ends
 
 
-def _drifted(
+def _drift_variance(
     time_s: FloatArray,
     rate_rad_s: FloatArray,
     since: NDArray[np.intp],
@@ -322,18 +327,18 @@ def _drifted(
     model: HeadingModel,
     until: NDArray[np.intp] | slice = slice(None),
 ) -> FloatArray:
-    """Return what the gyro alone adds to the heading's variance between instants, by default all n."""
+    """Return the growth of the heading's variance by the gyro between instants, by default all n."""
     turning = np.linalg.norm(rate_rad_s, axis=1) > model.turning_rad_s
     turned_s = np.cumsum(turning * steps_s(time_s))
     of_drift = np.maximum(turned_s[until] - turned_s[since], 0.0) / model.gyro_drift_s
-    # Of the integral of a bias that is forgotten.
+    # Variance of the integral of an Ornstein-Uhlenbeck bias.
     drift_s = 2.0 * model.gyro_drift_s**2 * (of_drift + np.expm1(-of_drift))
     variance: FloatArray = model.gyro_walk_rad_rts**2 * since_s + model.gyro_drift_rad_s**2 * drift_s
     return variance
 
 
-def turned_to_north(q_level: FloatArray, heading_rad: FloatArray) -> FloatArray:
-    """East, north, up from body: the level attitude (n, 4) turned back by the heading (n,)."""
+def rotate_to_north(q_level: FloatArray, heading_rad: FloatArray) -> FloatArray:
+    """Rotate level attitudes (n, 4) by the heading (n,) to east, north, up from body."""
     c, s = np.cos(0.5 * heading_rad), np.sin(0.5 * heading_rad)
     w, x, y, z = q_level.T
     return np.stack([c * w + s * z, c * x + s * y, c * y - s * x, c * z - s * w], axis=-1)

@@ -1,4 +1,4 @@
-"""Gyro, accelerometer and magnetometer on Earth: what is level, before the heading is asked for.
+"""Preparation of gyro, accelerometer and magnetometer readings on Earth: bias, lag and level attitude.
 
 See docs/theory/complementary-filters.md. Source of the low-pass: D. Laidig, T. Seel, VQF, Information Fusion 91, 2023.
 """
@@ -19,11 +19,11 @@ from adcs.complementary.inertial.gaps import (
     gap_warnings,
     hidden_variance,
     numbered_windows,
+    observed_turn_variance,
     sensor_gaps,
-    shown_turns,
     window_scatter,
 )
-from adcs.complementary.inertial.integration import gyro_attitudes, levelled, low_pass
+from adcs.complementary.inertial.integration import gyro_attitudes, level_attitudes, low_pass
 from adcs.complementary.inertial.level import GRAVITY_TIME_S, Steady, Up, direction_up
 from adcs.complementary.inertial.misreadings import check_lengths, check_turns
 from adcs.satellite.conventions import median
@@ -34,27 +34,27 @@ from arrays.typing import BoolArray, FloatArray
 from magloc import core
 
 _TILT_FLOOR_RAD = math.radians(0.4)
-_TURN_S = 0.5  # for how long a hand turns one way
-_USEFUL_TILT_RAD = math.radians(2.0)  # a field is levelled by a tilt that is known better
+_TURN_S = 0.5  # time for which a hand turns in one direction
+_USEFUL_TILT_RAD = math.radians(2.0)  # largest σ of the tilt with which the field is used
 _UP_STEP = 0.15  # part of the tilt's error that a step corrects: the direction up is smooth already
-_LONGEST_UP_STEP = 0.5 / _UP_STEP  # of usual ones: after a gap half of it is corrected
+_LONGEST_UP_STEP = 0.5 / _UP_STEP  # in usual steps: after a gap half of the error is corrected
 _REST_S = 1.5
 _REST_RATE_RAD_S = math.radians(0.5)
 _REST_ACCELERATION_M_S2 = 0.15
 _START_RATE_RAD_S = math.radians(2.0)
 _START_ACCELERATION_M_S2 = 0.3
 _START_BIAS_RAD_S = math.radians(5.0)
-_UNKNOWN_BIAS_RAD_S = 0.01  # of a gyro that was never seen at rest
+_UNKNOWN_BIAS_RAD_S = 0.01  # of a gyro that is never at rest
 _LAG_WINDOW_S = 0.2
-_LAG_EVERY_S = 0.01  # readings closer than that say the same
+_LAG_EVERY_S = 0.01  # closer readings are redundant
 _LONGEST_LAG_S = 0.04
 _USUAL_LENGTH = 0.1  # relative difference of a field's length
-_LARGEST = {"rate_rad_s": 1e4, "acceleration_m_s2": 1e6, "field_T": 1.0}  # of a reading: more is something else
+_LARGEST = {"rate_rad_s": 1e4, "acceleration_m_s2": 1e6, "field_T": 1.0}  # larger readings have another unit
 
 
 @dataclass(frozen=True, eq=False)
 class InertialMagneticRecord:
-    """Readings of one sensor at n instants, NaN where one has none.
+    """Readings of one inertial unit at n instants, NaN where missing.
 
     Attributes
     ----------
@@ -64,7 +64,7 @@ class InertialMagneticRecord:
         The acceleration is 9.8 m/s² upwards at rest. A field without any reading is that of a unit without a
         magnetometer.
     gyro_samples : str
-        What a sample of the gyro is: see :func:`adcs.satellite.vector_record.step_rates`.
+        Kind of the gyro's samples: see :func:`adcs.satellite.vector_record.step_rates`.
 
     Raises
     ------
@@ -95,7 +95,7 @@ class InertialMagneticRecord:
             missing = np.asarray(np.isnan(values).any(axis=1))
             if missing.any():
                 values = np.where(missing[:, None], np.nan, values)
-            if missing[self.starting].all() and not (name == "field_T" and missing.all()):
+            if missing[self.in_first_second].all() and not (name == "field_T" and missing.all()):
                 raise ValueError(f"Input {name} must have a reading within the first second; instead received none.")
             if name != "rate_rad_s" and (values == 0.0).all(axis=1).any():
                 zero = int(np.argmax((values == 0.0).all(axis=1)))
@@ -107,7 +107,7 @@ class InertialMagneticRecord:
 
     @property
     def has_field(self) -> bool:
-        """Whether there is a magnetometer."""
+        """Return whether there is a magnetometer."""
         return bool(is_read(self.field_T).any())
 
     @property
@@ -116,8 +116,8 @@ class InertialMagneticRecord:
         return steps_s(self.time_s)
 
     @property
-    def starting(self) -> BoolArray:
-        """Which instants are within the first second (n,)."""
+    def in_first_second(self) -> BoolArray:
+        """Mask (n,) of the instants within the first second."""
         return self.time_s < self.time_s[0] + 1.0
 
     def __len__(self) -> int:
@@ -126,9 +126,10 @@ class InertialMagneticRecord:
 
 
 def rest_bias(record: InertialMagneticRecord) -> FloatArray:
-    """Bias of the gyro at every instant: the mean of the last 20 rests of 1.5 s, the first of them before it.
+    """Return the bias of the gyro at each instant, (n, 3) [rad/s].
 
-    Returns (n, 3): zero where the sensor never rests [rad/s].
+    It is the mean of the last 20 rests of 1.5 s, before the first rest that of the first, and zero if the sensor never
+    rests.
     """
     window = numbered_windows(record.time_s, _REST_S)
     rate, *of_rate = window_scatter(record.rate_rad_s, window)
@@ -140,17 +141,17 @@ def rest_bias(record: InertialMagneticRecord) -> FloatArray:
     if len(found) == 0:
         return np.zeros((len(record), 3))
     means = np.array([found[max(0, i - 19) : i + 1].mean(axis=0) for i in range(len(found))])
-    # A rest is known at its end.
+    # A rest counts from its end on.
     latest = np.maximum(np.cumsum(np.concatenate([[False], rest[:-1]])) - 1, 0)
     return means[latest[window]]
 
 
 def start_motion(record: InertialMagneticRecord, bias_rad_s: FloatArray) -> str:
-    """Return how the unit moves in the first second, in words; the empty string where it rests.
+    """Describe the motion of the unit in the first second; return an empty string if it rests.
 
-    ``bias_rad_s`` (3,): of the gyro, as far as it is known.
+    ``bias_rad_s`` (3,): bias of the gyro, as far as it is known.
     """
-    rate, acceleration = (v[record.starting] for v in (record.rate_rad_s, record.acceleration_m_s2))
+    rate, acceleration = (v[record.in_first_second] for v in (record.rate_rad_s, record.acceleration_m_s2))
     turns, varies = (float(np.nanstd(v, axis=0).max()) for v in (rate, acceleration))
     mean = float(np.linalg.norm(np.nanmean(rate, axis=0) - bias_rad_s))
     if turns < _START_RATE_RAD_S and varies < _START_ACCELERATION_M_S2 and mean < _START_BIAS_RAD_S:
@@ -162,11 +163,10 @@ def start_motion(record: InertialMagneticRecord, bias_rad_s: FloatArray) -> str:
 
 
 @dataclass(frozen=True, eq=False)
-class Prepared:
-    """What the filter needs of a record.
+class PreparedReadings:
+    """Prepared readings of an inertial unit, for the heading filter.
 
-    ``q_level`` (n, 4): attitude of gyro and accelerometer alone: level from body, with a heading that drifts from an
-    unknown start.
+    ``q_level`` (n, 4): level from body, by gyro and accelerometer alone; its heading starts unknown and drifts.
     """
 
     time_s: FloatArray  # (n,)
@@ -182,32 +182,33 @@ class Prepared:
     warnings: tuple[str, ...] = ()
 
     @property
-    def starting(self) -> BoolArray:
-        """Which instants are within the first second (n,)."""
+    def in_first_second(self) -> BoolArray:
+        """Mask (n,) of the instants within the first second."""
         return self.time_s < self.time_s[0] + 1.0
 
 
 def check_units(record: InertialMagneticRecord) -> None:
-    """Raise ValueError if units or axes of a sensor, or the unit of the time, are not those that the others show."""
-    check_lengths(record.acceleration_m_s2, record.field_T, record.starting)
+    """Raise ValueError if the units or axes of a sensor, or the unit of time, contradict the others."""
+    check_lengths(record.acceleration_m_s2, record.field_T, record.in_first_second)
     gap = np.zeros(len(record), np.bool_)
     for before, after in sensor_gaps(record.time_s, is_read(record.rate_rad_s)):
         gap[before + 1 : after + 1] = True
-    rate = step_rates(_from_the_start(record.rate_rad_s), record.dt_s, record.gyro_samples)
+    rate = step_rates(_extend_to_start(record.rate_rad_s), record.dt_s, record.gyro_samples)
     check_turns(record.time_s, rate, record.acceleration_m_s2, record.field_T, gap)
 
 
-def _from_the_start(rate_rad_s: FloatArray) -> FloatArray:
-    """Rates with the first reading before it."""
+def _extend_to_start(rate_rad_s: FloatArray) -> FloatArray:
+    """Fill the rows before the first rate by that rate."""
     first = int(np.argmax(is_read(rate_rad_s)))
     return np.concatenate([np.repeat(rate_rad_s[first : first + 1], first, axis=0), rate_rad_s[first:]])
 
 
-def prepare(record: InertialMagneticRecord, model: HeadingModel = HeadingModel(), *, offline: bool = False) -> Prepared:
-    """Remove bias, lag and motion from a record; see :class:`Prepared`.
+def prepare(
+    record: InertialMagneticRecord, model: HeadingModel = HeadingModel(), *, offline: bool = False
+) -> PreparedReadings:
+    """Remove bias, lag and motion from a record; see :class:`PreparedReadings`.
 
-    Everything but the lag, for which the whole record is used, is what can be known at the time, or, offline, what the
-    whole record tells.
+    Each instant uses readings up to it, offline the whole record. The lag always uses the whole record.
     """
     time_s, dt_s, bias = record.time_s, record.dt_s, rest_bias(record)
     moves = start_motion(record, bias[0])
@@ -219,22 +220,22 @@ def prepare(record: InertialMagneticRecord, model: HeadingModel = HeadingModel()
     bias_sigma = 0.0
     if not bias.any():
         bias_sigma = _UNKNOWN_BIAS_RAD_S if moves else 0.0
-        bias = bias if moves else bias + np.nanmean(record.rate_rad_s[record.starting], axis=0)
-    rate = step_rates(_from_the_start(record.rate_rad_s) - bias, dt_s, record.gyro_samples)
+        bias = bias if moves else bias + np.nanmean(record.rate_rad_s[record.in_first_second], axis=0)
+    rate = step_rates(_extend_to_start(record.rate_rad_s) - bias, dt_s, record.gyro_samples)
     q_gyro = gyro_attitudes(rate, dt_s)
     gaps = sensor_gaps(time_s, read["gyro"])
     hidden = hidden_variance(time_s, record.rate_rad_s, gaps, model.gap_rad_s, model.long_gap_rad_s)
-    hidden += shown_turns(time_s, gaps, hidden, quaternion.rotate(q_gyro, _usual_field(record)))
-    at_rest = record.starting & (not moves) & (np.cumsum(hidden) < LOST_RAD**2)
+    hidden += observed_turn_variance(time_s, gaps, hidden, quaternion.rotate(q_gyro, _usual_field(record)))
+    at_rest = record.in_first_second & (not moves) & (np.cumsum(hidden) < LOST_RAD**2)
     acceleration = quaternion.rotate(q_gyro, record.acceleration_m_s2)
     drift = max(model.gyro_drift_rad_s, bias_sigma)
     up = direction_up(Steady(time_s, dt_s, acceleration, at_rest, gaps, hidden, drift), offline=offline)
     part = _UP_STEP * np.minimum(dt_s / float(np.median(dt_s)), _LONGEST_UP_STEP)
-    q_level = _levelled(q_gyro, up, np.where(up.fresh, 1.0, part))
+    q_level = _level_attitudes(q_gyro, up, np.where(up.fresh, 1.0, part))
     lag, field_T, start_tilt = 0.0, record.field_T, 0.0
     if record.has_field:
         lag = _lag_s(q_gyro, record)
-        field_T = _without_lag(q_gyro, time_s, field_T, lag)
+        field_T = _remove_lag(q_gyro, time_s, field_T, lag)
         best = float(up.sigma_rad[read["magnetometer"]].min())
         useful = up.sigma_rad <= max(_USEFUL_TILT_RAD, 1.5 * best)
         for before, after in gaps:
@@ -244,7 +245,7 @@ def prepare(record: InertialMagneticRecord, model: HeadingModel = HeadingModel()
     else:
         del read["magnetometer"]
     hides = [np.sum(hidden[before + 1 : after + 1]) > LOST_RAD**2 for before, after in gaps]
-    return Prepared(
+    return PreparedReadings(
         time_s,
         rate,
         bias,
@@ -259,22 +260,25 @@ def prepare(record: InertialMagneticRecord, model: HeadingModel = HeadingModel()
     )
 
 
-def _levelled(q_gyro: FloatArray, up: Up, part: FloatArray) -> FloatArray:
-    """Level attitudes (n, 4), from body; where the direction up begins anew the shortest turn takes it upwards."""
+def _level_attitudes(q_gyro: FloatArray, up: Up, part: FloatArray) -> FloatArray:
+    """Return level attitudes (n, 4), from body.
+
+    Where the direction up starts anew, the shortest rotation turns it upwards.
+    """
     q_level = np.empty_like(q_gyro)
     starts = 1 + np.flatnonzero(up.fresh[1:] & ~up.fresh[:-1])
     for begin, end in pairwise([0, *starts, len(up.up)]):
         v = up.up[begin]
-        start = _attitude(v, _across(v))
+        start = _attitude(v, _other_axis(v))
         if begin > 0:
             start = quaternion.multiply(q_level[begin - 1], quaternion.conjugate(q_gyro[begin - 1]))
             start = quaternion.turned_onto(start, v, np.array([0.0, 0.0, 1.0]))
-        q_level[begin:end] = levelled(q_gyro[begin:end], up.up[begin:end], part[begin:end], start)
+        q_level[begin:end] = level_attitudes(q_gyro[begin:end], up.up[begin:end], part[begin:end], start)
     return q_level
 
 
 def _start_warnings(moves: str, bias_sigma_rad_s: float) -> list[str]:
-    """Say that the first second is not at rest, and what that leaves."""
+    """Return a warning if the first second is not at rest."""
     if not moves:
         return []
     never = ", and it never rests, so that the gyro's bias is unknown" if bias_sigma_rad_s else ""
@@ -284,7 +288,7 @@ def _start_warnings(moves: str, bias_sigma_rad_s: float) -> list[str]:
 def _tilt_sigma_rad(
     dt_s: FloatArray, rate: FloatArray, hidden_rad2: FloatArray, model: HeadingModel, more_rad: FloatArray
 ) -> FloatArray:
-    """What an accelerometer at rest leaves, and what the gyro's scale makes of turns while the low-pass is behind."""
+    """Return σ of the tilt from the accelerometer, the gyro's scale and the delay of the low-pass."""
     squares = (model.gyro_scale**2 * np.einsum("ni,ni->n", rate, rate) + hidden_rad2 / _TURN_S**2)[:, None]
     smooth = low_pass(squares, dt_s, GRAVITY_TIME_S, squares[0])[:, 0]
     sigma = np.sqrt(_TILT_FLOOR_RAD**2 + _TURN_S**2 * np.maximum(smooth, 0.0) + np.square(more_rad))
@@ -292,13 +296,13 @@ def _tilt_sigma_rad(
 
 
 def _lag_s(q_gyro: FloatArray, record: InertialMagneticRecord) -> float:
-    """Lag at which the field changes least within a fifth of a second, seen from a frame that does not turn.
+    """Return the lag for which the field in a fixed frame changes least within a fifth of a second.
 
-    Readings whose length is not that of the first second are left out: a magnet on the sensor turns with it.
+    Readings with another length than in the first second are left out: a magnet on the sensor turns with it.
     """
     time_s, field_T = record.time_s, record.field_T
     lengths = np.sqrt(np.einsum("ni,ni->n", field_T, field_T))
-    usual = np.nanmedian(lengths[record.starting])
+    usual = np.nanmedian(lengths[record.in_first_second])
     rows = np.flatnonzero(np.isfinite(lengths))
     step = float(np.median(record.dt_s))
     rows = rows[:: instants_within(_LAG_EVERY_S, time_s[rows])]
@@ -328,18 +332,18 @@ def _lag_s(q_gyro: FloatArray, record: InertialMagneticRecord) -> float:
 
 
 def _usual_field(record: InertialMagneticRecord) -> FloatArray:
-    """Readings (n, 3) whose length is that of the first second; the others are NaN."""
+    """Return readings (n, 3) of the field, NaN where their length is not that of the first second."""
     lengths = np.sqrt(np.einsum("ni,ni->n", record.field_T, record.field_T))
-    usual = median(lengths[record.starting])
+    usual = median(lengths[record.in_first_second])
     return np.where((np.abs(lengths - usual) < _USUAL_LENGTH * usual)[:, None], record.field_T, np.nan)
 
 
-def _without_lag(q_gyro: FloatArray, time_s: FloatArray, field_T: FloatArray, lag_s: float) -> FloatArray:
-    return quaternion.rotate_back(q_gyro, without_turns(q_gyro, time_s, field_T, lag_s))
+def _remove_lag(q_gyro: FloatArray, time_s: FloatArray, field_T: FloatArray, lag_s: float) -> FloatArray:
+    return quaternion.rotate_back(q_gyro, rotate_to_fixed_frame(q_gyro, time_s, field_T, lag_s))
 
 
-def without_turns(q: FloatArray, time_s: FloatArray, field_T: FloatArray, lag_s: float) -> FloatArray:
-    """Return readings (n, 3) in a frame that does not turn, of a sensor that lags behind its attitude.
+def rotate_to_fixed_frame(q: FloatArray, time_s: FloatArray, field_T: FloatArray, lag_s: float) -> FloatArray:
+    """Rotate readings (n, 3) of a sensor with a lag into a frame that does not turn.
 
     ``q`` (n, 4): attitudes at the times (n,), on straight lines between them.
     """
@@ -348,7 +352,7 @@ def without_turns(q: FloatArray, time_s: FloatArray, field_T: FloatArray, lag_s:
 
 
 def _attitude(up: FloatArray, north: FloatArray) -> FloatArray:
-    """East, north, up from body: quaternion (4,) of an upward unit vector and one that leans to the north."""
+    """Return the quaternion (4,), east, north, up from body, of an upward and a northward vector."""
     from scipy.spatial.transform import Rotation
 
     y = north - north @ up * up
@@ -356,6 +360,6 @@ def _attitude(up: FloatArray, north: FloatArray) -> FloatArray:
     return quaternion.from_rotation(Rotation.from_matrix(np.stack([np.cross(y, up), y, up])))
 
 
-def _across(v: FloatArray) -> FloatArray:
-    """Some axis that is not along v."""
+def _other_axis(v: FloatArray) -> FloatArray:
+    """Return an axis that is not along v."""
     return np.eye(3)[np.argmin(np.abs(v))]

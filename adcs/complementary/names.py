@@ -1,4 +1,4 @@
-"""Words by which a complementary filter, and what stands in for its second vector, are chosen."""
+"""Names of complementary filters, of substitutions and of ways to treat a magnet."""
 
 from __future__ import annotations
 

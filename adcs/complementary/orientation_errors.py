@@ -24,7 +24,7 @@ class OrientationErrors:
 
 
 def error_angles(q: FloatArray, q_true: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Angle of the error, its part around the vertical, and the rest: (n,) each [rad]; NaN where the truth is unknown.
+    """Return total, heading and inclination errors, (n,) each [rad]; NaN where the truth is unknown.
 
     ``q``, ``q_true`` (n, 4): east, north, up from body.
     """
@@ -35,7 +35,7 @@ def error_angles(q: FloatArray, q_true: FloatArray) -> tuple[FloatArray, FloatAr
 
 
 def orientation_errors(q: FloatArray, q_true: FloatArray, counted: BoolArray) -> OrientationErrors:
-    """Root mean squares of :func:`error_angles` where they are counted (n,) and the truth is known."""
+    """Return root mean squares of :func:`error_angles` over ``counted`` (n,) rows with known truth."""
     known = counted & np.isfinite(q_true).all(axis=1)
     angles = error_angles(q[known], q_true[known])
     return OrientationErrors(*(float(np.sqrt(np.mean(angle**2))) for angle in angles))

@@ -1,4 +1,4 @@
-"""What stands in for the second vector while its sensor is out: an old first vector, as the field turns.
+"""Substitution of a missing second vector by an earlier first vector, as the field turns.
 
 See docs/theory/complementary-filters.md.
 """
@@ -13,14 +13,14 @@ from arrays.io.errors import check_positive
 
 @dataclass(frozen=True)
 class Substitution:
-    """What stands in for a missing second vector.
+    """Substitution of a missing second vector.
 
     Attributes
     ----------
     rule : {'magnetometer-only', 'raw', 'transported'}
         See docs/theory/complementary-filters.md.
     delay_s : float
-        Age of the field that is taken.
+        Age of the field that is used.
 
     Raises
     ------
@@ -41,5 +41,5 @@ NO_SUBSTITUTE = Substitution()
 
 
 def delay_steps(substitution: Substitution, dt_s: float) -> int:
-    """Delay M in samples, 1 at least."""
+    """Return the delay M in samples, 1 at least."""
     return 0 if substitution.rule == "magnetometer-only" else max(1, round(substitution.delay_s / dt_s))

@@ -1,7 +1,7 @@
-"""A magnet that stands near the path of a magnetometer: located by what it does to the field, then subtracted.
+"""Location of a fixed magnet near the path of a magnetometer from its field.
 
-Positions of the sensor must be known, as from cameras; they do not come from gyro and accelerometer. The attitude is
-one that did without the disturbed field, such as :func:`adcs.inertial_magnetic_filter` with a magnet "rejected".
+Positions of the sensor must be known, for example from cameras; gyro and accelerometer do not give them. The attitude
+must not depend on the disturbed field, as that of :func:`adcs.inertial_magnetic_filter` with a magnet "rejected".
 """
 
 from __future__ import annotations
@@ -11,13 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from adcs import quaternion
-from adcs.complementary.inertial_magnetic import Prepared
+from adcs.complementary.inertial_magnetic import PreparedReadings
 from arrays.typing import FloatArray
 from magloc.fields.dipole import field, field_matrix
 
-_EVERY = 3  # readings closer than a centisecond say the same
+_EVERY = 3  # readings closer than a centisecond are redundant
 _SIGMA_T = 2e-6
-_SAME_S = 0.3  # for how long the room's own variation is the same
+_SAME_S = 0.3  # correlation time of the room's own variation
 _FIRST_DISTANCE_M = 0.1
 _LARGEST_DISTANCE_M = 0.5
 _LARGEST_ROOM_M = 20.0
@@ -37,11 +37,11 @@ _GRADIENTS = np.array(
 
 @dataclass(frozen=True, eq=False)
 class StandingMagnet:
-    """A dipole.
+    """Fixed magnet as a dipole.
 
-    ``position_m``, ``moment_Am2`` (3,): east, north, up. ``sigma_m`` (3,): of the position. ``lever_arm_m`` (3,): body
-    axes, from the point whose positions are known to the magnetometer. ``explained``: share of the squared disturbance
-    that it explains where its own field exceeds two microtesla.
+    ``position_m``, ``moment_Am2`` (3,): east, north, up. ``sigma_m`` (3,): standard deviation of the position.
+    ``lever_arm_m`` (3,): body axes, from the point with known positions to the magnetometer. ``explained``: share of
+    the squared disturbance that it explains where its own field exceeds two microtesla.
     """
 
     position_m: FloatArray
@@ -51,11 +51,11 @@ class StandingMagnet:
     explained: float
 
 
-def locate_standing_magnet(prepared: Prepared, q: FloatArray, position_m: FloatArray) -> StandingMagnet:
-    """Dipole that explains best what a smooth room does not: one whose field is a constant and a gradient.
+def locate_standing_magnet(prepared: PreparedReadings, q: FloatArray, position_m: FloatArray) -> StandingMagnet:
+    """Locate the dipole that best explains the field, beside a constant and a gradient of the room.
 
-    Moment and room follow linearly from place and lever arm, which are searched from six sides of where the field
-    differs most. Differences larger than two microtesla count less than by their squares.
+    Moment and room are linear; position and lever arm are searched from six starts around the largest difference of the
+    field. Differences larger than two microtesla count less than by their squares (a robust loss).
 
     ``q`` (n, 4): east, north, up from body. ``position_m`` (n, 3): NaN where unknown. Raises ValueError: there are
     fewer than 100 known positions, or no dipole within 0.5 m of the largest difference that explains half of the
@@ -69,22 +69,22 @@ def locate_standing_magnet(prepared: Prepared, q: FloatArray, position_m: FloatA
     if len(known) < 100:
         raise ValueError(f"Input position_m must have 100 known positions; instead received {len(known)}.")
     points, q_known = position_m[known], q[known]
-    values = reference[known] - np.nanmean(reference[prepared.starting], axis=0)
+    values = reference[known] - np.nanmean(reference[prepared.in_first_second], axis=0)
     nearest = points[np.argmax(np.linalg.norm(values, axis=1))]
     centred = points - points.mean(axis=0)
     constant = np.broadcast_to(np.eye(3), (len(points), 3, 3))
     room = np.concatenate([constant, np.einsum("gij,nj->nig", _GRADIENTS, centred)], axis=2).reshape(-1, 8)
     Q = np.linalg.qr(room)[0]
 
-    def without_room(columns: FloatArray) -> FloatArray:
+    def remove_room(columns: FloatArray) -> FloatArray:
         return columns - Q @ (Q.T @ columns)
 
-    disturbance = without_room(values.ravel())
+    disturbance = remove_room(values.ravel())
 
     def fit(unknowns: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Moment, its field and what is left of the disturbance."""
+        """Return the moment, its field and the residual of the disturbance."""
         A = field_matrix(points + quaternion.rotate(q_known, unknowns[3:]), unknowns[:3]).reshape(-1, 3)
-        within = without_room(A)
+        within = remove_room(A)
         found = np.asarray(np.linalg.lstsq(within, disturbance)[0], dtype=np.float64)
         return found, A @ found, within @ found - disturbance
 
@@ -117,7 +117,10 @@ def locate_standing_magnet(prepared: Prepared, q: FloatArray, position_m: FloatA
 
 
 def standing_field(magnet: StandingMagnet, q: FloatArray, position_m: FloatArray) -> FloatArray:
-    """Field of the magnet in body axes [T], zero where the position is unknown. Shapes (n, 4), (n, 3) -> (n, 3)."""
+    """Return the field of the magnet in body axes [T], zero where the position is unknown.
+
+    Shapes (n, 4), (n, 3) -> (n, 3).
+    """
     known = np.isfinite(position_m).all(axis=1)
     found = np.zeros_like(position_m)
     points = position_m[known] + quaternion.rotate(q[known], magnet.lever_arm_m)

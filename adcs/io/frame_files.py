@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image, UnidentifiedImageError
 
 from adcs.mockup.vision.camera import Camera
-from adcs.mockup.vision.centroids import checked_frame
+from adcs.mockup.vision.centroids import check_frame
 from arrays.io.errors import InputError, naming
 from arrays.io.text import read_bytes, replace_file
 from arrays.typing import ByteArray
@@ -47,7 +47,7 @@ def read_frame(path: str | PathLike[str], camera: Camera = Camera()) -> ByteArra
     except (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error):
         raise InputError(f"{path}: found a damaged image, expected {_EXPECTED}.") from None
     with naming(str(path)):
-        return checked_frame(image)
+        return check_frame(image)
 
 
 def _check_kind(path: str | PathLike[str], image: Image.Image, camera: Camera) -> None:

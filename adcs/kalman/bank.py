@@ -19,7 +19,7 @@ from adcs.kalman.variants.constant_gain import run_constant_gain
 from adcs.kalman.variants.gyro_driven import run_reduced
 from adcs.kalman.variants.self_tuning import run_self_tuned
 from adcs.kalman.variants.separate_bias import run_parallel
-from adcs.satellite.attitude_track import AttitudeTrack, joined
+from adcs.satellite.attitude_track import AttitudeTrack, join_tracks
 from adcs.satellite.conventions import check_conventions
 from adcs.satellite.satellite import Satellite
 from adcs.satellite.sensors import SENSOR_WORDS, SENSORS
@@ -150,7 +150,7 @@ def estimate(
         raise reasons[0]
     told = f"; {len(reasons)} of the {len(pieces)} pieces tell no attitude: {reasons[0]}" if reasons else ""
     anew = f"{len(pieces) - 1} gaps longer than {chosen.longest_gap_s:g} s: the filter starts anew after each{told}"
-    return joined(tracks, anew)
+    return join_tracks(tracks, anew)
 
 
 def _estimate(telemetry: Telemetry, satellite: Satellite, chosen: EstimatorSettings) -> AttitudeTrack:

@@ -427,7 +427,7 @@ class AttitudeTracks:
 
     @property
     def definite(self) -> BoolArray:
-        """Whether all variances of a run are positive, shape (runs,); if not, it has diverged."""
+        """Mask (runs,) of runs with positive variances; the others have diverged."""
         variances = np.diagonal(self.covariance, axis1=-2, axis2=-1)
         return np.asarray((variances > 0.0).all(axis=(1, 2)))
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.figure import Figure
 
-from adcs.mockup.navigation.fixes import FixRecord, Outcome
+from adcs.mockup.navigation.fixes import FixOutcome, FixRecord
 from adcs.mockup.navigation.strapdown import ImuRecord, PlanarTrack, wrapped
 from magloc.plots import style
 
@@ -92,7 +92,7 @@ class FusionPicture:
     truth: PlanarTrack  # at the same instants
     track: PlanarTrack  # at the same instants
     fixes: FixRecord  # those that arrived within the run
-    outcomes: tuple[Outcome, ...]  # what became of them
+    outcomes: tuple[FixOutcome, ...]  # what became of them
     sigma_m: FloatArray | None = None  # (n, 2): what the method believes of its errors
     sigma_rad: FloatArray | None = None  # (n,): what the method believes of its errors
     begin_s: float = 10.0  # what is before it does not count, and is left out of the limits
@@ -100,7 +100,7 @@ class FusionPicture:
     @property
     def used(self) -> BoolArray:
         """Fixes that were not rejected, shape (k,)."""
-        return np.array([outcome is not Outcome.REJECTED for outcome in self.outcomes], dtype=np.bool_)
+        return np.array([outcome is not FixOutcome.REJECTED for outcome in self.outcomes], dtype=np.bool_)
 
 
 def fusion_figure(picture: FusionPicture) -> Figure:

@@ -1,1 +1,1 @@
-"""The satellite: its dynamics, its sensors, and the record of what they read."""
+"""Satellite: dynamics, sensors and records of readings."""

@@ -1,4 +1,4 @@
-"""Attitude through time, as a filter makes it of one log."""
+"""Attitude over time: the result of a filter for one log."""
 
 from __future__ import annotations
 
@@ -23,42 +23,43 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class AttitudeTrack(Result):
-    """Attitude and what else a filter estimates, at n instants.
+    """Attitude and further states, as estimated at n instants.
 
     Attributes
     ----------
     title : str
         Sensors, states and filter in words.
     time_s : ndarray, shape (n,)
-        Of every instant, those of missing rows too; it begins where a reading first tells something of the attitude.
+        Times of all instants, missing rows included, from the first reading of the attitude on.
     rows : ndarray of int
-        Instants that the log has.
+        Indices of the instants of the log.
     q : ndarray, shape (n, 4)
         Reference frame from body, scalar first; :attr:`rotation` is scipy's.
     states : mapping of str to ndarray, shape (n, 3)
-        ``rate`` against inertial space [rad/s], and of what is estimated ``gyro-bias`` [rad/s], ``field-bias`` [T] and
-        ``disturbance`` [1/s²] and ``dipole`` [A·m²], body axes, ``field-model`` [T], orbital frame,
-        and ``field-gain``, nine numbers.
+        ``rate`` against inertial space [rad/s] and the estimated states among ``gyro-bias`` [rad/s], ``field-bias``
+        [T], ``disturbance`` [1/s²] and ``dipole`` [A·m²], body axes; ``field-model`` [T], orbital frame; and
+        ``field-gain``, nine components.
     used : tuple of str
         Sensors in use.
     seen : mapping of str to ndarray of bool, shape (n,)
-        Where each sensor has a reading.
+        Rows with a reading of each sensor.
     sigma : mapping of str to ndarray, shape (n, 3)
         Standard deviations of the states and of ``attitude`` [rad]; empty for a filter without a covariance.
     nis : mapping of str to ndarray, shape (n,)
-        Normalised innovation squared of each sensor, NaN without a reading: χ² of 3 numbers, of 2 for the Sun sensor.
+        Normalised innovation squared of each sensor, NaN without a reading: χ² with 3 degrees of freedom, 2 for the Sun
+        sensor.
     q_orbital : ndarray, shape (n, 4), optional
         Orbital frame from body.
     warnings : tuple of str
-        What is degraded or cannot be observed, and for how long.
+        Sentences on what is degraded or cannot be observed, and for how long.
     gated : mapping of str to ndarray of bool, shape (n,)
-        Readings of each sensor that contradicted the estimate and were not used; empty for a filter without a gate.
+        Readings of each sensor that the gate rejected; empty for a filter without a gate.
     degraded : mapping of str to ndarray of bool, shape (n,)
-        What is there and yet of little use, in words, and where.
+        Rows in which readings are of little use, by the reason in words.
     unseen_torque_Nm : mapping of float to float
-        Amplitude of a torque below which the readings do not show it, by its period [s]; empty where not known.
+        Largest unobservable amplitude of a torque by its period [s]; empty if not known.
     tuned_disturbance_s2 : ndarray, shape (n,), optional
-        Standard deviation that the filter ``self-tuning`` has found for the disturbing acceleration.
+        Standard deviation of the disturbing acceleration, as estimated by the filter ``self-tuning``.
 
     Examples
     --------
@@ -94,17 +95,17 @@ class AttitudeTrack(Result):
 
     @property
     def rotation(self) -> Rotation:
-        """Reference frame from body: the inertial one (J2000) of :func:`adcs.estimate`, else that of its vectors."""
+        """Rotation, reference frame from body: inertial (J2000) of :func:`adcs.estimate`, else of the vectors."""
         return quaternion.to_rotation(self.q)
 
     @property
     def sigma_deg(self) -> FloatArray:
-        """Standard deviation of the attitude about each body axis [°], shape (n, 3); NaN if the filter has none."""
+        """Standard deviation of the attitude about the body axes [°], (n, 3); NaN if the filter has none."""
         return np.degrees(self.sigma.get("attitude", np.full((len(self), 3), np.nan)))
 
     @property
     def rejected(self) -> dict[str, BoolArray]:
-        """Readings that were not used, by sensor, shape (n,): those of sensors not in use, and those of the gate."""
+        """Masks (n,) of unused readings by sensor: of sensors not in use, and rejected by the gate."""
         return {
             name: seen & (self.gated[name] if name in self.gated and name in self.used else name not in self.used)
             for name, seen in self.seen.items()
@@ -112,11 +113,11 @@ class AttitudeTrack(Result):
 
     @property
     def frame(self) -> str:
-        """Frame that the attitude is of, from body."""
+        """Name of the frame of ``q``."""
         return "reference" if self.q_orbital is None else "orbital"
 
     def lines(self, most: int | None = None) -> list[str]:
-        """Return what ``adcs estimate`` prints, then the warnings."""
+        """Return the lines that ``adcs estimate`` prints, then the warnings."""
         return [*by_name("adcs.io.estimates:summary_lines")(self), *(f"warning: {text}" for text in self.warnings)]
 
     def columns(self) -> dict[str, Column]:
@@ -124,12 +125,12 @@ class AttitudeTrack(Result):
         return by_name("adcs.io.estimates:estimate_columns")(self)
 
 
-def joined(tracks: Sequence[AttitudeTrack], warning: str) -> AttitudeTrack:
-    """One track of those of a log's pieces, with a warning before theirs, of which ten are kept."""
+def join_tracks(tracks: Sequence[AttitudeTrack], warning: str) -> AttitudeTrack:
+    """Join the tracks of a log's pieces; ``warning`` comes before theirs, of which ten are kept."""
     first = tracks[0]
     before = np.cumsum([0, *(len(track) for track in tracks[:-1])])
 
-    def of(name: str) -> Any:
+    def concatenate(name: str) -> Any:
         values = [getattr(track, name) for track in tracks]
         if isinstance(values[0], Mapping):
             return {key: np.concatenate([one[key] for one in values]) for key in values[0]}
@@ -143,5 +144,5 @@ def joined(tracks: Sequence[AttitudeTrack], warning: str) -> AttitudeTrack:
         rows=np.concatenate([track.rows + n for track, n in zip(tracks, before, strict=True)]),
         warnings=(warning, *texts[:_MOST_WARNINGS], *more),
         unseen_torque_Nm={key: max(one.unseen_torque_Nm[key] for one in tracks) for key in first.unseen_torque_Nm},
-        **{name: of(name) for name in arrays},
+        **{name: concatenate(name) for name in arrays},
     )

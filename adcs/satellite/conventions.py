@@ -1,8 +1,8 @@
-"""Units and conventions that a log was written in but is not read in, named by what one change makes its sensors agree.
+"""Detection of wrong units and conventions in the log of a satellite.
 
-Sensors contradict each other, or the model of field and Sun, where one of them is misread: the field's length (units),
-the angle between field and Sun, both against the star tracker's attitude, and the turns of the gyro against those of an
-attitude. Where they do, every change that a misreading makes is tried, and named if it mends all of it.
+A misread sensor contradicts the others, or the model of field and Sun: the field's length (units), the angle between
+field and Sun, both against the star tracker's attitude, and the gyro's rotations against those of an attitude. All
+likely misreadings are then tried, and those that remove all contradictions are named.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _ORDERS = {"scalar last taken for scalar first": [3, 0, 1, 2], "scalar first tak
 
 @dataclass(frozen=True, eq=False)
 class _Log:
-    """Readings of some rows in body axes, and what the models say of them in the inertial frame."""
+    """Readings of some rows in body axes, and their models in the inertial frame."""
 
     time_s: FloatArray
     star: FloatArray  # (n, 4): inertial from body, scalar first
@@ -57,10 +57,10 @@ class _Log:
 
 
 def check_conventions(telemetry: Telemetry, record: Record, used: Collection[str]) -> None:
-    """Raise ValueError if one misreading of a sensor in use explains why a log contradicts itself or the orbit.
+    """Raise ValueError if one misread sensor explains why a log contradicts itself or the orbit.
 
-    ``record``: of the log. ``used``: names of :data:`SENSORS`. Where the orbit's elements are so old that the field
-    along it may be another one, the field is not compared.
+    ``record``: of the log. ``used``: names of :data:`SENSORS`. The field is not compared if the elements of the orbit
+    are too old to compute it.
     """
     around, orbit = record.environment, record.satellite.orbit
     old = isinstance(orbit, Sgp4Orbit) and 3.0 * orbit.relative_error(around.utc) > _SUSPICIOUS * math.log(_FACTOR)
@@ -83,21 +83,21 @@ def check_conventions(telemetry: Telemetry, record: Record, used: Collection[str
         return
     with np.errstate(over="ignore"):
         changed = {
-            f"the {SENSOR_WORDS[sensor]}{name}": _disagreements(_changed(log, attribute, matrix))
+            f"the {SENSOR_WORDS[sensor]}{name}": _disagreements(_apply_change(log, attribute, matrix))
             for sensor, name, attribute, matrix in _changes()
             if sensor in used
         }
-    if named := mending(as_read, changed, int(np.argmax(as_read))):
+    if named := remedies(as_read, changed, int(np.argmax(as_read))):
         raise ValueError(
             "Input telemetry must agree with itself and with the orbit; instead received what agrees if this is "
             f"undone: {', or '.join(named)}."
         )
 
 
-def mending(as_read: FloatArray, changed: Mapping[str, FloatArray], worst: int) -> list[str]:
-    """Return the names of the changes that mend a disagreement, that of number ``worst``, and make no other one worse.
+def remedies(as_read: FloatArray, changed: Mapping[str, FloatArray], worst: int) -> list[str]:
+    """Return the names of changes that remove disagreement ``worst`` and make no other one worse.
 
-    ``as_read`` (k,): disagreements, in units of what is allowed, and those after each change by its name.
+    ``as_read`` (k,): disagreements over their allowed values; ``changed``: those after each change by name.
     """
     mended = {
         name: found.sum()
@@ -109,7 +109,7 @@ def mending(as_read: FloatArray, changed: Mapping[str, FloatArray], worst: int) 
 
 
 def _changes() -> Iterator[tuple[str, str, str, FloatArray]]:
-    """Sensors, names of their misreadings, the attribute of a log, and the matrix that undoes each."""
+    """Yield sensors, names of misreadings, attributes of a log, and matrices that correct them."""
     for name, factor in FIELD_UNITS.items():
         yield "mag", f" in {name}", "field", factor * np.eye(3)
     for name, factor in RATE_UNITS.items():
@@ -128,12 +128,12 @@ def _changes() -> Iterator[tuple[str, str, str, FloatArray]]:
             yield sensor, name, attribute, matrix
 
 
-def _changed(log: _Log, attribute: str, matrix: FloatArray) -> _Log:
+def _apply_change(log: _Log, attribute: str, matrix: FloatArray) -> _Log:
     return replace(log, **{attribute: getattr(log, attribute) @ matrix})
 
 
 def reflected_axes() -> Iterator[tuple[str, FloatArray]]:
-    """Axes that are reversed or exchanged."""
+    """Yield names and matrices of reversed or exchanged axes."""
     yield ", all its signs reversed", -np.eye(3)
     for axis, name in enumerate("xyz"):
         yield f", its axis {name} reversed", np.diag(np.where(np.arange(3) == axis, -1.0, 1.0))
@@ -145,7 +145,7 @@ def reflected_axes() -> Iterator[tuple[str, FloatArray]]:
 
 
 def _disagreements(log: _Log) -> FloatArray:
-    """Contradictions (6,) in units of what is allowed; 0 of those that the log does not allow to see."""
+    """Return contradictions (6,) over their allowed values; 0 where the log has not the readings."""
     vectors = attitude_of_vectors([log.sun, log.field], [log.model_sun, log.model_field], [1.0, 1.0], method="triad").q
     vectors[np.sin(angle(log.sun, log.field)) < _LEAST_SINE] = np.nan
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
@@ -162,7 +162,7 @@ def _disagreements(log: _Log) -> FloatArray:
 
 
 def _turns(log: _Log, q: FloatArray) -> float:
-    """Angle between the gyro's turns and an attitude's over windows of large turns, as a part of what may be."""
+    """Return the angle between rotations of gyro and attitude over its allowed value, for large rotations."""
     if not np.isfinite(log.gyro[:1]).all() or len(log.gyro) < 3 or not np.isfinite(q).any():
         return 0.0
     steps = steps_s(log.time_s)
@@ -189,6 +189,6 @@ def angle(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def median(values: FloatArray) -> float:
-    """Return the median of what is there; 0 of nothing."""
+    """Return the median of the finite values; 0 without any."""
     there = values[np.isfinite(values)]
     return float(np.median(there)) if there.size else 0.0

@@ -24,7 +24,7 @@ ZERO = np.zeros(3)
 
 @dataclass(frozen=True, eq=False)
 class RigidBody:
-    """A satellite.
+    """Rigid satellite with a residual dipole.
 
     Attributes
     ----------
@@ -111,13 +111,16 @@ class WheelControl:
 
 
 def wheel_control(body: RigidBody, natural_rad_s: float = 0.03, damping: float = 0.8) -> WheelControl:
-    """Gains K_λ = 2 ω² J_ii and K_ω = 2 ζ ω J_ii of a natural frequency ω and a damping ratio ζ of small angles."""
+    """Return the gains K_λ = 2 ω² J_ii and K_ω = 2 ζ ω J_ii for small angles.
+
+    ``natural_rad_s``: natural frequency ω. ``damping``: damping ratio ζ.
+    """
     moments = np.diagonal(body.inertia_kgm2)
     return WheelControl(2.0 * natural_rad_s**2 * moments, 2.0 * damping * natural_rad_s * moments)
 
 
 def relative_rate(q: ArrayLike, w: ArrayLike, orbital_rate_rad_s: ArrayLike) -> FloatArray:
-    """Rate ω - Aω_o of the body against the orbital frame, body axes [rad/s].
+    """Return the rate ω - Aω_o of the body against the orbital frame, body axes [rad/s].
 
     ``q`` (..., 4): attitude, orbital from body. ``w`` (..., 3): rate against inertial space, body axes [rad/s].
     ``orbital_rate_rad_s`` (...): n. Returns shape (..., 3).
@@ -126,14 +129,14 @@ def relative_rate(q: ArrayLike, w: ArrayLike, orbital_rate_rad_s: ArrayLike) -> 
 
 
 def absolute_rate(q: ArrayLike, w_relative: ArrayLike, orbital_rate_rad_s: ArrayLike) -> FloatArray:
-    """Rate ω of the body against inertial space; inverse of :func:`relative_rate`."""
+    """Return the rate ω of the body against inertial space; inverse of :func:`relative_rate`."""
     return np.asarray(w_relative, dtype=np.float64) + rotate_back(q, np.asarray(orbital_rate_rad_s)[..., None] * _E2)
 
 
 def environment_torque(
     body: RigidBody, q: ArrayLike, gravity_s2: ArrayLike, b_orbital_T: ArrayLike, dipole_Am2: ArrayLike = ZERO
 ) -> FloatArray:
-    """Torque of the gravity gradient, 3(μ/r³) η×Jη, and of the magnetic dipole, m×B, body axes [N·m].
+    """Return the torques of gravity gradient, 3(μ/r³) η×Jη, and magnetic dipole, m×B, body axes [N·m].
 
     ``q`` (..., 4): attitude, orbital from body. ``gravity_s2`` (...): μ/r³. ``b_orbital_T`` (..., 3): field in the
     orbital frame. ``dipole_Am2`` (..., 3): besides the residual dipole of the body. Returns (..., 3).
@@ -170,7 +173,7 @@ def step(
     dt_s: float,
     dipole_Am2: ArrayLike = ZERO,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """State after one step of the classical Runge-Kutta method of order four.
+    """Return the state after one step of the classical Runge-Kutta method of order four.
 
     Torque, wheel torque and surroundings are held over the step, the momentum of the wheels is linear in time; the
     attitude is normalised after it.

@@ -1,4 +1,4 @@
-r"""Magnetic control: B-dot, which takes the rate out of a tumbling satellite, and rods that do so without any power.
+r"""Magnetic control: B-dot detumbling by torquers, and passive hysteresis rods.
 
 The field in body axes changes as the body turns, dB/dt ≈ B×ω. A moment against it, m = -k Ḃ/B², has the torque
 m×B ≈ -k ω⊥: it brakes what turns across the field, and the field turns along the orbit. With k = 4 n I the rate decays
@@ -24,7 +24,7 @@ _MEAN_OF_A_CUBE = 1.2
 
 @dataclass(frozen=True)
 class BDot:
-    """Law of B-dot, and the torquers.
+    """Control law B-dot and its torquers.
 
     Attributes
     ----------
@@ -58,7 +58,7 @@ class BDot:
             raise ValueError(f"Input duty must be at most 1; instead received {self.duty}.")
 
     def moment_Am2(self, before_T: ArrayLike, now_T: ArrayLike, step_s: float) -> FloatArray:
-        """Moment (..., 3) to set until the next reading, while the torquers are on; zero without both readings.
+        """Return the moment (..., 3) until the next reading, while torquers are on; zero without both readings.
 
         Parameters
         ----------
@@ -68,10 +68,12 @@ class BDot:
             Between them.
         """
         now = np.asarray(now_T, dtype=np.float64)
-        return self._limited(now, (now - np.asarray(before_T, dtype=np.float64)) / step_s)
+        return self._limit(now, (now - np.asarray(before_T, dtype=np.float64)) / step_s)
 
     def moment_by_rate_Am2(self, field_T: ArrayLike, rate_rad_s: ArrayLike) -> FloatArray:
-        """Moment (..., 3) by an estimate of the rate, dB/dt = B×ω: no noise of two readings, nor the orbit's turn.
+        """Return the moment (..., 3) from an estimated rate, dB/dt = B×ω.
+
+        It has neither the noise of two readings nor the rotation of the field along the orbit.
 
         Parameters
         ----------
@@ -81,16 +83,16 @@ class BDot:
             To be taken out, body axes: against inertial space, or the orbital frame.
         """
         b = np.asarray(field_T, dtype=np.float64)
-        return self._limited(b, np.cross(b, np.asarray(rate_rad_s, dtype=np.float64)))
+        return self._limit(b, np.cross(b, np.asarray(rate_rad_s, dtype=np.float64)))
 
-    def _limited(self, b: FloatArray, change_T_s: FloatArray) -> FloatArray:
+    def _limit(self, b: FloatArray, change_T_s: FloatArray) -> FloatArray:
         wanted = -self.gain_Nms * change_T_s / np.sum(b * b, axis=-1, keepdims=True)
         return np.clip(np.nan_to_num(wanted), -self.largest_Am2, self.largest_Am2)
 
 
 @dataclass(frozen=True, eq=False)
 class HysteresisRods:
-    r"""Rods of soft iron across a satellite's magnet, which take its rate out without power.
+    r"""Rods of soft iron across a satellite's magnet, which damp its rotation without power.
 
     The model of Flatley and Henretty, solved: the flux is :math:`B = \frac{2 B_s}{\pi} \arctan(k z)` with
     :math:`k = \tan(\pi B_r / 2 B_s) / H_c`, of a field z that lags behind H by up to H_c:
@@ -153,11 +155,11 @@ class HysteresisRods:
             )
 
     def demagnetised(self) -> FloatArray:
-        """State (2, K) of rods that no field has met."""
+        """Return the state (2, K) of demagnetised rods."""
         return np.zeros((2, len(self.axes)))
 
     def followed(self, state_A_m: ArrayLike, field_T: ArrayLike) -> FloatArray:
-        """State (..., 2, K) of the rods, H and z of each, after the field has come to a new value without turning.
+        """Return the state (..., 2, K) of the rods, H and z, after a monotonic change of the field.
 
         Parameters
         ----------
@@ -176,7 +178,7 @@ class HysteresisRods:
         return np.stack([H, H - way * self.coercivity_A_m * (2.0 * (s + t) / (1.0 + s * t) - 1.0)], axis=-2)
 
     def moment_Am2(self, state_A_m: ArrayLike) -> FloatArray:
-        """Moment (..., 3) of all rods, B V/μ₀ along each, body axes.
+        """Return the moment (..., 3) of all rods, B V/μ₀ along each, body axes.
 
         Parameters
         ----------
@@ -189,12 +191,14 @@ class HysteresisRods:
 
     @property
     def steepness_m_A(self) -> float:
-        """k, of the arc tangent of the loop."""
+        """Coefficient k of the arc tangent of the loop."""
         return float(np.tan(0.5 * np.pi * self.remanence_T / self.saturation_T) / self.coercivity_A_m)
 
 
 def b_dot_gain(inertia_kgm2: ArrayLike, orbital_rate_rad_s: float) -> float:
-    """Gain k = 4 n I of B-dot, I the largest moment of inertia: with the smallest it takes six times as long.
+    """Return the gain k = 4 n I of B-dot.
+
+    I is the largest moment of inertia: with the smallest one detumbling takes six times as long.
 
     Parameters
     ----------
@@ -216,7 +220,7 @@ def b_dot_gain(inertia_kgm2: ArrayLike, orbital_rate_rad_s: float) -> float:
 def detumbled(
     law: BDot, momentum_Nms: ArrayLike, b_inertial_T: ArrayLike, inertia_kgm2: ArrayLike, step_s: float
 ) -> FloatArray:
-    r"""Momentum of a satellite under B-dot, by its mean torque alone: what a detumbling should take.
+    r"""Return the momentum of a satellite under B-dot, predicted by the mean torque alone.
 
     .. math::
 

@@ -1,9 +1,9 @@
 r"""Calibration of a magnetometer from a log and the field along the orbit, with or without the attitude.
 
-The magnetometer reads :math:`z = (E + D)\,b + o + n`: D has nine numbers, gains on its diagonal, o is the bias. Without
-an attitude each row tells a modulus, :math:`|(E + D)^{-1}(z - o)| = |b|`, and with one all of b. All numbers have a
-prior, so that what a log does not tell stays there and has its deviation. The field is that of the orbit at the
-time of the row plus a shift, one number more. See docs/theory/attitude-kalman-filters.md.
+The magnetometer reads :math:`z = (E + D)\,b + o + n`: D has nine parameters, gains on its diagonal, o is the bias.
+Without an attitude each row measures a modulus, :math:`|(E + D)^{-1}(z - o)| = |b|`, and with one all of b. All
+parameters have a prior, so that an unobservable one keeps its prior value and deviation. The field is that of the orbit
+at the time of the row plus a shift, the last parameter. See docs/theory/attitude-kalman-filters.md.
 """
 
 from __future__ import annotations
@@ -28,31 +28,31 @@ from arrays.typing import BoolArray, FloatArray
 from magloc.least_squares import damped_step, minimise
 
 Attitude = Literal["none", "orbital"]
-"""What is known of the attitude: nothing, or that it is constant in the frame of the model's field."""
+"""Known attitude: none, or constant in the frame of the model's field."""
 NAMES = (
     *(f"bias_{axis}" for axis in "xyz"),
     *(f"gain_{row}{column}" for row in "xyz" for column in "xyz"),
     "time_shift",
 )
-"""Numbers of the calibration, in the order of its covariance."""
+"""Parameters of the calibration, in the order of its covariance."""
 OUTLIER = 5.0
-"""Rows farther off than this times their spread are left out."""
+"""Rows with residuals beyond this times their spread are left out."""
 _ITERATIONS, _ROUNDS, _DECIMATED, _SETTLED, _FEWEST = 60, 10, 1000, 1e-4, 20
 _KNOT_S, _SHIFTS_S = 10.0, 15.0
-"""Between instants at which the field is computed, and between shifts that are tried: it changes over minutes."""
+"""Steps of the instants of the model and of the shifts that are tried: the field changes over minutes."""
 _LONGEST_SHIFT_S = 3600.0  # the field is computed along the orbit three times as far, before and after
 
 
 @dataclass(frozen=True)
 class MagnetometerPrior:
-    """One standard deviation of everything, before the log is read.
+    """Prior standard deviations of a magnetometer's noise and calibration.
 
     Attributes
     ----------
     noise_T, bias_T : float
-        Of a reading of an axis, and of the bias.
+        Standard deviations of a reading of an axis, and of the bias.
     gain, axes_rad : float
-        Of the gains, and of the angles by which axes are off.
+        Of the gains, and of the misalignment of the axes.
     field_error_T, field_correlation_s : float
         Of a component of the model's error, and its time constant.
     time_shift_s : float
@@ -91,7 +91,7 @@ class MagnetometerPrior:
 
     @property
     def deviations(self) -> FloatArray:
-        """Of :data:`NAMES`, shape (13,)."""
+        """Standard deviations of :data:`NAMES`, shape (13,)."""
         D = np.where(np.eye(3), self.gain, self.axes_rad).ravel()
         return np.concatenate([np.full(3, self.bias_T), D, [self.time_shift_s]])
 
@@ -107,19 +107,19 @@ class MagnetometerCalibration(Drawn):
     gain : ndarray, shape (3, 3)
         D.
     time_shift_s : float
-        The field at a row is the model's so much later.
+        Time shift of the model: the field at a row is that of the model so much later.
     covariance : ndarray, shape (13, 13)
-        Of :data:`NAMES`, prior included.
+        Covariance of :data:`NAMES`, prior included.
     prior : MagnetometerPrior
-        What was known before.
+        Prior of the calibration.
     residual_T : ndarray, shape (n,) or (n, 3)
         Calibrated modulus, or field, minus the model; NaN of a row that is left out.
     raw_rms_T : float
         Rms of the same rows without a calibration; of an unknown attitude that of the modulus.
     chi2, dof : float, int
-        Of the whitened rows that are used, and their number.
+        Sum of squares of the whitened rows that are used, and their number.
     used : ndarray of bool, shape (n,)
-        Rows that are there and fit the others.
+        Rows with readings that fit the others.
     """
 
     figure = "adcs.plots.magnetometers:magnetometer_figure"
@@ -142,17 +142,17 @@ class MagnetometerCalibration(Drawn):
 
     @property
     def misfit(self) -> float:
-        """Deviations by which χ² is beyond what is expected of rows as they are stated."""
+        """Excess of χ² over its expectation, in standard deviations."""
         return (self.chi2 - self.dof) / math.sqrt(2.0 * self.dof)
 
     @property
     def rms_T(self) -> float:
-        """Rms of the residuals that are used."""
+        """Rms of the used residuals."""
         return float(np.sqrt(np.nanmean(self.residual_T**2)))
 
     @property
     def undetermined(self) -> tuple[str, ...]:
-        """Numbers of which the log told less than half of the prior's variance."""
+        """Parameters whose variance the log reduces by less than half."""
         prior = self.prior.deviations
         return tuple(
             name
@@ -161,24 +161,24 @@ class MagnetometerCalibration(Drawn):
         )
 
     def applied(self, readings_T: ArrayLike) -> FloatArray:
-        """Fields (..., 3) of readings (..., 3)."""
+        """Return the fields (..., 3) of readings (..., 3)."""
         return turned(np.linalg.inv(np.eye(3) + self.gain), np.asarray(readings_T, dtype=np.float64) - self.bias_T)
 
 
-class _Rows(NamedTuple):
-    """Rows with readings, and the model of the field through time."""
+class _FieldRows(NamedTuple):
+    """Rows with readings, and the model of the field over time."""
 
     time_s: FloatArray
     readings_T: FloatArray
     model: Callable[[FloatArray], FloatArray]
     slope: Callable[[FloatArray], FloatArray]
 
-    def some(self, which: BoolArray | slice) -> _Rows:
-        """Some of the rows."""
+    def select(self, which: BoolArray | slice) -> _FieldRows:
+        """Select some of the rows."""
         return self._replace(time_s=self.time_s[which], readings_T=self.readings_T[which])
 
 
-_Linearised = Callable[[_Rows, FloatArray, MagnetometerPrior], tuple[FloatArray, FloatArray]]
+_Linearised = Callable[[_FieldRows, FloatArray, MagnetometerPrior], tuple[FloatArray, FloatArray]]
 """Residuals (n,) or (n, 3) and their derivatives (..., 13) at parameters (13,)."""
 
 
@@ -227,10 +227,10 @@ def calibrate_magnetometer(
     start = satellite.start + np.timedelta64(round(1e6 * first_s), "us")
     around = environment(satellite.orbit, start, since_s, model=satellite.field_model)
     along = first_s + since_s, around.b_orbital_T
-    return calibrated(telemetry.time_s, telemetry.field_T, *along, prior=prior, attitude=attitude)
+    return calibrate_readings(telemetry.time_s, telemetry.field_T, *along, prior=prior, attitude=attitude)
 
 
-def calibrated(
+def calibrate_readings(
     time_s: ArrayLike,
     readings_T: ArrayLike,
     model_time_s: ArrayLike,
@@ -239,30 +239,30 @@ def calibrated(
     prior: MagnetometerPrior,
     attitude: Attitude,
 ) -> MagnetometerCalibration:
-    """Calibrate readings against a model of the field through time, as :func:`calibrate_magnetometer`.
+    """Calibrate readings against a model of the field over time, as :func:`calibrate_magnetometer`.
 
     ``time_s`` (n,), ``readings_T`` (n, 3): ascending times, rows with a NaN are left out. ``model_time_s`` (m,),
-    ``model_T`` (m, 3): the model's field, of an attitude that is constant in the frame in which that is; it must reach
-    beyond the rows by three deviations of the shift.
+    ``model_T`` (m, 3): the model's field, in a frame in which a known attitude is constant; it must extend beyond the
+    rows by three deviations of the shift.
     """
     times, readings = np.asarray(time_s, dtype=np.float64), np.asarray(readings_T, dtype=np.float64)
     knots = CubicSpline(np.asarray(model_time_s, dtype=np.float64), np.asarray(model_T, dtype=np.float64))
-    rows = _Rows(times, readings, knots, knots.derivative())
+    rows = _FieldRows(times, readings, knots, knots.derivative())
     used: BoolArray = np.isfinite(readings).all(axis=1)  # type: ignore[assignment]
     _check_enough(used)
-    linearised = _modulus if attitude == "none" else _OfOrbital(_orbital_frame(rows.some(used), prior))
-    x = _started(rows.some(used), prior, linearised)
+    linearised = _modulus if attitude == "none" else _OrbitalResiduals(_orbital_frame(rows.select(used), prior))
+    x = _fit_shifts(rows.select(used), prior, linearised)
     for _ in range(_ROUNDS):
-        fit = _fitted(rows.some(used), prior, linearised, x)
+        fit = _maximise_posterior(rows.select(used), prior, linearised, x)
         x = fit.x
-        far = _far(linearised(rows.some(used), x, prior)[0], prior)
+        far = _outliers(linearised(rows.select(used), x, prior)[0], prior)
         if not far.any():
             break
         used[np.flatnonzero(used)[far]] = False
         _check_enough(used)
-    kept = rows.some(used)
+    kept = rows.select(used)
     residual = linearised(kept, x, prior)[0]
-    whitened = _whitened(kept.time_s, residual.reshape(len(kept.time_s), -1), prior)
+    whitened = _whiten(kept.time_s, residual.reshape(len(kept.time_s), -1), prior)
     all_of = np.full((len(times), *residual.shape[1:]), np.nan)
     all_of[used] = residual
     raw = linearised(kept, np.concatenate([np.zeros(12), x[12:]]), prior)[0]
@@ -282,15 +282,15 @@ def calibrated(
 
 
 def _check_enough(used: BoolArray) -> None:
-    """Raise where too few rows are left."""
+    """Raise ValueError if too few rows are left."""
     if used.sum() < _FEWEST:
         raise ValueError(
             f"Input found {used.sum()} rows of the magnetometer that fit each other, expected {_FEWEST} or more."
         )
 
 
-def _modulus(rows: _Rows, x: FloatArray, prior: MagnetometerPrior) -> tuple[FloatArray, FloatArray]:
-    """Calibrated modulus minus the model's."""
+def _modulus(rows: _FieldRows, x: FloatArray, prior: MagnetometerPrior) -> tuple[FloatArray, FloatArray]:
+    """Return the calibrated modulus minus that of the model, and its derivatives."""
     inverse = np.linalg.inv(np.eye(3) + x[3:12].reshape(3, 3))
     at = rows.time_s + x[12]
     b, slope = rows.model(at), rows.slope(at)
@@ -299,20 +299,20 @@ def _modulus(rows: _Rows, x: FloatArray, prior: MagnetometerPrior) -> tuple[Floa
     modulus = np.linalg.norm(field, axis=1)
     n = field / modulus[:, None]
     across = n @ inverse
-    # At the model's modulus: with that of the readings their noise, squared, feigns knowledge of what they do not tell.
+    # At the model's modulus: the squared noise of the readings would count as information on unobservable parameters.
     by_gain = -(across[:, :, None] * (n * length[:, None])[:, None, :]).reshape(-1, 9)
     by_shift = -np.sum(b * slope, axis=1) / length
     # Noise across the field makes it longer.
     return modulus - length - prior.noise_T**2 / length, np.concatenate([-across, by_gain, by_shift[:, None]], axis=1)
 
 
-class _OfOrbital:
-    """Readings minus those of an attitude that is constant, body from the model's frame."""
+class _OrbitalResiduals:
+    """Residuals of readings for a constant attitude, body from the model's frame."""
 
     def __init__(self, rotation: FloatArray) -> None:
         self.rotation = rotation
 
-    def __call__(self, rows: _Rows, x: FloatArray, prior: MagnetometerPrior) -> tuple[FloatArray, FloatArray]:
+    def __call__(self, rows: _FieldRows, x: FloatArray, prior: MagnetometerPrior) -> tuple[FloatArray, FloatArray]:
         at = rows.time_s + x[12]
         b, slope = (values @ self.rotation.T for values in (rows.model(at), rows.slope(at)))
         gain = np.eye(3) + x[3:12].reshape(3, 3)
@@ -323,8 +323,8 @@ class _OfOrbital:
         return rows.readings_T - b @ gain.T - x[:3], by
 
 
-def _orbital_frame(rows: _Rows, prior: MagnetometerPrior) -> FloatArray:
-    """Rotation, body from the model's frame, of the best affine map at any shift of the grid."""
+def _orbital_frame(rows: _FieldRows, prior: MagnetometerPrior) -> FloatArray:
+    """Return the rotation, body from the model's frame, of the best affine map over shifts."""
     best, rotation = math.inf, np.eye(3)
     for shift in _grid(prior):
         b = rows.model(rows.time_s + shift)
@@ -338,28 +338,28 @@ def _orbital_frame(rows: _Rows, prior: MagnetometerPrior) -> FloatArray:
 
 
 def _grid(prior: MagnetometerPrior) -> FloatArray:
-    """Shifts within three deviations."""
+    """Return shifts within three deviations."""
     reach = 3.0 * prior.time_shift_s
     return np.linspace(-reach, reach, 1 + 2 * math.ceil(reach / _SHIFTS_S))
 
 
-def _started(rows: _Rows, prior: MagnetometerPrior, linearised: _Linearised) -> FloatArray:
-    """Parameters at the shift of the grid that fits best; few rows tell."""
-    few = rows.some(slice(None, None, 1 + len(rows.time_s) // _DECIMATED))
+def _fit_shifts(rows: _FieldRows, prior: MagnetometerPrior, linearised: _Linearised) -> FloatArray:
+    """Return the parameters at the best shift of the grid, by a part of the rows."""
+    few = rows.select(slice(None, None, 1 + len(rows.time_s) // _DECIMATED))
     starts = []
     for shift in _grid(prior):
         x = np.concatenate([np.zeros(12), [shift]])
-        x = _fitted(few, replace(prior, time_shift_s=0.0), linearised, x, most=4).x
+        x = _maximise_posterior(few, replace(prior, time_shift_s=0.0), linearised, x, most=4).x
         residual = np.abs(linearised(few, x, prior)[0])
         starts.append((float(np.median(residual)), x))
     return min(starts, key=lambda start: start[0])[1]
 
 
 @dataclass(frozen=True, eq=False)
-class _Fit:
-    """Parameters (13,) with the prior about what is held of the first ones: a prior of zero holds a number."""
+class _Posterior:
+    """Posterior at parameters (13,); a prior deviation of zero holds a parameter at its first value."""
 
-    rows: _Rows
+    rows: _FieldRows
     prior: MagnetometerPrior
     linearised: _Linearised
     x: FloatArray
@@ -367,54 +367,54 @@ class _Fit:
 
     @cached_property
     def _white(self) -> FloatArray:
-        """Residuals (n,) and their derivatives (n, 13) in units of the prior's deviations."""
+        """Whitened residuals (n,) and their derivatives (n, 13) in units of the prior's deviations."""
         residual, by = self.linearised(self.rows, self.x, self.prior)
         n = len(self.rows.time_s)
         both = np.concatenate([residual.reshape(n, -1, 1), (by * self.prior.deviations).reshape(n, -1, 13)], axis=2)
-        return _whitened(self.rows.time_s, both.reshape(n, -1), self.prior).reshape(-1, 14)
+        return _whiten(self.rows.time_s, both.reshape(n, -1), self.prior).reshape(-1, 14)
 
     @cached_property
     def _off(self) -> FloatArray:
-        """Parameters from the prior's, in its deviations."""
+        """Parameters minus those of the prior, in its deviations."""
         deviations = self.prior.deviations
         return np.divide(self.x - self.first, deviations, out=np.zeros(13), where=deviations > 0.0)
 
     @property
     def cost(self) -> float:
-        """Of rows and prior."""
+        """Cost of rows and prior."""
         return float(self._white[:, 0] @ self._white[:, 0] + self._off @ self._off)
 
     @property
     def information(self) -> FloatArray:
-        """H (13, 13) of the rows."""
+        """Information H (13, 13) of the rows."""
         return np.asarray(self._white[:, 1:].T @ self._white[:, 1:])
 
-    def step(self, damping: float) -> tuple[_Fit, float]:
-        """The parameters after a damped step."""
+    def step(self, damping: float) -> tuple[_Posterior, float]:
+        """Return the parameters after a damped step."""
         gradient = self._white[:, 1:].T @ self._white[:, 0] + self._off
         step, promised = damped_step(self.information + np.eye(13), gradient, damping)
         return replace(self, x=self.x + self.prior.deviations * step), promised
 
 
-def _fitted(
-    rows: _Rows, prior: MagnetometerPrior, linearised: _Linearised, x: FloatArray, most: int = _ITERATIONS
-) -> _Fit:
-    """Parameters of the largest posterior."""
-    start = _Fit(rows, prior, linearised, x, x * (prior.deviations == 0.0))
+def _maximise_posterior(
+    rows: _FieldRows, prior: MagnetometerPrior, linearised: _Linearised, x: FloatArray, most: int = _ITERATIONS
+) -> _Posterior:
+    """Maximise the posterior."""
+    start = _Posterior(rows, prior, linearised, x, x * (prior.deviations == 0.0))
     return minimise(start, lambda _: _SETTLED, max_iterations=most).point
 
 
-def _far(residual: FloatArray, prior: MagnetometerPrior) -> BoolArray:
-    """Rows (n,) that are beyond :data:`OUTLIER` times what is stated, and times what the rows show themselves."""
+def _outliers(residual: FloatArray, prior: MagnetometerPrior) -> BoolArray:
+    """Return rows (n,) beyond :data:`OUTLIER` times the stated noise and times the spread of the rows."""
     size = np.abs(residual).reshape(len(residual), -1).max(axis=1)
     spread = 1.4826 * float(np.median(np.abs(residual)))
     return size > OUTLIER * max(spread, math.hypot(prior.noise_T, prior.field_error_T))
 
 
-def _whitened(time_s: FloatArray, columns: FloatArray, prior: MagnetometerPrior) -> FloatArray:
-    """Columns (n, k), each with white noise and an Ornstein-Uhlenbeck error, as innovations over their deviation.
+def _whiten(time_s: FloatArray, columns: FloatArray, prior: MagnetometerPrior) -> FloatArray:
+    """Whiten columns (n, k) with white noise and an Ornstein-Uhlenbeck error.
 
-    A Kalman filter of one number whose gains do not depend on the columns.
+    The result is the normalised innovation of a scalar Kalman filter, whose gains do not depend on the columns.
     """
     decay = np.exp(-np.diff(time_s, prepend=time_s[0]) / prior.field_correlation_s)
     stationary, noise = prior.field_error_T**2, prior.noise_T**2

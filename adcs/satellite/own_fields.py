@@ -1,4 +1,4 @@
-"""A satellite's own fields: what loads, magnets and torquers that switch do to each of its magnetometers.
+"""Fields of a satellite's own loads, magnets and torquers at each of its magnetometers.
 
 Around a switch the ambient field, seen from axes that stand still, is a smooth function of time, and what switches adds
 a step. Fields y_i at a magnetometer in body axes, turned by the gyro (D_i) into those of the instant of the switch, are
@@ -33,7 +33,7 @@ from magloc.localization.fit.results import Fix
 from magloc.localization.locator import Locator
 
 WINDOW_S = 8.0
-"""Before and after a switch: longer, and the ambient field is no parabola."""
+"""Time before and after a switch; over a longer time the ambient field is no parabola."""
 _DEGREE = 2
 _LEAST_ROWS = 6
 _AMBIENT_T = 30e-6
@@ -49,7 +49,7 @@ _OTHERS = 12
 
 
 @dataclass(frozen=True)
-class Lag:
+class StateLag:
     """Time by which the field changes later than the states.
 
     Attributes
@@ -95,8 +95,8 @@ class Lag:
             "the states; the fields are corrected for it",
         )
 
-    def delayed(self, time_s: FloatArray, s: FloatArray) -> FloatArray:
-        """Return the states (n, K) that act at the rows; NaN where a state changes within the bounds."""
+    def delay(self, time_s: FloatArray, s: FloatArray) -> FloatArray:
+        """Delay the states (n, K) to the rows at which they act; NaN between the bounds of a change."""
         tolerance = 1e-3 * self.step_s
         first = np.searchsorted(time_s, time_s - self.most_rows * self.step_s + tolerance, side="right") - 1
         last = np.searchsorted(time_s, time_s - self.least_rows * self.step_s - tolerance)
@@ -126,7 +126,7 @@ class OwnFields(Drawn):
         Standard deviation of a component of what the regression leaves.
     chi2_per_dof : float
         Mean square of that over the noise that the array states; 1 where all is as stated.
-    lag : Lag
+    lag : StateLag
         Between states and readings, which the fields are corrected for.
 
     Examples
@@ -148,7 +148,7 @@ class OwnFields(Drawn):
     switches: NDArray[np.int64]
     noise_T: FloatArray
     chi2_per_dof: float
-    lag: Lag
+    lag: StateLag
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -177,7 +177,7 @@ class OwnFields(Drawn):
         """
         s = _states(states, self.names, len(np.asarray(readings_T)))
         times = np.asarray(self.lag.step_s * np.arange(len(s)) if time_s is None else time_s, dtype=np.float64)
-        s = self.lag.delayed(times, s)
+        s = self.lag.delay(times, s)
         fields = np.einsum("nk,kmi->nmi", s, self.vectors_T)
         return np.asarray(readings_T) - self.array.readings_of(fields) + self.array.channel_offset_T
 
@@ -267,7 +267,7 @@ def find_own_fields(
     used: BoolArray = np.isfinite(np.concatenate([readings, gyro], axis=1)).all(axis=1)
     turns = _turns(times, gyro)
     whole = _whole_lag(times, fields, turns, s)
-    lag, fit = _lag_between_rows(whole, lambda lag: _fit(times, lag.delayed(times, s), fields, used, turns, window_s))
+    lag, fit = _lag_between_rows(whole, lambda lag: _fit(times, lag.delay(times, s), fields, used, turns, window_s))
     vectors, deviations, noise, _ = fit
     for name, deviation in zip(names, deviations, strict=True):
         if deviation.max() > _UNKNOWN * _PRIOR_T:
@@ -283,7 +283,7 @@ def find_own_fields(
 def _fit(
     times: FloatArray, s: FloatArray, fields: FloatArray, used: BoolArray, turns: FloatArray, window_s: float
 ) -> _Fitted:
-    """Fields, deviations, noise and degrees of freedom by all switches of states (n, K), NaN where not known."""
+    """Fit fields, deviations, noise and degrees of freedom by all switches of states (n, K)."""
     known = np.flatnonzero(np.isfinite(s).all(axis=1))
     windows = [known[rows] for rows in _windows(times[known], s[known], used[known], window_s)]
     if 3 * sum(len(rows) - _DEGREE - 1 for rows in windows) <= 3 * s.shape[1] + _OTHERS:
@@ -293,26 +293,27 @@ def _fit(
     D = [_attitudes(turns, rows) for rows in windows]
     fitted = np.zeros((s.shape[1], fields.shape[1], 3)), np.zeros(0), np.zeros(0), 0
     for _ in range(2):
-        # The second time without the steps, of which the gains' errors would take a hundredth for the ambient field's.
+        # The second round removes the steps: errors of the gains would absorb a hundredth of them.
         ambient = np.mean(fields - np.einsum("nk,kmi->nmi", s, fitted[0]), axis=1)
         fitted = _regression(
-            [_projected(times[i], R, s[i], fields[i], ambient[i]) for i, R in zip(windows, D, strict=True)], s.shape[1]
+            [_project_ambient(times[i], R, s[i], fields[i], ambient[i]) for i, R in zip(windows, D, strict=True)],
+            s.shape[1],
         )
     return fitted
 
 
 @np.errstate(over="ignore", invalid="ignore")
-def _whole_lag(times: FloatArray, fields: FloatArray, turns: FloatArray, s: FloatArray) -> Lag:
-    """Lag in whole rows at which switches explain most of what the fields jump by between two rows."""
+def _whole_lag(times: FloatArray, fields: FloatArray, turns: FloatArray, s: FloatArray) -> StateLag:
+    """Return the lag in whole rows for which switches best explain the jumps between two rows."""
     steps, changes = np.diff(times), np.diff(s / np.maximum(np.abs(s).max(axis=0), np.finfo(float).tiny), axis=0)
     step_s, switches = float(np.median(steps)), np.flatnonzero((changes != 0.0).any(axis=1))
     jumps = np.einsum("nij,nmj->nmi", quaternion.matrix(turns[1:]), fields[1:]) - fields[:-1]
-    # Less what the steps before and after lead to expect, in deviations.
+    # Subtract the mean slope before and after, and divide by the deviation.
     slopes = (jumps[:-2] + jumps[2:]) / (steps[:-2] + steps[2:])[:, None, None]
     jumps = (jumps[1:-1] - steps[1:-1, None, None] * slopes).reshape(len(slopes), 3 * fields.shape[1])
     jumps = jumps[:, np.isfinite(jumps).any(axis=0)]
     if not jumps.size:
-        return Lag(0, 0, step_s, is_known=False)
+        return StateLag(0, 0, step_s, is_known=False)
     jumps /= np.maximum(1.4826 * np.nanmedian(np.abs(jumps), axis=0), 1e-12)
     longest = int(min(LONGEST_LAG_S / step_s, len(times)))
     lags = np.arange(-longest, longest + 1)
@@ -328,11 +329,11 @@ def _whole_lag(times: FloatArray, fields: FloatArray, turns: FloatArray, s: Floa
     alike = lags[explained >= explained.max(initial=0.0) - limit]
     best = 0 if not alike.size or 0 in alike else int(lags[np.argmax(explained)])
     is_known = bool(explained.max(initial=0.0) > limit and (np.abs(alike - best) <= 1).all())
-    return Lag(best if is_known else 0, best if is_known else 0, step_s, is_known)
+    return StateLag(best if is_known else 0, best if is_known else 0, step_s, is_known)
 
 
-def _lag_between_rows(whole: Lag, fit: Callable[[Lag], _Fitted]) -> tuple[Lag, _Fitted]:
-    """Narrowest bounds about a lag in whole rows within which no row beside the switches contradicts, and their fit."""
+def _lag_between_rows(whole: StateLag, fit: Callable[[StateLag], _Fitted]) -> tuple[StateLag, _Fitted]:
+    """Return the narrowest bounds of the lag that fit the rows next to the switches, and their fit."""
     first = fit(whole)
     if not whole.is_known:
         return whole, first
@@ -350,7 +351,7 @@ def _lag_between_rows(whole: Lag, fit: Callable[[Lag], _Fitted]) -> tuple[Lag, _
 
 
 def _states(states: Mapping[str, ArrayLike], names: tuple[str, ...], n: int) -> FloatArray:
-    """States (n, K) of the loads."""
+    """Return the states (n, K) of the loads."""
     if not names or set(names) - set(states):
         raise ValueError(
             f"Input states must have {', '.join(names) or 'a load'}; instead received {', '.join(states)}."
@@ -365,7 +366,7 @@ def _states(states: Mapping[str, ArrayLike], names: tuple[str, ...], n: int) -> 
 
 
 def _windows(time_s: FloatArray, s: FloatArray, used: BoolArray, window_s: float) -> list[NDArray[np.intp]]:
-    """Rows of each switch: those within the window, and nearer to it than to another one."""
+    """Return the rows of each switch: within the window, and nearest to this switch."""
     switches = np.flatnonzero((np.diff(s, axis=0) != 0.0).any(axis=1))
     if not switches.size:
         return []
@@ -377,7 +378,7 @@ def _windows(time_s: FloatArray, s: FloatArray, used: BoolArray, window_s: float
 
 
 def _turns(time_s: FloatArray, gyro_rad_s: FloatArray) -> FloatArray:
-    """Rotations (n, 4) of the steps that end at each instant, by a spline of the rates and the coning of its ends."""
+    """Return the rotations (n, 4) of the steps to each instant, by a spline of the rates with coning."""
     from scipy.interpolate import CubicSpline
 
     read = np.isfinite(gyro_rad_s).all(axis=1)
@@ -390,19 +391,19 @@ def _turns(time_s: FloatArray, gyro_rad_s: FloatArray) -> FloatArray:
 
 
 def _attitudes(turns: FloatArray, rows: NDArray[np.intp]) -> FloatArray:
-    """Attitudes (len(rows), 3, 3) of rows against the first of them, from the turns (n, 4) of all steps."""
+    """Return attitudes (len(rows), 3, 3) relative to the first row, from the rotations (n, 4) of steps."""
     q = [quaternion.IDENTITY]
     for turn in turns[rows[0] + 1 : rows[-1] + 1]:
         q.append(quaternion.multiply(q[-1], turn))
     return quaternion.matrix(np.array(q)[rows - rows[0]])
 
 
-def _projected(
+def _project_ambient(
     time_s: FloatArray, D: FloatArray, s: FloatArray, fields: FloatArray, ambient: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Design (3n, 3K + 12) and fields (3n, M) of a window without their parabolas in time.
+    """Project the parabola in time out of design (3n, 3K + 12) and fields (3n, M) of a window.
 
-    ``ambient`` (n, 3): about the field that is not the satellite's own; what an error of gains or axes makes of it.
+    ``ambient`` (n, 3): approximate ambient field, for the columns of errors of gains and axes.
     """
     n = len(time_s)
     regressors = np.concatenate([s, np.ones((n, 1))], axis=1)
@@ -419,7 +420,7 @@ def _projected(
 
 
 def _inverse(normal: FloatArray) -> FloatArray:
-    """Of a positive definite matrix, which the result is too, whatever rounding has left of its least eigenvalues."""
+    """Return the positive definite inverse of a normal matrix, robust to rounding of small eigenvalues."""
     scale = 1.0 / np.sqrt(np.diagonal(normal))
     values, vectors = np.linalg.eigh(scale[:, None] * normal * scale)
     root = scale[:, None] * vectors / np.sqrt(np.maximum(values, np.finfo(float).eps * values[-1]))
@@ -427,11 +428,14 @@ def _inverse(normal: FloatArray) -> FloatArray:
 
 
 def _regression(windows: Sequence[tuple[FloatArray, FloatArray]], loads: int) -> _Fitted:
-    """Fields (K, M, 3), deviations, noise (M,) and degrees of freedom by M least squares of one design, weak prior."""
+    """Solve M least squares of one design with a weak prior.
+
+    Returns fields (K, M, 3), deviations, noise (M,) and degrees of freedom.
+    """
     A, y = (np.concatenate(parts) for parts in zip(*windows, strict=True))
     dof = len(A) - 3 * (_DEGREE + 1) * len(windows) - A.shape[1]
     normal = A.T @ A
-    # The prior in units of a noise that is not known yet, twice: the second time it is.
+    # The weight of the prior depends on the noise, which the first round estimates.
     noise = np.full(y.shape[1], np.sqrt(np.mean(y**2)))
     for _ in range(2):
         inverse = [_inverse(normal + np.eye(len(normal)) * (one / _PRIOR_T) ** 2) for one in noise]

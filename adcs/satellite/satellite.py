@@ -1,4 +1,4 @@
-"""A satellite as its user knows it."""
+"""Description of a satellite by its user."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from magloc.fields.geomagnetic import Model
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Satellite:
-    """A satellite, its orbit and its sensors.
+    """Satellite with its orbit and its sensors.
 
     Attributes
     ----------

@@ -26,18 +26,18 @@ SENSORS = ("st", "gyro", "mag", "sun")
 """Names of star tracker, gyro, magnetometer and Sun sensor, in the order in which filters take them."""
 SENSOR_WORDS = dict(zip(SENSORS, ("star tracker", "gyro", "magnetometer", "Sun sensor"), strict=True))
 NIS_SIZES = dict(zip(SENSORS, (3, 3, 3, 2), strict=True))
-"""Numbers of which the normalised square of a sensor's innovation is a χ²; a direction to the Sun has two."""
+"""Degrees of freedom of a sensor's NIS; a direction to the Sun has two."""
 
 
-def _aligned() -> FloatArray:
+def _zero_misalignment() -> FloatArray:
     return np.zeros(3)
 
 
 class _Sensor:
-    """What is checked of all sensors."""
+    """Checks of the parameters of all sensors."""
 
     def __post_init__(self) -> None:
-        """Raise if a number is not finite or negative, or a noise, range, limit or field not positive."""
+        """Raise ValueError if a parameter is not finite, negative, or zero where it must be positive."""
         for name, value in vars(self).items():
             values = np.array(value, dtype=np.float64)
             if np.isnan(values).any():
@@ -82,7 +82,7 @@ class StarTracker(_Sensor):
     boresight_body: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
     sun_exclusion_rad: float = 0.0
     earth_exclusion_rad: float = 0.0
-    misalignment_rad: FloatArray = field(default_factory=_aligned)
+    misalignment_rad: FloatArray = field(default_factory=_zero_misalignment)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -116,7 +116,7 @@ class Gyro(_Sensor):
     sigma_rad_s: float = math.radians(0.005)
     range_rad_s: float = math.radians(250.0)
     bias_walk_rad_s: float = 0.0
-    misalignment_rad: FloatArray = field(default_factory=_aligned)
+    misalignment_rad: FloatArray = field(default_factory=_zero_misalignment)
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +143,7 @@ class Magnetometer(_Sensor):
     sigma_T: float = 250e-9
     range_T: float = 200_000e-9
     bias_walk_T: float = 0.0
-    misalignment_rad: FloatArray = field(default_factory=_aligned)
+    misalignment_rad: FloatArray = field(default_factory=_zero_misalignment)
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +171,7 @@ class SunSensor(_Sensor):
     sigma_rad: float = math.radians(0.1)
     heads_body: FloatArray = field(default_factory=lambda: FIVE_HEADS.copy())
     half_field_rad: float = math.radians(45.0)
-    misalignment_rad: FloatArray = field(default_factory=_aligned)
+    misalignment_rad: FloatArray = field(default_factory=_zero_misalignment)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -191,12 +191,12 @@ def star_tracker_readings(
     illuminated: ArrayLike,
     unit_noise: ArrayLike,
 ) -> FloatArray:
-    """Attitudes that a star tracker reports, q∘exp of misalignment and noise.
+    """Return the readings of a star tracker, q∘exp of misalignment and noise.
 
     Shape ``unit_noise`` (..., 3). ``q`` (..., 4): true attitude, orbital from body. ``w`` (..., 3): true rate [rad/s].
-    ``sun_orbital`` (..., 3): unit vector to the Sun; it blinds the tracker only where some of it is seen.
-    ``earth_radius_rad`` (...): angular radius of the Earth, around nadir. ``illuminated`` (...): part of the Sun that
-    is seen. Returns (..., 4): orbital from body, NaN where there is none.
+    ``sun_orbital`` (..., 3): unit vector to the Sun, which blinds the tracker unless it is eclipsed.
+    ``earth_radius_rad`` (...): angular radius of the Earth, around nadir. ``illuminated`` (...): visible part of the
+    Sun. Returns (..., 4): orbital from body, NaN without a reading.
     """
     delta = tracker.sigma_rad * np.asarray(unit_noise, dtype=np.float64)
     turned_by = quaternion.multiply(quaternion.exp(tracker.misalignment_rad), quaternion.from_error_vector(delta))
@@ -212,35 +212,35 @@ def star_tracker_readings(
 
 
 def gyro_readings(gyro: Gyro, w: ArrayLike, bias_rad_s: ArrayLike, unit_noise: ArrayLike) -> FloatArray:
-    """Rates that a gyro reports [rad/s]; all arguments (..., 3), NaN for all axes where one is beyond the range."""
+    """Return the readings of a gyro [rad/s]; arguments (..., 3), NaN if an axis is beyond the range."""
     return _vector_readings(w, gyro.misalignment_rad, bias_rad_s, gyro.sigma_rad_s, unit_noise, gyro.range_rad_s)
 
 
 def magnetometer_readings(
     magnetometer: Magnetometer, b_body_T: ArrayLike, bias_T: ArrayLike, unit_noise: ArrayLike
 ) -> FloatArray:
-    """Fields that a magnetometer reports [T]; all arguments (..., 3), NaN as :func:`gyro_readings`."""
+    """Return the readings of a magnetometer [T]; arguments (..., 3), NaN as in :func:`gyro_readings`."""
     m = magnetometer
     return _vector_readings(b_body_T, m.misalignment_rad, bias_T, m.sigma_T, unit_noise, m.range_T)
 
 
 def sun_readings(sensor: SunSensor, sun_body: ArrayLike, illuminated: ArrayLike, unit_noise: ArrayLike) -> FloatArray:
-    """Directions that the Sun heads report.
+    """Return the readings of the Sun heads.
 
-    Noise turns the direction by ``sigma_rad`` along each of two axes across it: three numbers per component are added
-    and the sum is normalised, which leaves nothing along it.
-    Shape ``unit_noise`` (..., 3). ``sun_body`` (..., 3): true unit vector. ``illuminated`` (...): part of the Sun that
-    is seen; at least half is needed. Returns (..., 3): unit vectors, NaN where no head sees the Sun.
+    Noise rotates the direction by ``sigma_rad`` about each of two axes across it: noise is added to all three
+    components, and normalising the sum removes the part along the direction.
+    Shape ``unit_noise`` (..., 3). ``sun_body`` (..., 3): true unit vector. ``illuminated`` (...): visible part of the
+    Sun; at least half is needed. Returns (..., 3): unit vectors, NaN if no head sees the Sun.
     """
     sun = np.asarray(sun_body, dtype=np.float64)
-    seen = in_field(sensor, sun).any(axis=-1) & (np.asarray(illuminated) >= 0.5)
+    seen = is_in_field(sensor, sun).any(axis=-1) & (np.asarray(illuminated) >= 0.5)
     noise = sensor.sigma_rad * np.asarray(unit_noise, dtype=np.float64)
     reading = quaternion.rotate_back(quaternion.exp(sensor.misalignment_rad), sun) + noise
     return np.where(seen[..., None], reading / np.linalg.norm(reading, axis=-1, keepdims=True), np.nan)
 
 
-def in_field(sensor: SunSensor, direction_body: ArrayLike) -> BoolArray:
-    """Which heads have a direction in their square fields. Directions (..., 3) -> (..., h)."""
+def is_in_field(sensor: SunSensor, direction_body: ArrayLike) -> BoolArray:
+    """Return which heads have a direction in their square fields, (..., 3) -> (..., h)."""
     axes = np.stack([_head_axes(axis) for axis in sensor.heads_body])
     along = np.einsum("hij,...j->...hi", axes, np.asarray(direction_body, dtype=np.float64))
     angles = np.abs(np.arctan2(along[..., :2], along[..., 2:]))
@@ -259,7 +259,10 @@ def _vector_readings(
 
 
 def _head_axes(axis: FloatArray) -> FloatArray:
-    """Rows: two sides of the square field and the axis. The first side is along the body axis that is most across."""
+    """Return two sides of the square field and the axis as rows.
+
+    The first side is along the body axis with the largest angle to the head's axis.
+    """
     side = np.eye(3)[np.argmin(np.abs(axis))]
     x = side - axis * (axis @ side)
     x = x / np.linalg.norm(x)

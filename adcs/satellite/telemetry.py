@@ -1,7 +1,7 @@
-"""What the filters of attitude are given: readings, wheels and surroundings of some runs at once.
+"""Input of the attitude filters: readings, wheels and environment of one or several runs.
 
-:class:`sims.attitude.simulation.AttitudeRuns` is a :class:`Record` with the truth, and a log, :class:`Telemetry`, gives
-one without it. The leading axis of all arrays is the run, the second the instant.
+:class:`sims.attitude.simulation.AttitudeRuns` is a :class:`Record` with the truth; a log, :class:`Telemetry`, gives one
+without it. The leading axis of all arrays is the run, the second the instant.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ _MOST_STEPS = 2.0**53  # whole numbers in double precision
 _STEP_TOLERANCE = 1e-3
 _SAME_STEP = 1e-6
 MOST_INSTANTS = 500_000
-"""Of a log, with those of its gaps."""
+"""Largest number of instants of a log, gaps included."""
 
 
 @dataclass(frozen=True, eq=False)
-class Readings:
-    """What the sensors report at the instants of some runs, in body axes; NaN where there is no reading.
+class AttitudeReadings:
+    """Readings of the sensors at the instants of some runs, in body axes; NaN where missing.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class Readings:
     sun : ndarray, shape (runs, n, 3)
         Unit vector to the Sun.
     star_whitening : ndarray, shape (runs, n, 3, 3)
-        W of every attitude: of W δq each component has the star tracker's standard deviation.
+        W of each attitude: each component of W δq has the star tracker's standard deviation.
     """
 
     star: FloatArray
@@ -56,36 +56,36 @@ class Readings:
     star_whitening: FloatArray = field(default_factory=lambda: np.eye(3))
 
     def __post_init__(self) -> None:
-        """One whitening for each attitude, E where nothing else is said."""
+        """Set one whitening for each attitude, by default E."""
         each = np.broadcast_to(self.star_whitening, (*self.star.shape[:2], 3, 3))
         object.__setattr__(self, "star_whitening", each)
 
     @property
     def seen(self) -> dict[str, BoolArray]:
-        """Whether there is a reading, shape (runs, n), by the sensor's name: st, gyro, mag, sun."""
+        """Masks (runs, n) of the readings by the sensor's name: st, gyro, mag, sun."""
         values = (self.star, self.gyro_rad_s, self.field_T, self.sun)
         return dict(zip(SENSORS, map(is_read, values), strict=True))
 
 
 def is_read(values: FloatArray) -> BoolArray:
-    """Whether there is a reading, (..., k) -> (...)."""
+    """Return whether there is a reading, (..., k) -> (...)."""
     return ~np.isnan(values[..., 0])
 
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """Everything that a filter may know of some runs, or of a log.
+    """Complete input of a filter for some runs, or for a log.
 
-    There are readings at every instant; the torque of the wheels acts from an instant to the next.
+    There are readings at each instant; the torque of the wheels acts from an instant to the next.
 
     Attributes
     ----------
     satellite : Satellite
-        With its sensors, as its user believes them to be.
+        Satellite and sensors, as their user knows them.
     dt_s : float
         Usual time between instants.
     environment : Environment
-        Leading axis runs; has the instants.
+        Instants, field and Sun; the leading axis is the run.
     momentum_Nms, wheel_torque_Nm : ndarray, shape (runs, n, 3)
         Momentum of the wheels, and its rate of change from each instant to the next.
     torquers_Am2 : ndarray, shape (runs, n, 3)
@@ -95,51 +95,51 @@ class Record:
     satellite: Satellite
     dt_s: float
     environment: Environment
-    readings: Readings
+    readings: AttitudeReadings
     momentum_Nms: FloatArray
     wheel_torque_Nm: FloatArray
     torquers_Am2: FloatArray
 
     @cached_property
     def steps_s(self) -> FloatArray:
-        """From each instant to the next, shape (n - 1,); exactly the usual one but for more than rounding."""
+        """Steps (n - 1,) between instants; equal to the usual step within rounding errors."""
         steps = np.diff(self.environment.time_s)
         return np.where(np.abs(steps - self.dt_s) < _SAME_STEP * self.dt_s, self.dt_s, steps)
 
 
 def part(record: Record, runs: NDArray[np.intp], rows: slice = slice(None)) -> Record:
-    """Some runs of a record, each as often as its index comes, and instants that follow one another."""
-    return _taken(record, record.environment.time_s[rows], lambda values: values[runs, rows])
+    """Return runs of a record, with indices that may repeat, and consecutive instants."""
+    return _take(record, record.environment.time_s[rows], lambda values: values[runs, rows])
 
 
 def instants_as_runs(record: Record, run: int) -> Record:
-    """Every instant of a run as a run of its own, of that instant alone."""
-    return _taken(record, record.environment.time_s[:1], lambda values: values[run][:, None])
+    """Return each instant of a run as a run of its own."""
+    return _take(record, record.environment.time_s[:1], lambda values: values[run][:, None])
 
 
-def _taken(record: Record, time_s: FloatArray, take: Callable[[Any], Any]) -> Record:
-    """Something of every value (runs, n, …) of a record."""
+def _take(record: Record, time_s: FloatArray, take: Callable[[Any], Any]) -> Record:
+    """Apply a selection to all values (runs, n, …) of a record."""
     around, readings = record.environment, record.readings
     of_around = {one.name: take(getattr(around, one.name)) for one in fields(around) if one.name != "time_s"}
     return Record(
         record.satellite,
         record.dt_s,
         Environment(time_s=time_s, **of_around),
-        Readings(*(take(getattr(readings, one.name)) for one in fields(readings))),
+        AttitudeReadings(*(take(getattr(readings, one.name)) for one in fields(readings))),
         *map(take, (record.momentum_Nms, record.wheel_torque_Nm, record.torquers_Am2)),
     )
 
 
 @dataclass(frozen=True, eq=False, init=False)
 class Telemetry:
-    """Log of a satellite's attitude sensors, in body axes; a value that is missing is NaN, a sensor None.
+    """Log of a satellite's attitude sensors, in body axes; missing values are NaN, missing sensors None.
 
     Attributes
     ----------
     time_s : ndarray, shape (n,)
         Seconds or durations since :attr:`adcs.Satellite.start`, ascending in any steps; rows may be missing.
     star : Rotation, or ndarray, shape (n, 4)
-        Star tracker: inertial (J2000) from body. As quaternions with the scalar last where some are missing.
+        Star tracker: inertial (J2000) from body; quaternions, scalar last, if some are missing.
     gyro_rad_s : ndarray, shape (n, 3)
         Rate against inertial space.
     field_T : ndarray, shape (n, 3)
@@ -147,15 +147,15 @@ class Telemetry:
     sun : ndarray, shape (n, 3)
         Direction to the Sun, of any length.
     wheels_Nms : ndarray, shape (n, 3)
-        Momentum of all wheels together; straight lines go through what is missing.
+        Total momentum of the wheels; missing values are interpolated linearly.
     torquers_Am2 : ndarray, shape (n, 3)
-        Commanded magnetic moment, held from each row until another one is told; none before the first.
+        Commanded magnetic moment, held until the next command; zero before the first.
     star_covariance_rad2 : ndarray, shape (n, 3, 3)
-        Of a small turn of the star tracker's attitude about the body's axes, NaN where it is as the satellite's star
-        tracker has it; such as of :func:`adcs.combined_star_fixes`.
+        Covariance of the star tracker's attitude, as a small rotation about the body's axes, for example of
+        :func:`adcs.combined_star_fixes`. NaN where the noise of the satellite's star tracker holds.
     step_s : float
-        Usual time between instants, which the process noise is for; by default the shortest between two rows, of times
-        that are no multiples of it their median.
+        Usual time between instants, to which the process noise refers; by default the shortest time between two rows,
+        or the median if times are not multiples of it.
 
     Raises
     ------
@@ -216,7 +216,7 @@ class Telemetry:
 
     @classmethod
     def of(cls, record: Record, start: np.datetime64, run: int = 0) -> Telemetry:
-        """Log that a run of a record would have written, its time counted from ``start``."""
+        """Return the log of a run of a record, with times since ``start``."""
         around, readings = record.environment, record.readings
         eci_from_orbital = quaternion.conjugate(orbital_from_eci(around)[run])
         return cls(
@@ -232,11 +232,11 @@ class Telemetry:
 
     @property
     def rows(self) -> NDArray[np.int64]:
-        """Instant of every row, as a place in :attr:`instants_s`."""
-        return _instants_of(self.time_s, self.step_s)[1]
+        """Index of each row in :attr:`instants_s`."""
+        return _filter_instants(self.time_s, self.step_s)[1]
 
     def pieces(self, longest_gap_s: float) -> list[Telemetry]:
-        """The log, cut where it has no row for longer than that."""
+        """Split the log at gaps that are longer than a limit."""
         cuts = np.flatnonzero(np.diff(self.time_s) > max(longest_gap_s, self.step_s)) + 1
         return [
             Telemetry(**{name: values if name == "step_s" else values[rows] for name, values in vars(self).items()})
@@ -244,12 +244,12 @@ class Telemetry:
         ]
 
     def record(self, satellite: Satellite) -> Record:
-        """What the filters are given: readings at every instant, field and Sun along the satellite's orbit."""
-        instants_s, rows = _instants_of(self.time_s, self.step_s)
+        """Return the input of the filters: readings at each instant, field and Sun along the orbit."""
+        instants_s, rows = _filter_instants(self.time_s, self.step_s)
         n, start_s = len(instants_s), self.time_s[0]
 
         def spread(values: FloatArray) -> FloatArray:
-            """Values at all instants, NaN in gaps."""
+            """Return values at all instants, NaN in gaps."""
             all_of = np.full((n, values.shape[1]), np.nan)
             all_of[rows] = values
             return all_of
@@ -260,11 +260,11 @@ class Telemetry:
             instants_s - start_s,
             model=satellite.field_model,
         )
-        momentum = _through_gaps(spread(self.wheels_Nms), instants_s)
+        momentum = _interpolate_gaps(spread(self.wheels_Nms), instants_s)
         torque = np.zeros_like(momentum)
         torque[:-1] = np.diff(momentum, axis=0) / np.diff(instants_s)[:, None]
         star, sun = spread(self.star[:, [3, 0, 1, 2]]), spread(self.sun)
-        readings = Readings(
+        readings = AttitudeReadings(
             star=quaternion.multiply(orbital_from_eci(around)[0], quaternion.normalised(star))[None],
             gyro_rad_s=spread(self.gyro_rad_s)[None],
             field_T=spread(self.field_T)[None],
@@ -273,17 +273,17 @@ class Telemetry:
                 spread(self.star_covariance_rad2.reshape(-1, 9)).reshape(-1, 3, 3), satellite.star_tracker.sigma_rad
             )[None],
         )
-        torquers = _held(spread(self.torquers_Am2))
+        torquers = _hold(spread(self.torquers_Am2))
         return Record(satellite, self.step_s, around, readings, momentum[None], torque[None], torquers[None])
 
     @property
     def instants_s(self) -> FloatArray:
-        """Time of every instant, with those of missing rows: multiples of the step, or steps like it within a gap."""
-        return _instants_of(self.time_s, self.step_s)[0]
+        """Times of all instants, missing rows included: multiples of the step, or similar steps in gaps."""
+        return _filter_instants(self.time_s, self.step_s)[0]
 
 
 def _columns(name: str, given: ArrayLike | None, n: int) -> FloatArray:
-    """Readings of a sensor, NaN where one of their numbers is missing."""
+    """Return the readings of a sensor, NaN where one of their components is missing."""
     shape = (n, 4 if name == "star" else 3)
     values = np.full(shape, np.nan) if given is None else numbers(given)
     if values.shape != shape or np.isinf(values).any():
@@ -294,7 +294,7 @@ def _columns(name: str, given: ArrayLike | None, n: int) -> FloatArray:
 
 
 def _covariances(given: ArrayLike | None, n: int) -> FloatArray:
-    """Covariances (n, 3, 3) that are symmetric and positive definite, or NaN."""
+    """Check covariances (n, 3, 3): symmetric and positive definite, or NaN."""
     values = np.full((n, 3, 3), np.nan) if given is None else np.array(given, dtype=np.float64)
     if values.shape != (n, 3, 3):
         raise ValueError(
@@ -307,7 +307,7 @@ def _covariances(given: ArrayLike | None, n: int) -> FloatArray:
 
 
 def _whitening(covariance_rad2: FloatArray, sigma: float) -> FloatArray:
-    """W (n, 3, 3) of covariances of turns: W δq has the covariance σ²E, δq being half a turn."""
+    """Return W (n, 3, 3) for covariances of rotations: W δq has covariance σ²E, δq being half the angle."""
     W = np.tile(np.eye(3), (len(covariance_rad2), 1, 1))
     known = ~np.isnan(covariance_rad2).any(axis=(1, 2))
     W[known] = 2.0 * sigma * np.linalg.inv(np.linalg.cholesky(covariance_rad2[known]))
@@ -315,7 +315,7 @@ def _whitening(covariance_rad2: FloatArray, sigma: float) -> FloatArray:
 
 
 def steps_of(time_s: FloatArray, step_s: float) -> tuple[NDArray[np.int64], BoolArray]:
-    """Steps (n,) since the first time, and which times are no multiple of the step."""
+    """Return the number (n,) of steps since the first time, and which times are no multiple of the step."""
     with np.errstate(over="ignore"):
         steps = (time_s - time_s[0]) / step_s
     rows = np.round(np.clip(steps, -_MOST_STEPS, _MOST_STEPS)).astype(np.int64)
@@ -323,12 +323,12 @@ def steps_of(time_s: FloatArray, step_s: float) -> tuple[NDArray[np.int64], Bool
 
 
 def steps_within(time_s: FloatArray, step_s: float) -> float:
-    """Steps from the first time to the last, with those of its rows that are closer."""
+    """Return the number of instants from the first time to the last, one at least for each row."""
     return float(np.clip(np.maximum(np.diff(time_s) / step_s, 1.0).sum(), 0.0, _MOST_STEPS))
 
 
 def usual_step_s(time_s: FloatArray) -> float:
-    """Shortest step of ascending times that are its multiples, the median one of others; 1 of one time alone."""
+    """Return the shortest step if all times are multiples of it, else the median; 1 for one time."""
     if len(time_s) < 2:
         return 1.0
     steps = np.diff(time_s)
@@ -336,8 +336,8 @@ def usual_step_s(time_s: FloatArray) -> float:
     return float(np.median(steps)) if steps_of(time_s, shortest)[1].any() else shortest
 
 
-def _instants_of(time_s: FloatArray, step_s: float) -> tuple[FloatArray, NDArray[np.int64]]:
-    """Instants of a filter, and which of them are the n times."""
+def _filter_instants(time_s: FloatArray, step_s: float) -> tuple[FloatArray, NDArray[np.int64]]:
+    """Return the instants of a filter, and the indices of the n times among them."""
     rows, off = steps_of(time_s, step_s)
     if not off.any() and (np.diff(rows) > 0).all():
         return time_s[0] + step_s * np.arange(int(rows[-1]) + 1), rows
@@ -346,22 +346,22 @@ def _instants_of(time_s: FloatArray, step_s: float) -> tuple[FloatArray, NDArray
     return np.interp(np.arange(rows[-1] + 1), rows, time_s), rows
 
 
-def _through_gaps(momentum: FloatArray, instants_s: FloatArray) -> FloatArray:
-    """Momentum at all instants: straight lines through gaps, zero where there is none at all."""
+def _interpolate_gaps(momentum: FloatArray, instants_s: FloatArray) -> FloatArray:
+    """Interpolate the momentum linearly in gaps; zero if there is none at all."""
     known = np.flatnonzero(~np.isnan(momentum[:, 0]))
     if not known.size:
         return np.zeros_like(momentum)
     return np.stack([np.interp(instants_s, instants_s[known], column[known]) for column in momentum.T], axis=1)
 
 
-def _held(values: FloatArray) -> FloatArray:
-    """Values (n, 3) that hold until there is another; zero before the first."""
+def _hold(values: FloatArray) -> FloatArray:
+    """Hold values (n, 3) until the next one; zero before the first."""
     last = np.maximum.accumulate(np.where(is_read(values), np.arange(len(values)), -1))
     return np.where(last[:, None] >= 0, values[last], 0.0)
 
 
 def orbital_from_eci(around: Environment) -> FloatArray:
-    """Attitude of the inertial frame in the orbital one, shape (runs, n, 4)."""
+    """Return the quaternions (runs, n, 4), orbital from inertial frame."""
     from scipy.spatial.transform import Rotation
 
     matrices = around.R_orbital_from_eci

@@ -12,11 +12,11 @@ from arrays.typing import FloatArray
 GyroSamples = Literal["mean", "point"]
 GYRO_SAMPLES: tuple[GyroSamples, ...] = get_args(GyroSamples)
 GAP_STEPS = 2.5
-"""A step is a gap where it is longer than so many usual ones."""
+"""Length of a gap in usual steps: longer steps are gaps."""
 
 
 def steps_s(time_s: FloatArray) -> FloatArray:
-    """Steps (n,) that end at each of n ascending times; the first is the usual one, the median."""
+    """Return the steps (n,) that end at n ascending times; the first is the median."""
     steps = np.diff(time_s)
     if time_s.ndim != 1 or len(time_s) < 2 or not (np.isfinite(steps) & (steps > 0.0)).all():
         raise ValueError("Input time_s must ascend, two instants or more; instead received others.")
@@ -24,16 +24,16 @@ def steps_s(time_s: FloatArray) -> FloatArray:
 
 
 def instants_within(seconds: float, time_s: FloatArray) -> int:
-    """How many of n ascending times are within so many seconds at their usual steps: 1 to n."""
+    """Return the number, 1 to n, of n ascending times in a duration, by their median step."""
     return max(1, min(len(time_s), round(seconds / float(np.median(np.diff(time_s)))))) if len(time_s) > 1 else 1
 
 
 def step_rates(rate_rad_s: FloatArray, dt_s: FloatArray, samples: GyroSamples = "mean") -> FloatArray:
-    """Mean rates (n, 3) over the steps that end at each instant, of a gyro's samples (n, 3), NaN where it has none.
+    """Return mean rates (n, 3) over the steps to each instant, from a gyro's samples (n, 3).
 
-    A sample is the ``mean`` rate since the one before, or the rate at its ``point`` in time; two points make the mean
-    of what is between them. Without a sample the last one is held, and the next one makes up for it, so that no turn is
-    lost and nothing is used before it is read. Across a gap the rate is the mean of both ends.
+    A sample is the ``mean`` rate since the one before, or the rate at a ``point`` in time, of which two give the mean
+    between them. Without a sample (NaN) the last one is held, and the next one corrects for it: so no rotation is lost,
+    and no sample is used before its time. Across a gap the rate is the mean of both ends.
     """
     if samples not in GYRO_SAMPLES:
         raise ValueError(f"Input samples must be one of {', '.join(GYRO_SAMPLES)}; instead received {samples!r}.")
@@ -58,13 +58,12 @@ def step_rates(rate_rad_s: FloatArray, dt_s: FloatArray, samples: GyroSamples = 
 
 @dataclass(frozen=True, eq=False)
 class VectorRecord:
-    """Readings of one or several runs at n instants, NaN where missing, and what they would be in the reference frame.
+    """Readings of one or several runs at n instants, NaN where missing, with their reference vectors.
 
     Attributes
     ----------
     dt_s : ndarray, shape (n,)
-        From the instant before to each, :func:`steps_s`. The first has no instant before: it only says how long its
-        readings count.
+        Steps to each instant, of :func:`steps_s`. The first step is only the time for which the first readings correct.
     rate_rad_s : ndarray, shape (R, n, 3)
         Gyro, the mean over the step that ends at each instant: see :func:`step_rates`.
     first_body, second_body : ndarray, shape (R, n, 3)
@@ -115,12 +114,12 @@ class VectorRecord:
 
     @property
     def n_runs(self) -> int:
-        """R."""
+        """Number R of runs."""
         return self.rate_rad_s.shape[0]
 
     @property
     def usual_dt_s(self) -> float:
-        """Median step; of no instants at all, 1."""
+        """Median step; 1 without any instant."""
         return float(np.median(self.dt_s)) if len(self) else 1.0
 
     def __len__(self) -> int:

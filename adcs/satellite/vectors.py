@@ -1,4 +1,4 @@
-"""Attitude of a satellite from field and Sun, row by row of its log."""
+"""Attitude of a satellite from field and Sun for each row of its log."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from adcs.satellite.wahba import VectorMethod, attitude_of_vectors
 
 
 def vector_attitude(telemetry: Telemetry, satellite: Satellite, *, method: VectorMethod = "quest") -> AttitudeTrack:
-    """Attitude of a satellite at every row of its log that has field and Sun, each row on its own.
+    """Return the attitude of a satellite at each row with field and Sun, each row on its own.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Attitude of one instant from vectors that are known in both frames: TRIAD, and Wahba's problem as QUEST solves it.
+"""Attitude from vectors that are known in both frames: TRIAD, and Wahba's problem by QUEST.
 
 Sources: H. D. Black, AIAA Journal 2 (7), 1964; M. D. Shuster, S. D. Oh, Three-Axis Attitude Determination from Vector
 Observations, Journal of Guidance and Control 4 (1), 1981.
@@ -20,7 +20,7 @@ VECTOR_METHODS: tuple[VectorMethod, ...] = get_args(VectorMethod)
 
 
 class VectorAttitudes(NamedTuple):
-    """Attitudes of n instants, NaN where fewer than two vectors, or collinear ones, tell one.
+    """Attitudes of n instants, NaN with fewer than two vectors or collinear ones.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ def attitude_of_vectors(
     *,
     method: VectorMethod = "quest",
 ) -> VectorAttitudes:
-    r"""Attitude of every instant from two vectors or more, each instant on its own.
+    r"""Estimate the attitude of each instant from two or more vectors, each instant on its own.
 
     ``quest`` minimises :math:`\sum |b_k - A^T r_k|^2 / \sigma_k^2` of unit vectors, by the largest eigenvalue of
     Davenport's matrix; its covariance is :math:`(\sum (E - b_k b_k^T)/\sigma_k^2)^{-1}`. ``triad`` takes the first
@@ -132,7 +132,7 @@ def _units(vectors: ArrayLike) -> FloatArray:
 
 
 def _triad(body: FloatArray, frame: FloatArray) -> FloatArray:
-    """Quaternions (n, 4) of two unit vectors each, (2, n, 3)."""
+    """Return quaternions (n, 4) of two unit vectors each, (2, n, 3)."""
 
     def axes(first: FloatArray, second: FloatArray) -> FloatArray:
         across = np.cross(first, second)
@@ -145,7 +145,7 @@ def _triad(body: FloatArray, frame: FloatArray) -> FloatArray:
 
 
 def _triad_covariance(body: FloatArray, sigma: FloatArray) -> FloatArray:
-    """σ₁² E + [(σ₂² - σ₁²) W₁W₁ᵀ + σ₁² (W₁·W₂)(W₁W₂ᵀ + W₂W₁ᵀ)] / |W₁ × W₂|²."""
+    """Return σ₁² E + [(σ₂² - σ₁²) W₁W₁ᵀ + σ₁² (W₁·W₂)(W₁W₂ᵀ + W₂W₁ᵀ)] / |W₁ × W₂|²."""
     first, second = body
     cosine = np.sum(first * second, axis=-1)[:, None, None]
     variance = np.square(sigma)[..., None, None]
@@ -156,7 +156,7 @@ def _triad_covariance(body: FloatArray, sigma: FloatArray) -> FloatArray:
 
 
 def _davenport(body: FloatArray, frame: FloatArray, weight: FloatArray) -> FloatArray:
-    """Quaternions (n, 4), frame from body: the eigenvector of the largest eigenvalue of Davenport's matrix."""
+    """Return the quaternions (n, 4), frame from body, of Davenport's largest eigenvalue."""
     B = np.einsum("kn,kni,knj->nij", weight, frame, body)
     K = np.empty((len(B), 4, 4))
     K[:, 0, 0] = np.trace(B, axis1=-2, axis2=-1)

@@ -1,4 +1,4 @@
-"""A camera that looks at the sky: a pinhole with the radial distortion of its lens."""
+"""Star camera: a pinhole with the radial distortion of its lens."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from arrays.io.errors import check_positive
 from arrays.typing import FloatArray
 
 MOST_PIXELS = 100_000
-"""Of either side of an image."""
+"""Largest number of pixels of either side of an image."""
 SCALE_ARCSEC = (0.01, 3600.0)
 """Of a pixel: from the largest telescopes to a degree."""
 WIDEST_RAD = math.radians(150.0)
@@ -21,7 +21,7 @@ WIDEST_RAD = math.radians(150.0)
 
 @dataclass(frozen=True)
 class StarCamera:
-    """A pinhole camera with a lens: tangents s = tan(rad_per_px) x, bent to s (1 + radial |s|²).
+    """Pinhole camera with a lens: tangents s = tan(rad_per_px) x, distorted to s (1 + radial |s|²).
 
     Attributes
     ----------
@@ -60,29 +60,29 @@ class StarCamera:
 
     @property
     def diagonal_rad(self) -> float:
-        """Angle between opposite corners."""
+        """Angle between opposite corners of the image."""
         return 2.0 * math.atan(self.corner)
 
     @property
     def solid_angle_sr(self) -> float:
-        """Part of the sphere that an image shows, as if it were flat."""
+        """Solid angle of an image in the flat approximation."""
         return self.width_px * self.height_px * self.rad_per_px**2
 
     @property
     def corner(self) -> float:
-        """Tangent of a corner's angle from the centre, through a pinhole."""
+        """Tangent of the angle between a corner and the centre, without distortion."""
         return 0.5 * math.hypot(self.width_px, self.height_px) * math.tan(self.rad_per_px)
 
     @property
     def corner_shift_px(self) -> float:
-        """Shift by the lens of the star that a pinhole shows in a corner [px], negative towards the centre."""
+        """Distortion at a corner [px], negative towards the centre."""
         bent, x = self.radial * self.corner**2, 1.0
         for _ in range(8):  # Newton's steps to x (1 + bent x²) = 1
             x -= (x * (1.0 + bent * x**2) - 1.0) / (1.0 + 3.0 * bent * x**2)
         return 0.5 * math.hypot(self.width_px, self.height_px) * (x - 1.0)
 
     def tangents(self, points_px: ArrayLike) -> FloatArray:
-        """Components (f, 2) across the line of sight, over that along it, of points (f, 2), y up.
+        """Return components (f, 2) across the line of sight over that along it, of points (f, 2), y up.
 
         Raises
         ------
@@ -99,7 +99,10 @@ class StarCamera:
         return bent
 
     def directions(self, points_px: ArrayLike) -> FloatArray:
-        """Unit vectors (f, 3) in the frame's axes of points (f, 2); see docs/theory/star-identification.md."""
+        """Return unit vectors (f, 3) in the camera frame of points (f, 2).
+
+        See docs/theory/star-identification.md.
+        """
         tangents = self.tangents(points_px)
         outward = np.concatenate([tangents, np.full((len(tangents), 1), -1.0)], axis=1)
         return outward / np.linalg.norm(outward, axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Stars of the sky, and where among them a direction is."""
+"""Star catalogue and its search structures."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from scipy.spatial import cKDTree
 from arrays.typing import FloatArray, IntArray
 
 CELLS = 64
-"""Of the sky's cube along each axis."""
+"""Number of cells of the sky's cube along each axis."""
 
 
 class SkyCells(NamedTuple):
-    """Stars of a catalogue by the cell of the cube [-1, 1]³ in which they are."""
+    """Stars of a catalogue by their cell of the cube [-1, 1]³."""
 
     directions: FloatArray  # (n, 3): ordered by cell
     begins: IntArray  # (CELLS³ + 1,)
@@ -26,7 +26,7 @@ class SkyCells(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class StarCatalogue:
-    """Stars of the sky; made by :meth:`of`.
+    """Star catalogue; made by :meth:`of`.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ class StarCatalogue:
     def of(
         cls, numbers: ArrayLike, right_ascension_rad: ArrayLike, declination_rad: ArrayLike, magnitudes: ArrayLike
     ) -> StarCatalogue:
-        """Catalogue from right ascension and declination, of shape (n,) each.
+        """Return a catalogue from right ascension and declination, shape (n,) each.
 
         Raises
         ------
@@ -65,7 +65,7 @@ class StarCatalogue:
         return cls(hip, directions, magnitude)
 
     def aberrated(self, velocity_m_s: ArrayLike) -> StarCatalogue:
-        """As an observer sees it who moves: stars are up to v/c nearer to where he goes, 20.5″ for the Earth.
+        """Return the catalogue with aberration, up to v/c towards the velocity; 20.5″ for the Earth.
 
         ``velocity_m_s`` (3,): from the solar system's centre, in the catalogue's frame.
         """
@@ -77,7 +77,7 @@ class StarCatalogue:
 
     @cached_property
     def tree(self) -> cKDTree:
-        """Directions, for search."""
+        """Search tree of the directions."""
         return cKDTree(self.directions)
 
     @cached_property

@@ -1,4 +1,4 @@
-"""Fixes of several cameras and frames, as a star tracker's readings of one body."""
+"""Combination of fixes of several star cameras to readings of one star tracker."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from arrays.typing import FloatArray
 
 
 class StarReadings(NamedTuple):
-    """Attitudes of a body by its star cameras.
+    """Attitudes of a body from its star cameras.
 
     Attributes
     ----------
@@ -41,7 +41,7 @@ class StarReadings(NamedTuple):
 def combined_star_fixes(
     time_s: ArrayLike, fixes: Sequence[StarFix | NoFix], body_from_frame: Rotation | Sequence[Rotation]
 ) -> StarReadings:
-    r"""Attitude of a body at every instant at which one of its star cameras has a fix.
+    r"""Combine fixes of star cameras to the attitude of their body at each instant with a fix.
 
     A camera tells the turn about its line of sight some ten times worse than those across; two that look elsewhere tell
     all three. Fixes of one instant are averaged by their information,

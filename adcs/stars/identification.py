@@ -1,4 +1,4 @@
-"""Stars of the real sky in an image: which they are, and where the camera looks, from the image and a catalogue alone.
+"""Lost-in-space identification of stars and attitude from an image and a catalogue.
 
 See docs/theory/star-identification.md.
 """
@@ -16,8 +16,8 @@ from scipy.stats import binom
 
 from adcs.stars.camera import StarCamera
 from adcs.stars.catalogue import StarCatalogue
-from adcs.stars.pose import CameraPose, LensPrior, fitted
-from adcs.stars.triangles import Checks, Hypothesis, TriangleIndex, star_triangles
+from adcs.stars.pose import CameraPose, LensPrior, fit_pose
+from adcs.stars.triangles import AttitudeHypothesis, Checks, TriangleIndex, star_triangles
 from arrays.typing import FloatArray, IntArray
 
 # Brighter neighbours with which a star makes triangles: of the catalogue, and of an image, which has hot pixels too.
@@ -66,7 +66,7 @@ class StarFix:
 
     @property
     def R_catalogue_from_frame(self) -> FloatArray:
-        """Of the pose."""
+        """Rotation of the pose, catalogue from camera frame."""
         return self.pose.R_catalogue_from_frame
 
 
@@ -92,7 +92,7 @@ class StarMatcher:
 
     @classmethod
     def of(cls, catalogue: StarCatalogue, camera: StarCamera, noise_px: float = 1.0) -> StarMatcher:
-        """Matcher of a camera.
+        """Return a matcher for a camera.
 
         Parameters
         ----------
@@ -107,7 +107,7 @@ class StarMatcher:
         return cls(catalogue, camera, TriangleIndex.of(catalogue.directions[bright], longest, _BRIGHTER), noise_px)
 
     def gate_rad(self, camera: StarCamera) -> float:
-        """Within which a star of an image is one of the catalogue: three standard deviations."""
+        """Return the matching radius of a star of the image: three standard deviations."""
         return 3.0 * self.noise_px * camera.rad_per_px
 
     def identify(
@@ -118,7 +118,7 @@ class StarMatcher:
         *,
         mirrored: bool = False,
     ) -> StarFix | NoFix:
-        """Attitude and stars of an image.
+        """Identify stars and attitude of an image.
 
         Parameters
         ----------
@@ -152,7 +152,7 @@ class StarMatcher:
         found = self.index.best(tangents[order], image, self.catalogue.cells, checks)
         reason = "no triangle of the image is in the catalogue"
         for hypotheses in islice(found, _ROUNDS):
-            fixes = [self._fitted(points, brightness[order], hypothesis, prior) for hypothesis in hypotheses]
+            fixes = [self._fit(points, brightness[order], hypothesis, prior) for hypothesis in hypotheses]
             best = min(fixes, key=lambda fix: fix.log10_chance)
             if best.log10_chance <= math.log10(self.most_chance):
                 stars = np.stack([order[best.stars[:, 0]], best.stars[:, 1]], axis=1)
@@ -161,15 +161,21 @@ class StarMatcher:
         return NoFix(reason)
 
     def _checks(self, stars: int, prior: LensPrior) -> Checks:
-        """Stars that match by chance in a crowded part of the sky one time in a hundred that would be accepted."""
+        """Return the limits of the search.
+
+        The number of matches that ends it occurs by chance a hundred times less often than is accepted, also in a
+        crowded part of the sky.
+        """
         near = _WIDENED * self.gate_rad(self.camera)
         crowd = min(_CROWDED * len(self.catalogue.numbers) * (0.5 * near) ** 2, 1.0)
         chance = binom.logsf(np.arange(stars) - 3, max(stars - 3, 0), crowd) + math.log(_MOST_HYPOTHESES)
         enough = int(np.count_nonzero(chance > math.log(0.01 * self.most_chance)))
         return Checks(4.0 * self.noise_px * self.camera.rad_per_px, prior.scale, near, stars, enough, _MOST_HYPOTHESES)
 
-    def _fitted(self, points: FloatArray, magnitudes: FloatArray, hypothesis: Hypothesis, prior: LensPrior) -> StarFix:
-        """Fix by all stars near their places, brightest first, with the chance of as many."""
+    def _fit(
+        self, points: FloatArray, magnitudes: FloatArray, hypothesis: AttitudeHypothesis, prior: LensPrior
+    ) -> StarFix:
+        """Fit the pose to all stars near their places, with the probability of as many by chance."""
         rad_per_px = math.atan(hypothesis.scale * math.tan(self.camera.rad_per_px))
         pose = CameraPose(hypothesis.R, replace(self.camera, rad_per_px=rad_per_px), np.zeros((5, 5)))
         widened, before = _WIDENED, np.empty(0, dtype=np.intp)
@@ -181,10 +187,10 @@ class StarMatcher:
             if np.count_nonzero(near) < 3 or np.array_equal(row, before):
                 break
             there = self.catalogue.directions[row[near]]
-            pose = fitted(points[near], there, pose, self.camera, prior, self.noise_px)
+            pose = fit_pose(points[near], there, pose, self.camera, prior, self.noise_px)
             widened, before = 1.0, row
         directions = pose.camera.directions(points) @ pose.R_catalogue_from_frame.T
-        stars = self._named(directions, magnitudes, self.gate_rad(pose.camera))
+        stars = self._match(directions, magnitudes, self.gate_rad(pose.camera))
         off = directions[stars[:, 0]] - self.catalogue.directions[stars[:, 1]]
         rms = float(np.sqrt(np.mean(np.sum(off**2, axis=1)))) if len(stars) else math.inf
         sizes = np.unique(np.minimum((*_BEGINNINGS, len(points)), len(points)))
@@ -192,8 +198,8 @@ class StarMatcher:
         chance = (float(chance) + math.log(hypothesis.tried * len(sizes))) / math.log(10.0)
         return StarFix(stars, rms, chance, pose)
 
-    def _named(self, directions: FloatArray, magnitudes: FloatArray, gate: float) -> IntArray:
-        """Pairs (k, 2) of a star and its row in the catalogue, each once, by place and, as of doubles, brightness."""
+    def _match(self, directions: FloatArray, magnitudes: FloatArray, gate: float) -> IntArray:
+        """Match stars to the catalogue one to one, by place and brightness; pairs (k, 2)."""
         found = self.catalogue.tree.query(directions, k=_COMPANIONS, distance_upper_bound=gate)
         distance, row = np.asarray(found[0]), np.asarray(found[1], dtype=np.intp)
         star, of_star = np.nonzero(np.isfinite(distance))
@@ -208,12 +214,12 @@ class StarMatcher:
         # Each star its best row and each row its best star, if no other is nearly as good.
         order = np.argsort(cost, kind="stable")
         for of in (star, row):
-            order = order[_clearly_first(of[order], cost[order])]
+            order = order[_clear_ranks(of[order], cost[order])]
         order = order[np.argsort(star[order])]
         return np.stack([star[order], row[order]], axis=1)
 
     def _log_chance(self, pose: CameraPose, matched: IntArray, stars: IntArray) -> FloatArray:
-        """Logarithm of the chance that an attitude matches as many of some stars besides the three that state it."""
+        """Return the log-probability that an attitude matches as many stars by chance, besides its triangle."""
         radius = 2.0 * math.sin(0.25 * self.camera.diagonal_rad)
         axis = -pose.R_catalogue_from_frame[:, 2]
         around = self.catalogue.tree.query_ball_point(axis, radius, return_length=True)
@@ -231,7 +237,7 @@ def identify_stars(
     lens: LensPrior = LensPrior(),  # noqa: B008 - frozen
     progress: Callable[[int], None] | None = None,
 ) -> list[StarFix | NoFix]:
-    """Attitude and stars of images, without knowing where the camera looked.
+    """Identify attitude and stars of images without a prior attitude.
 
     Parameters
     ----------
@@ -276,8 +282,8 @@ def identify_stars(
     return fixes
 
 
-def _clearly_first(of: IntArray, cost: FloatArray) -> IntArray:
-    """Where each value stands first in an order of ascending costs (k,), unless its second one is nearly as good."""
+def _clear_ranks(of: IntArray, cost: FloatArray) -> IntArray:
+    """Return the best place of each value by ascending costs (k,), unless its second is nearly as good."""
     _, first, count = np.unique(of, return_index=True, return_counts=True)
     later = np.ones(len(of), dtype=np.bool_)
     later[first] = False
@@ -289,6 +295,6 @@ def _clearly_first(of: IntArray, cost: FloatArray) -> IntArray:
 
 @dataclass(frozen=True)
 class NoFix:
-    """There is no fix, and why."""
+    """Reason for which there is no fix."""
 
     reason: str

@@ -1,4 +1,4 @@
-"""Stars in photographs of the sky: read a picture, and find lights above what surrounds them.
+"""Stars in photographs of the sky: read a picture, and detect lights above the background.
 
 A sky glows, more at one side than at the other, and a lens is darker at its corners: background and noise are those of
 a neighbourhood, not of the picture.
@@ -25,7 +25,7 @@ from arrays.typing import BoolArray, FloatArray
 SUFFIXES = (".png", ".tif", ".tiff", ".fits", ".fit", ".jpg", ".jpeg")
 _BLOCK_PX = 32
 LEAST_PX = 2 * _BLOCK_PX
-"""Of a picture, either way."""
+"""Least width and height of a picture."""
 _STAR_PX = 1.0  # standard deviation of a star's light, with which it is looked for
 _THRESHOLD_SIGMAS = 5.0
 _HOT_SHARE = 0.85  # of a light that one pixel has: more than any optics leaves to one
@@ -48,7 +48,7 @@ class PictureStars:
 
     @property
     def magnitudes(self) -> FloatArray:
-        """Of any zero (n,)."""
+        """Magnitudes (n,) with an arbitrary zero point."""
         return -2.5 * np.log10(self.flux)
 
     def __len__(self) -> int:
@@ -56,7 +56,9 @@ class PictureStars:
 
 
 def read_picture(path: str | PathLike[str]) -> FloatArray:
-    """Grey picture (height, width), its first row at the top, from PNG, TIFF or JPEG of 8 or 16 bits, or FITS.
+    """Read a grey picture (height, width) from PNG, TIFF or JPEG of 8 or 16 bits, or FITS.
+
+    The first row is at the top.
 
     Parameters
     ----------
@@ -94,11 +96,11 @@ def read_picture(path: str | PathLike[str]) -> FloatArray:
         ) from None
     if values.ndim == 3:
         values = values[..., : 3 if values.shape[2] > 2 else 1].mean(axis=2)
-    return _checked(path, values)
+    return _check_picture(path, values)
 
 
 def _fits(path: str | PathLike[str], data: bytes) -> FloatArray:
-    """First image of a FITS file; its first row is at the bottom."""
+    """Return the first image of a FITS file, whose first row is at the bottom."""
     header: dict[str, str] = {}
     start = 0
     for start in range(0, len(data), _FITS_CARD):
@@ -117,10 +119,10 @@ def _fits(path: str | PathLike[str], data: bytes) -> FloatArray:
         raise InputError(
             f"{path}: found no image in two dimensions, expected one as the first of a FITS file."
         ) from None
-    return _checked(path, scaled[::-1])
+    return _check_picture(path, scaled[::-1])
 
 
-def _checked(path: str | PathLike[str], values: np.ndarray) -> FloatArray:
+def _check_picture(path: str | PathLike[str], values: np.ndarray) -> FloatArray:
     picture = np.asarray(values, dtype=np.float64)
     if picture.ndim != 2 or min(picture.shape) < LEAST_PX or not np.isfinite(picture).all():
         raise InputError(f"{path}: found a picture of shape {picture.shape}, expected 64 × 64 finite pixels at least.")
@@ -128,7 +130,7 @@ def _checked(path: str | PathLike[str], values: np.ndarray) -> FloatArray:
 
 
 def find_picture_stars(picture: FloatArray, dark: FloatArray | None = None) -> PictureStars:
-    """Lights whose sum over a star's size is five standard deviations above their neighbourhood.
+    """Detect lights whose sum over a star's size is five standard deviations above the background.
 
     Background and noise are the median of blocks of 32 pixels and the standard deviation about it, smooth between them.
     A light that one pixel has nearly alone is a hot pixel. Centroids are the first moments under a Gaussian that
@@ -137,14 +139,14 @@ def find_picture_stars(picture: FloatArray, dark: FloatArray | None = None) -> P
     ``picture``, ``dark`` (height, width): the latter is subtracted. Returns them brightest first.
     """
     values = picture if dark is None else picture - dark
-    level = _of_neighbourhood(values, _median)
+    level = _neighbourhood_statistic(values, _median)
     above = values - level
-    noise = _of_neighbourhood(above, _deviation(1.0))
+    noise = _neighbourhood_statistic(above, _deviation(1.0))
     # Sum with the star's own shape, and its own noise: that of neighbouring pixels may be alike.
     kernel = np.exp(-0.5 * (np.arange(-_HALF_WINDOW, _HALF_WINDOW + 1) / _STAR_PX) ** 2)
     kernel /= kernel.sum()
     smooth = ndimage.correlate1d(ndimage.correlate1d(above, kernel, axis=0), kernel, axis=1)
-    significance = smooth / _of_neighbourhood(smooth, _deviation(float(np.sum(kernel**2))))
+    significance = smooth / _neighbourhood_statistic(smooth, _deviation(float(np.sum(kernel**2))))
     peak = (significance > _THRESHOLD_SIGMAS) & (significance == ndimage.maximum_filter(significance, 5))
     inside = np.zeros_like(peak)
     inside[_HALF_WINDOW:-_HALF_WINDOW, _HALF_WINDOW:-_HALF_WINDOW] = True
@@ -165,7 +167,7 @@ def find_picture_stars(picture: FloatArray, dark: FloatArray | None = None) -> P
 
 
 def _centroids(windows: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Offsets (n, 2) of lights from the middle of their windows, and by how much a pixel's noise moves them (n,).
+    """Return centroids (n, 2) from the middle of windows, and their σ (n,) per noise of a pixel.
 
     The weight is a Gaussian about the centroid itself, so that it favours no place within a pixel; as it is as wide as
     a light, its first moment is half of the distance.
@@ -183,8 +185,8 @@ def _centroids(windows: FloatArray) -> tuple[FloatArray, FloatArray]:
     return offsets, slope
 
 
-def _of_neighbourhood(values: FloatArray, statistic: Callable[[FloatArray], float]) -> FloatArray:
-    """A statistic of the blocks around every pixel, of those alike."""
+def _neighbourhood_statistic(values: FloatArray, statistic: Callable[[FloatArray], float]) -> FloatArray:
+    """Return a statistic of the blocks around each pixel, interpolated."""
     edges = [np.linspace(0, n, n // _BLOCK_PX + 1).astype(int) for n in values.shape]
     found = np.array(
         [
@@ -199,17 +201,17 @@ def _of_neighbourhood(values: FloatArray, statistic: Callable[[FloatArray], floa
 
 
 def _deviation(least: float) -> Callable[[FloatArray], float]:
-    """Standard deviation of what is within five of it, not less than what rounding may hide.
+    """Return a clipped standard deviation, within five σ, not below a least value.
 
     The median distance alone would be one of the whole numbers of a picture of 8 bits.
     """
 
-    def of(block: FloatArray) -> float:
+    def deviation(block: FloatArray) -> float:
         distance = np.abs(block - np.median(block))
         usual = max(_SIGMA_OF_MAD * float(np.median(distance)), least)
         return max(math.sqrt(float(np.mean(distance[distance <= 5.0 * usual] ** 2))), least)
 
-    return of
+    return deviation
 
 
 def _median(block: FloatArray) -> float:

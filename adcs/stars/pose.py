@@ -1,4 +1,4 @@
-"""Attitude, scale and distortion of a camera by stars that are known."""
+"""Attitude, scale and distortion of a camera from identified stars."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from arrays.typing import FloatArray
 
 @dataclass(frozen=True)
 class LensPrior:
-    """Standard deviations with which a camera is known; 0 is exactly."""
+    """Prior standard deviations of a camera's lens; 0 is exactly known."""
 
     scale: float = 0.0
-    """Relative."""
+    """Relative standard deviation of the scale."""
     bent: float = 0.0
     """Displacement of a corner by radial distortion, over its distance from the centre."""
 
 
 UNKNOWN_LENS = LensPrior(scale=0.05, bent=0.02)
-"""Of a star camera that nobody has calibrated."""
+"""Prior of a star camera without a calibration."""
 
 
 @dataclass(frozen=True, eq=False)
 class CameraPose:
-    """Where a camera looks, and what is known of its lens.
+    """Attitude and lens of a camera, with their covariance.
 
     Attributes
     ----------
@@ -45,10 +45,10 @@ class CameraPose:
     covariance: FloatArray
 
 
-def fitted(
+def fit_pose(
     points_px: FloatArray, there: FloatArray, pose: CameraPose, known: StarCamera, prior: LensPrior, noise_px: float
 ) -> CameraPose:
-    """One Gauss–Newton step from a pose: its stars (k, 2) and their directions (k, 3) in the catalogue.
+    """Refine a pose by one Gauss–Newton step, from stars (k, 2) and directions (k, 3) in the catalogue.
 
     A star at v = Rᵀd has the tangents t = (v₁, v₂) / −v₃; a turn δθ about the frame's axes moves it by v × δθ. They are
     those of its point, a x (1 + κ a²|x|²), but for the noise. The covariance is that of the residuals' own scatter.

@@ -1,4 +1,4 @@
-"""Triangles of stars, and the attitudes that those of an image state by those of a catalogue."""
+"""Triangles of stars, and attitude hypotheses from matches of image and catalogue."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _BLOCK = 16
 """Triangles of an image that one call looks up, each in up to a millisecond."""
 
 
-class Triangles(NamedTuple):
+class StarTriangles(NamedTuple):
     """Triangles of stars: corners ordered by the opposite side, shortest first."""
 
     corners: IntArray  # (T, 3)
@@ -33,7 +33,7 @@ class Triangles(NamedTuple):
 
 
 class Checks(NamedTuple):
-    """What an attitude has to pass."""
+    """Limits that an attitude hypothesis must pass."""
 
     side: float  # chord within which sides agree
     scale: float  # relative error of the image's scale
@@ -43,8 +43,8 @@ class Checks(NamedTuple):
     most: int  # attitudes, with which it ends too
 
 
-def star_triangles(directions: FloatArray, longest: float, brighter: int) -> Triangles:
-    """Triangles of every star with its nearest brighter neighbours.
+def star_triangles(directions: FloatArray, longest: float, brighter: int) -> StarTriangles:
+    """Return the triangles of each star with its nearest brighter neighbours.
 
     ``directions`` (n, 3): unit vectors, brightest first. ``longest``: longest side, a chord. ``brighter``: neighbours
     of each star. Returns: each triangle once.
@@ -65,12 +65,12 @@ def star_triangles(directions: FloatArray, longest: float, brighter: int) -> Tri
     short = (sides[:, 2] > 0.0) & (sides[:, 2] <= longest)  # stars at one place make no triangle
     # Turned inside out: the triple product is positive for corners that go round clockwise seen from the centre.
     a, b, c = np.moveaxis(directions[corners[short]], 1, 0)
-    return Triangles(corners[short], sides[short], np.sum(np.cross(a, b) * c, axis=-1) < 0.0)
+    return StarTriangles(corners[short], sides[short], np.sum(np.cross(a, b) * c, axis=-1) < 0.0)
 
 
 @dataclass(frozen=True)
-class Hypothesis:
-    """An attitude that a triangle states."""
+class AttitudeHypothesis:
+    """Attitude from the match of one triangle."""
 
     R: FloatArray  # (3, 3): into the catalogue's frame from the image's
     scale: float  # relative to the image's
@@ -79,25 +79,27 @@ class Hypothesis:
 
 @dataclass(frozen=True, eq=False)
 class TriangleIndex:
-    """Triangles of a catalogue, to be found by the ratios of their sides, which no scale changes; see :meth:`of`."""
+    """Triangles of a catalogue, indexed by the ratios of their sides; made by :meth:`of`."""
 
     bright: FloatArray  # (n, 3): directions of stars that make triangles, brightest first
-    triangles: Triangles  # by cell of the ratios, and in it by the longest side
+    triangles: StarTriangles  # by cell of the ratios, and in it by the longest side
     begins: IntArray  # (_RATIOS² + 1,): of the cells
 
     @classmethod
     def of(cls, bright: FloatArray, longest: float, brighter: int) -> TriangleIndex:
-        """Index of all triangles of these stars; see :func:`star_triangles`."""
+        """Return the index of all triangles of these stars; see :func:`star_triangles`."""
         made = star_triangles(bright, longest, brighter)
         ratios = np.minimum((made.sides[:, :2] / made.sides[:, 2:] * _RATIOS).astype(np.intp), _RATIOS - 1)
         cell = ratios @ np.array([_RATIOS, 1])
         order = np.lexsort((made.sides[:, 2], cell))
         begins = np.searchsorted(cell[order], np.arange(_RATIOS**2 + 1))
-        ordered = Triangles(made.corners[order], made.sides[order], made.is_counter_clockwise[order])
+        ordered = StarTriangles(made.corners[order], made.sides[order], made.is_counter_clockwise[order])
         return cls(bright, ordered, begins)
 
-    def best(self, tangents: FloatArray, image: Triangles, sky: SkyCells, checks: Checks) -> Iterator[list[Hypothesis]]:
-        """Hypotheses that match stars besides their own, the best of a part of the image's triangles at a time, if any.
+    def best(
+        self, tangents: FloatArray, image: StarTriangles, sky: SkyCells, checks: Checks
+    ) -> Iterator[list[AttitudeHypothesis]]:
+        """Yield the best hypotheses that match further stars, for a part of the image's triangles at a time.
 
         ``tangents`` (f, 2): of the image's stars, brightest first.
         """
@@ -137,4 +139,4 @@ class TriangleIndex:
             goes_on = progress[0] < n and progress[1] < checks.most
             chosen = np.flatnonzero(matched >= (checks.enough if goes_on else 1))[::-1]
             if len(chosen):
-                yield [Hypothesis(R[i], float(scale[i]), int(progress[1])) for i in chosen]
+                yield [AttitudeHypothesis(R[i], float(scale[i]), int(progress[1])) for i in chosen]

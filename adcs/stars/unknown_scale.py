@@ -1,4 +1,4 @@
-"""Where an image of the sky looks whose scale is known roughly or not at all, and photographs in one step.
+"""Identification of images of the sky with unknown scale, and of photographs in one step.
 
 See docs/theory/star-identification.md.
 """
@@ -34,7 +34,7 @@ def solve_photograph(
     noise_px: float = 0.5,
     dark: ArrayLike | None = None,
 ) -> tuple[PictureStars, StarFix | NoFix]:
-    """Where a photograph of the sky looks, and which stars it shows.
+    """Identify attitude, scale and stars of a photograph of the sky.
 
     Parameters
     ----------

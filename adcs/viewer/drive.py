@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from adcs.mockup.navigation.fixes import FixRecord, Outcome
+from adcs.mockup.navigation.fixes import FixOutcome, FixRecord
 from adcs.mockup.navigation.strapdown import PlanarState, PlanarTrack
 from adcs.mockup.vision.camera import Camera, Pose
 from adcs.mockup.vision.paper_matcher import CameraFix
@@ -52,7 +52,7 @@ class Drive:
         Those that arrived, in that order.
     exposure_s : ndarray, shape (k,)
         When their images were truly taken.
-    outcomes : tuple of Outcome
+    outcomes : tuple of FixOutcome
     sigma_m : ndarray, shape (n, 2), optional
         Standard deviations of X and Y that the method believes.
     frame_of : callable
@@ -66,7 +66,7 @@ class Drive:
     track: PlanarTrack
     fixes: FixRecord
     exposure_s: FloatArray
-    outcomes: tuple[Outcome, ...]
+    outcomes: tuple[FixOutcome, ...]
     sigma_m: FloatArray | None
     frame_of: Callable[[int], SeenFrame]
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from adcs.mockup.navigation.fixes import Outcome
+from adcs.mockup.navigation.fixes import FixOutcome
 from adcs.mockup.navigation.strapdown import wrapped
 from adcs.viewer.drive import SETTLED_S, Drive
 from arrays.typing import FloatArray
@@ -107,5 +107,5 @@ def words_of(drive: Drive, row: int) -> Sequence[str]:
     if fix is None:
         return [*lines, "no fix has arrived"]
     outcome = drive.outcomes[fix]
-    word = outcome.value if outcome is not Outcome.REJECTED else "<b>rejected</b>"
+    word = outcome.value if outcome is not FixOutcome.REJECTED else "<b>rejected</b>"
     return [*lines, f"last fix: taken {now - drive.fixes.time_s[fix]:.2f} s ago, {word}"]

@@ -8,7 +8,7 @@ import viser
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from adcs.mockup.navigation.fixes import Outcome
+from adcs.mockup.navigation.fixes import FixOutcome
 from adcs.mockup.vision.camera import Pose, footprint
 from adcs.mockup.vision.paper_matcher import CameraFix
 from adcs.viewer.drive import Drive, SeenFrame
@@ -134,7 +134,7 @@ class TableScene:
         if fix == self._fix:
             return
         self._fix = fix
-        rejected = drive.outcomes[fix] is Outcome.REJECTED
+        rejected = drive.outcomes[fix] is FixOutcome.REJECTED
         shown, hidden = (self._rejected, self._late) if rejected else (self._late, self._rejected)
         show_at(shown, drive.fixes.position_m[fix], float(drive.fixes.heading_rad[fix]))
         hidden.visible = False
@@ -211,7 +211,7 @@ def scene_entries(drive: Drive) -> tuple[Swatch, ...]:
         Swatch(VIEW_COLOUR, "what the camera sees now"),
         Swatch(IDENTIFIED_COLOUR, "light identified in that frame"),
         Swatch(OTHER_STAR_COLOUR, "star that is not"),
-        *((Swatch(_REJECTED_COLOUR, "fix that was rejected"),) if Outcome.REJECTED in drive.outcomes else ()),
+        *((Swatch(_REJECTED_COLOUR, "fix that was rejected"),) if FixOutcome.REJECTED in drive.outcomes else ()),
     )
 
 

@@ -22,7 +22,7 @@ from adcs.frames import turned
 from adcs.satellite import dynamics, sensors
 from adcs.satellite.attitude_track import AttitudeTrack
 from adcs.satellite.magnetic_control import MU0
-from adcs.satellite.telemetry import Readings, Record, is_read, orbital_from_eci
+from adcs.satellite.telemetry import AttitudeReadings, Record, is_read, orbital_from_eci
 from arrays.typing import BoolArray, FloatArray
 from magloc import core
 from sims.attitude.scenario import AttitudeScenario
@@ -212,7 +212,7 @@ def _array(values: ArrayLike) -> FloatArray:
     return np.ascontiguousarray(values, dtype=np.float64)
 
 
-def sense(prepared: Prepared, q: FloatArray, w: FloatArray, rows: slice = slice(None)) -> Readings:
+def sense(prepared: Prepared, q: FloatArray, w: FloatArray, rows: slice = slice(None)) -> AttitudeReadings:
     """Readings of the instants ``rows`` of all runs, from their true attitudes and rates.
 
     Shapes ``q`` (runs, len(rows), 4), ``w`` (runs, len(rows), 3). ``rows``: all instants, unless given.
@@ -223,7 +223,7 @@ def sense(prepared: Prepared, q: FloatArray, w: FloatArray, rows: slice = slice(
     b_body = quaternion.rotate_back(q, prepared.true_field_orbital_T[:, rows])
     b_body = b_body + turned(prepared.field_gain[:, None], b_body)
     noise = {name: numbers[:, rows] for name, numbers in prepared.noise.items()}
-    good = Readings(
+    good = AttitudeReadings(
         star=sensors.star_tracker_readings(satellite.star_tracker, q, w, sun_orbital, earth_radius, lit, noise["star"]),
         gyro_rad_s=sensors.gyro_readings(satellite.gyro, w, prepared.gyro_bias_rad_s[:, rows], noise["gyro"]),
         field_T=sensors.magnetometer_readings(
@@ -234,7 +234,7 @@ def sense(prepared: Prepared, q: FloatArray, w: FloatArray, rows: slice = slice(
     return _with_wild(prepared, good, rows)
 
 
-def _with_wild(prepared: Prepared, good: Readings, rows: slice) -> Readings:
+def _with_wild(prepared: Prepared, good: AttitudeReadings, rows: slice) -> AttitudeReadings:
     """Readings some of which are anything: any attitude, any direction, any field and rate of a usual size."""
     if not any(wild.any() for wild in prepared.wild.values()):
         return good
@@ -250,7 +250,7 @@ def _with_wild(prepared: Prepared, good: Readings, rows: slice) -> Readings:
         replaced = prepared.wild[name][:, rows] & is_read(values)
         return np.where(replaced[..., None], anything, values)
 
-    return Readings(
+    return AttitudeReadings(
         star=mixed("star", good.star, None),
         gyro_rad_s=mixed("gyro", good.gyro_rad_s, _WILD_RAD_S),
         field_T=mixed("field", good.field_T, _WILD_T),

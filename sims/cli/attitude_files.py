@@ -88,25 +88,25 @@ def dataset_of(parts: Sequence[Part], estimate: EstimatorSettings, title: str) -
 
     from arrays.io.outputs import installed_version
 
-    def joined(values: Callable[[Part], FloatArray]) -> FloatArray:
+    def join_tracks(values: Callable[[Part], FloatArray]) -> FloatArray:
         return np.concatenate([values(part) for part in parts])
 
     def of(state: str) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Estimates, truth and standard deviations of a state."""
         return (
-            joined(lambda part: part.estimates.states[state]),
-            joined(lambda part: part.runs.states[state]),
-            joined(lambda part: part.estimates.sigma_by_state[state]),
+            join_tracks(lambda part: part.estimates.states[state]),
+            join_tracks(lambda part: part.runs.states[state]),
+            join_tracks(lambda part: part.estimates.sigma_by_state[state]),
         )
 
     axis, component = ("run", "time", "axis"), ("run", "time", "component")
     rate, true_rate, sigma_rate = of("rate")
-    sigma_attitude = joined(lambda part: part.estimates.sigma_by_state["attitude"])
-    nis = joined(lambda part: part.estimates.nis)
-    rejected = joined(lambda part: part.estimates.rejected.astype(np.float64))
+    sigma_attitude = join_tracks(lambda part: part.estimates.sigma_by_state["attitude"])
+    nis = join_tracks(lambda part: part.estimates.nis)
+    rejected = join_tracks(lambda part: part.estimates.rejected.astype(np.float64))
     listed: list[tuple[str, tuple[str, ...], FloatArray, str, str]] = [
-        ("q", component, joined(lambda part: part.estimates.q), "1", "attitude, orbital from body"),
-        ("q_true", component, joined(lambda part: part.runs.q), "1", "true attitude"),
+        ("q", component, join_tracks(lambda part: part.estimates.q), "1", "attitude, orbital from body"),
+        ("q_true", component, join_tracks(lambda part: part.runs.q), "1", "true attitude"),
         ("rate", axis, rate, "rad/s", "rate, body axes"),
         ("rate_true", axis, true_rate, "rad/s", "true rate"),
         ("sigma_attitude", axis, sigma_attitude, "rad", "standard deviation of the angle"),

@@ -77,7 +77,7 @@ class FusionRuns:
 
         Those that were used and the unused ones of all reasons are the fixes; pending ones would have arrived later.
         """
-        from adcs.mockup.navigation.fixes import Outcome, unused_counts
+        from adcs.mockup.navigation.fixes import FixOutcome, unused_counts
 
         errors = [result.errors for result in self.results]
         outcomes = [outcome for result in self.results for outcome in result.fused.outcomes]
@@ -92,7 +92,7 @@ class FusionRuns:
             "delay_ms_median": None if not delays_s.size else 1e3 * float(np.median(delays_s)),
             "fixes": len(outcomes),
             "used_fixes": used,
-            "rejected_fixes": outcomes.count(Outcome.REJECTED),
+            "rejected_fixes": outcomes.count(FixOutcome.REJECTED),
             "unused_fixes": unused_counts(outcomes),
             "pending_fixes": sum(len(result.run.fixes) for result in self.results) - len(outcomes),
             "false_fixes": int(sum(result.run.false[: len(result.fused.outcomes)].sum() for result in self.results)),
@@ -276,7 +276,7 @@ def _zeros_result(unknowns: Unknowns, start_fixes: int, seed: int, run: TableRun
             f"{seed}; instead received {start_fixes}."
         )
     heading, gyro_zero = heading_from_fixes(run.imu, fixes)
-    imu = run.imu.less(0.0, gyro_zero)
+    imu = run.imu.subtract_zeros(0.0, gyro_zero)
     courses = (imu.time_s - 0.5 * imu.steps_s)[None] if unknowns == "drift" else None
     problem = zero_problem(imu, heading, fixes, courses)
     velocity = (fixes.position_m[1] - fixes.position_m[0]) / (fixes.time_s[1] - fixes.time_s[0])
@@ -286,7 +286,7 @@ def _zeros_result(unknowns: Unknowns, start_fixes: int, seed: int, run: TableRun
     start = fit.start(heading_start)
     zeros = fit.zero_course(courses)
     before = strapdown(imu, replace(start, position_m=position, velocity_m_s=velocity))
-    after = strapdown(imu.less(zeros, 0.0), start)
+    after = strapdown(imu.subtract_zeros(zeros, 0.0), start)
     error = float(np.linalg.norm(np.mean(zeros - run.zero_m_s2, axis=0)))
     return ZerosResult(seed, run, fit, before, after, _apart_mm(before, run), _apart_mm(after, run), error)
 

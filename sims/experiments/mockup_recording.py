@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from adcs.mockup.navigation.delayed_ekf import StartSigma
-from adcs.mockup.navigation.fixes import FixRecord, Fused, Outcome, counts_in_words, fuse, unused_counts
+from adcs.mockup.navigation.fixes import FixOutcome, FixRecord, Fused, counts_in_words, fuse, unused_counts
 from adcs.mockup.navigation.strapdown import Gate, ImuRecord, PlanarState, wrapped
 from arrays.io.csv import Table, read_table
 from arrays.io.errors import InputError
@@ -54,7 +54,7 @@ class RecordRun:
             "gaps_s": self.gaps_s.tolist(),
             "fixes": len(used),
             "used_fixes": int(used.sum()),
-            "rejected_fixes": self.fused.outcomes.count(Outcome.REJECTED),
+            "rejected_fixes": self.fused.outcomes.count(FixOutcome.REJECTED),
             "unused_fixes": unused_counts(self.fused.outcomes),
             "early_fixes": self.early_fixes,
             "pending_fixes": len(self.fixes) - len(used),
@@ -89,7 +89,7 @@ def fused_record(samples: Path, fixes: Path, method: Method) -> RecordRun:
     >>> run = experiments.fused_record(*files, "ekf")  # doctest: +SKIP
     """
     recorded, record = read_samples(samples), read_fixes(fixes)
-    imu = recorded.with_gaps_filled()
+    imu = recorded.fill_gaps()
     within = (record.time_s >= imu.begin_s) & (record.time_s < imu.end_s)
     if not within.any():
         raise InputError(
@@ -147,7 +147,7 @@ def read_samples(path: Path) -> ImuRecord:
     imu = ImuRecord(float(time_s[0]) - usual_s, time_s, readings[:, :2], np.radians(readings[:, 2]))
     gate = Gate()
     limits = [f"{gate.acceleration_m_s2:g} m/s²"] * 2 + [f"{math.degrees(gate.rate_rad_s):g} °/s"]
-    believed = gate.accepted(imu).any(axis=0)
+    believed = gate.accept(imu).any(axis=0)
     if not believed.all():
         column = int(np.argmin(believed))
         raise InputError(

@@ -14,7 +14,7 @@ from adcs.mockup.vision.camera import (
     Pose,
     camera_of_footprint,
     centred_from_table,
-    distorted,
+    distort,
     in_frame,
     undistorted,
 )
@@ -24,7 +24,7 @@ from adcs.mockup.vision.paper_matcher import SLIVER_RAD, Matcher, PaperMatcher, 
 from adcs.mockup.vision.pose_odds import PoseOdds
 from adcs.mockup.vision.predicted_matcher import LightTracker
 from adcs.mockup.vision.robust_matcher import RobustMatcher
-from adcs.mockup.vision.similarity import fitted_similarity, mirrored_image
+from adcs.mockup.vision.similarity import fit_similarity, mirrored_image
 from adcs.mockup.vision.sky import led_sky
 from adcs.mockup.vision.triangles import TriangleCatalogue, delaunay_triangles
 from sims.mockup.frames import rendered_frame
@@ -113,8 +113,8 @@ def _validation_rows(catalogue: TriangleCatalogue, size: Size) -> Iterator[Row]:
         candidates.append((seen, known))
     contestants = {}
     for seen, known in candidates:
-        centres = fitted_similarity(seen, known)[1]
-        contestants["centres", len(seen)] = Contestant(lambda p=seen, q=known: fitted_similarity(p, q))
+        centres = fit_similarity(seen, known)[1]
+        contestants["centres", len(seen)] = Contestant(lambda p=seen, q=known: fit_similarity(p, q))
         contestants["validation", len(seen)] = Contestant(
             lambda b=centres: longest_close_subset(b, PaperMatcher(catalogue).closeness_m)
         )
@@ -184,7 +184,7 @@ def wide_catalogue(n: int) -> TriangleCatalogue:
 def centred_stars(catalogue: TriangleCatalogue, camera: Camera) -> np.ndarray:
     """Centred pixels of the lights that the camera sees, with a tenth of a pixel of noise."""
     points = centred_from_table(camera, POSE, catalogue.positions_m)
-    seen = points[in_frame(camera, distorted(camera, points), 5.0)]
+    seen = points[in_frame(camera, distort(camera, points), 5.0)]
     return seen + 0.1 * np.random.default_rng(1).standard_normal(seen.shape)
 
 

@@ -1,4 +1,4 @@
-"""Gaps in the readings of an inertial unit, and the turn that a gap of the gyro hides."""
+"""Gaps in the readings of an inertial unit, and the rotation within a gap of the gyro."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from adcs.satellite.telemetry import is_read
 from adcs.satellite.vector_record import GAP_STEPS
 from arrays.typing import BoolArray, FloatArray
 
-_CHANGE_S = 1.0  # a hand changes its rate within that time; what a shorter gap hides shows after it
+_CHANGE_S = 1.0  # a hand changes its rate within that time
 _STEEP, _LONG = 6, 10.0
-_SHOWN_RAD, _SHOWN_S = 0.15, 0.3  # over a shorter gap a room's field turns as much as the unit
+_SHOWN_RAD, _SHOWN_S = 0.15, 0.3  # in a shorter gap the room's field changes as much as by a rotation
 _TINY = 1e-12
 HELD_VARIANCE = 4.0
-"""Part by which the rate at one end of a gap says less of a turn than the mean of both, as of a rate that wanders."""
+"""Factor of the variance with the rate at one end of a gap over that with both, for a rate that is a random walk."""
 UNKNOWN_RAD = math.pi / math.sqrt(3.0)
 """Standard deviation of an angle that may be any."""
 LOST_RAD = 0.05
@@ -28,15 +28,15 @@ LEAST_GAP_S = 1.0
 
 
 def numbered_windows(time_s: FloatArray, window_s: float) -> NDArray[np.intp]:
-    """Return the number (n,) of the window that each instant is in; windows without an instant are not counted."""
+    """Return the number (n,) of the window of each instant; empty windows are not counted."""
     window = np.floor((time_s - time_s[0]) / window_s * (1.0 + 1e-9))
     return np.cumsum(np.diff(window, prepend=0.0) > 0.0, dtype=np.intp)
 
 
 def window_scatter(values: FloatArray, window: NDArray[np.intp]) -> tuple[FloatArray, FloatArray, NDArray[np.intp]]:
-    """Return means (k, 3) of each window's readings, their largest standard deviation (k,), and their number (k,).
+    """Return mean (k, 3), largest standard deviation (k,) and number (k,) of each window's readings.
 
-    ``values`` (n, 3): NaN without a reading. ``window`` (n,): number of the window that each is in, ascending from 0.
+    ``values`` (n, 3): NaN without a reading. ``window`` (n,): number of its window, ascending from 0.
     """
     begins, read = np.flatnonzero(np.diff(window, prepend=-1)), np.isfinite(values.sum(axis=1))
     counts = np.add.reduceat(read, begins, dtype=np.intp)
@@ -47,9 +47,9 @@ def window_scatter(values: FloatArray, window: NDArray[np.intp]) -> tuple[FloatA
 
 
 def sensor_gaps(time_s: FloatArray, read: BoolArray, least_s: float = 0.0) -> NDArray[np.intp]:
-    """Return the rows (k, 2) before and after each gap of a sensor; n stands after a gap that lasts to the end.
+    """Return the rows (k, 2) before and after each gap of a sensor; n after a gap at the end.
 
-    A gap is longer than 2.5 usual steps of the sensor and than ``least_s``. Time before the first reading is none.
+    A gap is longer than 2.5 usual steps of the sensor and than ``least_s``. Time before the first reading is no gap.
     """
     rows = np.flatnonzero(read)
     span = np.diff(time_s[rows])
@@ -62,9 +62,9 @@ def sensor_gaps(time_s: FloatArray, read: BoolArray, least_s: float = 0.0) -> ND
 
 
 def hidden_turn_rad(seconds: FloatArray, held_rad_s: float, usual_rad_s: float) -> FloatArray:
-    """Return the standard deviation of the turn that a gap of the gyro hides, beside that by the mean rate of its ends.
+    """Return σ of the rotation in a gap of the gyro, relative to that by the mean rate of its ends.
 
-    In a short gap the mean rate is off by ``held_rad_s``; beyond a second the unit may have any of its usual rates.
+    In a short gap σ of the mean rate is ``held_rad_s``; beyond a second the unit may have any of its usual rates.
     """
     part = np.power(np.minimum(seconds / _CHANGE_S, _LONG), _STEEP)
     rate = np.hypot(held_rad_s, usual_rad_s * part / (1.0 + part))
@@ -74,10 +74,10 @@ def hidden_turn_rad(seconds: FloatArray, held_rad_s: float, usual_rad_s: float) 
 def hidden_variance(
     time_s: FloatArray, rate_rad_s: FloatArray, gaps: NDArray[np.intp], held_rad_s: float, usual_rad_s: float
 ) -> FloatArray:
-    """Return by how much the variance of the attitude grows at each instant (n,), within the gaps of the gyro [rad²].
+    """Return the growth (n,) of the attitude's variance within gaps of the gyro [rad²].
 
-    It is positive in all of a gap. ``rate_rad_s`` (n, 3) is NaN without a reading. Rates as of
-    :func:`hidden_turn_rad`, ``usual_rad_s`` at least that of the whole log.
+    It is positive in all of a gap. ``rate_rad_s`` (n, 3): NaN without a reading. Other rates as in
+    :func:`hidden_turn_rad`; the rms rate of the log replaces ``usual_rad_s`` if it is higher.
     """
     growth = np.zeros(len(time_s))
     usual = max(usual_rad_s, math.sqrt(float(np.nanmean(np.einsum("ni,ni->n", rate_rad_s, rate_rad_s)))))
@@ -88,13 +88,13 @@ def hidden_variance(
     return growth
 
 
-def shown_turns(
+def observed_turn_variance(
     time_s: FloatArray, gaps: NDArray[np.intp], hidden_rad2: FloatArray, steady_field: FloatArray
 ) -> FloatArray:
-    """Return what is to be added to the variance (n,) after each gap over which the field turns by more [rad²].
+    """Return the variance (n,) to add after gaps over which the field turns by more than σ [rad²].
 
-    ``steady_field`` (n, 3) is in the frame of the gyro alone, where it stands still but for a gap, and NaN where it is
-    not the Earth's.
+    ``steady_field`` (n, 3): in the frame of the gyro alone, where only a gap changes it; NaN where it is not the
+    Earth's.
     """
     more = np.zeros(len(time_s))
     rows = np.flatnonzero(is_read(steady_field))
@@ -111,7 +111,7 @@ def shown_turns(
 
 
 def gap_warnings(time_s: FloatArray, read: Mapping[str, BoolArray], lost: NDArray[np.intp]) -> list[str]:
-    """Return a sentence for each sensor with gaps: how many, how long, and when.
+    """Return a sentence for each sensor with gaps: number, duration and time.
 
     Parameters
     ----------
@@ -124,17 +124,19 @@ def gap_warnings(time_s: FloatArray, read: Mapping[str, BoolArray], lost: NDArra
     gyro, *others = read
     texts = []
     if len(lost):
-        texts.append(f"{_named(time_s, gyro, lost)}; the turn within a gap is unknown, and the field tells it again")
+        texts.append(
+            f"{_gap_sentence(time_s, gyro, lost)}; the turn within a gap is unknown, and the field tells it again"
+        )
     for name in others:
         gaps = sensor_gaps(time_s, read[name], LEAST_GAP_S)
         seen = np.concatenate([[0], np.cumsum(read[gyro])])
         own = gaps[seen[np.minimum(gaps[:, 1], len(time_s))] - seen[gaps[:, 0] + 1] > 0]
         if len(own):
-            texts.append(f"{_named(time_s, name, own)}; the gyro alone held the attitude there")
+            texts.append(f"{_gap_sentence(time_s, name, own)}; the gyro alone held the attitude there")
     return texts
 
 
-def _named(time_s: FloatArray, name: str, gaps: NDArray[np.intp]) -> str:
+def _gap_sentence(time_s: FloatArray, name: str, gaps: NDArray[np.intp]) -> str:
     lasts_s = time_s[np.minimum(gaps[:, 1], len(time_s) - 1)] - time_s[gaps[:, 0]]
     k = int(np.argmax(lasts_s))
     times = "1 gap, of" if len(gaps) == 1 else f"{len(gaps)} gaps, the longest of"

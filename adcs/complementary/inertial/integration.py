@@ -1,4 +1,4 @@
-"""What goes on from row to row in the log of an inertial unit, by compiled kernels: gyro, level, low-pass."""
+"""Compiled recursions over the log of an inertial unit: gyro, level attitude, low-pass."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from magloc import core
 
 
 def gyro_attitudes(rate_rad_s: FloatArray, dt_s: FloatArray) -> FloatArray:
-    """Return the attitudes (n, 4) of the gyro alone, from the identity at the first instant on.
+    """Return the attitudes (n, 4) of the gyro alone, starting with the identity.
 
     ``rate_rad_s`` (n, 3): mean over the step ``dt_s`` (n,) that ends at each instant.
     """
@@ -20,11 +20,11 @@ def gyro_attitudes(rate_rad_s: FloatArray, dt_s: FloatArray) -> FloatArray:
     return q
 
 
-def levelled(q_gyro: FloatArray, up: FloatArray, part: FloatArray, start: FloatArray) -> FloatArray:
-    """Return the attitudes (n, 4) of the gyro, turned so that a vector (n, 3) in its frame goes up.
+def level_attitudes(q_gyro: FloatArray, up: FloatArray, part: FloatArray, start: FloatArray) -> FloatArray:
+    """Rotate the attitudes (n, 4) of the gyro so that a vector (n, 3) in its frame points upwards.
 
-    A part (n,) of the angle is corrected at each instant, as the explicit filter does with one vector: the error is
-    across the level, so that the correction is gathered in a quaternion of its own, from ``start`` (4,) on.
+    A part (n,) of the angle is corrected at each instant, as in the explicit filter with one vector. The corrections
+    accumulate in a quaternion of their own, which begins with ``start`` (4,).
     """
     q = np.empty_like(q_gyro)
     work = core.problem("level", start=tuple(start), q_gyro=q_gyro, up=up, part=part, q=q)
@@ -33,10 +33,11 @@ def levelled(q_gyro: FloatArray, up: FloatArray, part: FloatArray, start: FloatA
 
 
 def low_pass(values: FloatArray, dt_s: FloatArray, time_s: float, start: FloatArray) -> FloatArray:
-    """Return values (n, k) after a Butterworth filter of second order, in any steps (n,), at rest at ``start``.
+    """Filter values (n, k) by a Butterworth low-pass of second order, initially at rest at ``start``.
 
-    It rises to 1 - 1/e within ``time_s``. Within a step, whose input is the mean of both ends, it is exact: with s the
-    inverse of that time and z the distance to the input, z'' + 2s z' + 2s² z = 0. NaN is the value before.
+    Steps ``dt_s`` (n,) are arbitrary. The step response reaches 1 - 1/e within ``time_s``. Within a step, whose input
+    is the mean of both ends, the solution is exact: z'' + 2s z' + 2s² z = 0 with s = 1/``time_s`` and z the distance to
+    the input. NaN repeats the value before.
     """
     out = np.empty_like(values)
     steps = np.ascontiguousarray(dt_s) / time_s

@@ -1,4 +1,4 @@
-"""Direction up of an inertial unit: the acceleration smoothed in a frame that does not turn, anew after each gap."""
+"""Direction up of an inertial unit: the acceleration, smoothed in a frame that does not turn."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from arrays.typing import BoolArray, FloatArray
 GRAVITY_TIME_S = 3.0
 """Time constant of the low-pass of the acceleration, as published for VQF."""
 _GRAVITY_M_S2 = 9.81
-_MEAN_S = 0.5  # mean accelerations of a hand fall with the time that they are of, from here on
+_MEAN_S = 0.5  # means of a hand's acceleration over longer times decrease with that time
 _WINDOW_S = 1.5
-_LEAST_RAD = 0.025  # a gap that hides less is smoothed over
-_MUCH = 2.0  # what was known before counts if it is not worse than some readings
-_LEAST_M_S2 = 0.1  # what an accelerometer's mean is off by
+_LEAST_RAD = 0.025  # smoothing continues over a gap that hides less
+_MUCH = 2.0  # the estimate before a gap is used up to this number of σ of a reading
+_LEAST_M_S2 = 0.1  # error of the mean of an accelerometer
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ class Up:
 
 @dataclass(frozen=True, eq=False)
 class Steady:
-    """Accelerations at n instants, in the frame of the gyro alone, and where they say little."""
+    """Accelerations at n instants, in the frame of the gyro alone, and gaps of the gyro."""
 
     time_s: FloatArray
     dt_s: FloatArray
@@ -55,9 +55,10 @@ class Steady:
 
 
 def direction_up(steady: Steady, *, offline: bool) -> Up:
-    """Smooth accelerations; offline the mean of a low-pass from either end, never late.
+    """Smooth accelerations; offline by the mean of a forward and a backward low-pass, without delay.
 
-    After a gap that hides more than a few readings leave open, the mean of the first seconds starts the low-pass anew.
+    After a gap that hides a larger rotation than the σ of a few readings, the low-pass restarts from the mean of the
+    first seconds.
     """
     n, acceleration = len(steady.time_s), steady.acceleration_m_s2
     smooth, sigma, fresh, hidden = np.empty((n, 3)), np.zeros(n), np.zeros(n, np.bool_), steady.hidden_rad2.copy()
@@ -70,7 +71,7 @@ def direction_up(steady: Steady, *, offline: bool) -> Up:
     for before, after, growth, turns in [*gaps, (n - 1, n, np.zeros(0), False)]:
         piece = slice(begin, before + 1)
         last = smooth[max(begin - 1, 0)]
-        smooth[piece], sigma[piece], fresh[piece] = _piece(steady, piece, last, unknown, scatter, offline)
+        smooth[piece], sigma[piece], fresh[piece] = _smooth_piece(steady, piece, last, unknown, scatter, offline)
         smooth[before + 1 : after] = smooth[before]
         sigma[before + 1 : after] = np.sqrt(sigma[before] ** 2 + HELD_VARIANCE * growth[: after - before - 1])
         if after < n:
@@ -85,7 +86,7 @@ def direction_up(steady: Steady, *, offline: bool) -> Up:
 
 
 def _gaps(steady: Steady) -> list[tuple[int, int, FloatArray, bool]]:
-    """Gaps that matter: rows before and after, the variance at each row within and after, and whether the gyro's."""
+    """Return gaps that matter: rows before and after, growing variance, and whether it is the gyro's."""
     time_s, found = steady.time_s, []
     for before, after in steady.gaps:
         growth = np.cumsum(steady.hidden_rad2[before + 1 : after + 1])
@@ -99,7 +100,7 @@ def _gaps(steady: Steady) -> list[tuple[int, int, FloatArray, bool]]:
 
 
 def _scatter_rad(steady: Steady, gaps: list[tuple[int, int, FloatArray, bool]]) -> FloatArray:
-    """Angle (n,) by which one reading is off: that of accelerations nearby, and of all."""
+    """Return σ (n,) of the angle of one reading, from the scatter of nearby and of all accelerations."""
     begins = np.diff(numbered_windows(steady.time_s, _WINDOW_S), prepend=0) > 0
     for before, after, *_ in gaps:
         begins[[before + 1, min(after, len(begins) - 1)]] = True
@@ -110,10 +111,10 @@ def _scatter_rad(steady: Steady, gaps: list[tuple[int, int, FloatArray, bool]]) 
     return np.asarray(np.hypot(np.maximum(near, np.median(scatter)), _LEAST_M_S2)[window] / _GRAVITY_M_S2)
 
 
-def _piece(
+def _smooth_piece(
     steady: Steady, piece: slice, last: FloatArray, before_rad: float, scatter: FloatArray, offline: bool
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Smooth accelerations of some rows, σ of their direction, and which are fresh.
+    """Return smoothed accelerations of some rows, σ of their direction, and the fresh rows.
 
     ``last`` is the smooth acceleration before them, and ``before_rad`` σ of its direction.
     """

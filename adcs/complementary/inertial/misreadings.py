@@ -1,7 +1,7 @@
-"""Units and axes that an inertial unit's log was written in but is not read in.
+"""Detection of wrong units and axes in the log of an inertial unit.
 
-Gravity and the Earth's field have known lengths, and stand still in a frame that does not turn: the gyro has to say of
-both how they turn in the body. Where a sensor contradicts the others, every change that a misreading makes is tried.
+Gravity and the Earth's field have known lengths, and are constant in a frame that does not turn: their rotation in body
+axes must agree with the gyro. If a sensor contradicts the others, all likely misreadings are tried.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from adcs import quaternion
 from adcs.complementary.inertial.integration import gyro_attitudes
-from adcs.satellite.conventions import FIELD_UNITS, RATE_UNITS, angle, median, mending, reflected_axes
+from adcs.satellite.conventions import FIELD_UNITS, RATE_UNITS, angle, median, reflected_axes, remedies
 from adcs.satellite.telemetry import is_read
 from adcs.satellite.vector_record import instants_within, steps_s
 from arrays.typing import BoolArray, FloatArray
@@ -53,7 +53,7 @@ _VECTORS = ("magnetometer", "accelerometer")
 
 @dataclass(frozen=True, eq=False)
 class _Windows:
-    """Times between two readings of a vector in which it turns."""
+    """Pairs of readings of a vector, between which it turns."""
 
     first: NDArray[np.intp]  # rows
     last: NDArray[np.intp]
@@ -61,12 +61,12 @@ class _Windows:
     after: FloatArray  # and at the last one
 
     def differences(self, turns: FloatArray) -> FloatArray:
-        """Angles (k,) between the vector's turn and others, as rotation vectors (k, 3) of the body."""
+        """Return the angles (k,) between the vector's rotations and others, rotation vectors (k, 3)."""
         return angle(quaternion.rotate(quaternion.exp(turns), self.after), self.before)
 
     @property
     def allowed_rad(self) -> float:
-        """Median difference that readings of a hand in a room may have."""
+        """Largest median difference of good readings, of a hand in a room."""
         return _ALLOWED_PART * median(angle(self.before, self.after)) + _ALLOWED_RAD
 
 
@@ -127,7 +127,7 @@ def check_turns(
     if not windows:
         return
     dt_s = steps_s(time_s)
-    dips = _some(np.flatnonzero(is_read(field_T) & is_read(acceleration_m_s2)))
+    dips = _thin(np.flatnonzero(is_read(field_T) & is_read(acceleration_m_s2)))
     pair = field_T[dips], acceleration_m_s2[dips]
     turns = _gyro_turns(rate_rad_s, dt_s, windows)
     before = _differences(windows, turns, pair)
@@ -149,7 +149,7 @@ def check_turns(
         seen = list(before)[worst]
         if seen == "dip" or as_read[worst] < _SUSPICIOUS:
             continue
-        named = mending(as_read, disagreements, int(worst))
+        named = remedies(as_read, disagreements, int(worst))
         if named := [name for name in named if _is_nearer(before[seen], changed[name][seen])]:
             raise ValueError(_sentence(named, seen, before[seen], changed[named[0]][seen]))
 
@@ -168,13 +168,13 @@ def _sentence(named: list[str], seen: str, before: FloatArray, after: FloatArray
     )
 
 
-def _some(rows: NDArray[np.intp]) -> NDArray[np.intp]:
-    """As many of them, evenly spread, as tell what all do."""
+def _thin(rows: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Thin rows evenly to at most :data:`_MOST_WINDOWS`."""
     return rows[:: -(-len(rows) // _MOST_WINDOWS)] if len(rows) else rows
 
 
 def _windows(time_s: FloatArray, v: FloatArray, gaps: NDArray[np.intp], turn_rad: float) -> _Windows:
-    """Windows one after the other, as short as such that a quarter of them turns enough; none of too few."""
+    """Return the shortest consecutive windows of which a quarter turns enough; none if there are few."""
     rows = np.flatnonzero(is_read(v))
     rows = rows[:: instants_within(_SAMPLE_S, time_s[rows])]
     units = v[rows] / np.linalg.norm(v[rows], axis=1, keepdims=True)
@@ -186,7 +186,7 @@ def _windows(time_s: FloatArray, v: FloatArray, gaps: NDArray[np.intp], turn_rad
             first = rows[:-size:size]
             moves = (turned > _LEAST_TURN * turn_rad) & (gaps[first] == gaps[rows[size::size]])
             if np.count_nonzero(moves) >= _WINDOWS:
-                chosen = _some(np.flatnonzero(moves)) * size
+                chosen = _thin(np.flatnonzero(moves)) * size
                 return _Windows(rows[chosen], rows[chosen + size], units[chosen], units[chosen + size])
             break
         size *= 2
@@ -194,7 +194,7 @@ def _windows(time_s: FloatArray, v: FloatArray, gaps: NDArray[np.intp], turn_rad
 
 
 def _gyro_turns(rate_rad_s: FloatArray, dt_s: FloatArray, windows: dict[str, _Windows]) -> dict[str, FloatArray]:
-    """Turns of the gyro (k, 3) over the windows of each vector, as rotation vectors of the body."""
+    """Return the gyro's rotation vectors (k, 3) over the windows of each vector."""
     q = gyro_attitudes(rate_rad_s, dt_s)
     return {
         name: quaternion.log(quaternion.multiply(quaternion.conjugate(q[w.first]), q[w.last]))
@@ -209,9 +209,9 @@ def _differences(
     sensor: str = "",
     matrix: FloatArray | None = None,
 ) -> dict[str, FloatArray]:
-    """Angles between the turns of each vector and the gyro's, and those of the dip to its median.
+    """Return the angles between the rotations of each vector and the gyro, and of the dip to its median.
 
-    ``matrix`` undoes a sensor's axes: what it does to the turn of a short window is what it does to the rates.
+    ``matrix`` corrects a sensor's axes. For the gyro it acts on the rotations of short windows as on rates.
     """
     found = {}
     for name, w in windows.items():
@@ -227,19 +227,19 @@ def _differences(
 
 
 def _disagreements(differences: dict[str, FloatArray], allowed: dict[str, float]) -> FloatArray:
-    """Medians of differences, in units of what is allowed."""
+    """Return medians of differences over their allowed values."""
     return np.array([median(found) / allowed[name] for name, found in differences.items()])
 
 
 def _is_nearer(before: FloatArray, after: FloatArray) -> bool:
-    """Whether more windows agree better than chance would do, by a test of signs."""
+    """Return whether more windows agree better than by chance, by a sign test."""
     from scipy.stats import binom
 
     return bool(binom.sf(np.count_nonzero(after < before) - 1, len(before), 0.5) < _CHANCE)
 
 
 def _units(dt_s: FloatArray, rate_rad_s: FloatArray, windows: dict[str, _Windows]) -> Iterator[tuple[str, str, float]]:
-    """Gyro or time, misreadings of its unit by name, and the factor of the turns that undoes each."""
+    """Yield gyro or time, names of wrong units, and the factor of the rotations that corrects each."""
     path = np.cumsum(np.sqrt(np.einsum("ni,ni->n", rate_rad_s, rate_rad_s)) * dt_s)
     parts = [median((path[w.last] - path[w.first]) / angle(w.before, w.after)) for w in windows.values()]
     if all(_LIKE_PART[0] < part < _LIKE_PART[1] for part in parts):
@@ -257,7 +257,7 @@ def _units(dt_s: FloatArray, rate_rad_s: FloatArray, windows: dict[str, _Windows
 
 
 def _axes(sensors: list[str]) -> Iterator[tuple[str, str, FloatArray]]:
-    """Some sensors, misreadings of their axes by name, and the matrix that undoes each."""
+    """Yield sensors, names of wrong axes, and the matrix that corrects each."""
     for sensor in sensors:
         known = [np.eye(3)]
         for name, matrix in _all_axes():
@@ -269,7 +269,7 @@ def _axes(sensors: list[str]) -> Iterator[tuple[str, str, FloatArray]]:
 
 
 def _all_axes() -> Iterator[tuple[str, FloatArray]]:
-    """Return the 48 ways to exchange and to reverse axes, the likely ones first."""
+    """Yield the 48 permutations and reversals of axes, the likely ones first."""
     yield from reflected_axes()
     for order in permutations(range(3)):
         for signs in product((1.0, -1.0), repeat=3):

@@ -1,1 +1,1 @@
-"""Fusion of late camera fixes with the inertial unit in the plane."""
+"""Fusion of delayed camera fixes with a planar inertial unit."""

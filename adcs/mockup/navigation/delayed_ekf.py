@@ -1,4 +1,4 @@
-"""Error-state Kalman filter of the table-top satellite that takes late camera fixes where they belong.
+"""Error-state Kalman filter of the table-top satellite with delayed camera fixes.
 
 See docs/theory/tabletop-navigation.md.
 """
@@ -13,8 +13,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike
 
-from adcs.mockup.navigation.fixes import Fix, Outcome
-from adcs.mockup.navigation.strapdown import Gate, ImuRecord, PlanarState, PlanarTrack, held, turned, wrapped
+from adcs.mockup.navigation.fixes import FixOutcome, PlanarFix
+from adcs.mockup.navigation.strapdown import Gate, ImuRecord, PlanarState, PlanarTrack, hold, rotate, wrapped
 from arrays.typing import FloatArray
 from magloc.state_space import symmetric_square_root, update
 
@@ -27,8 +27,8 @@ H_FIX: FloatArray = np.eye(N)[[0, 1, 4]]
 
 
 @dataclass(frozen=True)
-class FilterSettings:
-    """Noises and rules of :class:`DelayedFilter`, all positive.
+class DelayedFilterSettings:
+    """Noise and limits of :class:`DelayedFilter`, all positive.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ class FilterSettings:
 
     @property
     def densities(self) -> FloatArray:
-        """Noise of acceleration and rate, of both where missing, walks of zeros and drifts: squared densities, (7,)."""
+        """Squared noise densities (7,): acceleration, rate, both when missing, walks of zeros and drifts."""
         white = np.array(
             [self.acceleration_m_s2, self.rate_rad_s, self.missing_acceleration_m_s2, self.missing_rate_rad_s]
         )
@@ -95,7 +95,7 @@ class FilterSettings:
 
     @property
     def all_densities(self) -> FloatArray:
-        """The same, shape (2, 2, 7): where accelerations are not and are lost, and where the rate is not and is."""
+        """Densities (2, 2, 7), without and with loss of accelerations and of the rate."""
         densities = np.tile(self.densities, (2, 2, 1))
         densities[1, :, 2], densities[:, 1, 3] = self.lost_m_s_rs**2, self.lost_rad_rs**2
         return densities
@@ -103,7 +103,7 @@ class FilterSettings:
 
 @dataclass(frozen=True)
 class StartSigma:
-    """Standard deviations of the start, each axis.
+    """Initial standard deviations per axis.
 
     The accelerometer's zeros may drift by 0.0003 m/s² per °C, so that 2e-5 m/s³ is 4 °C in a minute.
     """
@@ -117,18 +117,18 @@ class StartSigma:
 
     @property
     def covariance(self) -> FloatArray:
-        """Diagonal, shape (10, 10)."""
+        """Diagonal covariance, shape (10, 10)."""
         p, v, z, d = self.position_m, self.velocity_m_s, self.zero_m_s2, self.drift_m_s3
         return np.diag(np.square([p, p, v, v, self.heading_rad, z, z, self.zero_rad_s, d, d]))
 
 
 LOST = StartSigma(position_m=10.0, velocity_m_s=0.5, heading_rad=math.pi)
-"""Of position, velocity and heading of a second hypothesis, before the fix that begins it."""
+"""Initial deviations of position, velocity and heading of a second hypothesis, before its first fix."""
 
 
 @dataclass(frozen=True, eq=False)
 class FilterTrack(PlanarTrack):
-    """Estimates as they were known at each sample, with all states.
+    """Estimates at each sample with the data available then, with all states.
 
     Attributes
     ----------
@@ -148,14 +148,14 @@ class FilterTrack(PlanarTrack):
     sigma: FloatArray
 
 
-def predicted(
+def predict(
     x: FloatArray, P: FloatArray, steps_s: ArrayLike, readings: ArrayLike, there: ArrayLike, densities: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """State and covariance after each of some samples, :math:`F P F^T + Q`.
+    """Return state and covariance after each of some samples, :math:`F P F^T + Q`.
 
     Shapes ``x`` (10,), ``P`` (10, 10) -> (n, 10), (n, 10, 10). ``steps_s`` (n,). ``readings`` (n, 3): accelerations
     along body x and y, and the rate. ``there`` (n, 3): which of them are believed. One that is not counts as zero
-    acceleration, or as the rate that is given. ``densities`` (7,): of :attr:`FilterSettings.densities`.
+    acceleration, or as the rate that is given. ``densities`` (7,): of :attr:`DelayedFilterSettings.densities`.
     """
     h, z, use = np.asarray(steps_s), np.asarray(readings, dtype=np.float64), np.asarray(there, dtype=np.bool_)
     # The gyro's zero and the drifts stay: headings, zeros, velocities and positions are sums, one after the other.
@@ -164,7 +164,7 @@ def predicted(
     states[:, 4] += np.cumsum(turn)
     states[:, 5:7] += passed[:, None] * x[8:10]
     middle = states[:, 4] - 0.5 * turn
-    a = turned(middle, use[:, :2] * (z[:, :2] - x[5:7] - (passed - h)[:, None] * x[8:10]))
+    a = rotate(middle, use[:, :2] * (z[:, :2] - x[5:7] - (passed - h)[:, None] * x[8:10]))
     change = h[:, None] * a
     states[:, 2:4] += np.cumsum(change, axis=0)
     states[:, 0:2] += np.cumsum(h[:, None] * (states[:, 2:4] - 0.5 * change), axis=0)
@@ -199,20 +199,20 @@ def predicted(
 
 @dataclass(eq=False)
 class _Taken:
-    """A fix of the history, and what became of it."""
+    """Fix of the history and its outcome."""
 
-    fix: Fix
-    outcome: Outcome
+    fix: PlanarFix
+    outcome: FixOutcome
 
 
 class DelayedFilter:
-    """The filter as samples and fixes arrive.
+    """Online filter of samples and delayed fixes.
 
     - A fix of the same exposure as another one is left out (duplicate), and so is one older than ``buffer_s``.
     - Through a drop-out the covariance grows by the noises of the samples; the gate opens with it.
     - A rate that the gate of the samples does not believe is held, an acceleration is zero; both get a larger noise,
       and a still larger one where they are lost.
-    - A gap between samples is not seen here: :meth:`adcs.mockup.navigation.strapdown.ImuRecord.with_gaps_filled` makes
+    - A gap between samples is not seen here: :meth:`adcs.mockup.navigation.strapdown.ImuRecord.fill_gaps` makes
       it samples whose readings are missing.
 
     Parameters
@@ -221,7 +221,7 @@ class DelayedFilter:
         At ``begin_s``.
     begin_s : float
         Where the first samples begin.
-    settings : FilterSettings
+    settings : DelayedFilterSettings
         Noises and rules.
     sigma : StartSigma
         How well the start is known. The zeros and their drifts start at 0.
@@ -247,7 +247,7 @@ class DelayedFilter:
         self,
         start: PlanarState,
         begin_s: float,
-        settings: FilterSettings = FilterSettings(),
+        settings: DelayedFilterSettings = DelayedFilterSettings(),
         sigma: StartSigma = StartSigma(),
     ) -> None:
         self.settings = settings
@@ -265,17 +265,17 @@ class DelayedFilter:
 
     @property
     def x(self) -> FloatArray:
-        """Estimate."""
+        """Estimated state."""
         return self._x[self._n - 1].copy()
 
     @property
     def P(self) -> FloatArray:
-        """Its covariance."""
+        """Covariance of the estimated state."""
         return self._P[self._n - 1].copy()
 
     @property
     def state(self) -> PlanarState:
-        """Estimate of position, velocity and heading."""
+        """Estimated position, velocity and heading."""
         x = self.x
         return PlanarState(x[0:2], x[2:4], float(x[4]))
 
@@ -298,8 +298,8 @@ class DelayedFilter:
                 f"Input imu must begin where the last samples ended, at {self._time_s[last]:.6g} s; "
                 f"instead received samples that begin at {imu.begin_s:.6g} s."
             )
-        there = self.settings.sample_gate.accepted(imu)
-        believed = held(imu, there, self._readings[last, 2])
+        there = self.settings.sample_gate.accept(imu)
+        believed = hold(imu, there, self._readings[last, 2])
         self._make_room(n)
         last = self._n - 1
         rows = slice(self._n, self._n + n)
@@ -319,17 +319,17 @@ class DelayedFilter:
         )
         return FilterTrack(imu.time_s, position, velocity, heading, zeros, rate_zero, drifts, sigma)
 
-    def add_fix(self, fix: Fix) -> Outcome:
-        """Go back to the exposure of a fix, correct the estimate there, and come back."""
+    def add_fix(self, fix: PlanarFix) -> FixOutcome:
+        """Update the estimate at the exposure of a fix, and predict again to the present."""
         now = float(self._time_s[self._n - 1])
         if fix.time_s > now:
-            return Outcome.AHEAD
+            return FixOutcome.AHEAD
         if any(fix.time_s == taken.fix.time_s for taken in self._history):
-            return Outcome.DUPLICATE
+            return FixOutcome.DUPLICATE
         if fix.time_s < now - self.settings.buffer_s or fix.time_s <= self._time_s[0]:
-            return Outcome.TOO_OLD
+            return FixOutcome.TOO_OLD
         row = self._row_at(fix.time_s) - 1
-        taken = _Taken(fix, Outcome.USED)
+        taken = _Taken(fix, FixOutcome.USED)
         place = bisect_left(self._history, fix.time_s, key=lambda entry: entry.fix.time_s)
         self._history.insert(place, taken)
         for later in range(place, len(self._history)):
@@ -343,21 +343,21 @@ class DelayedFilter:
         return taken.outcome
 
     def _correct(self, row: int, place: int) -> float:
-        """Correct the estimate of a row by a fix of the history, or leave the fix out; its normalised innovation²."""
+        """Update the estimate of a row by a fix of the history, or reject it; return its NIS."""
         taken = self._history[place]
         x, P, nis = self._with_fix(self._x[row], self._P[row], taken.fix)
-        taken.outcome = Outcome.USED
+        taken.outcome = FixOutcome.USED
         if not nis <= self.settings.fix_gate:
             second = self._second(place)
-            taken.outcome = Outcome.REJECTED if second is None else Outcome.REACQUIRED
+            taken.outcome = FixOutcome.REJECTED if second is None else FixOutcome.REACQUIRED
             if second is None:
                 return nis
             x, P = second
         self._x[row], self._P[row] = x, P
         return nis
 
-    def _with_fix(self, x: FloatArray, P: FloatArray, fix: Fix) -> tuple[FloatArray, FloatArray, float]:
-        """Estimate and covariance with a fix, and its normalised innovation²."""
+    def _with_fix(self, x: FloatArray, P: FloatArray, fix: PlanarFix) -> tuple[FloatArray, FloatArray, float]:
+        """Return estimate and covariance updated by a fix, and its NIS."""
         s = self.settings
         innovation = np.append(fix.position_m - x[0:2], wrapped(fix.heading_rad - x[4]))
         sigma = np.array([s.fix_m, s.fix_m, s.fix_rad] if fix.sigma is None else fix.sigma)
@@ -365,13 +365,13 @@ class DelayedFilter:
         return x, S @ S.T, nis
 
     def _second(self, place: int) -> tuple[FloatArray, FloatArray] | None:
-        """The hypothesis that the first of the last rejected fixes began, if it has taken all of them; else None.
+        """Return the second hypothesis, from the last rejected fixes, if it accepts all of them; else None.
 
         It is run when it is asked for: fixes arrive late, and change the order of those that were rejected.
         """
         first = place - self.settings.reacquire_after + 1
         rejected = self._history[max(first, 0) : place]
-        if first < 0 or any(entry.outcome is not Outcome.REJECTED for entry in rejected):
+        if first < 0 or any(entry.outcome is not FixOutcome.REJECTED for entry in rejected):
             return None
         row = self._row_at(self._history[first].fix.time_s)
         P = LOST.covariance
@@ -389,7 +389,7 @@ class DelayedFilter:
         return x, P
 
     def _predict(self, first: int, last: int, x: FloatArray | None = None, P: FloatArray | None = None) -> None:
-        """Predict rows, of the estimate or of another that begins with the first, with the noises of what is lost."""
+        """Predict rows from the estimate, or from another state in the first row, with noise of lost readings."""
         rows = slice(first, last + 1)
         x, P = self._x[rows] if x is None else x, self._P[rows] if P is None else P
         lost = self._lost[first + 1 : last + 1]
@@ -398,10 +398,10 @@ class DelayedFilter:
         for begin, end in pairwise([0, *changes.tolist(), last - first]):
             densities = self._densities[*self._lost[first + end].astype(np.intp)]
             part, after = slice(begin, end), slice(begin + 1, end + 1)
-            x[after], P[after] = predicted(x[begin], P[begin], steps[part], readings[part], there[part], densities)
+            x[after], P[after] = predict(x[begin], P[begin], steps[part], readings[part], there[part], densities)
 
     def _row_at(self, time_s: float) -> int:
-        """Row of an instant; an interval that holds it is cut there."""
+        """Return the row of an instant; split the interval that contains it."""
         row = int(np.searchsorted(self._time_s[: self._n], time_s))
         if self._time_s[row] == time_s:
             return row
@@ -414,7 +414,7 @@ class DelayedFilter:
         return row
 
     def _make_room(self, rows: int) -> None:
-        """Make room for more rows, by forgetting what is older than the buffer, or by longer arrays."""
+        """Make room for more rows: drop those older than the buffer, or extend the arrays."""
         if self._n + rows <= len(self._time_s):
             return
         horizon = self._time_s[self._n - 1] - self.settings.buffer_s

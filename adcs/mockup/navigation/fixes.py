@@ -1,4 +1,4 @@
-"""Camera fixes that arrive late, and how samples and fixes reach whatever fuses them.
+"""Delayed camera fixes, and the order in which samples and fixes arrive.
 
 A fix is stamped with the time of its exposure; it arrives when the image has been processed and sent. Fixes may pass
 one another, come twice, or stay out. The source stamps them on arrival, which is the same only while each exposure
@@ -20,7 +20,7 @@ from arrays.typing import BoolArray, FloatArray
 
 
 @dataclass(frozen=True, eq=False)
-class Fix:
+class PlanarFix:
     """Position and heading from one image.
 
     Attributes
@@ -99,30 +99,30 @@ class FixRecord:
         """Return the number of fixes."""
         return self.time_s.size
 
-    def __getitem__(self, row: int) -> Fix:
-        """One fix."""
+    def __getitem__(self, row: int) -> PlanarFix:
+        """Return one fix."""
         sigma = None if self.sigma is None else self.sigma[row]
-        return Fix(float(self.time_s[row]), self.position_m[row], float(self.heading_rad[row]), sigma)
+        return PlanarFix(float(self.time_s[row]), self.position_m[row], float(self.heading_rad[row]), sigma)
 
     def rows(self, rows: slice | BoolArray | NDArray[np.intp]) -> FixRecord:
-        """Some of the fixes."""
+        """Select some of the fixes."""
         return FixRecord(**self._columns(rows))
 
     def _columns(self, rows: slice | BoolArray | NDArray[np.intp]) -> dict[str, Any]:
         return {name: None if values is None else values[rows] for name, values in vars(self).items()}
 
     def in_time_order(self) -> FixRecord:
-        """The fixes sorted by exposure, arriving at it: as if there were no delay."""
+        """Return the fixes sorted by exposure and without delay."""
         columns = self._columns(np.argsort(self.time_s, kind="stable"))
         return FixRecord(**columns | {"arrival_s": columns["time_s"]})
 
     def earlier(self, latency_s: float) -> FixRecord:
-        """The fixes with time stamps put back by the camera's latency."""
+        """Return the fixes with time stamps reduced by the camera's latency."""
         return replace(self, time_s=self.time_s - latency_s)
 
 
-class Outcome(enum.Enum):
-    """What became of a fix."""
+class FixOutcome(enum.Enum):
+    """Outcome of a fix."""
 
     USED = "used"
     REJECTED = "rejected"
@@ -141,49 +141,49 @@ class Outcome(enum.Enum):
 
 
 class Fusion(Protocol):
-    """Takes samples and fixes as they arrive."""
+    """Interface of fusion methods: samples and fixes as they arrive."""
 
     def add_samples(self, imu: ImuRecord) -> PlanarTrack:
-        """Go on to the end of some samples, which begin where the last ones ended; the estimate at each of them."""
+        """Process consecutive samples; return the estimate at each of them."""
 
-    def add_fix(self, fix: Fix) -> Outcome:
-        """Take a fix into the estimate at the last sample."""
+    def add_fix(self, fix: PlanarFix) -> FixOutcome:
+        """Update the estimate at the last sample by a fix."""
 
 
 @dataclass(frozen=True, eq=False)
 class Fused:
-    """Estimates as they were known at each sample.
+    """Estimates at each sample with the data available then.
 
     Attributes
     ----------
     track : PlanarTrack
         At the end of every sample; a fix that arrives just then counts from the next one on.
-    outcomes : tuple of Outcome
+    outcomes : tuple of FixOutcome
         Of every fix, as it arrived.
     """
 
     track: PlanarTrack
-    outcomes: tuple[Outcome, ...]
+    outcomes: tuple[FixOutcome, ...]
 
     @property
     def used(self) -> BoolArray:
-        """Whether each fix was taken into the estimate, shape (k,)."""
+        """Mask (k,) of the used fixes."""
         return np.array([outcome in _TAKEN for outcome in self.outcomes], dtype=np.bool_)
 
 
-_TAKEN = (Outcome.USED, Outcome.REACQUIRED)
+_TAKEN = (FixOutcome.USED, FixOutcome.REACQUIRED)
 
 
-def unused_counts(outcomes: Sequence[Outcome]) -> dict[str, int]:
-    """Number of the fixes that were not used, by the reason; with those that were used they are all.
+def unused_counts(outcomes: Sequence[FixOutcome]) -> dict[str, int]:
+    """Return the number of unused fixes by reason.
 
     Returns: every reason in words, also where it has none.
     """
-    return {reason.value: outcomes.count(reason) for reason in Outcome if reason not in _TAKEN}
+    return {reason.value: outcomes.count(reason) for reason in FixOutcome if reason not in _TAKEN}
 
 
 def counts_in_words(used: int, unused: Mapping[str, int]) -> str:
-    """Numbers of fixes by what became of them, which add up: "187 used, 75 too old".
+    """Return the numbers of fixes by outcome in words: "187 used, 75 too old".
 
     ``unused``: of :func:`unused_counts`; reasons without fixes are left out.
     """
@@ -191,7 +191,7 @@ def counts_in_words(used: int, unused: Mapping[str, int]) -> str:
 
 
 def fuse(fusion: Fusion, imu: ImuRecord, fixes: FixRecord) -> Fused:
-    """Give a record's samples and fixes to a method in the order in which they arrive.
+    """Run a fusion method on a record's samples and fixes in the order of their arrival.
 
     A fix that is faster than the sample of its exposure waits for the end of that sample.
 
@@ -220,7 +220,7 @@ def fuse(fusion: Fusion, imu: ImuRecord, fixes: FixRecord) -> Fused:
     (500, 2)
     """
     tracks: list[PlanarTrack] = []
-    outcomes: list[Outcome] = []
+    outcomes: list[FixOutcome] = []
     done = 0
     exposed = np.searchsorted(imu.time_s, fixes.time_s) + 1
     rows = np.maximum(np.searchsorted(imu.time_s, fixes.arrival_s, side="right"), exposed)
@@ -230,10 +230,10 @@ def fuse(fusion: Fusion, imu: ImuRecord, fixes: FixRecord) -> Fused:
             done = int(rows[k])
         outcomes.append(fusion.add_fix(fixes[int(k)]))
     tracks.append(fusion.add_samples(imu.part(done, len(imu))))
-    return Fused(joined(tracks), tuple(outcomes))
+    return Fused(join_tracks(tracks), tuple(outcomes))
 
 
-def joined(tracks: list[PlanarTrack]) -> PlanarTrack:
-    """Tracks of one kind, of one run, one after the other in one."""
+def join_tracks(tracks: list[PlanarTrack]) -> PlanarTrack:
+    """Join consecutive tracks of one run."""
     kind = type(tracks[0])
     return kind(**{name: np.concatenate([getattr(track, name) for track in tracks]) for name in vars(tracks[0])})

@@ -1,4 +1,4 @@
-r"""The mock-up's gyro and its inclinometer, which serves as accelerometer.
+r"""Gyro and inclinometer of the mock-up; the latter serves as accelerometer.
 
 A reading is the true value plus a zero that is linear in temperature, plus noise; beyond the range there is none (NaN).
 An inclinometer that is mounted with a tilt also reads g·sin(tilt), which nothing tells from a zero.
@@ -23,7 +23,7 @@ def _zero_vector() -> FloatArray:
 
 @dataclass(frozen=True)
 class RateGyro:
-    """The ADIS16100: ±300 °/s, noise 0.1 °/s, a zero that is linear in temperature, -40 to 85 °C."""
+    """Gyro ADIS16100: ±300 °/s, noise 0.1 °/s, a zero that is linear in temperature, -40 to 85 °C."""
 
     sigma_rad_s: float = math.radians(0.1)  # noise of a sample
     range_rad_s: float = math.radians(300.0)
@@ -37,11 +37,11 @@ class RateGyro:
         _check_noise_and_range(self.sigma_rad_s, self.range_rad_s)
 
     def readings(self, rate_rad_s: ArrayLike, noise: ArrayLike, temperature_C: ArrayLike = 20.0) -> FloatArray:
-        """What it reads, NaN beyond its range.
+        """Return the readings, NaN beyond the range.
 
         Shapes ``rate_rad_s`` (...), ``temperature_C`` (...) -> (...). ``noise`` (...): standard normal numbers.
         """
-        warmer_K = _checked_temperature(temperature_C, self.lowest_C, self.highest_C) - self.reference_C
+        warmer_K = _check_temperature(temperature_C, self.lowest_C, self.highest_C) - self.reference_C
         zero = self.zero_rad_s + self.zero_slope_rad_s_K * warmer_K
         noise = np.asarray(noise, dtype=np.float64)
         return _within(np.asarray(rate_rad_s) + zero + self.sigma_rad_s * noise, self.range_rad_s)
@@ -49,7 +49,10 @@ class RateGyro:
 
 @dataclass(frozen=True, eq=False)
 class Inclinometer:
-    """The SCA103T-D04 as accelerometer of two axes: ±0.26 g, noise 0.002 m/s², ±0.0003 m/s² per °C, -40 to 125 °C."""
+    """Inclinometer SCA103T-D04 as accelerometer of two axes.
+
+    Range ±0.26 g, noise 0.002 m/s², ±0.0003 m/s² per °C, -40 to 125 °C.
+    """
 
     sigma_m_s2: float = 0.002  # noise of a sample, each axis
     range_m_s2: float = 0.26 * G_M_S2  # of each axis
@@ -69,12 +72,12 @@ class Inclinometer:
             object.__setattr__(self, name, vector)
 
     def readings(self, acceleration_m_s2: ArrayLike, noise: ArrayLike, temperature_C: ArrayLike = 20.0) -> FloatArray:
-        """What it reads, NaN beyond its range.
+        """Return the readings, NaN beyond the range.
 
         Shapes ``temperature_C`` (...) -> (..., 2). ``acceleration_m_s2`` (..., 2): along body x and y. ``noise``
         (..., 2): standard normal numbers.
         """
-        warmer_K = _checked_temperature(temperature_C, self.lowest_C, self.highest_C) - self.reference_C
+        warmer_K = _check_temperature(temperature_C, self.lowest_C, self.highest_C) - self.reference_C
         zero = self.zero_m_s2 + G_M_S2 * np.sin(self.tilt_rad) + self.zero_slope_m_s2_K * warmer_K[..., None]
         noise = np.asarray(noise, dtype=np.float64)
         return _within(np.asarray(acceleration_m_s2) + zero + self.sigma_m_s2 * noise, self.range_m_s2)
@@ -92,7 +95,7 @@ def _check_noise_and_range(sigma: float, largest: float) -> None:
         )
 
 
-def _checked_temperature(temperature_C: ArrayLike, lowest_C: float, highest_C: float) -> FloatArray:
+def _check_temperature(temperature_C: ArrayLike, lowest_C: float, highest_C: float) -> FloatArray:
     temperature = np.asarray(temperature_C, dtype=np.float64)
     outside = temperature[~((temperature >= lowest_C) & (temperature <= highest_C))]
     if outside.size:

@@ -1,4 +1,4 @@
-"""The camera's latency: by how much later than the exposure its fixes are stamped.
+"""Latency of the camera: delay of time stamps against exposures.
 
 See docs/theory/tabletop-navigation.md.
 """
@@ -56,7 +56,7 @@ def camera_latency(
     gyro_sigma_rad_s: float = math.radians(0.1),
     heading_sigma_rad: float = math.radians(0.05),
 ) -> LatencyEstimate:
-    """Latency between exposure and time stamp, from the headings of gyro and camera.
+    """Estimate the latency between exposure and time stamp from the headings of gyro and camera.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ def camera_latency(
         )
     if not np.isfinite(imu.rate_rad_s).all():
         raise ValueError(
-            "Input imu must have all rates; instead received missing ones: see adcs.mockup.navigation.strapdown.held."
+            "Input imu must have all rates; instead received missing ones: see adcs.mockup.navigation.strapdown.hold."
         )
     edges = np.concatenate([[imu.begin_s], imu.time_s])
     angle = np.concatenate([[0.0], np.cumsum(imu.rate_rad_s * imu.steps_s)])

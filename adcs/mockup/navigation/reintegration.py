@@ -1,4 +1,4 @@
-"""The source's fusion of late fixes: integrate again from the exposure; and the two estimates without fusion.
+"""Fusion of delayed fixes by re-integration, as in the source, and two estimates without fusion.
 
 See docs/theory/tabletop-navigation.md.
 """
@@ -9,20 +9,20 @@ from collections.abc import Callable
 
 import numpy as np
 
-from adcs.mockup.navigation.fixes import Fix, Outcome
-from adcs.mockup.navigation.strapdown import Gate, ImuRecord, PlanarState, PlanarTrack, held, strapdown, wrapped
+from adcs.mockup.navigation.fixes import FixOutcome, PlanarFix
+from adcs.mockup.navigation.strapdown import Gate, ImuRecord, PlanarState, PlanarTrack, hold, strapdown, wrapped
 from arrays.typing import FloatArray
 
-VelocityRule = Callable[[Fix, Fix, ImuRecord], FloatArray]
+VelocityRule = Callable[[PlanarFix, PlanarFix, ImuRecord], FloatArray]
 """Velocity (2,) at the exposure of the second fix, of two fixes and the samples between them."""
 
 
-def finite_difference(first: Fix, second: Fix, imu: ImuRecord) -> FloatArray:
-    """The source's velocity, (p₂ - p₁)/(t₂ - t₁), which is that of the middle between both.
+def finite_difference(first: PlanarFix, second: PlanarFix, imu: ImuRecord) -> FloatArray:
+    """Return the source's velocity, (p₂ - p₁)/(t₂ - t₁), which holds midway between both fixes.
 
     Parameters
     ----------
-    first, second : Fix
+    first, second : PlanarFix
     imu : ImuRecord
         Samples between both.
 
@@ -39,14 +39,14 @@ def finite_difference(first: Fix, second: Fix, imu: ImuRecord) -> FloatArray:
     return (second.position_m - first.position_m) / (second.time_s - first.time_s)
 
 
-def corrected_velocity(first: Fix, second: Fix, imu: ImuRecord) -> FloatArray:
-    r"""Velocity at the second exposure, :math:`(p_2 - p_1 - Δp_{imu})/(t_2 - t_1) + Δv_{imu}`.
+def corrected_velocity(first: PlanarFix, second: PlanarFix, imu: ImuRecord) -> FloatArray:
+    r"""Return the velocity at the second exposure, :math:`(p_2 - p_1 - Δp_{imu})/(t_2 - t_1) + Δv_{imu}`.
 
     Δp and Δv are what the samples make of rest at the first fix's heading.
 
     Parameters
     ----------
-    first, second : Fix
+    first, second : PlanarFix
     imu : ImuRecord
         Samples between both.
 
@@ -119,7 +119,7 @@ class Reintegration:
         self._samples = ImuRecord(begin_s, np.empty(0), np.empty((0, 2)), np.empty(0))
         self._oldest = start
         self._rate_rad_s = 0.0
-        self._last: Fix | None = None
+        self._last: PlanarFix | None = None
 
     def add_samples(self, imu: ImuRecord) -> PlanarTrack:
         """Integrate some samples.
@@ -134,8 +134,8 @@ class Reintegration:
         ValueError
             It begins elsewhere.
         """
-        believed = held(imu, self._gate.accepted(imu), self._rate_rad_s)
-        samples = self._samples.followed_by(believed)
+        believed = hold(imu, self._gate.accept(imu), self._rate_rad_s)
+        samples = self._samples.concatenate(believed)
         track = strapdown(believed, self.state)
         if len(imu):
             self._samples, self.state = samples, track.state(-1)
@@ -143,20 +143,20 @@ class Reintegration:
         self._forget_before(self._samples.end_s - self._buffer_s)
         return track
 
-    def add_fix(self, fix: Fix) -> Outcome:
+    def add_fix(self, fix: PlanarFix) -> FixOutcome:
         """Set the state at the exposure to a fix, and integrate again from there.
 
         Returns
         -------
-        Outcome
+        FixOutcome
             The state has changed only where it is USED.
         """
         if fix.time_s > self._samples.end_s:
-            return Outcome.AHEAD
+            return FixOutcome.AHEAD
         if self._last is not None and fix.time_s <= self._last.time_s:
-            return Outcome.DUPLICATE if fix.time_s == self._last.time_s else Outcome.STALE
+            return FixOutcome.DUPLICATE if fix.time_s == self._last.time_s else FixOutcome.STALE
         if fix.time_s < self._samples.begin_s:
-            return Outcome.TOO_OLD
+            return FixOutcome.TOO_OLD
         before = self._state_at(fix.time_s)
         last, velocity = self._last, before.velocity_m_s
         if last is not None and last.time_s >= max(self._samples.begin_s, fix.time_s - self._longest_gap_s):
@@ -167,7 +167,7 @@ class Reintegration:
         if len(self._samples):
             self.state = strapdown(self._samples, self._oldest).state(-1)
         self._last = fix
-        return Outcome.USED
+        return FixOutcome.USED
 
     def _state_at(self, time_s: float) -> PlanarState:
         samples = self._samples.between(self._samples.begin_s, time_s)
@@ -180,7 +180,7 @@ class Reintegration:
 
 
 class CameraOnly:
-    """The last fix that has arrived, held, with the velocity between it and the one before: late by its age.
+    """Last arrived fix, held constant, with the velocity between the last two fixes; late by its age.
 
     Parameters
     ----------
@@ -199,7 +199,7 @@ class CameraOnly:
 
     def __init__(self, start: PlanarState) -> None:
         self.state = start
-        self._last: Fix | None = None
+        self._last: PlanarFix | None = None
 
     def add_samples(self, imu: ImuRecord) -> PlanarTrack:
         """Hold the state, whatever the samples."""
@@ -207,17 +207,17 @@ class CameraOnly:
         position, velocity = np.tile(state.position_m, (n, 1)), np.tile(state.velocity_m_s, (n, 1))
         return PlanarTrack(imu.time_s, position, velocity, np.full(n, state.heading_rad))
 
-    def add_fix(self, fix: Fix) -> Outcome:
-        """Take a fix in place of the state, unless it is older than the last one."""
+    def add_fix(self, fix: PlanarFix) -> FixOutcome:
+        """Replace the state by a fix, unless it is older than the last one."""
         velocity = self.state.velocity_m_s
         if self._last is not None:
             if fix.time_s <= self._last.time_s:
-                return Outcome.DUPLICATE if fix.time_s == self._last.time_s else Outcome.STALE
+                return FixOutcome.DUPLICATE if fix.time_s == self._last.time_s else FixOutcome.STALE
             velocity = (fix.position_m - self._last.position_m) / (fix.time_s - self._last.time_s)
         heading = self.state.heading_rad + float(wrapped(fix.heading_rad - self.state.heading_rad))
         self.state = PlanarState(fix.position_m, velocity, heading)
         self._last = fix
-        return Outcome.USED
+        return FixOutcome.USED
 
 
 class ImuOnly:
@@ -247,12 +247,12 @@ class ImuOnly:
 
     def add_samples(self, imu: ImuRecord) -> PlanarTrack:
         """Integrate some samples."""
-        believed = held(imu, self._gate.accepted(imu), self._rate_rad_s)
+        believed = hold(imu, self._gate.accept(imu), self._rate_rad_s)
         track = strapdown(believed, self.state)
         if len(imu):
             self.state, self._rate_rad_s = track.state(-1), float(believed.rate_rad_s[-1])
         return track
 
-    def add_fix(self, fix: Fix) -> Outcome:
-        """Leave a fix out."""
-        return Outcome.UNUSED
+    def add_fix(self, fix: PlanarFix) -> FixOutcome:
+        """Ignore a fix."""
+        return FixOutcome.UNUSED

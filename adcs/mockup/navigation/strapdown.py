@@ -1,4 +1,4 @@
-"""Planar inertial navigation on the table: samples of the IMU, the gate, the integration.
+"""Planar inertial navigation on the table: samples of the IMU, gate and integration.
 
 See docs/theory/tabletop-navigation.md. Source: Bindel, Ivanov, Nuzhdin, Ovchinnikov, Trofimov, preprint of the Keldysh
 Institute on the table-top mock-up.
@@ -18,8 +18,8 @@ GAP_STEPS = 5.0
 """A longer interval, in medians of a record's intervals, is a gap: nobody takes a mean over it."""
 
 
-def turned(heading_rad: ArrayLike, vector_body: ArrayLike) -> FloatArray:
-    """Vector in table axes, ``R(φ) v``.
+def rotate(heading_rad: ArrayLike, vector_body: ArrayLike) -> FloatArray:
+    """Rotate a vector to table axes, ``R(φ) v``.
 
     Shapes ``vector_body`` (..., 2) -> (..., 2). ``heading_rad`` (...): counter-clockwise from above.
     """
@@ -29,7 +29,7 @@ def turned(heading_rad: ArrayLike, vector_body: ArrayLike) -> FloatArray:
 
 
 def wrapped(angle_rad: ArrayLike) -> FloatArray:
-    """Angle in (-π, π], any shape.
+    """Return an angle in (-π, π], any shape.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ class ImuRecord:
 
     @property
     def end_s(self) -> float:
-        """When the last interval ends."""
+        """End of the last interval."""
         return float(self.time_s[-1]) if len(self) else self.begin_s
 
     @property
@@ -112,7 +112,7 @@ class ImuRecord:
 
     @property
     def gaps_s(self) -> FloatArray:
-        """Where samples are missing, shape (k, 2): from the last sample before to the interval of the next one.
+        """Gaps (k, 2): from the last sample before to the interval of the next one.
 
         An interval is a gap where it is longer than :data:`GAP_STEPS` median ones. The sample that ends it is the mean
         over one median interval.
@@ -123,8 +123,8 @@ class ImuRecord:
         long = np.flatnonzero(steps_s > GAP_STEPS * usual_s)
         return np.stack([self.time_s[long] - steps_s[long], self.time_s[long] - usual_s], axis=1)
 
-    def with_gaps_filled(self) -> ImuRecord:
-        """The record with samples whose readings are missing in its gaps, so that time goes on in steps there, too."""
+    def fill_gaps(self) -> ImuRecord:
+        """Fill gaps by samples with missing readings, so that steps are short there too."""
         gaps = self.gaps_s
         if not len(gaps):
             return self
@@ -139,7 +139,7 @@ class ImuRecord:
         )
 
     def between(self, first_s: float, last_s: float) -> ImuRecord:
-        """Samples from one instant to another, of which the intervals at both ends are cut.
+        """Return the samples between two instants; the intervals at both ends are cut.
 
         Returns
         -------
@@ -165,13 +165,13 @@ class ImuRecord:
         return ImuRecord(first_s, time_s, self.acceleration_m_s2[..., rows, :], self.rate_rad_s[..., rows])
 
     def part(self, first: int, last: int) -> ImuRecord:
-        """Samples first to last, without the last."""
+        """Return the samples from ``first`` to ``last``, exclusive."""
         begin_s = self.begin_s if first == 0 else float(self.time_s[first - 1])
         rows = slice(first, last)
         return ImuRecord(begin_s, self.time_s[rows], self.acceleration_m_s2[..., rows, :], self.rate_rad_s[..., rows])
 
-    def followed_by(self, later: ImuRecord) -> ImuRecord:
-        """One record of this one and of that which begins where it ends.
+    def concatenate(self, later: ImuRecord) -> ImuRecord:
+        """Append a record that begins at the end of this one.
 
         Raises
         ------
@@ -190,8 +190,8 @@ class ImuRecord:
             np.concatenate([self.rate_rad_s, later.rate_rad_s], axis=-1),
         )
 
-    def less(self, acceleration_m_s2: ArrayLike, rate_rad_s: ArrayLike) -> ImuRecord:
-        """The record with zeros taken off: (2,) or (n, 2) of the accelerations, () or (n,) of the rates."""
+    def subtract_zeros(self, acceleration_m_s2: ArrayLike, rate_rad_s: ArrayLike) -> ImuRecord:
+        """Subtract zeros: (2,) or (n, 2) of the accelerations, () or (n,) of the rates."""
         return replace(
             self,
             acceleration_m_s2=self.acceleration_m_s2 - np.asarray(acceleration_m_s2, dtype=np.float64),
@@ -225,7 +225,7 @@ class PlanarState:
 
 @dataclass(frozen=True, eq=False)
 class PlanarTrack:
-    """States through time.
+    """States over time.
 
     Attributes
     ----------
@@ -244,18 +244,18 @@ class PlanarTrack:
         return self.time_s.size
 
     def state(self, row: int) -> PlanarState:
-        """State at an instant."""
+        """Return the state at an instant."""
         return PlanarState(self.position_m[..., row, :], self.velocity_m_s[..., row, :], self.heading_rad[..., row])
 
     def at(self, time_s: ArrayLike) -> PlanarTrack:
-        """States of one run at other instants (k,), linear between its own."""
+        """Interpolate the states of one run linearly at instants (k,)."""
         t = np.asarray(time_s, dtype=np.float64)
         columns = (*self.position_m.T, *self.velocity_m_s.T, self.heading_rad)
         x, y, vx, vy, heading = (np.interp(t, self.time_s, column) for column in columns)
         return PlanarTrack(t, np.stack([x, y], axis=1), np.stack([vx, vy], axis=1), heading)
 
     def rows(self, rows: slice) -> PlanarTrack:
-        """Some of the instants."""
+        """Select some of the instants."""
         return PlanarTrack(
             self.time_s[rows],
             self.position_m[..., rows, :],
@@ -266,7 +266,7 @@ class PlanarTrack:
 
 @dataclass(frozen=True)
 class Gate:
-    """Largest readings that are believed, each of the three channels on its own.
+    """Largest accepted readings, for each of the three channels.
 
     Attributes
     ----------
@@ -289,16 +289,16 @@ class Gate:
             if not value > 0.0:
                 raise ValueError(f"Input {name} must be positive; instead received {value}.")
 
-    def accepted(self, imu: ImuRecord) -> BoolArray:
-        """Whether x, y and rate of each sample are believed, shape (..., n, 3); missing ones are not."""
+    def accept(self, imu: ImuRecord) -> BoolArray:
+        """Return whether x, y and rate of each sample are accepted, (..., n, 3); missing ones are not."""
         limits = np.array([self.acceleration_m_s2, self.acceleration_m_s2, self.rate_rad_s])
         return np.abs(np.concatenate([imu.acceleration_m_s2, imu.rate_rad_s[..., None]], axis=-1)) <= limits
 
 
-def held(imu: ImuRecord, accepted: BoolArray, held_rate_rad_s: ArrayLike = 0.0) -> ImuRecord:
-    """Record without the readings that are not believed: velocity and rate are held, and time goes on.
+def hold(imu: ImuRecord, accepted: BoolArray, held_rate_rad_s: ArrayLike = 0.0) -> ImuRecord:
+    """Replace rejected readings: velocity and rate are held.
 
-    ``accepted`` (..., n, 3): of :meth:`Gate.accepted`. ``held_rate_rad_s`` (...): the last believed rate before the
+    ``accepted`` (..., n, 3): of :meth:`Gate.accept`. ``held_rate_rad_s`` (...): the last believed rate before the
     record. Returns: such an acceleration is zero, such a rate the last believed one.
     """
     rows = np.where(accepted[..., 2], np.arange(len(imu)), -1)
@@ -312,7 +312,7 @@ def held(imu: ImuRecord, accepted: BoolArray, held_rate_rad_s: ArrayLike = 0.0) 
 
 
 def step(state: PlanarState, step_s: float, acceleration_m_s2: ArrayLike, rate_rad_s: ArrayLike) -> PlanarState:
-    r"""State after one sample.
+    r"""Return the state after one sample.
 
     .. math::
 
@@ -326,7 +326,7 @@ def step(state: PlanarState, step_s: float, acceleration_m_s2: ArrayLike, rate_r
     The position takes the old velocity, which the source's section on least squares confirms.
     """
     angle = np.asarray(rate_rad_s, dtype=np.float64) * step_s
-    a = turned(state.heading_rad + 0.5 * angle, acceleration_m_s2)
+    a = rotate(state.heading_rad + 0.5 * angle, acceleration_m_s2)
     return PlanarState(
         state.position_m + state.velocity_m_s * step_s + 0.5 * step_s**2 * a,
         state.velocity_m_s + step_s * a,
@@ -335,12 +335,12 @@ def step(state: PlanarState, step_s: float, acceleration_m_s2: ArrayLike, rate_r
 
 
 def strapdown(imu: ImuRecord, start: PlanarState) -> PlanarTrack:
-    """States at the end of every sample: :func:`step` over a whole record, in cumulative sums.
+    """Integrate a whole record; the states after each sample by :func:`step`, in cumulative sums.
 
     Parameters
     ----------
     imu : ImuRecord
-        All readings there, zeros taken off: see :func:`held`. NaN stays NaN from there on.
+        All readings there, zeros taken off: see :func:`hold`. NaN stays NaN from there on.
     start : PlanarState
         At ``imu.begin_s``.
 
@@ -356,7 +356,7 @@ def strapdown(imu: ImuRecord, start: PlanarState) -> PlanarTrack:
     angle = imu.rate_rad_s * dt
     phi0 = np.asarray(start.heading_rad, dtype=np.float64)[..., None]
     heading = phi0 + np.cumsum(angle, axis=-1)
-    a = turned(heading - 0.5 * angle, imu.acceleration_m_s2)
+    a = rotate(heading - 0.5 * angle, imu.acceleration_m_s2)
     h = dt[:, None]
     change = np.cumsum(a * h, axis=-2)
     v0 = start.velocity_m_s[..., None, :]

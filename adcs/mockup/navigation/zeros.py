@@ -1,4 +1,4 @@
-"""Zeros of the accelerometer in closed form, from what its integral and the camera disagree by over a run.
+"""Zeros of the accelerometer in closed form, from its integral and the camera over a run.
 
 See docs/theory/tabletop-navigation.md. Source: Bindel et al., the section on least squares (its minus sign is lost in
 print); complex numbers, the start and the courses are ours.
@@ -20,7 +20,7 @@ SIGMA_M = 1e-3
 
 
 def double_integral(begin_s: float, time_s: ArrayLike, values: ArrayLike, at_s: ArrayLike) -> ComplexArray:
-    r"""Twice integrated from rest, :math:`\sum_j u_j Δ_j (t - \tfrac12(t_j + t_{j-1}))`, in O(n).
+    r"""Integrate twice from rest, :math:`\sum_j u_j Δ_j (t - \tfrac12(t_j + t_{j-1}))`, in O(n).
 
     ``begin_s``: where the first interval begins. ``time_s`` (n,): where each interval ends. ``values`` (..., n):
     constant over each interval. ``at_s`` (k,): within the record; where it is within an interval, that one counts up to
@@ -44,7 +44,7 @@ def double_integral(begin_s: float, time_s: ArrayLike, values: ArrayLike, at_s: 
 
 
 def heading_from_fixes(imu: ImuRecord, fixes: FixRecord) -> tuple[FloatArray, float]:
-    """Heading in the middle of every interval, from the gyro, its start and zero fitted to the camera's headings.
+    """Return the heading midway in each interval, by the gyro, with start and zero fitted to the camera.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ def heading_from_fixes(imu: ImuRecord, fixes: FixRecord) -> tuple[FloatArray, fl
 
 @dataclass(frozen=True, eq=False)
 class ZeroProblem:
-    """What the fits need, at the exposures of k fixes; table axes as complex numbers.
+    """Input of the fits at the exposures of k fixes; table axes as complex numbers.
 
     Attributes
     ----------
@@ -123,7 +123,7 @@ class ZeroProblem:
 def zero_problem(
     imu: ImuRecord, heading_rad: ArrayLike, fixes: FixRecord, courses: ArrayLike | None = None
 ) -> ZeroProblem:
-    """Gather what the fits need.
+    """Prepare the input of the fits.
 
     Parameters
     ----------
@@ -161,7 +161,7 @@ def zero_problem(
     if not np.isfinite(imu.acceleration_m_s2).all():
         raise ValueError(
             "Input imu must have all readings; instead received missing ones: see"
-            " adcs.mockup.navigation.strapdown.held."
+            " adcs.mockup.navigation.strapdown.hold."
         )
     turn = np.exp(1j * heading)
     values = np.concatenate([[_complex(imu.acceleration_m_s2) * turn, turn], further * turn])
@@ -171,7 +171,7 @@ def zero_problem(
 
 @dataclass(frozen=True, eq=False)
 class ZeroFit:
-    """Zeros, and the start that goes with them.
+    """Fitted zeros and start of a run.
 
     Attributes
     ----------
@@ -193,22 +193,22 @@ class ZeroFit:
 
     @property
     def zero_m_s2(self) -> FloatArray:
-        """The constant zeros, shape (2,)."""
+        """Constant zeros, shape (2,)."""
         return self.zeros[0]
 
     def zero_course(self, courses: ArrayLike | None = None) -> FloatArray:
-        """Zeros of every sample, shape (n, 2), or (2,) without courses (m, n), which are those of the problem."""
+        """Return the zeros of each sample, (n, 2), or (2,) without courses (m, n), those of the problem."""
         if courses is None:
             return self.zeros[0]
         return self.zeros[0] + np.asarray(courses, dtype=np.float64).T @ self.zeros[1:]
 
     def start(self, heading_rad: float) -> PlanarState:
-        """State at the beginning of the record, with a heading."""
+        """Return the state at the beginning of the record, with a heading."""
         return PlanarState(self.start_position_m, self.start_velocity_m_s, heading_rad)
 
 
 def constant_zeros_after(problem: ZeroProblem, first: int = 4, sigma_m: float = SIGMA_M) -> ZeroFit:
-    """Two zeros in closed form, with the start of a straight line through the first fixes.
+    """Fit two zeros in closed form, with the start of a straight line through the first fixes.
 
     The line is that of the fixes less what the samples moved by up to each, which depends on the zeros.
     ``problem``: without further courses. ``first``: fixes that the line goes through; two as in the source, whose
@@ -238,7 +238,7 @@ def constant_zeros_after(problem: ZeroProblem, first: int = 4, sigma_m: float = 
 
 
 def zeros_and_start(problem: ZeroProblem, sigma_m: float = SIGMA_M) -> ZeroFit:
-    """Zeros of all courses, start position and start velocity: six unknowns with constant zeros alone.
+    """Fit zeros of all courses, start position and velocity: six unknowns with constant zeros.
 
     Parameters
     ----------
@@ -292,7 +292,10 @@ def _rms(residual: ComplexArray) -> float:
 
 
 def _real_covariance(C: ComplexArray) -> FloatArray:
-    """Of real and imaginary parts in turn: noise that is the same along both axes makes blocks [[R, -I], [I, R]]."""
+    """Return the covariance of alternating real and imaginary parts.
+
+    Equal noise along both axes makes blocks [[R, -I], [I, R]].
+    """
     m = len(C)
     blocks = np.stack([np.stack([C.real, -C.imag], axis=-1), np.stack([C.imag, C.real], axis=-1)], axis=-2)
     return blocks.transpose(0, 2, 1, 3).reshape(2 * m, 2 * m)

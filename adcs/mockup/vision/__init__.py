@@ -1,1 +1,1 @@
-"""From the light on the camera to a fix: camera, centroids, triangles, matchers."""
+"""Fixes from images: camera, centroids, triangles, matchers."""

@@ -1,4 +1,4 @@
-"""The camera that looks up at the sky of lights: where a light is in the image, and where on the ceiling a pixel is.
+"""Camera that looks up at the sky of lights: projection between ceiling and image.
 
 See docs/theory/tabletop-vision.md.
 """
@@ -23,7 +23,7 @@ _NO_LENS = 1e-17  # less is lost in rounding, and the closed form of the inverse
 
 @dataclass(frozen=True)
 class Pose:
-    """Place and heading of the satellite, of one or of many (numbers or arrays of one shape).
+    """Position and heading of one satellite or of many (numbers or arrays of one shape).
 
     Attributes
     ----------
@@ -45,13 +45,13 @@ class Pose:
 
     @property
     def position_m(self) -> FloatArray:
-        """X and Y, shape (..., 2)."""
+        """Position X, Y, shape (..., 2)."""
         return np.stack(np.broadcast_arrays(np.float64(self.x_m), np.float64(self.y_m)), axis=-1)
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera with a vertical optical axis.
+    """Camera with a vertical optical axis.
 
     Attributes
     ----------
@@ -108,12 +108,12 @@ class Camera:
 
     @property
     def footprint_m(self) -> tuple[float, float]:
-        """Width and height of the seen part of the ceiling, the lens left out."""
+        """Width and height of the visible part of the ceiling, without distortion."""
         return self.width_px * self.m_per_px, self.height_px * self.m_per_px
 
 
 def camera_of_footprint(width_m: float, k1: float = 0.0) -> Camera:
-    """Camera of 640 × 480 px that sees a width of the ceiling.
+    """Return a camera of 640 × 480 px that sees a given width of the ceiling.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ def camera_of_footprint(width_m: float, k1: float = 0.0) -> Camera:
 
 
 def centred_from_table(camera: Camera, pose: Pose, points_m: ArrayLike) -> FloatArray:
-    """Where points of the ceiling are relative to the optical centre, with an ideal lens.
+    """Project points of the ceiling to centred pixels, with an ideal lens.
 
     ``pose``: numbers, or arrays of shape (...). ``points_m`` (..., n, 2): in the table's frame [m]. Returns
     (..., n, 2): centred pixels, y up.
@@ -144,7 +144,7 @@ def centred_from_table(camera: Camera, pose: Pose, points_m: ArrayLike) -> Float
 
 
 def table_from_centred(camera: Camera, pose: Pose, points_px: ArrayLike) -> FloatArray:
-    """Points of the ceiling from centred pixels; inverse of :func:`centred_from_table`.
+    """Project centred pixels to the ceiling; inverse of :func:`centred_from_table`.
 
     Shape ``points_px`` (..., n, 2). ``pose``: numbers, or arrays of shape (...). Returns (..., n, 2): in the table's
     frame [m].
@@ -155,8 +155,8 @@ def table_from_centred(camera: Camera, pose: Pose, points_px: ArrayLike) -> Floa
     return turned + pose.position_m[..., None, :]
 
 
-def distorted(camera: Camera, points_px: ArrayLike) -> FloatArray:
-    """Pixels of the image from centred pixels.
+def distort(camera: Camera, points_px: ArrayLike) -> FloatArray:
+    """Distort centred pixels to pixels of the image.
 
     ``points_px`` (..., 2): centred, y up. Returns (..., 2): column and row. NaN of a point so far out that the lens
     would fold it back (of k1 < 0 beyond 320 px/√(-3 k1)): such a point is not seen.
@@ -168,7 +168,7 @@ def distorted(camera: Camera, points_px: ArrayLike) -> FloatArray:
 
 
 def undistorted(camera: Camera, image_px: ArrayLike) -> FloatArray:
-    r"""Centred pixels from pixels of the image; inverse of :func:`distorted`.
+    r"""Return centred pixels from pixels of the image; inverse of :func:`distort`.
 
     With :math:`\rho = r/320` the cubic :math:`\rho + k_1 \rho^3 = d` is solved in closed form, :math:`\rho = A
     \sin(\tfrac13 \arcsin(3d/A))` with :math:`A = \sqrt{-4/(3k_1)}`, and with hyperbolic functions for :math:`k_1 > 0`.
@@ -204,17 +204,17 @@ def undistorted(camera: Camera, image_px: ArrayLike) -> FloatArray:
 
 
 def image_from_table(camera: Camera, pose: Pose, points_m: ArrayLike) -> FloatArray:
-    """Where points of the ceiling are in the image.
+    """Project points of the ceiling to the image.
 
     ``pose``: numbers, or arrays of shape (...). ``points_m`` (..., n, 2): in the table's frame [m]. Returns
     (..., n, 2): column and row [px], also outside of the frame; NaN where the lens shows no such point, see
-    :func:`distorted`.
+    :func:`distort`.
     """
-    return distorted(camera, centred_from_table(camera, pose, points_m))
+    return distort(camera, centred_from_table(camera, pose, points_m))
 
 
 def table_from_image(camera: Camera, pose: Pose, image_px: ArrayLike) -> FloatArray:
-    """Points of the ceiling from pixels; inverse of :func:`image_from_table`.
+    """Project pixels to the ceiling; inverse of :func:`image_from_table`.
 
     ``pose``: numbers, or arrays of shape (...). ``image_px`` (..., n, 2): column and row. Returns (..., n, 2): in the
     table's frame [m].
@@ -223,14 +223,14 @@ def table_from_image(camera: Camera, pose: Pose, image_px: ArrayLike) -> FloatAr
 
 
 def in_frame(camera: Camera, image_px: ArrayLike, margin_px: float = 0.0) -> BoolArray:
-    """Whether pixels, shape (..., 2), are within the frame, by a margin; no for NaN."""
+    """Return whether pixels (..., 2) are within the frame by a margin; False for NaN."""
     points = np.asarray(image_px, dtype=np.float64)
     last = np.array([camera.width_px - 1.0, camera.height_px - 1.0])
     return np.all((points >= margin_px) & (points <= last - margin_px), axis=-1)
 
 
 def footprint(camera: Camera, pose: Pose, points_per_side: int = 1) -> FloatArray:
-    """Outline of the seen part of the ceiling.
+    """Return the outline of the visible part of the ceiling.
 
     Parameters
     ----------

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from adcs.mockup.vision.camera import REFERENCE_RADIUS_PX, Camera, Pose, centred_from_table, distorted
+from adcs.mockup.vision.camera import REFERENCE_RADIUS_PX, Camera, Pose, centred_from_table, distort
 from adcs.mockup.vision.sky import LedSky
 from arrays.typing import FloatArray
 
@@ -132,12 +132,12 @@ def calibrated_camera(
         raise ValueError(f"Input sigmas must be finite and not negative; instead received {sigmas[1:].tolist()}.")
     # As far as the poses may be off, pairs are apart whatever the camera is.
     slack_px = 3.0 * math.hypot(position_sigma_m / camera.m_per_px, heading_sigma_rad * REFERENCE_RADIUS_PX)
-    pairs = [_paired(sky, camera, frame, _GATES_PX[0] + slack_px) for frame in frames]
+    pairs = [_pair_lights(sky, camera, frame, _GATES_PX[0] + slack_px) for frame in frames]
     for gate in _GATES_PX:
         for _ in range(_STEPS_PER_GATE):
-            camera = _refined(camera, pairs, sigmas).camera
-        pairs = [_paired(sky, camera, frame, gate + slack_px) for frame in frames]
-    return _refined(camera, pairs, sigmas)
+            camera = _refine(camera, pairs, sigmas).camera
+        pairs = [_pair_lights(sky, camera, frame, gate + slack_px) for frame in frames]
+    return _refine(camera, pairs, sigmas)
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,10 +149,10 @@ class _Pairs:
     image_px: FloatArray
 
 
-def _paired(sky: LedSky, camera: Camera, frame: KnownFrame, gate_px: float) -> _Pairs:
+def _pair_lights(sky: LedSky, camera: Camera, frame: KnownFrame, gate_px: float) -> _Pairs:
     """Lights of the sky and of the frame that are each other's nearest, within a gate."""
     stars = np.asarray(frame.positions_px, dtype=np.float64).reshape(-1, 2)
-    predicted = distorted(camera, centred_from_table(camera, frame.pose, sky.positions_m))
+    predicted = distort(camera, centred_from_table(camera, frame.pose, sky.positions_m))
     shown = np.flatnonzero(np.isfinite(predicted).all(axis=1))
     distance = np.linalg.norm(predicted[shown, None] - stars, axis=-1)
     if distance.size == 0:
@@ -162,7 +162,7 @@ def _paired(sky: LedSky, camera: Camera, frame: KnownFrame, gate_px: float) -> _
     return _Pairs(frame.pose, sky.positions_m[shown[light[kept]]], stars[kept])
 
 
-def _refined(camera: Camera, frames: Sequence[_Pairs], sigmas: FloatArray) -> CameraCalibration:
+def _refine(camera: Camera, frames: Sequence[_Pairs], sigmas: FloatArray) -> CameraCalibration:
     """One step of Gauss and Newton, and what is known after it."""
     usable = [pairs for pairs in frames if len(pairs.points_m) >= _FEWEST_OF_FRAME]
     n_pairs = sum(len(pairs.points_m) for pairs in usable)
@@ -172,13 +172,13 @@ def _refined(camera: Camera, frames: Sequence[_Pairs], sigmas: FloatArray) -> Ca
         )
     rows = [_rows(camera, pairs) for pairs in usable]
     noise_px = _noise(rows)
-    equations = _NormalEquations()
+    equations = _CameraEquations()
     for residual, by_camera, by_pose in rows:
         # The inverse of R = noise² I + E Eᵀ.
         E = by_pose * sigmas
         inner = np.linalg.solve(noise_px**2 * np.eye(3) + E.T @ E, E.T)
-        equations = equations.with_rows(residual, by_camera, (np.eye(residual.size) - E @ inner) / noise_px**2)
-    step, inverse, rank = equations.solved()
+        equations = equations.add_rows(residual, by_camera, (np.eye(residual.size) - E @ inner) / noise_px**2)
+    step, inverse, rank = equations.solve()
     if rank < len(PARAMETERS):
         raise ValueError("Input frames must determine the camera; instead received lights too few or too close.")
     centre = camera.centre + step[2:]
@@ -190,21 +190,21 @@ def _refined(camera: Camera, frames: Sequence[_Pairs], sigmas: FloatArray) -> Ca
 
 
 @dataclass(frozen=True, eq=False)
-class _NormalEquations:
+class _CameraEquations:
     """Weighted sums over frames: JᵀWJ, JᵀWr, rᵀWr."""
 
     matrix: FloatArray = field(default_factory=lambda: np.zeros((4, 4)))
     right: FloatArray = field(default_factory=lambda: np.zeros(4))
     squares: float = 0.0
 
-    def with_rows(self, residual: FloatArray, by_camera: FloatArray, weight: FloatArray) -> _NormalEquations:
+    def add_rows(self, residual: FloatArray, by_camera: FloatArray, weight: FloatArray) -> _CameraEquations:
         weighted = by_camera.T @ weight
         squares = float(residual @ weight @ residual)
-        return _NormalEquations(
+        return _CameraEquations(
             self.matrix + weighted @ by_camera, self.right + weighted @ residual, self.squares + squares
         )
 
-    def solved(self) -> tuple[FloatArray, FloatArray, int]:
+    def solve(self) -> tuple[FloatArray, FloatArray, int]:
         """Solution, inverse of the matrix, and rank; what is not determined stays zero."""
         scale = np.sqrt(np.maximum(np.diagonal(self.matrix), np.finfo(np.float64).tiny))
         scaled = self.matrix / scale / scale[:, None]
@@ -215,7 +215,7 @@ class _NormalEquations:
 def _rows(camera: Camera, pairs: _Pairs) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Residuals (2k,) of a frame in the image, and their derivatives by camera (2k, 4) and pose (2k, 3)."""
     ideal = centred_from_table(camera, pairs.pose, pairs.points_m)
-    residual = pairs.image_px - distorted(camera, ideal)
+    residual = pairs.image_px - distort(camera, ideal)
     rho2 = np.sum(ideal**2, axis=1) / REFERENCE_RADIUS_PX**2
     flip = np.array([1.0, -1.0])  # rows count downwards
     outer = ideal[:, :, None] * ideal[:, None, :] / REFERENCE_RADIUS_PX**2
@@ -234,11 +234,11 @@ def _rows(camera: Camera, pairs: _Pairs) -> tuple[FloatArray, FloatArray, FloatA
 
 def _noise(rows: Sequence[tuple[FloatArray, FloatArray, FloatArray]]) -> float:
     """Standard deviation of a coordinate, from what neither the camera nor a shift or turn of each frame explains."""
-    equations, freedom = _NormalEquations(), 0
+    equations, freedom = _CameraEquations(), 0
     for residual, by_camera, by_pose in rows:
         basis = np.linalg.qr(by_pose)[0]
-        equations = equations.with_rows(residual, by_camera, np.eye(residual.size) - basis @ basis.T)
+        equations = equations.add_rows(residual, by_camera, np.eye(residual.size) - basis @ basis.T)
         freedom += residual.size - basis.shape[1]
-    step, _, rank = equations.solved()
+    step, _, rank = equations.solve()
     squares = equations.squares - float(equations.right @ step)
     return max(math.sqrt(max(squares, 0.0) / max(freedom - rank, 1)), _LEAST_NOISE_PX)

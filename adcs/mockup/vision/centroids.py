@@ -18,9 +18,9 @@ WHITE = 255
 THRESHOLD_SIGMAS = 6.0
 SIGMA_OF_MAD = 1.4826
 FEWEST_PIXELS = 4
-"""Of a star: fewer are a hot pixel, or noise."""
+"""Least number of pixels of a star: fewer are a hot pixel, or noise."""
 FEWEST_SUMS = 10
-"""Of a star in sums of 3 × 3 pixels."""
+"""Least number of pixels of a star in sums of 3 × 3 pixels."""
 # Of a median of whole numbers the standard deviation of a quiet image comes out as zero; rounding alone has this.
 _ROUNDING_SIGMA = 12.0**-0.5
 _BACKGROUND_STRIDE = 3  # every third row is enough for medians: 100,000 pixels
@@ -86,7 +86,7 @@ def find_stars(frame: ArrayLike) -> Stars:
     >>> stars.positions_px.shape == (len(stars), 2)
     True
     """
-    image = checked_frame(frame)
+    image = check_frame(frame)
     background, sigma = _background(image)
     return _stars_above(image, background, THRESHOLD_SIGMAS * sigma)
 
@@ -99,7 +99,7 @@ def find_faint_stars(frame: ArrayLike) -> Stars:
     is below the threshold. A hot pixel has nine sums, so a star needs more of them.
     Shape ``frame`` (height, width). Returns: intensities, background and threshold are those of the sums.
     """
-    image = checked_frame(frame).astype(np.uint16)
+    image = check_frame(frame).astype(np.uint16)
     if min(image.shape) < 3:
         raise ValueError(f"Input frame must have 3 pixels each way at least; instead received shape {image.shape}.")
     rows = image[:-2] + image[1:-1] + image[2:]
@@ -110,19 +110,19 @@ def find_faint_stars(frame: ArrayLike) -> Stars:
 
 
 def find_stars_between_extremes(frame: ArrayLike, level: float = 0.3) -> Stars:
-    """Lights above a level between the darkest and the brightest pixel: the threshold of the source paper.
+    """Detect lights above a level between the darkest and the brightest pixel, as the source paper.
 
     Shape ``frame`` (height, width). ``level``: 0 is the darkest pixel of the frame and 1 the brightest one.
     """
     if not 0.0 < level < 1.0:
         raise ValueError(f"Input level must be between 0 and 1; instead received {level}.")
-    image = checked_frame(frame)
+    image = check_frame(frame)
     darkest, brightest = int(image.min()), int(image.max())
     return _stars_above(image, darkest, level * (brightest - darkest))
 
 
-def checked_frame(frame: ArrayLike) -> ByteArray:
-    """A grey image in which lights can be looked for: ``frame`` (height, width) -> (height, width)."""
+def check_frame(frame: ArrayLike) -> ByteArray:
+    """Check a grey image for the detection of lights: ``frame`` (height, width) -> (height, width)."""
     image = np.asarray(frame)
     if image.ndim != 2 or image.size == 0:
         raise ValueError(f"Input frame must be a grey image (height, width); instead received shape {image.shape}.")

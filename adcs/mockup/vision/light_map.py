@@ -1,4 +1,4 @@
-"""Which light is nearest, for very many points at once: a table over the ceiling instead of a search."""
+"""Nearest light of very many points at once, by a table over the ceiling."""
 
 from __future__ import annotations
 
@@ -41,7 +41,10 @@ class LightMap:
         return cls(catalogue.plane, complex(x[0], y[0]), cell, nearest)
 
     def lights_near(self, points: ComplexArray) -> IntArray:
-        """Number of the light nearest to points X + iY of any shape [m]; outside the grid, of one near its border."""
+        """Return the index of the light nearest to points X + iY [m].
+
+        Outside the grid it is that of a light near its border.
+        """
         offset = (points - self.corner) * (1.0 / self.cell_m)
         rows, columns = self.nearest.shape
         column = np.clip(offset.real.astype(np.intp), 0, columns - 1)
@@ -49,7 +52,7 @@ class LightMap:
         return self.nearest[row, column]
 
     def misses(self, points: ComplexArray, limit_m: float) -> FloatArray:
-        """Sum over the last axis of points of the squared distance to the nearest light, at most the limit² each."""
+        """Sum the squared distances to the nearest light over the last axis, at most the limit² each."""
         offset = points - self.plane[self.lights_near(points)]
         return np.minimum(offset.real**2 + offset.imag**2, limit_m**2).sum(axis=-1)
 

@@ -124,7 +124,7 @@ class OddsMatcher:
         if not len(a):
             return NoFix("no two stars are as far apart as two lights")
         best = self._best_cells(image, a, b)
-        poses = self.odds.fitted(image, a[best], b[best], self.coarse_px)
+        poses = self.odds.fit(image, a[best], b[best], self.coarse_px)
         log_odds = self.odds.log_odds(image, poses, self.odds.log_anywhere)
         return best_fix(self.odds, image, poses, log_odds, self.minimum_log_odds, self.minimum_stars)
 

@@ -1,4 +1,4 @@
-"""Where the camera is, from the stars of one image alone: what all matchers return, and the paper's matcher.
+"""Pose of the camera from one image: result of all matchers, and the paper's matcher.
 
 See docs/theory/tabletop-vision.md.
 """
@@ -12,8 +12,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from adcs.mockup.vision.similarity import fitted_similarity, mirrored_image
-from adcs.mockup.vision.triangles import TriangleCatalogue, Triangles, delaunay_triangles
+from adcs.mockup.vision.similarity import fit_similarity, mirrored_image
+from adcs.mockup.vision.triangles import LightTriangles, TriangleCatalogue, delaunay_triangles
 from adcs.stars.identification import NoFix
 from arrays.typing import ComplexArray, FloatArray, IntArray
 
@@ -27,7 +27,7 @@ _USUAL_PX, _USUAL_NUMBERS = 0.1, 4
 
 @dataclass(frozen=True, eq=False)
 class CameraFix:
-    """Pose of the camera that an image gives.
+    """Pose of the camera from an image.
 
     Attributes
     ----------
@@ -76,7 +76,7 @@ class Matcher(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class PaperMatcher:
-    """The paper's matcher: all triangles against all, centres that agree.
+    """Matcher of the paper: all pairs of triangles, and centres that agree.
 
     Attributes
     ----------
@@ -106,7 +106,7 @@ class PaperMatcher:
     opposite_handedness: bool = True
 
     def identify(self, points_px: ArrayLike) -> CameraFix | NoFix:
-        """Pose of the camera from the stars of an image.
+        """Identify the pose of the camera from the stars of an image.
 
         Parameters
         ----------
@@ -135,7 +135,7 @@ class PaperMatcher:
         # if asked for at all, fits the mirrored image only.
         turned = triangles.is_counter_clockwise[mine] != self.catalogue.triangles.is_counter_clockwise[theirs]
         seen = np.where(turned[:, None], np.conj(image[corners]), image[corners])
-        a, b = fitted_similarity(seen, self.catalogue.plane[lights])
+        a, b = fit_similarity(seen, self.catalogue.plane[lights])
         agreeing = longest_close_subset(b, self.closeness_m)
         votes = min(len(np.unique(mine[agreeing])), len(np.unique(theirs[agreeing])))
         if votes < self.minimum_votes:
@@ -148,8 +148,8 @@ class PaperMatcher:
             image = np.conj(image)
         return camera_fix(self.catalogue, image, stars, complex(fitted), complex(b[agreeing].mean()), votes)
 
-    def matches(self, triangles: Triangles) -> tuple[IntArray, IntArray]:
-        """All against all: numbers of the image's and of the catalogue's triangles that match, one pair per match."""
+    def matches(self, triangles: LightTriangles) -> tuple[IntArray, IntArray]:
+        """Return pairs of matching triangles of image and catalogue, by comparing all pairs."""
         known = self.catalogue.triangles
         difference = np.abs(triangles.angles_rad[:, None] - known.angles_rad)
         close = (difference <= self.tolerance_rad).all(axis=2)
@@ -163,7 +163,7 @@ class PaperMatcher:
 def camera_fix(
     catalogue: TriangleCatalogue, image: ComplexArray, stars: IntArray, a: complex, b: complex, votes: int
 ) -> CameraFix:
-    """Fix of a fit q = a p̄ + b, see :mod:`adcs.mockup.vision.similarity`.
+    """Return the fix of a fit q = a p̄ + b, see :mod:`adcs.mockup.vision.similarity`.
 
     ``image`` (f,): mirrored image points x - iy [px]. ``stars`` (k, 2): pairs of numbers in image and catalogue; pairs
     may repeat.
@@ -190,7 +190,7 @@ def camera_fix(
 
 
 def longest_close_subset(points: ComplexArray, closeness: float) -> IntArray:
-    """Numbers of points that are all within a distance of one another, as many as a greedy search finds.
+    """Return a large subset of points within a distance of one another, by a greedy search.
 
     Around every point in turn the others are added by their distance while they are close to all before.
     ``points`` (c,): x + iy. Returns (k,): of the longest subset; of equally long ones, that around the point with most

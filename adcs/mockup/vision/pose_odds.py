@@ -1,4 +1,4 @@
-"""How much better than chance a pose explains the stars of an image.
+"""Odds of a pose against chance, from the stars of an image.
 
 See docs/theory/tabletop-vision.md.
 """
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import betaln
 
-from adcs.mockup.vision.camera import Camera, distorted, in_frame
+from adcs.mockup.vision.camera import Camera, distort, in_frame
 from adcs.mockup.vision.light_map import LightMap
 from adcs.mockup.vision.similarity import pairs_of
 from adcs.mockup.vision.triangles import TriangleCatalogue
@@ -28,7 +28,7 @@ _DISTINCT_PX = 20.0
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """Fits to one image of f stars, and which star is which light under each."""
+    """Fits to one image of f stars, with the light of each star."""
 
     a: ComplexArray  # (h,): of q = a p̄ + b
     b: ComplexArray  # (h,): of q = a p̄ + b
@@ -36,14 +36,14 @@ class Poses:
     matched: BoolArray  # (h, f): whether the star is that light; no light is matched twice
 
     def stars(self, index: int) -> IntArray:
-        """Pairs (k, 2) of numbers in image and catalogue under one of them."""
+        """Return pairs (k, 2) of indices in image and catalogue under one pose."""
         star = np.flatnonzero(self.matched[index])
         return np.stack([star, self.lights[index, star]], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
 class PoseOdds:
-    """Model of what a camera sees of a catalogue; made by :meth:`of`.
+    """Model of a camera's image of a catalogue; made by :meth:`of`.
 
     Attributes
     ----------
@@ -82,7 +82,7 @@ class PoseOdds:
 
     @classmethod
     def of(cls, catalogue: TriangleCatalogue, camera: Camera) -> PoseOdds:
-        """Model with the default settings."""
+        """Return a model with the default settings."""
         return cls(catalogue, camera, LightMap.of(catalogue))
 
     @property
@@ -91,8 +91,8 @@ class PoseOdds:
         positions = self.catalogue.positions_m / self.camera.m_per_px
         return -math.log(2.0 * math.pi * float(np.prod(np.ptp(positions, axis=0))))
 
-    def fitted(self, image: ComplexArray, a: ComplexArray, b: ComplexArray, first_gate_px: float) -> Poses:
-        """Fits of least squares that begin at rough poses.
+    def fit(self, image: ComplexArray, a: ComplexArray, b: ComplexArray, first_gate_px: float) -> Poses:
+        """Fit poses by least squares from rough ones.
 
         Parameters
         ----------
@@ -111,22 +111,22 @@ class PoseOdds:
         s = self.camera.m_per_px
         stiffness = (float(np.median(self.noise_px)) / self.scale_sigma) ** 2
         for gate in np.linspace(max(first_gate_px, self.gate_px), self.gate_px, _FITS).tolist():
-            lights, matched = self._matched(image, a, b, gate)
+            lights, matched = self._match(image, a, b, gate)
             n = np.maximum(matched.sum(axis=1), 1)
             places = self.catalogue.plane[lights]
             p, q = (matched @ image) / n, (matched * places).sum(axis=1) / n
             centred = image - p[:, None]
             turn = (matched * np.conj(centred) * (places - q[:, None])).sum(axis=1)
-            inertia = (matched * _squared(centred)).sum(axis=1)
+            inertia = (matched * _squared_modulus(centred)).sum(axis=1)
             length = np.abs(turn)
             can = length > 0.0
             scale = (length + s * stiffness) / (inertia + stiffness)
             a = np.where(can, scale * turn / np.where(can, length, 1.0), a)
             b = np.where(can, q - a * p, b)
-        return Poses(a, b, *self._matched(image, a, b, self.gate_px))
+        return Poses(a, b, *self._match(image, a, b, self.gate_px))
 
     def log_odds(self, image: ComplexArray, poses: Poses, log_density: FloatArray | float) -> FloatArray:
-        """Logarithm of the odds of poses against "all clutter", shape (h,); see docs/theory/tabletop-vision.md.
+        """Return the log-odds of poses against "all clutter", shape (h,); see docs/theory/tabletop-vision.md.
 
         Parameters
         ----------
@@ -145,12 +145,12 @@ class PoseOdds:
         m = matched.sum(axis=1)
         n = np.maximum(m, 1)
         offset = poses.a[:, None] * image + poses.b[:, None] - self.catalogue.plane[poses.lights]
-        squares = (matched * _squared(offset)).sum(axis=1) / s**2
+        squares = (matched * _squared_modulus(offset)).sum(axis=1) / s**2
         centred = image - ((matched @ image) / n)[:, None]
-        inertia = np.maximum((matched * _squared(centred)).sum(axis=1), 1.0)
+        inertia = np.maximum((matched * _squared_modulus(centred)).sum(axis=1), 1.0)
         scale_error = (np.abs(poses.a) / s - 1.0) / self.scale_sigma
         alpha, beta = self.detection
-        found = betaln(alpha + m, beta + self._missing(poses)) - betaln(alpha, beta)
+        found = betaln(alpha + m, beta + self._missing_lights(poses)) - betaln(alpha, beta)
         clutter = m * math.log(self.camera.width_px * self.camera.height_px / max(len(image), 1))
         variance = np.array(self.noise_px)[:, None] ** 2
         likelihood = -m * np.log(2.0 * np.pi * variance) - 0.5 * (squares / variance + scale_error**2)
@@ -161,7 +161,7 @@ class PoseOdds:
         return np.where(m >= 2, total + found + clutter + log_density, -np.inf)
 
     def distinct(self, poses: Poses, log_odds: FloatArray) -> IntArray:
-        """Numbers of poses, best first, without those that are the same as a better one."""
+        """Return indices of poses, best first, without duplicates."""
         kept: list[int] = []
         limit = _DISTINCT_PX * self.camera.m_per_px
         for i in np.argsort(-log_odds, kind="stable"):
@@ -170,10 +170,10 @@ class PoseOdds:
                 kept.append(int(i))
         return np.array(kept, dtype=np.intp)
 
-    def _matched(
+    def _match(
         self, image: ComplexArray, a: ComplexArray, b: ComplexArray, gate_px: float
     ) -> tuple[IntArray, BoolArray]:
-        """Light nearest to each star, and whether it is within the gate and no other star is nearer to it."""
+        """Match each star to its nearest light, within the gate and each light once."""
         placed = a[:, None] * image + b[:, None]
         lights = self.light_map.lights_near(placed)
         distance = np.abs(placed - self.catalogue.plane[lights]) / (gate_px * self.camera.m_per_px)
@@ -187,14 +187,14 @@ class PoseOdds:
         np.put_along_axis(matched, order, first, axis=1)
         return lights, matched
 
-    def _missing(self, poses: Poses) -> IntArray:
-        """Lights well within the image that no star is matched to, shape (h,)."""
+    def _missing_lights(self, poses: Poses) -> IntArray:
+        """Return the number (h,) of lights well within the image without a star."""
         seen = np.conj((self.catalogue.plane - poses.b[:, None]) / poses.a[:, None])
-        expected = in_frame(self.camera, distorted(self.camera, pairs_of(seen)), self.border_px)
+        expected = in_frame(self.camera, distort(self.camera, pairs_of(seen)), self.border_px)
         found = np.take_along_axis(expected, poses.lights, axis=1) & poses.matched
         return expected.sum(axis=1) - found.sum(axis=1)
 
 
-def _squared(plane: ComplexArray) -> FloatArray:
-    """Squared modulus."""
+def _squared_modulus(plane: ComplexArray) -> FloatArray:
+    """Return the squared modulus."""
     return plane.real**2 + plane.imag**2

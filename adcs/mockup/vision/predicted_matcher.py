@@ -1,4 +1,4 @@
-"""Tracking: a predicted pose says which lights to expect and where, and so two stars are enough for a fix.
+"""Matching near a predicted pose, for which two stars are enough.
 
 See docs/theory/tabletop-vision.md.
 """
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from adcs.mockup.vision.camera import Camera, Pose, distorted
+from adcs.mockup.vision.camera import Camera, Pose, distort
 from adcs.mockup.vision.odds_matcher import best_fix
 from adcs.mockup.vision.paper_matcher import CameraFix
 from adcs.mockup.vision.pose_odds import PoseOdds, Poses
@@ -28,7 +28,7 @@ _MOST_TURNED_PX = 20.0
 
 @dataclass(frozen=True, eq=False)
 class ExpectedLights:
-    """What an image should show."""
+    """Expected lights in an image."""
 
     lights: IntArray  # (k,): numbers in the catalogue
     points_px: FloatArray  # (k, 2): centred pixels: relative to the optical centre, the lens undone, y up
@@ -41,12 +41,12 @@ class ExpectedLights:
 def expected_lights(
     catalogue: TriangleCatalogue, camera: Camera, pose: Pose, covariance: ArrayLike, sigmas: float = 4.0
 ) -> ExpectedLights:
-    """Lights that a camera should see from a predicted pose, and where.
+    """Return the expected lights and their places for a predicted pose.
 
     ``pose``: one pose. ``covariance`` (3, 3): of X, Y [m] and heading [rad]. ``sigmas``: radius in standard deviations
     along the worst direction. Returns: also those outside of the image by no more than their radius.
     """
-    P = _checked_covariance(covariance)
+    P = _check_covariance(covariance)
     a, b = _fit_of(camera, pose)
     offset = catalogue.plane - b
     seen = np.conj(offset / a)
@@ -57,7 +57,7 @@ def expected_lights(
     S = J @ P @ np.swapaxes(J, 1, 2) / camera.m_per_px**2
     radius = sigmas * np.sqrt(np.linalg.eigvalsh(S)[:, 1].clip(0.0) + CENTROID_PX**2)
     points = pairs_of(seen)
-    place = distorted(camera, points)
+    place = distort(camera, points)
     nearest_in_frame = np.clip(place, 0.0, [camera.width_px - 1.0, camera.height_px - 1.0])
     visible = np.linalg.norm(place - nearest_in_frame, axis=1) <= radius
     return ExpectedLights(np.flatnonzero(visible), points[visible], radius[visible])
@@ -104,7 +104,7 @@ class LightTracker:
     minimum_stars: int = 2
 
     def identify_near(self, points_px: ArrayLike, pose: Pose, covariance: ArrayLike) -> CameraFix | NoFix:
-        """Pose of the camera from the stars of an image and a prediction.
+        """Identify the pose of the camera from the stars of an image near a prediction.
 
         The prediction helps to find the lights and to weigh what is found; the fix itself is that of the stars alone.
 
@@ -124,28 +124,28 @@ class LightTracker:
             semidefinite.
         """
         image = mirrored_image(points_px)
-        P = _checked_covariance(covariance)
+        P = _check_covariance(covariance)
         expected = expected_lights(self.odds.catalogue, self.odds.camera, pose, P, self.sigmas)
         shifts = self._shifts(image, expected)
         if not len(shifts):
             return NoFix(f"none of {len(image)} stars is near one of {len(expected)} expected lights")
         a, b = _fit_of(self.odds.camera, pose)
         turned_px = self.sigmas * math.sqrt(P[2, 2]) * float(np.abs(image).max())
-        poses = self.odds.fitted(
+        poses = self.odds.fit(
             image, np.full(len(shifts), a), b + a * shifts, self.least_radius_px + min(turned_px, _MOST_TURNED_PX)
         )
         log_odds = self.odds.log_odds(image, poses, self._log_density(poses, pose, P))
         return best_fix(self.odds, image, poses, log_odds, self.minimum_log_odds, self.minimum_stars)
 
     def _shifts(self, image: ComplexArray, expected: ExpectedLights) -> ComplexArray:
-        """Shifts of the mirrored image that put a star on a light within its radius, the smallest first [px]."""
+        """Return shifts of the mirrored image that match a star to a light, the smallest first [px]."""
         offset = np.conj(expected.points_px[:, 0] + 1j * expected.points_px[:, 1])[:, None] - image
         radius = np.maximum(expected.radius_px, self.least_radius_px)
         shifts = offset[np.abs(offset) <= radius[:, None]]
         return shifts[np.argsort(np.abs(shifts), kind="stable")[: self.most_shifts]]
 
     def _log_density(self, poses: Poses, pose: Pose, P: FloatArray) -> FloatArray:
-        """Density of the prediction at fits, per px² and rad, blurred by what a fit of two stars is uncertain by."""
+        """Return the log-density of the prediction at fits, per px² and rad, with the noise of a fit of two stars."""
         s = self.odds.camera.m_per_px
         error = np.stack(
             [poses.b.real - pose.x_m, poses.b.imag - pose.y_m, np.angle(poses.a * np.exp(-1j * pose.heading_rad))]
@@ -158,13 +158,13 @@ class LightTracker:
 
 
 def _fit_of(camera: Camera, pose: Pose) -> tuple[complex, complex]:
-    """Fit of a pose: a and b of :mod:`adcs.mockup.vision.similarity`."""
+    """Return the fit of a pose: a and b of :mod:`adcs.mockup.vision.similarity`."""
     a = camera.m_per_px * complex(math.cos(float(pose.heading_rad)), math.sin(float(pose.heading_rad)))
     return a, complex(float(pose.x_m), float(pose.y_m))
 
 
-def _checked_covariance(covariance: ArrayLike) -> FloatArray:
-    """Covariance of X, Y and heading, checked."""
+def _check_covariance(covariance: ArrayLike) -> FloatArray:
+    """Check a covariance of X, Y and heading."""
     P = np.asarray(covariance, dtype=np.float64)
     if P.shape != (3, 3) or not np.isfinite(P).all():
         raise ValueError(f"Input covariance must be 3 by 3 finite numbers; instead received shape {P.shape}.")

@@ -1,4 +1,4 @@
-"""A matcher that stands lost lights, lights that are none and blurred stars: hypotheses of triangles, checked by all.
+"""Matcher that is robust to lost, false and blurred lights: triangle hypotheses, verified by all stars.
 
 See docs/theory/tabletop-vision.md.
 """
@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from adcs.mockup.vision.paper_matcher import SLIVER_RAD, CameraFix, camera_fix
-from adcs.mockup.vision.similarity import fitted_similarity, mirrored_image, pairs_of
-from adcs.mockup.vision.triangles import TriangleCatalogue, Triangles, delaunay_triangles
+from adcs.mockup.vision.similarity import fit_similarity, mirrored_image, pairs_of
+from adcs.mockup.vision.triangles import LightTriangles, TriangleCatalogue, delaunay_triangles
 from adcs.stars.identification import NoFix
 from arrays.typing import ComplexArray, FloatArray, IntArray
 
@@ -25,7 +25,7 @@ _IMAGE_RADIUS_PX = 400.0
 
 @dataclass(frozen=True, eq=False)
 class RobustMatcher:
-    """Triangles by k-d tree, gates, and the count of all stars that fit.
+    """Matcher by triangles in a k-d tree, gates, and the number of stars that fit.
 
     Attributes
     ----------
@@ -75,7 +75,7 @@ class RobustMatcher:
     most_chance: float = 1e-7
 
     def identify(self, points_px: ArrayLike) -> CameraFix | NoFix:
-        """Pose of the camera from the stars of an image.
+        """Identify the pose of the camera from the stars of an image.
 
         Parameters
         ----------
@@ -94,11 +94,11 @@ class RobustMatcher:
         a, b = self._hypotheses(image, delaunay_triangles(image, SLIVER_RAD))
         if not len(a):
             return NoFix("no triangle of the image is in the catalogue")
-        counts, misses = self._checked(image, a, b)
+        counts, misses = self._count_inliers(image, a, b)
         fits: list[tuple[complex, complex, IntArray]] = []
         for i in np.lexsort((misses, -counts))[:_CHECKED_AGAIN]:
             if not any(self._are_one(fit, complex(a[i]), complex(b[i])) for fit in fits):
-                fits.append(self._refitted(image, complex(a[i]), complex(b[i])))
+                fits.append(self._refit(image, complex(a[i]), complex(b[i])))
         a_best, b_best, stars = max(fits, key=lambda fit: len(fit[2]))
         if len(stars) < needed:
             return NoFix(f"{len(stars)} of {len(image)} stars fit, {needed} needed")
@@ -110,8 +110,8 @@ class RobustMatcher:
             return NoFix(f"{len(stars)} of {len(image)} stars fit, as do {chance:.1g} false hypotheses per image")
         return fix
 
-    def _hypotheses(self, image: ComplexArray, triangles: Triangles) -> tuple[ComplexArray, ComplexArray]:
-        """Similarities of the matches that pass the gates, the best by their angles first."""
+    def _hypotheses(self, image: ComplexArray, triangles: LightTriangles) -> tuple[ComplexArray, ComplexArray]:
+        """Return the similarities of matches that pass the gates, the best by their angles first."""
         known = self.catalogue.triangles
         near = self.catalogue.angle_tree.query_ball_point(triangles.angles_rad, self.radius_rad)
         found: list[list[int]] = np.asarray(near, dtype=object).tolist()
@@ -121,7 +121,7 @@ class RobustMatcher:
         handed = triangles.is_counter_clockwise[mine] == known.is_counter_clockwise[theirs]
         mine, theirs = mine[handed], theirs[handed]
         seen, lights = image[triangles.corners[mine]], self.catalogue.plane[known.corners[theirs]]
-        a, b = fitted_similarity(seen, lights)
+        a, b = fit_similarity(seen, lights)
         residual = np.abs(a[:, None] * seen + b[:, None] - lights)
         scale = np.abs(a) / self.m_per_px
         passed = np.sqrt((residual**2).mean(axis=1)) < self.triangle_residual_m
@@ -130,8 +130,8 @@ class RobustMatcher:
         order = np.argsort(difference[passed], kind="stable")[: self.hypotheses]
         return a[passed][order], b[passed][order]
 
-    def _checked(self, image: ComplexArray, a: ComplexArray, b: ComplexArray) -> tuple[IntArray, FloatArray]:
-        """Lights that have a star near them and the stars' summed squared distances, under every hypothesis."""
+    def _count_inliers(self, image: ComplexArray, a: ComplexArray, b: ComplexArray) -> tuple[IntArray, FloatArray]:
+        """Return the number of lights with a star near them, and the sum of squared distances, by hypothesis."""
         placed = pairs_of(a[:, None] * image + b[:, None])
         distance, light = self.catalogue.star_tree.query(placed, distance_upper_bound=self.inlier_m)
         light = np.sort(np.where(np.isfinite(distance), light, -1), axis=1)
@@ -140,7 +140,7 @@ class RobustMatcher:
         return is_first.sum(axis=1), misses.sum(axis=1)
 
     def _chance(self, fix: CameraFix, stars: int, hypotheses: int) -> float:
-        """Expected number of hypotheses under which as many stars fall as near to lights by chance.
+        """Return the expected number of hypotheses with as good a match by chance.
 
         Three corners fit by construction; each of the others is within r of a light with the probability of the part
         of the ceiling that is, and any of them may be.
@@ -152,16 +152,16 @@ class RobustMatcher:
         return hypotheses * math.comb(stars - 3, others) * covered**others
 
     def _are_one(self, fit: tuple[complex, complex, IntArray], a: complex, b: complex) -> bool:
-        """Whether a hypothesis is near a fit, all over the image."""
+        """Return whether a hypothesis is near a fit all over the image."""
         return abs(fit[0] - a) * _IMAGE_RADIUS_PX + abs(fit[1] - b) < self.inlier_m
 
-    def _refitted(self, image: ComplexArray, a: complex, b: complex) -> tuple[complex, complex, IntArray]:
-        """Fit by the stars that stay near their lights, and these stars."""
+    def _refit(self, image: ComplexArray, a: complex, b: complex) -> tuple[complex, complex, IntArray]:
+        """Refine a fit by the stars that stay near their lights; also return these."""
         stars = one_to_one(self.catalogue, image, a, b, self.inlier_m)
         for _ in range(self.refits):
             if len(stars) < 2:
                 break
-            fitted = fitted_similarity(image[stars[:, 0]], self.catalogue.plane[stars[:, 1]])
+            fitted = fit_similarity(image[stars[:, 0]], self.catalogue.plane[stars[:, 1]])
             a, b = complex(fitted[0]), complex(fitted[1])
             near = one_to_one(self.catalogue, image, a, b, self.refit_m)
             if np.array_equal(near, stars):
@@ -171,7 +171,7 @@ class RobustMatcher:
 
 
 def one_to_one(catalogue: TriangleCatalogue, image: ComplexArray, a: complex, b: complex, radius_m: float) -> IntArray:
-    """Pairs (k, 2) of a star's number in image and catalogue that a fit brings within a distance, each light once.
+    """Match stars (k, 2) of image and catalogue within a distance under a fit, each light once.
 
     ``image`` (f,): mirrored image points x - iy [px]. ``a``, ``b``: see :mod:`adcs.mockup.vision.similarity`. Returns
     (k, 2): a light to which several stars fall has the nearest.

@@ -12,7 +12,7 @@ from arrays.typing import ComplexArray, FloatArray
 
 
 def complex_points(points: ArrayLike, name: str = "points") -> ComplexArray:
-    """Complex numbers x + iy of points (n, 2), checked.
+    """Return points (n, 2) as complex numbers x + iy; check their shape.
 
     Shapes ``points`` (n, 2) -> (n,). ``name``: what an error calls them.
     """
@@ -25,17 +25,20 @@ def complex_points(points: ArrayLike, name: str = "points") -> ComplexArray:
 
 
 def mirrored_image(points_px: ArrayLike) -> ComplexArray:
-    """Centred pixels (f, 2) as complex numbers x - iy: what is seen from above, see docs/theory/tabletop-vision.md."""
+    """Return centred pixels (f, 2) as complex numbers x - iy, as seen from above.
+
+    See docs/theory/tabletop-vision.md.
+    """
     return np.conj(complex_points(points_px, "points_px"))
 
 
 def pairs_of(plane: ComplexArray) -> FloatArray:
-    """Real and imaginary part, shape (..., 2)."""
+    """Return real and imaginary part, shape (..., 2)."""
     return np.stack([plane.real, plane.imag], axis=-1)
 
 
-def fitted_similarity(image: ComplexArray, table: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
-    """Least squares of table - (a image + b): a and b.
+def fit_similarity(image: ComplexArray, table: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
+    """Return a and b of the least squares of table - (a image + b).
 
     ``image``, ``table`` (..., k): complex, k ≥ 2, the image points not all in one place (a is NaN there). Returns
     (...): a and b.

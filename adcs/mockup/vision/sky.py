@@ -1,4 +1,4 @@
-"""The sky of the table: identical lights on the ceiling, and their file.
+"""Sky of the table: identical lights on the ceiling, and their file.
 
 The file is TOML::
 
@@ -45,7 +45,7 @@ _MOST_DARTS = 100_000
 
 
 class AmbiguousSkyWarning(UserWarning):
-    """Lights that stand so regularly that an image of them does not tell where it was taken."""
+    """Warning of regular lights, whose images do not determine the pose."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +102,7 @@ class LedSky:
 
     @property
     def spacing_m(self) -> float:
-        """Distance of a light from the nearest other one, median of all [m]."""
+        """Median distance of a light from its nearest neighbour [m]."""
         return float(np.median(np.asarray(cKDTree(self.positions_m).query(self.positions_m, k=2)[0])[:, 1]))
 
     @cached_property
@@ -119,7 +119,7 @@ class LedSky:
 
     @property
     def cocircular_margins_rad(self) -> FloatArray:
-        """How far each edge is from one that could be drawn across as well, shape (inner edges,).
+        """Margin of each inner edge from a cocircular case, shape (inner edges,).
 
         Of the two triangles at an edge the angles opposite to it sum to less than π; with π their four corners are on
         one circle, and the other diagonal is as much Delaunay as this one.
@@ -151,7 +151,7 @@ class LedSky:
 
 
 def interior_angles(triangles: FloatArray) -> FloatArray:
-    """Interior angles of triangles.
+    """Return the interior angles of triangles.
 
     Of sides s and t from a corner the angle is atan2(|s × t|, s · t), exact to rounding for flat triangles as well.
     ``triangles`` (..., 3, 2): corners. Returns (..., 3): at each corner [rad].
@@ -163,7 +163,7 @@ def interior_angles(triangles: FloatArray) -> FloatArray:
 
 
 def led_sky(seed: int = 0) -> LedSky:
-    """Random sky of 180 lights, 3.0 × 2.4 m, at least 7 cm apart: 322 Delaunay triangles.
+    """Return a random sky of 180 lights, 3.0 × 2.4 m, at least 7 cm apart: 322 Delaunay triangles.
 
     A triangulation of n points, h of them on the hull, has 2n - 2 - h triangles. A random rectangle has about 15 on its
     hull; here 36 are on a border that bulges by 1.5 %, so that each is a corner of the hull beyond doubt.
@@ -194,7 +194,7 @@ def led_sky(seed: int = 0) -> LedSky:
 
 
 def _border(half: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Lights on a rectangle with sides that bulge, in nearly equal distances along it."""
+    """Return lights on a rectangle with convex sides, at nearly equal distances along it."""
     lengths = 2.0 * np.array([half[0], half[1], half[0], half[1]])
     # A quarter of the distance either way keeps neighbours 15 cm apart, also around a corner.
     steps = np.arange(N_BORDER_LIGHTS) + rng.uniform(-0.25, 0.25, N_BORDER_LIGHTS)
@@ -211,7 +211,7 @@ class _SkyFile(File, kw_only=True):
 
 
 def read_sky(path: str | PathLike[str]) -> LedSky:
-    """Sky from its TOML file.
+    """Read a sky from its TOML file.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Delaunay triangles of lights, and the catalogue of them that images are compared with.
+"""Delaunay triangles of lights, and their catalogue.
 
 See docs/theory/tabletop-vision.md. Source: Bindel, Ivanov, Nuzhdin, Ovchinnikov, Trofimov, KIAM preprint, "Star image
 processing".
@@ -23,7 +23,7 @@ FLAT_RAD = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class Triangles:
+class LightTriangles:
     """Triangles between numbered points."""
 
     corners: IntArray  # (T, 3): numbers of the points at the smallest, the largest and the third angle
@@ -33,23 +33,23 @@ class Triangles:
     def __len__(self) -> int:
         return len(self.corners)
 
-    def only(self, chosen: BoolArray) -> Triangles:
-        """Those of a mask, shape (T,)."""
-        return Triangles(self.corners[chosen], self.angles_rad[chosen], self.is_counter_clockwise[chosen])
+    def select(self, chosen: BoolArray) -> LightTriangles:
+        """Select triangles by a mask, shape (T,)."""
+        return LightTriangles(self.corners[chosen], self.angles_rad[chosen], self.is_counter_clockwise[chosen])
 
 
-def triangles_between(plane: ComplexArray, corners: IntArray) -> Triangles:
-    """Triangles with given corners (T, 3) in any order, between points x + iy."""
+def triangles_between(plane: ComplexArray, corners: IntArray) -> LightTriangles:
+    """Return triangles with given corners (T, 3) in any order, between points x + iy."""
     angles = interior_angles(pairs_of(plane[corners]))
     order = np.argsort(angles, axis=1)[:, [0, 2, 1]]
     ordered = np.take_along_axis(corners, order, axis=1)
     first, second, third = plane[ordered].T
     turn = np.conj(second - first) * (third - first)
-    return Triangles(ordered, np.take_along_axis(angles, order[:, :2], axis=1), turn.imag > 0.0)
+    return LightTriangles(ordered, np.take_along_axis(angles, order[:, :2], axis=1), turn.imag > 0.0)
 
 
-def delaunay_triangles(plane: ComplexArray, smallest_rad: float = FLAT_RAD) -> Triangles:
-    """Triangles of Delaunay's triangulation, without slivers.
+def delaunay_triangles(plane: ComplexArray, smallest_rad: float = FLAT_RAD) -> LightTriangles:
+    """Return the triangles of Delaunay's triangulation, without slivers.
 
     ``plane`` (n,): points x + iy. There is no triangle of fewer than three points, nor of points in one line.
     ``smallest_rad``: a triangle with a smaller angle is a sliver and left out [rad]. Returns: in the order of the
@@ -61,7 +61,7 @@ def delaunay_triangles(plane: ComplexArray, smallest_rad: float = FLAT_RAD) -> T
             corners = Delaunay(pairs_of(plane)).simplices.astype(np.intp)
     numbers = np.sort(corners, axis=1)
     triangles = triangles_between(plane, corners[np.lexsort(numbers.T[::-1])])
-    return triangles.only(triangles.angles_rad[:, 0] >= smallest_rad)
+    return triangles.select(triangles.angles_rad[:, 0] >= smallest_rad)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +72,7 @@ class TriangleCatalogue:
     ----------
     positions_m : ndarray, shape (n, 2)
         Lights in the table frame [m].
-    triangles : Triangles
+    triangles : LightTriangles
         Delaunay's, of all lights.
 
     Examples
@@ -84,11 +84,11 @@ class TriangleCatalogue:
     """
 
     positions_m: FloatArray
-    triangles: Triangles
+    triangles: LightTriangles
 
     @classmethod
     def of(cls, positions_m: ArrayLike) -> TriangleCatalogue:
-        """Catalogue of lights.
+        """Return a catalogue of lights.
 
         Parameters
         ----------

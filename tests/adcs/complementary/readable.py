@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from adcs import quaternion
 from adcs.complementary.adaptive import AdaptiveTuning
-from adcs.complementary.explicit import BEST_GAINS, Gains, complementary_track, counted_s, first_attitude
+from adcs.complementary.explicit import BEST_GAINS, Gains, complementary_track, correction_times_s, first_attitude
 from adcs.complementary.outage import NO_SUBSTITUTE, Substitution, delay_steps
 from adcs.satellite.vector_record import VectorRecord
 from arrays.typing import FloatArray
@@ -151,7 +151,7 @@ def steps(
     shared = 0 if record.first_reference.shape[0] == 1 else run
     q, integral, smooth = first_attitude(q_start), np.zeros(3), np.zeros(3)
     line = Substitute(substitution, delay_steps(substitution, record.usual_dt_s))
-    counted = counted_s(record, gains)
+    counted = correction_times_s(record, gains)
     for i in range(len(record)):
         if i > 0:
             body_rad = (record.rate_rad_s[run, i] + integral) * record.dt_s[i]
@@ -162,7 +162,7 @@ def steps(
         second = _unit(record.second_body[run, i]), _unit(record.second_reference[shared, i])
         outage = bool(np.isnan(second[0]).any())
         e = correction(q, [first, line.vector(first) if outage else second])
-        kp, ki = gains.during(outage)
+        kp, ki = gains.active_gains(outage)
         smooth = gains.boost_memory * smooth + (1.0 - gains.boost_memory) * e
         if np.linalg.norm(smooth) > gains.boost_level_rad:
             ki *= gains.boost

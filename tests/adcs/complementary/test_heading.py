@@ -10,7 +10,14 @@ from scipy.differentiate import jacobian
 from scipy.stats import chi2
 
 from adcs import quaternion
-from adcs.complementary.heading import HeadingModel, _blocks, filtered, heading_track, transitions, turned_to_north
+from adcs.complementary.heading import (
+    HeadingModel,
+    _blocks,
+    heading_track,
+    rotate_to_north,
+    run_heading_filter,
+    transitions,
+)
 
 MODEL = HeadingModel()
 STEP_S, FIELD_T = 0.02, np.array([0.0, 18e-6, -45e-6])
@@ -68,7 +75,7 @@ def room(seconds=60.0, seed=0, turning=1.0, **changes):
     field += MODEL.noise_T * rng.standard_normal((n, 3))
     # What the gyro makes of it: level, with a heading of its own.
     scaled = np.cumsum(np.sum((rate - true_rate) * quaternion.matrix(q)[:, 2], axis=1)) * STEP_S
-    q_level = turned_to_north(q, -(scaled + drifts[:, 0]))
+    q_level = rotate_to_north(q, -(scaled + drifts[:, 0]))
     return time_s, rate, q_level, field, scaled + drifts[:, 0]
 
 
@@ -82,7 +89,7 @@ class TestParts:
         x, P = 1e-3 * np.arange(14.0) * [1, 1, 1, 1, 1, *[1e-4] * 9], np.diag(MODEL.deviations() ** 2)
         other = ExtendedKalmanFilter(14, 3)
         other.x, other.P, other.R = x.copy(), P.copy(), model.noise_T**2 * np.eye(3)
-        ours = [filtered(x, P, blocks, model, offline=offline)[:2] for offline in (False, True)]
+        ours = [run_heading_filter(x, P, blocks, model, offline=offline)[:2] for offline in (False, True)]
         theirs = []
         for i, (Phi, Q) in enumerate(zip(*transition_matrices(blocks, model), strict=True)):
             other.F, other.Q = Phi, Q

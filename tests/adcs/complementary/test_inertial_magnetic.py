@@ -13,7 +13,7 @@ from adcs.complementary.explicit import Gains, complementary_track
 from adcs.complementary.filters import LEFT_OUT, SUBTRACTED, inertial_magnetic_filter
 from adcs.complementary.heading import heading_track
 from adcs.complementary.inertial.gaps import window_scatter
-from adcs.complementary.inertial.integration import gyro_attitudes, levelled, low_pass
+from adcs.complementary.inertial.integration import gyro_attitudes, level_attitudes, low_pass
 from adcs.complementary.inertial_magnetic import InertialMagneticRecord, prepare, rest_bias
 from adcs.complementary.names import MAGNETS
 from adcs.complementary.orientation_errors import error_angles, orientation_errors
@@ -119,7 +119,7 @@ class TestIntegration:
         record = VectorRecord(dt_s, rate, missing, quaternion.rotate_back(q_gyro, steady), *axes, still)
         gains = Gains(1.0, 0.0, second_weight=3.0)
         expected = complementary_track(record, gains, q_start=start).q[0]
-        np.testing.assert_allclose(levelled(q_gyro, steady, 3.0 * dt_s, start), expected, atol=1e-12)
+        np.testing.assert_allclose(level_attitudes(q_gyro, steady, 3.0 * dt_s, start), expected, atol=1e-12)
 
     @pytest.mark.parametrize("largest_rad", [1e-9, 0.3, 3.0, 300.0])
     def test_gyro_attitudes_are_products(self, largest_rad):
@@ -274,12 +274,12 @@ def tracks(data_folder):
     """Of four trials of the BROAD benchmark: log, and track by what is done with a magnet."""
     logs = {name[:2]: read_imu(data_folder / "broad" / f"{name}.mat") for name in FOUR}
     return {
-        name: (log, {magnet: filtered(log.record, magnet=magnet) for magnet in ("auto", "rejected")})
+        name: (log, {magnet: run_heading_filter(log.record, magnet=magnet) for magnet in ("auto", "rejected")})
         for name, log in logs.items()
     }
 
 
-def filtered(record, **options):
+def run_heading_filter(record, **options):
     """Track of a record."""
     readings = record.time_s, record.rate_rad_s, record.acceleration_m_s2, record.field_T
     return inertial_magnetic_filter(*readings, **options)
@@ -320,7 +320,7 @@ class TestBroad:
     def test_offline(self, data_folder):
         log = read_imu(data_folder / "broad" / f"{FOUR[2]}.mat")
         errors = [
-            orientation_errors(filtered(log.record, offline=offline).q, log.q_true, log.moving)
+            orientation_errors(run_heading_filter(log.record, offline=offline).q, log.q_true, log.moving)
             for offline in (False, True)
         ]
         assert errors[1].total < 0.8 * errors[0].total

@@ -6,7 +6,7 @@ import pytest
 
 from adcs import quaternion
 from adcs.complementary.filters import inertial_magnetic_filter
-from adcs.complementary.inertial_magnetic import Prepared, prepare
+from adcs.complementary.inertial_magnetic import PreparedReadings, prepare
 from adcs.complementary.standing_magnet import locate_standing_magnet, standing_field
 from adcs.io.imu_files import read_imu
 
@@ -24,7 +24,7 @@ def made_up(n=2000, moment_Am2=MOMENT_AM2, gradient_T_m=0.0):
     field = quaternion.rotate_back(q, magnet.getB(position + quaternion.rotate(q, LEVER_M)) + room)
     field = field + 0.3e-6 * np.random.default_rng(0).standard_normal(field.shape)
     still = np.zeros_like(field)
-    return Prepared(t, still, still, field, q, 0.0, still[:, 0]), q, position
+    return PreparedReadings(t, still, still, field, q, 0.0, still[:, 0]), q, position
 
 
 class TestMadeUp:

@@ -8,7 +8,7 @@ from functools import cache
 
 import numpy as np
 
-from adcs.mockup.vision.camera import Camera, Pose, centred_from_table, distorted, in_frame
+from adcs.mockup.vision.camera import Camera, Pose, centred_from_table, distort, in_frame
 from adcs.mockup.vision.paper_matcher import CameraFix
 from adcs.mockup.vision.sky import led_sky
 from adcs.mockup.vision.triangles import TriangleCatalogue
@@ -41,7 +41,7 @@ def projected(known, field, pose, rng):
     """Centred pixels of a pose, in random order, without the detour of an image."""
     camera = field.camera
     points = centred_from_table(camera, pose, known.positions_m)
-    points = points[in_frame(camera, distorted(camera, points), BORDER_PX)]
+    points = points[in_frame(camera, distort(camera, points), BORDER_PX)]
     points = points[rng.random(len(points)) >= field.lost]
     points = points + field.noise_px * rng.standard_normal(points.shape)
     half = [0.5 * camera.width_px - BORDER_PX, 0.5 * camera.height_px - BORDER_PX]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from adcs.mockup.navigation.fixes import FixRecord, Outcome
+from adcs.mockup.navigation.fixes import FixOutcome, FixRecord
 from adcs.mockup.navigation.strapdown import ImuRecord, PlanarTrack
 from adcs.mockup.vision.camera import Camera
 from adcs.mockup.vision.paper_matcher import CameraFix
@@ -108,7 +108,7 @@ class TestFusion:
             track(),
             track(shift_m),
             fixes(),
-            (Outcome.USED,) * 40 if outcomes is None else outcomes,
+            (FixOutcome.USED,) * 40 if outcomes is None else outcomes,
             np.full((300, 2), 0.001) if sigma else None,
             np.full(300, 0.001) if sigma else None,
         )
@@ -133,13 +133,13 @@ class TestFusion:
         assert texts == ["1 beyond the limits, at the edge"]
 
     def test_rejected_fixes_are_left_out_of_the_differences(self):
-        outcomes = (*(Outcome.USED,) * 39, Outcome.REJECTED)
+        outcomes = (*(FixOutcome.USED,) * 39, FixOutcome.REJECTED)
         figure = drawn(fusion_figure(self.picture(outcomes)))
         assert len(line(panel(figure, "fused position less"), "X")) == 39
 
     @pytest.mark.parametrize(("n", "texts"), [(0, ["no fixes"]), (1, [])])
     def test_without_fixes_the_panels_say_so(self, n, texts):
-        picture = replace(self.picture((Outcome.USED,) * n), fixes=fixes(n))
+        picture = replace(self.picture((FixOutcome.USED,) * n), fixes=fixes(n))
         figure = drawn(fusion_figure(picture))
         assert [text.get_text() for text in panel(figure, "fused position less").texts] == texts
         assert [text.get_text() for text in panel(figure, "fused velocity less").texts] == ["no two fixes"]
@@ -152,12 +152,12 @@ class TestFusion:
         low, high = panel(figure, "error of Y").get_ylim()
         assert low < -3.0 < 3.0 < high
 
-    @pytest.mark.parametrize("outcome", [Outcome.REJECTED, Outcome.UNUSED])
+    @pytest.mark.parametrize("outcome", [FixOutcome.REJECTED, FixOutcome.UNUSED])
     def test_all_fixes_rejected_or_unused_and_no_sigma(self, outcome):
         picture = self.picture((outcome,) * 40, sigma=False)
         drawn(fusion_figure(picture))
         labels = panel(drawn(errors_figure(picture)), "path").get_legend_handles_labels()[1]
-        assert ("rejected fixes" in labels) == (outcome is Outcome.REJECTED)
+        assert ("rejected fixes" in labels) == (outcome is FixOutcome.REJECTED)
 
     def test_methods(self):
         error_mm = np.where(np.arange(300) % 10 == 7, 4.0, 1.0)

@@ -22,7 +22,7 @@ from adcs import Telemetry, calibrate_magnetometer, quaternion
 from adcs.environment.environment import environment, field_eci
 from adcs.frames import R_ecef_from_eci, R_orbital_from_eci
 from adcs.satellite import magnetometer_calibration as module
-from adcs.satellite.magnetometer_calibration import MagnetometerCalibration, MagnetometerPrior, calibrated
+from adcs.satellite.magnetometer_calibration import MagnetometerCalibration, MagnetometerPrior, calibrate_readings
 from magloc.fields import geomagnetic
 from tests.adcs.filter_runs import tabletsat
 
@@ -80,8 +80,8 @@ class TestDerivatives:
         x = PRIOR.deviations * np.random.default_rng(3).standard_normal(13)
         time_s, turn = np.arange(0.0, 3000.0, 100.0), quaternion.matrix(quaternion.exp(np.array([0.3, -0.2, 0.5])))
         readings = knots(time_s + x[12]) @ turn.T @ (np.eye(3) + x[3:12].reshape(3, 3)).T + x[:3]
-        rows = module._Rows(time_s, readings, knots, knots.derivative())
-        linearised = module._modulus if attitude == "none" else module._OfOrbital(turn)
+        rows = module._FieldRows(time_s, readings, knots, knots.derivative())
+        linearised = module._modulus if attitude == "none" else module._OrbitalResiduals(turn)
         residual, by = linearised(rows, x, quiet)
         np.testing.assert_allclose(residual, 0.0, atol=1e-18)
         for column, step in enumerate([1e-9] * 3 + [1e-5] * 9 + [0.1]):
@@ -101,7 +101,7 @@ class TestWhitening:
         prior = MagnetometerPrior(noise_T=0.7, field_error_T=1.3)
         lag = np.abs(time_s[:, None] - time_s)
         covariance = 0.7**2 * np.eye(80) + 1.3**2 * np.exp(-lag / prior.field_correlation_s)
-        white = module._whitened(time_s, columns, prior)
+        white = module._whiten(time_s, columns, prior)
         np.testing.assert_allclose(white.T @ white, columns.T @ np.linalg.solve(covariance, columns), rtol=1e-9)
 
 
@@ -112,7 +112,7 @@ class TestConsistency:
         total, results = 0.0, []
         for seed in seeds:
             time_s, readings, x = simulated(motion, seed)
-            result = calibrated(time_s, readings, *along_orbit(), prior=PRIOR, attitude="none")
+            result = calibrate_readings(time_s, readings, *along_orbit(), prior=PRIOR, attitude="none")
             wrong = x - numbers(result)
             total += float(wrong @ np.linalg.solve(result.covariance, wrong))
             results.append(result)
@@ -137,7 +137,7 @@ class TestConsistency:
     def test_attitude_that_is_constant(self) -> None:
         """The turn of the sensor and that of the body are one: compared in what is left of them."""
         time_s, readings, x = simulated("orbital", 1)
-        result = calibrated(time_s, readings, *along_orbit(), prior=PRIOR, attitude="orbital")
+        result = calibrate_readings(time_s, readings, *along_orbit(), prior=PRIOR, attitude="orbital")
         M = [np.eye(3) + one[3:12].reshape(3, 3) for one in (x, numbers(result))]
         assert np.abs(M[0] @ M[0].T - M[1] @ M[1].T).max() < 0.02
         assert np.abs(result.bias_T - x[:3]).max() < 4.0 * result.sigma[:3].max()
@@ -148,13 +148,13 @@ class TestWhatIsNotTold:
     def test_is_named_and_keeps_its_prior(self) -> None:
         time_s, readings, _ = simulated("orbital", 2)
         few = slice(0, 60)
-        result = calibrated(time_s[few], readings[few], *along_orbit(), prior=PRIOR, attitude="none")
+        result = calibrate_readings(time_s[few], readings[few], *along_orbit(), prior=PRIOR, attitude="none")
         assert len(result.undetermined) >= 6
         assert (result.sigma <= PRIOR.deviations * (1.0 + 1e-9)).all()
 
     def test_the_modulus_does_not_tell_turns(self) -> None:
         time_s, readings, _ = simulated("tumbling", 3)
-        result = calibrated(time_s, readings, *along_orbit(), prior=PRIOR, attitude="none")
+        result = calibrate_readings(time_s, readings, *along_orbit(), prior=PRIOR, attitude="none")
         for i, j in ((0, 1), (0, 2), (1, 2)):
             turn = np.zeros(13)
             turn[3 + 3 * i + j], turn[3 + 3 * j + i] = 1.0, -1.0
@@ -170,14 +170,14 @@ class TestRows:
         _, _, x = simulated("tumbling", 4)
         moved_s = time_s - 240.0
         keep = (moved_s > 0.0) & (moved_s < DURATION_S)
-        result = calibrated(moved_s[keep], readings[keep], *along_orbit(), prior=wide, attitude="none")
+        result = calibrate_readings(moved_s[keep], readings[keep], *along_orbit(), prior=wide, attitude="none")
         assert abs(result.time_shift_s - 240.0 - x[12]) < 4.0 * result.sigma[12] < 20.0
 
     def test_wild_rows_are_left_out(self) -> None:
         time_s, readings, _ = simulated("tumbling", 5)
-        clean = calibrated(time_s, readings, *along_orbit(), prior=PRIOR, attitude="none")
+        clean = calibrate_readings(time_s, readings, *along_orbit(), prior=PRIOR, attitude="none")
         readings[::50] *= 1.5
-        result = calibrated(time_s, readings, *along_orbit(), prior=PRIOR, attitude="none")
+        result = calibrate_readings(time_s, readings, *along_orbit(), prior=PRIOR, attitude="none")
         assert not result.used[::50].any()
         assert result.used.sum() == len(time_s) - len(readings[::50])
         assert np.isnan(result.residual_T[::50]).all()
@@ -185,7 +185,7 @@ class TestRows:
 
     def test_applied(self) -> None:
         time_s, readings, _ = simulated("tumbling", 6)
-        result = calibrated(time_s, readings, *along_orbit(), prior=PRIOR, attitude="none")
+        result = calibrate_readings(time_s, readings, *along_orbit(), prior=PRIOR, attitude="none")
         b = CubicSpline(*along_orbit())(time_s + result.time_shift_s)
         modulus = np.linalg.norm(result.applied(readings), axis=1) - np.linalg.norm(b, axis=1)
         assert np.sqrt(np.mean(modulus**2)) == pytest.approx(result.rms_T, rel=0.05)
@@ -234,7 +234,7 @@ class TestRecording:
     def test_whole_record_by_the_modulus(self, station: tuple[Array, Array, Array, Array]) -> None:
         time_s, readings, *along = station
         inside = (time_s > 1000.0) & (time_s < time_s[-1] - 1000.0)
-        result = calibrated(time_s[inside], readings[inside], *along, prior=self.PRIOR, attitude="none")
+        result = calibrate_readings(time_s[inside], readings[inside], *along, prior=self.PRIOR, attitude="none")
         assert result.rms_T < 0.65e-6
         assert 420.0 < result.time_shift_s < 500.0
         assert result.sigma[12] < 5.0
@@ -245,7 +245,7 @@ class TestRecording:
         rms = []
         for begin in np.arange(1000.0, time_s[-1] - 3.3 * 3600.0, 3.0 * 3600.0):
             piece = (time_s >= begin) & (time_s < begin + 3.0 * 3600.0)
-            result = calibrated(time_s[piece], readings[piece], *along, prior=self.PRIOR, attitude="orbital")
+            result = calibrate_readings(time_s[piece], readings[piece], *along, prior=self.PRIOR, attitude="orbital")
             rms.append(result.rms_T)
             assert 420.0 < result.time_shift_s < 510.0
         assert np.median(rms) < 0.42e-6

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from adcs.kalman.error_state import FilterSettings, ProcessNoise, sensor_set, start_near
 from adcs.kalman.mekf import run_filter
-from adcs.satellite.own_fields import WINDOW_S, Lag, OwnFields, _windows, find_own_fields
+from adcs.satellite.own_fields import WINDOW_S, OwnFields, StateLag, _windows, find_own_fields
 from sims.attitude.simulation import start_estimates
 from sims.experiments import accuracy
 from sims.experiments.loads import LOADS, NOISE_T, LoadsRun, switching_loads
@@ -138,7 +138,7 @@ class TestLag:
         rng = np.random.default_rng(seed)
         n, step_s = int(rng.integers(3, 40)), float(rng.choice([0.02, 0.3, 7.0]))
         s = np.cumsum(rng.random((n, 2)) < 0.1, axis=0) % 2.0
-        delayed = Lag(least, least + width, step_s, is_known=True).delayed(step_s * np.arange(n), s)
+        delayed = StateLag(least, least + width, step_s, is_known=True).delay(step_s * np.arange(n), s)
         for row in range(n):
             window = s[max(row - least - width, 0) : max(row - least + 1, 0)]
             # Strictly between two rows there is none of its own, and both beside it count.

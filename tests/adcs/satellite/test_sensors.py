@@ -129,13 +129,13 @@ class TestSunHeads:
     def test_square_fields_leave_only_the_sixth_side_unseen(self, seed: int) -> None:
         direction = np.random.default_rng(seed).standard_normal((50, 3))
         direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
-        seen = sensors.in_field(SunSensor(), direction).any(axis=-1)
+        seen = sensors.is_in_field(SunSensor(), direction).any(axis=-1)
         below = -direction[:, 2] > np.abs(direction[:, :2]).max(axis=-1)
         np.testing.assert_array_equal(seen, ~below)
 
     def test_part_of_the_sky(self) -> None:
         # Five sides of a cube see 5/6. With 4000 directions three standard deviations are 1.8 %; once in 370.
-        seen = sensors.in_field(SunSensor(), quaternion.rotate(Q, ABOVE)).any(axis=-1)
+        seen = sensors.is_in_field(SunSensor(), quaternion.rotate(Q, ABOVE)).any(axis=-1)
         assert seen.mean() == pytest.approx(5 / 6, abs=0.018)
 
     def test_head_that_looks_anywhere(self) -> None:
@@ -145,7 +145,7 @@ class TestSunHeads:
         aside /= np.linalg.norm(aside)
         for degrees, seen in ((0.0, True), (19.0, True), (30.0, False), (180.0, False)):
             direction = np.cos(np.radians(degrees)) * axis + np.sin(np.radians(degrees)) * aside
-            assert bool(sensors.in_field(sensor, direction)[0]) == seen
+            assert bool(sensors.is_in_field(sensor, direction)[0]) == seen
 
     def test_eclipse(self) -> None:
         sun = np.tile(ABOVE, (3, 1))

@@ -21,7 +21,7 @@ from adcs.stars.camera import StarCamera
 from adcs.stars.catalogue import StarCatalogue
 from adcs.stars.files import read_star_frames
 from adcs.stars.identification import NoFix, StarFix, StarMatcher, identify_stars
-from adcs.stars.pose import UNKNOWN_LENS, CameraPose, fitted
+from adcs.stars.pose import UNKNOWN_LENS, CameraPose, fit_pose
 from adcs.stars.triangles import KEPT, Checks, TriangleIndex, star_triangles
 from arrays.io.errors import InputError
 from tests.adcs.refusals import assert_refused
@@ -219,7 +219,7 @@ class TestPose:
         known = StarCamera(1392, 1040, 1.02 * CAMERA.rad_per_px)
         pose = CameraPose(R @ Rotation.from_rotvec([1e-3, -1e-3, 2e-3]).as_matrix(), known, np.zeros((5, 5)))
         for _ in range(5):
-            pose = fitted(points, there, pose, known, UNKNOWN_LENS, max(noise_px, 1e-6))
+            pose = fit_pose(points, there, pose, known, UNKNOWN_LENS, max(noise_px, 1e-6))
         return pose
 
     def test_is_exact_without_noise(self):

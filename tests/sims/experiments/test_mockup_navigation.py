@@ -12,8 +12,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from adcs.mockup.navigation.delayed_ekf import DelayedFilter, FilterSettings, FilterTrack
-from adcs.mockup.navigation.fixes import Outcome, fuse
+from adcs.mockup.navigation.delayed_ekf import DelayedFilter, DelayedFilterSettings, FilterTrack
+from adcs.mockup.navigation.fixes import FixOutcome, fuse
 from adcs.mockup.navigation.strapdown import PlanarTrack
 from sims.experiments.mockup_navigation import fused_runs, track_errors, zeros_run
 from sims.experiments.mockup_settings import METHODS
@@ -56,7 +56,7 @@ class TestFusion:
         assert summary["position_rms_mm"] <= 6.0
         assert summary["rejected_fixes"] == summary["false_fixes"] == summary["fixes"] - summary["used_fixes"]
         for result in runs.results:
-            used = np.array([outcome is Outcome.USED for outcome in result.fused.outcomes])
+            used = np.array([outcome is FixOutcome.USED for outcome in result.fused.outcomes])
             assert not np.any(used & result.run.false[: used.size])
 
     def test_out_of_order_twice_and_with_drop_outs(self) -> None:
@@ -64,8 +64,8 @@ class TestFusion:
         runs = fused_runs("ekf", TableScenario(duration_s=120.0, camera=camera), range(2))
         for result in runs.results:
             outcomes = result.fused.outcomes
-            assert outcomes.count(Outcome.DUPLICATE) > 5
-            assert outcomes.count(Outcome.REJECTED) + outcomes.count(Outcome.REACQUIRED) == 0
+            assert outcomes.count(FixOutcome.DUPLICATE) > 5
+            assert outcomes.count(FixOutcome.REJECTED) + outcomes.count(FixOutcome.REACQUIRED) == 0
             k = result.run.truth.time_s >= 80.0
             distance = np.linalg.norm(result.fused.track.position_m - result.run.truth.position_m, axis=1)
             assert distance[k].max() < 0.015
@@ -104,7 +104,7 @@ class TestFusion:
 class TestOtherNoiseThanTheFilterAssumes:
     """The defaults match the simulator; here they do not, each by a factor, and the filter must not fall behind."""
 
-    def rms(self, settings=FilterSettings(), scenario=TableScenario(), seeds=range(2)):  # noqa: B008 - frozen
+    def rms(self, settings=DelayedFilterSettings(), scenario=TableScenario(), seeds=range(2)):  # noqa: B008 - frozen
         values = []
         for seed in seeds:
             run = table_run(scenario, seed)
@@ -114,7 +114,7 @@ class TestOtherNoiseThanTheFilterAssumes:
 
     @pytest.mark.parametrize("factor", [0.5, 3.0])
     def test_noise_of_the_samples(self, factor: float) -> None:
-        one = FilterSettings()
+        one = DelayedFilterSettings()
         assert self.rms(replace(one, acceleration_m_s2=factor * one.acceleration_m_s2)) <= 4.0
 
     def test_spikes_twice_as_large_and_drift_three_times_as_fast(self) -> None:

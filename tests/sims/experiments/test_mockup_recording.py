@@ -21,7 +21,7 @@ import pytest
 import viser
 from scipy.spatial.transform import Rotation
 
-from adcs.mockup.navigation.fixes import Outcome
+from adcs.mockup.navigation.fixes import FixOutcome
 from adcs.mockup.vision.paper_matcher import CameraFix
 from adcs.stars.identification import NoFix
 from adcs.viewer.drive import Drive, SeenFrame
@@ -45,7 +45,7 @@ DURATION_S = 20.0
 def drive() -> Drive:
     scenario = TableScenario(duration_s=DURATION_S, camera=CameraErrors(false=0.15))
     drive = drive_of(fused_runs("ekf", scenario, [0]).results[0], "ekf", MockupOptions().table_camera())
-    assert Outcome.REJECTED in drive.outcomes
+    assert FixOutcome.REJECTED in drive.outcomes
     return drive
 
 
@@ -167,7 +167,7 @@ class TestScene:
     def test_late_fix_and_rejected_fix(self, server, player, drive):
         for fix, outcome in enumerate(drive.outcomes):
             player.move_to(float(drive.fixes.arrival_s[fix]) + 0.02)
-            wrong = outcome is Outcome.REJECTED
+            wrong = outcome is FixOutcome.REJECTED
             shown, hidden = ("/rejected-fix", "/fix") if wrong else ("/fix", "/rejected-fix")
             assert (node(server, shown).visible, node(server, hidden).visible) == (True, False)
             np.testing.assert_allclose(node(server, shown).position[:2], drive.fixes.position_m[fix])

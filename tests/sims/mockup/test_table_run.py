@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from adcs.mockup.navigation.strapdown import strapdown, turned, wrapped
+from adcs.mockup.navigation.strapdown import rotate, strapdown, wrapped
 from sims.mockup.table_run import THRUST_M_S2, CameraErrors, ImuErrors, TableScenario, perimeter_drive, table_run
 from sims.noise import stream
 
@@ -216,4 +216,4 @@ class TestRefusals:
 
     def test_turning_is_the_shared_convention(self) -> None:
         # Thrust along body x of a satellite that is headed along +Y moves it along +Y.
-        np.testing.assert_allclose(turned(math.pi / 2, [1.0, 0.0]), [0.0, 1.0], atol=1e-16)
+        np.testing.assert_allclose(rotate(math.pi / 2, [1.0, 0.0]), [0.0, 1.0], atol=1e-16)

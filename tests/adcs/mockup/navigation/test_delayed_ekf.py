@@ -35,24 +35,24 @@ from adcs.mockup.navigation.delayed_ekf import (
     H_FIX,
     STATES,
     DelayedFilter,
-    FilterSettings,
+    DelayedFilterSettings,
     FilterTrack,
     N,
     StartSigma,
-    predicted,
+    predict,
 )
-from adcs.mockup.navigation.fixes import Fix, FixRecord, Outcome, fuse
+from adcs.mockup.navigation.fixes import FixOutcome, FixRecord, PlanarFix, fuse
 from adcs.mockup.navigation.strapdown import ImuRecord, PlanarState, step, strapdown
 
 seeds = st.integers(0, 2**32 - 1)
-SETTINGS, SIGMA = FilterSettings(), StartSigma()
+SETTINGS, SIGMA = DelayedFilterSettings(), StartSigma()
 START = PlanarState(np.array([0.3, -0.2]), np.array([0.05, 0.02]), 0.4)
 FALSE_ALARM = 1e-4
 
 
 def predicted_once(x, P, step_s, reading, there, densities):
     """State and covariance after one sample."""
-    (x,), (P,) = predicted(x, P, [step_s], [reading], [there], densities)
+    (x,), (P,) = predict(x, P, [step_s], [reading], [there], densities)
     return x, P
 
 
@@ -177,7 +177,7 @@ class TestPrediction:
         # Covariance and noises of order one, so that no term is lost in rounding.
         densities, root = rng.uniform(0.5, 2.0, SETTINGS.densities.size), rng.standard_normal((N, N))
         mean, covariance = rng.standard_normal(N), root @ root.T
-        x, P = predicted(mean, covariance, steps, readings, there, densities)
+        x, P = predict(mean, covariance, steps, readings, there, densities)
         for i in range(n):
             mean, covariance = predicted_once(mean, covariance, steps[i], readings[i], there[i], densities)
             np.testing.assert_allclose(x[i], mean, rtol=0, atol=1e-12)
@@ -249,14 +249,14 @@ class TestDelay:
 
     def test_samples_one_by_one_are_samples_at_once(self) -> None:
         _, _, imu, fixes = own_world(np.random.default_rng(4), 12.0)
-        settings = FilterSettings(buffer_s=1.0)  # the history is forgotten several times
+        settings = DelayedFilterSettings(buffer_s=1.0)  # the history is forgotten several times
         at_once = fuse(DelayedFilter(START, 0.0, settings), imu, fixes).track
         one_by_one, k = DelayedFilter(START, 0.0, settings), 0
         for i in range(len(imu)):
             track = one_by_one.add_samples(imu.part(i, i + 1))
             np.testing.assert_allclose(track.position_m[0], at_once.position_m[i], rtol=0, atol=1e-11)
             while k < len(fixes) and fixes.arrival_s[k] < imu.time_s[min(i + 1, len(imu) - 1)]:
-                assert one_by_one.add_fix(fixes[k]) is Outcome.USED
+                assert one_by_one.add_fix(fixes[k]) is FixOutcome.USED
                 k += 1
 
     def test_an_exposure_within_an_interval(self) -> None:
@@ -325,7 +325,7 @@ class TestFalseFixes:
         jumped = replace(fixes, position_m=position)
         late, without = DelayedFilter(START, 0.0), DelayedFilter(START, 0.0)
         outcomes = fuse(late, imu, jumped).outcomes
-        assert [k for k, outcome in enumerate(outcomes) if outcome is not Outcome.USED] == [8]
+        assert [k for k, outcome in enumerate(outcomes) if outcome is not FixOutcome.USED] == [8]
         fuse(without, imu, fixes.rows(np.arange(len(fixes)) != 8))
         np.testing.assert_allclose(late.x, without.x, rtol=0, atol=1e-11)
 
@@ -333,13 +333,15 @@ class TestFalseFixes:
         _, _, imu, fixes = self.world()
         heading = fixes.heading_rad.copy()
         heading[8] += math.radians(2.0)
-        assert fuse(DelayedFilter(START, 0.0), imu, replace(fixes, heading_rad=heading)).outcomes[8] is Outcome.REJECTED
+        assert (
+            fuse(DelayedFilter(START, 0.0), imu, replace(fixes, heading_rad=heading)).outcomes[8] is FixOutcome.REJECTED
+        )
 
     def test_good_fixes_are_beyond_a_gate_as_often_as_chi_square_says(self) -> None:
         nis: list[float] = []
         for k in range(30):
             _, _, imu, fixes = own_world(np.random.default_rng([9, k]), 12.0)
-            late = DelayedFilter(START, 0.0, FilterSettings(fix_gate=math.inf))
+            late = DelayedFilter(START, 0.0, DelayedFilterSettings(fix_gate=math.inf))
             fuse(late, imu, fixes)
             nis.extend(late.nis)
         beyond = int(np.sum(np.array(nis) > stats.chi2.isf(0.05, 3)))
@@ -353,9 +355,9 @@ class TestFalseFixes:
         )
         late = DelayedFilter(wrong, 0.0)
         fused = fuse(late, imu, fixes)
-        expected = (Outcome.REJECTED, Outcome.REJECTED, Outcome.REACQUIRED, Outcome.USED)
+        expected = (FixOutcome.REJECTED, FixOutcome.REJECTED, FixOutcome.REACQUIRED, FixOutcome.USED)
         assert fused.outcomes[:4] == expected
-        assert set(fused.outcomes[4:]) == {Outcome.USED}
+        assert set(fused.outcomes[4:]) == {FixOutcome.USED}
         error = fused.track.position_m[-1] - track.position_m[-1]
         assert isinstance(fused.track, FilterTrack)
         assert np.all(np.abs(error) < 5.0 * fused.track.sigma[-1, :2])
@@ -369,8 +371,8 @@ class TestFalseFixes:
         outcomes = fuse(
             DelayedFilter(START, 0.0), imu, replace(fixes, position_m=position, heading_rad=heading)
         ).outcomes
-        assert outcomes[5:11] == (Outcome.REJECTED,) * 6
-        assert set(outcomes[11:]) == {Outcome.USED}
+        assert outcomes[5:11] == (FixOutcome.REJECTED,) * 6
+        assert set(outcomes[11:]) == {FixOutcome.USED}
 
     def test_false_fixes_that_move_as_nothing_can_do_not_either(self) -> None:
         """Right headings, and places that jump to and fro by 0.2 m: no velocity takes three of them."""
@@ -378,32 +380,32 @@ class TestFalseFixes:
         position = fixes.position_m.copy()
         position[5:11] += 0.3 + 0.1 * (-1.0) ** np.arange(6)[:, None]
         outcomes = fuse(DelayedFilter(START, 0.0), imu, replace(fixes, position_m=position)).outcomes
-        assert outcomes[5:11] == (Outcome.REJECTED,) * 6
-        assert set(outcomes[11:]) == {Outcome.USED}
+        assert outcomes[5:11] == (FixOutcome.REJECTED,) * 6
+        assert set(outcomes[11:]) == {FixOutcome.USED}
 
 
 class TestArrival:
     def test_duplicates_old_ones_and_those_ahead(self) -> None:
         _, _, imu, fixes = own_world(np.random.default_rng(11), 12.0)
-        late = DelayedFilter(START, 0.0, FilterSettings(buffer_s=2.0))
+        late = DelayedFilter(START, 0.0, DelayedFilterSettings(buffer_s=2.0))
         late.add_samples(imu.part(0, 1000))
-        assert late.add_fix(Fix(8.5, fixes.position_m[13], fixes.heading_rad[13])) is not Outcome.DUPLICATE
+        assert late.add_fix(PlanarFix(8.5, fixes.position_m[13], fixes.heading_rad[13])) is not FixOutcome.DUPLICATE
         x = late.x
-        assert late.add_fix(Fix(8.5, np.zeros(2), 0.0)) is Outcome.DUPLICATE
-        assert late.add_fix(Fix(7.9, np.zeros(2), 0.0)) is Outcome.TOO_OLD
-        assert late.add_fix(Fix(10.01, np.zeros(2), 0.0)) is Outcome.AHEAD
+        assert late.add_fix(PlanarFix(8.5, np.zeros(2), 0.0)) is FixOutcome.DUPLICATE
+        assert late.add_fix(PlanarFix(7.9, np.zeros(2), 0.0)) is FixOutcome.TOO_OLD
+        assert late.add_fix(PlanarFix(10.01, np.zeros(2), 0.0)) is FixOutcome.AHEAD
         np.testing.assert_array_equal(late.x, x)
 
     def test_a_fix_of_the_very_beginning_is_too_old(self) -> None:
         late = DelayedFilter(START, 0.0)
-        assert late.add_fix(Fix(0.0, START.position_m, 0.4)) is Outcome.TOO_OLD
+        assert late.add_fix(PlanarFix(0.0, START.position_m, 0.4)) is FixOutcome.TOO_OLD
 
     def test_a_drop_out_opens_the_gate_and_is_survived(self) -> None:
         track, _, imu, fixes = own_world(np.random.default_rng(12), 60.0)
         inside = (fixes.time_s > 15.0) & (fixes.time_s < 50.0)
         late = DelayedFilter(START, 0.0)
         fused = fuse(late, imu, fixes.rows(~inside))
-        assert set(fused.outcomes) == {Outcome.USED}
+        assert set(fused.outcomes) == {FixOutcome.USED}
         assert isinstance(fused.track, FilterTrack)
         before, end = np.searchsorted(imu.time_s, [15.0, 50.0])
         assert fused.track.sigma[end, 0] > 20.0 * fused.track.sigma[before, 0]
@@ -457,7 +459,7 @@ class TestArrival:
         assert track.sigma[-1, 2] == pytest.approx(SETTINGS.lost_m_s_rs * math.sqrt(60.0), rel=0.01)
         assert track.sigma[-1, 4] == pytest.approx(SETTINGS.lost_rad_rs * math.sqrt(60.0), rel=0.01)
         far = START.position_m + START.velocity_m_s * 55.0 + [3.0, -2.0]
-        assert late.add_fix(Fix(55.0, far, 2.5)) is Outcome.USED
+        assert late.add_fix(PlanarFix(55.0, far, 2.5)) is FixOutcome.USED
         assert math.sqrt(late.P[0, 0]) < 0.2 * track.sigma[-1, 0]
 
     def test_samples_follow_one_another(self) -> None:
@@ -467,4 +469,4 @@ class TestArrival:
 
     def test_settings_are_positive(self) -> None:
         with pytest.raises(ValueError, match="Input fix_m must be positive; instead received 0"):
-            FilterSettings(fix_m=0.0)
+            DelayedFilterSettings(fix_m=0.0)

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from adcs.mockup.navigation.delayed_ekf import STATES, DelayedFilter, FilterSettings, StartSigma
+from adcs.mockup.navigation.delayed_ekf import STATES, DelayedFilter, DelayedFilterSettings, StartSigma
 from adcs.mockup.navigation.fixes import fuse
 from sims.mockup.table_run import ImuErrors, TableScenario, table_run
 
@@ -36,7 +36,7 @@ def drives(factor):
     return [table_run(scenario, seed) for seed in range(RUNS)]
 
 
-def squares(factor, settings=FilterSettings(), sigma=StartSigma()):  # noqa: B008 - frozen
+def squares(factor, settings=DelayedFilterSettings(), sigma=StartSigma()):  # noqa: B008 - frozen
     """Error squared over variance at the end of each run, summed over the runs, in the order of STATES."""
     squared = []
     for run in drives(factor):
@@ -61,5 +61,5 @@ def test_errors_are_no_larger_than_stated(factor: float) -> None:
 
 def test_a_walk_alone_would_not_be_honest() -> None:
     """The bounds are narrow enough to tell: without drifts the zeros lag."""
-    total = squares(1.0, FilterSettings(drift_walk_m_s3_rs=1e-15), StartSigma(drift_m_s3=1e-15))
+    total = squares(1.0, DelayedFilterSettings(drift_walk_m_s3_rs=1e-15), StartSigma(drift_m_s3=1e-15))
     assert total[ZEROS].sum() > stats.chi2.isf(FALSE_ALARM, 2 * RUNS)

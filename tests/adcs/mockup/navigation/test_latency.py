@@ -125,4 +125,4 @@ class TestRefusals:
         with pytest.raises(ValueError, match="must be positive; instead received 0"):
             camera_latency(imu, fixes, gyro_sigma_rad_s=0.0)
         with pytest.raises(ValueError, match="must have all rates"):
-            camera_latency(imu.less(0.0, math.nan), fixes)
+            camera_latency(imu.subtract_zeros(0.0, math.nan), fixes)

@@ -6,10 +6,10 @@ Who checks whom
 ====================  ==========================================================================
 operation             oracle
 ====================  ==========================================================================
-turned                scipy's Rotation about Z
+rotate                scipy's Rotation about Z
 strapdown             step by step; closed forms of constant acceleration; scipy's solve_ivp
-between, followed_by  the integral over the whole is that over its parts
-held                  straight motion through what the gate rejects
+between, concatenate  the integral over the whole is that over its parts
+hold                  straight motion through what the gate rejects
 ====================  ==========================================================================
 """
 
@@ -24,7 +24,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from adcs.mockup.navigation.strapdown import Gate, ImuRecord, PlanarState, held, step, strapdown, turned, wrapped
+from adcs.mockup.navigation.strapdown import Gate, ImuRecord, PlanarState, hold, rotate, step, strapdown, wrapped
 
 seeds = st.integers(0, 2**32 - 1)
 REST = PlanarState(np.zeros(2), np.zeros(2), 0.0)
@@ -60,7 +60,7 @@ class TestSign:
     def test_turning_is_a_rotation_about_z(self, heading: float, seed: int) -> None:
         v = np.random.default_rng(seed).standard_normal((5, 2))
         about_z = Rotation.from_euler("z", heading).apply(np.column_stack([v, np.zeros(5)]))
-        np.testing.assert_allclose(turned(heading, v), about_z[:, :2], atol=1e-14)
+        np.testing.assert_allclose(rotate(heading, v), about_z[:, :2], atol=1e-14)
 
     @given(st.floats(-50.0, 50.0))
     def test_wrapped_angles_are_the_same_direction(self, angle: float) -> None:
@@ -95,7 +95,7 @@ class TestIntegration:
     def test_constant_acceleration_is_a_parabola(self, heading: float, n: int) -> None:
         start = PlanarState(np.array([1.0, -2.0]), np.array([0.1, 0.2]), heading)
         end = strapdown(constant(n, [0.03, -0.02], 0.0), start).state(-1)
-        t, a = 0.01 * n, turned(heading, [0.03, -0.02])
+        t, a = 0.01 * n, rotate(heading, [0.03, -0.02])
         np.testing.assert_allclose(end.position_m, start.position_m + start.velocity_m_s * t + 0.5 * a * t**2)
         np.testing.assert_allclose(end.velocity_m_s, start.velocity_m_s + a * t)
 
@@ -103,7 +103,7 @@ class TestIntegration:
         a, w = np.array([0.03, 0.01]), 0.7
 
         def flow(t, y):
-            return [y[2], y[3], *turned(y[4], a), w]
+            return [y[2], y[3], *rotate(y[4], a), w]
 
         exact = solve_ivp(flow, (0.0, 10.0), [0.0, 0.0, 0.1, 0.0, 0.2], rtol=1e-11, atol=1e-12).y[:, -1]
         errors = []
@@ -133,7 +133,7 @@ class TestCutting:
     @given(seeds, st.integers(0, 50))
     def test_parts_at_samples_make_the_record_again(self, seed: int, row: int) -> None:
         imu = random_record(np.random.default_rng(seed))
-        whole = imu.part(0, row).followed_by(imu.part(row, 50))
+        whole = imu.part(0, row).concatenate(imu.part(row, 50))
         assert whole.begin_s == imu.begin_s
         np.testing.assert_array_equal(whole.time_s, imu.time_s)
         np.testing.assert_array_equal(whole.acceleration_m_s2, imu.acceleration_m_s2)
@@ -151,7 +151,7 @@ class TestCutting:
             with pytest.raises(ValueError, match=r"must be in order within 0 to 0\.1 s"):
                 imu.between(first_s, last_s)
         with pytest.raises(ValueError, match=r"must begin where this record ends, at 0\.1 s"):
-            imu.followed_by(imu)
+            imu.concatenate(imu)
 
 
 class TestTimeStamps:
@@ -188,7 +188,7 @@ class TestGaps:
         there = np.r_[0:30, 50:60]
         imu = ImuRecord(2.0, whole.time_s[there], whole.acceleration_m_s2[:, there], whole.rate_rad_s[:, there])
         np.testing.assert_allclose(imu.gaps_s, [[2.3, 2.5]], atol=1e-12)
-        filled = imu.with_gaps_filled()
+        filled = imu.fill_gaps()
         np.testing.assert_allclose(filled.time_s, whole.time_s, atol=1e-12)
         np.testing.assert_array_equal(filled.acceleration_m_s2[:, there], imu.acceleration_m_s2)
         assert np.isnan(filled.acceleration_m_s2[:, 30:50]).all()
@@ -197,7 +197,7 @@ class TestGaps:
 
     def test_several_gaps_of_no_whole_number_of_steps(self) -> None:
         time_s = np.concatenate([0.1 * np.arange(1, 11), 2.33 + 0.1 * np.arange(10), 9.871 + 0.1 * np.arange(10)])
-        filled = ImuRecord(0.0, time_s, np.zeros((30, 2)), np.zeros(30)).with_gaps_filled()
+        filled = ImuRecord(0.0, time_s, np.zeros((30, 2)), np.zeros(30)).fill_gaps()
         assert np.isin(time_s, filled.time_s).all()
         assert 0.05 < filled.steps_s.min() < filled.steps_s.max() < 0.1 + 1e-9
         assert np.isnan(filled.rate_rad_s).sum() == len(filled) - 30
@@ -207,7 +207,7 @@ class TestGaps:
         time_s = 0.01 * np.cumsum([*[1.0] * 4, 4.9, *[1.0] * 4])[:n]
         imu = ImuRecord(0.0, time_s, np.zeros((n, 2)), np.zeros(n))
         assert imu.gaps_s.shape == (0, 2)
-        assert imu.with_gaps_filled() is imu
+        assert imu.fill_gaps() is imu
 
 
 class TestGate:
@@ -220,30 +220,30 @@ class TestGate:
     def test_every_channel_has_its_own(self) -> None:
         expected = np.ones((10, 3), dtype=bool)
         expected[[3, 5, 7], [0, 1, 2]] = False
-        np.testing.assert_array_equal(Gate().accepted(self.imu()), expected)
+        np.testing.assert_array_equal(Gate().accept(self.imu()), expected)
 
     def test_velocity_and_rate_are_held(self) -> None:
         imu = self.imu()
-        believed = held(imu, Gate().accepted(imu))
+        believed = hold(imu, Gate().accept(imu))
         np.testing.assert_array_equal(believed.acceleration_m_s2[[3, 5]], [[0.0, 0.1], [0.1, 0.0]])
         np.testing.assert_array_equal(believed.rate_rad_s, np.ones(10))
 
     def test_time_does_not_stop(self) -> None:
         imu = constant(100, [5.0, 5.0], 0.0)
-        track = strapdown(held(imu, Gate().accepted(imu)), PlanarState(np.zeros(2), np.array([0.2, -0.1]), 1.0))
+        track = strapdown(hold(imu, Gate().accept(imu)), PlanarState(np.zeros(2), np.array([0.2, -0.1]), 1.0))
         np.testing.assert_allclose(track.position_m[-1], [0.2, -0.1])
         np.testing.assert_allclose(track.velocity_m_s[-1], [0.2, -0.1])
 
     def test_a_rate_from_before_the_record_is_held(self) -> None:
         imu = constant(5, [0.0, 0.0], 100.0)
-        np.testing.assert_array_equal(held(imu, Gate().accepted(imu), 0.3).rate_rad_s, np.full(5, 0.3))
+        np.testing.assert_array_equal(hold(imu, Gate().accept(imu), 0.3).rate_rad_s, np.full(5, 0.3))
         empty = imu.part(0, 0)
-        assert len(held(empty, Gate().accepted(empty))) == 0
+        assert len(hold(empty, Gate().accept(empty))) == 0
 
     def test_the_source_s_limit_rejects_its_own_firings(self) -> None:
         firing = constant(1, [0.0, 0.0], math.radians(105.0))
-        assert not Gate(rate_rad_s=math.radians(50.0)).accepted(firing)[0, 2]
-        assert Gate().accepted(firing)[0, 2]
+        assert not Gate(rate_rad_s=math.radians(50.0)).accept(firing)[0, 2]
+        assert Gate().accept(firing)[0, 2]
 
     def test_limits_are_positive(self) -> None:
         with pytest.raises(ValueError, match="Input acceleration_m_s2 must be positive"):

@@ -108,7 +108,7 @@ class TestTheSourcesSums:
     def coefficients(self, seed):
         imu = random_imu(np.random.default_rng(seed))
         phi = middle_heading(imu)
-        fixes = fixes_of(strapdown(imu.less(-ZEROS, 0.0), START))
+        fixes = fixes_of(strapdown(imu.subtract_zeros(-ZEROS, 0.0), START))
 
         def D(u):
             return double_integral(imu.begin_s, imu.time_s, u, fixes.time_s).real
@@ -153,7 +153,7 @@ class TestNoiseFree:
         rng = np.random.default_rng(seed)
         true = random_imu(rng)
         track = strapdown(true, START)
-        return true.less(-np.asarray(zeros), 0.0), fixes_of(track)
+        return true.subtract_zeros(-np.asarray(zeros), 0.0), fixes_of(track)
 
     @pytest.mark.parametrize("first", [2, 4, 10])
     def test_two_unknowns_with_a_line_through_the_first_fixes(self, first: int) -> None:
@@ -171,7 +171,7 @@ class TestNoiseFree:
         np.testing.assert_allclose(fit.zero_m_s2, ZEROS, rtol=0, atol=1e-9)
         np.testing.assert_allclose(fit.start_position_m, START.position_m, rtol=0, atol=1e-9)
         np.testing.assert_allclose(fit.start_velocity_m_s, START.velocity_m_s, rtol=0, atol=1e-9)
-        again = strapdown(imu.less(fit.zeros[0], 0.0), fit.start(START.heading_rad))
+        again = strapdown(imu.subtract_zeros(fit.zeros[0], 0.0), fit.start(START.heading_rad))
         rows = np.searchsorted(again.time_s, fixes.time_s)
         np.testing.assert_allclose(again.position_m[rows], fixes.position_m, atol=1e-8)
 
@@ -180,7 +180,7 @@ class TestNoiseFree:
         true = random_imu(rng, duration_s=60.0)
         warming = 5.0 * (1.0 - np.exp(-(true.time_s - true.begin_s) / 30.0))
         slope = np.array([3e-4, -2e-4])
-        imu = true.less(-(ZEROS + warming[:, None] * slope), 0.0)
+        imu = true.subtract_zeros(-(ZEROS + warming[:, None] * slope), 0.0)
         fixes = fixes_of(strapdown(true, START))
         fit = zeros_and_start(zero_problem(imu, middle_heading(imu), fixes, warming[None]))
         np.testing.assert_allclose(fit.zeros, [ZEROS, slope], rtol=0, atol=1e-9)
@@ -190,7 +190,7 @@ class TestNoiseFree:
         rng = np.random.default_rng(10)
         true = random_imu(rng, duration_s=180.0)
         t = true.time_s - true.begin_s
-        imu = true.less(-(ZEROS + np.outer(t / 180.0, [0.002, -0.0015])), 0.0)
+        imu = true.subtract_zeros(-(ZEROS + np.outer(t / 180.0, [0.002, -0.0015])), 0.0)
         fixes = fixes_of(strapdown(true, START))
         heading = middle_heading(imu)
         assert zeros_and_start(zero_problem(imu, heading, fixes)).residual_rms_m > 0.005  # five times a fix's noise
@@ -203,7 +203,7 @@ class TestNoiseFree:
         half_turns = FixRecord(
             fixes.time_s, fixes.arrival_s, fixes.position_m, np.angle(np.exp(1j * fixes.heading_rad))
         )
-        heading, zero = heading_from_fixes(true.less(0.0, -0.003), half_turns)
+        heading, zero = heading_from_fixes(true.subtract_zeros(0.0, -0.003), half_turns)
         assert zero == pytest.approx(0.003, abs=1e-10)
         np.testing.assert_allclose(np.exp(1j * heading), np.exp(1j * middle_heading(true, 3.1)), atol=1e-4)
 
@@ -215,11 +215,11 @@ class TestAgainstScipy:
         rng = np.random.default_rng(12)
         true = random_imu(rng)
         fixes = fixes_of(strapdown(true, START), noise=1e-3, rng=rng)
-        imu = true.less(-ZEROS, 0.0)
+        imu = true.subtract_zeros(-ZEROS, 0.0)
         return imu, fixes, zero_problem(imu, middle_heading(imu), fixes)
 
     def residual(self, imu, fixes, zeros, position, velocity):
-        track = strapdown(imu.less(zeros, 0.0), PlanarState(position, velocity, START.heading_rad))
+        track = strapdown(imu.subtract_zeros(zeros, 0.0), PlanarState(position, velocity, START.heading_rad))
         return (track.position_m[np.searchsorted(track.time_s, fixes.time_s)] - fixes.position_m).ravel()
 
     def test_six_unknowns(self) -> None:
@@ -240,7 +240,7 @@ class TestCovariance:
     def test_the_errors_are_as_large_as_stated(self, fit_of) -> None:
         rng = np.random.default_rng(13)
         true = random_imu(rng)
-        track, imu = strapdown(true, START), true.less(-ZEROS, 0.0)
+        track, imu = strapdown(true, START), true.subtract_zeros(-ZEROS, 0.0)
         heading, total, runs = middle_heading(imu), 0.0, 200
         for _ in range(runs):
             fit = fit_of(zero_problem(imu, heading, fixes_of(track, noise=1e-3, rng=rng)))
@@ -282,6 +282,6 @@ class TestRefusals:
         with pytest.raises(ValueError, match=r"courses must have shape \(m, 1500\)"):
             zero_problem(imu, middle_heading(imu), fixes, np.ones(1500))
         with pytest.raises(ValueError, match="must have all readings"):
-            zero_problem(imu.less([math.nan, 0.0], 0.0), middle_heading(imu), fixes)
+            zero_problem(imu.subtract_zeros([math.nan, 0.0], 0.0), middle_heading(imu), fixes)
         with pytest.raises(ValueError, match="must be two at least; instead received 1"):
             heading_from_fixes(imu, fixes.rows(slice(1)))

@@ -27,7 +27,7 @@ from adcs.mockup.vision.camera import (
     Pose,
     camera_of_footprint,
     centred_from_table,
-    distorted,
+    distort,
     footprint,
     image_from_table,
     in_frame,
@@ -114,8 +114,8 @@ class TestGeometry:
 class TestLens:
     def test_k1_is_what_happens_at_320_px(self):
         camera = Camera(k1=-0.05)
-        np.testing.assert_allclose(distorted(camera, [320.0, 0.0]) - camera.centre, [304.0, 0.0])
-        np.testing.assert_allclose(distorted(camera, [0.0, 320.0]) - camera.centre, [0.0, -304.0])
+        np.testing.assert_allclose(distort(camera, [320.0, 0.0]) - camera.centre, [304.0, 0.0])
+        np.testing.assert_allclose(distort(camera, [0.0, 320.0]) - camera.centre, [0.0, -304.0])
 
     @given(lenses, st.floats(0.01, 400.0), st.floats(-math.pi, math.pi))
     def test_undone_as_a_root_finder_does(self, k1, radius, angle):
@@ -132,7 +132,7 @@ class TestLens:
     def test_centre_stays(self, k1):
         camera = Camera(k1=k1)
         np.testing.assert_array_equal(undistorted(camera, camera.centre), [0.0, 0.0])
-        np.testing.assert_array_equal(distorted(camera, [0.0, 0.0]), camera.centre)
+        np.testing.assert_array_equal(distort(camera, [0.0, 0.0]), camera.centre)
 
     def test_tiny_k1_is_none(self):
         pixels = np.random.default_rng(0).uniform(0.0, 480.0, (50, 2))
@@ -143,7 +143,7 @@ class TestLens:
         camera = Camera(k1=-0.05)
         fold = 320.0 / math.sqrt(0.15)
         radii = np.array([0.99 * fold, 1.01 * fold, 1431.0, 5000.0])  # at 1431 px the formula would give the centre
-        shown = distorted(camera, np.stack([radii, np.zeros(4)], axis=1))
+        shown = distort(camera, np.stack([radii, np.zeros(4)], axis=1))
         assert np.isfinite(shown[0]).all()
         assert np.isnan(shown[1:]).all()
         assert not in_frame(camera, shown).any()

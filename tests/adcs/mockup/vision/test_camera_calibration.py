@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from adcs.mockup.vision.camera import Camera, Pose, distorted, image_from_table, in_frame
+from adcs.mockup.vision.camera import Camera, Pose, distort, image_from_table, in_frame
 from adcs.mockup.vision.camera_calibration import KnownFrame, calibrated_camera
 from adcs.mockup.vision.centroids import find_stars
 from adcs.mockup.vision.robust_matcher import RobustMatcher
@@ -197,5 +197,5 @@ class TestFrames:
         """Light by light: what the lens bent lies where an ideal lens would show it."""
         camera = self.calibration().camera
         grid = np.stack(np.meshgrid([-300.0, 0.0, 300.0], [-200.0, 0.0, 200.0]), axis=-1).reshape(-1, 2)
-        shown = distorted(Camera(k1=-0.05), grid)
-        assert np.abs(distorted(camera, grid) - shown).max() < 0.05
+        shown = distort(Camera(k1=-0.05), grid)
+        assert np.abs(distort(camera, grid) - shown).max() < 0.05

@@ -17,7 +17,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.special import betaln
 
-from adcs.mockup.vision.camera import Camera, centred_from_table, distorted, in_frame
+from adcs.mockup.vision.camera import Camera, centred_from_table, distort, in_frame
 from adcs.mockup.vision.light_map import LightMap
 from adcs.mockup.vision.odds_matcher import FirstFix, LightPairs, OddsMatcher, odds_matcher
 from adcs.mockup.vision.paper_matcher import CameraFix, PaperMatcher
@@ -134,7 +134,7 @@ class TestOdds:
         image = mirrored_image(points)
         s = odds.camera.m_per_px
         a, b = s * np.exp(1j * np.array([pose.heading_rad])), np.array([complex(*pose.position_m)])
-        fits = odds.fitted(image, a, b, 4.0)
+        fits = odds.fit(image, a, b, 4.0)
         stars = fits.stars(0)
         m = len(stars)
         assert m == len(points)
@@ -150,7 +150,7 @@ class TestOdds:
         density = np.exp(-0.5 * square / sigma**2) / (2.0 * math.pi * sigma**2) ** m
         integral = density.sum() * (shift[1] - shift[0]) ** 2 * (turn[1] - turn[0])
         camera = odds.camera
-        seen = in_frame(camera, distorted(camera, centred_from_table(camera, pose, known.positions_m)), 12.0)
+        seen = in_frame(camera, distort(camera, centred_from_table(camera, pose, known.positions_m)), 12.0)
         missing = np.count_nonzero(seen) - np.count_nonzero(np.isin(np.flatnonzero(seen), stars[:, 1]))
         expected = math.log(integral) + m * math.log(640 * 480 / len(points)) - 20.0
         expected += betaln(4.0 + m, 1.0 + missing) - betaln(4.0, 1.0)
@@ -165,7 +165,7 @@ class TestOdds:
         def log_odds(stars):
             image = mirrored_image(stars)
             a = odds.camera.m_per_px * np.exp(1j * np.array([pose.heading_rad]))
-            fits = odds.fitted(image, a, np.array([complex(*pose.position_m)]), 4.0)
+            fits = odds.fit(image, a, np.array([complex(*pose.position_m)]), 4.0)
             return odds.log_odds(image, fits, odds.log_anywhere)[0]
 
         assert log_odds(np.delete(points, inner, axis=0)) < log_odds(points) - 5.0
@@ -230,7 +230,7 @@ def test_fits_are_least_squares():
     pose, points = projected_set(Field(noise_px=0.5), 1, 9)[0]
     image = mirrored_image(points)
     a = odds.camera.m_per_px * np.exp(1j * np.array([pose.heading_rad]))
-    fits = odds.fitted(image, a, np.array([complex(*pose.position_m)]), 4.0)
+    fits = odds.fit(image, a, np.array([complex(*pose.position_m)]), 4.0)
     stars = fits.stars(0)
     design = np.stack([image[stars[:, 0]], np.ones(len(stars))], axis=1)
     solution = np.linalg.lstsq(design, catalogue().plane[stars[:, 1]], rcond=None)[0]

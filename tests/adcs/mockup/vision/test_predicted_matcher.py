@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from adcs.mockup.vision.camera import Camera, Pose, centred_from_table, distorted, in_frame
+from adcs.mockup.vision.camera import Camera, Pose, centred_from_table, distort, in_frame
 from adcs.mockup.vision.odds_matcher import OddsMatcher
 from adcs.mockup.vision.paper_matcher import CameraFix
 from adcs.mockup.vision.pose_odds import PoseOdds
@@ -74,7 +74,7 @@ class TestExpectedLights:
         expected = expected_lights(catalogue(), Camera(), POSE, P)
         for _ in range(200):
             points = centred_from_table(Camera(), predicted(POSE, P, rng), catalogue().positions_m)
-            seen = np.flatnonzero(in_frame(Camera(), distorted(Camera(), points)))
+            seen = np.flatnonzero(in_frame(Camera(), distort(Camera(), points)))
             row = np.searchsorted(expected.lights, seen)
             assert np.isin(seen, expected.lights).all()
             distance = np.linalg.norm(points[seen] - expected.points_px[row], axis=1)
@@ -83,7 +83,7 @@ class TestExpectedLights:
 
     def test_lights_behind_the_fold_of_a_lens_are_not(self):
         expected = expected_lights(catalogue(), Camera(k1=-0.05), POSE, covariance(0.001, 0.1))
-        place = distorted(Camera(k1=-0.05), expected.points_px)
+        place = distort(Camera(k1=-0.05), expected.points_px)
         assert np.isfinite(place).all()
 
     @pytest.mark.parametrize(
