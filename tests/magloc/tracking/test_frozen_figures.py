@@ -8,9 +8,9 @@ from dataclasses import replace
 import pytest
 
 from tests.tracking_figures.figures import Comparison, Figures, Run, compare
-from tests.tracking_figures.scenarios import QUICK, SCENARIOS, stored
+from tests.tracking_figures.scenarios import QUICK, SCENARIOS, read_stored
 
-OLD = stored()
+OLD = read_stored()
 LIKE = Run(1, 100, 1.2, 1.1, 600, 96, 100, 1.1, 1.0, 1.1, 1.0, {"swaps": 0}, ("s1 is well",))
 
 
