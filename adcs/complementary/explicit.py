@@ -71,7 +71,7 @@ class Gains:
             if value is not None and not value >= 0.0:
                 raise ValueError(f"Input {name} must be 0 or more; instead received {value}.")
 
-    def active_gains(self, outage: bool) -> tuple[float, float]:
+    def during(self, outage: bool) -> tuple[float, float]:
         """Return K_P and K_I, with the second vector or without."""
         if not outage:
             return self.kp_per_s, self.ki_per_s2
@@ -81,7 +81,7 @@ class Gains:
     @property
     def largest_kp_per_s(self) -> float:
         """Larger of the two K_P, times the larger weight."""
-        return max(self.kp_per_s, self.active_gains(outage=True)[0]) * max(self.first_weight, self.second_weight)
+        return max(self.kp_per_s, self.during(outage=True)[0]) * max(self.first_weight, self.second_weight)
 
     def check(self, dt_s: float) -> None:
         """Raise ValueError beyond the stability limit K_P·h·2 = 2."""
@@ -143,8 +143,8 @@ def complementary_track(
         is_gauss_newton=method == "gauss-newton",
         mu=_MU,
         weights=(gains.first_weight, gains.second_weight),
-        gains=gains.active_gains(False),
-        outage_gains=gains.active_gains(True),
+        gains=gains.during(False),
+        outage_gains=gains.during(True),
         boost=gains.boost,
         boost_level=gains.boost_level_rad,
         boost_memory=gains.boost_memory,

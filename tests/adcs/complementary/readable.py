@@ -162,7 +162,7 @@ def steps(
         second = _unit(record.second_body[run, i]), _unit(record.second_reference[shared, i])
         outage = bool(np.isnan(second[0]).any())
         e = correction(q, [first, line.vector(first) if outage else second])
-        kp, ki = gains.active_gains(outage)
+        kp, ki = gains.during(outage)
         smooth = gains.boost_memory * smooth + (1.0 - gains.boost_memory) * e
         if np.linalg.norm(smooth) > gains.boost_level_rad:
             ki *= gains.boost
