@@ -82,6 +82,7 @@ LINES: dict[str, tuple[str, ...]] = {
         "map --html out.html",
     ),
     "magloc new-array": ("out.toml --shape tetrahedron --size-m 1.5 --noise-nT 1",),
+    "magloc columns": ("readings.csv", "readings.csv --out out.toml"),
     "magloc demo": ("out",),
     "magloc warm-up": ("",),
     "adcs demo": ("out",),
