@@ -54,7 +54,7 @@ def may_be_dummies(
     for unit in units:
         found |= _is_known(size[-n_new:] / unit)
     least = np.min(size, axis=0, initial=np.inf, where=size > 0.0)
-    large = size[-n_new:] > _APART * least
+    large = size[-n_new:] / _APART > least
     for row, is_large in enumerate(large):
         found[row] |= is_large & ((readings == new[row]).sum(axis=0) > 1)
     return np.asarray(found.any(axis=0))

@@ -63,7 +63,8 @@ class LogFormat:
         """What tells the time [s] of a row below a header; ValueError or IndexError where it has none."""
         columns = self.columns
         if columns is None:
-            at = [cell.strip().strip('"') for cell in header.split(",")].index("time_s") if "time_s" in header else 0
+            names = [cell.strip().strip('"') for cell in header.split(",")]
+            at = names.index("time_s") if "time_s" in names else 0
             return lambda row: float(row.split(",")[at])
         names = cells_of(header, columns)
         ats = [names.index(name) for name in columns.clock if name in names] or [0]

@@ -272,5 +272,6 @@ def _sensors(
 
 def _modulus(values: dict[str, FloatArray], group: Sequence[str]) -> float:
     n = min(len(values[name]) for name in group)
-    moduli = np.linalg.norm([values[name][:n] for name in group], axis=0)
+    with np.errstate(over="ignore", invalid="ignore"):  # numbers of a log may be any
+        moduli = np.linalg.norm([values[name][:n] for name in group], axis=0)
     return float(np.median(moduli[np.isfinite(moduli)])) if np.isfinite(moduli).any() else 0.0

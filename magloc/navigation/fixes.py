@@ -136,9 +136,12 @@ def _errors_m(place: FloatArray, time_s: FloatArray, known: IntArray) -> FloatAr
     """
     at_s = time_s[known]
     took_s = np.diff(at_s)
-    velocity = np.diff(place[known], axis=0) / took_s[:, None]
-    bend = np.linalg.norm(np.diff(velocity, axis=0), axis=1)
+    # Places beyond all numbers, and times that stand still, are refused by who reads them.
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        velocity = np.diff(place[known], axis=0) / took_s[:, None]
+        bend = np.linalg.norm(np.diff(velocity, axis=0), axis=1)
     most = np.maximum(np.append(bend, 0.0), np.concatenate([[0.0], bend]))  # at either end of an interval
     which = np.clip(np.searchsorted(at_s, time_s, "right") - 1, 0, len(took_s) - 1)
-    part = np.clip((time_s - at_s[which]) / took_s[which], 0.0, 1.0)
-    return np.asarray(most[which] * took_s[which] * part * (1.0 - part))
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        part = np.clip((time_s - at_s[which]) / took_s[which], 0.0, 1.0)
+        return np.asarray(most[which] * took_s[which] * part * (1.0 - part))

@@ -70,6 +70,10 @@ class TestProposal:
     def test_asks(self, head: str, row: str, words: str, tmp_path: Path) -> None:
         assert any(words in question for question in propose_columns(written(tmp_path, head, row)).asked)
 
+    def test_numbers_beyond_all_fields_are_no_sensor(self, tmp_path: Path) -> None:
+        path = written(tmp_path, "time_s,x,y,z,Bx_nT,By_nT,Bz_nT", "{0:.1f},{1},{2},{3},1e300,1e300,{4}")
+        assert propose_columns(path).sensors == {}
+
     @given(st.binary(max_size=400))
     def test_anything_else_is_refused_in_a_sentence(self, data: bytes) -> None:
         with tempfile.TemporaryDirectory() as folder:
