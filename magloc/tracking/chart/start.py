@@ -180,7 +180,7 @@ class TrackStarter:
         dof = measurement.n_differences - N_SOURCE + (0 if known is None else known.n_known)
         if dof > 0 and found.chi2[sound].min() > chdtri(dof, CONTRADICTION):
             best = int(np.argmin(np.where(sound, found.chi2, np.inf)))
-            self.misfit = measurement.z - measurement.predict_source(found.x[best])
+            self.misfit = alone.z - alone.predict_source(found.x[best])
             return None, NO_DIPOLE
         log_weight = found.log_evidence + _EVEN * ((seeds.cell < 0) @ np.array([1.0, 2.0, 0.0]))
         log_weight -= math.log(2.0) * seeds.cell[:, 2]

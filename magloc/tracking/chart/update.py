@@ -31,8 +31,6 @@ class StateUpdates:
     log_evidence : ndarray, shape (K,)
         Log-likelihood of the readings up to a constant, by Laplace's method.
     converged : ndarray, shape (K,)
-    residual : ndarray, shape (K, k + n)
-        Whitened misfits of the readings and of the prediction at the end of the iteration.
     """
 
     x: FloatArray
@@ -41,7 +39,6 @@ class StateUpdates:
     chi2: FloatArray
     log_evidence: FloatArray
     converged: BoolArray
-    residual: FloatArray
 
 
 def update_states(
@@ -89,7 +86,7 @@ def update_states(
     x_after, S_after = problem.posterior(zeta, R)
     converged &= is_regular(S_after)
     chi2 = np.sum(residual[:, :k] ** 2, axis=1)
-    return StateUpdates(x_after, S_after, cost, chi2, -0.5 * (cost + log_N + problem.log_C), converged, residual)
+    return StateUpdates(x_after, S_after, cost, chi2, -0.5 * (cost + log_N + problem.log_C), converged)
 
 
 def is_regular(S: FloatArray) -> BoolArray:

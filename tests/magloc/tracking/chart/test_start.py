@@ -10,15 +10,17 @@ from scipy import stats
 from scipy.linalg import block_diag
 
 import magloc
+from arrays import geometries
 from arrays.array import SensorArray
 from arrays.pose import PoseUncertainty
 from magloc.ambient import in_world_field
+from magloc.localization.fit.prior import NOTHING_KNOWN
 from magloc.tracking import row_filter
 from magloc.tracking.chart.mixture import Mixture
-from magloc.tracking.chart.start import NO_AMBIENT, with_errors
+from magloc.tracking.chart.start import NO_AMBIENT, NO_DIPOLE, TrackStarter, with_errors
 from magloc.tracking.chart.update import update_states
 from magloc.tracking.row_filter import Gaussians
-from magloc.tracking.rows import rows_of
+from magloc.tracking.rows import Row, rows_of
 from magloc.tracking.tracker import Tracker
 from sims.magnetics.scenario_files import read_scenario
 from sims.magnetics.simulation import simulate
@@ -51,6 +53,22 @@ class TestErrorsOfSensors:
         units = unit[:, :, None] * unit[:, None, :]
         np.testing.assert_allclose((P - P_joint) / units, 0.0, atol=3e-3)
         assert np.abs(P_joint / units)[:, :6, 6:].max() > 0.1
+
+
+class TestMisfit:
+    def test_errors_of_sensors_count_as_noise(self) -> None:
+        """In one row, offsets that are equally uncertain on all axes are noise: the misfit is as large."""
+        array, times = geometries.cube(1.5, "vector", 1e-9), 10.0
+        offsets = tuple(replace(one, offset_uncertainty_T=times * one.noise_T) for one in array.sensors)
+        noisy = tuple(replace(one, noise_T=float(np.hypot(1.0, times)) * one.noise_T) for one in array.sensors)
+        row = Row(0.0, 1e-6 * np.random.default_rng(3).normal(size=array.n_channels))
+        found = []
+        for sensors in (offsets, noisy):
+            tracker = Tracker(replace(array, sensors=sensors), REST)
+            starter = TrackStarter(tracker.array, tracker.errors, NOTHING_KNOWN)
+            assert starter.mixture(tracker.measurements.of(row), REST) == (None, NO_DIPOLE)
+            found.append(starter.misfit @ starter.misfit)
+        assert found[0] == pytest.approx(found[1], rel=1e-3)
 
 
 class TestValleyOfRangesThatBends:
