@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from xdist.scheduler import LoadScopeScheduling
 
 REPOSITORY = Path(__file__).parents[1]
+LONGEST_WRITE_S = 600.0
 
 # The same examples in every run of `make test`; new ones, and more, in every run of `make test-full`. Neither asks the
 # clock.
@@ -143,8 +144,11 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     base = tmp_path_factory.getbasetemp()
     folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "files"
     written = folder.with_name("files-written")
-    # The first worker writes them, the others wait.
+    # The first worker writes them, the others wait; one that is killed while it writes leaves them without an end.
+    end_s = time.monotonic() + LONGEST_WRITE_S
     while not written.exists():
+        if time.monotonic() > end_s:
+            pytest.fail(f"{folder} was not written within {LONGEST_WRITE_S:g} s")
         try:
             folder.mkdir()
         except FileExistsError:

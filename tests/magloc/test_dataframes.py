@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import adcs
@@ -61,8 +62,6 @@ def test_dataset_has_units_and_as_many_rows(results: dict[str, Result], name: st
 
 
 def test_parquet_keeps_the_units(results: dict[str, Result], tmp_path: Path) -> None:
-    pandas = pytest.importorskip("pandas")
-    pytest.importorskip("pyarrow")
     results["fixes"].to_dataframe().to_parquet(tmp_path / "fixes.parquet")
-    again = pandas.read_parquet(tmp_path / "fixes.parquet")
+    again = pd.read_parquet(tmp_path / "fixes.parquet")
     assert again.attrs["units"]["x_m"] == "m"
