@@ -17,12 +17,15 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from arrays.io.errors import InputError
 from magloc.core._declarations import ffi
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
 
 _HERE = Path(__file__).parent
 _SUFFIX = ".dll" if sys.platform == "win32" else ".so"
@@ -134,9 +137,10 @@ def run(
         return
     chain = chain or block
     parts = range(0, n, chain)
+    n_threads = min(threads(), len(parts))
     stopped = False
 
-    def compute(parts: range) -> None:
+    def compute(parts: Iterable[int]) -> None:
         space = new_workspace(kernel, work) if workspace is None else workspace
         for part in parts:
             end = min(part + chain, n)
@@ -144,13 +148,13 @@ def run(
                 if not stopped:
                     function(work.struct, begin, min(begin + block, end), space)
 
-    n_threads = min(threads(), len(parts))
     if n_threads <= 1:
         compute(parts)
         return
+    shared = iter(parts)  # one job a thread: Ctrl-C while a job is queued can break a lock of the pool
     with ThreadPoolExecutor(n_threads) as pool:
         try:
-            for done in [pool.submit(compute, parts[i : i + 1]) for i in range(len(parts))]:
+            for done in [pool.submit(compute, shared) for _ in range(n_threads)]:
                 done.result()
         except BaseException:
             stopped = True

@@ -104,9 +104,10 @@ def interval_of_fixes(time_s: FloatArray, error_m: FloatArray | None) -> float:
     """Usual time between fixes where places with such errors were interpolated [s], 0 where none were."""
     if error_m is None:
         return 0.0
-    known = error_m == 0.0
-    times = time_s[1:][known[1:] & ~known[:-1]]  # of fixes after rows that were interpolated
-    return float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+    known = np.flatnonzero(error_m == 0.0)
+    between = time_s[known[1:]] - time_s[known[:-1]]
+    gaps = between[np.diff(known) > 1]
+    return float(np.median(gaps)) if gaps.size else 0.0
 
 
 def _last_fixes(place: FloatArray, time_s: FloatArray, first: IntArray) -> tuple[IntArray, int]:

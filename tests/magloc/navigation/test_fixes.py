@@ -70,6 +70,16 @@ class TestLostFixes:
         np.testing.assert_allclose(of_all.position_m, way(time_s), atol=1e-9)
 
 
+class TestIntervalOfFixes:
+    def test_is_the_length_of_the_only_gap(self) -> None:
+        time_s = np.arange(100) / 10.0
+        assert interval_of_fixes(time_s, np.where((time_s > 3.05) & (time_s < 8.95), 0.1, 0.0)) == pytest.approx(6.0)
+
+    def test_is_0_without_a_gap(self) -> None:
+        assert interval_of_fixes(np.arange(9.0), np.zeros(9)) == 0.0
+        assert interval_of_fixes(np.arange(9.0), None) == 0.0
+
+
 class TestRest:
     @given(stands=st.lists(st.integers(2, 300), min_size=1, max_size=5), digits=st.integers(3, 9))
     def test_a_carrier_that_stands_is_not_held(self, stands: list[int], digits: int) -> None:

@@ -5,14 +5,18 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import arrays
 import magloc
 import sims
+from arrays.columns import POSITION_COLUMNS
 from arrays.typing import FloatArray
+from magloc.readings import write_readings
 from sims.magnetics.paths import Lawnmower, Steered
 from sims.magnetics.scenario import Carrier, Platform, Source
 from sims.magnetics.simulation import Simulation
@@ -163,6 +167,17 @@ class TestHostileWorld:
         values = readings.values_T
         wild = np.where(rng.random(values.shape) < share, 1e-6 * rng.standard_normal(values.shape), 0.0)
         assert len(self.check(replace(readings, values_T=values + wild), caplog, "leap and come back")) == 2
+
+    def test_one_gap_in_the_places(self, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+        """6 s around the last turn without a position: the interpolated places cut the corner."""
+        field, path = simulated("survey-drone", 901), tmp_path / "log.csv"
+        write_readings(path, field.readings, field.array)
+        table = pd.read_csv(path)
+        x_m = table["array_x_m"].to_numpy()
+        turn = int(np.flatnonzero(np.diff(np.sign(np.diff(x_m))))[-1])
+        table.loc[(table["time_s"] - table["time_s"][turn]).abs() < 3.0, list(POSITION_COLUMNS)] = np.nan
+        table.to_csv(path, index=False)
+        assert len(self.check(magloc.read_readings(path, field.array), caplog, "have no whole place")) == 2
 
     @pytest.mark.slow
     def test_more_noise_than_is_stated(self, caplog: pytest.LogCaptureFixture) -> None:
