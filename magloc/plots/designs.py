@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from scipy.spatial.distance import pdist
 
-from arrays.rng import Rng, accept_seed
-from arrays.typing import FloatArray
+from arrays.io.values import accept_seed
+from arrays.typing import FloatArray, Rng
 from magloc.design.evaluation import EVEN, Judgement, range_spread
 from magloc.design.optimise import BEST_START, Design, random_sample
 from magloc.design.regions import Cap

@@ -74,7 +74,8 @@ def _draw_reach(figure: Figure, ax: Axes, places_m: FloatArray, moments_Am2: Flo
     corners = neighbour_triangles(xy)
     if not len(corners):
         return  # a single line of places has no map
-    surface = ax.tripcolor(Triangulation(*xy.T, corners), moments_Am2, norm="log", cmap="viridis", shading="gouraud", rasterized=True)
+    between = Triangulation(xy[:, 0], xy[:, 1], corners)
+    surface = ax.tripcolor(between, moments_Am2, norm="log", cmap="viridis", shading="gouraud", rasterized=True)
     _draw_bar(figure, ax, surface, _round_moments(float(moments_Am2.min()), float(moments_Am2.max())), "A·m²")
 
 
