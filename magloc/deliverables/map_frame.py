@@ -37,9 +37,10 @@ class MapFrame:
     Examples
     --------
     >>> import numpy as np
+    >>> from magloc.deliverables.map_frame import MapFrame
     >>> frame = MapFrame((52.41, 13.12, 41.0), "EPSG:32633")
     >>> frame.project(np.zeros((1, 3))).round(1)
-    array([[ 372149.4, 5808214. ]])
+    array([[ 372125.2, 5808303.8]])
     """
 
     origin: Vector
