@@ -173,7 +173,7 @@ class Follower:
         self._tracker, self._rest_rows = None, []
 
     def follow(self, source: Source, *, replay_speed: float = 1.0) -> Generator[LivePoint]:
-        """Yield the points of all rows of a source as soon as they are known; see :func:`magloc.live.track`."""
+        """Yield a point for every row of a source; see :func:`magloc.live.track`."""
         if not isinstance(source, str):
             yield from self._follow_rows(source)
             return
@@ -244,7 +244,7 @@ class Follower:
         raise InputError(f"{name}: found nothing, expected {EXPECTED_HEADER}.")
 
     def _track_rows(self, readings: Readings, arrival_s: float, pace: Pace | None = None) -> Generator[LivePoint]:
-        """Yield the points of new rows; with a pace, rows that cannot be tracked in time are skipped."""
+        """Yield the points of new rows; with a pace, skip rows that cannot be tracked in time."""
         new = np.array([self._clock.accepts(time_s) for time_s in readings.time_s.tolist()], dtype=bool)
         rows = self._prepare(readings[new]) if new.any() else []
         while rows:

@@ -49,7 +49,7 @@ class RestBackground:
 
     @classmethod
     def from_rows(cls, array: SensorArray, rows: Sequence[Row]) -> RestBackground:
-        """Return the background of the rows of a rest, without readings far from the median of their channel.
+        """Return the background of the rows of a rest, without outliers of each channel.
 
         Raises
         ------
@@ -144,7 +144,7 @@ def subtract_rest(array: SensorArray, readings: Readings, rest_s: float) -> tupl
 
 
 def check_rest(array: SensorArray, *, moves: bool) -> None:
-    """Raise InputError if the array moves or has scalar sensors: the background of its rest does not stay constant."""
+    """Raise InputError if the array moves or has scalar sensors: its background varies."""
     if moves:
         raise InputError("a rest: found rows with the array's pose, expected an array that stands.")
     scalar = [sensor.id for sensor in array.sensors if sensor.kind == "scalar"]

@@ -40,7 +40,7 @@ class _Header:
 
 
 class RowParser:
-    """Strict parser of the lines of one stream: the rows equal those of a readings file with the same lines.
+    """Parser of the lines of one stream, as strict as for a readings file.
 
     Lines that are neither a row nor a header of the array are counted and logged; they never end the stream. The header
     of a sender applies to its own rows. The first header of the stream applies to senders without one.

@@ -47,7 +47,7 @@ class _Queue:
         return bool(self.datagrams)
 
     def put(self, datagram: bytes, most: int) -> int:
-        """Add a datagram, drop the oldest ones above a number of bytes, and return the number of dropped lines."""
+        """Add a datagram, drop the oldest above a size, and return the number of dropped lines."""
         self.datagrams.append((time.perf_counter(), datagram))
         self.size += size_of(datagram)
         dropped = 0
@@ -97,7 +97,7 @@ class Senders:
         self._dropped = 0
 
     def __bool__(self) -> bool:
-        """Whether a datagram waits."""
+        """Return whether a datagram waits."""
         return any(self._waiting)
 
     @property
@@ -109,7 +109,7 @@ class Senders:
         return _GOOD if sender in self._good else _OTHERS if sender in self._others else _NEW
 
     def put(self, datagram: bytes, sender: Hashable) -> None:
-        """Add a datagram; above the bounds, drop the oldest ones of this sender or those of the oldest sender."""
+        """Add a datagram; above the bounds, drop the oldest of this sender or the oldest sender."""
         own = self._class_of(sender)
         queues = self._waiting[own]
         if sender not in queues and len(queues) >= _MOST_SENDERS[own]:

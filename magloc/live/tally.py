@@ -110,7 +110,7 @@ class Tally:
 
 
 class Pace:
-    """Rates of tracked and of skipped rows, with one warning where rows arrive faster than they can be tracked.
+    """Rates of tracked and skipped rows, with one warning if too many are skipped.
 
     Parameters
     ----------

@@ -247,7 +247,7 @@ def _read_serial(port: serial.Serial) -> Iterator[bytes]:  # type: ignore[name-d
 
 
 def _replay(lines: list[bytes], speed: float, form: LogFormat) -> Iterator[Batch]:
-    """Yield the lines of a readings file at the times of their rows, without pauses longer than 10 s."""
+    """Yield the lines of a readings file at the times of their rows, without long pauses."""
     texts = (line.removeprefix(b"\xef\xbb\xbf").decode(errors="replace") for line in lines)
     seconds_of = form.clock(next(filter(form.begins, texts), ""))
     due_s, last_s = time.monotonic(), math.inf
