@@ -37,7 +37,7 @@ from magloc.design.regions import Block, Cap, Mean, Quantile
 from magloc.design.task import DesignSearch, DesignTask
 from magloc.design.volumes import Ball, BoxVolume, Cylinder, MeshSurface, even_grid
 from magloc.fields.dipole import field
-from magloc.plots.designs import clear_azimuth
+from magloc.plots.designs import clearest_azimuth
 from tests.plain_locator import plain_locator
 
 RADIUS = 0.92
@@ -417,6 +417,6 @@ class TestPicture:
         e, a = np.radians([22.0, azimuth])
         sight = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
         points = np.array([sight, -sight, [0.0, 0.0, 2.0]])
-        e, a = np.radians([22.0, clear_azimuth(points)])
+        e, a = np.radians([22.0, clearest_azimuth(points)])
         towards = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
         assert np.linalg.norm(np.cross(towards, 2.0 * sight)) > 1.0
