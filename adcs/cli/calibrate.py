@@ -10,12 +10,12 @@ import numpy as np
 from cyclopts import Parameter
 
 import adcs
-from adcs.cli.options import naming_options, tell, warn
+from adcs.cli.options import naming_options
 from adcs.satellite.magnetometer_calibration import NAMES, Attitude, MagnetometerCalibration
 from arrays.io.errors import naming
 from arrays.io.outputs import refuse_unwritable
 from arrays.io.tables import by_sigma
-from magloc.cli.framework import Flag, QuietOptions, print_result
+from magloc.cli.framework import Flag, QuietOptions, note, print_result, warn
 
 _UNITS = {"bias": (1e9, "nT"), "gain": (100.0, "percent"), "time": (1.0, "s")}
 _MISFIT = 5.0
@@ -79,8 +79,8 @@ def calibrate(
         result = adcs.calibrate_magnetometer(log, scenario.satellite, prior=prior, attitude=attitude)
     if out is not None:
         _write(out, log, result)
-        tell(common, f"wrote {out}")
-    warn(common, warnings_of(result))
+        note(f"wrote {out}")
+    warn(warnings_of(result))
     told = {"warnings": [*scenario.warnings, *warnings_of(result)]}
     print_result(report(result) | told, lines(result, attitude), as_json=json)
 

@@ -19,22 +19,6 @@ from magloc.cli import framework
 from magloc.cli.framework import Count, Flag, QuietOptions  # noqa: F401 - of an inherited option
 
 
-def print_note(text: str) -> None:
-    """Print one line on stderr, whatever the text."""
-    framework.print_note(text, "adcs")
-
-
-def tell(common: framework.QuietOptions, *texts: str) -> None:
-    """Print some lines on stderr, unless it is to be quiet there."""
-    for text in () if common.quiet else texts:
-        print_note(text)
-
-
-def warn(common: framework.QuietOptions, texts: Iterable[str]) -> None:
-    """Print warnings on stderr, unless it is to be quiet there."""
-    tell(common, *(f"warning: {text}" for text in texts))
-
-
 @Parameter(name="*", group="Common options")
 @dataclass(frozen=True)
 class ReportOptions(QuietOptions):

@@ -14,8 +14,8 @@ import magloc
 from arrays.io.errors import LARGEST, InputError, naming, own_sentence
 from arrays.io.outputs import refuse_file, write_file
 from arrays.typing import Vector
-from magloc.cli.framework import CommonOptions, Flag, print_json, progress, refuse_outside, whole_number
-from magloc.cli.options import Grid, array_of_several, naming_options, print_note, refuse_not_positive
+from magloc.cli.framework import CommonOptions, Flag, note, print_json, progress, refuse_outside, whole_number
+from magloc.cli.options import Grid, array_of_several, naming_options, refuse_not_positive
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -160,12 +160,16 @@ def bounds(
     radius = _checked(array, place, of, task)
     wanted = _scenario(array, source.moment_Am2 if of.moment_Am2 is None else of.moment_Am2, radius, of, task)
     if array.channel_is_scalar.any() and array.ambient_T is None:
-        print_note("warning: the array has scalar sensors and no ambient_nT, the ambient field is taken to be zero")
+        note(
+            "warning: the array has scalar sensors and no ambient_nT: the ambient field counts as 0",
+            always=True,
+        )
     length_m = float(assumed_body_lengths(array.positions, place, array.circumradius, wanted.body_length_m))
     if wanted.body_length_m is None and length_m:
-        print_note(
+        note(
             f"note: the source is so near that its size matters: a quarter of its distance, {length_m:.3g} m, is taken;"
-            " --body-length-m says it, 0 a point"
+            " --body-length-m says it, 0 a point",
+            always=True,
         )
     of_source = magloc.cramer_rao_bounds(array, place, wanted.moment_Am2, **wanted.uncertainties)
     over_moments = bounds_over_moments(array, place[None], wanted.moments_Am2, **wanted.uncertainties)
@@ -174,8 +178,8 @@ def bounds(
     folder = Path(f"bounds-{name}-{task.grid}{moment}") if out is None else out
     refuse_file(folder, "--out")
     detector = _detector(array, task.false_alarm_rate, common.seed)
-    counts = _cube(wanted, task.grid, folder, quiet=common.quiet)
-    spheres = _pictures(wanted, detector, task.probability, radius, folder, gif=gif, quiet=common.quiet)
+    counts = _cube(wanted, task.grid, folder)
+    spheres = _pictures(wanted, detector, task.probability, radius, folder, gif=gif)
     if json:
         print_json(
             {
@@ -191,8 +195,7 @@ def bounds(
         )
         return
     print(_table(of_source, over_moments, spheres, wanted))
-    if not common.quiet:
-        print_note(f"{counts.points} sources × {task.moments + 1} moments in {counts.seconds:.2f} s; wrote {folder}/")
+    note(f"{counts.points} sources × {task.moments + 1} moments in {counts.seconds:.2f} s; wrote {folder}/")
 
 
 def _checked(array: SensorArray, place: FloatArray, of: SourceOptions, task: TaskOptions) -> float:
@@ -273,15 +276,15 @@ def _detector(array: SensorArray, false_alarm_rate: float, seed: int) -> Matched
             array, false_alarm_rate, n_draws=round(100 / false_alarm_rate), seed=seed
         )
     except ValueError as error:
-        print_note(f"how far a source is found is left out: {own_sentence(error)}")
+        note(f"how far a source is found is left out: {own_sentence(error)}", always=True)
         return None
 
 
-def _cube(task: BoundScenario, grid: int, folder: Path, *, quiet: bool) -> BoundsSummary:
+def _cube(task: BoundScenario, grid: int, folder: Path) -> BoundsSummary:
     """Counts of the cube, computed as far as it is not done."""
     from magloc.bounds.maps import summary
 
-    with progress(grid**3, "sources", quiet=quiet) as advance:
+    with progress(grid**3, "sources") as advance:
         cube = magloc.bound_map(
             task.array,
             task.moment_Am2,
@@ -305,7 +308,6 @@ def _pictures(
     folder: Path,
     *,
     gif: bool,
-    quiet: bool,
 ) -> xr.Dataset:
     """Slices and spheres, as data and as figures; returns the spheres."""
     import numpy as np
@@ -331,7 +333,7 @@ def _pictures(
         write_file(content, folder / name)
     if gif:
         frames = spheres.sel(range=ranges)
-        with progress(_FRAMES, "pictures", quiet=quiet) as advance:
+        with progress(_FRAMES, "pictures") as advance:
             write_bound_animation(frames, task, folder / "bounds.gif", advance)
     return spheres
 

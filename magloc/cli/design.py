@@ -16,8 +16,7 @@ import arrays
 import magloc
 from arrays.io.errors import naming
 from arrays.io.outputs import refuse_one_for_two, refuse_unwritable
-from magloc.cli.framework import CommonOptions, Flag, print_json, progress, whole_number
-from magloc.cli.options import print_note
+from magloc.cli.framework import CommonOptions, Flag, note, print_json, progress, whole_number
 
 Sensors = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=1, lte=1000))]
 
@@ -73,7 +72,7 @@ def design(
     best: list[SensorArray] = []
     begin = time.perf_counter()
     try:
-        with progress(wanted.search.n_steps, "steps", quiet=common.quiet) as advance, naming(task):
+        with progress(wanted.search.n_steps, "steps") as advance, naming(task):
             result = magloc.design_array(wanted, seed=common.seed, progress=advance, better=best.append)
     except KeyboardInterrupt:
         if not best:
@@ -88,12 +87,10 @@ def design(
         print_json(_report(result, target, png, seconds))
         return
     print("\n".join([*_table(result), "", *_findings(result)]))
-    if not common.quiet:
-        drawn = "" if png is None else f" and {png}"
-        print_note(
-            f"{result.n_converged} of {result.n_descents} refined starts converged, {seconds:.1f} s; wrote"
-            f" {target}{drawn}"
-        )
+    drawn = "" if png is None else f" and {png}"
+    note(
+        f"{result.n_converged} of {result.n_descents} refined starts converged, {seconds:.1f} s; wrote {target}{drawn}"
+    )
 
 
 def _compare_counts(
@@ -109,7 +106,7 @@ def _compare_counts(
     if png is not None:
         refuse_unwritable(png, "--png", ".png")
     results = []
-    with progress(sum(task.search.n_steps for task in tasks), "steps", quiet=common.quiet) as advance:
+    with progress(sum(task.search.n_steps for task in tasks), "steps") as advance:
         for task, path in zip(tasks, targets, strict=True):
             with naming(task.name):
                 results.append(magloc.design_array(task, seed=common.seed, progress=advance))

@@ -42,6 +42,8 @@ _warnings: list[str] = []
 # Commands that end when their user or their stream does.
 _ENDLESS = {"live", "view"}
 _FIRST_SIGN_S = 10.0
+# Level of the log between INFO and WARNING: results on stderr, which --quiet keeps.
+_RESULT = 25
 _bars: list[object] = []
 _TOO_LARGE = 10**18
 
@@ -92,10 +94,9 @@ class QuietOptions:
     quiet: Flag = False
 
     def apply(self) -> None:
-        """Limit the threads of compiled code, and what is said."""
-        if self.quiet:
-            for name in PACKAGES:
-                logging.getLogger(name).setLevel(logging.WARNING)
+        """Limit the threads of compiled code, and the notes on stderr."""
+        for name in PACKAGES:
+            logging.getLogger(name).setLevel(_RESULT if self.quiet else logging.INFO)
         if self.threads is not None:
             from magloc import core
 
@@ -294,7 +295,7 @@ def _one_line_warnings(program: str) -> Iterator[None]:
 
 
 class _Notes(logging.Handler):
-    """Prints what the library logs as notes of a program."""
+    """Prints what the library and the commands log as notes of a program."""
 
     def __init__(self, program: str) -> None:
         super().__init__()
@@ -377,6 +378,17 @@ def print_result(result: Mapping[str, object], lines: Sequence[str], *, as_json:
         print("\n".join(lines))
 
 
+def note(text: str, *, always: bool = False) -> None:
+    """Print one line on stderr; --quiet hides it unless it is a result, shown `always`."""
+    _LOG.log(_RESULT if always else logging.INFO, text)
+
+
+def warn(texts: Iterable[str]) -> None:
+    """Print warnings, which the JSON object of a command lists by itself; --quiet hides them."""
+    for text in texts:
+        note(f"warning: {text}")
+
+
 def print_note(text: str, program: str) -> None:
     """Print one line of a program on stderr, whatever the text: as a terminal shows it, no word of it endless."""
     words = (word if len(word) <= _LONGEST_WORD else f"{word[:20]}…{word[-20:]}" for word in text.split())
@@ -385,15 +397,14 @@ def print_note(text: str, program: str) -> None:
 
 
 @contextmanager
-def progress(total: int, unit: str, *, quiet: bool) -> Iterator[Callable[[int], None]]:
-    """Count up to a total on a terminal's stderr.
+def progress(total: int, unit: str) -> Iterator[Callable[[int], None]]:
+    """Count up to a total on a terminal's stderr, unless --quiet hides it.
 
     Parameters
     ----------
     total : int
     unit : str
         What is counted.
-    quiet : bool
 
     Yields
     ------
@@ -402,7 +413,7 @@ def progress(total: int, unit: str, *, quiet: bool) -> Iterator[Callable[[int], 
     """
     from tqdm import tqdm
 
-    hidden = quiet or not sys.stderr.isatty()
+    hidden = not (sys.stderr.isatty() and _LOG.isEnabledFor(logging.INFO))
     with tqdm(total=total, unit=f" {unit}", disable=hidden, leave=False) as bar:
 
         def advance(finished: int) -> None:

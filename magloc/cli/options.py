@@ -43,11 +43,6 @@ STREAM = "-"
 """In place of a file: standard input."""
 
 
-def print_note(text: str) -> None:
-    """Print one line on stderr, whatever the text."""
-    framework.print_note(text, "magloc")
-
-
 def number_of_sources(sources: str) -> int | Literal["auto"]:
     """What --sources asks for."""
     if sources == "auto":

@@ -14,14 +14,13 @@ import arrays
 import magloc
 from arrays.io.errors import InputError, naming
 from arrays.io.outputs import refuse_file, refuse_one_for_two, refuse_unwritable, write_files
-from magloc.cli.framework import CommonOptions, Flag, print_report
+from magloc.cli.framework import CommonOptions, Flag, note, print_report
 from magloc.cli.options import (
     KnownOptions,
     MapOptions,
     ambient_field,
     naming_options,
     naming_scheduler,
-    print_note,
     refuse_not_positive,
 )
 
@@ -133,7 +132,7 @@ def survey(
             body_length_m=ground.body_length_m,
             scheduler=scheduler,
             unfinished=None if out is None else out / "tiles",
-            progress=None if common.quiet or json else print_note,
+            progress=None if json else note,
         )
     maps.write(found, known.place)
     write_files(out, _files(found))
@@ -145,12 +144,12 @@ def survey(
         print_report(json_of_survey(found))
         return
     print(found.table())
-    if found.pose_assumed and not common.quiet:
+    if found.pose_assumed:
         pose = found.array.pose
         size = "" if pose is None else f" {100.0 * pose.position_m:.2g} cm that last {pose.correlation_s:g} s"
         if pose is not None and pose.position_white_m:
             size += f", and {100.0 * pose.position_white_m:.2g} cm new in every row"
-        print_note(f"nothing is stated of the pose's errors: as the rows show them{size}")
+        note(f"nothing is stated of the pose's errors: as the rows show them{size}")
 
 
 def _files(found: Survey) -> Iterator[tuple[str, Any]]:

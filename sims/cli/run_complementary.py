@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from adcs.cli.options import ReportOptions, warn
+from adcs.cli.options import ReportOptions
 from adcs.complementary.names import Method, Rule
 from arrays.io.errors import LARGEST, InputError
 from arrays.io.outputs import refuse_file, write_files
-from magloc.cli.framework import ABOVE_ZERO, Count, Seed, progress, refuse_outside
+from magloc.cli.framework import ABOVE_ZERO, Count, Seed, progress, refuse_outside, warn
 from sims.cli.run_tabletsat import seed_batches
 
 if TYPE_CHECKING:
@@ -243,7 +243,7 @@ def complementary(
     """
     options.check()
     if options.filter != "adaptive":
-        warn(report, options.gains.warnings(1.0))
-    with progress(options.seeds, "runs", quiet=report.quiet) as advance:
+        warn(options.gains.warnings(1.0))
+    with progress(options.seeds, "runs") as advance:
         result = run_complementary(options, report.out, advance)
     report.print(result, summary_lines(options, result))

@@ -63,7 +63,7 @@ def detumbling(
     refuse_outside(ABOVE_ZERO, 100.0, "more than 0 and at most 100", moment_Am2=moment_Am2)
     refuse_outside(ABOVE_ZERO, 1.0, "more than 0 and at most 1", duty=duty)
     refuse_outside(0.0, _STRONGEST_AM2, f"0 to {_STRONGEST_AM2:g}", magnet_Am2=magnet_Am2)
-    with progress(round(duration) + 1, "seconds", quiet=common.quiet) as advanced:
+    with progress(round(duration) + 1, "seconds") as advanced:
         found = experiments.detumbling(
             range(seed, seed + seeds),
             damping=damping,

@@ -213,6 +213,6 @@ def ellipsoid(
     report : ReportOptions
         Where the result goes.
     """
-    with progress(options.seeds, "runs", quiet=report.quiet) as advance:
+    with progress(options.seeds, "runs") as advance:
         result = run_ellipsoid(options, report.out, advance)
     report.print(result, summary_lines(options, result))

@@ -12,9 +12,9 @@ from cyclopts import Parameter
 
 import adcs
 import sims.experiments
-from adcs.cli.options import ReportOptions, ScenarioOptions, warn
+from adcs.cli.options import ReportOptions, ScenarioOptions
 from arrays.io.errors import InputError
-from magloc.cli.framework import ABOVE_ZERO, Count, Seed, progress, refuse_outside
+from magloc.cli.framework import ABOVE_ZERO, Count, Seed, progress, refuse_outside, warn
 
 if TYPE_CHECKING:
     from adcs.io.scenario_files import AttitudeFile
@@ -123,7 +123,7 @@ def run_attitude(
         report.check()
         check_netcdf()
     parts: list[Part] = []
-    with progress(runs.seeds, "runs", quiet=report.quiet) as advance:
+    with progress(runs.seeds, "runs") as advance:
         outcome = sims.experiments.run_scenario(
             file,
             estimate,
@@ -132,7 +132,7 @@ def run_attitude(
             look=None if report.out is None else parts.append,
             advance=advance,
         )
-    warn(report, outcome.warning_lines())
+    warn(outcome.warning_lines())
     numbers = outcome.numbers()
     if report.out is not None:
         from sims.cli.attitude_files import attitude_files

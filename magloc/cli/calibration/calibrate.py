@@ -14,8 +14,8 @@ import magloc
 from arrays.io.errors import InputError, naming
 from arrays.io.outputs import refuse_file, refuse_unwritable, write_files
 from arrays.io.tables import aligned
-from magloc.cli.framework import CommonOptions, Flag, print_result
-from magloc.cli.options import array_of_several, print_note, refuse_not_positive
+from magloc.cli.framework import CommonOptions, Flag, note, print_result
+from magloc.cli.options import array_of_several, refuse_not_positive
 
 if TYPE_CHECKING:
     from arrays.array import SensorArray
@@ -149,9 +149,8 @@ def calibrate(
     print_result(report, lines, as_json=json)
     if figures is not None:
         _draw(result, figures)
-    if not (json or common.quiet):
-        for note in notes:
-            print_note(note)
+    for line in [] if json else notes:
+        note(line)
 
 
 def _check_converged(result: SourceCalibration, readings: Path, out: Path) -> None:

@@ -6,8 +6,7 @@ from pathlib import Path
 
 from arrays.io.outputs import refuse_unwritable
 from arrays.io.text import write_text
-from magloc.cli.framework import QuietOptions
-from magloc.cli.options import print_note
+from magloc.cli.framework import QuietOptions, note
 
 
 def columns(log: Path, /, *, out: Path | None = None, common: QuietOptions = QuietOptions()) -> None:  # noqa: B008 - frozen
@@ -34,6 +33,5 @@ def columns(log: Path, /, *, out: Path | None = None, common: QuietOptions = Qui
         print(proposal.toml(), end="")
         return
     write_text(proposal.toml(), out)
-    if not common.quiet:
-        for question in proposal.asked:
-            print_note(f"asked: {question}")
+    for question in proposal.asked:
+        note(f"asked: {question}")
