@@ -10,9 +10,8 @@ import numpy as np
 from cyclopts import Parameter
 
 import adcs
-from adcs.cli.options import naming_options
 from adcs.satellite.magnetometer_calibration import NAMES, Attitude, MagnetometerCalibration
-from arrays.io.errors import naming
+from arrays.io.errors import naming, naming_options
 from arrays.io.outputs import refuse_unwritable
 from arrays.io.tables import by_sigma
 from magloc.cli.framework import Flag, QuietOptions, note, print_result, warn
@@ -64,7 +63,7 @@ def calibrate(
     if out is not None:
         refuse_unwritable(out, "--out", ".csv")
     scenario = adcs.read_scenario(str(config), allow_old_elements=allow_old_elements)
-    with naming_options():
+    with naming(str(config)), naming_options("time_shift_s"):
         prior = adcs.MagnetometerPrior(
             noise_T=scenario.satellite.magnetometer.sigma_T,
             bias_T=1e-9 * scenario.estimate.field_bias_nT,

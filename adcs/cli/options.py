@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -13,7 +11,6 @@ from cyclopts import Parameter
 
 import adcs
 from adcs.kalman.names import Filter, Noise, StartKind, is_measured
-from arrays.io.errors import InputError
 from arrays.io.outputs import refuse_file, write_files
 from magloc.cli import framework
 from magloc.cli.framework import Count, Flag, QuietOptions  # noqa: F401 - of an inherited option
@@ -50,20 +47,6 @@ class ReportOptions(QuietOptions):
     def print(self, result: Mapping[str, Any], lines: Sequence[str]) -> None:
         """Print a result as JSON or as text."""
         framework.print_result(result, lines, as_json=self.json)
-
-
-@contextmanager
-def naming_options() -> Iterator[None]:
-    """Say of an option what the library says of the argument of that name."""
-    try:
-        yield
-    except InputError:
-        raise
-    except ValueError as error:
-        said = re.fullmatch(r"Input (\w+) must be (.*); instead received (.*)\.", str(error))
-        if said is None:
-            raise
-        raise InputError(f"--{said[1].replace('_', '-')}: found {said[3]}, expected {said[2]}.") from None
 
 
 @Parameter(name="*")

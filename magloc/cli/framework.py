@@ -231,13 +231,10 @@ def call(app: App, tokens: Sequence[str]) -> None:
         raise InputError(str(error).replace(" requires an argument.", " is missing.")) from None
     except ImportError as error:
         raise InputError(f"the command cannot be loaded ({error.__cause__ or error}).") from None
-    quiet = False
-    for value in bound.arguments.values():
-        if isinstance(value, QuietOptions):
-            value.apply()
-            quiet = value.quiet
+    options = next((value for value in bound.arguments.values() if isinstance(value, QuietOptions)), QuietOptions())
+    options.apply()
     endless = "-" in tokens or not _ENDLESS.isdisjoint(tokens[:1])
-    with contextlib.nullcontext() if quiet or endless else _signs_of_life(app.name[0]):
+    with contextlib.nullcontext() if options.quiet or endless else _signs_of_life(app.name[0]):
         command(*bound.args, **bound.kwargs)
 
 

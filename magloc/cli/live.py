@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from arrays.io.errors import LARGEST, naming
+from arrays.io.errors import LARGEST, naming, naming_options
 from arrays.io.outputs import refuse_unwritable
 from magloc.cli.framework import ABOVE_ZERO, Flag, QuietOptions, note, refuse_outside
-from magloc.cli.options import STREAM, KnownOptions, MotionOptions, Port, naming_options, naming_place
+from magloc.cli.options import STREAM, KnownOptions, MotionOptions, Port, naming_place
 
 if TYPE_CHECKING:
     from arrays.io.csv import Column

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import magloc
-from arrays.io.errors import InputError, naming
+from arrays.io.errors import InputError, naming, naming_options
 from arrays.io.outputs import refuse_file
 from arrays.io.text import write_netcdf
 from magloc.cli.framework import CommonOptions, Flag, note, print_result, progress
-from magloc.cli.options import Grid, naming_options, naming_scheduler
+from magloc.cli.options import Grid
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -100,7 +100,7 @@ def map_(
     before = chunk_seconds(store)
     with (
         naming(scenario),
-        naming_scheduler(),
+        naming_options("scheduler"),
         progress(n**3, over) as advance,
     ):
         dataset = compute(n=n, out=store, scheduler=scheduler, progress=advance)

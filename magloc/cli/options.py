@@ -16,7 +16,7 @@ from cyclopts.validators import Number
 
 import arrays
 import magloc
-from arrays.io.errors import LARGEST, InputError, naming
+from arrays.io.errors import LARGEST, InputError, naming, naming_options
 from arrays.io.outputs import refuse_unwritable
 from arrays.io.text import write_text
 from arrays.typing import Vector
@@ -70,31 +70,8 @@ Grid = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=2, 
 """Points along an axis: 2000 are 8,000,000,000 points, more than a day of work."""
 
 
-@contextmanager
-def naming_scheduler() -> Iterator[None]:
-    """Let errors of a scheduler speak of the option."""
-    from magloc.grids.cluster import SchedulerError
-
-    try:
-        yield
-    except SchedulerError as error:
-        raise InputError(f"--{error}") from None
-
-
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _BOUNDS = re.compile(rf"(?:(?P<below>{_NUMBER})<(?=[xyz]<))?(?P<axis>[xyz])(?P<sign>[<>])(?P<bound>{_NUMBER})")
-
-
-@contextmanager
-def naming_options(*names: str) -> Iterator[None]:
-    """Say of an option what the library says of the argument of that name."""
-    try:
-        yield
-    except ValueError as error:
-        said = re.match(r"Input (\w+)", str(error))
-        if said is None or said[1] not in names:
-            raise
-        raise InputError(f"--{said[1].replace('_', '-')}{str(error)[said.end() :]}") from None
 
 
 @contextmanager

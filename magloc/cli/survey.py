@@ -12,15 +12,13 @@ from cyclopts import Parameter
 
 import arrays
 import magloc
-from arrays.io.errors import InputError, naming
+from arrays.io.errors import InputError, naming, naming_options
 from arrays.io.outputs import refuse_file, refuse_one_for_two, refuse_unwritable, write_files
 from magloc.cli.framework import CommonOptions, Flag, note, print_report
 from magloc.cli.options import (
     KnownOptions,
     MapOptions,
     ambient_field,
-    naming_options,
-    naming_scheduler,
     refuse_not_positive,
 )
 
@@ -120,7 +118,7 @@ def survey(
     at_base = arrays.SensorArray((arrays.Sensor("base", "scalar", (0.0, 0.0, 0.0), 1e-10),))
     station = None if base is None else magloc.read_readings(base, at_base, ordered=True)
     named = naming(", ".join(map(str, readings)), array=str(array))
-    with named, naming_options("ground_m", "base", "body_length_m"), naming_scheduler():
+    with named, naming_options("ground_m", "base", "body_length_m", "scheduler"):
         found = magloc.survey(
             used,
             rows,

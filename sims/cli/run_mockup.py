@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import sims.experiments
-from adcs.cli.options import ReportOptions, naming_options
+from adcs.cli.options import ReportOptions
+from arrays.io.errors import naming_options
 from magloc.cli.framework import progress, warn
 from sims.cli.mockup_options import MockupOptions, value_or
 from sims.cli.mockup_replay import ReplayOptions
@@ -211,7 +212,7 @@ def _sky(options: MockupOptions, report: ReportOptions) -> Told:
 
 def _zeros(options: MockupOptions, report: ReportOptions) -> Told:
     seeds, unknowns, start_fixes = options.runs(6), value_or(options.unknowns, "six"), value_or(options.start_fixes, 4)
-    with progress(len(seeds), "runs") as advance, naming_options():
+    with progress(len(seeds), "runs") as advance, naming_options("start_fixes"):
         runs = sims.experiments.zeros_run(
             unknowns, seeds, options.duration_s, start_fixes=start_fixes, progress=advance
         )

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from arrays.io.errors import InputError, naming
+from arrays.io.errors import InputError, naming, naming_options
 from magloc.cli.framework import CommonOptions, Flag, note, print_json
-from magloc.cli.options import naming_options
 
 
 def simulate(
