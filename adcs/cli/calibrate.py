@@ -60,8 +60,7 @@ def calibrate(
     """
     from adcs.kalman.error_state import FIELD_ERROR_T
 
-    if out is not None:
-        refuse_unwritable(out, "--out", ".csv")
+    refuse_unwritable(out, "--out", ".csv")
     scenario = adcs.read_scenario(str(config), allow_old_elements=allow_old_elements)
     with naming(str(config)), naming_options("time_shift_s"):
         prior = adcs.MagnetometerPrior(

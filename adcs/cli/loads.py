@@ -56,8 +56,7 @@ def loads(
     from adcs.io.load_files import channel_columns, read_load_log
     from arrays.io.csv import write_columns
 
-    if out is not None:
-        refuse_unwritable(out, "--out", ".csv")
+    refuse_unwritable(out, "--out", ".csv")
     sensors = arrays.read_array(array)
     log = read_load_log(readings, sensors, [name.strip() for name in loads.split(",") if name.strip()])
     with naming(str(readings)):

@@ -221,7 +221,7 @@ def _give_up_stdout() -> None:
 def call(app: App, tokens: Sequence[str]) -> None:
     """Run one command; what is wrong is raised."""
     try:
-        _show_whole_help(app, tokens)
+        use_docstrings(app, tokens)
         command, bound, _ = app.parse_args(tokens, print_error=False, exit_on_error=False)
     except UnknownCommandError as error:
         raise InputError(_unknown_command(app, error)) from None
@@ -267,8 +267,8 @@ def _unknown_command(app: App, error: UnknownCommandError) -> str:
     return f'Unknown command "{token}".{near} Available commands: {", ".join(names)}.'
 
 
-def _show_whole_help(app: App, tokens: Sequence[str]) -> None:
-    """Let the help of a command be its docstring: the line that it is registered with is for the list of commands."""
+def use_docstrings(app: App, tokens: Sequence[str]) -> None:
+    """Use the docstring of a command as its help, in place of the line in the list of commands."""
     chain, apps, _ = app.parse_commands(tokens)
     for name, command in zip(chain, apps[1:], strict=True):
         if not name.startswith("-") and all(inner.startswith("-") for inner in command):

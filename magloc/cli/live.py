@@ -90,8 +90,7 @@ def live(
 
     refuse_outside(0.0, LARGEST, "0 or a positive number", rest_s=rest_s)
     refuse_outside(ABOVE_ZERO, LARGEST, "a positive number", replay_speed=replay_speed)
-    if out is not None:
-        refuse_unwritable(out, "--out", ".csv")
+    refuse_unwritable(out, "--out", ".csv")
     used = known.array(array)
     with naming(str(array), sources=f"--sources {motion.sources}"):
         follower = motion.follower(used, known, known.where, rest_s)

@@ -329,8 +329,7 @@ class MapOptions:
         for option, path in self.outputs.items():
             if path is not None and place is None:
                 raise InputError(f"{option}: found no --place, expected the origin of the world frame with it.")
-            if path is not None:
-                refuse_unwritable(path, option)
+            refuse_unwritable(path, option)
 
     def refuse_far(self, rows: Readings, name: str) -> None:
         """Refuse, before long work, an array that is too far from the origin to be placed on the Earth."""

@@ -103,8 +103,7 @@ def survey(
     maps.refuse(known.place)
     refuse_file(out, "--out")
     refuse_one_for_two({"--out": out, "--html": html, **maps.outputs})
-    if html is not None:
-        refuse_unwritable(html, "--html")
+    refuse_unwritable(html, "--html")
     refuse_not_positive(ground, "shortest_geology_m", "false_per_hectare")
     if not math.isfinite(ground.ground_m):
         raise InputError(f"--ground-m: found {ground.ground_m:g}, expected a finite number.")

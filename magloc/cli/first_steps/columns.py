@@ -26,8 +26,7 @@ def columns(log: Path, /, *, out: Path | None = None, common: QuietOptions = Qui
     """
     from arrays.logs.proposal import propose_columns
 
-    if out is not None:
-        refuse_unwritable(out, "--out")
+    refuse_unwritable(out, "--out")
     proposal = propose_columns(log)
     if out is None:
         print(proposal.toml(), end="")
