@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,8 +21,13 @@ _GATES_PX = (30.0, 10.0, 3.0)
 _STEPS_PER_GATE = 2
 _FEWEST_PAIRS = 8
 _FEWEST_OF_FRAME = 2  # one light tells nothing that a shift does not explain
-_RANK_RTOL = 1e-12
+_RANK_RTOL = 1e-6
+_UNKNOWN_POSE = np.full(3, 1e9)  # standard deviations [m, rad] so large that a pose is free
 _LEAST_NOISE_PX = 1e-7  # of made-up centroids without noise
+
+
+_Rows = tuple[FloatArray, FloatArray, FloatArray]
+"""Residuals (2k,) of a frame, and their derivatives by camera (2k, 4) and pose (2k, 3)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,13 +177,7 @@ def _refine(camera: Camera, frames: Sequence[_Pairs], sigmas: FloatArray) -> Cam
         )
     rows = [_rows(camera, pairs) for pairs in usable]
     noise_px = _noise(rows)
-    equations = _CameraEquations()
-    for residual, by_camera, by_pose in rows:
-        # The inverse of R = noise² I + E Eᵀ.
-        E = by_pose * sigmas
-        inner = np.linalg.solve(noise_px**2 * np.eye(3) + E.T @ E, E.T)
-        equations = equations.add_rows(residual, by_camera, (np.eye(residual.size) - E @ inner) / noise_px**2)
-    step, inverse, rank = equations.solve()
+    step, covariance, rank, _ = _fit_camera(rows, sigmas, noise_px)
     if rank < len(PARAMETERS):
         raise ValueError("Input frames must determine the camera; instead received lights too few or too close.")
     centre = camera.centre + step[2:]
@@ -186,33 +185,38 @@ def _refine(camera: Camera, frames: Sequence[_Pairs], sigmas: FloatArray) -> Cam
         camera, m_per_px=camera.m_per_px + step[0], k1=camera.k1 + step[1], centre_px=(centre[0], centre[1])
     )
     left = np.concatenate([residual - by_camera @ step for residual, by_camera, _ in rows])
-    return CameraCalibration(refined, inverse, noise_px, float(np.sqrt(np.mean(left**2))), n_pairs)
+    return CameraCalibration(refined, covariance, noise_px, float(np.sqrt(np.mean(left**2))), n_pairs)
 
 
-@dataclass(frozen=True, eq=False)
-class _CameraEquations:
-    """Weighted sums over frames: JᵀWJ, JᵀWr, rᵀWr."""
+def _fit_camera(
+    rows: Sequence[_Rows], sigmas: FloatArray, noise_px: float
+) -> tuple[FloatArray, FloatArray, int, FloatArray]:
+    """Return the step (4,) of the camera, its covariance, its rank, and whitened residuals after it.
 
-    matrix: FloatArray = field(default_factory=lambda: np.zeros((4, 4)))
-    right: FloatArray = field(default_factory=lambda: np.zeros(4))
-    squares: float = 0.0
-
-    def add_rows(self, residual: FloatArray, by_camera: FloatArray, weight: FloatArray) -> _CameraEquations:
-        weighted = by_camera.T @ weight
-        squares = float(residual @ weight @ residual)
-        return _CameraEquations(
-            self.matrix + weighted @ by_camera, self.right + weighted @ residual, self.squares + squares
-        )
-
-    def solve(self) -> tuple[FloatArray, FloatArray, int]:
-        """Solution, inverse of the matrix, and rank; what is not determined stays zero."""
-        scale = np.sqrt(np.maximum(np.diagonal(self.matrix), np.finfo(np.float64).tiny))
-        scaled = self.matrix / scale / scale[:, None]
-        inverse = np.linalg.pinv(scaled, rcond=_RANK_RTOL, hermitian=True) / scale / scale[:, None]
-        return inverse @ self.right, inverse, int(np.linalg.matrix_rank(scaled, tol=_RANK_RTOL, hermitian=True))
+    ``sigmas`` (3,): standard deviations of each pose. A parameter that the rows do not determine keeps its value.
+    """
+    parts = [
+        _whiten(np.column_stack([residual, by_camera]), by_pose * sigmas, noise_px)
+        for residual, by_camera, by_pose in rows
+    ]
+    white = np.concatenate(parts)
+    r, J = white[:, 0], white[:, 1:]
+    scale = np.maximum(np.linalg.norm(J, axis=0), np.finfo(np.float64).tiny)
+    left, size, right = np.linalg.svd(J / scale, full_matrices=False)
+    rank = int(np.count_nonzero(size > _RANK_RTOL * size[0]))
+    inverse = (right[:rank].T / size[:rank]) @ left[:, :rank].T / scale[:, None]
+    step = inverse @ r
+    return step, inverse @ inverse.T, rank, r - J @ step
 
 
-def _rows(camera: Camera, pairs: _Pairs) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _whiten(columns: FloatArray, E: FloatArray, noise_px: float) -> FloatArray:
+    """Multiply columns (2k, n) by the inverse square root of noise² I + E Eᵀ."""
+    basis, size, _ = np.linalg.svd(E, full_matrices=False)
+    share = 1.0 - noise_px / np.hypot(noise_px, size)
+    return (columns - basis @ (share[:, None] * (basis.T @ columns))) / noise_px
+
+
+def _rows(camera: Camera, pairs: _Pairs) -> _Rows:
     """Residuals (2k,) of a frame in the image, and their derivatives by camera (2k, 4) and pose (2k, 3)."""
     ideal = centred_from_table(camera, pairs.pose, pairs.points_m)
     residual = pairs.image_px - distort(camera, ideal)
@@ -232,13 +236,8 @@ def _rows(camera: Camera, pairs: _Pairs) -> tuple[FloatArray, FloatArray, FloatA
     return residual.reshape(-1), by_camera.reshape(-1, 4), by_pose.reshape(-1, 3)
 
 
-def _noise(rows: Sequence[tuple[FloatArray, FloatArray, FloatArray]]) -> float:
+def _noise(rows: Sequence[_Rows]) -> float:
     """Standard deviation of a coordinate, from what neither the camera nor a shift or turn of each frame explains."""
-    equations, freedom = _CameraEquations(), 0
-    for residual, by_camera, by_pose in rows:
-        basis = np.linalg.qr(by_pose)[0]
-        equations = equations.add_rows(residual, by_camera, np.eye(residual.size) - basis @ basis.T)
-        freedom += residual.size - basis.shape[1]
-    step, _, rank = equations.solve()
-    squares = equations.squares - float(equations.right @ step)
-    return max(math.sqrt(max(squares, 0.0) / max(freedom - rank, 1)), _LEAST_NOISE_PX)
+    _, _, rank, left = _fit_camera(rows, _UNKNOWN_POSE, 1.0)
+    freedom = left.size - len(_UNKNOWN_POSE) * len(rows) - rank
+    return max(math.sqrt(float(left @ left) / max(freedom, 1)), _LEAST_NOISE_PX)
