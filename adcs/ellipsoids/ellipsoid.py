@@ -127,7 +127,7 @@ def shape_matrix(shape: ArrayLike, n: int, name: str = "shape") -> FloatArray:
     scale = float(np.abs(matrix).max())
     if np.abs(matrix - matrix.T).max() > _PSD_RTOL * scale:
         raise ValueError(f"Input {name} must be symmetric; instead received {matrix.tolist()}.")
-    matrix = _symmetric(matrix)
+    matrix = 0.5 * (matrix + matrix.T)
     smallest = float(np.linalg.eigvalsh(matrix)[0])
     if smallest < -_PSD_RTOL * scale:
         raise ValueError(
@@ -151,7 +151,3 @@ def unit_direction(direction: ArrayLike, n: int) -> FloatArray:
     h = measurement_direction(direction, n)
     h = h / np.abs(h).max()
     return h / np.linalg.norm(h)
-
-
-def _symmetric(matrix: FloatArray) -> FloatArray:
-    return 0.5 * (matrix + matrix.T)

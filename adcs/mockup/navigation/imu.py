@@ -17,10 +17,6 @@ from arrays.typing import FloatArray
 G_M_S2 = 9.80665
 
 
-def _zero_vector() -> FloatArray:
-    return np.zeros(2)
-
-
 @dataclass(frozen=True)
 class RateGyro:
     """Gyro ADIS16100: ±300 °/s, noise 0.1 °/s, a zero that is linear in temperature, -40 to 85 °C."""
@@ -56,9 +52,9 @@ class Inclinometer:
 
     sigma_m_s2: float = 0.002  # noise of a sample, each axis
     range_m_s2: float = 0.26 * G_M_S2  # of each axis
-    zero_m_s2: FloatArray = field(default_factory=_zero_vector)  # (2,): at ``reference_C``
-    zero_slope_m_s2_K: FloatArray = field(default_factory=_zero_vector)  # (2,): 0.0003 at most
-    tilt_rad: FloatArray = field(default_factory=_zero_vector)  # (2,): of the axes x and y above the horizontal
+    zero_m_s2: FloatArray = field(default_factory=lambda: np.zeros(2))  # (2,): at ``reference_C``
+    zero_slope_m_s2_K: FloatArray = field(default_factory=lambda: np.zeros(2))  # (2,): 0.0003 at most
+    tilt_rad: FloatArray = field(default_factory=lambda: np.zeros(2))  # (2,): of the axes x and y above the horizontal
     reference_C: float = 20.0
     lowest_C: float = -40.0  # temperatures that it works at
     highest_C: float = 125.0  # temperatures that it works at

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from adcs.mockup.navigation.fixes import FixRecord
 from adcs.mockup.navigation.strapdown import ImuRecord, PlanarState, wrapped
+from adcs.mockup.vision.similarity import complex_points, pairs_of
 from arrays.typing import ComplexArray, FloatArray
 
 SIGMA_M = 1e-3
@@ -164,9 +165,9 @@ def zero_problem(
             " adcs.mockup.navigation.strapdown.hold."
         )
     turn = np.exp(1j * heading)
-    values = np.concatenate([[_complex(imu.acceleration_m_s2) * turn, turn], further * turn])
+    values = np.concatenate([[complex_points(imu.acceleration_m_s2) * turn, turn], further * turn])
     integrals = double_integral(imu.begin_s, imu.time_s, values, fixes.time_s)
-    return ZeroProblem(fixes.time_s - imu.begin_s, integrals[0], integrals[1:], _complex(fixes.position_m))
+    return ZeroProblem(fixes.time_s - imu.begin_s, integrals[0], integrals[1:], complex_points(fixes.position_m))
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,7 +234,11 @@ def constant_zeros_after(problem: ZeroProblem, first: int = 4, sigma_m: float = 
     by_fix[:first] -= g.conj() @ line
     variance = sigma_m**2 * float(np.sum(np.abs(by_fix) ** 2)) / a11**2
     return ZeroFit(
-        _real([zeta]), _real(start.mean() - v0 * middle), _real(v0), variance * np.eye(2), _rms(y + zeta * g)
+        pairs_of(zeta[None]),
+        pairs_of(start.mean() - v0 * middle),
+        pairs_of(v0),
+        variance * np.eye(2),
+        _rms(y + zeta * g),
     )
 
 
@@ -275,16 +280,7 @@ def zeros_and_start(problem: ZeroProblem, sigma_m: float = SIGMA_M) -> ZeroFit:
     residual = problem.moved + A @ unknown - problem.measured
     inverse = np.linalg.inv(r) / size[:, None]
     covariance = _real_covariance(sigma_m**2 * (inverse @ inverse.conj().T))
-    return ZeroFit(_real(unknown[:m]), _real(unknown[m]), _real(unknown[m + 1]), covariance, _rms(residual))
-
-
-def _complex(vector: FloatArray) -> ComplexArray:
-    return np.asarray(vector[..., 0] + 1j * vector[..., 1])
-
-
-def _real(value: ArrayLike) -> FloatArray:
-    number = np.asarray(value, dtype=np.complex128)
-    return np.stack([number.real, number.imag], axis=-1)
+    return ZeroFit(pairs_of(unknown[:m]), pairs_of(unknown[m]), pairs_of(unknown[m + 1]), covariance, _rms(residual))
 
 
 def _rms(residual: ComplexArray) -> float:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from adcs.mockup.navigation.strapdown import rotate
 from arrays.io.errors import check_not_negative, check_positive
 from arrays.typing import BoolArray, FloatArray
 
@@ -138,9 +139,7 @@ def centred_from_table(camera: Camera, pose: Pose, points_m: ArrayLike) -> Float
     (..., n, 2): centred pixels, y up.
     """
     offset = np.asarray(points_m, dtype=np.float64) - pose.position_m[..., None, :]
-    cos, sin = np.cos(pose.heading_rad)[..., None], np.sin(pose.heading_rad)[..., None]
-    right, down = cos * offset[..., 0] + sin * offset[..., 1], cos * offset[..., 1] - sin * offset[..., 0]
-    return np.stack([right, -down], axis=-1) / camera.m_per_px
+    return rotate(-np.asarray(pose.heading_rad)[..., None], offset) * [1.0, -1.0] / camera.m_per_px
 
 
 def table_from_centred(camera: Camera, pose: Pose, points_px: ArrayLike) -> FloatArray:
@@ -150,9 +149,7 @@ def table_from_centred(camera: Camera, pose: Pose, points_px: ArrayLike) -> Floa
     frame [m].
     """
     body = np.asarray(points_px, dtype=np.float64) * [camera.m_per_px, -camera.m_per_px]
-    cos, sin = np.cos(pose.heading_rad)[..., None], np.sin(pose.heading_rad)[..., None]
-    turned = np.stack([cos * body[..., 0] - sin * body[..., 1], sin * body[..., 0] + cos * body[..., 1]], axis=-1)
-    return turned + pose.position_m[..., None, :]
+    return rotate(np.asarray(pose.heading_rad)[..., None], body) + pose.position_m[..., None, :]
 
 
 def distort(camera: Camera, points_px: ArrayLike) -> FloatArray:
