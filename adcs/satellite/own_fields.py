@@ -133,7 +133,7 @@ class OwnFields(Drawn):
     --------
     >>> import adcs
     >>> from sims import experiments
-    >>> run = experiments.switching_loads(seed=0, duration_s=600.0)
+    >>> run = experiments.switching_loads(rng=0, duration_s=600.0)
     >>> own = adcs.find_own_fields(run.array, run.readings_T, run.time_s, run.gyro_rad_s, run.states)
     >>> own.names, own.vectors_T.shape
     (('heater', 'radio'), (2, 4, 3))
@@ -245,7 +245,7 @@ def find_own_fields(
     --------
     >>> import adcs
     >>> from sims import experiments
-    >>> run = experiments.switching_loads(seed=0, duration_s=600.0)
+    >>> run = experiments.switching_loads(rng=0, duration_s=600.0)
     >>> own = adcs.find_own_fields(run.array, run.readings_T, run.time_s, run.gyro_rad_s, run.states)
     >>> bool(own.sigma_T.max() < 15e-9)
     True

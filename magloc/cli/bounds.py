@@ -269,9 +269,7 @@ def _scenario(
 def _detector(array: SensorArray, false_alarm_rate: float, seed: int) -> MatchedFilterDetector | None:
     """Matched filter of the array; None, with a note, where it has none."""
     try:
-        return magloc.MatchedFilterDetector.of(
-            array, false_alarm_rate, n_draws=round(100 / false_alarm_rate), seed=seed
-        )
+        return magloc.MatchedFilterDetector.of(array, false_alarm_rate, n_draws=round(100 / false_alarm_rate), rng=seed)
     except ValueError as error:
         print_note(f"how far a source is found is left out: {own_sentence(error)}")
         return None

@@ -140,7 +140,7 @@ def locate(
                 body_length_m=length_m,
                 exclude_faulty=not wanted.keep_sensors,
                 average=wanted.average,
-                seed=common.seed,
+                rng=common.seed,
                 progress=advance,
             )
     except InputError as error:

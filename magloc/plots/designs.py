@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from scipy.spatial.distance import pdist
 
+from arrays.rng import Rng, accept_seed
 from arrays.typing import FloatArray
 from magloc.design.evaluation import EVEN, Judgement, range_spread
 from magloc.design.optimise import BEST_START, Design, random_sample
@@ -37,14 +38,15 @@ _TURNS = (0.0, -15.0, 15.0, 90.0, -90.0, 180.0, 75.0, 105.0, -75.0, -105.0, 165.
 _REACH, _ARROW, _ARROW_LABEL, _FLAT = 1.25, 1.2, 1.42, 0.5
 
 
-def design(result: Design, seed: int = 0) -> Figure:
+@accept_seed
+def design(result: Design, rng: Rng = 0) -> Figure:
     """Sensors in their volume, and the 95 % quantile of the range's σ over the distance, against the references.
 
     Parameters
     ----------
     result : Design
-    seed : int
-        Of the sources that the curves are drawn from.
+    rng : int or numpy.random.Generator
+        Seed or generator of the sources of the curves.
 
     Examples
     --------
@@ -58,7 +60,7 @@ def design(result: Design, seed: int = 0) -> Figure:
     _scene(scene, result)
     ax = figure.add_axes((0.5, 0.15, 0.205, 0.68))
     relative = figure.add_axes((0.78, 0.15, 0.2, 0.68))
-    sources = random_sample(result.task, _N_SOURCES, np.random.default_rng(seed))
+    sources = random_sample(result.task, _N_SOURCES, np.random.default_rng(rng))
     distances = _distances(result)
     arrays = _shown(result)
     curves = [range_spread(result.task, judged.array, sources, distances).q95_m for judged in arrays]

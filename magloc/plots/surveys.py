@@ -12,7 +12,7 @@ from matplotlib.tri import Triangulation
 
 from arrays.typing import FloatArray
 from magloc.plots import style
-from magloc.surveying.results import linear_and_most
+from magloc.surveying.results import linear_and_most, neighbour_triangles
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -20,9 +20,7 @@ if TYPE_CHECKING:
 
     from magloc.surveying.results import Survey, Target
 
-_FLAT = 1e-6  # across over along a line
 _FEWEST_TICKS = 3
-_GAP = 3.0  # over the usual step between places: nothing is known across it
 _ACROSS, _UP = "x, east [m]", "y, north [m]"
 
 
@@ -44,7 +42,7 @@ def survey_figure(found: Survey) -> Figure:
     >>> import magloc
     >>> from dataclasses import replace
     >>> scenario = replace(sims.read_scenario("survey-drone"), duration_s=120.0)
-    >>> field = sims.simulate(scenario, seed=1)
+    >>> field = sims.simulate(scenario, rng=1)
     >>> figure = magloc.plots.survey(magloc.survey(field.array, field.readings))
     """
     x, y, _ = found.rows.place_m.T
@@ -73,13 +71,10 @@ def survey_figure(found: Survey) -> Figure:
 def _draw_reach(figure: Figure, ax: Axes, places_m: FloatArray, moments_Am2: FloatArray) -> None:
     """Moments between places that are neighbours, on a logarithmic scale."""
     xy = places_m[:, :2]
-    if len(xy) < 3 or np.linalg.matrix_rank(xy - xy.mean(axis=0), rtol=_FLAT) < 2:
+    corners = neighbour_triangles(xy)
+    if not len(corners):
         return  # a single line of places has no map
-    between = Triangulation(*xy.T)
-    corners = xy[between.triangles]
-    sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
-    between.set_mask((sides > _GAP * np.median(sides)).any(axis=1))
-    surface = ax.tripcolor(between, moments_Am2, norm="log", cmap="viridis", shading="gouraud", rasterized=True)
+    surface = ax.tripcolor(Triangulation(*xy.T, corners), moments_Am2, norm="log", cmap="viridis", shading="gouraud", rasterized=True)
     _draw_bar(figure, ax, surface, _round_moments(float(moments_Am2.min()), float(moments_Am2.max())), "A·m²")
 
 

@@ -237,7 +237,7 @@ class DelayedFilter:
     --------
     >>> import sims
     >>> from adcs import mockup
-    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), seed=0)
+    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), rng=0)
     >>> method = mockup.DelayedFilter(run.start, run.imu.begin_s)
     >>> len(mockup.fuse(method, run.imu, run.fixes).track)
     500

@@ -213,7 +213,7 @@ def fuse(fusion: Fusion, imu: ImuRecord, fixes: FixRecord) -> Fused:
     --------
     >>> import sims
     >>> from adcs import mockup
-    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), seed=0)
+    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), rng=0)
     >>> method = mockup.DelayedFilter(run.start, run.imu.begin_s)
     >>> fused = mockup.fuse(method, run.imu, run.fixes)
     >>> fused.track.position_m.shape

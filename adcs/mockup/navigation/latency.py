@@ -81,7 +81,7 @@ def camera_latency(
     >>> import sims
     >>> from adcs import mockup
     >>> camera = sims.CameraErrors(latency_s=0.1)
-    >>> run = sims.table_run(sims.TableScenario(duration_s=60.0, camera=camera), seed=0)
+    >>> run = sims.table_run(sims.TableScenario(duration_s=60.0, camera=camera), rng=0)
     >>> round(mockup.camera_latency(run.imu, run.fixes).latency_s, 1)
     0.1
     """

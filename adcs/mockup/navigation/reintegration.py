@@ -30,7 +30,7 @@ def finite_difference(first: PlanarFix, second: PlanarFix, imu: ImuRecord) -> Fl
     --------
     >>> import sims
     >>> from adcs import mockup
-    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), seed=0)
+    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), rng=0)
     >>> first, second = run.fixes[0], run.fixes[1]
     >>> imu = run.imu.between(first.time_s, second.time_s)
     >>> mockup.finite_difference(first, second, imu).shape
@@ -54,7 +54,7 @@ def corrected_velocity(first: PlanarFix, second: PlanarFix, imu: ImuRecord) -> F
     --------
     >>> import sims
     >>> from adcs import mockup
-    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), seed=0)
+    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), rng=0)
     >>> first, second = run.fixes[0], run.fixes[1]
     >>> imu = run.imu.between(first.time_s, second.time_s)
     >>> mockup.corrected_velocity(first, second, imu).shape
@@ -97,7 +97,7 @@ class Reintegration:
     --------
     >>> import sims
     >>> from adcs import mockup
-    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), seed=0)
+    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), rng=0)
     >>> method = mockup.Reintegration(run.start, run.imu.begin_s)
     >>> len(mockup.fuse(method, run.imu, run.fixes).track)
     500
@@ -191,7 +191,7 @@ class CameraOnly:
     --------
     >>> import sims
     >>> from adcs import mockup
-    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), seed=0)
+    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), rng=0)
     >>> method = mockup.CameraOnly(run.start)
     >>> len(mockup.fuse(method, run.imu, run.fixes).track)
     500
@@ -234,7 +234,7 @@ class ImuOnly:
     --------
     >>> import sims
     >>> from adcs import mockup
-    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), seed=0)
+    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), rng=0)
     >>> method = mockup.ImuOnly(run.start)
     >>> len(mockup.fuse(method, run.imu, run.fixes).track)
     500

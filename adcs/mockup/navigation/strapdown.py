@@ -348,7 +348,7 @@ def strapdown(imu: ImuRecord, start: PlanarState) -> PlanarTrack:
     --------
     >>> import sims
     >>> from adcs import mockup
-    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), seed=0)
+    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), rng=0)
     >>> mockup.strapdown(run.imu, run.start).position_m.shape
     (500, 2)
     """

@@ -70,7 +70,7 @@ def heading_from_fixes(imu: ImuRecord, fixes: FixRecord) -> tuple[FloatArray, fl
     --------
     >>> import sims
     >>> from adcs import mockup
-    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), seed=0)
+    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), rng=0)
     >>> heading_rad, zero_rad_s = mockup.heading_from_fixes(run.imu, run.fixes)
     >>> heading_rad.shape
     (500,)
@@ -108,7 +108,7 @@ class ZeroProblem:
     --------
     >>> import sims
     >>> from adcs import mockup
-    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), seed=0)
+    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), rng=0)
     >>> heading_rad, _ = mockup.heading_from_fixes(run.imu, run.fixes)
     >>> problem = mockup.zero_problem(run.imu, heading_rad, run.fixes)
     >>> len(problem.time_s) == len(run.fixes)
@@ -146,7 +146,7 @@ def zero_problem(
     --------
     >>> import sims
     >>> from adcs import mockup
-    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), seed=0)
+    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), rng=0)
     >>> heading_rad, _ = mockup.heading_from_fixes(run.imu, run.fixes)
     >>> problem = mockup.zero_problem(run.imu, heading_rad, run.fixes)
     >>> len(problem.time_s) == len(run.fixes)
@@ -261,7 +261,7 @@ def zeros_and_start(problem: ZeroProblem, sigma_m: float = SIGMA_M) -> ZeroFit:
     --------
     >>> import sims
     >>> from adcs import mockup
-    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), seed=0)
+    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), rng=0)
     >>> heading_rad, _ = mockup.heading_from_fixes(run.imu, run.fixes)
     >>> problem = mockup.zero_problem(run.imu, heading_rad, run.fixes)
     >>> mockup.zeros_and_start(problem).zero_m_s2.shape

@@ -17,7 +17,7 @@ from tests.command_line import refuse_constant
 
 @pytest.fixture(scope="module")
 def flight():
-    return switching_loads(seed=3, duration_s=900.0)
+    return switching_loads(rng=3, duration_s=900.0)
 
 
 @pytest.fixture
