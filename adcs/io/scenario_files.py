@@ -8,7 +8,6 @@ except those of the tables ``satellite`` and ``orbit``. The other files there ar
 from __future__ import annotations
 
 import datetime
-import json
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -37,7 +36,7 @@ from adcs.kalman.names import FILTERS, NOISES, STARTS
 from adcs.satellite.dynamics import RigidBody, WheelControl, wheel_control
 from adcs.satellite.satellite import Satellite
 from arrays.io.errors import InputError, naming
-from arrays.io.toml import BuiltIn, section_of
+from arrays.io.toml import BuiltIn, section_of, toml_value
 from magloc.fields.geomagnetic import Model
 
 _FILES = BuiltIn("adcs", "scenarios", "scenario")
@@ -109,7 +108,7 @@ def scenario_table(name_or_path: str) -> tuple[str, dict[str, Any]]:
 
 def scenario_text(file: AttitudeFile) -> str:
     """The scenario as text of a TOML file, without comments."""
-    lines = [f"{key} = {_toml(value)}" for key, value in file.tables.items() if not isinstance(value, dict)]
+    lines = [f"{key} = {toml_value(value)}" for key, value in file.tables.items() if not isinstance(value, dict)]
     for name, table in file.tables.items():
         if isinstance(table, dict):
             lines += _table_lines(name, table)
@@ -119,23 +118,11 @@ def scenario_text(file: AttitudeFile) -> str:
 def _table_lines(name: str, table: dict[str, Any]) -> list[str]:
     plain = {key: value for key, value in table.items() if not isinstance(value, dict)}
     lines = ["", f"[{name}]"] if plain or not table else []
-    lines += [f"{key} = {_toml(value)}" for key, value in plain.items()]
+    lines += [f"{key} = {toml_value(value)}" for key, value in plain.items()]
     for key, value in table.items():
         if isinstance(value, dict):
             lines += _table_lines(f"{name}.{key}", value)
     return lines
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, datetime.date):
-        value = value.isoformat()
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False)
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(_toml(item) for item in value) + "]"
-    return str(value) if math.isfinite(value) else f"{float(value)}"
 
 
 def scenario_of(path: str, tables: dict[str, Any], *, allow_old_elements: bool = False) -> AttitudeFile:
