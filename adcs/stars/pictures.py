@@ -65,6 +65,11 @@ def read_picture(path: str | PathLike[str]) -> FloatArray:
     path : str or path-like
         Colours are averaged.
 
+    Returns
+    -------
+    ndarray, shape (height, width)
+        Grey values as in the file, any unit; the first row is at the top.
+
     Raises
     ------
     InputError
