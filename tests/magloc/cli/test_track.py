@@ -211,6 +211,7 @@ class TestSmooth:
         for entry, point in zip(results, smooth_points(points, tracker.steps), strict=True):
             assert entry["position_m"] == (None if point.position_m is None else point.position_m.tolist())
 
+
 class TestTruth:
     def test_report(self, run: Run, array: Path, readings: Path, truth: Path) -> None:
         outcome = run("track", readings, "--array", array, "--truth", truth, *MOTION)
