@@ -41,7 +41,6 @@ _REACH, _ARROW, _ARROW_LABEL, _FLAT = 1.25, 1.2, 1.42, 0.5
 def design(result: Design, rng: Rng = 0) -> Figure:
     """Draw the sensors in their volume, and the 95 % quantile of σ of the range.
 
-
     Parameters
     ----------
     result : Design

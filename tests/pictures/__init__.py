@@ -218,7 +218,7 @@ PICTURES: dict[str, Picture] = {
     "background-diver.png": OfPage("background"),
     "distance-of-a-coil.png": OfPage("single-sensor-ranging"),
     "gradient-tensor.png": OfPage("gradient-tensor"),
-    "beating-tissue.png": OfRecording("tests.beating_tissue", ("tests/beating_tissue.py",)),
+    "beating-tissue.png": OfRecording("docs.studies.beating_tissue", ("docs/studies/beating_tissue.py",)),
     "stars-identified.png": OfPage("star-identification"),
     "view-array.png": OfCommands(
         (

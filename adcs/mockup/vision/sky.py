@@ -12,7 +12,6 @@ The file is TOML::
 
 from __future__ import annotations
 
-import json
 import math
 import warnings
 from dataclasses import dataclass
@@ -24,7 +23,7 @@ from scipy.spatial import Delaunay, QhullError, cKDTree
 
 from arrays.io.errors import naming
 from arrays.io.text import write_text
-from arrays.io.toml import FORMAT_VERSION, File, read_toml, section_of
+from arrays.io.toml import FORMAT_VERSION, File, read_toml, section_of, toml_value
 from arrays.io.values import accept_seed, seed_of
 from arrays.typing import FloatArray, IntArray, Rng
 
@@ -232,7 +231,7 @@ def write_sky(sky: LedSky, path: str | PathLike[str]) -> None:
     rows = [f"    [{x!r}, {y!r}]," for x, y in sky.positions_m.tolist()]
     lines = [
         f"format_version = {FORMAT_VERSION}",
-        f"name = {json.dumps(sky.name, ensure_ascii=False)}",
+        f"name = {toml_value(sky.name)}",
         "positions_m = [  # X and Y in the table's frame",
         *rows,
         "]",
