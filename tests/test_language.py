@@ -72,6 +72,23 @@ class TestSentences:
         assert sum(counts) <= MOST_WORDS * len(counts)
 
 
+# Pages of validation whose sections stand for themselves; the others state data and date once for the whole page.
+MEASURED = ("arrays", "attitude", "fixes", "surveys", "tracks")
+SECTION = re.compile(r"^## (?P<title>[^\n]*)\n(?P<text>.*?)(?=^## |\Z)", re.DOTALL | re.MULTILINE)
+STATED = {"data": r"Data:", "what was tuned": r"Tuned\s+on\s+it:", "date": r"\b20\d\d-\d\d-\d\d\b"}
+
+
+@pytest.mark.parametrize("page", MEASURED)
+def test_a_table_of_validation_states_data_tuning_and_date(page: str) -> None:
+    text = (REPOSITORY / "docs" / "validation" / f"{page}.md").read_text(encoding="utf-8")
+    sections = [section for section in SECTION.finditer(text) if "|---" in section["text"]]
+    assert len(sections) > 4
+    # The table of recordings on the page of tracks points to those of other pages.
+    own = [section for section in sections if section["title"] != "On data that nothing was tuned on"]
+    missing = [(s["title"], what) for s in own for what, pattern in STATED.items() if not re.search(pattern, s["text"])]
+    assert missing == []
+
+
 def test_the_changelog_is_short() -> None:
     assert len((REPOSITORY / "CHANGELOG.md").read_bytes()) <= MOST_BYTES
 
