@@ -29,8 +29,8 @@ from magloc.tracking.coordinates import Chart
 from magloc.tracking.measurement import RowMeasurements
 from magloc.tracking.motion import N_SOURCE, MotionModel, OrnsteinUhlenbeck
 from magloc.tracking.results import Innovation, Prediction, Step, TrackPoint
-from magloc.tracking.row_filter import LEAST_SHARE, Gaussians, Rows, convergence, refill_step, steps_problem
-from magloc.tracking.rows import Row
+from magloc.tracking.row_filter import LEAST_SHARE, Gaussians, convergence, refill_step, steps_problem
+from magloc.tracking.rows import Row, Rows
 
 MOST_AT_ONCE = 64
 """Largest number of rows of one call."""
@@ -221,7 +221,7 @@ class SettledTrack:
             taken.append(row)
         if differences is not None and differences is not self._differences:
             self._differences, k = differences, differences.n_differences
-            given.transforms[0, :k] = differences.transform / np.sqrt(differences.variance)[:, None]
+            given.transforms[0, :k] = differences.transform
             given.transforms[0, k:] = 0.0
             given.counts[:] = k
             errors = self._measurements.errors
