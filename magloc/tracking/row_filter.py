@@ -31,6 +31,8 @@ ROUNDING = 1e-9
 LEAST_SHARE = 0.02
 """Change of whitened readings over one σ of the prediction, above which a direction is as nonlinear as the readings of
 the row. Directions with less were measured by other rows, whose nonlinearity may differ."""
+_TURNING_NOISE = 15
+"""Number of noises of a turning motion: acceleration, torque, velocity, rate and moment along each axis."""
 _ROWS_A_CALL = 1000
 """Rows of trajectories that one call of the kernel smooths: some 10 ms."""
 _FOLLOWED = 1e-3
@@ -155,29 +157,34 @@ def steps_problem(
         States before each step of every source of every Gaussian, for a motion that is neither linear nor
         :class:`OrnsteinUhlenbeck`.
     """
-    F = A = B = moved = turning = None
-    n_noise = 15
     every: Sequence[Any] = motions if isinstance(motions, Sequence) else [motions] * len(steps_s)
     of_steps = list(zip(every, steps_s, strict=True))
     if isinstance(every[0], OrnsteinUhlenbeck):
-        turning = np.stack([one.turning_step(length_s) for one, length_s in of_steps])
-    elif hasattr(every[0], "linear_step"):
-        F, A, B = (np.stack(part) for part in zip(*(one.linear_step(dt_s) for one, dt_s in of_steps), strict=True))
-        n_noise = A.shape[2]
+        return motion_problem(
+            step_of_row, nuisances, turning=np.stack([one.turning_step(dt_s) for one, dt_s in of_steps])
+        )
+    if hasattr(every[0], "linear_step"):
+        steps, names = [one.linear_step(dt_s) for one, dt_s in of_steps], ("F", "A", "B")
     else:
         assert states is not None
-        taken = [one.step(x, dt_s) for x, (one, dt_s) in zip(states, cycle(of_steps), strict=False)]
-        moved, F, A = (np.stack(part) for part in zip(*taken, strict=True))
-        n_noise = A.shape[2]
+        steps = [one.step(x, dt_s) for x, (one, dt_s) in zip(states, cycle(of_steps), strict=False)]
+        names = ("moved", "F", "A")
+    parts = map(np.stack, zip(*steps, strict=True))
+    return motion_problem(step_of_row, nuisances, **dict(zip(names, parts, strict=True)))
+
+
+def motion_problem(
+    step_of_row: IntArray, nuisances: tuple[FloatArray, FloatArray] | None, **steps: FloatArray
+) -> core.Problem:
+    """Return the steps of a motion, by the names of the C header, as an argument of kernels.
+
+    See :func:`steps_problem`; steps of a turning motion are (n_steps, 12).
+    """
     kept, added = (None, None) if nuisances is None else map(np.ascontiguousarray, nuisances)
     return core.problem(
         "motion",
-        n_noise=n_noise,
-        F=F,
-        A=A,
-        B=B,
-        moved=moved,
-        turning=turning,
+        n_noise=steps["A"].shape[2] if "A" in steps else _TURNING_NOISE,
+        **dict.fromkeys(("F", "A", "B", "moved", "turning")) | steps,
         kept=kept,
         added=added,
         step_of_row=np.ascontiguousarray(step_of_row, dtype=np.int64),
