@@ -31,6 +31,8 @@ ROUNDING = 1e-9
 LEAST_SHARE = 0.02
 """Change of whitened readings over one σ of the prediction, above which a direction is as nonlinear as the readings of
 the row. Directions with less were measured by other rows, whose nonlinearity may differ."""
+LARGEST_BEND = 0.5
+"""Nonlinearity of readings within one σ of a Gaussian, in σ of their noise, above which it is divided."""
 _TURNING_NOISE = 15
 """Number of noises of a turning motion: acceleration, torque, velocity, rate and moment along each axis."""
 _ROWS_A_CALL = 1000

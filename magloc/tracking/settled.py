@@ -23,13 +23,13 @@ from magloc.levels import CONTRADICTION
 from magloc.measurement.rows import ambient_fields
 from magloc.readings import Readings
 from magloc.tracking.chart.mixture import Mixture, root_of
-from magloc.tracking.chart.split import LARGEST_BEND, MOST_ROWS
+from magloc.tracking.chart.split import MOST_ROWS
 from magloc.tracking.chart.steps import LARGEST_GROWTH, LARGEST_WIDTH, TrackState
 from magloc.tracking.coordinates import Chart
 from magloc.tracking.measurement import RowMeasurements
 from magloc.tracking.motion import N_SOURCE, MotionModel, OrnsteinUhlenbeck
 from magloc.tracking.results import Innovation, Prediction, Step, TrackPoint
-from magloc.tracking.row_filter import LEAST_SHARE, Gaussians, convergence, refill_step, steps_problem
+from magloc.tracking.row_filter import LARGEST_BEND, LEAST_SHARE, Gaussians, convergence, refill_step, steps_problem
 from magloc.tracking.rows import Row, Rows
 
 MOST_AT_ONCE = 64

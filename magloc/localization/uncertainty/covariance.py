@@ -24,8 +24,8 @@ from magloc.localization.fit.optima import Optima
 from magloc.localization.fit.refinement import rows_a_block
 from magloc.localization.fit.results import is_misfit, is_observable, spans
 from magloc.localization.uncertainty.ambiguity import (
-    LARGEST_BEND,
     LARGEST_GAUSSIAN_SIGMA,
+    LARGEST_RISE_ERROR,
     log_evidence_volume,
     longest_axes,
     relative_sigma,
@@ -109,7 +109,7 @@ def covariance_is_valid(optima: Optima, covariance: FloatArray, which: IntArray)
         q = problem.homogeneous(position + side[:, :, 0])
         mu = problem.scaled_moment(q, moment + side[:, :, 1])
         residual = problem.residual(y, q, mu, problem.source_fields(q, mu))
-        described &= np.abs(np.sum(residual**2, axis=1) - fits.chi2 - 1.0) <= LARGEST_BEND
+        described &= np.abs(np.sum(residual**2, axis=1) - fits.chi2 - 1.0) <= LARGEST_RISE_ERROR
     return np.asarray(described)
 
 
@@ -195,7 +195,7 @@ def single_source_columns(optima: Optima) -> _FitColumns:
         outside=OUTSIDE,
         certain_weight=CERTAIN_WEIGHT,
         largest_sigma=LARGEST_GAUSSIAN_SIGMA,
-        largest_bend=LARGEST_BEND,
+        largest_bend=LARGEST_RISE_ERROR,
         n_strengths=strengths.size,
         strengths=strengths,
         gained=gained,

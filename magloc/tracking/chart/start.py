@@ -35,7 +35,7 @@ from magloc.tracking.chart.update import StateUpdates, is_regular, update_states
 from magloc.tracking.coordinates import MOMENT_POWER, Chart, mirror_images, source_root
 from magloc.tracking.measurement import RowMeasurement, whitening, zero_if_nan
 from magloc.tracking.motion import N_SOURCE, MotionModel
-from magloc.tracking.row_filter import Gaussians, RowUpdates
+from magloc.tracking.row_filter import LARGEST_BEND, Gaussians, RowUpdates
 from magloc.tracking.rows import Row
 
 OF_PITCH = 0.6
@@ -53,8 +53,6 @@ _NARROW = 0.5
 # Logarithm of the density of all cells over that of one at its centre, along one coordinate.
 _EVEN = math.log(OF_PITCH * math.sqrt(2.0 * math.pi))
 _CELL = OF_PITCH * np.array([_PITCH, _SPACING, _SPACING])
-LARGEST_BEND = 0.5
-"""Largest nonlinearity of the readings over a component's σ along a valley of ranges, in σ of their noise."""
 _MOST_BENT = 100.0
 # Extent of the components along a valley, in standard deviations of its log-range.
 _VALLEY = 4.0

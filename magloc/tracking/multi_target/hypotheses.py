@@ -19,10 +19,9 @@ from magloc.tracking import row_filter
 from magloc.tracking.multi_target.measurement import JointRow
 from magloc.tracking.multi_target.smoothing import MOST_ROWS, YoungTrack
 from magloc.tracking.multi_target.state import JointState
+from magloc.tracking.row_filter import LARGEST_BEND
 from magloc.tracking.sensor_health import SensorHealth
 
-LARGEST_BEND = 0.5
-"""Largest nonlinearity of the readings within one σ of the state, in σ of their noise."""
 STRAIGHT = 2.0
 """Largest nonlinearity within one σ of a refit of all rows of a young track."""
 REFITS = (3, 5, 8, 12, 18, 27, 40, 60, MOST_ROWS)
