@@ -203,7 +203,7 @@ class CartesianFilter:
         F[:n, :n], S_q[:n, : S_q_motion.shape[1]] = F_motion, S_q_motion
         F[n + np.arange(n_errors), n + np.arange(n_errors)] = decay
         S_q[n + noisy, S_q_motion.shape[1] + np.arange(noisy.size)] = noise[noisy]
-        return Prediction(np.concatenate([x_motion, decay * x[n:]]), predict(S, F, S_q), F)
+        return Prediction(np.concatenate([x_motion, decay * x[n:]]), predict(S, F, S_q), F, S_q)
 
     def initial_state(
         self, centre: FloatArray, root: FloatArray, R_world_from_array: FloatArray | None = None

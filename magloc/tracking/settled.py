@@ -286,7 +286,7 @@ class SettledTrack:
         for i, (predicted, x) in enumerate(
             zip(self._predicted.x[:end].copy(), self._updated.x[:end].copy(), strict=True)
         ):
-            _, F, _ = self._motion.step(x_before, length_of_slot[int(self._step_of_row[i])])
-            steps.append(Step(first_index + i, Prediction(predicted, before[i], F), x, after[i]))
+            _, F, S_q = self._motion.step(x_before, length_of_slot[int(self._step_of_row[i])])
+            steps.append(Step(first_index + i, Prediction(predicted, before[i], F, S_q), x, after[i]))
             x_before = x
         return steps

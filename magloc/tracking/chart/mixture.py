@@ -10,7 +10,6 @@ from scipy.special import ndtr, ndtri
 
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.localization.fit.results import Intervals
-from magloc.state_space import symmetric_square_root
 from magloc.tracking.coordinates import MOMENT_POWER, Chart
 from magloc.tracking.motion import N_SOURCE
 
@@ -65,9 +64,9 @@ class Mixture:
     n_rows: int = 1
 
     @classmethod
-    def of_gaussian(cls, x: FloatArray, P: FloatArray, centroid_m: FloatArray, radius_m: float) -> Mixture:
-        """Return the mixture of one source with a Cartesian state (6,) and covariance (6, 6)."""
-        root = Chart.at(x, centroid_m, radius_m).inverse_jacobian() @ symmetric_square_root(P)
+    def of_gaussian(cls, x: FloatArray, S: FloatArray, centroid_m: FloatArray, radius_m: float) -> Mixture:
+        """Return the mixture of one source with a Cartesian state (6,) and root (6, m) of its covariance."""
+        root = Chart.at(x, centroid_m, radius_m).inverse_jacobian() @ S
         return cls(x[None], root_of(root)[None], np.zeros(1), x.size, centroid_m, radius_m)
 
     def __len__(self) -> int:
