@@ -16,7 +16,6 @@ from scipy.special import chdtrc
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc import core
 from magloc.chi_square import energy_threshold, quantile
-from magloc.fields.dipole import MU0_OVER_4PI
 from magloc.levels import CERTAIN_WEIGHT, DELTA_CHI2_95, MISFIT
 from magloc.localization.fit.columns import Solutions
 from magloc.localization.fit.gauss_newton import covariances
@@ -206,7 +205,7 @@ def single_source_columns(optima: Optima) -> _FitColumns:
     )
     block = rows_a_block(_LINEARISATIONS * rows.signals.shape[1])
     core.run("source_uncertainties", work, len(rows), block=block)
-    unit = np.array(3 * [model.radius] + 3 * [model.radius**3 / MU0_OVER_4PI])
+    unit = model.state_unit()
     covariance *= unit
     covariance *= unit[:, None]
     ranges *= model.radius
