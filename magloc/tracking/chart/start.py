@@ -332,7 +332,7 @@ def unique_components(mixture: Mixture, cell: IntArray | None = None) -> IntArra
     cell = np.zeros((len(source), 1), dtype=np.intp) if cell is None else cell.reshape(len(source), -1)
     _, share, n_alike = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
     share = share.ravel()  # numpy 2.0.0 gives a column
-    chart, left = source.chart, np.argsort(-mixture.log_weight, kind="stable")
+    left = np.argsort(-mixture.log_weight, kind="stable")
     alone = n_alike[share[left]] == 1
     unique, left = left[alone].tolist(), left[~alone]
     limit = chdtri(N_SOURCE, 1.0 - CREDIBLE_ROW)
@@ -340,8 +340,6 @@ def unique_components(mixture: Mixture, cell: IntArray | None = None) -> IntArra
         first, others = left[0], left[1:]
         unique.append(first)
         same = others[share[others] == share[first]]
-        about = chart.take(same)
-        e = about.coordinates(np.repeat(source.x[first][None], len(same), axis=0))
-        square = np.sum(np.linalg.solve(source.S[same], e[..., None])[..., 0] ** 2, axis=1)
-        left = others[~np.isin(others, same[square < limit])]
+        equal = same[source.take(same).square_distance(source.x[first]) < limit]
+        left = others[~np.isin(others, equal)]
     return np.array(sorted(unique, key=lambda k: -mixture.log_weight[k]))
