@@ -154,10 +154,10 @@ def _with_track(
 
 def _fixes(result: ReadingsResult, *, quiet: bool) -> tuple[Fixes, Readings]:
     """Fixes of the rows as ``magloc locate`` finds them, in its frame; of 2000 rows at most, evenly."""
-    from magloc.viewer.view import fixes_of, thinned
+    from magloc.viewer.view import locate_readings, thin_readings
 
-    rows, n = thinned(result.readings), len(result.readings)
+    rows, n = thin_readings(result.readings), len(result.readings)
     if len(rows) < n and not quiet:
         print_note(f"note: every {-(-n // len(rows))}th of {n} rows is fixed and shown")
     with progress(len(rows), "rows", quiet=quiet) as advance:
-        return fixes_of(result.array, rows, advance), rows
+        return locate_readings(result.array, rows, advance), rows
