@@ -150,10 +150,10 @@ def _with_track(
 
 def _fixes(result: ReadingsResult) -> tuple[Fixes, Readings]:
     """Fixes of the rows as ``magloc locate`` finds them, in its frame; of 2000 rows at most, evenly."""
-    from magloc.viewer.view import fixes_of, thinned
+    from magloc.viewer.view import locate_readings, thin_readings
 
-    rows, n = thinned(result.readings), len(result.readings)
+    rows, n = thin_readings(result.readings), len(result.readings)
     if len(rows) < n:
         note(f"note: every {-(-n // len(rows))}th of {n} rows is fixed and shown")
     with progress(len(rows), "rows") as advance:
-        return fixes_of(result.array, rows, advance), rows
+        return locate_readings(result.array, rows, advance), rows

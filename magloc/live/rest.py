@@ -79,7 +79,7 @@ class RestBackground:
         if unsteady:
             _LOG.warning(
                 f"the readings of {', '.join(unsteady)} changed by more than three times their noise during the rest,"
-                " expected an array that stands still; take the rest again."
+                " expected an array that does not move; take the rest again."
             )
         return cls(mean - array.channel_offset_T, sigma, len(rows), unsteady)
 
@@ -146,7 +146,7 @@ def subtract_rest(array: SensorArray, readings: Readings, rest_s: float) -> tupl
 def check_rest(array: SensorArray, *, moves: bool) -> None:
     """Raise InputError if the array moves or has scalar sensors: its background varies."""
     if moves:
-        raise InputError("a rest: found rows with the array's pose, expected an array that stands.")
+        raise InputError("a rest: found rows with the array's pose, expected an array that does not move.")
     scalar = [sensor.id for sensor in array.sensors if sensor.kind == "scalar"]
     if scalar:
         raise InputError(f"a rest: found scalar sensor {scalar[0]}, expected vector sensors only.")

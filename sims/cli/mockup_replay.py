@@ -32,7 +32,7 @@ def show_replay(runs: FusionRuns, camera: TableCamera, replay: ReplayOptions) ->
     """Show the first drive until Ctrl-C, or write it."""
     from adcs.viewer.drive_page import drive_page
     from magloc.cli.view import written_or_served
-    from magloc.viewer.view import View, shown
+    from magloc.viewer.view import View, open_view
 
     drive = drive_of(runs.results[0], runs.method, camera)
     at_s = 0.5 * drive.duration_s if replay.at is None else replay.at
@@ -40,7 +40,7 @@ def show_replay(runs: FusionRuns, camera: TableCamera, replay: ReplayOptions) ->
 
     def scene(port: int) -> View:
         title = f"adcs · mockup {runs.method}"
-        return shown(
+        return open_view(
             title, lambda server: drive_page(server, drive, at_s)[0], **files, movie=None, open=False, port=port
         )
 
@@ -51,14 +51,14 @@ def show_replay(runs: FusionRuns, camera: TableCamera, replay: ReplayOptions) ->
 def drive_of(result: FusionResult, method: str, camera: TableCamera) -> Drive:
     """What a replay shows of a run, with frames where the satellite truly was."""
     from adcs.mockup.navigation.delayed_ekf import FilterTrack
-    from adcs.viewer.drive import Drive, SeenFrame
+    from adcs.viewer.drive import Drive, IdentifiedFrame
 
     run, track = result.run, result.fused.track
 
-    def frame_of(fix: int) -> SeenFrame:
+    def frame_of(fix: int) -> IdentifiedFrame:
         # One image for a fix that comes twice.
         frame, found = camera.look(run.truth, float(run.exposure_s[fix]), result.seed)
-        return SeenFrame(frame.image, found.stars.positions_px, found.fix)
+        return IdentifiedFrame(frame.image, found.stars.positions_px, found.fix)
 
     arrived = slice(len(result.fused.outcomes))
     return Drive(
@@ -89,7 +89,7 @@ class ReplayOptions:
     png : Path, optional
         Write a picture; needs Chromium or Chrome.
     at : float, optional
-        Seconds since the beginning that are shown at first; the middle of the drive by default.
+        Seconds since the beginning that are open_view at first; the middle of the drive by default.
     port : int
         Port of the server; the next one that is free if it is in use.
     """
@@ -106,7 +106,7 @@ class ReplayOptions:
         return self.view or self.html is not None or self.png is not None
 
     def check(self, options: MockupOptions, *, json: bool) -> None:
-        """Raise InputError for what cannot be shown."""
+        """Raise InputError for what cannot be open_view."""
         if not self.wanted:
             for name, given in (("--at", self.at is not None), ("--port", self.port != ReplayOptions.port)):
                 if given:

@@ -25,7 +25,7 @@ from PIL import Image
 from arrays.array_file import read_array
 from magloc.viewer.origin import SMOOTH
 from magloc.viewer.pages.pages import array_page
-from magloc.viewer.server import opened
+from magloc.viewer.server import open_server
 from tests.browser.browser import Browser
 from tests.browser.screen import Screen
 from tests.notebooks import DOCS, MOST_PIXELS, NOTEBOOKS, ON_PAGES, SHOWN, small, with_commands
@@ -150,7 +150,7 @@ class LivePage:
     def draw(self, folder: Path) -> bytes:
         run(self.made_by, folder)
         array = read_array(folder / self.array)
-        with Browser("about:blank", self.size_px) as browser, opened(0, self.array) as server:
+        with Browser("about:blank", self.size_px) as browser, open_server(0, self.array) as server:
             screen, page = Screen(browser, folder), array_page(server, array, live=True)
             screen.open_server(server, SMOOTH)
             screen.until(lambda: "found at" in screen.text(), "the fit is found")
@@ -241,7 +241,7 @@ PICTURES: dict[str, Picture] = {
             "adcs/viewer/drive_page.py",
             "adcs/viewer/drive_player.py",
             "adcs/viewer/table_scene.py",
-            "magloc/viewer/panels/played_time.py",
+            "magloc/viewer/panels/time_player.py",
         ),
     ),
     "card-locate.png": Panel("notebook-03-real-magnet.png", (12, 58, 296, 326)),

@@ -242,9 +242,9 @@ class TestButtons:
         diver = magloc.datasets.load("diver")
         follower = Follower(diver.array)
         next(follower.follow(diver.readings))
-        with pytest.raises(InputError, match="an array that stands"):
+        with pytest.raises(InputError, match="an array that does not move"):
             follower.tare(1.0)
-        with pytest.raises(InputError, match="an array that stands"):
+        with pytest.raises(InputError, match="an array that does not move"):
             next(Follower(diver.array, rest_s=1.0).follow(diver.readings))
 
 
