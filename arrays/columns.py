@@ -176,8 +176,8 @@ class LogColumns:
             raise ValueError(
                 "Inputs position or geodetic must come with an attitude or a latency; instead received none."
             )
-        if (self.geodetic is None) != (self.origin is None) and self.crs is None:
-            raise ValueError("Inputs geodetic and origin must come together; instead received one of them.")
+        if self.origin is not None and not self.is_geodetic:
+            raise ValueError("Input origin must come with geodetic or crs; instead received neither.")
         numbers = (self.pose_latency_s, self.height_m or 0.0, *(self.origin or ()), *(self.antenna_m or ()))
         if not np.isfinite(numbers).all():
             names = "origin, height_m, antenna_m and pose_latency_s"
@@ -222,6 +222,11 @@ class LogColumns:
     def place(self) -> tuple[str, ...]:
         """Columns of the array's place."""
         return self.position or self.geodetic or ()
+
+    @property
+    def is_geodetic(self) -> bool:
+        """Whether places are known on the Earth, by latitude and longitude or in a grid."""
+        return self.geodetic is not None or self.crs is not None
 
     @property
     def above_ground(self) -> bool:

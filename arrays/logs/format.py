@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from os import PathLike
 
 import numpy as np
 
@@ -13,12 +14,14 @@ from arrays.columns import POSITION_COLUMNS, ROTATION_COLUMNS, SECONDS, SEPARATO
 from arrays.io.csv import DUMMY, Table, table_of_header, table_of_text
 from arrays.io.dummies import dummy_cells, may_be_dummies
 from arrays.io.errors import InputError
+from arrays.io.text import read_text
 from arrays.logs.clock import seconds_of_cell, seconds_of_rows
 from arrays.logs.lines import cells_of, header_and_rows
-from arrays.logs.places import array_origins, positions, quaternions
-from arrays.typing import FloatArray
+from arrays.logs.places import array_origins, geodetic_places, positions, quaternions
+from arrays.typing import FloatArray, Vector
 
 _LOG = logging.getLogger(__name__)
+_BEGIN_CHARACTERS = 2**20  # of a log that are read for its origin
 _FEW_ROWS = 20  # whose cells are screened before columns are
 
 
@@ -87,9 +90,14 @@ class LogFormat:
 
     def table(self, text: str, name: str, *, first_line: int | None = None, head: Table | None = None) -> Table:
         """Table of a text; rows that begin at a line below a header `head` have none of their own."""
-        columns = self.columns
-        if columns is None:
+        if self.columns is None:
             return table_of_text(text, name, self.expected, first_line=first_line, head=head)
+        return self.translated(self.table_of_log(text, name, self.columns, first_line=first_line, head=head))
+
+    def table_of_log(
+        self, text: str, name: str, columns: LogColumns, *, first_line: int | None = None, head: Table | None = None
+    ) -> Table:
+        """Return the table of a log's text, with the names and units of the log."""
         if columns.separator == "space":
             text = text.replace("\t", " ")
         line = 0
@@ -112,7 +120,7 @@ class LogFormat:
             dummy=[each for each in columns.dummy if isinstance(each, str)],
             ragged=True,
         )
-        return self.translated(replace(table, header_line=line))
+        return replace(table, header_line=line)
 
     def _is_time(self, cells: list[str]) -> bool:
         """Whether one of a row's cells may be an instant."""
@@ -169,6 +177,30 @@ class LogFormat:
         flags = [rows.column for rows in (columns.valid, columns.fix) if rows is not None]
         named = columns.of_sensors(self.channels).values()
         return tuple(dict.fromkeys((*columns.clock, *named, *columns.place, *columns.attitude, *flags)))
+
+
+def log_origin(path: str | PathLike[str], columns: LogColumns) -> Vector:
+    """Return latitude, longitude [deg] and height [m] of the first place of a log whose columns name a grid or both.
+
+    The height is 0 where heights count from the ground.
+
+    Raises
+    ------
+    InputError
+        The log cannot be read, or has no place.
+    """
+    text = read_text(path, "a CSV file", columns.encoding)
+    begin = text[: text.rfind("\n", 0, _BEGIN_CHARACTERS) + 1]  # long enough for a fix
+    for part in (begin, text) if len(begin) < len(text) and begin else (text,):
+        table = LogFormat({}, columns, "the columns that the array file names", ()).table_of_log(
+            part, str(path), columns
+        )
+        place = geodetic_places(table, columns, is_file=True)
+        known = place[np.isfinite(place).all(axis=1)]
+        if len(known):
+            latitude, longitude, height = known[0].tolist()
+            return latitude, longitude, 0.0 if columns.above_ground else height
+    raise InputError(f"{path}: found no row with a place, expected one.")
 
 
 READINGS_FILE = LogFormat({}, None, "", ())

@@ -16,18 +16,12 @@ _RIM_deg = 1.0  # a system is of use a little beyond its area
 
 def positions(table: Table, columns: LogColumns, *, is_file: bool) -> FloatArray:
     """Return the places (n, 3) [m] in the world, NaN in the rows of a file that have none."""
-    place = table.finite_or_missing(columns.place) if is_file else table.complete(columns.place)
-    if columns.fix is not None:
-        place[~np.isin(table.values[:, table.header.index(columns.fix.column)], columns.fix.equals)] = np.nan
-    if columns.geodetic is not None:
-        place[(place[:, :2] == 0.0).all(axis=1)] = np.nan  # a receiver without a fix
-    if columns.crs is not None:
-        place[:, :2] = _latitudes_and_longitudes(table, columns, columns.crs, place[:, :2])
-    height = place[:, 2] if columns.height_m is None else np.full(len(place), columns.height_m)
+    place = geodetic_places(table, columns, is_file=is_file)
+    height = place[:, 2]
     if columns.origin is None:
-        if columns.crs is not None:
+        if columns.is_geodetic:
             _refuse_no_origin(table, place)
-        return np.column_stack([place[:, :2], height])
+        return place
     with of_extra("geo", "latitude and longitude"):
         from pymap3d import geodetic2enu
     above_m = height if columns.above_ground else None
@@ -39,6 +33,19 @@ def positions(table: Table, columns: LogColumns, *, is_file: bool) -> FloatArray
     east, north, up = geodetic2enu(*place[:, :2].T, np.where(np.isnan(height), usual, height), *columns.origin)
     up = np.where(np.isnan(height), np.nan, up) if above_m is None else np.where(np.isnan(east), np.nan, above_m)
     return np.column_stack([east, north, up])
+
+
+def geodetic_places(table: Table, columns: LogColumns, *, is_file: bool) -> FloatArray:
+    """Return latitude, longitude [deg] and height [m] (n, 3), or places [m] of a frame without an origin."""
+    place = table.finite_or_missing(columns.place) if is_file else table.complete(columns.place)
+    if columns.fix is not None:
+        place[~np.isin(table.values[:, table.header.index(columns.fix.column)], columns.fix.equals)] = np.nan
+    if columns.geodetic is not None:
+        place[(place[:, :2] == 0.0).all(axis=1)] = np.nan  # a receiver without a fix
+    if columns.crs is not None:
+        place[:, :2] = _latitudes_and_longitudes(table, columns, columns.crs, place[:, :2])
+    height = place[:, 2] if columns.height_m is None else np.full(len(place), columns.height_m)
+    return np.column_stack([place[:, :2], height])
 
 
 def array_origins(antenna_m: FloatArray, quaternion: FloatArray, columns: LogColumns) -> FloatArray:
@@ -82,7 +89,7 @@ def _refuse_no_origin(table: Table, place: FloatArray) -> None:
     if len(known):
         near = f"[{known[0, 0]:.6f}, {known[0, 1]:.6f}, 0.0]"
         raise InputError(
-            f"{table.path}: found a grid without an origin of the world frame, expected its latitude, longitude and"
+            f"{table.path}: found places on the Earth without an origin of the world, expected latitude, longitude and"
             f" height: origin = {near} in the table columns of the array file is where the log begins."
         )
 

@@ -19,10 +19,11 @@ import magloc
 from arrays.io.errors import LARGEST, InputError, naming, naming_options
 from arrays.io.outputs import refuse_unwritable
 from arrays.io.text import write_text
+from arrays.logs.format import log_origin
 from arrays.typing import Vector
 from magloc.ambient import Place
 from magloc.cli import framework
-from magloc.cli.framework import ABOVE_ZERO, refuse_outside, whole_number
+from magloc.cli.framework import ABOVE_ZERO, note, refuse_outside, whole_number
 
 if TYPE_CHECKING:
     import numpy as np
@@ -236,7 +237,7 @@ class KnownOptions:
     def reduced(self, array: SensorArray, path: Path) -> SensorArray:
         """An array of a file, reduced to them; a grid without an origin of its own has that of --place."""
         ids, columns = self.ids, array.columns
-        if columns is not None and columns.crs is not None and columns.origin is None and self.place is not None:
+        if columns is not None and columns.is_geodetic and columns.origin is None and self.place is not None:
             array = replace(array, columns=replace(columns, origin=self.place))
         if ids is None:
             return array
@@ -248,6 +249,25 @@ class KnownOptions:
             return array.subset(ids)
         except ValueError as error:
             raise InputError(f"--sensors {','.join(ids)}: {error}") from None
+
+    def on_earth(self, array: SensorArray, log: Path) -> tuple[SensorArray, KnownOptions]:
+        """Return the array with an origin of its places on the Earth, and options that know place and date.
+
+        The origin is that of the array file or of --place, or else the first place of the log, which a note names. The
+        date of the array file serves where the ambient field is known from nothing else.
+        """
+        columns = array.columns
+        if columns is None or not columns.is_geodetic:
+            return array, self
+        origin = columns.origin
+        if origin is None:
+            origin = log_origin(log, columns)
+            array = replace(array, columns=replace(columns, origin=origin))
+            note(f"note: the origin of the world frame is the first place of {log}: {_degrees(origin)}")
+        date = self.date
+        if date is None and columns.date and array.channel_is_scalar.any() and array.ambient_world_T is None:
+            date = columns.date
+        return array, replace(self, place=self.place or origin, date=date)
 
     @property
     def prior(self) -> SourcePrior:
@@ -289,6 +309,10 @@ class KnownOptions:
         if not _DATE.fullmatch(self.date):
             raise InputError(f"--date: found {self.date!r}, expected a date such as 2026-11-21.")
         return Place(*self.place, self.date, self.geomagnetic_model or "IGRF-14")
+
+
+def _degrees(place: Vector) -> str:
+    return f"latitude {place[0]:.7f}, longitude {place[1]:.7f}, height {place[2]:.2f} m"
 
 
 class OnMaps(Protocol):

@@ -14,6 +14,7 @@ import arrays
 import magloc
 from arrays.io.errors import InputError, naming, naming_options
 from arrays.io.outputs import refuse_file, refuse_one_for_two, refuse_unwritable, write_files
+from arrays.typing import Vector
 from magloc.cli.framework import CommonOptions, Flag, note, print_report
 from magloc.cli.options import (
     KnownOptions,
@@ -23,6 +24,7 @@ from magloc.cli.options import (
 )
 
 if TYPE_CHECKING:
+    from magloc.deliverables.map_frame import MapFrame
     from magloc.surveying.results import Survey
 
 
@@ -58,6 +60,7 @@ def survey(
     base: Path | None = None,
     ground: GroundOptions = GroundOptions(),
     maps: MapOptions = MapOptions(),  # noqa: B008 - frozen
+    crs: str | None = None,
     scheduler: str | None = None,
     out: Path | None = None,
     html: Path | None = None,
@@ -88,10 +91,14 @@ def survey(
         What is known of the ground.
     maps : MapOptions
         Files for maps of the world.
+    crs : str
+        Coordinate system of the files for maps, such as EPSG:32633; by default that of the log, or else WGS 84. It
+        needs places on the Earth: --place, or a log with coordinates.
     scheduler : str
         Address of a dask scheduler (tcp://HOST:PORT) whose workers search the tiles of a large survey.
     out : Path
-        Folder for targets.csv, residual.csv, reach.csv (the least moment seen), the map and the lines past the targets;
+        Folder for targets.csv, residual.csv, reach.csv (the least moment seen), the map and the lines past the targets.
+        With places on the Earth also targets.gpkg, .geojson and .kml, field.tif, residual.tif, lines.xyz and a report;
         of a large survey it keeps what is done, until all is: the same command goes on with one that was interrupted.
     html : Path
         Write the survey in three dimensions, lines, ground and targets, as one page that needs no server.
@@ -100,15 +107,16 @@ def survey(
     common : CommonOptions
         Common options.
     """
-    maps.refuse(known.place)
     refuse_file(out, "--out")
     refuse_one_for_two({"--out": out, "--html": html, **maps.outputs})
     refuse_unwritable(html, "--html")
     refuse_not_positive(ground, "shortest_geology_m", "false_per_hectare")
     if not math.isfinite(ground.ground_m):
         raise InputError(f"--ground-m: found {ground.ground_m:g}, expected a finite number.")
+    used, known = known.on_earth(known.reduced(arrays.read_sensors(array), array), readings[0])  # one is enough
+    maps.refuse(known.place)
     where = None if known.place is not None and known.date is None else known.where
-    used = known.reduced(arrays.read_sensors(array), array)  # one is enough
+    frame = _map_frame(used, known.place, crs)
     parts = [magloc.read_readings(path, used, sensors=known.ids, ordered=True) for path in readings]
     for path, part in zip(readings, parts, strict=True):
         maps.refuse_far(part, str(path))
@@ -132,13 +140,13 @@ def survey(
             progress=None if json else note,
         )
     maps.write(found, known.place)
-    write_files(out, _files(found))
+    write_files(out, _files(found, frame, ", ".join(path.name for path in readings), ground))
     if html is not None:
         magloc.view(None, found, html=html, title="survey")
     if json:
         from magloc.surveying.files import json_of_survey
 
-        print_report(json_of_survey(found))
+        print_report(json_of_survey(found) | _json_of_map(found, frame))
         return
     print(found.table())
     if found.pose_assumed:
@@ -149,13 +157,47 @@ def survey(
         note(f"nothing is stated of the pose's errors: as the rows show them{size}")
 
 
-def _files(found: Survey) -> Iterator[tuple[str, Any]]:
-    """Yield targets.csv, residual.csv, reach.csv, the map, and the lines past the targets."""
+def _map_frame(array: arrays.SensorArray, origin: Vector | None, crs: str | None) -> MapFrame | None:
+    """Return the coordinate system of maps: as asked for, or that of the log, or WGS 84; None without an origin."""
+    from magloc.deliverables.map_frame import WGS84, MapFrame
+
+    if origin is None:
+        if crs is not None:
+            raise InputError("--crs: found no place on the Earth, expected --place or a log with coordinates.")
+        return None
+    own = None if array.columns is None else array.columns.crs
+    with naming("--crs" if crs is not None else "--place"):
+        return MapFrame(origin, crs or own or WGS84)
+
+
+def _json_of_map(found: Survey, frame: MapFrame | None) -> dict[str, Any]:
+    """Return the origin and the coordinate system of the map, and the targets' coordinates in it."""
+    from magloc.deliverables.files import map_columns
+
+    if frame is None:
+        return {}
+    columns = {name: list(values) for name, values in map_columns(found, frame).items()}
+    places = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+    targets = [entry | place for entry, place in zip(found.entries, places, strict=True)]
+    return {"origin": list(frame.origin), "crs": frame.crs, "targets": targets}
+
+
+def _files(found: Survey, frame: MapFrame | None, title: str, ground: GroundOptions) -> Iterator[tuple[str, Any]]:
+    """Yield targets.csv, residual.csv, reach.csv, the map, the lines past the targets, and files for a client's map."""
+    from magloc.deliverables.files import map_columns, survey_files
     from magloc.plots.profiles import survey_profiles
     from magloc.surveying.files import reach_columns, residual_columns
 
-    yield "targets.csv", found.columns()
+    yield "targets.csv", found.columns() | ({} if frame is None else map_columns(found, frame))
     yield "residual.csv", residual_columns(found)
     yield "reach.csv", reach_columns(found)
     yield "survey.png", found.plot()
     yield "profiles.png", survey_profiles(found)
+    if frame is not None:
+        assumptions = {
+            "ground": f"{ground.ground_m:g} m above the origin of the world frame",
+            "field of the ground": f"wavelengths above {ground.shortest_geology_m:g} m",
+            "false targets": f"{ground.false_per_hectare:g} in a hectare on average",
+            "size of targets": f"{ground.body_length_m:g} m" if ground.body_length_m else "points",
+        }
+        yield from survey_files(found, frame, title, assumptions)

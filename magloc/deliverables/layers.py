@@ -90,7 +90,7 @@ def survey_layers(found: Survey, frame: MapFrame) -> Iterator[Layer]:
     with of_extra("gis", _WHAT):
         import shapely
     places = frame.project(found.position_m)
-    yield Layer("targets", "Point", shapely.to_wkb(shapely.points(places)), _target_fields(found, frame, places))
+    yield Layer("targets", "Point", shapely.to_wkb(shapely.points(places)), target_fields(found, frame))
     ellipses = [shapely.Polygon(frame.project(_ellipse(target))) for target in found]
     ids = np.array([target.id for target in found], dtype=np.object_)
     yield Layer("ellipses", "Polygon", _wkb(ellipses), {"id": ids, "level": np.full(len(found), _LEVEL)})
@@ -112,9 +112,9 @@ def _wkb(geometries: list[Any]) -> NDArray[np.object_]:
     return np.asarray(shapely.to_wkb(np.array(geometries, dtype=np.object_)), dtype=np.object_)
 
 
-def _target_fields(found: Survey, frame: MapFrame, places: FloatArray) -> dict[str, NDArray[Any]]:
+def target_fields(found: Survey, frame: MapFrame) -> dict[str, NDArray[Any]]:
     """Return the attributes of all targets; eastings and northings are NaN in a geographic system."""
-    grid = np.full(places.shape, np.nan) if frame.is_geographic else places
+    grid = np.full((len(found), 2), np.nan) if frame.is_geographic else frame.project(found.position_m)
     latitude, longitude, height = frame.geodetic(found.position_m).T
     low, high = np.array([target.depth_interval95_m for target in found]).reshape(-1, 2).T
     sigma = np.sqrt([np.linalg.eigvalsh(target.covariance[:2, :2]) for target in found]).reshape(-1, 2)

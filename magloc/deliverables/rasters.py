@@ -21,6 +21,8 @@ METHOD = "linear interpolation between rows"
 _CELLS_PER_SPACING = 4.0
 _FARTHEST = 1.0  # spacings from the nearest row: farther cells have no value
 _MOST_CELLS = 4_000_000
+_FLAT = 1e-3  # across over along a line
+_ROWS_PER_CELL = 2.0  # rows of one line that are used
 _STEPS = (1.0, 2.0, 5.0, 10.0)
 
 
@@ -52,8 +54,10 @@ def grid_rows(rows: SurveyRows, values: FloatArray, frame: MapFrame, cell_m: flo
     xy_m = rows.place_m[:, :2]
     spacing_m = line_spacing(xy_m)
     cell_m = _round_down(spacing_m / _CELLS_PER_SPACING) if cell_m is None else cell_m
-    xy = frame.project(rows.place_m)
-    cell_m = max(cell_m, float(np.sqrt(np.prod(np.ptp(xy / frame.units_per_m, axis=0)) / _MOST_CELLS)))
+    cell_m = max(cell_m, float(np.sqrt(np.prod(np.ptp(xy_m, axis=0)) / _MOST_CELLS)))
+    step_m = float(np.median(np.linalg.norm(np.diff(xy_m, axis=0), axis=1)))
+    used = slice(None, None, max(1, int(cell_m / _ROWS_PER_CELL / step_m)) if step_m else 1)
+    xy, values = frame.project(rows.place_m[used]), values[used]
     cell = cell_m * frame.units_per_m
     low = np.floor(xy.min(axis=0) / cell) * cell
     n_columns, n_rows = (np.ceil((xy.max(axis=0) - low) / cell).astype(int) + 1).tolist()
@@ -70,11 +74,16 @@ def grid_rows(rows: SurveyRows, values: FloatArray, frame: MapFrame, cell_m: flo
     return Raster(gridded, corner, cell, cell_m)
 
 
+def covers_area(xy_m: FloatArray) -> bool:
+    """Return whether rows (n, 2) cover an area, and not a single line."""
+    return bool(np.linalg.matrix_rank(xy_m - xy_m.mean(axis=0), rtol=_FLAT) == 2)
+
+
 def line_spacing(xy_m: FloatArray) -> float:
     """Return the usual distance between lines [m] of rows (n, 2): the area that they cover over the way."""
     way_m = float(np.linalg.norm(np.diff(xy_m, axis=0), axis=1).sum())
     extent_m = float(np.ptp(xy_m, axis=0).max())
-    if np.linalg.matrix_rank(xy_m - xy_m.mean(axis=0), rtol=1e-3) < 2:
+    if not covers_area(xy_m):
         return extent_m / 20.0  # a single line
     from scipy.spatial import ConvexHull
 

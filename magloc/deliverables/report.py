@@ -91,7 +91,7 @@ def _survey_rows(found: Survey) -> Iterator[tuple[str, str]]:
     yield "rows", f"{len(rows.time_s)} at {rate_Hz:.3g} Hz, {(rows.time_s[-1] - rows.time_s[0]) / 60.0:.1f} min"
     yield "lines", f"{len(lines)}, {step_m.sum():.0f} m in total, about {line_spacing(rows.place_m[:, :2]):.2g} m apart"
     yield "speed", f"{np.mean(speeds):.2g} m/s ({min(speeds):.2g} to {max(speeds):.2g})"
-    yield "height above ground", f"{height.mean():.2f} m ({height.min():.2f} to {height.max():.2f})"
+    yield "height of the sensors above ground", f"{height.mean():.2f} m ({height.min():.2f} to {height.max():.2f})"
     rms_nT = 1e9 * float(rows.residual_T.std())
     yield "remainder", f"{rms_nT:.2g} nT rms without the targets, χ² {found.chi2_per_dof:.2f} per reading"
     yield "lag", f"{1e3 * found.lag_s:.0f} ms of the readings, corrected" if found.lag_s else "none found"

@@ -183,6 +183,18 @@ class Chromium(Closing):
             raise BrowserError(exception_text(answer["exceptionDetails"]))
         return answer["result"].get("value")
 
+    def pdf(self) -> bytes:
+        """Return the page as PDF, in the paper's size that its style states.
+
+        Raises
+        ------
+        BrowserError
+            The page cannot be printed.
+        """
+        self.wait_for("document.readyState === 'complete'")
+        answer = self.call("Page.printToPDF", printBackground=True, preferCSSPageSize=True)
+        return base64.b64decode(answer["data"])
+
     def wait_for(self, expression: str, timeout_s: float = 30.0) -> Any:
         """Wait until a JavaScript expression is true.
 

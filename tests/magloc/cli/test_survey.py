@@ -8,6 +8,9 @@ import math
 from collections.abc import Callable
 from pathlib import Path
 
+import pandas as pd
+import pyogrio
+import pyproj
 import pytest
 
 import sims
@@ -91,13 +94,8 @@ class TestSurvey:
         array = folder / "ground-array.toml"
         done = run("survey", folder / "ground.csv", "--array", array, *outputs, "--place", 48, 11, 500)
         assert done.status == 0, done.err
-        assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
-            "profiles.png",
-            "reach.csv",
-            "residual.csv",
-            "survey.png",
-            "targets.csv",
-        ]
+        own = {"profiles.png", "reach.csv", "residual.csv", "survey.png", "targets.csv"}
+        assert {path.name for path in (tmp_path / "out").iterdir()} - {"report.pdf"} == own | MAP_FILES
         assert len(json.loads((tmp_path / "t.json").read_text())["features"]) == 1
         assert "__VISER_EMBED_DATA__" in (tmp_path / "t.html").read_text()
         assert "<Placemark>" in (tmp_path / "t.kml").read_text()
@@ -182,3 +180,78 @@ class TestDoubts:
         assert any("state the height of the ground" in sentence for sentence in found["warnings"])
         assert right["warnings"] == []
         assert len(right["targets"]) == 1
+
+
+LATITUDE, LONGITUDE, HEIGHT_M = 52.41, 13.12, 41.0
+TOPOCENTRIC = (
+    f"+proj=pipeline +step +inv +proj=topocentric +ellps=WGS84 +lat_0={LATITUDE} +lon_0={LONGITUDE} +h_0={HEIGHT_M}"
+    " +step +inv +proj=cart +ellps=WGS84"
+)
+UTM_COLUMNS = '[columns]\nposition = ["E", "N", "H"]\ncrs = "EPSG:32633"\n'
+MAP_FILES = {"targets.gpkg", "targets.geojson", "targets.kml", "field.tif", "residual.tif", "lines.xyz", "report.html"}
+
+
+@pytest.fixture(scope="module")
+def log(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Log in UTM, by PROJ's own topocentric frame, beside its array file."""
+    place = tmp_path_factory.mktemp("utm")
+    table = pd.read_csv(folder / "ground.csv")
+    names = ["array_x_m", "array_y_m", "array_z_m"]
+    longitude, latitude, table["H"] = pyproj.Transformer.from_pipeline(TOPOCENTRIC).transform(
+        *table[names].to_numpy().T
+    )
+    table["E"], table["N"] = pyproj.Proj("EPSG:32633")(longitude, latitude)
+    table.drop(columns=names).to_csv(place / "log.csv", index=False)
+    (place / "array.toml").write_text((folder / "ground-array.toml").read_text() + UTM_COLUMNS)
+    return place / "log.csv"
+
+
+@pytest.fixture(scope="module")
+def target(folder: Path) -> dict[str, float]:
+    """Coordinates of the true target."""
+    truth = sims.simulate(sims.read_scenario(str(folder / "ground.toml")), rng=11).target_position_m[0]
+    longitude, latitude, _ = pyproj.Transformer.from_pipeline(TOPOCENTRIC).transform(*truth)
+    easting, northing = pyproj.Proj("EPSG:32633")(longitude, latitude)
+    return {"easting": easting, "northing": northing, "latitude": latitude, "longitude": longitude}
+
+
+class TestMaps:
+    """A log in UTM becomes what a client's map opens: targets in the log's system and in WGS 84."""
+
+    def test_in_one_command(self, log: Path, target: dict[str, float], run: Run, tmp_path: Path) -> None:
+        outcome = run(
+            "survey", log, "--array", log.with_name("array.toml"), "--ground-m", -1, "--out", tmp_path, "--json"
+        )
+        assert outcome.status == 0, outcome.err
+        assert "the origin of the world frame is the first place of" in outcome.err
+        assert {path.name for path in tmp_path.iterdir()} >= MAP_FILES
+        report = json.loads(outcome.out)
+        assert report["crs"] == "EPSG:32633"
+        metadata, _, _, fields = pyogrio.raw.read(tmp_path / "targets.gpkg", layer="targets")
+        of_layer = {name: field[0] for name, field in zip(metadata["fields"], fields, strict=True)}
+        with (tmp_path / "targets.csv").open() as file:
+            of_table = next(csv.DictReader(file))
+        for found in (report["targets"][0], of_layer, of_table):
+            assert float(found["easting"]) == pytest.approx(target["easting"], abs=0.05)
+            assert float(found["northing"]) == pytest.approx(target["northing"], abs=0.05)
+            assert float(found["latitude"]) == pytest.approx(target["latitude"], abs=5e-7)
+            assert float(found["longitude"]) == pytest.approx(target["longitude"], abs=8e-7)
+
+    def test_in_another_system(self, log: Path, target: dict[str, float], run: Run) -> None:
+        """Web Mercator, by PROJ."""
+        more = ("--ground-m", "-1", "--crs", "EPSG:3857", "--json")
+        outcome = run("survey", log, "--array", log.with_name("array.toml"), *more)
+        found = json.loads(outcome.out)["targets"][0]
+        expected = pyproj.Proj("EPSG:3857")(target["longitude"], target["latitude"])
+        assert (found["easting"], found["northing"]) == (
+            pytest.approx(expected[0], abs=0.1),
+            pytest.approx(expected[1], abs=0.1),
+        )
+
+    def test_an_unknown_system(self, log: Path, run: Run) -> None:
+        outcome = run("survey", log, "--array", log.with_name("array.toml"), "--crs", "EPSG:1", "--quiet")
+        assert_refused(outcome, "--crs", "'EPSG:1'", "a system that PROJ knows")
+
+    def test_a_system_without_a_place(self, folder: Path, run: Run) -> None:
+        outcome = run("survey", folder / "ground.csv", "--array", folder / "ground-array.toml", "--crs", "EPSG:3857")
+        assert_refused(outcome, "--crs", "--place")

@@ -1,0 +1,73 @@
+"""Files of a survey for a client's map, in one folder."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Iterator, Mapping
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from arrays.io.csv import Column
+from arrays.io.errors import InputError
+from arrays.io.text import replaced
+from magloc.deliverables.geosoft import geosoft_xyz
+from magloc.deliverables.layers import target_fields, write_layers
+from magloc.deliverables.map_frame import MapFrame
+from magloc.deliverables.rasters import covers_area, grid_rows, write_geotiff
+from magloc.deliverables.report import report_html
+
+if TYPE_CHECKING:
+    from magloc.surveying.results import Survey
+
+_LOG = logging.getLogger(__name__)
+_LIBRARIES = ("pyogrio", "rasterio", "shapely")
+
+
+def survey_files(
+    found: Survey, frame: MapFrame, title: str, assumptions: Mapping[str, str]
+) -> Iterator[tuple[str, Any]]:
+    """Yield names and contents of the files of a survey, as :func:`arrays.io.outputs.write_files` takes them.
+
+    Without the extra ``gis`` a GeoPackage and GeoTIFF are left out, and without a browser the report as PDF; a note
+    says so. Surveys of a single line have no GeoTIFF.
+    """
+    yield "targets.geojson", json.dumps(found.to_geojson(frame.origin)) + "\n"
+    yield "targets.kml", found.to_kml(frame.origin)
+    yield "lines.xyz", geosoft_xyz(found, frame)
+    if all(map(find_spec, _LIBRARIES)):
+        yield "targets.gpkg", partial(write_layers, found=found, frame=frame)
+        if covers_area(found.rows.place_m[:, :2]):
+            for name, values_T in (("field", found.rows.anomaly_T), ("residual", found.rows.residual_T)):
+                raster = grid_rows(found.rows, 1e9 * values_T, frame)
+                yield f"{name}.tif", partial(write_geotiff, raster=raster, frame=frame, title=name, unit="nT")
+    else:
+        _LOG.info('note: a GeoPackage and GeoTIFF need the extra "gis": pip install "magloc[gis]"')
+    yield "report.html", report_html(found, frame, title, assumptions)
+    yield "report.pdf", _print_report
+
+
+def map_columns(found: Survey, frame: MapFrame) -> dict[str, Column]:
+    """Return columns of the list of targets: easting and northing on a grid, latitude and longitude in WGS 84."""
+    names = ("latitude", "longitude") if frame.is_geographic else ("easting", "northing", "latitude", "longitude")
+    fields = target_fields(found, frame)
+    return {name: fields[name] for name in names}
+
+
+def _print_report(path: Path) -> None:
+    """Print the HTML page beside a PDF file into it; a note says so where there is no browser."""
+    try:
+        from magloc.viewer.chromium import BrowserError, Chromium
+    except InputError as error:
+        _LOG.info(f"note: {path.name} is not written: {error}")
+        return
+    try:
+        with Chromium(path.with_suffix(".html").absolute().as_uri()) as browser:
+            content = browser.pdf()
+    except (InputError, BrowserError) as error:
+        _LOG.info(f"note: {path.name} is not written: {error}")
+        return
+    with replaced(path) as unfinished:
+        unfinished.write_bytes(content)
