@@ -121,7 +121,7 @@ class MomentTrack(TrackColumns):
 
     @property
     def misfit(self) -> bool:
-        """Whether χ² is so large that noise explains it once in a million (no such dipole)."""
+        """True if χ² is so large that noise explains it once in a million (no such dipole)."""
         return bool(is_misfit(self.chi2, self.dof))
 
     @np.errstate(over="ignore", divide="ignore", invalid="ignore")
