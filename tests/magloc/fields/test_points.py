@@ -87,19 +87,6 @@ class TestTwins:
 class TestAccuracy:
     """Against 120-digit arithmetic, from near to far."""
 
-    @pytest.mark.parametrize("exponent", range(-9, 10, 3))
-    def test_from_near_to_far(self, exponent: int) -> None:
-        rng = np.random.default_rng(exponent + 200)
-        source, moment = rng.normal(size=3), rng.normal(size=3)
-        points = source + 10.0**exponent * rng.normal(size=(10, 3))
-        fields = kernels.field_at_points(points, [source], [moment])
-        gradients = kernels.gradient_at_points(points, [source], [moment])
-        for s, field, gradient in zip(points, fields, gradients, strict=True):
-            exact_field = oracles.decimal_field(s, source, moment)
-            exact_gradient = oracles.decimal_gradient_tensor(s, source, moment)
-            assert np.linalg.norm(field - exact_field) <= ROUNDING * np.linalg.norm(exact_field)
-            assert np.linalg.norm(gradient - exact_gradient) <= ROUNDING * np.linalg.norm(exact_gradient)
-
     @pytest.mark.parametrize("distance_m", [1e-50, 1e50])
     def test_neither_overflows_nor_underflows(self, distance_m: float) -> None:
         point, origin, moment = distance_m * np.array([[0.48, -0.6, 0.64]]), np.zeros(3), np.array([3.0, -5.0, 8.0])
