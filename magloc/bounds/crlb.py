@@ -77,7 +77,7 @@ class Bounds(Drawn):
 
     @property
     def is_regular(self) -> BoolArray:
-        """Whether all six parameters are estimable, shape (...)."""
+        """Sources of which all six parameters are estimable, shape (...)."""
         return self.rank == 6
 
     @property

@@ -79,7 +79,7 @@ class EllipsoidCalibration:
 
     @property
     def misfit(self) -> bool:
-        """Whether χ² is beyond noise; then the covariance is wrong too.
+        """True if χ² is beyond noise; then the covariance is wrong too.
 
         The modulus, its noise or the sensor are not as stated.
         """

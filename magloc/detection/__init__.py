@@ -1,1 +1,1 @@
-"""Whether there is a source at all, and how far off one is found."""
+"""Detection of a source, and the distance at which an array detects one."""

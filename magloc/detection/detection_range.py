@@ -1,4 +1,4 @@
-"""How far an array detects a source, in every direction and for every moment that it may have."""
+"""Distance at which an array detects a source, over directions and moments."""
 
 from __future__ import annotations
 

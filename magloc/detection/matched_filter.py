@@ -106,7 +106,7 @@ class MatchedFilterDetector:
         return cls(matched, float(statistic[n_above]), float(0.5 * (high - low)), false_alarm_rate, seed)
 
     def detects(self, readings_T: ArrayLike) -> NDArray[np.bool_]:
-        """Whether there is a source in each set of raw readings (n, C) [T]: (n,)."""
+        """Return whether each set of raw readings (n, C) [T] has a source: (n,)."""
         return self.filter.largest_energy(self.filter.whitened(readings_T)) > self.threshold
 
     def probability(self, signals: FloatArray, rng: np.random.Generator) -> float:
@@ -148,7 +148,7 @@ class MatchedFilterDetector:
         return float(brentq(surplus, 0.0, high, xtol=1e-3)) ** 2 if surplus(0.0) < 0.0 else 0.0
 
     def _above(self, whitened: FloatArray) -> NDArray[np.bool_]:
-        """Whether the statistic is above the threshold; refined only where candidates and energy leave it open."""
+        """Return which statistics are above the threshold; candidates and energy decide most."""
         above = self.filter.candidate_energy(whitened) > self.threshold
         open_ = np.flatnonzero(~above & (self.filter.energy(whitened) > self.threshold))
         if open_.size:

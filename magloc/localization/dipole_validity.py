@@ -81,7 +81,7 @@ class NearnessTest:
 
 
 def dipole_validity(distance_m: ArrayLike, body_length_m: ArrayLike) -> BoolArray:
-    """Whether a body is at least three body lengths away, so that it counts as a dipole.
+    """Return whether a body is at least three lengths away, so that it counts as a dipole.
 
     At three lengths, the length being the longest side, the field of a uniformly magnetised cube differs from that of a
     dipole by 0.3 % at most, that of a cylinder as long as it is wide by 1.3 %, of a flat brick by 5 % and of a thin rod
@@ -106,7 +106,7 @@ def nearness_test(
     *,
     false_alarm: float = EXTENDED_BODY,
 ) -> NearnessTest:
-    """Whether the residuals of a fix have the pattern of a source that is extended or too near.
+    """Test the residuals of a fix for the pattern of an extended or too near source.
 
     A quadrupole and then an octupole at the solution are added to the linearised dipole. Either is a finding if χ²
     decreases by more than noise explains, and by more, per parameter, than what is left of the misfit (F test at 5 %).

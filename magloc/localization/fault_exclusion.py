@@ -95,7 +95,7 @@ def exclude_faulty_sensors(
 
 
 def _is_doubtful(fixes: Fixes) -> BoolArray:
-    """Whether rows (n,) are doubtful: χ² not credible, several sources, or no solution."""
+    """Return doubtful rows (n,): χ² not credible, several sources, or no solution."""
     result = ~fixes.solved
     for row in np.flatnonzero(result).tolist():
         result[row] = fixes.reason[row] != NO_SIGNAL
@@ -117,7 +117,7 @@ def _largest_credible(dof: int, body_length_m: float) -> float:
 
 
 def _is_worth_dropping_for(fix: Fix, plain: Fix) -> bool:
-    """Whether a fix without some sensors explains the others, or fits incomparably better.
+    """Return whether a fix without some sensors explains the others, or fits far better.
 
     Where it does not, it is the model, or what is known of the source, that is wrong.
     """
@@ -263,7 +263,7 @@ class _Examination:
         return np.flatnonzero(spoilt & ~credible & ~self._is_noise(plain))
 
     def _is_noise(self, plain: Sequence[Fix]) -> BoolArray:
-        """Whether rows (n,) have no source and no more energy than noise."""
+        """Return the rows (n,) without a source and without more energy than noise."""
         without = self.problem.whiten(self.raw) - self.problem.predict(np.zeros_like(self.problem.ambient))
         energy = np.einsum("bc,bc->b", without, without)
         alone = np.array([fix.reason == NOISE_ALONE for fix in plain], dtype=bool)

@@ -100,7 +100,7 @@ def with_model_errors(
 
 
 def _is_far(q: FloatArray) -> bool:
-    """Whether all sources are far from every sensor, by a cheap test of the centroid."""
+    """Return whether all sources are far from every sensor, by a cheap test of the centroid."""
     s = q[..., 3]
     return np.count_nonzero(np.abs(s) < _FAR_S) == s.size
 

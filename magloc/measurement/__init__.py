@@ -1,1 +1,1 @@
-"""From sources to what an array measures."""
+"""Measurement models: from sources to the readings of an array."""

@@ -147,7 +147,7 @@ class SensorErrors:
 
     @property
     def is_constant(self) -> bool:
-        """Whether the effect is the same in every row, as of offsets."""
+        """True if the effect is the same in every row, as of offsets."""
         fields = (self.of_sensor[:, 1] >= _FIELD) & (self.of_sensor[:, 1] < _INDUCED)
         return bool(fields.all() and not self.is_slope.any() and not self.array.channel_is_scalar.any())
 

@@ -241,17 +241,17 @@ class PoseErrors:
 
     @property
     def is_changing(self) -> BoolArray:
-        """Whether each error changes with time (n,)."""
+        """Errors that change with time (n,)."""
         return np.isfinite(self.lasts_s)
 
     @property
     def is_of_mounting(self) -> BoolArray:
-        """Whether each error is a constant of the mounting or of the lever arm (n,)."""
+        """Errors that are constants of the mounting or of the lever arm (n,)."""
         return np.asarray(~self.is_changing & (self.of_pose < FIELD.start))
 
     @property
     def is_of_field(self) -> BoolArray:
-        """Whether each error is a constant of the ambient field (n,)."""
+        """Errors that are constants of the ambient field (n,)."""
         return np.asarray(~self.is_changing & (self.of_pose >= FIELD.start) & (self.of_pose < N_POSE))
 
     def step(self, dt_s: float | FloatArray) -> tuple[FloatArray, FloatArray]:

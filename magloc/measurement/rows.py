@@ -83,7 +83,7 @@ class WhitenedRows:
 
     @property
     def is_silent(self) -> BoolArray:
-        """Whether the differences (b,) are rounding errors."""
+        """Rows (b,) whose differences are rounding errors."""
         squares = np.vecdot(self.y, self.y) if self.model.sees_moduli else self.energy
         return np.asarray(squares < _SILENT * self.n_differences)
 

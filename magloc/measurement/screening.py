@@ -122,7 +122,7 @@ class _Scene:
         return wild
 
     def _comes_back(self, piece: IntArray, kept: IntArray) -> bool:
-        """Whether many smooth rows are a leap; without a return they are another level."""
+        """Return whether many smooth rows are a leap; without a return they are another level."""
         before, after = kept[kept < piece[0]], kept[kept > piece[-1]]
         if not (len(before) and len(after)):
             return False

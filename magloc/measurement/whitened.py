@@ -126,17 +126,17 @@ class WhitenedModel(ScaledSensors):
 
     @cached_property
     def sees_moduli(self) -> bool:
-        """Whether there are scalar channels."""
+        """True if there are scalar channels."""
         return bool(self.channel_is_scalar.any())
 
     @property
     def shares_whitening(self) -> bool:
-        """Whether all rows share one whitening, which is stored once."""
+        """True if all rows share one whitening, which is stored once."""
         return len(self) == 1 or self.gain.strides[0] == self.basis.strides[0] == 0
 
     @property
     def shares_ambient(self) -> bool:
-        """Whether all rows share one ambient field, which is stored once."""
+        """True if all rows share one ambient field, which is stored once."""
         return len(self) == 1 or self.ambient.strides[0] == 0
 
     @cached_property
@@ -168,7 +168,7 @@ class WhitenedModel(ScaledSensors):
 
     @property
     def is_even(self) -> bool:
-        """Whether moments m and -m give the same readings.
+        """True if moments m and -m give the same readings.
 
         So they do for moduli alone without an ambient field.
         """

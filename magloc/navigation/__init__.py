@@ -1,1 +1,1 @@
-"""What navigation measures beside the readings."""
+"""Navigation: poses, velocities and rates that are measured beside the readings."""

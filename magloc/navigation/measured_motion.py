@@ -23,7 +23,7 @@ _KINDS = (("v", "m_s", 1.0), ("w", "deg_s", np.pi / 180.0))
 
 @dataclass(frozen=True, eq=False)
 class MeasuredMotion:
-    """How array and object move; what is not measured is zero, with the standard deviation zero.
+    """Motion of array and object; unmeasured parts are zero, with zero standard deviation.
 
     Attributes
     ----------
@@ -69,7 +69,7 @@ class MeasuredMotion:
         return MeasuredMotion(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     def of_steps(self) -> MeasuredMotion:
-        """Of the steps that lead to the rows: the mean of both of their ends; the first row has none before it."""
+        """Return the motion of the steps to the rows: means of both ends; the first step is empty."""
         before = np.maximum(np.arange(len(self)) - 1, 0)
         values = [getattr(self, field.name) for field in fields(self)]
         means = [0.5 * (value[before] + value) for value in values[:2]]

@@ -100,7 +100,7 @@ class MomentModel:
 
     @property
     def is_linear(self) -> bool:
-        """Whether the readings are linear in the state."""
+        """True if the readings are linear in the state."""
         return not (self.path_error.sigma.size or self.rows[0].model.array.channel_is_scalar.any())
 
     @cached_property

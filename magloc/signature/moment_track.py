@@ -34,7 +34,7 @@ from magloc.tracking.motion import N_SOURCE
 from magloc.tracking.results import TrackPoint, warn_of_strengths
 from magloc.tracking.rows import rows_of
 from magloc.tracking.track import TURN_RAD_S, TrackColumns
-from magloc.tracking.whole_records.smoother import smooth_states
+from magloc.tracking.whole_records.smoother import states_of
 from magloc.truth import Truth, truth_of_rows
 
 EXACT = PathError()
@@ -121,7 +121,7 @@ class MomentTrack(TrackColumns):
 
     @property
     def misfit(self) -> bool:
-        """Whether χ² is so large that noise explains it once in a million (no such dipole)."""
+        """True if χ² is so large that noise explains it once in a million (no such dipole)."""
         return bool(is_misfit(self.chi2, self.dof))
 
     @np.errstate(over="ignore", divide="ignore", invalid="ignore")
@@ -366,7 +366,7 @@ def goodness_of_fit(model: MomentModel, steps: Sequence[MomentStep]) -> tuple[fl
 
 def _points(model: MomentModel, steps: Sequence[MomentStep], k: int, *, smooth: bool) -> list[TrackPoint]:
     """Return the points of the track of source k, from the filter or from the smoother."""
-    states = smooth_states(steps) if smooth else [(step.x, step.S) for step in steps]
+    states = states_of(steps, smooth=smooth)
     array = model.rows[0].model.array
     # S_0: covariance propagated from the start without measurements; MeasureS is relative to it.
     x_0, open_loop = model.start()
@@ -407,6 +407,6 @@ def _covariances_at(model: MomentModel, moment_Am2: FloatArray, *, smooth: bool)
         state[model.moment] = np.linalg.lstsq(model.basis.M[i], moment, rcond=None)[0]
         at.append(state)
     steps = filter_rows(model, at=at, gate=False)
-    states = smooth_states(steps) if smooth else [(step.x, step.S) for step in steps]
+    states = states_of(steps, smooth=smooth)
     roots = [(model.sources_jacobian(i, x)[0] @ S)[3:] for i, (x, S) in enumerate(states)]
     return np.array([root @ root.T for root in roots])

@@ -203,7 +203,7 @@ class Signature(Result):
 
     @property
     def misfit(self) -> bool:
-        """Whether χ² is so large that noise explains it once in a million (no such moment)."""
+        """True if χ² is so large that noise explains it once in a million (no such moment)."""
         return bool(is_misfit(self.chi2, self.dof))
 
     def moment(self, heading_deg: ArrayLike, ambient_T: ArrayLike | None = None) -> tuple[FloatArray, FloatArray]:

@@ -10,7 +10,7 @@ from magloc.truth import TRUE_POSITION_COLUMNS
 
 
 def json_of_survey(found: Survey) -> dict[str, Any]:
-    """What ``magloc survey --json`` prints."""
+    """Return what ``magloc survey --json`` prints."""
     return {
         "targets": found.entries,
         "rows": len(found.rows.time_s),

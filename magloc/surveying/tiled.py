@@ -37,7 +37,7 @@ Tell = Callable[[str], None]
 
 @dataclass(frozen=True, eq=False)
 class TiledSurvey:
-    """All rows in tiles, and the sources that are known so far.
+    """Rows of a survey in tiles, and the sources that are known so far.
 
     Attributes
     ----------

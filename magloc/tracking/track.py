@@ -34,7 +34,7 @@ from magloc.tracking.tracker import Tracker
 from magloc.tracking.whole_records.background import track_on_background
 from magloc.tracking.whole_records.body_errors import body_factor
 from magloc.tracking.whole_records.constants import constants_test
-from magloc.tracking.whole_records.posterior_bound import posterior_bound, smoothing_bound
+from magloc.tracking.whole_records.posterior_bound import posterior_bound
 from magloc.tracking.whole_records.smoother import smooth_points
 from magloc.truth import Truth, truth_of_rows
 
@@ -261,9 +261,8 @@ class Track(TrackColumns):
         known = self.readings.motion is None
         if known and moment_Am2 is not None and np.isfinite(position_m).all() and np.isfinite(moment_Am2).all():
             # Later rows lower the bound.
-            bound_of = smoothing_bound if self.is_smoothed else posterior_bound
             with suppress(np.linalg.LinAlgError), np.errstate(over="ignore", divide="ignore", invalid="ignore"):
-                bound = bound_of(self.tracker, self._rows, position_m, moment_Am2)
+                bound = posterior_bound(self.tracker, self._rows, position_m, moment_Am2, smooth=self.is_smoothed)
             if bound is not None and np.isnan(bound).any():  # overflow at the truth
                 bound = None
         return consistency(self, self.tracker, self._rows, position_m, moment_Am2, bound)

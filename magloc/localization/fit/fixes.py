@@ -138,7 +138,7 @@ class Fixes(Result, Sequence[Fix]):
 
     @cached_property
     def solved(self) -> BoolArray:
-        """Whether a row has a solution (n,)."""
+        """Rows with a solution (n,)."""
         return self._edges[1:] > self._edges[:-1]
 
     @property
@@ -182,7 +182,7 @@ class Fixes(Result, Sequence[Fix]):
 
     @property
     def misfit(self) -> BoolArray:
-        """Whether χ² is far beyond noise (n,)."""
+        """Rows whose χ² is far beyond noise (n,)."""
         result = np.zeros(len(self), dtype=bool)
         begin = self._edges[:-1][self.solved]
         every = self.solutions

@@ -58,7 +58,7 @@ class JointFits:
 
     @property
     def converged(self) -> NDArray[np.bool_]:
-        """Whether the iteration ended at an optimum, shape (...)."""
+        """Fits whose iteration ended at an optimum, shape (...)."""
         return np.isfinite(self.chi2)
 
     def rows(self, index: Any) -> JointFits:
@@ -233,7 +233,7 @@ def refine(
 
 
 def _has_kernel(problem: WhitenedModel, free: NDArray[np.bool_]) -> bool:
-    """Whether kernels can refine this problem.
+    """Return whether kernels can refine this problem.
 
     They refine sources of free moments by vector sensors, and one of free direction by any sensors.
     """

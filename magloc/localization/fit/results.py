@@ -71,7 +71,7 @@ class Source:
 
     @property
     def range_observable(self) -> bool:
-        """Whether the 95 % set of ranges is closed, with ends within a factor of two."""
+        """True if the 95 % set of ranges is closed, with ends within a factor of two."""
         return is_observable_set(self.range_interval_m)
 
     def __repr__(self) -> str:
@@ -123,7 +123,7 @@ class Solution:
 
     @property
     def misfit(self) -> bool:
-        """Whether χ², known moments included, is far beyond noise."""
+        """True if χ², known moments included, is far beyond noise."""
         return bool(is_misfit(self.chi2 + self.known_chi2, self.dof + self.n_known))
 
     @property
@@ -150,12 +150,12 @@ class Solution:
 
     @property
     def range_observable(self) -> bool:
-        """Whether the range of the only source is known."""
+        """True if the range of the only source is known."""
         return self.source.range_observable
 
     @property
     def gaussian(self) -> bool:
-        """Whether the covariance of the only source describes its uncertainty."""
+        """True if the covariance of the only source describes its uncertainty."""
         return self.source.gaussian
 
     def __repr__(self) -> str:
@@ -164,7 +164,7 @@ class Solution:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Fix:
-    """All distinct solutions of one set of readings.
+    """Distinct solutions of one set of readings.
 
     Attributes
     ----------
@@ -228,7 +228,7 @@ class Fix:
 
     @property
     def misfit(self) -> bool:
-        """Whether χ² is far beyond noise, so that neither position nor σ can be trusted."""
+        """True if χ² is far beyond noise, so that neither position nor σ can be trusted."""
         return bool(self.solutions) and self.solutions[0].misfit
 
     def __repr__(self) -> str:

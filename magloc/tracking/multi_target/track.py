@@ -58,7 +58,7 @@ class SourcesTrack(TrackRows[SourcesPoint]):
 
     @cached_property
     def ids(self) -> tuple[int, ...]:
-        """All ids, in the order in which the sources were first reported."""
+        """Ids of all sources, in the order in which they were first reported."""
         return tuple(sorted({track.id for point in self for track in point.tracks}))
 
     @property

@@ -13,7 +13,6 @@ from dataclasses import replace
 import numpy as np
 
 from arrays.typing import FloatArray
-from magloc.chi_square import error_factor
 from magloc.fields.multipole import DEFAULT_LENGTH, N_BODY_ERRORS, finite_body_errors
 from magloc.measurement.differences import fields_at_sensors
 from magloc.tracking.measurement import RowMeasurement
@@ -22,7 +21,7 @@ from magloc.tracking.results import TrackPoint
 from magloc.tracking.rows import Row
 from magloc.tracking.tracker import Tracker
 from magloc.tracking.whole_records.background import steps_of
-from magloc.tracking.whole_records.constants import placed_rows
+from magloc.tracking.whole_records.constants import neglected_error_factor, placed_rows
 
 # Largest number of rows, the latest: more rows change the error little.
 _MOST_ROWS = 200
@@ -37,14 +36,13 @@ def body_factor(tracker: Tracker, rows: Sequence[Row], points: Sequence[TrackPoi
     source from a sensor.
     """
     used = placed_rows(points)[-_MOST_ROWS:]
-    source = {i: np.concatenate([points[i].position_m, points[i].moment_Am2]) for i, _ in used}
-    measured = {i: tracker.measurements.of(rows[i]) for i in source}
-    seen = {i: measurement for i, measurement in measured.items() if measurement.z.size}
+    measured = ((tracker.measurements.of(rows[row.index]), row.source) for row in used)
+    seen = [(measurement, source) for measurement, source in measured if measurement.z.size]
     if not seen:
         return math.nan
-    length_m = DEFAULT_LENGTH * min(_nearest_m(measurement, source[i]) for i, measurement in seen.items())
-    errors = {i: _errors(measurement, source[i], length_m) for i, measurement in seen.items()}
-    if not any(np.sum(columns**2) * len(errors) > _NEGLIGIBLE for columns in errors.values()):
+    length_m = DEFAULT_LENGTH * min(_nearest_m(*of_row) for of_row in seen)
+    errors = [_errors(*of_row, length_m) for of_row in seen]
+    if not any(np.sum(columns**2) * len(errors) > _NEGLIGIBLE for columns in errors):
         return 1.0
     wider, own = copy.copy(tracker), tracker.errors
     none, n = np.zeros(N_BODY_ERRORS), tracker.motion.n_states + tracker.n_errors
@@ -55,14 +53,10 @@ def body_factor(tracker: Tracker, rows: Sequence[Row], points: Sequence[TrackPoi
         walk=np.concatenate([own.walk, none]),
     )
     rest = np.zeros(tracker.motion.n_states - N_SOURCE + wider.n_errors)
-    steps = steps_of(
-        wider,
-        [replace(seen[i], effect=np.concatenate([seen[i].effect, errors[i]], axis=1)) for i in seen],
-        [np.concatenate([source[i], rest]) for i in seen],
-    )
-    S = steps[-1].S
-    shift = S[:N_SOURCE] @ np.linalg.pinv(S[n : n + N_BODY_ERRORS])  # by errors that are taken for zero
-    return float(error_factor(used[-1][1], shift @ shift.T))
+    effects = [np.concatenate([row.effect, columns], axis=1) for (row, _), columns in zip(seen, errors, strict=True)]
+    with_bodies = [replace(row, effect=effect) for (row, _), effect in zip(seen, effects, strict=True)]
+    S = steps_of(wider, with_bodies, [np.concatenate([source, rest]) for _, source in seen])[-1].S
+    return neglected_error_factor(used[-1].covariance, S, S[n : n + N_BODY_ERRORS])
 
 
 def _nearest_m(measurement: RowMeasurement, source: FloatArray) -> float:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -61,8 +61,8 @@ def constants_test(tracker: Tracker, rows: Sequence[Row], points: Sequence[Track
         return ConstantsTest()
     wider = Tracker(array, tracker.motion, background=tracker.background)
     rest = np.zeros(wider.motion.n_states - N_SOURCE + wider.n_errors)
-    states = [np.concatenate([points[i].position_m, points[i].moment_Am2, rest]) for i, _ in used]
-    steps = iterate_steps(wider, [rows[i] for i, _ in used], states)
+    states = [np.concatenate([row.source, rest]) for row in used]
+    steps = iterate_steps(wider, [rows[row.index] for row in used], states)
     if steps is None:
         return ConstantsTest()
     errors, own = wider.pose_errors, tracker.pose_errors
@@ -71,11 +71,8 @@ def constants_test(tracker: Tracker, rows: Sequence[Row], points: Sequence[Track
     mounting = math.nan if own.is_of_mounting.any() else _score(*of_errors, errors.is_of_mounting)
     if own.is_of_field.any() or not errors.is_of_field.any():
         return ConstantsTest(mounting)
-    claimed, source, field = used[-1][1], steps[-1].S[:N_SOURCE], of_errors[1][errors.is_of_field]
-    shift = source @ np.linalg.pinv(field)  # of the source by neglected errors of unit variance
-    return ConstantsTest(
-        mounting, _score(*of_errors, errors.is_of_field), float(error_factor(claimed, shift @ shift.T))
-    )
+    factor = neglected_error_factor(used[-1].covariance, steps[-1].S, of_errors[1][errors.is_of_field])
+    return ConstantsTest(mounting, _score(*of_errors, errors.is_of_field), factor)
 
 
 def _with_constants(array: SensorArray) -> SensorArray:
@@ -104,16 +101,37 @@ def _score(x: FloatArray, S: FloatArray, which: BoolArray) -> float:
     return float(min(-ndtri(max(chdtrc(int(known.sum()), square), 1e-300)), 37.0))
 
 
-def placed_rows(points: Sequence[TrackPoint]) -> list[tuple[int, FloatArray]]:
-    """Return the rows of the last track with a Cartesian Gaussian, and its covariance (6, 6)."""
+def neglected_error_factor(claimed: FloatArray, S: FloatArray, errors: FloatArray) -> float:
+    """Return the ratio of the rms error of a source to its standard deviation, if errors count as zero.
+
+    The source has the covariance `claimed` (6, 6) then. With errors of unit variance as states, S (n, n) is the root of
+    the covariance of all states, and `errors` (k, n) are its rows of these errors.
+    """
+    shift = S[:N_SOURCE] @ np.linalg.pinv(errors)
+    return float(error_factor(claimed, shift @ shift.T))
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedRow:
+    """Index of a row whose source is a Cartesian Gaussian, with mean (6,) and covariance (6, 6)."""
+
+    index: int
+    source: FloatArray
+    covariance: FloatArray
+
+
+def placed_rows(points: Sequence[TrackPoint]) -> list[PlacedRow]:
+    """Return the rows of the last track whose source is a Cartesian Gaussian."""
     known = [i for i, point in enumerate(points) if point.is_on_track]
     begin = max((i for i in known if points[i].status == "acquired" or i == known[0]), default=0)
-    return [(i, P) for i in known if i >= begin and (P := _placed_covariance(points[i])) is not None]
+    found = (_placed_row(i, points[i]) for i in known if i >= begin)
+    return [row for row in found if row is not None]
 
 
-def _placed_covariance(point: TrackPoint) -> FloatArray | None:
-    """Return the covariance of a point that is a Cartesian Gaussian, otherwise None."""
-    if point.covariance is None or point.position_m is None or point.centroid_m is None:
+def _placed_row(index: int, point: TrackPoint) -> PlacedRow | None:
+    """Return a row whose source is a Cartesian Gaussian, otherwise None."""
+    if point.covariance is None or point.position_m is None or point.moment_Am2 is None or point.centroid_m is None:
         return None
-    error = relative_range_sigma(point.covariance, point.position_m - point.centroid_m)
-    return point.covariance if error <= START_RANGE_ERROR else None
+    if not relative_range_sigma(point.covariance, point.position_m - point.centroid_m) <= START_RANGE_ERROR:
+        return None
+    return PlacedRow(index, np.concatenate([point.position_m, point.moment_Am2]), point.covariance)

@@ -13,37 +13,25 @@ from magloc.tracking.results import Step
 from magloc.tracking.rows import Row
 from magloc.tracking.tracker import Tracker
 from magloc.tracking.whole_records.background import steps_of
-from magloc.tracking.whole_records.smoother import smooth_states
+from magloc.tracking.whole_records.smoother import states_of
 
 
 def posterior_bound(
-    tracker: Tracker, rows: Sequence[Row], position_m: FloatArray, moment_Am2: FloatArray
+    tracker: Tracker, rows: Sequence[Row], position_m: FloatArray, moment_Am2: FloatArray, *, smooth: bool = False
 ) -> FloatArray:
-    """Return the posterior Cramér-Rao bound of each row's position, by rows up to it.
+    r"""Return the posterior Cramér-Rao bound of each row's position, by rows up to it, or by all rows if `smooth`.
 
     The bound (n,) [m] is the root of the trace for the position. It begins with the first row that shows a source, and
     is infinite before. The prior is that of a tracker (:func:`magloc.tracking.chart.start.prior_root`). Lasting errors
     of the sensors are unknowns with their standard deviations. Speed and turn rate are those of the truth.
-    """
-    bounds = np.full(len(rows), np.inf)
-    for step in _steps_at_truth(tracker, rows, position_m, moment_Am2):
-        bounds[step.row] = float(np.linalg.norm(step.S[:3]))
-    return bounds
 
-
-def smoothing_bound(
-    tracker: Tracker, rows: Sequence[Row], position_m: FloatArray, moment_Am2: FloatArray
-) -> FloatArray:
-    r"""Return the posterior Cramér-Rao bound of each row's position, by all rows.
-
-    It is the diagonal block of the inverse information of all states together (Šimandl, Královec and Tichavský 2001),
-    by the recursion of Rauch, Tung and Striebel from the last row backwards:
-    :math:`P_{j|n} = P_j + G (P_{j+1|n} - P_{j+1|j}) G^T` with :math:`G = P_j F^T P_{j+1|j}^{-1}`. It is infinite in
-    the same rows as :func:`posterior_bound`, because a track that has not begun is not smoothed.
+    By all rows it is the diagonal block of the inverse information of all states together (Šimandl, Královec and
+    Tichavský 2001), by the recursion of Rauch, Tung and Striebel from the last row backwards:
+    :math:`P_{j|n} = P_j + G (P_{j+1|n} - P_{j+1|j}) G^T` with :math:`G = P_j F^T P_{j+1|j}^{-1}`.
     """
     bounds = np.full(len(rows), np.inf)
     steps = _steps_at_truth(tracker, rows, position_m, moment_Am2)
-    for step, (_, S) in zip(steps, smooth_states(steps), strict=True):
+    for step, (_, S) in zip(steps, states_of(steps, smooth=smooth), strict=True):
         bounds[step.row] = float(np.linalg.norm(S[:3]))
     return bounds
 

@@ -30,6 +30,11 @@ def smooth_points(points: list[TrackPoint], steps: list[Step]) -> list[TrackPoin
     return result
 
 
+def states_of(steps: Sequence[Step], *, smooth: bool) -> list[tuple[FloatArray, FloatArray]]:
+    """Return the state of each step and the root of its covariance, by earlier rows, or by all if `smooth`."""
+    return smooth_states(steps) if smooth else [(step.x, step.S) for step in steps]
+
+
 def smooth_states(steps: Sequence[Step]) -> list[tuple[FloatArray, FloatArray]]:
     """Return the smoothed state of every step, and the root of its covariance."""
     found: list[tuple[FloatArray, FloatArray]] = []

@@ -24,7 +24,7 @@ from magloc.readings import Readings, read_readings
 from magloc.tracking.motion import OrnsteinUhlenbeck, RandomWalk
 from magloc.tracking.rows import rows_of
 from magloc.tracking.tracker import Tracker
-from magloc.tracking.whole_records.posterior_bound import posterior_bound, smoothing_bound
+from magloc.tracking.whole_records.posterior_bound import posterior_bound
 from magloc.tracking.whole_records.smoother import smooth_points
 from magloc.truth import Truth, truth_of_rows
 from tests.command_line import Outcome, Run, assert_refused, refuse_constant, results_of
@@ -245,8 +245,8 @@ class TestTruth:
         table, (_, p, m) = read_readings(readings, tracker.array), source()
         rows = list(rows_of(table))
         of_smoother, of_filter = (
-            float(np.sqrt(np.mean(bound(tracker, rows, p, m)[N_EMPTY:] ** 2)))
-            for bound in (smoothing_bound, posterior_bound)
+            float(np.sqrt(np.mean(posterior_bound(tracker, rows, p, m, smooth=smooth)[N_EMPTY:] ** 2)))
+            for smooth in (True, False)
         )
         assert found == pytest.approx(of_smoother, rel=1e-9)
         assert of_smoother < 0.9 * of_filter

@@ -25,7 +25,7 @@ from magloc.tracking.motion import OrnsteinUhlenbeck, RandomWalk
 from magloc.tracking.results import TrackPoint
 from magloc.tracking.rows import Row, rows_of
 from magloc.tracking.tracker import Tracker
-from magloc.tracking.whole_records.posterior_bound import posterior_bound, smoothing_bound
+from magloc.tracking.whole_records.posterior_bound import posterior_bound
 from tests.oracles import derivative, magpylib_field
 
 FloatArray = NDArray[np.float64]
@@ -305,7 +305,7 @@ class TestSmoothingBound(MovingArray):
     def test_of_unknown_motion(self) -> None:
         t, p, m = self.truth()
         rows, rotations, origin = self.rows(t)
-        bounds = smoothing_bound(Tracker(ARRAY, RandomWalk(0.2, 0.05)), rows, p, m)
+        bounds = posterior_bound(Tracker(ARRAY, RandomWalk(0.2, 0.05)), rows, p, m, smooth=True)
         unit = np.repeat([1.0, 100.0], 3)
         J = np.zeros((6 * self.N_ROWS,) * 2)
         for i in range(self.N_ROWS):
@@ -325,7 +325,7 @@ class TestSmoothingBound(MovingArray):
         rows = list(rows_of(Readings(readings, time_s=t)))
         motion = OrnsteinUhlenbeck(0.2, 0.05)
         tracker = Tracker(ARRAY, motion)
-        bounds = smoothing_bound(tracker, rows, p, m)
+        bounds = posterior_bound(tracker, rows, p, m, smooth=True)
         velocity, rest = np.array([-0.2, 0.1, 0.0]), np.zeros(3)
         states = [motion.state_of(np.concatenate([place, m[0]]), velocity, rest) for place in p]
         J = np.zeros((12 * self.N_ROWS,) * 2)

@@ -26,7 +26,7 @@ from magloc.tracking.files import at_rest
 from magloc.tracking.results import TrackPoint
 from magloc.tracking.rows import rows_of
 from magloc.tracking.track import SPEED_M_S, TURN_RAD_S
-from magloc.tracking.whole_records.posterior_bound import posterior_bound, smoothing_bound
+from magloc.tracking.whole_records.posterior_bound import posterior_bound
 from magloc.tracking.whole_records.smoother import smooth_points
 from tests.passing_source import ARRAY, SLOW, moving_source, readings_of
 
@@ -197,8 +197,8 @@ class TestConsistency:
         motion = magloc.OrnsteinUhlenbeck(0.1, 0.02)
         track = magloc.track(ARRAY, READINGS, motion=motion, smooth=smooth)
         found = track.consistency(TRUTH)
-        bound_of = smoothing_bound if smooth else posterior_bound
-        expected = bound_of(magloc.Tracker(ARRAY, motion), list(rows_of(READINGS)), TRUE_M, MOMENT_AM2)
+        tracker, rows = magloc.Tracker(ARRAY, motion), list(rows_of(READINGS))
+        expected = posterior_bound(tracker, rows, TRUE_M, MOMENT_AM2, smooth=smooth)
         np.testing.assert_allclose(found.bound_m, expected, rtol=1e-9)
         np.testing.assert_array_equal(np.isfinite(found.nees), track.tracked)
         mean = found.nees[N_EMPTY:].sum() / found.nees_dof.sum()
