@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import adcs
-from adcs.cli.options import EstimateOptions, ReportOptions, warn
+from adcs.cli.options import EstimateOptions, ReportOptions
 from arrays.io.errors import naming
+from magloc.cli.framework import warn
 
 if TYPE_CHECKING:
     from adcs.io.scenario_files import AttitudeFile
@@ -54,7 +55,7 @@ def estimate(
     record = read_log(telemetry, scenario)
     with naming(str(telemetry)):
         track = adcs.estimate(record, scenario.satellite, sensors=settings)
-    warn(report, track.warnings)
+    warn(track.warnings)
     report.write(_files(track, scenario))
     result = {"results": rows_of(track.columns()), "warnings": [*scenario.warnings, *track.warnings]}
     report.print(result, summary_lines(track))

@@ -225,7 +225,8 @@ def prepare(
     q_gyro = gyro_attitudes(rate, dt_s)
     gaps = sensor_gaps(time_s, read["gyro"])
     hidden = hidden_variance(time_s, record.rate_rad_s, gaps, model.gap_rad_s, model.long_gap_rad_s)
-    hidden += observed_turn_variance(time_s, gaps, hidden, quaternion.rotate(q_gyro, _usual_field(record)))
+    usual_field_T = np.where(_has_usual_length(record)[:, None], record.field_T, np.nan)
+    hidden += observed_turn_variance(time_s, gaps, hidden, quaternion.rotate(q_gyro, usual_field_T))
     at_rest = record.in_first_second & (not moves) & (np.cumsum(hidden) < LOST_RAD**2)
     acceleration = quaternion.rotate(q_gyro, record.acceleration_m_s2)
     drift = max(model.gyro_drift_rad_s, bias_sigma)
@@ -301,13 +302,11 @@ def _lag_s(q_gyro: FloatArray, record: InertialMagneticRecord) -> float:
     Readings with another length than in the first second are left out: a magnet on the sensor turns with it.
     """
     time_s, field_T = record.time_s, record.field_T
-    lengths = np.sqrt(np.einsum("ni,ni->n", field_T, field_T))
-    usual = np.nanmedian(lengths[record.in_first_second])
-    rows = np.flatnonzero(np.isfinite(lengths))
+    rows = np.flatnonzero(is_read(field_T))
     step = float(np.median(record.dt_s))
     rows = rows[:: instants_within(_LAG_EVERY_S, time_s[rows])]
     apart = instants_within(_LAG_WINDOW_S, time_s[rows])
-    good = np.abs(lengths[rows] - usual) < _USUAL_LENGTH * usual
+    good = _has_usual_length(record)[rows]
     most = round(_LONGEST_LAG_S / step)
     changes = np.zeros(most + 1)
     work = core.problem(
@@ -331,11 +330,11 @@ def _lag_s(q_gyro: FloatArray, record: InertialMagneticRecord) -> float:
     return (least + 0.5 * (a - c) / (a - 2.0 * b + c)) * step
 
 
-def _usual_field(record: InertialMagneticRecord) -> FloatArray:
-    """Return readings (n, 3) of the field, NaN where their length is not that of the first second."""
+def _has_usual_length(record: InertialMagneticRecord) -> BoolArray:
+    """Return whether each field (n, 3) is as long as in the first second, within a tenth."""
     lengths = np.sqrt(np.einsum("ni,ni->n", record.field_T, record.field_T))
     usual = median(lengths[record.in_first_second])
-    return np.where((np.abs(lengths - usual) < _USUAL_LENGTH * usual)[:, None], record.field_T, np.nan)
+    return np.asarray(np.abs(lengths - usual) < _USUAL_LENGTH * usual)
 
 
 def _remove_lag(q_gyro: FloatArray, time_s: FloatArray, field_T: FloatArray, lag_s: float) -> FloatArray:

@@ -92,9 +92,13 @@ def transition(F: FloatArray, by_dipole: FloatArray, settings: FilterSettings, d
     for state, acceleration in (("disturbance", np.eye(3)), ("dipole", by_dipole)):
         if state in used.states:
             full[:, 3:6, used.slice_of(state)] = acceleration
-    step = full * dt_s
-    squared = step @ step
-    return np.asarray(np.eye(used.size) + step + squared / 2.0 + squared @ step / 6.0)
+    return third_order_exponential(full * dt_s)
+
+
+def third_order_exponential(A: FloatArray) -> FloatArray:
+    """Return the matrix exponential of matrices (..., n, n) to the third order."""
+    squared = A @ A
+    return np.asarray(np.eye(A.shape[-1]) + A + squared / 2.0 + squared @ A / 6.0)
 
 
 def propagate(record: Record, row: int, state: AttitudeState) -> tuple[FloatArray, FloatArray]:
@@ -219,24 +223,32 @@ def sensor_nis(noise: FloatArray, H: FloatArray, residual: FloatArray, used: Sen
     return nis
 
 
-def joseph_update(P: FloatArray, H: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
+def joseph_update(
+    P: FloatArray, H: FloatArray, residual: FloatArray, K: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
     """Return the correction (runs, N) and the covariance (E - KH) P (E - KH)ᵀ + KKᵀ.
 
-    ``residual`` (runs, k): in units of the noise.
+    ``residual`` (runs, k): in units of the noise. ``K`` (runs, N, k): gain, by default the optimal one.
     """
-    PHt = P @ H.mT
-    K = np.linalg.solve(H @ PHt + np.eye(H.shape[-2]), PHt.mT).mT
+    if K is None:
+        PHt = P @ H.mT
+        K = np.asarray(np.linalg.solve(H @ PHt + np.eye(H.shape[-2]), PHt.mT).mT)
     rest = np.eye(P.shape[-1]) - K @ H
     return (K @ residual[..., None])[..., 0], rest @ P @ rest.mT + K @ K.mT
 
 
 def update_state(
-    record: Record, row: int, state: AttitudeState, settings: FilterSettings
+    record: Record, row: int, state: AttitudeState, settings: FilterSettings, gain: FloatArray | None = None
 ) -> tuple[AttitudeState, FloatArray]:
-    """Update the state by all readings of instant ``row``, without a gate; also return NIS (runs, 4)."""
+    """Update the state by all readings of instant ``row``, without a gate; also return NIS (runs, 4).
+
+    ``gain`` (runs, N, k): gain for the k stacked residuals, by default the optimal one.
+    """
     H, residual = stacked_residuals(record, row, state, settings)
     nis = sensor_nis(H @ state.P @ H.mT + np.eye(H.shape[1]), H, residual, settings.sensors)
-    dx, P = joseph_update(state.P, H, residual)
+    # A sensor without a reading has rows of zeros in H, and must add no noise.
+    K = None if gain is None else gain * (H != 0.0).any(axis=-1)[:, None, :]
+    dx, P = joseph_update(state.P, H, residual, K)
     return replace(apply_error(state, dx, settings.sensors), P=P), nis
 
 

@@ -105,7 +105,7 @@ class FusionPicture:
 
     @property
     def used(self) -> BoolArray:
-        """Whether each fix was used, shape (k,)."""
+        """Return whether each fix was used, shape (k,)."""
         return np.array([outcome is not FixOutcome.REJECTED for outcome in self.outcomes], dtype=np.bool_)
 
 

@@ -117,11 +117,28 @@ class AttitudeTrack(Result):
         return "reference" if self.q_orbital is None else "orbital"
 
     def lines(self, most: int | None = None) -> list[str]:
-        """Return the lines that ``adcs estimate`` prints, then the warnings."""
+        """Return the lines that ``adcs estimate`` prints, then the warnings.
+
+        Parameters
+        ----------
+        most : int, optional
+            Not used: an attitude track has few lines.
+
+        Returns
+        -------
+        list of str
+            Summary of the track, one line each, then the warnings.
+        """
         return [*by_name("adcs.io.estimates:summary_lines")(self), *(f"warning: {text}" for text in self.warnings)]
 
     def columns(self) -> dict[str, Column]:
-        """Return the columns of estimates.csv."""
+        """Return the columns of estimates.csv.
+
+        Returns
+        -------
+        dict of str to column
+            Values of the log's rows by the column's name.
+        """
         return by_name("adcs.io.estimates:estimate_columns")(self)
 
 

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from adcs import quaternion
 from adcs.frames import turned
 from adcs.quaternion import rotate_back
+from arrays.io.errors import check_positive
 from arrays.typing import FloatArray
 from magloc.navigation.rotations import cross_matrix
 
@@ -105,9 +106,7 @@ class WheelControl:
             if gain.shape != (3,) or not np.isfinite(gain).all() or (gain < 0.0).any():
                 raise ValueError(f"Input {name} must be 3 finite numbers from 0 up; instead received {gain.tolist()}.")
             object.__setattr__(self, name, gain)
-        for name in ("torque_limit_Nm", "momentum_limit_Nms"):
-            if not getattr(self, name) > 0.0:
-                raise ValueError(f"Input {name} must be positive; instead received {getattr(self, name)}.")
+        check_positive(torque_limit_Nm=self.torque_limit_Nm, momentum_limit_Nms=self.momentum_limit_Nms)
 
 
 def wheel_control(body: RigidBody, natural_rad_s: float = 0.03, damping: float = 0.8) -> WheelControl:

@@ -29,10 +29,6 @@ NIS_SIZES = dict(zip(SENSORS, (3, 3, 3, 2), strict=True))
 """Degrees of freedom of a sensor's NIS; a direction to the Sun has two."""
 
 
-def _zero_misalignment() -> FloatArray:
-    return np.zeros(3)
-
-
 class _Sensor:
     """Checks of the parameters of all sensors."""
 
@@ -82,7 +78,7 @@ class StarTracker(_Sensor):
     boresight_body: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
     sun_exclusion_rad: float = 0.0
     earth_exclusion_rad: float = 0.0
-    misalignment_rad: FloatArray = field(default_factory=_zero_misalignment)
+    misalignment_rad: FloatArray = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -116,7 +112,7 @@ class Gyro(_Sensor):
     sigma_rad_s: float = math.radians(0.005)
     range_rad_s: float = math.radians(250.0)
     bias_walk_rad_s: float = 0.0
-    misalignment_rad: FloatArray = field(default_factory=_zero_misalignment)
+    misalignment_rad: FloatArray = field(default_factory=lambda: np.zeros(3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +139,7 @@ class Magnetometer(_Sensor):
     sigma_T: float = 250e-9
     range_T: float = 200_000e-9
     bias_walk_T: float = 0.0
-    misalignment_rad: FloatArray = field(default_factory=_zero_misalignment)
+    misalignment_rad: FloatArray = field(default_factory=lambda: np.zeros(3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +167,7 @@ class SunSensor(_Sensor):
     sigma_rad: float = math.radians(0.1)
     heads_body: FloatArray = field(default_factory=lambda: FIVE_HEADS.copy())
     half_field_rad: float = math.radians(45.0)
-    misalignment_rad: FloatArray = field(default_factory=_zero_misalignment)
+    misalignment_rad: FloatArray = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -26,6 +26,11 @@ def hipparcos_catalogue(year: float = DEFAULT_YEAR) -> StarCatalogue:
     year : float
         Julian year of the images.
 
+    Returns
+    -------
+    StarCatalogue
+        Numbers of Hipparcos, directions in the ICRS, and magnitudes.
+
     Raises
     ------
     InputError

@@ -65,6 +65,11 @@ def read_picture(path: str | PathLike[str]) -> FloatArray:
     path : str or path-like
         Colours are averaged.
 
+    Returns
+    -------
+    ndarray, shape (height, width)
+        Grey values as in the file, any unit; the first row is at the top.
+
     Raises
     ------
     InputError
@@ -139,7 +144,7 @@ def find_picture_stars(picture: FloatArray, dark: FloatArray | None = None) -> P
     ``picture``, ``dark`` (height, width): the latter is subtracted. Returns them brightest first.
     """
     values = picture if dark is None else picture - dark
-    level = _neighbourhood_statistic(values, _median)
+    level = _neighbourhood_statistic(values, lambda block: float(np.median(block)))
     above = values - level
     noise = _neighbourhood_statistic(above, _deviation(1.0))
     # Sum with the star's own shape, and its own noise: that of neighbouring pixels may be alike.
@@ -212,7 +217,3 @@ def _deviation(least: float) -> Callable[[FloatArray], float]:
         return max(math.sqrt(float(np.mean(distance[distance <= 5.0 * usual] ** 2))), least)
 
     return deviation
-
-
-def _median(block: FloatArray) -> float:
-    return float(np.median(block))

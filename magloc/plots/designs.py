@@ -10,7 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from scipy.spatial.distance import pdist
 
-from arrays.typing import FloatArray
+from arrays.io.values import accept_seed
+from arrays.typing import FloatArray, Rng
 from magloc.design.evaluation import EVEN, Judgement, range_spread
 from magloc.design.optimise import BEST_START, Design, random_sample
 from magloc.design.regions import Cap
@@ -36,14 +37,15 @@ _TURNS = (0.0, -15.0, 15.0, 90.0, -90.0, 180.0, 75.0, 105.0, -75.0, -105.0, 165.
 _REACH, _ARROW, _ARROW_LABEL, _FLAT = 1.25, 1.2, 1.42, 0.5
 
 
-def design(result: Design, seed: int = 0) -> Figure:
+@accept_seed
+def design(result: Design, rng: Rng = 0) -> Figure:
     """Draw the sensors in their volume, and the 95 % quantile of σ of the range.
 
     Parameters
     ----------
     result : Design
-    seed : int
-        Seed of the random sources for the curves.
+    rng : int or numpy.random.Generator
+        Seed or generator of the sources of the curves.
 
     Examples
     --------
@@ -57,7 +59,7 @@ def design(result: Design, seed: int = 0) -> Figure:
     _draw_scene(scene, result)
     ax = figure.add_axes((0.5, 0.15, 0.205, 0.68))
     relative = figure.add_axes((0.78, 0.15, 0.2, 0.68))
-    sources = random_sample(result.task, _N_SOURCES, np.random.default_rng(seed))
+    sources = random_sample(result.task, _N_SOURCES, np.random.default_rng(rng))
     distances = _distances(result)
     arrays = _judgements(result)
     curves = [range_spread(result.task, judged.array, sources, distances).q95_m for judged in arrays]

@@ -50,7 +50,7 @@ def survey_profiles(found: Survey) -> Figure:
     >>> import magloc
     >>> from dataclasses import replace
     >>> scenario = replace(sims.read_scenario("survey-drone"), duration_s=120.0)
-    >>> field = sims.simulate(scenario, seed=1)
+    >>> field = sims.simulate(scenario, rng=1)
     >>> found = magloc.survey(field.array, field.readings)
     >>> figure = magloc.plots.survey_profiles(found)
     """

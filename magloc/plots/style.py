@@ -54,9 +54,14 @@ class NotebookFigure(Figure):
     """Figure that a notebook shows without pyplot."""
 
     def _repr_png_(self) -> bytes:
-        picture = io.BytesIO()
-        self.canvas.print_figure(picture, format="png", dpi=_SCREEN_DPI)
-        return picture.getvalue()
+        return png(self, _SCREEN_DPI)
+
+
+def png(figure: Figure, dpi: int) -> bytes:
+    """Return the bytes of a figure as a PNG file."""
+    picture = io.BytesIO()
+    figure.canvas.print_figure(picture, format="png", dpi=dpi)
+    return picture.getvalue()
 
 
 def new_figure(height_in: float, *, layout: str | None = "constrained") -> NotebookFigure:

@@ -12,7 +12,7 @@ from matplotlib.tri import Triangulation
 
 from arrays.typing import FloatArray
 from magloc.plots import style
-from magloc.surveying.results import linear_and_most
+from magloc.surveying.results import linear_and_most, neighbour_triangles
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
     from magloc.surveying.results import Survey, Target
 
-_FLAT = 1e-6  # extent across a line, relative to that along it
-_GAP = 3.0  # of the usual distance between places: wider gaps are not filled
 _ACROSS, _UP = "x, east [m]", "y, north [m]"
 
 
@@ -43,7 +41,7 @@ def survey_figure(found: Survey) -> Figure:
     >>> import magloc
     >>> from dataclasses import replace
     >>> scenario = replace(sims.read_scenario("survey-drone"), duration_s=120.0)
-    >>> field = sims.simulate(scenario, seed=1)
+    >>> field = sims.simulate(scenario, rng=1)
     >>> figure = magloc.plots.survey(magloc.survey(field.array, field.readings))
     """
     x, y, _ = found.rows.place_m.T
@@ -72,12 +70,10 @@ def survey_figure(found: Survey) -> Figure:
 def _draw_reach(figure: Figure, ax: Axes, places_m: FloatArray, moments_Am2: FloatArray) -> None:
     """Draw the least moments, interpolated between neighbouring places, on a logarithmic scale."""
     xy = places_m[:, :2]
-    if len(xy) < 3 or np.linalg.matrix_rank(xy - xy.mean(axis=0), rtol=_FLAT) < 2:
-        return  # a single line of places gives no map
-    between = Triangulation(*xy.T)
-    corners = xy[between.triangles]
-    sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
-    between.set_mask((sides > _GAP * np.median(sides)).any(axis=1))
+    corners = neighbour_triangles(xy)
+    if not len(corners):
+        return  # a single line of places has no map
+    between = Triangulation(xy[:, 0], xy[:, 1], corners)
     surface = ax.tripcolor(between, moments_Am2, norm="log", cmap="viridis", shading="gouraud", rasterized=True)
     least, most = float(moments_Am2.min()), float(moments_Am2.max())
     _draw_bar(figure, ax, surface, style.log_ticks(least, most, (1.0,), (1.0, 2.0, 5.0)) or [least, most], "A·m²")

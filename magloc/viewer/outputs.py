@@ -13,10 +13,8 @@ FILM_FORMATS = {".mp4": "MP4", ".gif": "GIF", ".apng": "PNG"}
 
 def check_outputs(html: str | Path | None, png: str | Path | None, movie: str | Path | None = None) -> None:
     """Raise InputError for files that cannot be written, and for a missing browser."""
-    if html is not None:
-        refuse_unwritable(Path(html), "Input html")
-    if png is not None:
-        refuse_unwritable(Path(png), "Input png", ".png")
+    refuse_unwritable(None if html is None else Path(html), "Input html")
+    refuse_unwritable(None if png is None else Path(png), "Input png", ".png")
     if movie is not None:
         _refuse_format(Path(movie))
         refuse_unwritable(Path(movie), "Input movie")

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING
 
 from cyclopts import Parameter
 
-from adcs.cli.options import print_note
 from arrays.io.errors import InputError
-from magloc.cli.framework import Flag, QuietOptions, refuse_outside
+from magloc.cli.framework import Flag, refuse_outside
 from magloc.cli.options import Port, naming_outputs
 from sims.cli.mockup_options import MockupOptions
 from sims.experiments.mockup_settings import METHOD_WORDS
@@ -29,7 +28,7 @@ def check_places(replay: ReplayOptions) -> None:
         check_outputs(replay.html, replay.png)
 
 
-def show_replay(runs: FusionRuns, camera: TableCamera, replay: ReplayOptions, common: QuietOptions) -> None:
+def show_replay(runs: FusionRuns, camera: TableCamera, replay: ReplayOptions) -> None:
     """Show the first drive until Ctrl-C, or write it."""
     from adcs.viewer.drive_page import drive_page
     from magloc.cli.view import written_or_served
@@ -46,7 +45,7 @@ def show_replay(runs: FusionRuns, camera: TableCamera, replay: ReplayOptions, co
         )
 
     written = [str(file) for file in files.values() if file is not None]
-    written_or_served(scene, written, replay.port, quiet=common.quiet, note=print_note)
+    written_or_served(scene, written, replay.port)
 
 
 def drive_of(result: FusionResult, method: str, camera: TableCamera) -> Drive:

@@ -164,6 +164,16 @@ SIMULATED = "magloc simulate weaving --out weaving.csv"
 WEAVING = "sims/magnetics/scenarios/weaving.toml"
 PAPER = ("magloc/convergence/scenarios/paper.toml", "magloc/plots/maps.py", STYLE)
 MAP = "magloc map --out map"
+SURVEY = (
+    "magloc simulate survey-drone --out field.csv --seed 7",
+    "magloc survey field.csv --array field-array.toml --out found",
+)
+SURVEY_SOURCES = (
+    "sims/magnetics/scenarios/survey-drone.toml",
+    "magloc/plots/surveys.py",
+    "magloc/plots/profiles.py",
+    STYLE,
+)
 PICTURES: dict[str, Picture] = {
     "track-weaving.png": OfCommands(
         (
@@ -184,6 +194,8 @@ PICTURES: dict[str, Picture] = {
         ("sims/magnetics/scenarios/three-magnets.toml", "magloc/plots/tracks.py", STYLE),
         widest_px=1420,
     ),
+    "survey-map.png": OfCommands(SURVEY, "found/survey.png", SURVEY_SOURCES),
+    "survey-profiles.png": OfCommands(SURVEY, "found/profiles.png", SURVEY_SOURCES),
     "convergence-paper.png": OfCommands((MAP,), "map/convergence.png", PAPER, widest_px=1420),
     "bounds-reach.png": OfCommands(
         ("magloc bounds --moment-Am2 0 0 100 --accuracy-m 0.5 --out bounds",),
@@ -202,10 +214,11 @@ PICTURES: dict[str, Picture] = {
         ("adcs/plots/complementary.py", STYLE),
     ),
     "residuals-faulty.png": OfPage("sensor-faults", ("magloc/plots/localization.py", STYLE)),
+    "hall-board.png": OfPage("hall-board", ("magloc/plots/tracks.py", STYLE)),
     "background-diver.png": OfPage("background"),
     "distance-of-a-coil.png": OfPage("single-sensor-ranging"),
     "gradient-tensor.png": OfPage("gradient-tensor"),
-    "beating-tissue.png": OfRecording("tests.beating_tissue", ("tests/beating_tissue.py",)),
+    "beating-tissue.png": OfRecording("docs.studies.beating_tissue", ("docs/studies/beating_tissue.py",)),
     "stars-identified.png": OfPage("star-identification"),
     "view-array.png": OfCommands(
         (

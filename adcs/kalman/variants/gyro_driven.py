@@ -12,7 +12,14 @@ import numpy as np
 
 from adcs import quaternion
 from adcs.kalman.error_state import AttitudeState, AttitudeTracks, FilterSettings, FilterStart
-from adcs.kalman.mekf import check_start, collect_tracks, joseph_update, sensor_nis, stacked_residuals
+from adcs.kalman.mekf import (
+    check_start,
+    collect_tracks,
+    joseph_update,
+    sensor_nis,
+    stacked_residuals,
+    third_order_exponential,
+)
 from adcs.satellite.dynamics import relative_rate
 from adcs.satellite.telemetry import Record, is_read
 from arrays.typing import FloatArray
@@ -70,9 +77,7 @@ def _propagate(q: FloatArray, w: FloatArray, orbital_rate: FloatArray, h: float)
     F = np.zeros((len(q), 6, 6))
     F[:, :3, :3] = -cross_matrix(w)
     F[:, :3, 3:] = -0.5 * np.eye(3)
-    step = F * h
-    squared = step @ step
-    return quaternion.normalised(turned), np.eye(6) + step + squared / 2.0 + squared @ step / 6.0
+    return quaternion.normalised(turned), third_order_exponential(F * h)
 
 
 def _covariance_with_rate(P: FloatArray, gyro_rad_s: float) -> FloatArray:

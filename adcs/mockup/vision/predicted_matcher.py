@@ -19,6 +19,7 @@ from adcs.mockup.vision.similarity import mirrored_image, pairs_of
 from adcs.mockup.vision.triangles import TriangleCatalogue
 from adcs.stars.identification import NoFix
 from arrays.typing import ComplexArray, FloatArray, IntArray
+from magloc.state_space import symmetric_square_root
 
 CENTROID_PX = 0.3
 """Noise of a centroid that a search allows for [px]; what smears more is caught by the least radius."""
@@ -164,13 +165,9 @@ def _fit_of(camera: Camera, pose: Pose) -> tuple[complex, complex]:
 
 
 def _check_covariance(covariance: ArrayLike) -> FloatArray:
-    """Check a covariance of X, Y and heading."""
+    """Return a covariance of X, Y and heading; raise ValueError unless it is positive semidefinite."""
     P = np.asarray(covariance, dtype=np.float64)
     if P.shape != (3, 3) or not np.isfinite(P).all():
         raise ValueError(f"Input covariance must be 3 by 3 finite numbers; instead received shape {P.shape}.")
-    scale = float(np.abs(P).max())
-    if np.abs(P - P.T).max() > 1e-9 * scale or np.linalg.eigvalsh(P)[0] < -1e-9 * scale:
-        raise ValueError(
-            f"Input covariance must be symmetric and positive semidefinite; instead received {P.tolist()}."
-        )
+    symmetric_square_root(P)
     return P

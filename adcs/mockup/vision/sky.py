@@ -12,7 +12,6 @@ The file is TOML::
 
 from __future__ import annotations
 
-import json
 import math
 import warnings
 from dataclasses import dataclass
@@ -24,8 +23,9 @@ from scipy.spatial import Delaunay, QhullError, cKDTree
 
 from arrays.io.errors import naming
 from arrays.io.text import write_text
-from arrays.io.toml import FORMAT_VERSION, File, read_toml, section_of
-from arrays.typing import FloatArray, IntArray
+from arrays.io.toml import FORMAT_VERSION, File, read_toml, section_of, toml_value
+from arrays.io.values import accept_seed, seed_of
+from arrays.typing import FloatArray, IntArray, Rng
 
 FEWEST_LIGHTS = 4
 """Two triangles that agree need as many."""
@@ -162,7 +162,8 @@ def interior_angles(triangles: FloatArray) -> FloatArray:
     return np.arctan2(np.abs(across), np.sum(s * t, axis=-1))
 
 
-def led_sky(seed: int = 0) -> LedSky:
+@accept_seed
+def led_sky(rng: Rng = 0) -> LedSky:
     """Return a random sky of 180 lights, 3.0 × 2.4 m, at least 7 cm apart: 322 Delaunay triangles.
 
     A triangulation of n points, h of them on the hull, has 2n - 2 - h triangles. A random rectangle has about 15 on its
@@ -170,7 +171,8 @@ def led_sky(seed: int = 0) -> LedSky:
 
     Parameters
     ----------
-    seed : int
+    rng : int or numpy.random.Generator
+        Seed or generator of the places.
 
     Examples
     --------
@@ -178,15 +180,16 @@ def led_sky(seed: int = 0) -> LedSky:
     >>> len(mockup.led_sky())
     180
     """
-    rng = np.random.default_rng(seed)
+    seed = seed_of(rng)
+    generator = np.random.default_rng(seed)
     half = 0.5 * np.array(SKY_SIZE_M)
     places = np.empty((N_LIGHTS, 2))
-    places[:N_BORDER_LIGHTS] = _border(half, rng)
+    places[:N_BORDER_LIGHTS] = _border(half, generator)
     found = N_BORDER_LIGHTS
     for _ in range(_MOST_DARTS):
         if found == N_LIGHTS:
             return LedSky(places, f"sky {seed}")
-        dart = rng.uniform(-1.0, 1.0, 2) * ((1.0 - _BULGE) * half - 0.5 * SPACING_M)
+        dart = generator.uniform(-1.0, 1.0, 2) * ((1.0 - _BULGE) * half - 0.5 * SPACING_M)
         if np.min(np.sum((places[:found] - dart) ** 2, axis=1)) >= SPACING_M**2:
             places[found] = dart
             found += 1
@@ -228,7 +231,7 @@ def write_sky(sky: LedSky, path: str | PathLike[str]) -> None:
     rows = [f"    [{x!r}, {y!r}]," for x, y in sky.positions_m.tolist()]
     lines = [
         f"format_version = {FORMAT_VERSION}",
-        f"name = {json.dumps(sky.name, ensure_ascii=False)}",
+        f"name = {toml_value(sky.name)}",
         "positions_m = [  # X and Y in the table's frame",
         *rows,
         "]",

@@ -222,7 +222,7 @@ class SourcesTracker:
                 prior=scene.prior,
                 body_length_m=0.0,
                 exclude_faulty=False,
-                seed=seed,
+                rng=seed,
             )
             fix = locator.fit(row.readings_T, row.ambient_T)
             if not fix.solutions:
