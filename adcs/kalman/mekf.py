@@ -1,7 +1,7 @@
 """Multiplicative extended Kalman filter (MEKF) of attitude and rate.
 
 See docs/theory/attitude-kalman-filters.md. Source: Ivanov, Ivlev, Karpenko, Ovchinnikov, Keldysh Institute preprint 64,
-2014, with the corrections of :mod:`adcs.satellite.dynamics`; the factors 2 (δq is half an angle) are missing there.
+2014. Ours: the corrections of :mod:`adcs.satellite.dynamics`, and the factors 2 (δq is half an angle) missing there.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ from magloc.navigation.rotations import cross_matrix
 _COVARIANCES_A_CALL = 400_000
 """Elements of covariances that one call computes: about ten milliseconds."""
 PATIENCE_S = 300.0
-"""A second hypothesis replaces the main one if that has accepted no reading of the sensor for so long, even if no other
+"""Time without an accepted reading of a sensor after which a second hypothesis replaces the main one, even if no other
 sensor decides between them."""
 PATIENT_READINGS = 10
-"""The same for a gyro's bias, in instants. A main hypothesis that accepts as many readings of that sensor meanwhile is
-kept, and the gap of a sensor is over after as many of its intervals."""
+"""The same for a gyro's bias, in instants. As many accepted readings of that sensor keep the main hypothesis, and as
+many intervals of a sensor end its gap."""
 
 
 def initial_state(settings: FilterSettings, start: FilterStart) -> AttitudeState:
@@ -199,7 +199,7 @@ def stacked_residuals(
 ) -> tuple[FloatArray, FloatArray]:
     """Return H (runs, k, N) and residual (runs, k) of all sensors in units of their noise.
 
-    Both are zero where there is no reading, so that it changes nothing.
+    Both are zero without a reading, so that the update changes nothing.
     """
     sigma = deviations(record, settings)
     H, residual = [], []
@@ -297,10 +297,10 @@ def run_filter(
 ) -> AttitudeTracks:
     """Filter whole runs in compiled code, in parallel over runs.
 
-    ``record``: any number of runs, such as :class:`sims.attitude.simulation.AttitudeRuns`. ``start``: one for each
-    run, by :func:`start_near` or :mod:`adcs.kalman.initialisation`. ``closed_loop_F``: use the Jacobian of the source
-    paper, which supposes that the control knows the true state: its filters are overconfident. Raises ValueError: the
-    start does not have as many runs as the record.
+    ``record``: any number of runs, such as :class:`sims.attitude.simulation.AttitudeRuns`. ``start``: start of each
+    run, from :func:`start_near` or :mod:`adcs.kalman.initialisation`. ``closed_loop_F``: use the Jacobian of the source
+    paper, which assumes that the control knows the true state, so that its filters are overconfident. Raises
+    ValueError if the start does not have as many runs as the record.
     """
     check_start(record, start)
     used, around, readings = settings.sensors, record.environment, record.readings

@@ -29,9 +29,9 @@ from magloc.navigation.rotations import cross_matrix
 def run_reduced(record: Record, settings: FilterSettings, start: FilterStart) -> AttitudeTracks:
     """Run the reduced filter over whole runs.
 
-    ``settings``: a set with a gyro, the state ``gyro-bias`` and no other. Its q_λ and q_g are used; the gyro's noise is
-    added to the attitude. ``start``: only its attitude is used, the rate is the gyro's. Returns: covariance of (δq, δω,
-    δΔω), in which δω is minus the error of the bias, with the gyro's noise.
+    ``settings``: a set with a gyro and the state ``gyro-bias`` alone. Its q_λ and q_g are used; the gyro's noise is
+    added to the attitude. ``start``: only its attitude is used; the rate is that of the gyro. The covariance is that of
+    (δq, δω, δΔω), where δω is minus the error of the bias plus the gyro's noise.
     """
     used = settings.sensors
     if not used.gyro or used.states != ("gyro-bias",):
@@ -93,6 +93,8 @@ def _fill_gaps(values: FloatArray) -> FloatArray:
     """Fill the gaps of readings (runs, n, 3) by the last one before them."""
     seen = is_read(values)
     if not seen[:, 0].all():
-        raise ValueError("Input record must have a reading of the gyro at the first instant of every run.")
+        raise ValueError(
+            "Input record must have a gyro reading at the first instant of every run; instead one has none."
+        )
     last = np.maximum.accumulate(np.where(seen, np.arange(values.shape[1]), 0), axis=-1)
     return np.take_along_axis(values, last[..., None], axis=1)
