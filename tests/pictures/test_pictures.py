@@ -89,7 +89,7 @@ def test_docstrings_and_comments_draw_nothing(tmp_path: Path) -> None:
     path = tmp_path / "figure.py"
     codes = []
     for version in (
-        '"""A\\nmap."""\n\n# Why.\nWIDTH = 7.1\n\ndef draw():\n    """Draw it.\n\n    All.\n    """\n    return "#"\n',
+        '"""A\\nmap."""\n\n# W.\nWIDTH = 7.1\n\ndef draw():\n    """Draw it.\n\n    All.\n    """\n    return "#"\n',
         '"""Map."""\nWIDTH = 7.1\ndef draw():\n    """Draw."""\n    return "#"\n',
         '"""Map."""\nWIDTH = 7.1\ndef draw():\n    """Draw."""\n    return "##"\n',
     ):
