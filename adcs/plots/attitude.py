@@ -23,7 +23,7 @@ _MILLIONTHS = "disturbance"
 """State that is drawn in millionths of its unit."""
 _TRANSIENT = 0.25
 """Part of the time that does not count for limits and shares."""
-_SENSOR_STYLES = ((style.BLACK, "-"), (style.BLUE, "--"), (style.ORANGE, "-."), ("#009e73", ":"))
+_SENSOR_STYLES = ((style.BLACK, "-"), (style.BLUE, "--"), (style.ORANGE, "-."), (style.GREEN, ":"))
 
 
 def sensor_gaps(
@@ -229,7 +229,7 @@ def _draw_nis(ax: Axes, time_s: FloatArray, nis: FloatArray) -> None:
     style.add_legend(ax)
 
 
-_COMPARE_COLOURS = (style.BLACK, style.BLUE, style.ORANGE, "#009e73", "#cc79a7", "#56b4e9")
+_COMPARE_COLOURS = (style.BLACK, style.BLUE, style.ORANGE, style.GREEN, style.PURPLE, style.SKY_BLUE)
 _COMPARE_LINES = ("-", "--", "-.", ":")
 
 

@@ -12,8 +12,9 @@ from matplotlib.lines import Line2D
 
 from adcs.ellipsoids.roll_yaw import ROLL, YAW, KalmanTrack, SetTrack
 from arrays.typing import FloatArray
+from magloc.plots import style
 
-_SET, _KALMAN, _TRUTH = "#0072b2", "#d55e00", "black"
+_SET, _KALMAN, _TRUTH = style.BLUE, style.VERMILION, "black"
 _INSTANTS = 4
 _SET_SHADES = LinearSegmentedColormap.from_list("set", ["#ffffff", _SET, "#00304d"])
 _KALMAN_SHADES = LinearSegmentedColormap.from_list("kalman", ["#ffffff", _KALMAN, "#7a3600"])
@@ -156,8 +157,8 @@ def _draw_bounds(ax: Axes, picture: RollYawPicture) -> None:
 
 def _draw_attitude(ax: Axes, picture: RollYawPicture) -> None:
     roll, yaw = np.degrees(picture.states_rad[0]).T
-    ax.plot(picture.time_s, yaw, color="#009e73", lw=1.2, label="yaw")
-    ax.plot(picture.time_s, roll, color="#cc79a7", lw=1.0, label="roll")
+    ax.plot(picture.time_s, yaw, color=style.GREEN, lw=1.2, label="yaw")
+    ax.plot(picture.time_s, roll, color=style.PURPLE, lw=1.0, label="roll")
     ax.axhline(0.0, color="grey", lw=0.5)
     ax.legend(loc="upper right", frameon=False, fontsize=8, ncols=2)
     ax.set(ylabel="true attitude [°]")

@@ -23,7 +23,7 @@ from arrays.typing import BoolArray, FloatArray
 
 _AXES = (("X", style.BLUE, "-", "o"), ("Y", style.ORANGE, "--", "s"))
 _BODY_AXES = (("x", style.BLUE, "-"), ("y", style.ORANGE, "-"))
-_METHOD_LINES = ((style.ORANGE, "-"), ("#009e73", "-"), (style.BLUE, "-"), (style.GREY, "-"), (style.BLACK, "--"))
+_METHOD_LINES = ((style.ORANGE, "-"), (style.GREEN, "-"), (style.BLUE, "-"), (style.GREY, "-"), (style.BLACK, "--"))
 _BLOCK_S = 1.0
 _MOST_POINTS = 4000
 _FEW_FIXES = 60
@@ -105,7 +105,7 @@ class FusionPicture:
 
     @property
     def used(self) -> BoolArray:
-        """Whether each fix was used, shape (k,)."""
+        """Return whether each fix was used, shape (k,)."""
         return np.array([outcome is not FixOutcome.REJECTED for outcome in self.outcomes], dtype=np.bool_)
 
 

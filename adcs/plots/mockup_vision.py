@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 from arrays.typing import BoolArray, ByteArray, FloatArray, IntArray
 
-_FOUND = "#009e73"
+_FOUND = style.GREEN
 _NONE = style.ORANGE
-_FALSE = "#d55e00"
+_FALSE = style.VERMILION
 _PER_SIDE = 12
 _BRIGHT_DN = 120
 

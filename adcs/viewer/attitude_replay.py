@@ -76,7 +76,7 @@ class AttitudeReplay:
 
     @cached_property
     def known(self) -> BoolArray:
-        """Whether the truth is known in each row, shape (n,)."""
+        """Return whether the truth is known in each row, shape (n,)."""
         return np.asarray(np.isfinite(self.q_true).all(axis=1))
 
     @cached_property

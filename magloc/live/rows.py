@@ -91,7 +91,7 @@ class RowParser:
 
     @property
     def has_header(self) -> bool:
-        """Whether a header of the array has come."""
+        """Return whether a header of the array has come."""
         return self._first is not None
 
     def has_header_of(self, sender: Hashable) -> bool:

@@ -102,7 +102,7 @@ class Senders:
 
     @property
     def is_urgent(self) -> bool:
-        """Whether a good or a new sender waits."""
+        """Return whether a good or a new sender waits."""
         return bool(self._waiting[_GOOD] or self._waiting[_NEW])
 
     def _class_of(self, sender: Hashable) -> int:

@@ -35,6 +35,7 @@ _SCREEN_DPI = 120
 FONT_SIZE = 8.0
 SMALL_FONT_SIZE = 7.0
 BLACK, BLUE, ORANGE = "#000000", "#0072b2", "#e69f00"
+GREEN, VERMILION, PURPLE, SKY_BLUE = "#009e73", "#d55e00", "#cc79a7", "#56b4e9"
 GREY, PALE_GREY, LIGHT_GREY = "#7f7f7f", "#adadad", "#d9d9d9"
 ESTIMATE, TRUTH, BOUND = BLUE, BLACK, ORANGE
 COMPONENTS = (("x", BLACK, "o", "-"), ("y", BLUE, "s", "--"), ("z", ORANGE, "^", ":"))

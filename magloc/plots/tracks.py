@@ -59,7 +59,7 @@ _NARROWEST = 0.2
 # Least span of a coordinate's axis relative to the plan's width: a source at rest must not get ticks of 1 µm.
 _LEAST_HEIGHT = 0.01
 # Okabe and Ito, for colour-blind readers; the first colour is that of estimates.
-_SOURCE_COLOURS = (style.ESTIMATE, style.ORANGE, "#009e73", "#cc79a7", "#56b4e9")
+_SOURCE_COLOURS = (style.ESTIMATE, style.ORANGE, style.GREEN, style.PURPLE, style.SKY_BLUE)
 
 
 def track_figure(

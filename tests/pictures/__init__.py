@@ -7,6 +7,7 @@ pixels differ with fonts, versions and graphics drivers.
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import io
 import json
@@ -258,11 +259,23 @@ OF_NOTEBOOKS = {f"notebook-{name}.png" for name in SHOWN} | {file for file, _ in
 OF_THE_SITE = {f"notebooks/{path.stem}.png" for path in NOTEBOOKS}
 
 
+def code_of(path: Path) -> bytes:
+    """Return the contents of a file, of a Python file without docstrings and comment lines."""
+    if path.suffix != ".py":
+        return path.read_bytes()
+    lines = path.read_text(encoding="utf-8").splitlines()
+    for node in ast.walk(ast.parse("\n".join(lines))):
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
+            end = node.end_lineno or node.lineno
+            lines[node.lineno - 1 : end] = [""] * (end - node.lineno + 1)
+    return "\n".join(line for line in lines if line.strip() and not line.strip().startswith("#")).encode()
+
+
 def fingerprint(picture: Picture) -> str:
     """Checksum of its steps and of the files that decide what is seen."""
     digest = hashlib.sha256("\n".join(picture.steps()).encode())
     for source in picture.sources:
-        digest.update(hashlib.sha256((REPOSITORY / source).read_bytes()).digest())
+        digest.update(hashlib.sha256(code_of(REPOSITORY / source)).digest())
     return digest.hexdigest()
 
 

@@ -14,7 +14,18 @@ from PIL import Image
 import adcs.cli.app
 import magloc.cli.app
 from tests import pictures
-from tests.pictures import DOCS, OF_NOTEBOOKS, OF_THE_SITE, PICTURES, REPOSITORY, OfCommands, Panel, drawn, fingerprint
+from tests.pictures import (
+    DOCS,
+    OF_NOTEBOOKS,
+    OF_THE_SITE,
+    PICTURES,
+    REPOSITORY,
+    OfCommands,
+    Panel,
+    code_of,
+    drawn,
+    fingerprint,
+)
 
 APPS = {"magloc": magloc.cli.app.app, "adcs": adcs.cli.app.app}
 # A picture that a page shows, by a directive, an option of a card, an image of Markdown, or a table of the site.
@@ -72,6 +83,20 @@ class TestInputs:
         with (tmp_path / TRACK.sources[0]).open("a") as scenario:
             scenario.write("seed = 1\n")
         assert fingerprint(TRACK) != before
+
+
+def test_docstrings_and_comments_draw_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "figure.py"
+    codes = []
+    for version in (
+        '"""A\\nmap."""\n\n# W.\nWIDTH = 7.1\n\ndef draw():\n    """Draw it.\n\n    All.\n    """\n    return "#"\n',
+        '"""Map."""\nWIDTH = 7.1\ndef draw():\n    """Draw."""\n    return "#"\n',
+        '"""Map."""\nWIDTH = 7.1\ndef draw():\n    """Draw."""\n    return "##"\n',
+    ):
+        path.write_text(version, encoding="utf-8")
+        codes.append(code_of(path))
+    assert codes[0] == codes[1] == b'WIDTH = 7.1\ndef draw():\n    return "#"'
+    assert codes[2] != codes[1]
 
 
 def test_a_command_draws(tmp_path: Path) -> None:

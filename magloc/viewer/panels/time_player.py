@@ -88,7 +88,7 @@ class TimePlayer:
 
     @property
     def is_playing(self) -> bool:
-        """Whether the time runs."""
+        """Return whether the time runs."""
         return self._thread is not None and not self._stop.is_set()
 
     def move_to(self, time_s: float) -> None:

@@ -267,7 +267,7 @@ class DipoleGlyph:
 
     @property
     def visible(self) -> bool:
-        """Whether the dipole is shown while it is defined."""
+        """Return whether the dipole is shown while it is defined."""
         return self._is_enabled
 
     @visible.setter
@@ -311,7 +311,7 @@ class SurfaceGlyph:
 
     @property
     def visible(self) -> bool:
-        """Whether the surface is shown while it has faces."""
+        """Return whether the surface is shown while it has faces."""
         return self._is_enabled
 
     @visible.setter
