@@ -78,7 +78,7 @@ def main() -> None:
     scenario = replace(scenario, targets=None if given.targets == 0 else targets)
     fields = []
     for seed in range(given.first, given.first + given.seeds):
-        fields.append(judged(sims.simulate(scenario, seed=seed), given.false_per_hectare))
+        fields.append(judged(sims.simulate(scenario, rng=seed), given.false_per_hectare))
         last = fields[-1]
         print(
             f"seed {seed}: found {len(last.pairs)}, missed {[round(chi2) for chi2 in last.missed_chi2]} (χ²),"

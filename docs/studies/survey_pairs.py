@@ -28,7 +28,7 @@ HALF_M, GAP_M, THRESHOLD = 0.7, 0.3, 26.0
 
 def fitted_as_one(scenario: MagneticScenario, seed: int) -> tuple[bool, bool] | None:
     """Whether it is called merged, and whether it is off; None where it is not significant."""
-    field = sims.simulate(scenario, seed=seed)
+    field = sims.simulate(scenario, rng=seed)
     ground = Ground(magloc.SourcePrior(), 0.0, 15.0, THRESHOLD)
     tiled = TiledSurvey.of(*whole_rows(field.array, field.readings), ground)
     places, moments = field.target_position_m, field.target_moment_Am2

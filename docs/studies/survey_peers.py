@@ -135,7 +135,7 @@ def main() -> None:
     assert isinstance(scenario, MagneticScenario)
     scores: dict[str, list[Score]] = {name: [] for name in (*RULES, "magloc.survey")}
     for seed in range(given.first, given.first + given.seeds):
-        field = sims.simulate(scenario, seed=seed)
+        field = sims.simulate(scenario, rng=seed)
         grid = gridded(field)
         peaks = peaks_of(grid)
         for name, rule in RULES.items():

@@ -99,7 +99,7 @@ class TestEstimate:
         assert attitude.sigma_deg[79, 0] > attitude.sigma_deg[59, 0]
 
     @pytest.mark.parametrize(
-        ("sensors", "what"), [("sun+gyro", "observe attitude"), ("mag+sun", "no reading of the Sun sensor")]
+        ("sensors", "what"), [("sun+gyro", "observe attitude"), ("mag+sun", "must have readings of the Sun sensor")]
     )
     def test_misuse(self, flight, sensors, what):
         scenario, _, log = flight

@@ -78,5 +78,5 @@ class TestEitherKind:
         runs = sims.simulate(replace(sims.read_scenario("tabletsat"), duration_s=5.0), [1, 2])
         assert isinstance(runs, AttitudeRuns)
         assert runs.q.shape == (2, 6, 4)
-        with pytest.raises(ValueError, match="one number"):
+        with pytest.raises(ValueError, match="one seed"):
             sims.simulate(sims.read_scenario("paper"), [1, 2])

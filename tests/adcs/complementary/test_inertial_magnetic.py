@@ -322,7 +322,7 @@ class TestInput:
         good, time_s = np.ones((200, 3)), DT * np.arange(200)
         with pytest.raises(ValueError, match="time_s must ascend, two instants or more"):
             InertialMagneticRecord(0.0 * time_s, good, good, good)
-        with pytest.raises(ValueError, match="time_s must last a second at least"):
+        with pytest.raises(ValueError, match="time_s must cover a second at least"):
             InertialMagneticRecord(time_s[:50], good[:50], good[:50], good[:50])
         with pytest.raises(ValueError, match="field_T must be finite, of shape"):
             InertialMagneticRecord(time_s, good, good, np.full((200, 3), np.inf))

@@ -48,7 +48,7 @@ def readings(array: SensorArray, n: int, seed: int, moment: np.ndarray | None = 
 
 @pytest.fixture(scope="module")
 def detector() -> MatchedFilterDetector:
-    return MatchedFilterDetector.of(ARRAY, 2e-2, n_draws=6_000, seed=3)
+    return MatchedFilterDetector.of(ARRAY, 2e-2, n_draws=6_000, rng=3)
 
 
 class TestEnergyThreshold:
@@ -181,7 +181,7 @@ class TestMatchedFilter:
         assert detector.detects(readings(ARRAY, 500, 11)).sum() < 26
 
     def test_seed_makes_the_threshold(self):
-        a, b, c = (MatchedFilterDetector.of(ARRAY, 0.1, n_draws=500, seed=seed).threshold for seed in (3, 3, 4))
+        a, b, c = (MatchedFilterDetector.of(ARRAY, 0.1, n_draws=500, rng=seed).threshold for seed in (3, 3, 4))
         assert a == b != c
 
 

@@ -28,8 +28,8 @@ from magloc.tracking.chart.mixture import component_moments
 from magloc.tracking.coordinates import Chart
 from magloc.tracking.measurement import RowMeasurement
 from magloc.tracking.motion import CoordinatedTurn, KnownMotion, MotionModel, OrnsteinUhlenbeck, RandomWalk
-from magloc.tracking.row_filter import LEAST_SHARE, Gaussians, Rows
-from magloc.tracking.rows import Row
+from magloc.tracking.row_filter import LEAST_SHARE, Gaussians
+from magloc.tracking.rows import Row, Rows
 from magloc.tracking.tracker import Tracker
 from tests.passing_source import MOMENT, NOISE_T, POSITION
 
