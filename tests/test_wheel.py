@@ -102,6 +102,7 @@ class TestWheel:
 
 
 class TestSdist:
+    @pytest.mark.slow
     def test_gives_the_same_wheel(self, unpacked: Path, wheel: dict[str, bytes], tmp_path: Path) -> None:
         again = contents(made("wheel", unpacked, tmp_path))
         assert again.keys() == wheel.keys()

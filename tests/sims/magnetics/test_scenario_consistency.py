@@ -233,13 +233,13 @@ class TestStatedErrors:
 class TestDiver:
     """A buried object at rest, and a moving array: turned axes, wrong gains, drift, 1/f noise, a field of its own."""
 
-    @pytest.mark.parametrize("n_runs", [pytest.param(20, marks=SLOW)])
-    def test_is_consistent(self, n_runs: int) -> None:
+    @SLOW
+    def test_is_consistent(self) -> None:
         """False-alarm rate 1 % for NEES and for NIS, 1.2e-5 for 20 runs that end within 5 σ.
 
         NEES of 20 runs is held to 0.64 to 1.46 at every instant, and NIS to 0.98 to 1.02.
         """
-        result = found(read_scenario("diver"), at_rest, n_runs)
+        result = found(read_scenario("diver"), at_rest, 20)
         assert_nees_inside_bounds(result)
         assert_nis_inside_bounds(result)
         assert_none_is_far(result)
@@ -248,14 +248,14 @@ class TestDiver:
 class TestDrone:
     """A buried object at rest, scalar sensors on a drone with 1/f noise, wrong gains and a field of their own."""
 
-    @pytest.mark.parametrize("n_runs", [pytest.param(10, marks=SLOW)])
-    def test_is_consistent_once_it_has_passed(self, n_runs: int) -> None:
+    @SLOW
+    def test_is_consistent_once_it_has_passed(self) -> None:
         """The last 42 s: false-alarm rate 1 % for NEES and for NIS, 1e-5 for 10 runs that end within 5 σ.
 
         NEES of 10 runs is held to 0.52 to 1.67 of what it is at every instant, and NIS to 0.975 to 1.025. Not held to
         it before: over nine runs (seeds 0 to 8) NEES was 1.3 to 1.6 until the drone had passed, 1.10 to 1.19 then.
         """
-        result = found(read_scenario("drone"), at_rest, n_runs)
+        result = found(read_scenario("drone"), at_rest, 10)
         assert_nees_inside_bounds(result.isel(nees_0=slice(N_INSTANTS // 2, None)), DRONE_NEES)
         assert_nis_inside_bounds(result)
         assert_none_is_far(result)
@@ -264,27 +264,25 @@ class TestDrone:
 class TestUnmatchedPaths:
     """Paths that no random model draws, with the speeds and rates of theirs: the covariance is about right.
 
-    The bounds of NEES are not those of χ²: were its numbers independent, a right filter's mean of 90 of them (three
-    runs at five instants) would be outside 0.6 to 1.4 once in 140, that of 60 once in 35, of 36 once in 11, and that of
-    40 runs or more never. Farther than 5 σ: once in 1.7 million, of each run.
+    The bounds of NEES are not those of χ²: were its numbers independent, a right filter's mean of 60 of them (two runs
+    at five instants) would be outside 0.6 to 1.4 once in 35, and that of 360, the least of the slow sizes, once in a
+    million. Farther than 5 σ: once in 1.7 million, of each run.
     """
 
     @pytest.mark.slow
-    @pytest.mark.parametrize("n_runs", [3, pytest.param(150, marks=SLOW)])
-    def test_weaving(self, n_runs: int) -> None:
+    def test_weaving(self) -> None:
         """Measured over 40 runs (seeds 1000 to 1039): 0.84 of the whole record."""
-        result = found(read_scenario("weaving"), weaving, n_runs)
+        result = found(read_scenario("weaving"), weaving, 150)
         assert 0.6 < nees_of_the_last(result, 5) < 1.4
         assert_none_is_far(result)
 
     @pytest.mark.slow
-    @pytest.mark.parametrize("n_runs", [1, *(pytest.param(n, marks=SLOW) for n in (2, 60))])
-    def test_ship(self, n_runs: int) -> None:
+    def test_ship(self) -> None:
         """The last 30 s, when it has passed: measured 0.9 to 1.1 over 40 runs (seeds 1000 to 1039).
 
         It is not held to this in its first ten seconds, when it comes from far away: there it was 1.7 to 3.3.
         """
-        result = found(read_scenario("ship"), ship, n_runs)
+        result = found(read_scenario("ship"), ship, 20)
         assert 0.6 < nees_of_the_last(result, 3) < 1.4
         assert_none_is_far(result)
 
