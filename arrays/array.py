@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from arrays.columns import LogColumns
 from arrays.pose import PoseUncertainty
-from arrays.sensor import Sensor, _finite, _finite_number, _plain
+from arrays.sensor import Sensor, _finite, _not_negative, _plain
 from arrays.typing import BoolArray, FloatArray, IntArray
 
 AnyArray = TypeVar("AnyArray", bound=NDArray[Any])
@@ -93,11 +93,8 @@ class SensorArray:
         if not (isinstance(self.name, str) and self.name.isprintable()):  # type: ignore[redundant-expr]
             raise ValueError(f"Input name must be one line of printable text; instead received {self.name!r}.")
         for name in ("noise_fraction", "common_field_T", "ambient_uncertainty_T", "ambient_uncertainty_white_T"):
-            value = getattr(self, name)
-            if value is not None:
-                object.__setattr__(self, name, _finite_number(name, value))
-                if value < 0.0:
-                    raise ValueError(f"Input {name} must not be negative; instead received {value}.")
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, _not_negative(name, getattr(self, name)))
         for name in ("ambient_T", "ambient_world_T"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, tuple(_finite(name, getattr(self, name), (3,)).tolist()))

@@ -6,9 +6,11 @@ import math
 from dataclasses import dataclass
 from typing import Annotated
 
+import msgspec
+
 from arrays.io.errors import naming
 from arrays.io.toml import NotNegative, Rule, Table
-from arrays.sensor import _finite, _finite_number
+from arrays.sensor import _finite, _not_negative
 from arrays.typing import Vector
 
 _LARGEST_RAD = math.radians(30.0)
@@ -68,10 +70,8 @@ class PoseUncertainty:
 
     def __post_init__(self) -> None:
         for name in _SIGMAS:
-            value = _finite_number(name, getattr(self, name))
+            value = _not_negative(name, getattr(self, name))
             object.__setattr__(self, name, value)
-            if value < 0.0:
-                raise ValueError(f"Input {name} must not be negative; instead received {value}.")
             if name.startswith("attitude") and not value < _LARGEST_RAD:
                 raise ValueError(f"Input {name} must be below 30°; instead received {math.degrees(value):g}°.")
         object.__setattr__(self, "lever_arm_m", tuple(_finite("lever_arm_m", self.lever_arm_m, (3,)).tolist()))
@@ -96,18 +96,11 @@ class PoseTable(Table, kw_only=True):
 
     def uncertainty(self, place: str) -> PoseUncertainty:
         """What the table states; `place` is for errors."""
+        values = msgspec.structs.asdict(self)
+        for key in ("attitude", "attitude_constant"):
+            values[f"{key}_rad"] = math.radians(values.pop(f"{key}_deg"))
         with naming(place):
-            return PoseUncertainty(
-                position_m=self.position_m,
-                attitude_rad=math.radians(self.attitude_deg),
-                time_s=self.time_s,
-                correlation_s=self.correlation_s,
-                position_constant_m=self.position_constant_m,
-                attitude_constant_rad=math.radians(self.attitude_constant_deg),
-                time_constant_s=self.time_constant_s,
-                lever_arm_m=self.lever_arm_m,
-                position_white_m=self.position_white_m,
-            )
+            return PoseUncertainty(**values)
 
 
 def pose_toml(pose: PoseUncertainty) -> list[str]:

@@ -185,11 +185,8 @@ class Sensor:
             "induced_uncertainty",
             "eddy_uncertainty_s",
         ):
-            if getattr(self, name) is None:
-                continue
-            object.__setattr__(self, name, _finite_number(name, getattr(self, name)))
-            if getattr(self, name) < 0.0:
-                raise ValueError(f"Input {name} must not be negative; instead received {getattr(self, name)}.")
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, _not_negative(name, getattr(self, name)))
         if self.kind == "scalar" and self.misalignment_rad:
             raise ValueError(
                 f"Input misalignment_rad must be 0 for a scalar sensor; instead received {self.misalignment_rad}."
@@ -270,6 +267,13 @@ def _finite_number(name: str, value: float) -> float:
     if _numbers(name, value).ndim != 0:
         raise ValueError(f"Input {name} must be one number; instead received {_plain(value)}.")
     return float(_finite(name, value, ()))
+
+
+def _not_negative(name: str, value: float) -> float:
+    number = _finite_number(name, value)
+    if number < 0.0:
+        raise ValueError(f"Input {name} must not be negative; instead received {number}.")
+    return number
 
 
 def _plain(value: object) -> object:

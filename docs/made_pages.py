@@ -140,8 +140,11 @@ def command_pages() -> Iterator[tuple[str, str]]:
     """Name and page of every command, from the help that the command prints."""
     from adcs.cli.app import app as adcs
     from magloc.cli.app import app as magloc
+    from magloc.cli.framework import use_docstrings
 
     for app in (magloc, adcs):
+        for tokens in ([name, *inner] for name in app for inner in ([], *([other] for other in app[name]))):
+            use_docstrings(app, tokens)
         text = app.generate_docs(output_format="markdown", recursive=True)
         for part in re.split(r"^## (?=(?:magloc|adcs) )", text, flags=re.MULTILINE)[1:]:
             name, _, rest = part.partition("\n")

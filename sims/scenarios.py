@@ -9,7 +9,8 @@ from adcs.io.scenario_files import built_in_scenarios as built_in_satellites
 from adcs.io.scenario_files import read_scenario as read_satellite
 from arrays.io.errors import InputError
 from arrays.io.toml import read_toml
-from arrays.rng import Rng, accept_seed, seed_of
+from arrays.io.values import accept_seed, seed_of
+from arrays.typing import Rng
 from sims.attitude.files import simulation_of
 from sims.attitude.scenario import AttitudeScenario
 from sims.attitude.simulation import AttitudeRuns

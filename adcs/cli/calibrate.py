@@ -10,12 +10,11 @@ import numpy as np
 from cyclopts import Parameter
 
 import adcs
-from adcs.cli.options import naming_options, tell, warn
 from adcs.satellite.magnetometer_calibration import NAMES, Attitude, MagnetometerCalibration
-from arrays.io.errors import naming
+from arrays.io.errors import naming, naming_options
 from arrays.io.outputs import refuse_unwritable
 from arrays.io.tables import by_sigma
-from magloc.cli.framework import Flag, QuietOptions, print_result
+from magloc.cli.framework import Flag, QuietOptions, note, print_result, warn
 
 _UNITS = {"bias": (1e9, "nT"), "gain": (100.0, "percent"), "time": (1.0, "s")}
 _MISFIT = 5.0
@@ -61,10 +60,9 @@ def calibrate(
     """
     from adcs.kalman.error_state import FIELD_ERROR_T
 
-    if out is not None:
-        refuse_unwritable(out, "--out", ".csv")
+    refuse_unwritable(out, "--out", ".csv")
     scenario = adcs.read_scenario(str(config), allow_old_elements=allow_old_elements)
-    with naming_options():
+    with naming(str(config)), naming_options("time_shift_s"):
         prior = adcs.MagnetometerPrior(
             noise_T=scenario.satellite.magnetometer.sigma_T,
             bias_T=1e-9 * scenario.estimate.field_bias_nT,
@@ -79,8 +77,8 @@ def calibrate(
         result = adcs.calibrate_magnetometer(log, scenario.satellite, prior=prior, attitude=attitude)
     if out is not None:
         _write(out, log, result)
-        tell(common, f"wrote {out}")
-    warn(common, warnings_of(result))
+        note(f"wrote {out}")
+    warn(warnings_of(result))
     told = {"warnings": [*scenario.warnings, *warnings_of(result)]}
     print_result(report(result) | told, lines(result, attitude), as_json=json)
 

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import adcs
-from adcs.cli.options import EstimateOptions, ReportOptions, warn
+from adcs.cli.options import EstimateOptions, ReportOptions
 from arrays.io.errors import naming
+from magloc.cli.framework import warn
 
 if TYPE_CHECKING:
     from adcs.io.scenario_files import AttitudeFile
@@ -54,7 +55,7 @@ def estimate(
     record = read_log(telemetry, scenario)
     with naming(str(telemetry)):
         track = adcs.estimate(record, scenario.satellite, sensors=settings)
-    warn(report, track.warnings)
+    warn(track.warnings)
     report.write(_files(track, scenario))
     result = {"results": rows_of(track.columns()), "warnings": [*scenario.warnings, *track.warnings]}
     report.print(result, summary_lines(track))
@@ -71,11 +72,11 @@ def read_log(path: Path, scenario: AttitudeFile) -> adcs.Telemetry:
 
 def _files(track: adcs.AttitudeTrack, scenario: AttitudeFile) -> Iterator[tuple[str, Any]]:
     """Yield the estimates as a table, as messages and as figures."""
-    from adcs.plots.attitude import nis_figure, track_figure
+    from adcs.plots.attitude import attitude_figure, nis_figure
 
     yield "estimates.csv", track.columns()
     utc = adcs.frames.instants(scenario.satellite.start, track.time_s[track.rows])
     yield "attitude.aem", lambda path: adcs.write_aem(path, utc, track.rotation[track.rows].as_quat())
     yield "orbit.oem", lambda path: adcs.write_oem(path, utc, *scenario.satellite.orbit.position_velocity_eci(utc))
-    yield "estimates.png", track_figure(track, scenario.name)
+    yield "estimates.png", attitude_figure(track, scenario.name)
     yield "consistency.png", nis_figure(track, scenario.name)

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import adcs
-from adcs.cli.options import ReportOptions, warn
+from adcs.cli.options import ReportOptions
 from adcs.complementary.names import Magnet
 from arrays.io.errors import naming
-from magloc.cli.framework import Flag
+from magloc.cli.framework import Flag, warn
 
 if TYPE_CHECKING:
     from adcs.io.imu_files import ImuLog
@@ -60,7 +60,7 @@ def imu(
     began = time.perf_counter()
     track = inertial_attitude(log, data, _MAGNETS[method], offline=offline)
     summary: dict[str, Any] = {**imu_summary(track, data), "seconds": time.perf_counter() - began}
-    warn(report, track.warnings)
+    warn(track.warnings)
     if report.out is not None:
         from adcs.plots.inertial import inertial_figure
 

@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import adcs
 import arrays
-from adcs.cli.options import tell, warn
 from arrays.io.errors import naming
 from arrays.io.outputs import refuse_unwritable
-from magloc.cli.framework import Flag, QuietOptions, print_result
+from magloc.cli.framework import Flag, QuietOptions, note, print_result, warn
 
 if TYPE_CHECKING:
     from arrays.typing import FloatArray
@@ -57,19 +56,18 @@ def loads(
     from adcs.io.load_files import channel_columns, read_load_log
     from arrays.io.csv import write_columns
 
-    if out is not None:
-        refuse_unwritable(out, "--out", ".csv")
+    refuse_unwritable(out, "--out", ".csv")
     sensors = arrays.read_array(array)
     log = read_load_log(readings, sensors, [name.strip() for name in loads.split(",") if name.strip()])
     with naming(str(readings)):
         own = adcs.find_own_fields(sensors, log.readings_T, log.time_s, log.gyro_rad_s, log.states, window_s=window_s)
     with naming(str(array)):
         located = own.located() if sensors.n_sensors >= _LEAST_SENSORS else {}
-    warn(common, own.warnings)
+    warn(own.warnings)
     if out is not None:
         clean_nT = 1e9 * own.subtracted(log.readings_T, log.states, log.time_s)
         write_columns(log.columns | dict(zip(channel_columns(sensors), clean_nT.T, strict=True)), out)
-        tell(common, f"wrote {out}")
+        note(f"wrote {out}")
     print_result(report(own, located), lines(own, located), as_json=json)
 
 

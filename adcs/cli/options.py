@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -13,26 +11,9 @@ from cyclopts import Parameter
 
 import adcs
 from adcs.kalman.names import Filter, Noise, StartKind, is_measured
-from arrays.io.errors import InputError
 from arrays.io.outputs import refuse_file, write_files
 from magloc.cli import framework
 from magloc.cli.framework import Count, Flag, QuietOptions  # noqa: F401 - of an inherited option
-
-
-def print_note(text: str) -> None:
-    """Print one line on stderr, whatever the text."""
-    framework.print_note(text, "adcs")
-
-
-def tell(common: framework.QuietOptions, *texts: str) -> None:
-    """Print some lines on stderr, unless it is to be quiet there."""
-    for text in () if common.quiet else texts:
-        print_note(text)
-
-
-def warn(common: framework.QuietOptions, texts: Iterable[str]) -> None:
-    """Print warnings on stderr, unless it is to be quiet there."""
-    tell(common, *(f"warning: {text}" for text in texts))
 
 
 @Parameter(name="*", group="Common options")
@@ -66,20 +47,6 @@ class ReportOptions(QuietOptions):
     def print(self, result: Mapping[str, Any], lines: Sequence[str]) -> None:
         """Print a result as JSON or as text."""
         framework.print_result(result, lines, as_json=self.json)
-
-
-@contextmanager
-def naming_options() -> Iterator[None]:
-    """Say of an option what the library says of the argument of that name."""
-    try:
-        yield
-    except InputError:
-        raise
-    except ValueError as error:
-        said = re.fullmatch(r"Input (\w+) must be (.*); instead received (.*)\.", str(error))
-        if said is None:
-            raise
-        raise InputError(f"--{said[1].replace('_', '-')}: found {said[3]}, expected {said[2]}.") from None
 
 
 @Parameter(name="*")

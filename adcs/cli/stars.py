@@ -191,7 +191,7 @@ def _frames(
         with naming("--scale-arcsec"):
             camera = replace(camera, rad_per_px=rad_per_px)
     ended = [time.perf_counter()]
-    with progress(len(images), "frames", quiet=report.quiet) as advance:
+    with progress(len(images), "frames") as advance:
 
         def done(frames: int) -> None:
             ended.append(time.perf_counter())

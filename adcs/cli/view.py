@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, Any
 import adcs
 from adcs.cli.estimate import read_log
 from adcs.cli.imu import inertial_attitude
-from adcs.cli.options import print_note, warn
 from adcs.io.imu_files import imu_log
 from adcs.io.scenario_files import scenario_of, scenario_table
 from arrays.io.errors import InputError, naming
-from magloc.cli.framework import Flag, QuietOptions
+from magloc.cli.framework import Flag, QuietOptions, warn
 from magloc.cli.options import Port, naming_outputs
 
 if TYPE_CHECKING:
@@ -78,14 +77,12 @@ def view(
     else:
         scenario = scenario_of(*described, allow_old_elements=allow_old_elements)
         track, *made_of, q_true = _of_satellite(log, scenario, truth)
-    warn(common, track.warnings)
+    warn(track.warnings)
     files: dict[str, Any] = {"html": html, "png": png, "movie": movie}
     written_or_served(
         lambda used: adcs.view(track, *made_of, truth=q_true, open=open, port=used, title=log.stem, **files),
         [str(file) for file in files.values() if file is not None],
         port,
-        quiet=common.quiet,
-        note=print_note,
     )
 
 

@@ -70,7 +70,7 @@ class AttitudeTrack(Result):
     ((201, 4), ['attitude', 'rate'])
     """
 
-    figure = "adcs.plots.attitude:track_figure"
+    figure = "adcs.plots.attitude:attitude_figure"
     command = "estimate"
 
     title: str

@@ -380,12 +380,6 @@ def is_number_or_empty(cell: str) -> bool:
     return True
 
 
-def table_text(columns: Mapping[str, FloatArray | IntArray]) -> str:
-    """Return the text of a CSV file of numbers, to nine digits."""
-    rows = np.column_stack(list(columns.values())).tolist()
-    return "\n".join([",".join(columns), *(",".join(f"{value:.9g}" for value in row) for row in rows), ""])
-
-
 Column = NDArray[np.float64] | NDArray[np.int64] | NDArray[np.bool_] | Sequence[str]
 
 

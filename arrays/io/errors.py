@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
@@ -58,6 +59,19 @@ def naming(place: str, **others: object) -> Iterator[None]:
     except ValueError as error:
         sentence = own_sentence(error)
         raise InputError(f"{others.get(sentence.partition(' ')[0], place)}: {sentence}") from None
+
+
+@contextmanager
+def naming_options(*names: str) -> Iterator[None]:
+    """Turn errors of the library about arguments into errors about the options of these names."""
+    try:
+        yield
+    except ValueError as error:
+        parts = re.match(r"Input (\w+)(?: must be (.*); instead received (.*)\.$)?", str(error))
+        if parts is None or parts[1] not in names:
+            raise
+        rest = f": found {parts[3]}, expected {parts[2]}." if parts[2] else str(error)[parts.end() :]
+        raise InputError(f"--{parts[1].replace('_', '-')}{rest}") from None
 
 
 @contextmanager

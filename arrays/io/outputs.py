@@ -28,8 +28,10 @@ def refuse_file(folder: Path | None, option: str) -> None:
     _refuse_closed(place, folder, option)
 
 
-def refuse_unwritable(path: Path, option: str, suffix: str | None = None) -> None:
-    """Refuse, before long work, an output file that cannot be written or has another suffix; it is left alone."""
+def refuse_unwritable(path: Path | None, option: str, suffix: str | None = None) -> None:
+    """Refuse, before long work, an output file that cannot be written or has another suffix."""
+    if path is None:  # nothing is to be written
+        return
     if path.is_dir():
         raise InputError(f"{option} {path}: found a folder, expected a file.")
     if suffix is not None and path.suffix.lower() != suffix:

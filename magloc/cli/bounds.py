@@ -11,20 +11,26 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 import magloc
-from arrays.io.errors import LARGEST, InputError, naming, own_sentence
+from arrays.io.errors import LARGEST, InputError, naming, naming_options, own_sentence
 from arrays.io.outputs import refuse_file, write_file
 from arrays.typing import Vector
-from magloc.cli.framework import CommonOptions, Flag, print_json, progress, refuse_outside, whole_number
-from magloc.cli.options import Grid, array_of_several, naming_options, print_note, refuse_not_positive
+from magloc.cli.framework import (
+    CommonOptions,
+    Flag,
+    note,
+    print_result,
+    progress,
+    refuse_outside,
+    whole_number,
+)
+from magloc.cli.options import Grid, array_of_several, refuse_not_positive
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from arrays.array import SensorArray
     from arrays.typing import FloatArray
-    from magloc.bounds.crlb import Bounds
     from magloc.bounds.maps import BoundScenario, BoundsSummary
-    from magloc.bounds.over_moments import MomentBounds
     from magloc.detection.matched_filter import MatchedFilterDetector
 
 
@@ -36,7 +42,6 @@ _REACH = (1e-4, 1e6)
 _SLICE_GRID = 121
 _STEP_DEG = 5.0
 _FRAMES = 24
-_COMPONENTS = "xyz"
 
 
 @Parameter(name="*", group="Array and source")
@@ -148,6 +153,7 @@ def bounds(
     import numpy as np
 
     from magloc.bounds.over_moments import bounds_over_moments
+    from magloc.bounds.report import BoundsReport
     from magloc.convergence.scenario_files import read_starts_scenario
     from magloc.fields.multipole import assumed_body_lengths
     from magloc.measurement.rows import check_magnitudes
@@ -160,12 +166,13 @@ def bounds(
     radius = _checked(array, place, of, task)
     wanted = _scenario(array, source.moment_Am2 if of.moment_Am2 is None else of.moment_Am2, radius, of, task)
     if array.channel_is_scalar.any() and array.ambient_T is None:
-        print_note("warning: the array has scalar sensors and no ambient_nT, the ambient field is taken to be zero")
+        note("warning: the array has scalar sensors and no ambient_nT: the ambient field counts as 0", always=True)
     length_m = float(assumed_body_lengths(array.positions, place, array.circumradius, wanted.body_length_m))
     if wanted.body_length_m is None and length_m:
-        print_note(
+        note(
             f"note: the source is so near that its size matters: a quarter of its distance, {length_m:.3g} m, is taken;"
-            " --body-length-m says it, 0 a point"
+            " --body-length-m says it, 0 a point",
+            always=True,
         )
     of_source = magloc.cramer_rao_bounds(array, place, wanted.moment_Am2, **wanted.uncertainties)
     over_moments = bounds_over_moments(array, place[None], wanted.moments_Am2, **wanted.uncertainties)
@@ -174,30 +181,21 @@ def bounds(
     folder = Path(f"bounds-{name}-{task.grid}{moment}") if out is None else out
     refuse_file(folder, "--out")
     detector = _detector(array, task.false_alarm_rate, common.seed)
-    counts = _cube(wanted, task.grid, folder, quiet=common.quiet)
-    spheres = _pictures(wanted, detector, task.probability, radius, folder, gif=gif, quiet=common.quiet)
-    if json:
-        print_json(
-            {
-                **_json(of_source, over_moments, spheres, wanted, length_m),
-                **_detection_json(detector, task.probability, spheres),
-                "grid": task.grid,
-                "moments": task.moments,
-                "points": counts.points,
-                "accurate_fraction": counts.fraction,
-                "seconds": counts.seconds,
-                "out": str(folder),
-            }
-        )
-        return
-    print(_table(of_source, over_moments, spheres, wanted))
-    if not common.quiet:
-        print_note(f"{counts.points} sources × {task.moments + 1} moments in {counts.seconds:.2f} s; wrote {folder}/")
+    counts = _cube(wanted, task.grid, folder)
+    spheres = _pictures(wanted, detector, task.probability, radius, folder, gif=gif)
+    result = BoundsReport(of_source, over_moments, spheres, wanted, length_m, detector)
+    of_cube: dict[str, Any] = {"grid": task.grid, "moments": task.moments, "points": counts.points}
+    of_cube |= {"accurate_fraction": counts.fraction, "seconds": counts.seconds, "out": str(folder)}
+    print_result(result.json() | of_cube, result.lines(), as_json=json)
+    if not json:
+        note(f"{counts.points} sources × {task.moments + 1} moments in {counts.seconds:.2f} s; wrote {folder}/")
 
 
 def _checked(array: SensorArray, place: FloatArray, of: SourceOptions, task: TaskOptions) -> float:
     """Radius of the sphere, once the options are known to be in bounds."""
     import numpy as np
+
+    from magloc.bounds.report import plain_vector
 
     refuse_not_positive(task, "range_m", "half_width_m", "accuracy_m", expected="a positive length")
     if not 1e-4 <= task.false_alarm_rate < 0.5:
@@ -217,7 +215,7 @@ def _checked(array: SensorArray, place: FloatArray, of: SourceOptions, task: Tas
         )
     if of.moment_Am2 is not None and not 0.0 < max(map(abs, of.moment_Am2)) <= _LARGEST_AM2:
         raise InputError(
-            f"--moment-Am2: found {_plain(of.moment_Am2)}, expected three finite numbers, not all zero, up to "
+            f"--moment-Am2: found {plain_vector(of.moment_Am2)}, expected three finite numbers, not all zero, up to "
             f"{_LARGEST_AM2:g} A·m²."
         )
     return radius
@@ -227,19 +225,20 @@ def _check_place(array: SensorArray, place: FloatArray) -> None:
     """Refuse a source in a sensor, at the centroid, where range and bearing are none, and beyond all reach."""
     import numpy as np
 
+    from magloc.bounds.report import plain_vector
+
+    found = f"--position: found {plain_vector(place)}"
     if not np.isfinite(place).all():
-        raise InputError(f"--position: found {_plain(place)}, expected three finite numbers.")
+        raise InputError(f"{found}, expected three finite numbers.")
     if not np.abs(place - array.centroid).max() <= _REACH[1] * array.circumradius:
-        raise InputError(
-            f"--position: found {_plain(place)}, expected a place within {_REACH[1] * array.circumradius:.3g} m."
-        )
+        raise InputError(f"{found}, expected a place within {_REACH[1] * array.circumradius:.3g} m.")
     least_m = _LEAST_DISTANCE * array.circumradius
     if np.linalg.norm(place - array.centroid) < least_m:
-        raise InputError(f"--position: found {_plain(place)}, the sensors' centroid, expected a place away from it.")
+        raise InputError(f"{found}, the sensors' centroid, expected a place away from it.")
     distances = np.linalg.norm(place - array.positions, axis=1)
     if distances.min() < least_m:
         sensor = array.sensors[int(distances.argmin())].id
-        raise InputError(f"--position: found {_plain(place)}, at sensor {sensor}, expected a place away from it.")
+        raise InputError(f"{found}, at sensor {sensor}, expected a place away from it.")
 
 
 def _array_of(path: Path) -> SensorArray:
@@ -271,15 +270,15 @@ def _detector(array: SensorArray, false_alarm_rate: float, seed: int) -> Matched
     try:
         return magloc.MatchedFilterDetector.of(array, false_alarm_rate, n_draws=round(100 / false_alarm_rate), rng=seed)
     except ValueError as error:
-        print_note(f"how far a source is found is left out: {own_sentence(error)}")
+        note(f"how far a source is found is left out: {own_sentence(error)}", always=True)
         return None
 
 
-def _cube(task: BoundScenario, grid: int, folder: Path, *, quiet: bool) -> BoundsSummary:
+def _cube(task: BoundScenario, grid: int, folder: Path) -> BoundsSummary:
     """Counts of the cube, computed as far as it is not done."""
     from magloc.bounds.maps import summary
 
-    with progress(grid**3, "sources", quiet=quiet) as advance:
+    with progress(grid**3, "sources") as advance:
         cube = magloc.bound_map(
             task.array,
             task.moment_Am2,
@@ -303,7 +302,6 @@ def _pictures(
     folder: Path,
     *,
     gif: bool,
-    quiet: bool,
 ) -> xr.Dataset:
     """Slices and spheres, as data and as figures; returns the spheres."""
     import numpy as np
@@ -329,117 +327,6 @@ def _pictures(
         write_file(content, folder / name)
     if gif:
         frames = spheres.sel(range=ranges)
-        with progress(_FRAMES, "pictures", quiet=quiet) as advance:
+        with progress(_FRAMES, "pictures") as advance:
             write_bound_animation(frames, task, folder / "bounds.gif", advance)
     return spheres
-
-
-def _json(of: Bounds, over: MomentBounds, spheres: xr.Dataset, task: BoundScenario, length_m: float) -> dict[str, Any]:
-    import numpy as np
-
-    return {
-        "position_m": of.position_m,
-        "moment_Am2": of.moment_Am2,
-        "range_m": float(of.range_m),
-        **({"body_length_m": length_m} if length_m else {}),
-        "rank": int(of.rank),
-        "sigma_position_m": _finite(of.sigma[:3]),
-        "sigma_moment_Am2": _finite(of.sigma[3:]),
-        "sigma_range_m": float(of.sigma_range_m),
-        "sigma_bearing_deg": float(np.degrees(of.sigma_bearing_rad)),
-        "over_moments": {
-            name: dict(zip(_SPREAD, (factor * float(value[0]) for value in spread), strict=True))
-            for name, spread, factor in (
-                ("sigma_range_m", over.sigma_range_m, 1.0),
-                ("sigma_bearing_deg", over.sigma_bearing_rad, float(np.degrees(1.0))),
-            )
-        },
-        "accuracy_m": task.accuracy_m,
-        "accuracy_range_m": _reach(spheres, "accuracy_range"),
-    }
-
-
-def _detection_json(detector: MatchedFilterDetector | None, probability: float, spheres: xr.Dataset) -> dict[str, Any]:
-    if detector is None:
-        return {"detection": None, "detection_range_m": None}
-    return {
-        "detection": {
-            "probability": probability,
-            "false_alarm_rate": detector.false_alarm_rate,
-            "threshold": detector.threshold,
-            "threshold_error": detector.threshold_error,
-        },
-        "detection_range_m": _reach(spheres, "detection_range"),
-    }
-
-
-_SPREAD = ("mean", "median", "q95", "worst_sampled")
-
-
-def _reach(spheres: xr.Dataset, variable: str) -> dict[str, dict[str, float]]:
-    """Least, median and greatest reach over the directions, each with its share of the sphere."""
-    import numpy as np
-
-    from magloc.bounds.maps import CASES
-
-    weights = np.cos(np.radians(spheres["elevation"].to_numpy()))[:, None] * np.ones(spheres.sizes["azimuth"] - 1)
-    result = {}
-    for case, name in zip(CASES, ("moment", *_SPREAD[1:]), strict=True):
-        reach = spheres[f"{variable}{case}"].to_numpy()[:, :-1]  # the last azimuth is the first one again
-        order = np.argsort(reach, axis=None)
-        share = np.cumsum(weights.ravel()[order])
-        middle = order[np.searchsorted(share, 0.5 * share[-1])]
-        result[name] = {
-            "least": float(reach.min()),
-            "median": float(reach.ravel()[middle]),
-            "greatest": float(reach.max()),
-        }
-    return result
-
-
-def _table(of: Bounds, over: MomentBounds, spheres: xr.Dataset, task: BoundScenario) -> str:
-    import numpy as np
-
-    place, moment = _plain(of.position_m), _plain(of.moment_Am2)
-    lines = [
-        f"source at {place} m, moment {moment} A·m², {float(of.range_m):.4g} m from the sensors' centroid",
-        f"{'least σ':<22}" + "".join(f"{name:>10}" for name in _COMPONENTS),
-        f"{'position [m]':<22}" + "".join(f"{value:>10.4g}" for value in of.sigma[:3]),
-        f"{'moment [A·m²]':<22}" + "".join(f"{value:>10.4g}" for value in of.sigma[3:]),
-        "",
-        f"{'least σ':<22}{'given':>10}" + "".join(f"{name:>10}" for name in ("mean", "median", "95 %", "worst")),
-        _row("range [m]", of.sigma_range_m, over.sigma_range_m, 1.0),
-        _row("bearing [°]", of.sigma_bearing_rad, over.sigma_bearing_rad, float(np.degrees(1.0))),
-        *_reach_lines(f"σ of range ≤ {task.accuracy_m:g} m up to", _reach(spheres, "accuracy_range")),
-    ]
-    if "detection_range" in spheres:
-        share = f"{100.0 * spheres.attrs['detection_probability']:g} %"
-        lines += _reach_lines(f"found with {share} up to", _reach(spheres, "detection_range"))
-    if not of.is_regular:
-        lines.insert(
-            4, f"Only {int(of.rank)} of the six combinations of position and moment are estimable: inf = not at all."
-        )
-    return "\n".join(lines)
-
-
-def _reach_lines(title: str, reach: dict[str, dict[str, float]]) -> list[str]:
-    names = ("given moment [m]", "median of moments [m]", "95 % of moments [m]", "worst of those sampled [m]")
-    lines = ["", f"{title:<32}{'least':>10}{'median':>10}{'greatest':>10}"]
-    for name, of_case in zip(names, reach.values(), strict=True):
-        lines.append(f"{name:<32}" + "".join(f"{value:>10.4g}" for value in of_case.values()))
-    return lines
-
-
-def _row(name: str, given: Any, spread: Any, factor: float) -> str:
-    values = [given, *(value[0] for value in spread)]
-    return f"{name:<22}" + "".join(f"{factor * float(value):>10.4g}" for value in values)
-
-
-def _finite(values: Any) -> list[float | None]:
-    import numpy as np
-
-    return [float(value) if np.isfinite(value) else None for value in values]
-
-
-def _plain(vector: Any) -> str:
-    return f"({', '.join(f'{value:g}' for value in vector)})"

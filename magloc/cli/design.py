@@ -16,8 +16,7 @@ import arrays
 import magloc
 from arrays.io.errors import naming
 from arrays.io.outputs import refuse_one_for_two, refuse_unwritable
-from magloc.cli.framework import CommonOptions, Flag, print_json, progress, whole_number
-from magloc.cli.options import print_note
+from magloc.cli.framework import CommonOptions, Flag, note, print_result, progress, whole_number
 
 Sensors = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=1, lte=1000))]
 
@@ -68,12 +67,11 @@ def design(
         return
     refuse_one_for_two({"--out": target, "--png": png})
     refuse_unwritable(target, "--out")
-    if png is not None:
-        refuse_unwritable(png, "--png", ".png")
+    refuse_unwritable(png, "--png", ".png")
     best: list[SensorArray] = []
     begin = time.perf_counter()
     try:
-        with progress(wanted.search.n_steps, "steps", quiet=common.quiet) as advance, naming(task):
+        with progress(wanted.search.n_steps, "steps") as advance, naming(task):
             result = magloc.design_array(wanted, rng=common.seed, progress=advance, better=best.append)
     except KeyboardInterrupt:
         if not best:
@@ -84,16 +82,13 @@ def design(
     arrays.write_array(target, result.array)
     if png is not None:
         magloc.plots.save(result.plot(common.seed), png)
+    print_result(_report(result, target, png, seconds), [*_table(result), "", *_findings(result)], as_json=json)
     if json:
-        print_json(_report(result, target, png, seconds))
         return
-    print("\n".join([*_table(result), "", *_findings(result)]))
-    if not common.quiet:
-        drawn = "" if png is None else f" and {png}"
-        print_note(
-            f"{result.n_converged} of {result.n_descents} refined starts converged, {seconds:.1f} s; wrote"
-            f" {target}{drawn}"
-        )
+    drawn = "" if png is None else f" and {png}"
+    note(
+        f"{result.n_converged} of {result.n_descents} refined starts converged, {seconds:.1f} s; wrote {target}{drawn}"
+    )
 
 
 def _compare_counts(
@@ -106,10 +101,9 @@ def _compare_counts(
     for path in targets:
         refuse_one_for_two({"--out": path, "--png": png})
         refuse_unwritable(path, "--out")
-    if png is not None:
-        refuse_unwritable(png, "--png", ".png")
+    refuse_unwritable(png, "--png", ".png")
     results = []
-    with progress(sum(task.search.n_steps for task in tasks), "steps", quiet=common.quiet) as advance:
+    with progress(sum(task.search.n_steps for task in tasks), "steps") as advance:
         for task, path in zip(tasks, targets, strict=True):
             with naming(task.name):
                 results.append(magloc.design_array(task, rng=common.seed, progress=advance))
@@ -129,15 +123,14 @@ def _compare_counts(
         }
         for result, grid, path in zip(results, grids, targets, strict=True)
     ]
-    if json:
-        print_json({"task": tasks[0].name, "criterion": str(tasks[0].criterion), "counts": rows})
-        return
-    print(f"{tasks[0].criterion} of the range's standard deviation, on independent sources")
-    print(f"{'sensors':>7}{'design_m':>11}{'even_grid_m':>13}{'gain_%':>8}{'±':>5}")
+    lines = [f"{tasks[0].criterion} of the range's standard deviation, on independent sources"]
+    lines.append(f"{'sensors':>7}{'design_m':>11}{'even_grid_m':>13}{'gain_%':>8}{'±':>5}")
     for row in rows:
         gain, error = 100.0 * row["design_gain"], 100.0 * row["design_gain_standard_error"]
         sigma, grid_sigma = _number(row["criterion_m"]), _number(row["even_grid_m"])
-        print(f"{row['sensors']:>7}{sigma:>11}{grid_sigma:>13}{gain:>8.1f}{error:>5.1f}")
+        lines.append(f"{row['sensors']:>7}{sigma:>11}{grid_sigma:>13}{gain:>8.1f}{error:>5.1f}")
+    report = {"task": tasks[0].name, "criterion": str(tasks[0].criterion), "counts": rows}
+    print_result(report, lines, as_json=json)
 
 
 def _report(result: Design, out: Path, png: Path | None, seconds: float) -> dict[str, Any]:

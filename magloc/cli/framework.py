@@ -42,6 +42,8 @@ _warnings: list[str] = []
 # Commands that end when their user or their stream does.
 _ENDLESS = {"live", "view"}
 _FIRST_SIGN_S = 10.0
+# Level of the log between INFO and WARNING: results on stderr, which --quiet keeps.
+_RESULT = 25
 _bars: list[object] = []
 _TOO_LARGE = 10**18
 
@@ -92,10 +94,9 @@ class QuietOptions:
     quiet: Flag = False
 
     def apply(self) -> None:
-        """Limit the threads of compiled code, and what is said."""
-        if self.quiet:
-            for name in PACKAGES:
-                logging.getLogger(name).setLevel(logging.WARNING)
+        """Limit the threads of compiled code, and the notes on stderr."""
+        for name in PACKAGES:
+            logging.getLogger(name).setLevel(_RESULT if self.quiet else logging.INFO)
         if self.threads is not None:
             from magloc import core
 
@@ -220,7 +221,7 @@ def _give_up_stdout() -> None:
 def call(app: App, tokens: Sequence[str]) -> None:
     """Run one command; what is wrong is raised."""
     try:
-        _show_whole_help(app, tokens)
+        use_docstrings(app, tokens)
         command, bound, _ = app.parse_args(tokens, print_error=False, exit_on_error=False)
     except UnknownCommandError as error:
         raise InputError(_unknown_command(app, error)) from None
@@ -230,13 +231,10 @@ def call(app: App, tokens: Sequence[str]) -> None:
         raise InputError(str(error).replace(" requires an argument.", " is missing.")) from None
     except ImportError as error:
         raise InputError(f"the command cannot be loaded ({error.__cause__ or error}).") from None
-    quiet = False
-    for value in bound.arguments.values():
-        if isinstance(value, QuietOptions):
-            value.apply()
-            quiet = value.quiet
+    options = next((value for value in bound.arguments.values() if isinstance(value, QuietOptions)), QuietOptions())
+    options.apply()
     endless = "-" in tokens or not _ENDLESS.isdisjoint(tokens[:1])
-    with contextlib.nullcontext() if quiet or endless else _signs_of_life(app.name[0]):
+    with contextlib.nullcontext() if options.quiet or endless else _signs_of_life(app.name[0]):
         command(*bound.args, **bound.kwargs)
 
 
@@ -269,8 +267,8 @@ def _unknown_command(app: App, error: UnknownCommandError) -> str:
     return f'Unknown command "{token}".{near} Available commands: {", ".join(names)}.'
 
 
-def _show_whole_help(app: App, tokens: Sequence[str]) -> None:
-    """Let the help of a command be its docstring: the line that it is registered with is for the list of commands."""
+def use_docstrings(app: App, tokens: Sequence[str]) -> None:
+    """Use the docstring of a command as its help, in place of the line in the list of commands."""
     chain, apps, _ = app.parse_commands(tokens)
     for name, command in zip(chain, apps[1:], strict=True):
         if not name.startswith("-") and all(inner.startswith("-") for inner in command):
@@ -294,7 +292,7 @@ def _one_line_warnings(program: str) -> Iterator[None]:
 
 
 class _Notes(logging.Handler):
-    """Prints what the library logs as notes of a program."""
+    """Prints what the library and the commands log as notes of a program."""
 
     def __init__(self, program: str) -> None:
         super().__init__()
@@ -377,6 +375,17 @@ def print_result(result: Mapping[str, object], lines: Sequence[str], *, as_json:
         print("\n".join(lines))
 
 
+def note(text: str, *, always: bool = False) -> None:
+    """Print one line on stderr; --quiet hides it unless it is a result, shown `always`."""
+    _LOG.log(_RESULT if always else logging.INFO, text)
+
+
+def warn(texts: Iterable[str]) -> None:
+    """Print warnings, which the JSON object of a command lists by itself; --quiet hides them."""
+    for text in texts:
+        note(f"warning: {text}")
+
+
 def print_note(text: str, program: str) -> None:
     """Print one line of a program on stderr, whatever the text: as a terminal shows it, no word of it endless."""
     words = (word if len(word) <= _LONGEST_WORD else f"{word[:20]}…{word[-20:]}" for word in text.split())
@@ -385,15 +394,14 @@ def print_note(text: str, program: str) -> None:
 
 
 @contextmanager
-def progress(total: int, unit: str, *, quiet: bool) -> Iterator[Callable[[int], None]]:
-    """Count up to a total on a terminal's stderr.
+def progress(total: int, unit: str) -> Iterator[Callable[[int], None]]:
+    """Count up to a total on a terminal's stderr, unless --quiet hides it.
 
     Parameters
     ----------
     total : int
     unit : str
         What is counted.
-    quiet : bool
 
     Yields
     ------
@@ -402,7 +410,7 @@ def progress(total: int, unit: str, *, quiet: bool) -> Iterator[Callable[[int], 
     """
     from tqdm import tqdm
 
-    hidden = quiet or not sys.stderr.isatty()
+    hidden = not (sys.stderr.isatty() and _LOG.isEnabledFor(logging.INFO))
     with tqdm(total=total, unit=f" {unit}", disable=hidden, leave=False) as bar:
 
         def advance(finished: int) -> None:

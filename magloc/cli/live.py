@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from arrays.io.errors import LARGEST, naming
+from arrays.io.errors import LARGEST, naming, naming_options
 from arrays.io.outputs import refuse_unwritable
-from magloc.cli.framework import ABOVE_ZERO, Flag, QuietOptions, refuse_outside
-from magloc.cli.options import STREAM, KnownOptions, MotionOptions, Port, naming_options, naming_place, print_note
+from magloc.cli.framework import ABOVE_ZERO, Flag, QuietOptions, note, refuse_outside
+from magloc.cli.options import STREAM, KnownOptions, MotionOptions, Port, naming_place
 
 if TYPE_CHECKING:
     from arrays.io.csv import Column
@@ -90,13 +90,12 @@ def live(
 
     refuse_outside(0.0, LARGEST, "0 or a positive number", rest_s=rest_s)
     refuse_outside(ABOVE_ZERO, LARGEST, "a positive number", replay_speed=replay_speed)
-    if out is not None:
-        refuse_unwritable(out, "--out", ".csv")
+    refuse_unwritable(out, "--out", ".csv")
     used = known.array(array)
     with naming(str(array), sources=f"--sources {motion.sources}"):
         follower = motion.follower(used, known, known.where, rest_s)
     with ExitStack() as open_page:
-        view = open_page.enter_context(shown(follower, page, quiet=common.quiet)) if page.view else None
+        view = open_page.enter_context(shown(follower, page)) if page.view else None
         table = None if out is None else open_page.enter_context(GrowingTable(out))
         try:
             with naming_place(), naming(str(array), readings=source, time_s=source):
@@ -107,21 +106,20 @@ def live(
                     if view is not None:
                         view.update(point)
         finally:
-            if not common.quiet and follower.tally.rows:
-                print_note(str(follower.tally))
+            if follower.tally.rows:
+                note(str(follower.tally))
         if view is not None:
             view.wait()
 
 
-def shown(follower: Follower, page: PageOptions, *, quiet: bool) -> LiveView:
+def shown(follower: Follower, page: PageOptions) -> LiveView:
     """A page of what a follower follows, and a note of its address."""
     import magloc.viewer
 
     with naming_options("port"):
         view = magloc.viewer.LiveView(follower.array, controls=follower, port=page.port, open=page.open)
     sys.setswitchinterval(_SWITCH_S)
-    if not quiet:
-        print_note(f"open {view.address} in a browser; Ctrl-C ends the page")
+    note(f"open {view.address} in a browser; Ctrl-C ends the page")
     return view
 
 

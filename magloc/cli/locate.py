@@ -14,8 +14,8 @@ import magloc
 from arrays.io.errors import LARGEST, InputError, own_sentence
 from arrays.io.outputs import refuse_file
 from arrays.typing import Vector
-from magloc.cli.framework import CommonOptions, Flag, print_json_list, progress, refuse_outside
-from magloc.cli.options import KnownOptions, ambient_field, number_of_sources, print_note
+from magloc.cli.framework import CommonOptions, Flag, note, print_json_list, progress, refuse_outside
+from magloc.cli.options import KnownOptions, ambient_field, number_of_sources
 
 if TYPE_CHECKING:
     from arrays.array import SensorArray
@@ -129,7 +129,7 @@ def locate(
     try:
         pictured, noisy, _ = used_rows(rows, used, average=wanted.average)
         true_position_m = None if truth is None else truth_of_rows(pictured, magloc.read_truth(truth))[0]
-        with progress(len(rows), "rows", quiet=common.quiet) as advance:
+        with progress(len(rows), "rows") as advance:
             fixes = magloc.locate(
                 used,
                 rows,
@@ -161,15 +161,13 @@ def locate(
     if not n_solved:
         raise InputError(f"{readings}: found no row that can be solved ({reasons}).")
     if out is not None:
-        from magloc.plots.localization import write_pictures
+        from magloc.plots.localization import write_fix_figures
 
-        write_pictures(pictured, noisy, fixes, ambient_T, true_position_m, out)
-    if common.quiet:
-        return
+        write_fix_figures(pictured, noisy, fixes, ambient_T, true_position_m, out)
     if not json:
-        print_note(f"{n_solved} of {len(fixes)} rows solved" + (f"; not solved: {reasons}" if reasons else ""))
-    for note in [*_notes(fixes, assumed=length_m is None), *([] if json else legend(lines))]:
-        print_note(note)
+        note(f"{n_solved} of {len(fixes)} rows solved" + (f"; not solved: {reasons}" if reasons else ""))
+    for line in [*_notes(fixes, assumed=length_m is None), *([] if json else legend(lines))]:
+        note(line)
 
 
 def _refuse_farther(positions: list[Vector], rows: Readings) -> None:

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import magloc
-from arrays.io.errors import InputError, naming
+from arrays.io.errors import InputError, naming, naming_options
 from arrays.io.outputs import refuse_file
 from arrays.io.text import write_netcdf
-from magloc.cli.framework import CommonOptions, Flag, print_result, progress
-from magloc.cli.options import Grid, naming_options, naming_scheduler, print_note
+from magloc.cli.framework import CommonOptions, Flag, note, print_result, progress
+from magloc.cli.options import Grid
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -100,8 +100,8 @@ def map_(
     before = chunk_seconds(store)
     with (
         naming(scenario),
-        naming_scheduler(),
-        progress(n**3, over, quiet=common.quiet) as advance,
+        naming_options("scheduler"),
+        progress(n**3, over) as advance,
     ):
         dataset = compute(n=n, out=store, scheduler=scheduler, progress=advance)
     done = chunk_seconds(store)
@@ -112,8 +112,8 @@ def map_(
         if netcdf:
             write_netcdf(dataset, folder / "convergence.nc")
     print_result({**_KEYS, **asdict(counts), "out": str(folder)}, counts.lines(), as_json=json)
-    if not (json or common.quiet):
-        print_note(_how_done(int((before == done).sum()) if before.size else 0, done.size, counts, folder))
+    if not json:
+        note(_how_done(int((before == done).sum()) if before.size else 0, done.size, counts, folder))
 
 
 # Keys of every map, in this order; null where a map has no such number.

@@ -16,7 +16,7 @@ from cyclopts.validators import Number
 
 import arrays
 import magloc
-from arrays.io.errors import LARGEST, InputError, naming
+from arrays.io.errors import LARGEST, InputError, naming, naming_options
 from arrays.io.outputs import refuse_unwritable
 from arrays.io.text import write_text
 from arrays.typing import Vector
@@ -41,11 +41,6 @@ Port = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=0, 
 
 STREAM = "-"
 """In place of a file: standard input."""
-
-
-def print_note(text: str) -> None:
-    """Print one line on stderr, whatever the text."""
-    framework.print_note(text, "magloc")
 
 
 def number_of_sources(sources: str) -> int | Literal["auto"]:
@@ -75,31 +70,8 @@ Grid = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=2, 
 """Points along an axis: 2000 are 8,000,000,000 points, more than a day of work."""
 
 
-@contextmanager
-def naming_scheduler() -> Iterator[None]:
-    """Let errors of a scheduler speak of the option."""
-    from magloc.grids.cluster import SchedulerError
-
-    try:
-        yield
-    except SchedulerError as error:
-        raise InputError(f"--{error}") from None
-
-
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _BOUNDS = re.compile(rf"(?:(?P<below>{_NUMBER})<(?=[xyz]<))?(?P<axis>[xyz])(?P<sign>[<>])(?P<bound>{_NUMBER})")
-
-
-@contextmanager
-def naming_options(*names: str) -> Iterator[None]:
-    """Say of an option what the library says of the argument of that name."""
-    try:
-        yield
-    except ValueError as error:
-        said = re.match(r"Input (\w+)", str(error))
-        if said is None or said[1] not in names:
-            raise
-        raise InputError(f"--{said[1].replace('_', '-')}{str(error)[said.end() :]}") from None
 
 
 @contextmanager
@@ -357,8 +329,7 @@ class MapOptions:
         for option, path in self.outputs.items():
             if path is not None and place is None:
                 raise InputError(f"{option}: found no --place, expected the origin of the world frame with it.")
-            if path is not None:
-                refuse_unwritable(path, option)
+            refuse_unwritable(path, option)
 
     def refuse_far(self, rows: Readings, name: str) -> None:
         """Refuse, before long work, an array that is too far from the origin to be placed on the Earth."""

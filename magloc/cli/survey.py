@@ -12,16 +12,13 @@ from cyclopts import Parameter
 
 import arrays
 import magloc
-from arrays.io.errors import InputError, naming
+from arrays.io.errors import InputError, naming, naming_options
 from arrays.io.outputs import refuse_file, refuse_one_for_two, refuse_unwritable, write_files
-from magloc.cli.framework import CommonOptions, Flag, print_report
+from magloc.cli.framework import CommonOptions, Flag, note, print_report
 from magloc.cli.options import (
     KnownOptions,
     MapOptions,
     ambient_field,
-    naming_options,
-    naming_scheduler,
-    print_note,
     refuse_not_positive,
 )
 
@@ -106,8 +103,7 @@ def survey(
     maps.refuse(known.place)
     refuse_file(out, "--out")
     refuse_one_for_two({"--out": out, "--html": html, **maps.outputs})
-    if html is not None:
-        refuse_unwritable(html, "--html")
+    refuse_unwritable(html, "--html")
     refuse_not_positive(ground, "shortest_geology_m", "false_per_hectare")
     if not math.isfinite(ground.ground_m):
         raise InputError(f"--ground-m: found {ground.ground_m:g}, expected a finite number.")
@@ -121,7 +117,7 @@ def survey(
     at_base = arrays.SensorArray((arrays.Sensor("base", "scalar", (0.0, 0.0, 0.0), 1e-10),))
     station = None if base is None else magloc.read_readings(base, at_base, ordered=True)
     named = naming(", ".join(map(str, readings)), array=str(array))
-    with named, naming_options("ground_m", "base", "body_length_m"), naming_scheduler():
+    with named, naming_options("ground_m", "base", "body_length_m", "scheduler"):
         found = magloc.survey(
             used,
             rows,
@@ -133,7 +129,7 @@ def survey(
             body_length_m=ground.body_length_m,
             scheduler=scheduler,
             unfinished=None if out is None else out / "tiles",
-            progress=None if common.quiet or json else print_note,
+            progress=None if json else note,
         )
     maps.write(found, known.place)
     write_files(out, _files(found))
@@ -145,12 +141,12 @@ def survey(
         print_report(json_of_survey(found))
         return
     print(found.table())
-    if found.pose_assumed and not common.quiet:
+    if found.pose_assumed:
         pose = found.array.pose
         size = "" if pose is None else f" {100.0 * pose.position_m:.2g} cm that last {pose.correlation_s:g} s"
         if pose is not None and pose.position_white_m:
             size += f", and {100.0 * pose.position_white_m:.2g} cm new in every row"
-        print_note(f"nothing is stated of the pose's errors: as the rows show them{size}")
+        note(f"nothing is stated of the pose's errors: as the rows show them{size}")
 
 
 def _files(found: Survey) -> Iterator[tuple[str, Any]]:

@@ -13,7 +13,7 @@ import magloc
 from arrays.io.errors import InputError, naming
 from arrays.io.outputs import refuse_file, refuse_one_for_two, write_files
 from arrays.typing import Vector
-from magloc.cli.framework import CommonOptions, Flag, print_json_list, print_report, progress
+from magloc.cli.framework import CommonOptions, Flag, note, print_json_list, print_report, progress
 from magloc.cli.moments.known_path import (
     PathErrorOptions,
     TrackOutputs,
@@ -28,7 +28,6 @@ from magloc.cli.options import (
     MotionOptions,
     ambient_field,
     naming_place,
-    print_note,
     refuse_not_positive,
 )
 
@@ -205,7 +204,7 @@ def track(
     refuse_file(out, "--out")
     refuse_one_for_two({"--out": out, **maps.outputs})
     maps.refuse(known.place)
-    outputs = TrackOutputs(json, jsonl, maps, out, truth, common.quiet)
+    outputs = TrackOutputs(json, jsonl, maps, out, truth)
     # A place without a date may be there for the map alone.
     where = None if known.place is not None and known.date is None else known.where
     used = known.array(array)
@@ -239,9 +238,9 @@ def track(
     few = used.n_channels <= _FEW_CHANNELS and rows.array_rotation is not None
     if number is not None and on_background:
         raise InputError("--sources: found it together with --detrend or --high-pass-hz, expected one of them.")
-    if number is None and few and not common.quiet:
-        print_note(_USE_SURVEY)
-    with progress(len(rows), "rows", quiet=common.quiet) as advance, named:
+    if number is None and few:
+        note(_USE_SURVEY)
+    with progress(len(rows), "rows") as advance, named:
         alike: Any = {"prior": known.prior, "progress": advance, "told": motion.print_entry if jsonl else None}
         if number is None:
             one = magloc.track(used, rows, motion=model, smooth=smooth, **alike)
@@ -283,9 +282,9 @@ def _write_track(found: Track, name: str, known: KnownOptions, outputs: TrackOut
         result = None if outputs.truth is None else found.consistency(magloc.read_truth(outputs.truth))
         outputs.maps.write(found, known.place)
     if is_found and outputs.out is not None:
-        from magloc.plots.tracks import write_picture
+        from magloc.plots.tracks import write_track_figures
 
-        write_picture(
+        write_track_figures(
             found,
             None if result is None else result.true_position_m,
             outputs.out,
@@ -304,16 +303,13 @@ def _write_track(found: Track, name: str, known: KnownOptions, outputs: TrackOut
         raise _no_track(name, found.status, hint or _STATE_OFFSETS * (OFFSETS in found.status))
     if result is not None and not json:
         print_consistency(result.lines(), jsonl=jsonl)
-    if outputs.quiet:
-        return
     if not (json or jsonl):
-        print_note(f"{found.tracked.sum()} of {len(found)} rows tracked")
-        for note in legend([found.table()]):
-            print_note(note)
+        for line in [f"{found.tracked.sum()} of {len(found)} rows tracked", *legend([found.table()])]:
+            note(line)
     _note_dropped({name for names in found.dropped_sensors for name in names})
     if jsonl:
-        for said in filter(None, (found.innovations.reason, found.innovations.caution)):
-            print_note(said)
+        for line in filter(None, (found.innovations.reason, found.innovations.caution)):
+            note(line)
 
 
 def _write_sources(found: SourcesTrack, name: str, outputs: TrackOutputs, *, single: bool) -> None:
@@ -326,24 +322,20 @@ def _write_sources(found: SourcesTrack, name: str, outputs: TrackOutputs, *, sin
         raise _no_track(name, {point.status for point in found})
     if outputs.out is not None:
         write_files(outputs.out, [("track.png", found.plot()), ("track.csv", found.columns())])
-    is_table = not (outputs.json or outputs.jsonl)
-    if is_table:
+    if not (outputs.json or outputs.jsonl):
         print(found.table())
-    if outputs.quiet:
-        return
-    if is_table:
         tracked = sum(bool(point.tracks) for point in found)
-        print_note(f"{tracked} of {len(found)} rows with a source, {len(found.ids)} sources in all")
+        note(f"{tracked} of {len(found)} rows with a source, {len(found.ids)} sources in all")
     misfits = sum(point.status == "misfit" for point in found)
     if misfits:
-        print_note(f"{misfits} of {len(found)} rows are explained by no sources, faults or losses: status misfit")
+        note(f"{misfits} of {len(found)} rows are explained by no sources, faults or losses: status misfit")
     _note_dropped(found.dropped_sensors)
 
 
 def _note_dropped(names: Iterable[str]) -> None:
     """Name the sensors that are left out of some rows."""
     if names := sorted(names):
-        print_note(f"sensors left out of some rows: {', '.join(names)}")
+        note(f"sensors left out of some rows: {', '.join(names)}")
 
 
 def _in_ambient_field(array: SensorArray, rows: Readings, where: Place | None) -> tuple[SensorArray, Readings]:
@@ -357,7 +349,8 @@ def _is_undetermined(found: Iterable[TrackPoint]) -> bool:
 
     rows = sum(point.status == UNDETERMINED for point in found)
     if rows:
-        print_note(f"warning: {rows} rows show a source but do not determine its place: see the standard deviations")
+        text = f"warning: {rows} rows show a source but do not determine its place: see the standard deviations"
+        note(text, always=True)
     return rows > 0
 
 
@@ -377,6 +370,6 @@ def _stream(array: SensorArray, known: KnownOptions, motion: PathOptions, where:
             motion.print_entry(point)
             statuses.add(point.status)
     if follower.tally.faults:
-        print_note(str(follower.tally))
+        note(str(follower.tally), always=True)
     if not follower.tally.tracked and UNDETERMINED not in statuses:
         raise _no_track("standard input", statuses)

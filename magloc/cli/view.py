@@ -11,8 +11,8 @@ from cyclopts import Parameter
 
 import arrays
 from arrays.io.errors import InputError, naming
-from magloc.cli.framework import CommonOptions, Flag, progress
-from magloc.cli.options import STREAM, Port, naming_outputs, print_note
+from magloc.cli.framework import CommonOptions, Flag, note, progress
+from magloc.cli.options import STREAM, Port, naming_outputs
 
 if TYPE_CHECKING:
     from arrays.array import SensorArray
@@ -72,7 +72,7 @@ def view(
     if str(path) == STREAM:
         if array is None or any(file is not None for file in (readings, html, png, movie)):
             raise InputError("-: found no --array, or a file to be read or written, expected --array alone.")
-        _view_stream(array, port, open=open, quiet=common.quiet)
+        _view_stream(array, port, open=open)
         return
 
     with naming_outputs():
@@ -82,7 +82,7 @@ def view(
     file = path if isinstance(result, arrays.SensorArray) else None
     shown: Any = result
     if isinstance(result, ReadingsResult):
-        sensors, (shown, rows) = result.array, _fixes(result, quiet=common.quiet)
+        sensors, (shown, rows) = result.array, _fixes(result)
     elif isinstance(result, arrays.SensorArray):
         sensors, shown = result, None
     written = [str(file) for file in (html, png, movie) if file is not None]
@@ -93,39 +93,35 @@ def view(
             sensors, shown, readings=rows, html=html, png=png, movie=movie, open=open, port=port, title=title, file=file
         )
 
-    written_or_served(scene, written, port, quiet=common.quiet, note=print_note)
+    written_or_served(scene, written, port)
 
 
-def written_or_served(
-    scene: Callable[[int], View], written: Sequence[str], port: int, *, quiet: bool, note: Callable[[str], None]
-) -> None:
+def written_or_served(scene: Callable[[int], View], written: Sequence[str], port: int) -> None:
     """Make a scene, which writes files or is served at a port until Ctrl-C."""
     from magloc.viewer.server import free_port
 
     with naming_outputs():
         used = port if written else free_port(port)
-        if used != port and port and not quiet:
+        if used != port and port:
             note(f"port {port} is in use, {used} is taken")
         view = scene(used)
     if written:
-        if not quiet:
-            note(f"wrote {', '.join(written)}")
+        note(f"wrote {', '.join(written)}")
         return
     with suppress(KeyboardInterrupt):  # who has the address may press Ctrl-C before the waiting begins
-        if not quiet:
-            note("open this address in a browser; Ctrl-C ends the viewer")
+        note("open this address in a browser; Ctrl-C ends the viewer")
         print(view.address, flush=True)
         view.wait()
     view.close()
 
 
-def _view_stream(array: Path, port: int, *, open: bool, quiet: bool) -> None:
+def _view_stream(array: Path, port: int, *, open: bool) -> None:
     """Show a source that is followed through rows on standard input, and what is last known of it until Ctrl-C."""
     from magloc.cli.live import PageOptions, shown
     from magloc.live.follower import Follower
 
     follower = Follower(arrays.read_array(array))
-    with shown(follower, PageOptions(port=port, open=open), quiet=quiet) as scene, naming(str(array)):
+    with shown(follower, PageOptions(port=port, open=open)) as scene, naming(str(array)):
         print(scene.address, flush=True)
         for point in follower.follow(STREAM):
             scene.update(point)
@@ -152,12 +148,12 @@ def _with_track(
     return rows.array, rows.readings
 
 
-def _fixes(result: ReadingsResult, *, quiet: bool) -> tuple[Fixes, Readings]:
+def _fixes(result: ReadingsResult) -> tuple[Fixes, Readings]:
     """Fixes of the rows as ``magloc locate`` finds them, in its frame; of 2000 rows at most, evenly."""
-    from magloc.viewer.view import fixes_of, thinned
+    from magloc.viewer.view import locate_readings, thin_readings
 
-    rows, n = thinned(result.readings), len(result.readings)
-    if len(rows) < n and not quiet:
-        print_note(f"note: every {-(-n // len(rows))}th of {n} rows is fixed and shown")
-    with progress(len(rows), "rows", quiet=quiet) as advance:
-        return fixes_of(result.array, rows, advance), rows
+    rows, n = thin_readings(result.readings), len(result.readings)
+    if len(rows) < n:
+        note(f"note: every {-(-n // len(rows))}th of {n} rows is fixed and shown")
+    with progress(len(rows), "rows") as advance:
+        return locate_readings(result.array, rows, advance), rows

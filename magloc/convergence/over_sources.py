@@ -19,9 +19,9 @@ import numpy as np
 from arrays.array import SensorArray
 from arrays.geometries import tetrahedron
 from arrays.io.errors import check_positive
+from arrays.io.values import accept_seed, seed_of
 from arrays.noise import reading_errors
-from arrays.rng import Rng, accept_seed, seed_of
-from arrays.typing import BoolArray, FloatArray
+from arrays.typing import BoolArray, FloatArray, Rng
 from arrays.whitening import whitening
 from magloc.bounds.crlb import check_uncertainty, cramer_rao_bounds
 from magloc.chi_square import normalised_square
@@ -433,15 +433,9 @@ def source_map(
     >>> sorted(found.sizes)
     ['x', 'y', 'z']
     """
+    half, seed = check_half_width(edge_m), seed_of(rng)
     scenario = SourcesScenario(
-        array,
-        check_half_width(edge_m),
-        nearest_m,
-        farthest_m,
-        moment_Am2,
-        seed_of(rng),
-        known_moment_sigma_Am2,
-        body_length_m,
+        array, half, nearest_m, farthest_m, moment_Am2, seed, known_moment_sigma_Am2, body_length_m
     )
     return computed_map(SourcesMap(scenario, n), out, scheduler, progress)
 

@@ -22,8 +22,8 @@ from scipy.stats import qmc
 from arrays.array import SensorArray
 from arrays.geometries import GEOMETRIES
 from arrays.io.lazy import by_name
-from arrays.rng import Rng, accept_seed, seed_of
-from arrays.typing import FloatArray
+from arrays.io.values import accept_seed, seed_of
+from arrays.typing import FloatArray, Rng
 from magloc.design.descent import Descent, Sample, descend, is_spaced, move_into_volume
 from magloc.design.evaluation import Judgement, fits, judge, random_rotation, references, unit_shape, worst_case
 from magloc.design.task import N_DRAWN, DesignTask

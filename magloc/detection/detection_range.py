@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from arrays.array import SensorArray
-from arrays.rng import Rng, accept_seed
-from arrays.typing import FloatArray
+from arrays.io.values import accept_seed
+from arrays.typing import FloatArray, Rng
 from magloc.chi_square import Detector
 from magloc.detection.dipole_filter import DipoleFilter
 from magloc.detection.matched_filter import MatchedFilterDetector

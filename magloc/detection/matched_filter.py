@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import brentq
 
 from arrays.array import SensorArray
-from arrays.rng import Rng, accept_seed, seed_of
-from arrays.typing import FloatArray
+from arrays.io.values import accept_seed, seed_of
+from arrays.typing import FloatArray, Rng
 from magloc.chi_square import ChiSquareDetector, check_differences, check_probability, check_share
 from magloc.detection.dipole_filter import DipoleFilter
 from magloc.directions import fibonacci_directions

@@ -30,15 +30,11 @@ _LARGEST_PORT = 65535
 _one_chunk = threading.Lock()
 
 
-class SchedulerError(InputError):
-    """A scheduler that cannot be used; the text begins with the name of the argument."""
-
-
 def check_address(scheduler: str) -> None:
     """Refuse what cannot be the address of a scheduler."""
     address = _ADDRESS.fullmatch(scheduler)
     if address is None or not 0 < int(address["port"]) <= _LARGEST_PORT:
-        raise SchedulerError(f"scheduler: found {scheduler!r}, expected tcp://HOST:PORT or HOST:PORT.")
+        raise InputError(f"Input scheduler: found {scheduler!r}, expected tcp://HOST:PORT or HOST:PORT.")
 
 
 def worked_by(
@@ -59,9 +55,9 @@ def worked_by(
                     return
                 yield next(running).result()
         except (CancelledError, OSError):
-            raise SchedulerError(f"scheduler {scheduler}: the connection to the scheduler was lost.") from None
+            raise InputError(f"Input scheduler {scheduler}: the connection to the scheduler was lost.") from None
         except Exception as error:
-            raise SchedulerError(f"scheduler {scheduler}: a worker failed ({type(error).__name__}: {error}).") from None
+            raise InputError(f"Input scheduler {scheduler}: a worker failed: {error!r}.") from None
 
 
 def _by_worker(work: Callable[[Item], Result], item: Item) -> Result:
@@ -85,12 +81,12 @@ def _client(scheduler: str, timeout_s: float) -> Iterator[Any]:
         try:
             client = Client(scheduler, timeout=timeout_s, set_as_default=False)
         except (OSError, ValueError) as error:
-            raise SchedulerError(f"scheduler {scheduler}: found no scheduler there ({error}).") from None
+            raise InputError(f"Input scheduler {scheduler}: found no scheduler there ({error}).") from None
         with client:
             try:
                 client.wait_for_workers(1, timeout=timeout_s)
             except TimeoutError:
-                raise SchedulerError(f"scheduler {scheduler}: found no workers there within {timeout_s:g} s.") from None
+                raise InputError(f"Input scheduler {scheduler}: found no workers within {timeout_s:g} s.") from None
             yield client
     finally:
         logger.setLevel(level)
@@ -106,10 +102,10 @@ def _check_answer(scheduler: str, timeout_s: float) -> None:
     try:
         by_tls = Security().get_connection_args("client")  # of dask's own configuration
     except OSError as error:
-        raise SchedulerError(f"scheduler {scheduler}: dask's certificates cannot be read ({error}).") from None
+        raise InputError(f"Input scheduler {scheduler}: dask's certificates cannot be read ({error}).") from None
     if scheduler.startswith("tls:") and by_tls["ssl_context"] is None:
-        raise SchedulerError(
-            f"scheduler {scheduler}: found no certificates in dask's configuration, expected distributed.comm.tls."
+        raise InputError(
+            f"Input scheduler {scheduler}: found no certificates, expected some in dask's distributed.comm.tls."
         )
 
     async def answer() -> object:
@@ -122,12 +118,12 @@ def _check_answer(scheduler: str, timeout_s: float) -> None:
     try:
         found = asyncio.run(answer_in_time())
     except TimeoutError:
-        raise SchedulerError(
-            f"scheduler {scheduler}: found no scheduler there (no answer within {timeout_s:g} s)."
+        raise InputError(
+            f"Input scheduler {scheduler}: found no scheduler there (no answer within {timeout_s:g} s)."
         ) from None
     except OSError as error:
-        raise SchedulerError(f"scheduler {scheduler}: found no scheduler there ({error}).") from None
+        raise InputError(f"Input scheduler {scheduler}: found no scheduler there ({error}).") from None
     except Exception:  # what another service says may mean anything to dask
-        raise SchedulerError(f"scheduler {scheduler}: found another service there, expected a scheduler.") from None
+        raise InputError(f"Input scheduler {scheduler}: found another service there, expected a scheduler.") from None
     if found != "Scheduler":
-        raise SchedulerError(f"scheduler {scheduler}: found a {found} of dask there, expected a scheduler.")
+        raise InputError(f"Input scheduler {scheduler}: found a {found} of dask there, expected a scheduler.")

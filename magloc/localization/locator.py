@@ -15,10 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from arrays.array import SensorArray
-from arrays.io.values import numbers
+from arrays.io.values import accept_seed, numbers, seed_of
 from arrays.pose import PoseUncertainty
-from arrays.rng import Rng, accept_seed, seed_of
-from arrays.typing import FloatArray, IntArray
+from arrays.typing import FloatArray, IntArray, Rng
 from magloc.ambient import in_world_field
 from magloc.averages import average as averaged
 from magloc.averages import averaging_array, complete_rows

@@ -11,10 +11,10 @@ import numpy as np
 from cyclopts import Parameter
 
 import sims.experiments
-from adcs.cli.options import ReportOptions, ScenarioOptions, warn
+from adcs.cli.options import ReportOptions, ScenarioOptions
 from adcs.kalman.names import FILTERS
 from arrays.io.errors import InputError
-from magloc.cli.framework import Flag, progress
+from magloc.cli.framework import Flag, progress, warn
 from sims.cli.run_tabletsat import RunOptions, wanted
 
 if TYPE_CHECKING:
@@ -110,7 +110,7 @@ def compare(
     report.check()
     pairs = [wanted(name, chosen, runs.duration) for name, chosen in product(scenarios, options.combinations())]
     rows = []
-    with progress(len(pairs) * runs.seeds, "runs", quiet=report.quiet) as advance:
+    with progress(len(pairs) * runs.seeds, "runs") as advance:
         for file, estimate in pairs:
             outcome = sims.experiments.run_scenario(
                 file, estimate, runs.numbers, through_time=report.out is not None, advance=advance
@@ -120,7 +120,7 @@ def compare(
     report.write(_files(rows, reports))
     report.print({"rows": reports}, compare_lines(reports))
     for of_row in [] if report.json else reports:
-        warn(report, (f"{of_row['scenario']}, {of_row['sensors']}: {line}" for line in of_row["warnings"]))
+        warn(f"{of_row['scenario']}, {of_row['sensors']}: {line}" for line in of_row["warnings"])
 
 
 _COLUMNS = (

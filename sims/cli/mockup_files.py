@@ -18,7 +18,6 @@ from adcs.mockup.navigation.strapdown import ImuRecord, PlanarTrack
 from adcs.mockup.vision.camera import Pose
 from adcs.mockup.vision.sky import LedSky, write_sky
 from adcs.plots import mockup_navigation, mockup_vision
-from arrays.io.csv import table_text
 from arrays.typing import FloatArray
 from sims.experiments.mockup_navigation import FusionRuns, ZerosRuns
 from sims.experiments.mockup_recording import RecordRun
@@ -167,7 +166,7 @@ def zeros_files(runs: ZerosRuns) -> Iterator[File]:
     samples = _imu_columns(first.run.imu)
     for prefix, track in (("true_", first.run.truth), ("before_", first.before), ("after_", first.after)):
         samples |= _named(f"{prefix}x_m {prefix}y_m", track.position_m)
-    yield "mockup-zeros.csv", table_text(samples | {"after_heading_deg": np.degrees(first.after.heading_rad)})
+    yield "mockup-zeros.csv", samples | {"after_heading_deg": np.degrees(first.after.heading_rad)}
     runs_columns = {
         "seed": np.array([each.seed for each in runs.results]),
         "zero_x_m_s2": np.array([each.fit.zero_m_s2[0] for each in runs.results]),
@@ -177,7 +176,7 @@ def zeros_files(runs: ZerosRuns) -> Iterator[File]:
         "after_rms_mm": np.array([each.position_rms_mm for each in runs.results]),
         "fit_rms_mm": np.array([1e3 * each.fit.residual_rms_m for each in runs.results]),
     }
-    yield "mockup-zeros-runs.csv", table_text(runs_columns)
+    yield "mockup-zeros-runs.csv", runs_columns
     yield "mockup-fixes.csv", _fix_columns(first.run.fixes)
 
 
@@ -203,9 +202,9 @@ def fusion_files(runs: FusionRuns) -> Iterator[File]:
     samples = _imu_columns(run.imu) | _track_columns("true_", run.truth) | _track_columns("", track)
     # The gyro's zero stands in the file of a recording alone.
     samples.pop("zero_rate_deg_s", None)
-    yield "mockup-fusion.csv", table_text(samples)
+    yield "mockup-fusion.csv", samples
     errors = {name: np.array([getattr(each.errors, name) for each in runs.results]) for name in _ERRORS}
-    yield "mockup-fusion-runs.csv", table_text({"seed": np.array([each.seed for each in runs.results])} | errors)
+    yield "mockup-fusion-runs.csv", {"seed": np.array([each.seed for each in runs.results])} | errors
     used = first.fused.used
     yield "mockup-fixes.csv", _fix_columns(fixes) | {"false": run.false[: len(used)], "used": used}
 
@@ -243,7 +242,7 @@ def record_files(run: RecordRun) -> Iterator[File]:
         begin_s=run.imu.begin_s + SETTLED_S,
     )
     yield "mockup-fusion.png", mockup_navigation.fusion_figure(picture)
-    yield "mockup-estimate.csv", table_text({"time_s": track.time_s} | _track_columns("", track))
+    yield "mockup-estimate.csv", {"time_s": track.time_s} | _track_columns("", track)
 
 
 _ERRORS = ("position_rms_mm", "position_p95_mm", "position_max_mm", "velocity_rms_mm_s", "heading_rms_deg")

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING
 
 from cyclopts import Parameter
 
-from adcs.cli.options import print_note
 from arrays.io.errors import InputError
-from magloc.cli.framework import Flag, QuietOptions, refuse_outside
+from magloc.cli.framework import Flag, refuse_outside
 from magloc.cli.options import Port, naming_outputs
 from sims.cli.mockup_options import MockupOptions
 from sims.experiments.mockup_settings import METHOD_WORDS
@@ -29,11 +28,11 @@ def check_places(replay: ReplayOptions) -> None:
         check_outputs(replay.html, replay.png)
 
 
-def show_replay(runs: FusionRuns, camera: TableCamera, replay: ReplayOptions, common: QuietOptions) -> None:
+def show_replay(runs: FusionRuns, camera: TableCamera, replay: ReplayOptions) -> None:
     """Show the first drive until Ctrl-C, or write it."""
     from adcs.viewer.drive_page import drive_page
     from magloc.cli.view import written_or_served
-    from magloc.viewer.view import View, shown
+    from magloc.viewer.view import View, open_view
 
     drive = drive_of(runs.results[0], runs.method, camera)
     at_s = 0.5 * drive.duration_s if replay.at is None else replay.at
@@ -41,25 +40,25 @@ def show_replay(runs: FusionRuns, camera: TableCamera, replay: ReplayOptions, co
 
     def scene(port: int) -> View:
         title = f"adcs · mockup {runs.method}"
-        return shown(
+        return open_view(
             title, lambda server: drive_page(server, drive, at_s)[0], **files, movie=None, open=False, port=port
         )
 
     written = [str(file) for file in files.values() if file is not None]
-    written_or_served(scene, written, replay.port, quiet=common.quiet, note=print_note)
+    written_or_served(scene, written, replay.port)
 
 
 def drive_of(result: FusionResult, method: str, camera: TableCamera) -> Drive:
     """What a replay shows of a run, with frames where the satellite truly was."""
     from adcs.mockup.navigation.delayed_ekf import FilterTrack
-    from adcs.viewer.drive import Drive, SeenFrame
+    from adcs.viewer.drive import Drive, IdentifiedFrame
 
     run, track = result.run, result.fused.track
 
-    def frame_of(fix: int) -> SeenFrame:
+    def frame_of(fix: int) -> IdentifiedFrame:
         # One image for a fix that comes twice.
         frame, found = camera.look(run.truth, float(run.exposure_s[fix]), result.seed)
-        return SeenFrame(frame.image, found.stars.positions_px, found.fix)
+        return IdentifiedFrame(frame.image, found.stars.positions_px, found.fix)
 
     arrived = slice(len(result.fused.outcomes))
     return Drive(
@@ -90,7 +89,7 @@ class ReplayOptions:
     png : Path, optional
         Write a picture; needs Chromium or Chrome.
     at : float, optional
-        Seconds since the beginning that are shown at first; the middle of the drive by default.
+        Seconds since the beginning that are open_view at first; the middle of the drive by default.
     port : int
         Port of the server; the next one that is free if it is in use.
     """
@@ -107,7 +106,7 @@ class ReplayOptions:
         return self.view or self.html is not None or self.png is not None
 
     def check(self, options: MockupOptions, *, json: bool) -> None:
-        """Raise InputError for what cannot be shown."""
+        """Raise InputError for what cannot be open_view."""
         if not self.wanted:
             for name, given in (("--at", self.at is not None), ("--port", self.port != ReplayOptions.port)):
                 if given:

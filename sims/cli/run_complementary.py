@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from adcs.cli.options import ReportOptions, warn
+from adcs.cli.options import ReportOptions
 from adcs.complementary.names import Method, Rule
 from arrays.io.errors import LARGEST, InputError
 from arrays.io.outputs import refuse_file, write_files
-from magloc.cli.framework import ABOVE_ZERO, Count, Seed, progress, refuse_outside
-from sims.cli.run_tabletsat import seed_batches
+from magloc.cli.framework import ABOVE_ZERO, Seed, progress, refuse_outside, warn  # noqa: F401 - Seed of an inherited option
+from sims.cli.run_tabletsat import RunOptions, Runs, run_in_batches
 
 if TYPE_CHECKING:
     from adcs.complementary.explicit import Gains
@@ -31,7 +32,7 @@ _RUNS_AT_ONCE = 20  # 250 MB of the adaptive filter
 
 @Parameter(name="*")
 @dataclass(frozen=True)
-class ComplementaryOptions:
+class ComplementaryOptions(RunOptions):
     """What is run.
 
     Parameters
@@ -64,9 +65,7 @@ class ComplementaryOptions:
     sigma_nT: Annotated[float, Parameter(name="--sigma-nT")] = 1000.0
     outage: Rule | None = None
     amplitude_deg: float = 5.0
-    seeds: Annotated[Count, Parameter(name=["--seeds", "--runs"])] = 1
-    seed: Seed = 0
-    duration: float | None = None
+    seeds: Runs = field(default=1, kw_only=True)
 
     def check(self) -> None:
         """Raise InputError for what cannot be run."""
@@ -154,40 +153,31 @@ def run_complementary(
     """
     import numpy as np
 
-    from arrays.io.csv import table_text
     from sims.attitude.complementary import satellite_runs
-    from sims.experiments.complementary import RUN_COLUMNS, errors_deg, row_of_each
+    from sims.experiments.complementary import OUTAGE_COLUMNS, errors_deg, run_columns
 
     options.check()
     refuse_file(out, "--out")
-    rows: list[FloatArray] = []
-    files: list[tuple[str, Any]] = []
-    for seeds in seed_batches(options.seed, options.seeds, _RUNS_AT_ONCE):
-        runs = satellite_runs(options.scenario, seeds)
-        rows.append(row_of_each(runs.scenario, errors_deg(runs, options.filter, options.gains, options.outage)))
-        if out is not None and not files:
-            files += _files_of_first(options, runs)
-        if progress is not None:
-            progress(len(seeds))
-    table = np.concatenate(rows)
-    numbers = np.arange(options.seed, options.seed + options.seeds)
-    files.append(
-        ("complementary-runs.csv", table_text({"seed": numbers, **dict(zip(RUN_COLUMNS, table.T, strict=True))}))
+    table, files = run_in_batches(
+        options,
+        _RUNS_AT_ONCE,
+        lambda seeds: satellite_runs(options.scenario, seeds),
+        lambda runs: run_columns(runs.scenario, errors_deg(runs, options.filter, options.gains, options.outage)),
+        None if out is None else partial(_files_of_first, options),
+        progress,
     )
-    write_files(out, files)
-    means = [float(value) for value in table[:, :3].mean(axis=0)]
+    write_files(out, [*files, ("complementary-runs.csv", table)])
+    means = {name: float(table[name].mean()) for name in ("rms_deg", "steady_rms_deg", "peak_deg")}
+    largest = [float(np.median(table[name])) for name in OUTAGE_COLUMNS]
     return {
-        "rms_deg": means[0],
-        "steady_rms_deg": means[1],
-        "peak_deg": None if math.isnan(means[2]) else means[2],
-        "outage_max_deg": None if options.outage is None else np.median(table[:, 3:], axis=0).tolist(),
+        **{name: None if math.isnan(mean) else mean for name, mean in means.items()},
+        "outage_max_deg": None if options.outage is None else largest,
     }
 
 
 def _files_of_first(options: ComplementaryOptions, runs: SatelliteRuns) -> Iterator[tuple[str, Any]]:
     """Yield the figure and the errors of the first run, by all filters."""
     from adcs.plots.complementary import ComplementaryPicture, complementary_figure
-    from arrays.io.csv import table_text
     from sims.experiments.complementary import errors_deg
 
     names: tuple[Method, ...] = ("gauss-newton", "explicit", "adaptive")
@@ -205,7 +195,7 @@ def _files_of_first(options: ComplementaryOptions, runs: SatelliteRuns) -> Itera
         columns |= dict(
             zip((f"{name.replace('-', '_')}_{axis}_deg" for axis in ("roll", "pitch", "yaw")), of_filter.T, strict=True)
         )
-    yield "complementary.csv", table_text(columns)
+    yield "complementary.csv", columns
 
 
 def summary_lines(options: ComplementaryOptions, result: dict[str, Any]) -> list[str]:
@@ -243,7 +233,7 @@ def complementary(
     """
     options.check()
     if options.filter != "adaptive":
-        warn(report, options.gains.warnings(1.0))
-    with progress(options.seeds, "runs", quiet=report.quiet) as advance:
+        warn(options.gains.warnings(1.0))
+    with progress(options.seeds, "runs") as advance:
         result = run_complementary(options, report.out, advance)
     report.print(result, summary_lines(options, result))

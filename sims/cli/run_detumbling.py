@@ -7,7 +7,8 @@ from typing import Annotated, Literal
 import numpy as np
 from cyclopts import Parameter
 
-from magloc.cli.framework import ABOVE_ZERO, Count, Flag, QuietOptions, Seed, print_result, progress, refuse_outside
+from magloc.cli.framework import ABOVE_ZERO, Flag, QuietOptions, Seed, print_result, progress, refuse_outside
+from sims.cli.run_tabletsat import Runs
 
 _LONGEST_S, _MOST_S = 200_000.0, 2_000_000.0
 _STRONGEST_AM2 = 10.0
@@ -20,7 +21,7 @@ def detumbling(
     moment_Am2: Annotated[float, Parameter(name="--moment-Am2")] = 0.2,
     duty: float = 0.8,
     magnet_Am2: Annotated[float, Parameter(name="--magnet-Am2")] = 0.0,
-    seeds: Annotated[Count, Parameter(name=["--seeds", "--runs"])] = 40,
+    seeds: Runs = 40,
     seed: Seed = 0,
     duration: float = 5000.0,
     json: Flag = False,
@@ -63,7 +64,7 @@ def detumbling(
     refuse_outside(ABOVE_ZERO, 100.0, "more than 0 and at most 100", moment_Am2=moment_Am2)
     refuse_outside(ABOVE_ZERO, 1.0, "more than 0 and at most 1", duty=duty)
     refuse_outside(0.0, _STRONGEST_AM2, f"0 to {_STRONGEST_AM2:g}", magnet_Am2=magnet_Am2)
-    with progress(round(duration) + 1, "seconds", quiet=common.quiet) as advanced:
+    with progress(round(duration) + 1, "seconds") as advanced:
         found = experiments.detumbling(
             range(seed, seed + seeds),
             damping=damping,

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 from cyclopts import Parameter
 
@@ -15,8 +15,8 @@ from adcs.cli.options import ReportOptions
 from adcs.ellipsoids.names import StepRule
 from arrays.io.errors import LARGEST, InputError
 from arrays.io.outputs import refuse_file, write_files
-from magloc.cli.framework import Count, Flag, Seed, progress, refuse_outside
-from sims.cli.run_tabletsat import seed_batches
+from magloc.cli.framework import Flag, Seed, progress, refuse_outside  # noqa: F401 - Seed of an inherited option
+from sims.cli.run_tabletsat import RunOptions, Runs, run_in_batches
 
 if TYPE_CHECKING:
     from arrays.typing import FloatArray
@@ -29,7 +29,7 @@ _RUNS_AT_ONCE = 500  # 90 MB of an orbit
 
 @Parameter(name="*")
 @dataclass(frozen=True)
-class EllipsoidOptions:
+class EllipsoidOptions(RunOptions):
     """What is run.
 
     Parameters
@@ -58,9 +58,8 @@ class EllipsoidOptions:
     step: StepRule = "tightened"
     jump: Flag = False
     closed_loop: Flag = False
-    seeds: Annotated[Count, Parameter(name=["--seeds", "--runs"])] = 300
-    seed: Seed = 0
-    duration: float = 5678.0
+    seeds: Runs = field(default=300, kw_only=True)
+    duration: float = field(default=5678.0, kw_only=True)
 
     def check(self) -> None:
         """Raise InputError for what cannot be run."""
@@ -107,31 +106,28 @@ def run_ellipsoid(
     """
     import numpy as np
 
-    from arrays.io.csv import table_text
-    from sims.experiments.ellipsoid import RUN_COLUMNS, ellipsoid_runs, row_of_each
+    from sims.experiments.ellipsoid import ellipsoid_runs, run_columns
 
     options.check()
     refuse_file(out, "--out")
-    rows: list[FloatArray] = []
-    files: list[tuple[str, Any]] = []
-    for seeds in seed_batches(options.seed, options.seeds, _RUNS_AT_ONCE):
-        runs = ellipsoid_runs(options.settings, seeds)
-        rows.append(row_of_each(runs))
-        if out is not None and not files:
-            files += _files_of_first(options, runs)
-        if progress is not None:
-            progress(len(seeds))
-    table = np.concatenate(rows)
-    write_files(out, [*files, ("ellipsoid-runs.csv", table_text(dict(zip(RUN_COLUMNS, table.T, strict=True))))])
-    error, half_width, resets, outside = table[:, 1], table[:, 2], table[:, 4], table[:, 5]
+    table, files = run_in_batches(
+        options,
+        _RUNS_AT_ONCE,
+        lambda seeds: ellipsoid_runs(options.settings, seeds),
+        run_columns,
+        None if out is None else partial(_files_of_first, options),
+        progress,
+    )
+    write_files(out, [*files, ("ellipsoid-runs.csv", table)])
+    error = table["final_error_deg"]
     return {
         "final_error_mean_deg": float(error.mean()),
         "final_error_p95_deg": float(np.percentile(error, 95.0)),
         "final_error_max_deg": float(error.max()),
-        "half_width_mean_deg": float(half_width.mean()),
-        "containment_violations": int(outside.sum()),
+        "half_width_mean_deg": float(table["half_width_deg"].mean()),
+        "containment_violations": int(table["violations"].sum()),
         "steps": options.seeds * options.n_steps,
-        "resets_mean": float(resets.mean()),
+        "resets_mean": float(table["resets"].mean()),
     }
 
 
@@ -141,7 +137,6 @@ def _files_of_first(options: EllipsoidOptions, runs: EllipsoidRuns) -> Iterator[
 
     from adcs.ellipsoids.roll_yaw import STEP_S, kalman_track, roll_yaw_system
     from adcs.plots.ellipsoids import RollYawPicture, roll_yaw_figure
-    from arrays.io.csv import table_text
     from magloc.plots import style
 
     system = roll_yaw_system(math.radians(options.noise_deg), math.radians(options.drift_deg_s))
@@ -169,7 +164,7 @@ def _files_of_first(options: EllipsoidOptions, runs: EllipsoidRuns) -> Iterator[
         **_of_axes("kalman_", kalman.means),
         **_of_matrix("kalman_", P),
     }
-    yield "ellipsoid.csv", table_text(columns)
+    yield "ellipsoid.csv", columns
 
 
 def _of_axes(name: str, angles_rad: FloatArray) -> dict[str, FloatArray]:
@@ -213,6 +208,6 @@ def ellipsoid(
     report : ReportOptions
         Where the result goes.
     """
-    with progress(options.seeds, "runs", quiet=report.quiet) as advance:
+    with progress(options.seeds, "runs") as advance:
         result = run_ellipsoid(options, report.out, advance)
     report.print(result, summary_lines(options, result))

@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import sims.experiments
-from adcs.cli.options import ReportOptions, naming_options, warn
-from magloc.cli.framework import progress
+from adcs.cli.options import ReportOptions
+from arrays.io.errors import naming_options
+from magloc.cli.framework import progress, warn
 from sims.cli.mockup_options import MockupOptions, value_or
 from sims.cli.mockup_replay import ReplayOptions
 from sims.experiments.mockup_settings import METHODS, SETTLED_S, Method
@@ -171,7 +172,7 @@ def mockup(
         report.write(files_of(options, told.run))
     report.print(told.result, told.lines)
     if replay.wanted:
-        show_replay(told.run[0], options.table_camera(), replay, report)
+        show_replay(told.run[0], options.table_camera(), replay)
 
 
 class Told(NamedTuple):
@@ -196,14 +197,14 @@ def _recording(samples: Path, fixes: Path, options: MockupOptions, report: Repor
     from sims.experiments.mockup_recording import record_lines
 
     run = sims.experiments.fused_record(samples, fixes, value_or(options.fusion, "ekf"))
-    warn(report, run.warnings)
+    warn(run.warnings)
     return Told(run, run.summary(), record_lines(run))
 
 
 def _sky(options: MockupOptions, report: ReportOptions) -> Told:
     setup, seeds = options.sky_setup(), options.runs(1)
     sky, matcher, finder = options.led_sky, options.sky_matcher(), options.finder()
-    with progress(setup.poses * len(seeds), "frames", quiet=report.quiet) as advance:
+    with progress(setup.poses * len(seeds), "frames") as advance:
         run = sims.experiments.sky_run(sky, matcher, setup, seeds, advance, finder)
     result = run.summary()
     return Told(run, result, sky_lines(options, result))
@@ -211,7 +212,7 @@ def _sky(options: MockupOptions, report: ReportOptions) -> Told:
 
 def _zeros(options: MockupOptions, report: ReportOptions) -> Told:
     seeds, unknowns, start_fixes = options.runs(6), value_or(options.unknowns, "six"), value_or(options.start_fixes, 4)
-    with progress(len(seeds), "runs", quiet=report.quiet) as advance, naming_options():
+    with progress(len(seeds), "runs") as advance, naming_options("start_fixes"):
         runs = sims.experiments.zeros_run(
             unknowns, seeds, options.duration_s, start_fixes=start_fixes, progress=advance
         )
@@ -222,7 +223,7 @@ def _drives(options: MockupOptions, report: ReportOptions) -> Told:
     scenario, seeds = options.table_scenario(), options.runs(6)
     wanted = value_or(options.fusion, "ekf")
     methods: tuple[Method, ...] = METHODS if wanted == "all" else (wanted,)
-    with progress(len(seeds) * len(methods), "runs", quiet=report.quiet) as advance:
+    with progress(len(seeds) * len(methods), "runs") as advance:
         simulate = lru_cache(maxsize=len(seeds))(options.table_camera().run) if options.part == "all" else None
         every = [sims.experiments.fused_runs(method, scenario, seeds, advance, simulate) for method in methods]
     if wanted == "all":

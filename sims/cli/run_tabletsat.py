@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 from cyclopts import Parameter
 
 import adcs
 import sims.experiments
-from adcs.cli.options import ReportOptions, ScenarioOptions, warn
+from adcs.cli.options import ReportOptions, ScenarioOptions
 from arrays.io.errors import InputError
-from magloc.cli.framework import ABOVE_ZERO, Count, Seed, progress, refuse_outside
+from magloc.cli.framework import ABOVE_ZERO, Count, Seed, progress, refuse_outside, warn
 
 if TYPE_CHECKING:
     from adcs.io.scenario_files import AttitudeFile
@@ -25,22 +25,26 @@ _OTHERS = ("complementary", "detumbling", "ellipsoid", "mockup")
 _STAR_NOISE_DEG = {"angle": 0.001, "paper": 0.002}
 
 
+Runs = Annotated[Count, Parameter(name=["--seeds", "--runs"])]
+Simulated = TypeVar("Simulated")
+
+
 @Parameter(name="*")
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RunOptions:
-    """Runs.
+    """Number, seeds and duration of the runs.
 
     Parameters
     ----------
     seeds : int
         Number of runs.
     seed : int
-        Of the first run; the next ones follow.
+        Seed of the first run; the next runs take the next seeds.
     duration : float
-        Seconds; by default the scenario's, or the table's.
+        Duration of a run [s]; by default that of the scenario, or of the table.
     """
 
-    seeds: Annotated[Count, Parameter(name=["--seeds", "--runs"])] = 10
+    seeds: Runs = 10
     seed: Seed = 0
     duration: float | None = None
 
@@ -50,11 +54,31 @@ class RunOptions:
         return range(self.seed, self.seed + self.seeds)
 
 
-def seed_batches(seed: int, runs: int, at_once: int) -> Iterator[range]:
-    """Yield the seeds of all runs, in batches that memory has room for."""
-    last = seed + runs
-    for first in range(seed, last, at_once):
-        yield range(first, min(first + at_once, last))
+def run_in_batches(
+    options: RunOptions,
+    most_at_once: int,
+    simulate: Callable[[range], Simulated],
+    columns_of: Callable[[Simulated], dict[str, Any]],
+    files_of_first: Callable[[Simulated], Iterable[tuple[str, Any]]] | None,
+    progress: Callable[[int], None] | None,
+) -> tuple[dict[str, Any], list[tuple[str, Any]]]:
+    """Simulate all runs, in batches that fit into memory.
+
+    Returns: columns with a row for every run, and the files that show the first batch.
+    """
+    import numpy as np
+
+    parts: list[dict[str, Any]] = []
+    files: list[tuple[str, Any]] = []
+    for first in range(0, options.seeds, most_at_once):
+        seeds = options.numbers[first : first + most_at_once]
+        runs = simulate(seeds)
+        parts.append({"seed": np.array(seeds), **columns_of(runs)})
+        if files_of_first is not None and not files:
+            files += files_of_first(runs)
+        if progress is not None:
+            progress(len(seeds))
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}, files
 
 
 def wanted(scenario: str, options: ScenarioOptions, duration_s: float | None) -> tuple[AttitudeFile, EstimatorSettings]:
@@ -123,7 +147,7 @@ def run_attitude(
         report.check()
         check_netcdf()
     parts: list[Part] = []
-    with progress(runs.seeds, "runs", quiet=report.quiet) as advance:
+    with progress(runs.seeds, "runs") as advance:
         outcome = sims.experiments.run_scenario(
             file,
             estimate,
@@ -132,7 +156,7 @@ def run_attitude(
             look=None if report.out is None else parts.append,
             advance=advance,
         )
-    warn(report, outcome.warning_lines())
+    warn(outcome.warning_lines())
     numbers = outcome.numbers()
     if report.out is not None:
         from sims.cli.attitude_files import attitude_files

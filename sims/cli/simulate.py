@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from arrays.io.errors import InputError, naming
-from magloc.cli.framework import CommonOptions, Flag, print_json
-from magloc.cli.options import naming_options, print_note
+from arrays.io.errors import InputError, naming, naming_options
+from magloc.cli.framework import CommonOptions, Flag, note, print_json
 
 
 def simulate(
@@ -74,6 +73,6 @@ def simulate(
             "targets": [str(path) for path in files.targets],
         }
         print_json(report)
-    if not (json or common.quiet):
+    if not json:
         listed = ", ".join(map(str, files.all))
-        print_note(f"{len(result.readings)} rows of {result.array.n_channels} channels; wrote {listed}")
+        note(f"{len(result.readings)} rows of {result.array.n_channels} channels; wrote {listed}")

@@ -39,7 +39,7 @@ def tables(
     refuse_outside(1.0, 1e7, "1 to 1e7 s", unit=" s", duration=options.duration)
     rows = sims.experiments.PAPER_ROWS
     compared: list[Comparison] = []
-    with progress(len(rows), "rows", quiet=report.quiet) as advance:
+    with progress(len(rows), "rows") as advance:
         for row in rows:
             compared += sims.experiments.compared_with_paper(row, options.numbers, options.duration)
             advance(1)

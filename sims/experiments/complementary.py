@@ -11,7 +11,7 @@ from adcs.complementary.adaptive import AdaptiveTuning, adaptive_track
 from adcs.complementary.explicit import Gains, complementary_track
 from adcs.complementary.names import Method, Rule
 from adcs.complementary.outage import Substitution
-from arrays.typing import FloatArray
+from arrays.typing import BoolArray, FloatArray
 from sims.attitude.complementary import SatelliteRuns, SatelliteScenario
 
 RMS_ORBITS = (0.5, 3.0)
@@ -28,29 +28,25 @@ def errors_deg(runs: SatelliteRuns, method: Method, gains: Gains, outage: Rule |
     return np.degrees(2.0 * quaternion.error_vector(q, runs.q))
 
 
-RUN_COLUMNS = (
-    "rms_deg",
-    "steady_rms_deg",
-    "peak_deg",
-    "outage_max_roll_deg",
-    "outage_max_pitch_deg",
-    "outage_max_yaw_deg",
-)
+OUTAGE_COLUMNS = ("outage_max_roll_deg", "outage_max_pitch_deg", "outage_max_yaw_deg")
 
 
-def row_of_each(scenario: SatelliteScenario, errors: FloatArray) -> FloatArray:
-    """Columns of RUN_COLUMNS, NaN where a run has none."""
+def run_columns(scenario: SatelliteScenario, errors: FloatArray) -> dict[str, FloatArray]:
+    """Return what is kept of every run with errors (R, n, 3) [°], shape (R,) each; NaN where a run has none."""
     orbits, step, outage = scenario.orbits, scenario.step_orbits, scenario.outage_orbits
     late = math.inf if outage is None else outage
+    pooled = (orbits >= RMS_ORBITS[0]) & (orbits < RMS_ORBITS[1])
     steady = (orbits >= RMS_ORBITS[0]) & (orbits < step) if outage is None else (orbits >= 1.0) & (orbits < late)
     after = (orbits >= step) & (orbits < late)
-    rows = np.full((len(errors), len(RUN_COLUMNS)), np.nan)
-    for row, error in zip(rows, errors, strict=True):
-        pooled = error[(orbits >= RMS_ORBITS[0]) & (orbits < RMS_ORBITS[1])]
-        row[0] = math.sqrt(np.mean(pooled**2))
-        row[1] = math.sqrt(np.mean(error[steady] ** 2))
-        if after.any():
-            row[2] = np.abs(error[after]).max()
-        if outage is not None:
-            row[3:] = np.abs(error[orbits >= OUTAGE_MAX_FROM_ORBITS]).max(axis=0)
-    return rows
+    in_outage = orbits >= (math.inf if outage is None else OUTAGE_MAX_FROM_ORBITS)
+
+    def largest(rows: BoolArray, axis: tuple[int, ...]) -> FloatArray:
+        found: FloatArray = np.abs(errors[:, rows]).max(axis=axis, initial=-1.0)
+        return np.where(found < 0.0, np.nan, found)
+
+    return {
+        "rms_deg": np.sqrt(np.mean(errors[:, pooled] ** 2, axis=(1, 2))),
+        "steady_rms_deg": np.sqrt(np.mean(errors[:, steady] ** 2, axis=(1, 2))),
+        "peak_deg": largest(after, (1, 2)),
+        **dict(zip(OUTAGE_COLUMNS, largest(in_outage, (1,)).T, strict=True)),
+    }

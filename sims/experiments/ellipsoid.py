@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adcs.ellipsoids.names import StepRule
 from adcs.ellipsoids.roll_yaw import (
@@ -61,20 +63,15 @@ def ellipsoid_runs(settings: EllipsoidSettings, seeds: range) -> EllipsoidRuns:
     return EllipsoidRuns(seeds, runs.states_rad, observe(observer, runs.readings_rad), runs.readings_rad, None)
 
 
-RUN_COLUMNS = ("seed", "final_error_deg", "half_width_deg", "bound_deg", "resets", "violations", "yaw_max_1000s_deg")
-
-
-def row_of_each(runs: EllipsoidRuns) -> FloatArray:
-    """Columns of RUN_COLUMNS; the last one is the largest yaw after 1000 s, NaN of a shorter run."""
+def run_columns(runs: EllipsoidRuns) -> dict[str, NDArray[Any]]:
+    """Return what is kept of every run, shape (R,) each; the largest yaw is that after 1000 s, NaN of a shorter run."""
     track, yaw = runs.track, runs.states_rad[..., YAW]
     late = np.abs(yaw[:, int(1000.0 / STEP_S) :])
-    columns = [
-        np.array(runs.seeds),
-        np.degrees(np.abs(track.centres[:, -1, YAW] - yaw[:, -1])),
-        np.degrees(track.yaw_half_widths[:, -1]),
-        np.degrees(track.bounds[:, -1]),
-        track.resets[:, -1],
-        violations(track, runs.states_rad),
-        np.degrees(late.max(axis=1)) if late.size else np.full(len(yaw), np.nan),
-    ]
-    return np.stack(columns, axis=1)
+    return {
+        "final_error_deg": np.degrees(np.abs(track.centres[:, -1, YAW] - yaw[:, -1])),
+        "half_width_deg": np.degrees(track.yaw_half_widths[:, -1]),
+        "bound_deg": np.degrees(track.bounds[:, -1]),
+        "resets": track.resets[:, -1],
+        "violations": violations(track, runs.states_rad),
+        "yaw_max_1000s_deg": np.degrees(late.max(axis=1)) if late.size else np.full(len(yaw), np.nan),
+    }

@@ -11,9 +11,9 @@ import numpy as np
 from adcs.quaternion import rotate_back
 from adcs.satellite.sensors import Magnetometer
 from arrays.array import SensorArray
-from arrays.rng import Rng, accept_seed, seed_of
+from arrays.io.values import accept_seed, seed_of
 from arrays.sensor import Sensor
-from arrays.typing import FloatArray
+from arrays.typing import FloatArray, Rng
 from magloc.fields.dipole import total_field
 from sims.attitude.scenario import AttitudeScenario
 from sims.attitude.simulation import AttitudeRuns, moved, prepare

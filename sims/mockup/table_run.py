@@ -15,8 +15,8 @@ import numpy as np
 from adcs.mockup.navigation.fixes import FixRecord
 from adcs.mockup.navigation.imu import Inclinometer, RateGyro
 from adcs.mockup.navigation.strapdown import ImuRecord, PlanarState, PlanarTrack, strapdown
-from arrays.rng import Rng, accept_seed, seed_of
-from arrays.typing import BoolArray, FloatArray
+from arrays.io.values import accept_seed, seed_of
+from arrays.typing import BoolArray, FloatArray, Rng
 from sims.noise import stream
 
 DriveName = Literal["perimeter", "two-firings"]

@@ -233,11 +233,6 @@ class TestMaps:
             magloc.convergence_map(ARRAY, SOURCE, **options)
 
 
-def test_every_public_name_can_be_had():
-    for name in magloc.__all__:
-        assert getattr(magloc, name) is not None
-
-
 def test_errors_of_the_library_do_not_speak_of_options():
     """A command adds its options to them."""
     with pytest.raises(ValueError, match="scheduler") as caught:

@@ -24,8 +24,8 @@ from scipy.spatial import Delaunay, QhullError, cKDTree
 from arrays.io.errors import naming
 from arrays.io.text import write_text
 from arrays.io.toml import FORMAT_VERSION, File, read_toml, section_of, toml_value
-from arrays.rng import Rng, accept_seed, seed_of
-from arrays.typing import FloatArray, IntArray
+from arrays.io.values import accept_seed, seed_of
+from arrays.typing import FloatArray, IntArray, Rng
 
 FEWEST_LIGHTS = 4
 """Least number of lights: two triangles need as many."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -14,8 +15,8 @@ import magloc
 from arrays.io.errors import InputError, naming
 from arrays.io.outputs import refuse_file, refuse_unwritable, write_files
 from arrays.io.tables import aligned
-from magloc.cli.framework import CommonOptions, Flag, print_result
-from magloc.cli.options import array_of_several, print_note, refuse_not_positive
+from magloc.cli.framework import CommonOptions, Flag, note, print_result
+from magloc.cli.options import array_of_several, refuse_not_positive
 
 if TYPE_CHECKING:
     from arrays.array import SensorArray
@@ -121,8 +122,7 @@ def calibrate(
     from magloc.readings import read_readings
 
     refuse_unwritable(out, "--out")
-    if figures is not None:
-        refuse_file(figures, "--figures")
+    refuse_file(figures, "--figures")
     if modulus_nT is not None:
         if truth is not None:
             raise InputError("--modulus-nT: found it together with --truth, expected one of them.")
@@ -147,11 +147,9 @@ def calibrate(
         report, lines, notes = _report(result, len(rows), out), _table(result), _notes(result, len(rows), prior)
     arrays.write_array(out, result.array)
     print_result(report, lines, as_json=json)
-    if figures is not None:
-        _draw(result, figures)
-    if not (json or common.quiet):
-        for note in notes:
-            print_note(note)
+    write_files(figures, _files(result), "--figures")
+    for line in [] if json else notes:
+        note(line)
 
 
 def _check_converged(result: SourceCalibration, readings: Path, out: Path) -> None:
@@ -165,13 +163,14 @@ def _check_converged(result: SourceCalibration, readings: Path, out: Path) -> No
         )
 
 
-def _draw(result: SourceCalibration | TurningCalibration, folder: Path) -> None:
+def _files(result: SourceCalibration | TurningCalibration) -> Iterator[tuple[str, Any]]:
+    """Yield the figure of a calibration, and the data behind it."""
     from magloc.calibration.results import TurningCalibration
     from magloc.plots.calibrations import columns_of_calibration
 
     name = "turning" if isinstance(result, TurningCalibration) else "calibration"
-    files = {f"{name}.png": result.plot(), f"{name}.csv": columns_of_calibration(result)}
-    write_files(folder, files.items(), "--figures")
+    yield f"{name}.png", result.plot()
+    yield f"{name}.csv", columns_of_calibration(result)
 
 
 def _prior(options: PriorOptions, array: SensorArray, path: Path) -> CalibrationPrior:

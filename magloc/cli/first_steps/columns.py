@@ -6,8 +6,7 @@ from pathlib import Path
 
 from arrays.io.outputs import refuse_unwritable
 from arrays.io.text import write_text
-from magloc.cli.framework import QuietOptions
-from magloc.cli.options import print_note
+from magloc.cli.framework import QuietOptions, note
 
 
 def columns(log: Path, /, *, out: Path | None = None, common: QuietOptions = QuietOptions()) -> None:  # noqa: B008 - frozen
@@ -27,13 +26,11 @@ def columns(log: Path, /, *, out: Path | None = None, common: QuietOptions = Qui
     """
     from arrays.logs.proposal import propose_columns
 
-    if out is not None:
-        refuse_unwritable(out, "--out")
+    refuse_unwritable(out, "--out")
     proposal = propose_columns(log)
     if out is None:
         print(proposal.toml(), end="")
         return
     write_text(proposal.toml(), out)
-    if not common.quiet:
-        for question in proposal.asked:
-            print_note(f"asked: {question}")
+    for question in proposal.asked:
+        note(f"asked: {question}")

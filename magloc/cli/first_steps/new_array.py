@@ -14,8 +14,8 @@ import arrays
 from arrays.io.errors import InputError, naming
 from arrays.io.outputs import refuse_unwritable
 from arrays.io.text import write_text
-from magloc.cli.framework import Count, QuietOptions
-from magloc.cli.options import print_note, refuse_not_positive
+from magloc.cli.framework import Count, QuietOptions, note
+from magloc.cli.options import refuse_not_positive
 
 if TYPE_CHECKING:
     from arrays.array import SensorArray
@@ -81,10 +81,9 @@ def new_array(
         wanted = _asked()
     array, source = _array(wanted)
     write_text("".join(f"# {line}\n" for line in source) + arrays.array_toml(array), out)
-    if not common.quiet:
-        print_note(f"wrote {out}: {array.n_sensors} {array.sensors[0].kind} sensors, {array.n_channels} channels")
-        for line in source:
-            print_note(line)
+    note(f"wrote {out}: {array.n_sensors} {array.sensors[0].kind} sensors, {array.n_channels} channels")
+    for line in source:
+        note(line)
 
 
 def _asked() -> ArrayOptions:

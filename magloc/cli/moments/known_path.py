@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 from cyclopts import Parameter
 
 from arrays.io.errors import LARGEST, InputError
-from magloc.cli.framework import print_json, print_report, refuse_outside
-from magloc.cli.options import KnownOptions, MapOptions, print_note
+from magloc.cli.framework import note, print_json, print_report, refuse_outside
+from magloc.cli.options import KnownOptions, MapOptions
 
 if TYPE_CHECKING:
     from arrays.typing import BoolArray
@@ -30,7 +30,6 @@ class TrackOutputs:
     maps: MapOptions
     out: Path | None
     truth: Path | None
-    quiet: bool
 
 
 def refuse_bounds(known: KnownOptions) -> None:
@@ -97,9 +96,9 @@ def write_moment_tracks(
     result = None if outputs.truth is None else first.consistency(magloc.read_truth(outputs.truth))
     outputs.maps.write(first, known.place)
     if outputs.out is not None:
-        from magloc.plots.tracks import write_picture
+        from magloc.plots.tracks import write_track_figures
 
-        write_picture(first, None, outputs.out, array_m=first.readings.array_position_m)
+        write_track_figures(first, None, outputs.out, array_m=first.readings.array_position_m)
     entries = [_entry_of_several(points) if several else json_entry(points[0]) for points in zip(*found, strict=True)]
     if outputs.json:
         report = {"results": entries, "chi2": first.chi2, "dof": first.dof, "misfit": first.misfit}
@@ -125,14 +124,13 @@ def _entry_of_several(points: Sequence[TrackPoint]) -> dict[str, object]:
 
 def _note(found: MomentTrack, determined: BoolArray, readings: Path, outputs: TrackOutputs) -> None:
     """Say what does not fit, and refuse readings that determine nothing."""
-    if not outputs.quiet:
-        if found.misfit:
-            print_note(
-                f"misfit: χ² {found.chi2:.0f} of {found.dof}; no dipole on this path explains the readings (path,"
-                " clock, another source, a body too near, or noise that is understated)"
-            )
-        if not (outputs.json or outputs.jsonl):
-            print_note(f"{determined.sum()} of {len(found)} rows with a moment")
+    if found.misfit:
+        note(
+            f"misfit: χ² {found.chi2:.0f} of {found.dof}; no dipole on this path explains the readings (path,"
+            " clock, another source, a body too near, or noise that is understated)"
+        )
+    if not (outputs.json or outputs.jsonl):
+        note(f"{determined.sum()} of {len(found)} rows with a moment")
     if not determined.any():
         raise InputError(f"{readings}: found no row that determines the moment, expected rows nearer to the object.")
 
@@ -140,4 +138,4 @@ def _note(found: MomentTrack, determined: BoolArray, readings: Path, outputs: Tr
 def print_consistency(lines: Iterable[str], *, jsonl: bool) -> None:
     """Print how good a track is: below its table, or as notes beside its JSON lines."""
     for line in lines:
-        (print_note if jsonl else print)(line)
+        note(line, always=True) if jsonl else print(line)

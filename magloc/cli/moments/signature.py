@@ -10,9 +10,9 @@ from cyclopts import Parameter
 
 import magloc
 from arrays.io.errors import LARGEST, InputError, naming
-from magloc.cli.framework import ABOVE_ZERO, CommonOptions, Flag, print_result, refuse_outside
+from magloc.cli.framework import ABOVE_ZERO, CommonOptions, Flag, note, print_result, refuse_outside
 from magloc.cli.moments.known_path import PathErrorOptions, refuse_bounds
-from magloc.cli.options import KnownOptions, ambient_field, print_note
+from magloc.cli.options import KnownOptions, ambient_field
 
 if TYPE_CHECKING:
     from magloc.readings import Readings
@@ -96,8 +96,8 @@ def signature(
         )
     lines = [*result.table().splitlines(), *lines_of_depths(result, depths)]
     print_result(json_of_signature(result, depths), lines, as_json=json)
-    if result.misfit and not common.quiet:
-        print_note(
+    if result.misfit:
+        note(
             f"misfit: χ² {result.chi2:.0f} of {result.dof}; no such moment on these paths explains the readings (path,"
             " attitude, clock, another source, a body too near, or noise that is understated)"
         )

@@ -144,7 +144,7 @@ class TestResult:
             with open_map(tmp_path / str(i) / "map.zarr") as cube:
                 assert ("body_length_m" in cube.attrs) == bool(options)
         assert main(["bounds", *QUICK, "--body-length-m", "-1", "--out", str(tmp_path / "no")]) == 2
-        assert "--body-length-m must be from 0 to 10000 m" in capsys.readouterr().err
+        assert "--body-length-m: found -1, expected from 0 to 10000 m" in capsys.readouterr().err
 
     @with_plain_pictures
     def test_the_same_again_computes_nothing_anew_and_something_else_is_refused(self, tmp_path, capsys):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import subprocess
@@ -278,7 +279,7 @@ class TestSignsOfLife:
 
         @app.command
         def work(*, common: framework.QuietOptions = framework.QuietOptions()) -> None:  # noqa: B008 - frozen
-            with framework.progress(1, "rows", quiet=not bar):
+            with framework.progress(1, "rows") if bar else contextlib.nullcontext():
                 seen.wait(WAIT_S if watched and not common.quiet and not bar else 0.2)
 
         monkeypatch.setattr(framework, "_FIRST_SIGN_S", 0.01)

@@ -171,7 +171,7 @@ class TestOverSources:
             (ARRAY + "[sources]\nradius = 1\n", [], "key sources.radius: found an unknown key"),
             (ARRAY.replace("vector", "scalar"), [], "3 independent differences, 6 are needed"),
             (ARRAY + "[sources]\nbody_length_m = -1\n", [], "key sources.body_length_m: found -1"),
-            (ARRAY, ["--body-length-m", "-1"], "--body-length-m must be from 0 to 10000 m; instead received -1"),
+            (ARRAY, ["--body-length-m", "-1"], "--body-length-m: found -1, expected from 0 to 10000 m"),
             (ARRAY.replace("= 1.0", "= 1e-30"), [], "must have a noise between 1e-11 and 1e12 nT"),
             (ARRAY, ["--method", "iekf"], "--method: found 'iekf', expected global"),
             (ARRAY, ["--over", "moments"], "--over"),

@@ -19,12 +19,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.differentiate import jacobian
 from scipy.optimize import minimize
 from scipy.spatial.distance import cdist, pdist
-from scipy.spatial.transform import Rotation
 from scipy.stats import qmc
 from scipy.stats.mstats import hdquantiles
 
@@ -37,7 +34,7 @@ from magloc.design.regions import Block, Cap, Mean, Quantile
 from magloc.design.task import DesignSearch, DesignTask
 from magloc.design.volumes import Ball, BoxVolume, Cylinder, MeshSurface, even_grid
 from magloc.fields.dipole import field
-from magloc.plots.designs import clear_azimuth
+from magloc.plots.designs import clearest_azimuth
 from tests.plain_locator import plain_locator
 
 RADIUS = 0.92
@@ -126,27 +123,6 @@ class TestCriterion:
 
     def test_infinite_deviations_above_the_quantile_do_not_count(self):
         assert Quantile(0.5).of(np.array([1.0, 2.0, 3.0, np.inf])) == 2.0
-
-    @given(st.tuples(*[st.floats(-3.0, 3.0)] * 3))
-    @settings(max_examples=10, deadline=None)
-    def test_rotation_of_task_and_array(self, vector):
-        turn = Rotation.from_rotvec(vector)
-        sample = random_sample(TASK, 200, rng(11))
-        turned = Sample(turn.apply(sample.positions), turn.apply(sample.moments))
-        sensors = TETRAHEDRON + rng(12).normal(0.0, 0.1, (4, 3))
-        assert turned.value(TASK, turn.apply(sensors)) == pytest.approx(sample.value(TASK, sensors), rel=1e-9)
-
-    def test_order_of_the_sensors(self):
-        sample = random_sample(TASK, 200, rng(13))
-        assert sample.value(TASK, TETRAHEDRON[[2, 0, 3, 1]]) == pytest.approx(
-            sample.value(TASK, TETRAHEDRON), rel=1e-12
-        )
-
-    def test_scales_with_noise_and_moment(self):
-        sample = random_sample(TASK, 200, rng(14))
-        weaker = Sample(sample.positions, 0.5 * sample.moments)
-        noisy = replace(TASK, noise_T=2e-9)
-        assert weaker.value(TASK, TETRAHEDRON) == pytest.approx(sample.value(noisy, TETRAHEDRON), rel=1e-12)
 
 
 class TestSources:
@@ -302,11 +278,6 @@ class TestDesign:
         assert tetrahedron_.gain == pytest.approx(1.0 - own / tetrahedron_.criterion_m, abs=0.05)
         assert 0.0 < tetrahedron_.gain_error < 0.05
 
-    def test_small_search_gains_already(self, found):
-        """Four starts and a thousand sources: a fifth, at 2 m."""
-        assert found.judged[2].gain > 0.2
-        assert found.near_optimal == ()
-
     def test_same_seed_same_array_whatever_the_threads(self, found, threads):
         threads(1)
         again = design_array(replace(TASK, search=SMALL), rng=1)
@@ -417,6 +388,6 @@ class TestPicture:
         e, a = np.radians([22.0, azimuth])
         sight = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
         points = np.array([sight, -sight, [0.0, 0.0, 2.0]])
-        e, a = np.radians([22.0, clear_azimuth(points)])
+        e, a = np.radians([22.0, clearest_azimuth(points)])
         towards = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
         assert np.linalg.norm(np.cross(towards, 2.0 * sight)) > 1.0

@@ -126,7 +126,7 @@ class TestCluster:
     def test_a_worker_that_fails(self, cluster, cube):
         address, _ = cluster
         broken = StartsMap(cube.scenario, cube.grid, None, cube.z, cube.optimum)
-        with pytest.raises(InputError, match=r"a worker failed \(AttributeError: "):
+        with pytest.raises(InputError, match=r"a worker failed: AttributeError\("):
             list(worked_by(address, partial(computed, broken), boxes(cube)))
 
     @pytest.mark.slow
@@ -170,7 +170,7 @@ class TestTls:
             np.testing.assert_array_equal(chunk.values[name], values)
 
     def test_nobody_without_a_certificate(self, tls_scheduler, cube):
-        with pytest.raises(InputError, match="found no certificates in dask's configuration"):
+        with pytest.raises(InputError, match="found no certificates, expected some in dask's"):
             list(worked_by(tls_scheduler, partial(computed, cube), boxes(cube)))
         plain = tls_scheduler.replace("tls:", "tcp:")
         with pytest.raises(InputError, match=f"scheduler {plain}: found (no scheduler|another service) there"):

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import sims
-from arrays.rng import Rng, accept_seed, seed_of
+from arrays.io.values import accept_seed, seed_of
+from arrays.typing import Rng
 
 
 @accept_seed

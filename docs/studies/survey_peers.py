@@ -1,4 +1,4 @@
-"""What rules of thumb find on the fields of a survey: ``python -m tests.survey_peers --first 200 --seeds 6``.
+"""What rules of thumb find on the fields of a survey: ``python -m docs.studies.survey_peers --first 200 --seeds 6``.
 
 Peaks of the total gradient of both sensors' anomalies on a grid, and at each of them the place and the depth by the
 ratio of the two sensors, by the width of the peak, and by Euler deconvolution (harmonica's, structural index 3) in a
