@@ -80,9 +80,26 @@ def instants(date: Dates, time_s: ArrayLike = 0.0) -> Instants:
 
 
 def julian_dates(utc: Instants) -> tuple[FloatArray, FloatArray]:
-    """Return Julian dates as days and fractions of a day: two arrays of the shape of ``utc``.
+    """Return Julian dates as days and fractions of a day.
 
     Days of UTC have 86,400 s: an instant in a leap second does not exist in datetime64.
+
+    Parameters
+    ----------
+    utc : ndarray of datetime64, shape (...)
+        Instants in microseconds.
+
+    Returns
+    -------
+    days, fractions : ndarray, shape (...)
+        Days up to the midnight before, and the fraction of a day since then.
+
+    Examples
+    --------
+    >>> from adcs import frames
+    >>> day, fraction = frames.julian_dates(frames.instants("2000-01-01T12:00"))
+    >>> float(day), float(fraction)
+    (2451544.5, 0.5)
     """
     # The added half day makes the fraction count from midnight.
     days, rest = np.divmod((utc - _J2000).astype(np.int64) + 43_200_000_000, 86_400_000_000)
@@ -112,12 +129,40 @@ def terrestrial_dates(utc: Instants) -> tuple[FloatArray, FloatArray]:
 
 
 def R_ecef_from_eci(utc: Instants) -> FloatArray:
-    """Return the rotation of the Earth: IAU 2000B precession and nutation, UT1 = UTC; (...) -> (..., 3, 3)."""
+    """Return the rotation of the Earth, ecef from eci.
+
+    Parameters
+    ----------
+    utc : ndarray of datetime64, shape (...)
+        Instants; UT1 is taken as UTC.
+
+    Returns
+    -------
+    ndarray, shape (..., 3, 3)
+        Rotation matrices by the precession and nutation of IAU 2000B.
+
+    Examples
+    --------
+    >>> from adcs import frames
+    >>> frames.R_ecef_from_eci(frames.instants("2026-11-21")).shape
+    (3, 3)
+    """
     return np.asarray(pyerfa().c2t00b(*terrestrial_dates(utc), *julian_dates(utc), 0.0, 0.0), dtype=np.float64)
 
 
 def R_eci_from_teme(utc: Instants) -> FloatArray:
-    """Return the axes of TEME in eci, by ecef and the mean sidereal time of 1982; (...) -> (..., 3, 3)."""
+    """Return the rotation, eci from teme, by ecef and the mean sidereal time of 1982.
+
+    Parameters
+    ----------
+    utc : ndarray of datetime64, shape (...)
+        Instants; UT1 is taken as UTC.
+
+    Returns
+    -------
+    ndarray, shape (..., 3, 3)
+        Rotation matrices.
+    """
     return R_ecef_from_eci(utc).mT @ rotation_about_z(pyerfa().gmst82(*julian_dates(utc)))
 
 
@@ -164,6 +209,12 @@ def orbital_rate(position_eci_m: ArrayLike, velocity_eci_m_s: ArrayLike) -> Floa
 
     Forces across the orbit's plane also turn the frame about e3. That rate, about 1e-9 rad/s on a low orbit, is
     neglected.
+
+    Examples
+    --------
+    >>> from adcs import frames
+    >>> round(float(frames.orbital_rate([7e6, 0.0, 0.0], [0.0, 7.5e3, 0.0])), 6)
+    0.001071
     """
     position = np.asarray(position_eci_m, dtype=np.float64)
     momentum = np.cross(position, np.asarray(velocity_eci_m_s, dtype=np.float64))
@@ -171,5 +222,18 @@ def orbital_rate(position_eci_m: ArrayLike, velocity_eci_m_s: ArrayLike) -> Floa
 
 
 def turned(rotation: ArrayLike, vectors: ArrayLike) -> FloatArray:
-    """Rotate vectors (..., 3), each by its rotation matrix (..., 3, 3)."""
+    """Rotate vectors, each by its rotation matrix.
+
+    Parameters
+    ----------
+    rotation : array_like, shape (..., 3, 3)
+        Rotation matrices ``R_to_from``.
+    vectors : array_like, shape (..., 3)
+        Components in the "from" frame.
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+        Components in the "to" frame.
+    """
     return (np.asarray(rotation, dtype=np.float64) @ np.asarray(vectors, dtype=np.float64)[..., None])[..., 0]

@@ -110,8 +110,8 @@ class Gains:
         limit = 2.0 / (LARGEST_EIGENVALUE * dt_s)
         if not self.largest_kp_per_s <= limit:
             raise ValueError(
-                f"Input kp_per_s must be {limit:g} 1/s at most, the stability limit K_P·h·2 = 2 for steps of "
-                f"{dt_s:g} s; instead received {self.largest_kp_per_s:g}."
+                f"Input kp_per_s must be {limit:g} 1/s at most, because with steps of {dt_s:g} s a filter is unstable "
+                f"where K_P·h·2 exceeds 2; instead received {self.largest_kp_per_s:g}."
             )
 
     def warnings(self, dt_s: float) -> tuple[str, ...]:

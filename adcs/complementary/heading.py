@@ -295,7 +295,7 @@ def _blocks(
     level = quaternion.rotate(q_level, field_T)
     rows = np.flatnonzero(is_read(level))
     if not rows.size:
-        raise ValueError("Input field_T must have a reading; instead received none.")
+        raise ValueError("Input field_T must have a reading within the first second; instead received none.")
     start_T = level[rows[time_s[rows] < time_s[rows[0]] + _START_S]].mean(axis=0)
     size = instants_within(_BLOCK_S, time_s[rows])
     # No block extends over a gap.

@@ -29,6 +29,7 @@ from adcs.complementary.inertial.misreadings import check_lengths, check_turns
 from adcs.satellite.conventions import median
 from adcs.satellite.telemetry import is_read
 from adcs.satellite.vector_record import GyroSamples, instants_within, step_rates, steps_s
+from adcs.satellite.wahba import attitude_of_vectors
 from arrays.io.values import numbers, seconds
 from arrays.typing import BoolArray, FloatArray
 from magloc import core
@@ -270,8 +271,12 @@ def _level_attitudes(q_gyro: FloatArray, up: Up, part: FloatArray) -> FloatArray
     starts = 1 + np.flatnonzero(up.fresh[1:] & ~up.fresh[:-1])
     for begin, end in pairwise([0, *starts, len(up.up)]):
         v = up.up[begin]
-        start = _attitude(v, _other_axis(v))
-        if begin > 0:
+        if begin == 0:
+            # North is any axis that is not along the direction up.
+            north = np.eye(3)[np.argmin(np.abs(v))]
+            frame = [[[0.0, 0.0, 1.0]], [[0.0, 1.0, 0.0]]]
+            start = attitude_of_vectors([v[None], north[None]], frame, [1.0, 1.0], method="triad").q[0]
+        else:
             start = quaternion.multiply(q_level[begin - 1], quaternion.conjugate(q_gyro[begin - 1]))
             start = quaternion.turned_onto(start, v, np.array([0.0, 0.0, 1.0]))
         q_level[begin:end] = level_attitudes(q_gyro[begin:end], up.up[begin:end], part[begin:end], start)
@@ -348,17 +353,3 @@ def rotate_to_fixed_frame(q: FloatArray, time_s: FloatArray, field_T: FloatArray
     """
     then = np.stack([np.interp(time_s - lag_s, time_s, component) for component in q.T], axis=-1)
     return quaternion.rotate(quaternion.normalised(then), field_T)
-
-
-def _attitude(up: FloatArray, north: FloatArray) -> FloatArray:
-    """Return the quaternion (4,), east, north, up from body, of an upward and a northward vector."""
-    from scipy.spatial.transform import Rotation
-
-    y = north - north @ up * up
-    y = y / np.linalg.norm(y)
-    return quaternion.from_rotation(Rotation.from_matrix(np.stack([np.cross(y, up), y, up])))
-
-
-def _other_axis(v: FloatArray) -> FloatArray:
-    """Return an axis that is not along v."""
-    return np.eye(3)[np.argmin(np.abs(v))]

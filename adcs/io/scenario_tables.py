@@ -67,7 +67,7 @@ class OrbitTable(Table, kw_only=True):
 
 
 class StartTable(Table, kw_only=True):
-    """Table of the start of runs: conditions during a run, and errors of the initial motion."""
+    """Table of the start of runs: conditions during a run, and deviations of the initial motion."""
 
     sunlit: bool = True
     least_separation_deg: Annotated[float, _RIGHT_ANGLE] = 45.0

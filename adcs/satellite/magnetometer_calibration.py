@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -251,7 +251,7 @@ def calibrate_readings(
     rows = _FieldRows(times, readings, knots, knots.derivative())
     used: BoolArray = np.isfinite(readings).all(axis=1)  # type: ignore[assignment]
     _check_enough(used)
-    linearised = _modulus if attitude == "none" else _OrbitalResiduals(_orbital_frame(rows.select(used), prior))
+    linearised = _modulus if attitude == "none" else partial(_orbital, _orbital_frame(rows.select(used), prior))
     x = _fit_shifts(rows.select(used), prior, linearised)
     for _ in range(_ROUNDS):
         fit = _maximise_posterior(rows.select(used), prior, linearised, x)
@@ -308,21 +308,18 @@ def _modulus(rows: _FieldRows, x: FloatArray, prior: MagnetometerPrior) -> tuple
     return modulus - length - prior.noise_T**2 / length, np.concatenate([-across, by_gain, by_shift[:, None]], axis=1)
 
 
-class _OrbitalResiduals:
-    """Residuals of readings for a constant attitude, body from the model's frame."""
-
-    def __init__(self, rotation: FloatArray) -> None:
-        self.rotation = rotation
-
-    def __call__(self, rows: _FieldRows, x: FloatArray, prior: MagnetometerPrior) -> tuple[FloatArray, FloatArray]:
-        at = rows.time_s + x[12]
-        b, slope = (values @ self.rotation.T for values in (rows.model(at), rows.slope(at)))
-        gain = np.eye(3) + x[3:12].reshape(3, 3)
-        by = np.zeros((len(at), 3, 13))
-        by[:, :, :3] = -np.eye(3)
-        by[:, :, 3:12] = -np.einsum("ij,rk->rijk", np.eye(3), b).reshape(-1, 3, 9)
-        by[:, :, 12] = -slope @ gain.T
-        return rows.readings_T - b @ gain.T - x[:3], by
+def _orbital(
+    rotation: FloatArray, rows: _FieldRows, x: FloatArray, prior: MagnetometerPrior
+) -> tuple[FloatArray, FloatArray]:
+    """Return the residuals for a constant attitude, body from the model's frame, and their derivatives."""
+    at = rows.time_s + x[12]
+    b, slope = (values @ rotation.T for values in (rows.model(at), rows.slope(at)))
+    gain = np.eye(3) + x[3:12].reshape(3, 3)
+    by = np.zeros((len(at), 3, 13))
+    by[:, :, :3] = -np.eye(3)
+    by[:, :, 3:12] = -np.einsum("ij,rk->rijk", np.eye(3), b).reshape(-1, 3, 9)
+    by[:, :, 12] = -slope @ gain.T
+    return rows.readings_T - b @ gain.T - x[:3], by
 
 
 def _orbital_frame(rows: _FieldRows, prior: MagnetometerPrior) -> FloatArray:

@@ -39,8 +39,7 @@ _LEAST_ROWS = 6
 _AMBIENT_T = 30e-6
 _PRIOR_T = 100e-6  # prior standard deviation of a component of V and o
 _UNKNOWN = 0.5
-LONGEST_LAG_S = 30.0
-"""Largest lag between states and readings that is searched, in both directions."""
+LONGEST_LAG_S = 30.0  # largest lag between states and readings that is searched, in both directions
 _Fitted = tuple[FloatArray, FloatArray, FloatArray, int]
 _FALSE_ALARM, _MISFIT = 1e-6, 2.0
 _OTHERS = 12  # further unknowns of each magnetometer: its offset, and nine errors of gains and axes
@@ -167,6 +166,7 @@ class OwnFields(Drawn):
         Parameters
         ----------
         readings_T : array_like, shape (n, C)
+            Readings of the array's channels.
         states : mapping of str to array_like, shape (n,)
             State of each load at each row.
         time_s : array_like, shape (n,), optional

@@ -19,6 +19,7 @@ from arrays.typing import BoolArray, FloatArray
 REFERENCE_RADIUS_PX = 320.0
 """Radius at which the distortion of a light over its distance from the optical centre is k1."""
 _LARGEST_K1 = 1e6
+FLIP = np.array([1.0, -1.0])  # rows of an image count downwards, centred pixels upwards
 _NO_LENS = 1e-17  # a smaller distortion is below rounding, and the closed form of the inverse would overflow
 
 
@@ -144,7 +145,8 @@ def centred_from_table(camera: Camera, pose: Pose, points_m: ArrayLike) -> Float
     (..., n, 2): centred pixels, y up.
     """
     offset = np.asarray(points_m, dtype=np.float64) - pose.position_m[..., None, :]
-    return rotate(-np.asarray(pose.heading_rad)[..., None], offset) * [1.0, -1.0] / camera.m_per_px
+    # The image is a mirror image of the ceiling, so that the same rotation goes both ways.
+    return rotate(np.asarray(pose.heading_rad)[..., None], offset * FLIP) / camera.m_per_px
 
 
 def table_from_centred(camera: Camera, pose: Pose, points_px: ArrayLike) -> FloatArray:
@@ -153,7 +155,7 @@ def table_from_centred(camera: Camera, pose: Pose, points_px: ArrayLike) -> Floa
     Shape ``points_px`` (..., n, 2). ``pose``: numbers, or arrays of shape (...). Returns (..., n, 2): in the table's
     frame [m].
     """
-    body = np.asarray(points_px, dtype=np.float64) * [camera.m_per_px, -camera.m_per_px]
+    body = np.asarray(points_px, dtype=np.float64) * (camera.m_per_px * FLIP)
     return rotate(np.asarray(pose.heading_rad)[..., None], body) + pose.position_m[..., None, :]
 
 
@@ -166,7 +168,7 @@ def distort(camera: Camera, points_px: ArrayLike) -> FloatArray:
     points = np.asarray(points_px, dtype=np.float64)
     squared = np.sum(points**2, axis=-1, keepdims=True) / REFERENCE_RADIUS_PX**2
     moved = points * np.where(1.0 + 3.0 * camera.k1 * squared > 0.0, 1.0 + camera.k1 * squared, np.nan)
-    return moved * [1.0, -1.0] + camera.centre
+    return moved * FLIP + camera.centre
 
 
 def undistorted(camera: Camera, image_px: ArrayLike) -> FloatArray:
@@ -193,7 +195,7 @@ def undistorted(camera: Camera, image_px: ArrayLike) -> FloatArray:
     >>> mockup.undistorted(mockup.Camera(), [[320.5, 238.5]])
     array([[1., 1.]])
     """
-    points: FloatArray = (np.asarray(image_px, dtype=np.float64) - camera.centre) * [1.0, -1.0]
+    points: FloatArray = (np.asarray(image_px, dtype=np.float64) - camera.centre) * FLIP
     if abs(camera.k1) < _NO_LENS:
         return points
     d = np.linalg.norm(points, axis=-1, keepdims=True) / REFERENCE_RADIUS_PX

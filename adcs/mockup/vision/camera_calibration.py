@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from adcs.mockup.vision.camera import REFERENCE_RADIUS_PX, Camera, Pose, centred_from_table, distort
+from adcs.mockup.vision.camera import FLIP, REFERENCE_RADIUS_PX, Camera, Pose, centred_from_table, distort
 from adcs.mockup.vision.sky import LedSky
 from arrays.typing import FloatArray
 
@@ -224,12 +224,11 @@ def _rows(camera: Camera, pairs: _Pairs) -> _Rows:
     ideal = centred_from_table(camera, pairs.pose, pairs.points_m)
     residual = pairs.image_px - distort(camera, ideal)
     rho2 = np.sum(ideal**2, axis=1) / REFERENCE_RADIUS_PX**2
-    flip = np.array([1.0, -1.0])  # rows count downwards
     outer = ideal[:, :, None] * ideal[:, None, :] / REFERENCE_RADIUS_PX**2
-    by_ideal = flip[:, None] * ((1.0 + camera.k1 * rho2)[:, None, None] * np.eye(2) + 2.0 * camera.k1 * outer)
+    by_ideal = FLIP[:, None] * ((1.0 + camera.k1 * rho2)[:, None, None] * np.eye(2) + 2.0 * camera.k1 * outer)
     by_camera = np.empty((len(ideal), 2, 4))
     by_camera[..., 0] = -(by_ideal @ ideal[..., None])[..., 0] / camera.m_per_px
-    by_camera[..., 1] = flip * rho2[:, None] * ideal
+    by_camera[..., 1] = FLIP * rho2[:, None] * ideal
     by_camera[..., 2:] = np.eye(2)
     # Ideal pixels are right = (cos dX + sin dY)/s and up = (sin dX - cos dY)/s of the offset d from the satellite.
     cos, sin = np.cos(pairs.pose.heading_rad), np.sin(pairs.pose.heading_rad)

@@ -130,8 +130,7 @@ class LightTracker:
             The shape of the points does not match, a number is not finite, or the covariance is not symmetric and
             positive semidefinite.
         """
-        image = mirrored_image(points_px)
-        P = _check_covariance(covariance)
+        image, P = mirrored_image(points_px), np.asarray(covariance, dtype=np.float64)
         expected = expected_lights(self.odds.catalogue, self.odds.camera, pose, P, self.sigmas)
         shifts = self._shifts(image, expected)
         if not len(shifts):

@@ -92,5 +92,5 @@ class TestReduced:
             with pytest.raises(ValueError, match="must have a gyro and the state gyro-bias alone"):
                 run_reduced(runs, other, start)
         runs.readings.gyro_rad_s[1, 0] = np.nan
-        with pytest.raises(ValueError, match="reading of the gyro at the first instant"):
+        with pytest.raises(ValueError, match="gyro reading at the first instant"):
             run_reduced(runs, chosen, start)

@@ -99,7 +99,7 @@ class TestDoubt:
         triangular = grid(15, 12)
         triangular[:, 0] += 0.5 * triangular[:, 1]
         triangular[:, 1] *= math.sqrt(0.75)
-        with pytest.warns(AmbiguousSkyWarning, match="alike"):
+        with pytest.warns(AmbiguousSkyWarning, match="are similar"):
             LedSky(triangular)
 
     def test_one_square_among_many_lights(self):
