@@ -1,4 +1,4 @@
-"""Scenarios of either kind: an array of magnetometers, or a satellite that turns."""
+"""Scenarios of both kinds: an array of magnetometers, or a satellite."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from sims.magnetics.simulation import simulate as simulate_magnetic
 
 
 def read_scenario(name_or_path: str) -> MagneticScenario | AttitudeScenario:
-    """Scenario of a simulation.
+    """Read a scenario of a simulation.
 
     Parameters
     ----------
@@ -61,14 +61,14 @@ def simulate(scenario: MagneticScenario, seed: int) -> Simulation: ...
 @overload
 def simulate(scenario: AttitudeScenario, seed: int | Sequence[int]) -> AttitudeRuns: ...
 def simulate(scenario: MagneticScenario | AttitudeScenario, seed: int | Sequence[int]) -> Simulation | AttitudeRuns:
-    """Readings of a scenario, and the truth behind them.
+    """Simulate the readings of a scenario, and their truth.
 
     Parameters
     ----------
     scenario : MagneticScenario or AttitudeScenario
-        Of :func:`read_scenario`, or made in Python.
+        Scenario from :func:`read_scenario`, or made in Python.
     seed : int
-        Of all random numbers; of a satellite also several, one for every run.
+        Seed of all random numbers; for a satellite also several seeds, one for every run.
 
     Returns
     -------
