@@ -74,7 +74,7 @@ from arrays.io.toml import (
     read_toml,
     section_of,
 )
-from arrays.io.units import Number, nanotesla_list, nanotesla_text, scaled, shifted_text, tesla
+from arrays.io.units import Number, nanotesla_text, scaled, shifted_text, tesla
 from arrays.pose import PoseTable, pose_toml
 from arrays.sensor import Calibration, Sensor
 from arrays.typing import Vector
@@ -83,6 +83,8 @@ _DEFAULTS, _TURNS = "defaults", ("rotation_xyzw", "ypr_deg")
 _NOT_TURNED = (0.0, 0.0, 0.0, 1.0)
 _NotNegative = Annotated[Number, NOT_NEGATIVE]
 _NumberVector = tuple[Number, Number, Number]
+_FIELD_KEYS: tuple[str, ...] = ("common_field_nT", "ambient_nT", "ambient_world_nT", "ambient_gradient_nT_m")
+_FIELD_KEYS += ("ambient_uncertainty_nT", "ambient_uncertainty_white_nT")
 
 
 class _Header(File, kw_only=True):
@@ -246,17 +248,10 @@ def array_toml(array: SensorArray) -> str:
         lines.append(f"name = {_toml_string(array.name)}")
     if array.noise_fraction:
         lines.append(f"noise_fraction = {array.noise_fraction!r}")
-    if array.common_field_T is not None:
-        lines.append(f"common_field_nT = {nanotesla_text(array.common_field_T)}")
-    for key in ("ambient_nT", "ambient_world_nT"):
-        if (field_T := getattr(array, in_si(key)[0])) is not None:
-            lines.append(f"{key} = {nanotesla_list(field_T)}")
-    if array.ambient_gradient_T_m is not None:
-        rows = ", ".join(map(nanotesla_list, array.ambient_gradient_T_m))
-        lines.append(f"ambient_gradient_nT_m = [{rows}]")
-    for key in ("ambient_uncertainty_nT", "ambient_uncertainty_white_nT"):
-        if uncertainty_T := getattr(array, in_si(key)[0]):
-            lines.append(f"{key} = {nanotesla_text(uncertainty_T)}")
+    for key in _FIELD_KEYS:
+        name = in_si(key)[0]
+        if getattr(array, name) != SensorArray.__dataclass_fields__[name].default:
+            lines.append(f"{key} = {nanotesla_text(getattr(array, name))}")
     if array.pose is not None:
         lines += pose_toml(array.pose)
     if array.columns is not None:
@@ -275,7 +270,7 @@ def array_toml(array: SensorArray) -> str:
             lines.append(f"noise_fraction = {sensor.noise_fraction!r}")
         if sensor.calibration != Calibration.of(sensor.kind):
             offsets = sensor.calibration.offset_T
-            offset = nanotesla_list(offsets) if sensor.kind == "vector" else nanotesla_text(offsets[0])
+            offset = nanotesla_text(offsets if sensor.kind == "vector" else offsets[0])
             lines += ["[sensor.calibration]", f"scale = {_shortest_scale(sensor.calibration)}"]
             lines.append(f"offset_nT = {offset}")
     return "\n".join(lines) + "\n"
@@ -380,17 +375,7 @@ def _rotation(place: str, table: _SensorTable) -> tuple[float, float, float, flo
 
 
 def _with_header(path: str, array: SensorArray, header: _Header) -> SensorArray:
-    gradient_T_m = None
-    if header.ambient_gradient_nT_m is not None:
-        place = f"{path}, key ambient_gradient_nT_m"
-        gradient_T_m = tuple(_tesla_vector(place, row) for row in header.ambient_gradient_nT_m)
-    of_field: dict[str, Any] = {"ambient_gradient_T_m": gradient_T_m}
-    for key in ("common_field_nT", "ambient_uncertainty_nT", "ambient_uncertainty_white_nT"):
-        value = getattr(header, key)
-        of_field[in_si(key)[0]] = None if value is None else tesla(f"{path}, key {key}", value)
-    for key in ("ambient_nT", "ambient_world_nT"):
-        value = getattr(header, key)
-        of_field[in_si(key)[0]] = None if value is None else _tesla_vector(f"{path}, key {key}", value)
+    of_field = {in_si(key)[0]: _in_tesla(f"{path}, key {key}", getattr(header, key)) for key in _FIELD_KEYS}
     name = array.name if header.name is None else header.name
     pose = None if header.pose is None else header.pose.uncertainty(f"{path}, table pose")
     channels = {of.id: of.channel_names for of in array.sensors}
@@ -409,8 +394,11 @@ def _quality(place: str, table: _Quality) -> dict[str, Any]:
     return result
 
 
-def _tesla_vector(place: str, nT: _NumberVector) -> Vector:
-    return (tesla(place, nT[0]), tesla(place, nT[1]), tesla(place, nT[2]))
+def _in_tesla(place: str, nanotesla: Any) -> Any:
+    """Return a field, or a tuple of fields, in T; None stays."""
+    if isinstance(nanotesla, tuple):
+        return tuple(_in_tesla(place, each) for each in nanotesla)
+    return None if nanotesla is None else tesla(place, nanotesla)
 
 
 def _shortest_scale(calibration: Calibration) -> float | list[float] | list[list[float]]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from decimal import Context, Decimal
+from typing import Any
 
 from arrays.io.errors import InputError
 
@@ -45,14 +46,9 @@ def scaled(place: str, number: Number, exponent: int) -> float:
     return result
 
 
-def nanotesla_text(tesla: float) -> str:
-    """Return a field in T as a TOML float in nT."""
-    return shifted_text(tesla, 9)
-
-
-def nanotesla_list(tesla: Iterable[float]) -> str:
-    """Return fields in T as a TOML list in nT."""
-    return f"[{', '.join(map(nanotesla_text, tesla))}]"
+def nanotesla_text(tesla: float | Iterable[Any]) -> str:
+    """Return a field in T as a TOML float in nT, or fields as a TOML list."""
+    return f"[{', '.join(map(nanotesla_text, tesla))}]" if isinstance(tesla, Iterable) else shifted_text(tesla, 9)
 
 
 def shifted_text(value: float, exponent: int) -> str:

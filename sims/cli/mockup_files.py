@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import fields
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +20,7 @@ from adcs.mockup.vision.camera import Pose
 from adcs.mockup.vision.sky import LedSky, write_sky
 from adcs.plots import mockup_navigation, mockup_vision
 from arrays.typing import FloatArray
-from sims.experiments.mockup_navigation import FusionRuns, ZerosRuns
+from sims.experiments.mockup_navigation import FusionRuns, TrackErrors, ZerosRuns
 from sims.experiments.mockup_recording import RecordRun
 from sims.experiments.mockup_settings import METHOD_WORDS, SETTLED_S
 from sims.experiments.mockup_vision import FrameResult, SkyRun, frame_result, random_frame
@@ -203,7 +204,7 @@ def fusion_files(runs: FusionRuns) -> Iterator[File]:
     # Only the file of a recording has the zero of the gyro.
     samples.pop("zero_rate_deg_s", None)
     yield "mockup-fusion.csv", samples
-    errors = {name: np.array([getattr(each.errors, name) for each in runs.results]) for name in _ERRORS}
+    errors = _error_columns([each.errors for each in runs.results])
     yield "mockup-fusion-runs.csv", {"seed": np.array([each.seed for each in runs.results])} | errors
     used = first.fused.used
     yield "mockup-fixes.csv", _fix_columns(fixes) | {"false": run.false[: len(used)], "used": used}
@@ -224,7 +225,7 @@ def method_files(every: Sequence[FusionRuns]) -> Iterator[File]:
         {
             "fusion": [method for method, _, _ in each],
             "seed": np.array([seed for _, seed, _ in each], dtype=np.int64),
-            **{name: np.array([getattr(errors, name) for _, _, errors in each]) for name in _ERRORS},
+            **_error_columns([errors for _, _, errors in each]),
         },
     )
 
@@ -245,7 +246,8 @@ def record_files(run: RecordRun) -> Iterator[File]:
     yield "mockup-estimate.csv", {"time_s": track.time_s} | _track_columns("", track)
 
 
-_ERRORS = ("position_rms_mm", "position_p95_mm", "position_max_mm", "velocity_rms_mm_s", "heading_rms_deg")
+def _error_columns(errors: Sequence[TrackErrors]) -> dict[str, FloatArray]:
+    return {field.name: np.array([getattr(each, field.name) for each in errors]) for field in fields(TrackErrors)}
 
 
 def _imu_columns(imu: ImuRecord) -> dict[str, FloatArray]:

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -73,16 +73,13 @@ class FusionRuns:
         """
         from adcs.mockup.navigation.fixes import FixOutcome, unused_counts
 
-        errors = [result.errors for result in self.results]
+        errors = [asdict(result.errors) for result in self.results]
         outcomes = [outcome for result in self.results for outcome in result.fused.outcomes]
         used = sum(int(result.fused.used.sum()) for result in self.results)
         delays_s = np.concatenate([result.run.fixes.arrival_s - result.run.exposure_s for result in self.results])
         return {
-            "position_rms_mm": float(np.mean([error.position_rms_mm for error in errors])),
-            "position_p95_mm": float(np.mean([error.position_p95_mm for error in errors])),
-            "position_max_mm": max(error.position_max_mm for error in errors),
-            "velocity_rms_mm_s": float(np.mean([error.velocity_rms_mm_s for error in errors])),
-            "heading_rms_deg": float(np.mean([error.heading_rms_deg for error in errors])),
+            **{name: float(np.mean([error[name] for error in errors])) for name in errors[0]},
+            "position_max_mm": max(error["position_max_mm"] for error in errors),
             "delay_ms_median": None if not delays_s.size else 1e3 * float(np.median(delays_s)),
             "fixes": len(outcomes),
             "used_fixes": used,
