@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import codecs
 import datetime
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -18,7 +17,7 @@ import msgspec
 import numpy as np
 
 from arrays.io.errors import InputError, naming
-from arrays.io.toml import Table
+from arrays.io.toml import Table, toml_value
 from arrays.typing import Vector
 
 POSITION_COLUMNS = ("array_x_m", "array_y_m", "array_z_m")
@@ -319,4 +318,4 @@ def columns_toml(columns: LogColumns) -> list[str]:
 def _toml(value: object) -> str:
     if isinstance(value, ValidRows):
         return f"{{column = {_toml(value.column)}, equals = {_toml(value.equals)}}}"
-    return json.dumps(list(value) if isinstance(value, tuple) else value, ensure_ascii=False)
+    return toml_value(value)

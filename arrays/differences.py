@@ -78,6 +78,11 @@ class Differences:
         """Number of independent scalars k."""
         return int(self.variance.size)
 
+    @property
+    def whitened(self) -> Differences:
+        """The differences in units of their standard deviations."""
+        return Differences(self.transform / np.sqrt(self.variance)[:, None], np.ones_like(self.variance))
+
 
 def decorrelated_differences(
     array: SensorArray, available: BoolArray | None = None, *, base: int = -1, covariance_T2: FloatArray | None = None

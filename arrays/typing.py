@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     IntArray = NDArray[np.intp]
     ByteArray = NDArray[np.uint8]
     ComplexArray = NDArray[np.complex128]
+    Rng = int | np.integer | np.random.SeedSequence | np.random.BitGenerator | np.random.Generator | None
 
 Vector = tuple[float, float, float]
 _SCALARS = {
@@ -25,9 +26,11 @@ _SCALARS = {
 
 
 def __getattr__(name: str) -> object:
-    if name not in _SCALARS:
+    if name not in (*_SCALARS, "Rng"):
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     import numpy as np
     from numpy.typing import NDArray
 
+    if name == "Rng":
+        return int | np.integer | np.random.SeedSequence | np.random.BitGenerator | np.random.Generator | None
     return NDArray[getattr(np, _SCALARS[name])]  # type: ignore[misc]

@@ -9,6 +9,8 @@ from adcs.io.scenario_files import built_in_scenarios as built_in_satellites
 from adcs.io.scenario_files import read_scenario as read_satellite
 from arrays.io.errors import InputError
 from arrays.io.toml import read_toml
+from arrays.io.values import accept_seed, seed_of
+from arrays.typing import Rng
 from sims.attitude.files import simulation_of
 from sims.attitude.scenario import AttitudeScenario
 from sims.attitude.simulation import AttitudeRuns
@@ -57,18 +59,19 @@ def _is_of_a_satellite(name_or_path: str) -> bool:
 
 
 @overload
-def simulate(scenario: MagneticScenario, seed: int) -> Simulation: ...
+def simulate(scenario: MagneticScenario, rng: Rng) -> Simulation: ...
 @overload
-def simulate(scenario: AttitudeScenario, seed: int | Sequence[int]) -> AttitudeRuns: ...
-def simulate(scenario: MagneticScenario | AttitudeScenario, seed: int | Sequence[int]) -> Simulation | AttitudeRuns:
+def simulate(scenario: AttitudeScenario, rng: Rng | Sequence[int]) -> AttitudeRuns: ...
+@accept_seed
+def simulate(scenario: MagneticScenario | AttitudeScenario, rng: Rng | Sequence[int]) -> Simulation | AttitudeRuns:
     """Simulate the readings of a scenario, and their truth.
 
     Parameters
     ----------
     scenario : MagneticScenario or AttitudeScenario
         Scenario from :func:`read_scenario`, or made in Python.
-    seed : int
-        Seed of all random numbers; for a satellite also several seeds, one for every run.
+    rng : int or numpy.random.Generator
+        Seed or generator of all random numbers. For a satellite also several seeds, one for each run.
 
     Returns
     -------
@@ -85,12 +88,12 @@ def simulate(scenario: MagneticScenario | AttitudeScenario, seed: int | Sequence
     >>> import sims
     >>> from dataclasses import replace
     >>> scenario = replace(sims.read_scenario("weaving"), duration_s=5.0)
-    >>> simulation = sims.simulate(scenario, seed=0)
+    >>> simulation = sims.simulate(scenario, rng=0)
     >>> simulation.readings.values_T.shape
     (11, 12)
     """
     if isinstance(scenario, AttitudeScenario):
-        return simulate_attitude(scenario, [seed] if isinstance(seed, int) else seed)
-    if not isinstance(seed, int):
-        raise ValueError(f"Input seed must be one number for an array; instead received {seed}.")
-    return simulate_magnetic(scenario, seed)
+        return simulate_attitude(scenario, rng if isinstance(rng, Sequence) else [seed_of(rng)])
+    if isinstance(rng, Sequence):
+        raise ValueError(f"Input rng must be one seed or generator for an array; instead received {rng}.")
+    return simulate_magnetic(scenario, seed_of(rng))

@@ -73,11 +73,11 @@ def read_log(path: Path, scenario: AttitudeFile) -> adcs.Telemetry:
 
 def _files(track: adcs.AttitudeTrack, scenario: AttitudeFile) -> Iterator[tuple[str, Any]]:
     """Yield the estimates as a table, as messages and as figures."""
-    from adcs.plots.attitude import nis_figure, track_figure
+    from adcs.plots.attitude import attitude_figure, nis_figure
 
     yield "estimates.csv", track.columns()
     utc = adcs.frames.instants(scenario.satellite.start, track.time_s[track.rows])
     yield "attitude.aem", lambda path: adcs.write_aem(path, utc, track.rotation[track.rows].as_quat())
     yield "orbit.oem", lambda path: adcs.write_oem(path, utc, *scenario.satellite.orbit.position_velocity_eci(utc))
-    yield "estimates.png", track_figure(track, scenario.name)
+    yield "estimates.png", attitude_figure(track, scenario.name)
     yield "consistency.png", nis_figure(track, scenario.name)

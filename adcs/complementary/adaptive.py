@@ -27,7 +27,7 @@ class AdaptiveTuning:
     Attributes
     ----------
     first_sigma : float
-        Noise per axis of the first vector, in its own unit: tesla.
+        Noise of the first vector per axis, in its unit: tesla for a field.
     second_sigma_rad : float
         Noise of the direction of the second vector.
     attitude_noise_rad, bias_noise_rad_s : float
@@ -44,7 +44,7 @@ class AdaptiveTuning:
     Raises
     ------
     ValueError
-        A number is not positive and finite (noise of the attitude may be zero), or the memory is 1 or more.
+        A number is not positive and finite (the attitude's noise may be zero), or the memory is 1 or more.
     """
 
     first_sigma: float = 1000e-9
@@ -58,7 +58,6 @@ class AdaptiveTuning:
     start_bias_rad_s: float = math.radians(0.02)
 
     def __post_init__(self) -> None:
-        # Noise of the attitude may be zero.
         check_positive(
             **{name: value for name, value in vars(self).items() if (name, value) != ("attitude_noise_rad", 0)}
         )
@@ -95,7 +94,7 @@ def adaptive_track(
 ) -> AdaptiveTrack:
     """Run the adaptive filter over whole records in compiled code.
 
-    ``q_start`` (4,): first estimate. Raises ValueError: the first estimate has no length.
+    ``q_start`` (4,): first estimate. Raises ValueError if it has no length.
     """
     shape = (record.n_runs, len(record))
     track = AdaptiveTrack(np.empty((*shape, 4)), np.zeros((*shape, 3)), np.empty((*shape, 6, 6)), np.empty(shape))

@@ -1,7 +1,7 @@
 """Complementary filters of a gyro and two measured vectors, such as field and Sun.
 
 See docs/theory/complementary-filters.md. Source: a Ukrainian paper on the attitude of a magnetically stabilised
-satellite, by its equations. Ours: the rate of the frame, unit vectors, gains, frozen integral.
+satellite. Ours: the rate of the frame, unit vectors, gains, and the frozen integral.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from magloc import core
 LARGEST_EIGENVALUE = 2.0
 """Largest eigenvalue of e against the error angle, for unit vectors; the others are 1 ± |cos| of their angle."""
 WARNING_FRACTION = 0.9
-"""Fraction of the stability limit from which on there is a warning."""
+"""Fraction of the stability limit above which there is a warning."""
 _MU = 1e-6  # added to the diagonal of the normal equations of the measured quaternion
 BLOCK = 20_000
 """Number of instants per call of a kernel: some milliseconds."""
@@ -35,12 +35,12 @@ class Gains:
     Attributes
     ----------
     kp_per_s, ki_per_s2 : float
-        K_P sets the crossover between vectors and gyro, K_I removes the gyro's bias.
+        K_P, which sets the crossover between vectors and gyro, and K_I, which removes the gyro's bias.
     outage_kp_per_s, outage_ki_per_s2 : float
-        The same while the second vector is missing; by default K_P stays the same and the integral is frozen.
+        Gains while the second vector is missing; by default K_P is unchanged and the integral is frozen.
     boost, boost_level_rad, boost_memory : float
-        K_I is multiplied by ``boost`` while the smoothed error is longer than the level; ``boost_memory`` is the factor
-        of its exponential mean. A level of three times its noise detects a step of the bias soon.
+        Factor of K_I while the smoothed error is longer than the level, that level, and the factor of the exponential
+        mean. A level of three times the noise of the error detects a step of the bias soon.
     first_weight, second_weight : float
         Weights of the two vectors in the error e of the explicit filter.
 
@@ -72,7 +72,18 @@ class Gains:
                 raise ValueError(f"Input {name} must be 0 or more; instead received {value}.")
 
     def during(self, outage: bool) -> tuple[float, float]:
-        """Return K_P and K_I, with the second vector or without."""
+        """Return the gains with or without the second vector.
+
+        Parameters
+        ----------
+        outage : bool
+            Whether the second vector is missing.
+
+        Returns
+        -------
+        kp_per_s, ki_per_s2 : float
+            K_P and K_I.
+        """
         if not outage:
             return self.kp_per_s, self.ki_per_s2
         kp = self.kp_per_s if self.outage_kp_per_s is None else self.outage_kp_per_s
@@ -80,20 +91,42 @@ class Gains:
 
     @property
     def largest_kp_per_s(self) -> float:
-        """Larger of the two K_P, times the larger weight."""
+        """Larger one of both K_P, times the larger weight."""
         return max(self.kp_per_s, self.during(outage=True)[0]) * max(self.first_weight, self.second_weight)
 
     def check(self, dt_s: float) -> None:
-        """Raise ValueError beyond the stability limit K_P·h·2 = 2."""
+        """Raise ValueError beyond the stability limit K_P·h·2 = 2.
+
+        Parameters
+        ----------
+        dt_s : float
+            Usual step h of the filter.
+
+        Raises
+        ------
+        ValueError
+            The filter would be unstable.
+        """
         limit = 2.0 / (LARGEST_EIGENVALUE * dt_s)
         if not self.largest_kp_per_s <= limit:
             raise ValueError(
-                f"Input kp_per_s must be {limit:g} 1/s at most, where K_P·h·2 is 2 and a filter with steps of "
-                f"{dt_s:g} s becomes unstable; instead received {self.largest_kp_per_s:g}."
+                f"Input kp_per_s must be {limit:g} 1/s at most, the stability limit K_P·h·2 = 2 for steps of "
+                f"{dt_s:g} s; instead received {self.largest_kp_per_s:g}."
             )
 
     def warnings(self, dt_s: float) -> tuple[str, ...]:
-        """Return a sentence if the gains are within a tenth of the stability limit."""
+        """Return a sentence if the gains are within a tenth of the stability limit.
+
+        Parameters
+        ----------
+        dt_s : float
+            Usual step h of the filter.
+
+        Returns
+        -------
+        tuple of str
+            One sentence, or none.
+        """
         limit = 2.0 / (LARGEST_EIGENVALUE * dt_s)
         if self.largest_kp_per_s < WARNING_FRACTION * limit:
             return ()
@@ -112,8 +145,8 @@ class ComplementaryTrack:
     """Estimates of each run at each instant, with its readings."""
 
     q: FloatArray  # (R, n, 4): reference from body
-    integral_rad_s: FloatArray  # (R, n, 3): I; minus the bias of the gyro
-    q_measured: FloatArray  # (R, n, 4): measured quaternions, of the instant's readings; NaN of the explicit filter
+    integral_rad_s: FloatArray  # (R, n, 3): I, minus the bias of the gyro
+    q_measured: FloatArray  # (R, n, 4): measured quaternions of each instant's readings; NaN for the explicit filter
 
 
 def complementary_track(
@@ -127,9 +160,9 @@ def complementary_track(
     """Filter whole records with fixed gains in compiled code.
 
     ``method``: ``explicit``, by the error angle Σ weight · v × A(q̂) v_reference, or ``gauss-newton``, by the angle to a
-    measured quaternion, which does not use the weights of the gains. ``q_start`` (4,): first estimate, also the initial
-    value of the first measured quaternion. ``substitution``: replacement of a missing second vector. Raises
-    ValueError: the gains are beyond the stability limit, or the first estimate has no length.
+    measured quaternion, which does not use the weights. ``q_start`` (4,): first estimate, also the initial value of the
+    first measured quaternion. ``substitution``: replacement of a missing second vector. Raises ValueError if the gains
+    are beyond the stability limit, or if the first estimate has no length.
     """
     gains.check(record.usual_dt_s)
     shape = (record.n_runs, len(record))
@@ -180,7 +213,7 @@ def record_problem(record: VectorRecord) -> core.Problem:
 def correction_times_s(record: VectorRecord, gains: Gains) -> FloatArray:
     """Return the time (n,) for which the vectors of each instant correct.
 
-    The step before it, but after a gap at most the time with K_P·h·2 = 1.
+    It is the step before the instant, but after a gap at most the time with K_P·h·2 = 1.
     """
     after_gap = 0.5 / gains.largest_kp_per_s if gains.largest_kp_per_s else math.inf
     return np.minimum(record.dt_s, max(record.usual_dt_s, after_gap))

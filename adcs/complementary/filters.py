@@ -29,11 +29,11 @@ LOST = "heading lost"
 """Name of rows in which the heading of an inertial unit is hardly known."""
 LOST_RAD = 0.5
 _RELATIVE = (
-    "there is no magnetometer: the heading is that of gyro and accelerometer alone, against the first row, "
+    "there is no magnetometer: the heading is that of gyro and accelerometer alone, relative to the first row, "
     "and its σ grows to {:.2g}°"
 )
 _NAMES = ("first vector", "second vector")
-_MAGNET = 5.0  # a larger offset, in σ of the sensor's own, is that of a magnet
+_MAGNET = 5.0  # offset of a magnet in σ of the sensor's own offset
 
 
 def complementary_filter(
@@ -48,31 +48,32 @@ def complementary_filter(
 ) -> AttitudeTrack:
     """Estimate the attitude from a gyro and two vectors, such as those of an IMU, in a fixed frame.
 
-    It starts from the first readings of both vectors. Each estimate uses all readings up to its instant.
+    The filter starts from the first readings of both vectors. Each estimate uses all readings up to its instant.
 
     Parameters
     ----------
     time_s : array_like, shape (n,)
-        Ascending, in any steps.
+        Ascending times, in any steps.
     gyro_rad_s : array_like, shape (n, 3)
-        Rate, body axes; where NaN, the last one is held, and the next one makes up for it.
+        Rate, body axes. Where it is NaN, the last one is held, and the next one corrects for it.
     body_vectors : two array_like, shape (n, 3)
-        What is measured, of any length, such as acceleration and field; NaN where missing.
+        Measured vectors of any length, such as acceleration and field, body axes; NaN where missing.
     frame_vectors : two array_like, shape (3,) or (n, 3)
-        The same in the frame, such as up and the local field.
+        The same vectors in the frame, such as up and the local field.
     method : str
-        ``explicit`` and ``gauss-newton`` (of a measured quaternion) have fixed gains; ``adaptive`` is a Kalman filter
-        that lets the bias change where its innovations grow: its first vector is to be a field in tesla.
+        ``explicit`` and ``gauss-newton`` (with a measured quaternion) have fixed gains. ``adaptive`` is a Kalman filter
+        that lets the bias change when its innovations grow; its first vector must be a field in tesla.
     settings : Gains or AdaptiveTuning, optional
-        By default those of a satellite with a magnetometer of 1000 nT, which forget the start in a minute.
+        Settings of the method; by default those of a satellite with a magnetometer of 1000 nT, which forget the start
+        within a minute.
     gyro_samples : str
-        A sample is the ``mean`` rate since the one before, as of a gyro that integrates or filters, or the rate at its
-        ``point`` in time.
+        Kind of a sample: the ``mean`` rate since the one before, as of a gyro that integrates or filters, or the rate
+        at its ``point`` in time.
 
     Returns
     -------
     AttitudeTrack
-        Frame from body.
+        Attitude, frame from body, with rate and gyro bias; standard deviations from ``adaptive`` only.
 
     Raises
     ------
@@ -136,42 +137,43 @@ def inertial_magnetic_filter(
 ) -> AttitudeTrack:
     """Estimate the attitude of a hand-held inertial unit with a magnetometer, also near magnets.
 
-    The acceleration is smoothed in a frame that does not turn, the gyro's bias is measured at rest, and the
-    magnetometer's lag is estimated. The field of the first second, in which the unit should rest, is north. A Kalman
-    filter of the heading has as further states the gyro's scale and drift, the sensor's offset, and the difference of
-    the room's field from that of the start. Without a field the heading is that of the gyro, relative to the first row.
+    The acceleration is smoothed in a frame that does not rotate, the gyro's bias is measured at rest, and the
+    magnetometer's lag is estimated. The field of the first second, in which the unit should rest, defines north. A
+    Kalman filter estimates the heading. Its further states are the gyro's scale and drift, the sensor's offset, and the
+    difference of the room's field from that of the start. Without a field the heading is that of the gyro, relative to
+    the first row.
 
     Parameters
     ----------
     time_s : array_like, shape (n,)
-        Ascending, in any steps.
+        Ascending times, in any steps.
     gyro_rad_s, acceleration_m_s2, field_T : array_like, shape (n, 3)
-        Body axes; at rest the acceleration is upwards. NaN without a reading; within a gap of the gyro σ grows by the
-        possible rotation of a hand. Without a magnetometer the field is None, or NaN everywhere.
+        Readings in body axes, NaN where missing; at rest the acceleration is upwards. Within a gap of the gyro, σ grows
+        by the possible rotation of a hand. Without a magnetometer the field is None, or NaN everywhere.
     magnet : str
-        Treatment of a field that contradicts the filter: it is left out (``rejected``), or attributed to a magnet that
-        moves with the sensor and subtracted (``subtracted``). ``auto`` leaves it out until turns have shown that it
-        moves with the sensor, and then subtracts it. With ``kept`` all readings are used.
+        Treatment of a field that contradicts the filter. ``rejected`` ignores it. ``subtracted`` subtracts it as that
+        of a magnet that moves with the sensor. ``auto`` ignores it until rotations show that it moves with the sensor,
+        and then subtracts it. ``kept`` uses all readings.
     gyro_samples : str
-        As in :func:`adcs.complementary_filter`.
+        Kind of a sample, as in :func:`adcs.complementary_filter`.
     offline : bool
-        Use the whole log for each instant, not only the readings up to it.
+        Whether each instant uses the whole log, not only the readings up to it.
     model : HeadingModel
         Noise and limits of the heading filter.
 
     Returns
     -------
     AttitudeTrack
-        East, north, up from body. ``sigma["level"]`` (n, 3) is about east, north and up [rad]: σ of the tilt in the
-        first two, of the heading in the third. ``degraded`` marks the rows in which the field is left out, a magnet is
-        subtracted, or the heading is lost. ``warnings`` name gaps, a start that is not at rest, a missing
+        Attitude, east, north, up from body. ``sigma["level"]`` (n, 3) is about east, north and up [rad]: σ of the tilt
+        in the first two, of the heading in the third. ``degraded`` marks the rows in which the field is left out, a
+        magnet is subtracted, or the heading is lost. ``warnings`` name gaps, a start that is not at rest, a missing
         magnetometer, and minutes in which the gyro alone holds the heading.
 
     Raises
     ------
     ValueError
-        A shape does not match, the times do not ascend, a sensor has no first reading, a vector is zero, or the unit or
-        the axes of a sensor, or the unit of time, contradict the other sensors.
+        A shape does not match, the times do not ascend, a sensor has no reading within the first second, a vector is
+        zero, or the unit or axes of a sensor, or the unit of time, contradict the other sensors.
 
     Examples
     --------

@@ -1,8 +1,8 @@
 """Heading from gyro and magnetometer: a Kalman filter with the disturbances of the field as states.
 
-The measured field changes when the sensor turns, when it moves to another place, or when an object moves with it. The
-first is a rotation, the second a vector in the room, the third a vector in the sensor's axes. Only turns of the sensor
-separate them; without turns the covariance stays large.
+The measured field changes when the sensor rotates, when it moves to another place, or when a magnetic object moves with
+it. The first change is a rotation, the second a vector in the room, the third a vector in the sensor's axes. Only
+rotations of the sensor separate them; without rotations the covariance stays large.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from arrays.typing import BoolArray, FloatArray
 from magloc import core
 
 _BLOCK_S = 0.035
-"""Time over which readings are averaged; a hand turns by a few degrees within it."""
+"""Time over which readings are averaged; a hand rotates by a few degrees within it."""
 _START_S = 1.0
 _BLOCK = 4000
 """Number of means per call of a kernel: some milliseconds."""
-_LONG_STEP_S = 1.0  # a longer time without a field is one of the gyro alone
+_LONG_STEP_S = 1.0  # longest time without a field in which the drift of the gyro is negligible
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,13 @@ class HeadingModel:
     evidence: float = 10.0
 
     def deviations(self) -> FloatArray:
-        """Return the initial standard deviations of the state (14,); the initial field points north."""
+        """Return the initial standard deviations of the states; the initial field points north.
+
+        Returns
+        -------
+        ndarray, shape (14,)
+            Heading [rad], drift [rad/s], three scales, offset [T], and the room's field in two parts [T].
+        """
         return np.array(
             [
                 self.start_rad,
@@ -121,19 +127,19 @@ class Blocks(NamedTuple):
     R_level: FloatArray  # (m, 3, 3): level from body
     rate_rad_s: FloatArray  # (m, 3): body axes
     dt_s: FloatArray  # (m,)
-    gap_rad2: FloatArray  # (m,): variance of the turn that a gap of the gyro hides within it
-    turns: FloatArray  # (m,): 1 where the sensor turns, 0 where it lies still
-    start_T: FloatArray  # (3,): east, north, up: the field at the start
+    gap_rad2: FloatArray  # (m,): variance of the rotation within a gap of the gyro
+    turns: FloatArray  # (m,): 1 if the sensor rotates, 0 if it rests
+    start_T: FloatArray  # (3,): field at the start, east, north, up
 
 
 @dataclass(frozen=True, eq=False)
 class HeadingTrack:
     """Heading and offset of the magnetometer at n instants."""
 
-    heading_rad: FloatArray  # (n,): turn about the vertical from east and north to the axes of the level frame
-    sigma_rad: FloatArray  # (n,)
-    offset_T: FloatArray  # (n, 3): of the sensor, body axes
-    offset_sigma_T: FloatArray  # (n, 3)
+    heading_rad: FloatArray  # (n,): rotation about the vertical from east and north to the axes of the level frame
+    sigma_rad: FloatArray  # (n,): standard deviation of the heading
+    offset_T: FloatArray  # (n, 3): offset of the sensor, body axes
+    offset_sigma_T: FloatArray  # (n, 3): its standard deviation
     left_out: BoolArray  # (n,): rejected readings of the field
     changes: NDArray[np.intp]  # instants at which the offset changes
 
@@ -151,10 +157,10 @@ def heading_track(
 ) -> HeadingTrack:
     """Estimate the heading by a filter, or a smoother, of the field in the level frame.
 
-    ``rate_rad_s`` (n, 3): mean over the step that ends at each instant. ``q_level`` (n, 4): level from body, of gyro
-    and accelerometer alone. ``field_T`` (n, 3): NaN where there is no reading. ``hidden_rad2`` (n,): growth of the
-    heading's variance within gaps of the gyro. ``start_tilt_rad``: error of the tilt, 1 σ, at the first reading. Raises
-    ValueError: there is no reading.
+    ``rate_rad_s`` (n, 3): mean over the step that ends at each instant. ``q_level`` (n, 4): level from body, from gyro
+    and accelerometer alone. ``field_T`` (n, 3): NaN without a reading. ``hidden_rad2`` (n,): growth of the heading's
+    variance within gaps of the gyro. ``start_tilt_rad``: σ of the tilt at the first reading. Raises ValueError without
+    a reading.
     """
     hidden = np.zeros(len(time_s)) if hidden_rad2 is None else hidden_rad2
     blocks, ends = _blocks(time_s, rate_rad_s, q_level, field_T, model, hidden)
@@ -289,7 +295,7 @@ def _blocks(
     level = quaternion.rotate(q_level, field_T)
     rows = np.flatnonzero(is_read(level))
     if not rows.size:
-        raise ValueError("Input field_T must be there within the first second; instead received none.")
+        raise ValueError("Input field_T must have a reading; instead received none.")
     start_T = level[rows[time_s[rows] < time_s[rows[0]] + _START_S]].mean(axis=0)
     size = instants_within(_BLOCK_S, time_s[rows])
     # No block extends over a gap.

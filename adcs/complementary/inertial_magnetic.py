@@ -36,7 +36,7 @@ from magloc import core
 _TILT_FLOOR_RAD = math.radians(0.4)
 _TURN_S = 0.5  # time for which a hand turns in one direction
 _USEFUL_TILT_RAD = math.radians(2.0)  # largest σ of the tilt with which the field is used
-_UP_STEP = 0.15  # part of the tilt's error that a step corrects: the direction up is smooth already
+_UP_STEP = 0.15  # part of the tilt's error that a step corrects; the direction up is already smooth
 _LONGEST_UP_STEP = 0.5 / _UP_STEP  # in usual steps: after a gap half of the error is corrected
 _REST_S = 1.5
 _REST_RATE_RAD_S = math.radians(0.5)
@@ -44,11 +44,11 @@ _REST_ACCELERATION_M_S2 = 0.15
 _START_RATE_RAD_S = math.radians(2.0)
 _START_ACCELERATION_M_S2 = 0.3
 _START_BIAS_RAD_S = math.radians(5.0)
-_UNKNOWN_BIAS_RAD_S = 0.01  # of a gyro that is never at rest
+_UNKNOWN_BIAS_RAD_S = 0.01  # standard deviation for a gyro that is never at rest
 _LAG_WINDOW_S = 0.2
 _LAG_EVERY_S = 0.01  # closer readings are redundant
 _LONGEST_LAG_S = 0.04
-_USUAL_LENGTH = 0.1  # relative difference of a field's length
+_USUAL_LENGTH = 0.1  # largest relative difference of the length of an undisturbed field
 _LARGEST = {"rate_rad_s": 1e4, "acceleration_m_s2": 1e6, "field_T": 1.0}  # larger readings have another unit
 
 
@@ -59,10 +59,10 @@ class InertialMagneticRecord:
     Attributes
     ----------
     time_s : ndarray, shape (n,)
-        Ascending, in any steps.
+        Ascending times, in any steps.
     rate_rad_s, acceleration_m_s2, field_T : ndarray, shape (n, 3)
-        The acceleration is 9.8 m/s² upwards at rest. A field without any reading is that of a unit without a
-        magnetometer.
+        Readings in body axes. At rest the acceleration is 9.8 m/s² upwards. Without a magnetometer the field has no
+        reading.
     gyro_samples : str
         Kind of the gyro's samples: see :func:`adcs.satellite.vector_record.step_rates`.
 
@@ -84,7 +84,7 @@ class InertialMagneticRecord:
         shape = (len(steps_s(self.time_s)), 3)
         if np.ptp(self.time_s) < 1.0:
             raise ValueError(
-                f"Input time_s must last a second at least, in seconds; instead received {np.ptp(self.time_s):g} s."
+                f"Input time_s must cover a second at least, in seconds; instead received {np.ptp(self.time_s):g} s."
             )
         for name in ("rate_rad_s", "acceleration_m_s2", "field_T"):
             values = numbers(getattr(self, name))
@@ -107,7 +107,7 @@ class InertialMagneticRecord:
 
     @property
     def has_field(self) -> bool:
-        """Return whether there is a magnetometer."""
+        """Whether there is a magnetometer."""
         return bool(is_read(self.field_T).any())
 
     @property
@@ -128,8 +128,8 @@ class InertialMagneticRecord:
 def rest_bias(record: InertialMagneticRecord) -> FloatArray:
     """Return the bias of the gyro at each instant, (n, 3) [rad/s].
 
-    It is the mean of the last 20 rests of 1.5 s, before the first rest that of the first, and zero if the sensor never
-    rests.
+    It is the mean of the last 20 rests of 1.5 s. Before the first rest it is that of the first, and it is zero if the
+    sensor never rests.
     """
     window = numbered_windows(record.time_s, _REST_S)
     rate, *of_rate = window_scatter(record.rate_rad_s, window)
@@ -166,19 +166,19 @@ def start_motion(record: InertialMagneticRecord, bias_rad_s: FloatArray) -> str:
 class PreparedReadings:
     """Prepared readings of an inertial unit, for the heading filter.
 
-    ``q_level`` (n, 4): level from body, by gyro and accelerometer alone; its heading starts unknown and drifts.
+    ``q_level`` (n, 4): level from body, from gyro and accelerometer alone; its heading starts unknown and drifts.
     """
 
     time_s: FloatArray  # (n,)
-    rate_rad_s: FloatArray  # (n, 3): less the bias, the mean over the step that ends at each instant
+    rate_rad_s: FloatArray  # (n, 3): mean over the step that ends at each instant, without the bias
     bias_rad_s: FloatArray  # (n, 3)
-    field_T: FloatArray  # (n, 3): turned by the gyro to where it would be without the magnetometer's lag
+    field_T: FloatArray  # (n, 3): rotated by the gyro to remove the magnetometer's lag
     q_level: FloatArray
-    lag_s: float  # of the magnetometer behind the gyro
-    tilt_sigma_rad: FloatArray  # (n,): of the angle between up and its estimate
+    lag_s: float  # lag of the magnetometer behind the gyro
+    tilt_sigma_rad: FloatArray  # (n,): σ of the angle between up and its estimate
     hidden_rad2: FloatArray | None = None  # (n,): growth of the attitude's variance within gaps of the gyro
-    start_tilt_rad: float = 0.0  # what a start that moves leaves of the tilt where the field is used first
-    bias_sigma_rad_s: float = 0.0  # of a gyro that was never seen at rest
+    start_tilt_rad: float = 0.0  # σ of the tilt at the first used field, after a start in motion
+    bias_sigma_rad_s: float = 0.0  # σ of the bias of a gyro that never rests
     warnings: tuple[str, ...] = ()
 
     @property
@@ -208,7 +208,7 @@ def prepare(
 ) -> PreparedReadings:
     """Remove bias, lag and motion from a record; see :class:`PreparedReadings`.
 
-    Each instant uses readings up to it, offline the whole record. The lag always uses the whole record.
+    Each instant uses the readings up to it, offline the whole record. The lag always uses the whole record.
     """
     time_s, dt_s, bias = record.time_s, record.dt_s, rest_bias(record)
     moves = start_motion(record, bias[0])
@@ -225,7 +225,8 @@ def prepare(
     q_gyro = gyro_attitudes(rate, dt_s)
     gaps = sensor_gaps(time_s, read["gyro"])
     hidden = hidden_variance(time_s, record.rate_rad_s, gaps, model.gap_rad_s, model.long_gap_rad_s)
-    hidden += observed_turn_variance(time_s, gaps, hidden, quaternion.rotate(q_gyro, _usual_field(record)))
+    usual_field_T = np.where(_has_usual_length(record)[:, None], record.field_T, np.nan)
+    hidden += observed_turn_variance(time_s, gaps, hidden, quaternion.rotate(q_gyro, usual_field_T))
     at_rest = record.in_first_second & (not moves) & (np.cumsum(hidden) < LOST_RAD**2)
     acceleration = quaternion.rotate(q_gyro, record.acceleration_m_s2)
     drift = max(model.gyro_drift_rad_s, bias_sigma)
@@ -298,16 +299,14 @@ def _tilt_sigma_rad(
 def _lag_s(q_gyro: FloatArray, record: InertialMagneticRecord) -> float:
     """Return the lag for which the field in a fixed frame changes least within a fifth of a second.
 
-    Readings with another length than in the first second are left out: a magnet on the sensor turns with it.
+    Readings with another length than in the first second are not used, because a magnet on the sensor rotates with it.
     """
     time_s, field_T = record.time_s, record.field_T
-    lengths = np.sqrt(np.einsum("ni,ni->n", field_T, field_T))
-    usual = np.nanmedian(lengths[record.in_first_second])
-    rows = np.flatnonzero(np.isfinite(lengths))
+    rows = np.flatnonzero(is_read(field_T))
     step = float(np.median(record.dt_s))
     rows = rows[:: instants_within(_LAG_EVERY_S, time_s[rows])]
     apart = instants_within(_LAG_WINDOW_S, time_s[rows])
-    good = np.abs(lengths[rows] - usual) < _USUAL_LENGTH * usual
+    good = _has_usual_length(record)[rows]
     most = round(_LONGEST_LAG_S / step)
     changes = np.zeros(most + 1)
     work = core.problem(
@@ -331,11 +330,11 @@ def _lag_s(q_gyro: FloatArray, record: InertialMagneticRecord) -> float:
     return (least + 0.5 * (a - c) / (a - 2.0 * b + c)) * step
 
 
-def _usual_field(record: InertialMagneticRecord) -> FloatArray:
-    """Return readings (n, 3) of the field, NaN where their length is not that of the first second."""
+def _has_usual_length(record: InertialMagneticRecord) -> BoolArray:
+    """Return whether each field (n, 3) is as long as in the first second, within a tenth."""
     lengths = np.sqrt(np.einsum("ni,ni->n", record.field_T, record.field_T))
     usual = median(lengths[record.in_first_second])
-    return np.where((np.abs(lengths - usual) < _USUAL_LENGTH * usual)[:, None], record.field_T, np.nan)
+    return np.asarray(np.abs(lengths - usual) < _USUAL_LENGTH * usual)
 
 
 def _remove_lag(q_gyro: FloatArray, time_s: FloatArray, field_T: FloatArray, lag_s: float) -> FloatArray:
@@ -343,9 +342,9 @@ def _remove_lag(q_gyro: FloatArray, time_s: FloatArray, field_T: FloatArray, lag
 
 
 def rotate_to_fixed_frame(q: FloatArray, time_s: FloatArray, field_T: FloatArray, lag_s: float) -> FloatArray:
-    """Rotate readings (n, 3) of a sensor with a lag into a frame that does not turn.
+    """Rotate readings (n, 3) of a sensor with a lag into a frame that does not rotate.
 
-    ``q`` (n, 4): attitudes at the times (n,), on straight lines between them.
+    ``q`` (n, 4): attitudes at the times (n,), interpolated linearly.
     """
     then = np.stack([np.interp(time_s - lag_s, time_s, component) for component in q.T], axis=-1)
     return quaternion.rotate(quaternion.normalised(then), field_T)

@@ -1,4 +1,4 @@
-"""Substitution of a missing second vector by an earlier first vector, as the field turns.
+"""Substitution of a missing second vector by an earlier first vector, possible while the field rotates.
 
 See docs/theory/complementary-filters.md.
 """
@@ -20,7 +20,7 @@ class Substitution:
     rule : {'magnetometer-only', 'raw', 'transported'}
         See docs/theory/complementary-filters.md.
     delay_s : float
-        Age of the field that is used.
+        Age of the field in use.
 
     Raises
     ------

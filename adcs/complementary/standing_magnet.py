@@ -1,7 +1,7 @@
 """Location of a fixed magnet near the path of a magnetometer from its field.
 
 Positions of the sensor must be known, for example from cameras; gyro and accelerometer do not give them. The attitude
-must not depend on the disturbed field, as that of :func:`adcs.inertial_magnetic_filter` with a magnet "rejected".
+must not depend on the disturbed field: use :func:`adcs.inertial_magnetic_filter` with a magnet "rejected".
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from magloc.fields.dipole import field, field_matrix
 
 _EVERY = 3  # readings closer than a centisecond are redundant
 _SIGMA_T = 2e-6
-_SAME_S = 0.3  # correlation time of the room's own variation
+_SAME_S = 0.3  # correlation time of the variation of the room's field
 _FIRST_DISTANCE_M = 0.1
 _LARGEST_DISTANCE_M = 0.5
 _LARGEST_ROOM_M = 20.0
@@ -32,7 +32,7 @@ _GRADIENTS = np.array(
         [[0, 0, 0], [0, 0, 1], [0, 1, 0]],
     ],
     dtype=np.float64,
-)  # symmetric and traceless, as outside of all sources
+)  # symmetric and traceless, as the gradient outside of all sources
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,8 +40,8 @@ class StandingMagnet:
     """Fixed magnet as a dipole.
 
     ``position_m``, ``moment_Am2`` (3,): east, north, up. ``sigma_m`` (3,): standard deviation of the position.
-    ``lever_arm_m`` (3,): body axes, from the point with known positions to the magnetometer. ``explained``: share of
-    the squared disturbance that it explains where its own field exceeds two microtesla.
+    ``lever_arm_m`` (3,): vector from the point with known positions to the magnetometer, body axes. ``explained``:
+    explained share of the squared disturbance where the magnet's own field exceeds two microtesla.
     """
 
     position_m: FloatArray
@@ -52,14 +52,14 @@ class StandingMagnet:
 
 
 def locate_standing_magnet(prepared: PreparedReadings, q: FloatArray, position_m: FloatArray) -> StandingMagnet:
-    """Locate the dipole that best explains the field, beside a constant and a gradient of the room.
+    """Locate the dipole that best explains the field, besides a constant and a gradient of the room.
 
-    Moment and room are linear; position and lever arm are searched from six starts around the largest difference of the
-    field. Differences larger than two microtesla count less than by their squares (a robust loss).
+    Moment and room are linear. Position and lever arm are searched from six starts around the largest difference of the
+    field, with a robust loss for differences larger than two microtesla.
 
-    ``q`` (n, 4): east, north, up from body. ``position_m`` (n, 3): NaN where unknown. Raises ValueError: there are
-    fewer than 100 known positions, or no dipole within 0.5 m of the largest difference that explains half of the
-    disturbance where its field matters.
+    ``q`` (n, 4): east, north, up from body. ``position_m`` (n, 3): NaN where unknown. Raises ValueError if there are
+    fewer than 100 known positions, or if no dipole within 0.5 m of the largest difference explains half of the
+    disturbance near it.
     """
     from scipy.optimize import least_squares
 

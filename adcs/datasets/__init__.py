@@ -1,4 +1,4 @@
-"""Small simulated logs that come with the package, for a first try, for pages and for tests."""
+"""Small simulated logs in the package, for first steps, documentation and tests."""
 
 from __future__ import annotations
 
@@ -21,17 +21,18 @@ _FILES = BuiltIn("adcs", "datasets", "log", "-truth.csv")
 
 @dataclass(frozen=True, eq=False)
 class Dataset:
-    """A log with the truth behind it.
+    """Log of a satellite with its true attitude.
 
     Attributes
     ----------
     telemetry : Telemetry
+        Readings of the sensors.
     satellite : Satellite
-        As its user knows it.
+        Satellite as its user knows it.
     truth : Rotation of n
-        Inertial (J2000) from body, at the times of the telemetry.
+        True attitude, inertial (J2000) from body, at the times of the telemetry.
     path : Path
-        Of the telemetry file; NAME-scenario.toml and NAME-truth.csv stand beside it.
+        Telemetry file; NAME-scenario.toml and NAME-truth.csv are beside it.
     """
 
     telemetry: Telemetry
@@ -42,17 +43,19 @@ class Dataset:
 
 @dataclass(frozen=True, eq=False)
 class ImuDataset:
-    """Readings of an inertial unit with a magnetometer, with the truth behind them.
+    """Readings of an inertial unit with a magnetometer, with its true attitude.
 
     Attributes
     ----------
     time_s : ndarray, shape (n,)
+        Times of the readings.
     gyro_rad_s, acceleration_m_s2, field_T : ndarray, shape (n, 3)
-        Body axes; at rest the acceleration is 9.81 m/s² upwards. There is a field of (0, 20, -43) µT.
+        Readings in body axes; at rest the acceleration is 9.81 m/s² upwards. The field is (0, 20, -43) µT, east, north,
+        up.
     truth : Rotation of n
-        East, north, up from body.
+        True attitude, east, north, up from body.
     path : Path
-        Of the file; NAME-truth.csv stands beside it.
+        File of the readings; NAME-truth.csv is beside it.
     """
 
     time_s: FloatArray
@@ -64,10 +67,21 @@ class ImuDataset:
 
 
 def names() -> tuple[str, ...]:
-    """Names of the logs.
+    """Return the names of the logs.
 
-    ``satellite``: star tracker, gyro, magnetometer and Sun sensor of a microsatellite; ``imu``: gyro, accelerometer and
-    magnetometer that are turned by hand, with a magnet beside them for a while.
+    ``satellite`` has star tracker, gyro, magnetometer and Sun sensor of a microsatellite. ``imu`` has gyro,
+    accelerometer and magnetometer, turned by hand, at times near a magnet.
+
+    Returns
+    -------
+    tuple of str
+        Names for :func:`load`.
+
+    Examples
+    --------
+    >>> import adcs
+    >>> adcs.datasets.names()
+    ('imu', 'satellite')
     """
     return _FILES.names()
 
@@ -79,12 +93,28 @@ def load(name: Literal["satellite"]) -> Dataset: ...
 @overload
 def load(name: str) -> Dataset | ImuDataset: ...
 def load(name: str) -> Dataset | ImuDataset:
-    """A log by its name.
+    """Load a log by its name.
+
+    Parameters
+    ----------
+    name : str
+        One of :func:`names`.
+
+    Returns
+    -------
+    Dataset or ImuDataset
+        Readings and truth.
 
     Raises
     ------
     InputError
-        There is none of that name.
+        No log has that name.
+
+    Examples
+    --------
+    >>> import adcs
+    >>> adcs.datasets.load("imu").field_T.shape
+    (1500, 3)
     """
     beside = _FILES.chosen(name)
     path = beside.with_name(f"{name}.csv")

@@ -1,4 +1,4 @@
-"""Guaranteed ellipsoids: sets that contain the state for certain, where all that is known of the noise is a bound.
+"""Guaranteed ellipsoids: sets that contain the state with certainty if the noise is bounded.
 
 See docs/theory/guaranteed-ellipsoids.md. Source: Pankratova, Sholokhov, Cybernetics and Systems Analysis 55(1), 2019.
 """
@@ -13,21 +13,22 @@ from numpy.typing import ArrayLike
 from arrays.io.errors import check_positive
 from arrays.typing import BoolArray, FloatArray
 
-# Eigenvalues below zero by this much of the largest one are rounding, as is a difference from the transpose.
+# Largest rounding error of an eigenvalue, or of a difference from the transpose, relative to the largest element.
 _PSD_RTOL = 1e-9
-# Least eigenvalue of a shape, in units of its trace, with which points are tested against a flat one.
+# Smallest eigenvalue of a shape over its trace; smaller ones are raised to it, so that flat ellipsoids are invertible.
 _FLAT_RTOL = 1e-13
 
 
 @dataclass(frozen=True, eq=False)
 class Ellipsoid:
-    """An ellipsoid, flat ones and points included.
+    """Ellipsoid, including flat ones and points.
 
     Attributes
     ----------
     centre : ndarray, shape (n,)
+        Centre x̃.
     shape : ndarray, shape (n, n)
-        H, symmetric positive semidefinite: its eigenvalues are the squared semi-axes.
+        H, symmetric and positive semidefinite: its eigenvalues are the squared semi-axes.
 
     Raises
     ------
@@ -73,36 +74,50 @@ class Ellipsoid:
         return np.sqrt(np.diagonal(self.shape))
 
     def form(self, points: ArrayLike) -> FloatArray:
-        """Quadratic form of points, see :func:`quadratic_form`.
+        """Return the quadratic form of points; see :func:`quadratic_form`.
 
         Parameters
         ----------
         points : array_like, shape (..., n)
+            Points in the space of the ellipsoid.
 
         Returns
         -------
         ndarray, shape (...)
-            At most 1 inside.
+            Values of at most 1 inside the ellipsoid.
         """
         return quadratic_form(self.centre, self.shape, points)
 
     def contains(self, points: ArrayLike, tolerance: float = 1e-9) -> BoolArray:
-        """Whether the form of points, shape (..., n), is at most 1 + tolerance."""
+        """Return whether points are inside the ellipsoid.
+
+        Parameters
+        ----------
+        points : array_like, shape (..., n)
+            Points in the space of the ellipsoid.
+        tolerance : float
+            Excess of the quadratic form over 1 that still counts as inside.
+
+        Returns
+        -------
+        ndarray of bool, shape (...)
+            True inside and on the boundary.
+        """
         return self.form(points) <= 1.0 + tolerance
 
 
 def quadratic_form(centres: ArrayLike, shapes: ArrayLike, points: ArrayLike) -> FloatArray:
-    """(x - x̃)ᵀ H⁻¹ (x - x̃), eigenvalues of H taken as 1e-13 tr(H) at least: that keeps flat ellipsoids invertible.
+    """Return (x - x̃)ᵀ H⁻¹ (x - x̃), with eigenvalues of H of at least 1e-13 tr(H).
 
-    Shapes ``centres`` (..., n), ``shapes`` (..., n, n), ``points`` (..., n). Returns (...): of an ellipsoid that is a
-    point: 0 there and infinite elsewhere.
+    Shapes ``centres`` (..., n), ``shapes`` (..., n, n), ``points`` (..., n) -> (...). For an ellipsoid that is a point
+    the form is 0 there and infinite elsewhere.
     """
     shapes = np.asarray(shapes, dtype=np.float64)
     offset = np.asarray(points, dtype=np.float64) - np.asarray(centres, dtype=np.float64)
     trace = np.trace(shapes, axis1=-2, axis2=-1)
     is_point = trace == 0.0
     least = np.where(is_point, 1.0, _FLAT_RTOL * trace)
-    # Raised one by one: an addition to all of them would be an error of the thin, not only of the flat ones.
+    # Small eigenvalues are raised one by one: adding to all of them would change thin ellipsoids too.
     eigenvalues, axes = np.linalg.eigh(shapes)
     along = (axes.mT @ offset[..., None])[..., 0]
     form = np.sum(along**2 / np.maximum(eigenvalues, least[..., None]), axis=-1)
@@ -110,16 +125,16 @@ def quadratic_form(centres: ArrayLike, shapes: ArrayLike, points: ArrayLike) -> 
 
 
 def segment_shape(direction: ArrayLike, half_length: float, n: int) -> FloatArray:
-    """Shape d² f fᵀ of rank one of the segment from -d f to d f, f of length 1."""
+    """Return the shape d² f fᵀ of the segment from -d f to d f, with f of length 1."""
     f = unit_direction(direction, n)
     check_positive(half_length=half_length)
     return half_length * half_length * np.outer(f, f)
 
 
 def shape_matrix(shape: ArrayLike, n: int, name: str = "shape") -> FloatArray:
-    """Symmetric copy of a positive semidefinite matrix, checked.
+    """Return a symmetric copy of a matrix; raise ValueError unless it is positive semidefinite.
 
-    Shapes ``shape`` (n, n) -> (n, n). ``name``: what an error calls it.
+    Shapes ``shape`` (n, n) -> (n, n). ``name``: name of the argument in errors.
     """
     matrix = np.asarray(shape, dtype=np.float64)
     if matrix.shape != (n, n) or not np.isfinite(matrix).all():
@@ -127,7 +142,7 @@ def shape_matrix(shape: ArrayLike, n: int, name: str = "shape") -> FloatArray:
     scale = float(np.abs(matrix).max())
     if np.abs(matrix - matrix.T).max() > _PSD_RTOL * scale:
         raise ValueError(f"Input {name} must be symmetric; instead received {matrix.tolist()}.")
-    matrix = _symmetric(matrix)
+    matrix = 0.5 * (matrix + matrix.T)
     smallest = float(np.linalg.eigvalsh(matrix)[0])
     if smallest < -_PSD_RTOL * scale:
         raise ValueError(
@@ -137,7 +152,7 @@ def shape_matrix(shape: ArrayLike, n: int, name: str = "shape") -> FloatArray:
 
 
 def measurement_direction(direction: ArrayLike, n: int) -> FloatArray:
-    """Direction of a reading, checked: shape (n,), finite and of a length that is not zero."""
+    """Return the direction of a reading, (n,); raise ValueError unless it is finite and not zero."""
     h = np.asarray(direction, dtype=np.float64)
     if h.shape != (n,) or not np.isfinite(h).all() or not h.any():
         raise ValueError(
@@ -147,11 +162,7 @@ def measurement_direction(direction: ArrayLike, n: int) -> FloatArray:
 
 
 def unit_direction(direction: ArrayLike, n: int) -> FloatArray:
-    """Direction of length 1, checked as :func:`measurement_direction`."""
+    """Return a direction of length 1; errors as in :func:`measurement_direction`."""
     h = measurement_direction(direction, n)
     h = h / np.abs(h).max()
     return h / np.linalg.norm(h)
-
-
-def _symmetric(matrix: FloatArray) -> FloatArray:
-    return 0.5 * (matrix + matrix.T)

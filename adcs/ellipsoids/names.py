@@ -1,4 +1,4 @@
-"""Words by which the step of an ellipsoid to a strip is chosen."""
+"""Names of the rules for the step of an ellipsoid to a strip."""
 
 from __future__ import annotations
 

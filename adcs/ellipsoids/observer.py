@@ -1,4 +1,4 @@
-"""Guaranteed observer of a linear system whose disturbances and reading errors are only bounded.
+"""Guaranteed observer of a linear system with bounded disturbances and bounded errors of readings.
 
 See docs/theory/guaranteed-ellipsoids.md. Source: Pankratova, Sholokhov, Cybernetics and Systems Analysis 55(1), 2019;
 the factor and the enlargement are ours.
@@ -24,27 +24,27 @@ _RUNS_A_BLOCK = 4000
 
 @dataclass(frozen=True, eq=False)
 class BoundedSystem:
-    """A linear system with bounded noise.
+    """Linear system with bounded noise.
 
     Attributes
     ----------
     A : ndarray, shape (n, n)
         Transition matrix; may be unstable.
     disturbance : ndarray, shape (n, n)
-        Q, shape of the ellipsoid of the disturbances; of rank one for a segment, zero for none.
+        Q, shape of the ellipsoid of the disturbances: rank one for a segment, zero for no disturbance.
     directions : ndarray, shape (m, n)
-        H, the measured direction of every channel.
+        H, measured direction of each channel.
     bounds : ndarray, shape (m,)
-        c, the largest error of every channel, positive.
+        c, largest error of each channel, positive.
 
     Raises
     ------
     ValueError
-        The sizes do not match, Q is not positive semidefinite, a direction has no length or a bound is not positive.
+        The sizes do not match, Q is not positive semidefinite, a direction is zero, or a bound is not positive.
 
     Examples
     --------
-    A number that changes by 0.1 in a step at most, and is read with an error of 0.1 at most:
+    A number that changes by at most 0.1 per step and is read with an error of at most 0.1:
 
     >>> import numpy as np
     >>> import adcs
@@ -86,30 +86,33 @@ class BoundedSystem:
 
 
 class EllipsoidObserver:
-    """Sets that contain the states of many runs of one system for certain, compiled.
+    """Observer of many runs of one system: its sets contain the states with certainty.
 
     Parameters
     ----------
     system : BoundedSystem
+        System and bounds of its noise.
     start : Ellipsoid
         Set of the first state.
     n_runs : int
-        By default one.
+        Number of runs.
     rule : {'optimal', 'tightened', 'lemma'}
-        ``optimal`` has the least trace for the strip of a reading as it is; ``tightened`` first narrows the strip to
-        where it touches the ellipsoid, which usually gives the smallest set (2 % above the true minimum in the plane,
-        on average); ``lemma`` is the source paper's simplified step.
+        ``optimal`` gives the least trace for the strip of a reading. ``tightened`` first narrows the strip to the part
+        that touches the ellipsoid, which usually gives the smallest set: in the plane on average 2 % above the true
+        minimum. ``lemma`` is the simplified step of the source paper.
     reinflation : array_like, shape (n, n), optional
-        Shape of an ellipsoid that is added to the set where a reading contradicts it.
+        Shape of an ellipsoid that is added to the set if a reading contradicts it; by default none.
 
     Attributes
     ----------
     centres : ndarray, shape (n_runs, n)
+        Centres of the current sets.
     shapes : ndarray, shape (n_runs, n, n)
+        Shapes of the current sets.
     bounds : ndarray, shape (n_runs, m)
-        In force.
+        Bounds of the readings' errors in force.
     resets : ndarray of int, shape (n_runs,)
-        Contradictions so far.
+        Number of contradictions so far.
 
     Raises
     ------
@@ -153,12 +156,29 @@ class EllipsoidObserver:
         return len(self.centres)
 
     def predict(self, known_inputs: ArrayLike = 0.0) -> None:
-        """Advance all sets by one step; known_inputs of shape (n_runs, n), or one (n,) for all runs."""
+        """Advance all sets by one step.
+
+        Parameters
+        ----------
+        known_inputs : array_like, shape (n_runs, n) or (n,)
+            Known change of the state in the step, of each run or of all.
+        """
         inputs = np.broadcast_to(np.asarray(known_inputs, dtype=np.float64), self.centres.shape)
         self._run("ellipsoids_predict", inputs=np.ascontiguousarray(inputs), readings=None)
 
     def correct(self, readings: ArrayLike) -> None:
-        """Correct all sets by the readings of one instant, shape (n_runs, m), NaN where missing."""
+        """Correct all sets by the readings of one instant.
+
+        Parameters
+        ----------
+        readings : array_like, shape (n_runs, m)
+            Readings of the channels, NaN where missing.
+
+        Raises
+        ------
+        ValueError
+            The shape does not match, or a reading is infinite.
+        """
         shape = (len(self), self.system.m)
         values = np.asarray(readings, dtype=np.float64)
         if values.shape != shape or np.isinf(values).any():

@@ -1,8 +1,8 @@
 """Roll and yaw of a satellite from a horizon sensor and gyros, with guaranteed ellipsoids.
 
 See docs/theory/guaranteed-ellipsoids.md. Source: Pankratova, Sholokhov, Cybernetics and Systems Analysis 55(1), 2019,
-section 4. Ours: the increments of the gyros as known inputs, which are exact for a constant rate, and the control law
-of :class:`AttitudeLoop`.
+section 4. Ours: increments of the gyros as known inputs, exact for a constant rate, and the control law of
+:class:`AttitudeLoop`.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ ROLL, YAW = 0, 1
 
 
 def transition(orbital_rate: float = ORBITAL_RATE, step_s: float = STEP_S) -> FloatArray:
-    """Rotation of (roll, yaw) in a step without rates, exp(Ω Δt), shape (2, 2)."""
+    """Return the rotation of (roll, yaw) in a step without rates, exp(Ω Δt), shape (2, 2)."""
     angle = orbital_rate * step_s
     return np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
 
 
 def input_matrix(orbital_rate: float = ORBITAL_RATE, step_s: float = STEP_S) -> FloatArray:
-    """From the roll and yaw gyros' increments in a step to (roll, yaw): (1/Δt) ∫ exp(Ω t) dt, shape (2, 2).
+    """Return the change of (roll, yaw) per increment of the roll and yaw gyros, (1/Δt) ∫ exp(Ω t) dt, (2, 2).
 
-    The unit matrix to first order, which is what the source paper has; this is exact for a constant rate.
+    It is exact for a constant rate. The source paper has the unit matrix, which is its first order.
     """
     angle = orbital_rate * step_s
     s, c = math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle
@@ -49,12 +49,11 @@ def input_matrix(orbital_rate: float = ORBITAL_RATE, step_s: float = STEP_S) -> 
 def roll_yaw_system(
     noise_rad: float, drift_rad_s: float, *, orbital_rate: float = ORBITAL_RATE, step_s: float = STEP_S
 ) -> BoundedSystem:
-    """The system that the observer takes.
+    """Return the bounded system of roll and yaw.
 
-    ``noise_rad``: c, largest error of the horizon sensor, positive. ``drift_rad_s``: largest zero shift of the yaw
-    gyro, positive. It must be that of the gyro in use: with a better gyro and the old bound nothing is gained.
-    ``orbital_rate``: ω₀ [rad/s]. The source paper takes what the pitch gyro shows, whose zero shift is in no bound:
-    0.02 °/s are a third of ω₀, and void the guarantee.
+    ``noise_rad``: c, largest error of the horizon sensor, positive. ``drift_rad_s``: largest zero shift of the yaw gyro
+    in use, positive. ``orbital_rate``: ω₀ [rad/s]. The source paper takes the rate of the pitch gyro, whose zero shift
+    no bound covers: 0.02 °/s is a third of ω₀ and voids the guarantee.
     """
     check_positive(noise_rad=noise_rad, drift_rad_s=drift_rad_s)
     drift = drift_rad_s * step_s * input_matrix(orbital_rate, step_s)[:, YAW]
@@ -67,18 +66,18 @@ def roll_yaw_system(
 
 
 def first_set(noise_rad: float) -> Ellipsoid:
-    """Set of the first state: roll and yaw within a circle of radius 3 c."""
+    """Return the set of the first state: roll and yaw within a circle of radius 3 c."""
     return Ellipsoid(np.zeros(2), (3.0 * noise_rad) ** 2 * np.eye(2))
 
 
 def roll_yaw_observer(
     system: BoundedSystem, n_runs: int, rule: StepRule = "tightened", *, reinflation_rad: float | None = None
 ) -> EllipsoidObserver:
-    """Observers of many runs.
+    """Return an observer of many runs.
 
-    ``system``: see :func:`roll_yaw_system`. ``rule``, one of 'tightened', 'optimal', 'lemma': the first has the
-    smallest sets of this satellite, and recovers best from a bound that was wrong. ``reinflation_rad``: radius of the
-    circle that is added to a set that a reading contradicts, 4 c by default; zero as in the source paper.
+    ``system``: see :func:`roll_yaw_system`. ``rule``: 'tightened', 'optimal' or 'lemma'; the first has the smallest
+    sets for this satellite, and recovers best from a wrong bound. ``reinflation_rad``: radius of the circle that is
+    added to a set if a reading contradicts it, by default 4 c; zero as in the source paper.
     """
     c = float(system.bounds[0])
     radius = 4.0 * c if reinflation_rad is None else reinflation_rad
@@ -87,7 +86,7 @@ def roll_yaw_observer(
 
 @dataclass(frozen=True, eq=False)
 class SetTrack:
-    """Sets of many runs through time, the first one of the start."""
+    """Sets of many runs over time, beginning with the set of the start."""
 
     centres: FloatArray  # (n_runs, n_steps + 1, 2): (roll, yaw) [rad]
     shapes: FloatArray  # (n_runs, n_steps + 1, 2, 2): [rad²]
@@ -101,7 +100,7 @@ class SetTrack:
 
 
 class Recorder:
-    """Keeps the sets of an observer, step by step."""
+    """Recorder of an observer's sets, step by step."""
 
     def __init__(self, observer: EllipsoidObserver, n_steps: int) -> None:
         n, shape = observer.system.n, (len(observer), n_steps + 1)
@@ -112,7 +111,7 @@ class Recorder:
         self.record()
 
     def record(self) -> None:
-        """Keep what the observer holds now."""
+        """Record the current sets of the observer."""
         observer, step = self._observer, self._next
         self.track.centres[:, step] = observer.centres
         self.track.shapes[:, step] = observer.shapes
@@ -122,10 +121,10 @@ class Recorder:
 
 
 def observe(observer: EllipsoidObserver, readings_rad: FloatArray) -> SetTrack:
-    """Sets of many runs without known inputs: the dynamics of the error alone.
+    """Return the sets of many runs without known inputs: the dynamics of the error alone.
 
-    ``observer``: at its start; goes on to the end. ``readings_rad`` (n_runs, n_steps): roll readings after every step,
-    NaN where missing.
+    ``observer``: observer at its start, which the call advances to the end. ``readings_rad`` (n_runs, n_steps): roll
+    readings after every step, NaN where missing.
     """
     recorder = Recorder(observer, readings_rad.shape[1])
     for readings in readings_rad.T:
@@ -140,7 +139,7 @@ class AttitudeLoop:
 
     The torque is :math:`-J (k_p\,\alpha + k_d\,\omega_{rel})`, J the nominal inertia, α the estimated roll and yaw and
     the measured pitch, ω_rel the gyros' rates relative to the orbital frame.
-    ``n_steps``: cycles at most. ``orbital_rate``: of the control law [rad/s].
+    ``n_steps``: largest number of cycles. ``orbital_rate``: ω₀ in the control law [rad/s].
     """
 
     KP = 0.0025
@@ -152,11 +151,11 @@ class AttitudeLoop:
         self.recorder = Recorder(observer, n_steps)
 
     def __call__(self, horizon_rad: FloatArray, increments_rad: FloatArray, rates_rad_s: FloatArray) -> FloatArray:
-        """One cycle: the readings at its end, and the torque to hold during the next one.
+        """Process the readings at the end of a cycle; return the torque to hold during the next one.
 
         ``horizon_rad`` (n_runs, 2): roll and pitch readings. ``increments_rad`` (n_runs, 3): increments of the three
         gyros in the cycle. ``rates_rad_s`` (n_runs, 3): rates of the three gyros at its end. Returns (n_runs, 3):
-        torque in the body frame [N·m].
+        torque, body axes [N·m].
         """
         self._observer.predict(np.einsum("ij,rj->ri", self._input, increments_rad[:, [0, 2]]))
         self._observer.correct(horizon_rad[:, :1])
@@ -169,7 +168,7 @@ class AttitudeLoop:
 
 @dataclass(frozen=True, eq=False)
 class KalmanTrack:
-    """Kalman estimates of one run through time, the first one of the start."""
+    """Kalman estimates of one run over time, beginning with that of the start."""
 
     means: FloatArray  # (n_steps + 1, 2): (roll, yaw) [rad]
     covariances: FloatArray  # (n_steps + 1, 2, 2): [rad²]
@@ -178,13 +177,13 @@ class KalmanTrack:
 def kalman_track(
     system: BoundedSystem, readings_rad: FloatArray, increments_rad: FloatArray | None = None
 ) -> KalmanTrack:
-    """What a Kalman filter makes of the same readings, with errors taken as random numbers of the same bounds.
+    """Return the estimates of a Kalman filter with the same readings, for random errors within the same bounds.
 
-    Uniform numbers within ±b have the variance b²/3; the first standard deviation is a third of the first set's
-    radius, so that both ellipses, this one at 3 σ, start equal.
+    Uniform errors within ±b have the variance b²/3. The initial standard deviation is a third of the first set's
+    radius, so that the 3 σ ellipse equals that set.
     ``system``: see :func:`roll_yaw_system`. ``readings_rad`` (n_steps,): roll readings after every step, NaN where
-    missing. ``increments_rad`` (n_steps, 3): increments of the gyros in every step; none for the dynamics of the error
-    alone.
+    missing. ``increments_rad`` (n_steps, 3): increments of the gyros in every step; without them the dynamics of the
+    error alone.
     """
     noise_rad = float(system.bounds[0])
     eigenvalue, eigenvector = np.linalg.eigh(system.disturbance / 3.0)
@@ -205,7 +204,7 @@ def kalman_track(
 
 
 def violations(track: SetTrack, states_rad: FloatArray, tolerance: float = 1e-9) -> IntArray:
-    """Instants at which the true state is outside of the set, its form above 1 + tolerance.
+    """Count the instants at which the true state is outside of the set, with a form above 1 + tolerance.
 
     ``states_rad`` (n_runs, n_steps + 1, 2): true (roll, yaw) [rad]. Returns shape (n_runs,).
     """

@@ -1,7 +1,7 @@
-r"""What surrounds a satellite along its orbit: field, Sun, eclipse, gravity, in the frames of :mod:`adcs.frames`.
+r"""Environment of a satellite along its orbit: field, Sun, eclipse and gravity, in the frames of :mod:`adcs.frames`.
 
-Field and Sun are computed at knots 30 s apart and interpolated by cubic splines of their components in the orbital
-frame, where they change slowly: the error stays below 0.05 nT and 1e-7 rad on a low orbit.
+Field and Sun are computed at knots 30 s apart. Cubic splines interpolate their components in the orbital frame, where
+they change slowly. On a low orbit the errors stay below 0.05 nT and 1e-7 rad.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ KNOTS_S = 30.0
 
 @dataclass(frozen=True, eq=False)
 class Environment:
-    """Surroundings of one or several runs (...) at n instants each."""
+    """Environment of one or several runs (...) at n instants each."""
 
     utc: Instants  # (..., n)
     time_s: FloatArray  # (n,): since the start of the run
@@ -31,13 +31,13 @@ class Environment:
     velocity_eci_m_s: FloatArray  # (..., n, 3)
     b_orbital_T: FloatArray  # (..., n, 3): geomagnetic field
     sun_orbital: FloatArray  # (..., n, 3): unit vector to the Sun, also in eclipse
-    illuminated: FloatArray  # (..., n): part of the Sun's disc that is seen
+    illuminated: FloatArray  # (..., n): visible part of the Sun's disc
     orbital_rate_rad_s: FloatArray  # (..., n): n, rate of the orbital frame about its e2
-    gravity_s2: FloatArray  # (..., n): μ/r³, which is n² on a circle
+    gravity_s2: FloatArray  # (..., n): μ/r³, equal to n² on a circle
 
     @property
     def sunlit(self) -> BoolArray:
-        """Whether at least half of the Sun is seen, shape (..., n)."""
+        """Mask (..., n) of the instants with at least half of the Sun's disc visible."""
         return np.asarray(self.illuminated >= 0.5)
 
     @property
@@ -53,16 +53,16 @@ class Environment:
 
 
 def field_eci(position_eci_m: ArrayLike, utc: Instants, model: Model = "IGRF-14") -> FloatArray:
-    """Geomagnetic field in eci [T] at positions (..., 3) and instants (...)."""
+    """Return the geomagnetic field in eci [T] at positions (..., 3) and instants (...)."""
     rotation = R_ecef_from_eci(utc)
     return turned(rotation.mT, field_ecef(turned(rotation, position_eci_m), utc, model))
 
 
 def environment(orbit: Orbit, start: Dates, time_s: ArrayLike, *, model: Model = "IGRF-14") -> Environment:
-    """Surroundings along an orbit.
+    """Return the environment along an orbit.
 
-    ``start`` (...): start of every run, UTC. ``time_s`` (n,): since the start, ascending. ``model``: of the geomagnetic
-    field: "IGRF-14" (1900 to 2030) or "WMM2025".
+    ``start`` (...): start of each run, UTC. ``time_s`` (n,): ascending times since the start. ``model``: model of the
+    geomagnetic field, "IGRF-14" (1900 to 2030) or "WMM2025".
     """
     seconds = np.atleast_1d(np.asarray(time_s, dtype=np.float64))
     if seconds.ndim != 1 or seconds.size == 0 or not np.isfinite(seconds).all() or (np.diff(seconds) <= 0.0).any():
@@ -91,16 +91,16 @@ def environment(orbit: Orbit, start: Dates, time_s: ArrayLike, *, model: Model =
 
 
 def _knots(seconds: FloatArray) -> FloatArray:
-    """Where field and Sun are computed: at knots from the first to the last instant, or at few instants themselves.
+    """Return the times at which field and Sun are computed: knots, or the instants themselves if they are few.
 
-    None lies outside of the instants: a run may begin and end with the validity of the field model.
+    No knot is outside of the instants, because a run may begin and end with the validity of the field model.
     """
     n_knots = max(4, 1 + math.ceil((seconds[-1] - seconds[0]) / KNOTS_S))
     return seconds if len(seconds) <= n_knots else np.linspace(seconds[0], seconds[-1], n_knots)
 
 
 def _at(seconds: FloatArray, knots_s: FloatArray, values: FloatArray) -> FloatArray:
-    """Values (..., knots, 3) at the instants."""
+    """Interpolate values (..., knots, 3) at the instants."""
     from scipy.interpolate import CubicSpline
 
     if knots_s is seconds:

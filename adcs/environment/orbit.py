@@ -1,6 +1,6 @@
-"""Orbits around the Earth: a circle, or the elements of a real satellite.
+"""Orbits around the Earth: a circle, or published two-line elements.
 
-An orbit is anything with :meth:`Orbit.position_velocity_eci`. Positions and velocities are in the inertial frame of
+Any class with the methods of :class:`Orbit` is an orbit. Positions and velocities are in the inertial frame eci of
 :mod:`adcs.frames`.
 """
 
@@ -21,18 +21,18 @@ from arrays.typing import FloatArray
 MU_M3_S2 = 3.986004418e14
 """Gravitational parameter of the Earth, WGS-84."""
 EARTH_RADIUS_M = 6_378_137.0
-"""Equatorial radius, WGS-84: altitudes of circular orbits are above it."""
+"""Equatorial radius, WGS-84; altitudes of circular orbits count from it."""
 WARNED_DAYS, REFUSED_DAYS = 7.0, 30.0
-"""Age of two-line elements from which on there is a warning, and from which on they are refused."""
+"""Ages of two-line elements from which on there is a warning, and from which on they are refused."""
 _LOG = logging.getLogger(__name__)
 _FIRST_M, _PER_DAY_M = 1e3, 2e3  # published errors of two-line elements of low orbits: 1 km, and 1 to 3 km a day
-_DRAG_SHARE = 0.2  # by which models of the atmosphere are wrong
+_DRAG_SHARE = 0.2  # relative error of models of the atmosphere
 _SURFACE_FIELD_T = 45e-6
-_DECAYED = 6  # of SGP4's errors
+_DECAYED = 6  # SGP4's error code
 
 
 class Orbit(Protocol):
-    """Where a satellite is."""
+    """Interface of an orbit: position and velocity over time."""
 
     def __hash__(self) -> int: ...
 
@@ -42,22 +42,22 @@ class Orbit(Protocol):
         ...
 
     def position_velocity_eci(self, utc: Instants) -> tuple[FloatArray, FloatArray]:
-        """Position [m] and velocity [m/s] in eci, two arrays (..., 3), at instants of any shape (...)."""
+        """Return position [m] and velocity [m/s] in eci, two arrays (..., 3), at instants (...)."""
         ...
 
 
 @dataclass(frozen=True)
 class CircularOrbit:
-    """Circle around a point mass, whose plane stays.
+    """Circular orbit around a point mass, in a fixed plane.
 
     Attributes
     ----------
     altitude_m : float
-        Above the equatorial radius, 6378.137 km.
+        Altitude above the equatorial radius, 6378.137 km.
     inclination_rad, node_rad : float
-        Inclination to the equator of J2000 and right ascension of the ascending node.
+        Inclination to the equator of J2000, and right ascension of the ascending node.
     epoch : datetime64
-        When the satellite is at ``latitude_argument_rad``, UTC.
+        UTC at which the satellite is at ``latitude_argument_rad``.
     latitude_argument_rad : float
         Angle from the ascending node at the epoch.
 
@@ -96,7 +96,7 @@ class CircularOrbit:
         return 2.0 * math.pi / self.rate_rad_s
 
     def position_velocity_eci(self, utc: Instants) -> tuple[FloatArray, FloatArray]:
-        """Position [m] and velocity [m/s] in eci: instants (...) -> two arrays (..., 3)."""
+        """Return position [m] and velocity [m/s] in eci; instants (...) -> two arrays (..., 3)."""
         seconds = (instants(utc) - self.epoch).astype(np.float64) / 1e6
         u = self.latitude_argument_rad + self.rate_rad_s * seconds
         cos_node, sin_node = math.cos(self.node_rad), math.sin(self.node_rad)
@@ -118,20 +118,25 @@ def circular_orbit(
     local_time_h: float | None = None,
     latitude_argument_deg: float = 0.0,
 ) -> CircularOrbit:
-    """Orbit on a circle around a point mass.
+    """Return a circular orbit around a point mass.
 
     Parameters
     ----------
     altitude_m : float
-        Above the equatorial radius, 6378.137 km.
+        Altitude above the equatorial radius, 6378.137 km.
     inclination_deg : float
-        To the equator of J2000.
+        Inclination to the equator of J2000.
     epoch : datetime, datetime64 or str
         UTC at which the satellite is at ``latitude_argument_deg`` from the ascending node.
     node_deg, local_time_h : float, optional
-        Right ascension of the ascending node, by default 0; or mean solar time there at the epoch.
+        Right ascension of the ascending node, by default 0; or the mean solar time at the node at the epoch.
     latitude_argument_deg : float
         Angle from the ascending node to the satellite at the epoch.
+
+    Returns
+    -------
+    CircularOrbit
+        Orbit that :class:`adcs.Satellite` takes.
 
     Raises
     ------
@@ -155,7 +160,7 @@ def circular_orbit(
 
 
 def node_of_local_time(local_time_h: float, date: Dates) -> float:
-    """Right ascension of an ascending node that is crossed at a mean solar time, LTAN, on a date [rad, 0 to 2π].
+    """Return the right ascension of an ascending node with a mean solar time, LTAN, at a date [rad, 0 to 2π].
 
     The mean Sun is 12 h minus UT away from Greenwich, whose right ascension is the mean sidereal time.
     ``local_time_h``: local mean solar time at the node [h]. ``date``: UTC.
@@ -167,14 +172,14 @@ def node_of_local_time(local_time_h: float, date: Dates) -> float:
 
 
 class Sgp4Orbit:
-    """Orbit of published two-line elements, by SGP4 (WGS-72, as the elements are made).
+    """Orbit of published two-line elements, by SGP4 with WGS-72, the constants of such elements.
 
     Parameters
     ----------
     line1, line2 : str
-        The two lines of the elements.
+        Lines of the elements.
     allow_old_elements : bool
-        Compute positions at instants 30 days or more from the epoch too.
+        Accept instants 30 days or more from the epoch.
 
     Raises
     ------
@@ -198,19 +203,19 @@ class Sgp4Orbit:
 
     @property
     def epoch(self) -> np.datetime64:
-        """Of the elements, UTC."""
+        """Epoch of the elements, UTC."""
         microseconds = round((self._satellite.jdsatepoch - 2_440_587.5 + self._satellite.jdsatepochF) * 86_400e6)
         return np.datetime64(microseconds, "us")
 
     def age_days(self, utc: Instants) -> float:
-        """Time of the instants (...) from the epoch, the longest, before or after it [days]."""
+        """Return the longest time of instants (...) from the epoch, before or after it [days]."""
         return float(np.max(np.abs((instants(utc) - self.epoch).astype(np.float64)))) / (1e6 * DAY_S)
 
     def relative_error(self, utc: Instants) -> float:
-        """Error of the position that is expected at worst of the instants (...), over the distance from the centre.
+        """Return the largest expected error of positions at instants (...), over the distance from the centre.
 
-        1 km at the epoch, 2 km a day, and 20 % of what drag moves the satellite by, which grows as the square of time.
-        The two ends of the orbit are no farther from each other than 2.
+        The error is 1 km at the epoch, 2 km more each day, and 20 % of the displacement by drag, which grows with the
+        square of time. It is at most 2, the diameter of the orbit.
         """
         days = self.age_days(utc)
         error_m = _FIRST_M + _PER_DAY_M * days + _DRAG_SHARE * self._drag_of_a_day_m * days**2
@@ -223,7 +228,7 @@ class Sgp4Orbit:
 
     @cached_property
     def _drag_of_a_day_m(self) -> float:
-        """Distance by which drag moves the satellite in the first day."""
+        """Displacement of the satellite by drag in the first day."""
         from sgp4.api import WGS72, Satrec
 
         own, without = self._satellite, Satrec()
@@ -235,25 +240,25 @@ class Sgp4Orbit:
         return moved_m if math.isfinite(moved_m) else math.inf  # it decays within that day
 
     def _age(self, utc: Instants) -> str:
-        """Age and what it means, in words."""
+        """Return the age and its effects in words."""
         relative = self.relative_error(utc)
         field_T = min(3.0 * relative, 2.0) * _SURFACE_FIELD_T * (EARTH_RADIUS_M / self._radius_m) ** 3
         values = 1e-3 * relative * self._radius_m, 1e9 * field_T, math.degrees(min(2.0 * relative, math.pi))
         error_km, field_nT, angle_deg = (f"{float(f'{value:.2g}'):g}" for value in values)
         return (
             f"{self.age_days(utc):.1f} days from the epoch {np.datetime_as_string(self.epoch, 's')} of the two-line "
-            f"elements, where positions may be off by {error_km} km, the field by {field_nT} nT and an attitude from "
+            f"elements, where positions may be wrong by {error_km} km, the field by {field_nT} nT and an attitude from "
             f"it by {angle_deg}°"
         )
 
     def age_warning(self, utc: Instants) -> str:
-        """Sentence on elements that are a week or more from some instants (...), empty where they are not."""
+        """Return a sentence on elements a week or more from some instants (...), or an empty one."""
         if self.age_days(utc) < WARNED_DAYS:
             return ""
         return f"found instants {self._age(utc)}: use elements of that time"
 
     def refuse_old(self, utc: Instants) -> None:
-        """Raise ValueError if elements are 30 days or more from one of some instants (...), unless that is allowed."""
+        """Raise ValueError if one of some instants (...) is 30 days or more from the epoch, unless that is allowed."""
         if self.age_days(utc) >= REFUSED_DAYS and not self._allow_old_elements:
             raise ValueError(
                 f"Input utc must be less than {REFUSED_DAYS:g} days from the epoch of the elements; instead received "
@@ -261,13 +266,13 @@ class Sgp4Orbit:
             )
 
     def position_velocity_teme(self, utc: Instants) -> tuple[FloatArray, FloatArray]:
-        """Position [m] and velocity [m/s] in teme: instants (...) -> two arrays (..., 3).
+        """Return position [m] and velocity [m/s] in teme; instants (...) -> two arrays (..., 3).
 
         Raises
         ------
         ValueError
-            An instant is 30 days or more from the epoch, unless that is allowed; or SGP4 fails, as for a satellite that
-            has decayed.
+            An instant is 30 days or more from the epoch and that is not allowed, or SGP4 fails, as for a decayed
+            satellite.
         """
         self.refuse_old(utc)
         if not self._is_told and (text := self.age_warning(utc)):
@@ -285,7 +290,7 @@ class Sgp4Orbit:
         return 1e3 * position.reshape(shape), 1e3 * velocity.reshape(shape)
 
     def position_velocity_eci(self, utc: Instants) -> tuple[FloatArray, FloatArray]:
-        """Position [m] and velocity [m/s] in eci, as :meth:`position_velocity_teme`."""
+        """Return position [m] and velocity [m/s] in eci, as :meth:`position_velocity_teme`."""
         utc = instants(utc)
         position, velocity = self.position_velocity_teme(utc)
         rotation = R_eci_from_teme(utc)
@@ -293,5 +298,5 @@ class Sgp4Orbit:
 
 
 def _checksum(line: str) -> int:
-    """Sum of the digits before the last place, a minus counting 1, modulo 10."""
+    """Return the sum of the digits before the last place, modulo 10; a minus counts as 1."""
     return sum(int(c) if c.isdigit() else c == "-" for c in line[:68]) % 10

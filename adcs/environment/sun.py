@@ -1,4 +1,4 @@
-"""The Sun from an orbit around the Earth: where it is, and how much of it the Earth hides."""
+"""Sun as seen from an orbit around the Earth: its position, and its part that the Earth hides."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ _SPEED_OF_LIGHT_AU_DAY = speed_of_light / _AU_DAY_M_S
 
 
 def sun_position_eci(utc: Instants) -> FloatArray:
-    """Apparent position of the Sun from the Earth's centre in eci [m]; the annual aberration is in it.
+    """Return the apparent position of the Sun from the Earth's centre in eci [m], with annual aberration.
 
-    Shape ``utc`` (...). Returns (..., 3): good to some arc seconds from 1900 to 2100 (erfa's series of the Earth's
-    orbit; TT stands for TDB).
+    Shapes ``utc`` (...) -> (..., 3). The accuracy is some arc seconds from 1900 to 2100 (erfa's series of the Earth's
+    orbit, with TT in place of TDB).
     """
     heliocentric, barycentric = pyerfa().epv00(*terrestrial_dates(utc))
     distance = np.linalg.norm(heliocentric["p"], axis=-1)
@@ -33,18 +33,18 @@ def sun_position_eci(utc: Instants) -> FloatArray:
 
 
 def earth_velocity_m_s(utc: Instants) -> FloatArray:
-    """Velocity (..., 3) of the Earth's centre in eci, from the solar system's, at instants (...); 30 km/s."""
+    """Return the velocity (..., 3) of the Earth's centre against the solar system's, in eci, at instants (...)."""
     velocity: FloatArray = _AU_DAY_M_S * pyerfa().epv00(*terrestrial_dates(utc))[1]["v"]
     return velocity
 
 
 def illuminated_fraction(position_eci_m: ArrayLike, sun_position_eci_m: ArrayLike) -> FloatArray:
-    r"""Part of the Sun's disc that the Earth, a sphere of its equatorial radius without air, leaves to be seen.
+    r"""Return the visible part of the Sun's disc behind the Earth, a sphere of the equatorial radius without air.
 
-    Both are circles on the sky, of angular radii a (Sun) and b (Earth) and c apart; the hidden part is the lens that
-    two circles have in common, over :math:`\pi a^2`.
-    Shape ``sun_position_eci_m`` (..., 3). ``position_eci_m`` (..., 3): of the satellite, outside of the Earth. Returns
-    (...): 1 in the sunlight, 0 in the umbra, between them in the penumbra.
+    On the sky both are circles with the angular radii a (Sun) and b (Earth) and the distance c. The hidden part is the
+    area that they share, over :math:`\pi a^2`.
+    Shapes ``sun_position_eci_m``, ``position_eci_m`` (..., 3) -> (...). The satellite is outside of the Earth. Returns
+    1 in sunlight, 0 in the umbra, values between in the penumbra.
 
     References
     ----------
@@ -56,7 +56,7 @@ def illuminated_fraction(position_eci_m: ArrayLike, sun_position_eci_m: ArrayLik
     a = np.arcsin(np.minimum(SUN_RADIUS_M / sun_distance, 1.0))
     b = np.arcsin(np.minimum(EARTH_RADIUS_M / radius, 1.0))
     c = np.arccos(np.clip(-np.sum(position * to_sun, axis=-1) / (radius * sun_distance), -1.0, 1.0))
-    # Distance of the common chord from the Sun's centre; clipped where the circles do not cross.
+    # Distance of the common chord from the Sun's centre, clipped where the circles do not cross.
     with np.errstate(divide="ignore", invalid="ignore"):
         x = np.clip((c * c + a * a - b * b) / (2.0 * c), -a, a)
     y = np.sqrt(np.clip(a * a - x * x, 0.0, None))

@@ -1,1 +1,1 @@
-"""Files of :mod:`adcs`: scenarios, telemetry, estimates, recordings."""
+"""Files of :mod:`adcs`: scenarios, telemetry, estimates and frames."""

@@ -1,8 +1,8 @@
 """Orbit and attitude messages of the CCSDS: OEM (502.0-B) and AEM (504.0-B), as text with keywords.
 
-An attitude is that of the body against an inertial frame: with ``ATTITUDE_DIR = A2B`` and A inertial the message's
-quaternion, whose matrix takes components from A to B, is the rotation that takes those of a vector from body axes to
-inertial ones (Hamilton), as everywhere here.
+An attitude is that of a body against an inertial frame. With ``ATTITUDE_DIR = A2B`` and A inertial, the matrix of the
+message's quaternion transforms components from A to B. As a Hamilton quaternion it is the rotation, inertial from body,
+that :mod:`adcs` uses.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from arrays.io.text import read_text, write_text
 from arrays.typing import FloatArray
 
 INERTIAL = ("EME2000", "GCRF", "ICRF", "J2000")
-"""Frames whose axes are those of eci, within 0.03″."""
+"""Frames with the axes of eci within 0.03″."""
 _ORIGINATOR = "ADCS"
 
 
 @dataclass(frozen=True, eq=False)
 class _Segment:
-    """Keywords of a segment, and its lines of data with their instants."""
+    """Segment of a message: line number, keywords, instants, and numbers of the data lines."""
 
     line: int
     meta: Mapping[str, str]
@@ -36,19 +36,24 @@ class _Segment:
 
 
 def read_oem(path: str | PathLike[str]) -> EphemerisOrbit:
-    """Orbit of an orbit ephemeris message of the CCSDS (OEM).
+    """Read the orbit of an orbit ephemeris message of the CCSDS (OEM).
 
-    Several segments follow one another; accelerations and covariances are not looked at.
+    Segments are joined; accelerations and covariances are ignored.
 
     Parameters
     ----------
     path : str or path-like
-        Text with keywords, in UTC, in EME2000, GCRF, ICRF or TEME.
+        Message as text with keywords, in UTC and in EME2000, GCRF, ICRF or TEME.
+
+    Returns
+    -------
+    EphemerisOrbit
+        Orbit in eci, interpolated between the states of the message.
 
     Raises
     ------
     InputError
-        The file is no such message; the text says where and why.
+        The file is no such message; the text states line and cause.
 
     Examples
     --------
@@ -77,24 +82,24 @@ def read_oem(path: str | PathLike[str]) -> EphemerisOrbit:
 
 
 def read_aem(path: str | PathLike[str]) -> tuple[Instants, FloatArray]:
-    """Attitude of an attitude ephemeris message of the CCSDS (AEM).
+    """Read the attitude of an attitude ephemeris message of the CCSDS (AEM).
 
     Parameters
     ----------
     path : str or path-like
-        Text with keywords: quaternions of a body against an inertial frame, in either direction, in UTC.
+        Message as text with keywords, in UTC: quaternions of a body against an inertial frame, in either direction.
 
     Returns
     -------
     utc : ndarray of datetime64, shape (n,)
         Instants.
     q : ndarray, shape (n, 4)
-        Inertial from body, scalar last.
+        Attitudes, inertial from body, scalar last.
 
     Raises
     ------
     InputError
-        The file is no such message; the text says where and why.
+        The file is no such message; the text states line and cause.
 
     Examples
     --------
@@ -128,7 +133,7 @@ def write_oem(path: str | PathLike[str], utc: Instants, position_m: FloatArray, 
     utc : ndarray of datetime64, shape (n,)
         Instants.
     position_m, velocity_m_s : ndarray, shape (n, 3)
-        In eci, which is EME2000 here.
+        States in eci, which is written as EME2000.
 
     Examples
     --------
@@ -152,7 +157,7 @@ def write_aem(path: str | PathLike[str], utc: Instants, q: ArrayLike) -> None:
     utc : ndarray of datetime64, shape (n,)
         Instants.
     q : array_like, shape (n, 4)
-        Inertial from body, scalar last.
+        Attitudes, inertial from body, scalar last.
 
     Examples
     --------
@@ -180,14 +185,14 @@ def _write(
     *,
     data: bool,
 ) -> None:
-    """Write one segment; lines of an attitude stand between two words."""
+    """Write one segment; data lines of an attitude stand between DATA_START and DATA_STOP."""
     times = np.datetime_as_string(utc, unit="us")
     span = {"TIME_SYSTEM": "UTC", "START_TIME": times[0], "STOP_TIME": times[-1]}
     keys = {"OBJECT_NAME": "SATELLITE", "OBJECT_ID": "0000-000A", **meta, **span}
     rows = [" ".join([time, *map(shown.format, row)]) for time, row in zip(times, values, strict=True)]
     lines = [
         version,
-        # Of the last state: a file of the same states is the same.
+        # The time of the last state, so that the same states give the same file.
         f"CREATION_DATE = {times[-1]}",
         f"ORIGINATOR = {_ORIGINATOR}",
         "META_START",
@@ -199,7 +204,7 @@ def _write(
 
 
 def _segments(path: str | PathLike[str], version: str, columns: int) -> list[_Segment]:
-    """Segments of a message, of one at least."""
+    """Return the segments of a message; raise InputError without any."""
     lines = read_text(path, f"a message with {version}").splitlines()
     if not lines or not lines[0].startswith(version):
         first = lines[0][:40] if lines else "nothing"
@@ -231,7 +236,7 @@ def _segments(path: str | PathLike[str], version: str, columns: int) -> list[_Se
 
 
 def _numbers(path: str | PathLike[str], rows: list[tuple[int, list[str]]], columns: int) -> tuple[Instants, FloatArray]:
-    """Instants and numbers of lines."""
+    """Return the instants and the numbers of data lines."""
     utc, values = [], []
     for number, words in rows:
         try:
@@ -248,7 +253,7 @@ def _numbers(path: str | PathLike[str], rows: list[tuple[int, list[str]]], colum
 
 
 def _word(path: str | PathLike[str], segment: _Segment, key: str, known: tuple[str, ...]) -> str:
-    """Value of a keyword, one of those that are known."""
+    """Return the value of a keyword; raise InputError unless it is a known one."""
     value = segment.meta.get(key)
     if value not in known:
         expected = " or ".join(known)

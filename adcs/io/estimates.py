@@ -1,4 +1,4 @@
-"""What is written and printed of an attitude track: columns with units, and a summary."""
+"""Output of an attitude track: columns with units, and a summary."""
 
 from __future__ import annotations
 
@@ -13,11 +13,14 @@ from adcs.satellite.sensors import NIS_SIZES
 from arrays.io.tables import by_sigma
 
 _NAMES = {"st": "star", "gyro": "gyro", "mag": "field", "sun": "sun"}
-"""What files call a sensor's innovations."""
+"""Names of the sensors' innovations in files."""
 
 
 def estimate_columns(track: AttitudeTrack) -> dict[str, Any]:
-    """Columns (n,) of estimates.csv at the log's rows: ``qw`` is orbital from body, ``eci_qw`` inertial from body."""
+    """Return the columns (n,) of estimates.csv at the log's rows.
+
+    ``qw`` to ``qz`` are orbital from body, ``eci_qw`` to ``eci_qz`` inertial from body.
+    """
     columns: dict[str, Any] = {"time_s": track.time_s}
     for prefix, q in (("", track.q_orbital), ("eci_", track.q)):
         if q is not None:
@@ -38,12 +41,12 @@ def estimate_columns(track: AttitudeTrack) -> dict[str, Any]:
 
 
 def rows_of(columns: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """What ``--json`` prints of columns: one entry for every row."""
+    """Return one dict for every row of columns, as ``--json`` prints them."""
     return [dict(zip(columns, row, strict=True)) for row in zip(*map(np.ndarray.tolist, columns.values()), strict=True)]
 
 
 def summary_lines(track: AttitudeTrack) -> list[str]:
-    """The result as text: what is known at the end, and how readings fit."""
+    """Return the result as text: the estimate at the end, and the fit of the readings."""
     if not len(track.rows):
         return [f"no rows; {track.title}"]
     columns = estimate_columns(track)
@@ -76,6 +79,6 @@ def summary_lines(track: AttitudeTrack) -> list[str]:
 
 
 def unseen_line(torque_Nm: Mapping[float, float]) -> list[str]:
-    """A line with the amplitude, by period, below which a torque does not show in the readings; none of nothing."""
+    """Return a line with the largest torque that the readings do not show, by period; no line without any."""
     each = ", ".join(f"{torque:.2g} N·m ({period:g} s)" for period, torque in torque_Nm.items())
     return [f"{'largest torque unseen (its period)':34s}{each}"] if each else []

@@ -1,4 +1,4 @@
-"""Frames of the camera as PNG files: grey, 8 bits."""
+"""PNG files of camera frames: grey, 8 bits."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ _MODES = {
 
 
 def read_frame(path: str | PathLike[str], camera: Camera = Camera()) -> ByteArray:  # noqa: B008 - frozen
-    """Frame from a PNG file.
+    """Read a frame from a PNG file.
 
-    ``camera``: that took it; gives its size. Returns shape (height_px, width_px).
+    ``camera``: camera of the frame, which states its size. Returns shape (height_px, width_px).
     """
     data = read_bytes(path, _EXPECTED)
     try:
@@ -63,7 +63,7 @@ def _size_of(camera: Camera) -> str:
 
 
 def frame_paths(path: str | PathLike[str]) -> list[Path]:
-    """Frames that a path stands for: itself, or all PNG files of a folder in the order of their names."""
+    """Return a path itself, or all PNG files of a folder in the order of their names."""
     place = Path(path)
     if not place.is_dir():
         if not place.exists():
@@ -76,8 +76,5 @@ def frame_paths(path: str | PathLike[str]) -> list[Path]:
 
 
 def write_frame(frame: ByteArray, path: str | PathLike[str]) -> None:
-    """Write a frame as a PNG file, in one step.
-
-    Shape ``frame`` (height, width). ``path``: replaced if it exists.
-    """
+    """Write a frame (height, width) as a PNG file; replace an existing file at once."""
     replace_file(path, lambda unfinished: Image.fromarray(frame).save(unfinished, format="PNG"))

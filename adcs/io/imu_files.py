@@ -1,9 +1,9 @@
-"""Logs of an inertial unit, with a magnetometer or without: CSV files, and MAT files of the BROAD benchmark.
+"""Logs of an inertial unit with or without a magnetometer: CSV files, and MAT files of the BROAD benchmark.
 
-Columns of a CSV file without a layout: ``time_s``, ``gyro_x_rad_s`` or ``gyro_x_deg_s``, ``acceleration_x_m_s2`` and,
-of a unit with a magnetometer, ``field_x_nT``, with y and z, and if known the truth ``qw, qx, qy, qz`` (east, north, up
-from body) and ``moving``, 1 where errors count. An empty cell is a missing reading: sensors may have rates of their
-own, and steps may jitter.
+A CSV file without a layout has the columns ``time_s``, ``gyro_x_rad_s`` or ``gyro_x_deg_s``, ``acceleration_x_m_s2``
+and, with a magnetometer, ``field_x_nT``, each also for y and z. Optional columns are the truth ``qw, qx, qy, qz``
+(east, north, up from body) and ``moving``, which is 1 where errors count. An empty cell is a missing reading. Sensors
+may have different rates, and steps may vary.
 """
 
 from __future__ import annotations
@@ -40,31 +40,31 @@ _BROAD = {"imu_gyr": 3, "imu_acc": 3, "imu_mag": 3, "opt_quat": 4, "opt_pos": 3,
 
 
 class AccelerometerColumns(MountedTable, kw_only=True):
-    """Accelerations; ``at_rest`` says which way it reads then."""
+    """Columns of the accelerometer; ``at_rest`` is the direction of its reading at rest."""
 
     columns: Three = ("acceleration_x_m_s2", "acceleration_y_m_s2", "acceleration_z_m_s2")
     unit: Annotated[str, one_of(ACCELERATION_UNITS)] = "m/s2"
     at_rest: Annotated[str, one_of(("up", "down"))] = "up"
 
     def of(self, values: FloatArray) -> FloatArray:
-        """[m/s²], body axes, upwards at rest, of cells (n, 3)."""
+        """Return accelerations of cells (n, 3), body axes, upwards at rest [m/s²]."""
         return super().of(values if self.at_rest == "up" else -values)
 
 
 class SampledGyroColumns(GyroColumns, kw_only=True):
-    """Rates, and what a sample is."""
+    """Columns of the gyro, and the kind of its samples."""
 
     samples: Annotated[str, one_of(GYRO_SAMPLES)] = "mean"
 
 
 class TruthColumns(StarColumns, kw_only=True):
-    """Quaternions, ``inertial`` for east, north, up."""
+    """Columns of the true quaternions; ``inertial`` means east, north, up."""
 
     columns: tuple[str, str, str, str] = ("qw", "qx", "qy", "qz")
 
 
 class ImuTable(Table, kw_only=True):
-    """Which columns are read, and as what; the others are not looked at."""
+    """Table of the columns that are read, with their units; other columns are ignored."""
 
     gyro: SampledGyroColumns
     accelerometer: AccelerometerColumns
@@ -76,25 +76,25 @@ class ImuTable(Table, kw_only=True):
 
 
 class ImuFile(File, kw_only=True):
-    """The whole file of a layout."""
+    """Layout file."""
 
     log: ImuTable
 
 
 @dataclass(frozen=True, eq=False)
 class ImuLog:
-    """Readings of an inertial unit with a magnetometer, and what is known of the truth.
+    """Readings of an inertial unit, and the truth if it is known.
 
     Attributes
     ----------
     record : InertialMagneticRecord
         Times and readings, SI, body axes.
     q_true : ndarray, shape (n, 4), optional
-        East, north, up from body, scalar first, NaN where unknown.
+        True attitude, east, north, up from body, scalar first, NaN where unknown.
     moving : ndarray of bool, shape (n,)
-        Where errors count: everywhere, unless the file says it.
+        Rows in which errors count; all rows unless the file states them.
     position_m : ndarray, shape (n, 3), optional
-        East, north, up, NaN where unknown.
+        True position, east, north, up, NaN where unknown.
 
     Examples
     --------
@@ -111,15 +111,20 @@ class ImuLog:
 
 
 def read_imu(path: str | PathLike[str], layout: str | PathLike[str] | None = None) -> ImuLog:
-    """Read a log of gyro and accelerometer, with a magnetometer or without.
+    """Read a log of gyro and accelerometer, with or without a magnetometer.
 
     Parameters
     ----------
     path : str or path-like
-        A CSV file, or a MAT file of the BROAD benchmark.
+        CSV file, or MAT file of the BROAD benchmark.
     layout : str or path-like, optional
-        A TOML file whose table ``log`` names columns, units and mountings of a CSV file; see the file formats.
-        Without a table of the magnetometer its columns are not read.
+        TOML file whose table ``log`` names columns, units and mountings of a CSV file; see the file formats. Without a
+        table of the magnetometer its columns are ignored.
+
+    Returns
+    -------
+    ImuLog
+        Readings in SI and body axes, with the truth if the file has one.
 
     Raises
     ------
@@ -142,7 +147,7 @@ def _is_matlab(path: str | PathLike[str]) -> bool:
 
 
 def imu_log(path: str | PathLike[str], layout: tuple[str, dict[str, Any]] | None) -> ImuLog:
-    """Return the log of :func:`read_imu` with the path and the table of a layout that was read before."""
+    """Return the log of :func:`read_imu`; ``layout`` is the path and the table of a layout that is already read."""
     if not _is_matlab(path):
         return _csv_log(path, None if layout is None else section_of(*layout, ImuFile).log)
     if layout is not None:
@@ -183,10 +188,10 @@ def _layout(given: ImuTable) -> LogLayout:
 
 
 def _standard(header: tuple[str, ...]) -> ImuTable:
-    """Layout of a file without one, by its header."""
+    """Return the standard layout for a header."""
     per_rad = SampledGyroColumns(columns=("gyro_x_rad_s", "gyro_y_rad_s", "gyro_z_rad_s"), unit="rad/s")
     truth = TruthColumns()
-    # A column of a similar name is a magnetometer's that is misspelt; without one there is no magnetometer.
+    # A column with a similar name is a misspelt one of the magnetometer, which must be reported.
     magnetic = any("field" in name.lower() or "mag" in name.lower() for name in header)
     return ImuTable(
         gyro=per_rad if per_rad.columns[0] in header else SampledGyroColumns(),
@@ -202,10 +207,10 @@ def _broad_log(path: str | PathLike[str]) -> ImuLog:
 
     data = read_bytes(path, "a MAT file of the BROAD benchmark")
     try:
-        content = loadmat(BytesIO(data))  # type: ignore[arg-type]  # its stubs know paths alone
-    except Exception:  # whatever SciPy makes of a file that is none
+        content = loadmat(BytesIO(data))  # type: ignore[arg-type]  # its stubs accept paths only
+    except Exception:  # SciPy raises many kinds of errors for other files
         raise InputError(
-            f"{path}: found no MAT file that can be read, expected a trial of BROAD, of version 7 at most."
+            f"{path}: found no MAT file that can be read, expected a trial of BROAD, version 7 at most."
         ) from None
     if absent := [name for name in (*_BROAD, "sampling_rate") if name not in content]:
         raise InputError(f"{path}: found no variable {absent[0]}, expected those of a trial of the BROAD benchmark.")

@@ -1,4 +1,4 @@
-"""What is written and printed of an inertial unit's attitude."""
+"""Output of an inertial unit's attitude: columns, and a summary."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from adcs.satellite.attitude_track import AttitudeTrack
 
 
 def attitude_columns(track: AttitudeTrack) -> dict[str, Any]:
-    """Columns (n,) of attitude.csv: east, north, up from body.
+    """Return the columns (n,) of attitude.csv: east, north, up from body.
 
-    ``sigma_tilt_deg`` is that of the angle between up and its estimate, ``sigma_heading_deg`` that of the angle about
-    the vertical.
+    ``sigma_tilt_deg`` is the standard deviation of the angle between up and its estimate, ``sigma_heading_deg`` that of
+    the angle about the vertical.
     """
     east, north, up = np.degrees(track.sigma["level"]).T
     return {
@@ -29,7 +29,7 @@ def attitude_columns(track: AttitudeTrack) -> dict[str, Any]:
 
 
 def imu_summary(track: AttitudeTrack, log: ImuLog) -> dict[str, Any]:
-    """Totals of a track, and its errors where the log has a truth."""
+    """Return totals of a track, and its errors if the log has a truth."""
     left_out, subtracted = track.degraded[LEFT_OUT], track.degraded[SUBTRACTED]
     flags = {"field-left-out": left_out, "magnet-subtracted": subtracted, "heading-lost": track.degraded[LOST]}
     relative = "magnetometer" not in track.used
@@ -48,7 +48,7 @@ def imu_summary(track: AttitudeTrack, log: ImuLog) -> dict[str, Any]:
 
 
 def summary_words(summary: dict[str, Any]) -> list[str]:
-    """The totals as text."""
+    """Return the totals as text."""
     used = {
         "plain": "the field was used as it is",
         "reject": "the field was left out where it contradicts",

@@ -1,4 +1,4 @@
-"""Readings of a satellite's magnetometers and gyro beside the states of what switches on board: one CSV file."""
+"""CSV file with readings of a satellite's magnetometers and gyro, and the states of its loads."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ _OTHER_UNITS = ("_nT", "_deg_s", "_Nms", "_Am2")
 
 @dataclass(frozen=True, eq=False)
 class LoadLog:
-    """A log.
+    """Log of magnetometers, gyro and loads.
 
     Attributes
     ----------
     columns : dict of str to ndarray, shape (n,)
-        As in the file.
+        Columns as in the file.
     readings_T : ndarray, shape (n, C)
-        Of an array.
+        Readings of the array's channels.
     states : dict of str to ndarray, shape (n,)
-        Of each load.
+        State of each load by its name.
     """
 
     columns: dict[str, FloatArray]
@@ -36,22 +36,22 @@ class LoadLog:
 
     @property
     def time_s(self) -> FloatArray:
-        """Of the rows."""
+        """Times of the rows, shape (n,)."""
         return self.columns[TIME]
 
     @property
     def gyro_rad_s(self) -> FloatArray:
-        """Rate, shape (n, 3)."""
+        """Rates of the gyro, shape (n, 3)."""
         return np.radians(np.stack([self.columns[name] for name in GYRO], axis=1))
 
 
 def channel_columns(array: SensorArray) -> list[str]:
-    """Columns of an array's readings."""
+    """Return the names of the columns of an array's readings."""
     return [f"{name}_nT" for name in array.channel_names]
 
 
 def read_load_log(path: Path, array: SensorArray, loads: list[str]) -> LoadLog:
-    """Log of an array and a gyro; without names of ``loads`` every column without a unit is one."""
+    """Read a log; without names of ``loads`` each column without a unit is a load."""
     table = read_table(path, f"a header with {TIME}, readings of magnetometers and gyro, and loads")
     channels = channel_columns(array)
     known = [TIME, *GYRO, *channels]

@@ -1,4 +1,4 @@
-"""The table ``log`` of a scenario file: a log's own columns, units and conventions."""
+"""Table ``log`` of a scenario file: columns, units and conventions of a log."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ RATE_UNITS = {"deg/s": math.pi / 180.0, "rad/s": 1.0, "mrad/s": 1e-3, "deg/h": m
 MOMENTUM_UNITS = {"Nms": 1.0, "mNms": 1e-3}
 MOMENT_UNITS = {"Am2": 1.0, "mAm2": 1e-3}
 ACCELERATION_UNITS = {"m/s2": 1.0, "g": 9.80665, "mg": 9.80665e-3}
-_SI = {**FIELD_UNITS, **RATE_UNITS, **MOMENTUM_UNITS, **MOMENT_UNITS, **ACCELERATION_UNITS}  # no two of one name
+_SI = {**FIELD_UNITS, **RATE_UNITS, **MOMENTUM_UNITS, **MOMENT_UNITS, **ACCELERATION_UNITS}  # all names differ
 TIME_FORMATS = ("seconds", "utc", "unix")
 ORDERS = ("scalar-first", "scalar-last")
 DIRECTIONS = ("inertial-from-body", "body-from-inertial")
@@ -27,12 +27,12 @@ Three = tuple[str, str, str]
 
 
 class MountedTable(Table, kw_only=True):
-    """A sensor with axes of its own."""
+    """Columns of a sensor, with its mounting."""
 
     mounting: tuple[Vector, Vector, Vector] = _ALONG  # body from sensor
 
     def check(self) -> None:
-        """Refuse what is no rotation."""
+        """Raise RefusalError unless the mounting is a rotation."""
         matrix = np.array(self.mounting, dtype=np.float64)
         if np.abs(matrix @ matrix.T - np.eye(3)).max() > 1e-3:
             raise RefusalError("mounting", "found rows that are not orthonormal, expected a rotation, body from sensor")
@@ -40,19 +40,19 @@ class MountedTable(Table, kw_only=True):
             raise RefusalError("mounting", "found a mirror (determinant -1), expected a rotation, body from sensor")
 
     def of(self, values: FloatArray) -> FloatArray:
-        """In SI, body axes, of cells (n, 3)."""
+        """Return readings of cells (n, 3) in SI and body axes."""
         return _SI.get(getattr(self, "unit", ""), 1.0) * values @ np.array(self.mounting, dtype=np.float64).T
 
 
 class StarColumns(MountedTable, kw_only=True):
-    """Quaternions."""
+    """Columns of the star tracker's quaternions."""
 
     columns: tuple[str, str, str, str] = ("star_qw", "star_qx", "star_qy", "star_qz")
     order: Annotated[str, one_of(ORDERS)] = "scalar-first"
     direction: Annotated[str, one_of(DIRECTIONS)] = "inertial-from-body"
 
     def of(self, values: FloatArray) -> FloatArray:
-        """Inertial from body, scalar last, of cells (n, 4)."""
+        """Return attitudes of cells (n, 4), inertial from body, scalar last."""
         q = values if self.order == "scalar-first" else np.roll(values, 1, axis=1)
         if self.direction == "body-from-inertial":
             q = quaternion.conjugate(q)
@@ -63,41 +63,41 @@ class StarColumns(MountedTable, kw_only=True):
 
 
 class GyroColumns(MountedTable, kw_only=True):
-    """Rates."""
+    """Columns of the gyro's rates."""
 
     columns: Three = ("gyro_x_deg_s", "gyro_y_deg_s", "gyro_z_deg_s")
     unit: Annotated[str, one_of(RATE_UNITS)] = "deg/s"
 
 
 class MagnetometerColumns(MountedTable, kw_only=True):
-    """Fields."""
+    """Columns of the magnetometer's fields."""
 
     columns: Three = ("field_x_nT", "field_y_nT", "field_z_nT")
     unit: Annotated[str, one_of(FIELD_UNITS)] = "nT"
 
 
 class SunColumns(MountedTable, kw_only=True):
-    """Directions."""
+    """Columns of the direction to the Sun."""
 
     columns: Three = ("sun_x", "sun_y", "sun_z")
 
 
 class WheelColumns(MountedTable, kw_only=True):
-    """Momentum of all wheels together."""
+    """Columns of the total momentum of the wheels."""
 
     columns: Three = ("wheels_x_Nms", "wheels_y_Nms", "wheels_z_Nms")
     unit: Annotated[str, one_of(MOMENTUM_UNITS)] = "Nms"
 
 
 class TorquerColumns(MountedTable, kw_only=True):
-    """Commanded magnetic moment."""
+    """Columns of the commanded magnetic moment."""
 
     columns: Three = ("torquers_x_Am2", "torquers_y_Am2", "torquers_z_Am2")
     unit: Annotated[str, one_of(MOMENT_UNITS)] = "Am2"
 
 
 class LogTable(Table, kw_only=True):
-    """Which columns are read, and as what; the others are not looked at."""
+    """Table of the columns that are read, with their units; other columns are ignored."""
 
     time: str = "time_s"
     time_format: Annotated[str, one_of(TIME_FORMATS)] = "seconds"
@@ -118,23 +118,23 @@ STANDARD: dict[str, Columns] = {
     "wheels_Nms": WheelColumns(),
     "torquers_Am2": TorquerColumns(),
 }
-"""Of a log without a layout, by the argument of :class:`adcs.Telemetry` that they become."""
+"""Columns of a log without a layout, by argument of :class:`adcs.Telemetry`."""
 
 
 @dataclass(frozen=True, eq=False)
 class LogLayout:
-    """A log's own columns, units and conventions, as the table ``log`` of a scenario file states them.
+    """Columns, units and conventions of a log, as the table ``log`` of a scenario file states them.
 
     Attributes
     ----------
     start : datetime64
-        From which the log's time counts, UTC.
+        Zero of the log's time, UTC.
     time : str
         Column of the time.
     time_format : str
         ``seconds`` since the start, ``utc`` (ISO 8601) or ``unix`` (seconds since 1970).
     columns : dict
-        Columns and their conventions by the argument of :class:`adcs.Telemetry` that they become.
+        Columns and their conventions by argument of :class:`adcs.Telemetry`.
     """
 
     start: np.datetime64
@@ -144,7 +144,7 @@ class LogLayout:
 
     @classmethod
     def of(cls, place: str, table: LogTable, start: np.datetime64) -> LogLayout:
-        """Layout that a table describes; it names one sensor at least."""
+        """Return the layout of a table; raise InputError unless it names a sensor."""
         named = (table.star_tracker, table.gyro, table.magnetometer, table.sun_sensor, table.wheels, table.torquers)
         columns = {name: given for name, given in zip(STANDARD, named, strict=True) if given is not None}
         if not columns:
@@ -152,7 +152,7 @@ class LogLayout:
         return cls(start, table.time, table.time_format, columns)
 
     def seconds(self, values: FloatArray) -> FloatArray:
-        """Times since the start."""
+        """Return times as seconds since the start."""
         if self.time_format == "seconds":
             return values
         return values - (self.start - np.datetime64("1970-01-01", "us")) / np.timedelta64(1, "s")

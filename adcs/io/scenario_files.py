@@ -1,14 +1,13 @@
-"""Scenario files of ``adcs`` (TOML): a satellite, its orbit and sensors, what disturbs it, and what is estimated.
+"""Scenario files of ``adcs`` (TOML): satellite, orbit, sensors, disturbances and estimator.
 
-``scenarios/tabletsat.toml`` beside this file documents every key and has the values of Ivanov, Ivlev, Karpenko,
-Ovchinnikov, Keldysh Institute preprint 64, 2014; every key that a file leaves out has the value that stands there,
-except those of the tables ``satellite`` and ``orbit``. The other files there are the named problems of that paper.
+``scenarios/tabletsat.toml`` documents every key and has the values of Ivanov, Ivlev, Karpenko, Ovchinnikov, Keldysh
+Institute preprint 64, 2014. These values are the defaults, except in the tables ``satellite`` and ``orbit``. The other
+files in that folder are named problems of the same paper.
 """
 
 from __future__ import annotations
 
 import datetime
-import json
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -37,7 +36,7 @@ from adcs.kalman.names import FILTERS, NOISES, STARTS
 from adcs.satellite.dynamics import RigidBody, WheelControl, wheel_control
 from adcs.satellite.satellite import Satellite
 from arrays.io.errors import InputError, naming
-from arrays.io.toml import BuiltIn, section_of
+from arrays.io.toml import BuiltIn, section_of, toml_value
 from magloc.fields.geomagnetic import Model
 
 _FILES = BuiltIn("adcs", "scenarios", "scenario")
@@ -46,21 +45,21 @@ built_in_scenarios = _FILES.names
 
 @dataclass(frozen=True, eq=False)
 class AttitudeFile:
-    """A scenario file."""
+    """Scenario file, read and checked."""
 
     name: str
-    path: str  # of the file, for errors
-    tables: dict[str, Any]  # as read
-    satellite: Satellite  # runs start within the 24 hours from its start
+    path: str  # path of the file, for errors
+    tables: dict[str, Any]  # tables as read
+    satellite: Satellite  # runs start within 24 hours after its start
     duration_s: float
     step_s: float
     start: StartTable
     disturbance: DisturbanceTable
     estimate: EstimateTable
-    log: LogLayout | None = None  # of a log with columns of its own
+    log: LogLayout | None = None  # layout of a log with other columns than the standard ones
 
     def changed(self, changes: dict[str, Any]) -> AttitudeFile:
-        """The scenario with some keys replaced; keys of a table in a table of the changes."""
+        """Return the scenario with some keys replaced; a dict replaces keys of the table with its name."""
         tables = dict(self.tables)
         for key, value in changes.items():
             tables[key] = {**tables.get(key, {}), **value} if isinstance(value, dict) else value
@@ -68,30 +67,34 @@ class AttitudeFile:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Sentences on what the scenario itself leaves uncertain: old two-line elements."""
+        """Sentences on uncertain parts of the scenario: old two-line elements."""
         orbit, start = self.satellite.orbit, np.array(self.satellite.start)
         return tuple(filter(None, [orbit.age_warning(start)])) if isinstance(orbit, Sgp4Orbit) else ()
 
     def estimator(self, place: str = "") -> EstimatorSettings:
-        """What the table ``estimate`` orders, checked; errors name a place, or the file."""
+        """Return the settings of the table ``estimate``; errors name ``place``, by default the file."""
         return _estimator(place or self.path, self.estimate)
 
 
 def read_scenario(name_or_path: str, *, allow_old_elements: bool = False) -> AttitudeFile:
-    """Scenario of a satellite.
+    """Read the scenario of a satellite.
 
     Parameters
     ----------
     name_or_path : str
-        A built-in scenario's name, or a TOML file; ``scenarios/tabletsat.toml`` beside this module documents the keys.
+        Name of a built-in scenario, or a TOML file; ``scenarios/tabletsat.toml`` documents the keys.
     allow_old_elements : bool
-        Take two-line elements 30 days or more from their epoch too, as the key of that name.
+        Accept two-line elements 30 days or more from their epoch, as the key with that name.
+
+    Returns
+    -------
+    AttitudeFile
+        Satellite, runs and estimator of the scenario, and the layout of its log.
 
     Raises
     ------
     InputError
-        The file cannot be read or does not describe a scenario, or its two-line elements are too old; the text says
-        where and why.
+        The file cannot be read or is no scenario, or its two-line elements are too old; the text states key and cause.
 
     Examples
     --------
@@ -108,8 +111,8 @@ def scenario_table(name_or_path: str) -> tuple[str, dict[str, Any]]:
 
 
 def scenario_text(file: AttitudeFile) -> str:
-    """The scenario as text of a TOML file, without comments."""
-    lines = [f"{key} = {_toml(value)}" for key, value in file.tables.items() if not isinstance(value, dict)]
+    """Return the scenario as the text of a TOML file, without comments."""
+    lines = [f"{key} = {toml_value(value)}" for key, value in file.tables.items() if not isinstance(value, dict)]
     for name, table in file.tables.items():
         if isinstance(table, dict):
             lines += _table_lines(name, table)
@@ -119,23 +122,11 @@ def scenario_text(file: AttitudeFile) -> str:
 def _table_lines(name: str, table: dict[str, Any]) -> list[str]:
     plain = {key: value for key, value in table.items() if not isinstance(value, dict)}
     lines = ["", f"[{name}]"] if plain or not table else []
-    lines += [f"{key} = {_toml(value)}" for key, value in plain.items()]
+    lines += [f"{key} = {toml_value(value)}" for key, value in plain.items()]
     for key, value in table.items():
         if isinstance(value, dict):
             lines += _table_lines(f"{name}.{key}", value)
     return lines
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, datetime.date):
-        value = value.isoformat()
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False)
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(_toml(item) for item in value) + "]"
-    return str(value) if math.isfinite(value) else f"{float(value)}"
 
 
 def scenario_of(path: str, tables: dict[str, Any], *, allow_old_elements: bool = False) -> AttitudeFile:
@@ -250,7 +241,7 @@ def _orbit(path: str, place: str, section: OrbitTable) -> tuple[Orbit, np.dateti
             of_elements.refuse_old(instants(start))
         return of_elements, start, section.field_model
     if section.ephemeris is not None:
-        # Beside the scenario file, wherever the command runs.
+        # The path is relative to the scenario file, not to the working directory.
         return read_oem(Path(path).parent / section.ephemeris), start, section.field_model
     with naming(place):
         orbit = circular_orbit(

@@ -1,4 +1,4 @@
-"""Tables of a scenario file: their keys, types, defaults and bounds."""
+"""Tables of a scenario file: keys, types, defaults and bounds."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from magloc.fields.geomagnetic import MODELS
 from magloc.levels import CONTRADICTION
 
 MOST_STEPS = 200_000
-"""Of a run: its covariances are held together, 230 MB of them."""
+"""Largest number of steps of a run, whose covariances take 230 MB."""
 _ZERO: Vector = (0.0, 0.0, 0.0)
 _RIGHT_ANGLE = Rule(lambda value: 0.0 <= value <= 90.0, "0 to 90")
 _SHARE = Rule(lambda value: 0.0 <= value < 1.0, "0 to less than 1")
@@ -25,7 +25,7 @@ _NAME = Rule(lambda value: bool(re.fullmatch(r"[\w.-]+", value)), "letters, digi
 
 
 class SatelliteTable(Table, kw_only=True):
-    """The body and its wheels."""
+    """Table of the body and its wheels."""
 
     inertia_kgm2: tuple[Vector, Vector, Vector]
     residual_dipole_Am2: Vector = _ZERO
@@ -36,7 +36,7 @@ class SatelliteTable(Table, kw_only=True):
 
 
 class OrbitTable(Table, kw_only=True):
-    """A circle, or two-line elements; the day; the model of the field."""
+    """Table of the orbit: a circle, two-line elements or an ephemeris; its date, and the field model."""
 
     start: Annotated[str, date_such_as("an instant such as 2014-09-01T12:00:00 (UTC)")]
     altitude_km: Positive | None = None
@@ -50,7 +50,7 @@ class OrbitTable(Table, kw_only=True):
     field_model: Annotated[str, one_of(MODELS)] = "IGRF-14"
 
     def check(self) -> None:
-        """Refuse anything but one orbit."""
+        """Raise RefusalError unless there is exactly one orbit."""
         circle = ("altitude_km", "inclination_deg", "local_time_h", "node_deg")
         missing = [key for key in circle if getattr(self, key) is None]
         if self.elements is not None and self.ephemeris is not None:
@@ -67,7 +67,7 @@ class OrbitTable(Table, kw_only=True):
 
 
 class StartTable(Table, kw_only=True):
-    """When runs start and what holds throughout, and how the satellite moves then."""
+    """Table of the start of runs: conditions during a run, and errors of the initial motion."""
 
     sunlit: bool = True
     least_separation_deg: Annotated[float, _RIGHT_ANGLE] = 45.0
@@ -79,7 +79,7 @@ class StartTable(Table, kw_only=True):
 
 
 class DisturbanceTable(Table, kw_only=True):
-    """What the filters are not told."""
+    """Table of disturbances, which the filters do not know."""
 
     torque_Nm: NotNegative = 8e-7
     torque_period_s: Annotated[Positive, MAY_BE_INFINITE] = math.inf
@@ -94,7 +94,7 @@ class DisturbanceTable(Table, kw_only=True):
 
 
 class StarTrackerTable(Table, kw_only=True):
-    """Noise is that of the angle about each axis."""
+    """Table of the star tracker; its noise is that of the angle about each axis."""
 
     noise_deg: Positive = 0.001
     rate_limit_deg_s: Positive = 2.0
@@ -104,7 +104,7 @@ class StarTrackerTable(Table, kw_only=True):
     misalignment_deg: Vector = _ZERO
 
     def sensor(self) -> StarTracker:
-        """What the table describes."""
+        """Return the sensor of the table."""
         return StarTracker(
             sigma_rad=0.5 * math.radians(self.noise_deg),
             rate_limit_rad_s=math.radians(self.rate_limit_deg_s),
@@ -116,7 +116,7 @@ class StarTrackerTable(Table, kw_only=True):
 
 
 class GyroTable(Table, kw_only=True):
-    """Noise of one reading of one axis."""
+    """Table of the gyro; its noise is that of one reading of one axis."""
 
     noise_deg_s: Positive = 0.005
     range_deg_s: Positive = 250.0
@@ -124,7 +124,7 @@ class GyroTable(Table, kw_only=True):
     misalignment_deg: Vector = _ZERO
 
     def sensor(self) -> Gyro:
-        """What the table describes."""
+        """Return the sensor of the table."""
         return Gyro(
             sigma_rad_s=math.radians(self.noise_deg_s),
             range_rad_s=math.radians(self.range_deg_s),
@@ -134,7 +134,7 @@ class GyroTable(Table, kw_only=True):
 
 
 class MagnetometerTable(Table, kw_only=True):
-    """Noise of one reading of one axis."""
+    """Table of the magnetometer; its noise is that of one reading of one axis."""
 
     noise_nT: Positive = 250.0
     range_nT: Positive = 200_000.0
@@ -142,7 +142,7 @@ class MagnetometerTable(Table, kw_only=True):
     misalignment_deg: Vector = _ZERO
 
     def sensor(self) -> Magnetometer:
-        """What the table describes."""
+        """Return the sensor of the table."""
         return Magnetometer(
             sigma_T=1e-9 * self.noise_nT,
             range_T=1e-9 * self.range_nT,
@@ -152,7 +152,7 @@ class MagnetometerTable(Table, kw_only=True):
 
 
 class SunSensorTable(Table, kw_only=True):
-    """Noise of the direction along each of two axes across it."""
+    """Table of the Sun sensor; its noise is that of the direction along each of two axes across it."""
 
     noise_deg: Positive = 0.1
     half_field_deg: Positive = 45.0
@@ -160,7 +160,7 @@ class SunSensorTable(Table, kw_only=True):
     misalignment_deg: Vector = _ZERO
 
     def sensor(self) -> SunSensor:
-        """What the table describes."""
+        """Return the sensor of the table."""
         return SunSensor(
             sigma_rad=math.radians(self.noise_deg),
             heads_body=np.array(self.heads, dtype=np.float64),
@@ -170,7 +170,7 @@ class SunSensorTable(Table, kw_only=True):
 
 
 class EstimateTable(Table, kw_only=True):
-    """The filter."""
+    """Table of the filter."""
 
     sensors: str = "st+gyro+mag+sun"
     states: list[str] = msgspec.field(default_factory=list)
@@ -194,7 +194,7 @@ class EstimateTable(Table, kw_only=True):
 
 
 class ProcessNoiseTable(Table, kw_only=True):
-    """What every second adds to the error state, one standard deviation.
+    """Table of the process noise: growth of the standard deviations of the error state in a step.
 
     See :class:`adcs.kalman.error_state.ProcessNoise`.
     """
@@ -217,7 +217,7 @@ SENSOR_TABLES: dict[str, Any] = {
 
 
 class FileTable(File, kw_only=True):
-    """The whole file."""
+    """Scenario file."""
 
     satellite: SatelliteTable
     orbit: OrbitTable
@@ -231,7 +231,7 @@ class FileTable(File, kw_only=True):
     log: LogTable | None = None
 
     def check(self) -> None:
-        """Refuse no step at all, and too many."""
+        """Raise RefusalError unless a run has 1 to :data:`MOST_STEPS` steps."""
         if not 1.0 <= self.duration_s / self.step_s <= MOST_STEPS:
             expected = f"1 to {MOST_STEPS} steps of {self.step_s:g} s"
             raise RefusalError("duration_s", f"found {self.duration_s:g} s, expected {expected}")

@@ -1,19 +1,18 @@
-"""Telemetry of attitude sensors: CSV files with units in the names of their columns.
+"""Telemetry of attitude sensors: CSV files with units in the names of the columns.
 
-``time_s`` counts from ``start`` of the scenario file that goes with it, and ascends in any steps; rows may be missing,
-and an empty cell is a missing reading. All other columns are optional, but those of a
-sensor come together:
+``time_s`` is the time since ``start`` of the scenario file; it ascends in any steps. Rows may be missing, and an empty
+cell is a missing reading. All other columns are optional, but all columns of a sensor come together:
 
 =========================================  ============================================================================
 columns                                    meaning
 =========================================  ============================================================================
-``star_qw, star_qx, star_qy, star_qz``     attitude by the star tracker: the rotation that takes components of a vector
-                                           from body axes to the inertial frame (J2000), scalar part first
+``star_qw, star_qx, star_qy, star_qz``     attitude of the star tracker: rotation of components from body axes to the
+                                           inertial frame (J2000), scalar first
 ``gyro_x_deg_s``, y, z                     rate against inertial space, body axes
 ``field_x_nT``, y, z                       magnetometer, body axes
-``sun_x, sun_y, sun_z``                    direction to the Sun, body axes; of any length
-``wheels_x_Nms``, y, z                     momentum of all wheels together, body axes; without them there are none
-``torquers_x_Am2``, y, z                   commanded magnetic moment, body axes, held until the next; without it none
+``sun_x, sun_y, sun_z``                    direction to the Sun, body axes, any length
+``wheels_x_Nms``, y, z                     total momentum of the wheels, body axes; zero without the columns
+``torquers_x_Am2``, y, z                   commanded magnetic moment, body axes, held until the next; zero without them
 =========================================  ============================================================================
 
 ``adcs run SCENARIO --out DIR`` writes an example.
@@ -41,16 +40,21 @@ STAR, GYRO, FIELD, SUN, WHEELS, TORQUERS = GROUPS = tuple(one.columns for one in
 def read_telemetry(
     path: str | PathLike[str], step_s: float | None = None, *, layout: LogLayout | None = None
 ) -> Telemetry:
-    """Read a log.
+    """Read a log of attitude sensors.
 
     Parameters
     ----------
     path : str or path-like
-        A log (CSV); see the file formats.
+        Log (CSV); see the file formats.
     step_s : float, optional
         Usual time between readings, such as that of the scenario file; by default the shortest between two rows.
     layout : LogLayout, optional
-        Of a log with columns, units and conventions of its own: ``log`` of :func:`adcs.read_scenario`.
+        Columns, units and conventions of the log: ``log`` of :func:`adcs.read_scenario`; by default the standard ones.
+
+    Returns
+    -------
+    Telemetry
+        Readings in SI and body axes, NaN where missing.
 
     Raises
     ------
@@ -79,7 +83,7 @@ def read_telemetry(
 
 
 def read_named(path: str | PathLike[str], expected: str, layout: LogLayout, more: Sequence[str] = ()) -> Table:
-    """Table of the columns that a layout names, and of some more."""
+    """Read the columns that a layout names, and ``more`` ones."""
     names = [layout.time, *(name for one in layout.columns.values() for name in one.columns), *more]
     table = read_table(path, expected, only=names, instant=[layout.time] if layout.time_format == "utc" else [])
     for name in names:
@@ -88,7 +92,7 @@ def read_named(path: str | PathLike[str], expected: str, layout: LogLayout, more
 
 
 def columns_of(table: Table, layout: LogLayout) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """Ascending times (n,), and readings by the names of a layout, in SI and body axes, NaN where missing."""
+    """Return ascending times (n,), and readings by the layout's names, in SI and body axes, NaN where missing."""
     table.require(layout.time, [layout.time])
     time_s = layout.seconds(table.complete([layout.time])[:, 0])
     table.refuse_late(layout.time, time_s)
@@ -104,7 +108,7 @@ def columns_of(table: Table, layout: LogLayout) -> tuple[FloatArray, dict[str, F
 
 
 def _refuse_many(table: Table, column: str, time_s: FloatArray, step_s: float | None) -> None:
-    """Refuse more instants than a filter can hold."""
+    """Raise InputError if there are more instants than a filter can hold."""
     steps = steps_within(time_s, step_s or usual_step_s(time_s))
     if steps >= MOST_INSTANTS:
         raise InputError(
@@ -114,7 +118,7 @@ def _refuse_many(table: Table, column: str, time_s: FloatArray, step_s: float | 
 
 
 def telemetry_columns(telemetry: Telemetry) -> dict[str, FloatArray]:
-    """Columns (n,) of a log's file; there are none of a sensor without any reading."""
+    """Return the columns (n,) of a log's file; a sensor without any reading has none."""
     groups = (
         (STAR, np.roll(telemetry.star, 1, axis=1)),
         (GYRO, np.degrees(telemetry.gyro_rad_s)),

@@ -42,15 +42,15 @@ class EstimatorSettings:
         One of :data:`adcs.kalman.names.FILTERS`.
     start : str
         One of :data:`adcs.kalman.names.STARTS`, for simulations; :func:`estimate` starts from any attitude. With a
-        magnetometer alone, another attitude is used if it explains the readings better.
+        magnetometer alone, another start is used if it explains the readings better.
     start_attitude_rad, start_rate_rad_s : float
         Initial standard deviations per axis.
     forgetting : float
         Forgetting factor of the parallel filter of the disturbance.
     closed_loop_F : bool
-        Use the Jacobian of the source paper.
+        Whether to use the closed-loop Jacobian of the source paper.
     longest_gap_s : float
-        Longest gap of a log that the filter bridges by the dynamics; after a longer one it starts anew.
+        Longest gap of a log that the filter bridges by the dynamics; it restarts after a longer one.
 
     Examples
     --------
@@ -70,7 +70,27 @@ class EstimatorSettings:
 
     @classmethod
     def of(cls, sensors: str, states: Iterable[str] = (), filter: Filter = "mekf") -> EstimatorSettings:
-        """Return settings by names, with tuned process noise."""
+        """Return settings by names, with tuned process noise.
+
+        Parameters
+        ----------
+        sensors : str
+            Sensors in use, such as ``"mag+sun+gyro"``.
+        states : iterable of str
+            States besides attitude and rate.
+        filter : str
+            One of :data:`adcs.kalman.names.FILTERS`.
+
+        Returns
+        -------
+        EstimatorSettings
+            Settings for :func:`adcs.estimate`.
+
+        Raises
+        ------
+        ValueError
+            A name is unknown, or the sensors cannot observe the attitude or a state.
+        """
         if filter not in FILTERS:
             raise ValueError(f"Input filter must be one of {', '.join(FILTERS)}; instead received {filter!r}.")
         used = sensor_set(sensors, dict.fromkeys((*states, *IMPLIED_STATES.get(filter, ()))))
@@ -96,35 +116,35 @@ def estimate(
 
     Field and Sun are computed along the orbit. The filter starts from the first readings. If these leave a rotation
     open, it starts from the angle that fits the readings of five minutes best; with a magnetometer alone, of fifty
-    minutes. After a gap of more than ten minutes, or of ``longest_gap_s`` of the settings, it starts anew.
+    minutes. It restarts after a gap of more than ten minutes, or of ``longest_gap_s`` of the settings.
 
     Parameters
     ----------
     telemetry : Telemetry
-        The log, from :func:`adcs.read_telemetry` or from arrays.
+        Log from :func:`adcs.read_telemetry`, or from arrays.
     satellite : Satellite
         Inertia, orbit, sensors and their noise.
     sensors : str or EstimatorSettings
-        Sensors in use, ``st``, ``gyro``, ``mag`` and ``sun`` with + between them, such as ``"mag+sun+gyro"``; or all
-        settings, which then replace ``states`` and ``filter`` too.
+        Sensors in use: ``st``, ``gyro``, ``mag`` and ``sun`` with + between them, such as ``"mag+sun+gyro"``; or all
+        settings, which replace ``states`` and ``filter`` too.
     states : iterable of str
         States besides attitude and rate: ``gyro-bias``, ``field-bias``, ``disturbance``, ``field-model``, ``dipole``,
         ``field-gain``.
     filter : str
-        ``mekf``; ``constant-gain``, with its converged gain; ``parallel-disturbance``, with a separate filter of the
-        disturbance; ``reduced``, of attitude and gyro bias alone; ``smoother``, with a smoother after it;
-        ``self-tuning``, a bank that estimates the size of the disturbance.
+        ``mekf``: the multiplicative extended Kalman filter. ``constant-gain``: the same with its converged gain.
+        ``parallel-disturbance``: with a separate filter of the disturbance. ``reduced``: attitude and gyro bias alone.
+        ``smoother``: with a smoother after it. ``self-tuning``: a bank that estimates the size of the disturbance.
 
     Returns
     -------
     AttitudeTrack
-        Inertial from body.
+        Attitude, inertial from body, with rate, states, standard deviations and warnings.
 
     Raises
     ------
     ValueError
-        The sensors cannot observe attitude or have no reading, they contradict each other because the unit, the axes
-        or the quaternion of one is wrong, a date is outside of the model of the field, or the filter fails.
+        The sensors cannot observe the attitude or have no reading, one misread unit, axis or quaternion explains why
+        they contradict each other, a date is outside of the field model, or the filter fails.
 
     Examples
     --------
@@ -148,9 +168,9 @@ def estimate(
             reasons.append(error)
     if not tracks:
         raise reasons[0]
-    told = f"; {len(reasons)} of the {len(pieces)} pieces tell no attitude: {reasons[0]}" if reasons else ""
-    anew = f"{len(pieces) - 1} gaps longer than {chosen.longest_gap_s:g} s: the filter starts anew after each{told}"
-    return join_tracks(tracks, anew)
+    failed = f"; {len(reasons)} of the {len(pieces)} pieces tell no attitude: {reasons[0]}" if reasons else ""
+    gaps = f"{len(pieces) - 1} gaps longer than {chosen.longest_gap_s:g} s: the filter starts anew after each{failed}"
+    return join_tracks(tracks, gaps)
 
 
 def _estimate(telemetry: Telemetry, satellite: Satellite, chosen: EstimatorSettings) -> AttitudeTrack:
@@ -160,15 +180,15 @@ def _estimate(telemetry: Telemetry, satellite: Satellite, chosen: EstimatorSetti
     for name in used.sensors.split("+"):
         if not record.readings.seen[name].any():
             raise ValueError(
-                f"Input found no reading of the {SENSOR_WORDS[name]}, expected some because the sensors in use are "
-                f"{used.sensors}."
+                f"Input telemetry must have readings of the {SENSOR_WORDS[name]} for the sensors {used.sensors}; "
+                "instead received none."
             )
     check_conventions(telemetry, record, used.sensors.split("+"))
     first = first_observed_row(record, used, with_gyro=chosen.filter == "reduced")
     record = part(record, np.array([0]), slice(first, None))
     tracks = estimate_tracks(record, chosen, any_start)
     if not (np.isfinite(tracks.q).all() and tracks.definite.all()):
-        raise ValueError("Input found readings that no attitude explains: the filter has failed.")
+        raise ValueError("Input telemetry must have readings that an attitude explains; instead the filter has failed.")
     return _track(telemetry, first, record, chosen, tracks)
 
 
@@ -217,7 +237,7 @@ def estimate_tracks(
                 return _run_chosen(record, chosen, first)
         except np.linalg.LinAlgError:
             raise InputError(
-                f"filter {chosen.filter}: found a covariance that is not positive definite any more, expected noise of "
+                f"filter {chosen.filter}: found a covariance that is no longer positive definite, expected noise of "
                 "the size of the readings' errors, a shorter duration or another filter."
             ) from None
 

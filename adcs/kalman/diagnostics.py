@@ -1,7 +1,7 @@
 """Problems of attitude determination, found in a record and its estimates.
 
-Each is one sentence that says what is degraded or cannot be observed, and for how long. The covariance of the estimates
-says by how much, unless the model itself is wrong: then readings must be compared with the model.
+Each problem is one sentence on a degraded or unobservable state, with its duration. The covariance of the estimates
+states the size of the effect, unless the model itself is wrong. For wrong models, readings are compared with the model.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from magloc.navigation.rotations import cross_matrix
 
 COLLINEAR = "Sun and field on one line"
 COLLINEAR_RAD = math.radians(20.0)
-"""Angle of Sun and field from one line below which the rotation about it has three times the noise."""
+"""Angle between the lines of Sun and field below which the noise of the rotation about them is three times as large."""
 GROWS = 1.5
-"""Growth of the attitude's standard deviation, with one direction left, that is reported."""
+"""Least reported growth of the attitude's standard deviation with one direction left."""
 FALSE_ALARM = 1e-6
-"""Probability of reporting readings that fit their model."""
+"""Probability of a report on readings that fit their model."""
 BLOCK = 64
-"""Readings per sum of residuals: white noise averages out within it, errors that last do not."""
+"""Number of readings per sum of residuals; white noise averages out in it, lasting errors do not."""
 SEEN = 0.7
 """Smallest observable amplitude of the attitude, in standard deviations of the readings of one instant."""
 PERIODS_S = (100.0, 300.0, 1000.0)
@@ -202,7 +202,7 @@ def _field_model(record: Record, estimates: AttitudeTracks, run: int) -> list[st
     effect = "the star tracker keeps the attitude" if used.star else "attitude is degraded"
     return [
         f"field differs from its model by {1e9 * largest_T:.0f} nT in modulus or angle with the Sun: error of the "
-        f"model or of the orbit, bias or the satellite's own field; {effect}"
+        f"model or of the orbit, bias, or the satellite's own field; {effect}"
     ]
 
 
@@ -212,7 +212,7 @@ def _error_as_noise(settings: FilterSettings) -> list[str]:
         return []
     return [
         f"an error of the field's model of {1e9 * settings.field_error_T:.0f} nT is taken for noise, which averages "
-        "out: the deviations are too small for one that lasts, which the state field-model is for"
+        "out: the deviations are too small for an error that lasts; add the state field-model"
     ]
 
 
@@ -240,7 +240,7 @@ def _correlated_residuals(record: Record, estimates: AttitudeTracks, run: int) -
         blocks = rows[: len(rows) // BLOCK * BLOCK].reshape(-1, BLOCK, 3)
         if len(blocks) < 2:
             continue
-        # Process noise can explain a constant part.
+        # Process noise explains a constant part.
         sums = blocks.sum(axis=1) - blocks.sum(axis=1).mean(axis=0)
         variance = np.var(blocks, axis=(0, 1))
         told = variance > 0.0
@@ -265,9 +265,9 @@ def postfit_residuals(record: Record, estimates: AttitudeTracks, run: int) -> di
 def unseen_torque_Nm(record: Record, estimates: AttitudeTracks, run: int) -> Mapping[float, float]:
     """Return the largest unobservable torque amplitude [N·m] by period [s].
 
-    A torque of amplitude J·d and period T changes the attitude by d (T/2π)² and the rate by d T/2π. Below 0.7 standard
-    deviations of the readings of one instant, about the axis that they measure worst, no filter can estimate the
-    torque, nor the error that it causes.
+    A torque of amplitude J·d and period T changes the attitude by d (T/2π)² and the rate by d T/2π. No filter can
+    estimate a smaller torque, nor its error, than that of 0.7 standard deviations of the readings of one instant about
+    the worst axis.
     """
     sigma, used = deviations(record, estimates.settings), estimates.settings.sensors
     q, around = estimates.q[run], record.environment

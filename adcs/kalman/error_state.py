@@ -1,8 +1,8 @@
 """Sensors, optional states and process noise of an attitude filter.
 
 See docs/theory/attitude-kalman-filters.md. Source: Ivanov, Ivlev, Karpenko, Ovchinnikov, Keldysh Institute preprint 64,
-2014, Tables 3 to 5. Its exponents are missing or uncertain: those of :func:`paper_noise` are ours, chosen so that the
-filter is as accurate as the tables say.
+2014, Tables 3 to 5. Ours: the exponents of :func:`paper_noise`, which are missing or uncertain there. They give the
+accuracy that the tables state.
 """
 
 from __future__ import annotations
@@ -38,8 +38,7 @@ ALWAYS = 6
 class SensorSet:
     """Sensors in use and optional states; made by :func:`sensor_set`, which checks them.
 
-    ``star``, ``gyro``, ``magnetometer``, ``sun``: sensors. ``states``: names of the optional states, in the order of
-    :data:`STATES`.
+    ``states``: names of the optional states, in the order of :data:`STATES`.
     """
 
     star: bool = False
@@ -116,10 +115,10 @@ def check_observable(used: SensorSet) -> None:
             )
     if used.star or used.magnetometer:
         return
-    seen = "the Sun sensor leaves the rotation about the Sun open" if used.sun else "nothing measures attitude"
+    seen = "the Sun sensor leaves the rotation about the Sun open" if used.sun else "no sensor measures attitude"
     raise ValueError(
-        f"Input sensors must observe attitude; instead received {used.sensors!r}: {seen}; missing is a star tracker "
-        "(st) or a magnetometer (mag)."
+        f"Input sensors must observe attitude; instead received {used.sensors!r}: {seen}. Add a star tracker (st) or a "
+        "magnetometer (mag)."
     )
 
 
@@ -130,24 +129,24 @@ class ProcessNoise:
     Attributes
     ----------
     attitude : float
-        q_λ, of the vector part of the quaternion.
+        q_λ of the vector part of the quaternion.
     rate_rad_s : float
-        q_ω.
+        q_ω of the rate.
     field_bias_T : float
-        q_b.
+        q_b of the magnetometer's bias.
     gyro_bias_rad_s : float
-        q_g.
+        q_g of the gyro's bias.
     disturbance_s2 : float
-        q_d.
+        q_d of the disturbing acceleration.
     dipole_Am2 : float
-        q_m.
+        q_m of the dipole.
     field_gain : float
-        q_D, of each of the nine components.
+        q_D of each of the nine components of the magnetometer's gains.
 
     Raises
     ------
     ValueError
-        One is negative or not finite.
+        A number is negative or not finite.
     """
 
     attitude: float
@@ -169,7 +168,7 @@ def tuned_noise(used: SensorSet) -> ProcessNoise:
     to 1e-8 N·m besides that of the dipole.
     """
     if "dipole" in used.states:
-        # Only whole orbits separate a dipole from other torques, so that larger process noise would hide it.
+        # Only whole orbits separate a dipole from other torques; larger process noise would hide it.
         if "disturbance" in used.states:
             return ProcessNoise(1e-8, 1e-8, disturbance_s2=3e-10)
         return ProcessNoise(1e-8, 2e-7)
@@ -223,9 +222,13 @@ class FilterSettings:
 
     Attributes
     ----------
+    sensors : SensorSet
+        Sensors in use and optional states.
+    noise : ProcessNoise
+        Process noise of a usual step.
     field_error_T : float
         Standard deviation of each component of the field model's error. It is added to the magnetometer's noise, or is
-        that of the state ``field-model``, which takes :data:`FIELD_ERROR_T` in place of 0.
+        that of the state ``field-model``, with :data:`FIELD_ERROR_T` in place of 0.
     field_correlation_s : float
         Time constant of the state ``field-model``; 1,000 km of a low orbit.
     disturbance_correlation_s : float
@@ -235,10 +238,10 @@ class FilterSettings:
         Initial standard deviations of those states, whose initial values are zero. The dipole is added to the known
         residual dipole of the satellite.
     field_gain_sigma, field_axes_sigma_rad : float
-        The same of the magnetometer's gains, and of the misalignment of its axes; state ``field-gain``.
+        Initial standard deviations of the magnetometer's gains and of the misalignment of its axes, the state
+        ``field-gain``.
     gate : float
-        Probability of rejecting a good reading, because it seems to contradict the filter; with 0 all readings are
-        used.
+        Probability that the gate rejects a good reading; with 0 all readings are used.
     """
 
     sensors: SensorSet

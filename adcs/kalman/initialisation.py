@@ -31,9 +31,9 @@ from arrays.typing import FloatArray
 from magloc.navigation.rotations import cross_matrix
 
 AGAIN = 10.0
-"""Factor of a start's standard deviations over those of its readings, because the filter uses these again."""
+"""Standard deviations of a start over those of its readings; the filter uses the same readings again."""
 WINDOW_S, ALONE_S = 300.0, 3000.0
-"""Time that decides between hypotheses; longer with a magnetometer alone, as the field must turn along the orbit."""
+"""Duration of readings that decide between hypotheses, without and with a magnetometer alone."""
 RATES_ALONE = (1.0, 0.2, 0.04)
 """Competing deviations of the rate with a magnetometer alone, as parts of the largest: from tumbling to rest."""
 ROUNDS = 6
@@ -52,7 +52,7 @@ def vector_start(record: Record, settings: FilterSettings, rate_rad_s: float = R
     :data:`AGAIN` times that of the readings elsewhere.
     """
     used, readings, around = settings.sensors, record.readings, record.environment
-    # At one instant an error that is a state acts as noise; a constant one does not average out.
+    # At one instant the error of the field model acts as noise; constant errors do not average out.
     sigma = deviations(record, replace(settings, sensors=settings.sensors.drop("field-model")))
     constant_T = _calibration_deviation(settings, np.linalg.norm(record.environment.b_orbital_T[:, 0], axis=-1))
     b_orbital, b = around.b_orbital_T[:, 0], readings.field_T[:, 0]
@@ -106,7 +106,7 @@ def first_observed_row(record: Record, used: SensorSet, *, with_gyro: bool) -> i
     told = np.any([seen[name] for name in used.sensors.split("+") if name != "gyro"], axis=0)
     rows = np.flatnonzero(told & seen["gyro"] if with_gyro else told)
     if not rows.size:
-        raise ValueError(f"Input found no reading that tells the attitude, expected one of {used.sensors}.")
+        raise ValueError(f"Input record must have a reading of the attitude by {used.sensors}; instead received none.")
     return int(rows[0])
 
 
@@ -142,7 +142,7 @@ def any_start(record: Record, settings: FilterSettings, turns: int = 36, rate_ra
         return start
     variances, axes = np.linalg.eigh(start.covariance[open_runs, :3, :3])
     if (2.0 * np.sqrt(variances[:, 1]) > KNOWN_RAD).any():
-        raise ValueError("Input record must have a direction at the first instant of every run; one has none.")
+        raise ValueError("Input record must have a direction at the first instant of every run; instead one has none.")
     spacing = 2.0 * math.pi / turns
     angles = spacing * np.arange(turns)
     chosen = [start.select_runs(np.array([run])) for run in range(len(start.q))]
@@ -158,8 +158,8 @@ def any_start(record: Record, settings: FilterSettings, turns: int = 36, rate_ra
 def choose_start(record: Record, settings: FilterSettings, start: FilterStart) -> FilterStart:
     """Return a given start, or with a magnetometer alone :func:`any_start` if it fits the readings better.
 
-    Errors of degrees and of a tenth of a degree a second are enough to make such a filter diverge: it observes the
-    rotation about the field late, by equations of motion that are linearised at its estimate.
+    Errors of some degrees and of 0.1 °/s can make such a filter diverge. It observes the rotation about the field late,
+    by equations of motion that are linearised at its estimate.
     """
     if settings.sensors.sensors != "mag":
         return start
@@ -182,7 +182,7 @@ def _find_likeliest(
     # Without a gate, because readings that do not fit distinguish the hypotheses.
     tracks = run_filter(part(record, runs, slice(n)), replace(settings, gate=0.0), hypotheses)
     misfit = np.nansum(tracks.nis + tracks.log_det, axis=(1, 2))
-    # A filter that has overflowed has no innovations, which must not count as small ones.
+    # A filter that has overflowed has no innovations, and must not win for that.
     misfit[~np.isfinite(tracks.q[:, -1]).all(axis=-1)] = np.inf
     best = np.array([np.where(np.isfinite(misfit), misfit, np.inf).argmin()])
     optional = {name: values[best, -1] for name, values in tracks.optional.items()}

@@ -1,7 +1,7 @@
 """Multiplicative extended Kalman filter (MEKF) of attitude and rate.
 
 See docs/theory/attitude-kalman-filters.md. Source: Ivanov, Ivlev, Karpenko, Ovchinnikov, Keldysh Institute preprint 64,
-2014, with the corrections of :mod:`adcs.satellite.dynamics`; the factors 2 (δq is half an angle) are missing there.
+2014. Ours: the corrections of :mod:`adcs.satellite.dynamics`, and the factors 2 (δq is half an angle) missing there.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ from magloc.navigation.rotations import cross_matrix
 _COVARIANCES_A_CALL = 400_000
 """Elements of covariances that one call computes: about ten milliseconds."""
 PATIENCE_S = 300.0
-"""A second hypothesis replaces the main one if that has accepted no reading of the sensor for so long, even if no other
+"""Time without an accepted reading of a sensor after which a second hypothesis replaces the main one, even if no other
 sensor decides between them."""
 PATIENT_READINGS = 10
-"""The same for a gyro's bias, in instants. A main hypothesis that accepts as many readings of that sensor meanwhile is
-kept, and the gap of a sensor is over after as many of its intervals."""
+"""The same for a gyro's bias, in instants. As many accepted readings of that sensor keep the main hypothesis, and as
+many intervals of a sensor end its gap."""
 
 
 def initial_state(settings: FilterSettings, start: FilterStart) -> AttitudeState:
@@ -92,9 +92,13 @@ def transition(F: FloatArray, by_dipole: FloatArray, settings: FilterSettings, d
     for state, acceleration in (("disturbance", np.eye(3)), ("dipole", by_dipole)):
         if state in used.states:
             full[:, 3:6, used.slice_of(state)] = acceleration
-    step = full * dt_s
-    squared = step @ step
-    return np.asarray(np.eye(used.size) + step + squared / 2.0 + squared @ step / 6.0)
+    return third_order_exponential(full * dt_s)
+
+
+def third_order_exponential(A: FloatArray) -> FloatArray:
+    """Return the matrix exponential of matrices (..., n, n) to the third order."""
+    squared = A @ A
+    return np.asarray(np.eye(A.shape[-1]) + A + squared / 2.0 + squared @ A / 6.0)
 
 
 def propagate(record: Record, row: int, state: AttitudeState) -> tuple[FloatArray, FloatArray]:
@@ -195,7 +199,7 @@ def stacked_residuals(
 ) -> tuple[FloatArray, FloatArray]:
     """Return H (runs, k, N) and residual (runs, k) of all sensors in units of their noise.
 
-    Both are zero where there is no reading, so that it changes nothing.
+    Both are zero without a reading, so that the update changes nothing.
     """
     sigma = deviations(record, settings)
     H, residual = [], []
@@ -219,24 +223,32 @@ def sensor_nis(noise: FloatArray, H: FloatArray, residual: FloatArray, used: Sen
     return nis
 
 
-def joseph_update(P: FloatArray, H: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
+def joseph_update(
+    P: FloatArray, H: FloatArray, residual: FloatArray, K: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
     """Return the correction (runs, N) and the covariance (E - KH) P (E - KH)ᵀ + KKᵀ.
 
-    ``residual`` (runs, k): in units of the noise.
+    ``residual`` (runs, k): in units of the noise. ``K`` (runs, N, k): gain, by default the optimal one.
     """
-    PHt = P @ H.mT
-    K = np.linalg.solve(H @ PHt + np.eye(H.shape[-2]), PHt.mT).mT
+    if K is None:
+        PHt = P @ H.mT
+        K = np.asarray(np.linalg.solve(H @ PHt + np.eye(H.shape[-2]), PHt.mT).mT)
     rest = np.eye(P.shape[-1]) - K @ H
     return (K @ residual[..., None])[..., 0], rest @ P @ rest.mT + K @ K.mT
 
 
 def update_state(
-    record: Record, row: int, state: AttitudeState, settings: FilterSettings
+    record: Record, row: int, state: AttitudeState, settings: FilterSettings, gain: FloatArray | None = None
 ) -> tuple[AttitudeState, FloatArray]:
-    """Update the state by all readings of instant ``row``, without a gate; also return NIS (runs, 4)."""
+    """Update the state by all readings of instant ``row``, without a gate; also return NIS (runs, 4).
+
+    ``gain`` (runs, N, k): gain for the k stacked residuals, by default the optimal one.
+    """
     H, residual = stacked_residuals(record, row, state, settings)
     nis = sensor_nis(H @ state.P @ H.mT + np.eye(H.shape[1]), H, residual, settings.sensors)
-    dx, P = joseph_update(state.P, H, residual)
+    # A sensor without a reading has rows of zeros in H, and must add no noise.
+    K = None if gain is None else gain * (H != 0.0).any(axis=-1)[:, None, :]
+    dx, P = joseph_update(state.P, H, residual, K)
     return replace(apply_error(state, dx, settings.sensors), P=P), nis
 
 
@@ -285,10 +297,10 @@ def run_filter(
 ) -> AttitudeTracks:
     """Filter whole runs in compiled code, in parallel over runs.
 
-    ``record``: any number of runs, such as :class:`sims.attitude.simulation.AttitudeRuns`. ``start``: one for each
-    run, by :func:`start_near` or :mod:`adcs.kalman.initialisation`. ``closed_loop_F``: use the Jacobian of the source
-    paper, which supposes that the control knows the true state: its filters are overconfident. Raises ValueError: the
-    start does not have as many runs as the record.
+    ``record``: any number of runs, such as :class:`sims.attitude.simulation.AttitudeRuns`. ``start``: start of each
+    run, from :func:`start_near` or :mod:`adcs.kalman.initialisation`. ``closed_loop_F``: use the Jacobian of the source
+    paper, which assumes that the control knows the true state, so that its filters are overconfident. Raises
+    ValueError if the start does not have as many runs as the record.
     """
     check_start(record, start)
     used, around, readings = settings.sensors, record.environment, record.readings

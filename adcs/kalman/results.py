@@ -11,7 +11,7 @@ from arrays.typing import FloatArray
 
 
 class StateColumns(NamedTuple):
-    """Columns of a state in files: name with a place for the axis, factor from SI, unit, words."""
+    """Columns of a state in files: name with a placeholder for the axis, factor from SI, unit, words."""
 
     column: str
     scale: float

@@ -19,7 +19,7 @@ from arrays.typing import FloatArray
 def smooth(record: Record, estimates: AttitudeTracks) -> AttitudeTracks:
     """Smooth the estimates of whole runs.
 
-    ``estimates``: from :func:`adcs.kalman.mekf.run_filter`. Returns: ``nis`` is that of the filter.
+    ``estimates``: result of :func:`adcs.kalman.mekf.run_filter`, whose ``nis`` is kept.
     """
     settings, n = estimates.settings, estimates.q.shape[1]
     later = estimates.at(n - 1)
@@ -27,7 +27,7 @@ def smooth(record: Record, estimates: AttitudeTracks) -> AttitudeTracks:
     for row in reversed(range(n - 1)):
         state = estimates.at(row)
         ahead, Phi = predict(record, row, state, settings)
-        # States have different units: solving with correlations is better conditioned.
+        # States have different units, so solving with correlations is better conditioned.
         scale = np.sqrt(np.diagonal(ahead.P, axis1=-2, axis2=-1))
         correlation = ahead.P / (scale[:, :, None] * scale[:, None, :])
         C = np.linalg.solve(correlation, (Phi @ state.P) / scale[:, :, None]).mT / scale[:, None, :]

@@ -1,7 +1,7 @@
-"""Table-top satellite: a camera that looks up at a sky of LEDs, a planar inertial unit, and their fusion.
+"""Table-top satellite: a camera below a sky of LEDs, a planar inertial unit, and their fusion.
 
-The table's frame has X and Y in the plane and Z up [m]. The heading φ is counter-clockwise seen from above,
-v_table = R(φ) v_body with R(φ) = [[cos φ, -sin φ], [sin φ, cos φ]], and the gyro reads dφ/dt.
+The table's frame has X and Y in the plane and Z up [m]. The heading φ is counter-clockwise seen from above, with
+v_table = R(φ) v_body and R(φ) = [[cos φ, -sin φ], [sin φ, cos φ]]. The gyro reads dφ/dt.
 
 Source: Bindel, Ivanov, Nuzhdin, Ovchinnikov, Trofimov, Keldysh Institute preprint.
 """

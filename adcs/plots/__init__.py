@@ -1,1 +1,1 @@
-"""Figures of :mod:`adcs`. Only the command line draws."""
+"""Figures of :mod:`adcs`; only its command line draws."""

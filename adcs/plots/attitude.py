@@ -1,4 +1,4 @@
-"""Figures of attitude filters: errors or estimates through time with ±3σ, and how true the filter is to itself."""
+"""Figures of attitude filters: errors or estimates over time with ±3σ, and their consistency."""
 
 from __future__ import annotations
 
@@ -20,26 +20,30 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _MILLIONTHS = "disturbance"
-"""The state that is drawn in millionths of its unit."""
-_SETTLED = 0.25
+"""State that is drawn in millionths of its unit."""
+_TRANSIENT = 0.25
+"""Part of the time that does not count for limits and shares."""
 _SENSOR_STYLES = ((style.BLACK, "-"), (style.BLUE, "--"), (style.ORANGE, "-."), ("#009e73", ":"))
 
 
-def gaps_of(
+def sensor_gaps(
     seen: Mapping[str, BoolArray], used: Iterable[str], degraded: Mapping[str, BoolArray]
 ) -> list[tuple[str, BoolArray]]:
-    """Sensors in use that have no reading at times, and what else is degraded, in words, and where all is well."""
+    """Return labels of missing sensors and other degradations, with the unaffected rows (n,)."""
     gaps = [(f"no {SENSOR_WORDS.get(name, name)}", seen[name]) for name in used]
-    gaps += [(words, ~rows) for words, rows in degraded.items()]
-    return [(words, well) for words, well in gaps if not well.all()]
+    gaps += [(text, ~rows) for text, rows in degraded.items()]
+    return [(text, is_good) for text, is_good in gaps if not is_good.all()]
 
 
-def track_figure(track: AttitudeTrack, name: str = "") -> Figure:
-    """States of a track; the attitude is a rotation vector from the orbital frame, or from that of its vectors."""
+def attitude_figure(track: AttitudeTrack, name: str = "") -> Figure:
+    """Draw the states of a track.
+
+    The attitude is a rotation vector from the orbital frame, or from the frame of the track's vectors.
+    """
     attitude = quaternion.log(track.q if track.q_orbital is None else track.q_orbital)
     values = state_table({"attitude": attitude} | dict(track.states))
     sigma = state_table(track.sigma) if track.sigma else np.full_like(values, np.nan)
-    gaps = gaps_of(track.seen, track.used, track.degraded)
+    gaps = sensor_gaps(track.seen, track.used, track.degraded)
     title = f"{name}: {track.title}" if name else track.title
     return states_figure(
         title, track.time_s, values, sigma, are_errors=False, tuned_disturbance_s2=track.tuned_disturbance_s2, gaps=gaps
@@ -56,18 +60,18 @@ def states_figure(
     tuned_disturbance_s2: FloatArray | None = None,
     gaps: Sequence[tuple[str, BoolArray]] = (),
 ) -> Figure:
-    """Every state's three axes side by side, with the filter's ±3σ.
+    """Draw the three axes of every state side by side, with ±3σ of the filter.
 
-    ``values``, ``sigma`` (n, 30): estimates, or errors, whose band is around zero, in the units of ``adcs``' files; NaN
-    of a state that is not there. ``tuned_disturbance_s2`` (n,): 1 σ that a bank of filters expects. ``gaps``: what was
-    missing, and whether it was there (n,).
+    ``values``, ``sigma`` (n, 30): estimates or errors in the units of the files of ``adcs``; NaN for a state that the
+    filter does not have. The band of errors is around zero. ``tuned_disturbance_s2`` (n,): standard deviation that a
+    bank of filters expects. ``gaps``: labels, and whether the data were there (n,).
     """
-    # Nine numbers of one state are three rows.
+    # A state of nine numbers takes three rows.
     states = [state for state, shown in STATE_UNITS.items() for _ in range(len(shown.axes) // 3)]
     rows = [row for row in range(len(states)) if not np.isnan(values[:, 3 * row]).all()]
     figure = style.new_figure(1.25 * len(rows) + 0.75)
     axes = figure.subplots(len(rows), 3, sharex=True, sharey="row", squeeze=False)
-    settled = time_s >= time_s[0] + _SETTLED * np.ptp(time_s)
+    settled = time_s >= time_s[0] + _TRANSIENT * np.ptp(time_s)
     for across, row in zip(axes, rows, strict=True):
         state, shown = states[row], STATE_UNITS[states[row]]
         scale, unit = (1e6, f"1e-6{shown.unit.removeprefix('1')}") if state == _MILLIONTHS else (1.0, shown.unit)
@@ -87,50 +91,52 @@ def states_figure(
             )
             ax.plot(time_s, drawn[:, axis], color=style.BLUE, lw=0.8, label="error" if are_errors else "estimate")
             if state == "disturbance" and not are_errors and tuned_disturbance_s2 is not None:
-                for way in (-scale, scale):
+                for factor in (-scale, scale):
                     ax.plot(
                         time_s,
-                        way * tuned_disturbance_s2,
+                        factor * tuned_disturbance_s2,
                         color=style.ORANGE,
                         lw=0.8,
                         ls="--",
-                        label="±1σ that the bank found" if way > 0.0 else "_",
+                        label="±1σ that the bank found" if factor > 0.0 else "_",
                     )
             for gap, there in gaps:
                 style.shade_gaps(ax, time_s, there, gap)
             outside = float(np.mean(np.abs(drawn[settled, axis]) > wide[settled, axis]))
-            style.dress(ax, "", label if axis == 0 else "", "xyz"[axis] if row == rows[0] else "")
+            style.label_axes(ax, "", label if axis == 0 else "", "xyz"[axis] if row == rows[0] else "")
             if are_errors and outside > 0.0:
                 ax.text(
                     0.98,
                     0.95,
-                    f"{_percent(outside)} beyond 3σ",
+                    f"{_percentage(outside)} beyond 3σ",
                     transform=ax.transAxes,
                     ha="right",
                     va="top",
-                    fontsize=style.SMALL_LETTERS,
+                    fontsize=style.SMALL_FONT_SIZE,
                 )
             ax.axhline(0.0, color=style.GREY, lw=0.5, zorder=1.5)
-        # The band at rest fills half of the panel; errors and bands at the start may leave it, an estimate never.
+        # The settled band fills half of the panel. Initial errors and bands may leave it, but no estimate does.
         inside = [(middle - wide)[settled], (middle + wide)[settled], drawn[settled] if are_errors else drawn]
-        low, high = style.limits_of(inside, share=1.0, margin=0.25 if are_errors else 0.05)
+        low, high = style.axis_limits(inside, share=1.0, margin=0.25 if are_errors else 0.05)
         across[0].set_ylim(low, high)
     for ax in axes[-1]:
-        ax.set_xlabel("time [s]", fontsize=style.LETTERS)
+        ax.set_xlabel("time [s]", fontsize=style.FONT_SIZE)
         if len(time_s) > 1:
             ax.set_xlim(time_s[0], time_s[-1])
         ax.xaxis.set_major_locator(MaxNLocator(4))
-    named = {label: handle for ax in axes[:, 0] for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
-    style.legend(figure, handles=named.values(), labels=named.keys(), loc="outside lower center", ncols=6)
-    style.headline(figure, title)
+    labelled = {
+        label: handle for ax in axes[:, 0] for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)
+    }
+    style.add_legend(figure, handles=labelled.values(), labels=labelled.keys(), loc="outside lower center", ncols=6)
+    style.add_title(figure, title)
     return figure
 
 
-def _percent(part: float) -> str:
+def _percentage(part: float) -> str:
     return f"{100.0 * part:.0f} %" if part >= 0.01 else f"{100.0 * part:.1g} %"
 
 
-def consistency_figure(
+def attitude_consistency_figure(
     title: str,
     time_s: FloatArray,
     error_deg: FloatArray,
@@ -139,29 +145,29 @@ def consistency_figure(
     size: int,
     nis: FloatArray,
 ) -> Figure:
-    """Errors of all runs, NEES and NIS with their bounds.
+    """Draw the errors of all runs, and NEES and NIS with their bounds.
 
-    ``error_deg`` (runs, n): angle between truth and estimate. ``sigma_deg`` (n,): what the filter believes of it, root
-    of the sum of squares of the axes, in the first run. ``nees`` (runs, n): over its numbers, ``size``. ``nis``
-    (runs, n, 4).
+    ``error_deg`` (runs, n): angle between truth and estimate. ``sigma_deg`` (n,): its standard deviation by the filter
+    in the first run, the root of the sum of squares of the axes. ``nees`` (runs, n): NEES over its degrees of freedom,
+    ``size``. ``nis`` (runs, n, 4): NIS of every sensor.
     """
-    return _through_time(
+    return _stack_panels(
         title,
         time_s,
-        lambda ax: _errors(ax, time_s, error_deg, sigma_deg),
-        lambda ax: _nees(ax, time_s, nees, size),
-        lambda ax: _nis(ax, time_s, nis),
+        lambda ax: _draw_errors(ax, time_s, error_deg, sigma_deg),
+        lambda ax: _draw_nees(ax, time_s, nees, size),
+        lambda ax: _draw_nis(ax, time_s, nis),
     )
 
 
 def nis_figure(track: AttitudeTrack, name: str) -> Figure:
-    """Innovations of every sensor of a track."""
+    """Draw the NIS of every sensor of a track."""
     nis = np.stack(list(track.nis.values()), axis=-1)[None]
-    return _through_time(f"{name}: {track.title}", track.time_s, lambda ax: _nis(ax, track.time_s, nis))
+    return _stack_panels(f"{name}: {track.title}", track.time_s, lambda ax: _draw_nis(ax, track.time_s, nis))
 
 
-def _through_time(title: str, time_s: FloatArray, *panels: Callable[[Axes], None]) -> Figure:
-    """Panels one below the other."""
+def _stack_panels(title: str, time_s: FloatArray, *panels: Callable[[Axes], None]) -> Figure:
+    """Draw panels over time, one below the other."""
     figure = style.new_figure(1.75 * len(panels) + 0.5)
     axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
     for ax, draw in zip(axes, panels, strict=True):
@@ -170,35 +176,35 @@ def _through_time(title: str, time_s: FloatArray, *panels: Callable[[Axes], None
             ax.set_xlim(time_s[0], time_s[-1])
         if ax is not axes[-1]:
             ax.set_xlabel("")
-    style.headline(figure, title)
+    style.add_title(figure, title)
     return figure
 
 
-def _errors(ax: Axes, time_s: FloatArray, error_deg: FloatArray, sigma_deg: FloatArray) -> None:
+def _draw_errors(ax: Axes, time_s: FloatArray, error_deg: FloatArray, sigma_deg: FloatArray) -> None:
     for i, run in enumerate(error_deg):
         ax.plot(time_s, run, color=style.PALE_GREY, lw=0.4, label="each run" if i == 0 else "_", zorder=2.0)
     ax.plot(time_s, np.median(error_deg, axis=0), color=style.BLUE, lw=1.2, label="median")
     ax.plot(time_s, sigma_deg, color=style.ORANGE, lw=1.0, ls="--", label="σ of the filter, first run")
-    style.logarithmic(ax, [error_deg[:, 1:], np.empty(0)])
+    style.set_log_scale(ax, [error_deg[:, 1:], np.empty(0)])
     n = len(error_deg)
-    style.dress(ax, "time [s]", "attitude error [°]", f"{n} runs" if n > 1 else "one run")
-    style.legend(ax)
+    style.label_axes(ax, "time [s]", "attitude error [°]", f"{n} runs" if n > 1 else "one run")
+    style.add_legend(ax)
 
 
-def _nees(ax: Axes, time_s: FloatArray, nees: FloatArray, size: int) -> None:
+def _draw_nees(ax: Axes, time_s: FloatArray, nees: FloatArray, size: int) -> None:
     low, high = style.bounds99(np.full(len(time_s), float(size * len(nees))))
     mean = nees.mean(axis=0)
     ax.fill_between(time_s, low, high, color=style.LIGHT_GREY, lw=0.0, label="99 % bounds of χ²")
     ax.plot(time_s, mean, color=style.BLUE, lw=0.9, label="mean of the runs")
     ax.axhline(1.0, color=style.GREY, lw=0.5)
     inside = float(np.mean((mean >= low) & (mean <= high)))
-    style.logarithmic(ax, [mean, low, high])
-    style.dress(ax, "time [s]", "NEES / numbers [1]", f"NEES: {100.0 * inside:.0f} % of the instants within")
-    style.legend(ax)
+    style.set_log_scale(ax, [mean, low, high])
+    style.label_axes(ax, "time [s]", "NEES / numbers [1]", f"NEES: {100.0 * inside:.0f} % of the instants within")
+    style.add_legend(ax)
 
 
-def _nis(ax: Axes, time_s: FloatArray, nis: FloatArray) -> None:
-    """Means over the runs, and over so many instants that a picture can show."""
+def _draw_nis(ax: Axes, time_s: FloatArray, nis: FloatArray) -> None:
+    """Draw the NIS of every sensor as means over the runs and over up to 100 intervals of time."""
     width = max(1, len(time_s) // 100)
     n = len(time_s) // width * width
     times = time_s[:n].reshape(-1, width).mean(axis=1)
@@ -217,10 +223,10 @@ def _nis(ax: Axes, time_s: FloatArray, nis: FloatArray) -> None:
         ax.plot(times, mean, color=colour, ls=line, lw=0.9, label=SENSOR_WORDS[sensor])
         drawn.append(mean)
     ax.axhline(1.0, color=style.GREY, lw=0.5)
-    style.logarithmic(ax, drawn)
+    style.set_log_scale(ax, drawn)
     title = f"NIS, mean of {width} instants" if width > 1 else "NIS"
-    style.dress(ax, "time [s]", "NIS / numbers [1]", title)
-    style.legend(ax)
+    style.label_axes(ax, "time [s]", "NIS / numbers [1]", title)
+    style.add_legend(ax)
 
 
 _COMPARE_COLOURS = (style.BLACK, style.BLUE, style.ORANGE, "#009e73", "#cc79a7", "#56b4e9")
@@ -228,16 +234,16 @@ _COMPARE_LINES = ("-", "--", "-.", ":")
 
 
 def compare_figure(lines: Sequence[tuple[str, FloatArray, FloatArray]]) -> Figure:
-    """Attitude errors of several filters through time."""
+    """Draw the attitude errors of several filters over time."""
     figure = style.new_figure(3.4 + 0.15 * len(lines))
     ax = figure.add_subplot()
     for i, (name, time_s, error_deg) in enumerate(lines):
         colour = _COMPARE_COLOURS[i % len(_COMPARE_COLOURS)]
         dashes = _COMPARE_LINES[i // len(_COMPARE_COLOURS) % len(_COMPARE_LINES)]
         ax.plot(time_s, error_deg, color=colour, ls=dashes, lw=1.0, label=name)
-    style.logarithmic(ax, [error_deg[1:] for _, _, error_deg in lines])
+    style.set_log_scale(ax, [error_deg[1:] for _, _, error_deg in lines])
     ax.set_xlim(0.0, max(float(time_s[-1]) for _, time_s, _ in lines))
-    style.dress(ax, "time [s]", "attitude error [°]", "median of the runs")
+    style.label_axes(ax, "time [s]", "attitude error [°]", "median of the runs")
     handles, labels = ax.get_legend_handles_labels()
-    style.legend(figure, handles=handles, labels=labels, loc="outside lower center", ncols=2)
+    style.add_legend(figure, handles=handles, labels=labels, loc="outside lower center", ncols=2)
     return figure

@@ -1,4 +1,4 @@
-"""Figures of the roll/yaw satellite: its guaranteed sets, and the Kalman filter's ellipses beside them."""
+"""Figure of the roll/yaw satellite: guaranteed sets and ellipses of the Kalman filter."""
 
 from __future__ import annotations
 
@@ -17,37 +17,40 @@ _SET, _KALMAN, _TRUTH = "#0072b2", "#d55e00", "black"
 _INSTANTS = 4
 _SET_SHADES = LinearSegmentedColormap.from_list("set", ["#ffffff", _SET, "#00304d"])
 _KALMAN_SHADES = LinearSegmentedColormap.from_list("kalman", ["#ffffff", _KALMAN, "#7a3600"])
-# What makes it differ: it takes the shift of the gyro, which stays, for numbers that average out.
+# It models the constant shift of the gyro as white noise.
 _KALMAN_LABEL = "Kalman filter (white noise), 3σ"
 
 
 @dataclass(frozen=True, eq=False)
 class RollYawPicture:
-    """What a figure shows."""
+    """Data of the figure."""
 
     title: str
     time_s: FloatArray  # (n_steps + 1,)
     states_rad: FloatArray  # (n_runs, n_steps + 1, 2): true (roll, yaw)
     track: SetTrack  # sets of the same runs
     kalman: KalmanTrack  # of the first run
-    in_loop: bool  # whether the states are those of a satellite in its attitude loop
-    jump_s: float | None = None  # when the readings became worse than their bound
+    in_loop: bool  # whether the satellite is in its attitude loop
+    jump_s: float | None = None  # time from which the readings are worse than their bound
 
 
 def roll_yaw_figure(picture: RollYawPicture) -> Figure:
-    """Sets in the plane of roll and yaw, the yaw error of the first run, those of all runs, and bound or attitude."""
+    """Draw the sets in the plane of roll and yaw, and the yaw errors of the runs.
+
+    The last panel shows the attitude of a satellite in its attitude loop, or else the bound.
+    """
     figure = Figure(figsize=(13.0, 7.6), layout="constrained")
     grid = figure.add_gridspec(3, 2, width_ratios=[1.0, 1.15])
     plane, error = figure.add_subplot(grid[:, 0]), figure.add_subplot(grid[0, 1])
     runs = figure.add_subplot(grid[1, 1], sharex=error)
     last = figure.add_subplot(grid[2, 1], sharex=error)
-    _plane(plane, picture)
-    _error(error, picture)
-    _runs(runs, picture)
+    _draw_sets(plane, picture)
+    _draw_first_run(error, picture)
+    _draw_runs(runs, picture)
     if picture.in_loop:
-        _attitude(last, picture)
+        _draw_attitude(last, picture)
     else:
-        _bounds(last, picture)
+        _draw_bounds(last, picture)
     for ax in (error, runs):
         ax.tick_params(labelbottom=False)
     for ax in (error, runs, last):
@@ -60,15 +63,15 @@ def roll_yaw_figure(picture: RollYawPicture) -> Figure:
     return figure
 
 
-def outline(centre: FloatArray, shape: FloatArray, n_points: int = 181) -> FloatArray:
-    """Points around an ellipse in the plane, flat ones included, shape (n_points, 2)."""
+def ellipse_outline(centre: FloatArray, shape: FloatArray, n_points: int = 181) -> FloatArray:
+    """Return points around an ellipse, even a degenerate one, shape (n_points, 2)."""
     eigenvalue, eigenvector = np.linalg.eigh(shape)
     angle = np.linspace(0.0, 2.0 * np.pi, n_points)
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     return centre + circle @ (eigenvector * np.sqrt(np.maximum(eigenvalue, 0.0))).T
 
 
-def _plane(ax: Axes, picture: RollYawPicture) -> None:
+def _draw_sets(ax: Axes, picture: RollYawPicture) -> None:
     n_steps = len(picture.time_s) - 1
     instants = [n_steps * i // _INSTANTS for i in range(_INSTANTS + 1)]
     shades = np.linspace(0.3, 1.0, len(instants))
@@ -76,8 +79,8 @@ def _plane(ax: Axes, picture: RollYawPicture) -> None:
     drawn = []
     for shade, i in zip(shades, instants, strict=True):
         truth = picture.states_rad[0, i]
-        guaranteed = np.degrees(outline(picture.track.centres[0, i] - truth, picture.track.shapes[0, i]))
-        kalman = np.degrees(outline(picture.kalman.means[i] - truth, 9.0 * picture.kalman.covariances[i]))
+        guaranteed = np.degrees(ellipse_outline(picture.track.centres[0, i] - truth, picture.track.shapes[0, i]))
+        kalman = np.degrees(ellipse_outline(picture.kalman.means[i] - truth, 9.0 * picture.kalman.covariances[i]))
         ax.fill(*guaranteed.T, color=_SET, alpha=0.06)
         blue, orange = _SET_SHADES(shade), _KALMAN_SHADES(shade)
         label = f"{picture.time_s[i]:.0f} s"
@@ -87,7 +90,7 @@ def _plane(ax: Axes, picture: RollYawPicture) -> None:
     ax.plot(0.0, 0.0, "+", color=_TRUTH, ms=12, mew=1.5, zorder=5)
     ax.axhline(0.0, color="grey", lw=0.5)
     ax.axvline(0.0, color="grey", lw=0.5)
-    # The first set stays within the frame where the later ones can be seen beside it.
+    # The first set is within the limits only if the later ones stay visible beside it.
     later, first = np.concatenate(drawn[1:]), drawn[0]
     low, high = later.min(axis=0), later.max(axis=0)
     if (np.ptp(first, axis=0) < 8.0 * (high - low)).all():
@@ -103,7 +106,7 @@ def _plane(ax: Axes, picture: RollYawPicture) -> None:
     ax.set(xlabel="roll minus true roll [°]", ylabel="yaw minus true yaw [°]", title="first run, darker is later")
 
 
-def _error(ax: Axes, picture: RollYawPicture) -> None:
+def _draw_first_run(ax: Axes, picture: RollYawPicture) -> None:
     truth = picture.states_rad[0, :, YAW]
     centre = np.degrees(picture.track.centres[0, :, YAW] - truth)
     half_width = np.degrees(picture.track.yaw_half_widths[0])
@@ -122,7 +125,7 @@ def _error(ax: Axes, picture: RollYawPicture) -> None:
     ax.legend(loc="upper right", frameon=False, fontsize=8, ncols=2)
 
 
-def _runs(ax: Axes, picture: RollYawPicture) -> None:
+def _draw_runs(ax: Axes, picture: RollYawPicture) -> None:
     error = np.degrees(np.abs(picture.track.centres - picture.states_rad)[..., YAW])
     n_runs = len(error)
     ax.plot(picture.time_s, np.degrees(picture.track.yaw_half_widths.mean(axis=0)), color=_SET, lw=1.6)
@@ -136,7 +139,7 @@ def _runs(ax: Axes, picture: RollYawPicture) -> None:
     ax.title.set_fontsize(10)
 
 
-def _bounds(ax: Axes, picture: RollYawPicture) -> None:
+def _draw_bounds(ax: Axes, picture: RollYawPicture) -> None:
     roll = np.degrees(np.sqrt(picture.track.shapes[..., ROLL, ROLL]))
     bounds = np.degrees(picture.track.bounds)
     ax.plot(picture.time_s, bounds.mean(axis=0), color=_TRUTH, lw=1.2, label="bound c in force, mean")
@@ -146,12 +149,12 @@ def _bounds(ax: Axes, picture: RollYawPicture) -> None:
     ax.plot(picture.time_s, roll.mean(axis=0), color=_SET, lw=1.2, label="guaranteed half-width of roll, mean")
     ax.legend(loc="upper right", frameon=False, fontsize=8, ncols=3)
     ax.set(ylabel="roll [°]")
-    # The first set is wide for seconds only.
+    # The first sets are much wider.
     settled = roll[:, roll.shape[1] // 4 :]
     ax.set_ylim(0.0, 1.4 * max(float(bounds.max()), float(settled.max())))
 
 
-def _attitude(ax: Axes, picture: RollYawPicture) -> None:
+def _draw_attitude(ax: Axes, picture: RollYawPicture) -> None:
     roll, yaw = np.degrees(picture.states_rad[0]).T
     ax.plot(picture.time_s, yaw, color="#009e73", lw=1.2, label="yaw")
     ax.plot(picture.time_s, roll, color="#cc79a7", lw=1.0, label="roll")

@@ -1,4 +1,4 @@
-"""Figure of an inertial unit's attitude: its angles, what is believed of them, and where the field was disturbed."""
+"""Figure of the attitude of an inertial unit: angles, standard deviations, and times of a disturbed field."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ _MOST_POINTS = 4000
 
 
 def inertial_figure(track: AttitudeTrack, name: str, q_true: FloatArray | None = None) -> Figure:
-    """Yaw, pitch and roll; below σ of heading and tilt, with the errors where a truth (n, 4) is known."""
+    """Draw yaw, pitch and roll, and σ of heading and tilt, with errors by a truth (n, 4)."""
     every = slice(None, None, max(1, len(track) // _MOST_POINTS))
     time_s = track.time_s[every]
     figure = style.new_figure(5.2)
     above, heading, tilt = figure.subplots(3, 1, sharex=True, height_ratios=[3, 2, 2])
     angles = quaternion.to_rotation(track.q[every]).as_euler("ZYX", degrees=True)
     for values, word, (_, colour, _, line) in zip(angles.T, ("yaw", "pitch", "roll"), style.COMPONENTS, strict=True):
-        turned = np.abs(np.diff(values, prepend=values[0])) > 180.0
-        above.plot(time_s, np.where(turned, np.nan, values), color=colour, ls=line, lw=0.9, label=word)
-    style.dress(above, "", "angle [°]", "east, north, up from body: yaw, pitch, roll")
+        is_wrap = np.abs(np.diff(values, prepend=values[0])) > 180.0
+        above.plot(time_s, np.where(is_wrap, np.nan, values), color=colour, ls=line, lw=0.9, label=word)
+    style.label_axes(above, "", "angle [°]", "east, north, up from body: yaw, pitch, roll")
     sigma = np.degrees(track.sigma["level"][every])
     errors = None if q_true is None else [np.degrees(e) for e in error_angles(track.q[every], q_true[every])[1:]]
     for i, (ax, word, values) in enumerate(
@@ -36,8 +36,8 @@ def inertial_figure(track: AttitudeTrack, name: str, q_true: FloatArray | None =
             ax.plot(time_s, np.abs(shown), color=style.BLUE, lw=0.7, label="error")
         ax.plot(time_s, values, color=style.ORANGE, lw=1.1, ls="--", label="σ")
         ax.set_ylim(bottom=0.0)
-        style.dress(ax, "", f"{word} [°]")
-        style.legend(ax)
+        style.label_axes(ax, "", f"{word} [°]")
+        style.add_legend(ax)
     for ax in (above, heading):
         style.shade_gaps(ax, time_s, ~track.degraded[LEFT_OUT][every], LEFT_OUT)
         whole_height = {"transform": ax.get_xaxis_transform(), "color": style.PALE_GREY, "alpha": 0.35, "lw": 0.0}
@@ -45,8 +45,8 @@ def inertial_figure(track: AttitudeTrack, name: str, q_true: FloatArray | None =
         ax.fill_between(
             time_s, 0.0, 1.0, where=subtracted, label=SUBTRACTED if subtracted.any() else "_", **whole_height
         )
-    style.legend(above, ncols=5)
-    tilt.set_xlabel("time [s]", fontsize=style.LETTERS)
+    style.add_legend(above, ncols=5)
+    tilt.set_xlabel("time [s]", fontsize=style.FONT_SIZE)
     tilt.set_xlim(time_s[0], time_s[-1])
-    style.headline(figure, f"{name}: {track.title}")
+    style.add_title(figure, f"{name}: {track.title}")
     return figure

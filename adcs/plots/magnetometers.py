@@ -1,4 +1,4 @@
-"""Figures of magnetometers on board: the fields of the satellite's loads there, and their calibration in orbit."""
+"""Figures of magnetometers on board: fields of the satellite's loads, and the calibration in orbit."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _PANEL_IN, _MARGIN_IN = 1.3, 0.7
 
 
 def own_fields_figure(own: OwnFields) -> Figure:
-    """What every load adds to every magnetometer, with ±3σ; a panel for each load."""
+    """Draw the field of every load at every magnetometer with ±3σ, a panel for each load."""
     figure = style.new_figure(_PANEL_IN * len(own.names) + _MARGIN_IN)
     places = np.arange(own.array.n_sensors)
     axes = figure.subplots(len(own.names), 1, sharex=True, squeeze=False)[:, 0]
@@ -24,15 +24,18 @@ def own_fields_figure(own: OwnFields) -> Figure:
             bars = {"fmt": marker, "color": colour, "ms": 4.0, "lw": 0.9, "capsize": 2.0, "label": component}
             ax.errorbar(places + 0.2 * (i - 1), vectors[:, i], 3.0 * sigma[:, i], **bars)
         ax.axhline(0.0, color=style.GREY, lw=0.5)
-        style.dress(ax, "", "field [nT]", f"{name}: {switches} switches")
-    style.legend(axes[0])
-    style.name_sensors(axes[-1], own.array.ids)
-    style.headline(figure, "What loads add to the magnetometers, body axes, ±3σ")
+        style.label_axes(ax, "", "field [nT]", f"{name}: {switches} switches")
+    style.add_legend(axes[0])
+    style.label_sensors(axes[-1], own.array.ids)
+    style.add_title(figure, "What loads add to the magnetometers, body axes, ±3σ")
     return figure
 
 
 def magnetometer_figure(result: MagnetometerCalibration) -> Figure:
-    """What is left of every row, and every number in deviations of its prior: a bar as long as that tells nothing."""
+    """Draw the residuals of the rows, and the parameters in standard deviations of their prior.
+
+    A parameter with an error bar as long as the prior's is not observable.
+    """
     figure = style.new_figure(4.6)
     left, numbers = figure.subplots(2, 1)
     residual_nT = _T_IN_nT * result.residual_T.reshape(len(result.residual_T), -1)
@@ -42,17 +45,17 @@ def magnetometer_figure(result: MagnetometerCalibration) -> Figure:
     ):
         left.plot(values, ".", ms=2.0, color=colour, label=name)
     rms = f"rms {_T_IN_nT * result.rms_T:.0f} nT, {_T_IN_nT * result.raw_rms_T:.0f} nT without calibration"
-    style.dress(left, "row", "field less the model [nT]", rms)
-    style.legend(left, markerscale=3.0)
+    style.label_axes(left, "row", "field less the model [nT]", rms)
+    style.add_legend(left, markerscale=3.0)
     prior = result.prior.deviations
     known = prior > 0.0
     change = np.concatenate([result.bias_T, result.gain.ravel(), [result.time_shift_s]])[known] / prior[known]
     numbers.axhspan(-1.0, 1.0, color=style.LIGHT_GREY, lw=0.0, label="±σ of the prior")
     bars = {"fmt": "o", "color": style.BLUE, "ms": 4.0, "lw": 0.9, "capsize": 2.0, "label": "found, ±σ"}
     numbers.errorbar(np.arange(known.sum()), change, result.sigma[known] / prior[known], **bars)
-    style.dress(numbers, "", "change / σ of the prior [1]")
+    style.label_axes(numbers, "", "change / σ of the prior [1]")
     names = [name.replace("_", " ") for name, shown in zip(NAMES, known, strict=True) if shown]
     numbers.set_xticks(np.arange(len(names)), names, rotation=90.0)
-    style.legend(numbers)
-    style.headline(figure, "Calibration of a magnetometer")
+    style.add_legend(numbers)
+    style.add_title(figure, "Calibration of a magnetometer")
     return figure

@@ -1,6 +1,6 @@
-"""Figures of the sky of LEDs: a frame and what was identified in it, how good many are, and a drive.
+"""Figures of the camera under the sky of LEDs: one frame, statistics of many frames, and a drive.
 
-:func:`drive_figure` has what figures 8 to 10 of the source show.
+:func:`drive_figure` corresponds to figures 8 to 10 of the source.
 """
 
 from __future__ import annotations
@@ -32,14 +32,17 @@ _BRIGHT_DN = 120
 def frame_figure(
     title: str, image: ByteArray, stars_px: FloatArray, fix: CameraFix | NoFix, lights_m: FloatArray, camera: Camera
 ) -> Figure:
-    """The frame with its stars (f, 2), and the ceiling with what a believed camera shows of its lights (n, 2)."""
+    """Draw a frame with its stars (f, 2), and the ceiling with lights (n, 2) and footprint."""
     figure = style.new_figure(3.4)
     frame, ceiling = figure.subplots(1, 2)
     stars = fix.stars if isinstance(fix, CameraFix) else np.empty((0, 2), dtype=np.intp)
-    named = np.isin(np.arange(len(stars_px)), stars[:, 0])
-    # Lights of the real camera are faint too: half of the range shows them.
+    identified = np.isin(np.arange(len(stars_px)), stars[:, 0])
+    # Half of the range shows the faint lights too.
     frame.imshow(image, cmap="gray", vmin=0, vmax=_BRIGHT_DN)
-    for rows, colour, mark, name in ((named, _FOUND, "o", "identified"), (~named, _NONE, "s", "not identified")):
+    for rows, colour, mark, name in (
+        (identified, _FOUND, "o", "identified"),
+        (~identified, _NONE, "s", "not identified"),
+    ):
         if rows.any():
             frame.plot(*stars_px[rows].T, mark, color=colour, mfc="none", ms=9.0, mew=1.0, label=name)
     for star, light in stars:
@@ -51,27 +54,27 @@ def frame_figure(
         )  # fmt: skip
     frame.set_xlim(-0.5, image.shape[1] - 0.5)
     frame.set_ylim(image.shape[0] - 0.5, -0.5)
-    style.dress(frame, "column [px]", "row [px]", "frame, with numbers of the lights")
+    style.label_axes(frame, "column [px]", "row [px]", "frame, with numbers of the lights")
     frame.grid(visible=False)
     ceiling.plot(*lights_m.T, ".", color=style.PALE_GREY, ms=3.0)
     if isinstance(fix, CameraFix):
         ceiling.plot(*lights_m[stars[:, 1]].T, "o", color=_FOUND, ms=4.0)
         draw_footprint(ceiling, camera, fix)
         x, y = 1e3 * fix.position_m
-        words = f"ceiling: X {x:.1f} mm, Y {y:.1f} mm,\nheading {np.degrees(fix.heading_rad):.2f}°"
+        text = f"ceiling: X {x:.1f} mm, Y {y:.1f} mm,\nheading {np.degrees(fix.heading_rad):.2f}°"
     else:
-        words = f"ceiling; no fix: {fix.reason}"
+        text = f"ceiling; no fix: {fix.reason}"
     ceiling.set_aspect("equal")
-    style.dress(ceiling, "X [m]", "Y [m]", words)
+    style.label_axes(ceiling, "X [m]", "Y [m]", text)
     handles, labels = frame.get_legend_handles_labels()
     if handles:
-        style.legend(figure, handles=handles, labels=labels, loc="outside lower center", ncols=2)
-    style.headline(figure, title)
+        style.add_legend(figure, handles=handles, labels=labels, loc="outside lower center", ncols=2)
+    style.add_title(figure, title)
     return figure
 
 
 def draw_footprint(ax: Axes, camera: Camera, fix: CameraFix) -> None:
-    """Outline of the seen part of the ceiling, and the camera's place and heading."""
+    """Draw the camera's footprint on the ceiling, its position and its heading."""
     x, y = fix.position_m.tolist()
     pose = Pose(x, y, fix.heading_rad)
     outline = footprint(camera, pose, _PER_SIDE)
@@ -84,32 +87,32 @@ def draw_footprint(ax: Axes, camera: Camera, fix: CameraFix) -> None:
 
 @dataclass(frozen=True, eq=False)
 class SkyPicture:
-    """Many frames.
+    """Outcomes of many frames.
 
-    ``good``, ``false`` (p,): fixes near the truth, and others.
+    ``good``, ``false`` (p,): whether a frame gave a fix near the truth, or another fix.
     """
 
     title: str
     lights_m: FloatArray  # (n, 2)
-    places_m: FloatArray  # (p, 2): true places of the camera
+    places_m: FloatArray  # (p, 2): true positions of the camera
     errors_mm: FloatArray  # (p,): NaN without a fix
     good: BoolArray
     false: BoolArray
-    n_stars: IntArray  # (p,): found in the frame
+    n_stars: IntArray  # (p,): stars found in the frame
 
 
 def sky_figure(picture: SkyPicture) -> Figure:
-    """Where there are fixes, how good they are, and how both depend on the number of stars."""
+    """Draw the places of the fixes, their errors, and their outcomes by the number of stars."""
     figure = style.new_figure(3.7)
     panels = figure.subplot_mosaic([["map", "errors"], ["map", "stars"]], width_ratios=[1.35, 1.0])
-    _outcomes(panels["map"], picture)
-    _sorted_errors(panels["errors"], picture)
-    _by_stars(panels["stars"], picture)
-    style.headline(figure, picture.title)
+    _draw_outcomes(panels["map"], picture)
+    _draw_error_distribution(panels["errors"], picture)
+    _draw_star_counts(panels["stars"], picture)
+    style.add_title(figure, picture.title)
     return figure
 
 
-def _outcomes(ax: Axes, picture: SkyPicture) -> None:
+def _draw_outcomes(ax: Axes, picture: SkyPicture) -> None:
     ax.plot(*picture.lights_m.T, ".", color=style.PALE_GREY, ms=2.5, label="lights")
     groups = (
         ("good fix", picture.good, _FOUND, "o", 3.5),
@@ -120,11 +123,11 @@ def _outcomes(ax: Axes, picture: SkyPicture) -> None:
         if rows.any():
             ax.plot(*picture.places_m[rows].T, mark, color=colour, ms=size, mew=0.3, label=f"{name}: {rows.sum()}")
     ax.set_aspect("equal")
-    style.dress(ax, "X [m]", "Y [m]", "places of the camera")
-    style.legend(ax, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=4, columnspacing=1.0, handletextpad=0.3)
+    style.label_axes(ax, "X [m]", "Y [m]", "places of the camera")
+    style.add_legend(ax, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=4, columnspacing=1.0, handletextpad=0.3)
 
 
-def _sorted_errors(ax: Axes, picture: SkyPicture) -> None:
+def _draw_error_distribution(ax: Axes, picture: SkyPicture) -> None:
     errors = np.sort(picture.errors_mm[picture.good])
     n = len(picture.good)
     if errors.size:
@@ -137,11 +140,11 @@ def _sorted_errors(ax: Axes, picture: SkyPicture) -> None:
         rms = float(np.sqrt(np.mean(errors**2)))
         ax.axvline(rms, color=style.BLACK, lw=0.7, ls="--", label=f"rms {rms:.2g} mm")
     ax.set_ylim(0.0, 104.0)
-    style.dress(ax, "error of position [mm]", "frames below [%]", "good fixes")
-    style.legend(ax)
+    style.label_axes(ax, "error of position [mm]", "frames below [%]", "good fixes")
+    style.add_legend(ax)
 
 
-def _by_stars(ax: Axes, picture: SkyPicture) -> None:
+def _draw_star_counts(ax: Axes, picture: SkyPicture) -> None:
     counts = np.arange(picture.n_stars.min(), picture.n_stars.max() + 1)
     below = np.zeros(len(counts))
     groups = (
@@ -156,8 +159,8 @@ def _by_stars(ax: Axes, picture: SkyPicture) -> None:
         below += numbers
     ax.yaxis.set_major_locator(MaxNLocator(5, integer=True))
     ax.xaxis.set_major_locator(MaxNLocator(8, integer=True))
-    style.dress(ax, "stars found in the frame", "frames", "fixes by stars")
-    style.legend(ax)
+    style.label_axes(ax, "stars found in the frame", "frames", "fixes by stars")
+    style.add_legend(ax)
 
 
 def drive_figure(
@@ -169,34 +172,38 @@ def drive_figure(
     rest_m: FloatArray,
     rest_truth_m: FloatArray,
 ) -> Figure:
-    """A drive along the perimeter as the camera sees it, and X and Y at rest.
+    """Draw the fixes of a drive along the perimeter, and X and Y at rest.
 
-    ``truth_m``, ``fixes_m`` (p, 2): of the frames of the drive, NaN without a fix. ``rest_s`` (r,), ``rest_m`` (r, 2),
-    ``rest_truth_m`` (2,): of the frames at rest.
+    ``truth_m``, ``fixes_m`` (p, 2): true and fixed positions of the frames of the drive, NaN without a fix. ``rest_s``
+    (r,), ``rest_m`` (r, 2), ``rest_truth_m`` (2,): times, fixes and true position at rest.
     """
     figure = style.new_figure(3.7)
     panels = figure.subplot_mosaic([["path", "X"], ["path", "Y"]], width_ratios=[1.35, 1.0])
     path = panels["path"]
-    seen = np.isfinite(fixes_m).all(axis=1)
+    has_fix = np.isfinite(fixes_m).all(axis=1)
     path.plot(*lights_m.T, ".", color=style.LIGHT_GREY, ms=2.5, label="lights", zorder=1.5)
     style.draw_truth(path, *truth_m.T)
-    path.plot(*fixes_m[seen].T, ".", color=style.BLUE, ms=4.0, label="fixes")
-    if not seen.all():
-        path.plot(*truth_m[~seen].T, "s", color=_NONE, ms=4.5, mfc="none", label=f"no fix: {int((~seen).sum())}")
+    path.plot(*fixes_m[has_fix].T, ".", color=style.BLUE, ms=4.0, label="fixes")
+    if not has_fix.all():
+        path.plot(*truth_m[~has_fix].T, "s", color=_NONE, ms=4.5, mfc="none", label=f"no fix: {int((~has_fix).sum())}")
     path.set_aspect("equal")
     path.locator_params(axis="x", nbins=5)
-    error_mm = 1e3 * np.linalg.norm((fixes_m - truth_m)[seen], axis=1)
-    text = f": {np.sqrt(np.mean(error_mm**2)):.2g} mm rms" if error_mm.size else ""
-    style.dress(path, "X [m]", "Y [m]", f"perimeter drive{text}")
-    style.legend(path, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=4, columnspacing=1.0, handletextpad=0.5)
+    distance_mm = 1e3 * np.linalg.norm((fixes_m - truth_m)[has_fix], axis=1)
+    text = f": {np.sqrt(np.mean(distance_mm**2)):.2g} mm rms" if distance_mm.size else ""
+    style.label_axes(path, "X [m]", "Y [m]", f"perimeter drive{text}")
+    style.add_legend(
+        path, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=4, columnspacing=1.0, handletextpad=0.5
+    )
     for column, name in enumerate("XY"):
         ax = panels[name]
-        apart_mm = 1e3 * (rest_m[:, column] - rest_truth_m[column])
-        known = np.isfinite(apart_mm)
-        ax.plot(rest_s[known], apart_mm[known], ".-", color=style.BLUE, lw=0.6, ms=3.0)
+        error_mm = 1e3 * (rest_m[:, column] - rest_truth_m[column])
+        known = np.isfinite(error_mm)
+        ax.plot(rest_s[known], error_mm[known], ".-", color=style.BLUE, lw=0.6, ms=3.0)
         ax.axhline(0.0, color=style.TRUTH, lw=0.7, ls="--")
-        spread = f": σ {np.std(apart_mm[known]):.2g} mm" if known.any() else ""
+        spread = f": σ {np.std(error_mm[known]):.2g} mm" if known.any() else ""
         middle = f"{rest_truth_m[column]:.4f} m"
-        style.dress(ax, "time [s]" if name == "Y" else "", f"{name} less\n{middle} [mm]", f"{name} at rest{spread}")
-    style.headline(figure, title)
+        style.label_axes(
+            ax, "time [s]" if name == "Y" else "", f"{name} less\n{middle} [mm]", f"{name} at rest{spread}"
+        )
+    style.add_title(figure, title)
     return figure

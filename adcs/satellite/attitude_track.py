@@ -30,11 +30,11 @@ class AttitudeTrack(Result):
     title : str
         Sensors, states and filter in words.
     time_s : ndarray, shape (n,)
-        Times of all instants, missing rows included, from the first reading of the attitude on.
+        Times of all instants from the first reading of the attitude on, missing rows included.
     rows : ndarray of int
         Indices of the instants of the log.
     q : ndarray, shape (n, 4)
-        Reference frame from body, scalar first; :attr:`rotation` is scipy's.
+        Attitude, reference frame from body, scalar first; :attr:`rotation` is scipy's form.
     states : mapping of str to ndarray, shape (n, 3)
         ``rate`` against inertial space [rad/s] and the estimated states among ``gyro-bias`` [rad/s], ``field-bias``
         [T], ``disturbance`` [1/s²] and ``dipole`` [A·m²], body axes; ``field-model`` [T], orbital frame; and
@@ -44,20 +44,20 @@ class AttitudeTrack(Result):
     seen : mapping of str to ndarray of bool, shape (n,)
         Rows with a reading of each sensor.
     sigma : mapping of str to ndarray, shape (n, 3)
-        Standard deviations of the states and of ``attitude`` [rad]; empty for a filter without a covariance.
+        Standard deviations of the states, in their units, and of ``attitude`` [rad]; empty without a covariance.
     nis : mapping of str to ndarray, shape (n,)
         Normalised innovation squared of each sensor, NaN without a reading: χ² with 3 degrees of freedom, 2 for the Sun
         sensor.
     q_orbital : ndarray, shape (n, 4), optional
-        Orbital frame from body.
+        Attitude, orbital frame from body, scalar first.
     warnings : tuple of str
-        Sentences on what is degraded or cannot be observed, and for how long.
+        Sentences on degraded or unobservable states, with durations.
     gated : mapping of str to ndarray of bool, shape (n,)
         Readings of each sensor that the gate rejected; empty for a filter without a gate.
     degraded : mapping of str to ndarray of bool, shape (n,)
         Rows in which readings are of little use, by the reason in words.
     unseen_torque_Nm : mapping of float to float
-        Largest unobservable amplitude of a torque by its period [s]; empty if not known.
+        Largest unobservable amplitude of a torque by its period [s]; empty if unknown.
     tuned_disturbance_s2 : ndarray, shape (n,), optional
         Standard deviation of the disturbing acceleration, as estimated by the filter ``self-tuning``.
 
@@ -70,7 +70,7 @@ class AttitudeTrack(Result):
     ((201, 4), ['attitude', 'rate'])
     """
 
-    figure = "adcs.plots.attitude:track_figure"
+    figure = "adcs.plots.attitude:attitude_figure"
     command = "estimate"
 
     title: str
@@ -117,11 +117,28 @@ class AttitudeTrack(Result):
         return "reference" if self.q_orbital is None else "orbital"
 
     def lines(self, most: int | None = None) -> list[str]:
-        """Return the lines that ``adcs estimate`` prints, then the warnings."""
+        """Return the lines that ``adcs estimate`` prints, then the warnings.
+
+        Parameters
+        ----------
+        most : int, optional
+            Not used: an attitude track has few lines.
+
+        Returns
+        -------
+        list of str
+            Summary of the track, one line each, then the warnings.
+        """
         return [*by_name("adcs.io.estimates:summary_lines")(self), *(f"warning: {text}" for text in self.warnings)]
 
     def columns(self) -> dict[str, Column]:
-        """Return the columns of estimates.csv."""
+        """Return the columns of estimates.csv.
+
+        Returns
+        -------
+        dict of str to column
+            Values of the log's rows by the column's name.
+        """
         return by_name("adcs.io.estimates:estimate_columns")(self)
 
 

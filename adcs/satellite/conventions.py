@@ -1,8 +1,8 @@
 """Detection of wrong units and conventions in the log of a satellite.
 
-A misread sensor contradicts the others, or the model of field and Sun: the field's length (units), the angle between
-field and Sun, both against the star tracker's attitude, and the gyro's rotations against those of an attitude. All
-likely misreadings are then tried, and those that remove all contradictions are named.
+A misread sensor contradicts the others, or the model of field and Sun. The checks are: the length of the field, the
+angle between field and Sun, field and Sun in the star tracker's attitude, and the gyro's rotations against those of an
+attitude. All likely misreadings are then tried, and those that remove all contradictions are named.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from arrays.typing import FloatArray
 
 _MOST_ROWS = 3000
 _SUSPICIOUS, _MENDED = 0.25, 4.0
-_LEAST_SINE = 0.3  # of the angle between field and Sun, for an attitude of both
+_LEAST_SINE = 0.3  # least sine of the angle between field and Sun for an attitude from both
 _FACTOR = 1.4
 _ANGLE_RAD = math.radians(20.0)
 _TURN_RAD = math.radians(45.0)
@@ -39,7 +39,7 @@ FIELD_UNITS = {
     "G taken for nT": 1e5,
 }
 RATE_UNITS = {"rad/s taken for °/s": 180.0 / math.pi, "°/s taken for rad/s": math.pi / 180.0}
-# Components (w, x, y, z) as read, of columns that are (x, y, z, w), and the other way round.
+# Components (w, x, y, z) as read for columns in the order (x, y, z, w), and vice versa.
 _ORDERS = {"scalar last taken for scalar first": [3, 0, 1, 2], "scalar first taken for scalar last": [1, 2, 3, 0]}
 
 
@@ -59,8 +59,8 @@ class _Log:
 def check_conventions(telemetry: Telemetry, record: Record, used: Collection[str]) -> None:
     """Raise ValueError if one misread sensor explains why a log contradicts itself or the orbit.
 
-    ``record``: of the log. ``used``: names of :data:`SENSORS`. The field is not compared if the elements of the orbit
-    are too old to compute it.
+    ``record``: record of the log. ``used``: names of :data:`SENSORS`. The field is not compared if the elements of the
+    orbit are too old for it.
     """
     around, orbit = record.environment, record.satellite.orbit
     old = isinstance(orbit, Sgp4Orbit) and 3.0 * orbit.relative_error(around.utc) > _SUSPICIOUS * math.log(_FACTOR)
@@ -89,15 +89,15 @@ def check_conventions(telemetry: Telemetry, record: Record, used: Collection[str
         }
     if named := remedies(as_read, changed, int(np.argmax(as_read))):
         raise ValueError(
-            "Input telemetry must agree with itself and with the orbit; instead received what agrees if this is "
-            f"undone: {', or '.join(named)}."
+            "Input telemetry must agree with itself and with the orbit; instead received readings that agree if this "
+            f"is undone: {', or '.join(named)}."
         )
 
 
 def remedies(as_read: FloatArray, changed: Mapping[str, FloatArray], worst: int) -> list[str]:
-    """Return the names of changes that remove disagreement ``worst`` and make no other one worse.
+    """Return the names of changes that remove the disagreement ``worst`` and make no other one worse.
 
-    ``as_read`` (k,): disagreements over their allowed values; ``changed``: those after each change by name.
+    ``as_read`` (k,): disagreements over their allowed values. ``changed``: the same after each change, by its name.
     """
     mended = {
         name: found.sum()
@@ -145,7 +145,7 @@ def reflected_axes() -> Iterator[tuple[str, FloatArray]]:
 
 
 def _disagreements(log: _Log) -> FloatArray:
-    """Return contradictions (6,) over their allowed values; 0 where the log has not the readings."""
+    """Return contradictions (6,) over their allowed values; 0 without the readings."""
     vectors = attitude_of_vectors([log.sun, log.field], [log.model_sun, log.model_field], [1.0, 1.0], method="triad").q
     vectors[np.sin(angle(log.sun, log.field)) < _LEAST_SINE] = np.nan
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):

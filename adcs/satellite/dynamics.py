@@ -1,7 +1,7 @@
 """Rotation of a rigid satellite with reaction wheels, its wheel control, and the Jacobians of its error.
 
 See docs/theory/satellite-dynamics-and-sensors.md. Source: Ivanov, Ivlev, Karpenko, Ovchinnikov, Keldysh Institute
-preprint 64, 2014. The orbital rate in the kinematics, missing there, is ours.
+preprint 64, 2014. Ours: the orbital rate in the kinematics, which is missing there.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from adcs import quaternion
 from adcs.frames import turned
 from adcs.quaternion import rotate_back
+from arrays.io.errors import check_positive
 from arrays.typing import FloatArray
 from magloc.navigation.rotations import cross_matrix
 
@@ -38,8 +39,8 @@ class RigidBody:
     Raises
     ------
     ValueError
-        The inertia is not symmetric and positive definite, or one of its principal moments is larger than the other two
-        together, which no body has.
+        The inertia is not symmetric and positive definite, or one principal moment is larger than the sum of the other
+        two, which no body has.
     """
 
     inertia_kgm2: FloatArray
@@ -86,7 +87,7 @@ class WheelControl:
     rate_gain_Nms : ndarray, shape (3,)
         K_ω.
     torque_limit_Nm, momentum_limit_Nms : float
-        Of every wheel.
+        Limits of each wheel.
 
     Raises
     ------
@@ -105,9 +106,7 @@ class WheelControl:
             if gain.shape != (3,) or not np.isfinite(gain).all() or (gain < 0.0).any():
                 raise ValueError(f"Input {name} must be 3 finite numbers from 0 up; instead received {gain.tolist()}.")
             object.__setattr__(self, name, gain)
-        for name in ("torque_limit_Nm", "momentum_limit_Nms"):
-            if not getattr(self, name) > 0.0:
-                raise ValueError(f"Input {name} must be positive; instead received {getattr(self, name)}.")
+        check_positive(torque_limit_Nm=self.torque_limit_Nm, momentum_limit_Nms=self.momentum_limit_Nms)
 
 
 def wheel_control(body: RigidBody, natural_rad_s: float = 0.03, damping: float = 0.8) -> WheelControl:
@@ -139,7 +138,7 @@ def environment_torque(
     """Return the torques of gravity gradient, 3(μ/r³) η×Jη, and magnetic dipole, m×B, body axes [N·m].
 
     ``q`` (..., 4): attitude, orbital from body. ``gravity_s2`` (...): μ/r³. ``b_orbital_T`` (..., 3): field in the
-    orbital frame. ``dipole_Am2`` (..., 3): besides the residual dipole of the body. Returns (..., 3).
+    orbital frame. ``dipole_Am2`` (..., 3): dipole in addition to the residual one of the body. Returns (..., 3).
     """
     eta = rotate_back(q, _E3)
     gradient = 3.0 * np.asarray(gravity_s2)[..., None] * np.cross(eta, eta @ body.inertia_kgm2)
@@ -149,10 +148,10 @@ def environment_torque(
 def angular_acceleration(
     body: RigidBody, w: ArrayLike, momentum_Nms: ArrayLike, wheel_torque_Nm: ArrayLike, torque_Nm: ArrayLike
 ) -> FloatArray:
-    r"""Acceleration :math:`\dot\omega = J^{-1}(M - \dot k - \omega\times(J\omega + k))`, body axes [rad/s²].
+    r"""Return :math:`\dot\omega = J^{-1}(M - \dot k - \omega\times(J\omega + k))`, body axes [rad/s²].
 
-    ``w`` (..., 3): ω [rad/s]. ``momentum_Nms``, ``wheel_torque_Nm`` (..., 3): k and its rate of change.
-    ``torque_Nm`` (..., 3): M, all torques from outside. Returns (..., 3).
+    ``w`` (..., 3): ω [rad/s]. ``momentum_Nms``, ``wheel_torque_Nm`` (..., 3): k and its rate of change. ``torque_Nm``
+    (..., 3): M, all external torques. Returns (..., 3).
     """
     w = np.asarray(w, dtype=np.float64)
     gyroscopic = np.cross(w, w @ body.inertia_kgm2 + np.asarray(momentum_Nms, dtype=np.float64))
@@ -175,12 +174,12 @@ def step(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the state after one step of the classical Runge-Kutta method of order four.
 
-    Torque, wheel torque and surroundings are held over the step, the momentum of the wheels is linear in time; the
-    attitude is normalised after it.
-    Shape ``orbital_rate_rad_s``, ``gravity_s2`` (...). ``q`` (..., 4), ``w`` (..., 3), ``momentum_Nms`` (..., 3):
-    attitude (orbital from body), rate against inertial space [rad/s], momentum of the wheels, body axes.
-    ``wheel_torque_Nm``, ``torque_Nm`` (..., 3): rate of change of that momentum, and the torque of the disturbances,
-    body axes. ``b_orbital_T`` (..., 3): field that dipoles feel. ``dipole_Am2`` (..., 3): besides the residual dipole.
+    Torque, wheel torque and environment are constant over the step, the momentum of the wheels is linear in time. The
+    attitude is normalised after the step.
+    ``q`` (..., 4), ``w``, ``momentum_Nms`` (..., 3): attitude (orbital from body), rate against inertial space [rad/s],
+    momentum of the wheels, body axes. ``wheel_torque_Nm``, ``torque_Nm`` (..., 3): rate of change of that momentum, and
+    torque of the disturbances, body axes. ``orbital_rate_rad_s``, ``gravity_s2`` (...). ``b_orbital_T`` (..., 3): field
+    that acts on dipoles. ``dipole_Am2`` (..., 3): dipole in addition to the residual one.
     """
     q, w, k = (np.asarray(one, dtype=np.float64) for one in (q, w, momentum_Nms))
     k_dot, disturbance = (np.asarray(one, dtype=np.float64) for one in (wheel_torque_Nm, torque_Nm))
@@ -213,7 +212,7 @@ def error_jacobian(
     b_orbital_T: ArrayLike,
     dipole_Am2: ArrayLike = ZERO,
 ) -> FloatArray:
-    r"""F of the error (δq, δω) for a known wheel torque: d/dt (δq, δω) = F (δq, δω), shape (..., 6, 6).
+    r"""Return F of the error for a known wheel torque: d/dt (δq, δω) = F (δq, δω), shape (..., 6, 6).
 
     .. math::
 
@@ -221,11 +220,11 @@ def error_jacobian(
         F_{21} = J^{-1}\left(6\frac{\mu}{r^3}(W(\eta)JW(\eta) - W(J\eta)W(\eta)) + 2W(m)W(AB)\right), \quad
         F_{22} = J^{-1}(W(J\omega + k) - W(\omega)J)
 
-    δq is defined by :func:`adcs.quaternion.error_vector`. ω in F11 is the rate against inertial space, although q is
+    :func:`adcs.quaternion.error_vector` defines δq. The rate ω in F11 is that against inertial space, although q is
     against the orbital frame.
 
-    ``q`` (..., 4). ``w``, ``momentum_Nms`` (..., 3). ``gravity_s2`` (...). ``b_orbital_T`` (..., 3).
-    ``dipole_Am2`` (..., 3): besides the residual dipole of the body.
+    ``q`` (..., 4). ``w``, ``momentum_Nms`` (..., 3). ``gravity_s2`` (...). ``b_orbital_T`` (..., 3). ``dipole_Am2``
+    (..., 3): dipole in addition to the residual one of the body.
     """
     w = np.asarray(w, dtype=np.float64)
     J, eta, b_body = body.inertia_kgm2, rotate_back(q, _E3), rotate_back(q, b_orbital_T)

@@ -1,9 +1,10 @@
 r"""Magnetic control: B-dot detumbling by torquers, and passive hysteresis rods.
 
-The field in body axes changes as the body turns, dB/dt ≈ B×ω. A moment against it, m = -k Ḃ/B², has the torque
-m×B ≈ -k ω⊥: it brakes what turns across the field, and the field turns along the orbit. With k = 4 n I the rate decays
-within a quarter of a radian of the orbit; torquers saturate long before. Rods of soft iron lag behind the field, and
-each turn in it costs the energy of a loop.
+When the body rotates, the field in body axes changes, dB/dt ≈ B×ω. A moment against that change, m = -k Ḃ/B², causes
+the torque m×B ≈ -k ω⊥, which brakes the rotation across the field. The field changes its direction along the orbit, so
+all components of the rate decay. With k = 4 n I they decay within a quarter of a radian of the orbit; torquers saturate
+at much smaller gains. Rods of soft iron are magnetised with a delay. Each rotation in the field costs the energy of one
+hysteresis loop.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from magloc.fields.dipole import MU0_OVER_4PI
 
 MU0 = 4.0 * np.pi * MU0_OVER_4PI
 _MEAN_OF_A_CUBE = 1.2
-"""Largest moment across a field, of three torquers, each within its limit: its mean over directions, of that of one."""
+"""Largest moment of three limited torquers across a field, averaged over directions, over one torquer's limit."""
 
 
 @dataclass(frozen=True)
@@ -29,11 +30,11 @@ class BDot:
     Attributes
     ----------
     gain_Nms : float
-        k: torque over rate, while no torquer is at its limit; see :func:`b_dot_gain`.
+        Gain k: torque over rate while no torquer is at its limit; see :func:`b_dot_gain`.
     largest_Am2 : float
-        Moment of each of three torquers along the body axes.
+        Largest moment of each of three torquers along the body axes.
     duty : float
-        Part of each cycle in which they are on; the magnetometer is read while they are off.
+        Share of each cycle in which the torquers are on. The magnetometer is read while they are off.
 
     Raises
     ------
@@ -58,29 +59,39 @@ class BDot:
             raise ValueError(f"Input duty must be at most 1; instead received {self.duty}.")
 
     def moment_Am2(self, before_T: ArrayLike, now_T: ArrayLike, step_s: float) -> FloatArray:
-        """Return the moment (..., 3) until the next reading, while torquers are on; zero without both readings.
+        """Return the moment that the torquers command until the next reading, from the last two readings.
 
         Parameters
         ----------
         before_T, now_T : array_like, shape (..., 3)
-            Last two readings of the magnetometer, body axes.
+            Last two readings of the magnetometer, body axes [T].
         step_s : float
-            Between them.
+            Time between them [s].
+
+        Returns
+        -------
+        ndarray, shape (..., 3)
+            Moment while the torquers are on, body axes [A·m²]; zero without both readings.
         """
         now = np.asarray(now_T, dtype=np.float64)
         return self._limit(now, (now - np.asarray(before_T, dtype=np.float64)) / step_s)
 
     def moment_by_rate_Am2(self, field_T: ArrayLike, rate_rad_s: ArrayLike) -> FloatArray:
-        """Return the moment (..., 3) from an estimated rate, dB/dt = B×ω.
+        """Return the moment from an estimated rate, dB/dt = B×ω.
 
         It has neither the noise of two readings nor the rotation of the field along the orbit.
 
         Parameters
         ----------
         field_T : array_like, shape (..., 3)
-            In body axes: the last reading, or the model's in the attitude that is estimated.
+            Field in body axes [T]: the last reading, or the field model at the estimated attitude.
         rate_rad_s : array_like, shape (..., 3)
-            To be taken out, body axes: against inertial space, or the orbital frame.
+            Rate to brake, body axes [rad/s]: against inertial space, or against the orbital frame.
+
+        Returns
+        -------
+        ndarray, shape (..., 3)
+            Moment while the torquers are on, body axes [A·m²].
         """
         b = np.asarray(field_T, dtype=np.float64)
         return self._limit(b, np.cross(b, np.asarray(rate_rad_s, dtype=np.float64)))
@@ -102,24 +113,24 @@ class HysteresisRods:
         \frac{dz}{dH} = s^2, \quad s = \frac12 \pm \frac{H - z}{2 H_c} \quad\Rightarrow\quad
         s = \tanh\left(\operatorname{artanh} s_0 + \frac{|H - H_0|}{2 H_c}\right),
 
-    \+ where H rises and - where it falls, which holds from each turn of H to the next. A loop to saturation costs
-    :math:`4 H_c B_s`, a small one a share that falls with the cube of its size. The numbers are apparent ones, of rods
-    as they are mounted: a rod demagnetises itself, and is far from what its material does in a ring. The default ones
-    are in use for rods of HyMu-80 of 95 mm by 1 mm on satellites of three units, of which 1 cm³ is thirteen.
+    \+ where H rises and - where it falls, valid from each turning point of H to the next. A loop to saturation costs
+    :math:`4 H_c B_s`; the cost of a small loop falls with the cube of its size. The parameters are apparent values of
+    mounted rods: a rod demagnetises itself, so it differs much from a closed ring of the same material. The defaults
+    are in use for rods of HyMu-80 of 95 mm by 1 mm on satellites of three units; 1 cm³ is thirteen such rods.
 
     Attributes
     ----------
     axes : ndarray, shape (K, 3)
         Unit vectors along the rods, body axes.
     volume_m3 : float
-        Of all rods along each of them.
+        Total volume of the rods along each axis.
     coercivity_A_m, remanence_T, saturation_T : float
-        H_c, B_r and B_s.
+        Apparent H_c, B_r and B_s.
 
     Raises
     ------
     ValueError
-        An axis has no direction, a number is not positive, or the remanence not below saturation.
+        An axis has no direction, a number is not positive, or the remanence is not below the saturation.
 
     Examples
     --------
@@ -155,18 +166,29 @@ class HysteresisRods:
             )
 
     def demagnetised(self) -> FloatArray:
-        """Return the state (2, K) of demagnetised rods."""
+        """Return the state of demagnetised rods.
+
+        Returns
+        -------
+        ndarray, shape (2, K)
+            Zero field H and zero lagging field z of each rod [A/m].
+        """
         return np.zeros((2, len(self.axes)))
 
     def followed(self, state_A_m: ArrayLike, field_T: ArrayLike) -> FloatArray:
-        """Return the state (..., 2, K) of the rods, H and z, after a monotonic change of the field.
+        """Return the state of the rods after a monotonic change of the field.
 
         Parameters
         ----------
         state_A_m : array_like, shape (..., 2, K)
-            The same before.
+            State before the change, H and z along each rod [A/m].
         field_T : array_like, shape (..., 3)
-            Field from outside, body axes.
+            External field after the change, body axes [T].
+
+        Returns
+        -------
+        ndarray, shape (..., 2, K)
+            State after the change, H and z along each rod [A/m].
         """
         before, z = np.moveaxis(np.asarray(state_A_m, dtype=np.float64), -2, 0)
         H = np.asarray(field_T, dtype=np.float64) @ self.axes.T / MU0
@@ -178,12 +200,17 @@ class HysteresisRods:
         return np.stack([H, H - way * self.coercivity_A_m * (2.0 * (s + t) / (1.0 + s * t) - 1.0)], axis=-2)
 
     def moment_Am2(self, state_A_m: ArrayLike) -> FloatArray:
-        """Return the moment (..., 3) of all rods, B V/μ₀ along each, body axes.
+        """Return the moment of all rods, B V/μ₀ along each.
 
         Parameters
         ----------
         state_A_m : array_like, shape (..., 2, K)
-            Of :meth:`followed`.
+            State from :meth:`followed` [A/m].
+
+        Returns
+        -------
+        ndarray, shape (..., 3)
+            Moment in body axes [A·m²].
         """
         z = np.asarray(state_A_m, dtype=np.float64)[..., 1, :]
         flux_T = 2.0 / np.pi * self.saturation_T * np.arctan(self.steepness_m_A * z)
@@ -198,14 +225,19 @@ class HysteresisRods:
 def b_dot_gain(inertia_kgm2: ArrayLike, orbital_rate_rad_s: float) -> float:
     """Return the gain k = 4 n I of B-dot.
 
-    I is the largest moment of inertia: with the smallest one detumbling takes six times as long.
+    I is the largest moment of inertia. With the smallest one, detumbling takes six times as long.
 
     Parameters
     ----------
     inertia_kgm2 : array_like, shape (3, 3)
-        Of the satellite.
+        Inertia of the satellite.
     orbital_rate_rad_s : float
-        n.
+        Rate n of the orbit.
+
+    Returns
+    -------
+    float
+        Gain k for :class:`BDot` [N·m·s].
 
     Examples
     --------
@@ -226,21 +258,21 @@ def detumbled(
 
         \dot H = -\min\left(\frac{k d |H_\perp|}{I}, 1.2\, m d |B|\right) \hat H_\perp
 
-    with the part of H across the field along the orbit; no attitude is in it. I Δω over the mean torque is off by
-    factors, because what is along the field waits.
+    :math:`H_\perp` is the component of H across the field along the orbit. The attitude does not matter. The simple
+    estimate I Δω over the mean torque is wrong by factors, because the component along the field does not decay.
 
     Parameters
     ----------
     law : BDot
         Gain, largest moment and duty.
     momentum_Nms : array_like, shape (..., 3)
-        At the start, in the axes of the field.
+        Momentum at the start, inertial axes [N·m·s].
     b_inertial_T : array_like, shape (..., n, 3)
-        Along the orbit, inertial axes.
+        Field along the orbit, inertial axes.
     inertia_kgm2 : array_like, shape (3, 3)
-        I is its largest moment.
+        Inertia of the satellite; I is its largest moment.
     step_s : float
-        Between the n instants.
+        Time between the n instants.
 
     Returns
     -------

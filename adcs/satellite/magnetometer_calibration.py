@@ -1,9 +1,9 @@
 r"""Calibration of a magnetometer from a log and the field along the orbit, with or without the attitude.
 
-The magnetometer reads :math:`z = (E + D)\,b + o + n`: D has nine parameters, gains on its diagonal, o is the bias.
-Without an attitude each row measures a modulus, :math:`|(E + D)^{-1}(z - o)| = |b|`, and with one all of b. All
-parameters have a prior, so that an unobservable one keeps its prior value and deviation. The field is that of the orbit
-at the time of the row plus a shift, the last parameter. See docs/theory/attitude-kalman-filters.md.
+The magnetometer reads :math:`z = (E + D)\,b + o + n`. D has nine parameters, with the gains on its diagonal; o is the
+bias. Without an attitude each row measures a modulus, :math:`|(E + D)^{-1}(z - o)| = |b|`, with one all of b. All
+parameters have a prior, so that an unobservable one keeps its prior value and deviation. The field is that along the
+orbit at the row's time plus a shift, the last parameter. See docs/theory/attitude-kalman-filters.md.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ OUTLIER = 5.0
 """Rows with residuals beyond this times their spread are left out."""
 _ITERATIONS, _ROUNDS, _DECIMATED, _SETTLED, _FEWEST = 60, 10, 1000, 1e-4, 20
 _KNOT_S, _SHIFTS_S = 10.0, 15.0
-"""Steps of the instants of the model and of the shifts that are tried: the field changes over minutes."""
-_LONGEST_SHIFT_S = 3600.0  # the field is computed along the orbit three times as far, before and after
+"""Steps of the model's instants and of the trial shifts; the field changes over minutes."""
+_LONGEST_SHIFT_S = 3600.0  # the field is computed along the orbit for three times as long, before and after the log
 
 
 @dataclass(frozen=True)
@@ -52,16 +52,16 @@ class MagnetometerPrior:
     noise_T, bias_T : float
         Standard deviations of a reading of an axis, and of the bias.
     gain, axes_rad : float
-        Of the gains, and of the misalignment of the axes.
+        Standard deviations of the gains, and of the misalignment of the axes.
     field_error_T, field_correlation_s : float
-        Of a component of the model's error, and its time constant.
+        Standard deviation of a component of the model's error, and its time constant.
     time_shift_s : float
-        Of the time of the positions against that of the readings; 0 = known.
+        Standard deviation of the time of the positions against that of the readings; 0 if it is known.
 
     Raises
     ------
     ValueError
-        A number is not positive; the model's error and the shift may be zero. Or the shift is more than an hour.
+        A number is not positive (the model's error and the shift may be zero), or the shift is more than an hour.
 
     Examples
     --------
@@ -103,23 +103,23 @@ class MagnetometerCalibration(Drawn):
     Attributes
     ----------
     bias_T : ndarray, shape (3,)
-        Reading in zero field, o.
+        Bias o, the reading in zero field.
     gain : ndarray, shape (3, 3)
-        D.
+        Gains and misalignments D.
     time_shift_s : float
-        Time shift of the model: the field at a row is that of the model so much later.
+        Time shift of the model: the field at a row is that of the model at this later time.
     covariance : ndarray, shape (13, 13)
-        Covariance of :data:`NAMES`, prior included.
+        Posterior covariance of :data:`NAMES`.
     prior : MagnetometerPrior
         Prior of the calibration.
     residual_T : ndarray, shape (n,) or (n, 3)
-        Calibrated modulus, or field, minus the model; NaN of a row that is left out.
+        Calibrated modulus, or field, minus the model; NaN for rows that are not used.
     raw_rms_T : float
-        Rms of the same rows without a calibration; of an unknown attitude that of the modulus.
+        Root mean square of the same rows without a calibration; that of the modulus without an attitude.
     chi2, dof : float, int
-        Sum of squares of the whitened rows that are used, and their number.
+        Sum of squares of the whitened used rows, and their number.
     used : ndarray of bool, shape (n,)
-        Rows with readings that fit the others.
+        Rows in use: those with readings that fit the others.
     """
 
     figure = "adcs.plots.magnetometers:magnetometer_figure"
@@ -147,7 +147,7 @@ class MagnetometerCalibration(Drawn):
 
     @property
     def rms_T(self) -> float:
-        """Rms of the used residuals."""
+        """Root mean square of the used residuals."""
         return float(np.sqrt(np.nanmean(self.residual_T**2)))
 
     @property
@@ -194,24 +194,25 @@ def calibrate_magnetometer(
     Parameters
     ----------
     telemetry : Telemetry
-        The log; its magnetometer and its times are used.
+        Log, of which the magnetometer and the times are used.
     satellite : Satellite
-        Its orbit, and its model of the field.
+        Orbit, and model of the field.
     prior : MagnetometerPrior
-        What is known before: noise, and deviations of bias, gains, axes, the model's error and the time shift.
+        Noise, and prior deviations of bias, gains, axes, the model's error and the time shift.
     attitude : str
-        ``none``: unknown, the modulus of each row counts. It does not tell how the sensor is turned: compare
-        (E + D)(E + D)ᵀ. ``orbital``: constant in the orbital frame, unknown there.
+        ``none``: the attitude is unknown, and the modulus of each row counts. The modulus does not determine the
+        rotation of the sensor, only (E + D)(E + D)ᵀ. ``orbital``: the attitude is constant in the orbital frame, and
+        unknown there.
 
     Returns
     -------
     MagnetometerCalibration
-        With its covariance; what the log does not tell has the deviation of the prior.
+        Calibration with its covariance; an unobservable parameter has the deviation of its prior.
 
     Raises
     ------
     ValueError
-        Fewer than 20 rows can be used, or a date is outside of the model of the field.
+        Fewer than 20 rows can be used, or a date is outside of the field model.
 
     Examples
     --------
@@ -241,9 +242,9 @@ def calibrate_readings(
 ) -> MagnetometerCalibration:
     """Calibrate readings against a model of the field over time, as :func:`calibrate_magnetometer`.
 
-    ``time_s`` (n,), ``readings_T`` (n, 3): ascending times, rows with a NaN are left out. ``model_time_s`` (m,),
-    ``model_T`` (m, 3): the model's field, in a frame in which a known attitude is constant; it must extend beyond the
-    rows by three deviations of the shift.
+    ``time_s`` (n,), ``readings_T`` (n, 3): ascending times and readings; rows with a NaN are not used.
+    ``model_time_s`` (m,), ``model_T`` (m, 3): field of the model in a frame in which a known attitude is constant. It
+    must extend beyond the rows by three deviations of the shift.
     """
     times, readings = np.asarray(time_s, dtype=np.float64), np.asarray(readings_T, dtype=np.float64)
     knots = CubicSpline(np.asarray(model_time_s, dtype=np.float64), np.asarray(model_T, dtype=np.float64))
@@ -285,7 +286,8 @@ def _check_enough(used: BoolArray) -> None:
     """Raise ValueError if too few rows are left."""
     if used.sum() < _FEWEST:
         raise ValueError(
-            f"Input found {used.sum()} rows of the magnetometer that fit each other, expected {_FEWEST} or more."
+            f"Input telemetry must have {_FEWEST} rows of the magnetometer that fit each other; "
+            f"instead received {used.sum()}."
         )
 
 
@@ -299,10 +301,10 @@ def _modulus(rows: _FieldRows, x: FloatArray, prior: MagnetometerPrior) -> tuple
     modulus = np.linalg.norm(field, axis=1)
     n = field / modulus[:, None]
     across = n @ inverse
-    # At the model's modulus: the squared noise of the readings would count as information on unobservable parameters.
+    # With the model's modulus, because squared noise of the readings would look like information on the gains.
     by_gain = -(across[:, :, None] * (n * length[:, None])[:, None, :]).reshape(-1, 9)
     by_shift = -np.sum(b * slope, axis=1) / length
-    # Noise across the field makes it longer.
+    # The noise across the field increases the modulus.
     return modulus - length - prior.noise_T**2 / length, np.concatenate([-across, by_gain, by_shift[:, None]], axis=1)
 
 
@@ -414,7 +416,7 @@ def _outliers(residual: FloatArray, prior: MagnetometerPrior) -> BoolArray:
 def _whiten(time_s: FloatArray, columns: FloatArray, prior: MagnetometerPrior) -> FloatArray:
     """Whiten columns (n, k) with white noise and an Ornstein-Uhlenbeck error.
 
-    The result is the normalised innovation of a scalar Kalman filter, whose gains do not depend on the columns.
+    The result is the normalised innovation of a scalar Kalman filter; its gains are the same for all columns.
     """
     decay = np.exp(-np.diff(time_s, prepend=time_s[0]) / prior.field_correlation_s)
     stationary, noise = prior.field_error_T**2, prior.noise_T**2

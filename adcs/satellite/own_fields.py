@@ -1,18 +1,17 @@
 """Fields of a satellite's own loads, magnets and torquers at each of its magnetometers.
 
-Around a switch the ambient field, seen from axes that stand still, is a smooth function of time, and what switches adds
-a step. Fields y_i at a magnetometer in body axes, turned by the gyro (D_i) into those of the instant of the switch, are
+Around a switch the ambient field in fixed axes is a smooth function of time, and the load adds a step. The gyro turns
+(D_i) the fields y_i of a magnetometer from body axes into the axes at the switch:
 
     D_i y_i = quadratic(t_i) + D_i (Σ_k s_k(t_i) V_k + o),
 
-with the states s_k of the loads, the field V_k of each there and an offset o. The polynomial is projected out; all
-switches make one regression for V. No model of the ambient field enters, nor an attitude, and V_k has the errors of
-gain and axes that the readings have: it is what must be subtracted of them. Where a load is, and what its moment is,
-tells a dipole that is fitted to its fields at all magnetometers.
+with the states s_k of the loads, the field V_k of each load and an offset o. The polynomial is projected out, and all
+switches together give one regression for V. It needs neither a field model nor an attitude. V_k has the same errors of
+gain and axes as the readings, so it can be subtracted from them. A dipole fit to the V_k at all magnetometers locates
+the load.
 
-States may be of another clock than readings. How much later the field changes than the states is found first, from
-what the readings jump by between two rows: the lag in whole rows at which jumps and switches explain each other best.
-Then the rows beside the switches are left out if they fit neither state: the lag is between two rows.
+States and readings may have different clocks. The lag in whole rows is the one for which the switches explain the jumps
+between rows best. Rows beside the switches that fit neither state are then left out.
 """
 
 from __future__ import annotations
@@ -22,6 +21,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import CubicSpline
 from scipy.special import chdtri
 
 from adcs import quaternion
@@ -37,15 +37,13 @@ WINDOW_S = 8.0
 _DEGREE = 2
 _LEAST_ROWS = 6
 _AMBIENT_T = 30e-6
-_PRIOR_T = 100e-6
-"""Standard deviation of a component of V and o beforehand: what the readings do not tell stays there."""
+_PRIOR_T = 100e-6  # prior standard deviation of a component of V and o
 _UNKNOWN = 0.5
 LONGEST_LAG_S = 30.0
-"""Between states and readings, looked for both ways."""
+"""Largest lag between states and readings that is searched, in both directions."""
 _Fitted = tuple[FloatArray, FloatArray, FloatArray, int]
 _FALSE_ALARM, _MISFIT = 1e-6, 2.0
-_OTHERS = 12
-"""Numbers of each magnetometer that the regression finds besides: its offset, and nine errors of gains and axes."""
+_OTHERS = 12  # further unknowns of each magnetometer: its offset, and nine errors of gains and axes
 
 
 @dataclass(frozen=True)
@@ -55,11 +53,11 @@ class StateLag:
     Attributes
     ----------
     least_rows, most_rows : int
-        Bounds in rows, equal unless the lag is between two rows; both 0 where the readings do not tell.
+        Bounds in rows; equal unless the lag is between two rows, and 0 if the readings do not determine it.
     step_s : float
         Median time from row to row.
     is_known : bool
-        Whether the readings tell it.
+        Whether the readings determine it.
     """
 
     least_rows: int
@@ -79,20 +77,20 @@ class StateLag:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Return what a user must know of it."""
+        """Return sentences on an unknown lag, or on one that is corrected."""
         if not self.is_known:
             return (
-                "the switches do not tell whether states and readings are of one clock: they are too few, too alike or "
-                "too weak; the fields are wrong if the states are a row early or late",
+                "the switches do not tell whether states and readings have the same clock: they are too few, too "
+                "alike or too weak; the fields are wrong if the states are a row early or late",
             )
         if self.least_rows == self.most_rows == 0:
             return ()
-        least, most = sorted(abs(rows) for rows in (self.least_rows, self.most_rows))
+        least, most = sorted(map(abs, (self.least_rows, self.most_rows)))
         by = f"{most} row{'s' * (most != 1)}" if least == most and self.rows else f"{least} to {most} rows"
         way = "later" if self.rows > 0.0 else "earlier" if self.rows < 0.0 else "earlier or later"
         return (
-            f"states and readings are not of one clock: the field changes {by} ({abs(self.seconds):.3g} s) {way} than "
-            "the states; the fields are corrected for it",
+            f"states and readings do not have the same clock: the field changes {by} ({abs(self.seconds):.3g} s) "
+            f"{way} than the states; the fields are corrected for it",
         )
 
     def delay(self, time_s: FloatArray, s: FloatArray) -> FloatArray:
@@ -113,27 +111,27 @@ class OwnFields(Drawn):
     Attributes
     ----------
     names : tuple of str
-        Of the loads.
+        Names of the loads.
     array : SensorArray
         The magnetometers, in body axes.
     vectors_T : ndarray, shape (K, M, 3)
-        What one unit of a load's state adds to the field at each magnetometer, body axes.
+        Field of each load per unit of its state at each magnetometer, body axes.
     sigma_T : ndarray, shape (K, M, 3)
-        Its standard deviation.
+        Standard deviations of these fields.
     switches : ndarray of int, shape (K,)
-        How often the state of each load changed.
+        Number of changes of each load's state.
     noise_T : ndarray, shape (M,)
-        Standard deviation of a component of what the regression leaves.
+        Standard deviation of a component of the regression's residual.
     chi2_per_dof : float
-        Mean square of that over the noise that the array states; 1 where all is as stated.
+        Mean square of the residuals over the array's stated noise; 1 if the model is right.
     lag : StateLag
-        Between states and readings, which the fields are corrected for.
+        Lag between states and readings, for which the fields are corrected.
 
     Examples
     --------
     >>> import adcs
     >>> from sims import experiments
-    >>> run = experiments.switching_loads(seed=0, duration_s=600.0)
+    >>> run = experiments.switching_loads(rng=0, duration_s=600.0)
     >>> own = adcs.find_own_fields(run.array, run.readings_T, run.time_s, run.gyro_rad_s, run.states)
     >>> own.names, own.vectors_T.shape
     (('heater', 'radio'), (2, 4, 3))
@@ -152,28 +150,32 @@ class OwnFields(Drawn):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Return what makes the fields doubtful, or was corrected."""
+        """Return sentences on doubts about the fields, and on corrections."""
         texts = self.lag.warnings
         if self.chi2_per_dof > _MISFIT:
             texts += (
-                f"χ² per number is {self.chi2_per_dof:.1f}: the noise is larger than the array states, a load is not "
-                "in the log, or the states of one have a clock of their own; the deviations are those of what is left",
+                f"χ² per degree of freedom is {self.chi2_per_dof:.1f}: the noise is larger than stated, or a load is "
+                "missing or late in the log; the standard deviations follow the residuals",
             )
         return texts
 
     def subtracted(
         self, readings_T: ArrayLike, states: Mapping[str, ArrayLike], time_s: ArrayLike | None = None
     ) -> FloatArray:
-        """Readings (n, C) without what the loads add to them.
+        """Subtract the fields of the loads from readings.
 
         Parameters
         ----------
         readings_T : array_like, shape (n, C)
-            Of the array's channels.
         states : mapping of str to array_like, shape (n,)
-            Of each load at each row.
+            State of each load at each row.
         time_s : array_like, shape (n,), optional
-            Of the rows, which a lag needs; by default equal steps. A row is NaN where the lag leaves a state open.
+            Times of the rows, used for the lag; by default equal steps.
+
+        Returns
+        -------
+        ndarray, shape (n, C)
+            Corrected readings; NaN where the lag leaves a state open.
         """
         s = _states(states, self.names, len(np.asarray(readings_T)))
         times = np.asarray(self.lag.step_s * np.arange(len(s)) if time_s is None else time_s, dtype=np.float64)
@@ -182,10 +184,14 @@ class OwnFields(Drawn):
         return np.asarray(readings_T) - self.array.readings_of(fields) + self.array.channel_offset_T
 
     def located(self) -> dict[str, Fix]:
-        """Fix of each load as a dipole, body axes, of its fields at all magnetometers.
+        """Locate each load as a dipole from its fields at all magnetometers.
 
-        Noise is that of the fields, the array's ``noise_fraction`` what places of magnetometers and extents of loads
-        make of it. What all magnetometers have in common counts as known to the deviation of the fields.
+        The array's ``noise_fraction`` covers errors of the magnetometers' positions and the extent of the loads.
+
+        Returns
+        -------
+        dict of str to Fix
+            Fix of each load by its name, body axes.
 
         Raises
         ------
@@ -214,38 +220,38 @@ def find_own_fields(
     *,
     window_s: float = WINDOW_S,
 ) -> OwnFields:
-    r"""Fields of what switches on board, at each magnetometer, from the steps of its readings.
+    r"""Estimate the fields of a satellite's own loads at each magnetometer from the steps of its readings.
 
     Parameters
     ----------
     array : SensorArray
         Vector magnetometers in body axes; one alone gives its fields, three tell where the loads are.
     readings_T : array_like, shape (n, C)
-        Of the array's channels; NaN where missing.
+        Readings of the array's channels; NaN where missing.
     time_s : array_like, shape (n,)
-        Ascending.
+        Ascending times.
     gyro_rad_s : array_like, shape (n, 3)
-        Rate against inertial space, body axes; a constant bias of some hundredths of a degree a second does no harm.
+        Rate against inertial space, body axes; a constant bias of some 0.01 °/s does no harm.
     states : mapping of str to array_like, shape (n,)
-        Of each load: 0 and 1, a current, a commanded moment.
+        State of each load by its name: 0 and 1, a current, or a commanded moment.
     window_s : float
-        Before and after a switch, in which the ambient field is a parabola in time.
+        Time before and after a switch in which the ambient field is a parabola in time.
 
     Returns
     -------
     OwnFields
-        The field of each per unit of its state, corrected for a lag of up to 30 s between states and readings.
+        Field of each load per unit of its state, corrected for a lag of up to 30 s between states and readings.
 
     Raises
     ------
     ValueError
-        A shape does not match, the array has a scalar sensor, or a load never switches, or only together with others.
+        A shape does not match, the array has a scalar sensor, or a load never switches without others.
 
     Examples
     --------
     >>> import adcs
     >>> from sims import experiments
-    >>> run = experiments.switching_loads(seed=0, duration_s=600.0)
+    >>> run = experiments.switching_loads(rng=0, duration_s=600.0)
     >>> own = adcs.find_own_fields(run.array, run.readings_T, run.time_s, run.gyro_rad_s, run.states)
     >>> bool(own.sigma_T.max() < 15e-9)
     True
@@ -272,8 +278,8 @@ def find_own_fields(
     for name, deviation in zip(names, deviations, strict=True):
         if deviation.max() > _UNKNOWN * _PRIOR_T:
             raise ValueError(
-                f"Input states must have every load switch, and not always with another; instead received "
-                f"{name}, whose field the readings do not tell."
+                "Input states must have every load switch, and not always with another; instead received "
+                f"{name}, whose field the readings do not determine."
             )
     switches = np.sum(np.diff(s, axis=0) != 0.0, axis=0)
     stated = np.mean(array.channel_noise_T.reshape(-1, 3) ** 2, axis=1)
@@ -379,8 +385,6 @@ def _windows(time_s: FloatArray, s: FloatArray, used: BoolArray, window_s: float
 
 def _turns(time_s: FloatArray, gyro_rad_s: FloatArray) -> FloatArray:
     """Return the rotations (n, 4) of the steps to each instant, by a spline of the rates with coning."""
-    from scipy.interpolate import CubicSpline
-
     read = np.isfinite(gyro_rad_s).all(axis=1)
     if read.sum() < 2:
         raise ValueError(f"Input gyro_rad_s must have two readings at least; instead received {read.sum()}.")

@@ -21,26 +21,27 @@ class Satellite:
     Attributes
     ----------
     inertia_kgm2 : ndarray, shape (3, 3)
-        Wheels included, body axes.
+        Inertia with the wheels, body axes.
     orbit : Orbit
-        Of :func:`adcs.circular_orbit`, or :class:`adcs.environment.orbit.Sgp4Orbit`.
+        Orbit, such as :func:`adcs.circular_orbit` or :class:`adcs.environment.orbit.Sgp4Orbit`.
     residual_dipole_Am2 : ndarray, shape (3,)
         Magnetic moment that stays with the satellite, body axes.
     star_tracker, gyro, magnetometer, sun_sensor : StarTracker, Gyro, Magnetometer, SunSensor
-        Of :mod:`adcs.satellite.sensors`. Their noise is what the filters believe; by default that of TabletSat-Aurora.
+        Sensors of :mod:`adcs.satellite.sensors`, with the noise that the filters assume; by default that of
+        TabletSat-Aurora.
     control : WheelControl
-        Only of use to a simulation, and to the Jacobian of the closed loop.
+        Wheel control, used by simulations and by the Jacobian of the closed loop.
     start : datetime64
-        UTC from which a telemetry's time counts; by default the orbit's epoch.
+        UTC from which times of the telemetry count; by default the orbit's epoch.
     field_model : str or Coefficients
-        Of the geomagnetic field: "IGRF-14" (1900 to 2030) or "WMM2025".
+        Model of the geomagnetic field: "IGRF-14" (1900 to 2030) or "WMM2025".
     body : RigidBody
         Inertia and dipole, checked.
 
     Raises
     ------
     ValueError
-        No body has this inertia.
+        No rigid body has this inertia.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Models of the attitude sensors: what they read, and when they read nothing.
+"""Models of the attitude sensors: their readings, and the conditions for a reading.
 
 See docs/theory/satellite-dynamics-and-sensors.md. Defaults are Table 1 of the source: Ivanov, Ivlev, Karpenko,
 Ovchinnikov, Keldysh Institute preprint 64, 2014.
@@ -16,21 +16,17 @@ from adcs import quaternion
 from arrays.typing import BoolArray, FloatArray
 
 ANGLE_NOISE_RAD = math.radians(0.0005)
-"""Noise of the star tracker's quaternion where 0.001° is the angle, twice that."""
+"""Noise of the star tracker's quaternion: half of the noise of the angle, 0.001°."""
 FIVE_HEADS: FloatArray = np.array(
     [[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]]
 )
-"""Axes of Sun heads on ±x, ±y and z, which points to the zenith in the orbital frame."""
+"""Axes of Sun heads on ±x, ±y and +z; +z points to the zenith in the orbital frame."""
 
 SENSORS = ("st", "gyro", "mag", "sun")
-"""Names of star tracker, gyro, magnetometer and Sun sensor, in the order in which filters take them."""
+"""Names of star tracker, gyro, magnetometer and Sun sensor, in the order in which filters process them."""
 SENSOR_WORDS = dict(zip(SENSORS, ("star tracker", "gyro", "magnetometer", "Sun sensor"), strict=True))
 NIS_SIZES = dict(zip(SENSORS, (3, 3, 3, 2), strict=True))
 """Degrees of freedom of a sensor's NIS; a direction to the Sun has two."""
-
-
-def _zero_misalignment() -> FloatArray:
-    return np.zeros(3)
 
 
 class _Sensor:
@@ -56,20 +52,20 @@ class _Sensor:
 
 @dataclass(frozen=True, eq=False)
 class StarTracker(_Sensor):
-    """Measures the attitude.
+    """Star tracker, which measures the attitude.
 
     Attributes
     ----------
     sigma_rad : float
         Standard deviation of each component of the vector part of the quaternion's error: half of that of the angle.
     rate_limit_rad_s : float
-        No stars are found above it.
+        Largest rate at which stars are found.
     boresight_body : ndarray, shape (3,)
-        Its axis.
+        Optical axis.
     sun_exclusion_rad, earth_exclusion_rad : float
-        The axis must be farther than these from the Sun, and from the limb of the Earth; 0 = only not on it.
+        Least angle of the axis from the Sun, and from the limb of the Earth.
     misalignment_rad : ndarray, shape (3,)
-        Rotation vector.
+        Rotation vector of the misalignment.
 
     Raises
     ------
@@ -82,7 +78,7 @@ class StarTracker(_Sensor):
     boresight_body: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
     sun_exclusion_rad: float = 0.0
     earth_exclusion_rad: float = 0.0
-    misalignment_rad: FloatArray = field(default_factory=_zero_misalignment)
+    misalignment_rad: FloatArray = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -94,7 +90,7 @@ class StarTracker(_Sensor):
 
 @dataclass(frozen=True, eq=False)
 class Gyro(_Sensor):
-    """Measures the rate against inertial space.
+    """Gyro, which measures the rate against inertial space.
 
     Attributes
     ----------
@@ -105,23 +101,23 @@ class Gyro(_Sensor):
     bias_walk_rad_s : float
         Growth of the bias's standard deviation in one second [rad/s per √s].
     misalignment_rad : ndarray, shape (3,)
-        Rotation vector.
+        Rotation vector of the misalignment.
 
     Raises
     ------
     ValueError
-        As :class:`StarTracker`.
+        A number is not finite, or not positive where it must be.
     """
 
     sigma_rad_s: float = math.radians(0.005)
     range_rad_s: float = math.radians(250.0)
     bias_walk_rad_s: float = 0.0
-    misalignment_rad: FloatArray = field(default_factory=_zero_misalignment)
+    misalignment_rad: FloatArray = field(default_factory=lambda: np.zeros(3))
 
 
 @dataclass(frozen=True, eq=False)
 class Magnetometer(_Sensor):
-    """Measures the field.
+    """Magnetometer, which measures the field.
 
     Attributes
     ----------
@@ -132,23 +128,23 @@ class Magnetometer(_Sensor):
     bias_walk_T : float
         Growth of the bias's standard deviation in one second [T per √s].
     misalignment_rad : ndarray, shape (3,)
-        Rotation vector.
+        Rotation vector of the misalignment.
 
     Raises
     ------
     ValueError
-        As :class:`StarTracker`.
+        A number is not finite, or not positive where it must be.
     """
 
     sigma_T: float = 250e-9
     range_T: float = 200_000e-9
     bias_walk_T: float = 0.0
-    misalignment_rad: FloatArray = field(default_factory=_zero_misalignment)
+    misalignment_rad: FloatArray = field(default_factory=lambda: np.zeros(3))
 
 
 @dataclass(frozen=True, eq=False)
 class SunSensor(_Sensor):
-    """Heads that measure the direction to the Sun.
+    """Sun sensor: heads that measure the direction to the Sun.
 
     Attributes
     ----------
@@ -157,28 +153,28 @@ class SunSensor(_Sensor):
     heads_body : ndarray, shape (h, 3)
         Axes of the heads.
     half_field_rad : float
-        Half the side of the square field: a head sees the Sun where both angles, of its projections on the planes
-        through the head's axis and its two sides, are within it.
+        Half the side of the square field. A head sees the Sun if both angles are within it: those of the projections on
+        the planes through the head's axis and its two sides.
     misalignment_rad : ndarray, shape (3,)
         Rotation vector of all heads together.
 
     Raises
     ------
     ValueError
-        As :class:`StarTracker`, or a head has no direction.
+        A number is not finite, or not positive where it must be, or a head has no direction.
     """
 
     sigma_rad: float = math.radians(0.1)
     heads_body: FloatArray = field(default_factory=lambda: FIVE_HEADS.copy())
     half_field_rad: float = math.radians(45.0)
-    misalignment_rad: FloatArray = field(default_factory=_zero_misalignment)
+    misalignment_rad: FloatArray = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
         super().__post_init__()
         heads = np.atleast_2d(self.heads_body)
         lengths = np.linalg.norm(heads, axis=-1, keepdims=True)
         if heads.ndim != 2 or heads.shape[1] != 3 or not (lengths > 0.0).all():
-            raise ValueError("Input heads_body must be rows of 3 numbers that are not all zero.")
+            raise ValueError(f"Input heads_body must be vectors that are not zero; instead received {heads.tolist()}.")
         object.__setattr__(self, "heads_body", heads / lengths)
 
 
@@ -193,10 +189,10 @@ def star_tracker_readings(
 ) -> FloatArray:
     """Return the readings of a star tracker, q∘exp of misalignment and noise.
 
-    Shape ``unit_noise`` (..., 3). ``q`` (..., 4): true attitude, orbital from body. ``w`` (..., 3): true rate [rad/s].
-    ``sun_orbital`` (..., 3): unit vector to the Sun, which blinds the tracker unless it is eclipsed.
-    ``earth_radius_rad`` (...): angular radius of the Earth, around nadir. ``illuminated`` (...): visible part of the
-    Sun. Returns (..., 4): orbital from body, NaN without a reading.
+    ``q`` (..., 4): true attitude, orbital from body. ``w`` (..., 3): true rate [rad/s]. ``sun_orbital`` (..., 3): unit
+    vector to the Sun, which blinds the tracker unless it is eclipsed. ``earth_radius_rad`` (...): angular radius of the
+    Earth around nadir. ``illuminated`` (...): visible part of the Sun. ``unit_noise`` (..., 3): standard normal
+    numbers. Returns (..., 4): orbital from body, NaN without a reading.
     """
     delta = tracker.sigma_rad * np.asarray(unit_noise, dtype=np.float64)
     turned_by = quaternion.multiply(quaternion.exp(tracker.misalignment_rad), quaternion.from_error_vector(delta))
@@ -227,10 +223,10 @@ def magnetometer_readings(
 def sun_readings(sensor: SunSensor, sun_body: ArrayLike, illuminated: ArrayLike, unit_noise: ArrayLike) -> FloatArray:
     """Return the readings of the Sun heads.
 
-    Noise rotates the direction by ``sigma_rad`` about each of two axes across it: noise is added to all three
-    components, and normalising the sum removes the part along the direction.
-    Shape ``unit_noise`` (..., 3). ``sun_body`` (..., 3): true unit vector. ``illuminated`` (...): visible part of the
-    Sun; at least half is needed. Returns (..., 3): unit vectors, NaN if no head sees the Sun.
+    Noise rotates the direction by ``sigma_rad`` about each of two axes across it. It is added to all three components,
+    and normalising the sum removes the part along the direction.
+    ``sun_body`` (..., 3): true unit vector. ``illuminated`` (...): visible part of the Sun, of which a half is needed.
+    ``unit_noise`` (..., 3): standard normal numbers. Returns (..., 3): unit vectors, NaN if no head sees the Sun.
     """
     sun = np.asarray(sun_body, dtype=np.float64)
     seen = is_in_field(sensor, sun).any(axis=-1) & (np.asarray(illuminated) >= 0.5)
@@ -244,7 +240,7 @@ def is_in_field(sensor: SunSensor, direction_body: ArrayLike) -> BoolArray:
     axes = np.stack([_head_axes(axis) for axis in sensor.heads_body])
     along = np.einsum("hij,...j->...hi", axes, np.asarray(direction_body, dtype=np.float64))
     angles = np.abs(np.arctan2(along[..., :2], along[..., 2:]))
-    # A direction on the edge between two heads must not fall between them by rounding.
+    # Rounding must not exclude a direction on the edge between two heads from both.
     return np.asarray((angles <= sensor.half_field_rad + 1e-12).all(axis=-1))
 
 

@@ -1,7 +1,7 @@
 """Input of the attitude filters: readings, wheels and environment of one or several runs.
 
-:class:`sims.attitude.simulation.AttitudeRuns` is a :class:`Record` with the truth; a log, :class:`Telemetry`, gives one
-without it. The leading axis of all arrays is the run, the second the instant.
+:class:`sims.attitude.simulation.AttitudeRuns` is a :class:`Record` with the truth. A log, :class:`Telemetry`, gives one
+without it. In all arrays the first axis is the run, the second the instant.
 """
 
 from __future__ import annotations
@@ -39,10 +39,11 @@ class AttitudeReadings:
     Attributes
     ----------
     star : ndarray, shape (runs, n, 4)
-        Attitude, orbital from body, scalar first; sign as it comes.
+        Attitude, orbital from body, scalar first, of either sign.
     gyro_rad_s : ndarray, shape (runs, n, 3)
         Rate against inertial space.
     field_T : ndarray, shape (runs, n, 3)
+        Field at the magnetometer.
     sun : ndarray, shape (runs, n, 3)
         Unit vector to the Sun.
     star_whitening : ndarray, shape (runs, n, 3, 3)
@@ -81,15 +82,17 @@ class Record:
     Attributes
     ----------
     satellite : Satellite
-        Satellite and sensors, as their user knows them.
+        Satellite and sensors as their user knows them.
     dt_s : float
         Usual time between instants.
     environment : Environment
-        Instants, field and Sun; the leading axis is the run.
+        Instants, field and Sun.
+    readings : AttitudeReadings
+        Readings at each instant.
     momentum_Nms, wheel_torque_Nm : ndarray, shape (runs, n, 3)
         Momentum of the wheels, and its rate of change from each instant to the next.
     torquers_Am2 : ndarray, shape (runs, n, 3)
-        Magnetic moment that the torquers are commanded to have from each instant to the next, body axes.
+        Commanded magnetic moment of the torquers from each instant to the next, body axes.
     """
 
     satellite: Satellite
@@ -139,11 +142,11 @@ class Telemetry:
     time_s : ndarray, shape (n,)
         Seconds or durations since :attr:`adcs.Satellite.start`, ascending in any steps; rows may be missing.
     star : Rotation, or ndarray, shape (n, 4)
-        Star tracker: inertial (J2000) from body; quaternions, scalar last, if some are missing.
+        Attitude of the star tracker, inertial (J2000) from body; quaternions, scalar last, if some are missing.
     gyro_rad_s : ndarray, shape (n, 3)
         Rate against inertial space.
     field_T : ndarray, shape (n, 3)
-        Magnetometer.
+        Field at the magnetometer.
     sun : ndarray, shape (n, 3)
         Direction to the Sun, of any length.
     wheels_Nms : ndarray, shape (n, 3)
@@ -151,8 +154,8 @@ class Telemetry:
     torquers_Am2 : ndarray, shape (n, 3)
         Commanded magnetic moment, held until the next command; zero before the first.
     star_covariance_rad2 : ndarray, shape (n, 3, 3)
-        Covariance of the star tracker's attitude, as a small rotation about the body's axes, for example of
-        :func:`adcs.combined_star_fixes`. NaN where the noise of the satellite's star tracker holds.
+        Covariance of the star tracker's attitude, as a small rotation about the body's axes, for example from
+        :func:`adcs.combined_star_fixes`. Where it is NaN, the noise of the satellite's star tracker applies.
     step_s : float
         Usual time between instants, to which the process noise refers; by default the shortest time between two rows,
         or the median if times are not multiples of it.
@@ -216,7 +219,22 @@ class Telemetry:
 
     @classmethod
     def of(cls, record: Record, start: np.datetime64, run: int = 0) -> Telemetry:
-        """Return the log of a run of a record, with times since ``start``."""
+        """Return the log of a run of a record.
+
+        Parameters
+        ----------
+        record : Record
+            Readings with wheels and torquers.
+        start : datetime64
+            Zero of the log's times, UTC.
+        run : int
+            Index of the run.
+
+        Returns
+        -------
+        Telemetry
+            Log with the record's usual step.
+        """
         around, readings = record.environment, record.readings
         eci_from_orbital = quaternion.conjugate(orbital_from_eci(around)[run])
         return cls(
@@ -232,11 +250,22 @@ class Telemetry:
 
     @property
     def rows(self) -> NDArray[np.int64]:
-        """Index of each row in :attr:`instants_s`."""
+        """Index of each row in :attr:`instants_s`, shape (n,)."""
         return _filter_instants(self.time_s, self.step_s)[1]
 
     def pieces(self, longest_gap_s: float) -> list[Telemetry]:
-        """Split the log at gaps that are longer than a limit."""
+        """Split the log at gaps that are longer than a limit.
+
+        Parameters
+        ----------
+        longest_gap_s : float
+            Longest gap within a piece; a usual step is never a gap.
+
+        Returns
+        -------
+        list of Telemetry
+            Pieces in order of time; the log itself without such gaps.
+        """
         cuts = np.flatnonzero(np.diff(self.time_s) > max(longest_gap_s, self.step_s)) + 1
         return [
             Telemetry(**{name: values if name == "step_s" else values[rows] for name, values in vars(self).items()})
@@ -244,7 +273,18 @@ class Telemetry:
         ]
 
     def record(self, satellite: Satellite) -> Record:
-        """Return the input of the filters: readings at each instant, field and Sun along the orbit."""
+        """Return the input of the filters: readings at each instant, field and Sun along the orbit.
+
+        Parameters
+        ----------
+        satellite : Satellite
+            Orbit, field model and noise of the star tracker.
+
+        Returns
+        -------
+        Record
+            Record of one run, with all instants.
+        """
         instants_s, rows = _filter_instants(self.time_s, self.step_s)
         n, start_s = len(instants_s), self.time_s[0]
 

@@ -12,7 +12,7 @@ from arrays.typing import FloatArray
 GyroSamples = Literal["mean", "point"]
 GYRO_SAMPLES: tuple[GyroSamples, ...] = get_args(GyroSamples)
 GAP_STEPS = 2.5
-"""Length of a gap in usual steps: longer steps are gaps."""
+"""Length of a gap in usual steps; longer steps are gaps."""
 
 
 def steps_s(time_s: FloatArray) -> FloatArray:
@@ -31,9 +31,9 @@ def instants_within(seconds: float, time_s: FloatArray) -> int:
 def step_rates(rate_rad_s: FloatArray, dt_s: FloatArray, samples: GyroSamples = "mean") -> FloatArray:
     """Return mean rates (n, 3) over the steps to each instant, from a gyro's samples (n, 3).
 
-    A sample is the ``mean`` rate since the one before, or the rate at a ``point`` in time, of which two give the mean
-    between them. Without a sample (NaN) the last one is held, and the next one corrects for it: so no rotation is lost,
-    and no sample is used before its time. Across a gap the rate is the mean of both ends.
+    A sample is the ``mean`` rate since the one before, or the rate at a ``point`` in time; then the mean of two samples
+    is the rate between them. Without a sample (NaN) the last one is held, and the next one corrects for it. So no
+    rotation is lost, and no sample is used before its time. Across a gap the rate is the mean of both ends.
     """
     if samples not in GYRO_SAMPLES:
         raise ValueError(f"Input samples must be one of {', '.join(GYRO_SAMPLES)}; instead received {samples!r}.")
@@ -63,13 +63,13 @@ class VectorRecord:
     Attributes
     ----------
     dt_s : ndarray, shape (n,)
-        Steps to each instant, of :func:`steps_s`. The first step is only the time for which the first readings correct.
+        Steps to each instant from :func:`steps_s`; the first one is only the time for which the first readings correct.
     rate_rad_s : ndarray, shape (R, n, 3)
-        Gyro, the mean over the step that ends at each instant: see :func:`step_rates`.
+        Mean rate of the gyro over the step that ends at each instant; see :func:`step_rates`.
     first_body, second_body : ndarray, shape (R, n, 3)
         Measured vectors, such as the field and the Sun, of any length.
     first_reference, second_reference : ndarray, shape (R or 1, n, 3)
-        The same in the reference frame.
+        The same vectors in the reference frame.
     frame_rate_rad_s : ndarray, shape (R or 1, n, 3)
         Rate of the reference frame against inertial space, in its own axes, over the step that ends at each instant.
 

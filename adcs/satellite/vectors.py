@@ -13,27 +13,27 @@ from adcs.satellite.wahba import VectorMethod, attitude_of_vectors
 
 
 def vector_attitude(telemetry: Telemetry, satellite: Satellite, *, method: VectorMethod = "quest") -> AttitudeTrack:
-    """Return the attitude of a satellite at each row with field and Sun, each row on its own.
+    """Estimate the attitude of a satellite independently at each row with field and Sun.
 
     Parameters
     ----------
     telemetry : Telemetry
-        With magnetometer and Sun sensor.
+        Log with magnetometer and Sun sensor.
     satellite : Satellite
-        Its orbit and the noise of its sensors.
+        Orbit, and noise of the sensors.
     method : str
-        As of :func:`adcs.attitude_of_vectors`; ``triad`` takes the Sun for the first vector.
+        Method of :func:`adcs.attitude_of_vectors`; the first vector of ``triad`` is the Sun.
 
     Returns
     -------
     AttitudeTrack
-        Inertial from body, at the rows that have both; no rate.
+        Attitude, inertial from body, at the rows with both sensors; it has no rate.
 
     Raises
     ------
     ValueError
-        No row has both, one misreading explains why the log contradicts the orbit, or a date is outside of the model of
-        the field.
+        No row has both sensors, one misreading explains why the log contradicts the orbit, or a date is outside of the
+        field model.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Attitude from vectors that are known in both frames: TRIAD, and Wahba's problem by QUEST.
+"""Attitude from vectors with known components in two frames: TRIAD, and Wahba's problem by QUEST.
 
 Sources: H. D. Black, AIAA Journal 2 (7), 1964; M. D. Shuster, S. D. Oh, Three-Axis Attitude Determination from Vector
 Observations, Journal of Guidance and Control 4 (1), 1981.
@@ -20,16 +20,16 @@ VECTOR_METHODS: tuple[VectorMethod, ...] = get_args(VectorMethod)
 
 
 class VectorAttitudes(NamedTuple):
-    """Attitudes of n instants, NaN with fewer than two vectors or collinear ones.
+    """Attitudes of n instants; NaN with fewer than two vectors or collinear ones.
 
     Attributes
     ----------
     q : ndarray, shape (n, 4)
-        Frame from body, scalar first.
+        Attitude, frame from body, scalar first.
     covariance : ndarray, shape (n, 3, 3)
-        Of the error angle in body axes [rad²].
+        Covariance of the error angle, body axes [rad²].
     loss : ndarray, shape (n,)
-        Twice Wahba's loss, Σ |b - Aᵀr|² / σ²: χ² of 2k - 3 for k vectors with such noise.
+        Twice Wahba's loss, Σ |b - Aᵀr|² / σ²: χ² with 2k - 3 degrees of freedom for k vectors with that noise.
 
     Examples
     --------
@@ -53,30 +53,31 @@ def attitude_of_vectors(
     *,
     method: VectorMethod = "quest",
 ) -> VectorAttitudes:
-    r"""Estimate the attitude of each instant from two or more vectors, each instant on its own.
+    r"""Estimate the attitude of each instant independently from two or more vectors.
 
-    ``quest`` minimises :math:`\sum |b_k - A^T r_k|^2 / \sigma_k^2` of unit vectors, by the largest eigenvalue of
-    Davenport's matrix; its covariance is :math:`(\sum (E - b_k b_k^T)/\sigma_k^2)^{-1}`. ``triad`` takes the first
-    vector for exact in direction and the second one for the turn around it; its covariance is that of Shuster and Oh.
+    ``quest`` minimises :math:`\sum |b_k - A^T r_k|^2 / \sigma_k^2` of unit vectors by the largest eigenvalue of
+    Davenport's matrix. Its covariance is :math:`(\sum (E - b_k b_k^T)/\sigma_k^2)^{-1}`. ``triad`` takes the direction
+    of the first vector as exact and uses the second one for the rotation about it. Its covariance is that of Shuster
+    and Oh.
 
     Parameters
     ----------
     body_vectors, frame_vectors : sequence of array_like, shape (n, 3)
         The same vectors in both frames, of any length; NaN where one is missing.
     sigma_rad : sequence of array_like, shape () or (n,)
-        Noise of the direction of each, about each axis across it.
+        Noise of the direction of each vector, about each axis across it.
     method : str
-        ``quest``, or ``triad`` of the first two.
+        ``quest``, or ``triad`` with the first two vectors.
 
     Returns
     -------
     VectorAttitudes
-        Frame from body, with covariance and loss.
+        Attitudes, frame from body, with covariance and loss.
 
     Raises
     ------
     ValueError
-        Fewer than two vectors, shapes that do not match, or a noise that is not positive.
+        There are fewer than two vectors, shapes do not match, or a noise is not positive.
 
     Examples
     --------

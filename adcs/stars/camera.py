@@ -14,9 +14,9 @@ from arrays.typing import FloatArray
 MOST_PIXELS = 100_000
 """Largest number of pixels of either side of an image."""
 SCALE_ARCSEC = (0.01, 3600.0)
-"""Of a pixel: from the largest telescopes to a degree."""
+"""Range of a pixel's size, from the largest telescopes to one degree."""
 WIDEST_RAD = math.radians(150.0)
-"""Between opposite corners: no lens that maps like a pinhole shows more."""
+"""Largest angle between opposite corners; no pinhole lens shows more."""
 
 
 @dataclass(frozen=True)
@@ -25,10 +25,12 @@ class StarCamera:
 
     Attributes
     ----------
+    width_px, height_px : int
+        Size of the image.
     rad_per_px : float
-        Scale at the centre [rad/px].
+        Scale at the centre.
     radial : float
-        Distortion: positive where a star stands nearer to the centre than through a pinhole.
+        Distortion; if positive, a star is nearer to the centre than with a pinhole.
 
     Raises
     ------
@@ -55,7 +57,7 @@ class StarCamera:
         if self.diagonal_rad > WIDEST_RAD:
             raise ValueError(
                 f"Input camera must be at most {math.degrees(WIDEST_RAD):.0f}° wide from corner to corner; "
-                f"instead received one of {math.degrees(self.diagonal_rad):.1f}°."
+                f"instead received {math.degrees(self.diagonal_rad):.1f}°."
             )
 
     @property
@@ -75,19 +77,19 @@ class StarCamera:
 
     @property
     def corner_shift_px(self) -> float:
-        """Distortion at a corner [px], negative towards the centre."""
+        """Displacement of a corner by the distortion, negative towards the centre."""
         bent, x = self.radial * self.corner**2, 1.0
-        for _ in range(8):  # Newton's steps to x (1 + bent x²) = 1
+        for _ in range(8):  # Newton's method for x (1 + bent x²) = 1
             x -= (x * (1.0 + bent * x**2) - 1.0) / (1.0 + 3.0 * bent * x**2)
         return 0.5 * math.hypot(self.width_px, self.height_px) * (x - 1.0)
 
     def tangents(self, points_px: ArrayLike) -> FloatArray:
-        """Return components (f, 2) across the line of sight over that along it, of points (f, 2), y up.
+        """Return the tangents (f, 2) of points (f, 2), y up: components across the line of sight over that along it.
 
         Raises
         ------
         ValueError
-            The shape is another one, or a number is not finite.
+            The shape does not match, or a number is not finite.
         """
         points = np.asarray(points_px, dtype=np.float64)
         if points.ndim != 2 or points.shape[1] != 2 or not np.isfinite(points).all():

@@ -31,10 +31,11 @@ class StarCatalogue:
     Attributes
     ----------
     numbers : ndarray, shape (n,)
-        Such as those of Hipparcos.
+        Numbers of the stars, such as those of Hipparcos.
     directions : ndarray, shape (n, 3)
         Unit vectors in the catalogue's frame.
     magnitudes : ndarray, shape (n,)
+        Magnitudes.
     """
 
     numbers: IntArray
@@ -67,7 +68,7 @@ class StarCatalogue:
     def aberrated(self, velocity_m_s: ArrayLike) -> StarCatalogue:
         """Return the catalogue with aberration, up to v/c towards the velocity; 20.5″ for the Earth.
 
-        ``velocity_m_s`` (3,): from the solar system's centre, in the catalogue's frame.
+        ``velocity_m_s`` (3,): velocity against the solar system's centre, in the catalogue's frame.
         """
         beta = np.asarray(velocity_m_s, dtype=np.float64) / speed_of_light
         along = self.directions @ beta
@@ -82,7 +83,7 @@ class StarCatalogue:
 
     @cached_property
     def cells(self) -> SkyCells:
-        """Directions by their cell of a cube, for compiled search."""
+        """Directions by their cell of a cube, for the compiled search."""
         cell = np.clip(((self.directions + 1.0) * (0.5 * CELLS)).astype(np.intp), 0, CELLS - 1)
         number = cell @ np.array([CELLS * CELLS, CELLS, 1])
         order = np.argsort(number, kind="stable")

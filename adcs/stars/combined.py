@@ -1,4 +1,4 @@
-"""Combination of fixes of several star cameras to readings of one star tracker."""
+"""Combination of fixes of several star cameras into readings of one star tracker."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ class StarReadings(NamedTuple):
     Attributes
     ----------
     time_s : ndarray, shape (n,)
-        Ascending.
-    rotation : Rotation
-        Catalogue from body, n of them.
+        Ascending times.
+    rotation : Rotation of n
+        Attitudes, catalogue from body.
     covariance_rad2 : ndarray, shape (n, 3, 3)
-        Of a small turn about the body's axes.
+        Covariance of a small rotation about the body's axes.
 
     Examples
     --------
@@ -41,25 +41,25 @@ class StarReadings(NamedTuple):
 def combined_star_fixes(
     time_s: ArrayLike, fixes: Sequence[StarFix | NoFix], body_from_frame: Rotation | Sequence[Rotation]
 ) -> StarReadings:
-    r"""Combine fixes of star cameras to the attitude of their body at each instant with a fix.
+    r"""Combine fixes of star cameras into the attitude of their body at each instant with a fix.
 
-    A camera tells the turn about its line of sight some ten times worse than those across; two that look elsewhere tell
-    all three. Fixes of one instant are averaged by their information,
+    A camera measures the rotation about its line of sight about ten times worse than those across it. Two cameras with
+    different lines of sight measure all three well. Fixes of one instant are averaged by their information,
     :math:`\delta\theta = (\sum C_k^{-1})^{-1} \sum C_k^{-1} \delta\theta_k`, all about the body's axes.
 
     Parameters
     ----------
     time_s : array_like, shape (m,)
-        Of the fixes, in any order.
+        Times of the fixes, in any order.
     fixes : sequence of StarFix or NoFix
-        Of :func:`adcs.identify_stars`; what is no fix is left out.
+        Results of :func:`adcs.identify_stars`; NoFix is ignored.
     body_from_frame : Rotation or sequence of Rotation
-        How a camera is mounted: of all fixes, or of each. The frame's axes are x to the right, y up, z out of the sky.
+        Mounting of the camera, of all fixes or of each. The camera frame has x to the right, y up, z out of the sky.
 
     Returns
     -------
     StarReadings
-        For ``adcs.Telemetry(time_s, star=rotation, star_covariance_rad2=covariance_rad2)``.
+        Readings for ``adcs.Telemetry(time_s, star=rotation, star_covariance_rad2=covariance_rad2)``.
 
     Raises
     ------

@@ -3,14 +3,14 @@
 A folder of frames has
 
 - ``calibration.txt``: lines ``IMG_X=1392``, ``IMG_Y=1040`` (size in pixels) and ``PIXSCALE=15.78`` (arc seconds per
-  pixel); other lines are left alone;
-- ``input.csv``: one line for each frame, three numbers for each star: x to the right, y **up** (pixels, as one looks at
-  the sky), magnitude;
-- ``result.csv``, optional: for each star of each frame its number in the catalogue, or -1 of one that is none.
+  pixel); other lines are ignored;
+- ``input.csv``: one line for each frame with three numbers for each star: x to the right and y **up** (pixels, as seen
+  on the sky), and magnitude;
+- ``result.csv``, optional: the number of each star of each frame in the catalogue, or -1 for no star.
 
-A catalogue is a CSV file with the columns ``hip`` (whole numbers from 0, each once), ``ra_deg``, ``dec_deg`` and
-``mag``, and any others. Its positions should be of the frames' date: a star that moves by a second of arc a year is
-elsewhere after a few years.
+A catalogue is a CSV file with the columns ``hip`` (different whole numbers from 0), ``ra_deg``, ``dec_deg`` and
+``mag``; other columns are ignored. Its positions should be those at the frames' date, because some stars move by a
+second of arc per year.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from arrays.typing import FloatArray, IntArray
 NO_STAR = -1
 COLUMNS = ("hip", "ra_deg", "dec_deg", "mag")
 _LARGEST_NUMBER = 10**15
-"""Of a star: numbers of files are floating-point ones, which have whole numbers up to it and beyond."""
+"""Largest number of a star; floating-point numbers of a file represent whole numbers up to it exactly."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,10 +42,11 @@ class StarFrame:
     Attributes
     ----------
     points_px : ndarray, shape (f, 2)
-        x to the right, y up.
+        Points, x to the right, y up.
     magnitudes : ndarray, shape (f,)
+        Magnitudes.
     numbers : ndarray, shape (f,), optional
-        In the catalogue; -1 where it is no star.
+        Numbers in the catalogue; -1 for no star.
     """
 
     points_px: FloatArray
@@ -54,7 +55,17 @@ class StarFrame:
 
 
 def read_star_catalogue(path: str | PathLike[str]) -> StarCatalogue:
-    """Read a catalogue from a CSV file, see the module.
+    """Read a catalogue from a CSV file; see :mod:`adcs.stars.files`.
+
+    Parameters
+    ----------
+    path : str or path-like
+        CSV file.
+
+    Returns
+    -------
+    StarCatalogue
+        Stars of the file.
 
     Raises
     ------
@@ -80,12 +91,24 @@ def read_star_catalogue(path: str | PathLike[str]) -> StarCatalogue:
 
 
 def read_star_frames(folder: str | PathLike[str]) -> tuple[StarCamera, list[StarFrame]]:
-    """Read the frames of a folder, see the module.
+    """Read the frames of a folder; see :mod:`adcs.stars.files`.
+
+    Parameters
+    ----------
+    folder : str or path-like
+        Folder with ``calibration.txt`` and ``input.csv``.
+
+    Returns
+    -------
+    camera : StarCamera
+        Camera of all frames.
+    frames : list of StarFrame
+        Frames in the order of the file.
 
     Raises
     ------
     InputError
-        A file cannot be read, a number is none, or the numbers of a line do not fit.
+        A file cannot be read, a cell is no number, or the count of numbers in a line is wrong.
     """
     camera = _read_camera(Path(folder) / "calibration.txt")
     frames_path, labels_path = Path(folder) / "input.csv", Path(folder) / "result.csv"
@@ -152,7 +175,7 @@ def _read_camera(path: Path) -> StarCamera:
 
 
 def _read_lines(path: Path, what: str) -> list[tuple[int, FloatArray]]:
-    """Return line number and values of each line that is not blank; a comma may end it."""
+    """Return line number and values of each line that is not blank; a line may end with a comma."""
     rows = []
     for line, text in enumerate(read_text(path, f"a CSV file with {what}").splitlines(), start=1):
         cells = text.strip().rstrip(",")

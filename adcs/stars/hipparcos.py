@@ -19,12 +19,17 @@ _NUMBER, _RA, _DEC, _MOTION_RA, _MOTION_DEC, _MAGNITUDE = (0, 6), (15, 28), (29,
 
 
 def hipparcos_catalogue(year: float = DEFAULT_YEAR) -> StarCatalogue:
-    """Return all 117,955 stars at a date, in the ICRS; needs the extra "stars".
+    """Return the Hipparcos catalogue of 117,955 stars at a date, in the ICRS; it needs the extra "stars".
 
     Parameters
     ----------
     year : float
         Julian year of the images.
+
+    Returns
+    -------
+    StarCatalogue
+        Numbers of Hipparcos, directions in the ICRS, and magnitudes.
 
     Raises
     ------

@@ -20,23 +20,23 @@ from adcs.stars.pose import CameraPose, LensPrior, fit_pose
 from adcs.stars.triangles import AttitudeHypothesis, Checks, TriangleIndex, star_triangles
 from arrays.typing import FloatArray, IntArray
 
-# Brighter neighbours with which a star makes triangles: of the catalogue, and of an image, which has hot pixels too.
+# Number of brighter neighbours with which a star forms triangles, in the catalogue and in an image with hot pixels.
 _BRIGHTER, _IMAGE_BRIGHTER = 4, 8
-# Stars of the catalogue in the triangles, per image on average; of an image; and those that check an attitude.
+# Mean number of catalogue stars in the triangles of an image, of image stars in triangles, and of checking stars.
 _BRIGHT_PER_IMAGE = 30
 _IMAGE_STARS = 30
 _CHECKED = 24
-# Triangles that agree and are checked, of an image: a second of work.
+# Largest number of checked triangle matches of an image: a second of computing.
 _MOST_HYPOTHESES = 250_000
-_ROUNDS = 3  # of hypotheses that match enough stars to be fitted
-_CROWDED = 4.0  # stars about an image, over their mean
-_WIDENED = 2.0  # gate of a hypothesis of three noisy stars
+_ROUNDS = 3  # largest number of groups of hypotheses that are fitted
+_CROWDED = 4.0  # largest density of stars over the mean
+_WIDENED = 2.0  # gate of a hypothesis from three noisy stars over the usual one
 _REFITS = 6
-# Lights are brightest first, and few of a picture may be stars: the chance of the best beginning.
+# Numbers of the brightest lights whose match is tested: in a picture only the brightest may be stars.
 _BEGINNINGS = (15, 30, 60, 100)
-_COMPANIONS = 3  # of the catalogue, within the noise of one place
-_LEAST_SPREAD = 0.5  # of the magnitudes of an image
-_CLEARLY = 2.0  # difference of two squared distances: less is a toss
+_COMPANIONS = 3  # largest number of catalogue stars within the noise of one place
+_LEAST_SPREAD = 0.5  # least spread of the magnitudes of an image
+_CLEARLY = 2.0  # least difference of two costs that decides between two stars
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,16 +46,15 @@ class StarFix:
     Attributes
     ----------
     stars : ndarray, shape (k, 2)
-        Pairs of a star's number in the image and its row in the catalogue.
+        Pairs of a star's index in the image and its row in the catalogue.
     rms_rad : float
-        Root mean square angle of these stars from their catalogue's places [rad].
+        Root mean square angle of these stars from their places in the catalogue.
     log10_chance : float
-        Logarithm of the number of attitudes expected to match as many stars by chance alone.
+        Logarithm of the expected number of attitudes that match as many stars by chance.
     pose : CameraPose
-        The same attitude with its covariance and that of the lens.
+        Attitude and lens with their covariance.
     mirrored : bool
-        Whether the image shows the sky as a mirror does. Attitude and lens are then those of the image with left and
-        right exchanged.
+        Whether the image is mirrored. Attitude and lens are then those of the image with left and right exchanged.
     """
 
     stars: IntArray
@@ -76,12 +75,16 @@ class StarMatcher:
 
     Attributes
     ----------
+    catalogue : StarCatalogue
+        Stars at the date of the images.
+    camera : StarCamera
+        Camera of the images.
     index : TriangleIndex
-        Of the catalogue's stars that an image of this camera shows.
+        Triangles of the catalogue's stars that an image of this camera shows.
     noise_px : float
-        Standard deviation of a centroid, per axis [px].
+        Standard deviation of a centroid, per axis.
     most_chance : float
-        Attitudes as good as the fix that chance may produce.
+        Largest expected number of equally good attitudes by chance.
     """
 
     catalogue: StarCatalogue
@@ -97,9 +100,11 @@ class StarMatcher:
         Parameters
         ----------
         catalogue : StarCatalogue
-            At the date of the images.
+            Stars at the date of the images.
+        camera : StarCamera
+            Camera of the images.
         noise_px : float
-            Standard deviation of a centroid, per axis [px].
+            Standard deviation of a centroid, per axis.
         """
         per_image = camera.solid_angle_sr / (4.0 * math.pi)
         bright = np.argsort(catalogue.magnitudes, kind="stable")[: math.ceil(_BRIGHT_PER_IMAGE / per_image)]
@@ -123,18 +128,23 @@ class StarMatcher:
         Parameters
         ----------
         points_px : array_like, shape (f, 2)
-            x to the right, y up.
+            Stars, x to the right, y up.
         magnitudes : array_like, shape (f,)
-            Their order counts, and of stars that are as near as the noise their differences.
+            Magnitudes. Their order matters, and for stars closer than the noise their differences.
         prior : LensPrior
-            How well the camera is known: exactly, if not stated.
+            Errors of the camera's scale and distortion; by default none.
         mirrored : bool
-            Exchange left and right first.
+            Whether to exchange left and right first.
+
+        Returns
+        -------
+        StarFix or NoFix
+            Attitude and stars, or the reason for which there are none.
 
         Raises
         ------
         ValueError
-            The shapes do not agree, or a number is not finite.
+            The shapes do not match, or a number is not finite.
         """
         tangents = self.camera.tangents(points_px)
         brightness = np.asarray(magnitudes, dtype=np.float64)
@@ -163,7 +173,7 @@ class StarMatcher:
     def _checks(self, stars: int, prior: LensPrior) -> Checks:
         """Return the limits of the search.
 
-        The number of matches that ends it occurs by chance a hundred times less often than is accepted, also in a
+        The number of matches that ends the search occurs by chance a hundred times less often than accepted, even in a
         crowded part of the sky.
         """
         near = _WIDENED * self.gate_rad(self.camera)
@@ -209,9 +219,9 @@ class StarMatcher:
         fainter = magnitudes[star] - self.catalogue.magnitudes[row]
         nearest = fainter[of_star == 0]
         spread = max(1.4826 * float(np.median(np.abs(nearest - np.median(nearest)))), _LEAST_SPREAD)
-        # Magnitudes of other colours and of noise have tails: Student's t of two degrees of freedom.
+        # Magnitudes in other colours and noise have tails: Student's t with two degrees of freedom.
         cost = distance**2 + 3.0 * np.log1p(0.5 * ((fainter - np.median(nearest)) / spread) ** 2)
-        # Each star its best row and each row its best star, if no other is nearly as good.
+        # Each star keeps its best row and each row its best star, unless another one is nearly as good.
         order = np.argsort(cost, kind="stable")
         for of in (star, row):
             order = order[_clear_ranks(of[order], cost[order])]
@@ -224,7 +234,7 @@ class StarMatcher:
         axis = -pose.R_catalogue_from_frame[:, 2]
         around = self.catalogue.tree.query_ball_point(axis, radius, return_length=True)
         covered = float(np.asarray(around)) * (self.gate_rad(pose.camera) / radius) ** 2
-        # Of at least `matched` - 3: the survival function counts what is more than its argument.
+        # At least `matched` - 3 matches; the survival function is that of more than its argument.
         return np.asarray(binom.logsf(matched - 4, np.maximum(stars - 3, 0), min(covered, 1.0)))
 
 
@@ -242,23 +252,28 @@ def identify_stars(
     Parameters
     ----------
     catalogue : StarCatalogue
-        At the date of the images.
+        Stars at the date of the images.
     camera : StarCamera
-        Its scale and its size in pixels.
+        Scale of the images, and their size in pixels.
     frames : iterable of (array_like, array_like)
         Points (f, 2), y up, and magnitudes (f,) of each image; see :meth:`StarMatcher.identify`.
     noise_px : float
         Standard deviation of a star's place, per axis.
     lens : LensPrior
-        Errors of the camera's scale and of its distortion, such as ``adcs.stars.pose.UNKNOWN_LENS``: exact without it.
+        Errors of the camera's scale and distortion, such as ``adcs.stars.pose.UNKNOWN_LENS``; by default none.
     progress : callable, optional
-        Called with 1 after every image.
+        Function that is called with 1 after each image.
 
     Returns
     -------
     list of StarFix or NoFix
-        One for every image: attitude and names of the stars, or why there are none. Images without a fix are tried
-        mirrored too.
+        Attitude and stars of each image, or the reason for which there are none. An image without a fix is also tried
+        mirrored.
+
+    Raises
+    ------
+    ValueError
+        The shapes of an image do not match, or a number is not finite.
 
     Examples
     --------

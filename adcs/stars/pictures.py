@@ -1,7 +1,7 @@
-"""Stars in photographs of the sky: read a picture, and detect lights above the background.
+"""Stars in photographs of the sky: reading of pictures, and detection of lights above the background.
 
-A sky glows, more at one side than at the other, and a lens is darker at its corners: background and noise are those of
-a neighbourhood, not of the picture.
+The sky glows unevenly, and a lens is darker at its corners. So background and noise are those of a neighbourhood, not
+of the whole picture.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ SUFFIXES = (".png", ".tif", ".tiff", ".fits", ".fit", ".jpg", ".jpeg")
 _BLOCK_PX = 32
 LEAST_PX = 2 * _BLOCK_PX
 """Least width and height of a picture."""
-_STAR_PX = 1.0  # standard deviation of a star's light, with which it is looked for
+_STAR_PX = 1.0  # standard deviation of a star's light in the detection
 _THRESHOLD_SIGMAS = 5.0
-_HOT_SHARE = 0.85  # of a light that one pixel has: more than any optics leaves to one
+_HOT_SHARE = 0.85  # share of a light in one pixel above which it is a hot pixel
 _HALF_WINDOW = 3
-_WEIGHT_PX, _ROUNDS = 1.2, 6  # of centroids
+_WEIGHT_PX, _ROUNDS = 1.2, 6  # width of the weight of centroids, and number of iterations
 _SIGMA_OF_MAD = 1.4826
 _MOST_PIXELS = 10**8
 _FITS_BLOCK, _FITS_CARD = 2880, 80
@@ -41,9 +41,9 @@ _FITS_TYPES = {8: ">u1", 16: ">i2", 32: ">i4", -32: ">f4", -64: ">f8"}
 class PictureStars:
     """Lights of a picture, brightest first."""
 
-    points_px: FloatArray  # (n, 2): x to the right, y up, of centres: the first pixel's is (0.5, 0.5) from below
-    sigma_px: FloatArray  # (n,): per axis, from the noise alone
-    flux: FloatArray  # (n,): above the background
+    points_px: FloatArray  # (n, 2): centroids, x to the right, y up; the centre of the lower left pixel is (0.5, 0.5)
+    sigma_px: FloatArray  # (n,): standard deviations per axis, from the noise alone
+    flux: FloatArray  # (n,): sums above the background
     saturated: BoolArray  # (n,)
 
     @property
@@ -63,12 +63,17 @@ def read_picture(path: str | PathLike[str]) -> FloatArray:
     Parameters
     ----------
     path : str or path-like
-        Colours are averaged.
+        Picture; its colours are averaged.
+
+    Returns
+    -------
+    ndarray, shape (height, width)
+        Grey values as in the file, any unit; the first row is at the top.
 
     Raises
     ------
     InputError
-        The file cannot be read or is no picture of such a kind.
+        The file cannot be read or is no such picture.
 
     Examples
     --------
@@ -90,7 +95,7 @@ def read_picture(path: str | PathLike[str]) -> FloatArray:
         raise
     except Image.DecompressionBombError:
         raise InputError(f"{path}: found too many pixels, expected 10⁸ at most.") from None
-    except Exception:  # whatever the decoder makes of a file that is none
+    except Exception:  # decoders raise many kinds of errors for other files
         raise InputError(
             f"{path}: found no picture that can be read, expected a whole PNG, TIFF or JPEG file of 8 or 16 bits."
         ) from None
@@ -113,7 +118,7 @@ def _fits(path: str | PathLike[str], data: bytes) -> FloatArray:
         kind = np.dtype(_FITS_TYPES[int(header["BITPIX"])])
         width, height = int(header["NAXIS1"]), int(header["NAXIS2"])
         values = np.frombuffer(data, kind, width * height, start).reshape(height, width)
-        with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is refused
+        with np.errstate(invalid="ignore", over="ignore"):  # _check_picture refuses numbers that are not finite
             scaled = float(header.get("BSCALE", 1.0)) * values + float(header.get("BZERO", 0.0))
     except (KeyError, OverflowError, ValueError):
         raise InputError(
@@ -132,17 +137,17 @@ def _check_picture(path: str | PathLike[str], values: np.ndarray) -> FloatArray:
 def find_picture_stars(picture: FloatArray, dark: FloatArray | None = None) -> PictureStars:
     """Detect lights whose sum over a star's size is five standard deviations above the background.
 
-    Background and noise are the median of blocks of 32 pixels and the standard deviation about it, smooth between them.
-    A light that one pixel has nearly alone is a hot pixel. Centroids are the first moments under a Gaussian that
-    follows them, in a window of 7 pixels.
+    Background and noise are the median of blocks of 32 pixels and the standard deviation about it, interpolated between
+    blocks. A light nearly all in one pixel is a hot pixel. Centroids are first moments, weighted by a Gaussian about
+    the centroid, in a window of 7 pixels.
 
-    ``picture``, ``dark`` (height, width): the latter is subtracted. Returns them brightest first.
+    ``picture``, ``dark`` (height, width): the dark picture is subtracted. The brightest light comes first.
     """
     values = picture if dark is None else picture - dark
-    level = _neighbourhood_statistic(values, _median)
+    level = _neighbourhood_statistic(values, lambda block: float(np.median(block)))
     above = values - level
     noise = _neighbourhood_statistic(above, _deviation(1.0))
-    # Sum with the star's own shape, and its own noise: that of neighbouring pixels may be alike.
+    # The noise of the sum with the star's shape is measured, because noise of neighbouring pixels may be correlated.
     kernel = np.exp(-0.5 * (np.arange(-_HALF_WINDOW, _HALF_WINDOW + 1) / _STAR_PX) ** 2)
     kernel /= kernel.sum()
     smooth = ndimage.correlate1d(ndimage.correlate1d(above, kernel, axis=0), kernel, axis=1)
@@ -169,8 +174,8 @@ def find_picture_stars(picture: FloatArray, dark: FloatArray | None = None) -> P
 def _centroids(windows: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return centroids (n, 2) from the middle of windows, and their σ (n,) per noise of a pixel.
 
-    The weight is a Gaussian about the centroid itself, so that it favours no place within a pixel; as it is as wide as
-    a light, its first moment is half of the distance.
+    The weight is a Gaussian about the centroid, so that no place within a pixel is favoured. It is as wide as a light,
+    so its first moment is half of the distance.
     """
     around = np.arange(-_HALF_WINDOW, _HALF_WINDOW + 1)
     offsets = np.zeros((len(windows), 2))
@@ -203,7 +208,7 @@ def _neighbourhood_statistic(values: FloatArray, statistic: Callable[[FloatArray
 def _deviation(least: float) -> Callable[[FloatArray], float]:
     """Return a clipped standard deviation, within five σ, not below a least value.
 
-    The median distance alone would be one of the whole numbers of a picture of 8 bits.
+    In a picture of 8 bits the median distance alone would be a whole number.
     """
 
     def deviation(block: FloatArray) -> float:
@@ -212,7 +217,3 @@ def _deviation(least: float) -> Callable[[FloatArray], float]:
         return max(math.sqrt(float(np.mean(distance[distance <= 5.0 * usual] ** 2))), least)
 
     return deviation
-
-
-def _median(block: FloatArray) -> float:
-    return float(np.median(block))

@@ -33,11 +33,11 @@ class CameraPose:
     Attributes
     ----------
     R_catalogue_from_frame : ndarray, shape (3, 3)
-        Rotation of components in the frame's axes into those of the catalogue.
+        Rotation matrix, catalogue from camera frame.
     camera : StarCamera
-        With the scale and the distortion that fit best.
+        Camera with the fitted scale and distortion.
     covariance : ndarray, shape (5, 5)
-        Of small turns about the frame's axes [rad], of the logarithm of the scale, and of the distortion.
+        Covariance of small rotations about the frame's axes [rad], the logarithm of the scale, and the distortion.
     """
 
     R_catalogue_from_frame: FloatArray
@@ -50,8 +50,8 @@ def fit_pose(
 ) -> CameraPose:
     """Refine a pose by one Gauss–Newton step, from stars (k, 2) and directions (k, 3) in the catalogue.
 
-    A star at v = Rᵀd has the tangents t = (v₁, v₂) / −v₃; a turn δθ about the frame's axes moves it by v × δθ. They are
-    those of its point, a x (1 + κ a²|x|²), but for the noise. The covariance is that of the residuals' own scatter.
+    A star at v = Rᵀd has the tangents t = (v₁, v₂) / −v₃. A rotation δθ about the frame's axes moves it by v × δθ.
+    Without noise, t equals a x (1 + κ a²|x|²) of the star's point x. The covariance uses the scatter of the residuals.
     """
     v = there @ pose.R_catalogue_from_frame
     pinhole = replace(pose.camera, radial=0.0).tangents(points_px)

@@ -15,13 +15,13 @@ from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc import core
 
 NEIGHBOURS = 24
-"""Among which brighter ones are looked for."""
+"""Number of nearest neighbours among which brighter stars are searched."""
 KEPT = 8
-"""Best hypotheses."""
+"""Number of best hypotheses."""
 _RATIOS = 64
-"""Cells of a ratio of two sides."""
+"""Number of cells of a ratio of two sides."""
 _BLOCK = 16
-"""Triangles of an image that one call looks up, each in up to a millisecond."""
+"""Triangles of an image per call; each takes up to a millisecond."""
 
 
 class StarTriangles(NamedTuple):
@@ -35,19 +35,19 @@ class StarTriangles(NamedTuple):
 class Checks(NamedTuple):
     """Limits that an attitude hypothesis must pass."""
 
-    side: float  # chord within which sides agree
+    side: float  # largest difference of two sides, as chords
     scale: float  # relative error of the image's scale
-    near: float  # chord within which a star of the image is one of the catalogue
-    stars: int  # of the image, brightest first
-    enough: int  # of these, with which a search ends
-    most: int  # attitudes, with which it ends too
+    near: float  # largest chord between a star of the image and its place in the catalogue
+    stars: int  # number of the image's brightest stars that are checked
+    enough: int  # number of matches that ends a search
+    most: int  # number of attitudes that ends a search
 
 
 def star_triangles(directions: FloatArray, longest: float, brighter: int) -> StarTriangles:
     """Return the triangles of each star with its nearest brighter neighbours.
 
-    ``directions`` (n, 3): unit vectors, brightest first. ``longest``: longest side, a chord. ``brighter``: neighbours
-    of each star. Returns: each triangle once.
+    ``directions`` (n, 3): unit vectors, brightest first. ``longest``: longest side, a chord. ``brighter``: number of
+    neighbours of each star. Each triangle is returned once.
     """
     n = len(directions)
     k = min(NEIGHBOURS + 1, n)
@@ -63,7 +63,7 @@ def star_triangles(directions: FloatArray, longest: float, brighter: int) -> Sta
     order = np.argsort(opposite, axis=1)
     corners, sides = np.take_along_axis(corners, order, axis=1), np.take_along_axis(opposite, order, axis=1)
     short = (sides[:, 2] > 0.0) & (sides[:, 2] <= longest)  # stars at one place make no triangle
-    # Turned inside out: the triple product is positive for corners that go round clockwise seen from the centre.
+    # The triple product is positive for corners that are clockwise seen from the centre.
     a, b, c = np.moveaxis(directions[corners[short]], 1, 0)
     return StarTriangles(corners[short], sides[short], np.sum(np.cross(a, b) * c, axis=-1) < 0.0)
 
@@ -72,9 +72,9 @@ def star_triangles(directions: FloatArray, longest: float, brighter: int) -> Sta
 class AttitudeHypothesis:
     """Attitude from the match of one triangle."""
 
-    R: FloatArray  # (3, 3): into the catalogue's frame from the image's
-    scale: float  # relative to the image's
-    tried: int  # hypotheses so far
+    R: FloatArray  # (3, 3): catalogue from image
+    scale: float  # scale relative to the image's
+    tried: int  # number of hypotheses so far
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +83,7 @@ class TriangleIndex:
 
     bright: FloatArray  # (n, 3): directions of stars that make triangles, brightest first
     triangles: StarTriangles  # by cell of the ratios, and in it by the longest side
-    begins: IntArray  # (_RATIOS² + 1,): of the cells
+    begins: IntArray  # (_RATIOS² + 1,): first triangle of each cell
 
     @classmethod
     def of(cls, bright: FloatArray, longest: float, brighter: int) -> TriangleIndex:
@@ -99,9 +99,9 @@ class TriangleIndex:
     def best(
         self, tangents: FloatArray, image: StarTriangles, sky: SkyCells, checks: Checks
     ) -> Iterator[list[AttitudeHypothesis]]:
-        """Yield the best hypotheses that match further stars, for a part of the image's triangles at a time.
+        """Yield the best hypotheses that match further stars, for one part of the image's triangles at a time.
 
-        ``tangents`` (f, 2): of the image's stars, brightest first.
+        ``tangents`` (f, 2): tangents of the image's stars, brightest first.
         """
         n, known = len(image.corners), self.triangles
         progress = np.zeros(2, np.int64)

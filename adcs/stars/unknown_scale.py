@@ -20,7 +20,7 @@ from adcs.stars.pose import UNKNOWN_LENS
 from arrays.io.errors import check_positive
 from arrays.typing import FloatArray
 
-_STARS = 100  # of a picture, the brightest: what is fainter than all of the catalogue tells nothing
+_STARS = 100  # number of the brightest lights in use; the catalogue has no fainter stars
 _WIDEST_TOLERANCE = 0.1
 _FIRST_FIELD_RAD, _LAST_FIELD_RAD = math.radians(3.0), math.radians(45.0)
 
@@ -39,30 +39,30 @@ def solve_photograph(
     Parameters
     ----------
     picture : array_like, shape (height, width)
-        Grey, any unit, its first row at the top, such as of :func:`adcs.read_picture`.
+        Grey picture in any unit, the first row at the top, such as from :func:`adcs.read_picture`.
     catalogue : StarCatalogue
-        Such as :func:`adcs.hipparcos_catalogue`.
+        Catalogue, such as :func:`adcs.hipparcos_catalogue`.
     rad_per_px : float, optional
-        Scale at the centre; without it fields of 3 to 45° from corner to corner are tried.
+        Scale at the centre; by default fields of 3 to 45° from corner to corner are tried.
     tolerance : float
-        Relative error of that scale, 0.1 at most.
+        Relative error of that scale, at most 0.1.
     noise_px : float
-        Standard deviation of a star's place, with what the lens bends.
+        Standard deviation of a star's place, with errors of the lens.
     dark : array_like, shape (height, width), optional
-        What the camera shows without a sky; it is subtracted.
+        Picture of the camera without light, which is subtracted.
 
     Returns
     -------
     stars : PictureStars
-        Lights that were found, brightest first.
+        Detected lights, brightest first.
     fix : StarFix or NoFix
-        Attitude, scale, distortion and the names of the stars, or why there are none. A picture without a fix is tried
-        mirrored too.
+        Attitude, scale, distortion and stars, or the reason for which there are none. A picture without a fix is also
+        tried mirrored.
 
     Raises
     ------
     ValueError
-        A shape or number is not of this kind.
+        A shape does not match, or a number is out of range.
 
     Examples
     --------
@@ -102,10 +102,10 @@ def identify_at_unknown_scale(
     tolerance: float = 0.05,
     noise_px: float = 0.5,
 ) -> StarFix | NoFix:
-    """Attitude, scale and stars of a picture.
+    """Identify attitude, scale and stars of a picture.
 
-    ``rad_per_px``: at the centre, within ``tolerance`` of it, 0.1 at most; without one, fields of 3 to 45° from corner
-    to corner are tried. ``noise_px``: standard deviation of a star's place, with what a lens bends.
+    ``rad_per_px``: scale at the centre with the relative error ``tolerance``, at most 0.1; by default fields of 3 to
+    45° from corner to corner are tried. ``noise_px``: standard deviation of a star's place, with errors of the lens.
     """
     check_positive(tolerance=tolerance, noise_px=noise_px)
     if tolerance > _WIDEST_TOLERANCE:
@@ -124,13 +124,13 @@ def identify_at_unknown_scale(
 
 
 def _scales(diagonal_px: float, rad_per_px: float | None, tolerance: float) -> tuple[list[float], float]:
-    """Scales to try, and how far from each the true one may be."""
+    """Return the scales to try, and their relative error."""
     if rad_per_px is not None:
         return [rad_per_px], tolerance
     step = (1.0 + _WIDEST_TOLERANCE) / (1.0 - _WIDEST_TOLERANCE)
     n = math.ceil(math.log(_LAST_FIELD_RAD / _FIRST_FIELD_RAD) / math.log(step))
     fields = _FIRST_FIELD_RAD * step ** np.arange(n + 1)
-    # From those of ten degrees outwards: most star cameras.
+    # Fields near ten degrees come first, as most star cameras have them.
     fields = fields[np.argsort(np.abs(np.log(fields / math.radians(10.0))))]
     return [
         math.atan(2.0 * math.tan(0.5 * min(field, WIDEST_RAD)) / diagonal_px) for field in fields

@@ -1,3 +1,3 @@
-"""Attitude results seen in three dimensions, in a browser."""
+"""Viewer of attitude results in three dimensions, in a browser."""
 
 from magloc.viewer import viser as viser  # names the extra that is missing, if it is

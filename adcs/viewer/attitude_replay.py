@@ -1,4 +1,4 @@
-"""What a replay of an attitude shows: body axes, what is believed of them, directions measured and expected."""
+"""Data of a replay of an attitude: body axes, uncertainties, directions measured and expected."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.truth import nearest_rows
 
 ENLARGEMENTS = (1.0, 10.0, 100.0, 1e3, 1e4)
-_SEEN_DEG = 10.0  # what an enlarged error or cone is at most, usually
+_LARGEST_DRAWN_DEG = 10.0  # most enlarged errors and cones are below it
 _SAME_INSTANT = 1e-6
 _LARGEST_RAD = math.radians(80.0)
 SENSOR_WORDS = {"st": "star tracker", "gyro": "gyro", "mag": "magnetometer", "sun": "Sun sensor"}
@@ -27,7 +27,7 @@ SENSOR_WORDS = {"st": "star tracker", "gyro": "gyro", "mag": "magnetometer", "su
 
 @dataclass(frozen=True, eq=False)
 class Direction:
-    """A direction that a sensor measures.
+    """Direction that a sensor measures.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ class Direction:
 
 @dataclass(frozen=True, eq=False)
 class AttitudeReplay:
-    """An attitude at n instants, and what it was made of.
+    """Attitude at n instants, with its measurements.
 
     Attributes
     ----------
@@ -54,14 +54,14 @@ class AttitudeReplay:
         Names of the frame's axes, the last one upwards.
     time_s : ndarray, shape (n,)
     q : ndarray, shape (n, 4)
-        Frame from body, scalar first.
+        Estimated attitude, frame from body, scalar first.
     sigma_rad : ndarray, shape (n, 3)
-        Standard deviation about each body axis; NaN where none is known.
+        Standard deviation about each body axis [rad], NaN where unknown.
     q_true : ndarray, shape (n, 4)
-        NaN where unknown.
+        True attitude, NaN where unknown.
     directions : tuple of Direction
     seen, rejected : mapping of str to ndarray of bool, shape (n,)
-        Where each sensor has a reading, and where it was not used.
+        Rows in which each sensor has a reading, and rows in which it was not used.
     """
 
     title: str
@@ -76,12 +76,12 @@ class AttitudeReplay:
 
     @cached_property
     def known(self) -> BoolArray:
-        """Where the truth is, shape (n,)."""
+        """Whether the truth is known in each row, shape (n,)."""
         return np.asarray(np.isfinite(self.q_true).all(axis=1))
 
     @cached_property
     def errors_rad(self) -> FloatArray:
-        """Turns (n, 3) from the true body axes to the estimated ones, in these; NaN where no truth is."""
+        """Rotation vectors (n, 3) from true to estimated body axes, in these; NaN where unknown."""
         errors = np.full((len(self.q), 3), np.nan)
         if self.known.any():
             turn = quaternion.to_rotation(self.q_true[self.known]).inv() * quaternion.to_rotation(self.q[self.known])
@@ -89,23 +89,26 @@ class AttitudeReplay:
         return errors
 
     @cached_property
-    def enlarged(self) -> float:
-        """The largest of :data:`ENLARGEMENTS` that draws usual errors and 3σ below 10°."""
+    def enlargement(self) -> float:
+        """Largest of :data:`ENLARGEMENTS` that draws most errors and 3σ below 10°."""
         sizes = np.concatenate([np.abs(self.errors_rad), 3.0 * self.sigma_rad])
         sizes = sizes[np.isfinite(sizes)]
         usual = float(np.degrees(np.percentile(sizes, 90.0))) if sizes.size else math.inf
-        return max((value for value in ENLARGEMENTS if value * usual <= _SEEN_DEG), default=1.0)
+        return max((value for value in ENLARGEMENTS if value * usual <= _LARGEST_DRAWN_DEG), default=1.0)
 
-    def drawn(self, row: int, enlarged: float) -> Rotation:
-        """Attitude (frame from body) with its error so many times as large, where the truth is known."""
+    def enlarged_attitude(self, row: int, enlargement: float) -> Rotation:
+        """Return the attitude (frame from body) with an enlarged error, if the truth is known."""
         if not self.known[row]:
             return quaternion.to_rotation(self.q[row])
-        return quaternion.to_rotation(self.q_true[row]) * Rotation.from_rotvec(enlarged * self.errors_rad[row])
+        return quaternion.to_rotation(self.q_true[row]) * Rotation.from_rotvec(enlargement * self.errors_rad[row])
 
-    def cones(self, row: int, enlarged: float) -> FloatArray:
-        """Tangents (3, 2) of the half-angles that 3σ gives each body axis, along the next one and the one after it."""
-        half = np.minimum(3.0 * enlarged * self.sigma_rad[row], _LARGEST_RAD)
-        # A turn about the third axis moves the first one along the second.
+    def cones(self, row: int, enlargement: float) -> FloatArray:
+        """Return the tangents (3, 2) of the half-angles of each body axis' 3σ cone.
+
+        The two half-angles of an axis are along the next axis and along the one after it.
+        """
+        half = np.minimum(3.0 * enlargement * self.sigma_rad[row], _LARGEST_RAD)
+        # A rotation about the third axis moves the first one along the second.
         return np.tan(np.stack([np.roll(half, -2), np.roll(half, -1)], axis=1))
 
 
@@ -116,7 +119,10 @@ def replay_of(
     truth: FloatArray | None,
     title: str,
 ) -> AttitudeReplay:
-    """Replay of a track, with the readings that it was made of; ``truth`` (k, 4) is at their rows, or at its own."""
+    """Return the replay of a track with its readings.
+
+    ``truth`` (k, 4): true attitudes at the rows of the readings, or of the track without readings.
+    """
     q = track.q if track.q_orbital is None else track.q_orbital
     n = len(track)
     own_s, axes = track.time_s, ("x", "y", "z")
@@ -155,21 +161,21 @@ def replay_of(
         sigma,
         q_true,
         tuple(one for one in directions if np.isfinite(one.measured).any()),
-        {SENSOR_WORDS.get(name, name): there for name, there in track.seen.items() if there.any()},
-        {SENSOR_WORDS.get(name, name): there for name, there in track.rejected.items() if there.any()},
+        {SENSOR_WORDS.get(name, name): rows for name, rows in track.seen.items() if rows.any()},
+        {SENSOR_WORDS.get(name, name): rows for name, rows in track.rejected.items() if rows.any()},
     )
 
 
 def rows_at(wanted_s: FloatArray, time_s: FloatArray) -> IntArray:
-    """Row of each wanted instant, −1 where there is none."""
+    """Return the row of each wanted instant, −1 where there is none."""
     nearest = nearest_rows(wanted_s, time_s)
     same = np.abs(time_s[nearest] - wanted_s) <= _SAME_INSTANT * np.maximum(np.abs(wanted_s), 1.0)
     return np.where(same, nearest, -1)
 
 
 def _direction(name: str, measured: FloatArray, expected: FloatArray, at: IntArray) -> Direction:
-    def units(values: FloatArray) -> FloatArray:
-        found = np.where((at >= 0)[:, None], values[at], np.nan)
-        return np.asarray(found / np.linalg.norm(found, axis=1, keepdims=True))
+    def unit_vectors(values: FloatArray) -> FloatArray:
+        vectors = np.where((at >= 0)[:, None], values[at], np.nan)
+        return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
 
-    return Direction(name, units(measured), units(expected))
+    return Direction(name, unit_vectors(measured), unit_vectors(expected))

@@ -1,4 +1,4 @@
-"""What a replay shows: a drive on the table, its estimate, its late fixes, and the frames they came from."""
+"""Data of a replay: a drive on the table, its estimate, its late fixes, and their camera frames."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from adcs.mockup.vision.paper_matcher import CameraFix
 from adcs.stars.identification import NoFix
 from arrays.typing import ByteArray, FloatArray
 
-SETTLED_S = 10.0
-"""Scales are chosen for what comes after it."""
+SETTLING_S = 10.0
+"""Time of the first transient, which scales ignore."""
 
 
 @dataclass(frozen=True, eq=False)
-class SeenFrame:
-    """A frame of the camera and what was identified in it.
+class IdentifiedFrame:
+    """Frame of the camera with its identified stars.
 
     Attributes
     ----------
     image : ndarray of uint8, shape (height, width)
     stars_px : ndarray, shape (f, 2)
-        Column and row of the stars that were found.
+        Column and row of all stars that were found.
     fix : CameraFix or NoFix
     """
 
@@ -38,25 +38,25 @@ class SeenFrame:
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """A drive and its estimate.
+    """Drive with its estimate.
 
     Attributes
     ----------
     title : str
     lights_m : ndarray, shape (n, 2)
-        The sky.
+        Lights of the sky [m].
     camera : Camera
     truth, track : PlanarTrack
-        At the same instants, from 0 s on.
+        True and estimated track at the same instants, from 0 s on.
     fixes : FixRecord
-        Those that arrived, in that order.
+        Fixes in the order of their arrival.
     exposure_s : ndarray, shape (k,)
-        When their images were truly taken.
+        True times of their images [s].
     outcomes : tuple of FixOutcome
     sigma_m : ndarray, shape (n, 2), optional
-        Standard deviations of X and Y that the method believes.
+        Standard deviations of X and Y by the method [m].
     frame_of : callable
-        From the number of a fix to its frame; called when the frame is to be seen.
+        It computes the frame of a fix by its number; the player calls it for visible frames only.
     """
 
     title: str
@@ -68,7 +68,7 @@ class Drive:
     exposure_s: FloatArray
     outcomes: tuple[FixOutcome, ...]
     sigma_m: FloatArray | None
-    frame_of: Callable[[int], SeenFrame]
+    frame_of: Callable[[int], IdentifiedFrame]
 
     @cached_property
     def errors_m(self) -> FloatArray:
@@ -77,33 +77,33 @@ class Drive:
 
     @property
     def duration_s(self) -> float:
-        """Of the drive."""
+        """Duration of the drive [s]."""
         return float(self.truth.time_s[-1])
 
     @cached_property
     def usual_error_m(self) -> float:
-        """95 % of the distances between estimate and truth are below, the beginning left out."""
-        late = self.truth.time_s >= min(SETTLED_S, 0.5 * self.duration_s)
+        """95 % quantile of the distance between estimate and truth, without the first transient [m]."""
+        late = self.truth.time_s >= min(SETTLING_S, 0.5 * self.duration_s)
         return float(np.percentile(np.linalg.norm(self.errors_m[late], axis=1), 95.0))
 
     def row_at(self, time_s: float) -> int:
-        """Number of the last instant up to a time; the first one before it."""
+        """Return the number of the last instant up to a time, or of the first instant."""
         return max(0, int(np.searchsorted(self.truth.time_s, time_s + 1e-9, side="right")) - 1)
 
     def last_fix(self, row: int) -> int | None:
-        """Number of the fix that arrived last, if one has."""
+        """Return the number of the latest fix, if there is one yet."""
         arrived = int(np.searchsorted(self.fixes.arrival_s, self.truth.time_s[row], side="right"))
         return arrived - 1 if arrived else None
 
     def true_pose(self, row: int) -> Pose:
-        """Where the satellite is."""
-        return _pose(self.truth.state(row))
+        """Return the true pose of the satellite."""
+        return _planar_pose(self.truth.state(row))
 
     def pose_of_exposure(self, fix: int) -> Pose:
-        """Where it was when the image of a fix was taken."""
-        return _pose(self.truth.at(self.exposure_s[fix : fix + 1]).state(0))
+        """Return the true pose at the exposure of a fix."""
+        return _planar_pose(self.truth.at(self.exposure_s[fix : fix + 1]).state(0))
 
 
-def _pose(state: PlanarState) -> Pose:
+def _planar_pose(state: PlanarState) -> Pose:
     x, y = state.position_m.tolist()
     return Pose(x, y, float(state.heading_rad))

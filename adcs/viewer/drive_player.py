@@ -1,11 +1,11 @@
-"""A drive played through time: slider, play and pause, speed, enlargement of errors; the camera's frame beside it.
+"""Player of a drive: time, speed, enlargement of errors, and the camera's frame.
 
 Use::
 
     player = DrivePlayer(server, drive, scene)
     player.move_to(90.0)
     player.play()
-    player.pause()                           # ends the playing thread; call it before server.stop()
+    player.pause()                           # ends the thread; call it before server.stop()
 """
 
 from __future__ import annotations
@@ -17,41 +17,41 @@ import viser
 
 from adcs.viewer.drive import Drive
 from adcs.viewer.enlargement import enlargement_dropdown
-from adcs.viewer.error_dial import ErrorDial, words_of
-from adcs.viewer.frame_image import marked_image, named_stars
+from adcs.viewer.error_dial import ErrorDial, estimate_lines
+from adcs.viewer.frame_image import identified_stars, mark_stars
 from adcs.viewer.table_scene import ENLARGEMENTS, TableScene
-from magloc.viewer.pages import words
-from magloc.viewer.panels.played_time import PlayedTime
+from magloc.viewer.pages import texts
+from magloc.viewer.panels.time_player import TimePlayer
 
-_FRAMES_KEPT = 32
+_CACHE_SIZE = 32
 _JPEG_QUALITY = 85
 
 
-class DrivePlayer(PlayedTime):
-    """A drive in the scene at one time, and the panels that move the time.
+class DrivePlayer(TimePlayer):
+    """Player of a drive in the scene.
 
-    Frames are rendered and identified when they are to be seen, and a few are kept.
+    Frames are rendered and identified when they become visible, and a few are cached.
 
     Parameters
     ----------
     server : viser.ViserServer
-        The panels are added where its GUI is at present.
+        The panels are added to the present container of its GUI.
     drive : Drive
     scene : TableScene
-        Of this drive.
+        Scene of the drive.
 
     Attributes
     ----------
     row : int
-        That is shown.
+        Present row.
     """
 
     def __init__(self, server: viser.ViserServer, drive: Drive, scene: TableScene) -> None:
         self._drive, self._scene = drive, scene
         self.row = 0
-        self._frame_of = lru_cache(_FRAMES_KEPT)(drive.frame_of)
+        self._frame_of = lru_cache(_CACHE_SIZE)(drive.frame_of)
         self._dial = ErrorDial(drive)
-        self._pictured: int | None = None
+        self._shown_fix: int | None = None
         self._add_panels(server.gui)
         self.move_to(0.0)
 
@@ -81,19 +81,19 @@ class DrivePlayer(PlayedTime):
         frame = None if fix is None else self._frame_of(fix)
         self._scene.show(row, frame)
         self._time.show(float(drive.truth.time_s[row]))
-        self.row_panel.content = words.panel(words_of(drive, row))
-        believed = "" if drive.sigma_m is None else ", with its 3σ ellipse"
-        self.dial_panel.content = self._dial.svg(row) + words.panel(
-            [f"cross: truth; dot: estimate{believed}; line: the last 5 s. Table axes."]
+        self.row_panel.content = texts.panel_html(estimate_lines(drive, row))
+        ellipse = "" if drive.sigma_m is None else ", with its 3σ ellipse"
+        self.dial_panel.content = self._dial.svg(row) + texts.panel_html(
+            [f"cross: truth; dot: estimate{ellipse}; line: the last 5 s. Table axes."]
         )
-        if fix == self._pictured:
+        if fix == self._shown_fix:
             return
-        self._pictured = fix
+        self._shown_fix = fix
         if frame is None:
             self.frame_image.image = self._blank
-            self.frame_panel.content = words.panel(["no fix has arrived"])
+            self.frame_panel.content = texts.panel_html(["no fix has arrived"])
             return
-        self.frame_image.image = marked_image(frame)
-        named = len(named_stars(frame))
-        text = f"frame that the last fix came from: {named} of {len(frame.stars_px)} stars identified"
-        self.frame_panel.content = words.panel([text])
+        self.frame_image.image = mark_stars(frame)
+        n = len(identified_stars(frame))
+        text = f"frame of the last fix: {n} of {len(frame.stars_px)} stars identified"
+        self.frame_panel.content = texts.panel_html([text])

@@ -1,4 +1,4 @@
-"""A dropdown of how many times larger than it is a scene shows an error."""
+"""Dropdown for the enlargement of errors in a scene."""
 
 from __future__ import annotations
 
@@ -8,23 +8,23 @@ from typing import Protocol
 import viser
 
 
-class Enlarging(Protocol):
-    """A scene that enlarges errors."""
+class EnlargedScene(Protocol):
+    """Protocol of a scene with enlarged errors."""
 
-    enlarged: float
+    enlargement: float
 
 
 def enlargement_dropdown(
-    gui: viser.GuiApi, scene: Enlarging, choices: Sequence[float], hint: str, follow: Callable[[], None]
+    gui: viser.GuiApi, scene: EnlargedScene, choices: Sequence[float], hint: str, update: Callable[[], None]
 ) -> viser.GuiDropdownHandle[str]:
-    """The dropdown, which changes the scene and then follows."""
+    """Add a dropdown that changes the enlargement of a scene and then calls an update."""
     dropdown = gui.add_dropdown(
-        "Errors", [f"{value:g} ×" for value in choices], initial_value=f"{scene.enlarged:g} ×", hint=hint
+        "Errors", [f"{value:g} ×" for value in choices], initial_value=f"{scene.enlargement:g} ×", hint=hint
     )
 
     def enlarge(_: object) -> None:
-        scene.enlarged = float(dropdown.value.split()[0])
-        follow()
+        scene.enlargement = float(dropdown.value.split()[0])
+        update()
 
     dropdown.on_update(enlarge)
     return dropdown

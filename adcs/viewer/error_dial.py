@@ -1,4 +1,4 @@
-"""A dial of the present error: where the estimate is as seen from the truth, with its 3σ ellipse, as SVG."""
+"""Dial of the present error: position of the estimate relative to the truth, with its 3σ ellipse."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from adcs.mockup.navigation.fixes import FixOutcome
 from adcs.mockup.navigation.strapdown import wrapped
-from adcs.viewer.drive import SETTLED_S, Drive
+from adcs.viewer.drive import SETTLING_S, Drive
 from arrays.typing import FloatArray
 from magloc.viewer.scene.glyphs import length_text, round_length
 
@@ -19,7 +19,7 @@ _POINTS = 60
 
 
 class ErrorDial:
-    """The error of a drive's estimate at one time.
+    """Dial of the error of a drive's estimate at one time.
 
     Parameters
     ----------
@@ -28,22 +28,20 @@ class ErrorDial:
     Attributes
     ----------
     reach_m : float
-        Of the outer circle: 5 mm, 10 mm, 20 mm, …
+        Radius of the outer circle: 5 mm, 10 mm, 20 mm, … [m].
     """
 
     def __init__(self, drive: Drive) -> None:
         self._drive = drive
-        late = drive.truth.time_s >= min(SETTLED_S, 0.5 * drive.duration_s)
-        wanted = _ROOM * drive.usual_error_m
+        late = drive.truth.time_s >= min(SETTLING_S, 0.5 * drive.duration_s)
+        least_m = _ROOM * drive.usual_error_m
         if drive.sigma_m is not None:
-            wanted = max(wanted, 3.0 * float(np.median(drive.sigma_m[late])) + drive.usual_error_m)
-        # The next round length above.
-        self.reach_m = next(
-            length for length in (round_length(factor * wanted) for factor in (1.0, 2.0, 2.5, 5.0)) if length >= wanted
-        )
+            least_m = max(least_m, 3.0 * float(np.median(drive.sigma_m[late])) + drive.usual_error_m)
+        lengths = (round_length(factor * least_m) for factor in (1.0, 2.0, 2.5, 5.0))
+        self.reach_m = next(length for length in lengths if length >= least_m)
 
     def svg(self, row: int) -> str:
-        """The dial in a row of the drive.
+        """Return the dial for a row of the drive.
 
         Parameters
         ----------
@@ -64,7 +62,7 @@ class ErrorDial:
         parts = [
             *(f'<circle r="{r}" fill="none" stroke="#c4cad0"/>' for r in (0.5 * _HALF, _HALF)),
             f'<path d="M {-_HALF} 0 H {_HALF} M 0 {-_HALF} V {_HALF}" stroke="#c4cad0"/>',
-            f'<polyline points="{_points(trail)}" fill="none" stroke="#56b4e9" stroke-width="2"/>',
+            f'<polyline points="{_svg_points(trail)}" fill="none" stroke="#56b4e9" stroke-width="2"/>',
         ]
         if drive.sigma_m is not None:
             a, b = (3.0 * drive.sigma_m[row] * scale).tolist()
@@ -85,7 +83,7 @@ class ErrorDial:
         )
 
 
-def _points(values: FloatArray) -> str:
+def _svg_points(values: FloatArray) -> str:
     return " ".join(f"{x:.1f},{-y:.1f}" for x, y in values.tolist())
 
 
@@ -93,8 +91,8 @@ def _text(x: float, y: float, text: str, anchor: str) -> str:
     return f'<text x="{x}" y="{y}" font-size="10" fill="currentColor" text-anchor="{anchor}">{text}</text>'
 
 
-def words_of(drive: Drive, row: int) -> Sequence[str]:
-    """What is known in a row, as lines of HTML."""
+def estimate_lines(drive: Drive, row: int) -> Sequence[str]:
+    """Return the estimate and its error in a row as lines of HTML."""
     track, now = drive.track, float(drive.truth.time_s[row])
     error_mm = 1e3 * float(np.hypot(*drive.errors_m[row]))
     turn = float(np.degrees(wrapped(track.heading_rad[row] - drive.truth.heading_rad[row])))
@@ -107,5 +105,5 @@ def words_of(drive: Drive, row: int) -> Sequence[str]:
     if fix is None:
         return [*lines, "no fix has arrived"]
     outcome = drive.outcomes[fix]
-    word = outcome.value if outcome is not FixOutcome.REJECTED else "<b>rejected</b>"
-    return [*lines, f"last fix: taken {now - drive.fixes.time_s[fix]:.2f} s ago, {word}"]
+    text = outcome.value if outcome is not FixOutcome.REJECTED else "<b>rejected</b>"
+    return [*lines, f"last fix: taken {now - drive.fixes.time_s[fix]:.2f} s ago, {text}"]

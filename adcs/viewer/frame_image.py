@@ -1,4 +1,4 @@
-"""The camera's frame as it is shown: with marks in the panel, and as a sheet of the ceiling."""
+"""Pictures of the camera's frame: with marks for the panel, and as a sheet on the ceiling."""
 
 from __future__ import annotations
 
@@ -6,40 +6,37 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from adcs.mockup.vision.paper_matcher import CameraFix
-from adcs.viewer.drive import SeenFrame
+from adcs.viewer.drive import IdentifiedFrame
 from arrays.typing import ByteArray, IntArray
 from magloc.viewer.scene.legend import Colour
 
 IDENTIFIED_COLOUR: Colour = (0, 158, 115)
 OTHER_STAR_COLOUR: Colour = (230, 159, 0)
-_BRIGHTER = 2.0  # lights are faint where nothing saturates
+_BRIGHTENING = 2.0  # because lights are faint in unsaturated frames
 _RING_PX, _LINE_PX = 13, 3
 _SHEET_STEP = 2  # every second pixel is enough on the ceiling
 _SHEET_COLOUR = (30, 36, 48, 150)
 _LIGHT_DN = 30
 
 
-def named_stars(frame: SeenFrame) -> IntArray:
-    """Numbers of the image's stars that the fix names."""
+def identified_stars(frame: IdentifiedFrame) -> IntArray:
+    """Return the numbers of the image's stars that the fix identifies."""
     return frame.fix.stars[:, 0] if isinstance(frame.fix, CameraFix) else np.empty(0, dtype=np.intp)
 
 
-def marked_image(frame: SeenFrame) -> ByteArray:
-    """The frame, brightened, with a ring around each star: green where it is identified, else orange.
+def mark_stars(frame: IdentifiedFrame) -> ByteArray:
+    """Return the brightened frame (height, width, 3) with a ring around each star.
 
-    Returns (height, width, 3).
+    Rings of identified stars are green, the others orange.
     """
-    bright = np.minimum(frame.image * _BRIGHTER, 255.0).astype(np.uint8)
+    bright = np.minimum(frame.image * _BRIGHTENING, 255.0).astype(np.uint8)
     picture = Image.fromarray(bright).convert("RGB")
     _draw_rings(picture, frame, _RING_PX, 1)
     return np.asarray(picture)
 
 
-def ceiling_sheet(frame: SeenFrame) -> ByteArray:
-    """The frame as a translucent sheet: dark, with the stars and their rings.
-
-    Returns (height / 2, width / 2, 4): red, green, blue and opacity.
-    """
+def ceiling_sheet(frame: IdentifiedFrame) -> ByteArray:
+    """Return the frame as a dark translucent sheet with rings (height / 2, width / 2, 4)."""
     height, width = (size // _SHEET_STEP * _SHEET_STEP for size in frame.image.shape)
     blocks = frame.image[:height, :width].reshape(height // _SHEET_STEP, _SHEET_STEP, width // _SHEET_STEP, -1)
     brightest = blocks.max(axis=(1, 3))
@@ -51,10 +48,10 @@ def ceiling_sheet(frame: SeenFrame) -> ByteArray:
     return np.asarray(picture)
 
 
-def _draw_rings(picture: Image.Image, frame: SeenFrame, radius: int, step: int) -> None:
+def _draw_rings(picture: Image.Image, frame: IdentifiedFrame, radius: int, step: int) -> None:
     draw = ImageDraw.Draw(picture)
-    named = set(named_stars(frame).tolist())
+    identified = set(identified_stars(frame).tolist())
     for star, (column, row) in enumerate(frame.stars_px / step):
-        colour = IDENTIFIED_COLOUR if star in named else OTHER_STAR_COLOUR
+        colour = IDENTIFIED_COLOUR if star in identified else OTHER_STAR_COLOUR
         box = (column - radius, row - radius, column + radius, row + radius)
         draw.ellipse(box, outline=colour, width=_LINE_PX)

@@ -1,4 +1,4 @@
-"""The table under its sky in three dimensions: lights, camera's view, true and estimated satellite, late fix."""
+"""Scene of the table under its sky: lights, camera's view, true and estimated satellite, late fix."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from scipy.spatial.transform import Rotation
 from adcs.mockup.navigation.fixes import FixOutcome
 from adcs.mockup.vision.camera import Pose, footprint
 from adcs.mockup.vision.paper_matcher import CameraFix
-from adcs.viewer.drive import Drive, SeenFrame
+from adcs.viewer.drive import Drive, IdentifiedFrame
 from adcs.viewer.frame_image import IDENTIFIED_COLOUR, OTHER_STAR_COLOUR, ceiling_sheet
 from arrays.typing import FloatArray
 from magloc.viewer.scene.framing import Extent, extent_of
-from magloc.viewer.scene.glyphs import screen_label, screen_lines, solid
+from magloc.viewer.scene.glyphs import add_label, add_lines, add_mesh, show_segments
 from magloc.viewer.scene.legend import Colour, Swatch
-from magloc.viewer.scene.shapes import Surface, line_segments, surface_of, unit_circle
+from magloc.viewer.scene.shapes import Surface, fan, line_segments, surface_of, unit_circle
 
 CEILING_M = 1.5
-"""Height of the sky above the table; the source does not tell it."""
+"""Height of the sky above the table [m]; the source does not state it."""
 TRUTH_COLOUR: Colour = (70, 76, 85)
 ESTIMATE_COLOUR: Colour = (0, 114, 178)
 FIX_COLOUR: Colour = (213, 94, 0)
@@ -39,7 +39,7 @@ _TRAIL_POINTS = 400
 
 
 class TableScene:
-    """Table, sky, satellite and what is believed of it, at one time of a drive.
+    """Scene of one time of a drive: table, sky, true and estimated satellite.
 
     Parameters
     ----------
@@ -48,59 +48,56 @@ class TableScene:
 
     Attributes
     ----------
-    enlarged : float
-        How many times the estimate's error and its 3σ ellipse are drawn larger than they are.
+    enlargement : float
+        Factor by which the error of the estimate and its 3σ ellipse are enlarged.
     """
 
     def __init__(self, scene: viser.SceneApi, drive: Drive) -> None:
         self._scene, self._drive = scene, drive
-        self.enlarged = suitable_enlargement(drive.usual_error_m)
+        self.enlargement = suitable_enlargement(drive.usual_error_m)
         self._fix: int | None = None
         self._add_room()
         path = np.column_stack([drive.truth.position_m, np.full(len(drive.truth), 0.003)])
         step = max(1, len(path) // (5 * _TRAIL_POINTS))
-        screen_lines(scene, "/path/whole", line_segments(path[::step]), _PATH_COLOUR, 1.0)
+        add_lines(scene, "/path/whole", line_segments(path[::step]), _PATH_COLOUR, 1.0)
         self._trails = [
-            screen_lines(scene, f"/path/{name}", np.zeros((1, 2, 3)), colour, width, visible=False)
+            add_lines(scene, f"/path/{name}", np.zeros((1, 2, 3)), colour, width, visible=False)
             for name, colour, width in (("truth", TRUTH_COLOUR, 2.5), ("estimate", ESTIMATE_COLOUR, 2.0))
         ]
         self._satellite = scene.add_frame("/satellite", show_axes=False)
-        solid(scene, "/satellite/body", satellite_body(), TRUTH_COLOUR, flat=True)
+        add_mesh(scene, "/satellite/body", satellite_body(), TRUTH_COLOUR, flat=True)
         self._estimate = self._mark("/estimate", ESTIMATE_COLOUR, _HEIGHT_M + 0.01, 4.0)
         self._late = self._mark("/fix", FIX_COLOUR, _HEIGHT_M + 0.006, 3.0)
         self._rejected = self._mark("/rejected-fix", _REJECTED_COLOUR, _HEIGHT_M + 0.006, 3.0)
-        rim = unit_circle()
-        disc, n = np.concatenate([np.zeros((1, 3)), rim[:-1]]), len(rim) - 1
-        faces = np.array([[0, i + 1, (i + 1) % n + 1] for i in range(n)])
-        self._ellipse = solid(scene, "/ellipse", Surface(disc, faces), ESTIMATE_COLOUR, opacity=0.3)
+        self._ellipse = add_mesh(scene, "/ellipse", fan(unit_circle()[:-1]), ESTIMATE_COLOUR, opacity=0.3)
         self._ellipse.visible = False
-        # What the camera sees moves with it: only poses change.
+        # The footprint of the camera moves with it, so that only poses change.
         outline = self._outline_from_body()
         lens = np.array([0.0, 0.0, _HEIGHT_M])
         edges = np.stack([np.broadcast_to(lens, (4, 3)), outline[: -1 : len(outline) // 4]], axis=1)
-        screen_lines(scene, "/satellite/view", np.concatenate([line_segments(outline), edges]), VIEW_COLOUR, 1.6)
+        add_lines(scene, "/satellite/view", np.concatenate([line_segments(outline), edges]), VIEW_COLOUR, 1.6)
         self._exposure = scene.add_frame("/exposure", show_axes=False, visible=False)
-        screen_lines(scene, "/exposure/edge", line_segments(outline), FIX_COLOUR, 2.0)
+        add_lines(scene, "/exposure/edge", line_segments(outline), FIX_COLOUR, 2.0)
         self._sheet: viser.ImageHandle | None = None
-        self._age = screen_label(scene, "/age", "", np.zeros(3))
+        self._age = add_label(scene, "/age", "", np.zeros(3))
         self._age.visible = False
 
-    def show(self, row: int, frame: SeenFrame | None) -> None:
+    def show(self, row: int, frame: IdentifiedFrame | None) -> None:
         """Show a row of the drive.
 
         Parameters
         ----------
         row : int
-        frame : SeenFrame, optional
-            That the last fix came from.
+        frame : IdentifiedFrame, optional
+            Frame of the last fix.
         """
         drive = self._drive
         truth, pose = drive.truth.position_m[row], drive.true_pose(row)
-        stand(self._satellite, pose)
-        place = truth + self.enlarged * drive.errors_m[row]
-        show_at(self._estimate, place, float(drive.track.heading_rad[row]))
+        place_frame(self._satellite, pose)
+        place = truth + self.enlargement * drive.errors_m[row]
+        show_frame(self._estimate, place, float(drive.track.heading_rad[row]))
         if drive.sigma_m is not None:
-            semi_axes = 3.0 * self.enlarged * drive.sigma_m[row]
+            semi_axes = 3.0 * self.enlargement * drive.sigma_m[row]
             self._ellipse.scale = (float(semi_axes[0]), float(semi_axes[1]), 1.0)
             self._ellipse.position = np.array([*place, _HEIGHT_M + 0.008])
             self._ellipse.visible = True
@@ -112,14 +109,11 @@ class TableScene:
         times = drive.truth.time_s
         first = int(np.searchsorted(times, times[row] - TRAIL_S))
         rows = np.unique(np.append(np.arange(first, row + 1, max(1, (row - first) // _TRAIL_POINTS)), row))
-        shown = drive.truth.position_m[rows] + self.enlarged * drive.errors_m[rows]
+        shown = drive.truth.position_m[rows] + self.enlargement * drive.errors_m[rows]
         for trail, places, z in zip(self._trails, (drive.truth.position_m[rows], shown), (0.006, 0.009), strict=True):
-            segments = line_segments(np.column_stack([places, np.full(len(rows), z)]))
-            trail.visible = bool(len(segments))
-            if len(segments):
-                trail.points = segments.astype(np.float32)
+            show_segments(trail, line_segments(np.column_stack([places, np.full(len(rows), z)])))
 
-    def _show_fix(self, row: int, frame: SeenFrame | None) -> None:
+    def _show_fix(self, row: int, frame: IdentifiedFrame | None) -> None:
         drive = self._drive
         fix = drive.last_fix(row)
         if fix is None or frame is None:
@@ -136,15 +130,15 @@ class TableScene:
         self._fix = fix
         rejected = drive.outcomes[fix] is FixOutcome.REJECTED
         shown, hidden = (self._rejected, self._late) if rejected else (self._late, self._rejected)
-        show_at(shown, drive.fixes.position_m[fix], float(drive.fixes.heading_rad[fix]))
+        show_frame(shown, drive.fixes.position_m[fix], float(drive.fixes.heading_rad[fix]))
         hidden.visible = False
         self._age.position = np.array([*drive.fixes.position_m[fix], _HEIGHT_M + 0.16])
         self._age.visible = True
         self._show_frame(frame, drive.pose_of_exposure(fix))
         self._lights.batched_colors = self._light_colours(frame)
 
-    def _show_frame(self, frame: SeenFrame, pose: Pose) -> None:
-        # Image's right and down are the body's x and y: seen from above it is as it lies on the ceiling.
+    def _show_frame(self, frame: IdentifiedFrame, pose: Pose) -> None:
+        # Right and down in the image are the body's x and y, so that it lies on the ceiling as seen from above.
         sheet = ceiling_sheet(frame)
         if self._sheet is None:
             width, height = self._drive.camera.footprint_m
@@ -153,29 +147,29 @@ class TableScene:
                 cast_shadow=False, receive_shadow=False,
             )  # fmt: skip
         self._sheet.image = sheet
-        stand(self._exposure, pose)
+        place_frame(self._exposure, pose)
         self._exposure.visible = True
 
-    def _light_colours(self, frame: SeenFrame | None) -> NDArray[np.uint8]:
+    def _light_colours(self, frame: IdentifiedFrame | None) -> NDArray[np.uint8]:
         colours = np.tile(np.array(LIGHT_COLOUR, dtype=np.uint8), (len(self._drive.lights_m), 1))
         if frame is not None and isinstance(frame.fix, CameraFix):
             colours[frame.fix.stars[:, 1]] = IDENTIFIED_COLOUR
         return colours
 
     def _outline_from_body(self) -> FloatArray:
-        """What the camera sees of the ceiling, from the satellite; the first point again at the end."""
+        """Return the closed outline of the camera's footprint, relative to the satellite."""
         outline = footprint(self._drive.camera, Pose(0.0, 0.0, 0.0), 4)
         closed = np.concatenate([outline, outline[:1]])
         return np.column_stack([closed, np.full(len(closed), CEILING_M)])
 
     def _mark(self, name: str, colour: Colour, height_m: float, width: float) -> viser.FrameHandle:
-        """A ring with an arrow, in a frame that moves them."""
+        """Add a ring with an arrow in a frame of their own."""
         frame = self._scene.add_frame(name, show_axes=False, visible=False)
         tip = np.array([_ARROW_M, 0.0, 0.0])
         barbs = [tip + np.array([-0.06, side * 0.045, 0.0]) for side in (1.0, -1.0)]
         shaft = np.array([[[_RING_M, 0.0, 0.0], tip], [barbs[0], tip], [barbs[1], tip]])
         lines = np.concatenate([line_segments(_RING_M * unit_circle()), shaft]) + np.array([0.0, 0.0, height_m])
-        screen_lines(self._scene, f"{name}/lines", lines, colour, width)
+        add_lines(self._scene, f"{name}/lines", lines, colour, width)
         return frame
 
     def _add_room(self) -> None:
@@ -189,24 +183,24 @@ class TableScene:
         (x0, y0), (x1, y1) = lights.min(axis=0) - 0.05, lights.max(axis=0) + 0.05
         corners = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]])
         edges = line_segments(np.column_stack([corners, np.full(5, CEILING_M)]))
-        screen_lines(scene, "/ceiling", edges, LIGHT_COLOUR, 1.5)
-        solid(scene, "/table", table_body(), TABLE_COLOUR, flat=True)
+        add_lines(scene, "/ceiling", edges, LIGHT_COLOUR, 1.5)
+        add_mesh(scene, "/table", table_body(), TABLE_COLOUR, flat=True)
 
 
-def scene_extent(drive: Drive) -> Extent:
-    """What should be in view: sky and table."""
+def table_extent(drive: Drive) -> Extent:
+    """Return the extent of the scene: sky and table."""
     lights = np.column_stack([drive.lights_m, np.full(len(drive.lights_m), CEILING_M)])
     x, y, _ = _TABLE_HALF_M
     return extent_of(lights, [[a * x, b * y, -0.1] for a in (-1.0, 1.0) for b in (-1.0, 1.0)])
 
 
-def scene_entries(drive: Drive) -> tuple[Swatch, ...]:
-    """Legend of the scene."""
-    enlarged = ", errors enlarged" if suitable_enlargement(drive.usual_error_m) > 1.0 else ""
-    believed = "estimate" + ("" if drive.sigma_m is None else " with its 3σ ellipse")
+def table_entries(drive: Drive) -> tuple[Swatch, ...]:
+    """Return the entries of the legend."""
+    note = ", errors enlarged" if suitable_enlargement(drive.usual_error_m) > 1.0 else ""
+    estimate = "estimate" + ("" if drive.sigma_m is None else " with its 3σ ellipse")
     return (
         Swatch(TRUTH_COLOUR, "satellite, where it is, and its trail"),
-        Swatch(ESTIMATE_COLOUR, believed + enlarged),
+        Swatch(ESTIMATE_COLOUR, estimate + note),
         Swatch(FIX_COLOUR, "late fix: where it was, and the frame on the ceiling"),
         Swatch(VIEW_COLOUR, "what the camera sees now"),
         Swatch(IDENTIFIED_COLOUR, "light identified in that frame"),
@@ -216,29 +210,28 @@ def scene_entries(drive: Drive) -> tuple[Swatch, ...]:
 
 
 def suitable_enlargement(usual_error_m: float) -> float:
-    """The largest of :data:`ENLARGEMENTS` that draws an error no longer than 12 cm."""
-    fitting = [value for value in ENLARGEMENTS if value * usual_error_m <= 0.12]
-    return max(fitting, default=1.0)
+    """Return the largest of :data:`ENLARGEMENTS` that draws an error no longer than 12 cm."""
+    return max((value for value in ENLARGEMENTS if value * usual_error_m <= 0.12), default=1.0)
 
 
 ENLARGEMENTS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
 
 
-def stand(frame: viser.FrameHandle, pose: Pose) -> None:
-    """Put a frame on the table."""
+def place_frame(frame: viser.FrameHandle, pose: Pose) -> None:
+    """Move a frame to a pose on the table."""
     frame.position = np.array([pose.x_m, pose.y_m, 0.0])
     frame.wxyz = Rotation.from_rotvec([0.0, 0.0, pose.heading_rad]).as_quat(scalar_first=True)
 
 
-def show_at(frame: viser.FrameHandle, place_m: FloatArray, heading_rad: float) -> None:
-    """Put a frame on the table, and show it."""
-    x, y = place_m.tolist()
-    stand(frame, Pose(x, y, heading_rad))
+def show_frame(frame: viser.FrameHandle, position_m: FloatArray, heading_rad: float) -> None:
+    """Move a frame on the table, and show it."""
+    x, y = position_m.tolist()
+    place_frame(frame, Pose(x, y, heading_rad))
     frame.visible = True
 
 
 def satellite_body() -> Surface:
-    """A can with a lens on top and a nose along x."""
+    """Return the satellite: a can with a lens on top and a nose along x."""
     can = trimesh.creation.cylinder(_RADIUS_M, sections=32, segment=[[0.0, 0.0, 0.012], [0.0, 0.0, _HEIGHT_M - 0.015]])
     lens = trimesh.creation.cylinder(0.3 * _RADIUS_M, sections=24, segment=[[0.0, 0.0, 0.0], [0.0, 0.0, _HEIGHT_M]])
     nose = trimesh.creation.box(extents=[0.06, 0.035, 0.03])
@@ -247,7 +240,7 @@ def satellite_body() -> Surface:
 
 
 def table_body() -> Surface:
-    """A slab with its top at z = 0, on four legs."""
+    """Return the table: a slab with its top at z = 0, on four legs."""
     x, y, z = _TABLE_HALF_M
     slab = trimesh.creation.box(extents=[2.0 * x, 2.0 * y, 2.0 * z])
     slab.apply_translation([0.0, 0.0, -z])

@@ -1,4 +1,4 @@
-"""An attitude in three dimensions: in a browser, in a notebook, as a page, a picture or a film."""
+"""View of an attitude in three dimensions, in a browser, in a notebook, as a page, picture or film."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from adcs.viewer.attitude_replay import replay_of
 from arrays.typing import FloatArray
 from magloc.viewer.outputs import check_outputs
 from magloc.viewer.server import FIRST_PORT
-from magloc.viewer.view import View, shown
+from magloc.viewer.view import View, open_view
 
 
 def view(
@@ -30,38 +30,38 @@ def view(
     port: int = FIRST_PORT,
     title: str = "",
 ) -> View:
-    """See an attitude through time in three dimensions.
+    """View an attitude over time in three dimensions.
 
-    Body axes with their 3σ cones, the true ones, the field and the Sun as measured and as expected, and which sensors
-    have readings. Errors and cones are enlarged where they would not be seen. As :func:`magloc.view` it opens a
-    browser, shows itself in a notebook, or writes files.
+    The scene shows estimated body axes with 3σ cones, true body axes, and the field and the Sun as measured and as
+    expected; panels show which sensors have readings. Errors and cones are enlarged if they would be invisible. Like
+    :func:`magloc.view`, the view opens a browser, shows itself in a notebook, or writes files.
 
     Parameters
     ----------
     track : AttitudeTrack
-        Of any filter.
+        Result of any filter.
     readings : Telemetry, InertialMagneticRecord or ImuLog, optional
-        That the track was made of: what was measured is shown beside what was to be expected.
+        Readings of the track, whose directions are shown beside the expected ones.
     satellite : Satellite, optional
-        Of the telemetry: whose orbit says where field and Sun are.
+        Satellite of the telemetry, whose orbit gives the directions of field and Sun.
     truth : ndarray, shape (n, 4), optional
-        True attitude, scalar first, NaN where unknown, at the rows of the readings: orbital frame from body of
-        telemetry, otherwise the frame of the track. By default that of an ImuLog.
+        True attitude at the rows of the readings, scalar first, NaN where unknown: from the body to the orbital frame
+        for telemetry, otherwise to the frame of the track. By default that of an ImuLog.
     html, png, movie : path, optional
-        Write a static page that plays or, by Chromium, a picture or a film (.mp4, .gif, .apng); serve nothing.
+        Write a static page with a player or, by Chromium, a picture or a film (.mp4, .gif, .apng), and serve nothing.
     open : bool
         Open the browser.
     port : int
-        The next one that is free is taken if it is in use.
+        Port of the server; if it is in use, the next free one is used.
     title : str
-        By default the track's.
+        Title of the page; by default that of the track.
 
     Raises
     ------
     ValueError
         Telemetry comes without its satellite, or the truth has another number of rows.
     InputError
-        A file cannot be written, or Chromium is not there.
+        A file cannot be written, or there is no Chromium.
 
     Examples
     --------
@@ -75,7 +75,7 @@ def view(
         truth = readings.q_true if truth is None else truth
         readings = readings.record
     replay = replay_of(track, readings, satellite, truth, title)
-    return shown(
+    return open_view(
         f"adcs · {replay.title}",
         lambda server: attitude_page(server, replay),
         html=html,

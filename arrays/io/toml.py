@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import datetime
 import difflib
+import json
 import math
 import re
 import tomllib
@@ -318,3 +319,16 @@ def _type_in_words(types: str) -> str:
 
 def _lower_first(text: str) -> str:
     return text[:1].lower() + text[1:]
+
+
+def toml_value(value: Any) -> str:
+    """Return a value as TOML text: a text, a date, a number, a truth value, or a list of them."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, datetime.date):
+        value = value.isoformat()
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False)
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(toml_value, value)) + "]"
+    return str(value) if math.isfinite(value) else f"{float(value)}"

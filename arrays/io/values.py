@@ -1,10 +1,13 @@
-"""Numbers and times of callers in double precision: masked arrays, dates, durations."""
+"""Numbers, times and random arguments of callers: masked arrays, dates, durations, generators."""
 
 from __future__ import annotations
 
 import datetime
 import re
-from typing import TYPE_CHECKING, Any
+import warnings
+from collections.abc import Callable
+from functools import wraps
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 from arrays.io.errors import InputError
 
@@ -16,7 +19,10 @@ LARGEST_T = 1e6
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from arrays.typing import FloatArray
+    from arrays.typing import FloatArray, Rng
+
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
 
 
 def numbers(values: ArrayLike) -> FloatArray:
@@ -81,3 +87,27 @@ def unix_seconds(place: str, cell: str) -> str:
         found = repr(cell.strip()[:SHOWN_CHARACTERS])
         raise InputError(f"{place}: found {found}, expected a time such as 2026-11-21T12:00:00.5 (UTC).") from None
     return repr((instant if instant.tzinfo else instant.replace(tzinfo=datetime.UTC)).timestamp())
+
+
+def seed_of(rng: Rng) -> int:
+    """Return the seed that fixes all draws: ``rng`` itself, or one that a generator draws."""
+    import numpy as np
+
+    if isinstance(rng, int | np.integer):
+        return int(rng)
+    return int(np.random.default_rng(rng).integers(2**63))
+
+
+def accept_seed(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Decorate a function whose argument ``rng`` was called ``seed`` before: accept the old name with a warning."""
+
+    @wraps(function)
+    def wrapper(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        if "seed" in kwargs:
+            if "rng" in kwargs:
+                raise TypeError(f"{function.__name__}() takes rng or seed, not both")
+            warnings.warn(f"seed of {function.__name__}() is called rng now", DeprecationWarning, stacklevel=2)
+            kwargs["rng"] = kwargs.pop("seed")
+        return function(*args, **kwargs)
+
+    return wrapper

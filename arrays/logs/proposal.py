@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from arrays.columns import NANOTESLA, LogColumns
 from arrays.io.csv import is_number_or_empty
 from arrays.io.errors import InputError
 from arrays.io.text import read_text
+from arrays.io.toml import toml_value
 from arrays.logs.lines import cells_of
 from arrays.typing import FloatArray
 
@@ -70,13 +70,9 @@ class Proposal:
             kind = "scalar" if isinstance(of, str) else "vector"
             lines += ["", "[[sensor]]", f'id = "{name}"', f'kind = "{kind}"', "position_m = [0.0, 0.0, 0.0]  # asked"]
             lines += ["noise_nT = 1.0  # asked"]
-        lines += ["", "[columns]", *(f"{key} = {_toml(value)}" for key, value in self.keys.items())]
-        lines += ["", "[columns.sensors]", *(f"{name} = {_toml(of)}" for name, of in self.sensors.items())]
+        lines += ["", "[columns]", *(f"{key} = {toml_value(value)}" for key, value in self.keys.items())]
+        lines += ["", "[columns.sensors]", *(f"{name} = {toml_value(of)}" for name, of in self.sensors.items())]
         return "\n".join([*lines, ""])
-
-
-def _toml(value: object) -> str:
-    return json.dumps(list(value) if isinstance(value, tuple) else value, ensure_ascii=False)
 
 
 def propose_columns(path: str | PathLike[str]) -> Proposal:

@@ -39,7 +39,7 @@ _BISECTIONS = 40
 # Relative standard deviation beyond which a linearised covariance is not valid.
 _LARGEST_UNCERTAINTY = 0.02
 # Allowed factor between χ² and its parabola, two standard deviations along the least known direction.
-_LARGEST_BEND = 2.0
+_LARGEST_RISE_RATIO = 2.0
 # Noise over the least radius of curvature beyond which the second-order bias of the distance is not valid.
 _LARGEST_NOISE = 0.2
 # Noise spreads the readings by σ/M, which looks like information about directions that they do not cover.
@@ -337,7 +337,7 @@ def _root_covariance(problem: _EllipsoidProblem, fit: _EllipsoidIterate) -> Floa
         # χ² must rise by four there, or the uncertainty is bent and no covariance describes it.
         step = deviations * root[:, -1]
         rise = fit.retract(step).cost - fit.cost
-        if not 4.0 / _LARGEST_BEND < rise < 4.0 * _LARGEST_BEND:
+        if not 4.0 / _LARGEST_RISE_RATIO < rise < 4.0 * _LARGEST_RISE_RATIO:
             return None
     return root
 

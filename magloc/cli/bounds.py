@@ -267,9 +267,7 @@ def _scenario(
 def _detector(array: SensorArray, false_alarm_rate: float, seed: int) -> MatchedFilterDetector | None:
     """Return the matched filter of the array; None, with a note, if it has none."""
     try:
-        return magloc.MatchedFilterDetector.of(
-            array, false_alarm_rate, n_draws=round(100 / false_alarm_rate), seed=seed
-        )
+        return magloc.MatchedFilterDetector.of(array, false_alarm_rate, n_draws=round(100 / false_alarm_rate), rng=seed)
     except ValueError as error:
         note(f"the detection range is left out: {own_sentence(error)}", always=True)
         return None

@@ -73,7 +73,7 @@ def design(
     begin = time.perf_counter()
     try:
         with progress(wanted.search.n_steps, "steps") as advance, naming(task):
-            result = magloc.design_array(wanted, seed=common.seed, progress=advance, better=best.append)
+            result = magloc.design_array(wanted, rng=common.seed, progress=advance, better=best.append)
     except KeyboardInterrupt:
         if not best:
             raise KeyboardInterrupt("interrupted: nothing is written, no start had been judged") from None
@@ -107,7 +107,7 @@ def _compare_counts(
     with progress(sum(task.search.n_steps for task in tasks), "steps") as advance:
         for task, path in zip(tasks, targets, strict=True):
             with naming(task.name):
-                results.append(magloc.design_array(task, seed=common.seed, progress=advance))
+                results.append(magloc.design_array(task, rng=common.seed, progress=advance))
             arrays.write_array(path, results[-1].array)
     if png is not None:
         magloc.plots.save(magloc.plots.design_counts(results), png)

@@ -95,7 +95,7 @@ def live(
     with naming(str(array), sources=f"--sources {motion.sources}"):
         follower = motion.follower(used, known, known.where, rest_s)
     with ExitStack() as open_page:
-        view = open_page.enter_context(shown(follower, page)) if page.view else None
+        view = open_page.enter_context(open_live_page(follower, page)) if page.view else None
         table = None if out is None else open_page.enter_context(GrowingTable(out))
         try:
             with naming_place(), naming(str(array), readings=source, time_s=source):
@@ -112,7 +112,7 @@ def live(
             view.wait()
 
 
-def shown(follower: Follower, page: PageOptions) -> LiveView:
+def open_live_page(follower: Follower, page: PageOptions) -> LiveView:
     """Open a page of a tracker, and print its address."""
     import magloc.viewer
 

@@ -140,7 +140,7 @@ def locate(
                 body_length_m=length_m,
                 exclude_faulty=not wanted.keep_sensors,
                 average=wanted.average,
-                seed=common.seed,
+                rng=common.seed,
                 progress=advance,
             )
     except InputError as error:
@@ -161,9 +161,9 @@ def locate(
     if not n_solved:
         raise InputError(f"{readings}: found no row that can be solved ({reasons}).")
     if out is not None:
-        from magloc.plots.localization import write_pictures
+        from magloc.plots.localization import write_fix_figures
 
-        write_pictures(pictured, noisy, fixes, ambient_T, true_position_m, out)
+        write_fix_figures(pictured, noisy, fixes, ambient_T, true_position_m, out)
     if not json:
         note(f"{n_solved} of {len(fixes)} rows solved" + (f"; not solved: {reasons}" if reasons else ""))
     for line in [*_notes(fixes, assumed=length_m is None), *([] if json else legend(lines))]:

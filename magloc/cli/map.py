@@ -162,7 +162,7 @@ def _over_sources(
         edge_m=2.0 * task.half_width_m,
         nearest_m=task.nearest_m,
         farthest_m=task.farthest_m,
-        seed=seed,
+        rng=seed,
         known_moment_sigma_Am2=task.known_moment_sigma_Am2,
         body_length_m=task.body_length_m,
     )

@@ -281,9 +281,9 @@ def _write_track(found: Track, name: str, known: KnownOptions, outputs: TrackOut
         result = None if outputs.truth is None else found.consistency(magloc.read_truth(outputs.truth))
         outputs.maps.write(found, known.place)
     if is_found and outputs.out is not None:
-        from magloc.plots.tracks import write_picture
+        from magloc.plots.tracks import write_track_figures
 
-        write_picture(
+        write_track_figures(
             found,
             None if result is None else result.true_position_m,
             outputs.out,

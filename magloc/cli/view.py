@@ -116,11 +116,11 @@ def write_or_serve(scene: Callable[[int], View], written: Sequence[str], port: i
 
 def _view_stream(array: Path, port: int, *, open: bool) -> None:
     """Show a source that is tracked through rows on standard input, until Ctrl-C."""
-    from magloc.cli.live import PageOptions, shown
+    from magloc.cli.live import PageOptions, open_live_page
     from magloc.live.follower import Follower
 
     follower = Follower(arrays.read_array(array))
-    with shown(follower, PageOptions(port=port, open=open)) as scene, naming(str(array)):
+    with open_live_page(follower, PageOptions(port=port, open=open)) as scene, naming(str(array)):
         print(scene.address, flush=True)
         for point in follower.follow(STREAM):
             scene.update(point)
@@ -149,10 +149,10 @@ def _with_track(
 
 def _fixes(result: ReadingsResult) -> tuple[Fixes, Readings]:
     """Locate the source in every row, of at most 2000 rows, as ``magloc locate`` does."""
-    from magloc.viewer.view import fixes_of, thinned
+    from magloc.viewer.view import locate_readings, thin_readings
 
-    rows, n = thinned(result.readings), len(result.readings)
+    rows, n = thin_readings(result.readings), len(result.readings)
     if len(rows) < n:
         note(f"note: every {-(-n // len(rows))}th of {n} rows is located and shown")
     with progress(len(rows), "rows") as advance:
-        return fixes_of(result.array, rows, advance), rows
+        return locate_readings(result.array, rows, advance), rows

@@ -19,8 +19,9 @@ import numpy as np
 from arrays.array import SensorArray
 from arrays.geometries import tetrahedron
 from arrays.io.errors import check_positive
+from arrays.io.values import accept_seed, seed_of
 from arrays.noise import reading_errors
-from arrays.typing import BoolArray, FloatArray
+from arrays.typing import BoolArray, FloatArray, Rng
 from arrays.whitening import whitening
 from magloc.bounds.crlb import check_uncertainty, cramer_rao_bounds
 from magloc.chi_square import normalised_square
@@ -367,6 +368,7 @@ def _tally(values: Values) -> Tally:
     return Tally.of(points, values["iterations"])
 
 
+@accept_seed
 def source_map(
     array: SensorArray,
     moment_Am2: float = SourcesScenario.moment_Am2,
@@ -375,7 +377,7 @@ def source_map(
     n: int = 21,
     nearest_m: float = SourcesScenario.nearest_m,
     farthest_m: float = SourcesScenario.farthest_m,
-    seed: int = 0,
+    rng: Rng = 0,
     known_moment_sigma_Am2: float = np.inf,
     body_length_m: float | None = None,
     out: str | PathLike[str] | None = None,
@@ -396,8 +398,8 @@ def source_map(
         Sources along every axis, at least 2.
     nearest_m, farthest_m : float
         Sources nearer to the centroid, or farther from it, are left out [m].
-    seed : int
-        Seed of the moments' directions and all errors.
+    rng : int or numpy.random.Generator
+        Seed or generator of the moments' directions and all errors.
     known_moment_sigma_Am2 : float
         Standard deviation of the moments' modulus [A·m²], which fixes and bounds know. If infinite, all moments have
         the same modulus, and fixes and bounds know nothing.
@@ -431,8 +433,9 @@ def source_map(
     >>> sorted(found.sizes)
     ['x', 'y', 'z']
     """
+    half, seed = check_half_width(edge_m), seed_of(rng)
     scenario = SourcesScenario(
-        array, check_half_width(edge_m), nearest_m, farthest_m, moment_Am2, seed, known_moment_sigma_Am2, body_length_m
+        array, half, nearest_m, farthest_m, moment_Am2, seed, known_moment_sigma_Am2, body_length_m
     )
     return computed_map(SourcesMap(scenario, n), out, scheduler, progress)
 

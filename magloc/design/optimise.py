@@ -22,7 +22,8 @@ from scipy.stats import qmc
 from arrays.array import SensorArray
 from arrays.geometries import GEOMETRIES
 from arrays.io.lazy import by_name
-from arrays.typing import FloatArray
+from arrays.io.values import accept_seed, seed_of
+from arrays.typing import FloatArray, Rng
 from magloc.design.descent import Descent, Sample, descend, is_spaced, move_into_volume
 from magloc.design.evaluation import Judgement, fits, judge, random_rotation, references, unit_shape, worst_case
 from magloc.design.task import N_DRAWN, DesignTask
@@ -99,19 +100,21 @@ class Design:
             if other.fits and other.array.n_sensors <= self.array.n_sensors and other.gain < NEAR_OPTIMAL
         )
 
-    def plot(self, seed: int = 0) -> Figure:
+    @accept_seed
+    def plot(self, rng: Rng = 0) -> Figure:
         """Plot the sensors in their volume, and σ of the range over the distance.
 
-        `seed`: seed of the sources of the plot.
+        `rng`: seed or generator of the sources of the plot.
         """
-        return by_name("magloc.plots.designs:design")(self, seed)
+        return by_name("magloc.plots.designs:design")(self, rng)
 
 
+@accept_seed
 def design_array(
     task: DesignTask,
     *,
     starts: int | None = None,
-    seed: int = 0,
+    rng: Rng = 0,
     progress: Callable[[int], None] | None = None,
     better: Callable[[SensorArray], None] = lambda _: None,
 ) -> Design:
@@ -123,8 +126,8 @@ def design_array(
         Sensors, their noise and volume, and the sources; :meth:`DesignTask.read` reads one.
     starts : int, optional
         Number of shapes and random places to start from; by default that of ``task.search``.
-    seed : int
-        Seed of starts and samples; the same seed gives the same array for any number of threads.
+    rng : int or numpy.random.Generator
+        Seed or generator of starts and samples; the same seed gives the same array for any number of threads.
     progress : callable, optional
         Called with steps done, of ``task.search.n_steps``.
     better : callable, optional
@@ -149,7 +152,7 @@ def design_array(
     """
     search = task.search if starts is None else replace(task.search, n_starts=starts)
     step_done = progress or (lambda _: None)
-    of_starts, of_small, of_large, of_references, of_judge = np.random.SeedSequence(seed).spawn(5)
+    of_starts, of_small, of_large, of_references, of_judge = np.random.SeedSequence(seed_of(rng)).spawn(5)
     small = sobol_sample(task, search.log2_small, np.random.default_rng(of_small))
     large = sobol_sample(task, search.log2_large, np.random.default_rng(of_large))
     known = references(task, large, np.random.default_rng(of_references))

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from arrays.array import SensorArray
-from arrays.typing import FloatArray
+from arrays.io.values import accept_seed
+from arrays.typing import FloatArray, Rng
 from magloc.chi_square import Detector
 from magloc.detection.dipole_filter import DipoleFilter
 from magloc.detection.matched_filter import MatchedFilterDetector
@@ -24,6 +25,7 @@ _N_DIRECTIONS, _N_MOMENTS = 100, 50
 _EXCEEDANCES = 20
 
 
+@accept_seed
 def detection_range(
     array: SensorArray,
     moment_Am2: float,
@@ -31,7 +33,7 @@ def detection_range(
     probability: float = 0.9,
     false_alarm_rate: float = FALSE_ALARM,
     share: float = 0.5,
-    seed: int = 0,
+    rng: Rng = 0,
 ) -> float:
     """Distance up to which the matched filter finds a source, over directions of the source and of its moment.
 
@@ -47,8 +49,8 @@ def detection_range(
         Share of the rows without a source in which one is found.
     share : float
         Of the directions for which that distance suffices: 0.5 gives the median, 0.95 what is nearly sure.
-    seed : int
-        Of the noise that sets the threshold.
+    rng : int or numpy.random.Generator
+        Seed or generator of the noise that sets the threshold.
 
     Returns
     -------
@@ -69,7 +71,7 @@ def detection_range(
     10
     """
     detector = MatchedFilterDetector.of(
-        array, false_alarm_rate, n_draws=round(_EXCEEDANCES / false_alarm_rate), seed=seed
+        array, false_alarm_rate, n_draws=round(_EXCEEDANCES / false_alarm_rate), rng=rng
     )
     moments = moments_on_sphere(moment_Am2, _N_MOMENTS)
     ranges = detection_ranges(array, sphere_directions(_N_DIRECTIONS), moments, detector, probability=probability)

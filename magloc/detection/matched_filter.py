@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import brentq
 
 from arrays.array import SensorArray
-from arrays.typing import FloatArray
+from arrays.io.values import accept_seed, seed_of
+from arrays.typing import FloatArray, Rng
 from magloc.chi_square import ChiSquareDetector, check_differences, check_probability, check_share
 from magloc.detection.dipole_filter import DipoleFilter
 from magloc.directions import fibonacci_directions
@@ -62,8 +63,9 @@ class MatchedFilterDetector:
     seed: int
 
     @classmethod
+    @accept_seed
     def of(
-        cls, array: SensorArray, false_alarm_rate: float = FALSE_ALARM, *, n_draws: int = 100_000, seed: int = 0
+        cls, array: SensorArray, false_alarm_rate: float = FALSE_ALARM, *, n_draws: int = 100_000, rng: Rng = 0
     ) -> MatchedFilterDetector:
         """Detector whose threshold noise alone exceeds at a given rate.
 
@@ -71,6 +73,9 @@ class MatchedFilterDetector:
         ----------
         n_draws : int
             Sets of noise; a hundred exceedances, n_draws = 100 / rate, know the rate to a tenth.
+
+        rng : int or numpy.random.Generator
+            Seed or generator of the noise.
 
         Raises
         ------
@@ -87,9 +92,13 @@ class MatchedFilterDetector:
             )
         matched = DipoleFilter(array)
         check_differences(matched.n_differences, N_UNKNOWNS, "a position and a moment")
-        rng = np.random.default_rng(seed)
+        seed = seed_of(rng)
+        generator = np.random.default_rng(seed)
         noise = np.concatenate(
-            [_loudest(matched, rng, n, min(1.0, _SCREENED * false_alarm_rate)) for n in _parts(n_draws, _DRAWS_AT_ONCE)]
+            [
+                _loudest(matched, generator, n, min(1.0, _SCREENED * false_alarm_rate))
+                for n in _parts(n_draws, _DRAWS_AT_ONCE)
+            ]
         )
         statistic = np.sort(matched.largest_energy(noise))[::-1]
         spread = max(1, round(np.sqrt(n_above)))

@@ -1,4 +1,4 @@
-"""A source followed while its readings come in: from a pipe, a socket, a serial port, or a file in its own time."""
+"""Tracking of sources while their readings come in from a pipe, a socket, a serial port or a replayed file."""
 
 from arrays.io.lazy import lazy_names
 

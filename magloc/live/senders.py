@@ -1,4 +1,4 @@
-"""Lines of several senders who do not wait, within bounds and handed out in turns, so that none starves the others."""
+"""Bounded queues of lines from several senders, served in turns so that no sender starves the others."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from collections.abc import Hashable, Iterator
 from dataclasses import dataclass, field
 
 _GOOD, _NEW, _OTHERS = range(3)
-_MOST_SENDERS = 64, 1024, 64  # of each class, that wait
-_MOST_BYTES = 2**18, 2**12, 2**16  # of a sender of each class, that wait
-_MOST_LINES = 1000, 4, 16  # of a sender of each class, at once
-_MOST_REMEMBERED = 4096  # senders of nothing but what is no row
+_MOST_SENDERS = 64, 1024, 64  # that wait, by class
+_MOST_BYTES = 2**18, 2**12, 2**16  # that wait for one sender, by class
+_MOST_LINES = 1000, 4, 16  # that one sender gets at once, by class
+_MOST_OTHERS = 4096  # senders without a row that are remembered
 
 
 @dataclass(frozen=True)
@@ -21,23 +21,23 @@ class Batch:
     Attributes
     ----------
     lines : list of bytes
-        Whole lines, without their ends.
+        Complete lines without line ends.
     sender : hashable, optional
-        Who sent them, where there may be several.
-    arrived_s : float
-        When the first of them arrived, by ``time.perf_counter``.
+        Sender of the lines, where there may be several senders.
+    arrival_s : float
+        Arrival time of the first line, by ``time.perf_counter``.
     dropped : int
-        Lines that were dropped unread since the batch before.
+        Lines that were dropped unread since the previous batch.
     """
 
     lines: list[bytes]
     sender: Hashable = None
-    arrived_s: float = field(default_factory=time.perf_counter)
+    arrival_s: float = field(default_factory=time.perf_counter)
     dropped: int = 0
 
 
 class _Queue:
-    """Datagrams of one sender that wait, with their times of arrival."""
+    """Waiting datagrams of one sender, with their arrival times."""
 
     def __init__(self) -> None:
         self.datagrams: deque[tuple[float, bytes]] = deque()
@@ -47,7 +47,7 @@ class _Queue:
         return bool(self.datagrams)
 
     def put(self, datagram: bytes, most: int) -> int:
-        """Add a datagram; returns how many lines of the oldest ones have to go, for so many bytes at most to wait."""
+        """Add a datagram, drop the oldest above a size, and return the number of dropped lines."""
         self.datagrams.append((time.perf_counter(), datagram))
         self.size += size_of(datagram)
         dropped = 0
@@ -60,19 +60,19 @@ class _Queue:
     def take(self, most: int) -> Iterator[bytes]:
         """Remove and return the oldest lines."""
         while self.datagrams and most > 0:
-            arrived_s, datagram = self.datagrams.popleft()
+            arrival_s, datagram = self.datagrams.popleft()
             lines = datagram.split(b"\n", most)
             self.size -= size_of(datagram)
             if len(lines) > most:
                 rest = lines.pop()
-                self.datagrams.appendleft((arrived_s, rest))
+                self.datagrams.appendleft((arrival_s, rest))
                 self.size += size_of(rest)
             most -= len(lines)
             yield from lines
 
 
 def size_of(datagram: bytes) -> int:
-    """Return the memory that a datagram takes, an empty one too."""
+    """Return the memory that a datagram takes, even an empty one."""
     return len(datagram) + 100
 
 
@@ -82,34 +82,34 @@ def n_lines(datagram: bytes) -> int:
 
 
 class Senders:
-    """Datagrams that wait, by their senders.
+    """Waiting datagrams by sender.
 
-    Whoever sent a row or a header before and whoever sends for the first time are served in turns, and all others when
-    none of these waits; strangers get few lines each time. So a good sender waits for one stranger at most, however
-    many they are. The newest datagrams of every sender are kept, and the last senders of every class.
+    Good senders have sent a row or a header before. Good and new senders are served in turns; all others are served
+    when none of these waits. New senders get few lines each time. A good sender therefore waits for at most one new
+    sender, however many there are. Each sender keeps its newest datagrams, and each class its latest senders.
     """
 
     def __init__(self) -> None:
-        self._good: dict[Hashable, None] = {}  # the last one to send a row at the end
-        self._heard: dict[Hashable, None] = {}  # others, the last new one at the end
+        self._good: dict[Hashable, None] = {}  # the latest sender of a row is last
+        self._others: dict[Hashable, None] = {}  # the latest new sender is last
         self._waiting: tuple[dict[Hashable, _Queue], ...] = {}, {}, {}
         self._turn = _GOOD
         self._dropped = 0
 
     def __bool__(self) -> bool:
-        """Whether anything waits."""
+        """Return whether a datagram waits."""
         return any(self._waiting)
 
     @property
     def is_urgent(self) -> bool:
-        """Whether more waits than what comes from senders of nothing but what is no row."""
+        """Whether a good or a new sender waits."""
         return bool(self._waiting[_GOOD] or self._waiting[_NEW])
 
     def _class_of(self, sender: Hashable) -> int:
-        return _GOOD if sender in self._good else _OTHERS if sender in self._heard else _NEW
+        return _GOOD if sender in self._good else _OTHERS if sender in self._others else _NEW
 
     def put(self, datagram: bytes, sender: Hashable) -> None:
-        """Add a datagram; the oldest ones of this sender, or those of the first of too many, are dropped for it."""
+        """Add a datagram; above the bounds, drop the oldest of this sender or the oldest sender."""
         own = self._class_of(sender)
         queues = self._waiting[own]
         if sender not in queues and len(queues) >= _MOST_SENDERS[own]:
@@ -124,16 +124,16 @@ class Senders:
         sender = next(iter(self._waiting[turn]))
         queue = self._waiting[turn].pop(sender)
         if turn == _NEW:
-            _remember(self._heard, sender, _MOST_REMEMBERED)
-        arrived_s, dropped = queue.datagrams[0][0], self._dropped
+            _remember(self._others, sender, _MOST_OTHERS)
+        arrival_s, dropped = queue.datagrams[0][0], self._dropped
         lines = list(queue.take(_MOST_LINES[turn]))
         if queue:
             self._waiting[self._class_of(sender)][sender] = queue
         self._dropped = 0
-        return Batch(lines, sender, arrived_s, dropped)
+        return Batch(lines, sender, arrival_s, dropped)
 
     def accept(self, sender: Hashable) -> None:
-        """Note that a sender sent a row or a header."""
+        """Record that a sender has sent a row or a header."""
         queue = self._waiting[self._class_of(sender)].pop(sender, None)
         _remember(self._good, sender, _MOST_SENDERS[_GOOD])
         if queue is not None:
@@ -141,7 +141,7 @@ class Senders:
 
 
 def _remember(senders: dict[Hashable, None], sender: Hashable, most: int) -> None:
-    """Put a sender at the end of the last ones."""
+    """Move a sender to the end, and forget the first one above a number of senders."""
     senders.pop(sender, None)
     senders[sender] = None
     if len(senders) > most:

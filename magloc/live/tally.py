@@ -1,4 +1,4 @@
-"""What came in and what did not: late, lost, doubled and garbled rows are counted and named, and end nothing."""
+"""Counts of the rows of a stream: late, lost, doubled and garbled rows are logged and never end it."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from dataclasses import dataclass, field
 
 _LOG = logging.getLogger(__name__)
 _MOST_NAMED = 5
-"""Rows of a kind that are named one by one."""
+"""Rows of a kind that are logged one by one."""
 _STEPS = 101
 _FEWEST_STEPS = 5
-_EVERY = 20  # rows, the median step is counted anew
+_EVERY = 20  # rows between two computations of the median step
 _LATENCIES = 10_000
 _JUMP_STEPS, _JUMP_S = 100.0, 1.0
 _ROWS_TO_JUMP, _ROWS_TO_SET_BACK = 2, 10
@@ -24,32 +24,32 @@ _PACE_S, _LONGEST_PACE_S, _MOST_SKIPPED = 1.0, 10.0, 0.1
 
 @dataclass
 class Tally:
-    """Rows of a stream, counted.
+    """Numbers of rows of a stream.
 
     Attributes
     ----------
     rows : int
-        That were used, or could have been.
+        Valid rows in the order of time.
     tracked : int
-        Of them, where the source was tracked.
+        Rows in which the source was tracked.
     skipped : int
-        Of them, that were left out because newer ones were waiting.
+        Rows that were skipped because newer ones were waiting.
     late : int
-        That came after a later one, and were not used.
+        Rows that came after a later one; they are not used.
     lost : int
-        That never came, as far as the usual step tells.
+        Rows that never came, estimated from the usual step.
     doubled : int
-        That came a second time.
+        Rows that came a second time.
     garbled : int
-        Lines that are no rows, and rows whose time is not to be believed.
+        Lines that are no rows, and rows with an implausible time.
     dummies : int
-        Readings, one of a sensor in a row, that were dummy values.
+        Readings that were dummy values, one for each sensor and row.
     dropped : int
-        Lines that were not read, because one sender sent more than can be read.
+        Lines that were dropped unread because a sender sent too many.
     restarts : int
-        How often the sender's clock was set back.
+        Times that the sender's clock was set back.
     latencies_s : deque of float
-        From the arrival of a row to its answer, of the last 10,000 rows [s].
+        Time from the arrival of a row to its point, for the last 10,000 rows [s].
 
     Examples
     --------
@@ -72,17 +72,19 @@ class Tally:
     latencies_s: deque[float] = field(default_factory=lambda: deque(maxlen=_LATENCIES), repr=False)
 
     def name(self, kind: str, what: str, number: int = 1) -> None:
-        """Count a row of a kind, or some, and name the first ones."""
+        """Count rows of a kind, and log the first ones."""
         before = getattr(self, kind)
         setattr(self, kind, before + number)
         if before < _MOST_NAMED:
-            last = "; more of them are only counted" if before + number >= _MOST_NAMED else ""
+            last = "; further ones are only counted" if before + number >= _MOST_NAMED else ""
             _LOG.info(f"{kind}: {what}{last}")
 
     def drop(self, lines: int, stream: str) -> None:
-        """Count lines that were not read, and say it the first time."""
+        """Count lines that were dropped unread, and warn the first time."""
         if lines and not self.dropped:
-            _LOG.warning(f"{stream}: more comes than can be read, the oldest lines of who sends most are dropped")
+            _LOG.warning(
+                f"{stream}: more lines arrive than can be read; the oldest lines of the busiest senders are dropped"
+            )
         self.dropped += lines
 
     @property
@@ -91,7 +93,7 @@ class Tally:
         return self.late + self.lost + self.doubled + self.garbled
 
     def latency_ms(self, share: float) -> float:
-        """A quantile of the latencies [ms]; 0 before the first."""
+        """Return a quantile of the latencies [ms]; 0 before the first one."""
         ordered = sorted(self.latencies_s)
         return 1e3 * ordered[min(int(share * len(ordered)), len(ordered) - 1)] if ordered else 0.0
 
@@ -108,88 +110,90 @@ class Tally:
 
 
 class Pace:
-    """Whether rows come faster than they can be followed, which is said once.
+    """Rates of tracked and skipped rows, with one warning if too many are skipped.
 
     Parameters
     ----------
     stream : str
-        Its name.
+        Name of the stream.
     """
 
     def __init__(self, stream: str) -> None:
         self._stream = stream
-        self._since_s = -math.inf
-        self._answered = self._skipped = 0
-        self._is_told = False
+        self._begin_s = -math.inf
+        self._n_tracked = self._n_skipped = 0
+        self._has_warned = False
 
-    def count(self, answered: int, skipped: int) -> None:
-        """Count rows that were answered and that were skipped, and compare them once a second."""
+    def count(self, n_tracked: int, n_skipped: int) -> None:
+        """Count tracked and skipped rows, and compare both once a second."""
         now_s = time.perf_counter()
-        self._answered, self._skipped = self._answered + answered, self._skipped + skipped
-        elapsed_s = now_s - self._since_s
+        self._n_tracked, self._n_skipped = self._n_tracked + n_tracked, self._n_skipped + n_skipped
+        elapsed_s = now_s - self._begin_s
         if elapsed_s < _PACE_S:
             return
-        if elapsed_s < _LONGEST_PACE_S and self._skipped > _MOST_SKIPPED * self._answered and not self._is_told:
-            self._is_told = True
-            come, can = (n / elapsed_s for n in (self._answered + self._skipped, self._answered))
+        is_behind = elapsed_s < _LONGEST_PACE_S and self._n_skipped > _MOST_SKIPPED * self._n_tracked
+        if is_behind and not self._has_warned:
+            self._has_warned = True
+            arriving, followed = (n / elapsed_s for n in (self._n_tracked + self._n_skipped, self._n_tracked))
             _LOG.warning(
-                f"{self._stream}: {come:.3g} rows a second come and {can:.3g} can be followed: the oldest are skipped"
+                f"{self._stream}: {arriving:.3g} rows arrive a second, but only {followed:.3g} can be followed;"
+                " the oldest are skipped"
             )
-        self._since_s, self._answered, self._skipped = now_s, 0, 0
+        self._begin_s, self._n_tracked, self._n_skipped = now_s, 0, 0
 
 
 class Clock:
-    """The sender's clock, as the times of its rows tell it.
+    """Check of the times of a sender's rows.
 
-    A row whose time jumps is not believed before others have followed it: two ahead, and ten where it goes back, for
-    rows that were only delayed come in order too.
+    A jump of the time is accepted after a number of successive rows confirms it: two for a jump ahead, ten for a jump
+    back, because rows that were only delayed are in order too.
 
     Parameters
     ----------
     tally : Tally
-        Where rows are counted that cannot be used.
-    set_back : callable
+        It counts the rows that cannot be used.
+    on_set_back : callable
         Called before the first row of a clock that was set back.
     """
 
-    def __init__(self, tally: Tally, set_back: Callable[[], None]) -> None:
-        self._tally, self._set_back = tally, set_back
+    def __init__(self, tally: Tally, on_set_back: Callable[[], None]) -> None:
+        self._tally, self._on_set_back = tally, on_set_back
         self._last_s: float | None = None
         self._steps_s: deque[float] = deque(maxlen=_STEPS)
         self._recent: deque[float] = deque(maxlen=_STEPS)
         self._until_median = _FEWEST_STEPS
         self.step_s = 0.0
-        self._jump_s, self._jumped = 0.0, 0
+        self._jump_s, self._n_after_jump = 0.0, 0
 
-    def takes(self, time_s: float) -> bool:
-        """Whether a row of this time [s] is the next one."""
+    def accepts(self, time_s: float) -> bool:
+        """Return whether a row of this time [s] is to be used, and count it."""
         if self._last_s is None:
-            return self._taken(time_s, 0.0)
+            return self._accept(time_s, 0.0)
         step_s = time_s - self._last_s
         limit_s = max(_JUMP_S, _JUMP_STEPS * self.step_s) if self.step_s else float("inf")
         if 0.0 < step_s <= limit_s:
-            return self._taken(time_s, step_s)
+            return self._accept(time_s, step_s)
         if time_s in self._recent:
             self._tally.name("doubled", f"the row of {time_s:.10g} s")
             return False
         follows = 0.0 < time_s - self._jump_s <= limit_s
-        self._jump_s, self._jumped = time_s, self._jumped + 1 if follows else 1
+        self._jump_s, self._n_after_jump = time_s, self._n_after_jump + 1 if follows else 1
         if step_s > 0.0:
-            if self._jumped >= _ROWS_TO_JUMP:
-                return self._taken(time_s, step_s)
+            if self._n_after_jump >= _ROWS_TO_JUMP:
+                return self._accept(time_s, step_s)
             self._tally.name("garbled", f"the row of {time_s:.10g} s, {step_s:.3g} s after the one before")
             return False
-        if self._jumped >= _ROWS_TO_SET_BACK:
+        if self._n_after_jump >= _ROWS_TO_SET_BACK:
             self._tally.restarts += 1
             self._recent.clear()
-            self._set_back()
-            return self._taken(time_s, 0.0)
+            self._on_set_back()
+            return self._accept(time_s, 0.0)
         self._tally.name("late", f"the row of {time_s:.10g} s, after that of {self._last_s:.10g} s")
         self._tally.lost = max(0, self._tally.lost - 1)
         return False
 
-    def _taken(self, time_s: float, step_s: float) -> bool:
-        self._last_s, self._jumped = time_s, 0
+    def _accept(self, time_s: float, step_s: float) -> bool:
+        self._last_s, self._n_after_jump = time_s, 0
         self._recent.append(time_s)
         self._tally.rows += 1
         if step_s:

@@ -1,7 +1,7 @@
-"""Where rows come from: addresses of pipes, sockets, serial ports and files, and the lines that arrive there.
+"""Streams of lines from pipes, sockets, serial ports and files.
 
-Lines come in batches: all that have arrived since the last look, so that whoever is behind catches up; of datagrams in
-turns of their senders.
+A batch has all lines that have arrived since the previous one, so that a slow reader catches up. Batches of datagrams
+take their senders in turns.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from magloc.live.senders import Batch, Senders
 
 STANDARD_INPUT = "-"
 KINDS = "-, tcp://HOST:PORT, udp://HOST:PORT, serial:DEVICE@BAUD or replay:FILE"
-"""Of addresses."""
+"""Kinds of addresses."""
 _CHUNK = 65536
-_ALL_THAT_WAITS = 2**20  # bytes of a connection, read at once
-_DATAGRAMS = 200  # of a socket, read at once: more would keep what was read from being handed out
+_TCP_CHUNK = 2**20
+_DATAGRAMS = 200  # of a socket, read at once: more would delay those that were read
 _OWN_SOCKETS = 8
-_PAUSE_S = 0.002  # before senders of nothing but what is no row are heard: a flood must not take the whole processor
+_PAUSE_S = 0.002  # before senders without a row are served: a flood must not take the whole processor
 LONGEST_LINE = 2**20
-"""Bytes: what has no line end until then is a garbled line."""
+"""Length [bytes] above which a line without an end counts as garbled."""
 _CONNECTION_S = 10.0
 _UDP_BUFFER = 2**22
 _LONGEST_PAUSE_S = 10.0
@@ -38,16 +38,16 @@ _LONGEST_PAUSE_S = 10.0
 
 @dataclass(frozen=True)
 class Stream:
-    """Lines that come in.
+    """Lines from one address.
 
     Attributes
     ----------
     name : str
-        In errors.
+        Name of the stream in errors.
     batches : iterator of Batch
-        Whole lines that have arrived since the last ones.
+        Complete lines that have arrived since the previous batch.
     accept : callable
-        To be called with the sender of lines that were rows or a header.
+        The reader calls it with the sender of rows or of a header.
     """
 
     name: str
@@ -56,25 +56,28 @@ class Stream:
 
 
 def sender_waits(address: str) -> bool:
-    """Whether whoever sends waits for a slow reader: a pipe and a file do."""
+    """Return whether the sender waits for a slow reader, as a pipe and a file do."""
     return address == STANDARD_INPUT or address.startswith("replay:")
 
 
 @contextmanager
-def opened(address: str, *, replay_speed: float = 1.0, form: LogFormat = READINGS_FILE) -> Iterator[Stream]:
-    """What comes in at an address, in a form that tells the time of a row; InputError if nothing can."""
+def open_stream(address: str, *, replay_speed: float = 1.0, form: LogFormat = READINGS_FILE) -> Iterator[Stream]:
+    """Open the stream of an address; raise InputError if that is not possible.
+
+    ``form`` tells the times of the rows of a file.
+    """
     if address == STANDARD_INPUT:
-        yield Stream("standard input", _lines(_of_stdin()))
+        yield Stream("standard input", _split_lines(_read_stdin()))
         return
     kind, _, rest = address.partition(":")
     match kind:
         case "tcp":
-            with _connected(address) as peer:
-                yield Stream(address, _lines(_of_tcp(peer)))
+            with _connect(address) as peer:
+                yield Stream(address, _split_lines(_receive(peer)))
         case "udp":
-            with _bound(address) as peer, ExitStack() as stack:
-                port_of_all = _Port(peer, stack)
-                yield Stream(address, port_of_all.batches(), port_of_all.accept)
+            with _bind(address) as own, ExitStack() as stack:
+                datagrams = _DatagramPort(own, stack)
+                yield Stream(address, datagrams.batches(), datagrams.accept)
         case "serial":
             device, separator, baud = rest.rpartition("@")
             if not (separator and device and baud.isascii() and baud.isdigit() and int(baud)):
@@ -86,37 +89,37 @@ def opened(address: str, *, replay_speed: float = 1.0, form: LogFormat = READING
             except (OSError, ValueError, OverflowError) as error:
                 raise InputError(f"{address}: cannot be opened ({_reason(error)}), expected a serial port.") from None
             with port:
-                yield Stream(address, _lines(_of_serial(port)))
+                yield Stream(address, _split_lines(_read_serial(port)))
         case "replay":
             check_positive(replay_speed=replay_speed)
             lines = read_bytes(rest, "a readings file").splitlines()
-            yield Stream(rest, _in_own_time(lines, replay_speed, form))
+            yield Stream(rest, _replay(lines, replay_speed, form))
         case _:
             raise InputError(f"{address}: found no such kind of source, expected {KINDS}.")
 
 
 def _reason(error: Exception) -> str:
-    """What the system says, without what pyserial and Python put around it."""
+    """Return the message of the system, without the text that pyserial and Python put around it."""
     return getattr(error, "strerror", None) or str(error)
 
 
-def _lines(chunks: Iterator[bytes]) -> Iterator[Batch]:
-    """Whole lines of chunks of bytes; the last one may have no end."""
-    begun = b""
+def _split_lines(chunks: Iterator[bytes]) -> Iterator[Batch]:
+    """Split chunks of bytes into lines; the last line may have no end."""
+    rest = b""
     for chunk in chunks:
-        *whole, begun = (begun + chunk).split(b"\n")
-        if len(begun) > LONGEST_LINE:
-            whole.append(begun)
-            begun = b""
-        if whole:
-            yield Batch(whole)
-    if begun:
-        yield Batch([begun])
+        *lines, rest = (rest + chunk).split(b"\n")
+        if len(rest) > LONGEST_LINE:
+            lines.append(rest)
+            rest = b""
+        if lines:
+            yield Batch(lines)
+    if rest:
+        yield Batch([rest])
 
 
-def _of_stdin() -> Iterator[bytes]:
+def _read_stdin() -> Iterator[bytes]:
     buffer = getattr(sys.stdin, "buffer", None)
-    if buffer is None:  # somebody's text
+    if buffer is None:  # a caller has put a text stream in its place
         yield from (line.encode() for line in sys.stdin)
         return
     while chunk := buffer.read1(_CHUNK):
@@ -135,11 +138,11 @@ def _host_and_port(address: str) -> tuple[str, int]:
 
 
 @contextmanager
-def _connected(address: str) -> Iterator[socket.socket]:
-    """A connection to whoever sends."""
-    where = _host_and_port(address)
+def _connect(address: str) -> Iterator[socket.socket]:
+    """Connect to a sender."""
+    host_and_port = _host_and_port(address)
     try:
-        peer = socket.create_connection(where, timeout=_CONNECTION_S)
+        peer = socket.create_connection(host_and_port, timeout=_CONNECTION_S)
     except (OSError, UnicodeError) as error:
         raise InputError(f"{address}: cannot be reached ({_reason(error)}), expected a sender of rows.") from None
     with peer:
@@ -147,27 +150,27 @@ def _connected(address: str) -> Iterator[socket.socket]:
         yield peer
 
 
-def _of_tcp(peer: socket.socket) -> Iterator[bytes]:
+def _receive(peer: socket.socket) -> Iterator[bytes]:
     quick = getattr(socket, "TCP_QUICKACK", None)  # Linux
     try:
-        while chunk := peer.recv(_ALL_THAT_WAITS):
+        while chunk := peer.recv(_TCP_CHUNK):
             if quick is not None:
-                # A sender that gathers what is small (Nagle) waits for this; the system forgets the option again.
+                # A sender with Nagle's algorithm waits for this; the system resets the option.
                 peer.setsockopt(socket.IPPROTO_TCP, quick, 1)
             yield chunk
-    except ConnectionError:  # as good an end as another
+    except ConnectionError:  # an end of the stream too
         return
 
 
 @contextmanager
-def _bound(address: str) -> Iterator[socket.socket]:
-    """A socket that others send to."""
+def _bind(address: str) -> Iterator[socket.socket]:
+    """Open a socket for datagrams."""
     host, port = _host_and_port(address)
     try:
-        family, kind, protocol, _, where = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+        family, kind, protocol, _, own_address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
         with socket.socket(family, kind, protocol) as own:
             own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _UDP_BUFFER)
-            own.bind(where)
+            own.bind(own_address)
             bound = own.dup()
     except (OSError, UnicodeError) as error:
         expected = "expected a free port of this machine"
@@ -176,10 +179,10 @@ def _bound(address: str) -> Iterator[socket.socket]:
         yield bound
 
 
-class _Port:
-    """Datagrams that arrive at a port, handed out by sender; each ends with its last line.
+class _DatagramPort:
+    """Datagrams that arrive at a port, by sender. No line continues in the next datagram.
 
-    On Linux a good sender gets a socket of its own, with a buffer that no flood fills.
+    On Linux a good sender gets a socket of its own, whose buffer no flood of others fills.
     """
 
     def __init__(self, common: socket.socket, stack: ExitStack) -> None:
@@ -189,7 +192,7 @@ class _Port:
         self._senders = Senders()
 
     def batches(self) -> Iterator[Batch]:
-        """Lines of the datagrams that wait, of one sender at a time."""
+        """Yield the lines of the datagrams that wait, one sender at a time."""
         senders = self._senders
         while True:
             select.select([self._common, *self._own.values()], [], [], 0.0 if senders else None)
@@ -201,14 +204,14 @@ class _Port:
                 yield senders.take()
 
     def accept(self, sender: Hashable) -> None:
-        """Note that a sender sent a row or a header."""
+        """Record that a sender has sent a row or a header."""
         self._senders.accept(sender)
         if sys.platform == "linux" and sender not in self._own and len(self._own) < _OWN_SOCKETS:
-            with suppress(OSError):  # the sender then stays among the others
-                self._own[sender] = self._socket_of(sender)
+            with suppress(OSError):  # the sender then uses the common socket
+                self._own[sender] = self._open_socket(sender)
 
-    def _socket_of(self, sender: Hashable) -> socket.socket:
-        """A socket of the same port, connected to a sender, to which the system hands that sender's datagrams."""
+    def _open_socket(self, sender: Hashable) -> socket.socket:
+        """Open a socket of the same port for the datagrams of one sender."""
         common = self._common
         own = self._stack.enter_context(socket.socket(common.family, common.type, common.proto))
         own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _UDP_BUFFER)
@@ -217,15 +220,15 @@ class _Port:
             each.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             own.bind(common.getsockname())
-        finally:  # or another program could take the port
+        finally:  # otherwise another program could take the port
             for each in (common, own):
                 each.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 0)
         own.connect(sender)  # type: ignore[arg-type]  # an address
         return own
 
     def _receive(self) -> None:
-        """Take in the datagrams that wait."""
-        buffer = bytearray(_CHUNK)  # one for all: bytes that are shortened afterwards leave holes in the memory
+        """Read the datagrams that wait."""
+        buffer = bytearray(_CHUNK)  # one for all: large buffers cut to size would fragment the memory
         for each in (*self._own.values(), self._common):
             with suppress(BlockingIOError, ConnectionError):
                 for _ in range(_DATAGRAMS):
@@ -233,7 +236,7 @@ class _Port:
                     self._senders.put(bytes(buffer[:size]), sender)
 
 
-def _of_serial(port: serial.Serial) -> Iterator[bytes]:  # type: ignore[name-defined]  # noqa: F821 - an extra
+def _read_serial(port: serial.Serial) -> Iterator[bytes]:  # type: ignore[name-defined]  # noqa: F821 - an extra
     import serial
 
     while True:
@@ -243,14 +246,14 @@ def _of_serial(port: serial.Serial) -> Iterator[bytes]:  # type: ignore[name-def
             return
 
 
-def _in_own_time(lines: list[bytes], speed: float, form: LogFormat) -> Iterator[Batch]:
-    """Lines of a readings file, each when its time has come; nobody waits for long pauses."""
+def _replay(lines: list[bytes], speed: float, form: LogFormat) -> Iterator[Batch]:
+    """Yield the lines of a readings file at the times of their rows, without long pauses."""
     texts = (line.removeprefix(b"\xef\xbb\xbf").decode(errors="replace") for line in lines)
     seconds_of = form.clock(next(filter(form.begins, texts), ""))
     due_s, last_s = time.monotonic(), math.inf
     waiting: list[bytes] = []
     for line in lines:
-        with suppress(IndexError, ValueError):  # what has no time comes with the line before
+        with suppress(IndexError, ValueError):  # a line without a time follows the previous one at once
             time_s = seconds_of(line.decode(errors="replace"))
             step_s, last_s = time_s - last_s, time_s
             due_s += step_s / speed if 0.0 < step_s <= _LONGEST_PAUSE_S * speed else 0.0

@@ -10,7 +10,6 @@ import numpy as np
 
 from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray, IntArray
-from magloc.fields.dipole import MU0_OVER_4PI
 from magloc.fields.multipole import DEFAULT_LENGTH
 from magloc.localization.fit.columns import Solutions
 from magloc.localization.fit.fixes import Fixes
@@ -44,9 +43,7 @@ def body_covariances(
     points: BoolArray = fixes.solved & (fixes.body_length_m == 0.0)
     if not points.any():
         return added[:0]
-    if any(fixes.dropped_sensors):
-        out = np.array([np.isin(array.ids, names)[array.channel_sensor] for names in fixes.dropped_sensors])
-        readings_T = np.where(out, np.nan, readings_T)
+    readings_T = fixes.used_readings(array, readings_T)
     for rows in whitened_rows(array, readings_T, ambient_T, _AT_ONCE):
         loud = points[rows.index] & (rows.energy > _LEAST_ENERGY)
         for k in np.unique(solutions.n_sources[best[rows.index[loud]]]).tolist():
@@ -76,7 +73,7 @@ def _covariances(
     if ambient_sigma_T and model.sees_moduli:
         model = model.marginalise(ambient_errors(model, q, mu, ambient_sigma_T))
     jacobian, errors = scaled_jacobian(model, q, mu), model.whiten(errors)
-    unit = np.tile(np.repeat([model.radius, model.radius**3 / MU0_OVER_4PI], 3), n_sources)
+    unit = model.state_unit(n_sources)
     if known_place:
         of_moments = np.tile(np.repeat([False, True], 3), n_sources)
         jacobian, unit = jacobian[..., of_moments], unit[of_moments]

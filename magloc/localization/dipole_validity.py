@@ -193,9 +193,9 @@ def is_too_near(
         nearest = np.min([np.linalg.norm(place - sensor, axis=1) for sensor in array.positions], axis=0)
         near[alone] = ~dipole_validity(nearest, body_length_m)
     doubtful = ~near[alone] & exceeds(solutions.chi2[best], dof, SECOND_LOOK)
+    used_T = fixes.used_readings(array, readings_T)
     for i in doubtful.nonzero()[0].tolist():
         row, place, moment = alone[i], solutions.position_m[best[i], 0], solutions.moment_Am2[best[i], 0]
-        used = ~np.isin(array.ids, fixes.dropped_sensors[row])[array.channel_sensor]
         of_row = array if ambient_T is None else array.in_ambient_field(ambient_T[row])
-        near[row] = nearness_test(of_row, place, moment, np.where(used, readings_T[row], np.nan)).extended
+        near[row] = nearness_test(of_row, place, moment, used_T[row]).extended
     return near

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from arrays.array import SensorArray
-from arrays.io.values import numbers
+from arrays.io.values import accept_seed, numbers, seed_of
 from arrays.pose import PoseUncertainty
-from arrays.typing import FloatArray, IntArray
+from arrays.typing import FloatArray, IntArray, Rng
 from magloc.ambient import in_world_field
 from magloc.averages import average as averaged
 from magloc.averages import averaging_array, complete_rows
@@ -75,8 +75,8 @@ class Locator:
         array's circumradius; 0 for a point.
     exclude_faulty : bool
         Leave out, and name, sensors that contradict all others.
-    seed : int
-        Of random restarts and of the draws for the threshold of another source.
+    rng : int or numpy.random.Generator
+        Seed or generator of random restarts and of the draws for the threshold of another source.
 
     Raises
     ------
@@ -92,6 +92,7 @@ class Locator:
     array([-0.06, -0.05,  0.12])
     """
 
+    @accept_seed
     def __init__(
         self,
         array: SensorArray,
@@ -101,7 +102,7 @@ class Locator:
         prior: SourcePrior = NOTHING_KNOWN,
         body_length_m: float | None = None,
         exclude_faulty: bool = True,
-        seed: int = 0,
+        rng: Rng = 0,
     ) -> None:
         check_body_length(body_length_m or 0.0)
         if position_m is not None and sources != 1:
@@ -121,7 +122,7 @@ class Locator:
             self._search, self._fewest = cached_search(array) if alike else SingleSourceSearch(array, prior=prior), 6
         else:
             number = None if sources == "auto" else int(sources)
-            self._search = MultiSourceSearch(array, n_sources=number, prior=prior, seed=seed)
+            self._search = MultiSourceSearch(array, n_sources=number, prior=prior, seed=seed_of(rng))
             self._fewest = 6 * (number or 1)
 
     def fit(self, readings_T: ArrayLike, ambient_T: ArrayLike | None = None) -> Fix:
@@ -297,6 +298,7 @@ def fit_at_rest(
     return found.fixes()[0]
 
 
+@accept_seed
 def locate(
     array: SensorArray,
     readings: Readings | ArrayLike,
@@ -308,7 +310,7 @@ def locate(
     body_length_m: float | None = None,
     exclude_faulty: bool = True,
     average: bool = False,
-    seed: int = 0,
+    rng: Rng = 0,
     progress: Callable[[int], None] | None = None,
 ) -> Fixes:
     """Find the sources in every row of readings, each row on its own.
@@ -319,7 +321,7 @@ def locate(
         As its user knows it: places, noise and calibration of the sensors.
     readings : Readings or array_like, shape (n, C) or (C,)
         Raw readings [T], NaN where missing. Those that saturate are not used, and named.
-    sources, prior, body_length_m, exclude_faulty, seed
+    sources, prior, body_length_m, exclude_faulty, rng
         As in :class:`Locator`.
     position_m : array_like, shape (3,) or (K, 3), optional
         Where the source is, or several sources are [m], in the frame of the results: only moments are looked for.
@@ -373,7 +375,7 @@ def locate(
         prior=prior,
         body_length_m=body_length_m,
         exclude_faulty=exclude_faulty,
-        seed=seed,
+        rng=rng,
     )
     fixes = locator.fit_rows(rows.values_T, ambient, time_s=rows.time_s, progress=progress)
     fixes = replace(fixes, saturated_channels=saturated)

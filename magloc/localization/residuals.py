@@ -25,9 +25,7 @@ def fix_residuals(
     or no solution, and for sensors that the fix left out.
     """
     readings = check_rows(array, readings_T)
-    dropped = np.array([[name in names for name in array.ids] for names in fixes.dropped_sensors], dtype=bool)
-    unused = ~fixes.solved[:, None] | dropped.reshape(-1, array.n_sensors)[:, array.channel_sensor]
-    used = np.where(unused, np.nan, readings)
+    used = np.where(fixes.solved[:, None], fixes.used_readings(array, readings), np.nan)
     result = np.full(readings.shape, np.nan)
     for rows in whitened_rows(array, used, ambient_T, _ROWS_AT_ONCE):
         if rows.mask.any():

@@ -43,7 +43,7 @@ def channel_jacobian(
 ) -> FloatArray:
     """Return the Jacobian (..., C, 6) of the channels by (p, m) [T/m], [T/(A·m²)].
 
-    A modulus has the gradient of its field along the direction of the sum, equation (4).
+    A modulus has the gradient of its field along the direction of the sum: equation (4) of the source paper.
     """
     p = np.asarray(position_m, dtype=np.float64)[..., None, :]
     m = np.asarray(moment_Am2, dtype=np.float64)[..., None, :]

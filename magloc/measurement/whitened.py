@@ -64,6 +64,10 @@ class ScaledSensors:
             moment: FloatArray = mu * (self.radius**3 / MU0_OVER_4PI) / np.abs(q[..., 3:]) ** 3
         return moment
 
+    def state_unit(self, n_sources: int = 1) -> FloatArray:
+        """Return the radius [m] and the unit of moments [A·m²] for (p₁, m₁, p₂, …), shape (6 K,)."""
+        return np.tile(np.repeat([self.radius, self.radius**3 / MU0_OVER_4PI], 3), n_sources)
+
     def scaled_moment(self, q: FloatArray, moment_Am2: ArrayLike) -> FloatArray:
         """Return scaled moments (..., 3) [T], the inverse of :meth:`moment`."""
         return np.asarray(moment_Am2) * (MU0_OVER_4PI / self.radius**3) * np.abs(q[..., 3:]) ** 3

@@ -1,4 +1,4 @@
-"""Figures of results, in one house style (:mod:`magloc.plots.style`): units on every axis, fit for print."""
+"""Figures of results for print, in one house style (:mod:`magloc.plots.style`)."""
 
 from arrays.io.lazy import lazy_names
 

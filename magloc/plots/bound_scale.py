@@ -1,4 +1,4 @@
-"""Colours, contours and words that all pictures of Cramér-Rao bounds share."""
+"""Colour scale, contours and texts of all figures of Cramér-Rao bounds."""
 
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ if TYPE_CHECKING:
 COLOURS = "viridis"
 ON_DARK, _ON_LIGHT = "#ffffff", "#000000"
 _DECADES = 10.0 ** np.arange(-9, 10)
-_LIGHT_FROM = 0.65  # share of the colours from which on a line has to be black to be seen
+_LIGHT_FROM = 0.65  # part of the colour scale above which lines are black
 
 
-def name_accuracy(ax: Axes, scenario: BoundScenario, values_m: FloatArray) -> None:
-    """The thick line, for the legend; where no value (…) is on its other side, this in words."""
+def label_accuracy(ax: Axes, scenario: BoundScenario, values_m: FloatArray) -> None:
+    """Add the required accuracy to the legend; state if it is met everywhere or nowhere."""
     known = values_m[np.isfinite(values_m)]
-    met, words = known <= scenario.accuracy_m, f"required: {style.length_text(scenario.accuracy_m)}"
+    met, text = known <= scenario.accuracy_m, f"required: {style.length_label(scenario.accuracy_m)}"
     if met.all() or not met.any():
-        words += f", met {'everywhere' if met.all() else 'nowhere'}"
-    ax.plot([], [], color=style.ORANGE, lw=1.8, label=words)
+        text += f", met {'everywhere' if met.all() else 'nowhere'}"
+    ax.plot([], [], color=style.ORANGE, lw=1.8, label=text)
 
 
 def sigma_unit(values_m: FloatArray, most_m: float) -> tuple[str, float]:
-    """Unit of a σ, and how many of it make a metre, so that the numbers on its colour bar are short."""
-    return style.length_unit(0.999 * _limits(log_norm(values_m, most_m))[1])
+    """Return the unit of a σ for short numbers on its colour bar, and the units in a metre."""
+    return style.axis_unit(0.999 * _limits(log_norm(values_m, most_m))[1])
 
 
 def log_norm(values: FloatArray, most: float) -> LogNorm:
-    """Whole decades that most of the values lie in, up to one that is as good as knowing nothing; five at most."""
+    """Return a logarithmic scale over the decades of most values, at most five."""
     positive = values[np.isfinite(values) & (values > 0.0)]
     low, high = np.log10(np.percentile(positive, [2.0, 98.0])) if positive.size else (0.0, 1.0)
     top = min(np.ceil(high - 0.1), np.ceil(np.log10(most) - 0.1))
@@ -47,8 +47,8 @@ def log_norm(values: FloatArray, most: float) -> LogNorm:
     return LogNorm(10.0**bottom, 10.0**top)
 
 
-def levels_of(values: FloatArray, norm: LogNorm, accuracy: float | None) -> list[float]:
-    """Contours that are worth a label: powers of ten; where they would be few, 2 and 5 between them."""
+def contour_levels(values: FloatArray, norm: LogNorm, accuracy: float | None) -> list[float]:
+    """Return contour levels: powers of ten, with 2 and 5 between them where they are few."""
     finite = values[np.isfinite(values)]
     if not finite.size:
         return []
@@ -56,7 +56,7 @@ def levels_of(values: FloatArray, norm: LogNorm, accuracy: float | None) -> list
     low, high = max(float(finite.min()), 0.999 * lowest), min(float(finite.max()), 1.001 * highest)
     steps = (1.0, 2.0, 5.0) if high < 300.0 * low else (1.0,)
     every = np.sort(np.outer(_DECADES, steps).ravel())
-    # So near to the thick line the labels of both would meet.
+    # Labels of levels near the required accuracy would overlap its line.
     return [
         float(f"{level:.3g}")
         for level in every
@@ -68,13 +68,13 @@ def _limits(norm: LogNorm) -> tuple[float, float]:
     return float(norm.vmin or 0.0), float(norm.vmax or 0.0)
 
 
-def shown_values(ax: Axes, values: FloatArray, norm: LogNorm) -> FloatArray:
-    """Values to colour: what is infinite has the last colour, and a word where that is all; what is undefined none."""
+def fill_infinite(ax: Axes, values: FloatArray, norm: LogNorm) -> FloatArray:
+    """Replace infinite values by the last colour, with a text if no value is finite."""
     infinite = np.isinf(values)
     if infinite.any() and not np.isfinite(values).any():
         ax.text(
             0.5, 0.3, "infinite: not to be known", transform=ax.transAxes, ha="center", va="center",
-            fontsize=style.LETTERS,
+            fontsize=style.FONT_SIZE,
         )  # fmt: skip
     return np.where(infinite, 10.0 * _limits(norm)[1], values)
 
@@ -88,7 +88,7 @@ def draw_contours(
     levels: Sequence[float],
     accuracy: float | None,
 ) -> Any:
-    """Thin lines at the levels, a thick one at the accuracy; returns the thin ones, if there are any."""
+    """Draw thin contours at the levels, which are returned, and a thick one at the accuracy."""
     finite = np.where(np.isfinite(values), values, np.nan)
     if np.isnan(finite).all():
         return None
@@ -110,24 +110,24 @@ def _line_colours(levels: Sequence[float], norm: LogNorm) -> list[str]:
     return [ON_DARK if norm(level) < _LIGHT_FROM else _ON_LIGHT for level in levels]
 
 
-def colour_bar(figure: Figure, beside: Axes, norm: LogNorm, label: str) -> Any:
-    """Colour bar at the right of a panel, as high as the panel."""
+def add_colour_bar(figure: Figure, beside: Axes, norm: LogNorm, label: str) -> Any:
+    """Add a colour bar to the right of a panel, as high as the panel."""
     place = beside.get_position()
     bar = figure.colorbar(
         ScalarMappable(norm, COLOURS),
         cax=figure.add_axes((place.x1 + 0.016, place.y0, 0.014, place.height)),
         extend="both",
     )
-    bar.set_label(label, fontsize=style.LETTERS)
-    bar.ax.tick_params(labelsize=style.SMALL_LETTERS, which="major", length=2.0)
+    bar.set_label(label, fontsize=style.FONT_SIZE)
+    bar.ax.tick_params(labelsize=style.SMALL_FONT_SIZE, which="major", length=2.0)
     bar.ax.tick_params(which="minor", length=0.0)
     bar.ax.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     bar.ax.yaxis.set_minor_formatter("")
     return bar
 
 
-def mark_lines(bar: Any, levels: Sequence[float], accuracy: float | None, norm: LogNorm) -> None:
-    """The contour lines, on the bar: lines on a map of the sphere have no room for labels."""
+def mark_levels(bar: Any, levels: Sequence[float], accuracy: float | None, norm: LogNorm) -> None:
+    """Draw the contour levels on the colour bar, because contours on a sphere have no labels."""
     low, high = _limits(norm)
     for level, colour in zip(levels, _line_colours(levels, norm), strict=True):
         bar.ax.axhline(level, color=colour, lw=0.6)
@@ -136,13 +136,13 @@ def mark_lines(bar: Any, levels: Sequence[float], accuracy: float | None, norm: 
     bar.set_ticks([level for level in levels if low <= level <= high])
 
 
-def in_words(scenario: BoundScenario) -> str:
-    """The array, and the size of the moment."""
+def scenario_text(scenario: BoundScenario) -> str:
+    """Return the name of the array and the size of the moment."""
     size = float(np.linalg.norm(scenario.moment_Am2))
-    return f"{_name(scenario)}, {size:.4g} A·m²"
+    return f"{_array_text(scenario)}, {size:.4g} A·m²"
 
 
-def _name(scenario: BoundScenario) -> str:
+def _array_text(scenario: BoundScenario) -> str:
     array = scenario.array
     kinds: Sequence[str] = sorted({sensor.kind for sensor in array.sensors})
     return array.name or f"an array of {array.n_sensors} {' and '.join(kinds)} sensors"

@@ -1,4 +1,4 @@
-"""What a calibration adds to an array, and what it leaves of the readings."""
+"""Figures of calibrations: changes of the array, and residuals of the readings."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _T_IN_nT = 1e9
 
 
 def calibration(result: SourceCalibration | TurningCalibration) -> Figure:
-    """The figure that suits a calibration.
+    """Draw a calibration.
 
     Parameters
     ----------
     result : Calibration
-        From a source on a path, or from turning.
+        Calibration by a source on a path, or by turning the array.
 
     Examples
     --------
@@ -40,12 +40,12 @@ def calibration(result: SourceCalibration | TurningCalibration) -> Figure:
 
 
 def columns_of_calibration(result: SourceCalibration | TurningCalibration) -> dict[str, Column]:
-    """The data behind that figure."""
+    """Return the data of the figure as columns."""
     return turning_columns(result) if isinstance(result, TurningCalibration) else calibration_columns(result)
 
 
 def calibration_columns(result: SourceCalibration) -> dict[str, Column]:
-    """What :func:`calibration_figure` shows, as columns of a table."""
+    """Return the data of :func:`calibration_figure` as columns."""
     before, after = result.rms_T
     axes = [f"axis_{'xyz'[channel]}_to_{'xyz'[component]}" for channel, component in AXIS_PAIRS]
     columns: dict[str, Column] = {
@@ -67,7 +67,7 @@ def calibration_columns(result: SourceCalibration) -> dict[str, Column]:
 
 
 def turning_columns(result: TurningCalibration) -> dict[str, Column]:
-    """What :func:`turning_figure` is drawn from: the moduli that the sensors read."""
+    """Return the moduli of the sensors before and after the calibration as columns."""
     columns: dict[str, Column] = {"time_s": result.time_s}
     for i, name in enumerate(result.fits):
         for when, modulus in zip(("before", "after"), result.moduli_T, strict=True):
@@ -84,29 +84,29 @@ _GROUPS = (
 
 
 def calibration_figure(result: SourceCalibration) -> Figure:
-    """Residuals of every sensor before and after, and what the calibration adds to the array file.
+    """Draw the residuals of every sensor before and after, and the changes of the array file.
 
-    With a panel for each of positions, gains, axes and offsets that is estimated; bars are 95 % intervals.
+    Estimated positions, gains, axes and offsets have a panel each. The bars are 95 % intervals.
     """
     ids, estimated = result.array.ids, result.estimated
     groups = [(place, scale, label) for place, scale, label in _GROUPS if estimated[:, place].any()]
     figure = style.new_figure(1.5 + 1.35 * len(groups))
     axes = np.atleast_1d(figure.subplots(1 + len(groups), 1, sharex=True))
-    _before_and_after(axes[0], *result.rms_T, "residual rms [nT]", "what is left of the readings")
+    _draw_before_after(axes[0], *result.rms_T, "residual rms [nT]", "what is left of the readings")
     for ax, (place, scale, label) in zip(axes[1:], groups, strict=True):
         values = scale * np.where(estimated[:, place], result.change[:, place], np.nan)
         spread = scale * style.SIGMAS_95 * result.sigma[:, place]
-        _values(ax, values, spread)
-        style.dress(ax, "", f"change of\n{label}")
+        _draw_values(ax, values, spread)
+        style.label_axes(ax, "", f"change of\n{label}")
     if groups:
-        axes[1].set_title("what the calibration changes, 95 % intervals", fontsize=style.LETTERS, loc="left")
-        style.legend(axes[1])
-    style.name_sensors(axes[-1], ids)
+        axes[1].set_title("what the calibration changes, 95 % intervals", fontsize=style.FONT_SIZE, loc="left")
+        style.add_legend(axes[1])
+    style.label_sensors(axes[-1], ids)
     return figure
 
 
 def turning_figure(result: TurningCalibration) -> Figure:
-    """How far the modulus that a sensor reads while it is turned is from that of the field, before and after."""
+    """Draw the rms error of every sensor's modulus, and the changes of gains and offsets."""
     ids = list(result.fits)
     modulus_T = np.broadcast_to(result.modulus_T, len(result.time_s))[:, None]
     first, last = (np.sqrt(np.nanmean((read - modulus_T) ** 2, axis=0)) for read in result.moduli_T)
@@ -118,31 +118,31 @@ def turning_figure(result: TurningCalibration) -> Figure:
     offset_change_T = np.subtract([one.offset_T for one in after], [one.offset_T for one in before])
     figure = style.new_figure(4.2)
     axes = figure.subplots(3, 1, sharex=True)
-    _before_and_after(axes[0], first, last, "rms of the\nmodulus [nT]", "modulus read minus the field's")
+    _draw_before_after(axes[0], first, last, "rms of the\nmodulus [nT]", "modulus read minus the field's")
     for ax, values, label in (
         (axes[1], 1e2 * (gains[1] / gains[0] - 1.0), "gain [%]"),
         (axes[2], 1e6 * offset_change_T, "offset [µT]"),
     ):
-        _values(ax, values, np.full_like(values, np.nan))
-        style.dress(ax, "", f"change of\n{label}")
-    axes[1].set_title("what the calibration changes", fontsize=style.LETTERS, loc="left")
-    style.legend(axes[1])
-    style.name_sensors(axes[-1], ids)
+        _draw_values(ax, values, np.full_like(values, np.nan))
+        style.label_axes(ax, "", f"change of\n{label}")
+    axes[1].set_title("what the calibration changes", fontsize=style.FONT_SIZE, loc="left")
+    style.add_legend(axes[1])
+    style.label_sensors(axes[-1], ids)
     return figure
 
 
-def _before_and_after(ax: Axes, before_T: FloatArray, after_T: FloatArray, label: str, title: str) -> None:
+def _draw_before_after(ax: Axes, before_T: FloatArray, after_T: FloatArray, label: str, title: str) -> None:
     sensors = np.arange(len(before_T))
-    style.logarithmic(ax, [1e9 * before_T, 1e9 * after_T])
+    style.set_log_scale(ax, [1e9 * before_T, 1e9 * after_T])
     ax.vlines(sensors, 1e9 * before_T, 1e9 * after_T, color=style.GREY, lw=0.6, zorder=1.5)
     ax.plot(sensors, 1e9 * before_T, "o", ms=3.5, mfc="white", mec=style.BLACK, label="before")
     ax.plot(sensors, 1e9 * after_T, "s", ms=3.5, color=style.BLUE, label="after")
-    style.dress(ax, "", label, title)
-    style.legend(ax)
+    style.label_axes(ax, "", label, title)
+    style.add_legend(ax)
 
 
-def _values(ax: Axes, values: FloatArray, spread: FloatArray) -> None:
-    """Three components (n, 3) of every sensor, or its six angles, two for each channel."""
+def _draw_values(ax: Axes, values: FloatArray, spread: FloatArray) -> None:
+    """Draw three components (n, 3) of every sensor, or its six angles, two for each channel."""
     per_component = values.shape[1] // 3
     step, thin = (0.22, 0.0) if per_component == 1 else (0.13, 1.0)
     for k in range(values.shape[1]):

@@ -1,4 +1,4 @@
-"""Slices through convergence maps and source maps."""
+"""Figures of slices through convergence maps and source maps."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 _SLICES = (("x", "y", "z"), ("x", "z", "y"), ("y", "z", "x"))
 _WHITE = "#ffffff"
-# Colour, hatching and name: the hatching tells them from the values in a grey print too.
+# Colour, hatching and name; the hatching distinguishes them from the values in a grey print.
 _NOT_CONVERGED = {
     StartStatus.OTHER_OPTIMUM: (_WHITE, "", "stopped elsewhere"),
     StartStatus.NOT_STOPPED: (_WHITE, "////", "did not stop"),
@@ -39,16 +39,16 @@ _SOURCES_COLOURS = ListedColormap([colour for colour, _, _ in _SOURCE_ENDS.value
 
 
 def convergence(dataset: xr.Dataset) -> Figure:
-    """Iterations to convergence on three slices through the source, as in the source paper.
+    """Draw the iterations to convergence on three slices through the source.
 
-    Starts that did not converge are white and hatched; the dashed line is the plane through the array, orthogonal to
-    the direction of the source.
+    Starts that did not converge are white and hatched. The dashed line is the plane through the array that is
+    orthogonal to the direction of the source.
 
     Parameters
     ----------
     dataset : xarray.Dataset
-        A map made by :func:`magloc.convergence.over_starts.convergence_map`, or one opened by
-        :func:`magloc.grids.store.open_map`: only its slices are in memory at once.
+        A map of :func:`magloc.convergence.over_starts.convergence_map`, or one opened by
+        :func:`magloc.grids.store.open_map`. Only its slices are loaded.
 
     Examples
     --------
@@ -62,42 +62,42 @@ def convergence(dataset: xr.Dataset) -> Figure:
     source = np.atleast_1d(dataset.attrs["position_m"])
     centroid = np.atleast_1d(dataset.attrs["centroid_m"])
     moment = np.atleast_1d(dataset.attrs["moment_Am2"])
-    # Places by hand: a layout engine draws everything twice.
+    # The panels have fixed places, because a layout engine draws everything twice.
     figure = style.new_figure(3.0, layout=None)
     places = {"left": 0.07, "right": 0.895, "bottom": 0.25, "top": 0.8, "wspace": 0.34}
     axes = figure.subplots(1, 3, gridspec_kw=places)
-    parts = _slices(dataset[["status", "iterations"]], source)
+    parts = _load_slices(dataset[["status", "iterations"]], source)
     shown = [part["iterations"].where(part["status"] == StartStatus.CONVERGED) for part in parts]
     converged = np.concatenate([values.to_numpy()[np.isfinite(values)] for values in shown])
     top = float(np.percentile(converged, 99)) if converged.size else 1.0
     for ax, part, values, (across, up, through) in zip(axes, parts, shown, _SLICES, strict=True):
-        _slice(ax, part["status"], _STARTS_COLOURS, values, across, up, "start", (0.0, top))
-        _hatch(ax, part["status"], across, up)
-        _scene(ax, dataset, source, centroid, moment, "xyz".index(across), "xyz".index(up))
-        ax.set_title(f"starts with {through} = {float(part[through]):g} m", fontsize=style.LETTERS)
+        _draw_slice(ax, part["status"], _STARTS_COLOURS, values, across, up, "start", (0.0, top))
+        _hatch_failures(ax, part["status"], across, up)
+        _draw_markers(ax, dataset, source, centroid, moment, "xyz".index(across), "xyz".index(up))
+        ax.set_title(f"starts with {through} = {float(part[through]):g} m", fontsize=style.FONT_SIZE)
     bar = figure.colorbar(axes[-1].images[-1], cax=figure.add_axes((0.915, 0.25, 0.014, 0.55)), extend="max")
-    bar.set_label("passes until convergence [1]", fontsize=style.LETTERS)
-    bar.ax.tick_params(labelsize=style.SMALL_LETTERS)
-    handles = _handles(parts, _NOT_CONVERGED) + axes[0].get_legend_handles_labels()[0]
-    style.legend(figure, handles=handles, loc="lower center", ncols=6)
+    bar.set_label("passes until convergence [1]", fontsize=style.FONT_SIZE)
+    bar.ax.tick_params(labelsize=style.SMALL_FONT_SIZE)
+    handles = _legend_handles(parts, _NOT_CONVERGED) + axes[0].get_legend_handles_labels()[0]
+    style.add_legend(figure, handles=handles, loc="lower center", ncols=6)
     halves = {"front": counts.front_fraction, "back": counts.back_fraction}
-    style.headline(
+    style.add_title(
         figure,
         f"Convergence of '{dataset.attrs['method']}', moment ({', '.join(f'{m:g}' for m in moment)}) A·m²: "
-        + ", ".join(f"{half} half {_percent(part)}" for half, part in halves.items() if not np.isnan(part))
+        + ", ".join(f"{half} half {100.0 * part:.1f} %" for half, part in halves.items() if not np.isnan(part))
         + (f", median {counts.median_iterations:.0f} passes" if counts.converged else ""),
     )
     return figure
 
 
 def sources(dataset: xr.Dataset) -> Figure:
-    """How fixes ended, over the Cramér-Rao bound of the range, on three slices through the array.
+    """Draw outcomes of fixes and the Cramér-Rao bound of the range on three slices.
 
     Parameters
     ----------
     dataset : xarray.Dataset
-        A map made by :func:`magloc.convergence.over_sources.source_map`, or one opened by
-        :func:`magloc.grids.store.open_map`: only its slices are in memory at once.
+        A map of :func:`magloc.convergence.over_sources.source_map`, or one opened by
+        :func:`magloc.grids.store.open_map`. Only its slices are loaded.
 
     Examples
     --------
@@ -109,23 +109,23 @@ def sources(dataset: xr.Dataset) -> Figure:
     counts = source_summary(dataset)
     figure = style.new_figure(4.9, layout="compressed")
     axes = figure.subplots(2, 3)
-    parts = _slices(dataset[["status", "sigma_range"]], np.zeros(3))
+    parts = _load_slices(dataset[["status", "sigma_range"]], np.zeros(3))
     bounds = [part["sigma_range"].copy(data=np.log10(part["sigma_range"].to_numpy())) for part in parts]
     finite = np.concatenate([bound.to_numpy()[np.isfinite(bound)] for bound in bounds])
     low, high = np.percentile(finite, [1, 99]) if finite.size else (0.0, 1.0)
     white = ListedColormap([_WHITE])
     for column, part, bound, (across, up, through) in zip(axes.T, parts, bounds, _SLICES, strict=True):
-        _slice(column[0], part["status"], _SOURCES_COLOURS, bound.where(False), across, up, "source")
-        _slice(column[1], part["status"], white, bound, across, up, "source", (low, high))
-        column[0].set_title(f"sources with {through} = {float(part[through]):g} m", fontsize=style.LETTERS)
+        _draw_slice(column[0], part["status"], _SOURCES_COLOURS, bound.where(False), across, up, "source")
+        _draw_slice(column[1], part["status"], white, bound, across, up, "source", (low, high))
+        column[0].set_title(f"sources with {through} = {float(part[through]):g} m", fontsize=style.FONT_SIZE)
         for ax in column:
             ax.plot(0.0, 0.0, "^", color=_WHITE, mec=style.BLACK, ms=6, label="array")
     bar = figure.colorbar(axes[1, 2].images[-1], ax=axes[1], shrink=0.9, extend="both")
-    bar.set_label("log10 of the range's\nCramér-Rao bound / m [1]", fontsize=style.LETTERS)
-    bar.ax.tick_params(labelsize=style.SMALL_LETTERS)
-    handles = _handles(parts, _SOURCE_ENDS) + axes[0, 0].get_legend_handles_labels()[0]
-    style.legend(figure, handles=handles, loc="outside lower center", ncols=6)
-    style.headline(
+    bar.set_label("log10 of the range's\nCramér-Rao bound / m [1]", fontsize=style.FONT_SIZE)
+    bar.ax.tick_params(labelsize=style.SMALL_FONT_SIZE)
+    handles = _legend_handles(parts, _SOURCE_ENDS) + axes[0, 0].get_legend_handles_labels()[0]
+    style.add_legend(figure, handles=handles, loc="outside lower center", ncols=6)
+    style.add_title(
         figure,
         f"One start-free fix each of {counts.starts} sources of {dataset.attrs['moment_magnitude_Am2']:g} A·m²: "
         f"{counts.fraction:.2%} found, truth listed {counts.truth_listed:.2%}",
@@ -133,14 +133,14 @@ def sources(dataset: xr.Dataset) -> Figure:
     return figure
 
 
-def _slices(dataset: xr.Dataset, through: np.ndarray) -> list[xr.Dataset]:
-    """The three planes through a point, loaded."""
+def _load_slices(dataset: xr.Dataset, through: np.ndarray) -> list[xr.Dataset]:
+    """Load the three planes through a point."""
     planes = ({name: float(through["xyz".index(name)])} for _, _, name in _SLICES)
     return [dataset.sel(plane, method="nearest").load() for plane in planes]
 
 
-def _handles(parts: Sequence[xr.Dataset], colours: Mapping[Any, tuple[str, str, str]]) -> list[Any]:
-    """Legend of the colours that occur."""
+def _legend_handles(parts: Sequence[xr.Dataset], colours: Mapping[Any, tuple[str, str, str]]) -> list[Any]:
+    """Return the handles of the legend for the colours that occur."""
     present = [status for status in colours if any(bool((part["status"] == status).any()) for part in parts)]
     entries = (colours[status] for status in present)
     return [
@@ -149,11 +149,7 @@ def _handles(parts: Sequence[xr.Dataset], colours: Mapping[Any, tuple[str, str, 
     ]
 
 
-def _percent(fraction: float) -> str:
-    return f"{100.0 * fraction:.1f} %"
-
-
-def _slice(
+def _draw_slice(
     ax: Axes,
     status: xr.DataArray,
     colours: ListedColormap,
@@ -163,19 +159,19 @@ def _slice(
     point: str,
     limits: tuple[float, float] = (0.0, 1.0),
 ) -> None:
-    """Colours of the status, and over them the values that are finite."""
+    """Draw the colours of the status, and the finite values above them."""
     axis = status[across].to_numpy()
     half_cell = 0.5 * float(axis[1] - axis[0])
     low, high = float(axis[0]) - half_cell, float(axis[-1]) + half_cell
     options: dict[str, Any] = {"origin": "lower", "extent": (low, high, low, high), "interpolation": "nearest"}
     ax.imshow(status.transpose(up, across), cmap=colours, vmin=-0.5, vmax=colours.N - 0.5, **options)
     ax.imshow(shown.transpose(up, across), cmap="viridis", vmin=limits[0], vmax=limits[1], **options)
-    style.dress(ax, f"{point} {across} [m]", f"{point} {up} [m]")
+    style.label_axes(ax, f"{point} {across} [m]", f"{point} {up} [m]")
     ax.grid(visible=False)
 
 
-def _hatch(ax: Axes, status: xr.DataArray, across: str, up: str) -> None:
-    """Hatching over the cells that did not converge."""
+def _hatch_failures(ax: Axes, status: xr.DataArray, across: str, up: str) -> None:
+    """Hatch the cells that did not converge."""
     axis = status[across].to_numpy()
     half_cell = 0.5 * float(axis[1] - axis[0])
     edges = np.append(axis - half_cell, axis[-1] + half_cell)
@@ -183,7 +179,7 @@ def _hatch(ax: Axes, status: xr.DataArray, across: str, up: str) -> None:
     for kind, (_, hatch, _) in _NOT_CONVERGED.items():
         if not hatch or not (values == kind).any():
             continue
-        # Corners of the cells, so that the hatching ends where they end.
+        # Contours between the corners of the cells end exactly at the cells.
         fine = np.repeat(np.repeat(values == kind, 2, axis=0), 2, axis=1).astype(np.float64)
         inner = 1e-3 * half_cell
         corners = np.column_stack([edges[:-1] + inner, edges[1:] - inner]).ravel()
@@ -192,10 +188,10 @@ def _hatch(ax: Axes, status: xr.DataArray, across: str, up: str) -> None:
         filled.set_linewidth(0.0)
 
 
-def _scene(
+def _draw_markers(
     ax: Axes, dataset: xr.Dataset, source: np.ndarray, centroid: np.ndarray, moment: np.ndarray, across: int, up: int
 ) -> None:
-    """Array, source with its moment, and the line where the plane between the halves cuts the slice."""
+    """Draw the array, the source with its moment, and the plane between the halves."""
     limits = ax.get_xlim()
     width = limits[1] - limits[0]
     ax.plot(centroid[across], centroid[up], "^", color=_WHITE, mec=style.BLACK, ms=6, ls="none", label="array")

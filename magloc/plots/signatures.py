@@ -1,4 +1,4 @@
-"""The parts of an object's moment, and how well its field on a course is known."""
+"""Figure of a magnetic signature: the parts of the moment, and the moment over the heading."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ _HEADINGS_DEG = np.linspace(0.0, 360.0, 145)
 
 
 def signature_figure(found: Signature) -> Figure:
-    """Permanent, induced and eddy-current moment with 95 % intervals, and the moment over the heading.
+    """Draw the parts of the moment with 95 % intervals, and the moment over the heading.
 
     Parameters
     ----------
     found : Signature
-        Of :func:`magloc.fit_signature`.
+        A result of :func:`magloc.fit_signature`.
 
     Returns
     -------
@@ -45,11 +45,11 @@ def signature_figure(found: Signature) -> Figure:
     )  # fmt: skip
     parts.plot(np.zeros(np.sum(~known)), place[~known], "x", color=style.GREY, ms=5.0, label="not determined")
     parts.axvline(0.0, color=style.GREY, lw=0.6)
-    style.dress(parts, "moment [A·m²]", "")
+    style.label_axes(parts, "moment [A·m²]", "")
     parts.set_yticks(place, found.names)
     parts.xaxis.set_major_locator(MaxNLocator(4))
     parts.set_ylim(len(place) - 0.5, -0.5)
-    style.legend(parts)
+    style.add_legend(parts)
     moment, covariance = found.moment(_HEADINGS_DEG)
     sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     axes = zip(("east", "north", "up"), style.COMPONENTS, strict=True)
@@ -57,8 +57,8 @@ def signature_figure(found: Signature) -> Figure:
         turns.plot(_HEADINGS_DEG, moment[:, i], color=colour, ls=line, lw=1.2, label=name)
         ends = (moment[:, i] + sign * style.SIGMAS_95 * sigma[:, i] for sign in (-1.0, 1.0))
         turns.fill_between(_HEADINGS_DEG, *ends, color=colour, alpha=0.15, lw=0.0)
-    style.dress(turns, "heading [°]", "moment [A·m²]", "on a level keel")
+    style.label_axes(turns, "heading [°]", "moment [A·m²]", "on a level keel")
     turns.set_xticks(range(0, 361, 90))
     turns.set_xlim(0.0, 360.0)
-    style.legend(turns)
+    style.add_legend(turns)
     return figure

@@ -1,4 +1,4 @@
-"""A survey from above: the anomaly, what the targets leave of it, the targets, and what could have been found."""
+"""Figure of a survey from above: anomaly, residual, targets, and the least moments that are found."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from matplotlib.tri import Triangulation
 
 from arrays.typing import FloatArray
 from magloc.plots import style
-from magloc.surveying.results import linear_and_most
+from magloc.surveying.results import linear_and_most, neighbour_triangles
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -20,19 +20,16 @@ if TYPE_CHECKING:
 
     from magloc.surveying.results import Survey, Target
 
-_FLAT = 1e-6  # across over along a line
-_FEWEST_TICKS = 3
-_GAP = 3.0  # over the usual step between places: nothing is known across it
 _ACROSS, _UP = "x, east [m]", "y, north [m]"
 
 
 def survey_figure(found: Survey) -> Figure:
-    """Maps of the anomaly along the ambient field, of what the targets leave of it, and of the least moments seen.
+    """Draw maps of the anomaly, of its residual, and of the least moments that are found.
 
     Parameters
     ----------
     found : Survey
-        Of :func:`magloc.survey`.
+        A result of :func:`magloc.survey`.
 
     Returns
     -------
@@ -44,7 +41,7 @@ def survey_figure(found: Survey) -> Figure:
     >>> import magloc
     >>> from dataclasses import replace
     >>> scenario = replace(sims.read_scenario("survey-drone"), duration_s=120.0)
-    >>> field = sims.simulate(scenario, seed=1)
+    >>> field = sims.simulate(scenario, rng=1)
     >>> figure = magloc.plots.survey(magloc.survey(field.array, field.readings))
     """
     x, y, _ = found.rows.place_m.T
@@ -56,45 +53,34 @@ def survey_figure(found: Survey) -> Figure:
         both, (rows.anomaly_T, rows.residual_T), ("anomaly", "less the targets' fields"), strict=True
     ):
         _draw_values(figure, ax, rows.place_m, values_T * 1e9)
-        style.dress(ax, _ACROSS, _UP, title)
+        style.label_axes(ax, _ACROSS, _UP, title)
         ax.set_aspect("equal")
     for target in found:
-        _draw_target(both[0], target, named=False)
-        _draw_target(both[1], target, named=True)
+        _draw_target(both[0], target, has_label=False)
+        _draw_target(both[1], target, has_label=True)
     depths = found.ground_m - found.reach.place_m[:, 2]
     for ax, depth in zip(reach, (depths.min(initial=np.inf), depths.max(initial=0.0)), strict=True):
         at = np.isclose(depths, depth)
         _draw_reach(figure, ax, found.reach.place_m[at], found.reach.moment_Am2[at])
-        style.dress(ax, _ACROSS, _UP, f"least moment seen, {depth:.2g} m deep" if at.any() else "")
+        style.label_axes(ax, _ACROSS, _UP, f"least moment seen, {depth:.2g} m deep" if at.any() else "")
         ax.set_aspect("equal")
     return figure
 
 
 def _draw_reach(figure: Figure, ax: Axes, places_m: FloatArray, moments_Am2: FloatArray) -> None:
-    """Moments between places that are neighbours, on a logarithmic scale."""
+    """Draw the least moments, interpolated between neighbouring places, on a logarithmic scale."""
     xy = places_m[:, :2]
-    if len(xy) < 3 or np.linalg.matrix_rank(xy - xy.mean(axis=0), rtol=_FLAT) < 2:
+    corners = neighbour_triangles(xy)
+    if not len(corners):
         return  # a single line of places has no map
-    between = Triangulation(*xy.T)
-    corners = xy[between.triangles]
-    sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
-    between.set_mask((sides > _GAP * np.median(sides)).any(axis=1))
+    between = Triangulation(xy[:, 0], xy[:, 1], corners)
     surface = ax.tripcolor(between, moments_Am2, norm="log", cmap="viridis", shading="gouraud", rasterized=True)
-    _draw_bar(figure, ax, surface, _round_moments(float(moments_Am2.min()), float(moments_Am2.max())), "A·m²")
-
-
-def _round_moments(least: float, most: float) -> list[float]:
-    """1, 2 and 5 of every decade between two; of many decades 1 alone, and the ends where there is none."""
-    for steps in ((1.0,), (1.0, 2.0, 5.0)):
-        every = [step * 10.0**decade for decade in range(-12, 13) for step in steps]
-        ticks = [tick for tick in every if least <= tick <= most]
-        if len(ticks) >= _FEWEST_TICKS:
-            return ticks
-    return ticks or [least, most]
+    least, most = float(moments_Am2.min()), float(moments_Am2.max())
+    _draw_bar(figure, ax, surface, style.log_ticks(least, most, (1.0,), (1.0, 2.0, 5.0)) or [least, most], "A·m²")
 
 
 def _draw_values(figure: Figure, ax: Axes, places_m: FloatArray, values_nT: FloatArray) -> None:
-    """Rows as coloured points."""
+    """Draw rows as coloured points."""
     linear, most = linear_and_most(values_nT)
     norm = SymLogNorm(linear, vmin=-most, vmax=most)
     points = ax.scatter(
@@ -107,16 +93,16 @@ def _draw_bar(figure: Figure, ax: Axes, shown: Collection, ticks: Sequence[float
     bar = figure.colorbar(shown, ax=ax, orientation="horizontal", shrink=0.8, aspect=30)
     bar.set_ticks(ticks, labels=[f"{float(f'{tick:.2g}'):g}".replace("-", "\N{MINUS SIGN}") for tick in ticks])
     bar.minorticks_off()
-    bar.ax.tick_params(labelsize=style.SMALL_LETTERS)
-    bar.set_label(unit, fontsize=style.LETTERS)
+    bar.ax.tick_params(labelsize=style.SMALL_FONT_SIZE)
+    bar.set_label(unit, fontsize=style.FONT_SIZE)
 
 
-def _draw_target(ax: Axes, target: Target, *, named: bool) -> None:
+def _draw_target(ax: Axes, target: Target, *, has_label: bool) -> None:
     place = (float(target.position_m[0]), float(target.position_m[1]))
     ax.plot(*place, "+", color=style.BLACK, ms=5, mew=0.8, zorder=3)
     ax.add_patch(style.ellipse95(target.position_m[:2], target.covariance[:2, :2], edgecolor=style.BLACK))
-    if named:
-        words = f"{target.id}: {target.depth_m:.1f} m"
+    if has_label:
+        text = f"{target.id}: {target.depth_m:.1f} m"
         low, high = ax.get_xlim()
-        side, aligned = (-3.0, "right") if place[0] > high - 0.15 * (high - low) else (3.0, "left")
-        ax.annotate(words, place, (side, 3.0), textcoords="offset points", ha=aligned, fontsize=5.5, zorder=4)
+        offset, side = (-3.0, "right") if place[0] > high - 0.15 * (high - low) else (3.0, "left")
+        ax.annotate(text, place, (offset, 3.0), textcoords="offset points", ha=side, fontsize=5.5, zorder=4)

@@ -1,4 +1,4 @@
-"""A track in space and time, and how true it is to its own covariance."""
+"""Figures of tracks: paths with uncertainties, and the consistency of the covariance."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-def write_picture(
+def write_track_figures(
     points: Sequence[TrackPoint],
     truth_m: FloatArray | None,
     folder: Path,
@@ -30,12 +30,12 @@ def write_picture(
     bound_m: FloatArray | None = None,
     array_m: FloatArray | None = None,
 ) -> None:
-    """Write track.png and consistency.png of one source, and track.csv with the data behind both.
+    """Write track.png and consistency.png of one source, and track.csv with their data.
 
-    ``truth_m`` (n, 3): true positions [m], NaN where they are not known. ``folder``: made if it is not there.
-    ``nees`` (n,): normalised estimation error squared of every row, and its degrees of freedom. ``bound_m`` (n,):
-    posterior Cramér-Rao bound of the distance from the truth. ``array_m`` (n, 3): origin of the array's frame in
-    every row. Raises InputError: the folder cannot be written.
+    ``truth_m`` (n, 3): true positions [m], NaN where unknown. ``folder``: it is created if necessary. ``nees`` (n,):
+    normalised estimation error squared of every row, and its degrees of freedom. ``bound_m`` (n,): posterior Cramér-Rao
+    bound of the distance from the truth [m]. ``array_m`` (n, 3): origin of the array's frame in every row [m]. Raises
+    InputError if the folder cannot be written.
     """
     columns = columns_of_track(points, array_m)
     status = columns.pop("status")
@@ -56,24 +56,24 @@ def write_picture(
 _PLAN_IN = (1.2, 3.4, 6.2)
 # Least ratio of the plan's sides.
 _NARROWEST = 0.2
-# Least height of a coordinate's axis, over the width of the plan: what stands still is a line, without ticks of 1 µm.
+# Least span of a coordinate's axis relative to the plan's width: a source at rest must not get ticks of 1 µm.
 _LEAST_HEIGHT = 0.01
-# Of several sources, the first that of estimates; told apart by colour-blind readers too.
-_SOURCES = (style.ESTIMATE, style.ORANGE, "#009e73", "#cc79a7", "#56b4e9")
+# Okabe and Ito, for colour-blind readers; the first colour is that of estimates.
+_SOURCE_COLOURS = (style.ESTIMATE, style.ORANGE, "#009e73", "#cc79a7", "#56b4e9")
 
 
 def track_figure(
     points: Sequence[TrackPoint], truth_m: FloatArray | None = None, array_m: FloatArray | None = None
 ) -> Figure:
-    """A track from above with 95 % ellipses, and its coordinates and its strength through time with 95 % bands.
+    """Draw a track from above with 95 % ellipses, and its state over time with 95 % bands.
 
     Parameters
     ----------
     points : sequence of TrackPoint
     truth_m : ndarray, shape (n, 3), optional
-        True positions [m], NaN where they are not known.
+        True positions [m], NaN where unknown.
     array_m : ndarray, shape (n, 3), optional
-        Origin of the array's frame in every row [m]; without it the array stands at the origin.
+        Origin of the array's frame in every row [m]; by default the array is at the origin.
 
     Examples
     --------
@@ -82,18 +82,18 @@ def track_figure(
     >>> track = magloc.track(diver.array, diver.readings[90:])
     >>> figure = magloc.plots.track(track.points, diver.truth.position_m[90:])
     """
-    return _figure({"track": points}, truth_m, array_m)
+    return _tracks_figure({"track": points}, truth_m, array_m)
 
 
 def sources_figure(result: TrackResult, array_m: FloatArray | None = None) -> Figure:
-    """Tracks of several sources from above, and their coordinates and strengths through time, as of one.
+    """Draw tracks of several sources from above, and their coordinates and moments over time.
 
     Parameters
     ----------
     result : TrackResult
-        As :attr:`magloc.SourcesTrack.as_result`, or read from a file.
+        A result of :attr:`magloc.SourcesTrack.as_result`, or one read from a file.
     array_m : ndarray, shape (n, 3), optional
-        Origin of the array's frame in every row [m]; without it the array stands at the origin.
+        Origin of the array's frame in every row [m]; by default the array is at the origin.
 
     Examples
     --------
@@ -103,27 +103,27 @@ def sources_figure(result: TrackResult, array_m: FloatArray | None = None) -> Fi
     >>> figure = magloc.plots.source_tracks(track.as_result)
     """
     names = [f"source {id}" for id in result.ids] or ["track"]
-    return _figure(dict(zip(names, result.tracks, strict=True)), None, array_m)
+    return _tracks_figure(dict(zip(names, result.tracks, strict=True)), None, array_m)
 
 
-def _figure(
+def _tracks_figure(
     tracks: Mapping[str, Sequence[TrackPoint]], truth_m: FloatArray | None, array_m: FloatArray | None
 ) -> Figure:
-    """Sources by their names, of which a single one has its truth."""
+    """Draw tracks by the names of their sources; the truth is that of a single source."""
     tracks = {name: on_track(points) for name, points in tracks.items()}
     columns = {name: states_of(points) for name, points in tracks.items()}
     tracked = np.any([np.isfinite(position[:, 0]) for _, position, _, _ in columns.values()], axis=0)
     origin_m = np.zeros((1, 3)) if array_m is None else array_m
     extent = [position for _, position, _, _ in columns.values()] + ([] if truth_m is None else [truth_m])
-    across, up = (style.limits_of([part[:, i] for part in extent], [origin_m[:, i]]) for i in (0, 1))
+    across, up = (style.axis_limits([part[:, i] for part in extent], [origin_m[:, i]]) for i in (0, 1))
     widest = max(across[1] - across[0], up[1] - up[0])
-    across, up = (_at_least(_NARROWEST * widest, *limits) for limits in (across, up))
-    unit, per_m = style.length_unit(widest)
+    across, up = (_widen(_NARROWEST * widest, *limits) for limits in (across, up))
+    unit, per_m = style.axis_unit(widest)
     plan_in = min(max(_PLAN_IN[2] * (up[1] - up[0]) / (across[1] - across[0]), _PLAN_IN[0]), _PLAN_IN[1])
     figure = style.new_figure(plan_in + 4.2)
     grid = figure.add_gridspec(3, 2, height_ratios=[plan_in + 0.5, 1.4, 1.4])
     plan = figure.add_subplot(grid[0, :])
-    _plan(plan, tracks, truth_m, origin_m, unit, per_m)
+    _draw_plan(plan, tracks, truth_m, origin_m, unit, per_m)
     plan.set_xlim(per_m * across[0], per_m * across[1])
     plan.set_ylim(per_m * up[0], per_m * up[1])
     first: Axes | None = None
@@ -132,29 +132,29 @@ def _figure(
         first = ax if first is None else first
         for source, (time, position, _, covariance) in columns.items():
             sigma = np.sqrt(covariance[:, i, i])
-            _through_time(ax, time, per_m * position[:, i], per_m * sigma, source, _colour(columns, source))
+            _draw_band(ax, time, per_m * position[:, i], per_m * sigma, source, _source_colour(columns, source))
         style.shade_gaps(ax, time, tracked, "not tracked")
         if truth_m is not None:
             ax.plot(time, per_m * truth_m[:, i], color=style.TRUTH, lw=0.8, ls="--", label="truth")
-        low, high = style.limits_of([part[:, i] for part in extent], margin=0.15)
-        ax.set_ylim(*(per_m * end for end in _at_least(_LEAST_HEIGHT * widest, low, high)))
-        style.dress(ax, "time [s]", f"{name} [{unit}]")
+        low, high = style.axis_limits([part[:, i] for part in extent], margin=0.15)
+        ax.set_ylim(*(per_m * end for end in _widen(_LEAST_HEIGHT * widest, low, high)))
+        style.label_axes(ax, "time [s]", f"{name} [{unit}]")
     strength = figure.add_subplot(grid[2, 1], sharex=first)
     ends: list[FloatArray] = []
     for source, (time, _, moment, covariance) in columns.items():
         modulus = np.linalg.norm(moment, axis=1)
         along = moment / np.where(modulus > 0.0, modulus, np.nan)[:, None]
         spread = np.sqrt(np.einsum("ni,nij,nj->n", along, covariance[:, 3:, 3:], along))
-        _through_time(strength, time, modulus, spread, source, _colour(columns, source))
+        _draw_band(strength, time, modulus, spread, source, _source_colour(columns, source))
         ends += [modulus - style.SIGMAS_95 * spread, modulus + style.SIGMAS_95 * spread]
     style.shade_gaps(strength, time, tracked, "not tracked")
-    strength.set_ylim(style.limits_of(ends, share=0.95))
-    style.dress(strength, "time [s]", "moment [A·m²]")
+    strength.set_ylim(style.axis_limits(ends, share=0.95))
+    style.label_axes(strength, "time [s]", "moment [A·m²]")
     entries: dict[str, Artist] = {}
     for ax in (plan, strength if first is None else first):
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
             entries.setdefault(label, handle)
-    style.legend(
+    style.add_legend(
         figure,
         handles=entries.values(),
         labels=entries.keys(),
@@ -172,13 +172,13 @@ def consistency_figure(
     nees: tuple[FloatArray, IntArray] | None = None,
     bound_m: FloatArray | None = None,
 ) -> Figure:
-    """Whether a track is as certain as it says: errors, NEES and NIS with bounds, and what the readings taught.
+    """Draw the consistency of a track: errors, NEES, NIS and the estimability of the state.
 
     Parameters
     ----------
     points : sequence of TrackPoint
     truth_m : ndarray, shape (n, 3), optional
-        True positions [m], NaN where they are not known; without them there are neither errors nor NEES.
+        True positions [m], NaN where unknown; errors and NEES need them.
     nees : tuple of ndarray, shape (n,), optional
         Normalised estimation error squared of every row and its degrees of freedom.
     bound_m : ndarray, shape (n,), optional
@@ -196,21 +196,21 @@ def consistency_figure(
     figure = style.new_figure(1.35 * n_panels + 0.3)
     axes = list(figure.subplots(n_panels, 1, sharex=True))
     if truth_m is not None and nees is not None:
-        _errors(axes[0], time, position - truth_m, covariance, bound_m)
-        style.squares_panel(axes[1], time, *nees, "NEES")
+        _draw_errors(axes[0], time, position - truth_m, covariance, bound_m)
+        style.draw_chi_square(axes[1], time, *nees, "NEES")
     tracked = np.array([point.is_on_track for point in points])
     nis = np.array([point.nis for point in points])
     nis_dof = np.array([point.nis_dof for point in points])
-    style.squares_panel(axes[-3], time, nis, nis_dof, "NIS")
+    style.draw_chi_square(axes[-3], time, nis, nis_dof, "NIS")
     estimability = track_column(points, "estimability", 6)
     for ax, first, what in ((axes[-2], 0, "position"), (axes[-1], 3, "moment")):
         for i, (name, colour, _, line) in enumerate(style.COMPONENTS):
             label = name if first == 0 else f"m{name}"
             ax.plot(time, estimability[:, first + i], color=colour, ls=line, lw=1.0, label=label)
         ax.set_ylim(-0.03, 1.03)
-        style.dress(ax, "time [s]", f"estimability\nof the {what} [1]")
-        style.legend(ax)
-    axes[-2].set_title("what the readings taught: 1 - σ / σ without any of them", fontsize=style.LETTERS, loc="left")
+        style.label_axes(ax, "time [s]", f"estimability\nof the {what} [1]")
+        style.add_legend(ax)
+    axes[-2].set_title("what the readings taught: 1 - σ / σ without any of them", fontsize=style.FONT_SIZE, loc="left")
     for ax in axes:
         style.shade_gaps(ax, time, tracked, "not tracked")
         if ax is not axes[-1]:
@@ -218,13 +218,13 @@ def consistency_figure(
     return figure
 
 
-def _at_least(width: float, low: float, high: float) -> tuple[float, float]:
-    """Limits that are this wide at least."""
+def _widen(width: float, low: float, high: float) -> tuple[float, float]:
+    """Return limits that are at least this wide, with the same centre."""
     missing = max(0.0, width - (high - low))
     return low - 0.5 * missing, high + 0.5 * missing
 
 
-def _plan(
+def _draw_plan(
     ax: Axes,
     tracks: Mapping[str, Sequence[TrackPoint]],
     truth_m: FloatArray | None,
@@ -232,55 +232,55 @@ def _plan(
     unit: str,
     per_m: float,
 ) -> None:
-    """Seen from above, with the array."""
+    """Draw the tracks and the array from above."""
     if truth_m is not None:
         style.draw_truth(ax, per_m * truth_m[:, 0], per_m * truth_m[:, 1])
-    edges = {} if len(tracks) == 1 else {source: {"edgecolor": _colour(tracks, source)} for source in tracks}
+    edges = {} if len(tracks) == 1 else {source: {"edgecolor": _source_colour(tracks, source)} for source in tracks}
     for source, points in tracks.items():
         _, position, _, covariance = states_of(points)
         shown = per_m * position
-        ax.plot(shown[:, 0], shown[:, 1], color=_colour(tracks, source), lw=1.2, label=source, zorder=2.2)
-        for i in style.some_of(np.flatnonzero(np.isfinite(position[:, 0]))):
+        ax.plot(shown[:, 0], shown[:, 1], color=_source_colour(tracks, source), lw=1.2, label=source, zorder=2.2)
+        for i in style.thin(np.flatnonzero(np.isfinite(position[:, 0]))):
             edge = edges.get(source, {})
             ax.add_patch(style.ellipse95(shown[i, :2], per_m**2 * covariance[i, :2, :2], label="95 % ellipses", **edge))
-        begun = [i for i, point in enumerate(points) if point.status == "acquired"]
-        if begun:
-            ax.plot(shown[begun, 0], shown[begun, 1], "o", ms=4.5, mfc="none", mec=style.BLACK, label="track begins")
+        starts = [i for i, point in enumerate(points) if point.status == "acquired"]
+        if starts:
+            ax.plot(shown[starts, 0], shown[starts, 1], "o", ms=4.5, mfc="none", mec=style.BLACK, label="track begins")
     origin = per_m * origin_m
     if len(origin) > 1:
         ax.plot(origin[:, 0], origin[:, 1], color=style.GREY, lw=1.0, ls="-.", label="path of the array")
     ax.plot(origin[-1, 0], origin[-1, 1], "^", color="white", mec=style.BLACK, ms=6, ls="none", label="array")
     ax.set_aspect("equal", adjustable="box")
-    style.dress(ax, f"x [{unit}]", f"y [{unit}]", "from above")
+    style.label_axes(ax, f"x [{unit}]", f"y [{unit}]", "from above")
 
 
-def _through_time(ax: Axes, time: FloatArray, value: FloatArray, sigma: FloatArray, name: str, colour: str) -> None:
-    """A number of every row with its 95 % band."""
+def _draw_band(ax: Axes, time: FloatArray, value: FloatArray, sigma: FloatArray, name: str, colour: str) -> None:
+    """Draw a quantity over time with its 95 % band."""
     low, high = value - style.SIGMAS_95 * sigma, value + style.SIGMAS_95 * sigma
     ax.fill_between(time, low, high, color=colour, alpha=0.25, lw=0.0, label="95 % band")
     ax.plot(time, value, color=colour, lw=1.0, label=name)
 
 
-def _colour(tracks: Mapping[str, object], source: str) -> str:
-    """A colour of its own for every source; of a single one that of estimates."""
-    return _SOURCES[list(tracks).index(source) % len(_SOURCES)]
+def _source_colour(tracks: Mapping[str, object], source: str) -> str:
+    """Return the colour of a source."""
+    return _SOURCE_COLOURS[list(tracks).index(source) % len(_SOURCE_COLOURS)]
 
 
-def _errors(
+def _draw_errors(
     ax: Axes, time: FloatArray, error_m: FloatArray, covariance: FloatArray, bound_m: FloatArray | None
 ) -> None:
-    """Distance from the truth, in the coordinates that are known of it, against what it should be."""
+    """Draw the distance from the truth, in its known coordinates, and its standard deviation."""
     known = np.isfinite(error_m)
     distance = np.sqrt(np.where(known, error_m**2, 0.0).sum(axis=1))
     distance[~known.any(axis=1)] = np.nan
     variances = np.diagonal(covariance, axis1=1, axis2=2)[:, :3]
     expected = np.sqrt(np.where(known, variances, 0.0).sum(axis=1))
     expected[~known.any(axis=1)] = np.nan
-    style.logarithmic(ax, [distance, expected])
+    style.set_log_scale(ax, [distance, expected])
     ax.plot(time, distance, ".", color=style.ESTIMATE, ms=3, label="error")
     ax.plot(time, expected, color=style.ORANGE, lw=1.2, label="σ that the track states")
     if bound_m is not None:
         possible = np.where(np.isfinite(bound_m), bound_m, np.nan)
         ax.plot(time, possible, color=style.BLACK, ls="--", lw=0.9, label="posterior Cramér-Rao bound")
-    style.dress(ax, "time [s]", "distance from\nthe truth [m]", "error")
-    style.legend(ax)
+    style.label_axes(ax, "time [s]", "distance from\nthe truth [m]", "error")
+    style.add_legend(ax)

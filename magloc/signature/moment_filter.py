@@ -21,9 +21,11 @@ from arrays.typing import BoolArray, FloatArray
 from magloc.levels import CONTRADICTION
 from magloc.measurement.nuisances import SensorErrors
 from magloc.signature.path import PathError
-from magloc.state_space import IteratedUpdate, iterated_update, predict, smoothing_gain, update
+from magloc.state_space import IteratedUpdate, iterated_update, predict, update
 from magloc.tracking.measurement import RowMeasurement
 from magloc.tracking.motion import N_SOURCE
+from magloc.tracking.results import Prediction, Step
+from magloc.tracking.whole_records.smoother import smooth_states
 
 UNKNOWN = 1e3
 """Initial σ of the moment, in units of the moment that explains the strongest row."""
@@ -174,27 +176,17 @@ class MomentModel:
 
 
 @dataclass(frozen=True, eq=False)
-class MomentStep:
+class MomentStep(Step):
     """One row of a filter.
 
     Attributes
     ----------
-    x_predicted, S_predicted, x, S : ndarray
-        State and square root of its covariance before and after the row's readings.
-    F, S_q : ndarray
-        Diagonal of the transition to this row, and square root of its noise.
     nis : float
         Normalised innovation squared of the row.
     status : str
         Status as in :class:`magloc.tracking.results.TrackPoint`.
     """
 
-    x_predicted: FloatArray
-    S_predicted: FloatArray
-    x: FloatArray
-    S: FloatArray
-    F: FloatArray
-    S_q: FloatArray
     nis: float
     status: str
     iterations: int
@@ -212,8 +204,9 @@ def filter_rows(model: MomentModel, *, at: Sequence[FloatArray] | None = None, g
     for i, row in enumerate(model.rows):
         F, S_q = model.step(x, i) if i else (np.ones(x.size), np.zeros((x.size, 0)))
         x, S = F * x, predict(S, np.diag(F), S_q)
+        prediction = Prediction(x, S, np.diag(F), S_q)
         if not row.z.size:
-            steps.append(MomentStep(x, S, x, S, F, S_q, math.nan, "predicted", 0))
+            steps.append(MomentStep(i, prediction, x, S, math.nan, "predicted", 0))
             continue
         update = _update_row(model, i, x, S, None if at is None else at[i])
         status = "tracked"
@@ -224,14 +217,15 @@ def filter_rows(model: MomentModel, *, at: Sequence[FloatArray] | None = None, g
                 unknown[model.moment] = scale * np.eye(model.n_parameters)
                 S_q = np.concatenate([S_q, unknown], axis=1)
                 S = predict(S, np.eye(x.size), unknown)
+                prediction = Prediction(x, S, np.diag(F), S_q)
                 update, status = _update_row(model, i, x, S, None if at is None else at[i]), "acquired"
         if status == "outlier":
-            steps.append(MomentStep(x, S, x, S, F, S_q, update.nis, status, 0))
+            steps.append(MomentStep(i, prediction, x, S, update.nis, status, 0))
             continue
         contradictions = 0
         if not np.isfinite(update.S).all():
             raise InputError(_OVERFLOW)
-        steps.append(MomentStep(x, S, update.x, update.S, F, S_q, update.nis, status, update.iterations))
+        steps.append(MomentStep(i, prediction, update.x, update.S, update.nis, status, update.iterations))
         x, S = update.x, update.S
     return steps
 
@@ -257,18 +251,6 @@ def _update_row(model: MomentModel, i: int, x: FloatArray, S: FloatArray, at: Fl
     return IteratedUpdate(after, root, 1, True, innovation, nis)
 
 
-def smooth_steps(steps: Sequence[MomentStep]) -> list[tuple[FloatArray, FloatArray]]:
-    """Return the smoothed state of every row, and the square root of its covariance."""
-    x, S = steps[-1].x, steps[-1].S
-    found = [(x, S)]
-    for step, after in zip(reversed(steps[:-1]), reversed(steps[1:]), strict=True):
-        G, D = smoothing_gain(step.S, np.diag(after.F), after.S_q)
-        x = step.x + G @ (x - after.x_predicted)
-        S = predict(S, G, D)
-        found.append((x, S))
-    return found[::-1]
-
-
 def relinearise(model: MomentModel, *, gate: bool) -> list[MomentStep]:
     """Filter with all rows linearised at the smoothed states.
 
@@ -278,7 +260,7 @@ def relinearise(model: MomentModel, *, gate: bool) -> list[MomentStep]:
     if model.is_linear:
         return steps
     for _ in range(_MOST_PASSES):
-        states = smooth_steps(steps)
+        states = smooth_states(steps)
         steps = filter_rows(model, at=[x for x, _ in states], gate=gate)
         change, S = steps[-1].x - states[-1][0], states[-1][1]
         if np.all(np.abs(change) < _SETTLED * np.linalg.norm(S, axis=1)):

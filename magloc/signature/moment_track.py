@@ -25,7 +25,6 @@ from magloc.signature.moment_filter import (
     MomentStep,
     filter_rows,
     relinearise,
-    smooth_steps,
 )
 from magloc.signature.path import ObjectPath, PathError
 from magloc.state_space import estimability
@@ -35,6 +34,7 @@ from magloc.tracking.motion import N_SOURCE
 from magloc.tracking.results import TrackPoint, warn_of_strengths
 from magloc.tracking.rows import rows_of
 from magloc.tracking.track import TURN_RAD_S, TrackColumns
+from magloc.tracking.whole_records.smoother import smooth_states
 from magloc.truth import Truth, truth_of_rows
 
 EXACT = PathError()
@@ -366,7 +366,7 @@ def goodness_of_fit(model: MomentModel, steps: Sequence[MomentStep]) -> tuple[fl
 
 def _points(model: MomentModel, steps: Sequence[MomentStep], k: int, *, smooth: bool) -> list[TrackPoint]:
     """Return the points of the track of source k, from the filter or from the smoother."""
-    states = smooth_steps(steps) if smooth else [(step.x, step.S) for step in steps]
+    states = smooth_states(steps) if smooth else [(step.x, step.S) for step in steps]
     array = model.rows[0].model.array
     # S_0: covariance propagated from the start without measurements; MeasureS is relative to it.
     x_0, open_loop = model.start()
@@ -407,6 +407,6 @@ def _covariances_at(model: MomentModel, moment_Am2: FloatArray, *, smooth: bool)
         state[model.moment] = np.linalg.lstsq(model.basis.M[i], moment, rcond=None)[0]
         at.append(state)
     steps = filter_rows(model, at=at, gate=False)
-    states = smooth_steps(steps) if smooth else [(step.x, step.S) for step in steps]
+    states = smooth_states(steps) if smooth else [(step.x, step.S) for step in steps]
     roots = [(model.sources_jacobian(i, x)[0] @ S)[3:] for i, (x, S) in enumerate(states)]
     return np.array([root @ root.T for root in roots])

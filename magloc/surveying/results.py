@@ -9,13 +9,14 @@ from functools import cached_property
 from typing import Any, NamedTuple, overload
 
 import numpy as np
+from scipy.spatial import Delaunay
 from scipy.special import chdtri
 
 from arrays.array import SensorArray
 from arrays.io.csv import Column
 from arrays.io.results import Result
 from arrays.io.tables import align, by_sigma
-from arrays.typing import FloatArray, Vector
+from arrays.typing import FloatArray, IntArray, Vector
 from magloc.localization.fit.table import cells_of_strength
 from magloc.truth import state_columns
 
@@ -23,6 +24,8 @@ IRON_Am2_PER_KG = (0.05, 0.3)
 """Moment of a kilogram of iron in the ground: a range, as its remanence and shape are not known."""
 _MOST_POINTS = 20_000
 _MOST, _LEAST_LINEAR = 0.8, 1e-3
+_FLAT = 1e-6  # across over along a line
+_GAP = 3.0  # over the usual step between places: nothing is known across it
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +57,7 @@ class Target:
     >>> import magloc
     >>> from dataclasses import replace
     >>> scenario = replace(sims.read_scenario("survey-drone"), duration_s=120.0)
-    >>> field = sims.simulate(scenario, seed=1)
+    >>> field = sims.simulate(scenario, rng=1)
     >>> target = magloc.survey(field.array, field.readings)[0]
     >>> target.id, round(target.depth_m, 1), round(target.strength_Am2)
     ('t1', 0.4, 13)
@@ -127,6 +130,15 @@ class Reach(NamedTuple):
     moment_Am2: FloatArray
 
 
+def neighbour_triangles(xy_m: FloatArray) -> IntArray:
+    """Return triangles (k, 3) of places (n, 2) that are neighbours; none where all lie on one line."""
+    if len(xy_m) < 3 or np.linalg.matrix_rank(xy_m - xy_m.mean(axis=0), rtol=_FLAT) < 2:
+        return np.zeros((0, 3), dtype=np.int64)
+    corners = Delaunay(xy_m).simplices
+    sides = np.linalg.norm(xy_m[corners] - xy_m[np.roll(corners, 1, axis=1)], axis=2)
+    return np.asarray(corners[(sides <= _GAP * np.median(sides)).all(axis=1)], dtype=np.int64)
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Survey(Result):
     """Targets, rows and reach of a survey.
@@ -159,7 +171,7 @@ class Survey(Result):
     >>> import magloc
     >>> from dataclasses import replace
     >>> scenario = replace(sims.read_scenario("survey-drone"), duration_s=120.0)
-    >>> field = sims.simulate(scenario, seed=1)
+    >>> field = sims.simulate(scenario, rng=1)
     >>> magloc.survey(field.array, field.readings)
     Survey: 3 targets, 1921 rows
     """

@@ -111,7 +111,7 @@ def survey(
     >>> import magloc
     >>> from dataclasses import replace
     >>> scenario = replace(sims.read_scenario("survey-drone"), duration_s=120.0)
-    >>> field = sims.simulate(scenario, seed=1)
+    >>> field = sims.simulate(scenario, rng=1)
     >>> found = magloc.survey(field.array, field.readings)
     >>> found[0].position_m.round(1).tolist(), [round(depth, 1) for depth in found[0].depth_interval95_m]
     ([12.7, 12.5, -0.4], [0.4, 0.4])

@@ -12,6 +12,7 @@ from scipy.special import chdtri
 
 from arrays.array import SensorArray
 from arrays.typing import FloatArray
+from magloc.chi_square import normalised_square
 from magloc.levels import CONTRADICTION, DISAGREEMENT
 from magloc.localization.fit.prior import SourcePrior
 from magloc.localization.fit.results import Fix, Solution
@@ -145,7 +146,7 @@ def _agree(before: Solution | None, after: Solution) -> bool:
         return False
     offset = after.position_m - before.position_m
     both = before.covariance[:3, :3] + after.covariance[:3, :3]
-    return bool(offset @ np.linalg.solve(both, offset) < chdtri(3, DISAGREEMENT))
+    return bool(normalised_square(offset, both) < chdtri(3, DISAGREEMENT))
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,7 +204,7 @@ class CartesianFilter:
         F[:n, :n], S_q[:n, : S_q_motion.shape[1]] = F_motion, S_q_motion
         F[n + np.arange(n_errors), n + np.arange(n_errors)] = decay
         S_q[n + noisy, S_q_motion.shape[1] + np.arange(noisy.size)] = noise[noisy]
-        return Prediction(np.concatenate([x_motion, decay * x[n:]]), predict(S, F, S_q), F)
+        return Prediction(np.concatenate([x_motion, decay * x[n:]]), predict(S, F, S_q), F, S_q)
 
     def initial_state(
         self, centre: FloatArray, root: FloatArray, R_world_from_array: FloatArray | None = None

@@ -29,8 +29,7 @@ from magloc.measurement.pose import N_POSE, ArrayPose, PoseErrors
 from magloc.state_space import MeasurementFunction
 from magloc.tracking.coordinates import Chart
 from magloc.tracking.motion import N_SOURCE
-from magloc.tracking.row_filter import Rows
-from magloc.tracking.rows import Row
+from magloc.tracking.rows import Row, Rows
 
 LEAST_SINGULAR = 1e-6
 """Least ratio of the diagonal of R of a scaled Jacobian (QR) for which a row determines coordinates."""
@@ -54,9 +53,7 @@ class RowMeasurement:
     Attributes
     ----------
     model : DifferenceMeasurement
-        In the array's frame.
-    sigma : ndarray, shape (k,)
-        Standard deviations of the differences [T].
+        Model in the array's frame, of differences in units of their noise.
     row : Row
     n_motion : int
         Number of states of the motion.
@@ -69,7 +66,6 @@ class RowMeasurement:
     """
 
     model: DifferenceMeasurement
-    sigma: FloatArray
     row: Row
     n_motion: int
     effect: FloatArray
@@ -79,12 +75,12 @@ class RowMeasurement:
     @cached_property
     def z(self) -> FloatArray:
         """Measured differences, shape (k,)."""
-        return self.model.measured(self.row.readings_T) / self.sigma
+        return self.model.measured(self.row.readings_T)
 
     @property
     def n_differences(self) -> int:
         """Number of differences k."""
-        return self.sigma.size
+        return self.model.differences.n_differences
 
     @property
     def n_pose(self) -> int:
@@ -100,6 +96,11 @@ class RowMeasurement:
     def n_states(self) -> int:
         """Number of states: motion, errors of the pose, errors of the sensors."""
         return self.n_charted + self.effect.shape[1]
+
+    @property
+    def transform(self) -> FloatArray:
+        """Matrix (k, C) from channels to differences."""
+        return self.model.differences.transform
 
     @cached_property
     def centroid_m(self) -> FloatArray:
@@ -122,27 +123,20 @@ class RowMeasurement:
 
     def pad(self, k: int) -> RowMeasurement:
         """Return the row padded to k differences by zeros that do not depend on the source."""
-        more = k - self.n_differences
-        differences = Differences(
-            np.pad(self.model.differences.transform, ((0, more), (0, 0))),
-            np.pad(self.model.differences.variance, (0, more), constant_values=1.0),
-        )
-        padded = replace(
-            self,
-            model=replace(self.model, differences=differences),
-            sigma=np.pad(self.sigma, (0, more), constant_values=1.0),
-            effect=np.pad(self.effect, ((0, more), (0, 0))),
-        )
-        return padded if more else self
+        more = ((0, k - self.n_differences), (0, 0))
+        padded = self._with_transform(np.pad(self.transform, more), np.pad(self.effect, more))
+        return self if k == self.n_differences else padded
+
+    def _with_transform(self, transform: FloatArray, effect: FloatArray) -> RowMeasurement:
+        """Return the row with another matrix from channels to differences of unit noise."""
+        differences = Differences(transform, np.ones(len(transform)))
+        return replace(self, model=replace(self.model, differences=differences), effect=effect)
 
     def with_errors_as_noise(self, sigma: FloatArray) -> RowMeasurement:
         """Return the row with the sensors' errors, of σ (n_errors,), as part of its noise."""
         if not sigma.size:
             return self
-        whiten, k = whitening(self.effect * sigma), self.n_differences
-        differences = Differences(whiten @ (self.model.differences.transform / self.sigma[:, None]), np.ones(k))
-        model = replace(self.model, differences=differences)
-        return replace(self, model=model, sigma=np.ones(k), effect=np.zeros((k, 0)))
+        return self._with_transform(whitening(self.effect * sigma) @ self.transform, self.effect[:, :0])
 
     def predict_source(self, state: FloatArray, others_T: FloatArray | None = None) -> FloatArray:
         """Return the differences (..., k) of sources or states, without errors of sensors.
@@ -151,7 +145,7 @@ class RowMeasurement:
         """
         error = self._pose_error(state)
         in_array = self.pose.to_array(state[..., :N_SOURCE], error)
-        return self.model.predicted(in_array[..., :3], in_array[..., 3:], self._ambient_T(error, others_T)) / self.sigma
+        return self.model.predicted(in_array[..., :3], in_array[..., 3:], self._ambient_T(error, others_T))
 
     def directional_derivative(
         self, state: FloatArray, directions: FloatArray, others_T: FloatArray | None = None
@@ -160,7 +154,6 @@ class RowMeasurement:
         error = self._pose_error(state)
         in_array = self.pose.to_array(state[..., :N_SOURCE], error)
         H = self.model.jacobian(in_array[..., :3], in_array[..., 3:], self._ambient_T(error, others_T))
-        H = H / self.sigma[:, None]
         of_source = self._by_source(H, error) @ directions[..., :N_SOURCE, :]
         if error is None:
             return np.asarray(of_source)
@@ -171,8 +164,7 @@ class RowMeasurement:
         """Return the derivative (..., k, 3) by the moment of a weak source at (..., 3)."""
         array, R = self.model.array, self.row.R_world_from_array
         matrix = dipole.field_matrix(array.positions, ((position_m - self.row.origin_m) @ R)[..., None, :])
-        of_channels = self.model.differences.transform / self.sigma[:, None]
-        of_sensors = of_channels[:, :, None] * array.linear_gain(array.ambient_fields)
+        of_sensors = self.transform[:, :, None] * array.linear_gain(array.ambient_fields)
         sensors = array.channel_sensor == np.arange(array.n_sensors)[:, None]
         of_fields = (sensors @ of_sensors).reshape(self.n_differences, -1)
         return np.asarray(of_fields @ matrix.reshape(*matrix.shape[:-3], -1, 3) @ R.T)
@@ -199,7 +191,7 @@ class RowMeasurement:
         """Measured differences (k,) minus those of the ambient field."""
         array = self.model.array
         ambient = array.readings_of(array.ambient_fields) - array.channel_offset_T
-        return self.z - (self.model.differences.transform @ ambient) / self.sigma
+        return self.z - self.transform @ ambient
 
     @cached_property
     def whitening(self) -> FloatArray:
@@ -208,7 +200,9 @@ class RowMeasurement:
             return np.eye(self.n_differences)
         # Without a moment the rest is the ambient field, rotated by the errors of the pose.
         nowhere = self.pose.to_array(np.zeros(N_SOURCE))
-        return whitening(zero_if_nan(self._by_pose(np.zeros((len(self.sigma), N_SOURCE)), nowhere, np.zeros(N_POSE))))
+        return whitening(
+            zero_if_nan(self._by_pose(np.zeros((self.n_differences, N_SOURCE)), nowhere, np.zeros(N_POSE)))
+        )
 
     def is_detected(self, sigma_errors: FloatArray) -> bool:
         """Return True if the differences exceed noise and the effects of errors of sensors and pose."""
@@ -224,7 +218,7 @@ class RowMeasurement:
         They are as nonlinear as the readings, if these determine a source. Otherwise, or if not `of_readings`, they are
         as nonlinear as position and moment in the array's axes are in the errors of the pose.
         """
-        if of_readings and len(self.sigma) >= N_SOURCE:
+        if of_readings and self.n_differences >= N_SOURCE:
             G = self.jacobian(state)
             Q, R = np.linalg.qr(G[:, :N_SOURCE] * unit)
             diagonal = np.abs(np.diagonal(R))
@@ -269,9 +263,9 @@ class RowMeasurement:
 
     def _by_pose(self, H: FloatArray, in_array: FloatArray, error: FloatArray) -> FloatArray:
         """Return the Jacobian (..., k, n_pose) by the errors of the pose."""
-        array, whiten = self.model.array, self.model.differences.transform / self.sigma[:, None]
+        array = self.model.array
         by_error = H @ self.pose.error_jacobian(in_array, error)
-        by_error += whiten @ self.pose.ambient_jacobian(array, in_array, error, array.ambient_fields)
+        by_error += self.transform @ self.pose.ambient_jacobian(array, in_array, error, array.ambient_fields)
         return np.asarray(by_error @ self.pose_effect)
 
     def _ambient_T(self, error: FloatArray | None, others_T: FloatArray | None) -> FloatArray | None:
@@ -284,20 +278,14 @@ class RowMeasurement:
 
 def stack_rows(rows: Sequence[RowMeasurement]) -> Rows:
     """Return rows of one array as an argument of kernels."""
-    k = max(row.n_differences for row in rows)
-    padded = [row.pad(k) for row in rows]
-    return Rows(
-        rows[0].model.array,
-        np.stack([row.z for row in padded]),
-        np.array([row.n_differences for row in rows]),
-        np.stack([row.model.differences.transform / row.sigma[:, None] for row in padded]),
-        np.arange(len(rows)),
-        np.stack([row.effect for row in padded]),
-        np.stack([row.row.origin_m for row in rows]),
-        np.stack([row.row.R_world_from_array for row in rows]),
-        np.stack([row.model.array.ambient_fields for row in rows]),
-        np.stack([row.pose_effect for row in rows]) if rows[0].n_pose else None,
-        tuple(rows[0].pose.lever_arm_m.tolist()),
+    counts = np.array([row.n_differences for row in rows])
+    padded = [row.pad(counts.max()) for row in rows]
+    ambients_T = np.stack([row.model.array.ambient_fields for row in rows])
+    return replace(
+        Rows.stack(rows[0].model.array, padded, ambients_T),
+        counts=counts,
+        pose_effects=np.stack([row.pose_effect for row in rows]) if rows[0].n_pose else None,
+        lever_arm_m=tuple(rows[0].pose.lever_arm_m.tolist()),
     )
 
 
@@ -342,24 +330,21 @@ class RowMeasurements:
         array = self._array
         if row.ambient_T is not None:
             array = array.in_ambient_field(row.ambient_T)
-        differences = self.differences(row)
-        sigma = np.sqrt(differences.variance)
-        pose = row.pose(self._lever_arm_m)
+        differences, pose = self.differences(row), row.pose(self._lever_arm_m)
         of_errors = self.errors.effect(array, row.readings_T, row.time_s, pose.rate_rad_s)
-        effect = differences.transform @ of_errors / sigma[:, None]
         of_pose = self.pose_errors.effect(pose, row.pose_sigma)
-        model = DifferenceMeasurement(array, differences)
-        return RowMeasurement(model, sigma, row, self._n_motion, effect, pose, of_pose)
+        model, effect = DifferenceMeasurement(array, differences), differences.transform @ of_errors
+        return RowMeasurement(model, row, self._n_motion, effect, pose, of_pose)
 
     def differences(self, row: Row) -> Differences:
-        """Return the independent differences of a row's readings."""
+        """Return the independent differences of a row's readings, in units of their noise."""
         available = np.isfinite(row.readings_T)
         if self._noise_varies:
             covariance = reading_covariance(self._array, row.readings_T)
-            return decorrelated_differences(self._array, available, covariance_T2=covariance)
+            return decorrelated_differences(self._array, available, covariance_T2=covariance).whitened
         key = available.tobytes()
         if key not in self._differences:
-            self._differences[key] = decorrelated_differences(self._array, available)
+            self._differences[key] = decorrelated_differences(self._array, available).whitened
         return self._differences[key]
 
 

@@ -206,12 +206,8 @@ class OrnsteinUhlenbeck(_MovingState):
 
     def turning_step(self, dt_s: float) -> FloatArray:
         """Return the numbers (12,) of a step for the C++ kernel."""
-        gain_s, decay, root = ornstein_uhlenbeck_step(self._correlation_s, dt_s)
-        lower = root[[0, 1, 1], [0, 0, 1]]
-        change = self.moment_change * math.sqrt(dt_s)
-        return np.array(
-            [gain_s, decay, gain_s, decay, *self.speed_m_s * lower, *self.turn_rad_s * lower, change, change]
-        )
+        tau_s, change = self._correlation_s, self.moment_change * math.sqrt(dt_s)
+        return np.array([*turning_step((tau_s, self.speed_m_s), (tau_s, self.turn_rad_s), dt_s), change, change])
 
     def step(self, x: FloatArray, dt_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the prediction, see :class:`MotionModel`."""
@@ -332,6 +328,15 @@ def ornstein_uhlenbeck_step(correlation_s: float, dt_s: float) -> tuple[float, f
     scale = np.sqrt(np.diagonal(Q))
     root = math.sqrt(2.0 / correlation_s) * scale[:, None] * np.linalg.cholesky(Q / np.outer(scale, scale))
     return float(F[0, 1]), float(F[1, 1]), root
+
+
+def turning_step(velocity: tuple[float, float], rate: tuple[float, float], dt_s: float) -> list[float]:
+    """Return ten numbers of a step for the C++ kernel, by correlation time and σ of velocity and rate of turn."""
+    (gain_s, decay, root_v), (turn_gain_s, turn_decay, root_w) = (
+        ornstein_uhlenbeck_step(tau_s, dt_s) for tau_s, _ in (velocity, rate)
+    )
+    lower = [0, 1, 1], [0, 0, 1]
+    return [gain_s, decay, turn_gain_s, turn_decay, *velocity[1] * root_v[lower], *rate[1] * root_w[lower]]
 
 
 @dataclass(frozen=True)

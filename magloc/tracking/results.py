@@ -213,11 +213,12 @@ def point_of_mixture(time_s: float, mixture: Mixture, open_loop: FloatArray) -> 
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """Predicted state, square root of its covariance, and transition matrix."""
+    """Predicted state, root of its covariance, transition matrix, and root of the step's noise."""
 
     x: FloatArray
     S: FloatArray
     F: FloatArray
+    S_q: FloatArray
 
 
 @dataclass(frozen=True, eq=False)

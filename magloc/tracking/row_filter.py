@@ -8,18 +8,18 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cache
 from itertools import cycle
 from typing import Any
 
 import numpy as np
 
-from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc import core
 from magloc.measurement.nuisances import SensorErrors
 from magloc.tracking.coordinates import FIRM
 from magloc.tracking.motion import N_SOURCE, MotionModel, OrnsteinUhlenbeck
+from magloc.tracking.rows import Rows
 
 TOLERANCE = 1e-3
 """Length of the next step, in posterior standard deviations, at which the iteration stops."""
@@ -31,6 +31,10 @@ ROUNDING = 1e-9
 LEAST_SHARE = 0.02
 """Change of whitened readings over one σ of the prediction, above which a direction is as nonlinear as the readings of
 the row. Directions with less were measured by other rows, whose nonlinearity may differ."""
+LARGEST_BEND = 0.5
+"""Nonlinearity of readings within one σ of a Gaussian, in σ of their noise, above which it is divided."""
+_TURNING_NOISE = 15
+"""Number of noises of a turning motion: acceleration, torque, velocity, rate and moment along each axis."""
 _ROWS_A_CALL = 1000
 """Rows of trajectories that one call of the kernel smooths: some 10 ms."""
 _FOLLOWED = 1e-3
@@ -78,80 +82,6 @@ class Gaussians:
     def empty_like(self) -> Gaussians:
         """Return as many Gaussians without values."""
         return replace(self, x=np.empty_like(self.x, order="C"), S=np.empty_like(self.S, order="C"))
-
-
-@dataclass(frozen=True, eq=False)
-class Rows:
-    """Rows of an array's readings.
-
-    Attributes
-    ----------
-    array : SensorArray
-    readings : ndarray, shape (n, k)
-        Differences in units of their noise, padded by zeros.
-    counts : ndarray of int, shape (n,)
-        Number of differences of each row.
-    transforms, transform_of_row : ndarray, shapes (m, k, n_channels) and (n,)
-        Matrices from channels to differences, and the index of that of each row.
-    effects : ndarray, shape (n or 1, k, n_nuisances)
-        Effects of nuisances on the readings.
-    origins_m, rotations : ndarray, shapes (n, 3) and (n, 3, 3)
-        Pose of the array.
-    ambients_T : ndarray, shape (n or 1, n_sensors, 3)
-        Field at the sensors without a source.
-    pose_effects : ndarray, shape (n, 12, n_pose), optional
-        Effects of errors of the pose and of the ambient field.
-    lever_arm_m : tuple of 3 floats
-        Vector from the pose's reference point to the array's origin, in the array's axes.
-    """
-
-    array: SensorArray
-    readings: FloatArray
-    counts: IntArray
-    transforms: FloatArray
-    transform_of_row: IntArray
-    effects: FloatArray
-    origins_m: FloatArray
-    rotations: FloatArray
-    ambients_T: FloatArray
-    pose_effects: FloatArray | None = None
-    lever_arm_m: tuple[float, ...] = (0.0, 0.0, 0.0)
-
-    @property
-    def n_pose(self) -> int:
-        """Number of errors of the pose and of the ambient field."""
-        return 0 if self.pose_effects is None else self.pose_effects.shape[2]
-
-    @cached_property
-    def problem(self) -> core.Problem:
-        """Arguments of kernels."""
-        array, order = self.array, np.arange(len(self.readings))
-        return core.problem(
-            "rows",
-            n_sensors=array.n_sensors,
-            n_channels=array.n_channels,
-            n_readings=self.readings.shape[1],
-            n_nuisances=self.effects.shape[2],
-            n_pose=self.n_pose,
-            sensors=array.positions,
-            array_centroid=tuple(array.centroid),
-            radius=array.circumradius,
-            sensor=np.ascontiguousarray(array.channel_sensor, dtype=np.int64),
-            gain=array.channel_gain,
-            is_modulus=array.channel_is_scalar.astype(np.uint8),
-            readings=np.ascontiguousarray(self.readings),
-            counts=np.ascontiguousarray(self.counts, dtype=np.int64),
-            transforms=np.ascontiguousarray(self.transforms),
-            transform_of_row=np.ascontiguousarray(self.transform_of_row, dtype=np.int64),
-            effects=np.ascontiguousarray(self.effects),
-            effect_of_row=order if len(self.effects) > 1 else np.zeros_like(order),
-            origins=np.ascontiguousarray(self.origins_m),
-            rotations=np.ascontiguousarray(self.rotations),
-            ambients=np.ascontiguousarray(self.ambients_T),
-            ambient_of_row=order if len(self.ambients_T) > 1 else np.zeros_like(order),
-            pose_effects=None if self.pose_effects is None else np.ascontiguousarray(self.pose_effects),
-            lever_arm=self.lever_arm_m,
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,29 +159,34 @@ def steps_problem(
         States before each step of every source of every Gaussian, for a motion that is neither linear nor
         :class:`OrnsteinUhlenbeck`.
     """
-    F = A = B = moved = turning = None
-    n_noise = 15
     every: Sequence[Any] = motions if isinstance(motions, Sequence) else [motions] * len(steps_s)
     of_steps = list(zip(every, steps_s, strict=True))
     if isinstance(every[0], OrnsteinUhlenbeck):
-        turning = np.stack([one.turning_step(length_s) for one, length_s in of_steps])
-    elif hasattr(every[0], "linear_step"):
-        F, A, B = (np.stack(part) for part in zip(*(one.linear_step(dt_s) for one, dt_s in of_steps), strict=True))
-        n_noise = A.shape[2]
+        return motion_problem(
+            step_of_row, nuisances, turning=np.stack([one.turning_step(dt_s) for one, dt_s in of_steps])
+        )
+    if hasattr(every[0], "linear_step"):
+        steps, names = [one.linear_step(dt_s) for one, dt_s in of_steps], ("F", "A", "B")
     else:
         assert states is not None
-        taken = [one.step(x, dt_s) for x, (one, dt_s) in zip(states, cycle(of_steps), strict=False)]
-        moved, F, A = (np.stack(part) for part in zip(*taken, strict=True))
-        n_noise = A.shape[2]
+        steps = [one.step(x, dt_s) for x, (one, dt_s) in zip(states, cycle(of_steps), strict=False)]
+        names = ("moved", "F", "A")
+    parts = map(np.stack, zip(*steps, strict=True))
+    return motion_problem(step_of_row, nuisances, **dict(zip(names, parts, strict=True)))
+
+
+def motion_problem(
+    step_of_row: IntArray, nuisances: tuple[FloatArray, FloatArray] | None, **steps: FloatArray
+) -> core.Problem:
+    """Return the steps of a motion, by the names of the C header, as an argument of kernels.
+
+    See :func:`steps_problem`; steps of a turning motion are (n_steps, 12).
+    """
     kept, added = (None, None) if nuisances is None else map(np.ascontiguousarray, nuisances)
     return core.problem(
         "motion",
-        n_noise=n_noise,
-        F=F,
-        A=A,
-        B=B,
-        moved=moved,
-        turning=turning,
+        n_noise=steps["A"].shape[2] if "A" in steps else _TURNING_NOISE,
+        **dict.fromkeys(("F", "A", "B", "moved", "turning")) | steps,
         kept=kept,
         added=added,
         step_of_row=np.ascontiguousarray(step_of_row, dtype=np.int64),

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 
 from arrays.array import SensorArray
-from arrays.typing import BoolArray, FloatArray
+from arrays.typing import BoolArray, FloatArray, IntArray
+from magloc import core
 from magloc.ambient import in_world_field
 from magloc.measurement.pose import ArrayPose, rates_of
 from magloc.readings import Readings, without_saturated
@@ -52,6 +55,117 @@ class Row:
         """Return the array's pose; an array without a velocity or rate is at rest."""
         velocity, rate = (np.zeros(3) if value is None else value for value in (self.velocity_m_s, self.rate_rad_s))
         return ArrayPose(self.origin_m, self.R_world_from_array, velocity, rate, lever_arm_m)
+
+
+class WhitenedRow(Protocol):
+    """Differences z (k,) of one row, in units of their noise."""
+
+    @property
+    def row(self) -> Row:
+        """Row with the pose of the array."""
+
+    @property
+    def z(self) -> FloatArray:
+        """Measured differences (k,)."""
+
+    @property
+    def transform(self) -> FloatArray:
+        """Matrix (k, C) from channels to differences."""
+
+    @property
+    def effect(self) -> FloatArray:
+        """Effect (k, n) of nuisances on the differences."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Rows of an array's readings.
+
+    Attributes
+    ----------
+    array : SensorArray
+    readings : ndarray, shape (n, k)
+        Differences in units of their noise, padded by zeros.
+    counts : ndarray of int, shape (n,)
+        Number of differences of each row.
+    transforms, transform_of_row : ndarray, shapes (m, k, n_channels) and (n,)
+        Matrices from channels to differences, and the index of that of each row.
+    effects : ndarray, shape (n or 1, k, n_nuisances)
+        Effects of nuisances on the readings.
+    origins_m, rotations : ndarray, shapes (n, 3) and (n, 3, 3)
+        Pose of the array.
+    ambients_T : ndarray, shape (n or 1, n_sensors, 3)
+        Field at the sensors without a source.
+    pose_effects : ndarray, shape (n, 12, n_pose), optional
+        Effects of errors of the pose and of the ambient field.
+    lever_arm_m : tuple of 3 floats
+        Vector from the pose's reference point to the array's origin, in the array's axes.
+    """
+
+    array: SensorArray
+    readings: FloatArray
+    counts: IntArray
+    transforms: FloatArray
+    transform_of_row: IntArray
+    effects: FloatArray
+    origins_m: FloatArray
+    rotations: FloatArray
+    ambients_T: FloatArray
+    pose_effects: FloatArray | None = None
+    lever_arm_m: tuple[float, ...] = (0.0, 0.0, 0.0)
+
+    @classmethod
+    def stack(cls, array: SensorArray, rows: Sequence[WhitenedRow], ambients_T: FloatArray) -> Rows:
+        """Return rows with equally many differences, without errors of the pose."""
+        distinct = {id(row.transform): row.transform for row in rows}
+        index = {key: i for i, key in enumerate(distinct)}
+        return cls(
+            array,
+            np.stack([row.z for row in rows]),
+            np.array([row.z.size for row in rows]),
+            np.stack(list(distinct.values())),
+            np.array([index[id(row.transform)] for row in rows]),
+            np.stack([row.effect for row in rows]),
+            np.stack([row.row.origin_m for row in rows]),
+            np.stack([row.row.R_world_from_array for row in rows]),
+            ambients_T,
+        )
+
+    @property
+    def n_pose(self) -> int:
+        """Number of errors of the pose and of the ambient field."""
+        return 0 if self.pose_effects is None else self.pose_effects.shape[2]
+
+    @cached_property
+    def problem(self) -> core.Problem:
+        """Arguments of kernels."""
+        array, order = self.array, np.arange(len(self.readings))
+        return core.problem(
+            "rows",
+            n_sensors=array.n_sensors,
+            n_channels=array.n_channels,
+            n_readings=self.readings.shape[1],
+            n_nuisances=self.effects.shape[2],
+            n_pose=self.n_pose,
+            sensors=array.positions,
+            array_centroid=tuple(array.centroid),
+            radius=array.circumradius,
+            sensor=np.ascontiguousarray(array.channel_sensor, dtype=np.int64),
+            gain=array.channel_gain,
+            is_modulus=array.channel_is_scalar.astype(np.uint8),
+            readings=np.ascontiguousarray(self.readings),
+            counts=np.ascontiguousarray(self.counts, dtype=np.int64),
+            transforms=np.ascontiguousarray(self.transforms),
+            transform_of_row=np.ascontiguousarray(self.transform_of_row, dtype=np.int64),
+            effects=np.ascontiguousarray(self.effects),
+            effect_of_row=order if len(self.effects) > 1 else np.zeros_like(order),
+            origins=np.ascontiguousarray(self.origins_m),
+            rotations=np.ascontiguousarray(self.rotations),
+            ambients=np.ascontiguousarray(self.ambients_T),
+            ambient_of_row=order if len(self.ambients_T) > 1 else np.zeros_like(order),
+            pose_effects=None if self.pose_effects is None else np.ascontiguousarray(self.pose_effects),
+            lever_arm=self.lever_arm_m,
+        )
 
 
 def with_array_motion(row: Row, before: Row | None) -> Row:

@@ -2,8 +2,7 @@
 
 The state is one Gaussian of one source, without errors of the pose.
 
-Offsets of sensors are further states, in which readings are linear. With them the kernel's predictions are linear,
-unlike those of the Python steps. Rows whose readings are noticeably nonlinear are left to the Python steps.
+Offsets of sensors are further states, in which readings are linear.
 """
 
 from __future__ import annotations
@@ -23,14 +22,14 @@ from magloc.levels import CONTRADICTION
 from magloc.measurement.rows import ambient_fields
 from magloc.readings import Readings
 from magloc.tracking.chart.mixture import Mixture, root_of
-from magloc.tracking.chart.split import LARGEST_BEND, MOST_ROWS
+from magloc.tracking.chart.split import MOST_ROWS
 from magloc.tracking.chart.steps import LARGEST_GROWTH, LARGEST_WIDTH, TrackState
 from magloc.tracking.coordinates import Chart
 from magloc.tracking.measurement import RowMeasurements
 from magloc.tracking.motion import N_SOURCE, MotionModel, OrnsteinUhlenbeck
 from magloc.tracking.results import Innovation, Prediction, Step, TrackPoint
-from magloc.tracking.row_filter import LEAST_SHARE, Gaussians, Rows, convergence, refill_step, steps_problem
-from magloc.tracking.rows import Row
+from magloc.tracking.row_filter import LARGEST_BEND, LEAST_SHARE, Gaussians, convergence, refill_step, steps_problem
+from magloc.tracking.rows import Row, Rows
 
 MOST_AT_ONCE = 64
 """Largest number of rows of one call."""
@@ -40,8 +39,6 @@ _TERMS_OF_STEPS = 3000
 """Products of a row that do not depend on the number of its differences."""
 _MOST_ERRORS, _MOST_NUMBERS = 100, 500_000
 """Largest number of errors of sensors for which the kernel is faster than NumPy, and of numbers in a call's roots."""
-_LARGEST_STRAIGHT = 0.05
-"""Nonlinearity of the readings, as LARGEST_BEND, up to which errors of sensors have linear predictions."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +107,7 @@ class SettledTrack:
             convergence=convergence(),
             nis_limits=np.asarray(chdtri(np.maximum(np.arange(k + 1), 1), CONTRADICTION), dtype=np.float64),
             largest_width=LARGEST_WIDTH,
-            largest_bend=_LARGEST_STRAIGHT if e else LARGEST_BEND,
+            largest_bend=math.inf if e else LARGEST_BEND,  # with errors of sensors no component is divided
             longest_memory=MOST_ROWS,
             largest_growth=LARGEST_GROWTH,
             full_count=full_count,
@@ -172,6 +169,8 @@ class SettledTrack:
             Results up to the first row that misses other channels, goes back in time, or does not continue the track;
             None if that is the first one. The Python steps take that row.
         """
+        if known.used is not None and self._measurements.errors.n_states:
+            return None  # the step counts from the last row whose readings were used
         taken, mixture = self._fill(rows[: self._most], time_s), known.mixture
         n = len(taken)
         self._state.x[:], self._state.S[:], self._centroid[:] = mixture.x, mixture.S, mixture.centroid_m
@@ -221,7 +220,7 @@ class SettledTrack:
             taken.append(row)
         if differences is not None and differences is not self._differences:
             self._differences, k = differences, differences.n_differences
-            given.transforms[0, :k] = differences.transform / np.sqrt(differences.variance)[:, None]
+            given.transforms[0, :k] = differences.transform
             given.transforms[0, k:] = 0.0
             given.counts[:] = k
             errors = self._measurements.errors
@@ -286,7 +285,7 @@ class SettledTrack:
         for i, (predicted, x) in enumerate(
             zip(self._predicted.x[:end].copy(), self._updated.x[:end].copy(), strict=True)
         ):
-            _, F, _ = self._motion.step(x_before, length_of_slot[int(self._step_of_row[i])])
-            steps.append(Step(first_index + i, Prediction(predicted, before[i], F), x, after[i]))
+            _, F, S_q = self._motion.step(x_before, length_of_slot[int(self._step_of_row[i])])
+            steps.append(Step(first_index + i, Prediction(predicted, before[i], F, S_q), x, after[i]))
             x_before = x
         return steps

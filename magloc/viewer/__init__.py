@@ -1,4 +1,4 @@
-"""Results seen in three dimensions, in a browser (viser)."""
+"""Viewer of results in three dimensions, in a browser (viser)."""
 
 from arrays.io.errors import of_extra
 from arrays.io.lazy import lazy_names

@@ -1,4 +1,4 @@
-"""A browser without a window: Chromium, driven over its DevTools protocol."""
+"""Headless Chromium, controlled by its DevTools protocol."""
 
 from __future__ import annotations
 
@@ -22,23 +22,20 @@ from arrays.io.closing import Closing, delay_signals
 from arrays.io.errors import InputError
 
 BINARIES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-# WebGL in software: without both of these the canvas stays blank on a machine without a graphics card.
+# On a machine without a graphics card the canvas stays blank unless both flags are set.
 _SOFTWARE_WEBGL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
-# Ends the browser with all its children and removes its folder once stdin is closed: by us, or as we are killed.
+# Ends the browser with its children and removes its folder when stdin is closed, also if this process is killed.
 _GUARD = 'exec >/dev/null 2>&1; read pid; cat; [ -z "$pid" ] || kill -9 "-$pid"; until rm -rf "$0"; do sleep 0.1; done'
 _POLL_S = 0.05
 _REPLY_S = 60.0
 
 
 class BrowserError(RuntimeError):
-    """The browser ended, did not answer in time, or its page raised an error."""
+    """Error of a browser: it ended, did not answer in time, or its page raised an exception."""
 
 
 def find_chromium() -> str:
-    """Path of Chromium or Chrome.
-
-    Raises InputError: none is on the PATH.
-    """
+    """Return the path of Chromium or Chrome; raise InputError if none is on the PATH."""
     for name in BINARIES:
         found = shutil.which(name)
         if found:
@@ -47,7 +44,7 @@ def find_chromium() -> str:
 
 
 class Chromium(Closing):
-    """One page of a headless Chromium; a context manager.
+    """One page of a headless Chromium, as a context manager.
 
     Parameters
     ----------
@@ -56,14 +53,14 @@ class Chromium(Closing):
     size : tuple of 2 ints
         Width and height of the page [px].
     timeout_s : float
-        How long the browser may take to start.
+        Longest time that the browser may take to start.
 
     Raises
     ------
     InputError
         There is no Chromium.
     BrowserError
-        It does not start, or cannot reach the page.
+        The browser does not start, or cannot reach the page.
     """
 
     def __init__(self, url: str, size: tuple[int, int] = (1280, 800), timeout_s: float = 60.0) -> None:
@@ -73,18 +70,18 @@ class Chromium(Closing):
         self._process: subprocess.Popen[bytes] | None = None
         self._guard: subprocess.Popen[bytes] | None = None
         try:
-            with delay_signals():  # or something was made that nobody knows of
+            with delay_signals():  # otherwise a folder or a process could be left over
                 self._profile = tempfile.mkdtemp(prefix="magloc-chromium-")
                 if os.name == "posix":
                     guard = ["sh", "-c", _GUARD, self._profile]
                     self._guard = subprocess.Popen(guard, bufsize=0, stdin=subprocess.PIPE, start_new_session=True)
-                self._process = _started(find_chromium(), self._profile, size)
+                self._process = _start(find_chromium(), self._profile, size)
                 if self._guard and self._guard.stdin:
                     self._guard.stdin.write(b"%d\n" % self._process.pid)
             self._socket = connect(self._page_address(timeout_s), max_size=None, proxy=None, ping_interval=None)
             for domain in ("Network", "Page", "Runtime"):
                 self.call(f"{domain}.enable")
-            # The window's size counts its frame too; this one is the page's own.
+            # The size of the window includes its frame; these metrics are those of the page.
             metrics = {"width": size[0], "height": size[1], "deviceScaleFactor": 1, "mobile": False}
             self.call("Emulation.setDeviceMetricsOverride", **metrics)
             self.open(url)
@@ -109,8 +106,8 @@ class Chromium(Closing):
             if self._profile:
                 shutil.rmtree(self._profile, ignore_errors=True)
             return
-        # Children of the browser outlive it, and write while its folder is removed: the guard ends them first.
-        with contextlib.suppress(subprocess.TimeoutExpired):  # it goes on without us
+        # Children of the browser may outlive it and still write to its folder: the guard ends them first.
+        with contextlib.suppress(subprocess.TimeoutExpired):  # the guard continues on its own
             self._guard.communicate(timeout=10.0)
         self._guard = None
 
@@ -124,20 +121,20 @@ class Chromium(Closing):
         Raises
         ------
         BrowserError
-            It cannot be reached.
+            The page cannot be reached.
         """
         fault = self.call("Page.navigate", url=url).get("errorText")
         if fault:
             raise BrowserError(f"Chromium cannot open {url}: {fault}.")
 
     def call(self, method: str, **parameters: object) -> dict[str, Any]:
-        """Result of a DevTools method, such as ``Page.reload``.
+        """Call a DevTools method, such as ``Page.reload``, and return its result.
 
         Parameters
         ----------
         method : str
         **parameters : object
-            As the protocol names them.
+            Parameters by their names in the protocol.
 
         Returns
         -------
@@ -146,7 +143,7 @@ class Chromium(Closing):
         Raises
         ------
         BrowserError
-            The method fails, or the browser is gone.
+            The method fails, or the browser has ended.
         """
         if self._socket is None:
             raise BrowserError("The browser is closed.")
@@ -165,7 +162,7 @@ class Chromium(Closing):
         return message["result"]
 
     def evaluate(self, expression: str) -> Any:
-        """Value of a JavaScript expression in the page; promises are awaited.
+        """Evaluate a JavaScript expression in the page, and await a promise.
 
         Parameters
         ----------
@@ -174,7 +171,7 @@ class Chromium(Closing):
         Returns
         -------
         object
-            As JSON has it.
+            Value of the expression, through JSON.
 
         Raises
         ------
@@ -197,71 +194,70 @@ class Chromium(Closing):
         Returns
         -------
         object
-            Its value.
+            Value of the expression.
 
         Raises
         ------
         BrowserError
-            It does not become true in time.
+            The expression does not become true in time.
         """
         deadline = time.monotonic() + timeout_s
         while not (value := self.evaluate(expression)):
             if time.monotonic() > deadline:
-                raise BrowserError(f"The page did not get ready in {timeout_s:g} s: {expression}")
+                raise BrowserError(f"The page was not ready within {timeout_s:g} s: {expression}")
             time.sleep(_POLL_S)
         return value
 
     def screenshot(self) -> bytes:
-        """The page as it is now, as a PNG file."""
+        """Return the present page as a PNG file."""
         return base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
 
     def settled_screenshot(
         self, timeout_s: float = 60.0, interval_s: float = 0.3, same: int = 3, before: str = ""
     ) -> bytes:
-        """The page when nothing moves any more.
+        """Wait until the page no longer changes, and return it as a PNG file.
 
         Parameters
         ----------
         timeout_s : float
         interval_s : float
-            Between two looks.
+            Time between two screenshots.
         same : int
-            How many looks in a row have to be identical.
+            Number of successive screenshots that have to be identical.
         before : str
-            JavaScript that is evaluated before every look.
+            JavaScript that is evaluated before every screenshot.
 
         Returns
         -------
         bytes
-            A PNG file.
 
         Raises
         ------
         BrowserError
-            The page goes on changing.
+            The page does not come to rest in time.
         """
         deadline = time.monotonic() + timeout_s
-        last, seen = b"", 0
-        while seen < same:
+        last, n_same = b"", 0
+        while n_same < same:
             if time.monotonic() > deadline:
-                raise BrowserError(f"The page did not come to rest in {timeout_s:g} s.")
+                raise BrowserError(f"The page did not come to rest within {timeout_s:g} s.")
             if before:
                 self.evaluate(before)
             shot = self.screenshot()
-            seen = seen + 1 if shot == last else 1
+            n_same = n_same + 1 if shot == last else 1
             last = shot
             time.sleep(interval_s)
         return last
 
     def note(self, event: dict[str, Any]) -> None:
-        """What the page reports while a method is under way; nothing of it is kept."""
+        """Receive an event of the page; this class ignores events."""
 
     def _page_address(self, timeout_s: float) -> str:
-        """Address of the page's DevTools socket, once the browser has written its port."""
+        """Wait for the browser's port, and return the address of the page's DevTools socket."""
         if self._process is None:
             raise BrowserError("The browser is closed.")
         port_file = Path(self._profile, "DevToolsActivePort")
-        # A proxy of the environment would not reach this machine.
+        # A proxy from the environment could not reach this machine.
         direct = urllib.request.build_opener(urllib.request.ProxyHandler({}))
         deadline = time.monotonic() + timeout_s
         while time.monotonic() < deadline:
@@ -277,12 +273,12 @@ class Chromium(Closing):
         raise BrowserError(f"Chromium did not start within {timeout_s:g} s.")
 
 
-def _started(binary: str, profile: str, size: tuple[int, int]) -> subprocess.Popen[bytes]:
+def _start(binary: str, profile: str, size: tuple[int, int]) -> subprocess.Popen[bytes]:
     flags = [
         "--headless=new",
         "--disable-dev-shm-usage",
         "--disable-background-networking",
-        "--disable-features=BackForwardCache",  # a page that is left gives its socket back
+        "--disable-features=BackForwardCache",  # otherwise a page that was left keeps its socket
         "--no-first-run",
         "--no-proxy-server",
         "--hide-scrollbars",
@@ -292,10 +288,10 @@ def _started(binary: str, profile: str, size: tuple[int, int]) -> subprocess.Pop
         f"--user-data-dir={profile}",
     ]
     if hasattr(os, "geteuid") and os.geteuid() == 0:
-        flags.append("--no-sandbox")  # root has none
+        flags.append("--no-sandbox")  # Chromium has no sandbox for root
     return subprocess.Popen(
         [binary, *flags, "about:blank"],
-        # Its socket, whose path must not be long, goes with the folder.
+        # The browser's socket, whose path must be short, is removed with the folder.
         env={**os.environ, "TMPDIR": profile} if len(profile) < 50 else None,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
@@ -304,5 +300,5 @@ def _started(binary: str, profile: str, size: tuple[int, int]) -> subprocess.Pop
 
 
 def exception_text(details: dict[str, Any]) -> str:
-    """What a page's exception says of itself."""
+    """Return the description of an exception in a page."""
     return str(details.get("exception", {}).get("description", details.get("text", "an exception")))

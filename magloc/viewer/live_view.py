@@ -1,4 +1,4 @@
-"""A page that shows a source while it moves, for the command and for a loop of one's own."""
+"""Live page of tracked sources, for the command and for user code."""
 
 from __future__ import annotations
 
@@ -19,27 +19,28 @@ from magloc.viewer.view import View
 
 
 class LiveView(View):
-    """A page of sources that are followed: scene, readings, residuals, rate, latency and lost rows.
+    """Page of tracked sources: scene, readings, residuals, rate, latency and lost rows.
 
-    It draws the newest point whenever it is ready, in a thread of its own, so that no row waits for the picture. A
-    context manager that closes it.
+    A thread of its own draws the newest point, so that no row waits for the page. As a context manager it closes the
+    page at the end.
 
     Parameters
     ----------
     array : SensorArray
     controls : Follower, optional
-        Which the buttons of the page stop, start and tare: a :class:`magloc.live.Follower`, or what has these methods.
+        Object that the buttons of the page stop, start and tare: a :class:`magloc.live.Follower`, or another one with
+        these methods.
     port : int
-        The next one that is free is taken if it is in use.
+        Port of the server; if it is in use, the next free one is used.
     open : bool
         Open the browser.
     title : str
-        Of the browser's tab; by default the array's name.
+        Title of the browser's tab; by default the name of the array.
 
     Attributes
     ----------
     address : str
-        Where a browser of this machine finds it until it is closed.
+        Address of the page on this machine until it is closed.
 
     Examples
     --------
@@ -69,14 +70,14 @@ class LiveView(View):
             webbrowser.open(self.address)
 
     def update(self, point: TrackPoint | SourcesPoint, row: Readings | None = None) -> None:
-        """Show one more point, unless a newer one comes before it is drawn.
+        """Show a new point, unless a newer one comes before it is drawn.
 
         Parameters
         ----------
         point : TrackPoint or SourcesPoint
-            Of :meth:`magloc.Tracker.update`, :meth:`magloc.SourcesTracker.update` or :func:`magloc.live.track`.
+            Result of :meth:`magloc.Tracker.update`, :meth:`magloc.SourcesTracker.update` or :func:`magloc.live.track`.
         row : Readings of length one, optional
-            That it was found from; a LivePoint has it already.
+            Row of the point; a LivePoint contains it already.
         """
         if isinstance(point, LivePoint):
             self._live.update(point, point.row, point.tally, point.latency_s)

@@ -1,4 +1,4 @@
-"""Films as MP4, in H.264: the browser that draws the pictures encodes them, so that no other encoder is needed."""
+"""MP4 files in H.264, encoded by the browser that draws the pictures, so that no other encoder is needed."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from PIL.Image import Image
 
 from magloc.viewer.chromium import BrowserError, Chromium
 
-_BITS_PER_PIXEL = 2.0  # of every picture; lines of one pixel keep their colours
+_BITS_PER_PIXEL = 2.0  # of every picture: lines of one pixel keep their colours
 _IDENTITY = struct.pack(">9i", 0x10000, 0, 0, 0, 0x10000, 0, 0, 0, 0x40000000)
 _START = """
 (async () => {
   const config = {codec: 'avc1.640028', width: %d, height: %d, bitrate: %d, framerate: %f, avc: {format: 'avc'}};
   if (!(await VideoEncoder.isConfigSupported(config)).supported) return false;
   const film = {pictures: [], time_us: 0};
-  const text = data => btoa(Array.from(new Uint8Array(data), byte => String.fromCharCode(byte)).join(''));
-  const keep = (chunk, about) => {
+  const base64 = data => btoa(Array.from(new Uint8Array(data), byte => String.fromCharCode(byte)).join(''));
+  const addChunk = (chunk, metadata) => {
     const data = new Uint8Array(chunk.byteLength);
     chunk.copyTo(data);
-    if (about.decoderConfig) film.avcC = text(about.decoderConfig.description);
-    film.pictures.push([text(data), chunk.type === 'key']);
+    if (metadata.decoderConfig) film.avcC = base64(metadata.decoderConfig.description);
+    film.pictures.push([base64(data), chunk.type === 'key']);
   };
-  film.encoder = new VideoEncoder({output: keep, error: fault => { film.fault = String(fault); }});
+  film.encoder = new VideoEncoder({output: addChunk, error: fault => { film.fault = String(fault); }});
   film.encoder.configure(config);
   window.film = film;
   return true;
@@ -33,8 +33,8 @@ _START = """
 _ADD = """
 (() => {
   const pixels = Uint8Array.from(atob('%s'), letter => letter.charCodeAt(0));
-  const of = {format: 'RGBX', codedWidth: %d, codedHeight: %d, timestamp: film.time_us, duration: %d};
-  const frame = new VideoFrame(pixels, of);
+  const options = {format: 'RGBX', codedWidth: %d, codedHeight: %d, timestamp: film.time_us, duration: %d};
+  const frame = new VideoFrame(pixels, options);
   film.encoder.encode(frame, {keyFrame: film.time_us === 0});
   film.time_us += frame.duration;
   frame.close();
@@ -43,14 +43,14 @@ _ADD = """
 _FINISH = "film.encoder.flush().then(() => [film.avcC, film.pictures, film.fault])"
 
 
-def mp4_of(browser: Chromium, pictures: Sequence[Image], duration_ms: int) -> bytes:
-    """An MP4 file of pictures of one size, even in width and height; BrowserError if the browser cannot encode it.
+def encode_mp4(browser: Chromium, pictures: Sequence[Image], duration_ms: int) -> bytes:
+    """Encode pictures of one size as an MP4 file; raise BrowserError if that is not possible.
 
-    The page that is open has to be one of this machine: browsers encode for no other.
+    Width and height have to be even. The open page has to be one of this machine, because browsers encode for no other.
     """
     (width, height), fps = pictures[0].size, 1e3 / duration_ms
     if not browser.evaluate(_START % (width, height, _BITS_PER_PIXEL * width * height * fps, fps)):
-        raise BrowserError("This browser has no encoder of H.264, which an MP4 needs; a .gif needs none.")
+        raise BrowserError("This browser has no H.264 encoder, which an MP4 needs; write a .gif instead.")
     for picture in pictures:
         pixels = base64.b64encode(picture.convert("RGBX").tobytes()).decode()
         browser.evaluate(_ADD % (pixels, width, height, 1000 * duration_ms))
@@ -59,11 +59,16 @@ def mp4_of(browser: Chromium, pictures: Sequence[Image], duration_ms: int) -> by
         raise BrowserError(f"The browser encoded {len(chunks)} of {len(pictures)} pictures ({fault or 'no error'}).")
     samples = [base64.b64decode(data) for data, _ in chunks]
     keys = [i for i, (_, is_key) in enumerate(chunks, 1) if is_key]
-    return _file(samples, keys, base64.b64decode(avcC), width, height, duration_ms)
+    return _mp4_file(samples, keys, base64.b64decode(avcC), width, height, duration_ms)
 
 
-def _file(samples: Sequence[bytes], keys: Sequence[int], avcC: bytes, width: int, height: int, each_ms: int) -> bytes:
-    """One track of H.264 samples, its index before them (ISO/IEC 14496-12, -15); `keys` count from 1, times are ms."""
+def _mp4_file(
+    samples: Sequence[bytes], keys: Sequence[int], avcC: bytes, width: int, height: int, each_ms: int
+) -> bytes:
+    """Return a file with one track of H.264 samples below their index (ISO/IEC 14496-12, -15).
+
+    ``keys``: numbers of the key frames, from 1 on.
+    """
     n, whole_ms = len(samples), len(samples) * each_ms
     colours = _box(b"colr", b"nclx", struct.pack(">3HB", 1, 1, 1, 0))  # BT.709
     entry = _box(
@@ -106,5 +111,5 @@ def _box(kind: bytes, *content: bytes) -> bytes:
 
 
 def _full(kind: bytes, *content: bytes, flags: int = 0) -> bytes:
-    """A box with version 0 and flags."""
+    """Return a box with version 0 and flags."""
     return _box(kind, struct.pack(">I", flags), *content)

@@ -1,4 +1,4 @@
-"""Files that a view is written into: refused before long work where they cannot be."""
+"""Checks of the files of a view before long work."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ FILM_FORMATS = {".mp4": "MP4", ".gif": "GIF", ".apng": "PNG"}
 
 
 def check_outputs(html: str | Path | None, png: str | Path | None, movie: str | Path | None = None) -> None:
-    """Refuse files that cannot be written, and a picture or a film without a browser."""
+    """Raise InputError for files that cannot be written, and for a missing browser."""
     refuse_unwritable(None if html is None else Path(html), "Input html")
     refuse_unwritable(None if png is None else Path(png), "Input png", ".png")
     if movie is not None:

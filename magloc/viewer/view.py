@@ -1,4 +1,4 @@
-"""What an array is, reads or finds, in three dimensions: in a browser, in a notebook, as a page or as a picture."""
+"""View of an array or a result in three dimensions, in a browser, in a notebook, as a page, picture or film."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from magloc.tracking.results import TrackResult
 from magloc.truth import Truth
 from magloc.viewer.film import write_film
 from magloc.viewer.outputs import check_outputs
-from magloc.viewer.pages.open_result import MapResult, map_of, path_of_truth
+from magloc.viewer.pages.open_result import MapResult, map_result, track_of_truth
 from magloc.viewer.pages.pages import Page, array_page, map_page, readings_page, survey_page, track_page
 from magloc.viewer.server import (
     FIRST_PORT,
     address,
     free_port,
-    opened,
+    open_server,
     page_html,
     wait_for_interruption,
     write_page,
-    write_picture,
+    write_screenshot,
 )
 
 if TYPE_CHECKING:
@@ -47,17 +47,17 @@ _INLINE_PX = 560
 
 
 class View(Closing):
-    """A scene; a context manager that closes it.
+    """View of a scene in a browser; as a context manager it closes the server at the end.
 
     Attributes
     ----------
     address : str
-        Where a browser of this machine finds it until it is closed.
+        Address of the page on this machine until the view is closed.
     """
 
     def __init__(self, title: str, fill: Callable[[viser.ViserServer], Page], port: int) -> None:
         with ExitStack() as stack:
-            self._server = stack.enter_context(opened(free_port(port), title))
+            self._server = stack.enter_context(open_server(free_port(port), title))
             self._page = fill(self._server)
             stack.callback(self._page.close)
             self._open = stack.pop_all()
@@ -65,24 +65,24 @@ class View(Closing):
 
     @cached_property
     def html(self) -> str:
-        """One static page that needs nothing else."""
+        """Self-contained static page."""
         return page_html(self._server, self._page)
 
     def write_png(self, path: Path) -> None:
-        """Write the page as a headless Chromium shows it."""
-        write_picture(self._server, path)
+        """Write the page in a headless Chromium as a picture."""
+        write_screenshot(self._server, path)
 
     def write_movie(self, path: Path, progress: Callable[[int], None] | None = None) -> None:
-        """Write the rows of the page, or a turn around what it shows, as a film (.mp4, .gif, .apng)."""
+        """Write the rows of the page, or a turn around its scene, as a film (.mp4, .gif, .apng)."""
         write_film(self._server, self._page, path, progress)
 
     def wait(self) -> None:
-        """Serve until Ctrl-C, and close."""
+        """Wait for Ctrl-C, and close the view."""
         wait_for_interruption()
         self.close()
 
     def close(self) -> None:
-        """Stop the server; the page remains where it was taken before."""
+        """Stop the server. A notebook keeps its page."""
         self._open.close()
 
     def __repr__(self) -> str:
@@ -108,20 +108,20 @@ def view(
     file: str | Path | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> View:
-    """See an array, and what it reads or finds, in three dimensions.
+    """View an array, its readings or its results in three dimensions.
 
-    In a browser of this machine, until the view is closed or Python ends: a script ends with ``view(…).wait()``. In a
-    notebook the view shows itself, as a page without a server, which a saved notebook keeps.
+    The page opens in a browser of this machine, until the view is closed or Python ends: end a script with
+    ``view(…).wait()``. In a notebook the view is a page without a server, which a saved notebook keeps.
 
     Parameters
     ----------
     array : SensorArray, optional
-        None for a map, a Survey or a Track, which have their own, and for a path without an array.
+        None for a map, a Survey or a Track, which have their own array, and for a path without an array.
     result : Readings, Fixes, Track, SourcesTrack, TrackResult, Truth, Survey or xarray.Dataset, optional
-        Of the array; a Dataset is a map over starts or sources. Readings are located first, 2000 rows at most, evenly.
-        Without it the array alone is seen, with a dipole to be dragged.
+        Result for the array; a Dataset is a map over starts or sources. Readings are located first, at most 2000 rows,
+        evenly spaced. Without a result the page shows the array, with a dipole that the user can drag.
     readings : Readings, optional
-        Rows that fixes were made of, or a track that does not have its own, for their plot and the array's poses.
+        Rows of the fixes, or of a track without its own rows, for their plot and the array's poses.
     html, png : path, optional
         Write a static page or, by Chromium, a picture, and serve nothing.
     movie : path, optional
@@ -129,21 +129,21 @@ def view(
     open : bool
         Open the browser.
     port : int
-        The next one that is free is taken if it is in use.
+        Port of the server; if it is in use, the next free one is used.
     title : str
-        Of the browser's tab; by default the array's name.
+        Title of the browser's tab; by default the name of the array.
     file : path, optional
-        That the array was read from: the page, where sensors are dragged, may replace it. Otherwise it writes new files
+        File of the array, which the page may replace after sensors were dragged. Otherwise the page writes new files
         only, below the working directory.
     progress : callable, optional
-        Called with the number of readings located since the last call.
+        Called with the number of readings located since the previous call.
 
     Raises
     ------
     ValueError
-        The result is none that can be seen, or an argument is missing or too many.
+        The result is of another kind, or an argument is missing or superfluous.
     InputError
-        A file cannot be written, or Chromium is not there.
+        A file cannot be written, or there is no Chromium.
 
     Examples
     --------
@@ -153,17 +153,17 @@ def view(
     """
     check_outputs(html, png, movie)
     live = not _is_static(html, png, movie)
-    fill = _filling(array, result, readings, progress, None if file is None else Path(file), live=live)
-    called = title or (array.name if array is not None else "") or "view"
-    return shown(f"magloc · {called}", fill, html=html, png=png, movie=movie, open=open, port=port)
+    fill = _choose_page(array, result, readings, progress, None if file is None else Path(file), live=live)
+    name = title or (array.name if array is not None else "") or "view"
+    return open_view(f"magloc · {name}", fill, html=html, png=png, movie=movie, open=open, port=port)
 
 
 def _is_static(*files: str | Path | None) -> bool:
-    """Whether a view is written or put into a notebook and not served."""
+    """Return whether a view is written to files or into a notebook instead of served."""
     return any(file is not None for file in files) or _in_notebook()
 
 
-def shown(
+def open_view(
     title: str,
     fill: Callable[[viser.ViserServer], Page],
     *,
@@ -173,10 +173,10 @@ def shown(
     open: bool,
     port: int,
 ) -> View:
-    """A scene that `fill` fills, served and opened, or written into files that have been checked."""
-    static = _is_static(html, png, movie)
-    view = View(title, fill, 0 if static else port)
-    if not static:
+    """Serve and open a view with the page of `fill`, or write it to checked files."""
+    is_static = _is_static(html, png, movie)
+    view = View(title, fill, 0 if is_static else port)
+    if not is_static:
         if open:
             webbrowser.open(view.address)
         return view
@@ -188,17 +188,17 @@ def shown(
         if movie is not None:
             view.write_movie(Path(movie))
         if _in_notebook():
-            _ = view.html  # taken while there is a server; of a long record it takes seconds
+            _ = view.html  # computed now, because it needs the server
     return view
 
 
 def _in_notebook() -> bool:
-    """Whether this process is a notebook's kernel; that its package is loaded says nothing yet."""
+    """Return whether this process is the kernel of a notebook."""
     kernel = sys.modules.get("ipykernel.kernelapp")
     return kernel is not None and bool(kernel.IPKernelApp.initialized())
 
 
-def _filling(
+def _choose_page(
     array: SensorArray | None,
     result: Any,
     readings: Readings | None,
@@ -207,9 +207,9 @@ def _filling(
     *,
     live: bool,
 ) -> Callable[[viser.ViserServer], Page]:
-    """What fills the scene; all that can be wrong is found, and all that is slow is done, before it is opened."""
+    """Return the function that fills the page, after all checks and slow computations."""
     if isinstance(result, Truth):
-        result = path_of_truth(result)
+        result = track_of_truth(result)
     if hasattr(result, "as_result"):
         array = result.tracker.array if array is None and hasattr(result, "tracker") else array
         readings = result.readings if readings is None else readings
@@ -226,32 +226,34 @@ def _filling(
                 "Input result must be readings, fixes, a track, a truth, a survey or a map; instead received "
                 f"{type(result).__name__}."
             )
-        result = map_of(result)
+        result = map_result(result)
     if isinstance(result, MapResult):
         return lambda server: map_page(server, result)
     if array is None:
-        raise ValueError("Input array must be the one that the result belongs to; instead received None.")
+        raise ValueError("Input array must be the array of the result; instead received None.")
     if result is None:
         return lambda server: array_page(server, array, live=live, file=file)
     if isinstance(result, Readings):
-        readings = thinned(result)
-        result = fixes_of(array, readings, progress)
+        readings = thin_readings(result)
+        result = locate_readings(array, readings, progress)
     fixes, rows = result, readings
     if rows is not None and len(rows) != len(fixes):
-        raise ValueError(f"Input readings must have {len(fixes)} rows, one a fix; instead received {len(rows)}.")
+        raise ValueError(
+            f"Input readings must have a row for each of {len(fixes)} fixes; instead received {len(rows)}."
+        )
     if fixes.frame == "world" and (rows is None or rows.pose is None):
-        raise ValueError("Input readings must hold the poses of fixes in the world; instead received none.")
+        raise ValueError("Input readings must have poses for fixes in the world frame; instead received none.")
     return lambda server: readings_page(server, array, fixes, rows)
 
 
-def thinned(rows: Readings) -> Readings:
-    """Every so many of the rows, so that 2000 remain at most."""
+def thin_readings(rows: Readings) -> Readings:
+    """Return evenly spaced rows, at most 2000."""
     return rows[:: -(-len(rows) // _MOST_ROWS)]
 
 
-def fixes_of(array: SensorArray, rows: Readings, progress: Callable[[int], None] | None = None) -> Fixes:
-    """Fixes of readings in the ambient field that they show; without any, and a reason, where none can be located."""
-    # What locates takes a second to load, and other results do without.
+def locate_readings(array: SensorArray, rows: Readings, progress: Callable[[int], None] | None = None) -> Fixes:
+    """Return the fixes of readings in their ambient field, or unsolved ones with a reason."""
+    # These modules take a second to load, and other results do not need them.
     from magloc.ambient import with_ambient_field
     from magloc.localization.locator import locate
 

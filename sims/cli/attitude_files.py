@@ -25,7 +25,7 @@ def attitude_files(
     file: AttitudeFile, estimate: EstimatorSettings, parts: Sequence[Part], outcome: Outcome
 ) -> Iterator[tuple[str, Any]]:
     """Yield the names and the contents of all files of some runs."""
-    from adcs.plots.attitude import consistency_figure, gaps_of, states_figure
+    from adcs.plots.attitude import attitude_consistency_figure, sensor_gaps, states_figure
 
     first = parts[0]
     time_s, name = first.runs.time_s, file.name
@@ -36,13 +36,13 @@ def attitude_files(
     seen = {name: there[0] for name, there in first.runs.readings.seen.items()}
     used = estimate.settings.sensors
     degraded = {COLLINEAR: collinear_rows(first.runs, used, 0)}
-    gaps = gaps_of(seen, used.sensors.split("+"), degraded)
+    gaps = sensor_gaps(seen, used.sensors.split("+"), degraded)
     seed = int(outcome.seeds[0])
     states = states_figure(f"{title}; seed {seed}", time_s, errors, sigma, are_errors=True, gaps=gaps)
     yield f"{name}-errors.png", states
     sigma_deg = np.sqrt(np.sum(sigma[:, :3] ** 2, axis=1))
     nees = outcome.nees, outcome.size, outcome.nis
-    yield f"{name}-consistency.png", consistency_figure(title, time_s, outcome.error_deg, sigma_deg, *nees)
+    yield f"{name}-consistency.png", attitude_consistency_figure(title, time_s, outcome.error_deg, sigma_deg, *nees)
     columns: dict[str, Any] = {"time_s": time_s}
     columns |= {f"error_{key}": errors[:, i] for i, key in enumerate(STATE_COLUMNS) if not np.isnan(errors[:, i]).all()}
     columns |= {f"sigma_{key}": sigma[:, i] for i, key in enumerate(STATE_COLUMNS) if not np.isnan(sigma[:, i]).all()}

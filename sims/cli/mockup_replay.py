@@ -32,7 +32,7 @@ def show_replay(runs: FusionRuns, camera: TableCamera, replay: ReplayOptions) ->
     """Show the first drive until Ctrl-C, or write it."""
     from adcs.viewer.drive_page import drive_page
     from magloc.cli.view import write_or_serve
-    from magloc.viewer.view import View, shown
+    from magloc.viewer.view import View, open_view
 
     drive = drive_of(runs.results[0], runs.method, camera)
     at_s = 0.5 * drive.duration_s if replay.at is None else replay.at
@@ -40,7 +40,7 @@ def show_replay(runs: FusionRuns, camera: TableCamera, replay: ReplayOptions) ->
 
     def scene(port: int) -> View:
         title = f"adcs · mockup {runs.method}"
-        return shown(
+        return open_view(
             title, lambda server: drive_page(server, drive, at_s)[0], **files, movie=None, open=False, port=port
         )
 
@@ -51,14 +51,14 @@ def show_replay(runs: FusionRuns, camera: TableCamera, replay: ReplayOptions) ->
 def drive_of(result: FusionResult, method: str, camera: TableCamera) -> Drive:
     """Return the drive of a run for a replay, with frames at the true positions."""
     from adcs.mockup.navigation.delayed_ekf import FilterTrack
-    from adcs.viewer.drive import Drive, SeenFrame
+    from adcs.viewer.drive import Drive, IdentifiedFrame
 
     run, track = result.run, result.fused.track
 
-    def frame_of(fix: int) -> SeenFrame:
+    def frame_of(fix: int) -> IdentifiedFrame:
         # The image of a fix does not depend on how often the fix comes.
         frame, found = camera.look(run.truth, float(run.exposure_s[fix]), result.seed)
-        return SeenFrame(frame.image, found.stars.positions_px, found.fix)
+        return IdentifiedFrame(frame.image, found.stars.positions_px, found.fix)
 
     arrived = slice(len(result.fused.outcomes))
     return Drive(

@@ -11,8 +11,9 @@ import numpy as np
 from adcs.quaternion import rotate_back
 from adcs.satellite.sensors import Magnetometer
 from arrays.array import SensorArray
+from arrays.io.values import accept_seed, seed_of
 from arrays.sensor import Sensor
-from arrays.typing import FloatArray
+from arrays.typing import FloatArray, Rng
 from magloc.fields.dipole import total_field
 from sims.attitude.scenario import AttitudeScenario
 from sims.attitude.simulation import AttitudeRuns, prepare, simulate_motion
@@ -71,13 +72,14 @@ class LoadsRun:
         return {"time_s": self.time_s, **channels, **gyro, **self.states}
 
 
-def switching_loads(seed: int, *, duration_s: float = 2400.0, rate_deg_s: float = 0.4) -> LoadsRun:
+@accept_seed
+def switching_loads(rng: Rng, *, duration_s: float = 2400.0, rate_deg_s: float = 0.4) -> LoadsRun:
     """Simulate a tumbling satellite of 4 kg whose loads switch every 20 to 90 s.
 
     Parameters
     ----------
-    seed : int
-        Seed of all random numbers.
+    rng : int or numpy.random.Generator
+        Seed or generator of all random numbers.
     duration_s : float
         Duration [s], with one reading per second.
     rate_deg_s : float
@@ -86,10 +88,11 @@ def switching_loads(seed: int, *, duration_s: float = 2400.0, rate_deg_s: float 
     Examples
     --------
     >>> from sims import experiments
-    >>> experiments.switching_loads(seed=0, duration_s=60.0).readings_T.shape
+    >>> experiments.switching_loads(rng=0, duration_s=60.0).readings_T.shape
     (61, 12)
     """
-    rng = stream(seed, "loads")
+    seed = seed_of(rng)
+    generator = stream(seed, "loads")
     satellite = three_units(magnetometer=Magnetometer(sigma_T=NOISE_T))
     scenario = AttitudeScenario(
         satellite,
@@ -102,7 +105,7 @@ def switching_loads(seed: int, *, duration_s: float = 2400.0, rate_deg_s: float 
     )
     prepared = prepare(scenario, [seed])
     n = scenario.n_instants
-    states = {name: _switch_states(n, rng) for name in LOADS}
+    states = {name: _switch_states(n, generator) for name in LOADS}
     moments = sum(states[name][:, None] * np.array(moment) for name, (_, moment) in LOADS.items())
     run = simulate_motion(replace(prepared, dipole_Am2=prepared.dipole_Am2 + moments))
     array = SensorArray(
@@ -113,12 +116,12 @@ def switching_loads(seed: int, *, duration_s: float = 2400.0, rate_deg_s: float 
         # Relative change of the field of a dipole 0.1 m away, for 1 mm of the position.
         noise_fraction=3.0 * PLACE_M / 0.1,
     )
-    places = array.positions + PLACE_M * rng.standard_normal((4, 3))
-    response = np.eye(3) + np.where(np.eye(3), GAIN, AXES_RAD) * rng.standard_normal((4, 3, 3))
+    places = array.positions + PLACE_M * generator.standard_normal((4, 3))
+    response = np.eye(3) + np.where(np.eye(3), GAIN, AXES_RAD) * generator.standard_normal((4, 3, 3))
     own = np.stack([total_field(places, np.array([place]), np.array([moment])) for place, moment in LOADS.values()])
     fields = np.einsum("mij,kmj->kmi", response, own)
     ambient = rotate_back(run.q[0], prepared.true_field_orbital_T[0])
-    quiet = np.einsum("mij,nj->nmi", response, ambient) + NOISE_T * rng.standard_normal((n, 4, 3))
+    quiet = np.einsum("mij,nj->nmi", response, ambient) + NOISE_T * generator.standard_normal((n, 4, 3))
     loaded = quiet + np.einsum("kn,kmi->nmi", np.stack(list(states.values())), fields)
     return LoadsRun(array, loaded.reshape(n, 12), quiet.reshape(n, 12), states, fields, run)
 

@@ -82,7 +82,7 @@ def write_simulation(simulation: Simulation, readings: str | PathLike[str]) -> S
     >>> import sims
     >>> from dataclasses import replace
     >>> scenario = replace(sims.read_scenario("weaving"), duration_s=5.0)
-    >>> simulation = sims.simulate(scenario, seed=0)
+    >>> simulation = sims.simulate(scenario, rng=0)
     >>> sims.write_simulation(simulation, "weaving.csv").array.name
     'weaving-array.toml'
     """

@@ -15,7 +15,8 @@ import numpy as np
 from adcs.mockup.navigation.fixes import FixRecord
 from adcs.mockup.navigation.imu import Inclinometer, RateGyro
 from adcs.mockup.navigation.strapdown import ImuRecord, PlanarState, PlanarTrack, strapdown
-from arrays.typing import BoolArray, FloatArray
+from arrays.io.values import accept_seed, seed_of
+from arrays.typing import BoolArray, FloatArray, Rng
 from sims.noise import stream
 
 DriveName = Literal["perimeter", "two-firings"]
@@ -190,23 +191,25 @@ class TableRun:
     false: BoolArray  # (k,): which of them are false
 
 
-def table_run(scenario: TableScenario, seed: int) -> TableRun:
+@accept_seed
+def table_run(scenario: TableScenario, rng: Rng) -> TableRun:
     """Simulate one run of the table-top satellite.
 
     Parameters
     ----------
     scenario : TableScenario
         The drive, and the errors of the sensors.
-    seed : int
-        Seed of all random numbers.
+    rng : int or numpy.random.Generator
+        Seed or generator of all random numbers.
 
     Examples
     --------
     >>> import sims
-    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), seed=0)
+    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), rng=0)
     >>> run.truth.position_m.shape
     (500, 2)
     """
+    seed = seed_of(rng)
     camera, n, polls = scenario.camera, scenario.n_samples, scenario.polls
     drive = perimeter_drive if scenario.drive == "perimeter" else two_firings_drive
     polled, true_start = drive(n * polls, stream(seed, "drive"))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 import tomllib
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from arrays.geometries import GEOMETRIES, tetrahedron
 from arrays.io.errors import InputError
 from arrays.pose import PoseUncertainty
 from arrays.sensor import Calibration, Sensor
+from tests.written import WriteFile, writer
 
 GEOMETRY = """\
 geometry = "tetrahedron"
@@ -58,17 +58,9 @@ LASTING = {
     "induced_uncertainty": 2e-4,
     "eddy_uncertainty_s": 3e-4,
 }
-WriteFile = Callable[[str | bytes], Path]
 
 
-@pytest.fixture
-def write(tmp_path: Path) -> WriteFile:
-    def write_file(content: str | bytes) -> Path:
-        path = tmp_path / "array.toml"
-        path.write_bytes(content if isinstance(content, bytes) else content.encode())
-        return path
-
-    return write_file
+write = writer("array.toml")
 
 
 def changed(text: str, old: str, new: str) -> str:

@@ -3,7 +3,6 @@
 | what | who checks it |
 |---|---|
 | the paper's T, eigenvalues | the printed matrices (13)-(15) |
-| decorrelated noise | Monte Carlo of the differences themselves |
 | χ² of Differences and of Whitening | generalised least squares with the full covariance, in extended form |
 | reading_covariance | closed forms, and Monte Carlo of sensors with other calibrations |
 | calibration_errors | differences of readings of sensors with other calibrations |
@@ -160,70 +159,28 @@ class TestDecorrelation:
         with pytest.raises(ValueError, match="within a factor of 1e13 of each other"):
             decorrelated_differences(array)
 
-    @pytest.mark.parametrize("case", ["equal", "unequal", "mixed", "prior"])
-    def test_noise_of_decorrelated_differences_by_monte_carlo(self, case):
-        """10⁵ draws: correlations within 4 standard errors of zero, variances of the stated ones.
-
-        With k differences the false-alarm rate is k(k+1)/2 · 6.3e-5: 0.6 % for 14.
-        """
-        array = {
-            "equal": tetrahedron(1.5, noise_T=1e-9),
-            "unequal": random_array(1),
-            "mixed": random_array(2, 6, kinds=("vector", "scalar")),
-            "prior": random_array(3, 4, common_field_T=1e-9),
-        }[case]
-        n = 100_000
-        rng = np.random.default_rng(20)
-        noise = rng.normal(size=(n, array.n_channels)) * array.channel_noise_T
-        if array.common_field_T is not None:
-            noise += (rng.normal(size=(n, 3)) * array.common_field_T) @ array.channel_gain.T
-        d = decorrelated_differences(array)
-        z = (noise @ d.transform.T) / np.sqrt(d.variance)
-        correlation = np.corrcoef(z.T)
-        k = d.n_differences
-        assert np.abs(correlation[~np.eye(k, dtype=bool)]).max() < 4 / np.sqrt(n)
-        assert_allclose(z.var(axis=0), 1.0, atol=4 * np.sqrt(2 / n))
-
-
-class TestCommonFieldCancels:
-    @given(SEEDS)
-    @settings(max_examples=30, deadline=None)
-    def test_uniform_field_leaves_no_difference(self, seed):
-        array = random_array(seed, 5)
-        field = np.random.default_rng(seed).normal(size=3)
-        channels = array.channel_gain @ field
-        scale = np.abs(channels).max()
-        assert_allclose(decorrelated_differences(array).transform @ channels / scale, 0.0, atol=1e-12)
-        assert_allclose(whitening(array).apply(channels) * array.channel_noise_T / scale, 0.0, atol=1e-12)
-
 
 class TestLikelihoodDoesNotDependOnItsForm:
     """Base sensor, closed or numerical form, projection, and the marginalised common field: one χ²."""
 
-    @given(SEEDS, st.integers(0, 4))
-    @settings(max_examples=40, deadline=None)
-    def test_base_sensor(self, seed, base):
-        array = random_array(seed, 5, equal=bool(seed % 2))
-        channels = 1e-9 * np.random.default_rng(seed).normal(size=15)
-        last = chi2_of_differences(decorrelated_differences(array), channels)
-        other = chi2_of_differences(decorrelated_differences(array, base=base), channels)
-        assert other == pytest.approx(last, rel=1e-9)
-
+    @pytest.mark.parametrize("correlated", [False, True])
     @given(SEEDS, st.sampled_from([("vector",), ("scalar",), ("vector", "scalar")]), st.booleans(), st.booleans())
     @settings(max_examples=60, deadline=None)
-    def test_correlated_readings(self, seed, kinds, missing, prior):
-        """In a field of 50 µT: the errors of a calibration are up to 50 times the noise, and correlated."""
-        array = random_array(seed, 6, kinds=kinds, common_field_T=3e-9 if prior else None, uncertain=True)
+    def test_differences_whitening_and_generalised_least_squares(self, correlated, seed, kinds, missing, prior):
+        """Correlated in a field of 50 µT, where the errors of a calibration are up to 50 times the noise, or not."""
+        array = random_array(seed, 6, kinds=kinds, common_field_T=3e-9 if prior else None, uncertain=correlated)
         rng = np.random.default_rng(seed)
         readings = array.readings_of(earth_field(rng) + 1e-7 * rng.normal(size=(6, 3)))
         available = rng.random(array.n_channels) > 0.3 if missing else np.ones(array.n_channels, dtype=bool)
-        covariance = reading_covariance(array, np.where(available, readings, np.nan))
+        covariance = reading_covariance(array, np.where(available, readings, np.nan)) if correlated else None
         channels = 1e-8 * rng.normal(size=array.n_channels)
         d = decorrelated_differences(array, available, covariance_T2=covariance)
         w = whitening(array, available, covariance_T2=covariance)
         expected = chi2_by_generalised_least_squares(array, available, channels, covariance)
-        assert chi2_of_differences(d, channels) == pytest.approx(expected, rel=1e-7, abs=1e-9)
-        assert float(np.sum(w.apply(channels) ** 2)) == pytest.approx(expected, rel=1e-7, abs=1e-9)
+        assert chi2_of_differences(d, channels) == pytest.approx(expected, rel=1e-7 if correlated else 1e-8, abs=1e-9)
+        assert float(np.sum(w.apply(channels) ** 2)) == pytest.approx(
+            expected, rel=1e-7 if correlated else 1e-8, abs=1e-9
+        )
         assert d.n_differences == w.n_differences
 
     @given(SEEDS, st.integers(0, 4))
@@ -262,39 +219,6 @@ class TestLikelihoodDoesNotDependOnItsForm:
             assert_allclose(of_row.apply(channels), alone.apply(channels), atol=1e-9)
             assert_array_equal(of_row.root, alone.root)
             assert together.n_differences == alone.n_differences
-
-    @given(SEEDS, st.sampled_from([("vector",), ("scalar",), ("vector", "scalar")]), st.booleans(), st.booleans())
-    @settings(max_examples=60, deadline=None)
-    def test_differences_whitening_and_generalised_least_squares(self, seed, kinds, missing, prior):
-        array = random_array(seed, 6, kinds=kinds, common_field_T=3e-9 if prior else None)
-        rng = np.random.default_rng(seed)
-        channels = 1e-9 * rng.normal(size=array.n_channels)
-        available = rng.random(array.n_channels) > 0.3 if missing else np.ones(array.n_channels, dtype=bool)
-        d, w = decorrelated_differences(array, available), whitening(array, available)
-        expected = chi2_by_generalised_least_squares(array, available, channels)
-        assert chi2_of_differences(d, channels) == pytest.approx(expected, rel=1e-8, abs=1e-9)
-        assert float(np.sum(w.apply(channels) ** 2)) == pytest.approx(expected, rel=1e-8, abs=1e-9)
-        assert d.n_differences == w.n_differences
-
-    def test_equal_noise_is_the_projector_free_of_the_mean(self):
-        array = tetrahedron(1.5, noise_T=1e-9)
-        y = np.random.default_rng(0).normal(size=(4, 3))
-        centred = y - y.mean(axis=0)
-        assert chi2_of_differences(decorrelated_differences(array), 1e-9 * y.ravel()) == pytest.approx(
-            float(np.sum(centred**2)), rel=1e-12
-        )
-
-    def test_a_wide_prior_is_an_unknown_field_and_a_narrow_one_a_known_field(self):
-        channels = 1e-9 * np.random.default_rng(0).normal(size=15)
-        unknown = random_array(3, 5)
-        wide = random_array(3, 5, common_field_T=1e-3)
-        narrow = random_array(3, 5, common_field_T=1e-16)
-        assert np.sum(whitening(wide).apply(channels) ** 2) == pytest.approx(
-            np.sum(whitening(unknown).apply(channels) ** 2), rel=1e-6
-        )
-        assert np.sum(whitening(narrow).apply(channels) ** 2) == pytest.approx(
-            np.sum((channels / narrow.channel_noise_T) ** 2), rel=1e-6
-        )
 
 
 class TestMissingReadings:
@@ -416,21 +340,6 @@ class TestReadingCovariance:
         block = np.diag([5e-9**2, 5e-9**2, 0.0]) + 1e-9**2 * np.eye(3)
         assert_allclose(covariance, block_diag(*[block] * 4), rtol=1e-12, atol=1e-30)
 
-    def test_errors_of_the_gain_are_relative(self):
-        array = with_errors(tetrahedron(1.0, noise_T=1e-12), gain_uncertainty=1e-3)
-        field = np.array([1e-5, -2e-5, 3e-5])
-        covariance = reading_covariance(array, np.tile(field, 4))
-        assert_allclose(covariance, np.diag(np.tile((1e-3 * field) ** 2 + 1e-24, 4)), rtol=1e-12, atol=1e-30)
-
-    def test_scalar_sensors(self):
-        sensors = [
-            Sensor(f"s{i}", "scalar", (i, 0, 0), 1e-9, calibration=Calibration.of("scalar", 2.0, 1e-6))
-            for i in range(2)
-        ]
-        array = with_errors(SensorArray(tuple(sensors)), gain_uncertainty=1e-3)
-        readings = array.readings_of(np.tile([3e-5, 0.0, 4e-5], (2, 1)))
-        assert_allclose(reading_covariance(array, readings), np.eye(2) * (1e-9**2 + 1e-7**2), rtol=1e-12)
-
     @given(SEEDS)
     @settings(max_examples=20, deadline=None)
     def test_without_errors_of_calibration_it_is_the_noise(self, seed):
@@ -517,13 +426,6 @@ class TestCalibrationErrors:
                 variance = variance * (np.arange(6) == 3)
             blocks.append(used * variance @ used.T + sensor.noise_T**2 * np.eye(sensor.n_channels))
         assert_allclose(reading_covariance(array, readings), block_diag(*blocks), rtol=1e-9, atol=1e-28)
-
-    def test_batches(self):
-        array = random_array(3, 4)
-        readings = array.readings_of(np.random.default_rng(4).normal(0.0, 3e-5, (2, 5, 4, 3)))
-        found = calibration_errors(array, readings)
-        assert found.shape == (2, 5, 4, 3, 6)
-        assert_allclose(found[1, 3], calibration_errors(array, readings[1, 3]), rtol=1e-12)
 
 
 class TestCovarianceOfIncompleteReadings:

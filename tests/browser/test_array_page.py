@@ -15,7 +15,7 @@ from magloc.measurement.differences import suitable_dipole
 from magloc.viewer.pages.pages import array_page
 from magloc.viewer.scene.glyphs import DIPOLE_COLOUR, FIELD_LINE_COLOUR, FIT_COLOUR, ArrayGlyphs
 from magloc.viewer.scene.shapes import field_lines
-from magloc.viewer.server import opened
+from magloc.viewer.server import open_server
 from tests.browser.screen import Camera, Screen, Sight, dark_grey, hue_of
 
 FloatArray = NDArray[np.float64]
@@ -30,7 +30,7 @@ ROD_BLUE = hue_of((70, 110, 200))
 @pytest.fixture(scope="module")
 def server(screen: Screen) -> Iterator[viser.ViserServer]:
     """The page of the array, open in the browser."""
-    with opened(0, "array") as server:
+    with open_server(0, "array") as server:
         page = array_page(server, ARRAY, live=True)
         screen.open_server(server)
         yield server
@@ -68,7 +68,7 @@ class TestSensors:
         self, screen: Screen, server: viser.ViserServer
     ) -> None:
         camera = screen.live_camera(server)
-        with opened(0, "size") as other:
+        with open_server(0, "size") as other:
             size = ArrayGlyphs(other.scene, ARRAY).size_m
         bodies = camera.pixels(ARRAY.positions)
         rods = camera.pixels(ARRAY.positions + 0.8 * size * Z)

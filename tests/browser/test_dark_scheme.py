@@ -11,7 +11,7 @@ import viser
 
 from arrays.geometries import tetrahedron
 from magloc.viewer.pages.pages import array_page
-from magloc.viewer.server import opened, page_html, write_page
+from magloc.viewer.server import open_server, page_html, write_page
 from tests.browser.screen import Screen, Sight, close_to, dark_grey
 
 ARRAY = tetrahedron(1.0)
@@ -36,7 +36,7 @@ def sights(screen: Screen, server: viser.ViserServer, scheme: str) -> list[Sight
 class TestScheme:
     @pytest.mark.slow
     def test_live_page(self, screen: Screen, scheme: str) -> None:
-        with opened(0, "array") as server:
+        with open_server(0, "array") as server:
             array_page(server, ARRAY, live=False)
             screen.open_server(server)
             screen.until_seen(*sights(screen, server, scheme))
@@ -45,7 +45,7 @@ class TestScheme:
 
     def test_static_page(self, screen: Screen, scheme: str, tmp_path: Path) -> None:
         page = tmp_path / "array.html"
-        with opened(0, "array") as server:
+        with open_server(0, "array") as server:
             write_page(page_html(server, array_page(server, ARRAY, live=False)), page)
             screen.open(page.as_uri())
             screen.until_seen(*sights(screen, server, scheme))

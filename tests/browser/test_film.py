@@ -16,7 +16,7 @@ from arrays.geometries import tetrahedron
 from arrays.io.errors import InputError
 from magloc.tracking.results import TrackPoint, TrackResult
 from magloc.viewer import film
-from magloc.viewer.mp4 import mp4_of
+from magloc.viewer.mp4 import encode_mp4
 from magloc.viewer.scene.glyphs import DIPOLE_COLOUR
 from tests.browser.screen import Screen, hue_of
 
@@ -88,7 +88,7 @@ def test_a_turn(screen: Screen, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 def played(screen: Screen, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """What a browser, which knows nothing of how the film was made, shows in the middle of every picture's time."""
     screen.browser.open(tmp_path_factory.mktemp("film").as_uri())  # encoders are for pages of this machine
-    return play(screen, mp4_of(screen.browser, colour_pictures(), EACH_MS), len(COLOURS), EACH_MS / 1000.0)
+    return play(screen, encode_mp4(screen.browser, colour_pictures(), EACH_MS), len(COLOURS), EACH_MS / 1000.0)
 
 
 def play(screen: Screen, mp4: bytes, n: int, each_s: float) -> dict[str, Any]:

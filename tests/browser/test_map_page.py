@@ -15,7 +15,7 @@ from magloc.viewer.pages.map import FAILED_COLOUR
 from magloc.viewer.pages.open_result import MapResult
 from magloc.viewer.pages.pages import map_page
 from magloc.viewer.scene.glyphs import DIPOLE_COLOUR, REGION_COLOUR
-from magloc.viewer.server import opened
+from magloc.viewer.server import open_server
 from tests.browser.screen import Camera, Screen, Sight, close_to, dark_grey, hue_of
 
 FloatArray = NDArray[np.float64]
@@ -58,7 +58,7 @@ def colour_of(place_m: FloatArray) -> FloatArray:
 
 @pytest.fixture(scope="module")
 def server(screen: Screen) -> Iterator[viser.ViserServer]:
-    with opened(0, "map") as server:
+    with open_server(0, "map") as server:
         page = map_page(server, RESULT)
         screen.open_server(server)
         yield server

@@ -18,7 +18,7 @@ from adcs.viewer.drive_player import DrivePlayer
 from adcs.viewer.frame_image import IDENTIFIED_COLOUR
 from adcs.viewer.table_scene import CEILING_M, ESTIMATE_COLOUR, FIX_COLOUR, VIEW_COLOUR
 from magloc.viewer.pages.pages import Page
-from magloc.viewer.server import opened, page_html, write_page
+from magloc.viewer.server import open_server, page_html, write_page
 from sims.cli.mockup_options import MockupOptions
 from sims.cli.mockup_replay import drive_of
 from sims.experiments.mockup_navigation import fused_runs
@@ -41,7 +41,7 @@ def replay(screen: Screen) -> Iterator[Open]:
     """The page of a drive, open in the browser."""
     result = fused_runs("ekf", TableScenario(duration_s=DURATION_S), [0]).results[0]
     drive = drive_of(result, "ekf", MockupOptions().table_camera())
-    with opened(0, "drive") as server:
+    with open_server(0, "drive") as server:
         page, player = drive_page(server, drive, 15.0)
         screen.open_server(server)
         yield Open(server, drive, page, player)
@@ -92,7 +92,7 @@ class TestDrive:
         camera = screen.live_camera(replay.server)
         screen.until_seen(*sights(camera, replay.drive, replay.player.row))
         screen.keep("mockup")
-        assert "frame that the last fix came from" in screen.text()
+        assert "frame of the last fix" in screen.text()
         assert screen.browser.errors == []
 
     def test_the_time_slider_moves_the_scene(self, screen: Screen, replay: Open) -> None:

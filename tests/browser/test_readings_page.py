@@ -14,7 +14,7 @@ from magloc.readings import Readings
 from magloc.viewer.pages.live_fit import LiveFit
 from magloc.viewer.pages.pages import readings_page
 from magloc.viewer.scene.glyphs import DIPOLE_COLOUR, FIT_COLOUR
-from magloc.viewer.server import opened
+from magloc.viewer.server import open_server
 from tests.browser.conftest import SIZE
 from tests.browser.screen import Screen, Sight, dark_grey, hue_of
 
@@ -32,7 +32,7 @@ def server(screen: Screen) -> Iterator[viser.ViserServer]:
     rows = Readings(values, time_s=0.5 * np.arange(9.0))
     fit = LiveFit(ARRAY)
     fixes = [fit.fix(reading) for reading in values]
-    with opened(0, "readings") as server:
+    with open_server(0, "readings") as server:
         page = readings_page(server, ARRAY, fixes, rows)
         screen.open_server(server)
         yield server

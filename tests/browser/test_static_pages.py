@@ -13,9 +13,9 @@ from arrays.array_file import write_array
 from arrays.geometries import tetrahedron
 from magloc.viewer.pages.open_result import MapResult
 from magloc.viewer.pages.pages import array_page, map_page, track_page
-from magloc.viewer.scene.framing import SIDES_OF_A_PHONE
+from magloc.viewer.scene.framing import PHONE_WIDTH
 from magloc.viewer.scene.glyphs import DIPOLE_COLOUR
-from magloc.viewer.server import opened, page_html, write_page
+from magloc.viewer.server import open_server, page_html, write_page
 from tests.browser.conftest import SIZE
 from tests.browser.screen import Screen, Sight, dark_grey, hue_of
 from tests.browser.test_map_page import DIPOLE, RESULT, sights
@@ -34,7 +34,7 @@ class TestStaticPages:
         write_array(tmp_path / "array.toml", array)
         page = tmp_path / "array.html"
         assert run("view", tmp_path / "array.toml", "--html", page, "--quiet").status == 0
-        with opened(0, "array") as server:
+        with open_server(0, "array") as server:
             array_page(server, array, live=False)
             screen.open(page.as_uri())
             camera = screen.camera(server.initial_camera)
@@ -48,7 +48,7 @@ class TestStaticPages:
 
     def test_map(self, screen: Screen, tmp_path: Path) -> None:
         page = tmp_path / "map.html"
-        with opened(0, "map") as server:
+        with open_server(0, "map") as server:
             write_page(page_html(server, map_page(server, RESULT)), page)
             screen.open(page.as_uri())
             camera = screen.camera(server.initial_camera)
@@ -66,7 +66,7 @@ class TestStaticPages:
         known = np.zeros(values.shape, dtype=bool)
         array = tetrahedron(1.0)
         result = MapResult(axis, values, known, "starts", "passes", False, array, None, None, "random", 1)
-        with opened(0, "map") as server:
+        with open_server(0, "map") as server:
             write_page(page_html(server, map_page(server, result)), tmp_path / "map.html")
         assert (tmp_path / "map.html").stat().st_size < LARGEST
 
@@ -74,13 +74,13 @@ class TestStaticPages:
         """A page that is narrow sees as far to the sides as the first camera does: its picture is that much smaller."""
         page, shape = tmp_path / "array.html", {"deviceScaleFactor": 1, "mobile": False}
         array = tetrahedron(0.03)
-        with opened(0, "array") as server:
+        with open_server(0, "array") as server:
             write_page(page_html(server, array_page(server, array, live=False)), page)
             screen.browser.call("Emulation.setDeviceMetricsOverride", width=390, height=844, **shape)
             try:
                 screen.open(page.as_uri())
                 camera = screen.camera(server.initial_camera)
-                upright = 2.0 * np.arctan(SIDES_OF_A_PHONE * 844.0 / 390.0 * np.tan(0.5 * camera.field_of_view_rad))
+                upright = 2.0 * np.arctan(PHONE_WIDTH * 844.0 / 390.0 * np.tan(0.5 * camera.field_of_view_rad))
                 places = replace(camera, field_of_view_rad=upright).pixels(array.positions)
                 assert (places[:, 0] > 0.0).all()
                 assert (places[:, 0] < 390.0).all()
@@ -105,7 +105,7 @@ class TestReadings:
     @pytest.mark.usefixtures("wide")
     def test_a_click_into_the_plot_moves_the_scene_and_the_cursor(self, screen: Screen, tmp_path: Path) -> None:
         page = tmp_path / "track.html"
-        with opened(0, "track") as server:
+        with open_server(0, "track") as server:
             write_page(page_html(server, track_page(server, TRACK, ARRAY, READINGS)), page)
             screen.open(page.as_uri())
             camera = screen.camera(server.initial_camera)

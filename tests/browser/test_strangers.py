@@ -14,7 +14,7 @@ from websockets.sync.server import ServerConnection, serve
 
 from arrays.geometries import tetrahedron
 from magloc.viewer.pages.pages import array_page
-from magloc.viewer.server import address, opened
+from magloc.viewer.server import address, open_server
 from tests.browser.screen import Screen
 
 SOCKET = """new Promise(done => {
@@ -55,7 +55,7 @@ def elsewhere() -> Iterator[int]:
 @pytest.fixture(scope="module")
 def only_server(screen: Screen) -> Iterator[viser.ViserServer]:
     """Stopped once: it waits some seconds for what the browser has connected ahead and never used."""
-    with opened(0, "array") as server:
+    with open_server(0, "array") as server:
         page = array_page(server, tetrahedron(1.0), live=True)
         yield server
         page.close()

@@ -19,7 +19,7 @@ from magloc.viewer.pages.pages import track_page
 from magloc.viewer.pages.track_player import time_colours
 from magloc.viewer.panels.lines import _LEFT, _RIGHT, _WIDTH
 from magloc.viewer.scene.glyphs import DIPOLE_COLOUR
-from magloc.viewer.server import opened
+from magloc.viewer.server import open_server
 from tests.browser.screen import Screen, Sight, close_to, dark_grey, hue_of
 
 FloatArray = NDArray[np.float64]
@@ -54,7 +54,7 @@ def coloured(picture: FloatArray) -> NDArray[np.bool_]:
 
 @pytest.fixture(scope="module")
 def server(screen: Screen) -> Iterator[viser.ViserServer]:
-    with opened(0, "track") as server:
+    with open_server(0, "track") as server:
         page = track_page(server, RESULT, ARRAY, READINGS)
         screen.open_server(server)
         yield server
@@ -142,7 +142,7 @@ class TestTrack:
 
     def test_play_and_pause(self, screen: Screen, server: viser.ViserServer, monkeypatch: pytest.MonkeyPatch) -> None:
         tenths, last = iter(range(52)), [52]  # the clock stands still after 5.2 s, in row 10
-        monkeypatch.setattr("magloc.viewer.panels.played_time.perf_counter", lambda: 0.1 * next(tenths, last[0]))
+        monkeypatch.setattr("magloc.viewer.panels.time_player.perf_counter", lambda: 0.1 * next(tenths, last[0]))
         camera = screen.live_camera(server)
 
         def play() -> None:

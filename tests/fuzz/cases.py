@@ -315,7 +315,7 @@ def write_files(folder: Path) -> None:
     rows = Path(adcs.datasets.load("imu").path).read_text(encoding="utf-8").splitlines()
     (folder / "imu.csv").write_text("\n".join(rows[:101]), encoding="utf-8")
     _write_scalars(folder)
-    flight = switching_loads(seed=0, duration_s=150.0)
+    flight = switching_loads(rng=0, duration_s=150.0)
     write_columns(flight.columns, folder / "loads.csv")
     arrays.write_array(folder / "loads.toml", flight.array)
     _write_stars(folder)

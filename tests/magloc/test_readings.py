@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,13 +20,13 @@ from arrays.array_file import read_array
 from arrays.io.errors import InputError
 from arrays.sensor import Sensor
 from magloc.readings import Readings, read_readings, without_saturated, write_readings
+from tests.written import WriteFile, writer
 
 HEADER = "time_s,s1_x_nT,s1_y_nT,s1_z_nT,s2_x_nT,s2_y_nT,s2_z_nT,s3_nT"
 ROW = "0,1,2,3,4,5,6,7"
 POSE = "array_x_m,array_y_m,array_z_m,array_qx,array_qy,array_qz,array_qw"
 SIGMA = "array_sigma_m,array_sigma_deg"
 HALF_OF_DIGIT_15 = 5e-15 + 4.0 * np.finfo(np.float64).eps  # and the rounding of nT to T and back
-WriteFile = Callable[[str | bytes], Path]
 
 
 @pytest.fixture
@@ -42,14 +41,7 @@ def array() -> SensorArray:
     )
 
 
-@pytest.fixture
-def write(tmp_path: Path) -> WriteFile:
-    def write_file(content: str | bytes) -> Path:
-        path = tmp_path / "readings.csv"
-        path.write_bytes(content if isinstance(content, bytes) else content.encode())
-        return path
-
-    return write_file
+write = writer("readings.csv")
 
 
 def numbers(largest: float) -> st.SearchStrategy[float]:

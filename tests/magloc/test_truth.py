@@ -3,26 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from arrays.io.errors import InputError
 from magloc.truth import read_truth
+from tests.written import WriteFile, writer
 
-WriteFile = Callable[[str], Path]
-
-
-@pytest.fixture
-def write(tmp_path: Path) -> WriteFile:
-    def write_file(content: str) -> Path:
-        path = tmp_path / "truth.csv"
-        path.write_text(content, encoding="utf-8")
-        return path
-
-    return write_file
+write = writer("truth.csv")
 
 
 class TestTruth:

@@ -25,8 +25,8 @@ from magloc.surveying.results import Reach, SurveyRows
 from magloc.tracking.results import TrackPoint, TrackResult
 from magloc.viewer.pages.pages import readings_page, survey_page
 from magloc.viewer.pages.survey import target_lines
-from magloc.viewer.server import address, free_port, opened
-from magloc.viewer.view import View, thinned
+from magloc.viewer.server import address, free_port, open_server
+from magloc.viewer.view import View, thin_readings
 from tests.browser.browser import Browser
 from tests.magloc.cli.test_view import needs_chromium
 
@@ -67,7 +67,7 @@ class TestServer:
             page_of(shown.address)
 
     def test_nothing_is_said_and_others_may_speak_again(self, capsys: pytest.CaptureFixture[str]) -> None:
-        with opened(free_port(0), "quiet"):
+        with open_server(free_port(0), "quiet"):
             pass
         assert capsys.readouterr().out == ""
         rich.print("heard")
@@ -120,7 +120,7 @@ class TestInline:
         reach = Reach(np.zeros((0, 3)), np.zeros(0))
         survey = magloc.Survey((target,), ARRAY, values, reach, 0.0, 26.0, 1.0, False, 0.0, 1.0)
         assert "95 % ellipsoids of their positions" in self.page(magloc.view(None, survey))
-        with opened(0, "survey") as server:
+        with open_server(0, "survey") as server:
             survey_page(server, survey)
             nodes = server.scene._handle_from_node_name
             np.testing.assert_allclose(nodes["/t1"].position, position)
@@ -135,7 +135,7 @@ class TestInline:
         array = cube(1.5)
         places = ([2.0, 2.5, 0.5], [-2.5, -2.0, 1.0])
         fixes = locate(array, sum(predicted_channels(array, place, [0.0, 80.0, 30.0]) for place in places), sources=2)
-        with opened(0, "fixes") as server:
+        with open_server(0, "fixes") as server:
             readings_page(server, array, fixes, None)
             shown = [handle for name, handle in server.scene._handle_from_node_name.items() if "/fixes/best" in name]
             found = [handle.position for handle in shown if handle.name in ("/fixes/best", "/fixes/best-2")]
@@ -214,15 +214,15 @@ class TestArguments:
             magloc.view(ARRAY, "fixes.json")  # type: ignore[arg-type]
 
     def test_readings_of_other_rows(self, fixes: Fixes) -> None:
-        with pytest.raises(ValueError, match="5 rows, one a fix; instead received 2"):
+        with pytest.raises(ValueError, match="a row for each of 5 fixes; instead received 2"):
             magloc.view(ARRAY, fixes, readings=Readings(VALUES_T[:2]))
 
     def test_fixes_in_the_world_need_poses(self, fixes: Fixes) -> None:
         moved = fixes.moved(np.zeros((5, 3)), Rotation.identity(5), frame="world")
-        with pytest.raises(ValueError, match="must hold the poses"):
+        with pytest.raises(ValueError, match="must have poses"):
             magloc.view(ARRAY, moved)
 
 
 def test_long_readings_are_thinned_evenly() -> None:
-    rows = thinned(Readings(np.zeros((4001, 12))))
+    rows = thin_readings(Readings(np.zeros((4001, 12))))
     np.testing.assert_array_equal(rows.time_s, np.arange(0.0, 4001.0, 3.0))

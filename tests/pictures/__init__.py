@@ -25,7 +25,7 @@ from PIL import Image
 from arrays.array_file import read_array
 from magloc.viewer.origin import SMOOTH
 from magloc.viewer.pages.pages import array_page
-from magloc.viewer.server import opened
+from magloc.viewer.server import open_server
 from tests.browser.browser import Browser
 from tests.browser.screen import Screen
 from tests.notebooks import DOCS, MOST_PIXELS, NOTEBOOKS, ON_PAGES, SHOWN, small, with_commands
@@ -150,7 +150,7 @@ class LivePage:
     def draw(self, folder: Path) -> bytes:
         run(self.made_by, folder)
         array = read_array(folder / self.array)
-        with Browser("about:blank", self.size_px) as browser, opened(0, self.array) as server:
+        with Browser("about:blank", self.size_px) as browser, open_server(0, self.array) as server:
             screen, page = Screen(browser, folder), array_page(server, array, live=True)
             screen.open_server(server, SMOOTH)
             screen.until(lambda: "found at" in screen.text(), "the fit is found")
@@ -164,6 +164,16 @@ SIMULATED = "magloc simulate weaving --out weaving.csv"
 WEAVING = "sims/magnetics/scenarios/weaving.toml"
 PAPER = ("magloc/convergence/scenarios/paper.toml", "magloc/plots/maps.py", STYLE)
 MAP = "magloc map --out map"
+SURVEY = (
+    "magloc simulate survey-drone --out field.csv --seed 7",
+    "magloc survey field.csv --array field-array.toml --out found",
+)
+SURVEY_SOURCES = (
+    "sims/magnetics/scenarios/survey-drone.toml",
+    "magloc/plots/surveys.py",
+    "magloc/plots/profiles.py",
+    STYLE,
+)
 PICTURES: dict[str, Picture] = {
     "track-weaving.png": OfCommands(
         (
@@ -184,6 +194,8 @@ PICTURES: dict[str, Picture] = {
         ("sims/magnetics/scenarios/three-magnets.toml", "magloc/plots/tracks.py", STYLE),
         widest_px=1420,
     ),
+    "survey-map.png": OfCommands(SURVEY, "found/survey.png", SURVEY_SOURCES),
+    "survey-profiles.png": OfCommands(SURVEY, "found/profiles.png", SURVEY_SOURCES),
     "convergence-paper.png": OfCommands((MAP,), "map/convergence.png", PAPER, widest_px=1420),
     "bounds-reach.png": OfCommands(
         ("magloc bounds --moment-Am2 0 0 100 --accuracy-m 0.5 --out bounds",),
@@ -202,10 +214,11 @@ PICTURES: dict[str, Picture] = {
         ("adcs/plots/complementary.py", STYLE),
     ),
     "residuals-faulty.png": OfPage("sensor-faults", ("magloc/plots/localization.py", STYLE)),
+    "hall-board.png": OfPage("hall-board", ("magloc/plots/tracks.py", STYLE)),
     "background-diver.png": OfPage("background"),
     "distance-of-a-coil.png": OfPage("single-sensor-ranging"),
     "gradient-tensor.png": OfPage("gradient-tensor"),
-    "beating-tissue.png": OfRecording("tests.beating_tissue", ("tests/beating_tissue.py",)),
+    "beating-tissue.png": OfRecording("docs.studies.beating_tissue", ("docs/studies/beating_tissue.py",)),
     "stars-identified.png": OfPage("star-identification"),
     "view-array.png": OfCommands(
         (
@@ -228,15 +241,17 @@ PICTURES: dict[str, Picture] = {
             "adcs/viewer/drive_page.py",
             "adcs/viewer/drive_player.py",
             "adcs/viewer/table_scene.py",
-            "magloc/viewer/panels/played_time.py",
+            "magloc/viewer/panels/time_player.py",
         ),
     ),
     "card-locate.png": Panel("notebook-03-real-magnet.png", (12, 58, 296, 326)),
     "card-track.png": Panel("notebook-05-tracking.png", (434, 362, 852, 562)),
-    "card-bounds.png": Panel("notebook-06-which-array.png", (18, 40, 448, 286)),
+    "card-survey.png": Panel("survey-map.png", (56, 200, 412, 394)),
+    "card-live.png": Panel("hall-board.png", (272, 62, 722, 510)),
     "card-calibrate.png": Panel("notebook-08-calibration.png", (24, 6, 330, 168)),
-    "card-convergence.png": Panel("notebook-02-convergence-map.png", (0, 50, 255, 320)),
+    "card-design.png": Panel("design-half-space.png", (58, 92, 418, 424)),
     "card-attitude.png": Panel("attitude-track.png", (20, 28, 322, 188)),
+    "card-stars.png": Panel("stars-identified.png", (72, 5, 400, 270)),
 }
 OF_NOTEBOOKS = {f"notebook-{name}.png" for name in SHOWN} | {file for file, _ in ON_PAGES.values()}
 # Pages of the gallery have pictures of notebooks that are written when the site is built.

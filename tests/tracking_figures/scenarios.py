@@ -20,7 +20,6 @@ QUICK = (
     "moduli, ambient exact",
     "known modulus, 8 m",
     "one magnet, auto",
-    "two magnets, first seconds",
     "stream, first rows",
 )
 """Those of ``make test``, some seconds together; the others are slow."""

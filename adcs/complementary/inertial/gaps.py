@@ -13,18 +13,18 @@ from adcs.satellite.telemetry import is_read
 from adcs.satellite.vector_record import GAP_STEPS
 from arrays.typing import BoolArray, FloatArray
 
-_CHANGE_S = 1.0  # a hand changes its rate within that time
+_CHANGE_S = 1.0  # time in which a hand changes its rate
 _STEEP, _LONG = 6, 10.0
-_SHOWN_RAD, _SHOWN_S = 0.15, 0.3  # in a shorter gap the room's field changes as much as by a rotation
+_SHOWN_RAD, _SHOWN_S = 0.15, 0.3  # in a shorter gap the room's field may change as much as by a rotation
 _TINY = 1e-12
 HELD_VARIANCE = 4.0
-"""Factor of the variance with the rate at one end of a gap over that with both, for a rate that is a random walk."""
+"""Variance with the rate at one end of a gap over that with both, for a rate that is a random walk."""
 UNKNOWN_RAD = math.pi / math.sqrt(3.0)
-"""Standard deviation of an angle that may be any."""
+"""Standard deviation of an unknown angle."""
 LOST_RAD = 0.05
-"""A gap that hides a turn of this size, 1 σ, is named."""
+"""Least σ of the rotation in a gap that a warning names."""
 LEAST_GAP_S = 1.0
-"""A shorter gap is not named, unless it hides a turn."""
+"""Least duration of a gap that a warning names, unless it hides a rotation."""
 
 
 def numbered_windows(time_s: FloatArray, window_s: float) -> NDArray[np.intp]:
@@ -49,7 +49,7 @@ def window_scatter(values: FloatArray, window: NDArray[np.intp]) -> tuple[FloatA
 def sensor_gaps(time_s: FloatArray, read: BoolArray, least_s: float = 0.0) -> NDArray[np.intp]:
     """Return the rows (k, 2) before and after each gap of a sensor; n after a gap at the end.
 
-    A gap is longer than 2.5 usual steps of the sensor and than ``least_s``. Time before the first reading is no gap.
+    A gap is longer than 2.5 usual steps of the sensor, and than ``least_s``. Time before the first reading is no gap.
     """
     rows = np.flatnonzero(read)
     span = np.diff(time_s[rows])
@@ -62,9 +62,9 @@ def sensor_gaps(time_s: FloatArray, read: BoolArray, least_s: float = 0.0) -> ND
 
 
 def hidden_turn_rad(seconds: FloatArray, held_rad_s: float, usual_rad_s: float) -> FloatArray:
-    """Return σ of the rotation in a gap of the gyro, relative to that by the mean rate of its ends.
+    """Return σ of the rotation in a gap of the gyro, relative to the rotation at the mean rate of its ends.
 
-    In a short gap σ of the mean rate is ``held_rad_s``; beyond a second the unit may have any of its usual rates.
+    In a short gap σ of the mean rate is ``held_rad_s``. After a second the unit may have any of its usual rates.
     """
     part = np.power(np.minimum(seconds / _CHANGE_S, _LONG), _STEEP)
     rate = np.hypot(held_rad_s, usual_rad_s * part / (1.0 + part))
@@ -76,7 +76,7 @@ def hidden_variance(
 ) -> FloatArray:
     """Return the growth (n,) of the attitude's variance within gaps of the gyro [rad²].
 
-    It is positive in all of a gap. ``rate_rad_s`` (n, 3): NaN without a reading. Other rates as in
+    It is positive in the whole gap. ``rate_rad_s`` (n, 3): NaN without a reading. Other rates: see
     :func:`hidden_turn_rad`; the rms rate of the log replaces ``usual_rad_s`` if it is higher.
     """
     growth = np.zeros(len(time_s))
@@ -91,9 +91,9 @@ def hidden_variance(
 def observed_turn_variance(
     time_s: FloatArray, gaps: NDArray[np.intp], hidden_rad2: FloatArray, steady_field: FloatArray
 ) -> FloatArray:
-    """Return the variance (n,) to add after gaps over which the field turns by more than σ [rad²].
+    """Return the variance (n,) to add after gaps over which the field rotates by more than σ [rad²].
 
-    ``steady_field`` (n, 3): in the frame of the gyro alone, where only a gap changes it; NaN where it is not the
+    ``steady_field`` (n, 3): field in the frame of the gyro alone, where only a gap changes it; NaN where it is not the
     Earth's.
     """
     more = np.zeros(len(time_s))
@@ -113,20 +113,12 @@ def observed_turn_variance(
 def gap_warnings(time_s: FloatArray, read: Mapping[str, BoolArray], lost: NDArray[np.intp]) -> list[str]:
     """Return a sentence for each sensor with gaps: number, duration and time.
 
-    Parameters
-    ----------
-    time_s : ndarray, shape (n,)
-    read : mapping of str to ndarray of bool, shape (n,)
-        Sensors by name, the gyro first.
-    lost : ndarray, shape (k, 2)
-        Gaps of the gyro that hide a turn.
+    ``read``: masks (n,) of readings by sensor, the gyro first. ``lost`` (k, 2): gaps of the gyro that hide a rotation.
     """
     gyro, *others = read
     texts = []
     if len(lost):
-        texts.append(
-            f"{_gap_sentence(time_s, gyro, lost)}; the turn within a gap is unknown, and the field tells it again"
-        )
+        texts.append(f"{_gap_sentence(time_s, gyro, lost)}; the turn within a gap is unknown until the field shows it")
     for name in others:
         gaps = sensor_gaps(time_s, read[name], LEAST_GAP_S)
         seen = np.concatenate([[0], np.cumsum(read[gyro])])

@@ -24,7 +24,7 @@ def level_attitudes(q_gyro: FloatArray, up: FloatArray, part: FloatArray, start:
     """Rotate the attitudes (n, 4) of the gyro so that a vector (n, 3) in its frame points upwards.
 
     A part (n,) of the angle is corrected at each instant, as in the explicit filter with one vector. The corrections
-    accumulate in a quaternion of their own, which begins with ``start`` (4,).
+    accumulate in a separate quaternion, which begins with ``start`` (4,).
     """
     q = np.empty_like(q_gyro)
     work = core.problem("level", start=tuple(start), q_gyro=q_gyro, up=up, part=part, q=q)
@@ -35,9 +35,9 @@ def level_attitudes(q_gyro: FloatArray, up: FloatArray, part: FloatArray, start:
 def low_pass(values: FloatArray, dt_s: FloatArray, time_s: float, start: FloatArray) -> FloatArray:
     """Filter values (n, k) by a Butterworth low-pass of second order, initially at rest at ``start``.
 
-    Steps ``dt_s`` (n,) are arbitrary. The step response reaches 1 - 1/e within ``time_s``. Within a step, whose input
-    is the mean of both ends, the solution is exact: z'' + 2s z' + 2s² z = 0 with s = 1/``time_s`` and z the distance to
-    the input. NaN repeats the value before.
+    Steps ``dt_s`` (n,) are arbitrary. The step response reaches 1 - 1/e after ``time_s``. The input within a step is
+    the mean of both ends, and the solution is exact: z'' + 2s z' + 2s² z = 0 with s = 1/``time_s`` and z the distance
+    from the input. NaN repeats the value before.
     """
     out = np.empty_like(values)
     steps = np.ascontiguousarray(dt_s) / time_s

@@ -1,4 +1,4 @@
-"""Direction up of an inertial unit: the acceleration, smoothed in a frame that does not turn."""
+"""Direction up of an inertial unit: the acceleration, smoothed in a frame that does not rotate."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from arrays.typing import BoolArray, FloatArray
 GRAVITY_TIME_S = 3.0
 """Time constant of the low-pass of the acceleration, as published for VQF."""
 _GRAVITY_M_S2 = 9.81
-_MEAN_S = 0.5  # means of a hand's acceleration over longer times decrease with that time
+_MEAN_S = 0.5  # means of a hand's acceleration over longer times decrease in proportion
 _WINDOW_S = 1.5
-_LEAST_RAD = 0.025  # smoothing continues over a gap that hides less
-_MUCH = 2.0  # the estimate before a gap is used up to this number of σ of a reading
-_LEAST_M_S2 = 0.1  # error of the mean of an accelerometer
+_LEAST_RAD = 0.025  # least σ in a gap after which smoothing restarts
+_MUCH = 2.0  # largest σ of the estimate before a gap that is used, in σ of a reading
+_LEAST_M_S2 = 0.1  # error of an accelerometer's mean
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,9 +36,11 @@ class Up:
     """Direction up at n instants, in the frame of the gyro alone."""
 
     up: FloatArray  # (n, 3): unit vectors
-    sigma_rad: FloatArray  # (n,): of their angle, what gaps and a start that moves leave of it
-    fresh: BoolArray  # (n,): where few readings tell it: it is followed at once
-    hidden_rad2: FloatArray  # (n,): growth of the attitude's variance in gaps of the gyro, with what shows after them
+    sigma_rad: FloatArray  # (n,): σ of their angle after gaps and a start in motion
+    fresh: BoolArray  # (n,): instants with few readings since a restart; the attitude follows them at once
+    hidden_rad2: (
+        FloatArray  # (n,): growth of the attitude's variance in gaps of the gyro, and by rotations seen after them
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,10 +50,10 @@ class Steady:
     time_s: FloatArray
     dt_s: FloatArray
     acceleration_m_s2: FloatArray  # (n, 3): NaN without a reading
-    at_rest: BoolArray  # (n,): readings that start the first low-pass; none where the unit moves at the start
+    at_rest: BoolArray  # (n,): readings that start the first low-pass; none if the unit moves at the start
     gaps: NDArray[np.intp]  # (k, 2): rows before and after the gaps of the gyro
-    hidden_rad2: FloatArray  # (n,): growth of the attitude's variance within them
-    drift_rad_s: float  # of the gyro
+    hidden_rad2: FloatArray  # (n,): growth of the attitude's variance within these gaps
+    drift_rad_s: float  # drift of the gyro
 
 
 def direction_up(steady: Steady, *, offline: bool) -> Up:

@@ -1,7 +1,7 @@
 """Detection of wrong units and axes in the log of an inertial unit.
 
-Gravity and the Earth's field have known lengths, and are constant in a frame that does not turn: their rotation in body
-axes must agree with the gyro. If a sensor contradicts the others, all likely misreadings are tried.
+Gravity and the Earth's field have known lengths, and are constant in a frame that does not rotate. Their rotation in
+body axes must agree with the gyro. If a sensor contradicts the others, all likely misreadings are tried.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from adcs.satellite.vector_record import instants_within, steps_s
 from arrays.typing import BoolArray, FloatArray
 
 _GRAVITY_M_S2 = 9.81
-_LEAST_GRAVITY_M_S2 = 5.0  # the median of all readings is larger, however the unit moves
+_LEAST_GRAVITY_M_S2 = 5.0  # least median of all readings for any motion of the unit
 _ACCELERATION_UNITS = {
     "g taken for m/s²": 9.80665,
     "mg taken for m/s²": 9.80665e-3,
@@ -39,21 +39,21 @@ _MORE_RATE_UNITS = {
 }
 _TIME_UNITS = {"ms taken for s": 1e-3, "µs taken for s": 1e-6, "ns taken for s": 1e-9, "s taken for ms": 1e3}
 _STEP_S = (5e-4, 0.5)  # usual steps of a log
-# A quarter of the windows turns by so much: accelerations of a hand are off by more than fields of a room.
+# Rotation of a quarter of the windows; accelerations of a hand have larger errors than fields of a room.
 _TURNS_RAD = {"magnetometer": math.radians(15.0), "accelerometer": math.radians(30.0)}
-_LEAST_TURN = 1.0 / 3.0  # of that, of a window that counts
+_LEAST_TURN = 1.0 / 3.0  # least part of that rotation in a window that counts
 _SUSPICIOUS = 0.5
 _ALLOWED_PART, _ALLOWED_RAD, _DIP_RAD = 0.3, math.radians(2.0), math.radians(20.0)
 _WINDOWS, _MOST_WINDOWS = 16, 200
 _CHANCE = 2e-5
 _SAMPLE_S = 0.02
-_LIKE_PART = (0.2, 10.0)  # path of the gyro over the turn of a vector: of no other unit
+_LIKE_PART = (0.2, 10.0)  # path of the gyro over the rotation of a vector if the units are right
 _VECTORS = ("magnetometer", "accelerometer")
 
 
 @dataclass(frozen=True, eq=False)
 class _Windows:
-    """Pairs of readings of a vector, between which it turns."""
+    """Pairs of readings of a vector, between which it rotates."""
 
     first: NDArray[np.intp]  # rows
     last: NDArray[np.intp]
@@ -73,7 +73,7 @@ class _Windows:
 def check_lengths(acceleration_m_s2: FloatArray, field_T: FloatArray, starting: BoolArray) -> None:
     """Raise ValueError if the length of the acceleration or of the field is that of another unit.
 
-    Both the first second (``starting``, (n,)) and the whole log have to say so.
+    Both the first second (``starting``, (n,)) and the whole log must show it.
     """
     lengths, fields = (np.sqrt(np.einsum("ni,ni->n", v, v)) for v in (acceleration_m_s2, field_T))
     gravity, field = (np.array([median(v[starting]), median(v)]) for v in (lengths, fields))
@@ -86,9 +86,9 @@ def check_lengths(acceleration_m_s2: FloatArray, field_T: FloatArray, starting: 
             )
     if (gravity < _LEAST_GRAVITY_M_S2).all():
         raise ValueError(
-            f"Input acceleration_m_s2 must have gravity in it, 9.8 m/s² upwards at rest; instead received "
-            f"{gravity[1]:.2g} m/s² in the median. The accelerometer's readings are without gravity, as of a linear "
-            "acceleration, or in another unit. Take its raw readings."
+            f"Input acceleration_m_s2 must include gravity, 9.8 m/s² upwards at rest; instead received a median of "
+            f"{gravity[1]:.2g} m/s². The readings are without gravity, as of a linear acceleration, or in another "
+            "unit. Use the accelerometer's raw readings."
         )
     if np.isfinite(field_T).any() and not (_PLAUSIBLE_T[0] < field[0] < _PLAUSIBLE_T[1]):
         for name, factor in FIELD_UNITS.items():
@@ -105,20 +105,12 @@ def check_turns(
 ) -> None:
     """Raise ValueError if one misreading of a sensor or of the time explains why the turns contradict each other.
 
-    The turns of gravity and field in the body are compared with the gyro's, over windows in which they turn by 15 to
-    30°. A change is believed if it takes three quarters of a disagreement, makes no other one worse, and brings nearer
-    the truth so many windows that chance does it once in 50,000 times; with 120 changes fewer than one right log in
-    400 would be refused by the last rule alone. A log that turns too little says nothing.
-
-    Parameters
-    ----------
-    time_s : ndarray, shape (n,)
-    rate_rad_s : ndarray, shape (n, 3)
-        Mean over the step that ends at each instant.
-    acceleration_m_s2, field_T : ndarray, shape (n, 3)
-        NaN without a reading.
-    hidden : ndarray of bool, shape (n,)
-        Instants within a gap of the gyro.
+    The rotations of gravity and field in body axes are compared with the gyro's over windows with rotations of 15 to
+    30°. A change counts if it removes three quarters of a disagreement, makes no other one worse, and improves so many
+    windows that chance does so once in 50,000 times. With 120 changes, that last rule alone refuses fewer than one
+    right log in 400. A log that rotates too little shows nothing.
+    ``rate_rad_s`` (n, 3): mean over the step that ends at each instant. ``acceleration_m_s2``, ``field_T`` (n, 3): NaN
+    without a reading. ``hidden`` (n,): instants within a gap of the gyro.
     """
     gaps = np.cumsum(hidden, dtype=np.intp)
     vectors = {"magnetometer": field_T, "accelerometer": acceleration_m_s2}
@@ -140,7 +132,7 @@ def check_turns(
         changed[f"the {sensor} in {name}"] = _differences(
             windows, _gyro_turns(factor * rate_rad_s, dt_s, windows), pair
         )
-    # A gyro that agrees with the field is right, and so is the field.
+    # If gyro and field agree, both are right.
     agree = "magnetometer" in windows and as_read[0] < _SUSPICIOUS
     for sensor, name, matrix in _axes(["accelerometer"] if agree else ["gyro", *windows]):
         changed[f"the {sensor}{name}"] = _differences(windows, turns, pair, sensor, matrix)
@@ -161,7 +153,7 @@ def _sentence(named: list[str], seen: str, before: FloatArray, after: FloatArray
     argument = next(value for word, value in _ARGUMENTS.items() if word in named[0])
     as_read, undone = (f"{math.degrees(median(found)):.2g}°" for found in (before, after))
     return (
-        f"Input {argument} must turn as the other sensors do; instead received what agrees if this is undone: "
+        f"Input {argument} must turn as the other sensors do; instead received readings that agree if this is undone: "
         f"{', or '.join(named[:3])}. The turns of gyro and {seen} differ by {as_read} as read and by {undone} without "
         f"it (median of {len(before)} windows). Convert it, or state unit, order of the columns and mounting in the "
         "layout of the log."
@@ -261,7 +253,7 @@ def _axes(sensors: list[str]) -> Iterator[tuple[str, str, FloatArray]]:
     for sensor in sensors:
         known = [np.eye(3)]
         for name, matrix in _all_axes():
-            # The turns of a vector are those of its opposite.
+            # A vector and its opposite have the same rotations.
             same = [matrix] if sensor == "gyro" else [matrix, -matrix]
             if not any(np.array_equal(a, b) for a in same for b in known):
                 known.append(matrix)

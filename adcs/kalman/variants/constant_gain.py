@@ -6,20 +6,17 @@ See docs/theory/attitude-kalman-filters.md. Source: Ivanov, Ivlev, Karpenko, Ovc
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from adcs.kalman.error_state import AttitudeTracks, FilterSettings, FilterStart
 from adcs.kalman.mekf import (
-    apply_error,
     check_start,
     collect_tracks,
     initial_state,
     predict,
     run_filter,
-    sensor_nis,
     stacked_residuals,
+    update_state,
 )
 from adcs.satellite.telemetry import Record
 from arrays.typing import FloatArray
@@ -53,13 +50,7 @@ def run_constant_gain(
     for row in range(record.momentum_Nms.shape[1]):
         if row:
             state, _ = predict(record, row - 1, state, settings)
-        H, residual = stacked_residuals(record, row, state, settings)
-        noise = H @ state.P @ H.mT + np.eye(H.shape[1])
-        nis.append(sensor_nis(noise, H, residual, settings.sensors))
-        # A sensor without a reading has rows of zeros in H, and must add no noise.
-        K_now = K * (H != 0.0).any(axis=-1)[:, None, :]
-        rest = np.eye(settings.sensors.size) - K_now @ H
-        P = rest @ state.P @ rest.mT + K_now @ K_now.mT
-        state = replace(apply_error(state, (K_now @ residual[..., None])[..., 0], settings.sensors), P=P)
+        state, nis_now = update_state(record, row, state, settings, K)
         states.append(state)
+        nis.append(nis_now)
     return collect_tracks(settings, states, np.stack(nis, axis=1))

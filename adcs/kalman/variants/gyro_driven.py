@@ -12,7 +12,14 @@ import numpy as np
 
 from adcs import quaternion
 from adcs.kalman.error_state import AttitudeState, AttitudeTracks, FilterSettings, FilterStart
-from adcs.kalman.mekf import check_start, collect_tracks, joseph_update, sensor_nis, stacked_residuals
+from adcs.kalman.mekf import (
+    check_start,
+    collect_tracks,
+    joseph_update,
+    sensor_nis,
+    stacked_residuals,
+    third_order_exponential,
+)
 from adcs.satellite.dynamics import relative_rate
 from adcs.satellite.telemetry import Record, is_read
 from arrays.typing import FloatArray
@@ -22,9 +29,9 @@ from magloc.navigation.rotations import cross_matrix
 def run_reduced(record: Record, settings: FilterSettings, start: FilterStart) -> AttitudeTracks:
     """Run the reduced filter over whole runs.
 
-    ``settings``: a set with a gyro, the state ``gyro-bias`` and no other. Its q_λ and q_g are used; the gyro's noise is
-    added to the attitude. ``start``: only its attitude is used, the rate is the gyro's. Returns: covariance of (δq, δω,
-    δΔω), in which δω is minus the error of the bias, with the gyro's noise.
+    ``settings``: a set with a gyro and the state ``gyro-bias`` alone. Its q_λ and q_g are used; the gyro's noise is
+    added to the attitude. ``start``: only its attitude is used; the rate is that of the gyro. The covariance is that of
+    (δq, δω, δΔω), where δω is minus the error of the bias plus the gyro's noise.
     """
     used = settings.sensors
     if not used.gyro or used.states != ("gyro-bias",):
@@ -70,9 +77,7 @@ def _propagate(q: FloatArray, w: FloatArray, orbital_rate: FloatArray, h: float)
     F = np.zeros((len(q), 6, 6))
     F[:, :3, :3] = -cross_matrix(w)
     F[:, :3, 3:] = -0.5 * np.eye(3)
-    step = F * h
-    squared = step @ step
-    return quaternion.normalised(turned), np.eye(6) + step + squared / 2.0 + squared @ step / 6.0
+    return quaternion.normalised(turned), third_order_exponential(F * h)
 
 
 def _covariance_with_rate(P: FloatArray, gyro_rad_s: float) -> FloatArray:
@@ -88,6 +93,8 @@ def _fill_gaps(values: FloatArray) -> FloatArray:
     """Fill the gaps of readings (runs, n, 3) by the last one before them."""
     seen = is_read(values)
     if not seen[:, 0].all():
-        raise ValueError("Input record must have a reading of the gyro at the first instant of every run.")
+        raise ValueError(
+            "Input record must have a gyro reading at the first instant of every run; instead one has none."
+        )
     last = np.maximum.accumulate(np.where(seen, np.arange(values.shape[1]), 0), axis=-1)
     return np.take_along_axis(values, last[..., None], axis=1)

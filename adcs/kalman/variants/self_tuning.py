@@ -1,7 +1,7 @@
 r"""Multiple-model adaptive estimation: a bank of MEKFs with different standard deviations of the disturbance.
 
-The disturbance is an Ornstein-Uhlenbeck process of 300 s with a standard deviation of 1e-8 to 1e-4 s⁻², by half
-decades. With the innovations ν of each filter and their covariance S, the weights are
+The disturbance is an Ornstein-Uhlenbeck process with a time constant of 300 s and a standard deviation of 1e-8 to 1e-4
+s⁻², in steps of half a decade. With the innovations ν of each filter and their covariance S, the weights are
 
 .. math:: w \propto \exp\left(-\tfrac12 \sum (\nu^T S^{-1} \nu + \ln |S|)\, e^{-\mathrm{age} / 1000\,\mathrm{s}}\right)
 
@@ -32,8 +32,8 @@ _RATE_NOISE_RAD_S = 1e-8  # per step: small, as the disturbance is a state
 def run_self_tuned(record: Record, settings: FilterSettings, start: FilterStart) -> AttitudeTracks:
     """Run the bank over whole runs and return its mixture.
 
-    ``settings``: a set with the state ``disturbance``, whose deviation and process noise the bank replaces. Returns:
-    ``nis`` is the weighted mean, ``rejected`` that of the filter with the largest weight.
+    ``settings``: a set with the state ``disturbance``, whose deviation and process noise the bank replaces. In the
+    result ``nis`` is the weighted mean, and ``rejected`` that of the filter with the largest weight.
     """
     if "disturbance" not in settings.sensors.states:
         raise ValueError("Input settings must have the state disturbance; instead received a set without it.")

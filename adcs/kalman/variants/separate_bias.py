@@ -38,12 +38,12 @@ def run_parallel(
     """Filter whole runs with a parallel filter of the disturbance.
 
     ``settings``: a set with the state ``disturbance``; forgetting replaces its process noise q_d. ``forgetting``: λ,
-    above 0 and up to 1. Returns: the covariance is that of all states, the disturbance last.
+    above 0 and at most 1. The covariance is that of all states, with the disturbance last.
     """
     if "disturbance" not in settings.sensors.states:
         raise ValueError("Input settings must have the state disturbance; instead received a set without it.")
     if not 0.0 < forgetting <= 1.0:
-        raise ValueError(f"Input forgetting must be above 0 and up to 1; instead received {forgetting}.")
+        raise ValueError(f"Input forgetting must be above 0 and at most 1; instead received {forgetting}.")
     check_start(record, start)
     inner = replace(settings, sensors=settings.sensors.drop("disturbance"))
     state = initial_state(inner, start)

@@ -33,32 +33,33 @@ class DelayedFilterSettings:
     Attributes
     ----------
     sample_s : float
-        Interval of a sample that the next two belong to.
+        Interval of the samples for which the next two numbers hold.
     acceleration_m_s2 : float
-        Noise of a sample, each axis: the sensor's 0.002 and the valves' spikes of ±0.07 about once in a second.
+        Noise of a sample, each axis: 0.002 of the sensor, and spikes of ±0.07 by the valves about once in a second.
     rate_rad_s : float
         Noise of a sample of the gyro.
     missing_acceleration_m_s2, missing_rate_rad_s : float
-        What may be missed in a sample that the gate of the samples does not believe.
+        Standard deviations of the true values in a sample that fails the gate.
     lost_after_s : float
-        Readings that stay missing for longer are lost: what is missed then lasts, and is no noise of each sample.
+        Time after which missing readings are lost: then the unknown motion lasts and is no white noise.
     lost_m_s_rs, lost_rad_rs : float
-        What may be missed meanwhile: growth of the standard deviations of velocity and heading in one second [unit per
-        √s]. Thrust of 0.04 m/s² and turns of 20°/s that last for a second or two.
+        Growth of the standard deviations of velocity and heading in one second without readings [unit per √s]: thrust
+        of 0.04 m/s² and rates of 20°/s that last for a second or two.
     zero_walk_m_s2_rs, zero_walk_rad_s_rs : float
-        Walks of the zeros: growth of their standard deviations in one second [unit per √s].
+        Growth of the zeros' standard deviations in one second [unit per √s].
     drift_walk_m_s3_rs : float
-        Walk of the drifts: 7e-6 m/s³ in 200 s, for a sensor whose warming levels off within minutes. If it does so
-        within one minute, errors of zeros and drifts are 1.1 and 1.4 of their standard deviations.
+        Growth of the drifts' standard deviations in one second: 7e-6 m/s³ in 200 s, for a sensor that warms up within
+        minutes. If it warms up within one minute, errors of zeros and drifts are 1.1 and 1.4 standard deviations.
     fix_m, fix_rad : float
-        Noise of a fix, each axis, where it does not say its own.
+        Noise of a fix that does not state its own, each axis.
     fix_gate : float
-        Largest normalised innovation squared of a fix, a χ² of 3 numbers: 25 rejects one good fix in 65,000.
+        Largest normalised innovation squared of a fix, χ² with 3 degrees of freedom: 25 rejects one good fix in 65,000.
     reacquire_after : int
-        A rejected fix begins a second hypothesis, in which it is right; it is believed once it has taken so many fixes
-        in a row, of the last ``buffer_s``, which the estimate rejects.
+        Number of consecutive rejected fixes that replace the estimate if they agree with each other.
     buffer_s : float
-        How old a fix may be.
+        Largest age of a fix.
+    sample_gate : Gate
+        Limits of the samples.
     """
 
     sample_s: float = 0.01
@@ -86,7 +87,7 @@ class DelayedFilterSettings:
 
     @property
     def densities(self) -> FloatArray:
-        """Squared noise densities (7,): acceleration, rate, both when missing, walks of zeros and drifts."""
+        """Noise densities, shape (7,): acceleration, rate, both if missing, walks of zeros and drifts."""
         white = np.array(
             [self.acceleration_m_s2, self.rate_rad_s, self.missing_acceleration_m_s2, self.missing_rate_rad_s]
         )
@@ -95,7 +96,7 @@ class DelayedFilterSettings:
 
     @property
     def all_densities(self) -> FloatArray:
-        """Densities (2, 2, 7), without and with loss of accelerations and of the rate."""
+        """Noise densities, shape (2, 2, 7), without and with loss of accelerations and of the rate."""
         densities = np.tile(self.densities, (2, 2, 1))
         densities[1, :, 2], densities[:, 1, 3] = self.lost_m_s_rs**2, self.lost_rad_rs**2
         return densities
@@ -105,7 +106,7 @@ class DelayedFilterSettings:
 class StartSigma:
     """Initial standard deviations per axis.
 
-    The accelerometer's zeros may drift by 0.0003 m/s² per °C, so that 2e-5 m/s³ is 4 °C in a minute.
+    The accelerometer's zeros drift by up to 0.0003 m/s² per °C; 2e-5 m/s³ is the drift at 4 °C per minute.
     """
 
     position_m: float = 1.5e-3
@@ -133,11 +134,11 @@ class FilterTrack(PlanarTrack):
     Attributes
     ----------
     zero_m_s2 : ndarray, shape (n, 2)
-        Of the accelerometer.
+        Zeros of the accelerometer.
     zero_rad_s : ndarray, shape (n,)
-        Of the gyro.
+        Zero of the gyro.
     drift_m_s3 : ndarray, shape (n, 2)
-        Of the accelerometer's zeros.
+        Drifts of the accelerometer's zeros.
     sigma : ndarray, shape (n, 10)
         Standard deviations of the states in the order of :data:`STATES`.
     """
@@ -154,11 +155,11 @@ def predict(
     """Return state and covariance after each of some samples, :math:`F P F^T + Q`.
 
     Shapes ``x`` (10,), ``P`` (10, 10) -> (n, 10), (n, 10, 10). ``steps_s`` (n,). ``readings`` (n, 3): accelerations
-    along body x and y, and the rate. ``there`` (n, 3): which of them are believed. One that is not counts as zero
-    acceleration, or as the rate that is given. ``densities`` (7,): of :attr:`DelayedFilterSettings.densities`.
+    along body x and y, and the rate. ``there`` (n, 3): accepted readings; a rejected acceleration counts as zero, a
+    rejected rate as given. ``densities`` (7,): see :attr:`DelayedFilterSettings.densities`.
     """
     h, z, use = np.asarray(steps_s), np.asarray(readings, dtype=np.float64), np.asarray(there, dtype=np.bool_)
-    # The gyro's zero and the drifts stay: headings, zeros, velocities and positions are sums, one after the other.
+    # The gyro's zero and the drifts are constant, so headings, zeros, velocities and positions are cumulative sums.
     states = np.tile(x, (len(h), 1))
     turn, passed = h * (z[:, 2] - x[7]), np.cumsum(h)
     states[:, 4] += np.cumsum(turn)
@@ -199,7 +200,7 @@ def predict(
 
 @dataclass(eq=False)
 class _Taken:
-    """Fix of the history and its outcome."""
+    """Fix in the history and its outcome."""
 
     fix: PlanarFix
     outcome: FixOutcome
@@ -208,36 +209,35 @@ class _Taken:
 class DelayedFilter:
     """Online filter of samples and delayed fixes.
 
-    - A fix of the same exposure as another one is left out (duplicate), and so is one older than ``buffer_s``.
-    - Through a drop-out the covariance grows by the noises of the samples; the gate opens with it.
-    - A rate that the gate of the samples does not believe is held, an acceleration is zero; both get a larger noise,
-      and a still larger one where they are lost.
-    - A gap between samples is not seen here: :meth:`adcs.mockup.navigation.strapdown.ImuRecord.fill_gaps` makes
-      it samples whose readings are missing.
+    - A fix with the exposure of another one is ignored (duplicate), also a fix older than ``buffer_s``.
+    - Without fixes the covariance grows by the noise of the samples, and the gate widens with it.
+    - A rejected rate is replaced by the last accepted one, a rejected acceleration by zero. Both have a larger noise,
+      and a still larger one if readings are lost.
+    - :meth:`adcs.mockup.navigation.strapdown.ImuRecord.fill_gaps` must fill gaps between samples by missing readings.
 
     Parameters
     ----------
     start : PlanarState
-        At ``begin_s``.
+        State at ``begin_s``.
     begin_s : float
-        Where the first samples begin.
+        Beginning of the first sample.
     settings : DelayedFilterSettings
-        Noises and rules.
+        Noise and limits.
     sigma : StartSigma
-        How well the start is known. The zeros and their drifts start at 0.
+        Standard deviations of the start; zeros and drifts start at 0.
 
     Attributes
     ----------
     x, P : ndarray, shape (10,), (10, 10)
-        Estimate and covariance at the last sample; ``state`` is the same without zeros and drifts.
+        Estimate and covariance at the last sample; ``state`` is the estimate without zeros and drifts.
     nis : list of float
-        Normalised innovation squared of every fix that came and could be taken, when it was first taken.
+        Normalised innovation squared of each usable fix at its arrival.
 
     Examples
     --------
     >>> import sims
     >>> from adcs import mockup
-    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), seed=0)
+    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), rng=0)
     >>> method = mockup.DelayedFilter(run.start, run.imu.begin_s)
     >>> len(mockup.fuse(method, run.imu, run.fixes).track)
     500
@@ -254,11 +254,11 @@ class DelayedFilter:
         self.nis: list[float] = []
         self._densities = settings.all_densities
         self._n = 1
-        # Row 0 is where the history begins; the reading of a row is that of the interval which ends there.
+        # Row 0 is the beginning of the history; the reading of a row is that of the interval that ends there.
         self._time_s = np.full(1, float(begin_s))
         self._readings, self._there = np.zeros((1, 3)), np.zeros((1, 3), dtype=np.bool_)
         self._lost = np.zeros((1, 2), dtype=np.bool_)  # accelerations, rate
-        self._read_s = np.full(3, float(begin_s))  # when each reading was last there
+        self._read_s = np.full(3, float(begin_s))  # time of the last accepted reading
         self._x = np.concatenate([start.position_m, start.velocity_m_s, [float(start.heading_rad)], np.zeros(5)])[None]
         self._P = sigma.covariance[None]
         self._history: list[_Taken] = []
@@ -285,12 +285,17 @@ class DelayedFilter:
         Parameters
         ----------
         imu : ImuRecord
-            One run; begins where the last samples ended.
+            Samples of one run, which begin at the end of the last ones.
+
+        Returns
+        -------
+        FilterTrack
+            Estimate at the end of each sample.
 
         Raises
         ------
         ValueError
-            It begins elsewhere.
+            The samples begin elsewhere.
         """
         last, n = self._n - 1, len(imu)
         if imu.begin_s != self._time_s[last]:
@@ -320,7 +325,18 @@ class DelayedFilter:
         return FilterTrack(imu.time_s, position, velocity, heading, zeros, rate_zero, drifts, sigma)
 
     def add_fix(self, fix: PlanarFix) -> FixOutcome:
-        """Update the estimate at the exposure of a fix, and predict again to the present."""
+        """Update the estimate at the exposure of a fix, and predict again to the present.
+
+        Parameters
+        ----------
+        fix : PlanarFix
+            Fix that arrives.
+
+        Returns
+        -------
+        FixOutcome
+            Outcome; later fixes may change it in the history.
+        """
         now = float(self._time_s[self._n - 1])
         if fix.time_s > now:
             return FixOutcome.AHEAD
@@ -367,7 +383,7 @@ class DelayedFilter:
     def _second(self, place: int) -> tuple[FloatArray, FloatArray] | None:
         """Return the second hypothesis, from the last rejected fixes, if it accepts all of them; else None.
 
-        It is run when it is asked for: fixes arrive late, and change the order of those that were rejected.
+        It is computed on demand, because late fixes change the order of the rejected ones.
         """
         first = place - self.settings.reacquire_after + 1
         rejected = self._history[max(first, 0) : place]

@@ -1,8 +1,8 @@
 """Delayed camera fixes, and the order in which samples and fixes arrive.
 
-A fix is stamped with the time of its exposure; it arrives when the image has been processed and sent. Fixes may pass
-one another, come twice, or stay out. The source stamps them on arrival, which is the same only while each exposure
-begins on the arrival of the fix before: one failed frame breaks that.
+The time stamp of a fix is the time of its exposure. A fix arrives when its image has been processed and sent. Fixes may
+overtake each other, arrive twice, or be lost. The source stamps them on arrival, which is equivalent only if each
+exposure begins when the fix before it arrives: one failed frame breaks that.
 """
 
 from __future__ import annotations
@@ -26,12 +26,13 @@ class PlanarFix:
     Attributes
     ----------
     time_s : float
-        Of the exposure.
+        Time of the exposure.
     position_m : ndarray, shape (2,)
+        X and Y, table axes.
     heading_rad : float
-        Counter-clockwise, of any number of turns.
+        Heading, counter-clockwise, of any number of turns.
     sigma : ndarray, shape (3,), optional
-        Standard deviations of X, Y [m] and heading [rad], where they are known.
+        Standard deviations of X, Y [m] and heading [rad], if known.
     """
 
     time_s: float
@@ -47,13 +48,15 @@ class FixRecord:
     Attributes
     ----------
     time_s : ndarray, shape (k,)
-        Of the exposures, in any order.
+        Times of the exposures, in any order.
     arrival_s : ndarray, shape (k,)
-        Not before the exposure.
+        Times of arrival, ascending and not before the exposure.
     position_m : ndarray, shape (k, 2)
+        X and Y, table axes.
     heading_rad : ndarray, shape (k,)
+        Headings, counter-clockwise.
     sigma : ndarray, shape (k, 3), optional
-        Standard deviations of X, Y [m] and heading [rad] of every fix, where they are known.
+        Standard deviations of X, Y [m] and heading [rad] of each fix, if known.
 
     Raises
     ------
@@ -126,14 +129,14 @@ class FixOutcome(enum.Enum):
 
     USED = "used"
     REJECTED = "rejected"
-    """By the gate: it contradicts the estimate."""
+    """The fix contradicts the estimate and fails the gate."""
     REACQUIRED = "reacquired"
-    """It contradicts the estimate but not the fixes before, which were rejected: the estimate was given up."""
+    """The fix agrees with the rejected fixes before it: they replace the estimate."""
     DUPLICATE = "duplicate"
     STALE = "stale"
-    """A later exposure has been used, and the method cannot go back behind it."""
+    """A later exposure has been used, and the method cannot go back before it."""
     TOO_OLD = "too old"
-    """The samples since its exposure are not kept any more."""
+    """The samples since its exposure are no longer in the buffer."""
     AHEAD = "ahead"
     """The samples do not reach its exposure yet."""
     UNUSED = "unused"
@@ -157,9 +160,9 @@ class Fused:
     Attributes
     ----------
     track : PlanarTrack
-        At the end of every sample; a fix that arrives just then counts from the next one on.
+        Estimate at the end of each sample; a fix that arrives just then counts from the next sample on.
     outcomes : tuple of FixOutcome
-        Of every fix, as it arrived.
+        Outcome of each fix, in the order of arrival.
     """
 
     track: PlanarTrack
@@ -175,17 +178,14 @@ _TAKEN = (FixOutcome.USED, FixOutcome.REACQUIRED)
 
 
 def unused_counts(outcomes: Sequence[FixOutcome]) -> dict[str, int]:
-    """Return the number of unused fixes by reason.
-
-    Returns: every reason in words, also where it has none.
-    """
+    """Return the number of unused fixes by reason in words, also for reasons without fixes."""
     return {reason.value: outcomes.count(reason) for reason in FixOutcome if reason not in _TAKEN}
 
 
 def counts_in_words(used: int, unused: Mapping[str, int]) -> str:
     """Return the numbers of fixes by outcome in words: "187 used, 75 too old".
 
-    ``unused``: of :func:`unused_counts`; reasons without fixes are left out.
+    ``unused``: result of :func:`unused_counts`; reasons without fixes are omitted.
     """
     return ", ".join([f"{used} used", *(f"{count} {reason}" for reason, count in unused.items() if count)])
 
@@ -193,27 +193,27 @@ def counts_in_words(used: int, unused: Mapping[str, int]) -> str:
 def fuse(fusion: Fusion, imu: ImuRecord, fixes: FixRecord) -> Fused:
     """Run a fusion method on a record's samples and fixes in the order of their arrival.
 
-    A fix that is faster than the sample of its exposure waits for the end of that sample.
+    A fix that arrives before the sample of its exposure ends waits for that end.
 
     Parameters
     ----------
     fusion : Fusion
-        At ``imu.begin_s``.
+        Fusion method with its state at ``imu.begin_s``.
     imu : ImuRecord
-        Of one run, with one sample at least.
+        Samples of one run, at least one.
     fixes : FixRecord
-        Those that arrive after the last sample are left out.
+        Fixes; those that arrive after the last sample are ignored.
 
     Returns
     -------
     Fused
-        Its track is of the kind that the method returns.
+        Track of the type that the method returns, and the outcome of each fix.
 
     Examples
     --------
     >>> import sims
     >>> from adcs import mockup
-    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), seed=0)
+    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), rng=0)
     >>> method = mockup.DelayedFilter(run.start, run.imu.begin_s)
     >>> fused = mockup.fuse(method, run.imu, run.fixes)
     >>> fused.track.position_m.shape

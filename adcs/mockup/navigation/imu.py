@@ -1,7 +1,7 @@
-r"""Gyro and inclinometer of the mock-up; the latter serves as accelerometer.
+r"""Gyro and inclinometer of the mock-up; the inclinometer serves as accelerometer.
 
-A reading is the true value plus a zero that is linear in temperature, plus noise; beyond the range there is none (NaN).
-An inclinometer that is mounted with a tilt also reads g·sin(tilt), which nothing tells from a zero.
+A reading is the true value plus a zero that is linear in temperature, plus noise; it is NaN beyond the range. A tilted
+inclinometer also reads g·sin(tilt), which cannot be distinguished from a zero.
 """
 
 from __future__ import annotations
@@ -17,21 +17,17 @@ from arrays.typing import FloatArray
 G_M_S2 = 9.80665
 
 
-def _zero_vector() -> FloatArray:
-    return np.zeros(2)
-
-
 @dataclass(frozen=True)
 class RateGyro:
     """Gyro ADIS16100: ±300 °/s, noise 0.1 °/s, a zero that is linear in temperature, -40 to 85 °C."""
 
-    sigma_rad_s: float = math.radians(0.1)  # noise of a sample
+    sigma_rad_s: float = math.radians(0.1)  # standard deviation of a sample
     range_rad_s: float = math.radians(300.0)
     zero_rad_s: float = 0.0  # at ``reference_C``
     zero_slope_rad_s_K: float = 0.0  # the source does not state it
     reference_C: float = 20.0
-    lowest_C: float = -40.0  # temperatures that it works at
-    highest_C: float = 85.0  # temperatures that it works at
+    lowest_C: float = -40.0  # lowest operating temperature
+    highest_C: float = 85.0  # highest operating temperature
 
     def __post_init__(self) -> None:
         _check_noise_and_range(self.sigma_rad_s, self.range_rad_s)
@@ -54,14 +50,16 @@ class Inclinometer:
     Range ±0.26 g, noise 0.002 m/s², ±0.0003 m/s² per °C, -40 to 125 °C.
     """
 
-    sigma_m_s2: float = 0.002  # noise of a sample, each axis
-    range_m_s2: float = 0.26 * G_M_S2  # of each axis
-    zero_m_s2: FloatArray = field(default_factory=_zero_vector)  # (2,): at ``reference_C``
-    zero_slope_m_s2_K: FloatArray = field(default_factory=_zero_vector)  # (2,): 0.0003 at most
-    tilt_rad: FloatArray = field(default_factory=_zero_vector)  # (2,): of the axes x and y above the horizontal
+    sigma_m_s2: float = 0.002  # standard deviation of a sample, each axis
+    range_m_s2: float = 0.26 * G_M_S2  # largest reading of each axis
+    zero_m_s2: FloatArray = field(default_factory=lambda: np.zeros(2))  # (2,): at ``reference_C``
+    zero_slope_m_s2_K: FloatArray = field(default_factory=lambda: np.zeros(2))  # (2,): at most 0.0003
+    tilt_rad: FloatArray = field(
+        default_factory=lambda: np.zeros(2)
+    )  # (2,): tilt of the axes x and y above the horizontal
     reference_C: float = 20.0
-    lowest_C: float = -40.0  # temperatures that it works at
-    highest_C: float = 125.0  # temperatures that it works at
+    lowest_C: float = -40.0  # lowest operating temperature
+    highest_C: float = 125.0  # highest operating temperature
 
     def __post_init__(self) -> None:
         _check_noise_and_range(self.sigma_m_s2, self.range_m_s2)

@@ -15,10 +15,10 @@ from adcs.mockup.navigation.fixes import FixRecord
 from adcs.mockup.navigation.strapdown import ImuRecord, wrapped
 from arrays.typing import FloatArray
 
-_HALF_WINDOW_S = 0.25  # of the rate at an exposure
+_HALF_WINDOW_S = 0.25  # half of the time over which the rate at an exposure is a mean
 _GRID_S = 0.02
-_FALSE_ALARM = 1e-6  # how often a constant rate passes for one that changes
-_LARGEST_SIGMA = 0.1  # of the range that is searched
+_FALSE_ALARM = 1e-6  # probability that a constant rate counts as a changing one
+_LARGEST_SIGMA = 0.1  # largest standard deviation over the range that is searched
 
 
 @dataclass(frozen=True)
@@ -28,15 +28,17 @@ class LatencyEstimate:
     Attributes
     ----------
     latency_s : float
-        NaN where it is not observable.
+        Time stamp minus exposure; NaN if it is not observable.
     sigma_s : float
-        Its standard deviation, infinite where it is not observable.
+        Standard deviation of the latency; infinite if it is not observable.
     gyro_zero_rad_s : float
-        b, NaN likewise.
+        Zero of the gyro; NaN if the latency is not observable.
+    observable : bool
+        Whether the record determines the latency.
     reason : str
-        Why not; empty where it is.
+        Reason for which the latency is not observable; empty if it is.
     used : int
-        Differences of fixes that it rests on.
+        Number of the differences of fixes in use.
     """
 
     latency_s: float
@@ -61,27 +63,32 @@ def camera_latency(
     Parameters
     ----------
     imu : ImuRecord
-        One run, all readings there.
+        Samples of one run without missing readings.
     fixes : FixRecord
-        Those whose exposures may be outside of the record are left out.
+        Fixes; those whose exposures may be outside of the record are ignored.
     lowest_s, highest_s : float
-        Range that is searched.
+        Range of latencies that is searched.
     gyro_sigma_rad_s : float
-        Noise of a sample.
+        Standard deviation of a sample of the gyro.
     heading_sigma_rad : float
-        Noise of a fix's heading.
+        Standard deviation of a fix's heading.
+
+    Returns
+    -------
+    LatencyEstimate
+        Latency with its standard deviation, or the reason for which it is not observable.
 
     Raises
     ------
     ValueError
-        The range is empty, a noise is not positive, or there are missing readings.
+        The range is empty, a noise is not positive, or readings are missing.
 
     Examples
     --------
     >>> import sims
     >>> from adcs import mockup
     >>> camera = sims.CameraErrors(latency_s=0.1)
-    >>> run = sims.table_run(sims.TableScenario(duration_s=60.0, camera=camera), seed=0)
+    >>> run = sims.table_run(sims.TableScenario(duration_s=60.0, camera=camera), rng=0)
     >>> round(mockup.camera_latency(run.imu, run.fixes).latency_s, 1)
     0.1
     """
@@ -94,7 +101,8 @@ def camera_latency(
         )
     if not np.isfinite(imu.rate_rad_s).all():
         raise ValueError(
-            "Input imu must have all rates; instead received missing ones: see adcs.mockup.navigation.strapdown.hold."
+            "Input imu must have all rates; instead received missing ones. Fill them by "
+            "adcs.mockup.navigation.strapdown.hold."
         )
     edges = np.concatenate([[imu.begin_s], imu.time_s])
     angle = np.concatenate([[0.0], np.cumsum(imu.rate_rad_s * imu.steps_s)])
@@ -123,7 +131,7 @@ def camera_latency(
         return -float(np.median(residuals(latency_s) / step_s))
 
     def misfit(latency_s: float) -> float:
-        # Between two values of the grid a residual may be this far from zero; one false fix counts no more than 25.
+        # Half a step of the grid changes a residual by this much; one false fix counts at most 25.
         allowed = variance + (0.5 * _GRID_S * np.diff(rates(latency_s))) ** 2
         r = residuals(latency_s) + zero_at(latency_s) * step_s
         return float(np.minimum(r**2 / allowed, 25.0).sum())
@@ -137,7 +145,7 @@ def camera_latency(
         r = residuals(latency_s) + zero * step_s
         by_latency = np.diff(rates(latency_s))
         used = np.flatnonzero(r**2 <= 25.0 * (variance + (slack_s * by_latency) ** 2))
-        # ∂r/∂L and ∂r/∂b; what is left out leaves a tridiagonal covariance.
+        # ∂r/∂L and ∂r/∂b; neighbouring differences share a fix, so that their covariance is tridiagonal.
         J = np.stack([by_latency, step_s], axis=1)[used]
         band = np.zeros((2, used.size))
         band[1] = variance[used]

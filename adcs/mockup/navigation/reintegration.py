@@ -18,19 +18,25 @@ VelocityRule = Callable[[PlanarFix, PlanarFix, ImuRecord], FloatArray]
 
 
 def finite_difference(first: PlanarFix, second: PlanarFix, imu: ImuRecord) -> FloatArray:
-    """Return the source's velocity, (p₂ - p₁)/(t₂ - t₁), which holds midway between both fixes.
+    """Return the source's velocity, (p₂ - p₁)/(t₂ - t₁), which is the velocity midway between both fixes.
 
     Parameters
     ----------
     first, second : PlanarFix
+        Consecutive fixes.
     imu : ImuRecord
-        Samples between both.
+        Samples between both fixes; not used.
+
+    Returns
+    -------
+    ndarray, shape (2,)
+        Velocity, table axes [m/s].
 
     Examples
     --------
     >>> import sims
     >>> from adcs import mockup
-    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), seed=0)
+    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), rng=0)
     >>> first, second = run.fixes[0], run.fixes[1]
     >>> imu = run.imu.between(first.time_s, second.time_s)
     >>> mockup.finite_difference(first, second, imu).shape
@@ -42,19 +48,25 @@ def finite_difference(first: PlanarFix, second: PlanarFix, imu: ImuRecord) -> Fl
 def corrected_velocity(first: PlanarFix, second: PlanarFix, imu: ImuRecord) -> FloatArray:
     r"""Return the velocity at the second exposure, :math:`(p_2 - p_1 - Δp_{imu})/(t_2 - t_1) + Δv_{imu}`.
 
-    Δp and Δv are what the samples make of rest at the first fix's heading.
+    Δp and Δv are the integrals of the samples from rest at the first fix's heading.
 
     Parameters
     ----------
     first, second : PlanarFix
+        Consecutive fixes.
     imu : ImuRecord
-        Samples between both.
+        Samples between both fixes.
+
+    Returns
+    -------
+    ndarray, shape (2,)
+        Velocity, table axes [m/s].
 
     Examples
     --------
     >>> import sims
     >>> from adcs import mockup
-    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), seed=0)
+    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), rng=0)
     >>> first, second = run.fixes[0], run.fixes[1]
     >>> imu = run.imu.between(first.time_s, second.time_s)
     >>> mockup.corrected_velocity(first, second, imu).shape
@@ -66,27 +78,27 @@ def corrected_velocity(first: PlanarFix, second: PlanarFix, imu: ImuRecord) -> F
 
 
 class Reintegration:
-    """Fusion by integrating again from the exposure of each fix.
+    """Fusion that integrates again from the exposure of each fix.
 
-    - The first fix, and one after a drop-out of more than ``longest_gap_s``, has no other one to tell the velocity: it
-      stays what the estimate has at the exposure.
-    - A fix of an exposure before the last one used is left out (stale), and so is one of the same exposure (duplicate).
-    - Samples are kept for ``buffer_s`` at most: a fix after a longer drop-out is used if it is younger than that.
+    - The first fix, and a fix after a gap longer than ``longest_gap_s``, keeps the velocity of the estimate at its
+      exposure.
+    - A fix with an exposure before the last used one is ignored (stale), also one with the same exposure (duplicate).
+    - The buffer of samples is ``buffer_s`` long; a fix older than that is ignored.
 
     Parameters
     ----------
     start : PlanarState
-        At ``begin_s``.
+        State at ``begin_s``.
     begin_s : float
-        Where the first samples begin.
+        Beginning of the first sample.
     velocity : callable
         :func:`finite_difference` as in the source, or :func:`corrected_velocity`.
     gate : Gate
-        Of the samples.
+        Limits of the samples.
     longest_gap_s : float
-        Between two fixes that tell a velocity; the source's slowest fix is 2.7 s late.
+        Longest time between two fixes that determine a velocity; the source's slowest fix is 2.7 s late.
     buffer_s : float
-        How long samples are kept.
+        Length of the buffer of samples.
 
     Attributes
     ----------
@@ -97,7 +109,7 @@ class Reintegration:
     --------
     >>> import sims
     >>> from adcs import mockup
-    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), seed=0)
+    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), rng=0)
     >>> method = mockup.Reintegration(run.start, run.imu.begin_s)
     >>> len(mockup.fuse(method, run.imu, run.fixes).track)
     500
@@ -127,12 +139,17 @@ class Reintegration:
         Parameters
         ----------
         imu : ImuRecord
-            One run; begins where the last samples ended.
+            Samples of one run, which begin at the end of the last ones.
+
+        Returns
+        -------
+        PlanarTrack
+            Estimate at the end of each sample.
 
         Raises
         ------
         ValueError
-            It begins elsewhere.
+            The samples begin elsewhere.
         """
         believed = hold(imu, self._gate.accept(imu), self._rate_rad_s)
         samples = self._samples.concatenate(believed)
@@ -146,10 +163,15 @@ class Reintegration:
     def add_fix(self, fix: PlanarFix) -> FixOutcome:
         """Set the state at the exposure to a fix, and integrate again from there.
 
+        Parameters
+        ----------
+        fix : PlanarFix
+            Fix with an exposure before the last sample.
+
         Returns
         -------
         FixOutcome
-            The state has changed only where it is USED.
+            The state has changed only if it is USED.
         """
         if fix.time_s > self._samples.end_s:
             return FixOutcome.AHEAD
@@ -180,18 +202,18 @@ class Reintegration:
 
 
 class CameraOnly:
-    """Last arrived fix, held constant, with the velocity between the last two fixes; late by its age.
+    """Estimate from the last fix alone, held constant, with the velocity between the last two fixes.
 
     Parameters
     ----------
     start : PlanarState
-        Until the first fix.
+        State until the first fix.
 
     Examples
     --------
     >>> import sims
     >>> from adcs import mockup
-    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), seed=0)
+    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), rng=0)
     >>> method = mockup.CameraOnly(run.start)
     >>> len(mockup.fuse(method, run.imu, run.fixes).track)
     500
@@ -202,13 +224,35 @@ class CameraOnly:
         self._last: PlanarFix | None = None
 
     def add_samples(self, imu: ImuRecord) -> PlanarTrack:
-        """Hold the state, whatever the samples."""
+        """Hold the state, whatever the samples.
+
+        Parameters
+        ----------
+        imu : ImuRecord
+            Samples, of which only the times count.
+
+        Returns
+        -------
+        PlanarTrack
+            The same state at each sample.
+        """
         n, state = len(imu), self.state
         position, velocity = np.tile(state.position_m, (n, 1)), np.tile(state.velocity_m_s, (n, 1))
         return PlanarTrack(imu.time_s, position, velocity, np.full(n, state.heading_rad))
 
     def add_fix(self, fix: PlanarFix) -> FixOutcome:
-        """Replace the state by a fix, unless it is older than the last one."""
+        """Replace the state by a fix, unless it is older than the last one.
+
+        Parameters
+        ----------
+        fix : PlanarFix
+            Fix that arrives.
+
+        Returns
+        -------
+        FixOutcome
+            USED, STALE or DUPLICATE.
+        """
         velocity = self.state.velocity_m_s
         if self._last is not None:
             if fix.time_s <= self._last.time_s:
@@ -221,20 +265,20 @@ class CameraOnly:
 
 
 class ImuOnly:
-    """Integration of the samples alone; fixes are left out.
+    """Estimate from the samples alone; fixes are ignored.
 
     Parameters
     ----------
     start : PlanarState
-        At the first sample.
+        State at the beginning of the first sample.
     gate : Gate
-        Of the samples.
+        Limits of the samples.
 
     Examples
     --------
     >>> import sims
     >>> from adcs import mockup
-    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), seed=0)
+    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), rng=0)
     >>> method = mockup.ImuOnly(run.start)
     >>> len(mockup.fuse(method, run.imu, run.fixes).track)
     500
@@ -246,7 +290,18 @@ class ImuOnly:
         self._rate_rad_s = 0.0
 
     def add_samples(self, imu: ImuRecord) -> PlanarTrack:
-        """Integrate some samples."""
+        """Integrate some samples.
+
+        Parameters
+        ----------
+        imu : ImuRecord
+            Samples of one run.
+
+        Returns
+        -------
+        PlanarTrack
+            Estimate at the end of each sample.
+        """
         believed = hold(imu, self._gate.accept(imu), self._rate_rad_s)
         track = strapdown(believed, self.state)
         if len(imu):
@@ -254,5 +309,16 @@ class ImuOnly:
         return track
 
     def add_fix(self, fix: PlanarFix) -> FixOutcome:
-        """Ignore a fix."""
+        """Ignore a fix.
+
+        Parameters
+        ----------
+        fix : PlanarFix
+            Fix that arrives.
+
+        Returns
+        -------
+        FixOutcome
+            UNUSED.
+        """
         return FixOutcome.UNUSED

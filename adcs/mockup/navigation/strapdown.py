@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from arrays.typing import BoolArray, FloatArray
 
 GAP_STEPS = 5.0
-"""A longer interval, in medians of a record's intervals, is a gap: nobody takes a mean over it."""
+"""Length of a gap in median intervals of a record: longer intervals are gaps."""
 
 
 def rotate(heading_rad: ArrayLike, vector_body: ArrayLike) -> FloatArray:
@@ -34,6 +34,12 @@ def wrapped(angle_rad: ArrayLike) -> FloatArray:
     Parameters
     ----------
     angle_rad : array_like, any shape
+        Angle of any number of turns.
+
+    Returns
+    -------
+    ndarray, same shape
+        The same angle within half a turn of zero [rad].
 
     Examples
     --------
@@ -46,16 +52,16 @@ def wrapped(angle_rad: ArrayLike) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class ImuRecord:
-    """Samples of the IMU in body axes, of one run or, with leading axes, of several that share their time stamps.
+    """Samples of the IMU in body axes, of one run or, with leading axes, of several with the same time stamps.
 
     Attributes
     ----------
     begin_s : float
-        When the interval of the first sample begins.
+        Beginning of the first sample's interval.
     time_s : ndarray, shape (n,)
-        When the interval of each sample ends; n may be 0.
+        End of each sample's interval; n may be 0.
     acceleration_m_s2 : ndarray, shape (..., n, 2)
-        Along body x and y, NaN where missing.
+        Acceleration along body x and y, NaN where missing.
     rate_rad_s : ndarray, shape (..., n)
         Rate of the heading, NaN where missing.
 
@@ -107,15 +113,15 @@ class ImuRecord:
 
     @property
     def usual_step_s(self) -> float:
-        """Median length of the intervals; the record has one at least."""
+        """Median length of the intervals of a record with samples."""
         return float(np.median(self.steps_s))
 
     @property
     def gaps_s(self) -> FloatArray:
-        """Gaps (k, 2): from the last sample before to the interval of the next one.
+        """Begin and end of the gaps, shape (k, 2): from the last sample to the interval of the next one.
 
-        An interval is a gap where it is longer than :data:`GAP_STEPS` median ones. The sample that ends it is the mean
-        over one median interval.
+        A gap is longer than :data:`GAP_STEPS` median intervals. The sample after it is the mean over one median
+        interval.
         """
         if not len(self):
             return np.empty((0, 2))
@@ -124,7 +130,7 @@ class ImuRecord:
         return np.stack([self.time_s[long] - steps_s[long], self.time_s[long] - usual_s], axis=1)
 
     def fill_gaps(self) -> ImuRecord:
-        """Fill gaps by samples with missing readings, so that steps are short there too."""
+        """Fill gaps by samples with missing readings, so that all steps are short."""
         gaps = self.gaps_s
         if not len(gaps):
             return self
@@ -139,17 +145,17 @@ class ImuRecord:
         )
 
     def between(self, first_s: float, last_s: float) -> ImuRecord:
-        """Return the samples between two instants; the intervals at both ends are cut.
+        """Return the samples between two instants, with the first and the last interval shortened.
 
         Returns
         -------
         ImuRecord
-            Ends at ``last_s``; without a sample where both are the same.
+            Record that ends at ``last_s``; without samples if both instants are the same.
 
         Raises
         ------
         ValueError
-            The record does not cover all of it.
+            The record does not cover that time.
         """
         if not self.begin_s <= first_s <= last_s <= self.end_s:
             raise ValueError(
@@ -176,7 +182,7 @@ class ImuRecord:
         Raises
         ------
         ValueError
-            The later one does not begin there.
+            The later record begins elsewhere.
         """
         if later.begin_s != self.end_s:
             raise ValueError(
@@ -206,9 +212,9 @@ class PlanarState:
     Attributes
     ----------
     position_m, velocity_m_s : ndarray, shape (..., 2)
-        In table axes.
+        Position and velocity, table axes.
     heading_rad : ndarray or float, shape (...)
-        Counter-clockwise; counts full turns.
+        Heading, counter-clockwise; counts full turns.
     """
 
     position_m: FloatArray
@@ -230,8 +236,11 @@ class PlanarTrack:
     Attributes
     ----------
     time_s : ndarray, shape (n,)
+        Times of the states.
     position_m, velocity_m_s : ndarray, shape (..., n, 2)
+        Position and velocity, table axes.
     heading_rad : ndarray, shape (..., n)
+        Heading, counter-clockwise; counts full turns.
     """
 
     time_s: FloatArray
@@ -271,9 +280,9 @@ class Gate:
     Attributes
     ----------
     acceleration_m_s2 : float
-        Of each axis, its zero taken off.
+        Limit of each axis after subtraction of its zero.
     rate_rad_s : float
-        The source has 50 °/s, which the firings of its own figure 14 exceed.
+        Limit of the rate. The source states 50 °/s, which the firings in its own figure 14 exceed.
 
     Raises
     ------
@@ -290,16 +299,16 @@ class Gate:
                 raise ValueError(f"Input {name} must be positive; instead received {value}.")
 
     def accept(self, imu: ImuRecord) -> BoolArray:
-        """Return whether x, y and rate of each sample are accepted, (..., n, 3); missing ones are not."""
+        """Return whether x, y and rate of each sample are accepted, (..., n, 3); missing readings are not."""
         limits = np.array([self.acceleration_m_s2, self.acceleration_m_s2, self.rate_rad_s])
         return np.abs(np.concatenate([imu.acceleration_m_s2, imu.rate_rad_s[..., None]], axis=-1)) <= limits
 
 
 def hold(imu: ImuRecord, accepted: BoolArray, held_rate_rad_s: ArrayLike = 0.0) -> ImuRecord:
-    """Replace rejected readings: velocity and rate are held.
+    """Replace rejected accelerations by zero, and rejected rates by the last accepted one.
 
-    ``accepted`` (..., n, 3): of :meth:`Gate.accept`. ``held_rate_rad_s`` (...): the last believed rate before the
-    record. Returns: such an acceleration is zero, such a rate the last believed one.
+    ``accepted`` (..., n, 3): result of :meth:`Gate.accept`. ``held_rate_rad_s`` (...): last accepted rate before the
+    record.
     """
     rows = np.where(accepted[..., 2], np.arange(len(imu)), -1)
     last = np.maximum.accumulate(rows, axis=-1)
@@ -319,11 +328,8 @@ def step(state: PlanarState, step_s: float, acceleration_m_s2: ArrayLike, rate_r
         a = R(φ_{i-1} + ωΔ/2)\,a_{body}, \quad X_i = X_{i-1} + v_{i-1}Δ + aΔ^2/2, \quad v_i = v_{i-1} + aΔ, \quad
         φ_i = φ_{i-1} + ωΔ
 
-    Shapes ``acceleration_m_s2`` (..., 2), ``rate_rad_s`` (...). ``step_s``: Δ.
-
-    Notes
-    -----
-    The position takes the old velocity, which the source's section on least squares confirms.
+    Shapes ``acceleration_m_s2`` (..., 2), ``rate_rad_s`` (...). ``step_s``: Δ. The position uses the old velocity, as
+    in the source's section on least squares.
     """
     angle = np.asarray(rate_rad_s, dtype=np.float64) * step_s
     a = rotate(state.heading_rad + 0.5 * angle, acceleration_m_s2)
@@ -335,20 +341,25 @@ def step(state: PlanarState, step_s: float, acceleration_m_s2: ArrayLike, rate_r
 
 
 def strapdown(imu: ImuRecord, start: PlanarState) -> PlanarTrack:
-    """Integrate a whole record; the states after each sample by :func:`step`, in cumulative sums.
+    """Integrate a whole record by :func:`step`, in cumulative sums.
 
     Parameters
     ----------
     imu : ImuRecord
-        All readings there, zeros taken off: see :func:`hold`. NaN stays NaN from there on.
+        Samples without zeros and without missing readings (:func:`hold`); all states after a NaN are NaN.
     start : PlanarState
-        At ``imu.begin_s``.
+        State at ``imu.begin_s``.
+
+    Returns
+    -------
+    PlanarTrack
+        States after each sample.
 
     Examples
     --------
     >>> import sims
     >>> from adcs import mockup
-    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), seed=0)
+    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), rng=0)
     >>> mockup.strapdown(run.imu, run.start).position_m.shape
     (500, 2)
     """

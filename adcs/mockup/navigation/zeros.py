@@ -1,7 +1,7 @@
-"""Zeros of the accelerometer in closed form, from its integral and the camera over a run.
+"""Zeros of the accelerometer in closed form, from the integral of its readings and the camera over a run.
 
-See docs/theory/tabletop-navigation.md. Source: Bindel et al., the section on least squares (its minus sign is lost in
-print); complex numbers, the start and the courses are ours.
+See docs/theory/tabletop-navigation.md. Source: Bindel et al., section on least squares (a minus sign is missing in
+print). Ours: complex numbers, the fitted start, and further courses of the zeros.
 """
 
 from __future__ import annotations
@@ -13,18 +13,18 @@ from numpy.typing import ArrayLike
 
 from adcs.mockup.navigation.fixes import FixRecord
 from adcs.mockup.navigation.strapdown import ImuRecord, PlanarState, wrapped
+from adcs.mockup.vision.similarity import complex_points, pairs_of
 from arrays.typing import ComplexArray, FloatArray
 
 SIGMA_M = 1e-3
-"""Noise of the camera's fixes, each axis."""
+"""Standard deviation of the camera's fixes, each axis."""
 
 
 def double_integral(begin_s: float, time_s: ArrayLike, values: ArrayLike, at_s: ArrayLike) -> ComplexArray:
     r"""Integrate twice from rest, :math:`\sum_j u_j Δ_j (t - \tfrac12(t_j + t_{j-1}))`, in O(n).
 
-    ``begin_s``: where the first interval begins. ``time_s`` (n,): where each interval ends. ``values`` (..., n):
-    constant over each interval. ``at_s`` (k,): within the record; where it is within an interval, that one counts up to
-    it. Returns shape (..., k).
+    ``begin_s``: beginning of the first interval. ``time_s`` (n,): end of each interval. ``values`` (..., n): constant
+    over each interval. ``at_s`` (k,): times within the record; the last interval counts up to them. Returns (..., k).
     """
     t = np.asarray(time_s, dtype=np.float64) - begin_s
     u = np.asarray(values, dtype=np.complex128)
@@ -44,21 +44,21 @@ def double_integral(begin_s: float, time_s: ArrayLike, values: ArrayLike, at_s: 
 
 
 def heading_from_fixes(imu: ImuRecord, fixes: FixRecord) -> tuple[FloatArray, float]:
-    """Return the heading midway in each interval, by the gyro, with start and zero fitted to the camera.
+    """Return the heading of the gyro midway in each interval, with start and zero fitted to the camera.
 
     Parameters
     ----------
     imu : ImuRecord
-        One run, all readings there.
+        Samples of one run without missing readings.
     fixes : FixRecord
-        Two at least, with exposures within the record.
+        At least two fixes with exposures within the record.
 
     Returns
     -------
-    ndarray, shape (n,)
-        Counter-clockwise [rad].
-    float
-        Zero of the gyro [rad/s].
+    heading_rad : ndarray, shape (n,)
+        Heading, counter-clockwise.
+    zero_rad_s : float
+        Zero of the gyro.
 
     Raises
     ------
@@ -69,7 +69,7 @@ def heading_from_fixes(imu: ImuRecord, fixes: FixRecord) -> tuple[FloatArray, fl
     --------
     >>> import sims
     >>> from adcs import mockup
-    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), seed=0)
+    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), rng=0)
     >>> heading_rad, zero_rad_s = mockup.heading_from_fixes(run.imu, run.fixes)
     >>> heading_rad.shape
     (500,)
@@ -81,7 +81,7 @@ def heading_from_fixes(imu: ImuRecord, fixes: FixRecord) -> tuple[FloatArray, fl
     edges = np.concatenate([[imu.begin_s], imu.time_s])
     t = fixes.time_s - imu.begin_s
     misfit = fixes.heading_rad - np.interp(fixes.time_s, edges, np.concatenate([[0.0], turned_by]))
-    # Against the first one, so that a misfit near half a turn is not torn apart.
+    # Relative to the first one, so that misfits near half a turn do not jump by a turn.
     misfit = misfit[0] + wrapped(misfit - misfit[0])
     zero, start = np.linalg.lstsq(np.stack([-t, np.ones(t.size)], axis=1), misfit, rcond=None)[0]
     middle: FloatArray = start + turned_by - 0.5 * angle - zero * (imu.time_s - 0.5 * imu.steps_s - imu.begin_s)
@@ -95,11 +95,11 @@ class ZeroProblem:
     Attributes
     ----------
     time_s : ndarray, shape (k,)
-        Since the beginning of the record.
+        Times since the beginning of the record.
     moved : ndarray of complex, shape (k,)
-        D[a e^{iφ}] of the readings [m].
+        Double integral D[a e^{iφ}] of the readings [m].
     by_zero : ndarray of complex, shape (m, k)
-        D[s e^{iφ}] for each course s of a zero [s²]; the first one is constant.
+        Double integral D[s e^{iφ}] for each course s of a zero [s²]; the first course is constant.
     measured : ndarray of complex, shape (k,)
         Positions of the fixes [m].
 
@@ -107,7 +107,7 @@ class ZeroProblem:
     --------
     >>> import sims
     >>> from adcs import mockup
-    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), seed=0)
+    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), rng=0)
     >>> heading_rad, _ = mockup.heading_from_fixes(run.imu, run.fixes)
     >>> problem = mockup.zero_problem(run.imu, heading_rad, run.fixes)
     >>> len(problem.time_s) == len(run.fixes)
@@ -128,24 +128,29 @@ def zero_problem(
     Parameters
     ----------
     imu : ImuRecord
-        One run, all readings there.
+        Samples of one run without missing readings.
     heading_rad : array_like, shape (n,)
-        In the middle of every interval: of :func:`heading_from_fixes`, or from a filter.
+        Heading in the middle of each interval, from :func:`heading_from_fixes` or a filter.
     fixes : FixRecord
-        With exposures within the record.
+        Fixes with exposures within the record.
     courses : array_like, shape (m, n), optional
-        What further zeros go along with, such as the time or the temperature less that at the beginning.
+        Courses of further zeros, such as the time or the temperature since the beginning.
+
+    Returns
+    -------
+    ZeroProblem
+        Input of :func:`zeros_and_start`.
 
     Raises
     ------
     ValueError
-        The shapes do not match, there are missing readings, or an exposure is outside of the record.
+        The shapes do not match, readings are missing, or an exposure is outside of the record.
 
     Examples
     --------
     >>> import sims
     >>> from adcs import mockup
-    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), seed=0)
+    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), rng=0)
     >>> heading_rad, _ = mockup.heading_from_fixes(run.imu, run.fixes)
     >>> problem = mockup.zero_problem(run.imu, heading_rad, run.fixes)
     >>> len(problem.time_s) == len(run.fixes)
@@ -160,13 +165,13 @@ def zero_problem(
         raise ValueError(f"Input courses must have shape (m, {n}); instead received {further.shape}.")
     if not np.isfinite(imu.acceleration_m_s2).all():
         raise ValueError(
-            "Input imu must have all readings; instead received missing ones: see"
-            " adcs.mockup.navigation.strapdown.hold."
+            "Input imu must have all readings; instead received missing ones. Fill them by "
+            "adcs.mockup.navigation.strapdown.hold."
         )
     turn = np.exp(1j * heading)
-    values = np.concatenate([[_complex(imu.acceleration_m_s2) * turn, turn], further * turn])
+    values = np.concatenate([[complex_points(imu.acceleration_m_s2) * turn, turn], further * turn])
     integrals = double_integral(imu.begin_s, imu.time_s, values, fixes.time_s)
-    return ZeroProblem(fixes.time_s - imu.begin_s, integrals[0], integrals[1:], _complex(fixes.position_m))
+    return ZeroProblem(fixes.time_s - imu.begin_s, integrals[0], integrals[1:], complex_points(fixes.position_m))
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,11 +181,11 @@ class ZeroFit:
     Attributes
     ----------
     zeros : ndarray, shape (m, 2)
-        Along body x and y: the constant ones [m/s²], and those along each course [m/s² per its unit].
+        Zeros along body x and y: the constant ones [m/s²], then those of each course [m/s² per its unit].
     start_position_m, start_velocity_m_s : ndarray, shape (2,)
-        At the beginning of the record.
+        State at the beginning of the record, table axes.
     covariance : ndarray
-        Of what was fitted, two rows each: the zeros, and where fitted, the position and the velocity.
+        Covariance of the zeros and, if fitted, of position and velocity, two rows each.
     residual_rms_m : float
         Distance between integrated position and fix, rms.
     """
@@ -210,9 +215,9 @@ class ZeroFit:
 def constant_zeros_after(problem: ZeroProblem, first: int = 4, sigma_m: float = SIGMA_M) -> ZeroFit:
     """Fit two zeros in closed form, with the start of a straight line through the first fixes.
 
-    The line is that of the fixes less what the samples moved by up to each, which depends on the zeros.
-    ``problem``: without further courses. ``first``: fixes that the line goes through; two as in the source, whose
-    velocity then has √2 times the noise of a fix over one period. ``sigma_m``: noise of a fix, each axis, for the
+    The line fits the fixes minus the motion by the samples, which depends on the zeros.
+    ``problem``: problem without further courses. ``first``: number of fixes on the line; two as in the source, where
+    the velocity has √2 times the noise of a fix over one period. ``sigma_m``: noise of a fix, each axis, for the
     covariance.
     """
     if len(problem.by_zero) != 1:
@@ -222,7 +227,7 @@ def constant_zeros_after(problem: ZeroProblem, first: int = 4, sigma_m: float = 
         raise ValueError(f"Input first must be 2 or more and less than the {t.size} fixes; instead received {first}.")
     middle = t[:first].mean()
     weight = (t[:first] - middle) / np.sum((t[:first] - middle) ** 2)
-    line = 1.0 / first + np.outer(t - middle, weight)  # what each of the first fixes does to the line at each instant
+    line = 1.0 / first + np.outer(t - middle, weight)  # derivative of the line at each instant by the first fixes
     rest = problem.measured - problem.moved
     g, y = turn - line @ turn[:first], rest - line @ rest[:first]
     a11 = float(np.sum(np.abs(g) ** 2))
@@ -233,7 +238,11 @@ def constant_zeros_after(problem: ZeroProblem, first: int = 4, sigma_m: float = 
     by_fix[:first] -= g.conj() @ line
     variance = sigma_m**2 * float(np.sum(np.abs(by_fix) ** 2)) / a11**2
     return ZeroFit(
-        _real([zeta]), _real(start.mean() - v0 * middle), _real(v0), variance * np.eye(2), _rms(y + zeta * g)
+        pairs_of(zeta[None]),
+        pairs_of(start.mean() - v0 * middle),
+        pairs_of(v0),
+        variance * np.eye(2),
+        _rms(y + zeta * g),
     )
 
 
@@ -243,9 +252,14 @@ def zeros_and_start(problem: ZeroProblem, sigma_m: float = SIGMA_M) -> ZeroFit:
     Parameters
     ----------
     problem : ZeroProblem
-        Of :func:`zero_problem`.
+        Result of :func:`zero_problem`.
     sigma_m : float
-        Noise of a fix, each axis, for the covariance.
+        Standard deviation of a fix, each axis, for the covariance.
+
+    Returns
+    -------
+    ZeroFit
+        Zeros, start position and start velocity with their covariance.
 
     Raises
     ------
@@ -256,7 +270,7 @@ def zeros_and_start(problem: ZeroProblem, sigma_m: float = SIGMA_M) -> ZeroFit:
     --------
     >>> import sims
     >>> from adcs import mockup
-    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), seed=0)
+    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), rng=0)
     >>> heading_rad, _ = mockup.heading_from_fixes(run.imu, run.fixes)
     >>> problem = mockup.zero_problem(run.imu, heading_rad, run.fixes)
     >>> mockup.zeros_and_start(problem).zero_m_s2.shape
@@ -275,16 +289,7 @@ def zeros_and_start(problem: ZeroProblem, sigma_m: float = SIGMA_M) -> ZeroFit:
     residual = problem.moved + A @ unknown - problem.measured
     inverse = np.linalg.inv(r) / size[:, None]
     covariance = _real_covariance(sigma_m**2 * (inverse @ inverse.conj().T))
-    return ZeroFit(_real(unknown[:m]), _real(unknown[m]), _real(unknown[m + 1]), covariance, _rms(residual))
-
-
-def _complex(vector: FloatArray) -> ComplexArray:
-    return np.asarray(vector[..., 0] + 1j * vector[..., 1])
-
-
-def _real(value: ArrayLike) -> FloatArray:
-    number = np.asarray(value, dtype=np.complex128)
-    return np.stack([number.real, number.imag], axis=-1)
+    return ZeroFit(pairs_of(unknown[:m]), pairs_of(unknown[m]), pairs_of(unknown[m + 1]), covariance, _rms(residual))
 
 
 def _rms(residual: ComplexArray) -> float:

@@ -1,4 +1,4 @@
-"""Camera that looks up at the sky of lights: projection between ceiling and image.
+"""Camera below the sky of lights: projection between ceiling and image.
 
 See docs/theory/tabletop-vision.md.
 """
@@ -12,25 +12,26 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from adcs.mockup.navigation.strapdown import rotate
 from arrays.io.errors import check_not_negative, check_positive
 from arrays.typing import BoolArray, FloatArray
 
 REFERENCE_RADIUS_PX = 320.0
-"""Radius at which the lens moves a light by k1 of its distance to the optical centre."""
+"""Radius at which the distortion of a light over its distance from the optical centre is k1."""
 _LARGEST_K1 = 1e6
-_NO_LENS = 1e-17  # less is lost in rounding, and the closed form of the inverse would overflow
+_NO_LENS = 1e-17  # a smaller distortion is below rounding, and the closed form of the inverse would overflow
 
 
 @dataclass(frozen=True)
 class Pose:
-    """Position and heading of one satellite or of many (numbers or arrays of one shape).
+    """Position and heading of one satellite, or of many as arrays of one shape.
 
     Attributes
     ----------
     x_m, y_m : float or ndarray
-        Of the optical axis, where it meets the ceiling, in the table's frame [m].
+        Position at which the optical axis meets the ceiling, table axes.
     heading_rad : float or ndarray
-        Counter-clockwise seen from above, from the table's X to the body's x [rad].
+        Angle from the table's X to the body's x, counter-clockwise seen from above.
 
     Examples
     --------
@@ -55,21 +56,21 @@ class Camera:
 
     Attributes
     ----------
-    width_px : int
-    height_px : int
+    width_px, height_px : int
+        Size of the image.
     m_per_px : float
-        Size of a pixel on the ceiling, at the optical centre [m].
+        Size of a pixel on the ceiling, at the optical centre.
     centre_px : tuple, shape (2,), optional
-        Column and row of the optical centre; the middle of the image if it is not given.
+        Column and row of the optical centre; by default the middle of the image.
     k1 : float
-        Radial distortion at 320 px, relative.
+        Relative radial distortion at 320 px.
     exposure_s : float
-        A light that moves is smeared over this time; a pose belongs to its middle.
+        Time over which a moving light is smeared; the pose is that of its middle.
 
     Raises
     ------
     ValueError
-        A size is not positive, a number is not finite, or the lens folds the image onto itself within the frame.
+        A size is not positive, a number is not finite, or the lens maps two points of the ceiling to one pixel.
 
     Examples
     --------
@@ -118,9 +119,14 @@ def camera_of_footprint(width_m: float, k1: float = 0.0) -> Camera:
     Parameters
     ----------
     width_m : float
-        Of what it sees.
+        Width of the visible part of the ceiling.
     k1 : float
-        Radial distortion at 320 px, relative.
+        Relative radial distortion at 320 px.
+
+    Returns
+    -------
+    Camera
+        Camera with the optical centre in the middle of the image.
 
     Examples
     --------
@@ -138,9 +144,7 @@ def centred_from_table(camera: Camera, pose: Pose, points_m: ArrayLike) -> Float
     (..., n, 2): centred pixels, y up.
     """
     offset = np.asarray(points_m, dtype=np.float64) - pose.position_m[..., None, :]
-    cos, sin = np.cos(pose.heading_rad)[..., None], np.sin(pose.heading_rad)[..., None]
-    right, down = cos * offset[..., 0] + sin * offset[..., 1], cos * offset[..., 1] - sin * offset[..., 0]
-    return np.stack([right, -down], axis=-1) / camera.m_per_px
+    return rotate(-np.asarray(pose.heading_rad)[..., None], offset) * [1.0, -1.0] / camera.m_per_px
 
 
 def table_from_centred(camera: Camera, pose: Pose, points_px: ArrayLike) -> FloatArray:
@@ -150,16 +154,14 @@ def table_from_centred(camera: Camera, pose: Pose, points_px: ArrayLike) -> Floa
     frame [m].
     """
     body = np.asarray(points_px, dtype=np.float64) * [camera.m_per_px, -camera.m_per_px]
-    cos, sin = np.cos(pose.heading_rad)[..., None], np.sin(pose.heading_rad)[..., None]
-    turned = np.stack([cos * body[..., 0] - sin * body[..., 1], sin * body[..., 0] + cos * body[..., 1]], axis=-1)
-    return turned + pose.position_m[..., None, :]
+    return rotate(np.asarray(pose.heading_rad)[..., None], body) + pose.position_m[..., None, :]
 
 
 def distort(camera: Camera, points_px: ArrayLike) -> FloatArray:
     """Distort centred pixels to pixels of the image.
 
-    ``points_px`` (..., 2): centred, y up. Returns (..., 2): column and row. NaN of a point so far out that the lens
-    would fold it back (of k1 < 0 beyond 320 px/√(-3 k1)): such a point is not seen.
+    ``points_px`` (..., 2): centred, y up. Returns (..., 2): column and row; NaN for a point that a lens with k1 < 0
+    does not show, beyond 320 px/√(-3 k1).
     """
     points = np.asarray(points_px, dtype=np.float64)
     squared = np.sum(points**2, axis=-1, keepdims=True) / REFERENCE_RADIUS_PX**2
@@ -176,13 +178,14 @@ def undistorted(camera: Camera, image_px: ArrayLike) -> FloatArray:
     Parameters
     ----------
     camera : Camera
+        Camera with its centre and its distortion.
     image_px : array_like, shape (..., 2)
         Column and row.
 
     Returns
     -------
     ndarray, shape (..., 2)
-        Centred, y up. NaN where the lens shows nothing.
+        Centred pixels, y up; NaN where the lens shows nothing.
 
     Examples
     --------
@@ -223,7 +226,7 @@ def table_from_image(camera: Camera, pose: Pose, image_px: ArrayLike) -> FloatAr
 
 
 def in_frame(camera: Camera, image_px: ArrayLike, margin_px: float = 0.0) -> BoolArray:
-    """Return whether pixels (..., 2) are within the frame by a margin; False for NaN."""
+    """Return whether pixels (..., 2) are within the frame by at least a margin; False for NaN."""
     points = np.asarray(image_px, dtype=np.float64)
     last = np.array([camera.width_px - 1.0, camera.height_px - 1.0])
     return np.all((points >= margin_px) & (points <= last - margin_px), axis=-1)
@@ -235,15 +238,16 @@ def footprint(camera: Camera, pose: Pose, points_per_side: int = 1) -> FloatArra
     Parameters
     ----------
     camera : Camera
+        Camera with its distortion.
     pose : Pose
-        Numbers, or arrays of shape (...).
+        Pose of numbers, or of arrays of shape (...).
     points_per_side : int
-        With a lens that bends straight lines more than the corners are wanted.
+        Points of each side; a lens with distortion needs more than the corners.
 
     Returns
     -------
     ndarray, shape (..., 4 points_per_side, 2)
-        In the table's frame [m], beginning at the image's upper left.
+        Points in table axes [m], beginning at the image's upper left.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Calibration of the camera: scale, distortion and optical centre from frames taken at known poses.
+"""Calibration of the camera: scale, distortion and optical centre from frames with known poses.
 
 See docs/theory/tabletop-vision.md.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,25 +16,30 @@ from adcs.mockup.vision.sky import LedSky
 from arrays.typing import FloatArray
 
 PARAMETERS = ("m_per_px", "k1", "centre_x_px", "centre_y_px")
-# Pairs are farther apart than this only by mistake: as long as the lens is unknown, and at the end.
+# Largest distances of true pairs of star and light, from an unknown lens to a known one.
 _GATES_PX = (30.0, 10.0, 3.0)
 _STEPS_PER_GATE = 2
 _FEWEST_PAIRS = 8
-_FEWEST_OF_FRAME = 2  # one light tells nothing that a shift does not explain
-_RANK_RTOL = 1e-12
-_LEAST_NOISE_PX = 1e-7  # of made-up centroids without noise
+_FEWEST_OF_FRAME = 2  # a shift explains one light
+_RANK_RTOL = 1e-6
+_UNKNOWN_POSE = np.full(3, 1e9)  # standard deviations [m, rad] so large that a pose is free
+_LEAST_NOISE_PX = 1e-7  # for simulated centroids without noise
+
+
+_Rows = tuple[FloatArray, FloatArray, FloatArray]
+"""Residuals (2k,) of a frame, and their derivatives by camera (2k, 4) and pose (2k, 3)."""
 
 
 @dataclass(frozen=True, eq=False)
 class KnownFrame:
-    """Lights found in a frame of which the pose is known.
+    """Detected lights of a frame with a known pose.
 
     Attributes
     ----------
     pose : Pose
-        In the middle of the exposure.
+        Pose in the middle of the exposure.
     positions_px : ndarray, shape (n, 2)
-        Column and row.
+        Column and row of each light.
 
     Examples
     --------
@@ -53,18 +58,20 @@ class KnownFrame:
 
 @dataclass(frozen=True, eq=False)
 class CameraCalibration:
-    """A calibrated camera.
+    """Calibrated camera.
 
     Attributes
     ----------
+    camera : Camera
+        Camera with the fitted scale, distortion and centre.
     covariance : ndarray, shape (4, 4)
-        Of :data:`PARAMETERS`, in m/px, 1 and px.
+        Covariance of :data:`PARAMETERS`, in m/px, 1 and px.
     noise_px : float
         Standard deviation of a centroid's coordinate, from the residuals.
     residual_rms_px : float
-        Root mean square of the coordinates' residuals, what the poses' errors make of them included.
+        Root mean square of the coordinates' residuals, which include the errors of the poses.
     n_pairs : int
-        Lights that were used.
+        Number of lights in use.
     """
 
     camera: Camera
@@ -91,27 +98,28 @@ def calibrated_camera(
     position_sigma_m: float = 0.0,
     heading_sigma_rad: float = 0.0,
 ) -> CameraCalibration:
-    """Camera that explains where the lights of some frames are.
+    """Calibrate a camera by the lights of frames with known poses.
 
     Parameters
     ----------
     sky : LedSky
+        Lights on the ceiling.
     frames : sequence of KnownFrame
-        Eight lights at least in all.
+        Frames with at least eight lights in total.
     camera : Camera
-        To start from: the scale to some percent, the lens to some hundredths.
+        Initial camera: the scale is within some percent, k1 within some hundredths.
     position_sigma_m, heading_sigma_rad : float
-        Standard deviations of X, Y and heading of the poses, independent from frame to frame.
+        Standard deviations of X, Y and heading of the poses, independent between frames.
 
     Returns
     -------
     CameraCalibration
-        The camera, and the covariance of its scale, distortion and centre.
+        Camera, and covariance of its scale, distortion and centre.
 
     Raises
     ------
     ValueError
-        A standard deviation is negative, too few lights are where the poses predict them, or they do not determine the
+        A standard deviation is negative, too few lights are near their predicted places, or they do not determine the
         camera.
 
     Examples
@@ -130,7 +138,7 @@ def calibrated_camera(
     sigmas = np.array([position_sigma_m, position_sigma_m, heading_sigma_rad])
     if not ((sigmas >= 0.0) & np.isfinite(sigmas)).all():
         raise ValueError(f"Input sigmas must be finite and not negative; instead received {sigmas[1:].tolist()}.")
-    # As far as the poses may be off, pairs are apart whatever the camera is.
+    # Errors of the poses displace lights for any camera.
     slack_px = 3.0 * math.hypot(position_sigma_m / camera.m_per_px, heading_sigma_rad * REFERENCE_RADIUS_PX)
     pairs = [_pair_lights(sky, camera, frame, _GATES_PX[0] + slack_px) for frame in frames]
     for gate in _GATES_PX:
@@ -142,7 +150,7 @@ def calibrated_camera(
 
 @dataclass(frozen=True, eq=False)
 class _Pairs:
-    """Lights of one frame: where they are on the ceiling and in the image, shapes (k, 2)."""
+    """Paired lights of one frame: positions on the ceiling and in the image, shapes (k, 2)."""
 
     pose: Pose
     points_m: FloatArray
@@ -150,7 +158,7 @@ class _Pairs:
 
 
 def _pair_lights(sky: LedSky, camera: Camera, frame: KnownFrame, gate_px: float) -> _Pairs:
-    """Lights of the sky and of the frame that are each other's nearest, within a gate."""
+    """Pair lights of the sky and of the frame that are each other's nearest, within a gate."""
     stars = np.asarray(frame.positions_px, dtype=np.float64).reshape(-1, 2)
     predicted = distort(camera, centred_from_table(camera, frame.pose, sky.positions_m))
     shown = np.flatnonzero(np.isfinite(predicted).all(axis=1))
@@ -163,22 +171,16 @@ def _pair_lights(sky: LedSky, camera: Camera, frame: KnownFrame, gate_px: float)
 
 
 def _refine(camera: Camera, frames: Sequence[_Pairs], sigmas: FloatArray) -> CameraCalibration:
-    """One step of Gauss and Newton, and what is known after it."""
+    """Return the calibration after one Gauss-Newton step."""
     usable = [pairs for pairs in frames if len(pairs.points_m) >= _FEWEST_OF_FRAME]
     n_pairs = sum(len(pairs.points_m) for pairs in usable)
     if n_pairs < _FEWEST_PAIRS:
         raise ValueError(
-            f"Input frames must show {_FEWEST_PAIRS} lights where their poses predict them; instead received {n_pairs}."
+            f"Input frames must show {_FEWEST_PAIRS} lights near their predicted places; instead received {n_pairs}."
         )
     rows = [_rows(camera, pairs) for pairs in usable]
     noise_px = _noise(rows)
-    equations = _CameraEquations()
-    for residual, by_camera, by_pose in rows:
-        # The inverse of R = noise² I + E Eᵀ.
-        E = by_pose * sigmas
-        inner = np.linalg.solve(noise_px**2 * np.eye(3) + E.T @ E, E.T)
-        equations = equations.add_rows(residual, by_camera, (np.eye(residual.size) - E @ inner) / noise_px**2)
-    step, inverse, rank = equations.solve()
+    step, covariance, rank, _ = _fit_camera(rows, sigmas, noise_px)
     if rank < len(PARAMETERS):
         raise ValueError("Input frames must determine the camera; instead received lights too few or too close.")
     centre = camera.centre + step[2:]
@@ -186,34 +188,39 @@ def _refine(camera: Camera, frames: Sequence[_Pairs], sigmas: FloatArray) -> Cam
         camera, m_per_px=camera.m_per_px + step[0], k1=camera.k1 + step[1], centre_px=(centre[0], centre[1])
     )
     left = np.concatenate([residual - by_camera @ step for residual, by_camera, _ in rows])
-    return CameraCalibration(refined, inverse, noise_px, float(np.sqrt(np.mean(left**2))), n_pairs)
+    return CameraCalibration(refined, covariance, noise_px, float(np.sqrt(np.mean(left**2))), n_pairs)
 
 
-@dataclass(frozen=True, eq=False)
-class _CameraEquations:
-    """Weighted sums over frames: JᵀWJ, JᵀWr, rᵀWr."""
+def _fit_camera(
+    rows: Sequence[_Rows], sigmas: FloatArray, noise_px: float
+) -> tuple[FloatArray, FloatArray, int, FloatArray]:
+    """Return the step (4,) of the camera, its covariance, its rank, and whitened residuals after it.
 
-    matrix: FloatArray = field(default_factory=lambda: np.zeros((4, 4)))
-    right: FloatArray = field(default_factory=lambda: np.zeros(4))
-    squares: float = 0.0
-
-    def add_rows(self, residual: FloatArray, by_camera: FloatArray, weight: FloatArray) -> _CameraEquations:
-        weighted = by_camera.T @ weight
-        squares = float(residual @ weight @ residual)
-        return _CameraEquations(
-            self.matrix + weighted @ by_camera, self.right + weighted @ residual, self.squares + squares
-        )
-
-    def solve(self) -> tuple[FloatArray, FloatArray, int]:
-        """Solution, inverse of the matrix, and rank; what is not determined stays zero."""
-        scale = np.sqrt(np.maximum(np.diagonal(self.matrix), np.finfo(np.float64).tiny))
-        scaled = self.matrix / scale / scale[:, None]
-        inverse = np.linalg.pinv(scaled, rcond=_RANK_RTOL, hermitian=True) / scale / scale[:, None]
-        return inverse @ self.right, inverse, int(np.linalg.matrix_rank(scaled, tol=_RANK_RTOL, hermitian=True))
+    ``sigmas`` (3,): standard deviations of each pose. A parameter that the rows do not determine keeps its value.
+    """
+    parts = [
+        _whiten(np.column_stack([residual, by_camera]), by_pose * sigmas, noise_px)
+        for residual, by_camera, by_pose in rows
+    ]
+    white = np.concatenate(parts)
+    r, J = white[:, 0], white[:, 1:]
+    scale = np.maximum(np.linalg.norm(J, axis=0), np.finfo(np.float64).tiny)
+    left, size, right = np.linalg.svd(J / scale, full_matrices=False)
+    rank = int(np.count_nonzero(size > _RANK_RTOL * size[0]))
+    inverse = (right[:rank].T / size[:rank]) @ left[:, :rank].T / scale[:, None]
+    step = inverse @ r
+    return step, inverse @ inverse.T, rank, r - J @ step
 
 
-def _rows(camera: Camera, pairs: _Pairs) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Residuals (2k,) of a frame in the image, and their derivatives by camera (2k, 4) and pose (2k, 3)."""
+def _whiten(columns: FloatArray, E: FloatArray, noise_px: float) -> FloatArray:
+    """Multiply columns (2k, n) by the inverse square root of noise² I + E Eᵀ."""
+    basis, size, _ = np.linalg.svd(E, full_matrices=False)
+    share = 1.0 - noise_px / np.hypot(noise_px, size)
+    return (columns - basis @ (share[:, None] * (basis.T @ columns))) / noise_px
+
+
+def _rows(camera: Camera, pairs: _Pairs) -> _Rows:
+    """Return the residuals of a frame in the image, and their derivatives by camera and pose."""
     ideal = centred_from_table(camera, pairs.pose, pairs.points_m)
     residual = pairs.image_px - distort(camera, ideal)
     rho2 = np.sum(ideal**2, axis=1) / REFERENCE_RADIUS_PX**2
@@ -232,13 +239,8 @@ def _rows(camera: Camera, pairs: _Pairs) -> tuple[FloatArray, FloatArray, FloatA
     return residual.reshape(-1), by_camera.reshape(-1, 4), by_pose.reshape(-1, 3)
 
 
-def _noise(rows: Sequence[tuple[FloatArray, FloatArray, FloatArray]]) -> float:
-    """Standard deviation of a coordinate, from what neither the camera nor a shift or turn of each frame explains."""
-    equations, freedom = _CameraEquations(), 0
-    for residual, by_camera, by_pose in rows:
-        basis = np.linalg.qr(by_pose)[0]
-        equations = equations.add_rows(residual, by_camera, np.eye(residual.size) - basis @ basis.T)
-        freedom += residual.size - basis.shape[1]
-    step, _, rank = equations.solve()
-    squares = equations.squares - float(equations.right @ step)
-    return max(math.sqrt(max(squares, 0.0) / max(freedom - rank, 1)), _LEAST_NOISE_PX)
+def _noise(rows: Sequence[_Rows]) -> float:
+    """Return the standard deviation of a coordinate, with the camera and each frame's pose free."""
+    _, _, rank, left = _fit_camera(rows, _UNKNOWN_POSE, 1.0)
+    freedom = left.size - len(_UNKNOWN_POSE) * len(rows) - rank
+    return max(math.sqrt(float(left @ left) / max(freedom, 1)), _LEAST_NOISE_PX)

@@ -18,34 +18,35 @@ WHITE = 255
 THRESHOLD_SIGMAS = 6.0
 SIGMA_OF_MAD = 1.4826
 FEWEST_PIXELS = 4
-"""Least number of pixels of a star: fewer are a hot pixel, or noise."""
+"""Least number of pixels of a star; fewer are a hot pixel or noise."""
 FEWEST_SUMS = 10
 """Least number of pixels of a star in sums of 3 × 3 pixels."""
-# Of a median of whole numbers the standard deviation of a quiet image comes out as zero; rounding alone has this.
+# Standard deviation of rounding; the median deviation of whole numbers is zero for a quiet image.
 _ROUNDING_SIGMA = 12.0**-0.5
-_BACKGROUND_STRIDE = 3  # every third row is enough for medians: 100,000 pixels
+_BACKGROUND_STRIDE = 3  # every third row, 100,000 pixels, is enough for medians
 _ALL_NEIGHBOURS = np.ones((3, 3), dtype=np.int8)
 
 
 class NoLightsError(ValueError):
-    """A frame is black, saturated or of one value throughout."""
+    """Error of a frame that is black, saturated or uniform."""
 
 
 @dataclass(frozen=True, eq=False)
 class Stars:
-    """Lights found in a frame, brightest first.
+    """Detected lights of a frame, brightest first.
 
     Attributes
     ----------
     positions_px : ndarray, shape (n, 2)
         Column and row of each centroid.
     intensity_DN : ndarray, shape (n,)
-        Sum above the background.
+        Sum of each light's pixels above the background.
     n_pixels : ndarray of int, shape (n,)
+        Number of pixels of each light.
     background_DN : float
         Median of the frame.
     threshold_DN : float
-        Above the background.
+        Threshold above the background.
     """
 
     positions_px: FloatArray
@@ -59,21 +60,27 @@ class Stars:
 
 
 def find_stars(frame: ArrayLike) -> Stars:
-    """Lights above six standard deviations of the background.
+    """Detect lights above six standard deviations of the background.
 
-    The background is the frame's median, its standard deviation 1.4826 times the median distance from it (MAD). Blobs
-    are 8-connected pixels above the threshold; those of fewer than 4 pixels and those at the border are left out.
+    The background is the frame's median. Its standard deviation is 1.4826 times the median distance from it (MAD).
+    Blobs are 8-connected pixels above the threshold; blobs of fewer than 4 pixels or at the border are ignored.
 
     Parameters
     ----------
     frame : array_like of uint8, shape (height, width)
+        Grey image.
+
+    Returns
+    -------
+    Stars
+        Centroids and intensities, brightest first.
 
     Raises
     ------
     NoLightsError
-        It is black, saturated or of one value throughout.
+        The frame is black, saturated or uniform.
     ValueError
-        This is no grey image of bytes.
+        The frame is no grey image of bytes.
 
     Examples
     --------
@@ -92,12 +99,12 @@ def find_stars(frame: ArrayLike) -> Stars:
 
 
 def find_faint_stars(frame: ArrayLike) -> Stars:
-    """Lights above six standard deviations of the background in sums of 3 × 3 pixels.
+    """Detect lights above six standard deviations of the background in sums of 3 × 3 pixels.
 
-    As :func:`find_stars`, for sums of each pixel and its eight neighbours. A light that moves over 24 pixels is as
-    bright as noise and breaks into pieces; its sums do not. At rest centroids are better as well, as less of the light
-    is below the threshold. A hot pixel has nine sums, so a star needs more of them.
-    Shape ``frame`` (height, width). Returns: intensities, background and threshold are those of the sums.
+    The method is that of :func:`find_stars`, for sums of each pixel and its eight neighbours. A light that moves over
+    24 pixels is as weak as noise and breaks into pieces, but its sums do not. At rest centroids are better too, because
+    less of the light is below the threshold. A hot pixel has nine sums, so a star needs more.
+    Shape ``frame`` (height, width). Intensities, background and threshold are those of the sums.
     """
     image = check_frame(frame).astype(np.uint16)
     if min(image.shape) < 3:
@@ -110,7 +117,7 @@ def find_faint_stars(frame: ArrayLike) -> Stars:
 
 
 def find_stars_between_extremes(frame: ArrayLike, level: float = 0.3) -> Stars:
-    """Detect lights above a level between the darkest and the brightest pixel, as the source paper.
+    """Detect lights above a level between the darkest and the brightest pixel, as in the source paper.
 
     Shape ``frame`` (height, width). ``level``: 0 is the darkest pixel of the frame and 1 the brightest one.
     """
@@ -139,7 +146,7 @@ def check_frame(frame: ArrayLike) -> ByteArray:
 
 
 def _background(image: ByteArray | WordArray) -> tuple[int, float]:
-    """Median and standard deviation of whole numbers, the latter from the median distance."""
+    """Return the median of whole numbers, and their standard deviation from the median distance."""
     counts = np.bincount(image[::_BACKGROUND_STRIDE].reshape(-1))
     background = _median(counts)
     distances = np.bincount(np.abs(np.arange(counts.size) - background), weights=counts)
@@ -147,7 +154,7 @@ def _background(image: ByteArray | WordArray) -> tuple[int, float]:
 
 
 def _median(counts: NDArray[np.intp] | FloatArray) -> int:
-    """Lower median of whole numbers from how often each occurs."""
+    """Return the lower median of whole numbers from the count of each."""
     cumulative = np.cumsum(counts)
     return int(np.searchsorted(cumulative, 0.5 * cumulative[-1]))
 
@@ -155,7 +162,7 @@ def _median(counts: NDArray[np.intp] | FloatArray) -> int:
 def _stars_above(
     image: ByteArray | WordArray, background: int, threshold: float, fewest_pixels: int = FEWEST_PIXELS
 ) -> Stars:
-    # In whole numbers: a comparison of bytes is several times as fast as one of floats.
+    # A comparison of bytes is several times as fast as one of floats.
     above = image > min(background + int(threshold), np.iinfo(image.dtype).max)
     labels, n_blobs = ndimage.label(above, structure=_ALL_NEIGHBOURS)
     places = np.flatnonzero(above)

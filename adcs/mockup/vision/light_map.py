@@ -1,4 +1,4 @@
-"""Nearest light of very many points at once, by a table over the ceiling."""
+"""Nearest lights of many points at once, by a table over the ceiling."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ import numpy as np
 from adcs.mockup.vision.triangles import TriangleCatalogue
 from arrays.typing import ComplexArray, FloatArray, IntArray
 
-# Of the distance between the closest two lights.
-_CELLS_PER_SPACING = 4
+_CELLS_PER_SPACING = 4  # cells per distance of the two closest lights
 _MOST_CELLS = 2_000_000
 
 
@@ -21,14 +20,14 @@ class LightMap:
     plane: ComplexArray  # (n,): the lights, X + iY [m]
     corner: complex  # lower left corner of the grid [m]
     cell_m: float
-    nearest: IntArray  # (rows, columns): number of the light that is nearest to the cell's middle
+    nearest: IntArray  # (rows, columns): index of the light nearest to the cell's middle
 
     @classmethod
     def of(cls, catalogue: TriangleCatalogue) -> LightMap:
-        """Map of a catalogue's lights.
+        """Return the map of a catalogue's lights.
 
-        A cell is a quarter of the smallest distance d between two lights, so that the light that is found for a point
-        within 0.32 d of one is that one.
+        A cell is a quarter of the smallest distance d between two lights. A point within 0.32 d of a light is therefore
+        matched to that light.
         """
         positions = catalogue.positions_m
         distance = np.asarray(catalogue.star_tree.query(positions, k=2)[0])
@@ -43,7 +42,7 @@ class LightMap:
     def lights_near(self, points: ComplexArray) -> IntArray:
         """Return the index of the light nearest to points X + iY [m].
 
-        Outside the grid it is that of a light near its border.
+        Points outside of the grid get a light near its border.
         """
         offset = (points - self.corner) * (1.0 / self.cell_m)
         rows, columns = self.nearest.shape
@@ -52,7 +51,7 @@ class LightMap:
         return self.nearest[row, column]
 
     def misses(self, points: ComplexArray, limit_m: float) -> FloatArray:
-        """Sum the squared distances to the nearest light over the last axis, at most the limit² each."""
+        """Sum the squared distances to the nearest light over the last axis, each at most the limit²."""
         offset = points - self.plane[self.lights_near(points)]
         return np.minimum(offset.real**2 + offset.imag**2, limit_m**2).sum(axis=-1)
 

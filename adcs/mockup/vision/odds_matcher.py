@@ -1,4 +1,4 @@
-"""A matcher that wins on sparse fields as on damaged ones: pairs of stars, weighed by what all stars say.
+"""Matcher for sparse and for damaged images: pairs of stars, weighed by the likelihood of all stars.
 
 See docs/theory/tabletop-vision.md.
 """
@@ -20,35 +20,35 @@ from adcs.stars.identification import NoFix
 from arrays.typing import ComplexArray, FloatArray, IntArray
 
 ROUGH_NOISE_PX = (*NOISE_PX, 3.2, 6.4)
-# More than this are no sky of lights but noise, and their pairs would fill the memory.
+# More stars than this are noise, and their pairs would fill the memory.
 _MOST_STARS = 500
-# A cell of hypotheses that are checked once: of position, and of heading.
+# Size of a cell of poses in position and heading; one hypothesis of each cell is fitted.
 _CELL_PX = 10.0
 _CELL_RAD = 0.05
-# Best hypotheses among which the candidates are looked for: each true pair of stars gives the same pose again.
+# Best hypotheses per candidate: each true pair of stars gives the same pose.
 _PER_CANDIDATE = 16
 
 
 @dataclass(frozen=True, eq=False)
 class LightPairs:
-    """Pairs of lights by their distance; made by :meth:`of`."""
+    """Pairs of lights sorted by distance; made by :meth:`of`."""
 
     lights: IntArray  # (k, 2)
     lengths_m: FloatArray  # (k,): ascending
 
     @classmethod
     def of(cls, catalogue: TriangleCatalogue, longest_m: float) -> LightPairs:
-        """All pairs up to a distance [m]."""
+        """Return all pairs up to a distance [m]."""
         pairs = np.asarray(catalogue.star_tree.query_pairs(longest_m, output_type="ndarray"), dtype=np.intp)
         lengths = np.abs(catalogue.plane[pairs[:, 0]] - catalogue.plane[pairs[:, 1]])
         order = np.argsort(lengths, kind="stable")
         return cls(pairs[order], lengths[order])
 
     def between(self, least_m: FloatArray, most_m: FloatArray) -> tuple[IntArray, IntArray]:
-        """Pairs whose lengths are in any of several ranges.
+        """Return the pairs with lengths in several ranges.
 
-        Shape ``least_m``, ``most_m`` (r,). Returns (c,) and (c, 2): number of the range, and lights; a pair may be in
-        several ranges.
+        Shapes ``least_m``, ``most_m`` (r,) -> (c,), (c, 2): number of the range, and lights. A pair may be in several
+        ranges.
         """
         first, last = np.searchsorted(self.lengths_m, least_m), np.searchsorted(self.lengths_m, most_m)
         counts = np.maximum(last - first, 0)
@@ -58,24 +58,26 @@ class LightPairs:
 
 @dataclass(frozen=True, eq=False)
 class OddsMatcher:
-    """Pairs of stars, weighed by odds; made by :meth:`of`.
+    """Matcher by pairs of stars, weighed by odds; made by :meth:`of`.
 
     Attributes
     ----------
+    odds : PoseOdds
+        Model of the camera's images.
     pairs : LightPairs
-        Up to the image's diagonal on the ceiling.
+        Pairs of lights up to the image's diagonal on the ceiling.
     image_pairs : int
-        Shortest pairs of the image that are looked up: one of two true stars is enough.
+        Number of the shortest pairs of the image in use; one pair of true stars is enough.
     length_tolerance_px : float
-        Largest error of a pair's length [px].
+        Largest error of a pair's length.
     coarse_px : float
-        How far off a pose from one pair may place another star [px].
+        Largest error of another star's place under a pose from one pair.
     candidates : int
-        Hypotheses that are fitted.
+        Number of hypotheses that are fitted.
     minimum_log_odds : float
-        Of the fix; by default a thousand to one.
+        Least log-odds of the fix; by default a thousand to one.
     minimum_stars : int
-        That the fix must explain.
+        Least number of stars that the fix must explain.
     """
 
     odds: PoseOdds
@@ -89,33 +91,45 @@ class OddsMatcher:
 
     @classmethod
     def of(cls, catalogue: TriangleCatalogue, camera: Camera) -> OddsMatcher:
-        """Matcher with the default settings.
+        """Return a matcher with the default settings.
 
         Parameters
         ----------
+        catalogue : TriangleCatalogue
+            Catalogue of the lights.
         camera : Camera
-            Calibrated: its scale and its lens are used.
+            Calibrated camera, with its scale and its distortion.
+
+        Returns
+        -------
+        OddsMatcher
+            Matcher with precise tolerances.
         """
         diagonal = math.hypot(*camera.footprint_m)
         return cls(PoseOdds.of(catalogue, camera), LightPairs.of(catalogue, 1.05 * diagonal))
 
     def rough(self) -> OddsMatcher:
-        """The same with wide tolerances: for a lens that is not calibrated, a scale off by 1 %, badly smeared stars."""
+        """Return a matcher with wide tolerances, for an unknown lens, a scale wrong by 1 %, or smeared stars."""
         odds = replace(self.odds, gate_px=16.0, scale_sigma=0.01, noise_px=ROUGH_NOISE_PX)
         return replace(self, odds=odds, length_tolerance_px=6.0, coarse_px=24.0)
 
     def identify(self, points_px: ArrayLike) -> CameraFix | NoFix:
-        """Pose of the camera from the stars of an image.
+        """Identify the pose of the camera from the stars of an image.
 
         Parameters
         ----------
         points_px : array_like, shape (f, 2)
-            Centred pixels: relative to the optical centre, the lens undone, y up.
+            Centred pixels: relative to the optical centre, undistorted, y up.
+
+        Returns
+        -------
+        CameraFix or NoFix
+            Pose, or the reason for which there is none.
 
         Raises
         ------
         ValueError
-            The shape is another one, or a number is not finite.
+            The shape does not match, or a number is not finite.
         """
         image = mirrored_image(points_px)
         if not self.minimum_stars <= len(image) <= _MOST_STARS:
@@ -129,7 +143,7 @@ class OddsMatcher:
         return best_fix(self.odds, image, poses, log_odds, self.minimum_log_odds, self.minimum_stars)
 
     def _hypotheses(self, image: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
-        """Poses under which a short pair of stars is a pair of lights of about its length."""
+        """Return the poses under which a short pair of stars is a pair of lights of a similar length."""
         i, j = np.triu_indices(len(image), 1)
         length = np.abs(image[j] - image[i])
         shortest = np.argsort(length, kind="stable")[: self.image_pairs]
@@ -146,7 +160,7 @@ class OddsMatcher:
         return a, 0.5 * (first + second)[apart] - a * 0.5 * (first_px + second_px)[apart]
 
     def _best_cells(self, image: ComplexArray, a: ComplexArray, b: ComplexArray) -> IntArray:
-        """Numbers of the hypotheses that place the stars best, one of each cell of poses."""
+        """Return the indices of the best hypotheses, one of each cell of poses."""
         s = self.odds.camera.m_per_px
         misses = self.odds.light_map.misses_of_poses(image, a, b, self.coarse_px * s)
         best = np.argpartition(misses, min(_PER_CANDIDATE * self.candidates, len(misses)) - 1)
@@ -154,19 +168,19 @@ class OddsMatcher:
         order = best[np.lexsort((best, misses[best]))]
         cells = np.stack([b.real / (_CELL_PX * s), b.imag / (_CELL_PX * s), np.angle(a) / _CELL_RAD])
         x, y, heading = np.round(cells[:, order]).astype(np.int64)
-        # Far apart enough for any ceiling: a million cells either way.
+        # A unique key of each cell for any ceiling: a million cells in each direction.
         _, first = np.unique((x << 40) + (y << 12) + heading, return_index=True)
         return order[np.sort(first)[: self.candidates]]
 
 
 @dataclass(frozen=True)
 class FirstFix:
-    """Matchers that are tried in turn, until one has a fix."""
+    """Matcher that tries several matchers in turn until one has a fix."""
 
     matchers: tuple[Matcher, ...]
 
     def identify(self, points_px: ArrayLike) -> CameraFix | NoFix:
-        """First fix, or why the first matcher has none; see :class:`adcs.mockup.vision.paper_matcher.Matcher`."""
+        """Return the first fix, or the first matcher's reason for none; see :meth:`OddsMatcher.identify`."""
         first: NoFix | None = None
         for matcher in self.matchers:
             fix = matcher.identify(points_px)
@@ -177,13 +191,19 @@ class FirstFix:
 
 
 def odds_matcher(catalogue: TriangleCatalogue, camera: Camera) -> FirstFix:
-    """Recommended matcher: :class:`OddsMatcher`, precise and then rough.
+    """Return the recommended matcher: :class:`OddsMatcher`, precise and then rough.
 
     Parameters
     ----------
     catalogue : TriangleCatalogue
+        Catalogue of the lights.
     camera : Camera
-        As well calibrated as it is.
+        Camera, calibrated as well as possible.
+
+    Returns
+    -------
+    FirstFix
+        Matcher with the method ``identify``.
 
     Examples
     --------
@@ -205,11 +225,11 @@ def odds_matcher(catalogue: TriangleCatalogue, camera: Camera) -> FirstFix:
 def best_fix(
     odds: PoseOdds, image: ComplexArray, poses: Poses, log_odds: FloatArray, minimum_log_odds: float, minimum_stars: int
 ) -> CameraFix | NoFix:
-    """Fix of the best pose, if it stands out.
+    """Return the fix of the best pose if its odds are high enough.
 
-    ``image`` (f,): mirrored centred pixels x - iy. ``log_odds`` (h,): of each against "all clutter".
-    ``minimum_log_odds``: that the best must have against all others and "all clutter" together. ``minimum_stars``: that
-    it must explain.
+    ``image`` (f,): mirrored centred pixels x - iy. ``log_odds`` (h,): log-odds of each pose against "all clutter".
+    ``minimum_log_odds``: least log-odds of the best pose against all others and "all clutter" together.
+    ``minimum_stars``: least number of stars that it must explain.
     """
     distinct = odds.distinct(poses, log_odds)
     if not len(distinct):

@@ -1,4 +1,4 @@
-"""Pose of the camera from one image: result of all matchers, and the paper's matcher.
+"""Pose of the camera from one image: result of all matchers, and the matcher of the paper.
 
 See docs/theory/tabletop-vision.md.
 """
@@ -18,10 +18,9 @@ from adcs.stars.identification import NoFix
 from arrays.typing import ComplexArray, FloatArray, IntArray
 
 SLIVER_RAD = math.radians(3.0)
-"""A triangle of an image with a smaller angle is not looked for: noise changes its angles most."""
+"""Smallest angle of a triangle in use; noise changes the angles of narrower ones too much."""
 
-# What a centroid is wrong by along each axis, before its distance from the catalogue's place is known, and how many
-# numbers that knowledge counts for.
+# Prior standard deviation of a centroid along each axis, and the number of values that it counts for.
 _USUAL_PX, _USUAL_NUMBERS = 0.1, 4
 
 
@@ -32,19 +31,19 @@ class CameraFix:
     Attributes
     ----------
     position_m : ndarray, shape (2,)
-        X, Y of the camera in the table frame, where its optical axis meets the ceiling [m].
+        X, Y at which the camera's optical axis meets the ceiling, table axes.
     heading_rad : float
-        φ, counter-clockwise seen from above, from -π to π [rad].
+        Heading φ, counter-clockwise seen from above, from -π to π.
     stars : ndarray, shape (k, 2)
-        Pairs of a star's number in the image and in the catalogue.
+        Pairs of a star's index in the image and in the catalogue.
     rms_m : float
-        Root mean square distance of these stars from their catalogue's places, on the ceiling [m].
+        Root mean square distance of these stars from their lights on the ceiling.
     votes : int
-        What spoke for the fix: triangles that agree for the paper's matcher, stars for the others.
+        Number of agreeing triangles (:class:`PaperMatcher`) or of matched stars (other matchers).
     m_per_px : float
-        Scale of the image on the ceiling, as fitted [m/px].
+        Fitted scale of the image on the ceiling.
     sigma_m, sigma_rad : float
-        Standard deviations of the position, each axis, and of the heading, from the distances of the stars.
+        Standard deviations of the position, each axis, and of the heading, from the residuals of the stars.
 
     Examples
     --------
@@ -70,7 +69,7 @@ class Matcher(Protocol):
     """Lost-in-space identification of one image."""
 
     def identify(self, points_px: ArrayLike) -> CameraFix | NoFix:
-        """Pose of the camera from stars of shape (f, 2), centred pixels: relative to the optical centre, y up."""
+        """Identify the pose of the camera from stars (f, 2): centred undistorted pixels, y up."""
         ...
 
 
@@ -81,15 +80,16 @@ class PaperMatcher:
     Attributes
     ----------
     catalogue : TriangleCatalogue
+        Catalogue of the lights.
     tolerance_rad : float
-        Largest difference of either angle of two triangles that match [rad].
+        Largest difference of the angles of two matching triangles.
     closeness_m : float
-        Largest distance between two centres that agree [m].
+        Largest distance between two centres that agree.
     minimum_votes : int
-        Triangles that have to agree.
+        Least number of agreeing triangles.
     opposite_handedness : bool
-        Whether a triangle of the image must go round the other way than the catalogue's, as the image of a camera that
-        looks up does. The paper does not ask it, and so doubles its false matches.
+        Whether a triangle of the image must have the opposite orientation of the catalogue's, as in the image of a
+        camera that looks up. The paper does not require it, which doubles its false matches.
 
     Examples
     --------
@@ -111,17 +111,18 @@ class PaperMatcher:
         Parameters
         ----------
         points_px : array_like, shape (f, 2)
-            Centred pixels: relative to the optical centre, the lens undone, y up.
+            Centred pixels: relative to the optical centre, undistorted, y up.
 
         Returns
         -------
         CameraFix or NoFix
-            The position is the mean of the centres that agree, the heading the mean on the circle.
+            Pose, or the reason for which there is none. The position is the mean of the agreeing centres, the heading
+            their circular mean.
 
         Raises
         ------
         ValueError
-            The shape is another one, or a number is not finite.
+            The shape does not match, or a number is not finite.
         """
         image = mirrored_image(points_px)
         triangles = delaunay_triangles(image, SLIVER_RAD)
@@ -131,8 +132,8 @@ class PaperMatcher:
         if not len(mine):
             return NoFix(f"none of {len(triangles)} triangles is in the catalogue")
         corners, lights = triangles.corners[mine], self.catalogue.triangles.corners[theirs]
-        # Seen from above, a triangle that goes round the same way as the catalogue's fits as it is; one that does not,
-        # if asked for at all, fits the mirrored image only.
+        # A triangle with the catalogue's orientation fits the image as seen from above; another one, if it is accepted,
+        # fits the mirrored image only.
         turned = triangles.is_counter_clockwise[mine] != self.catalogue.triangles.is_counter_clockwise[theirs]
         seen = np.where(turned[:, None], np.conj(image[corners]), image[corners])
         a, b = fit_similarity(seen, self.catalogue.plane[lights])
@@ -149,12 +150,23 @@ class PaperMatcher:
         return camera_fix(self.catalogue, image, stars, complex(fitted), complex(b[agreeing].mean()), votes)
 
     def matches(self, triangles: LightTriangles) -> tuple[IntArray, IntArray]:
-        """Return pairs of matching triangles of image and catalogue, by comparing all pairs."""
+        """Return the pairs of matching triangles of image and catalogue; all pairs are compared.
+
+        Parameters
+        ----------
+        triangles : LightTriangles
+            Triangles of the image.
+
+        Returns
+        -------
+        mine, theirs : ndarray of int, shape (c,)
+            Indices of matching triangles in the image and in the catalogue.
+        """
         known = self.catalogue.triangles
         difference = np.abs(triangles.angles_rad[:, None] - known.angles_rad)
         close = (difference <= self.tolerance_rad).all(axis=2)
         if self.opposite_handedness:
-            # The image has been mirrored, so that a true match goes round the same way.
+            # The image has been mirrored, so that a true match has the same orientation.
             close &= triangles.is_counter_clockwise[:, None] == known.is_counter_clockwise
         mine, theirs = np.nonzero(close)
         return mine, theirs
@@ -165,14 +177,14 @@ def camera_fix(
 ) -> CameraFix:
     """Return the fix of a fit q = a p̄ + b, see :mod:`adcs.mockup.vision.similarity`.
 
-    ``image`` (f,): mirrored image points x - iy [px]. ``stars`` (k, 2): pairs of numbers in image and catalogue; pairs
+    ``image`` (f,): mirrored image points x - iy [px]. ``stars`` (k, 2): pairs of indices in image and catalogue, which
     may repeat.
     """
     pairs = np.unique(stars, axis=0)
     points = image[pairs[:, 0]]
     residual = a * points + b - catalogue.plane[pairs[:, 1]]
     squares, k = float(np.sum(residual.real**2 + residual.imag**2)), len(points)
-    # Two numbers of every star less the four of the fit, and what is known of any star's centroid.
+    # Two numbers of each star minus the four of the fit, and the prior of a centroid.
     known = _USUAL_NUMBERS * (_USUAL_PX * abs(a)) ** 2
     sigma_m = math.sqrt((known + squares) / (_USUAL_NUMBERS + 2 * k - 4))
     middle = points.mean()
@@ -192,9 +204,9 @@ def camera_fix(
 def longest_close_subset(points: ComplexArray, closeness: float) -> IntArray:
     """Return a large subset of points within a distance of one another, by a greedy search.
 
-    Around every point in turn the others are added by their distance while they are close to all before.
-    ``points`` (c,): x + iy. Returns (k,): of the longest subset; of equally long ones, that around the point with most
-    neighbours.
+    For each point in turn, the other points are added in order of their distance if they are close to all added ones.
+    ``points`` (c,): x + iy. Returns (k,): indices of the longest subset; of equally long ones, that around the point
+    with most neighbours.
     """
     distance = np.abs(points[:, None] - points)
     close = distance <= closeness

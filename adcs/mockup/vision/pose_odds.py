@@ -18,10 +18,10 @@ from adcs.mockup.vision.triangles import TriangleCatalogue
 from arrays.typing import BoolArray, ComplexArray, FloatArray, IntArray
 
 NOISE_PX = (0.1, 0.2, 0.4, 0.8, 1.6)
-"""Noise of centroids that is taken to be equally likely, from a standing image to a smeared one."""
-# From the rough pose that it begins with to its own stars.
+"""Equally likely standard deviations of centroids, from an image at rest to a smeared one."""
+# Fits from a rough pose to the final match of stars.
 _FITS = 3
-# Two fits that differ by less, all over the image, are one.
+# Fits that differ by less all over the image count as one.
 _IMAGE_RADIUS_PX = 400.0
 _DISTINCT_PX = 20.0
 
@@ -48,20 +48,21 @@ class PoseOdds:
     Attributes
     ----------
     catalogue : TriangleCatalogue
+        Catalogue of the lights.
     camera : Camera
-        Calibrated: its scale and its lens are used.
+        Calibrated camera, with its scale and its distortion.
     light_map : LightMap
-        The light nearest to every place of the ceiling.
+        Map of the nearest light to each place of the ceiling.
     gate_px : float
-        A star farther from a light is another one [px].
+        Largest distance of a star from its light.
     scale_sigma : float
         Relative standard deviation of the camera's scale.
     detection : tuple of two floats
-        α and β of the share of lights that are found; by default 0.8 ± 0.16.
+        α and β of the beta distribution of the detected share of lights; by default 0.8 ± 0.16.
     border_px : float
-        A light nearer to the image's border may or may not be found [px].
+        Width of the image's border in which a light may or may not be detected.
     noise_px : tuple of floats
-        Noise of centroids, each taken to be equally likely [px].
+        Equally likely standard deviations of centroids.
 
     Examples
     --------
@@ -82,12 +83,25 @@ class PoseOdds:
 
     @classmethod
     def of(cls, catalogue: TriangleCatalogue, camera: Camera) -> PoseOdds:
-        """Return a model with the default settings."""
+        """Return a model with the default settings.
+
+        Parameters
+        ----------
+        catalogue : TriangleCatalogue
+            Catalogue of the lights.
+        camera : Camera
+            Calibrated camera.
+
+        Returns
+        -------
+        PoseOdds
+            Model of the camera's images.
+        """
         return cls(catalogue, camera, LightMap.of(catalogue))
 
     @property
     def log_anywhere(self) -> float:
-        """Logarithm of the density of poses, per px² and rad, when nothing is known but the ceiling's extent."""
+        """Logarithm of the uniform density of poses below the ceiling, per px² and rad."""
         positions = self.catalogue.positions_m / self.camera.m_per_px
         return -math.log(2.0 * math.pi * float(np.prod(np.ptp(positions, axis=0))))
 
@@ -99,14 +113,14 @@ class PoseOdds:
         image : ndarray, shape (f,)
             Mirrored centred pixels x - iy.
         a, b : ndarray, shape (h,)
-            Rough poses.
+            Rough poses of q = a p̄ + b.
         first_gate_px : float
-            How far off the rough poses may place a star; it shrinks to ``gate_px`` in steps.
+            Gate of the first fit; it shrinks to ``gate_px`` in steps.
 
         Returns
         -------
         Poses
-            The scale is a compromise of fit and calibration.
+            Fits, whose scales are weighted means of fit and calibration.
         """
         s = self.camera.m_per_px
         stiffness = (float(np.median(self.noise_px)) / self.scale_sigma) ** 2
@@ -132,13 +146,15 @@ class PoseOdds:
         ----------
         image : ndarray, shape (f,)
             Mirrored centred pixels x - iy.
+        poses : Poses
+            Fits from :meth:`fit`.
         log_density : float or ndarray, shape (h,)
             Logarithm of the prior density of a pose, per px² and rad, such as :attr:`log_anywhere`.
 
         Returns
         -------
         ndarray, shape (h,)
-            -inf for a pose of fewer than two stars.
+            Log-odds; -inf for a pose with fewer than two stars.
         """
         s = self.camera.m_per_px
         matched = poses.matched
@@ -154,14 +170,27 @@ class PoseOdds:
         clutter = m * math.log(self.camera.width_px * self.camera.height_px / max(len(image), 1))
         variance = np.array(self.noise_px)[:, None] ** 2
         likelihood = -m * np.log(2.0 * np.pi * variance) - 0.5 * (squares / variance + scale_error**2)
-        # Of X, Y, φ, and what the stars leave of the scale's prior.
+        # Posterior volume of X, Y, φ and of the scale.
         volume = 1.5 * np.log(2.0 * np.pi * variance) - np.log(n) - 0.5 * np.log(inertia)
         volume -= 0.5 * np.log1p(self.scale_sigma**2 * inertia / variance)
         total = np.logaddexp.reduce(likelihood + volume, axis=0) - math.log(len(self.noise_px))
         return np.where(m >= 2, total + found + clutter + log_density, -np.inf)
 
     def distinct(self, poses: Poses, log_odds: FloatArray) -> IntArray:
-        """Return indices of poses, best first, without duplicates."""
+        """Return indices of poses, best first, without duplicates.
+
+        Parameters
+        ----------
+        poses : Poses
+            Fits from :meth:`fit`.
+        log_odds : ndarray, shape (h,)
+            Log-odds from :meth:`log_odds`.
+
+        Returns
+        -------
+        ndarray of int, shape (k,)
+            Indices of distinct poses with finite log-odds.
+        """
         kept: list[int] = []
         limit = _DISTINCT_PX * self.camera.m_per_px
         for i in np.argsort(-log_odds, kind="stable"):
@@ -177,7 +206,7 @@ class PoseOdds:
         placed = a[:, None] * image + b[:, None]
         lights = self.light_map.lights_near(placed)
         distance = np.abs(placed - self.catalogue.plane[lights]) / (gate_px * self.camera.m_per_px)
-        # Sorted by light and then by distance, which is below 1, the first of a light is the nearest to it.
+        # The key sorts by light, then by distance, which is below 1: the first star of a light is its nearest.
         key = np.where(distance < 1.0, lights + distance, np.inf)
         order = np.argsort(key, axis=1)
         light = np.floor(np.take_along_axis(key, order, axis=1))

@@ -19,10 +19,11 @@ from adcs.mockup.vision.similarity import mirrored_image, pairs_of
 from adcs.mockup.vision.triangles import TriangleCatalogue
 from adcs.stars.identification import NoFix
 from arrays.typing import ComplexArray, FloatArray, IntArray
+from magloc.state_space import symmetric_square_root
 
 CENTROID_PX = 0.3
-"""Noise of a centroid that a search allows for [px]; what smears more is caught by the least radius."""
-# A heading that is more uncertain than this at the image's border is for a matcher that needs no prediction.
+"""Standard deviation of a centroid in the search; the least radius covers smeared stars."""
+# Largest effect of the heading's error at the image's border; beyond it, use a matcher without a prediction.
 _MOST_TURNED_PX = 20.0
 
 
@@ -30,9 +31,9 @@ _MOST_TURNED_PX = 20.0
 class ExpectedLights:
     """Expected lights in an image."""
 
-    lights: IntArray  # (k,): numbers in the catalogue
-    points_px: FloatArray  # (k, 2): centred pixels: relative to the optical centre, the lens undone, y up
-    radius_px: FloatArray  # (k,): within which the light's star is expected
+    lights: IntArray  # (k,): indices in the catalogue
+    points_px: FloatArray  # (k, 2): centred pixels: relative to the optical centre, undistorted, y up
+    radius_px: FloatArray  # (k,): radius in which the light's star is expected
 
     def __len__(self) -> int:
         return len(self.lights)
@@ -43,14 +44,14 @@ def expected_lights(
 ) -> ExpectedLights:
     """Return the expected lights and their places for a predicted pose.
 
-    ``pose``: one pose. ``covariance`` (3, 3): of X, Y [m] and heading [rad]. ``sigmas``: radius in standard deviations
-    along the worst direction. Returns: also those outside of the image by no more than their radius.
+    ``pose``: one pose. ``covariance`` (3, 3): covariance of X, Y [m] and heading [rad]. ``sigmas``: radius in standard
+    deviations along the worst direction. Lights outside of the image by at most their radius are included.
     """
     P = _check_covariance(covariance)
     a, b = _fit_of(camera, pose)
     offset = catalogue.plane - b
     seen = np.conj(offset / a)
-    # A shift of the pose moves a light by its negative in the ceiling's plane, a turn by -i (q - b) a radian.
+    # A shift of the pose shifts a light by its negative in the ceiling's plane, a rotation by -i (q - b) per radian.
     J = np.zeros((len(seen), 2, 3))
     J[:, 0, 0] = J[:, 1, 1] = -1.0
     J[:, :, 2] = pairs_of(-1j * offset)
@@ -70,16 +71,17 @@ class LightTracker:
     Attributes
     ----------
     odds : PoseOdds
+        Model of the camera's images.
     sigmas : float
-        Radius of search, in standard deviations.
+        Radius of the search in standard deviations.
     least_radius_px : float
-        Of search, for smeared stars.
+        Least radius of the search, for smeared stars.
     most_shifts : int
-        Shifts that are weighed: the likeliest by their prediction.
+        Largest number of shifts that are weighed, the likeliest of the prediction.
     minimum_log_odds : float
-        Of a fix against all others and "all clutter"; by default a thousand to one.
+        Least log-odds of a fix against all others and "all clutter"; by default a thousand to one.
     minimum_stars : int
-        That a fix must explain.
+        Least number of stars that a fix must explain.
 
     Examples
     --------
@@ -106,22 +108,27 @@ class LightTracker:
     def identify_near(self, points_px: ArrayLike, pose: Pose, covariance: ArrayLike) -> CameraFix | NoFix:
         """Identify the pose of the camera from the stars of an image near a prediction.
 
-        The prediction helps to find the lights and to weigh what is found; the fix itself is that of the stars alone.
+        The prediction guides the search and weighs the candidates; the fix itself depends on the stars alone.
 
         Parameters
         ----------
         points_px : array_like, shape (f, 2)
-            Centred pixels: relative to the optical centre, the lens undone, y up.
+            Centred pixels: relative to the optical centre, undistorted, y up.
         pose : Pose
-            Predicted for the middle of the exposure.
+            Prediction for the middle of the exposure.
         covariance : array_like, shape (3, 3)
-            Of the prediction's X, Y [m] and heading [rad].
+            Covariance of the prediction's X, Y [m] and heading [rad].
+
+        Returns
+        -------
+        CameraFix or NoFix
+            Pose, or the reason for which there is none.
 
         Raises
         ------
         ValueError
-            The points have another shape or are not finite, or the covariance is not symmetric and positive
-            semidefinite.
+            The shape of the points does not match, a number is not finite, or the covariance is not symmetric and
+            positive semidefinite.
         """
         image = mirrored_image(points_px)
         P = _check_covariance(covariance)
@@ -145,7 +152,7 @@ class LightTracker:
         return shifts[np.argsort(np.abs(shifts), kind="stable")[: self.most_shifts]]
 
     def _log_density(self, poses: Poses, pose: Pose, P: FloatArray) -> FloatArray:
-        """Return the log-density of the prediction at fits, per px² and rad, with the noise of a fit of two stars."""
+        """Return the prediction's log-density at fits, per px² and rad, with the noise of a fit of two stars added."""
         s = self.odds.camera.m_per_px
         error = np.stack(
             [poses.b.real - pose.x_m, poses.b.imag - pose.y_m, np.angle(poses.a * np.exp(-1j * pose.heading_rad))]
@@ -164,13 +171,9 @@ def _fit_of(camera: Camera, pose: Pose) -> tuple[complex, complex]:
 
 
 def _check_covariance(covariance: ArrayLike) -> FloatArray:
-    """Check a covariance of X, Y and heading."""
+    """Return a covariance of X, Y and heading; raise ValueError unless it is positive semidefinite."""
     P = np.asarray(covariance, dtype=np.float64)
     if P.shape != (3, 3) or not np.isfinite(P).all():
         raise ValueError(f"Input covariance must be 3 by 3 finite numbers; instead received shape {P.shape}.")
-    scale = float(np.abs(P).max())
-    if np.abs(P - P.T).max() > 1e-9 * scale or np.linalg.eigvalsh(P)[0] < -1e-9 * scale:
-        raise ValueError(
-            f"Input covariance must be symmetric and positive semidefinite; instead received {P.tolist()}."
-        )
+    symmetric_square_root(P)
     return P

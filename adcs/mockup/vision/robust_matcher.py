@@ -17,9 +17,9 @@ from adcs.mockup.vision.triangles import LightTriangles, TriangleCatalogue, dela
 from adcs.stars.identification import NoFix
 from arrays.typing import ComplexArray, FloatArray, IntArray
 
-# Hypotheses that are fitted again: the counts of the best are often equal.
+# Number of best hypotheses that are refined; their counts are often equal.
 _CHECKED_AGAIN = 6
-# Where two fits are compared: they agree in the whole image if they do here.
+# Radius at which two fits are compared; if they agree there, they agree in the whole image.
 _IMAGE_RADIUS_PX = 400.0
 
 
@@ -30,27 +30,28 @@ class RobustMatcher:
     Attributes
     ----------
     catalogue : TriangleCatalogue
+        Catalogue of the lights.
     m_per_px : float
-        Nominal scale of the image on the ceiling [m/px].
+        Nominal scale of the image on the ceiling.
     radius_rad : float
-        Largest distance of two pairs of angles [rad].
+        Largest distance of two pairs of angles.
     scale_range : tuple of two floats
         Least and largest ratio of a fitted scale to the nominal one.
     triangle_residual_m : float
-        Largest root mean square residual of a similarity of three corners [m].
+        Largest root mean square residual of a similarity of three corners.
     inlier_m, refit_m : float
-        Distance from a light within which a star counts in the first check, and in the fits [m].
+        Largest distance of a star from its light in the first check, and in the fits.
     hypotheses : int
-        Matches that are checked at most.
+        Largest number of matches that are checked.
     refits : int
-        How often the best are fitted again.
+        Largest number of fits of each of the best hypotheses.
     minimum_inliers : int
-        Stars that the fix must explain.
+        Least number of stars that the fix must explain.
     minimum_fraction : float
-        Part of the image's stars that it must explain.
+        Least share of the image's stars that the fix must explain.
     most_chance : float
-        Hypotheses in one image, on average, that may fit as well by chance. Far below what is wanted: the fit moves the
-        pose and the scale so that chance fits better than it would.
+        Largest expected number of hypotheses of one image that fit as well by chance. It is far below the wanted rate
+        of false fixes, because the fit adapts pose and scale to chance matches too.
 
     Examples
     --------
@@ -80,12 +81,17 @@ class RobustMatcher:
         Parameters
         ----------
         points_px : array_like, shape (f, 2)
-            Centred pixels: relative to the optical centre, the lens undone, y up.
+            Centred pixels: relative to the optical centre, undistorted, y up.
+
+        Returns
+        -------
+        CameraFix or NoFix
+            Pose, or the reason for which there is none.
 
         Raises
         ------
         ValueError
-            The shape is another one, or a number is not finite.
+            The shape does not match, or a number is not finite.
         """
         image = mirrored_image(points_px)
         needed = max(self.minimum_inliers, math.ceil(self.minimum_fraction * len(image)))
@@ -111,13 +117,13 @@ class RobustMatcher:
         return fix
 
     def _hypotheses(self, image: ComplexArray, triangles: LightTriangles) -> tuple[ComplexArray, ComplexArray]:
-        """Return the similarities of matches that pass the gates, the best by their angles first."""
+        """Return the similarities of matches that pass the gates, sorted by the difference of their angles."""
         known = self.catalogue.triangles
         near = self.catalogue.angle_tree.query_ball_point(triangles.angles_rad, self.radius_rad)
         found: list[list[int]] = np.asarray(near, dtype=object).tolist()
         mine = np.repeat(np.arange(len(triangles)), [len(matches) for matches in found])
         theirs = np.array([match for matches in found for match in matches], dtype=np.intp)
-        # The image has been mirrored, so that a true match goes round the same way.
+        # The image has been mirrored, so that a true match has the same orientation.
         handed = triangles.is_counter_clockwise[mine] == known.is_counter_clockwise[theirs]
         mine, theirs = mine[handed], theirs[handed]
         seen, lights = image[triangles.corners[mine]], self.catalogue.plane[known.corners[theirs]]
@@ -142,11 +148,11 @@ class RobustMatcher:
     def _chance(self, fix: CameraFix, stars: int, hypotheses: int) -> float:
         """Return the expected number of hypotheses with as good a match by chance.
 
-        Three corners fit by construction; each of the others is within r of a light with the probability of the part
-        of the ceiling that is, and any of them may be.
+        Three corners fit by construction. Each other star is within r of a light with a probability equal to the part
+        of the ceiling within r of a light.
         """
         density = self.catalogue.n_stars / float(np.prod(np.ptp(self.catalogue.positions_m, axis=0)))
-        # The mean square of the distances that chance leaves within r is half of r².
+        # The mean square of distances by chance within r is half of r².
         covered = min(density * math.pi * 2.0 * fix.rms_m**2, 1.0)
         others = len(fix.stars) - 3
         return hypotheses * math.comb(stars - 3, others) * covered**others
@@ -156,7 +162,7 @@ class RobustMatcher:
         return abs(fit[0] - a) * _IMAGE_RADIUS_PX + abs(fit[1] - b) < self.inlier_m
 
     def _refit(self, image: ComplexArray, a: complex, b: complex) -> tuple[complex, complex, IntArray]:
-        """Refine a fit by the stars that stay near their lights; also return these."""
+        """Refine a fit by the stars near their lights; also return these stars."""
         stars = one_to_one(self.catalogue, image, a, b, self.inlier_m)
         for _ in range(self.refits):
             if len(stars) < 2:
@@ -173,8 +179,8 @@ class RobustMatcher:
 def one_to_one(catalogue: TriangleCatalogue, image: ComplexArray, a: complex, b: complex, radius_m: float) -> IntArray:
     """Match stars (k, 2) of image and catalogue within a distance under a fit, each light once.
 
-    ``image`` (f,): mirrored image points x - iy [px]. ``a``, ``b``: see :mod:`adcs.mockup.vision.similarity`. Returns
-    (k, 2): a light to which several stars fall has the nearest.
+    ``image`` (f,): mirrored image points x - iy [px]. ``a``, ``b``: see :mod:`adcs.mockup.vision.similarity`. A light
+    with several stars keeps the nearest.
     """
     found = catalogue.star_tree.query(pairs_of(a * image + b), distance_upper_bound=radius_m)
     distance, light = np.asarray(found[0]), np.asarray(found[1], dtype=np.intp)

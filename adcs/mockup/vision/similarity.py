@@ -14,7 +14,7 @@ from arrays.typing import ComplexArray, FloatArray
 def complex_points(points: ArrayLike, name: str = "points") -> ComplexArray:
     """Return points (n, 2) as complex numbers x + iy; check their shape.
 
-    Shapes ``points`` (n, 2) -> (n,). ``name``: what an error calls them.
+    Shapes ``points`` (n, 2) -> (n,). ``name``: name of the argument in errors.
     """
     pairs = np.asarray(points, dtype=np.float64)
     if pairs.size == 0:
@@ -38,10 +38,9 @@ def pairs_of(plane: ComplexArray) -> FloatArray:
 
 
 def fit_similarity(image: ComplexArray, table: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
-    """Return a and b of the least squares of table - (a image + b).
+    """Return a and b of the least-squares fit of table - (a image + b).
 
-    ``image``, ``table`` (..., k): complex, k ≥ 2, the image points not all in one place (a is NaN there). Returns
-    (...): a and b.
+    Shapes ``image``, ``table`` (..., k) -> (...), complex, k ≥ 2. If all image points are in one place, a is NaN.
     """
     p, q = image.mean(axis=-1), table.mean(axis=-1)
     centred = image - p[..., None]

@@ -12,7 +12,6 @@ The file is TOML::
 
 from __future__ import annotations
 
-import json
 import math
 import warnings
 from dataclasses import dataclass
@@ -24,23 +23,24 @@ from scipy.spatial import Delaunay, QhullError, cKDTree
 
 from arrays.io.errors import naming
 from arrays.io.text import write_text
-from arrays.io.toml import FORMAT_VERSION, File, read_toml, section_of
-from arrays.typing import FloatArray, IntArray
+from arrays.io.toml import FORMAT_VERSION, File, read_toml, section_of, toml_value
+from arrays.io.values import accept_seed, seed_of
+from arrays.typing import FloatArray, IntArray, Rng
 
 FEWEST_LIGHTS = 4
-"""Two triangles that agree need as many."""
+"""Least number of lights: two triangles need as many."""
 SKY_SIZE_M = (3.0, 2.4)
 SPACING_M = 0.07
 N_LIGHTS = 180
 N_BORDER_LIGHTS = 36
-# Four lights are on one circle where the angles at two of them sum to 180°, to within a rounding or to within what the
-# noise of centroids turns into.
+# Four lights are on one circle if the angles at two opposite ones sum to 180°, within rounding or within the noise of
+# centroids.
 _EXACTLY_RAD = 1e-9
 _NEARLY_RAD = math.radians(1.0)
 _NEARLY_SHARE = 0.1
 _ALIKE_RAD = math.radians(0.02)
 _ALIKE_SHARE = 0.5
-_BULGE = 0.015  # of the half size: sides that are straight would leave it to rounding which lights are on the hull
+_BULGE = 0.015  # over the half size; on straight sides rounding would decide which lights are on the hull
 _MOST_DARTS = 100_000
 
 
@@ -52,18 +52,20 @@ class AmbiguousSkyWarning(UserWarning):
 class LedSky:
     """Lights on the ceiling.
 
-    A sky of which the Delaunay triangulation is not unique (four neighbours on one circle, as on a square grid), or of
-    triangles that are all alike, is accepted with an :class:`AmbiguousSkyWarning`.
+    A sky causes an :class:`AmbiguousSkyWarning` if its Delaunay triangulation is not unique (four neighbours on one
+    circle, as on a square grid), or if its triangles are all similar.
 
     Attributes
     ----------
     positions_m : ndarray, shape (n, 2)
         X and Y of each light in the table's frame [m].
+    name : str
+        Name of the sky.
 
     Raises
     ------
     ValueError
-        Fewer than four lights, two at one place, all on one line, or a number is not finite.
+        There are fewer than four lights, two have the same position, all are on one line, or a number is not finite.
     """
 
     positions_m: FloatArray
@@ -85,9 +87,9 @@ class LedSky:
             pair = sorted(neighbour[nearest].tolist())
             raise ValueError(
                 "Input positions_m must have each light at its own place; "
-                f"instead received lights {pair[0]} and {pair[1]} at one."
+                f"instead received lights {pair[0]} and {pair[1]} at the same one."
             )
-        # A view of the ceiling's own middle: rounding of coordinates far away would look like lights on no line.
+        # Relative to the middle of the lights, so that rounding of large coordinates does not matter.
         singular_values = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)
         if singular_values[1] <= 1e-9 * singular_values[0]:
             raise ValueError("Input positions_m must not be on one line; instead received lights that are.")
@@ -121,8 +123,8 @@ class LedSky:
     def cocircular_margins_rad(self) -> FloatArray:
         """Margin of each inner edge from a cocircular case, shape (inner edges,).
 
-        Of the two triangles at an edge the angles opposite to it sum to less than π; with π their four corners are on
-        one circle, and the other diagonal is as much Delaunay as this one.
+        The angles opposite to an edge in its two triangles sum to less than π. If the sum is π, the four corners are on
+        one circle, and the other diagonal is a Delaunay edge as well.
         """
         corners, neighbours = self._delaunay.simplices, self._delaunay.neighbors
         angles = interior_angles(self.positions_m[corners])
@@ -144,8 +146,8 @@ class LedSky:
         nearest = np.asarray(cKDTree(angles).query(angles, k=2)[0])[:, 1]
         if len(angles) > 2 and np.mean(nearest < _ALIKE_RAD) > _ALIKE_SHARE:
             return (
-                f"The triangles of the {len(self)} lights are alike, as on a regular grid, and do not tell where an "
-                "image was taken; displace lights at random."
+                f"The triangles of the {len(self)} lights are similar, as on a regular grid, and do not determine the "
+                "pose of an image; displace lights at random."
             )
         return ""
 
@@ -153,8 +155,8 @@ class LedSky:
 def interior_angles(triangles: FloatArray) -> FloatArray:
     """Return the interior angles of triangles.
 
-    Of sides s and t from a corner the angle is atan2(|s × t|, s · t), exact to rounding for flat triangles as well.
-    ``triangles`` (..., 3, 2): corners. Returns (..., 3): at each corner [rad].
+    The angle between sides s and t at a corner is atan2(|s × t|, s · t), which is accurate for flat triangles too.
+    ``triangles`` (..., 3, 2): corners. Returns (..., 3): angle at each corner [rad].
     """
     s = np.roll(triangles, -1, axis=-2) - triangles
     t = np.roll(triangles, 1, axis=-2) - triangles
@@ -162,15 +164,22 @@ def interior_angles(triangles: FloatArray) -> FloatArray:
     return np.arctan2(np.abs(across), np.sum(s * t, axis=-1))
 
 
-def led_sky(seed: int = 0) -> LedSky:
+@accept_seed
+def led_sky(rng: Rng = 0) -> LedSky:
     """Return a random sky of 180 lights, 3.0 × 2.4 m, at least 7 cm apart: 322 Delaunay triangles.
 
-    A triangulation of n points, h of them on the hull, has 2n - 2 - h triangles. A random rectangle has about 15 on its
-    hull; here 36 are on a border that bulges by 1.5 %, so that each is a corner of the hull beyond doubt.
+    A triangulation of n points with h on the hull has 2n - 2 - h triangles. A random rectangle has about 15 points on
+    its hull. Here 36 are on a convex border that bulges by 1.5 %, so that each is certainly a corner of the hull.
 
     Parameters
     ----------
-    seed : int
+    rng : int or numpy.random.Generator
+        Seed or generator of the places.
+
+    Returns
+    -------
+    LedSky
+        Sky with the border lights first.
 
     Examples
     --------
@@ -178,15 +187,16 @@ def led_sky(seed: int = 0) -> LedSky:
     >>> len(mockup.led_sky())
     180
     """
-    rng = np.random.default_rng(seed)
+    seed = seed_of(rng)
+    generator = np.random.default_rng(seed)
     half = 0.5 * np.array(SKY_SIZE_M)
     places = np.empty((N_LIGHTS, 2))
-    places[:N_BORDER_LIGHTS] = _border(half, rng)
+    places[:N_BORDER_LIGHTS] = _border(half, generator)
     found = N_BORDER_LIGHTS
     for _ in range(_MOST_DARTS):
         if found == N_LIGHTS:
             return LedSky(places, f"sky {seed}")
-        dart = rng.uniform(-1.0, 1.0, 2) * ((1.0 - _BULGE) * half - 0.5 * SPACING_M)
+        dart = generator.uniform(-1.0, 1.0, 2) * ((1.0 - _BULGE) * half - 0.5 * SPACING_M)
         if np.min(np.sum((places[:found] - dart) ** 2, axis=1)) >= SPACING_M**2:
             places[found] = dart
             found += 1
@@ -194,9 +204,9 @@ def led_sky(seed: int = 0) -> LedSky:
 
 
 def _border(half: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Return lights on a rectangle with convex sides, at nearly equal distances along it."""
+    """Return lights on a rectangle with convex sides, at nearly equal distances."""
     lengths = 2.0 * np.array([half[0], half[1], half[0], half[1]])
-    # A quarter of the distance either way keeps neighbours 15 cm apart, also around a corner.
+    # Shifts of at most a quarter of the distance keep neighbours 15 cm apart, also around a corner.
     steps = np.arange(N_BORDER_LIGHTS) + rng.uniform(-0.25, 0.25, N_BORDER_LIGHTS)
     along = (steps / N_BORDER_LIGHTS % 1.0) * lengths.sum()
     corners = half * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0]])
@@ -216,7 +226,7 @@ def read_sky(path: str | PathLike[str]) -> LedSky:
     Raises
     ------
     InputError
-        The file cannot be read, or is no sky; the text names the key.
+        The file cannot be read or is no sky; the text names the key.
     """
     table = section_of(str(path), read_toml(path, "the TOML file of a sky"), _SkyFile)
     with naming(f"{path}, key positions_m"):
@@ -224,11 +234,11 @@ def read_sky(path: str | PathLike[str]) -> LedSky:
 
 
 def write_sky(sky: LedSky, path: str | PathLike[str]) -> None:
-    """Write a sky as a TOML file that :func:`read_sky` reads, to the last digit."""
+    """Write a sky with all digits as a TOML file that :func:`read_sky` reads."""
     rows = [f"    [{x!r}, {y!r}]," for x, y in sky.positions_m.tolist()]
     lines = [
         f"format_version = {FORMAT_VERSION}",
-        f"name = {json.dumps(sky.name, ensure_ascii=False)}",
+        f"name = {toml_value(sky.name)}",
         "positions_m = [  # X and Y in the table's frame",
         *rows,
         "]",

@@ -18,7 +18,7 @@ from adcs.mockup.vision.similarity import complex_points, pairs_of
 from adcs.mockup.vision.sky import interior_angles
 from arrays.typing import BoolArray, ComplexArray, FloatArray, IntArray
 
-# Lights in one line on the hull: what rounding makes of them is no triangle.
+# Smallest angle of a triangle; rounding makes flatter ones of lights in one line on the hull.
 FLAT_RAD = 1e-6
 
 
@@ -26,9 +26,9 @@ FLAT_RAD = 1e-6
 class LightTriangles:
     """Triangles between numbered points."""
 
-    corners: IntArray  # (T, 3): numbers of the points at the smallest, the largest and the third angle
-    angles_rad: FloatArray  # (T, 2): smallest and largest interior angle [rad]
-    is_counter_clockwise: BoolArray  # (T,): whether the corners, in that order, go round counter-clockwise
+    corners: IntArray  # (T, 3): indices of the points at the smallest, the largest and the third angle
+    angles_rad: FloatArray  # (T, 2): smallest and largest interior angle
+    is_counter_clockwise: BoolArray  # (T,): orientation of the corners in that order
 
     def __len__(self) -> int:
         return len(self.corners)
@@ -51,9 +51,8 @@ def triangles_between(plane: ComplexArray, corners: IntArray) -> LightTriangles:
 def delaunay_triangles(plane: ComplexArray, smallest_rad: float = FLAT_RAD) -> LightTriangles:
     """Return the triangles of Delaunay's triangulation, without slivers.
 
-    ``plane`` (n,): points x + iy. There is no triangle of fewer than three points, nor of points in one line.
-    ``smallest_rad``: a triangle with a smaller angle is a sliver and left out [rad]. Returns: in the order of the
-    numbers of their points, so that it does not depend on that of the computation.
+    ``plane`` (n,): points x + iy; fewer than three points, or points in one line, have no triangle. ``smallest_rad``:
+    smallest angle of a triangle that is no sliver. The triangles are sorted by the indices of their points.
     """
     corners = np.empty((0, 3), dtype=np.intp)
     if len(plane) >= 3:
@@ -71,9 +70,9 @@ class TriangleCatalogue:
     Attributes
     ----------
     positions_m : ndarray, shape (n, 2)
-        Lights in the table frame [m].
+        Lights, table axes.
     triangles : LightTriangles
-        Delaunay's, of all lights.
+        Delaunay triangles of all lights.
 
     Examples
     --------
@@ -93,11 +92,17 @@ class TriangleCatalogue:
         Parameters
         ----------
         positions_m : array_like, shape (n, 2)
+            Lights, table axes.
+
+        Returns
+        -------
+        TriangleCatalogue
+            Lights with their Delaunay triangles.
 
         Raises
         ------
         ValueError
-            There are fewer than four lights, one is not finite, or all lie in one line.
+            There are fewer than four lights, one is not finite, or all are in one line.
         """
         plane = complex_points(positions_m, "positions_m")
         if len(plane) < 4:
@@ -119,10 +124,10 @@ class TriangleCatalogue:
 
     @cached_property
     def angle_tree(self) -> cKDTree:
-        """The triangles' pairs of angles, for search."""
+        """Search tree of the triangles' pairs of angles."""
         return cKDTree(self.triangles.angles_rad)
 
     @cached_property
     def star_tree(self) -> cKDTree:
-        """The lights' positions, for search."""
+        """Search tree of the lights' positions."""
         return cKDTree(self.positions_m)

@@ -96,9 +96,9 @@ def write_moment_tracks(
     result = None if outputs.truth is None else first.consistency(magloc.read_truth(outputs.truth))
     outputs.maps.write(first, known.place)
     if outputs.out is not None:
-        from magloc.plots.tracks import write_picture
+        from magloc.plots.tracks import write_track_figures
 
-        write_picture(first, None, outputs.out, array_m=first.readings.array_position_m)
+        write_track_figures(first, None, outputs.out, array_m=first.readings.array_position_m)
     entries = [_entry_of_several(points) if several else json_entry(points[0]) for points in zip(*found, strict=True)]
     if outputs.json:
         report = {"results": entries, "chi2": first.chi2, "dof": first.dof, "misfit": first.misfit}

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar, overload
 
 import numpy as np
 
+from arrays.array import SensorArray
 from arrays.io.csv import Column
 from arrays.io.results import Result
 from arrays.typing import BoolArray, FloatArray, IntArray
@@ -188,6 +189,16 @@ class Fixes(Result, Sequence[Fix]):
         chi2, dof = every.chi2 + every.known_chi2, every.dof + every.n_known
         result[self.solved] = is_misfit(chi2[begin], dof[begin])
         return result
+
+    def used_readings(self, array: SensorArray, readings_T: FloatArray) -> FloatArray:
+        """Return readings (n, C) with NaN for the sensors that each row leaves out."""
+        rows = [row for row, names in enumerate(self.dropped_sensors) if names]
+        if not rows:
+            return readings_T
+        used = readings_T.copy()
+        for row in rows:
+            used[row, np.isin(array.ids, self.dropped_sensors[row])[array.channel_sensor]] = np.nan
+        return used
 
     @cached_property
     def body_covariance(self) -> FloatArray:

@@ -8,14 +8,14 @@ Shapes: b fits, K sources, N sensors, C channels, c columns of the whitening's c
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from arrays.typing import FloatArray, IntArray
-from magloc.fields.dipole import MU0_OVER_4PI
+from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.localization.fit.refinement import MOST_SOURCES, OPTIMUM_TOLERANCE, RELATIVE_TOLERANCE, refine_starts
 from magloc.measurement.whitened import WhitenedModel
 
@@ -80,6 +80,24 @@ class JointFits:
         result = JointFits(*(values.copy() for values in vars(self).values()))
         result.put(index, fits)
         return result
+
+    def distinct(self, width: int, is_same: Callable[[JointFits], BoolArray]) -> JointFits:
+        """Return the best distinct fits (b, width) of each row of fits (b, n).
+
+        `is_same` tells which fits (b, n) equal one of each row (b,). A row without any fit keeps its first one, because
+        the next source starts better beside it.
+        """
+        chi2, rows = self.chi2.copy(), np.arange(len(self.chi2))
+        kept = JointFits.none((len(rows), width), self.n_sources)
+        for k in range(width):
+            best = np.argmin(chi2, axis=1)
+            found = np.isfinite(chi2[rows, best]) | (k == 0)
+            if not found.any():
+                break
+            kept.put((found, k), self.rows((rows[found], best[found])))
+            chi2[is_same(kept.rows((slice(None), k)))] = np.inf
+            chi2[rows, best] = np.inf
+        return kept
 
     def with_opposite_moments(self, n_rows: int) -> JointFits:
         """Return the fits of n rows, each followed by that of the opposite moments."""
@@ -358,7 +376,7 @@ def covariances(problem: WhitenedModel, fits: JointFits) -> FloatArray:
     n_sources = fits.n_sources
     if not len(fits.q):
         return np.empty((0, 6 * n_sources, 6 * n_sources))
-    unit = np.tile(np.repeat([problem.radius, problem.radius**3 / MU0_OVER_4PI], 3), n_sources)
+    unit = problem.state_unit(n_sources)
     return inverse_information(scaled_jacobian(problem, fits.q, fits.mu)) * np.outer(unit, unit)
 
 

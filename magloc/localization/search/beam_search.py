@@ -51,23 +51,14 @@ def best_distinct(fits: JointFits, n_rows: int, width: int) -> JointFits:
     """
     # q and -q are the same source.
     sign = np.where(fits.q[..., 3:] < 0.0, -1.0, 1.0)
-    every = replace(fits, q=fits.q * sign, chi2=fits.chi2.copy()).reshape(n_rows, -1)
-    chi2, rows = every.chi2, np.arange(n_rows)
-    kept = JointFits.none((n_rows, width), fits.n_sources)
-    for k in range(width):
-        best = np.argmin(chi2, axis=1)
-        value = chi2[rows, best]
-        # A row without any fit keeps its first one, infinite χ² and all: the next source starts better beside it.
-        fit = np.isfinite(value) | (k == 0)
-        if not fit.any():
-            break
-        kept.put((fit, k), every.rows((rows[fit], best[fit])))
+    every = replace(fits, q=fits.q * sign).reshape(n_rows, -1)
+
+    def is_same(one: JointFits) -> NDArray[np.bool_]:
         with np.errstate(invalid="ignore"):
-            same = np.abs(chi2 - value[:, None]) < _SAME_CHI2 * (1.0 + 1e-6 * value[:, None])
-            same &= _same_sources(every.q, every.mu, kept.q[:, None, k], kept.mu[:, None, k])
-        chi2[same] = np.inf
-        chi2[rows, best] = np.inf
-    return kept
+            near = np.abs(every.chi2 - one.chi2[:, None]) < _SAME_CHI2 * (1.0 + 1e-6 * one.chi2[:, None])
+            return near & _same_sources(every.q, every.mu, one.q[:, None], one.mu[:, None])
+
+    return every.distinct(width, is_same)
 
 
 def _same_sources(q: FloatArray, mu: FloatArray, other_q: FloatArray, other_mu: FloatArray) -> NDArray[np.bool_]:

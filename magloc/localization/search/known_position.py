@@ -7,8 +7,6 @@ in the moment, and the solution unique, equations (20) to (30).
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -117,26 +115,20 @@ def _distinct_optima(problem: WhitenedModel, y: FloatArray, q: FloatArray, fits:
     Opposite moments are added where χ² is even.
     """
     n = len(y)
-    every = replace(fits, chi2=fits.chi2.copy()).reshape(n, -1)
-    mu, chi2 = every.mu, every.chi2
-    row, rows = np.repeat(np.arange(n), mu.shape[1]), np.arange(n)
-    each = problem.rows(row)
-    even = _is_even(problem)
-    kept = JointFits.none((n, _MOST_SOLUTIONS), q.shape[1])
-    for k in range(_MOST_SOLUTIONS):
-        best = np.argmin(chi2, axis=1)
-        if not np.isfinite(chi2[rows, best]).any():
-            break
-        kept.put((rows, k), every.rows((rows, best)))
-        best_mu = kept.mu[:, None, k]
+    every = fits.reshape(n, -1)
+    row = np.repeat(np.arange(n), every.mu.shape[1])
+    each, even = problem.rows(row), _is_even(problem)
+
+    def is_same(one: JointFits) -> NDArray[np.bool_]:
+        mu, best_mu = every.mu, one.mu[:, None]
         opposite = even[:, None] & (np.sum(mu * best_mu, axis=(-2, -1)) < 0.0)
         halfway = 0.5 * (np.where(opposite[..., None, None], -mu, mu) + best_mu)
         halfway = halfway.reshape(-1, *q.shape[1:2], 3)
         residual = each.residual(y[row], q[row], halfway, each.source_fields(q[row], halfway))
         between = np.sum(residual**2, axis=-1).reshape(n, -1)
-        chi2[between < np.where(np.isfinite(chi2), chi2, 0.0) + _BARRIER] = np.inf
-        chi2[rows, best] = np.inf
-    both = kept.reshape(-1).with_opposite_moments(n).reshape(n, -1)
+        return np.asarray(between < every.chi2 + _BARRIER)
+
+    both = every.distinct(_MOST_SOLUTIONS, is_same).reshape(-1).with_opposite_moments(n).reshape(n, -1)
     both.chi2[~even, 1::2] = np.inf
     return both
 

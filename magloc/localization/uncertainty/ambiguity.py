@@ -13,7 +13,7 @@ from magloc.localization.uncertainty.range_interval import relative_range_sigma
 
 LARGEST_GAUSSIAN_SIGMA = 0.04
 """Standard deviations of position and moment, over range and moment, up to which their errors are Gaussian."""
-LARGEST_BEND = 0.5
+LARGEST_RISE_ERROR = 0.5
 """Largest deviation from one of the rise of χ² at one standard deviation, for Gaussian errors."""
 
 

@@ -16,7 +16,6 @@ from scipy.special import chdtrc
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc import core
 from magloc.chi_square import energy_threshold, quantile
-from magloc.fields.dipole import MU0_OVER_4PI
 from magloc.levels import CERTAIN_WEIGHT, DELTA_CHI2_95, MISFIT
 from magloc.localization.fit.columns import Solutions
 from magloc.localization.fit.gauss_newton import covariances
@@ -24,8 +23,8 @@ from magloc.localization.fit.optima import Optima
 from magloc.localization.fit.refinement import rows_a_block
 from magloc.localization.fit.results import is_misfit, is_observable, spans
 from magloc.localization.uncertainty.ambiguity import (
-    LARGEST_BEND,
     LARGEST_GAUSSIAN_SIGMA,
+    LARGEST_RISE_ERROR,
     log_evidence_volume,
     longest_axes,
     relative_sigma,
@@ -109,7 +108,7 @@ def covariance_is_valid(optima: Optima, covariance: FloatArray, which: IntArray)
         q = problem.homogeneous(position + side[:, :, 0])
         mu = problem.scaled_moment(q, moment + side[:, :, 1])
         residual = problem.residual(y, q, mu, problem.source_fields(q, mu))
-        described &= np.abs(np.sum(residual**2, axis=1) - fits.chi2 - 1.0) <= LARGEST_BEND
+        described &= np.abs(np.sum(residual**2, axis=1) - fits.chi2 - 1.0) <= LARGEST_RISE_ERROR
     return np.asarray(described)
 
 
@@ -195,7 +194,7 @@ def single_source_columns(optima: Optima) -> _FitColumns:
         outside=OUTSIDE,
         certain_weight=CERTAIN_WEIGHT,
         largest_sigma=LARGEST_GAUSSIAN_SIGMA,
-        largest_bend=LARGEST_BEND,
+        largest_bend=LARGEST_RISE_ERROR,
         n_strengths=strengths.size,
         strengths=strengths,
         gained=gained,
@@ -206,7 +205,7 @@ def single_source_columns(optima: Optima) -> _FitColumns:
     )
     block = rows_a_block(_LINEARISATIONS * rows.signals.shape[1])
     core.run("source_uncertainties", work, len(rows), block=block)
-    unit = np.array(3 * [model.radius] + 3 * [model.radius**3 / MU0_OVER_4PI])
+    unit = model.state_unit()
     covariance *= unit
     covariance *= unit[:, None]
     ranges *= model.radius

@@ -10,7 +10,6 @@ from scipy.special import ndtr, ndtri
 
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.localization.fit.results import Intervals
-from magloc.state_space import symmetric_square_root
 from magloc.tracking.coordinates import MOMENT_POWER, Chart
 from magloc.tracking.motion import N_SOURCE
 
@@ -65,9 +64,9 @@ class Mixture:
     n_rows: int = 1
 
     @classmethod
-    def of_gaussian(cls, x: FloatArray, P: FloatArray, centroid_m: FloatArray, radius_m: float) -> Mixture:
-        """Return the mixture of one source with a Cartesian state (6,) and covariance (6, 6)."""
-        root = Chart.at(x, centroid_m, radius_m).inverse_jacobian() @ symmetric_square_root(P)
+    def of_gaussian(cls, x: FloatArray, S: FloatArray, centroid_m: FloatArray, radius_m: float) -> Mixture:
+        """Return the mixture of one source with a Cartesian state (6,) and root (6, m) of its covariance."""
+        root = Chart.at(x, centroid_m, radius_m).inverse_jacobian() @ S
         return cls(x[None], root_of(root)[None], np.zeros(1), x.size, centroid_m, radius_m)
 
     def __len__(self) -> int:
@@ -155,12 +154,13 @@ class Mixture:
     def moments(self) -> tuple[FloatArray, FloatArray]:
         """Return Cartesian mean (6,) and covariance (6, 6); ranges are log-normal."""
         mean, covariance = component_moments(self.chart, self.S)
-        if len(self) == 1:
-            return mean[0], covariance[0]
-        weight = self.weight
-        centre = weight @ mean
-        off = mean - centre
-        return centre, np.einsum("k,kij->ij", weight, covariance) + (weight[:, None] * off).T @ off
+        return (mean[0], covariance[0]) if len(self) == 1 else mixture_moments(self.weight, mean, covariance)
+
+    def square_distance(self, x: FloatArray) -> FloatArray:
+        """Return the squared Mahalanobis distance (K,) of a state (N,), or of one each (K, N), from the components."""
+        n = self.n_charted
+        e = self.chart.coordinates(x[..., :n])
+        return np.asarray(np.sum(np.linalg.solve(root_of(self.S[:, :n]), e[..., None])[..., 0] ** 2, axis=1))
 
     def range_interval_m(self) -> Intervals:
         """Return the 95 % set of the distance from the centroid [m], by quantiles of the mixture."""
@@ -197,6 +197,13 @@ def component_moments(chart: Chart, S: FloatArray) -> tuple[FloatArray, FloatArr
     by_range = np.expm1(0.5 * np.minimum(np.sum(S[:, 0] ** 2, axis=1), _WIDEST**2))
     mean[:, :3] += (by_range * chart.length)[:, None] * chart.u
     return mean, root @ np.swapaxes(root, -1, -2)
+
+
+def mixture_moments(weight: FloatArray, mean: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return mean (n,) and covariance (n, n) of a mixture with weights (K,), by those of its components."""
+    centre = weight @ mean
+    off = mean - centre
+    return centre, np.einsum("k,kij->ij", weight, covariance) + (weight[:, None] * off).T @ off
 
 
 def _in_chart(about: Chart, mixture: Mixture) -> tuple[FloatArray, FloatArray]:

@@ -23,7 +23,8 @@ from magloc.tracking.chart.start import first_root
 from magloc.tracking.coordinates import Chart
 from magloc.tracking.measurement import RowMeasurement, stack_rows, step_of_errors
 from magloc.tracking.motion import N_SOURCE, MotionModel
-from magloc.tracking.row_filter import Gaussians, Rows, SmootherPass, smooth, steps_problem
+from magloc.tracking.row_filter import Gaussians, SmootherPass, smooth, steps_problem
+from magloc.tracking.rows import Rows
 
 _MOST_PASSES = 15
 # Passes after which a component is dropped if its log-evidence is less than the best by the second number.

@@ -28,10 +28,8 @@ from magloc.tracking import row_filter
 from magloc.tracking.chart.mixture import Mixture, root_of
 from magloc.tracking.measurement import RowMeasurement
 from magloc.tracking.motion import N_SOURCE
-from magloc.tracking.row_filter import Gaussians
+from magloc.tracking.row_filter import LARGEST_BEND, Gaussians
 
-LARGEST_BEND = 0.5
-"""Nonlinearity of the readings over a component, in σ of their noise, above which it is divided."""
 MOST_COMPONENTS = 80
 """Largest number of components after a division."""
 MOST_ROWS = 400

@@ -152,7 +152,7 @@ class Stack:
     @cached_property
     def _transform(self) -> FloatArray:
         """Matrices (n, k, C) from channels to differences of unit noise."""
-        return np.stack([row.model.differences.transform / row.sigma[:, None] for row in self.rows])
+        return np.stack([row.transform for row in self.rows])
 
     def _in_arrays(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return positions and moments (n, K, 1, 3) of sources in the array's axes of each row."""
@@ -225,7 +225,7 @@ class Stack:
             in_array = row.pose.to_array(state)
             by_array = np.zeros((len(state), row.z.size, N_SOURCE))
             if not far:
-                by_array = row.model.jacobian(in_array[:, :3], in_array[:, 3:]) / row.sigma[:, None]
+                by_array = row.model.jacobian(in_array[:, :3], in_array[:, 3:])
             by_source.append(row._by_source(by_array, None))
             if row.n_pose:
                 by_pose.append(zero_if_nan(row._by_pose(by_array, in_array, error)))

@@ -35,7 +35,7 @@ from magloc.tracking.chart.update import StateUpdates, is_regular, update_states
 from magloc.tracking.coordinates import MOMENT_POWER, Chart, mirror_images, source_root
 from magloc.tracking.measurement import RowMeasurement, whitening, zero_if_nan
 from magloc.tracking.motion import N_SOURCE, MotionModel
-from magloc.tracking.row_filter import Gaussians, RowUpdates
+from magloc.tracking.row_filter import LARGEST_BEND, Gaussians, RowUpdates
 from magloc.tracking.rows import Row
 
 OF_PITCH = 0.6
@@ -53,8 +53,6 @@ _NARROW = 0.5
 # Logarithm of the density of all cells over that of one at its centre, along one coordinate.
 _EVEN = math.log(OF_PITCH * math.sqrt(2.0 * math.pi))
 _CELL = OF_PITCH * np.array([_PITCH, _SPACING, _SPACING])
-LARGEST_BEND = 0.5
-"""Largest nonlinearity of the readings over a component's σ along a valley of ranges, in σ of their noise."""
 _MOST_BENT = 100.0
 # Extent of the components along a valley, in standard deviations of its log-range.
 _VALLEY = 4.0
@@ -334,7 +332,7 @@ def unique_components(mixture: Mixture, cell: IntArray | None = None) -> IntArra
     cell = np.zeros((len(source), 1), dtype=np.intp) if cell is None else cell.reshape(len(source), -1)
     _, share, n_alike = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
     share = share.ravel()  # numpy 2.0.0 gives a column
-    chart, left = source.chart, np.argsort(-mixture.log_weight, kind="stable")
+    left = np.argsort(-mixture.log_weight, kind="stable")
     alone = n_alike[share[left]] == 1
     unique, left = left[alone].tolist(), left[~alone]
     limit = chdtri(N_SOURCE, 1.0 - CREDIBLE_ROW)
@@ -342,8 +340,6 @@ def unique_components(mixture: Mixture, cell: IntArray | None = None) -> IntArra
         first, others = left[0], left[1:]
         unique.append(first)
         same = others[share[others] == share[first]]
-        about = chart.take(same)
-        e = about.coordinates(np.repeat(source.x[first][None], len(same), axis=0))
-        square = np.sum(np.linalg.solve(source.S[same], e[..., None])[..., 0] ** 2, axis=1)
-        left = others[~np.isin(others, same[square < limit])]
+        equal = same[source.take(same).square_distance(source.x[first]) < limit]
+        left = others[~np.isin(others, equal)]
     return np.array(sorted(unique, key=lambda k: -mixture.log_weight[k]))

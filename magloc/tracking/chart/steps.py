@@ -27,7 +27,7 @@ from magloc.measurement.nuisances import SensorErrors
 from magloc.measurement.pose import PoseErrors
 from magloc.tracking import row_filter
 from magloc.tracking.chart.known_moment import UNIFORM_IN_SPACE, KnownInWorld
-from magloc.tracking.chart.mixture import Mixture, root_of
+from magloc.tracking.chart.mixture import Mixture
 from magloc.tracking.chart.refit import RangeCells, RefitResult, refit_components
 from magloc.tracking.chart.split import split
 from magloc.tracking.chart.stack import Stack
@@ -244,13 +244,14 @@ class ChartFilter:
         if not fit.decided[:n_seeds].all() or not _is_credible(fit.mixture, fit.nis, rows):
             return known
         found = fit.mixture.take(unique_components(fit.mixture)).reduce()
-        n, heaviest = mixture.n_charted, np.repeat(np.argmax(mixture.log_weight), len(found))
-        elsewhere = _offset(found, mixture.x[heaviest]).min() > chdtri(n, CONTRADICTION)
+        n = mixture.n_charted
+        heaviest = mixture.x[np.argmax(mixture.log_weight)]
+        elsewhere = found.square_distance(heaviest).min() > chdtri(n, CONTRADICTION)
         if elsewhere and fit.nis.min() > known.nis:
             # The refit moved to another place that explains the rows less well.
             return known
         if len(found) == 1 and len(mixture) == 1:
-            change = _offset(mixture, found.x)[0]
+            change = mixture.square_distance(found.x)[0]
             if change < SETTLED * n and found.widths[0] < OLD_WIDTH:
                 known = replace(known, young=())
             if change < n and found.widths[0] < WIDER * mixture.widths[0]:
@@ -299,13 +300,6 @@ class ChartFilter:
             return found
         spread = replace(fit.mixture, log_weight=fit.mixture.log_weight + np.log(pitch[fit.origin]))
         return spread.take(unique_components(spread, cell[fit.origin])).reduce()
-
-
-def _offset(mixture: Mixture, x: FloatArray) -> FloatArray:
-    """Return the squared Mahalanobis distance (K,) of each state (K, N) from its component."""
-    n = mixture.n_charted
-    e = mixture.chart.coordinates(x[:, :n])
-    return np.asarray(np.sum(np.linalg.solve(root_of(mixture.S[:, :n]), e[..., None])[..., 0] ** 2, axis=1))
 
 
 def _is_credible(found: Mixture, nis: FloatArray, rows: Sequence[RowMeasurement]) -> bool:

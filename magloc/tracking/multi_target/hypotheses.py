@@ -15,14 +15,15 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from arrays.typing import FloatArray
+from magloc.chi_square import normalised_square
 from magloc.tracking import row_filter
+from magloc.tracking.chart.mixture import mixture_moments
 from magloc.tracking.multi_target.measurement import JointRow
 from magloc.tracking.multi_target.smoothing import MOST_ROWS, YoungTrack
 from magloc.tracking.multi_target.state import JointState
+from magloc.tracking.row_filter import LARGEST_BEND
 from magloc.tracking.sensor_health import SensorHealth
 
-LARGEST_BEND = 0.5
-"""Largest nonlinearity of the readings within one σ of the state, in σ of their noise."""
 STRAIGHT = 2.0
 """Largest nonlinearity within one σ of a refit of all rows of a young track."""
 REFITS = (3, 5, 8, 12, 18, 27, 40, 60, MOST_ROWS)
@@ -125,7 +126,7 @@ def match_sources(best: Hypothesis, other: Hypothesis) -> dict[int, int]:
     return {int(k): int(j) for k, j in zip(*linear_sum_assignment(apart_m), strict=True)}
 
 
-def mixture_moments(
+def moments_of_source(
     states: list[JointState], weights: FloatArray, sources: list[int | None]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return position, moment and covariance of a source in a mixture of states."""
@@ -135,10 +136,9 @@ def mixture_moments(
         return one.position_m[k], one.moment_Am2[k], one.covariances[k]
     x = np.array([np.concatenate([one.position_m[k], one.moment_Am2[k]]) for _, one, k in parts])
     share = np.array([weight for weight, _, _ in parts])
-    share /= share.sum()
-    mean = share @ x
-    covariance = sum(part * one.covariances[k] for part, (_, one, k) in zip(share, parts, strict=True))
-    return mean[:3], mean[3:], covariance + (share[:, None] * (x - mean)).T @ (x - mean)
+    of_parts = np.stack([one.covariances[k] for _, one, k in parts])
+    mean, covariance = mixture_moments(share / share.sum(), x, of_parts)
+    return mean[:3], mean[3:], covariance
 
 
 def inherit_ids(restart: Hypothesis, before: Hypothesis) -> tuple[int, ...]:
@@ -148,7 +148,7 @@ def inherit_ids(restart: Hypothesis, before: Hypothesis) -> tuple[int, ...]:
     """
     offset = restart.state.position_m[:, None] - before.state.position_m
     P, Q = (one.state.covariances[:, :3, :3] for one in (restart, before))
-    apart = np.vecdot(offset, np.linalg.solve(P[:, None] + Q, offset[..., None])[..., 0])
+    apart = normalised_square(offset, P[:, None] + Q)
     ids = list(restart.ids)
     for new, old in zip(*linear_sum_assignment(np.linalg.norm(offset, axis=-1)), strict=True):
         if apart[new, old] < _ANOTHER_SIGMA2:

@@ -14,8 +14,7 @@ from magloc.fields import dipole
 from magloc.localization.search.candidates import candidate_positions
 from magloc.measurement.rows import ambient_fields, channels_above_ambient, whitenings_of
 from magloc.tracking.multi_target.state import JointState
-from magloc.tracking.row_filter import Rows
-from magloc.tracking.rows import Row
+from magloc.tracking.rows import Row, Rows
 
 # Size of the cache of whitenings by available channels.
 _MOST_MASKS = 16
@@ -103,19 +102,8 @@ class JointRow:
 
 def stack_joint_rows(rows: Sequence[JointRow]) -> Rows:
     """Return rows of one array as an argument of kernels."""
-    array, distinct = rows[0].array, {id(row.transform): row.transform for row in rows}
-    index = {key: i for i, key in enumerate(distinct)}
-    return Rows(
-        array,
-        np.stack([row.z for row in rows]),
-        np.full(len(rows), array.n_channels),
-        np.stack(list(distinct.values())),
-        np.array([index[id(row.transform)] for row in rows]),
-        np.stack([row.effect for row in rows]),
-        np.stack([row.row.origin_m for row in rows]),
-        np.stack([row.row.R_world_from_array for row in rows]),
-        np.zeros((1, array.n_sensors, 3)),
-    )
+    array = rows[0].array
+    return Rows.stack(array, rows, np.zeros((1, array.n_sensors, 3)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ import numpy as np
 from arrays.typing import FloatArray
 from magloc import core
 from magloc.tracking import row_filter
-from magloc.tracking.motion import ornstein_uhlenbeck_step
+from magloc.tracking.motion import turning_step
 from magloc.tracking.multi_target.measurement import JointRow
 from magloc.tracking.multi_target.state import N_COMMON, N_OF_SOURCE, JointState
 
@@ -63,12 +63,10 @@ class FreeMotion:
 
     def numbers(self, dt_s: float, *, agility: float = 1.0) -> FloatArray:
         """Return the numbers (13,) of a step; `agility` multiplies the noise of velocity and turn."""
-        gain_s, decay, root_v = ornstein_uhlenbeck_step(self.correlation_s, dt_s)
-        turn_gain_s, turn_decay, root_w = ornstein_uhlenbeck_step(self.turn_correlation_s, dt_s)
-        lower = [0, 1, 1], [0, 0, 1]
-        of_v, of_w = agility * self.speed_m_s * root_v[lower], agility * self.turn_rad_s * root_w[lower]
+        velocity = self.correlation_s, agility * self.speed_m_s
+        turning = turning_step(velocity, (self.turn_correlation_s, agility * self.turn_rad_s), dt_s)
         walks = self.strength_change * math.sqrt(dt_s), self.common_walk_T * math.sqrt(dt_s)
-        return np.array([gain_s, decay, turn_gain_s, turn_decay, *of_v, *of_w, 0.0, *walks])
+        return np.array([*turning, 0.0, *walks])
 
     def start(self, moment_Am2: FloatArray, position_m: FloatArray, turn_rad: float, log_strength: float) -> FloatArray:
         """Return Cartesian roots (j, 12, 12) of sources (j, 3) with given standard deviations."""
@@ -84,19 +82,10 @@ class FreeMotion:
 
 def steps_problem(numbers: FloatArray) -> core.Problem:
     """Return the motion of sources in the steps (m, 13) to m rows, as an argument of kernels."""
-    added = np.repeat(numbers[:, _N_TURNING:], N_COMMON, axis=1)
-    return core.problem(
-        "motion",
-        n_noise=15,
-        F=None,
-        A=None,
-        B=None,
-        moved=None,
-        turning=np.ascontiguousarray(numbers[:, :_N_TURNING]),
-        kept=np.ones_like(added),
-        added=added,
-        step_of_row=np.arange(len(numbers)),
-    )
+    turning, walk = np.split(numbers, [_N_TURNING], axis=1)
+    added = np.repeat(walk, N_COMMON, axis=1)
+    every = np.arange(len(numbers))
+    return row_filter.motion_problem(every, (np.ones_like(added), added), turning=np.ascontiguousarray(turning))
 
 
 def predict_state(state: JointState, step: FloatArray, row: JointRow) -> JointState:

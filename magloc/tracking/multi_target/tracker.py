@@ -35,7 +35,7 @@ from magloc.tracking.multi_target.hypotheses import (
     inherit_ids,
     match_sources,
     merged_pairs,
-    mixture_moments,
+    moments_of_source,
     split,
 )
 from magloc.tracking.multi_target.measurement import Channels
@@ -222,7 +222,7 @@ class SourcesTracker:
                 prior=scene.prior,
                 body_length_m=0.0,
                 exclude_faulty=False,
-                seed=seed,
+                rng=seed,
             )
             fix = locator.fit(row.readings_T, row.ambient_T)
             if not fix.solutions:
@@ -411,7 +411,7 @@ class SourcesTracker:
         tracks = [
             SourcePoint(
                 row.time_s,
-                *mixture_moments([one.state for one in accepted], weights, [match.get(k) for match in matches]),
+                *moments_of_source([one.state for one in accepted], weights, [match.get(k) for match in matches]),
                 nis=chi2,
                 nis_dof=int(np.count_nonzero(row.available)),
                 status="predicted" if status in ("misfit", "no readings") else "merged" if merged[k] else status,

@@ -26,7 +26,7 @@ from magloc.tracking.chart.steps import from_cartesian
 from magloc.tracking.coordinates import Chart
 from magloc.tracking.measurement import RowMeasurement
 from magloc.tracking.motion import N_SOURCE
-from magloc.tracking.results import Innovation, Prediction, Step, TrackPoint, point_of_mixture
+from magloc.tracking.results import Innovation, Step, TrackPoint, point_of_mixture
 from magloc.tracking.rows import Row, rows_of
 from magloc.tracking.tracker import LARGEST_RANGE_ERROR, Tracker
 from magloc.tracking.whole_records.smoother import smooth_points, smooth_states
@@ -203,7 +203,7 @@ def _iterate_passes(
             with np.errstate(all="ignore"):  # passes may overflow
                 passed = _forward_pass(tracker, measurements, begin, states, used)
                 later = smooth_states(passed.steps)
-                sigma = np.array([np.sqrt(np.diagonal(P)[:N_SOURCE]) for _, P in later])
+                sigma = np.array([np.linalg.norm(S[:N_SOURCE], axis=1) for _, S in later])
         except np.linalg.LinAlgError:
             return None
         new = [x for x, _ in later]
@@ -243,7 +243,7 @@ def _forward_pass(
         if j:
             before = states[j - 1]
             at = tracker.predict(before, S, measurement.row.time_s - measurements[j - 1].row.time_s)
-            prediction = Prediction(at.x + at.F @ (x - before), at.S, at.F)
+            prediction = replace(at, x=at.x + at.F @ (x - before))
             x, S = prediction.x, prediction.S
         k = measurement.z.size
         innovations.append(None)

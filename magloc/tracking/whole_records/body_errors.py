@@ -81,4 +81,4 @@ def _errors(measurement: RowMeasurement, source: FloatArray, length_m: float) ->
     fields = finite_body_errors((array.positions - in_array[:3]) @ R.T, source[3:], length_m)
     gain = array.linear_gain(fields_at_sensors(array, in_array[:3], in_array[3:]))
     columns = np.einsum("cj,ij,cin->cn", gain, R, fields[array.channel_sensor])
-    return np.asarray(measurement.model.differences.transform @ columns / measurement.sigma[:, None])
+    return np.asarray(measurement.transform @ columns)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -44,8 +43,8 @@ def smoothing_bound(
     """
     bounds = np.full(len(rows), np.inf)
     steps = _steps_at_truth(tracker, rows, position_m, moment_Am2)
-    for step, (_, P) in zip(steps, smooth_states(steps), strict=True):
-        bounds[step.row] = math.sqrt(float(np.trace(P[:3, :3])))
+    for step, (_, S) in zip(steps, smooth_states(steps), strict=True):
+        bounds[step.row] = float(np.linalg.norm(S[:3]))
     return bounds
 
 

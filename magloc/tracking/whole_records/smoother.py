@@ -2,27 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from arrays.typing import FloatArray
+from magloc.state_space import predict, smoothing_gain
 from magloc.tracking.chart.mixture import Mixture
 from magloc.tracking.motion import N_SOURCE
-from magloc.tracking.results import Step, TrackPoint
+from magloc.tracking.results import Prediction, Step, TrackPoint
 
 
 def smooth_points(points: list[TrackPoint], steps: list[Step]) -> list[TrackPoint]:
     """Return the smoothed points of a record: a fixed-interval smoother over every track.
 
-    It is the Rauch-Tung-Striebel recursion on the filter's steps, with the gain :math:`P F^T P_{pred}^{-1}`.
+    It is the Rauch-Tung-Striebel recursion on the filter's steps, in square roots.
     """
     result = list(points)
-    for step, (x, P) in zip(steps, smooth_states(steps), strict=True):
+    for step, (x, S) in zip(steps, smooth_states(steps), strict=True):
         point = points[step.row]
         if point.position_m is not None:
             assert point.centroid_m is not None
-            source = Mixture.of_gaussian(x[:N_SOURCE], P[:N_SOURCE, :N_SOURCE], point.centroid_m, point.radius_m)
+            source = Mixture.of_gaussian(x[:N_SOURCE], S[:N_SOURCE], point.centroid_m, point.radius_m)
             mean, covariance = source.moments()
             result[step.row] = replace(
                 point, position_m=mean[:3], moment_Am2=mean[3:], covariance=covariance, mixture=source
@@ -30,24 +30,15 @@ def smooth_points(points: list[TrackPoint], steps: list[Step]) -> list[TrackPoin
     return result
 
 
-def smooth_states(steps: list[Step]) -> list[tuple[FloatArray, FloatArray]]:
-    """Return the smoothed state and covariance of every step."""
-    result: list[tuple[FloatArray, FloatArray]] = []
-    x, P = np.empty(0), np.empty((0, 0))
-    after: Step | None = None
+def smooth_states(steps: Sequence[Step]) -> list[tuple[FloatArray, FloatArray]]:
+    """Return the smoothed state of every step, and the root of its covariance."""
+    found: list[tuple[FloatArray, FloatArray]] = []
+    later: Prediction | None = None
     for step in reversed(steps):
-        later_x, later_P = x, P
-        x, P = step.x, step.S @ step.S.T
-        if after is not None and after.prediction is not None:
-            predicted = after.prediction
-            predicted_P = predicted.S @ predicted.S.T
-            # States of mixed units: solve with the correlations.
-            scale = np.sqrt(np.diagonal(predicted_P))
-            correlation = predicted_P / np.outer(scale, scale)
-            gain = np.linalg.solve(correlation, (predicted.F @ P) / scale[:, None]).T / scale
-            x = x + gain @ (later_x - predicted.x)
-            P = P + gain @ (later_P - predicted_P) @ gain.T
-            P = 0.5 * (P + P.T)
-        after = step
-        result.append((x, P))
-    return result[::-1]
+        x, S = step.x, step.S
+        if later is not None:
+            G, D = smoothing_gain(S, later.F, later.S_q)
+            x, S = x + G @ (found[-1][0] - later.x), predict(found[-1][1], G, D)
+        found.append((x, S))
+        later = step.prediction
+    return found[::-1]

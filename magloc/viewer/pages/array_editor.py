@@ -1,10 +1,9 @@
-"""An array whose sensors the user drags, and saves as an array file.
+"""Editor of an array: the user drags its sensors, and saves it as an array file.
 
 Use, inside a tab or folder of the GUI::
 
-    editor = ArrayEditor(server, array, on_change=[glyphs.set_array, dipole_editor.set_array], parent="/array")
-    editor.array                                       # as edited
-    editor.visible = False                             # takes its control out of the scene
+    editor = ArrayEditor(server, array, on_change=[glyphs.set_array, dipole_editor.set_array])
+    editor.array                                       # with all changes
 """
 
 from __future__ import annotations
@@ -22,11 +21,12 @@ from numpy.typing import ArrayLike
 from arrays.array import SensorArray
 from arrays.array_file import write_array
 from arrays.typing import FloatArray
-from magloc.viewer.pages import words
-from magloc.viewer.pages.dipole_editor import sensible_step
-from magloc.viewer.panels.inputs import SharedInput, set_value
-from magloc.viewer.panels.latest import Latest
+from magloc.viewer.pages import texts
+from magloc.viewer.pages.dipole_editor import input_step
+from magloc.viewer.panels.coalesced import CoalescedCall
+from magloc.viewer.panels.inputs import SharedInput
 
+_FILE = "edited-array.toml"
 _CONTROL = 0.6
 _SAME_PLACE_RTOL = 1e-3
 
@@ -37,21 +37,17 @@ class ArrayEditor:
     Parameters
     ----------
     server : viser.ViserServer
-        The panels are added where its GUI is at present.
+        The panels are added to the present container of its GUI.
     array : SensorArray
-    save_as : str
-        Path that is suggested for the edited array.
     on_change : sequence of callable
-        Called with the array after every change of it.
-    parent : str
-        Name of the scene node of the array's frame; empty for the scene itself.
+        Called with the array after every change.
     file : Path, optional
-        That the array was read from: the only file there is that may be replaced.
+        File of the array, the only existing file that the editor may replace.
 
     Attributes
     ----------
     array : SensorArray
-        As edited: the last one that was valid.
+        Last valid array.
     """
 
     def __init__(
@@ -59,18 +55,16 @@ class ArrayEditor:
         server: viser.ViserServer,
         array: SensorArray,
         *,
-        save_as: str = "edited-array.toml",
         on_change: Sequence[Callable[[SensorArray], None]] = (),
-        parent: str = "",
         file: Path | None = None,
     ) -> None:
-        self._own = set() if file is None else {file.resolve()}
+        self._own_files = set() if file is None else {file.resolve()}
         self.array = self._original = array
         self._on_change = on_change
-        self._follow = Latest(self._move_to_control)
+        self._update = CoalescedCall(self._move_to_control)
         self._sensor = array.ids[0]
         self.control = server.scene.add_transform_controls(
-            f"{parent}/sensor-control",
+            "/array/sensor-control",
             scale=_CONTROL * array.circumradius,
             disable_rotations=True,
             depth_test=False,
@@ -78,7 +72,7 @@ class ArrayEditor:
             position=array.positions[0],
             visible=False,
         )
-        gui, self._step_m = server.gui, sensible_step(array.circumradius)
+        gui, self._step_m = server.gui, input_step(array.circumradius)
         with gui.add_folder("Move a sensor"):
             self.sensor_dropdown = gui.add_dropdown("Sensor", array.ids)
             self.drag_checkbox = gui.add_checkbox("Drag it", False, hint="show arrows at the sensor in the scene")
@@ -86,135 +80,114 @@ class ArrayEditor:
             self.back_button = gui.add_button("Put all sensors back")
             self.move_panel = gui.add_html("")
         with gui.add_folder("Save the array"):
-            self.path_input = gui.add_text("File", save_as, hint="TOML array file, below the folder of the viewer")
+            self.path_input = gui.add_text("File", _FILE, hint="TOML array file, below the folder of the viewer")
             self.save_button = gui.add_button("Save")
             self.overwrite_button = gui.add_button("Overwrite the file", visible=False, color="red")
             self.save_panel = gui.add_html("")
-        self.control.on_update(self._follow)
-        self.sensor_dropdown.on_update(self._sensor_chosen)
-        self.drag_checkbox.on_update(self._drag_switched)
-        self._position = SharedInput(self.position_input, self._position_typed)
+        self.control.on_update(self._update)
+        self.sensor_dropdown.on_update(self._on_sensor)
+        self.drag_checkbox.on_update(self._on_drag)
+        self._position = SharedInput(self.position_input, self._on_position)
         self.back_button.on_click(lambda _: self._put_back())
-        self.path_input.on_update(lambda _: self._say_of_file("", ask=False))
+        self.path_input.on_update(lambda _: self._show_message("", can_overwrite=False))
         self.save_button.on_click(lambda _: self.save(overwrite=False))
         self.overwrite_button.on_click(lambda _: self.save(overwrite=True))
 
-    @property
-    def visible(self) -> bool:
-        """Whether the control is in the scene."""
-        return self.control.visible
-
-    @visible.setter
-    def visible(self, visible: bool) -> None:
-        set_value(self.drag_checkbox, visible)
-
-    def move(self, sensor_id: str, position_m: ArrayLike) -> None:
-        """Move a sensor, as if the user had chosen and dragged it.
-
-        Parameters
-        ----------
-        sensor_id : str
-        position_m : array-like, shape (3,)
-            In the array's frame [m].
-        """
-        set_value(self.sensor_dropdown, sensor_id)
-        self.control.position = np.asarray(position_m, dtype=np.float64)
-        self._follow()
-
     def save(self, *, overwrite: bool) -> None:
-        """Write the array to the path that the user typed; what this run opened or wrote only if told to.
+        """Write the array to the path in the input.
 
         Parameters
         ----------
         overwrite : bool
-            Whether the user has agreed that an existing file is replaced.
+            Whether the user has agreed to replace an existing file.
         """
         path = Path(self.path_input.value.strip())
         try:
-            fault = fault_of_path(path, self._own)
+            fault = path_fault(path, self._own_files)
             if fault:
-                self._say_of_file(fault, ask=False)
+                self._show_message(fault, can_overwrite=False)
             elif path.exists() and not overwrite:
-                self._say_of_file(f"{path} exists already: nothing was written yet.", ask=True)
+                self._show_message(f"{path} exists already: nothing was written yet.", can_overwrite=True)
             else:
                 write_array(path, self.array)
-                self._own.add(path.resolve())
-                self._say_of_file(f"saved as {path}", ask=False, warning=False)
-        except (OSError, RuntimeError, ValueError) as error:  # of names that no file can have too
-            self._say_of_file(f"{path} cannot be written: {getattr(error, 'strerror', None) or error}.", ask=False)
+                self._own_files.add(path.resolve())
+                self._show_message(f"saved as {path}", can_overwrite=False, warning=False)
+        except (OSError, RuntimeError, ValueError) as error:  # also from names that no file can have
+            reason = getattr(error, "strerror", None) or error
+            self._show_message(f"{path} cannot be written: {reason}.", can_overwrite=False)
 
-    def _say_of_file(self, text: str, *, ask: bool, warning: bool = True) -> None:
-        self.overwrite_button.visible = ask
-        self.save_panel.content = words.panel([escape(text)], warning=warning) if text else ""
+    def _show_message(self, text: str, *, can_overwrite: bool, warning: bool = True) -> None:
+        self.overwrite_button.visible = can_overwrite
+        self.save_panel.content = texts.panel_html([escape(text)], warning=warning) if text else ""
 
-    def _sensor_chosen(self, *_: object) -> None:
-        chosen = self.sensor_dropdown.value
-        if chosen != self._sensor:
-            self.control.position = self._place_of(chosen)
-            self._sensor = chosen
-            self._show_place()
+    def _on_sensor(self, *_: object) -> None:
+        sensor = self.sensor_dropdown.value
+        if sensor != self._sensor:
+            self.control.position = self._position_of(sensor)
+            self._sensor = sensor
+            self._show_position()
 
-    def _drag_switched(self, *_: object) -> None:
+    def _on_drag(self, *_: object) -> None:
         self.control.visible = self.drag_checkbox.value
 
-    def _position_typed(self) -> None:
+    def _on_position(self) -> None:
         self.control.position = np.array(self.position_input.value)
-        self._follow()
+        self._update()
 
     def _put_back(self) -> None:
         self._apply(self._original)
-        self.control.position = self._place_of(self._sensor)
+        self.control.position = self._position_of(self._sensor)
 
     def _move_to_control(self) -> None:
         try:
-            # Rounded to what a hand can do: the file should not have ten digits of it.
-            place = np.round(self.control.position, 2 - round(math.log10(self._step_m)))
-            array = moved(self.array, self._sensor, place)
+            # Rounded to the precision of a hand, so that the file has few digits.
+            position_m = np.round(self.control.position, 2 - round(math.log10(self._step_m)))
+            array = move_sensor(self.array, self._sensor, position_m)
         except ValueError as error:
-            self.move_panel.content = words.panel([escape(f"Not moved: {error}")], warning=True)
+            self.move_panel.content = texts.panel_html([escape(f"Not moved: {error}")], warning=True)
             return
         self._apply(array)
 
     def _apply(self, array: SensorArray) -> None:
         self.array = array
         self.move_panel.content = ""
-        self._show_place()
-        for follow in self._on_change:
-            follow(array)
+        self._show_position()
+        for call in self._on_change:
+            call(array)
 
-    def _show_place(self) -> None:
-        x, y, z = self._place_of(self._sensor).tolist()
+    def _show_position(self) -> None:
+        x, y, z = self._position_of(self._sensor).tolist()
         self._position.show((x, y, z))
 
-    def _place_of(self, sensor_id: str) -> FloatArray:
+    def _position_of(self, sensor_id: str) -> FloatArray:
         return self.array.positions[self.array.ids.index(sensor_id)]
 
 
-def moved(array: SensorArray, sensor_id: str, position_m: ArrayLike) -> SensorArray:
-    """The array with one sensor at another place.
+def move_sensor(array: SensorArray, sensor_id: str, position_m: ArrayLike) -> SensorArray:
+    """Return the array with one sensor at another position.
 
-    ``position_m`` (3,): in the array's frame [m]. Raises ValueError: another sensor of the same kind stands there,
-    or this is no array.
+    ``position_m`` (3,): position in the array's frame [m]. Raises ValueError if another sensor of the same kind is
+    there, or the array would be invalid.
     """
     place = tuple(np.asarray(position_m, dtype=np.float64).tolist())
     sensors = tuple(replace(sensor, position_m=place) if sensor.id == sensor_id else sensor for sensor in array.sensors)
-    (changed,) = (sensor for sensor in sensors if sensor.id == sensor_id)
+    own = sensors[array.ids.index(sensor_id)]
     for sensor in sensors:
-        distance = float(np.linalg.norm(np.subtract(sensor.position_m, changed.position_m)))
-        if sensor is not changed and sensor.kind == changed.kind and distance <= _SAME_PLACE_RTOL * array.circumradius:
+        distance = float(np.linalg.norm(np.subtract(sensor.position_m, own.position_m)))
+        if sensor is not own and sensor.kind == own.kind and distance <= _SAME_PLACE_RTOL * array.circumradius:
             raise ValueError(f"sensors {sensor.id} and {sensor_id} would stand in the same place.")
     return replace(array, sensors=sensors)
 
 
-def fault_of_path(path: Path, own: Collection[Path] = ()) -> str:
-    """Why an array file must not be written to a path, as a sentence; empty if nothing speaks against it.
+def path_fault(path: Path, own_files: Collection[Path] = ()) -> str:
+    """Return the reason why an array file must not be written to a path, or an empty text.
 
-    A file below the working directory, where there is none yet, or one of `own`.
+    Allowed are new files below the working directory, and `own_files`.
     """
     if path.suffix.lower() != ".toml":
         return f"{path}: expected the name of a file that ends in .toml."
     place = path.resolve()
-    if place in own:
+    if place in own_files:
         return ""
     if not place.is_relative_to(Path.cwd().resolve()):
         return f"{path}: expected a file below the folder in which the viewer was started."

@@ -1,4 +1,4 @@
-"""What of the field is seen of a row of readings: arrows at the sensors, field lines, a slice of its modulus."""
+"""Panel for the fields of a row of readings: arrows at the sensors, field lines, and a slice of the modulus."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from arrays.array import SensorArray
 from arrays.typing import FloatArray
 from magloc.fields.dipole import field
 from magloc.readings import Readings
-from magloc.viewer.pages import words
+from magloc.viewer.pages import texts
 from magloc.viewer.pages.fixes import FixView
-from magloc.viewer.panels.latest import Latest
+from magloc.viewer.panels.coalesced import CoalescedCall
 from magloc.viewer.panels.readings_plot import differences_from_mean
 from magloc.viewer.scene.fields import FieldSlice, SensorArrows
 from magloc.viewer.scene.glyphs import ARROW_COLOUR
@@ -21,20 +21,18 @@ _PLANES = (NONE, "across x", "across y", "across z")
 
 
 class FieldPanel:
-    """Switches for the fields of the row that is shown.
+    """Switches for the fields of the present row.
 
     Parameters
     ----------
     server : viser.ViserServer
-        The panels are added where its GUI is at present.
+        The panel is added to the present container of its GUI.
     array : SensorArray
     view : FixView
     rows : Readings, optional
-        Without them there are no arrows.
+        Readings for the arrows.
     size_m : float
-        Length of the longest arrow, and a quarter of the side of the slice.
-    parent : str
-        Name of the node of the array's frame.
+        Length of the longest arrow, and a quarter of the side of the slice [m].
     """
 
     def __init__(
@@ -44,11 +42,10 @@ class FieldPanel:
         view: FixView,
         rows: Readings | None,
         size_m: float,
-        parent: str = "/array",
     ) -> None:
         self._array, self._view, self._rows = array, view, rows
         self._vector = np.array([sensor.kind == "vector" for sensor in array.sensors])
-        self._arrows = SensorArrows(server.scene, f"{parent}/arrows", size_m, ARROW_COLOUR)
+        self._arrows = SensorArrows(server.scene, "/array/arrows", size_m, ARROW_COLOUR)
         self._slice = FieldSlice(server.scene, "/fixes/slice", 4.0 * size_m)
         gui = server.gui
         with gui.add_folder("Field"):
@@ -58,16 +55,16 @@ class FieldPanel:
             kinds = (NONE, MEASURED, RESIDUAL) if has_arrows else (NONE,)
             self.arrows_dropdown = gui.add_dropdown(
                 "arrows", kinds, disabled=not has_arrows,
-                hint="At vector sensors, to one scale: the field beyond their mean, or what the fix leaves of it.",
+                hint="Fields at the vector sensors less their mean, or residuals of the fix, on one scale.",
             )  # fmt: skip
             self._panel = gui.add_html("")
-        follow = Latest(self._show)
+        follow = CoalescedCall(self._show)
         for switch in (self.plane_dropdown, self.arrows_dropdown):
             switch.on_update(follow)
         self.lines_checkbox.on_update(lambda _: view.show_field_lines(self.lines_checkbox.value))
 
     def show_row(self, _: int) -> None:
-        """Follow the row that the view shows."""
+        """Show the fields of the view's row."""
         self._show()
 
     def _show(self) -> None:
@@ -79,16 +76,16 @@ class FieldPanel:
         else:
             positions, moments = np.array([[source.position_m, source.moment_Am2] for source in sources]).swapaxes(0, 1)
             low, high = self._slice.show(positions, moments, "xyz".index(plane[-1]))
-            lines.append(f"|B| from {words.field_text(low)} (violet) to {words.field_text(high)} (yellow), logarithmic")
+            lines.append(f"|B| from {texts.field_text(low)} (violet) to {texts.field_text(high)} (yellow), logarithmic")
         if self.arrows_dropdown.value == NONE:
             self._arrows.hide()
         else:
             longest = self._arrows.show(self._array.positions[self._vector], self._vectors(self.arrows_dropdown.value))
-            lines.append(f"longest arrow: {words.field_text(longest)}")
-        self._panel.content = words.panel(lines) if lines else ""
+            lines.append(f"longest arrow: {texts.field_text(longest)}")
+        self._panel.content = texts.panel_html(lines) if lines else ""
 
     def _vectors(self, kind: str) -> FloatArray:
-        """Fields (n, 3) at the vector sensors beyond their mean, in the array's axes [T]."""
+        """Return the fields (n, 3) at the vector sensors less their mean, in the array's axes [T]."""
         if self._rows is None:
             return np.zeros((0, 3))
         row = self._rows[self._view.row]

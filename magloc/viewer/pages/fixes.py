@@ -1,4 +1,4 @@
-"""Fixes of the rows of a readings file in a scene: all of them as points, and one with its uncertainty."""
+"""View of the fixes of rows: all of them as points, and one with its uncertainty."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import viser
 
 from arrays.typing import FloatArray, IntArray
 from magloc.localization.fit.results import Fix, Solution, Source
-from magloc.viewer.pages import words
+from magloc.viewer.pages import texts
+from magloc.viewer.panels.coalesced import CoalescedCall
 from magloc.viewer.panels.events import EventButtons, rows_of_change
 from magloc.viewer.panels.inputs import set_value
-from magloc.viewer.panels.latest import Latest
-from magloc.viewer.panels.played_time import time_strip
+from magloc.viewer.panels.time_player import time_strip
 from magloc.viewer.scene.glyphs import (
     DIPOLE_COLOUR,
     FIELD_LINE_COLOUR,
@@ -24,27 +24,30 @@ from magloc.viewer.scene.glyphs import (
     UNDETECTED_COLOUR,
     DipoleGlyph,
     SurfaceGlyph,
-    dots,
-    screen_label,
+    add_label,
+    add_points,
 )
 from magloc.viewer.scene.legend import Entry, Swatch
 from magloc.viewer.scene.ruler import DropLines
-from magloc.viewer.scene.shapes import NOTHING, Surface, joined, uncertainty
+from magloc.viewer.scene.shapes import NOTHING, Surface, join_surfaces, uncertainty
 
 _MOST_OTHERS = 3
 _FARTHEST_OF_RANGE = 2.5
 
 
 class FixView:
-    """Fixes in a scene, in its frame, and the source of one row, with where it may be.
+    """All fixes in a scene, and the sources of one row with their regions.
 
     Parameters
     ----------
+    server : viser.ViserServer
     times_s : ndarray, shape (n,)
+    fixes : sequence of Fix
+        Fixes of the n rows in the frame of the scene.
     centroids_m : ndarray, shape (n, 3)
-        Of the sensors.
+        Centroids of the sensors [m].
     size_m, reach_m, dot_m : float
-        Length of the arrows and of the field lines, diameter of the dots that stand for all fixes.
+        Length of the arrows, reach of the field lines, and diameter of the points of all fixes [m].
     """
 
     def __init__(
@@ -60,12 +63,12 @@ class FixView:
     ) -> None:
         self._server, self._times, self._fixes, self._centroids = server, times_s, fixes, centroids_m
         scene = server.scene
-        of_row, positions = best_positions(fixes)
+        rows, positions = best_positions(fixes)
         self._detected = np.array([fix.detected and bool(fix.solutions) for fix in fixes])
         if len(positions) > 1:
-            colours = np.where(self._detected[of_row, None], FIT_COLOUR, UNDETECTED_COLOUR).astype(np.uint8)
-            dots(scene, "/fixes/all", positions, colours, dot_m)
-        most = int(np.bincount(of_row, minlength=1).max())  # sources of a row
+            colours = np.where(self._detected[rows, None], FIT_COLOUR, UNDETECTED_COLOUR).astype(np.uint8)
+            add_points(scene, "/fixes/all", positions, colours, dot_m)
+        most = int(np.bincount(rows, minlength=1).max())  # sources of a row
         self.best = DipoleGlyph(scene, "/fixes/best", size_m, DIPOLE_COLOUR, reach_m)
         more = [DipoleGlyph(scene, f"/fixes/best-{i}", size_m, DIPOLE_COLOUR, reach_m) for i in range(2, most + 1)]
         self._best = [self.best, *more]
@@ -73,20 +76,20 @@ class FixView:
         self.others = [DipoleGlyph(scene, f"/fixes/other-{i}", 0.8 * size_m, OTHER_COLOUR) for i in range(n_others)]
         self.region = SurfaceGlyph(scene, "/fixes/region", REGION_COLOUR, 0.4)
         self.drop = DropLines(scene, "/fixes/drop", DIPOLE_COLOUR)
-        self.time_label = screen_label(scene, "/fixes/time", "", np.zeros(3), "center-left")
-        self.row = _clearest(fixes, centroids_m)
+        self.time_label = add_label(scene, "/fixes/time", "", np.zeros(3), "center-left")
+        self.row = _clearest_row(fixes, centroids_m)
         self.show_row(self.row)
 
     def show_row(self, row: int) -> None:
-        """Show another row."""
+        """Show a row."""
         with self._server.atomic():
             self._show(row)
 
     def _show(self, row: int) -> None:
         self.row = row
-        solutions = heaviest_first(self._fixes[row])
-        self.shown_sources = _sources(solutions[:1])
-        best, others = self.shown_sources, _sources(solutions[1 : 1 + _MOST_OTHERS])
+        solutions = best_first(self._fixes[row])
+        self.shown_sources = _sources_of(solutions[:1])
+        best, others = self.shown_sources, _sources_of(solutions[1 : 1 + _MOST_OTHERS])
         for glyph in self._best:
             glyph.body.color = DIPOLE_COLOUR if self._detected[row] else UNDETECTED_COLOUR
         for glyphs, sources in ((self._best, best), (self.others, others)):
@@ -101,16 +104,16 @@ class FixView:
             self.time_label.position = best[0].position_m
         self.drop.show([source.position_m for source in best])
         regions = [self._region_of(source) for source in best]
-        self.region.show(regions[0] if len(regions) == 1 else joined(regions))
+        self.region.show(regions[0] if len(regions) == 1 else join_surfaces(regions))
 
     def show_field_lines(self, visible: bool) -> None:
-        """Show the field lines of the row's sources, or not."""
+        """Show or hide the field lines of the row's sources."""
         for glyph in self._best:
             if glyph.field_lines is not None:
                 glyph.field_lines.visible = visible
 
     def _region_of(self, source: Source) -> Surface:
-        """Where a source may be; nowhere else if its place is known beforehand."""
+        """Return the 95 % region of a source, or nothing if its position was known beforehand."""
         if source.covariance is None or len(source.covariance) < 6:
             return NOTHING
         centroid = self._centroids[self.row]
@@ -124,70 +127,68 @@ class FixView:
         )
 
     def add_controls(self, on_row: Sequence[Callable[[int], None]] = ()) -> None:
-        """Put the choice of the row, which calls `on_row`, and what is known of its fix, into the panel."""
+        """Add the slider of the row, which calls `on_row`, and the text of its fix to the panel."""
         gui = self._server.gui
         with gui.add_folder("Fix"):
             if len(self._fixes) > 1:
                 self.slider = gui.add_slider("row", min=0, max=len(self._fixes) - 1, step=1, initial_value=self.row)
-                states = [(bool(fix.solutions), *words.doubts_of(fix)) for fix in self._fixes]
-                plain = np.array([state == (True,) for state in states])
-                text = f"{int(plain.sum())} of {len(plain)} rows have a fix that nothing speaks against; grey: others"
+                states = [(bool(fix.solutions), *texts.warning_lines(fix)) for fix in self._fixes]
+                is_good = np.array([state == (True,) for state in states])
+                text = f"{int(is_good.sum())} of {len(is_good)} rows have a fix without warnings; grey: others"
                 order = np.argsort(self._times, kind="stable")
                 since = self._times[order] - self._times[order[0]]
-                self.strip_panel = gui.add_html(words.panel([time_strip(since, plain[order], FIT_COLOUR), text]))
+                self.strip_panel = gui.add_html(texts.panel_html([time_strip(since, is_good[order], FIT_COLOUR), text]))
                 self.events = EventButtons(
                     gui, rows_of_change(states), lambda: self.row, self.choose,
-                    "Rows in which a source is detected or lost, or a doubt comes or goes. Keys: E, and Shift E.",
+                    "Rows in which a source is detected or lost, or a warning begins or ends. Keys: E and Shift E.",
                 )  # fmt: skip
-            panel = gui.add_html(self.words())
+            panel = gui.add_html(self.html())
 
         def follow() -> None:
             self.show_row(int(self.slider.value))
-            panel.content = self.words()
+            panel.content = self.html()
             for call in on_row:
                 call(self.row)
 
         if len(self._fixes) > 1:
-            self.slider.on_update(Latest(follow))
+            self.slider.on_update(CoalescedCall(follow))
 
     def choose(self, row: int) -> None:
-        """Show a row that the user has chosen elsewhere than at the slider."""
+        """Show a row that the user has selected, and move the slider there."""
         set_value(self.slider, row)
 
-    def words(self) -> str:
-        """What is known of the row's fix, as HTML."""
+    def html(self) -> str:
+        """Return the text of the row's fix as HTML."""
         fix = self._fixes[self.row]
         time = f"<b>time {self._times[self.row]:.6g} s</b>"
         if not fix.solutions:
-            return words.panel([time, f"<b>no fix</b>: {escape(fix.reason)}"], warning=True)
+            return texts.panel_html([time, f"<b>no fix</b>: {escape(fix.reason)}"], warning=True)
         best = fix.best
         places = []
         for source in best.sources:
-            places.append(words.place(source.position_m))
+            places.append(texts.position_text(source.position_m))
             places.append(f"moment {np.linalg.norm(source.moment_Am2):.3g} A·m²")
         lines = [
-            *words.doubts_of(fix),
+            *texts.warning_lines(fix),
             f"{time}, {places[0]}",
             *places[1:],
             f"χ² {best.chi2:.3g}, {best.dof} degrees of freedom",
             *(
-                words.range_words(ends, observable=source.range_observable)
+                texts.range_text(interval, observable=source.range_observable)
                 for source in best.sources
-                for ends in source.range_interval_m
+                for interval in source.range_interval_m
             ),
+            *texts.ambiguity_lines(fix),
         ]
-        others = len(fix.solutions) - 1
-        if others:
-            lines.append(f"<b>{others} other solution{'s fit' if others > 1 else ' fits'}</b> almost as well")
-        return words.panel(lines, warning=bool(words.doubts_of(fix)))
+        return texts.panel_html(lines, warning=bool(texts.warning_lines(fix)))
 
     @property
-    def dropped(self) -> tuple[str, ...]:
-        """Sensors that are not used in the row."""
+    def dropped_sensors(self) -> tuple[str, ...]:
+        """Sensors that the row's fix does not use."""
         return tuple(self._fixes[self.row].dropped_sensors)
 
     def entries(self) -> list[Entry]:
-        """Lines of the legend."""
+        """Return the entries of the legend."""
         if not any(fix.solutions for fix in self._fixes):
             return []
         lines: list[Entry] = [
@@ -210,8 +211,8 @@ class FixView:
         return lines
 
 
-def _clearest(fixes: Sequence[Fix], centroids_m: FloatArray) -> int:
-    """The row that is shown first: of those with a source, where the position is best known, relative to its range."""
+def _clearest_row(fixes: Sequence[Fix], centroids_m: FloatArray) -> int:
+    """Return the row with the smallest uncertainty of a detected source relative to its range."""
 
     def relative_variance(row: int) -> float:
         if not fixes[row].solutions:
@@ -225,27 +226,27 @@ def _clearest(fixes: Sequence[Fix], centroids_m: FloatArray) -> int:
     return min(range(len(fixes)), key=lambda row: (not fixes[row].detected, relative_variance(row)))
 
 
-def heaviest_first(fix: Fix) -> list[Solution]:
-    """The solutions of a fix: its best one, and then the others in their order."""
+def best_first(fix: Fix) -> list[Solution]:
+    """Return the solutions of a fix: its best one, then the others in their order."""
     if not fix.solutions:
         return []
     best = fix.best
     return [best, *(solution for solution in fix.solutions if solution is not best)]
 
 
-def _sources(solutions: Sequence[Solution]) -> list[Source]:
+def _sources_of(solutions: Sequence[Solution]) -> list[Source]:
     return [source for solution in solutions for source in solution.sources]
 
 
 def best_positions(fixes: Sequence[Fix]) -> tuple[IntArray, FloatArray]:
-    """Rows (k,) and positions (k, 3) of all sources of the best solutions [m]."""
+    """Return rows (k,) and positions (k, 3) of all sources of the best solutions [m]."""
     found = [(row, source) for row, fix in enumerate(fixes) if fix.solutions for source in fix.best.sources]
     positions = np.array([source.position_m for _, source in found]).reshape(-1, 3)
     return np.array([row for row, _ in found], dtype=np.intp), positions
 
 
 def single_sources(fixes: Sequence[Fix]) -> tuple[FloatArray, FloatArray] | None:
-    """Position and moment of every row's source (n, 3), NaN without one; None where a row has several."""
+    """Return position and moment of every row's source (n, 3), or None for several sources."""
     if any(fix.solutions and len(fix.best.sources) > 1 for fix in fixes):
         return None
     nowhere = np.full(3, np.nan)

@@ -1,4 +1,4 @@
-"""The page of sources that are followed while their readings come in: the newest row, and the last seconds."""
+"""Live page of tracked sources: the newest row, and the last seconds."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from magloc.live.tally import Tally
 from magloc.readings import Readings
 from magloc.tracking.results import SourcesPoint, TrackPoint, track_column
 from magloc.tracking.rows import Row
-from magloc.viewer.pages import words
-from magloc.viewer.pages.track_player import SOURCE_COLOURS, point_words
+from magloc.viewer.pages import texts
+from magloc.viewer.pages.track_player import SOURCE_COLOURS, point_html
 from magloc.viewer.panels.readings_plot import ReadingsPlot, residuals_of
 from magloc.viewer.scene.glyphs import (
     DIPOLE_COLOUR,
@@ -33,93 +33,92 @@ from magloc.viewer.scene.glyphs import (
     Colour,
     DipoleGlyph,
     SurfaceGlyph,
-    screen_lines,
+    add_lines,
+    show_segments,
 )
 from magloc.viewer.scene.legend import Entry, Swatch
 from magloc.viewer.scene.shapes import ellipsoid, line_segments
 
 WINDOW_S = 10.0
-"""Of the tail and the plots."""
+"""Length of the tail and of the plots."""
 _MOST_ROWS = 400
 _FRAMES_PER_SECOND = 15.0
 _PLOT_S = 0.25
-"""Between two drawings of the plots, which take longer."""
+"""Time between two updates of the plots, which take longer than the scene."""
 _RATE_ROWS = 200
 _REST_S = 3.0
 NOWHERE = np.full(3, np.nan)
-ALONE = 0
-"""Instead of the id of a source that is followed on its own."""
+SINGLE_ID = 0
+"""Id of a source that is tracked on its own."""
 
 
 class Controls(Protocol):
-    """What the buttons of the page do, as of :class:`magloc.live.Follower`."""
+    """Protocol of the object that the buttons control, such as :class:`magloc.live.Follower`."""
 
     def stop(self) -> None:
-        """Follow nothing."""
+        """Stop tracking."""
 
     def start(self) -> None:
-        """Follow again."""
+        """Restart tracking."""
 
     def tare(self, rest_s: float) -> None:
-        """Take the next seconds as the background."""
+        """Take the mean of the next seconds as the background."""
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
-    """One row as the page shows it."""
+class LiveRow:
+    """Row with its point."""
 
     point: TrackPoint | SourcesPoint
     row: Row | None
 
 
-class Marks:
-    """A source in the scene: its moment, its 95 % region, and its track of the last seconds."""
+class LiveSource:
+    """Source in the scene: moment, 95 % region, and track of the last seconds."""
 
     def __init__(self, scene: viser.SceneApi, name: str, array: SensorArray, colour: Colour, region: Colour) -> None:
         size = 0.5 * array.circumradius
         self.dipole = DipoleGlyph(scene, f"{name}/moment", size, DIPOLE_COLOUR)
-        self._tail = screen_lines(scene, f"{name}/tail", np.zeros((1, 2, 3)), colour, 3.0, visible=False)
+        self._tail = add_lines(scene, f"{name}/tail", np.zeros((1, 2, 3)), colour, 3.0, visible=False)
         self._region = SurfaceGlyph(scene, f"{name}/region", region, 0.35)
 
     def show(self, point: TrackPoint | None, recent: Sequence[TrackPoint]) -> None:
-        """Show the source now, where it is known, and its last points."""
+        """Show the present source, if it is known, and its last points."""
         position, moment = (None, None) if point is None else (point.position_m, point.moment_Am2)
         self.dipole.show(NOWHERE if position is None else position, NOWHERE if moment is None else moment)
         covariance = None if point is None else point.covariance
         self._region.show(None if position is None or covariance is None else ellipsoid(position, covariance[:3, :3]))
         segments = line_segments(track_column(recent, "position_m", 3)) if len(recent) > 1 else np.zeros((0, 2, 3))
-        self._tail.visible = bool(len(segments))
-        if len(segments):
-            self._tail.points = segments.astype(np.float32)
+        show_segments(self._tail, segments)
 
 
 class LivePage:
-    """Shows the newest of the rows that it is told of, from a thread of its own: who tells it never waits.
+    """Page that draws the newest row in a thread of its own, so that the caller never waits.
 
     Parameters
     ----------
     server : viser.ViserServer
     array : SensorArray
     controls : Controls, optional
-        What the buttons work on; without it there are none.
+        Object of the buttons; without it there are none.
     """
 
     def __init__(self, server: viser.ViserServer, array: SensorArray, controls: Controls | None) -> None:
         self._server, self._array, self._controls = server, array, controls
         self._lock, self._new, self._stop = Lock(), Event(), Event()
-        self._newest: Seen | None = None
+        self._newest: LiveRow | None = None
         self._tally: Tally | None = None
         self._latency_s = math.nan
-        self._window: deque[Seen] = deque(maxlen=_MOST_ROWS + 1)
+        self._window: deque[LiveRow] = deque(maxlen=_MOST_ROWS + 1)
         self._arrivals: deque[float] = deque(maxlen=_RATE_ROWS)
         self._glyphs = ArrayGlyphs(server.scene, array)
-        self._marks = {ALONE: Marks(server.scene, "/live", array, TRACK_COLOUR, REGION_COLOUR)}
+        self._sources = {SINGLE_ID: LiveSource(server.scene, "/live", array, TRACK_COLOUR, REGION_COLOUR)}
         self._add_panels()
         self._thread = Thread(target=self._run, name="magloc-live-page", daemon=True)
         self._thread.start()
 
     def entries(self) -> list[Entry]:
-        """Lines of the legend."""
+        """Return the entries of the legend."""
         return [
             Swatch(DIPOLE_COLOUR, "the source now: the arrow is its moment"),
             Swatch(TRACK_COLOUR, f"its track of the last {WINDOW_S:g} s; of several each has a colour"),
@@ -127,42 +126,42 @@ class LivePage:
         ]
 
     def update(self, point: TrackPoint | SourcesPoint, row: Row | None, tally: Tally | None, latency_s: float) -> None:
-        """Take one more row; what has not been shown yet is passed over."""
-        seen = Seen(point, row)
+        """Set the newest row; rows that have not been drawn yet are skipped."""
+        newest = LiveRow(point, row)
         with self._lock:
-            self._newest, self._tally, self._latency_s = seen, tally, latency_s
+            self._newest, self._tally, self._latency_s = newest, tally, latency_s
             self._arrivals.append(perf_counter())
             window = self._window
             if window and point.time_s < window[-1].point.time_s:  # the sender's clock was set back
                 window.clear()
             if not window or point.time_s - window[-1].point.time_s >= WINDOW_S / _MOST_ROWS:
-                window.append(seen)
+                window.append(newest)
         self._new.set()
 
     def close(self) -> None:
-        """End the thread; to be called before the server is stopped."""
+        """End the thread. Call this before the server is stopped."""
         self._stop.set()
         self._new.set()
         self._thread.join()
 
     def _add_panels(self) -> None:
         gui = self._server.gui
-        if self._controls is not None:  # above all that grows and shrinks
+        if self._controls is not None:  # above the panels of variable height
             with gui.add_folder("Follow"):
-                self._switch = gui.add_button("Stop", hint="Follow nothing until Start; rows are still counted.")
-                self._tare = gui.add_button("Tare", hint="What is read meanwhile is taken off all later readings.")
+                self._switch = gui.add_button("Stop", hint="Stop tracking until Start; rows are still counted.")
+                self._tare = gui.add_button("Tare", hint="Subtract the mean of the next seconds from later readings.")
                 self._rest = gui.add_number("Rest [s]", _REST_S, min=0.1, max=600.0, step=0.1)
-                self._said = gui.add_html("")
-                self._switch.on_click(self._switched)
-                self._tare.on_click(self._tared)
+                self._message = gui.add_html("")
+                self._switch.on_click(self._on_switch)
+                self._tare.on_click(self._on_tare)
         with gui.add_folder("Source"):
-            self._source_panel = gui.add_html(words.panel(["no row yet"]))
+            self._source_panel = gui.add_html(texts.panel_html(["no row yet"]))
         with gui.add_folder("Stream"):
-            self._stream_panel = gui.add_html(words.panel(["no row yet"]))
+            self._stream_panel = gui.add_html(texts.panel_html(["no row yet"]))
         empty = Readings(np.full((1, self._array.n_channels), np.nan))
         self._plot = ReadingsPlot(self._server, empty, self._array, residuals_T=empty.values_T, window_s=WINDOW_S)
 
-    def _switched(self, _: object) -> None:
+    def _on_switch(self, _: object) -> None:
         assert self._controls is not None
         if self._switch.label == "Stop":
             self._controls.stop()
@@ -171,18 +170,18 @@ class LivePage:
             self._controls.start()
             self._switch.label = "Stop"
 
-    def _tared(self, _: object) -> None:
+    def _on_tare(self, _: object) -> None:
         assert self._controls is not None
         try:
             self._controls.tare(float(self._rest.value))
-            self._said.content = ""
+            self._message.content = ""
         except InputError as error:
-            self._said.content = words.panel([escape(str(error))], warning=True)
+            self._message.content = texts.panel_html([escape(str(error))], warning=True)
 
     def _run(self) -> None:
-        plotted, plotted_at = True, 0.0
+        is_plotted, plot_time_s = True, 0.0
         while True:
-            is_new = self._new.wait(None if plotted else _PLOT_S)
+            is_new = self._new.wait(None if is_plotted else _PLOT_S)
             if self._stop.is_set():
                 return
             self._new.clear()
@@ -193,31 +192,31 @@ class LivePage:
             if is_new:
                 with self._server.atomic():
                     self._show(newest, window)
-                plotted = False
-            if perf_counter() - plotted_at >= _PLOT_S:
+                is_plotted = False
+            if perf_counter() - plot_time_s >= _PLOT_S:
                 self._show_plot(window)
-                plotted, plotted_at = True, perf_counter()
+                is_plotted, plot_time_s = True, perf_counter()
             self._stop.wait(1.0 / _FRAMES_PER_SECOND)
 
-    def _show(self, newest: Seen, window: Sequence[Seen]) -> None:
-        """The newest row in the scene and in words."""
+    def _show(self, newest: LiveRow, window: Sequence[LiveRow]) -> None:
+        """Show the newest row in the scene and in the panels."""
         point, row = newest.point, newest.row
         if row is not None:
             self._glyphs.set_pose(row.origin_m, Rotation.from_matrix(row.R_world_from_array).as_quat())
-        recent = [seen.point for seen in window if seen.point.time_s >= point.time_s - WINDOW_S]
-        now = sources_of(point)
+        recent = [each.point for each in window if each.point.time_s >= point.time_s - WINDOW_S]
+        now = sources_by_id(point)
         for id in now:
-            if id not in self._marks:
+            if id not in self._sources:
                 colour = SOURCE_COLOURS[(id - 1) % len(SOURCE_COLOURS)]
-                self._marks[id] = Marks(self._server.scene, f"/live/{id}", self._array, colour, colour)
-        for id, marks in self._marks.items():
+                self._sources[id] = LiveSource(self._server.scene, f"/live/{id}", self._array, colour, colour)
+        for id, source in self._sources.items():
             missing = TrackPoint(point.time_s)
-            marks.show(now.get(id), [sources_of(seen).get(id, missing) for seen in recent])
-        self._source_panel.content = words_of(point)
-        self._stream_panel.content = words.panel(self._stream_lines())
+            source.show(now.get(id), [sources_by_id(each).get(id, missing) for each in recent])
+        self._source_panel.content = sources_html(point)
+        self._stream_panel.content = texts.panel_html(self._stream_lines())
 
     def _stream_lines(self) -> list[str]:
-        """Rate, latency and what was lost."""
+        """Return lines with rate, latency and counts."""
         with self._lock:
             arrivals, tally, latency_s = list(self._arrivals), self._tally, self._latency_s
         lines = []
@@ -232,10 +231,10 @@ class LivePage:
                 lines.append(f"{tally.skipped} skipped")
         return lines
 
-    def _show_plot(self, window: Sequence[Seen]) -> None:
-        """Readings and residuals of the last seconds."""
+    def _show_plot(self, window: Sequence[LiveRow]) -> None:
+        """Show readings and residuals of the last seconds."""
         last_s = window[-1].point.time_s if window else 0.0
-        shown = [(seen.point, seen.row) for seen in window if seen.point.time_s >= last_s - WINDOW_S]
+        shown = [(each.point, each.row) for each in window if each.point.time_s >= last_s - WINDOW_S]
         rows = [row for _, row in shown if row is not None]
         if len(rows) != len(shown) or not rows:
             return
@@ -243,30 +242,30 @@ class LivePage:
         origins, R = np.array([row.origin_m for row in rows]), np.array([row.R_world_from_array for row in rows])
         time_s = np.array([point.time_s for point, _ in shown]) - last_s
         readings = Readings(values, time_s=time_s, array_position_m=origins, array_rotation=Rotation.from_matrix(R))
-        of_rows = [sources_of(point) for point, _ in shown]
-        left = np.where(np.array([[bool(sources)] for sources in of_rows]), values, np.nan)
+        of_rows = [sources_by_id(point) for point, _ in shown]
+        residuals_T = np.where(np.array([[bool(sources)] for sources in of_rows]), values, np.nan)
         for id in set().union(*of_rows):
-            there = np.array([id in sources for sources in of_rows])
+            has_source = np.array([id in sources for sources in of_rows])
             points = [sources[id] for sources in of_rows if id in sources]
             source = track_column(points, "position_m", 3), track_column(points, "moment_Am2", 3)
-            left[there] += residuals_of(self._array, readings[there], *source) - values[there]
-        self._plot.take(readings, left)
+            residuals_T[has_source] += residuals_of(self._array, readings[has_source], *source) - values[has_source]
+        self._plot.replace_readings(readings, residuals_T)
 
 
-def sources_of(point: TrackPoint | SourcesPoint) -> dict[int, TrackPoint]:
-    """Sources by their ids; one that is followed on its own has none."""
+def sources_by_id(point: TrackPoint | SourcesPoint) -> dict[int, TrackPoint]:
+    """Return the sources by their ids."""
     several = point.sources if isinstance(point, LivePoint) else point
     if isinstance(several, SourcesPoint):
         return {source.id: source for source in several.tracks}
     assert isinstance(point, TrackPoint)
-    return {ALONE: point}
+    return {SINGLE_ID: point}
 
 
-def words_of(point: TrackPoint | SourcesPoint) -> str:
-    """What is known of the sources now, as HTML."""
-    when = f"time {point.time_s:.3f} s"
-    sources = sources_of(point)
-    if ALONE in sources:
-        return point_words(sources[ALONE], when)
-    known = [point_words(source, f"source {id}") for id, source in sources.items()]
-    return "".join([words.panel([when, escape(point.status)], warning=not known), *known])
+def sources_html(point: TrackPoint | SourcesPoint) -> str:
+    """Return the states of the sources as HTML."""
+    time = f"time {point.time_s:.3f} s"
+    sources = sources_by_id(point)
+    if SINGLE_ID in sources:
+        return point_html(sources[SINGLE_ID], time)
+    known = [point_html(source, f"source {id}") for id, source in sources.items()]
+    return "".join([texts.panel_html([time, escape(point.status)], warning=not known), *known])

@@ -1,4 +1,4 @@
-"""What an array reads of one dipole, how well it can be known from it, and what a fix of such readings finds."""
+"""Readings of an array for one dipole, their Cramér-Rao bound, and fixes of simulated readings."""
 
 from __future__ import annotations
 
@@ -21,31 +21,31 @@ from magloc.localization.search.single_source import N_UNKNOWNS
 from magloc.localization.uncertainty.range_interval import gaussian_ranges
 from magloc.measurement.differences import DifferenceMeasurement, predicted_channels
 
-_CERTAIN = 1e5  # squared signal over noise that is detected by any array; the distribution is not evaluated beyond
+_CERTAIN = 1e5  # squared signal-to-noise ratio that any array detects: an upper limit for the distribution
 
 
 @dataclass(frozen=True, eq=False)
 class Forecast:
-    """What one set of readings of a dipole will be, and what it can tell at best.
+    """Readings of a dipole, and the bound for its position and moment.
 
     Attributes
     ----------
     readings_T : ndarray, shape (C,)
-        Noise-free readings, ambient field and offsets included [T].
+        Noise-free readings, with ambient field and offsets [T].
     signal_T : ndarray, shape (C,)
-        What the dipole adds to them [T].
+        Part of the readings due to the dipole [T].
     signal_to_noise : float
-        Root of the sum of squared whitened differences: the signal in standard deviations of its noise.
+        Root of the sum of squared whitened differences.
     detectable : bool
-        Whether a fix finds the signal to stand out of noise more often than not.
+        Whether the probability of detection by a fix exceeds one half.
     covariance : ndarray, shape (6, 6), optional
-        Cramér-Rao bound of (position, moment); None where the readings do not determine them.
+        Cramér-Rao bound of (position, moment); None if the readings do not determine them.
     range_interval_m : tuple of (low, high)
-        95 % interval of the distance from the sensors' centroid by the bound [m]; high is None where it is open.
+        95 % interval of the distance from the sensors' centroid by the bound [m]; high is None if it is open.
     range_observable : bool
-        Whether it is closed and its ends differ by a factor of two at most.
+        Whether the interval is closed and its ends differ by at most a factor of two.
     reason : str
-        Why there is no bound; empty if there is one.
+        Reason why there is no bound; empty if there is one.
     """
 
     readings_T: FloatArray
@@ -73,13 +73,13 @@ class LiveFit:
             self._reason = own_sentence(error).rstrip(".")
 
     def forecast(self, position_m: ArrayLike, moment_Am2: ArrayLike) -> Forecast:
-        """Readings of a dipole, NaN of a sensor that it stands on, and their Cramér-Rao bound."""
+        """Return the readings of a dipole, NaN for a sensor at its position, and their bound."""
         array = self.array
         readings = predicted_channels(array, position_m, moment_Am2) + array.channel_offset_T
         signal = readings - self._without_source
         if not np.isfinite(readings).all():
-            where = array.ids[int(array.channel_sensor[np.isnan(readings).argmax()])]
-            return Forecast(readings, signal, np.nan, False, reason=f"the dipole stands on sensor {where}")
+            sensor = array.ids[int(array.channel_sensor[np.isnan(readings).argmax()])]
+            return Forecast(readings, signal, np.nan, False, reason=f"the dipole stands on sensor {sensor}")
         measurement = DifferenceMeasurement(array, self._differences_at(readings))
         whitened = measurement.differences.transform @ signal / np.sqrt(measurement.variance)
         energy, k = float(whitened @ whitened), whitened.size
@@ -89,7 +89,7 @@ class LiveFit:
             return Forecast(readings, signal, energy**0.5, detectable, reason=reason)
         bounds = cramer_rao_bounds(array, position_m, moment_Am2)
         if not bounds.is_regular:
-            return Forecast(readings, signal, energy**0.5, detectable, reason=_why_singular(moment_Am2))
+            return Forecast(readings, signal, energy**0.5, detectable, reason=_singularity_reason(moment_Am2))
         offset_m = np.asarray(position_m) - array.centroid
         low, high = gaussian_ranges(bounds.covariance, offset_m, array.circumradius).tolist()
         return Forecast(
@@ -102,13 +102,13 @@ class LiveFit:
             is_observable(low, high),
         )
 
-    def simulated(self, readings_T: FloatArray, seed: int) -> FloatArray:
-        """Readings with one draw of the array's noise, shape (C,) [T]."""
+    def simulate(self, readings_T: FloatArray, seed: int) -> FloatArray:
+        """Return the readings with one draw of the array's noise, shape (C,) [T]."""
         normal = np.random.default_rng(seed).standard_normal(self.array.n_channels)
         return readings_T + reading_errors(self.array, readings_T, normal)
 
     def fix(self, readings_T: FloatArray) -> Fix:
-        """Fix of one set of readings (C,) [T], without a start."""
+        """Return the fix of one row of readings (C,) [T], without a start."""
         if self._locator is None:
             return Fix((), self._reason)
         if not np.isfinite(readings_T).all():
@@ -121,7 +121,7 @@ class LiveFit:
         return decorrelated_differences(self.array, covariance_T2=reading_covariance(self.array, readings_T))
 
 
-def _why_singular(moment_Am2: ArrayLike) -> str:
+def _singularity_reason(moment_Am2: ArrayLike) -> str:
     if not np.any(moment_Am2):
         return "a dipole without a moment has no signal"
     return "the differences between the sensors do not determine the source"

@@ -1,4 +1,4 @@
-"""A map in a scene: a cloud, a surface around a level, slices that move, and the panels that steer them."""
+"""Map in a scene: points, a surface around a level, movable slices, and their panels."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from scipy.spatial.transform import Rotation
 
 from arrays.typing import ByteArray, FloatArray
 from magloc.viewer.pages.open_result import MapResult
+from magloc.viewer.panels.coalesced import CoalescedCall
 from magloc.viewer.panels.inputs import set_value
-from magloc.viewer.panels.latest import Latest
 from magloc.viewer.scene.fields import PICTURE_AXES, picture_axes
 from magloc.viewer.scene.glyphs import (
     REGION_COLOUR,
     Colour,
     LabelAnchor,
     SurfaceGlyph,
-    dots,
-    screen_label,
-    screen_lines,
+    add_label,
+    add_lines,
+    add_points,
 )
 from magloc.viewer.scene.legend import ColourScale, Entry, Swatch
 from magloc.viewer.scene.shapes import box_edges, iso_surface
@@ -30,22 +30,22 @@ _LOGARITHMIC_STEP = 0.01
 
 
 class MapControls:
-    """Folders of switches and sliders for a map in the scene.
+    """Switches and sliders for a map in the scene.
 
     Parameters
     ----------
     server : viser.ViserServer
-        The folders are added where its GUI is at present.
+        The folders are added to the present container of its GUI.
     view : MapView
 
     Attributes
     ----------
     surface : viser.GuiCheckboxHandle
     level : viser.GuiSliderHandle
-        Of the surface; its logarithm to the base 10 where the map is logarithmic.
+        Level of the surface; log₁₀ of it for a logarithmic map.
     slices : list of viser.GuiCheckboxHandle
     places : list of viser.GuiSliderHandle
-        Of the slices across x, y and z [m].
+        Coordinates of the slices across x, y and z [m].
     """
 
     def __init__(self, server: viser.ViserServer, view: MapView) -> None:
@@ -80,26 +80,26 @@ class MapControls:
                 )
                 for i, name in enumerate(_AXES)
             ]
-        # Two switches that are thrown at once must not undo each other.
-        self._show_switched = Latest(self._switch)
-        self.points.on_update(self._show_switched)
-        self.failed.on_update(self._show_switched)
-        self.cut.on_update(Latest(lambda: view.show_cut(self.cut.value)))
+        # Two simultaneous changes must not undo each other.
+        self._show_visible = CoalescedCall(self._set_visible)
+        self.points.on_update(self._show_visible)
+        self.failed.on_update(self._show_visible)
+        self.cut.on_update(CoalescedCall(lambda: view.show_cut(self.cut.value)))
         self.size.on_update(lambda _: view.show_size(self.size.value))
-        show_level = Latest(self._show_level)
+        show_level = CoalescedCall(self._show_level)
         self.surface.on_update(show_level)
-        # Who moves a slider wants to see what it moves.
+        # A moved slider shows its surface or slice.
         self.level.on_update(lambda _: set_value(self.surface, True))
         self.level.on_update(show_level)
         for i in range(3):
             self._connect_slice(i)
 
     def _connect_slice(self, i: int) -> None:
-        self.slices[i].on_update(self._show_switched)
+        self.slices[i].on_update(self._show_visible)
         self.places[i].on_update(lambda _: set_value(self.slices[i], True))
-        self.places[i].on_update(Latest(lambda: self._view.show_slice(i, self.places[i].value)))
+        self.places[i].on_update(CoalescedCall(lambda: self._view.show_slice(i, self.places[i].value)))
 
-    def _switch(self) -> None:
+    def _set_visible(self) -> None:
         view = self._view
         view.cloud.visible, view.failed.visible = self.points.value, self.failed.value
         for handle, switch in zip(view.slices, self.slices, strict=True):
@@ -115,7 +115,6 @@ class MapControls:
 FAILED_COLOUR: Colour = (150, 150, 150)
 _BOX_COLOUR: Colour = (120, 126, 134)
 _SCALE = colormaps["viridis"]
-_LEGEND_STEPS = 9
 _TOP_PERCENTILE = 99.0
 POINT_OF_SPACING = 0.16
 _PIXELS_OF_SLICE = 400
@@ -125,46 +124,45 @@ _CUT_AXIS = 1  # the first camera looks along y
 
 
 class MapView:
-    """A map in a scene.
+    """Map in a scene.
 
     Parameters
     ----------
     server : viser.ViserServer
     result : MapResult
-    name : str
-        Of the node that holds it all.
 
     Attributes
     ----------
     cloud : viser.PointCloudHandle
-        All points that have a value, as one cloud; where it is cut open, those behind the slice across y.
+        Points with a value; in a cut map, those behind the slice across y.
     surface : SurfaceGlyph
     slices : list of viser.ImageHandle
-        Across x, y and z.
+        Slices across x, y and z.
     limits : tuple of 2 floats
         Values of the first and the last colour.
     indices : list of 3 ints
-        Of the planes that the slices show.
+        Indices of the slices' planes.
     spacing_m : float
-        Between two points along an axis.
+        Distance between two points along an axis [m].
     """
 
-    def __init__(self, server: viser.ViserServer, result: MapResult, name: str = "/map") -> None:
+    def __init__(self, server: viser.ViserServer, result: MapResult) -> None:
+        name = "/map"
         self._server, self.result = server, result
-        self.limits = _limits(result)
+        self.limits = _colour_limits(result)
         axis = result.axis_m
         self.spacing_m = float(axis[1] - axis[0])
         through = np.zeros(3) if result.source_m is None else result.source_m
         self.indices = [int(np.argmin(np.abs(axis - through[i]))) for i in range(3)]
         self.cut = True
         size = POINT_OF_SPACING * self.spacing_m
-        self.cloud = dots(server.scene, f"{name}/points", *self._points(np.isfinite(result.values)), size)
-        self.failed = dots(server.scene, f"{name}/failed-points", *self._points(result.failed), size)
+        self.cloud = add_points(server.scene, f"{name}/points", *self._points(np.isfinite(result.values)), size)
+        self.failed = add_points(server.scene, f"{name}/failed-points", *self._points(result.failed), size)
         self.failed.visible = False
         self.surface = SurfaceGlyph(server.scene, f"{name}/surface", REGION_COLOUR, 0.45)
         self.surface.visible = False
         self.level = self.limits[1]
-        self._colour_cube = self._all_colours()
+        self._colour_cube = self._cube_colours()
         side = self.spacing_m * len(axis)
         self.slices = [
             server.scene.add_image(
@@ -180,33 +178,27 @@ class MapView:
             )
             for i in range(3)
         ]
-        # One slice and the points behind it: more would hide what is inside.
+        # Only one slice is visible at first, because more would hide the points behind it.
         for i in (0, 2):
             self.slices[i].visible = False
 
-    def add_box(self, name: str = "/map/box") -> None:
-        """Show the edges of the cube, with the coordinates of their ends.
-
-        Parameters
-        ----------
-        name : str
-            Of the node that holds it.
-        """
-        scene, axis = self._server.scene, self.result.axis_m
+    def add_box(self) -> None:
+        """Add the edges of the cube, with the coordinates of their ends."""
+        name, scene, axis = "/map/box", self._server.scene, self.result.axis_m
         low, high = float(axis[0]), float(axis[-1])
         edges = box_edges([low] * 3, [high] * 3)
-        screen_lines(scene, f"{name}/edges", edges, _BOX_COLOUR, 1.0)
+        add_lines(scene, f"{name}/edges", edges, _BOX_COLOUR, 1.0)
         beyond = low - 0.06 * (high - low)
-        # Along the edges that the first camera sees at the border: x in front, y to the right, z to the left.
-        edges_seen: tuple[tuple[list[float], LabelAnchor], ...] = (
+        # The first camera sees these edges at the border: x in front, y at the right, z at the left.
+        labelled_edges: tuple[tuple[list[float], LabelAnchor], ...] = (
             ([0.0, beyond, low], "center-right"),
             ([high + low - beyond, 0.0, low], "center-left"),
             ([beyond, low, 0.0], "center-right"),
         )
-        for axis_name, (place, anchor) in zip("xyz", edges_seen, strict=True):
+        for axis_name, (place, anchor) in zip("xyz", labelled_edges, strict=True):
             for end in (low, high):
                 place["xyz".index(axis_name)] = end
-                screen_label(scene, f"{name}/{axis_name} {end:g}", f"{axis_name} = {end:g} m", place, anchor)
+                add_label(scene, f"{name}/{axis_name} {end:g}", f"{axis_name} = {end:g} m", place, anchor)
 
     def show_level(self, level: float) -> None:
         """Move the surface to another level.
@@ -214,7 +206,7 @@ class MapView:
         Parameters
         ----------
         level : float
-            In the map's quantity.
+            Level in the map's quantity.
         """
         self.level = level
         self.surface.show(iso_surface(self.result.axis_m, self.result.values, level))
@@ -225,9 +217,9 @@ class MapView:
         Parameters
         ----------
         axis : int
-            0, 1, 2 for the slice across x, y, z.
+            0, 1 or 2 for the slice across x, y or z.
         coordinate_m : float
-            The nearest plane of points is shown [m].
+            Coordinate of the slice, which shows the nearest plane of points [m].
         """
         self.indices[axis] = int(np.argmin(np.abs(self.result.axis_m - coordinate_m)))
         handle = self.slices[axis]
@@ -237,7 +229,7 @@ class MapView:
             self._show_points()
 
     def show_cut(self, cut: bool) -> None:
-        """Leave out the points in front of the slice across y, or show them.
+        """Hide or show the points in front of the slice across y.
 
         Parameters
         ----------
@@ -247,22 +239,21 @@ class MapView:
         self._show_points()
 
     def entries(self) -> list[Entry]:
-        """Lines of the legend."""
+        """Return the entries of the legend."""
         low, high = self.limits
-        colours = tuple(tuple(int(c) for c in rgb) for rgb in self._scale(np.linspace(0.0, 1.0, _LEGEND_STEPS)))
-        lines: list[Entry] = [ColourScale(self.result.quantity, f"{low:.3g}", f"{high:.3g}", colours)]  # type: ignore[arg-type]
+        lines: list[Entry] = [ColourScale.sample(self.result.quantity, f"{low:.3g}", f"{high:.3g}", _scale_colours)]
         if self.result.failed.any():
-            what = "start that does not converge" if self.result.over == "starts" else "source that is not found"
-            lines.append(Swatch(FAILED_COLOUR, f"{what} (in slices)"))
+            failure = "start that does not converge" if self.result.over == "starts" else "source that is not found"
+            lines.append(Swatch(FAILED_COLOUR, f"{failure} (in slices)"))
         return lines
 
     def show_size(self, share: float) -> None:
-        """Draw the points larger or smaller.
+        """Set the size of the points.
 
         Parameters
         ----------
         share : float
-            Their diameter over the distance between two of them.
+            Diameter of a point relative to the spacing.
         """
         for cloud in (self.cloud, self.failed):
             cloud.point_size = share * self.spacing_m
@@ -270,13 +261,13 @@ class MapView:
     def _show_points(self) -> None:
         for cloud, where in ((self.cloud, np.isfinite(self.result.values)), (self.failed, self.result.failed)):
             points, colours = self._points(where)
-            # Fewer colours than points, for a moment, would be an error in the browser.
+            # Fewer colours than points would be an error in the browser.
             with self._server.atomic():
                 cloud.points = points.astype(np.float32)
                 cloud.colors = colours
 
     def _points(self, where: NDArray[np.bool_]) -> tuple[FloatArray, ByteArray]:
-        """Places and colours of some points of the cube, of those behind the cut."""
+        """Return positions and colours of points of the cube, without those in front of the cut."""
         if self.cut:
             behind = np.arange(len(self.result.axis_m)) >= self.indices[_CUT_AXIS]
             where = where & behind[None, :, None]
@@ -287,17 +278,14 @@ class MapView:
         colours[known] = self._colours(values[known])
         return points, colours
 
-    def _scale(self, share: FloatArray) -> ByteArray:
-        return np.asarray(_SCALE(share, bytes=True)[..., :3], dtype=np.uint8)
-
     def _colours(self, values: FloatArray) -> ByteArray:
         low, high = self.limits
         if self.result.logarithmic:
             values, low, high = np.log(values), np.log(low), np.log(high)
-        return self._scale((values - low) / max(high - low, 1e-12))
+        return _scale_colours((values - low) / max(high - low, 1e-12))
 
-    def _all_colours(self) -> ByteArray:
-        """Colour and opacity of every point (n, n, n, 4)."""
+    def _cube_colours(self) -> ByteArray:
+        """Return colour and opacity of every point (n, n, n, 4)."""
         values, failed = self.result.values, self.result.failed
         colours = np.zeros((*values.shape, 4), dtype=np.uint8)
         shown = np.isfinite(values)
@@ -307,10 +295,10 @@ class MapView:
         return colours
 
     def _picture(self, i: int) -> ByteArray:
-        """The plane across an axis, with cells of several pixels so that their edges stay sharp."""
+        """Return the picture of a plane across an axis, with several pixels for each cell."""
         across, down = PICTURE_AXES[i]
         plane = np.take(self._colour_cube, self.indices[i], axis=i)
-        if across < down:  # the plane's axes are in their order; rows go down
+        if across < down:  # rows of the picture are vertical
             plane = plane.swapaxes(0, 1)
         pixels = max(1, _PIXELS_OF_SLICE // len(plane))
         return np.repeat(np.repeat(plane, pixels, axis=0), pixels, axis=1)
@@ -322,7 +310,12 @@ class MapView:
         return place
 
 
-def _limits(result: MapResult) -> tuple[float, float]:
+def _scale_colours(share: FloatArray) -> ByteArray:
+    """Return the colours (..., 3) of shares of the scale."""
+    return np.asarray(_SCALE(share, bytes=True)[..., :3], dtype=np.uint8)
+
+
+def _colour_limits(result: MapResult) -> tuple[float, float]:
     values = result.values[np.isfinite(result.values)]
     if not values.size:
         return 1.0, 2.0

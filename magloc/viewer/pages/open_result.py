@@ -1,7 +1,7 @@
-"""What kind of result a path holds, read completely before anything is opened.
+"""Reader of the results that the viewer shows, complete before a page opens.
 
-An array (``.toml``), readings or a truth (``.csv``, by their columns), a track (``.json`` or ``.jsonl``, as ``magloc
-track`` prints it), or a map (the folder that ``magloc map`` writes, or ``map.zarr`` in it).
+A path can be an array (``.toml``), readings or a truth (``.csv``, by their columns), a track (``.json`` or ``.jsonl``
+of ``magloc track``), or a map (the folder of ``magloc map``, or its ``map.zarr``).
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ KINDS = (
     "an array (.toml), readings or a truth (.csv), a track of `magloc track` (.json, .jsonl), or the folder of a map"
 )
 _STORE = "map.zarr"
-_MOST_POINTS = 64  # along an axis of a map: more would not be told apart
+_MOST_POINTS = 64  # along an axis of a map: more would not be distinguishable
 
 
 @dataclass(frozen=True, eq=False)
 class ReadingsResult:
-    """Readings, with one at least, and the array that was found for them."""
+    """Readings with at least one value, and their array."""
 
     readings: Readings
     array: SensorArray
@@ -47,27 +47,27 @@ class ReadingsResult:
 
 @dataclass(frozen=True, eq=False)
 class MapResult:
-    """A map over starts or sources.
+    """Map over starts or sources.
 
     Attributes
     ----------
     axis_m : ndarray, shape (n,)
         Coordinates of the cube, the same along x, y and z [m].
     values : ndarray, shape (n, n, n)
-        What is drawn; NaN where there is nothing to draw.
+        Values to draw, NaN where there are none.
     failed : ndarray of bool, shape (n, n, n)
-        Points that did not converge, or whose source was not found.
+        Points without convergence, or whose source was not found.
     over : {"starts", "sources"}
     quantity : str
-        What the values are, with their unit.
+        Quantity of the values, with its unit.
     logarithmic : bool
-        Whether they are to be seen on a logarithmic scale.
+        Whether the scale of the values is logarithmic.
     array : SensorArray
     source_m, moment_Am2 : ndarray, shape (3,), optional
-        The one source of a map over starts.
+        Source of a map over starts.
     title : str
     every : int
-        Points of the map for one that is drawn, along an axis.
+        Step of the drawn points along an axis of the map.
     """
 
     axis_m: FloatArray
@@ -87,7 +87,7 @@ Result = SensorArray | ReadingsResult | TrackResult | MapResult
 
 
 def read_result(path: Path, array_path: Path | None = None) -> Result:
-    """Whatever a path holds; the array of readings is by default the one that stands beside them."""
+    """Read the result at a path; the array of readings is by default the one beside them."""
     if path.is_dir():
         return _read_map(path)
     suffix = path.suffix.lower()
@@ -103,19 +103,19 @@ def read_result(path: Path, array_path: Path | None = None) -> Result:
 
 
 def read_rows(path: Path, array_path: Path | None) -> ReadingsResult:
-    """A readings file with its array, by default the one that stands beside it."""
-    where = _array_beside(path) if array_path is None else array_path
-    array = read_sensors(where)
+    """Read a readings file with its array, by default the one beside it."""
+    array_path = _array_beside(path) if array_path is None else array_path
+    array = read_sensors(array_path)
     readings = read_readings(path, array)
     if not np.isfinite(readings.values_T).any():
-        raise InputError(f"{path}: found no reading in any row, expected one that is not missing.")
-    return ReadingsResult(readings, array, where)
+        raise InputError(f"{path}: found no reading in any row, expected at least one.")
+    return ReadingsResult(readings, array, array_path)
 
 
 def _read_csv(path: Path, array_path: Path | None) -> ReadingsResult | TrackResult:
     header = read_table(path, "a header with time_s and the sensors' columns").header
     if "x_m" in header and "y_m" in header:
-        return path_of_truth(read_truth(path))
+        return track_of_truth(read_truth(path))
     if not any(name.endswith("_nT") for name in header):
         raise InputError(
             f"{path}: found neither readings (columns in nT) nor a truth (columns x_m, y_m), expected {KINDS}."
@@ -132,9 +132,9 @@ def _array_beside(path: Path) -> Path:
     )
 
 
-def path_of_truth(truth: Truth) -> TrackResult:
-    """The true path, in the order of time."""
-    position = np.where(np.isfinite(truth.position_m), truth.position_m, 0.0)  # a truth in the plane is at z = 0
+def track_of_truth(truth: Truth) -> TrackResult:
+    """Return the true path in the order of time."""
+    position = np.where(np.isfinite(truth.position_m), truth.position_m, 0.0)  # a truth without z is in the plane z = 0
     moments = [None] * len(position) if truth.moment_Am2 is None else list(truth.moment_Am2)
     order = np.argsort(truth.time_s, kind="stable")
     points = (
@@ -146,8 +146,8 @@ def path_of_truth(truth: Truth) -> TrackResult:
 def _read_map(folder: Path) -> MapResult:
     store = folder / _STORE if (folder / _STORE).is_dir() else folder
     if not (store / "zarr.json").is_file():
-        what = "an empty folder" if not any(folder.iterdir()) else "a folder without a map"
-        raise InputError(f"{folder}: found {what}, expected one that `magloc map` wrote, with {_STORE}.")
+        found = "an empty folder" if not any(folder.iterdir()) else "a folder without a map"
+        raise InputError(f"{folder}: found {found}, expected one that `magloc map` wrote, with {_STORE}.")
     from magloc.grids.store import UNREADABLE, open_map
 
     try:
@@ -155,41 +155,41 @@ def _read_map(folder: Path) -> MapResult:
     except InputError:
         raise
     except UNREADABLE:
-        raise _no_map(store) from None
-    return map_of(dataset, str(folder))
+        raise _map_error(store) from None
+    return map_result(dataset, str(folder))
 
 
-def _no_map(place: str | Path) -> InputError:
-    return InputError(f"{place}: found something else than a map, expected one that `magloc map` wrote.")
+def _map_error(name: str | Path) -> InputError:
+    return InputError(f"{name}: found something else than a map, expected one that `magloc map` wrote.")
 
 
-def map_of(dataset: xr.Dataset, place: str = "Input result") -> MapResult:
-    """A map over starts or sources, thinned to what can be told apart; `place` names it in errors."""
+def map_result(dataset: xr.Dataset, name: str = "Input result") -> MapResult:
+    """Return a map with a bounded number of points; ``name`` is for errors."""
     from magloc.grids.store import UNREADABLE
 
     try:
-        return _map_of(dataset, place)
+        return _thin_map(dataset, name)
     except InputError:
         raise
     except UNREADABLE:
-        raise _no_map(place) from None
+        raise _map_error(name) from None
 
 
-def _map_of(dataset: xr.Dataset, place: str) -> MapResult:
+def _thin_map(dataset: xr.Dataset, name: str) -> MapResult:
     axis = dataset["x"].to_numpy().astype(np.float64)
     if not (np.isfinite(axis).all() and (np.diff(axis) > 0.0).all()):
-        raise InputError(f"{place}: found an axis that does not increase, expected the map as it was written.")
+        raise InputError(f"{name}: found an axis that does not increase, expected the map as it was written.")
     every = max(1, math.ceil(len(axis) / _MOST_POINTS))
     part = dataset.isel(x=slice(None, None, every), y=slice(None, None, every), z=slice(None, None, every))
     over = "starts" if "half" in dataset else "sources"
     status = part["status"].to_numpy()
     shown = part["iterations" if over == "starts" else "sigma_range"].to_numpy().astype(np.float64)
     attributes = dataset.attrs
-    array = array_of_table(place, tomllib.loads(attributes["array"], parse_float=Decimal))
-    # What is not computed yet has the smallest integer there is.
+    array = array_of_table(name, tomllib.loads(attributes["array"], parse_float=Decimal))
+    # Points that have not been computed yet have the smallest integer.
     done = status >= 0
     if not done.any():
-        raise InputError(f"{place}: found a map of which nothing is computed yet, expected some points of it.")
+        raise InputError(f"{name}: found a map without computed points, expected one with some.")
     if over == "starts":
         values = np.where(status == 0, shown, np.nan)
         failed = done & (status != 0)

@@ -1,18 +1,18 @@
-"""Tracks played through time: slider, play and pause, speed, tail.
+"""Player of tracks: time, speed and tail.
 
 Use, inside a tab or folder of the GUI::
 
     player = TrackPlayer(
         server,
-        TrackResult(points, is_truth=False), # of one source or of several
+        TrackResult(points, is_truth=False), # of one source or several
         size_m,                              # length of the arrow [m]
-        array_poses=(position_m (n, 3), rotation_xyzw (n, 4)) or None,     # where the readings hold them, row by row
+        array_poses=(position_m (n, 3), rotation_xyzw (n, 4)) or None,     # of every row
         on_pose=glyphs.set_pose,             # called with (position_m, rotation_xyzw) of the row
         on_row=[readings_plot.show_row],     # called with the index of the row
     )
     player.show_row(index)
     player.play()
-    player.pause()                           # ends the playing thread; call it before server.stop()
+    player.pause()                           # ends the thread; call it before server.stop()
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from numpy.typing import NDArray
 
 from arrays.typing import BoolArray, ByteArray, FloatArray
 from magloc.tracking.results import TrackPoint, TrackResult, track_column
-from magloc.viewer.pages import words
+from magloc.viewer.pages import texts
 from magloc.viewer.panels.events import EventButtons, rows_of_change
-from magloc.viewer.panels.played_time import PlayedTime, time_strip
+from magloc.viewer.panels.time_player import TimePlayer, time_strip
 from magloc.viewer.scene.glyphs import (
     ARROW_COLOUR,
     DIPOLE_COLOUR,
@@ -40,32 +40,33 @@ from magloc.viewer.scene.glyphs import (
     TRACK_COLOUR,
     Colour,
     DipoleGlyph,
+    add_label,
+    add_lines,
     length_text,
-    screen_label,
-    screen_lines,
+    show_segments,
 )
 from magloc.viewer.scene.ruler import DropLines
 from magloc.viewer.scene.track_glyph import TrackGlyph, track_segments
 
 Poses = tuple[FloatArray, FloatArray]
-_DARKEST, _BRIGHTEST = 0.12, 0.88  # what is seen on a dark page, and on white
+_DARKEST, _BRIGHTEST = 0.12, 0.88  # visible on a dark page and on white
 _WHOLE_COLOUR = (190, 196, 203)
 SOURCE_COLOURS: tuple[Colour, ...] = (TRACK_COLOUR, FIELD_LINE_COLOUR, ARROW_COLOUR, OTHER_COLOUR, REGION_COLOUR)
 
 
 class Trail:
-    """A source in the scene: its whole track as a thin line, and tail, ellipsoid, moment and place at one time.
+    """Source in the scene: whole track, and tail, ellipsoid, moment and mark at one time.
 
     Parameters
     ----------
     scene : viser.SceneApi
     name : str
-        Of the node that holds it all.
+        Name of the parent node.
     points : sequence of TrackPoint
     size_m : float
         Length of the moment's arrow [m].
     colour : tuple of 3 ints, optional
-        By default the line is coloured by time.
+        Colour of the line; by default it is coloured by time.
     """
 
     def __init__(
@@ -74,7 +75,7 @@ class Trail:
         positions, self._moments = track_column(points, "position_m", 3), track_column(points, "moment_Am2", 3)
         self.tracked: BoolArray = np.array(np.isfinite(positions).all(axis=1))
         self._whole_m = positions[track_segments(positions, 0, len(positions) - 1)]
-        self.whole = screen_lines(scene, f"{name}/whole", self._whole_m, _WHOLE_COLOUR, 1.0)
+        self.whole = add_lines(scene, f"{name}/whole", self._whole_m, _WHOLE_COLOUR, 1.0)
         has_any = any(point.covariance is not None for point in points)
         covariances = track_column(points, "covariance", 6, 6)[:, :3, :3] if has_any else None
         shades = time_colours(track_column(points, "time_s")) if colour is None else None
@@ -89,10 +90,10 @@ class Trail:
         )
         self.dipole = DipoleGlyph(scene, f"{name}/moment", size_m, DIPOLE_COLOUR)
         self.drop = DropLines(scene, f"{name}/drop", DIPOLE_COLOUR)
-        self.label = screen_label(scene, f"{name}/now", "", np.zeros(3), "center-left")
+        self.label = add_label(scene, f"{name}/now", "", np.zeros(3), "center-left")
 
     def show(self, first: int, last: int, text: str) -> None:
-        """Show the rows of the tail, and the source at the last of them with a label; "": none."""
+        """Show the rows of the tail, and the source at the last of them with an optional label."""
         positions = self.glyph.positions_m
         self.glyph.show_until(last, last - first)
         self.dipole.show(positions[last], self._moments[last])
@@ -102,39 +103,37 @@ class Trail:
             self.label.text, self.label.position = f"   {text}", positions[last]
 
     def show_rest(self, first: int, last: int, *, visible: bool) -> None:
-        """The thin line before and after the tail, not through it."""
+        """Show or hide the thin line before and after the tail."""
         positions = self.glyph.positions_m
         parts = ((0, first), (last, len(positions) - 1))
         ends = np.concatenate([track_segments(positions, *part) for part in parts])
-        self.whole.visible = visible and bool(len(ends))
-        if len(ends):
-            self.whole.points = positions[ends].astype(np.float32)
+        show_segments(self.whole, positions[ends if visible else ends[:0]])
 
 
-class TrackPlayer(PlayedTime):
-    """Tracks in the scene at one time, and the panels that move the time.
+class TrackPlayer(TimePlayer):
+    """Player of tracks in the scene.
 
     Parameters
     ----------
     server : viser.ViserServer
-        The panels are added where its GUI is at present.
+        The panels are added to the present container of its GUI.
     result : TrackResult
-        Its points in the order of time.
+        Tracks with points in the order of time.
     size_m : float
         Length of the moments' arrows [m].
     array_poses : tuple of ndarrays, shapes (n, 3) and (n, 4), optional
         Position [m] and rotation (xyzw) of the array in every row.
     on_pose : callable, optional
-        Called with the pose of the array in the row that is shown.
+        Called with the pose of the array in the present row.
     on_row : sequence of callable
-        Called with the index of the row that is shown.
+        Called with the index of the present row.
 
     Attributes
     ----------
     index : int
-        Row that is shown.
+        Present row.
     trails : tuple of Trail
-        Of every source.
+        Sources in the scene.
     """
 
     def __init__(
@@ -159,7 +158,9 @@ class TrackPlayer(PlayedTime):
         )
         self._tracked = np.any([trail.tracked for trail in self.trails], axis=0)
         tracked = np.flatnonzero(self._tracked)
-        self._ends = {int(row) for row in tracked[[0, -1]]} if tracked.size else set()  # which have times of their own
+        self._labelled_rows = (
+            {int(row) for row in tracked[[0, -1]]} if tracked.size else set()
+        )  # rows with labels of their times
         self.index = int(tracked[-1]) if tracked.size else 0
         self._add_panels(server.gui)
         self.show_row(self.index)
@@ -170,18 +171,18 @@ class TrackPlayer(PlayedTime):
         Parameters
         ----------
         index : int
-            Rows before the first and after the last are those.
+            Row; it is limited to the track.
         """
         index = min(max(index, 0), len(self._since_first_s) - 1)
         self.move_to(float(self._since_first_s[index]))
 
     def _add_panels(self, gui: viser.GuiApi) -> None:
         with gui.add_folder("Time"):
-            self.strip_panel = gui.add_html(_strip(self._since_first_s, self._tracked))
+            self.strip_panel = gui.add_html(_strip_html(self._since_first_s, self._tracked))
             super().__init__(gui, self._span_s, self._show, "magloc-track-player")
             self.row_buttons = gui.add_button_group("Row", ("previous", "next"))
             self.events = EventButtons(
-                gui, rows_of_change(_states(self._result)), lambda: self.index, self.choose,
+                gui, rows_of_change(_row_states(self._result)), lambda: self.index, self.choose,
                 "Rows in which a source is found or lost, or the status changes. Keys: E, and Shift E.",
             )  # fmt: skip
             longest, still = self.time_slider.max, self.time_slider.disabled
@@ -198,7 +199,7 @@ class TrackPlayer(PlayedTime):
         self.whole_checkbox.on_update(self._follow)
 
     def choose(self, index: int) -> None:
-        """Show a row that the user has chosen, and stand still there."""
+        """Show a row that the user has selected, and pause."""
         self.pause()
         self.show_row(index)
 
@@ -206,10 +207,10 @@ class TrackPlayer(PlayedTime):
         self.choose(self.index + step)
 
     def _label(self, source: int) -> str:
-        """What stands beside a source: its id, or of a single one the time, but where that stands already."""
+        """Return the label of a source: its id, or the time if the row has no other label."""
         if self._result.ids:
             return str(self._result.ids[source])
-        return "" if self.index in self._ends else f"{self._result.points[self.index].time_s:.6g} s"
+        return "" if self.index in self._labelled_rows else f"{self._result.points[self.index].time_s:.6g} s"
 
     def _show(self) -> None:
         index = max(0, int(np.searchsorted(self._since_first_s, self.now_s, side="right")) - 1)
@@ -222,13 +223,13 @@ class TrackPlayer(PlayedTime):
         if self._poses is not None and self._on_pose is not None:
             self._on_pose(self._poses[0][index], self._poses[1][index])
         self._time.show(now)
-        self.row_panel.content = row_words(self._result, index)
-        for follow in self._on_row:
-            follow(index)
+        self.row_panel.content = row_html(self._result, index)
+        for call in self._on_row:
+            call(index)
 
 
 def time_colours(time_s: FloatArray) -> ByteArray:
-    """Colours (n, 3) of times (n,), evenly from the first to the last."""
+    """Return the colours (n, 3) of times (n,), evenly from the first to the last."""
     span = float(time_s[-1] - time_s[0])
     share = (time_s - time_s[0]) / span if span > 0.0 else np.zeros_like(time_s)
     return np.asarray(
@@ -237,27 +238,29 @@ def time_colours(time_s: FloatArray) -> ByteArray:
 
 
 def source_colours(result: TrackResult) -> list[Colour | None]:
-    """A colour for every source of a result; of a single one None, as time is its colour."""
+    """Return the colour of every source; None for a single one, which is coloured by time."""
     return [colour for colour, _ in zip(cycle(SOURCE_COLOURS), result.ids, strict=False)] or [None]
 
 
-def row_words(result: TrackResult, index: int) -> str:
-    """What is known of the sources in one row, as HTML."""
-    when = f"row {index + 1} of {len(result.points)}, time {result.points[index].time_s:.3f} s"
+def row_html(result: TrackResult, index: int) -> str:
+    """Return the states of the sources in one row as HTML."""
+    time = f"row {index + 1} of {len(result.points)}, time {result.points[index].time_s:.3f} s"
     if not result.ids:
-        return point_words(result.points[index], when)
+        return point_html(result.points[index], time)
     now = [(id, track[index]) for id, track in zip(result.ids, result.tracks, strict=True)]
-    known = [point_words(point, f"source {id}") for id, point in now if point.position_m is not None]
-    return "".join([words.panel([when]), *known])
+    known = [point_html(point, f"source {id}") for id, point in now if point.position_m is not None]
+    return "".join([texts.panel_html([time]), *known])
 
 
-def point_words(point: TrackPoint, when: str) -> str:
-    """What is known of the source at a time, as HTML."""
-    lines = [when]
+def point_html(point: TrackPoint, title: str) -> str:
+    """Return the state of a source as HTML, below a title."""
+    lines = [title]
     if point.position_m is None:
-        return words.panel([*lines, f"<b>not tracked</b>: {escape(point.status or 'no reason given')}"], warning=True)
+        return texts.panel_html(
+            [*lines, f"<b>not tracked</b>: {escape(point.status or 'no reason given')}"], warning=True
+        )
     without = "".join(f", without {name}" for name in point.dropped_sensors)
-    lines.append(f"{escape(point.status + without)} at {words.place(point.position_m)}")
+    lines.append(f"{escape(point.status + without)} at {texts.position_text(point.position_m)}")
     if point.covariance is not None:
         x, y, z = (length_text(sigma) for sigma in np.sqrt(np.diagonal(point.covariance)[:3]).tolist())
         lines.append(f"σ x {x}, y {y}, z {z}")
@@ -265,16 +268,16 @@ def point_words(point: TrackPoint, when: str) -> str:
         lines.append(f"moment {float(np.linalg.norm(point.moment_Am2)):.4g} A·m²")
     if np.isfinite(point.nis) and point.nis_dof:
         lines.append(f"NIS/dof {point.nis:.3g}/{point.nis_dof}")
-    return words.panel(lines)
+    return texts.panel_html(lines)
 
 
-def _states(result: TrackResult) -> list[tuple[object, ...]]:
-    """What is to be told of every row, where it changes."""
+def _row_states(result: TrackResult) -> list[tuple[object, ...]]:
+    """Return the states of every row whose changes are events."""
     each = [[(point.position_m is None, point.status, point.dropped_sensors) for point in t] for t in result.tracks]
     return list(zip(*each, strict=True))
 
 
-def _strip(since_first_s: FloatArray, tracked: NDArray[np.bool_]) -> str:
-    """A strip along the time, coloured where the source is tracked."""
+def _strip_html(since_first_s: FloatArray, tracked: NDArray[np.bool_]) -> str:
+    """Return a strip along the time, coloured where the source is tracked."""
     text = f"tracked in {int(tracked.sum())} of {len(tracked)} rows" + ("" if tracked.all() else "; grey: not tracked")
-    return words.panel([time_strip(since_first_s, tracked, TRACK_COLOUR), text])
+    return texts.panel_html([time_strip(since_first_s, tracked, TRACK_COLOUR), text])

@@ -1,1 +1,1 @@
-"""Inputs and readouts beside the scene."""
+"""Inputs and outputs beside the scene."""

@@ -1,4 +1,4 @@
-"""Rows in which something changes: found by buttons and keys, in place of a search by eye."""
+"""Buttons and keys for the rows in which a state changes."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ from arrays.typing import IntArray
 
 
 def rows_of_change(states: Sequence[Hashable]) -> IntArray:
-    """Rows whose state differs from that of the row before."""
+    """Return the rows whose state differs from that of the previous row."""
     return np.array([i for i in range(1, len(states)) if states[i] != states[i - 1]], dtype=np.intp)
 
 
 class EventButtons:
-    """Buttons and keys that show the row of the next event and of the one before; none where there is no event.
+    """Buttons and keys that show the row of the next or the previous event, if there are events.
 
     Parameters
     ----------
     gui : viser.GuiApi
-        The buttons are added where it is at present.
+        The buttons are added to its present container.
     rows : ndarray of int, shape (k,)
-        Of the events, ascending.
+        Rows of the events, ascending.
     present : callable
-        The row that is shown.
+        It returns the present row.
     show : callable
-        Shows a row.
+        It shows a row.
     hint : str
-        What counts as an event.
+        Explanation of the events.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class EventButtons:
         backwards.on_trigger(lambda _: self.go(forwards=False))
 
     def go(self, *, forwards: bool) -> None:
-        """Show the next event or the one before; nothing where there is none."""
+        """Show the next or the previous event, if there is one."""
         place = int(np.searchsorted(self._rows, self._present(), side="right" if forwards else "left"))
         place -= 0 if forwards else 1
         if 0 <= place < len(self._rows):

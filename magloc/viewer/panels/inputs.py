@@ -1,4 +1,4 @@
-"""Inputs of the GUI that both the user and the program write."""
+"""Inputs of the GUI that both the user and the program change."""
 
 from __future__ import annotations
 
@@ -11,34 +11,34 @@ T = TypeVar("T")
 
 
 class SharedInput(Generic[T]):
-    """An input that follows something, and that the user may change; only the user's changes are acted on.
+    """Input whose callback is called for changes by the user only.
 
-    viser calls an input's callbacks for what the program writes too. Whether a change was the user's is told by the
-    value, not by a flag, because the two come in different threads.
+    viser calls the callbacks of an input for changes by the program too. The value distinguishes the two, not a flag,
+    because they come from different threads.
 
     Parameters
     ----------
     handle : viser.GuiInputHandle
     on_user : callable
-        Called after a change that the program did not write.
+        Called after a change by the user.
     """
 
     def __init__(self, handle: viser.GuiInputHandle[T], on_user: Callable[[], None]) -> None:
         self.handle = handle
         self._on_user = on_user
-        self._written: T = handle.value
-        handle.on_update(self._changed)
+        self._program_value: T = handle.value
+        handle.on_update(self._on_update)
 
     def show(self, value: T) -> None:
-        """Write a value without acting on it."""
-        self._written = value
+        """Set the value without a call of the callback."""
+        self._program_value = value
         set_value(self.handle, value)
 
-    def _changed(self, _: object) -> None:
-        if self.handle.value != self._written:
+    def _on_update(self, _: object) -> None:
+        if self.handle.value != self._program_value:
             self._on_user()
 
 
 def set_value(handle: Any, value: object) -> None:
-    """Write the value of an input. viser's setter is none to mypy, because it is decorated twice."""
+    """Set the value of an input; mypy does not know viser's setter, which has two decorators."""
     handle.value = value

@@ -1,10 +1,10 @@
-"""Readings as a live plot beside the scene, with the player's time marked.
+"""Plot of readings beside the scene, with a cursor at the time of the player.
 
 Use, inside a tab or folder of the GUI::
 
     plot = ReadingsPlot(server, readings, array)      # magloc.readings.Readings, arrays.array.SensorArray
-    plot.show_row(index)                              # marks the time of a row of the readings
-    plot.when_pointed(player.show_row)                # called with the row that the user points at
+    plot.show_row(index)                              # moves the cursor to a row of the readings
+    plot.on_select(player.show_row)                   # called with the row that the user selects
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from arrays.typing import FloatArray
 from magloc.measurement.differences import predicted_channels
 from magloc.readings import Readings
 from magloc.truth import nearest_rows
+from magloc.viewer.panels.coalesced import CoalescedCall
 from magloc.viewer.panels.inputs import SharedInput
-from magloc.viewer.panels.latest import Latest
 from magloc.viewer.panels.lines import PlotLines, across, cursor_svg, lines_svg, numbers_html
 from magloc.viewer.scene.glyphs import round_length
 
@@ -31,10 +31,10 @@ DIFFERENCES = "differences from the mean"
 RESIDUALS = "residuals of the differences"
 TICKED, ALL = "those ticked", "all"
 AT = "At [s]"
-"""Label of the input that takes a time, which the page types when the plot is pointed at."""
-# Okabe and Ito, without yellow, which is not seen on white; all are seen on a dark page.
+"""Label of the input of the time, which the page also fills in after a press on the plot."""
+# Okabe and Ito without yellow, which is invisible on white; all are visible on a dark page.
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#666666")
-# Opacities of the axes. Dashes of noise take a browser without a graphics card a second a picture, and cannot be told.
+# Opacities of the axes; dashed lines of noise take a second a frame without a graphics card, and are not legible.
 _SHADES = {"x": "", "y": "bf", "z": "80", "": ""}
 _MOST_POINTS = 400
 _MOST_CHANNELS_AT_FIRST = 12
@@ -42,7 +42,7 @@ _LEAST_ROWS = 20  # of the shortest span
 
 
 class Channel(NamedTuple):
-    """What one line of the plot shows.
+    """Channel of a line of the plot.
 
     Attributes
     ----------
@@ -50,7 +50,7 @@ class Channel(NamedTuple):
     sensor : str
         Id of the sensor.
     axis : {"x", "y", "z", ""}
-        Empty for a scalar sensor.
+        Axis of the sensor; empty for a scalar sensor.
     """
 
     label: str
@@ -59,24 +59,24 @@ class Channel(NamedTuple):
 
 
 class ReadingsPlot:
-    """A plot of readings over time, and the panels that choose what it shows.
+    """Plot of readings over time, with panels to select its contents.
 
     Parameters
     ----------
     server : viser.ViserServer
-        The panels are added where its GUI is at present.
+        The panels are added to the present container of its GUI.
     readings : Readings
     array : SensorArray
-        Whose channels they have.
+        Array of the readings.
     residuals_T : ndarray, shape (n, C), optional
-        Readings less what a source explains of them; without it they cannot be shown.
+        Readings less the predictions of a source; without them residuals cannot be shown.
     window_s : float, optional
-        The time axis shows so long before the last row [s]; by default all since the first row.
+        Length of the time axis before the last row [s]; by default it begins at the first row.
 
     Attributes
     ----------
     index : int
-        Row whose time is marked.
+        Row at the cursor.
     """
 
     def __init__(
@@ -88,11 +88,11 @@ class ReadingsPlot:
         window_s: float | None = None,
     ) -> None:
         self._server, self._array, self._window_s = server, array, window_s
-        self._channels, self._ids = channels_of(array), array.ids
-        self._hold(readings, residuals_T)
-        self._follow = Latest(self._show)
-        self._drawn: tuple[str, tuple[int, ...], float, int] | None = None
-        self._wanted: Callable[[int], None] = lambda row: None
+        self._channels, self._ids = plot_channels(array), array.ids
+        self._set_readings(readings, residuals_T)
+        self._follow = CoalescedCall(self._show)
+        self._drawn_state: tuple[str, tuple[int, ...], float, int] | None = None
+        self._select: Callable[[int], None] = lambda row: None
         self.index = 0
         gui = server.gui
         with gui.add_folder("Readings"):
@@ -120,74 +120,74 @@ class ReadingsPlot:
         self._follow()
 
     def _add_times(self, gui: viser.GuiApi) -> None:
-        """Inputs for the time that is marked, and for how much time is seen."""
+        """Add inputs for the time of the cursor and for the span of the time axis."""
         last_s, spans = float(self._time_s[-1]), ["all"]
         self.at_input = gui.add_number(AT, 0.0, step=1e-3, hint="Or press the mouse in the plot.")
-        self._at = SharedInput(self.at_input, lambda: self._wanted(self._row_at(float(self.at_input.value))))
+        self._at = SharedInput(self.at_input, lambda: self._select(self._row_at(float(self.at_input.value))))
         while last_s > 0.0 and len(self._time_s) * 0.1 ** len(spans) >= _LEAST_ROWS:
             spans.append(f"{round_length(last_s * 0.1 ** len(spans)):g} s")
         self.span_dropdown = gui.add_dropdown("Span", spans, disabled=len(spans) == 1, hint="Of the axis of time.")
         self.span_dropdown.on_update(self._follow)
 
-    def when_pointed(self, wanted: Callable[[int], None]) -> None:
-        """Call something with the row whose time the user points at, or types."""
-        self._wanted = wanted
+    def on_select(self, select: Callable[[int], None]) -> None:
+        """Set the function that is called with the row whose time the user selects or types."""
+        self._select = select
 
-    def take(self, readings: Readings, residuals_T: FloatArray | None = None) -> None:
-        """Show other readings of the array in place of those so far, and mark the last row."""
-        self._hold(readings, residuals_T)
-        self._drawn = None
+    def replace_readings(self, readings: Readings, residuals_T: FloatArray | None = None) -> None:
+        """Show other readings of the array, with the cursor at the last row."""
+        self._set_readings(readings, residuals_T)
+        self._drawn_state = None
         self.show_row(len(readings) - 1)
 
-    def _hold(self, readings: Readings, residuals_T: FloatArray | None) -> None:
+    def _set_readings(self, readings: Readings, residuals_T: FloatArray | None) -> None:
         self._order = np.argsort(readings.time_s, kind="stable")
         self._time_s = readings.time_s[self._order] - readings.time_s[self._order[0 if self._window_s is None else -1]]
         self._rank = np.argsort(self._order)
         self._values_T = readings.values_T[self._order]
         self._residuals_T = None if residuals_T is None else residuals_T[self._order]
-        # Long records are thinned once for every choice: the mark that moves is all that changes in between.
-        self._values_nT = lru_cache(maxsize=2)(self._computed_nT)
-        self._thinned = lru_cache(maxsize=4)(self._thinned_lines)
+        # Long records are thinned once for every selection, because most updates only move the cursor.
+        self._values_nT = lru_cache(maxsize=2)(self._compute_nT)
+        self._lines = lru_cache(maxsize=4)(self._thin_lines)
 
     def show_row(self, index: int) -> None:
-        """Mark the time of a row.
+        """Move the cursor to a row.
 
         Parameters
         ----------
         index : int
-            Of the readings.
+            Row of the readings.
         """
         self.index = index
         self._follow()
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """What can be shown."""
+        """Kinds of values that can be shown."""
         return tuple(self.kind_dropdown.options)
 
     @property
-    def time_words(self) -> str:
-        """What the axis of time is."""
+    def time_label(self) -> str:
+        """Label of the time axis."""
         return f"time {'since the first' if self._window_s is None else 'before the last'} row [s]"
 
     def lines(self, kind: str) -> PlotLines:
-        """What it shows of a kind at all times."""
-        return self._thinned(kind, tuple(self._chosen()), 0.0, 0)
+        """Return the lines of a kind at all times."""
+        return self._lines(kind, tuple(self._selected_channels()), 0.0, 0)
 
     def _row_at(self, time_s: float) -> int:
-        """Row of the readings that is nearest to a time since the first."""
+        """Return the row of the readings that is nearest to a time since the first."""
         return int(self._order[nearest_rows(np.array([time_s]), self._time_s)[0]])
 
-    def _chosen(self) -> list[int]:
+    def _selected_channels(self) -> list[int]:
         return [
             i
             for i, channel in enumerate(self._channels)
-            if self._is_chosen(channel.sensor) and (not channel.axis or self.axis_checkboxes[channel.axis].value)
+            if self._is_selected(channel.sensor) and (not channel.axis or self.axis_checkboxes[channel.axis].value)
         ]
 
-    def _is_chosen(self, sensor: str) -> bool:
-        chosen = self.sensors_dropdown.value
-        return bool(self.sensor_checkboxes[sensor].value) if chosen == TICKED else chosen in (ALL, sensor)
+    def _is_selected(self, sensor: str) -> bool:
+        selection = self.sensors_dropdown.value
+        return bool(self.sensor_checkboxes[sensor].value) if selection == TICKED else selection in (ALL, sensor)
 
     def _show(self) -> None:
         row, span_s = self.index, 0.0
@@ -195,26 +195,26 @@ class ReadingsPlot:
         if self._window_s is None and self.span_dropdown.value != "all":
             span_s = float(self.span_dropdown.value.split()[0])
         page = int(now_s[0] // span_s) if span_s else 0
-        wanted = (self.kind_dropdown.value, tuple(self._chosen()), span_s, page)
-        lines = self._thinned(*wanted)
+        state = (self.kind_dropdown.value, tuple(self._selected_channels()), span_s, page)
+        lines = self._lines(*state)
         cursor = cursor_svg(float(across(lines, now_s)[0])) + numbers_html(lines, lines.at([row])[1][0].tolist())
         with self._server.atomic():
-            if wanted != self._drawn:  # what is drawn anew takes a picture as long as the whole scene
-                self.lines_panel.content, self._drawn = lines_svg(lines, self.time_words), wanted
+            if state != self._drawn_state:  # a new plot takes the browser as long as the whole scene
+                self.lines_panel.content, self._drawn_state = lines_svg(lines, self.time_label), state
             self.cursor_panel.content = cursor
             if self._window_s is None:
                 self._at.show(round(float(now_s[0]), 6))
 
-    def _computed_nT(self, kind: str) -> FloatArray:
-        """Readings (n, C), their differences, or what a source leaves of these, in the order of time."""
+    def _compute_nT(self, kind: str) -> FloatArray:
+        """Return readings (n, C), their differences, or the residuals, in the order of time."""
         if kind == RAW:
             return 1e9 * self._values_T
-        of = self._values_T if kind != RESIDUALS or self._residuals_T is None else self._residuals_T
-        return 1e9 * differences_from_mean(self._array, of)
+        values_T = self._values_T if kind != RESIDUALS or self._residuals_T is None else self._residuals_T
+        return 1e9 * differences_from_mean(self._array, values_T)
 
-    def _thinned_lines(self, kind: str, chosen: tuple[int, ...], span_s: float, page: int) -> PlotLines:
-        """Lines of no more points than can be seen; of one page, if it has a span."""
-        values, time_s = self._values_nT(kind)[:, chosen], self._time_s
+    def _thin_lines(self, kind: str, selection: tuple[int, ...], span_s: float, page: int) -> PlotLines:
+        """Return lines in the resolution of the plot, of one page if there is a span."""
+        values, time_s = self._values_nT(kind)[:, selection], self._time_s
         ends = (float(time_s[0]), float(time_s[-1])) if self._window_s is None else (-self._window_s, 0.0)
         span = span_of(values)
 
@@ -228,24 +228,27 @@ class ReadingsPlot:
             first, last = np.searchsorted(time_s, ends)
             time_s, shown = time_s[first : last + 1], values[first : last + 1]
             span = span_of(shown)
-        channels = [self._channels[i] for i in chosen]
+        channels = [self._channels[i] for i in selection]
         colours = tuple(
             _COLOURS[self._ids.index(channel.sensor) % len(_COLOURS)] + _SHADES[channel.axis] for channel in channels
         )
         labels = tuple(channel.label for channel in channels)
-        return PlotLines(*thinned(time_s, shown, _MOST_POINTS), ends, span, labels, colours, at)
+        return PlotLines(*thin_extremes(time_s, shown, _MOST_POINTS), ends, span, labels, colours, at)
 
 
 def residuals_of(array: SensorArray, rows: Readings, positions_m: FloatArray, moments_Am2: FloatArray) -> FloatArray:
-    """Readings (n, C) less those of a source that is at (n, 3), in the world where the rows have poses [T]."""
+    """Return the readings (n, C) less the predictions of a source [T].
+
+    ``positions_m``, ``moments_Am2`` (n, 3): source in the world if the rows have poses, otherwise in the array's frame.
+    """
     if rows.pose is not None:
         origins_m, back = rows.pose[0], rows.pose[1].inv()
         positions_m, moments_Am2 = back.apply(positions_m - origins_m), back.apply(moments_Am2)
     return rows.values_T - predicted_channels(array, positions_m, moments_Am2)
 
 
-def channels_of(array: SensorArray) -> list[Channel]:
-    """The channels of an array by sensor and axis."""
+def plot_channels(array: SensorArray) -> list[Channel]:
+    """Return the channels of an array by sensor and axis."""
     return [
         Channel(name, sensor.id, axis)
         for sensor in array.sensors
@@ -254,30 +257,30 @@ def channels_of(array: SensorArray) -> list[Channel]:
 
 
 def differences_from_mean(array: SensorArray, readings_T: FloatArray) -> FloatArray:
-    """What every channel sees beyond the mean of the sensors of its kind, calibration undone.
+    """Return the calibrated fields less the mean of all sensors of the same kind (n, C) [T].
 
-    ``readings_T`` (n, C): NaN where missing [T]. Returns (n, C): of vector sensors the components along the array's
-    axes; NaN where a reading of the sensor is missing [T].
+    ``readings_T`` (n, C): readings [T], NaN where missing. Vector sensors give components along the array's axes; NaN
+    where a reading of the sensor is missing.
     """
     fields = array.calibrated_field(readings_T)
     result = np.full(readings_T.shape, np.nan)
     channels = array.sensor_channels
     vector = np.array([sensor.kind == "vector" for sensor in array.sensors])
     if vector.any():
-        beyond = fields[:, vector] - _mean_of_known(fields[:, vector])
-        result[:, channels[vector].ravel()] = beyond.reshape(len(result), -1)
+        differences = fields[:, vector] - _finite_mean(fields[:, vector])
+        result[:, channels[vector].ravel()] = differences.reshape(len(result), -1)
     if not vector.all():
         scalar = channels[~vector, 0]
         moduli = (readings_T - array.channel_offset_T)[:, scalar] / array.channel_gain[scalar, 0]
-        result[:, scalar] = moduli - _mean_of_known(moduli)
+        result[:, scalar] = moduli - _finite_mean(moduli)
     return result
 
 
-def thinned(time_s: FloatArray, values: FloatArray, most: int) -> tuple[FloatArray, FloatArray]:
-    """No more points than a plot can show: the least and the greatest value of every stretch of time.
+def thin_extremes(time_s: FloatArray, values: FloatArray, most: int) -> tuple[FloatArray, FloatArray]:
+    """Reduce lines to the least and the greatest value of every interval of time.
 
-    ``time_s`` (n,): ascending [s]. ``values`` (n, C): NaN where missing. ``most``: points at most, of every
-    channel. Returns times (k,) and values (k, C), all if there are no more than that. An extreme value is never lost.
+    ``time_s`` (n,): ascending times [s]. ``values`` (n, C): NaN where missing. ``most``: largest number of points.
+    Returns times (k,) and values (k, C); they contain all extreme values.
     """
     if len(time_s) <= most:
         return time_s, values
@@ -288,15 +291,15 @@ def thinned(time_s: FloatArray, values: FloatArray, most: int) -> tuple[FloatArr
 
 
 def span_of(values: FloatArray) -> tuple[float, float]:
-    """From below the least to above the greatest finite value."""
+    """Return limits around the finite values, with a margin."""
     known = values[np.isfinite(values)]
     low, high = (float(known.min()), float(known.max())) if known.size else (-1.0, 1.0)
     margin = 0.05 * (high - low) or 0.05 * abs(high) or 1.0
     return low - margin, high + margin
 
 
-def _mean_of_known(values: FloatArray) -> FloatArray:
-    """Mean over the second axis of what is not NaN, that axis kept; NaN where nothing is known."""
+def _finite_mean(values: FloatArray) -> FloatArray:
+    """Return the mean of the finite values along the second axis, which has length 1 then."""
     known = np.isfinite(values)
     with np.errstate(invalid="ignore"):
         mean: FloatArray = np.where(known, values, 0.0).sum(axis=1, keepdims=True) / known.sum(axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""What a page without a server says of the row that its player shows, and readings with a cursor that moves it."""
+"""Panel of a static page with a player: text of the present row, and plot of the readings with a cursor."""
 
 from __future__ import annotations
 
@@ -6,25 +6,25 @@ import json
 from collections.abc import Sequence
 from html import escape
 
-from magloc.viewer.panels.lines import POINTED, across, cursor_svg, lines_svg, number_texts, numbers_html
+from magloc.viewer.panels.lines import POINTER_SCRIPT, across, cursor_svg, lines_svg, number_texts, numbers_html
 from magloc.viewer.panels.readings_plot import ReadingsPlot
 from magloc.viewer.scene.legend import NARROW_PX
 
-_LOW_PX = 640  # of a page
+_LOW_PX = 640  # height of a page below which the plot is folded at first
 
-# viser's player says its time in a slider, and takes one from its input, in which it stands rounded. It begins by
-# itself, and has nothing to show until it has begun; a time that is typed stops it.
+# viser's player shows its time in a slider, and rounded in an input, which also sets it. It plays from the start, and
+# shows no scene before; a time in the input stops it.
 _SCRIPT = """<script>
 (() => {
-  const {begin, step, words, x, values} = %s;
+  const {begin, step, texts, x, values} = %s;
   %s
   const box = document.getElementById('row'), kind = box.querySelector('select');
-  const said = box.querySelector('.said'), numbers = [...box.querySelectorAll('b.of-channel')];
+  const text = box.querySelector('.row-text'), numbers = [...box.querySelectorAll('b.of-channel')];
   const plots = [...box.querySelectorAll('svg.lines')], cursor = box.querySelector('.now');
   const input = () => document.querySelector('input[inputmode=decimal]');
   let at = 0;
   const show = () => {
-    said.innerHTML = words[at];
+    text.innerHTML = texts[at];
     if (!kind) return;
     plots.forEach((plot, i) => { plot.style.display = i === kind.selectedIndex ? 'block' : 'none'; });
     cursor.setAttribute('transform', `translate(${x[at]})`);
@@ -33,55 +33,56 @@ _SCRIPT = """<script>
   const follow = () => {
     const slider = document.querySelector('[role=slider]');
     const now = slider ? Math.floor((Number(slider.ariaValueNow) - begin) / step + 1e-3) + 1 : 0;
-    const row = Math.min(Math.max(now, 0), words.length - 1);
+    const row = Math.min(Math.max(now, 0), texts.length - 1);
     if (row !== at) { at = row; show(); }
   };
-  whenPointed(box, (plot, event) => {
-    const place = placeOf(plot, event);
+  onPlotPointer(box, (plot, event) => {
+    const place = plotX(plot, event);
     let row = 1;
-    x.forEach((one, i) => { if (i && Math.abs(one - place) < Math.abs(x[row] - place)) row = i; });
-    if (input() && row !== at) typeInto(input(), begin + (row - 0.5) * step);
+    x.forEach((each, i) => { if (i && Math.abs(each - place) < Math.abs(x[row] - place)) row = i; });
+    if (input() && row !== at) setInput(input(), begin + (row - 0.5) * step);
   });
   if (kind) kind.addEventListener('change', show);
-  const changed = {subtree: true, attributes: true, attributeFilter: ['aria-valuenow']};
-  new MutationObserver(follow).observe(document.body, changed);
-  const begun = setInterval(() => {
+  const options = {subtree: true, attributes: true, attributeFilter: ['aria-valuenow']};
+  new MutationObserver(follow).observe(document.body, options);
+  const timer = setInterval(() => {
     if (!input() || !(Number(input().value) > 0)) return;
-    clearInterval(begun);
-    typeInto(input(), 0.05);
+    clearInterval(timer);
+    setInput(input(), 0.05);
   }, 20);
   box.open = innerWidth > %d;
-  const folded = innerHeight < %d && box.querySelector('.plot');  // as in a notebook, where it would hide the scene
-  if (folded) folded.open = false;
+  const plot = innerHeight < %d && box.querySelector('.plot');  // in a notebook it would hide the scene
+  if (plot) plot.open = false;
   show();
 })();
 </script>"""
 
 
 def static_player(
-    words: Sequence[str], begin_s: float, step_s: float, plot: ReadingsPlot | None = None, rows: Sequence[int] = ()
+    texts: Sequence[str], begin_s: float, step_s: float, plot: ReadingsPlot | None = None, rows: Sequence[int] = ()
 ) -> str:
-    """HTML and a script of what is said of every row that is played: at first, and from a time on at steps.
+    """Return the panel with its script.
 
-    ``words``: HTML. ``rows``: those of the plot's readings.
+    ``texts``: HTML of the initial row, and of every row that is played. ``begin_s``, ``step_s``: begin of the playback,
+    and time between its rows. ``rows``: the rows in the plot's readings.
     """
-    held: dict[str, object] = {"begin": begin_s, "step": step_s, "words": list(words)}
-    drawn = ""
+    content: dict[str, object] = {"begin": begin_s, "step": step_s, "texts": list(texts)}
+    plot_html = ""
     if plot is not None:
         kinds = [plot.lines(kind) for kind in plot.kinds]
-        held["x"] = across(kinds[0], kinds[0].at(rows)[0]).round(2).tolist()
-        held["values"] = [[number_texts(lines, row) for row in lines.at(rows)[1].tolist()] for lines in kinds]
+        content["x"] = across(kinds[0], kinds[0].at(rows)[0]).round(2).tolist()
+        content["values"] = [[number_texts(lines, row) for row in lines.at(rows)[1].tolist()] for lines in kinds]
         options = "".join(f"<option>{escape(kind)}</option>" for kind in plot.kinds)
-        drawn = (
+        plot_html = (
             '<details class="plot" open><summary style="font-size:.8rem;cursor:pointer">Readings</summary>'
             f'<select aria-label="Show" style="font:inherit;font-size:.75rem;margin:.3em 0">{options}</select>'
-            f"{''.join(lines_svg(lines, plot.time_words) for lines in kinds)}"
+            f"{''.join(lines_svg(lines, plot.time_label) for lines in kinds)}"
             f"{cursor_svg(0.0)}{numbers_html(kinds[0])}</details>"
         )
-    data = json.dumps(held).replace("</", "<\\/")
+    data = json.dumps(content).replace("</", "<\\/")
     return (
         '<details id="row" class="box" open style="top:.8em;right:.8em">'
         '<summary style="font-weight:600;padding:.5em .6em .2em;cursor:pointer">At this time</summary>'
-        f'<div style="padding:0 .6em .5em;width:18rem"><div class="said" style="margin:0 -.6em"></div>{drawn}</div>'
-        f"</details>{_SCRIPT % (data, POINTED, NARROW_PX, _LOW_PX)}"
+        '<div style="padding:0 .6em .5em;width:18rem"><div class="row-text" style="margin:0 -.6em"></div>'
+        f"{plot_html}</div></details>{_SCRIPT % (data, POINTER_SCRIPT, NARROW_PX, _LOW_PX)}"
     )

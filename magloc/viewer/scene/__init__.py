@@ -1,1 +1,1 @@
-"""What stands in the scene: glyphs, shapes, legends."""
+"""Contents of the scene: glyphs, shapes, legends."""

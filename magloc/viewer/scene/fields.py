@@ -1,4 +1,4 @@
-"""Fields in a scene: arrows at the sensors, and a plane through a source that is coloured by the field's modulus."""
+"""Fields in a scene: arrows at the sensors, and a plane coloured by the modulus."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ _SCALE = colormaps["viridis"]
 _PIXELS = 160
 _DECADES = 3.0
 _ALPHA = 200
-# Of arrows, in their greatest length.
+# Sizes of the arrows, relative to the greatest length.
 _SHAFT, _HEAD, _HEAD_LENGTH = 0.03, 0.08, 0.2
 
 
 class SensorArrows:
-    """Arrows at places of a frame, all to one linear scale: the longest has a given length.
+    """Arrows at places of a frame on one linear scale.
 
     Parameters
     ----------
     scene : viser.SceneApi
     name : str
-        Of the node; below the frame that places and vectors are in.
+        Name of the node, below the frame of places and vectors.
     size_m : float
-        Length of the longest arrow.
+        Length of the longest arrow [m].
     colour : tuple of 3 ints
     """
 
@@ -41,11 +41,11 @@ class SensorArrows:
         )  # fmt: skip
 
     def hide(self) -> None:
-        """Show none."""
+        """Hide the arrows."""
         self._arrows.visible = False
 
     def show(self, places_m: ArrayLike, vectors: ArrayLike) -> float:
-        """Show vectors (n, 3) at places (n, 3) [m], those that are finite; returns the modulus of the longest."""
+        """Show the finite vectors (n, 3) at places (n, 3) [m], and return the largest modulus."""
         places, values = np.asarray(places_m, dtype=np.float64), np.asarray(vectors, dtype=np.float64)
         known = np.isfinite(values).all(axis=1)
         longest = float(np.linalg.norm(values[known], axis=1).max()) if known.any() else 0.0
@@ -57,32 +57,33 @@ class SensorArrows:
 
 
 class FieldSlice:
-    """A square plane through a source across an axis, coloured by the logarithm of the field's modulus.
+    """Square plane through a source, coloured by the logarithm of the field's modulus.
 
     Parameters
     ----------
     scene : viser.SceneApi
     name : str
-        Of the node.
+        Name of the node.
     side_m : float
-        Of the square.
+        Side of the square [m].
     """
 
     def __init__(self, scene: viser.SceneApi, name: str, side_m: float) -> None:
         self._side_m = side_m
-        nothing = np.zeros((2, 2, 4), dtype=np.uint8)
+        empty = np.zeros((2, 2, 4), dtype=np.uint8)
         self._image = scene.add_image(
-            name, nothing, side_m, side_m, format="png", cast_shadow=False, receive_shadow=False, visible=False
+            name, empty, side_m, side_m, format="png", cast_shadow=False, receive_shadow=False, visible=False
         )
 
     def hide(self) -> None:
-        """Show none."""
+        """Hide the plane."""
         self._image.visible = False
 
     def show(self, positions_m: ArrayLike, moments_Am2: ArrayLike, axis: int) -> tuple[float, float]:
-        """Show the field of sources (k, 3) [m, A·m²] across an axis through the first; returns ends of the scale [T].
+        """Show the field of sources (k, 3) [m, A·m²], and return the ends of the scale [T].
 
-        Three decades, up to the field that one pixel in a hundred exceeds.
+        The plane goes through the first source. The scale has three decades, up to the field that one pixel in a
+        hundred exceeds.
         """
         positions, moments = np.atleast_2d(positions_m), np.atleast_2d(moments_Am2)
         R = picture_axes(axis)
@@ -91,7 +92,7 @@ class FieldSlice:
         B = np.linalg.norm(field(points[..., None, :], positions, moments).sum(axis=-2), axis=-1)
         high = float(np.nanquantile(B, 0.99))
         low = high * 10.0**-_DECADES
-        self._image.image = _coloured(np.log10(B / low) / _DECADES)
+        self._image.image = _slice_colours(np.log10(B / low) / _DECADES)
         self._image.position = positions[0]
         self._image.wxyz = Rotation.from_matrix(R.T).as_quat(scalar_first=True)
         self._image.visible = True
@@ -99,17 +100,17 @@ class FieldSlice:
 
 
 PICTURE_AXES = ((1, 2), (2, 0), (0, 1))
-"""Axes of the scene across and down a picture that is across an axis."""
+"""Horizontal and vertical axis of a picture across each axis of the scene."""
 
 
 def picture_axes(axis: int) -> FloatArray:
-    """Return the directions across, down and out of a picture (3, 3), one a row; right-handed."""
+    """Return the right-handed directions across, down and out of a picture, as rows (3, 3)."""
     across, down = PICTURE_AXES[axis]
     return np.eye(3)[[across, down, axis]]
 
 
-def _coloured(share: FloatArray) -> ByteArray:
-    """Shares of the scale as colours (..., 4); what is not known is transparent."""
+def _slice_colours(share: FloatArray) -> ByteArray:
+    """Return the colours (..., 4) of shares of the scale; unknown values are transparent."""
     colours = _SCALE(np.clip(np.nan_to_num(share), 0.0, 1.0), bytes=True)
     colours[..., 3] = np.where(np.isfinite(share), _ALPHA, 0)
     return np.asarray(colours, dtype=np.uint8)

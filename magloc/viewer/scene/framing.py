@@ -1,4 +1,4 @@
-"""What is in view at first: the extent of a scene, its floor, and the first camera."""
+"""First view of a scene: extent, floor, lights and camera."""
 
 from __future__ import annotations
 
@@ -13,34 +13,34 @@ from arrays.typing import FloatArray
 from magloc.viewer.scene.glyphs import round_length
 
 FIELD_OF_VIEW_RAD = np.radians(40.0)
-"""Of the first camera, upright."""
-# From where the first camera looks: from the front right, from above.
+"""Vertical field of view of the first camera."""
+# The first camera looks from the front right, from above.
 _TOWARDS_CAMERA = np.array([0.55, -0.72, 0.42])
-_ASPECT = 1.0  # of the scene beside the panel, less the words to its right
-SIDES_OF_A_PHONE = 1.4
-"""What a narrow page sees to its sides, over the height that the first camera sees: words are as large on it."""
+_ASPECT = 1.0  # of the scene beside the panel, less the labels to its right
+PHONE_WIDTH = 1.4
+"""Width that a narrow page sees, relative to the height of the first view: its labels need more room."""
 _MARGIN = 1.12
 _CELLS_PER_RADIUS = 4.0
 _FLOOR_RADII = 3.0
 _BELOW_RADII = 0.05
-# Seen on white, and not too much on a dark page.
+# Visible on white, and not too bright on a dark page.
 _FLOOR_COLOUR, _FLOOR_LINE = (150, 155, 160), 0.45
-# Strengths of the lights beside the one from above, which has 3: from everywhere, and from each of four sides.
+# Intensities of the ambient light and of four side lights; the light from above has 3.
 _AMBIENT = 1.6
 _SIDE = 1.3
 
 
 class Extent(NamedTuple):
-    """What should be in view.
+    """Points that should be in view.
 
     Attributes
     ----------
     centre_m : ndarray, shape (3,)
-        Middle of the points' box, about which the camera turns [m].
+        Centre of the points' bounding box, around which the camera turns [m].
     radius_m : float
-        Of the ball around it that holds the points [m]; positive.
+        Radius of the ball around the centre that contains the points, positive [m].
     points_m : ndarray, shape (k, 3)
-        [m].
+        The points [m].
     """
 
     centre_m: FloatArray
@@ -49,19 +49,18 @@ class Extent(NamedTuple):
 
 
 class Floor(NamedTuple):
-    """Where the floor is [m], and the side of its squares [m]."""
+    """Height of the floor, and side of its squares."""
 
     height_m: float
     cell_m: float
 
 
 def extent_of(*points_m: ArrayLike) -> Extent:
-    """Extent of points.
+    """Return the extent of points, with a radius of 1 m for a single place or none.
 
-    ``*points_m`` (..., 3): those that are not finite do not count [m]. Returns: with a radius of 1 m if there is no
-    point, or only one place.
+    ``*points_m`` (..., 3): points [m]; those that are not finite are ignored.
     """
-    points = np.concatenate([np.asarray(some, dtype=np.float64).reshape(-1, 3) for some in points_m])
+    points = np.concatenate([np.asarray(part, dtype=np.float64).reshape(-1, 3) for part in points_m])
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):
         points = np.zeros((1, 3))
@@ -73,20 +72,17 @@ def extent_of(*points_m: ArrayLike) -> Extent:
 
 
 def corners_of(centre_m: ArrayLike, half_side_m: float) -> FloatArray:
-    """Corners of a cube, shape (8, 3) [m]."""
+    """Return the corners of a cube, shape (8, 3) [m]."""
     signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
     return np.asarray(centre_m, dtype=np.float64) + half_side_m * signs
 
 
-def prepare(server: viser.ViserServer, extent: Extent) -> Floor:
-    """Up direction, light, floor and the first camera.
-
-    ``extent``: what should be in view.
-    """
+def set_up_scene(server: viser.ViserServer, extent: Extent) -> Floor:
+    """Set up direction, lights, floor and first camera of a scene of an extent."""
     scene, centre, radius = server.scene, extent.centre_m, extent.radius_m
     scene.set_up_direction("+z")
     scene.world_axes.visible = False
-    _light(scene)
+    _add_lights(scene)
     cell = round_length(radius / _CELLS_PER_RADIUS * 1.5)
     side = 2.0 * np.ceil(_FLOOR_RADII * radius / cell) * cell
     middle = np.round(centre[:2] / cell) * cell
@@ -106,15 +102,15 @@ def prepare(server: viser.ViserServer, extent: Extent) -> Floor:
         fade_distance=20.0 * radius,
         position=(middle[0], middle[1], height),
     )
-    aim(server, extent)
+    aim_camera(server, extent)
     return Floor(height, cell)
 
 
-def _light(scene: viser.SceneApi) -> None:
-    """From above, and from all sides: nothing is black, wherever it is seen from."""
-    # Shadows fall on whatever is near, and say nothing.
+def _add_lights(scene: viser.SceneApi) -> None:
+    """Add light from above and from all sides, so that no side is black."""
+    # Shadows of neighbouring objects would be confusing.
     scene.configure_default_lights(enabled=True, cast_shadow=False)
-    # The picture of surroundings that viser lights with costs a machine without a graphics card several seconds.
+    # The default environment map takes several seconds on a machine without a graphics card.
     scene.configure_environment_map(hdri=None)
     scene.add_light_ambient("/lights/everywhere", intensity=_AMBIENT)
     x, y, z = _TOWARDS_CAMERA.tolist()
@@ -122,14 +118,14 @@ def _light(scene: viser.SceneApi) -> None:
         scene.add_light_directional(f"/lights/side-{i}", intensity=_SIDE, position=side)
 
 
-def aim(server: viser.ViserServer, extent: Extent) -> None:
-    """Point the first camera, and what "Reset View" returns to, so that all points are just in view."""
+def aim_camera(server: viser.ViserServer, extent: Extent) -> None:
+    """Set the first camera, also that of "Reset View", so that all points are just in view."""
     back = _TOWARDS_CAMERA / np.linalg.norm(_TOWARDS_CAMERA)
     right = np.cross([0.0, 0.0, 1.0], back)
     right /= np.linalg.norm(right)
     axes = np.stack([right, np.cross(back, right), back])
     across, up, towards = axes @ (extent.points_m - extent.centre_m).T
-    # A point is in view if it is no farther from the axis than the field of view is wide at its depth.
+    # A point is in view if its distance from the axis is within the field of view at its depth.
     tangent = np.tan(0.5 * FIELD_OF_VIEW_RAD) / _MARGIN
     distance = np.max(towards + np.maximum(np.abs(up) / tangent, np.abs(across) / (_ASPECT * tangent)))
     camera = server.initial_camera

@@ -1,40 +1,42 @@
-"""The legend: what the colours mean, with units. The same HTML in the panel of the live page and in a static file."""
+"""Legend of the colours of a scene, as HTML for the panel of a served page and for a static page."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from html import escape
 
 import numpy as np
 
-from magloc.viewer.scene.framing import FIELD_OF_VIEW_RAD, SIDES_OF_A_PHONE
+from arrays.typing import ByteArray, FloatArray
+from magloc.viewer.scene.framing import FIELD_OF_VIEW_RAD, PHONE_WIDTH
 
 Colour = tuple[int, int, int]
-ABOVE_THE_PLAYER = "4em"
-"""Where the legend stands on a page that plays."""
+BOTTOM_WITH_PLAYER = "4em"
+"""Distance of the legend from the bottom of a page with a player."""
 NARROW_PX = 600
-"""Of a page whose legend or panel is folded at first, for it would hide the scene."""
-_TO_ONE_SIDE = SIDES_OF_A_PHONE * np.tan(0.5 * FIELD_OF_VIEW_RAD)
-FOLLOWS_THE_SCHEME = """<script>
+"""Width of a page below which legend and panel are folded at first, because they would hide the scene."""
+_SHADES = 9
+_TO_ONE_SIDE = PHONE_WIDTH * np.tan(0.5 * FIELD_OF_VIEW_RAD)
+SCHEME_SCRIPT = """<script>
 if (matchMedia('(prefers-color-scheme: dark)').matches) {
-  const asked = URLSearchParams.prototype.get;
-  URLSearchParams.prototype.get = function (name) { return name === 'darkMode' ? '' : asked.call(this, name); };
+  const original = URLSearchParams.prototype.get;
+  URLSearchParams.prototype.get = function (name) { return name === 'darkMode' ? '' : original.call(this, name); };
 }
 </script>"""
-"""Of the head of viser's page, which asks its address whether it is to be dark: as the browser is, light or dark."""
+"""Script for the head of viser's page: its query ``darkMode`` follows the scheme of the browser."""
 _BOX = """<style>
 .box { background: rgba(255,255,255,.9); color: #222; position: fixed; z-index: 1000; border-radius: .4em;
   box-shadow: 0 1px 4px rgba(0,0,0,.25); font-family: sans-serif }
 @media (prefers-color-scheme: dark) { .box { background: rgba(30,32,36,.9); color: #ddd } }
 </style>"""
-# viser's page takes its first camera from its address, which a page of a file must not change.
-_SEES_AS_WIDE = f"""<script>
+# viser's page reads its first camera from its address, which a file cannot change.
+_PHONE_CAMERA_SCRIPT = f"""<script>
 if (innerWidth < {NARROW_PX}) {{
-  const inAddress = URLSearchParams.prototype.get;
-  const upright = 2 * Math.atan({_TO_ONE_SIDE:.4f} * Math.max(innerHeight / innerWidth, 1));
+  const original = URLSearchParams.prototype.get;
+  const vertical = 2 * Math.atan({_TO_ONE_SIDE:.4f} * Math.max(innerHeight / innerWidth, 1));
   URLSearchParams.prototype.get = function (name) {{
-    return name === 'initialCameraFov' ? upright : inAddress.call(this, name);
+    return name === 'initialCameraFov' ? vertical : original.call(this, name);
   }};
 }}
 </script>"""
@@ -42,13 +44,13 @@ if (innerWidth < {NARROW_PX}) {{
 
 @dataclass(frozen=True)
 class Swatch:
-    """A colour and what it stands for.
+    """Colour with its meaning.
 
     Attributes
     ----------
     colour : tuple of 3 ints
     text : str
-        With its unit.
+        Meaning with its unit.
     """
 
     colour: Colour
@@ -57,16 +59,16 @@ class Swatch:
 
 @dataclass(frozen=True)
 class ColourScale:
-    """A scale of colours.
+    """Scale of colours.
 
     Attributes
     ----------
     text : str
-        What is coloured, with its unit.
+        Quantity with its unit.
     low, high : str
-        What the first and the last colour stand for.
+        Values of the first and the last colour.
     colours : tuple of tuples of 3 ints
-        Evenly along the scale.
+        Colours, evenly along the scale.
     """
 
     text: str
@@ -74,16 +76,19 @@ class ColourScale:
     high: str
     colours: tuple[Colour, ...]
 
+    @classmethod
+    def sample(cls, text: str, low: str, high: str, colours_at: Callable[[FloatArray], ByteArray]) -> ColourScale:
+        """Return a scale with the colours (n, 3) at n places from 0 to 1."""
+        colours = colours_at(np.linspace(0.0, 1.0, _SHADES)).tolist()
+        return cls(text, low, high, tuple((red, green, blue) for red, green, blue in colours))
+
 
 Entry = Swatch | ColourScale
 
 
 def legend_html(entries: Sequence[Entry], notes: Sequence[str] = ()) -> str:
-    """Legend as HTML.
-
-    ``notes``: sentences below. Returns: one ``div``; all texts are escaped.
-    """
-    rows = [_row(entry) for entry in entries]
+    """Return the legend as one ``div`` with escaped texts; ``notes`` are sentences below it."""
+    rows = [_entry_html(entry) for entry in entries]
     rows += [f'<div style="margin-top:.35em;opacity:.8">{escape(note)}</div>' for note in notes]
     return f'<div style="font-size:.8rem;line-height:1.35;padding:.2em .6em .5em">{"".join(rows)}</div>'
 
@@ -97,9 +102,9 @@ def with_legend(
     bottom: str = ".8em",
     beside: str = "",
 ) -> str:
-    """A static page as viser makes it, without a panel, with a legend that folds in its corner, and HTML beside it.
+    """Add a foldable legend and other HTML to a static page of viser.
 
-    A page as narrow as a phone sees as far to the sides as a wider one, and more above and below.
+    A page as narrow as a phone sees as much to the sides as a wider one, and more above and below.
     """
     box = (
         f'<details id="legend" class="box" open'
@@ -108,13 +113,12 @@ def with_legend(
         f"{escape(title)}</summary>{legend_html(entries, notes)}</details>"
         f"<script>document.getElementById('legend').open = innerWidth > {NARROW_PX}</script>"
     )
-    before, end, after = page.replace("<head>", f"<head>{FOLLOWS_THE_SCHEME}{_SEES_AS_WIDE}{_BOX}", 1).rpartition(
-        "</body>"
-    )
+    head = f"<head>{SCHEME_SCRIPT}{_PHONE_CAMERA_SCRIPT}{_BOX}"
+    before, end, after = page.replace("<head>", head, 1).rpartition("</body>")
     return f"{before}{box}{beside}{end}{after}"
 
 
-def _row(entry: Entry) -> str:
+def _entry_html(entry: Entry) -> str:
     if isinstance(entry, Swatch):
         swatch = f"background:{css(entry.colour)};width:.9em;height:.9em;border-radius:.15em;flex:none;margin-top:.2em"
         return f'<div style="display:flex;gap:.55em"><span style="{swatch}"></span>{escape(entry.text)}</div>'
@@ -128,5 +132,5 @@ def _row(entry: Entry) -> str:
 
 
 def css(colour: Colour) -> str:
-    """A colour as a page writes it."""
+    """Return a colour in the notation of CSS."""
     return f"rgb({colour[0]},{colour[1]},{colour[2]})"

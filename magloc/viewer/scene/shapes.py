@@ -1,7 +1,6 @@
-r"""Shapes of what is seen: field lines, uncertainty, iso-surfaces, frames. Pure geometry, nothing of a viewer.
+r"""Geometry of the glyphs: field lines, uncertainty regions, iso-surfaces and frames, independent of the viewer.
 
-All lengths are in metres, in whichever frame the arguments are. What cannot be drawn, because a number of it is not
-finite, is :data:`NOTHING`.
+All lengths are in metres, in the frame of the arguments. A shape with numbers that are not finite is :data:`NOTHING`.
 """
 
 from __future__ import annotations
@@ -23,20 +22,20 @@ IntArray = NDArray[np.int64]
 CHI2_95 = {2: 5.991464547107979, 3: 7.814727903251179}
 """95 % quantiles of χ², by degrees of freedom."""
 _AROUND, _ALONG = 24, 33  # points of a range region
-_OF_CIRCLE = 48
-_NEAREST_OF_RANGE = 0.02
+_CIRCLE_POINTS = 48
+_LEAST_RANGE = 0.02  # of a range region, relative to its range
 _SAME_LENGTH_RTOL = 1e-6
 
 
 class Surface(NamedTuple):
-    """A triangulated surface.
+    """Triangulated surface.
 
     Attributes
     ----------
     vertices : ndarray, shape (n, 3)
-        [m].
+        Positions of the vertices [m].
     faces : ndarray of int, shape (k, 3)
-        Vertices of every triangle, counter-clockwise seen from outside.
+        Vertices of every triangle, counter-clockwise as seen from outside.
     """
 
     vertices: FloatArray
@@ -46,8 +45,8 @@ class Surface(NamedTuple):
 NOTHING = Surface(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
 
 
-def joined(surfaces: Iterable[Surface]) -> Surface:
-    """Several surfaces as one."""
+def join_surfaces(surfaces: Iterable[Surface]) -> Surface:
+    """Join several surfaces into one."""
     vertices, faces = [NOTHING.vertices], [NOTHING.faces]
     before = 0
     for surface in surfaces:
@@ -58,17 +57,24 @@ def joined(surfaces: Iterable[Surface]) -> Surface:
 
 
 def surface_of(*meshes: trimesh.Trimesh) -> Surface:
-    """Meshes as one surface."""
-    return joined(Surface(np.array(mesh.vertices), np.array(mesh.faces, dtype=np.int64)) for mesh in meshes)
+    """Return meshes as one surface."""
+    return join_surfaces(Surface(np.array(mesh.vertices), np.array(mesh.faces, dtype=np.int64)) for mesh in meshes)
+
+
+def fan(rim_m: FloatArray) -> Surface:
+    """Return the triangles between the origin and a closed rim (n, 3)."""
+    n = len(rim_m)
+    faces = np.array([[0, i + 1, (i + 1) % n + 1] for i in range(n)])
+    return Surface(np.concatenate([np.zeros((1, 3)), rim_m]), faces)
 
 
 def dipole_body(size_m: float, thickness_m: float | None = None) -> Surface:
-    """A ball at the origin and an arrow from it along z, which stand for a dipole.
+    """Return the body of a dipole: a ball at the origin, and an arrow along z.
 
-    ``size_m``: length of the arrow [m]. ``thickness_m``: diameter of the ball, by which the arrow's shaft and head
-    are sized too; by default a quarter of the length, about [m].
+    ``size_m``: length of the arrow [m]. ``thickness_m``: diameter of the ball, to which shaft and head are
+    proportional; by default about a quarter of the length [m].
     """
-    # Made of the length 1: the library merges vertices by an absolute tolerance, in whole numbers.
+    # The meshes have the length 1, because the library merges vertices by an absolute tolerance.
     thickness = 0.26 if thickness_m is None else thickness_m / size_m
     neck = 1.0 - 1.23 * thickness
     head = trimesh.creation.cone(0.46 * thickness, 1.0 - neck, sections=24)
@@ -80,10 +86,7 @@ def dipole_body(size_m: float, thickness_m: float | None = None) -> Surface:
 
 
 def box_edges(corner_m: ArrayLike, opposite_m: ArrayLike) -> FloatArray:
-    """The twelve edges of a box between two opposite corners.
-
-    ``corner_m``, ``opposite_m`` (3,): [m]. Returns (12, 2, 3): [m].
-    """
+    """Return the edges (12, 2, 3) of a box between two opposite corners (3,) [m]."""
     ends = np.array([corner_m, opposite_m], dtype=np.float64)
     corners = np.array(list(itertools.product(*ends.T)))
     along_one_axis = [(a, b) for a, b in itertools.combinations(corners, 2) if np.count_nonzero(a != b) == 1]
@@ -99,12 +102,12 @@ def field_lines(
     meridians: int = 6,
     points: int = 49,
 ) -> FloatArray:
-    r"""Field lines of one dipole: :math:`r = L \sin^2 θ` with θ from the moment, in planes through it.
+    r"""Return field lines of a dipole, :math:`r = L \sin^2 θ` with θ from the moment.
 
-    ``position_m``, ``moment_Am2`` (3,): source [m] and moment [A·m²]. ``reach_m``: largest L: where the outermost
-    lines cross the equator of the dipole [m]. ``shells``: different L, which grow as the square of 1, 2, 3, ….
-    ``meridians``: planes' halves, evenly around the moment. ``points``: on every line, evenly in θ, from the source
-    back to the source. Returns (shells · meridians, points, 3): [m]; NaN where there is no moment.
+    ``position_m``, ``moment_Am2`` (3,): position [m] and moment [A·m²]. ``reach_m``: largest L, at which the outermost
+    lines cross the equator [m]. ``shells``: number of values of L, which grow as the squares of 1, 2, 3, ….
+    ``meridians``: number of half-planes, evenly around the moment. ``points``: number of points of a line, evenly in θ,
+    from the source back to the source. Returns (shells · meridians, points, 3) [m]; NaN without a moment.
     """
     axes = _axes_along(np.asarray(moment_Am2, dtype=np.float64))
     theta = np.linspace(0.0, np.pi, points)
@@ -119,35 +122,32 @@ def field_lines(
 
 
 def line_segments(lines: ArrayLike) -> FloatArray:
-    """Polylines as separate segments, without those that have an end which is not finite.
-
-    ``lines`` (..., n, 3): [m]. Returns (segments, 2, 3): [m].
-    """
+    """Return the finite segments (k, 2, 3) of polylines (..., n, 3) [m]."""
     points = np.asarray(lines, dtype=np.float64)
     segments = np.stack([points[..., :-1, :], points[..., 1:, :]], axis=-2).reshape(-1, 2, 3)
     return segments[np.isfinite(segments).all(axis=(1, 2))]
 
 
 def unit_circle() -> FloatArray:
-    """Points (n + 1, 3) of a circle around the z axis, of radius 1, the first one again at the end."""
-    angle = 2.0 * np.pi * np.arange(_OF_CIRCLE + 1) / _OF_CIRCLE
+    """Return points (n + 1, 3) of the unit circle around z; the last one repeats the first."""
+    angle = 2.0 * np.pi * np.arange(_CIRCLE_POINTS + 1) / _CIRCLE_POINTS
     return np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
 
 
 def frame_edges(positions_m: ArrayLike) -> FloatArray:
-    """Bars between sensors: each pair that has no third sensor nearer to both (relative neighbourhood graph).
+    """Return bars between sensors: each pair without a third sensor that is nearer to both.
 
-    The edges of a tetrahedron, a square, a cube or a grid; any array is held together.
+    This relative neighbourhood graph has the edges of a tetrahedron, a square, a cube or a grid. It connects any array.
 
     Parameters
     ----------
     positions_m : array-like, shape (n, 3)
-        [m].
+        Positions of the sensors [m].
 
     Returns
     -------
     ndarray, shape (bars, 2, 3)
-        [m].
+        Ends of the bars [m].
 
     References
     ----------
@@ -162,30 +162,30 @@ def frame_edges(positions_m: ArrayLike) -> FloatArray:
             for i, j in zip(first, second, strict=True)
         ]
     )
-    kept = nearest_third >= (1.0 - _SAME_LENGTH_RTOL) * distance[first, second]
-    return np.stack([positions[first[kept]], positions[second[kept]]], axis=1)
+    is_bar = nearest_third >= (1.0 - _SAME_LENGTH_RTOL) * distance[first, second]
+    return np.stack([positions[first[is_bar]], positions[second[is_bar]]], axis=1)
 
 
 def ellipsoid(centre_m: ArrayLike, covariance_m2: ArrayLike) -> Surface:
-    """95 % ellipsoid of a position (χ² of three degrees of freedom).
+    """Return the 95 % ellipsoid of a position (χ² with three degrees of freedom).
 
-    ``centre_m`` (3,): [m]. ``covariance_m2`` (3, 3): [m²].
+    ``centre_m`` (3,): position [m]. ``covariance_m2`` (3, 3): covariance [m²].
     """
     centre, covariance = np.asarray(centre_m, dtype=np.float64), np.asarray(covariance_m2, dtype=np.float64)
     if not (np.isfinite(centre).all() and np.isfinite(covariance).all()):
         return NOTHING
     unit, faces = _unit_sphere()
     values, vectors = np.linalg.eigh(covariance)
-    # The symmetric root, which does not mirror: outside stays outside.
+    # The symmetric root is no reflection, so that the faces stay oriented outwards.
     root = (vectors * np.sqrt(CHI2_95[3] * np.clip(values, 0.0, None))) @ vectors.T
     return Surface(centre + unit @ root, faces)
 
 
 def ellipsoid_axes(covariance_m2: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Rotations and semi-axes of 95 % ellipsoids, for many that share one mesh.
+    """Return rotations and semi-axes of 95 % ellipsoids that share one mesh.
 
-    ``covariance_m2`` (..., 3, 3): [m²], finite. Returns the rotation from the axes of the ellipsoid
-    (..., 3, 3), proper, and the semi-axes (..., 3) [m].
+    ``covariance_m2`` (..., 3, 3): finite covariances [m²]. Returns the proper rotations from the axes of the ellipsoids
+    (..., 3, 3), and the semi-axes (..., 3) [m].
     """
     values, vectors = np.linalg.eigh(np.asarray(covariance_m2, dtype=np.float64))
     vectors[..., 0] *= np.sign(np.linalg.det(vectors))[..., None]
@@ -199,18 +199,17 @@ def range_region(
     interval_m: tuple[float, float | None],
     farthest_m: float,
 ) -> Surface:
-    r"""Where a source may be whose range is not observable: long, and bent where range and direction go together.
+    r"""Return the 95 % region of a source with an unobservable range: a long tube.
 
-    It has every range r of the interval, and at each the 95 % ellipse of the direction given that range. The estimates
-    of direction and 1/r are taken as jointly Gaussian, which holds far better than for the position: with the
-    covariance C of two angles t and :math:`w = 1/r`,
+    The tube may be bent. It contains every range r of the interval, with the 95 % ellipse of the direction given that
+    range. The estimates of direction and 1/r are jointly Gaussian to a far better approximation than the position. With
+    the covariance C of two angles t and :math:`w = 1/r`,
 
     .. math:: t \mid w \sim N\left(C_{tw} (w - w_0) / C_{ww},\; C_{tt} - C_{tw} C_{wt} / C_{ww}\right).
 
-    ``position_m`` (3,): estimate [m]. ``covariance_m2`` (3, 3): of the position, by linearisation [m²].
-    ``centroid_m`` (3,): where the range is counted from [m]. ``interval_m``: 95 % interval of the range [m]; high
-    is None where it is open. ``farthest_m``: where an open interval is cut [m]; at twice the estimated range at
-    least. Returns: closed.
+    ``position_m`` (3,): estimate [m]. ``covariance_m2`` (3, 3): covariance of the position, by linearisation [m²].
+    ``centroid_m`` (3,): origin of the range [m]. ``interval_m``: 95 % interval of the range [m]; high is None if it is
+    open. ``farthest_m``: end of an open interval, at least twice the estimated range [m]. Returns a closed surface.
     """
     centroid, covariance = np.asarray(centroid_m, dtype=np.float64), np.asarray(covariance_m2, dtype=np.float64)
     offset = np.asarray(position_m, dtype=np.float64) - centroid
@@ -219,7 +218,7 @@ def range_region(
         return NOTHING
     low, high = interval_m
     high = max(farthest_m, 2.0 * r0) if high is None else high
-    low = max(low, _NEAREST_OF_RANGE * min(r0, high))
+    low = max(low, _LEAST_RANGE * min(r0, high))
     axes = _axes_along(offset)
     # δt = e·δp / r0 for the two axes e across, δw = -u·δp / r0².
     to_angles = np.stack([axes[0] / r0, axes[1] / r0, -axes[2] / r0**2])
@@ -233,7 +232,7 @@ def range_region(
     around = 2.0 * np.pi * np.arange(_AROUND) / _AROUND
     rim = np.stack([np.cos(around), np.sin(around)], axis=-1) @ root.T
     middle = (1.0 / r - 1.0 / r0)[:, None] * slope
-    # The last point of every ring is its middle; the rings of the ends come twice, so that their edges look sharp.
+    # The last point of a ring is its centre. The end rings are repeated, so that their edges look sharp.
     angles = np.concatenate([middle[:, None] + rim, middle[:, None]], axis=1)
     direction = angles @ axes[:2] + axes[2]
     direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
@@ -250,26 +249,26 @@ def uncertainty(
     range_interval_m: Iterable[tuple[float, float | None]],
     farthest_m: float,
 ) -> Surface:
-    """Where the source of a fix may be: the 95 % ellipsoid if its range is observable, else the long region.
+    """Return the 95 % region of a source: an ellipsoid, or a tube for an unobservable range.
 
-    ``position_m`` (3,): [m]. ``covariance`` (k, k): of the position, or with the position first [m²].
-    ``centroid_m`` (3,): of the sensors [m]. ``range_interval_m``: as in
-    :class:`magloc.localization.fit.results.Solution`. ``farthest_m``: where an open interval is cut [m].
+    ``position_m`` (3,): estimate [m]. ``covariance`` (k, k): covariance of the position, or of more with the position
+    first [m²]. ``centroid_m`` (3,): centroid of the sensors [m]. ``range_interval_m``: see
+    :class:`magloc.localization.fit.results.Solution`. ``farthest_m``: end of an open interval [m].
     """
-    of_position = np.asarray(covariance, dtype=np.float64)[:3, :3]
+    covariance_m2 = np.asarray(covariance, dtype=np.float64)[:3, :3]
     if range_observable:
-        return ellipsoid(position_m, of_position)
-    return joined(
-        range_region(position_m, of_position, centroid_m, interval, farthest_m) for interval in range_interval_m
+        return ellipsoid(position_m, covariance_m2)
+    return join_surfaces(
+        range_region(position_m, covariance_m2, centroid_m, interval, farthest_m) for interval in range_interval_m
     )
 
 
 def iso_surface(axis_m: ArrayLike, values: ArrayLike, level: float) -> Surface:
-    """Closed surface around those points of a cube whose value is at most a level (marching cubes).
+    """Return the closed surface around the points with values up to a level (marching cubes).
 
     ``axis_m`` (n,): evenly spaced coordinates of the points, the same along all axes [m]. ``values`` (n, n, n):
-    positive; NaN is above every level. ``level``: positive. Returns: half a spacing beyond the points where they
-    are at the border of the cube; :data:`NOTHING` if no value is low enough.
+    positive values; NaN is above every level. ``level``: positive. The surface is half a spacing beyond points at the
+    border of the cube. Returns :data:`NOTHING` if no value is low enough.
     """
     with of_extra("view", "a surface"):
         from skimage.measure import marching_cubes
@@ -278,7 +277,7 @@ def iso_surface(axis_m: ArrayLike, values: ArrayLike, level: float) -> Surface:
     inside = cube <= level
     if not inside.any():
         return NOTHING
-    # Between a point inside and one that has no value the surface stands half way: the depth is cut off symmetrically.
+    # The depth has symmetric limits, so that the surface is half way between a point inside and one without a value.
     depth = np.clip(np.where(np.isfinite(cube), level - cube, -np.inf) / level, -0.5, 0.5)
     depth = np.where(inside, np.maximum(depth, 1e-3), np.minimum(depth, -1e-3))
     spacing = float(axis[1] - axis[0])
@@ -295,7 +294,7 @@ def _unit_sphere() -> Surface:
 
 @cache
 def _tube_faces() -> IntArray:
-    """Faces of rings stacked along a tube, outwards, and of the two rings after them that close its ends."""
+    """Return the faces of the rings along a tube, and of two more rings that close its ends."""
     ring = _AROUND + 1
     i = np.arange(_AROUND)
     j = (i + 1) % _AROUND
@@ -311,7 +310,7 @@ def _tube_faces() -> IntArray:
 
 
 def _axes_along(vector: FloatArray) -> FloatArray:
-    """Right-handed unit axes (3, 3), one a row, the last along a vector; NaN if it has no direction."""
+    """Return right-handed unit axes as rows (3, 3), the last along a vector."""
     with np.errstate(invalid="ignore", divide="ignore"):
         along = vector / np.linalg.norm(vector)
     across = np.cross(along, np.eye(3)[np.argmin(np.abs(along))])

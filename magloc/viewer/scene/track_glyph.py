@@ -1,4 +1,4 @@
-"""A track in a scene, coloured by time: as many points as an eye can tell, however long it is."""
+"""Track in a scene, coloured by time, with a bounded number of points."""
 
 from __future__ import annotations
 
@@ -9,32 +9,32 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from arrays.typing import ByteArray, FloatArray
-from magloc.viewer.scene.glyphs import TRACK_COLOUR, Colour, SurfaceGlyph, screen_lines
+from magloc.viewer.scene.glyphs import TRACK_COLOUR, Colour, SurfaceGlyph, add_lines
 from magloc.viewer.scene.shapes import ellipsoid, ellipsoid_axes, surface_of
 
 _MOST_ELLIPSOIDS = 40
 _MOST_SEGMENTS = 500
-_FINENESS = 2  # of an ellipsoid among many: with 3 a picture takes half as long again without a graphics card
+_SUBDIVISIONS = 2  # of the ellipsoids: with 3 a frame takes 50 % longer without a graphics card
 
 
 class TrackGlyph:
-    """A track in a scene: its line, 95 % ellipsoids of some of its points, and the place at one time.
+    """Track in a scene: line, 95 % ellipsoids of some points, and mark at one time.
 
     Parameters
     ----------
     scene : viser.SceneApi
     name : str
-        Of the node that holds it all.
+        Name of the parent node.
     positions_m : ndarray, shape (n, 3)
-        NaN where the source is not tracked [m].
+        Positions [m], NaN where the source is not tracked.
     covariances_m2 : ndarray, shape (n, 3, 3), optional
-        Of the positions [m²]; without them there are no ellipsoids.
+        Covariances of the positions [m²]; without them there are no ellipsoids.
     size_m : float
-        Diameter of the mark at one time.
+        Diameter of the mark [m].
     colour : tuple of 3 ints
-        Of mark and ellipsoids.
+        Colour of mark and ellipsoids.
     colours : ndarray of uint8, shape (n, 3), optional
-        Of the line at every point; by default it has one colour.
+        Colours of the line at its points; by default that of the mark.
     """
 
     def __init__(
@@ -51,9 +51,9 @@ class TrackGlyph:
         self.positions_m, self.covariances_m2 = positions_m, covariances_m2
         self._scene, self._name, self._colour = scene, name, colour
         every = np.tile(np.array(colour, dtype=np.uint8), (len(positions_m), 1)) if colours is None else colours
-        self._colours = linear(every)
+        self._colours = linear_intensities(every)
         ends = track_segments(positions_m, 0, len(positions_m) - 1)
-        self.line = screen_lines(scene, f"{name}/line", positions_m[ends], self._colours[ends], 4.0)
+        self.line = add_lines(scene, f"{name}/line", positions_m[ends], self._colours[ends], 4.0)
         self.mark = scene.add_icosphere(
             f"{name}/mark", radius=0.5 * size_m, color=colour, visible=False, cast_shadow=False, receive_shadow=False
         )
@@ -63,9 +63,9 @@ class TrackGlyph:
             self._add_ellipsoids(covariances_m2)
 
     def show_until(self, index: int, tail: int) -> None:
-        """Show the track up to a point, which is marked with its ellipsoid, and some intervals before it.
+        """Show a tail of some intervals up to a point, which has a mark and an ellipsoid.
 
-        What changes belongs together: to be called where the server is atomic.
+        Call this within ``server.atomic()``, because the changes belong together.
         """
         first, position = max(0, index - tail), self.positions_m[index]
         ends = track_segments(self.positions_m, first, index)
@@ -77,12 +77,12 @@ class TrackGlyph:
             self.mark.position = position
         self.region.show(None if self.covariances_m2 is None else ellipsoid(position, self.covariances_m2[index]))
         if self.regions is not None:
-            # Those that are not to be seen shrink to nothing: their number cannot change.
-            seen = (self._chosen >= first) & (self._chosen <= index)
-            self.regions.batched_scales = np.where(seen[:, None], self._semi_axes, 0.0).astype(np.float32)
+            # The number of ellipsoids cannot change, so hidden ones get a size of zero.
+            is_shown = (self._chosen >= first) & (self._chosen <= index)
+            self.regions.batched_scales = np.where(is_shown[:, None], self._semi_axes, 0.0).astype(np.float32)
 
     def _add_ellipsoids(self, covariances_m2: FloatArray) -> None:
-        """One node for all; at most 40, evenly among the points that are tracked."""
+        """Add one node for the ellipsoids, at most 40, evenly among the tracked points."""
         tracked = np.flatnonzero(
             np.isfinite(self.positions_m).all(axis=1) & np.isfinite(covariances_m2).all(axis=(1, 2))
         )
@@ -90,7 +90,7 @@ class TrackGlyph:
             return
         self._chosen = tracked[:: int(np.ceil(len(tracked) / _MOST_ELLIPSOIDS))]
         rotations, self._semi_axes = ellipsoid_axes(covariances_m2[self._chosen])
-        sphere = surface_of(trimesh.creation.icosphere(subdivisions=_FINENESS))
+        sphere = surface_of(trimesh.creation.icosphere(subdivisions=_SUBDIVISIONS))
         self.regions = self._scene.add_batched_meshes_simple(
             f"{self._name}/regions",
             sphere.vertices,
@@ -106,17 +106,17 @@ class TrackGlyph:
         )
 
 
-def linear(colours: ByteArray) -> ByteArray:
-    """Colours as the page wants those of single vertices, which it takes for linear intensities (sRGB undone)."""
+def linear_intensities(colours: ByteArray) -> ByteArray:
+    """Convert sRGB colours to the linear intensities that the page expects for vertices."""
     share = colours / 255.0
     intensity = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
     return np.rint(255.0 * intensity).astype(np.uint8)
 
 
 def track_segments(positions_m: FloatArray, first: int, last: int) -> NDArray[np.intp]:
-    """Ends (k, 2) of the segments of a track from one of its points (n, 3) to another: 500 segments at most, evenly.
+    """Return the ends (k, 2) of at most 500 segments between two points of a track (n, 3).
 
-    None leads over a point that is not finite.
+    No segment crosses a point that is not finite.
     """
     chosen = np.unique(np.linspace(first, last, min(last - first, _MOST_SEGMENTS) + 1).round().astype(np.intp))
     missing = np.cumsum(~np.isfinite(positions_m).all(axis=1))

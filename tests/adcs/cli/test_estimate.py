@@ -126,7 +126,9 @@ class TestRefusals:
         log = tmp_path / "log.csv"
         rows = [",".join(f"{columns[name][i]:.12g}" for name in names) for i in range(20)]
         log.write_text("\n".join([",".join(names), *rows, ""]))
-        assert_refused(adcs("estimate", log, "--config", example / "scenario.toml"), "no reading of the Sun sensor")
+        assert_refused(
+            adcs("estimate", log, "--config", example / "scenario.toml"), "must have readings of the Sun sensor"
+        )
 
     def test_a_set_that_cannot_observe_attitude(self, adcs, example):
         files = (example / "telemetry.csv", "--config", example / "scenario.toml")

@@ -106,4 +106,4 @@ class TestImu:
         log.write_text("\n".join([text[0], *text[900:], *text[1:5]]))
         assert_refused(adcs("imu", log), "line 603, column time_s", "expected times that ascend")
         log.write_text("\n".join(text[:5]))
-        assert_refused(adcs("imu", log), "time_s must last a second at least")
+        assert_refused(adcs("imu", log), "time_s must cover a second at least")

@@ -17,7 +17,7 @@ from tests.command_line import refuse_constant
 
 @pytest.fixture(scope="module")
 def flight():
-    return switching_loads(seed=3, duration_s=900.0)
+    return switching_loads(rng=3, duration_s=900.0)
 
 
 @pytest.fixture
@@ -53,7 +53,7 @@ class TestResult:
         outcome = adcs(*files, "--json")
         found = json.loads(outcome.out)
         assert (found["lag_rows"], found["lag_s"]) == (2.0, 2.0)
-        assert "not of one clock: the field changes 2 rows (2 s) later" in outcome.err
+        assert "do not have the same clock: the field changes 2 rows (2 s) later" in outcome.err
         assert found["warnings"][0] in outcome.err
         for entry, fields in zip(found["results"], flight.fields_T, strict=True):
             np.testing.assert_allclose(entry["field_nT"]["m1"], 1e9 * fields[0], atol=1e9 * NOISE_T)

@@ -140,16 +140,6 @@ class TestIntegration:
             np.testing.assert_allclose(means[i], seen.mean(axis=0))
             assert scatter[i] == pytest.approx(seen.std(axis=0).max())
 
-    def test_low_pass_is_scipys_butterworth(self):
-        """On equal steps, against the bilinear transform, whose error falls with the square of the step."""
-        values = np.random.default_rng(1).standard_normal((4000, 3)).cumsum(axis=0)
-        cutoff_Hz = math.sqrt(2.0) / (2.0 * math.pi * 2.0)
-        sections = signal.butter(2, 2.0 * DT * cutoff_Hz, output="sos")
-        start = signal.sosfilt_zi(sections)[..., None] * values[0]
-        expected, _ = signal.sosfilt(sections, values, axis=0, zi=start)
-        found = low_pass(values, np.full(4000, DT), 2.0, values[0])
-        np.testing.assert_allclose(found, expected, atol=0.01 * np.ptp(values))
-
     @pytest.mark.parametrize("time_s", [1e-3, 1.0, 1e3])
     def test_a_step_of_the_low_pass_is_exact(self, time_s):
         """The solution of z'' + 2s z' + 2s² z = 0 after a step, from rest, and its slope in the step after."""
@@ -332,7 +322,7 @@ class TestInput:
         good, time_s = np.ones((200, 3)), DT * np.arange(200)
         with pytest.raises(ValueError, match="time_s must ascend, two instants or more"):
             InertialMagneticRecord(0.0 * time_s, good, good, good)
-        with pytest.raises(ValueError, match="time_s must last a second at least"):
+        with pytest.raises(ValueError, match="time_s must cover a second at least"):
             InertialMagneticRecord(time_s[:50], good[:50], good[:50], good[:50])
         with pytest.raises(ValueError, match="field_T must be finite, of shape"):
             InertialMagneticRecord(time_s, good, good, np.full((200, 3), np.inf))

@@ -15,9 +15,8 @@ from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 
 from adcs.ellipsoids.ellipsoid import Ellipsoid, measurement_direction, segment_shape, shape_matrix
-from adcs.ellipsoids.names import STEP_RULES, StepRule
+from adcs.ellipsoids.names import StepRule
 from adcs.ellipsoids.observer import INFLATION, BoundedSystem
-from arrays.io.errors import check_positive
 from arrays.typing import FloatArray
 
 EPS = float(np.finfo(np.float64).eps)
@@ -190,11 +189,6 @@ def intersect_strip(
         touches the ellipsoid, which usually gives the smallest set (2 % above the true minimum in the plane, on
         average); ``lemma`` is the source paper's simplified step.
 
-    Raises
-    ------
-    ValueError
-        The direction has no length, the reading is not finite, the bound is not positive, or there is no such rule.
-
     Notes
     -----
     In one dimension the intersection of two intervals is an interval, and every rule
@@ -206,11 +200,6 @@ def intersect_strip(
     shape, which may be a small difference of large numbers.
     """
     h = measurement_direction(direction, ellipsoid.n)
-    check_positive(bound=bound)
-    if rule not in STEP_RULES:
-        raise ValueError(f"Input rule must be one of {', '.join(STEP_RULES)}; instead received {rule!r}.")
-    if not math.isfinite(value):
-        raise ValueError(f"Input value must be finite; instead received {value}.")
     x, H = ellipsoid.centre, ellipsoid.shape
     Hh = H @ h
     e2, trace = float(h @ Hh), ellipsoid.trace

@@ -15,11 +15,9 @@ from scipy import linalg
 from scipy.integrate import solve_ivp
 
 from adcs.ellipsoids import roll_yaw
-from adcs.ellipsoids.ellipsoid import Ellipsoid, quadratic_form
-from adcs.ellipsoids.observer import BoundedSystem, EllipsoidObserver
+from adcs.ellipsoids.ellipsoid import quadratic_form
 from adcs.ellipsoids.roll_yaw import (
     ORBITAL_RATE,
-    STEP_S,
     YAW,
     AttitudeLoop,
     first_set,
@@ -208,17 +206,6 @@ class TestPlant:
         found = advance(scenario, angles[None], rates[None], torque[None], 10.0)[0]
         np.testing.assert_allclose(found, expected, rtol=0, atol=3e-8)
 
-    def test_angular_momentum_and_energy_of_a_free_body(self):
-        """Without torques 100 s of tumbling keep |J ω| and ωᵀ J ω."""
-        scenario = LoopScenario(0.02, 1e-4, 1, 0.0, torque_Nm=0.0)
-        J, w = scenario.inertia_kgm2, np.array([[0.05, -0.08, 0.03]])
-        state = np.concatenate([np.zeros((1, 3)), w], axis=1)
-        for step in range(50):
-            state = advance(scenario, state[:, :3], state[:, 3:6], np.zeros((1, 3)), 2.0 * step)
-        for power in (1, 2):
-            before, after = (float(v @ np.linalg.matrix_power(J, power) @ v) for v in (w[0], state[0, 3:6]))
-            assert after == pytest.approx(before, rel=1e-9)
-
 
 class TestAttitudeLoop:
     @pytest.mark.slow_after(1)
@@ -304,41 +291,3 @@ class TestKalman:
 def outside_3_sigma(track, states):
     sigma = np.sqrt(track.covariances[1:, YAW, YAW])
     return np.mean(np.abs(track.means[1:, YAW] - states[:, YAW]) > 3.0 * sigma)
-
-
-def constant_shift_system(noise_rad, drift_rad_s):
-    """The system with the gyro's shift as a third state that stays as it is, and the set of its first state.
-
-    The third state is 3 c · shift / drift_rad_s, so that the states have comparable sizes. The first set is the least
-    ellipsoid of its kind around a circle of radius 3 c times all shifts within the bound.
-    """
-    A = np.eye(3)
-    A[:2, :2] = transition()
-    A[:2, 2] = input_matrix()[:, YAW] * STEP_S * drift_rad_s / (3.0 * noise_rad)
-    system = BoundedSystem(A, np.zeros((3, 3)), np.array([[1.0, 0.0, 0.0]]), np.array([noise_rad]))
-    return system, Ellipsoid(np.zeros(3), 2.0 * (3.0 * noise_rad) ** 2 * np.eye(3))
-
-
-class TestConstantShift:
-    @pytest.mark.parametrize(
-        ("noise", "half_width"), [(1.0, 0.7), (4.0, 1.0)]
-    )  # 0.48 instead of 4.3, 0.71 instead of 6.8
-    def test_a_third_state_finds_it(self, noise, half_width):
-        noise, drift = math.radians(noise), math.radians(0.02)
-        truth = error_runs(ErrorScenario(noise, drift, ORBIT), range(50))
-        system, first = constant_shift_system(noise, drift)
-        observer = EllipsoidObserver(system, first, 50, rule="tightened")
-        for step, readings in enumerate(truth.readings_rad.T, start=1):
-            observer.predict()
-            observer.correct(readings[:, None])
-            x = np.column_stack([truth.states_rad[:, step], np.full(50, 3.0 * noise)])
-            assert (quadratic_form(observer.centres, observer.shapes, x) <= 1.0 + 1e-9).all()
-        assert observer.resets.sum() == 0
-        assert np.degrees(np.sqrt(observer.shapes[:, YAW, YAW]).mean()) <= half_width
-
-    def test_first_set_holds_every_start(self):
-        system, first = constant_shift_system(0.02, 1e-4)
-        angle = np.linspace(0.0, 2.0 * math.pi, 50)
-        for shift in (-1.0, 1.0):
-            assert first.contains(0.06 * np.column_stack([np.cos(angle), np.sin(angle), np.full(50, shift)])).all()
-        assert system.n == 3

@@ -121,7 +121,7 @@ class TestRefusals:
     def test_no_matlab_file(self, tmp_path):
         (tmp_path / "cut.mat").write_bytes(matlab(tmp_path / "trial.mat").read_bytes()[:4000])
         with pytest.raises(
-            InputError, match=r"no MAT file that can be read, expected a trial of BROAD, of version 7 at most\.$"
+            InputError, match=r"no MAT file that can be read, expected a trial of BROAD, version 7 at most\.$"
         ):
             read_imu(tmp_path / "cut.mat")
         with pytest.raises(InputError, match="does not exist"):

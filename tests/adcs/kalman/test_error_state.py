@@ -65,9 +65,9 @@ class TestObservability:
     @pytest.mark.parametrize(
         ("sensors", "missing"),
         [
-            ("gyro", r"nothing measures attitude; missing is a star tracker \(st\) or a magnetometer \(mag\)"),
-            ("sun", r"rotation about the Sun open; missing is a star tracker \(st\) or a magnetometer \(mag\)"),
-            ("sun+gyro", r"rotation about the Sun open; missing is a star tracker \(st\) or a magnetometer \(mag\)"),
+            ("gyro", r"no sensor measures attitude. Add a star tracker \(st\) or a magnetometer \(mag\)"),
+            ("sun", r"rotation about the Sun open. Add a star tracker \(st\) or a magnetometer \(mag\)"),
+            ("sun+gyro", r"rotation about the Sun open. Add a star tracker \(st\) or a magnetometer \(mag\)"),
         ],
     )
     def test_says_what_is_missing(self, sensors: str, missing: str) -> None:

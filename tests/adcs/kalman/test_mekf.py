@@ -2,14 +2,14 @@
 
 One class per property.
 
-The oracles: central differences of the full equations, three algebraically equal updates, the acceptance figures that
+The oracles: central differences of the full equations, the update that adds information, the acceptance figures that
 a prototype of its own reached, and χ² for runs whose truth does exactly what the filter believes.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -47,7 +47,6 @@ from adcs.kalman.smoother import error_between
 from adcs.satellite.sensors import StarTracker
 from magloc import core
 from magloc.chi_square import normalised_square
-from magloc.state_space import symmetric_square_root, update
 from sims.attitude.scenario import AttitudeScenario, StartConditions
 from sims.attitude.simulation import AttitudeRuns, advance, prepare, sense, simulate
 from sims.experiments.accuracy import error_norm_deg, errors, last_rows, normalised_error_squared
@@ -70,7 +69,6 @@ from tests.adcs.kalman.test_error_state import TABLE_3
 from tests.calls import calls_of
 
 Array = NDArray[np.float64]
-Update = Callable[[Array, Array, Array], tuple[Array, Array]]
 ALL = ("st+gyro+mag+sun", ("field-bias", "gyro-bias", "disturbance"))
 EVERYTHING = (ALL[0], (*ALL[1], "field-model", "dipole", "field-gain"))
 SIZE = settings(*EVERYTHING).sensors.size
@@ -181,26 +179,15 @@ def information_update(P: Array, H: Array, residual: Array) -> tuple[Array, Arra
     return (updated @ H.mT @ residual[..., None])[..., 0], updated
 
 
-def square_root_update(P: Array, H: Array, residual: Array) -> tuple[Array, Array]:
-    """Update by square roots: magloc.state_space."""
-    corrections, covariances = [], []
-    for P_run, H_run, residual_run in zip(P, H, residual, strict=True):
-        dx, S, _ = update(np.zeros(len(P_run)), symmetric_square_root(P_run), H_run, residual_run)
-        corrections.append(dx)
-        covariances.append(S @ S.T)
-    return np.array(corrections), np.array(covariances)
-
-
 class TestUpdates:
     def problem(self) -> tuple[Array, Array, Array]:
         rng = np.random.default_rng(4)
         root = rng.standard_normal((8, 9, 9))
         return root @ root.mT, rng.standard_normal((8, 5, 9)), rng.standard_normal((8, 5))
 
-    @pytest.mark.parametrize("other", [square_root_update, information_update])
-    def test_forms_agree(self, other: Update) -> None:
+    def test_forms_agree(self) -> None:
         P, H, residual = self.problem()
-        for one, two in zip(joseph_update(P, H, residual), other(P, H, residual), strict=True):
+        for one, two in zip(joseph_update(P, H, residual), information_update(P, H, residual), strict=True):
             np.testing.assert_allclose(one, two, rtol=0, atol=1e-9)
 
     def test_no_reading_teaches_nothing(self) -> None:
@@ -419,13 +406,6 @@ class TestAcceptance:
         runs, estimates = filtered("st", (), 60.0)
         assert error_norm_deg(runs, estimates).max() < 0.01
 
-    def test_vectors_and_gyro_are_below_a_tenth_of_a_degree_after_240_s(self) -> None:
-        runs, estimates = filtered("mag+sun+gyro", (), 400.0)
-        late = error_norm_deg(runs, estimates)[:, 240:]
-        # Of 110 runs 60 to 65 % stay below it at every instant, and 94 to 96 % of the instants are below it.
-        assert np.mean(late < 0.1) > 0.9
-        assert np.median(late.max(axis=-1)) < 0.1
-
     def test_unmodelled_gyro_bias_with_one_direction(self) -> None:
         """Negative: nothing observes the turn about the field, and the error grows."""
         chosen = settings("mag+gyro")
@@ -507,16 +487,6 @@ class TestFieldModel:
         ignored = settings("mag+sun+gyro", self.STATES[:2])
         for wrong in (ignored, replace(ignored, field_error_T=field_error_T)):
             assert self.attitude_nees(runs, wrong) > 4.0
-
-    def test_claims_what_it_reaches(self) -> None:
-        """At 400 nT, from a start that is linear: 5° off in eclipse is not, and three runs of 80 are the rms."""
-        runs = self.runs(400e-9)
-        chosen = replace(settings("mag+sun+gyro", self.STATES), field_error_T=400e-9)
-        estimates = run_filter(runs, chosen, start_of(runs, math.radians(1.0)))
-        claimed = 4.0 * np.trace(estimates.covariance[:, 1000:, :3, :3], axis1=2, axis2=3).mean()
-        reached = np.mean(np.radians(error_norm_deg(runs, estimates)[:, 1000:]) ** 2)
-        # Few runs are most of both sums.
-        assert 0.4 < reached / claimed < 1.6
 
     def test_nothing_is_lost_where_there_is_none(self) -> None:
         runs = self.runs(0.0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import adcs
-from adcs.plots.attitude import gaps_of, states_figure
+from adcs.plots.attitude import sensor_gaps, states_figure
 
 
 def figure(are_errors):
@@ -33,7 +33,7 @@ class TestGaps:
     def test_what_is_missing_and_what_is_of_little_use(self):
         seen = {"sun": np.array([True, False, True]), "mag": np.ones(3, dtype=bool)}
         degraded = {"on one line": np.array([False, False, True]), "never": np.zeros(3, dtype=bool)}
-        gaps = gaps_of(seen, ("sun", "mag"), degraded)
+        gaps = sensor_gaps(seen, ("sun", "mag"), degraded)
         assert [words for words, _ in gaps] == ["no Sun sensor", "on one line"]
         assert [well.tolist() for _, well in gaps] == [[True, False, True], [True, True, False]]
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from adcs.ellipsoids.roll_yaw import YAW, KalmanTrack, SetTrack
-from adcs.plots.ellipsoids import RollYawPicture, outline, roll_yaw_figure
+from adcs.plots.ellipsoids import RollYawPicture, ellipse_outline, roll_yaw_figure
 
 TIME_S = np.linspace(0.0, 40.0, 21)
 N = TIME_S.size
@@ -64,9 +64,9 @@ class TestSets:
     def test_an_outline_is_the_edge_of_the_set(self) -> None:
         root = np.random.default_rng(0).standard_normal((2, 2))
         centre, shape = np.array([3.0, -1.0]), root @ root.T
-        away = outline(centre, shape) - centre
+        away = ellipse_outline(centre, shape) - centre
         np.testing.assert_allclose(np.einsum("ni,ij,nj->n", away, np.linalg.inv(shape), away), 1.0, rtol=1e-9)
-        np.testing.assert_allclose(outline(centre, np.zeros((2, 2))), np.tile(centre, (181, 1)))
+        np.testing.assert_allclose(ellipse_outline(centre, np.zeros((2, 2))), np.tile(centre, (181, 1)))
 
     def test_are_drawn_about_the_truth_at_five_instants(self) -> None:
         shown = picture()

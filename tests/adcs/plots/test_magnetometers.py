@@ -13,7 +13,7 @@ from sims import experiments
 
 class TestOwnFields:
     def test_a_panel_for_each_load_has_the_fields_at_all_magnetometers(self) -> None:
-        run = experiments.switching_loads(seed=0, duration_s=600.0)
+        run = experiments.switching_loads(rng=0, duration_s=600.0)
         own = adcs.find_own_fields(run.array, run.readings_T, run.time_s, run.gyro_rad_s, run.states)
         axes = own.plot().axes
         assert [ax.get_title("left").partition(":")[0] for ax in axes] == ["heater", "radio"]

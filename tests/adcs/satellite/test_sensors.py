@@ -166,5 +166,5 @@ class TestBadSettings:
     def test_no_direction(self) -> None:
         with pytest.raises(ValueError, match=r"Input boresight_body must have a length"):
             StarTracker(boresight_body=np.zeros(3))
-        with pytest.raises(ValueError, match=r"Input heads_body must be rows of 3 numbers"):
+        with pytest.raises(ValueError, match=r"Input heads_body must be vectors that are not zero"):
             SunSensor(heads_body=np.zeros((2, 3)))

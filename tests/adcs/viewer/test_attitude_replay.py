@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import adcs
-from adcs.viewer.attitude_page import row_words, strips
+from adcs.viewer.attitude_page import row_lines, strips_html
 from adcs.viewer.attitude_replay import AttitudeReplay, replay_of, rows_at
 from adcs.viewer.attitude_scene import _cone
 
@@ -38,14 +38,14 @@ class TestEnlarged:
         assert np.isnan(replay.errors_rad[-1]).all()
 
     def test_drawn(self, replay: AttitudeReplay) -> None:
-        turned = TRUTH[1].inv() * replay.drawn(1, 100.0)
+        turned = TRUTH[1].inv() * replay.enlarged_attitude(1, 100.0)
         np.testing.assert_allclose(turned.as_rotvec(), 100.0 * ERROR, atol=1e-10)
-        np.testing.assert_allclose(scalar_first(replay.drawn(N - 1, 100.0)), replay.q[-1], atol=1e-12)
+        np.testing.assert_allclose(scalar_first(replay.enlarged_attitude(N - 1, 100.0)), replay.q[-1], atol=1e-12)
 
     def test_by_as_much_as_can_be_seen(self, replay: AttitudeReplay) -> None:
         """3σ of 0.12° becomes 1.2°, and not 12°, of which 10° are let through."""
-        assert replay.enlarged == 10.0
-        assert replace(replay, sigma_rad=0.01 * replay.sigma_rad, q_true=np.full((N, 4), np.nan)).enlarged == 1000.0
+        assert replay.enlargement == 10.0
+        assert replace(replay, sigma_rad=0.01 * replay.sigma_rad, q_true=np.full((N, 4), np.nan)).enlargement == 1000.0
 
 
 class TestCones:
@@ -89,11 +89,11 @@ class TestRows:
 
 class TestWords:
     def test_of_a_row(self, replay: AttitudeReplay) -> None:
-        lines = row_words(replay, 2)
+        lines = row_lines(replay, 2)
         assert "no reading of Sun sensor" in lines
         assert any("error <b>0.0374°" in line for line in lines)
-        assert not any("error" in line for line in row_words(replay, N - 1))
+        assert not any("error" in line for line in row_lines(replay, N - 1))
 
     def test_strips(self, replay: AttitudeReplay) -> None:
-        assert "Sun sensor: 4 of 5 rows" in strips(replay)
-        assert strips(replay).count("#d5d9de") == 1
+        assert "Sun sensor: 4 of 5 rows" in strips_html(replay)
+        assert strips_html(replay).count("#d5d9de") == 1

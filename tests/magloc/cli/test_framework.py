@@ -267,6 +267,8 @@ class TestSignsOfLife:
 
     def told(self, monkeypatch: pytest.MonkeyPatch, *tokens: str, watched: bool, bar: bool = False) -> list[str]:
         """Notes of a command that waits for three of them, where there may be some."""
+        import tqdm  # noqa: F401 - a bar loads it, which takes longer than the first sign
+
         notes: list[str] = []
         seen = threading.Event()
 

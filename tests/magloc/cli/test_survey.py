@@ -54,7 +54,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A simulated survey."""
     place = tmp_path_factory.mktemp("survey")
     (place / "ground.toml").write_text(SCENARIO)
-    field = sims.simulate(sims.read_scenario(str(place / "ground.toml")), seed=11)
+    field = sims.simulate(sims.read_scenario(str(place / "ground.toml")), rng=11)
     sims.write_simulation(field, place / "ground.csv")
     return place
 

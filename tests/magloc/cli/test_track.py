@@ -211,15 +211,6 @@ class TestSmooth:
         for entry, point in zip(results, smooth_points(points, tracker.steps), strict=True):
             assert entry["position_m"] == (None if point.position_m is None else point.position_m.tolist())
 
-    def test_is_nearer_to_the_truth(self, run: Run, array: Path, readings: Path) -> None:
-        arguments = ("track", readings, "--array", array, "--json", "--motion", "wandering", *MOTION)
-        p = source()[1][N_EMPTY:]
-        before, after = (
-            np.array([entry["position_m"] for entry in results_of(run(*arguments, *extra))[N_EMPTY:]])
-            for extra in ((), ("--smooth",))
-        )
-        assert np.sum((after - p) ** 2) < np.sum((before - p) ** 2)
-
 
 class TestTruth:
     def test_report(self, run: Run, array: Path, readings: Path, truth: Path) -> None:

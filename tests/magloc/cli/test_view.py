@@ -25,7 +25,7 @@ from magloc.viewer.chromium import BINARIES, find_chromium
 from magloc.viewer.pages.open_result import MapResult, ReadingsResult, read_result
 from magloc.viewer.pages.pages import array_page
 from magloc.viewer.scene.glyphs import ArrayGlyphs
-from magloc.viewer.server import free_port, opened
+from magloc.viewer.server import free_port, open_server
 from tests.browser.browser import Browser
 from tests.command_line import Run, assert_refused, viewer_started
 
@@ -184,7 +184,7 @@ class TestBadInput:
 
         with Sweep(StartsMap.of(read_starts_scenario("paper", method=None, noise_seed=None), 5), tmp_path / "map.zarr"):
             pass
-        assert_refused(run("view", tmp_path), "nothing is computed yet")
+        assert_refused(run("view", tmp_path), "without computed points")
 
     def test_a_store_of_something_else(self, run: Run, tmp_path: Path) -> None:
         import zarr
@@ -352,7 +352,7 @@ class TestPicture:
         assert struct.unpack(">II", picture.read_bytes()[16:24]) == PICTURE_PX
         red, green, blue = np.moveaxis(read_png(picture).astype(int), -1, 0)
         array = tetrahedron(1.5)
-        with opened(0, "test") as server:
+        with open_server(0, "test") as server:
             array_page(server, array, live=False)
             camera = server.initial_camera
             size = ArrayGlyphs(server.scene, array).size_m

@@ -457,13 +457,6 @@ class TestLanes:
         assert np.all(ends.iterations == 17)
 
     @each_filter
-    def test_nor_does_the_readable_twin_say_that_it_stopped(self, method: Filter) -> None:
-        (start,) = starts_of("cube", 1)
-        for tolerance_T, stops in ((0.0, False), (np.inf, True)):
-            end = run_one(replace(method, tolerance_T=tolerance_T, max_iterations=3), self.measurement, self.z, start)
-            assert (end.converged, end.iterations < 3) == (stops, stops)
-
-    @each_filter
     def test_starts_are_left_as_they_were(self, method: Filter) -> None:
         starts = starts_of("cube", 40)
         before = starts.copy()

@@ -19,12 +19,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.differentiate import jacobian
 from scipy.optimize import minimize
 from scipy.spatial.distance import cdist, pdist
-from scipy.spatial.transform import Rotation
 from scipy.stats import qmc
 from scipy.stats.mstats import hdquantiles
 
@@ -37,7 +34,7 @@ from magloc.design.regions import Block, Cap, Mean, Quantile
 from magloc.design.task import DesignSearch, DesignTask
 from magloc.design.volumes import Ball, BoxVolume, Cylinder, MeshSurface, even_grid
 from magloc.fields.dipole import field
-from magloc.plots.designs import clear_azimuth
+from magloc.plots.designs import clearest_azimuth
 from tests.plain_locator import plain_locator
 
 RADIUS = 0.92
@@ -126,27 +123,6 @@ class TestCriterion:
 
     def test_infinite_deviations_above_the_quantile_do_not_count(self):
         assert Quantile(0.5).of(np.array([1.0, 2.0, 3.0, np.inf])) == 2.0
-
-    @given(st.tuples(*[st.floats(-3.0, 3.0)] * 3))
-    @settings(max_examples=10, deadline=None)
-    def test_rotation_of_task_and_array(self, vector):
-        turn = Rotation.from_rotvec(vector)
-        sample = random_sample(TASK, 200, rng(11))
-        turned = Sample(turn.apply(sample.positions), turn.apply(sample.moments))
-        sensors = TETRAHEDRON + rng(12).normal(0.0, 0.1, (4, 3))
-        assert turned.value(TASK, turn.apply(sensors)) == pytest.approx(sample.value(TASK, sensors), rel=1e-9)
-
-    def test_order_of_the_sensors(self):
-        sample = random_sample(TASK, 200, rng(13))
-        assert sample.value(TASK, TETRAHEDRON[[2, 0, 3, 1]]) == pytest.approx(
-            sample.value(TASK, TETRAHEDRON), rel=1e-12
-        )
-
-    def test_scales_with_noise_and_moment(self):
-        sample = random_sample(TASK, 200, rng(14))
-        weaker = Sample(sample.positions, 0.5 * sample.moments)
-        noisy = replace(TASK, noise_T=2e-9)
-        assert weaker.value(TASK, TETRAHEDRON) == pytest.approx(sample.value(noisy, TETRAHEDRON), rel=1e-12)
 
 
 class TestSources:
@@ -253,7 +229,7 @@ class TestDescent:
 
 @pytest.fixture(scope="module")
 def found():
-    return design_array(replace(TASK, search=SMALL), seed=1)
+    return design_array(replace(TASK, search=SMALL), rng=1)
 
 
 class TestEvenGrid:
@@ -302,17 +278,12 @@ class TestDesign:
         assert tetrahedron_.gain == pytest.approx(1.0 - own / tetrahedron_.criterion_m, abs=0.05)
         assert 0.0 < tetrahedron_.gain_error < 0.05
 
-    def test_small_search_gains_already(self, found):
-        """Four starts and a thousand sources: a fifth, at 2 m."""
-        assert found.judged[2].gain > 0.2
-        assert found.near_optimal == ()
-
     def test_same_seed_same_array_whatever_the_threads(self, found, threads):
         threads(1)
-        again = design_array(replace(TASK, search=SMALL), seed=1)
+        again = design_array(replace(TASK, search=SMALL), rng=1)
         assert again.array == found.array
         other = design_array(
-            replace(TASK, search=replace(SMALL, n_starts=2, small_iterations=3, large_iterations=3)), seed=2
+            replace(TASK, search=replace(SMALL, n_starts=2, small_iterations=3, large_iterations=3)), rng=2
         )
         assert other.array != found.array
 
@@ -331,7 +302,7 @@ class TestDesign:
 
     def test_surface(self):
         task = replace(TASK, volume=HULL, least_spacing_m=0.2)
-        result = design_array(replace(task, search=replace(SMALL, n_starts=2)), seed=3)
+        result = design_array(replace(task, search=replace(SMALL, n_starts=2)), rng=3)
         _, distance, _ = trimesh.proximity.closest_point_naive(HULL.mesh, result.array.positions)
         assert distance.max() < 1e-9
         assert pdist(result.array.positions).min() >= 0.2 * (1.0 - 1e-6)
@@ -344,7 +315,7 @@ class TestDesign:
     def test_references_that_could_be_built_are_starts(self):
         """So that no tetrahedron of the span, in none of the tried attitudes, is better on the sample."""
         search = replace(SMALL, n_starts=2, small_iterations=1, large_iterations=1)
-        result = design_array(replace(TASK, search=search), seed=4)
+        result = design_array(replace(TASK, search=search), rng=4)
         sample = sobol_sample(TASK, search.log2_large, rng(0))
         for judged in (result.judged[2], result.judged[4]):
             assert sample.value(TASK, result.array.positions) < 1.03 * sample.value(TASK, judged.array.positions)
@@ -401,7 +372,7 @@ class TestGain:
     @pytest.mark.parametrize("seed", [0, 1, 2])
     def test_over_the_tetrahedron(self, distance, least, most, seed):
         task = replace(TASK, region=Cap(distance, distance, (1.0, 0.0, 0.0), 0.5 * np.pi))
-        result = design_array(task, seed=seed)
+        result = design_array(task, rng=seed)
         tetrahedron_ = result.judged[2]
         assert least <= tetrahedron_.gain - 2.0 * tetrahedron_.gain_error
         assert tetrahedron_.gain < most
@@ -417,6 +388,6 @@ class TestPicture:
         e, a = np.radians([22.0, azimuth])
         sight = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
         points = np.array([sight, -sight, [0.0, 0.0, 2.0]])
-        e, a = np.radians([22.0, clear_azimuth(points)])
+        e, a = np.radians([22.0, clearest_azimuth(points)])
         towards = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
         assert np.linalg.norm(np.cross(towards, 2.0 * sight)) > 1.0

@@ -31,9 +31,15 @@ def jacobians_at(points: Array, source: Array, moment: Array) -> Array:
     return np.concatenate([-kernels.gradient_at_points(points, source[None], moment[None]), by_moment], axis=-1)
 
 
+def gradient_of_all(points: Array, sources: Array, moments: Array) -> Array:
+    """Gradient tensors (N, 3, 3) of the sum of several dipoles' fields."""
+    of_each = (dipole.gradient_tensor(points, p, m) for p, m in zip(sources, moments, strict=True))
+    return sum(of_each, start=np.zeros((len(points), 3, 3)))
+
+
 PAIRS = [
     pytest.param(kernels.field_at_points, dipole.total_field, dipole.field, id="field"),
-    pytest.param(kernels.gradient_at_points, dipole.total_gradient_tensor, dipole.gradient_tensor, id="gradient"),
+    pytest.param(kernels.gradient_at_points, gradient_of_all, dipole.gradient_tensor, id="gradient"),
 ]
 
 
@@ -80,19 +86,6 @@ class TestTwins:
 
 class TestAccuracy:
     """Against 120-digit arithmetic, from near to far."""
-
-    @pytest.mark.parametrize("exponent", range(-9, 10, 3))
-    def test_from_near_to_far(self, exponent: int) -> None:
-        rng = np.random.default_rng(exponent + 200)
-        source, moment = rng.normal(size=3), rng.normal(size=3)
-        points = source + 10.0**exponent * rng.normal(size=(10, 3))
-        fields = kernels.field_at_points(points, [source], [moment])
-        gradients = kernels.gradient_at_points(points, [source], [moment])
-        for s, field, gradient in zip(points, fields, gradients, strict=True):
-            exact_field = oracles.decimal_field(s, source, moment)
-            exact_gradient = oracles.decimal_gradient_tensor(s, source, moment)
-            assert np.linalg.norm(field - exact_field) <= ROUNDING * np.linalg.norm(exact_field)
-            assert np.linalg.norm(gradient - exact_gradient) <= ROUNDING * np.linalg.norm(exact_gradient)
 
     @pytest.mark.parametrize("distance_m", [1e-50, 1e50])
     def test_neither_overflows_nor_underflows(self, distance_m: float) -> None:

@@ -172,7 +172,7 @@ class TestDamage:
 def batches_of(lines: list[str], size: int, waited_s: float = 0.0) -> Iterator[Batch]:
     for i in range(0, len(lines), size):
         encoded = [line.encode() for line in lines[i : i + size]]
-        yield Batch(encoded, arrived_s=time.perf_counter() - waited_s)
+        yield Batch(encoded, arrival_s=time.perf_counter() - waited_s)
 
 
 class TestWhoFallsBehind:
@@ -200,7 +200,7 @@ class TestWhoFallsBehind:
         assert follower.tally.skipped == 49 * 7
         (message,) = [record.message for record in caplog.records if record.levelname == "WARNING"]
         assert re.fullmatch(
-            r"the stream: \S+ rows a second come and \S+ can be followed: the oldest are skipped", message
+            r"the stream: \S+ rows arrive a second, but only \S+ can be followed; the oldest are skipped", message
         )
 
     def test_nobody_is_behind_with_single_rows(self, lines: list[str]) -> None:
@@ -242,9 +242,9 @@ class TestButtons:
         diver = magloc.datasets.load("diver")
         follower = Follower(diver.array)
         next(follower.follow(diver.readings))
-        with pytest.raises(InputError, match="an array that stands"):
+        with pytest.raises(InputError, match="an array that does not move"):
             follower.tare(1.0)
-        with pytest.raises(InputError, match="an array that stands"):
+        with pytest.raises(InputError, match="an array that does not move"):
             next(Follower(diver.array, rest_s=1.0).follow(diver.readings))
 
 
@@ -254,8 +254,8 @@ class TestEnds:
         [
             ("", "found nothing, expected a header"),
             ("HEADER", "found a header without rows"),
-            ("HEADER\nx", r"found garbled lines alone \(1\)"),
-            ("x\ny", r"found garbled lines alone \(2\)"),
+            ("HEADER\nx", r"found only garbled lines \(1\)"),
+            ("x\ny", r"found only garbled lines \(2\)"),
         ],
     )
     def test_without_a_row(self, lines: list[str], tmp_path: Path, text: str, what: str) -> None:

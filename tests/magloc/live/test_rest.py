@@ -14,7 +14,7 @@ from arrays import geometries
 from arrays.io.errors import InputError
 from arrays.sensor import Calibration
 from magloc.live.follower import RESTING, Follower
-from magloc.live.rest import Background
+from magloc.live.rest import RestBackground
 from magloc.readings import Readings
 from magloc.tracking.rows import Row
 from tests.passing_source import ARRAY, NOISE_T, SLOW, moving_source, readings_of
@@ -32,7 +32,7 @@ def rows_at_rest(seed: int) -> list[Row]:
 class TestBackground:
     def test_its_error_is_as_large_as_it_says(self) -> None:
         """χ² of 100 means of 12 channels: a right one is outside once in a million."""
-        found = [Background.of(ARRAY, rows_at_rest(seed)) for seed in range(100)]
+        found = [RestBackground.from_rows(ARRAY, rows_at_rest(seed)) for seed in range(100)]
         square = sum(float(np.sum(((one.mean_T - OFFSET_T) / one.sigma_T) ** 2)) for one in found)
         low, high = chi2.ppf([5e-7, 1.0 - 5e-7], 1200)
         assert low < square < high
@@ -41,15 +41,17 @@ class TestBackground:
         """As everything else that is subtracted, it may not be taken off twice."""
         known = tuple(replace(s, calibration=Calibration.of("vector", 1.0, [1e-6, 2e-6, 3e-6])) for s in ARRAY.sensors)
         array = replace(ARRAY, sensors=known)
-        found = Background.of(array, rows_at_rest(1))
-        np.testing.assert_allclose(found.mean_T, Background.of(ARRAY, rows_at_rest(1)).mean_T - array.channel_offset_T)
+        found = RestBackground.from_rows(array, rows_at_rest(1))
+        np.testing.assert_allclose(
+            found.mean_T, RestBackground.from_rows(ARRAY, rows_at_rest(1)).mean_T - array.channel_offset_T
+        )
 
     def test_spikes_do_not_count(self) -> None:
         rows = rows_at_rest(2)
         spiked = list(rows)
         for i in range(0, N_REST, 8):
             spiked[i] = replace(rows[i], readings_T=rows[i].readings_T + 1e-3)
-        found, plain = Background.of(ARRAY, spiked), Background.of(ARRAY, rows)
+        found, plain = RestBackground.from_rows(ARRAY, spiked), RestBackground.from_rows(ARRAY, rows)
         assert np.all(np.abs(found.mean_T - plain.mean_T) < 3.0 * plain.sigma_T)
         assert np.all(found.sigma_T > plain.sigma_T)
 
@@ -58,8 +60,8 @@ class TestBackground:
         ramp = np.zeros(ARRAY.n_channels)
         ramp[4] = 2.0 * NOISE_T
         moved = [replace(row, readings_T=row.readings_T + i * ramp) for i, row in enumerate(rows)]
-        assert Background.of(ARRAY, moved).restless == ("s2",)
-        assert Background.of(ARRAY, rows).restless == ()
+        assert RestBackground.from_rows(ARRAY, moved).unsteady_sensors == ("s2",)
+        assert RestBackground.from_rows(ARRAY, rows).unsteady_sensors == ()
 
     def test_readings_that_no_rest_has_are_refused(self) -> None:
         """A wild value in a rest of two rows would be taken for the sensor's noise."""
@@ -67,19 +69,21 @@ class TestBackground:
         wild = np.zeros(ARRAY.n_channels)
         wild[4] = 1e5
         with pytest.raises(InputError, match=r"a rest: found readings of s2 that scatter by .* nT, expected an array"):
-            Background.of(ARRAY, [rows[0], replace(rows[1], readings_T=rows[1].readings_T + wild)])
+            RestBackground.from_rows(ARRAY, [rows[0], replace(rows[1], readings_T=rows[1].readings_T + wild)])
 
     def test_a_channel_without_readings_stays_without(self) -> None:
         rows = rows_at_rest(4)
         for row in rows:
             row.readings_T[5] = math.nan
-        found = Background.of(ARRAY, rows)
+        found = RestBackground.from_rows(ARRAY, rows)
         assert np.isnan(found.mean_T[5])
-        assert np.isnan(found.subtracted(Row(9.0, np.ones(12))).readings_T).sum() == 1
-        assert all(math.isfinite(sensor.offset_uncertainty_T) for sensor in found.array(ARRAY).sensors)
+        assert np.isnan(found.subtract_from(Row(9.0, np.ones(12))).readings_T).sum() == 1
+        assert all(
+            math.isfinite(sensor.offset_uncertainty_T) for sensor in found.with_offset_uncertainty(ARRAY).sensors
+        )
 
     def test_offsets_are_as_uncertain_as_it_is(self) -> None:
-        found = Background.of(ARRAY, rows_at_rest(5)).array(ARRAY)
+        found = RestBackground.from_rows(ARRAY, rows_at_rest(5)).with_offset_uncertainty(ARRAY)
         for sensor in found.sensors:
             assert sensor.offset_uncertainty_T == pytest.approx(NOISE_T / math.sqrt(N_REST), rel=0.6)
 

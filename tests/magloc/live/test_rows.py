@@ -43,7 +43,7 @@ def parsed(pieces: Sequence[Sequence[str | bytes]], sensors: Sequence[str] | Non
     rows = [
         readings
         for piece in pieces
-        for readings in parser.rows_of([line.encode() if isinstance(line, str) else line for line in piece])
+        for readings in parser.parse([line.encode() if isinstance(line, str) else line for line in piece])
     ]
     return joined(rows), tally
 
@@ -164,7 +164,7 @@ class TestHeader:
             "WARNING"
         ]
         with pytest.raises(InputError, match=r"the stream, line 1, column s4_x_nT: found no"):
-            list(RowParser(ARRAY, "the stream", Tally(), is_file=True).rows_of([other.encode()]))
+            list(RowParser(ARRAY, "the stream", Tally(), is_file=True).parse([other.encode()]))
 
     @pytest.mark.parametrize("foreign", ["hello", '{"time_s": 1.0, "s1_x_nT": 2.0}', "time_s,a\n1,2"])
     def test_foreign_senders_cost_no_row(self, lines: list[str], foreign: str) -> None:
@@ -180,8 +180,8 @@ class TestHeader:
             parser = RowParser(ARRAY, "the stream", tally)
             found: list[Readings] = []
             for line in good:
-                assert not list(parser.rows_of(strange, "foreign"))
-                found += parser.rows_of([line.encode()], "good")
+                assert not list(parser.parse(strange, "foreign"))
+                found += parser.parse([line.encode()], "good")
             assert_same(joined(found), parsed([lines])[0])
             assert tally.garbled == len(good) * len(strange)
 
@@ -190,12 +190,12 @@ class TestHeader:
         turned = [",".join(reversed(line.split(","))) for line in lines]
         names = lines[0].split(",")
         parser = RowParser(ARRAY, "the stream", Tally())
-        found: list[Readings] = list(parser.rows_of([lines[0].encode()], 0))
+        found: list[Readings] = list(parser.parse([lines[0].encode()], 0))
         for i, line in enumerate(lines[1:]):
             cells = [float(cell) if cell else None for cell in line.split(",")]
             of_json = dict(zip(reversed(names), reversed(cells), strict=True))
             sent = [[line], [turned[0], turned[1 + i]], [json.dumps(of_json)], [line]][i % 4]
-            found += parser.rows_of([each.encode() for each in sent], i % 4)
+            found += parser.parse([each.encode() for each in sent], i % 4)
         assert_same(joined(found), parsed([lines])[0])
 
     def test_of_another_array_later_is_garbled(self, lines: list[str]) -> None:
@@ -246,7 +246,7 @@ class TestColumnsOfAnotherProgram:
     def parsed(self, lines: Sequence[str]) -> tuple[Readings, Tally]:
         tally = Tally()
         parser = RowParser(self.ARRAY, "the stream", tally)
-        pieces = [piece for line in lines for piece in parser.rows_of([line.encode()])]
+        pieces = [piece for line in lines for piece in parser.parse([line.encode()])]
         names = ("values_T", "time_s", "array_position_m")
         values, time_s, place = (np.concatenate([getattr(piece, name) for piece in pieces]) for name in names)
         turns = Rotation.concatenate([piece.array_rotation for piece in pieces if piece.array_rotation is not None])
@@ -279,7 +279,7 @@ class TestColumnsOfAnotherProgram:
         parser = RowParser(array, "the stream", tally := Tally())
         rows = ["\t".join([*map(str, range(11)), "", "0.5"]), "\t".join(["", *map(str, range(11)), "1"])]
         lines = ["\t".join([*names, "time_s"]), *rows, "\t".join(map(str, range(13))) + "\r"]
-        (found,) = parser.rows_of([line.encode() for line in lines])
+        (found,) = parser.parse([line.encode() for line in lines])
         assert tally.garbled == 0
         assert np.argwhere(np.isnan(found.values_T)).tolist() == [[0, 11], [1, 0]]
 
@@ -296,7 +296,7 @@ class TestColumnsOfAnotherProgram:
 
     def test_a_header_without_a_sensor(self) -> None:
         parser = RowParser(self.ARRAY, "the stream", Tally())
-        assert not list(parser.rows_of([self.TEXT.replace("Ay", "By").encode(), *map(str.encode, self.rows(2))]))
+        assert not list(parser.parse([self.TEXT.replace("Ay", "By").encode(), *map(str.encode, self.rows(2))]))
         assert "line 1, column Ay: found no such column" in parser.fault
 
 
@@ -307,7 +307,7 @@ class TestDummies:
         parser = RowParser(array, "the rows", tally)
         good = [f"{i},{48e3 + i},{48e3 - i}" for i in range(1, 12)]
         lines = ["time_s,s1_nT,s2_nT", "0,-99999,48000", *good, "12,0,48000"]
-        rows = [row for line in lines for row in parser.rows_of([line.encode()])]
+        rows = [row for line in lines for row in parser.parse([line.encode()])]
         assert [i for i, row in enumerate(rows) if np.isnan(row.values_T[0, 0])] == [0, 12]
         assert not any(np.isnan(row.values_T[0, 1]) for row in rows)
         assert tally.dummies == 2

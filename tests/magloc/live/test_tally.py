@@ -25,7 +25,7 @@ class Watched:
 
     def take(self, step_s: float) -> bool:
         self.now_s += step_s
-        return self.clock.takes(self.now_s)
+        return self.clock.accepts(self.now_s)
 
     def counts(self) -> tuple[int, int, int, int]:
         tally = self.tally
@@ -47,13 +47,13 @@ class TestClock:
         watched = Watched(0)
         jitter = np.random.default_rng(0).uniform(-0.2, 0.2, 500)
         for i in range(500):
-            assert watched.clock.takes(STEP_S * (i + jitter[i]))
+            assert watched.clock.accepts(STEP_S * (i + jitter[i]))
         assert watched.counts() == (0, 0, 0, 0)
 
     def test_a_row_that_comes_twice(self) -> None:
         watched = Watched()
-        assert not watched.clock.takes(watched.now_s)
-        assert not watched.clock.takes(watched.now_s - 3 * STEP_S - 1e-17)
+        assert not watched.clock.accepts(watched.now_s)
+        assert not watched.clock.accepts(watched.now_s - 3 * STEP_S - 1e-17)
         assert watched.counts()[2] >= 1
 
     def test_a_row_that_was_overtaken_is_late_and_not_lost(self) -> None:
@@ -61,14 +61,14 @@ class TestClock:
         overtaken = watched.now_s + STEP_S
         assert watched.take(2 * STEP_S)
         assert watched.counts() == (0, 1, 0, 0)
-        assert not watched.clock.takes(overtaken)
+        assert not watched.clock.accepts(overtaken)
         assert watched.counts() == (1, 0, 0, 0)
         assert watched.take(STEP_S)
 
     @pytest.mark.parametrize("jump_s", [5.0, 1e6, 1e29])
     def test_one_time_far_ahead_is_not_believed(self, jump_s: float) -> None:
         watched = Watched()
-        assert not watched.clock.takes(watched.now_s + jump_s)
+        assert not watched.clock.accepts(watched.now_s + jump_s)
         assert watched.take(STEP_S)
         assert watched.counts() == (0, 0, 0, 1)
 
@@ -106,7 +106,7 @@ class TestClock:
             taken: list[float] = []
             clock = Clock(Tally(), taken.clear)
             for time_s in rng.choice([0.0, 0.1, 1.0, 5.0, 1e6, -3.0], 300) + np.round(rng.normal(size=300), 1):
-                if clock.takes(float(time_s)):
+                if clock.accepts(float(time_s)):
                     taken.append(float(time_s))
                     assert taken == sorted(set(taken))
 

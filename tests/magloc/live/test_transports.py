@@ -17,14 +17,14 @@ from arrays.columns import LogColumns
 from arrays.io.errors import InputError
 from arrays.logs.format import READINGS_FILE, LogFormat
 from magloc.live import transports
-from magloc.live.transports import opened
+from magloc.live.transports import open_stream
 
 TEXT = b"time_s,a\n0,1\n1,2\n\n2,3"
 LINES = TEXT.split(b"\n")
 
 
 def lines_at(address: str, **options: float) -> list[bytes]:
-    with opened(address, **options) as stream:
+    with open_stream(address, **options) as stream:
         return [line for batch in stream.batches for line in batch.lines]
 
 
@@ -77,7 +77,10 @@ class TestUdp:
             probe.bind(("127.0.0.1", 0))
             port = probe.getsockname()[1]
         found: list[bytes] = []
-        with opened(f"udp://127.0.0.1:{port}") as stream, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        with (
+            open_stream(f"udp://127.0.0.1:{port}") as stream,
+            socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
+        ):
             for datagram in (b"time_s,a\n0,1", b"1,2\n", b"\n2,3"):
                 sender.sendto(datagram, ("127.0.0.1", port))
             while len(found) < len(LINES):
@@ -91,7 +94,7 @@ class TestUdp:
             probe.bind(("127.0.0.1", 0))
             port = ("127.0.0.1", probe.getsockname()[1])
         with (
-            opened(f"udp://127.0.0.1:{port[1]}") as stream,
+            open_stream(f"udp://127.0.0.1:{port[1]}") as stream,
             socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as good,
             socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as foreign,
         ):
@@ -126,7 +129,7 @@ class TestSerial:
 
         master, slave = pty.openpty()
         tty.setraw(slave)
-        with opened(f"serial:{os.ttyname(slave)}@115200") as stream:
+        with open_stream(f"serial:{os.ttyname(slave)}@115200") as stream:
             os.write(master, TEXT + b"\n")
             found: list[bytes] = []
             while len(found) < len(LINES):
@@ -170,7 +173,7 @@ class TestReplay:
     ) -> list[tuple[bytes, float]]:
         time = Time()
         monkeypatch.setattr(transports, "time", time)
-        with opened(f"replay:{path}", replay_speed=speed, form=form) as stream:
+        with open_stream(f"replay:{path}", replay_speed=speed, form=form) as stream:
             return [(line, time.now_s - 100.0) for batch in stream.batches for line in batch.lines]
 
     @pytest.mark.parametrize("speed", [1.0, 10.0])

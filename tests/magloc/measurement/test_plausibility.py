@@ -39,7 +39,7 @@ def record(name: str) -> tuple[SensorArray, Readings]:
         return recording.array, recording.readings
     scenario = sims.read_scenario(name)
     assert isinstance(scenario, sims.MagneticScenario)
-    simulation = sims.simulate(scenario, seed=7)
+    simulation = sims.simulate(scenario, rng=7)
     return simulation.array, simulation.readings
 
 

@@ -13,7 +13,7 @@ from scipy.stats import chi2
 from arrays.io.csv import write_columns
 from magloc.calibration.results import residual_rms
 from magloc.localization.fit.fixes import BODY_MATTERS
-from magloc.plots.tracks import write_picture
+from magloc.plots.tracks import write_track_figures
 from magloc.tracking.results import TrackPoint
 from tests.command_line import Run, assert_refused, results_of
 from tests.magloc.cli.test_calibrate import MOMENT, Files, made
@@ -103,7 +103,7 @@ class TestTrack:
     def test_writes_both_pictures_and_one_table(self, tmp_path: Path) -> None:
         truth, nees = np.zeros((2, 3)), (np.array([np.nan, 7.5]), np.array([0, 6]))
         folder = tmp_path / "a" / "b"
-        write_picture(self.points(), truth, folder, nees=nees, bound_m=np.array([np.inf, 0.5]), array_m=truth)
+        write_track_figures(self.points(), truth, folder, nees=nees, bound_m=np.array([np.inf, 0.5]), array_m=truth)
         assert_picture(folder / "track.png")
         assert_picture(folder / "consistency.png")
         columns = table(folder / "track.csv")
@@ -115,7 +115,7 @@ class TestTrack:
         assert columns["nees"] == ["", "7.5"]
 
     def test_without_truth(self, tmp_path: Path) -> None:
-        write_picture(self.points(), None, tmp_path)
+        write_track_figures(self.points(), None, tmp_path)
         assert not any("nees" in name or "true" in name for name in table(tmp_path / "track.csv"))
 
 

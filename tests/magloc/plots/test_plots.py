@@ -160,7 +160,7 @@ class TestEllipses:
 
     @pytest.mark.parametrize("n", [0, 1, 24, 25, 1000])
     def test_few_enough_are_drawn_to_be_told_apart(self, n: int) -> None:
-        chosen = style.some_of(np.arange(n))
+        chosen = style.thin(np.arange(n))
         assert min(n, 12) <= len(chosen) <= 24
         assert len(set(np.diff(chosen))) <= 1
 
@@ -182,7 +182,7 @@ class TestBounds:
         dof = np.full(n, 6)
         squares = np.full(n, 6.0)
         squares[0] = 1000.0
-        style.squares_panel(ax, np.arange(n, dtype=float), squares, dof, "χ²")
+        style.draw_chi_square(ax, np.arange(n, dtype=float), squares, dof, "χ²")
         drawn = [np.unique(artist.get_ydata()) for artist in ax.lines if artist.get_drawstyle() == "steps-mid"]
         np.testing.assert_allclose(np.ravel(drawn), chi2.ppf([0.005, 0.995], 6) / 6)
         np.testing.assert_allclose(line(ax, "outside").get_ydata(), [1000.0 / 6])
@@ -193,32 +193,32 @@ class TestBounds:
         """Of right squares 99 % are within; 0.97 to 1 at a false-alarm rate below 1e-8 of the binomial."""
         ax = Figure().subplots()
         squares = np.random.default_rng(0).chisquare(5, 2000)
-        style.squares_panel(ax, np.arange(2000.0), squares, np.full(2000, 5), "NIS")
+        style.draw_chi_square(ax, np.arange(2000.0), squares, np.full(2000, 5), "NIS")
         assert len(line(ax, "within").get_ydata()) > 0.97 * 2000
 
 
 class TestLimits:
     @given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=30), st.lists(st.floats(-1e6, 1e6), max_size=5))
     def test_show_what_must_be_seen(self, values: list[float], always: list[float]) -> None:
-        low, high = style.limits_of([np.array(values)], [np.array(always)])
+        low, high = style.axis_limits([np.array(values)], [np.array(always)])
         assert low < high
         assert all(low <= value <= high for value in always)
         assert low <= float(np.median(values)) <= high
 
     def test_one_wild_value_does_not_rule(self) -> None:
-        low, high = style.limits_of([np.append(np.linspace(0.0, 1.0, 200), 1e6)])
+        low, high = style.axis_limits([np.append(np.linspace(0.0, 1.0, 200), 1e6)])
         assert -0.2 < low < high < 1.2
 
     def test_what_differs_by_rounding_alone_is_one_number(self) -> None:
-        assert style.limits_of([np.array([2.0, 2.0 + 4e-16, 2.0 - 4e-16])]) == pytest.approx((1.84, 2.16))
+        assert style.axis_limits([np.array([2.0, 2.0 + 4e-16, 2.0 - 4e-16])]) == pytest.approx((1.84, 2.16))
 
     def test_nothing_to_show(self) -> None:
-        low, high = style.limits_of([np.array([np.nan])])
+        low, high = style.axis_limits([np.array([np.nan])])
         assert low < high
 
     def test_lengths_below_a_metre_are_in_millimetres(self) -> None:
-        assert style.length_unit(0.3) == ("mm", 1e3)
-        assert style.length_unit(30.0) == ("m", 1.0)
+        assert style.axis_unit(0.3) == ("mm", 1e3)
+        assert style.axis_unit(30.0) == ("m", 1.0)
 
 
 class TestMaps:

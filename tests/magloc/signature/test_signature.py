@@ -316,7 +316,7 @@ class TestFigures:
     def found(self, seed: int) -> tuple[magloc.Signature, FloatArray, FloatArray]:
         """Signature, error of its parameters, and the true ones."""
         scenario = sims.read_scenario("ship-headings")
-        ship = sims.simulate(scenario, seed=seed)
+        ship = sims.simulate(scenario, rng=seed)
         source = scenario.sources[0]
         found = magloc.fit_signature(ship.array, ship.readings, ship.paths[0], path_error=source.path_error)
         alpha = np.diag(source.polarisability_m3)

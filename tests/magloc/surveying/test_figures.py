@@ -12,7 +12,7 @@ from tests.survey_figures import holds, judged
 @pytest.mark.slow
 def test_fields() -> None:
     """Two fields of twelve targets: of 24 right ellipsoids fewer than 18 hold the truth once in 10,000 times."""
-    fields = [judged(sims.simulate(sims.read_scenario("survey-drone"), seed=seed)) for seed in (300, 301)]  # type: ignore[arg-type]
+    fields = [judged(sims.simulate(sims.read_scenario("survey-drone"), rng=seed)) for seed in (300, 301)]  # type: ignore[arg-type]
     pairs = [pair for field in fields for pair in field.pairs]
     missed = [chi2 for field in fields for chi2 in field.missed_chi2]
     assert sum(chi2 > 2.0 * fields[0].threshold for chi2 in missed) <= 1

@@ -38,7 +38,7 @@ def simulated(name: str, seed: int, number: int = 2) -> Simulation:
         targets = replace(whole.targets, number=number, x_m=rectangle, y_m=rectangle, gap_m=4.0, moment_Am2=(1.0, 20.0))
     carrier = replace(whole.carrier, path=path)
     way = 11 * 2.0 * PLOT_M + 10 * np.pi / 2.0
-    return sims.simulate(replace(whole, carrier=carrier, targets=targets, duration_s=way / path.speed_m_s), seed=seed)
+    return sims.simulate(replace(whole, carrier=carrier, targets=targets, duration_s=way / path.speed_m_s), rng=seed)
 
 
 @cache
@@ -78,7 +78,7 @@ class TestTargets:
     def test_what_the_ambient_field_induces_in_the_carrier(self, size: float) -> None:
         """Terms of 5 and of 25 nT, stated: both targets and no other. What errors of the attitude leave counts too."""
         scenario = simulated("survey-drone", 901).scenario
-        field = sims.simulate(replace(scenario, platform=Platform(induced=size, eddy_s=size)), seed=901)
+        field = sims.simulate(replace(scenario, platform=Platform(induced=size, eddy_s=size)), rng=901)
         found = magloc.survey(field.array, field.readings)
         assert len(found) == 2
         for position in field.target_position_m:
@@ -115,7 +115,7 @@ class TestPair:
             Source(Carrier(Steered(place)), moment)
             for place, moment in (((0.0, 0.0, -0.5), (3.0, 1.0, -6.0)), ((1.2, 1.0, -0.6), (-4.0, 5.0, 2.0)))
         )
-        field = sims.simulate(replace(scenario, sources=sources), seed=905)
+        field = sims.simulate(replace(scenario, sources=sources), rng=905)
         found = magloc.survey(field.array, field.readings)
         assert len(found) == 2
         for truth in field.truths:

@@ -53,7 +53,7 @@ def plot() -> Piece:
     sources = tuple(Source(Carrier(Steered(place)), moment) for place, moment in (WEAK, STRONG))
     carrier, seconds = replace(whole.carrier, path=path), (110.0 + 5.0 * np.pi) / path.speed_m_s
     scenario = replace(whole, carrier=carrier, targets=None, sources=sources, duration_s=seconds, rate_Hz=8.0)
-    field = sims.simulate(scenario, seed=912)
+    field = sims.simulate(scenario, rng=912)
     tiled = TiledSurvey.of(*whole_rows(field.array, field.readings), Ground(magloc.SourcePrior(), 0.0, 15.0, 25.0))
     place, moment = np.array([WEAK, STRONG]).transpose(1, 0, 2)
     return replace(tiled, sources=Sources(place, moment)).piece(0)

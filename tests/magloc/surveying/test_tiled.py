@@ -40,7 +40,7 @@ def field() -> Simulation:
     sources = tuple(Source(Carrier(Steered(place)), moment) for place, moment in TARGETS)
     seconds = (6 * 26.0 + 5 * np.pi / 2.0) / path.speed_m_s
     scenario = replace(whole, carrier=carrier, targets=None, sources=sources, duration_s=seconds, rate_Hz=8.0)
-    return sims.simulate(scenario, seed=911)
+    return sims.simulate(scenario, rng=911)
 
 
 @cache

@@ -84,18 +84,6 @@ class TestNees:
         assert result.nees_per_dimension == pytest.approx(expected, rel=1e-6)
         assert result.position_rms_m == pytest.approx(math.hypot(0.04, 0.05))
 
-    def test_of_truth_is_chi_square(self) -> None:
-        """5,000 draws from the covariance lie inside the 99 % bounds: false-alarm rate 1 %, seed not tuned."""
-        rng = np.random.default_rng(7)
-        root = rng.normal(size=(6, 6)) * np.repeat([0.05, 20.0], 3)[:, None]
-        draws = rng.normal(size=(5000, 6)) @ root.T
-        nis = rng.chisquare(9.0, 5000)
-        covariance = root @ root.T
-        points = [point_of(x[:3], x[3:], covariance, float(n)) for x, n in zip(draws, nis, strict=True)]
-        result = consistency(points, TRACKER, blank_rows(5000), np.zeros((5000, 3)), np.zeros((5000, 3)))
-        assert result.nees_bounds[0] < result.nees_per_dimension < result.nees_bounds[1]
-        assert result.nis_bounds[0] < result.nis_per_dimension < result.nis_bounds[1]
-
     def test_bounds_are_printed_of_what_is_independent(self) -> None:
         """Innovations are, errors of a track's rows are not."""
         points = [point_of(np.ones(3), np.ones(3), np.eye(6), 9.0)] * 4
@@ -281,13 +269,6 @@ class TestPosteriorBound(MovingArray):
         (bound,) = posterior_bound(Tracker(array, RandomWalk(0.1, 0.1)), [row], p, m)
         assert bound == pytest.approx(math.sqrt(0.289**2 + 0.082**2 + 0.076**2), rel=0.01)
 
-    def test_of_rest_falls_with_the_root_of_the_rows(self) -> None:
-        t, p, m = self.truth()
-        rows = list(rows_of(Readings(shown(self.N_ROWS), time_s=t)))
-        still_p, still_m = np.tile(p[0], (self.N_ROWS, 1)), m
-        bounds = posterior_bound(Tracker(ARRAY, RandomWalk(1e-9, 1e-9)), rows, still_p, still_m)
-        np.testing.assert_allclose(bounds, bounds[0] / np.sqrt(np.arange(1.0, self.N_ROWS + 1.0)), rtol=1e-6)
-
     def test_counts_lasting_errors_as_unknowns_of_their_own(self) -> None:
         """Rest, and fields fixed to the array: the inverse of the information of source and fields from all rows."""
         t, p, m = self.truth()
@@ -357,16 +338,6 @@ class TestSmoothingBound(MovingArray):
                 _, F, root = motion.step(states[i - 1], t[i] - t[i - 1])
                 self.add_step(J, i, F, root @ root.T)
         np.testing.assert_allclose(bounds, self.of_information(J, np.repeat([1.0, 100.0, 0.2, 0.05], 3)), rtol=1e-5)
-
-    def test_is_below_that_of_a_filter_but_at_the_last_row(self) -> None:
-        t, p, m = self.truth()
-        readings = shown(self.N_ROWS)
-        readings[0] = 0.0
-        rows, tracker = list(rows_of(Readings(readings, time_s=t))), Tracker(ARRAY, OrnsteinUhlenbeck(0.2, 0.05))
-        filtered, with_later_rows = posterior_bound(tracker, rows, p, m), smoothing_bound(tracker, rows, p, m)
-        assert np.isinf(with_later_rows[0])
-        assert np.all(with_later_rows[1:-1] < filtered[1:-1])
-        assert with_later_rows[-1] == pytest.approx(filtered[-1], rel=1e-12)
 
     def add_step(self, J: FloatArray, i: int, F: FloatArray, Q: FloatArray) -> None:
         """Information that a step gives of the states before and after it, in place."""

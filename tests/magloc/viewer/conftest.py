@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 import viser
 
-from magloc.viewer.server import free_port, opened
+from magloc.viewer.server import free_port, open_server
 from tests.waiting import wait_for
 
 
@@ -16,7 +16,7 @@ from tests.waiting import wait_for
 def server() -> Iterator[viser.ViserServer]:
     """Open a server, and see that none of its threads outlives it."""
     before = set(threading.enumerate())
-    with opened(free_port(0), "test") as server:
+    with open_server(free_port(0), "test") as server:
         yield server
     wait_for(lambda: set(threading.enumerate()) <= before)
 

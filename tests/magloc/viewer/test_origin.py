@@ -22,7 +22,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from arrays.array_file import read_array, write_array
 from arrays.geometries import cube, tetrahedron
-from magloc.viewer.origin import MOST_BYTES, guarded_server
+from magloc.viewer.origin import MOST_BYTES, start_guarded_server
 from magloc.viewer.pages.array_editor import ArrayEditor
 from tests.conftest import REPOSITORY
 from tests.waiting import WAIT_S, wait_for
@@ -148,8 +148,8 @@ class TestWhoIsAnswered:
                 Other.stopped = True
 
         monkeypatch.setattr(viser, "ViserServer", Other)
-        with pytest.raises(RuntimeError, match="in a way that is not known"):
-            guarded_server()
+        with pytest.raises(RuntimeError, match="in an unknown way"):
+            start_guarded_server()
         assert Other.stopped
 
     def test_every_page_has_such_a_server(self) -> None:

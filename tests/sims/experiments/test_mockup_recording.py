@@ -24,14 +24,14 @@ from scipy.spatial.transform import Rotation
 from adcs.mockup.navigation.fixes import FixOutcome
 from adcs.mockup.vision.paper_matcher import CameraFix
 from adcs.stars.identification import NoFix
-from adcs.viewer.drive import Drive, SeenFrame
+from adcs.viewer.drive import Drive, IdentifiedFrame
 from adcs.viewer.drive_page import drive_page
 from adcs.viewer.drive_player import DrivePlayer
-from adcs.viewer.error_dial import ErrorDial, words_of
-from adcs.viewer.frame_image import IDENTIFIED_COLOUR, OTHER_STAR_COLOUR, ceiling_sheet, marked_image
+from adcs.viewer.error_dial import ErrorDial, estimate_lines
+from adcs.viewer.frame_image import IDENTIFIED_COLOUR, OTHER_STAR_COLOUR, ceiling_sheet, mark_stars
 from adcs.viewer.table_scene import CEILING_M, LIGHT_COLOUR, suitable_enlargement
 from magloc.viewer.panels.inputs import set_value
-from magloc.viewer.server import opened, page_html
+from magloc.viewer.server import open_server, page_html
 from sims.cli.mockup_options import MockupOptions
 from sims.cli.mockup_replay import drive_of
 from sims.experiments.mockup_navigation import fused_runs
@@ -52,7 +52,7 @@ def drive() -> Drive:
 @pytest.fixture
 def server() -> Iterator[viser.ViserServer]:
     before = set(threading.enumerate())
-    with opened(0, "test") as server:
+    with open_server(0, "test") as server:
         yield server
     wait_for(lambda: set(threading.enumerate()) <= before)
 
@@ -104,21 +104,21 @@ class TestDrive:
 
 
 class TestFrameImage:
-    def frame(self, fix) -> SeenFrame:
+    def frame(self, fix) -> IdentifiedFrame:
         image = np.full((480, 640), 20, np.uint8)
         image[199:202, 299:302] = 200
-        return SeenFrame(image, np.array([[300.0, 200.0], [100.0, 50.0]]), fix)
+        return IdentifiedFrame(image, np.array([[300.0, 200.0], [100.0, 50.0]]), fix)
 
     @pytest.fixture
-    def named(self) -> SeenFrame:
+    def named(self) -> IdentifiedFrame:
         return self.frame(CameraFix(np.zeros(2), 0.0, np.array([[0, 5]]), 0.0, 5, 0.9 / 640))
 
     def test_rings(self, named):
-        picture = marked_image(named)
+        picture = mark_stars(named)
         assert picture.shape == (480, 640, 3)
         np.testing.assert_array_equal(picture[200, 287], IDENTIFIED_COLOUR)
         np.testing.assert_array_equal(picture[50, 87], OTHER_STAR_COLOUR)
-        np.testing.assert_array_equal(marked_image(self.frame(NoFix("none")))[200, 287], OTHER_STAR_COLOUR)
+        np.testing.assert_array_equal(mark_stars(self.frame(NoFix("none")))[200, 287], OTHER_STAR_COLOUR)
 
     def test_sheet_is_translucent_but_for_stars(self, named):
         sheet = ceiling_sheet(named)
@@ -216,7 +216,7 @@ class TestPlayer:
 
     def test_it_stops_at_the_end_and_begins_again(self, player, drive, monkeypatch):
         tenths = iter(range(20))  # the clock stands still early in the second time
-        monkeypatch.setattr("magloc.viewer.panels.played_time.perf_counter", lambda: 0.1 * next(tenths, 20))
+        monkeypatch.setattr("magloc.viewer.panels.time_player.perf_counter", lambda: 0.1 * next(tenths, 20))
         player.move_to(DURATION_S - 0.1)
         player.play()
         wait_for(lambda: not player.is_playing)
@@ -228,7 +228,7 @@ class TestPlayer:
     def test_frames_are_made_once_and_only_when_seen(self, server, drive):
         asked = []
 
-        def frame_of(fix: int) -> SeenFrame:
+        def frame_of(fix: int) -> IdentifiedFrame:
             asked.append(fix)
             return drive.frame_of(fix)
 
@@ -256,7 +256,7 @@ class TestErrorDial:
 
     def test_words(self, drive):
         row = drive.row_at(15.0)
-        _, error, fix = words_of(drive, row)
+        _, error, fix = estimate_lines(drive, row)
         assert f"<b>{1e3 * np.hypot(*drive.errors_m[row]):.1f} mm</b>" in error
         age_s = drive.truth.time_s[row] - drive.fixes.time_s[drive.last_fix(row)]
         assert f"taken {age_s:.2f} s ago" in fix

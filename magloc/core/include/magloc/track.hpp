@@ -69,7 +69,7 @@ class Track {
   // Whether the prediction bends as the readings do: not if the motion has made it so wide, nor as a row does in which
   // readings are missing.
   bool prediction_bends(int64_t row) const {
-    bool bends = p_.state->n_nuisances == 0 && p_.rows->counts[row] >= p_.full_count;
+    bool bends = p_.rows->counts[row] >= p_.full_count;
     for (int64_t i = 0; i < n_measured * K_; ++i)
       bends &= seen_variance(i) <= p_.largest_growth * p_.largest_growth * variances_[i];
     return bends;

@@ -38,7 +38,7 @@ class TestMangled:
         readings = list(unit_log(2)[:4])
         still = unit_log(2, acceleration=0.0)[2]
         readings[2] = readings[2] - still + 0.01
-        with pytest.raises(ValueError, match=r"must have gravity in it.*without gravity"):
+        with pytest.raises(ValueError, match=r"must include gravity.*without gravity"):
             check_units(InertialMagneticRecord(*readings))
 
     def test_without_a_magnetometer(self):

@@ -81,7 +81,7 @@ class TestParallelFilter:
         with pytest.raises(ValueError, match="must have the state disturbance"):
             run_parallel(runs, settings("st"), start)
         for forgetting in (0.0, 1.1, float("nan")):
-            with pytest.raises(ValueError, match="Input forgetting must be above 0 and up to 1"):
+            with pytest.raises(ValueError, match="Input forgetting must be above 0 and at most 1"):
                 run_parallel(runs, CHOSEN, start, forgetting)
 
 

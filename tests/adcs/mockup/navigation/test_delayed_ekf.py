@@ -9,7 +9,7 @@ operation                  oracle
 predicted, of many         the same sample after sample
 predicted, of one          the integration step; derivatives by finite differences; the integral of
                            white noise (van Loan)
-the filter                 a textbook filter of ten lines that gets the fixes without delay; filterpy
+the filter                 a textbook filter of ten lines that gets the fixes without delay
 consistency                NEES of all states and of each, NIS of the fixes, with truth of the filter's
                            own noises; zeros that drift steadily: test_delayed_filter_zeros.py
 =========================  ============================================================================
@@ -25,7 +25,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from filterpy.common import van_loan_discretization
-from filterpy.kalman import ExtendedKalmanFilter
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
@@ -208,27 +207,6 @@ class TestDelay:
         sigma = np.sqrt(np.diagonal(Ps, axis1=1, axis2=2))
         np.testing.assert_allclose(at_once.sigma[between], sigma[between], rtol=1e-8)
         assert end > 1800
-
-    def test_it_is_filterpy_s_filter(self) -> None:
-        _, _, imu, fixes = own_world(np.random.default_rng(3), 8.0)
-        other = ExtendedKalmanFilter(N, 3)
-        other.x = np.concatenate([START.position_m, START.velocity_m_s, [START.heading_rad], np.zeros(N - 5)])
-        other.P = SIGMA.covariance
-        other.R = np.diag(np.square([SETTINGS.fix_m, SETTINGS.fix_m, SETTINGS.fix_rad]))
-        k = 0
-        for i, dt in enumerate(imu.steps_s):
-            reading = [*imu.acceleration_m_s2[i], imu.rate_rad_s[i]]
-            other.x, other.P = predicted_once(other.x, other.P, dt, reading, [True] * 3, SETTINGS.densities)
-            if k < len(fixes) and fixes.time_s[k] == imu.time_s[i]:
-                z = np.append(
-                    fixes.position_m[k], other.x[4] + np.angle(np.exp(1j * (fixes.heading_rad[k] - other.x[4])))
-                )
-                other.update(z, lambda x: H_FIX, lambda x: H_FIX @ x)
-                k += 1
-        late = DelayedFilter(START, 0.0)
-        fuse(late, imu, replace(fixes, arrival_s=np.minimum(fixes.arrival_s, imu.end_s)))
-        np.testing.assert_allclose(late.x, other.x, rtol=0, atol=1e-11)
-        np.testing.assert_allclose(scaled(late.P, other.P), scaled(other.P, other.P), atol=1e-8)
 
     @settings(max_examples=15, deadline=None)
     @given(seeds)

@@ -62,14 +62,6 @@ class TestDamagedFrames:
             setup = SkySetup(poses=1000, lost=lost, spurious=spurious)
             assert score(matcher, rendered_set(setup, 2)).false == 0
 
-    @pytest.mark.slow
-    def test_a_lens_that_nobody_has_calibrated(self, matcher):
-        """k1 = -0.05: at least 97 %, at most 2 mm."""
-        result = score(matcher, rendered_set(SkySetup(k1=-0.05)))
-        assert result.success >= 0.97
-        assert result.false == 0
-        assert result.position_rms_m <= 2e-3
-
 
 class TestGates:
     def test_five_stars_near_lights_are_not_enough(self, matcher):

@@ -2,10 +2,10 @@
 
 | what | who checks it |
 |---|---|
-| predictions, χ² | magpylib; DifferenceMeasurement |
+| predictions, χ² | magpylib |
 | Jacobians | scipy.differentiate |
 | the optimum | scipy.optimize.least_squares on magpylib's field |
-| covariance | oracles.fisher_information; scipy.differentiate on magpylib's field; scatter of the fits |
+| covariance | scipy.differentiate on magpylib's field; scatter of the fixes: test_locator, test_multi_source |
 
 """
 
@@ -20,12 +20,10 @@ import scipy.optimize
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
-from scipy.spatial.transform import Rotation
-from scipy.stats import chi2 as chi2_distribution
 
 from arrays.array import SensorArray
 from arrays.differences import decorrelated_differences
-from arrays.geometries import cube, tetrahedron
+from arrays.geometries import tetrahedron
 from arrays.sensor import Sensor
 from magloc.localization.fit.gauss_newton import (
     JointFits,
@@ -36,7 +34,6 @@ from magloc.localization.fit.gauss_newton import (
     refine_moments,
     tangents,
 )
-from magloc.measurement.differences import DifferenceMeasurement
 from magloc.measurement.rows import whitened_model, whitenings_of
 from magloc.measurement.whitened import WhitenedModel
 from tests import oracles
@@ -165,17 +162,6 @@ class TestPredictions:
         chi2 = chi2_at(problem, y, q, problem.scaled_moment(q, m))
         # Moduli of 50 µT with a noise of 0.3 nT cancel to 1e-10 of the noise, squared against some 1e3.
         assert_allclose(chi2[0], chi2_by_magpylib(array, readings[0], p[0], m[0]), rtol=1e-7)
-
-    @given(SEEDS, st.sampled_from(KINDS))
-    @settings(max_examples=20, deadline=None)
-    def test_one_source_is_the_measurement_model(self, seed, kind):
-        array = array_of(kind, seed)
-        problem, y, p, m, readings, *_ = drawn(array, seed, 1, 1)
-        q = problem.homogeneous(p)
-        measurement = DifferenceMeasurement.of(array)
-        residual = measurement.measured(readings[0]) - measurement.predicted(p[0, 0], m[0, 0])
-        expected = np.sum(residual**2 / measurement.variance)
-        assert_allclose(chi2_at(problem, y, q, problem.scaled_moment(q, m))[0], expected, rtol=1e-7)
 
     def test_a_prior_of_the_common_field(self):
         array = replace(array_of("vector", 3), common_field_T=3e-9)
@@ -383,42 +369,6 @@ class TestOptimum:
             assert_allclose(alone.chi2[0], together.chi2[i], rtol=1e-8)
             assert_allclose(alone.q[0], together.q[i], atol=1e-7)
 
-    def test_order_of_the_fits_does_not_matter(self):
-        problem, y, p, m, _, rng = drawn(array_of("mixed in ambient", 25), 25, 6, 2)
-        order = rng.permutation(6)
-        one, other = refined_from(problem, y, p, m), refined_from(problem.rows(order), y[order], p[order], m[order])
-        assert_allclose(other.chi2, one.chi2[order], rtol=1e-8)
-
-
-class TestRotation:
-    """Turning the array, the ambient field and the source together changes nothing but the frame."""
-
-    @pytest.mark.parametrize("kind", KINDS)
-    def test_equivariance(self, kind):
-        array = array_of(kind, 31)
-        rng = np.random.default_rng(31)
-        p, m = random_sources(rng, 3, 2)
-        readings = noisy_readings(array, p, m, rng)
-        turn = Rotation.from_rotvec([0.4, -1.1, 2.0])
-        turned = replace(
-            array,
-            sensors=tuple(
-                replace(
-                    s,
-                    position_m=tuple(turn.apply(s.position_m)),
-                    rotation_xyzw=tuple((turn * Rotation.from_quat(s.rotation_xyzw)).as_quat()),
-                )
-                for s in array.sensors
-            ),
-            ambient_T=None if array.ambient_T is None else tuple(turn.apply(array.ambient_T)),
-        )
-        problem, y = problem_of(array, readings)
-        other, other_y = problem_of(turned, readings)
-        fits = refined_from(problem, y, 1.02 * p, m)
-        again = refined_from(other, other_y, p @ turn.as_matrix().T * 1.02, m @ turn.as_matrix().T)
-        assert_allclose(again.chi2, fits.chi2, rtol=1e-5)
-        assert_allclose(other.position(again.q), problem.position(fits.q) @ turn.as_matrix().T, rtol=1e-4, atol=1e-4)
-
 
 class TestHeldRange:
     @pytest.mark.parametrize("kind", ["vector", "scalar in ambient"])
@@ -437,27 +387,17 @@ class TestHeldRange:
 
 
 class TestCovariance:
-    @pytest.mark.parametrize("kind", KINDS)
-    def test_one_source_against_the_information_of_the_measurement(self, kind):
-        array = array_of(kind, 51)
-        problem, y, p, m, *_ = drawn(array, 51, 4, 1)
-        fits = refined_from(problem, y, p, m)
-        position, moment = problem.position(fits.q), problem.moment(fits.q, fits.mu)
-        information = oracles.fisher_information(DifferenceMeasurement.of(array), position[:, 0], moment[:, 0])
-        for found, expected in zip(covariances(problem, fits), np.linalg.inv(information), strict=True):
-            sigma = np.sqrt(np.diagonal(expected))
-            assert_allclose(found / np.outer(sigma, sigma), expected / np.outer(sigma, sigma), atol=1e-5)
-
     @pytest.mark.parametrize("kind", ["vector", "scalar in ambient"])
-    def test_two_sources_against_differences_of_magpylib_fields(self, kind):
+    @pytest.mark.parametrize("n_sources", [1, 2])
+    def test_against_differences_of_magpylib_fields(self, kind, n_sources):
         array = array_of(kind, 52, 18)
-        problem, _, p, m, *_ = drawn(array, 52, 1, 2)
+        problem, _, p, m, *_ = drawn(array, 52, 1, n_sources)
         q = problem.homogeneous(p)
         fits = JointFits(q, problem.scaled_moment(q, m), np.zeros(1), np.zeros(1, dtype=np.int64))
-        unit = np.tile(np.repeat([1.0, 300.0], 3), 2)
+        unit = np.tile(np.repeat([1.0, 300.0], 3), n_sources)
 
         def residual(x):
-            states = (x * unit).reshape(-1, 2, 2, 3)
+            states = (x * unit).reshape(-1, n_sources, 2, 3)
             rows = [whitened_residuals(array, np.zeros(array.n_channels), s[:, 0], s[:, 1]) for s in states]
             return np.reshape(rows, (*x.shape[:-1], -1))
 
@@ -467,29 +407,6 @@ class TestCovariance:
         found = covariances(problem, fits)[0] / np.outer(unit, unit)
         sigma = np.sqrt(np.diagonal(expected))
         assert_allclose(found / np.outer(sigma, sigma), expected / np.outer(sigma, sigma), atol=1e-4)
-
-    @pytest.mark.parametrize("case", ["one by vector sensors", "two by vector sensors", "one by 12 scalar sensors"])
-    def test_scatter_of_the_fits(self, case):
-        """NEES of 200 fixes of strong sources, two-sided false-alarm rate 1e-4."""
-        array = scalar_cloud(53) if "scalar" in case else cube(2.0, noise_T=1e-10)
-        n_sources = 2 if "two" in case else 1
-        rng = np.random.default_rng(53)
-        p, m = (np.repeat(x, 200, axis=0) for x in random_sources(rng, 1, n_sources, 2.8, 3.5))
-        problem, y = problem_of(array, noisy_readings(array, p, m, rng))
-        fits = refined_from(problem, y, p, m)
-        assert fits.converged.all()
-        error = np.concatenate([problem.position(fits.q) - p, problem.moment(fits.q, fits.mu) - m], axis=-1).reshape(
-            200, -1
-        )
-        nees = np.einsum("bi,bi->", error, np.linalg.solve(covariances(problem, fits), error[..., None])[..., 0])
-        low, high = chi2_distribution.ppf([0.5e-4, 1 - 0.5e-4], 6 * n_sources * 200)
-        assert low < nees < high
-
-    def test_chi2_of_the_fits(self):
-        """Sum of χ² of 200 fixes of two sources, 9 degrees of freedom each; two-sided false-alarm rate 1e-4."""
-        problem, y, p, m, *_ = drawn(cube(2.0, noise_T=1e-10), 54, 200, 2, 2.8, 3.5)
-        low, high = chi2_distribution.ppf([0.5e-4, 1 - 0.5e-4], (24 - 3 - 12) * 200)
-        assert low < refined_from(problem, y, p, m).chi2.sum() < high
 
     def test_moduli_without_ambient_field_of_both_signs(self):
         """The opposite moment is as good, with the same covariance up to the sign of the moment."""

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from magloc.tracking.chart.mixture import Mixture
-from magloc.tracking.chart.split import LARGEST_BEND, MOST_COMPONENTS, bends, split
+from magloc.tracking.chart.split import MOST_COMPONENTS, bends, split
+from magloc.tracking.row_filter import LARGEST_BEND
 from magloc.tracking.rows import Row
 from magloc.tracking.tracker import Tracker
 from tests.passing_source import ARRAY, MOMENT, POSITION, SLOW, readings_of

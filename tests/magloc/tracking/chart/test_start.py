@@ -120,6 +120,6 @@ def test_a_single_component_has_the_set_of_two_that_are_alike() -> None:
     rng = np.random.default_rng(0)
     for distance in (0.1, 0.5, 3.0, 30.0):
         root = 0.2 * rng.normal(size=(6, 6))
-        one = Mixture.of_gaussian(distance * rng.normal(size=6), root @ root.T, np.zeros(3), 0.5)
+        one = Mixture.of_gaussian(distance * rng.normal(size=6), root, np.zeros(3), 0.5)
         two = replace(one, x=one.x.repeat(2, 0), S=one.S.repeat(2, 0), log_weight=np.log([0.5, 0.5]))
         np.testing.assert_allclose(one.range_interval_m(), two.range_interval_m(), rtol=1e-9)

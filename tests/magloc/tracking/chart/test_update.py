@@ -34,7 +34,7 @@ def far_update(shift: FloatArray) -> tuple[float, FloatArray, FloatArray, FloatA
     blank = measurements.of(Row(0.0, np.zeros(THREE.n_channels)))
     h = blank.predict_source(SOURCE)
     J = blank.directional_derivative(SOURCE, chart.jacobian(np.zeros((1, 6)))[0]) @ S
-    readings = np.linalg.lstsq(blank.model.differences.transform / blank.sigma[:, None], blank.predict_source(there))[0]
+    readings = np.linalg.lstsq(blank.transform, blank.predict_source(there))[0]
     measurement = measurements.of(Row(0.0, readings))
     gaussian = Gaussians(SOURCE[None], S[None])
     found = row_filter.update(gaussian, measurement.kernel_rows, bends=np.ones(1, dtype=bool))

@@ -7,10 +7,11 @@ import pytest
 
 from magloc.fields import dipole
 from magloc.tracking import row_filter
-from magloc.tracking.multi_target.hypotheses import LARGEST_BEND, split
+from magloc.tracking.multi_target.hypotheses import split
 from magloc.tracking.multi_target.measurement import JointRow
 from magloc.tracking.multi_target.state import JointState
 from magloc.tracking.multi_target.update import joint_update
+from magloc.tracking.row_filter import LARGEST_BEND
 from magloc.tracking.rows import Row
 from tests.magloc.tracking.multi_target.test_update import BOARD, MOTION, known, readings
 

@@ -69,16 +69,6 @@ def test_strength_and_rate_of_turn():
     np.testing.assert_allclose(after.sources[0, 9:], np.exp(-dt_s / 0.4) * state.sources[0, 9:])
 
 
-@pytest.mark.parametrize("dt_s", [0.01, 0.2])
-def test_two_half_steps_are_one(dt_s):
-    """Of a source that does not turn: the noise of a step is that of two halves."""
-    state = known(2)
-    state.sources[:, 9:] = 0.0
-    halves, whole = predict(predict(state, 0.5 * dt_s), 0.5 * dt_s), predict(state, dt_s)
-    np.testing.assert_allclose(covariance(halves), covariance(whole), rtol=1e-6, atol=1e-8)
-    np.testing.assert_allclose(halves.position_m, whole.position_m)
-
-
 def test_start_is_what_is_known():
     """Of position, direction, strength, speed and rate of turn, in Cartesian units."""
     moment = np.array([[0.0, 3.0, 0.0]])

@@ -27,16 +27,17 @@ class TestSmoother:
             if i:
                 reference.predict()
                 x_predicted = reference.x.ravel().copy()
-                prediction = Prediction(x_predicted, np.linalg.cholesky(reference.P), reference.F)
+                root = np.linalg.cholesky(reference.P)
+                prediction = Prediction(x_predicted, root, reference.F, np.linalg.cholesky(reference.Q))
             reference.update(rng.normal(size=4))
             x, P = reference.x.ravel().copy(), 0.5 * (reference.P + reference.P.T)
             xs.append(x)
             Ps.append(P)
             steps.append(Step(i, prediction, x, np.linalg.cholesky(P)))
         expected_x, expected_P, _, _ = reference.rts_smoother(np.array(xs)[..., None], np.array(Ps))
-        for i, (x, P) in enumerate(smooth_states(steps)):
+        for i, (x, S) in enumerate(smooth_states(steps)):
             np.testing.assert_allclose(x, expected_x[i].ravel(), rtol=1e-8, atol=1e-9)
-            np.testing.assert_allclose(P, expected_P[i], rtol=1e-8, atol=1e-9)
+            np.testing.assert_allclose(S @ S.T, expected_P[i], rtol=1e-8, atol=1e-9)
 
     def test_goes_no_farther_than_a_track(self) -> None:
         """Every track is smoothed by itself: the last row of one stays as the filter had it."""

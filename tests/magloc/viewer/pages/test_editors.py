@@ -16,6 +16,7 @@ import pytest
 import viser
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, ncx2
@@ -29,13 +30,13 @@ from magloc.levels import FALSE_ALARM
 from magloc.localization.fit.results import Fix
 from magloc.localization.uncertainty.range_interval import gaussian_ranges
 from magloc.measurement.differences import suitable_dipole
-from magloc.viewer.pages.array_editor import ArrayEditor, fault_of_path, moved
-from magloc.viewer.pages.dipole_editor import DipoleEditor, angles_of, direction_of, sensible_step
+from magloc.viewer.pages.array_editor import ArrayEditor, move_sensor, path_fault
+from magloc.viewer.pages.dipole_editor import DipoleEditor, angles_of, direction_of, input_step
 from magloc.viewer.pages.live_fit import LiveFit
-from magloc.viewer.pages.words import panel
+from magloc.viewer.pages.texts import panel_html
+from magloc.viewer.panels.coalesced import CoalescedCall
 from magloc.viewer.panels.inputs import set_value
-from magloc.viewer.panels.latest import Latest
-from magloc.viewer.scene.glyphs import turned_to
+from magloc.viewer.scene.glyphs import rotation_from_z
 from tests.magloc.viewer.conftest import node
 from tests.oracles import derivative, magpylib_field
 from tests.plain_locator import plain_locator
@@ -178,13 +179,13 @@ class TestForecast:
     def test_simulated_noise_has_the_array_s_deviation(self):
         live = LiveFit(LARGE)
         forecast = live.forecast(*suitable_dipole(LARGE))
-        errors = np.array([live.simulated(forecast.readings_T, seed) - forecast.readings_T for seed in range(200)])
+        errors = np.array([live.simulate(forecast.readings_T, seed) - forecast.readings_T for seed in range(200)])
         n = errors.size
         # Outside these bounds in one of ten thousand runs.
         low, high = chi2.ppf([5e-5, 1.0 - 5e-5], n)
         assert low < np.sum((errors / LARGE.channel_noise_T) ** 2) < high
-        again = live.simulated(forecast.readings_T, 3)
-        np.testing.assert_array_equal(again, live.simulated(forecast.readings_T, 3))
+        again = live.simulate(forecast.readings_T, 3)
+        np.testing.assert_array_equal(again, live.simulate(forecast.readings_T, 3))
 
 
 class TestLatest:
@@ -196,7 +197,7 @@ class TestLatest:
             begun.set()
             assert hold.wait(WAIT_S)
 
-        latest = Latest(work)
+        latest = CoalescedCall(work)
         first = threading.Thread(target=latest)
         first.start()
         assert begun.wait(WAIT_S)
@@ -215,7 +216,7 @@ class TestLatest:
             if len(runs) == 1:
                 raise ArithmeticError("once")
 
-        latest = Latest(work)
+        latest = CoalescedCall(work)
         with pytest.raises(ArithmeticError):
             latest()
         latest()
@@ -226,43 +227,43 @@ class TestTurns:
     @given(st.tuples(*[st.floats(-1.0, 1.0)] * 3).filter(lambda v: np.linalg.norm(v) > 1e-3))
     def test_direction_comes_back_from_its_turn(self, vector):
         direction = np.array(vector) / np.linalg.norm(vector)
-        wxyz = turned_to(direction)
+        wxyz = rotation_from_z(direction)
         assert np.linalg.norm(wxyz) == pytest.approx(1.0, abs=1e-12)
         np.testing.assert_allclose(direction_of(wxyz), direction, atol=2e-6)
         expected = Rotation.from_quat(np.roll(wxyz, -1)).apply([0.0, 0.0, 1.0])
         np.testing.assert_allclose(direction_of(wxyz), expected, atol=1e-12)
 
     def test_straight_down_and_angles(self):
-        np.testing.assert_array_equal(direction_of(turned_to(np.array([0.0, 0.0, -1.0]))), [0.0, 0.0, -1.0])
+        np.testing.assert_array_equal(direction_of(rotation_from_z(np.array([0.0, 0.0, -1.0]))), [0.0, 0.0, -1.0])
         np.testing.assert_allclose(angles_of(np.array([0.0, 2.0, 2.0])), (90.0, 45.0))
 
     def test_steps_suit_the_array(self):
-        assert sensible_step(SMALL.circumradius) == pytest.approx(1e-4)
-        assert sensible_step(LARGE.circumradius) == pytest.approx(0.1)
+        assert input_step(SMALL.circumradius) == pytest.approx(1e-4)
+        assert input_step(LARGE.circumradius) == pytest.approx(0.1)
 
 
 @pytest.mark.parametrize("array", [SMALL, LARGE], ids=["3 cm", "30 m"])
 class TestDipoleEditor:
     def test_everything_follows_a_move(self, server, array):
-        editor = DipoleEditor(server, array, parent="/array")
+        editor = DipoleEditor(server, array)
         set_value(editor.noise_checkbox, False)
         radius = array.circumradius
         position = array.centroid + radius * np.array([-1.4, 1.1, 0.7])
         moment = np.linalg.norm(editor.moment_Am2) * np.array([0.0, -0.6, 0.8])
         editor.move_to(position, moment)
 
-        np.testing.assert_allclose(node(server, "/array/dipole/true").position, position)
+        np.testing.assert_allclose(node(server, "/dipole/true").position, position)
         expected = magpylib_field(array.positions, position, moment).ravel()
         np.testing.assert_allclose(editor.forecast.signal_T, expected, rtol=1e-12)
         for nanotesla in 1e9 * expected[:3]:
             assert f"reading {nanotesla:.6g} nT" in editor.readings_panel.content
         # The fit of readings without noise is the dipole.
-        fit = node(server, "/array/dipole/fit 1")
+        fit = node(server, "/dipole/fit 1")
         np.testing.assert_allclose(fit.position, position, atol=1e-5 * radius)
         assert fit.visible
         np.testing.assert_allclose(direction_of(fit.wxyz), moment / np.linalg.norm(moment), atol=1e-4)
         # The surface is the 95 % ellipsoid of the bound.
-        offset = np.asarray(node(server, "/array/dipole/region").vertices) - position
+        offset = np.asarray(node(server, "/dipole/region").vertices) - position
         covariance = bound_with_unknown_common_field(array, position, moment)[:3, :3]
         scale = np.sqrt(np.diagonal(covariance))
         squared = np.einsum(
@@ -289,9 +290,9 @@ class TestDipoleEditor:
             drag(server, editor.control, start * (1.0 + 0.01 * (i + 1)))
         last = start * 1.6
         wait_for(lambda: bool(np.allclose(node(server, "/dipole/true").position, last)))
-        wait_for(lambda: not editor._follow_fit._running and not editor._follow_dipole._running)
+        wait_for(lambda: not editor._update_fix._is_running and not editor._update_forecast._is_running)
         assert 1 <= len(fixes) <= 60
-        np.testing.assert_allclose(editor.position_input.value, last, atol=0.1 * sensible_step(array.circumradius))
+        np.testing.assert_allclose(editor.position_input.value, last, atol=0.1 * input_step(array.circumradius))
         np.testing.assert_allclose(editor.forecast.signal_T, LiveFit(array).forecast(last, editor.moment_Am2).signal_T)
         n_fixes = len(fixes)
         time.sleep(0.1)
@@ -319,7 +320,7 @@ class TestDipoleEditor:
     def test_turning_the_control_and_the_inputs_turn_the_moment(self, server, array):
         editor = DipoleEditor(server, array)
         strength = np.linalg.norm(editor.moment_Am2)
-        drag(server, editor.control, editor.position_m, wxyz=turned_to(np.array([0.0, 1.0, 0.0])))
+        drag(server, editor.control, editor.position_m, wxyz=rotation_from_z(np.array([0.0, 1.0, 0.0])))
         wait_for(lambda: editor.azimuth_slider.value == 90.0 and editor.elevation_slider.value == 0.0)
         np.testing.assert_allclose(editor.moment_Am2, [0.0, strength, 0.0], atol=1e-9 * strength)
         set_value(editor.azimuth_slider, 180.0)
@@ -391,10 +392,17 @@ class TestDipoleEditor:
 
     def test_a_changed_array_reads_the_same_dipole(self, server, array):
         editor = DipoleEditor(server, array)
-        other = moved(array, array.ids[0], array.positions[0] * 1.5)
+        other = move_sensor(array, array.ids[0], array.positions[0] * 1.5)
         editor.set_array(other)
         expected = magpylib_field(other.positions, editor.position_m, editor.moment_Am2).ravel()
         np.testing.assert_allclose(editor.forecast.signal_T, expected, rtol=1e-12)
+
+
+def move(editor: ArrayEditor, sensor_id: str, position_m: ArrayLike) -> None:
+    """Choose a sensor, and drag it."""
+    set_value(editor.sensor_dropdown, sensor_id)
+    editor.control.position = np.asarray(position_m, dtype=np.float64)
+    editor._update()
 
 
 class TestArrayEditor:
@@ -415,7 +423,7 @@ class TestArrayEditor:
         expected = SMALL.positions.copy()
         expected[2] = place
         np.testing.assert_allclose(editor.array.positions, expected, atol=1e-9)
-        wait_for(lambda: dipole.forecast.covariance is not before and not dipole._follow_dipole._running)
+        wait_for(lambda: dipole.forecast.covariance is not before and not dipole._update_forecast._is_running)
         bound = bound_with_unknown_common_field(editor.array, dipole.position_m, dipole.moment_Am2)
         np.testing.assert_allclose(np.diagonal(dipole.forecast.covariance), np.diagonal(bound), rtol=1e-6)
         np.testing.assert_allclose(editor.position_input.value, place, atol=1e-9)
@@ -427,12 +435,12 @@ class TestArrayEditor:
     def test_two_sensors_in_one_place_are_one_sentence_and_no_array(self, server):
         seen: list[SensorArray] = []
         editor = ArrayEditor(server, SMALL, on_change=[seen.append])
-        editor.move("s2", SMALL.positions[0])
+        move(editor, "s2", SMALL.positions[0])
         sentence = "Not moved: sensors s1 and s2 would stand in the same place."
-        assert editor.move_panel.content == panel([sentence], warning=True)
+        assert editor.move_panel.content == panel_html([sentence], warning=True)
         assert editor.array == SMALL
         assert not seen
-        editor.move("s2", [0.0, 0.0, 0.1])
+        move(editor, "s2", [0.0, 0.0, 0.1])
         assert editor.move_panel.content == ""
         np.testing.assert_allclose(editor.array.positions[1], [0.0, 0.0, 0.1], atol=1e-9)
 
@@ -444,8 +452,9 @@ class TestArrayEditor:
     def test_saved_array_is_read_back(self, server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         monkeypatch.chdir(tmp_path)
         array = replace(SMALL, name="edited", ambient_T=(1e-5, 0.0, 4e-5))
-        editor = ArrayEditor(server, array, save_as=str(tmp_path / "a.toml"))
-        editor.move("s4", [0.001, 0.002, 0.05])
+        editor = ArrayEditor(server, array)
+        set_value(editor.path_input, str(tmp_path / "a.toml"))
+        move(editor, "s4", [0.001, 0.002, 0.05])
         set_value(editor.save_button, True)
         assert read_array(tmp_path / "a.toml") == editor.array
         assert "saved as" in editor.save_panel.content
@@ -454,7 +463,8 @@ class TestArrayEditor:
     def test_an_existing_file_is_replaced_after_a_confirmation_only(self, server, tmp_path: Path):
         path = tmp_path / "a.toml"
         write_array(path, LARGE)
-        editor = ArrayEditor(server, SMALL, save_as=str(path), file=path)
+        editor = ArrayEditor(server, SMALL, file=path)
+        set_value(editor.path_input, str(path))
         set_value(editor.save_button, True)
         assert read_array(path) == LARGE
         assert editor.overwrite_button.visible
@@ -480,12 +490,12 @@ class TestArrayEditor:
             set_value(editor.save_button, True)
             assert words in editor.save_panel.content
         (tmp_path / "folder.toml").mkdir()
-        assert "is a folder" in fault_of_path(tmp_path / "folder.toml")
+        assert "is a folder" in path_fault(tmp_path / "folder.toml")
         assert [path.name for path in tmp_path.iterdir()] == ["folder.toml"]
 
     def test_only_sensors_of_one_kind_exclude_each_other(self):
         scalar = replace(SMALL.sensors[0], id="m1", kind="scalar", position_m=(0.5, 0.0, 0.0), calibration=None)
         array = replace(SMALL, sensors=(*SMALL.sensors, scalar))
-        at_one_place = moved(array, "m1", SMALL.positions[0])
+        at_one_place = move_sensor(array, "m1", SMALL.positions[0])
         np.testing.assert_array_equal(at_one_place.positions[4], SMALL.positions[0])
         assert plain_locator(SMALL).fit(LiveFit(SMALL).forecast(*suitable_dipole(SMALL)).readings_T).solutions

@@ -17,7 +17,7 @@ from magloc.readings import Readings
 from magloc.viewer.pages.field_panel import MEASURED, NONE, RESIDUAL, FieldPanel
 from magloc.viewer.pages.fixes import FixView
 from magloc.viewer.panels.inputs import set_value
-from magloc.viewer.server import opened
+from magloc.viewer.server import open_server
 from tests.waiting import wait_for
 
 ARRAY = tetrahedron(1.5)
@@ -34,7 +34,7 @@ def panel(request: pytest.FixtureRequest) -> Iterator[FieldPanel]:
         pose = {"array_position_m": np.ones((2, 3)), "array_rotation": Rotation.from_rotvec([[0.1, 0.2, 0.3]] * 2)}
     rows = Readings(VALUES, time_s=np.arange(2.0), **pose)
     fixes = locate(ARRAY, rows)
-    with opened(0, "test") as server:
+    with open_server(0, "test") as server:
         centroids = np.tile(ARRAY.centroid, (2, 1))
         view = FixView(server, rows.time_s, fixes, centroids, size_m=0.5, reach_m=1.0, dot_m=0.01)
         view.show_row(0)

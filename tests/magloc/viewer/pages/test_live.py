@@ -14,7 +14,7 @@ from magloc.fields import dipole
 from magloc.readings import Readings
 from magloc.tracking.results import SourcePoint, SourcesPoint, TrackPoint
 from magloc.viewer.live_view import LiveView
-from magloc.viewer.pages.live import ALONE
+from magloc.viewer.pages.live import SINGLE_ID
 from tests.waiting import wait_for
 
 ARRAY = tetrahedron(1.5)
@@ -80,10 +80,10 @@ def test_what_is_said(view: LiveView) -> None:
     page = view._live
     wait_for(lambda: "time 1.900 s" in page._source_panel.content)
     assert "tracked at (1.000, 1.900, 0.500) m" in page._source_panel.content
-    np.testing.assert_allclose(page._marks[ALONE].dipole.frame.position, [1.0, 1.9, 0.5])
+    np.testing.assert_allclose(page._sources[SINGLE_ID].dipole.frame.position, [1.0, 1.9, 0.5])
     view.update(TrackPoint(2.0, status="lost: the range is no longer known"))
     wait_for(lambda: "lost: the range" in page._source_panel.content)
-    assert not page._marks[ALONE].dipole.frame.visible
+    assert not page._sources[SINGLE_ID].dipole.frame.visible
 
 
 def several_at(time_s: float, *ids: int) -> SourcesPoint:
@@ -101,12 +101,12 @@ def test_several_sources_come_and_go(view: LiveView) -> None:
     view.update(several_at(0.0, 1, 2), Readings(ARRAY.readings_of(field)[None], time_s=[0.0]))
     wait_for(lambda: "source 2" in page._source_panel.content)
     for id in (1, 2):
-        np.testing.assert_allclose(page._marks[id].dipole.frame.position, [1.0, 0.0, id])
-    assert not page._marks[ALONE].dipole.frame.visible
+        np.testing.assert_allclose(page._sources[id].dipole.frame.position, [1.0, 0.0, id])
+    assert not page._sources[SINGLE_ID].dipole.frame.visible
     wait_for(lambda: page._plot._residuals_T is not None and np.abs(page._plot._residuals_T).max() < 1e-15)
     view.update(several_at(1.0, 2))
     wait_for(lambda: "source 1" not in page._source_panel.content)
-    assert not page._marks[1].dipole.frame.visible
+    assert not page._sources[1].dipole.frame.visible
     view.update(several_at(2.0))
     wait_for(lambda: "no source" in page._source_panel.content)
 
@@ -123,15 +123,15 @@ def test_the_window_is_as_long_as_it_says(view: LiveView) -> None:
 
 def test_buttons(view: LiveView, controls: Controls) -> None:
     page = view._live
-    page._switched(None)
+    page._on_switch(None)
     assert page._switch.label == "Start"
-    page._switched(None)
+    page._on_switch(None)
     assert page._switch.label == "Stop"
-    page._tared(None)
+    page._on_tare(None)
     assert controls.calls == ["stop", "start", 3.0]
-    assert page._said.content == ""
-    page._tared(None)
-    assert "scalar sensor s1" in page._said.content
+    assert page._message.content == ""
+    page._on_tare(None)
+    assert "scalar sensor s1" in page._message.content
 
 
 def test_it_ends() -> None:

@@ -14,7 +14,7 @@ from magloc.tracking.results import TrackPoint
 from magloc.viewer.pages.pages import _nearest_rows
 from magloc.viewer.panels.inputs import set_value
 from magloc.viewer.panels.readings_plot import ALL, RAW, ReadingsPlot, residuals_of
-from magloc.viewer.scene.track_glyph import linear, track_segments
+from magloc.viewer.scene.track_glyph import linear_intensities, track_segments
 from tests.waiting import wait_for
 
 ARRAY = tetrahedron(1.5)
@@ -47,7 +47,7 @@ def test_a_hundred_thousand_rows_are_no_more_segments_than_five_hundred() -> Non
 
 def test_linear_colours_are_srgb_undone() -> None:
     """The inverse of the transfer function of IEC 61966-2-1."""
-    share = linear(np.arange(256, dtype=np.uint8)) / 255.0
+    share = linear_intensities(np.arange(256, dtype=np.uint8)) / 255.0
     back = np.where(share <= 0.0031308, 12.92 * share, 1.055 * share ** (1.0 / 2.4) - 0.055)
     np.testing.assert_allclose(255.0 * back, np.arange(256), atol=7.0)  # dark ones are rounded most
 
@@ -55,13 +55,13 @@ def test_linear_colours_are_srgb_undone() -> None:
 class TestPlot:
     def test_a_row_moves_the_mark_alone(self, server: viser.ViserServer) -> None:
         plot = ReadingsPlot(server, rows_of(2000, np.random.default_rng(2)), ARRAY)
-        before, drawn, marks = plot._thinned.cache_info().misses, plot.lines_panel.content, set()
+        before, drawn, marks = plot._lines.cache_info().misses, plot.lines_panel.content, set()
         for row in (3, 700, 1999):
             plot.show_row(row)
             marks.add(plot.cursor_panel.content)
         assert len(marks) == 3
         assert plot.lines_panel.content is drawn
-        assert plot._thinned.cache_info().misses == before
+        assert plot._lines.cache_info().misses == before
 
     def test_sensors_are_chosen_from_a_list(self, server: viser.ViserServer) -> None:
         plot = ReadingsPlot(server, rows_of(20, np.random.default_rng(3)), ARRAY)

@@ -29,7 +29,7 @@ from magloc.viewer.panels.readings_plot import (
     ReadingsPlot,
     differences_from_mean,
     span_of,
-    thinned,
+    thin_extremes,
 )
 from magloc.viewer.scene.glyphs import FIELD_LINE_COLOUR, TRACK_COLOUR, ArrayGlyphs
 from tests.magloc.viewer.conftest import node
@@ -155,7 +155,7 @@ class TestTrackPlayer:
 
     def test_a_loop_begins_again(self, player, monkeypatch):
         tenths = itertools.count()
-        monkeypatch.setattr("magloc.viewer.panels.played_time.perf_counter", lambda: 0.1 * next(tenths))
+        monkeypatch.setattr("magloc.viewer.panels.time_player.perf_counter", lambda: 0.1 * next(tenths))
         seen: list[int] = []
         player._on_row = [seen.append]
         set_value(player.speed_dropdown, "10 ×")
@@ -180,7 +180,7 @@ class TestTrackPlayer:
 
     def test_play_runs_to_the_end_with_its_speed_and_stops(self, player, monkeypatch):
         tenths = itertools.count()  # the clock's: at ten times the speed, a second of the track for every frame
-        monkeypatch.setattr("magloc.viewer.panels.played_time.perf_counter", lambda: 0.1 * next(tenths))
+        monkeypatch.setattr("magloc.viewer.panels.time_player.perf_counter", lambda: 0.1 * next(tenths))
         seen: list[int] = []
         player._on_row = [seen.append]
         player.show_row(0)
@@ -198,7 +198,7 @@ class TestTrackPlayer:
 
     def test_play_at_the_end_begins_anew_and_pause_holds(self, player, monkeypatch):
         tenths = iter(range(20))  # the clock stands still before half of the time is over
-        monkeypatch.setattr("magloc.viewer.panels.played_time.perf_counter", lambda: 0.1 * next(tenths, 20))
+        monkeypatch.setattr("magloc.viewer.panels.time_player.perf_counter", lambda: 0.1 * next(tenths, 20))
         player.show_row(N - 1)
         set_value(player.speed_dropdown, "1 ×")
         player.play()
@@ -213,7 +213,7 @@ class TestTrackPlayer:
         assert not any(thread.name == "magloc-track-player" for thread in threading.enumerate())
 
     def test_a_time_that_the_user_chooses_while_it_plays_counts(self, player, monkeypatch):
-        monkeypatch.setattr("magloc.viewer.panels.played_time.perf_counter", lambda: 0.0)
+        monkeypatch.setattr("magloc.viewer.panels.time_player.perf_counter", lambda: 0.0)
         player.show_row(0)
         set_value(player.speed_dropdown, "0.1 ×")
         player.play()
@@ -320,14 +320,14 @@ class TestReadingsPlot:
     def test_a_time_that_is_typed_asks_for_the_nearest_row(self, server):
         shuffled = np.random.default_rng(3).permutation(N)
         plot, asked = ReadingsPlot(server, readings()[shuffled], ARRAY), []
-        plot.when_pointed(asked.append)
+        plot.on_select(asked.append)
         set_value(plot.at_input, 4.04)
         wait_for(lambda: bool(asked))
         assert [shuffled[row] for row in asked] == [40]
 
     def test_a_row_that_is_shown_asks_for_none(self, server):
         plot, asked = ReadingsPlot(server, readings(), ARRAY), []
-        plot.when_pointed(asked.append)
+        plot.on_select(asked.append)
         for row in (3, 50, 99):
             plot.show_row(row)
         assert asked == []
@@ -341,7 +341,7 @@ class TestReadingsPlot:
         wait_for(lambda: ends(plot) == (120.0, 130.0))
         inside = (plot._time_s >= 120.0) & (plot._time_s <= 130.0)
         low, high = span_of(1e9 * rows.values_T[inside])
-        lines = plot._thinned(RAW, tuple(range(12)), 10.0, 12)
+        lines = plot._lines(RAW, tuple(range(12)), 10.0, 12)
         assert lines.span == pytest.approx((low, high))
         drawn = plot.lines_panel.content
         plot.show_row(1250)
@@ -397,7 +397,7 @@ class TestThinning:
     )
     def test_extremes_stay_and_time_goes_on(self, values, most):
         time_s = np.arange(len(values)) * 0.5
-        kept_s, kept = thinned(time_s, values, most)
+        kept_s, kept = thin_extremes(time_s, values, most)
         assert len(kept_s) == len(kept) <= max(most, 1)
         assert np.all(np.diff(kept_s) >= 0.0)
         assert kept_s[0] == time_s[0]

@@ -16,10 +16,10 @@ from magloc.measurement.differences import predicted_channels
 from magloc.readings import Readings
 from magloc.tracking.results import TrackPoint, TrackResult
 from magloc.viewer.pages.pages import readings_page, track_page
-from magloc.viewer.pages.words import doubts_of
+from magloc.viewer.pages.texts import warning_lines
 from magloc.viewer.panels.events import EventButtons, rows_of_change
 from magloc.viewer.scene.glyphs import ArrayGlyphs
-from magloc.viewer.server import opened
+from magloc.viewer.server import open_server
 
 ARRAY = tetrahedron(1.5)
 
@@ -36,14 +36,14 @@ class TestRowsOfChange:
 class TestButtons:
     def test_they_go_from_event_to_event_and_not_beyond(self) -> None:
         shown = [5]
-        with opened(0, "test") as server:
+        with open_server(0, "test") as server:
             events = EventButtons(server.gui, np.array([3, 5, 9]), lambda: shown[-1], shown.append, "hint")
             for forwards in (True, True, False, False, False, True):
                 events.go(forwards=forwards)
         assert shown == [5, 9, 5, 3, 5]
 
     def test_none_where_nothing_happens(self) -> None:
-        with opened(0, "test") as server:
+        with open_server(0, "test") as server:
             events = EventButtons(server.gui, rows_of_change([1, 1]), lambda: 0, pytest.fail, "hint")
             events.go(forwards=True)
             assert not server.gui._gui_input_handle_from_uuid
@@ -64,25 +64,25 @@ class TestDoubts:
         ],
     )
     def test_each_is_said(self, change: dict[str, object], words: str) -> None:
-        assert doubts_of(self.FIX) == []
-        (line,) = doubts_of(replace(self.FIX, **change))  # type: ignore[arg-type]
+        assert warning_lines(self.FIX) == []
+        (line,) = warning_lines(replace(self.FIX, **change))  # type: ignore[arg-type]
         assert words in line
 
     def test_of_a_misfit(self) -> None:
         worse = replace(self.FIX.best, chi2=1e4)
-        assert "misfit" in doubts_of(Fix((worse,)))[0]
+        assert "misfit" in warning_lines(Fix((worse,)))[0]
 
 
 class TestMarks:
     def test_the_sensors_that_are_not_used_are_marked_in_their_row(self) -> None:
         point = TrackPoint(0.0, np.array([3.0, 0.0, 0.0]), np.array([0.0, 0.0, 9.0]), status="tracked")
         points = [replace(point, time_s=float(i), dropped_sensors=("s2",) if i == 1 else ()) for i in range(3)]
-        with opened(0, "test") as server:
+        with open_server(0, "test") as server:
             page = track_page(server, TrackResult(tuple(points), is_truth=False), ARRAY, None)
-            assert page.playing is not None
+            assert page.playback is not None
             marks = []
             for row in range(3):
-                page.playing.show(row)
+                page.playback.show(row)
                 node = server.scene._handle_from_node_name.get("/array/not-used")
                 marks.append(node is not None and node.visible)
             assert marks == [False, True, False]
@@ -91,8 +91,8 @@ class TestMarks:
             page.close()
 
     def test_none_of_an_array_without_a_fault(self) -> None:
-        with opened(0, "test") as server:
-            ArrayGlyphs(server.scene, ARRAY).mark(())
+        with open_server(0, "test") as server:
+            ArrayGlyphs(server.scene, ARRAY).mark_unused(())
             assert "/array/not-used" not in server.scene._handle_from_node_name
 
     def test_a_page_of_fixes_goes_to_the_row_of_a_fault(self) -> None:
@@ -100,7 +100,7 @@ class TestMarks:
         rows = Readings(values, time_s=np.arange(4.0))
         fixes = list(locate(ARRAY, rows))
         fixes[2] = replace(fixes[2], dropped_sensors=("s4",))
-        with opened(0, "test") as server:
+        with open_server(0, "test") as server:
             page = readings_page(server, ARRAY, fixes, rows)
             labels = [getattr(handle, "label", "") for handle in server.gui._gui_input_handle_from_uuid.values()]
             assert "Event (2)" in labels

@@ -11,7 +11,7 @@ from arrays.geometries import tetrahedron
 from magloc.readings import Readings
 from magloc.viewer.panels.readings_plot import ReadingsPlot
 from magloc.viewer.panels.static_player import static_player
-from magloc.viewer.server import opened
+from magloc.viewer.server import open_server
 
 ARRAY = tetrahedron(1.0)
 
@@ -22,7 +22,7 @@ class TestCursor:
         time_s = rng.permutation(1000) * 0.25
         rows = Readings(rng.normal(0.0, 1e-7, (1000, ARRAY.n_channels)), time_s=time_s)
         played = [999, 3, 500]
-        with opened(0, "test") as server:
+        with open_server(0, "test") as server:
             plot = ReadingsPlot(server, rows, ARRAY)
             html = static_player(["<b>a</b>", "b", "c"], 2.0, 0.5, plot, played)
         found = re.search(r"= (\{.*\});", html)
@@ -33,7 +33,7 @@ class TestCursor:
         places, times = np.array(held["x"]), rows.time_s[played]
         slope = (places[1] - places[0]) / (times[1] - times[0])
         np.testing.assert_allclose(places - places[0], slope * (times - times[0]), atol=0.02)
-        assert held["words"] == ["<b>a</b>", "b", "c"]
+        assert held["texts"] == ["<b>a</b>", "b", "c"]
 
     def test_no_word_ends_the_script(self) -> None:
         html = static_player(["</script>", "b"], 2.0, 0.5)

@@ -18,7 +18,7 @@ from arrays.sensor import Sensor, SensorKind
 from magloc.localization.fit.results import Fix, Solution
 from magloc.readings import Readings
 from magloc.tracking.results import TrackPoint, TrackResult
-from magloc.viewer.pages import pages, words
+from magloc.viewer.pages import pages, texts
 from magloc.viewer.pages.fixes import FixView
 from magloc.viewer.pages.map import MapControls, MapView
 from magloc.viewer.pages.open_result import MapResult
@@ -26,7 +26,7 @@ from magloc.viewer.panels.inputs import set_value
 from magloc.viewer.scene import framing, shapes, track_glyph
 from magloc.viewer.scene import glyphs as scene
 from magloc.viewer.scene.legend import ColourScale, Swatch, legend_html, with_legend
-from magloc.viewer.server import opened
+from magloc.viewer.server import open_server
 from tests.calls import calls_of
 from tests.plain_locator import one_source
 from tests.waiting import wait_for
@@ -36,7 +36,7 @@ FloatArray = NDArray[np.float64]
 
 @pytest.fixture(scope="module")
 def server() -> Iterator[viser.ViserServer]:
-    with opened(0, "test") as opened_server:
+    with open_server(0, "test") as opened_server:
         yield opened_server
 
 
@@ -90,7 +90,7 @@ class TestFirstCamera:
     @pytest.mark.parametrize("size", [0.03, 1.5, 30.0])
     def test_all_points_are_in_view_and_fill_it(self, server: viser.ViserServer, size: float) -> None:
         points = size * np.random.default_rng(5).normal(size=(30, 3)) * [3.0, 1.0, 0.3] + [7.0 * size, 0.0, 0.0]
-        framing.aim(server, framing.extent_of(points))
+        framing.aim_camera(server, framing.extent_of(points))
         seen = self.seen_from(server, points)
         assert np.abs(seen[:, 1]).max() < 1.0
         assert np.abs(seen[:, 0]).max() < 1.15
@@ -122,7 +122,7 @@ class TestFloor:
         floors: list[dict[str, Any]] = []
         monkeypatch.setattr(server.scene, "add_grid", lambda name, **how: floors.append({"name": name, **how}))
         points = size * (np.array([7.0, -3.0, 2.0]) + np.random.default_rng(5).uniform(-1.0, 1.0, (30, 3)))
-        height, cell = framing.prepare(server, framing.extent_of(points))
+        height, cell = framing.set_up_scene(server, framing.extent_of(points))
         (floor,) = floors
         assert floor["name"] == "/floor"
         assert floor["cell_size"] == cell
@@ -155,7 +155,7 @@ class TestLengths:
         ("field", "expected"), [(1.5e-5, "15 µT"), (1e-9, "1 nT"), (2e-10, "0.2 nT"), (5e-12, "5 pT"), (2e-3, "2 mT")]
     )
     def test_units_suit_the_noise(self, field: float, expected: str) -> None:
-        assert words.field_text(field) == expected
+        assert texts.field_text(field) == expected
 
 
 class TestArray:
@@ -302,9 +302,7 @@ class TestTrack:
         self, server: viser.ViserServer, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         written: dict[str, FloatArray] = {}
-        monkeypatch.setattr(
-            pages, "screen_label", lambda _, name, text, place: written.update({f"{name} {text}": place})
-        )
+        monkeypatch.setattr(pages, "add_label", lambda _, name, text, place: written.update({f"{name} {text}": place}))
         begin, end = (TrackPoint(time_s, status="not acquired") for time_s in (-1.0, 99.0))
         points = (begin, *(TrackPoint(2.0 * i, p) for i, p in enumerate(self.POSITIONS)), end)
         page = pages.track_page(server, TrackResult(points, is_truth=False), None, None)
@@ -433,7 +431,7 @@ class TestFixes:
         assert view.row == 2  # nine metres with the same σ
         assert view.best.frame.position == pytest.approx(far)
         assert view.others[0].frame.visible
-        assert "not observable" in view.words()
+        assert "not observable" in view.html()
         assert view.region.mesh is not None
         assert np.linalg.norm(view.region.mesh.vertices, axis=1).max() == pytest.approx(2.5 * 9.0, rel=1e-5)
         view.show_row(1)
@@ -443,7 +441,7 @@ class TestFixes:
         view.show_row(0)
         assert not view.best.frame.visible
         assert not view.region.mesh.visible
-        assert "no signal" in view.words()
+        assert "no signal" in view.html()
 
     def test_slider(self, server: viser.ViserServer) -> None:
         fixes = [Fix((solution(np.array([x, 0.0, 0.0])),)) for x in (5.0, 6.0, 7.0)]
@@ -456,7 +454,7 @@ class TestFixes:
 
     def test_no_fix_at_all(self, server: viser.ViserServer) -> None:
         view = self.view(server, [Fix((), "no <signal>")] * 3)
-        assert "no &lt;signal&gt;" in view.words()
+        assert "no &lt;signal&gt;" in view.html()
 
     def test_page_of_an_array_that_moves(self, server: viser.ViserServer) -> None:
         array = tetrahedron_of(1.0)

@@ -21,7 +21,7 @@ class TestRuler:
         )
         points = size * np.random.default_rng(1).uniform(-1.0, 2.0, (20, 3))
         extent = framing.extent_of(points)
-        floor = framing.prepare(server, extent)
+        floor = framing.set_up_scene(server, extent)
         ends = add_ruler(server.scene, extent, floor)
         for i, axis in enumerate("xyz"):
             own = [(text, place) for name, text, place in labels if name.startswith(f"/ruler/{axis}/")]
@@ -37,9 +37,9 @@ class TestRuler:
     def test_all_of_it_is_in_the_first_view(self, server: viser.ViserServer) -> None:
         """Its ends are among the points that the camera aims at; where it looks stays the middle of the scene."""
         extent = framing.extent_of([[0.0, 0.0, 0.0], [1.0, 2.0, 0.5]])
-        ends = add_ruler(server.scene, extent, framing.prepare(server, extent))
+        ends = add_ruler(server.scene, extent, framing.set_up_scene(server, extent))
         near = np.linalg.norm(server.initial_camera.position - extent.centre_m)
-        framing.aim(server, extent._replace(points_m=np.vstack([extent.points_m, ends])))
+        framing.aim_camera(server, extent._replace(points_m=np.vstack([extent.points_m, ends])))
         assert np.linalg.norm(server.initial_camera.position - extent.centre_m) > near
         assert server.initial_camera.look_at == pytest.approx(extent.centre_m)
 
@@ -51,14 +51,14 @@ class TestDropLines:
         drop = DropLines(server.scene, "/drop")
         drop.show([[0.2, 0.3, 0.9], [np.nan, 0.0, 0.0]])
         assert not drop._lines.visible
-        drop.stand_on(framing.Floor(-0.5, 0.1), self.EXTENT)
+        drop.set_floor(framing.Floor(-0.5, 0.1), self.EXTENT)
         assert drop._lines.visible
         np.testing.assert_allclose(drop._lines.points[0], [[0.2, 0.3, 0.9], [0.2, 0.3, -0.5]], rtol=1e-6)
         assert (drop._lines.points[1:, :, 2] == -0.5).all()
 
     def test_nothing_to_drop(self, server: viser.ViserServer) -> None:
         drop = DropLines(server.scene, "/drop")
-        drop.stand_on(framing.Floor(-0.5, 0.1), self.EXTENT)
+        drop.set_floor(framing.Floor(-0.5, 0.1), self.EXTENT)
         drop.show([[0.2, 0.3, 0.9]])
         drop.show(np.zeros((0, 3)))
         assert not drop._lines.visible

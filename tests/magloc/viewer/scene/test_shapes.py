@@ -285,7 +285,7 @@ class TestBody:
 
     def test_joined_surfaces_keep_their_faces(self) -> None:
         one = shapes.ellipsoid(POSITION, SPREAD)
-        both = shapes.joined([one, one])
+        both = shapes.join_surfaces([one, one])
         assert len(both.faces) == 2 * len(one.faces)
         assert both.faces.max() == len(both.vertices) - 1
-        assert shapes.joined([]).faces.shape == (0, 3)
+        assert shapes.join_surfaces([]).faces.shape == (0, 3)

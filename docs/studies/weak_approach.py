@@ -1,4 +1,4 @@
-"""A weak source that comes nearer, from its first row: ``python -m tests.weak_approach --first 100 --seeds 20``.
+"""A weak source that comes nearer, from its first row: ``python -m docs.studies.weak_approach --first 100 --seeds 20``.
 
 A tetrahedron of 1.5 m, 0.2 nT, 2 Hz. The source starts 20 m away in any direction, with a moment in any direction that
 is 4 to 6 standard deviations strong in the first row, and passes by at 5 m in the last one, at constant velocity; its

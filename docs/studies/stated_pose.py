@@ -1,4 +1,4 @@
-"""Tracks where the array's pose errs, stated or not, or the ambient field: ``python -m tests.stated_pose diver walk``.
+"""Tracks where the pose or the ambient field errs, stated or not: ``python -m docs.studies.stated_pose diver walk``.
 
 The source is known to rest. Prints of every seed, and of all: rows that have an answer; NEES per dimension and rms
 error over the bound that has the errors as nuisance, over the answered rows and of the last one; and what the tests of

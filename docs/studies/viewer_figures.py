@@ -1,4 +1,4 @@
-"""``python -m tests.viewer_figures``: how long a page of the viewer takes in the browser, as the validation states it.
+"""How long a page of the viewer takes in the browser: ``python -m docs.studies.viewer_figures``.
 
 Times of the page are those of its main thread, in processor time, and of the whole way to the words that it shows. A
 machine without a graphics card draws in software, on the same processors; frames are counted beside it.

@@ -1,4 +1,4 @@
-"""Simulated photographs, solved from the picture alone: ``python -m tests.photograph_figures``.
+"""Simulated photographs, solved from the picture alone: ``python -m docs.studies.photograph_figures``.
 
 Of the real sky, 1024 × 768 px of 40″, twice as bright at one side as at the other, corners 30 % dark, 20 hot pixels,
 every second with trails of 3 px, the scale stated wrong by up to 4 %. Prints how many are solved, how many are false,

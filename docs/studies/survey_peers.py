@@ -1,4 +1,4 @@
-"""What rules of thumb find on the fields of a survey: ``python -m tests.survey_peers --first 200 --seeds 6``.
+"""What rules of thumb find on the fields of a survey: ``python -m docs.studies.survey_peers --first 200 --seeds 6``.
 
 Peaks of the total gradient of both sensors' anomalies on a grid, and at each of them the place and the depth by the
 ratio of the two sensors, by the width of the peak, and by Euler deconvolution (harmonica's, structural index 3) in a
@@ -135,7 +135,7 @@ def main() -> None:
     assert isinstance(scenario, MagneticScenario)
     scores: dict[str, list[Score]] = {name: [] for name in (*RULES, "magloc.survey")}
     for seed in range(given.first, given.first + given.seeds):
-        field = sims.simulate(scenario, seed=seed)
+        field = sims.simulate(scenario, rng=seed)
         grid = gridded(field)
         peaks = peaks_of(grid)
         for name, rule in RULES.items():

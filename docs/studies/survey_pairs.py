@@ -1,4 +1,4 @@
-"""Whether one dipole that is fitted to a pair is called ``merged``: ``python -m tests.survey_pairs survey-drone``.
+"""Whether one dipole fitted to a pair is called ``merged``: ``python -m docs.studies.survey_pairs survey-drone``.
 
 Plots of 8 m with one target, or two within 1.4 m: how often it is said of single ones, and of pairs where the fit is
 off the middle of the moments by more than its 95 % ellipsoid, and where it is not.
@@ -14,6 +14,7 @@ from scipy.special import chdtri
 
 import magloc
 import sims
+from docs.studies.survey_figures import enlarged
 from magloc.surveying.fit.joint_fit import Sources
 from magloc.surveying.piece import Ground
 from magloc.surveying.preparation import whole_rows
@@ -21,14 +22,13 @@ from magloc.surveying.rounds import AT_LAST
 from magloc.surveying.targets import targets_of
 from magloc.surveying.tiled import TiledSurvey
 from sims.magnetics.scenario import MagneticScenario
-from tests.survey_figures import enlarged
 
 HALF_M, GAP_M, THRESHOLD = 0.7, 0.3, 26.0
 
 
 def fitted_as_one(scenario: MagneticScenario, seed: int) -> tuple[bool, bool] | None:
     """Whether it is called merged, and whether it is off; None where it is not significant."""
-    field = sims.simulate(scenario, seed=seed)
+    field = sims.simulate(scenario, rng=seed)
     ground = Ground(magloc.SourcePrior(), 0.0, 15.0, THRESHOLD)
     tiled = TiledSurvey.of(*whole_rows(field.array, field.readings), ground)
     places, moments = field.target_position_m, field.target_moment_Am2

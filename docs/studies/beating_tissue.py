@@ -1,4 +1,4 @@
-"""Twenty-four magnets in beating tissue, followed in one filter: ``python -m tests.beating_tissue --out beating.png``.
+"""Twenty-four magnets in beating tissue in one filter: ``python -m docs.studies.beating_tissue --out beating.png``.
 
 The recording `curibio`: 24 wells, each with a magnet some 5 mm over three sensors of its own, 100 rows a second. Prints
 whether any two tracks came near each other, how far each magnet moved and what a row took, and draws how they move.

@@ -1,0 +1,113 @@
+"""Maps of a survey as GeoTIFF: the anomaly, and what the targets leave of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from scipy.interpolate import LinearNDInterpolator
+from scipy.spatial import Delaunay, KDTree
+
+from arrays.io.errors import of_extra
+from arrays.io.text import replaced
+from arrays.typing import FloatArray
+from magloc.deliverables.map_frame import MapFrame
+
+if TYPE_CHECKING:
+    from magloc.surveying.results import SurveyRows
+
+METHOD = "linear interpolation between rows"
+_CELLS_PER_SPACING = 4.0
+_FARTHEST = 1.0  # spacings from the nearest row: farther cells have no value
+_MOST_CELLS = 4_000_000
+_STEPS = (1.0, 2.0, 5.0, 10.0)
+
+
+class Raster(NamedTuple):
+    """Values (rows from north to south, columns from west to east), NaN where nothing is known.
+
+    `corner` (2,) is the north-west corner and `cell` (2,) the size of a cell, both in units of the map; `cell_m` is the
+    size of a cell in metres.
+    """
+
+    values: FloatArray
+    corner: FloatArray
+    cell: FloatArray
+    cell_m: float
+
+
+def grid_rows(rows: SurveyRows, values: FloatArray, frame: MapFrame, cell_m: float | None = None) -> Raster:
+    """Return values (n,) of rows on a regular grid of the map.
+
+    Parameters
+    ----------
+    rows : SurveyRows
+    values : ndarray, shape (n,)
+        Interpolated linearly between the rows. Cells farther from all rows than the lines from each other have none.
+    frame : MapFrame
+    cell_m : float, optional
+        Size of a cell [m], by default a quarter of the spacing of lines, rounded down to 1, 2 or 5 times a power of 10.
+    """
+    xy_m = rows.place_m[:, :2]
+    spacing_m = line_spacing(xy_m)
+    cell_m = _round_down(spacing_m / _CELLS_PER_SPACING) if cell_m is None else cell_m
+    xy = frame.project(rows.place_m)
+    cell_m = max(cell_m, float(np.sqrt(np.prod(np.ptp(xy / frame.units_per_m, axis=0)) / _MOST_CELLS)))
+    cell = cell_m * frame.units_per_m
+    low = np.floor(xy.min(axis=0) / cell) * cell
+    n_columns, n_rows = (np.ceil((xy.max(axis=0) - low) / cell).astype(int) + 1).tolist()
+    corner = np.array([low[0], low[1] + n_rows * cell[1]])
+    east, north = (
+        corner[0] + (np.arange(n_columns) + 0.5) * cell[0],
+        corner[1] - (np.arange(n_rows) + 0.5) * cell[1],
+    )
+    cells = np.stack(np.meshgrid(east, north), axis=-1)
+    scaled, known = cells / frame.units_per_m, xy / frame.units_per_m
+    unique, first = np.unique(known, axis=0, return_index=True)
+    gridded = LinearNDInterpolator(Delaunay(unique), values[first])(scaled)
+    gridded[KDTree(unique).query(scaled)[0] > _FARTHEST * spacing_m] = np.nan
+    return Raster(gridded, corner, cell, cell_m)
+
+
+def line_spacing(xy_m: FloatArray) -> float:
+    """Return the usual distance between lines [m] of rows (n, 2): the area that they cover over the way."""
+    way_m = float(np.linalg.norm(np.diff(xy_m, axis=0), axis=1).sum())
+    extent_m = float(np.ptp(xy_m, axis=0).max())
+    if np.linalg.matrix_rank(xy_m - xy_m.mean(axis=0), rtol=1e-3) < 2:
+        return extent_m / 20.0  # a single line
+    from scipy.spatial import ConvexHull
+
+    return max(float(ConvexHull(xy_m).volume) / way_m, extent_m / 500.0)
+
+
+def _round_down(length: float) -> float:
+    decade = 10.0 ** np.floor(np.log10(length))
+    return float(decade * max(step for step in _STEPS if step <= length / decade * (1.0 + 1e-9)))
+
+
+def write_geotiff(path: Path, raster: Raster, frame: MapFrame, title: str, unit: str) -> None:
+    """Write a raster as GeoTIFF with its coordinate system; tags name the method of gridding and the cell's size."""
+    with of_extra("gis", "a GeoTIFF"):
+        import rasterio
+    n_rows, n_columns = raster.values.shape
+    with (
+        replaced(path) as unfinished,
+        rasterio.open(
+            unfinished,
+            "w",
+            driver="GTiff",
+            height=n_rows,
+            width=n_columns,
+            count=1,
+            dtype="float32",
+            crs=frame.crs,
+            transform=rasterio.Affine(raster.cell[0], 0.0, raster.corner[0], 0.0, -raster.cell[1], raster.corner[1]),
+            nodata=np.nan,
+            compress="deflate",
+        ) as file,
+    ):
+        file.write(raster.values.astype(np.float32), 1)
+        file.update_tags(method=METHOD, cell_m=f"{raster.cell_m:g}")
+        file.set_band_description(1, title)
+        file.set_band_unit(1, unit)

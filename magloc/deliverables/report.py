@@ -1,0 +1,166 @@
+"""Report of a survey: an HTML page that prints on two to six sheets."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from html import escape
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from arrays.io.outputs import installed_version
+from magloc.deliverables.flight_lines import flight_lines
+from magloc.deliverables.map_frame import MapFrame
+from magloc.deliverables.rasters import line_spacing
+from magloc.surveying.results import IRON_Am2_PER_KG, Survey
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_DPI = 170
+_REACH_Am2 = (0.1, 0.3, 1.0, 3.0, 10.0)
+_STYLE = """
+@page { size: A4; margin: 16mm } body { font: 10.5pt/1.45 sans-serif; max-width: 178mm; margin: auto; color: #111 }
+h1 { font-size: 19pt; margin: 0 0 2mm } h2 { font-size: 13pt; margin: 7mm 0 2mm; break-after: avoid }
+table { border-collapse: collapse; width: 100%; font-size: 9pt } th { text-align: left; border-bottom: 1px solid #111 }
+td, th { padding: 0.8mm 1.5mm; vertical-align: top } tr { break-inside: avoid } td.n, th.n { text-align: right }
+tr:nth-child(even) td { background: #f3f3f3 } figure { margin: 2mm 0; break-inside: avoid } img { width: 100% }
+figcaption, small { color: #444; font-size: 9pt }
+"""
+_MAPS = (
+    "Anomaly along the ambient field, the remainder without the targets, and the least moment that is found with 95 %"
+    " at the shallowest and at the deepest level."
+)
+_PROFILES = "Readings along the line nearest to each target, and the fields of the targets."
+_FLAGS = {
+    "weak": "the depth interval holds, the ellipse does not",
+    "near": "another target is so near that one of the two may be spurious",
+    "merged": "more than one source, too near to each other to be separated",
+    "edge": "at the edge of the volume that was searched",
+    "misfit": "the readings do not fit a dipole; errors are larger than stated",
+}
+
+
+def report_html(found: Survey, frame: MapFrame, title: str, assumptions: Mapping[str, str]) -> str:
+    """Return the report of a survey as one HTML page without links to other files.
+
+    Parameters
+    ----------
+    found : Survey
+    frame : MapFrame
+        Coordinate system of the list of targets, and the origin of the survey's world frame.
+    title : str
+    assumptions : mapping of str
+        What was assumed, by names, such as the height of the ground.
+    """
+    from magloc.plots.profiles import survey_profiles
+
+    body = [
+        f"<h1>{escape(title)}</h1>",
+        f"<small>magloc {installed_version()}; coordinates: {escape(frame.crs)} ({escape(frame.system.name)})</small>",
+        "<h2>Survey</h2>",
+        _table(("", ""), _survey_rows(found)),
+        f"<h2>Targets ({len(found)})</h2>",
+        _table(_target_header(frame), _target_rows(found, frame), numbers=range(1, 8)),
+        _flag_words(found),
+        "<h2>Maps</h2>",
+        _picture(found.plot(), _MAPS),
+        "<h2>Profiles</h2>",
+        _picture(survey_profiles(found), _PROFILES),
+        "<h2>Detectable moments</h2>",
+        _table(("depth", *(f"{moment:g} A·m²" for moment in _REACH_Am2)), _reach_rows(found), numbers=range(1, 6)),
+        "<small>Share of the area in which a target of that moment is found with 95 %, whatever its direction.</small>",
+        "<h2>Assumptions</h2>",
+        _table(("", ""), [*assumptions.items(), *_assumption_rows(found)]),
+    ]
+    return (
+        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
+        f"<style>{_STYLE}</style></head><body>" + "\n".join(body) + "</body></html>\n"
+    )
+
+
+def _survey_rows(found: Survey) -> Iterator[tuple[str, str]]:
+    rows = found.rows
+    lines = flight_lines(rows.time_s, rows.place_m, found.ground_m)
+    step_m = np.linalg.norm(np.diff(rows.place_m[:, :2], axis=0), axis=1)
+    height = rows.place_m[:, 2] - found.ground_m
+    speeds = [line.speed_m_s for line in lines] or [0.0]
+    rate_Hz = 1.0 / float(np.median(np.diff(rows.time_s)))
+    yield "array", f"{found.array.name or 'unnamed'}, {found.array.n_sensors} sensors"
+    yield "rows", f"{len(rows.time_s)} at {rate_Hz:.3g} Hz, {(rows.time_s[-1] - rows.time_s[0]) / 60.0:.1f} min"
+    yield "lines", f"{len(lines)}, {step_m.sum():.0f} m in total, about {line_spacing(rows.place_m[:, :2]):.2g} m apart"
+    yield "speed", f"{np.mean(speeds):.2g} m/s ({min(speeds):.2g} to {max(speeds):.2g})"
+    yield "height above ground", f"{height.mean():.2f} m ({height.min():.2f} to {height.max():.2f})"
+    rms_nT = 1e9 * float(rows.residual_T.std())
+    yield "remainder", f"{rms_nT:.2g} nT rms without the targets, χ² {found.chi2_per_dof:.2f} per reading"
+    yield "lag", f"{1e3 * found.lag_s:.0f} ms of the readings, corrected" if found.lag_s else "none found"
+
+
+def _target_header(frame: MapFrame) -> tuple[str, ...]:
+    places = ("longitude", "latitude") if frame.is_geographic else ("easting", "northing")
+    return ("id", *places, "depth [m]", "95 %", "|m| [A·m²]", "± xy [cm]", "iron [kg]", "flags")
+
+
+def _target_rows(found: Survey, frame: MapFrame) -> Iterator[tuple[str, ...]]:
+    digits = 7 if frame.is_geographic else 2
+    for target, (x, y) in zip(found, frame.project(found.position_m).tolist(), strict=True):
+        low, high = target.depth_interval95_m
+        least, most = target.iron_kg
+        yield (
+            target.id,
+            f"{x:.{digits}f}",
+            f"{y:.{digits}f}",
+            f"{target.depth_m:.2f}",
+            f"{low:.2f}–{high:.2f}",
+            f"{target.strength_Am2:.3g}",
+            f"{100.0 * target.ellipse95[0]:.2g}",
+            f"{_two_digits(least)}–{_two_digits(most)}",
+            " ".join(target.flags),
+        )
+
+
+def _two_digits(value: float) -> str:
+    return f"{float(f'{value:.2g}'):g}"
+
+
+def _flag_words(found: Survey) -> str:
+    used = sorted({flag for target in found for flag in target.flags})
+    words = "; ".join(f"<b>{flag}</b>: {_FLAGS.get(flag, '')}" for flag in used)
+    iron = f"A kilogram of iron has {IRON_Am2_PER_KG[0]:g} to {IRON_Am2_PER_KG[1]:g} A·m²."
+    return f"<small>± xy: longer half axis of the 95 % ellipse. {iron} {words}</small>"
+
+
+def _reach_rows(found: Survey) -> Iterator[tuple[str, ...]]:
+    depths = np.round(found.ground_m - found.reach.place_m[:, 2], 6)
+    for depth in np.unique(depths):
+        moments = found.reach.moment_Am2[depths == depth]
+        yield f"{depth:g} m", *(f"{100.0 * np.mean(moments <= moment):.0f} %" for moment in _REACH_Am2)
+
+
+def _assumption_rows(found: Survey) -> Iterator[tuple[str, str]]:
+    yield "model", "every target is a magnetic dipole at rest"
+    pose = found.array.pose
+    if pose is not None:
+        how = "estimated from the rows, because none were stated" if found.pose_assumed else "as stated"
+        yield "errors of positions", f"{100.0 * pose.position_m:.2g} cm that last {pose.correlation_s:g} s, {how}"
+
+
+def _table(header: Sequence[str], rows: Iterable[Sequence[str]], numbers: Iterable[int] = ()) -> str:
+    numbers = set(numbers)
+
+    def line(cells: Sequence[str], tag: str) -> str:
+        kinds = [' class="n"' if i in numbers else "" for i in range(len(cells))]
+        return "<tr>" + "".join(f"<{tag}{k}>{escape(c)}</{tag}>" for k, c in zip(kinds, cells, strict=True)) + "</tr>"
+
+    head = line(header, "th") if any(header) else ""
+    return "<table>" + head + "".join(line(row, "td") for row in rows) + "</table>"
+
+
+def _picture(figure: Figure, caption: str) -> str:
+    from magloc.plots import style
+
+    data = base64.b64encode(style.png(figure, _DPI)).decode()
+    words = escape(caption)
+    image = f'<img alt="{words}" src="data:image/png;base64,{data}">'
+    return f"<figure>{image}<figcaption>{words}</figcaption></figure>"

@@ -1,0 +1,33 @@
+"""The report of a survey."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import magloc
+from magloc.deliverables.map_frame import MapFrame
+from magloc.deliverables.report import report_html
+
+
+class TestReportHtml:
+    def test_has_all_targets_with_their_places(self, survey: magloc.Survey, frame: MapFrame) -> None:
+        page = report_html(survey, frame, "Meadow <1>", {"ground": "0 m"})
+        cells = [re.findall(r"<td[^>]*>([^<]*)</td>", row) for row in re.findall(r"<tr>.*?</tr>", page)]
+        found = {row[0]: row for row in cells if row and re.fullmatch(r"t\d", row[0])}
+        digits = 7 if frame.is_geographic else 2
+        for target, (x, y) in zip(survey, frame.project(survey.position_m), strict=True):
+            assert found[target.id][1:4] == [f"{x:.{digits}f}", f"{y:.{digits}f}", f"{target.depth_m:.2f}"]
+        assert "<title>Meadow &lt;1&gt;</title>" in page
+        assert ["ground", "0 m"] in cells
+
+    def test_needs_no_other_file(self, survey: magloc.Survey, frame: MapFrame) -> None:
+        page = report_html(survey, frame, "Meadow", {})
+        assert re.findall(r'(?:src|href)="(?!data:)', page) == []
+        assert page.count("<img alt=") == 2
+
+    def test_words_of_flags_that_occur(self, survey: magloc.Survey, frame: MapFrame) -> None:
+        weak = replace(survey, targets=(replace(survey[0], flags=("weak",)), *survey[1:]))
+        page = report_html(weak, frame, "Meadow", {})
+        assert "<b>weak</b>: the depth interval holds" in page
+        assert "<b>merged</b>" not in page

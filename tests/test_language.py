@@ -1,0 +1,172 @@
+"""Language of pages, docstrings and messages, as far as a machine can hold it: short sentences, plain first words."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import REPOSITORY
+
+PACKAGES = ("arrays", "magloc", "adcs", "sims")
+WRITTEN = [
+    REPOSITORY / "README.md",
+    REPOSITORY / "CONTRIBUTING.md",
+    *(page for page in sorted((REPOSITORY / "docs").rglob("*.md")) if not {"names", "commands"} & set(page.parts)),
+]
+MOST_WORDS, MOST_WORDS_OF_A_PAGE, MOST_BYTES = 20.0, 24.0, 12 * 1024
+
+FENCE = re.compile(r"^(```+|~~~+)[^\n]*\n.*?^\1[ ]*$", re.DOTALL | re.MULTILINE)
+HIDDEN = re.compile(r"<!--.*?-->", re.DOTALL)
+FORMULA = re.compile(r"^\$\$.*?\$\$", re.DOTALL | re.MULTILINE)
+ITEM = re.compile(r"(?:[-*+]|\d+\.)\s+")
+# Lines without sentences: tables, headings, directives and their options, comments, labels.
+SKIPPED = re.compile(r"[|#:<{]|---|\(\w[\w-]*\)=$")
+# The end of a sentence, before a capital, a digit, a symbol or code.
+END = re.compile(r"(?<=[.!?])[*_)\"]*\s+(?=[A-Z*_(\"§\dχσΔ∂])")
+WORD = re.compile(r"[^\W_][\w'’.,²³/%°-]*")
+
+UNCLEAR = re.compile(r"(?:What|Of|Where|That|Whether)\b")
+
+
+def paragraphs(text: str) -> Iterator[str]:
+    """Paragraphs and items of lists; code spans count as one word, links as their text."""
+    text = FORMULA.sub("\n\n", HIDDEN.sub("", FENCE.sub("\n\n", text)))
+    lines: list[str] = []
+    for line in [*text.splitlines(), ""]:
+        shown = line.strip()
+        indented_code = line.startswith("    ") and not lines
+        if not shown or SKIPPED.match(shown) or indented_code or ITEM.match(shown):
+            if lines:
+                joined = re.sub(r"`[^`]*`", "§", " ".join(lines))
+                yield re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", re.sub(r"\$[^$]*\$", "§", joined))
+            lines = []
+        if shown and not SKIPPED.match(shown) and not indented_code:
+            lines.append(ITEM.sub("", shown, count=1) if ITEM.match(shown) else shown)
+
+
+def words_of_sentences(text: str) -> list[int]:
+    """Number of words of each sentence of three words or more; a code span is one word."""
+    sentences = [sentence for paragraph in paragraphs(text) for sentence in END.split(paragraph)]
+    counts = [len(WORD.findall(sentence.replace("§", "x"))) for sentence in sentences]
+    return [count for count in counts if count >= 3]
+
+
+class TestSentences:
+    def test_counted(self) -> None:
+        prose = "# Title of a page\n\nOne `two three` four. Five\nsix seven!\n\n"
+        text = prose + "| a | b |\n\n```python\nx = 1\n```\n- Eight nine ten.\n"
+        assert words_of_sentences(text) == [3, 3, 3]
+
+    @pytest.mark.parametrize("page", WRITTEN, ids=lambda page: str(page.relative_to(REPOSITORY)))
+    def test_of_a_page_are_short(self, page: Path) -> None:
+        counts = words_of_sentences(page.read_text(encoding="utf-8"))
+        assert sum(counts) <= MOST_WORDS_OF_A_PAGE * len(counts)
+
+    def test_of_all_pages_are_short(self) -> None:
+        counts = [count for page in WRITTEN for count in words_of_sentences(page.read_text(encoding="utf-8"))]
+        assert len(counts) > 2000
+        assert sum(counts) <= MOST_WORDS * len(counts)
+
+
+def test_the_changelog_is_short() -> None:
+    assert len((REPOSITORY / "CHANGELOG.md").read_bytes()) <= MOST_BYTES
+
+
+def docstrings(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Line and text of all docstrings, also of attributes."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            for part in node.body:
+                constant = part.value if isinstance(part, ast.Expr) else None
+                if isinstance(constant, ast.Constant) and isinstance(constant.value, str):
+                    yield part.lineno, constant.value
+
+
+def messages(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Line and beginning of texts that are raised, warned of or logged."""
+    for node in ast.walk(tree):
+        calls = [node.exc] if isinstance(node, ast.Raise) else [node]
+        for call in calls:
+            if not isinstance(call, ast.Call) or not call.args:
+                continue
+            name = call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
+            if not isinstance(node, ast.Raise) and name not in ("warn", "warning", "info", "error"):
+                continue
+            first = call.args[0]
+            if isinstance(first, ast.JoinedStr) and first.values:
+                first = first.values[0]
+            if isinstance(first, ast.Constant) and isinstance(first.value, str):
+                yield first.lineno, first.value
+
+
+def unclear(path: Path) -> list[str]:
+    """Docstrings and messages of a file that begin with a word of ``UNCLEAR``."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    texts = [*docstrings(tree), *messages(tree)]
+    return [
+        f"{path.relative_to(REPOSITORY)}:{line}: {text.strip().splitlines()[0]}"
+        for line, text in texts
+        if UNCLEAR.match(text.strip())
+    ]
+
+
+FOLDERS = sorted({path.parent for package in PACKAGES for path in (REPOSITORY / package).rglob("*.py")})
+# Folders whose docstrings are still to be reworded; a folder leaves the list when it is clean.
+TO_REWORD = {
+    "adcs/cli",
+    "adcs/ellipsoids",
+    "adcs/environment",
+    "adcs/io",
+    "adcs/plots",
+    "adcs/stars",
+    "adcs/viewer",
+    "arrays",
+    "arrays/io",
+    "arrays/logs",
+    "magloc",
+    "magloc/bounds",
+    "magloc/calibration",
+    "magloc/cli",
+    "magloc/cli/calibration",
+    "magloc/cli/moments",
+    "magloc/deliverables",
+    "magloc/design",
+    "magloc/detection",
+    "magloc/fields",
+    "magloc/grids",
+    "magloc/live",
+    "magloc/localization",
+    "magloc/localization/fit",
+    "magloc/measurement",
+    "magloc/navigation",
+    "magloc/signature",
+    "magloc/surveying",
+    "magloc/viewer",
+    "magloc/viewer/pages",
+    "magloc/viewer/panels",
+    "magloc/viewer/scene",
+    "sims",
+    "sims/attitude",
+    "sims/cli",
+    "sims/experiments",
+    "sims/magnetics",
+    "sims/mockup",
+}
+CLEAN = [folder for folder in FOLDERS if folder.relative_to(REPOSITORY).as_posix() not in TO_REWORD]
+
+
+class TestFirstWords:
+    def test_unclear_ones_are_found(self) -> None:
+        function = 'def f(x):\n    """Of it."""\n    raise ValueError(f"Where {x}")\n'
+        code = f'"""What is."""\n\n{function}\nA = 1\n"""Whatever."""\n'
+        tree = ast.parse(code)
+        texts = [text for _, text in [*docstrings(tree), *messages(tree)]]
+        assert [text for text in texts if UNCLEAR.match(text)] == ["What is.", "Of it.", "Where "]
+
+    @pytest.mark.parametrize("folder", CLEAN, ids=lambda folder: folder.relative_to(REPOSITORY).as_posix())
+    def test_of_docstrings_and_messages_are_clear(self, folder: Path) -> None:
+        assert [text for path in sorted(folder.glob("*.py")) for text in unclear(path)] == []

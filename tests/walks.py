@@ -1,0 +1,110 @@
+"""Write docs/development/walks.md: the files that one row passes, in the order of a debugger.
+
+python -m tests.walks
+"""
+
+from __future__ import annotations
+
+import ast
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+from typing import NamedTuple
+
+import adcs
+import magloc
+
+ROOT = Path(__file__).parents[1]
+PAGE = ROOT / "docs/development/walks.md"
+_PACKAGES = ("adcs", "arrays", "magloc", "sims")
+_CORE = "magloc/core/__init__.py"
+_MOST_NAMES = 3  # functions and kernels that a line of the page names
+_HEAD = """# Walks: the path of one row
+
+The files that one row passes, in the order in which a debugger enters them, with the first functions that run there.
+Imports and caches are not part of a walk. `python -m tests.walks` writes this page.
+"""
+
+
+class Walk(NamedTuple):
+    """Functions that ran, by file in the order of the first call, and how often the file changed."""
+
+    functions: dict[str, list[str]]
+    switches: int
+
+
+def _locate() -> Callable[[], object]:
+    board = magloc.datasets.load("board")
+    return lambda: magloc.locate(board.array, board.readings[:1])
+
+
+def _track() -> Callable[[], object]:
+    board = magloc.datasets.load("board")
+    row = next(iter(board.readings))
+    motion = magloc.RandomWalk(speed_m_s=0.1, turn_rad_s=0.02)
+    return lambda: magloc.Tracker(board.array, motion).update(row)
+
+
+def _estimate() -> Callable[[], object]:
+    log = adcs.datasets.load("satellite")
+    return lambda: adcs.estimate(log.telemetry, log.satellite, sensors="mag+sun")
+
+
+WALKS = {
+    "One row through `magloc.locate`": _locate,
+    "The first row of a track, `magloc.Tracker.update`": _track,
+    "A telemetry log through `adcs.estimate`": _estimate,
+}
+
+
+def walk(call: Callable[[], object]) -> Walk:
+    """Return the path of a call whose imports and caches are warm."""
+    call()
+    functions: dict[str, list[str]] = {}
+    switches, last = 0, ""
+
+    def profile(frame: FrameType, event: str, _: object) -> None:
+        nonlocal switches, last
+        file = os.path.relpath(frame.f_code.co_filename, ROOT).replace(os.sep, "/")
+        if event != "call" or file.partition("/")[0] not in _PACKAGES:
+            return
+        name = frame.f_code.co_qualname
+        if file == _CORE and name == "run":
+            name = f"kernel {frame.f_locals['kernel']}"
+        names = functions.setdefault(file, [])
+        if "<" not in name and name not in names:
+            names.append(name)
+        switches += last not in ("", file)
+        last = file
+
+    sys.setprofile(profile)
+    try:
+        call()
+    finally:
+        sys.setprofile(None)
+    return Walk(functions, switches)
+
+
+def page() -> str:
+    """Return the text of the page."""
+    return _HEAD + "".join(f"\n## {title}\n\n{_lines(walk(make()))}" for title, make in WALKS.items())
+
+
+def _lines(path: Walk) -> str:
+    head = f"{len(path.functions)} files, {path.switches} switches between files.\n\n"
+    return head + "".join(f"{i}. {_line(*item)}\n" for i, item in enumerate(path.functions.items(), 1))
+
+
+def _line(file: str, names: list[str]) -> str:
+    shown = [name for name in names if name.startswith("kernel ")] or names
+    more = " …" if len(shown) > _MOST_NAMES else ""
+    summary = (ast.get_docstring(ast.parse((ROOT / file).read_text("utf-8"))) or "").partition("\n")[0]
+    listed = ", ".join(f"`{name}`" for name in shown[:_MOST_NAMES])
+    return f"`{file}`: {summary}" + (f" {listed}{more}" if listed else "")
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), "utf-8")
+    print(PAGE)
