@@ -1,4 +1,4 @@
-"""Arrays of magnetometers: what the sensors are, where they stand, and how they differ."""
+"""Arrays of magnetometers: sensors, positions, noise and differences between sensors."""
 
 from arrays.io.lazy import lazy_names
 

@@ -1,4 +1,4 @@
-"""The array: sensors that stand together, their channels, and the ambient field that they stand in."""
+"""The array: rigidly connected sensors, their channels, and the ambient field."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ AMBIENT_CHANNELS = ("ambient_x", "ambient_y", "ambient_z")
 _FARTHEST_M = 1e9
 _SAME_PLACE_RTOL = 1e-9
 _GRADIENT_RTOL = 1e-6
-# What an array knows of itself by its ambient field.
+# Cached properties that depend on the ambient field.
 _OF_AMBIENT_FIELD = ("_hash", "ambient_fields", "channel_ambient_T")
 
 
@@ -31,40 +31,40 @@ _OF_AMBIENT_FIELD = ("_hash", "ambient_fields", "channel_ambient_T")
 class SensorArray:
     """Sensors that are rigidly connected.
 
-    Properties per channel are in the order of the sensors, x y z within a vector sensor; C is the number of channels, N
-    that of sensors. The arrays that they return are read-only.
+    Properties per channel are in the order of the sensors, x y z within a vector sensor. C is the number of channels, N
+    that of the sensors. The arrays that properties return are read-only.
 
     Attributes
     ----------
     sensors : tuple of Sensor
-        With different ids and not all in one place. One alone can be calibrated; differences need two.
+        Sensors with different ids, not all at one position. A single sensor can be calibrated; differences need two.
     name : str
         One line of text, or empty.
     noise_fraction : float
-        Noise proportional to the field, of sensors that do not state their own: variance = noise² + (fraction · |B|)².
+        Noise proportional to the field, for sensors without their own: variance = noise² + (fraction · |B|)².
     common_field_T : float, optional
-        Standard deviation, per axis, of the field that is common to all sensors [T]. None: nothing is known of it, and
-        only differences between sensors carry information.
+        Standard deviation, per axis, of the field common to all sensors [T]. None: it is unknown, and only differences
+        between sensors carry information.
     ambient_T : tuple, shape (3,), optional
         Known ambient field in the array's frame, at its origin [T].
     ambient_world_T : tuple, shape (3,), optional
-        The same in the world frame of the readings' pose [T]; it comes first where they have one.
+        The same in the world frame of the readings' pose [T]; it has priority for readings with a pose.
     ambient_gradient_T_m : tuple of tuples, shape (3, 3), optional
-        Known gradient tensor dB_i/dx_j of the ambient field in the array's frame [T/m]: symmetric and traceless, as
-        that of any field whose sources are elsewhere. None stands for a uniform field.
+        Known gradient tensor dB_i/dx_j of the ambient field in the array's frame [T/m], symmetric and traceless, as for
+        all fields of distant sources. None: a uniform field.
     ambient_uncertainty_T : float
-        Standard deviation, per axis, of the error of the ambient field, one for all sensors and rows [T].
+        Standard deviation, per axis, of the error of the ambient field, constant for all sensors and rows [T].
     ambient_uncertainty_white_T : float
-        The same of an error that is new in every row [T].
+        The same for an error that is new in every row [T].
     pose : PoseUncertainty, optional
-        How wrong the pose in the readings may be; None: it counts as exact.
+        Errors of the pose in the readings; None: the pose is exact.
     columns : LogColumns, optional
-        How its logs name and count their columns; None: as a readings file does.
+        Names and units of the columns of its logs; None: those of a readings file.
 
     Raises
     ------
     ValueError
-        Any of this does not hold.
+        One of these conditions does not hold.
 
     Examples
     --------
@@ -116,11 +116,11 @@ class SensorArray:
 
     @cached_property
     def _hash(self) -> int:
-        """Of all fields: what is cached by an array asks for it in every fix."""
+        """Hash of all fields, cached because every fix needs it."""
         return hash(tuple(getattr(self, field.name) for field in fields(self)))
 
     def __getstate__(self) -> dict[str, Any]:
-        # Cached arrays are left out: they would come back writeable.
+        # Without the cached arrays, which would come back writeable.
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     @cached_property
@@ -186,12 +186,12 @@ class SensorArray:
 
     @cached_property
     def channel_is_scalar(self) -> BoolArray:
-        """Whether each channel reads the modulus of the field, shape (C,)."""
+        """Mask of the channels that read the modulus of the field, shape (C,)."""
         return _read_only(np.array([sensor.kind == "scalar" for sensor in self.sensors])[self.channel_sensor])
 
     @cached_property
     def channel_noise_T(self) -> FloatArray:
-        """Standard deviation of each channel in one row by itself, shape (C,) [T]."""
+        """Standard deviation of each channel in a single row, shape (C,) [T]."""
         return _read_only(np.array([sensor.row_noise_T for sensor in self.sensors])[self.channel_sensor])
 
     @cached_property
@@ -202,12 +202,12 @@ class SensorArray:
 
     @property
     def row_ambient_uncertainty_T(self) -> float:
-        """Standard deviation, per axis, of the error of the ambient field in one row by itself [T]."""
+        """Standard deviation, per axis, of the error of the ambient field in a single row [T]."""
         return math.hypot(self.ambient_uncertainty_T, self.ambient_uncertainty_white_T)
 
     @cached_property
     def noise_depends_on_reading(self) -> bool:
-        """Whether the covariance of the readings changes with them; else it is diagonal, with the channels' noise."""
+        """True if the covariance depends on the readings; otherwise it is diagonal and constant."""
         uncertain = any(s.misalignment_rad or s.gain_uncertainty or s.induced_uncertainty for s in self.sensors)
         return bool(self.noise_fractions.any()) or uncertain
 
@@ -221,7 +221,7 @@ class SensorArray:
     def ambient_fields(self) -> FloatArray:
         """Known ambient field at every sensor, ``ambient_T + ambient_gradient_T_m @ position``: (N, 3) [T].
 
-        What is not known counts as zero.
+        Unknown parts count as zero.
         """
         fields = np.zeros((self.n_sensors, 3))
         if self.ambient_T is not None:
@@ -237,16 +237,16 @@ class SensorArray:
 
     @cached_property
     def channel_ambient_T(self) -> FloatArray:
-        """Reading of each vector channel in the known ambient field, of each scalar one in zero field, (C,) [T]."""
+        """Reading of vector channels in the known ambient field, of scalar ones in zero field, (C,) [T]."""
         of_field = np.vecdot(self.ambient_fields[self.channel_sensor], self.channel_gain)
         return _read_only(self.channel_offset_T + np.where(self.channel_is_scalar, 0.0, of_field))
 
     @cached_property
     def channel_gain(self) -> FloatArray:
-        """What each channel reads of the field, shape (C, 3).
+        """Gain of each channel, shape (C, 3).
 
         For a vector channel the row a of ``reading - offset = a · B`` with B in the array's frame: calibration and
-        rotation of its sensor in one. For a scalar channel (g, 0, 0) of ``reading - offset = g |B|``.
+        rotation of its sensor. For a scalar channel (g, 0, 0) of ``reading - offset = g |B|``.
         """
         gain = np.zeros((self.n_channels, 3))
         for i, sensor in enumerate(self.sensors):
@@ -259,9 +259,9 @@ class SensorArray:
         return _read_only(gain)
 
     def linear_gain(self, fields_T: FloatArray) -> FloatArray:
-        """What each channel reads of a small change of the fields (..., N, 3) at the sensors: (..., C, 3) or (C, 3).
+        """Return the gain of each channel for small changes of the fields (..., N, 3): (..., C, 3) or (C, 3).
 
-        A modulus reads what is along its field; NaN where that is zero.
+        A modulus reads changes along its field; NaN in zero field.
         """
         if not self.channel_is_scalar.any():
             return self.channel_gain
@@ -271,22 +271,22 @@ class SensorArray:
         return np.where(self.channel_is_scalar[:, None], of_modulus, self.channel_gain)
 
     def subset(self, ids: Sequence[str]) -> SensorArray:
-        """The array reduced to some of its sensors.
+        """Return the array with some of its sensors.
 
         Parameters
         ----------
         ids : sequence of str
-            Two at least, or one where a common field has a prior, each once, in the order that the sensors get.
+            At least two ids, or one if a common field has a prior; each once, in the new order of the sensors.
 
         Returns
         -------
         SensorArray
-            With everything else as in this array.
+            Array with all other properties of this one.
 
         Raises
         ------
         ValueError
-            An id is unknown, or the remaining sensors are no array.
+            An id is unknown, or the sensors are too few.
         """
         by_id = dict(zip(self.ids, self.sensors, strict=True))
         for name in ids:
@@ -300,9 +300,9 @@ class SensorArray:
         return replace(self, sensors=tuple(by_id[name] for name in ids))
 
     def in_ambient_field(self, ambient_T: ArrayLike) -> SensorArray:
-        """The array in another known ambient field, as every row of a log may have one of its own.
+        """Return the array in another known ambient field, such as that of a row of a log.
 
-        What is known of the sensors is shared, not computed anew.
+        Cached properties of the sensors are shared, not computed again.
 
         Parameters
         ----------
@@ -312,7 +312,7 @@ class SensorArray:
         Returns
         -------
         SensorArray
-            With everything else as in this array.
+            Array with all other properties of this one.
 
         Raises
         ------
@@ -351,7 +351,7 @@ class SensorArray:
         return readings + self.channel_offset_T
 
     def calibrated_field(self, readings: ArrayLike) -> FloatArray:
-        """Fields that the vector sensors saw: calibration undone, rotated to the array's frame.
+        """Return the fields at the vector sensors: calibrated, and rotated to the array's frame.
 
         Parameters
         ----------
@@ -380,7 +380,7 @@ class SensorArray:
 
 
 def _check_distinct_names(array: SensorArray) -> None:
-    """Ids must differ, and so must the channels' names: a scalar sensor a_x and a vector sensor a share a column."""
+    """Refuse equal ids, and equal names of channels, as of a scalar sensor a_x and a vector sensor a."""
     name, count = Counter(array.ids).most_common(1)[0]
     if count > 1:
         raise ValueError(f"Input sensors must have different ids; instead received {name!r} {count} times.")
@@ -396,7 +396,7 @@ def _check_distinct_names(array: SensorArray) -> None:
 
 
 def _gradient_tensor(value: ArrayLike) -> tuple[tuple[float, ...], ...]:
-    """Gradient of a field without sources or currents: its divergence and its curl vanish, to a part in a million."""
+    """Return a gradient tensor; it must be symmetric and traceless to a part in a million."""
     tensor = _finite("ambient_gradient_T_m", value, (3, 3))
     largest = float(np.abs(tensor).max())
     for fault, what in ((np.abs(tensor - tensor.T).max(), "symmetric"), (abs(np.trace(tensor)), "traceless")):

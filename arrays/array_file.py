@@ -74,7 +74,7 @@ from arrays.io.toml import (
     read_toml,
     section_of,
 )
-from arrays.io.units import Number, nanotesla_list, nanotesla_text, scaled, shifted_text, tesla
+from arrays.io.units import Number, nanotesla_text, scaled, shifted_text, tesla
 from arrays.pose import PoseTable, pose_toml
 from arrays.sensor import Calibration, Sensor
 from arrays.typing import Vector
@@ -83,6 +83,8 @@ _DEFAULTS, _TURNS = "defaults", ("rotation_xyzw", "ypr_deg")
 _NOT_TURNED = (0.0, 0.0, 0.0, 1.0)
 _NotNegative = Annotated[Number, NOT_NEGATIVE]
 _NumberVector = tuple[Number, Number, Number]
+_FIELD_KEYS: tuple[str, ...] = ("common_field_nT", "ambient_nT", "ambient_world_nT", "ambient_gradient_nT_m")
+_FIELD_KEYS += ("ambient_uncertainty_nT", "ambient_uncertainty_white_nT")
 
 
 class _Header(File, kw_only=True):
@@ -142,22 +144,22 @@ class _SensorsFile(_Header, kw_only=True):
 
 
 def read_array(path: str | PathLike[str]) -> SensorArray:
-    """Array from its TOML file.
+    """Read an array from its TOML file.
 
     Parameters
     ----------
     path : str or path-like
-        An array file (TOML); it gives lengths in m and fields in nT.
+        Array file (TOML), with lengths in m and fields in nT.
 
     Returns
     -------
     SensorArray
-        A geometry without a name in the file is called after its shape.
+        Array; without a name in the file, a geometry has the name of its shape.
 
     Raises
     ------
     InputError
-        The file cannot be read, or does not describe an array; the text says where and why.
+        The file cannot be read or describes no array; the text states the place and the reason.
 
     Examples
     --------
@@ -173,12 +175,12 @@ def read_array(path: str | PathLike[str]) -> SensorArray:
 
 
 def read_sensors(path: str | PathLike[str]) -> SensorArray:
-    """Array from its TOML file as :func:`read_array`, which may also be a single sensor in any field, to be calibrated.
+    """Read an array as :func:`read_array`, or a single sensor, for a calibration.
 
     Parameters
     ----------
     path : str or path-like
-        An array file (TOML).
+        Array file (TOML).
 
     Examples
     --------
@@ -192,7 +194,7 @@ def read_sensors(path: str | PathLike[str]) -> SensorArray:
 
 
 def array_of_table(place: str, table: dict[str, Any]) -> SensorArray:
-    """Array from the keys of an array file, which another file may hold as a table; `place` is for errors."""
+    """Return an array from the keys of an array file; `place` is for errors."""
     if not table:
         raise InputError(f"{place} is empty, expected an array: a geometry with its size, or [[sensor]] tables.")
     if "geometry" in table and "sensor" in table:
@@ -211,7 +213,7 @@ def write_array(path: str | PathLike[str], array: SensorArray) -> None:
     Parameters
     ----------
     path : path-like
-        Replaced if it exists, in one step: nobody sees half a file.
+        File to write; an existing file is replaced in one step.
     array : SensorArray
 
     Raises
@@ -228,12 +230,12 @@ def write_array(path: str | PathLike[str], array: SensorArray) -> None:
 
 
 def array_toml(array: SensorArray) -> str:
-    """Text of an array's TOML file, sensor by sensor.
+    """Return the text of an array's TOML file, sensor by sensor.
 
     Parameters
     ----------
     array : SensorArray
-        Any; its sensors are written one by one, with their calibration.
+        Array; its sensors are written one by one, with their calibration.
 
     Examples
     --------
@@ -243,26 +245,19 @@ def array_toml(array: SensorArray) -> str:
     """
     lines = [f"format_version = {FORMAT_VERSION}"]
     if array.name:
-        lines.append(f"name = {_quoted(array.name)}")
+        lines.append(f"name = {_toml_string(array.name)}")
     if array.noise_fraction:
         lines.append(f"noise_fraction = {array.noise_fraction!r}")
-    if array.common_field_T is not None:
-        lines.append(f"common_field_nT = {nanotesla_text(array.common_field_T)}")
-    for key in ("ambient_nT", "ambient_world_nT"):
-        if (field_T := getattr(array, in_si(key)[0])) is not None:
-            lines.append(f"{key} = {nanotesla_list(field_T)}")
-    if array.ambient_gradient_T_m is not None:
-        rows = ", ".join(map(nanotesla_list, array.ambient_gradient_T_m))
-        lines.append(f"ambient_gradient_nT_m = [{rows}]")
-    for key in ("ambient_uncertainty_nT", "ambient_uncertainty_white_nT"):
-        if uncertainty_T := getattr(array, in_si(key)[0]):
-            lines.append(f"{key} = {nanotesla_text(uncertainty_T)}")
+    for key in _FIELD_KEYS:
+        name = in_si(key)[0]
+        if getattr(array, name) != SensorArray.__dataclass_fields__[name].default:
+            lines.append(f"{key} = {nanotesla_text(getattr(array, name))}")
     if array.pose is not None:
         lines += pose_toml(array.pose)
     if array.columns is not None:
         lines += columns_toml(array.columns)
     for sensor in array.sensors:
-        lines += ["", "[[sensor]]", f"id = {_quoted(sensor.id)}", f'kind = "{sensor.kind}"']
+        lines += ["", "[[sensor]]", f"id = {_toml_string(sensor.id)}", f'kind = "{sensor.kind}"']
         lines.append(f"position_m = {list(sensor.position_m)}")
         if sensor.rotation_xyzw != _NOT_TURNED:
             lines.append(f"rotation_xyzw = {list(sensor.rotation_xyzw)}")
@@ -275,7 +270,7 @@ def array_toml(array: SensorArray) -> str:
             lines.append(f"noise_fraction = {sensor.noise_fraction!r}")
         if sensor.calibration != Calibration.of(sensor.kind):
             offsets = sensor.calibration.offset_T
-            offset = nanotesla_list(offsets) if sensor.kind == "vector" else nanotesla_text(offsets[0])
+            offset = nanotesla_text(offsets if sensor.kind == "vector" else offsets[0])
             lines += ["[sensor.calibration]", f"scale = {_shortest_scale(sensor.calibration)}"]
             lines.append(f"offset_nT = {offset}")
     return "\n".join(lines) + "\n"
@@ -303,7 +298,7 @@ def _array_of_geometry(path: str, table: dict[str, Any]) -> SensorArray:
 
 
 def _with_defaults(path: str, table: dict[str, Any]) -> dict[str, Any]:
-    """Table of an array with the values of its table defaults in every sensor."""
+    """Return the table of an array, with the values of its table defaults in every sensor."""
     defaults, sensors = table.get(_DEFAULTS), table["sensor"]
     if defaults is None or not isinstance(sensors, list):
         return table
@@ -313,14 +308,14 @@ def _with_defaults(path: str, table: dict[str, Any]) -> dict[str, Any]:
     others = {key: value for key, value in table.items() if key != _DEFAULTS}
     return {
         **others,
-        "sensor": [_merged(defaults, sensor) if isinstance(sensor, dict) else sensor for sensor in sensors],
+        "sensor": [_merge_defaults(defaults, sensor) if isinstance(sensor, dict) else sensor for sensor in sensors],
     }
 
 
-def _merged(defaults: dict[str, Any], sensor: dict[str, Any]) -> dict[str, Any]:
-    """A sensor's own keys, and the defaults of those that it does not have; its own turn replaces either kind."""
-    turned = not sensor.keys().isdisjoint(_TURNS)
-    return {key: value for key, value in defaults.items() if not (turned and key in _TURNS)} | sensor
+def _merge_defaults(defaults: dict[str, Any], sensor: dict[str, Any]) -> dict[str, Any]:
+    """Return a sensor's keys and defaults; its own rotation replaces both kinds of default rotation."""
+    has_rotation = not sensor.keys().isdisjoint(_TURNS)
+    return {key: value for key, value in defaults.items() if not (has_rotation and key in _TURNS)} | sensor
 
 
 def _array_of_sensors(path: str, table: dict[str, Any]) -> SensorArray:
@@ -363,7 +358,7 @@ def _sensor(place: str, table: _SensorTable) -> Sensor:
 
 
 def _rotation(place: str, table: _SensorTable) -> tuple[float, float, float, float]:
-    """Quaternion of a sensor's axes in the array's frame."""
+    """Return the quaternion of a sensor's axes in the array's frame."""
     if table.ypr_deg is None:
         return table.rotation_xyzw or _NOT_TURNED
     if table.rotation_xyzw is not None:
@@ -380,17 +375,7 @@ def _rotation(place: str, table: _SensorTable) -> tuple[float, float, float, flo
 
 
 def _with_header(path: str, array: SensorArray, header: _Header) -> SensorArray:
-    gradient_T_m = None
-    if header.ambient_gradient_nT_m is not None:
-        place = f"{path}, key ambient_gradient_nT_m"
-        gradient_T_m = tuple(_tesla_vector(place, row) for row in header.ambient_gradient_nT_m)
-    of_field: dict[str, Any] = {"ambient_gradient_T_m": gradient_T_m}
-    for key in ("common_field_nT", "ambient_uncertainty_nT", "ambient_uncertainty_white_nT"):
-        value = getattr(header, key)
-        of_field[in_si(key)[0]] = None if value is None else tesla(f"{path}, key {key}", value)
-    for key in ("ambient_nT", "ambient_world_nT"):
-        value = getattr(header, key)
-        of_field[in_si(key)[0]] = None if value is None else _tesla_vector(f"{path}, key {key}", value)
+    of_field = {in_si(key)[0]: _in_tesla(f"{path}, key {key}", getattr(header, key)) for key in _FIELD_KEYS}
     name = array.name if header.name is None else header.name
     pose = None if header.pose is None else header.pose.uncertainty(f"{path}, table pose")
     channels = {of.id: of.channel_names for of in array.sensors}
@@ -400,7 +385,7 @@ def _with_header(path: str, array: SensorArray, header: _Header) -> SensorArray:
 
 
 def _quality(place: str, table: _Quality) -> dict[str, Any]:
-    """How good a sensor is, as arguments of Sensor."""
+    """Return noise and errors of a sensor, as arguments of Sensor."""
     result = {}
     for key in _keys(_Quality):
         name, exponent = in_si(key)
@@ -409,12 +394,15 @@ def _quality(place: str, table: _Quality) -> dict[str, Any]:
     return result
 
 
-def _tesla_vector(place: str, nT: _NumberVector) -> Vector:
-    return (tesla(place, nT[0]), tesla(place, nT[1]), tesla(place, nT[2]))
+def _in_tesla(place: str, nanotesla: Any) -> Any:
+    """Return a field, or a tuple of fields, in T; None stays."""
+    if isinstance(nanotesla, tuple):
+        return tuple(_in_tesla(place, each) for each in nanotesla)
+    return None if nanotesla is None else tesla(place, nanotesla)
 
 
 def _shortest_scale(calibration: Calibration) -> float | list[float] | list[list[float]]:
-    """A number, 3 numbers or the matrix."""
+    """Return the scale as a number, 3 numbers or the matrix."""
     rows = [list(row) for row in calibration.scale]
     diagonal = [row[i] for i, row in enumerate(rows)]
     if any(x for i, row in enumerate(rows) for j, x in enumerate(row) if i != j):
@@ -422,8 +410,8 @@ def _shortest_scale(calibration: Calibration) -> float | list[float] | list[list
     return diagonal[0] if len(set(diagonal)) == 1 else diagonal
 
 
-def _quoted(text: str) -> str:
-    """A TOML string; what JSON escapes TOML escapes alike, and printable text needs nothing else."""
+def _toml_string(text: str) -> str:
+    """Return a TOML string; for printable text the escapes of TOML and JSON agree."""
     return json.dumps(text, ensure_ascii=False)
 
 

@@ -1,7 +1,7 @@
-"""One thread of linear algebra: over matrices as small as ours, BLAS's threads do little but wait for each other.
+"""One thread of linear algebra: on small matrices the threads of BLAS mostly wait for each other.
 
 :func:`guard_public` is applied to all public names of a package where they are loaded
-(:func:`arrays.io.lazy.lazy_names`). Commands say it to BLAS before it loads.
+(:func:`arrays.io.lazy.lazy_names`). Commands set it before BLAS loads.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from threading import Lock, local
 from types import ModuleType
 from typing import Any
 
-import numpy as np  # noqa: F401 - it and scipy.linalg each load a BLAS of their own
+import numpy as np  # noqa: F401 - numpy and scipy.linalg each load their own BLAS
 import scipy.linalg  # noqa: F401
 from threadpoolctl import ThreadpoolController
 
@@ -25,7 +25,7 @@ _guarded: set[object] = set()
 
 
 class _OneThread:
-    """Gives the process one thread of BLAS, and its own number back when the last call in any thread has ended."""
+    """Context of one thread of BLAS; the end of the last call in any thread restores the number."""
 
     def __init__(self) -> None:
         self._lock, self._calls = Lock(), 0
@@ -54,7 +54,7 @@ one_blas_thread = _OneThread()
 
 
 def guard_public(modules: Mapping[str, str]) -> None:
-    """Guard the functions and classes of a table of public names, as far as their modules are loaded."""
+    """Guard the functions and classes of a table of public names whose modules are loaded."""
     for name, where in modules.items():
         module_name, _, of_module = where.partition(":")
         if module_name in sys.modules:
@@ -69,7 +69,7 @@ def guard_public(modules: Mapping[str, str]) -> None:
 def _guard(module: ModuleType, name: str) -> None:
     value = getattr(module, name, None)
     if inspect.isfunction(value):
-        setattr(module, name, _guarded_function(value))
+        setattr(module, name, _guard_function(value))
     elif inspect.isclass(value):
         for one in value.__mro__:
             if one not in _guarded and one.__module__.partition(".")[0] in _PACKAGES:
@@ -78,19 +78,19 @@ def _guard(module: ModuleType, name: str) -> None:
 
 
 def _guard_class(of: type) -> None:
-    """Guard the methods and cached properties of a class; other properties only look things up."""
+    """Guard the methods and cached properties of a class; other properties compute nothing."""
     for name, value in list(vars(of).items()):
         if name.startswith("_") and name not in _SPECIAL:
             continue
         if isinstance(value, cached_property):
-            value.func = _guarded_function(value.func)
+            value.func = _guard_function(value.func)
         elif isinstance(value, classmethod | staticmethod):
-            setattr(of, name, type(value)(_guarded_function(value.__func__)))
+            setattr(of, name, type(value)(_guard_function(value.__func__)))
         elif inspect.isfunction(value):
-            setattr(of, name, _guarded_function(value))
+            setattr(of, name, _guard_function(value))
 
 
-def _guarded_function(function: Callable[..., Any]) -> Callable[..., Any]:
+def _guard_function(function: Callable[..., Any]) -> Callable[..., Any]:
     if function in _guarded or not inspect.isfunction(function):
         return function
 

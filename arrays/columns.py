@@ -1,7 +1,7 @@
-"""How another program names and counts the columns of its logs: the table ``columns`` of an array file.
+"""Columns of logs of other programs: the table ``columns`` of an array file.
 
 The columns of a log become those of a readings file: names, units and times are translated, geodetic places become
-east, north, up of an origin, and yaw, pitch and roll a quaternion. Columns that nothing names are left out.
+east, north, up of an origin, and yaw, pitch and roll a quaternion. Other columns are ignored.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class ValidRows:
     column : str
         Name of a column of numbers.
     equals : tuple of float
-        Its values in rows that count; rows with another one, or with none, have no reading.
+        Values of rows that count; rows with another value, or without one, have no reading.
 
     Examples
     --------
@@ -57,66 +57,66 @@ class ValidRows:
 
 @dataclass(frozen=True, kw_only=True)
 class LogColumns:
-    """Columns of a log that is no readings file.
+    """Columns of a log of another program.
 
     Attributes
     ----------
     separator : str
         "comma", "semicolon", "tab" or "space".
     decimal : str
-        "." or ",", of its numbers.
+        Decimal mark of its numbers, "." or ",".
     time : str or tuple of 2 str
         Name of the column with the time, or with "iso" those of the date and of the time.
     time_unit : str
-        "s", "ms", "us", "iso" for instants such as 2026-11-21T12:00:00.5, UTC where they say nothing else, and times of
-        day such as 09:14:03.5, or "hhmmss" for numbers such as 091403.5.
+        "s", "ms", "us", "iso" for instants such as 2026-11-21T12:00:00.5 (UTC by default) and times of day such as
+        09:14:03.5, or "hhmmss" for numbers such as 091403.5.
     date : str, optional
-        Of the first row, such as 2026-05-12, where the log has times of day alone; without it they count from the
+        Date of the first row, such as 2026-05-12, for a log with times of day only; without it times count from the
         midnight before the first row.
     day_first : bool, optional
-        Whether dates such as 12/05/2026 begin with the day.
+        True if dates such as 12/05/2026 begin with the day.
     unit : str or float
-        Of all sensors: "nT", "uT", "µT", "mT", "T", "mG", "G", or how many nT a count is.
+        Unit of all sensors: "nT", "uT", "µT", "mT", "T", "mG", "G", or the number of nT per count.
     sensors : dict
-        By the sensor's id the name of its column, or the three of a vector sensor. Others have the columns of a
+        Column of each sensor by its id, or three columns for a vector sensor. Other sensors have the columns of a
         readings file.
     position : tuple of 2 or 3 str, optional
-        Columns of the array's place [m], in a world frame whose z points up; two with `height_m`.
+        Columns of the array's position [m], in a world frame whose z points up; two with `height_m`.
     geodetic : tuple of 2 or 3 str, optional
-        In its place: those of latitude, longitude [deg] and, without `height_m`, height [m].
+        In place of `position`: columns of latitude, longitude [deg] and, without `height_m`, height [m].
     crs : str, optional
-        System of coordinates, such as "EPSG:32633": `position` has easting and northing in it, or `geodetic` latitude
-        and longitude. The world is east, north, up of the origin, whatever the grid's convergence and scale.
+        Coordinate system, such as "EPSG:32633", of easting and northing in `position`, or of latitude and longitude in
+        `geodetic`. The world frame is east, north, up of the origin; convergence and scale of the grid are corrected.
     height_m : float, optional
-        Height of all places above the ground, which is at the height of the origin.
+        Constant height above the ground, which is at the height of the origin [m].
     height_is : str
         "ellipsoid", "geoid" (that of the origin is the same), or "ground": heights above ground.
     antenna_m : tuple of 3 floats, optional
-        Place of the receiver's antenna in the array's frame [m].
+        Position of the receiver's antenna in the array's frame [m].
     fix : ValidRows, optional
-        Rows whose places count; by default all. Others, and those without a place, are interpolated.
+        Rows whose positions count; by default all. Other rows, and rows without a position, are interpolated.
     origin : tuple of 3 floats, optional
-        With `geodetic` or `crs`: latitude, longitude [deg] and height [m] of the world's origin, one for all logs.
+        With `geodetic` or `crs`: latitude, longitude [deg] and height [m] of the world's origin, the same for all logs.
     quaternion : tuple of 4 str, optional
         Columns of the attitude, from the array's frame to the world, x, y, z, w.
     angles : tuple of str, optional
-        In its place: yaw, or yaw, pitch and roll [deg], from north, east, down to forward, right, down; the array's own
-        axes are forward, left, up. Without any attitude its axes are those of the world.
+        In place of `quaternion`: columns of yaw, or of yaw, pitch and roll [deg], from north, east, down to forward,
+        right, down. The array's axes are forward, left, up. Without an attitude they are those of the world.
     pose_latency_s : float
-        How much older the pose of a row is than its readings [s].
+        Time by which the pose of a row is older than its readings [s].
     dummy : tuple of float and str
-        Numbers, in the unit of the log, and words that stand where there is no reading.
+        Numbers, in the unit of the log, and words that mark a missing reading.
     valid : ValidRows, optional
         Rows whose readings count; by default all.
     comment, skip : tuple of str
-        How rows begin that are left out: remarks, and names of lines flown.
+        Beginnings of rows to ignore: comments, and names of survey lines.
     encoding : str, optional
-        Of the text, such as "windows-1252"; without it UTF-8, or UTF-16 with a byte order mark.
+        Encoding of the text, such as "windows-1252"; by default UTF-8, or UTF-16 with a byte order mark.
 
     Raises
     ------
     ValueError
-        A value is none of those above, or two do not fit each other.
+        A value is invalid, or two values contradict each other.
 
     Examples
     --------
@@ -220,7 +220,7 @@ class LogColumns:
 
     @property
     def place(self) -> tuple[str, ...]:
-        """Columns of the array's place."""
+        """Columns of the array's position."""
         return self.position or self.geodetic or ()
 
     @property
@@ -230,16 +230,16 @@ class LogColumns:
 
     @property
     def above_ground(self) -> bool:
-        """Whether heights are above the ground."""
+        """True if heights count from the ground."""
         return self.height_m is not None or self.height_is == "ground"
 
     @property
     def attitude(self) -> tuple[str, ...]:
-        """Columns of its attitude."""
+        """Columns of the array's attitude."""
         return self.quaternion or self.angles or ()
 
     def of_sensors(self, channels: Mapping[str, Sequence[str]]) -> dict[str, str]:
-        """By the names of a readings file those of the log; sensors that are not among ``channels`` are left out."""
+        """Return the columns of the log by those of a readings file, for the sensors in ``channels``."""
         named: dict[str, str] = {}
         for sensor, ours in channels.items():
             of_sensor = self.sensors.get(sensor, ())
@@ -287,7 +287,7 @@ class ColumnsTable(Table, kw_only=True):
     encoding: str | None = None
 
     def columns(self, path: str, channels: Mapping[str, Sequence[str]]) -> LogColumns:
-        """What the table of the array file `path` says, whose sensors have these channels."""
+        """Return the columns that the table in the array file `path` describes."""
         said = {key: _frozen(value) for key, value in msgspec.structs.asdict(self).items()}
         sensors: dict[str, str | tuple[str, ...]] = {name: _frozen(of) for name, of in self.sensors.items()}
         said |= {"sensors": sensors}
@@ -312,7 +312,7 @@ def _frozen(value: Any) -> Any:
 
 
 def columns_toml(columns: LogColumns) -> list[str]:
-    """Lines of the table of an array file."""
+    """Return the lines of the table in an array file."""
     said = {each.name: getattr(columns, each.name) for each in fields(columns) if each.name != "sensors"}
     lines = ["", "[columns]", *(f"{key} = {_toml(value)}" for key, value in said.items() if value is not None)]
     if columns.sensors:

@@ -145,14 +145,14 @@ def _groups(array: SensorArray, mask: BoolArray) -> list[NDArray[np.intp]]:
 
 
 def _common_field(array: SensorArray, group: NDArray[np.intp], gain: FloatArray) -> FloatArray:
-    """How the common field enters the channels of one kind: (..., channels, 3), or (..., channels, 1) for moduli."""
+    """Return the gain of channels of one kind for the common field, (..., n, 3) or (..., n, 1)."""
     return gain[..., group, :1] if array.channel_is_scalar[group[0]] else gain[..., group, :]
 
 
 def _closed_form(
     array: SensorArray, group: NDArray[np.intp], mask: BoolArray, covariance_T2: FloatArray, base: int
 ) -> tuple[FloatArray, FloatArray] | None:
-    """The paper's form where it holds: complete sensors whose calibrated noise is the same along every axis."""
+    """Return the form of the paper, for complete sensors with equal calibrated noise on all axes."""
     width = 1 if array.channel_is_scalar[group[0]] else 3
     sensors = np.unique(array.channel_sensor[group])
     if group.size != width * sensors.size or sensors.size < 2:
@@ -179,7 +179,7 @@ def _closed_form(
 def _numerical_form(
     array: SensorArray, group: NDArray[np.intp], covariance_T2: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Combinations of channels that are free of the common field, decorrelated by their eigenvectors."""
+    """Return combinations of channels without the common field, decorrelated by eigenvectors."""
     common = _common_field(array, group, array.channel_gain)
     root = np.linalg.cholesky(covariance_T2[np.ix_(group, group)])
     if array.common_field_T is not None:

@@ -1,4 +1,4 @@
-"""Arrays of equal sensors in the shapes that are in use.
+"""Arrays of equal sensors in common shapes.
 
 All are centred on the origin of the array's frame, with the sensors' axes along the frame's and ids s1, s2, …
 Each takes one size, under the name that an array file gives it. The last sensor is the base of the paper's differences.
@@ -224,7 +224,7 @@ def _array(name: str, positions: FloatArray, kind: SensorKind, noise_T: float) -
 
 
 def _ring(n: int, radius: float) -> FloatArray:
-    """Points on a circle in the x-y plane, counter-clockwise from +x."""
+    """Return points on a circle in the x-y plane, counter-clockwise from +x."""
     angle = 2.0 * np.pi / n * np.arange(n)
     return radius * np.stack([np.cos(angle), np.sin(angle), np.zeros(n)], axis=1)
 

@@ -1,4 +1,4 @@
-"""Covariance of readings: noise that grows with the field, errors of calibration, and what the field induces."""
+"""Covariance of readings: noise, noise proportional to the field, calibration, induced fields."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ _REGULAR_RTOL = 1e-13
 
 
 def proportional_noise(array: SensorArray, readings_T: FloatArray) -> FloatArray:
-    """Noise of every channel when a part of it is proportional to the field.
+    """Return the noise of every channel, with its part proportional to the field.
 
     ``σ² = noise² + (noise_fraction · |B|)²`` with |B| the modulus of the calibrated reading minus the array's mean
     (vector sensors; of a sensor alone the whole of it), or the deviation of the modulus from the mean modulus (scalar
     sensors). The noise is in the readings' units, so |B| is multiplied by the channel's gain.
 
     ``readings_T`` (..., C): raw readings [T], NaN where missing. Returns (..., C): standard deviations [T], in the
-    units of the readings. Of a sensor whose reading is incomplete the known axes stand for the missing ones, and
-    the largest |B| of a complete sensor is the least it is given.
+    units of the readings. In an incomplete reading the known axes replace the missing ones, and |B| is at least the
+    largest of all complete sensors.
     """
     readings_T = np.asarray(readings_T, dtype=np.float64)
     noise = np.broadcast_to(array.channel_noise_T, readings_T.shape)
@@ -40,27 +40,27 @@ def proportional_noise(array: SensorArray, readings_T: FloatArray) -> FloatArray
 
 
 def reading_covariance(array: SensorArray, readings_T: FloatArray) -> FloatArray:
-    r"""Covariance of the readings' errors: noise, proportional noise, calibration, and what the field induces.
+    r"""Return the covariance of the readings' errors.
 
     A vector sensor of scale S in the field b, in its own axes, that is turned by a small unknown rotation θ and has
     relative errors g of its gains reads :math:`S (b + θ × b + g ∘ b)`. Its block is
 
     .. math:: diag(σ²) + S (σ_θ² (|b|² I - b b^T) + σ_g² diag(b²) + σ_i² |b|²) S^T
 
-    with σ of :func:`proportional_noise`; the error of an angle stands at right angles to the field, what the field
-    induces in the carrier along any axis (σ_i, `induced_uncertainty`). That of a scalar sensor is
-    :math:`σ² + (σ_g² + σ_i²) (reading - offset)²`. Rotations, gains and carrier are constant, so that the errors of one
-    sensor's rows are not independent of each other: this is their covariance within one row.
+    with σ of :func:`proportional_noise`. An error of an angle is perpendicular to the field; the field that is induced
+    in the carrier has any direction (σ_i, `induced_uncertainty`). That of a scalar sensor is :math:`σ² + (σ_g² + σ_i²)
+    (reading - offset)²`. Rotations, gains and carrier are constant, so the errors of different rows are correlated;
+    this is the covariance within one row.
 
-    ``readings_T`` (..., C): raw readings of the whole field [T], NaN where missing. For a missing axis of b stands
-    the known ambient field, else the mean of the other sensors' fields, else zero. Returns (..., C, C):
+    ``readings_T`` (..., C): raw readings of the whole field [T], NaN where missing. The known ambient field
+    replaces a missing axis of b, else the mean of the other sensors' fields, else zero. Returns (..., C, C):
     block-diagonal by sensor, in the units of the readings [T²]. Entries of missing channels are finite.
     """
     return block_diagonal(array.sensor_channels, covariance_blocks(array, readings_T))
 
 
 def reading_errors(array: SensorArray, readings_T: FloatArray, normal: FloatArray) -> FloatArray:
-    """Errors (..., C) [T] of the covariance of :func:`reading_covariance`, from standard normal numbers (..., C)."""
+    """Return errors (..., C) [T] with this covariance from standard normal numbers (..., C)."""
     if not array.noise_depends_on_reading:
         return array.channel_noise_T * normal
     used = array.sensor_channels >= 0
@@ -71,7 +71,7 @@ def reading_errors(array: SensorArray, readings_T: FloatArray, normal: FloatArra
 
 
 def covariance_blocks(array: SensorArray, readings_T: FloatArray) -> FloatArray:
-    """Blocks of :func:`reading_covariance`, (..., N, 3, 3) [T²], with unit variances in the slots that are not used."""
+    """Return the blocks of :func:`reading_covariance` (..., N, 3, 3) [T²]; unused slots have unit variance."""
     readings_T = np.asarray(readings_T, dtype=np.float64)
     channel, used = array.sensor_channels, array.sensor_channels >= 0
     variance = np.where(used, proportional_noise(array, readings_T)[..., channel] ** 2, 1.0)
@@ -94,10 +94,10 @@ def covariance_blocks(array: SensorArray, readings_T: FloatArray) -> FloatArray:
 
 
 def calibration_errors(array: SensorArray, readings_T: FloatArray) -> FloatArray:
-    """Derivatives of readings (..., C) with respect to small turns θ and gains g of a calibration: (..., N, 3, 6).
+    """Return the derivatives (..., N, 3, 6) of readings by small rotations θ and gains g of a calibration.
 
-    By sensor, its three axes, and (θ, g): ``S (θ × b + g ∘ b)`` [T]. A scalar sensor has its first axis only. For what
-    stands for missing readings see :func:`reading_covariance`.
+    By sensor, axis, and (θ, g): ``S (θ × b + g ∘ b)`` [T]. A scalar sensor has its first axis only. Missing readings
+    are replaced as in :func:`reading_covariance`.
     """
     readings_T, scale = np.asarray(readings_T, dtype=np.float64), _scales(array)
     b = _fields_in_sensor_axes(array, readings_T, scale)
@@ -106,7 +106,7 @@ def calibration_errors(array: SensorArray, readings_T: FloatArray) -> FloatArray
 
 
 def _scales(array: SensorArray) -> FloatArray:
-    """Scales of the sensors' calibrations (N, 3, 3), those of scalar sensors in their first axis."""
+    """Return the scales of the sensors (N, 3, 3), of scalar sensors in their first axis."""
     scale = np.tile(np.eye(3), (array.n_sensors, 1, 1))
     for i, sensor in enumerate(array.sensors):
         scale[i, : sensor.n_channels, : sensor.n_channels] = sensor.calibration.scale
@@ -114,7 +114,7 @@ def _scales(array: SensorArray) -> FloatArray:
 
 
 def _fields_in_sensor_axes(array: SensorArray, readings_T: FloatArray, scale: FloatArray) -> FloatArray:
-    """Field that each sensor saw, in its own axes, complete: (..., N, 3) [T]; (modulus, 0, 0) of a scalar sensor."""
+    """Return the field at each sensor in its own axes, complete, (..., N, 3) [T]."""
     channel, used = array.sensor_channels, array.sensor_channels >= 0
     response = np.where(used, (readings_T - array.channel_offset_T)[..., channel], 0.0)
     missing = np.isnan(response)
@@ -131,7 +131,7 @@ def _fields_in_sensor_axes(array: SensorArray, readings_T: FloatArray, scale: Fl
 def _deviations(array: SensorArray, readings_T: FloatArray) -> FloatArray:
     """Modulus of every sensor's field minus the array's mean: (..., N) [T]."""
     fields = array.calibrated_field(readings_T)
-    # The mean stands for the common field. With one sensor there is none but the prior's, which is zero.
+    # The mean estimates the common field; a single sensor has only its prior, zero.
     mean = mean_of_finite(fields, axis=-2) if array.n_sensors > 1 else np.zeros((*fields.shape[:-2], 1, 3))
     deviation: FloatArray = np.linalg.norm(fields - mean, axis=-1)
     missing = np.isnan(deviation)
@@ -148,23 +148,23 @@ def _deviations(array: SensorArray, readings_T: FloatArray) -> FloatArray:
 
 
 def mean_of_finite(values: FloatArray, axis: int) -> FloatArray:
-    """Mean along an axis, which stays, of what is no NaN; zero of nothing."""
+    """Return the mean of finite values along an axis, which is kept; 0 if there are none."""
     finite = np.isfinite(values)
     count = np.maximum(finite.sum(axis=axis, keepdims=True), 1)
     return np.where(finite, values, 0.0).sum(axis=axis, keepdims=True) / count
 
 
 def block_diagonal(channels: IntArray, blocks: FloatArray) -> FloatArray:
-    """Matrices (..., C, C) of the sensors' blocks (..., N, 3, 3), whose axes are channels (N, 3) or none, negative."""
+    """Return matrices (..., C, C) from blocks (..., N, 3, 3) of channels (N, 3), negative for none."""
     n = int(channels.max()) + 1
-    slot = np.where(channels >= 0, channels, n)  # the others end in a row and a column that are cut off
+    slot = np.where(channels >= 0, channels, n)  # other slots go to a last row and column, which are removed
     matrix = np.zeros((*blocks.shape[:-3], n + 1, n + 1))
     matrix[..., slot[:, :, None], slot[:, None, :]] = blocks
     return matrix[..., :n, :n]
 
 
 def in_slots(used: BoolArray, channels: FloatArray) -> FloatArray:
-    """Channels (..., C) by sensor and axis (..., N, 3), zero for the axes that a scalar sensor has none of."""
+    """Return channels (..., C) by sensor and axis (..., N, 3); 0 for missing axes of scalar sensors."""
     if used.all():
         return channels.reshape(*channels.shape[:-1], *used.shape)
     slots = np.zeros((*channels.shape[:-1], *used.shape))

@@ -1,4 +1,4 @@
-"""How wrong the pose of an array that moves may be: what its user states, and the table of it in an array file."""
+"""Errors of the pose of a moving array, and their table in an array file."""
 
 from __future__ import annotations
 
@@ -21,27 +21,27 @@ _BELOW_30 = Rule(lambda value: 0.0 <= value < 30.0, "a number from 0 to below 30
 class PoseUncertainty:
     """Standard deviations of the errors of an array's pose, along or about each axis.
 
-    The true attitude is that of the readings, turned by a small vector in the array's axes; it turns about the pose's
-    reference point. The true place is that of the readings, moved along the axes of the world. Where the clocks differ
-    the pose is that of another time.
+    The true attitude is that of the readings, rotated by a small vector in the array's axes about the reference point
+    of the pose. The true position is that of the readings, moved along the axes of the world. Different clocks make the
+    pose that of another time.
 
     Attributes
     ----------
     position_m, attitude_rad, time_s : float
-        Of errors that change from row to row.
+        Standard deviations of errors that vary between rows.
     correlation_s : float
-        How long these last: first-order Markov processes of that time. 0: they are new in every row.
+        Correlation time of these errors, first-order Markov processes [s]. 0: new errors in every row.
     position_white_m : float
-        Of an error of the position beside that, new in every row.
+        Standard deviation of an additional error of the position, new in every row.
     position_constant_m : float
-        Of an error of the lever arm, constant in the array's axes.
+        Standard deviation of an error of the lever arm, constant in the array's axes.
     attitude_constant_rad : float
-        Of a constant turn between the array and what its pose is that of: its mounting.
+        Standard deviation of a constant rotation of the array in its mounting.
     time_constant_s : float
-        Of a constant difference of the clocks.
+        Standard deviation of a constant difference of the clocks.
     lever_arm_m : tuple of 3 floats
-        From the pose's reference point to the origin of the array, in the array's axes: what an error of the attitude
-        moves the sensors about. The pose in the readings is that of the origin.
+        Vector from the reference point of the pose to the origin of the array, in the array's axes; errors of the
+        attitude rotate about the reference point. The pose in the readings is that of the origin.
 
     Raises
     ------
@@ -78,24 +78,24 @@ class PoseUncertainty:
 
 
 _SIGMAS = tuple(name for name in PoseUncertainty.__dataclass_fields__ if name != "lever_arm_m")
-_NOT_SAID = PoseUncertainty()
+_DEFAULT = PoseUncertainty()
 
 
 class PoseTable(Table, kw_only=True):
-    """The table ``pose`` of an array file; constants that it leaves out are those of an ordinary mounting."""
+    """The table ``pose`` of an array file; the default constants are those of an ordinary mounting."""
 
     position_m: NotNegative = 0.0
     attitude_deg: Annotated[float, _BELOW_30] = 0.0
     time_s: NotNegative = 0.0
     correlation_s: NotNegative = 0.0
-    position_constant_m: NotNegative = _NOT_SAID.position_constant_m
+    position_constant_m: NotNegative = _DEFAULT.position_constant_m
     attitude_constant_deg: Annotated[float, _BELOW_30] = 0.5
     time_constant_s: NotNegative = 0.0
-    lever_arm_m: Vector = _NOT_SAID.lever_arm_m
+    lever_arm_m: Vector = _DEFAULT.lever_arm_m
     position_white_m: NotNegative = 0.0
 
     def uncertainty(self, place: str) -> PoseUncertainty:
-        """What the table states; `place` is for errors."""
+        """Return the errors that the table states; `place` is for errors."""
         values = msgspec.structs.asdict(self)
         for key in ("attitude", "attitude_constant"):
             values[f"{key}_rad"] = math.radians(values.pop(f"{key}_deg"))
@@ -104,7 +104,7 @@ class PoseTable(Table, kw_only=True):
 
 
 def pose_toml(pose: PoseUncertainty) -> list[str]:
-    """Lines of the table of an array file, all of its keys."""
+    """Return the lines of the table in an array file, with all keys."""
     lines = ["", "[pose]"]
     for key in PoseTable.__struct_fields__:
         value = getattr(pose, key.replace("_deg", "_rad"))
@@ -115,7 +115,7 @@ def pose_toml(pose: PoseUncertainty) -> list[str]:
 
 
 def _degrees(angle_rad: float) -> float:
-    """An angle in degrees that is read as it was."""
+    """Return an angle in degrees that converts back exactly."""
     angle = math.degrees(angle_rad)
     near = (float(f"{angle:.12g}"), angle, math.nextafter(angle, math.inf), math.nextafter(angle, 0.0))
     return next((value for value in near if math.radians(value) == angle_rad), angle)

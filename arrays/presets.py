@@ -1,4 +1,4 @@
-"""Magnetometers that can be bought, with the figures of their makers.
+"""Commercial magnetometers, with the figures of their data sheets.
 
 Only figures that were checked against the document that is named stand here; what could not be checked is left out, and
 has to be given by whoever makes an array of such a sensor. They stand in ``presets.toml``.
@@ -18,13 +18,13 @@ from arrays.sensor import SensorKind
 
 @dataclass(frozen=True)
 class SensorPreset:
-    """What is known of a kind of sensor.
+    """Data of a kind of sensor.
 
     Attributes
     ----------
     kind : {"vector", "scalar"}
     source : str
-        Where the figures stand.
+        Source of the figures.
     noise_nT : float, optional
         Standard deviation of one reading, per axis [nT].
     noise_nT_rtHz : float, optional
@@ -47,7 +47,7 @@ class SensorPreset:
     saturation_nT: float | None = None
 
     def noise_of_reading_nT(self, rate_Hz: float) -> float | None:
-        """Noise of one reading [nT] at a rate, white up to half of it; None where no figure is known."""
+        """Return the noise of one reading [nT] at a rate, white up to half of it; None if unknown."""
         if self.noise_nT is not None or self.noise_nT_rtHz is None:
             return self.noise_nT
         return float(f"{self.noise_nT_rtHz * math.sqrt(0.5 * rate_Hz):.3g}")
@@ -59,4 +59,4 @@ SENSOR_PRESETS: Mapping[str, SensorPreset] = MappingProxyType(
         for name, table in tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")).items()
     }
 )
-"""Sensors by the name that ``magloc new-array --sensor`` takes."""
+"""Sensors by their names for ``magloc new-array --sensor``."""

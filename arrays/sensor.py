@@ -1,6 +1,6 @@
-"""Sensors and arrays of them: where they stand, how they are turned, how noisy they are and how they are calibrated.
+"""Sensors: position, rotation, noise and calibration.
 
-Everything here is immutable, validated when it is made, and compares, hashes and pickles by value. Positions, rotations
+All classes are immutable, validate their values, and compare, hash and pickle by value. Positions, rotations
 and fields refer to the array's own frame; all quantities are SI.
 """
 
@@ -18,7 +18,7 @@ from arrays.typing import FloatArray
 
 SensorKind = Literal["vector", "scalar"]
 FLICKER_DECADES = 3
-"""Decades of frequency that 1/f noise is counted in: above them white noise is stronger, below them drift."""
+"""Decades of frequency of 1/f noise: above them white noise is stronger, below them drift."""
 _SINGULAR_RTOL = 1e-12
 _UNIT_QUATERNION_ATOL = 1e-6
 
@@ -65,7 +65,7 @@ class Calibration:
 
     @classmethod
     def of(cls, kind: SensorKind, scale: ArrayLike = 1.0, offset_T: ArrayLike = 0.0) -> Calibration:
-        """Calibration of a kind of sensor, from short forms; by default the identity.
+        """Return the calibration of a kind of sensor, from short forms; by default the identity.
 
         Parameters
         ----------
@@ -97,40 +97,39 @@ class Sensor:
     Attributes
     ----------
     id : str
-        Names the columns of its readings.
+        Name in the columns of its readings.
     kind : {"vector", "scalar"}
-        Whether it reads the three components of the field, or its modulus.
+        Reading of three components of the field, or of its modulus.
     position_m : tuple, shape (3,)
-        In the array's frame [m].
+        Position in the array's frame [m].
     noise_T : float
-        Standard deviation of a reading, per channel and sample, in the reading's units before calibration is undone
-        [T].
+        Standard deviation of a reading, per channel and sample, in the units of the raw reading [T].
     rotation_xyzw : tuple, shape (4,)
         Unit quaternion from the sensor's axes to the array's frame.
     calibration : Calibration
-        None stands for the identity.
+        Response of the sensor; None for the identity.
     saturation_T : float, optional
-        A reading whose modulus reaches it is no measurement, in the reading's units [T]. None: the sensor never
-        saturates.
+        Modulus at which the sensor saturates, in the units of the raw reading [T]; such readings are ignored. None: no
+        limit.
     misalignment_rad : float
         Standard deviation, per axis, of a small constant rotation of the sensor's axes that the calibration does not
-        know [rad]; 0 for a scalar sensor, which has no axes.
+        include [rad]; 0 for a scalar sensor, which has no axes.
     gain_uncertainty : float
         Standard deviation of the relative error of the gain, independent per axis.
     offset_uncertainty_T : float
-        Standard deviation, per axis, of an unknown field at the sensor that is fixed to the array, such as that of what
-        carries it; for a vector sensor the same as an error of its offsets [T].
+        Standard deviation, per axis, of an unknown field at the sensor that turns with the array, such as that of the
+        carrier; for a vector sensor it is the same as an error of its offsets [T].
     flicker_T : float
-        Standard deviation of what 1/f noise adds in every decade of frequency, per channel [T].
+        Standard deviation of 1/f noise in every decade of frequency, per channel [T].
     drift_T_rth : float
-        Random walk of the offset, per channel: its standard deviation after an hour [T/√h].
+        Random walk of the offset, per channel: standard deviation after one hour [T/√h].
     noise_fraction : float, optional
         Noise proportional to the field, in place of the array's: variance = noise² + (fraction · |B|)².
     induced_uncertainty : float
-        Standard deviation of every component of what the ambient field induces in the carrier, as seen at the sensor in
-        the array's axes, over that field.
+        Standard deviation of every component of the field that the ambient field induces in the carrier, at the sensor
+        in the array's axes, over the ambient field.
     eddy_uncertainty_s : float
-        The same of eddy currents: over the derivative of the ambient field in the array's axes [s].
+        The same for eddy currents, over the derivative of the ambient field in the array's axes [s].
 
     Raises
     ------
@@ -202,12 +201,12 @@ class Sensor:
 
     @property
     def row_noise_T(self) -> float:
-        """Standard deviation of a channel in one row by itself: noise, 1/f noise and error of the offset [T]."""
+        """Standard deviation of a channel in a single row: noise, 1/f noise and error of the offset [T]."""
         return math.hypot(self.noise_T, self.offset_uncertainty_T, math.sqrt(FLICKER_DECADES) * self.flicker_T)
 
     @property
     def n_channels(self) -> int:
-        """Numbers in one reading: 3 of a vector sensor, 1 of a scalar one."""
+        """Number of channels: 3 for a vector sensor, 1 for a scalar sensor."""
         return _n_channels(self.kind)
 
     @property
@@ -240,7 +239,7 @@ def _unit_quaternion(value: ArrayLike) -> tuple[float, ...]:
         raise ValueError(
             f"Input rotation_xyzw must be a quaternion of norm 1; instead received {_plain(value)} of norm {norm:.6g}."
         )
-    # One that is normalised already keeps its last digits, or it would change whenever it is copied.
+    # A normalised quaternion keeps its last digits, so that copies stay equal.
     unit = quaternion if abs(norm - 1.0) <= 4 * np.finfo(np.float64).eps else quaternion / norm
     return tuple(unit.tolist())
 
@@ -277,5 +276,5 @@ def _not_negative(name: str, value: float) -> float:
 
 
 def _plain(value: object) -> object:
-    """A value as Python writes it, without numpy's own forms."""
+    """Return a value without NumPy types, for error messages."""
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else value

@@ -1,4 +1,4 @@
-"""Decorrelation of differences: the common field taken out, the rest at unit variance."""
+"""Whitening of readings: the common field projected out, unit variance for the rest."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from arrays.typing import BoolArray, FloatArray, IntArray
 
 @dataclass(frozen=True, eq=False)
 class Whitening:
-    """The differences' likelihood as a projection: ``w = e - Q (g ∘ Qᵀ e)``, ``e = L⁻¹ y``, noise covariance ``L Lᵀ``.
+    """Likelihood of the differences as a projection ``w = e - Q (g ∘ Qᵀ e)`` of ``e = L⁻¹ y``.
 
-    ``wᵀ w`` equals the χ² of :class:`Differences`, for the same readings. Of many rows, one for every row along leading
-    axes.
+    The noise has the covariance ``L Lᵀ``. ``wᵀ w`` equals the χ² of :class:`Differences` for the same readings. Leading
+    axes are rows.
 
     Attributes
     ----------
     roots : ndarray, shape (..., N, 3, 3)
-        ``L⁻¹`` [1/T] of every sensor, lower triangular: 1/σ where the channels' noise is independent. Rows and columns
-        of missing channels are zero; a sensor's other channels keep the covariance that they have without them.
+        ``L⁻¹`` [1/T] of every sensor, lower triangular: 1/σ for independent noise. Rows and columns of missing channels
+        are zero; the other channels of the sensor keep their marginal covariance.
     gain : ndarray, shape (..., C, 3)
-        Of every channel in units of the noise: ``L⁻¹`` times the array's [1/T].
+        Gain of every channel in units of the noise: ``L⁻¹`` times that of the array [1/T].
     basis : ndarray, shape (..., C, q)
         Orthonormal basis of the common field in channels of unit noise.
     shrinkage : ndarray, shape (..., q)
-        1 where the common field is unknown, less where a prior bounds it.
+        1 for an unknown common field, less with a prior.
     n_differences : int
         Number of independent scalars in w.
     channels : ndarray of int, shape (N, 3)
-        Which the roots' rows are; negative where a scalar sensor has none.
+        Channels of the rows of the roots; negative for missing axes of a scalar sensor.
     """
 
     roots: FloatArray
@@ -51,13 +51,13 @@ class Whitening:
 
     @cached_property
     def per_noise(self) -> FloatArray | None:
-        """1/σ of every channel (C,) [1/T], 0 of a missing one, where all rows have one noise without correlation."""
+        """1/σ of every channel (C,) [1/T], 0 if missing; None for correlated or varying noise."""
         if self.roots.ndim > 3 or (self.roots * (1.0 - np.eye(3))).any():
             return None
         return np.einsum("nii->ni", self.roots)[self.channels >= 0]
 
     def of_unit_noise(self, channels: FloatArray) -> FloatArray:
-        """Channels (..., C) [T] of every row in units of the noise, their common field included."""
+        """Return channels (..., C) [T] in units of the noise, including the common field."""
         if self.per_noise is not None:
             return channels * self.per_noise
         used = self.channels >= 0
@@ -65,7 +65,7 @@ class Whitening:
         return of_sensors[..., used]
 
     def apply(self, channels: FloatArray) -> FloatArray:
-        """Whitened channels (..., C) of readings without offset, predictions or columns of a Jacobian [T], of one row.
+        """Return whitened channels (..., C) of readings without offset or of Jacobian columns [T].
 
         Residuals have unit variance once the common field is projected out. Missing entries must be finite; they do not
         count.
@@ -77,7 +77,7 @@ class Whitening:
 def whitening(
     array: SensorArray, available: BoolArray | None = None, *, covariance_T2: FloatArray | None = None
 ) -> Whitening:
-    """The projection form of :func:`decorrelated_differences`, with the same parameters.
+    """Return the projection form of :func:`decorrelated_differences`, with the same parameters.
 
     With channels ``y = U c + n``, n of covariance ``L Lᵀ`` and c the common field of prior variance λ:
     ``L⁻¹ U = Q diag(s) Vᵀ`` gives the shrinkage ``1 - 1/√(1 + s² λ)``, which is 1 for an unknown field.
@@ -88,22 +88,22 @@ def whitening(
     return whitenings(array, mask, _blocks(array, covariance))
 
 
-@lru_cache(maxsize=16)  # readings that come one by one miss the same channels
+@lru_cache(maxsize=16)  # readings of a stream often miss the same channels
 def _of_constant_noise(array: SensorArray, available: bytes) -> Whitening:
-    """Whitening of the channels of a mask, with the noise that the array states."""
+    """Return the whitening of the channels of a mask, with the noise that the array states."""
     mask, covariance = _channels(array, np.frombuffer(available, dtype=np.bool_), None)
     return whitenings(array, mask, _blocks(array, covariance))
 
 
 def _blocks(array: SensorArray, covariance_T2: FloatArray) -> FloatArray:
-    """Blocks (N, 3, 3) of a covariance (C, C) that is block-diagonal by sensor; what a scalar has none of is unity."""
+    """Return the blocks (N, 3, 3) of a covariance (C, C); unused slots have unit variance."""
     channel, used = array.sensor_channels, array.sensor_channels >= 0
     both = used[:, :, None] & used[:, None, :]
     return np.where(both, covariance_T2[channel[:, :, None], channel[:, None, :]], np.eye(3))
 
 
 def whitenings(array: SensorArray, available: BoolArray, blocks_T2: FloatArray) -> Whitening:
-    """:func:`whitening` of the sensors' covariances (..., N, 3, 3) [T²], for rows that have the same readings."""
+    """Return the whitening of covariances (..., N, 3, 3) [T²], for rows with the same channels."""
     n, used = array.n_channels, array.sensor_channels >= 0
     roots = _inverse_roots(blocks_T2, used & available[array.sensor_channels])
     of_sensors = in_slots(used, array.channel_gain.T).transpose(1, 2, 0)
@@ -126,7 +126,7 @@ def whitenings(array: SensorArray, available: BoolArray, blocks_T2: FloatArray) 
 
 
 def _inverse_roots(covariance: FloatArray, present: BoolArray) -> FloatArray:
-    """``L⁻¹`` of the sensors' ``L Lᵀ`` (..., N, 3, 3) among the axes that have a reading, zero elsewhere."""
+    """Return ``L⁻¹`` of covariances ``L Lᵀ`` (..., N, 3, 3) on axes with a reading, 0 elsewhere."""
     blocks = np.where(present[:, :, None] & present[:, None, :], covariance, np.eye(3))
     inverse = np.zeros_like(blocks)
     with np.errstate(invalid="ignore", divide="ignore"):

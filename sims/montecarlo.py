@@ -1,4 +1,4 @@
-"""Many realisations of a scenario, and what an estimator makes of each."""
+"""Monte-Carlo runs: many realisations of a scenario, and an estimator for each."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from sims.magnetics.simulation import Simulation
 from sims.scenarios import simulate
 
 Estimator = Callable[[Any, Any], Any]
-"""Of an array and its readings, or of a log and its satellite."""
+"""Function of an array and its readings, or of a log and its satellite."""
 Judge = Callable[[Any, Any], Mapping[str, Any]]
-"""Of a simulation and what the estimator makes of its readings."""
+"""Function of a simulation and the result of the estimator."""
 _RESERVED = ("seed", "error")
 _Outcome = dict[str, FloatArray] | str
 _Work = Callable[[int], _Outcome]
@@ -42,26 +42,26 @@ def run_many(
     processes: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> xr.Dataset:
-    """What an estimator makes of a scenario, seed by seed.
+    """Run an estimator on many realisations of a scenario.
 
     An interruption (KeyboardInterrupt, or any exception of ``progress``) stops the other processes and is raised.
 
     Parameters
     ----------
     scenario : MagneticScenario or AttitudeScenario
-        Of :func:`sims.read_scenario`, or made in Python.
+        Scenario from :func:`sims.read_scenario`, or made in Python.
     estimator : callable
-        Takes an array and its readings, or a :class:`adcs.Telemetry` and its :class:`adcs.Satellite`. What it returns
-        is kept as ``judge`` says.
+        Takes an array and its readings, or a :class:`adcs.Telemetry` and its :class:`adcs.Satellite`. ``judge`` selects
+        what is kept of its result.
     seeds : sequence of int
-        Each once.
+        Seeds, each once.
     judge : callable, optional
         Takes the simulation and what the estimator returned, and gives a mapping of names to numbers, or to arrays of
         numbers of the same shape for all seeds. By default a mapping is kept as it is, of an attitude the angle from
         the truth (``error_deg``), and of all else the numbers of ``result.consistency(truth)``, such as ``nees``.
     processes : int, optional
-        By default as many as there are processors, but no more than seeds, and one for what cannot be pickled, such as
-        a lambda. The result does not depend on it. One runs in the calling process.
+        Number of processes; by default that of the processors, at most that of the seeds, and 1 for an estimator that
+        cannot be pickled, such as a lambda. The result does not depend on it. 1 runs in the calling process.
     progress : callable, optional
         Called with 1 after every seed.
 
@@ -136,7 +136,7 @@ def _in_parallel(work: _Work, seeds: Sequence[int], processes: int) -> Generator
 
 
 def against_truth(simulation: Simulation | AttitudeRuns, result: Any) -> Mapping[str, Any]:
-    """What is kept of a result unless something else is asked for."""
+    """Return the default numbers of a result."""
     if isinstance(result, Mapping):
         return result
     if isinstance(simulation, AttitudeRuns):
@@ -148,7 +148,7 @@ def against_truth(simulation: Simulation | AttitudeRuns, result: Any) -> Mapping
 
 
 def _one(scenario: MagneticScenario | AttitudeScenario, estimator: Estimator, judge: Judge, seed: int) -> _Outcome:
-    """Result of one seed, or why there is none."""
+    """Return the result of one seed, or the error as text."""
     try:
         simulation = simulate(scenario, seed)
         if isinstance(simulation, AttitudeRuns):

@@ -1,4 +1,4 @@
-"""Random processes of a simulation, each from a stream of its own.
+"""Random processes of a simulation, each from its own stream.
 
 See docs/theory/magnetic-simulation.md.
 """
@@ -18,7 +18,7 @@ HOUR_S = 3600.0
 
 
 def stream(seed: int, feature: str, owner: str = "") -> np.random.Generator:
-    """Random numbers of one feature of one sensor, source or carrier.
+    """Return random numbers of one feature of one sensor, source or carrier.
 
     ``seed``: of the simulation. ``feature``: what they are for, such as ``"noise"``. ``owner``: whose they are, such as
     a sensor's id. Returns: independent of that of any other name: leaving out a feature or a sensor changes no other
@@ -37,7 +37,7 @@ def coloured_noise(
     bandwidth_Hz: float,
     rng: np.random.Generator,
 ) -> FloatArray:
-    """Noise with a white and a 1/f part behind a first-order low-pass.
+    """Return noise with a white and a 1/f part behind a first-order low-pass.
 
     ``n``, ``channels``: samples, and independent channels. ``rate_Hz``: sampling rate. ``density``: N, square root
     of the one-sided spectral density of the white part [unit/√Hz]. ``corner_Hz``: f_c, where both parts are equal;
@@ -53,7 +53,7 @@ def coloured_noise(
 
 
 def white_sigma(rate_Hz: float, density: float, bandwidth_Hz: float) -> float:
-    r"""Standard deviation of the white part of :func:`coloured_noise` in one sample.
+    r"""Return the standard deviation of the white part of :func:`coloured_noise` in one sample.
 
     :math:`σ² = N² ∫_0^{f_s/2} df/(1 + (f/f_b)²) = N² f_b \arctan(f_s/(2 f_b))`.
     ``rate_Hz``, ``density``, ``bandwidth_Hz``: as there. Returns [unit].
@@ -64,7 +64,7 @@ def white_sigma(rate_Hz: float, density: float, bandwidth_Hz: float) -> float:
 
 
 def flicker_sigma(rate_Hz: float, density: float, corner_Hz: float, bandwidth_Hz: float, lowest_Hz: float) -> float:
-    """Standard deviation of the 1/f part of :func:`coloured_noise` above a frequency, in one sample.
+    """Return the standard deviation of the 1/f part of :func:`coloured_noise` above a frequency, in one sample.
 
     :math:`σ² = N² f_c ∫_{f_1}^{f_s/2} df/(f (1 + (f/f_b)²))`, zero where the rate does not reach that frequency.
     ``rate_Hz``, ``density``, ``corner_Hz``, ``bandwidth_Hz``: as there. ``lowest_Hz``: f_1, positive. Returns [unit].
@@ -77,7 +77,7 @@ def flicker_sigma(rate_Hz: float, density: float, corner_Hz: float, bandwidth_Hz
 
 
 def lasting(random: FloatArray, correlation_s: float, rate_Hz: float) -> FloatArray:
-    """First-order Markov processes of unit variance from standard normal numbers (n, k); 0 s: white, ∞: constant."""
+    """Return first-order Markov processes (n, k) of unit variance; 0 s: white, ∞: constant."""
     decay = math.exp(-1.0 / (rate_Hz * correlation_s)) if correlation_s else 0.0
     added = random * math.sqrt(1.0 - decay**2)
     added[0] = random[0]
@@ -85,7 +85,7 @@ def lasting(random: FloatArray, correlation_s: float, rate_Hz: float) -> FloatAr
 
 
 def random_walk(n: int, channels: int, rate_Hz: float, per_root_hour: float, rng: np.random.Generator) -> FloatArray:
-    """Drift that starts at zero and whose variance grows by ``per_root_hour²`` in an hour.
+    """Return a drift from zero whose variance grows by ``per_root_hour²`` in an hour.
 
     ``n``, ``channels``: samples, and independent channels. ``rate_Hz``: sampling rate. ``per_root_hour`` [unit/√h].
     Returns (n, channels) [unit].
@@ -96,7 +96,7 @@ def random_walk(n: int, channels: int, rate_Hz: float, per_root_hour: float, rng
 
 
 def low_passed(values: FloatArray, rate_Hz: float, bandwidth_Hz: float) -> FloatArray:
-    """What a first-order low-pass makes of a signal that is linear between its samples and constant before them.
+    """Filter a signal, linear between samples and constant before them, by a first-order low-pass.
 
     Shapes ``values`` (n, channels) -> (n, channels). ``rate_Hz``: sampling rate. ``bandwidth_Hz``: where the amplitude
     has fallen by 3 dB; infinite = no filter.

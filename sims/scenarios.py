@@ -1,4 +1,4 @@
-"""Scenarios of either kind: an array of magnetometers, or a satellite that turns."""
+"""Scenarios of both kinds: an array of magnetometers, or a satellite."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from sims.magnetics.simulation import simulate as simulate_magnetic
 
 
 def read_scenario(name_or_path: str) -> MagneticScenario | AttitudeScenario:
-    """Scenario of a simulation.
+    """Read a scenario of a simulation.
 
     Parameters
     ----------
@@ -64,12 +64,12 @@ def simulate(scenario: MagneticScenario, rng: Rng) -> Simulation: ...
 def simulate(scenario: AttitudeScenario, rng: Rng | Sequence[int]) -> AttitudeRuns: ...
 @accept_seed
 def simulate(scenario: MagneticScenario | AttitudeScenario, rng: Rng | Sequence[int]) -> Simulation | AttitudeRuns:
-    """Readings of a scenario, and the truth behind them.
+    """Simulate the readings of a scenario, and their truth.
 
     Parameters
     ----------
     scenario : MagneticScenario or AttitudeScenario
-        Of :func:`read_scenario`, or made in Python.
+        Scenario from :func:`read_scenario`, or made in Python.
     rng : int or numpy.random.Generator
         Seed or generator of all random numbers. For a satellite also several seeds, one for each run.
 

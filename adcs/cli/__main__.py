@@ -2,12 +2,12 @@
 
 import sys
 
-from magloc.cli.entry import entered
+from magloc.cli.entry import run_program
 
 
 def main() -> int:
-    """Run one command; its exit status."""
-    return entered("adcs")
+    """Run one command, and return its exit status."""
+    return run_program("adcs")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """The command line ``adcs``.
 
-Every command is a function in a module of :mod:`adcs.cli`; its NumPy docstring is its help text. What the command
-lines have in common is in :mod:`magloc.cli.framework`.
+Every command is a function in a module of :mod:`adcs.cli`; its NumPy docstring is its help text. The shared parts of
+all command lines are in :mod:`magloc.cli.framework`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""``adcs calibrate``: a magnetometer from a log, by the field along the orbit."""
+"""``adcs calibrate``: calibration of a magnetometer by the field along the orbit."""
 
 from __future__ import annotations
 
@@ -34,27 +34,27 @@ def calibrate(
 ) -> None:
     """Calibrate the magnetometer of a log by the field along the orbit.
 
-    Gains, axes and bias are found, and how far the times of the positions are off. What the log does not tell is
-    named; it keeps the prior of the scenario file: noise_nT of the magnetometer, and field_bias_nT, field_gain,
+    Estimates gains, axes and bias, and the time shift of the positions. The command names what the log does not
+    determine. The prior is that of the scenario file: noise_nT of the magnetometer, and field_bias_nT, field_gain,
     field_axes_deg, field_model_error_nT (150 for 0) and field_model_correlation_s of the table estimate.
 
     Parameters
     ----------
     telemetry : Path
-        CSV file, as `adcs estimate` takes it.
+        Telemetry (CSV), as for `adcs estimate`.
     config : Path
-        Scenario file (TOML) of the satellite; time_s counts from its orbit's start.
+        Scenario file (TOML) of the satellite. time_s counts from the start of its orbit.
     attitude : str
-        Unknown ("none"): the modulus of each row counts, which does not tell how the sensor is turned. Or constant in
-        the orbital frame ("orbital"), unknown there.
+        Attitude of the satellite: unknown ("none"), so that only the modulus of each row counts and the mounting of the
+        sensor stays unknown, or constant and unknown in the orbital frame ("orbital").
     time_shift_s : float
-        One standard deviation of the time of the positions against that of the readings; 0 = known.
+        Standard deviation of the time shift between positions and readings [s]; 0 for none.
     allow_old_elements : bool
-        Take two-line elements 30 days or more from their epoch too.
+        Also accept two-line elements 30 days or more from their epoch.
     out : Path, optional
-        CSV file for the log with calibrated readings.
+        CSV file to write: the log with calibrated readings.
     json : bool
-        Print one JSON object.
+        Print one JSON object, in place of the text.
     common : QuietOptions
         Common options.
     """
@@ -84,23 +84,25 @@ def calibrate(
 
 
 def warnings_of(result: MagnetometerCalibration) -> list[str]:
-    """What the log does not tell, and what does not fit."""
+    """Return warnings on what the log does not determine, and on what does not fit."""
     texts = []
     if result.undetermined:
-        texts.append(f"this log does not tell {', '.join(result.undetermined)}: left at the prior within its deviation")
+        texts.append(
+            f"this log does not determine {', '.join(result.undetermined)}: the prior stays, with its deviation"
+        )
     if result.misfit > _MISFIT:
         ratio = math.sqrt(result.chi2 / result.dof)
         texts.append(
-            f"residuals are {ratio:.1f} times what noise and the model's error explain: deviations are too small"
+            f"residuals are {ratio:.1f} times what noise and errors of the model explain: deviations are too small"
         )
     left_out = len(result.used) - int(result.used.sum())
     if left_out:
-        texts.append(f"{left_out} rows are missing, or too far off to be used")
+        texts.append(f"{left_out} rows are missing or too far off, and are not used")
     return texts
 
 
 def report(result: MagnetometerCalibration) -> dict[str, Any]:
-    """What ``--json`` prints."""
+    """Return the report that ``--json`` prints."""
     values = np.concatenate([result.bias_T, result.gain.ravel(), [result.time_shift_s]])
     numbers: dict[str, Any] = {}
     for name, value, sigma in zip(NAMES, values, result.sigma, strict=True):
@@ -120,7 +122,7 @@ def report(result: MagnetometerCalibration) -> dict[str, Any]:
 
 
 def lines(result: MagnetometerCalibration, attitude: Attitude) -> list[str]:
-    """The result as text."""
+    """Return the result as text."""
     what = "modulus" if attitude == "none" else "component, constant attitude in the orbital frame"
     sigma = result.sigma
 

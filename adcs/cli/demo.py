@@ -1,4 +1,4 @@
-"""``adcs demo``: from nothing to a picture."""
+"""``adcs demo``: a first example without any files."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ def demo(
     *,
     common: QuietOptions = QuietOptions(),  # noqa: B008 - frozen
 ) -> None:
-    """Estimate the attitude of a simulated satellite, and draw what comes out: two commands, shown as they are typed.
+    """Simulate a satellite and estimate its attitude by two commands, shown as a user types them.
 
     Parameters
     ----------
     out : Path
-        Folder for what they write.
+        Folder for the files of the commands.
     common : QuietOptions
         Common options.
     """
@@ -36,7 +36,7 @@ def demo(
 
 
 _STORY = """
-Simulated: a small satellite that its wheels hold for 300 s, and how far the filter is off. NEES 1 is as far as it says.
+Simulated: a small satellite with wheels for 300 s, and the errors of the filter. NEES 1: errors as large as stated.
 {simulated}
 Estimated from the file of its sensors alone:
 {estimated}

@@ -1,4 +1,4 @@
-"""``adcs estimate``: attitude from a user's own telemetry."""
+"""``adcs estimate``: attitude and rate from telemetry."""
 
 from __future__ import annotations
 
@@ -27,24 +27,25 @@ def estimate(
 ) -> None:
     """Estimate attitude and rate from telemetry, with the filters of `adcs run`.
 
-    The filter starts from the first readings; where they leave a turn open, from the turn that fits the readings of
-    five minutes, or fifty of a magnetometer alone. `adcs run tabletsat --out DIR` writes an example: DIR/telemetry.csv
-    with DIR/scenario.toml. --out writes estimates.csv, the same as messages (attitude.aem, orbit.oem), and figures;
-    --json has one entry for every row.
+    The filter starts from the first readings. If these do not determine the attitude, it starts from the attitude that
+    fits the readings of five minutes, or of fifty minutes with a magnetometer alone. `adcs run tabletsat --out DIR`
+    writes an example: DIR/telemetry.csv and DIR/scenario.toml. --out writes estimates.csv, CCSDS messages
+    (attitude.aem, orbit.oem) and figures. --json has one entry for every row.
 
     Parameters
     ----------
     telemetry : Path
-        CSV file: time_s, and any of star_qw, star_qx, star_qy, star_qz (inertial from body, scalar first), gyro_x_deg_s
-        and so on, field_x_nT, sun_x, the wheels' momentum wheels_x_Nms and the moment commanded torquers_x_Am2, in body
-        axes. Empty cells and missing rows are missing readings. Or an attitude ephemeris message of the CCSDS (.aem).
+        CSV file with time_s and any of star_qw, star_qx, star_qy, star_qz (inertial from body, scalar first),
+        gyro_x_deg_s, field_x_nT, sun_x, the momentum of the wheels wheels_x_Nms and the commanded moment
+        torquers_x_Am2, with y and z, in body axes. Empty cells and missing rows are missing readings. Or an attitude
+        ephemeris message of the CCSDS (.aem).
     config : Path
-        Scenario file (TOML) of the satellite; time_s counts from its orbit's start. Its table log names other columns,
-        UTC times, units, axes and conventions of quaternions.
+        Scenario file (TOML) of the satellite. time_s counts from the start of its orbit. Its table log states other
+        names of columns, UTC times, units, axes and conventions of quaternions.
     options : EstimateOptions
-        What differs from the scenario file.
+        Values that replace those of the scenario file.
     report : ReportOptions
-        Where the result goes.
+        Outputs.
     """
     from adcs.io.estimates import rows_of, summary_lines
 
@@ -62,7 +63,7 @@ def estimate(
 
 
 def read_log(path: Path, scenario: AttitudeFile) -> adcs.Telemetry:
-    """Log of a table, or of an attitude ephemeris message."""
+    """Read telemetry from a table or from an attitude ephemeris message."""
     if path.suffix.lower() != ".aem":
         return adcs.read_telemetry(path, scenario.step_s, layout=scenario.log)
     utc, q = adcs.read_aem(path)

@@ -27,31 +27,31 @@ def imu(
     offline: Flag = False,
     report: ReportOptions = ReportOptions(),  # noqa: B008 - frozen
 ) -> None:
-    """Attitude of an inertial unit, with iron and magnets near its magnetometer or not.
+    """Estimate the attitude of an inertial unit, with or without iron and magnets near its magnetometer.
 
-    The first second should be at rest, and its field is north. Without a magnetometer the heading is relative to the
-    first row. Within gaps σ grows, and they are named; a log with misread units or axes is refused. --out writes
-    attitude.csv and attitude.png.
+    The unit should be at rest during the first second; its field then defines north. Without a magnetometer the heading
+    is relative to the first row. During gaps σ grows, and the gaps are reported. A log with wrong units or axes is
+    refused. --out writes attitude.csv and attitude.png.
 
-    After D. Laidig and T. Seel (VQF, Information Fusion 91,
-    2023), with a Kalman filter of the heading that knows what else changes a field.
+    The method is that of D. Laidig and T. Seel (VQF, Information Fusion 91, 2023), with a Kalman filter of the heading
+    that models disturbances of the field.
 
     Parameters
     ----------
     log : Path
-        CSV file: time_s, gyro_x_rad_s or gyro_x_deg_s, acceleration_x_m_s2 and, of a unit with a magnetometer,
-        field_x_nT, with y and z, and if known the truth qw, qx, qy, qz (east, north, up from body) and moving (1 where
-        errors count). Empty cells are missing readings. Or a MAT file of the BROAD benchmark.
+        CSV file with time_s, gyro_x_rad_s or gyro_x_deg_s, acceleration_x_m_s2 and, with a magnetometer, field_x_nT,
+        each with y and z; if known the truth qw, qx, qy, qz (east, north, up from body) and moving (1 where errors
+        count). Empty cells are missing readings. Or a MAT file of the BROAD benchmark.
     config : Path, optional
-        TOML file whose table log names other columns, units and mountings.
+        TOML file whose table log states other names of columns, units and mountings.
     method : str
-        What is done with a field that contradicts the filter: it is left out until the turns that were made show that
-        it moves with the sensor, and subtracted then ("auto"), left out ("reject"), always taken for a magnet that
-        moves with the sensor ("subtract"), or used as it is ("plain").
+        Treatment of a field that contradicts the filter: rejected until the motion shows that it moves with the sensor,
+        then subtracted ("auto"); rejected ("reject"); subtracted, as the field of a magnet that moves with
+        the sensor ("subtract"); used as it is ("plain").
     offline : bool
-        Use the whole log for every row.
+        Use the whole log for every row (smoothing).
     report : ReportOptions
-        Where the result goes.
+        Outputs.
     """
     from adcs.io.imu_results import attitude_columns, imu_summary, summary_words
 
@@ -70,7 +70,7 @@ def imu(
 
 
 def inertial_attitude(log: Path, data: ImuLog, magnet: Magnet = "auto", *, offline: bool = False) -> adcs.AttitudeTrack:
-    """Attitude of a log; errors name its file."""
+    """Return the attitude of a log; errors name its file."""
     record = data.record
     readings = (record.time_s, record.rate_rad_s, record.acceleration_m_s2, record.field_T)
     with naming(str(log)):

@@ -1,4 +1,4 @@
-"""``adcs loads``: what switches on board, at each magnetometer, and where it is."""
+"""``adcs loads``: fields and places of loads that switch on board."""
 
 from __future__ import annotations
 
@@ -29,27 +29,26 @@ def loads(
 ) -> None:
     """Find the fields of loads, magnets and torquers that switch on board, at each magnetometer.
 
-    Each switch is a step of the readings, and the gyro tells how the satellite turns meanwhile; no model of the
-    Earth's field is needed. Where the states are of another clock than the readings, a warning says the lag, and the
-    fields are corrected for it. With three magnetometers or more every load is located too, as a dipole: that names
-    it, gives its torque, and predicts its field elsewhere. What is subtracted is the field that was found, not the
-    dipole's.
+    Each switch is a step in the readings, and the gyro measures how the satellite turns meanwhile. The command needs no
+    model of the Earth's field. If states and readings have different clocks, a warning states the lag, and the fields
+    are corrected for it. With three magnetometers or more the command also locates every load as a dipole, which
+    identifies it and gives its torque. It subtracts the estimated field, not that of the dipole.
 
     Parameters
     ----------
     readings : Path
-        CSV file: time_s, readings of the array's magnetometers, gyro_x_deg_s and so on, and a column with the state of
-        each load, such as 0 and 1, or its current.
+        CSV file with time_s, the readings of the array's magnetometers, gyro_x_deg_s with y and z, and a column with
+        the state of each load, such as 0 and 1, or its current.
     array : Path
         Array file (TOML) of the magnetometers, in body axes.
     loads : str
-        Columns of the loads with commas between them; by default all that have no unit.
+        Columns of the loads, separated by commas; by default all columns without a unit.
     window_s : float
-        Seconds before and after a switch that are used.
+        Time before and after a switch that is used [s].
     out : Path, optional
-        CSV file for the same log without the loads' fields.
+        CSV file to write: the same log without the fields of the loads.
     json : bool
-        Print one JSON object.
+        Print one JSON object, in place of the text.
     common : QuietOptions
         Common options.
     """
@@ -75,7 +74,7 @@ _LEAST_SENSORS = 3
 
 
 def report(own: adcs.OwnFields, located: dict[str, Fix]) -> dict[str, Any]:
-    """What ``--json`` prints."""
+    """Return the report that ``--json`` prints."""
     results = []
     for name, vectors, sigma, switches in zip(own.names, own.vectors_T, own.sigma_T, own.switches, strict=True):
         entry: dict[str, Any] = {
@@ -104,7 +103,7 @@ def report(own: adcs.OwnFields, located: dict[str, Fix]) -> dict[str, Any]:
 
 
 def lines(own: adcs.OwnFields, located: dict[str, Fix]) -> list[str]:
-    """The result as text."""
+    """Return the result as text."""
     import numpy as np
 
     noise = ", ".join(f"{name} {1e9 * one:.3g}" for name, one in zip(own.array.ids, own.noise_T, strict=True))

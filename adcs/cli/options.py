@@ -1,4 +1,4 @@
-"""What all commands share."""
+"""Options that several commands share."""
 
 from __future__ import annotations
 
@@ -19,29 +19,29 @@ from magloc.cli.framework import Count, Flag, QuietOptions  # noqa: F401 - of an
 @Parameter(name="*", group="Common options")
 @dataclass(frozen=True)
 class ReportOptions(QuietOptions):
-    """Where a result goes.
+    """Outputs of a command.
 
     Parameters
     ----------
     out : Path, optional
-        Folder for figures and the data behind them; made if it is not there.
+        Folder for figures and their data; it is created if it does not exist.
     json : bool
-        Print one JSON object.
+        Print one JSON object, in place of the text.
     threads : int
-        Threads at most; by default all cores. Results do not depend on it.
+        Largest number of threads; by default all cores. Results do not depend on it.
     quiet : bool
-        No progress and no summary on stderr, only errors.
+        Print errors only: no progress and no summary on stderr.
     """
 
     out: Path | None = None
     json: Flag = False
 
     def check(self) -> None:
-        """Refuse, before long work, what cannot become a folder."""
+        """Refuse, before long work, a path that cannot become a folder."""
         refuse_file(self.out, "--out")
 
     def write(self, files: Iterable[tuple[str, Any]]) -> None:
-        """Write files by their names, as :func:`arrays.io.outputs.write_files`, if there is a folder for them."""
+        """Write files by their names into the folder, if there is one."""
         write_files(self.out, files)
 
     def print(self, result: Mapping[str, Any], lines: Sequence[str]) -> None:
@@ -52,20 +52,20 @@ class ReportOptions(QuietOptions):
 @Parameter(name="*")
 @dataclass(frozen=True)
 class EstimateOptions:
-    """What replaces keys of the scenario file; by default nothing does.
+    """Options that replace keys of the scenario file.
 
     Parameters
     ----------
     sensors : str
-        Sensors in use: any of st, gyro, mag and sun that observe attitude, in any order.
+        Sensors to use: st, gyro, mag and sun, in any order, joined by +; together they must observe attitude.
     states : str
-        What is estimated besides attitude and rate: any of gyro-bias, field-bias, field-gain, magnetometer (both),
-        disturbance, field-model and dipole with commas, or none.
-        With other sensors the scenario's own states stay, but for the bias of a sensor that is not in use.
+        States to estimate besides attitude and rate: gyro-bias, field-bias, field-gain, magnetometer (both),
+        disturbance, field-model and dipole, separated by commas, or none. By default those of the scenario, without
+        the biases of sensors that are not used.
     filter : str
-        As of `adcs run tabletsat`.
+        Filter, as in `adcs run tabletsat`; by default that of the scenario.
     allow_old_elements : bool
-        Take two-line elements 30 days or more from their epoch too.
+        Also accept two-line elements 30 days or more from their epoch.
     """
 
     sensors: str | None = None
@@ -74,7 +74,7 @@ class EstimateOptions:
     allow_old_elements: Flag = False
 
     def estimate(self, own: Sequence[str]) -> dict[str, Any]:
-        """Keys of the table ``estimate``, and what replaces them; of its own states those stay that sensors measure."""
+        """Return the values that replace keys of the table ``estimate``."""
         given = {"sensors": self.sensors, "states": _names(self.states), "filter": self.filter}
         if self.sensors is not None and self.states is None:
             given["states"] = [state for state in own if is_measured(state, self.sensors)]
@@ -84,39 +84,40 @@ class EstimateOptions:
 @Parameter(name="*")
 @dataclass(frozen=True)
 class ScenarioOptions(EstimateOptions):
-    """What replaces keys of the scenario file; by default nothing does.
+    """Options that replace keys of the scenario file.
 
     Parameters
     ----------
     sensors : str
-        Sensors in use: any of st, gyro, mag and sun that observe attitude, in any order, as in st+gyro+mag+sun.
+        Sensors to use: st, gyro, mag and sun, in any order, as in st+gyro+mag+sun; together they must observe attitude.
     states : str
-        What is estimated besides attitude and rate: any of gyro-bias, field-bias, field-gain, magnetometer (both),
-        disturbance, field-model and dipole with commas, or none.
-        With other sensors the scenario's own states stay, but for the bias of a sensor that is not in use.
+        States to estimate besides attitude and rate: gyro-bias, field-bias, field-gain, magnetometer (both),
+        disturbance, field-model and dipole, separated by commas, or none. By default those of the scenario, without
+        the biases of sensors that are not used.
     filter : str
-        Error-state Kalman filter ("mekf"); with its converged gain ("constant-gain"); with a filter of the disturbance
-        beside it ("parallel-disturbance"); of attitude and gyro bias alone ("reduced"); with a smoother of the whole
-        run after it ("smoother"); a bank that finds how large the disturbance is ("self-tuning").
+        Error-state Kalman filter ("mekf"); with its converged gain ("constant-gain"); with a parallel filter of the
+        disturbance ("parallel-disturbance"); of attitude and gyro bias only ("reduced"); followed by a smoother
+        ("smoother"); a bank of filters that estimates the size of the disturbance ("self-tuning").
     process_noise : str
-        Found by us ("tuned"), or as printed ("paper").
+        Process noise: tuned for this simulation ("tuned"), or as printed in the paper ("paper").
     star_noise : str
-        The star tracker's 0.001° are the noise of its angle ("angle"), or of its quaternion's components ("paper").
+        Meaning of the star tracker's 0.001°: noise of its angle ("angle"), or of the components of its quaternion
+        ("paper").
     field_error_nT : float
-        True field minus its model.
+        Size of the true field minus its model [nT].
     share : float
-        Share of the readings of every sensor that are wild, 0 to 1.
+        Share of wild readings of every sensor, 0 to less than 1.
     eclipse : bool
         The satellite enters the Earth's shadow at 600 s.
     start : str
-        The filter starts near the truth ("near"), from the first readings of two sensors ("vectors"), or from nowhere
-        ("any").
+        Start of the filter: near the truth ("near"), from the first readings of two sensors ("vectors"), or without any
+        knowledge ("any").
     start_error_deg : float
-        Error per axis of what the filter starts from.
+        Standard deviation of the attitude at the start of the filter, per axis [°].
     allow_old_elements : bool
-        Take two-line elements 30 days or more from their epoch too.
+        Also accept two-line elements 30 days or more from their epoch.
     closed_loop_F : bool
-        The Jacobian as printed by Ivanov et al., which takes the feedback of the control for dynamics.
+        Use the Jacobian as printed by Ivanov et al., which treats the feedback of the control as dynamics.
     """
 
     process_noise: Noise | None = None
@@ -129,7 +130,7 @@ class ScenarioOptions(EstimateOptions):
     closed_loop_F: Annotated[Flag, Parameter(name="--closed-loop-F")] = False
 
     def changes(self, duration_s: float | None, own: Sequence[str]) -> dict[str, Any]:
-        """Keys of the scenario file with states of its own, and what replaces them."""
+        """Return the values that replace keys of a scenario file with its own states."""
         estimate = {
             "process_noise": self.process_noise,
             "start": self.start,
@@ -145,7 +146,7 @@ class ScenarioOptions(EstimateOptions):
         if self.eclipse:
             eclipse = adcs.read_scenario("eclipse").tables
             changes |= {key: eclipse[key] for key in ("start", "duration_s")}
-            # The noise of that file is too small without the torque in the state.
+            # Without the torque in the state the process noise of that file is too small.
             if self.process_noise is None and "disturbance" in (_names(self.states) or []):
                 changes["estimate"]["process_noise"] = eclipse["estimate"]["process_noise"]
         if duration_s is not None:

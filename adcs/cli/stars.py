@@ -1,4 +1,4 @@
-"""``adcs stars``: which stars of the real sky images show, and where the camera looked."""
+"""``adcs stars``: stars in images of the sky, and the direction of the camera."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 _LARGEST_NOISE = 0.1
-"""Of the shorter side of an image."""
+"""Largest noise, over the shorter side of an image."""
 
 
 def stars(
@@ -40,34 +40,34 @@ def stars(
 ) -> None:
     """Identify the stars of images by a catalogue, without knowing where the camera looked.
 
-    Of frames with the true numbers of the stars (result.csv) it says how many were found and how many were wrong.
-    Mirrored images are solved too, and named. --out writes the photographs with the names of their stars.
+    For frames with the true numbers of the stars (result.csv) the command counts correct and wrong ones. It also solves
+    mirrored images, and says so. --out writes the photographs with the names of their stars.
 
     Parameters
     ----------
     images : Path
-        Photographs of the sky: PNG, TIFF or JPEG of 8 or 16 bits, or FITS. Or a folder with calibration.txt (IMG_X,
-        IMG_Y, PIXSCALE in arc seconds at the centre), input.csv (a line for each frame: x, y up, magnitude of each
-        star) and, if known, result.csv (the stars' numbers, -1 for none).
+        Photographs of the sky: PNG, TIFF or JPEG with 8 or 16 bits, or FITS. Or one folder with calibration.txt (IMG_X,
+        IMG_Y, PIXSCALE in arc seconds at the centre), input.csv (one line for each frame: x, y up, magnitude of each
+        star) and, if known, result.csv (numbers of the stars, -1 for none).
     catalogue : Path
-        "hipparcos", which needs the extra "stars", or a CSV file with the columns hip, ra_deg, dec_deg and mag, at the
+        "hipparcos", which needs the extra "stars", or a CSV file with the columns hip, ra_deg, dec_deg and mag at the
         date of the images.
     noise_px : float, optional
-        Standard deviation of a star's place, per axis: 1 in frames, 0.5 in photographs. Up to a tenth of the image's
-        shorter side: stars that may be anywhere in it cannot be told apart.
+        Standard deviation of a star's position, per axis [px]; 1 in frames, 0.5 in photographs by default. At most a
+        tenth of the image's shorter side.
     scale_arcsec : float, optional
-        Of a pixel at the centre. Photographs without it are tried with fields of 3 to 45°.
+        Size of a pixel at the centre [arcsec]. Without it the command tries fields of 3 to 45° for photographs.
     scale_tolerance : float, optional
-        Relative error of the scale, 0.1 at most: 0.05 in photographs; in frames it is exact without it.
+        Relative error of the scale, at most 0.1; by default 0.05 for photographs, 0 for frames.
     year : float
-        Date of the images, to which the stars of Hipparcos are moved.
+        Date of the images; the proper motions of Hipparcos are applied up to it.
     aberration : bool
-        Show the stars as the Earth sees them, which moves at 30 km/s at that date: up to 20.5 arc seconds off. A day
-        is 0.0027 years and 0.35 arc seconds. Needs the extra "satellites".
+        Apply the annual aberration at that date, up to 20.5 arc seconds. An error of one day (0.0027 years) makes 0.35
+        arc seconds. Needs the extra "satellites".
     dark : Path, optional
-        Photograph without a sky, which is subtracted.
+        Dark frame: a photograph without sky, which is subtracted.
     report : ReportOptions
-        Where the result goes.
+        Outputs.
     """
     from adcs.stars.files import read_star_catalogue
     from adcs.stars.hipparcos import hipparcos_catalogue
@@ -124,7 +124,7 @@ def _pictures(
             row |= dict.fromkeys(("corner_px", "corner_sigma_px", "field_deg"))
             row |= {"mirrored": None, "matched": 0, "residual_arcsec": None, "reason": found.reason}
         else:
-            row |= _where(found.R_catalogue_from_frame)
+            row |= _direction(found.R_catalogue_from_frame)
             camera, sigma = found.pose.camera, np.sqrt(np.diag(found.pose.covariance))
             width = math.atan(0.5 * picture.shape[1] * math.tan(camera.rad_per_px))
             half_diagonal_px = 0.5 * math.hypot(camera.width_px, camera.height_px)
@@ -141,7 +141,7 @@ def _pictures(
             }
         rows.append({**row, "milliseconds": took_ms})
         solved.append((path, picture, lights, None if isinstance(found, NoFix) else found))
-    # Once all photographs are read: a later one may be refused.
+    # Only after all photographs are read, because one of them may be refused.
     report.write(
         (f"{path.stem}-stars.png", picture_figure(path.name, picture, lights, fix, known))
         for path, picture, lights, fix in solved
@@ -149,7 +149,7 @@ def _pictures(
     report.print({"pictures": rows}, [_picture_line(row) for row in rows])
 
 
-def _mirrored(row: dict[str, Any]) -> str:
+def _mirror_note(row: dict[str, Any]) -> str:
     return "; mirrored: solved with left and right exchanged" if row["mirrored"] else ""
 
 
@@ -158,14 +158,14 @@ def _arcsec(angle_rad: float) -> float:
 
 
 def _picture_line(row: dict[str, Any]) -> str:
-    """One photograph in words."""
+    """Return the text of one photograph."""
     if not row["solved"]:
         return f"{row['file']}: no fix, {row['reason']}"
     return (
         f"{row['file']}: RA {row['ra_deg']:.3f}°, Dec {row['dec_deg']:+.3f}°, roll {row['roll_deg']:+.2f}°; "
         f"{row['scale_arcsec']:.3f} ± {row['scale_sigma_arcsec']:.3f} arcsec/px, {row['field_deg']:.2f}° wide, "
         f"corners bent by {row['corner_px']:+.1f} ± {row['corner_sigma_px']:.1f} px; "
-        f"{row['matched']} stars, {row['residual_arcsec']:.1f} arcsec rms{_mirrored(row)}"
+        f"{row['matched']} stars, {row['residual_arcsec']:.1f} arcsec rms{_mirror_note(row)}"
     )
 
 
@@ -201,18 +201,18 @@ def _frames(
         frames_of = [(image.points_px, image.magnitudes) for image in images]
         fixes = adcs.identify_stars(known, camera, frames_of, noise_px=noise_px, lens=prior, progress=done)
     rows = [_row(known, image, fix) for image, fix in zip(images, fixes, strict=True)]
-    # The first frame waits for the triangles of the catalogue.
+    # The time of the first frame includes the triangles of the catalogue.
     milliseconds = 1e3 * np.diff(ended)[min(1, len(images) - 1) :]
     totals = _totals(known, images, rows) | {
         "milliseconds_median": float(np.median(milliseconds)),
         "milliseconds_max": float(milliseconds.max()),
     }
-    words = [*(_line(number, row) for number, row in enumerate(rows)), _in_words(totals)]
+    words = [*(_line(number, row) for number, row in enumerate(rows)), _totals_line(totals)]
     report.print({"frames": rows, **totals}, words)
 
 
 def _row(catalogue: StarCatalogue, image: StarFrame, fix: StarFix | NoFix) -> dict[str, Any]:
-    """What was found in one frame."""
+    """Return the JSON entry of one frame."""
     from adcs.stars.files import NO_STAR
     from adcs.stars.identification import NoFix
 
@@ -222,15 +222,15 @@ def _row(catalogue: StarCatalogue, image: StarFrame, fix: StarFix | NoFix) -> di
     if isinstance(fix, NoFix):
         return {**row, "reason": fix.reason, "hip": numbers}
     numbers[fix.stars[:, 0]] = catalogue.numbers[fix.stars[:, 1]]
-    row |= _where(fix.R_catalogue_from_frame)
+    row |= _direction(fix.R_catalogue_from_frame)
     row |= {"rms_arcsec": _arcsec(fix.rms_rad), "mirrored": fix.mirrored}
     return {**row, "reason": "", "hip": numbers}
 
 
-def _where(R_catalogue_from_frame: FloatArray) -> dict[str, float]:
-    """Right ascension and declination of the centre, and the angle of the image's y from north, towards east.
+def _direction(R_catalogue_from_frame: FloatArray) -> dict[str, float]:
+    """Return right ascension and declination of the centre, and the roll of y from north to east.
 
-    The same in a mirrored image, where left and right are exchanged and y stays.
+    They do not change in a mirrored image, which exchanges left and right.
     """
     right, up, back = R_catalogue_from_frame.T
     north = np.array([0.0, 0.0, 1.0])
@@ -242,7 +242,7 @@ def _where(R_catalogue_from_frame: FloatArray) -> dict[str, float]:
 
 
 def _totals(catalogue: StarCatalogue, images: list[StarFrame], rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Counts over all frames, and rates where the true numbers are known."""
+    """Return counts over all frames, and rates where the true numbers are known."""
     found = np.concatenate([row["hip"] for row in rows])
     totals: dict[str, Any] = {
         "fixes": sum(not row["reason"] for row in rows),
@@ -263,18 +263,18 @@ def _totals(catalogue: StarCatalogue, images: list[StarFrame], rows: list[dict[s
 
 
 def _line(number: int, row: dict[str, Any]) -> str:
-    """One frame in words."""
+    """Return the text of one frame."""
     if row["reason"]:
         return f"frame {number}: no fix, {row['reason']}"
     identified = sum(int(hip) >= 0 for hip in row["hip"])
     return (
         f"frame {number}: RA {row['ra_deg']:.3f}°, Dec {row['dec_deg']:+.3f}°, roll {row['roll_deg']:+.2f}°; "
-        f"{identified} of {row['stars']} stars, {row['rms_arcsec']:.1f} arcsec rms{_mirrored(row)}"
+        f"{identified} of {row['stars']} stars, {row['rms_arcsec']:.1f} arcsec rms{_mirror_note(row)}"
     )
 
 
-def _in_words(totals: dict[str, Any]) -> str:
-    """All frames in words."""
+def _totals_line(totals: dict[str, Any]) -> str:
+    """Return the text of all frames."""
     text = f"{totals['fixes']} fixes, {totals['identified']} stars identified"
     if totals["identification_rate"] is None:
         return text

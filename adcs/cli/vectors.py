@@ -1,4 +1,4 @@
-"""``adcs vectors``: attitude of every row of a log from field and Sun alone."""
+"""``adcs vectors``: attitude of every row from field and Sun alone."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ def vectors(
     allow_old_elements: Flag = False,
     report: ReportOptions = ReportOptions(),  # noqa: B008 - frozen
 ) -> None:
-    """Attitude of every row that has magnetometer and Sun sensor, each row on its own: TRIAD, or Wahba's problem.
+    """Compute the attitude of every row with magnetometer and Sun sensor, each row on its own.
 
     --out writes vectors.csv; --json has one entry for every such row.
 
     Parameters
     ----------
     telemetry : Path
-        Log, as of `adcs estimate`.
+        Telemetry, as for `adcs estimate`.
     config : Path
-        Scenario file, as of `adcs estimate`: its orbit, the noise of both sensors, its table log.
+        Scenario file, as for `adcs estimate`; its orbit, the noise of both sensors and its table log are used.
     method : str
-        Least squares of both vectors ("quest"), or the Sun exactly and the field for the turn around it ("triad").
+        Least squares of both vectors ("quest"), or the Sun exactly and the field for the rotation about it ("triad").
     allow_old_elements : bool
-        Take two-line elements 30 days or more from their epoch too.
+        Also accept two-line elements 30 days or more from their epoch.
     report : ReportOptions
-        Where the result goes.
+        Outputs.
     """
     from adcs.io.estimates import rows_of, summary_lines
 

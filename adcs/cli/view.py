@@ -1,4 +1,4 @@
-"""``adcs view``: an attitude through time in three dimensions, in a browser, as a page, a picture or a film."""
+"""``adcs view``: attitude through time in three dimensions."""
 
 from __future__ import annotations
 
@@ -36,42 +36,41 @@ def view(
     open: Flag = False,
     common: QuietOptions = QuietOptions(),  # noqa: B008 - frozen
 ) -> None:
-    """See the attitude of a log in three dimensions: body axes with 3σ cones, field and Sun as measured and expected.
+    """Show the attitude of a log in three dimensions.
 
-    Estimates as `adcs estimate` does, or `adcs imu` of an inertial unit, and starts a server on this machine, whose
-    address any browser on this machine opens; Ctrl-C ends it. With --html, --png or --movie a file is written instead.
+    The scene has body axes with 3σ cones, and field and Sun as measured and as expected. The command estimates the
+    attitude as `adcs estimate` does, or as `adcs imu` for an inertial unit. It starts a server on this machine and
+    prints its address; Ctrl-C ends the server. With --html, --png or --movie it writes a file instead.
 
     Parameters
     ----------
     log : Path
-        Telemetry or an attitude message (.aem) as of `adcs estimate`, such as `adcs run --out` writes, or a log as of
-        `adcs imu`.
+        Telemetry or an attitude message (.aem) as for `adcs estimate`, or a log as for `adcs imu`.
     config : Path, optional
-        Scenario file of the satellite; or the layout of an inertial unit's log, a file with the table log alone.
+        Scenario file of the satellite; or, for the log of an inertial unit, a file with only the table log.
     truth : Path, optional
-        CSV file of the true attitude of telemetry, such as `adcs run --out` writes: time_s, qw, qx, qy, qz, orbital
-        frame from body.
+        CSV file of the true attitude: time_s, qw, qx, qy, qz (orbital frame from body), as `adcs run --out` writes it.
     allow_old_elements : bool
-        Take two-line elements 30 days or more from their epoch too.
+        Also accept two-line elements 30 days or more from their epoch.
     html : Path
-        Write one static HTML file that plays and needs no server.
+        HTML file to write; it plays the log and needs no server.
     png : Path
-        Write a picture; needs Chromium or Chrome.
+        Picture to write (.png); needs Chromium or Chrome.
     movie : Path
-        Write a film (.mp4, .gif or .apng); needs Chromium or Chrome.
+        Film to write (.mp4, .gif or .apng); needs Chromium or Chrome.
     port : int
-        Port of the server; the next one that is free if it is in use.
+        Port of the server; the next free one if it is in use.
     open : bool
-        Open the browser.
+        Open the page in the browser.
     common : QuietOptions
         Common options.
     """
-    from magloc.cli.view import written_or_served
+    from magloc.cli.view import write_or_serve
     from magloc.viewer.outputs import check_outputs
 
     with naming_outputs():
         check_outputs(html, png, movie)
-    described = None if config is None else scenario_table(str(config))  # once: it may be a pipe
+    described = None if config is None else scenario_table(str(config))  # read once, because it may be a pipe
     if described is None or set(described[1]) <= _OF_A_LAYOUT:
         track, *made_of, q_true = _of_inertial_unit(log, described, truth)
     else:
@@ -79,7 +78,7 @@ def view(
         track, *made_of, q_true = _of_satellite(log, scenario, truth)
     warn(track.warnings)
     files: dict[str, Any] = {"html": html, "png": png, "movie": movie}
-    written_or_served(
+    write_or_serve(
         lambda used: adcs.view(track, *made_of, truth=q_true, open=open, port=used, title=log.stem, **files),
         [str(file) for file in files.values() if file is not None],
         port,
@@ -106,7 +105,7 @@ def _of_satellite(log: Path, scenario: AttitudeFile, truth: Path | None) -> tupl
 
 
 def _truth(path: Path, time_s: FloatArray) -> FloatArray:
-    """True attitudes at some instants; NaN where the file has none."""
+    """Read true attitudes at some instants; NaN where the file has none."""
     import numpy as np
 
     from adcs.viewer.attitude_replay import rows_at

@@ -108,7 +108,7 @@ class InertialMagneticRecord:
 
     @property
     def has_field(self) -> bool:
-        """Whether there is a magnetometer."""
+        """True if any row has a reading of the magnetometer."""
         return bool(is_read(self.field_T).any())
 
     @property

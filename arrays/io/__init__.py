@@ -1,1 +1,1 @@
-"""What every package reads and writes with: errors, text, TOML, CSV, outputs."""
+"""Reading and writing for all packages: errors, text, TOML, CSV, outputs."""

@@ -1,4 +1,4 @@
-"""What is closed, goes on again, or is first heard of, at the end of a block."""
+"""Contexts that close resources, pause the garbage collector, or delay signals."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from typing import Self
 
 
 class Closing(ABC):
-    """A context manager that closes itself."""
+    """Base of objects that a ``with`` block closes."""
 
     @abstractmethod
     def close(self) -> None:
-        """Give back what is held."""
+        """Close open resources."""
 
     def __enter__(self) -> Self:
         return self
@@ -27,8 +27,8 @@ class Closing(ABC):
 
 
 @contextmanager
-def garbage_waits() -> Iterator[None]:
-    """While many objects are made that stay: the collector would look at all of them, again and again."""
+def pause_garbage_collection() -> Iterator[None]:
+    """Pause the garbage collector while many lasting objects are made."""
     collects = gc.isenabled()
     gc.disable()
     try:
@@ -39,10 +39,10 @@ def garbage_waits() -> Iterator[None]:
 
 
 @contextmanager
-def uninterrupted() -> Iterator[None]:
-    """Let signals wait for the end of the block: compiled code and writing would fail with errors of their own."""
+def delay_signals() -> Iterator[None]:
+    """Delay signals to the end of the block, in which they would cause other errors."""
     if threading.current_thread() is not threading.main_thread():
-        yield  # which no signal interrupts
+        yield  # signals only interrupt the main thread
         return
     signals: list[int] = []
     before = {

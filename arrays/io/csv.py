@@ -1,6 +1,6 @@
-"""Tables of numbers from CSV files, read strictly: whatever is wrong is named with its line and column.
+"""Tables of numbers from CSV files, with errors that name line and column.
 
-The first line names the columns; every other one has a number, or an empty cell, for each of them. A byte order mark,
+The first line names the columns; every other line has a number or an empty cell for each of them. A byte order mark,
 any line ends, blank lines and spaces around cells are tolerated.
 """
 
@@ -31,33 +31,33 @@ from arrays.typing import FloatArray, IntArray
 
 _LOG = logging.getLogger(__name__)
 LATEST_S = 1e11
-"""Latest time of a row, and earliest below zero: of microseconds since 1970 a row would be beyond it."""
+"""Largest modulus of a time; microseconds since 1970 would be beyond it."""
 _HEAD_CHARACTERS = 2**16
 _MOST_LINES_ABOVE = 100
 _SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs", " ": "blanks"}
 DUMMY = math.nextafter(1e32, math.inf)
-"""Number, as good as unique, for a word that says that there is no value."""
+"""Number that marks a word for a missing value; no reading has it."""
 _DUMMY_WORDS = frozenset({"*"})
 _MISSING_WORDS = frozenset(
     ("#N/A", "#N/A N/A", "#NA", "-1.#IND", "-1.#QNAN", "1.#IND", "1.#QNAN", "<NA>", "N/A", "NA", "NULL", "None", "n/a")
 ) | {"null"}
-"""Words that pandas takes for missing, beside those that float() does."""
+"""Words that pandas accepts as missing, without those of float()."""
 
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """A table of numbers, from a CSV file or from columns in memory.
+    """Table of numbers, from a CSV file or from columns in memory.
 
     Attributes
     ----------
     header : tuple of str
-        Names of the columns, each once.
+        Names of the columns, without repetition.
     header_line : int, optional
-        Line that they stand on, of a file.
+        Line of the names in a file.
     values : ndarray, shape (n, columns)
-        NaN where a cell is empty.
+        Values; NaN for an empty cell.
     line_numbers : ndarray of int, shape (n,)
-        Line of every row as an editor counts it; of columns the row, counted from one.
+        Line of every row in an editor; for columns in memory the row, from 1.
     """
 
     path: str
@@ -67,34 +67,34 @@ class Table:
     line_numbers: IntArray
 
     def row_place(self, row: int) -> str:
-        """Where a row, counted from zero, is, for the start of an error's sentence."""
+        """Return the place of a row, counted from 0, for an error."""
         return f"{self.path}, {'row' if self.header_line is None else 'line'} {self.line_numbers[row]}"
 
     def place(self, row: int, column: str) -> str:
-        """Where a cell is, for the start of an error's sentence."""
-        return f"{self.row_place(row)}, column {_clipped(column)}"
+        """Return the place of a cell, for an error."""
+        return f"{self.row_place(row)}, column {_short_name(column)}"
 
     @cached_property
     def _index(self) -> dict[str, int]:
         return {name: i for i, name in enumerate(self.header)}
 
     def header_place(self, column: str) -> str:
-        """Where a column's name is, or should be, for the start of an error's sentence."""
+        """Return the place of a column's name, for an error."""
         line = "" if self.header_line is None else f", line {self.header_line}"
-        return f"{self.path}{line}, column {_clipped(column)}"
+        return f"{self.path}{line}, column {_short_name(column)}"
 
     def require(self, column: str, known: Sequence[str]) -> None:
-        """Raise an InputError if a column is missing, with the nearest name in the file that is not a known one."""
+        """Refuse a missing column; the error has the nearest unknown name in the file."""
         if column in self.header:
             return
         nearest = difflib.get_close_matches(column, [name for name in self.header if name not in known], n=1)
-        hint = f" (the nearest is {_clipped(nearest[0])})" if nearest else ""
+        hint = f" (the nearest is {_short_name(nearest[0])})" if nearest else ""
         names = self.header if len(self.header) < 9 else [*self.header[:6], "…", self.header[-1]]
-        there = ", ".join(_clipped(name) for name in names)
+        there = ", ".join(_short_name(name) for name in names)
         raise InputError(f"{self.header_place(column)}: found no such column{hint}, expected it beside {there}.")
 
     def refuse_unknown(self, known: Sequence[str]) -> None:
-        """Raise an InputError with the first column that is not a known one."""
+        """Refuse unknown columns."""
         for name in self.header:
             if name not in known:
                 raise InputError(
@@ -102,7 +102,7 @@ class Table:
                 )
 
     def has_group(self, columns: Sequence[str]) -> bool:
-        """Whether the file has these columns; some of them without the others are an InputError."""
+        """Return whether the file has these columns; refuse a part of them."""
         present = [name for name in columns if name in self.header]
         missing = [name for name in columns if name not in self.header]
         if present and missing:
@@ -112,14 +112,14 @@ class Table:
         return bool(present)
 
     def finite_or_missing(self, columns: Sequence[str], largest: float = LARGEST) -> FloatArray:
-        """Values of some columns (n, k); an infinite one, or one above the largest, is an InputError."""
+        """Return the values of columns (n, k); refuse infinite values and values above the largest."""
         values = self.values[:, [self._index[name] for name in columns]]
         self.refuse(np.isinf(values), columns, "found an infinite number, expected a finite number or an empty cell")
         self._refuse_larger(values, columns, largest)
         return values
 
     def complete(self, columns: Sequence[str], largest: float = LARGEST) -> FloatArray:
-        """Values of some columns (n, k); a missing or infinite one, or one above the largest, is an InputError."""
+        """Return the values of columns (n, k); refuse missing values and values above the largest."""
         values = self.values[:, [self._index[name] for name in columns]]
         self.refuse(np.isnan(values) | (values == DUMMY), columns, "found no value, expected a number")
         self.refuse(np.isinf(values), columns, "found an infinite number, expected a finite number")
@@ -127,7 +127,7 @@ class Table:
         return values
 
     def complete_and_distinct(self, column: str) -> FloatArray:
-        """Values of one column (n,); a missing, infinite or repeated one is an InputError."""
+        """Return the values of a column (n,); refuse missing, infinite and repeated values."""
         values = self.complete([column])[:, 0]
         order = np.argsort(values, kind="stable")
         repeated = order[1:][np.diff(values[order]) == 0.0]
@@ -141,13 +141,13 @@ class Table:
         return values
 
     def refuse_late(self, column: str, time_s: FloatArray) -> None:
-        """Raise an InputError for the first time (n,) [s] that no clock shows."""
+        """Refuse times (n,) [s] that no clock shows."""
         late = np.abs(time_s) > LATEST_S
         found = f"found the time {time_s[np.argmax(late)]:.6g} s" if late.any() else ""
         self.refuse(late[:, None], [column], f"{found}, beyond 3,000 years, expected seconds")
 
     def times(self, column: str = "time_s") -> FloatArray:
-        """Return the times (n,) [s] of a column; a missing or repeated one, or one that no clock shows, is refused."""
+        """Return the times (n,) [s] of a column; refuse missing, repeated and absurd times."""
         time_s = self.complete_and_distinct(column)
         self.refuse_late(column, time_s)
         return time_s
@@ -156,13 +156,13 @@ class Table:
         self.refuse(np.abs(values) > largest, columns, f"found a number above {largest:g}, expected a smaller one")
 
     def refuse(self, bad: NDArray[np.bool_], columns: Sequence[str], fault: str) -> None:
-        """Raise an InputError with the place of the first bad cell (n, k) of some columns, and the fault in words."""
+        """Refuse bad cells (n, k) of columns; the error has the first place and the fault."""
         if bad.any():
             row, column = np.argwhere(bad)[0]
             raise InputError(f"{self.place(row, columns[column])}: {fault}.")
 
     def refuse_back(self, column: str, bad: NDArray[np.bool_], expected: str, shown: str = "{:.6g} s") -> None:
-        """Raise an InputError for the first pair (n − 1) of successive rows whose values are in a bad order."""
+        """Refuse bad pairs (n − 1) of successive rows; the error has the first place."""
         if bad.any():
             row = int(np.argmax(bad)) + 1
             before, found = self.values[row - 1 : row + 1, self.header.index(column)]
@@ -173,27 +173,27 @@ class Table:
 def read_table(
     path: str | PathLike[str], expected_header: str, *, only: Collection[str] | None = None, instant: Sequence[str] = ()
 ) -> Table:
-    """Table, of one row at least, of a CSV file of numbers; `expected_header` says in words what it should have.
+    """Read a table of at least one row from a CSV file; `expected_header` is for errors.
 
-    ``only``: columns that are read, others may hold anything. ``instant``: a column of ISO 8601 times, UTC unless they
-    say otherwise, or two of dates and of times; the first one becomes seconds since 1970.
+    ``only``: columns to read; others may hold anything. ``instant``: a column of ISO 8601 times, UTC by default, or two
+    columns of dates and of times; the first one becomes seconds since 1970.
     """
     return table_of_text(read_text(path, "a CSV file"), str(path), expected_header, only=only, instant=instant)
 
 
 class Columns(Protocol):
-    """A mapping from names to columns, or a data frame."""
+    """Mapping from names to columns, or a data frame."""
 
     def __iter__(self) -> Iterator[Any]:
-        """Names of the columns."""
+        """Iterate over the names of the columns."""
 
     def __getitem__(self, name: Any, /) -> Any:
-        """A column."""
+        """Return a column."""
 
 
 def table_of_columns(columns: Columns, name: str) -> Table:
-    """Table as of :func:`read_table`, from columns in memory; `name` is what they are called in errors."""
-    # Iterating a frame of polars gives columns, not their names.
+    """Return a table as :func:`read_table` does, from columns in memory; `name` is for errors."""
+    # Iteration over a frame of polars gives columns, not names.
     names = list(getattr(columns, "columns", columns))
     header = tuple(map(str, names))
     values = []
@@ -202,7 +202,7 @@ def table_of_columns(columns: Columns, name: str) -> Table:
             values.append((seconds if str(column).startswith("time") else numbers)(columns[column]))
         except (TypeError, ValueError):
             raise InputError(
-                f"{name}, column {_clipped(column)}: found what is not a number, expected numbers."
+                f"{name}, column {_short_name(column)}: found what is not a number, expected numbers."
             ) from None
     shapes = {column.shape for column in values}
     if len(shapes) != 1 or len(*shapes) != 1 or shapes == {(0,)}:
@@ -225,11 +225,12 @@ def table_of_text(
     ragged: bool = False,
     seconds_of: Callable[[str, str], str] = unix_seconds,
 ) -> Table:
-    """As :func:`read_table`, from text that errors call `name` and whose rows begin at `first_line` of a longer one.
+    """Return a table as :func:`read_table` does, from text; `name` is for errors.
 
-    ``head``: the table whose header the rows have; the text has none then. ``dummy``: words that become `DUMMY`, as
-    ``*`` does. ``ragged``: rows may have more empty cells than the header has columns, or end behind the last column
-    that is read; the last one may be cut. ``seconds_of``: what reads an instant, as :func:`unix_seconds` does.
+    ``first_line``: line of the first row in a longer text. ``head``: table with the header of the rows, for a text
+    without one. ``dummy``: words that become `DUMMY`, as ``*`` does. ``ragged``: rows may have more empty cells than
+    the header has columns, or end behind the last column that is read; the last row may be cut. ``seconds_of``:
+    function that reads an instant, as :func:`unix_seconds` does.
     """
     text = text.replace("\r\n", "\n").replace("\r", "\n")
     if "\0" in text:
@@ -243,7 +244,7 @@ def table_of_text(
         header_line, cells = next(rows, (1, []))
         if not cells:
             raise InputError(f"{name} is empty, expected {expected_header}.")
-        header = _checked_header(f"{name}, line {header_line}", cells, expected_header, separator)
+        header = _check_header(f"{name}, line {header_line}", cells, expected_header, separator)
     # float() would also take 1_000 and digits of other scripts: only text without them may go through it directly.
     read = float if text.isascii() and "_" not in text[text.find("\n") if head is None else 0 :] else _number
     kept = [i for i, column in enumerate(header) if only is None or column in only]
@@ -257,7 +258,7 @@ def table_of_text(
         if wrong:
             raise InputError(wrong)
         if ragged and len(cells) != len(header):
-            cells = _fitted(cells, len(header), last)
+            cells = _fit_row(cells, len(header), last)
         if len(cells) != len(header):
             wrong = f"{name}, line {line}: found {len(cells)} cells, expected {len(header)} as in the header."
             if not ragged:
@@ -287,22 +288,22 @@ def table_of_text(
     return Table(name, chosen, header_line, table, np.array(line_numbers, dtype=np.int64))
 
 
-def _fitted(cells: list[str], n: int, last: int) -> list[str]:
-    """Return a row without empty cells that are too many, or with those that it lacks behind the last one in use."""
+def _fit_row(cells: list[str], n: int, last: int) -> list[str]:
+    """Return a row of the right length: without excess empty cells, or with the missing ones."""
     while len(cells) > n and not cells[-1].strip():
         cells = cells[:-1]
     return cells + [""] * (n - len(cells)) if len(cells) > last + 1 else cells
 
 
 def table_of_header(line: str, name: str, expected_header: str, *, number: int = 1, separator: str = ",") -> Table:
-    """Table without rows from the line that names its columns; `name` and `number` are what errors call it."""
+    """Return a table without rows from its header; `name` and `number` are for errors."""
     _, cells = next(_csv_rows(name, line, separator), (1, [""]))
-    header = _checked_header(f"{name}, line {number}", cells, expected_header, separator)
+    header = _check_header(f"{name}, line {number}", cells, expected_header, separator)
     return Table(name, header, number, np.zeros((0, len(header))), np.zeros(0, dtype=np.int64))
 
 
 def _csv_rows(path: str, text: str, separator: str = ",") -> Iterator[tuple[int, list[str]]]:
-    """Line number and cells of every row that is not blank."""
+    """Yield line number and cells of every row that is not blank."""
     rows = csv.reader(io.StringIO(text), delimiter=separator, skipinitialspace=separator == " ")
     line = 1
     try:
@@ -315,7 +316,7 @@ def _csv_rows(path: str, text: str, separator: str = ",") -> Iterator[tuple[int,
 
 
 def _refuse_preamble(name: str, head: str, separator: str) -> None:
-    """Raise an InputError for lines of text above the first row of names that has a row of numbers below it."""
+    """Refuse lines of text above the header, the first row of names above a row of numbers."""
     rows = itertools.islice(_csv_rows(name, head, separator), _MOST_LINES_ABOVE)
     for k, ((line, names), (_, below)) in enumerate(itertools.pairwise(rows)):
         numbers = sum(map(is_number_or_empty, below))
@@ -328,7 +329,7 @@ def _refuse_preamble(name: str, head: str, separator: str) -> None:
             return
 
 
-def _checked_header(place: str, cells: Sequence[str], expected: str, separator: str) -> tuple[str, ...]:
+def _check_header(place: str, cells: Sequence[str], expected: str, separator: str) -> tuple[str, ...]:
     header = tuple(cell.strip() for cell in cells)
     for other, called in _SEPARATORS.items():
         is_one = len(header) == 1 or (separator == "," and other in ";\t")
@@ -341,13 +342,13 @@ def _checked_header(place: str, cells: Sequence[str], expected: str, separator: 
             found = f"{name!r} in place of a name" if name else "no name"
             raise InputError(f"{place}, column {position}: found {found}, expected {expected}.")
         if name in seen:
-            raise InputError(f"{place}, column {_clipped(name)}: found a second time, expected once.")
+            raise InputError(f"{place}, column {_short_name(name)}: found a second time, expected once.")
         seen.add(name)
     return header
 
 
 def _careful_numbers(place: str, header: Sequence[str], cells: Sequence[str], dummy: Collection[str]) -> list[float]:
-    """Numbers of one row, NaN for empty cells; names the column of a cell that is neither."""
+    """Return the numbers of a row, NaN for empty cells; the error names the column of a bad cell."""
     found_numbers = []
     for name, cell in zip(header, cells, strict=True):
         word = cell.strip()
@@ -359,7 +360,7 @@ def _careful_numbers(place: str, header: Sequence[str], cells: Sequence[str], du
         except ValueError:
             found = repr(cell.strip()[:SHOWN_CHARACTERS])
             raise InputError(
-                f"{place}, column {_clipped(name)}: found {found}, expected a number or an empty cell."
+                f"{place}, column {_short_name(name)}: found {found}, expected a number or an empty cell."
             ) from None
     return found_numbers
 
@@ -372,7 +373,7 @@ def _number(cell: str) -> float:
 
 
 def is_number_or_empty(cell: str) -> bool:
-    """Whether a cell is no word."""
+    """Return whether a cell is a number or empty."""
     try:
         _number(cell)
     except ValueError:
@@ -384,23 +385,23 @@ Column = NDArray[np.float64] | NDArray[np.int64] | NDArray[np.bool_] | Sequence[
 
 
 def write_columns(columns: Mapping[str, Column], path: Path) -> None:
-    """Write columns of equal length as CSV; numbers in full, those that are not finite as empty cells, texts quoted."""
+    """Write columns of equal length as CSV, numbers in full; NaN and infinity are empty cells."""
     write_text("\n".join([*csv_lines(columns), ""]), path)
 
 
 def csv_lines(columns: Mapping[str, Column]) -> list[str]:
-    """Return the header and the rows of columns, as of :func:`write_columns`."""
+    """Return the header and the rows of columns, as :func:`write_columns` writes them."""
     cells = [[_cell(value) for value in column] for column in columns.values()]
     return [",".join(columns), *(",".join(row) for row in zip(*cells, strict=True))]
 
 
 class GrowingTable:
-    """A CSV file that is written row by row, each whole, so that an interruption leaves complete rows.
+    """CSV file that grows by whole rows, so that an interruption leaves complete rows.
 
     Parameters
     ----------
     path : Path
-        Replaced when the first row comes.
+        File; the first row replaces it.
     """
 
     def __init__(self, path: Path) -> None:
@@ -415,7 +416,7 @@ class GrowingTable:
             self._file.close()
 
     def add(self, columns: Mapping[str, Column]) -> None:
-        """Write rows; the names are those of the first ones."""
+        """Write rows; the first rows set the names."""
         header, *rows = csv_lines(columns)
         try:
             if self._file is None:
@@ -427,8 +428,8 @@ class GrowingTable:
             raise OSError(error.errno, error.strerror, str(self._path)) from None
 
 
-def _clipped(name: str) -> str:
-    """Shorten a column's name for a sentence: a header of another separator is one long name."""
+def _short_name(name: str) -> str:
+    """Return a name short enough for a sentence; with a wrong separator a header is one long name."""
     return name if len(name) <= SHOWN_CHARACTERS else f"{name[: SHOWN_CHARACTERS - 1]}…"
 
 

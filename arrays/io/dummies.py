@@ -1,4 +1,4 @@
-"""Dummy values: numbers that a log writes in place of a missing reading, such as -99999, 1e32, or 0 beside 48,000."""
+"""Dummy values: numbers in place of missing readings, such as -99999, 1e32, or 0 beside 48,000."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ _ALONE, _MOST_NEAR = 0.5, 0.02  # share of other readings that are nearer than s
 
 @np.errstate(over="ignore", invalid="ignore")
 def dummy_cells(readings: FloatArray, declared: Sequence[float] = (), units: Sequence[float] = (1.0,)) -> BoolArray:
-    """Return which cells of one sensor's channels (n, k) hold dummy values.
+    """Return a mask of the cells of one sensor's channels (n, k) that hold dummy values.
 
-    Dummies are what is declared; numbers that are known for it (-99999 and other rows of nines, powers of ten from 1e20
-    on), unless other readings are as large; and where nearly all else is far away, zeros and numbers that are repeated.
+    Dummies are declared numbers; known ones (-99999 and other numbers of nines, powers of ten from 1e20 on), unless
+    other readings are as large; and zeros and repeated numbers far from nearly all readings.
 
     Parameters
     ----------
     readings : ndarray, shape (n, k)
-        NaN where there is none.
+        Readings; NaN if missing.
     declared : sequence of float
-        In the unit of the readings.
+        Declared dummies, in the unit of the readings.
     units : sequence of float
-        In which a known number may be written, over the unit of the readings.
+        Units in which a known number may be written, over the unit of the readings.
     """
     cells = np.isin(readings, declared) if len(declared) else np.zeros(readings.shape, np.bool_)
     for own, column in zip(cells.T, np.where(cells, np.nan, readings).T, strict=True):
@@ -45,9 +45,9 @@ def dummy_cells(readings: FloatArray, declared: Sequence[float] = (), units: Seq
 def may_be_dummies(
     readings: FloatArray, n_new: int, declared: Sequence[float] = (), units: Sequence[float] = (1.0,)
 ) -> BoolArray:
-    """Return which channels (k,) may have dummies in the last rows of readings (n, k): a quick bound of `dummy_cells`.
+    """Return a mask of channels (k,) that may have dummies in the last rows; a quick bound.
 
-    A channel whose new cells are neither declared, known, zero nor large numbers that are repeated has none.
+    A channel without declared, known, zero and large repeated numbers in its new cells has none.
     """
     new, size = readings[-n_new:], np.abs(readings)
     found = np.isin(new, declared) | (size[-n_new:] < _SQUARE_VANISHES)
@@ -61,7 +61,7 @@ def may_be_dummies(
 
 
 def _dummy_values(column: FloatArray, units: Sequence[float]) -> FloatArray:
-    """Values of a column (n,), NaN where there is none, that are dummies."""
+    """Return the values of a column (n,) that are dummies."""
     found, counts = np.unique(column[np.isfinite(column)], return_counts=True)
     known = np.zeros(len(found), np.bool_)
     for unit in units:
@@ -84,7 +84,7 @@ def _dummy_values(column: FloatArray, units: Sequence[float]) -> FloatArray:
 
 @np.errstate(over="ignore", invalid="ignore")
 def _is_known(size: FloatArray) -> BoolArray:
-    """Whether magnitudes (...) are numbers that are known for dummies."""
+    """Return a mask of magnitudes (...) that are known dummies."""
     power = 10.0 ** np.round(np.log10(np.maximum(size, 1.0)))
     large = (size >= _LARGE) & (np.abs(size - power) <= 1e-6 * power)
     short = np.zeros(size.shape, np.bool_)

@@ -1,4 +1,4 @@
-"""What is raised for files that cannot be used."""
+"""Errors of bad input, and contexts that name its place."""
 
 from __future__ import annotations
 
@@ -15,14 +15,13 @@ if TYPE_CHECKING:
 
 PACKAGES = ("arrays", "magloc", "adcs", "sims")
 LARGEST = 1e30
-"""Of the numbers in files: more than anything measured, and less than what double precision cannot raise to a power."""
+"""Largest number in files: above all measurements, and its powers stay finite."""
 
 
 class InputError(ValueError):
     """Bad input from outside: a file, a command's option.
 
-    The text is one sentence that names the file, the line or key, what was found and what was expected, fit to be shown
-    to a user as it is.
+    The text is one sentence for users. It names the file, the line or key, the value found and the value expected.
 
     Examples
     --------
@@ -36,9 +35,9 @@ class InputError(ValueError):
 
 
 def own_sentence(error: ValueError) -> str:
-    """Return what the library refuses, without its first word; raise any other error again, no file is to blame for it.
+    """Return the sentence of an error of ours without its first word; raise any other error again.
 
-    NumPy and SciPy raise ValueErrors too, whose words say nothing to a user.
+    ValueErrors of NumPy and SciPy do not help a user.
     """
     text = str(error)
     if not text.startswith(("Input ", "Inputs ")) and type(error).__module__.partition(".")[0] not in PACKAGES:
@@ -48,9 +47,9 @@ def own_sentence(error: ValueError) -> str:
 
 @contextmanager
 def naming(place: str, **others: object) -> Iterator[None]:
-    """Turn what the library refuses into bad input at a place of a file or command.
+    """Turn an error of the library into bad input at a place of a file or command.
 
-    `others` are the places of arguments that come from elsewhere, by their names, the first words of such sentences.
+    `others`: places of arguments from elsewhere, by their names, which are the first words of such sentences.
     """
     try:
         yield
@@ -76,7 +75,7 @@ def naming_options(*names: str) -> Iterator[None]:
 
 @contextmanager
 def of_extra(extra: str, what: str) -> Iterator[None]:
-    """Name the extra that brings what is imported here, for whoever did not install it."""
+    """Turn a failed import into an error that names the extra to install."""
     try:
         yield
     except ModuleNotFoundError:
@@ -84,14 +83,14 @@ def of_extra(extra: str, what: str) -> Iterator[None]:
 
 
 def check_positive(**values: float) -> None:
-    """Raise ValueError for the first of some arguments that is not positive and finite."""
+    """Refuse arguments that are not positive and finite."""
     for name, value in values.items():
         if not 0.0 < value < math.inf:
             raise ValueError(f"Input {name} must be positive and finite; instead received {value}.")
 
 
 def check_not_negative(**values: float) -> None:
-    """Raise ValueError for the first of some arguments that is not 0 or more and finite."""
+    """Refuse arguments that are negative or not finite."""
     for name, value in values.items():
         if not 0.0 <= value < math.inf:
             raise ValueError(f"Input {name} must be 0 or more and finite; instead received {value}.")
@@ -109,7 +108,7 @@ def _vector(name: str, value: ArrayLike) -> FloatArray:
 def _vectors(name: str, values: ArrayLike) -> FloatArray:
     import numpy as np
 
-    # A length of 1 would broadcast to nonsense.
+    # A length of 1 would broadcast silently.
     vectors = np.asarray(values, dtype=np.float64)
     if vectors.ndim == 0 or vectors.shape[-1] != 3:
         raise ValueError(f"Input {name} must have shape (..., 3); instead received shape {vectors.shape}.")

@@ -1,4 +1,4 @@
-"""Names of a package that are loaded when they are first used, so that importing the package costs nothing."""
+"""Names of a package that load at their first use, so that importing the package is fast."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ _tables: list[Mapping[str, str]] = []
 def lazy_names(
     package: str, modules: Mapping[str, str]
 ) -> tuple[Callable[[str], object], Callable[[], list[str]], list[str]]:
-    """``__getattr__``, ``__dir__`` and ``__all__`` of a package, from name to module.
+    """Return ``__getattr__``, ``__dir__`` and ``__all__`` of a package, from name to module.
 
-    ``":module"`` is the module itself, ``"module:other"`` what it names otherwise.
+    ``":module"`` is the module itself, ``"module:other"`` an object with another name.
     """
 
     def getattr_(name: str) -> object:
@@ -40,6 +40,6 @@ def lazy_names(
 
 
 def by_name(where: str) -> Callable[..., Any]:
-    """A function named as ``module:function``: for what stands on a higher floor, such as the figure of a result."""
+    """Return a function by ``module:function``, such as the figure of a result on a higher floor."""
     module, _, name = where.partition(":")
     return getattr(import_module(module), name)

@@ -1,4 +1,4 @@
-"""Folders and files that commands write, whole or not at all, with errors that name the option."""
+"""Output folders and files, written completely or not at all, with errors that name the option."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from arrays.io.closing import uninterrupted
+from arrays.io.closing import delay_signals
 from arrays.io.errors import InputError
 from arrays.io.lazy import by_name
 
@@ -17,7 +17,7 @@ _LOG = logging.getLogger(__name__)
 
 
 def refuse_file(folder: Path | None, option: str) -> None:
-    """Refuse, before long work and without making it, what cannot become a folder; `option` names it in errors."""
+    """Refuse, before long work, a path that cannot become a folder."""
     if folder is None:  # nothing is to be written
         return
     place = folder.absolute()
@@ -37,7 +37,7 @@ def refuse_unwritable(path: Path | None, option: str, suffix: str | None = None)
     if suffix is not None and path.suffix.lower() != suffix:
         raise InputError(f"{option} {path}: found a name that ends with {path.suffix!r}, expected {suffix}.")
     if path.exists() and not path.is_file():
-        return  # a pipe or a terminal: nothing has to be made beside it
+        return  # a pipe or a terminal needs no file beside it
     folder = path.absolute().parent
     if not folder.is_dir():
         raise InputError(f"{option} {path}: found no folder {folder}, expected one.")
@@ -45,7 +45,7 @@ def refuse_unwritable(path: Path | None, option: str, suffix: str | None = None)
 
 
 def refuse_one_for_two(outputs: Mapping[str, Path | None]) -> None:
-    """Refuse outputs, by their options, of which one would replace another."""
+    """Refuse outputs, by their options, with the same path."""
     seen: dict[str, str] = {}
     for option, path in outputs.items():
         if path is None:
@@ -56,10 +56,10 @@ def refuse_one_for_two(outputs: Mapping[str, Path | None]) -> None:
 
 
 def _refuse_closed(folder: Path, wanted: Path, option: str, prefix: str = ".") -> None:
-    """Refuse a folder in which no file can be made: only an attempt tells, of whatever user and file system."""
+    """Refuse a folder in which no file can be made; only an attempt shows it."""
     try:
-        # Of a name that may be too long. An interruption waits, or the file would be left behind.
-        with uninterrupted(), tempfile.NamedTemporaryFile(dir=folder, prefix=prefix, suffix=".tmp"):
+        # The prefix tests the length of the name. An interruption waits, so that no file stays behind.
+        with delay_signals(), tempfile.NamedTemporaryFile(dir=folder, prefix=prefix, suffix=".tmp"):
             pass
     except OSError as error:
         raise InputError(
@@ -69,7 +69,7 @@ def _refuse_closed(folder: Path, wanted: Path, option: str, prefix: str = ".") -
 
 
 def make_folder(folder: Path, option: str) -> None:
-    """Make a folder if it is not there; InputError, with the name of its option, if nothing can be written in it."""
+    """Make a folder if it does not exist; refuse one in which nothing can be written."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError):
@@ -80,7 +80,7 @@ def make_folder(folder: Path, option: str) -> None:
 
 
 def write_files(folder: Path | None, files: Iterable[tuple[str, Any]], option: str = "--out") -> None:
-    """Write files by their names into a folder, as :func:`write_file`, and log the names; nothing without a folder."""
+    """Write files by their names into a folder, if there is one, and log the names."""
     if folder is None:
         return
     make_folder(folder, option)
@@ -92,7 +92,7 @@ def write_files(folder: Path | None, files: Iterable[tuple[str, Any]], option: s
 
 
 def write_file(content: Any, path: Path) -> None:
-    """Write a file whole or not at all.
+    """Write a file completely or not at all.
 
     A figure becomes a PNG file, a mapping of columns a CSV file, a dataset a netCDF file, a string a text file.
     Anything else is called with the path.
@@ -113,7 +113,7 @@ def write_file(content: Any, path: Path) -> None:
 
 
 def installed_version() -> str:
-    """Version of the package that holds the command lines."""
+    """Return the version of the package with the command lines."""
     from importlib import metadata
 
     try:

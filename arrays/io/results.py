@@ -1,4 +1,4 @@
-"""Results: what each can do, and its quantities, declared once with their units."""
+"""Base classes of results, and their quantities with units."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MOST_SHOWN = 10
-"""Rows of a long result in its representation: the first and the last ones."""
+"""Number of rows that the representation of a long result shows."""
 
 
 class Quantity(NamedTuple):
-    """A quantity of a result.
+    """Quantity of a result.
 
     Attributes
     ----------
     unit : str
-        As CF writes it.
+        Unit, as in the CF conventions.
     description : str
     dimensions : tuple of str
-        Beyond that of the rows.
+        Dimensions after that of the rows.
     """
 
     unit: str
@@ -41,12 +41,12 @@ class Quantity(NamedTuple):
 
 
 class Drawn:
-    """A result with a figure.
+    """Result with a figure.
 
     Attributes
     ----------
     figure : str
-        Function that draws the result, as ``module:function``: it stands on a higher floor.
+        Function that draws the result, as ``module:function``, on a higher floor.
     """
 
     figure: ClassVar[str]
@@ -57,7 +57,7 @@ class Drawn:
 
 
 class Result(Drawn, ABC):
-    """A result as text, as a figure, and as tables for other programs.
+    """Result as text, as a figure, and as tables for other programs.
 
     Attributes
     ----------
@@ -88,7 +88,7 @@ class Result(Drawn, ABC):
 
     @property
     def about(self) -> dict[str, str]:
-        """Frame, and the version and the command that the result is from."""
+        """Frame, version and command of the result."""
         from arrays.io.outputs import installed_version
 
         return {"frame": self.frame, "source": f"magloc {installed_version()}, {self.command}"}

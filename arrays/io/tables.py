@@ -1,4 +1,4 @@
-"""Tables for people: aligned, with as many digits as standard deviations leave."""
+"""Text tables, align, with the significant digits of their standard deviations."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _FINEST, _LARGEST_TENS = 9, 1e7
 def by_sigma(value: float, sigma: float) -> tuple[str, str]:
     """Format a value and its standard deviation, to two significant digits of the latter.
 
-    Where there is none, because it is zero, infinite or unknown, the value has six digits.
+    If it is zero, infinite or unknown, the value has six digits.
 
     Examples
     --------
@@ -31,8 +31,8 @@ def by_sigma(value: float, sigma: float) -> tuple[str, str]:
     return f"{round(value, decimals) + 0.0:.{shown}f}", f"{rounded:.{shown}f}"
 
 
-def aligned(rows: Sequence[Sequence[str]], left: int = 0) -> list[str]:
-    """Align the cells of a table to the right, the first `left` ones to the left; the last of a row stands as it is."""
+def align(rows: Sequence[Sequence[str]], left: int = 0) -> list[str]:
+    """Align the cells of a table to the right, the first `left` ones to the left, the last not at all."""
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]) - 1)]
     lines = []
     for row in rows:

@@ -18,18 +18,18 @@ if TYPE_CHECKING:
 
 
 MOST_BYTES, MOST_PIPED_BYTES = 4 * 10**9, 10**9
-"""Bytes that are read of a file, and of what is none, such as a pipe or a device, which need not end."""
+"""Largest number of bytes of a file, and of a pipe or device, which may not end."""
 LONGEST_LINE = 2**26
-"""Bytes of a pipe or device without the end of a line."""
+"""Largest number of bytes of a line in a pipe or device."""
 _CHUNK = 2**24
 UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
-"""First bytes of a text of two bytes a character."""
+"""First bytes of a text in UTF-16."""
 
 
 def read_bytes(path: str | PathLike[str], expected: str, *, text: bool = False) -> bytes:
-    """Return the content of a file; `expected` says in words what it should be.
+    """Return the content of a file; `expected` describes it in errors.
 
-    Of `text` nothing is read behind a NUL byte, which no text has.
+    ``text``: stop behind a NUL byte, which no text has.
     """
     try:
         with Path(path).open("rb", buffering=0) as file:
@@ -63,9 +63,9 @@ def read_bytes(path: str | PathLike[str], expected: str, *, text: bool = False) 
 
 
 def read_text(path: str | PathLike[str], expected: str, encoding: str | None = None) -> str:
-    """Return the text of a file, as :func:`read_bytes`.
+    """Return the text of a file, as :func:`read_bytes` does.
 
-    It is UTF-8, with or without a byte order mark, or UTF-16 with one, unless an `encoding` is stated.
+    Without an `encoding` it is UTF-8, with or without a byte order mark, or UTF-16 with one.
     """
     data = read_bytes(path, expected, text=not (encoding or "").lower().startswith(("utf-16", "utf_16", "utf16")))
     used = "utf-16" if data.startswith(UTF_16) else encoding or "utf-8-sig"
@@ -82,9 +82,9 @@ def read_text(path: str | PathLike[str], expected: str, encoding: str | None = N
 
 @contextmanager
 def replaced(path: str | PathLike[str]) -> Iterator[Path]:
-    """Where to write a file that replaces another, or the target of a link, in one step: none sees half of it, ever.
+    """Yield the path of a temporary file, which replaces the target in one step at the end.
 
-    What cannot be replaced, such as a pipe or a terminal, is written in place. An OSError names the path.
+    Pipes and terminals are written in place. An OSError names the path.
     """
     target = Path(path)
     in_place = target.exists() and not target.is_file()
@@ -104,13 +104,13 @@ def replaced(path: str | PathLike[str]) -> Iterator[Path]:
 
 
 def write_text(text: str, path: str | PathLike[str]) -> None:
-    """Write a UTF-8 file, whole or not at all."""
+    """Write a UTF-8 file, completely or not at all."""
     with replaced(path) as written:
         written.write_text(text, encoding="utf-8", newline="\n")
 
 
 def replace_file(path: str | PathLike[str], write: Callable[[Path], object]) -> None:
-    """Have a file written, whole or not at all; InputError if it cannot be."""
+    """Write a file by a function, completely or not at all."""
     try:
         with replaced(path) as written:
             write(written)
@@ -119,12 +119,12 @@ def replace_file(path: str | PathLike[str], write: Callable[[Path], object]) -> 
 
 
 def check_netcdf() -> None:
-    """Refuse to go on, before long work, where no netCDF file can be written."""
+    """Refuse, before long work, netCDF files without the package that writes them."""
     with of_extra("maps", "a netCDF file"):
         import netCDF4  # noqa: F401
 
 
 def write_netcdf(dataset: xr.Dataset, path: Path) -> None:
-    """Write a netCDF file, whole or not at all."""
+    """Write a netCDF file, completely or not at all."""
     check_netcdf()
     replace_file(path, lambda unfinished: dataset.to_netcdf(unfinished))

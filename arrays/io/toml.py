@@ -1,9 +1,9 @@
-"""TOML files: one strict reader that makes typed structs of them, with errors that name the file, table and key.
+"""Strict reader of TOML files into typed structs, with errors that name file, table and key.
 
-A kind of file is a :class:`File` with a field for every key, units in the names, and in it fields that are a
-:class:`Table`, a list or a dict of them. What a type cannot say of a value stands beside it (``radius_m: Positive``,
-``kind: Annotated[str, one_of(KINDS)]``), what holds between keys in :meth:`Table.check`. Numbers with a fraction are
-read as Decimal, so that whoever converts a unit can do it without rounding.
+A kind of file is a :class:`File` with a field for every key, units in the names. Tables are fields of type
+:class:`Table`, or lists or dicts of it. Rules beside the type restrict a value (``radius_m: Positive``,
+``kind: Annotated[str, one_of(KINDS)]``); :meth:`Table.check` tests relations between keys. Numbers with a fraction are
+read as Decimal, so that units convert without rounding.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _Any = TypeVar("_Any")
 
 @dataclass(frozen=True)
 class Rule:
-    """What a text, or every number of a value, must be; numbers are finite unless the rule lets them be infinite."""
+    """Rule for a text, or for every number of a value; numbers are finite unless it allows more."""
 
     holds: Callable[[Any], bool]
     expected: str
@@ -42,7 +42,7 @@ class Rule:
 
 
 def date_such_as(example: str) -> Rule:
-    """A date, in quotation marks or not; it is read as text."""
+    """Return the rule of a date, with or without quotation marks, which is read as text."""
     return Rule(_is_date, example, is_date=True)
 
 
@@ -55,7 +55,7 @@ def _is_date(text: str) -> bool:
 
 
 def one_of(names: Collection[str], expected: str = "") -> Rule:
-    """A text must be one of some names."""
+    """Return the rule of a text that is one of some names."""
     return Rule(lambda value: value in names, expected or f"one of {', '.join(names)}")
 
 
@@ -65,29 +65,29 @@ MAY_BE_INFINITE = Rule(lambda _: True, "", may_be_infinite=True)
 _VERSION = Rule(lambda value: value == FORMAT_VERSION, str(FORMAT_VERSION))
 Positive = Annotated[float, POSITIVE]
 Rate = Annotated[float, Rule(lambda value: value >= 1.0 / LARGEST, f"a positive rate, {1.0 / LARGEST:g} at least")]
-"""Positive, and no time divided by it is infinite."""
+"""Positive number by which times can be divided."""
 NotNegative = Annotated[float, NOT_NEGATIVE]
 
 
 class RefusalError(ValueError):
-    """Something is wrong with the value of a key, or with a table: the key or "", what was found and expected."""
+    """Invalid value of a key or table: the key or "", and a sentence with found and expected."""
 
 
 class Table(msgspec.Struct, kw_only=True):
-    """A table of a file."""
+    """Table of a file."""
 
     is_inline: ClassVar[bool] = False
-    """Whether errors name its keys ``table.key``, as of the file that it stands in."""
+    """True if errors name its keys ``table.key`` of the file."""
 
     floats_may_be_infinite: ClassVar[bool] = False
-    """Whether whoever uses the floats refuses those that are not finite."""
+    """True if the user of the floats refuses infinite ones."""
 
     def check(self) -> None:
-        """Raise a :class:`RefusalError` if its values do not fit each other."""
+        """Raise a :class:`RefusalError` if its values contradict each other."""
 
 
 class File(Table, kw_only=True):
-    """A whole file."""
+    """Complete file."""
 
     format_version: Annotated[int, _VERSION] = FORMAT_VERSION
 
@@ -97,7 +97,7 @@ AnyTable = TypeVar("AnyTable", bound=Table)
 
 @dataclass(frozen=True)
 class BuiltIn:
-    """Files of one kind that come with a package, in a folder of it: NAME and how their names end."""
+    """Built-in files of one kind, in a folder of a package."""
 
     package: str
     folder: str
@@ -105,33 +105,33 @@ class BuiltIn:
     ending: str = ".toml"
 
     def names(self) -> tuple[str, ...]:
-        """Of the files."""
+        """Return the names of the files."""
         return tuple(sorted(path.name.removesuffix(self.ending) for path in self._folder().glob(f"*{self.ending}")))
 
     def path(self, name: str) -> Path:
-        """Of the file of a name."""
+        """Return the path of the file of a name."""
         return self._folder() / f"{name}{self.ending}"
 
     def chosen(self, name: str) -> Path:
-        """Of the file of a name; InputError where there is none."""
+        """Return the path of the file of a name; refuse unknown names."""
         if name not in self.names():
             raise InputError(f"Input name must be one of {', '.join(self.names())}; instead received {name!r}.")
         return self.path(name)
 
     def _folder(self) -> Path:
-        from importlib import resources  # of some milliseconds, which an array's file does not need
+        from importlib import resources  # slow to import, and an array's file does not need it
 
         return Path(str(resources.files(self.package) / self.folder))
 
     def read(self, name_or_path: str) -> tuple[str, dict[str, Any]]:
-        """Path and table of a built-in file or one of the user's."""
+        """Return path and table of a built-in file or of a user's file."""
         names = self.names()
         path = str(self.path(name_or_path)) if name_or_path in names else name_or_path
         return path, read_toml(path, f"a {self.called} file, or one of the built-in {self.called}s {', '.join(names)}")
 
 
 def read_toml(path: str | PathLike[str], expected: str) -> dict[str, Any]:
-    """Table of a TOML file, fractional numbers as Decimal; `expected` says in words what it should be, for errors."""
+    """Read the table of a TOML file, fractions as Decimal; `expected` describes it in errors."""
     text = read_text(path, expected)
     try:
         return tomllib.loads(text, parse_float=Decimal)
@@ -147,13 +147,13 @@ def read_toml(path: str | PathLike[str], expected: str) -> dict[str, Any]:
 
 
 def in_si(key: str) -> tuple[str, int]:
-    """What a key is called in SI, and by which power of ten its number is larger than there: nT and mrad."""
+    """Return the SI name of a key, and the power of ten of its unit: 9 for nT, 3 for mrad."""
     exponent = 9 if "nT" in key else 3 if "mrad" in key else 0
     return key.replace("nT", "T").replace("mrad", "rad"), exponent
 
 
 def check_keys(place: str, table: Mapping[str, Any], known: Collection[str], what: str = "key") -> None:
-    """Refuse a table with a key that is not known, naming the nearest one that is."""
+    """Refuse unknown keys of a table; the error has the nearest known key."""
     for key in table:
         if key not in known:
             nearest = difflib.get_close_matches(key, sorted(known), n=1, cutoff=0.0)[0]
@@ -177,7 +177,7 @@ _TYPES = {
 
 
 def key_place(place: str, key: str, what: str = "key") -> str:
-    """Where a key is: of a place that ends with a stop, as of an inline table, in one word with it."""
+    """Return the place of a key, for an error; a place that ends with a dot is an inline table."""
     return f"{place}{key}" if place.endswith(".") else f"{place}, {what} {key}"
 
 
@@ -186,14 +186,14 @@ def _within(place: str) -> str:
 
 
 def section_of(place: str, table: dict[str, Any], struct: type[AnyTable]) -> AnyTable:
-    """The struct that a table of :func:`read_toml` and those in it describe; InputError says where and why not."""
+    """Return the struct of a table from :func:`read_toml`, with the tables in it."""
     fields = _fields(struct)
     check_keys(place, table, fields)
     read = {key: _with_tables(place, struct, key, value, fields[key][1]) for key, value in table.items()}
     for key, value in table.items():
         if isinstance(value, datetime.date) and any(rule.is_date for rule in fields[key][0]):
             read[key] = value.isoformat()
-    result = _converted(place, read, struct)
+    result = _convert(place, read, struct)
     for key, (rules, _) in fields.items():
         for value in _values(getattr(result, key)):
             if not (struct.floats_may_be_infinite and isinstance(value, float)):
@@ -207,7 +207,7 @@ def section_of(place: str, table: dict[str, Any], struct: type[AnyTable]) -> Any
 
 
 def named_section(place: str, table: dict[str, Any], key: str, structs: Mapping[str, type[AnyTable]]) -> AnyTable:
-    """A table as the struct that it names under a key."""
+    """Return a table as the struct that a key of it names."""
     if key not in table:
         raise InputError(f"{place}: found no key {key}, expected one of {', '.join(structs)}.")
     name = table[key]
@@ -217,7 +217,7 @@ def named_section(place: str, table: dict[str, Any], key: str, structs: Mapping[
 
 
 def _check_value(where: str, value: Any, rules: tuple[Rule, ...]) -> None:
-    # A Decimal may be finite and beyond every float: its unit is not what it will have.
+    # A Decimal may be finite and beyond every float, because its unit changes later.
     is_finite = (
         value.is_finite() if isinstance(value, Decimal) else isinstance(value, int | str) or math.isfinite(value)
     )
@@ -234,7 +234,7 @@ def _check_value(where: str, value: Any, rules: tuple[Rule, ...]) -> None:
 
 
 def _values(value: Any) -> Iterator[float | str | Decimal]:
-    """The texts and numbers of a value."""
+    """Yield the texts and numbers of a value."""
     if isinstance(value, int | float | str | Decimal):
         yield value
     elif isinstance(value, list | tuple):
@@ -244,29 +244,29 @@ def _values(value: Any) -> Iterator[float | str | Decimal]:
 
 @cache
 def _fields(struct: type[Table]) -> dict[str, tuple[tuple[Rule, ...], Any]]:
-    """Rules of every key, and the type of its value if there are tables in it."""
+    """Return the rules of every key, and the type of its value if it contains tables."""
     hints = get_type_hints(struct, include_extras=True)
-    return {key: (tuple(_found(hints[key], Rule)), _with_tables_in(hints[key])) for key in struct.__struct_fields__}
+    return {key: (tuple(_extras(hints[key], Rule)), _with_tables_in(hints[key])) for key in struct.__struct_fields__}
 
 
-def _found(hint: Any, kind: type[_Any]) -> Iterator[_Any]:
-    """What stands beside a type, or one of its alternatives."""
+def _extras(hint: Any, kind: type[_Any]) -> Iterator[_Any]:
+    """Yield the annotations of a type and of its alternatives."""
     if get_origin(hint) is Annotated:
         yield from (extra for extra in hint.__metadata__ if isinstance(extra, kind))
     elif get_origin(hint) is not dict:
         for argument in get_args(hint):
-            yield from _found(argument, kind)
+            yield from _extras(argument, kind)
 
 
 def _with_tables_in(hint: Any) -> Any:
-    """A kind of table, or a list or dict of one, among the alternatives of a type."""
+    """Return a table type, or a list or dict of one, among the alternatives of a type."""
     if (isinstance(hint, type) and issubclass(hint, Table)) or get_origin(hint) in (list, dict):
         return hint if get_origin(hint) is None or _with_tables_in(get_args(hint)[-1]) else None
     return next(filter(None, map(_with_tables_in, get_args(hint))), None)
 
 
 def _with_tables(place: str, struct: type[Table], key: str, value: Any, type_: Any) -> Any:
-    """A value with structs in place of the tables in it; one of another type is the type check's to refuse."""
+    """Return a value with structs in place of its tables; a later check refuses other types."""
     container = get_origin(type_) or type_
     if container is list and isinstance(value, list):
         (table,) = get_args(type_)
@@ -280,11 +280,11 @@ def _with_tables(place: str, struct: type[Table], key: str, value: Any, type_: A
 
 
 def _item(place: str, item: Any, table: type[AnyTable]) -> AnyTable:
-    return section_of(place, _converted(place, item, dict), table)
+    return section_of(place, _convert(place, item, dict), table)
 
 
 def item_place(place: str, key: str, i: int, item: Any, table: type[Table]) -> str:
-    """Where a table of a list is: by its number, or by its id if it has one that can be shown."""
+    """Return the place of a table in a list, for an error: its id or its number."""
     if "id" not in table.__struct_fields__:
         return f"{place}, {key} {i + 1}"
     name = item.get("id") if isinstance(item, dict) else None
@@ -292,8 +292,8 @@ def item_place(place: str, key: str, i: int, item: Any, table: type[Table]) -> s
     return f"{place}, {key} {name}" if usable else f"{place}, {key} number {i + 1}"
 
 
-def _converted(place: str, table: Any, type_: type[_Any]) -> _Any:
-    """A table as a struct of the right types."""
+def _convert(place: str, table: Any, type_: type[_Any]) -> _Any:
+    """Return a table as a struct of the right types."""
     try:
         return msgspec.convert(table, type_, builtin_types=(Decimal,))
     except msgspec.ValidationError as error:

@@ -1,4 +1,4 @@
-"""Numbers, times and random arguments as callers hand them over: masked arrays, dates, durations, generators."""
+"""Numbers, times and random arguments of callers: masked arrays, dates, durations, generators."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 from arrays.io.errors import InputError
 
 SHOWN_CHARACTERS = 40
-"""Of a cell, in a sentence."""
+"""Largest number of characters of a cell in an error."""
 LARGEST_T = 1e6
-"""Readings beyond it are those of something else, or of a broken line."""
+"""Largest modulus of a reading [T]; larger numbers are no fields."""
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -26,7 +26,7 @@ _R = TypeVar("_R")
 
 
 def numbers(values: ArrayLike) -> FloatArray:
-    """Return values as numbers, NaN where a masked array has a mask; TypeError for dates and durations."""
+    """Return values as numbers, masked ones as NaN; TypeError for dates and durations."""
     import numpy as np
 
     mask = np.ma.getmask(values)
@@ -39,7 +39,7 @@ def numbers(values: ArrayLike) -> FloatArray:
 
 
 def fields(values_T: ArrayLike) -> FloatArray:
-    """Return readings of fields [T] as numbers, NaN where they are beyond all magnets and what can be squared."""
+    """Return readings of fields [T] as numbers; NaN beyond the largest field."""
     import numpy as np
 
     given = numbers(values_T)
@@ -49,10 +49,9 @@ def fields(values_T: ArrayLike) -> FloatArray:
 
 
 def seconds(times: ArrayLike, *, name: str = "time_s", dates: bool = True) -> FloatArray:
-    """Return times as seconds, NaN where there is none.
+    """Return times as seconds, missing ones as NaN.
 
-    Durations (timedelta64) count as such. Dates (datetime64, UTC) count from 1970; without `dates` they are refused,
-    as where times count from an instant of their own.
+    Durations (timedelta64) become seconds. Dates (datetime64, UTC) count from 1970; without `dates` they are refused.
     """
     import numpy as np
 
@@ -70,7 +69,7 @@ def seconds(times: ArrayLike, *, name: str = "time_s", dates: bool = True) -> Fl
 
 
 def _of_object(time: Any) -> Any:
-    """Return a date or duration of Python or pandas as one of NumPy; anything else as it is."""
+    """Return a date or duration of Python or pandas as NumPy's; anything else unchanged."""
     import numpy as np
 
     if isinstance(time, datetime.timedelta):
@@ -81,7 +80,7 @@ def _of_object(time: Any) -> Any:
 
 
 def unix_seconds(place: str, cell: str) -> str:
-    """Seconds since 1970 of an instant, as text; 2026/11/21T7:00:00 is taken too."""
+    """Return the seconds since 1970 of an instant, as text; also of 2026/11/21T7:00:00."""
     try:
         instant = datetime.datetime.fromisoformat(re.sub(r"T(?=\d:)", "T0", cell.strip().replace("/", "-")))
     except ValueError:

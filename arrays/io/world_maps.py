@@ -1,4 +1,4 @@
-"""What maps of the world read: GeoJSON (RFC 7946) and KML, of places east, north, up of an origin."""
+"""Maps of the world, GeoJSON (RFC 7946) and KML, of positions east, north, up of an origin."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ from arrays.io.errors import of_extra
 from arrays.typing import FloatArray, Vector
 
 FARTHEST_M = 1e5
-"""From the origin of a local frame: beyond it neither a plane Earth nor single centimetres of a track hold."""
+"""Largest distance from the origin of a local frame [m], for a plane Earth."""
 
 
 def world_place(position_m: FloatArray, origin: Vector) -> list[float]:
-    """Longitude, latitude [deg] and height [m] of a position (3,); `origin` has latitude, longitude, height.
+    """Return longitude, latitude [deg] and height [m] of a position (3,).
 
-    Raises ValueError for what is no place near the origin, such as coordinates of a grid.
+    ``origin``: latitude, longitude [deg] and height [m]. Raises ValueError far from the origin, as for grid
+    coordinates.
     """
     check_near(float(np.linalg.norm(position_m)))
     with of_extra("geo", "a map of the world"):
@@ -29,7 +30,7 @@ def world_place(position_m: FloatArray, origin: Vector) -> list[float]:
 
 
 def check_near(farthest_m: float) -> None:
-    """Refuse places that lie so far from the origin of a local frame."""
+    """Refuse positions too far from the origin of a local frame."""
     if not farthest_m <= FARTHEST_M:
         raise ValueError(
             f"Input places must lie within {FARTHEST_M / 1e3:.0f} km of the origin of their frame, which is put at one"
@@ -39,17 +40,17 @@ def check_near(farthest_m: float) -> None:
 
 
 def feature(kind: str, coordinates: Sequence[Any], properties: Mapping[str, Any]) -> dict[str, Any]:
-    """A feature of GeoJSON: "Point" with one place, "LineString" with several."""
+    """Return a feature of GeoJSON: "Point" with one place, "LineString" with several."""
     return {"type": "Feature", "geometry": {"type": kind, "coordinates": coordinates}, "properties": dict(properties)}
 
 
 def feature_collection(features: Iterable[dict[str, Any]]) -> dict[str, Any]:
-    """A file of GeoJSON."""
+    """Return a file of GeoJSON."""
     return {"type": "FeatureCollection", "features": list(features)}
 
 
 def placemark(name: str, words: str, places: Sequence[Sequence[float]]) -> str:
-    """A placemark of KML, clamped to the ground: a point at one place, a line along several."""
+    """Return a placemark of KML on the ground: a point, or a line through several places."""
     kind = "Point" if len(places) == 1 else "LineString"
     text = " ".join(f"{longitude:.9f},{latitude:.9f}" for longitude, latitude, *_ in places)
     return (
@@ -59,6 +60,6 @@ def placemark(name: str, words: str, places: Sequence[Sequence[float]]) -> str:
 
 
 def kml(placemarks: Iterable[str]) -> str:
-    """A file of KML."""
+    """Return a file of KML."""
     head = '<?xml version="1.0" encoding="UTF-8"?>\n<kml xmlns="http://www.opengis.net/kml/2.2"><Document>'
     return "\n".join([head, *placemarks, "</Document></kml>", ""])

@@ -1,1 +1,1 @@
-"""Logs of other programs: their text, clocks and places become the columns of a readings file."""
+"""Logs of other programs, converted to the columns of a readings file."""

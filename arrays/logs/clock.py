@@ -1,4 +1,4 @@
-"""Clocks of logs: instants, dates of either order, times of day, and stamps of whole seconds."""
+"""Clocks of logs: instants, dates, times of day, and stamps of whole seconds."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _DAY_S = 86400.0
 
 
 def seconds_of_cell(place: str, cell: str, columns: LogColumns) -> str:
-    """Return the seconds of an instant, since 1970, or of a time of day, since midnight, as text."""
+    """Return seconds since 1970 of an instant, or since midnight of a time of day, as text."""
     text = cell.strip()
     if found := _TIME_OF_DAY.fullmatch(text):
         hours, minutes, seconds = int(found[1]), int(found[2]), float((found[3] or "0").replace(",", "."))
@@ -38,7 +38,7 @@ def seconds_of_cell(place: str, cell: str, columns: LogColumns) -> str:
 
 
 def seconds_of_rows(table: Table, columns: LogColumns, *, is_file: bool) -> FloatArray:
-    """Return the times (n,) [s] of the rows of a log; those of a file may pass midnight, and share whole seconds."""
+    """Return the times (n,) [s] of the rows of a log, which may pass midnight or share seconds."""
     name = columns.clock[0]
     stamps = table.complete([name])[:, 0]
     if columns.time_unit == "hhmmss":
@@ -68,7 +68,7 @@ def seconds_of_rows(table: Table, columns: LogColumns, *, is_file: bool) -> Floa
 
 
 def _spread(time_s: FloatArray) -> FloatArray | None:
-    """Return times of rows at equal steps within their second, None unless most are of whole seconds that rows share.
+    """Return times at equal steps within each second; None unless most rows share whole seconds.
 
     The first second may have begun before its first row, and the last one goes on: their rows have the usual step.
     """

@@ -1,4 +1,4 @@
-"""How the text of a readings file, or of a log, becomes a table, and which of its numbers are dummies."""
+"""Format of a readings file or a log: conversion to a table, and dummy values."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ _FEW_ROWS = 20  # whose cells are screened before columns are
 
 @dataclass(frozen=True)
 class LogFormat:
-    """How the text of a readings file, or of a log, becomes a table with the names and units of a readings file.
+    """Conversion of the text of a readings file, or of a log, to a table of a readings file.
 
     Attributes
     ----------
     channels : dict
         Columns of a readings file for every sensor, by its id.
     columns : LogColumns, optional
-        Of a log; None: of a readings file.
+        Columns of a log; None for a readings file.
     expected : str
-        What the header should have, in words.
+        Description of the header, for errors.
     others : collection of str
-        Further columns of a readings file that are taken as they are.
+        Other columns of a readings file, which are not converted.
     """
 
     channels: Mapping[str, Sequence[str]]
@@ -48,22 +48,22 @@ class LogFormat:
 
     @property
     def separator(self) -> str:
-        """Between the cells of a row."""
+        """Separator of the cells in a row."""
         return "," if self.columns is None else SEPARATORS[self.columns.separator]
 
     @property
     def encoding(self) -> str | None:
-        """Of the text, where it is stated."""
+        """Stated encoding of the text."""
         return None if self.columns is None else self.columns.encoding
 
     def begins(self, line: str) -> bool:
-        """Whether a line names columns, the time among them."""
+        """Return whether a line names columns, including the time."""
         if self.columns is None:
             return "time_s" in line
         return self.columns.clock[0] in cells_of(line, self.columns)
 
     def clock(self, header: str) -> Callable[[str], float]:
-        """What tells the time [s] of a row below a header; ValueError or IndexError where it has none."""
+        """Return a function of the time [s] of a row; ValueError or IndexError for a row without one."""
         columns = self.columns
         if columns is None:
             names = [cell.strip().strip('"') for cell in header.split(",")]
@@ -82,17 +82,17 @@ class LogFormat:
         return seconds
 
     def header(self, line: str, name: str, number: int) -> Table:
-        """Table without rows, as the log names its columns, from its first line."""
+        """Return a table without rows, with the names of the log, from its first line."""
         if self.columns is None:
             return table_of_header(line, name, self.expected, number=number)
         text = self.separator.join(cells_of(line, self.columns))
         return table_of_header(text, name, self.expected, number=number, separator=self.separator)
 
     def table(self, text: str, name: str, *, first_line: int | None = None, head: Table | None = None) -> Table:
-        """Table of a text; rows that begin at a line below a header `head` have none of their own."""
+        """Return the table of a text; with `head` the text has no header of its own."""
         if self.columns is None:
             return table_of_text(text, name, self.expected, first_line=first_line, head=head)
-        return self.translated(self.table_of_log(text, name, self.columns, first_line=first_line, head=head))
+        return self.translate(self.table_of_log(text, name, self.columns, first_line=first_line, head=head))
 
     def table_of_log(
         self, text: str, name: str, columns: LogColumns, *, first_line: int | None = None, head: Table | None = None
@@ -123,7 +123,7 @@ class LogFormat:
         return replace(table, header_line=line)
 
     def _is_time(self, cells: list[str]) -> bool:
-        """Whether one of a row's cells may be an instant."""
+        """Return whether one of a row's cells may be an instant."""
         assert self.columns is not None
         for cell in cells:
             try:
@@ -133,8 +133,8 @@ class LogFormat:
             return True
         return False
 
-    def translated(self, logged: Table) -> Table:
-        """The table with the names and units of a readings file."""
+    def translate(self, logged: Table) -> Table:
+        """Return the table with the names and units of a readings file."""
         columns = self.columns
         if columns is None:
             return logged
@@ -204,24 +204,24 @@ def log_origin(path: str | PathLike[str], columns: LogColumns) -> Vector:
 
 
 READINGS_FILE = LogFormat({}, None, "", ())
-"""Of a readings file, of whatever sensors."""
+"""Format of a readings file of any sensors."""
 
 
 def without_dummies(
     table: Table, form: LogFormat, name: Callable[[str, int], None] | None = None, before: FloatArray | None = None
 ) -> Table:
-    """Return a table of readings with NaN in place of dummy values, which are counted and named.
+    """Return a table of readings with NaN in place of dummy values, and report their numbers.
 
     Parameters
     ----------
     table : Table
-        With the columns of a readings file.
+        Table with the columns of a readings file.
     form : LogFormat
-        Its sensors, and which dummies are declared.
+        Sensors, and declared dummies.
     name : callable, optional
-        Called with a sentence and the number of dummies; by default a warning is logged.
+        Called with a sentence and the number of dummies; by default the sentence is logged as a warning.
     before : ndarray, shape (m, columns), optional
-        Rows that came before.
+        Earlier rows.
     """
     columns = form.columns or LogColumns()
     declared = [columns.unit_nT * each for each in columns.dummy if not isinstance(each, str)]

@@ -1,4 +1,4 @@
-"""Lines of a log: which one is the header, and which ones below it are no rows."""
+"""Lines of a log: the header, and lines below it that are no rows."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from arrays.io.errors import InputError
 
 _LOG = logging.getLogger(__name__)
 _MOST_LINES_ABOVE = 1000
-_NOT_WORDS = "(?!N/?A)"  # "#N/A" is a missing cell and no remark
+_NOT_WORDS = "(?!N/?A)"  # "#N/A" is a missing cell, not a comment
 
 
 def cells_of(line: str, columns: LogColumns) -> list[str]:
-    """Return the cells of a line that may name columns, without a mark of comments and empty cells at its end."""
+    """Return the cells of a header line, without a comment mark and empty cells at the end."""
     separator = SEPARATORS[columns.separator]
     text = line.strip(" \r\n" if separator == "\t" else " \t\r\n").removeprefix("\ufeff")
     for mark in columns.comment:
@@ -44,9 +44,10 @@ def without_empty_end(cells: list[str]) -> list[str]:
 def header_and_rows(
     text: str, name: str, columns: LogColumns, wanted: Sequence[str], is_time: Callable[[list[str]], bool]
 ) -> tuple[Table, str]:
-    """Return the table of a log's header, the first line with all wanted columns, and the text of the rows below it.
+    """Return the table of a log's header, and the text of the rows below it.
 
-    Lines of that text that are no rows are empty, so that the others keep their numbers.
+    The header is the first line with all wanted columns. Other lines than rows are emptied, so that rows keep their
+    line numbers.
     """
     number, header, start = _header(text, name, columns, wanted)
     rows = text[start:]
@@ -69,7 +70,7 @@ def header_and_rows(
 
 
 def _header(text: str, name: str, columns: LogColumns, wanted: Sequence[str]) -> tuple[int, tuple[str, ...], int]:
-    """Return the number of the header's line, its cells, and where the next line begins."""
+    """Return line number and cells of the header, and the begin of the next line."""
     best: tuple[int, int, str] = (-1, 1, "")
     start = 0
     for number, line in enumerate(itertools.islice(_lines(text), _MOST_LINES_ABOVE), start=1):
@@ -105,6 +106,6 @@ def _lines(text: str) -> Iterator[str]:
 
 
 def _are_units(cells: list[str], header: Sequence[str], is_time: Callable[[list[str]], bool]) -> bool:
-    """Whether the first row below a header has no number and no time."""
+    """Return whether the first row below a header has no number and no time."""
     is_row = any(map(is_number_or_empty, filter(None, cells)))
     return len(cells) <= len(header) and not is_row and not is_time(cells)

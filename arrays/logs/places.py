@@ -1,4 +1,4 @@
-"""Places and attitudes of a log in the world frame."""
+"""Positions and attitudes of a log in the world frame."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _RIM_deg = 1.0  # a system is of use a little beyond its area
 
 
 def positions(table: Table, columns: LogColumns, *, is_file: bool) -> FloatArray:
-    """Return the places (n, 3) [m] in the world, NaN in the rows of a file that have none."""
+    """Return the positions (n, 3) [m] in the world; NaN for rows without one."""
     place = geodetic_places(table, columns, is_file=is_file)
     height = place[:, 2]
     if columns.origin is None:
@@ -27,7 +27,7 @@ def positions(table: Table, columns: LogColumns, *, is_file: bool) -> FloatArray
     above_m = height if columns.above_ground else None
     if above_m is not None:
         height = height + columns.origin[2]
-    # Where the height alone is missing the rest is as if it were that of the other rows: the Earth is nearly plane.
+    # A missing height does not change east and north much, so use that of the other rows.
     known = height[np.isfinite(height)]
     usual = float(np.median(known)) if len(known) else columns.origin[2]
     east, north, up = geodetic2enu(*place[:, :2].T, np.where(np.isnan(height), usual, height), *columns.origin)
@@ -49,7 +49,7 @@ def geodetic_places(table: Table, columns: LogColumns, *, is_file: bool) -> Floa
 
 
 def array_origins(antenna_m: FloatArray, quaternion: FloatArray, columns: LogColumns) -> FloatArray:
-    """Return the origins of the array's frame (n, 3) [m] from the places of an antenna on it."""
+    """Return the origins of the array's frame (n, 3) [m] from the positions of its antenna."""
     from scipy.spatial.transform import Rotation
 
     if columns.antenna_m is None or not len(antenna_m):
@@ -58,7 +58,7 @@ def array_origins(antenna_m: FloatArray, quaternion: FloatArray, columns: LogCol
 
 
 def _latitudes_and_longitudes(table: Table, columns: LogColumns, crs: str, place: FloatArray) -> FloatArray:
-    """Return latitude and longitude (n, 2) [deg] of places in a system of coordinates."""
+    """Return latitude and longitude (n, 2) [deg] of positions in a coordinate system."""
     with of_extra("geo", "a system of coordinates (crs)"):
         import pyproj
     try:
@@ -95,7 +95,7 @@ def _refuse_no_origin(table: Table, place: FloatArray) -> None:
 
 
 def quaternions(table: Table, columns: LogColumns) -> FloatArray:
-    """Return the attitudes (n, 4), from the array's axes to the world's, which they are where nothing is known."""
+    """Return the attitudes (n, 4) from array to world; identity if the log has none."""
     from scipy.spatial.transform import Rotation
 
     logged = table.complete(columns.attitude)

@@ -1,4 +1,4 @@
-"""A proposal of the table ``columns`` from a log itself: what its names and numbers say, and what it leaves open."""
+"""Proposal of the table ``columns`` from the names and numbers of a log."""
 
 from __future__ import annotations
 
@@ -39,20 +39,20 @@ _UNIT_OF_NAME = re.compile(r"^(.*?)[ _]*(?:\[([^\]]*)\]|\(([^)]*)\)|_(nT|uT|mT|T
 
 @dataclass(frozen=True)
 class Proposal:
-    """What a log says of its columns.
+    """Proposed columns of a log, and open questions.
 
     Attributes
     ----------
     channels : dict of str to str
-        Its columns, with the first cell of each that is not empty.
+        Columns of the log, with the first cell of each that is not empty.
     keys : dict
         Keys of the table ``columns`` that the log determines.
     sensors : dict
-        By an id the columns of what reads like a magnetic field.
+        Columns of likely magnetometers, by an id.
     asked : list of str
-        What the log does not say.
+        Questions that the log leaves open.
     header_line : int
-        Line of its header.
+        Line of the header.
     """
 
     channels: dict[str, str]
@@ -62,7 +62,7 @@ class Proposal:
     header_line: int
 
     def toml(self) -> str:
-        """Return the text of an array file with the table, and remarks on what is asked."""
+        """Return the text of an array file with the table, and comments with open questions."""
         lines = [f"# The header is on line {self.header_line}. Columns, with their first values:"]
         lines += [f"#   {name}: {cell}" for name, cell in self.channels.items()]
         lines += [f"# Asked: {question}" for question in self.asked]
@@ -76,7 +76,7 @@ class Proposal:
 
 
 def propose_columns(path: str | PathLike[str]) -> Proposal:
-    """Return a proposal of how a log of another program is read.
+    """Return a proposal for reading the log of another program.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ def propose_columns(path: str | PathLike[str]) -> Proposal:
     Returns
     -------
     Proposal
-        What is certain, and what has to be answered by its owner.
+        Keys that the log determines, and questions to its owner.
 
     Raises
     ------
@@ -120,7 +120,7 @@ def propose_columns(path: str | PathLike[str]) -> Proposal:
 
 
 def _layout(name: str, lines: Sequence[str]) -> tuple[LogColumns, int, list[str], list[list[str]]]:
-    """Return separator and decimal, the number of the header's line, its cells, and rows: of the best separator."""
+    """Return the best separator and decimal, line and cells of the header, and the rows."""
     best: tuple[int, LogColumns, int, list[str], list[list[str]]] | None = None
     for separator in ("semicolon", "tab", "comma", "space"):
         for decimal in (".", ",") if separator != "comma" else (".",):
@@ -141,7 +141,7 @@ def _layout(name: str, lines: Sequence[str]) -> tuple[LogColumns, int, list[str]
 
 
 def _are_names(cells: Sequence[str], decimal: str) -> bool:
-    """Whether no cell is a number, and not all are units."""
+    """Return whether no cell is a number, and not all cells are units."""
     filled = [cell for cell in cells if cell]
     is_number = any(is_number_or_empty(cell.replace(decimal, ".")) for cell in filled)
     return not is_number and not all(map(_UNIT.fullmatch, filled))
@@ -164,7 +164,7 @@ def _numbers(cells: Sequence[str], decimal: str) -> FloatArray:
 
 
 def _find(header: Sequence[str], kind: str) -> str | None:
-    """Return the first column whose name, without a unit, is one of a kind."""
+    """Return the first column whose name, without its unit, is of a kind."""
     for name in header:
         found = _UNIT_OF_NAME.match(name)
         if found and re.fullmatch(_NAMES[kind], found[1].strip(), re.IGNORECASE):
@@ -231,7 +231,7 @@ def _propose_places(
 def _sensors(
     header: Sequence[str], values: dict[str, FloatArray], keys: dict[str, object], asked: list[str]
 ) -> dict[str, str | tuple[str, ...]]:
-    """Return columns whose moduli are those of the Earth's field, in the unit of their names or in the likely one."""
+    """Return columns with the modulus of the Earth's field, and their stated or likely unit."""
     taken: list[object] = []
     for key in ("time", "position", "geodetic"):
         named = keys.get(key, ())

@@ -1,7 +1,7 @@
 """The command line ``magloc``.
 
 Every command is a function in a module of :mod:`magloc.cli`; its NumPy docstring is its help text. It raises
-:class:`arrays.io.errors.InputError` for bad input. What the command lines have in common is in
+:class:`arrays.io.errors.InputError` for bad input. The shared parts of all command lines are in
 :mod:`magloc.cli.framework`.
 """
 
@@ -42,6 +42,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        Exit status: 0 done, 2 bad input, 130 interrupted, 141 the reader of the output is gone.
+        Exit status: 0 done, 2 bad input, 130 interrupted, 141 nobody reads the output.
     """
     return framework.run(app, arguments)

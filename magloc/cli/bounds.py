@@ -1,4 +1,4 @@
-"""``magloc bounds``: how well can an array know a source, wherever it is?"""
+"""``magloc bounds``: Cramér-Rao bounds of a source, and the reach of an array."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 Directions = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=1, lte=10_000))]
 _LARGEST_AM2 = 1e12
-# In circumradii of the array: the least distance of a source from a sensor and from the centroid, and of a sphere.
+# In circumradii: the least distance of a source from a sensor and from the centroid, and the limits of a sphere.
 _LEAST_DISTANCE = 1e-4
 _REACH = (1e-4, 1e6)
 _SLICE_GRID = 121
@@ -47,23 +47,23 @@ _FRAMES = 24
 @Parameter(name="*", group="Array and source")
 @dataclass(frozen=True)
 class SourceOptions:
-    """What stands in place of the scenario's.
+    """Array and source, in place of those of the scenario.
 
     Parameters
     ----------
     array : Path
         Array file (TOML), in place of the scenario's array.
     position : tuple of 3 floats
-        Where the source is [m], in the array's frame, in place of the scenario's position.
+        Position of the source [m], in the array's frame, in place of the scenario's.
     moment_Am2 : tuple of 3 floats
-        Its moment [A·m²], in place of the scenario's.
+        Moment of the source [A·m²], in place of the scenario's.
     ambient_uncertainty_nT : float
-        Standard deviation per axis of the ambient field that the array file states, for scalar sensors [nT].
+        Standard deviation per axis [nT] of the ambient field in the array file. It matters for scalar sensors.
     known_moment_sigma_Am2 : float
-        Standard deviation of what is known beforehand of the moment's modulus [A·m²]. Nothing is by default.
+        Standard deviation of a modulus of the moment that is known [A·m²]. By default the modulus is unknown.
     body_length_m : float
-        Length of the source: what a dipole leaves out of its field counts as noise. By default a quarter of its
-        distance, where four sensors are nearer than 0.6 of the array's circumradius; 0 for a point.
+        Length of the source [m]. The part of its field that a dipole does not describe counts as noise. By default a
+        quarter of its distance, if four sensors are nearer than 0.6 of the array's circumradius. 0 for a point source.
     """
 
     array: Path | None = None
@@ -74,27 +74,27 @@ class SourceOptions:
     body_length_m: float | None = None
 
 
-@Parameter(name="*", group="What is required, and where")
+@Parameter(name="*", group="Required accuracy, and extent of the maps")
 @dataclass(frozen=True)
 class TaskOptions:
-    """What the maps are to show.
+    """Required accuracy, and the extent of the maps.
 
     Parameters
     ----------
     range_m : float
-        Distance from the sensors' centroid [m] for the picture of a sphere; by default that of the source.
+        Radius of the sphere that is drawn, about the sensors' centroid [m]; by default the distance of the source.
     accuracy_m : float
         Required standard deviation of the range [m].
     half_width_m : float
-        The cube and the slices reach so far from the centroid [m]; by default twice the range.
+        Half the edge of the cube and of the slices [m]; by default twice --range-m.
     probability : float
-        Of detection, for the distances at which a source is found.
+        Required probability of detection, for the detection range.
     false_alarm_rate : float
-        Share of the rows without a source in which one may be found, 0.0001 or more.
+        Allowed share of false alarms in rows without a source, at least 0.0001.
     moments : int
-        Directions of the moment, 10,000 at most.
+        Number of directions of the moment, at most 10,000.
     grid : int
-        Points along every axis of the cube, 2,000 at most.
+        Number of points along every axis of the cube, at most 2,000.
     """
 
     range_m: float | None = None
@@ -117,38 +117,37 @@ def bounds(
     json: Flag = False,
     common: CommonOptions = CommonOptions(),  # noqa: B008 - frozen
 ) -> None:
-    """Tell how well an array can know a source at best (Cramér-Rao bounds), and how far it reaches.
+    """Compute Cramér-Rao bounds of a source, and how far an array reaches.
 
-    Prints the bounds of the scenario's source, how far away the range is known as well as required, and how far away
-    the matched filter finds a source at all. Writes map.zarr (a cube of sources), slices.nc and spheres.nc, and
-    pictures: bounds-slices.png, bounds-sphere.png, bounds-reach.png. All bounds come for the given moment, and over
-    moments of its size in all directions. The same command continues a map that was interrupted.
+    Prints the bounds of the scenario's source, the distance up to which the range is as accurate as required, and the
+    distance up to which the matched filter detects a source. All bounds are for the given moment, and over moments of
+    its size in all directions. Writes map.zarr (a cube of sources), slices.nc, spheres.nc, and the pictures
+    bounds-slices.png, bounds-sphere.png and bounds-reach.png. The same command continues an interrupted map.
 
     Parameters
     ----------
     scenario : str
-        Built-in scenario or scenario file (TOML) of magloc map, for its array and source: "wide", or "paper", that of
-        Pavlov, Karshakov and Goldin.
+        Built-in scenario or scenario file (TOML) of magloc map; its array and its source are used. Built in are "wide"
+        and "paper", the scenario of Pavlov, Karshakov and Goldin.
     of : SourceOptions
         Array and source.
     task : TaskOptions
-        What is required, and where.
+        Required accuracy, and extent of the maps.
     gif : bool
-        Write bounds.gif as well: the sphere, from half to twice the range.
+        Also write bounds.gif: the sphere, from half to twice its radius.
     out : Path
-        Folder to write; by default bounds-SCENARIO-GRID, or bounds-ARRAY-GRID, and the moment if one is given.
+        Folder to write; by default bounds-SCENARIO-GRID, or bounds-ARRAY-GRID, with the moment if one is given.
     json : bool
-        Print one JSON object: "position_m", "moment_Am2", "range_m"; "body_length_m" that is taken, 0 of a point,
-        where it is not; "rank" of the information, 6 if everything is
-        estimable; "sigma_position_m", "sigma_moment_Am2" (three numbers), "sigma_range_m", "sigma_bearing_deg" (null:
-        infinite); "over_moments": "sigma_range_m" and "sigma_bearing_deg" with "mean", "median", "q95",
-        "worst_sampled" for the same position; "accuracy_m"; "accuracy_range_m": for "moment", "median", "q95",
-        "worst_sampled" the "least", "median" and "greatest" over all directions; "detection": "probability",
-        "false_alarm_rate", "threshold" of the matched filter and its "threshold_error", null without one;
-        "detection_range_m" in the form of "accuracy_range_m"; "grid", "moments", "points",
-        "accurate_fraction" of the cube (95 % of the moments), "seconds" of the cube alone, "out".
+        Print one JSON object: "position_m", "moment_Am2", "range_m"; "body_length_m", which is left out for a point
+        source; "rank" of the information, 6 if everything is estimable; "sigma_position_m", "sigma_moment_Am2" (three
+        numbers), "sigma_range_m", "sigma_bearing_deg" (null: infinite); "over_moments": "sigma_range_m" and
+        "sigma_bearing_deg" with "mean", "median", "q95", "worst_sampled" for the same position; "accuracy_m";
+        "accuracy_range_m": for "moment", "median", "q95", "worst_sampled" the "least", "median" and "greatest" over all
+        directions; "detection": "probability", "false_alarm_rate", "threshold" of the matched filter and its
+        "threshold_error", null without one; "detection_range_m" in the form of "accuracy_range_m"; "grid", "moments",
+        "points", "accurate_fraction" of the cube (95 % of the moments), "seconds" of the cube alone, "out".
     common : CommonOptions
-        Common options. The seed is that of the noise which sets the threshold of detection; no bound depends on it.
+        Common options. The seed only affects the threshold of detection, which simulated noise sets.
     """
     import numpy as np
 
@@ -163,15 +162,15 @@ def bounds(
     with naming(scenario if of.array is None else str(of.array)):
         check_magnitudes(array)
     place = np.asarray(source.position_m if of.position is None else of.position)
-    radius = _checked(array, place, of, task)
+    radius = _check_options(array, place, of, task)
     wanted = _scenario(array, source.moment_Am2 if of.moment_Am2 is None else of.moment_Am2, radius, of, task)
     if array.channel_is_scalar.any() and array.ambient_T is None:
         note("warning: the array has scalar sensors and no ambient_nT: the ambient field counts as 0", always=True)
     length_m = float(assumed_body_lengths(array.positions, place, array.circumradius, wanted.body_length_m))
     if wanted.body_length_m is None and length_m:
         note(
-            f"note: the source is so near that its size matters: a quarter of its distance, {length_m:.3g} m, is taken;"
-            " --body-length-m says it, 0 a point",
+            f"note: so near, the size of the source matters: {length_m:.3g} m, a quarter of its distance, are"
+            " assumed; set --body-length-m, 0 for a point source",
             always=True,
         )
     of_source = magloc.cramer_rao_bounds(array, place, wanted.moment_Am2, **wanted.uncertainties)
@@ -191,8 +190,8 @@ def bounds(
         note(f"{counts.points} sources × {task.moments + 1} moments in {counts.seconds:.2f} s; wrote {folder}/")
 
 
-def _checked(array: SensorArray, place: FloatArray, of: SourceOptions, task: TaskOptions) -> float:
-    """Radius of the sphere, once the options are known to be in bounds."""
+def _check_options(array: SensorArray, place: FloatArray, of: SourceOptions, task: TaskOptions) -> float:
+    """Check the options, and return the radius of the sphere."""
     import numpy as np
 
     from magloc.bounds.report import plain_vector
@@ -222,7 +221,7 @@ def _checked(array: SensorArray, place: FloatArray, of: SourceOptions, task: Tas
 
 
 def _check_place(array: SensorArray, place: FloatArray) -> None:
-    """Refuse a source in a sensor, at the centroid, where range and bearing are none, and beyond all reach."""
+    """Refuse a source in a sensor, at the centroid or beyond all reach."""
     import numpy as np
 
     from magloc.bounds.report import plain_vector
@@ -243,7 +242,7 @@ def _check_place(array: SensorArray, place: FloatArray) -> None:
 
 def _array_of(path: Path) -> SensorArray:
     array = array_of_several(path, "which knows no place: magloc locate --position tells the moment at a known one")
-    # A figure calls an array by its name; one without is called after its file.
+    # Figures show the name of an array.
     return array if array.name else replace(array, name=path.stem)
 
 
@@ -266,16 +265,16 @@ def _scenario(
 
 
 def _detector(array: SensorArray, false_alarm_rate: float, seed: int) -> MatchedFilterDetector | None:
-    """Matched filter of the array; None, with a note, where it has none."""
+    """Return the matched filter of the array; None, with a note, if it has none."""
     try:
         return magloc.MatchedFilterDetector.of(array, false_alarm_rate, n_draws=round(100 / false_alarm_rate), rng=seed)
     except ValueError as error:
-        note(f"how far a source is found is left out: {own_sentence(error)}", always=True)
+        note(f"the detection range is left out: {own_sentence(error)}", always=True)
         return None
 
 
 def _cube(task: BoundScenario, grid: int, folder: Path) -> BoundsSummary:
-    """Counts of the cube, computed as far as it is not done."""
+    """Compute the chunks of the cube that are missing, and return its counts."""
     from magloc.bounds.maps import summary
 
     with progress(grid**3, "sources") as advance:
@@ -303,7 +302,7 @@ def _pictures(
     *,
     gif: bool,
 ) -> xr.Dataset:
-    """Slices and spheres, as data and as figures; returns the spheres."""
+    """Write slices and spheres, as data and as figures; return the spheres."""
     import numpy as np
 
     from magloc.bounds.maps import bound_slices

@@ -1,4 +1,4 @@
-"""``magloc design``: where should the sensors of an array stand?"""
+"""``magloc design``: positions of an array's sensors."""
 
 from __future__ import annotations
 
@@ -37,24 +37,25 @@ def design(
     counts: Annotated[list[Sensors] | None, Parameter(consume_multiple=True)] = None,
     common: CommonOptions = CommonOptions(),  # noqa: B008 - frozen
 ) -> None:
-    """Design an array: place its sensors for the sources that it is to locate.
+    """Optimise the positions of an array's sensors for the sources that it has to locate.
 
-    Makes a quantile or the mean, over sources and moments, of the least standard deviation of the range (the
-    Cramér-Rao bound) as small as it can, and compares the array with a tetrahedron, a cube and a cross of the same
-    span, and with an even grid of as many sensors in the same volume. Interrupted, it writes the best array so far.
+    Minimises a quantile or the mean, over sources and moments, of the Cramér-Rao bound of the range. Compares the
+    array with a tetrahedron, a cube and a cross of the same span, and with an even grid of as many sensors in the same
+    volume. An interrupted command writes the best array so far.
 
     Parameters
     ----------
     task : str
-        Built-in task, or task file (TOML): sensors, volume or surface, sources, criterion.
+        Built-in task, or task file (TOML) with sensors, volume or surface, sources and criterion.
     out : Path
         Array file to write; by default design-TASK.toml.
     png : Path
-        Picture to write: the sensors, and the range's standard deviation over the distance.
+        Picture to write (.png): the sensors, and the standard deviation of the range over the distance.
     json : bool
         Print one JSON object with the array and the comparison.
     counts : list of int
-        Numbers of sensors in place of the task's: one array each, as NAME-NUMBER.toml, and what more of them gain.
+        Numbers of sensors, in place of the task's. Writes one array each, NAME-NUMBER.toml, and shows the gain of more
+        sensors.
     common : CommonOptions
         Common options.
     """
@@ -94,7 +95,7 @@ def design(
 def _compare_counts(
     tasks: Sequence[DesignTask], out: Path, png: Path | None, *, json: bool, common: CommonOptions
 ) -> None:
-    """Designs of several numbers of sensors, their arrays, a table and a picture of what more sensors gain."""
+    """Design arrays of several numbers of sensors, and show the gain of more sensors."""
     from magloc.design.evaluation import EVEN
 
     targets = [out.with_name(f"{out.stem}-{task.n_sensors}{out.suffix}") for task in tasks]
@@ -168,7 +169,7 @@ def _of_array(judged: Judgement) -> dict[str, Any]:
 
 
 def _table(result: Design) -> list[str]:
-    """Bounds of all arrays at all distances."""
+    """Return the bounds of all arrays at all distances."""
     statistics = "".join(f"{name:>11}" for name in ("q50_m", "q95_m", "mean_m"))
     head = f"{'array':<24}{'sensors':>8}{'distance_m':>12}{statistics}{'bearing_q95_deg':>17}"
     lines = ["standard deviations of range and bearing (Cramér-Rao bounds)", head]
@@ -186,7 +187,7 @@ def _table(result: Design) -> list[str]:
 
 
 def _findings(result: Design) -> list[str]:
-    """What the table says, in sentences."""
+    """Return the conclusions of the table."""
     from magloc.design.evaluation import EVEN
     from magloc.design.optimise import NEAR_OPTIMAL
 
@@ -194,7 +195,7 @@ def _findings(result: Design) -> list[str]:
     own = result.judged[0]
     lines = [f"{criterion} of the range's standard deviation: {_number(own.criterion_m)} m, on independent sources"]
     for other in result.judged[1:]:
-        lines.append(f"  {_compared(other)}")
+        lines.append(f"  {_comparison(other)}")
     lines += [
         f"The {name} of the same {'volume' if name == EVEN else 'span'} is near-optimal for this task: the design gains"
         f" less than {100.0 * NEAR_OPTIMAL:g} % on it."
@@ -202,7 +203,7 @@ def _findings(result: Design) -> list[str]:
     ]
     lines.append(_worst_case(result))
     if not result.converged:
-        lines.append("The descent to this array had not stopped falling: a little better ones may be near.")
+        lines.append("The descent to this array did not converge: slightly better arrays may be near.")
     return lines
 
 
@@ -214,7 +215,7 @@ def _worst_case(result: Design) -> str:
     return f"{text}, as those of every array of four vector sensors do." if four_vector_sensors else f"{text}."
 
 
-def _compared(other: Judgement) -> str:
+def _comparison(other: Judgement) -> str:
     outside = "" if other.fits else ", outside the volume"
     name = f"{other.name} ({other.array.n_sensors} sensors{outside})"
     if not math.isfinite(other.criterion_m):

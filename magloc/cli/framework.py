@@ -1,7 +1,7 @@
-"""What the command lines have in common: one main loop, the options of every command, JSON, notes and progress.
+"""Main loop, common options, JSON output, notes and progress of the command lines.
 
-Commands are functions that :mod:`cyclopts` calls. They raise :class:`arrays.io.errors.InputError` for bad input;
-whatever is wrong with the input becomes one line on stderr and exit status 2, an interruption becomes 130.
+Commands are functions that :mod:`cyclopts` calls. They raise :class:`arrays.io.errors.InputError` for bad input, which
+becomes one line on stderr and exit status 2. An interruption becomes exit status 130.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ BROKEN_PIPE = 141
 _LONGEST_WORD = 200
 _LOG = logging.getLogger(__name__)
 _warnings: list[str] = []
-"""Warnings since a command line began, for its JSON."""
+"""Warnings of the command line that runs, for its JSON."""
 # Commands that end when their user or their stream does.
 _ENDLESS = {"live", "view"}
 _FIRST_SIGN_S = 10.0
@@ -49,7 +49,7 @@ _TOO_LARGE = 10**18
 
 
 def whole_number(_: type, tokens: Sequence[Token]) -> int:
-    """Convert one argument; cyclopts alone would round 1.5, and pass what no float or int64 can hold."""
+    """Convert one argument. cyclopts alone would round 1.5 and accept numbers beyond int64."""
     try:
         number = int(tokens[0].value)
         if abs(number) < _TOO_LARGE:
@@ -60,11 +60,11 @@ def whole_number(_: type, tokens: Sequence[Token]) -> int:
 
 
 ABOVE_ZERO = math.ulp(0.0)
-"""Least positive number: the limit of options that must be positive."""
+"""Smallest positive number: the limit of options that must be positive."""
 
 
 def refuse_outside(low: float, high: float, expected: str, *, unit: str = "", **options: float | None) -> None:
-    """Refuse options, by their names in Python, that are given and not within limits."""
+    """Refuse options, given by their Python names, whose values are outside the limits."""
     for name, value in options.items():
         if value is not None and not low <= value <= high:
             most = f", at most {LARGEST:g}" if LARGEST == high < value < math.inf else ""
@@ -72,7 +72,7 @@ def refuse_outside(low: float, high: float, expected: str, *, unit: str = "", **
 
 
 Flag = Annotated[bool, Parameter(show_default=False)]
-# Ten million of anything would never end.
+# A command with ten million runs would not end.
 Count = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=1, lt=10_000_000))]
 Seed = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=0))]
 
@@ -85,16 +85,16 @@ class QuietOptions:
     Parameters
     ----------
     threads : int
-        Threads at most; by default all cores. Results do not depend on it.
+        Largest number of threads; by default all cores. Results do not depend on it.
     quiet : bool
-        No progress and no summary on stderr, only errors.
+        Print errors only: no progress and no summary on stderr.
     """
 
     threads: Count | None = None
     quiet: Flag = False
 
     def apply(self) -> None:
-        """Limit the threads of compiled code, and the notes on stderr."""
+        """Set the number of threads of the kernels, and which notes are printed."""
         for name in PACKAGES:
             logging.getLogger(name).setLevel(_RESULT if self.quiet else logging.INFO)
         if self.threads is not None:
@@ -111,20 +111,20 @@ class CommonOptions(QuietOptions):
     Parameters
     ----------
     threads : int
-        Threads at most; by default all cores. Results do not depend on it.
+        Largest number of threads; by default all cores. Results do not depend on it.
     quiet : bool
-        No progress and no summary on stderr, only errors.
+        Print errors only: no progress and no summary on stderr.
     seed : int
-        Seed of whatever is random; the same seed gives the same result.
+        Seed of all random numbers. The same seed gives the same result.
     """
 
     seed: Seed = 0
 
 
 def new_app(name: str, help: str, commands: Iterable[tuple[str, str, str]], **options: Any) -> App:
-    """Return a command line; commands are given by name, as ``module:function``, and with their lines of help.
+    """Return a command line whose commands load when they are called.
 
-    Each loads when it is called. By name those of a package on a higher floor can be had too.
+    ``commands``: name, ``module:function`` and a line of help each. Names also reach packages on a higher floor.
     """
     app = App(name=name, help=help, **options)
     for command, where, line in commands:
@@ -151,19 +151,18 @@ def run(app: App, arguments: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        Exit status: 0 done, 1 a fault of the program, 2 bad input, 130 interrupted, 141 the reader of the output is
-        gone.
+        Exit status: 0 done, 1 a fault of the program, 2 bad input, 130 interrupted, 141 nobody reads the output.
     """
     _warnings.clear()
     program = app.name[0]
     tokens = sys.argv[1:] if arguments is None else list(arguments)
-    # None where the shell closed it. In this order the first file that is opened does not become one of the others.
+    # A stream is None where the shell closed it. This order keeps the first file opened from taking its place.
     for name in ("stdin", "stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "r" if name == "stdin" else "w", encoding="utf-8"))  # noqa: SIM115
-    # As all files, what comes in is UTF-8, whatever the system; what an output has no character for is escaped.
+    # Input is UTF-8 on every system, as in files. Characters that an output cannot show are escaped.
     if isinstance(sys.stdin, io.TextIOWrapper):
-        with contextlib.suppress(io.UnsupportedOperation):  # it was read before
+        with contextlib.suppress(io.UnsupportedOperation):  # something was read from it already
             sys.stdin.reconfigure(encoding="utf-8")
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
@@ -181,21 +180,21 @@ def run(app: App, arguments: Sequence[str] | None = None) -> int:
         _give_up_stdout()
         return BROKEN_PIPE
     except SystemExit as error:
-        if not isinstance(error.__context__, BrokenPipeError):  # which rich, that prints the help, turns into this
+        if not isinstance(error.__context__, BrokenPipeError):  # raised by rich for a broken pipe
             raise
         _give_up_stdout()
         return BROKEN_PIPE
     except OSError as error:
-        # Whatever writes a file names it.
+        # Every function that writes a file names it in the error; here it is stdout.
         if not error.filename and error.errno in (errno.ENOSPC, errno.EIO, errno.EBADF):
             error.filename = "standard output"
             _give_up_stdout()
         print_note(f"{error.filename}: {error.strerror}" if error.filename else str(error), program)
         return BAD_INPUT
     except MemoryError:
-        print_note("found no memory left, expected fewer rows or points, or a coarser grid.", program)
+        print_note("the memory is full; use fewer rows or points, or a coarser grid.", program)
         return BAD_INPUT
-    except Exception as error:  # no file is to blame, and no trace helps who is not its author
+    except Exception as error:  # a traceback does not help a user
         print_note(_internal(error), program)
         _LOG.debug("internal error", exc_info=error)
         return INTERNAL
@@ -203,23 +202,23 @@ def run(app: App, arguments: Sequence[str] | None = None) -> int:
 
 
 def _internal(error: Exception) -> str:
-    """Say where in this program an error came up that nobody expected, and ask for a report."""
+    """Return a sentence that names the place of an unexpected error and asks for a report."""
     frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
     own = [frame for frame in frames if frame.f_globals.get("__name__", "").partition(".")[0] in PACKAGES]
     place = f" in {own[-1].f_globals['__name__']}, line {own[-1].f_lineno}" if own else ""
     return (
-        f"internal error{place} ({type(error).__name__}: {error}). The program is at fault, not the input alone: please"
-        " report this line, with the command and its files if you may."
+        f"internal error{place} ({type(error).__name__}: {error}). This is a fault of the program: please report"
+        " this line, with the command and its files if you may."
     )
 
 
 def _give_up_stdout() -> None:
-    """The interpreter flushes stdout once more when it exits, which must not fail again."""
+    """Send stdout to the null device, because the interpreter flushes it once more at its end."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def call(app: App, tokens: Sequence[str]) -> None:
-    """Run one command; what is wrong is raised."""
+    """Run one command; errors are raised."""
     try:
         use_docstrings(app, tokens)
         command, bound, _ = app.parse_args(tokens, print_error=False, exit_on_error=False)
@@ -240,7 +239,7 @@ def call(app: App, tokens: Sequence[str]) -> None:
 
 @contextmanager
 def _signs_of_life(program: str) -> Iterator[None]:
-    """Tell on a terminal how long a command has run, at growing intervals, while it shows no progress of its own."""
+    """Print at growing intervals how long a command has run, on a terminal without a progress bar."""
     ended = threading.Event()
 
     def tell() -> None:
@@ -260,7 +259,7 @@ def _signs_of_life(program: str) -> Iterator[None]:
 
 
 def _unknown_command(app: App, error: UnknownCommandError) -> str:
-    """As cyclopts says it, but it would load every command."""
+    """Return the sentence for an unknown command; that of cyclopts would load every command."""
     token, *_ = error.unused_tokens or [""]
     names = [name for name in app if not name.startswith("-")]
     near = "".join(f' Did you mean "{name}"?' for name in difflib.get_close_matches(token, names, n=1))
@@ -277,7 +276,7 @@ def use_docstrings(app: App, tokens: Sequence[str]) -> None:
 
 @contextmanager
 def _one_line_warnings(program: str) -> Iterator[None]:
-    """Show own warnings without the source line that raised them, and keep those of other libraries from users."""
+    """Show our own warnings in one line, and log those of other libraries."""
 
     def show(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
         if category.__module__.partition(".")[0] in PACKAGES:
@@ -309,7 +308,7 @@ class _Notes(logging.Handler):
 
 @contextmanager
 def _notes_of_the_library(program: str) -> Iterator[None]:
-    """Show what the packages log, one line each."""
+    """Print the log of the packages, one line for each record."""
     handler = _Notes(program)
     loggers = [logging.getLogger(name) for name in PACKAGES]
     for logger in loggers:
@@ -326,7 +325,7 @@ def _notes_of_the_library(program: str) -> Iterator[None]:
 
 
 def demonstrate(app: App, out: Path, calls: Sequence[Sequence[str]], common: QuietOptions) -> list[str]:
-    """Run commands that write into a folder, each shown as a user types it, and return what each prints."""
+    """Run commands, show each as a user types it, and return their outputs."""
     make_folder(out, "OUT")
     every = []
     for tokens in calls:
@@ -339,19 +338,19 @@ def demonstrate(app: App, out: Path, calls: Sequence[Sequence[str]], common: Qui
 
 
 def json_text(value: object) -> str:
-    """One JSON value: numbers that are not finite become null, numpy arrays lists."""
+    """Return a value as JSON; NaN and infinity become null, numpy arrays lists."""
     import msgspec
 
     return msgspec.json.encode(value, enc_hook=lambda array: array.tolist()).decode()
 
 
 def print_json(value: object) -> None:
-    """Print one JSON value on stdout; numbers that are not finite become null, numpy arrays lists."""
+    """Print one JSON value on stdout."""
     print(json_text(value))
 
 
 def print_json_list(name: str, entries: Iterable[object]) -> None:
-    """Print a JSON object with one list whose entries are made one by one: those of a long file are never all there."""
+    """Print a JSON object with one list; only one entry at a time is in memory."""
     print(f'{{"{name}":[', end="")
     for i, entry in enumerate(entries):
         print("," if i else "", json_text(entry), sep="", end="")
@@ -359,14 +358,14 @@ def print_json_list(name: str, entries: Iterable[object]) -> None:
 
 
 def print_report(report: Mapping[str, object]) -> None:
-    """Print the report of a command as one JSON object, with what was warned of."""
+    """Print the report of a command as one JSON object with all warnings."""
     own = report.get("warnings", [])
     assert isinstance(own, list)
-    print_json({**report, "warnings": [*own, *(said for said in _warnings if said not in own)]})
+    print_json({**report, "warnings": [*own, *(text for text in _warnings if text not in own)]})
 
 
 def print_result(result: Mapping[str, object], lines: Sequence[str], *, as_json: bool) -> None:
-    """Print a result as one JSON object, with what was warned of if anything was, or as text."""
+    """Print a result as text, or as one JSON object with the warnings, if there are any."""
     if as_json and _warnings:
         print_report(result)
     elif as_json:
@@ -387,7 +386,7 @@ def warn(texts: Iterable[str]) -> None:
 
 
 def print_note(text: str, program: str) -> None:
-    """Print one line of a program on stderr, whatever the text: as a terminal shows it, no word of it endless."""
+    """Print one line on stderr: control characters are escaped, very long words are shortened."""
     words = (word if len(word) <= _LONGEST_WORD else f"{word[:20]}…{word[-20:]}" for word in text.split())
     line = "".join(char if char.isprintable() else ascii(char)[1:-1] for char in " ".join(words))
     print(f"{program}: {line}", file=sys.stderr)
@@ -406,7 +405,7 @@ def progress(total: int, unit: str) -> Iterator[Callable[[int], None]]:
     Yields
     ------
     callable
-        To be called with the number finished since the last call.
+        Function to call with the number finished since the last call.
     """
     from tqdm import tqdm
 

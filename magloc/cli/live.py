@@ -1,4 +1,4 @@
-"""``magloc live``: one source followed while its readings come in, or several."""
+"""``magloc live``: one source, or several, tracked while readings arrive."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ if TYPE_CHECKING:
     from magloc.viewer.live_view import LiveView
 
 _SWITCH_S = 5e-4
-"""After so long a thread of the page lets a row that has come be followed."""
+"""Time after which a thread of the page yields to the tracker."""
 
 
 @Parameter(name="*", group="Live page")
 @dataclass(frozen=True)
 class PageOptions:
-    """The live page.
+    """Page that shows a source while it moves.
 
     Parameters
     ----------
     view : bool
-        Serve a page that shows the source while it moves; it stays until Ctrl-C.
+        Serve a page that shows the source while it moves. The page stays until Ctrl-C.
     port : int
-        Port of its server; the next one that is free if it is in use.
+        Port of the server; the next free one if it is in use.
     open : bool
-        Open the browser.
+        Open the page in the browser.
     """
 
     view: Flag = False
@@ -56,33 +56,33 @@ def live(
     motion: MotionOptions = MotionOptions(),  # noqa: B008 - frozen
     common: QuietOptions = QuietOptions(),  # noqa: B008 - frozen
 ) -> None:
-    """Follow one source, or several, while their readings come in.
+    """Track one source, or several, while readings arrive.
 
-    Every row is answered by one JSON line at once, as of magloc track --jsonl, with latency_ms. Rows are CSV, first a
-    header with the columns of a readings file, or JSON objects with these names. Those that are late, lost, doubled or
-    garbled are counted and named on stderr, and end nothing.
+    Every row gives one JSON line at once, as magloc track --jsonl does, with latency_ms. Rows are CSV, after a header
+    with the columns of a readings file, or JSON objects with these names. Late, lost, doubled and garbled rows are
+    counted and named on stderr; tracking goes on.
 
     Parameters
     ----------
     array : Path
         Array file (TOML).
     source : str
-        Where rows come from: - for standard input, tcp://HOST:PORT to connect to, udp://HOST:PORT to listen at,
+        Source of the rows: - for standard input, tcp://HOST:PORT to connect to, udp://HOST:PORT to listen at,
         serial:DEVICE@BAUD (extra serial), or replay:FILE for a readings file in its own time.
     rest_s : float
-        The first seconds are a rest, without a source, whose mean is taken off all later readings; vector sensors of an
-        array that stands.
+        Duration of a rest without a source at the beginning [s]. Its mean is subtracted from all later readings. Only
+        for vector sensors of an array that does not move.
     replay_speed : float
-        How much faster than in its own time a file is replayed.
+        Speed of a replay, over that of the recording.
     out : Path, optional
-        CSV file with the columns of track.csv of magloc track --out, a row for every line, or for every source of it.
-        Every row is in the file as soon as it is known.
+        CSV file to write, with the columns of track.csv of magloc track --out: a row for every line and source, as soon
+        as it is known.
     page : PageOptions
-        The live page.
+        Page that shows the source.
     known : KnownOptions
-        What is known of the sensors, of the source when a track starts, and of the ambient field.
+        Prior knowledge of the sensors, of the source when a track starts, and of the ambient field.
     motion : MotionOptions
-        How many sources there are, and what is known of their motion.
+        Number of sources, and the model of their motion.
     common : QuietOptions
         Common options.
     """
@@ -95,7 +95,7 @@ def live(
     with naming(str(array), sources=f"--sources {motion.sources}"):
         follower = motion.follower(used, known, known.where, rest_s)
     with ExitStack() as open_page:
-        view = open_page.enter_context(shown(follower, page)) if page.view else None
+        view = open_page.enter_context(open_live_page(follower, page)) if page.view else None
         table = None if out is None else open_page.enter_context(GrowingTable(out))
         try:
             with naming_place(), naming(str(array), readings=source, time_s=source):
@@ -112,8 +112,8 @@ def live(
             view.wait()
 
 
-def shown(follower: Follower, page: PageOptions) -> LiveView:
-    """A page of what a follower follows, and a note of its address."""
+def open_live_page(follower: Follower, page: PageOptions) -> LiveView:
+    """Open a page of a tracker, and print its address."""
     import magloc.viewer
 
     with naming_options("port"):
@@ -124,7 +124,7 @@ def shown(follower: Follower, page: PageOptions) -> LiveView:
 
 
 def _columns(point: LivePoint, *, moves: bool) -> dict[str, Column]:
-    """Columns of the file with one row, or of several sources one of each."""
+    """Return the columns of one row, or of one row for each of several sources."""
     from magloc.tracking.files import columns_of_track
 
     if point.sources is not None:

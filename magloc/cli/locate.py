@@ -22,31 +22,32 @@ if TYPE_CHECKING:
     from magloc.localization.fit.fixes import Fixes
     from magloc.readings import Readings
 
-# Of a known place from the array, along each axis: farther than any field that can be measured, and not out of range.
+# Largest distance of a known position from the array, per axis: no field from there can be measured.
 _FARTHEST_M = 1e6
 
 
 @Parameter(name="*", group="Fixes")
 @dataclass(frozen=True)
 class FixOptions:
-    """What is looked for in every row.
+    """Sources to estimate in every row.
 
     Parameters
     ----------
     sources : str
-        Number of sources in every row, or "auto": as many as the readings support, five at most. One by default.
+        Number of sources in every row, or "auto" for as many as the readings support, at most five. 1 by default.
     position : tuple of 3 floats
-        Where the source is [m], in the frame of the results: only its moment is looked for. More than once: several.
+        Known position of the source [m], in the frame of the results; only its moment is estimated. Give it several
+        times for several sources.
     average : bool
-        Average all rows to one fix. The array and the source must stand still.
+        Average all rows to one fix. The array and the source must not move.
     ambient_gradient : bool
-        Take the gradient of the geomagnetic field into account too (tens of pT/m).
+        Also model the gradient of the geomagnetic field (tens of pT/m); needs --place.
     body_length_m : float
-        Length of the object: what a dipole leaves out of its field counts as noise, and fixes that are nearer than
-        three lengths are flagged. By default a quarter of its distance, where four sensors are nearer than 0.6 of the
-        array's circumradius; 0 for a point.
+        Length of the object [m]. The part of its field that a dipole does not describe counts as noise, and fixes
+        nearer than three lengths are flagged. By default a quarter of its distance, if four sensors are nearer than 0.6
+        of the array's circumradius. 0 for a point source.
     keep_sensors : bool
-        Use all sensors, also those that contradict the others.
+        Use all sensors, even those that contradict the others.
     """
 
     sources: str | None = None
@@ -58,7 +59,7 @@ class FixOptions:
 
     @property
     def n_sources(self) -> int | Literal["auto"]:
-        """The number of sources that is asked for."""
+        """Number of sources to estimate."""
         return 1 if self.sources is None else number_of_sources(self.sources)
 
 
@@ -74,17 +75,16 @@ def locate(
     json: Flag = False,
     common: CommonOptions = CommonOptions(),  # noqa: B008 - frozen
 ) -> None:
-    """Find the sources in every row of a readings file, each row on its own.
+    """Locate the sources in every row of a readings file, each row on its own.
 
     Positions are in the array's frame, or in the world frame if the readings have the array's pose. The table has the
-    best solution of every row: s is the standard deviation, range95 the 95 % set of distances from the sensors'
-    centroid, of all solutions together. Flags: "weak" = nothing stands out of the noise, which alone makes one of a
-    thousand rows look like a source, and the range may be anything; "range?" = the range is not observable: s is
-    widened until it is as long as range95; "bent" = position or moment are uncertain by more than 4 %, or there is
-    another solution, or χ² does not rise as a Gaussian's: trust range95 rather than s; "+2(70%)" = two other solutions
-    fit almost as well, and the best one has 70 % of the probability, see --json; "-s3" = sensor s3 contradicts all
-    others and is not used; "merged" = two sources that the array does not tell apart; "near" = too near for a dipole;
-    "misfit" = χ² is far beyond noise.
+    best solution of every row: s is the standard deviation; range95 is the 95 % set of distances from the sensors'
+    centroid, over all solutions. Flags: "weak" = no source stands out of the noise, the range may be anything (noise
+    alone looks like a source in one of a thousand rows); "range?" = the range is not observable, s is as long as
+    range95; "bent" = the likelihood is not Gaussian, trust range95 rather than s; "+2(70%)" = two other solutions fit
+    almost as well, the best one has 70 % of the probability, see --json; "-s3" = sensor s3 contradicts all others and
+    is not used; "merged" = two sources that the array cannot separate; "near" = too near for a dipole; "misfit" = χ² is
+    far beyond noise.
 
     Parameters
     ----------
@@ -93,16 +93,16 @@ def locate(
     array : Path
         Array file (TOML).
     known : KnownOptions
-        What is known of the sensors, of the source and of the ambient field.
+        Prior knowledge of the sensors, of the source and of the ambient field.
     wanted : FixOptions
-        What is looked for in every row.
+        Sources to estimate in every row.
     truth : Path
-        Truth file (CSV) to draw in the figures, with the errors; goes with --out.
+        Truth file (CSV). The figures of --out show it, with the errors.
     out : Path
-        Folder for figures and the data behind them: the fixes with 95 % ellipses, standard deviations and χ² with its
-        bounds, and what is left of every sensor's readings.
+        Folder for figures and their data: fixes with 95 % ellipses, standard deviations, χ² with its bounds, and the
+        residuals of every sensor.
     json : bool
-        Print one JSON object with every solution in place of the table.
+        Print one JSON object with all solutions, in place of the table.
     common : CommonOptions
         Common options.
     """
@@ -156,7 +156,7 @@ def locate(
     else:
         lines = lines_of_fixes(fixes, joint=joint)
         print("\n".join(lines))
-    reasons = counted_reasons(reason for reason, solved in zip(fixes.reason, fixes.solved, strict=True) if not solved)
+    reasons = count_reasons(reason for reason, solved in zip(fixes.reason, fixes.solved, strict=True) if not solved)
     n_solved = int(fixes.solved.sum())
     if not n_solved:
         raise InputError(f"{readings}: found no row that can be solved ({reasons}).")
@@ -171,7 +171,7 @@ def locate(
 
 
 def _refuse_farther(positions: list[Vector], rows: Readings) -> None:
-    """Refuse a place that is too far away from the array in some row."""
+    """Refuse a position that is too far from the array in some row."""
     import numpy as np
 
     array_m = np.zeros(3) if rows.array_position_m is None else rows.array_position_m
@@ -183,7 +183,7 @@ def _refuse_farther(positions: list[Vector], rows: Readings) -> None:
 
 
 def _option_of(sentence: str, region: str | None, sources: str | None) -> str:
-    """The option that an error of the library is about."""
+    """Return the option that an error of the library is about."""
     if sentence.startswith(("n_sources", "sources")):
         return f"--sources {sources}"
     if sentence.startswith("position_m"):
@@ -193,12 +193,12 @@ def _option_of(sentence: str, region: str | None, sources: str | None) -> str:
 
 def _advice(sentence: str, array: SensorArray) -> str:
     if sentence.startswith("array must give") and array.channel_is_scalar.any():
-        return " Add sensors, or name the place of the source with --position."
+        return " Add sensors, or state the position of the source with --position."
     return ""
 
 
 def _notes(fixes: Fixes, *, assumed: bool) -> Iterator[str]:
-    """What is wrong with the sensors and with the sources."""
+    """Yield notes on faulty sensors and on doubtful fixes."""
     n = len(fixes)
     dropped = Counter(name for names in fixes.dropped_sensors for name in names)
     if dropped:
@@ -208,14 +208,14 @@ def _notes(fixes: Fixes, *, assumed: bool) -> Iterator[str]:
         yield f"note: in {count} of {n} rows {reason}"
     if fixes.misfit.any():
         yield (
-            f"warning: in {fixes.misfit.sum()} of {n} rows χ² is far beyond noise: the noise is understated, or the"
-            " model does not hold; the standard deviations, enlarged by √(χ²/dof), are a guess"
+            f"warning: in {fixes.misfit.sum()} of {n} rows χ² is far beyond noise: the stated noise is too small or"
+            " the model does not hold; the standard deviations, enlarged by √(χ²/dof), are rough"
         )
     weak = fixes.solved & ~fixes.detected
     if weak.any():
         yield (
-            f"note: in {weak.sum()} of {n} rows nothing stands out of the noise: their solutions are fits of noise,"
-            " and a source may be at any range"
+            f"note: in {weak.sum()} of {n} rows nothing stands out of the noise: their solutions fit noise, and a"
+            " source may be at any range"
         )
     lost = Counter(name for names in fixes.saturated_channels for name in names)
     if lost:
@@ -224,14 +224,14 @@ def _notes(fixes: Fixes, *, assumed: bool) -> Iterator[str]:
     if assumed and bodies.any():
         yield (
             f"note: in {bodies.sum()} of {n} rows the source is so near that its size matters: a length of a quarter of"
-            " its distance is assumed, --body-length-m says it, 0 a point"
+            " its distance is assumed; set --body-length-m, 0 for a point source"
         )
     if fixes.caution:
         yield f"note: {fixes.caution}, --body-length-m, 0 of a point"
     if fixes.too_near.any():
         yield (
-            f"warning: in {fixes.too_near.sum()} of {n} rows the source is too near, or too large, for a dipole: what"
-            " is left has the pattern of an extended source, or it is nearer than three body lengths"
+            f"warning: in {fixes.too_near.sum()} of {n} rows the source is too near, or too large, for a dipole: the"
+            " residuals have the pattern of an extended source, or it is nearer than three body lengths"
         )
 
 
@@ -239,8 +239,8 @@ def _rows_of(counts: Counter[str]) -> str:
     return ", ".join(f"{name} ({n} row{'s' if n > 1 else ''})" for name, n in counts.most_common())
 
 
-def counted_reasons(reasons: Iterable[str], most: int = 3) -> str:
-    """Reasons with the number of rows that each applies to, the commonest first."""
+def count_reasons(reasons: Iterable[str], most: int = 3) -> str:
+    """Return reasons with their numbers of rows, the commonest first."""
     counts = Counter(reasons).most_common()
     others = sum(n for _, n in counts[most:])
     parts = counts[:most] + [("other reasons", others)] * (others > 0)

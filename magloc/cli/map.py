@@ -1,4 +1,4 @@
-"""``magloc map``: from which starts does a filter find the source, and which sources does a fix find?"""
+"""``magloc map``: convergence map of a filter over starts, or of fixes over sources."""
 
 from __future__ import annotations
 
@@ -44,36 +44,35 @@ def map_(
     json: Flag = False,
     common: CommonOptions = CommonOptions(),  # noqa: B008 - frozen
 ) -> None:
-    """Draw the convergence map of a filter over a cube of starts, or that of start-free fixes over a cube of sources.
+    """Compute a convergence map: of a filter over a cube of starts, or of fixes over a cube of sources.
 
-    Writes map.zarr chunk by chunk, and convergence.png (three slices). The same command continues a map that was
-    interrupted.
+    Writes map.zarr chunk by chunk, and convergence.png (three slices). The same command continues an interrupted map.
 
     Parameters
     ----------
     scenario : str
-        Built-in scenario or scenario file (TOML): by default over starts "paper", the figure of the source paper, and
-        over sources "wide", its source before an array that is wide enough to know the range.
+        Built-in scenario or scenario file (TOML). By default "paper" over starts, the figure of the source paper, and
+        "wide" over sources, with an array wide enough to determine the range.
     over : str
-        starts: one source, a filter from every start. sources: every source with a random moment and noise, drawn with
-        --seed, fixed once without a start.
+        starts: one source, and a filter from every start. sources: many sources with random moments and noise, located
+        once each, without a start.
     method : str
-        Filter over starts, in place of the scenario's: repeated, iekf, damped, global.
+        Filter over starts: repeated, iekf, damped or global; by default that of the scenario.
     device : str
-        cpu. Filters no longer run on graphics processors; the next release will not have this option.
+        cpu, the only one. The next release removes this option.
     grid : int
-        Points along every axis; by default 41 starts, 21 sources.
+        Number of points along every axis; by default 41 starts, 21 sources.
     noise : bool
-        Over starts: add one realisation of the sensors' noise, drawn with --seed, to the noise-free readings.
+        Over starts: add noise of the sensors, drawn with --seed, to the noise-free readings.
     body_length_m : float
-        Over sources: length of every one, in place of the scenario's; what a dipole leaves out of its field counts as
-        noise. By default a quarter of its distance near the array; 0 for points.
+        Over sources: length of every source [m], in place of the scenario's. The part of its field that a dipole does
+        not describe counts as noise. By default a quarter of its distance near the array. 0 for point sources.
     scheduler : str
-        Address of a dask scheduler (tcp://HOST:PORT) whose workers compute the map.
+        Address of a dask scheduler (tcp://HOST:PORT), whose workers then compute the map.
     out : Path
         Folder to write; by default map-SCENARIO-METHOD-GRID.
     netcdf : bool
-        Write convergence.nc as well: the whole map, which has to fit into memory.
+        Also write convergence.nc, the whole map; it has to fit into memory.
     json : bool
         Print one JSON object with the counts.
     common : CommonOptions
@@ -87,9 +86,7 @@ def map_(
     scenario = scenario or ("paper" if over == "starts" else "wide")
     if over == "starts":
         if body_length_m is not None:
-            raise InputError(
-                f"--body-length-m: found {body_length_m:g}, expected none over starts: they are no bodies."
-            )
+            raise InputError(f"--body-length-m: found {body_length_m:g}, expected none with --over starts.")
         name, compute = _over_starts(scenario, method, common.seed if noise else None)
     else:
         name, compute = over, _over_sources(scenario, method, common.seed, body_length_m)
@@ -133,7 +130,7 @@ _KEYS = dict.fromkeys(
 
 
 def _over_starts(scenario: str, method: str | None, noise_seed: int | None) -> tuple[str, Callable[..., xr.Dataset]]:
-    """Name of the method, and the map without the arguments that all maps have."""
+    """Return the name of the method, and the function of the map without the common arguments."""
     import numpy as np
 
     from magloc.convergence.filters import FILTERS

@@ -41,11 +41,11 @@ if TYPE_CHECKING:
 Port = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=0, lte=65535))]
 
 STREAM = "-"
-"""In place of a file: standard input."""
+"""Name of standard input in place of a file."""
 
 
 def number_of_sources(sources: str) -> int | Literal["auto"]:
-    """What --sources asks for."""
+    """Return the number of sources that --sources states."""
     if sources == "auto":
         return "auto"
     try:
@@ -55,12 +55,12 @@ def number_of_sources(sources: str) -> int | Literal["auto"]:
 
 
 def refuse_not_positive(options: object, *names: str, expected: str = "a positive number") -> None:
-    """Refuse an option that is given and not positive, or endless, by the names of the fields that hold them."""
+    """Refuse options, given by their field names, that are not positive and finite."""
     refuse_outside(1.0 / LARGEST, LARGEST, expected, **{name: getattr(options, name) for name in names})
 
 
 def array_of_several(path: Path, why: str = "") -> SensorArray:
-    """The array of a file, of two sensors at least."""
+    """Read an array of at least two sensors."""
     array = arrays.read_array(path)
     if array.n_sensors < 2:
         raise InputError(f"{path}: sensors must be at least 2; instead received 1{why and f', {why}'}.")
@@ -68,7 +68,7 @@ def array_of_several(path: Path, why: str = "") -> SensorArray:
 
 
 Grid = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=2, lte=2000))]
-"""Points along an axis: 2000 are 8,000,000,000 points, more than a day of work."""
+"""Points along an axis. 2000 make 8 billion points, more than a day of computing."""
 
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
@@ -77,7 +77,7 @@ _BOUNDS = re.compile(rf"(?:(?P<below>{_NUMBER})<(?=[xyz]<))?(?P<axis>[xyz])(?P<s
 
 @contextmanager
 def naming_outputs() -> Iterator[None]:
-    """Let errors of a viewer speak of the options --html, --png, --movie and --port."""
+    """Turn errors of a viewer into errors about --html, --png, --movie and --port."""
     from magloc.viewer.chromium import BrowserError
 
     try:
@@ -90,7 +90,7 @@ def naming_outputs() -> Iterator[None]:
 def ambient_field(
     array: SensorArray, rows: Readings, where: Place | None, *, gradient: bool = False
 ) -> tuple[SensorArray, NDArray[np.float64] | None]:
-    """The array with its ambient field, and that of every row if it differs; errors speak of the options."""
+    """Return the array with its ambient field, and the field of every row if rows differ."""
     from magloc.ambient import with_ambient_field
 
     with naming_place():
@@ -98,31 +98,31 @@ def ambient_field(
 
 
 def naming_place() -> AbstractContextManager[None]:
-    """Let errors of the ambient field speak of its options."""
+    """Turn errors of the ambient field into errors about its options."""
     return naming_options("place", "date", "geomagnetic_model", "ambient_gradient")
 
 
 @Parameter(name="*", group="Motion")
 @dataclass(frozen=True)
 class MotionOptions:
-    """What is known of the motion of one source, or of several.
+    """Model of the motion of one source, or of several.
 
     Parameters
     ----------
     speed_m_s : float
-        Characteristic speed of the source along each axis.
+        Typical speed of the source along each axis [m/s].
     turn_deg_s : float
-        Characteristic rate at which its moment turns; 5 by default, of several sources 100.
+        Typical rate at which the moment turns [°/s]; 5 by default, 100 with --sources.
     motion : {"unknown", "wandering", "turn"}
-        unknown: position and moment are random walks, by the speed and the rate times the interval in every row.
-        wandering: speed and turn rate are estimated too, and forgotten in --correlation-s. turn: a steady turn about
-        the vertical. By default unknown.
+        unknown: position and moment are random walks; a step is the speed, or the rate, times the interval of two rows.
+        wandering: speed and turn rate are estimated too, with the correlation time --correlation-s. turn: a steady turn
+        about the vertical. By default unknown.
     correlation_s : float
-        How long a speed lasts, for wandering; by default as long as a turn at the characteristic rate. Of several
-        sources 1.5 by default.
+        Correlation time of the speed, for wandering [s]; by default the time of one turn at the typical rate, 1.5 with
+        --sources.
     sources : str
-        Follow several moving sources in one filter: at most so many, or "auto": as many as the readings support, five
-        at most. Speeds and rates of turn are then estimated too, and a sensor that dies is left out and named.
+        Track several moving sources in one filter: the largest number of sources, or "auto" for as many as the readings
+        support, at most five. Speeds and turn rates are then estimated too. A sensor that fails is excluded and named.
     """
 
     speed_m_s: float = 0.5
@@ -133,16 +133,16 @@ class MotionOptions:
 
     @property
     def number(self) -> int | Literal["auto"] | None:
-        """Most sources that are followed in one filter; None: one on its own."""
+        """Largest number of sources in one filter; None for the filter of one source."""
         return None if self.sources is None else number_of_sources(self.sources)
 
     @property
     def turn_rad_s(self) -> float:
-        """Characteristic rate of turn of one source."""
+        """Typical turn rate of one source."""
         return math.radians(5.0 if self.turn_deg_s is None else self.turn_deg_s)
 
     def model(self, *, lasting: bool = False) -> MotionModel:
-        """Return the motion of one source that the options name: without a name a random walk or a `lasting` speed."""
+        """Return the motion of one source; by default a random walk, or with `lasting` a speed that lasts."""
         refuse_not_positive(self, "speed_m_s", "turn_deg_s", "correlation_s")
         turn = self.turn_rad_s
         name = self.motion or ("wandering" if lasting else "unknown")
@@ -164,7 +164,7 @@ class MotionOptions:
     def follower(
         self, array: SensorArray, known: KnownOptions, place: Place | None = None, rest_s: float = 0.0
     ) -> Follower:
-        """Return what follows the source, or the sources, through a stream."""
+        """Return the tracker of a stream."""
         from magloc.live.follower import Follower
 
         return Follower(
@@ -191,29 +191,29 @@ _DATE = re.compile(r"\d{4}-\d{2}-\d{2}(T\d{2}:\d{2}(:\d{2}(\.\d+)?)?)?")
 @Parameter(name="*", group="What is known")
 @dataclass(frozen=True)
 class KnownOptions:
-    """What is known of the sensors, of the source and of the ambient field.
+    """Prior knowledge of the sensors, of the source and of the ambient field.
 
     Parameters
     ----------
     sensors : str
-        Ids of the sensors to use, separated by commas; columns of others are ignored. All by default.
+        Ids of the sensors to use, separated by commas. Columns of other sensors are ignored. By default all.
     region : str
-        Where the source is known to be, in m in the array's frame, as "z>0" or "-1<x<1,z>0"; solutions elsewhere are
-        left out.
+        Known bounds of the source [m], in the array's frame, such as "z>0" or "-1<x<1,z>0". Solutions outside them are
+        discarded.
     max_moment_Am2 : float
-        Largest moment that the source can have [A·m²]; solutions with a larger one are left out.
+        Largest possible moment of the source [A·m²]. Solutions with a larger moment are discarded.
     known_moment_Am2 : float
-        What the modulus of the moment is known to be [A·m²]: counts as one more measurement, of a track before its
-        first row, and stays while the moment turns.
+        Known modulus of the moment [A·m²]. It counts as one more measurement; a track uses it once, before its first
+        row, and keeps it while the moment turns.
     known_moment_sigma_Am2 : float
-        1 σ of that [A·m²]; a tenth of the modulus by default.
+        Standard deviation of --known-moment-Am2 [A·m²]; a tenth of the modulus by default.
     place : tuple of 3 floats
         Latitude, longitude [deg] and height [m] of the origin of the world frame, or of the array if the readings have
-        no pose, for the ambient field of scalar sensors. That frame is then east, north, up.
+        no pose. The world frame is then east, north, up. Scalar sensors need it for the ambient field.
     date : str
-        When, such as 2026-11-21; goes with --place.
+        Date of the readings, such as 2026-11-21; needs --place.
     geomagnetic_model : str
-        IGRF-14 (1900 to 2030) or WMM2025 (2025 to 2030). IGRF-14 by default.
+        Model of the Earth's field: IGRF-14 (1900 to 2030) or WMM2025 (2025 to 2030). By default IGRF-14.
     """
 
     sensors: str | None = None
@@ -227,15 +227,15 @@ class KnownOptions:
 
     @property
     def ids(self) -> list[str] | None:
-        """Ids of the sensors in use, None for all."""
+        """Ids of the sensors to use; None for all."""
         return None if self.sensors is None else [name.strip() for name in self.sensors.split(",")]
 
     def array(self, path: Path) -> SensorArray:
-        """The array of a file, reduced to the sensors in use."""
-        return self.reduced(arrays.read_array(path), path)
+        """Read the array of a file, with the sensors to use."""
+        return self.select(arrays.read_array(path), path)
 
-    def reduced(self, array: SensorArray, path: Path) -> SensorArray:
-        """An array of a file, reduced to them; a grid without an origin of its own has that of --place."""
+    def select(self, array: SensorArray, path: Path) -> SensorArray:
+        """Return an array with the sensors to use, and --place as the origin of a grid without one."""
         ids, columns = self.ids, array.columns
         if columns is not None and columns.is_geodetic and columns.origin is None and self.place is not None:
             array = replace(array, columns=replace(columns, origin=self.place))
@@ -271,7 +271,7 @@ class KnownOptions:
 
     @property
     def prior(self) -> SourcePrior:
-        """What is known of the source."""
+        """Prior of the source."""
         low, high = [-math.inf] * 3, [math.inf] * 3
         for part in [] if self.region is None else self.region.split(","):
             bounds = _BOUNDS.fullmatch(part.replace(" ", ""))
@@ -298,7 +298,7 @@ class KnownOptions:
 
     @property
     def where(self) -> Place | None:
-        """Where and when the geomagnetic field is wanted, None where the options do not ask for it."""
+        """Place and date of the geomagnetic field; None without these options."""
         if self.place is None and self.date is None and self.geomagnetic_model is None:
             return None
         if self.place is None:
@@ -315,15 +315,15 @@ def _degrees(place: Vector) -> str:
     return f"latitude {place[0]:.7f}, longitude {place[1]:.7f}, height {place[2]:.2f} m"
 
 
-class OnMaps(Protocol):
-    """What maps of the world can show."""
+class Mappable(Protocol):
+    """A result that can be written as a map of the world."""
 
     def to_geojson(self, place: Vector) -> dict[str, Any]:
-        """A FeatureCollection."""
+        """Return a FeatureCollection."""
         ...
 
     def to_kml(self, place: Vector) -> str:
-        """Placemarks."""
+        """Return placemarks."""
         ...
 
 
@@ -335,9 +335,9 @@ class MapOptions:
     Parameters
     ----------
     geojson : Path
-        Write what is found as a GeoJSON file; needs --place.
+        GeoJSON file to write, with the positions of the sources; needs --place.
     kml : Path
-        Write what is found as a KML file; needs --place.
+        KML file to write, with the positions of the sources; needs --place.
     """
 
     geojson: Path | None = None
@@ -345,18 +345,18 @@ class MapOptions:
 
     @property
     def outputs(self) -> dict[str, Path | None]:
-        """The files by their options."""
+        """Files to write, by their options."""
         return {"--geojson": self.geojson, "--kml": self.kml}
 
     def refuse(self, place: Vector | None) -> None:
-        """Refuse, before long work, files without a place, and those that cannot be written."""
+        """Refuse, before long work, files without a place and files that cannot be written."""
         for option, path in self.outputs.items():
             if path is not None and place is None:
                 raise InputError(f"{option}: found no --place, expected the origin of the world frame with it.")
             refuse_unwritable(path, option)
 
     def refuse_far(self, rows: Readings, name: str) -> None:
-        """Refuse, before long work, an array that is too far from the origin to be placed on the Earth."""
+        """Refuse, before long work, an array too far from the origin to be put on the Earth."""
         from arrays.io.world_maps import check_near
         from magloc.measurement.plausibility import farthest_place
 
@@ -364,8 +364,8 @@ class MapOptions:
             with naming(name):
                 check_near(farthest_place(rows))
 
-    def write(self, found: OnMaps, place: Vector | None) -> None:
-        """Write the files that are asked for."""
+    def write(self, found: Mappable, place: Vector | None) -> None:
+        """Write the files of the options."""
         if place is None:
             return
         if self.geojson is not None:

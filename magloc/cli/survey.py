@@ -1,4 +1,4 @@
-"""``magloc survey``: static targets from sensors that move over ground."""
+"""``magloc survey``: targets at rest from sensors that move over ground."""
 
 from __future__ import annotations
 
@@ -31,18 +31,19 @@ if TYPE_CHECKING:
 @Parameter(name="*", group="Ground")
 @dataclass(frozen=True)
 class GroundOptions:
-    """What is known of the ground.
+    """Properties of the ground.
 
     Parameters
     ----------
     ground_m : float
-        Height of the ground in the world frame.
+        Height of the ground in the world frame [m].
     shortest_geology_m : float
-        Shortest wavelength in the field of the ground itself; what is smaller is taken for a target.
+        Shortest wavelength in the field of the ground itself [m]; smaller anomalies are targets.
     false_per_hectare : float
-        False targets in a hectare that noise may make, on average.
+        Allowed mean number of false targets per hectare.
     body_length_m : float
-        Longest edge of what may be buried: what a dipole leaves out of its field counts as noise. 0 for points.
+        Longest edge of a target [m]. The part of its field that a dipole does not describe counts as noise. 0 for
+        point sources.
     """
 
     ground_m: Annotated[float, Parameter(allow_leading_hyphen=True)] = 0.0
@@ -69,39 +70,40 @@ def survey(
 ) -> None:
     """Find targets at rest in the ground that sensors moved over.
 
-    All rows count together, and as many targets are found as are significant. Readings need the pose of the array, and
-    for scalar sensors the ambient field. The table has the most significant target first: ± xy is the longer half axis
-    of the 95 % ellipse, χ² what would be lost without the target. Flags: "weak" = trust the depth interval and not the
-    ellipse; "near" = another target is so near that one of the two may be spurious; "merged" = more than one, too near
-    to be told apart; "edge" = at the rim of what was searched; "misfit" = errors are larger than is said. Sensors that
-    stick, wild readings and late ones are named.
+    Uses all rows together, and finds all significant targets. Readings need the pose of the array, and for scalar
+    sensors the ambient field. The table lists the most significant target first: ± xy is the longer half axis of the
+    95 % ellipse, χ² the increase without the target. Flags: "weak" = trust the depth interval, not the ellipse; "near"
+    = another target is so near that one of the two may be spurious; "merged" = several targets, too near to be
+    separated; "edge" = at the edge of the searched area; "misfit" = errors are larger than stated. The command names
+    sensors that stick, wild readings and late readings.
 
     Parameters
     ----------
     readings : list of Path
-        Readings files (CSV), each later than the one before.
+        Readings files (CSV), in order of time.
     array : Path
         Array file (TOML).
     known : KnownOptions
-        What is known of the sensors, of the targets, in the world frame, and of the ambient field.
+        Prior knowledge of the sensors, of the targets (in the world frame), and of the ambient field.
     base : Path
-        Readings of a base station (CSV): time_s, at the clock of the readings, and base_nT, the modulus there. The
-        ambient field varies as it does.
+        Readings of a base station (CSV): time_s, on the clock of the readings, and base_nT, the modulus. Its variation
+        is that of the ambient field.
     ground : GroundOptions
-        What is known of the ground.
+        Properties of the ground.
     maps : MapOptions
         Files for maps of the world.
     crs : str
         Coordinate system of the files for maps, such as EPSG:32633; by default that of the log, or else WGS 84. It
         needs places on the Earth: --place, or a log with coordinates.
     scheduler : str
-        Address of a dask scheduler (tcp://HOST:PORT) whose workers search the tiles of a large survey.
+        Address of a dask scheduler (tcp://HOST:PORT), whose workers then search the tiles of a large survey.
     out : Path
-        Folder for targets.csv, residual.csv, reach.csv (the least moment seen), the map and the lines past the targets.
-        With places on the Earth also targets.gpkg, .geojson and .kml, field.tif, residual.tif, lines.xyz and a report;
-        of a large survey it keeps what is done, until all is: the same command goes on with one that was interrupted.
+        Folder for targets.csv, residual.csv, reach.csv (the smallest moment that is found), a map, and profiles past
+        the targets. With positions on the Earth also for targets.gpkg, .geojson and .kml, field.tif, residual.tif,
+        lines.xyz and a report. It also holds the finished tiles of a large survey; the same command continues an
+        interrupted survey.
     html : Path
-        Write the survey in three dimensions, lines, ground and targets, as one page that needs no server.
+        HTML file to write: lines, ground and targets in three dimensions, as one page that needs no server.
     json : bool
         Print one JSON object in place of the table.
     common : CommonOptions
@@ -113,7 +115,9 @@ def survey(
     refuse_not_positive(ground, "shortest_geology_m", "false_per_hectare")
     if not math.isfinite(ground.ground_m):
         raise InputError(f"--ground-m: found {ground.ground_m:g}, expected a finite number.")
-    used, known = known.on_earth(known.reduced(arrays.read_sensors(array), array), readings[0])  # one is enough
+    used, known = known.on_earth(
+        known.select(arrays.read_sensors(array), array), readings[0]
+    )  # a survey works with one sensor
     maps.refuse(known.place)
     where = None if known.place is not None and known.date is None else known.where
     frame = _map_frame(used, known.place, crs)
@@ -154,7 +158,7 @@ def survey(
         size = "" if pose is None else f" {100.0 * pose.position_m:.2g} cm that last {pose.correlation_s:g} s"
         if pose is not None and pose.position_white_m:
             size += f", and {100.0 * pose.position_white_m:.2g} cm new in every row"
-        note(f"nothing is stated of the pose's errors: as the rows show them{size}")
+        note(f"the array file states no errors of the pose; estimated from the rows:{size}")
 
 
 def _map_frame(array: arrays.SensorArray, origin: Vector | None, crs: str | None) -> MapFrame | None:

@@ -1,4 +1,4 @@
-"""``magloc track``: one source followed through the rows of a readings file, or of a stream."""
+"""``magloc track``: a source, or several, through the rows of a file or a stream."""
 
 from __future__ import annotations
 
@@ -42,41 +42,41 @@ if TYPE_CHECKING:
     from magloc.tracking.track import Track
 
 
-# Two vector sensors have no more: too few for the six numbers of a source in one row.
+# Channels of two vector sensors: too few for the six numbers of a source in one row.
 _FEW_CHANNELS = 6
 _STATE_OFFSETS = "; state offset_uncertainty_nT in the array file, use --rest-s, or calibrate the array"
-_USE_SURVEY = "sources at rest that few sensors move past are found by magloc survey"
+_USE_SURVEY = "magloc survey finds sources at rest that few sensors move past"
 
 
 @Parameter(name="*", group="Motion")
 @dataclass(frozen=True)
 class PathOptions(MotionOptions):
-    """What is known of the motion.
+    """Model of the motion, or a known path.
 
     Parameters
     ----------
     sources : str
-        Follow several moving sources in one filter: at most so many, or "auto": as many as the readings support, five
-        at most. Speeds and rates of turn are then estimated too, and a sensor that dies is left out and named.
+        Track several moving sources in one filter: the largest number of sources, or "auto" for as many as the readings
+        support, at most five. Speeds and turn rates are then estimated too. A sensor that fails is excluded and named.
     speed_m_s : float
-        Characteristic speed of the source along each axis.
+        Typical speed of the source along each axis [m/s].
     turn_deg_s : float
-        Characteristic rate at which its moment turns; 5 by default, of several sources 100.
+        Typical rate at which the moment turns [°/s]; 5 by default, 100 with --sources.
     motion : {"unknown", "wandering", "turn"}
-        unknown: position and moment are random walks, by the speed and the rate times the interval in every row.
-        wandering: speed and turn rate are estimated too, and forgotten in --correlation-s. turn: a steady turn about
-        the vertical. By default unknown; with --smooth, --detrend and --high-pass-hz wandering.
+        unknown: position and moment are random walks; a step is the speed, or the rate, times the interval of two rows.
+        wandering: speed and turn rate are estimated too, with the correlation time --correlation-s. turn: a steady turn
+        about the vertical. By default unknown; wandering with --smooth, --detrend or --high-pass-hz.
     correlation_s : float
-        How long a speed lasts, for wandering; by default as long as a turn at the characteristic rate. Of several
-        sources 1.5 by default.
+        Correlation time of the speed, for wandering [s]; by default the time of one turn at the typical rate, 1.5 with
+        --sources.
     position : tuple of 3 floats
-        Where the source is, at rest, in the frame of the results [m]: only its moment is followed. More than once:
-        several sources.
+        Known position of a source at rest [m], in the frame of the results; only its moment is estimated. Give it
+        several times for several sources.
     object_path : Path
         Path file (CSV) of the source: time_s,x_m,y_m,z_m and optionally its attitude qx,qy,qz,qw, in the frame of the
-        results; only its moment is followed, and turns with the attitude. Rows outside the path are left out.
+        results. Only the moment is estimated; it turns with the attitude. Rows outside the path are left out.
     error : PathErrorOptions
-        How wrong a known path may be.
+        Errors of a known path.
     """
 
     position: list[Vector] | None = None
@@ -84,7 +84,7 @@ class PathOptions(MotionOptions):
     error: PathErrorOptions = field(default_factory=PathErrorOptions)
 
     def known_path(self) -> ObjectPath | list[Vector] | None:
-        """Where the source is known to be, None where that is to be found."""
+        """Return the known path or positions; None if the position is to be estimated."""
         if self.position is None and self.object_path is None:
             if self.error != PathErrorOptions():
                 raise InputError("--path-sigma-m: found neither --position nor --object-path, expected one of them.")
@@ -101,21 +101,21 @@ class PathOptions(MotionOptions):
 @Parameter(name="*", group="Conditioning of the readings")
 @dataclass(frozen=True)
 class ConditioningOptions:
-    """What of the readings is no signal, and what is done to them first; not for a stream.
+    """Processing of the readings before tracking; not for a stream.
 
     Parameters
     ----------
     rest_s : float
-        The first seconds are a rest, without a source, whose mean is taken off all readings; vector sensors of an array
-        that stands.
+        Duration of a rest without a source at the beginning [s]. Its mean is subtracted from all readings. Only for
+        vector sensors of an array that does not move.
     detrend : bool
-        Every channel has a straight line through its mean, whose slope is estimated beside the source.
+        Subtract the mean of every channel, and estimate a linear trend with the source.
     high_pass_hz : float
-        Every channel has an offset and a drift, as large as its noise at this frequency, that are estimated too.
+        Estimate an offset and a drift of every channel; the drift equals the noise at this frequency [Hz].
     mains_hz : float
-        Take out this frequency and its harmonics.
+        Frequency to remove, with its harmonics [Hz], such as 50.
     window_s : float
-        Average windows of this length.
+        Length of the windows to average [s]; by default every row counts.
     """
 
     rest_s: float | None = None
@@ -125,7 +125,7 @@ class ConditioningOptions:
     window_s: float | None = None
 
     def apply(self, rows: Readings, array: SensorArray, path: Path) -> tuple[Readings, SensorArray]:
-        """Readings without those that saturate, conditioned, and the array with their noise."""
+        """Return the processed readings without saturated ones, and the array with their noise."""
         from magloc.averages import window_averages, window_averaging_array
         from magloc.readings import without_saturated
 
@@ -163,39 +163,38 @@ def track(
     conditioning: ConditioningOptions = ConditioningOptions(),
     common: CommonOptions = CommonOptions(),  # noqa: B008 - frozen
 ) -> None:
-    """Follow one source through time.
+    """Track one source, or several, through time.
 
-    The track starts by itself from the first row that shows a source, is updated by every row, and ends where the
-    readings contradict it three times in a row or its place is no longer known; then it starts anew. Rows where the
-    source is not tracked are null. With --position or --object-path the source is where they say, and its moment alone
-    is followed from the first row that determines it.
+    A track starts without a guess from the first row that shows a source, and every row updates it. It ends where three
+    rows in succession contradict it, or where the position is no longer known; then it starts again. Rows without a
+    track are null. With --position or --object-path the position is known, and only the moment is estimated.
 
     Parameters
     ----------
     readings : Path
-        Readings file (CSV), or - for rows on standard input; then every row is answered by one JSON line at once.
+        Readings file (CSV), or - for rows on standard input; then every row gives one JSON line at once.
     array : Path
         Array file (TOML).
     truth : Path
-        Truth file (CSV): errors, NEES, NIS with its 99 % bounds, and the least error that is possible on average over
-        the motions that the options allow: a source that moves less may be found better.
+        Truth file (CSV). Prints errors, NEES, NIS with its 99 % bounds, and the Cramér-Rao bound over the motions that
+        the options allow; for a source that moves less the error may be smaller.
     smooth : bool
-        Use later rows too (fixed-interval smoother).
+        Also use later rows (fixed-interval smoother).
     json : bool
         Print one JSON object in place of the table.
     jsonl : bool
         Print one JSON line for every row, as soon as it is known.
     known : KnownOptions
-        What is known of the sensors, of the source when a track starts, and of the ambient field.
+        Prior knowledge of the sensors, of the source when a track starts, and of the ambient field.
     maps : MapOptions
-        Files for maps of the world: one point of a source at rest, else the track.
+        Files for maps of the world: one point for a source at rest, otherwise the track.
     out : Path
-        Folder for the picture of the track with its 95 % ellipses, its consistency and the data behind both; with
-        --sources for the picture and the data, a row for every source.
+        Folder for figures and their data: the track with its 95 % ellipses, and its consistency; with --sources the
+        track alone, with a row for every source.
     motion : PathOptions
-        What is known of the motion.
+        Model of the motion, or a known path.
     conditioning : ConditioningOptions
-        What is done to the readings first.
+        Processing of the readings before tracking.
     common : CommonOptions
         Common options.
     """
@@ -205,7 +204,7 @@ def track(
     refuse_one_for_two({"--out": out, **maps.outputs})
     maps.refuse(known.place)
     outputs = TrackOutputs(json, jsonl, maps, out, truth)
-    # A place without a date may be there for the map alone.
+    # A place without a date is for the maps only.
     where = None if known.place is not None and known.date is None else known.where
     used = known.array(array)
     on_background = conditioning.detrend or conditioning.high_pass_hz is not None
@@ -255,7 +254,7 @@ def track(
 def _moments(
     array: SensorArray, rows: Readings, path: ObjectPath | list[Vector], motion: PathOptions, *, smooth: bool
 ) -> tuple[MomentTrack, ...]:
-    """Follow the moments of one source on a known path, or of several at known places."""
+    """Track the moment of one source on a known path, or of several at known positions."""
     if isinstance(path, list) and len(path) > 1:
         return magloc.track_moments(array, rows, path, turn_rad_s=motion.turn_rad_s, smooth=smooth)
     return (
@@ -271,7 +270,7 @@ def _moments(
 
 
 def _write_track(found: Track, name: str, known: KnownOptions, outputs: TrackOutputs, hint: str) -> None:
-    """Print a track and write what is asked for; a `hint` may help where there is none."""
+    """Print a track and write the outputs; `hint` ends the error where there is no track."""
     from magloc.localization.fit.table import legend
     from magloc.tracking.files import json_of_track
     from magloc.tracking.sensor_health import OFFSETS
@@ -313,7 +312,7 @@ def _write_track(found: Track, name: str, known: KnownOptions, outputs: TrackOut
 
 
 def _write_sources(found: SourcesTrack, name: str, outputs: TrackOutputs, *, single: bool) -> None:
-    """Print the tracks of several sources and write what is asked for."""
+    """Print the tracks of several sources, and write the outputs."""
     from magloc.tracking.files import json_entry
 
     if outputs.json:
@@ -333,7 +332,7 @@ def _write_sources(found: SourcesTrack, name: str, outputs: TrackOutputs, *, sin
 
 
 def _note_dropped(names: Iterable[str]) -> None:
-    """Name the sensors that are left out of some rows."""
+    """Print the sensors that some rows do not use."""
     if names := sorted(names):
         note(f"sensors left out of some rows: {', '.join(names)}")
 
@@ -344,12 +343,12 @@ def _in_ambient_field(array: SensorArray, rows: Readings, where: Place | None) -
 
 
 def _is_undetermined(found: Iterable[TrackPoint]) -> bool:
-    """Whether rows tell where a source may be; warns that they do not tell where it is."""
+    """Return whether rows show a source without determining its position, and warn of it."""
     from magloc.tracking.results import UNDETERMINED
 
     rows = sum(point.status == UNDETERMINED for point in found)
     if rows:
-        text = f"warning: {rows} rows show a source but do not determine its place: see the standard deviations"
+        text = f"warning: {rows} rows show a source but do not determine its position: see the standard deviations"
         note(text, always=True)
     return rows > 0
 
@@ -360,7 +359,7 @@ def _no_track(readings: str, statuses: Iterable[str], hint: str = "") -> InputEr
 
 
 def _stream(array: SensorArray, known: KnownOptions, motion: PathOptions, where: Place | None) -> None:
-    """Answer every row of standard input by one line; none that is tracked is an InputError at its end."""
+    """Print one line for every row of standard input; refuse at its end a stream without a track."""
     from magloc.tracking.results import UNDETERMINED
 
     follower = motion.follower(array, known, where)

@@ -1,4 +1,4 @@
-"""``magloc view``: a result seen in three dimensions, in a browser, as a page or as a picture."""
+"""``magloc view``: a result in three dimensions, in a browser, as a page or as a picture."""
 
 from __future__ import annotations
 
@@ -35,31 +35,30 @@ def view(
     open: Flag = False,
     common: CommonOptions = CommonOptions(),  # noqa: B008 - frozen
 ) -> None:
-    """See an array, readings, a track or a map in three dimensions.
+    """Show an array, readings, a track or a map in three dimensions.
 
-    Starts a server on this machine and prints its address, which any browser on this machine opens; Ctrl-C ends it.
-    With --html, --png or --movie a file is written instead.
+    Starts a server on this machine and prints its address for a browser on this machine; Ctrl-C ends the server. With
+    --html, --png or --movie the command writes a file instead.
 
     Parameters
     ----------
     path : Path
         Array file (TOML), readings or truth file (CSV), track of magloc track --json or --jsonl, folder of magloc
-        map, or - for rows on standard input, whose source is followed as by magloc live.
+        map, or - for rows on standard input, whose source is tracked as by magloc live.
     array : Path
-        Array file that readings or a track belong to; for readings by default NAME-array.toml or array.toml beside
-        them.
+        Array file of readings or of a track; for readings by default NAME-array.toml or array.toml in their folder.
     readings : Path
-        Readings file (CSV) that a track belongs to.
+        Readings file (CSV) of a track.
     html : Path
-        Write one static HTML file that needs no server.
+        HTML file to write; it needs no server.
     png : Path
-        Write a picture; needs Chromium or Chrome.
+        Picture to write (.png); needs Chromium or Chrome.
     movie : Path
-        Write a film (.mp4, .gif or .apng) of all rows, or once around an array or a map; needs Chromium or Chrome.
+        Film to write (.mp4, .gif or .apng): all rows, or once around an array or a map; needs Chromium or Chrome.
     port : int
-        Port of the server; the next one that is free if it is in use.
+        Port of the server; the next free one if it is in use.
     open : bool
-        Open the browser.
+        Open the page in the browser.
     common : CommonOptions
         Common options.
     """
@@ -93,11 +92,11 @@ def view(
             sensors, shown, readings=rows, html=html, png=png, movie=movie, open=open, port=port, title=title, file=file
         )
 
-    written_or_served(scene, written, port)
+    write_or_serve(scene, written, port)
 
 
-def written_or_served(scene: Callable[[int], View], written: Sequence[str], port: int) -> None:
-    """Make a scene, which writes files or is served at a port until Ctrl-C."""
+def write_or_serve(scene: Callable[[int], View], written: Sequence[str], port: int) -> None:
+    """Make a scene; it writes files, or a server shows it until Ctrl-C."""
     from magloc.viewer.server import free_port
 
     with naming_outputs():
@@ -108,7 +107,7 @@ def written_or_served(scene: Callable[[int], View], written: Sequence[str], port
     if written:
         note(f"wrote {', '.join(written)}")
         return
-    with suppress(KeyboardInterrupt):  # who has the address may press Ctrl-C before the waiting begins
+    with suppress(KeyboardInterrupt):  # Ctrl-C may come before the waiting begins
         note("open this address in a browser; Ctrl-C ends the viewer")
         print(view.address, flush=True)
         view.wait()
@@ -116,12 +115,12 @@ def written_or_served(scene: Callable[[int], View], written: Sequence[str], port
 
 
 def _view_stream(array: Path, port: int, *, open: bool) -> None:
-    """Show a source that is followed through rows on standard input, and what is last known of it until Ctrl-C."""
-    from magloc.cli.live import PageOptions, shown
+    """Show a source that is tracked through rows on standard input, until Ctrl-C."""
+    from magloc.cli.live import PageOptions, open_live_page
     from magloc.live.follower import Follower
 
     follower = Follower(arrays.read_array(array))
-    with shown(follower, PageOptions(port=port, open=open)) as scene, naming(str(array)):
+    with open_live_page(follower, PageOptions(port=port, open=open)) as scene, naming(str(array)):
         print(scene.address, flush=True)
         for point in follower.follow(STREAM):
             scene.update(point)
@@ -131,7 +130,7 @@ def _view_stream(array: Path, port: int, *, open: bool) -> None:
 def _with_track(
     result: Result, array: Path | None, readings: Path | None
 ) -> tuple[SensorArray | None, Readings | None]:
-    """The array and the readings that a track belongs to."""
+    """Read the array and the readings of a track."""
     from arrays.array_file import read_sensors
     from magloc.tracking.results import TrackResult
     from magloc.viewer.pages.open_result import ReadingsResult, read_rows
@@ -149,11 +148,11 @@ def _with_track(
 
 
 def _fixes(result: ReadingsResult) -> tuple[Fixes, Readings]:
-    """Fixes of the rows as ``magloc locate`` finds them, in its frame; of 2000 rows at most, evenly."""
+    """Locate the source in every row, of at most 2000 rows, as ``magloc locate`` does."""
     from magloc.viewer.view import locate_readings, thin_readings
 
     rows, n = thin_readings(result.readings), len(result.readings)
     if len(rows) < n:
-        note(f"note: every {-(-n // len(rows))}th of {n} rows is fixed and shown")
+        note(f"note: every {-(-n // len(rows))}th of {n} rows is located and shown")
     with progress(len(rows), "rows") as advance:
         return locate_readings(result.array, rows, advance), rows

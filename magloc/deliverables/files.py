@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from arrays.io.csv import Column
 from arrays.io.errors import InputError
-from arrays.io.text import replaced
+from arrays.io.text import replace_file
 from magloc.deliverables.geosoft import geosoft_xyz
 from magloc.deliverables.layers import target_fields, write_layers
 from magloc.deliverables.map_frame import MapFrame
@@ -69,5 +69,4 @@ def _print_report(path: Path) -> None:
     except (InputError, BrowserError) as error:
         _LOG.info(f"note: {path.name} is not written: {error}")
         return
-    with replaced(path) as unfinished:
-        unfinished.write_bytes(content)
+    replace_file(path, lambda place: place.write_bytes(content))

@@ -10,7 +10,7 @@ from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import Delaunay, KDTree
 
 from arrays.io.errors import of_extra
-from arrays.io.text import replaced
+from arrays.io.text import replace_file
 from arrays.typing import FloatArray
 from magloc.deliverables.map_frame import MapFrame
 
@@ -98,25 +98,23 @@ def _round_down(length: float) -> float:
 def write_geotiff(path: Path, raster: Raster, frame: MapFrame, title: str, unit: str) -> None:
     """Write a raster as GeoTIFF with its coordinate system; tags name the method of gridding and the cell's size."""
     with of_extra("gis", "a GeoTIFF"):
-        import rasterio
+        from rasterio import Affine, MemoryFile
     n_rows, n_columns = raster.values.shape
-    with (
-        replaced(path) as unfinished,
-        rasterio.open(
-            unfinished,
-            "w",
+    with MemoryFile() as memory:
+        with memory.open(
             driver="GTiff",
             height=n_rows,
             width=n_columns,
             count=1,
             dtype="float32",
             crs=frame.crs,
-            transform=rasterio.Affine(raster.cell[0], 0.0, raster.corner[0], 0.0, -raster.cell[1], raster.corner[1]),
+            transform=Affine(raster.cell[0], 0.0, raster.corner[0], 0.0, -raster.cell[1], raster.corner[1]),
             nodata=np.nan,
             compress="deflate",
-        ) as file,
-    ):
-        file.write(raster.values.astype(np.float32), 1)
-        file.update_tags(method=METHOD, cell_m=f"{raster.cell_m:g}")
-        file.set_band_description(1, title)
-        file.set_band_unit(1, unit)
+        ) as file:
+            file.write(raster.values.astype(np.float32), 1)
+            file.update_tags(method=METHOD, cell_m=f"{raster.cell_m:g}")
+            file.set_band_description(1, title)
+            file.set_band_unit(1, unit)
+        content = bytes(memory.getbuffer())
+    replace_file(path, lambda place: place.write_bytes(content))

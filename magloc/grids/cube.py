@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from arrays.array import SensorArray
 from arrays.array_file import array_toml
-from arrays.io.closing import uninterrupted
+from arrays.io.closing import delay_signals
 from arrays.io.errors import check_positive
 from arrays.typing import FloatArray
 
@@ -270,7 +270,7 @@ def computed(cube: CubeMap, box: Box) -> Chunk:
     layers = -(-(x.stop - x.start) // _PARTS)
     parts: list[Values] = []
     for begin in range(x.start, x.stop, layers):
-        with uninterrupted():
+        with delay_signals():
             parts.append(cube.values(Box(box.place, (slice(begin, min(begin + layers, x.stop)), y, z))))
     values = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     return Chunk(box, values, time.perf_counter() - began)

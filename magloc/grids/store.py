@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from arrays.io.closing import Closing, uninterrupted
+from arrays.io.closing import Closing, delay_signals
 from arrays.io.errors import InputError, of_extra
 from arrays.typing import FloatArray
 from magloc.grids.cube import (
@@ -121,7 +121,7 @@ class Sweep(Closing):
     def write(self, chunks: Iterable[Chunk], progress: Callable[[int], None] | None = None) -> None:
         """Write chunks as they come; where one cannot be written, those before it are done."""
         for chunk in chunks:
-            with uninterrupted():
+            with delay_signals():
                 for name, array in self._arrays.items():
                     array[chunk.box.region] = chunk.values[name]
                 self._marks[chunk.box.place] = chunk.seconds

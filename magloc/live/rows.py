@@ -166,7 +166,7 @@ class RowParser:
             return
         try:
             table = self._format.header(text, self._name, self._n_lines)
-            readings_of_table(self._format.translated(table), self._array, self._sensors)
+            readings_of_table(self._format.translate(table), self._array, self._sensors)
         except InputError as error:
             if self._first is None:
                 if self._is_file:
@@ -176,7 +176,7 @@ class RowParser:
                 self._has_warned, self.fault = True, str(error)
             self._count_garbled(str(error))
             return
-        header = _Header(text, table, np.zeros((0, len(self._format.translated(table).header))))
+        header = _Header(text, table, np.zeros((0, len(self._format.translate(table).header))))
         if self._first is None:
             self._first = header
         if len(self._headers) >= _MOST_HEADERS:

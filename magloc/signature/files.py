@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from arrays.io.tables import aligned, by_sigma
+from arrays.io.tables import align, by_sigma
 from arrays.typing import FloatArray
 from magloc.localization.fit.results import values_of
 
@@ -26,7 +26,7 @@ def lines_of_signature(signature: Signature) -> list[str]:
     cells = [["part", "A·m²", "σ", ""]]
     for name, value, sigma in zip(signature.names, determined, signature.sigma_Am2, strict=True):
         cells.append([name, *(by_sigma(value, sigma) if np.isfinite(value) else "--"), ""])
-    lines = aligned(cells, left=1)
+    lines = align(cells, left=1)
     if signature.components.induced != "none":
         lines.append(f"induced at {1e9 * signature.components.ambient_T:.0f} nT")
     if signature.components.eddy:
@@ -61,7 +61,7 @@ def lines_of_depths(signature: Signature, depths_m: Sequence[float]) -> list[str
             sigma = float(_sigma(direction @ of_covariance[k] @ direction))
             of_field_nT = by_sigma(1e9 * float(modulus[k]), 1e9 * sigma)
             rows.append([f"{depth:g}", heading, *of_field_nT, f"{x[k]:.1f}", ""])
-    return aligned(rows) if depths_m else []
+    return align(rows) if depths_m else []
 
 
 def json_of_signature(signature: Signature, depths_m: Sequence[float]) -> dict[str, object]:

@@ -15,7 +15,7 @@ from scipy.special import chdtri
 from arrays.array import SensorArray
 from arrays.io.csv import Column
 from arrays.io.results import Result
-from arrays.io.tables import aligned, by_sigma
+from arrays.io.tables import align, by_sigma
 from arrays.typing import FloatArray, IntArray, Vector
 from magloc.localization.fit.table import cells_of_strength
 from magloc.truth import state_columns
@@ -295,4 +295,4 @@ class Survey(Result):
             across = f"{100.0 * t.ellipse95[0]:.2g}"
             size = [strength, across, f"{t.significance:.4g}"]
             rows.append([t.id, x, y, depth, "–".join(interval), *size, ", ".join(t.flags)])
-        return aligned(rows)
+        return align(rows)

@@ -12,11 +12,11 @@ import msgspec
 import numpy as np
 from scipy.special import chdtri
 
-from arrays.io.closing import garbage_waits
+from arrays.io.closing import pause_garbage_collection
 from arrays.io.csv import Column
 from arrays.io.errors import LARGEST, InputError
 from arrays.io.results import Quantity
-from arrays.io.tables import aligned, by_sigma
+from arrays.io.tables import align, by_sigma
 from arrays.io.text import read_text
 from arrays.io.world_maps import feature, feature_collection, kml, placemark, world_place
 from arrays.typing import FloatArray, Vector
@@ -90,7 +90,7 @@ def lines_of_track(points: Sequence[TrackPoint | SourcesPoint], *, most: int | N
             unsure = "" if point.range_observable or point.centroid_m is None else ", range?"
             nis = f"{point.nis:.1f}/{point.nis_dof}" if np.isfinite(point.nis) else "-"
             rows.append([time, *cells, nis, row.status + faults + unsure])
-    lines = aligned(rows)
+    lines = align(rows)
     if len(shown) < len(points):
         lines.insert(middle, f"… {len(points)} rows")
     return lines
@@ -235,7 +235,7 @@ def _known(point: TrackPoint) -> tuple[FloatArray, FloatArray, FloatArray]:
     return np.asarray(point.position_m), np.asarray(point.moment_Am2), np.sqrt(np.diagonal(point.covariance))  # type: ignore[arg-type]
 
 
-@garbage_waits()
+@pause_garbage_collection()
 def read_track(path: Path) -> TrackResult:
     """Read a track from a file of ``magloc track --json`` or ``--jsonl``.
 

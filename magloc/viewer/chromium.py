@@ -18,7 +18,7 @@ from typing import Any
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
-from arrays.io.closing import Closing, uninterrupted
+from arrays.io.closing import Closing, delay_signals
 from arrays.io.errors import InputError
 
 BINARIES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
@@ -70,7 +70,7 @@ class Chromium(Closing):
         self._process: subprocess.Popen[bytes] | None = None
         self._guard: subprocess.Popen[bytes] | None = None
         try:
-            with uninterrupted():  # otherwise a folder or a process could be left over
+            with delay_signals():  # otherwise a folder or a process could be left over
                 self._profile = tempfile.mkdtemp(prefix="magloc-chromium-")
                 if os.name == "posix":
                     guard = ["sh", "-c", _GUARD, self._profile]

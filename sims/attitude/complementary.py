@@ -66,7 +66,7 @@ class SatelliteRuns:
 
 
 def satellite_runs(scenario: SatelliteScenario, seeds: Sequence[int]) -> SatelliteRuns:
-    """Simulate one run for each seed; a run is the same whatever runs are beside it.
+    """Simulate one run for each seed; a run does not depend on the others.
 
     The gyro gives the mean rate over the step that ends at each instant, plus its bias.
     """
@@ -98,7 +98,7 @@ def satellite_runs(scenario: SatelliteScenario, seeds: Sequence[int]) -> Satelli
 
 
 def attitude(phases_rad: ArrayLike, amplitude_rad: float, time_s: ArrayLike) -> FloatArray:
-    """Attitude of 3-2-1 Euler angles, amplitude·sin(2πt/(pT) + φ).
+    """Return the attitude of 3-2-1 Euler angles, amplitude·sin(2πt/(pT) + φ).
 
     Shape ``time_s`` (n,). ``phases_rad`` (R, 3): φ of roll, pitch and yaw. Returns (R, n, 4): orbital from body.
     """

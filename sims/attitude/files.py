@@ -1,4 +1,4 @@
-"""What is simulated of a scenario file of ``adcs``."""
+"""The simulation of a scenario file of ``adcs``."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from sims.attitude.scenario import AttitudeScenario, StartConditions
 
 
 def simulation_of(file: AttitudeFile) -> AttitudeScenario:
-    """Scenario of a simulation.
+    """Return the scenario of a simulation.
 
     ``file``: of :func:`adcs.io.scenario_files.read_scenario`.
     """

@@ -1,4 +1,4 @@
-"""Truth of the roll/yaw satellite: the dynamics of the error alone, and the satellite in its attitude loop.
+"""Truth of the roll/yaw satellite: the error dynamics alone, and the attitude loop.
 
 :mod:`adcs.ellipsoids.roll_yaw` has the system, and the observers that read what is made here. Every run has its own
 stream of random numbers: run s is the same whatever runs are beside it.
@@ -43,7 +43,7 @@ class ErrorScenario:
 
 
 def error_runs(scenario: ErrorScenario, seeds: Sequence[int]) -> ErrorRuns:
-    """Simulate errors of roll and yaw: uniform at the start in a circle of radius 3 c, then carried by the drift."""
+    """Simulate errors of roll and yaw, uniform at the start in a circle of radius 3 c."""
     n_runs, n_steps = len(seeds), scenario.n_steps
     amplitude = _amplitude(scenario)
     states, noise = np.empty((n_runs, n_steps + 1, 2)), np.empty((n_runs, n_steps))
@@ -116,7 +116,7 @@ def fly(scenario: LoopScenario, controller: Controller, seeds: Sequence[int]) ->
 
 
 def _amplitude(scenario: ErrorScenario | LoopScenario) -> FloatArray:
-    """Largest error of every reading [rad], shape (n_steps,)."""
+    """Return the largest error of every reading [rad], shape (n_steps,)."""
     amplitude = np.full(scenario.n_steps, scenario.noise_rad)
     if scenario.jump_s is not None:
         amplitude[STEP_S * np.arange(1, scenario.n_steps + 1) >= scenario.jump_s] *= JUMP
@@ -126,7 +126,7 @@ def _amplitude(scenario: ErrorScenario | LoopScenario) -> FloatArray:
 def advance(
     scenario: LoopScenario, angles_rad: FloatArray, rates_rad_s: FloatArray, torque_Nm: FloatArray, time_s: float
 ) -> FloatArray:
-    r"""Satellites one cycle of 2 s later, by Runge-Kutta steps of 0.2 s.
+    r"""Advance satellites by one cycle of 2 s, in Runge-Kutta steps of 0.2 s.
 
     Euler's equations :math:`J\dot\omega = T - \omega \times J\omega`, and small angles against the orbital frame:
     :math:`\dot\gamma = \omega_x + \omega_0\psi`, :math:`\dot\theta = \omega_y + \omega_0`,

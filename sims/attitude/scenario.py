@@ -1,4 +1,4 @@
-"""What is simulated: a satellite with its wheels and sensors, its orbit, disturbances, and when a run may start."""
+"""Attitude scenario: satellite, orbit, disturbances and conditions of the start."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from arrays.io.errors import check_not_negative
 
 @dataclass(frozen=True)
 class StartConditions:
-    r"""What must hold from the start of a run to its end.
+    r"""Conditions that hold from the start of a run to its end.
 
     Attributes
     ----------
@@ -35,37 +35,37 @@ class StartConditions:
 
 @dataclass(frozen=True, eq=False)
 class AttitudeScenario:
-    """A satellite under wheel control that holds the orbital frame.
+    """Satellite whose wheels hold the orbital frame.
 
     Directions of torque, biases and errors are random, one for every run.
 
     Attributes
     ----------
     satellite : Satellite
-        Runs start within the 24 hours from its start; its control sees the true state.
+        Satellite; runs start within 24 hours from its start, and its control knows the true state.
     conditions : StartConditions
-        Of Sun and field, which hold throughout a run.
+        Conditions of Sun and field that hold throughout a run.
     duration_s, dt_s : float
-        Of a run, and between its instants. Readings are taken and torques set at every instant.
+        Duration of a run, and step between its instants, at which readings are taken and torques are set.
     torque_Nm : float
         Size of a disturbing torque that is constant in the body.
     torque_period_s : float
-        Period with which that torque goes to its opposite and back; infinite = constant.
+        Period of that torque; infinite = constant.
     gyro_bias_rad_s, field_bias_T : float
         Sizes of the biases at the start.
     field_gain, field_axes_rad : float
-        Standard deviations of the errors of the magnetometer's gains, and of the angles by which its axes are off.
+        Standard deviations of the errors of the magnetometer's gains, and of the errors of its axes.
     field_error_T : float
         Size of the difference between the true field and its model, constant in the orbital frame.
     field_error_correlation_s : float
-        Time constant with which each component of that difference goes to and fro, ``field_error_T`` then being its
-        standard deviation; infinite = constant.
+        Correlation time of each component of that difference, with ``field_error_T`` as standard deviation; infinite =
+        constant.
     dipole_Am2 : tuple of 3 floats
-        Magnetic dipole in the body that filters are not told, besides the residual one of the satellite.
+        Magnetic dipole of the body that filters do not know, in addition to the residual dipole of the satellite.
     rods : HysteresisRods or None
-        On board, across a magnet; filters are not told of them.
+        Hysteresis rods on board, across a magnet; filters do not know them.
     wild_share : float
-        Share of the readings of every sensor that are anything at all.
+        Share of wild readings of every sensor.
     start_attitude_rad, start_rate_rad_s : float
         Standard deviations, per axis, of attitude and rate from those of the orbital frame.
 
@@ -115,5 +115,5 @@ class AttitudeScenario:
 
     @property
     def n_instants(self) -> int:
-        """Instants of a run, the start included."""
+        """Number of instants of a run, including the start."""
         return 1 + round(self.duration_s / self.dt_s)

@@ -1,4 +1,4 @@
-"""Truth and readings of many runs of an attitude scenario at once: the leading axis of all arrays is the run.
+"""Truth and readings of many attitude runs at once; the first axis of all arrays is the run.
 
 :func:`simulate` lets the control see the true state. That makes no difference to a filter which is told the torque that
 was set. Where the loop shall be closed by an estimate, :func:`prepare` gives everything that does not depend on it, and
@@ -40,8 +40,8 @@ Command = Callable[[Record, int], FloatArray]
 
 
 @dataclass(frozen=True, eq=False)
-class Prepared:
-    """Everything of some runs that does not depend on their motion.
+class PreparedRuns:
+    """Part of some runs that does not depend on their motion.
 
     ``q`` (runs, 4), ``w`` (runs, 3), ``momentum_Nms`` (runs, 3): true state at the start.
     """
@@ -65,7 +65,7 @@ class Prepared:
 
 @dataclass(frozen=True, eq=False)
 class AttitudeRuns(Record):
-    """Truth and readings.
+    """Truth and readings of runs.
 
     Attributes
     ----------
@@ -75,27 +75,27 @@ class AttitudeRuns(Record):
         Rate against inertial space, body axes [rad/s].
     """
 
-    prepared: Prepared
+    prepared: PreparedRuns
     q: FloatArray
     w: FloatArray
 
     @classmethod
     def of(
-        cls, prepared: Prepared, q: FloatArray, w: FloatArray, momentum_Nms: FloatArray, wheel_torque_Nm: FloatArray
+        cls, prepared: PreparedRuns, q: FloatArray, w: FloatArray, momentum_Nms: FloatArray, wheel_torque_Nm: FloatArray
     ) -> AttitudeRuns:
-        """Runs of a motion, with its readings."""
+        """Return the runs of a motion, with its readings."""
         scenario, readings = prepared.scenario, sense(prepared, q, w)
         known = scenario.satellite, scenario.dt_s, prepared.environment
         return cls(*known, readings, momentum_Nms, wheel_torque_Nm, prepared.torquers_Am2, prepared, q, w)
 
     @property
     def scenario(self) -> AttitudeScenario:
-        """What was simulated."""
+        """Scenario of the simulation."""
         return self.prepared.scenario
 
     @property
     def states(self) -> dict[str, FloatArray]:
-        """True rate [rad/s], biases and disturbance d = J⁻¹·torque [1/s²] by their names, shape (runs, n, 3)."""
+        """True rate [rad/s], biases and disturbance d = J⁻¹·torque [1/s²] by name, (runs, n, 3)."""
         return {
             "rate": self.w,
             "field-bias": self.prepared.field_bias_T,
@@ -107,7 +107,7 @@ class AttitudeRuns(Record):
         }
 
     def error_deg(self, track: AttitudeTrack) -> FloatArray:
-        """Angle between the first run's truth and a track of its log, shape (n,) [°]; NaN before the track begins."""
+        """Return the angle between the first run and a track of its log (n,) [°]; NaN before its start."""
         eci_from_orbital = quaternion.conjugate(orbital_from_eci(self.environment)[0])
         true = quaternion.multiply(eci_from_orbital, self.q[0])[-len(track) :]
         error = np.full(self.q.shape[1], np.nan)
@@ -116,12 +116,12 @@ class AttitudeRuns(Record):
 
     @property
     def time_s(self) -> FloatArray:
-        """Since the start of every run, shape (n,)."""
+        """Time since the start of every run, shape (n,) [s]."""
         return self.environment.time_s
 
 
-def prepare(scenario: AttitudeScenario, seeds: Sequence[int]) -> Prepared:
-    """Starts, surroundings, disturbances, biases and noise of one run for every seed.
+def prepare(scenario: AttitudeScenario, seeds: Sequence[int]) -> PreparedRuns:
+    """Draw start, environment, disturbances, biases and noise of one run for every seed.
 
     ``seeds``: the numbers of a run depend on its seed alone, and every sensor has its own stream.
     """
@@ -135,7 +135,7 @@ def prepare(scenario: AttitudeScenario, seeds: Sequence[int]) -> Prepared:
     q = quaternion.exp(scenario.start_attitude_rad * _normal(numbers, "start attitude", 1)[:, 0])
     w_relative = scenario.start_rate_rad_s * _normal(numbers, "start rate", 1)[:, 0]
     wave = np.cos(2.0 * math.pi * time_s / scenario.torque_period_s)
-    return Prepared(
+    return PreparedRuns(
         scenario=scenario,
         seeds=tuple(numbers),
         environment=around,
@@ -156,13 +156,13 @@ def prepare(scenario: AttitudeScenario, seeds: Sequence[int]) -> Prepared:
 
 
 def simulate(scenario: AttitudeScenario, seeds: Sequence[int]) -> AttitudeRuns:
-    """Truth and readings of one run for every seed, with a control that sees the true state."""
-    return moved(prepare(scenario, seeds))
+    """Simulate one run for every seed, with a control that knows the true state."""
+    return simulate_motion(prepare(scenario, seeds))
 
 
 @np.errstate(over="ignore", divide="ignore", invalid="ignore")
-def moved(prepared: Prepared) -> AttitudeRuns:
-    """Truth and readings from the start, torques and dipoles of prepared runs, which may have been changed."""
+def simulate_motion(prepared: PreparedRuns) -> AttitudeRuns:
+    """Simulate prepared runs, whose start, torques and dipoles may have been changed."""
     scenario, around = prepared.scenario, prepared.environment
     runs, n = prepared.torque_Nm.shape[:2]
     body, control, rods = scenario.satellite.body, scenario.satellite.control, scenario.rods
@@ -212,8 +212,8 @@ def _array(values: ArrayLike) -> FloatArray:
     return np.ascontiguousarray(values, dtype=np.float64)
 
 
-def sense(prepared: Prepared, q: FloatArray, w: FloatArray, rows: slice = slice(None)) -> AttitudeReadings:
-    """Readings of the instants ``rows`` of all runs, from their true attitudes and rates.
+def sense(prepared: PreparedRuns, q: FloatArray, w: FloatArray, rows: slice = slice(None)) -> AttitudeReadings:
+    """Return the readings of the instants ``rows`` of all runs.
 
     Shapes ``q`` (runs, len(rows), 4), ``w`` (runs, len(rows), 3). ``rows``: all instants, unless given.
     """
@@ -234,8 +234,8 @@ def sense(prepared: Prepared, q: FloatArray, w: FloatArray, rows: slice = slice(
     return _with_wild(prepared, good, rows)
 
 
-def _with_wild(prepared: Prepared, good: AttitudeReadings, rows: slice) -> AttitudeReadings:
-    """Readings some of which are anything: any attitude, any direction, any field and rate of a usual size."""
+def _with_wild(prepared: PreparedRuns, good: AttitudeReadings, rows: slice) -> AttitudeReadings:
+    """Replace some readings by wild ones: random attitudes, directions, fields and rates."""
     if not any(wild.any() for wild in prepared.wild.values()):
         return good
 
@@ -258,8 +258,8 @@ def _with_wild(prepared: Prepared, good: AttitudeReadings, rows: slice) -> Attit
     )
 
 
-def advance(prepared: Prepared, state: State, wheel_torque_Nm: FloatArray, row: int) -> State:
-    """True state (q, w, momentum) of all runs at instant ``row`` + 1 from that at ``row``, without rods.
+def advance(prepared: PreparedRuns, state: State, wheel_torque_Nm: FloatArray, row: int) -> State:
+    """Advance the true state (q, w, momentum) of all runs from ``row`` to ``row`` + 1, without rods.
 
     Shape ``state`` (runs, 4), (runs, 3), (runs, 3). ``wheel_torque_Nm`` (runs, 3): as set, by
     the control of an estimate.
@@ -278,10 +278,12 @@ def advance(prepared: Prepared, state: State, wheel_torque_Nm: FloatArray, row: 
     )
 
 
-def controlled(prepared: Prepared, command: Command, advanced: Callable[[int], None] | None = None) -> AttitudeRuns:
-    """Truth and readings from the start of prepared runs, without wheels; what is commanded goes into the record.
+def simulate_control(
+    prepared: PreparedRuns, command: Command, advanced: Callable[[int], None] | None = None
+) -> AttitudeRuns:
+    """Simulate prepared runs without wheels; the commands go into the record.
 
-    Raises ValueError: the scenario has rods, which only :func:`moved` simulates.
+    Raises ValueError: the scenario has rods, which only :func:`simulate_motion` simulates.
     """
     if prepared.scenario.rods is not None:
         raise ValueError(
@@ -309,9 +311,9 @@ def controlled(prepared: Prepared, command: Command, advanced: Callable[[int], N
 
 
 def start_estimates(
-    prepared: Prepared, attitude_error_rad: float, rate_error_rad_s: float
+    prepared: PreparedRuns, attitude_error_rad: float, rate_error_rad_s: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Attitudes and rates that a filter may start from: the truth with normal errors in body axes.
+    """Return starts of a filter: true attitudes and rates with normal errors in body axes.
 
     ``attitude_error_rad``, ``rate_error_rad_s``: standard deviations per axis. Returns ``q, w`` (runs, 4), (runs, 3).
     """
@@ -322,19 +324,19 @@ def start_estimates(
 
 
 def _bias(scenario: AttitudeScenario, seeds: list[int], sensor: str, size: float, walk: float) -> FloatArray:
-    """Biases (runs, n, 3): of a size at the start, then changed by white noise, ``walk`` per √s."""
+    """Return biases (runs, n, 3) that walk from a size at the start, ``walk`` per √s."""
     n, rate_Hz, per_root_hour = scenario.n_instants, 1.0 / scenario.dt_s, walk * math.sqrt(HOUR_S)
     walks = [random_walk(n, 3, rate_Hz, per_root_hour, stream(seed, f"{sensor} walk")) for seed in seeds]
     return size * _directions(seeds, f"{sensor} bias")[:, None] + np.stack(walks)
 
 
 def _normal(seeds: list[int], feature: str, n: int) -> FloatArray:
-    """Standard normal numbers (runs, n, 3)."""
+    """Return standard normal numbers (runs, n, 3)."""
     return np.stack([stream(seed, feature).standard_normal((n, 3)) for seed in seeds])
 
 
 def _field_error(scenario: AttitudeScenario, seeds: list[int]) -> FloatArray:
-    """True field minus its model (runs, n, 3), orbital frame: constant, or an Ornstein-Uhlenbeck process."""
+    """Return the error of the field model (runs, n, 3), constant or an Ornstein-Uhlenbeck process."""
     if math.isinf(scenario.field_error_correlation_s):
         return np.repeat(
             scenario.field_error_T * _directions(seeds, "field error")[:, None], scenario.n_instants, axis=1
@@ -346,11 +348,11 @@ def _field_error(scenario: AttitudeScenario, seeds: list[int]) -> FloatArray:
 
 
 def _wild(seeds: list[int], sensor: str, n: int, share: float) -> BoolArray:
-    """Which readings (runs, n) are anything."""
+    """Return a mask (runs, n) of wild readings."""
     return np.stack([stream(seed, f"{sensor} wild").random(n) < share for seed in seeds])
 
 
 def _directions(seeds: list[int], feature: str) -> FloatArray:
-    """Unit vectors (runs, 3), uniform on the sphere."""
+    """Return unit vectors (runs, 3), uniform on the sphere."""
     vectors = _normal(seeds, feature, 1)[:, 0]
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)

@@ -1,4 +1,4 @@
-"""When runs may start: instants of a day from which the conditions of a scenario hold to the end of a run."""
+"""Starts of runs: instants of a day from which the conditions of a scenario hold."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ GRID_S = 10.0
 
 
 def starts(scenario: AttitudeScenario, seeds: list[int]) -> Instants:
-    """Start of the run of every seed, drawn from the instants of the day that the conditions allow, shape (runs,)."""
+    """Draw the start of every run (runs,) from the instants that the conditions allow."""
     satellite = scenario.satellite
     day = _day(satellite.orbit, satellite.start, scenario.duration_s, satellite.field_model)
     n = 1 + math.ceil(scenario.duration_s / GRID_S)
@@ -39,7 +39,7 @@ def _day(orbit: Orbit, day: np.datetime64, duration_s: float, model: Model) -> E
 
 
 def _allowed(conditions: StartConditions, day: Environment, n: int) -> BoolArray:
-    """For every instant of the day, whether a run of n instants may start there."""
+    """Return a mask of the instants at which a run of n instants may start."""
     lit = day.sunlit
     field_T = np.linalg.norm(day.b_orbital_T, axis=-1)
     throughout = (day.separation_rad >= conditions.least_separation_rad) & (field_T >= conditions.least_field_T)
@@ -57,5 +57,5 @@ def _allowed(conditions: StartConditions, day: Environment, n: int) -> BoolArray
 
 
 def _windows(values: BoolArray, n: int) -> BoolArray:
-    """All runs of n values in turn, shape (..., n)."""
+    """Return all windows of n values, shape (..., n)."""
     return np.lib.stride_tricks.sliding_window_view(values, n)

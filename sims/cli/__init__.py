@@ -1,1 +1,1 @@
-"""Commands that simulate; the command lines register them by name."""
+"""Commands that simulate; the command lines load them by name."""

@@ -1,4 +1,4 @@
-"""Files of attitude runs: figures, the data behind them, and the telemetry that ``adcs estimate`` takes."""
+"""Files of attitude runs: figures, their data, and telemetry for ``adcs estimate``."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def attitude_files(
 
     first = parts[0]
     time_s, name = first.runs.time_s, file.name
-    # Truth minus estimate is what the filter's state is; an error is estimate minus truth.
+    # The filter estimates truth minus estimate; an error is estimate minus truth.
     errors = -errors_in_units(first)[0]
     sigma = state_table(first.estimates.sigma_by_state)[0]
     title = f"{name}: {estimate.in_words}"
@@ -75,7 +75,7 @@ def _runs_table(outcome: Outcome) -> dict[str, Any]:
 
 
 def _truth_columns(part: Part, time_s: FloatArray) -> dict[str, Any]:
-    """What the estimates of the telemetry may be compared with."""
+    """Return the truth at the instants of the telemetry."""
     runs = part.runs
     states = state_table({state: values[0] for state, values in runs.states.items()})
     columns: dict[str, Any] = {"time_s": time_s} | dict(zip(("qw", "qx", "qy", "qz"), runs.q[0].T, strict=True))
@@ -83,7 +83,7 @@ def _truth_columns(part: Part, time_s: FloatArray) -> dict[str, Any]:
 
 
 def dataset_of(parts: Sequence[Part], estimate: EstimatorSettings, title: str) -> xr.Dataset:
-    """Truth and estimates of all runs."""
+    """Return truth and estimates of all runs."""
     import xarray as xr
 
     from arrays.io.outputs import installed_version
@@ -92,7 +92,7 @@ def dataset_of(parts: Sequence[Part], estimate: EstimatorSettings, title: str) -
         return np.concatenate([values(part) for part in parts])
 
     def of(state: str) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Estimates, truth and standard deviations of a state."""
+        """Return estimates, truth and standard deviations of a state."""
         return (
             join_tracks(lambda part: part.estimates.states[state]),
             join_tracks(lambda part: part.runs.states[state]),

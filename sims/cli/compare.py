@@ -1,4 +1,4 @@
-"""``adcs compare``: scenarios, sensors and filters side by side, on the same seeds."""
+"""``adcs compare``: scenarios, sensors and filters on the same seeds."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from adcs.cli.options import ReportOptions, ScenarioOptions
 from adcs.kalman.names import FILTERS
 from arrays.io.errors import InputError
 from magloc.cli.framework import Flag, progress, warn
-from sims.cli.run_tabletsat import RunOptions, wanted
+from sims.cli.run_tabletsat import RunOptions, configure
 
 if TYPE_CHECKING:
     from adcs.io.scenario_files import AttitudeFile
@@ -27,18 +27,19 @@ from arrays.typing import FloatArray
 @Parameter(name="*")
 @dataclass(frozen=True)
 class CompareOptions:
-    """What is compared, besides the scenarios; lists have commas between their items.
+    """Sensors, states and filters to compare, in lists separated by commas.
 
     Parameters
     ----------
     sensors : str
-        Sets of sensors, as in st,st+gyro,mag+sun+gyro; by default each scenario's.
+        Sets of sensors, as in st,st+gyro,mag+sun+gyro; by default that of each scenario.
     states : str
-        Sets of states, as in none,gyro-bias,gyro-bias+disturbance; by default each scenario's.
+        Sets of states, as in none,gyro-bias,gyro-bias+disturbance; by default that of each scenario.
     filter : str
-        Filters: mekf, constant-gain, parallel-disturbance, reduced, smoother, self-tuning; by default each scenario's.
+        Filters: mekf, constant-gain, parallel-disturbance, reduced, smoother, self-tuning; by default that of each
+        scenario.
     allow_old_elements : bool
-        Take two-line elements 30 days or more from their epoch too.
+        Also accept two-line elements 30 days or more from their epoch.
     """
 
     sensors: str | None = None
@@ -47,7 +48,7 @@ class CompareOptions:
     allow_old_elements: Flag = False
 
     def combinations(self) -> list[ScenarioOptions]:
-        """All combinations of what is listed."""
+        """Return all combinations of the lists."""
         lists = [[None] if text is None else _items(text) for text in (self.sensors, self.states, self.filter)]
         for name in lists[2]:
             if name is not None and name not in FILTERS:
@@ -72,7 +73,7 @@ class Row:
     outcome: Outcome
 
     def report(self) -> dict[str, Any]:
-        """What ``--json`` prints of it."""
+        """Return the JSON object of the row."""
         used = self.estimate.settings.sensors
         return {
             "scenario": self.file.name,
@@ -90,7 +91,7 @@ def compare(
     runs: RunOptions = RunOptions(),  # noqa: B008 - frozen
     report: ReportOptions = ReportOptions(),  # noqa: B008 - frozen
 ) -> None:
-    """Run several scenarios, sets of sensors or filters on the same seeds and show them side by side.
+    """Compare scenarios, sets of sensors or filters on the same seeds.
 
     --out writes compare.png, with the median errors through time, and compare.csv.
 
@@ -99,16 +100,16 @@ def compare(
     scenarios : str
         Scenario files (TOML) or names of built-in ones.
     options : CompareOptions
-        Sensors, states and filters.
+        Sensors, states and filters to compare.
     runs : RunOptions
-        Runs.
+        Number, seeds and duration of the runs.
     report : ReportOptions
-        Where the result goes.
+        Outputs.
     """
     if not scenarios:
         raise InputError("adcs compare: found no scenario, expected one or more, such as tabletsat eclipse.")
     report.check()
-    pairs = [wanted(name, chosen, runs.duration) for name, chosen in product(scenarios, options.combinations())]
+    pairs = [configure(name, chosen, runs.duration) for name, chosen in product(scenarios, options.combinations())]
     rows = []
     with progress(len(pairs) * runs.seeds, "runs") as advance:
         for file, estimate in pairs:
@@ -139,7 +140,7 @@ _COLUMNS = (
 
 
 def compare_lines(reports: list[dict[str, Any]]) -> list[str]:
-    """The comparison as text."""
+    """Return the comparison as text."""
     names = [label_of(report) for report in reports]
     width = max(22, *(len(name) for name in names)) + 1
     lines = [f"{'rms of the last minute':{width}s}" + "".join(f"{title:>12s}" for _, title in _COLUMNS)]
@@ -150,7 +151,7 @@ def compare_lines(reports: list[dict[str, Any]]) -> list[str]:
 
 
 def label_of(report: dict[str, Any]) -> str:
-    """Scenario, sensors, states and filter in a few words."""
+    """Return scenario, sensors, states and filter in a few words."""
     parts = [report["scenario"], report["sensors"], *report["states"]]
     return " ".join(parts if report["filter"] == "mekf" else [*parts, report["filter"]])
 

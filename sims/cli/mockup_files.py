@@ -1,9 +1,10 @@
-"""What ``adcs run mockup --out`` writes: figures, and the data behind them."""
+"""Figures and data that ``adcs run mockup --out`` writes."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import fields
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +20,7 @@ from adcs.mockup.vision.camera import Pose
 from adcs.mockup.vision.sky import LedSky, write_sky
 from adcs.plots import mockup_navigation, mockup_vision
 from arrays.typing import FloatArray
-from sims.experiments.mockup_navigation import FusionRuns, ZerosRuns
+from sims.experiments.mockup_navigation import FusionRuns, TrackErrors, ZerosRuns
 from sims.experiments.mockup_recording import RecordRun
 from sims.experiments.mockup_settings import METHOD_WORDS, SETTLED_S
 from sims.experiments.mockup_vision import FrameResult, SkyRun, frame_result, random_frame
@@ -30,15 +31,15 @@ if TYPE_CHECKING:
     from sims.cli.mockup_options import MockupOptions
 
 File = tuple[str, Any]
-"""A name, and what is written into the file, as :func:`arrays.io.outputs.write_file` takes it."""
+"""Name and content of a file, for :func:`arrays.io.outputs.write_file`."""
 _DRIVE_S, _DRIVE_STEP_S = 150.0, 1.8
 _REST_FRAMES, _REST_STEP_S = 40, 0.6
 _REST_M, _REST_RAD = (-1.2228, 0.3), 0.5
-"""About where the source's figure 10 is."""
+"""Place of the rest in figure 10 of the source paper."""
 
 
 def files_of(options: MockupOptions, run: Any) -> Iterator[File]:
-    """Yield what belongs to a run of some kind."""
+    """Yield the files of a run of any kind."""
     match run:
         case SkyRun():
             return sky_files(options, run)
@@ -54,7 +55,7 @@ def files_of(options: MockupOptions, run: Any) -> Iterator[File]:
 
 
 def sky_files(options: MockupOptions, run: SkyRun) -> Iterator[File]:
-    """Frames' results: figures, a table, the sky, and a frame of the kind."""
+    """Yield figures, a table, the sky and one frame of simulated frames."""
     sky, setup, seeds = options.led_sky, options.sky_setup(), options.runs(1)
     n_stars = np.array([len(result.stars) for result in run.results])
     errors_mm = 1e3 * run.position_errors_m
@@ -63,7 +64,7 @@ def sky_files(options: MockupOptions, run: SkyRun) -> Iterator[File]:
         title, sky.positions_m, run.truth[:, :2], errors_mm, run.good, run.false_fixes, n_stars
     )
     yield "mockup-sky.png", mockup_vision.sky_figure(picture)
-    # The first frame with a good fix, or the first one; once more, as a first time may have been that of a compiler.
+    # The first frame with a good fix, or else the first one.
     seed, row = divmod(int(np.argmax(run.good)), setup.poses)
     image = random_frame(sky, setup, seeds[seed], row)[1].image
     result = frame_result(image, setup.believed_camera, options.sky_matcher(), options.finder())
@@ -98,7 +99,7 @@ def _frame_figure(options: MockupOptions, title: str, image: Any, result: FrameR
 
 
 def _drive_figure(options: MockupOptions, sky: LedSky) -> Figure:
-    """Frames along a drive around the table, at its speed, and at rest, all identified."""
+    """Draw the fixes of frames along a drive around the table, and at rest."""
     setup, matcher, finder, seed = options.sky_setup(), options.sky_matcher(), options.finder(), options.seed
     truth = table_run(TableScenario(duration_s=_DRIVE_S), seed).truth
     driven = truth.rows(slice(None, None, round(_DRIVE_STEP_S / (truth.time_s[1] - truth.time_s[0]))))
@@ -122,7 +123,7 @@ def _drive_figure(options: MockupOptions, sky: LedSky) -> Figure:
 
 
 def frame_files(options: MockupOptions, results: Mapping[Path, FrameResult]) -> Iterator[File]:
-    """A figure of every frame that was read, and a table."""
+    """Yield a figure of every frame that was read, and a table."""
     for path, result in results.items():
         image = read_frame(path, options.camera())
         yield f"{path.stem}-stars.png", _frame_figure(options, path.name, image, result)
@@ -139,19 +140,19 @@ def frame_files(options: MockupOptions, results: Mapping[Path, FrameResult]) -> 
     )
 
 
-def _named(names: str, *values: FloatArray) -> dict[str, FloatArray]:
+def _columns(names: str, *values: FloatArray) -> dict[str, FloatArray]:
     """Return columns by their names; values have shape (n,), or (n, k) for k names."""
     return dict(zip(names.split(), np.column_stack(values).T, strict=True))
 
 
 def _pose_columns(prefix: str, poses: FloatArray) -> dict[str, FloatArray]:
-    return _named(f"{prefix}x_m {prefix}y_m {prefix}heading_deg", poses[:, :2], np.degrees(poses[:, 2]))
+    return _columns(f"{prefix}x_m {prefix}y_m {prefix}heading_deg", poses[:, :2], np.degrees(poses[:, 2]))
 
 
 def zeros_files(runs: ZerosRuns) -> Iterator[File]:
-    """The first run's figure and samples, and a row of every run."""
+    """Yield figure and samples of the first run, and a row for every run."""
     first = runs.results[0]
-    # With slopes, what is found is the zeros at the beginning.
+    # A fit with slopes gives the zeros at the beginning.
     true_zeros, when = first.run.zero_m_s2, "on average"
     if runs.unknowns == "drift":
         true_zeros, when = true_zeros[:1], "at first"
@@ -165,7 +166,7 @@ def zeros_files(runs: ZerosRuns) -> Iterator[File]:
     yield "mockup-zeros.png", figure
     samples = _imu_columns(first.run.imu)
     for prefix, track in (("true_", first.run.truth), ("before_", first.before), ("after_", first.after)):
-        samples |= _named(f"{prefix}x_m {prefix}y_m", track.position_m)
+        samples |= _columns(f"{prefix}x_m {prefix}y_m", track.position_m)
     yield "mockup-zeros.csv", samples | {"after_heading_deg": np.degrees(first.after.heading_rad)}
     runs_columns = {
         "seed": np.array([each.seed for each in runs.results]),
@@ -181,7 +182,7 @@ def zeros_files(runs: ZerosRuns) -> Iterator[File]:
 
 
 def fusion_files(runs: FusionRuns) -> Iterator[File]:
-    """The first run's figures, samples and fixes, and a row of every run."""
+    """Yield figures, samples and fixes of the first run, and a row for every run."""
     first = runs.results[0]
     run, track = first.run, first.fused.track
     fixes = run.fixes.rows(slice(len(first.fused.outcomes)))
@@ -200,17 +201,17 @@ def fusion_files(runs: FusionRuns) -> Iterator[File]:
     yield "mockup-fusion.png", mockup_navigation.fusion_figure(picture)
     yield "mockup-fusion-errors.png", mockup_navigation.errors_figure(picture)
     samples = _imu_columns(run.imu) | _track_columns("true_", run.truth) | _track_columns("", track)
-    # The gyro's zero stands in the file of a recording alone.
+    # Only the file of a recording has the zero of the gyro.
     samples.pop("zero_rate_deg_s", None)
     yield "mockup-fusion.csv", samples
-    errors = {name: np.array([getattr(each.errors, name) for each in runs.results]) for name in _ERRORS}
+    errors = _error_columns([each.errors for each in runs.results])
     yield "mockup-fusion-runs.csv", {"seed": np.array([each.seed for each in runs.results])} | errors
     used = first.fused.used
     yield "mockup-fixes.csv", _fix_columns(fixes) | {"false": run.false[: len(used)], "used": used}
 
 
 def method_files(every: Sequence[FusionRuns]) -> Iterator[File]:
-    """A figure of the first run by all methods, and a row of every run and method."""
+    """Yield a figure of the first run by all methods, and a row for every run and method."""
     lines = []
     for runs in every:
         result = runs.results[0]
@@ -224,15 +225,15 @@ def method_files(every: Sequence[FusionRuns]) -> Iterator[File]:
         {
             "fusion": [method for method, _, _ in each],
             "seed": np.array([seed for _, seed, _ in each], dtype=np.int64),
-            **{name: np.array([getattr(errors, name) for _, _, errors in each]) for name in _ERRORS},
+            **_error_columns([errors for _, _, errors in each]),
         },
     )
 
 
 def record_files(run: RecordRun) -> Iterator[File]:
-    """The estimate of a recording and its figure."""
+    """Yield the estimate of a recording and its figure."""
     track = run.fused.track
-    # There is no truth; this figure shows none.
+    # A recording has no truth.
     picture = mockup_navigation.FusionPicture(
         f"Recording, fusion {run.method}",
         track,
@@ -245,25 +246,26 @@ def record_files(run: RecordRun) -> Iterator[File]:
     yield "mockup-estimate.csv", {"time_s": track.time_s} | _track_columns("", track)
 
 
-_ERRORS = ("position_rms_mm", "position_p95_mm", "position_max_mm", "velocity_rms_mm_s", "heading_rms_deg")
+def _error_columns(errors: Sequence[TrackErrors]) -> dict[str, FloatArray]:
+    return {field.name: np.array([getattr(each, field.name) for each in errors]) for field in fields(TrackErrors)}
 
 
 def _imu_columns(imu: ImuRecord) -> dict[str, FloatArray]:
     names = "time_s acceleration_x_m_s2 acceleration_y_m_s2 rate_deg_s"
-    return _named(names, imu.time_s, imu.acceleration_m_s2, np.degrees(imu.rate_rad_s))
+    return _columns(names, imu.time_s, imu.acceleration_m_s2, np.degrees(imu.rate_rad_s))
 
 
 def _track_columns(p: str, track: PlanarTrack) -> dict[str, FloatArray]:
     """Return the columns of a track, their names behind a prefix."""
     names = f"{p}x_m {p}y_m {p}vx_m_s {p}vy_m_s {p}heading_deg"
-    columns = _named(names, track.position_m, track.velocity_m_s, np.degrees(track.heading_rad))
+    columns = _columns(names, track.position_m, track.velocity_m_s, np.degrees(track.heading_rad))
     if isinstance(track, FilterTrack):
-        columns |= _named("zero_x_m_s2 zero_y_m_s2 zero_rate_deg_s", track.zero_m_s2, np.degrees(track.zero_rad_s))
+        columns |= _columns("zero_x_m_s2 zero_y_m_s2 zero_rate_deg_s", track.zero_m_s2, np.degrees(track.zero_rad_s))
         sigma = 1e3 * track.sigma[:, :2], np.degrees(track.sigma[:, 4])
-        columns |= _named("sigma_x_mm sigma_y_mm sigma_heading_deg", *sigma)
+        columns |= _columns("sigma_x_mm sigma_y_mm sigma_heading_deg", *sigma)
     return columns
 
 
 def _fix_columns(fixes: FixRecord) -> dict[str, FloatArray]:
     names = "exposure_s arrival_s x_m y_m heading_deg"
-    return _named(names, fixes.time_s, fixes.arrival_s, fixes.position_m, np.degrees(fixes.heading_rad))
+    return _columns(names, fixes.time_s, fixes.arrival_s, fixes.position_m, np.degrees(fixes.heading_rad))

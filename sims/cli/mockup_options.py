@@ -1,4 +1,4 @@
-"""Options of ``adcs run mockup``, and what they mean."""
+"""Options of ``adcs run mockup``."""
 
 from __future__ import annotations
 
@@ -51,84 +51,88 @@ _BELONGS: dict[str, tuple[str, ...]] = {
     "all": (*_OF_THE_CAMERA, "fusion", "duration", "delay_s", "outage"),
 }
 _OF_FRAMES = ("part", "frames", "sky", "matcher", "footprint_m", "believed_k1", "stars")
-"""What counts for frames that are read: all else is about frames that are simulated."""
+"""Options of frames that are read from files; all others belong to simulated frames."""
 _OF_RECORDS = ("part", "samples", "fixes", "fusion")
-"""The same of a recording."""
+"""Options of a recording; all others belong to simulated drives."""
 _CLOSEST_PX = 4.0
-"""Lights that are nearer to each other are one blob."""
+"""Distance below which two lights are one blob."""
 
 
 @Parameter(name="*")
 @dataclass(frozen=True)
 class MockupOptions:
-    """What is run.
+    """Part of the mock-up to simulate, and its settings.
 
     Parameters
     ----------
     part : str
-        Frames of the camera, rendered and identified ("sky"), drives with late fixes ("fusion"), zeros of the
-        accelerometer from short runs ("zeros"), or drives with the fixes of rendered frames ("all").
+        Frames of the camera, rendered and identified ("sky"), drives with delayed fixes ("fusion"), zeros of the
+        accelerometer from short runs ("zeros"), or drives with fixes from rendered frames ("all").
     seeds : int, optional
-        Number of runs: 6; of "sky" 1.
+        Number of runs; by default 6, 1 for "sky".
     seed : int
-        Of the first run; the next ones follow.
+        Seed of the first run; the next runs take the next seeds.
     poses : int, optional
-        sky: frames of a run, at random places and headings; 120.
+        sky: number of frames in a run, at random positions and headings; 120 by default.
     matcher : str, optional
-        sky, all: the source's triangles ("paper"), triangles checked by all stars ("robust", the default), or pairs of
-        stars weighed by odds ("odds").
+        sky, all: star matcher: triangles as in the source paper ("paper"), triangles verified by all stars ("robust",
+        the default), or pairs of stars weighted by odds ("odds").
     lost : float, optional
-        sky, all: part of the lights that are dark, 0 to 1; none.
+        sky, all: fraction of dark lights, 0 to 1; 0 by default.
     spurious : int, optional
-        sky, all: lights in view that are in no catalogue; 0.
+        sky, all: number of lights in view that are not in the catalogue; 0 by default.
     hot_pixels : int, optional
-        sky, all: pixels that are white always; 0.
+        sky, all: number of pixels that are always white; 0 by default.
     noise_dn : float, optional
-        sky, all: of a pixel, of 255; 4.
+        sky, all: noise of a pixel, of 255; 4 by default.
     speed_m_s : float, optional
-        sky: during the exposure of 1/30 s [m/s]; at rest.
+        sky: speed during the exposure of 1/30 s [m/s]; 0 by default.
     turn_deg_s : float, optional
-        sky: during the exposure [°/s]; at rest.
+        sky: turn rate during the exposure [°/s]; 0 by default.
     footprint_m : float, optional
-        sky, all: width of the seen part of the ceiling [m]; 0.9.
+        sky, all: width of the visible part of the ceiling [m]; 0.9 by default.
     k1 : float, optional
-        sky, all: radial distortion of the lens at 320 px from its centre, such as -0.05; 0.
+        sky, all: radial distortion of the lens at 320 px from its centre, such as -0.05; 0 by default.
     believed_k1 : float, optional
-        sky, all: what the calibration says of it; 0.
+        sky, all: radial distortion in the calibration of the camera; 0 by default.
     stars : str, optional
-        sky, all: pixels far above the background ("bright", the default), sums of pixels for faint and smeared lights
-        ("faint"), or the source's level between the darkest and the brightest pixel ("level").
+        sky, all: detection of stars: pixels far above the background ("bright", the default), sums of pixels for faint
+        and smeared lights ("faint"), or the level of the source paper, between the darkest and the brightest pixel
+        ("level").
     sky : Path, optional
-        sky, all: TOML file of the lights' places; by default 180 random ones.
+        sky, all: TOML file of the positions of the lights; by default 180 random ones.
     frames : Path, optional
-        sky: PNG file, or folder of them, to be identified in place of simulated frames; needs --sky.
+        sky: PNG file, or a folder of PNG files, to identify in place of simulated frames; needs --sky.
     fusion : str, optional
-        fusion, all: integration from the exposure of each fix ("paper"), the same with the velocity corrected
-        ("velocity-corrected"), the delayed error-state filter ("ekf", the default), fixes alone, held and late
-        ("camera"), samples alone ("imu"), or each of these ("all").
+        fusion, all: integration from the exposure of each fix ("paper"), the same with corrected velocity
+        ("velocity-corrected"), the delayed error-state filter ("ekf", the default), fixes alone, delayed and held
+        ("camera"), samples alone ("imu"), or all of these ("all").
     duration : float, optional
-        fusion, zeros, all: seconds; 180, of "zeros" 15. Runs of zeros of up to 20 s are the one with two firings.
+        fusion, zeros, all: duration [s]; 180 by default, 15 for "zeros". Runs of "zeros" up to 20 s have two firings.
     false_fixes : float, optional
-        fusion: part of the fixes that are anywhere; none.
+        fusion: fraction of false fixes, at random positions; 0 by default.
     failed : float, optional
-        fusion: part of the frames without a fix; 0.12.
+        fusion: fraction of frames without a fix; 0.12 by default.
     overtaken : float, optional
-        fusion: part of the fixes that arrive up to 1.8 s later than usual; none.
+        fusion: fraction of fixes that arrive up to 1.8 s later than usual; 0 by default.
     repeated : float, optional
-        fusion: part of the fixes that arrive twice; none.
+        fusion: fraction of fixes that arrive twice; 0 by default.
     delay_s : float, optional
-        fusion, all: from the exposure to the fix [s]; 0.6, of "all" what identifying it takes on this machine.
+        fusion, all: delay from the exposure to the fix [s]; 0.6 by default, for "all" the time that identification
+        takes on this machine.
     outage : float, optional
-        fusion, all: from when to when there are no frames [s].
+        fusion, all: begin and end of a period without frames [s].
     samples : Path, optional
-        fusion: CSV file of a recording, in place of simulated drives: time_s, acceleration_x_m_s2, acceleration_y_m_s2
-        and rate_deg_s of every sample; needs --fixes.
+        fusion: CSV file of a recording, in place of simulated drives, with time_s, acceleration_x_m_s2,
+        acceleration_y_m_s2 and rate_deg_s of every sample; needs --fixes.
     fixes : Path, optional
-        fusion: CSV file of its fixes: exposure_s, arrival_s, x_m, y_m and heading_deg of each; needs --samples.
+        fusion: CSV file of the fixes of a recording, with exposure_s, arrival_s, x_m, y_m and heading_deg; needs
+        --samples.
     unknowns : str, optional
-        zeros: zeros alone ("two"), with the start ("six", the default), or also their slopes ("drift").
+        zeros: unknowns of the fit: the zeros ("two"), also the start ("six", the default), or also the slopes of the
+        zeros ("drift").
     start_fixes : int, optional
-        zeros: fixes whose line is the start of "two"; 4, and 2 in the source.
+        zeros: number of fixes that determine the start of "two"; 4 by default, 2 in the source paper.
     """
 
     part: Part = "sky"
@@ -162,7 +166,7 @@ class MockupOptions:
     start_fixes: Annotated[int | None, Parameter(converter=whole_number, validator=Number(gte=2))] = None
 
     def check(self) -> None:
-        """Raise InputError for what cannot be run."""
+        """Refuse options that contradict each other or are out of range."""
         belongs = {*_BELONGS[self.part], *_EVERYWHERE}
         for name in self.given():
             if name not in belongs:
@@ -187,7 +191,7 @@ class MockupOptions:
             )
 
     def given(self) -> list[str]:
-        """Names of the options that are not as by default."""
+        """Return the names of the options that differ from their defaults."""
         return [field.name for field in fields(self) if getattr(self, field.name) != field.default]
 
     def _check_frames(self) -> None:
@@ -209,11 +213,11 @@ class MockupOptions:
                 raise InputError(f"{option_name(name)}: {fault}")
 
     def runs(self, default: int) -> range:
-        """Seeds of the runs."""
+        """Return the seeds of the runs."""
         return range(self.seed, self.seed + (default if self.seeds is None else self.seeds))
 
     def camera(self) -> Camera:
-        """The camera as its user knows it."""
+        """Return the camera as its user knows it."""
         from adcs.mockup.vision.camera import camera_of_footprint
 
         with naming("--believed-k1"):
@@ -237,11 +241,11 @@ class MockupOptions:
 
     @property
     def matcher_name(self) -> MatcherName:
-        """The matcher that is asked for, or else the usual one."""
+        """Name of the star matcher."""
         return self.matcher or "robust"
 
     def sky_matcher(self) -> Matcher:
-        """What identifies the stars of an image of the sky."""
+        """Return the star matcher."""
         from adcs.mockup.vision.odds_matcher import odds_matcher
         from adcs.mockup.vision.paper_matcher import PaperMatcher
         from adcs.mockup.vision.robust_matcher import RobustMatcher
@@ -255,7 +259,7 @@ class MockupOptions:
         return RobustMatcher(catalogue, camera.m_per_px)
 
     def finder(self) -> Finder:
-        """What finds the stars of an image."""
+        """Return the function that finds the stars of an image."""
         from adcs.mockup.vision.centroids import find_faint_stars, find_stars, find_stars_between_extremes
 
         if self.stars == "faint":
@@ -263,7 +267,7 @@ class MockupOptions:
         return find_stars_between_extremes if self.stars == "level" else find_stars
 
     def sky_setup(self) -> SkySetup:
-        """Frames that are simulated."""
+        """Return the settings of simulated frames."""
         from sims.experiments.mockup_vision import SkySetup
 
         names = ("poses", "lost", "spurious", "hot_pixels", "speed_m_s", "footprint_m", "k1", "believed_k1")
@@ -275,18 +279,18 @@ class MockupOptions:
         return setup
 
     def table_camera(self) -> TableCamera:
-        """What takes the frames of a drive, and finds their places."""
+        """Return the camera of a drive, which takes and locates the frames."""
         from sims.experiments.mockup_camera import TableCamera
 
         return TableCamera(self.led_sky, self.sky_setup(), self.sky_matcher(), self.finder(), self.delay_s)
 
     def _known(self, *names: str, **more: Any) -> dict[str, Any]:
-        """Options by their names, and more, without those that are not given."""
+        """Return options by their names, and `more`, without those that are not given."""
         values = {name: getattr(self, name) for name in names} | more
         return {name: value for name, value in values.items() if value is not None}
 
     def table_scenario(self) -> TableScenario:
-        """Drives that are simulated."""
+        """Return the settings of simulated drives."""
         from sims.mockup.table_run import CameraErrors, TableScenario
 
         outages_s = None if self.outage is None else (self.outage,)
@@ -296,7 +300,7 @@ class MockupOptions:
 
     @property
     def duration_s(self) -> float:
-        """Of a run."""
+        """Duration of a run [s]."""
         duration = value_or(self.duration, 15.0 if self.part == "zeros" else 180.0)
         if not SETTLED_S < duration <= 1e4:
             raise InputError(f"--duration: found {duration:g} s, expected more than {SETTLED_S:g} and up to 10000 s.")
@@ -304,10 +308,10 @@ class MockupOptions:
 
 
 def option_name(name: str) -> str:
-    """Option as it is written on the command line."""
+    """Return an option as users type it."""
     return f"--{name.replace('_', '-')}"
 
 
 def value_or(value: Any, default: Any) -> Any:
-    """The value, or where there is none the default."""
+    """Return the value, or the default if there is none."""
     return default if value is None else value

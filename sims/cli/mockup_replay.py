@@ -1,4 +1,4 @@
-"""The replay of ``adcs run mockup --part fusion`` and ``--part all``: --view, --html and --png."""
+"""Replay of a drive of ``adcs run mockup``: --view, --html and --png."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def check_places(replay: ReplayOptions) -> None:
-    """Refuse, before long work, files that cannot be written, and a picture without a browser."""
+    """Refuse, before long work, files that cannot be written, and pictures without a browser."""
     from magloc.viewer.outputs import check_outputs
 
     with naming_outputs():
@@ -31,7 +31,7 @@ def check_places(replay: ReplayOptions) -> None:
 def show_replay(runs: FusionRuns, camera: TableCamera, replay: ReplayOptions) -> None:
     """Show the first drive until Ctrl-C, or write it."""
     from adcs.viewer.drive_page import drive_page
-    from magloc.cli.view import written_or_served
+    from magloc.cli.view import write_or_serve
     from magloc.viewer.view import View, open_view
 
     drive = drive_of(runs.results[0], runs.method, camera)
@@ -45,18 +45,18 @@ def show_replay(runs: FusionRuns, camera: TableCamera, replay: ReplayOptions) ->
         )
 
     written = [str(file) for file in files.values() if file is not None]
-    written_or_served(scene, written, replay.port)
+    write_or_serve(scene, written, replay.port)
 
 
 def drive_of(result: FusionResult, method: str, camera: TableCamera) -> Drive:
-    """What a replay shows of a run, with frames where the satellite truly was."""
+    """Return the drive of a run for a replay, with frames at the true positions."""
     from adcs.mockup.navigation.delayed_ekf import FilterTrack
     from adcs.viewer.drive import Drive, IdentifiedFrame
 
     run, track = result.run, result.fused.track
 
     def frame_of(fix: int) -> IdentifiedFrame:
-        # One image for a fix that comes twice.
+        # The image of a fix does not depend on how often the fix comes.
         frame, found = camera.look(run.truth, float(run.exposure_s[fix]), result.seed)
         return IdentifiedFrame(frame.image, found.stars.positions_px, found.fix)
 
@@ -83,15 +83,15 @@ class ReplayOptions:
     Parameters
     ----------
     view : bool
-        Start a server on this machine and print its address, which any browser on this machine opens.
+        Start a server on this machine, and print its address for a browser on this machine.
     html : Path, optional
-        Write a static HTML file that plays the drive and needs no server.
+        HTML file to write; it plays the drive and needs no server.
     png : Path, optional
-        Write a picture; needs Chromium or Chrome.
+        Picture to write (.png); needs Chromium or Chrome.
     at : float, optional
-        Seconds since the beginning that are open_view at first; the middle of the drive by default.
+        Time that the replay shows at first [s]; by default the middle of the drive.
     port : int
-        Port of the server; the next one that is free if it is in use.
+        Port of the server; the next free one if it is in use.
     """
 
     view: Flag = False
@@ -102,11 +102,11 @@ class ReplayOptions:
 
     @property
     def wanted(self) -> bool:
-        """Whether there is something to be seen."""
+        """Return whether a replay is to be shown or written."""
         return self.view or self.html is not None or self.png is not None
 
     def check(self, options: MockupOptions, *, json: bool) -> None:
-        """Raise InputError for what cannot be open_view."""
+        """Refuse options of a replay that contradict the others."""
         if not self.wanted:
             for name, given in (("--at", self.at is not None), ("--port", self.port != ReplayOptions.port)):
                 if given:

@@ -1,4 +1,4 @@
-"""``adcs run``: a scenario simulated, its attitude estimated and judged."""
+"""``adcs run``: simulated scenarios and the errors of their estimates."""
 
 from __future__ import annotations
 
@@ -11,7 +11,5 @@ _COMMANDS = (
     ("ellipsoid", "sims.cli.run_ellipsoid:ellipsoid", "Estimate yaw in guaranteed ellipsoids."),
     ("mockup", "sims.cli.run_mockup:mockup", "Run the table-top satellite under a sky of LEDs."),
 )
-run = new_app(
-    "run", "Simulate a scenario, estimate its attitude, and say how good that is.", _COMMANDS, version_flags=[]
-)
+run = new_app("run", "Simulate a scenario, estimate its attitude, and report the errors.", _COMMANDS, version_flags=[])
 run.default(run_attitude)

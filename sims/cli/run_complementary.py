@@ -1,4 +1,4 @@
-"""``adcs run complementary``: attitude from field, Sun and gyro, with a step of the gyro's bias or without the Sun."""
+"""``adcs run complementary``: complementary filters of field, Sun and gyro."""
 
 from __future__ import annotations
 
@@ -33,30 +33,30 @@ _RUNS_AT_ONCE = 20  # 250 MB of the adaptive filter
 @Parameter(name="*")
 @dataclass(frozen=True)
 class ComplementaryOptions(RunOptions):
-    """What is run.
+    """Filter, gains and disturbances.
 
     Parameters
     ----------
     filter : str
-        Gain on vector products ("explicit"), on the angle to a quaternion measured from both vectors ("gauss-newton"),
-        or an error-state filter that finds steps of the bias ("adaptive", without gains).
+        Gain on vector products ("explicit"), on the angle to a quaternion measured from both vectors
+        ("gauss-newton"), or an error-state filter that detects steps of the bias ("adaptive", without gains).
     kp : float, optional
-        K_P [1/s]: 0.02, or 0.005 with an outage.
+        Gain K_P [1/s]; by default 0.02, 0.005 with an outage.
     ki : float, optional
-        K_I [1/s²]: kp²/4, 2e-6 at least; zero during an outage.
+        Gain K_I [1/s²]; by default kp²/4, at least 2e-6. It is 0 during an outage.
     sigma_nT : float
-        Noise of the magnetometer, each axis [nT].
+        Noise of the magnetometer per axis [nT].
     outage : str, optional
-        The Sun sensor fails, and in its place stands the field of 500 s ago as it was ("raw"), turned to the present by
-        the gyro ("transported"), or nothing ("magnetometer-only"). The adaptive filter uses nothing.
+        The Sun sensor fails. Its replacement is the field of 500 s ago as measured ("raw"), the same turned by the gyro
+        ("transported"), or nothing ("magnetometer-only"); the adaptive filter always uses nothing.
     amplitude_deg : float
-        Of roll, pitch and yaw against the orbital frame [°].
+        Amplitude of roll, pitch and yaw against the orbital frame [°].
     seeds : int
         Number of runs.
     seed : int
-        Of the first run; the next ones follow.
+        Seed of the first run; the next runs take the next seeds.
     duration : float, optional
-        Seconds: 3.5 orbits of 5881 s, or 4 with an outage.
+        Duration of a run [s]; by default 3.5 orbits of 5881 s, 4 with an outage.
     """
 
     filter: Method = "explicit"
@@ -68,7 +68,7 @@ class ComplementaryOptions(RunOptions):
     seeds: Runs = field(default=1, kw_only=True)
 
     def check(self) -> None:
-        """Raise InputError for what cannot be run."""
+        """Refuse options that are out of range."""
         refuse_outside(0.0, LARGEST, "0 or more", kp=self.kp, ki=self.ki)
         for name, value in (("--kp", self.kp), ("--ki", self.ki)):
             if value is not None and self.filter == "adaptive":
@@ -93,7 +93,7 @@ class ComplementaryOptions(RunOptions):
 
     @property
     def duration_s(self) -> float:
-        """Of a run."""
+        """Duration of a run [s]."""
         from sims.attitude.complementary import ORBIT
 
         orbits = ORBITS if self.outage is None else ORBITS_WITH_OUTAGE
@@ -101,7 +101,7 @@ class ComplementaryOptions(RunOptions):
 
     @property
     def gains(self) -> Gains:
-        """With their defaults."""
+        """Gains, with defaults for those that are not given."""
         from adcs.complementary.explicit import Gains
 
         kp = (_ALONE_KP_PER_S if self.outage is None else _OUTAGE_KP_PER_S) if self.kp is None else self.kp
@@ -110,7 +110,7 @@ class ComplementaryOptions(RunOptions):
 
     @property
     def scenario(self) -> SatelliteScenario:
-        """What is simulated."""
+        """Scenario of the simulation."""
         from sims.attitude.complementary import SatelliteScenario
 
         return SatelliteScenario(
@@ -123,7 +123,7 @@ class ComplementaryOptions(RunOptions):
 
     @property
     def surroundings(self) -> str:
-        """What is simulated, as text."""
+        """Scenario of the simulation, as text."""
         outage = "" if self.outage is None else f"; Sun sensor out from {OUTAGE_ORBITS} orbits: {self.outage}"
         return (
             f"magnetometer {self.sigma_nT:g} nT; angles of {self.amplitude_deg:g}°; bias step 0.02 °/s at "
@@ -132,7 +132,7 @@ class ComplementaryOptions(RunOptions):
 
     @property
     def gains_text(self) -> str:
-        """K_P and K_I as the time constants that they stand for; none of one that is zero."""
+        """K_P and K_I as time constants; a gain of 0 has none."""
         K_P, K_I = self.gains.kp_per_s, self.gains.ki_per_s2
         first = f"K_P 1/({1.0 / K_P:.4g} s)" if K_P else "K_P 0"
         return f"{first}, K_I " + (f"1/({1.0 / math.sqrt(K_I):.4g} s)²" if K_I else "0")
@@ -141,7 +141,7 @@ class ComplementaryOptions(RunOptions):
 def run_complementary(
     options: ComplementaryOptions, out: Path | None = None, progress: Callable[[int], None] | None = None
 ) -> dict[str, Any]:
-    """Run the scenario, and write its figure and data.
+    """Run the scenario, and write its figures and data.
 
     ``out``: folder for ``complementary.png`` (the first run), ``complementary.csv`` (the first run through time, both
     complementary filters and the adaptive one) and ``complementary-runs.csv`` (all runs); made if it is not there.
@@ -176,7 +176,7 @@ def run_complementary(
 
 
 def _files_of_first(options: ComplementaryOptions, runs: SatelliteRuns) -> Iterator[tuple[str, Any]]:
-    """Yield the figure and the errors of the first run, by all filters."""
+    """Yield the figure and the errors of the first run, for all filters."""
     from adcs.plots.complementary import ComplementaryPicture, complementary_figure
     from sims.experiments.complementary import errors_deg
 
@@ -199,7 +199,7 @@ def _files_of_first(options: ComplementaryOptions, runs: SatelliteRuns) -> Itera
 
 
 def summary_lines(options: ComplementaryOptions, result: dict[str, Any]) -> list[str]:
-    """The settings and the result as text."""
+    """Return the settings and the result as text."""
     peak = result["peak_deg"]
     lines = [
         f"{options.filter} filter" + ("" if options.filter == "adaptive" else f", {options.gains_text}"),
@@ -220,16 +220,16 @@ def complementary(
     options: ComplementaryOptions = ComplementaryOptions(),
     report: ReportOptions = ReportOptions(),  # noqa: B008 - frozen
 ) -> None:
-    """Attitude of a satellite from magnetometer, Sun sensor and gyro by complementary filters.
+    """Run complementary filters of magnetometer, Sun sensor and gyro on a satellite.
 
-    The gyro's bias steps, or the Sun sensor fails. --out writes the figure and the data behind it.
+    The bias of the gyro steps, or the Sun sensor fails. --out writes the figure and its data.
 
     Parameters
     ----------
     options : ComplementaryOptions
-        What is run.
+        Filter, gains and disturbances.
     report : ReportOptions
-        Where the result goes.
+        Outputs.
     """
     options.check()
     if options.filter != "adaptive":

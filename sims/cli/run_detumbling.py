@@ -1,4 +1,4 @@
-"""``adcs run detumbling``: a satellite that tumbles, braked by torquers or by rods."""
+"""``adcs run detumbling``: a tumbling satellite with torquers or hysteresis rods."""
 
 from __future__ import annotations
 
@@ -27,32 +27,32 @@ def detumbling(
     json: Flag = False,
     common: QuietOptions = QuietOptions(),  # noqa: B008 - frozen
 ) -> None:
-    """Take the rate out of a tumbling satellite of three units, by torquers with B-dot or by rods that lag behind.
+    """Stop the tumbling of a satellite of three units, by torquers with B-dot or by hysteresis rods.
 
-    Printed is how long it takes until the rate stays below 0.5°/s, beside what the mean torque of torquers along the
-    orbit says, the rate that is left, and how far a magnet's axis is off the field then.
+    Prints the time until the rate stays below 0.5°/s, the time that the mean torque along the orbit predicts, the rate
+    at the end, and the angle between the axis of a magnet and the field.
 
     Parameters
     ----------
     damping : str
-        By torquers from the magnetometer's "readings", or from the "estimate" of a filter of magnetometer, Sun sensor
-        and gyro, which is told what is commanded; or by hysteresis "rods" along x and y, 1 cm³ each.
+        Torquers with the "readings" of the magnetometer, or with the "estimate" of a filter of magnetometer, Sun sensor
+        and gyro, which knows the commands; or hysteresis "rods" along x and y, 1 cm³ each.
     rate_deg_s : float
-        At the start, about any axis.
+        Rate at the start, about a random axis [°/s].
     moment_Am2 : float
-        Largest moment of each of three torquers.
+        Largest moment of each of three torquers [A·m²].
     duty : float
-        Part of each second in which they are on; the magnetometer is read while they are off.
+        Fraction of each second in which the torquers are on; the magnetometer is read while they are off.
     magnet_Am2 : float
-        Of a magnet along the axis z, which the field turns towards itself.
+        Moment of a magnet along the axis z [A·m²], which aligns with the field.
     seeds : int
         Number of runs.
     seed : int
-        Of the first run; the next ones follow.
+        Seed of the first run; the next runs take the next seeds.
     duration : float
-        Seconds.
+        Duration of a run [s].
     json : bool
-        Print one JSON object.
+        Print one JSON object, in place of the text.
     common : QuietOptions
         Common options.
     """
@@ -75,7 +75,7 @@ def detumbling(
             duration_s=duration,
             advanced=advanced,
         )
-    # A slow spin about the axis of the smallest moment has a momentum that is below from the start.
+    # A slow spin about the axis of the smallest moment of inertia is below the limit from the start.
     compared = np.isfinite(found.time_s) & (found.theory_s > 0.0)
     ratio = found.time_s[compared] / found.theory_s[compared]
     done = compared if compared.any() else np.isfinite(found.time_s)

@@ -1,4 +1,4 @@
-"""``adcs run ellipsoid``: yaw from roll alone, with guaranteed ellipsoids."""
+"""``adcs run ellipsoid``: yaw from roll alone, in guaranteed ellipsoids."""
 
 from __future__ import annotations
 
@@ -30,27 +30,27 @@ _RUNS_AT_ONCE = 500  # 90 MB of an orbit
 @Parameter(name="*")
 @dataclass(frozen=True)
 class EllipsoidOptions(RunOptions):
-    """What is run.
+    """Bounds of the errors, and settings of the observer.
 
     Parameters
     ----------
     noise_deg : float
-        Largest error of the horizon sensor [°]: 1 of a compensated one, 4 of a raw one.
+        Largest error of the horizon sensor [°]: 1 for a compensated sensor, 4 for a raw one.
     drift_deg_s : float
-        Zero shift of the yaw gyro, and its bound [°/s]: 0.02, or 0.0001 of a better one.
+        Bias of the yaw gyro, and its bound [°/s]: 0.02, or 0.0001 for a better gyro.
     step : str
-        How far a set shrinks to a reading: least trace of a strip that is narrowed first ("tightened"), of the strip as
-        it is ("optimal"), or that of Pankratova and Sholokhov ("lemma").
+        Update of a set by a reading: least trace with a narrowed strip ("tightened"), with the strip as it
+        is ("optimal"), or the update of Pankratova and Sholokhov ("lemma").
     jump : bool
-        The readings become four times as bad as their bound at 2000 s.
+        After 2000 s the errors of the readings are four times their bound.
     closed_loop : bool
-        The satellite in its attitude loop in place of the dynamics of the error alone.
+        Simulate the satellite in its attitude loop, in place of the error dynamics alone.
     seeds : int
         Number of runs.
     seed : int
-        Of the first run; the next ones follow.
+        Seed of the first run; the next runs take the next seeds.
     duration : float
-        Seconds; one orbit by default.
+        Duration of a run [s]; by default one orbit.
     """
 
     noise_deg: float = 1.0
@@ -62,7 +62,7 @@ class EllipsoidOptions(RunOptions):
     duration: float = field(default=5678.0, kw_only=True)
 
     def check(self) -> None:
-        """Raise InputError for what cannot be run."""
+        """Refuse options that are out of range."""
         from adcs.ellipsoids.roll_yaw import STEP_S
 
         least = f"{_LEAST_DEG:g} or more"
@@ -73,14 +73,14 @@ class EllipsoidOptions(RunOptions):
 
     @property
     def n_steps(self) -> int:
-        """Steps of 2 s."""
+        """Number of steps of 2 s."""
         from adcs.ellipsoids.roll_yaw import STEP_S
 
         return int(self.duration / STEP_S)
 
     @property
     def settings(self) -> EllipsoidSettings:
-        """What is simulated and observed."""
+        """Settings of the simulation and of the observer."""
         from sims.experiments.ellipsoid import EllipsoidSettings
 
         return EllipsoidSettings(
@@ -96,7 +96,7 @@ class EllipsoidOptions(RunOptions):
 def run_ellipsoid(
     options: EllipsoidOptions, out: Path | None = None, progress: Callable[[int], None] | None = None
 ) -> dict[str, Any]:
-    """Run the scenario, and write its figure and data.
+    """Run the scenario, and write its figures and data.
 
     ``out``: folder for ``ellipsoid.png`` (the first 500 runs at most), ``ellipsoid.csv`` (the first run through time)
     and ``ellipsoid-runs.csv`` (all runs); made if it is not there. ``progress``: called with the number of runs
@@ -177,7 +177,7 @@ def _of_matrix(name: str, matrix_rad2: FloatArray) -> dict[str, FloatArray]:
 
 
 def summary_lines(options: EllipsoidOptions, result: dict[str, Any]) -> list[str]:
-    """The result as text, one line for each number."""
+    """Return the result as text, one line for each number."""
     from adcs.ellipsoids.roll_yaw import STEP_S
 
     return [
@@ -196,17 +196,17 @@ def ellipsoid(
     options: EllipsoidOptions = EllipsoidOptions(),
     report: ReportOptions = ReportOptions(),  # noqa: B008 - frozen
 ) -> None:
-    """Yaw of a satellite from a horizon sensor and gyros, in guaranteed ellipsoids.
+    """Estimate the yaw of a satellite from a horizon sensor and gyros, in guaranteed ellipsoids.
 
-    Nothing measures yaw: the orbit turns it into roll and back. Of the errors only bounds are known, and the sets hold
-    the true attitude for certain. --out writes the figure and the data behind it.
+    No sensor measures yaw; along the orbit it turns into roll and back. Only bounds of the errors are known, and the
+    sets are certain to contain the true attitude. --out writes the figure and its data.
 
     Parameters
     ----------
     options : EllipsoidOptions
-        What is run.
+        Bounds of the errors, and settings of the observer.
     report : ReportOptions
-        Where the result goes.
+        Outputs.
     """
     with progress(options.seeds, "runs") as advance:
         result = run_ellipsoid(options, report.out, advance)

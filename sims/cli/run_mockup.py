@@ -1,4 +1,4 @@
-"""``adcs run mockup``: the table-top satellite under its sky of LEDs: identification, zeros, fusion of late fixes."""
+"""``adcs run mockup``: the table-top satellite under its sky of LEDs."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def frame_entries(results: dict[Path, FrameResult]) -> list[dict[str, Any]]:
-    """What ``--json`` prints of every file."""
+    """Return the JSON entry of every file."""
     from adcs.mockup.vision.paper_matcher import CameraFix
 
     entries = []
@@ -43,7 +43,7 @@ def frame_entries(results: dict[Path, FrameResult]) -> list[dict[str, Any]]:
 
 
 def sky_lines(options: MockupOptions, result: dict[str, Any]) -> list[str]:
-    """The result of frames as text."""
+    """Return the result of frames as text."""
     setup = options.sky_setup()
     damage = [f"noise {setup.noise_DN:g} DN"]
     damage += [f"{100.0 * setup.lost:g} % of the lights lost"] if setup.lost else []
@@ -66,7 +66,7 @@ def sky_lines(options: MockupOptions, result: dict[str, Any]) -> list[str]:
 
 
 def frame_lines(entries: Sequence[dict[str, Any]]) -> list[str]:
-    """Fixes of files as a table."""
+    """Return the fixes of files as a table."""
     width = max(5, *(len(entry["file"]) for entry in entries))
     lines = [f"{'frame':{width}s}  stars  matched    X [m]    Y [m]  heading [°]  rms [mm]"]
     for entry in entries:
@@ -82,7 +82,7 @@ def frame_lines(entries: Sequence[dict[str, Any]]) -> list[str]:
 
 
 def fusion_lines(runs: FusionRuns, duration_s: float) -> list[str]:
-    """The result of drives as text."""
+    """Return the result of drives as text."""
     from adcs.mockup.navigation.fixes import counts_in_words
 
     result = runs.summary()
@@ -99,7 +99,7 @@ def fusion_lines(runs: FusionRuns, duration_s: float) -> list[str]:
 
 
 def methods_lines(every: Sequence[FusionRuns], duration_s: float) -> list[str]:
-    """The results of several methods as a table."""
+    """Return the results of several methods as a table."""
     first = every[0].summary()
     lines = [
         f"{_runs(first['runs'])} of {duration_s:g} s, errors after {SETTLED_S:g} s:",
@@ -116,7 +116,7 @@ def methods_lines(every: Sequence[FusionRuns], duration_s: float) -> list[str]:
 
 
 def zeros_lines(runs: ZerosRuns, duration_s: float) -> list[str]:
-    """The result of fits as text."""
+    """Return the result of fits as text."""
     result = runs.summary()
     return [
         f"{_runs(result['runs'])} of {duration_s:g} s, unknowns {runs.unknowns}:",
@@ -141,16 +141,16 @@ def mockup(
     replay: ReplayOptions = ReplayOptions(),  # noqa: B008 - frozen
     report: ReportOptions = ReportOptions(),  # noqa: B008 - frozen
 ) -> None:
-    """Table-top satellite that looks up at a sky of LEDs: star identification, zeros, and fusion of late fixes.
+    """Run the table-top satellite: star identification, accelerometer zeros, fusion of delayed fixes.
 
     Parameters
     ----------
     options : MockupOptions
-        What is run.
+        Part of the mock-up to simulate, and its settings.
     replay : ReplayOptions
         Replay of the first drive.
     report : ReportOptions
-        Where the result goes.
+        Outputs.
     """
     options.check()
     replay.check(options, json=report.json)
@@ -160,66 +160,66 @@ def mockup(
 
         check_places(replay)
     if options.frames is not None:
-        told = _frames(options, options.frames)
+        outcome = _frames(options, options.frames)
     elif options.samples is not None and options.fixes is not None:
-        told = _recording(options.samples, options.fixes, options, report)
+        outcome = _recording(options.samples, options.fixes, options, report)
     else:
         kinds = {"sky": _sky, "zeros": _zeros, "fusion": _drives, "all": _drives}
-        told = kinds[options.part](options, report)
+        outcome = kinds[options.part](options, report)
     if report.out is not None:
         from sims.cli.mockup_files import files_of
 
-        report.write(files_of(options, told.run))
-    report.print(told.result, told.lines)
+        report.write(files_of(options, outcome.run))
+    report.print(outcome.result, outcome.lines)
     if replay.wanted:
-        show_replay(told.run[0], options.table_camera(), replay)
+        show_replay(outcome.run[0], options.table_camera(), replay)
 
 
-class Told(NamedTuple):
-    """A run of some kind, what is printed of it as JSON, and what as text."""
+class Report(NamedTuple):
+    """A run of any kind, its JSON object, and its text."""
 
     run: Any
     result: dict[str, Any]
     lines: list[str]
 
 
-def _frames(options: MockupOptions, frames: Path) -> Told:
+def _frames(options: MockupOptions, frames: Path) -> Report:
     from adcs.io.frame_files import frame_paths
 
     sky_matcher, finder = options.sky_matcher(), options.finder()
     results = sims.experiments.identified_files(frame_paths(frames), options.camera(), sky_matcher, finder)
     entries = frame_entries(results)
     fixed = sum(entry["position_m"] is not None for entry in entries)
-    return Told(results, {"frames": entries, "identified": fixed}, frame_lines(entries))
+    return Report(results, {"frames": entries, "identified": fixed}, frame_lines(entries))
 
 
-def _recording(samples: Path, fixes: Path, options: MockupOptions, report: ReportOptions) -> Told:
+def _recording(samples: Path, fixes: Path, options: MockupOptions, report: ReportOptions) -> Report:
     from sims.experiments.mockup_recording import record_lines
 
     run = sims.experiments.fused_record(samples, fixes, value_or(options.fusion, "ekf"))
     warn(run.warnings)
-    return Told(run, run.summary(), record_lines(run))
+    return Report(run, run.summary(), record_lines(run))
 
 
-def _sky(options: MockupOptions, report: ReportOptions) -> Told:
+def _sky(options: MockupOptions, report: ReportOptions) -> Report:
     setup, seeds = options.sky_setup(), options.runs(1)
     sky, matcher, finder = options.led_sky, options.sky_matcher(), options.finder()
     with progress(setup.poses * len(seeds), "frames") as advance:
         run = sims.experiments.sky_run(sky, matcher, setup, seeds, advance, finder)
     result = run.summary()
-    return Told(run, result, sky_lines(options, result))
+    return Report(run, result, sky_lines(options, result))
 
 
-def _zeros(options: MockupOptions, report: ReportOptions) -> Told:
+def _zeros(options: MockupOptions, report: ReportOptions) -> Report:
     seeds, unknowns, start_fixes = options.runs(6), value_or(options.unknowns, "six"), value_or(options.start_fixes, 4)
     with progress(len(seeds), "runs") as advance, naming_options("start_fixes"):
         runs = sims.experiments.zeros_run(
             unknowns, seeds, options.duration_s, start_fixes=start_fixes, progress=advance
         )
-    return Told(runs, runs.summary(), zeros_lines(runs, options.duration_s))
+    return Report(runs, runs.summary(), zeros_lines(runs, options.duration_s))
 
 
-def _drives(options: MockupOptions, report: ReportOptions) -> Told:
+def _drives(options: MockupOptions, report: ReportOptions) -> Report:
     scenario, seeds = options.table_scenario(), options.runs(6)
     wanted = value_or(options.fusion, "ekf")
     methods: tuple[Method, ...] = METHODS if wanted == "all" else (wanted,)
@@ -228,5 +228,5 @@ def _drives(options: MockupOptions, report: ReportOptions) -> Told:
         every = [sims.experiments.fused_runs(method, scenario, seeds, advance, simulate) for method in methods]
     if wanted == "all":
         result = {str(one.method): one.summary() for one in every}
-        return Told(every, result, methods_lines(every, options.duration_s))
-    return Told(every, every[0].summary(), fusion_lines(every[0], options.duration_s))
+        return Report(every, result, methods_lines(every, options.duration_s))
+    return Report(every, every[0].summary(), fusion_lines(every[0], options.duration_s))

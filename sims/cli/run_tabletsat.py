@@ -1,4 +1,4 @@
-"""``adcs run tabletsat``, any other scenario of a satellite with a Kalman filter, and a user's own scenario file."""
+"""``adcs run`` of a satellite with a Kalman filter, and the options of many runs."""
 
 from __future__ import annotations
 
@@ -81,8 +81,10 @@ def run_in_batches(
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}, files
 
 
-def wanted(scenario: str, options: ScenarioOptions, duration_s: float | None) -> tuple[AttitudeFile, EstimatorSettings]:
-    """The scenario with the options in it, and its filter."""
+def configure(
+    scenario: str, options: ScenarioOptions, duration_s: float | None
+) -> tuple[AttitudeFile, EstimatorSettings]:
+    """Return the scenario with the options, and its filter."""
     from adcs.io.scenario_tables import MOST_STEPS
 
     file = adcs.read_scenario(scenario, allow_old_elements=options.allow_old_elements)
@@ -111,12 +113,12 @@ def run_attitude(
     runs: RunOptions = RunOptions(),
     report: ReportOptions = ReportOptions(),  # noqa: B008 - frozen
 ) -> None:
-    """Simulate a satellite, estimate its attitude with a Kalman filter, and say how good that is.
+    """Simulate a satellite, estimate its attitude with a Kalman filter, and report the errors.
 
-    Errors are those of the last minute: the rms of every axis, its mean over the runs, of these the worst axis. A
-    run that is more than 10° off then has diverged. The largest error while something is degraded or not observable
-    (an eclipse, Sun and field on one line) is of all runs, after their first minute. Beside the figures, --out
-    writes telemetry.csv and scenario.toml, with which `adcs estimate` does the same.
+    Errors are the rms of the last minute per axis, averaged over the runs, of the worst axis. A run with an error of
+    more than 10° then has diverged. The largest error while a sensor is degraded or a state is not observable (an
+    eclipse, Sun and field on one line) is that of all runs, after their first minute. --out writes figures, and
+    telemetry.csv and scenario.toml for `adcs estimate`.
 
     Parameters
     ----------
@@ -124,11 +126,11 @@ def run_attitude(
         Scenario file (TOML), or a built-in scenario: tabletsat, collinearity, eclipse, field-error, one-vector,
         outliers, residual-dipole, star-blinded or uncalibrated-magnetometer.
     options : ScenarioOptions
-        What differs from the scenario file.
+        Values that replace those of the scenario file.
     runs : RunOptions
-        Runs.
+        Number, seeds and duration of the runs.
     report : ReportOptions
-        Where the result goes.
+        Outputs.
     """
     from adcs.io.scenario_files import built_in_scenarios
     from arrays.io.text import check_netcdf
@@ -142,7 +144,7 @@ def run_attitude(
             f"{scenario} does not exist, expected a scenario file, or one of {', '.join(names)} "
             f"(the nearest is {nearest})."
         )
-    file, estimate = wanted(scenario, options, runs.duration)
+    file, estimate = configure(scenario, options, runs.duration)
     if report.out is not None:
         report.check()
         check_netcdf()
@@ -166,14 +168,14 @@ def run_attitude(
 
 
 def summary_lines(file: AttitudeFile, estimate: EstimatorSettings, numbers: dict[str, Any]) -> Sequence[str]:
-    """The result as text."""
+    """Return the result as text."""
     from adcs.io.estimates import unseen_line
     from adcs.kalman.diagnostics import PERIODS_S
     from adcs.kalman.results import STATE_UNITS
 
     runs = "1 run" if numbers["runs"] == 1 else f"{numbers['runs']} runs"
     lines = [f"{file.name}: {runs} of {file.duration_s:g} s; {estimate.in_words}"]
-    # The first numbers are those of the states, in this order.
+    # The first numbers belong to the states, in this order.
     for (state, shown), number in zip(STATE_UNITS.items(), numbers.values(), strict=False):
         if number is not None:
             words = "angle, rms of the last minute" if state == "attitude" else shown.words

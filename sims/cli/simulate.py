@@ -1,4 +1,4 @@
-"""``magloc simulate``: readings of a scenario, the truth behind them, and the array as its user knows it."""
+"""``magloc simulate``: readings of a scenario, their truth, and the array."""
 
 from __future__ import annotations
 
@@ -20,27 +20,26 @@ def simulate(
 ) -> None:
     """Simulate the readings of an array.
 
-    Beside READINGS.csv are written READINGS-truth.csv, with the position and the moment of the source in the world
-    frame (READINGS-truth-2.csv and so on of further sources), READINGS-path.csv, with its position and its attitude,
-    READINGS-targets.csv, with a row for every target in the ground of a survey, and READINGS-array.toml, with what the
-    user of the array knows of it: noise of one sample, saturation, and how uncertain axes and gains are.
+    Writes READINGS.csv, and beside it READINGS-truth.csv with the position and the moment of the source in the world
+    frame (READINGS-truth-2.csv and so on for more sources), READINGS-path.csv with its position and attitude,
+    READINGS-targets.csv with a row for every target of a survey, and READINGS-array.toml with the array as its user
+    knows it: noise of one sample, saturation, and the uncertainty of axes and gains.
 
     Parameters
     ----------
     scenario : str
-        Scenario file (TOML), or a built-in scenario: diver, drone, hand-magnet, paper, ship,
-        ship-headings, survey-cart, survey-diver, survey-drone, three-magnets or weaving.
+        Scenario file (TOML), or a built-in scenario: diver, drone, hand-magnet, paper, ship, ship-headings,
+        survey-cart, survey-diver, survey-drone, three-magnets or weaving.
     out : Path
         Readings file (CSV) to write. Existing files are replaced.
     body_length_m : float
-        Length of every source, in place of the scenario's: a thin bar along the body's axis x that has the source's
-        moment. 0: a point.
+        Length of every source [m], in place of the scenario's: a thin bar along the body's axis x with the moment of
+        the source. 0 for a point source.
     json : bool
-        Print one JSON object that names the files.
+        Print one JSON object with the names of the files.
     common : CommonOptions
         Common options.
     """
-    # The command line stands on top of all packages; nothing that it imports imports it.
     from arrays.io.outputs import refuse_unwritable
     from sims.magnetics.files import files_beside, write_simulation
     from sims.magnetics.scenario_files import read_scenario

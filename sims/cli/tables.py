@@ -1,4 +1,4 @@
-"""``adcs tables``: Tables 3 to 5 of Ivanov et al. (Keldysh Institute, 2014), what we find, and the ratio."""
+"""``adcs tables``: Tables 3 to 5 of Ivanov et al. (Keldysh Institute, 2014) and our results."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ def tables(
     options: RunOptions = RunOptions(),  # noqa: B008 - frozen
     report: ReportOptions = ReportOptions(),  # noqa: B008 - frozen
 ) -> None:
-    """Tables 3, 4 and 5 of Ivanov et al. (Keldysh Institute preprint 64, 2014): their value, ours, and the ratio.
+    """Repeat Tables 3, 4 and 5 of Ivanov et al. (Keldysh Institute preprint 64, 2014).
 
-    Process noise and noise of the star tracker are as printed, as far as they can be read. Ours is the standard
-    deviation that the filter gives at the end, worst axis, the mean of the runs, and beside it the rms of its errors in
-    the last minute. The attitude is half of the angle, as there. A number of ours that is more than three times off has
-    a star, and below it is why. Runs of Table 3 take 200 s and all others 600 s, unless ``--duration`` says otherwise.
-    --out writes tables.csv.
+    Prints the value of the paper, our value and the ratio. Process noise and noise of the star tracker are as printed,
+    as far as they are legible. Our value is the standard deviation of the filter at the end, of the worst axis,
+    averaged over the runs; beside it stands the rms of the errors in the last minute. The attitude is half of the
+    angle, as in the paper. A star marks a ratio beyond three; the reason stands below. Runs of Table 3 take 200 s, all
+    others 600 s, unless --duration is given. --out writes tables.csv.
 
     Parameters
     ----------
     options : RunOptions
-        Runs of every row.
+        Number, seeds and duration of the runs of every row.
     report : ReportOptions
-        Where the result goes.
+        Outputs.
     """
     report.check()
     refuse_outside(1.0, 1e7, "1 to 1e7 s", unit=" s", duration=options.duration)
@@ -53,7 +53,7 @@ _TITLES = {3: "Table 3", 4: "Table 4, disturbance in the state", 5: "Table 5, co
 
 
 def table_lines(compared: list[Comparison]) -> list[str]:
-    """The comparison as text."""
+    """Return the comparison as text."""
     lines: list[str] = []
     table = 0
     for (of_table, label), rows in groupby(compared, lambda one: (one.table, one.set)):

@@ -1,4 +1,4 @@
-"""Runs that simulate and estimate; what repeats the papers."""
+"""Simulated experiments, and those that repeat the papers."""
 
 from arrays.io.lazy import lazy_names
 

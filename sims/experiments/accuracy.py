@@ -1,4 +1,4 @@
-"""How far estimates are from the truth of a simulation."""
+"""Errors of estimates against the truth of a simulation."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ from magloc.chi_square import normalised_square
 from sims.attitude.simulation import AttitudeRuns
 
 LAST_S = 60.0
-"""Errors are those of the last minute."""
+"""Duration at the end of a run over which errors count [s]."""
 DIVERGED_DEG = 10.0
-"""A run whose attitude is farther off than this in the last minute has diverged."""
+"""Error in the last minute beyond which a run has diverged."""
 
 
 def errors(runs: AttitudeRuns, estimates: AttitudeTracks) -> FloatArray:
-    """Error state of truth against estimate, shape (runs, n, N)."""
+    """Return the error state of truth against estimate, shape (runs, n, N)."""
     true = runs.states
     others = (true[state] - values for state, values in estimates.states.items())
     return np.concatenate([quaternion.error_vector(estimates.q, runs.q), *others], axis=-1)
 
 
 def normalised_error_squared(runs: AttitudeRuns, estimates: AttitudeTracks) -> FloatArray:
-    """NEES, shape (runs, n): χ² of N numbers where the filter is consistent."""
+    """Return the NEES, shape (runs, n); χ² with N degrees of freedom for a consistent filter."""
     return normalised_square(errors(runs, estimates), estimates.covariance)
 
 
 def last_rows(runs: AttitudeRuns) -> slice:
-    """Instants of the last minute."""
+    """Return the instants of the last minute."""
     return slice(-max(1, round(LAST_S / runs.dt_s)), None)
 
 
 def error_norm_deg(runs: AttitudeRuns, estimates: AttitudeTracks) -> FloatArray:
-    """Length of the error's rotation vector, shape (runs, n) [°]."""
+    """Return the angle between truth and estimate, shape (runs, n) [°]."""
     return np.degrees(quaternion.angle_between(estimates.q, runs.q))

@@ -1,4 +1,4 @@
-"""Runs of an attitude scenario: truth, readings, estimates, and how good these are."""
+"""Runs of an attitude scenario: truth, readings, estimates and their errors."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from sims.attitude.simulation import AttitudeRuns, simulate, start_estimates
 from sims.experiments import accuracy
 
 _NUMBERS_AT_ONCE = 40_000_000
-"""Of all covariances that are held together: 320 MB."""
+"""Largest number of elements of all covariances in memory: 320 MB."""
 
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Some runs that are held together."""
+    """Runs that are in memory together."""
 
     runs: AttitudeRuns
     estimates: AttitudeTracks
@@ -37,7 +37,7 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """How good the estimates of all runs are.
+    """Errors and consistency of the estimates of all runs.
 
     Attributes
     ----------
@@ -47,27 +47,27 @@ class Outcome:
         disturbance [1/s²], the error of the field's model [nT] and the dipole [A·m²], three axes each, and nine gains
         of the magnetometer [%]; NaN of a state that the filter does not have.
     nees : ndarray, shape (runs, n)
-        Normalised error squared, over its numbers; at all instants, or at those of the last minute.
+        NEES per dimension, at all instants or at those of the last minute.
     nis : ndarray, shape (runs, n, 4)
         Normalised innovation squared of every sensor, NaN where it has no reading.
     error_deg : ndarray, shape (runs, n)
         Angle between truth and estimate.
     diverged : ndarray of bool, shape (runs,)
     size : int
-        Numbers of the error state.
+        Dimension of the error state.
     late : slice
         Instants of the last minute among the n.
     worst_deg : ndarray, shape (runs,)
-        Largest error while something is degraded or not observable, but for the first minute, which is the start's;
-        NaN where nothing is.
+        Largest error while a sensor is degraded or a state is not observable, without the first minute; NaN if there
+        is no such time.
     rejected, rejected_good : ndarray of int, shape (runs,)
-        Readings that the filter did not use, and those of them that are not wild.
+        Number of readings that the filter rejected, and of those among them that are not wild.
     tuned_disturbance_s2 : ndarray, shape (runs,)
-        What the filter ``self-tuning`` has found at the end, 1 σ; NaN of others.
+        Disturbance that the filter ``self-tuning`` has found at the end, 1 σ; NaN for other filters.
     unseen_torque_Nm : dict of float to float
-        Amplitude below which a torque does not show in the readings, by its period [s]; the largest of all runs.
+        Largest amplitude of a torque that the readings do not show, by its period [s]; the largest of all runs.
     warnings : list of list of str
-        What can be told of every run without the truth: what is degraded or not observable.
+        Warnings of every run, which need no truth: degraded sensors and unobservable states.
     """
 
     seeds: NDArray[np.int64]
@@ -86,12 +86,12 @@ class Outcome:
     warnings: list[list[str]]
 
     def last_minute(self) -> Outcome:
-        """The same without the earlier instants, which only a figure through time shows."""
+        """Return the outcome with the instants of the last minute only."""
         late = {name: getattr(self, name)[:, self.late].copy() for name in ("nees", "nis", "error_deg")}
         return replace(self, **late, late=slice(None))
 
     def warning_lines(self) -> list[str]:
-        """One line for every kind of warning: that of the first run which has it, and in how many runs it comes."""
+        """Return one line for every kind of warning, with the number of runs that have it."""
         first: dict[str, str] = {}
         count: dict[str, int] = {}
         for texts in self.warnings:
@@ -103,7 +103,7 @@ class Outcome:
         return [text + (f" ({count[kind]} of {runs} runs)" if runs > 1 else "") for kind, text in first.items()]
 
     def numbers(self) -> dict[str, Any]:
-        """What ``--json`` prints: every axis' mean over the runs, and of these the worst axis."""
+        """Return the keys of ``--json``: means over the runs, of the worst axis."""
         mean, tuned = largest_by_state(self.axis_rms.mean(axis=0)), np.median(self.tuned_disturbance_s2)
         names = (
             *("angle_rms_deg", "rate_rms_deg_s", "gyro_bias_rms_deg_s"),
@@ -129,7 +129,7 @@ class Outcome:
 
 
 def parts_of(file: AttitudeFile, estimate: EstimatorSettings, seeds: Sequence[int]) -> Iterator[Part]:
-    """All runs, as many at once as fit into memory."""
+    """Yield all runs, as many at once as fit into memory."""
     scenario = simulation_of(file)
     at_once = max(1, _NUMBERS_AT_ONCE // (scenario.n_instants * estimate.settings.sensors.size**2))
     for begin in range(0, len(seeds), at_once):
@@ -137,14 +137,14 @@ def parts_of(file: AttitudeFile, estimate: EstimatorSettings, seeds: Sequence[in
 
 
 def _part(file: AttitudeFile, estimate: EstimatorSettings, scenario: AttitudeScenario, seeds: Sequence[int]) -> Part:
-    runs, start = _simulated(file, scenario, seeds), None
+    runs, start = _simulate(file, scenario, seeds), None
     if estimate.start == "near":
         errors = estimate.start_attitude_rad, estimate.start_rate_rad_s
         start = start_near(*start_estimates(runs.prepared, *errors), *errors)
     return Part(runs, estimate_tracks(runs, estimate, start))
 
 
-def _simulated(file: AttitudeFile, scenario: AttitudeScenario, seeds: Sequence[int]) -> AttitudeRuns:
+def _simulate(file: AttitudeFile, scenario: AttitudeScenario, seeds: Sequence[int]) -> AttitudeRuns:
     try:
         return simulate(scenario, seeds)
     except ValueError as error:
@@ -158,7 +158,7 @@ def _simulated(file: AttitudeFile, scenario: AttitudeScenario, seeds: Sequence[i
         raise InputError(f"{file.path}: {text}") from None
 
 
-@np.errstate(over="ignore", divide="ignore", invalid="ignore")  # a run that leaves double precision has diverged
+@np.errstate(over="ignore", divide="ignore", invalid="ignore")  # a run that overflows has diverged
 def run_scenario(
     file: AttitudeFile,
     estimate: EstimatorSettings,
@@ -173,13 +173,13 @@ def run_scenario(
     Parameters
     ----------
     file : AttitudeFile
-        Of :func:`adcs.read_scenario`.
+        Scenario from :func:`adcs.read_scenario`.
     estimate : EstimatorSettings
-        What estimates.
+        Filter and its settings.
     seeds : sequence of int
         One for each run.
     through_time : bool
-        Keep NEES, NIS and error at all instants, six numbers each, and not at those of the last minute alone.
+        Keep NEES, NIS and error at all instants, six numbers each; otherwise of the last minute only.
     look : callable, optional
         Called with every part of the runs.
     advance : callable, optional
@@ -188,7 +188,7 @@ def run_scenario(
     Raises
     ------
     InputError
-        As :func:`parts_of`.
+        The same errors as in :func:`parts_of`.
 
     Examples
     --------
@@ -207,7 +207,7 @@ def run_scenario(
             look(part)
         if advance is not None:
             advance(len(outcome.seeds))
-        del part, outcome  # or two would be in memory while the next one is made
+        del part, outcome  # only one part fits into memory
     of_runs: tuple[str, ...] = ("seeds", "axis_rms", "nees", "nis", "error_deg", "diverged", "worst_deg", "rejected")
     of_runs += ("rejected_good", "tuned_disturbance_s2")
     joined: dict[str, Any] = {name: np.concatenate([getattr(one, name) for one in outcomes]) for name in of_runs}
@@ -216,18 +216,18 @@ def run_scenario(
 
 
 def _largest(each: Iterable[Mapping[float, float]]) -> dict[float, float]:
-    """The largest value of every key, of mappings that have the same ones."""
+    """Return the largest value of every key of mappings with the same keys."""
     first, *others = each
     return {key: max([value, *(other[key] for other in others)]) for key, value in first.items()}
 
 
 def errors_in_units(part: Part) -> FloatArray:
-    """Truth minus estimate, shape (runs, n, 30), in the order and units of :attr:`Outcome.axis_rms`."""
+    """Return truth minus estimate (runs, n, 30), ordered as :attr:`Outcome.axis_rms`."""
     return state_table(part.estimates.settings.sensors.split(accuracy.errors(part.runs, part.estimates)))
 
 
 def outcome_of(part: Part) -> Outcome:
-    """How good the estimates of some runs are."""
+    """Return errors and consistency of the estimates of some runs."""
     runs, estimates = part.runs, part.estimates
     late = accuracy.last_rows(runs)
     error_deg = accuracy.error_norm_deg(runs, estimates)
@@ -256,7 +256,7 @@ def outcome_of(part: Part) -> Outcome:
 
 
 def _worst(error_deg: FloatArray, problems: Sequence[AttitudeProblem], first: int) -> float:
-    """Largest error at the instants of some problems, from the instant ``first`` on; NaN where there are none."""
+    """Return the largest error during problems, from the instant ``first`` on; NaN without any."""
     rows = np.zeros(len(error_deg), dtype=np.bool_)
     for problem in problems:
         rows |= problem.rows

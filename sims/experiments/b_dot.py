@@ -1,4 +1,4 @@
-"""A satellite of three units that tumbles, and is braked by torquers or by rods: ``adcs run detumbling``."""
+"""Detumbling of a satellite of three units by torquers or rods: ``adcs run detumbling``."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from adcs.satellite.satellite import Satellite
 from adcs.satellite.telemetry import Record, is_read, orbital_from_eci, part
 from arrays.typing import BoolArray, FloatArray
 from sims.attitude.scenario import AttitudeScenario, StartConditions
-from sims.attitude.simulation import AttitudeRuns, Command, Prepared, controlled, moved, prepare
+from sims.attitude.simulation import AttitudeRuns, Command, PreparedRuns, prepare, simulate_control, simulate_motion
 from sims.noise import stream
 
 Damping = Literal["readings", "estimate", "rods"]
@@ -33,14 +33,14 @@ ANYWHERE = StartConditions(sunlit=False, least_separation_rad=0.0, least_field_T
 
 
 def three_units(**more: Any) -> Satellite:
-    """The satellite, without wheels, with what else its experiment wants of it."""
+    """Return the satellite without wheels, with the options of its experiment."""
     no_wheels = WheelControl(np.zeros(3), np.zeros(3), torque_limit_Nm=1e-15)
     return Satellite(inertia_kgm2=INERTIA_KGM2, orbit=ORBIT, control=no_wheels, **more)
 
 
 @dataclass(frozen=True, eq=False)
 class Detumbling:
-    """Some runs.
+    """Runs of detumbling.
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ class Detumbling:
 
     @property
     def last_rate_deg_s(self) -> FloatArray:
-        """Rms over the last ten minutes of every run's rate against inertial space, shape (runs,)."""
+        """Rms rate of every run over the last ten minutes, against inertial space, shape (runs,)."""
         return np.degrees(np.sqrt(np.mean(np.sum(self._last(self.runs.w) ** 2, axis=-1), axis=1)))
 
     @property
@@ -83,25 +83,25 @@ def detumbling(
     duration_s: float = 6000.0,
     advanced: Callable[[int], None] | None = None,
 ) -> Detumbling:
-    """Runs from rates in random directions, with a law that is told readings, or an estimate from them, or with rods.
+    """Simulate detumbling from rates in random directions, by torquers or by rods.
 
     Parameters
     ----------
     seeds : sequence of int
         One for each run.
     damping : str
-        ``readings``: torquers by two readings of the magnetometer; ``estimate``: torquers by the rate of a filter of
-        magnetometer, Sun sensor and gyro, once it has seen the Sun; ``rods``: no torquers.
+        ``readings``: torquers with two readings of the magnetometer; ``estimate``: torquers with the rate of a filter
+        of magnetometer, Sun sensor and gyro, after it has seen the Sun; ``rods``: no torquers.
     rate_deg_s : float
-        At the start, of any direction.
+        Rate at the start, in a random direction.
     largest_Am2, duty : float
-        Of the torquers; a cycle takes a second.
+        Largest moment and duty cycle of the torquers; a cycle takes one second.
     magnet_Am2 : float
-        Of a magnet along the axis z.
+        Moment of a magnet along the axis z.
     rods : HysteresisRods
-        Used where they damp.
+        Rods for ``rods``.
     duration_s : float
-        Of every run.
+        Duration of every run.
     advanced : callable, optional
         Called with the number of steps finished since the last call.
 
@@ -127,12 +127,12 @@ def detumbling(
     prepared = replace(prepare(scenario, seeds), w=w)
     law = BDot(b_dot_gain(INERTIA_KGM2, float(prepared.environment.orbital_rate_rad_s[0, 0])), largest_Am2, duty)
     if damping == "rods":
-        runs = moved(prepared)
+        runs = simulate_motion(prepared)
         if advanced is not None:
             advanced(scenario.n_instants)
     else:
         command = _by_readings(law) if damping == "readings" else _by_estimate(law)
-        runs = controlled(prepared, command, advanced)
+        runs = simulate_control(prepared, command, advanced)
     return Detumbling(
         runs,
         _time_below(np.linalg.norm(runs.w, axis=-1), scenario.dt_s),
@@ -141,7 +141,7 @@ def detumbling(
 
 
 def _by_readings(law: BDot) -> Command:
-    """What acts over a cycle is the mean over it: on for a part of it."""
+    """Return a command from readings: the mean over a cycle, in which torquers are on for a part."""
 
     def command(record: Record, row: int) -> FloatArray:
         field_T = record.readings.field_T
@@ -152,12 +152,12 @@ def _by_readings(law: BDot) -> Command:
 
 
 def _by_estimate(law: BDot) -> Command:
-    """By the rate against the orbital frame that a filter estimates, and by readings until it has started."""
+    """Return a command from the estimated rate, or from readings until the filter has started."""
     used = sensor_set("mag+sun+gyro", ["gyro-bias"])
     on_board, by_readings = _OnBoard(FilterSettings(used, tuned_noise(used))), _by_readings(law)
 
     def command(record: Record, row: int) -> FloatArray:
-        state, started = on_board.take(record, row)
+        state, started = on_board.update(record, row)
         around = record.environment
         b = quaternion.rotate_back(state.q, around.b_orbital_T[:, row])
         rate = relative_rate(state.q, state.w, around.orbital_rate_rad_s[:, row])
@@ -166,8 +166,8 @@ def _by_estimate(law: BDot) -> Command:
     return command
 
 
-def _by_mean_torque(prepared: Prepared, law: BDot) -> FloatArray:
-    """Rate (runs, n) of the equation of the mean torque."""
+def _by_mean_torque(prepared: PreparedRuns, law: BDot) -> FloatArray:
+    """Return the rate (runs, n) that the mean torque predicts."""
     eci_from_orbital = quaternion.conjugate(orbital_from_eci(prepared.environment))
     b_eci = quaternion.rotate(eci_from_orbital, prepared.true_field_orbital_T)
     eci_from_body = quaternion.multiply(eci_from_orbital[:, 0], prepared.q)
@@ -176,37 +176,37 @@ def _by_mean_torque(prepared: Prepared, law: BDot) -> FloatArray:
 
 
 class _OnBoard:
-    """Error-state filter, without a gate, that goes along with runs; each starts where it first sees field and Sun."""
+    """Error-state filter on board, without a gate; it starts when a run first sees field and Sun."""
 
     def __init__(self, settings: FilterSettings) -> None:
         self.settings = settings
         self.started: BoolArray | None = None
         self.state: AttitudeState | None = None
 
-    def take(self, record: Record, row: int) -> tuple[AttitudeState, BoolArray]:
-        """Estimate after the readings of an instant, of which none may be left out, and which runs have started."""
+    def update(self, record: Record, row: int) -> tuple[AttitudeState, BoolArray]:
+        """Process the readings of one instant; return the estimate, and which runs have started."""
         settings, readings = self.settings, record.readings
         both = is_read(readings.field_T[:, row]) & is_read(readings.sun[:, row])
         if self.state is None or self.started is None:
-            state, begins = self._begun(record, row, np.arange(len(both))), both
+            state, begins = self._start(record, row, np.arange(len(both))), both
             self.started = both
         else:
             state, begins = predict(record, row - 1, self.state, settings)[0], both & ~self.started
             self.started = self.started | both
         if begins.any():
-            fresh = self._begun(record, row, np.flatnonzero(begins))
+            fresh = self._start(record, row, np.flatnonzero(begins))
             state.q[begins], state.w[begins], state.P[begins] = fresh.q, fresh.w, fresh.P
             for name, values in fresh.optional.items():
                 state.optional[name][begins] = values
         self.state, _ = update_state(record, row, state, settings)
         return self.state, self.started
 
-    def _begun(self, record: Record, row: int, runs: NDArray[np.intp]) -> AttitudeState:
+    def _start(self, record: Record, row: int, runs: NDArray[np.intp]) -> AttitudeState:
         return initial_state(self.settings, vector_start(part(record, runs, slice(row, row + 1)), self.settings))
 
 
 def _time_below(rate: FloatArray, step_s: float) -> FloatArray:
-    """Time (runs,) from which rates (runs, n) stay below the slow one for a minute; NaN where they do not."""
+    """Return the time (runs,) from which rates stay low for a minute; NaN where they do not."""
     lasting = min(round(60.0 / step_s), rate.shape[1])
     largest = np.lib.stride_tricks.sliding_window_view(rate, lasting, axis=1).max(axis=-1)
     return np.where((largest < SLOW_RAD_S).any(axis=1), step_s * (largest < SLOW_RAD_S).argmax(axis=1), np.nan)

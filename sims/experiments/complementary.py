@@ -19,7 +19,7 @@ OUTAGE_MAX_FROM_ORBITS = 2.0
 
 
 def errors_deg(runs: SatelliteRuns, method: Method, gains: Gains, outage: Rule | None) -> FloatArray:
-    """Errors of roll, pitch and yaw (R, n, 3), in body axes, of one of the filters; ``outage`` stands for the Sun."""
+    """Return errors of roll, pitch and yaw (R, n, 3) [°] of a filter, in body axes."""
     if method == "adaptive":
         q = adaptive_track(runs.record, AdaptiveTuning(first_sigma=runs.scenario.sigma_T)).q
     else:
@@ -32,7 +32,7 @@ OUTAGE_COLUMNS = ("outage_max_roll_deg", "outage_max_pitch_deg", "outage_max_yaw
 
 
 def run_columns(scenario: SatelliteScenario, errors: FloatArray) -> dict[str, FloatArray]:
-    """Return what is kept of every run with errors (R, n, 3) [°], shape (R,) each; NaN where a run has none."""
+    """Return statistics (R,) of every run with errors (R, n, 3) [°]; NaN where a run has none."""
     orbits, step, outage = scenario.orbits, scenario.step_orbits, scenario.outage_orbits
     late = math.inf if outage is None else outage
     pooled = (orbits >= RMS_ORBITS[0]) & (orbits < RMS_ORBITS[1])

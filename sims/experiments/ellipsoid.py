@@ -25,7 +25,7 @@ from sims.attitude.roll_yaw import ErrorScenario, LoopScenario, error_runs, fly
 
 @dataclass(frozen=True)
 class EllipsoidSettings:
-    """What is simulated and observed.
+    """Settings of the simulation and of the observer.
 
     ``noise_rad``, ``drift_rad_s``: bounds of the horizon sensor's errors and of the yaw gyro's zero shift.
     """
@@ -40,7 +40,7 @@ class EllipsoidSettings:
 
 @dataclass(frozen=True, eq=False)
 class EllipsoidRuns:
-    """Truth and sets of some runs."""
+    """Truth and sets of runs."""
 
     seeds: range
     states_rad: FloatArray
@@ -50,7 +50,7 @@ class EllipsoidRuns:
 
 
 def ellipsoid_runs(settings: EllipsoidSettings, seeds: range) -> EllipsoidRuns:
-    """Runs of some seeds, all at once."""
+    """Simulate the runs of some seeds, all at once."""
     noise, drift, n_steps = settings.noise_rad, settings.drift_rad_s, settings.n_steps
     observer = roll_yaw_observer(roll_yaw_system(noise, drift), len(seeds), settings.step)
     if settings.closed_loop:
@@ -64,7 +64,7 @@ def ellipsoid_runs(settings: EllipsoidSettings, seeds: range) -> EllipsoidRuns:
 
 
 def run_columns(runs: EllipsoidRuns) -> dict[str, NDArray[Any]]:
-    """Return what is kept of every run, shape (R,) each; the largest yaw is that after 1000 s, NaN of a shorter run."""
+    """Return statistics (R,) of every run; the largest yaw is NaN for runs below 1000 s."""
     track, yaw = runs.track, runs.states_rad[..., YAW]
     late = np.abs(yaw[:, int(1000.0 / STEP_S) :])
     return {

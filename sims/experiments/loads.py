@@ -1,4 +1,4 @@
-"""A satellite of three units with four magnetometers, and two loads that switch and make fields of their own."""
+"""A satellite with four magnetometers, and two loads whose fields switch."""
 
 from __future__ import annotations
 
@@ -16,35 +16,35 @@ from arrays.sensor import Sensor
 from arrays.typing import FloatArray, Rng
 from magloc.fields.dipole import total_field
 from sims.attitude.scenario import AttitudeScenario
-from sims.attitude.simulation import AttitudeRuns, moved, prepare
+from sims.attitude.simulation import AttitudeRuns, prepare, simulate_motion
 from sims.experiments.b_dot import ANYWHERE, three_units
 from sims.noise import stream
 
 NOISE_T = 15e-9
 GAIN, AXES_RAD, PLACE_M = 0.01, math.radians(0.5), 1e-3
-"""Standard deviations of what is not known of a magnetometer: gains, axes, and where it stands, each component."""
+"""Standard deviations of gains, axes and position of a magnetometer, per component."""
 LOADS = {"heater": ((0.02, -0.025, -0.06), (0.012, 0.0, 0.016)), "radio": ((-0.015, 0.02, 0.085), (0.06, -0.08, 0.0))}
-"""Place [m] and moment [A·m²] of each load, body axes: 0.02 and 0.1 A·m²."""
+"""Position [m] and moment [A·m²] of each load, in body axes: 0.02 and 0.1 A·m²."""
 PLACES_M = ((0.045, 0.045, 0.165), (-0.045, 0.045, -0.165), (0.045, -0.045, 0.0), (-0.045, -0.045, 0.12))
-"""Of the magnetometers; the first one is that of the attitude."""
+"""Positions of the magnetometers; the first one serves the attitude filter."""
 
 
 @dataclass(frozen=True, eq=False)
 class LoadsRun:
-    """Readings of a run, and the truth behind them.
+    """Readings of a run, and their truth.
 
     Attributes
     ----------
     array : SensorArray
         The magnetometers ``m1`` to ``m4``, as their user knows them.
     readings_T, quiet_T : ndarray, shape (n, 12)
-        Of the array, with the loads, and of the same magnetometers and noise without.
+        Readings of the array with the loads, and the same without them.
     states : dict of str to ndarray, shape (n,)
-        0 and 1 of each load.
+        State of each load, 0 or 1.
     fields_T : ndarray, shape (K, 4, 3)
-        What each load adds to the readings, body axes.
+        Field of each load in the readings, body axes.
     run : AttitudeRuns
-        Of the satellite, one run; its magnetometer is not on board.
+        Motion of the satellite, one run.
     """
 
     array: SensorArray
@@ -56,17 +56,17 @@ class LoadsRun:
 
     @property
     def time_s(self) -> FloatArray:
-        """Of the rows, shape (n,)."""
+        """Times of the rows, shape (n,)."""
         return self.run.time_s
 
     @property
     def gyro_rad_s(self) -> FloatArray:
-        """Gyro, shape (n, 3)."""
+        """Readings of the gyro, shape (n, 3)."""
         return self.run.readings.gyro_rad_s[0]
 
     @property
     def columns(self) -> dict[str, FloatArray]:
-        """Columns (n,) of a log as ``adcs loads`` reads it."""
+        """Columns (n,) of a log for ``adcs loads``."""
         channels = dict(zip((f"{name}_nT" for name in self.array.channel_names), 1e9 * self.readings_T.T, strict=True))
         gyro = dict(zip((f"gyro_{axis}_deg_s" for axis in "xyz"), np.degrees(self.gyro_rad_s.T), strict=True))
         return {"time_s": self.time_s, **channels, **gyro, **self.states}
@@ -74,14 +74,14 @@ class LoadsRun:
 
 @accept_seed
 def switching_loads(rng: Rng, *, duration_s: float = 2400.0, rate_deg_s: float = 0.4) -> LoadsRun:
-    """A tumbling satellite of 4 kg whose loads switch every 20 to 90 s.
+    """Simulate a tumbling satellite of 4 kg whose loads switch every 20 to 90 s.
 
     Parameters
     ----------
     rng : int or numpy.random.Generator
-        Seed or generator of everything that is random.
+        Seed or generator of all random numbers.
     duration_s : float
-        At a reading a second.
+        Duration [s], with one reading per second.
     rate_deg_s : float
         Standard deviation of the rate about each axis.
 
@@ -105,15 +105,15 @@ def switching_loads(rng: Rng, *, duration_s: float = 2400.0, rate_deg_s: float =
     )
     prepared = prepare(scenario, [seed])
     n = scenario.n_instants
-    states = {name: _switched(n, generator) for name in LOADS}
+    states = {name: _switch_states(n, generator) for name in LOADS}
     moments = sum(states[name][:, None] * np.array(moment) for name, (_, moment) in LOADS.items())
-    run = moved(replace(prepared, dipole_Am2=prepared.dipole_Am2 + moments))
+    run = simulate_motion(replace(prepared, dipole_Am2=prepared.dipole_Am2 + moments))
     array = SensorArray(
         tuple(
             Sensor(f"m{i}", "vector", place, noise_T=NOISE_T, gain_uncertainty=GAIN, misalignment_rad=AXES_RAD)
             for i, place in enumerate(PLACES_M, start=1)
         ),
-        # Of the field of a dipole 0.1 m away, by 1 mm of the place.
+        # Relative change of the field of a dipole 0.1 m away, for 1 mm of the position.
         noise_fraction=3.0 * PLACE_M / 0.1,
     )
     places = array.positions + PLACE_M * generator.standard_normal((4, 3))
@@ -126,7 +126,7 @@ def switching_loads(rng: Rng, *, duration_s: float = 2400.0, rate_deg_s: float =
     return LoadsRun(array, loaded.reshape(n, 12), quiet.reshape(n, 12), states, fields, run)
 
 
-def _switched(n: int, rng: np.random.Generator) -> FloatArray:
-    """0 and 1 of n rows, with changes 20 to 90 s apart."""
+def _switch_states(n: int, rng: np.random.Generator) -> FloatArray:
+    """Return states 0 and 1 of n rows, with changes 20 to 90 s apart."""
     changes = np.cumsum(rng.integers(20, 91, size=1 + n // 20))
     return np.asarray((np.searchsorted(changes, np.arange(n), side="right") % 2).astype(np.float64))

@@ -1,4 +1,4 @@
-"""The mock-up end to end: frames of a drive, what is found in them, and when: ``adcs run mockup --part all``."""
+"""The mock-up end to end, with rendered frames: ``adcs run mockup --part all``."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from sims.mockup.table_run import TableRun, TableScenario, table_run
 
 @dataclass(frozen=True, eq=False)
 class TableCamera:
-    """The camera of a drive, and what becomes of its frames.
+    """Camera of a drive, and the processing of its frames.
 
     Attributes
     ----------
     sky : LedSky
     setup : SkySetup
-        What frames are like, and what is believed of the camera; its places and motions are those of the drive.
+        Quality of the frames, and the calibration of the camera; positions and motions are those of the drive.
     matcher, finder : callable
-        As of :func:`sims.experiments.sky_run`.
+        Functions as in :func:`sims.experiments.sky_run`.
     delay_s : float, optional
-        From the middle of an exposure to its fix; by default the rest of the exposure, and what finding and identifying
-        the stars takes on this machine.
+        Delay from the middle of an exposure to its fix [s]; by default the rest of the exposure, and the time that this
+        machine takes to find and identify the stars.
 
     Examples
     --------
@@ -51,20 +51,20 @@ class TableCamera:
     delay_s: float | None = None
 
     def look(self, truth: PlanarTrack, at_s: float, seed: int) -> tuple[Frame, FrameResult]:
-        """The frame at an instant of a drive, the same whenever it is asked for, and what is found in it."""
+        """Render the frame at an instant of a drive, always the same, and locate it."""
         pose, motion = pose_and_motion(truth, at_s)
         rng = np.random.default_rng([seed, round(1e3 * at_s)])
         frame = rendered_frame(self.sky, self.setup.camera, pose, rng, motion, self.setup)
         return frame, frame_result(frame.image, self.setup.believed_camera, self.matcher, self.finder)
 
     def run(self, scenario: TableScenario, seed: int) -> TableRun:
-        """A drive of :func:`sims.table_run` with the fixes of its frames; of the camera's errors its outages stay."""
+        """Simulate a drive with the fixes of its frames; of the camera's errors only outages remain."""
         exact = replace(scenario.camera, failed=0.0, false=0.0, overtaken=0.0, repeated=0.0)
         run = table_run(replace(scenario, camera=exact), seed)
         exposure_s = np.sort(run.exposure_s)
         if not exposure_s.size:
             return run
-        self.look(run.truth, float(exposure_s[0]), seed)  # a first time may be that of a compiler
+        self.look(run.truth, float(exposure_s[0]), seed)  # the first frame fills caches
         results = tuple(self.look(run.truth, at_s, seed)[1] for at_s in exposure_s.tolist())
         delay_s = np.array([self._delay_s(result) for result in results])
         true = run.truth.at(exposure_s)

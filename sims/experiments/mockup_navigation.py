@@ -1,4 +1,4 @@
-"""The mock-up's runs of fusion and of zeros: simulated table runs, estimates, and how good they are.
+"""Fusion and accelerometer zeros of the mock-up: simulated runs, estimates and errors.
 
 ``adcs run mockup --part fusion`` and ``--part zeros`` print the summaries.
 """
@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -23,17 +23,14 @@ if TYPE_CHECKING:
 from arrays.typing import FloatArray
 
 SHORT_S = 20.0
-"""Runs of zeros up to it are the one with two firings, longer ones drive around the table."""
+"""Largest duration of a run with two firings [s]; longer ones drive around the table."""
 ZERO_M_S2 = (0.005, -0.004)
 _DRIFT_M_S3 = (0.002 / 180.0, -0.0015 / 180.0)
 
 
 @dataclass(frozen=True)
 class TrackErrors:
-    """Errors of a track against the truth of the same instants.
-
-    ``position_rms_mm``, ``position_p95_mm``, ``position_max_mm``: of the distance.
-    """
+    """Errors of a track against the truth of the same instants; position errors are distances."""
 
     position_rms_mm: float
     position_p95_mm: float
@@ -43,10 +40,7 @@ class TrackErrors:
 
 
 def track_errors(track: PlanarTrack, truth: PlanarTrack, after_s: float = SETTLED_S) -> TrackErrors:
-    """Errors of one run from an instant on.
-
-    ``track``, ``truth``: at the same instants.
-    """
+    """Return the errors of a track from an instant on; truth and track have the same instants."""
     late = truth.time_s >= after_s
     distance = 1e3 * np.linalg.norm(track.position_m - truth.position_m, axis=1)[late]
     velocity = 1e3 * np.linalg.norm(track.velocity_m_s - truth.velocity_m_s, axis=1)[late]
@@ -73,22 +67,19 @@ class FusionRuns:
     results: tuple[FusionResult, ...]
 
     def summary(self) -> dict[str, Any]:
-        """What ``--json`` prints: means over the runs, but the largest error of all runs, and counts of all fixes.
+        """Return the keys of ``--json``: means over the runs, the largest error, and counts of fixes.
 
-        Those that were used and the unused ones of all reasons are the fixes; pending ones would have arrived later.
+        Fixes are the used and the unused ones; pending fixes would have arrived after the end.
         """
         from adcs.mockup.navigation.fixes import FixOutcome, unused_counts
 
-        errors = [result.errors for result in self.results]
+        errors = [asdict(result.errors) for result in self.results]
         outcomes = [outcome for result in self.results for outcome in result.fused.outcomes]
         used = sum(int(result.fused.used.sum()) for result in self.results)
         delays_s = np.concatenate([result.run.fixes.arrival_s - result.run.exposure_s for result in self.results])
         return {
-            "position_rms_mm": float(np.mean([error.position_rms_mm for error in errors])),
-            "position_p95_mm": float(np.mean([error.position_p95_mm for error in errors])),
-            "position_max_mm": max(error.position_max_mm for error in errors),
-            "velocity_rms_mm_s": float(np.mean([error.velocity_rms_mm_s for error in errors])),
-            "heading_rms_deg": float(np.mean([error.heading_rms_deg for error in errors])),
+            **{name: float(np.mean([error[name] for error in errors])) for name in errors[0]},
+            "position_max_mm": max(error["position_max_mm"] for error in errors),
             "delay_ms_median": None if not delays_s.size else 1e3 * float(np.median(delays_s)),
             "fixes": len(outcomes),
             "used_fixes": used,
@@ -107,7 +98,7 @@ def fused_runs(
     progress: Callable[[int], None] | None = None,
     simulate: Callable[[TableScenario, int], TableRun] | None = None,
 ) -> FusionRuns:
-    """Drive around the table, seed by seed, and estimate by one method.
+    """Simulate drives around the table, and estimate each by one method.
 
     Parameters
     ----------
@@ -119,8 +110,8 @@ def fused_runs(
     progress : callable, optional
         Called with 1 after every run.
     simulate : callable, optional
-        What makes a run of a scenario and a seed, such as :meth:`sims.experiments.mockup_camera.TableCamera.run`; by
-        default :func:`sims.table_run`.
+        Function that makes a run of a scenario and a seed, such as
+        :meth:`sims.experiments.mockup_camera.TableCamera.run`; by default :func:`sims.table_run`.
 
     Raises
     ------
@@ -150,14 +141,14 @@ def fused_runs(
 
 @lru_cache(maxsize=8)
 def _table_run(scenario: TableScenario, seed: int) -> TableRun:
-    """One run, which several methods in turn may ask for."""
+    """Simulate one run, which several methods share."""
     from sims.mockup.table_run import table_run
 
     return table_run(scenario, seed)
 
 
 def fusion_of(method: Method, start: PlanarState, begin_s: float, sigma: StartSigma | None = None) -> Fusion:
-    """What estimates by a method; ``sigma`` says to the delayed filter how well another start than usual is known."""
+    """Return the estimator of a method; ``sigma`` is the accuracy of an unusual start."""
     from adcs.mockup.navigation.delayed_ekf import DelayedFilter, StartSigma
     from adcs.mockup.navigation.reintegration import (
         CameraOnly,
@@ -179,10 +170,10 @@ def fusion_of(method: Method, start: PlanarState, begin_s: float, sigma: StartSi
 
 @dataclass(frozen=True, eq=False)
 class ZerosResult:
-    """One run, integrated with and without the zeros that were found.
+    """One run, integrated with and without the estimated zeros.
 
-    ``before``, ``after``: integrated samples without zeros taken off, from a line through two fixes, and with them.
-    ``position_before_mm``, ``position_rms_mm``: distance of both from the truth, rms over the run.
+    ``before``, ``after``: integrated samples, raw from a line through two fixes, and without the zeros.
+    ``position_before_mm``, ``position_rms_mm``: rms distance of both from the truth.
     """
 
     seed: int
@@ -203,7 +194,7 @@ class ZerosRuns:
     results: tuple[ZerosResult, ...]
 
     def summary(self) -> dict[str, Any]:
-        """What ``--json`` prints: means over the runs."""
+        """Return the keys of ``--json``: means over the runs."""
         return {
             "position_rms_mm": float(np.mean([result.position_rms_mm for result in self.results])),
             "zero_error_m_s2": float(np.mean([result.zero_error_m_s2 for result in self.results])),
@@ -221,20 +212,20 @@ def zeros_run(
     start_fixes: int = 4,
     progress: Callable[[int], None] | None = None,
 ) -> ZerosRuns:
-    """Find the zeros of the accelerometer from a run's samples and fixes.
+    """Estimate the zeros of the accelerometer from the samples and fixes of runs.
 
-    They are 0.005 and -0.004 m/s² at the beginning, and drift by 0.002 and -0.0015 m/s² in 180 s.
+    The true zeros are 0.005 and -0.004 m/s² at the beginning, and drift by 0.002 and -0.0015 m/s² in 180 s.
 
     Parameters
     ----------
     unknowns : {'two', 'six', 'drift'}
-        Constant zeros; these and the start; these, the start, and slopes of the zeros in time.
+        Constant zeros; also the start; also the slopes of the zeros.
     seeds : sequence of int
         One for each run.
     duration_s : float
-        Up to 20 s the run with two firings, else a drive around the table.
+        Duration of a run [s]: up to 20 s with two firings, longer around the table.
     start_fixes : int
-        Fixes whose line is the start of "two"; two in the source.
+        Number of fixes that determine the start of "two"; 2 in the source paper.
     progress : callable, optional
         Called with 1 after every run.
 
@@ -288,10 +279,10 @@ def _zeros_result(unknowns: Unknowns, start_fixes: int, seed: int, run: TableRun
     before = strapdown(imu, replace(start, position_m=position, velocity_m_s=velocity))
     after = strapdown(imu.subtract_zeros(zeros, 0.0), start)
     error = float(np.linalg.norm(np.mean(zeros - run.zero_m_s2, axis=0)))
-    return ZerosResult(seed, run, fit, before, after, _apart_mm(before, run), _apart_mm(after, run), error)
+    return ZerosResult(seed, run, fit, before, after, _distance_mm(before, run), _distance_mm(after, run), error)
 
 
-def _apart_mm(track: PlanarTrack, run: TableRun) -> float:
+def _distance_mm(track: PlanarTrack, run: TableRun) -> float:
     return _rms(1e3 * np.linalg.norm(track.position_m - run.truth.position_m, axis=1))
 
 

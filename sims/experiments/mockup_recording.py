@@ -1,4 +1,4 @@
-"""``adcs run mockup --part fusion --samples … --fixes …``: fusion of a recording, of which no truth is known."""
+"""Fusion of a recording without truth: ``adcs run mockup --part fusion --samples … --fixes …``."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from sims.experiments.mockup_settings import SETTLED_S, Method
 SAMPLE_COLUMNS = ("time_s", "acceleration_x_m_s2", "acceleration_y_m_s2", "rate_deg_s")
 FIX_COLUMNS = ("exposure_s", "arrival_s", "x_m", "y_m", "heading_deg")
 _LONGEST_GAP = 100_000
-"""Samples: a quarter of an hour at 100 Hz."""
+"""Longest gap in samples: a quarter of an hour at 100 Hz."""
 _FARTHEST_M = 100.0
-"""The table and its ceiling are some metres wide."""
+"""Largest coordinate: the table and its ceiling are some metres wide."""
 _MOST_DEG = 1e6
-"""A heading may count full turns."""
-# The velocity at the start is not known, and nothing was calibrated for certain.
+"""Largest heading, which may count full turns."""
+# The velocity at the start and the calibration are unknown.
 _START = StartSigma(velocity_m_s=0.2, zero_m_s2=0.01, zero_rad_s=math.radians(0.2))
 
 
@@ -41,10 +41,10 @@ class RecordRun:
     samples: int  # without those that fill the gaps
     early_fixes: int  # before the first one: exposed before the samples or after them
     gaps_s: FloatArray  # (k, 2): of :attr:`adcs.mockup.navigation.strapdown.ImuRecord.gaps_s`, of the whole recording
-    warnings: tuple[str, ...]  # what the estimate should not be read without
+    warnings: tuple[str, ...]  # of gaps in the samples
 
     def summary(self) -> dict[str, Any]:
-        """What ``--json`` prints; the difference is that of fused and measured positions at the exposures."""
+        """Return the keys of ``--json``; the difference compares fused and measured positions."""
         track, used = self.fused.track, self.fused.used
         fixes = self.fixes.rows(np.flatnonzero(used))
         late = fixes.time_s >= self.imu.begin_s + SETTLED_S
@@ -66,7 +66,7 @@ class RecordRun:
 
 
 def fused_record(samples: Path, fixes: Path, method: Method) -> RecordRun:
-    """Read a recording and fuse it.
+    """Read a recording, and fuse its samples and fixes.
 
     The first fix is the start, at rest.
 
@@ -79,7 +79,7 @@ def fused_record(samples: Path, fixes: Path, method: Method) -> RecordRun:
     Raises
     ------
     InputError
-        A file is not what it should be, or no fix is within the samples.
+        A file is invalid, or no fix is within the samples.
 
     Examples
     --------
@@ -107,7 +107,7 @@ def fused_record(samples: Path, fixes: Path, method: Method) -> RecordRun:
 
 
 def _gap_warnings(path: Path, imu: ImuRecord, method: Method) -> tuple[str, ...]:
-    """One sentence if samples are missing."""
+    """Return one sentence if samples are missing."""
     gaps = imu.gaps_s
     if not len(gaps):
         return ()
@@ -115,19 +115,18 @@ def _gap_warnings(path: Path, imu: ImuRecord, method: Method) -> tuple[str, ...]
     where = f"no samples from {begin_s:.10g} to {end_s:.10g} s"
     if len(gaps) > 1:
         where = f"{len(gaps)} gaps between samples, the longest from {begin_s:.10g} to {end_s:.10g} s"
-    held = {
+    consequence = {
         "ekf": "acceleration and rate are unknown there, and the standard deviations grow",
         "camera": "this fusion does not use samples",
-    }.get(method, "velocity and rate are held there, and how wrong that is only ekf tells")
-    return (f"{path}: found {where}, expected one every {imu.usual_step_s:.4g} s; {held}.",)
+    }.get(method, "velocity and rate stay constant there, and only ekf states how wrong that is")
+    return (f"{path}: found {where}, expected one every {imu.usual_step_s:.4g} s; {consequence}.",)
 
 
 def read_samples(path: Path) -> ImuRecord:
-    """Samples from a CSV file with the columns of :data:`SAMPLE_COLUMNS`; others are left out.
+    """Read samples from a CSV file with the columns of :data:`SAMPLE_COLUMNS`; others are ignored.
 
-    ``path``: A time is when the interval of its sample ends; an empty cell is a missing reading. Raises InputError:
-    it is no such file, has fewer than two rows, its times go back, a gap is too long to go through it in steps, or
-    a column has no reading that is believed.
+    A time is the end of the interval of its sample; an empty cell is a missing reading. Raises InputError if the file
+    is invalid, has fewer than two rows, its times decrease, a gap is too long, or a column has no plausible reading.
     """
     table = _table_with(path, SAMPLE_COLUMNS)
     time_s = table.complete(["time_s"], math.inf)[:, 0]
@@ -158,12 +157,12 @@ def read_samples(path: Path) -> ImuRecord:
 
 
 def read_fixes(path: Path) -> FixRecord:
-    """Fixes from a CSV file with the columns of :data:`FIX_COLUMNS`, in the order of their arrival.
+    """Read fixes from a CSV file with the columns of :data:`FIX_COLUMNS`, in order of arrival.
 
     Raises
     ------
     InputError
-        It is no such file, arrivals go back, a fix arrives before its exposure, or is nowhere near the table.
+        The file is invalid, arrivals decrease, a fix arrives before its exposure, or is far from the table.
     """
     table = _table_with(path, FIX_COLUMNS)
     values = table.complete(list(FIX_COLUMNS), math.inf)
@@ -194,7 +193,7 @@ def _table_with(path: Path, columns: tuple[str, ...]) -> Table:
 
 
 def record_lines(run: RecordRun) -> list[str]:
-    """The result as text."""
+    """Return the result as text."""
     result = run.summary()
     x, y = result["position_m"]
     apart = result["difference_rms_mm"]

@@ -1,4 +1,4 @@
-"""What the mock-up's runs may be asked for, and their words; nothing heavy is imported here."""
+"""Methods and settings of the mock-up's runs; this module imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -16,4 +16,4 @@ METHOD_WORDS = {
 Unknowns = Literal["two", "six", "drift"]
 UNKNOWNS: tuple[Unknowns, ...] = get_args(Unknowns)
 SETTLED_S = 10.0
-"""Errors count after it."""
+"""Time after which errors count."""

@@ -1,4 +1,4 @@
-"""Many frames of the mock-up's camera, identified and compared with the truth: ``adcs run mockup --part sky``."""
+"""Frames of the mock-up's camera, compared with the truth: ``adcs run mockup --part sky``."""
 
 from __future__ import annotations
 
@@ -25,25 +25,25 @@ from sims.mockup.frames import Frame, FrameQuality, Motion, rendered_frame
 
 Finder = Callable[[ByteArray], Stars]
 REACH_M = (1.25, 1.0)
-"""Largest |X| and |Y| of the poses: the range of the source paper's figures."""
+"""Largest |X| and |Y| of the poses, as in the figures of the source paper."""
 FALSE_POSITION_M = 0.02
 FALSE_HEADING_RAD = math.radians(2.0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class SkySetup(FrameQuality):
-    """Frames that are taken, what they are like, and what is believed of the camera.
+    """Number and quality of simulated frames, and the calibration of the camera.
 
     Attributes
     ----------
     poses : int
         Number of frames, at random places and headings.
     speed_m_s, turn_rate_rad_s : float
-        During the exposure, in random directions.
+        Motion during the exposure, in random directions.
     footprint_m : float
-        Width of the seen part of the ceiling.
+        Width of the visible part of the ceiling.
     k1, believed_k1 : float
-        Distortion of the camera, and what its user knows of it.
+        True distortion of the camera, and that of its calibration.
     reach_m : tuple, shape (2,)
         Largest |X| and |Y|.
 
@@ -83,9 +83,9 @@ class SkySetup(FrameQuality):
 
 @dataclass(frozen=True, eq=False)
 class FrameResult:
-    """What one frame gave.
+    """Stars and fix of one frame.
 
-    ``identify_s``, ``frame_s``: time of the identification, and of all from the image to the fix.
+    ``identify_s``, ``frame_s``: computing time of the identification, and from the image to the fix.
     """
 
     stars: Stars
@@ -108,18 +108,18 @@ class FrameResult:
 
     @property
     def matched(self) -> int:
-        """Number of the stars that the fix names."""
+        """Number of identified stars."""
         return len(self.fix.stars) if isinstance(self.fix, CameraFix) else 0
 
     @property
     def reason(self) -> str:
-        """Why there is no fix; empty where there is one."""
+        """Reason of a missing fix; empty if there is one."""
         return "" if isinstance(self.fix, CameraFix) else self.fix.reason
 
 
 @dataclass(frozen=True, eq=False)
 class SkyRun:
-    """Frames and what was found in them, row by row."""
+    """Frames and their results, row by row."""
 
     truth: FloatArray  # (n, 3): X, Y [m] and heading [rad]
     results: tuple[FrameResult, ...]
@@ -131,7 +131,7 @@ class SkyRun:
 
     @property
     def found(self) -> BoolArray:
-        """Whether there is a fix, shape (n,)."""
+        """Frames with a fix, shape (n,)."""
         return np.isfinite(self.estimates[:, 0])
 
     @property
@@ -141,7 +141,7 @@ class SkyRun:
 
     @property
     def heading_errors_rad(self) -> FloatArray:
-        """Between -π and π, shape (n,); NaN without a fix."""
+        """Errors of the heading from -π to π, shape (n,); NaN without a fix."""
         error = self.estimates[:, 2] - self.truth[:, 2]
         return np.angle(np.exp(1j * error))
 
@@ -153,11 +153,11 @@ class SkyRun:
 
     @property
     def false_fixes(self) -> BoolArray:
-        """Fixes farther off than that, shape (n,)."""
+        """Fixes with larger errors, shape (n,)."""
         return self.found & ~self.good
 
     def summary(self) -> dict[str, Any]:
-        """Numbers of the whole run; root mean squares are those of the good fixes, None where there are none.
+        """Return the statistics of the run; rms errors are those of good fixes, None without any.
 
         Returns
         -------
@@ -184,9 +184,9 @@ def _rms(values: FloatArray) -> float | None:
 
 
 def frame_result(image: ByteArray, camera: Camera, matcher: Matcher, finder: Finder = find_stars) -> FrameResult:
-    """Fix of one frame, timed; a frame in which nothing can shine, such as a black one, has no stars.
+    """Return the fix of one frame, with computing times; a black frame has no stars.
 
-    Shape ``image`` (height, width). ``camera``: as it is believed to be. ``finder``: of
+    ``image``: shape (height, width). ``camera``: with its calibration. ``finder``: a function of
     :mod:`adcs.mockup.vision.centroids`.
     """
     begin = time.perf_counter()
@@ -215,15 +215,15 @@ def sky_run(
     ----------
     sky : LedSky
     matcher : Matcher
-        For the catalogue of that sky and a camera of that footprint, such as :func:`adcs.mockup.odds_matcher`.
+        Matcher for the catalogue of that sky and a camera of that footprint, such as :func:`adcs.mockup.odds_matcher`.
     setup : SkySetup
-        Frames, and what is believed of the camera.
+        Frames, and the calibration of the camera.
     seeds : sequence of int
-        Of all frames, one after the other; each frame has random numbers of its own, whatever the others do.
+        Seeds of the runs. The random numbers of a frame do not depend on the other frames.
     progress : callable, optional
         Called with the number of frames finished since the last call.
     finder : callable
-        Of :mod:`adcs.mockup.vision.centroids`.
+        Function of :mod:`adcs.mockup.vision.centroids`.
 
     Examples
     --------
@@ -247,10 +247,7 @@ def sky_run(
 
 
 def random_frame(sky: LedSky, setup: SkySetup, seed: int, row: int) -> tuple[Pose, Frame]:
-    """Frame of a row of :func:`sky_run`, the same whatever the other rows are.
-
-    Returns: in the middle of the exposure.
-    """
+    """Return pose and frame of a row of :func:`sky_run`, in the middle of the exposure."""
     rng = np.random.default_rng([seed, row])
     x, y, heading = rng.uniform(-1.0, 1.0, 3) * [*setup.reach_m, math.pi]
     course, turn = rng.uniform(-math.pi, math.pi), rng.choice([-1.0, 1.0])
@@ -262,15 +259,15 @@ def random_frame(sky: LedSky, setup: SkySetup, seed: int, row: int) -> tuple[Pos
 def identified_files(
     paths: Iterable[Path], camera: Camera, matcher: Matcher, finder: Finder = find_stars
 ) -> dict[Path, FrameResult]:
-    """Fixes of frames in PNG files, by their paths.
+    """Locate frames in PNG files; return the results by their paths.
 
     Parameters
     ----------
     paths : iterable of Path
     camera : Camera
-        As it is believed to be; the frames must have its size.
+        Camera with its calibration; the frames must have its size.
     matcher, finder
-        As of :func:`sky_run`.
+        Functions as in :func:`sky_run`.
 
     Examples
     --------

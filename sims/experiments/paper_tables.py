@@ -1,7 +1,7 @@
 """Tables 3 to 5 of Ivanov, Ivlev, Karpenko, Ovchinnikov, Keldysh Institute preprint 64, 2014.
 
-In the scan that is left of the paper most exponents are lost. Mantissas are as printed; a (?) says that the exponent,
-or the digit, is what the context needs. "1" of a quantity is one standard deviation of the worst axis.
+In the only scan of the paper most exponents are illegible. Mantissas are as printed; (?) marks an exponent or a digit
+that the context implies. Values are standard deviations of the worst axis.
 """
 
 from __future__ import annotations
@@ -24,43 +24,43 @@ QUANTITIES = {state: state.replace("-", " ") for state in STATE_UNITS}  # as the
 
 
 @dataclass(frozen=True)
-class Printed:
-    """A number of the paper.
+class PrintedValue:
+    """Number of the paper.
 
-    ``low``, ``high``: its value, or the range that is left of it.
+    ``low``, ``high``: its value, or its range where it is illegible.
     """
 
-    text: str  # as it can be read
+    text: str  # as far as it is legible
     low: float
     high: float
 
     def ratio(self, ours: float) -> float:
-        """Ours over the paper's, or over the nearer end of its range; 1 within it."""
+        """Return our value over that of the paper, or over the nearer end of its range; 1 within it."""
         return ours / min(max(ours, self.low), self.high)
 
 
-def printed(text: str) -> Printed:
-    """Number of a text such as ``"2e-2 (?)"`` or ``"3e-4…5e-3 (?)"``."""
+def parse_value(text: str) -> PrintedValue:
+    """Return the number of a text such as ``"2e-2 (?)"`` or ``"3e-4…5e-3 (?)"``."""
     ends = [float(part) for part in text.replace("(?)", "").split("…")]
-    return Printed(text, ends[0], ends[-1])
+    return PrintedValue(text, ends[0], ends[-1])
 
 
 @dataclass(frozen=True)
 class PaperRow:
-    """A row of a table."""
+    """Row of a table of the paper."""
 
     table: int
     label: str  # sensors, and what is estimated where the table says so
     sensors: str
     states: tuple[str, ...]
-    numbers: dict[str, Printed]  # what is printed
+    numbers: dict[str, PrintedValue]  # what is printed
     filter: Filter
-    duration_s: float  # after which ours is taken
-    note: str  # why a number of ours is far from theirs, where one is
+    duration_s: float  # after which our value is taken
+    note: str  # reason of a large difference, if there is one
 
 
 def _paper_rows() -> Iterator[PaperRow]:
-    """Rows of the file beside this module."""
+    """Yield the rows of the file beside this module."""
     with Path(__file__).with_suffix(".csv").open(encoding="utf-8") as file:
         for row in csv.DictReader(file):
             yield PaperRow(
@@ -68,7 +68,7 @@ def _paper_rows() -> Iterator[PaperRow]:
                 label=row["set"],
                 sensors=row["sensors"],
                 states=tuple(row["states"].split("+")) if row["states"] else (),
-                numbers={quantity: printed(row[quantity]) for quantity in QUANTITIES.values() if row.get(quantity)},
+                numbers={quantity: parse_value(row[quantity]) for quantity in QUANTITIES.values() if row.get(quantity)},
                 filter=cast(Filter, row["filter"]),
                 duration_s=float(row["duration_s"]),
                 note=row["note"],
@@ -76,34 +76,34 @@ def _paper_rows() -> Iterator[PaperRow]:
 
 
 PAPER_ROWS = tuple(_paper_rows())
-"""All rows. What Table 5 prints for Δb, 6e-1°, has a lost exponent and another unit; it is left out.
+"""All rows. The value of Table 5 for Δb, 6e-1°, is left out: its exponent is illegible and its unit differs.
 
-Its rows ST+G are three, [λ, ω], [λ, ω, Δω] and [λ, Δω], of which one line can be read: all have its numbers.
+The three rows ST+G, [λ, ω], [λ, ω, Δω] and [λ, Δω], have the numbers of the one legible line.
 """
 FAR = 3.0
-"""A number of ours is far from theirs beyond this ratio, and says why."""
+"""Ratio beyond which a value of ours needs a reason."""
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """A number of the paper and ours; that of the attitude is half of the angle, as the paper has it."""
+    """Value of the paper and ours; the attitude is half of the angle, as in the paper."""
 
     table: int
     set: str
     filter: str
     quantity: str
     unit: str
-    paper_text: str  # as it can be read, (?) where it is unsure
+    paper_text: str  # as far as it is legible, (?) where it is uncertain
     paper_low: float
     paper_high: float
     ours: float  # standard deviation by the filter's covariance at the end, worst axis, mean over the runs
     ratio: float  # ours over the paper's
     rms: float  # of our errors in the last minute, worst axis
-    note: str  # why, where it is more than :data:`FAR` times off
+    note: str  # reason, if the ratio is beyond :data:`FAR`
 
 
 def compared_with_paper(row: PaperRow, seeds: Sequence[int], duration_s: float | None = None) -> list[Comparison]:
-    """Numbers of a row of the paper and ours; the duration is the row's unless given.
+    """Compare a row of the paper with our values; by default with the duration of the row.
 
     Parameters
     ----------

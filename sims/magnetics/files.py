@@ -41,12 +41,12 @@ class SimulationFiles(NamedTuple):
 
     @property
     def all(self) -> tuple[Path, ...]:
-        """Every file."""
+        """All files."""
         return (self.readings, self.array, *self.truths, *self.paths, *self.targets)
 
 
 def files_beside(readings: str | PathLike[str], n_sources: int, *, has_targets: bool = False) -> SimulationFiles:
-    """Paths of the files of a simulation, from that of the readings.
+    """Return the paths of the files of a simulation, from that of the readings.
 
     Returns: READINGS-array.toml, READINGS-truth.csv, READINGS-truth-2.csv and so on beside READINGS.csv, and the same
     of READINGS-path.csv; READINGS-targets.csv if there are targets in the ground.
@@ -61,14 +61,14 @@ def files_beside(readings: str | PathLike[str], n_sources: int, *, has_targets: 
 
 
 def write_simulation(simulation: Simulation, readings: str | PathLike[str]) -> SimulationFiles:
-    """Write the files of a simulation; none of them appears before all of them are complete.
+    """Write the files of a simulation; they appear when all of them are complete.
 
     Parameters
     ----------
     simulation : Simulation
-        Of :func:`sims.simulate`.
+        Simulation from :func:`sims.simulate`.
     readings : path-like
-        Of the readings file; the others are written beside it (:func:`files_beside`). Existing files are replaced.
+        Path of the readings file; the others are written beside it (:func:`files_beside`). Existing files are replaced.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What lies in the ground of a survey: buried targets, and rock that is magnetised on all scales."""
+"""Ground of a survey: buried targets, and magnetised rock on all scales."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ _MOST_DRAWS = 10_000
 
 @dataclass(frozen=True)
 class Targets:
-    """Targets at random places: as many as given, evenly over a rectangle, log-uniform in depth and in moment.
+    """Targets at random positions, uniform over a rectangle, log-uniform in depth and moment.
 
     Attributes
     ----------
     number : int
     x_m, y_m : pair of floats
-        Of the rectangle, world frame.
+        Bounds of the rectangle, world frame.
     depth_m, moment_Am2 : pair of floats
         Least and largest depth below the ground at z = 0, and modulus of the moment.
     gap_m : float
-        No two are nearer to each other, seen from above.
+        Least horizontal distance of two targets.
     """
 
     number: int
@@ -36,8 +36,8 @@ class Targets:
     moment_Am2: tuple[float, float] = (0.1, 30.0)
     gap_m: float = 5.0
 
-    def drawn(self, seed: int) -> tuple[FloatArray, FloatArray]:
-        """Positions and moments (k, 3) of one realisation.
+    def draw(self, seed: int) -> tuple[FloatArray, FloatArray]:
+        """Draw positions and moments (k, 3) of one realisation.
 
         Raises ValueError where the rectangle has no room for so many.
         """
@@ -62,7 +62,7 @@ class Targets:
 
 @dataclass(frozen=True)
 class Geology:
-    """A random field of no direction, whose sources lie below the ground at z = 0: a sum of plane waves.
+    """Random isotropic field of sources below the ground at z = 0, a sum of plane waves.
 
     Attributes
     ----------
@@ -77,7 +77,7 @@ class Geology:
     longest_m: float = 80.0
 
     def at(self, points_m: FloatArray, seed: int) -> FloatArray:
-        """Field (..., 3) at points of the world."""
+        """Return the field (..., 3) at points of the world."""
         rng = stream(seed, "geology")
         k = 2.0 * math.pi / _log_uniform(rng, (self.shortest_m, self.longest_m), _WAVES)
         way, phase = rng.uniform(0.0, 2.0 * math.pi, (2, _WAVES))

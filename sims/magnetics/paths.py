@@ -1,4 +1,4 @@
-r"""Paths of arrays and sources, and how they are turned along them: positions and attitudes as functions of time.
+r"""Paths of arrays and sources: positions and attitudes as functions of time.
 
 World frame: x east, y north, z up [m]. A course ψ is counted clockwise from north, so that its direction is
 (sin ψ, cos ψ, 0). A carrier's own axes are forward, left and up: with the course 90° they are those of the world.
@@ -27,7 +27,7 @@ _SAME_PLACE_M = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Where something is at n instants, and where it goes.
+    """Positions and velocities at n instants.
 
     ``course_rad`` (n,): direction of the horizontal velocity, clockwise from north; the last one where there is none
     [rad].
@@ -39,16 +39,16 @@ class Motion:
 
 
 class Path(Protocol):
-    """Anything that moves."""
+    """Path of a moving array or source."""
 
     def at(self, time_s: ArrayLike) -> Motion:
-        """Motion at some instants [s], shape (n,)."""
+        """Return the motion at instants (n,) [s]."""
         ...
 
 
 @dataclass(frozen=True)
 class Steered:
-    r"""A path of constant speed whose course turns steadily, weaves, or both; at rest with the speed zero.
+    r"""Path of constant speed whose course turns steadily, weaves, or both.
 
     .. math:: ψ(t) = ψ_0 + ω t + a \sin(2π t/T)
 
@@ -82,7 +82,7 @@ class Steered:
     climb_m_s: float = 0.0
 
     def at(self, time_s: ArrayLike) -> Motion:
-        """Motion at some instants [s], shape (n,)."""
+        """Return the motion at instants (n,) [s]."""
         t = np.asarray(time_s, dtype=np.float64)
         weaving = 2.0 * math.pi / self.weave_period_s
         course = self.course_rad + self.turn_rad_s * t + self.weave_rad * np.sin(weaving * t)
@@ -90,7 +90,7 @@ class Steered:
         most = math.ceil(abs(self.weave_rad)) + _BESSEL_TAIL if self.weave_rad else 0
         order = np.arange(-most, most + 1)
         rate: FloatArray = self.turn_rad_s + weaving * order.astype(np.float64)
-        north_and_east = np.exp(1j * self.course_rad) * (_integrated(rate, t) @ jv(order, self.weave_rad))
+        north_and_east = np.exp(1j * self.course_rad) * (_integral(rate, t) @ jv(order, self.weave_rad))
         velocity = np.stack([np.sin(course), np.cos(course), np.zeros_like(t)], axis=-1) * self.speed_m_s
         velocity[..., 2] = self.climb_m_s
         way = np.stack([north_and_east.imag, north_and_east.real], axis=-1) * self.speed_m_s
@@ -101,7 +101,7 @@ class Steered:
 def circle(
     centre_m: Vector, radius_m: float, speed_m_s: float, start_rad: float = 0.0, *, clockwise: bool = True
 ) -> Steered:
-    """Horizontal circle.
+    """Return a horizontal circle.
 
     ``centre_m``: world frame [m]. ``start_rad``: bearing of the position at the time 0, seen from the centre, clockwise
     from north. ``clockwise``: seen from above.
@@ -114,7 +114,7 @@ def circle(
 
 @dataclass(frozen=True)
 class Waypoints:
-    """Straight from point to point at constant speed, and at rest in the last one."""
+    """Straight lines between points at constant speed, at rest in the last point."""
 
     points_m: tuple[Vector, ...]  # (k, 3): two at least, each at some distance from the one before, world frame [m]
     speed_m_s: float  # along the path, also where it climbs
@@ -132,7 +132,7 @@ class Waypoints:
             raise ValueError(f"Input speed_m_s must be positive; instead received {self.speed_m_s:g}.")
 
     def at(self, time_s: ArrayLike) -> Motion:
-        """Motion at some instants [s], shape (n,). On a corner the velocity is that of the leg to come."""
+        """Return the motion at instants (n,) [s]; at a corner the velocity is that of the next leg."""
         points = np.array(self.points_m, dtype=np.float64)
         legs = np.diff(points, axis=0)
         lengths = np.linalg.norm(legs, axis=1)
@@ -152,7 +152,7 @@ class Waypoints:
 
 @dataclass(frozen=True)
 class Lawnmower:
-    """Parallel lines at constant height and speed, joined by half circles, and at rest at the end of the last line.
+    """Parallel lines at constant height and speed, joined by half circles, at rest at the end.
 
     ``length_m``, ``spacing_m``: length of every line, distance between neighbours.
     """
@@ -170,7 +170,7 @@ class Lawnmower:
                 raise ValueError(f"Input {name} must be positive; instead received {getattr(self, name):g}.")
 
     def at(self, time_s: ArrayLike) -> Motion:
-        """Motion at some instants [s], shape (n,)."""
+        """Return the motion at instants (n,) [s]."""
         radius = self.spacing_m / 2.0
         turn = math.pi * radius
         end = self.lines * self.length_m + (self.lines - 1) * turn
@@ -194,7 +194,7 @@ class Lawnmower:
 
 @dataclass(frozen=True)
 class Attitude:
-    r"""How something is turned while it moves.
+    r"""Attitude along a path.
 
     .. math:: R_{world←body} = R_{course}\, R_{wobble}\, R_{mount}\, e^{[ω t]_×}
 
@@ -222,12 +222,12 @@ class Attitude:
 
     @property
     def is_world(self) -> bool:
-        """Whether the body's axes are always those of the world, whatever the path."""
+        """Return whether the body's axes always equal those of the world."""
         turned = self.follows_course or any(self.mount_xyzw[:3]) or any(self.rate_rad_s) or any(self.wobble_rad)
         return not turned
 
     def at(self, time_s: ArrayLike, course_rad: ArrayLike, wobble_phase_rad: ArrayLike) -> Rotation:
-        """Rotations from the body's axes to the world's.
+        """Return the rotations from the body's axes to the world.
 
         Parameters
         ----------
@@ -250,7 +250,7 @@ class Attitude:
         return carrier * Rotation.from_quat(self.mount_xyzw) * turned
 
 
-def _integrated(rate: FloatArray, t: FloatArray) -> NDArray[np.complex128]:
-    """Integral of exp(i·rate·τ) over τ from 0 to t: (n, K). As t sinc(rate t/2) it has no singularity at rate 0."""
+def _integral(rate: FloatArray, t: FloatArray) -> NDArray[np.complex128]:
+    """Return the integral (n, K) of exp(i·rate·τ) from 0 to t, without a singularity at rate 0."""
     half = 0.5 * rate * t[..., None]
     return t[..., None] * np.sinc(half / math.pi) * np.exp(1j * half)

@@ -1,4 +1,4 @@
-"""What is simulated: an array and its sensors, sources, fields and noise. All quantities are SI."""
+"""Magnetic scenario: array, sensors, sources, fields and noise, in SI units."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ _ZERO: Vector = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class Carrier:
-    """How an array or a source moves: its path in the world frame, and its attitude along it."""
+    """Path of an array or a source in the world frame, and its attitude along it."""
 
     path: Path = field(default_factory=Steered)
     attitude: Attitude = field(default_factory=Attitude)
 
     @property
     def is_world(self) -> bool:
-        """Whether its frame is the world's: at rest in the origin, and not turned."""
+        """Return whether the frame equals the world: at rest in the origin, not turned."""
         path = self.path
         if not isinstance(path, Steered) or path.speed_m_s or path.climb_m_s or any(path.start_m):
             return False
@@ -40,7 +40,7 @@ class Carrier:
 
 @dataclass(frozen=True)
 class Source:
-    """A dipole fixed to a body, or a bar.
+    """Dipole fixed to a body, or a bar.
 
     Its moment in body axes is :math:`m = m_{permanent} + α B_a/μ_0` with the ambient field B_a in body axes. Only the
     main ambient field magnetises it, not its pulsations.
@@ -48,20 +48,20 @@ class Source:
     Attributes
     ----------
     carrier : Carrier
-        Of the body.
+        Motion of the body.
     moment_Am2 : tuple, shape (3,)
         Permanent part, body axes.
     polarisability_m3 : tuple of tuples, shape (3, 3)
         α: volume times susceptibility, demagnetisation included; 4π a³ for a sphere of iron of radius a.
     radius_m : float
-        Size of the body: no sensor may come nearer.
+        Radius of the body; sensors must stay outside.
     body_length_m : float
-        Length of a thin bar along the body's axis x that has this moment, evenly spread. 0: a point. No sensor may come
-        nearer to its centre than that length.
+        Length of a thin bar along the body's axis x with this moment, uniformly distributed. 0 for a point source. No
+        sensor may come nearer to its centre than that length.
     path_error : PathError
-        Of what is known of its path and its attitude.
+        Errors of its stated path and attitude.
     from_s, until_s : float
-        When it is there; its truth has no other rows.
+        Times between which the source exists; its truth has only these rows.
     """
 
     carrier: Carrier = field(default_factory=Carrier)
@@ -79,7 +79,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Pulsation:
-    """A sinusoid of random phase in the ambient field, the same at all sensors."""
+    """Sinusoid of random phase in the ambient field, the same at all sensors."""
 
     amplitude_T: Vector  # (3,): world frame
     period_s: float
@@ -87,7 +87,7 @@ class Pulsation:
 
 @dataclass(frozen=True)
 class Platform:
-    r"""Noise of what carries the array.
+    r"""Noise of the platform that carries the array.
 
     Attributes
     ----------
@@ -112,7 +112,7 @@ class Platform:
 
 @dataclass(frozen=True)
 class Missing:
-    """Readings that are not there.
+    """Missing readings.
 
     Attributes
     ----------
@@ -133,36 +133,35 @@ class MagneticScenario:
     Attributes
     ----------
     array : SensorArray
-        Where the sensors stand, and the calibration that their user knows. Their noise, limits and uncertainties are
-        those of the models.
+        Positions of the sensors, and their known calibration. Noise, limits and uncertainties are those of the models.
     models : tuple of SensorModel
-        One for each sensor.
+        Model of each sensor.
     duration_s, rate_Hz : float
         Rows are at 0, 1/rate, 2/rate, … up to and including the duration.
     carrier : Carrier
-        Of the array.
+        Motion of the array.
     sources : tuple of Source
-        None is allowed: a recording of noise.
+        Sources; an empty tuple for a recording of noise.
     ambient_T : tuple, shape (3,), optional
-        Geomagnetic field, world frame. None: there is none, and the readings have no columns for it.
+        Geomagnetic field, world frame. None: no field, and no columns for it in the readings.
     pulsations : tuple of Pulsation
         Sinusoids in the ambient field.
     platform : Platform
-        Noise of what carries the array.
+        Noise of the platform that carries the array.
     missing : Missing
-        Readings that are not there.
+        Missing readings.
     pose : PoseUncertainty, optional
-        Errors of the pose that the readings state. The nominal array states them too, unless `array` states others.
+        Errors of the pose in the readings. The nominal array states them too, unless `array` states others.
     targets : Targets, optional
-        At random places in the ground, beside the sources.
+        Targets at random positions in the ground, in addition to the sources.
     geology : Geology, optional
-        The ground itself.
+        Field of the ground.
     name : str
 
     Raises
     ------
     ValueError
-        The models are not those of the array's sensors, or the times are not positive and finite or give more than five
+        The models do not fit the sensors of the array, or the times are not positive and finite or give more than five
         million rows.
 
     Examples
@@ -209,7 +208,7 @@ class MagneticScenario:
 
     @property
     def time_s(self) -> FloatArray:
-        """Instants of all samples, also of those in gaps, shape (n,) [s]."""
+        """Instants of all samples, including gaps, shape (n,) [s]."""
         # A rounded product must not lose the last row: 0.1 s at 30 Hz are 3 periods.
         return np.arange(math.floor(self.duration_s * self.rate_Hz * (1.0 + 1e-12)) + 1) / self.rate_Hz
 

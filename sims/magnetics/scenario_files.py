@@ -43,7 +43,7 @@ built_in_scenarios = _FILES.names
 
 
 def read_scenario(name_or_path: str) -> MagneticScenario:
-    """Scenario of a simulation.
+    """Read a scenario of a simulation.
 
     ``name_or_path``: a built-in scenario's name, or a TOML file; ``diver.toml`` beside this module documents the
     keys. Raises InputError: the file cannot be read or does not describe a scenario; the text says where and why.
@@ -77,7 +77,7 @@ def _array_and_models(path: str, file: FileTable) -> tuple[SensorArray, tuple[Se
     if isinstance(file.array, str):
         array = read_array(FilePath(path).parent / file.array)
     else:
-        table = _completed(f"{path}, table array", file.array, common, single)
+        table = _complete(f"{path}, table array", file.array, common, single)
         array = array_of_table(f"{path}, table array", table)
     for key in ("ambient_T", "ambient_gradient_T_m"):
         if getattr(array, key) is not None:
@@ -102,10 +102,10 @@ def _merged(common: SensorsTable, own: SensorsTable) -> SensorsTable:
     return msgspec.structs.replace(common, **values)
 
 
-def _completed(
+def _complete(
     place: str, table: dict[str, Any], common: SensorsTable, single: dict[str, SensorsTable]
 ) -> dict[str, Any]:
-    """An array's table with what the kinds of its sensors say; their models replace the noise later."""
+    """Add the properties of sensor kinds to an array's table; their models replace the noise later."""
     one_by_one = isinstance(table.get("sensor"), list)
     tables = table["sensor"] if one_by_one else [table]
     filled = []
@@ -178,7 +178,7 @@ def _source(place: str, table: SourceTable) -> Source:
 
 
 def _matrix(place: str, value: float | list[float | list[float]]) -> Matrix:
-    """A symmetric matrix from a number, three numbers or three rows."""
+    """Return a symmetric matrix from a number, three numbers or three rows."""
     try:
         numbers = np.array(value, dtype=np.float64)
     except ValueError:

@@ -34,7 +34,7 @@ _BELOW_1000 = Rule(lambda value: value < 1000.0, "a number below 1000")
 
 
 class SensorsTable(Table, kw_only=True):
-    """What is known of all sensors, or of one."""
+    """Properties of all sensors, or of one."""
 
     kind: Annotated[str, one_of(SENSOR_KINDS)] | None = None
     noise_nT: Positive | None = None
@@ -50,13 +50,13 @@ class SensorsTable(Table, kw_only=True):
     of: dict[str, SensorsTable] = msgspec.field(default_factory=dict)
 
     def check(self) -> None:
-        """Refuse two noises."""
+        """Refuse two kinds of noise."""
         if self.noise_nT is not None and self.noise_nT_rtHz is not None:
             raise RefusalError("noise_nT and noise_nT_rtHz", "found both, expected one of them")
 
 
 class CarrierTable(Table, kw_only=True):
-    """How the array moves."""
+    """Motion of the array."""
 
     path: dict[str, Any] = msgspec.field(default_factory=dict)
     attitude: Annotated[str, one_of(("fixed", "course"), "fixed or course")] = "fixed"
@@ -66,14 +66,14 @@ class CarrierTable(Table, kw_only=True):
     wobble_period_s: Annotated[float | Vector, POSITIVE] = 4.0
 
     def check(self) -> None:
-        """Refuse what is no rotation."""
+        """Refuse a quaternion that is no rotation."""
         norm = math.hypot(*self.rotation_xyzw)
         if abs(norm - 1.0) > _UNIT_QUATERNION_ATOL:
             raise RefusalError("rotation_xyzw", f"found a quaternion of norm {norm:.6g}, expected norm 1")
 
 
 class SourceTable(CarrierTable, kw_only=True):
-    """A source, and how it moves."""
+    """Source and its motion."""
 
     moment_Am2: Vector = _ORIGIN
     polarisability_m3: float | list[float | list[float]] = 0.0
@@ -87,14 +87,14 @@ class SourceTable(CarrierTable, kw_only=True):
     until_s: Annotated[float, MAY_BE_INFINITE] = math.inf
 
     def check(self) -> None:
-        """Refuse a source that goes before it comes."""
+        """Refuse a source that leaves before it arrives."""
         super().check()
         if not self.from_s < self.until_s:
             raise RefusalError("until_s", f"found {self.until_s:g}, expected a time after from_s = {self.from_s:g}")
 
 
 class AmbientTable(Table, kw_only=True):
-    """The geomagnetic field: given, or that of a place and date."""
+    """Geomagnetic field: a vector, or that of a place and date."""
 
     field_nT: Vector | None = None
     place: Vector | None = None
@@ -102,7 +102,7 @@ class AmbientTable(Table, kw_only=True):
     model: str = "IGRF-14"
 
     def check(self) -> None:
-        """Refuse a place without its date, and anything but one field."""
+        """Refuse a place without a date, and more or less than one field."""
         if (self.field_nT is None) == (self.place is None):
             found = "neither field_nT nor place" if self.place is None else "both field_nT and place"
             raise RefusalError("", f"found {found}, expected one of them")
@@ -118,13 +118,13 @@ class PulsationTable(Table, kw_only=True):
     direction: Vector
 
     def check(self) -> None:
-        """Refuse a direction that is none."""
+        """Refuse a zero direction."""
         if not any(self.direction):
             raise RefusalError("direction", "found zero, expected a direction")
 
 
 class PlatformTable(Table, kw_only=True):
-    """Noise of what carries the array."""
+    """Noise of the platform that carries the array."""
 
     position_m: Vector = _ORIGIN
     moment_Am2: Vector = _ORIGIN
@@ -135,7 +135,7 @@ class PlatformTable(Table, kw_only=True):
 
 
 class MissingTable(Table, kw_only=True):
-    """Readings that are not there."""
+    """Missing readings."""
 
     dropout: Annotated[NotNegative, Rule(lambda value: value < 1.0, "a probability below 1")] = 0.0
     gaps_s: list[tuple[float, float]] = msgspec.field(default_factory=list)
@@ -148,7 +148,7 @@ class MissingTable(Table, kw_only=True):
 
 
 class PoseErrorTable(PoseTable, kw_only=True):
-    """Errors of the pose that the readings state, as in an array file, but none that is not named."""
+    """Errors of the stated pose, as in an array file; errors that are not named are zero."""
 
     position_constant_m: NotNegative = 0.0
     attitude_constant_deg: Annotated[NotNegative, _BELOW_30] = 0.0
@@ -183,7 +183,7 @@ class GeologyTable(Table, kw_only=True):
     longest_m: Positive = 80.0
 
     def check(self) -> None:
-        """Refuse wavelengths that are none."""
+        """Refuse invalid wavelengths."""
         if self.shortest_m > self.longest_m:
             found = f"found {self.shortest_m:g} above longest_m = {self.longest_m:g}"
             raise RefusalError("shortest_m", f"{found}, expected the shorter one")
@@ -209,18 +209,18 @@ class FileTable(File, kw_only=True):
 
 
 class PathTable(Table, kw_only=True):
-    """A path of some kind; every one makes its path with ``path()``."""
+    """Base of all path tables; ``path()`` returns the path."""
 
     kind: str
 
 
 class FixedPath(PathTable, kw_only=True):
-    """At rest."""
+    """Position at rest."""
 
     position_m: Vector = _ORIGIN
 
     def path(self) -> Path:
-        """The path that the table describes."""
+        """Return the path of the table."""
         return Steered(self.position_m)
 
 
@@ -233,17 +233,17 @@ class LinePath(PathTable, kw_only=True):
     climb_m_s: float = 0.0
 
     def path(self) -> Steered:
-        """The path that the table describes."""
+        """Return the path of the table."""
         return Steered(self.start_m, math.radians(self.course_deg), self.speed_m_s, climb_m_s=self.climb_m_s)
 
 
 class CoursePath(LinePath, kw_only=True):
-    """Constant speed, and a course that turns, if it does."""
+    """Constant speed, and a course that may turn."""
 
     turn_deg_s: float = 0.0
 
     def path(self) -> Steered:
-        """The path that the table describes."""
+        """Return the path of the table."""
         return replace(super().path(), turn_rad_s=math.radians(self.turn_deg_s))
 
 
@@ -255,7 +255,7 @@ class WeavingPath(LinePath, kw_only=True):
     turn_deg_s: float = 0.0
 
     def path(self) -> Steered:
-        """The path that the table describes."""
+        """Return the path of the table."""
         return replace(
             super().path(),
             turn_rad_s=math.radians(self.turn_deg_s),
@@ -274,20 +274,20 @@ class CirclePath(PathTable, kw_only=True):
     clockwise: bool = True
 
     def path(self) -> Path:
-        """The path that the table describes."""
+        """Return the path of the table."""
         return circle(
             self.centre_m, self.radius_m, self.speed_m_s, math.radians(self.start_deg), clockwise=self.clockwise
         )
 
 
 class WaypointsPath(PathTable, kw_only=True):
-    """Straight from point to point."""
+    """Straight lines between points."""
 
     points_m: list[Vector]
     speed_m_s: Positive
 
     def path(self) -> Path:
-        """The path that the table describes."""
+        """Return the path of the table."""
         return Waypoints(tuple(self.points_m), self.speed_m_s)
 
 
@@ -302,7 +302,7 @@ class LawnmowerPath(PathTable, kw_only=True):
     speed_m_s: Positive
 
     def path(self) -> Path:
-        """The path that the table describes."""
+        """Return the path of the table."""
         return Lawnmower(
             self.start_m, math.radians(self.course_deg), self.length_m, self.spacing_m, self.lines, self.speed_m_s
         )

@@ -1,4 +1,4 @@
-"""What real sensors do to a field, with typical figures of their kinds.
+"""Errors of real sensors, with typical figures of their kinds.
 
 The figures are of the order that makers publish for calibrated instruments of a kind, not those of one instrument: a
 fluxgate such as Bartington's Mag-13, an optically pumped total-field sensor such as QuSpin's QTFM, an Overhauser sensor
@@ -35,11 +35,11 @@ class SensorModel:
     corner_Hz : float
         Frequency below which the noise has the density 1/f; 0 = it is white.
     bandwidth_Hz : float
-        Of a first-order low-pass for signal and noise; infinite = none.
+        Bandwidth of a first-order low-pass for signal and noise; infinite = none.
     range_T : float
         Modulus at which a channel saturates; infinite = never.
     resolution_T : float
-        Readings are multiples of it; 0 = they are not rounded.
+        Step of the readings; 0 = no rounding.
     misalignment_rad : float
         Standard deviation, per axis, of a constant rotation of a vector sensor's axes.
     gain_error : float
@@ -67,7 +67,7 @@ class SensorModel:
         return self.noise_T_rtHz * math.sqrt(self.corner_Hz * math.log(10.0))
 
     def sigma_T(self, rate_Hz: float) -> float:
-        """Standard deviation of what is as good as independent from sample to sample [T].
+        """Standard deviation of errors that are independent between samples [T].
 
         White noise, rounding, and the 1/f noise above the decades that an array states as lasting; that of the rest of
         the 1/f noise depends on the record.
@@ -77,7 +77,7 @@ class SensorModel:
         return float(f"{math.hypot(white, self.resolution_T / math.sqrt(12.0), flicker):.{_DIGITS}g}")
 
     def with_sigma(self, sigma_T: float, rate_Hz: float) -> SensorModel:
-        """The same with the density of white noise of this standard deviation in one sample, all else aside."""
+        """Return the model with white noise of this standard deviation in one sample."""
         return replace(self, noise_T_rtHz=sigma_T / white_sigma(rate_Hz, 1.0, self.bandwidth_Hz))
 
 
@@ -87,7 +87,7 @@ SENSOR_KINDS = {kind: SensorModel(**attributes) for kind, attributes in _FIGURES
 
 
 def model_of(sensor: Sensor, rate_Hz: float) -> SensorModel:
-    """The model that an array file's sensor describes, with nothing that the array does not state.
+    """Return the model of a sensor from an array file, without errors that it does not state.
 
     ``rate_Hz``: rate at which its noise is that of one sample.
     """
@@ -104,7 +104,7 @@ def model_of(sensor: Sensor, rate_Hz: float) -> SensorModel:
 
 
 def nominal_array(array: SensorArray, models: tuple[SensorModel, ...], rate_Hz: float) -> SensorArray:
-    """The array as its user knows it: noise, limits and uncertainties of its sensors' models.
+    """Return the array as its user knows it: noise, limits and uncertainties of the models.
 
     ``array``: where the sensors stand, and their nominal calibration. ``models``: one for each sensor.
     """

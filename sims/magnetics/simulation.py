@@ -36,18 +36,18 @@ class Simulation:
     Attributes
     ----------
     array : SensorArray
-        As its user knows it.
+        Array as its user knows it.
     readings : Readings
-        With the pose of the array, and its errors, unless its frame is the world's; and with the ambient field if there
-        is one, with the errors that the array states of it, as that attitude turns it.
+        Readings with the stated pose of the array, unless its frame is the world's, and with the stated ambient field,
+        if there is one, in the axes of that pose.
     truths : tuple of Truth
         Position and moment of every source at the times of the readings, world frame.
     paths : tuple of ObjectPath
-        Position and attitude of every source, as whoever steers it knows them.
+        Stated position and attitude of every source, with their errors.
     true_array : SensorArray
-        The array with its true calibration: misalignments and errors of the gains are part of it.
+        Array with its true calibration, including misalignments and errors of the gains.
     target_position_m, target_moment_Am2 : ndarray, shape (k, 3)
-        Of the targets in the ground, world frame.
+        Positions and moments of the targets in the ground, world frame.
     """
 
     scenario: MagneticScenario
@@ -93,7 +93,7 @@ def simulate(scenario: MagneticScenario, seed: int) -> Simulation:
     """
     time_s = scenario.time_s
     array_pose = _pose(scenario.carrier, time_s, seed, "array")
-    sensors_m = array_pose.position_m[:, None, :] + _applied(array_pose.rotation, scenario.array.positions[None])
+    sensors_m = array_pose.position_m[:, None, :] + _rotate(array_pose.rotation, scenario.array.positions[None])
     ambient_T = np.zeros(3) if scenario.ambient_T is None else np.array(scenario.ambient_T)
     varying_T = ambient_T + _pulsations(scenario, time_s, seed)
     fields_T = np.zeros_like(sensors_m) + varying_T[:, None, :]
@@ -106,15 +106,15 @@ def simulate(scenario: MagneticScenario, seed: int) -> Simulation:
         fields_T[there] += _source_fields(source, sensors_m, pose, moment_Am2)[there]
         truths.append(Truth(time_s[there], pose.position_m[there], moment_Am2[there]))
         poses.append(pose)
-    buried = (np.zeros((0, 3)),) * 2 if scenario.targets is None else scenario.targets.drawn(seed)
+    buried = (np.zeros((0, 3)),) * 2 if scenario.targets is None else scenario.targets.draw(seed)
     fields_T += field_at_points(sensors_m.reshape(-1, 3), *buried).reshape(sensors_m.shape)
     if scenario.geology is not None:
         fields_T += scenario.geology.at(sensors_m, seed)
-    fields_T = _applied(array_pose.rotation.inv(), fields_T) + _platform_fields(scenario, time_s, seed)
+    fields_T = _rotate(array_pose.rotation.inv(), fields_T) + _platform_fields(scenario, time_s, seed)
     fields_T += _induced_fields(scenario, time_s, array_pose.rotation.inv().apply(varying_T), seed)
     fields_T += _stray_fields(scenario, seed)
     true_array = _true_array(scenario, seed)
-    values_T = _sensed(scenario, true_array.readings_of(fields_T), seed)
+    values_T = _sense(scenario, true_array.readings_of(fields_T), seed)
     present = np.ones(len(time_s), dtype=bool)
     for start, end in scenario.missing.gaps_s:
         present &= ~((time_s >= start) & (time_s <= end))
@@ -141,7 +141,7 @@ def _pose(carrier: Carrier, time_s: FloatArray, seed: int, owner: str) -> _Pose:
 
 
 def _stated_pose(scenario: MagneticScenario, of: PoseUncertainty, time_s: FloatArray, seed: int) -> _Pose:
-    """Pose of the array with the errors that its readings state it with: see :mod:`magloc.measurement.pose`."""
+    """Return the stated pose of the array, with the errors of :mod:`magloc.measurement.pose`."""
     random = stream(seed, "pose error").standard_normal((len(time_s), 7))
     changing = lasting(random, of.correlation_s, scenario.rate_Hz)
     constant = stream(seed, "pose constants").standard_normal(7)
@@ -157,7 +157,7 @@ def _stated_pose(scenario: MagneticScenario, of: PoseUncertainty, time_s: FloatA
 
 
 def _stated_ambient(scenario: MagneticScenario, stated: _Pose, seed: int) -> FloatArray:
-    """Ambient field (n, 3) in the axes of the stated pose, with the errors that the array states of it."""
+    """Return the stated ambient field (n, 3) in the axes of the stated pose, with its errors."""
     constant = scenario.array.ambient_uncertainty_T * stream(seed, "ambient error").standard_normal(3)
     white = stream(seed, "white ambient error").standard_normal(stated.position_m.shape)
     field_T = np.asarray(scenario.ambient_T) + constant + scenario.array.ambient_uncertainty_white_T * white
@@ -165,7 +165,7 @@ def _stated_ambient(scenario: MagneticScenario, stated: _Pose, seed: int) -> Flo
 
 
 def _known_path(scenario: MagneticScenario, number: int, time_s: FloatArray, pose: _Pose, seed: int) -> ObjectPath:
-    """Path of a source as it is known, with its errors."""
+    """Return the known path of a source, with its errors."""
     error = scenario.sources[number].path_error
     if not error.sigma.size:
         return ObjectPath(time_s, pose.position_m, pose.rotation)
@@ -179,13 +179,13 @@ def _known_path(scenario: MagneticScenario, number: int, time_s: FloatArray, pos
 
 
 def _moments(source: Source, rotation: Rotation, ambient_T: FloatArray) -> FloatArray:
-    """Moments in the world frame (n, 3): permanent and induced."""
+    """Return moments in the world frame (n, 3), permanent and induced."""
     polarisability = np.array(source.polarisability_m3) / MU0
     return induced_and_permanent_moment(rotation.as_matrix(), source.moment_Am2, polarisability, ambient_T)
 
 
 def _source_fields(source: Source, sensors_m: FloatArray, pose: _Pose, moment_Am2: FloatArray) -> FloatArray:
-    """Fields of a source (n, N, 3), of its dipole or of dipoles along its bar, world frame."""
+    """Return fields of a source (n, N, 3), a dipole or dipoles along its bar, world frame."""
     if not source.body_length_m:
         return field(sensors_m, pose.position_m[:, None, :], moment_Am2[:, None, :])
     half_m = 0.5 * source.body_length_m * pose.rotation.as_matrix()[:, :, 0]
@@ -197,7 +197,7 @@ def _source_fields(source: Source, sensors_m: FloatArray, pose: _Pose, moment_Am
 
 
 def _refuse_contact(scenario: MagneticScenario, number: int, time_s: FloatArray, offset_m: FloatArray) -> None:
-    """Raise if a sensor is inside a source; offset (n, N, 3)."""
+    """Refuse a sensor inside a source; offset (n, N, 3)."""
     if not len(time_s):  # the source is never there
         return
     distance = np.linalg.norm(offset_m, axis=-1)
@@ -213,7 +213,7 @@ def _refuse_contact(scenario: MagneticScenario, number: int, time_s: FloatArray,
 
 
 def _pulsations(scenario: MagneticScenario, time_s: FloatArray, seed: int) -> FloatArray:
-    """Variations of the ambient field (n, 3), world frame."""
+    """Return variations of the ambient field (n, 3), world frame."""
     total = np.zeros((len(time_s), 3))
     for number, pulsation in enumerate(scenario.pulsations, start=1):
         phase = stream(seed, "pulsation", str(number)).uniform(0.0, 2.0 * math.pi)
@@ -223,7 +223,7 @@ def _pulsations(scenario: MagneticScenario, time_s: FloatArray, seed: int) -> Fl
 
 
 def _platform_fields(scenario: MagneticScenario, time_s: FloatArray, seed: int) -> FloatArray:
-    """Fields of the carrier at the sensors (n, N, 3), array frame."""
+    """Return fields of the carrier at the sensors (n, N, 3), array frame."""
     platform, array = scenario.platform, scenario.array
     total = np.zeros((len(time_s), array.n_sensors, 3))
     if any(platform.moment_Am2):
@@ -246,7 +246,7 @@ def _platform_fields(scenario: MagneticScenario, time_s: FloatArray, seed: int) 
 
 
 def _induced_fields(scenario: MagneticScenario, time_s: FloatArray, ambient_T: FloatArray, seed: int) -> FloatArray:
-    """Fields (n, N, 3) at the sensors of what an ambient field (n, 3) induces in the carrier, all in the array's axes.
+    """Return fields (n, N, 3) that an ambient field (n, 3) induces in the carrier, array frame.
 
     Tolles and Lawson's induced and eddy-current terms.
     """
@@ -263,7 +263,7 @@ def _induced_fields(scenario: MagneticScenario, time_s: FloatArray, ambient_T: F
 
 
 def _stray_fields(scenario: MagneticScenario, seed: int) -> FloatArray:
-    """Constant fields at the sensors (N, 3) that are fixed to the array."""
+    """Return constant fields at the sensors (N, 3) that turn with the array."""
     return np.stack(
         [
             model.offset_error_T * stream(seed, "offset", name).standard_normal(3)
@@ -273,7 +273,7 @@ def _stray_fields(scenario: MagneticScenario, seed: int) -> FloatArray:
 
 
 def _true_array(scenario: MagneticScenario, seed: int) -> SensorArray:
-    """The array with the calibration that its sensors really have.
+    """Return the array with the true calibration of its sensors.
 
     A vector sensor of nominal scale S reads S diag(1 + g) R b: R is a random rotation, g a random error of the gains.
     """
@@ -289,8 +289,8 @@ def _true_array(scenario: MagneticScenario, seed: int) -> SensorArray:
     return replace(scenario.array, sensors=tuple(sensors))
 
 
-def _sensed(scenario: MagneticScenario, clean_T: FloatArray, seed: int) -> FloatArray:
-    """What the sensors make of their clean readings (n, C); NaN where a sensor misses a sample."""
+def _sense(scenario: MagneticScenario, clean_T: FloatArray, seed: int) -> FloatArray:
+    """Return noisy readings (n, C) from clean ones; NaN for missing samples."""
     values = np.empty_like(clean_T)
     for i, (name, model) in enumerate(zip(scenario.array.ids, scenario.models, strict=True)):
         channels = scenario.array.channel_sensor == i
@@ -301,7 +301,7 @@ def _sensed(scenario: MagneticScenario, clean_T: FloatArray, seed: int) -> Float
 
 
 def _read(model: SensorModel, clean_T: FloatArray, rate_Hz: float, seed: int, name: str) -> FloatArray:
-    """Readings of one sensor (n, c)."""
+    """Return the readings of one sensor (n, c)."""
     n, channels = clean_T.shape
     values = low_passed(clean_T, rate_Hz, model.bandwidth_Hz)
     values = values + coloured_noise(
@@ -315,12 +315,12 @@ def _read(model: SensorModel, clean_T: FloatArray, rate_Hz: float, seed: int, na
 
 
 def _of_rows(truth: Truth, time_s: FloatArray) -> Truth:
-    """A truth at those of its instants at which there are readings."""
+    """Return a truth at the instants with readings."""
     rows = np.isin(truth.time_s, time_s)
     moments = None if truth.moment_Am2 is None else truth.moment_Am2[rows]
     return Truth(truth.time_s[rows], truth.position_m[rows], moments)
 
 
-def _applied(rotation: Rotation, vectors: FloatArray) -> FloatArray:
-    """The vectors (n, N, 3) of every instant, or (1, N, 3) of all of them, turned by its rotation."""
+def _rotate(rotation: Rotation, vectors: FloatArray) -> FloatArray:
+    """Rotate vectors (n, N, 3), or (1, N, 3), by the rotation of every instant."""
     return np.einsum("tij,tkj->tki", rotation.as_matrix(), vectors)

@@ -1,4 +1,4 @@
-"""Frames of the camera under the sky of lights: point spread, motion, noise, lost and spurious lights, hot pixels."""
+"""Simulated frames of the camera under the sky of LEDs, with blur, noise and faulty lights."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ _MOST_STEPS = 2000
 
 @dataclass(frozen=True)
 class Motion:
-    """How the satellite moves during the exposure."""
+    """Motion of the satellite during the exposure."""
 
     velocity_m_s: tuple[float, float] = (0.0, 0.0)  # (2,): in the table's frame
     turn_rate_rad_s: float = 0.0  # counter-clockwise seen from above
 
 
 def pose_and_motion(track: PlanarTrack, at_s: float) -> tuple[Pose, Motion]:
-    """Where a satellite is at an instant of its track, and how it moves."""
+    """Return pose and motion of a satellite at an instant of its track."""
     state = track.at([at_s]).state(0)
     turn_rate = np.interp(at_s, track.time_s, np.gradient(track.heading_rad, track.time_s))
     (x, y), (velocity_x, velocity_y) = state.position_m.tolist(), state.velocity_m_s.tolist()
@@ -37,22 +37,22 @@ def pose_and_motion(track: PlanarTrack, at_s: float) -> tuple[Pose, Motion]:
 
 @dataclass(frozen=True)
 class FrameQuality:
-    """What a frame of the camera is like.
+    """Quality of a frame of the camera.
 
     Attributes
     ----------
     psf_px : float
         Standard deviation of the Gaussian image of a light.
     peak_DN : float
-        Of a light at rest, above the background; motion spreads the same light over more pixels.
+        Peak of a light at rest, above the background; motion spreads the light over more pixels.
     noise_DN : float
-        Standard deviation in a pixel.
+        Standard deviation of a pixel.
     lost : float
         Probability that a light is dark.
     spurious : int
-        Lights in view that are in no catalogue, at random places of the ceiling.
+        Lights in view that are not in the catalogue, at random positions on the ceiling.
     hot_pixels : int
-        Pixels at 255, at random places.
+        Number of pixels at 255, at random positions.
 
     Raises
     ------
@@ -94,7 +94,7 @@ def rendered_frame(
     motion: Motion = Motion(),
     quality: FrameQuality = FrameQuality(),
 ) -> Frame:
-    """Frame that the camera takes.
+    """Render a frame of the camera.
 
     A light's image is a Gaussian, drawn out along the path that it takes during the exposure; the total light does not
     depend on the motion. Gaussian noise, then rounding to whole numbers from 0 to 255.
@@ -105,7 +105,7 @@ def rendered_frame(
         Such as :func:`adcs.mockup.led_sky`.
     camera : Camera
     pose : Pose
-        In the middle of the exposure.
+        Pose in the middle of the exposure.
     rng : numpy.random.Generator
     motion : Motion
         Velocity and turn rate meanwhile; at rest by default.
@@ -142,7 +142,7 @@ def rendered_frame(
 
 
 def _paths(camera: Camera, pose: Pose, motion: Motion, points_m: FloatArray, psf_px: float) -> FloatArray:
-    """Where the lights that come near the frame are during the exposure, shape (lights, steps, 2)."""
+    """Return the paths of lights near the frame during the exposure, (lights, steps, 2)."""
     path_px = camera.exposure_s / camera.m_per_px * math.hypot(*motion.velocity_m_s)
     path_px += camera.exposure_s * abs(motion.turn_rate_rad_s) * math.hypot(camera.width_px, camera.height_px)
     n_steps = min(max(math.ceil(path_px / (_STEP_PSF * psf_px)), 1), _MOST_STEPS)
@@ -160,7 +160,7 @@ def _paths(camera: Camera, pose: Pose, motion: Motion, points_m: FloatArray, psf
 
 
 def _add_light(image: NDArray[np.float32], path: FloatArray, quality: FrameQuality) -> None:
-    """Add what a light leaves along a path, shape (steps, 2); steps that the lens does not show are NaN."""
+    """Add the light of a path (steps, 2); NaN steps are outside the lens."""
     shown = path[np.isfinite(path[:, 0])]
     reach = _PSF_REACH * quality.psf_px
     size = np.array(image.shape[::-1])

@@ -1,4 +1,4 @@
-"""Runs of the table-top satellite: how it drives, what its inertial unit reads, and which fixes its camera sends.
+"""Simulated runs of the table-top satellite: motion, inertial unit and camera fixes.
 
 See docs/theory/tabletop-navigation.md.
 """
@@ -37,19 +37,19 @@ class ImuErrors:
     Attributes
     ----------
     acceleration_m_s2, rate_rad_s : float
-        Noise of a sample, each axis.
+        Noise of a sample, per axis.
     spikes_Hz, spike_m_s2 : float
-        One sample in about a second gets a parasitic spike on each axis, uniform within ± its size.
+        About one sample per second has a parasitic spike on each axis, uniform within ± its size.
     calibration_m_s2 : float
-        Standard deviation of what the calibration leaves of each zero.
+        Standard deviation of each zero after the calibration.
     zero_m_s2 : tuple
-        Constant zeros beside it.
+        Additional constant zeros.
     drift_m_s2 : tuple
-        What the zeros drift by, linearly, over the run.
+        Linear drift of the zeros over the run.
     warming_K : float
-        How much warmer the sensor becomes meanwhile: the drift over it is its slope.
+        Warming of the sensor during the run; drift over warming is the temperature coefficient.
     zero_rad_s : float
-        Of the gyro.
+        Zero of the gyro.
     """
 
     acceleration_m_s2: float = 0.002
@@ -76,20 +76,20 @@ class CameraErrors:
     failed : float
         Fraction of the frames that give no fix.
     false : float
-        Fraction of the fixes that are anywhere under the sky, at any heading.
+        Fraction of false fixes, at random positions and headings under the sky.
     overtaken : float
         Fraction of the fixes that arrive up to three periods later than the others.
     repeated : float
         Fraction of the fixes that arrive twice.
     outages_s : tuple of (float, float)
-        From when to when there are no exposures.
+        Begin and end of periods without exposures.
     latency_s : float
-        By how much later than the exposure the time stamps are.
+        Delay of the time stamps after the exposure.
 
     Raises
     ------
     ValueError
-        A fraction is none.
+        A fraction is not between 0 and 1.
 
     Examples
     --------
@@ -126,11 +126,11 @@ class TableScenario:
     drive : {'perimeter', 'two-firings'}
     duration_s : float
     sample_s : float
-        Between samples of the inertial unit, a multiple of :data:`POLL_S`.
+        Interval of the samples of the inertial unit, a multiple of :data:`POLL_S`.
     imu : ImuErrors
-        Of the inertial unit.
+        Errors of the inertial unit.
     camera : CameraErrors
-        Of its fixes.
+        Errors of the fixes.
 
     Raises
     ------
@@ -163,18 +163,18 @@ class TableScenario:
 
     @property
     def polls(self) -> int:
-        """Polls of a sample."""
+        """Number of polls in a sample."""
         return max(1, round(self.sample_s / POLL_S))
 
     @property
     def n_samples(self) -> int:
-        """Samples of the run."""
+        """Number of samples in the run."""
         return int(self.duration_s / self.sample_s + 1e-9)
 
 
 @dataclass(frozen=True, eq=False)
 class TableRun:
-    """Truth and readings.
+    """Truth and readings of a run.
 
     ``true_start``, ``start``: at 0 s, and what is known of it: as well as from a fix, and the true velocity.
     """
@@ -193,7 +193,7 @@ class TableRun:
 
 @accept_seed
 def table_run(scenario: TableScenario, rng: Rng) -> TableRun:
-    """Simulate one run of the table-top satellite: truth, samples of its inertial unit, and fixes of its camera.
+    """Simulate one run of the table-top satellite.
 
     Parameters
     ----------
@@ -235,7 +235,7 @@ def table_run(scenario: TableScenario, rng: Rng) -> TableRun:
 
 
 def _readings(ideal: ImuRecord, scenario: TableScenario, seed: int) -> tuple[ImuRecord, FloatArray, FloatArray]:
-    """Readings, temperatures and true zeros of the accelerometer."""
+    """Return readings, temperatures and true zeros of the accelerometer."""
     errors, n = scenario.imu, len(ideal)
     left = errors.calibration_m_s2 * stream(seed, "calibration").standard_normal(2)
     slope = np.array(errors.drift_m_s2) / errors.warming_K
@@ -256,7 +256,7 @@ def _readings(ideal: ImuRecord, scenario: TableScenario, seed: int) -> tuple[Imu
 
 
 def _fixes(flown: PlanarTrack, camera: CameraErrors, seed: int) -> tuple[FixRecord, FloatArray, BoolArray]:
-    """Fixes as they arrive, when their images were taken, and which of them are false."""
+    """Return fixes in order of arrival, their exposures, and which of them are false."""
     phase = stream(seed, "camera").uniform(0.0, camera.period_s)
     time_s = np.arange(phase, flown.time_s[-1], camera.period_s)
     k = len(time_s)
@@ -284,7 +284,7 @@ def _fixes(flown: PlanarTrack, camera: CameraErrors, seed: int) -> tuple[FixReco
 
 
 def perimeter_drive(n_polls: int, rng: np.random.Generator) -> tuple[ImuRecord, PlanarState]:
-    """True readings of every poll around the table, and the start, at rest.
+    """Return the true readings of every poll around the table, and the start, at rest.
 
     ``rng``: for where and which way round it starts, its heading, and how it turns.
     """
@@ -303,7 +303,7 @@ def perimeter_drive(n_polls: int, rng: np.random.Generator) -> tuple[ImuRecord, 
 
 
 def _firings(way: float, along_m: float, heading: float, turns: FloatArray) -> FloatArray:
-    """Accelerations along body x and y in every step of the controller, in which the satellite turns by ``turns``.
+    """Return accelerations along body x and y in every step, in which the satellite turns by ``turns``.
 
     Table axes are complex numbers. The controller knows where it is, but for rates that change within its step.
     """
@@ -327,7 +327,7 @@ def _firings(way: float, along_m: float, heading: float, turns: FloatArray) -> F
 
 
 def _on_perimeter(along_m: float) -> tuple[complex, complex]:
-    """Point of the rounded rectangle after a length, and the direction of the path there, as complex numbers."""
+    """Return point and direction of the rounded rectangle after a length, as complex numbers."""
     arc = 0.5 * math.pi * _CORNER_M
     rest = along_m % (2.0 * sum(_STRAIGHT_M) + 4.0 * arc)
     position = complex(-0.5 * _STRAIGHT_M[0], -0.5 * _STRAIGHT_M[1] - _CORNER_M)
@@ -347,7 +347,7 @@ def _on_perimeter(along_m: float) -> tuple[complex, complex]:
 
 
 def two_firings_drive(n_polls: int, rng: np.random.Generator) -> tuple[ImuRecord, PlanarState]:
-    """True readings of every poll of the run with two firings, and its start; nothing of it is random."""
+    """Return the true readings of every poll with two firings, and the start; not random."""
     time_s = POLL_S * np.arange(1.0, n_polls + 1.0)
     middle_s = time_s - 0.5 * POLL_S
     knots_s = [2.0, 2.6, 4.5, 5.2, 9.0, 9.5, 11.8, 12.2]

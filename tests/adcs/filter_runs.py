@@ -26,7 +26,7 @@ from adcs.satellite import dynamics
 from adcs.satellite.satellite import Satellite
 from adcs.satellite.telemetry import Record
 from sims.attitude.scenario import AttitudeScenario, StartConditions
-from sims.attitude.simulation import AttitudeRuns, Prepared, prepare, simulate, start_estimates
+from sims.attitude.simulation import AttitudeRuns, PreparedRuns, prepare, simulate, start_estimates
 from sims.experiments.attitude import Part, outcome_of
 from tests.adcs.attitudes import commanded_torque, random_attitudes
 from tests.adcs.kalman.readable import run_readable
@@ -99,7 +99,7 @@ def assert_as_readable(record: Record, chosen: FilterSettings, start: FilterStar
     return fast
 
 
-def followed(prepared: Prepared) -> AttitudeRuns:
+def followed(prepared: PreparedRuns) -> AttitudeRuns:
     """Truth and readings from the start and the torques of ``prepared``, which may have been changed."""
     satellite, around = prepared.scenario.satellite, prepared.environment
     states, torques = [(prepared.q, prepared.w, prepared.momentum_Nms)], []

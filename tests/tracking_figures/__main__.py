@@ -17,7 +17,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from fnmatch import fnmatch
 
-from arrays.io.tables import aligned
+from arrays.io.tables import align
 from tests.tracking_figures.figures import Comparison, Figures, compare
 from tests.tracking_figures.scenarios import QUICK, SCENARIOS, read_stored, store
 
@@ -74,7 +74,7 @@ def print_comparisons(
         for i, one in enumerate(of_name):
             rows.append([name * (i == 0), one.name, _cell(one.old), _cell(one.new), one.limit, "WORSE" * one.worse])
         rows.append(["", "cpu", _cell(old[name].cpu), _cell(new[name].cpu), "", ""])
-    print("\n".join(aligned(rows)))
+    print("\n".join(align(rows)))
     worse = sum(one.worse for of_name in comparisons.values() for one in of_name)
     cpu = [sum(figures[name].cpu for name in comparisons) for figures in (old, new)]
     print(f"{worse} figures of {len(comparisons)} scenarios are worse; processor time {cpu[1] / cpu[0]:.2f} of the old")

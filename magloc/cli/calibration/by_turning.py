@@ -1,4 +1,4 @@
-"""``magloc calibrate --modulus-nT``: gains, angles and offsets of sensors that were turned in a uniform field."""
+"""``magloc calibrate --modulus-nT``: gains, angles and offsets of sensors turned in a field."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from magloc.calibration.modulus import EllipsoidCalibration
 from magloc.calibration.results import TurningCalibration
 from magloc.readings import Readings
 
-# Of a gain from the array file: beyond it the modulus is in another unit.
+# Largest factor between a gain and that of the array file: beyond it the modulus has another unit.
 _LARGEST_CHANGE = 3.0
-_NEARLY_ALL, _OUTLYING = 0.9, 3.0  # a share of the readings, and how far others are beyond these
+_NEARLY_ALL, _OUTLYING = 0.9, 3.0  # share of the readings, and factor beyond them at which others are outliers
 
 
 def modulus_of(given: str, readings: Readings) -> float | FloatArray:
-    """Modulus [T] that the option gives: a number, or of every row from a file of moduli through time."""
+    """Return the modulus [T] of the option: a number, or that of every row from a file."""
     try:
         modulus_nT = float(given)
     except ValueError:
@@ -32,7 +32,7 @@ def modulus_of(given: str, readings: Readings) -> float | FloatArray:
 
 
 def _modulus_through_time(path: Path, time_s: FloatArray) -> FloatArray:
-    """Modulus at some times, linear between those of a file."""
+    """Return the modulus at some times, interpolated between the rows of a file."""
     table = read_table(path, "a header with time_s and modulus_nT, or a number for --modulus-nT")
     columns = ("time_s", "modulus_nT")
     for name in columns:
@@ -53,25 +53,25 @@ def _modulus_through_time(path: Path, time_s: FloatArray) -> FloatArray:
 
 
 def notes(result: TurningCalibration) -> list[str]:
-    """What the modulus does not tell, and sensors that it does not fit."""
-    said = ["the modulus does not tell how a sensor is mounted: its rotation stays as in the array file"]
+    """Return notes on what the modulus does not determine, and on sensors that it does not fit."""
+    texts = ["the modulus does not determine how a sensor is mounted: its rotation stays as in the array file"]
     for name, fit in result.fits.items():
         if fit.misfit:
             ratio = fit.chi2 / fit.dof
-            said.append(
+            texts.append(
                 f"warning: sensor {name} does not fit (χ² {ratio:.3g} times what its noise explains): more noise, a"
                 f" field that changes, or iron near it; standard deviations are at least {np.sqrt(ratio):.2g} times as"
                 " large"
             )
-    return said
+    return texts
 
 
 def check(result: TurningCalibration, readings: Path, array: Path, out: Path) -> None:
-    """Refuse readings that do not determine a sensor, and a modulus that is in another unit."""
+    """Refuse readings that do not determine a sensor, and a modulus in another unit."""
     for name, fit in result.fits.items():
         if not fit.converged:
-            said = f"sensor {name} cannot be calibrated: {fit.reason}{overflow(result.readings_T)}"
-            raise InputError(f"{readings}: {said}; {out} is not written.")
+            fault = f"sensor {name} cannot be calibrated: {fit.reason}{overflow(result.readings_T)}"
+            raise InputError(f"{readings}: {fault}; {out} is not written.")
     for before, sensor in zip(result.nominal.sensors, result.array.sensors, strict=True):
         volumes = np.linalg.det([sensor.calibration.scale, before.calibration.scale])
         ratio = float(np.cbrt(volumes[0] / volumes[1]))
@@ -84,7 +84,7 @@ def check(result: TurningCalibration, readings: Path, array: Path, out: Path) ->
 
 
 def overflow(readings_T: FloatArray) -> str:
-    """Say how many readings are far larger than nearly all others; empty where none is."""
+    """Return a sentence on readings far larger than nearly all others; empty if there are none."""
     size = np.abs(readings_T[np.isfinite(readings_T)])
     most = _OUTLYING * float(np.quantile(size, _NEARLY_ALL, method="lower")) if size.size else np.inf
     n = int((size > most).sum())
@@ -97,13 +97,13 @@ def overflow(readings_T: FloatArray) -> str:
 
 
 def report(result: TurningCalibration, out: Path) -> dict[str, Any]:
-    """What ``--json`` prints."""
+    """Return the report that ``--json`` prints."""
     sensors = [_entry(*item) for item in result.fits.items()]
     return {"out": str(out), "rows": len(result.time_s), "sensors": sensors}
 
 
 def lines(result: TurningCalibration) -> list[str]:
-    """One line for every sensor."""
+    """Return one line for every sensor."""
     return [_line(*item) for item in result.fits.items()]
 
 
@@ -137,7 +137,7 @@ def _line(name: str, result: EllipsoidCalibration) -> str:
 
 
 def values_by_sigma(values: FloatArray, sigma: FloatArray) -> tuple[str, str]:
-    """Some values and the largest of their standard deviations, by whose digits they are rounded."""
+    """Return values and the largest of their standard deviations, rounded to its digits."""
     largest = float(np.max(sigma))
     cells = [by_sigma(value, largest) for value in values.tolist()]
     return " ".join(value for value, _ in cells), cells[0][1]

@@ -1,4 +1,4 @@
-"""``magloc calibrate``: positions, gains, axes and offsets of an array's sensors from a source that moves past it."""
+"""``magloc calibrate``: positions, gains, axes and offsets of an array's sensors."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import arrays
 import magloc
 from arrays.io.errors import InputError, naming
 from arrays.io.outputs import refuse_file, refuse_unwritable, write_files
-from arrays.io.tables import aligned
+from arrays.io.tables import align
 from magloc.cli.framework import CommonOptions, Flag, note, print_result
 from magloc.cli.options import array_of_several, refuse_not_positive
 
@@ -26,33 +26,33 @@ if TYPE_CHECKING:
     from magloc.truth import Truth
 
 
-# Gains beyond this many standard deviations of the prior are named.
+# Standard deviations of the prior beyond which a gain is reported.
 _STRANGE = 4.0
-_ALIKE = 0.1  # gains that differ by less have one cause
+_ALIKE = 0.1  # largest difference of gains that have one cause
 
 
 @Parameter(name="*", group="What is known of the array")
 @dataclass(frozen=True)
 class PriorOptions:
-    """How well the array file is known.
+    """Accuracy of the array file before the calibration.
 
     Parameters
     ----------
     estimate : str
-        What is estimated: some of positions, gains, axes, offsets, separated by commas. The rest is as in the array
-        file.
+        Quantities to estimate: some of positions, gains, axes, offsets, separated by commas. The others
+        stay as in the array file.
     trust_position : str
-        Ids of sensors, separated by commas, whose position in the array file is exact.
+        Ids of sensors, separated by commas, whose positions in the array file are exact.
     trust_scale : str
-        Ids of sensors whose gains and axes in the array file are exact.
+        Ids of sensors, separated by commas, whose gains and axes in the array file are exact.
     position_prior_mm : float
-        Standard deviation of a position in the array file, along each axis.
+        Standard deviation of a position in the array file, per axis [mm].
     gain_prior : float
-        That of a gain (0.2 = 20 %).
+        Standard deviation of a gain in the array file (0.2 = 20 %).
     axes_prior_deg : float
-        That of the direction of a channel.
+        Standard deviation of the direction of a channel [°].
     offset_prior_nT : float
-        That of an offset.
+        Standard deviation of an offset [nT].
     """
 
     estimate: str = "positions,gains,axes,offsets"
@@ -81,37 +81,37 @@ def calibrate(
 ) -> None:
     """Calibrate vector sensors by a source that moves past them, or by turning them in a field of known modulus.
 
-    With --truth the path of the source is known; without it, the path is found as well, and the array as a whole can be
-    moved, turned and scaled unseen: there the array file decides, or the sensors that are trusted. What the readings do
-    not tell is said. The table has what the calibration adds to the array file, with standard deviations.
+    With --truth the path of the source is known. Without it the path is estimated too; then the readings do not show
+    where the array as a whole stands, how it is turned and its scale, which come from the array file or from trusted
+    sensors. The command reports what the readings do not determine. The table lists the changes to the array file, with
+    standard deviations.
 
-    With --modulus-nT there is no source: every sensor, or a single one, was turned in a uniform field of that modulus.
-    That tells the gains, the angles between the axes and the offsets of each sensor, not how it is mounted.
+    With --modulus-nT there is no source: every sensor was turned in a uniform field of that modulus. This determines
+    the gains, the angles between the axes and the offsets of each sensor, but not how it is mounted.
 
     Parameters
     ----------
     readings : Path
         Readings file (CSV).
     array : Path
-        Array file (TOML) to start from. Its noise weights the readings; noise_fraction is worth setting when the source
-        comes near.
+        Array file (TOML) to start from. Its noise weights the readings. Set noise_fraction when the source comes near.
     out : Path
         Array file to write. Nothing is written if the calibration fails.
     truth : Path
-        Truth file (CSV); rows belong to the readings of the same time. A missing z_m is one unknown height for all
-        rows. Moments, where it has them, are taken as known.
+        Truth file (CSV) of the source. Its rows belong to the readings of the same time. Without z_m one height is
+        estimated for all rows. Moments in it are taken as known.
     modulus_nT : str
-        Modulus of the uniform field that the sensors were turned in: a number, or a CSV file with time_s and
-        modulus_nT, such as a base station's, between whose rows it is linear.
+        Modulus of the uniform field in which the sensors were turned [nT]: a number, or a CSV file with time_s and
+        modulus_nT, such as that of a base station, which is interpolated linearly.
     height_m : float
-        The z of a truth file without z_m.
+        Height of the source for a truth file without z_m [m].
     moment : {"constant", "free"}
-        Whether the unknown moment of the source is constant, of a source that does not turn, or free in every row.
-        Constant by default.
+        Model of an unknown moment: constant, for a source that does not turn, or free in every row. By default
+        constant.
     known : PriorOptions
-        What is known of the array.
+        Accuracy of the array file.
     figures : Path
-        Folder for figures and the data behind them: residuals before and after, and what the calibration changes.
+        Folder for figures and their data: residuals before and after, and the changes of the calibration.
     json : bool
         Print one JSON object in place of the table.
     common : CommonOptions
@@ -176,12 +176,12 @@ def _files(result: SourceCalibration | TurningCalibration) -> Iterator[tuple[str
 def _prior(options: PriorOptions, array: SensorArray, path: Path) -> CalibrationPrior:
     from magloc.calibration.array import QUANTITIES
 
-    quantities = _listed(options.estimate)
+    quantities = _names(options.estimate)
     for name in quantities or [""]:
         if name not in QUANTITIES:
             raise InputError(f"--estimate: found {name!r}, expected some of {', '.join(QUANTITIES)}.")
     for option, ids in (("--trust-position", options.trust_position), ("--trust-scale", options.trust_scale)):
-        for name in _listed(ids):
+        for name in _names(ids):
             if name not in array.ids:
                 raise InputError(
                     f"{option}: found {name!r}, expected ids of sensors in {path}: {', '.join(array.ids)}."
@@ -193,17 +193,17 @@ def _prior(options: PriorOptions, array: SensorArray, path: Path) -> Calibration
         axes_rad=math.radians(options.axes_prior_deg),
         offset_T=options.offset_prior_nT * 1e-9,
         estimate=tuple(quantity for quantity in QUANTITIES if quantity in quantities),
-        trusted_positions=tuple(_listed(options.trust_position)),
-        trusted_scales=tuple(_listed(options.trust_scale)),
+        trusted_positions=tuple(_names(options.trust_position)),
+        trusted_scales=tuple(_names(options.trust_scale)),
     )
 
 
-def _listed(text: str) -> list[str]:
+def _names(text: str) -> list[str]:
     return [name.strip() for name in text.split(",")] if text else []
 
 
 def _path(readings: Readings, path: Path | None, height_m: float | None, readings_path: Path) -> Truth | None:
-    """The source's path, with a missing z set to the height if that is given."""
+    """Read the path of the source; a missing z becomes the height, if one is given."""
     import numpy as np
 
     from magloc.truth import read_truth, rows_of_same_time
@@ -227,7 +227,7 @@ def _path(readings: Readings, path: Path | None, height_m: float | None, reading
 
 
 def _report(result: SourceCalibration, n_rows: int, out: Path) -> dict[str, Any]:
-    """What ``--json`` prints."""
+    """Return the report that ``--json`` prints."""
     from magloc.calibration.model import AXES, GAINS, OFFSET, POSITION
 
     sensors = [
@@ -262,7 +262,7 @@ def _report(result: SourceCalibration, n_rows: int, out: Path) -> dict[str, Any]
 
 
 def _table(result: SourceCalibration) -> list[str]:
-    """What the calibration adds to every sensor, with the largest standard deviation of each group."""
+    """Return the changes of every sensor, with the largest standard deviation of each group."""
     import numpy as np
 
     from magloc.calibration.model import AXES, GAINS, OFFSET, POSITION
@@ -279,11 +279,11 @@ def _table(result: SourceCalibration) -> list[str]:
             *turning.values_by_sigma(1e6 * change[OFFSET], 1e6 * sd[OFFSET]),
         ]
         rows.append([sensor, *cells, f"{1e9 * rms:.1f}", ""])
-    return aligned(rows, left=1)
+    return align(rows, left=1)
 
 
 def _notes(result: SourceCalibration, n_rows: int, prior: CalibrationPrior) -> list[str]:
-    """Rows and χ², what is not told, and sensors whose gain is farther off than an array file could be: dead ones."""
+    """Return notes on rows and χ², on undetermined directions, and on sensors with absurd gains."""
     import numpy as np
 
     from magloc.calibration.model import GAINS
@@ -294,7 +294,7 @@ def _notes(result: SourceCalibration, n_rows: int, prior: CalibrationPrior) -> l
     ]
     if result.unobservable:
         names = "; ".join(direction.name for direction in result.unobservable)
-        notes.append(f"not told by the readings, as in the array file: {names}")
+        notes.append(f"not determined by the readings, kept as in the array file: {names}")
     far = np.max(np.abs(result.change[:, GAINS]), axis=1) > _STRANGE * prior.gain
     strangers = [sensor for sensor, strange in zip(result.array.ids, far.tolist(), strict=True) if strange]
     gains = 1.0 + result.change[:, GAINS]

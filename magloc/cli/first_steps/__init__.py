@@ -1,1 +1,1 @@
-"""The first commands of a new user: an array file, a demonstration, compiling ahead."""
+"""The first commands of a new user: an array file, the layout of a log, a demonstration."""

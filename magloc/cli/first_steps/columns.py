@@ -1,4 +1,4 @@
-"""``magloc columns``: how a log of another program is read."""
+"""``magloc columns``: a proposal how to read the log of another program."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from magloc.cli.framework import QuietOptions, note
 def columns(log: Path, /, *, out: Path | None = None, common: QuietOptions = QuietOptions()) -> None:  # noqa: B008 - frozen
     """Propose the table [columns] of an array file for the log of another program.
 
-    It lists the columns of the log with their first values, says in TOML what the log determines, and asks for the
-    rest in remarks. Nothing else is read from the log: check it, answer what is asked, and use the file as --array.
+    Lists the columns of the log with their first values, writes in TOML what the log determines, and asks for the rest
+    in comments. Check the file, answer the questions, and use it as --array.
 
     Parameters
     ----------
     log : Path
         Text file with a header and rows of numbers.
     out : Path
-        Write the proposal there, as an array file, in place of printing it.
+        Array file to write, in place of printing the proposal.
     common : QuietOptions
         Common options.
     """

@@ -1,4 +1,4 @@
-"""``magloc demo``: from nothing to a picture."""
+"""``magloc demo``: a first example without any files."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ def demo(
     view: Flag = False,
     common: QuietOptions = QuietOptions(),  # noqa: B008 - frozen
 ) -> None:
-    """Simulate, locate and track a magnet: four commands, each shown as it is typed, and what they found.
+    """Simulate, locate and track a magnet by four commands, and compare the results with the truth.
 
     Parameters
     ----------
     out : Path
-        Folder for what they write.
+        Folder for the files of the commands.
     view : bool
-        Open the scene in the browser at the end. Ctrl-C ends it.
+        Show the scene in the browser at the end, until Ctrl-C.
     common : QuietOptions
         Common options.
     """
@@ -52,7 +52,7 @@ def demo(
 
 
 def _story(fixes: dict[str, Any], track: dict[str, Any], truth_file: str) -> str:
-    """Return what the commands have found, beside the truth."""
+    """Return the results of the commands, compared with the truth."""
     import numpy as np
 
     truth = np.genfromtxt(truth_file, delimiter=",", names=True)

@@ -1,4 +1,4 @@
-"""``magloc new-array``: an array file from a shape and a kind of sensor."""
+"""``magloc new-array``: an array file from a shape and a sensor."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ class ArrayOptions:
     Parameters
     ----------
     shape : str
-        tetrahedron, square, cross, cube, hexagon, axial, or grid: a flat board.
+        tetrahedron, square, cross, cube, hexagon, axial, or grid (a flat board).
     size_m : float
-        Edge, arm, radius or baseline of the shape, or the distance of neighbours on a board [m].
+        Edge, arm, radius or baseline of the shape, or the distance between neighbours on a board [m].
     grid : tuple of 2 int
-        Sensors along x and along y, of a board.
+        Numbers of sensors along x and along y, for --shape grid.
     sensor : str
-        rm3100, lis3mdl, tlv493d, mlx90393, fluxgate, opm or overhauser: kind, noise and range of its data sheet.
+        rm3100, lis3mdl, tlv493d, mlx90393, fluxgate, opm or overhauser. Sets kind, noise and range from a data sheet.
     noise_nT : float
-        Standard deviation of one reading, per axis [nT], in place of the sensor's.
+        Standard deviation of one reading, per axis [nT]; by default that of --sensor.
     kind : {"vector", "scalar"}
-        What a sensor reads, where none is named: three components, the default, or the modulus.
+        Kind of the sensors without --sensor: three components, the default, or the modulus.
     rate_Hz : float
-        Readings a second, which the noise of sensors with a noise density depends on; 10 by default.
+        Readings per second [Hz], for sensors whose data sheet has a noise density; 10 by default.
     """
 
     shape: str | None = None
@@ -62,10 +62,10 @@ def new_array(
     wanted: ArrayOptions = ArrayOptions(),
     common: QuietOptions = QuietOptions(),  # noqa: B008 - frozen
 ) -> None:
-    """Write an array file: a shape, a size and a sensor, by options or by answering questions.
+    """Write an array file from a shape, a size and a sensor.
 
-    Without an option, on a terminal, it asks. The file has one table for every sensor, to be edited: positions, axes
-    and what else is known of each.
+    Without options, on a terminal, the command asks questions. The file has one table for every sensor; edit positions,
+    axes and other properties there.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ def new_array(
     """
     refuse_unwritable(out, "OUT", ".toml")
     if wanted == ArrayOptions() and sys.stdin.isatty():
-        wanted = _asked()
+        wanted = _ask()
     array, source = _array(wanted)
     write_text("".join(f"# {line}\n" for line in source) + arrays.array_toml(array), out)
     note(f"wrote {out}: {array.n_sensors} {array.sensors[0].kind} sensors, {array.n_channels} channels")
@@ -86,8 +86,8 @@ def new_array(
         note(line)
 
 
-def _asked() -> ArrayOptions:
-    """Options from questions and answers."""
+def _ask() -> ArrayOptions:
+    """Ask for the options on the terminal."""
     shape = _answer(f"Shape ({', '.join((*arrays.GEOMETRIES, _GRID))})", "tetrahedron")
     grid = None
     if shape == _GRID:
@@ -118,12 +118,12 @@ def _number(text: str, option: str) -> float:
 
 
 def _tesla(nanotesla: float) -> float:
-    """Exactly what an array file with the number in nT says."""
+    """Convert exactly as the reader of array files does."""
     return float(Decimal(repr(float(nanotesla))).scaleb(-9))
 
 
 def _array(wanted: ArrayOptions) -> tuple[SensorArray, list[str]]:
-    """The array, and where the figures of its sensors come from."""
+    """Return the array, and the sources of its sensors' data."""
     shapes = (*arrays.GEOMETRIES, _GRID)
     if wanted.shape not in shapes:
         found = "nothing" if wanted.shape is None else repr(wanted.shape)

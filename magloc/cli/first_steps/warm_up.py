@@ -1,4 +1,4 @@
-"""``magloc warm-up`` and ``adcs warm-up``, which earlier releases needed to compile ahead."""
+"""``magloc warm-up`` and ``adcs warm-up``, which compiled kernels in earlier releases."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from magloc.cli.framework import QuietOptions
 
 
 def warm_up(*, common: QuietOptions = QuietOptions()) -> None:  # noqa: B008 - frozen
-    """Do nothing. No command compiles anything when it is first used; the next release removes `warm-up`.
+    """Do nothing. The kernels are compiled at installation; the next release removes `warm-up`.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""``magloc track`` with ``--position`` or ``--object-path``: the moment alone through time."""
+"""``magloc track`` with ``--position`` or ``--object-path``: the moment through time."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class TrackOutputs:
-    """Where a track goes; see :func:`magloc.cli.track.track`."""
+    """Outputs of a track; see :func:`magloc.cli.track.track`."""
 
     json: bool
     jsonl: bool
@@ -33,7 +33,7 @@ class TrackOutputs:
 
 
 def refuse_bounds(known: KnownOptions) -> None:
-    """Refuse bounds of a position that is known, and of a moment that is estimated without them."""
+    """Refuse bounds of the source where its position is known."""
     for option, value in (("--region", known.region), ("--max-moment-Am2", known.max_moment_Am2)):
         if value is not None:
             raise InputError(f"{option}: found it together with a known position, expected no bounds of the source.")
@@ -42,18 +42,18 @@ def refuse_bounds(known: KnownOptions) -> None:
 @Parameter(name="*", group="Error of the known path")
 @dataclass(frozen=True)
 class PathErrorOptions:
-    """How wrong a known path may be.
+    """Errors of a known path.
 
     Parameters
     ----------
     path_sigma_m : float
-        1 σ of the position along each axis; exact by default.
+        Standard deviation of the position along each axis [m].
     path_correlation_s : float
-        How long its error lasts: 0 for a new one in every row; by default a whole path.
+        Correlation time of that error [s]: 0 for a new error in every row; by default constant over the path.
     attitude_sigma_deg : float
-        1 σ of the attitude about each axis; exact by default.
+        Standard deviation of the attitude about each axis [°].
     attitude_correlation_s : float
-        How long its error lasts, such as a second of an unknown roll; by default a whole path.
+        Correlation time of that error [s], such as 1 for an unknown roll; by default constant over the path.
     """
 
     path_sigma_m: float = 0.0
@@ -62,7 +62,7 @@ class PathErrorOptions:
     attitude_correlation_s: float | None = None
 
     def path_error(self) -> PathError:
-        """The errors that the options state."""
+        """Return the errors that the options state."""
         from magloc.signature.path import PathError
 
         refuse_outside(0.0, LARGEST, "a number that is not negative", **asdict(self))
@@ -83,7 +83,7 @@ class PathErrorOptions:
 def write_moment_tracks(
     found: Sequence[MomentTrack], readings: Path, known: KnownOptions, outputs: TrackOutputs
 ) -> None:
-    """Print the moments of one source or of several, and write what is asked for."""
+    """Print the moments of one source or of several, and write the outputs."""
     import numpy as np
 
     import magloc
@@ -115,7 +115,7 @@ def write_moment_tracks(
 
 
 def _entry_of_several(points: Sequence[TrackPoint]) -> dict[str, object]:
-    """One row of several sources, in the keys of one and of fixes of several."""
+    """Return the JSON entry of one row of several sources."""
     from magloc.localization.fit.results import values_of
 
     sources = [values_of(point, ("position_m", "moment_Am2", "covariance")) for point in points]
@@ -123,11 +123,11 @@ def _entry_of_several(points: Sequence[TrackPoint]) -> dict[str, object]:
 
 
 def _note(found: MomentTrack, determined: BoolArray, readings: Path, outputs: TrackOutputs) -> None:
-    """Say what does not fit, and refuse readings that determine nothing."""
+    """Print notes on the fit, and refuse readings that determine nothing."""
     if found.misfit:
         note(
             f"misfit: χ² {found.chi2:.0f} of {found.dof}; no dipole on this path explains the readings (path,"
-            " clock, another source, a body too near, or noise that is understated)"
+            " clock, another source, a body too near, or a stated noise that is too small)"
         )
     if not (outputs.json or outputs.jsonl):
         note(f"{determined.sum()} of {len(found)} rows with a moment")
@@ -136,6 +136,6 @@ def _note(found: MomentTrack, determined: BoolArray, readings: Path, outputs: Tr
 
 
 def print_consistency(lines: Iterable[str], *, jsonl: bool) -> None:
-    """Print how good a track is: below its table, or as notes beside its JSON lines."""
+    """Print the consistency of a track below its table, or on stderr beside its JSON lines."""
     for line in lines:
         note(line, always=True) if jsonl else print(line)

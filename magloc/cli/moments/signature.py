@@ -1,4 +1,4 @@
-"""``magloc signature``: permanent and induced moment of a ship that passes on known courses."""
+"""``magloc signature``: permanent and induced moment of a ship on known courses."""
 
 from __future__ import annotations
 
@@ -32,31 +32,32 @@ def signature(
 ) -> None:
     """Separate the permanent and the induced moment of a ship that passes on known courses.
 
-    In its axes forward, left, up (x, y, z) the moment is a permanent one, what the ambient field induces, and what eddy
-    currents make of its rate while the ship turns. What the headings do not tell apart is said; that the model does not
-    explain the readings is said too.
+    In the ship's axes forward, left, up (x, y, z) the moment is the sum of a permanent moment, of the moment that the
+    ambient field induces, and of that of eddy currents while the ship turns. The command reports what the headings do
+    not separate, and readings that the model does not explain.
 
     Parameters
     ----------
     readings : Path
-        Readings files (CSV), one for every pass, of one clock and in the order of time; or one of all passes.
+        Readings files (CSV), one for every pass, of one clock and in order of time; or one file of all passes.
     array : Path
-        Array file (TOML). Lasting errors of the sensors that it states are estimated along.
+        Array file (TOML). The constant errors of the sensors that it states are estimated too.
     object_path : list of Path
-        Path file (CSV) of every pass, or one for all: time_s,x_m,y_m,z_m and optionally the attitude qx,qy,qz,qw from
-        the ship's axes to the frame of the results. Without an attitude the ship is level, its bow along the course.
+        Path file (CSV) of every pass, or one for all: time_s,x_m,y_m,z_m and optionally the attitude qx,qy,qz,qw, from
+        the ship's axes to the frame of the results. Without an attitude the ship is level, with its bow along the
+        course.
     induced : {"diagonal", "symmetric", "none"}
-        Which components of the polarisability are estimated.
+        Components of the polarisability to estimate.
     eddy : bool
-        Estimate eddy currents: needs passes on which the ship turns or rolls.
+        Estimate eddy currents too; needs passes on which the ship turns or rolls.
     depth_m : list of float
-        Predict the field along the keel at these depths below the path, on four headings.
+        Depths below the path [m] at which to predict the field along the keel, on four headings.
     json : bool
         Print one JSON object in place of the table.
     known : KnownOptions
-        What is known of the sensors and of the ambient field.
+        Prior knowledge of the sensors and of the ambient field.
     error : PathErrorOptions
-        How wrong the paths may be.
+        Errors of the paths.
     common : CommonOptions
         Common options.
     """
@@ -99,5 +100,5 @@ def signature(
     if result.misfit:
         note(
             f"misfit: χ² {result.chi2:.0f} of {result.dof}; no such moment on these paths explains the readings (path,"
-            " attitude, clock, another source, a body too near, or noise that is understated)"
+            " attitude, clock, another source, a body too near, or a stated noise that is too small)"
         )

@@ -69,7 +69,7 @@ class TestResult:
         assert outcome.status == 0, outcome.err
         for words in ("rms of the modulus", "bias, x y z [nT]", "D, row z [%]", "time shift [s]", "1 is consistent"):
             assert words in outcome.out
-        assert "does not tell" in outcome.err
+        assert "does not determine" in outcome.err
         with (tmp_path / "calibrated.csv").open() as file:
             rows = list(csv.DictReader(file))
         modulus = np.array([math.hypot(*(float(row[f"field_{axis}_nT"]) for axis in "xyz")) for row in rows])

@@ -18,7 +18,7 @@ from adcs import quaternion
 from adcs.kalman.mekf import run_filter
 from adcs.satellite import dynamics
 from adcs.satellite.magnetic_control import BDot, HysteresisRods, b_dot_gain, detumbled
-from sims.attitude.simulation import advance, controlled, prepare
+from sims.attitude.simulation import advance, prepare, simulate_control
 from sims.experiments import accuracy
 from sims.experiments.b_dot import INERTIA_KGM2, Damping, Detumbling, detumbling
 from tests.adcs.filter_runs import settings, start_of
@@ -219,7 +219,7 @@ class TestRuns:
     def test_no_commands_beside_rods(self, few: Detumbling) -> None:
         with_rods = prepare(replace(few.runs.scenario, rods=HysteresisRods()), [0])
         with pytest.raises(ValueError, match=r"Input prepared must have no rods .*; instead received"):
-            controlled(with_rods, lambda record, row: np.zeros((1, 3)))
+            simulate_control(with_rods, lambda record, row: np.zeros((1, 3)))
 
     @pytest.mark.slow
     def test_of_forty_starts_at_ten_degrees_a_second(self) -> None:

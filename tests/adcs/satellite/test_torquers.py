@@ -13,7 +13,7 @@ from adcs.io.telemetry_files import telemetry_columns
 from adcs.kalman.mekf import run_filter
 from adcs.satellite.telemetry import Telemetry
 from arrays.io.csv import write_columns
-from sims.attitude.simulation import AttitudeRuns, moved, prepare
+from sims.attitude.simulation import AttitudeRuns, prepare, simulate_motion
 from sims.experiments import accuracy
 from tests.adcs.filter_runs import ANY_START, assert_as_readable, settings, start_of, tabletsat
 
@@ -26,7 +26,7 @@ def commanded() -> AttitudeRuns:
     scenario = replace(tabletsat(900.0), conditions=ANY_START)
     prepared = prepare(scenario, range(4))
     sign = np.where(np.arange(scenario.n_instants) // 50 % 2, 1.0, -1.0)
-    return moved(replace(prepared, torquers_Am2=np.tile(0.2 * sign[:, None] * [1.0, 0.0, 0.0], (4, 1, 1))))
+    return simulate_motion(replace(prepared, torquers_Am2=np.tile(0.2 * sign[:, None] * [1.0, 0.0, 0.0], (4, 1, 1))))
 
 
 def rms_deg(runs: AttitudeRuns) -> float:
@@ -37,13 +37,13 @@ def rms_deg(runs: AttitudeRuns) -> float:
 class TestKnownInput:
     def test_it_is_as_if_there_were_none(self, commanded: AttitudeRuns) -> None:
         none = np.zeros_like(commanded.torquers_Am2)
-        quiet = moved(replace(commanded.prepared, torquers_Am2=none))
+        quiet = simulate_motion(replace(commanded.prepared, torquers_Am2=none))
         assert rms_deg(commanded) < 1.1 * rms_deg(quiet)
         assert rms_deg(replace(commanded, torquers_Am2=none)) > 3.0 * rms_deg(quiet)
 
     def test_compiled_as_readable(self, commanded: AttitudeRuns) -> None:
         scenario = replace(commanded.scenario, duration_s=60.0)
-        runs = moved(replace(prepare(scenario, range(2)), torquers_Am2=commanded.torquers_Am2[:2, 20:81]))
+        runs = simulate_motion(replace(prepare(scenario, range(2)), torquers_Am2=commanded.torquers_Am2[:2, 20:81]))
         start, used = start_of(runs), settings("mag+sun", ["disturbance", "dipole"])
         assert_as_readable(runs, used, start)
 

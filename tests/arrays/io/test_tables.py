@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from arrays.io.tables import aligned, by_sigma
+from arrays.io.tables import align, by_sigma
 
 
 class TestBySigma:
@@ -32,4 +32,4 @@ class TestBySigma:
 
 
 def test_cells_stand_below_each_other() -> None:
-    assert aligned([["name", "x", "flags"], ["a", "12.5", ""]], left=1) == ["name     x  flags", "a     12.5"]
+    assert align([["name", "x", "flags"], ["a", "12.5", ""]], left=1) == ["name     x  flags", "a     12.5"]

@@ -140,7 +140,7 @@ class TestArrayFile:
         assert outcome.out.splitlines()[0].split()[:2] == ["sensor", "position"]
         assert len(outcome.out.splitlines()) == 7
         assert "40 of 40 rows used" in outcome.err
-        assert "not told by the readings" in outcome.err
+        assert "not determined by the readings" in outcome.err
         assert "common gain against the moment" in outcome.err
 
     @pytest.mark.parametrize("posed", [False, True])
@@ -149,7 +149,7 @@ class TestArrayFile:
         files = made(tmp_path, posed=posed)
         outcome = calibrated(run, files, truth=files.truth(moment=True))
         assert_recovered(files)
-        assert "not told" not in outcome.err
+        assert "not determined" not in outcome.err
 
     def test_self_calibration_with_trusted_sensors(self, run: Run, files: Files) -> None:
         nominal = read_array(files.array)

@@ -192,7 +192,7 @@ class TestWhatNobodyExpected:
 
     def test_want_of_memory_has_a_cure(self, capsys: pytest.CaptureFixture[str]) -> None:
         outcome = self.outcome(lambda: bytearray(2**62), capsys)
-        assert_refused(outcome, "found no memory left, expected fewer rows")
+        assert_refused(outcome, "the memory is full; use fewer rows")
 
     def test_warnings_of_other_libraries_are_not_shown(self, capsys: pytest.CaptureFixture[str]) -> None:
         outcome = self.outcome(lambda: np.log(np.zeros(1)), capsys)
@@ -267,6 +267,8 @@ class TestSignsOfLife:
 
     def told(self, monkeypatch: pytest.MonkeyPatch, *tokens: str, watched: bool, bar: bool = False) -> list[str]:
         """Notes of a command that waits for three of them, where there may be some."""
+        import tqdm  # noqa: F401 - a bar loads it, which takes longer than the first sign
+
         notes: list[str] = []
         seen = threading.Event()
 

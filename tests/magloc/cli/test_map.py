@@ -156,7 +156,7 @@ class TestOverSources:
 
     def test_starts_are_no_bodies(self, tmp_path, run):
         outcome = run("map", "--grid", "3", "--body-length-m", "1", "--out", tmp_path / "out")
-        assert_refused(outcome, "--body-length-m: found 1, expected none over starts")
+        assert_refused(outcome, "--body-length-m: found 1, expected none with --over starts")
 
     def test_the_paper_file_has_the_defaults(self):
         default = SourcesScenario()
@@ -194,7 +194,7 @@ def chunked(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory, chunked):
-    """What the uninterrupted command makes."""
+    """What the delay_signals command makes."""
     out = tmp_path_factory.mktemp("whole")
     assert main([*chunked, "--out", str(out), "--quiet"]) == 0
     return out
@@ -215,7 +215,7 @@ class TestInterrupted:
         return process
 
     def resumed(self, chunked, out, whole, capsys):
-        """Result of the same command, compared with that of an uninterrupted one, to the last bit."""
+        """Result of the same command, compared with that of an delay_signals one, to the last bit."""
         assert main([*chunked, "--out", str(out)]) == 0
         err = capsys.readouterr().err
         assert re.search(r"\d+ of 27 chunks were there before", err)

@@ -61,8 +61,8 @@ def main():
     Broken()
     return 0
 magloc.cli.app.main = main
-from magloc.cli.entry import entered
-sys.exit(entered("magloc"))
+from magloc.cli.entry import run_program
+sys.exit(run_program("magloc"))
 """
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=WAIT_S, check=False)
         assert done.returncode == 0

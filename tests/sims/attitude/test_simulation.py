@@ -16,12 +16,12 @@ from sims.attitude import simulation
 from sims.attitude.scenario import AttitudeScenario, StartConditions
 from sims.attitude.simulation import (
     AttitudeRuns,
-    Prepared,
+    PreparedRuns,
     _field_error,
-    moved,
     prepare,
     sense,
     simulate,
+    simulate_motion,
     start_estimates,
 )
 from tests.adcs.filter_runs import ANY_START, followed, tabletsat
@@ -80,7 +80,7 @@ class TestKernel:
     """Against adcs.satellite.dynamics, with a dipole and wheels that come to their limits."""
 
     @staticmethod
-    def prepared(n_runs: int, rods: HysteresisRods | None = None) -> Prepared:
+    def prepared(n_runs: int, rods: HysteresisRods | None = None) -> PreparedRuns:
         scenario = replace(tabletsat(100.0), conditions=ANY_START, start_rate_rad_s=0.02, rods=rods)
         satellite = replace(scenario.satellite, residual_dipole_Am2=(0.3, -0.2, 0.5))
         control = replace(satellite.control, torque_limit_Nm=2e-4, momentum_limit_Nms=3e-3)
@@ -94,7 +94,7 @@ class TestKernel:
     @pytest.mark.parametrize("n_runs", [1, 2, 4, 5, 9])
     def test_agrees_with_the_readable_steps(self, n_runs: int) -> None:
         prepared = self.prepared(n_runs)
-        found, expected = moved(prepared), followed(prepared)
+        found, expected = simulate_motion(prepared), followed(prepared)
         np.testing.assert_allclose(found.wheel_torque_Nm, expected.wheel_torque_Nm, rtol=0, atol=1e-15)
         for name in ("q", "w", "momentum_Nms"):
             np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=0, atol=1e-13)
@@ -103,12 +103,12 @@ class TestKernel:
 
     def test_neither_calls_nor_threads_change_it(self, monkeypatch: pytest.MonkeyPatch) -> None:
         prepared = self.prepared(20, HysteresisRods())
-        whole, threads = moved(prepared), core.threads()
+        whole, threads = simulate_motion(prepared), core.threads()
         monkeypatch.setattr(simulation, "_INSTANTS_A_CALL", 7)
         try:
             for n_threads in (1, 3):
                 core.set_threads(n_threads)
-                found = moved(prepared)
+                found = simulate_motion(prepared)
                 for name in ("q", "w", "momentum_Nms", "wheel_torque_Nm"):
                     np.testing.assert_array_equal(getattr(found, name), getattr(whole, name))
         finally:

@@ -9,7 +9,7 @@ import pytest
 
 import sims.experiments
 from adcs.io.scenario_files import read_scenario
-from sims.experiments.paper_tables import PAPER_ROWS, printed
+from sims.experiments.paper_tables import PAPER_ROWS, parse_value
 from tests.adcs.refusals import assert_refused
 from tests.command_line import refuse_constant
 
@@ -41,12 +41,12 @@ class TestPaper:
         [("5e-4", 5e-4, 5e-4), ("2e-2 (?)", 2e-2, 2e-2), ("3e-4…5e-3 (?)", 3e-4, 5e-3), ("80", 80.0, 80.0)],
     )
     def test_numbers(self, text, low, high):
-        number = printed(text)
+        number = parse_value(text)
         assert (number.text, number.low, number.high) == (text, low, high)
 
     def test_ratio(self):
-        assert printed("2e-2 (?)").ratio(4e-2) == pytest.approx(2.0)
-        wide = printed("3e-4…6e-4 (?)")
+        assert parse_value("2e-2 (?)").ratio(4e-2) == pytest.approx(2.0)
+        wide = parse_value("3e-4…6e-4 (?)")
         assert [wide.ratio(ours) for ours in (1e-4, 5e-4, 1.2e-3)] == pytest.approx([1 / 3, 1.0, 2.0])
 
     def test_every_row_can_be_run(self):

@@ -33,7 +33,7 @@ class TestGeology:
 
 class TestTargets:
     def test_within_the_bounds(self) -> None:
-        position, moment = TARGETS.drawn(4)
+        position, moment = TARGETS.draw(4)
         assert position.shape == moment.shape == (12, 3)
         assert (np.abs(position[:, :2]) <= [15.0, 10.0]).all()
         assert ((-position[:, 2] >= 0.3) & (-position[:, 2] <= 2.0)).all()
@@ -41,10 +41,10 @@ class TestTargets:
         assert ((strength >= 0.1) & (strength <= 30.0)).all()
 
     def test_gaps(self) -> None:
-        position, _ = TARGETS.drawn(4)
+        position, _ = TARGETS.draw(4)
         apart = np.linalg.norm(position[:, None, :2] - position[:, :2], axis=-1)
         assert apart[~np.eye(12, dtype=bool)].min() >= 5.0
 
     def test_no_room(self) -> None:
         with pytest.raises(ValueError, match="found room"):
-            Targets(50, (0.0, 10.0), (0.0, 10.0)).drawn(0)
+            Targets(50, (0.0, 10.0), (0.0, 10.0)).draw(0)
