@@ -115,9 +115,8 @@ def survey(
     refuse_not_positive(ground, "shortest_geology_m", "false_per_hectare")
     if not math.isfinite(ground.ground_m):
         raise InputError(f"--ground-m: found {ground.ground_m:g}, expected a finite number.")
-    used, known = known.on_earth(
-        known.select(arrays.read_sensors(array), array), readings[0]
-    )  # a survey works with one sensor
+    chosen = known.select(arrays.read_sensors(array), array)  # a survey works with one sensor
+    used, known = known.on_earth(chosen, readings[0])
     maps.refuse(known.place)
     where = None if known.place is not None and known.date is None else known.where
     frame = _map_frame(used, known.place, crs)
