@@ -104,4 +104,4 @@ class TestRefusals:
         only = Telemetry(time_s, gyro_rad_s=np.zeros((50, 3)))
         write_columns(telemetry_columns(only), tmp_path / "gyro.csv")
         outcome = adcs("calibrate", tmp_path / "gyro.csv", "--config", log / "scenario.toml")
-        assert_refused(outcome, "gyro.csv", "0 rows of the magnetometer", "20 or more")
+        assert_refused(outcome, "gyro.csv", "20 rows of the magnetometer", "instead received 0")
