@@ -50,6 +50,8 @@ def text_without_encoding(call: ast.Call) -> bool:
     name = call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
     if name not in OPENING or (whole := ast.unparse(call.func)) in NO_FILES:
         return False
+    if any(keyword.arg == "driver" for keyword in call.keywords):  # a raster
+        return False
     keywords = {keyword.arg: ast.unparse(keyword.value) for keyword in call.keywords}
     if name in {"run", "Popen"}:
         return whole.startswith("subprocess.") and bool(keywords.keys() & {"text", "universal_newlines"})

@@ -19,7 +19,6 @@ import magloc
 from arrays.io.errors import LARGEST, InputError, naming, naming_options
 from arrays.io.outputs import refuse_unwritable
 from arrays.io.text import write_text
-from arrays.logs.format import log_origin
 from arrays.typing import Vector
 from magloc.ambient import Place
 from magloc.cli import framework
@@ -261,6 +260,8 @@ class KnownOptions:
             return array, self
         origin = columns.origin
         if origin is None:
+            from arrays.logs.format import log_origin
+
             origin = log_origin(log, columns)
             array = replace(array, columns=replace(columns, origin=origin))
             note(f"note: the origin of the world frame is the first place of {log}: {_degrees(origin)}")

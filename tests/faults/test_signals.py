@@ -189,7 +189,7 @@ def main():
         os.kill(os.getpid(), signal.SIGTERM)
         print("tidied", flush=True)
 """
-ENTER = "import sys; from magloc.cli.entry import entered; sys.exit(entered('greedy_program'))"
+ENTER = "import sys; from magloc.cli.entry import run_program; sys.exit(run_program('greedy_program'))"
 
 
 @pytest.mark.skipif(os.name != "posix", reason="needs signals")

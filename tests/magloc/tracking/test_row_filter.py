@@ -576,7 +576,7 @@ class TestSeveralSources:
                 largest_width=1.0,
                 largest_bend=largest_bend,
                 longest_memory=10,
-                largest_growth=1.5,
+                largest_growth=0.0,  # predictions are straight, as those of the steps below
                 full_count=0,
                 least_share=0.02,
                 state=now.problem,
