@@ -1,4 +1,4 @@
-"""The ambient field of a readings file's rows, from wherever it is known."""
+"""Ambient field of each row of readings: from the readings, the array file or the geomagnetic model."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ _LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Place:
-    """Where and when the geomagnetic field is wanted.
+    """Place and date for the geomagnetic field.
 
     Attributes
     ----------
     latitude_deg, longitude_deg, height_m : float
-        Geodetic; above the WGS-84 ellipsoid.
+        Geodetic coordinates; the height is above the WGS-84 ellipsoid.
     date : str
-        ISO 8601.
+        Date in ISO 8601, such as 2026-11-21.
     """
 
     latitude_deg: float
@@ -38,7 +38,7 @@ class Place:
 
 
 def in_world_field(readings: Readings, array: SensorArray) -> Readings:
-    """Readings with the ambient field of every row where the array states that of the world, and they have none."""
+    """Return readings with the array's world ambient field in each row, unless they have one already."""
     if array.ambient_world_T is None or readings.ambient_T is not None:
         return readings
     if readings.array_rotation is None:
@@ -54,10 +54,10 @@ def in_world_field(readings: Readings, array: SensorArray) -> Readings:
 def with_ambient_field(
     array: SensorArray, readings: Readings, place: Place | None, *, gradient: bool
 ) -> tuple[SensorArray, NDArray[np.float64] | None]:
-    """The array with the ambient field that its readings were taken in, and that of every row if it differs.
+    """Return the array with its ambient field, and the field of every row if it differs between rows.
 
-    The readings' own columns come first, then the array file, then the geomagnetic model. Its axes, east, north and up,
-    are those of the world frame, and of the array if the readings do not have its pose.
+    The readings' own columns take precedence, then the array file, then the geomagnetic model. The model's axes are
+    east, north and up: the axes of the world frame, or of the array if the readings have no pose.
     """
     readings = in_world_field(readings, array)
     model_T = gradient_T_m = None
@@ -101,7 +101,7 @@ def with_ambient_field(
 
 
 def _turns(readings: Readings) -> bool:
-    """Whether the array turns between the rows, by more than a milliradian."""
+    """Return True if the array turns by more than a milliradian between the rows."""
     if readings.array_rotation is None:
         return False
     rotations = readings.array_rotation.as_quat()

@@ -88,7 +88,7 @@ class Design:
 
     @property
     def worst_is_bounded(self) -> bool:
-        """True if the worst case found is of the size of the others, not a loss of rank."""
+        """True if the worst case found is comparable to the other σ, so that it is no loss of rank."""
         return self.worst_m < _UNBOUNDED * self.judged[0].criterion_m
 
     @property

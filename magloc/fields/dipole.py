@@ -7,8 +7,8 @@ A dipole of moment m at the position p (the source) is seen from a point s. With
     (2)  B = A(d) m,  A(d) = k (3 n n^T - I)/r^3
     (3)  G = dB/ds = (3k/r^4) [(n.m) I + n m^T + m n^T - 5 (n.m) n n^T]
 
-Everything is in SI units: metres, A m^2, tesla, T/m. Each argument is a vector in its last axis, and the leading axes
-of all arguments broadcast against each other, as in NumPy; all vectors share one Cartesian frame, whichever it is.
+Everything is in SI units: metres, A m^2, tesla, T/m. Each argument has vectors along its last axis. The leading axes of
+all arguments broadcast against each other, as in NumPy. All vectors share one Cartesian frame.
 
 Exactly on the source every function returns NaN for that point only, without an exception or a warning. Distances
 from 1e-75 m to 1e75 m neither overflow nor underflow, because each formula starts from the unit vector n.
@@ -32,12 +32,12 @@ _IDENTITY = np.eye(3)
 
 def field(points: ArrayLike, source: ArrayLike, moment: ArrayLike) -> Array:
     """
-    Induction B = k [3 (n.m) n - m]/r^3 of a dipole, equation (2).
+    Return the induction B = k [3 (n.m) n - m]/r^3 of a dipole, equation (2).
 
     Parameters
     ----------
     points : array_like, shape (..., 3)
-        Where the field is wanted, m.
+        Points of the field, m.
     source : array_like, shape (..., 3)
         Position of the dipole, m.
     moment : array_like, shape (..., 3)
@@ -60,14 +60,14 @@ def field(points: ArrayLike, source: ArrayLike, moment: ArrayLike) -> Array:
 
 def field_matrix(points: ArrayLike, source: ArrayLike) -> Array:
     """
-    Matrix A = k (3 n n^T - I)/r^3 that turns a moment into its field, B = A m, equation (2).
+    Return the matrix A = k (3 n n^T - I)/r^3 that gives the field of a moment, B = A m, equation (2).
 
     The field is linear in the moment, so A is also its Jacobian dB/dm. It is symmetric and traceless.
 
     Parameters
     ----------
     points : array_like, shape (..., 3)
-        Where the field is wanted, m.
+        Points of the field, m.
     source : array_like, shape (..., 3)
         Position of the dipole, m.
 
@@ -86,14 +86,14 @@ def field_matrix(points: ArrayLike, source: ArrayLike) -> Array:
 
 def gradient_tensor(points: ArrayLike, source: ArrayLike, moment: ArrayLike) -> Array:
     """
-    Gradient tensor G = dB/ds of the field of a dipole, equation (3): G[i, j] = dB_i/ds_j.
+    Return the gradient tensor G = dB/ds of the field of a dipole, equation (3): G[i, j] = dB_i/ds_j.
 
     It is symmetric (bit for bit) because the field has no curl, and traceless because it has no divergence.
 
     Parameters
     ----------
     points : array_like, shape (..., 3)
-        Where the gradient is wanted, m.
+        Points of the gradient, m.
     source : array_like, shape (..., 3)
         Position of the dipole, m.
     moment : array_like, shape (..., 3)
@@ -114,12 +114,12 @@ def gradient_tensor(points: ArrayLike, source: ArrayLike, moment: ArrayLike) -> 
 
 def field_jacobian(points: ArrayLike, source: ArrayLike, moment: ArrayLike) -> Array:
     """
-    Jacobian of the field with respect to the dipole's state (p, m): [dB/dp, dB/dm] = [-G, A].
+    Return the Jacobian of the field by the dipole's state (p, m): [dB/dp, dB/dm] = [-G, A].
 
     Parameters
     ----------
     points : array_like, shape (..., 3)
-        Where the field is observed, m.
+        Points of the field, m.
     source : array_like, shape (..., 3)
         Position p of the dipole, m.
     moment : array_like, shape (..., 3)
@@ -143,12 +143,12 @@ def field_jacobian(points: ArrayLike, source: ArrayLike, moment: ArrayLike) -> A
 
 def total_field(points: ArrayLike, sources: ArrayLike, moments: ArrayLike) -> Array:
     """
-    Induction of several dipoles together: the sum of their fields, equation (2).
+    Return the induction of several dipoles together: the sum of their fields, equation (2).
 
     Parameters
     ----------
     points : array_like, shape (..., 3)
-        Where the field is wanted, m.
+        Points of the field, m.
     sources : array_like, shape (..., K, 3)
         Positions of the K dipoles, m.
     moments : array_like, shape (..., K, 3)
@@ -183,12 +183,12 @@ def total_field(points: ArrayLike, sources: ArrayLike, moments: ArrayLike) -> Ar
 
 
 def _field_matrix(n: Array, r: Array) -> Array:
-    """:func:`field_matrix` of directions (..., 3) and distances (..., 1)."""
+    """Return :func:`field_matrix` for directions (..., 3) and distances (..., 1)."""
     return (MU0_OVER_4PI / (r * r * r))[..., None] * (3.0 * _outer(n, n) - _IDENTITY)
 
 
 def _gradient_tensor(n: Array, r: Array, m: Array) -> Array:
-    """:func:`gradient_tensor` of moments (..., 3), at directions (..., 3) and distances (..., 1)."""
+    """Return :func:`gradient_tensor` of moments (..., 3) for directions (..., 3) and distances (..., 1)."""
     radial = _dot(n, m)[..., None, None]
     mixed = _outer(n, m)
     shape = radial * _IDENTITY + (mixed + mixed.mT) - 5.0 * radial * _outer(n, n)
@@ -196,19 +196,19 @@ def _gradient_tensor(n: Array, r: Array, m: Array) -> Array:
 
 
 def _direction_and_distance(points: ArrayLike, source: ArrayLike) -> tuple[Array, Array]:
-    """Unit vectors (..., 3) and distances (..., 1) from the source to the points, NaN on the source."""
+    """Return unit vectors (..., 3) and distances (..., 1) from the source to the points; NaN on the source."""
     d = _vectors("points", points) - _vectors("source", source)
     r = np.sqrt(_dot(d, d))[..., None]
-    # NaN in place of zero spreads quietly through the arithmetic that follows; 0/0 would warn.
+    # NaN propagates without a warning; 0/0 would warn.
     r = np.where(r > 0.0, r, np.nan)
     return d / r, r
 
 
 def _dot(a: Array, b: Array) -> Array:
-    """Scalar products a.b, shape (...)."""
+    """Return scalar products a.b, shape (...)."""
     return np.vecdot(a, b)
 
 
 def _outer(a: Array, b: Array) -> Array:
-    """Outer products a b^T, shape (..., 3, 3)."""
+    """Return outer products a b^T, shape (..., 3, 3)."""
     return a[..., :, None] * b[..., None, :]
