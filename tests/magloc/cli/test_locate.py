@@ -182,7 +182,7 @@ class TestTable:
         outcome = run("locate", readings, "--array", array, "--json")
         factor = results_of(outcome)[0]["body_factor"]
         assert (
-            "note: in 2 of 3 rows the source counts as a point: were it a body of a quarter of its distance"
+            "note: in 2 of 3 rows the source counts as a point: for a body as long as a quarter of its distance"
             in outcome.err
         )
         assert factor > 1.5
