@@ -52,7 +52,7 @@ class Design:
     fitted_m, start_m : float
         Criterion on the large sample: of the design, and of the best of its starts.
     converged : bool
-        Whether the descent to the design converged.
+        True if the descent to the design converged.
     n_converged, n_descents : int
         Numbers of converged and of all descents from refined starts.
     judged : tuple of Judgement

@@ -103,7 +103,7 @@ def _check_answer(scheduler: str, timeout_s: float) -> None:
     from distributed import Security, rpc
 
     try:
-        by_tls = Security().get_connection_args("client")  # of dask's own configuration
+        by_tls = Security().get_connection_args("client")  # TLS settings in dask's own configuration
     except OSError as error:
         raise InputError(f"Input scheduler {scheduler}: dask's certificates cannot be read ({error}).") from None
     if scheduler.startswith("tls:") and by_tls["ssl_context"] is None:

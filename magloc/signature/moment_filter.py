@@ -34,7 +34,7 @@ ROWS_TO_START_ANEW = 3
 _TOLERANCE = 1e-4
 _SHRINK = 0.5
 _MOST_ITERATIONS = 50
-# Passes over a record, until its last state changes by less than a share of its σ.
+# Largest number of passes over a record; they end when the last state changes by less than a share of its σ.
 _MOST_PASSES = 20
 _SETTLED = 1e-2
 

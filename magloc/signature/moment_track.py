@@ -100,7 +100,7 @@ class MomentTrack(TrackColumns):
     dof : int
         Its degrees of freedom.
     is_smoothed : bool
-        Whether later rows were used too.
+        True if later rows were used too.
 
     Examples
     --------
@@ -393,7 +393,7 @@ def _points(model: MomentModel, steps: Sequence[MomentStep], k: int, *, smooth: 
                 nis_dof=model.rows[i].z.size,
                 status=step.status if known else "not determined: the readings so far do not tell the whole moment",
                 centroid_m=row.origin_m + row.R_world_from_array @ array.centroid,
-                radius_m=array.circumradius or 1.0,  # where one sensor has none: only a unit of ranges
+                radius_m=array.circumradius or 1.0,  # a unit of ranges; a single sensor has no circumradius
             )
         )
     return points

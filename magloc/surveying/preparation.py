@@ -21,11 +21,11 @@ from magloc.surveying.pose_components import UNSTATED
 
 _LOG = logging.getLogger(__name__)
 FEWEST_ROWS = 20
-_MOST_APART = 2.0  # ratio of fields of places on one survey; more means another unit
-_LEAST_DEPTH_M, _LOWEST = 0.1, 0.1  # from the sensor to the shallowest sources: least, and quantile of its heights
+_MOST_APART = 2.0  # largest ratio of fields in one survey; more means another unit
+_LEAST_DEPTH_M, _LOWEST = 0.1, 0.1  # least distance to the shallowest sources; quantile of the sensor's heights
 _LEAST_JITTER_M = 0.01
-_BASE_STEP, _BASE_NOISE_T = 0.4, 1e-10  # usual step of a base's rows over the depth of its sources, and its noise
-_LONG_GAP, _LONG_GAP_S = 5.0, 30.0  # long gap of a base: over its usual step, and at least
+_BASE_STEP, _BASE_NOISE_T = 0.4, 1e-10  # usual step of a base's rows relative to the depth of sources, and its noise
+_LONG_GAP, _LONG_GAP_S = 5.0, 30.0  # shortest long gap of a base, in usual steps and in seconds
 _FASTEST_M_S = 300.0
 _BLOCK = 2**18  # rows per block
 _LONGEST_RUN = 25  # equal readings in a run, relative to the mean run of the best sensor
@@ -34,11 +34,10 @@ _LONGEST_RUN = 25  # equal readings in a run, relative to the mean run of the be
 def whole_rows(
     array: SensorArray, readings: Readings, base: Readings | None = None, shallowest_m: float = 0.0
 ) -> tuple[SensorArray, Readings]:
-    """Return the rows with readings of all sensors.
+    """Return the rows with readings of all sensors, and the array.
 
-    Sensors that would cost too many rows are left out.
-
-    Their ambient field varies like the modulus at a base station. No source is above `shallowest_m`.
+    Sensors that miss too many rows are left out. The ambient field varies like the modulus at a base station. No source
+    is above `shallowest_m`.
     """
     if readings.array_rotation is None:
         raise ValueError("Input readings must have the pose of the array in every row; instead received none.")
@@ -106,7 +105,7 @@ def _unusable(array: SensorArray, readings: Readings, shallowest_m: float) -> tu
     assert readings.array_rotation is not None
     blocks = [readings.values_T[first : first + _BLOCK] for first in range(0, max(len(readings), 1), _BLOCK)]
     stuck = np.concatenate([stuck_readings(array, values) for values in blocks])
-    moduli = np.concatenate([_moduli(array, values) for values in blocks])  # which no attitude changes
+    moduli = np.concatenate([_moduli(array, values) for values in blocks])  # independent of the attitude
     moduli[stuck] = np.nan
     wild = np.zeros(moduli.shape, np.bool_)
     jitter_m = _jitter_m(array, readings)

@@ -29,7 +29,7 @@ from magloc.surveying.tiled import TiledSurvey
 from magloc.surveying.tiles import assign_sources
 
 _LOG = logging.getLogger(__name__)
-_TRIALS = 1.25  # independent trials of a map, over its area in squared distances to the shallowest sources: 1.0 to 1.4
+_TRIALS = 1.25  # independent trials per area of a map, in squared distances to the shallowest sources: 1.0 to 1.4
 _HECTARE_M2 = 1e4
 _MOST_SWEEPS = 5
 _MISFIT = 2.0
@@ -152,7 +152,7 @@ def survey(
                     break
             return tiled, due
 
-        # Strong sources beside a tile hide all others until they are known.
+        # Strong sources beside a tile mask all others until they are known.
         tiled, lag = settle(tiled, strongest_sources)[0].correct_lag(assumed)
         if lag.s:
             _LOG.warning(
