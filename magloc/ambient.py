@@ -73,13 +73,13 @@ def with_ambient_field(
     scalar = bool(array.channel_is_scalar.any())
     if scalar and readings.ambient_T is None and array.ambient_T is not None and _turns(readings):
         raise InputError(
-            "key ambient_nT of the array file: found an array that turns, for which it is not constant; expected"
+            "key ambient_nT of the array file: found readings of an array that rotates, expected one at rest. State"
             " ambient_world_nT, columns ambient_x_nT and so on in the readings, or place and date."
         )
     if scalar and array.common_field_T is not None:
         _LOG.warning(
-            "common_field_nT stands for one offset of all moduli; how a change of the ambient field differs"
-            " between scalar sensors is not modelled"
+            "common_field_nT is one offset of all moduli: differences between scalar sensors in a change of the ambient"
+            " field are not modelled"
         )
     if readings.ambient_T is not None or array.ambient_T is not None:
         if place is not None and not gradient:
@@ -90,11 +90,11 @@ def with_ambient_field(
         if scalar:
             _LOG.warning(
                 "no ambient field is known (ambient_x_nT and so on in the readings, ambient_nT or ambient_world_nT in"
-                " the array file, or place and date): moduli are taken as those of the source alone"
+                " the array file, or place and date): moduli count as those of the source alone"
             )
         return array, None
     if scalar and not array.row_ambient_uncertainty_T:
-        _LOG.info("note: the geomagnetic model is taken as exact; crust and storms make it wrong by some 100 nT")
+        _LOG.info("note: the geomagnetic model counts as exact; crust and storms add errors of about 100 nT")
     if readings.array_rotation is None:
         return array.in_ambient_field(model_T), None
     return array, readings.array_rotation.inv().apply(model_T)

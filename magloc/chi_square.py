@@ -149,7 +149,7 @@ def check_differences(n: int, least: int, what: str) -> None:
     """Raise ValueError if an array gives fewer than the least number of independent differences."""
     if n < least:
         raise ValueError(
-            f"Input array must give {least} independent differences at least for {what}; instead it gives {n}."
+            f"Input array must give at least {least} independent differences for {what}; instead it gives {n}."
         )
 
 

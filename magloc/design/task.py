@@ -218,7 +218,7 @@ class _Sensors(Table, kw_only=True):
             raise RefusalError(
                 "count",
                 f"found {self.count}, expected {least} to {_MOST_SENSORS} {self.kind} sensors,"
-                " which give the six differences that a position and a moment take",
+                " which give the six differences that a position and a moment need",
             )
         if self.kind == "scalar" and not any(self.ambient_nT or ()):
             raise RefusalError("ambient_nT", "found none, expected the ambient field of scalar sensors")

@@ -269,9 +269,7 @@ def _arrays_of_same_map(cube: CubeMap, group: zarr.Group, path: Path) -> dict[st
     try:
         arrays = {name: group[name] for name in (*cube.variables, SECONDS_OF_CHUNK)}
     except UNREADABLE:
-        raise InputError(
-            f"{path}: found a map of which a part is missing: remove it, or choose another folder."
-        ) from None
+        raise InputError(f"{path}: found an incomplete map: remove it, or choose another folder.") from None
     return arrays
 
 

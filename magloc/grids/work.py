@@ -83,8 +83,8 @@ def _pooled(pool: ProcessPoolExecutor, ahead: int, work: Callable[[Any], Any], i
             yield from [future.result() for future in done]
     except BrokenProcessPool:
         raise InputError(
-            "a process died, for want of memory perhaps: ask for fewer processes. A script of your own has to start"
-            " its work below `if __name__ == '__main__':`, as processes import it."
+            "a process died, perhaps because memory ran out: use fewer processes. Your own script must start its work"
+            " below `if __name__ == '__main__':`, because the processes import it."
         ) from None
 
 

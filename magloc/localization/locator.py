@@ -431,7 +431,7 @@ def used_rows(
     """Return the rows to fit, the array with their noise, and saturated channels of each row."""
     rows = in_world_field(without_saturated(readings, array), array)
     if rows.background:
-        _LOG.warning("a row on its own has no background: filters take it out, and with it some of the signal")
+        _LOG.warning("fits of single rows do not model a background: filters remove it, with some of the signal")
         values_T = rows.background.taken_out(rows.time_s, rows.values_T)
         rows = replace(rows, values_T=values_T, background=NO_BACKGROUND)
     if not average:

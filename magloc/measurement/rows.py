@@ -223,7 +223,7 @@ def _concatenate_columns(parts: Sequence[FloatArray | None]) -> FloatArray | Non
 def check_spans(array: SensorArray) -> None:
     """Raise ValueError for a single sensor, which cannot determine a position."""
     if array.n_sensors < 2:
-        raise ValueError("Input array must have two sensors at least where no place is known; instead received one.")
+        raise ValueError("Input array must have at least two sensors if no position is known; instead received one.")
 
 
 def check_magnitudes(array: SensorArray) -> None:
@@ -236,9 +236,9 @@ def check_magnitudes(array: SensorArray) -> None:
         )
     if array.common_field_T is not None and array.common_field_T > 1e3:
         common_nT = 1e9 * array.common_field_T
-        raise ValueError(f"Input array must have a common field of 1e12 nT at most; instead received {common_nT:g} nT.")
+        raise ValueError(f"Input array must have a common field of at most 1e12 nT; instead received {common_nT:g} nT.")
     if not np.abs(array.ambient_fields).max() <= 1e3:
-        raise ValueError("Input array must have an ambient field of 1e12 nT at most; instead received a larger one.")
+        raise ValueError("Input array must have an ambient field of at most 1e12 nT; instead received a larger one.")
     fraction = float(array.noise_fractions.max())
     if fraction > 10.0:
-        raise ValueError(f"Input array must have a noise_fraction of 10 at most; instead: {fraction:g}.")
+        raise ValueError(f"Input array must have a noise_fraction of at most 10; instead received {fraction:g}.")

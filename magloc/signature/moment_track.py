@@ -350,9 +350,7 @@ def moment_model(
         for p in places:
             offset = row.row.R_world_from_array.T @ (p - row.row.origin_m) - array.positions
             if np.linalg.norm(offset, axis=1).min() <= _TOUCHING * array.circumradius:
-                raise ValueError(
-                    f"Input path must keep off the sensors; instead it has a place of a sensor: {p.tolist()}."
-                )
+                raise ValueError(f"Input path must not pass through a sensor; instead received {p.tolist()}.")
     begins = np.concatenate([np.arange(len(of_pass)) == 0 for of_pass in passes])
     return MomentModel(rows, np.concatenate(positions_m), basis, measurements.errors, path_error, turn_rad_s, begins)
 

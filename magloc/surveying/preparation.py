@@ -50,13 +50,15 @@ def whole_rows(
     whole = np.asarray(~missing[:, kept].any(axis=1))
     for i, sensor in enumerate(array.sensors):
         if i not in kept:
-            why = "sticks" if stuck[:, i].any() else "lacks readings"
+            why = "is stuck" if stuck[:, i].any() else "lacks readings"
             _LOG.warning(f"sensor {sensor.id} {why} in {missing[:, i].sum()} of {len(missing)} rows and is left out")
         elif stuck[:, i].any():
-            _LOG.warning(f"sensor {sensor.id} sticks in {stuck[:, i].sum()} of {len(missing)} rows, which are left out")
+            _LOG.warning(
+                f"sensor {sensor.id} is stuck in {stuck[:, i].sum()} of {len(missing)} rows, which are left out"
+            )
     if (counts := wild[:, kept].sum(axis=0)).any():
         each = ", ".join(f"{n} of sensor {array.sensors[i].id}" for i, n in zip(kept, counts, strict=True) if n)
-        _LOG.warning(f"readings leap and come back: {counts.sum()} in all, {each}; their rows are left out")
+        _LOG.warning(f"spikes in the readings: {counts.sum()} in all, {each}; their rows are left out")
     if whole.sum() < FEWEST_ROWS:
         raise ValueError(f"Input readings must have {FEWEST_ROWS} whole rows or more; instead received {whole.sum()}.")
     if len(kept) < array.n_sensors:
@@ -83,8 +85,8 @@ def with_places_between_fixes(array: SensorArray, readings: Readings) -> tuple[S
         return array, readings
     n = len(readings)
     _LOG.warning(
-        f"places stand still in {found.held} of {n} rows, between fixes that come {found.rate_Hz:.3g} times a second:"
-        " interpolated between fixes" + (f", and the last {n - found.end} rows left out" if found.end < n else "")
+        f"places do not change in {found.held} of {n} rows: they are interpolated between fixes at"
+        f" {found.rate_Hz:.3g} Hz" + (f", and the last {n - found.end} rows are left out" if found.end < n else "")
     )
     error_m = found.error_m if readings.interpolated_m is None else np.maximum(found.error_m, readings.interpolated_m)
     poses = {"array_position_m": found.position_m, "array_rotation": found.rotation, "interpolated_m": error_m}
@@ -100,7 +102,7 @@ def _some(readings: Readings, which: BoolArray) -> Readings:
 
 
 def _unusable(array: SensorArray, readings: Readings, shallowest_m: float) -> tuple[BoolArray, BoolArray, BoolArray]:
-    """Return readings (n, N) that stick, those that leap, and all that are unusable."""
+    """Return readings (n, N) that are stuck, spikes, and all unusable readings."""
     assert readings.array_position_m is not None
     assert readings.array_rotation is not None
     blocks = [readings.values_T[first : first + _BLOCK] for first in range(0, max(len(readings), 1), _BLOCK)]
@@ -155,7 +157,7 @@ def leaping_rows(readings: Readings) -> BoolArray:
     leaps = way > _FASTEST_M_S * np.diff(time_s)
     wild = np.concatenate([[False], leaps[1:] & leaps[:-1], [False]])
     if wild.any():
-        _LOG.warning(f"{wild.sum()} places leap and come back: their rows are left out")
+        _LOG.warning(f"spikes in the places: {wild.sum()}; their rows are left out")
     left = np.flatnonzero(leaps & ~wild[1:] & ~wild[:-1])
     if left.size:
         k = int(left[0])
@@ -185,8 +187,7 @@ def vary_with_base(ambient_T: FloatArray, time_s: FloatArray, base: Readings) ->
     if not len(read) or time_s[0] < read.time_s.min() or time_s[-1] > read.time_s.max():
         ends = f"{read.time_s.min():.15g} to {read.time_s.max():.15g} s" if len(read) else "nothing"
         raise ValueError(
-            f"Input base must read from {time_s[0]:.15g} to {time_s[-1]:.15g} s, as the survey does; instead received"
-            f" {ends}."
+            f"Input base must cover the survey from {time_s[0]:.15g} to {time_s[-1]:.15g} s; instead received {ends}."
         )
     _warn_of_gap(time_s, read)
     there, modulus = vectors_at(time_s, read.time_s, read.values_T), np.linalg.norm(ambient_T, axis=1, keepdims=True)
@@ -208,7 +209,7 @@ def _usable_base(base: Readings) -> Readings:
     place_m[:, 0] = read.time_s * (_BASE_STEP / step_s)
     wild = wild_readings(read.values_T[:, 0], place_m, 1.0, _BASE_NOISE_T, 0.0)
     if wild.any():
-        _LOG.warning(f"{wild.sum()} readings of the base station leap and come back, and are left out")
+        _LOG.warning(f"spikes in the readings of the base station: {wild.sum()}; they are left out")
     return _some(read, ~wild)
 
 

@@ -162,7 +162,7 @@ def survey(
             tiled, _ = settle(tiled, strongest_sources)
         tiled, due = settle(tiled, significant_sources)
         if due:
-            _LOG.warning(f"{len(due)} of {len(every)} tiles do not agree with others on what lies beside them")
+            _LOG.warning(f"{len(due)} of {len(every)} tiles differ from their neighbours in the sources at their edges")
         if assumed:
             tiled = tiled.with_likeliest_pose()
         results = tiled.map_tiles(measure_targets, each, tell)
@@ -172,7 +172,7 @@ def survey(
     if chi2_per_dof > _MISFIT:
         _LOG.warning(
             f"χ² per reading is {chi2_per_dof:.1f}: noise, errors of the pose or changes of the field are larger than"
-            " is stated, and so are the errors of the targets"
+            " stated, and so are the errors of the targets"
         )
     return Survey(
         _targets(tiled, results),

@@ -29,7 +29,7 @@ QUANTITIES = STATE_QUANTITIES | {
     "dof": Quantity("1", "differences minus unknowns"),
     "weight": Quantity("1", "probability that the solution is the right one"),
     "n_sources": Quantity("1", "sources of the solution"),
-    "detected": Quantity("1", "whether the readings stand out of noise"),
+    "detected": Quantity("1", "whether the readings exceed noise"),
     "misfit": Quantity("1", "whether χ² is far beyond noise"),
     "body_length_m": Quantity("m", "length of the object that was taken into account, 0 for a point"),
     "body_factor": Quantity(

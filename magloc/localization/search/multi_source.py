@@ -42,7 +42,7 @@ _FAINT = 40.0
 _NEAR = 150.0
 _MOST_BY_ITSELF = 5
 _NOT_CONVERGED = "the search did not converge to a solution within the known region and largest moment"
-NOISE_ALONE = "noise alone explains the readings: no source stands out of it"
+NOISE_ALONE = "noise alone explains the readings: no source is significant"
 
 
 def most_sources(n_differences: int) -> int:
@@ -80,7 +80,7 @@ class MultiSourceSearch:
         whitening = whitenings_of(array, np.ones(array.n_channels, dtype=bool), np.zeros(array.n_channels))
         if whitening.n_differences < N_UNKNOWNS:
             raise ValueError(
-                f"Input array must give {N_UNKNOWNS} independent differences at least for a position and a moment;"
+                f"Input array must give at least {N_UNKNOWNS} independent differences for a position and a moment;"
                 f" instead it gives {whitening.n_differences}."
             )
         # A single source may be exactly determined: a solution without a degree of freedom.
@@ -88,8 +88,8 @@ class MultiSourceSearch:
         if n_sources is not None and not 1 <= n_sources <= most:
             allowed = "1" if most == 1 else f"between 1 and {most}"
             raise ValueError(
-                f"Input n_sources must be {allowed}, as an array of {whitening.n_differences} independent differences"
-                f" can tell no more, with {N_UNKNOWNS} unknowns a source; instead received {n_sources}."
+                f"Input n_sources must be {allowed}: {whitening.n_differences} independent differences determine no"
+                f" more, with {N_UNKNOWNS} unknowns per source; instead received {n_sources}."
             )
         self.array = array
         self.n_sources = n_sources
@@ -351,7 +351,7 @@ class _Levels:
         """Return the reason why a row has fewer sources, and the source that represents the closest pair."""
         n = len(q)
         reason = f"the readings support {n} source{'s' if n > 1 else ''}"
-        reason += "" if self.asked is None else f", {self.asked} were asked for"
+        reason += "" if self.asked is None else f", {self.asked} were requested"
         nothing = np.zeros(n, dtype=bool)
         if not np.isfinite(more.chi2[row, 0]):
             return reason, nothing
