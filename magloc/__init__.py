@@ -1,4 +1,4 @@
-"""Magnetic models, and the estimation of magnetic dipoles from the differences between sensors."""
+"""Location and tracking of magnetic dipoles by the differences between sensors."""
 
 from magloc.own_packages import refuse_foreign_packages
 

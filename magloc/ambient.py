@@ -1,4 +1,4 @@
-"""The ambient field of a readings file's rows, from wherever it is known."""
+"""Ambient field of each row of readings: from the readings, the array file or the geomagnetic model."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ _LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Place:
-    """Where and when the geomagnetic field is wanted.
+    """Place and date for the geomagnetic field.
 
     Attributes
     ----------
     latitude_deg, longitude_deg, height_m : float
-        Geodetic; above the WGS-84 ellipsoid.
+        Geodetic coordinates; the height is above the WGS-84 ellipsoid.
     date : str
-        ISO 8601.
+        Date in ISO 8601, such as 2026-11-21.
     """
 
     latitude_deg: float
@@ -38,7 +38,7 @@ class Place:
 
 
 def in_world_field(readings: Readings, array: SensorArray) -> Readings:
-    """Readings with the ambient field of every row where the array states that of the world, and they have none."""
+    """Return readings with the array's world ambient field in each row, unless they have one already."""
     if array.ambient_world_T is None or readings.ambient_T is not None:
         return readings
     if readings.array_rotation is None:
@@ -54,10 +54,10 @@ def in_world_field(readings: Readings, array: SensorArray) -> Readings:
 def with_ambient_field(
     array: SensorArray, readings: Readings, place: Place | None, *, gradient: bool
 ) -> tuple[SensorArray, NDArray[np.float64] | None]:
-    """The array with the ambient field that its readings were taken in, and that of every row if it differs.
+    """Return the array with its ambient field, and the field of every row if it differs between rows.
 
-    The readings' own columns come first, then the array file, then the geomagnetic model. Its axes, east, north and up,
-    are those of the world frame, and of the array if the readings do not have its pose.
+    The readings' own columns take precedence, then the array file, then the geomagnetic model. The model's axes are
+    east, north and up: the axes of the world frame, or of the array if the readings have no pose.
     """
     readings = in_world_field(readings, array)
     model_T = gradient_T_m = None
@@ -73,13 +73,13 @@ def with_ambient_field(
     scalar = bool(array.channel_is_scalar.any())
     if scalar and readings.ambient_T is None and array.ambient_T is not None and _turns(readings):
         raise InputError(
-            "key ambient_nT of the array file: found an array that turns, for which it is not constant; expected"
+            "key ambient_nT of the array file: found readings of an array that rotates, expected one at rest. State"
             " ambient_world_nT, columns ambient_x_nT and so on in the readings, or place and date."
         )
     if scalar and array.common_field_T is not None:
         _LOG.warning(
-            "common_field_nT stands for one offset of all moduli; how a change of the ambient field differs"
-            " between scalar sensors is not modelled"
+            "common_field_nT is one offset of all moduli: differences between scalar sensors in a change of the ambient"
+            " field are not modelled"
         )
     if readings.ambient_T is not None or array.ambient_T is not None:
         if place is not None and not gradient:
@@ -90,18 +90,18 @@ def with_ambient_field(
         if scalar:
             _LOG.warning(
                 "no ambient field is known (ambient_x_nT and so on in the readings, ambient_nT or ambient_world_nT in"
-                " the array file, or place and date): moduli are taken as those of the source alone"
+                " the array file, or place and date): moduli count as those of the source alone"
             )
         return array, None
     if scalar and not array.row_ambient_uncertainty_T:
-        _LOG.info("note: the geomagnetic model is taken as exact; crust and storms make it wrong by some 100 nT")
+        _LOG.info("note: the geomagnetic model counts as exact; crust and storms add errors of about 100 nT")
     if readings.array_rotation is None:
         return array.in_ambient_field(model_T), None
     return array, readings.array_rotation.inv().apply(model_T)
 
 
 def _turns(readings: Readings) -> bool:
-    """Whether the array turns between the rows, by more than a milliradian."""
+    """Return True if the array turns by more than a milliradian between the rows."""
     if readings.array_rotation is None:
         return False
     rotations = readings.array_rotation.as_quat()

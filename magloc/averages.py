@@ -1,4 +1,4 @@
-"""Rows of readings averaged: all of a record to one, or those of successive windows of time."""
+"""Averages of readings: over a whole record, or over successive windows of time."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ from magloc.readings import Readings, change_between_rows
 
 
 def average(readings: Readings) -> Readings:
-    """All complete rows of an array at rest averaged to one, at the mean time.
+    """Return the average of all complete rows of an array at rest, at the mean time.
 
-    Complete are the rows with every channel that any row has; a channel that no row has stays missing. Rows with less
-    are left out: the field common to all sensors changes from row to row, and cancels only between channels that are
-    averaged over the same rows. InputError if the array moves or the ambient field changes, or no row is complete.
+    A row is complete if it has every channel that any row has. A channel that no row has stays missing. Incomplete
+    rows are left out: the field common to all sensors changes from row to row, and it cancels only between channels
+    that are averaged over the same rows. Raises InputError if the array moves, the ambient field changes or no row is
+    complete.
     """
     change = change_between_rows(readings)
     if change is not None:
@@ -37,22 +38,22 @@ def average(readings: Readings) -> Readings:
 
 
 def complete_rows(readings: Readings) -> NDArray[np.bool_]:
-    """Rows with every channel that any row has."""
+    """Return which rows have every channel that any row has."""
     present = np.isfinite(readings.values_T)
     return np.asarray((present == present.any(axis=0)).all(axis=1))
 
 
 def averaging_array(array: SensorArray, readings: Readings) -> SensorArray:
-    r"""The array with the noise of :func:`average`'s row in place of that of a single row.
+    r"""Return the array with the noise of an averaged row (:func:`average`).
 
-    White noise, and the proportional noise with it, falls by :math:`\sqrt n` with n complete rows. Misalignments and
-    errors of the gains stay as they are: they are the same in every row, and no average removes them.
+    White noise and proportional noise fall by :math:`\sqrt n` with n complete rows. Misalignments and errors of the
+    gains do not change: they are the same in every row, and no average removes them.
     """
     return _less_noisy(array, math.sqrt(max(1, int(complete_rows(readings).sum()))))
 
 
 def window_averages(readings: Readings, window_s: float) -> Readings:
-    """Means of successive windows of time [s] that have a row, at the pose of the row in the middle of each."""
+    """Return the mean of every window of time [s] that has a row, at the pose of its middle row."""
     window = np.floor((readings.time_s - readings.time_s[0]) / window_s + 1e-9)
     _, first, count = np.unique(window, return_index=True, return_counts=True)
     middle = first + count // 2
@@ -71,13 +72,16 @@ def window_averages(readings: Readings, window_s: float) -> Readings:
 
 
 def window_averaging_array(array: SensorArray, readings: Readings, window_s: float) -> SensorArray:
-    """The array with the white noise of :func:`window_averages`' rows, by the median number of readings in one."""
+    """Return the array with the noise of the rows of :func:`window_averages`.
+
+    The median number of readings in a window decides.
+    """
     window = np.floor((readings.time_s - readings.time_s[0]) / window_s + 1e-9)
     return _less_noisy(array, float(np.sqrt(np.median(np.unique(window, return_counts=True)[1]))))
 
 
 def _less_noisy(array: SensorArray, root: float) -> SensorArray:
-    """The array with what is new in every row divided by the root of a number of rows."""
+    """Return the array with its white and proportional noise divided by the root of a number of rows."""
     own = (None if sensor.noise_fraction is None else sensor.noise_fraction / root for sensor in array.sensors)
     sensors = tuple(
         replace(sensor, noise_T=sensor.noise_T / root, noise_fraction=fraction)

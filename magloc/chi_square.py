@@ -17,7 +17,7 @@ from magloc.levels import CONSISTENCY, FALSE_ALARM
 
 
 def mean_bounds(degrees_of_freedom: int, level: float = CONSISTENCY) -> tuple[float, float]:
-    """Two-sided bounds of a χ² over its degrees of freedom."""
+    """Return two-sided bounds of χ² divided by its degrees of freedom."""
     if degrees_of_freedom <= 0:
         return math.nan, math.nan
     tail = 0.5 * (1.0 - level)
@@ -26,7 +26,7 @@ def mean_bounds(degrees_of_freedom: int, level: float = CONSISTENCY) -> tuple[fl
 
 
 def bounds99(degrees_of_freedom: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Two-sided 99 % bounds of χ² over its degrees of freedom; NaN where there are none."""
+    """Return two-sided 99 % bounds of χ² divided by its degrees of freedom; NaN without any."""
     dof = np.asarray(degrees_of_freedom, dtype=np.float64)
     known = np.where(dof > 0.0, dof, np.nan)
     return chdtri(known, 0.995) / known, chdtri(known, 0.005) / known
@@ -35,7 +35,7 @@ def bounds99(degrees_of_freedom: ArrayLike) -> tuple[FloatArray, FloatArray]:
 def exceeds(chi2: FloatArray, dof: IntArray, probability: float) -> BoolArray:
     """Return whether each χ² is above the quantile that noise exceeds with a probability; False for dof = 0."""
     largest = np.full(dof.shape, np.inf)
-    for n in set(dof.tolist()):  # inverse distributions take longer than all else of a test, and rows are alike
+    for n in set(dof.tolist()):  # The quantile is the slow part of a test, and most rows have the same number.
         largest[dof == n] = quantile(n, probability)
     return np.asarray(chi2 > largest)
 
@@ -47,16 +47,17 @@ def quantile(dof: int, probability: float) -> float:
 
 
 def square_columns(name: str, square: FloatArray, dof: NDArray[np.int64]) -> dict[str, Column]:
-    """Columns of a normalised square, its degrees of freedom, and its 99 % bounds."""
+    """Return columns of a normalised square, its degrees of freedom, and its 99 % bounds."""
     low, high = bounds99(dof)
     prefix = "" if name == "chi2" else f"{name}_"
     return {name: square, f"{prefix}dof": dof, f"{name}_low99": low * dof, f"{name}_high99": high * dof}
 
 
 def normalised_square(error: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Squared errors (..., N) in units of a covariance (..., N, N), shape (...): χ² of N numbers where it is right.
+    """Return normalised squared errors (...) of errors (..., N) with covariances (..., N, N).
 
-    NaN where the covariance is none, as that of a filter that has diverged.
+    They follow χ² with N degrees of freedom if the covariance is right. NaN if the matrix is not a valid covariance, as
+    after a filter has diverged.
     """
     with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
         scaled, solved = _solved(covariance, error[..., None])
@@ -64,9 +65,9 @@ def normalised_square(error: FloatArray, covariance: FloatArray) -> FloatArray:
 
 
 def error_factor(claimed: FloatArray, added: FloatArray) -> FloatArray:
-    """How many times their standard deviations errors are, rms, where a covariance (..., N, N) is added to theirs.
+    """Return the rms ratio of true to claimed standard deviations if errors have an added covariance (..., N, N).
 
-    NaN where the claimed covariance is none.
+    NaN if the claimed matrix is not a valid covariance.
     """
     with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
         sigma = np.sqrt(np.diagonal(claimed, axis1=-2, axis2=-1))
@@ -75,9 +76,9 @@ def error_factor(claimed: FloatArray, added: FloatArray) -> FloatArray:
 
 
 def _solved(covariance: FloatArray, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Columns (..., N, n) in units of standard deviations, and multiplied by the inverse of the correlations.
+    """Return columns (..., N, n) over the standard deviations, and their product with the inverse correlations.
 
-    States have mixed units: their correlations are well-conditioned. NaN where the covariance is none.
+    States have mixed units, but their correlations are well-conditioned. NaN if the matrix is not a valid covariance.
     """
     sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
     correlation = covariance / (sigma[..., :, None] * sigma[..., None, :])
@@ -91,18 +92,21 @@ def _solved(covariance: FloatArray, columns: FloatArray) -> tuple[FloatArray, Fl
 
 
 class Detector(Protocol):
-    """A statistic with a threshold, and the energy of a signal that it finds."""
+    """A test for a source: a threshold, and the energy that a signal needs to exceed it."""
 
     @property
     def threshold(self) -> float:
-        """Value of the statistic above which there is a source."""
+        """Value of the statistic above which a source is reported."""
 
     def required_energy(self, probability: float) -> float:
-        """Energy of a signal, in units of the noise's variance, that is found with a probability."""
+        """Return the energy of a signal, in units of the noise variance, that is found with a probability."""
 
 
 def energy_threshold(n_differences: int, false_alarm_rate: float = FALSE_ALARM) -> float:
-    r"""Quantile of :math:`\|z'\|^2 \sim \chi^2_k`: energy of k whitened differences that noise exceeds at a rate."""
+    r"""Return the energy of k whitened differences that noise exceeds at a rate.
+
+    It is a quantile of :math:`\|z'\|^2 \sim \chi^2_k`.
+    """
     if n_differences < 1:
         raise ValueError(f"Input n_differences must be at least 1; instead received {n_differences}.")
     check_share("false_alarm_rate", false_alarm_rate)
@@ -111,7 +115,7 @@ def energy_threshold(n_differences: int, false_alarm_rate: float = FALSE_ALARM) 
 
 @dataclass(frozen=True)
 class ChiSquareDetector:
-    r"""Energy in a space that is known beforehand: all differences, or the moments of a source of known position.
+    r"""Energy detector in a known space: all differences, or the moments of a source at a known position.
 
     Attributes
     ----------
@@ -124,36 +128,39 @@ class ChiSquareDetector:
 
     @property
     def threshold(self) -> float:
-        """Value of the energy above which there is a source."""
+        """Value of the energy above which a source is reported."""
         return energy_threshold(self.n_dimensions, self.false_alarm_rate)
 
     def probability(self, signal_energy: ArrayLike) -> FloatArray:
-        """Probability of detection: noncentral χ² beyond the threshold, for energies in units of the noise."""
+        """Return the probability of detection (noncentral χ²) of signal energies in units of the noise variance."""
         energy = np.asarray(signal_energy, dtype=np.float64)
         return 1.0 - chndtr(self.threshold, float(self.n_dimensions), energy)
 
     def required_energy(self, probability: float) -> float:
-        """Energy, in units of the noise, of a signal that is found with a probability above the false-alarm rate."""
+        """Return the energy of a signal, in units of the noise variance, that is found with a probability.
+
+        The probability must be above the false-alarm rate.
+        """
         check_probability(probability, self.false_alarm_rate)
         return float(chndtrinc(self.threshold, float(self.n_dimensions), 1.0 - probability))
 
 
 def check_differences(n: int, least: int, what: str) -> None:
-    """Refuse an array that gives fewer than the least number of differences for what is wanted."""
+    """Raise ValueError if an array gives fewer than the least number of independent differences."""
     if n < least:
         raise ValueError(
-            f"Input array must give {least} independent differences at least for {what}; instead it gives {n}."
+            f"Input array must give at least {least} independent differences for {what}; instead it gives {n}."
         )
 
 
 def check_share(name: str, value: float) -> None:
-    """Refuse a share that is not between 0 and 1."""
+    """Raise ValueError if a share is not between 0 and 1."""
     if not 0.0 < value < 1.0:
         raise ValueError(f"Input {name} must be between 0 and 1; instead received {value}.")
 
 
 def check_probability(probability: float, false_alarm_rate: float) -> None:
-    """Refuse a probability of detection that noise alone reaches."""
+    """Raise ValueError if a probability of detection is not between the false-alarm rate and 1."""
     if not false_alarm_rate < probability < 1.0:
         raise ValueError(
             f"Input probability must be between the false-alarm rate {false_alarm_rate:g} and 1;"

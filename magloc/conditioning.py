@@ -1,8 +1,8 @@
-"""What of readings is no signal: trends and slow fields, which tracks model, and mains hum, which is taken out.
+"""Removal of trends, slow fields and mains hum from readings.
 
-Filters run forwards and backwards over the whole record, so that nothing is delayed; they need rows at equal intervals
-without gaps. A column with a missing reading is refused, not interpolated. Users call the methods of
-:class:`magloc.readings.Readings`.
+Filters run forwards and backwards over the whole record, so that they cause no delay. They need rows at equal intervals
+without gaps. A column with a missing reading is refused, not interpolated. Tracks model trends and slow fields instead
+(:class:`Background`). Users call the methods of :class:`magloc.readings.Readings`.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ _EQUAL_INTERVAL_RTOL = 1e-3
 
 @dataclass(frozen=True)
 class Background:
-    """What every channel reads besides the source's field.
+    """Model of the background of every channel: a trend, or a slow field.
 
     Attributes
     ----------
     trend_about_s : float, optional
-        There is a straight line that is zero at this time.
+        The background is a straight line that is zero at this time [s].
     corner_Hz : float, optional
-        There is an offset, and what changes more slowly than this frequency.
+        The background is an offset and all changes slower than this frequency [Hz].
     """
 
     trend_about_s: float | None = None
@@ -38,7 +38,10 @@ class Background:
         return self.trend_about_s is not None or self.corner_Hz is not None
 
     def taken_out(self, time_s: FloatArray, values_T: FloatArray) -> FloatArray:
-        """Columns without it, and without what of the signal looks like it: to search in, or to look at."""
+        """Return columns without the background, for a search or a plot.
+
+        The part of the signal that looks like the background is lost too.
+        """
         if self.trend_about_s is not None:
             values_T = detrended(time_s, values_T)
         return values_T if self.corner_Hz is None else high_passed(time_s, values_T, self.corner_Hz)
@@ -48,22 +51,20 @@ NO_BACKGROUND = Background()
 
 
 def detrended(time_s: FloatArray, values_T: FloatArray) -> FloatArray:
-    """Every column without its straight line, its mean kept."""
+    """Return columns without their linear trends; the means stay."""
     values = values_T.copy()
     time = time_s - time_s.mean()
     for column in range(values.shape[1]):
         known = np.isfinite(values[:, column])
         if known.sum() < 2:
-            raise InputError(
-                "found a channel with fewer than two readings, expected two at least to take its trend out."
-            )
+            raise InputError("found a channel with fewer than two readings, expected at least two to remove its trend.")
         t = time[known] - time[known].mean()
         values[known, column] -= t * (t @ values[known, column]) / (t @ t)
     return values
 
 
 def high_passed(time_s: FloatArray, values_T: FloatArray, corner_Hz: float) -> FloatArray:
-    """Columns without what changes more slowly than a corner frequency: a Butterworth filter of second order."""
+    """Return columns after a high-pass filter: Butterworth, of second order."""
     from scipy.signal import butter  # a third of a second to import
 
     rate = _rate_Hz(time_s, values_T, corner_Hz, 1e6)
@@ -71,7 +72,7 @@ def high_passed(time_s: FloatArray, values_T: FloatArray, corner_Hz: float) -> F
 
 
 def without_hum(time_s: FloatArray, values_T: FloatArray, mains_Hz: float) -> FloatArray:
-    """Columns without the mains frequency and those of its harmonics that the rate of the rows shows."""
+    """Return columns without the mains frequency and its harmonics below half the rate of the rows."""
     from scipy.signal import iirnotch, tf2sos
 
     rate = _rate_Hz(time_s, values_T, mains_Hz, 2000.0)
@@ -81,7 +82,7 @@ def without_hum(time_s: FloatArray, values_T: FloatArray, mains_Hz: float) -> Fl
 
 
 def _rate_Hz(time_s: FloatArray, values_T: FloatArray, frequency_Hz: float, most: float) -> float:
-    """Rate of the rows, that is more than twice a frequency and at most so many times it."""
+    """Return the rate of the rows; raise InputError unless it is 2 to `most` times a frequency."""
     intervals = np.diff(time_s)
     interval = float(np.median(intervals)) if intervals.size else 0.0
     if not interval > 0.0 or np.any(np.abs(intervals - interval) > _EQUAL_INTERVAL_RTOL * interval):

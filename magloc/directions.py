@@ -10,12 +10,12 @@ _GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 
 
 def sphere_directions(n: int) -> FloatArray:
-    """Evenly spread directions over the whole sphere, shape (n, 3): a Fibonacci lattice, from +z to -z."""
+    """Return evenly spread directions over the whole sphere (n, 3): a Fibonacci lattice, from +z to -z."""
     return _fibonacci(n, -1.0)
 
 
 def _fibonacci(n: int, lowest: float) -> FloatArray:
-    """Lattice (n, 3) on the part of the unit sphere above z = lowest, each point with an equal area."""
+    """Return a lattice (n, 3) on the unit sphere above z = lowest, with the same area for every point."""
     i = np.arange(n)
     z = 1.0 - (1.0 - lowest) * (i + 0.5) / n
     radius = np.sqrt(1.0 - z * z)
@@ -23,21 +23,21 @@ def _fibonacci(n: int, lowest: float) -> FloatArray:
 
 
 def moments_on_sphere(moment_Am2: float, n: int = 50, *, half: bool = False) -> FloatArray:
-    """Moments of one size in evenly spread directions: a Fibonacci lattice.
+    """Return moments of one size in evenly spread directions: a Fibonacci lattice.
 
     Parameters
     ----------
     moment_Am2 : float
-        Their size [A·m²].
+        Size of the moments [A·m²].
     n : int
-        At least 1.
+        Number of moments, at least 1.
     half : bool
-        Cover half of the sphere, which is enough for bounds of vector sensors: they are the same for m and -m.
+        Cover half of the sphere. This is enough for bounds of vector sensors, which are the same for m and -m.
 
     Returns
     -------
     ndarray, shape (n, 3)
-        [A·m²]
+        Moments [A·m²].
 
     Raises
     ------
@@ -56,7 +56,7 @@ def moments_on_sphere(moment_Am2: float, n: int = 50, *, half: bool = False) -> 
 
 
 def fibonacci_directions(n: int) -> FloatArray:
-    """Nearly uniform unit vectors, shape (n, 3), on a Fibonacci spiral."""
+    """Return nearly uniform unit vectors (n, 3) on a Fibonacci spiral."""
     i = np.arange(n) + 0.5
     z = 1.0 - 2.0 * i / n
     azimuth = np.pi * (1.0 + np.sqrt(5.0)) * i
@@ -65,5 +65,5 @@ def fibonacci_directions(n: int) -> FloatArray:
 
 
 def hemisphere(n: int) -> FloatArray:
-    """Nearly uniform unit vectors (n, 3) with z > 0."""
+    """Return nearly uniform unit vectors (n, 3) with z > 0."""
     return fibonacci_directions(2 * n)[:n]

@@ -1,7 +1,7 @@
 r"""Damped least squares: the Levenberg-Marquardt iteration, for problems solved one at a time.
 
-The iteration is here, the problem is its user's: an iterate knows its cost, and what a damped step from it leads to.
-So a problem may eliminate nuisances, have priors and bounds, and limit its steps.
+This module has the iteration; the caller supplies the problem as an :class:`Iterate`, with its cost and its damped
+step. So a problem may eliminate nuisances, have priors and bounds, and limit its steps.
 
 Source: D. W. Marquardt, "An algorithm for least-squares estimation of nonlinear parameters", J. SIAM 11 (1963).
 """
@@ -19,18 +19,18 @@ from arrays.typing import FloatArray
 
 _LEAST_DAMPING, _LARGEST_DAMPING = 1e-9, 1e8
 _FACTOR = 10.0
-_ROUNDING = 1e-14  # of a cost
+_ROUNDING = 1e-14  # relative rounding error of a cost
 
 
 class Iterate(Protocol):
-    """Values of all unknowns, and the problem about them."""
+    """Values of all unknowns, with the problem that they belong to."""
 
     @property
     def cost(self) -> float:
-        """Sum of squares of residuals and priors; not finite where the unknowns have no meaning."""
+        """Sum of squares of residuals and priors; not finite if the unknowns are invalid."""
 
     def step(self, damping: float) -> tuple[Self, float]:
-        """Return the iterate after a damped step, and by how much the linearised problem promises to lower the cost."""
+        """Return the iterate after a damped step, and the decrease of the cost that the linearisation predicts."""
 
 
 Point = TypeVar("Point", bound=Iterate)
@@ -38,16 +38,16 @@ Point = TypeVar("Point", bound=Iterate)
 
 @dataclass(frozen=True, eq=False)
 class Optimum(Generic[Point]):
-    """Where an iteration ended.
+    """Result of :func:`minimise`.
 
     Attributes
     ----------
     point : Iterate
-        The best one.
+        Iterate with the lowest cost.
     iterations : int
-        Linearisations.
+        Number of linearisations.
     converged : bool
-        Whether the last step lowered the cost by no more than the tolerance, or promised to.
+        True if the last decrease of the cost, actual or predicted, is within the tolerance.
     """
 
     point: Point
@@ -64,19 +64,20 @@ def minimise(
     max_iterations: int = 100,
 ) -> Optimum[Point]:
     """
-    Return the optimum that damped steps from a start lead to: none of them raises the cost.
+    Return the optimum reached by damped steps from a start; no step raises the cost.
 
     Parameters
     ----------
     start : Iterate
     tolerance : callable
-        Of an iterate: by how much a step from it lowers the cost, or promises to, where the iteration ends.
+        Function of an iterate. The iteration ends when a step from it lowers the cost, or is predicted to lower it, by
+        no more than the returned value.
     damping : float
-        Of the first step, relative to the information about each unknown.
+        Damping of the first step, relative to the information about each unknown.
     last_damping : float
-        Largest damping of a step that may be the last one: more shortens steps, far from an optimum too.
+        Largest damping at which the iteration may end. With more damping steps are short far from an optimum too.
     max_iterations : int
-        Linearisations at most.
+        Largest number of linearisations.
     """
     point = start
     for iteration in range(1, max_iterations + 1):
@@ -97,16 +98,16 @@ def minimise(
 
 def damped_step(information: FloatArray, gradient: FloatArray, damping: float) -> tuple[FloatArray, float]:
     """
-    Return a step that lowers a cost, and by how much it promises to at least.
+    Return a damped step, and a lower bound of the decrease of the cost that it predicts.
 
     Parameters
     ----------
     information : ndarray, shape (n, n)
-        ``JᵀJ`` of the residuals' derivatives, and that of priors.
+        ``JᵀJ`` with the Jacobian of the residuals, plus the information of priors.
     gradient : ndarray, shape (n,)
-        ``Jᵀr``, half of that of the cost.
+        ``Jᵀr``, half of the gradient of the cost.
     damping : float
-        Share of its diagonal that is added to the information.
+        Multiple of the diagonal of the information that is added to it.
     """
     scale = 1.0 / np.sqrt(np.maximum(np.diagonal(information), np.finfo(np.float64).tiny))
     system = scale[:, None] * information * scale + damping * np.eye(len(scale))

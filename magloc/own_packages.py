@@ -1,4 +1,4 @@
-"""Refuse to run beside packages of other distributions that have the names of ours."""
+"""Check that no other distribution has installed a package with one of our names."""
 
 import os
 from importlib.util import find_spec
@@ -7,7 +7,7 @@ _HERE = os.path.dirname(os.path.dirname(os.path.realpath(__file__)))
 
 
 def refuse_foreign_packages() -> None:
-    """Raise an ImportError if `arrays` or `sims` is not the one that was installed with magloc."""
+    """Raise ImportError if `arrays` or `sims` was not installed with magloc."""
     for name in ("arrays", "sims"):
         spec = find_spec(name)
         path = "" if spec is None else spec.origin or "".join(list(spec.submodule_search_locations or ())[:1])

@@ -1,4 +1,4 @@
-"""Readings of an array row by row, and the files that hold them.
+"""Readings of an array, row by row, and readings files.
 
 A readings file is CSV with one row per instant: ``time_s``, then ``<id>_x_nT, <id>_y_nT, <id>_z_nT`` for every vector
 sensor and ``<id>_nT`` for every scalar sensor, in any order. An empty cell, or ``nan``, is a missing reading. Optional
@@ -7,7 +7,7 @@ array_z_m, array_qx, array_qy, array_qz, array_qw``), the ambient field in the a
 ambient_y_nT, ambient_z_nT``), velocities and rates (:mod:`magloc.navigation.measured_motion`), and standard deviations
 of the pose (``array_sigma_m, array_sigma_deg``).
 
-A fault of a file raises :class:`arrays.io.errors.InputError`: file, line, column, what was found, what was expected.
+A fault in a file raises :class:`arrays.io.errors.InputError`: file, line, column, value found, value expected.
 """
 
 from __future__ import annotations
@@ -45,23 +45,23 @@ _OPTIONAL_COLUMNS = (*POSITION_COLUMNS, *ROTATION_COLUMNS, *POSE_SIGMA_COLUMNS, 
 EXPECTED_HEADER = "a header with time_s and the sensors' columns"
 _ROW_SHAPES = {"time_s": (), "array_position_m": (3,), "ambient_T": (3,), "pose_sigma": (2,), "interpolated_m": ()}
 _T_IN_nT = 1e9
-_SIGMA_UNITS = np.array([1.0, np.pi / 180.0])  # of a pose's standard deviations, m and degrees
+_SIGMA_UNITS = np.array([1.0, np.pi / 180.0])  # A file has a pose's standard deviations in m and degrees.
 _SATURATION_RTOL = 1e-12
 _LARGEST_nT = LARGEST_T * _T_IN_nT
-_SAME_AMBIENT_RTOL = 1e-3  # change of the ambient field within which moduli may be averaged: 50 nT in 50 µT
+_SAME_AMBIENT_RTOL = 1e-3  # Moduli may be averaged if the ambient field changes by less: 50 nT in 50 µT.
 _SENSOR_COLUMN = re.compile(r"(?P<id>.+?)(_[xyz])?_nT")
 
 
 @dataclass(frozen=True, eq=False)
 class Readings:
-    """Raw readings of an array at n instants; iterating gives its rows, each as readings of length one.
+    """Raw readings of an array at n instants; iteration yields the rows as readings of length one.
 
     Attributes
     ----------
     values_T : ndarray, shape (n, C)
         Raw readings [T] in the array's channel order; NaN, masked or beyond 1e6 T where a reading is missing.
     time_s : ndarray, shape (n,), optional
-        Instants [s], durations, or dates (UTC) as seconds since 1970; by default one row a second from zero.
+        Instants [s], as durations or as dates (UTC, seconds since 1970). By default one row per second from zero.
     array_position_m : ndarray, shape (n, 3), optional
         Origin of the array's frame in the world frame [m].
     array_rotation : Rotation of n, optional
@@ -75,7 +75,7 @@ class Readings:
     interpolated_m : ndarray, shape (n,), optional
         Standard deviation along each axis that interpolation between fixes adds to the error of a position [m].
     background : Background
-        What of the values is said to be no signal, by :meth:`detrended` and :meth:`high_passed`.
+        Model of the part of the values that is no signal, from :meth:`detrended` and :meth:`high_passed`.
 
     Raises
     ------
@@ -98,7 +98,7 @@ class Readings:
 
     values_T: FloatArray
     _: KW_ONLY
-    time_s: FloatArray = None  # type: ignore[assignment]  # never None once it is made
+    time_s: FloatArray = None  # type: ignore[assignment]  # never None after __post_init__
     array_position_m: FloatArray | None = None
     array_rotation: Rotation | None = None
     ambient_T: FloatArray | None = None
@@ -136,19 +136,19 @@ class Readings:
 
     @classmethod
     def from_columns(cls, columns: Columns, array: SensorArray) -> Readings:
-        """Readings from a data frame, or any mapping, with the columns of a readings file.
+        """Return readings from a data frame, or any mapping, with the columns of a readings file.
 
         Parameters
         ----------
         columns : mapping or DataFrame
-            From the names of a file's columns, with their units, to numbers; NaN is a missing reading.
+            Maps the names of a file's columns, with their units, to numbers. NaN is a missing reading.
         array : SensorArray
-            Whose sensors the columns are.
+            Array whose sensors the columns belong to.
 
         Raises
         ------
         InputError
-            They are not the columns of this array's readings; the text names the row, counted from one, and column.
+            The columns are not those of this array's readings. The text names the column and the row, counted from one.
         """
         return readings_of_table(table_of_columns(columns, "the readings"), array, None)
 
@@ -156,7 +156,7 @@ class Readings:
         return len(self.values_T)
 
     def __getitem__(self, rows: int | slice | NDArray[np.bool_] | IntArray) -> Readings:
-        """Some rows; a single one as readings of length one."""
+        """Return selected rows; an integer gives readings of length one."""
         if isinstance(rows, (int, np.integer)):
             rows = np.arange(len(self))[[rows]]
 
@@ -179,9 +179,9 @@ class Readings:
         return (self[row] for row in range(len(self)))
 
     def detrended(self) -> Readings:
-        """Readings whose channels are said to have straight lines through their means that are no signal.
+        """Return readings with a linear trend of every channel declared as background.
 
-        Values stay as they are: a track has the slopes as unknowns, a fix of single rows takes the lines out first.
+        The values do not change. A track estimates the slopes; a fix of single rows removes the lines first.
 
         Raises
         ------
@@ -191,10 +191,10 @@ class Readings:
         return self._with(replace(self.background, trend_about_s=float(np.mean(self.time_s))))
 
     def high_passed(self, hz: float) -> Readings:
-        """Readings of which it is said that offsets, and what changes more slowly than a corner `hz`, are no signal.
+        """Return readings with offsets and changes slower than a corner frequency `hz` declared as background.
 
-        Values stay as they are: a track has an unknown random walk of every channel, as large as its noise at the
-        corner; a fix of single rows filters first, by a Butterworth of second order forwards and backwards.
+        The values do not change. A track estimates a random walk of every channel, as large as its noise at the corner.
+        A fix of single rows filters first, by a Butterworth filter of second order, forwards and backwards.
 
         Raises
         ------
@@ -204,21 +204,21 @@ class Readings:
         return self._with(replace(self.background, corner_Hz=hz))
 
     def _with(self, background: Background) -> Readings:
-        background.taken_out(self.time_s, self.values_T)  # or say why no filter could
+        background.taken_out(self.time_s, self.values_T)  # raises InputError if no filter can
         return replace(self, background=background)
 
     def without_hum(self, mains_hz: float) -> Readings:
-        """Readings without the mains frequency and those of its harmonics that the rate of the rows shows.
+        """Return readings without the mains frequency and its harmonics below half the rate of the rows.
 
         Raises
         ------
         InputError
-            As of :meth:`high_passed`.
+            For the same reasons as :meth:`high_passed`.
         """
         return replace(self, values_T=without_hum(self.time_s, self.values_T, mains_hz))
 
     def posed_later(self, latency_s: float) -> Readings:
-        """Readings with the poses that their rows have some time later [s], which were so much older than they."""
+        """Return readings with the poses of a later time, to correct poses that lag the readings by a latency [s]."""
         if self.pose is None:
             raise ValueError("Input readings must have a pose; instead received none.")
         (position_m, rotation), later_s = self.pose, self.time_s + latency_s
@@ -230,14 +230,14 @@ class Readings:
 
     @property
     def pose(self) -> tuple[FloatArray, Rotation] | None:
-        """Origin (n, 3) [m] and rotation of the array's frame in the world frame, if they are known."""
+        """Origin (n, 3) [m] and rotation of the array's frame in the world frame; None without a pose."""
         if self.array_position_m is None or self.array_rotation is None:
             return None
         return self.array_position_m, self.array_rotation
 
 
 def as_readings(values: Readings | ArrayLike) -> Readings:
-    """Readings as they are, or from values (n, C) or (C,) [T]."""
+    """Return readings unchanged, or make them from values (n, C) or (C,) [T]."""
     return values if isinstance(values, Readings) else Readings(np.atleast_2d(numbers(values)))
 
 
@@ -249,26 +249,26 @@ def read_readings(
     ordered: bool = False,
     still: bool = False,
 ) -> Readings:
-    """Readings of an array from a CSV file.
+    """Read the readings of an array from a CSV file.
 
     Parameters
     ----------
     path : str or path-like
         A readings file (CSV): fields in nT, times in s.
     array : SensorArray
-        Whose sensors the file must have, with a column for each channel.
+        Array whose sensors the file must have, with a column for each channel.
     sensors : sequence of str, optional
-        Ids of a subset of the array. Only their columns are read, and the columns of any other sensor are ignored;
-        without it such columns are an error.
+        Ids of a subset of the array. Only their columns are read; columns of other sensors are ignored. Without this
+        argument, columns of other sensors raise an error.
     ordered : bool
-        Refuse times that do not increase from row to row.
+        Raise an error if times do not increase from row to row.
     still : bool
-        Refuse an array that moves, and an ambient field that changes, as :func:`magloc.averages.average` does.
+        Raise an error if the array moves or the ambient field changes, as :func:`magloc.averages.average` does.
 
     Returns
     -------
     Readings
-        With the channels of ``array``, or of ``array.subset(sensors)``.
+        Readings with the channels of ``array``, or of ``array.subset(sensors)``.
 
     Raises
     ------
@@ -297,13 +297,13 @@ def read_readings(
 
 
 def log_format(array: SensorArray, sensors: Sequence[str] | None) -> LogFormat:
-    """How the text of a file or stream of some sensors, or of all, is read."""
+    """Return the format of a file or stream of readings of some or all sensors."""
     channels = {of.id: _columns_of(of) for of in array.sensors if sensors is None or of.id in sensors}
     return LogFormat(channels, array.columns, EXPECTED_HEADER, _OPTIONAL_COLUMNS)
 
 
 def readings_of_table(table: Table, array: SensorArray, sensors: Sequence[str] | None) -> Readings:
-    """Readings as :func:`read_readings`, from a table, which may have no row."""
+    """Return readings as :func:`read_readings` does, from a table, which may have no rows."""
     if sensors is not None:
         array = array.subset(sensors)
     channels = [f"{name}_nT" for name in array.channel_names]
@@ -312,7 +312,7 @@ def readings_of_table(table: Table, array: SensorArray, sensors: Sequence[str] |
 
 
 def readings_of_checked(table: Table, array: SensorArray) -> Readings:
-    """Readings of a table without dummies whose header is that of the array, as :func:`readings_of_table` has found."""
+    """Return readings of a table without dummies whose header :func:`readings_of_table` has checked."""
     channels = [f"{name}_nT" for name in array.channel_names]
     time_s = table.times()
     position_m = rotation = ambient_T = pose_sigma = None
@@ -341,9 +341,9 @@ def readings_of_checked(table: Table, array: SensorArray) -> Readings:
 
 
 def write_readings(path: str | PathLike[str], readings: Readings, array: SensorArray) -> None:
-    """Write a readings file whose columns the array names, replacing it.
+    """Write a readings file with the array's columns; an existing file is replaced.
 
-    Fields are written in nT with 15 significant digits, as many as a file had; the other numbers are written exactly.
+    Fields are written in nT with 15 significant digits, the other numbers exactly.
     """
     _check_channels(readings, array)
     header = ["time_s", *(f"{name}_nT" for name in array.channel_names)]
@@ -372,7 +372,7 @@ def write_readings(path: str | PathLike[str], readings: Readings, array: SensorA
 
 
 def change_between_rows(readings: Readings) -> tuple[str, int, str] | None:
-    """What keeps rows from being averaged, the first row that differs from row 0 in it, and what is expected."""
+    """Return why rows cannot be averaged, the first row that differs, and the expected input; None if they can."""
     ambient_T = readings.ambient_T
     if readings.pose is not None:
         pose = np.hstack([readings.pose[0], readings.pose[1].as_quat()])
@@ -388,9 +388,9 @@ def change_between_rows(readings: Readings) -> tuple[str, int, str] | None:
 
 
 def without_saturated(readings: Readings, array: SensorArray) -> Readings:
-    """The readings with NaN for every single one whose modulus reaches the ``saturation_T`` of its sensor."""
+    """Return readings with NaN for each value whose modulus reaches the ``saturation_T`` of its sensor."""
     _check_channels(readings, array)
-    # A limit and a reading that are written alike in two files may differ by their rounding.
+    # A limit and a reading with the same digits in two files may differ by their rounding.
     saturated = np.abs(readings.values_T) >= array.channel_saturation_T * (1.0 - _SATURATION_RTOL)
     return replace(readings, values_T=np.where(saturated, np.nan, readings.values_T))
 
@@ -442,7 +442,7 @@ def _columns_of(sensor: Sensor) -> list[str]:
 
 
 def _columns_of_other_kind(sensor: Sensor) -> list[str]:
-    """Columns that a sensor would have if it were of the other kind."""
+    """Return the columns that a sensor of the other kind would have."""
     return [f"{sensor.id}_nT"] if sensor.kind == "vector" else [f"{sensor.id}_{axis}_nT" for axis in "xyz"]
 
 

@@ -1,9 +1,9 @@
 r"""State-space filtering with square roots of covariances: predict, update, iterate, smooth.
 
-Generic: no magnetics in here. The covariance is carried as a square root S with :math:`P = S S^T`, so that it stays
-symmetric and positive semidefinite however small a measurement's noise is against the prior.
+The module is generic and contains no magnetics. The covariance is stored as a square root S with :math:`P = S S^T`, so
+that it stays symmetric and positive semidefinite even if a measurement's noise is tiny compared with the prior.
 
-The names of the source paper (Pavlov, Karshakov, Goldin) and ours:
+Names in the source paper (Pavlov, Karshakov, Goldin) and here:
 
 ==============  =================================================================
 PrognosisFK     :func:`predict`
@@ -31,7 +31,7 @@ _ones_below = cache(np.tri)
 
 
 def predict(S: FloatArray, F: FloatArray, S_q: FloatArray) -> FloatArray:
-    """Square root of ``F S Sᵀ Fᵀ + S_q S_qᵀ`` (the paper's PrognosisFK).
+    """Return the square root of ``F S Sᵀ Fᵀ + S_q S_qᵀ`` (the paper's PrognosisFK).
 
     Parameters
     ----------
@@ -45,18 +45,18 @@ def predict(S: FloatArray, F: FloatArray, S_q: FloatArray) -> FloatArray:
     Returns
     -------
     ndarray, shape (n, n)
-        Lower triangular, by an orthogonal factorisation: the covariance itself is never formed.
+        Lower triangular matrix from an orthogonal factorisation. The covariance itself is never formed.
     """
-    # LAPACK itself: the checks of NumPy's form take several times longer than so small a factorisation.
+    # Call LAPACK directly: NumPy's checks take several times longer than such a small factorisation.
     upper = dgeqrf(np.concatenate([F @ S, S_q], axis=1).T, overwrite_a=True)[0]
     return upper[: len(S)].T * _ones_below(len(S))
 
 
 def update(x: FloatArray, S: FloatArray, H: FloatArray, innovation: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-    r"""Update by all scalars of one linearisation, in units of their noise (ProcessingFK, of all scalars at once).
+    r"""Update with all scalars of one linearisation at once, in units of their noise (the paper's ProcessingFK).
 
     Least squares in units of the prior, :math:`x^+ = x + S e`: e minimises :math:`|Φ e - ν|^2 + |e|^2` with
-    :math:`Φ = H S`. The triangle :math:`[U, b; 0, ρ]` of the rows :math:`[Φ, ν; I, 0]` has it all:
+    :math:`Φ = H S`. The triangular factor :math:`[U, b; 0, ρ]` of the rows :math:`[Φ, ν; I, 0]` gives all results:
     :math:`S^+ = S U^{-1}`, :math:`x^+ = x + S^+ b`, NIS = :math:`ρ^2`.
 
     Parameters
@@ -65,16 +65,16 @@ def update(x: FloatArray, S: FloatArray, H: FloatArray, innovation: FloatArray) 
     S : ndarray, shape (n, n)
         Square root of the covariance.
     H : ndarray, shape (k, n)
-        Measurement matrix; every row over the standard deviation of its scalar, which are independent.
+        Measurement matrix of independent scalars. Every row is divided by the standard deviation of its scalar.
     innovation : ndarray, shape (k,)
-        Measured minus predicted at x, over the same standard deviations.
+        Measured minus predicted at x, divided by the same standard deviations.
 
     Returns
     -------
     x, S : ndarray
         Updated copies.
     nis : float
-        Normalised innovation squared, a χ² of k numbers for a right prediction.
+        Normalised innovation squared: χ² with k degrees of freedom if the prediction is right.
 
     Notes
     -----
@@ -91,14 +91,14 @@ def update(x: FloatArray, S: FloatArray, H: FloatArray, innovation: FloatArray) 
 
 
 def whitened_innovation(S: FloatArray, H: FloatArray, innovation: FloatArray) -> FloatArray:
-    """``L⁻¹ ν`` (k,) of an innovation ν with its covariance ``L Lᵀ = H S Sᵀ Hᵀ + I``, L lower triangular.
+    """Return the whitened innovation ``L⁻¹ ν`` (k,) with ``L Lᵀ = H S Sᵀ Hᵀ + I``, L lower triangular.
 
-    In units of the noise, as :func:`update`.
+    H and ν are in units of the noise, as in :func:`update`.
     """
     k = len(H)
     if not k:
         return innovation
-    # A root of I + Φ Φᵀ without the sum, which would lose the digits of a prediction that is hardly known.
+    # A root of I + Φ Φᵀ without the sum, which would lose digits if the prediction is very uncertain.
     L = predict(np.eye(k), np.eye(k), H @ S)
     return np.asarray(np.sign(L.diagonal()) * dtrtrs(L, innovation, lower=True)[0])
 
@@ -112,17 +112,17 @@ class IteratedUpdate:
     x : ndarray, shape (n,)
         Updated estimate.
     S : ndarray, shape (n, n)
-        Square root of its covariance, linearised where the last iteration was.
+        Square root of its covariance, linearised at the last iteration.
     iterations : int
         Number of linearisations.
     converged : bool
-        Whether the stop rule was met. If not, x is not an optimum and must not be used as one.
+        True if the stop rule was met. Otherwise x is not an optimum and must not be used as one.
     innovation : ndarray, shape (k,)
         Measured minus predicted at the predicted state.
     nis : float
-        Normalised innovation squared, of the last linearisation: where the iteration converged it is the smallest sum
-        of squares of residual and correction in units of their noise, a χ² of k numbers for curved measurements too.
-        NaN without a linearisation.
+        Normalised innovation squared of the last linearisation. After convergence it is the minimum of the sum of
+        squares of residual and correction, in units of their noise: χ² with k degrees of freedom, for nonlinear
+        measurements too. NaN without a linearisation.
     """
 
     x: FloatArray
@@ -145,11 +145,11 @@ def iterated_update(
     max_iterations: int = 50,
     shrink: float = 1.0,
 ) -> IteratedUpdate:
-    r"""Iterated extended Kalman update with the paper's stop rule.
+    r"""Return the iterated extended Kalman update with the paper's stop rule.
 
     Every iteration linearises at :math:`x_k` and processes all scalars from the *predicted* mean and covariance again,
-    with innovations :math:`z - h(x_k) - H(x_k)(x - x_k)`: Gauss-Newton on the maximum-a-posteriori cost, so a
-    measurement is counted once however often it is linearised. It stops when
+    with innovations :math:`z - h(x_k) - H(x_k)(x - x_k)`. This is Gauss-Newton on the maximum-a-posteriori cost, so
+    each measurement counts once, no matter how many linearisations there are. The iteration stops when
     :math:`\|h(x_{k+1}) - h(x_k)\| <` `tolerance`, equations (19) and (30).
 
     Parameters
@@ -167,13 +167,15 @@ def iterated_update(
     HJacobian : callable
         Their Jacobian, (n,) -> (k, n).
     tolerance : float
-        In the unit of z; a fraction of the sensors' noise. 0: as many linearisations as are allowed.
+        Tolerance of the stop rule in the unit of z, usually a fraction of the sensors' noise. With 0 all allowed
+        linearisations are used.
     max_iterations : int
-        Linearisations at most. 1: an extended Kalman filter, which with a `tolerance` of 0 asks for one prediction.
+        Largest number of linearisations. With 1 the update is that of an extended Kalman filter; with a `tolerance` of
+        0 it then needs one prediction only.
     shrink : float
-        What the length of the steps is multiplied by whenever one changes the prediction no less than the one before:
-        Gauss-Newton steps may swing to and fro about an optimum in a strongly curved direction. 1: they are whole, as
-        in the paper.
+        Factor for the length of the steps. It applies each time a step changes the prediction no less than the step
+        before, because Gauss-Newton steps may oscillate about an optimum in a strongly curved direction. With 1 all
+        steps are full steps, as in the paper.
     """
     sigma = np.sqrt(variance)
     x_k, predicted = x, Hx(x)
@@ -186,7 +188,7 @@ def iterated_update(
         optimum, S_k, nis = update(x, S, H / sigma[:, None], (z - predicted - H @ (x - x_k)) / sigma)
         x_k = optimum if length == 1.0 else x_k + length * (optimum - x_k)
         if iteration == max_iterations and not tolerance > 0.0:
-            break  # nothing would be below it
+            break  # no change is below a tolerance of 0
         before, predicted = predicted, Hx(x_k)
         step = predicted - before
         change_before, change = change, math.sqrt(step @ step) / length
@@ -196,11 +198,11 @@ def iterated_update(
 
 
 def smoothing_gain(S: FloatArray, F: FloatArray, S_q: FloatArray) -> tuple[FloatArray, FloatArray]:
-    r"""Gain of a fixed-interval smoother over one step, and what it leaves unknown.
+    r"""Return the gain G of a fixed-interval smoother over one step, and a root D of the remaining covariance.
 
-    With the filtered covariance :math:`S S^T` before a step, the next state tells of this one
-    :math:`x_{j|n} = x_j + G (x_{j+1|n} - x_{j+1|j})` and
-    :math:`P_{j|n} = D D^T + G P_{j+1|n} G^T`, sums of squares alone.
+    With the filtered covariance :math:`S S^T` before a step, the smoothed state is
+    :math:`x_{j|n} = x_j + G (x_{j+1|n} - x_{j+1|j})`, and its covariance
+    :math:`P_{j|n} = D D^T + G P_{j+1|n} G^T` is a sum of squares without subtraction.
 
     Parameters
     ----------
@@ -209,7 +211,7 @@ def smoothing_gain(S: FloatArray, F: FloatArray, S_q: FloatArray) -> tuple[Float
     F : ndarray, shape (..., n, n)
         Transition matrix.
     S_q : ndarray, shape (..., n, m)
-        Square root of the noise of the step.
+        Square root of the covariance of the step's process noise.
 
     Returns
     -------
@@ -217,7 +219,7 @@ def smoothing_gain(S: FloatArray, F: FloatArray, S_q: FloatArray) -> tuple[Float
 
     Notes
     -----
-    Rauch, Tung and Striebel's smoother in an array form: P. Park and T. Kailath, "New square-root smoothing
+    This is Rauch, Tung and Striebel's smoother in array form: P. Park and T. Kailath, "New square-root smoothing
     algorithms", IEEE Transactions on Automatic Control 41 (1996) 727.
     """
     n = S.shape[-1]
@@ -228,9 +230,10 @@ def smoothing_gain(S: FloatArray, F: FloatArray, S_q: FloatArray) -> tuple[Float
 
 
 def estimability(S: FloatArray, S_predicted: FloatArray) -> FloatArray:
-    r"""Stochastic measure of estimability of every component (the paper's MeasureS).
+    r"""Return the stochastic measure of estimability of every component (the paper's MeasureS).
 
-    :math:`\mu_i = 1 - \sigma_i / \sigma_i^-`: 0 where the measurements taught nothing, 1 where they fixed it.
+    :math:`\mu_i = 1 - \sigma_i / \sigma_i^-` is 0 if the measurements have no information about a component, and 1 if
+    they determine it exactly.
 
     Parameters
     ----------
@@ -249,24 +252,25 @@ def estimability(S: FloatArray, S_predicted: FloatArray) -> FloatArray:
 class IteratedExtendedKalmanFilter:
     r"""Iterated extended Kalman filter with a square-root covariance and filterpy's names.
 
-    ``predict()`` then ``update(z, HJacobian, Hx)`` as in :class:`filterpy.kalman.ExtendedKalmanFilter`. The measurement
-    is iterated (:func:`iterated_update`), a correlated `R` is decorrelated by its eigenvectors first.
+    Call ``predict()``, then ``update(z, HJacobian, Hx)``, as in :class:`filterpy.kalman.ExtendedKalmanFilter`. The
+    update is iterated (:func:`iterated_update`). A correlated `R` is first decorrelated by its eigenvectors.
 
     Parameters
     ----------
     dim_x, dim_z : int
         Sizes of the state and of the measurement.
     tolerance : float
-        Stop rule: norm of the change of the predicted measurements between iterations, in the unit of z; 0: none.
+        Stop rule: norm of the change of the predicted measurements between iterations, in the unit of z. 0 means no
+        stop rule.
     max_iterations : int
-        Linearisations at most, one at least.
+        Largest number of linearisations, at least 1.
 
     Attributes
     ----------
     x : ndarray, shape (n,)
         State estimate.
     P : ndarray, shape (n, n)
-        Its covariance; assigning it factorises it. `S` is the square root itself.
+        Covariance of x; an assignment factorises it. The attribute `S` is the square root.
     F, Q : ndarray, shape (n, n)
         Transition matrix and process noise covariance (positive semidefinite).
     R : ndarray, shape (k, k)
@@ -274,7 +278,7 @@ class IteratedExtendedKalmanFilter:
     y, nis : ndarray, float
         Innovation of the last update at the predicted state, and its normalised square.
     iterations, converged : int, bool
-        Of the last update.
+        Number of linearisations of the last update, and True if it met the stop rule.
     x_prior, S_prior, P_prior, x_post, S_post, P_post : ndarray
         Copies after the last `predict` and the last `update`.
 
@@ -344,7 +348,7 @@ class IteratedExtendedKalmanFilter:
         Hx: MeasurementFunction,
         R: ArrayLike | None = None,
     ) -> None:
-        """Iterated measurement update.
+        """Update the state with a measurement, iterating its linearisation.
 
         Parameters
         ----------
@@ -372,9 +376,9 @@ class IteratedExtendedKalmanFilter:
 
 
 def symmetric_square_root(covariance: FloatArray) -> FloatArray:
-    """S with ``S Sᵀ = covariance``, for a positive semidefinite matrix (Cholesky does not take singular ones)."""
+    """Return S with ``S Sᵀ = covariance`` of a positive semidefinite matrix; Cholesky fails for singular ones."""
     covariance = np.asarray(covariance, dtype=np.float64)
-    # States of mixed units (m, A·m²) differ by many orders: factor the correlations, whose entries are of order one.
+    # States of mixed units (m, A·m²) differ by many orders of magnitude. Correlations do not, so factor those.
     deviation = np.sqrt(np.clip(np.diagonal(covariance), 0.0, None))
     scale = np.where(deviation > 0.0, deviation, 1.0)
     correlation = covariance / np.outer(scale, scale)

@@ -1,4 +1,4 @@
-"""Where a source truly was: files of it, and the rows of readings that they belong to.
+"""True positions and moments of a source: truth files, and their values at the rows of readings.
 
 A truth file is CSV with ``time_s, x_m, y_m[, z_m][, mx_Am2, my_Am2, mz_Am2]``, one row per instant.
 """
@@ -25,15 +25,15 @@ STATE_QUANTITIES = {
     "moment_Am2": Quantity("A m2", "magnetic moment of the source", ("axis",)),
     "covariance": Quantity("m, A m2", "covariance of (position, moment)", ("component", "component_")),
 }
-"""What results with a source in every row have in common."""
+"""Quantities that all results with a source in every row share."""
 SAME_TIME_S = 1e-6
-# Of the truth's usual interval: over a longer one it is not interpolated.
+# Longest interval of the truth that is interpolated, in usual intervals.
 _LONGEST_STEP = 2.0
 
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """Where the source truly was at n instants.
+    """True positions of the source at n instants, and its moments.
 
     Attributes
     ----------
@@ -44,7 +44,7 @@ class Truth:
     moment_Am2 : ndarray, shape (n, 3), optional
         Moment of the source [A·m²].
     name : str
-        What errors call it: the file that it was read from.
+        Name in error messages, usually the file's path.
 
     Examples
     --------
@@ -61,12 +61,12 @@ class Truth:
 
 
 def read_truth(path: str | PathLike[str]) -> Truth:
-    """True positions, and moments where they are known, from a CSV file.
+    """Read true positions, and moments if they are known, from a CSV file.
 
     Parameters
     ----------
     path : str or path-like
-        A truth file (CSV): ``time_s``, ``x_m`` and ``y_m``, and what else is known.
+        A truth file (CSV) with ``time_s``, ``x_m``, ``y_m`` and optionally the other columns.
 
     Raises
     ------
@@ -94,7 +94,7 @@ def read_truth(path: str | PathLike[str]) -> Truth:
 
 
 def rows_of_same_time(readings: Readings, truth: Truth) -> tuple[IntArray, IntArray]:
-    """Rows (k,) of readings and of a truth that have the same time, to a microsecond, in the order of the readings."""
+    """Return rows (k,) of readings and of a truth with the same time to a microsecond, in the order of the readings."""
     order = np.argsort(truth.time_s, kind="stable")
     times = truth.time_s[order]
     nearest = nearest_rows(readings.time_s, times)
@@ -103,14 +103,14 @@ def rows_of_same_time(readings: Readings, truth: Truth) -> tuple[IntArray, IntAr
 
 
 def nearest_rows(wanted_s: FloatArray, time_s: FloatArray) -> IntArray:
-    """Row (k,) of the ascending times (n,) that is nearest to each wanted one, the earlier of two."""
+    """Return the row (k,) of the ascending times (n,) nearest to each wanted time; of two, the earlier."""
     after = np.clip(np.searchsorted(time_s, wanted_s), 1, max(1, len(time_s) - 1))
     before, after = after - 1, np.minimum(after, len(time_s) - 1)
     return np.where(np.abs(wanted_s - time_s[before]) <= np.abs(time_s[after] - wanted_s), before, after)
 
 
 def truth_of_rows(readings: Readings, truth: Truth) -> tuple[FloatArray, FloatArray | None]:
-    """True position and moment of rows (n, 3), interpolated but not over a gap; NaN where the truth says nothing."""
+    """Return true positions and moments of rows (n, 3), interpolated but not over gaps; NaN without a truth."""
     order = np.argsort(truth.time_s, kind="stable")
     times, wanted = truth.time_s[order], readings.time_s
     after = np.clip(np.searchsorted(times, wanted - SAME_TIME_S), 0, len(times) - 1)
@@ -132,7 +132,7 @@ def truth_of_rows(readings: Readings, truth: Truth) -> tuple[FloatArray, FloatAr
 
 
 def state_columns(position_m: FloatArray, moment_Am2: FloatArray, covariance: FloatArray) -> dict[str, Column]:
-    """Columns of positions, moments (n, 3) and their standard deviations."""
+    """Return columns of positions, moments (n, 3) and their standard deviations."""
     sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     state = np.concatenate([position_m, moment_Am2], axis=1)
     columns: dict[str, Column] = dict(zip(STATE_COLUMNS, state.T, strict=True))

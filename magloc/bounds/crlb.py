@@ -37,13 +37,13 @@ class Bounds(Drawn):
     Attributes
     ----------
     position_m, moment_Am2 : ndarray, shape (..., 3)
-        The source, in the array's frame.
+        Position and moment of the source in the array's frame.
     range_m : ndarray, shape (...)
         Distance of the source from the sensors' centroid.
     covariance : ndarray, shape (..., 6, 6)
         Covariance of (p, m) [m, A·m²]. A parameter that is not estimable has an infinite variance and NaN beside it.
     sigma_range_m : ndarray, shape (...)
-        Along the line from the centroid to the source.
+        σ along the line from the centroid to the source.
     sigma_bearing_rad : ndarray, shape (...)
         σ of the direction of that line: root of the sum of the variances of its two angles, taken about any two axes at
         right angles to each other and to the line. So ``σ_position² = σ_range² + (range · σ_bearing)²``.
@@ -77,7 +77,7 @@ class Bounds(Drawn):
 
     @property
     def is_regular(self) -> BoolArray:
-        """Sources of which all six parameters are estimable, shape (...)."""
+        """Sources whose six parameters are all estimable, shape (...)."""
         return self.rank == 6
 
     @property
@@ -146,15 +146,15 @@ def cramer_rao_bounds(
     known_moment_sigma_Am2: float = np.inf,
     body_length_m: ArrayLike | None = 0.0,
 ) -> Bounds:
-    """Cramér-Rao bounds of a source, or of many over leading axes.
+    """Return the Cramér-Rao bounds of a source, or of many over leading axes.
 
     Parameters
     ----------
     array : SensorArray
         Array with its noise and uncertainties. With an uncertain pose the bounds are those of a source in the world,
-        in the axes of the stated pose. The array does not move, so that clocks have no effect.
+        in the axes of the stated pose. The array does not move, so clock errors have no effect.
     position_m, moment_Am2 : array_like, shape (..., 3)
-        Source in the array's frame [m], its moment [A·m²].
+        Position [m] and moment [A·m²] of the source in the array's frame.
     ambient_uncertainty_T : float
         Standard deviation per axis of the error of ``array.ambient_T``, the same for all sensors [T]. It replaces
         that of the array.

@@ -49,7 +49,7 @@ _TITLE = "Cramer-Rao bounds of a magnetic dipole"
 
 
 class AccuracyReach(IntEnum):
-    """Share of the moments whose range is as accurate as required."""
+    """Cases of the share of moments whose range has the required accuracy."""
 
     UNDEFINED = -1
     FEW = 0

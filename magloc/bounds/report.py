@@ -35,7 +35,7 @@ class BoundsReport:
     spheres : xarray.Dataset
         Reach by direction, from :func:`magloc.bounds.spheres.bound_spheres`.
     scenario : BoundScenario
-        What the bounds are computed for.
+        Array and source of the bounds.
     body_length_m : float
         Length of the source; 0 for a point.
     detector : MatchedFilterDetector, optional

@@ -15,7 +15,7 @@ from magloc.fields.multipole import N_BODY_ERRORS, finite_body_errors
 
 # Share of the information with all other parameters known below which a parameter counts as unknown.
 _LOST_INFORMATION = 1e-12
-_PRODUCTS_A_BLOCK = 10_000_000  # of columns, in one call: about two milliseconds
+_PRODUCTS_A_BLOCK = 10_000_000  # products of columns in one call: about two milliseconds
 
 
 def array_model(
@@ -35,7 +35,7 @@ def array_model(
     ambient_uncertainty_T, known_moment_sigma_Am2 : float
         See :func:`magloc.bounds.crlb.cramer_rao_bounds`.
     bodies : bool
-        Whether sources are bodies, not points.
+        True if the sources are bodies, not points.
     lost : float
         The range is unknown if the other parameters leave less than this share of its information.
 
@@ -110,8 +110,8 @@ def source_bounds(
     length_m : ndarray, shape (P,), optional
         Lengths of the bodies, if the model has any [m].
     slopes : ndarray, shape (P, M, N, 3), optional
-        Receives d log σ/d sensor for the σ of the range [1/m]. For noise that does not depend on readings, and no other
-        nuisance than a common field.
+        Receives d log σ/d sensor for the σ of the range [1/m]. Valid only if noise does not depend on readings and a
+        common field is the only nuisance.
 
     Returns
     -------

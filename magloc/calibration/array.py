@@ -44,17 +44,17 @@ class CalibrationPrior:
     Attributes
     ----------
     position_m, gain, axes_rad, offset_T : float
-        Standard deviations: of a position along each axis [m], of a channel's gain (relative), of the direction in
-        which a channel looks, along each of the two other axes [rad], and of an offset [T].
+        Standard deviations of a position along each axis [m], of a channel's relative gain, of a channel's direction
+        towards each of the two other axes [rad], and of an offset [T].
     estimate : tuple of str
-        Which of positions, gains, axes and offsets are estimated; the others stay nominal.
+        Quantities to estimate, from positions, gains, axes and offsets; the others stay nominal.
     trusted_positions, trusted_scales : tuple of str
         Ids of sensors with exact nominal positions, and of those with exact nominal gains and axes.
 
     Raises
     ------
     ValueError
-        A standard deviation is not positive, or nothing of that name can be estimated.
+        A standard deviation is not positive, or `estimate` names an unknown quantity.
 
     Examples
     --------

@@ -49,10 +49,10 @@ def calibrate(
     modulus_T : array_like, shape () or (n,), optional
         Modulus of the field in which the sensors were turned [T].
     moment : {"constant", "free"}, optional
-        Whether the unknown moment of the source is one vector in the world frame, of a source that does not turn, or
-        free in every row; moments of the truth are not used then. Constant by default.
+        Model of an unknown moment: one vector in the world frame (a source that does not turn), or free in every row.
+        Moments of the truth are then not used. Constant by default.
     prior : CalibrationPrior
-        How well the nominal array is known; not used with `modulus_T`.
+        Uncertainty of the nominal array; not used with `modulus_T`.
 
     Returns
     -------

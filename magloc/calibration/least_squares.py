@@ -164,7 +164,7 @@ def apply_step(
     sensors[problem.free] += problem.prior[problem.free] * step[:n]
     position, height, moment = state.position_m, state.height_m, state.moment_Am2
     if problem.unknown_position:
-        # A source that leaps far away would not return, because its field and all derivatives vanish.
+        # A source that jumps far away would not return, because its field and all derivatives vanish.
         length = np.linalg.norm(of_rows[:, :3], axis=1, keepdims=True)
         radius = problem.array.circumradius
         of_rows = of_rows * (radius / np.maximum(length, radius))

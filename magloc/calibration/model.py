@@ -68,13 +68,13 @@ class CalibrationProblem:
     prior : ndarray, shape (N, 15)
         Standard deviations of the sensors' unknowns around the nominal array.
     free : ndarray of bool, shape (N, 15)
-        Which of the sensors' unknowns are estimated.
+        True for the sensors' unknowns that are estimated.
     world_from_array : ndarray, shape (T, 3, 3)
         Attitude of the array in every row.
     unknown_position : bool
-        Whether the rows' positions are unknown.
+        True if the rows' positions are unknown.
     unknown_height : bool
-        Whether one height of all rows, along the world's z, is unknown.
+        True if one height of all rows, along the world's z, is unknown.
     moment : {"constant", "free", "known"}
     """
 

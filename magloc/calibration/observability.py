@@ -40,7 +40,7 @@ class Unobservable:
     Attributes
     ----------
     name : str
-        What changes: one gauge, a combination of gauges, or the unknowns that change most.
+        Description of the change: one gauge, a combination of gauges, or the unknowns that change most.
     information : float
         Information of the readings, relative to the prior; 0 if they do not depend on it.
     """

@@ -22,13 +22,13 @@ class Calibration(Drawn):
     Attributes
     ----------
     nominal, array : SensorArray
-        Before and after; the latter has the estimated positions, scale matrices and offsets.
+        Array before and after; the latter has the estimated positions, scale matrices and offsets.
     converged : bool
-        Whether the iteration ended at an optimum; otherwise no number here is a result.
+        True if the iteration ended at an optimum. Otherwise no number here is a result.
     change, sigma : ndarray, shape (N, 15)
-        What the estimate adds to the nominal array, and its posterior standard deviation: position x y z [m], relative
-        gain of channel x y z, axes [rad] (x towards y, x towards z, y towards x, …), offset x y z [T]. The standard
-        deviation is 0 where nothing is estimated, infinite where the readings do not determine a sensor.
+        Estimated change of the nominal array, and its posterior standard deviation: position x y z [m], relative gain
+        of channel x y z, axes [rad] (x towards y, x towards z, y towards x, …), offset x y z [T]. The standard
+        deviation is 0 for quantities that are not estimated, and infinite if the readings do not determine a sensor.
     chi2, dof : float
         Σ ((reading - prediction)/noise)² with the calibrated sensors, and the number of readings minus that of the
         unknowns that they determine.
@@ -76,11 +76,11 @@ class SourceCalibration(Calibration):
     residual_rms_T : ndarray, shape (N,)
         Root mean square of every sensor's residuals with the calibrated array [T].
     estimated : ndarray of bool, shape (N, 15)
-        Which of the unknowns were estimated.
+        True for the unknowns that were estimated.
     covariance : ndarray, shape (F, F)
         Posterior covariance of ``change[estimated]``.
     position_m, moment_Am2 : ndarray, shape (T, 3)
-        The source in the rows that were used: in the array's frame, and in the world frame.
+        Position of the source in the array's frame, and its moment in the world frame, in the rows that were used.
     readings_T, world_from_array : ndarray, shape (T, C), (T, 3, 3)
         Readings of these rows [T], and the array's attitude.
     """
@@ -115,9 +115,9 @@ class TurningCalibration(Calibration):
     Attributes
     ----------
     fits : dict
-        The fit of every vector sensor, by its id.
+        Fits of the vector sensors, by their ids.
     time_s, readings_T : ndarray, shape (n,), (n, C)
-        The rows.
+        Times [s] and readings [T] of the rows.
     modulus_T : float or ndarray, shape (n,)
         Modulus of the field.
     """

@@ -31,8 +31,8 @@ def survey_files(
 ) -> Iterator[tuple[str, Any]]:
     """Yield names and contents of the files of a survey, as :func:`arrays.io.outputs.write_files` takes them.
 
-    Without the extra ``gis`` a GeoPackage and GeoTIFF are left out, and without a browser the report as PDF; a note
-    says so. Surveys of a single line have no GeoTIFF.
+    Without the extra ``gis`` the GeoPackage and GeoTIFF are left out, and without a browser the report as PDF. A note
+    is logged then. Surveys of a single line have no GeoTIFF.
     """
     yield "targets.geojson", json.dumps(found.to_geojson(frame.origin)) + "\n"
     yield "targets.kml", found.to_kml(frame.origin)
@@ -57,7 +57,7 @@ def map_columns(found: Survey, frame: MapFrame) -> dict[str, Column]:
 
 
 def _print_report(path: Path) -> None:
-    """Print the HTML page beside a PDF file into it; a note says so where there is no browser."""
+    """Print the HTML page beside a PDF file into it; without a browser, log a note instead."""
     try:
         from magloc.viewer.chromium import BrowserError, Chromium
     except InputError as error:

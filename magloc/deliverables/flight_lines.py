@@ -8,10 +8,10 @@ import numpy as np
 
 from arrays.typing import FloatArray
 
-_LONGEST_GAP = 20.0  # usual steps of time
-_CHORD_M = 2.0  # length over which the course is taken
-_TURN_deg = 35.0  # between the courses before and after a row of a turn
-_SHORTEST = 3.0  # chords
+_LONGEST_GAP = 20.0  # in usual steps of time
+_CHORD_M = 2.0  # length over which the course is measured
+_TURN_deg = 35.0  # smallest angle between the courses before and after a row of a turn
+_SHORTEST = 3.0  # in chords
 
 
 class FlightLine(NamedTuple):

@@ -19,7 +19,7 @@ from magloc.surveying.results import neighbour_triangles
 if TYPE_CHECKING:
     from magloc.surveying.results import Survey, Target
 
-_CORNERS = 72  # of an ellipse's polygon
+_CORNERS = 72  # corners of the polygon of an ellipse
 _LEVEL = 0.95
 _MOMENTS_Am2 = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)  # edges of the polygons of reach
 # Names in a Shapefile have ten letters at most.
@@ -57,7 +57,7 @@ def write_layers(path: Path, found: Survey, frame: MapFrame) -> None:
     Raises
     ------
     ValueError
-        The suffix is another one.
+        The suffix is neither of these.
     """
     with of_extra("gis", _WHAT):
         from pyogrio.raw import write

@@ -65,7 +65,7 @@ class MapFrame:
 
     @property
     def is_geographic(self) -> bool:
-        """Whether coordinates are longitudes and latitudes in degrees."""
+        """True if coordinates are longitudes and latitudes in degrees."""
         return bool(self.system.is_geographic)
 
     def geodetic(self, position_m: FloatArray) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Maps of a survey as GeoTIFF: the anomaly, and what the targets leave of it."""
+"""Maps of a survey as GeoTIFF: the anomaly, and the residual without the targets."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ if TYPE_CHECKING:
 
 METHOD = "linear interpolation between rows"
 _CELLS_PER_SPACING = 4.0
-_FARTHEST = 1.0  # spacings from the nearest row: farther cells have no value
+_FARTHEST = 1.0  # Cells farther from the nearest row, in spacings of lines, have no value.
 _MOST_CELLS = 4_000_000
-_FLAT = 1e-3  # across over along a line
-_ROWS_PER_CELL = 2.0  # rows of one line that are used
+_FLAT = 1e-3  # A single line extends less across than this share of its length.
+_ROWS_PER_CELL = 2.0  # rows of one line that are used for each cell
 _STEPS = (1.0, 2.0, 5.0, 10.0)
 
 
 class Raster(NamedTuple):
-    """Values (rows from north to south, columns from west to east), NaN where nothing is known.
+    """Grid of values, rows from north to south and columns from west to east; NaN where there is no value.
 
     `corner` (2,) is the north-west corner and `cell` (2,) the size of a cell, both in units of the map; `cell_m` is the
     size of a cell in metres.
@@ -46,7 +46,8 @@ def grid_rows(rows: SurveyRows, values: FloatArray, frame: MapFrame, cell_m: flo
     ----------
     rows : SurveyRows
     values : ndarray, shape (n,)
-        Interpolated linearly between the rows. Cells farther from all rows than the lines from each other have none.
+        Values to interpolate linearly between the rows. A cell has no value if it is farther from all rows than the
+        spacing of lines.
     frame : MapFrame
     cell_m : float, optional
         Size of a cell [m], by default a quarter of the spacing of lines, rounded down to 1, 2 or 5 times a power of 10.
@@ -80,7 +81,7 @@ def covers_area(xy_m: FloatArray) -> bool:
 
 
 def line_spacing(xy_m: FloatArray) -> float:
-    """Return the usual distance between lines [m] of rows (n, 2): the area that they cover over the way."""
+    """Return the usual distance between lines [m] of rows (n, 2): the area that they cover, divided by the way."""
     way_m = float(np.linalg.norm(np.diff(xy_m, axis=0), axis=1).sum())
     extent_m = float(np.ptp(xy_m, axis=0).max())
     if not covers_area(xy_m):

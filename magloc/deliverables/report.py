@@ -52,7 +52,7 @@ def report_html(found: Survey, frame: MapFrame, title: str, assumptions: Mapping
         Coordinate system of the list of targets, and the origin of the survey's world frame.
     title : str
     assumptions : mapping of str
-        What was assumed, by names, such as the height of the ground.
+        Assumptions by name, such as the height of the ground.
     """
     from magloc.plots.profiles import survey_profiles
 

@@ -1,8 +1,8 @@
 """Descent of a design criterion over sensor positions, within a volume or on a surface.
 
 The criterion is that of a fixed sample of sources, with an exact gradient. Steps are those of a spectral projected
-gradient: the change of the gradient in the last step gives the length, the step is projected into the volume, and is
-shortened until the criterion is below the worst of the last few ones.
+gradient. The change of the gradient in the last step gives the length. The step is projected into the volume, and
+shortened until the criterion is below the worst of the last few values.
 
 Source: E. G. Birgin, J. M. Martínez, M. Raydan, "Nonmonotone spectral projected gradient methods on convex sets",
 SIAM Journal on Optimization 10 (2000); on a surface, which is not convex, every trial is projected onto it.
@@ -42,7 +42,7 @@ class Sample:
     Attributes
     ----------
     positions, moments : ndarray, shape (n, 3)
-        [m], [A·m²].
+        Positions [m] and moments [A·m²] of the sources.
     """
 
     positions: FloatArray
@@ -110,7 +110,7 @@ class Descent:
     value : float
         Criterion of its sample at these positions [m].
     converged : bool
-        Whether the criterion stopped falling; otherwise the iterations ran out.
+        True if the criterion stopped falling; otherwise the iterations ran out.
     """
 
     sensors: FloatArray
@@ -142,7 +142,7 @@ def move_into_volume(task: DesignTask, sensors: FloatArray) -> FloatArray:
 
 
 def is_spaced(task: DesignTask, sensors: FloatArray) -> bool:
-    """Return whether no two sensors are closer than the least spacing, to a part in a million."""
+    """Return True if all sensors are at least the least spacing apart, to a part in a million."""
     return bool(pdist(sensors).min() >= task.least_spacing_m * (1.0 - 1e-6))
 
 

@@ -50,10 +50,10 @@ class Judgement:
     criterion_m : float
         The task's criterion on the independent sources.
     fits : bool
-        Whether its sensors are within the task's volume.
+        True if all its sensors are within the task's volume.
     gain, gain_error : float
-        Share by which the design's criterion is lower, and its standard error from resampled sources; zero for the
-        design itself.
+        Relative difference by which the design's criterion is lower, and its standard error from resampled sources.
+        Zero for the design itself.
     distance_m : ndarray, shape (k,)
         Distance of the sources from the origin, in the directions of the task's region.
     sigma_range : RangeSpread

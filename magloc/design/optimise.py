@@ -52,7 +52,7 @@ class Design:
     fitted_m, start_m : float
         Criterion on the large sample: of the design, and of the best of its starts.
     converged : bool
-        Whether the descent to the design converged.
+        True if the descent to the design converged.
     n_converged, n_descents : int
         Numbers of converged and of all descents from refined starts.
     judged : tuple of Judgement
@@ -88,7 +88,7 @@ class Design:
 
     @property
     def worst_is_bounded(self) -> bool:
-        """True if the worst case found is of the size of the others, not a loss of rank."""
+        """True if the worst case found is comparable to the other σ, so that it is no loss of rank."""
         return self.worst_m < _UNBOUNDED * self.judged[0].criterion_m
 
     @property

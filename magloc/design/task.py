@@ -9,15 +9,15 @@ Built-in tasks are files beside this one. A task file (TOML)::
     count = 4
     kind = "vector"                 # or "scalar"
     noise_nT = 1.0                  # 1 sigma, per axis and sample
-    ambient_nT = [20e3, 0.0, -45e3] # of scalar sensors
+    ambient_nT = [20e3, 0.0, -45e3] # for scalar sensors
     least_spacing_m = 0.05          # optional, 0 by default
 
-    [volume]                        # where sensors may stand
+    [volume]                        # allowed positions of the sensors
     shape = "ball"                  # ball, box, cylinder: solid; surface: on a mesh
-    radius_m = 0.92                 # of a ball or a cylinder
-    height_m = 0.5                  # of a cylinder, which stands along z; 0 is a disc
-    size_m = [2.0, 1.0, 0.0]        # of a box along the axes; one or two zeros make a plate or a rod
-    file = "hull.stl"               # of a surface: STL, OBJ or PLY in metres, beside the task file
+    radius_m = 0.92                 # for a ball or a cylinder
+    height_m = 0.5                  # for a cylinder along z; 0 is a disc
+    size_m = [2.0, 1.0, 0.0]        # for a box along the axes; one or two zeros make a plate or a rod
+    file = "hull.stl"               # for a surface: STL, OBJ or PLY in metres, beside the task file
     centre_m = [0.0, 0.0, 0.0]      # optional, not for a surface
 
     [sources]
@@ -25,21 +25,21 @@ Built-in tasks are files beside this one. A task file (TOML)::
     nearest_m = 2.0                 # distances from the origin, evenly distributed; not for a box
     farthest_m = 2.0
     towards = [1.0, 0.0, 0.0]       # axis of a half-space or a cap
-    half_angle_deg = 30.0           # of a cap
+    half_angle_deg = 30.0           # for a cap
     low_m = [3.0, -2.0, -2.0]       # corners of a box
     high_m = [5.0, 2.0, 2.0]
     moment_Am2 = 100.0              # modulus; directions are evenly distributed
 
     [criterion]                     # optional, of the standard deviation of the range (Cramér-Rao bound)
     quantity = "quantile"           # or "mean"
-    level = 0.95                    # of a quantile
+    level = 0.95                    # for a quantile
 
     [search]                        # optional
     starts = 16                     # shapes and random places
-    refined = 4                     # of them, which descend again on all sources
+    refined = 4                     # best starts, which descend again on all sources
     sources = 16_384                # a power of two; the starts descend on an eighth of them
-    iterations = 250                # of a descent, at most; a third of them of the starts
-    judged = 40_000                 # independent sources that the result is judged on
+    iterations = 250                # at most, of a refined descent; a third of them for the starts
+    judged = 40_000                 # independent sources for the comparison
 """
 
 from __future__ import annotations
@@ -218,7 +218,7 @@ class _Sensors(Table, kw_only=True):
             raise RefusalError(
                 "count",
                 f"found {self.count}, expected {least} to {_MOST_SENSORS} {self.kind} sensors,"
-                " which give the six differences that a position and a moment take",
+                " which give the six differences that a position and a moment need",
             )
         if self.kind == "scalar" and not any(self.ambient_nT or ()):
             raise RefusalError("ambient_nT", "found none, expected the ambient field of scalar sensors")

@@ -217,7 +217,7 @@ def read_surface(path: str | PathLike[str]) -> MeshSurface:
     try:
         mesh = load_mesh(str(path), process=True)
     except Exception as error:  # every reader has errors of its own
-        raise InputError(f"{path}: found what is no mesh ({str(error).rstrip('.')}), expected {expected}.") from None
+        raise InputError(f"{path}: found no mesh ({str(error).rstrip('.')}), expected {expected}.") from None
     faces = np.asarray(getattr(mesh, "faces", ()))
     if not faces.size or not np.isfinite(mesh.triangles).all() or not mesh.area > 0.0:
         raise InputError(f"{path}: found no triangles with an area, expected {expected}.")

@@ -14,9 +14,9 @@ from magloc.detection.matched_filter import MatchedFilterDetector
 from magloc.directions import moments_on_sphere, sphere_directions
 from magloc.levels import FALSE_ALARM
 
-# Ratio of neighbouring distances of the search: the energy is a power of the distance to 1e-5 between two of them.
+# Ratio of neighbouring distances of the search: between two of them a power law describes the energy to 1e-5.
 _STEP = 1.03
-# Nearer than this many circumradii a distance from the centroid says little about that from the sensors.
+# Least distance in circumradii: nearer, the distance from the centroid says little about that from the sensors.
 _NEAREST = 1.1
 _DIRECTIONS_AT_ONCE = 32
 _FARTHEST_M = 1e6
@@ -35,27 +35,28 @@ def detection_range(
     share: float = 0.5,
     rng: Rng = 0,
 ) -> float:
-    """Distance up to which the matched filter finds a source, over directions of the source and of its moment.
+    """Return the distance up to which the matched filter finds a source of any direction and moment direction.
 
     Parameters
     ----------
     array : SensorArray
-        Whose noise counts.
+        Array with its noise.
     moment_Am2 : float
         Size of the moment [A·m²].
     probability : float
-        Of detection.
+        Probability of detection.
     false_alarm_rate : float
         Share of the rows without a source in which one is found.
     share : float
-        Of the directions for which that distance suffices: 0.5 gives the median, 0.95 what is nearly sure.
+        Share of the directions in which a source is found at the returned distance: 0.5 gives the median, 0.95 a
+        cautious value.
     rng : int or numpy.random.Generator
         Seed or generator of the noise that sets the threshold.
 
     Returns
     -------
     float
-        From the sensors' centroid [m]; 0 where a source is not even found beside the array.
+        Distance from the sensors' centroid [m]; 0 if a source is not found even beside the array.
 
     Raises
     ------
@@ -86,15 +87,15 @@ def detection_ranges(
     *,
     probability: float = 0.9,
 ) -> FloatArray:
-    """Largest distance at which a source is detected with a probability, along given directions.
+    """Return the largest distances (d, n) [m] at which a source is detected with a probability.
 
-    ``directions`` (d, 3): from the sensors' centroid, array frame, of any length. ``moments_Am2`` (n, 3): moments
-    that the source may have [A·m²]: :func:`magloc.directions.moments_on_sphere`, say. ``detector``: with its
-    false-alarm rate: :class:`magloc.chi_square.ChiSquareDetector` or
-    :class:`magloc.detection.matched_filter.MatchedFilterDetector`. ``probability``: of detection. Returns (d, n):
-    distance from the sensors' centroid [m], for every moment; its quantiles over the last axis are what to expect
-    of a moment of unknown direction. Zero where the source is not even detected beside the array, at 1.1
-    circumradii from the centroid. Raises ValueError: a direction has no length, or an input is out of range.
+    Distances are from the sensors' centroid, for each direction and moment; quantiles over the last axis apply to a
+    moment of unknown direction. The result is zero if the source is not detected even at 1.1 circumradii.
+
+    ``directions`` (d, 3): from the sensors' centroid in the array's frame, of any length. ``moments_Am2`` (n, 3):
+    possible moments of the source [A·m²], for example :func:`magloc.directions.moments_on_sphere`. ``detector``: a
+    :class:`magloc.chi_square.ChiSquareDetector` or :class:`magloc.detection.matched_filter.MatchedFilterDetector`.
+    ``probability``: probability of detection. Raises ValueError: a direction is zero, or an input is out of range.
     """
     towards = np.asarray(directions, dtype=np.float64)
     lengths = np.linalg.norm(towards, axis=-1, keepdims=True)
@@ -110,7 +111,7 @@ def detection_ranges(
 
 
 def _ranges(matched: DipoleFilter, directions: FloatArray, moments: FloatArray, required: float) -> FloatArray:
-    """Largest distances (d, n) at which moments (n, 3) have the required energy."""
+    """Return the largest distances (d, n) at which moments (n, 3) have the required energy."""
     nearest = _NEAREST * matched.array.circumradius
     farthest = 2.0 * nearest
     while farthest < _FARTHEST_M and _log_energies(matched, directions, moments, farthest).max() > np.log(required):
@@ -129,7 +130,7 @@ def _ranges(matched: DipoleFilter, directions: FloatArray, moments: FloatArray, 
 
 
 def _log_energies(matched: DipoleFilter, directions: FloatArray, moments: FloatArray, distance: float) -> FloatArray:
-    """Logarithm of the energy of moments (n, 3) at one distance along directions (d, 3): (d, n)."""
+    """Return the logarithm (d, n) of the energy of moments (n, 3) at a distance along directions (d, 3)."""
     signals = matched.unit_signals(matched.array.centroid + distance * directions)
     normal = np.swapaxes(signals, -1, -2) @ signals
     energies = np.einsum("nj,djk,nk->dn", moments, normal, moments, optimize=True)

@@ -1,8 +1,8 @@
-"""Is there a source at all? Detection statistics of readings: energy, known position, and the matched filter.
+"""Detection statistics of readings: energy, known position, and the matched filter.
 
-The matched filter is the generalised likelihood ratio, the energy in the space of the moments of a dipole at the
-position where that is largest. Signals are linear in the moment; moduli are so where the ambient field is large against
-the source's, and need one. Distributions: docs/theory/detection.md.
+The matched filter is the generalised likelihood ratio: the largest energy that a dipole at any position explains, with
+the best moment. Signals are linear in the moment. For moduli this holds if the ambient field is large compared with the
+field of the source, so moduli need an ambient field. Distributions: docs/theory/detection.md.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from magloc.localization.search.kernels import search_optima
 from magloc.measurement.channels import signals_of
 from magloc.measurement.whitened import WhitenedModel
 
-# As Locator searches: starts of every refinement, least angle between them, linearisations at most.
+# Number of refinements, least angle between their starts, and most linearisations, as in the search of Locator.
 _N_STARTS, _APART_RAD, _MOST_ITERATIONS = 12, 0.25, 100
 _ROWS_AT_ONCE = 512
 
@@ -40,7 +40,8 @@ class DipoleFilter:
     Parameters
     ----------
     array : SensorArray
-        Scalar sensors need its ambient field. Its noise is that without a source: `noise_fraction` does not count.
+        Array with its noise, and with an ambient field for scalar sensors. `noise_fraction` does not count, because
+        the noise is that without a source.
 
     Raises
     ------
@@ -72,7 +73,7 @@ class DipoleFilter:
         return linear_bases(self._problem, self._gain, 0, self._candidates)
 
     def whitened(self, readings_T: ArrayLike) -> FloatArray:
-        """Raw readings (n, C) [T], none missing, as an orthogonal transform of the whitened differences."""
+        """Return an orthogonal transform of the whitened differences of raw readings (n, C) [T], none missing."""
         readings = np.asarray(readings_T, dtype=np.float64)
         if readings.ndim != 2 or readings.shape[1] != self.array.n_channels or not np.isfinite(readings).all():
             raise ValueError(
@@ -82,21 +83,20 @@ class DipoleFilter:
         return self.whitening.apply(readings - self._without_source)
 
     def noise(self, n: int, rng: np.random.Generator) -> FloatArray:
-        """Whitened noise of n sets of readings, shape (n, C)."""
+        """Draw the whitened noise of n sets of readings, shape (n, C)."""
         w = self.whitening
         unknown = w.basis[:, w.shrinkage == 1.0]
         draws = rng.normal(size=(n, self.array.n_channels))
         return draws - draws @ unknown @ unknown.T
 
     def signal(self, position_m: ArrayLike, moment_Am2: ArrayLike) -> FloatArray:
-        """Whitened signals of sources (..., 3), noise-free: (..., C)."""
+        """Return the whitened signals (..., C) of sources (..., 3), without noise."""
         return np.einsum("...cj,...j->...c", self.unit_signals(position_m), np.asarray(moment_Am2))
 
     def unit_signals(self, position_m: ArrayLike) -> FloatArray:
-        """Whitened signals (..., C, 3) [1/(A·m²)] of the three unit moments at positions (..., 3) [m].
+        """Return the whitened signals (..., C, 3) [1/(A·m²)] of the three unit moments at positions (..., 3) [m].
 
-        Of a product with its own transpose the eigenvalues are the energies of the best, the middle and the worst
-        moment of 1 A·m².
+        For signals S the eigenvalues of SᵀS are the energies of the best, the middle and the worst moment of 1 A·m².
         """
         position = np.asarray(position_m, dtype=np.float64)[..., None, :]
         fields = dipole.field_matrix(self.array.positions, position)[..., self.array.channel_sensor, :, :]
@@ -105,29 +105,30 @@ class DipoleFilter:
         return rows - (w.basis * w.shrinkage) @ (w.basis.T @ rows)
 
     def energy(self, whitened: FloatArray) -> FloatArray:
-        """Energy of whitened readings (n, C), χ² without a source: (n,)."""
+        """Return the energy (n,) of whitened readings (n, C); it follows χ² without a source."""
         return np.einsum("nc,nc->n", whitened, whitened)
 
     def candidate_energy(self, whitened: FloatArray) -> FloatArray:
-        """Energy of whitened readings (n, C) that the best of the candidate positions explains: (n,).
+        """Return the energy (n,) of whitened readings (n, C) that the best candidate position explains.
 
-        A little below :meth:`largest_energy`, which refines the candidates, and a hundred times faster.
+        It is slightly below :meth:`largest_energy`, which refines the candidates, and a hundred times faster.
         """
         parts = np.array_split(whitened, -(-len(whitened) // _ROWS_AT_ONCE) or 1)
         return np.concatenate([linear_scores(self._bases, part).max(axis=1) for part in parts])
 
     def largest_energy(self, whitened: FloatArray) -> FloatArray:
-        """Matched-filter statistic (n,) of whitened readings (n, C): the largest energy that a single source explains.
+        """Return the largest energy (n,) of whitened readings (n, C) that a single source explains.
 
-        The generalised likelihood ratio, χ² without a source less χ² of the best source anywhere.
+        This matched-filter statistic is the generalised likelihood ratio: χ² without a source minus χ² of the best
+        source at any position.
         """
-        # A candidate is a source too, where none of the refinements converged.
+        # If no refinement converged, the best candidate counts.
         return np.maximum(self.refined_energy(whitened), self.candidate_energy(whitened))
 
     def refined_energy(self, whitened: FloatArray) -> FloatArray:
-        """The same of refined candidates alone: minus infinity where none converged."""
+        """Return the largest energy (n,) of refined candidates alone; minus infinity if none converged."""
         n = len(whitened)
-        # All channels as linear ones.
+        # The filter treats all channels as linear.
         problem = replace(
             self._problem.rows(np.zeros(n, dtype=np.intp)),
             gain=np.broadcast_to(self._gain, (n, *self._gain.shape)),

@@ -1,7 +1,7 @@
-"""The matched filter as a detector: its threshold, and the signals that it finds, from simulated noise.
+"""Matched-filter detector, with its threshold and its detection probability from simulated noise.
 
-The largest of the energies that sources at all positions explain has no closed form. Its threshold is an order
-statistic of simulated noise; only the draws that candidates explain most of are refined, as the others stay below.
+The distribution of the largest energy over all positions has no closed form. Its threshold is an order statistic of
+simulated noise. Only the draws with the largest candidate energies are refined, because the others stay below it.
 """
 
 from __future__ import annotations
@@ -22,29 +22,29 @@ from magloc.directions import fibonacci_directions
 from magloc.levels import FALSE_ALARM
 
 N_UNKNOWNS = 6
-# Noise that may reach the threshold is among this many times as many of the draws that candidates explain most of.
+# Draws that are refined, as a multiple of those above the threshold.
 _SCREENED = 10.0
 _DRAWS_AT_ONCE = 50_000
-# Sources that a required energy is simulated with stand this many circumradii away.
+# Distance, in circumradii, of the sources that a required energy is simulated with.
 _FAR = 5.0
 
 
 @dataclass(frozen=True)
 class MatchedFilterDetector:
-    """The matched filter of an array with the threshold that simulated noise sets.
+    """Matched filter of an array, with a threshold from simulated noise.
 
     Attributes
     ----------
     filter : DipoleFilter
-        The matched filter of the array.
+        Matched filter of the array.
     threshold : float
-        Of its energy [1]: what is larger is a source.
+        Energy [1] above which a source is reported.
     threshold_error : float
         Standard error of the threshold, from the order statistics beside it.
     false_alarm_rate : float
         Share of rows of noise alone whose energy is larger.
     seed : int
-        Of the draws for the threshold and for required energies.
+        Seed of the draws for the threshold and for required energies.
 
     Examples
     --------
@@ -67,12 +67,12 @@ class MatchedFilterDetector:
     def of(
         cls, array: SensorArray, false_alarm_rate: float = FALSE_ALARM, *, n_draws: int = 100_000, rng: Rng = 0
     ) -> MatchedFilterDetector:
-        """Detector whose threshold noise alone exceeds at a given rate.
+        """Return the detector with a given false-alarm rate.
 
         Parameters
         ----------
         n_draws : int
-            Sets of noise; a hundred exceedances, n_draws = 100 / rate, know the rate to a tenth.
+            Number of simulated rows of noise. With n_draws = 100 / rate the rate is accurate to a tenth.
 
         rng : int or numpy.random.Generator
             Seed or generator of the noise.
@@ -110,23 +110,24 @@ class MatchedFilterDetector:
         return self.filter.largest_energy(self.filter.whitened(readings_T)) > self.threshold
 
     def probability(self, signals: FloatArray, rng: np.random.Generator) -> float:
-        """Share of whitened signals (n, C) that are detected in noise, one draw of noise each."""
+        """Return the share of whitened signals (n, C) that are detected, with one draw of noise each."""
         return float(np.mean(self._above(signals + self.filter.noise(len(signals), rng))))
 
     def required_energy(self, probability: float, *, n_draws: int = 4_000) -> float:
-        """Energy of a signal that is found with a probability, on average over directions and moments.
+        """Return the energy of a signal that is found with a probability, averaged over directions and moments.
 
         Parameters
         ----------
         probability : float
-            Above the false-alarm rate.
+            Probability of detection, above the false-alarm rate.
         n_draws : int
-            Sources, and sets of noise, that it is simulated with.
+            Number of sources and rows of noise in the simulation.
 
         Returns
         -------
         float
-            In units of the noise's variance. It hardly depends on where the source is: how much it does is tested.
+            Energy in units of the noise variance. It hardly depends on the position of the source; a test states how
+            much it does.
         """
         check_probability(probability, self.false_alarm_rate)
         rng = np.random.default_rng([self.seed, 1])
@@ -137,14 +138,14 @@ class MatchedFilterDetector:
         unit = signals / np.linalg.norm(signals, axis=1, keepdims=True)
         noise = self.filter.noise(n_draws, rng)
 
-        @cache  # brentq asks for both ends once more
+        @cache  # brentq evaluates both ends once more
         def surplus(amplitude: float) -> float:
             return float(np.mean(self._above(amplitude * unit + noise))) - probability
 
         high = np.sqrt(ChiSquareDetector(self.filter.n_differences, self.false_alarm_rate).required_energy(probability))
         while surplus(high) < 0.0:
             high *= 1.5
-        # The draws may exceed the rate already without a signal where the probability is hardly above it.
+        # If the probability is hardly above the false-alarm rate, the draws may exceed it without a signal.
         return float(brentq(surplus, 0.0, high, xtol=1e-3)) ** 2 if surplus(0.0) < 0.0 else 0.0
 
     def _above(self, whitened: FloatArray) -> NDArray[np.bool_]:
@@ -157,7 +158,7 @@ class MatchedFilterDetector:
 
 
 def _loudest(matched: DipoleFilter, rng: np.random.Generator, n: int, share: float) -> FloatArray:
-    """The share of n draws of noise of which candidates explain most."""
+    """Return the share of n draws of noise with the largest candidate energies."""
     noise = matched.noise(n, rng)
     kept = max(1, round(share * n))
     return noise[np.argsort(-matched.candidate_energy(noise))[:kept]]

@@ -1,4 +1,7 @@
-"""Magnetic bodies: the dipole that stands for one. When a body counts as a dipole: docs/theory/extended-sources.md."""
+"""Magnetic bodies and their equivalent dipoles.
+
+See docs/theory/extended-sources.md for when a body counts as a dipole.
+"""
 
 from __future__ import annotations
 
@@ -21,20 +24,20 @@ _MU0 = 4.0 * np.pi * MU0_OVER_4PI
 
 @dataclass(frozen=True, eq=False)
 class EquivalentDipole:
-    """The dipole of a magnetised body, with the ellipsoid that stands for the body.
+    """Dipole of a magnetised body, with the ellipsoid that approximates the body.
 
     Attributes
     ----------
     position_m : ndarray, shape (3,)
         Centroid of the body [m].
     moment_Am2 : ndarray, shape (3,)
-        [A·m²].
+        Moment [A·m²].
     semi_axes_m : ndarray, shape (3,)
-        Of the ellipsoid, longest first [m].
+        Semi-axes of the ellipsoid, longest first [m].
     axes : ndarray, shape (3, 3)
-        Their directions as rows, in the frame of the body.
+        Directions of the semi-axes as rows, in the frame of the body.
     demagnetising_factors : ndarray, shape (3,)
-        Along the axes.
+        Demagnetising factors along the axes.
     body_length_m : float
         Greatest distance between two points of the body [m].
     """
@@ -49,26 +52,25 @@ class EquivalentDipole:
 
 
 def demagnetising_factors(semi_axes_m: ArrayLike) -> FloatArray:
-    r"""Demagnetising factors of an ellipsoid along its axes.
+    r"""Return the demagnetising factors of an ellipsoid along its axes.
 
     They are 0 along a long needle, 1/3 in a sphere, 1 across a thin disc.
 
     .. math:: N_i = \frac{abc}{2} \int_0^\infty \frac{ds}{(a_i^2 + s)\sqrt{(a^2 + s)(b^2 + s)(c^2 + s)}}
               = \frac{abc}{3} R_D(a_j^2, a_k^2, a_i^2)
 
-    with Carlson's integral R_D, which is accurate for every shape, near the sphere too, where the closed forms of
-    spheroids lose their digits. J. A. Osborn, "Demagnetizing factors of the general ellipsoid", Physical Review 67,
-    1945.
+    with Carlson's integral R_D, which is accurate for every shape. Closed forms for spheroids lose digits near the
+    sphere. Source: J. A. Osborn, "Demagnetizing factors of the general ellipsoid", Physical Review 67, 1945.
 
     Parameters
     ----------
     semi_axes_m : array_like, shape (..., 3)
-        Positive, in any order; only their ratios count.
+        Positive semi-axes in any order; only their ratios count.
 
     Returns
     -------
     ndarray, shape (..., 3)
-        In the order of the axes; their sum is 1.
+        Factors in the order of the axes; their sum is 1.
 
     Raises
     ------
@@ -91,15 +93,15 @@ def equivalent_dipole(
     ambient_T: ArrayLike,
     remanence_A_m: ArrayLike = (0.0, 0.0, 0.0),
 ) -> EquivalentDipole:
-    r"""Dipole of a magnetic body in a uniform field.
+    r"""Return the dipole of a magnetic body in a uniform field.
 
-    The body is replaced by the ellipsoid of its volume and of the principal axes and the proportions of its second
-    moments. In an ellipsoid the magnetisation is uniform,
+    The body is replaced by an ellipsoid of the same volume. Its principal axes and their proportions are those of the
+    body's second moments. In an ellipsoid the magnetisation is uniform,
 
     .. math:: M = (1 + χ N)^{-1} (χ B_0 / μ_0 + M_r), \qquad m = V M,
 
-    with N its demagnetising factors along its axes: m = 3 V B_0/μ_0 of a sphere of large χ, χ V B_0/μ_0 of a long
-    needle.
+    with the demagnetising factors N along the axes. A sphere of large χ has m = 3 V B_0/μ_0, a long needle
+    m = χ V B_0/μ_0.
 
     Parameters
     ----------
@@ -115,7 +117,7 @@ def equivalent_dipole(
     Returns
     -------
     EquivalentDipole
-        In the frame of the mesh.
+        Dipole in the frame of the mesh.
 
     Raises
     ------
@@ -162,7 +164,7 @@ def _greatest_distance(points: FloatArray) -> float:
 def induced_and_permanent_moment(
     R_world_from_body: ArrayLike, permanent_Am2: ArrayLike, polarisability_Am2_T: ArrayLike, ambient_T: ArrayLike
 ) -> FloatArray:
-    r"""Moment of a turning body in the world frame: what turns with it, and what the ambient field induces in it.
+    r"""Return the sum of a turning body's permanent and induced moments in the world frame.
 
     .. math:: m = R (m_p + α R^T B_a)
 
@@ -172,14 +174,14 @@ def induced_and_permanent_moment(
     permanent_Am2 : array_like, shape (..., 3)
         Permanent moment in the body's axes [A·m²].
     polarisability_Am2_T : array_like, shape (..., 3, 3)
-        Induced moment per field in the body's axes [A·m²/T], as of :func:`equivalent_dipole`.
+        Induced moment per field in the body's axes [A·m²/T], for example from :func:`equivalent_dipole`.
     ambient_T : array_like, shape (..., 3)
         Ambient field in the world frame [T].
 
     Returns
     -------
     ndarray, shape (..., 3)
-        [A·m²]
+        Moment in the world frame [A·m²].
     """
     R = np.asarray(R_world_from_body, dtype=np.float64)
     field_body = np.swapaxes(R, -1, -2) @ np.asarray(ambient_T, dtype=np.float64)[..., None]

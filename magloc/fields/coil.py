@@ -1,4 +1,4 @@
-"""The field of a circular loop of current."""
+"""Field of a circular loop of current."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _ON_AXIS = 1e-8
 
 
 def loop_field(points_m: ArrayLike, centre_m: ArrayLike, moment_Am2: ArrayLike, radius_m: float) -> FloatArray:
-    r"""Field of a circular current loop, in closed form; that of a dipole for a radius of zero.
+    r"""Return the field of a circular current loop in closed form, or of a dipole for a radius of zero.
 
     With z along the moment, ρ from the axis, :math:`α^2 = (a + ρ)^2 + z^2`, :math:`β^2 = (a - ρ)^2 + z^2`,
     :math:`m_K = 1 - β^2/α^2` the parameter of the elliptic integrals and :math:`C = 2 k m/(π a^2)`,
@@ -22,19 +22,20 @@ def loop_field(points_m: ArrayLike, centre_m: ArrayLike, moment_Am2: ArrayLike, 
     .. math:: B_z = \frac{C}{α β^2} [(a^2 - ρ^2 - z^2) E + β^2 K], \qquad
               B_ρ = \frac{C z}{α β^2 ρ} [(a^2 + ρ^2 + z^2) E - β^2 K].
 
-    J. Simpson et al., "Simple analytic expressions for the magnetic field of a circular current loop", NASA, 2001.
+    Source: J. Simpson et al., "Simple analytic expressions for the magnetic field of a circular current loop", NASA,
+    2001.
 
     Parameters
     ----------
     points_m, centre_m, moment_Am2 : array_like, shape (..., 3)
-        [m], [m], [A·m²]; the moment is normal to the loop.
+        Points [m], centre of the loop [m] and its moment [A·m²], which is normal to the loop.
     radius_m : float
-        a [m].
+        Radius a of the loop [m].
 
     Returns
     -------
     ndarray, shape (..., 3)
-        [T]; NaN on the wire.
+        Field [T]; NaN on the wire.
     """
     if not radius_m >= 0.0:
         raise ValueError(f"Input radius_m must not be negative; instead received {radius_m}.")

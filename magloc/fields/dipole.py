@@ -9,8 +9,8 @@ A dipole of moment m at the position p (the source) is seen from a point s. With
     (3)  G = dB/ds = (3k/r^4) [(n.m) I + n m^T + m n^T - 5 (n.m) n n^T]
     (4)  grad |B| = G B/|B|
 
-Everything is in SI units: metres, A m^2, tesla, T/m. Each argument is a vector in its last axis, and the leading axes
-of all arguments broadcast against each other, as in NumPy; all vectors share one Cartesian frame, whichever it is.
+Everything is in SI units: metres, A m^2, tesla, T/m. Each argument has vectors along its last axis. The leading axes of
+all arguments broadcast against each other, as in NumPy. All vectors share one Cartesian frame.
 
 Exactly on the source every function returns NaN for that point only, without an exception or a warning. Distances
 from 1e-75 m to 1e75 m neither overflow nor underflow, because each formula starts from the unit vector n.
@@ -36,12 +36,12 @@ _IDENTITY = np.eye(3)
 
 def potential(points: ArrayLike, source: ArrayLike, moment: ArrayLike) -> Array:
     """
-    Scalar potential U = -k (n.m)/r^2 of a dipole, equation (1), whose gradient is the field: B = +grad U.
+    Return the scalar potential U = -k (n.m)/r^2 of a dipole, equation (1), whose gradient is the field: B = +grad U.
 
     Parameters
     ----------
     points : array_like, shape (..., 3)
-        Where the potential is wanted, m.
+        Points of evaluation, m.
     source : array_like, shape (..., 3)
         Position of the dipole, m.
     moment : array_like, shape (..., 3)
@@ -63,12 +63,12 @@ def potential(points: ArrayLike, source: ArrayLike, moment: ArrayLike) -> Array:
 
 def field(points: ArrayLike, source: ArrayLike, moment: ArrayLike) -> Array:
     """
-    Induction B = k [3 (n.m) n - m]/r^3 of a dipole, equation (2).
+    Return the induction B = k [3 (n.m) n - m]/r^3 of a dipole, equation (2).
 
     Parameters
     ----------
     points : array_like, shape (..., 3)
-        Where the field is wanted, m.
+        Points of the field, m.
     source : array_like, shape (..., 3)
         Position of the dipole, m.
     moment : array_like, shape (..., 3)
@@ -91,14 +91,14 @@ def field(points: ArrayLike, source: ArrayLike, moment: ArrayLike) -> Array:
 
 def field_matrix(points: ArrayLike, source: ArrayLike) -> Array:
     """
-    Matrix A = k (3 n n^T - I)/r^3 that turns a moment into its field, B = A m, equation (2).
+    Return the matrix A = k (3 n n^T - I)/r^3 that gives the field of a moment, B = A m, equation (2).
 
     The field is linear in the moment, so A is also its Jacobian dB/dm. It is symmetric and traceless.
 
     Parameters
     ----------
     points : array_like, shape (..., 3)
-        Where the field is wanted, m.
+        Points of the field, m.
     source : array_like, shape (..., 3)
         Position of the dipole, m.
 
@@ -117,14 +117,14 @@ def field_matrix(points: ArrayLike, source: ArrayLike) -> Array:
 
 def gradient_tensor(points: ArrayLike, source: ArrayLike, moment: ArrayLike) -> Array:
     """
-    Gradient tensor G = dB/ds of the field of a dipole, equation (3): G[i, j] = dB_i/ds_j.
+    Return the gradient tensor G = dB/ds of the field of a dipole, equation (3): G[i, j] = dB_i/ds_j.
 
     It is symmetric (bit for bit) because the field has no curl, and traceless because it has no divergence.
 
     Parameters
     ----------
     points : array_like, shape (..., 3)
-        Where the gradient is wanted, m.
+        Points of the gradient, m.
     source : array_like, shape (..., 3)
         Position of the dipole, m.
     moment : array_like, shape (..., 3)
@@ -147,14 +147,14 @@ def modulus_gradient(
     points: ArrayLike, source: ArrayLike, moment: ArrayLike, ambient: ArrayLike | None = None
 ) -> Array:
     """
-    Gradient of the modulus of the total field, grad |B_a + B| = G e with e along B_a + B, equation (4).
+    Return the gradient of the modulus of the total field, grad |B_a + B| = G e, equation (4).
 
-    The ambient field B_a (the geomagnetic field, say) is uniform, so it only turns e; without it e is along B.
+    The unit vector e is along B_a + B. The ambient field B_a is uniform, such as the geomagnetic field.
 
     Parameters
     ----------
     points : array_like, shape (..., 3)
-        Where the gradient is wanted, m.
+        Points of evaluation, m.
     source : array_like, shape (..., 3)
         Position of the dipole, m.
     moment : array_like, shape (..., 3)
@@ -182,12 +182,12 @@ def modulus_gradient(
 
 def field_jacobian(points: ArrayLike, source: ArrayLike, moment: ArrayLike) -> Array:
     """
-    Jacobian of the field with respect to the dipole's state (p, m): [dB/dp, dB/dm] = [-G, A].
+    Return the Jacobian of the field by the dipole's state (p, m): [dB/dp, dB/dm] = [-G, A].
 
     Parameters
     ----------
     points : array_like, shape (..., 3)
-        Where the field is observed, m.
+        Points of the field, m.
     source : array_like, shape (..., 3)
         Position p of the dipole, m.
     moment : array_like, shape (..., 3)
@@ -211,12 +211,12 @@ def field_jacobian(points: ArrayLike, source: ArrayLike, moment: ArrayLike) -> A
 
 def total_field(points: ArrayLike, sources: ArrayLike, moments: ArrayLike) -> Array:
     """
-    Induction of several dipoles together: the sum of their fields, equation (2).
+    Return the induction of several dipoles together: the sum of their fields, equation (2).
 
     Parameters
     ----------
     points : array_like, shape (..., 3)
-        Where the field is wanted, m.
+        Points of the field, m.
     sources : array_like, shape (..., K, 3)
         Positions of the K dipoles, m.
     moments : array_like, shape (..., K, 3)
@@ -242,12 +242,12 @@ def total_field(points: ArrayLike, sources: ArrayLike, moments: ArrayLike) -> Ar
 
 def total_gradient_tensor(points: ArrayLike, sources: ArrayLike, moments: ArrayLike) -> Array:
     """
-    Gradient tensor of the field of several dipoles together: the sum of their tensors, equation (3).
+    Return the gradient tensor of the field of several dipoles: the sum of their tensors, equation (3).
 
     Parameters
     ----------
     points : array_like, shape (..., 3)
-        Where the gradient is wanted, m.
+        Points of evaluation, m.
     sources : array_like, shape (..., K, 3)
         Positions of the K dipoles, m.
     moments : array_like, shape (..., K, 3)
@@ -292,12 +292,12 @@ def _sum_over_dipoles(
 
 
 def _field_matrix(n: Array, r: Array) -> Array:
-    """:func:`field_matrix` of directions (..., 3) and distances (..., 1)."""
+    """Return :func:`field_matrix` for directions (..., 3) and distances (..., 1)."""
     return (MU0_OVER_4PI / (r * r * r))[..., None] * (3.0 * _outer(n, n) - _IDENTITY)
 
 
 def _gradient_tensor(n: Array, r: Array, m: Array) -> Array:
-    """:func:`gradient_tensor` of moments (..., 3), at directions (..., 3) and distances (..., 1)."""
+    """Return :func:`gradient_tensor` of moments (..., 3) for directions (..., 3) and distances (..., 1)."""
     radial = _dot(n, m)[..., None, None]
     mixed = _outer(n, m)
     shape = radial * _IDENTITY + (mixed + mixed.mT) - 5.0 * radial * _outer(n, n)
@@ -305,12 +305,12 @@ def _gradient_tensor(n: Array, r: Array, m: Array) -> Array:
 
 
 def _direction_and_distance(points: ArrayLike, source: ArrayLike) -> tuple[Array, Array]:
-    """Unit vectors (..., 3) and distances (..., 1) from the source to the points, NaN on the source."""
+    """Return unit vectors (..., 3) and distances (..., 1) from the source to the points; NaN on the source."""
     return _unit(_vectors("points", points) - _vectors("source", source))
 
 
 def _unit(vectors: Array) -> tuple[Array, Array]:
-    """Directions (..., 3) and lengths (..., 1) of vectors; both are NaN for a vector of length zero."""
+    """Return directions (..., 3) and lengths (..., 1) of vectors; both are NaN for a vector of length zero."""
     lengths = np.sqrt(_dot(vectors, vectors))[..., None]
     # NaN in place of zero spreads quietly through the arithmetic that follows; 0/0 would warn.
     lengths = np.where(lengths > 0.0, lengths, np.nan)
@@ -318,10 +318,10 @@ def _unit(vectors: Array) -> tuple[Array, Array]:
 
 
 def _dot(a: Array, b: Array) -> Array:
-    """Scalar products a.b, shape (...)."""
+    """Return scalar products a.b, shape (...)."""
     return np.vecdot(a, b)
 
 
 def _outer(a: Array, b: Array) -> Array:
-    """Outer products a b^T, shape (..., 3, 3)."""
+    """Return outer products a b^T, shape (..., 3, 3)."""
     return a[..., :, None] * b[..., None, :]

@@ -38,7 +38,7 @@ class Coefficients:
     h_T: FloatArray
 
     def at(self, year: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Coefficients g and h of decimal years of any shape (...): two arrays (..., K) [T].
+        """Return coefficients g and h, both (..., K) [T], at decimal years (...).
 
         Raises
         ------
@@ -58,11 +58,11 @@ class Coefficients:
 
 
 Model = str | Coefficients
-"""A model by its name, or coefficients of one's own: a model cut at a lower degree, say."""
+"""Name of a model, or coefficients, for example of a model that ends at a lower degree."""
 
 
 def coefficients(model: Model) -> Coefficients:
-    """Gauss coefficients of a model.
+    """Return the Gauss coefficients of a model.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ def coefficients(model: Model) -> Coefficients:
 
 @cache
 def _igrf14() -> Coefficients:
-    # Loaded here because ppigrf brings pandas, which costs more time than all the rest of this package.
+    # Imported here because ppigrf imports pandas, which takes longer than all the rest of this package.
     with of_extra("geo", FIELD):
         from ppigrf import ppigrf
 
@@ -111,4 +111,4 @@ def _wmm2025() -> Coefficients:
 
 _READERS = {"IGRF-14": _igrf14, "WMM2025": _wmm2025}
 MODELS = tuple(_READERS)
-"""The names of the models."""
+"""Names of the models."""

@@ -1,6 +1,6 @@
-r"""The Earth's magnetic field: IGRF-14 and WMM2025, their gradient across an array, and the dipole Earth.
+r"""Magnetic field of the Earth by IGRF-14 and WMM2025, and its gradient across an array.
 
-Both models are a potential of internal sources, as spherical harmonics of the geocentric radius r, colatitude θ and
+Both models are a potential of internal sources, in spherical harmonics of the geocentric radius r, colatitude θ and
 longitude φ, with a = 6371.2 km, Schmidt semi-normalised Legendre functions P and Gauss coefficients g, h [T]:
 
     (1)  V = a Σ_n (a/r)^(n+1) Σ_m (g_nm cos mφ + h_nm sin mφ) P_nm(cos θ),   B = -grad V
@@ -8,17 +8,18 @@ longitude φ, with a = 6371.2 km, Schmidt semi-normalised Legendre functions P a
     (3)  B_θ = -Σ (a/r)^(n+2) (g cos mφ + h sin mφ) dP/dθ
     (4)  B_φ =  Σ (a/r)^(n+2) m (g sin mφ - h cos mφ) P / sin θ
 
-Between its nodes in time (every five years) a model's coefficients are linear in the decimal year, so that every point
-of a batch may have its own time at no extra cost. (ppigrf itself counts days, not decimal years: with a leap year among
-the five, fields between nodes differ by up to 0.75 days of secular variation, some 0.2 nT.) The degree n = 1 alone is
-the field of a dipole at the Earth's centre, which :mod:`magloc.fields.dipole` computes from its moment.
+Between its nodes in time (every five years) a model's coefficients are linear in the decimal year. So every point of a
+batch may have its own time at no extra cost. (ppigrf itself counts days, not decimal years. With a leap year among the
+five, fields between nodes differ by up to 0.75 days of secular variation, about 0.2 nT.) The degree n = 1 alone is the
+field of a dipole at the Earth's centre, which :mod:`magloc.fields.dipole` computes from its moment.
 
-Coefficients come from the packages ppigrf (IGRF-14) and wmm-calculator (WMM2025), the Legendre functions from ppigrf,
-geodetic positions (WGS-84) from pymap3d; nothing is downloaded, and the packages are loaded at the first field.
+Coefficients come from the packages ppigrf (IGRF-14) and wmm-calculator (WMM2025), Legendre functions from ppigrf, and
+geodetic positions (WGS-84) from pymap3d. Nothing is downloaded. The packages are imported when a field is first
+computed.
 
-Frames: ECEF has its origin in the Earth's centre, z through the north pole and x through longitude 0; NED is north,
-east, down of a place; ENU (x east, y north, z up) is the frame of an array whose place is given. Latitudes, longitudes
-and heights are geodetic, above the WGS-84 ellipsoid, unless the name says geocentric.
+Frames: ECEF has its origin in the Earth's centre, z through the north pole and x through longitude 0. NED is north,
+east, down at a place. ENU (x east, y north, z up) is the frame of an array whose place is given. Latitudes, longitudes
+and heights are geodetic (WGS-84 ellipsoid), unless the name says geocentric.
 
 References
 ----------
@@ -45,22 +46,22 @@ from magloc.fields.gauss_coefficients import coefficients as coefficients
 
 Dates = ArrayLike | datetime.date | Sequence[datetime.date]
 REFERENCE_RADIUS_M = 6_371_200.0
-"""The a of equation (1), of both models."""
+"""Reference radius a of equation (1) in both models."""
 CORE_RADIUS_M = 3_485_000.0
-"""Radius of the Earth's core, where the sources are: equation (1) holds outside of it only."""
+"""Radius of the Earth's core, which contains the sources. Equation (1) holds only outside of it."""
 GRADIENT_STEP_M = 100.0
-"""Half the base of the central differences: at the surface truncation and rounding stay below 1e-8."""
+"""Half the base of the central differences. At the surface, truncation and rounding stay below 1e-8."""
 _POLE_DEG = 1e-9
 _CHUNK = 8192
 
 
 def decimal_year(date: Dates) -> FloatArray:
-    """Decimal years of dates: the year, plus the part of it that has passed.
+    """Return the decimal years of dates: the year plus the fraction of it that has passed.
 
     Parameters
     ----------
     date : date, datetime, datetime64 or float, or an array or sequence of one of them, shape (...)
-        A date alone is its midnight; a datetime without a time zone is UTC; a number is a decimal year already.
+        A date means its midnight. A datetime without a time zone is UTC. A number is a decimal year.
 
     Returns
     -------
@@ -78,7 +79,7 @@ def decimal_year(date: Dates) -> FloatArray:
         instant = array.astype("datetime64[us]")
         year = instant.astype("datetime64[Y]")
         start, end = year.astype("datetime64[us]"), (year + 1).astype("datetime64[us]")
-        # NaT becomes NaN, which is refused below.
+        # NaT becomes NaN, which raises an error below.
         passed = (instant - start) / (end - start)
         array = np.where(np.isnat(instant), np.nan, 1970.0 + year.astype(np.int64) + passed)
     if array.dtype.kind not in "fiu":
@@ -87,7 +88,7 @@ def decimal_year(date: Dates) -> FloatArray:
 
 
 def _utc(date: datetime.date) -> datetime.date:
-    """Date or datetime without a time zone; NumPy warns about those with one."""
+    """Return a date or datetime in UTC without a time zone; NumPy warns about those with one."""
     if isinstance(date, datetime.datetime) and date.tzinfo is not None:
         return date.astimezone(datetime.UTC).replace(tzinfo=None)
     return date
@@ -96,7 +97,7 @@ def _utc(date: datetime.date) -> datetime.date:
 def field_ned(
     latitude_deg: ArrayLike, longitude_deg: ArrayLike, height_m: ArrayLike, date: Dates, model: Model = "IGRF-14"
 ) -> FloatArray:
-    """Field at geodetic positions, in the north-east-down frame of each.
+    """Return the field at geodetic positions, in the north-east-down frame of each.
 
     Parameters
     ----------
@@ -105,14 +106,14 @@ def field_ned(
     height_m : array_like, shape (...)
         Height above the ellipsoid [m].
     date : date, datetime, datetime64 or decimal year, shape (...)
-        As in :func:`decimal_year`. All four arguments broadcast, so that every point may have its own time.
+        Date as in :func:`decimal_year`. All four arguments broadcast, so every point may have its own time.
     model : str or Coefficients
         "IGRF-14" or "WMM2025".
 
     Returns
     -------
     ndarray, shape (..., 3)
-        North, east, down [T]. At a pole, north is towards it along the meridian of the given longitude.
+        North, east, down [T]. At a pole, north is defined by the meridian of the given longitude.
 
     Raises
     ------
@@ -127,7 +128,7 @@ def field_ned(
 def field_enu(
     latitude_deg: ArrayLike, longitude_deg: ArrayLike, height_m: ArrayLike, date: Dates, model: Model = "IGRF-14"
 ) -> FloatArray:
-    """Field at geodetic positions, in the east-north-up frame of each: the ambient field of an array set up there.
+    """Return the field at geodetic positions in the east-north-up frame: the ambient field of an array there.
 
     Parameters
     ----------
@@ -150,12 +151,12 @@ def field_enu(
 def gradient_enu(
     latitude_deg: ArrayLike, longitude_deg: ArrayLike, height_m: ArrayLike, date: Dates, model: Model = "IGRF-14"
 ) -> FloatArray:
-    """Gradient tensor of the field at geodetic positions, in the east-north-up frame of each: G[i, j] = dB_i/dx_j.
+    """Return the gradient tensor G[i, j] = dB_i/dx_j at geodetic positions, in the east-north-up frame of each.
 
-    At points x [m] of an array set up at a place, the ambient field is ``field_enu(...) + x @ gradient_enu(...).T``.
-    The tensor is the central difference of the field along the three axes of the place, which stay where they are
-    (the neighbours' own axes are turned by the Earth's curvature). It is therefore symmetric and traceless not by
-    construction, but as far as the field has neither curl nor divergence.
+    At points x [m] of an array at a place, the ambient field is ``field_enu(...) + x @ gradient_enu(...).T``. The
+    tensor is the central difference of the field along the three fixed axes of the place. (The Earth's curvature turns
+    the axes of neighbouring places.) It is symmetric and traceless because the field has neither curl nor divergence,
+    not by construction.
 
     Parameters
     ----------
@@ -165,8 +166,8 @@ def gradient_enu(
     Returns
     -------
     ndarray, shape (..., 3, 3)
-        [T/m]; some tens of pT/m at the Earth's surface. The crust and the surroundings, which no global model holds,
-        may well add more.
+        Gradient [T/m], some tens of pT/m at the Earth's surface. The crust and the surroundings, which no global model
+        contains, may add more.
 
     Raises
     ------
@@ -190,16 +191,16 @@ def field_geocentric_ned(
     date: Dates,
     model: Model = "IGRF-14",
 ) -> FloatArray:
-    """Field at geocentric positions, in the geocentric north-east-down frame of each: equations (2) to (4).
+    """Return the field at geocentric positions, in the geocentric north-east-down frame: equations (2) to (4).
 
     Parameters
     ----------
     radius_m : array_like, shape (...)
         Distance from the Earth's centre [m].
     geocentric_latitude_deg, longitude_deg : array_like, shape (...)
-        Angle to the equator's plane, longitude [°].
+        Angle to the equatorial plane, and longitude [°].
     date : date, datetime, datetime64 or decimal year, shape (...)
-        As in :func:`decimal_year`; all four arguments broadcast.
+        Date as in :func:`decimal_year`; all four arguments broadcast.
     model : str or Coefficients
         "IGRF-14" or "WMM2025".
 
@@ -225,7 +226,7 @@ def field_geocentric_ned(
     flat = [np.ravel(one) for one in points]
     table = coefficients(model)
     field = np.empty((flat[0].size, 3))
-    # A hundred harmonics of each point are held at once: pieces keep that to a few tens of MB.
+    # Each point needs a hundred harmonics at once; chunks limit the memory to a few tens of MB.
     for start in range(0, len(field), _CHUNK):
         piece = slice(start, start + _CHUNK)
         field[piece] = _harmonic_sum(table, *(one[piece] for one in flat))
@@ -235,11 +236,11 @@ def field_geocentric_ned(
 def _harmonic_sum(
     table: Coefficients, radius_m: FloatArray, latitude_deg: FloatArray, longitude_deg: FloatArray, year: FloatArray
 ) -> FloatArray:
-    """Equations (2) to (4) as north, east, down: (N, 3) [T]; all arguments (N,)."""
+    """Return equations (2) to (4) as north, east, down (N, 3) [T]; all arguments are (N,)."""
     with of_extra("geo", FIELD):
         from ppigrf.ppigrf import get_legendre
 
-    # (4) divides by sin θ. Every P with m > 0 holds that factor, so a tenth of a millimetre off the pole is far enough.
+    # (4) divides by sin θ. Every P with m > 0 has that factor, so 0.1 mm from the pole is far enough.
     colatitude = np.clip(90.0 - latitude_deg, _POLE_DEG, 180.0 - _POLE_DEG)
     n, m = table.degree, table.order
     P, dP = get_legendre(colatitude, list(zip(n.tolist(), m.tolist(), strict=True)))
@@ -255,26 +256,26 @@ def _harmonic_sum(
 
 
 def field_ecef(position_ecef_m: ArrayLike, date: Dates, model: Model = "IGRF-14") -> FloatArray:
-    """Field at Cartesian positions, in the Earth-centred Earth-fixed frame.
+    """Return the field at Cartesian positions, in the Earth-centred Earth-fixed frame.
 
     Parameters
     ----------
     position_ecef_m : array_like, shape (..., 3)
         Positions in ECEF [m].
     date : date, datetime, datetime64 or decimal year, shape (...)
-        As in :func:`decimal_year`; it broadcasts against the leading axes of the positions.
+        Date as in :func:`decimal_year`; it broadcasts against the leading axes of the positions.
     model : str or Coefficients
         "IGRF-14" or "WMM2025".
 
     Returns
     -------
     ndarray, shape (..., 3)
-        ECEF [T].
+        Field in ECEF [T].
 
     Raises
     ------
     ValueError
-        As :func:`field_ned`, or if a position has not three components.
+        As :func:`field_ned`, or if a position does not have three components.
     """
     position = _vectors("position_ecef_m", _finite("position_ecef_m", position_ecef_m))
     x, y, z = np.moveaxis(position, -1, 0)
@@ -284,7 +285,7 @@ def field_ecef(position_ecef_m: ArrayLike, date: Dates, model: Model = "IGRF-14"
 
 
 def tilted_dipole_ecef(date: Dates, model: Model = "IGRF-14") -> FloatArray:
-    """Moment of the dipole at the Earth's centre whose field is the degree n = 1 of a model: 4π/µ0 a³ (g11, h11, g10).
+    """Return the moment of the dipole at the Earth's centre with the field of degree 1: 4π/µ0 a³ (g11, h11, g10).
 
     Its field is ``magloc.fields.dipole.field(position_ecef_m, 0, moment)`` with the origin as the source.
 
@@ -313,7 +314,7 @@ def tilted_dipole_ecef(date: Dates, model: Model = "IGRF-14") -> FloatArray:
 
 
 def ecef_from_geodetic(latitude_deg: ArrayLike, longitude_deg: ArrayLike, height_m: ArrayLike) -> FloatArray:
-    """Earth-centred Earth-fixed positions of geodetic ones (WGS-84).
+    """Return Earth-centred Earth-fixed positions of geodetic positions (WGS-84).
 
     Parameters
     ----------
@@ -323,7 +324,7 @@ def ecef_from_geodetic(latitude_deg: ArrayLike, longitude_deg: ArrayLike, height
     Returns
     -------
     ndarray, shape (..., 3)
-        ECEF [m].
+        Positions in ECEF [m].
 
     Raises
     ------
@@ -339,7 +340,7 @@ def ecef_from_geodetic(latitude_deg: ArrayLike, longitude_deg: ArrayLike, height
 
 
 def R_ned_from_ecef(latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> FloatArray:
-    """Rotation matrices whose rows are north, east and down of a place in ECEF.
+    """Return rotation matrices whose rows are north, east and down of a place in ECEF.
 
     Parameters
     ----------
@@ -370,7 +371,7 @@ _ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
 def _turned(rotation: FloatArray, vectors: FloatArray) -> FloatArray:
-    """Vectors (..., 3), each turned by its rotation matrix (..., 3, 3)."""
+    """Rotate vectors (..., 3), each by its rotation matrix (..., 3, 3)."""
     return (rotation @ vectors[..., None])[..., 0]
 
 

@@ -1,4 +1,4 @@
-"""Multipole fields of any order, equation of docs/theory/extended-sources.md."""
+"""Multipole fields of any order; docs/theory/extended-sources.md has the equation."""
 
 from __future__ import annotations
 
@@ -15,40 +15,40 @@ from arrays.typing import FloatArray
 from magloc.fields.dipole import MU0_OVER_4PI
 
 BODY_SIGMA = {2: 0.025, 4: 0.0015}
-"""Standard deviations of a component of a body's moments of rank 2 and 4, over L² and L⁴."""
+"""Standard deviations of the components of a body's moments of rank 2 and 4, in units of L² and L⁴."""
 _LONGEST_BODY_M = 1e4
 DEFAULT_LENGTH = 0.25
-"""Length over the distance from the nearest sensor that is assumed of a body of which nothing is said."""
+"""Assumed length of a body of unknown length, divided by its distance from the nearest sensor."""
 NEAR, _N_NEAR = 0.6, 4
-"""Sensors that are nearer than this, in circumradii of the array, where a body of default length is assumed.
+"""Distance, in circumradii of the array, and number of sensors: so many must be nearer to assume a default body.
 
-A source that a single sensor is near to may be a fault of it.
+A source near a single sensor may be a fault of that sensor.
 """
 N_BODY_ERRORS = sum(2 * rank + 1 for rank in BODY_SIGMA)
-"""Independent errors of a body that counts as a dipole."""
+"""Number of independent errors of a body that is fitted as a dipole."""
 
 
 def multipole_field_matrix(points_m: ArrayLike, source_m: ArrayLike, order: int) -> FloatArray:
-    """Field of every component of a multipole: the dipole (order 1), the quadrupole (2), the octupole (3), and so on.
+    """Return the field of each component of a multipole: dipole (order 1), quadrupole (2), octupole (3), and so on.
 
     Parameters
     ----------
     points_m : array_like, shape (..., 3)
-        Where the field is wanted [m].
+        Points of the field [m].
     source_m : array_like, shape (..., 3)
-        Where the multipole is [m].
+        Position of the multipole [m].
     order : int
-        l, at least 1.
+        Order l, at least 1.
 
     Returns
     -------
     ndarray, shape (..., 3, 2 l + 1)
-        [T/(A·m^(l+1))], for an orthonormal basis of the symmetric traceless tensors of rank l. NaN on the source.
+        Fields [T/(A·m^(l+1))] for an orthonormal basis of the symmetric traceless tensors of rank l; NaN on the source.
 
     Raises
     ------
     ValueError
-        The order is below 1, or the points are no 3-vectors.
+        The order is below 1, or the points are not 3-vectors.
     """
     if order < 1:
         raise ValueError(f"Input order must be at least 1; instead received {order}.")
@@ -68,14 +68,14 @@ def multipole_field_matrix(points_m: ArrayLike, source_m: ArrayLike, order: int)
 
 
 def finite_body_fields(separation_m: FloatArray, moment_Am2: FloatArray, rank: int) -> FloatArray:
-    r"""How the field of a body differs from its dipole's: (..., 3, 2 n + 1) by the components of its n-th moments.
+    r"""Return derivatives (..., 3, 2 n + 1) of a body's field by the components of its moments of rank n.
 
-    The traceless moment T of even rank n, 2 or 4, of the density of magnetisation adds
-    :math:`T \cdot \nabla^n B / n!` to the field: by orthonormal components of T, in tesla per m^n. Separations (..., 3)
-    are from the body's centre to the points.
+    The traceless moment T of even rank n, 2 or 4, of the magnetisation density adds :math:`T \cdot \nabla^n B / n!` to
+    the field of the dipole. Derivatives are by orthonormal components of T, in tesla per m^n. Separations (..., 3) are
+    from the body's centre to the points.
     """
     separation, moment = np.broadcast_arrays(separation_m, moment_Am2)
-    # Points come last, (3, p): what is done of each then runs over them.
+    # Points come last, (3, p), so that inner loops run over them.
     x, m = (np.ascontiguousarray(of.reshape(-1, 3).T) for of in (separation, moment))
     r = np.sqrt(np.sum(x * x, axis=0))
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -99,9 +99,9 @@ def finite_body_fields(separation_m: FloatArray, moment_Am2: FloatArray, rank: i
 
 
 def finite_body_errors(separation_m: FloatArray, moment_Am2: FloatArray, length_m: FloatArray | float) -> FloatArray:
-    """What bodies of some lengths (..., 1, 1) add to the field of their dipoles, of one σ: (..., 3, 14) [T].
+    """Return one σ of the field that bodies of lengths (..., 1, 1) add to their dipoles: (..., 3, 14) [T].
 
-    Their moments of rank 2 and 4 are unknown, with standard deviations that grow with the length:
+    The moments of rank 2 and 4 are unknown, with standard deviations that grow with the length:
     docs/theory/extended-sources.md.
     """
     parts = [s * length_m**rank * finite_body_fields(separation_m, moment_Am2, rank) for rank, s in BODY_SIGMA.items()]
@@ -111,7 +111,7 @@ def finite_body_errors(separation_m: FloatArray, moment_Am2: FloatArray, length_
 def assumed_body_lengths(
     sensors_m: FloatArray, position_m: FloatArray, radius_m: float, body_length_m: ArrayLike | None
 ) -> FloatArray:
-    """Lengths (...) of bodies at positions (..., 3): what is said, else a share of the distance near the array."""
+    """Return lengths (...) of bodies at positions (..., 3): as stated, else a share of the distance near the array."""
     if body_length_m is not None:
         length_m = np.asarray(body_length_m, dtype=np.float64)
         return np.broadcast_to(length_m, np.broadcast_shapes(length_m.shape, position_m.shape[:-1]))
@@ -122,7 +122,7 @@ def assumed_body_lengths(
 
 
 def check_body_length(body_length_m: ArrayLike | None) -> None:
-    """Raise ValueError for lengths of bodies that are none; None: nothing is said."""
+    """Raise ValueError for invalid lengths of bodies; None means that no length is stated."""
     length_m = np.ravel(0.0 if body_length_m is None else body_length_m)
     wrong = length_m[~((length_m >= 0.0) & (length_m <= _LONGEST_BODY_M))]
     if wrong.size:
@@ -131,7 +131,7 @@ def check_body_length(body_length_m: ArrayLike | None) -> None:
 
 @cache
 def traceless_basis(order: int) -> FloatArray:
-    """Orthonormal basis of the symmetric traceless tensors of a rank, (2 l + 1, 3, …, 3)."""
+    """Return an orthonormal basis of the symmetric traceless tensors of a rank, (2 l + 1, 3, …, 3)."""
     symmetric = []
     for index in combinations_with_replacement(range(3), order):
         tensor = np.zeros((3,) * order)
@@ -147,7 +147,7 @@ def traceless_basis(order: int) -> FloatArray:
 
 @cache
 def _contractions(rank: int) -> tuple[list[list[int]], FloatArray]:
-    """Indices of the factors of all monomials of rank - 1, and the traceless basis by them (3 (2 l + 1), f)."""
+    """Return the factors' indices of all monomials of rank - 1, and the traceless basis by them (3 (2 l + 1), f)."""
     monomials = list(combinations_with_replacement(range(3), rank - 1))
     basis = np.moveaxis(traceless_basis(rank), 0, 1).reshape(3, 2 * rank + 1, -1)
     places = [[np.ravel_multi_index(of, (3,) * (rank - 1)) for of in set(permutations(every))] for every in monomials]

@@ -12,7 +12,7 @@ from arrays.typing import FloatArray
 from magloc import core
 
 _TERMS_A_BLOCK = 100_000
-"""Points times sources that one call computes: about a millisecond."""
+"""Number of points times sources in one call, which takes about a millisecond."""
 
 
 def field_at_points(points: ArrayLike, sources: ArrayLike, moments: ArrayLike) -> FloatArray:
@@ -22,7 +22,7 @@ def field_at_points(points: ArrayLike, sources: ArrayLike, moments: ArrayLike) -
     Parameters
     ----------
     points : array_like, shape (N, 3)
-        Where the field is wanted, m.
+        Points of the field, m.
     sources : array_like, shape (K, 3)
         Positions of the dipoles, m.
     moments : array_like, shape (K, 3)

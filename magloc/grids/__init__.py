@@ -1,1 +1,1 @@
-"""Cubes of points, swept on one machine or many, streamed to disk."""
+"""Maps over cubes of points, computed on one machine or many and streamed to disk."""

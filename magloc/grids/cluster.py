@@ -1,6 +1,6 @@
-"""Boxes of a map, or other pieces of work, on the workers of a dask cluster.
+"""Computation of boxes of a map, or other work, by the workers of a dask cluster.
 
-The results come back to this process, which alone writes them: workers need no disk in common, only magloc.
+The results return to this process, and only this process writes them. So workers need magloc, but no shared disk.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from magloc import core
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-# Items sent ahead for every worker: one that it computes, one that it has ready.
+# Items sent to each worker: one that it computes, and the next one.
 _PER_WORKER = 2
-# Those of TLS need dask's own configuration besides.
+# Addresses with TLS also need dask's own configuration.
 _ADDRESS = re.compile(r"(?:(?:tcp|tls)://)?(?:[^\s/:@\[\]]+|\[[0-9a-fA-F:.]+\]):(?P<port>[0-9]{1,5})")
 _LARGEST_PORT = 65535
-# All threads serve one chunk of a process at a time.
+# A process computes one chunk at a time, with all its threads.
 _one_chunk = threading.Lock()
 
 
 def check_address(scheduler: str) -> None:
-    """Refuse what cannot be the address of a scheduler."""
+    """Raise InputError if a text cannot be the address of a scheduler."""
     address = _ADDRESS.fullmatch(scheduler)
     if address is None or not 0 < int(address["port"]) <= _LARGEST_PORT:
         raise InputError(f"Input scheduler: found {scheduler!r}, expected tcp://HOST:PORT or HOST:PORT.")
@@ -40,7 +40,10 @@ def check_address(scheduler: str) -> None:
 def worked_by(
     scheduler: str, work: Callable[[Item], Result], items: Iterable[Item], timeout_s: float = 10.0
 ) -> Iterator[Result]:
-    """Results as they become ready, from the workers of a dask scheduler; a few items a worker at any time."""
+    """Yield results of the workers of a dask scheduler in the order in which they finish.
+
+    Each worker has a few items at any time.
+    """
     check_address(scheduler)
     with of_extra("cluster", "a scheduler"):
         from distributed import as_completed
@@ -70,7 +73,7 @@ def _by_worker(work: Callable[[Item], Result], item: Item) -> Result:
 
 @contextmanager
 def _client(scheduler: str, timeout_s: float) -> Iterator[Any]:
-    """Connection to a scheduler that has workers, without the log of a connection that breaks."""
+    """Connect to a scheduler that has workers; a lost connection is not logged."""
     from distributed import Client
 
     logger = logging.getLogger("distributed")
@@ -93,14 +96,14 @@ def _client(scheduler: str, timeout_s: float) -> Iterator[Any]:
 
 
 def _check_answer(scheduler: str, timeout_s: float) -> None:
-    """Refuse an address where no scheduler answers.
+    """Raise InputError if no scheduler answers at an address.
 
-    A client that cannot connect is not asked: it waits for itself when it is deleted, and prints a traceback then.
+    The check does not use dask's client: a client that cannot connect waits when it is deleted, and prints a traceback.
     """
     from distributed import Security, rpc
 
     try:
-        by_tls = Security().get_connection_args("client")  # of dask's own configuration
+        by_tls = Security().get_connection_args("client")  # TLS settings in dask's own configuration
     except OSError as error:
         raise InputError(f"Input scheduler {scheduler}: dask's certificates cannot be read ({error}).") from None
     if scheduler.startswith("tls:") and by_tls["ssl_context"] is None:
@@ -123,7 +126,7 @@ def _check_answer(scheduler: str, timeout_s: float) -> None:
         ) from None
     except OSError as error:
         raise InputError(f"Input scheduler {scheduler}: found no scheduler there ({error}).") from None
-    except Exception:  # what another service says may mean anything to dask
+    except Exception:  # the answer of another service may raise any error in dask
         raise InputError(f"Input scheduler {scheduler}: found another service there, expected a scheduler.") from None
     if found != "Scheduler":
         raise InputError(f"Input scheduler {scheduler}: found a {found} of dask there, expected a scheduler.")

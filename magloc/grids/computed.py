@@ -1,4 +1,4 @@
-"""Whole maps: here or on a cluster, in memory or streamed to a store from which an interrupted one goes on."""
+"""Computation of whole maps: here or on a cluster, in memory or streamed to a store that can resume."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ def computed_map(
     scheduler: str | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> xr.Dataset:
-    """All values of a map over (x, y, z), here, in a zarr store that resumes, or by the workers of a scheduler.
+    """Compute all values of a map over (x, y, z), here or by the workers of a scheduler.
 
-    `out` is the store's folder: what is there of the same map is not computed again, and the dataset is loaded piece by
-    piece. `progress` is called with the number of points finished since the last call, at first with those in the
-    store.
+    `out` is the folder of a zarr store, or None for a map in memory. Finished parts of the same map in the store are
+    not computed again, and the dataset is loaded piece by piece. `progress` is called with the number of points
+    finished since the last call; the first call counts those in the store.
     """
     chunks = partial(runner(scheduler), partial(computed, cube))
     if out is None:
@@ -45,7 +45,7 @@ def computed_map(
 
 
 def _write(sweep: Sweep, chunks: Iterable[Chunk], progress: Callable[[int], None] | None) -> None:
-    """Write chunks as they are computed; however that ends, say how to go on."""
+    """Write chunks as they are computed; if that is interrupted or fails, state how to resume."""
 
     def kept() -> str:
         return f"{sweep.chunks_done} of {sweep.n_chunks} chunks are done, the same command goes on with the others"

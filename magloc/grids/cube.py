@@ -1,8 +1,8 @@
-"""Maps over a cube of points, computed box by box: what all of them have in common.
+"""Common parts of maps over a cube of points, computed box by box.
 
-A map says what it holds (:class:`CubeMap`) and computes the values of any box of its points. Where that happens is not
-its business (here, or on other machines: :mod:`magloc.grids.cluster`), nor where the values go (:func:`in_memory`, or
-into a store on disk: :mod:`magloc.grids.store`).
+A map (:class:`CubeMap`) declares its variables and computes the values of any box of its points. Other modules decide
+where it is computed (here, or on other machines: :mod:`magloc.grids.cluster`), and where the values go
+(:func:`in_memory`, or a store on disk: :mod:`magloc.grids.store`).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 Values = Mapping[str, NDArray[Any]]
 DIMENSIONS = ("x", "y", "z")
-# An interruption throws away what is done of a box, and waits for a part of it.
+# An interruption discards an unfinished box, and waits for one part of it.
 _BOX_S, _PARTS = 1.0, 3
 _EDGES = (8, 64)
 _COUNTED = 64  # points along the edges of the parts that are counted at once
@@ -43,9 +43,9 @@ class Box(NamedTuple):
     Attributes
     ----------
     place : tuple of 3 ints
-        Which one of the boxes that tile the cube.
+        Index of the box among the boxes that tile the cube.
     region : tuple of 3 slices
-        Its points, along x, y, z.
+        Indices of its points along x, y, z.
     """
 
     place: tuple[int, int, int]
@@ -53,7 +53,7 @@ class Box(NamedTuple):
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Points along x, y, z."""
+        """Number of points along x, y, z."""
         x, y, z = (part.stop - part.start for part in self.region)
         return x, y, z
 
@@ -64,7 +64,7 @@ class Box(NamedTuple):
         return x * y * z
 
     def points(self, axis: FloatArray) -> FloatArray:
-        """Points (n, 3) in the order of the flattened box, for a cube with the same axis along x, y and z."""
+        """Return points (n, 3) in the order of the flattened box; the cube's axis is the same along x, y and z."""
         return np.stack(np.meshgrid(*(axis[part] for part in self.region), indexing="ij"), axis=-1).reshape(-1, 3)
 
 
@@ -76,20 +76,20 @@ class Variable(NamedTuple):
 
     @property
     def not_done(self) -> Any:
-        """Value where nothing was computed yet; no result is the smallest integer."""
+        """Value of points that are not computed yet: NaN or the smallest integer, which is never a result."""
         return np.nan if np.issubdtype(self.dtype, np.floating) else int(np.iinfo(self.dtype).min)
 
 
 @dataclass(frozen=True)
 class Tally:
-    """What the summary of a map needs of its values; tallies of boxes add up to that of the cube.
+    """Counts of a map's values for its summary; the tallies of boxes add up to that of the cube.
 
     Attributes
     ----------
     counts : Counter
-        Points of every kind, and ``iterations`` of all of them.
+        Number of points of every kind, and ``iterations``, the sum over all points.
     iterations_of_converged : Counter
-        Converged points by their number of iterations.
+        Number of converged points by their number of iterations.
     """
 
     counts: Counter[str] = field(default_factory=Counter)
@@ -97,7 +97,7 @@ class Tally:
 
     @classmethod
     def of(cls, points: Mapping[str, NDArray[np.bool_]], iterations: NDArray[Any]) -> Tally:
-        """From a mask of the points of every kind, with "converged" among them."""
+        """Return the tally of masks of the points of every kind, which include "converged"."""
         counts = Counter({name: int(mask.sum()) for name, mask in points.items()})
         counts["iterations"] = int(iterations.sum(dtype=np.int64))
         values, times = np.unique(iterations[points["converged"]], return_counts=True)
@@ -107,11 +107,11 @@ class Tally:
         return Tally(self.counts + other.counts, self.iterations_of_converged + other.iterations_of_converged)
 
     def fraction(self, part: str, whole: str) -> float:
-        """Of the points of one kind those that are of another as well; NaN if there are none."""
+        """Return the share of the points of kind `whole` that are also of kind `part`; NaN if there are none."""
         return self.counts[part] / self.counts[whole] if self.counts[whole] else float("nan")
 
     def median_iterations(self) -> float:
-        """Over the converged points; NaN if there are none."""
+        """Return the median number of iterations of the converged points; NaN if there are none."""
         if not self.iterations_of_converged:
             return float("nan")
         values, counts = np.array(sorted(self.iterations_of_converged.items())).T
@@ -127,15 +127,15 @@ class Summary:
     Attributes
     ----------
     starts, converged : int
-        Points that were computed, and those of them that converged.
+        Number of computed points, and of those that converged.
     fraction : float
-        Of the latter.
+        Share of points that converged.
     median_iterations : float
-        Over the points that converged; NaN if there are none.
+        Median number of iterations of the points that converged; NaN if there are none.
     iterations_total : int
-        Of all points.
+        Number of iterations of all points.
     seconds : float
-        Duration of the computation alone; that of all machines together.
+        Duration of the computation alone, summed over all machines.
     """
 
     starts: int
@@ -147,7 +147,7 @@ class Summary:
 
 
 def common_counts(dataset: xr.Dataset, tally: Tally) -> dict[str, Any]:
-    """The fields of a :class:`Summary`, from a map and its tally of "starts", "converged" and "iterations"."""
+    """Return the fields of a :class:`Summary` from a map and its tally of "starts", "converged" and "iterations"."""
     return {
         "starts": tally.counts["starts"],
         "converged": tally.counts["converged"],
@@ -159,31 +159,31 @@ def common_counts(dataset: xr.Dataset, tally: Tally) -> dict[str, Any]:
 
 
 def described(title: str, array: SensorArray) -> dict[str, Any]:
-    """Attributes of every dataset about an array."""
+    """Return the attributes that every dataset about an array has."""
     source = f"magloc {version('magloc')}"
     return {"Conventions": "CF-1.10", "title": title, "source": source, "array": array_toml(array)}
 
 
 def flags(statuses: type[IntEnum]) -> dict[str, Any]:
-    """CF attributes of a variable that holds a status."""
+    """Return the CF attributes of a variable that holds a status."""
     values = np.array([status.value for status in statuses], dtype=np.int8)
     return {"flag_values": values, "flag_meanings": " ".join(status.name.lower() for status in statuses)}
 
 
 @dataclass(frozen=True, eq=False)
 class CubeMap(ABC):
-    """A map over a cube of points around an array. It is sent to other processes: keep it small when pickled.
+    """Map over a cube of points around an array; it is sent to other processes, so its pickle must be small.
 
     Attributes
     ----------
     scenario
-        With an ``array``, and the ``half_width_m`` of the cube.
+        Scenario with an ``array``, and the ``half_width_m`` of the cube.
     grid : int
-        Points along every axis, at least 2.
+        Number of points along every axis, at least 2.
     title, point : str
-        What the map is, and what a point is, in one word.
+        Title of the map, and the noun for a point.
     variables : mapping
-        Over the cube; with an integer one among them.
+        Variables over the cube; at least one has integers.
     """
 
     scenario: Any
@@ -199,7 +199,7 @@ class CubeMap(ABC):
 
     @property
     def edge(self) -> int:
-        """Points along the edges of a box, which takes about a second."""
+        """Number of points along the edges of a box, which takes about a second."""
         smallest, largest = _EDGES
         return min(max(smallest, int(np.cbrt(_BOX_S / self.point_s))), largest)
 
@@ -210,7 +210,7 @@ class CubeMap(ABC):
 
     @property
     def attributes(self) -> dict[str, Any]:
-        """All that determines the values: two maps with equal attributes are the same."""
+        """Attributes that determine the values: two maps with equal attributes are the same."""
         cube = {"grid": self.grid, "half_width_m": self.scenario.half_width_m}
         return {**described(self.title, self.scenario.array), **cube, **self.settings}
 
@@ -220,7 +220,10 @@ class CubeMap(ABC):
         return {"centroid_m": self.scenario.array.centroid}
 
     def values(self, box: Box) -> Values:
-        """Values of every variable, of the box's shape. They depend neither on the box nor on the number of threads."""
+        """Return the values of every variable in the shape of the box.
+
+        They depend neither on the choice of boxes nor on the number of threads.
+        """
         flat = self.values_at(box)
         return {
             name: np.asarray(flat[name]).reshape(box.shape).astype(variable.dtype, copy=False)
@@ -230,20 +233,20 @@ class CubeMap(ABC):
     @property
     @abstractmethod
     def point_s(self) -> float:
-        """Seconds of one core that a slow point takes, roughly."""
+        """Approximate time of one core for a slow point [s]."""
 
     @property
     @abstractmethod
     def settings(self) -> Mapping[str, Any]:
-        """What determines the values beside the array and the cube."""
+        """Settings that determine the values, apart from the array and the cube."""
 
     @abstractmethod
     def values_at(self, box: Box) -> Mapping[str, Any]:
-        """Values of every variable at the points of a box, in their order."""
+        """Return the values of every variable at the points of a box, in their order."""
 
 
 class Chunk(NamedTuple):
-    """Values of one box, and how long they took."""
+    """Values of one box, and the duration of their computation."""
 
     box: Box
     values: Values
@@ -251,12 +254,12 @@ class Chunk(NamedTuple):
 
 
 def boxes(cube: CubeMap) -> Iterator[Box]:
-    """Boxes that tile a cube."""
+    """Yield the boxes that tile a cube."""
     return tiles(cube.grid, cube.edge)
 
 
 def tiles(grid: int, edge: int) -> Iterator[Box]:
-    """Boxes of some points along their edges that tile a cube."""
+    """Yield boxes with `edge` points along their edges that tile a cube."""
     parts = [slice(i, min(i + edge, grid)) for i in range(0, grid, edge)]
     n = len(parts)
     for i, j, k in np.ndindex(n, n, n):
@@ -264,7 +267,7 @@ def tiles(grid: int, edge: int) -> Iterator[Box]:
 
 
 def computed(cube: CubeMap, box: Box) -> Chunk:
-    """Compute the values of one box, and take the time. Ctrl-C waits for a part of the box."""
+    """Compute the values of one box and measure the time; Ctrl-C waits for a part of the box."""
     began = time.perf_counter()
     x, y, z = box.region
     layers = -(-(x.stop - x.start) // _PARTS)
@@ -277,7 +280,7 @@ def computed(cube: CubeMap, box: Box) -> Chunk:
 
 
 def coordinates(cube: CubeMap) -> dict[str, tuple[FloatArray, dict[str, str]]]:
-    """Coordinates of a cube's points along every dimension, with CF attributes."""
+    """Return the coordinates of a cube's points along every dimension, with CF attributes."""
     return {
         name: (cube.axis, {"long_name": f"{cube.point} {name}, array frame", "units": "m", "axis": name.upper()})
         for name in DIMENSIONS
@@ -285,13 +288,13 @@ def coordinates(cube: CubeMap) -> dict[str, tuple[FloatArray, dict[str, str]]]:
 
 
 def check_half_width(edge_m: float) -> float:
-    """Half of a cube's edge."""
+    """Return half of a cube's edge; raise ValueError for an invalid edge."""
     check_positive(edge_m=edge_m)
     return 0.5 * edge_m
 
 
 def tallied(dataset: xr.Dataset, names: Sequence[str], tally: Callable[[Values], Tally]) -> Tally:
-    """Tally of some variables of a map, part by part: the map need not fit into memory."""
+    """Tally some variables of a map part by part, so that the map need not fit into memory."""
     total = Tally()
     for box in tiles(dataset.sizes[DIMENSIONS[0]], _COUNTED):
         part = dataset[list(names)].isel(dict(zip(DIMENSIONS, box.region, strict=True)))
@@ -302,7 +305,7 @@ def tallied(dataset: xr.Dataset, names: Sequence[str], tally: Callable[[Values],
 def in_memory(
     cube: CubeMap, progress: Callable[[int], None] | None = None, chunks: Iterable[Chunk] | None = None
 ) -> xr.Dataset:
-    """All values of a map over (x, y, z) with its attributes and ``seconds``, from chunks or computed here."""
+    """Return all values of a map over (x, y, z), from chunks or computed here, with attributes and ``seconds``."""
     import xarray as xr
 
     shape = (cube.grid,) * 3

@@ -1,4 +1,4 @@
-"""Processes of this machine that compute beside each other."""
+"""Parallel processes on this machine."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from magloc import core
 
 @contextmanager
 def process_pool(processes: int) -> Iterator[ProcessPoolExecutor]:
-    """New interpreters of one thread each, ended at once where the block is left by an exception.
+    """Start interpreters of one thread each; an exception in the block ends them at once.
 
-    A fork of a process with threads, such as those of compiled code, may never come back.
+    They are not forked: a fork of a process with threads, such as those of compiled code, may hang.
     """
     pool = ProcessPoolExecutor(processes, mp_context=get_context("spawn"), initializer=_prepare)
     try:
         yield pool
     except BaseException:
-        for process in list((pool._processes or {}).values()):  # what a pool has no public name for before 3.14
+        for process in list((pool._processes or {}).values()):  # no public name before Python 3.14
             process.terminate()
         raise
     finally:
@@ -31,8 +31,8 @@ def process_pool(processes: int) -> Iterator[ProcessPoolExecutor]:
 
 
 def _prepare() -> None:
-    """Settings of a process: one thread, and an interruption is the business of the process that started it."""
+    """Limit a process to one thread, and leave interruptions to the process that started it."""
     core.set_threads(1)
-    warnings.simplefilter("ignore")  # those of NumPy: what a user is told is logged
-    one_blas_thread.__enter__()  # for good
+    warnings.simplefilter("ignore")  # NumPy's warnings; messages for users are logged
+    one_blas_thread.__enter__()  # never left: the limit lasts as long as the process
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -1,8 +1,8 @@
-"""Maps of any size, streamed to a zarr store from which an interrupted one goes on.
+"""Maps of any size, streamed to a zarr store that can resume an interrupted map.
 
-The store (zarr version 3, ``xarray.open_zarr`` opens it) has one chunk per box of the cube. A chunk's number in
-``seconds_of_chunk`` is written after everything else of it, and marks it as done: whatever happens before, the chunk is
-computed again; whatever happens after, it never is. Only one box is in memory at a time.
+The store (zarr version 3, ``xarray.open_zarr`` opens it) has one chunk per box of the cube. The duration of a chunk in
+``seconds_of_chunk`` is written last and marks the chunk as done. After an interruption only chunks without this mark
+are computed again. Only one box is in memory at a time.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 SECONDS_OF_CHUNK = "seconds_of_chunk"
 _SOMETHING_ELSE = "{}: found something else than a map, expected a map or nothing."
-# What zarr and xarray raise for a store that is cut short or damaged depends on the place and the codec.
+# Errors of zarr and xarray for a truncated or damaged store; they depend on the damaged part and the codec.
 UNREADABLE = (
     ArithmeticError,
     AssertionError,
@@ -57,24 +57,24 @@ UNREADABLE = (
 
 
 class Sweep(Closing):
-    """The store of one map, open for writing: a context manager that keeps other processes from writing to it.
+    """Store of one map, open for writing; as a context manager it locks out other writing processes.
 
     Parameters
     ----------
     path : path-like
-        The store; made if it does not exist.
+        Folder of the store; created if it does not exist.
 
     Attributes
     ----------
     unreadable : list of str
-        One sentence for every chunk that was done but cannot be read; it is computed again.
+        One sentence for every chunk that is done but cannot be read, and is computed again.
 
     Raises
     ------
     InputError
-        The path holds something else, or another map, or another process is writing to it. It is left as it is.
+        The path holds something else or another map, or another process is writing to it. Nothing is changed.
     OSError
-        The store cannot be made.
+        The store cannot be created.
     """
 
     def __init__(self, cube: CubeMap, path: str | os.PathLike[str]) -> None:
@@ -99,27 +99,27 @@ class Sweep(Closing):
             raise
 
     def close(self) -> None:
-        """Let other processes write."""
+        """Release the lock, so that other processes can write."""
         if self._lock is not None:
             os.close(self._lock)
             self._lock = None
 
     @property
     def n_chunks(self) -> int:
-        """Chunks of the whole map."""
+        """Number of chunks of the whole map."""
         return int(self._seconds.size)
 
     @property
     def chunks_done(self) -> int:
-        """Chunks that will not be computed again."""
+        """Number of chunks that are done."""
         return int(np.isfinite(self._seconds).sum())
 
     def unfinished(self) -> Iterator[Box]:
-        """Boxes that are not done."""
+        """Yield the boxes that are not done."""
         return (box for box in self._boxes() if np.isnan(self._seconds[box.place]))
 
     def write(self, chunks: Iterable[Chunk], progress: Callable[[int], None] | None = None) -> None:
-        """Write chunks as they come; where one cannot be written, those before it are done."""
+        """Write chunks as they arrive; if one cannot be written, those before it are done."""
         for chunk in chunks:
             with delay_signals():
                 for name, array in self._arrays.items():
@@ -158,13 +158,13 @@ class Sweep(Closing):
 
 
 def open_map(path: str | os.PathLike[str]) -> xr.Dataset:
-    """Map in a store, loaded piece by piece; NaN, or the smallest integer there is, where a chunk is not done."""
+    """Open the map in a store, loaded piece by piece; NaN or the smallest integer if a chunk is not done."""
     import xarray as xr
 
     with warnings.catch_warnings():
-        warnings.filterwarnings("error", ".*not recognized as a component")  # an array whose description is damaged
+        warnings.filterwarnings("error", ".*not recognized as a component")  # the metadata of an array are damaged
         group = _opened(Path(path))
-        # One by one: of several that zarr opens at once it retrieves one error, and asyncio prints the others.
+        # Open arrays one by one: zarr retrieves only one error of several, and asyncio prints the others.
         for name in (folder.name for folder in sorted(Path(path).iterdir()) if folder.is_dir()):
             array = group[name]
             for file in Path(path, name, "c").rglob("*"):
@@ -173,13 +173,13 @@ def open_map(path: str | os.PathLike[str]) -> xr.Dataset:
     seconds = float(dataset[SECONDS_OF_CHUNK].sum())
     dataset = dataset.drop_vars(SECONDS_OF_CHUNK).assign_attrs(seconds=seconds)
     for variable in dataset.data_vars.values():
-        if "flag_values" in variable.attrs:  # JSON knows no types, netCDF and CF want that of the variable
+        if "flag_values" in variable.attrs:  # JSON loses the type; netCDF and CF need that of the variable
             variable.attrs["flag_values"] = np.asarray(variable.attrs["flag_values"], dtype=variable.dtype)
     return dataset
 
 
 def chunk_seconds(path: str | os.PathLike[str]) -> FloatArray:
-    """Duration of every chunk of a store, NaN where it is not done; empty where there is no map."""
+    """Return the duration of every chunk of a store, NaN if it is not done; empty without a map."""
     try:
         return _readable_marks(_opened(Path(path))[SECONDS_OF_CHUNK])
     except UNREADABLE:
@@ -187,12 +187,12 @@ def chunk_seconds(path: str | os.PathLike[str]) -> FloatArray:
 
 
 def _as_json(attributes: Mapping[str, Any]) -> dict[str, Any]:
-    """Attributes as they come back from a store."""
+    """Return attributes as they are after a round trip through a store."""
     return json.loads(json.dumps(dict(attributes), default=lambda value: value.tolist()))
 
 
 def _make_store(cube: CubeMap, path: Path) -> None:
-    """Make an empty store in one step: an interruption leaves no half of one in its place."""
+    """Create an empty store in one step, so that an interruption leaves no incomplete store."""
     with of_extra("maps", "a stored map"):
         import zarr
         from zarr.codecs import ZstdCodec
@@ -228,12 +228,12 @@ def _make_store(cube: CubeMap, path: Path) -> None:
             attributes={"long_name": "duration of every chunk's computation; NaN where it is not done", "units": "s"},
         )
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # not yet in zarr's specification; xarray asks for it, others ignore it
+            warnings.simplefilter("ignore")  # consolidated metadata are not in zarr's specification
             zarr.consolidate_metadata(unfinished)
         try:
             os.replace(unfinished, path)
         except OSError:
-            if not path.is_dir():  # else another process was faster: whose it is, and whether it writes, is seen next
+            if not path.is_dir():  # otherwise another process was faster; later checks find out if it has the same map
                 raise
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
@@ -243,10 +243,10 @@ def _opened(path: Path) -> zarr.Group:
     with of_extra("maps", "a stored map"):
         import zarr
 
-    if not path.is_dir():  # early versions of zarr make what they are to open
+    if not path.is_dir():  # early versions of zarr create a missing store on opening
         raise InputError(_SOMETHING_ELSE.format(path))
     for file in path.rglob("*"):
-        if not (file.is_file() or file.is_dir()):  # a device or a pipe would be read without end
+        if not (file.is_file() or file.is_dir()):  # reading a device or a pipe would never end
             raise InputError(f"{path}: found {file.relative_to(path)}, which is neither a file nor a folder.")
     try:
         return zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
@@ -255,7 +255,7 @@ def _opened(path: Path) -> zarr.Group:
 
 
 def _arrays_of_same_map(cube: CubeMap, group: zarr.Group, path: Path) -> dict[str, Any]:
-    """Arrays of a store that holds this very map."""
+    """Return the arrays of a store; raise InputError if it does not hold the same map."""
     stored, expected = dict(group.attrs), _as_json(cube.attributes)
     if not stored.keys() & expected.keys():
         raise InputError(_SOMETHING_ELSE.format(path))
@@ -269,18 +269,16 @@ def _arrays_of_same_map(cube: CubeMap, group: zarr.Group, path: Path) -> dict[st
     try:
         arrays = {name: group[name] for name in (*cube.variables, SECONDS_OF_CHUNK)}
     except UNREADABLE:
-        raise InputError(
-            f"{path}: found a map of which a part is missing: remove it, or choose another folder."
-        ) from None
+        raise InputError(f"{path}: found an incomplete map: remove it, or choose another folder.") from None
     return arrays
 
 
 def _check_stated_size(array: Any, file: Path) -> None:
-    """Refuse a chunk compressed by zstd that states another size than its own: the decoder allocates what it states.
+    """Raise ValueError if a chunk compressed by zstd states a wrong size; the decoder would allocate it.
 
     The layout of the first bytes is that of RFC 8878, section 3.1.1.1.
     """
-    if not file.is_file():  # a folder, or a chunk that is not done
+    if not file.is_file():  # a folder, or no chunk yet
         return
     with file.open("rb") as stream:
         head = stream.read(18)
@@ -296,7 +294,7 @@ def _check_stated_size(array: Any, file: Path) -> None:
 
 
 def _edge(arrays: Mapping[str, Any], marks: FloatArray, path: Path) -> int:
-    """Points along the edges of the chunks, which are those of the store, whatever a new one would have."""
+    """Return the number of points along the edges of the store's chunks; a new store may have another one."""
     (shape, chunks), *others = {(array.shape, array.chunks) for array in arrays.values()}
     if others or len({*shape}) != 1 or len({*chunks}) != 1 or marks.shape != (-(-shape[0] // chunks[0]),) * 3:
         raise InputError(f"{path}: found chunks that are not those of a map: remove it, or choose another folder.")
@@ -311,7 +309,7 @@ def _in_words(key: str, found: Any, wanted: Any) -> str:
 
 
 def _readable_marks(marks: Any) -> FloatArray:
-    """What is done (seconds) and what is not (NaN, also where the mark itself is damaged)."""
+    """Return the seconds of each chunk that is done; NaN for others, also if the mark itself is damaged."""
     try:
         return np.array(marks[:])
     except UNREADABLE:
@@ -323,7 +321,7 @@ def _readable_marks(marks: Any) -> FloatArray:
 
 
 def _locked(path: Path) -> int | None:
-    """Descriptor that holds a lock until it is closed or the process ends, however it does; None without locks."""
+    """Return a descriptor with a lock, which ends when it is closed or the process ends; None without locks."""
     if sys.platform == "win32":
         return None
     import fcntl

@@ -1,4 +1,4 @@
-"""Independent pieces of work: here, in processes or on a cluster, and kept in a folder until all are done."""
+"""Independent items of work: computed here, in processes or on a cluster, with results cached in a folder."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from magloc.grids.cluster import check_address, worked_by
 from magloc.grids.pool import process_pool
 
 Arrays = Mapping[str, NDArray[Any]]
-"""What work results in."""
+"""Result of the work on one item."""
 Work = Callable[[Any], Arrays]
 Each = Callable[[Work, Iterable[Any]], Iterator[tuple[int, Arrays]]]
-"""Numbers of items, in any order, with what some work makes of them."""
-_PER_PROCESS = 2  # items sent ahead: one that it computes, one that it has ready
+"""Function that yields the numbers of items, in any order, with the results of the work on them."""
+_PER_PROCESS = 2  # items sent to each process: one that it computes, and the next one
 
 
 def runner(scheduler: str | None) -> Callable[[Callable[[Any], Any], Iterable[Any]], Iterator[Any]]:
-    """Return `map`, or what does the same by the workers of a dask scheduler, in any order."""
+    """Return `map`, or the equivalent with the workers of a dask scheduler, which yields in any order."""
     if scheduler is None:
         return map
     check_address(scheduler)
@@ -42,9 +42,9 @@ def runner(scheduler: str | None) -> Callable[[Callable[[Any], Any], Iterable[An
 
 @contextmanager
 def workers(processes: int, scheduler: str | None, folder: Path | None) -> Iterator[Each]:
-    """What does work on many items: in processes, or by the workers of a dask scheduler.
+    """Provide a function that works on many items, in processes or by the workers of a dask scheduler.
 
-    What is done is kept in a folder; what is there of the same work on the same item is not done again.
+    Results are cached in a folder. Work whose result is there is not done again.
     """
     with ExitStack() as stack:
         run = runner(scheduler)
@@ -83,8 +83,8 @@ def _pooled(pool: ProcessPoolExecutor, ahead: int, work: Callable[[Any], Any], i
             yield from [future.result() for future in done]
     except BrokenProcessPool:
         raise InputError(
-            "a process died, for want of memory perhaps: ask for fewer processes. A script of your own has to start"
-            " its work below `if __name__ == '__main__':`, as processes import it."
+            "a process died, perhaps because memory ran out: use fewer processes. Your own script must start its work"
+            " below `if __name__ == '__main__':`, because the processes import it."
         ) from None
 
 
@@ -93,13 +93,13 @@ def _numbered(work: Work, item: tuple[int, Any]) -> tuple[int, Arrays]:
 
 
 def _key(work: Work, item: Any) -> str:
-    """Of all that determines a result."""
+    """Return the key of a cached result: a hash of everything that determines it."""
     content = pickle.dumps((version("magloc"), work, item), protocol=5)
     return hashlib.sha256(content).hexdigest()
 
 
 def _read(path: Path) -> Arrays | None:
-    """A result that was kept; None if it is not there or was cut short."""
+    """Read a cached result; None if it is missing or incomplete."""
     try:
         with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
             return dict(file)
@@ -108,10 +108,10 @@ def _read(path: Path) -> Arrays | None:
 
 
 def _write(path: Path, result: Arrays) -> None:
-    """Keep a result: whole or not at all, whenever the process ends."""
+    """Write a result to the cache, completely or not at all."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with replaced(path) as written, written.open("wb") as file:
-            np.savez(file, **result)  # type: ignore[arg-type]  # allow_pickle, which NumPy 2.0 does not know
+            np.savez(file, **result)  # type: ignore[arg-type]  # NumPy 2.0 does not have allow_pickle
     except OSError as error:
         raise InputError(f"{path} cannot be written ({error.strerror or error}).") from None

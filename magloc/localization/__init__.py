@@ -1,1 +1,1 @@
-"""One fix: where a dipole is, from one set of readings."""
+"""Fixes: locations of dipoles from single sets of readings."""

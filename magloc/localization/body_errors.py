@@ -1,7 +1,8 @@
-"""Errors of point fixes if the objects were bodies of the default length.
+"""Errors of point fixes if the objects are in fact bodies of the default length.
 
-χ² does not see a body that is farther away than two of its lengths: what a dipole leaves out of its field looks like a
-shift and a turn. Where noise is small against the field, that is far more than the standard deviations of a point.
+χ² does not reveal a body that is farther away than two of its lengths: the difference from a dipole's field looks like
+a shift and a rotation. If noise is small compared with the field, this error is far larger than the standard deviations
+of a point fix.
 """
 
 from __future__ import annotations
@@ -18,8 +19,8 @@ from magloc.localization.model_errors import ambient_errors, body_errors
 from magloc.measurement.rows import whitened_rows
 from magloc.measurement.whitened import WhitenedModel
 
-# Sum of squared differences below which a body of default length is less than the noise, whatever the array: its field
-# differs from its dipole's by a hundredth or two.
+# Sum of squared differences below which the effect of a default body is below the noise for any array: its field
+# differs from a dipole's by one or two per cent.
 _LEAST_ENERGY = 3e3
 _AT_ONCE = 256
 
@@ -32,11 +33,9 @@ def body_covariances(
     *,
     known_place: bool,
 ) -> FloatArray:
-    """Return the covariance (n, D, D) that bodies would add to fixes of points.
+    """Return the covariance (n, D, D) that bodies would add to the best solutions of point fixes.
 
-    Best solutions, in the array's frame.
-
-    (0, D, D) where no row stands out of noise enough for it to matter.
+    It is in the array's frame. The shape is (0, D, D) if no row has enough signal for it to matter.
     """
     solutions, best = fixes.solutions, fixes.best
     added = np.zeros((len(fixes), *solutions.covariance.shape[1:]))

@@ -1,6 +1,6 @@
 """Validity of the dipole model: by the body's length, or by the residuals of a fix.
 
-The patterns that are looked for, quadrupole and octupole, are derived in docs/theory/extended-sources.md.
+The residual patterns of quadrupole and octupole are derived in docs/theory/extended-sources.md.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from magloc.measurement.rows import whitenings_of
 
 BODY_LENGTHS = 3.0
 _ORDERS = (2, 3)
-# Columns whose part outside the earlier ones is smaller than this are not seen by the array.
+# Smallest relative part of a column outside the earlier ones that the array sees.
 _UNSEEN_RTOL = 1e-6
 
 
@@ -36,14 +36,14 @@ class MultipoleGain:
     order : int
         2 for the quadrupole, 3 for the octupole.
     gain : float
-        By how much χ² decreases.
+        Decrease of χ².
     n_parameters : int
-        How many more parameters the array sees.
+        Number of further parameters that the array sees.
     noise_probability : float
-        Probability that noise of the stated size gains as much: χ² test.
+        Probability that noise of the stated size gives the same decrease (χ² test).
     misfit_probability : float
-        Probability that a misfit without any pattern gains as much: F test against what is left. 1 where nothing is
-        left to compare it with.
+        Probability that a misfit without any pattern gives the same decrease (F test against the remaining χ²). 1 if no
+        degree of freedom remains.
     """
 
     order: int
@@ -60,17 +60,17 @@ class NearnessTest:
     Attributes
     ----------
     misfit : bool
-        Whether χ² is larger than noise explains.
+        True if χ² is larger than noise explains.
     extended : bool
-        Whether a quadrupole or an octupole explains significantly more than noise, and more than a misfit of another
-        kind does: the source is too near or too large for a dipole. So near that the expansion about one point does
-        not hold, and with few sensors, there is a misfit only.
+        True if a quadrupole or an octupole explains significantly more than noise and more than another kind of misfit:
+        the source is too near or too large for a dipole. With few sensors, or so near that the multipole expansion
+        fails, only `misfit` is true.
     chi2 : float
-        Of the dipole, at the end of one linearised step.
+        χ² of the dipole after one linearised step.
     dof : int
-        Differences minus the unknowns of a dipole that the array sees.
+        Number of differences minus the unknowns of a dipole that the array sees.
     gains : tuple of MultipoleGain
-        Each beyond the orders before it.
+        Gain of each order beyond the orders before it.
     """
 
     misfit: bool
@@ -81,15 +81,14 @@ class NearnessTest:
 
 
 def dipole_validity(distance_m: ArrayLike, body_length_m: ArrayLike) -> BoolArray:
-    """Return whether a body is at least three lengths away, so that it counts as a dipole.
+    """Return True if a body is at least three lengths away, so that it counts as a dipole.
 
-    At three lengths, the length being the longest side, the field of a uniformly magnetised cube differs from that of a
-    dipole by 0.3 % at most, that of a cylinder as long as it is wide by 1.3 %, of a flat brick by 5 % and of a thin rod
-    by 6 %, on whose axis the ratio of the two is ``1/(1 - (L/2r)²)²``.
+    The length is that of the longest side. At three lengths the field of a uniformly magnetised body differs from that
+    of a dipole by at most 0.3 % for a cube, 1.3 % for a cylinder as long as it is wide, 5 % for a flat brick and 6 %
+    for a thin rod. On the axis of the rod the ratio of the two fields is ``1/(1 - (L/2r)²)²``.
 
-    ``distance_m``: from the body's centre to the sensors [m]. ``body_length_m``: greatest extent of the body [m].
-    Returns: their shapes broadcast; False where either is NaN. Raises ValueError: a distance or a length is
-    negative.
+    ``distance_m``: distance from the body's centre to the sensors [m]. ``body_length_m``: greatest extent of the body
+    [m]. Both broadcast; the result is False if either is NaN. Raises ValueError: a distance or a length is negative.
     """
     distance, length = np.asarray(distance_m, dtype=np.float64), np.asarray(body_length_m, dtype=np.float64)
     for name, values in (("distance_m", distance), ("body_length_m", length)):
@@ -108,15 +107,15 @@ def nearness_test(
 ) -> NearnessTest:
     """Test the residuals of a fix for the pattern of an extended or too near source.
 
-    A quadrupole and then an octupole at the solution are added to the linearised dipole. Either is a finding if χ²
-    decreases by more than noise explains, and by more, per parameter, than what is left of the misfit (F test at 5 %).
-    The octupole is left out where it would leave no degree of freedom. That χ² itself is too large is a finding too.
-    Each of the three tests has a third of the rate of false alarms.
+    A quadrupole and then an octupole at the solution are added to the linearised dipole. Either is significant if χ²
+    decreases by more than noise explains, and by more per parameter than the remaining misfit (F test at 5 %). The
+    octupole is left out if it would leave no degree of freedom. A too large χ² is a finding of its own. Each of the
+    three tests has a third of the false-alarm rate.
 
-    ``array``: its noise decides what is significant. ``position_m``, ``moment_Am2`` (3,): solution of a fix, in the
-    array's frame [m], [A·m²]. ``readings_T`` (C,): the readings of that fix [T]; NaN where missing.
-    ``false_alarm``: probability at most of any finding for a dipole with noise of the stated size. Raises
-    ValueError: the shapes do not agree, or the rate of false alarms is not between 0 and 1.
+    ``array``: array with the noise that decides what is significant. ``position_m``, ``moment_Am2`` (3,): solution of a
+    fix in the array's frame [m], [A·m²]. ``readings_T`` (C,): readings of that fix [T]; NaN where missing.
+    ``false_alarm``: largest probability of any finding for a dipole with noise of the stated size. Raises ValueError:
+    the shapes do not agree, or the false-alarm rate is not between 0 and 1.
     """
     position, moment = _vector("position_m", position_m), _vector("moment_Am2", moment_Am2)
     readings = np.asarray(readings_T, dtype=np.float64)
@@ -179,7 +178,7 @@ def is_too_near(
     ambient_T: FloatArray | None = None,
     body_length_m: float | None = None,
 ) -> BoolArray:
-    """Return whether each row's source is too near for a dipole, by length or misfit.
+    """Return which rows have a source too near for a dipole, by its length or its misfit.
 
     Fixes are in the array's frame.
     """

@@ -1,12 +1,11 @@
 r"""Exclusion of faulty sensors from fixes.
 
-A row whose χ² is not credible is fitted again with Student-t scores (:mod:`magloc.localization.reweighting`), iterated
-from the plain fit and from the best fits without one sensor each. These are refined from the plain fit, which a single
-sensor seldom moves to another optimum; which are worth it is told to first order
-(:mod:`magloc.localization.leave_one_out`). Only where none of them explains the others are optima without some sensors
-searched for anew. The sensors that are then far outside of what their noise allows are named, and the row is fitted
-anew without them; what is returned is a plain least-squares fix, with the χ² and the covariance of the sensors that it
-uses.
+A row whose χ² is not credible is fitted again with Student-t scores (:mod:`magloc.localization.reweighting`). The
+iteration starts from the plain fit and from the best fits without one sensor each. These are refined from the plain
+fit, because a single sensor seldom moves it to another optimum; a first-order estimate selects the promising ones
+(:mod:`magloc.localization.leave_one_out`). If none of them explains the other sensors, a new search without some
+sensors follows. Sensors whose residuals are then far beyond their noise are named, and the row is fitted again without
+them. The result is a plain least-squares fix, with the χ² and the covariance of the remaining sensors.
 """
 
 from __future__ import annotations
@@ -32,24 +31,24 @@ from magloc.localization.search.multi_source import NOISE_ALONE
 from magloc.measurement.rows import NO_SIGNAL, rows_of_equal_mask, whitened_model, whitenings_of
 from magloc.measurement.whitened import WhitenedModel
 
-# χ² per degree of freedom above which a faulty sensor may have bent the fit and hide in it.
+# χ² per degree of freedom above which a faulty sensor may have biased the fit, so that its residual is small.
 _SPOILT = 4.0
-# Squared residuals, in limits, are cut here: a larger one is no stronger evidence.
+# Upper limit of squared residuals, in units of their limits: a larger one is no stronger evidence.
 _BEYOND_DOUBT = 10.0
-# A fix that explains the other sensors badly must be better by this factor in χ² per degree of freedom.
+# Factor in χ² per degree of freedom by which a fix must be better if it explains the other sensors badly.
 _INCOMPARABLE = 1000.0
-# Sensors of an array of which every two are left out in turn, and every one: of a larger one where a fit blames them.
+# Largest arrays in which each pair of sensors, and each single sensor, is left out. In larger arrays only suspects are.
 _MOST_IN_PAIRS, _MOST_ONE_BY_ONE = 8, 16
-# Fits without one sensor, of lowest expected χ²: how many are refined, and how many are kept for a row.
+# Number of fits without one sensor that are refined, lowest expected χ² first, and number that are kept for a row.
 _MOST_REFINED, _MOST_KEPT = 6, 3
 # Largest number of gross faults that are excluded one after another.
 _MOST_GROSS = 3
-# Share of the largest fall of χ² below which the falls without other sensors are negligible.
+# Share of the largest decrease of χ² below which the decreases without other sensors are negligible.
 _MATTERS = 0.05
-# Share of a sensor's readings, along any direction, that the others check: below the larger one a fit without it is
-# refined, whatever it promises; one that bends a fit, and draws a source to itself, leaves less than the smaller one.
+# Share of a sensor's readings, along any direction, that the other sensors check. Below the first value a fit without
+# the sensor is always refined. A faulty sensor that attracts the source has less than the second value.
 _HALF_CHECKED, _LEAST_CHECKED = 0.5, 0.1
-# Suspect sensors of a larger array, each of which is left out of a new search.
+# Number of suspect sensors of a larger array that are left out of a new search, one at a time.
 _MOST_SEARCHED = 2
 # Share of a source's energy in one sensor above which no other sensor sees it.
 _LONELY = 0.9
@@ -74,8 +73,7 @@ def exclude_faulty_sensors(
 ) -> Fixes:
     """Return fixes without sensors that contradict all others, named in `dropped_sensors`.
 
-    No sensor is dropped from a row whose χ² is credible, nor where too few would be left to tell which of them is
-    wrong.
+    No sensor is dropped from a row whose χ² is credible, or if too few sensors would remain to identify the faulty one.
     """
     doubtful = _is_doubtful(fixes)
     examined, found = [], []
@@ -112,14 +110,14 @@ def _is_credible(fix: Fix) -> bool:
 
 def _largest_credible(dof: int, body_length_m: float) -> float:
     """Return the largest credible χ²."""
-    # The prior of a body's shape is a coarse one, and no fault of a sensor.
+    # The prior of a body's shape is coarse, so a body needs a lower level.
     return quantile(dof, MISFIT if body_length_m > 0.0 else 1.0 - CREDIBLE_ROW)
 
 
 def _is_worth_dropping_for(fix: Fix, plain: Fix) -> bool:
     """Return whether a fix without some sensors explains the others, or fits far better.
 
-    Where it does not, it is the model, or what is known of the source, that is wrong.
+    Otherwise the model, or the prior of the source, is wrong.
     """
     if not fix.solutions or fix.solutions[0].dof <= 0:
         return False
@@ -132,9 +130,9 @@ def _is_worth_dropping_for(fix: Fix, plain: Fix) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class _Start:
-    """Fit q (K, 4), mu (K, 3) to reweight from: sensors left out, and whether it is credible.
+    """Start of a reweighting: fit q (K, 4), mu (K, 3), sensors left out, and whether it is credible.
 
-    A fit is not for lack of degrees of freedom.
+    A fit without degrees of freedom is not credible.
     """
 
     q: FloatArray
@@ -174,11 +172,11 @@ class _Examination:
 
     @property
     def problem(self) -> WhitenedModel:
-        """Model of the rows, with the model errors that are allowed for."""
+        """Model of the rows, with model errors counted as noise."""
         return self.fits.problem
 
     def allow_for_model_errors(self, plain: Sequence[Fix]) -> None:
-        """Count errors by bodies and the ambient field as noise, so that no sensor is blamed."""
+        """Count errors of bodies and the ambient field as noise, so that no sensor is dropped for them."""
         sigma_T = self.array.row_ambient_uncertainty_T if self.array.channel_is_scalar.any() else 0.0
         length_m = np.array([fix.body_length_m for fix in plain])
         errors = []
@@ -193,7 +191,7 @@ class _Examination:
             self.fits = replace(self.fits, problem=self.problem.marginalise(every))
 
     def drop_lonely_sources(self, plain: Sequence[Fix]) -> list[Fix]:
-        """Drop sources that only one sensor sees: they look the same as a fault of that sensor."""
+        """Drop sources that only one sensor sees, because they look like a fault of that sensor."""
         found = list(plain)
         for row, fix in enumerate(plain):
             if not fix.solutions or len(self._scale(fix)[0]) < 2:
@@ -246,10 +244,10 @@ class _Examination:
         return found
 
     def _suspect_rows(self, plain: Sequence[Fix]) -> IntArray:
-        """Return rows with an outlier in the plain fix, or with a fit too poor to tell."""
+        """Return rows with an outlier in the plain fix, or with a fit too poor to show one."""
         solved = np.array([bool(fix.solutions) for fix in plain])
         credible = np.array([bool(fix.solutions) and _is_credible(fix) for fix in plain])
-        # Mean share of a sensor's residual that a fit of so many unknowns leaves.
+        # Mean share of a sensor's residual that remains after a fit of so many unknowns.
         unknowns = np.array([3.0 + 6.0 * (len(self._scale(fix)[0]) if fix.solutions else 1) for fix in plain])
         unseen = np.clip(1.0 - unknowns / max(1, self.count.sum()), 0.2, 1.0)
         spoilt = ~solved
@@ -280,7 +278,7 @@ class _Examination:
     def _refine_without_one(self, plain: Sequence[Fix], rows: IntArray) -> dict[int, list[_Start]]:
         """Return the plain fits and the best fits without one sensor, best first.
 
-        Rows are left out where no sensor stands out of what all others leave, and each is checked by them.
+        A row is left out if no sensor is an outlier and each sensor is checked by the others.
         """
         every = self._starts([(row, plain[row]) for row in rows.tolist()])
         starts: dict[int, list[_Start]] = {row: [] for row in rows.tolist()} | {row: [start] for row, start in every}
@@ -305,7 +303,7 @@ class _Examination:
     def _exclude_gross_faults(self, plain: Sequence[Fix], tried: Sequence[_StartOfRow]) -> list[_StartOfRow]:
         """Return fits that explain rows without two or three sensors, each beyond doubt.
 
-        From one without a sensor, the next one is that which lowers χ² most.
+        From a fit without one sensor, the next sensor to exclude is the one that lowers χ² most.
         """
         found = []
         left = [(row, start) for row, start in tried if plain[row].solutions and not start.explains]
@@ -354,9 +352,9 @@ class _Examination:
         return _Start(fits.q[k], fits.mu[k], without, bool(credible))
 
     def _exclusion_candidates(self, rows: IntArray, q: FloatArray, mu: FloatArray) -> BoolArray:
-        """Return sensors (f, N) that are outliers, or that may bend the fits unseen.
+        """Return sensors (f, N) that are outliers, or that may bias the fits unnoticed.
 
-        None where all of many leave evenly much, so that the noise is larger than stated.
+        None is returned if many sensors have similar residuals, so that the noise is larger than stated.
         """
         fall, checked = self.fits.chi2_falls(rows, q, mu)
         fall = np.where(self.count, fall, 0.0)
@@ -370,10 +368,10 @@ class _Examination:
     def _plan_searches(
         self, plain: Sequence[Fix], starts: dict[int, list[_Start]], unexplained: Sequence[int]
     ) -> list[dict[frozenset[int], list[int]]]:
-        """Return rows to search again, by the sensors that are left out, one set after another.
+        """Return the rows to search again for each set of sensors to leave out, one set after another.
 
-        Of a small array every one and every two, of a large one the nearest to every source and those that the
-        refinements blame most.
+        In a small array these are all single sensors and all pairs. In a large one they are the sensors nearest to each
+        source and the strongest suspects of the refinements.
         """
         standing = np.flatnonzero(self.count).tolist()
         every = [frozenset({sensor}) for sensor in standing] if len(standing) <= _MOST_ONE_BY_ONE else []
@@ -416,7 +414,7 @@ class _Examination:
     def _certain_faults(self, starts: dict[int, list[_Start]]) -> dict[int, frozenset[int]]:
         """Return sensors that are certainly faulty: the only credible fit leaves them out.
 
-        To it they are beyond doubt, and none of the others would stand out even if it did not count.
+        In that fit they are outliers beyond doubt, and no other sensor would be an outlier even if left out.
         """
         only = [(row, tried[0]) for row, tried in starts.items() if len(tried) == 1 and tried[0].explains]
         found: dict[int, frozenset[int]] = {}
@@ -434,7 +432,7 @@ class _Examination:
         every = [(row, start) for row, of_row in starts.items() for start in of_row]
         for _, rows, q, mu, weight in self._stack(every):
             misfit, scale2 = self.fits.reweight(rows, q, mu, weight)
-            # Beyond doubt is beyond doubt: two sensors that are far off must not cost less than one that is farther.
+            # Residuals are limited, so that one sensor very far off does not cost more than two far off.
             bounded = np.minimum(misfit / scale2[:, None], _BEYOND_DOUBT * self.limits)
             score = 0.5 * np.sum(
                 (DEGREES_OF_FREEDOM + self.count) * np.log1p(bounded / DEGREES_OF_FREEDOM), axis=1

@@ -1,14 +1,14 @@
-"""Dipole from field and gradient tensor in closed form, to show the cost of derivatives.
+"""Dipole from field and gradient tensor in closed form, to compare with fits of differences.
 
 Vector sensors at the offsets δ from their centroid see B + G δ, as long as the field is linear across the array; B and
 the five numbers of the symmetric, traceless G follow by least squares. A dipole's field is homogeneous of degree -3 in
-the offset d from it, so that Euler's theorem gives
+the offset d from the dipole, so Euler's theorem gives
 
     G d = -3 B,   m = (r³/k) (3/2 n nᵀ - I) B,   r = |d|, n = d/r.
 
-What is not linear across the array, of relative size edge over distance, is an error that no averaging takes away.
-The differences themselves, which :func:`magloc.locate` predicts exactly, do not have it, and they need no field that is
-known to be the source's alone.
+Nonlinearity of the field across the array, of relative size edge over distance, is an error that no averaging removes.
+:func:`magloc.locate` predicts the differences exactly. So it does not have this error, and it does not need the field
+of the source alone.
 
 Source: T. Nara, S. Suzuki, S. Ando, "A closed-form formula for magnetic dipole localization by measurement of its
 magnetic field and spatial gradients", IEEE Transactions on Magnetics 42 (2006).
@@ -26,7 +26,7 @@ from arrays.typing import FloatArray
 from magloc.fields.dipole import MU0_OVER_4PI
 
 N_UNKNOWNS = 8
-# Of a symmetric, traceless tensor: G = Σ g_i E_i with g = (xx, xy, xz, yy, yz).
+# Basis of the symmetric, traceless tensors: G = Σ g_i E_i with g = (xx, xy, xz, yy, yz).
 _TENSORS = np.array(
     [
         [[1, 0, 0], [0, 0, 0], [0, 0, -1]],
@@ -46,11 +46,11 @@ class GradientTensor:
     Attributes
     ----------
     centroid_m : ndarray, shape (3,)
-        Of the sensors.
+        Centroid of the sensors [m].
     field_T : ndarray, shape (..., 3)
-        Field of the source there.
+        Field of the source at the centroid [T].
     tensor_T_m : ndarray, shape (..., 3, 3)
-        Its gradient, symmetric and traceless [T/m].
+        Gradient of the field, symmetric and traceless [T/m].
 
     Examples
     --------
@@ -68,9 +68,9 @@ class GradientTensor:
 
     @property
     def position_m(self) -> FloatArray:
-        """Position of the dipole, shape (..., 3); not finite where the tensor is singular.
+        """Position of the dipole, shape (..., 3); not finite if the tensor is singular.
 
-        It is singular for a moment across the line of sight.
+        The tensor is singular for a moment across the line of sight.
         """
         return self.centroid_m - self._offset
 
@@ -86,7 +86,7 @@ class GradientTensor:
     def _offset(self) -> FloatArray:
         """Centroid relative to the dipole, -3 G⁻¹ B, by Cramer's rule.
 
-        A singular tensor is no error.
+        A singular tensor raises no error.
         """
         a, b, c = np.moveaxis(self.tensor_T_m, -2, 0)
         adjugate = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=-2)
@@ -98,20 +98,19 @@ class GradientTensor:
 def fit_gradient_tensor(array: SensorArray, readings_T: ArrayLike) -> GradientTensor:
     """Fit field and gradient tensor at the centroid of an array by least squares.
 
-    The array's ambient field, where it states one, is taken out first: the closed form needs the field of the source
-    alone.
+    A stated ambient field of the array is subtracted first: the closed form needs the field of the source alone.
 
     Parameters
     ----------
     array : SensorArray
-        Vector sensors that are not in one line.
+        Array of vector sensors that are not in one line.
     readings_T : array_like, shape (..., C)
-        Raw readings [T]. A row that misses some has NaN for a result.
+        Raw readings [T]. The result of a row with missing readings is NaN.
 
     Returns
     -------
     GradientTensor
-        In the array's frame, with the leading axes of the readings.
+        Result in the array's frame, with the leading axes of the readings.
 
     Raises
     ------

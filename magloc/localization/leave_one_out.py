@@ -27,14 +27,14 @@ def chi2_falls_without_sensors(
     *,
     free_position: bool = True,
 ) -> tuple[FloatArray, FloatArray]:
-    r"""Return the first-order decrease of χ² without each sensor, and how it is checked.
+    r"""Return the first-order decrease of χ² without each sensor, and the share of it that others check.
 
     Both are (b, N), for fits (b, K, …).
 
     Deleting channels adds their readings to the unknowns. With the readings' whitening W, residuals r and an
     orthonormal basis Q of the derivatives, sensor s takes :math:`g^T (I - H)^{-1} g`, where :math:`g = (W r)_s` and
-    :math:`I - H = [W (I - Q Q^T) W]_{ss}`. Its least eigenvalue tells how well the other sensors check its readings:
-    0 where they do not. Channels (N, 3) are negative where a sensor has none.
+    :math:`I - H = [W (I - Q Q^T) W]_{ss}`. Its least eigenvalue is the share that the other sensors check, 0 if they
+    do not check it. Channels (N, 3) are negative if a sensor has none.
     """
     y = problem.whiten(raw)
     residual = problem.residual(y, q, mu, problem.source_fields(q, mu))
@@ -59,10 +59,10 @@ def weight_channels(problem: WhitenedModel, raw: FloatArray, weight: FloatArray)
     """Return a problem and its raw readings (b, C) with variances divided by weights (b, C)."""
     root = np.sqrt(weight)[..., None]
     flat = problem.shrinkage >= 1.0
-    # A flat prior needs only the span of its columns, another one also the variance along each of them.
+    # A flat prior needs only the span of its columns; other priors need the variance along each of them too.
     some, known = flat.any(axis=0), ~flat.all(axis=0)
     span = root * (problem.basis * flat[:, None])[..., some]
-    for _ in range(2):  # once more, for the digits that squares lose
+    for _ in range(2):  # a second pass restores the digits that squares lose
         square, axes = np.linalg.eigh(span.transpose(0, 2, 1) @ span)
         seen = square > _UNSEEN * square[:, -1:]
         span = span @ (axes * np.where(seen, 1.0 / np.sqrt(np.where(seen, square, 1.0)), 0.0)[:, None])

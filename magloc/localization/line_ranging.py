@@ -1,7 +1,7 @@
 """Distance of a source on a straight line, from one vector sensor.
 
-The source keeps its moment and its attitude, and does not pass the sensor. The field of a dipole is the same on both
-sides of it, so that the line may as well be inverted through the sensor: distances are not affected.
+The source keeps its moment and its attitude, and does not pass the sensor. The field of a dipole is the same on
+opposite sides, so a line inverted through the sensor fits equally well. Distances are not affected.
 """
 
 from __future__ import annotations
@@ -21,30 +21,31 @@ from magloc.fields.coil import loop_field
 _N_UNKNOWNS = 8
 _N_DIRECTIONS = 24
 _GRID = 4000
-# Radii of a coil that a fit starts from, relative to the distance of its start.
+# Start values of a coil's radius, relative to the distance of the start.
 _RADII = (0.3, 0.8)
 
 
 @dataclass(frozen=True, eq=False)
 class SourceLine:
-    """Source on a straight line, seen by a vector sensor at the origin.
+    """Source on a straight line near a vector sensor at the origin.
 
     Attributes
     ----------
     start_m : ndarray, shape (3,)
-        Source at distance zero, in the sensor's axes [m], up to the sign of (start, direction) together.
+        Position of the source at distance zero, in the sensor's axes [m]. The common sign of start and direction is not
+        determined.
     direction : ndarray, shape (3,)
         Unit vector in which the distance grows.
     moment_Am2 : ndarray, shape (3,)
-        [A·m²].
+        Moment [A·m²].
     radius_m : float
-        Of the current loop that the source is; 0 for a dipole.
+        Radius of the source if it is a current loop; 0 for a dipole.
     chi2 : float
-        Sum of squared residuals over the noise.
+        Sum of squared residuals divided by the noise.
     dof : int
-        Readings minus unknowns.
+        Number of readings minus number of unknowns.
     converged : bool
-        Whether the iteration ended at an optimum; else nothing here is a result.
+        True if the iteration ended at an optimum. Otherwise no number here is a result.
 
     Examples
     --------
@@ -85,15 +86,15 @@ def fit_source_line(
     noise_T : float
         Standard deviation per axis [T].
     noise_fraction : float
-        Noise proportional to the field, as of an array: variance = noise² + (fraction · |B|)².
+        Noise proportional to the field, as for an array: variance = noise² + (fraction · |B|)².
     coil : bool
-        Whether the source is a coil, that is the single loop whose radius fits best, and no dipole.
+        Fit a single loop with its radius instead of a dipole.
 
     Returns
     -------
     SourceLine
-        The best of the fits from many directions of the line; after it :func:`distance_along_line` gives a distance
-        for every single reading.
+        Best of the fits from many directions of the line. With it :func:`distance_along_line` gives a distance for
+        every single reading.
 
     Raises
     ------
@@ -132,25 +133,25 @@ def distance_along_line(
     Parameters
     ----------
     line : SourceLine
-        Of :func:`fit_source_line`.
+        Result of :func:`fit_source_line`.
     field_T : array_like, shape (..., 3)
         Field of the source alone, in the sensor's axes [T].
     noise_T, noise_fraction
-        As of :func:`fit_source_line`.
+        Noise as in :func:`fit_source_line`.
     within_m : tuple of 2 floats
-        Where the source may be [m].
+        Bounds of the distance [m].
 
     Returns
     -------
     distance_m : ndarray, shape (...)
-        Where the field of the line is nearest to the reading [m]; a bound where that is the nearest.
+        Distance [m] at which the field of the line is nearest to the reading; it may be one of the bounds.
     standard_deviation_m : ndarray, shape (...)
-        Of the noise alone, for a line that is exactly known [m].
+        Standard deviation [m] by the noise alone, for an exactly known line.
 
     Raises
     ------
     ValueError
-        The shapes do not agree, or the bounds are none.
+        The shapes do not agree, or the bounds are invalid.
 
     Examples
     --------
@@ -207,9 +208,7 @@ def _check_readings(
 
 
 def _starts(distance: FloatArray, field: FloatArray) -> list[FloatArray]:
-    """Return lines near the sensor, in many directions, at the range of the decay.
-
-    The directions cover a hemisphere.
+    """Return start lines near the sensor in directions of a hemisphere, at a range from the field's decay.
 
     Along a line through the sensor |B|^(-1/3) is linear in the distance, and zero at the sensor.
     """

@@ -1,4 +1,4 @@
-"""Locator of sources: the order of the steps that make a fix.
+"""Locator of sources: the sequence of steps that make a fix.
 
 Detection → search → uncertainty → exclusion of faulty sensors → validity of the dipole → result.
 """
@@ -49,39 +49,39 @@ if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
 _LOG = logging.getLogger(__name__)
-# A search for several sources, or with known moments, takes its rows in smaller blocks.
+# Rows per block; a search for several sources, or with known moments, has smaller blocks.
 _ROWS_AT_ONCE, _ROWS_OF_SEVERAL = 1024, 64
-# Size of the whitenings of a block, where each row has its own.
+# Largest size of the whitenings of a block if each row has its own.
 _MOST_NUMBERS = 8_000_000
 
 
 class Locator:
-    """Fixes without a start value, with one array of any sensors.
+    """Locator of sources by one array of any sensors, without a start value.
 
     Parameters
     ----------
     array : SensorArray
-        Vector sensors, scalar ones, or both, with six differences at least.
+        Array of vector sensors, scalar sensors or both, with at least six differences.
     sources : int or "auto"
-        How many sources there are in every row; "auto": as many as the readings support, five at most.
+        Number of sources in every row. "auto" finds as many as the readings support, at most five.
     position_m : array_like, shape (3,), (n, 3) or (n, K, 3), optional
-        Where the source is, in the array's frame [m], in all rows or in every one: only its moment is looked for. Of
-        several sources n is 1 for all rows.
+        Known position of the source in the array's frame [m], for all rows or for each row; only its moment is fitted.
+        With several sources, n is 1 for all rows.
     prior : SourcePrior
-        Bounds of position and moment that hold for every source; solutions that contradict them are left out.
+        Bounds of position and moment for every source; solutions outside of them are left out.
     body_length_m : float, optional
-        Length of the object: what a dipole leaves out of its field counts as noise, and fixes nearer than three lengths
-        are flagged `too_near`. By default a quarter of its distance, where four sensors are nearer than 0.6 of the
-        array's circumradius; 0 for a point.
+        Length of the object. The deviation of its field from a dipole counts as noise, and fixes nearer than three
+        lengths are flagged `too_near`. By default the length is a quarter of the distance if four sensors are nearer
+        than 0.6 of the array's circumradius. 0 for a point.
     exclude_faulty : bool
-        Leave out, and name, sensors that contradict all others.
+        Leave out sensors that contradict all others, and name them.
     rng : int or numpy.random.Generator
         Seed or generator of random restarts and of the draws for the threshold of another source.
 
     Raises
     ------
     ValueError
-        The array cannot tell that many sources, the prior leaves nothing, or the position is no place for a source.
+        The array cannot separate that many sources, the prior leaves no source, or the position is not valid.
 
     Examples
     --------
@@ -141,7 +141,7 @@ class Locator:
         time_s: FloatArray | None = None,
         progress: Callable[[int], None] | None = None,
     ) -> Fixes:
-        """Return the fixes of many sets of readings, each on its own.
+        """Return the fixes of many sets of readings, each independent of the others.
 
         Parameters
         ----------
@@ -150,15 +150,15 @@ class Locator:
         ambient_T : array_like, shape (n, 3), optional
             Ambient field of every row in the array's frame [T], in place of the array's own.
         time_s : ndarray, shape (n,), optional
-            Of the rows; 0, 1, 2 … by default.
+            Times of the rows [s]; 0, 1, 2 … by default.
         progress : callable, optional
             Called with the number of rows finished since the last call.
 
         Returns
         -------
         Fixes
-            In the order of the rows, in the array's frame. Several sources keep their number from row to row where
-            they can be followed, at first the strongest comes first.
+            Fixes in the order of the rows, in the array's frame. Several sources keep their number from row to row if
+            they can be followed. In the first row the strongest comes first.
         """
         readings = check_rows(self.array, readings_T)
         ambient = None if ambient_T is None else np.asarray(ambient_T, dtype=np.float64)
@@ -192,7 +192,7 @@ class Locator:
         return exclude_faulty_sensors(self.array, fixes, refit, readings, ambient, free_position=free)
 
     def _fit_with_all_sensors(self, index: IntArray, readings: FloatArray, ambient: FloatArray | None) -> Fixes:
-        """Return fixes of some rows with all sensors: detection, search, uncertainty."""
+        """Return fixes of some rows with all sensors, by detection, search and uncertainty."""
         search = self._search
         if isinstance(search, MomentSearch):
             search = search.select(index)
@@ -221,7 +221,7 @@ class _FixCollector:
         self.parts: list[Solutions] = []
 
     def refuse(self, rows: IntArray, reason: str) -> None:
-        """Record why some rows have no solution."""
+        """Record the reason why some rows have no solution."""
         for row in rows.tolist():
             self.reason[row] = reason
 
@@ -281,9 +281,9 @@ def fit_at_rest(
 ) -> Fix:
     """Fit one source at rest to several rows of a moving array, in the world frame.
 
-    A few scalar sensors do not locate a source in one row, but they do while they pass it. Every row keeps a common
-    field of its own. Parameters are those of :func:`magloc.localization.search.moving_array.stacked_rows`, and a prior
-    in the world frame. `poses`: with their errors, which count as noise.
+    A few scalar sensors do not locate a source in one row, but they do while they pass it. Every row has its own common
+    field. Parameters are those of :func:`magloc.localization.search.moving_array.stacked_rows`, and a prior in the
+    world frame. Errors of `poses` count as noise.
     """
     rows = stacked_rows(array, readings_T, origins_m, R_world_from_array, ambient_T)
     found = _FixCollector(1)
@@ -313,20 +313,20 @@ def locate(
     rng: Rng = 0,
     progress: Callable[[int], None] | None = None,
 ) -> Fixes:
-    """Find the sources in every row of readings, each row on its own.
+    """Find the sources in every row of readings, each row independent of the others.
 
     Parameters
     ----------
     array : SensorArray
-        As its user knows it: places, noise and calibration of the sensors.
+        Array with the positions, noise and calibration of its sensors.
     readings : Readings or array_like, shape (n, C) or (C,)
-        Raw readings [T], NaN where missing. Those that saturate are not used, and named.
+        Raw readings [T], NaN where missing. Saturated readings are not used, and their channels are named.
     sources, prior, body_length_m, exclude_faulty, rng
         As in :class:`Locator`.
     position_m : array_like, shape (3,) or (K, 3), optional
-        Where the source is, or several sources are [m], in the frame of the results: only moments are looked for.
+        Known position of the source, or of K sources [m], in the frame of the results; only moments are fitted.
     ambient_T : array_like, shape (n, 3) or (3,), optional
-        Ambient field in the array's frame [T], in place of the readings' and the array's own.
+        Ambient field in the array's frame [T], in place of that of the readings or the array.
     average : bool
         Average all rows to one fix. The array and the source must stand still.
     progress : callable, optional
@@ -335,14 +335,14 @@ def locate(
     Returns
     -------
     Fixes
-        In the world frame where the readings have the array's pose, else in the array's.
+        Fixes in the world frame if the readings have the array's pose, otherwise in the array's frame.
 
     Raises
     ------
     InputError
-        Rows that cannot be averaged.
+        The rows cannot be averaged.
     ValueError
-        As of :class:`Locator`.
+        For the same reasons as :class:`Locator`.
 
     Examples
     --------
@@ -403,7 +403,7 @@ def _places_in_array(position_m: ArrayLike, pose: tuple[FloatArray, Rotation] | 
 def _with_eddies(array: SensorArray, rows: Readings) -> SensorArray:
     """Return the array with eddy currents as errors of its offsets.
 
-    Their size follows from the turns between the rows.
+    Their size follows from the rotation between the rows.
     """
     if rows.pose is None or not any(sensor.eddy_uncertainty_s for sensor in array.sensors):
         return array
@@ -416,7 +416,7 @@ def _with_attitude_as_field_error(
 ) -> SensorArray:
     """Return the array with attitude errors as errors of the ambient field.
 
-    Errors are rms over the rows; only moduli see them.
+    Errors are rms over the rows; they affect only moduli.
     """
     attitude_rad = pose.attitude_rad if rows.pose_sigma is None else np.sqrt(np.mean(rows.pose_sigma[:, 1] ** 2))
     field_T = array.ambient_fields if ambient_T is None else ambient_T
@@ -431,7 +431,7 @@ def used_rows(
     """Return the rows to fit, the array with their noise, and saturated channels of each row."""
     rows = in_world_field(without_saturated(readings, array), array)
     if rows.background:
-        _LOG.warning("a row on its own has no background: filters take it out, and with it some of the signal")
+        _LOG.warning("fits of single rows do not model a background: filters remove it, with some of the signal")
         values_T = rows.background.taken_out(rows.time_s, rows.values_T)
         rows = replace(rows, values_T=values_T, background=NO_BACKGROUND)
     if not average:

@@ -1,10 +1,10 @@
-r"""Model errors that a fit allows for: extended bodies and an inexact ambient field.
+r"""Model errors of a fit: extended bodies and an inexact ambient field.
 
-What they add to the readings at the fit counts as noise, and the fit is refined with it held. A modulus sees an error
-of the ambient field along the field at its sensor: differences keep what the source turns there. A body's second and
-fourth moments of magnetisation are unknown, with standard deviations that grow with its length L: :math:`0.025 L^2` and
-:math:`0.0015 L^4` for each of 5 and 9 orthonormal components, those of bars, discs and cuboids. Their field has rank 14
-for every source: docs/theory/extended-sources.md.
+Their effect on the readings at the fit counts as noise, and the fit is refined with this noise fixed. A modulus reads
+the component of an ambient field's error along the total field at its sensor. The source turns this direction, so the
+error does not cancel in differences. A body's second and fourth moments of magnetisation are unknown, with standard
+deviations that grow with its length L: :math:`0.025 L^2` and :math:`0.0015 L^4` for each of 5 and 9 orthonormal
+components, as for bars, discs and cuboids. Their field has rank 14 for every source: docs/theory/extended-sources.md.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from magloc.localization.fit.gauss_newton import JointFits, refine
 from magloc.localization.fit.optima import Optima
 from magloc.measurement.whitened import WhitenedModel
 
-# |s| of unit q = (u, s) below which the source is farther than NEAR from every sensor.
+# Value of |s| of unit q = (u, s) below which the source is farther than NEAR from every sensor.
 _FAR_S = 1.0 / math.hypot(1.0, 1.0 + NEAR)
-# Negligible variance of the field that a dipole leaves out, summed over the channels in units of the noise.
+# Negligible variance of a body's deviation from a dipole, summed over the channels in units of the noise.
 _NEGLIGIBLE = 0.1
 _ROUNDS = 3
-# Second-order effect of the ambient field's error, in σ of a reading, from which errors are not Gaussian.
+# Second-order effect of the ambient field's error, in σ of a reading, above which errors are not Gaussian.
 _BENT = 0.3
 
 
 def body_errors(model: WhitenedModel, q: FloatArray, mu: FloatArray, length_m: FloatArray) -> FloatArray:
     """Return errors (b, C, 14 K) of readings by bodies (b, K), in units of the noise.
 
-    Columns are of one σ.
+    Each column is the effect of one σ.
     """
     sensors = model.centroid + model.radius * model.sensors
     separation = sensors - model.position(q)[:, :, None]
@@ -67,7 +67,7 @@ def ambient_errors(model: WhitenedModel, q: FloatArray, mu: FloatArray, sigma_T:
 def with_model_errors(
     optima: Optima, body_length_m: float | None, ambient_sigma_T: float = 0.0
 ) -> list[tuple[Optima, FloatArray]]:
-    """Return optima refined with model errors, and body lengths (b,), 0 where none matters."""
+    """Return optima refined with model errors, and body lengths (b,), 0 if the body does not matter."""
     rows, none = optima.rows, np.zeros(len(optima.rows))
     point = body_length_m == 0.0 or (body_length_m is None and _is_far(optima.fits.q))
     ambient_sigma_T = ambient_sigma_T if rows.model.sees_moduli else 0.0
@@ -90,7 +90,7 @@ def with_model_errors(
     if not matters.any():
         return [(optima, none)]
     refined = _refine(optima.select(matters), lengths[matters], ambient_sigma_T, known)
-    # A row whose refined fits did not converge keeps those of a point in a known field.
+    # If the refined fits of a row did not converge, the fits of a point in a known field remain.
     lost = np.bincount(refined.of_row, minlength=len(refined.rows)) == 0
     matters[np.flatnonzero(matters)[lost]] = False
     result = [(refined.select(~lost), lengths[matters].max(axis=1))] if matters.any() else []
@@ -108,7 +108,7 @@ def _is_far(q: FloatArray) -> bool:
 def _refine(optima: Optima, lengths: FloatArray, ambient_sigma_T: float, errors: FloatArray | None) -> Optima:
     """Refine optima with errors linearised at the best fit of every row, twice.
 
-    The errors at the first best fits may be known.
+    `errors` are those at the first best fits, if they are known already.
     """
     fits, rows = optima.fits, optima.rows
     merged = np.broadcast_to(optima.merged, fits.mu.shape[:2])
@@ -144,10 +144,7 @@ def model_errors(
 
 
 def _is_nonlinear(model: WhitenedModel, fits: JointFits, of_row: IntArray, ambient_sigma_T: float) -> BoolArray:
-    """Return whether moduli are nonlinear (f,) in an error of the ambient field.
-
-    Their second order is beyond noise.
-    """
+    """Return in which fits (f,) the second-order effect of the ambient field's error on moduli exceeds noise."""
     if not ambient_sigma_T:
         return np.zeros(len(of_row), dtype=bool)
     at = model.rows(of_row)

@@ -18,11 +18,11 @@ _ROWS_AT_ONCE = 256
 def fix_residuals(
     array: SensorArray, readings_T: ArrayLike, fixes: Fixes, ambient_T: FloatArray | None = None
 ) -> FloatArray:
-    """Return residuals (n, C) of the best solution of every row, over the noise's σ.
+    """Return residuals (n, C) of the best solution of every row, divided by the noise σ.
 
-    The field common to all sensors, of which nothing is known, is fitted and taken out. The sum of squares of a row is
-    the χ² of its solution; a fitted channel's own variance is therefore a little below 1. NaN where there is no reading
-    or no solution, and for sensors that the fix left out.
+    The unknown field common to all sensors is fitted and removed. The sum of squares of a row is the χ² of its
+    solution, so the variance of a fitted channel is slightly below 1. NaN without a reading or a solution, and for
+    sensors that the fix leaves out.
     """
     readings = check_rows(array, readings_T)
     used = np.where(fixes.solved[:, None], fixes.used_readings(array, readings), np.nan)

@@ -1,4 +1,4 @@
-r"""Fits with weights of whole sensors: without some of them, or by Student-t scores.
+r"""Fits with weights of whole sensors: without some sensors, or by Student-t scores.
 
 A sensor whose squared residual is :math:`\rho_s` has the weight :math:`(\nu + n_s)/(\nu + \rho_s)`, iterated.
 """
@@ -19,7 +19,7 @@ from magloc.measurement.whitened import WhitenedModel
 
 DEGREES_OF_FREEDOM = 4.0
 LEAST_WEIGHT = 1e-16
-# Ratio to the stated variance above which the noise counts as understated.
+# Ratio of estimated to stated variance above which the noise counts as understated.
 _UNDERSTATED = 2.0
 _N_REWEIGHTINGS = 30
 # Fits of a row that differ less in position and (relatively) in weights are merged.
@@ -36,13 +36,13 @@ class WeightedFits:
     Attributes
     ----------
     sensor_channels : ndarray of int, shape (N, 3)
-        Negative where a sensor has no such channel.
+        Channels of every sensor; negative if it has no such channel.
     count : ndarray of int, shape (N,)
-        Readings of every sensor.
+        Number of readings of every sensor.
     limits : ndarray, shape (N,)
-        Of the squared residual of every sensor.
+        Limit of the squared residual of every sensor.
     free_position : bool
-        Whether sources are not at known places.
+        True if the positions of sources are unknown.
     """
 
     problem: WhitenedModel
@@ -100,20 +100,19 @@ class WeightedFits:
         return squares
 
     def scale2(self, misfit: FloatArray) -> FloatArray:
-        """Return the variance of the noise (f,) over the stated one, one at least.
+        """Return the ratio (f,) of the noise variance to the stated one, at least one.
 
-        It is estimated from the median sensor.
-
-        Where everything fits badly it is the model or the stated noise that is wrong, not a sensor.
+        It is estimated from the median sensor. If all sensors fit badly, the model or the stated noise is wrong, and
+        not a sensor.
         """
         standing = self.count > 0
         ratio = np.median(misfit[:, standing] / self.count[standing], axis=1) / _MEDIAN_RATIO
         return np.maximum(1.0, ratio)
 
     def square_limits(self, scale2: float, n_sources: int) -> FloatArray:
-        """Return limits (N,) of squared residuals over the noise variance.
+        """Return limits (N,) of squared residuals divided by the noise variance.
 
-        They are wider where that is an estimate.
+        They are wider if the variance is an estimate.
         """
         if scale2 < _UNDERSTATED:
             return self.limits

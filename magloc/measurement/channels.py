@@ -1,7 +1,7 @@
-"""Whitened channels as the kernels of fits take them: the C struct ``magloc_channels``.
+"""Whitened channels for the kernels of fits: the C struct ``magloc_channels``.
 
-A prior of the common field is turned into readings of it, so that taking the common field out of the channels is a
-projection, however much is known of it.
+A prior of the common field becomes additional readings of it. So the common field is always removed from the channels
+by a projection, with or without a prior.
 """
 
 from __future__ import annotations
@@ -36,11 +36,9 @@ def channels_of(model: WhitenedModel) -> core.Problem:
 
 
 def problem(model: WhitenedModel, gain: FloatArray, columns: FloatArray, *, moduli: bool = False) -> core.Problem:
-    """Return the channels of a model with gains (sets, C, 3) and columns (sets, C, c).
+    """Return the channels of a model with gains (sets, C, 3) and columns (sets, C, c) to project out.
 
-    The columns are projected out.
-
-    Channels behind those of the sensors are known parts of the common field. Without moduli all channels are linear.
+    Channels after those of the sensors are known parts of the common field. Without moduli all channels are linear.
     """
     n_sets, n_channels, n_common = columns.shape
     is_modulus = np.zeros(n_channels, dtype=np.uint8)

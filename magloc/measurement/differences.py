@@ -1,11 +1,11 @@
 r"""Measurement model of an array: decorrelated differences of a dipole and their Jacobian.
 
-The predictions of all channels are formed first, vector sensors as components of the field in their own axes, scalar
-sensors as the exact modulus :math:`|B_a + B|`, then combined to the independent differences of
-:mod:`arrays.differences`. The state is (p, m): the source's position in the array's frame [m], its moment [A·m²].
+All channels are predicted first: vector sensors as components of the field in their own axes, scalar sensors as the
+exact modulus :math:`|B_a + B|`. Then they are combined to the independent differences of :mod:`arrays.differences`. The
+state is (p, m): the source's position [m] in the array's frame and its moment [A·m²].
 
-The names of the source paper and ours: ForwardMT and ForwardMV are :meth:`DifferenceMeasurement.predicted`, JacobianH
-is :meth:`DifferenceMeasurement.jacobian` (analytic; the paper's (11) takes central differences).
+The source paper's ForwardMT and ForwardMV are :meth:`DifferenceMeasurement.predicted` here. Its JacobianH is
+:meth:`DifferenceMeasurement.jacobian`, which is analytic; the paper's (11) takes central differences.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ def predicted_channels(
 ) -> FloatArray:
     """Return noise-free readings (..., C) [T] of a source in the array's frame, without offset.
 
-    ``a_c · (B_a + B)`` for a component, ``g |B_a + B|`` for a modulus, with the ambient field B_a at each sensor: of
-    ``ambient_T`` and, where it is not uniform, ``ambient_gradient_T_m``, which differences of either kind see. The
-    argument `ambient_T` (N, 3) stands in their place.
+    A component is ``a_c · (B_a + B)``, a modulus ``g |B_a + B|``. The ambient field B_a at each sensor follows from the
+    array's ``ambient_T`` and ``ambient_gradient_T_m``; differences of both kinds contain the gradient. The argument
+    `ambient_T` (N, 3) replaces it.
     """
     fields = fields_at_sensors(array, position_m, moment_Am2, ambient_T)
     return array.readings_of(fields) - array.channel_offset_T
@@ -65,13 +65,13 @@ def fields_at_sensors(
 
 @dataclass(frozen=True, eq=False)
 class DifferenceMeasurement:
-    """The decorrelated differences of one array, as a measurement model.
+    """Measurement model of the decorrelated differences of one array.
 
     Attributes
     ----------
     differences : Differences
-        Which combinations of channels are measured; see :func:`arrays.differences.decorrelated_differences` for missing
-        readings, another base sensor or another noise.
+        Combinations of channels; see :func:`arrays.differences.decorrelated_differences` for missing readings, another
+        base sensor or another noise.
     """
 
     array: SensorArray
@@ -92,7 +92,7 @@ class DifferenceMeasurement:
 
         Equations (16) and (28) of the source paper.
 
-        What the differences leave out may be NaN.
+        Channels that the differences do not use may be NaN.
         """
         transform = self.differences.transform
         used = np.any(transform != 0.0, axis=0)

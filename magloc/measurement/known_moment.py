@@ -1,9 +1,9 @@
 r"""Prior of a moment: a pseudo-measurement of its modulus or of its three components.
 
-The modulus makes the moment no linear unknown, but a fit of it stays cheap: what minimises
+With a known modulus the fit of the moment is nonlinear but still cheap. The minimum of
 :math:`\|y - A\mu\|^2 + (|\mu| - M)^2/\sigma^2` solves :math:`(A^T A + \nu I)\mu = A^T y` with
-:math:`|\mu| = M/(1 - \nu\sigma^2)` for exactly one ν above :math:`-\lambda_1`, the least eigenvalue of
-:math:`A^T A`: docs/theory/known-position.md.
+:math:`|\mu| = M/(1 - \nu\sigma^2)` for exactly one ν above :math:`-\lambda_1`, where :math:`\lambda_1` is the least
+eigenvalue of :math:`A^T A`: docs/theory/known-position.md.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class KnownMoment:
     Attributes
     ----------
     value_Am2 : tuple of float
-        One number is the modulus, three are the components in the array's frame.
+        One number for the modulus, or three for the components in the array's frame.
     sigma_Am2 : float
     """
 
@@ -48,7 +48,7 @@ class KnownMoment:
     def residual(self, moment_Am2: FloatArray) -> FloatArray:
         """Return the residuals (..., K k) of moments (..., K, 3), in standard deviations.
 
-        Prior value minus moment.
+        A residual is the prior value minus the moment's.
         """
         has = moment_Am2 if self.n_known == 3 else np.linalg.norm(moment_Am2, axis=-1, keepdims=True)
         left = np.asarray((np.array(self.value_Am2) - has) / self.sigma_Am2, dtype=np.float64)
@@ -66,7 +66,7 @@ class KnownMoment:
     def best_moments(self, information: FloatArray, pull: FloatArray, unit_Am2: FloatArray) -> FloatArray:
         """Return the scaled moments μ (..., 3) that minimise ``μᵀ I μ - 2 pᵀ μ + |residual|²``.
 
-        I (..., 3, 3) is their information, unit (...) the size in A·m² of a scaled moment of one.
+        I (..., 3, 3) is the information on μ, and unit (...) the moment [A·m²] for a scaled moment of 1.
         """
         sigma = self.sigma_Am2 / unit_Am2
         if self.n_known == 3:
@@ -94,7 +94,8 @@ def moments_of_modulus(eigenvalue: FloatArray, along: FloatArray, modulus: Float
 
     λ and b (..., 3) are eigenvalues of ``AᵀA``, the least one first, and ``Aᵀy`` along its eigenvectors; the result
     has their shape. Newton's iteration on 1/|x|, which is concave in ν, comes from the left and never passes the root.
-    In the hard case, b₁ = 0 and the other components too short, the first one may have either sign: it is positive.
+    In the hard case, b₁ = 0 and the other components too short, the sign of the first one is not determined; the result
+    has a positive one.
     """
     variance, wanted = (sigma**2)[..., None], modulus[..., None]
     least = eigenvalue[..., :1]

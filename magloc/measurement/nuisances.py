@@ -1,8 +1,8 @@
-r"""Lasting errors of sensors, as states that are estimated along with a source.
+r"""Lasting errors of sensors, as states that are estimated together with a source.
 
-Turned axes, gains, the platform's fields, 1/f noise and drift do not average out as noise does. Every one of them is a
-first-order Markov process :math:`\dot e = -e/τ + w`: constant for the calibration, a random walk for drift, one
-process a decade of frequency for 1/f noise. See docs/theory/sensor-errors.md.
+Rotated axes, gains, the platform's fields, 1/f noise and drift do not average out as noise does. Each error is a
+first-order Markov process :math:`\dot e = -e/τ + w`: a constant for calibration errors, a random walk for drift, and
+one process per decade of frequency for 1/f noise. See docs/theory/sensor-errors.md.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from magloc.conditioning import Background
 # Corner frequencies of the processes that make up 1/f noise [Hz].
 _FLICKER_HZ = tuple(10.0**-decade for decade in range(FLICKER_DECADES))
 FASTEST_FLICKER_HZ = math.sqrt(10.0) * _FLICKER_HZ[0]
-"""Upper end of the decades that they stand for [Hz]: 1/f noise above it counts as noise of one sample."""
+"""Upper end of the decades of these processes [Hz]. 1/f noise above it counts as white noise."""
 _SECONDS_PER_HOUR = 3600.0
 _UNKNOWN = 1e5
-"""Standard deviation, in that of a reading's noise, of a background of which nothing is known."""
+"""Standard deviation of an unknown background, in units of a reading's noise."""
 
-# First index of each error of a sensor: turns, gains, a field, those induced by the ambient field and by its rate.
+# First index of each kind of error: rotation, gain, fixed field, field induced by the ambient field, and by its rate.
 _TURN, _GAIN, _FIELD, _INDUCED, _EDDY = 0, 3, 6, 9, 18
 
 
@@ -37,9 +37,9 @@ class BackgroundDrift:
     Attributes
     ----------
     offset, walk_rts : float
-        Standard deviation of an offset, and of what a random walk adds to it in the root of a second.
+        Standard deviation of an offset, and of a random walk per root of a second.
     slope_Hz, about_s : float
-        Standard deviation of the slope of a line that is zero at this time [1/s].
+        Standard deviation of the slope [1/s] of a line, and the time [s] at which the line is zero.
     """
 
     offset: float = 0.0
@@ -51,8 +51,8 @@ class BackgroundDrift:
     def of(cls, background: Background, time_s: FloatArray) -> BackgroundDrift | None:
         r"""Return the drift that a background leaves over rows at these times.
 
-        A random walk that adds :math:`2π f_c Δt` of the noise in every row leaves in its steady state what a high-pass
-        of first order with the corner :math:`f_c` leaves.
+        A random walk that adds :math:`2π f_c Δt` of the noise in every row acts, in its steady state, like a high-pass
+        filter of first order with the corner :math:`f_c`.
         """
         if not background or len(time_s) < 2:
             return None
@@ -73,18 +73,19 @@ class SensorErrors:
     Attributes
     ----------
     sigma : ndarray, shape (n,)
-        Standard deviations before anything is known.
+        Prior standard deviations.
     decay_Hz : ndarray, shape (n,)
-        1/τ [1/s].
+        Decay rates 1/τ [1/s].
     walk : ndarray, shape (n,)
-        Standard deviation that a random walk adds in the root of a second.
+        Standard deviation of a random walk per root of a second.
     of_sensor : ndarray, shape (a, 2)
-        What the first a states are: sensor, and which of its errors: turns about its three axes, gains of them,
-        components of a field that is fixed to the array, and of what the ambient field and its rate induce, 3×3 each.
+        Sensor and kind of error of the first a states. Kinds are rotations about the sensor's three axes, their gains,
+        components of a field that is fixed to the array, and 3×3 components each of the fields that the ambient field
+        and its rate induce.
     of_channel : ndarray, shape (n - a,)
-        Channel to which the others, drift and 1/f noise, are added.
+        Channel of the other states, which are drift and 1/f noise.
     is_slope : ndarray of bool, shape (n - a,)
-        Whether they are added times the time since `about_s`.
+        True if a state is multiplied by the time since `about_s`.
     """
 
     array: SensorArray
@@ -147,7 +148,7 @@ class SensorErrors:
 
     @property
     def is_constant(self) -> bool:
-        """True if the effect is the same in every row, as of offsets."""
+        """True if the effect is the same in every row, as for offsets."""
         fields = (self.of_sensor[:, 1] >= _FIELD) & (self.of_sensor[:, 1] < _INDUCED)
         return bool(fields.all() and not self.is_slope.any() and not self.array.channel_is_scalar.any())
 
@@ -162,9 +163,7 @@ class SensorErrors:
     ) -> FloatArray:
         """Return the derivative (C, n) of one row's readings (C,) [T] by the errors.
 
-        It is finite also for missing readings.
-
-        The array turns at a rate (3,) about its own axes.
+        It is finite for missing readings too. The array rotates at a rate (3,) about its own axes.
         """
         effect = np.zeros((array.n_channels, self.n_states))
         n = len(self.of_sensor)
@@ -189,11 +188,10 @@ class SensorErrors:
 
 
 def ambient_in_array(array: SensorArray, readings_T: FloatArray, ambient_T: FloatArray | None = None) -> FloatArray:
-    """Return the ambient field (..., 3) at the middle of the sensors.
+    """Return the ambient field (..., 3) at the middle of the sensors for rows (..., C).
 
-    It is the known field, else the mean of what vector sensors read.
-
-    Of rows (..., C); that of each of them (..., 3) stands in place of the array's own.
+    It is the known field, otherwise the mean reading of the vector sensors. `ambient_T` (..., 3) of each row replaces
+    the array's own.
     """
     known_T = array.ambient_fields.mean(axis=0) if ambient_T is None else ambient_T
     if np.any(known_T):
@@ -204,7 +202,7 @@ def ambient_in_array(array: SensorArray, readings_T: FloatArray, ambient_T: Floa
 def with_eddies_as_offsets(array: SensorArray, ambient_T: FloatArray, rate_rad_s: FloatArray) -> SensorArray:
     """Return the array with eddy currents as offset errors of the same rms.
 
-    Ambient fields and rates (n, 3) are those of rows that turn.
+    Ambient fields and rates of rotation (n, 3) are those of the rows.
     """
     change_T_s = math.sqrt(np.mean(np.sum(np.cross(ambient_T, rate_rad_s) ** 2, axis=-1)))
     sensors = tuple(
@@ -221,14 +219,14 @@ def with_eddies_as_offsets(array: SensorArray, ambient_T: FloatArray, rate_rad_s
 def _field_jacobian(array: SensorArray) -> FloatArray:
     """Return the derivative (N, 3, 3) of readings by a field in the array's frame.
 
-    A modulus sees it along the ambient field.
+    A modulus reads the component along the ambient field.
     """
     rows = np.nan_to_num(array.linear_gain(array.ambient_fields))
     return np.where(array.sensor_channels[..., None] >= 0, rows[array.sensor_channels], 0.0)
 
 
 def without_lasting_errors(array: SensorArray) -> SensorArray:
-    """Return the array with noise that is independent from row to row alone."""
+    """Return the array with only the noise that is independent from row to row."""
     sensors = tuple(
         replace(
             sensor,

@@ -1,6 +1,6 @@
 """Plausibility of a record: units, clocks and attitudes that contradict the readings.
 
-Every doubt is a sentence. None is a refusal: the numbers could be true, of a laboratory that is not imagined here.
+Every doubt is a warning, and none is an error, because unusual numbers may still be right.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger(__name__)
 FEWEST_ROWS = 20
-"""Rows that a record is judged by."""
+"""Least number of rows for a check of a record."""
 _OF_A_NANOTESLA = {"µT": 1e-3, "G": 1e-5, "T": 1e-9}
-_LIKE = 3.0  # factor to the noise of another unit
-_WHITE = 5.0  # growth from lag 1 to lag 2: 1 for white noise, 8 behind a filter of second order, 2**6 for smooth fields
-_OTHER_UNIT = 5.0  # ratio of moduli to the ambient field's: a source beside the sensors is not so strong for long
-_STEADY = 0.02  # relative change of the modulus of a field that is the Earth's
-_TURNS_RAD = 0.06  # three times what an attitude of 1° and a source's share of the field do
-_TURNS_UNEXPLAINED_RAD = 0.3  # offsets of 10 µT in 50 µT do 0.2
+_LIKE = 3.0  # largest factor between the measured noise and the stated noise in another unit
+_WHITE = 5.0  # growth from lag 1 to lag 2: 1 for white noise, 8 after a filter of second order, 2**6 for smooth fields
+_OTHER_UNIT = 5.0  # ratio of moduli to the ambient field; a source near the sensors is not so strong for long
+_STEADY = 0.02  # largest relative change of the modulus of the Earth's field
+_TURNS_RAD = 0.06  # three times the effect of attitude errors of 1° and of a source
+_TURNS_UNEXPLAINED_RAD = 0.3  # offsets of 10 µT in 50 µT cause 0.2
 _SLOWEST_M_S, _FASTEST_M_S, _FAR_M = 0.01, 500.0, 2.0
 _ORBIT_M_S = (3e3, 11e3)  # geostationary to escape
 _AMBIENT_SIGMAS = 4.0
-_MODEL_SIGMA_T = 150e-9  # of a geomagnetic model where nothing is stated: crust and storms
-_ALIKE = 0.2  # spread of a difference between rows and sensors, over it: a source's differs more
+_MODEL_SIGMA_T = 150e-9  # default error of a geomagnetic model: crust and storms
+_ALIKE = 0.2  # largest relative spread of a difference over rows and sensors; that by a source varies more
 _FEWEST_COMPARED, _MOST_COMPARED = 16, 10_000  # readings, rows
-_WIDEST_M, _COARSE_T = 3.0, 50e-9  # across an array of coarse sensors, and their noise; finer ones stand farther apart
+_WIDEST_M, _COARSE_T = 3.0, 50e-9  # widest array of coarse sensors, and their noise; finer sensors may be farther apart
 _NARROWEST_M = 1e-3
 _WIDEST_ON_THE_MOVE_M = 30.0
 _MAGNET_A_m, _MAGNET_M = 1.1e6, 0.05  # magnetisation of the strongest magnets, and the radius of a large one
@@ -48,7 +48,7 @@ _MOMENTS_Am2 = (1e-9, 1e7)  # a grain of magnetite, the largest ships
 
 
 def usable_readings(array: SensorArray, values: Readings | ArrayLike) -> Readings:
-    """Return readings without saturated ones, in their ambient field; warn of implausible input."""
+    """Return readings without saturated values and with their ambient field; warn of implausible input."""
     readings = as_readings(values)
     used = _drop_saturated(array, readings)
     _warn(doubts(array, readings, used))
@@ -61,17 +61,17 @@ def warn_of_doubts(array: SensorArray, readings: Readings) -> None:
 
 
 def warn_of_array(array: SensorArray, readings: Readings | None = None) -> None:
-    """Warn of an array whose size is hardly in metres."""
+    """Warn of an array whose size is implausible in metres."""
     _warn(array_doubts(array, readings))
 
 
 def warn_of_record(array: SensorArray, readings: Readings) -> None:
-    """Warn of implausible readings, without a look at the array."""
+    """Warn of implausible readings, without checks of the array."""
     _warn(record_doubts(array, readings))
 
 
 def warn_of_moments(distance_m: ArrayLike, moment_Am2: ArrayLike) -> None:
-    """Warn of moments (n, 3) that no object has at distances (n,) from the sensors.
+    """Warn of moments (n, 3) that are implausible at distances (n,) from the sensors.
 
     NaN are left out.
     """
@@ -90,7 +90,7 @@ def _drop_saturated(array: SensorArray, readings: Readings) -> Readings:
 def doubts(array: SensorArray, readings: Readings, used: Readings | None = None) -> Iterator[str]:
     """Yield sentences on an array and readings that are implausible.
 
-    `used` are those that do not saturate, in their ambient field, where they are known.
+    `used` are the readings without saturated values and with their ambient field, if known already.
     """
     yield from array_doubts(array, readings)
     yield from record_doubts(array, readings, used)
@@ -111,8 +111,8 @@ def record_doubts(array: SensorArray, readings: Readings, used: Readings | None 
     for unit, nanotesla in _OF_A_NANOTESLA.items():
         if nanotesla / _LIKE < noise < nanotesla * _LIKE:
             yield (
-                f"the readings change from row to row by {noise:.1g} of the noise that is stated, as they would in"
-                f" {unit}: are they in nT, is noise_nT right, were they filtered?"
+                f"the readings change from row to row by {noise:.1g} times the stated noise, as they would in {unit}:"
+                " are they in nT, is noise_nT right, were they filtered?"
             )
     ambient_T = array.ambient_fields if used.ambient_T is None else used.ambient_T
     of_unit = list(
@@ -143,7 +143,7 @@ def array_doubts(array: SensorArray, readings: Readings | None = None) -> Iterat
 
 
 def moment_doubts(distance_m: ArrayLike, moment_Am2: ArrayLike) -> Iterator[str]:
-    """Yield a sentence on moments (n, 3) that no object has at distances (n,).
+    """Yield a sentence on moments (n, 3) that are implausible at distances (n,).
 
     Distances are from the sensors; NaN are left out.
     """
@@ -168,7 +168,7 @@ def _origin_doubts(readings: Readings) -> Iterator[str]:
     if farthest_m > FARTHEST_M:
         yield (
             f"places lie up to {farthest_m / 1e3:.4g} km from the origin of their frame: if they are eastings and"
-            " northings of a grid, subtract those of a place nearby, for so large numbers cost digits"
+            " northings of a grid, subtract those of a place nearby, because large numbers lose digits"
         )
 
 
@@ -181,10 +181,10 @@ def farthest_place(readings: Readings) -> float:
 
 
 def noise_ratio(array: SensorArray, values_T: FloatArray) -> float:
-    """Return the white noise of rows (n, C) over the stated one; NaN where they show none.
+    """Return the ratio of the white noise of rows (n, C) to the stated noise; NaN if it cannot be measured.
 
-    From differences of sixth order in time, in which little is left of fields that last. White noise is as large in
-    those of every other row; filtered noise, and a source too fast for the rows, are several times larger there.
+    The noise follows from differences of sixth order in time, which remove slow fields. White noise is equally large in
+    differences of every other row. Filtered noise, and a source too fast for the rows, are several times larger there.
     """
     own = _beyond_each_other(array, values_T)
     ratio, of_every_other = (_median(np.abs(_sixth_difference(own, lag))) / 0.6745 for lag in (1, 2))  # if Gaussian
@@ -192,9 +192,9 @@ def noise_ratio(array: SensorArray, values_T: FloatArray) -> float:
 
 
 def _beyond_each_other(array: SensorArray, values_T: FloatArray) -> FloatArray:
-    """Return readings less the mean of their kind of sensor, over the stated noise (n, ...).
+    """Return readings minus the mean of their kind of sensor, divided by the stated noise (n, ...).
 
-    A sensor alone of its kind tells it by its modulus, which no attitude changes.
+    For a single sensor of its kind the result is its modulus, which does not depend on the attitude.
     """
     fields, noise = array.calibrated_field(values_T), np.array([sensor.noise_T for sensor in array.sensors])
     owner, scalar = array.channel_sensor, array.channel_is_scalar
@@ -226,16 +226,15 @@ def _moduli_doubts(moduli_T: FloatArray, ambient_T: float) -> Iterator[str]:
     if ambient_T > 0.0 and unlike and not (moduli_T < 0.0).any():
         yield (
             f"scalar sensors read {1e9 * read:.4g} nT in the median where the ambient field is {1e9 * ambient_T:.4g}"
-            " nT: are both in nT, or was it taken off the readings?"
+            " nT: are both in nT, or was it subtracted from the readings?"
         )
 
 
 def _ambient_doubts(array: SensorArray, used: Readings) -> Iterator[str]:
     """Yield a sentence if moduli disagree with the stated ambient field.
 
-    Only rows without a source nearby count.
-
-    An error of that field is the same in most rows and for all sensors, unlike the field of a source.
+    Only rows without a source nearby count. An error of the ambient field is the same in most rows and for all sensors,
+    unlike the field of a source.
     """
     if used.ambient_T is None and array.ambient_T is None:
         return
@@ -291,7 +290,7 @@ def _path_doubts(time_s: FloatArray, position_m: FloatArray) -> Iterator[str]:
     speed = step_m / dt_s
     order = np.argsort(speed)
     made_m = np.cumsum(step_m[order])
-    slow = speed[order[np.searchsorted(made_m, made_m[-1] / 2.0)]]  # of half of the path: rests do not count
+    slow = speed[order[np.searchsorted(made_m, made_m[-1] / 2.0)]]  # median over the path, so rests do not count
     fast = np.quantile(speed, 0.9)  # single jumps do not count
     if slow < _SLOWEST_M_S or (fast > _FASTEST_M_S and not _ORBIT_M_S[0] < fast < _ORBIT_M_S[1]):
         wrong = slow if slow < _SLOWEST_M_S else fast
@@ -299,9 +298,9 @@ def _path_doubts(time_s: FloatArray, position_m: FloatArray) -> Iterator[str]:
 
 
 def _attitude_doubts(array: SensorArray, readings: Readings, rotation: Rotation) -> Iterator[str]:
-    """Yield a sentence if a field of steady modulus, the Earth's, turns in the world.
+    """Yield a sentence if a field of steady modulus, that of the Earth, rotates in the world frame.
 
-    It is what vector sensors read on average, else the ambient field of the rows.
+    The field is the mean reading of the vector sensors, otherwise the ambient field of the rows.
     """
     from scipy.spatial.transform import Rotation
 

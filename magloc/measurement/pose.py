@@ -1,19 +1,21 @@
 r"""Errors of pose and ambient field: their effect on readings and their correlation in time.
 
-With the true attitude :math:`R e^{[θ]_×}`, the true place of the pose's reference point moved by δx in the world, and
-the lever arm l from there to the array's origin wrong by δl, a source at p with the moment m stands in the array's axes
-at
+The true attitude is :math:`R e^{[θ]_×}`, and the true reference point of the pose is displaced by δx in the world. The
+lever arm l from there to the array's origin has the error δl. A source at p with the moment m then has the position and
+moment
 
 .. math:: p_a = e^{-[θ]_×} R^T (p - x - δx) - l - δl, \qquad m_a = e^{-[θ]_×} R^T m
 
-and an ambient field that is known through the attitude turns as m does. An error δt of the clock moves and turns with
-the array's own motion: :math:`δx = \dot x δt`, :math:`θ = ω δt`.
+in the array's axes. An ambient field that is known in the world rotates as m does. A clock error δt acts through the
+array's own motion: :math:`δx = \dot x δt`, :math:`θ = ω δt`.
 
-An error d of the ambient field b in the world counts along b as one of its modulus, across as a turn of its direction,
+An error d of the ambient field b in the world changes the modulus of b by its part along b, and the direction of b by
+its part across,
 
 .. math:: b' = (|b| + u \cdot d) \, w/|w|, \qquad w = u + (1 - u u^T) d/|b|, \qquad u = b/|b|,
 
-since moduli know the first much better than the second: along a straight d they would lose the square of it.
+because moduli determine the first part much better than the second. If d were added to b, moduli would change by the
+square of the second part.
 """
 
 from __future__ import annotations
@@ -32,7 +34,7 @@ from magloc.navigation.rotations import cross_matrix, rotation_matrix, turn_of_c
 from magloc.readings import Readings
 
 N_POSE = 12
-"""Numbers of an error of a pose: θ [rad], δx [m], δl [m], and that of the ambient field d [T]."""
+"""Number of components of a pose error: θ [rad], δx [m], δl [m], and the error d of the ambient field [T]."""
 TURN, SHIFT, LEVER, FIELD = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 _N_CLOCK = 1
 _NO_ERROR = np.zeros(N_POSE)
@@ -40,15 +42,15 @@ _NO_ERROR = np.zeros(N_POSE)
 
 @dataclass(frozen=True, eq=False)
 class ArrayPose:
-    """Position, attitude and motion of an array, as its readings state them.
+    """Position, attitude and motion of an array, as stated by its readings.
 
     Attributes
     ----------
     origin_m, R_world_from_array : ndarray, shapes (3,) and (3, 3)
     velocity_m_s, rate_rad_s : ndarray, shape (3,)
-        Of the origin in the world, and of the array about its own axes.
+        Velocity of the origin in the world, and rate of rotation about the array's own axes.
     lever_arm_m : ndarray, shape (3,)
-        From the pose's reference point to the origin, in the array's axes.
+        Vector from the pose's reference point to the origin, in the array's axes.
     """
 
     origin_m: FloatArray
@@ -135,10 +137,7 @@ class ArrayPose:
 
 
 def _field_with_error(field_T: FloatArray, error_T: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return a field (3,) with errors (..., 3), and its derivative (..., 3, 3) by them.
-
-    Errors are those of modulus and direction.
-    """
+    """Return a field (3,) with errors (..., 3) of modulus and direction, and its derivative (..., 3, 3) by them."""
     modulus_T, one = float(np.linalg.norm(field_T)), np.eye(3)
     if modulus_T == 0.0:
         return error_T, np.broadcast_to(one, (*error_T.shape, 3))
@@ -154,7 +153,7 @@ def _field_with_error(field_T: FloatArray, error_T: FloatArray) -> tuple[FloatAr
 
 @dataclass(frozen=True, eq=False)
 class PosesOfRows:
-    """Poses of several rows of one array, and the effects of errors of unit variance on them.
+    """Poses of several rows of one array, and the effects of pose errors of unit variance.
 
     Attributes
     ----------
@@ -168,10 +167,7 @@ class PosesOfRows:
     effects: Sequence[FloatArray]
 
     def channel_errors(self, source: FloatArray, ambient_T: FloatArray) -> list[FloatArray]:
-        """Return the errors (C, n) [T] of the channels of every row.
-
-        For a source (6,) and ambient fields (rows, N, 3).
-        """
+        """Return the channel errors (C, n) [T] of every row for a source (6,) and ambient fields (rows, N, 3)."""
         rows = zip(self.poses, self.effects, ambient_T, strict=True)
         return [channel_errors(self.array, pose, source, effect, field) for pose, effect, field in rows]
 
@@ -184,13 +180,13 @@ class PoseErrors:
     ----------
     uncertainty : PoseUncertainty
     of_pose : ndarray of int, shape (n,)
-        What each of the n states is of: a component of the error (0 to 11), or 12, the clock.
+        Component of the pose error (0 to 11) of each state, or 12 for the clock.
     lasts_s : ndarray, shape (n,)
-        How long it does: 0 of one that is new in every row, infinite of a constant.
+        Correlation time of each state: 0 if it is independent from row to row, infinite for a constant.
     ambient_T : tuple of 2 floats
-        Standard deviations of the ambient field's constant error and of the one that is new in every row.
+        Standard deviations of the ambient field's constant error, and of its error that is independent from row to row.
     between_s : float
-        How long errors of places last that were interpolated between fixes; 0 where none were.
+        Correlation time of the errors of places that were interpolated between fixes; 0 without interpolation.
     """
 
     uncertainty: PoseUncertainty
@@ -205,7 +201,7 @@ class PoseErrors:
     ) -> PoseErrors:
         """Return all stated errors.
 
-        Errors of position and attitude that change are always states, since a row may state their size.
+        Changing errors of position and attitude are always states, because a row may state their size.
         """
         turn, shift, lever, field = (list(range(N_POSE)[part]) for part in (TURN, SHIFT, LEVER, FIELD))
         clock, known = [N_POSE], uncertainty or PoseUncertainty()
@@ -228,7 +224,7 @@ class PoseErrors:
     def of_array(cls, array: SensorArray) -> PoseErrors:
         """Return all errors that an array states.
 
-        Differences of vector sensors do not see an error of the ambient field.
+        An error of the ambient field has no effect on differences of vector sensors.
         """
         moduli = bool(array.channel_is_scalar.any())
         known = (array.ambient_uncertainty_T, array.ambient_uncertainty_white_T) if moduli else (0.0, 0.0)
@@ -263,7 +259,7 @@ class PoseErrors:
     def effect(self, pose: ArrayPose, sigma: FloatArray | None = None) -> FloatArray:
         """Return the pose error (12, n) by every state.
 
-        `sigma` (2,) of position and attitude replaces the array's own.
+        `sigma` (2,) of position and attitude replaces the array's standard deviations.
         """
         if not self.n_states:
             return np.zeros((N_POSE, 0))
@@ -278,7 +274,7 @@ class PoseErrors:
     ) -> FloatArray:
         """Return the pose errors (..., 12, n) by every state, for rates and velocities (..., 3).
 
-        Places that were interpolated have errors of `between_m` (...,) beside those that are stated.
+        Interpolated places have additional errors of `between_m` (...,).
         """
         known, rows = self.uncertainty, rate_rad_s.shape[:-1]
         stated = np.array([known.position_m, known.attitude_rad]) if sigma is None else sigma
@@ -321,7 +317,7 @@ def channel_errors(
 ) -> FloatArray:
     """Return the errors (C, n) [T] of the channels for pose errors (12, n), at zero.
 
-    The source (6,) stands in the world, the ambient field (N, 3) in the array's axes.
+    The source (6,) is in the world frame, the ambient field (N, 3) in the array's axes.
     """
     in_array = pose.to_array(source)
     position, moment = in_array[:3], in_array[3:]
@@ -335,8 +331,6 @@ def pose_errors_at_rest(
     """Return the errors (..., C, n) [T] of the channels by pose errors of an array at rest.
 
     Errors have unit variance; sources (..., 3) are in the axes of the stated pose.
-
-    Of sources (..., 3) in the axes of the stated pose.
     """
     pose = ArrayPose(np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3), np.array(uncertainty.lever_arm_m))
     in_array = np.concatenate([position_m, moment_Am2], axis=-1)
@@ -346,10 +340,7 @@ def pose_errors_at_rest(
 
 
 def with_stated_pose(array: SensorArray, readings: Readings) -> SensorArray:
-    """Return the array with the pose uncertainty that holds for some readings.
-
-    There is none where the readings have no pose.
-    """
+    """Return the array with the pose uncertainty for some readings: none if the readings have no pose."""
     if readings.pose is None:
         return array if array.pose is None else replace(array, pose=None)
     if readings.pose_sigma is None or array.pose is not None:
@@ -368,7 +359,7 @@ def rates_of(time_s: FloatArray, position_m: FloatArray, R: FloatArray) -> tuple
     moving = dt > 0.0
     velocity = np.divide(position_m[after] - position_m[before], dt, out=np.zeros_like(position_m), where=moving)
     turns = np.swapaxes(R[before], 1, 2) @ R[after]
-    # The turn between two rows as a vector, from the skew part of its matrix and its trace.
+    # Rotation vector between two rows, from the skew part and the trace of the rotation matrix.
     skew = 0.5 * np.stack(
         [turns[:, 2, 1] - turns[:, 1, 2], turns[:, 0, 2] - turns[:, 2, 0], turns[:, 1, 0] - turns[:, 0, 1]], axis=1
     )

@@ -31,14 +31,14 @@ class WhitenedRows:
     Attributes
     ----------
     index : ndarray of int, shape (b,)
-        Which rows of the readings they are.
+        Indices of the rows in the readings.
     mask : ndarray of bool, shape (C,)
         Channels that have a reading.
     readings_T : ndarray, shape (b, C)
     raw : ndarray, shape (b, C)
-        Of unit noise.
+        Readings divided by their noise.
     y : ndarray, shape (b, C)
-        Free of the common field, too.
+        Readings divided by their noise, without the common field.
     """
 
     index: IntArray
@@ -89,7 +89,7 @@ class WhitenedRows:
 
     @cached_property
     def energy(self) -> FloatArray:
-        """Sums of squared differences (b,), that is χ² without a source."""
+        """Sums of squared differences (b,): χ² without a source."""
         without = self.y - self.model.ambient_signals if self.model.sees_moduli else self.y
         return np.asarray(np.vecdot(without, without))
 
@@ -155,9 +155,9 @@ def ambient_fields(array: SensorArray, n_rows: int, ambient_T: FloatArray | None
 def channels_above_ambient(
     array: SensorArray, mask: BoolArray, readings_T: FloatArray, ambient_T: FloatArray | None
 ) -> FloatArray:
-    """Return readings (n, C) less the ambient field (n, N, 3); those of scalar sensors stay.
+    """Return readings (n, C) minus the ambient field (n, N, 3); readings of scalar sensors do not change.
 
-    None stands for the array's own field. Zero where the mask (n, C) or (C,) has no reading.
+    None means the array's own field. Channels outside the mask (n, C) or (C,) are zero.
     """
     if ambient_T is None:
         above = readings_T - array.channel_ambient_T
@@ -177,8 +177,8 @@ def whitened_model(
 ) -> tuple[WhitenedModel, FloatArray]:
     """Return the exact model of rows of readings (n, C), and their channels over the noise.
 
-    :meth:`WhitenedModel.whiten` frees these from the common field. The whitening is that of every row or of all, and
-    `ambient_T` (n, 3) stands in place of the array's ambient field.
+    :meth:`WhitenedModel.whiten` removes the common field from these channels. The whitening is one for all rows or one
+    for each, and `ambient_T` (n, 3) replaces the array's ambient field.
     """
     if len(readings_T) == 1 and ambient_T is None and whitening.roots.ndim == 3:
         model = _model_of_one_row(array, whitening)
@@ -189,7 +189,7 @@ def whitened_model(
     return model, whitening.of_unit_noise(channels)
 
 
-@lru_cache(maxsize=16)  # readings that come one by one have one model, and what kernels take of it
+@lru_cache(maxsize=16)  # rows that are fitted one by one share a model and its kernel structs
 def _model_of_one_row(array: SensorArray, whitening: Whitening) -> WhitenedModel:
     return WhitenedModel.of(array, whitening, array.ambient_fields[None])
 
@@ -197,7 +197,7 @@ def _model_of_one_row(array: SensorArray, whitening: Whitening) -> WhitenedModel
 def concatenate_readings(parts: Sequence[Readings]) -> Readings:
     """Concatenate readings of several files.
 
-    Raises ValueError where some have what others lack.
+    Raises ValueError if some have columns that others lack.
     """
     from scipy.spatial.transform import Rotation
 
@@ -221,13 +221,13 @@ def _concatenate_columns(parts: Sequence[FloatArray | None]) -> FloatArray | Non
 
 
 def check_spans(array: SensorArray) -> None:
-    """Raise ValueError for a single sensor, which cannot tell a position."""
+    """Raise ValueError for a single sensor, which cannot determine a position."""
     if array.n_sensors < 2:
-        raise ValueError("Input array must have two sensors at least where no place is known; instead received one.")
+        raise ValueError("Input array must have at least two sensors if no position is known; instead received one.")
 
 
 def check_magnitudes(array: SensorArray) -> None:
-    """Raise ValueError for numbers whose squares exceed double precision."""
+    """Raise ValueError for numbers whose squares exceed the range of double precision."""
     noise = array.channel_noise_T
     if noise.min() < 1e-20 or noise.max() > 1e3:
         raise ValueError(
@@ -236,9 +236,9 @@ def check_magnitudes(array: SensorArray) -> None:
         )
     if array.common_field_T is not None and array.common_field_T > 1e3:
         common_nT = 1e9 * array.common_field_T
-        raise ValueError(f"Input array must have a common field of 1e12 nT at most; instead received {common_nT:g} nT.")
+        raise ValueError(f"Input array must have a common field of at most 1e12 nT; instead received {common_nT:g} nT.")
     if not np.abs(array.ambient_fields).max() <= 1e3:
-        raise ValueError("Input array must have an ambient field of 1e12 nT at most; instead received a larger one.")
+        raise ValueError("Input array must have an ambient field of at most 1e12 nT; instead received a larger one.")
     fraction = float(array.noise_fractions.max())
     if fraction > 10.0:
-        raise ValueError(f"Input array must have a noise_fraction of 10 at most; instead: {fraction:g}.")
+        raise ValueError(f"Input array must have a noise_fraction of at most 10; instead received {fraction:g}.")

@@ -1,9 +1,9 @@
-"""Wild readings: leaps that no source makes, since rows beside them show no flanks.
+"""Wild readings: jumps that no source causes, because rows beside them show no flanks of a peak.
 
-Rows are cut where neighbours differ by far more than usual. Of the pieces, the largest set is kept whose members agree:
-each is predicted from the others by a Gaussian process whose covariance is that of sources below a depth, and the size
-of the process is estimated from the rows that are kept. So groups of wild readings neither hide each other nor blame
-the good ones between them, and where a peak is sampled so coarsely that a source could be all of it, nothing is wild.
+The rows are cut into pieces where neighbours differ by far more than usual. The result keeps the largest set of pieces
+that agree. Pieces agree if a Gaussian process, with the covariance of sources below a depth, predicts each from the
+others; the size of the process is estimated from the kept rows. So several wild readings do not mask each other, and
+good readings between them are kept. If a peak is sampled so coarsely that it may be a source, nothing is wild.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from scipy.ndimage import percentile_filter
 
 from arrays.typing import BoolArray, FloatArray, IntArray
 
-_LIMIT, _COARSE = 11.0, 30.0  # lose 0 of 101,280 rows of clean surveys, 2 to 100 a second (with 20: 1)
-_NUGGET, _GRADIENT = 1e-3, 3.0  # of the process: variance of a row, and of an error of its place over the depth
-_FREE = 30.0  # prior variance of a level and of a slope, over that of the process
-_ZONE, _HALO = 50, 25  # rows that are judged, and that are looked at on either side of them
-_CUT, _STEP = 8.0, 3.0  # over the usual leap
+_LIMIT, _COARSE = 11.0, 30.0  # lose 0 of 101,280 rows of clean surveys at 2 to 100 Hz (with 20: 1)
+_NUGGET, _GRADIENT = 1e-3, 3.0  # relative variances of the process: of a row, and by an error of its place over depth
+_FREE = 30.0  # prior variance of a level and of a slope, relative to that of the process
+_ZONE, _HALO = 50, 25  # rows that are judged, and further rows on either side for the prediction
+_CUT, _STEP = 8.0, 3.0  # in units of the usual step
 _QUARTILE = 3.1  # standard deviation of normal numbers over the lower quartile of their absolute values
-_SUPPORTS, _NEAR = 3, 0.25  # rows of a piece that speaks for itself; variance of a row that is predicted well
-_JOINED = 3  # rows of the record between neighbours
+_SUPPORTS, _NEAR = 3, 0.25  # rows of a piece that supports itself; largest variance of a well predicted row
+_JOINED = 3  # largest distance between neighbours, in rows of the record
 _STARTS, _SWEEPS = 3, 4
 _FEWEST = 20
 
@@ -34,13 +34,13 @@ def wild_readings(values: FloatArray, place_m: FloatArray, depth_m: float, noise
     Parameters
     ----------
     values : ndarray, shape (n,)
-        Moduli of the field, NaN where there is none.
+        Moduli of the field; NaN if missing.
     place_m : ndarray, shape (n, 3)
-        Where they were read [m].
+        Places of the readings [m].
     depth_m : float
         Least distance from the sensor to sources [m].
     noise : float
-        Standard deviation that is stated, in the unit of the values.
+        Stated standard deviation, in the unit of the values.
     jitter_m : float
         Error of the place from row to row [m].
     """
@@ -67,7 +67,7 @@ def wild_readings(values: FloatArray, place_m: FloatArray, depth_m: float, noise
 
 
 def _cuts(values: FloatArray, noise: float) -> BoolArray:
-    """Return rows (n,) whose step is unusual beside lines through the rows on either side."""
+    """Return rows (n,) with an unusual step, compared with lines through the rows on either side."""
     leap = np.zeros(len(values))
     step = np.diff(values, prepend=values[0])
     leap[1], leap[-1] = step[1], step[-1]
@@ -77,16 +77,16 @@ def _cuts(values: FloatArray, noise: float) -> BoolArray:
 
 
 class _Scene:
-    """Successive rows, and the covariance of sources' fields there, of unit size.
+    """Successive rows, and the covariance of the fields of sources there, scaled to unit variance.
 
     Parameters
     ----------
     index, values : ndarray, shape (n,)
-        Rows of the record, and what was read there.
+        Rows of the record, and their readings.
     place : ndarray, shape (n, 3)
-        In depths.
+        Places in units of the depth.
     nugget, noise : float
-        As of :func:`wild_readings`, the nugget a variance over that of the process.
+        Variance of a row relative to the process, and noise as in :func:`wild_readings`.
     """
 
     def __init__(self, index: IntArray, values: FloatArray, place: FloatArray, nugget: float, noise: float) -> None:
@@ -95,7 +95,7 @@ class _Scene:
         self._least = noise**2 / nugget
         apart2 = ((place[:, None] - place) ** 2).sum(axis=-1)
         way = np.linspace(-1.0, 1.0, len(values))
-        # Fields of sources below a plane fade as exp(-2 k depth) in their spectrum, and so does this covariance.
+        # The spectrum of sources below a plane decays as exp(-2 k depth), and so does that of this covariance.
         smooth = (1.0 + apart2 / 4.0) ** -2.5 + _FREE * (1.0 + np.outer(way, way))
         self._covariance = smooth + nugget * np.eye(len(values))
 
@@ -122,7 +122,7 @@ class _Scene:
         return wild
 
     def _comes_back(self, piece: IntArray, kept: IntArray) -> bool:
-        """Return whether many smooth rows are a leap; without a return they are another level."""
+        """Return whether many smooth rows are a jump that returns; otherwise they are another level."""
         before, after = kept[kept < piece[0]], kept[kept > piece[-1]]
         if not (len(before) and len(after)):
             return False
@@ -161,7 +161,7 @@ class _Scene:
         return kept
 
     def _drop_outliers(self, kept: IntArray) -> IntArray:
-        """Return the kept rows without those that the others do not predict, worst first."""
+        """Return the kept rows after dropping those that the others do not predict, worst first."""
         while len(kept) > _SUPPORTS:
             weights, values = self._inverse(kept), self._values[kept]
             variance = 1.0 / weights.diagonal()
@@ -184,7 +184,7 @@ class _Scene:
         return math.sqrt(max(float(values @ self._inverse(rows) @ values) / len(rows), self._least))
 
     def _scores(self, errors: FloatArray, covariance: FloatArray) -> float:
-        """Return the largest prediction error over its limit, for a process of size one.
+        """Return the largest prediction error divided by its limit, for a process of unit size.
 
         Errors are along the axes of their covariance.
         """
@@ -194,11 +194,10 @@ class _Scene:
 
 
 def _limits(unknown: FloatArray) -> FloatArray:
-    """Return the largest error by one source, over its standard deviation.
+    """Return the largest plausible prediction error in standard deviations.
 
-    `unknown` is its variance, for a process of one.
-
-    Sources are few, and their peaks are higher than a normal process makes them, the more so the coarser the rows.
+    `unknown` is the variance of the prediction, for a process of unit variance. Sources are few, so their peaks are
+    higher than those of a normal process, the more so the coarser the rows are.
     """
     part = np.clip(unknown, 0.0, 1.0 - 1e-9)
     return np.asarray(_LIMIT * (1.0 + _COARSE * part) / (1.0 - part))

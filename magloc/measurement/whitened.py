@@ -1,8 +1,8 @@
 r"""Whitened model: readings of dipoles in homogeneous coordinates, with unit noise.
 
 Positions are :math:`q = (u, s)` on the unit sphere of :math:`R^4`, :math:`p = c + \rho_0 \, u / s` with the sensors'
-centroid c and circumradius :math:`\rho_0`; moments are :math:`\mu = k |s|^3 m / \rho_0^3`, so that infinity (s = 0) is
-an ordinary point: docs/theory/homogeneous-coordinates.md.
+centroid c and circumradius :math:`\rho_0`. Moments are :math:`\mu = k |s|^3 m / \rho_0^3`. So infinity (s = 0) is a
+regular point: docs/theory/homogeneous-coordinates.md.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from magloc.fields.dipole import MU0_OVER_4PI
 from magloc.measurement.channels import channels_of
 from magloc.measurement.known_moment import KnownMoment
 
-# Largest squares, over the noise, with negligible rounding errors; relative size of a column that counts as zero.
+# Largest squares, relative to noise, with negligible rounding errors; relative size of a column that counts as zero.
 _MOST_SQUARES, _UNSEEN = 1e8, 1e-7
 
 
@@ -32,9 +32,9 @@ class ScaledSensors:
     Attributes
     ----------
     centroid : ndarray, shape (3,)
-        Sensors' centroid [m], array frame.
+        Centroid of the sensors in the array's frame [m].
     radius : float
-        Largest distance of a sensor from it [m].
+        Largest distance of a sensor from the centroid [m].
     sensors : ndarray, shape (N, 3)
         Sensors relative to the centroid, in radii.
     channel_sensor : ndarray of int, shape (C,)
@@ -81,14 +81,14 @@ class WhitenedModel(ScaledSensors):
     ----------
     channel_is_scalar : ndarray of bool, shape (C,)
     gain : ndarray, shape (b, C, 3)
-        Channel gains divided by the noise; of a scalar channel the first number counts.
+        Channel gains divided by the noise; a scalar channel uses only the first number.
     ambient : ndarray, shape (b, N, 3)
-        Ambient field at the sensors [T]; only scalar channels see it.
+        Ambient field at the sensors [T]; only scalar channels use it.
     basis : ndarray, shape (b, C, c)
         Orthonormal common field of the whitening.
     shrinkage : ndarray, shape (b, c)
     known : KnownMoment, optional
-        What is known of every source's moment: more numbers of unit variance that a fit explains.
+        Prior of every source's moment: additional measurements with unit variance.
     """
 
     channel_is_scalar: NDArray[np.bool_]
@@ -102,9 +102,9 @@ class WhitenedModel(ScaledSensors):
     def of(cls, array: SensorArray, whitening: Whitening, ambient_T: FloatArray) -> WhitenedModel:
         """Return the model of b rows with ambient fields (b, N, 3).
 
-        The whitening is that of each row or of all.
+        The whitening is one for all rows or one for each.
         """
-        radius = array.circumradius or 1.0  # of one sensor alone any length will do
+        radius = array.circumradius or 1.0  # any length serves for a single sensor
 
         def of_rows(values: FloatArray, n_axes: int) -> FloatArray:
             return np.broadcast_to(values, (len(ambient_T), *values.shape[-n_axes:]))
@@ -168,10 +168,7 @@ class WhitenedModel(ScaledSensors):
 
     @property
     def is_even(self) -> bool:
-        """True if moments m and -m give the same readings.
-
-        So they do for moduli alone without an ambient field.
-        """
+        """True if moments m and -m give the same readings, as for moduli alone without an ambient field."""
         return bool(self.channel_is_scalar.all()) and not np.any(self.ambient)
 
     def without_ambient(self) -> WhitenedModel:
@@ -303,9 +300,8 @@ class WhitenedModel(ScaledSensors):
 def _left_singular(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return left singular vectors (b, C, k) and values (b, k) of columns (b, C, n).
 
-    k is n or C.
-
-    Few columns that are not large go by their squares; singular values that are rounding errors are then zero.
+    k is n or C. For a few columns that are not large, the squares of the columns are used; singular values that are
+    rounding errors are then zero.
     """
     n = columns.shape[2]
     square = columns.transpose(0, 2, 1) @ columns if 2 * n < columns.shape[1] else np.array(np.inf)

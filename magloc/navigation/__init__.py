@@ -1,1 +1,1 @@
-"""Navigation: poses, velocities and rates that are measured beside the readings."""
+"""Navigation: measured poses, velocities and rates that accompany the readings."""

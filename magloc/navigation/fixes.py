@@ -1,4 +1,4 @@
-"""Places that stand still between the fixes of a receiver that is slower than the readings."""
+"""Interpolation of places between the fixes of a receiver that is slower than the readings."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger(__name__)
 _FEWEST_PLACES = 4
-_LOST = 3  # rows: where places are new in every row, the next one that changes leaps if so many were held
-_AS_FAST = 0.5  # of the usual speed, over all of a run: it was held, and the carrier did not rest
+_LOST = 3  # After so many equal rows in a record of new places, the next change counts as a jump.
+_AS_FAST = 0.5  # Above this share of the usual speed over a run, the place was held and the carrier did not rest.
 
 
 class Interpolated(NamedTuple):
-    """Poses between fixes, standard deviation of places along each axis, and how many rows had stood still.
+    """Poses between fixes, standard deviation of places along each axis, and number of rows with held places.
 
-    Rows after the last fix stand beyond ``end``: their places are not known.
+    Rows from ``end`` are after the last fix; their places are unknown.
     """
 
     position_m: FloatArray
@@ -38,11 +38,11 @@ class Interpolated(NamedTuple):
 
 
 def between_fixes(time_s: FloatArray, position_m: FloatArray, rotation: Rotation) -> Interpolated | None:
-    """Return poses that move evenly between fixes, or None where places do not stand still.
+    """Return poses interpolated between fixes, or None if places are not held between fixes.
 
-    Where most places are repeated in a row they are a staircase: one step for each fix. A carrier that rests repeats
-    its place, too, but it goes on from there by no more than in any other interval. An attitude that stands still with
-    the places moves with them.
+    If most places equal those of the row before, they form a staircase with one step for each fix. A carrier at rest
+    repeats its place too, but its next step is no longer than in any other interval. An attitude that is held with the
+    places is interpolated with them.
     """
     first = np.flatnonzero(np.concatenate([[True], (position_m[1:] != position_m[:-1]).any(axis=1)]))
     if len(first) < _FEWEST_PLACES or not (np.diff(time_s) > 0.0).all():
@@ -69,7 +69,7 @@ def between_fixes(time_s: FloatArray, position_m: FloatArray, rotation: Rotation
 def without_gaps(table: Table) -> tuple[Table, FloatArray | None]:
     """Return the table of a log with places in all rows, and the standard deviations (n,) that interpolation adds [m].
 
-    Rows before the first place or after the last one are left out. None: no place was missing.
+    Rows before the first place or after the last one are left out. Without a missing place the second item is None.
     """
     if not set(POSITION_COLUMNS) <= set(table.header):
         return table, None
@@ -95,13 +95,13 @@ def without_gaps(table: Table) -> tuple[Table, FloatArray | None]:
             error_m = np.maximum(error_m, _errors_m(place[:, [at.index(each) for each in columns]], time_s, fixes))
     found = [f"{(inside & ~whole).sum()} are interpolated"] * bool((inside & ~whole).any())
     found += [f"{(~inside).sum()} before the first or after the last one are left out"] * bool((~inside).any())
-    _LOG.warning(f"{table.path}: {(~whole).sum()} of {len(time_s)} rows have no whole place: {', '.join(found)}")
+    _LOG.warning(f"{table.path}: {(~whole).sum()} of {len(time_s)} rows have no complete place: {', '.join(found)}")
     table = replace(table, values=values[inside], line_numbers=table.line_numbers[inside])
     return table, error_m[inside] if (inside & ~whole).any() else None
 
 
 def interval_of_fixes(time_s: FloatArray, error_m: FloatArray | None) -> float:
-    """Usual time between fixes where places with such errors were interpolated [s], 0 where none were."""
+    """Return the usual time between fixes [s] from the errors of interpolated places; 0 without any."""
     if error_m is None:
         return 0.0
     known = np.flatnonzero(error_m == 0.0)
@@ -130,14 +130,14 @@ def _last_fixes(place: FloatArray, time_s: FloatArray, first: IntArray) -> tuple
 
 
 def _errors_m(place: FloatArray, time_s: FloatArray, known: IntArray) -> FloatArray:
-    """Return the standard deviation (n,) of places between rows that are known, as much as the way bends about them.
+    """Return the standard deviation (n,) of places between known rows, from the curvature of the path.
 
-    A way of constant acceleration leaves the chord by half of the change of velocity in one interval, times u (1 - u)
-    of that interval. Where it has a corner it leaves it by up to four times as much.
+    With constant acceleration the distance from the chord is half of the change of velocity in one interval, times the
+    interval, times u (1 - u). At a corner it is up to four times as large.
     """
     at_s = time_s[known]
     took_s = np.diff(at_s)
-    # Places beyond all numbers, and times that stand still, are refused by who reads them.
+    # The readers of files refuse infinite places and equal times.
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         velocity = np.diff(place[known], axis=0) / took_s[:, None]
         bend = np.linalg.norm(np.diff(velocity, axis=0), axis=1)

@@ -1,9 +1,9 @@
-"""Velocities and rates of an array and of an object, measured beside the readings, and their columns.
+"""Measured velocities and rates of an array and of an object, and their columns.
 
-``array_vx_m_s, array_vy_m_s, array_vz_m_s`` and ``array_wx_deg_s, …`` are those of the array in its own axes, as a
-velocity log and a gyroscope give them, ``object_vx_m_s, …`` and ``object_wx_deg_s, …`` those of the object in the frame
-of the results; each group is complete or absent. ``array_v_sigma_m_s``, ``array_w_sigma_deg_s`` and so on are standard
-deviations along or about each axis, of an error that is new in every row.
+``array_vx_m_s, array_vy_m_s, array_vz_m_s`` and ``array_wx_deg_s, …`` are those of the array in its own axes, as from a
+velocity log and a gyroscope. ``object_vx_m_s, …`` and ``object_wx_deg_s, …`` are those of the object in the frame of
+the results. Each group is complete or absent. ``array_v_sigma_m_s``, ``array_w_sigma_deg_s`` and so on are standard
+deviations along or about each axis, of an error that is independent from row to row.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from arrays.io.errors import InputError
 from arrays.typing import BoolArray, FloatArray, IntArray
 
 CARRIERS = ("array", "object")
-# Of velocities and of rates: the letter and the unit of their columns, and what one of it is in SI.
+# Letter and unit of the columns of velocities and rates, and the factor to SI.
 _KINDS = (("v", "m_s", 1.0), ("w", "deg_s", np.pi / 180.0))
 
 
@@ -28,9 +28,9 @@ class MeasuredMotion:
     Attributes
     ----------
     velocity_m_s, rate_rad_s : ndarray, shape (n, 2, 3)
-        Of the array, in its axes, and of the object, in the frame of the results.
+        Velocities and rates of the array in its own axes, and of the object in the frame of the results.
     velocity_sigma_m_s, rate_sigma_rad_s : ndarray, shape (n, 2)
-        Their standard deviations along, and about, each axis.
+        Standard deviations along, and about, each axis.
 
     Raises
     ------
@@ -65,15 +65,15 @@ class MeasuredMotion:
         return len(self.velocity_m_s)
 
     def of_rows(self, rows: slice | BoolArray | IntArray) -> MeasuredMotion:
-        """Some of the rows."""
+        """Return some of the rows."""
         return MeasuredMotion(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     def of_steps(self) -> MeasuredMotion:
-        """Return the motion of the steps to the rows: means of both ends; the first step is empty."""
+        """Return the motion of the steps to the rows, as the mean of both ends; the first step is empty."""
         before = np.maximum(np.arange(len(self)) - 1, 0)
         values = [getattr(self, field.name) for field in fields(self)]
         means = [0.5 * (value[before] + value) for value in values[:2]]
-        # Errors of the two ends are independent; those of successive steps are then not, which is small beside them.
+        # Errors of the two ends are independent. The correlation of successive steps is neglected.
         sigmas = [np.sqrt(0.5 * (value[before] ** 2 + value**2)) for value in values[2:]]
         return MeasuredMotion(*means, *sigmas)
 
@@ -83,12 +83,12 @@ MOTION_GROUPS = tuple(
     for letter, unit, scale in _KINDS
     for who in CARRIERS
 )
-"""Columns of velocities and rates, the column of their σ, and what one of them is in SI."""
+"""Columns of velocities and rates, the column of their σ, and the factor to SI."""
 MOTION_COLUMNS = tuple(name for columns, sigma, _ in MOTION_GROUPS for name in (*columns, sigma))
 
 
 def motion_of_table(table: Table, *, posed: bool) -> MeasuredMotion | None:
-    """The measured motion that a table's columns have; with the array's pose that of the object alone."""
+    """Return the measured motion of a table; with the array's pose only that of the object."""
     if not set(MOTION_COLUMNS) & set(table.header):
         return None
     n = len(table.values)
@@ -111,7 +111,7 @@ def motion_of_table(table: Table, *, posed: bool) -> MeasuredMotion | None:
 
 
 def motion_columns(motion: MeasuredMotion) -> tuple[list[str], FloatArray]:
-    """Names of all columns, and their numbers (n, 16)."""
+    """Return the names of all columns, and their numbers (n, 16)."""
     values = np.concatenate([motion.velocity_m_s, motion.rate_rad_s], axis=1)
     sigmas = np.concatenate([motion.velocity_sigma_m_s, motion.rate_sigma_rad_s], axis=1)
     numbers = [np.column_stack([values[:, i], sigmas[:, i]]) / scale for i, (_, _, scale) in enumerate(MOTION_GROUPS)]

@@ -1,4 +1,4 @@
-"""Poses of rows: unit quaternions of a table, and places and attitudes between the rows of a record."""
+"""Poses of rows: unit quaternions of a table, and interpolation between the rows of a record."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _UNIT_QUATERNION_ATOL = 1e-3  # a log that keeps four decimals passes; the quate
 
 
 def unit_rotation(table: Table, columns: Sequence[str]) -> Rotation:
-    """Rotations of a table's columns of unit quaternions, scalar last."""
+    """Return the rotations of a table's columns of unit quaternions, scalar last."""
     from scipy.spatial.transform import Rotation
 
     quaternion = table.complete(columns)
@@ -34,13 +34,13 @@ def unit_rotation(table: Table, columns: Sequence[str]) -> Rotation:
 
 
 def vectors_at(wanted_s: FloatArray, time_s: FloatArray, vectors: FloatArray) -> FloatArray:
-    """Vectors (n, 3) at some instants, straight between the rows (k, 3) of a record, and as at its ends outside."""
+    """Return vectors (n, 3) at some instants, interpolated in a record (k, 3) and constant beyond its ends."""
     order = np.argsort(time_s, kind="stable")
     return np.stack([np.interp(wanted_s, time_s[order], column[order]) for column in vectors.T], axis=1)
 
 
 def rotations_at(wanted_s: FloatArray, time_s: FloatArray, rotations: Rotation) -> Rotation:
-    """Rotations at some instants, evenly turning between the k of a record, and as at its ends outside."""
+    """Return rotations at some instants, interpolated in a record of k and constant beyond its ends."""
     from scipy.spatial.transform import Slerp
 
     order = np.argsort(time_s, kind="stable")

@@ -1,4 +1,4 @@
-"""Small rotations: cross products as matrices, rotations by a vector, and how these change."""
+"""Rotations by vectors, their derivatives, and cross products as matrices."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from arrays.typing import FloatArray
 
 
 def cross_matrix(vector: ArrayLike) -> FloatArray:
-    """Matrix ``[a]×`` with ``[a]× b = a × b``, equation (18): (..., 3, 3) of (..., 3)."""
+    """Return matrices ``[a]×`` (..., 3, 3) of vectors a (..., 3) with ``[a]× b = a × b``, equation (18)."""
     a = np.asarray(vector, dtype=np.float64)
     K = np.zeros((*a.shape, 3))
     K[..., 2, 1], K[..., 0, 2], K[..., 1, 0] = a[..., 0], a[..., 1], a[..., 2]
@@ -20,7 +20,7 @@ def cross_matrix(vector: ArrayLike) -> FloatArray:
 
 
 def rotation_matrix(rotation_vector: FloatArray) -> FloatArray:
-    """Rotations (..., 3, 3) by vectors (..., 3), by Rodrigues' formula [rad]."""
+    """Return rotation matrices (..., 3, 3) of vectors (..., 3) [rad], by Rodrigues' formula."""
     angle = np.sqrt(np.sum(rotation_vector * rotation_vector, axis=-1))[..., None, None]
     K = cross_matrix(rotation_vector)
     # sin(a)/a and (1 - cos(a))/a², without cancelling.
@@ -29,7 +29,7 @@ def rotation_matrix(rotation_vector: FloatArray) -> FloatArray:
 
 
 def turn_of_change(rotation_vector: FloatArray) -> FloatArray:
-    """The small turns J δ (..., 3, 3) that follow rotations by vectors (..., 3) when δ is added to these."""
+    """Return the left Jacobian J (..., 3, 3) at rotation vectors φ (..., 3): exp(φ + δ) = exp(J δ) exp(φ)."""
     square = np.sum(rotation_vector * rotation_vector, axis=-1)[..., None, None]
     angle = np.sqrt(square)
     K = cross_matrix(rotation_vector)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from magloc.signature.signature import Signature
 
 HEADINGS = {"north": 0.0, "east": 90.0, "south": 180.0, "west": 270.0}
-# Along the keel, in depths to either side.
+# Distance along the keel to either side, in depths.
 _REACH = 3.0
 _POINTS = 61
 
@@ -65,7 +65,7 @@ def lines_of_depths(signature: Signature, depths_m: Sequence[float]) -> list[str
 
 
 def json_of_signature(signature: Signature, depths_m: Sequence[float]) -> dict[str, object]:
-    """Return what ``magloc signature --json`` prints."""
+    """Return the JSON that ``magloc signature --json`` prints."""
     predicted = []
     for depth in depths_m:
         x, field, covariance = along_keel(signature, depth)
@@ -86,5 +86,5 @@ def json_of_signature(signature: Signature, depths_m: Sequence[float]) -> dict[s
 
 
 def _sigma(variance: FloatArray) -> FloatArray:
-    """Return standard deviations, NaN where rounding has made a variance negative."""
+    """Return standard deviations; NaN if rounding has made a variance negative."""
     return np.sqrt(np.where(variance >= 0.0, variance, np.nan))

@@ -30,11 +30,11 @@ from magloc.tracking.whole_records.smoother import smooth_states
 UNKNOWN = 1e3
 """Initial σ of the moment, in units of the moment that explains the strongest row."""
 ROWS_TO_START_ANEW = 3
-"""Number of successive contradicting rows after which the moment starts anew."""
+"""Number of successive contradicting rows after which the moment is started again."""
 _TOLERANCE = 1e-4
 _SHRINK = 0.5
 _MOST_ITERATIONS = 50
-# Passes over a record, until its last state changes by less than a share of its σ.
+# Largest number of passes over a record; they end when the last state changes by less than a share of its σ.
 _MOST_PASSES = 20
 _SETTLED = 1e-2
 
@@ -196,7 +196,7 @@ def filter_rows(model: MomentModel, *, at: Sequence[FloatArray] | None = None, g
     """Return the filter's steps over all rows.
 
     ``at``: states at which the rows are linearised; without them each row is iterated. ``gate``: do not use rows that
-    contradict the prediction; the third in succession starts the moment anew.
+    contradict the prediction; the third in succession starts the moment again.
     """
     steps: list[MomentStep] = []
     x, S = model.start()

@@ -100,7 +100,7 @@ class MomentTrack(TrackColumns):
     dof : int
         Its degrees of freedom.
     is_smoothed : bool
-        Whether later rows were used too.
+        True if later rows were used too.
 
     Examples
     --------
@@ -350,9 +350,7 @@ def moment_model(
         for p in places:
             offset = row.row.R_world_from_array.T @ (p - row.row.origin_m) - array.positions
             if np.linalg.norm(offset, axis=1).min() <= _TOUCHING * array.circumradius:
-                raise ValueError(
-                    f"Input path must keep off the sensors; instead it has a place of a sensor: {p.tolist()}."
-                )
+                raise ValueError(f"Input path must not pass through a sensor; instead received {p.tolist()}.")
     begins = np.concatenate([np.arange(len(of_pass)) == 0 for of_pass in passes])
     return MomentModel(rows, np.concatenate(positions_m), basis, measurements.errors, path_error, turn_rad_s, begins)
 
@@ -393,7 +391,7 @@ def _points(model: MomentModel, steps: Sequence[MomentStep], k: int, *, smooth: 
                 nis_dof=model.rows[i].z.size,
                 status=step.status if known else "not determined: the readings so far do not tell the whole moment",
                 centroid_m=row.origin_m + row.R_world_from_array @ array.centroid,
-                radius_m=array.circumradius or 1.0,  # where one sensor has none: only a unit of ranges
+                radius_m=array.circumradius or 1.0,  # a unit of ranges; a single sensor has no circumradius
             )
         )
     return points

@@ -85,7 +85,7 @@ class Components:
         A turn of the object turns the ambient field the other way in the body.
         """
         turning = turning_basis(self.moment_matrix(R, field_T, rate_T_s))
-        axes = np.swapaxes(R, 1, 2)  # of the frame, in the body, as columns
+        axes = np.swapaxes(R, 1, 2)  # axes of the frame in the body, as columns
         for k in range(3):
             turned = -np.cross(axes[:, :, k], field_T)
             turning.by_turn[:, k, :, self.induced_columns] += R @ self._induced_moment(turned)
@@ -119,7 +119,7 @@ class Signature(Result):
     components : Components
         Parts of the moment.
     parameters_Am2 : ndarray, shape (q,)
-        Combinations that are not determined are as near to zero as the others allow.
+        Parameters. Combinations that are not determined are as near to zero as the others allow.
     covariance : ndarray, shape (q, q)
         Covariance of the parameters [(A·m²)²].
     ambient_T : ndarray, shape (3,)
@@ -212,7 +212,7 @@ class Signature(Result):
         Parameters
         ----------
         heading_deg : array_like, shape (...)
-            Clockwise from the frame's y axis, which is north if the frame is east, north, up.
+            Heading, clockwise from the y axis of the frame, which is north if the frame is east, north, up.
         ambient_T : array_like, shape (3,), optional
             Ambient field in the frame of the results [T]; by default that of the passes.
 
@@ -243,7 +243,7 @@ class Signature(Result):
         Returns
         -------
         field_T : ndarray, shape (..., 3)
-            In the frame of the results.
+            Field in the frame of the results [T].
         covariance : ndarray, shape (..., 3, 3)
         """
         offset = _level_rotation(heading_deg) @ np.asarray(offset_m, dtype=np.float64)[..., None]
@@ -292,7 +292,7 @@ def fit_signature(
     path : ObjectPath, or a sequence of them
         Path of every pass, or one for all. Without an attitude the object is level, its bow along the course.
     induced : {"diagonal", "symmetric", "none"}
-        Which components of α are estimated.
+        Components of α that are estimated.
     eddy : bool
         Estimate the diagonal β. It needs passes on which the object turns.
     path_error : PathError

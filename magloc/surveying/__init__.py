@@ -1,1 +1,1 @@
-"""Static targets from sensors that move: all rows of a survey together."""
+"""Surveys: static targets from all rows of moving sensors together."""

@@ -52,7 +52,7 @@ def by_cost(one: Trial) -> float:
 
 
 def estimate_lag(piece_at: Callable[[float], Piece], here: Trial | None = None, near: Trial | None = None) -> ClockLag:
-    """Return the likeliest lag of a piece, 0 if it explains no more than chance does.
+    """Return the likeliest lag of a piece, 0 if it is not significant.
 
     ``piece_at`` returns the piece with the poses of an earlier time. ``here``: trial without a lag for comparison.
     ``near``: trial to search around; by default the search covers all lags.

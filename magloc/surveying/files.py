@@ -10,7 +10,7 @@ from magloc.truth import TRUE_POSITION_COLUMNS
 
 
 def json_of_survey(found: Survey) -> dict[str, Any]:
-    """Return what ``magloc survey --json`` prints."""
+    """Return the JSON that ``magloc survey --json`` prints."""
     return {
         "targets": found.entries,
         "rows": len(found.rows.time_s),
@@ -23,7 +23,7 @@ def json_of_survey(found: Survey) -> dict[str, Any]:
 
 
 def residual_columns(found: Survey) -> dict[str, Column]:
-    """Columns of ``residual.csv``: every row's anomaly, and what the targets leave of it."""
+    """Return the columns of ``residual.csv``: every row's anomaly and residual."""
     rows = found.rows
     columns: dict[str, Column] = {"time_s": rows.time_s}
     columns |= dict(zip(TRUE_POSITION_COLUMNS, rows.place_m.T, strict=True))
@@ -33,6 +33,6 @@ def residual_columns(found: Survey) -> dict[str, Column]:
 
 
 def reach_columns(found: Survey) -> dict[str, Column]:
-    """Columns of ``reach.csv``: places, and the least moment that is seen there."""
+    """Return the columns of ``reach.csv``: places, and the least moment that is detected there."""
     x, y, z = found.reach.place_m.T
     return {"x_m": x, "y_m": y, "depth_m": found.ground_m - z, "moment_Am2": found.reach.moment_Am2}

@@ -21,11 +21,11 @@ from magloc.surveying.pose_components import UNSTATED
 
 _LOG = logging.getLogger(__name__)
 FEWEST_ROWS = 20
-_MOST_APART = 2.0  # ratio of fields of places on one survey; more means another unit
-_LEAST_DEPTH_M, _LOWEST = 0.1, 0.1  # from the sensor to the shallowest sources: least, and quantile of its heights
+_MOST_APART = 2.0  # largest ratio of fields in one survey; more means another unit
+_LEAST_DEPTH_M, _LOWEST = 0.1, 0.1  # least distance to the shallowest sources; quantile of the sensor's heights
 _LEAST_JITTER_M = 0.01
-_BASE_STEP, _BASE_NOISE_T = 0.4, 1e-10  # usual step of a base's rows over the depth of its sources, and its noise
-_LONG_GAP, _LONG_GAP_S = 5.0, 30.0  # long gap of a base: over its usual step, and at least
+_BASE_STEP, _BASE_NOISE_T = 0.4, 1e-10  # usual step of a base's rows relative to the depth of sources, and its noise
+_LONG_GAP, _LONG_GAP_S = 5.0, 30.0  # shortest long gap of a base, in usual steps and in seconds
 _FASTEST_M_S = 300.0
 _BLOCK = 2**18  # rows per block
 _LONGEST_RUN = 25  # equal readings in a run, relative to the mean run of the best sensor
@@ -34,11 +34,10 @@ _LONGEST_RUN = 25  # equal readings in a run, relative to the mean run of the be
 def whole_rows(
     array: SensorArray, readings: Readings, base: Readings | None = None, shallowest_m: float = 0.0
 ) -> tuple[SensorArray, Readings]:
-    """Return the rows with readings of all sensors.
+    """Return the rows with readings of all sensors, and the array.
 
-    Sensors that would cost too many rows are left out.
-
-    Their ambient field varies like the modulus at a base station. No source is above `shallowest_m`.
+    Sensors that miss too many rows are left out. The ambient field varies like the modulus at a base station. No source
+    is above `shallowest_m`.
     """
     if readings.array_rotation is None:
         raise ValueError("Input readings must have the pose of the array in every row; instead received none.")
@@ -51,13 +50,15 @@ def whole_rows(
     whole = np.asarray(~missing[:, kept].any(axis=1))
     for i, sensor in enumerate(array.sensors):
         if i not in kept:
-            why = "sticks" if stuck[:, i].any() else "lacks readings"
+            why = "is stuck" if stuck[:, i].any() else "lacks readings"
             _LOG.warning(f"sensor {sensor.id} {why} in {missing[:, i].sum()} of {len(missing)} rows and is left out")
         elif stuck[:, i].any():
-            _LOG.warning(f"sensor {sensor.id} sticks in {stuck[:, i].sum()} of {len(missing)} rows, which are left out")
+            _LOG.warning(
+                f"sensor {sensor.id} is stuck in {stuck[:, i].sum()} of {len(missing)} rows, which are left out"
+            )
     if (counts := wild[:, kept].sum(axis=0)).any():
         each = ", ".join(f"{n} of sensor {array.sensors[i].id}" for i, n in zip(kept, counts, strict=True) if n)
-        _LOG.warning(f"readings leap and come back: {counts.sum()} in all, {each}; their rows are left out")
+        _LOG.warning(f"spikes in the readings: {counts.sum()} in all, {each}; their rows are left out")
     if whole.sum() < FEWEST_ROWS:
         raise ValueError(f"Input readings must have {FEWEST_ROWS} whole rows or more; instead received {whole.sum()}.")
     if len(kept) < array.n_sensors:
@@ -84,8 +85,8 @@ def with_places_between_fixes(array: SensorArray, readings: Readings) -> tuple[S
         return array, readings
     n = len(readings)
     _LOG.warning(
-        f"places stand still in {found.held} of {n} rows, between fixes that come {found.rate_Hz:.3g} times a second:"
-        " interpolated between fixes" + (f", and the last {n - found.end} rows left out" if found.end < n else "")
+        f"places do not change in {found.held} of {n} rows: they are interpolated between fixes at"
+        f" {found.rate_Hz:.3g} Hz" + (f", and the last {n - found.end} rows are left out" if found.end < n else "")
     )
     error_m = found.error_m if readings.interpolated_m is None else np.maximum(found.error_m, readings.interpolated_m)
     poses = {"array_position_m": found.position_m, "array_rotation": found.rotation, "interpolated_m": error_m}
@@ -101,12 +102,12 @@ def _some(readings: Readings, which: BoolArray) -> Readings:
 
 
 def _unusable(array: SensorArray, readings: Readings, shallowest_m: float) -> tuple[BoolArray, BoolArray, BoolArray]:
-    """Return readings (n, N) that stick, those that leap, and all that are unusable."""
+    """Return readings (n, N) that are stuck, spikes, and all unusable readings."""
     assert readings.array_position_m is not None
     assert readings.array_rotation is not None
     blocks = [readings.values_T[first : first + _BLOCK] for first in range(0, max(len(readings), 1), _BLOCK)]
     stuck = np.concatenate([stuck_readings(array, values) for values in blocks])
-    moduli = np.concatenate([_moduli(array, values) for values in blocks])  # which no attitude changes
+    moduli = np.concatenate([_moduli(array, values) for values in blocks])  # independent of the attitude
     moduli[stuck] = np.nan
     wild = np.zeros(moduli.shape, np.bool_)
     jitter_m = _jitter_m(array, readings)
@@ -156,7 +157,7 @@ def leaping_rows(readings: Readings) -> BoolArray:
     leaps = way > _FASTEST_M_S * np.diff(time_s)
     wild = np.concatenate([[False], leaps[1:] & leaps[:-1], [False]])
     if wild.any():
-        _LOG.warning(f"{wild.sum()} places leap and come back: their rows are left out")
+        _LOG.warning(f"spikes in the places: {wild.sum()}; their rows are left out")
     left = np.flatnonzero(leaps & ~wild[1:] & ~wild[:-1])
     if left.size:
         k = int(left[0])
@@ -186,8 +187,7 @@ def vary_with_base(ambient_T: FloatArray, time_s: FloatArray, base: Readings) ->
     if not len(read) or time_s[0] < read.time_s.min() or time_s[-1] > read.time_s.max():
         ends = f"{read.time_s.min():.15g} to {read.time_s.max():.15g} s" if len(read) else "nothing"
         raise ValueError(
-            f"Input base must read from {time_s[0]:.15g} to {time_s[-1]:.15g} s, as the survey does; instead received"
-            f" {ends}."
+            f"Input base must cover the survey from {time_s[0]:.15g} to {time_s[-1]:.15g} s; instead received {ends}."
         )
     _warn_of_gap(time_s, read)
     there, modulus = vectors_at(time_s, read.time_s, read.values_T), np.linalg.norm(ambient_T, axis=1, keepdims=True)
@@ -209,7 +209,7 @@ def _usable_base(base: Readings) -> Readings:
     place_m[:, 0] = read.time_s * (_BASE_STEP / step_s)
     wild = wild_readings(read.values_T[:, 0], place_m, 1.0, _BASE_NOISE_T, 0.0)
     if wild.any():
-        _LOG.warning(f"{wild.sum()} readings of the base station leap and come back, and are left out")
+        _LOG.warning(f"spikes in the readings of the base station: {wild.sum()}; they are left out")
     return _some(read, ~wild)
 
 

@@ -12,7 +12,7 @@ from magloc.surveying.search import WINDOW, SearchGrid, groups_near, normal_equa
 
 DEPTHS_M = (0.5, 1.0, 2.0)
 SEEN = 0.95
-_ROUNDING = 1e-12  # of the information on all three axes
+_ROUNDING = 1e-12  # relative rounding error of the information on all three axes
 
 
 def least_moments(
@@ -20,10 +20,8 @@ def least_moments(
 ) -> tuple[FloatArray, FloatArray]:
     """Return places (k, 3) below a rectangle, and the moments (k,) that are found with 95 %.
 
-    The moments hold for the worst direction.
-
-    A moment is found if a noncentral χ² with 3 degrees of freedom, moment·information·moment, exceeds the threshold.
-    Places where the rows have no information are left out.
+    The moments hold for the worst direction. A moment is found if a noncentral χ² with 3 degrees of freedom,
+    moment·information·moment, exceeds the threshold. Places where the rows have no information are left out.
     """
     record = model.record
     directions = record.directions(sources.fields(record))

@@ -24,8 +24,8 @@ IRON_Am2_PER_KG = (0.05, 0.3)
 """Moment of a kilogram of iron in the ground: a range, as its remanence and shape are not known."""
 _MOST_POINTS = 20_000
 _MOST, _LEAST_LINEAR = 0.8, 1e-3
-_FLAT = 1e-6  # across over along a line
-_GAP = 3.0  # over the usual step between places: nothing is known across it
+_FLAT = 1e-6  # largest ratio of width to length of a line
+_GAP = 3.0  # shortest gap, in usual steps between places, across which nothing is known
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,13 +36,13 @@ class Target:
     ----------
     id : str
     position_m, moment_Am2 : ndarray, shape (3,)
-        In the world frame.
+        Position [m] and moment [A·m²] in the world frame.
     covariance : ndarray, shape (6, 6)
-        Covariance of position and moment, everything else in the survey eliminated.
+        Covariance of position and moment, with all other unknowns of the survey eliminated.
     depth_m : float
         Depth below the ground.
     depth_interval95_m : tuple of 2 floats
-        For a weak target from the profile of χ², because its depth is not Gaussian.
+        95 % interval of the depth; for a weak target from the profile of χ², because its depth is not Gaussian.
     significance : float
         Increase of χ² without the target, with 3 degrees of freedom.
     flags : tuple of str
@@ -146,9 +146,9 @@ class Survey(Result):
     Attributes
     ----------
     targets : tuple of Target
-        The most significant one first.
+        Targets, the most significant one first.
     array : SensorArray
-        The sensors that were used, with the assumed pose errors.
+        Array of the sensors that were used, with the assumed pose errors.
     rows : SurveyRows
         Anomaly and residual of every row.
     reach : Reach
@@ -160,7 +160,7 @@ class Survey(Result):
     chi2_per_dof : float
         χ² of all white residuals per degree of freedom: 1 if the stated errors are right.
     pose_assumed : bool
-        Whether the pose errors (`array.pose`) are estimated from the rows because none were stated.
+        True if the pose errors (`array.pose`) are estimated from the rows because none were stated.
     lag_s : float
         Delay of the readings after their poses, estimated from the targets and corrected; 0 if the targets show none.
     seconds : float

@@ -17,20 +17,20 @@ from magloc.surveying.fit.whitening import SurveyDrift
 from magloc.surveying.search import Candidates, SearchGrid, peaks, search, sources_at
 
 MOST_ROUNDS = 60
-_MOST_IN_VAIN = 4  # rounds: near strong sources and the edges of tiles some candidates always remain
-_MOST_OF_MISFITS, _MISFIT = 8, 1.5  # rounds while χ² per reading is too large
+_MOST_IN_VAIN = 4  # rounds without a new source; near strong sources and edges of tiles some candidates always remain
+_MOST_OF_MISFITS, _MISFIT = 8, 1.5  # the same while χ² per reading exceeds a limit
 _PROGRESS, _WORSE = 0.999, 1.02
 _MOST_AT_ONCE = 8
 _SAME_PLACE_M = 1e-6
-_FELT = 0.3  # of the noise of a group of rows: smaller changes of sources do not count
-_REACH = 0.6  # largest shift in a fit, over the distance from the sensors
-_TWINS = 0.15  # over the distance from the sensors: sources nearer to each other are merged
+_FELT = 0.3  # smallest change of sources that counts, in units of the noise of a group of rows
+_REACH = 0.6  # largest shift in a fit, relative to the distance from the sensors
+_TWINS = 0.15  # largest distance of sources that are merged, relative to that from the sensors
 _MOST_WEIGHINGS = 4
 _SETTLED_COARSELY = 0.5
 # Steps of a fit with new weights at each, and the change of χ² in the last one.
 _MOST_STEPS, _FEW_STEPS, _SMALL_STEP = 6, 3, 0.1
 _HARDLY_DAMPED = 1e-9
-# Rows that pass within such a part of the distance to a source count as one.
+# Rows within this share of the distance to a source count as one group.
 WHILE_SEARCHING, AT_LAST = 0.33, 0.15
 Groups = Callable[[float], IntArray]
 """Group of every row (n,), of neighbours within a length."""
@@ -82,7 +82,7 @@ class SurveyModel:
     def _around(self, sources: Sources) -> SourceBounds:
         """Return bounds around sources that keep their identity.
 
-        A source that leaps would replace one that is not found yet.
+        A source that jumps would replace one that is not found yet.
         """
         return self.bounds.around(sources, _REACH * self._distances(sources))
 
@@ -98,7 +98,7 @@ class SurveyModel:
             if not len(sources):
                 break
             kept = fit.significance > self.threshold
-            if weighing:  # at its start the pose errors of a source hide what keeps it off an edge
+            if weighing:  # at the start pose errors hide the signal that keeps a source off an edge
                 kept &= self.bounds.contains(fit.sources)
             sources = fit.sources.some(kept).without_twins(_TWINS * self._distances(fit.sources.some(kept)))
             if len(sources) == len(kept) and weighing:

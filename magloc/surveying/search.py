@@ -17,7 +17,7 @@ from magloc.surveying.fit.whitening import RecordWhitening
 
 N_DISTANCES = 5
 PITCH = 1.8
-"""Distance of a source from the sensors over the pitch of the grid: 91 % of its energy is found in the median."""
+"""Distance of a source from the sensors over the pitch of the grid, which finds 91 % of its energy in the median."""
 WINDOW = 4.0
 """Size of the window of rows, in distances from the sensors."""
 _CHUNK = 6  # places along each side of a tile

@@ -29,7 +29,7 @@ from magloc.surveying.tiled import TiledSurvey
 from magloc.surveying.tiles import assign_sources
 
 _LOG = logging.getLogger(__name__)
-_TRIALS = 1.25  # independent trials of a map, over its area in squared distances to the shallowest sources: 1.0 to 1.4
+_TRIALS = 1.25  # independent trials per area of a map, in squared distances to the shallowest sources: 1.0 to 1.4
 _HECTARE_M2 = 1e4
 _MOST_SWEEPS = 5
 _MISFIT = 2.0
@@ -152,7 +152,7 @@ def survey(
                     break
             return tiled, due
 
-        # Strong sources beside a tile hide all others until they are known.
+        # Strong sources beside a tile mask all others until they are known.
         tiled, lag = settle(tiled, strongest_sources)[0].correct_lag(assumed)
         if lag.s:
             _LOG.warning(
@@ -162,7 +162,7 @@ def survey(
             tiled, _ = settle(tiled, strongest_sources)
         tiled, due = settle(tiled, significant_sources)
         if due:
-            _LOG.warning(f"{len(due)} of {len(every)} tiles do not agree with others on what lies beside them")
+            _LOG.warning(f"{len(due)} of {len(every)} tiles differ from their neighbours in the sources at their edges")
         if assumed:
             tiled = tiled.with_likeliest_pose()
         results = tiled.map_tiles(measure_targets, each, tell)
@@ -172,7 +172,7 @@ def survey(
     if chi2_per_dof > _MISFIT:
         _LOG.warning(
             f"χ² per reading is {chi2_per_dof:.1f}: noise, errors of the pose or changes of the field are larger than"
-            " is stated, and so are the errors of the targets"
+            " stated, and so are the errors of the targets"
         )
     return Survey(
         _targets(tiled, results),

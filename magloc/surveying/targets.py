@@ -21,7 +21,7 @@ _NEAR = 1.5
 _MISFIT = 1.5  # χ² per reading
 _LASTING = 3.72  # standard deviations, one-sided
 _N_DEPTHS = 16
-_SPAN = 3.0  # over and under the depth, as a factor
+_SPAN = 3.0  # factor above and below the depth
 _N_SECOND = 9  # degrees of freedom of a second source
 _FALSE_MERGED = 0.01  # false alarms among single sources
 _WITHIN, _N_BESIDE, _DEEPER, _N_BELOW = 1.0, 7, 1.6, 5  # places of a second source, over the distance
@@ -96,10 +96,9 @@ def second_source_chi2(
 ) -> float:
     """Return χ² of a score test for a second source near a position.
 
-    It is what quadrupole and octupole at the position would explain of the residuals.
-
-    Two dipoles near each other equal one dipole, quadrupole and octupole at their middle, to third order of the gap. Q
-    projects out everything else, including the source's position, so that 9 of 12 degrees of freedom remain.
+    It is the χ² of the residuals that quadrupole and octupole at the position would explain. Two dipoles near each
+    other equal one dipole, quadrupole and octupole at their middle, to third order of the gap. Q projects out
+    everything else, including the source's position, so that 9 of 12 degrees of freedom remain.
     """
     record, white = model.record, background.white
     near = groups_near(record, white, position[None], WINDOW * (record.height_m - position[2]))
@@ -119,7 +118,7 @@ def second_source_chi2(
 def shift_by_second(
     model: SurveyModel, fit: JointFit, background: SurveyBackground, Q: FloatArray, left: FloatArray, which: int
 ) -> FloatArray:
-    """Return how position and moment (6,) would change by the likeliest second source.
+    """Return the change of position and moment (6,) by the likeliest second source.
 
     The result is of first order. Q projects out all sources; ``left`` is the residual.
     """
@@ -194,10 +193,11 @@ def targets_of(
 def is_misfit(left: FloatArray, at: IntArray) -> bool:
     """Return whether residuals of groups fit much worse than noise, or are correlated in time.
 
-    The first: groups `at` of the residuals (g, k) fit worse than one of 10,000 right models, and χ² is 50 % too large.
+    First test: groups `at` of the residuals (g, k) fit worse than in one of 10,000 right models, and χ² is 50 % too
+    large.
 
-    The second: residuals of successive groups are correlated, as if a target moves to and fro, more than in one of
-    10,000 right models. The test is the sum of their products over its standard deviation, estimated from them.
+    Second test: residuals of successive groups are correlated, as if a target moves to and fro, more than in one of
+    10,000 right models. The statistic is the sum of their products divided by its estimated standard deviation.
     """
     near, after = left[at], np.diff(at) == 1
     products = near[1:][after] * near[:-1][after]

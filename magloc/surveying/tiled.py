@@ -26,10 +26,10 @@ from magloc.surveying.tiles import Tile, assign_sources, tiles_of
 _LOG = logging.getLogger(__name__)
 _SAMPLE = 20_000  # rows for properties that all tiles share
 _LEAST_GEOLOGY_T, _MOST_GEOLOGY_T = 1e-10, 5e-9
-_SAME = 0.5  # over the distance to the nearest sources: two finds at a seam within it are one source
-_FELT, _CHANGED = 0.1, 1.0  # fields over the noise: noticeable, and worth a new search
+_SAME = 0.5  # distance, relative to that to the nearest sources, within which two finds at a seam are one source
+_FELT, _CHANGED = 0.1, 1.0  # fields, relative to noise, that are noticeable, and that cause a new search
 _MOVED_M = 0.15
-_NARROW, _NEARLY_ALL = 0.2, 0.95  # width of a line over the distance to the nearest sources; share of rows
+_NARROW, _NEARLY_ALL = 0.2, 0.95  # width of a line relative to the distance to the nearest sources; share of rows
 _BESIDE_M = 1.0
 _POSES = 2  # alternating estimates of pose errors and lag
 Tell = Callable[[str], None]
@@ -52,8 +52,8 @@ class TiledSurvey:
         Median and typical size of the anomalies.
     sources : Sources
     found, known, outside : sequence of Sources
-        Sources that every tile found last, including its margin; those that it started with; and those whose field was
-        subtracted from its readings.
+        For each tile: sources that it found last, including its margin; sources that it started with; and sources whose
+        field was subtracted from its readings.
     """
 
     array: SensorArray
@@ -94,7 +94,7 @@ class TiledSurvey:
         elif np.quantile(across_m, _NEARLY_ALL) < _NARROW * nearest_m:
             _LOG.warning(
                 "all readings lie on one line: the side and the distance of a target are poorly determined, and several"
-                " targets are taken for others"
+                " targets may be found at wrong places"
             )
         return cls(
             array,

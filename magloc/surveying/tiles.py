@@ -9,8 +9,8 @@ import numpy as np
 
 from arrays.typing import BoolArray, FloatArray, IntArray
 
-_CORE, _MARGIN = 4.0, 1.2  # over the distance from the sensors to the deepest sources
-SEAM_M = 1.2  # more than the margin of sources beside the rows
+_CORE, _MARGIN = 4.0, 1.2  # widths relative to the distance from the sensors to the deepest sources
+SEAM_M = 1.2  # wider than the margin of sources beside the rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,10 +20,10 @@ class Tile:
     Attributes
     ----------
     low_m, high_m : ndarray, shape (2,)
-        Infinite where there is no other tile.
+        Corners of the rectangle; infinite on sides without another tile.
     rows : ndarray of int
     own : ndarray of bool
-        Which rows are in the rectangle, not in the margin.
+        True for rows in the rectangle, False for those in the margin.
     colour : int
         0 to 3; adjacent tiles differ.
     """
@@ -40,7 +40,7 @@ class Tile:
         return low, np.where(np.isfinite(self.high_m), self.high_m, places_m.max(axis=0))
 
     def inside_m(self, position_m: FloatArray) -> FloatArray:
-        """Return how far positions (K, 3) are inside the rectangle, negative outside."""
+        """Return the distance (K,) of positions (K, 3) from the edge of the rectangle, negative outside."""
         xy = position_m[:, :2]
         return np.asarray(np.minimum(xy - self.low_m, self.high_m - xy).min(axis=1, initial=np.inf))
 
@@ -79,7 +79,7 @@ def tiles_of(places_m: FloatArray, reach_m: float) -> tuple[list[Tile], float]:
 def assign_sources(tiles: Sequence[Tile], position_m: Sequence[FloatArray], same_m: float) -> list[tuple[int, int]]:
     """Return tile and index of every source that tiles found in (K, 3).
 
-    A source on a seam counts once, for the tile in which it lies deeper.
+    A source on a seam counts once, for the tile in which it is farther from the edge.
     """
     found = []
     for t, (tile, places) in enumerate(zip(tiles, position_m, strict=True)):

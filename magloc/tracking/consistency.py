@@ -291,12 +291,12 @@ class InnovationTest:
         cautions = []
         if self.ambient_factor > MATTERS:
             cautions.append(
-                "the ambient field counts as exact: were it wrong by 300 nT, errors would be about"
+                "the ambient field counts as exact: if it is wrong by 300 nT, errors are about"
                 f" {self.ambient_factor:.2g} times their standard deviations; state ambient_uncertainty_nT"
             )
         if self.body_factor > MATTERS:
             cautions.append(
-                "the source counts as a point: were it a body of a quarter of its distance, errors would be about"
+                "the source counts as a point: for a body as long as a quarter of its distance, errors would be about"
                 f" {self.body_factor:.2g} times their standard deviations"
             )
         return "; ".join(cautions)

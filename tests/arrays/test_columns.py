@@ -310,7 +310,7 @@ class TestGaps:
         np.testing.assert_allclose(found.time_s, time_s)
         assert found.array_position_m is not None
         np.testing.assert_allclose(found.array_position_m, np.stack([3 * time_s, -time_s, 7 + 0 * time_s], axis=1))
-        assert "8 of 10 rows have no whole place: 4 are interpolated, 4 before" in caplog.text
+        assert "8 of 10 rows have no complete place: 4 are interpolated, 4 before" in caplog.text
 
     def test_have_an_error(self, tmp_path: Path) -> None:
         """At most what is known of the bend: on a circle the chord of half a turn is off by its radius."""

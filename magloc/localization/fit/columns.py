@@ -20,7 +20,7 @@ class Solutions:
     ----------
     of_row, n_sources, dof, iterations, n_known : ndarray of int, shape (f,)
     position_m, moment_Am2 : ndarray, shape (f, K, 3)
-        NaN beyond the sources of a solution.
+        Positions and moments; NaN beyond the sources of a solution.
     covariance : ndarray, shape (f, 6 K, 6 K), or (f, 3 K, 3 K) of moments alone
     chi2, weight, known_chi2 : ndarray, shape (f,)
     ranges : ndarray, shape (f, K, i, 2)

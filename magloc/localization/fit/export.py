@@ -29,7 +29,7 @@ QUANTITIES = STATE_QUANTITIES | {
     "dof": Quantity("1", "differences minus unknowns"),
     "weight": Quantity("1", "probability that the solution is the right one"),
     "n_sources": Quantity("1", "sources of the solution"),
-    "detected": Quantity("1", "whether the readings stand out of noise"),
+    "detected": Quantity("1", "whether the readings exceed noise"),
     "misfit": Quantity("1", "whether χ² is far beyond noise"),
     "body_length_m": Quantity("m", "length of the object that was taken into account, 0 for a point"),
     "body_factor": Quantity(
@@ -46,22 +46,22 @@ _OF_ROWS = ("detected", "misfit", "too_near", "body_length_m", "body_factor")
 
 @dataclass(frozen=True, eq=False)
 class FixColumns:
-    """Sources of the best solutions of all rows, k of them; NaN where a row has none.
+    """Columns of the k sources of the best solutions of all rows; NaN if a row has none.
 
     Attributes
     ----------
     row : ndarray of int, shape (k,)
-        Which row a source belongs to.
+        Row of each source.
     source : ndarray of int, shape (k,)
-        Its number in the row, from 1; 0 where a row has no solution.
+        Number of each source in its row, from 1; 0 if a row has no solution.
     time_s, chi2 : ndarray, shape (k,)
     dof : ndarray of int, shape (k,)
     position_m, moment_Am2 : ndarray, shape (k, 3)
     covariance : ndarray, shape (k, 6, 6)
-        Of (position, moment); zero for a position that is known beforehand.
+        Covariance of (position, moment); zero for a known position.
     range_observable : ndarray of bool, shape (k,)
     range95_m : ndarray, shape (k, 2)
-        Least and largest distance from the sensors' centroid within the 95 % interval; infinite where it is open.
+        Ends of the 95 % interval of the distance from the sensors' centroid; the upper end may be infinite.
     """
 
     row: IntArray
@@ -94,7 +94,7 @@ def fix_columns(fixes: Fixes) -> FixColumns:
     covariance = np.full((n, 6, 6), np.nan)
     position[solved], moment[solved] = columns.position_m[at], columns.moment_Am2[at]
     of_source = columns.covariance_of_source[at]
-    n_known = 6 - of_source.shape[1]  # a position that is known is exact
+    n_known = 6 - of_source.shape[1]  # a known position is exact
     covariance[solved] = 0.0
     covariance[solved, n_known:, n_known:] = of_source
     intervals[solved] = spans(columns.ranges[at])

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 _Column = TypeVar("_Column")
 BODY_MATTERS = 1.5
-"""Times their standard deviations that errors of a point would be if it were a body, from which on that is told."""
+"""Factor on standard deviations, if a point were a body, above which a fix has a caution."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -35,18 +35,18 @@ class Fixes(Result, Sequence[Fix]):
     Attributes
     ----------
     solutions : Solutions
-        Of all rows.
+        Solutions of all rows.
     time_s : ndarray, shape (n,)
     frame : {"array", "world"}
-        Of positions, moments and covariances.
+        Frame of positions, moments and covariances.
     detected, too_near : ndarray of bool, shape (n,)
     reason : list of str
     dropped_sensors, saturated_channels : list of tuple of str
     failed_starts : ndarray of int, shape (n,)
     body_length_m : ndarray, shape (n,)
-        Length of the object that was taken into account, said or assumed [m]; 0 for a point.
+        Stated or assumed length of the object [m]; 0 for a point.
     bodies : callable, optional
-        Gives `body_covariance`, when it is asked for.
+        Function that computes `body_covariance` when it is needed.
 
     Examples
     --------
@@ -123,7 +123,7 @@ class Fixes(Result, Sequence[Fix]):
         return result
 
     def _column(self, values: _Column, empty: float) -> _Column:
-        """Return values of the best solutions (n, ...), `empty` where there is none."""
+        """Return values of the best solutions (n, ...), `empty` if there is none."""
         every: Any = values
         if not len(self.solutions):
             every = np.full((1, *every.shape[1:]), empty)
@@ -155,7 +155,7 @@ class Fixes(Result, Sequence[Fix]):
     def covariance(self) -> FloatArray:
         """Covariances (n, 6, 6) of the best solutions with one source.
 
-        (n, 3, 3) of moments where the position is known.
+        The shape is (n, 3, 3), of moments alone, if the position is known.
         """
         return self._column(self._require_one_source(self.solutions.covariance[:, :6, :6]), np.nan)
 
@@ -202,23 +202,19 @@ class Fixes(Result, Sequence[Fix]):
 
     @cached_property
     def body_covariance(self) -> FloatArray:
-        """Covariance (n, D, D) that an object of a quarter of its distance would add.
+        """Covariance (n, D, D) that an object as long as a quarter of its distance would add to the best solution.
 
-        It is that of the best solution.
-
-        Zero where the object counts as a point by what is said, or stands not far out of noise; (0, D, D) where all do.
+        It is zero if the object is stated to be a point, or if its signal is weak. The shape is (0, D, D) if this holds
+        for all rows.
         """
         return np.zeros((0, 6, 6)) if self.bodies is None else self.bodies()
 
     @cached_property
     def body_factor(self) -> FloatArray:
-        """Factor (n,) by which errors would exceed their standard deviations, rms.
-
-        For objects of `body_covariance`.
-        """
+        """Factor (n,) by which rms errors would exceed their standard deviations for objects of `body_covariance`."""
         factor, added, columns = np.ones(len(self)), self.body_covariance, self.solutions
         matter = np.flatnonzero(added.any(axis=(1, 2)))
-        size = columns.covariance.shape[1] // columns.position_m.shape[1]  # of one source
+        size = columns.covariance.shape[1] // columns.position_m.shape[1]  # unknowns of one source
         n_unknowns = size * columns.n_sources[self.best[matter]]
         for n in np.unique(n_unknowns).tolist():
             rows = matter[n_unknowns == n]
@@ -227,14 +223,14 @@ class Fixes(Result, Sequence[Fix]):
 
     @property
     def caution(self) -> str:
-        """Warning of errors that the fixes cannot show; empty where they would not matter."""
+        """Warning of errors that the fixes cannot show; empty if they would not matter."""
         matters = self.body_factor > BODY_MATTERS
         if not matters.any():
             return ""
         middle = float(np.median(self.body_factor[matters]))
         return (
-            f"in {matters.sum()} of {len(self)} rows the source counts as a point: were it a body of a quarter of its"
-            f" distance, errors would be about {middle:.2g} times their standard deviations; state its length"
+            f"in {matters.sum()} of {len(self)} rows the source counts as a point: for a body as long as a quarter of"
+            f" its distance, errors would be about {middle:.2g} times their standard deviations; state its length"
         )
 
     @classmethod
@@ -285,7 +281,7 @@ class Fixes(Result, Sequence[Fix]):
 
     @property
     def first(self) -> IntArray:
-        """Index (n,) in `solutions` of the smallest χ² of every row, where it is solved."""
+        """Index (n,) in `solutions` of the smallest χ² of every row that has a solution."""
         return self._edges[:-1]
 
     def replaced(self, rows: IntArray, fixes: Sequence[Fix]) -> Fixes:
@@ -313,7 +309,7 @@ class Fixes(Result, Sequence[Fix]):
         return columns_of_fixes(self)
 
     def table(self) -> str:
-        """Return the table that ``magloc locate`` prints, and what may be wrong with it."""
+        """Return the table that ``magloc locate`` prints, with its warnings."""
         return "\n".join([super().table(), *filter(None, [self.caution])])
 
     def to_xarray(self, which: Literal["best", "all"] = "best") -> xr.Dataset:
@@ -322,7 +318,7 @@ class Fixes(Result, Sequence[Fix]):
         Parameters
         ----------
         which : {"best", "all"}
-            The heaviest solution of every row, or all of them, padded with NaN.
+            Solution with the largest weight of every row, or all solutions, padded with NaN.
         """
         return dataset_of_fixes(self, which)
 

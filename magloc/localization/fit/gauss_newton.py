@@ -1,7 +1,7 @@
 """Damped Gauss-Newton fits of several dipoles to any sensors, many fits at once.
 
-In the coordinates of :mod:`magloc.measurement.whitened`. Positions are damped, moments are not: after every step of
-the positions the moments are fitted anew, which for vector sensors makes the iteration that of variable projection.
+The coordinates are those of :mod:`magloc.measurement.whitened`. Positions are damped, moments are not. After every step
+of the positions the moments are fitted again; for vector sensors the iteration is then variable projection.
 
 Shapes: b fits, K sources, N sensors, C channels, c columns of the whitening's common field.
 """
@@ -19,7 +19,7 @@ from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.localization.fit.refinement import MOST_SOURCES, OPTIMUM_TOLERANCE, RELATIVE_TOLERANCE, refine_starts
 from magloc.measurement.whitened import WhitenedModel
 
-# Converged where the linearised model predicts a smaller decrease of χ² than this, absolute and relative.
+# Predicted decrease of χ², absolute and relative, below which a fit has converged.
 PROMISE_ABSOLUTE = 1e-8
 PROMISE_RELATIVE = 1e-11
 LARGEST_STEP_RAD, LARGEST_DAMPING = 0.5, 1e9
@@ -35,9 +35,9 @@ class JointFits:
     q : ndarray, shape (..., K, 4)
     mu : ndarray, shape (..., K, 3)
     chi2 : ndarray, shape (...)
-        Infinite where the fit did not converge, or where there is none.
+        χ²; infinite if a fit did not converge or does not exist.
     iterations : ndarray of int, shape (...)
-        Linearisations.
+        Number of linearisations.
     """
 
     q: FloatArray
@@ -71,7 +71,7 @@ class JointFits:
         return JointFits(*(values.reshape(*shape, *values.shape[n_axes:]) for values in vars(self).values()))
 
     def put(self, index: Any, fits: JointFits) -> None:
-        """Write fits to some of the places."""
+        """Write fits into this array, at an index of the leading axes."""
         for values, others in zip(vars(self).values(), vars(fits).values(), strict=True):
             values[index] = others
 
@@ -84,8 +84,8 @@ class JointFits:
     def distinct(self, width: int, is_same: Callable[[JointFits], BoolArray]) -> JointFits:
         """Return the best distinct fits (b, width) of each row of fits (b, n).
 
-        `is_same` tells which fits (b, n) equal one of each row (b,). A row without any fit keeps its first one, because
-        the next source starts better beside it.
+        `is_same` returns which fits (b, n) equal one fit of each row (b,). A row without any converged fit keeps its
+        first one, because the next source starts better beside it.
         """
         chi2, rows = self.chi2.copy(), np.arange(len(self.chi2))
         kept = JointFits.none((len(rows), width), self.n_sources)
@@ -110,12 +110,12 @@ class JointFits:
 def tangents(q: FloatArray) -> FloatArray:
     """Return orthonormal tangents (..., 4, 3) of the unit sphere at q (..., 4).
 
-    The first two turn the direction u at one range, the third changes the range alone.
+    The first two change the direction u at constant range, the third changes the range alone.
     """
     u, s = q[..., :3], q[..., 3:]
     length = np.linalg.norm(u, axis=-1, keepdims=True)
     direction = np.where(length > 1e-12, u / np.maximum(length, 1e-12), [0.0, 0.0, 1.0])
-    # Any vector that is not along u: the axis of its smallest component.
+    # The axis of the smallest component of u is not along u.
     axis = np.eye(3)[np.argmin(np.abs(direction), axis=-1)]
     first = np.cross(direction, axis)
     first /= np.linalg.norm(first, axis=-1, keepdims=True)
@@ -132,7 +132,7 @@ def tangents(q: FloatArray) -> FloatArray:
 def fit_moments(problem: WhitenedModel, y: FloatArray, q: FloatArray) -> FloatArray:
     """Return scaled moments (b, K, 3) that fit y (b, C) best at q.
 
-    The channels are linearised about the ambient field alone.
+    Channels are linearised about the ambient field alone.
     """
     gain = problem.linear_gain(np.zeros_like(problem.ambient))
     return _moment_step(problem.moment_jacobian(q, gain), y - problem.ambient_signals)
@@ -176,7 +176,7 @@ class _FitNormalEquations:
     def step(self, damping: FloatArray | float = 0.0) -> tuple[FloatArray, FloatArray]:
         """Return the damped step (b, n) and the predicted decrease of χ² (b,).
 
-        Every column has its damping.
+        Damping may differ between columns.
         """
         diagonal = np.arange(self.norm.shape[-1])
         system = self.information.copy()
@@ -206,11 +206,11 @@ def refine(
 ) -> JointFits:
     """Fit positions and moments from starts (b, K, 4) and (b, K, 3); χ² never rises.
 
-    y (b, C) are whitened readings, `free` (K, 3) says which :func:`tangents` of a source may change: without the third
-    its range stays. It has converged where the linearised model promises to lower χ² by less than `promise`, of one
-    free source by vector sensors by less than ``OPTIMUM_TOLERANCE``. Kernels refine sources of free moments by vector
-    sensors, beginning with the moments that fit best, and one source by any sensors; they give up what will not come
-    below a χ² (b,) that is too high.
+    y (b, C) are whitened readings. `free` (K, 3) states along which :func:`tangents` a source may move; without the
+    third its range is constant. A fit has converged if the predicted decrease of χ² is below `promise`, or below
+    ``OPTIMUM_TOLERANCE`` for one free source and vector sensors. Kernels refine several sources with vector sensors,
+    starting from the best moments, and one source with any sensors. They stop fits that will not fall below `too_high`
+    (b,).
     """
     free = np.ones((q.shape[1], 3), dtype=bool) if free is None else free
     if not _has_kernel(problem, free):
@@ -235,7 +235,7 @@ def refine(
 def _has_kernel(problem: WhitenedModel, free: NDArray[np.bool_]) -> bool:
     """Return whether kernels can refine this problem.
 
-    They refine sources of free moments by vector sensors, and one of free direction by any sensors.
+    They refine sources with unknown moments by vector sensors, and one source of free direction by any sensors.
     """
     if problem.known is not None or not free.any() or len(free) > MOST_SOURCES:
         return False
@@ -336,9 +336,9 @@ def _squares(residual: FloatArray) -> FloatArray:
 def _take_step(
     q: FloatArray, mu: FloatArray, step: FloatArray, tangent: FloatArray, columns: NDArray[np.intp]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return coordinates and moments after a step, and the share of it that was taken.
+    """Return coordinates and moments after a step, and the applied share of the step.
 
-    A step that would turn q too far is shortened.
+    A step that would rotate q too far is shortened.
     """
     n_fits, n_sources = q.shape[:2]
     along = np.zeros((n_fits, 3 * n_sources))
@@ -347,7 +347,7 @@ def _take_step(
     longest = np.max(np.linalg.norm(along, axis=-1), axis=-1)
     share = np.minimum(1.0, LARGEST_STEP_RAD / np.maximum(longest, 1e-300))
     moved = q + (tangent @ (share[:, None, None] * along)[..., None])[..., 0]
-    # A step along the tangents lengthens u a little: where the range is held, u keeps its length.
+    # A step along the tangents lengthens u slightly; restore its length if the range is constant.
     held = ~np.isin(3 * np.arange(n_sources) + 2, columns)
     before, after = (np.linalg.norm(x[:, held, :3], axis=-1, keepdims=True) for x in (q, moved))
     moved[:, held, :3] *= before / np.maximum(after, 1e-300)
@@ -394,9 +394,9 @@ def scaled_jacobian(problem: WhitenedModel, q: FloatArray, mu: FloatArray) -> Fl
 
 
 def inverse_information(jacobian: FloatArray) -> FloatArray:
-    """Return ``(JᵀJ)⁻¹`` (b, n, n) of whitened Jacobians (b, C, n); NaN where singular.
+    """Return ``(JᵀJ)⁻¹`` (b, n, n) of whitened Jacobians (b, C, n); NaN if singular.
 
-    By singular values of scaled columns.
+    The inverse uses the singular values of scaled columns.
     """
     n_fits, n_rows, n = jacobian.shape
     norm = np.linalg.norm(jacobian, axis=1)

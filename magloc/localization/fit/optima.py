@@ -20,18 +20,18 @@ class Optima:
     Attributes
     ----------
     of_row : ndarray of int, shape (f,)
-        Place of a fit's row among the b rows.
+        Index of a fit's row among the b rows.
     reason : list of str
-        Of every row: why it has no optimum, or fewer sources than were asked for; empty otherwise.
+        Reason why each row has no optimum, or fewer sources than requested; empty otherwise.
     merged : ndarray of bool, shape (f, K)
-        Whether a source stands for two that the array does not tell apart.
+        True if a source represents two that the array cannot separate.
     failed_starts : ndarray of int, shape (b,)
     position_m : ndarray, shape (b, K, 3), optional
-        Places of the sources where they are known: then the unknowns are the moments alone.
+        Known positions of the sources; the unknowns are then the moments alone.
     undetermined : str
-        Why a row has no solution if its optima have no finite covariance.
+        Reason for rows without a solution because their optima have no finite covariance.
     bent : ndarray of bool, shape (f,)
-        Whether errors beyond noise follow a curve.
+        True if errors are not Gaussian, because nonlinear effects exceed the noise.
     """
 
     rows: WhitenedRows

@@ -15,30 +15,30 @@ from magloc.measurement.known_moment import KnownMoment
 if TYPE_CHECKING:
     from magloc.measurement.whitened import ScaledSensors
 
-# Of the strength of a magnet that somebody states: a share of it.
+# Default σ of a stated moment, relative to its modulus.
 _DEFAULT_SIGMA = 0.1
 
 
 @dataclass(frozen=True)
 class SourcePrior:
-    """Prior knowledge of a source; solutions that contradict it are left out.
+    """Prior knowledge of a source; solutions outside its bounds are left out.
 
     Attributes
     ----------
     low_m, high_m : tuple of 3 floats
-        Bounds of the position in the array's frame [m], infinite where there is none: a box, a slab or a half-space.
+        Bounds of the position in the array's frame [m]: a box, a slab or a half-space. Infinite for no bound.
     largest_moment_Am2 : float
-        Bound of the moment's modulus [A·m²].
+        Upper bound of the moment's modulus [A·m²].
     known_moment_Am2 : float or tuple of 3 floats, optional
-        What the moment is known to be: its modulus, or its components in the array's frame [A·m²]. Counts as one more
+        Known modulus of the moment, or its known components in the array's frame [A·m²]. It counts as one more
         measurement, or as three.
     known_moment_sigma_Am2 : float, optional
-        1 σ of that, of every component; a tenth of the modulus by default.
+        Standard deviation of the known modulus, or of each known component; a tenth of the modulus by default.
 
     Raises
     ------
     ValueError
-        The bounds leave nothing, or a known moment or its σ is not positive.
+        The bounds exclude all sources, or a known moment or its σ is not positive.
 
     Examples
     --------
@@ -96,11 +96,11 @@ class SourcePrior:
         return np.all((position_m >= np.asarray(self.low_m)) & (position_m <= np.asarray(self.high_m)), axis=-1)
 
     def allows_moment(self, moment_Am2: FloatArray) -> Any:
-        """Return whether moments (..., 3) are small enough."""
+        """Return whether moments (..., 3) lie within the bound."""
         return np.linalg.norm(moment_Am2, axis=-1) <= self.largest_moment_Am2
 
     def allows(self, sensors: ScaledSensors, q: FloatArray, mu: FloatArray) -> BoolArray:
-        """Return whether sources at q (..., 4) with moments μ (..., 3) agree with both bounds."""
+        """Return whether sources at q (..., 4) with moments μ (..., 3) lie within all bounds."""
         with np.errstate(invalid="ignore"):
             allowed = self.allows_position(sensors.position(q)) & self.allows_moment(sensors.moment(q, mu))
         return np.asarray(allowed)

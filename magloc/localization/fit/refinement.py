@@ -16,9 +16,9 @@ from magloc.measurement.channels import signals_of
 from magloc.measurement.whitened import WhitenedModel
 
 MOST_SOURCES = 4
-"""Most sources that the kernels fit together."""
+"""Largest number of sources that the kernels fit together."""
 OPTIMUM_TOLERANCE = 1e-10
-"""Predicted gain in χ² at which a state of one source is an optimum: its position is within 1e-5 σ of it."""
+"""Predicted decrease of χ² below which one source is at an optimum: its position is then within 1e-5 σ of it."""
 RELATIVE_TOLERANCE = 1e-14
 _CHANNELS_A_BLOCK = 100_000
 
@@ -26,9 +26,8 @@ _CHANNELS_A_BLOCK = 100_000
 class Refinements(NamedTuple):
     """Results of n refinements of K sources.
 
-    q (n, K, 4), scaled moments (n, K, 3), χ² (n,), linearisations (n,).
-
-    The last item tells which converged, or were given up because they would not come below a useful χ².
+    The items are q (n, K, 4), scaled moments (n, K, 3), χ² (n,), numbers of linearisations (n,), and which converged.
+    Refinements that would not fall below a useful χ² are stopped early.
     """
 
     q: FloatArray
@@ -57,19 +56,20 @@ def refine_starts(
     ----------
     model : WhitenedModel
     y : ndarray, shape (b, C)
-        Whitened readings; those of moduli above the ambient field's.
+        Whitened readings; moduli are relative to that of the ambient field.
     q : ndarray, shape (b, K, 4)
-        Positions to start from. K is at most :data:`MOST_SOURCES`, and one with moduli.
+        Start positions. K is at most :data:`MOST_SOURCES`, and 1 with moduli.
     mu : ndarray, shape (b, K, 3), optional
-        Moments about which moduli are linearised first; zero where there is none.
+        Moments about which moduli are first linearised; zero by default.
     free : ndarray of bool, shape (K, 3), optional
-        Whether each source may turn in two directions and change its range. By default all may.
+        True where a source may move along each of its tangents: two change its direction, one its range. By default all
+        are free.
     max_iterations : int
         Largest number of linearisations.
     tolerance, relative_tolerance : float
-        Predicted gain in χ² at which a state is an optimum, absolute and relative to χ².
+        Predicted decrease of χ² below which a state is an optimum, absolute and relative to χ².
     too_high : ndarray, shape (b,), optional
-        χ² above which a fit is of no use.
+        χ² above which a fit is not useful.
 
     Returns
     -------

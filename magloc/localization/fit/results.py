@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
 Intervals = tuple[tuple[float, float | None], ...]
 EVERYWHERE: Intervals = ((0.0, None),)
-"""The set of ranges of a row that says nothing."""
-# Δχ² within which another optimum is a solution too.
+"""Set of ranges of a row without information on the range."""
+# Rise of χ² within which another optimum counts as a solution too.
 DISTINCT_WITHIN = 20.0
 
 
@@ -31,22 +31,22 @@ class Source:
     Attributes
     ----------
     position_m : ndarray, shape (3,)
-        In the frame of its fix [m].
+        Position in the frame of its fix [m].
     moment_Am2 : ndarray, shape (3,)
-        [A·m²].
+        Moment [A·m²].
     covariance : ndarray, shape (6, 6), optional
-        Of (position, moment), all other sources being unknown too; (3, 3) of the moment where the place is known. None
-        for a source that is not the result of a fix. Where the range is not observable it is widened along the range
-        until it is as long as `range_interval_m`.
+        Covariance of (position, moment) with all other sources unknown, or (3, 3) of the moment if the position is
+        known. None for a source that is not the result of a fix. If the range is not observable, the covariance is
+        widened along the range until it covers `range_interval_m`.
     range_interval_m : tuple of (low, high)
-        95 % set of the distance from the sensors' centroid [m], in ascending order; high is None where it is open. With
-        one source it belongs to the readings, all solutions together; of several sources each has its own, where the
-        profile χ² over its range stays within 3.84 of the solution.
+        Intervals of the 95 % set of the distance from the sensors' centroid [m], in ascending order; high is None for
+        an open interval. With one source the set covers all solutions of the readings. With several sources each has
+        its own set, in which the profile χ² over its range is within 3.84 of the solution.
     gaussian : bool
-        Whether the covariance describes the uncertainty: the range is observable in one interval, no other solution has
-        a weight to speak of, σ of position and moment are small, and χ² is one of noise and rises as a Gaussian's.
+        True if the covariance describes the uncertainty: the range is observable in one interval, no other solution has
+        a noticeable weight, σ of position and moment are small, and χ² agrees with noise and rises like a parabola.
     merged : bool
-        Whether it stands for two sources that the array does not tell apart.
+        True if the source represents two that the array cannot separate.
 
     Examples
     --------
@@ -89,19 +89,20 @@ class Solution:
     ----------
     sources : tuple of Source
     covariance : ndarray, shape (6 K, 6 K)
-        Of (position, moment) of the first source, then of the second, and so on; (3, 3) where the place is known.
+        Covariance of (position, moment) of the first source, then the second, and so on; (3 K, 3 K) of the moments if
+        the positions are known.
     chi2 : float
         Sum of squared residuals of the decorrelated differences over their variances.
     dof : int
-        Differences minus unknowns.
+        Number of differences minus number of unknowns.
     weight : float
-        How likely the solution is among those of the fix; they add up to one.
+        Probability of the solution among those of the fix; the weights add up to one.
     iterations : int
-        Linearisations that led here.
+        Number of linearisations.
     known_chi2 : float
-        What the moments add to χ² by differing from what is known of them; not part of `chi2`.
+        χ² of the differences between fitted and known moments; not part of `chi2`.
     n_known : int
-        Numbers that are known of them.
+        Number of known components or moduli of the moments.
 
     Examples
     --------
@@ -128,7 +129,7 @@ class Solution:
 
     @property
     def source(self) -> Source:
-        """Only source; a ValueError where there are several."""
+        """Only source; raises ValueError if there are several."""
         if len(self.sources) != 1:
             raise ValueError(f"The solution has {len(self.sources)} sources: see its attribute sources.")
         return self.sources[0]
@@ -169,25 +170,25 @@ class Fix:
     Attributes
     ----------
     solutions : tuple of Solution
-        Best χ² first; empty if the readings cannot be solved.
+        Solutions, best χ² first; empty if the readings have none.
     reason : str
-        Why there is no solution, or why it has fewer sources than were asked for; empty otherwise.
+        Reason why there is no solution, or why it has fewer sources than requested; empty otherwise.
     detected : bool
-        Whether the readings stand out of noise, which alone makes them do so in one of a thousand rows. Where they do
-        not, or cannot be tested, the solutions are fits of noise and nothing is known of the range.
+        True if the readings exceed noise, with one false alarm in a thousand rows. Otherwise, or if there is no test,
+        the solutions are fits of noise and nothing is known of the range.
     dropped_sensors : tuple of str
         Ids of sensors that contradict all others, and were left out.
     saturated_channels : tuple of str
-        Names of the channels whose reading is none because it saturates.
+        Names of the channels without a reading because they saturate.
     too_near : bool
-        Whether the source is too near, or too large, for a dipole.
+        True if the source is too near, or too large, for a dipole.
     failed_starts : int
-        Starts of the search that ended without an optimum.
+        Number of starts of the search that ended without an optimum.
     time_s : float
     body_length_m : float
-        Length of the object that was taken into account, said or assumed [m]; 0 for a point.
+        Stated or assumed length of the object [m]; 0 for a point.
     of_rows : tuple of Fixes and int, optional
-        The fixes that it is one of, and which.
+        Fixes that contain this one, and its row.
 
     Examples
     --------
@@ -211,17 +212,15 @@ class Fix:
 
     @property
     def body_factor(self) -> float:
-        """Factor by which errors would exceed their standard deviations, rms.
+        """Factor by which rms errors would exceed their standard deviations for a body instead of a point.
 
-        For a body of a quarter of its distance instead of a point.
-
-        1 where that does not matter, or where something is said of its length.
+        The body is as long as a quarter of its distance. The factor is 1 if it does not matter or a length is stated.
         """
         return 1.0 if self.of_rows is None else float(self.of_rows[0].body_factor[self.of_rows[1]])
 
     @property
     def best(self) -> Solution:
-        """Solution of the largest weight; a ValueError with the reason where there is none."""
+        """Solution with the largest weight; raises ValueError with the reason if there is none."""
         if not self.solutions:
             raise ValueError(f"The readings have no solution: {self.reason}.")
         return max(self.solutions, key=lambda solution: solution.weight)
@@ -255,7 +254,7 @@ def is_observable(low: Any, high: Any) -> Any:
 
 
 def open_ended(low: float, high: float) -> tuple[float, float | None]:
-    """An interval whose upper end may be open."""
+    """Return an interval, with None for an infinite upper end."""
     return low, high if math.isfinite(high) else None
 
 

@@ -19,17 +19,17 @@ _WIDTH = 100
 _MILLIMETRES_BELOW_M = 1.0
 _MEANINGS = {
     r"\bbent\b": "bent: errors are not Gaussian, trust range95 rather than s",
-    r"\brange\?": "range?: the readings do not tell the distance, s is widened to hold all of its 95 % set",
+    r"\brange\?": "range?: the readings do not determine the distance, s is widened to cover its 95 % set",
     r"\+\d+\(\d+%\)": "+1(95%): one other solution fits almost as well, the best one has 95 % of the probability",
-    r"\bmerged\b": "merged: two sources that the array does not tell apart",
+    r"\bmerged\b": "merged: two sources that the array cannot separate",
 }
 
 
 def lines_of_fixes(fixes: Fixes, *, joint: bool | None = None, most: int | None = None) -> list[str]:
     """Return aligned lines: a header, then one per source of the best solution of every fix.
 
-    Lengths are in mm if most positions are within a metre, else in m. `joint` adds the number of the source, by default
-    where some row has several; `most` keeps the first and the last rows.
+    Lengths are in mm if most positions are within a metre, otherwise in m. `joint` adds the number of the source; by
+    default it does if some row has several. `most` limits the lines to the first and the last rows.
     """
     shown = list(range(len(fixes)))
     if most is not None and len(shown) > most:
@@ -138,7 +138,7 @@ def cells_of_vector(values: FloatArray, sigma: FloatArray) -> list[str]:
 def _strengths(moment_Am2: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return moduli (...) of moments (..., 3) and their standard deviations.
 
-    0 for the mean of two that differ in sign.
+    They are 0 for the mean of two that differ in sign.
     """
     strength = np.linalg.norm(moment_Am2, axis=-1)
     spread = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1))
@@ -149,7 +149,7 @@ def _strengths(moment_Am2: FloatArray, covariance: FloatArray) -> tuple[FloatArr
 
 
 def _uncertainty_notes(observable: bool, described: bool) -> list[str]:
-    """Return notes on the standard deviations; for a misfit only that it is one."""
+    """Return notes on the standard deviations: an unknown range, or errors that are not Gaussian."""
     if not observable:
         return ["range?"]
     return [] if described else ["bent"]

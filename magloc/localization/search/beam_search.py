@@ -1,6 +1,6 @@
 """Beam search for several dipoles, one more source at a time, with random restarts.
 
-Everything works on b sets of readings of one :class:`magloc.measurement.whitened.WhitenedModel` at once.
+All functions work on b sets of readings of one :class:`magloc.measurement.whitened.WhitenedModel` at once.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ _SAME_RAD = 0.02
 _SAME_MOMENT = 0.05
 _SAME_CHI2 = 0.01
 _N_TEMPLATE_DIRECTIONS = 24
-# Rows that are scored by templates at once: their scores are many.
+# Rows that are scored by templates at once; each row has many scores.
 _ROWS_OF_TEMPLATES = 64
-# Starts for every fit that is to be extended by a source.
+# Starts of a new source for every fit.
 _MORE_STARTS = 4
 # A restart draws its new source from this many of the best candidates.
 _RESTART_CANDIDATES = 16
@@ -78,17 +78,17 @@ class BeamSearch:
     candidates : ndarray, shape (n, 4)
         Homogeneous coordinates of the positions to start from.
     allowed : callable
-        Whether sources (..., 4), (..., 3) agree with what is known.
+        Function of sources (..., 4), (..., 3): whether they agree with the prior.
     width : int
-        Fits kept of every set of readings.
+        Number of fits that are kept for every set of readings.
     within : float
-        How far above the best one the χ² of a fit of one source by moduli may be to be of use.
+        Largest rise of χ² above the best fit for useful fits of one source by moduli.
     n_starts : int
-        Starts of a restart for every fit that is kept; half as many again for the first source.
+        Number of starts of a restart for every kept fit; half as many again for the first source.
     apart_rad : float
         Least angle between two starts.
     bases : LastBases
-        Of the candidates.
+        Bases of the candidates.
     """
 
     candidates: FloatArray
@@ -150,9 +150,9 @@ class BeamSearch:
         return JointFits(found.q[:, :, None], found.mu[:, :, None], chi2, found.iterations).reshape(-1)
 
     def _needs_templates(self, problem: WhitenedModel, y: FloatArray) -> NDArray[np.bool_]:
-        """Return whether moduli are far from linear in rows (b,).
+        """Return in which rows (b,) moduli are far from linear.
 
-        The source's field is then not small against the ambient field.
+        There the field of the source is not small compared with the ambient field.
         """
         scalar = problem.channel_is_scalar
         ambient = np.linalg.norm(problem.ambient[:, problem.channel_sensor[scalar]], axis=-1)
@@ -175,7 +175,7 @@ class BeamSearch:
         direction = directions[np.take_along_axis(best, chosen, axis=1)]
         row = np.repeat(np.arange(len(y)), n_starts)
         at = problem.rows(row)
-        # The length of the moment, as if there were no ambient field.
+        # Moment without regard to the ambient field.
         fields = at.source_fields(q.reshape(-1, 1, 4), direction.reshape(-1, 1, 3))
         unit = at.without_ambient().predict(fields)
         length = np.sum(unit * y[row], axis=-1) / np.maximum(np.sum(unit * unit, axis=-1), 1e-300)
@@ -217,7 +217,7 @@ class BeamSearch:
     def add_source(self, problem: WhitenedModel, y: FloatArray, beam: JointFits, credible: float = 0.0) -> JointFits:
         """Return the beam with one more source, from candidates that explain most of the residual.
 
-        Where the first of them lead to a χ² that is credible, others are given up that will stay far above it.
+        If the first candidates reach a credible χ², fits that will stay far above it are stopped.
         """
         width = beam.chi2.shape[1]
         row = np.repeat(np.arange(len(y)), width)
@@ -247,7 +247,7 @@ class BeamSearch:
     ) -> JointFits:
         """Refine sources (f, K, …) with each of the chosen candidates (f, n) added.
 
-        `row` is that of every fit.
+        `row` is the row of every fit.
         """
         each = np.repeat(np.arange(len(q)), chosen.shape[1])
         at, y_each = problem.rows(row), y[row]

@@ -1,9 +1,9 @@
-r"""Candidate positions on a grid, scored by how much of the readings they explain.
+r"""Candidate positions on a grid, with scores of how much of the readings they explain.
 
-Where the channels are linear in the moment (vector sensors, and moduli in an ambient field that is large against the
-source's), a position is scored by the energy of the readings in the space of its three unit moments. Moduli without an
-ambient field are even in the moment and only linear in its length; there a pair of position and moment direction is
-scored by the energy along one template.
+Vector sensors are linear in the moment; moduli are nearly so if the ambient field is large compared with the field of
+the source. Then the score of a position is the energy of the readings in the space of its three unit moments. Moduli
+without an ambient field are even in the moment and linear only in its length. Then each pair of position and moment
+direction has a score, the energy along one template.
 """
 
 from __future__ import annotations
@@ -25,26 +25,24 @@ SingleArray = NDArray[np.float32]
 _SAME_GAIN = 0.02
 _APART_RAD, _LEAST_APART_RAD = 0.25, 0.075
 _CANDIDATES_AT_ONCE = 512
-# Squares of a candidate's unit moment, along one direction, that only missing channels see.
+# Smallest square of a candidate's unit moment, along one direction, in the available channels.
 _UNSEEN = 1e-7
-_ROWS_AT_ONCE = 64  # whose components stay in the processor's cache
-_LARGEST_SINGLE = 1e15  # of residuals in units of noise
+_ROWS_AT_ONCE = 64  # rows whose components fit into the processor's cache
+_LARGEST_SINGLE = 1e15  # largest residual, in units of noise, for single precision
 
 
 def linear_bases(problem: WhitenedModel, gain: FloatArray, row: int, candidates: FloatArray) -> SingleArray:
-    """Return whitened orthonormal bases (C, 3 n) of unit moments at candidates (n, 4).
+    """Return whitened orthonormal bases (C, 3 n) of unit moments at candidates (n, 4), for linear channels.
 
-    The channels are linear.
-
-    By moment axis, then by candidate, under the whitening of `row`; `gain` (C, 3) is in units of the noise. Single
-    precision ranks the candidates as well.
+    Columns are ordered by moment axis, then by candidate. The whitening is that of `row`; `gain` (C, 3) is in units of
+    the noise. Single precision is enough to rank candidates.
     """
     columns = problem.basis[row] * np.sqrt(problem.shrinkage[row])
     return candidate_bases(problem, gain, columns, candidates).reshape(gain.shape[0], -1)
 
 
 class LastBases:
-    """Cache of bases and templates of the same candidates, while the whitening stays."""
+    """Cache of bases and templates of the same candidates for the last whitening."""
 
     def __init__(self) -> None:
         self._kept: dict[str, tuple[bytes, SingleArray]] = {}
@@ -81,13 +79,12 @@ def linear_scores(bases: SingleArray, residual: FloatArray) -> FloatArray:
 
 
 def orthonormalisation_without(lost: SingleArray) -> SingleArray:
-    """Return factors (6, n) that make components orthonormal without some directions.
+    """Return factors (6, n) that make components orthonormal after some directions are removed.
 
-    The components are along :func:`linear_bases` Q.
-
-    These have the components `lost` (k, 3 n), B of every candidate. Those that are left, ``Qᵀ r`` of readings r without
-    these directions, are along an orthonormal basis again times the inverse of the lower Cholesky factor of
-    ``I - Bᵀ B``: its diagonal, then the rest row by row (6, n). A candidate that only they see explains nothing.
+    Components are ``Qᵀ r`` of readings r along :func:`linear_bases` Q. The removed directions have the components
+    `lost` (k, 3 n), B for each candidate. The remaining components, times the inverse of the lower Cholesky factor of
+    ``I - Bᵀ B``, are along an orthonormal basis again. The result has the diagonal of this inverse, then the rest row
+    by row. A candidate with a signal in the removed directions alone explains nothing.
     """
     x, y, z = lost.reshape(len(lost), 3, -1).astype(np.float64).swapaxes(0, 1)
     xx, yx, yy, zx, zy, zz = (-np.sum(a * b, axis=0) for a, b in ((x, x), (y, x), (y, y), (z, x), (z, y), (z, z)))
@@ -111,14 +108,14 @@ def best_candidates(
 ) -> NDArray[np.intp]:
     """Return :func:`distinct_best` of :func:`linear_scores` of residuals (b, C), compiled.
 
-    `orthonormal`: of residuals without some directions, :func:`orthonormalisation_without` these.
+    `orthonormal` is :func:`orthonormalisation_without` the directions that the residuals lack, if any.
     """
     chosen = np.zeros((len(residual), n_starts), dtype=np.intp)
-    # Rows are scaled, since single precision must hold their squares; the order of candidates stays.
+    # Scale rows so that single precision holds their squares; the ranking does not change.
     largest = np.abs(residual).max(axis=1, keepdims=True, initial=0.0)
     of_rows = (residual / np.where(largest > _LARGEST_SINGLE, largest, 1.0)).astype(np.float32)
     cos_apart = math.cos(apart_rad)
-    # One piece of memory for all: a new one is cleared by the system first, which takes as long as the choice.
+    # Reuse memory: the system clears new memory first, which takes as long as the choice.
     components = np.empty((min(_ROWS_AT_ONCE, len(residual)), bases.shape[1]), dtype=np.float32)
     for begin in range(0, len(residual), _ROWS_AT_ONCE):
         some = of_rows[begin : begin + _ROWS_AT_ONCE]
@@ -148,7 +145,7 @@ def rows_of_equal_gain(gain: FloatArray) -> Iterator[NDArray[np.intp]]:
 def modulus_templates(problem: WhitenedModel, row: int, candidates: FloatArray, directions: FloatArray) -> SingleArray:
     """Return unit templates (n, d, C) of moments along directions (d, 3) at candidates (n, 4).
 
-    Without ambient field all channels, moduli too, are proportional to the length of the moment.
+    Without an ambient field all channels, including moduli, are proportional to the length of the moment.
     """
     n_directions = len(directions)
     templates = np.empty((len(candidates), n_directions, problem.gain.shape[1]), dtype=np.float32)
@@ -199,9 +196,9 @@ def candidate_positions(
 ) -> FloatArray:
     """Return positions (n, 3) [m] that a search scores.
 
-    Directions times geometric ranges of 0.6 to 60 circumradii around the centroid, shells of 0.35, 0.7 and 1.4 times
-    the distance of the next sensor around every sensor, for sources close to a large array, and inner ones of 0.2 and
-    0.4 circumradii, where weak rows have optima.
+    Around the centroid they are directions times ranges from 0.6 to 60 circumradii, in geometric steps. Around each
+    sensor there are shells of 0.35, 0.7 and 1.4 times the distance to the next sensor, for sources close to a large
+    array. Inner shells of 0.2 and 0.4 circumradii serve weak rows, which have optima there.
     """
     shells = array.circumradius * np.asarray(ranges)
     outer = array.centroid + (shells[:, None, None] * fibonacci_directions(n_directions)).reshape(-1, 3)
@@ -217,7 +214,7 @@ def candidate_positions(
 def start_separation(array: SensorArray) -> float:
     """Return the least angle [rad] between two starts.
 
-    It is smaller where sensors are close together, since several starts must be near one.
+    It is smaller if sensors are close together, because several starts must be near one sensor.
     """
     apart = _APART_RAD * float(np.median(_to_next_sensor(array))) / array.circumradius
     return min(max(apart, _LEAST_APART_RAD), _APART_RAD)
@@ -237,12 +234,12 @@ def fine_positions(array: SensorArray) -> FloatArray:
 
 
 def allowed_positions(array: SensorArray, prior: SourcePrior, candidates: FloatArray | None = None) -> FloatArray:
-    """Return the candidates that a prior allows; ValueError if none.
+    """Return the candidates that a prior allows; raise ValueError if there are none.
 
-    By default :func:`candidate_positions`.
+    By default the candidates are :func:`candidate_positions`.
     """
     candidates = candidate_positions(array) if candidates is None else candidates
     allowed: FloatArray = candidates[prior.allows_position(candidates)]
     if not len(allowed):
-        raise ValueError("Input prior must leave some of the space around the array; instead it leaves nothing.")
+        raise ValueError("Input prior must allow positions around the array; instead it excludes all of them.")
     return allowed

@@ -17,16 +17,15 @@ from magloc.measurement.channels import problem
 from magloc.measurement.whitened import WhitenedModel
 
 SAME_COSINE, SAME_CHI2 = 0.99995, 0.01
-"""Two optima are one if their positions are 0.01 rad apart at most, and χ² is equal: those of the kernel."""
+"""Limits of the kernel for equal optima: cosine of the angle between positions (0.01 rad), and difference of χ²."""
 _ROWS_TO_CHOOSE_FOR = 512
 
 
 class LocalOptima(NamedTuple):
     """Distinct optima of rows, best first: q (rows, starts, 4), mu (…, 3), χ², iterations.
 
-    NaN and 0 fill the places behind them.
-
-    Counts (rows, 3) are the optima kept, the starts that did not converge, and all linearisations.
+    NaN and 0 fill unused places. Counts (rows, 3) are the kept optima, the starts that did not converge, and all
+    linearisations.
     """
 
     q: FloatArray
@@ -41,7 +40,7 @@ def candidate_bases(
 ) -> NDArray[np.float32]:
     """Return orthonormal readings (C, 3, n) of the unit moments at candidates q (n, 4).
 
-    The channels are linear ones with gains (C, 3), of which columns (C, c) are projected out.
+    Channels are linear with gains (C, 3), and columns (C, c) are projected out.
     """
     bases = np.empty((len(gain), 3, len(candidates)), dtype=np.float32)
     work = core.problem(
@@ -58,12 +57,10 @@ def candidate_bases(
 def choose_candidates(
     components: NDArray[np.float32], candidates: FloatArray, cosine: float, n_chosen: int
 ) -> NDArray[np.intp]:
-    """Return the candidates (rows, n_chosen) that explain most of each row, best first.
+    """Return the candidates (rows, n_chosen) that explain most of each row, best first, and some angle apart.
 
-    They are some angle apart.
-
-    Components (rows, 3, n) are those of the rows along the bases of the candidates (n, 4). Where too few candidates are
-    left, the first one is chosen again.
+    Components (rows, 3, n) are those of the rows along the bases of the candidates (n, 4). If too few candidates are
+    left, the first one is repeated.
     """
     chosen = np.empty((len(components), n_chosen), dtype=np.int64)
     work = core.problem(
@@ -94,17 +91,17 @@ def search_optima(
     ----------
     model : WhitenedModel
     signals : ndarray, shape (b, C + k)
-        :func:`magloc.measurement.channels.signals_of` readings; those of moduli above the ambient field's.
+        Readings from :func:`magloc.measurement.channels.signals_of`; moduli are relative to that of the ambient field.
     row : ndarray of int, shape (n,)
-        Readings that each set of starts belongs to.
+        Row of readings for each set of starts.
     starts : ndarray, shape (n, s, 4)
-        Positions.
+        Start positions.
     moments : ndarray, shape (n, s, 3), optional
-        Scaled moments about which moduli are linearised first.
+        Scaled moments about which moduli are first linearised.
     keep_within : float
-        Largest χ² above that of the best optimum.
+        Largest rise of χ² above the best optimum for optima that are kept.
     max_iterations : int
-        Linearisations of a start to near an optimum, and three times as many from there on.
+        Largest number of linearisations from a start to near an optimum; three times as many are allowed from there.
 
     Returns
     -------

@@ -9,7 +9,7 @@ from magloc.localization.search.candidates import distinct_best, rows_of_equal_g
 from magloc.measurement.known_moment import KnownMoment
 from magloc.measurement.whitened import WhitenedModel
 
-# σ of the modulus, over it, as far as a grid of candidates is coarse: beside the source another moment fits best.
+# Relative σ of the modulus by the pitch of the grid: at a candidate beside the source another moment fits best.
 _PITCH = 0.3
 
 
@@ -21,12 +21,10 @@ def starts_of_known_moment(
     n_starts: int,
     apart_rad: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return starts q (b, 2 n, 4) and μ (b, 2 n, 3) of one source.
+    """Return starts q (b, 2 n, 4) and μ (b, 2 n, 3) of one source for whitened readings (b, C) above the ambient field.
 
-    The whitened readings (b, C) are without ambient field.
-
-    Every candidate comes with two moments: the best one, and its mirror image across the axis that the readings see
-    least, which explains nearly as much. The channels are linearised about the ambient field.
+    Every candidate has two moments: the best one, and its mirror image across the axis about which the readings have
+    least information; it explains nearly as much. Channels are linearised about the ambient field.
     """
     gain = problem.linear_gain(np.zeros_like(problem.ambient))
     wide = known.widen(_PITCH)

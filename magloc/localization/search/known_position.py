@@ -1,8 +1,8 @@
 """Moments of dipoles at known positions, by any sensors (the paper's vector gradiometer).
 
-Differences of moduli without an ambient field are even in the moment: m and -m fit exactly alike, and three of them
-usually have four exact solutions. All of them are returned. A known ambient field makes the differences nearly linear
-in the moment, and the solution unique, equations (20) to (30).
+Differences of moduli without an ambient field are even in the moment: m and -m fit equally well, and three differences
+usually have four exact solutions. The search returns all of them. With a known ambient field the differences are nearly
+linear in the moment, and the solution is unique, equations (20) to (30).
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from magloc.measurement.whitened import WhitenedModel
 
 N_UNKNOWNS = 3
 _N_DIRECTIONS = 60
-# Up to the sign.
+# Number of distinct solutions up to the sign.
 _MOST_SOLUTIONS = 8
-# Rise of χ² halfway between two optima that makes them distinct.
+# Rise of χ² halfway between two optima above which they are distinct.
 _BARRIER = 0.01
 _TOO_LARGE = "the differences between the sensors do not determine a moment that is small enough"
 
@@ -35,10 +35,10 @@ class MomentSearch:
     Parameters
     ----------
     position_m : array_like, shape (3,), (n, 3) or (n, K, 3)
-        The source in the array's frame [m]: in all rows, or in every one of an array that moves; or several of them,
-        n is 1 for all rows.
+        Position of the source in the array's frame [m], for all rows or for each row of a moving array; or positions of
+        several sources. n is 1 for all rows.
     prior : SourcePrior
-        Of which only what it says of the moment is used.
+        Prior; only its parts about the moment are used.
 
     Raises
     ------
@@ -94,13 +94,13 @@ def _all_moments(problem: WhitenedModel, y: FloatArray, q: FloatArray) -> JointF
     n, n_sources = q.shape[:2]
     starts = [fit_moments(problem, y, q)[:, None]]
     if problem.channel_is_scalar.any():
-        # With several sources each start has other directions.
+        # With several sources each start combines other directions.
         directions = np.stack([np.roll(fibonacci_directions(_N_DIRECTIONS), 17 * k, 0) for k in range(n_sources)], 1)
         row = np.repeat(np.arange(n), _N_DIRECTIONS)
         alone = problem.rows(row).without_ambient()
         around = np.tile(directions, (n, 1, 1))
         unit = alone.predict(alone.source_fields(q[row], around))
-        # As long as the readings ask for if there were no ambient field: the scale of the moduli.
+        # Length that the readings require without an ambient field: the scale of the moduli.
         length = np.linalg.norm(y[row], axis=-1) / np.maximum(np.linalg.norm(unit, axis=-1), 1e-300)
         starts.append((length[:, None, None] * around).reshape(n, _N_DIRECTIONS, n_sources, 3))
     mu = np.concatenate(starts, axis=1)
@@ -134,10 +134,7 @@ def _distinct_optima(problem: WhitenedModel, y: FloatArray, q: FloatArray, fits:
 
 
 def _is_even(problem: WhitenedModel) -> NDArray[np.bool_]:
-    """Return whether readings (b,) stay if the moment is reversed.
-
-    So do moduli alone without an ambient field.
-    """
+    """Return which readings (b,) do not change with the sign of the moment: moduli alone without an ambient field."""
     silent = ~np.any(problem.gain, axis=-1)
     lone = problem.channel_is_scalar & ~np.any(problem.ambient, axis=-1)[:, problem.channel_sensor]
     return np.all(silent | lone, axis=-1)

@@ -1,7 +1,7 @@
 """Search for one source at rest from several rows of a moving array.
 
-A few scalar sensors do not locate a source in one row, but they do while they pass it. Every row keeps its own common
-field, so that what changes from row to row in the ambient field does not matter.
+A few scalar sensors do not locate a source in one row, but they do while they pass it. Every row has its own common
+field, so that changes of the ambient field between rows do not matter.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from magloc.measurement.whitened import WhitenedModel
 _N_DIRECTIONS = 200
 _N_RANGES = 10
 _WIDTH = 8
-# Linearisations of the errors of poses.
+# Number of linearisations of the errors of poses.
 _ROUNDS = 3
 _UNSEEN = "the rows together do not determine the source"
 
@@ -40,8 +40,8 @@ def optima_at_rest(
 
     `prior` bounds its position in the world frame.
 
-    `errors`, columns (b, C, n) in units of the noise for a source (6,), count as noise: they are linearised at the best
-    optimum, for a search of its own and then until they stay.
+    `errors` returns columns (b, C, n) in units of the noise for a source (6,), which count as noise. They are
+    linearised at the best optimum, first for a new search, then until they no longer change.
     """
     rows = rows.with_known_moment(prior.known_moment)
     optima = _search(rows, prior)
@@ -74,9 +74,9 @@ def _search(rows: WhitenedRows, prior: SourcePrior) -> Optima:
 def stacked_errors(
     poses: PosesOfRows, readings_T: FloatArray, ambient_T: FloatArray | None
 ) -> Callable[[FloatArray], FloatArray]:
-    """Return a function for the effect (1, C n, k) of pose errors on :func:`stacked_rows`.
+    """Return a function of a source for the effect (1, C n, k) of pose errors on :func:`stacked_rows`.
 
-    In units of the noise, for a source.
+    The effect is in units of the noise.
     """
     array = poses.array
     fields = ambient_fields(array, len(readings_T), ambient_T)
@@ -103,7 +103,7 @@ def stacked_rows(
     fields = ambient_fields(array, n, ambient_T)
     channels = channels_above_ambient(array, available, readings_T, fields)
     raw = np.concatenate([w.root @ row for w, row in zip(whitenings, channels, strict=True)])
-    # A vector channel reads a · Rᵀ B of the world's field B; a modulus does not see the turn.
+    # A vector channel reads a · Rᵀ B of the world's field B; a modulus does not depend on the attitude.
     turned = np.where(
         array.channel_is_scalar[:, None],
         array.channel_gain,

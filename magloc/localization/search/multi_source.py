@@ -1,11 +1,12 @@
 """Search for several dipoles by any sensors: their number and positions.
 
-One source is searched for, then another in what the first leaves, and so on; all sources are refined together and the
-best three distinct fits go on. A source is only added where it lowers χ² by more than a threshold: the larger one of
-the penalty of the Bayesian information criterion and of what noise alone reaches in one of a thousand sets of readings,
-drawn for the array at hand. A plain χ² test would not do, because without a source its position has no meaning, and the
-best of many positions is what is compared. While the best fit of the largest number of sources is not credible, random
-sources are replaced by others; in the end every source is left out in turn, and stays out where it is not missed.
+The search finds one source, then another in the residuals of the first, and so on. All sources are refined together,
+and the best three distinct fits are continued. A source is added only if it lowers χ² by more than a threshold. The
+threshold is the larger one of two values: the penalty of the Bayesian information criterion, and the decrease that
+noise alone reaches in one of a thousand rows, simulated for the array. A plain χ² test would be wrong, because the best
+of many positions is compared, and without a source its position has no meaning. While the best fit with the largest
+number of sources is not credible, random sources are replaced by others. At the end each source is removed in turn,
+and stays out if the fit is as good without it.
 """
 
 from __future__ import annotations
@@ -32,16 +33,16 @@ from magloc.measurement.rows import WhitenedRows, check_magnitudes, whitenings_o
 N_UNKNOWNS = 6
 _N_DRAWS = 5_000
 _MOST_RESTARTS = 20
-# What noise never lowers χ² by: with six degrees of freedom once in 10¹¹ places, of which an array has not a million.
+# Decrease of χ² that noise never reaches: with six degrees of freedom once in 10¹¹ places; an array has less than 10⁶.
 _BEYOND_NOISE = 60.0
-# Where removing a source costs so many times that, restarts find no fit without it.
+# If the removal of a source costs so many times that, restarts find no fit without it.
 _FAR_BEYOND = 10.0
-# Squared moment and squared offset, over their covariance, below which they are hardly significant.
+# Normalised squares of a moment and of an offset below which they are hardly significant.
 _FAINT = 40.0
 _NEAR = 150.0
 _MOST_BY_ITSELF = 5
 _NOT_CONVERGED = "the search did not converge to a solution within the known region and largest moment"
-NOISE_ALONE = "noise alone explains the readings: no source stands out of it"
+NOISE_ALONE = "noise alone explains the readings: no source is significant"
 
 
 def most_sources(n_differences: int) -> int:
@@ -59,7 +60,7 @@ class MultiSourceSearch:
     prior : SourcePrior
         Bounds that hold for every source.
     seed : int
-        Of random restarts and of the draws for the threshold.
+        Seed of random restarts and of the draws for the threshold.
 
     Raises
     ------
@@ -79,16 +80,16 @@ class MultiSourceSearch:
         whitening = whitenings_of(array, np.ones(array.n_channels, dtype=bool), np.zeros(array.n_channels))
         if whitening.n_differences < N_UNKNOWNS:
             raise ValueError(
-                f"Input array must give {N_UNKNOWNS} independent differences at least for a position and a moment;"
+                f"Input array must give at least {N_UNKNOWNS} independent differences for a position and a moment;"
                 f" instead it gives {whitening.n_differences}."
             )
-        # A single source may be exactly determined: no χ² to judge it by, but a solution.
+        # A single source may be exactly determined: a solution without a degree of freedom.
         most = max(1, most_sources(whitening.n_differences))
         if n_sources is not None and not 1 <= n_sources <= most:
             allowed = "1" if most == 1 else f"between 1 and {most}"
             raise ValueError(
-                f"Input n_sources must be {allowed}, as an array of {whitening.n_differences} independent differences"
-                f" can tell no more, with {N_UNKNOWNS} unknowns a source; instead received {n_sources}."
+                f"Input n_sources must be {allowed}: {whitening.n_differences} independent differences determine no"
+                f" more, with {N_UNKNOWNS} unknowns per source; instead received {n_sources}."
             )
         self.array = array
         self.n_sources = n_sources
@@ -121,7 +122,7 @@ class _Levels:
         self.rng = np.random.default_rng(locator.seed)
         self.penalty = N_UNKNOWNS * math.log(self.n_differences)
 
-        # A single source is listed with all its solutions, several ones with those of the beam.
+        # A single source has all its solutions in the result, several sources have those of the beam.
         self.search = BeamSearch(
             rows.model.homogeneous(locator._candidates),
             partial(locator.prior.allows, rows.model),
@@ -180,7 +181,7 @@ class _Levels:
             certain[at[unresolved & ~superfluous]] = True
         alone = np.zeros(len(self.y), dtype=bool)
         if self.asked is None and self.most > 1:
-            # Against the chosen number: a single source may have no fit where several ones stand out.
+            # Compare with the chosen number: a single source may have no fit if several are significant.
             chosen = np.array([beams[n].chi2[row, 0] for row, n in enumerate(level)])
             alone = weak | (np.isfinite(chosen) & ~self._stands_out(self.rows.energy, chosen))
         return [
@@ -219,7 +220,7 @@ class _Levels:
         return found
 
     def _is_weak(self) -> BoolArray:
-        """Return whether rows need no search for more: only noise is left."""
+        """Return which rows need no search for more sources, because only noise is left."""
         if self.asked is not None or self.most == 1:
             return np.zeros(len(self.y), dtype=bool)
         energy = self.rows.energy
@@ -229,9 +230,9 @@ class _Levels:
         return weak
 
     def _may_have_another(self, rows: IntArray, beam: JointFits) -> BoolArray:
-        """Return whether another source might pay.
+        """Return in which rows another source is worth a search.
 
-        χ² is suspicious, or a candidate explains much of the residual.
+        There χ² is suspicious, or a candidate explains much of the residual.
         """
         suspicious = ~(beam.chi2[:, 0] <= self._quantile(beam.n_sources, SUSPICIOUS_FIT))
         clean = np.flatnonzero(~suspicious)
@@ -260,10 +261,9 @@ class _Levels:
     def threshold(self) -> float:
         """Return the decrease of χ² that another source needs.
 
-        The larger one of BIC's penalty and of what noise reaches in one of a thousand rows.
-
-        Noise is drawn around the best fit of all rows; only the loudest draws, where a candidate explains most, are
-        searched for a second source: many more than stay above the threshold, as candidates stand far apart.
+        It is the larger one of BIC's penalty and of the decrease that noise reaches in one of a thousand rows. Noise is
+        drawn around the best fit of all rows. Only the draws of which a candidate explains most are searched for a
+        second source. These are many more than exceed the threshold, because the grid of candidates is coarse.
         """
         beam = self.one
         best = int(np.argmin(beam.chi2[:, 0]))
@@ -284,18 +284,19 @@ class _Levels:
         problem, draws = self.problem.rows(row[loud]), draws[loud]
         one = refine(problem, draws, q[np.zeros(loud.size, dtype=np.intp)], mu[np.zeros(loud.size, dtype=np.intp)])
         first = best_distinct(one, loud.size, 1)
-        with np.errstate(invalid="ignore"):  # where neither has converged
+        with np.errstate(invalid="ignore"):  # neither may have converged
             fall = first.chi2[:, 0] - search.add_source(problem, draws, first).chi2[:, 0]
         fall = np.sort(fall[np.isfinite(fall)])
-        # Another draw falls by more than the k-th largest of n with probability k / (n + 1).
+        # A new draw exceeds the k-th largest of n with probability k / (n + 1).
         k = int(FALSE_ALARM * (_N_DRAWS + 1))
         return max(self.penalty, float(fall[-k])) if fall.size >= k else self.penalty
 
     def _has_unresolved_pair(self, rows: IntArray, beam: JointFits) -> BoolArray:
         """Return whether the best fit has a pair of sources that cannot be resolved.
 
-        Its moment is not far from nothing, and its place not far from the other's, both by their own covariance. In
-        such a fit χ² has curved valleys and several optima, and the covariance of one of them says far too little.
+        One source of the pair has a moment near zero and a position near the other one, both in terms of their own
+        covariance. In such a fit χ² has curved valleys and several optima, and the covariance of one of them is far too
+        small.
         """
         fits = beam.rows((slice(None), 0))
         problem = self.problem.rows(rows)
@@ -309,7 +310,7 @@ class _Levels:
                 of_moment = covariance[:, i, 3:, i, 3:]
                 pair = [[covariance[:, a, :3, b, :3] for b in (i, j)] for a in (i, j)]
                 of_offset = pair[0][0] - pair[0][1] - pair[1][0] + pair[1][1]
-                faint = ~(normalised_square(moment[:, i], of_moment) >= _FAINT)  # nor is what has no covariance
+                faint = ~(normalised_square(moment[:, i], of_moment) >= _FAINT)  # NaN counts as faint too
                 near = ~(normalised_square(position[:, i] - position[:, j], of_offset) >= _NEAR)
                 unresolved |= faint & near
         return unresolved
@@ -323,9 +324,9 @@ class _Levels:
         certain: BoolArray,
         noise_alone: BoolArray,
     ) -> Optima:
-        """Return the listed optima of the rows with n + 1 sources.
+        """Return the optima of the rows with n + 1 sources.
 
-        `fewer`: whether that is fewer than were asked for, or seen.
+        `fewer` is True if that is less than the requested or the visible number of sources.
         """
         beam = beams[n].rows(rows)
         listed = np.isfinite(beam.chi2) & (beam.chi2 <= beam.chi2[:, :1] + DISTINCT_WITHIN)
@@ -347,10 +348,10 @@ class _Levels:
     def _closest_pair(
         self, q: FloatArray, mu: FloatArray, more: JointFits, row: int, certain: bool
     ) -> tuple[str, BoolArray]:
-        """Return why a row has fewer sources, and which one stands for the closest pair."""
+        """Return the reason why a row has fewer sources, and the source that represents the closest pair."""
         n = len(q)
         reason = f"the readings support {n} source{'s' if n > 1 else ''}"
-        reason += "" if self.asked is None else f", {self.asked} were asked for"
+        reason += "" if self.asked is None else f", {self.asked} were requested"
         nothing = np.zeros(n, dtype=bool)
         if not np.isfinite(more.chi2[row, 0]):
             return reason, nothing

@@ -1,8 +1,8 @@
 """Search for one dipole by vector sensors, without a start.
 
-The moment is eliminated (:mod:`magloc.localization.fit.refinement`), a grid of positions is scored by
-how much of the readings' energy they explain, the best distinct ones are refined by a damped Gauss-Newton iteration
-that only accepts steps which decrease χ², and every distinct optimum near the best one is returned.
+The moment is eliminated (:mod:`magloc.localization.fit.refinement`). Each position of a grid has a score: the share of
+the readings' energy that it explains. A damped Gauss-Newton iteration, which accepts only steps that decrease χ²,
+refines the best distinct positions. The result has every distinct optimum near the best one.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ from magloc.measurement.rows import WhitenedRows, channels_above_ambient, check_
 from magloc.measurement.whitened import WhitenedModel
 
 N_UNKNOWNS = 6
-_MORE = 3  # times the starts where none of them explains a row
+_MORE = 3  # factor on the number of starts if none of them explains a row
 # Largest share of missing channels for which candidates are ranked by the bases of all channels.
 _MOST_MISSING = 0.4
-# Singular value below which a direction of missing channels only sees the common field.
+# Singular value below which a direction of missing channels contains only the common field.
 _UNSEEN = 1e-3
 
 
@@ -50,10 +50,10 @@ class BestFits:
     Attributes
     ----------
     position_m, moment_Am2 : ndarray, shape (n, 3)
-        NaN where no start converged.
+        Position [m] and moment [A·m²]; NaN if no start converged.
     chi2 : ndarray, shape (n,)
     linearisations : ndarray of int, shape (n,)
-        Of all refinements together.
+        Number of linearisations of all refinements together.
     """
 
     position_m: FloatArray
@@ -66,8 +66,9 @@ class BestFits:
 class _Ranking:
     """Candidates and their bases (C, 3 n) under the whitening of a mask.
 
-    If few channels are missing, the whitening and the bases are those of all channels, and missing readings count as
-    unknown: `orthonormal` (6, n) makes the candidates' components orthonormal without the directions `lost` (C, k).
+    If few channels are missing, the whitening and the bases are those of all channels, and missing readings are
+    unknowns. Then `orthonormal` (6, n) makes the candidates' components orthonormal without the directions `lost`
+    (C, k).
     """
 
     whitening: Whitening
@@ -84,7 +85,7 @@ class _Ranking:
         seen = singular > _UNSEEN
         turned, touched = (left[:, seen] / singular[seen]).T @ unit, unit.any(axis=0)
         bases = turned[:, touched].astype(np.float32) @ self.bases[touched]
-        if not (shrinkage >= 1.0).all():  # bases are orthogonal to a common field that is unknown
+        if not (shrinkage >= 1.0).all():  # otherwise the bases are orthogonal to the unknown common field
             bases -= (turned @ basis * shrinkage).astype(np.float32) @ self.common
         return replace(self, lost=lost[seen].T, orthonormal=orthonormalisation_without(bases))
 
@@ -106,22 +107,22 @@ class SingleSourceSearch:
     Parameters
     ----------
     array : SensorArray
-        Vector sensors only.
+        Array of vector sensors only.
     n_starts : int
-        Distinct candidates that are refined; three times as many where none leads to a credible χ².
+        Number of distinct candidates that are refined; three times as many if none reaches a credible χ².
     apart_rad : float, optional
         Least distance of two candidates, as an angle of their homogeneous coordinates; by default that of
         :func:`start_separation`.
     max_iterations : int
-        Linearisations of one refinement to near an optimum at most, and three times as many from there on; a refinement
-        that needs more did not converge.
+        Largest number of linearisations of one refinement to near an optimum; three times as many are allowed from
+        there. A refinement that needs more has not converged.
     prior : SourcePrior
         Bounds of the source's position and moment.
 
     Raises
     ------
     ValueError
-        The array has scalar sensors, or the known region is out of its reach.
+        The array has scalar sensors, or the prior excludes all positions of the grid.
     """
 
     def __init__(
@@ -165,7 +166,7 @@ class SingleSourceSearch:
             found = self._apply_prior(rows.model, found)
         kept = found.counts[:, 0].tolist()
         of_row = np.arange(len(rows)).repeat(kept)
-        # Of a row alone a slice: a table of what is listed takes longer than all else here.
+        # A slice for a single row: the table would take longer than all the rest of this function.
         listed = np.s_[0, : kept[0]] if len(rows) == 1 else np.arange(found.chi2.shape[1]) < found.counts[:, :1]
         q, mu = found.q[listed], found.mu[listed]
         reason = [""] * len(rows)
@@ -177,7 +178,7 @@ class SingleSourceSearch:
     def optima_from(self, readings_T: ArrayLike, starts_m: ArrayLike) -> BestFits:
         """Return the best optimum of readings (C,) for every start (n, 3) [m].
 
-        Starts are refined beside the candidates, without prior.
+        Starts are refined in addition to the candidates, without a prior.
         """
         (rows,) = whitened_rows(self.array, np.asarray(readings_T, dtype=np.float64)[None], None, 1)
         first = rows.model.homogeneous(np.asarray(starts_m, dtype=np.float64))[:, None]
@@ -242,9 +243,9 @@ class SingleSourceSearch:
         )
 
 
-@lru_cache(maxsize=2)  # candidates' bases, which are large, take longer than a fix
+@lru_cache(maxsize=2)  # the bases of the candidates are large and take longer than a fix
 def cached_search(array: SensorArray) -> SingleSourceSearch:
-    """Return the cached search of a recent array without prior, for readings one by one."""
+    """Return the cached search of a recent array without a prior, for rows that are fitted one by one."""
     return SingleSourceSearch(array)
 
 

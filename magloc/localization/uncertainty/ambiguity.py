@@ -12,9 +12,9 @@ from magloc.levels import DELTA_CHI2_95
 from magloc.localization.uncertainty.range_interval import relative_range_sigma
 
 LARGEST_GAUSSIAN_SIGMA = 0.04
-"""Standard deviations of position and moment, over range and moment, up to which their errors are Gaussian."""
+"""Largest relative σ of position (over range) and of moment for Gaussian errors."""
 LARGEST_RISE_ERROR = 0.5
-"""Largest deviation from one of the rise of χ² at one standard deviation, for Gaussian errors."""
+"""Largest deviation from 1 of the rise of χ² at one standard deviation for Gaussian errors."""
 
 
 def log_evidence_volume(
@@ -22,11 +22,11 @@ def log_evidence_volume(
 ) -> FloatArray:
     r"""Return the log of the prior volume (...) that a solution represents, up to a constant.
 
-    Nothing is known beforehand of the scale: direction, orientation and the logarithms of range and moment are uniform,
-    a density :math:`\propto r^{-3} |m|^{-3}` of position and moment. By Laplace's method a solution then stands for the
-    root of the determinant of its covariance (..., 6 K, 6 K), or (..., 3, 3) of a moment alone, in units of r and |m|.
-    The logarithm of the range counts with a standard deviation of one at most: χ² is no parabola over more than that.
-    A known moment gives a scale: positions are then uniform in space, in units of any length.
+    The prior has no scale: direction, orientation and the logarithms of range and moment are uniform, which is a
+    density :math:`\propto r^{-3} |m|^{-3}` of position and moment. By Laplace's method the volume is the root of the
+    determinant of the covariance (..., 6 K, 6 K), or (..., 3, 3) of a moment alone, in units of r and |m|. The standard
+    deviation of the logarithm of the range is limited to 1, because χ² is not a parabola beyond. A known moment gives a
+    scale; positions are then uniform in space, in units of any length.
     """
     unit = _units(*([moment] if offset_m is None else [offset_m, moment]))
     if scale_m is not None and offset_m is not None:
@@ -55,7 +55,7 @@ def _units(*vectors: FloatArray) -> FloatArray:
 def weights(chi2: ArrayLike, volume: ArrayLike) -> FloatArray:
     r"""Return the weights of solutions (..., n), :math:`\propto V \exp(-\chi^2/2)`.
 
-    All are zero where no solution is.
+    All are zero if there is no solution.
     """
     values = np.asarray(volume, dtype=np.float64) - 0.5 * np.asarray(chi2, dtype=np.float64)
     best = values.max(axis=-1, keepdims=True)
@@ -84,13 +84,11 @@ def longest_axes(covariance: FloatArray, offset_m: FloatArray, moment: FloatArra
 def widen(
     covariance: FloatArray, offset_m: FloatArray, low_m: FloatArray, high_m: FloatArray, source: int = 0
 ) -> FloatArray:
-    """Return covariances (..., 6 K, 6 K) as long as the set of ranges of one source.
+    """Return covariances (..., 6 K, 6 K) that cover the set of ranges of one source, if it is not observable.
 
-    For ranges that are not observable.
-
-    The state follows the range along :math:`w = C e / e^T C e`, with e the gradient of the range: it is there that
-    variance is added. Given the range, all else is as certain as before. The 95 % interval then reaches the farther end
-    of the set; where that is open, σ of the range is no less than the range itself.
+    The state follows the range along :math:`w = C e / e^T C e`, with the gradient e of the range; variance is added in
+    this direction. Given the range, the uncertainty of all other quantities does not change. The 95 % interval then
+    reaches the farther end of the set. If the set is open, σ of the range is at least the range itself.
     """
     distance = np.linalg.norm(offset_m, axis=-1)
     farther = np.maximum(distance - low_m, high_m - distance) / math.sqrt(DELTA_CHI2_95)

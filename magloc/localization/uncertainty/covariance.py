@@ -1,8 +1,8 @@
 """Uncertainty of sources: covariances, sets of ranges, and weights of the solutions.
 
-Of a single source all solutions of a row are taken together (:mod:`magloc.localization.uncertainty.range_interval`).
-Several sources have no common range: each has its own ranges in each solution, where the profile of χ² stays within
-3.84 of that solution.
+The set of ranges of a single source covers all solutions of a row
+(:mod:`magloc.localization.uncertainty.range_interval`). Several sources have no common range. Each has its own set in
+each solution, in which the profile of χ² is within 3.84 of that solution.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from magloc.localization.uncertainty.range_interval import (
 )
 from magloc.localization.uncertainty.range_profile import profile_stretches, ranges_within
 
-# Linearisations that the profile of a fit takes, roughly.
+# Approximate number of linearisations for the profile of a fit.
 _LINEARISATIONS = 20
 
 
@@ -95,8 +95,9 @@ def solutions_of(optima: Optima, detected: BoolArray) -> Solutions:
 def covariance_is_valid(optima: Optima, covariance: FloatArray, which: IntArray) -> BoolArray:
     """Return whether covariances (f, 6 K, 6 K) describe the errors of some fits.
 
-    They do where χ² agrees with noise and rises by about one (0.5 to 1.5) at one standard deviation along the longest
-    axis, on both sides: not where the errors follow a curve. Without degrees of freedom χ² is not tested.
+    They do if χ² agrees with noise and rises by about one (0.5 to 1.5) at one standard deviation along the longest
+    axis, on both sides. The second condition fails for strongly nonlinear readings. Without degrees of freedom χ² is
+    not tested.
     """
     fits, of_row = optima.fits.rows(which), optima.of_row[which]
     problem, y = optima.rows.model.rows(of_row), optima.rows.y[of_row]
@@ -115,7 +116,7 @@ def covariance_is_valid(optima: Optima, covariance: FloatArray, which: IntArray)
 def fit_columns(optima: Optima, detected: BoolArray) -> _FitColumns:
     """Return the columns of fits at unknown positions.
 
-    The range of a single source comes from all solutions of its row together.
+    The set of ranges of a single source follows from all solutions of its row together.
     """
     rows, fits, of_row = optima.rows, optima.fits, optima.of_row
     model = rows.model.rows(of_row)
@@ -221,7 +222,7 @@ def _detection(n_differences: int, dof: int) -> tuple[float, FloatArray, FloatAr
 
 
 def _best_chi2(optima: Optima) -> FloatArray:
-    """Return χ² (b,) of the best fit of every row; infinite where there is none."""
+    """Return χ² (b,) of the best fit of every row; infinite if there is none."""
     best = np.full(len(optima.rows), np.inf)
     rows, first = np.unique(optima.of_row, return_index=True)
     best[rows] = optima.fits.chi2[first]
@@ -229,9 +230,9 @@ def _best_chi2(optima: Optima) -> FloatArray:
 
 
 def _noise_factor(optima: Optima) -> FloatArray:
-    """Return the factor (b,) of the noise variance: χ²/dof of rows that are misfits, else 1.
+    """Return the factor (b,) on the noise variance: χ²/dof for misfits, otherwise 1.
 
-    Residuals of a wrong model are no noise, but σ from the stated noise alone would be worse.
+    Residuals of a wrong model are not noise, but σ from the stated noise alone would be worse.
     """
     chi2 = _best_chi2(optima)
     return np.where(np.isfinite(chi2) & is_misfit(chi2, optima.dof), chi2 / max(optima.dof, 1), 1.0)
@@ -248,7 +249,7 @@ def _known_position_columns(optima: Optima, position_m: FloatArray) -> _FitColum
     covariance = moment_covariances(model.rows(of_row), rows.y[of_row], fits) * understated[:, None, None]
     told = np.where(np.isfinite(covariance).all(axis=(1, 2)), fits.chi2 / understated, np.inf)
     weight = _weights_of_rows(of_row, told, log_evidence_volume(covariance, moment))
-    # The readings of vector sensors are linear in the moment, those of moduli only over a small part of it.
+    # Readings of vector sensors are linear in the moment, moduli only over small changes of it.
     with np.errstate(invalid="ignore", divide="ignore"):
         variance = np.diagonal(covariance, axis1=1, axis2=2).reshape(moment.shape).sum(axis=2)
         sigma = np.sqrt(variance) / np.linalg.norm(moment, axis=2)

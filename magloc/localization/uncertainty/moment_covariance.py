@@ -14,9 +14,8 @@ _LEAST_EIGENVALUE = 1e-13
 def moment_covariances(problem: WhitenedModel, y: FloatArray, fits: JointFits) -> FloatArray:
     """Return the inverse of half the Hessian of χ² (b, 3 K, 3 K) [A·m²].
 
-    NaN where it is not positive definite.
-
-    Where two exact solutions are about to meet, the first derivative of the readings alone would say nothing.
+    It is NaN if the Hessian is not positive definite. Second derivatives are needed: where two exact solutions merge,
+    the first derivative of the readings vanishes along one direction.
     """
     if not len(problem):
         return np.empty((0, *2 * (3 * fits.n_sources,)))

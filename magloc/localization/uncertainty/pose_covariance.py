@@ -14,7 +14,7 @@ from magloc.readings import Readings
 def pose_covariances(uncertainty: PoseUncertainty, rows: Readings, solutions: Solutions) -> FloatArray:
     """Return covariances (F, n, n) by pose errors, to add to solutions moved to the world.
 
-    All sources of a row share the row's errors. Of a source at a known place the moment turns.
+    All sources of a row share the row's errors. For a source at a known position only the moment rotates.
     """
     added = np.zeros_like(solutions.covariance)
     if rows.pose is None:

@@ -1,9 +1,9 @@
 r"""Set of ranges that one row of readings allows.
 
-The 95 % set is where the profile of χ² over the range, all solutions together, is within a rise of its least value. It
-is followed as the angle :math:`\alpha = \mathrm{atan2}(s, |u|)` of homogeneous coordinates: π/2 at the sensors'
-centroid, 0 at infinity, and negative beyond it. The rise is 3.84 for a strong signal with one solution; several
-solutions raise it, and so do weak signals, given that they are detected: docs/theory/range-interval.md.
+In the 95 % set the profile of χ² over the range, all solutions together, is within a limit above its minimum. The
+coordinate of the range is the angle :math:`\alpha = \mathrm{atan2}(s, |u|)` of homogeneous coordinates: π/2 at the
+sensors' centroid, 0 at infinity, and negative beyond it. The limit is 3.84 for a strong signal with one solution. It is
+larger for several solutions, and for weak signals that are detected: docs/theory/range-interval.md.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from arrays.typing import FloatArray
 from magloc.chi_square import energy_threshold
 from magloc.levels import DELTA_CHI2_95
 
-# Signals so many standard deviations above the root of the threshold are always detected.
+# Standard deviations above the root of the threshold at which signals are always detected.
 _CERTAIN = 8.0
 _N_STRENGTHS = 1200
 OUTSIDE = 0.05
@@ -28,24 +28,21 @@ _N_BISECTIONS = 24
 
 
 def is_detected(energy: ArrayLike, n_differences: int) -> NDArray[np.bool_]:
-    """Return whether an energy is significant.
-
-    Noise alone reaches that in one of a thousand rows.
-    """
+    """Return whether an energy is significant; that of noise alone is in one of a thousand rows."""
     return np.asarray(np.asarray(energy) > energy_threshold(n_differences))
 
 
 def rise(energy: ArrayLike, chi2: ArrayLike, n_differences: int, level: ArrayLike = DELTA_CHI2_95) -> FloatArray:
     """Return the rise of the χ² profile over the best solution within the set of ranges.
 
-    The level of :func:`levels` for strong signals, more for weak ones; infinite where nothing is detected.
+    It is the level of :func:`levels` for strong signals, larger for weak ones, and infinite without a detection.
     """
     of_energy, wanted_rise = np.asarray(energy, dtype=np.float64), np.asarray(level, dtype=np.float64)
     explained = np.maximum(of_energy - np.asarray(chi2, dtype=np.float64), 0.0)
     strength, left = detection_statistic(n_differences)
     best = np.sqrt(explained)
     wanted = np.asarray(np.interp(best, strength, left)) + wanted_rise
-    # The table falls: turned round it gives the strength that leaves so much.
+    # The table decreases; reversed it gives the strength for a value.
     weakest = np.interp(wanted, left[::-1], strength[::-1])
     raised = explained - weakest * weakest
     raised = np.where(best > strength[-1], wanted_rise, np.maximum(raised, wanted_rise))
@@ -54,9 +51,9 @@ def rise(energy: ArrayLike, chi2: ArrayLike, n_differences: int, level: ArrayLik
 
 @lru_cache(maxsize=64)
 def detection_statistic(n_differences: int) -> tuple[FloatArray, FloatArray]:
-    """Return strengths a, and D(a) of the module's docstring.
+    """Return strengths a, and the statistic D(a) of docs/theory/range-interval.md.
 
-    D falls strictly, but for ties at the weakest.
+    D decreases strictly, except for ties at the weakest signals.
     """
     threshold = energy_threshold(n_differences)
     largest = np.sqrt(threshold) + _CERTAIN
@@ -102,10 +99,8 @@ def ranges_of(alpha: FloatArray, unit_m: float = 1.0) -> FloatArray:
 def gaussian_ranges(covariance: FloatArray, offset_m: FloatArray, unit_m: float) -> FloatArray:
     """Return 95 % intervals (..., 2) [m] of the range from a covariance, symmetric in α.
 
-    The covariance begins with the position.
-
-    χ² is nearly a parabola in α and not at all one in the range: so does the interval open where the source is far, to
-    0 and infinity.
+    The covariance begins with the position. χ² is nearly a parabola in α, but not in the range. For far sources the
+    interval is therefore open, to 0 or infinity.
     """
     alpha = np.arctan2(unit_m, np.linalg.norm(offset_m, axis=-1))
     sigma = np.sin(alpha) * np.cos(alpha) * relative_range_sigma(covariance, offset_m)
@@ -133,10 +128,7 @@ def union(ends: FloatArray) -> FloatArray:
 
 
 def relative_range_sigma(covariance: FloatArray, offset_m: FloatArray) -> FloatArray:
-    """Return σ of the range over the range, (...).
-
-    From covariances (..., n, n) and offsets (..., 3).
-    """
+    """Return the relative σ (...) of the range from covariances (..., n, n) and offsets (..., 3)."""
     with np.errstate(invalid="ignore", divide="ignore"):
         variance = np.einsum("...i,...ij,...j->...", offset_m, covariance[..., :3, :3], offset_m)
         sigma: FloatArray = np.sqrt(variance) / np.sum(offset_m * offset_m, axis=-1)

@@ -1,7 +1,7 @@
 r"""Profile of χ² over the range of a source, for any sensors; all else is fitted again.
 
-The range is followed as :math:`\alpha = \mathrm{atan2}(s, |u|)`: π/2 at the sensors' centroid, 0 at infinity, negative
-beyond it, on the other side.
+The coordinate of the range is :math:`\alpha = \mathrm{atan2}(s, |u|)`: π/2 at the sensors' centroid, 0 at infinity, and
+negative beyond it, on the other side.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from magloc.localization.uncertainty.range_interval import ranges_of, relative_r
 from magloc.measurement.whitened import WhitenedModel
 
 _SMALLEST_ALPHA = 1e-6
-# Steps outwards in standard deviations of a Gaussian profile, about the one where it would have risen enough.
+# Steps outwards, relative to the step at which a Gaussian profile would reach the limit.
 _STEPS = np.array([1.0, 1.5, 2.2, 4.0, 9.0, 25.0, 80.0])
 _ROUNDS = 3
 # Tolerance of χ² at a point of the profile.
@@ -33,8 +33,8 @@ def profile_stretches(
 ) -> FloatArray:
     """Return intervals (b, 2) of α of one source in which χ² stays within a rise (b,).
 
-    -π/2 and π/2 where χ² does not rise so much. The relative σ of the range as the covariance has it, NaN if unknown,
-    serves for the first steps.
+    The ends are -π/2 and π/2 if χ² does not rise so much. The relative σ of the range from the covariance, NaN if
+    unknown, sets the first steps.
     """
     n = len(y)
     if not n:
@@ -43,7 +43,7 @@ def profile_stretches(
     alpha = np.arctan2(np.abs(q[:, 3]), np.linalg.norm(q[:, :3], axis=-1))
     sigma = np.abs(np.nan_to_num(sigma_over_range, nan=1.0)) * np.sin(alpha) * np.cos(alpha)
     step = np.clip(np.sqrt(rise) * sigma, 1e-7, 0.05)
-    # Both sides at once: outwards, where α falls, for all fits, then inwards.
+    # Both sides at once: first outwards (decreasing α) for all fits, then inwards.
     rows = np.tile(np.arange(n), 2)
     sign = np.repeat([-1.0, 1.0], n)
     at_optimum, allowed = alpha[rows], rise[rows]
@@ -115,6 +115,6 @@ def _rises(
     free = np.ones((q.shape[1], 3), dtype=bool)
     free[source, 2] = False
     profile = refine(problem.rows(row), y[row], q, mu, free=free, max_iterations=100, promise=_PROMISE)
-    # A refinement that did not end says nothing of the profile: the points beyond it decide.
+    # A refinement that did not converge gives no value of the profile; the points beyond it decide.
     chi2 = np.where(profile.converged, profile.chi2, -np.inf)
     return np.asarray(chi2 - fits.chi2[row])

@@ -27,9 +27,9 @@ from magloc.surveying.fit.whitening import RecordWhitening, SurveyDrift
 _MOST_STEPS = 25
 _SETTLED, _DAMPING = 1e-3, 1e-3
 _UNKNOWN = 1e4  # standard deviation of a column of unit length
-_NEGLIGIBLE = 0.1  # of the noise
-_BESIDE_M, _BESIDE_SHARE = 0.1, 0.2  # errors of sources from other rows: of places, and of moments over their size
-_RIDGE = 1e-10  # of a parameter's own information: above rounding, so that few rows leave no matrix singular
+_NEGLIGIBLE = 0.1  # negligible effect, in units of the noise
+_BESIDE_M, _BESIDE_SHARE = 0.1, 0.2  # errors of sources from other rows: of positions [m], and relative, of moments
+_RIDGE = 1e-10  # share of a parameter's own information that is added, so that no matrix is singular for few rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +41,7 @@ class Sources:
 
     @classmethod
     def none(cls) -> Sources:
-        """Return no source."""
+        """Return an empty set of sources."""
         return cls(np.zeros((0, 3)), np.zeros((0, 3)))
 
     def __len__(self) -> int:
@@ -103,7 +103,7 @@ class Layer:
         return cls(grid, depth, field_T)
 
     def columns(self, record: SurveyRecord, directions: FloatArray, white: RecordWhitening) -> FloatArray:
-        """Return white columns (g·k, P): what poles of the expected strength add."""
+        """Return white columns (g·k, P): the readings of poles of the expected strength."""
         starts, owner = white.starts, record.array.channel_sensor
         # Poles are deep, so that the means of half a group replace its rows.
         halves = np.unique(np.concatenate([starts[:-1], (starts[:-1] + starts[1:]) // 2]))
@@ -149,9 +149,8 @@ class SurveyBackground:
     ) -> Iterator[SurveyBackground]:
         """Return a background for every way to group the rows (n,).
 
-        Pose errors act through the gradient of the sources' field; bodies are no points.
-
-        Sources ``beside``, whose field the record includes, have small errors of position and moment.
+        Pose errors act through the gradient of the sources' field, and bodies deviate from points. Sources ``beside``,
+        whose field the record includes, have small errors of position and moment.
         """
         beside = Sources.none() if beside is None else beside
         fields = sources.fields(record)
@@ -320,7 +319,7 @@ def source_jacobian(
 ) -> FloatArray:
     """Return the white derivative (g·k, 6 K), given the directions of the channels.
 
-    A direction is what a channel reads of a small change of the field.
+    A direction is the derivative of a channel by the field at its sensor.
     """
     rows = white.measured_rows(record, directions)
     return white.of_groups(rows.source_columns(sources.position_m, sources.moment_Am2))

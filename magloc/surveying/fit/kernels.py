@@ -13,7 +13,7 @@ from arrays.typing import FloatArray, IntArray
 from magloc import core
 
 _TERMS_A_BLOCK = 100_000
-"""Fields, or products of matrices' elements, that one call computes: about a millisecond."""
+"""Number of fields, or products of matrix elements, in one call, which takes about a millisecond."""
 
 
 class WhiteningFilter:
@@ -68,16 +68,16 @@ class WhiteningFilter:
 
 
 class MeasuredRows(NamedTuple):
-    """Measurement model of groups of rows: what a source adds to them.
+    """Measurement model of groups of rows, as a function of sources.
 
     Attributes
     ----------
     sensors_m : ndarray, shape (n, N, 3)
         Places of the sensors.
     directions : ndarray, shape (n, C, 3)
-        What channels read of a small change of the field.
+        Derivatives of the channels by the field at their sensors.
     U : ndarray, shape (k, C)
-        From channels to measurements.
+        Matrix from channels to measurements.
     channel_sensor : ndarray of int, shape (C,)
     first_row : ndarray of int, shape (g + 1,)
         First row of each group. A group's measurement is the sum over its rows, divided by the root of their number.

@@ -169,7 +169,7 @@ class SurveyRecord:
         in its carrier, and gains and axes of vector sensors. Tolles and Lawson's terms are among them.
         """
         R, owner = self.R_world_from_array, self.array.channel_sensor
-        by_field = directions @ R  # of a field in the array's axes
+        by_field = directions @ R  # derivative by a field in the array's axes
         body = np.einsum("nji,nj->ni", R, self.ambient_T)
         rate = np.gradient(body, self.time_s, axis=0)
         columns = []
@@ -210,11 +210,9 @@ class SurveyRecord:
     def by_turned_carrier(self, errors: PoseErrors, least_T: float) -> tuple[FloatArray, FloatArray]:
         """Return the effect (n, C, q) of attitude errors on the fields of the carrier.
 
-        Errors have unit variance.
-
-        The stated attitude gives the fields of the carrier. Each channel has one error with the correlation time of the
-        attitude, and one of the eddy currents that is new in every row, because their rate is a difference of
-        attitudes. Channels with effects below ``least_T`` have no column.
+        Errors have unit variance. The fields of the carrier follow from the stated attitude. Each channel has one error
+        with the correlation time of the attitude, and one of the eddy currents that is independent from row to row,
+        because their rate is a difference of attitudes. Channels with effects below ``least_T`` have no column.
         """
         turn = np.sqrt(np.sum(self.pose_effects[:, TURN, errors.is_changing] ** 2, axis=(1, 2)) / 3.0)
         body = np.einsum("nji,nj->ni", self.R_world_from_array, self.ambient_T)
@@ -238,10 +236,8 @@ class SurveyRecord:
     ) -> FloatArray:
         r"""Return the derivative (n, C, 5) of the channels by the pose's squared shift δ.
 
-        Its components have unit variance.
-
-        The effect :math:`δ^T \nabla\nabla B δ / 2` depends only on the traceless part of δδᵀ, whose 5 components have
-        the variance 2σ⁴. There are no columns if it is below ``least_T`` everywhere.
+        Components have unit variance. The effect :math:`δ^T \nabla\nabla B δ / 2` depends only on the traceless part of
+        δδᵀ, whose 5 components have the variance 2σ⁴. There are no columns if it is below ``least_T`` everywhere.
         """
         variance = np.sum(self.pose_effects[:, SHIFT] ** 2, axis=(1, 2)) / 3.0
         fields = np.zeros((*self.sensors_m.shape, 5))
@@ -257,9 +253,8 @@ class SurveyRecord:
     ) -> FloatArray:
         """Return the derivative (n, C, 14 K') of the channels by the extent of bodies.
 
-        The unit is one σ of the deviation from a dipole, for bodies of some length.
-
-        K' counts the sources with a deviation above ``least_T`` anywhere.
+        The unit is one σ of the deviation from a dipole, for bodies of some length. K' counts the sources with a
+        deviation above ``least_T`` anywhere.
         """
         columns = [np.zeros((*directions.shape[:2], 0))]
         for near, away, moment in self._curved_sources(position_m, moment_Am2, 0.05 * length_m**2, least_T):

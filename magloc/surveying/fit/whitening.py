@@ -74,32 +74,32 @@ class RecordWhitening:
     ) -> RecordWhitening:
         """Return the map for derivatives (n, C, q) of the channels by pose errors.
 
-        ``by_turn``: derivatives (n, C, ...) by attitude errors of the carrier's fields that last, and by those that are
-        new in every row. ``by_square``: derivative (n, C, 5) by squares of the shift, or none.
+        ``by_turn``: derivatives (n, C, ...) by lasting attitude errors of the carrier's fields, and by those that are
+        independent from row to row. ``by_square``: derivative (n, C, 5) by squares of the shift, or none.
         """
         U = independent_measurements(record)
         scale = np.sqrt(1.0 / np.bincount(group))
         time_s = np.bincount(group, record.time_s) * scale**2
         dt_s = np.diff(time_s, prepend=time_s[0])
         of_pose = errors.step(dt_s)[0]
-        lasting = of_pose[:, errors.of_pose == SHIFT.start][:, :1]  # of those with the stated correlation
+        lasting = of_pose[:, errors.of_pose == SHIFT.start][:, :1]  # errors with the stated correlation time
         more = (
             (by_turn[0], lasting),
             (by_turn[1], 0.0 * lasting),
             (by_square, lasting**2),
-        )  # a square lasts half as long
+        )  # the correlation time of a square is half as long
         of_pose = np.concatenate(
             [of_pose, *(np.repeat(share, columns.shape[2], axis=1) for columns, share in more)], axis=1
         )
         seen, white = U @ np.concatenate([by_pose, *by_turn, by_square], axis=2), (of_pose == 0.0).all(axis=0)
-        # Errors of rates count as alike in a group: central differences of successive rows share a step.
+        # Errors of rates count as equal in a group, because central differences of successive rows share a step.
         white[by_pose.shape[2] + by_turn[0].shape[2] :][: by_turn[1].shape[2]] = False
         seen = np.concatenate(
             [_sum_groups(seen[..., ~white], group, scale), _mean_covariance_roots(seen[..., white], group, scale)],
             axis=2,
         )
         C, q = record.array.n_channels, seen.shape[2]
-        # Offsets of the channels, and what is common to them: along the ambient field.
+        # Offsets of the channels, and their common part along the ambient field.
         H = np.zeros((len(time_s), len(U), q + C + 2))
         H[..., :q] = seen
         H[..., q : q + C] = U / scale[:, None, None]
@@ -199,7 +199,7 @@ def _sum_groups(rows: FloatArray, group: IntArray, scale: FloatArray) -> FloatAr
 def _mean_covariance_roots(rows: FloatArray, group: IntArray, scale: FloatArray) -> FloatArray:
     """Return roots (g, k, q) of the mean covariance of columns (n, k, q) in each group.
 
-    The columns' errors are new in every row.
+    The errors of the columns are independent from row to row.
     """
     if not rows.shape[2] or (len(scale) == len(rows) and rows.shape[2] <= rows.shape[1]):
         return rows[: len(scale)]

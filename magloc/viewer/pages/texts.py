@@ -99,7 +99,7 @@ def warning_lines(fix: Fix) -> list[str]:
     if fix.too_near:
         lines.append("<b>near</b>: the source is too near, or too large, for a dipole")
     if fix.solutions and any(source.merged for source in fix.best.sources):
-        lines.append("<b>merged</b>: two sources that the array does not tell apart")
+        lines.append("<b>merged</b>: two sources that the array cannot separate")
     lines += [f"sensor <b>{escape(name)}</b> contradicts all others and is not used" for name in fix.dropped_sensors]
     if fix.saturated_channels:
         lines.append(f"saturated, not used: {escape(', '.join(fix.saturated_channels))}")

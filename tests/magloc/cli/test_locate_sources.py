@@ -219,8 +219,8 @@ class TestSeveralSources:
         )
         for row in results_of(outcome):
             assert len(row["solutions"][0]["sources"]) == 2
-            assert "3 were asked for" in row["reason"]
-        assert "3 were asked for" in outcome.err
+            assert "3 were requested" in row["reason"]
+        assert "3 were requested" in outcome.err
 
     def test_noise_alone(self, run: Run, files: Files) -> None:
         command = files.write(vector_plate(), readings_of(vector_plate(), []))
@@ -319,7 +319,7 @@ class TestTurningArray:
         turns = Rotation.from_rotvec(np.radians([[0.0, 0.0, angle] for angle in (0.0, 40.0, 80.0)]))
         values = readings_of(array, [(PLACE * 0.7, MOMENT)], ambient=AMBIENT)
         command = files.write(array, values, pose=(np.zeros((3, 3)), turns))
-        assert_refused(run(*command), "ambient_nT", "turns")
+        assert_refused(run(*command), "ambient_nT", "rotates")
 
 
 class TestTooNear:

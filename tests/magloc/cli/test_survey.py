@@ -133,7 +133,7 @@ class TestSurvey:
         assert target["position_m"] == pytest.approx(expected["position_m"], abs=1e-3)
         (tmp_path / "short.csv").write_text("\n".join([*base[:100], ""]))
         assert_refused(
-            run("survey", tmp_path / "storm.csv", *line, "--base", tmp_path / "short.csv"), "--base must read"
+            run("survey", tmp_path / "storm.csv", *line, "--base", tmp_path / "short.csv"), "--base must cover"
         )
 
     def test_bad_input(self, folder: Path, run: Run) -> None:

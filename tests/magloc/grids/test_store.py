@@ -320,7 +320,7 @@ class TestRefused:
     def test_a_map_of_which_a_part_is_missing(self, waves, tmp_path):
         run(waves, tmp_path / "map.zarr")
         (tmp_path / "map.zarr/height/zarr.json").unlink()
-        with pytest.raises(InputError, match="a part is missing"):
+        with pytest.raises(InputError, match="incomplete map"):
             Sweep(waves, tmp_path / "map.zarr")
 
     def test_parts_that_are_missing_are_told_once(self, waves, tmp_path, caplog):

@@ -195,7 +195,7 @@ class TestFarFromTheArray:
             value, fixes = nees(case, None)
             assert fixes.body_length_m[0] == 0.0
             assert value < 3.0 * fixes.body_factor[0] ** 2 * max(1.0, (4.0 / lengths) ** 4)
-            assert value < 10.0 or "were it a body" in fixes.caution
+            assert value < 10.0 or "for a body" in fixes.caution
 
     def test_what_is_said_of_the_length_ends_it(self):
         case = cases(3.0, 1e-3, 1)[0]

@@ -21,9 +21,9 @@ ARRAY = tetrahedron(1.0)
     [
         (lambda by: tetrahedron(1.0, noise_T=1e-20 / by), "noise between"),
         (lambda by: tetrahedron(1.0, noise_T=1e3 * by), "noise between"),
-        (lambda by: replace(ARRAY, common_field_T=1e3 * by), "common field of 1e12 nT"),
-        (lambda by: replace(ARRAY, ambient_T=np.array([0.0, -1e3 * by, 0.0])), "ambient field of 1e12 nT"),
-        (lambda by: replace(ARRAY, noise_fraction=10.0 * by), "noise_fraction of 10"),
+        (lambda by: replace(ARRAY, common_field_T=1e3 * by), "common field of at most 1e12 nT"),
+        (lambda by: replace(ARRAY, ambient_T=np.array([0.0, -1e3 * by, 0.0])), "ambient field of at most 1e12 nT"),
+        (lambda by: replace(ARRAY, noise_fraction=10.0 * by), "noise_fraction of at most 10"),
     ],
 )
 @pytest.mark.parametrize("by", [1.0 - 1e-6, 1.0 + 1e-6])

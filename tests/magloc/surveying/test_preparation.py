@@ -35,7 +35,7 @@ class TestBaseStation:
         base_T[rows] -= 3e-7
         found = vary_with_base(self.AMBIENT_T, self.TIME_S, Readings(base_T[:, None], time_s=self.TIME_S))
         np.testing.assert_allclose(found, self.varying(self.TIME_S), rtol=0.0, atol=2e-9)
-        assert f"{len(rows)} readings of the base station leap" in caplog.text
+        assert f"readings of the base station: {len(rows)};" in caplog.text
 
     def test_a_long_gap_is_named(self, caplog: pytest.LogCaptureFixture) -> None:
         gap = self.TIME_S[(self.TIME_S < 20.0) | (self.TIME_S > 70.0)]

@@ -157,7 +157,7 @@ class TestHostileWorld:
         readings = simulated("survey-drone", 901).readings
         values = readings.values_T.copy()
         values[since:, 1] = values[since, 1]
-        found = self.check(replace(readings, values_T=values), caplog, "high sticks in")
+        found = self.check(replace(readings, values_T=values), caplog, "high is stuck in")
         assert (len(found), found.array.ids) == (2, ("low",))
 
     @pytest.mark.slow_after(1)
@@ -166,7 +166,7 @@ class TestHostileWorld:
         readings, rng = simulated("survey-drone", 901).readings, np.random.default_rng(11)
         values = readings.values_T
         wild = np.where(rng.random(values.shape) < share, 1e-6 * rng.standard_normal(values.shape), 0.0)
-        assert len(self.check(replace(readings, values_T=values + wild), caplog, "leap and come back")) == 2
+        assert len(self.check(replace(readings, values_T=values + wild), caplog, "spikes in the readings")) == 2
 
     def test_one_gap_in_the_places(self, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
         """6 s around the last turn without a position: the interpolated places cut the corner."""
@@ -177,7 +177,7 @@ class TestHostileWorld:
         turn = int(np.flatnonzero(np.diff(np.sign(np.diff(x_m))))[-1])
         table.loc[(table["time_s"] - table["time_s"][turn]).abs() < 3.0, list(POSITION_COLUMNS)] = np.nan
         table.to_csv(path, index=False)
-        assert len(self.check(magloc.read_readings(path, field.array), caplog, "have no whole place")) == 2
+        assert len(self.check(magloc.read_readings(path, field.array), caplog, "have no complete place")) == 2
 
     @pytest.mark.slow
     def test_more_noise_than_is_stated(self, caplog: pytest.LogCaptureFixture) -> None:
@@ -265,7 +265,7 @@ class TestBadInput:
         wild = places + np.outer(np.arange(len(places)) == 30, [1e6, 1e6, 0.0])
         with caplog.at_level(logging.WARNING):
             found = magloc.survey(field.array, replace(field.readings, array_position_m=wild))
-        assert "1 places leap and come back" in caplog.text
+        assert "spikes in the places: 1" in caplog.text
         assert (len(found), len(found.rows.time_s)) == (0, len(places) - 1)
 
     def test_few_rows(self) -> None:

@@ -80,7 +80,7 @@ class TestNotStated:
         for constant_T in (0.0, 200e-9):
             test = run(5, constant_T, stated=False)[1].innovations
             assert constant_T or not test.flagged  # right tracks are once in 1,000
-            assert "were it wrong by 300 nT" in test.caution
+            assert "if it is wrong by 300 nT" in test.caution
 
     def test_rows_that_see_it_say_so(self) -> None:
         """Errors of 500 nT, of which every second record or more sees enough."""

@@ -134,7 +134,7 @@ class TestOneSensor:
     def test_no_place_is_found(self):
         array = SensorArray((tetrahedron(1.5).sensors[0],), common_field_T=2e-9)
         for estimate in (magloc.locate, magloc.track):
-            with pytest.raises(ValueError, match="Input array must have two sensors at least where no place is known"):
+            with pytest.raises(ValueError, match="Input array must have at least two sensors if no position is known"):
                 estimate(array, np.full((2, 3), 1e-6))
 
 

@@ -141,7 +141,7 @@ class TestFalseAlarms:
         fixes = plain_locator(PLATE, sources="auto").fit_rows(noise)
         assert sum(bool(fix.solutions) for fix in fixes) <= self.most(n_rows)
         assert {fix.reason for fix in fixes if not fix.solutions} == {
-            "noise alone explains the readings: no source stands out of it"
+            "noise alone explains the readings: no source is significant"
         }
 
 
@@ -186,7 +186,7 @@ class TestNumberAsked:
     )
     def test_more_than_the_array_can_tell(self, array, n_sources, most):
         with pytest.raises(
-            ValueError, match=rf"n_sources must be (between 1 and )?{most}, .*; instead received {n_sources}"
+            ValueError, match=rf"n_sources must be (between 1 and )?{most}: .*; instead received {n_sources}"
         ):
             plain_locator(array, sources=n_sources)
 
@@ -196,7 +196,7 @@ class TestNumberAsked:
             assert n_differences - 6 * (most_sources(n_differences) + 1) < 1
 
     def test_too_small_an_array(self):
-        with pytest.raises(ValueError, match=r"must give 6 independent differences .* instead it gives 3"):
+        with pytest.raises(ValueError, match=r"must give at least 6 independent differences .* instead it gives 3"):
             plain_locator(SensorArray(PLATE.sensors[:2]), sources="auto")
 
 
@@ -216,7 +216,7 @@ class TestMergedSources:
         _, fix = self.fix(0.005, seed=seed)
         (source,) = fix.solutions[0].sources
         assert source.merged
-        assert fix.reason.startswith("the readings support 1 source, 2 were asked for")
+        assert fix.reason.startswith("the readings support 1 source, 2 were requested")
         assert "closer than the array resolves" in fix.reason
         assert_allclose(source.position_m, self.middle, atol=0.02)
         assert_allclose(source.moment_Am2, self.m.sum(axis=0), atol=0.5)
@@ -232,7 +232,7 @@ class TestMergedSources:
         assert_allclose(second.position_m, p[2], atol=0.02)
         assert first.merged
         assert not second.merged
-        assert fix.reason.startswith("the readings support 2 sources, 3 were asked for")
+        assert fix.reason.startswith("the readings support 2 sources, 3 were requested")
 
     def largest_error(self, p, fix):
         """Largest error of a component of two sources, in standard deviations."""
@@ -504,7 +504,7 @@ class TestKnowledge:
             assert "within the known region" in fix.reason
 
     def test_nothing_left_of_the_space_around(self):
-        with pytest.raises(ValueError, match="leaves nothing"):
+        with pytest.raises(ValueError, match="excludes all of them"):
             plain_locator(PLATE, prior=SourcePrior(low_m=(1e6, 1e6, 1e6)), sources="auto")
 
 

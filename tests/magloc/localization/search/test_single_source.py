@@ -212,7 +212,7 @@ class TestKnowledge:
             SourcePrior((1.0, 0.0, 0.0), (0.0, 1.0, 1.0))
         with pytest.raises(ValueError, match="must be positive"):
             SourcePrior(largest_moment_Am2=0.0)
-        with pytest.raises(ValueError, match="leaves nothing"):
+        with pytest.raises(ValueError, match="excludes all of them"):
             plain_locator(TETRAHEDRON, prior=SourcePrior(low_m=(1e6, 1e6, 1e6)))
 
 

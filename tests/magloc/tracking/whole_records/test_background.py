@@ -145,7 +145,7 @@ class TestTrack:
         filtered = magloc.Readings(said.background.taken_out(said.time_s, said.values_T), time_s=said.time_s)
         with caplog.at_level(logging.WARNING, logger="magloc"):
             fixes = magloc.locate(simulation.array, magloc.Readings(said.values_T, time_s=said.time_s).detrended())
-        assert "a row on its own has no background" in caplog.text
+        assert "fits of single rows do not model a background" in caplog.text
         np.testing.assert_array_equal(fixes.position_m, magloc.locate(simulation.array, filtered).position_m)
 
 
