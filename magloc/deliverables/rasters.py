@@ -107,7 +107,7 @@ def write_geotiff(path: Path, raster: Raster, frame: MapFrame, title: str, unit:
             width=n_columns,
             count=1,
             dtype="float32",
-            crs=frame.crs,
+            crs=frame.label,
             transform=Affine(raster.cell[0], 0.0, raster.corner[0], 0.0, -raster.cell[1], raster.corner[1]),
             nodata=np.nan,
             compress="deflate",

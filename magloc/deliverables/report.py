@@ -58,7 +58,7 @@ def report_html(found: Survey, frame: MapFrame, title: str, assumptions: Mapping
 
     body = [
         f"<h1>{escape(title)}</h1>",
-        f"<small>magloc {installed_version()}; coordinates: {escape(frame.crs)} ({escape(frame.system.name)})</small>",
+        f"<small>magloc {installed_version()}; coordinates: {escape(f'{frame.label} ({frame.system.name})')}</small>",
         "<h2>Survey</h2>",
         _table(("", ""), _survey_rows(found)),
         f"<h2>Targets ({len(found)})</h2>",
