@@ -206,7 +206,6 @@ def _files(found: Survey, frame: MapFrame | None, title: str, ground: GroundOpti
     yield "profiles.png", survey_profiles(found)
     if frame is not None:
         assumptions = {
-            "ground": f"{ground.ground_m:g} m above the origin of the world frame",
             "field of the ground": f"wavelengths above {ground.shortest_geology_m:g} m",
             "false targets": f"{ground.false_per_hectare:g} in a hectare on average",
             "size of targets": f"{ground.body_length_m:g} m" if ground.body_length_m else "points",

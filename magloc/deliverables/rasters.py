@@ -23,6 +23,7 @@ _FARTHEST = 1.0  # spacings from the nearest row: farther cells have no value
 _MOST_CELLS = 4_000_000
 _FLAT = 1e-3  # across over along a line
 _ROWS_PER_CELL = 2.0  # rows of one line that are used
+_DIGITS = 3  # of a cell's size in units of the map: corners become round numbers
 _STEPS = (1.0, 2.0, 5.0, 10.0)
 
 
@@ -58,7 +59,7 @@ def grid_rows(rows: SurveyRows, values: FloatArray, frame: MapFrame, cell_m: flo
     step_m = float(np.median(np.linalg.norm(np.diff(xy_m, axis=0), axis=1)))
     used = slice(None, None, max(1, int(cell_m / _ROWS_PER_CELL / step_m)) if step_m else 1)
     xy, values = frame.project(rows.place_m[used]), values[used]
-    cell = cell_m * frame.units_per_m
+    cell = np.array([float(f"{side:.{_DIGITS}g}") for side in cell_m * frame.units_per_m])
     low = np.floor(xy.min(axis=0) / cell) * cell
     n_columns, n_rows = (np.ceil((xy.max(axis=0) - low) / cell).astype(int) + 1).tolist()
     corner = np.array([low[0], low[1] + n_rows * cell[1]])

@@ -30,7 +30,7 @@ figcaption, small { color: #444; font-size: 9pt }
 """
 _MAPS = (
     "Anomaly along the ambient field, the remainder without the targets, and the least moment that is found with 95 %"
-    " at the shallowest and at the deepest level."
+    " at the shallowest and at the deepest level. White: no target is found there, however strong."
 )
 _PROFILES = "Readings along the line nearest to each target, and the fields of the targets."
 _FLAGS = {
@@ -52,12 +52,12 @@ def report_html(found: Survey, frame: MapFrame, title: str, assumptions: Mapping
         Coordinate system of the list of targets, and the origin of the survey's world frame.
     title : str
     assumptions : mapping of str
-        What was assumed, by names, such as the height of the ground.
+        What was assumed, by names, such as the size of targets.
     """
     from magloc.plots.profiles import survey_profiles
 
     body = [
-        f"<h1>{escape(title)}</h1>",
+        f"<h1>Survey of {escape(title)}</h1>",
         f"<small>magloc {installed_version()}; coordinates: {escape(f'{frame.label} ({frame.system.name})')}</small>",
         "<h2>Survey</h2>",
         _table(("", ""), _survey_rows(found)),
@@ -72,7 +72,7 @@ def report_html(found: Survey, frame: MapFrame, title: str, assumptions: Mapping
         _table(("depth", *(f"{moment:g} A·m²" for moment in _REACH_Am2)), _reach_rows(found), numbers=range(1, 6)),
         "<small>Share of the area in which a target of that moment is found with 95 %, whatever its direction.</small>",
         "<h2>Assumptions</h2>",
-        _table(("", ""), [*assumptions.items(), *_assumption_rows(found)]),
+        _table(("", ""), [_ground_row(found, frame), *assumptions.items(), *_assumption_rows(found)]),
     ]
     return (
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
@@ -89,7 +89,8 @@ def _survey_rows(found: Survey) -> Iterator[tuple[str, str]]:
     rate_Hz = 1.0 / float(np.median(np.diff(rows.time_s)))
     yield "array", f"{found.array.name or 'unnamed'}, {found.array.n_sensors} sensors"
     yield "rows", f"{len(rows.time_s)} at {rate_Hz:.3g} Hz, {(rows.time_s[-1] - rows.time_s[0]) / 60.0:.1f} min"
-    yield "lines", f"{len(lines)}, {step_m.sum():.0f} m in total, about {line_spacing(rows.place_m[:, :2]):.2g} m apart"
+    apart = f", about {line_spacing(rows.place_m[:, :2]):.2g} m apart" if len(lines) > 1 else ""
+    yield "lines", f"{len(lines)}, {step_m.sum():.0f} m in total{apart}"
     yield "speed", f"{np.mean(speeds):.2g} m/s ({min(speeds):.2g} to {max(speeds):.2g})"
     yield "height of the sensors above ground", f"{height.mean():.2f} m ({height.min():.2f} to {height.max():.2f})"
     rms_nT = 1e9 * float(rows.residual_T.std())
@@ -136,6 +137,13 @@ def _reach_rows(found: Survey) -> Iterator[tuple[str, ...]]:
     for depth in np.unique(depths):
         moments = found.reach.moment_Am2[depths == depth]
         yield f"{depth:g} m", *(f"{100.0 * np.mean(moments <= moment):.0f} %" for moment in _REACH_Am2)
+
+
+def _ground_row(found: Survey, frame: MapFrame) -> tuple[str, str]:
+    latitude, longitude, height = frame.origin
+    where = f"latitude {latitude:.7f}, longitude {longitude:.7f}, height {height:.2f} m"
+    side = "below" if found.ground_m < 0.0 else "above"
+    return "ground", f"flat, {abs(found.ground_m):g} m {side} the origin of the world frame ({where})"
 
 
 def _assumption_rows(found: Survey) -> Iterator[tuple[str, str]]:
