@@ -34,7 +34,8 @@ class TestReportHtml:
 
     def test_the_ground_is_below_the_origin(self, survey: magloc.Survey, frame: MapFrame) -> None:
         page = report_html(replace(survey, ground_m=-1.6), frame, "Meadow", {})
-        assert "flat, 1.6 m below the origin of the world frame (latitude 52.4100000, longitude 13.1200000" in page
+        assert "<td>origin</td><td>latitude 52.4100000, longitude 13.1200000, height 41.00 m</td>" in page
+        assert "<td>ground</td><td>flat, 1.6 m below the origin</td>" in page
 
     def test_a_single_line_has_no_spacing(self, survey: magloc.Survey, frame: MapFrame) -> None:
         """Six lines, and the first of them alone."""
