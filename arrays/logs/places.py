@@ -6,12 +6,12 @@ import numpy as np
 
 from arrays.columns import LogColumns
 from arrays.io.csv import Table
-from arrays.io.errors import InputError, of_extra
+from arrays.io.errors import InputError, naming, of_extra
+from arrays.logs.systems import area_words, coordinate_system, is_outside_area
 from arrays.typing import FloatArray
 
 _ENU_FROM_NED = ((0, 1, 0), (1, 0, 0), (0, 0, -1))
 _BODY_FROM_ARRAY = ((1, 0, 0), (0, -1, 0), (0, 0, -1))
-_RIM_deg = 1.0  # a system is of use a little beyond its area
 
 
 def positions(table: Table, columns: LogColumns, *, is_file: bool) -> FloatArray:
@@ -40,10 +40,12 @@ def geodetic_places(table: Table, columns: LogColumns, *, is_file: bool) -> Floa
     place = table.finite_or_missing(columns.place) if is_file else table.complete(columns.place)
     if columns.fix is not None:
         place[~np.isin(table.values[:, table.header.index(columns.fix.column)], columns.fix.equals)] = np.nan
-    if columns.geodetic is not None:
+    if columns.is_geodetic:
         place[(place[:, :2] == 0.0).all(axis=1)] = np.nan  # a receiver without a fix
     if columns.crs is not None:
         place[:, :2] = _latitudes_and_longitudes(table, columns, columns.crs, place[:, :2])
+    if columns.geodetic is not None:
+        _refuse_exchanged(table, columns.geodetic, place[:, 0])
     height = place[:, 2] if columns.height_m is None else np.full(len(place), columns.height_m)
     return np.column_stack([place[:, :2], height])
 
@@ -59,29 +61,35 @@ def array_origins(antenna_m: FloatArray, quaternion: FloatArray, columns: LogCol
 
 def _latitudes_and_longitudes(table: Table, columns: LogColumns, crs: str, place: FloatArray) -> FloatArray:
     """Return latitude and longitude (n, 2) [deg] of positions in a coordinate system."""
-    with of_extra("geo", "a system of coordinates (crs)"):
-        import pyproj
-    try:
-        system = pyproj.CRS.from_user_input(crs)
-    except pyproj.exceptions.CRSError:
-        expected = "one that PROJ knows, such as EPSG:32633"
-        raise InputError(f"{table.path}: found the system crs = {crs!r}, expected {expected}.") from None
+    with naming(table.path):
+        system = coordinate_system(crs)
     is_grid = columns.geodetic is None
     if not (system.is_projected if is_grid else system.is_geographic):
         kind, key = ("eastings and northings", "position") if is_grid else ("latitude and longitude", "geodetic")
         raise InputError(f"{table.path}: found {crs} ({system.name}), expected a system of {kind} for the key {key}.")
-    transformer = pyproj.Transformer.from_crs(system, "EPSG:4326", always_xy=True)
+    from pyproj import Transformer
+
+    transformer = Transformer.from_crs(system, "EPSG:4326", always_xy=True)
     known = np.isfinite(place).all(axis=1)
     longitude, latitude = transformer.transform(*(place if is_grid else place[:, ::-1])[known].T)
     found = np.full(place.shape, np.nan)
     found[known] = np.column_stack([latitude, longitude])
-    area = system.area_of_use
-    if area is not None:
-        low, high = np.array([area.south, area.west]) - _RIM_deg, np.array([area.north, area.east]) + _RIM_deg
-        outside = ~np.isnan(found) & ~((found >= low) & (found <= high))
-        fault = f"found a place outside the area of {crs} ({area.name}), expected one in it"
-        table.refuse(np.asarray(outside), columns.place[:2], fault)
+    outside = is_outside_area(system, *found.T)
+    if outside.any():
+        first = "latitude {:.4g}, longitude {:.4g}".format(*found[np.argmax(outside)])
+        area = f"the area of {crs} ({area_words(system)})"
+        fault = f"found a place outside {area}: {first}, expected one in it: correct crs, or exchange the columns"
+        table.refuse(outside[:, None], columns.place[:1], fault)
     return found
+
+
+def _refuse_exchanged(table: Table, names: tuple[str, ...], latitude_deg: FloatArray) -> None:
+    """Refuse columns of longitude and latitude in this order, by their names or by a latitude above 90 degrees."""
+    first, second = names[0].lower(), names[1].lower()
+    if ("lon" in first or "lng" in first) and "lat" in second:
+        raise InputError(f"{table.path}: found geodetic = {list(names[:2])}, expected latitude before longitude.")
+    fault = "found a latitude beyond 90 degrees, expected latitude before longitude in geodetic"
+    table.refuse((np.abs(latitude_deg) > 90.0)[:, None], names[:1], fault)
 
 
 def _refuse_no_origin(table: Table, place: FloatArray) -> None:

@@ -356,12 +356,12 @@ class MapOptions:
                 raise InputError(f"{option}: found no --place, expected the origin of the world frame with it.")
             refuse_unwritable(path, option)
 
-    def refuse_far(self, rows: Readings, name: str) -> None:
-        """Refuse, before long work, an array too far from the origin to be put on the Earth."""
+    def refuse_far(self, rows: Readings, name: str, *, always: bool = False) -> None:
+        """Refuse, before long work, an array too far from the origin to be put on the Earth, if a map needs it."""
         from arrays.io.world_maps import check_near
         from magloc.measurement.plausibility import farthest_place
 
-        if self != MapOptions():
+        if always or self != MapOptions():
             with naming(name):
                 check_near(farthest_place(rows))
 

@@ -117,12 +117,13 @@ def survey(
         raise InputError(f"--ground-m: found {ground.ground_m:g}, expected a finite number.")
     chosen = known.select(arrays.read_sensors(array), array)  # a survey works with one sensor
     used, known = known.on_earth(chosen, readings[0])
+    _note_ground(chosen, used, ground)
     maps.refuse(known.place)
     where = None if known.place is not None and known.date is None else known.where
     frame = _map_frame(used, known.place, crs)
     parts = [magloc.read_readings(path, used, sensors=known.ids, ordered=True) for path in readings]
     for path, part in zip(readings, parts, strict=True):
-        maps.refuse_far(part, str(path))
+        maps.refuse_far(part, str(path), always=out is not None and frame is not None)
     fields = [ambient_field(used, part, where) for part in parts]
     used, rows = fields[0][0], [replace(part, ambient_T=own) for part, (_, own) in zip(parts, fields, strict=True)]
     at_base = arrays.SensorArray((arrays.Sensor("base", "scalar", (0.0, 0.0, 0.0), 1e-10),))
@@ -170,7 +171,14 @@ def _map_frame(array: arrays.SensorArray, origin: Vector | None, crs: str | None
         return None
     own = None if array.columns is None else array.columns.crs
     with naming("--crs" if crs is not None else "--place"):
-        return MapFrame(origin, crs or own or WGS84)
+        return MapFrame(origin, crs if crs is not None else own or WGS84)
+
+
+def _note_ground(given: arrays.SensorArray, used: arrays.SensorArray, ground: GroundOptions) -> None:
+    """Name the height that the ground is stated above, where it is that of the log's first place."""
+    if given.columns == used.columns or used.columns is None or used.columns.above_ground:
+        return
+    note(f"note: --ground-m counts from the height of that place, negative below it: found {ground.ground_m:g} m")
 
 
 def _json_of_map(found: Survey, frame: MapFrame | None) -> dict[str, Any]:
@@ -182,7 +190,7 @@ def _json_of_map(found: Survey, frame: MapFrame | None) -> dict[str, Any]:
     columns = {name: list(values) for name, values in map_columns(found, frame).items()}
     places = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
     targets = [entry | place for entry, place in zip(found.entries, places, strict=True)]
-    return {"origin": list(frame.origin), "crs": frame.crs, "targets": targets}
+    return {"origin": list(frame.origin), "crs": frame.label, "targets": targets}
 
 
 def _files(found: Survey, frame: MapFrame | None, title: str, ground: GroundOptions) -> Iterator[tuple[str, Any]]:
@@ -198,7 +206,6 @@ def _files(found: Survey, frame: MapFrame | None, title: str, ground: GroundOpti
     yield "profiles.png", survey_profiles(found)
     if frame is not None:
         assumptions = {
-            "ground": f"{ground.ground_m:g} m above the origin of the world frame",
             "field of the ground": f"wavelengths above {ground.shortest_geology_m:g} m",
             "false targets": f"{ground.false_per_hectare:g} in a hectare on average",
             "size of targets": f"{ground.body_length_m:g} m" if ground.body_length_m else "points",

@@ -16,7 +16,7 @@ def geosoft_xyz(found: Survey, frame: MapFrame) -> str:
     height = frame.geodetic(rows.place_m)[:, 2]
     names = ("Longitude", "Latitude") if frame.is_geographic else ("X", "Y")
     digits = 9 if frame.is_geographic else 3
-    text = [f"/ coordinates: {frame.crs} ({frame.system.name})"]
+    text = [f"/ coordinates: {frame.label} ({frame.system.name})"]
     text.append(f"/{names[0]} {names[1]} Height_m Time_s Anomaly_nT Residual_nT")
     columns = np.column_stack([x, y, height, rows.time_s, 1e9 * rows.anomaly_T, 1e9 * rows.residual_T])
     form = f"%.{digits}f %.{digits}f %.3f %.3f %.3f %.3f"

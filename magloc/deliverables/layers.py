@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from arrays.io.errors import of_extra
+from arrays.io.errors import InputError, of_extra
 from arrays.typing import FloatArray
 from magloc.deliverables.flight_lines import flight_lines
 from magloc.deliverables.map_frame import MapFrame
@@ -57,7 +57,7 @@ def write_layers(path: Path, found: Survey, frame: MapFrame) -> None:
     Raises
     ------
     ValueError
-        The suffix is neither of these.
+        The suffix is neither of these, or the file cannot be written.
     """
     with of_extra("gis", _WHAT):
         from pyogrio.raw import write
@@ -66,23 +66,26 @@ def write_layers(path: Path, found: Survey, frame: MapFrame) -> None:
     if driver is None:
         raise ValueError(f"Input path must end with .gpkg or .shp; instead received {path.name!r}.")
     one_file = driver == "GPKG"
-    with TemporaryDirectory(dir=path.parent, prefix=f".{path.stem}.") as folder:
-        unfinished = Path(folder, path.name)
-        for number, layer in enumerate(survey_layers(found, frame)):
-            write(
-                str(unfinished if one_file or not number else unfinished.with_stem(f"{path.stem}_{layer.name}")),
-                layer.geometry,
-                list(layer.fields.values()),
-                list(layer.fields) if one_file else [_SHORT_NAMES.get(name, name) for name in layer.fields],
-                layer=layer.name if one_file else None,
-                driver=driver,
-                geometry_type=layer.kind,
-                crs=frame.crs,
-                append=one_file and number > 0,
-                encoding="UTF-8",
-            )
-        for file in Path(folder).iterdir():
-            file.replace(path.with_name(file.name))
+    try:
+        with TemporaryDirectory(dir=path.parent, prefix=f".{path.stem}.") as folder:
+            unfinished = Path(folder, path.name)
+            for number, layer in enumerate(survey_layers(found, frame)):
+                write(
+                    str(unfinished if one_file or not number else unfinished.with_stem(f"{path.stem}_{layer.name}")),
+                    layer.geometry,
+                    list(layer.fields.values()),
+                    list(layer.fields) if one_file else [_SHORT_NAMES.get(name, name) for name in layer.fields],
+                    layer=layer.name if one_file else None,
+                    driver=driver,
+                    geometry_type=layer.kind,
+                    crs=frame.label,
+                    append=one_file and number > 0,
+                    encoding="UTF-8",
+                )
+            for file in Path(folder).iterdir():
+                file.replace(path.with_name(file.name))
+    except (OSError, RuntimeError) as error:  # GDAL's own errors are RuntimeErrors
+        raise InputError(f"{path} cannot be written ({getattr(error, 'strerror', None) or error}).") from None
 
 
 def survey_layers(found: Survey, frame: MapFrame) -> Iterator[Layer]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from arrays.io.errors import of_extra
 from arrays.io.world_maps import check_near
+from arrays.logs.systems import area_words, coordinate_system, is_outside_area
 from arrays.typing import FloatArray, Vector
 
 if TYPE_CHECKING:
@@ -32,7 +33,7 @@ class MapFrame:
     Raises
     ------
     ValueError
-        PROJ does not know the system, or it is neither projected nor geographic.
+        PROJ does not know the system, it is neither projected nor geographic, or the origin is far outside its area.
 
     Examples
     --------
@@ -47,21 +48,28 @@ class MapFrame:
     crs: str = WGS84
 
     def __post_init__(self) -> None:
-        if not (self.system.is_projected or self.system.is_geographic):
-            received = f"{self.crs!r} ({self.system.name})"
+        system = self.system
+        if not (system.is_projected or system.is_geographic):
+            received = f"{self.crs!r} ({system.name})"
             raise ValueError(f"Input crs must be a projected or geographic system; instead received {received}.")
+        latitude, longitude, _ = self.origin
+        if is_outside_area(system, np.array([latitude]), np.array([longitude])).any():
+            place = f"latitude {latitude:.4g}, longitude {longitude:.4g}"
+            received = f"{self.crs!r} ({system.name}: {area_words(system)})"
+            raise ValueError(f"Input crs must be a system for {place}; instead received {received}.")
 
     @cached_property
     def system(self) -> pyproj.CRS:
-        """System of coordinates as PROJ describes it."""
-        with of_extra("geo", "a system of coordinates"):
-            import pyproj
-        try:
-            return pyproj.CRS.from_user_input(self.crs)
-        except pyproj.exceptions.CRSError:
-            raise ValueError(
-                f"Input crs must be a system that PROJ knows, such as EPSG:32633; instead received {self.crs!r}."
-            ) from None
+        """System of coordinates as PROJ describes it; of one with heights the horizontal part."""
+        system = coordinate_system(self.crs)
+        parts = system.sub_crs_list if system.is_compound else [system]
+        return parts[0].to_2d()
+
+    @cached_property
+    def label(self) -> str:
+        """Name of the system by its authority, such as "EPSG:32633"; without one the system as it was named."""
+        authority = self.system.to_authority(min_confidence=100)
+        return ":".join(authority) if authority else self.crs
 
     @property
     def is_geographic(self) -> bool:

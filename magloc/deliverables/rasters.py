@@ -23,6 +23,7 @@ _FARTHEST = 1.0  # Cells farther from the nearest row, in spacings of lines, hav
 _MOST_CELLS = 4_000_000
 _FLAT = 1e-3  # A single line extends less across than this share of its length.
 _ROWS_PER_CELL = 2.0  # rows of one line that are used for each cell
+_DIGITS = 3  # of the size of a cell in units of the map, so that corners are round numbers
 _STEPS = (1.0, 2.0, 5.0, 10.0)
 
 
@@ -59,7 +60,7 @@ def grid_rows(rows: SurveyRows, values: FloatArray, frame: MapFrame, cell_m: flo
     step_m = float(np.median(np.linalg.norm(np.diff(xy_m, axis=0), axis=1)))
     used = slice(None, None, max(1, int(cell_m / _ROWS_PER_CELL / step_m)) if step_m else 1)
     xy, values = frame.project(rows.place_m[used]), values[used]
-    cell = cell_m * frame.units_per_m
+    cell = np.array([float(f"{side:.{_DIGITS}g}") for side in cell_m * frame.units_per_m])
     low = np.floor(xy.min(axis=0) / cell) * cell
     n_columns, n_rows = (np.ceil((xy.max(axis=0) - low) / cell).astype(int) + 1).tolist()
     corner = np.array([low[0], low[1] + n_rows * cell[1]])
@@ -108,7 +109,7 @@ def write_geotiff(path: Path, raster: Raster, frame: MapFrame, title: str, unit:
             width=n_columns,
             count=1,
             dtype="float32",
-            crs=frame.crs,
+            crs=frame.label,
             transform=Affine(raster.cell[0], 0.0, raster.corner[0], 0.0, -raster.cell[1], raster.corner[1]),
             nodata=np.nan,
             compress="deflate",

@@ -26,13 +26,17 @@ h1 { font-size: 19pt; margin: 0 0 2mm } h2 { font-size: 13pt; margin: 7mm 0 2mm;
 table { border-collapse: collapse; width: 100%; font-size: 9pt } th { text-align: left; border-bottom: 1px solid #111 }
 td, th { padding: 0.8mm 1.5mm; vertical-align: top } tr { break-inside: avoid } td.n, th.n { text-align: right }
 tr:nth-child(even) td { background: #f3f3f3 } figure { margin: 2mm 0; break-inside: avoid } img { width: 100% }
+td:first-child { white-space: nowrap }
 figcaption, small { color: #444; font-size: 9pt }
 """
 _MAPS = (
     "Anomaly along the ambient field, the remainder without the targets, and the least moment that is found with 95 %"
-    " at the shallowest and at the deepest level."
+    " at the shallowest and at the deepest level. White: no target is found there, however strong."
 )
-_PROFILES = "Readings along the line nearest to each target, and the fields of the targets."
+_PROFILES = (
+    "Readings along the line nearest to each target, and the fields of the targets. Slow differences are the field of"
+    " the ground."
+)
 _FLAGS = {
     "weak": "the depth interval holds, the ellipse does not",
     "near": "another target is so near that one of the two may be spurious",
@@ -57,8 +61,8 @@ def report_html(found: Survey, frame: MapFrame, title: str, assumptions: Mapping
     from magloc.plots.profiles import survey_profiles
 
     body = [
-        f"<h1>{escape(title)}</h1>",
-        f"<small>magloc {installed_version()}; coordinates: {escape(frame.crs)} ({escape(frame.system.name)})</small>",
+        f"<h1>Survey of {escape(title)}</h1>",
+        f"<small>magloc {installed_version()}; coordinates: {escape(f'{frame.label} ({frame.system.name})')}</small>",
         "<h2>Survey</h2>",
         _table(("", ""), _survey_rows(found)),
         f"<h2>Targets ({len(found)})</h2>",
@@ -72,7 +76,7 @@ def report_html(found: Survey, frame: MapFrame, title: str, assumptions: Mapping
         _table(("depth", *(f"{moment:g} A·m²" for moment in _REACH_Am2)), _reach_rows(found), numbers=range(1, 6)),
         "<small>Share of the area in which a target of that moment is found with 95 %, whatever its direction.</small>",
         "<h2>Assumptions</h2>",
-        _table(("", ""), [*assumptions.items(), *_assumption_rows(found)]),
+        _table(("", ""), [*_ground_rows(found, frame), *assumptions.items(), *_assumption_rows(found)]),
     ]
     return (
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
@@ -87,9 +91,10 @@ def _survey_rows(found: Survey) -> Iterator[tuple[str, str]]:
     height = rows.place_m[:, 2] - found.ground_m
     speeds = [line.speed_m_s for line in lines] or [0.0]
     rate_Hz = 1.0 / float(np.median(np.diff(rows.time_s)))
-    yield "array", f"{found.array.name or 'unnamed'}, {found.array.n_sensors} sensors"
+    yield "array", ", ".join(filter(None, (found.array.name, _count(found.array.n_sensors, "sensor"))))
     yield "rows", f"{len(rows.time_s)} at {rate_Hz:.3g} Hz, {(rows.time_s[-1] - rows.time_s[0]) / 60.0:.1f} min"
-    yield "lines", f"{len(lines)}, {step_m.sum():.0f} m in total, about {line_spacing(rows.place_m[:, :2]):.2g} m apart"
+    apart = f", about {line_spacing(rows.place_m[:, :2]):.2g} m apart" if len(lines) > 1 else ""
+    yield "lines", f"{len(lines)}, {step_m.sum():.0f} m in total{apart}"
     yield "speed", f"{np.mean(speeds):.2g} m/s ({min(speeds):.2g} to {max(speeds):.2g})"
     yield "height of the sensors above ground", f"{height.mean():.2f} m ({height.min():.2f} to {height.max():.2f})"
     rms_nT = 1e9 * float(rows.residual_T.std())
@@ -136,6 +141,17 @@ def _reach_rows(found: Survey) -> Iterator[tuple[str, ...]]:
     for depth in np.unique(depths):
         moments = found.reach.moment_Am2[depths == depth]
         yield f"{depth:g} m", *(f"{100.0 * np.mean(moments <= moment):.0f} %" for moment in _REACH_Am2)
+
+
+def _ground_rows(found: Survey, frame: MapFrame) -> Iterator[tuple[str, str]]:
+    latitude, longitude, height = frame.origin
+    yield "origin", f"latitude {latitude:.7f}, longitude {longitude:.7f}, height {height:.2f} m"
+    side = "below" if found.ground_m < 0.0 else "above"
+    yield "ground", f"flat, {abs(found.ground_m):g} m {side} the origin" if found.ground_m else "flat, at the origin"
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'s' if number != 1 else ''}"
 
 
 def _assumption_rows(found: Survey) -> Iterator[tuple[str, str]]:

@@ -41,7 +41,7 @@ def positions(place: FloatArray, **columns: object) -> FloatArray:
     names = ("E", "N", "H")[: place.shape[1]]
     said = {"sensors": {"a": "Mag"}, "origin": ORIGIN} | columns
     if "geodetic" not in said:
-        said |= {"position": names}
+        said.setdefault("position", names)
     rows = "".join(f"{k},1,{','.join(map(repr, row))}\n" for k, row in enumerate(place.tolist()))
     form = LogFormat({"a": ["a_nT"]}, LogColumns(**said), "a header", ())  # type: ignore[arg-type]
     table: Table = form.table(f"time_s,Mag,{','.join(names)}\n{rows}", "log.csv")
@@ -92,7 +92,12 @@ class TestGrids:
     @pytest.mark.parametrize(
         ("columns", "words"),
         [
-            ({"crs": "EPSG:99999"}, "found the system crs = 'EPSG:99999', expected one that PROJ knows"),
+            ({"crs": "EPSG:99999"}, "crs must be a system that PROJ knows.*'EPSG:99999'"),
+            ({"crs": "EPSG:5773"}, r"found EPSG:5773 \(EGM96 height\), expected a system of eastings"),
+            (
+                {"crs": "EPSG:32633", "position": ("N", "E", "H")},
+                "longitude 12 to 18.*latitude 2.*exchange the columns",
+            ),
             ({"crs": "EPSG:4326"}, r"found EPSG:4326 \(WGS 84\), expected a system of eastings and northings"),
             ({"crs": "EPSG:32633", "origin": None}, r"origin = \[52\.4\d+, 13\.1\d+, 0\.0\] in the table columns"),
             ({"crs": "EPSG:27700"}, "line 2, column E: found a place outside the area of EPSG:27700"),
@@ -104,3 +109,25 @@ class TestGrids:
         grid = np.column_stack([utm_33(*place[:, :2].T), place[:, 2]])
         with pytest.raises(InputError, match=words):
             positions(grid, **columns)
+
+    def test_zeros_are_no_place(self, true_m: FloatArray) -> None:
+        """A receiver without a fix writes them."""
+        grid = utm_33(*geodetic(true_m)[:, :2].T)
+        grid[:3] = 0.0
+        found = positions(grid, crs="EPSG:32633", height_m=0.4)
+        np.testing.assert_array_equal(np.isnan(found).any(axis=1), np.arange(len(grid)) < 3)
+
+    @pytest.mark.parametrize(
+        ("names", "place", "words"),
+        [
+            (("E", "N", "H"), (151.2, -33.0, 0.0), "column E: found a latitude beyond 90 degrees"),
+            (("Lon", "Lat", "H"), (13.1, 52.4, 0.0), r"\['Lon', 'Lat'\], expected latitude before longitude"),
+        ],
+    )
+    def test_latitude_and_longitude_exchanged(
+        self, names: tuple[str, ...], place: tuple[float, ...], words: str
+    ) -> None:
+        columns = LogColumns(sensors={"a": "Mag"}, origin=ORIGIN, geodetic=names)
+        text = f"time_s,Mag,{','.join(names)}\n0,1,{','.join(map(repr, place))}\n"
+        with pytest.raises(InputError, match=words):
+            LogFormat({"a": ["a_nT"]}, columns, "a header", ()).table(text, "log.csv")

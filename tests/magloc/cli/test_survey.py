@@ -255,3 +255,19 @@ class TestMaps:
     def test_a_system_without_a_place(self, folder: Path, run: Run) -> None:
         outcome = run("survey", folder / "ground.csv", "--array", folder / "ground-array.toml", "--crs", "EPSG:3857")
         assert_refused(outcome, "--crs", "--place")
+
+    def test_a_system_of_another_continent(self, log: Path, run: Run, tmp_path: Path) -> None:
+        line = ("survey", log, "--array", log.with_name("array.toml"), "--out", tmp_path / "out", "--quiet")
+        assert_refused(run(*line, "--crs", "EPSG:32610"), "--crs", "longitude -126 to -120")
+        assert not (tmp_path / "out").exists()
+
+    def test_an_origin_far_away(self, log: Path, run: Run, tmp_path: Path) -> None:
+        """A map there has no digits left; the sentence comes before the work."""
+        line = ("survey", log, "--array", log.with_name("array.toml"), "--out", tmp_path / "out", "--quiet")
+        assert_refused(run(*line, "--place", 48, 11, 0), "within 100 km", "513")
+        assert not (tmp_path / "out").exists()
+
+    def test_the_ground_counts_from_the_first_place(self, log: Path, run: Run) -> None:
+        outcome = run("survey", log, "--array", log.with_name("array.toml"))
+        assert outcome.status == 2
+        assert "--ground-m counts from the height of that place, negative below it" in outcome.err

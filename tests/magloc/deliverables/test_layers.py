@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 import magloc
+from arrays.io.errors import InputError
 from magloc.deliverables.layers import survey_layers, write_layers
 from magloc.deliverables.map_frame import MapFrame
 
@@ -99,3 +100,10 @@ class TestFiles:
         write_layers(tmp_path / "none.gpkg", replace(survey, targets=()), frame)
         assert len(read(tmp_path / "none.gpkg", "targets")[1]) == 0
         assert {layer.name for layer in survey_layers(survey, frame)} == {"targets", "ellipses", "lines", "reach"}
+
+    def test_a_file_that_cannot_be_written(self, survey: magloc.Survey, frame: MapFrame, tmp_path: Path) -> None:
+        """One sentence, and nothing stays behind."""
+        (tmp_path / "targets.gpkg").mkdir()
+        with pytest.raises(InputError, match=r"targets\.gpkg cannot be written \(Is a directory\)"):
+            write_layers(tmp_path / "targets.gpkg", survey, frame)
+        assert [path.name for path in tmp_path.iterdir()] == ["targets.gpkg"]

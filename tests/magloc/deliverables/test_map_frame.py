@@ -51,3 +51,20 @@ class TestBadInput:
     def test_a_geocentric_system(self) -> None:
         with pytest.raises(ValueError, match=r"projected or geographic.*WGS 84"):
             MapFrame(ORIGIN, "EPSG:4978")
+
+    def test_origin_outside_the_area(self) -> None:
+        """Zone 10 lies in America; zone 32 serves all of Germany."""
+        with pytest.raises(ValueError, match=r"a system for latitude 52\.41.*longitude -126 to -120"):
+            MapFrame(ORIGIN, "EPSG:32610")
+        MapFrame(ORIGIN, "EPSG:25832")
+
+    def test_no_name(self) -> None:
+        with pytest.raises(ValueError, match=r"a system that PROJ knows.*''"):
+            MapFrame(ORIGIN, "")
+
+
+class TestLabel:
+    @pytest.mark.parametrize("crs", ["EPSG:25833", "25833", "ETRS89 / UTM zone 33N", "EPSG:25833+5783"])
+    def test_names_the_horizontal_system_by_its_authority(self, crs: str) -> None:
+        """Other programs do not take a bare number, and files have no heights of the system."""
+        assert MapFrame(ORIGIN, crs).label == "EPSG:25833"

@@ -40,6 +40,12 @@ class TestGridRows:
         assert grid_rows(survey.rows, survey.rows.anomaly_T, frame).cell_m == 0.2
         assert grid_rows(survey.rows, survey.rows.anomaly_T, frame, 0.5).cell_m == 0.5
 
+    def test_corners_are_round_numbers(self, survey: magloc.Survey) -> None:
+        """A cell is 0.2 m on the map, although a metre of the ground is 0.9998 m there."""
+        raster = grid_rows(survey.rows, survey.rows.anomaly_T, MapFrame((52.41, 13.12, 41.0), "EPSG:32633"))
+        np.testing.assert_array_equal(raster.cell, 0.2)
+        np.testing.assert_allclose(raster.corner / 0.2, np.round(raster.corner / 0.2), rtol=0.0, atol=1e-6)
+
 
 class TestWriteGeotiff:
     def test_as_rasterio_reads_it(self, survey: magloc.Survey, frame: MapFrame, tmp_path: Path) -> None:

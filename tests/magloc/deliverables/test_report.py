@@ -12,14 +12,14 @@ from magloc.deliverables.report import report_html
 
 class TestReportHtml:
     def test_has_all_targets_with_their_places(self, survey: magloc.Survey, frame: MapFrame) -> None:
-        page = report_html(survey, frame, "Meadow <1>", {"ground": "0 m"})
+        page = report_html(survey, frame, "Meadow <1>", {"size": "0 m"})
         cells = [re.findall(r"<td[^>]*>([^<]*)</td>", row) for row in re.findall(r"<tr>.*?</tr>", page)]
         found = {row[0]: row for row in cells if row and re.fullmatch(r"t\d", row[0])}
         digits = 7 if frame.is_geographic else 2
         for target, (x, y) in zip(survey, frame.project(survey.position_m), strict=True):
             assert found[target.id][1:4] == [f"{x:.{digits}f}", f"{y:.{digits}f}", f"{target.depth_m:.2f}"]
         assert "<title>Meadow &lt;1&gt;</title>" in page
-        assert ["ground", "0 m"] in cells
+        assert ["size", "0 m"] in cells
 
     def test_needs_no_other_file(self, survey: magloc.Survey, frame: MapFrame) -> None:
         page = report_html(survey, frame, "Meadow", {})
@@ -31,3 +31,14 @@ class TestReportHtml:
         page = report_html(weak, frame, "Meadow", {})
         assert "<b>weak</b>: the depth interval holds" in page
         assert "<b>merged</b>" not in page
+
+    def test_the_ground_is_below_the_origin(self, survey: magloc.Survey, frame: MapFrame) -> None:
+        page = report_html(replace(survey, ground_m=-1.6), frame, "Meadow", {})
+        assert "<td>origin</td><td>latitude 52.4100000, longitude 13.1200000, height 41.00 m</td>" in page
+        assert "<td>ground</td><td>flat, 1.6 m below the origin</td>" in page
+
+    def test_a_single_line_has_no_spacing(self, survey: magloc.Survey, frame: MapFrame) -> None:
+        """Six lines, and the first of them alone."""
+        first = type(survey.rows)(*(column[:240] for column in survey.rows))
+        pages = [report_html(found, frame, "Meadow", {}) for found in (survey, replace(survey, rows=first))]
+        assert ["m apart" in page for page in pages] == [True, False]
