@@ -225,7 +225,7 @@ class LogColumns:
 
     @property
     def is_geodetic(self) -> bool:
-        """Whether places are known on the Earth, by latitude and longitude or in a grid."""
+        """True if positions are latitudes and longitudes, or coordinates of a grid."""
         return self.geodetic is not None or self.crs is not None
 
     @property

@@ -132,23 +132,6 @@ def unclear(path: Path) -> list[str]:
 
 
 FOLDERS = sorted({path.parent for package in PACKAGES for path in (REPOSITORY / package).rglob("*.py")})
-# Folders whose docstrings are still to be reworded; a folder leaves the list when it is clean.
-TO_REWORD = {
-    "adcs/cli",
-    "arrays",
-    "arrays/io",
-    "arrays/logs",
-    "magloc/cli",
-    "magloc/cli/calibration",
-    "magloc/cli/moments",
-    "sims",
-    "sims/attitude",
-    "sims/cli",
-    "sims/experiments",
-    "sims/magnetics",
-    "sims/mockup",
-}
-CLEAN = [folder for folder in FOLDERS if folder.relative_to(REPOSITORY).as_posix() not in TO_REWORD]
 
 
 class TestFirstWords:
@@ -159,6 +142,6 @@ class TestFirstWords:
         texts = [text for _, text in [*docstrings(tree), *messages(tree)]]
         assert [text for text in texts if UNCLEAR.match(text)] == ["What is.", "Of it.", "Where "]
 
-    @pytest.mark.parametrize("folder", CLEAN, ids=lambda folder: folder.relative_to(REPOSITORY).as_posix())
+    @pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.relative_to(REPOSITORY).as_posix())
     def test_of_docstrings_and_messages_are_clear(self, folder: Path) -> None:
         assert [text for path in sorted(folder.glob("*.py")) for text in unclear(path)] == []

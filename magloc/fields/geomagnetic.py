@@ -37,6 +37,7 @@ from numpy.typing import ArrayLike
 
 from arrays.io.errors import _vectors, of_extra
 from arrays.typing import FloatArray
+from magloc.fields.dipole import MU0_OVER_4PI
 from magloc.fields.gauss_coefficients import FIELD
 from magloc.fields.gauss_coefficients import MODELS as MODELS
 from magloc.fields.gauss_coefficients import Coefficients as Coefficients
@@ -281,6 +282,35 @@ def field_ecef(position_ecef_m: ArrayLike, date: Dates, model: Model = "IGRF-14"
     latitude, longitude = np.degrees(np.arctan2(z, np.hypot(x, y))), np.degrees(np.arctan2(y, x))
     b_ned = field_geocentric_ned(np.linalg.norm(position, axis=-1), latitude, longitude, date, model)
     return _turned(R_ned_from_ecef(latitude, longitude).mT, b_ned)
+
+
+def tilted_dipole_ecef(date: Dates, model: Model = "IGRF-14") -> FloatArray:
+    """Moment of the dipole at the Earth's centre whose field is the degree n = 1 of a model: 4π/µ0 a³ (g11, h11, g10).
+
+    Its field is ``magloc.fields.dipole.field(position_ecef_m, 0, moment)`` with the origin as the source.
+
+    Parameters
+    ----------
+    date : date, datetime, datetime64 or decimal year, shape (...)
+        As in :func:`decimal_year`.
+    model : str or Coefficients
+        "IGRF-14" or "WMM2025".
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+        ECEF [A·m²]; it points south, some 9.2° from the axis in 2025.
+
+    Raises
+    ------
+    ValueError
+        If a date is outside the model's validity, or there is no such model.
+    """
+    table = coefficients(model)
+    g, h = table.at(decimal_year(date))
+    (axial,) = np.flatnonzero((table.degree == 1) & (table.order == 0))
+    (across,) = np.flatnonzero((table.degree == 1) & (table.order == 1))
+    return REFERENCE_RADIUS_M**3 / MU0_OVER_4PI * np.stack([g[..., across], h[..., across], g[..., axial]], axis=-1)
 
 
 def ecef_from_geodetic(latitude_deg: ArrayLike, longitude_deg: ArrayLike, height_m: ArrayLike) -> FloatArray:

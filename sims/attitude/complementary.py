@@ -24,7 +24,7 @@ from sims.noise import stream
 
 ORBIT = CircularOrbit(670e3, math.radians(98.0), 0.0, np.datetime64("2008-03-01"))
 ANGLE_PERIODS = np.array([1.0, 0.8, 1.3])
-"""Of roll, pitch and yaw, in orbits."""
+"""Periods of roll, pitch and yaw, in orbits."""
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ MU0 = 4.0 * math.pi * MU0_OVER_4PI
 NEAREST_M = 1e-3
 """No sensor may come nearer to a source, whatever its size."""
 _ALONG_BAR, _WEIGHTS = np.polynomial.legendre.leggauss(8)
-"""Where dipoles stand for a bar, in half lengths, and twice their shares: its field a length away to 2e-7."""
+"""Positions of dipoles in a bar, in half lengths, and twice their shares; the field is exact to 2e-7."""
 
 
 @dataclass(frozen=True, eq=False)

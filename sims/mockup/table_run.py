@@ -23,7 +23,7 @@ DriveName = Literal["perimeter", "two-firings"]
 POLL_S = 1e-3
 THRUST_M_S2 = 0.04
 SPEED_M_S = 0.085
-"""Of the point that the perimeter drive follows."""
+"""Speed of the point that the perimeter drive follows."""
 _CONTROL_S = 0.1
 _STRAIGHT_M = (1.4, 0.9)
 _CORNER_M = 0.2

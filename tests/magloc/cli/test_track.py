@@ -468,7 +468,10 @@ class TestStream:
     @pytest.mark.parametrize(
         ("data", "fragments"),
         [
-            (f"{HEADER}\n0,1,2,\xff".encode("latin-1"), ("garbled", "line 2", "0xff is not UTF-8", "lines alone (1)")),
+            (
+                f"{HEADER}\n0,1,2,\xff".encode("latin-1"),
+                ("garbled", "line 2", "0xff is not UTF-8", "only garbled lines (1)"),
+            ),
             (f"\ufeff{HEADER}\n".encode(), ("standard input, line 1", "without rows")),
         ],
     )

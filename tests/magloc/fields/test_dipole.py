@@ -3,9 +3,10 @@
 | function | who checks it |
 |---|---|
 | field, gradient_tensor | arithmetic with 120 decimals, from 1 nm to 10⁹ m; choclo |
+| potential | its gradient is the field |
 | field_matrix | choclo: the gravity gradient of a unit mass, by Poisson's relation |
 | field_jacobian | scipy.differentiate |
-| total_field | the sum of magpylib's fields |
+| modulus_gradient, total_field, total_gradient_tensor | magpylib's field, and its derivative by scipy.differentiate |
 
 Kernels are compared with these functions in test_points.py.
 
@@ -38,10 +39,13 @@ DIFFERENCING = 1e-10
 RNG = np.random.default_rng(20261)
 SOURCE = np.array([0.7, -1.1, 0.4])
 MOMENT = np.array([3.0, -5.0, 8.0])
+AMBIENT = np.array([18e-6, -2e-6, 45e-6])
 POINTS = SOURCE + RNG.uniform(1.0, 6.0, (25, 1)) * Rotation.random(25, rng=RNG).apply([1.0, 0.0, 0.0])
 SINGLE_DIPOLE_FUNCTIONS = [
+    dipole.potential,
     dipole.field,
     dipole.gradient_tensor,
+    dipole.modulus_gradient,
     dipole.field_jacobian,
 ]
 
@@ -65,15 +69,9 @@ class TestConstant:
 
 
 class TestPotential:
-    """The field is the gradient of the potential -k (n.m)/r^2, with the sign of the source paper."""
-
     def test_its_gradient_is_plus_the_field(self) -> None:
-        def potential(x: Array) -> Array:
-            d = x - SOURCE
-            return -K * np.vecdot(d, MOMENT)[..., None] / np.linalg.norm(d, axis=-1, keepdims=True) ** 3
-
         for s in POINTS:
-            gradient = oracles.derivative(potential, s, distance(s) / 20)
+            gradient = oracles.derivative(lambda x: dipole.potential(x, SOURCE, MOMENT)[..., None], s, distance(s) / 20)
             assert relative_error(gradient[0], dipole.field(s, SOURCE, MOMENT)) <= DIFFERENCING
 
 
@@ -99,6 +97,35 @@ class TestJacobians:
             assert relative_error(actual[:, 3:], by_moment, 2) <= DIFFERENCING
 
 
+class TestModulusGradient:
+    @pytest.mark.parametrize("ambient", [None, AMBIENT, 1e-3 * AMBIENT], ids=["none", "strong", "comparable"])
+    def test_is_the_derivative_of_the_modulus_of_a_foreign_field(self, ambient: Array | None) -> None:
+        def modulus(x: Array) -> Array:
+            field = oracles.magpylib_field(x.reshape(-1, 3), SOURCE, MOMENT)
+            total = field if ambient is None else ambient + field
+            return np.asarray(np.linalg.norm(total, axis=-1)).reshape(*x.shape[:-1], 1)
+
+        actual = dipole.modulus_gradient(POINTS, SOURCE, MOMENT, ambient)
+        # The modulus of a sum keeps eps |B_a| of rounding, which differences over r/20 turn into a slope.
+        field = dipole.field(POINTS, SOURCE, MOMENT)
+        ratio = 0.0 if ambient is None else np.max(np.linalg.norm(ambient) / np.linalg.norm(field, axis=-1))
+        for s, gradient in zip(POINTS, actual, strict=True):
+            numerical = oracles.derivative(modulus, s, distance(s) / 20)[0]
+            size = np.linalg.norm(dipole.gradient_tensor(s, SOURCE, MOMENT))
+            assert np.linalg.norm(gradient - numerical) <= DIFFERENCING * (1 + ratio) * size
+
+    def test_zero_ambient_field_is_no_ambient_field(self) -> None:
+        np.testing.assert_array_equal(
+            dipole.modulus_gradient(POINTS, SOURCE, MOMENT, np.zeros(3)),
+            dipole.modulus_gradient(POINTS, SOURCE, MOMENT),
+        )
+
+    def test_is_nan_where_the_total_field_vanishes_and_there_only(self) -> None:
+        ambient = -dipole.field(POINTS[3], SOURCE, MOMENT)
+        is_nan = np.isnan(dipole.modulus_gradient(POINTS, SOURCE, MOMENT, ambient))
+        np.testing.assert_array_equal(is_nan, np.repeat(np.arange(len(POINTS)) == 3, 3).reshape(-1, 3))
+
+
 class TestSuperposition:
     sources = SOURCE + np.array([[0.0, 0.0, 0.0], [0.3, -0.2, 0.1], [-0.4, 0.1, 0.2]])
     moments = np.array([[1.0, 2.0, 3.0], [-4.0, 1.0, 0.5], [2.0, 2.0, -7.0]])
@@ -109,14 +136,29 @@ class TestSuperposition:
         error = np.linalg.norm(dipole.total_field(POINTS, self.sources, self.moments) - np.sum(parts, axis=0), axis=-1)
         assert np.all(error <= ROUNDING * size)
 
+    def test_total_gradient_tensor_is_the_derivative_of_the_sum_of_foreign_fields(self) -> None:
+        def total(x: Array) -> Array:
+            flat = x.reshape(-1, 3)
+            parts = [oracles.magpylib_field(flat, p, m) for p, m in zip(self.sources, self.moments, strict=True)]
+            return np.asarray(np.sum(parts, axis=0)).reshape(x.shape)
+
+        for s in POINTS:
+            nearest = np.min(np.linalg.norm(s - self.sources, axis=-1))
+            numerical = oracles.derivative(total, s, float(nearest) / 20)
+            actual = dipole.total_gradient_tensor(s, self.sources, self.moments)
+            assert relative_error(actual, numerical, 2) <= DIFFERENCING
+
     def test_no_dipoles_make_no_field(self) -> None:
         none = np.empty((0, 3))
         np.testing.assert_array_equal(dipole.total_field(POINTS, none, none), np.zeros((25, 3)))
+        np.testing.assert_array_equal(dipole.total_gradient_tensor(POINTS, none, none), np.zeros((25, 3, 3)))
 
     def test_sets_of_dipoles_broadcast(self) -> None:
         sets = np.stack([self.sources, self.sources + 0.1])[:, None]  # (2, 1, K, 3) against points (25, 3)
-        one_by_one = np.stack([dipole.total_field(POINTS, p[0], self.moments) for p in sets])
-        np.testing.assert_array_equal(dipole.total_field(POINTS, sets, self.moments), one_by_one)
+        for function in (dipole.total_field, dipole.total_gradient_tensor):
+            together = function(POINTS, sets, self.moments)
+            one_by_one = np.stack([function(POINTS, p[0], self.moments) for p in sets])
+            np.testing.assert_array_equal(together, one_by_one)
 
 
 class TestPeers:
@@ -171,15 +213,19 @@ class TestSingularPoint:
     @pytest.mark.parametrize("function", SINGLE_DIPOLE_FUNCTIONS)
     @pytest.mark.parametrize("moment", [MOMENT, np.zeros(3)], ids=["dipole", "zero moment"])
     def test_of_one_dipole(self, function: Callable[..., Array], moment: Array) -> None:
-        self.check(function(self.points, SOURCE, moment))
+        if function is dipole.modulus_gradient:
+            self.check(function(self.points, SOURCE, moment, AMBIENT))
+        else:
+            self.check(function(self.points, SOURCE, moment))
 
     @pytest.mark.filterwarnings("error")
     def test_of_the_field_matrix(self) -> None:
         self.check(dipole.field_matrix(self.points, SOURCE))
 
     @pytest.mark.filterwarnings("error")
-    def test_of_several_dipoles(self) -> None:
-        self.check(dipole.total_field(self.points, [SOURCE, SOURCE + 10.0], [MOMENT, MOMENT]))
+    @pytest.mark.parametrize("function", [dipole.total_field, dipole.total_gradient_tensor])
+    def test_of_several_dipoles(self, function: Callable[..., Array]) -> None:
+        self.check(function(self.points, [SOURCE, SOURCE + 10.0], [MOMENT, MOMENT]))
 
     @pytest.mark.filterwarnings("error")
     def test_of_a_missing_point(self) -> None:
@@ -209,6 +255,12 @@ class TestBroadcasting:
             single = dipole.field_matrix(self.points[i, 0, k], self.sources[j, 0])
             np.testing.assert_array_equal(batch[i, j, k], single)
 
+    def test_ambient_field_broadcasts(self) -> None:
+        ambients = np.stack([AMBIENT, -AMBIENT])
+        batch = dipole.modulus_gradient(POINTS[:, None], SOURCE, MOMENT, ambients)
+        for j, ambient in enumerate(ambients):
+            np.testing.assert_array_equal(batch[:, j], dipole.modulus_gradient(POINTS, SOURCE, MOMENT, ambient))
+
     @pytest.mark.parametrize("function", SINGLE_DIPOLE_FUNCTIONS)
     def test_empty_batch(self, function: Callable[..., Array]) -> None:
         assert function(np.empty((0, 3)), SOURCE, MOMENT).shape[0] == 0
@@ -228,7 +280,12 @@ class TestMisuse:
         with pytest.raises(ValueError, match=rf"Input {name} must have shape \(\.\.\., 3\); instead received shape"):
             function(**arguments)
 
-    def test_numbers_of_sources_and_moments_differ(self) -> None:
+    def test_ambient_field_is_not_a_vector(self) -> None:
+        with pytest.raises(ValueError, match=r"Input ambient must have shape"):
+            dipole.modulus_gradient(POINTS, SOURCE, MOMENT, 5e-5)
+
+    @pytest.mark.parametrize("function", [dipole.total_field, dipole.total_gradient_tensor])
+    def test_numbers_of_sources_and_moments_differ(self, function: Callable[..., Array]) -> None:
         for sources, moments in [(np.ones((2, 3)), np.ones((3, 3))), (np.ones((1, 3)), np.ones(3))]:
             with pytest.raises(ValueError, match="Inputs sources and moments must have shapes"):
-                dipole.total_field(POINTS, sources, moments)
+                function(POINTS, sources, moments)

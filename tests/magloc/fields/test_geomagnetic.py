@@ -24,9 +24,7 @@ from numpy.typing import NDArray
 from magloc.fields import dipole
 from magloc.fields.geomagnetic import (
     MODELS,
-    REFERENCE_RADIUS_M,
     Coefficients,
-    Dates,
     coefficients,
     decimal_year,
     ecef_from_geodetic,
@@ -35,6 +33,7 @@ from magloc.fields.geomagnetic import (
     field_geocentric_ned,
     field_ned,
     gradient_enu,
+    tilted_dipole_ecef,
 )
 
 Array = NDArray[np.float64]
@@ -313,16 +312,6 @@ class TestGradient:
             assert np.max(np.abs(field_enu(*place) - expected)) > 1e-11
 
 
-def tilted_dipole_ecef(date: Dates, model: str = "IGRF-14") -> Array:
-    """Moment (..., 3) [A·m²] at the Earth's centre of the degree n = 1 of a model: 4π/µ0 a³ (g11, h11, g10)."""
-    table = coefficients(model)
-    g, h = table.at(decimal_year(date))
-    (axial,) = np.flatnonzero((table.degree == 1) & (table.order == 0))
-    (across,) = np.flatnonzero((table.degree == 1) & (table.order == 1))
-    moment = np.stack([g[..., across], h[..., across], g[..., axial]], axis=-1)
-    return REFERENCE_RADIUS_M**3 / dipole.MU0_OVER_4PI * moment
-
-
 class TestDipoleEarth:
     """The degree n = 1 of a model is magloc.fields.dipole with the moment at the Earth's centre."""
 
@@ -372,6 +361,8 @@ class TestMisuse:
         for function in (field_ned, gradient_enu):
             with pytest.raises(ValueError, match=message):
                 function(50, 10, 0, date, model)  # type: ignore[arg-type]
+        with pytest.raises(ValueError, match=message):
+            tilted_dipole_ecef(date, model)  # type: ignore[arg-type]
 
     @pytest.mark.parametrize("date", ["2026-11-21", None, [datetime.date(2026, 1, 1), 2026.5], datetime.time(12)])
     def test_not_a_date(self, date: object) -> None:

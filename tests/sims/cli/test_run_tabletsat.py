@@ -333,7 +333,7 @@ class TestOwnScenario:
     @pytest.mark.parametrize(
         ("arguments", "fragments"),
         [
-            (["--sensors", "sun+gyro"], ["--sensors", "must observe attitude", "missing is"]),
+            (["--sensors", "sun+gyro"], ["--sensors", "must observe attitude", "Add a star tracker"]),
             (["--sensors", "st", "--states", "gyro-bias"], ["without a gyro"]),
             (["--states", "wind"], ["wind", "gyro-bias"]),
             (["--start-error-deg", "-1"], ["--start-error-deg"]),

@@ -93,7 +93,7 @@ class TestDerivatives:
             numeric = (values[0] - values[1]) / (2.0 * self.STEP) * POSE.position_m
             record = record_of(array, readings_of(array, PLACES, TURNS))
             fields = record.fields(*SOURCE)
-            gradients = sum(dipole.gradient_tensor(record.sensors_m, p, m) for p, m in zip(*SOURCE, strict=True))
+            gradients = dipole.total_gradient_tensor(record.sensors_m, *SOURCE)
             found = record.by_pose(record.directions(fields), fields, gradients)[..., 3 + axis]
             if array is VECTOR:
                 # What is across the ambient field of the sensors' mean is zero in the turned axes.

@@ -1,0 +1,1 @@
+"""Joint fit of a survey: rows, whitening, sources and backgrounds."""
