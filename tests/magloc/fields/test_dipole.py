@@ -213,7 +213,7 @@ class TestSingularPoint:
     @pytest.mark.parametrize("function", SINGLE_DIPOLE_FUNCTIONS)
     @pytest.mark.parametrize("moment", [MOMENT, np.zeros(3)], ids=["dipole", "zero moment"])
     def test_of_one_dipole(self, function: Callable[..., Array], moment: Array) -> None:
-        if function is dipole.modulus_gradient:
+        if function.__name__ == "modulus_gradient":
             self.check(function(self.points, SOURCE, moment, AMBIENT))
         else:
             self.check(function(self.points, SOURCE, moment))
