@@ -85,7 +85,7 @@ def with_places_between_fixes(array: SensorArray, readings: Readings) -> tuple[S
         return array, readings
     n = len(readings)
     _LOG.warning(
-        f"places do not change in {found.held} of {n} rows: they are interpolated between fixes at"
+        f"places stand still in {found.held} of {n} rows: they are interpolated between fixes at"
         f" {found.rate_Hz:.3g} Hz" + (f", and the last {n - found.end} rows are left out" if found.end < n else "")
     )
     error_m = found.error_m if readings.interpolated_m is None else np.maximum(found.error_m, readings.interpolated_m)
