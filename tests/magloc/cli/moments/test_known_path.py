@@ -120,7 +120,7 @@ class TestBadInput:
     def test_the_place_of_a_sensor(self, run: Run, files: Path) -> None:
         place = map(float, ARRAY.positions[0])
         outcome = run("track", files / "ship.csv", "--array", files / "array.toml", "--position", *place)
-        assert_refused(outcome, "a place of a sensor")
+        assert_refused(outcome, "must not pass through a sensor")
 
 
 class TestSeveralPlaces:
