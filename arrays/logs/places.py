@@ -7,7 +7,7 @@ import numpy as np
 from arrays.columns import LogColumns
 from arrays.io.csv import Table
 from arrays.io.errors import InputError, naming, of_extra
-from arrays.logs.systems import area_words, coordinate_system, is_outside_area
+from arrays.logs.systems import area_words, coordinate_system, is_outside_area, transform_points
 from arrays.typing import FloatArray
 
 _ENU_FROM_NED = ((0, 1, 0), (1, 0, 0), (0, 0, -1))
@@ -71,7 +71,7 @@ def _latitudes_and_longitudes(table: Table, columns: LogColumns, crs: str, place
 
     transformer = Transformer.from_crs(system, "EPSG:4326", always_xy=True)
     known = np.isfinite(place).all(axis=1)
-    longitude, latitude = transformer.transform(*(place if is_grid else place[:, ::-1])[known].T)
+    longitude, latitude = transform_points(transformer, *(place if is_grid else place[:, ::-1])[known].T).T
     found = np.full(place.shape, np.nan)
     found[known] = np.column_stack([latitude, longitude])
     outside = is_outside_area(system, *found.T)

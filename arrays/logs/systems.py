@@ -34,6 +34,12 @@ def coordinate_system(crs: str) -> pyproj.CRS:
         ) from None
 
 
+def transform_points(transformer: pyproj.Transformer, x: FloatArray, y: FloatArray) -> FloatArray:
+    """Return transformed coordinates (n, 2) of points (n,); one point goes as numbers, since older NumPy warns else."""
+    points = (x, y) if len(x) != 1 else (float(x[0]), float(y[0]))
+    return np.stack(np.atleast_1d(*transformer.transform(*points)), axis=-1)
+
+
 def is_outside_area(system: pyproj.CRS, latitude_deg: FloatArray, longitude_deg: FloatArray) -> NDArray[np.bool_]:
     """Return whether places (n,) lie far outside the area of a system; NaN and systems without an area do not."""
     area = system.area_of_use

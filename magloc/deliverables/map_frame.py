@@ -10,7 +10,7 @@ import numpy as np
 
 from arrays.io.errors import of_extra
 from arrays.io.world_maps import check_near
-from arrays.logs.systems import area_words, coordinate_system, is_outside_area
+from arrays.logs.systems import area_words, coordinate_system, is_outside_area, transform_points
 from arrays.typing import FloatArray, Vector
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ class MapFrame:
     def project(self, position_m: FloatArray) -> FloatArray:
         """Return easting and northing [m], or longitude and latitude [deg], (n, 2) of positions (n, 3)."""
         latitude, longitude, _ = self.geodetic(position_m).T
-        return np.stack(self._transformer.transform(longitude, latitude), axis=-1)
+        return transform_points(self._transformer, longitude, latitude)
 
     @cached_property
     def _transformer(self) -> pyproj.Transformer:
