@@ -20,11 +20,13 @@ ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs/development/walks.md"
 _PACKAGES = ("adcs", "arrays", "magloc", "sims")
 _CORE = "magloc/core/__init__.py"
+_GUARD = "arrays/blas_threads.py"  # acts only where linear algebra has several threads
 _MOST_NAMES = 3  # functions and kernels that a line of the page names
 _HEAD = """# Walks: the path of one row
 
 The files that one row passes, in the order in which a debugger enters them, with the first functions that run there.
-Imports and caches are not part of a walk. `python -m tests.walks` writes this page.
+Imports, caches and the guard of linear algebra's threads are not part of a walk.
+`python -m tests.walks` writes this page.
 """
 
 
@@ -68,7 +70,7 @@ def walk(call: Callable[[], object]) -> Walk:
     def profile(frame: FrameType, event: str, _: object) -> None:
         nonlocal switches, last
         file = os.path.relpath(frame.f_code.co_filename, ROOT).replace(os.sep, "/")
-        if event != "call" or file.partition("/")[0] not in _PACKAGES:
+        if event != "call" or file == _GUARD or file.partition("/")[0] not in _PACKAGES:
             return
         name = frame.f_code.co_qualname
         if file == _CORE and name == "run":
@@ -106,5 +108,8 @@ def _line(file: str, names: list[str]) -> str:
 
 
 if __name__ == "__main__":
-    PAGE.write_text(page(), "utf-8")
-    print(PAGE)
+    if "--print" in sys.argv:
+        sys.stdout.buffer.write(page().encode())
+    else:
+        PAGE.write_text(page(), "utf-8")
+        print(PAGE)
