@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import re
 import sys
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     from magloc.tracking.results import SourcesPoint, TrackPoint
 
 
+_LOG = logging.getLogger(__name__)
 Port = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=0, lte=65535))]
 
 STREAM = "-"
@@ -184,6 +186,7 @@ class MotionOptions:
         sys.stdout.flush()
 
 
+_SAME_deg = 1e-6  # between places that count as one, a tenth of a metre
 _DATE = re.compile(r"\d{4}-\d{2}-\d{2}(T\d{2}:\d{2}(:\d{2}(\.\d+)?)?)?")
 
 
@@ -249,6 +252,15 @@ class KnownOptions:
         except ValueError as error:
             raise InputError(f"--sensors {','.join(ids)}: {error}") from None
 
+    def map_origin(self, array: SensorArray) -> Vector | None:
+        """Return the place on the Earth of the origin of the world frame: that of the array file, or else --place."""
+        own = None if array.columns is None else array.columns.origin
+        if own is None or self.place is None:
+            return own or self.place
+        if any(abs(ours - theirs) > _SAME_deg for ours, theirs in zip(own[:2], self.place[:2], strict=True)):
+            _LOG.warning(f"--place is not the origin of the array file, which maps use: {_degrees(own)}")
+        return own
+
     def on_earth(self, array: SensorArray, log: Path) -> tuple[SensorArray, KnownOptions]:
         """Return the array with an origin of its places on the Earth, and options that know place and date.
 
@@ -258,17 +270,17 @@ class KnownOptions:
         columns = array.columns
         if columns is None or not columns.is_geodetic:
             return array, self
-        origin = columns.origin
-        if origin is None:
+        if columns.origin is None:
             from arrays.logs.format import log_origin
 
             origin = log_origin(log, columns)
             array = replace(array, columns=replace(columns, origin=origin))
             note(f"note: the origin of the world frame is the first place of {log}: {_degrees(origin)}")
         date = self.date
-        if date is None and columns.date and array.channel_is_scalar.any() and array.ambient_world_T is None:
+        is_known = array.ambient_T is not None or array.ambient_world_T is not None
+        if date is None and columns.date and array.channel_is_scalar.any() and not is_known:
             date = columns.date
-        return array, replace(self, place=self.place or origin, date=date)
+        return array, replace(self, place=self.map_origin(array), date=date)
 
     @property
     def prior(self) -> SourcePrior:

@@ -207,6 +207,7 @@ def track(
     # A place without a date is for the maps only.
     where = None if known.place is not None and known.date is None else known.where
     used = known.array(array)
+    known = replace(known, place=known.map_origin(used))
     on_background = conditioning.detrend or conditioning.high_pass_hz is not None
     model = motion.model(lasting=smooth or on_background)
     path = motion.known_path()

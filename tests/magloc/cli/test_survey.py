@@ -248,6 +248,21 @@ class TestMaps:
             pytest.approx(expected[1], abs=0.1),
         )
 
+    def test_the_origin_of_the_array_file_counts(
+        self, log: Path, target: dict[str, float], run: Run, tmp_path: Path
+    ) -> None:
+        """--place for the ambient field, 1 km away, moves no map."""
+        array = tmp_path / "array.toml"
+        array.write_text(log.with_name("array.toml").read_text() + f"origin = {[LATITUDE, LONGITUDE, HEIGHT_M]}\n")
+        place = ("--place", LATITUDE + 0.01, LONGITUDE, HEIGHT_M)
+        outcome = run("survey", log, "--array", array, *place, "--geojson", tmp_path / "map.geojson", "--json")
+        report = json.loads(outcome.out)
+        assert any("--place is not the origin of the array file" in warning for warning in report["warnings"])
+        (feature,) = json.loads((tmp_path / "map.geojson").read_text())["features"]
+        expected = (target["longitude"], target["latitude"])
+        assert feature["geometry"]["coordinates"][:2] == pytest.approx(expected, rel=0.0, abs=8e-7)
+        assert report["targets"][0]["latitude"] == pytest.approx(target["latitude"], abs=5e-7)
+
     def test_an_unknown_system(self, log: Path, run: Run) -> None:
         outcome = run("survey", log, "--array", log.with_name("array.toml"), "--crs", "EPSG:1", "--quiet")
         assert_refused(outcome, "--crs", "'EPSG:1'", "a system that PROJ knows")
