@@ -29,6 +29,11 @@ def world_place(position_m: FloatArray, origin: Vector) -> list[float]:
     return [float(longitude), float(latitude), float(height)]
 
 
+def place_in_words(place: Vector) -> str:
+    """Return latitude, longitude [deg] and height [m] of a place in words."""
+    return f"latitude {place[0]:.7f}, longitude {place[1]:.7f}, height {place[2]:.2f} m"
+
+
 def check_near(farthest_m: float) -> None:
     """Refuse positions too far from the origin of a local frame."""
     if not farthest_m <= FARTHEST_M:

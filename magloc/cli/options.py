@@ -258,7 +258,9 @@ class KnownOptions:
         if own is None or self.place is None:
             return own or self.place
         if any(abs(ours - theirs) > _SAME_deg for ours, theirs in zip(own[:2], self.place[:2], strict=True)):
-            _LOG.warning(f"--place is not the origin of the array file, which maps use: {_degrees(own)}")
+            from arrays.io.world_maps import place_in_words
+
+            _LOG.warning(f"--place is not the origin of the array file, which maps use: {place_in_words(own)}")
         return own
 
     def on_earth(self, array: SensorArray, log: Path) -> tuple[SensorArray, KnownOptions]:
@@ -271,11 +273,12 @@ class KnownOptions:
         if columns is None or not columns.is_geodetic:
             return array, self
         if columns.origin is None:
+            from arrays.io.world_maps import place_in_words
             from arrays.logs.format import log_origin
 
             origin = log_origin(log, columns)
             array = replace(array, columns=replace(columns, origin=origin))
-            note(f"note: the origin of the world frame is the first place of {log}: {_degrees(origin)}")
+            note(f"note: the origin of the world frame is the first place of {log}: {place_in_words(origin)}")
         date = self.date
         is_known = array.ambient_T is not None or array.ambient_world_T is not None
         if date is None and columns.date and array.channel_is_scalar.any() and not is_known:
@@ -322,10 +325,6 @@ class KnownOptions:
         if not _DATE.fullmatch(self.date):
             raise InputError(f"--date: found {self.date!r}, expected a date such as 2026-11-21.")
         return Place(*self.place, self.date, self.geomagnetic_model or "IGRF-14")
-
-
-def _degrees(place: Vector) -> str:
-    return f"latitude {place[0]:.7f}, longitude {place[1]:.7f}, height {place[2]:.2f} m"
 
 
 class Mappable(Protocol):

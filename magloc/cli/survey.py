@@ -202,12 +202,13 @@ def _files(found: Survey, frame: MapFrame | None, title: str, ground: GroundOpti
     yield "targets.csv", found.columns() | ({} if frame is None else map_columns(found, frame))
     yield "residual.csv", residual_columns(found)
     yield "reach.csv", reach_columns(found)
-    yield "survey.png", found.plot()
-    yield "profiles.png", survey_profiles(found)
+    maps, profiles = found.plot(), survey_profiles(found)
+    yield "survey.png", maps
+    yield "profiles.png", profiles
     if frame is not None:
         assumptions = {
             "field of the ground": f"wavelengths above {ground.shortest_geology_m:g} m",
             "false targets": f"{ground.false_per_hectare:g} in a hectare on average",
             "size of targets": f"{ground.body_length_m:g} m" if ground.body_length_m else "points",
         }
-        yield from survey_files(found, frame, title, assumptions)
+        yield from survey_files(found, frame, title, assumptions, (maps, profiles))

@@ -10,6 +10,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from arrays.io.csv import Column
 from arrays.io.errors import InputError
 from arrays.io.text import replace_file
@@ -20,6 +22,8 @@ from magloc.deliverables.rasters import covers_area, grid_rows, write_geotiff
 from magloc.deliverables.report import report_html
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from magloc.surveying.results import Survey
 
 _LOG = logging.getLogger(__name__)
@@ -27,12 +31,12 @@ _LIBRARIES = ("pyogrio", "rasterio", "shapely")
 
 
 def survey_files(
-    found: Survey, frame: MapFrame, title: str, assumptions: Mapping[str, str]
+    found: Survey, frame: MapFrame, title: str, assumptions: Mapping[str, str], figures: tuple[Figure, Figure]
 ) -> Iterator[tuple[str, Any]]:
     """Yield names and contents of the files of a survey, as :func:`arrays.io.outputs.write_files` takes them.
 
     Without the extra ``gis`` the GeoPackage and GeoTIFF are left out, and without a browser the report as PDF. A note
-    is logged then. Surveys of a single line have no GeoTIFF.
+    is logged then. Surveys of a single line have no GeoTIFF. The report shows the figures: maps, and profiles.
     """
     yield "targets.geojson", json.dumps(found.to_geojson(frame.origin)) + "\n"
     yield "targets.kml", found.to_kml(frame.origin)
@@ -40,12 +44,14 @@ def survey_files(
     if all(map(find_spec, _LIBRARIES)):
         yield "targets.gpkg", partial(write_layers, found=found, frame=frame)
         if covers_area(found.rows.place_m[:, :2]):
-            for name, values_T in (("field", found.rows.anomaly_T), ("residual", found.rows.residual_T)):
-                raster = grid_rows(found.rows, 1e9 * values_T, frame)
+            rows = found.rows
+            both = grid_rows(rows, 1e9 * np.stack([rows.anomaly_T, rows.residual_T], axis=-1), frame)
+            for i, name in enumerate(("field", "residual")):
+                raster = both._replace(values=both.values[..., i])
                 yield f"{name}.tif", partial(write_geotiff, raster=raster, frame=frame, title=name, unit="nT")
     else:
         _LOG.info('note: a GeoPackage and GeoTIFF need the extra "gis": pip install "magloc[gis]"')
-    yield "report.html", report_html(found, frame, title, assumptions)
+    yield "report.html", report_html(found, frame, title, assumptions, figures)
     yield "report.pdf", _print_report
 
 

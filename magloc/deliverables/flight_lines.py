@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -39,17 +40,17 @@ def flight_lines(time_s: FloatArray, place_m: FloatArray, ground_m: float = 0.0)
         return []
     step_s = float(np.median(np.diff(time_s)))
     gaps = np.flatnonzero(np.diff(time_s) > _LONGEST_GAP * step_s) + 1
-    pieces = [slice(a, b) for a, b in zip([0, *gaps], [*gaps, len(time_s)], strict=True) if b - a > 1]
-    starts = [slice_.start + first for slice_ in pieces for first in _line_starts(place_m[slice_, :2])]
-    ends = [*starts[1:], len(time_s)]
-    stops = {piece.stop for piece in pieces}
-    lines = []
-    for number, (start, end) in enumerate(zip(starts, ends, strict=True), 1):
-        stop = min([stop for stop in stops if start < stop <= end], default=end)
-        way = float(np.linalg.norm(np.diff(place_m[start:stop, :2], axis=0), axis=1).sum())
-        duration = float(time_s[stop - 1] - time_s[start])
-        height = float(place_m[start:stop, 2].mean() - ground_m)
-        lines.append(FlightLine(f"L{number}", slice(start, stop), way / duration if duration else 0.0, height))
+    lines: list[FlightLine] = []
+    for begin, stop in pairwise([0, *gaps.tolist(), len(time_s)]):
+        if stop - begin < 2:
+            continue  # a single row
+        starts = [begin + first for first in _line_starts(place_m[begin:stop, :2])]
+        for rows in (slice(*ends) for ends in pairwise([*starts, stop])):
+            way_m = float(np.linalg.norm(np.diff(place_m[rows, :2], axis=0), axis=1).sum())
+            duration_s = float(time_s[rows][-1] - time_s[rows][0])
+            height_m = float(place_m[rows, 2].mean() - ground_m)
+            speed_m_s = way_m / duration_s if duration_s else 0.0
+            lines.append(FlightLine(f"L{len(lines) + 1}", rows, speed_m_s, height_m))
     return lines
 
 

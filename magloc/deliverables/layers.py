@@ -153,10 +153,7 @@ def _reach_polygons(found: Survey, frame: MapFrame) -> Iterator[tuple[float, flo
     """Yield moments [A·m²], depths [m] and the polygons in which a target of that moment is found with 95 %."""
     import shapely
 
-    depths = np.round(found.ground_m - found.reach.place_m[:, 2], 6)
-    for depth in np.unique(depths):
-        at = depths == depth
-        places, moments = found.reach.place_m[at], found.reach.moment_Am2[at]
+    for depth, (places, moments) in found.reach_by_depth.items():
         corners = neighbour_triangles(places[:, :2])
         xy = frame.project(places)
         for moment in _MOMENTS_Am2:
@@ -164,4 +161,4 @@ def _reach_polygons(found: Survey, frame: MapFrame) -> Iterator[tuple[float, flo
             if len(cells):
                 union = shapely.union_all(shapely.polygons(xy[cells]))
                 parts = [union] if union.geom_type == "Polygon" else list(union.geoms)
-                yield moment, float(depth), shapely.MultiPolygon(parts)
+                yield moment, depth, shapely.MultiPolygon(parts)

@@ -28,7 +28,9 @@ _STEPS = (1.0, 2.0, 5.0, 10.0)
 
 
 class Raster(NamedTuple):
-    """Grid of values, rows from north to south and columns from west to east; NaN where there is no value.
+    """Grid of values, or of several sets along the last axis; NaN where there is no value.
+
+    Rows go from north to south, columns from west to east.
 
     `corner` (2,) is the north-west corner and `cell` (2,) the size of a cell, both in units of the map; `cell_m` is the
     size of a cell in metres.
@@ -41,14 +43,14 @@ class Raster(NamedTuple):
 
 
 def grid_rows(rows: SurveyRows, values: FloatArray, frame: MapFrame, cell_m: float | None = None) -> Raster:
-    """Return values (n,) of rows on a regular grid of the map.
+    """Return values of rows on a regular grid of the map.
 
     Parameters
     ----------
     rows : SurveyRows
-    values : ndarray, shape (n,)
-        Values to interpolate linearly between the rows. A cell has no value if it is farther from all rows than the
-        spacing of lines.
+    values : ndarray, shape (n,) or (n, k)
+        Values, or k sets of them, to interpolate linearly between the rows. A cell has no value if it is farther from
+        all rows than the spacing of lines.
     frame : MapFrame
     cell_m : float, optional
         Size of a cell [m], by default a quarter of the spacing of lines, rounded down to 1, 2 or 5 times a power of 10.

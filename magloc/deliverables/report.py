@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from arrays.io.outputs import installed_version
+from arrays.io.world_maps import place_in_words
 from magloc.deliverables.flight_lines import flight_lines
 from magloc.deliverables.map_frame import MapFrame
 from magloc.deliverables.rasters import line_spacing
@@ -46,7 +47,9 @@ _FLAGS = {
 }
 
 
-def report_html(found: Survey, frame: MapFrame, title: str, assumptions: Mapping[str, str]) -> str:
+def report_html(
+    found: Survey, frame: MapFrame, title: str, assumptions: Mapping[str, str], figures: tuple[Figure, Figure]
+) -> str:
     """Return the report of a survey as one HTML page without links to other files.
 
     Parameters
@@ -57,9 +60,10 @@ def report_html(found: Survey, frame: MapFrame, title: str, assumptions: Mapping
     title : str
     assumptions : mapping of str
         Assumptions by name, such as the height of the ground.
+    figures : tuple of 2 matplotlib.figure.Figure
+        Maps and profiles of the survey.
     """
-    from magloc.plots.profiles import survey_profiles
-
+    maps, profiles = figures
     body = [
         f"<h1>Survey of {escape(title)}</h1>",
         f"<small>magloc {installed_version()}; coordinates: {escape(f'{frame.label} ({frame.system.name})')}</small>",
@@ -69,9 +73,9 @@ def report_html(found: Survey, frame: MapFrame, title: str, assumptions: Mapping
         _table(_target_header(frame), _target_rows(found, frame), numbers=range(1, 8)),
         _flag_words(found),
         "<h2>Maps</h2>",
-        _picture(found.plot(), _MAPS),
+        _picture(maps, _MAPS),
         "<h2>Profiles</h2>",
-        _picture(survey_profiles(found), _PROFILES),
+        _picture(profiles, _PROFILES),
         "<h2>Detectable moments</h2>",
         _table(("depth", *(f"{moment:g} A·m²" for moment in _REACH_Am2)), _reach_rows(found), numbers=range(1, 6)),
         "<small>Share of the area in which a target of that moment is found with 95 %, whatever its direction.</small>",
@@ -137,15 +141,12 @@ def _flag_words(found: Survey) -> str:
 
 
 def _reach_rows(found: Survey) -> Iterator[tuple[str, ...]]:
-    depths = np.round(found.ground_m - found.reach.place_m[:, 2], 6)
-    for depth in np.unique(depths):
-        moments = found.reach.moment_Am2[depths == depth]
-        yield f"{depth:g} m", *(f"{100.0 * np.mean(moments <= moment):.0f} %" for moment in _REACH_Am2)
+    for depth, reach in found.reach_by_depth.items():
+        yield f"{depth:g} m", *(f"{100.0 * np.mean(reach.moment_Am2 <= moment):.0f} %" for moment in _REACH_Am2)
 
 
 def _ground_rows(found: Survey, frame: MapFrame) -> Iterator[tuple[str, str]]:
-    latitude, longitude, height = frame.origin
-    yield "origin", f"latitude {latitude:.7f}, longitude {longitude:.7f}, height {height:.2f} m"
+    yield "origin", place_in_words(frame.origin)
     side = "below" if found.ground_m < 0.0 else "above"
     yield "ground", f"flat, {abs(found.ground_m):g} m {side} the origin" if found.ground_m else "flat, at the origin"
 

@@ -214,6 +214,12 @@ class Survey(Result):
         return np.array([target.position_m for target in self]).reshape(-1, 3)
 
     @property
+    def reach_by_depth(self) -> dict[float, Reach]:
+        """Least moments at each depth below the ground [m], the shallowest first."""
+        depths = np.round(self.ground_m - self.reach.place_m[:, 2], 6)
+        return {float(depth): Reach(*(column[depths == depth] for column in self.reach)) for depth in np.unique(depths)}
+
+    @property
     def entries(self) -> list[dict[str, Any]]:
         """Targets as JSON and GeoJSON write them."""
         return [

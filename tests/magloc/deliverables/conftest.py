@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
+from matplotlib.figure import Figure
 
 import magloc
 import sims
 from magloc.deliverables.map_frame import MapFrame
+from magloc.plots.profiles import survey_profiles
 
 ORIGIN = (52.41, 13.12, 41.0)
 
@@ -25,3 +27,9 @@ def survey() -> magloc.Survey:
 def frame(request: pytest.FixtureRequest) -> MapFrame:
     """A map in UTM or in longitudes and latitudes."""
     return MapFrame(ORIGIN, request.param)
+
+
+@pytest.fixture(scope="session")
+def figures(survey: magloc.Survey) -> tuple[Figure, Figure]:
+    """Maps and profiles of the survey."""
+    return survey.plot(), survey_profiles(survey)

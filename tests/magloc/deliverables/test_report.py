@@ -5,14 +5,18 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 
+from matplotlib.figure import Figure
+
 import magloc
 from magloc.deliverables.map_frame import MapFrame
 from magloc.deliverables.report import report_html
 
 
 class TestReportHtml:
-    def test_has_all_targets_with_their_places(self, survey: magloc.Survey, frame: MapFrame) -> None:
-        page = report_html(survey, frame, "Meadow <1>", {"size": "0 m"})
+    def test_has_all_targets_with_their_places(
+        self, survey: magloc.Survey, frame: MapFrame, figures: tuple[Figure, Figure]
+    ) -> None:
+        page = report_html(survey, frame, "Meadow <1>", {"size": "0 m"}, figures)
         cells = [re.findall(r"<td[^>]*>([^<]*)</td>", row) for row in re.findall(r"<tr>.*?</tr>", page)]
         found = {row[0]: row for row in cells if row and re.fullmatch(r"t\d", row[0])}
         digits = 7 if frame.is_geographic else 2
@@ -21,24 +25,30 @@ class TestReportHtml:
         assert "<title>Meadow &lt;1&gt;</title>" in page
         assert ["size", "0 m"] in cells
 
-    def test_needs_no_other_file(self, survey: magloc.Survey, frame: MapFrame) -> None:
-        page = report_html(survey, frame, "Meadow", {})
+    def test_needs_no_other_file(self, survey: magloc.Survey, frame: MapFrame, figures: tuple[Figure, Figure]) -> None:
+        page = report_html(survey, frame, "Meadow", {}, figures)
         assert re.findall(r'(?:src|href)="(?!data:)', page) == []
         assert page.count("<img alt=") == 2
 
-    def test_words_of_flags_that_occur(self, survey: magloc.Survey, frame: MapFrame) -> None:
+    def test_words_of_flags_that_occur(
+        self, survey: magloc.Survey, frame: MapFrame, figures: tuple[Figure, Figure]
+    ) -> None:
         weak = replace(survey, targets=(replace(survey[0], flags=("weak",)), *survey[1:]))
-        page = report_html(weak, frame, "Meadow", {})
+        page = report_html(weak, frame, "Meadow", {}, figures)
         assert "<b>weak</b>: the depth interval holds" in page
         assert "<b>merged</b>" not in page
 
-    def test_the_ground_is_below_the_origin(self, survey: magloc.Survey, frame: MapFrame) -> None:
-        page = report_html(replace(survey, ground_m=-1.6), frame, "Meadow", {})
+    def test_the_ground_is_below_the_origin(
+        self, survey: magloc.Survey, frame: MapFrame, figures: tuple[Figure, Figure]
+    ) -> None:
+        page = report_html(replace(survey, ground_m=-1.6), frame, "Meadow", {}, figures)
         assert "<td>origin</td><td>latitude 52.4100000, longitude 13.1200000, height 41.00 m</td>" in page
         assert "<td>ground</td><td>flat, 1.6 m below the origin</td>" in page
 
-    def test_a_single_line_has_no_spacing(self, survey: magloc.Survey, frame: MapFrame) -> None:
+    def test_a_single_line_has_no_spacing(
+        self, survey: magloc.Survey, frame: MapFrame, figures: tuple[Figure, Figure]
+    ) -> None:
         """Six lines, and the first of them alone."""
         first = type(survey.rows)(*(column[:240] for column in survey.rows))
-        pages = [report_html(found, frame, "Meadow", {}) for found in (survey, replace(survey, rows=first))]
+        pages = [report_html(found, frame, "Meadow", {}, figures) for found in (survey, replace(survey, rows=first))]
         assert ["m apart" in page for page in pages] == [True, False]
