@@ -180,9 +180,9 @@ class LogFormat:
 
 
 def log_origin(path: str | PathLike[str], columns: LogColumns) -> Vector:
-    """Return latitude, longitude [deg] and height [m] of the first place of a log whose columns name a grid or both.
+    """Return latitude, longitude [deg] and height [m] of the first position of a log.
 
-    The height is 0 where heights count from the ground.
+    The height is 0 if the log has heights above ground.
 
     Raises
     ------

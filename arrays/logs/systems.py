@@ -35,7 +35,8 @@ def coordinate_system(crs: str) -> pyproj.CRS:
 
 
 def transform_points(transformer: pyproj.Transformer, x: FloatArray, y: FloatArray) -> FloatArray:
-    """Return transformed coordinates (n, 2) of points (n,); one point goes as numbers, since older NumPy warns else."""
+    """Return transformed coordinates (n, 2) of points (n,)."""
+    # pyproj turns an array of one point into a number, which older NumPy warns of.
     points = (x, y) if len(x) != 1 else (float(x[0]), float(y[0]))
     return np.stack(np.atleast_1d(*transformer.transform(*points)), axis=-1)
 

@@ -101,7 +101,7 @@ def without_gaps(table: Table) -> tuple[Table, FloatArray | None]:
 
 
 def interval_of_fixes(time_s: FloatArray, error_m: FloatArray | None) -> float:
-    """Return the usual time between fixes [s] from the errors of interpolated places; 0 without any."""
+    """Return the median duration of the gaps whose positions were interpolated [s]; 0 without a gap."""
     if error_m is None:
         return 0.0
     known = np.flatnonzero(error_m == 0.0)
