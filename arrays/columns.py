@@ -22,8 +22,9 @@ from arrays.typing import Vector
 
 POSITION_COLUMNS = ("array_x_m", "array_y_m", "array_z_m")
 ROTATION_COLUMNS = ("array_qx", "array_qy", "array_qz", "array_qw")
+LINE = "line"
 NANOTESLA = {"nT": 1.0, "uT": 1e3, "µT": 1e3, "mT": 1e6, "T": 1e9, "mG": 1e2, "G": 1e5}
-SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "iso": 1.0, "hhmmss": 1.0}
+SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "iso": 1.0, "hhmmss": 1.0, "rows": 1.0}
 SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t", "space": " "}
 _CHOICES = {
     "separator": SEPARATORS,
@@ -69,7 +70,7 @@ class LogColumns:
         Name of the column with the time, or with "iso" those of the date and of the time.
     time_unit : str
         "s", "ms", "us", "iso" for instants such as 2026-11-21T12:00:00.5 (UTC by default) and times of day such as
-        09:14:03.5, or "hhmmss" for numbers such as 091403.5.
+        09:14:03.5, "hhmmss" for numbers such as 091403.5, or "rows" for a log without times: one row per second.
     date : str, optional
         Date of the first row, such as 2026-05-12, for a log with times of day only; without it times count from the
         midnight before the first row.
@@ -108,6 +109,11 @@ class LogColumns:
         Numbers, in the unit of the log, and words that mark a missing reading.
     valid : ValidRows, optional
         Rows whose readings count; by default all.
+    names : tuple of str
+        Names of all columns, for a log without a header, or with one that does not fit its rows. The first row is then
+        the first line with a number in each column that is read.
+    line : str, optional
+        Column with the number of the survey line.
     comment, skip : tuple of str
         Beginnings of rows to ignore: comments, and names of survey lines.
     encoding : str, optional
@@ -148,6 +154,8 @@ class LogColumns:
     pose_latency_s: float = 0.0
     dummy: tuple[float | str, ...] = ()
     valid: ValidRows | None = None
+    names: tuple[str, ...] = ()
+    line: str | None = None
     comment: tuple[str, ...] = ("#",)
     skip: tuple[str, ...] = ()
     encoding: str | None = None
@@ -215,7 +223,9 @@ class LogColumns:
 
     @property
     def clock(self) -> tuple[str, ...]:
-        """Column of the time, or those of date and time."""
+        """Column of the time, or those of date and time; empty for a log without times."""
+        if self.time_unit == "rows":
+            return ()
         return (self.time,) if isinstance(self.time, str) else self.time
 
     @property
@@ -282,6 +292,8 @@ class ColumnsTable(Table, kw_only=True):
     pose_latency_s: float = 0.0
     dummy: list[float | str] = msgspec.field(default_factory=list)
     valid: ValidTable | None = None
+    names: list[str] = msgspec.field(default_factory=list)
+    line: str | None = None
     comment: str | list[str] = "#"
     skip: str | list[str] = msgspec.field(default_factory=list)
     encoding: str | None = None

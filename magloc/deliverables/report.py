@@ -90,7 +90,7 @@ def report_html(
 
 def _survey_rows(found: Survey) -> Iterator[tuple[str, str]]:
     rows = found.rows
-    lines = flight_lines(rows.time_s, rows.place_m, found.ground_m)
+    lines = flight_lines(rows.time_s, rows.place_m, found.ground_m, found.named_lines)
     step_m = np.linalg.norm(np.diff(rows.place_m[:, :2], axis=0), axis=1)
     height = rows.place_m[:, 2] - found.ground_m
     speeds = [line.speed_m_s for line in lines] or [0.0]

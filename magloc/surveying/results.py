@@ -164,6 +164,8 @@ class Survey(Result):
     lag_s : float
         Delay of the readings after their poses, estimated from the targets and corrected; 0 if the targets show none.
     seconds : float
+    named_lines : tuple of (float, str)
+        Times [s] at which the lines of the log begin, and their names; empty if the log names none.
 
     Examples
     --------
@@ -191,6 +193,7 @@ class Survey(Result):
     pose_assumed: bool
     lag_s: float
     seconds: float
+    named_lines: tuple[tuple[float, str], ...] = ()
 
     def __len__(self) -> int:
         return len(self.targets)

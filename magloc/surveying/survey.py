@@ -185,6 +185,7 @@ def survey(
         assumed,
         lag.s,
         time.monotonic() - began,
+        rows.lines,
     )
 
 
