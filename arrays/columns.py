@@ -103,6 +103,8 @@ class LogColumns:
     angles : tuple of str, optional
         In place of `quaternion`: columns of yaw, or of yaw, pitch and roll [deg], from north, east, down to forward,
         right, down. The array's axes are forward, left, up. Without an attitude they are those of the world.
+    course : bool
+        In place of an attitude: the array's x axis points along the course over ground. Files only.
     pose_latency_s : float
         Time by which the pose of a row is older than its readings [s].
     dummy : tuple of float and str
@@ -151,6 +153,7 @@ class LogColumns:
     fix: ValidRows | None = None
     quaternion: tuple[str, str, str, str] | None = None
     angles: tuple[str, ...] | None = None
+    course: bool = False
     pose_latency_s: float = 0.0
     dummy: tuple[float | str, ...] = ()
     valid: ValidRows | None = None
@@ -180,7 +183,9 @@ class LogColumns:
             raise ValueError(
                 f"Input angles must be yaw, or yaw, pitch, roll; instead received {len(self.angles)} names."
             )
-        if not self.place and (self.attitude or self.pose_latency_s):
+        if self.course and self.attitude:
+            raise ValueError("Input course must not come together with quaternion or angles.")
+        if not self.place and (self.attitude or self.course or self.pose_latency_s):
             raise ValueError(
                 "Inputs position or geodetic must come with an attitude or a latency; instead received none."
             )
@@ -289,6 +294,7 @@ class ColumnsTable(Table, kw_only=True):
     fix: ValidTable | None = None
     quaternion: tuple[str, str, str, str] | None = None
     angles: list[str] | None = None
+    course: bool = False
     pose_latency_s: float = 0.0
     dummy: list[float | str] = msgspec.field(default_factory=list)
     valid: ValidTable | None = None

@@ -33,6 +33,7 @@ from arrays.logs.lines import line_starts
 from arrays.sensor import Sensor
 from arrays.typing import FloatArray, IntArray
 from magloc.conditioning import NO_BACKGROUND, Background, without_hum
+from magloc.navigation.course import turned_to_course
 from magloc.navigation.fixes import without_gaps
 from magloc.navigation.measured_motion import MOTION_COLUMNS, MeasuredMotion, motion_columns, motion_of_table
 from magloc.navigation.poses import rotations_at, unit_rotation, vectors_at
@@ -277,6 +278,8 @@ def read_readings(
     """
     form = log_format(array, sensors)
     table, error_m = without_gaps(form.table(read_text(path, "a CSV file", form.encoding), str(path)))
+    if array.columns is not None and array.columns.course:
+        table = turned_to_course(table)
     readings = replace(readings_of_table(table, array, sensors), interpolated_m=error_m)
     if array.columns is not None and array.columns.pose_latency_s:
         readings = readings.posed_later(array.columns.pose_latency_s)

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from arrays.typing import FloatArray
+from magloc.navigation.course import chords
 
 _LONGEST_GAP = 20.0  # in usual steps of time
-_CHORD_M = 2.0  # length over which the course is measured
 _TURN_deg = 35.0  # smallest angle between the courses before and after a row of a turn
 _SHORTEST = 3.0  # in chords
 
@@ -75,15 +75,9 @@ def _straight_rows(time_s: FloatArray, place_m: FloatArray) -> Iterator[tuple[st
 
 def _line_starts(xy_m: FloatArray) -> list[int]:
     """Return the first rows of lines in a piece without a gap: its first row, and rows where turns end."""
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy_m, axis=0), axis=1))])
-    chord = min(_CHORD_M, way[-1] / 10.0)
-    if not chord > 0.0:
+    way, back, forth, chord = chords(xy_m)
+    if not chord:
         return [0]
-    way += np.arange(len(way)) * 1e-9 * chord  # rows at rest: interpolation needs increasing abscissae
-    before, here, after = (
-        np.stack([np.interp(way + shift, way, axis) for axis in xy_m.T], axis=-1) for shift in (-chord, 0.0, chord)
-    )
-    back, forth = here - before, after - here
     turn = np.abs(np.arctan2(back[:, 0] * forth[:, 1] - back[:, 1] * forth[:, 0], (back * forth).sum(axis=1)))
     turn[(way < chord) | (way > way[-1] - chord)] = 0.0  # beyond the ends there is no course
     turning = turn > np.radians(_TURN_deg)
