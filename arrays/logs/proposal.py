@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 
 import numpy as np
@@ -17,23 +18,26 @@ from arrays.io.toml import toml_value
 from arrays.logs.lines import cells_of
 from arrays.typing import FloatArray
 
-_HEAD_LINES, _ROWS = 1000, 200
+_HEAD_LINES, _ROWS, _FEWEST_ROWS = 1000, 200, 5
 _MARKS = ("#", "/", "!", "%")
-_LINE_NAME = re.compile(r"(/?(?:line|tie|l|t))\s*-?\d+\s*$", re.IGNORECASE)
+_LINE_NAME = re.compile(r"(/?(?:line|tie|l|t))\s*-?(?:(?<=\s)[A-Za-z]?)\d[\w.:-]*\s*$", re.IGNORECASE)
+_MONTHS = 12
 _EARTH_nT = (20e3, 70e3)
 _NAMES = {
     "date": r"date|datum|gps ?date|utc ?date",
-    "time": r"(gps|utc|system)?[ _]?(time|timestamp|uhrzeit|zeit|clock|counter|utc)|t",
+    "time": r"(gps|utc|system)?[ _]?(time|timestamp|uhrzeit|zeit|clock|counter|utc|tow|seconds)|t|tow",
     "latitude": r"lat(itude)?|breite|gps ?lat(itude)?",
     "longitude": r"lon(g|gitude)?|lng|länge|gps ?lon(gitude)?",
-    "height": r"alt(itude)?|height|elev(ation)?|höhe|z|h|u|up",
+    "height": r"(ell|orth|gps)?[ _.]?(alt(itude)?|height|elev(ation)?|höhe|h)([ _](asl|amsl|msl))?|z|u|up|h[ _]?ell",
+    "above ground": r"(alt(itude)?|height|elev(ation)?|höhe)[ _](agl|(above|over) ground|über grund)|agl|laser",
     "east": r"x|e|east(ing)?|rechtswert|rw|utm[ _]?(e|x|east(ing)?)",
     "north": r"y|n|north(ing)?|hochwert|hw|utm[ _]?(n|y|north(ing)?)",
     "valid": r"(mag)?[ _]?valid",
     "fix": r"fix([ _]?(quality|type))?|gps ?fix|quality",
 }
+_TIME_OF_DAY = re.compile(r"\d:\d\d")
 _UNIT = re.compile(r"\[.*\]|\(.*\)|nT|[uµ]T|m?T|m?G|[mu]?s|h|m|deg|°C?|V|Hz|-")
-_FIELD = re.compile(r"mag|^b\d*[xyz]?$|field|feld|tmi|^nt", re.IGNORECASE)
+_FIELD = re.compile(r"mag|^b\d*[xyz]?$|field|feld|tmi|^nt|^t?f\d*$", re.IGNORECASE)
 _UNIT_OF_NAME = re.compile(r"^(.*?)[ _]*(?:\[([^\]]*)\]|\(([^)]*)\)|_(nT|uT|mT|T|ms|us|s|m|deg))?$")
 
 
@@ -63,7 +67,8 @@ class Proposal:
 
     def toml(self) -> str:
         """Return the text of an array file with the table, and comments with open questions."""
-        lines = [f"# The header is on line {self.header_line}. Columns, with their first values:"]
+        said = "rows begin" if "names" in self.keys else "header is"
+        lines = [f"# The {said} on line {self.header_line}. Columns, with their first values:"]
         lines += [f"#   {name}: {cell}" for name, cell in self.channels.items()]
         lines += [f"# Asked: {question}" for question in self.asked]
         for name, of in self.sensors.items():
@@ -106,6 +111,8 @@ def propose_columns(path: str | PathLike[str]) -> Proposal:
     lines = text.splitlines()[:_HEAD_LINES]
     columns, number, header, rows = _layout(str(path), lines)
     keys |= _text_keys(columns, lines, number)
+    if columns.names:
+        asked.append("the log has no header: what its columns are, by the names that the other keys use")
     cells = {name: [row[i] for row in rows if len(row) > i] for i, name in enumerate(header)}
     channels = {name: next(filter(None, of), "") for name, of in cells.items()}
     values = {name: _numbers(of, columns.decimal) for name, of in cells.items()}
@@ -130,14 +137,35 @@ def _layout(name: str, lines: Sequence[str]) -> tuple[LogColumns, int, list[str]
                 if len(header) < 2 or not _are_names(header, decimal) or (best is not None and header == best[3]):
                     continue
                 rows = [row for row in split[k + 1 : k + 1 + _ROWS] if len(header) / 2 <= len(row) <= len(header)]
-                counts = [int(np.isfinite(_numbers(row, decimal)).sum()) for row in rows]
+                counts = [_filled(row, decimal) for row in rows]
                 score = int(np.median(counts)) if counts else 0
                 is_lower = best is not None and best[1] is columns and score == best[0]  # than a line of the preamble
                 if score > 1 and (best is None or score > best[0] or is_lower):
                     best = (score, columns, k + 1, header, [row for row, n in zip(rows, counts, strict=True) if n])
     if best is None:
-        raise InputError(f"{name}: found no names with rows of numbers below them, expected the text of a logger.")
+        return _layout_without_names(name, lines)
     return best[1:]
+
+
+def _layout_without_names(name: str, lines: Sequence[str]) -> tuple[LogColumns, int, list[str], list[list[str]]]:
+    """Return separator, first line, made names and rows of a log without a header."""
+    for separator, decimal in itertools.product(("semicolon", "tab", "comma", "space"), (".", ",")):
+        if (separator, decimal) == ("comma", ","):
+            continue
+        columns = LogColumns(separator=separator, decimal=decimal, comment=_MARKS)
+        split = [cells_of(line, columns) for line in lines]
+        n = int(np.median([len(row) for row in split if row] or [0]))
+        numbers = [_filled(row, decimal) if len(row) == n else 0 for row in split]
+        rows = [row for row, k in zip(split, numbers, strict=True) if k >= max(2, n // 2)]
+        if n > 1 and len(rows) >= _FEWEST_ROWS and 2 * len(rows) > len(lines):
+            names = [f"c{i}" for i in range(1, n + 1)]
+            return replace(columns, names=tuple(names)), split.index(rows[0]) + 1, names, rows[:_ROWS]
+    raise InputError(f"{name}: found no names with rows of numbers below them, expected the text of a logger.")
+
+
+def _filled(row: Sequence[str], decimal: str) -> int:
+    """Return the number of cells of a row that are numbers or times of day."""
+    return int(np.isfinite(_numbers(row, decimal)).sum()) + sum(bool(_TIME_OF_DAY.search(cell)) for cell in row)
 
 
 def _are_names(cells: Sequence[str], decimal: str) -> bool:
@@ -150,6 +178,7 @@ def _are_names(cells: Sequence[str], decimal: str) -> bool:
 def _text_keys(columns: LogColumns, lines: Sequence[str], number: int) -> dict[str, object]:
     keys: dict[str, object] = {} if columns.separator == "comma" else {"separator": columns.separator}
     keys |= {} if columns.decimal == "." else {"decimal": columns.decimal}
+    keys |= {"names": columns.names} if columns.names else {}
     below = [line.strip() for line in lines[number:]]
     marks = [mark for mark in _MARKS if any(line.startswith(mark) for line in (lines[number - 1].strip(), *below))]
     if marks and marks != ["#"]:
@@ -194,8 +223,13 @@ def _propose_time(
         if date is not None:
             keys["time"] = (date, time)
         instant = channels[date] if date is not None else channels[time]
-        if re.match(r"\d{1,2}[./-]\d{1,2}[./-]\d{4}", instant):
-            asked.append(f"does {instant} begin with the day? day_first = true or false")
+        if re.match(r"\d{1,2}[./-]\d{1,2}[./-]\d{2,4}", instant):
+            if "." in instant.split(" ")[0] or int(re.split(r"[./-]", instant)[0]) > _MONTHS:
+                keys["day_first"] = True  # no format with points begins with the month
+            elif int(re.split(r"[./-]", instant)[1]) > _MONTHS:
+                keys["day_first"] = False
+            else:
+                asked.append(f"does {instant} begin with the day? day_first = true or false")
         elif not re.match(r"\d{4}", instant):
             asked.append('the date of the first row, if it matters: date = "2026-05-12"')
     elif _unit(time) in ("s", "ms", "us"):
@@ -209,7 +243,8 @@ def _propose_time(
 def _propose_places(
     header: Sequence[str], values: dict[str, FloatArray], keys: dict[str, object], asked: list[str]
 ) -> None:
-    height = _find(header, "height")
+    ground = _find(header, "above ground")
+    height = ground or _find(header, "height")
     for key, kinds in (("geodetic", ("latitude", "longitude")), ("position", ("east", "north"))):
         names = [_find(header, kind) for kind in kinds]
         if None in names:
@@ -217,11 +252,15 @@ def _propose_places(
         place = np.array([values[name] for name in names if name is not None])
         place = place[:, (np.isfinite(place) & (place != 0.0)).all(axis=0)]
         keys[key] = tuple(name for name in (*names, height) if name is not None)
-        if height is None:
+        if ground is not None:
+            keys["height_is"] = "ground"
+        elif height is None:
             asked.append("the height of the array above the ground: height_m = 0.4")
         if key == "geodetic" and place.size:
-            keys["origin"] = (round(float(place[0, 0]), 5), round(float(place[1, 0]), 5), 0.0)
-            asked.append("the origin of the world's frame is put at the first place: its height, the third number")
+            heights = np.zeros(1) if height is None or ground is not None else values[height]
+            first = float(next(iter(heights[np.isfinite(heights)]), 0.0))
+            keys["origin"] = (round(float(place[0, 0]), 5), round(float(place[1, 0]), 5), round(first, 2))
+            asked.append("the origin of the world's frame is put at the first place. --ground-m counts from its height")
         elif place.size and np.abs(place).max() > 1e4:
             asked.append('which grid are these places of? crs = "EPSG:32633" for UTM zone 33 north; and an origin')
         return
@@ -249,13 +288,17 @@ def _sensors(
     for group in groups:
         modulus = _modulus(values, group)
         stated = _unit(group[0])
-        likely = ("nT", "uT", "G", "mG") if not stated and _FIELD.search(group[0]) else ()
+        likely = (
+            ("nT", "uT", "G", "mG") if not stated and _FIELD.search(group[0]) else ("nT",) if "names" in keys else ()
+        )
         for unit in (stated,) if stated in NANOTESLA else likely:
             if _EARTH_nT[0] < modulus * NANOTESLA[unit] < _EARTH_nT[1]:
                 units[group] = unit
                 break
     if not units:
-        asked.append("no column reads like the Earth's field: name those of the sensors")
+        near = [name for name in free if _EARTH_nT[0] < _modulus(values, (name,)) < _EARTH_nT[1]]
+        hint = f" (in nT it could be {' or '.join(near)})" if near else ""
+        asked.append(f"no column reads like the Earth's field: name those of the sensors{hint}")
         return {}
     unit = next(iter(units.values()))
     if any(not _unit(group[0]) for group in units):

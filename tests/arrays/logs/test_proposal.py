@@ -30,6 +30,8 @@ LOGS = {
     "preamble": ("Logger of mine;\nserial;12;\n\nTime [ms];East;North;Height;Mag [nT];", "{ms};{1};{2};{3};{4};"),
     "remarks": ("/some words about it all\n/ X  Y  elev  nT  time_s\n/line 1", " {1} {2}  {3} {4} {0:.1f} "),
     "lines": ("Time;X;Y;Z;Mag\nh;m;m;m;nT\nLine 10", "{clock};{1};{2};{3};{4}"),
+    "words": ("TOW [s],x,y,Height above ground [m],TF", "{0:.1f},{1},{2},{3},{4}"),
+    "named lines": ("/ X Y ALT UTC TMI\n/====\nLine  L1000", " {1} {2} {3} {clock} {4}"),
     "tabs": ("Zeit [s]\tRechtswert\tHochwert\tHöhe\tFeldstärke [nT]", "{0:.1f}\t{1}\t{2}\t{3}\t{4}"),
 }
 
@@ -47,6 +49,27 @@ class TestProposal:
         assert found.array_position_m is not None
         np.testing.assert_allclose(found.array_position_m, true[:, 1:4])
         np.testing.assert_allclose(1e9 * found.values_T[:, 0], true[:, 4])
+
+    @pytest.mark.parametrize(
+        ("day", "day_first"),
+        [("12.05.2026", True), ("13/05/2026", True), ("05/13/26", False), ("05/12/2026", None)],
+    )
+    def test_order_of_a_date(self, day: str, day_first: bool | None, tmp_path: Path) -> None:
+        found = propose_columns(written(tmp_path, "Date,Time,Mag", f"{day},{{clock}},{{4}}"))
+        assert found.keys.get("day_first") == day_first
+        assert any("begin with the day" in question for question in found.asked) == (day_first is None)
+
+    def test_height_above_the_ground(self, tmp_path: Path) -> None:
+        path = written(tmp_path, "time_s,Lat,Lon,Altitude,Altitude AGL,Mag", "{0:.1f},48.1,11.5,521.5,1.5,{4}")
+        found = propose_columns(path).keys
+        assert (found["geodetic"], found["height_is"]) == (("Lat", "Lon", "Altitude AGL"), "ground")
+        assert found["origin"] == (48.1, 11.5, 0.0)
+
+    def test_a_log_without_a_header(self, tmp_path: Path) -> None:
+        """Columns have numbers as names, and the one with the Earth's field is found."""
+        found = propose_columns(written(tmp_path, "/ me", "M1;{0:.1f};{1};{4}"))
+        assert (found.keys["names"], found.sensors, found.header_line) == (("c1", "c2", "c3", "c4"), {"s1": "c4"}, 2)
+        assert any("no header" in question for question in found.asked)
 
     def test_vectors_and_their_unit(self, tmp_path: Path) -> None:
         path = written(tmp_path, "time_s,B1x [uT],B1y [uT],B1z [uT],Temp", "{0:.1f},{1},{2},40,31")
