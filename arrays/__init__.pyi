@@ -4,6 +4,7 @@ from arrays.array_file import read_array as read_array
 from arrays.array_file import read_sensors as read_sensors
 from arrays.array_file import write_array as write_array
 from arrays.columns import LogColumns as LogColumns
+from arrays.columns import Track as Track
 from arrays.columns import ValidRows as ValidRows
 from arrays.geometries import GEOMETRIES as GEOMETRIES
 from arrays.geometries import axial as axial
@@ -16,6 +17,7 @@ from arrays.geometries import tetrahedron as tetrahedron
 from arrays.instruments.templates import Instrument as Instrument
 from arrays.instruments.templates import instrument_names as instrument_names
 from arrays.instruments.templates import read_instrument as read_instrument
+from arrays.instruments.templates import read_track as read_track
 from arrays.io.errors import InputError as InputError
 from arrays.meshes import mesh_of as mesh_of
 from arrays.pose import PoseUncertainty as PoseUncertainty

@@ -56,6 +56,28 @@ class ValidRows:
     equals: tuple[float, ...]
 
 
+@dataclass(frozen=True)
+class Track:
+    """Positions of a log in another file.
+
+    Attributes
+    ----------
+    path : str
+    columns : LogColumns
+        Columns of that file, with `geodetic` or `position`. Its clock is that of the log.
+
+    Examples
+    --------
+    >>> import arrays
+    >>> where = arrays.LogColumns(geodetic=("Lat", "Lon", "Alt"))
+    >>> arrays.LogColumns(track=arrays.Track("drone.csv", where)).is_placed
+    True
+    """
+
+    path: str
+    columns: LogColumns
+
+
 @dataclass(frozen=True, kw_only=True)
 class LogColumns:
     """Columns of a log of another program.
@@ -74,6 +96,8 @@ class LogColumns:
     date : str, optional
         Date of the first row, such as 2026-05-12, for a log with times of day only; without it times count from the
         midnight before the first row.
+    time_offset_s : float
+        Number of seconds to add to the times, such as -18 from the time of GPS to UTC.
     day_first : bool, optional
         True if dates such as 12/05/2026 begin with the day.
     unit : str or float
@@ -85,6 +109,8 @@ class LogColumns:
         Columns of the array's position [m], in a world frame whose z points up; two with `height_m`.
     geodetic : tuple of 2 or 3 str, optional
         In place of `position`: columns of latitude, longitude [deg] and, without `height_m`, height [m].
+    track : Track, optional
+        In place of `position`: another file with the positions.
     crs : str, optional
         Coordinate system, such as "EPSG:32633", of easting and northing in `position`, or of latitude and longitude in
         `geodetic`. The world frame is east, north, up of the origin; convergence and scale of the grid are corrected.
@@ -142,9 +168,11 @@ class LogColumns:
     unit: str | float = "nT"
     sensors: dict[str, str | tuple[str, ...]] = field(default_factory=dict, hash=False)
     date: str | None = None
+    time_offset_s: float = 0.0
     day_first: bool | None = None
     position: tuple[str, ...] | None = None
     geodetic: tuple[str, ...] | None = None
+    track: Track | None = None
     origin: Vector | None = None
     crs: str | None = None
     height_m: float | None = None
@@ -185,15 +213,23 @@ class LogColumns:
             )
         if self.course and self.attitude:
             raise ValueError("Input course must not come together with quaternion or angles.")
-        if not self.place and (self.attitude or self.course or self.pose_latency_s):
+        if self.track is not None and self.place:
+            raise ValueError("Input track must not come together with position or geodetic.")
+        if not self.is_placed and (self.attitude or self.course or self.pose_latency_s):
             raise ValueError(
                 "Inputs position or geodetic must come with an attitude or a latency; instead received none."
             )
         if self.origin is not None and not self.is_geodetic:
             raise ValueError("Input origin must come with geodetic or crs; instead received neither.")
-        numbers = (self.pose_latency_s, self.height_m or 0.0, *(self.origin or ()), *(self.antenna_m or ()))
+        numbers = (
+            self.pose_latency_s,
+            self.time_offset_s,
+            self.height_m or 0.0,
+            *(self.origin or ()),
+            *(self.antenna_m or ()),
+        )
         if not np.isfinite(numbers).all():
-            names = "origin, height_m, antenna_m and pose_latency_s"
+            names = "origin, height_m, antenna_m, time_offset_s and pose_latency_s"
             raise ValueError(f"Inputs {names} must be finite; instead received {numbers}.")
 
     def _refuse_places(self) -> None:
@@ -202,7 +238,7 @@ class LogColumns:
             if (names := getattr(self, name)) is not None and len(names) != n:
                 why = "without height_m" if n == 3 else "with height_m"
                 raise ValueError(f"Input {name} must have {n} names {why}; instead received {len(names)}.")
-        of_places = (self.height_m, self.fix, self.crs, self.antenna_m)
+        of_places = (self.height_m, self.fix, self.crs, None if self.track else self.antenna_m)
         if not self.place and of_places != (None,) * len(of_places):
             names = "height_m, fix, crs and antenna_m"
             raise ValueError(f"Inputs {names} must come with position or geodetic; instead received neither.")
@@ -239,14 +275,21 @@ class LogColumns:
         return self.position or self.geodetic or ()
 
     @property
+    def is_placed(self) -> bool:
+        """True if the log has positions, or another file has them."""
+        return bool(self.place) or self.track is not None
+
+    @property
     def is_geodetic(self) -> bool:
         """True if positions are latitudes and longitudes, or coordinates of a grid."""
-        return self.geodetic is not None or self.crs is not None
+        columns = self if self.track is None else self.track.columns
+        return columns.geodetic is not None or columns.crs is not None
 
     @property
     def above_ground(self) -> bool:
         """True if heights count from the ground."""
-        return self.height_m is not None or self.height_is == "ground"
+        columns = self if self.track is None else self.track.columns
+        return columns.height_m is not None or columns.height_is == "ground"
 
     @property
     def attitude(self) -> tuple[str, ...]:
@@ -283,6 +326,7 @@ class ColumnsTable(Table, kw_only=True):
     unit: str | float = "nT"
     sensors: dict[str, str | list[str]] = msgspec.field(default_factory=dict)
     date: str | None = None
+    time_offset_s: float = 0.0
     day_first: bool | None = None
     position: list[str] | None = None
     geodetic: list[str] | None = None
@@ -330,10 +374,10 @@ def _frozen(value: Any) -> Any:
 
 
 def columns_toml(columns: LogColumns) -> list[str]:
-    """Return the lines of the table in an array file, without values that are those by default."""
+    """Return the lines of the table in an array file, without values that are those by default, and without a track."""
     by_default = LogColumns()
     own = {each.name: getattr(columns, each.name) for each in fields(columns) if each.name != "sensors"}
-    own = {key: value for key, value in own.items() if value != getattr(by_default, key)}
+    own = {key: value for key, value in own.items() if value != getattr(by_default, key) and key != "track"}
     lines = ["", "[columns]", *(f"{key} = {_toml(value)}" for key, value in own.items())]
     if columns.sensors:
         lines += ["", "[columns.sensors]", *(f"{_toml(key)} = {_toml(of)}" for key, of in columns.sensors.items())]

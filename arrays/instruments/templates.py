@@ -1,6 +1,7 @@
 """Array files for the logs of known instruments.
 
-A template is a TOML file in this folder with the keys of an array file, and in addition:
+A template is a TOML file in this folder, or in ``tracks`` for positions only. It has the keys of an array file, and in
+addition:
 
 - ``title``, and ``source``, the public document or sample that shows the format; ``secondary = true`` if that is not
   the maker's own.
@@ -19,19 +20,21 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
+from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from arrays.array import SensorArray
 from arrays.array_file import array_of_table
-from arrays.columns import LogColumns
+from arrays.columns import ColumnsTable, LogColumns, Track
 from arrays.io.errors import InputError
 from arrays.io.text import read_text
 from arrays.io.toml import BuiltIn, File, read_toml, section_of
 from arrays.logs.lines import cells_of
 
 _TEMPLATES = BuiltIn("arrays", "instruments", "instrument")
+_TRACKS = BuiltIn("arrays", "instruments/tracks", "log of positions")
 _CHARACTERS = 2**20
 _LINES = 1000  # at the begin of a log that may hold its header
 _RULES = ("every_sensor", "row")
@@ -138,13 +141,52 @@ def read_instrument(name: str) -> Instrument:
     >>> arrays.read_instrument("gsm19").title
     'GEM Systems GSM-19'
     """
-    path = _TEMPLATES.chosen(name.lower())
+    return _instrument(name.lower(), _TEMPLATES.chosen(name.lower()))
+
+
+def _instrument(name: str, path: Path) -> Instrument:
+    """Return the template in a file."""
     table = read_toml(path, "a template")
     keys = {key: table[key] for key in _OWN_KEYS if key in table}
     own = section_of(str(path), keys, _Template)
     common = {key: value for key, value in table.items() if key not in _OWN_KEYS}
     layouts = tuple(_merge(common, layout) for layout in own.layout)
-    return Instrument(name.lower(), own.title, own.source, own.secondary, own.add, layouts)
+    return Instrument(name, own.title, own.source, own.secondary, own.add, layouts)
+
+
+def read_track(path: str | PathLike[str]) -> Track:
+    """Return a log of positions, for :attr:`arrays.LogColumns.track`.
+
+    Parameters
+    ----------
+    path : str or path-like
+        Solution of RTKLIB or Emlid (.pos).
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, or has another format.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> import arrays
+    >>> names = "%  GPST                  latitude(deg) longitude(deg)  height(m)   Q  ns"
+    >>> row = "2026/05/12 09:14:21.000   52.41000001   13.12000002    41.400   1  12"
+    >>> _ = Path("walk.pos").write_text(names + chr(10) + row)
+    >>> arrays.read_track("walk.pos").columns.time_offset_s
+    -18.0
+    """
+    text = read_text(path, "a log of positions")
+    titles = []
+    for name in _TRACKS.names():
+        template = _instrument(name, _TRACKS.path(name))
+        titles.append(template.title)
+        for layout in template._layouts:
+            if (fitted := _fit(layout, text)) is not None:
+                table = section_of(f"track {name}", fitted["columns"], ColumnsTable)
+                return Track(str(path), table.columns(f"track {name}", {}))
+    raise InputError(f"{path}: found no log of positions, expected one of {', '.join(titles)}.")
 
 
 def _merge(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
@@ -187,11 +229,12 @@ def _fit(table: Mapping[str, Any], text: str) -> dict[str, Any] | None:
     if re.search(table.get("row", ""), text[:_CHARACTERS], flags=re.MULTILINE) is None:
         return None
     form = LogColumns(**{key: _tuple(columns[key]) for key in ("separator", "comment") if key in columns})
-    for header in _headers(text, form):
+    wanted = columns.get("sensors", {})
+    for header in [columns["names"]] if "names" in columns else _headers(text, form):
         if all(_name(names, header) for names in _required(columns)):
-            sensors = {id_: _names(of, header) for id_, of in columns["sensors"].items()}
+            sensors = {id_: _names(of, header) for id_, of in wanted.items()}
             sensors = {id_: names for id_, names in sensors.items() if names is not None}
-            if len(sensors) == len(columns["sensors"]) or (sensors and not table.get("every_sensor")):
+            if len(sensors) == len(wanted) or (sensors and not table.get("every_sensor")):
                 fitted = {key: _names(value, header) for key, value in columns.items() if key != "sensors"}
                 fitted = {key: columns[key] if value is None else value for key, value in fitted.items()}
                 for key in _OPTIONAL:
@@ -199,7 +242,7 @@ def _fit(table: Mapping[str, Any], text: str) -> dict[str, Any] | None:
                         del fitted[key]
                     elif key in columns:
                         fitted[key] = found
-                present = [of for of in table["sensor"] if of["id"] in sensors]
+                present = [of for of in table.get("sensor", ()) if of["id"] in sensors]
                 keys = {key: value for key, value in table.items() if key not in _RULES}
                 return {**keys, "sensor": present, "columns": {**fitted, "sensors": sensors}}
     return None

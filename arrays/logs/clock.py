@@ -64,12 +64,14 @@ def seconds_of_rows(table: Table, columns: LogColumns, *, is_file: bool) -> Floa
     else:
         time_s = SECONDS[columns.time_unit] * stamps
     of_day = bool(columns.time_unit in ("iso", "hhmmss") and (np.abs(time_s) < _DAY_S + 1.0).all())
-    date_s = float(unix_seconds("", columns.date)) if columns.date is not None else 0.0
+    date_s = columns.time_offset_s
+    if columns.date is not None:
+        date_s += float(unix_seconds("", columns.date))
     if columns.date is not None and not of_day:
         if len(time_s) and not -_DAY_S < time_s[0] - date_s < 2.0 * _DAY_S:
             found = date_of(time_s[0]) if columns.time_unit == "iso" else "no times of day"
             raise InputError(f"{table.header_place(name)}: found {found}, expected the date {columns.date}.")
-        date_s = 0.0
+        date_s = columns.time_offset_s
     if not is_file:
         return time_s + date_s
     days = np.cumsum(np.diff(time_s, prepend=time_s[:1]) < -_DAY_S / 2.0) if of_day else np.zeros(len(time_s))

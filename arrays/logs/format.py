@@ -10,7 +10,7 @@ from os import PathLike
 
 import numpy as np
 
-from arrays.columns import LINE, POSITION_COLUMNS, ROTATION_COLUMNS, SECONDS, SEPARATORS, LogColumns
+from arrays.columns import LINE, POSITION_COLUMNS, ROTATION_COLUMNS, SECONDS, SEPARATORS, LogColumns, Track
 from arrays.io.csv import DUMMY, Table, table_of_header, table_of_text
 from arrays.io.dummies import dummy_cells, may_be_dummies
 from arrays.io.errors import InputError
@@ -173,7 +173,9 @@ class LogFormat:
         found["time_s"] = seconds_of_rows(logged, columns, is_file=is_file)
         if columns.place:
             found |= zip(POSITION_COLUMNS, positions(logged, columns, is_file=is_file).T, strict=True)
-        if columns.attitude or (columns.place and not set(ROTATION_COLUMNS) & found.keys()):
+        elif columns.track is not None:
+            found |= zip(POSITION_COLUMNS, _positions_of_track(found["time_s"], columns, columns.track).T, strict=True)
+        if columns.attitude or (columns.is_placed and not set(ROTATION_COLUMNS) & found.keys()):
             found |= zip(ROTATION_COLUMNS, quaternions(logged, columns).T, strict=True)
         if columns.antenna_m is not None:
             if np.any(columns.antenna_m[:2]) and not (columns.attitude or set(ROTATION_COLUMNS) <= index.keys()):
@@ -206,6 +208,8 @@ def log_origin(path: str | PathLike[str], columns: LogColumns) -> Vector:
     InputError
         The log cannot be read, or has no place.
     """
+    if columns.track is not None:
+        return log_origin(columns.track.path, columns.track.columns)
     for table in _begins(path, columns):
         place = geodetic_places(table, columns, is_file=True)
         known = place[np.isfinite(place).all(axis=1)]
@@ -217,8 +221,31 @@ def log_origin(path: str | PathLike[str], columns: LogColumns) -> Vector:
 
 def log_date(path: str | PathLike[str], columns: LogColumns) -> str | None:
     """Return the date of the first row of a log, such as 2026-05-12; None if its times have no date."""
-    table = next(_begins(path, replace(columns, sensors={})))
+    table = next(_begins(path, columns))
     return date_of(float(seconds_of_rows(table, columns, is_file=False)[0]))
+
+
+def _positions_of_track(time_s: FloatArray, columns: LogColumns, track: Track) -> FloatArray:
+    """Return positions (n, 3) [m] in the rows nearest to the positions of another file, and NaN in the others."""
+    form = LogFormat({}, replace(track.columns, origin=columns.origin), "a header", ())
+    table = form.table(read_text(track.path, "a log of positions", track.columns.encoding), track.path)
+    at = [table.header.index(name) for name in ("time_s", *POSITION_COLUMNS)]
+    fixes = table.values[:, at][np.isfinite(table.values[:, at]).all(axis=1)]
+    fixes = fixes[np.argsort(fixes[:, 0], kind="stable")]
+    place = np.full((len(time_s), 3), np.nan)
+    inside = np.flatnonzero((time_s >= fixes[:1, 0].sum()) & (time_s <= fixes[-1:, 0].sum()))
+    if not len(fixes) or not len(inside):
+        span = f"{fixes[0, 0]:.0f} to {fixes[-1, 0]:.0f} s" if len(fixes) else "no position"
+        raise InputError(
+            f"{track.path}: found {span}, expected positions from {time_s[0]:.0f} to {time_s[-1]:.0f} s, the times of"
+            " the log: state its date (--date), or time_offset_s between both clocks."
+        )
+    inside = inside[np.argsort(time_s[inside], kind="stable")]
+    after = np.clip(np.searchsorted(time_s[inside], fixes[:, 0]), 1, max(len(inside) - 1, 1))
+    rows = np.clip(np.concatenate([after - 1, after]), 0, len(inside) - 1)  # before and after each position
+    rows = inside[np.unique(rows)]
+    place[rows] = np.column_stack([np.interp(time_s[rows], fixes[:, 0], axis) for axis in fixes[:, 1:].T])
+    return place
 
 
 def _begins(path: str | PathLike[str], columns: LogColumns) -> Iterator[Table]:

@@ -280,9 +280,9 @@ class KnownOptions:
         if columns.is_geodetic and columns.origin is None:
             from arrays.io.world_maps import place_in_words
 
-            origin = log_origin(log, columns)
+            origin, placed = log_origin(log, columns), log if columns.track is None else columns.track.path
             array = replace(array, columns=replace(columns, origin=origin))
-            note(f"note: the origin of the world frame is the first place of {log}: {place_in_words(origin)}")
+            note(f"note: the origin of the world frame is the first place of {placed}: {place_in_words(origin)}")
         date = self.date
         is_known = array.ambient_T is not None or array.ambient_world_T is not None
         if date is None and array.channel_is_scalar.any() and not is_known:
@@ -342,10 +342,13 @@ class LogOptions:
         Array file (TOML). Beside --instrument it needs only the keys that differ from the template.
     instrument : str
         Instrument that wrote the log, such as magarrow or gsm19, in place of --array. An unknown name lists all.
+    positions : Path
+        Positions of the log in another file, in place of its own: a solution of RTKLIB or Emlid (.pos).
     """
 
     array: Path | None = None
     instrument: str | None = None
+    positions: Path | None = None
 
     @property
     def name(self) -> str:
@@ -354,6 +357,16 @@ class LogOptions:
 
     def sensors(self, log: Path) -> SensorArray:
         """Return the array, also of a single sensor, that the options state for a log."""
+        array = self._sensors(log)
+        if self.positions is None:
+            return array
+        own = arrays.LogColumns() if array.columns is None else array.columns
+        nothing: dict[str, Any] = dict.fromkeys(("position", "geodetic", "crs", "height_m", "fix"))
+        with naming("--positions"):
+            columns = replace(own, **nothing, height_is="ellipsoid", track=arrays.read_track(self.positions))
+        return replace(array, columns=columns)
+
+    def _sensors(self, log: Path) -> SensorArray:
         if self.instrument is None:
             if self.array is None:
                 raise InputError("--array: found neither --array nor --instrument, expected one of them.")

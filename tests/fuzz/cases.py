@@ -37,6 +37,8 @@ LINES: dict[str, tuple[str, ...]] = {
         "ground.csv --array ground-array.toml --json",
         "ground.csv --array ground-array.toml --ground-m -0.1 --region=z>-2 --out out",
         "ground.csv --array ground-array.toml --region=z>-0.3 --threads 1 --json",
+        "magarrow.csv --instrument magarrow --place 48 11 500 --json",
+        "magarrow.csv --instrument magarrow --positions magarrow.pos --place 48 11 500 --json",
     ),
     "magloc locate": (
         "readings.csv --array array.toml --json",
@@ -332,13 +334,18 @@ def _write_log(folder: Path) -> None:
 
 
 def _write_magarrow(folder: Path) -> None:
-    """The readings of the survey as a MagArrow logs them."""
+    """The readings of the survey as a MagArrow logs them, and the positions as RTKLIB computes them."""
     table = np.genfromtxt(folder / "ground.csv", delimiter=",", names=True)
     rows = ["Counter,Date,Time,Latitude,Longitude,Mag, MagValid,Altitude"]
     for k, (t, x, y, z, mag) in enumerate(zip(*(table[name] for name in _OF_GROUND), strict=True)):
         place = f"{48.0 + y / 111e3:.9f},{11.0 + x / 74e3:.9f}"
         rows.append(f"{k},2026/04/25,09:40:{t:06.3f},{place},{mag:.3f},1,{500.0 + z:.3f}")
     (folder / "magarrow.csv").write_text("\n".join(rows) + "\n")
+    cells = [row.split(",") for row in rows[1:]]
+    solution = [f"2026/04/25 {row[2]} {row[3]} {row[4]} {row[7]} 1 12" for row in cells]
+    (folder / "magarrow.pos").write_text(
+        "\n".join(["%  UTC latitude(deg) longitude(deg) height(m) Q ns", *solution, ""])
+    )
 
 
 def _write_scalars(folder: Path) -> None:

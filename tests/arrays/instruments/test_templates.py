@@ -247,3 +247,59 @@ def test_a_constant_height_replaces_a_column_of_heights(tmp_path: Path) -> None:
     columns = arrays.read_instrument("magarrow").array(tmp_path / "log.csv", tmp_path / "keys.toml").columns
     assert columns is not None
     assert (columns.geodetic, columns.height_m) == (("Latitude", "Longitude"), 0.5)
+
+
+class TestTracks:
+    """Positions of RTKLIB, 5 a second, for a log of 20 rows a second."""
+
+    HEAD = (
+        "% program   : RTKLIB\n%  {scale}                  latitude(deg) longitude(deg)  height(m)   Q  ns   sdn(m)\n"
+    )
+
+    def read(self, folder: Path, scale: str = "UTC", date: str = "2026-04-25") -> magloc.Readings:
+        pytest.importorskip("pymap3d")
+        lines = [self.HEAD.format(scale=scale)]
+        for k in range(-3, 13):
+            day = datetime.datetime.fromtimestamp(T0 + 0.2 * k + 18.0 * (scale == "GPST"), datetime.UTC)
+            place = f"{48.1372 + 2e-6 * k:.9f}   11.575500000    521.5000"
+            lines.append(f"{day:%Y/%m/%d %H:%M:%S.%f}   {place}   {5 if k in (4, 5) else 1}  12   0.0100\n")
+        (folder / "walk.pos").write_text("".join(lines), encoding="utf-8")
+        rows = [
+            f"{datetime.datetime.fromtimestamp(T0 + 0.05 * k, datetime.UTC):%H:%M:%S.%f},48500\n" for k in range(80)
+        ]
+        (folder / "log.csv").write_text("t,F\n" + "".join(rows), encoding="utf-8")
+        columns = arrays.LogColumns(
+            time="t",
+            time_unit="iso",
+            date=date,
+            sensors={"m": "F"},
+            origin=(48.1372, 11.5755, 520.0),
+            track=arrays.read_track(folder / "walk.pos"),
+        )
+        array = arrays.SensorArray((arrays.Sensor("m", "scalar", (0.0, 0.0, 0.0), 1e-10),), columns=columns)
+        return magloc.read_readings(folder / "log.csv", array)
+
+    @pytest.mark.parametrize("scale", ["UTC", "GPST"])
+    def test_places_the_rows_of_a_log(self, scale: str, tmp_path: Path) -> None:
+        """Rows after the last solution are left out; those without a solution have an error."""
+        found = self.read(tmp_path, scale)
+        assert found.array_position_m is not None
+        assert found.interpolated_m is not None
+        after_s = found.time_s - T0
+        assert after_s[-1] == pytest.approx(2.4, abs=0.051)
+        north = 2e-6 / 0.2 * after_s * 111_200.0
+        np.testing.assert_allclose(
+            found.array_position_m, np.stack([0.0 * north, north, 0.0 * north + 1.5], 1), atol=2e-3
+        )
+        assert found.interpolated_m.shape == after_s.shape
+
+    def test_clocks_apart(self, tmp_path: Path) -> None:
+        with pytest.raises(
+            arrays.InputError, match=r"walk\.pos: found 1777\d+ to 1777\d+ s, expected positions from 1774"
+        ):
+            self.read(tmp_path, date="2026-03-25")
+
+    def test_another_file(self, tmp_path: Path) -> None:
+        (tmp_path / "log.csv").write_text(MAGARROW, encoding="utf-8")
+        with pytest.raises(arrays.InputError, match="expected one of RTKLIB and Emlid"):
+            arrays.read_track(tmp_path / "log.csv")
