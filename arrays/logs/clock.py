@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import logging
 import re
+from functools import lru_cache
 
 import numpy as np
 
@@ -16,6 +17,8 @@ from arrays.typing import FloatArray
 
 _LOG = logging.getLogger(__name__)
 _TIME_OF_DAY = re.compile(r"(\d{1,2}):(\d{2})(?::(\d{2}(?:[.,]\d*)?))?")
+_MINUTE = re.compile(r"(?:^|[T ])\d{1,2}:\d{2}$")
+_SECONDS = re.compile(r"[0-5]\d(?:[.,]\d*)?")
 _OTHER_DATE = re.compile(r"(\d{1,2})[./-](\d{1,2})[./-](\d{4}|\d{2})(?!\d)[T ]*")
 _NAMED_MONTH = re.compile(r"(\d{1,2})[ ./-]*([A-Za-z]{3})[a-z]*[ ./-]*(\d{4}|\d{2})(?!\d)[T ]*")
 _MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
@@ -27,6 +30,24 @@ _FIRST_DATE_S = 3e8  # before it, 1979, clocks count from their own start
 def seconds_of_cell(place: str, cell: str, columns: LogColumns) -> str:
     """Return seconds since 1970 of an instant, or since midnight of a time of day, as text."""
     text = cell.strip()
+    minute, _, within = text.rpartition(":")
+    if _SECONDS.fullmatch(within) and _MINUTE.search(minute):
+        minute_s = _seconds_of_minute(minute, columns.day_first)
+        if minute_s is not None:
+            return repr(minute_s + float(within.replace(",", ".")))
+    return _seconds_of_instant(place, text, columns.day_first)
+
+
+@lru_cache(maxsize=16)
+def _seconds_of_minute(minute: str, day_first: bool | None) -> float | None:
+    """Return the seconds of the begin of a minute, cached because many rows share it; None if it is none."""
+    try:
+        return float(_seconds_of_instant("", f"{minute}:00", day_first))
+    except InputError:
+        return None
+
+
+def _seconds_of_instant(place: str, text: str, day_first: bool | None) -> str:
     if found := _TIME_OF_DAY.fullmatch(text):
         hours, minutes, seconds = int(found[1]), int(found[2]), float((found[3] or "0").replace(",", "."))
         if hours < 24 and minutes < 60 and seconds < 61.0:
@@ -34,12 +55,12 @@ def seconds_of_cell(place: str, cell: str, columns: LogColumns) -> str:
     if (found := _NAMED_MONTH.match(text)) and found[2].lower() in _MONTHS:
         text = _iso(found[3], _MONTHS.index(found[2].lower()) + 1, found[1], text[found.end() :])
     elif found := _OTHER_DATE.match(text):
-        if columns.day_first is None:
+        if day_first is None:
             raise InputError(
                 f"{place}: found {text!r}, which may begin with the day or the month, expected day_first = true or"
                 " false in the table columns of the array file."
             )
-        day, month = (found[1], found[2]) if columns.day_first else (found[2], found[1])
+        day, month = (found[1], found[2]) if day_first else (found[2], found[1])
         text = _iso(found[3], int(month), day, text[found.end() :])
     return unix_seconds(place, text)
 
