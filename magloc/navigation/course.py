@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from arrays.columns import POSITION_COLUMNS, ROTATION_COLUMNS
+from arrays.columns import POSITION_COLUMNS, ROTATION_COLUMNS, LogColumns
 from arrays.io.csv import Table
+from arrays.logs.places import array_origins
 from arrays.typing import FloatArray
 
 CHORD_M = 2.0
@@ -30,15 +31,19 @@ def chords(xy_m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, float]
     return way, here - before, after - here, chord
 
 
-def turned_to_course(table: Table) -> Table:
-    """Return the table of a log with attitudes whose x axis points along the course, and whose z axis points up."""
+def turned_to_course(table: Table, columns: LogColumns) -> Table:
+    """Return the table of a log with attitudes whose x axis points along the course, and whose z axis points up.
+
+    Positions of an antenna become those of the array.
+    """
     at = [table.header.index(name) for name in POSITION_COLUMNS[:2]]
     _, back, forth, _ = chords(table.values[:, at])
     ahead = back + forth
     half = 0.5 * np.arctan2(ahead[:, 1], ahead[:, 0])
-    values = table.values.copy()
     zero = np.zeros(len(half))
-    values[:, [table.header.index(name) for name in ROTATION_COLUMNS]] = np.stack(
-        [zero, zero, np.sin(half), np.cos(half)], axis=1
-    )
+    turns = np.stack([zero, zero, np.sin(half), np.cos(half)], axis=1)
+    values = table.values.copy()
+    values[:, [table.header.index(name) for name in ROTATION_COLUMNS]] = turns
+    at = [table.header.index(name) for name in POSITION_COLUMNS]
+    values[:, at] = array_origins(values[:, at], turns, columns)
     return replace(table, values=values)
