@@ -17,6 +17,9 @@ SHOWN_CHARACTERS = 40
 LARGEST_T = 1e6
 """Largest modulus of a reading [T]; larger numbers are no fields."""
 
+_MOST_DIGITS = 15  # of a number below 2^53
+_BLOCK = 2**22  # characters of a text of numbers that are read at once
+
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
@@ -99,24 +102,77 @@ def plain_numbers(text: str, separator: str, decimal: str, columns: int) -> tupl
 
     if not text.isascii() or separator == " " or decimal == separator:
         return None
-    data = text.encode()
-    if data.translate(None, f"0123456789+-eE\n{separator}{decimal}".encode()):
+    blocks, numbers, begin, line = [], [], 0, 0
+    while begin < len(text):
+        end = text.find("\n", begin + _BLOCK) + 1 or len(text)
+        lines = text[begin:end].encode().split(b"\n")
+        filled = [k for k, each in enumerate(lines) if each]
+        values = _numbers_of_lines([lines[k] for k in filled], separator.encode(), decimal.encode(), columns)
+        if values is None:
+            return None
+        blocks.append(values)
+        numbers.append(np.array(filled, dtype=np.int64) + line)
+        begin, line = end, line + len(lines) - 1
+    return (np.concatenate(blocks), np.concatenate(numbers)) if any(map(len, blocks)) else None
+
+
+def _numbers_of_lines(lines: list[bytes], separator: bytes, decimal: bytes, columns: int) -> FloatArray | None:
+    """Return the numbers (n, columns) of lines that are not empty; None for other lines."""
+    import numpy as np
+
+    if not lines:
+        return np.zeros((0, columns))
+    joined = separator.join(lines)
+    if joined.translate(None, b"0123456789+-eE" + separator + decimal):
         return None
-    lines = data.split(b"\n")
-    cells = np.fromiter(map(methodcaller("count", separator.encode()), lines), np.int64, len(lines)) + 1
-    filled = np.flatnonzero(np.fromiter(map(len, lines), np.int64, len(lines)))
-    if not len(filled) or (cells[filled] != columns).any():
+    if set(map(methodcaller("count", separator), lines)) != {columns - 1}:
         return None
-    comma = separator.encode()
-    joined = comma.join(filter(None, lines)).replace(decimal.encode(), b".")
-    if comma + comma in joined or joined.startswith(comma) or joined.endswith(comma):
+    if separator + separator in joined or joined.startswith(separator) or joined.endswith(separator):
         return None
-    try:
-        with warnings.catch_warnings(action="ignore"):  # it warns of text that is no number, and stops there
-            values = np.fromstring(joined, sep=separator)
-    except ValueError:
+    joined = joined.replace(decimal, b".")
+    if (values := _fixed_point_numbers(joined, separator)) is None:
+        try:
+            with warnings.catch_warnings(
+                action="ignore"
+            ):  # older NumPy warns of text that is no number, and stops there
+                values = np.fromstring(joined, sep=separator.decode())
+        except ValueError:
+            return None
+    return values.reshape(-1, columns) if values.size == columns * len(lines) else None
+
+
+def _fixed_point_numbers(joined: bytes, separator: bytes) -> FloatArray | None:
+    """Return the numbers of cells such as -12.50, exactly as float() reads them; None for another cell.
+
+    A whole number below 2^53 over a power of ten below 10^23 is rounded once.
+    """
+    import numpy as np
+
+    text = np.frombuffer(joined + separator, np.uint8)
+    end = np.flatnonzero(text == ord(separator))
+    start = np.concatenate([[0], end[:-1] + 1])
+    is_sign, dot = (text == ord("-")) | (text == ord("+")), np.flatnonzero(text == ord("."))
+    is_digit = (text >= ord("0")) & (text <= ord("9"))
+    signed = is_sign[start]
+    if is_digit.sum() + signed.sum() + len(dot) + len(end) != len(text):
         return None
-    return (values.reshape(-1, columns), filled) if values.size == columns * len(filled) else None
+    decimals = np.zeros(len(end), np.int64)
+    cell = np.searchsorted(end, dot)
+    if (np.diff(cell) == 0).any():
+        return None
+    decimals[cell] = end[cell] - dot - 1
+    digits = end - start - signed
+    digits[cell] -= 1
+    most = int(digits.max())
+    if digits.min() < 1 or most > _MOST_DIGITS:
+        return None
+    figure, first = text[is_digit] - ord("0"), np.cumsum(digits) - digits
+    whole = np.zeros(len(end), np.int64)
+    for k in range(most):
+        more = digits > k
+        whole[more] = 10 * whole[more] + figure[first[more] + k]
+    values = whole / 10.0 ** np.arange(_MOST_DIGITS + 1)[decimals]
+    return np.where(text[start] == ord("-"), -values, values)
 
 
 def seed_of(rng: Rng) -> int:

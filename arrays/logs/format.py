@@ -180,8 +180,7 @@ class LogFormat:
         if columns.antenna_m is not None and not (columns.course and is_file):
             if np.any(columns.antenna_m[:2]) and not (columns.attitude or set(ROTATION_COLUMNS) <= index.keys()):
                 raise InputError(
-                    f"{logged.path}: found no attitude, expected one, or course = true, beside an antenna that is off to a"
-                    " side."
+                    f"{logged.path}: found no attitude, expected one, or course = true, for an antenna off to a side."
                 )
             place, turn = (np.stack([found[name] for name in of], 1) for of in (POSITION_COLUMNS, ROTATION_COLUMNS))
             found |= zip(POSITION_COLUMNS, array_origins(place, turn, columns).T, strict=True)

@@ -72,6 +72,16 @@ class TestPlainNumbers:
             np.testing.assert_array_equal(quick[1] + 5, table.line_numbers)
         np.testing.assert_array_equal(table_of_text(text, "log", "names", **form).values, table.values)
 
+    def test_in_blocks(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """The numbers of lines count through blocks; an empty line may end one."""
+        monkeypatch.setattr("arrays.io.values._BLOCK", 5)
+        rows = np.arange(40.0).reshape(-1, 2)
+        text = "\n".join(f"{a},{b}\n" if k % 3 else f"{a},{b}" for k, (a, b) in enumerate(rows.tolist()))
+        found = plain_numbers(text, ",", ".", 2)
+        assert found is not None
+        np.testing.assert_array_equal(found[0], rows)
+        assert [text.split("\n")[k] for k in found[1]] == [f"{a},{b}" for a, b in rows.tolist()]
+
     def test_reads_most_texts(self) -> None:
         found = plain_numbers("1,-2.5\n\n+3e-2,4\n", ",", ".", 2)
         assert found is not None
