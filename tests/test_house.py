@@ -111,7 +111,7 @@ def pages() -> list[Path]:
 
 def test_names_in_pages_are_there() -> None:
     dotted = re.compile(r"\b(?<!tests\.)(?:arrays|magloc|adcs|sims)(?:\.[A-Za-z_]\w*)+")
-    files = (".h", ".hpp", ".csv", ".toml", ".png", ".gif", ".zarr", ".json", ".py", ".html", ".md")
+    files = (".h", ".hpp", ".csv", ".toml", ".png", ".gif", ".zarr", ".json", ".py", ".html", ".md", ".txt")
     named = {name for page in pages() for name in dotted.findall(page.read_text(encoding="utf-8"))}
     found = {name for name in named if not name.endswith(files)}
     missing = []
