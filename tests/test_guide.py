@@ -21,7 +21,7 @@ from tests.conftest import REPOSITORY
 
 DOCS = REPOSITORY / "docs"
 GUIDE = sorted((DOCS / "guide").glob("*.md"))
-PAGES = [REPOSITORY / "README.md", DOCS / "quickstart.md", *GUIDE, DOCS / "theory" / "tracking.md"]
+PAGES = [REPOSITORY / "README.md", DOCS / "quickstart.md", *GUIDE]
 BLOCKS = re.compile(r"<!-- (?:before|after) the page:\n(.*?)-->|```python\n(.*?)```", re.DOTALL)
 APPS = {"magloc": magloc.cli.app.app, "adcs": adcs.cli.app.app}
 COMMAND = re.compile(r"^(?:    |\$ )((?:magloc|adcs) .*)$|`((?:magloc|adcs) [a-z]+ [^`…]*)`", re.MULTILINE)
