@@ -33,6 +33,7 @@ lint: .venv/installed-test
 	$(BIN)/clang-tidy --quiet magloc/core/*.cpp adcs/core/*.cpp docs/examples/*.cpp -- -std=c++17 -Imagloc/core/include -DMAGLOC_LANES=2
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-cache --no-logo
+	$(BIN)/codespell README.md CONTRIBUTING.md CHANGELOG.md arrays magloc adcs sims docs
 
 # Tests are compiled once, beside the linters.
 ready: .venv/installed-test

@@ -182,6 +182,11 @@ def read_sensors(path: str | PathLike[str]) -> SensorArray:
     path : str or path-like
         Array file (TOML).
 
+    Returns
+    -------
+    SensorArray
+        Array of the file, of one sensor or more.
+
     Examples
     --------
     >>> import arrays
@@ -215,6 +220,7 @@ def write_array(path: str | PathLike[str], array: SensorArray) -> None:
     path : path-like
         File to write; an existing file is replaced in one step.
     array : SensorArray
+        Array; its sensors are written one by one, with their calibration.
 
     Raises
     ------
@@ -236,6 +242,11 @@ def array_toml(array: SensorArray) -> str:
     ----------
     array : SensorArray
         Array; its sensors are written one by one, with their calibration.
+
+    Returns
+    -------
+    str
+        Text that :func:`read_array` reads.
 
     Examples
     --------

@@ -68,6 +68,11 @@ def read_truth(path: str | PathLike[str]) -> Truth:
     path : str or path-like
         A truth file (CSV) with ``time_s``, ``x_m``, ``y_m`` and optionally the other columns.
 
+    Returns
+    -------
+    Truth
+        True positions [m] and, if the file has them, moments [A·m²].
+
     Raises
     ------
     InputError

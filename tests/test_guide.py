@@ -16,7 +16,6 @@ from cyclopts import CycloptsError, MissingArgumentError
 
 import adcs.cli.app
 import magloc.cli.app
-from docs.explained import EXPLAINED
 from tests.conftest import REPOSITORY
 
 DOCS = REPOSITORY / "docs"
@@ -153,7 +152,8 @@ def test_command_line_is_accepted(line: str, whole: bool) -> None:
 def test_the_reference_has_every_public_name(package: str) -> None:
     """On a page by itself, or in a list that is made when the site is built: of a module, or by page of the guide."""
     pages = "\n".join(path.read_text(encoding="utf-8") for path in (DOCS / "reference").glob("*.md"))
-    listed = {name for names in EXPLAINED.values() for name in names.split()}
+    explained = importlib.import_module("docs.explained").EXPLAINED
+    listed = {name for names in explained.values() for name in names.split()}
     whole = re.findall(r"\{include\} names/([\w.]+)\.txt", pages)
     public = {f"{package}.{name}" for name in importlib.import_module(package).__all__}
     named = {*NAMED.findall(pages), *listed}

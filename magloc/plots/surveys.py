@@ -34,6 +34,7 @@ def survey_figure(found: Survey) -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
+        Figure; :func:`save` writes it to a file.
 
     Examples
     --------

@@ -226,10 +226,14 @@ def track_moments(
     ----------
     array : SensorArray
         Three independent differences for every source are enough.
-    readings, turn_rad_s, smooth
-        As in :func:`magloc.track_moment`.
+    readings : Readings or array_like, shape (n, C)
+        Raw readings [T] in the order of time, NaN where missing. Saturated readings are not used.
     positions_m : array_like, shape (K, 3)
         Positions of the sources, at rest in the frame of the results [m].
+    turn_rad_s : float
+        Characteristic rate at which the moments turn, or change in another way [rad/s].
+    smooth : bool
+        Use later rows too (fixed-interval smoother).
 
     Returns
     -------

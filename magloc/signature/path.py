@@ -153,6 +153,11 @@ def read_object_path(path: str | PathLike[str]) -> ObjectPath:
     path : str or path-like
         A path file (CSV): ``time_s,x_m,y_m,z_m``, and ``qx,qy,qz,qw`` where the attitude is known.
 
+    Returns
+    -------
+    ObjectPath
+        Path with positions [m], and rotations if the file has attitudes.
+
     Raises
     ------
     InputError

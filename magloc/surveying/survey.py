@@ -96,6 +96,7 @@ def survey(
     Returns
     -------
     Survey
+        Targets, the most significant first, with residuals and the least moments that would have been found.
 
     Raises
     ------

@@ -286,6 +286,7 @@ def track(
     Parameters
     ----------
     array : SensorArray
+        Array with the positions, noise and calibration of its sensors.
     readings : Readings or array_like, shape (n, C)
         Raw readings [T], NaN where missing, in the order of time. Saturated readings are not used.
     motion : MotionModel, optional

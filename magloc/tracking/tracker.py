@@ -58,7 +58,9 @@ class Tracker(CartesianFilter):
     Parameters
     ----------
     array : SensorArray
+        Array with the positions, noise and calibration of its sensors.
     motion : MotionModel
+        Motion of the source, such as :class:`magloc.RandomWalk`.
     prior : SourcePrior
         Bounds of the source where a track starts, and its known moment, in the array's frame.
     keep_steps : bool
