@@ -312,9 +312,11 @@ def _frozen(value: Any) -> Any:
 
 
 def columns_toml(columns: LogColumns) -> list[str]:
-    """Return the lines of the table in an array file."""
-    said = {each.name: getattr(columns, each.name) for each in fields(columns) if each.name != "sensors"}
-    lines = ["", "[columns]", *(f"{key} = {_toml(value)}" for key, value in said.items() if value is not None)]
+    """Return the lines of the table in an array file, without values that are those by default."""
+    by_default = LogColumns()
+    own = {each.name: getattr(columns, each.name) for each in fields(columns) if each.name != "sensors"}
+    own = {key: value for key, value in own.items() if value != getattr(by_default, key)}
+    lines = ["", "[columns]", *(f"{key} = {_toml(value)}" for key, value in own.items())]
     if columns.sensors:
         lines += ["", "[columns.sensors]", *(f"{_toml(key)} = {_toml(of)}" for key, of in columns.sensors.items())]
     return lines

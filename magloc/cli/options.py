@@ -236,7 +236,7 @@ class KnownOptions:
         """Read the array of a file, with the sensors to use."""
         return self.select(arrays.read_array(path), path)
 
-    def select(self, array: SensorArray, path: Path) -> SensorArray:
+    def select(self, array: SensorArray, path: Path | str) -> SensorArray:
         """Return an array with the sensors to use, and --place as the origin of a grid without one."""
         ids, columns = self.ids, array.columns
         if columns is not None and columns.is_geodetic and columns.origin is None and self.place is not None:
@@ -325,6 +325,43 @@ class KnownOptions:
         if not _DATE.fullmatch(self.date):
             raise InputError(f"--date: found {self.date!r}, expected a date such as 2026-11-21.")
         return Place(*self.place, self.date, self.geomagnetic_model or "IGRF-14")
+
+
+@Parameter(name="*", group="Sensors")
+@dataclass(frozen=True)
+class LogOptions:
+    """Sensors and columns of a log.
+
+    Parameters
+    ----------
+    array : Path
+        Array file (TOML). Beside --instrument it needs only the keys that differ from the template.
+    instrument : str
+        Instrument that wrote the log, such as magarrow or gsm19, in place of --array. An unknown name lists all.
+    """
+
+    array: Path | None = None
+    instrument: str | None = None
+
+    @property
+    def name(self) -> str:
+        """Name of the array, for messages."""
+        return f"instrument {self.instrument}" if self.array is None else str(self.array)
+
+    def sensors(self, log: Path) -> SensorArray:
+        """Return the array, also of a single sensor, that the options state for a log."""
+        if self.instrument is None:
+            if self.array is None:
+                raise InputError("--array: found neither --array nor --instrument, expected one of them.")
+            return arrays.read_sensors(self.array)
+        names = arrays.instrument_names()
+        if self.instrument.lower() not in names:
+            raise InputError(f"--instrument: found {self.instrument!r}, expected one of {', '.join(names)}.")
+        template = arrays.read_instrument(self.instrument)
+        array = template.array(log, self.array)
+        if template.add:
+            note(f"note: a log of {template.title} does not state: {template.add}")
+        return array
 
 
 class Mappable(Protocol):

@@ -18,6 +18,7 @@ from arrays.typing import Vector
 from magloc.cli.framework import CommonOptions, Flag, note, print_report
 from magloc.cli.options import (
     KnownOptions,
+    LogOptions,
     MapOptions,
     ambient_field,
     refuse_not_positive,
@@ -56,7 +57,7 @@ def survey(
     readings: Annotated[list[Path], Parameter(negative_iterable="")],
     /,
     *,
-    array: Path,
+    log: LogOptions = LogOptions(),  # noqa: B008 - frozen
     known: KnownOptions = KnownOptions(),  # noqa: B008 - frozen
     base: Path | None = None,
     ground: GroundOptions = GroundOptions(),
@@ -81,8 +82,8 @@ def survey(
     ----------
     readings : list of Path
         Readings files (CSV), in order of time.
-    array : Path
-        Array file (TOML).
+    log : LogOptions
+        Sensors and columns of the readings: --array or --instrument.
     known : KnownOptions
         Prior knowledge of the sensors, of the targets (in the world frame), and of the ambient field.
     base : Path
@@ -115,7 +116,7 @@ def survey(
     refuse_not_positive(ground, "shortest_geology_m", "false_per_hectare")
     if not math.isfinite(ground.ground_m):
         raise InputError(f"--ground-m: found {ground.ground_m:g}, expected a finite number.")
-    chosen = known.select(arrays.read_sensors(array), array)  # a survey works with one sensor
+    chosen = known.select(log.sensors(readings[0]), log.name)
     used, known = known.on_earth(chosen, readings[0])
     _note_ground(chosen, used, ground)
     maps.refuse(known.place)
@@ -128,7 +129,7 @@ def survey(
     used, rows = fields[0][0], [replace(part, ambient_T=own) for part, (_, own) in zip(parts, fields, strict=True)]
     at_base = arrays.SensorArray((arrays.Sensor("base", "scalar", (0.0, 0.0, 0.0), 1e-10),))
     station = None if base is None else magloc.read_readings(base, at_base, ordered=True)
-    named = naming(", ".join(map(str, readings)), array=str(array))
+    named = naming(", ".join(map(str, readings)), array=log.name)
     with named, naming_options("ground_m", "base", "body_length_m", "scheduler"):
         found = magloc.survey(
             used,
