@@ -18,10 +18,14 @@ from arrays.io.results import Result
 from arrays.io.tables import align, by_sigma
 from arrays.typing import FloatArray, IntArray, Vector
 from magloc.localization.fit.table import cells_of_strength
+from magloc.navigation.flight_lines import FlightLine, flight_lines
 from magloc.truth import state_columns
 
 IRON_Am2_PER_KG = (0.05, 0.3)
 """Moment of a kilogram of iron in the ground: a range, as its remanence and shape are not known."""
+SIZE_CLASSES_Am2 = {"small": 0.0, "medium": 0.3, "large": 3.0}
+"""Least moment of each class of size. 0.3 A·m² are 1 to 6 kg of iron, 3 A·m² are 10 to 60 kg."""
+_POOR_FITS = ("misfit", "merged", "near", "edge", "weak")  # flags that make a fit worse than good, the worst first
 _MOST_POINTS = 20_000
 _MOST, _LEAST_LINEAR = 0.8, 1e-3
 _FLAT = 1e-6  # largest ratio of width to length of a line
@@ -82,6 +86,16 @@ class Target:
         """Mass of iron with such a moment, from the most to the least magnetic."""
         least, most = IRON_Am2_PER_KG
         return self.strength_Am2 / most, self.strength_Am2 / least
+
+    @property
+    def size_class(self) -> str:
+        """Class of size by the moment: small, medium or large, with the bounds ``SIZE_CLASSES_Am2``."""
+        return [name for name, least in SIZE_CLASSES_Am2.items() if self.strength_Am2 >= least][-1]
+
+    @property
+    def fit_quality(self) -> str:
+        """Quality of the dipole fit: ``good``, or the first of the flags misfit, merged, near, edge, weak."""
+        return next((flag for flag in _POOR_FITS if flag in self.flags), "good")
 
     @property
     def ellipse95(self) -> tuple[float, float, float]:
@@ -213,6 +227,11 @@ class Survey(Result):
         """Positions of all targets (K, 3)."""
         return np.array([target.position_m for target in self]).reshape(-1, 3)
 
+    @cached_property
+    def flight_lines(self) -> list[FlightLine]:
+        """Lines as flown, in the order of time."""
+        return flight_lines(self.rows.time_s, self.rows.place_m, self.ground_m)
+
     @property
     def reach_by_depth(self) -> dict[float, Reach]:
         """Least moments at each depth below the ground [m], the shallowest first."""
@@ -235,6 +254,8 @@ class Survey(Result):
                 "iron_kg": list(target.iron_kg),
                 "significance": target.significance,
                 "flags": list(target.flags),
+                "size_class": target.size_class,
+                "fit_quality": target.fit_quality,
             }
             for target in self
         ]
@@ -250,6 +271,8 @@ class Survey(Result):
         columns |= {"strength_Am2": np.array([t.strength_Am2 for t in self])}
         columns |= {"significance": np.array([t.significance for t in self])}
         columns["flags"] = [" ".join(t.flags) for t in self]
+        columns["size_class"] = [t.size_class for t in self]
+        columns["fit_quality"] = [t.fit_quality for t in self]
         return columns
 
     def to_geojson(self, place: Vector) -> dict[str, Any]:
