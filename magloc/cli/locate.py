@@ -168,6 +168,14 @@ def locate(
         note(f"{n_solved} of {len(fixes)} rows solved" + (f"; not solved: {reasons}" if reasons else ""))
     for line in [*_notes(fixes, assumed=length_m is None), *([] if json else legend(lines))]:
         note(line)
+    if n_sources == 1 and position is None and rows.pose is None:
+        from magloc.localization.subtracted_background import background_is_subtracted
+
+        if background_is_subtracted(noisy, pictured.values_T[fixes.solved & fixes.detected]):
+            note(
+                "hint: the field common to all sensors is small, as after a background was subtracted; fixes are more"
+                ' accurate with background = "subtracted" in the array file'
+            )
 
 
 def _refuse_farther(positions: list[Vector], rows: Readings) -> None:
