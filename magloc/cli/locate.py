@@ -128,7 +128,7 @@ def locate(
     used, ambient_T = ambient_field(used, rows, where, gradient=wanted.ambient_gradient)
     try:
         pictured, noisy, _ = used_rows(rows, used, average=wanted.average)
-        true_position_m = None if truth is None else truth_of_rows(pictured, magloc.read_truth(truth))[0]
+        true = None if truth is None else truth_of_rows(pictured, magloc.read_truth(truth))
         with progress(len(rows), "rows") as advance:
             fixes = magloc.locate(
                 used,
@@ -163,7 +163,7 @@ def locate(
     if out is not None:
         from magloc.plots.localization import write_fix_figures
 
-        write_fix_figures(pictured, noisy, fixes, ambient_T, true_position_m, out)
+        write_fix_figures(pictured, noisy, fixes, ambient_T, None if true is None else true.position_m, out)
     if not json:
         note(f"{n_solved} of {len(fixes)} rows solved" + (f"; not solved: {reasons}" if reasons else ""))
     for line in [*_notes(fixes, assumed=length_m is None), *([] if json else legend(lines))]:
