@@ -135,7 +135,7 @@ class MomentTrack(TrackColumns):
         """
         if truth.moment_Am2 is None:
             raise InputError(f"{truth.name}: found no moment, expected columns mx_Am2, my_Am2 and mz_Am2.")
-        _, moment_Am2 = truth_of_rows(self.readings, truth)
+        moment_Am2 = truth_of_rows(self.readings, truth).moment_Am2
         true = np.full_like(self.moment_Am2, np.nan) if moment_Am2 is None else moment_Am2
         known = self.tracked & np.isfinite(true).all(axis=1)
         error, covariance = (self.moment_Am2 - true)[known], self.covariance[known][:, 3:, 3:]

@@ -72,7 +72,7 @@ class ObjectPath:
             The path has none of the instants.
         """
         wanted = Readings(np.empty((len(time_s), 0)), time_s=time_s)
-        position, _ = truth_of_rows(wanted, Truth(self.time_s, self.position_m, name=self.name))
+        position = truth_of_rows(wanted, Truth(self.time_s, self.position_m, name=self.name)).position_m
         if self.rotation is None:
             return position, None
         return position, rotations_at(time_s, self.time_s, self.rotation).as_matrix()
