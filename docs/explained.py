@@ -1,5 +1,9 @@
 """Which page of the guide explains a public name, and which picture shows what it finds or draws."""
 
+import re
+
+# Number, title, minutes and question of a notebook, as its first cell says them: its card in the gallery.
+CARD = re.compile(r"# (\d+)\. (.+)\n.*?(\d+) minutes.*?\*\*(.+?)\*\*", re.DOTALL)
 # The picture of what a function finds or draws, on the function's page.
 PICTURES = {
     "notebook-01-first-fix.png": ["magloc.locate", "magloc.Fixes", "magloc.Fix", "magloc.plots.fixes"],

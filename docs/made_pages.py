@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from docutils import nodes
-from explained import EXPLAINED, PICTURES
+from explained import CARD, EXPLAINED, PICTURES
 from sphinx.addnodes import pending_xref
 from sphinx.application import Sphinx
 
@@ -28,8 +28,6 @@ PAGE = re.compile(r"docs/theory/([\w-]+)\.md")
 LINK = re.compile(r"^(\* )\[(`[\w-]+`)\]\(#[\w-]+\)", re.MULTILINE)
 # Modules whose names have a list of their own, in alphabetical order.
 MODULES = ("magloc.live", "magloc.plots", "adcs.mockup", "sims.experiments")
-# Text and time of a notebook, as its first cell says them.
-CARD = re.compile(r"# (\d+)\. (.+)\n.*?(\d+) minutes.*?\*\*(.+?)\*\*", re.DOTALL)
 # Other pages that a function's page names at most of each folder, in this order.
 MOST_PAGES = {"guide": 3, "theory": 2, "gallery": 2}
 # What a bar stands in: literal text and formulas keep it, elsewhere it would be a substitution.

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.colors import SymLogNorm
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 from matplotlib.tri import Triangulation
 
 from arrays.typing import FloatArray
@@ -55,6 +56,7 @@ def survey_figure(found: Survey) -> Figure:
     ):
         _draw_values(figure, ax, rows.place_m, values_T * 1e9)
         style.label_axes(ax, _ACROSS, _UP, title)
+        ax.tick_params(labelbottom=True)
         ax.set_aspect("equal")
     for target in found:
         _draw_target(both[0], target, has_label=False)
@@ -106,4 +108,5 @@ def _draw_target(ax: Axes, target: Target, *, has_label: bool) -> None:
         text = f"{target.id}: {target.depth_m:.1f} m"
         low, high = ax.get_xlim()
         offset, side = (-3.0, "right") if place[0] > high - 0.15 * (high - low) else (3.0, "left")
-        ax.annotate(text, place, (offset, 3.0), textcoords="offset points", ha=side, fontsize=5.5, zorder=4)
+        note = ax.annotate(text, place, (offset, 3.0), textcoords="offset points", ha=side, fontsize=5.5, zorder=4)
+        note.set_path_effects([withStroke(linewidth=1.5, foreground="white")])
