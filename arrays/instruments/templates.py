@@ -5,16 +5,17 @@ A template is a TOML file in this folder with the keys of an array file, and in 
 - ``title``, and ``source``, the public document or sample that shows the format; ``secondary = true`` if that is not
   the maker's own.
 - ``add``, what the user has to add.
-- ``[[layout]]``, tables with keys that replace those of the file. The first layout that the log fits is used.
+- ``[[layout]]``, tables with keys that replace those of the file. The first layout that the log fits is used: the
+  header has its columns, with ``every_sensor = true`` those of all sensors, and a line matches the pattern ``row``.
 
 In the table ``columns`` a name may have alternatives, ``"Alt|Altitude"``. Sensors and optional columns (``valid``,
-``fix``, attitude) that a log does not have are left out.
+``fix``, ``line``, attitude) that a log does not have are left out.
 """
 
 from __future__ import annotations
 
 import itertools
-import logging
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
@@ -30,11 +31,12 @@ from arrays.io.text import read_text
 from arrays.io.toml import BuiltIn, File, read_toml, section_of
 from arrays.logs.lines import cells_of
 
-_LOG = logging.getLogger(__name__)
 _TEMPLATES = BuiltIn("arrays", "instruments", "instrument")
+_CHARACTERS = 2**20
 _LINES = 1000  # at the begin of a log that may hold its header
+_RULES = ("every_sensor", "row")
 _OWN_KEYS = ("title", "source", "secondary", "add", "layout")
-_OPTIONAL = ("valid", "fix", "quaternion", "angles")
+_OPTIONAL = ("valid", "fix", "quaternion", "angles", "line")
 
 
 class _Template(File, kw_only=True):
@@ -96,6 +98,7 @@ class Instrument:
         text = ""
         for layout in self._layouts:
             table = _merge(layout, own)
+            _drop_replaced(table["columns"], own.get("columns", {}))
             columns = table["columns"]
             text = text or read_text(log, "a log of text", columns.get("encoding"))
             if (fitted := _fit(table, text)) is not None:
@@ -161,21 +164,34 @@ def _merge(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
     return merged
 
 
+def _drop_replaced(columns: dict[str, Any], own: Mapping[str, Any]) -> None:
+    """Drop keys that contradict those of the user: another place, another attitude, a column of heights."""
+    for keys in (("position", "geodetic"), ("quaternion", "angles", "course")):
+        if any(key in own for key in keys):
+            for key in set(keys) - own.keys():
+                columns.pop(key, None)
+    if "height_m" in own:
+        columns.pop("height_is", None)
+        columns.update({key: columns[key][:2] for key in ("position", "geodetic") if key in columns})
+
+
 def _required(columns: Mapping[str, Any]) -> list[str]:
     """Return the names, with their alternatives, of the columns that a log must have."""
-    time = columns.get("time", "time_s")
+    time = [] if columns.get("time_unit") == "rows" else columns.get("time", "time_s")
     return [*([time] if isinstance(time, str) else time), *columns.get("position", columns.get("geodetic", ()))]
 
 
 def _fit(table: Mapping[str, Any], text: str) -> dict[str, Any] | None:
     """Return the table with the names of a log, without what the log lacks; None if it has no such header."""
     columns = table["columns"]
+    if re.search(table.get("row", ""), text[:_CHARACTERS], flags=re.MULTILINE) is None:
+        return None
     form = LogColumns(**{key: _tuple(columns[key]) for key in ("separator", "comment") if key in columns})
     for header in _headers(text, form):
         if all(_name(names, header) for names in _required(columns)):
             sensors = {id_: _names(of, header) for id_, of in columns["sensors"].items()}
             sensors = {id_: names for id_, names in sensors.items() if names is not None}
-            if sensors:
+            if len(sensors) == len(columns["sensors"]) or (sensors and not table.get("every_sensor")):
                 fitted = {key: _names(value, header) for key, value in columns.items() if key != "sensors"}
                 fitted = {key: columns[key] if value is None else value for key, value in fitted.items()}
                 for key in _OPTIONAL:
@@ -184,12 +200,13 @@ def _fit(table: Mapping[str, Any], text: str) -> dict[str, Any] | None:
                     elif key in columns:
                         fitted[key] = found
                 present = [of for of in table["sensor"] if of["id"] in sensors]
-                return {**table, "sensor": present, "columns": {**fitted, "sensors": sensors}}
+                keys = {key: value for key, value in table.items() if key not in _RULES}
+                return {**keys, "sensor": present, "columns": {**fitted, "sensors": sensors}}
     return None
 
 
 def _headers(text: str, form: LogColumns) -> Iterator[list[str]]:
-    lines = text.removeprefix("\ufeff").splitlines() if len(text) < 2**20 else text[: 2**20].splitlines()
+    lines = text[:_CHARACTERS].removeprefix("\ufeff").splitlines()
     return (cells_of(line, form) for line in itertools.islice(lines, _LINES))
 
 

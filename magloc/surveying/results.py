@@ -178,6 +178,8 @@ class Survey(Result):
     lag_s : float
         Delay of the readings after their poses, estimated from the targets and corrected; 0 if the targets show none.
     seconds : float
+    named_lines : tuple of (float, str)
+        Times [s] at which the lines of the log begin, and their names; empty if the log names none.
 
     Examples
     --------
@@ -205,6 +207,7 @@ class Survey(Result):
     pose_assumed: bool
     lag_s: float
     seconds: float
+    named_lines: tuple[tuple[float, str], ...] = ()
 
     def __len__(self) -> int:
         return len(self.targets)
@@ -230,7 +233,7 @@ class Survey(Result):
     @cached_property
     def flight_lines(self) -> list[FlightLine]:
         """Lines as flown, in the order of time."""
-        return flight_lines(self.rows.time_s, self.rows.place_m, self.ground_m)
+        return flight_lines(self.rows.time_s, self.rows.place_m, self.ground_m, self.named_lines)
 
     @property
     def reach_by_depth(self) -> dict[float, Reach]:

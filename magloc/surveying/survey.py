@@ -186,6 +186,7 @@ def survey(
         assumed,
         lag.s,
         time.monotonic() - began,
+        rows.lines,
     )
 
 

@@ -50,6 +50,13 @@ class TestFlightLines:
         place[200:] = place[100] + place[1:101] - place[0]
         assert len(flight_lines(time_s, place)) == 1
 
+    def test_a_log_names_them(self) -> None:
+        """Rows before the first name count to its line, and a line without rows is left out."""
+        time_s, place = straight(300)
+        names = [(3.0, "10"), (12.0, "T2"), (40.0, "11"), (50.0, "12")]
+        lines = flight_lines(time_s, place, 0.0, names)
+        assert [(line.name, line.rows) for line in lines] == [("10", slice(0, 120)), ("T2", slice(120, 300))]
+
     def test_of_no_rows(self) -> None:
         assert flight_lines(np.zeros(0), np.zeros((0, 3))) == []
 
