@@ -27,6 +27,11 @@ if TYPE_CHECKING:
     from magloc.surveying.results import Survey
 
 _LOG = logging.getLogger(__name__)
+MAP_FILES = (
+    *("targets.geojson", "targets.kml", "targets.gpkg", "field.tif", "residual.tif"),
+    *("lines.xyz", "report.html", "report.pdf"),
+)
+"""Names of all files that :func:`survey_files` may write."""
 _LIBRARIES = ("pyogrio", "rasterio", "shapely")
 
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple, overload
+from typing import TYPE_CHECKING, Any, NamedTuple, overload
 
 import numpy as np
 from scipy.spatial import Delaunay
@@ -19,7 +19,11 @@ from arrays.io.tables import align, by_sigma
 from arrays.typing import FloatArray, IntArray, Vector
 from magloc.localization.fit.table import cells_of_strength
 from magloc.navigation.flight_lines import FlightLine, flight_lines
+from magloc.surveying.review.decisions import Decision
 from magloc.truth import state_columns
+
+if TYPE_CHECKING:
+    from magloc.surveying.review.state import SurveyState
 
 IRON_Am2_PER_KG = (0.05, 0.3)
 """Moment of a kilogram of iron in the ground: a range, as its remanence and shape are not known."""
@@ -178,6 +182,10 @@ class Survey(Result):
     lag_s : float
         Delay of the readings after their poses, estimated from the targets and corrected; 0 if the targets show none.
     seconds : float
+    state : SurveyState, optional
+        Rows and sources, for a :class:`magloc.Review`.
+    decisions : tuple
+        Decisions of a review that led to this result.
 
     Examples
     --------
@@ -205,6 +213,8 @@ class Survey(Result):
     pose_assumed: bool
     lag_s: float
     seconds: float
+    state: SurveyState | None = None
+    decisions: tuple[Decision, ...] = ()
 
     def __len__(self) -> int:
         return len(self.targets)
