@@ -12,7 +12,7 @@ import numpy as np
 from arrays.io.outputs import installed_version
 from arrays.io.world_maps import place_in_words
 from magloc.deliverables.map_frame import MapFrame
-from magloc.deliverables.rasters import line_spacing
+from magloc.navigation.flight_lines import line_spacing
 from magloc.surveying.results import IRON_Am2_PER_KG, SIZE_CLASSES_Am2, Survey
 from magloc.surveying.review.decisions import entry_of
 

@@ -19,6 +19,7 @@ from arrays.io.tables import align, by_sigma
 from arrays.typing import FloatArray, IntArray, Vector
 from magloc.localization.fit.table import cells_of_strength
 from magloc.navigation.flight_lines import FlightLine, flight_lines
+from magloc.surveying.fit.levelling import FEWEST_LINES, line_levels
 from magloc.surveying.review.decisions import Decision
 from magloc.truth import state_columns
 
@@ -241,6 +242,23 @@ class Survey(Result):
     def flight_lines(self) -> list[FlightLine]:
         """Lines as flown, in the order of time."""
         return flight_lines(self.rows.time_s, self.rows.place_m, self.ground_m)
+
+    @cached_property
+    def levelled_rows(self) -> SurveyRows:
+        """Rows for maps, without the level of their line (:func:`magloc.surveying.fit.levelling.line_levels`).
+
+        The levels are estimated from the residual, so that targets do not count.
+        """
+        level_T = line_levels(self.rows.place_m, self.rows.residual_T, self.flight_lines)
+        return self.rows._replace(anomaly_T=self.rows.anomaly_T - level_T, residual_T=self.rows.residual_T - level_T)
+
+    @property
+    def levelling(self) -> str:
+        """Levelling of the maps in words."""
+        level_T = self.rows.residual_T - self.levelled_rows.residual_T
+        if not level_T.any():
+            return f"lines not levelled: fewer than {FEWEST_LINES}, or on one line"
+        return f"offset and drift of each line removed, {1e9 * float(np.std(level_T)):.2g} nT rms"
 
     @property
     def reach_by_depth(self) -> dict[float, Reach]:
