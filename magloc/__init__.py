@@ -31,6 +31,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "RandomWalk": "magloc.tracking.motion",
         "Readings": "magloc.readings",
         "RepeatedFilter": "magloc.convergence.filters",
+        "Review": "magloc.surveying.review.review",
         "Signature": "magloc.signature.signature",
         "Solution": "magloc.localization.fit.results",
         "Source": "magloc.localization.fit.results",

@@ -47,6 +47,7 @@ from magloc.signature.signature import fit_signature as fit_signature
 from magloc.state_space import IteratedExtendedKalmanFilter as IteratedExtendedKalmanFilter
 from magloc.surveying.results import Survey as Survey
 from magloc.surveying.results import Target as Target
+from magloc.surveying.review.review import Review as Review
 from magloc.surveying.survey import survey as survey
 from magloc.tracking.motion import CoordinatedTurn as CoordinatedTurn
 from magloc.tracking.motion import KnownMotion as KnownMotion

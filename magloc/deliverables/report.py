@@ -12,8 +12,9 @@ import numpy as np
 from arrays.io.outputs import installed_version
 from arrays.io.world_maps import place_in_words
 from magloc.deliverables.map_frame import MapFrame
-from magloc.deliverables.rasters import line_spacing
+from magloc.navigation.flight_lines import line_spacing
 from magloc.surveying.results import IRON_Am2_PER_KG, SIZE_CLASSES_Am2, Survey
+from magloc.surveying.review.decisions import entry_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -102,7 +103,19 @@ def _survey_rows(found: Survey) -> Iterator[tuple[str, str]]:
     yield "height of the sensors above ground", f"{height.mean():.2f} m ({height.min():.2f} to {height.max():.2f})"
     rms_nT = 1e9 * float(rows.residual_T.std())
     yield "remainder", f"{rms_nT:.2g} nT rms without the targets, χ² {found.chi2_per_dof:.2f} per reading"
+    if found.decisions:
+        yield "review", _review_words(found)
     yield "lag", f"{1e3 * found.lag_s:.0f} ms of the readings, corrected" if found.lag_s else "none found"
+
+
+def _review_words(found: Survey) -> str:
+    """Return the decisions of a review in words, with the number of each kind."""
+    actions = [entry_of(decision)["action"] for decision in found.decisions]
+    words = (("drop", "dropped"), ("split", "split"), ("add", "added"))
+    parts = [f"{_count(actions.count(action), 'target')} {word}" for action, word in words if action in actions]
+    if "exclude" in actions:
+        parts.append(f"rows excluded in {_count(actions.count('exclude'), 'place')}")
+    return f"{', '.join(parts)}; fit after the last decision, each one in decisions.jsonl"
 
 
 def _target_header(frame: MapFrame) -> tuple[str, ...]:

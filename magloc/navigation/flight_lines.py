@@ -14,6 +14,7 @@ from magloc.navigation.course import chords
 _LONGEST_GAP = 20.0  # in usual steps of time
 _TURN_deg = 35.0  # smallest angle between the courses before and after a row of a turn
 _SHORTEST = 3.0  # in chords
+_FLAT = 1e-3  # A single line extends less across than this share of its length.
 
 
 class FlightLine(NamedTuple):
@@ -86,3 +87,19 @@ def _line_starts(xy_m: FloatArray) -> list[int]:
         if way[end] - way[starts[-1]] > _SHORTEST * chord and way[-1] - way[end] > _SHORTEST * chord:
             starts.append(int(end))
     return starts
+
+
+def covers_area(xy_m: FloatArray) -> bool:
+    """Return whether rows (n, 2) cover an area, and not a single line."""
+    return bool(np.linalg.matrix_rank(xy_m - xy_m.mean(axis=0), rtol=_FLAT) == 2)
+
+
+def line_spacing(xy_m: FloatArray) -> float:
+    """Return the usual distance between lines [m] of rows (n, 2): the area that they cover, divided by the way."""
+    way_m = float(np.linalg.norm(np.diff(xy_m, axis=0), axis=1).sum())
+    extent_m = float(np.ptp(xy_m, axis=0).max())
+    if not covers_area(xy_m):
+        return extent_m / 20.0  # a single line
+    from scipy.spatial import ConvexHull
+
+    return max(float(ConvexHull(xy_m).volume) / way_m, extent_m / 500.0)

@@ -25,7 +25,7 @@ _ACROSS, _UP = "x, east [m]", "y, north [m]"
 
 
 def survey_figure(found: Survey) -> Figure:
-    """Draw maps of the anomaly, of its residual, and of the least moments that are found.
+    """Draw maps of the anomaly, of its residual, and of the least moments that are found; lines are levelled.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def survey_figure(found: Survey) -> Figure:
     x, y, _ = found.rows.place_m.T
     height = style.WIDTH_IN * 0.5 * float(np.clip(np.ptp(y) / max(np.ptp(x), 1e-9), 0.12, 1.6)) + 1.0
     figure = style.new_figure(2.0 * height)
-    rows = found.rows.decimate()
+    rows = found.levelled_rows.decimate()
     both, reach = figure.subplots(2, 2, sharex=True, sharey=True)
     for ax, values_T, title in zip(
         both, (rows.anomaly_T, rows.residual_T), ("anomaly", "less the targets' fields"), strict=True
@@ -67,6 +67,8 @@ def survey_figure(found: Survey) -> Figure:
         _draw_reach(figure, ax, found.reach.place_m[at], found.reach.moment_Am2[at])
         style.label_axes(ax, _ACROSS, _UP, f"least moment seen, {depth:.2g} m deep" if at.any() else "")
         ax.set_aspect("equal")
+    note = f"Upper maps: every row a point; {found.levelling}. Lower maps: linear between places."
+    figure.supxlabel(note, fontsize=style.SMALL_FONT_SIZE)
     return figure
 
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple, overload
+from typing import TYPE_CHECKING, Any, NamedTuple, overload
 
 import numpy as np
 from scipy.spatial import Delaunay
@@ -19,7 +19,12 @@ from arrays.io.tables import align, by_sigma
 from arrays.typing import FloatArray, IntArray, Vector
 from magloc.localization.fit.table import cells_of_strength
 from magloc.navigation.flight_lines import FlightLine, flight_lines
+from magloc.surveying.fit.levelling import FEWEST_LINES, line_levels
+from magloc.surveying.review.decisions import Decision
 from magloc.truth import state_columns
+
+if TYPE_CHECKING:
+    from magloc.surveying.review.state import SurveyState
 
 IRON_Am2_PER_KG = (0.05, 0.3)
 """Moment of a kilogram of iron in the ground: a range, as its remanence and shape are not known."""
@@ -180,6 +185,10 @@ class Survey(Result):
     seconds : float
     named_lines : tuple of (float, str)
         Times [s] at which the lines of the log begin, and their names; empty if the log names none.
+    state : SurveyState, optional
+        Rows and sources, for a :class:`magloc.Review`.
+    decisions : tuple
+        Decisions of a review that led to this result.
 
     Examples
     --------
@@ -208,6 +217,8 @@ class Survey(Result):
     lag_s: float
     seconds: float
     named_lines: tuple[tuple[float, str], ...] = ()
+    state: SurveyState | None = None
+    decisions: tuple[Decision, ...] = ()
 
     def __len__(self) -> int:
         return len(self.targets)
@@ -234,6 +245,23 @@ class Survey(Result):
     def flight_lines(self) -> list[FlightLine]:
         """Lines as flown, in the order of time."""
         return flight_lines(self.rows.time_s, self.rows.place_m, self.ground_m, self.named_lines)
+
+    @cached_property
+    def levelled_rows(self) -> SurveyRows:
+        """Rows for maps, without the level of their line (:func:`magloc.surveying.fit.levelling.line_levels`).
+
+        The levels are estimated from the residual, so that targets do not count.
+        """
+        level_T = line_levels(self.rows.place_m, self.rows.residual_T, self.flight_lines)
+        return self.rows._replace(anomaly_T=self.rows.anomaly_T - level_T, residual_T=self.rows.residual_T - level_T)
+
+    @property
+    def levelling(self) -> str:
+        """Levelling of the maps in words."""
+        level_T = self.rows.residual_T - self.levelled_rows.residual_T
+        if not level_T.any():
+            return f"lines not levelled: fewer than {FEWEST_LINES}, or on one line"
+        return f"offset and drift of each line removed, {1e9 * float(np.std(level_T)):.2g} nT rms"
 
     @property
     def reach_by_depth(self) -> dict[float, Reach]:
