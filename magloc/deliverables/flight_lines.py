@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from arrays.typing import FloatArray
+from magloc.terrain.surface import FLAT, Terrain
 
 _LONGEST_GAP = 20.0  # in usual steps of time
 _CHORD_M = 2.0  # length over which the course is measured
@@ -24,7 +25,11 @@ class FlightLine(NamedTuple):
     height_m: float
 
 
-def flight_lines(time_s: FloatArray, place_m: FloatArray, ground_m: float = 0.0) -> list[FlightLine]:
+def flight_lines(
+    time_s: FloatArray,
+    place_m: FloatArray,
+    terrain: Terrain = FLAT,
+) -> list[FlightLine]:
     """Return the lines of a survey in the order of time.
 
     A line begins after a gap in time and after a turn. A turn belongs to the line before it.
@@ -33,14 +38,15 @@ def flight_lines(time_s: FloatArray, place_m: FloatArray, ground_m: float = 0.0)
     ----------
     time_s : ndarray, shape (n,)
     place_m : ndarray, shape (n, 3)
-    ground_m : float
-        Height of the ground in the world frame.
+    terrain : Terrain
+        Ground that heights count from.
     """
     if len(time_s) < 2:
         return []
     step_s = float(np.median(np.diff(time_s)))
     gaps = np.flatnonzero(np.diff(time_s) > _LONGEST_GAP * step_s) + 1
     lines: list[FlightLine] = []
+    flat_m = terrain.flatten(place_m)
     for begin, stop in pairwise([0, *gaps.tolist(), len(time_s)]):
         if stop - begin < 2:
             continue  # a single row
@@ -48,7 +54,7 @@ def flight_lines(time_s: FloatArray, place_m: FloatArray, ground_m: float = 0.0)
         for rows in (slice(*ends) for ends in pairwise([*starts, stop])):
             way_m = float(np.linalg.norm(np.diff(place_m[rows, :2], axis=0), axis=1).sum())
             duration_s = float(time_s[rows][-1] - time_s[rows][0])
-            height_m = float(place_m[rows, 2].mean() - ground_m)
+            height_m = float(flat_m[rows, 2].mean() - terrain.height_m)
             speed_m_s = way_m / duration_s if duration_s else 0.0
             lines.append(FlightLine(f"L{len(lines) + 1}", rows, speed_m_s, height_m))
     return lines

@@ -98,7 +98,7 @@ def survey_layers(found: Survey, frame: MapFrame) -> Iterator[Layer]:
     ids = np.array([target.id for target in found], dtype=np.object_)
     yield Layer("ellipses", "Polygon", _wkb(ellipses), {"id": ids, "level": np.full(len(found), _LEVEL)})
     rows = found.rows
-    flown = flight_lines(rows.time_s, rows.place_m, found.ground_m)
+    flown = flight_lines(rows.time_s, rows.place_m, found.terrain)
     ways = [shapely.LineString(frame.project(rows.place_m[line.rows])) for line in flown]
     fields: dict[str, NDArray[Any]] = {"line": np.array([line.name for line in flown], dtype=np.object_)}
     fields["rows"] = np.array([line.rows.stop - line.rows.start for line in flown], dtype=np.int64)

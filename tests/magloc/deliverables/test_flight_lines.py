@@ -36,7 +36,7 @@ class TestFlightLines:
         assert [line.speed_m_s for line in lines[:-1]] == pytest.approx([path.speed_m_s] * (path.lines - 1), rel=0.03)
 
     def test_a_straight_way_is_one(self) -> None:
-        (line,) = flight_lines(*straight(300), ground_m=0.5)
+        (line,) = flight_lines(*straight(300), magloc.Terrain(0.5))
         assert (line.rows, line.name) == (slice(0, 300), "L1")
         assert (line.speed_m_s, line.height_m) == (pytest.approx(1.0), pytest.approx(1.0))
 
