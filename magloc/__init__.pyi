@@ -49,6 +49,8 @@ from magloc.surveying.results import Survey as Survey
 from magloc.surveying.results import Target as Target
 from magloc.surveying.review.review import Review as Review
 from magloc.surveying.survey import survey as survey
+from magloc.terrain.files import read_terrain as read_terrain
+from magloc.terrain.surface import Terrain as Terrain
 from magloc.tracking.motion import CoordinatedTurn as CoordinatedTurn
 from magloc.tracking.motion import KnownMotion as KnownMotion
 from magloc.tracking.motion import OrnsteinUhlenbeck as OrnsteinUhlenbeck

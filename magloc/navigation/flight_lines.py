@@ -27,7 +27,7 @@ class FlightLine(NamedTuple):
 
 
 def flight_lines(
-    time_s: FloatArray, place_m: FloatArray, ground_m: float = 0.0, names: Sequence[tuple[float, str]] = ()
+    time_s: FloatArray, place_m: FloatArray, height_m: FloatArray, names: Sequence[tuple[float, str]] = ()
 ) -> list[FlightLine]:
     """Return the lines of a survey in the order of time.
 
@@ -38,8 +38,8 @@ def flight_lines(
     ----------
     time_s : ndarray, shape (n,)
     place_m : ndarray, shape (n, 3)
-    ground_m : float
-        Height of the ground in the world frame.
+    height_m : ndarray, shape (n,)
+        Heights above the ground.
     names : sequence of (float, str)
         Times at which the lines of the log begin, and their names.
     """
@@ -49,9 +49,8 @@ def flight_lines(
     for name, rows in _named_rows(time_s, names) if names else _straight_rows(time_s, place_m):
         way_m = float(np.linalg.norm(np.diff(place_m[rows, :2], axis=0), axis=1).sum())
         duration_s = float(time_s[rows][-1] - time_s[rows][0])
-        height_m = float(place_m[rows, 2].mean() - ground_m)
         speed_m_s = way_m / duration_s if duration_s else 0.0
-        lines.append(FlightLine(name or f"L{len(lines) + 1}", rows, speed_m_s, height_m))
+        lines.append(FlightLine(name or f"L{len(lines) + 1}", rows, speed_m_s, float(height_m[rows].mean())))
     return lines
 
 

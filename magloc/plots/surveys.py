@@ -61,7 +61,7 @@ def survey_figure(found: Survey) -> Figure:
     for target in found:
         _draw_target(both[0], target, has_label=False)
         _draw_target(both[1], target, has_label=True)
-    depths = found.ground_m - found.reach.place_m[:, 2]
+    depths = found.terrain.depth_of(found.reach.place_m)
     for ax, depth in zip(reach, (depths.min(initial=np.inf), depths.max(initial=0.0)), strict=True):
         at = np.isclose(depths, depth)
         _draw_reach(figure, ax, found.reach.place_m[at], found.reach.moment_Am2[at])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,6 +22,7 @@ from magloc.cli.options import (
     ambient_field,
     refuse_not_positive,
 )
+from magloc.cli.surveys.ground import SurfaceOptions
 
 if TYPE_CHECKING:
     from magloc.deliverables.map_frame import MapFrame
@@ -31,13 +31,19 @@ if TYPE_CHECKING:
 
 @Parameter(name="*", group="Ground")
 @dataclass(frozen=True)
-class GroundOptions:
+class GroundOptions(SurfaceOptions):
     """Properties of the ground.
 
     Parameters
     ----------
     ground_m : float
-        Height of the ground in the world frame [m].
+        Height of the ground in the world frame [m]. With --terrain: amount to add to its heights, such as the height of
+        the sea above the ellipsoid.
+    terrain : str
+        Heights of uneven ground: a GeoTIFF (.tif) in any coordinate system, a CSV file with columns x, y, height or
+        easting, northing, height or longitude, latitude, height, or the name of the log's column with the height above
+        ground [m] from an altimeter. It must cover all lines. Depths, and limits of heights in --region, then count
+        from the ground.
     shortest_geology_m : float
         Shortest wavelength in the field of the ground itself [m]; smaller anomalies are targets.
     false_per_hectare : float
@@ -47,7 +53,6 @@ class GroundOptions:
         point sources.
     """
 
-    ground_m: Annotated[float, Parameter(allow_leading_hyphen=True)] = 0.0
     shortest_geology_m: float = 15.0
     false_per_hectare: float = 0.1
     body_length_m: float = 0.0
@@ -133,8 +138,7 @@ def survey(
     refuse_one_for_two({"--out": out, "--html": review.html, **maps.outputs})
     refuse_unwritable(review.html, "--html")
     refuse_not_positive(ground, "shortest_geology_m", "false_per_hectare")
-    if not math.isfinite(ground.ground_m):
-        raise InputError(f"--ground-m: found {ground.ground_m:g}, expected a finite number.")
+    ground.refuse()
     chosen = known.select(log.sensors(readings[0]), log.name)
     decisions = [] if review.decisions is None else read_decisions(review.decisions)
     used, known = known.on_earth(chosen, readings[0])
@@ -143,6 +147,11 @@ def survey(
     where = None if known.place is not None and known.date is None else known.where
     frame = _map_frame(used, known.place, crs)
     parts = [magloc.read_readings(path, used, sensors=known.ids, ordered=True) for path in readings]
+    surface, parts, origin = ground.below(readings, parts, used, known.place)
+    if origin is not None and origin != known.place:
+        note(f"note: the origin is on the ground, at a height of {origin[2]:.2f} m")
+        known, frame = replace(known, place=origin), _map_frame(used, origin, crs)
+        where = where and known.where
     for path, part in zip(readings, parts, strict=True):
         maps.refuse_far(part, str(path), always=out is not None and frame is not None)
     fields = [ambient_field(used, part, where) for part in parts]
@@ -156,7 +165,7 @@ def survey(
             rows,
             base=station,
             prior=known.prior,
-            ground_m=ground.ground_m,
+            ground_m=surface,
             shortest_geology_m=ground.shortest_geology_m,
             false_per_hectare=ground.false_per_hectare,
             body_length_m=ground.body_length_m,
@@ -200,7 +209,8 @@ def _map_frame(array: arrays.SensorArray, origin: Vector | None, crs: str | None
 
 def _note_ground(given: arrays.SensorArray, used: arrays.SensorArray, ground: GroundOptions) -> None:
     """Name the height that the ground is stated above, where it is that of the log's first place."""
-    if given.columns == used.columns or used.columns is None or used.columns.above_ground:
+    is_stated = given.columns == used.columns or used.columns is None or used.columns.above_ground
+    if is_stated or ground.terrain is not None:
         return
     note(f"note: --ground-m counts from the height of that place, negative below it: found {ground.ground_m:g} m")
 
