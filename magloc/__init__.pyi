@@ -8,6 +8,8 @@ from magloc.bounds.maps import bound_map as bound_map
 from magloc.calibration.array import CalibrationPrior as CalibrationPrior
 from magloc.calibration.calibrate import calibrate as calibrate
 from magloc.calibration.results import Calibration as Calibration
+from magloc.compensation.compensate import compensate as compensate
+from magloc.compensation.results import Compensation as Compensation
 from magloc.convergence.filters import RepeatedFilter as RepeatedFilter
 from magloc.convergence.over_sources import source_map as source_map
 from magloc.convergence.over_starts import convergence_map as convergence_map
