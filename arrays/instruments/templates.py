@@ -110,6 +110,11 @@ class Instrument:
 def instrument_names() -> tuple[str, ...]:
     """Return the names of the instruments whose logs can be read.
 
+    Returns
+    -------
+    tuple of str
+        Names, in alphabetical order.
+
     Examples
     --------
     >>> import arrays
@@ -126,6 +131,11 @@ def read_instrument(name: str) -> Instrument:
     ----------
     name : str
         One of :func:`instrument_names`.
+
+    Returns
+    -------
+    Instrument
+        Its array, with the columns of its logs, and the source of the format.
 
     Raises
     ------

@@ -41,6 +41,7 @@ def compensate(
     Parameters
     ----------
     array : SensorArray
+        Sensors with their noise and the priors of their platform.
     readings : Readings
         Log to correct. The attitude is that of the vector sensor with the least noise, or of the pose, which needs the
         ambient field of every row.

@@ -27,6 +27,7 @@ def compensation(found: Compensation) -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
+        Two panels: before and after.
 
     Examples
     --------
