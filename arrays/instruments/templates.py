@@ -91,6 +91,11 @@ class Instrument:
         keys : str or path-like, optional
             Array file (TOML) with keys that replace those of the template; sensors are matched by their ids.
 
+        Returns
+        -------
+        SensorArray
+            Array with its columns, for :func:`magloc.read_readings`.
+
         Raises
         ------
         InputError
@@ -113,6 +118,11 @@ class Instrument:
 def instrument_names() -> tuple[str, ...]:
     """Return the names of the instruments whose logs can be read.
 
+    Returns
+    -------
+    tuple of str
+        Names, in alphabetical order.
+
     Examples
     --------
     >>> import arrays
@@ -129,6 +139,11 @@ def read_instrument(name: str) -> Instrument:
     ----------
     name : str
         One of :func:`instrument_names`.
+
+    Returns
+    -------
+    Instrument
+        Its array, with the columns of its logs, and the source of the format.
 
     Raises
     ------
@@ -161,6 +176,11 @@ def read_track(path: str | PathLike[str]) -> Track:
     ----------
     path : str or path-like
         Solution of RTKLIB or Emlid (.pos).
+
+    Returns
+    -------
+    Track
+        The file, with the meaning of its columns.
 
     Raises
     ------

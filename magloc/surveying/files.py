@@ -6,6 +6,7 @@ from typing import Any
 
 from arrays.io.csv import Column
 from magloc.surveying.results import Survey
+from magloc.surveying.review.decisions import entry_of
 from magloc.truth import TRUE_POSITION_COLUMNS
 
 
@@ -19,6 +20,7 @@ def json_of_survey(found: Survey) -> dict[str, Any]:
         "chi2_per_dof": found.chi2_per_dof,
         "pose_assumed": found.pose_assumed,
         "lag_s": found.lag_s,
+        **({"decisions": [entry_of(decision) for decision in found.decisions]} if found.decisions else {}),
     }
 
 
@@ -34,5 +36,6 @@ def residual_columns(found: Survey) -> dict[str, Column]:
 
 def reach_columns(found: Survey) -> dict[str, Column]:
     """Return the columns of ``reach.csv``: places, and the least moment that is detected there."""
-    x, y, z = found.reach.place_m.T
-    return {"x_m": x, "y_m": y, "depth_m": found.ground_m - z, "moment_Am2": found.reach.moment_Am2}
+    x, y, _ = found.reach.place_m.T
+    depth_m = found.terrain.depth_of(found.reach.place_m)
+    return {"x_m": x, "y_m": y, "depth_m": depth_m, "moment_Am2": found.reach.moment_Am2}

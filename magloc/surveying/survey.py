@@ -11,28 +11,25 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 from scipy.special import chdtri
 
 from arrays.array import SensorArray
 from magloc import core
-from magloc.grids.work import Arrays, Work, workers
+from magloc.grids.work import workers
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.measurement.plausibility import warn_of_doubts
 from magloc.measurement.rows import concatenate_readings
 from magloc.readings import Readings
-from magloc.surveying.piece import ROW_ENTRIES, Ground, measure_targets, significant_sources, strongest_sources
+from magloc.surveying.piece import Ground, significant_sources, strongest_sources
 from magloc.surveying.preparation import whole_rows, with_places_between_fixes
-from magloc.surveying.results import Reach, Survey, SurveyRows, Target
-from magloc.surveying.targets import TARGET_ENTRIES
+from magloc.surveying.results import Survey
+from magloc.surveying.review.state import SurveyState
 from magloc.surveying.tiled import TiledSurvey
-from magloc.surveying.tiles import assign_sources
+from magloc.terrain.surface import Terrain
 
 _LOG = logging.getLogger(__name__)
 _TRIALS = 1.25  # independent trials per area of a map, in squared distances to the shallowest sources: 1.0 to 1.4
 _HECTARE_M2 = 1e4
-_MOST_SWEEPS = 5
-_MISFIT = 2.0
 _MOST_DOUBTED = 1_000_000  # rows
 _LONGEST_BODY_M = 10.0
 
@@ -43,7 +40,7 @@ def survey(
     *,
     base: Readings | None = None,
     prior: SourcePrior = NOTHING_KNOWN,
-    ground_m: float = 0.0,
+    ground_m: float | Terrain = 0.0,
     shortest_geology_m: float = 15.0,
     false_per_hectare: float = 0.1,
     body_length_m: float = 0.0,
@@ -75,9 +72,9 @@ def survey(
         field varies like it. Without it slow variations are estimated from the survey itself.
     prior : SourcePrior
         Limits of positions in the world frame and of moments; by default from 5 cm to 4 m below the ground, up to 1 m
-        beside the sensors, and up to 300 A·m².
-    ground_m : float
-        Height of the ground in the world frame [m].
+        beside the sensors, and up to 300 A·m². With terrain, limits of heights count from the ground.
+    ground_m : float or Terrain
+        Height of the ground in the world frame [m], or terrain: depths then count from the ground above the target.
     shortest_geology_m : float
         Shortest wavelength in the field of the ground itself [m]; shorter ones count as targets.
     false_per_hectare : float
@@ -96,6 +93,7 @@ def survey(
     Returns
     -------
     Survey
+        Targets, the most significant first, with residuals and the least moments that would have been found.
 
     Raises
     ------
@@ -131,81 +129,33 @@ def survey(
     warn_of_doubts(array, rows[:_MOST_DOUBTED])
     assumed = array.pose is None and rows.pose_sigma is None
     array, rows = with_places_between_fixes(array, rows)
-    ground = Ground(prior, ground_m, shortest_geology_m, math.inf, body_length_m)
-    tiled = TiledSurvey.of(*whole_rows(array, rows, base, ground.shallowest_m), ground)
+    terrain = ground_m if isinstance(ground_m, Terrain) else Terrain(ground_m)
+    if not terrain.is_flat:
+        low_m, high_m = ((x, y, z + terrain.height_m) for x, y, z in (prior.low_m, prior.high_m))
+        prior = replace(prior, low_m=low_m, high_m=high_m)
+    ground = Ground(prior, terrain, shortest_geology_m, math.inf, body_length_m)
+    tiled = TiledSurvey.of(*whole_rows(array, rows, base, ground.shallowest_m, terrain), ground)
     trials = _TRIALS * _HECTARE_M2 / tiled.nearest_m**2
     threshold = float(chdtri(3, min(0.5, false_per_hectare / trials)))
     tiled = replace(tiled, ground=replace(ground, threshold=threshold))
     tell: Callable[[str], None] = progress or (lambda _: None)
     folder = None if unfinished is None else Path(unfinished)
-    every = range(len(tiled.tiles))
-    at_once = min(core.threads() if processes is None else processes, len(every))
+    at_once = min(core.threads() if processes is None else processes, len(tiled.tiles))
     with workers(at_once, scheduler, folder) as each:
-
-        def settle(tiled: TiledSurvey, work: Work) -> tuple[TiledSurvey, Sequence[int]]:
-            """Search all tiles, then again those whose neighbours report changes."""
-            due: Sequence[int] = every
-            for _ in range(_MOST_SWEEPS):
-                tiled = tiled.search(work, due, each, tell)
-                due = tiled.changes()
-                if not due:
-                    break
-            return tiled, due
-
         # Strong sources beside a tile mask all others until they are known.
-        tiled, lag = settle(tiled, strongest_sources)[0].correct_lag(assumed)
+        tiled, lag = tiled.settle(strongest_sources, each, tell)[0].correct_lag(assumed)
         if lag.s:
             _LOG.warning(
                 f"the readings are {lag.s:.3f} ± {lag.sigma_s:.3f} s later than their poses, as the targets show: taken"
                 " into account"
             )
-            tiled, _ = settle(tiled, strongest_sources)
-        tiled, due = settle(tiled, significant_sources)
+            tiled, _ = tiled.settle(strongest_sources, each, tell)
+        tiled, due = tiled.settle(significant_sources, each, tell)
         if due:
-            _LOG.warning(f"{len(due)} of {len(every)} tiles differ from their neighbours in the sources at their edges")
-        if assumed:
-            tiled = tiled.with_likeliest_pose()
-        results = tiled.map_tiles(measure_targets, each, tell)
+            _LOG.warning(
+                f"{len(due)} of {len(tiled.tiles)} tiles differ from their neighbours in the sources at their edges"
+            )
+        found = SurveyState(tiled, assumed, lag.s).measure(each, tell)
     if folder is not None:
         shutil.rmtree(folder, ignore_errors=True)
-    chi2_per_dof = float(sum(result["chi2"] for result in results) / sum(result["size"] for result in results))
-    if chi2_per_dof > _MISFIT:
-        _LOG.warning(
-            f"χ² per reading is {chi2_per_dof:.1f}: noise, errors of the pose or changes of the field are larger than"
-            " stated, and so are the errors of the targets"
-        )
-    return Survey(
-        _targets(tiled, results),
-        tiled.array,
-        _rows(tiled, results),
-        Reach(*(np.concatenate([result[name] for result in results]) for name in ("reach_m", "reach_Am2"))),
-        ground_m,
-        threshold,
-        chi2_per_dof,
-        assumed,
-        lag.s,
-        time.monotonic() - began,
-        rows.lines,
-    )
-
-
-def _targets(tiled: TiledSurvey, results: Sequence[Arrays]) -> tuple[Target, ...]:
-    """Return the targets of all tiles, the most significant one first."""
-    kept = assign_sources(tiled.tiles, [result["position_m"] for result in results], tiled.same_m)
-    kept.sort(key=lambda where: -results[where[0]]["significance"][where[1]])
-    targets = []
-    for number, (t, k) in enumerate(kept, start=1):
-        position, moment, covariance, interval, significance, flags = (results[t][name][k] for name in TARGET_ENTRIES)
-        depth = tiled.ground.ground_m - float(position[2])
-        chi2, words = float(significance), tuple(str(flags).split())
-        interval95 = (float(interval[0]), float(interval[1]))
-        targets.append(Target(f"t{number}", position, moment, covariance, depth, interval95, chi2, words))
-    return tuple(targets)
-
-
-def _rows(tiled: TiledSurvey, results: Sequence[Arrays]) -> SurveyRows:
-    """Return the rows of all tiles in order of time."""
-    which = np.concatenate([tile.rows[tile.own] for tile in tiled.tiles])
-    order = np.argsort(which)
-    place, anomaly, residual = (np.concatenate([result[name] for result in results])[order] for name in ROW_ENTRIES)
-    return SurveyRows(tiled.readings.time_s[which[order]], place, anomaly, residual)
+    return replace(found, seconds=time.monotonic() - began)

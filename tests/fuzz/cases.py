@@ -39,6 +39,7 @@ LINES: dict[str, tuple[str, ...]] = {
         "ground.csv --array ground-array.toml --region=z>-0.3 --threads 1 --json",
         "magarrow.csv --instrument magarrow --place 48 11 500 --json",
         "magarrow.csv --instrument magarrow --positions magarrow.pos --place 48 11 500 --json",
+        "ground.csv --array ground-array.toml --decisions decisions.jsonl --out out",
     ),
     "magloc locate": (
         "readings.csv --array array.toml --json",
@@ -134,6 +135,10 @@ SELDOM = {
 STREAM = "readings.csv"  # what stands on stdin where a line reads from there
 
 _FILES = {
+    "decisions.jsonl": """{"action": "exclude", "from_s": 3.0, "to_s": 4.0}
+{"action": "add", "place_m": [0.2, 0.1], "when": "2026-11-29T03:50:00Z"}
+{"action": "refit"}
+""",
     "imu.toml": """format_version = 1
 [log]
 [log.gyro]

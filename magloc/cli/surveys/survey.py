@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,6 +22,7 @@ from magloc.cli.options import (
     ambient_field,
     refuse_not_positive,
 )
+from magloc.cli.surveys.ground import SurfaceOptions
 
 if TYPE_CHECKING:
     from magloc.deliverables.map_frame import MapFrame
@@ -31,13 +31,19 @@ if TYPE_CHECKING:
 
 @Parameter(name="*", group="Ground")
 @dataclass(frozen=True)
-class GroundOptions:
+class GroundOptions(SurfaceOptions):
     """Properties of the ground.
 
     Parameters
     ----------
     ground_m : float
-        Height of the ground in the world frame [m].
+        Height of the ground in the world frame [m]. With --terrain: amount to add to its heights, such as the height of
+        the sea above the ellipsoid.
+    terrain : str
+        Heights of uneven ground: a GeoTIFF (.tif) in any coordinate system, a CSV file with columns x, y, height or
+        easting, northing, height or longitude, latitude, height, or the name of the log's column with the height above
+        ground [m] from an altimeter. It must cover all lines. Depths, and limits of heights in --region, then count
+        from the ground.
     shortest_geology_m : float
         Shortest wavelength in the field of the ground itself [m]; smaller anomalies are targets.
     false_per_hectare : float
@@ -47,10 +53,26 @@ class GroundOptions:
         point sources.
     """
 
-    ground_m: Annotated[float, Parameter(allow_leading_hyphen=True)] = 0.0
     shortest_geology_m: float = 15.0
     false_per_hectare: float = 0.1
     body_length_m: float = 0.0
+
+
+@Parameter(name="*", group="Review")
+@dataclass(frozen=True)
+class ReviewOptions:
+    """Review of the targets.
+
+    Parameters
+    ----------
+    decisions : Path
+        Log of decisions about targets and rows (decisions.jsonl of an earlier review) to apply after the search.
+    html : Path
+        HTML file to write: lines, ground and targets in three dimensions, as one page that needs no server.
+    """
+
+    decisions: Path | None = None
+    html: Path | None = None
 
 
 def survey(
@@ -65,7 +87,7 @@ def survey(
     crs: str | None = None,
     scheduler: str | None = None,
     out: Path | None = None,
-    html: Path | None = None,
+    review: ReviewOptions = ReviewOptions(),
     json: Flag = False,
     common: CommonOptions = CommonOptions(),  # noqa: B008 - frozen
 ) -> None:
@@ -99,30 +121,37 @@ def survey(
     scheduler : str
         Address of a dask scheduler (tcp://HOST:PORT), whose workers then search the tiles of a large survey.
     out : Path
-        Folder for targets.csv, residual.csv, reach.csv (the smallest moment that is found), a map, and profiles past
-        the targets. With positions on the Earth also for targets.gpkg, .geojson and .kml, field.tif, residual.tif,
-        lines.xyz and a report. It also holds the finished tiles of a large survey; the same command continues an
-        interrupted survey.
-    html : Path
-        HTML file to write: lines, ground and targets in three dimensions, as one page that needs no server.
+        Folder for targets.csv, residual.csv, reach.csv (the smallest moment that is found), a map, profiles past the
+        targets, and decisions.jsonl of a review. With positions on the Earth also for targets.gpkg, .geojson and .kml,
+        field.tif, residual.tif, lines.xyz and a report. It also holds the finished tiles of a large survey; the same
+        command continues an interrupted survey.
+    review : ReviewOptions
+        Review of the targets.
     json : bool
         Print one JSON object in place of the table.
     common : CommonOptions
         Common options.
     """
+    from magloc.surveying.review.decisions import read_decisions
+
     refuse_file(out, "--out")
-    refuse_one_for_two({"--out": out, "--html": html, **maps.outputs})
-    refuse_unwritable(html, "--html")
+    refuse_one_for_two({"--out": out, "--html": review.html, **maps.outputs})
+    refuse_unwritable(review.html, "--html")
     refuse_not_positive(ground, "shortest_geology_m", "false_per_hectare")
-    if not math.isfinite(ground.ground_m):
-        raise InputError(f"--ground-m: found {ground.ground_m:g}, expected a finite number.")
+    ground.refuse()
     chosen = known.select(log.sensors(readings[0]), log.name)
+    decisions = [] if review.decisions is None else read_decisions(review.decisions)
     used, known = known.on_earth(chosen, readings[0])
     _note_ground(chosen, used, ground)
     maps.refuse(known.place)
     where = None if known.place is not None and known.date is None else known.where
     frame = _map_frame(used, known.place, crs)
     parts = [magloc.read_readings(path, used, sensors=known.ids, ordered=True) for path in readings]
+    surface, parts, origin = ground.below(readings, parts, used, known.place)
+    if origin is not None and origin != known.place:
+        note(f"note: the origin is on the ground, at a height of {origin[2]:.2f} m")
+        known, frame = replace(known, place=origin), _map_frame(used, origin, crs)
+        where = where and known.where
     for path, part in zip(readings, parts, strict=True):
         maps.refuse_far(part, str(path), always=out is not None and frame is not None)
     fields = [ambient_field(used, part, where) for part in parts]
@@ -136,7 +165,7 @@ def survey(
             rows,
             base=station,
             prior=known.prior,
-            ground_m=ground.ground_m,
+            ground_m=surface,
             shortest_geology_m=ground.shortest_geology_m,
             false_per_hectare=ground.false_per_hectare,
             body_length_m=ground.body_length_m,
@@ -144,10 +173,13 @@ def survey(
             unfinished=None if out is None else out / "tiles",
             progress=None if json else note,
         )
+    if review.decisions is not None:
+        with naming(str(review.decisions)):
+            found = magloc.Review(found).replay(decisions, None if json else note).found
     maps.write(found, known.place)
-    write_files(out, _files(found, frame, ", ".join(path.name for path in readings), ground))
-    if html is not None:
-        magloc.view(None, found, html=html, title="survey")
+    _write(out, _files(found, frame, ", ".join(path.name for path in readings), ground))
+    if review.html is not None:
+        magloc.view(None, found, html=review.html, title="survey")
     if json:
         from magloc.surveying.files import json_of_survey
 
@@ -177,7 +209,8 @@ def _map_frame(array: arrays.SensorArray, origin: Vector | None, crs: str | None
 
 def _note_ground(given: arrays.SensorArray, used: arrays.SensorArray, ground: GroundOptions) -> None:
     """Name the height that the ground is stated above, where it is that of the log's first place."""
-    if given.columns == used.columns or used.columns is None or used.columns.above_ground:
+    is_stated = given.columns == used.columns or used.columns is None or used.columns.above_ground
+    if is_stated or ground.terrain is not None:
         return
     note(f"note: --ground-m counts from the height of that place, negative below it: found {ground.ground_m:g} m")
 
@@ -194,15 +227,35 @@ def _json_of_map(found: Survey, frame: MapFrame | None) -> dict[str, Any]:
     return {"origin": list(frame.origin), "crs": frame.label, "targets": targets}
 
 
+def _write(out: Path | None, files: Iterator[tuple[str, Any]]) -> None:
+    """Write files into a folder, and name those of an earlier survey that stay."""
+    from magloc.deliverables.files import MAP_FILES
+
+    if out is None:
+        return
+    before = {name: _changed_ns(out / name) for name in ("decisions.jsonl", *MAP_FILES)}
+    write_files(out, files)
+    if older := [name for name, at in before.items() if at is not None and _changed_ns(out / name) == at]:
+        note(f"note: {', '.join(older)} in {out} {'are' if len(older) > 1 else 'is'} of an earlier run")
+
+
+def _changed_ns(path: Path) -> int | None:
+    """Return the time of the last change of a file [ns], None if it does not exist."""
+    return path.stat().st_mtime_ns if path.exists() else None
+
+
 def _files(found: Survey, frame: MapFrame | None, title: str, ground: GroundOptions) -> Iterator[tuple[str, Any]]:
     """Yield targets.csv, residual.csv, reach.csv, the map, the lines past the targets, and files for a client's map."""
     from magloc.deliverables.files import map_columns, survey_files
     from magloc.plots.profiles import survey_profiles
     from magloc.surveying.files import reach_columns, residual_columns
+    from magloc.surveying.review.decisions import decision_lines
 
     yield "targets.csv", found.columns() | ({} if frame is None else map_columns(found, frame))
     yield "residual.csv", residual_columns(found)
     yield "reach.csv", reach_columns(found)
+    if found.decisions:
+        yield "decisions.jsonl", decision_lines(found.decisions)
     maps, profiles = found.plot(), survey_profiles(found)
     yield "survey.png", maps
     yield "profiles.png", profiles

@@ -11,6 +11,7 @@ from matplotlib.colors import SymLogNorm
 
 from arrays.typing import ByteArray, FloatArray
 from magloc.surveying.results import Survey, Target, linear_and_most
+from magloc.terrain.surface import Terrain
 from magloc.viewer.pages import texts
 from magloc.viewer.scene.glyphs import (
     DIPOLE_COLOUR,
@@ -27,6 +28,7 @@ from magloc.viewer.scene.shapes import Surface, ellipsoid, join_surfaces, line_s
 
 _SCALE = colormaps["RdBu_r"]
 _GROUND_COLOUR = (150, 120, 90)
+_GROUND_NODES = 50  # along each side of uneven ground
 
 
 def add_survey(server: viser.ViserServer, found: Survey) -> tuple[list[Entry], FloatArray]:
@@ -38,8 +40,7 @@ def add_survey(server: viser.ViserServer, found: Survey) -> tuple[list[Entry], F
     low, high = places.min(axis=0), places.max(axis=0)
     size = 0.04 * float(np.linalg.norm(high - low))
     add_points(scene, "/rows", places, _colours(SymLogNorm(linear, vmin=-most, vmax=most)(anomaly_nT)), 0.12 * size)
-    corners = np.array([[x, y, found.ground_m] for x in (low[0], high[0]) for y in (low[1], high[1])])
-    ground = Surface(corners.astype(np.float32), np.array([[0, 2, 1], [1, 2, 3]], dtype=np.uint32))
+    ground = _ground(found.terrain, low[:2], high[:2])
     add_mesh(scene, "/ground", ground, _GROUND_COLOUR, flat=True, opacity=0.3)
     text = f"anomaly, linear up to {linear:.2g} nT, then logarithmic"
     entries: list[Entry] = [
@@ -49,9 +50,9 @@ def add_survey(server: viser.ViserServer, found: Survey) -> tuple[list[Entry], F
     if len(found):
         for target in found:
             DipoleGlyph(scene, f"/{target.id}", size).show(target.position_m, target.moment_Am2)
-            above = np.array([*target.position_m[:2], found.ground_m])
-            add_label(scene, f"/{target.id}-text", f"{target.id}: {target.depth_m:.2f} m", above, "bottom-center")
-        ends = np.stack([found.position_m, found.position_m * [1.0, 1.0, 0.0] + [0.0, 0.0, found.ground_m]], axis=1)
+            text = f"{target.id}: {target.depth_m:.2f} m"
+            add_label(scene, f"/{target.id}-text", text, _above(found.terrain, target.position_m), "bottom-center")
+        ends = np.stack([found.position_m, _above(found.terrain, found.position_m)], axis=1)
         add_lines(scene, "/depths", ends, DIPOLE_COLOUR, 1.0)
         regions = join_surfaces(ellipsoid(target.position_m, target.covariance[:3, :3]) for target in found)
         add_mesh(scene, "/ellipsoids", regions, REGION_COLOUR, opacity=0.4)
@@ -60,7 +61,22 @@ def add_survey(server: viser.ViserServer, found: Survey) -> tuple[list[Entry], F
         )
         entries.append(Swatch(REGION_COLOUR, "95 % ellipsoids of their positions"))
         _add_targets(server, found, size)
-    return entries, np.vstack([places, corners, found.position_m])
+    return entries, np.vstack([places, ground.vertices, found.position_m])
+
+
+def _ground(terrain: Terrain, low_m: FloatArray, high_m: FloatArray) -> Surface:
+    """Return the ground in a rectangle."""
+    n = 2 if terrain.is_flat else _GROUND_NODES
+    xy = np.stack(np.meshgrid(*np.linspace(low_m, high_m, n).T, indexing="ij"), axis=-1).reshape(-1, 2)
+    nodes = np.column_stack([xy, terrain.height_at(xy)])
+    first = (n * np.arange(n - 1)[:, None] + np.arange(n - 1)).reshape(-1, 1)
+    faces = first + np.array([[0, n, 1], [1, n, n + 1]])[:, None]
+    return Surface(nodes.astype(np.float32), faces.reshape(-1, 3).astype(np.uint32))
+
+
+def _above(terrain: Terrain, position_m: FloatArray) -> FloatArray:
+    """Return the places (..., 3) on the ground above positions (..., 3)."""
+    return np.concatenate([position_m[..., :2], terrain.height_at(position_m[..., :2])[..., None]], axis=-1)
 
 
 def _add_targets(server: viser.ViserServer, found: Survey, size_m: float) -> None:
@@ -73,7 +89,7 @@ def _add_targets(server: viser.ViserServer, found: Survey, size_m: float) -> Non
 
     def show(_: object = None) -> None:
         target = targets[dropdown.value]
-        ring.position = np.array([*target.position_m[:2], found.ground_m])
+        ring.position = _above(found.terrain, target.position_m)
         panel.content = texts.panel_html(target_lines(target), warning=bool(target.flags))
 
     dropdown.on_update(show)

@@ -14,6 +14,7 @@ from magloc.navigation.course import chords
 _LONGEST_GAP = 20.0  # in usual steps of time
 _TURN_deg = 35.0  # smallest angle between the courses before and after a row of a turn
 _SHORTEST = 3.0  # in chords
+_FLAT = 1e-3  # A single line extends less across than this share of its length.
 
 
 class FlightLine(NamedTuple):
@@ -26,7 +27,7 @@ class FlightLine(NamedTuple):
 
 
 def flight_lines(
-    time_s: FloatArray, place_m: FloatArray, ground_m: float = 0.0, names: Sequence[tuple[float, str]] = ()
+    time_s: FloatArray, place_m: FloatArray, height_m: FloatArray, names: Sequence[tuple[float, str]] = ()
 ) -> list[FlightLine]:
     """Return the lines of a survey in the order of time.
 
@@ -37,8 +38,8 @@ def flight_lines(
     ----------
     time_s : ndarray, shape (n,)
     place_m : ndarray, shape (n, 3)
-    ground_m : float
-        Height of the ground in the world frame.
+    height_m : ndarray, shape (n,)
+        Heights above the ground.
     names : sequence of (float, str)
         Times at which the lines of the log begin, and their names.
     """
@@ -48,9 +49,8 @@ def flight_lines(
     for name, rows in _named_rows(time_s, names) if names else _straight_rows(time_s, place_m):
         way_m = float(np.linalg.norm(np.diff(place_m[rows, :2], axis=0), axis=1).sum())
         duration_s = float(time_s[rows][-1] - time_s[rows][0])
-        height_m = float(place_m[rows, 2].mean() - ground_m)
         speed_m_s = way_m / duration_s if duration_s else 0.0
-        lines.append(FlightLine(name or f"L{len(lines) + 1}", rows, speed_m_s, height_m))
+        lines.append(FlightLine(name or f"L{len(lines) + 1}", rows, speed_m_s, float(height_m[rows].mean())))
     return lines
 
 
@@ -86,3 +86,19 @@ def _line_starts(xy_m: FloatArray) -> list[int]:
         if way[end] - way[starts[-1]] > _SHORTEST * chord and way[-1] - way[end] > _SHORTEST * chord:
             starts.append(int(end))
     return starts
+
+
+def covers_area(xy_m: FloatArray) -> bool:
+    """Return whether rows (n, 2) cover an area, and not a single line."""
+    return bool(np.linalg.matrix_rank(xy_m - xy_m.mean(axis=0), rtol=_FLAT) == 2)
+
+
+def line_spacing(xy_m: FloatArray) -> float:
+    """Return the usual distance between lines [m] of rows (n, 2): the area that they cover, divided by the way."""
+    way_m = float(np.linalg.norm(np.diff(xy_m, axis=0), axis=1).sum())
+    extent_m = float(np.ptp(xy_m, axis=0).max())
+    if not covers_area(xy_m):
+        return extent_m / 20.0  # a single line
+    from scipy.spatial import ConvexHull
+
+    return max(float(ConvexHull(xy_m).volume) / way_m, extent_m / 500.0)
