@@ -167,11 +167,10 @@ def attitude_effects(
     """Return what errors of the attitude (n, m), of unit variance, change of a platform's effect on the modulus."""
     if attitude.errors is None:
         return np.zeros((len(time_s), 0))
-    errors = np.moveaxis(attitude.errors.columns(field_T, rate_T_s, currents), 2, 0)
-    turnings = np.nan_to_num(np.gradient(errors, time_s, axis=1))
-
-    def effect(share: float, error: FloatArray, turning: FloatArray) -> FloatArray:
-        turned = field_T + share * error, rate_T_s + share * turning
-        return platform_moduli(terms, coefficients, *turned, currents)[0]
-
-    return np.stack([effect(0.5, *each) - effect(-0.5, *each) for each in zip(errors, turnings, strict=True)], axis=1)
+    errors = attitude.errors.columns(field_T, rate_T_s, currents)
+    turnings = np.nan_to_num(np.gradient(errors, time_s, axis=0))
+    total = field_T + terms.fields(field_T, rate_T_s, currents) @ coefficients
+    before, after = (each / np.linalg.norm(each, axis=1, keepdims=True) for each in (field_T, total))
+    induced, eddy = terms.matrices(coefficients)
+    along = np.einsum("ni,nim->nm", after - before, errors)
+    return np.asarray(along + np.einsum("ni,nim->nm", after, induced @ errors + eddy @ turnings))

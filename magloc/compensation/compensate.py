@@ -129,45 +129,47 @@ def _corrected(log: PlatformLog, fits: Mapping[str, PlatformFit]) -> tuple[Float
         gain = array.channel_gain[channels]
         if sensor.kind == "vector":
             used = log.attitude_of(sensor).without(fit.terms, fit.coefficients, log.currents)
-            h, _, deviation = _correction(log, sensor, fit, used, coarse_s)
-            change = log.factors[sensor.id] * h @ gain.T
         else:
             assert attitude is not None
-            _, effect, deviation = _correction(log, sensor, fit, attitude, coarse_s)
-            change = effect[:, None] * gain[:, :1].T
-        every = _between(coarse_s, np.column_stack([change, deviation]), time_s)
-        values[:, channels] = log.readings.values_T[:, channels] - every[:, :-1]
-        sigma[:, i] = every[:, -1]
+            used = attitude
+        coarse = np.column_stack(_correction(log, sensor, fit, used, coarse_s))
+        h, unit, effect, deviation = np.split(_between(coarse_s, coarse, time_s), [3, 6, 7], axis=1)
+        jumps = log.jumps @ fit.terms.current_fields(fit.coefficients)
+        if sensor.kind == "vector":
+            change = log.factors[sensor.id] * (h + jumps) @ gain.T
+        else:
+            change = (effect + np.sum(unit * jumps, axis=1, keepdims=True)) * gain[:, :1].T
+        values[:, channels] = log.readings.values_T[:, channels] - change
+        sigma[:, i] = deviation[:, 0]
     return values, sigma
 
 
 def _correction(
     log: PlatformLog, sensor: Sensor, fit: PlatformFit, attitude: Attitude, time_s: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the platform's field (n, 3), its effect on the modulus (n,), and the σ of the effect's changes (n,)."""
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return the platform's field and the ambient unit vector (n, 3), the effect on the modulus, and its σ (n,)."""
     sampled_s, samples = log.signals[sensor.id].samples()
     known = np.isfinite(attitude.at(sampled_s + fit.lag_s)[0]).all(axis=1)
     known &= np.isfinite(currents_at(log.currents, sampled_s)).all(axis=1)
     if known.sum() < 2:
-        nothing = np.full(len(time_s), np.nan)
-        return np.stack([nothing] * 3, axis=1), nothing, nothing
+        nothing = np.full((len(time_s), 3), np.nan)
+        return nothing, nothing, nothing[:, 0], nothing[:, 0]
     sampled_s, read = sampled_s[known], np.linalg.norm(samples[known], axis=1)
     flowing, modulus = currents_at(log.currents, sampled_s), read
     for _ in range(2):
         field, rate = ambient_at(attitude, sampled_s, modulus, fit.lag_s)
         modulus = read - platform_moduli(fit.terms, fit.coefficients, field, rate, flowing)[0]
-    slow = np.linalg.norm(field, axis=1)
     unit, turning = attitude.at(time_s + fit.lag_s)
-    size = np.interp(time_s, sampled_s, slow)[:, None]
-    currents = currents_at(log.currents, time_s)
-    effect, columns = platform_moduli(fit.terms, fit.coefficients, unit * size, turning * size, currents)
-    h = fit.terms.fields(unit * size, turning * size, currents) @ fit.coefficients
-    if len(fit.mean) > len(fit.coefficients):
-        more = attitude_effects(attitude, time_s, fit.terms, fit.coefficients, unit * size, turning * size, currents)
-        effect, columns = effect + more @ fit.mean[len(fit.coefficients) :], np.column_stack([columns, more])
+    size = np.interp(time_s, sampled_s, np.linalg.norm(field, axis=1))[:, None]
+    field, rate, currents = unit * size, turning * size, currents_at(log.currents, time_s)
+    effect, columns = platform_moduli(fit.terms, fit.coefficients, field, rate, currents)
+    errors = attitude_effects(attitude, time_s, fit.terms, fit.coefficients, field, rate, currents)
+    effect = effect + errors @ fit.mean[len(fit.coefficients) :]
+    columns = np.column_stack([columns, errors])
     changes = columns - np.nanmean(columns, axis=0)
     variance = np.einsum("nq,qr,nr->n", changes, fit.joint_covariance, changes)
-    return h, effect, np.sqrt(np.maximum(variance, 0.0))
+    h = fit.terms.fields(field, rate, currents) @ fit.coefficients
+    return h, unit, effect, np.sqrt(np.maximum(variance, 0.0))
 
 
 def _between(coarse_s: FloatArray, values: FloatArray, time_s: FloatArray) -> FloatArray:

@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from arrays.typing import FloatArray
 from magloc.compensation.figure_of_merit import HEADINGS
-from magloc.compensation.fit import PlatformFit
+from magloc.compensation.fit import Background, PlatformFit
 from magloc.compensation.log import PlatformLog
 from magloc.compensation.results import SensorCompensation
 
@@ -17,6 +17,7 @@ _LATE_SIGMAS, _LATE_S = 4.0, 0.02
 _TURNED_DEG = 5.0
 _FALSE_ALARM = 1e-4
 _CANDIDATES, _LEAST_SHARE, _LEAST_NOISES = 40, 0.02, 5.0
+_LEAST_SIGMAS = 1.0  # a smaller step is within the uncertainty of the permanent field
 _NOISE_RATIO = 5.0
 _UNSURE_T, _UNSURE_SHARE = 1e-10, 0.5
 _EARTH_T = (15e-6, 80e-6)
@@ -104,29 +105,28 @@ def _change(fit: PlatformFit) -> tuple[float, float] | None:
 
     A score test: residuals against three components from each of some times on, with all coefficients estimated.
     """
-    A, r, n = fit.columns, fit.innovations, len(fit.innovations)
-    white = fit.background.whitening(fit.rows.time_s)
+    background = Background.usual(fit.rows.noise_T)
+    solved = fit.problem.solve(background)
+    A, r, n = solved.columns, solved.innovations, len(solved.innovations)
+    white = background.whitening(fit.rows.time_s)
     unit = fit.field_T / np.linalg.norm(fit.field_T, axis=1, keepdims=True)
     begins = np.linspace(0, n, _CANDIDATES + 2)[1:-1].astype(np.intp)
     steps = np.concatenate([np.where(np.arange(n)[:, None] >= k, unit, 0.0) for k in begins], axis=1)
-    S = np.ascontiguousarray(steps[:, None] / fit.background.noise_nT)
+    S = np.ascontiguousarray(steps[:, None] / background.noise_nT)
     white.whiten(S, np.arange(n))
     S = S[:, 0]
     inverse = np.linalg.inv(A.T @ A + np.eye(A.shape[1]))
     scores, across = S.T @ r, S.T @ A
-    best = (0.0, 0, 0.0)
-    for k, begin in enumerate(begins):
+    prior = np.diag((1e9 * fit.terms.sigma[:3]) ** -2.0)
+    best, begin, step_nT = 0.0, 0, np.zeros(3)
+    for k, first in enumerate(begins):
         own = slice(3 * k, 3 * k + 3)
         information = S[:, own].T @ S[:, own] - across[own] @ inverse @ across[own].T
-        values, axes = np.linalg.eigh(information)
-        good = values > 1e-9 * max(values[-1], 1e-300)
-        along = (axes.T @ scores[own])[good]
-        score = float(np.sum(along**2 / values[good]))
-        size_nT = float(np.linalg.norm(along / values[good]))
-        if score > best[0]:
-            best = score, int(begin), size_nT
-    score, begin, size_nT = best
+        estimate = np.linalg.solve(information + prior, scores[own])
+        score = float(scores[own] @ estimate)
+        if score > best:
+            best, begin, step_nT = score, int(first), np.asarray(estimate)
     threshold = max(float(chi2.isf(_FALSE_ALARM / _CANDIDATES, 3)), _LEAST_SHARE * n)
-    if score < threshold or size_nT < _LEAST_NOISES * fit.background.noise_nT:
-        return None
-    return float(fit.rows.time_s[begin]), 1e-9 * size_nT
+    size_nT, sigma_nT = float(np.linalg.norm(step_nT)), 1e9 * fit.sigma[:3]
+    is_small = size_nT < _LEAST_NOISES * fit.background.noise_nT or (np.abs(step_nT) < _LEAST_SIGMAS * sigma_nT).all()
+    return None if best < threshold or is_small else (float(fit.rows.time_s[begin]), 1e-9 * size_nT)

@@ -26,7 +26,7 @@ from magloc.surveying.fit.kernels import WhiteningFilter
 _NANO = 1e9
 _ITERATIONS = 6
 _NOISE_AT = (1, 3)  # iterations that estimate the noise anew
-_LARGEST_SLOPE = 1e3  # prior of the background's slope [nT/s]
+_LARGEST_nT, _LARGEST_SLOPE = 1e4, 1e2  # priors of the background and of its slope, per second
 _GRADIENT_nT_m = 0.1  # prior of a uniform gradient of the Earth's field
 _LAG_S, _LARGEST_LAG_S, _LAG_STEP_S = 0.5, 1.0, 0.1
 _DIFFERENCE_S = 0.02
@@ -51,13 +51,18 @@ class Background:
     walk_nT_rts: float
     bend_nT_s15: float
 
+    @classmethod
+    def usual(cls, noise_T: float) -> Background:
+        """Return a background that leaves manoeuvres alone, for a stated noise."""
+        return cls(max(_NANO * noise_T, 1e-3), 0.3, 0.1)
+
     def whitening(self, time_s: FloatArray) -> WhiteningFilter:
         """Return the filter that whitens samples at some times, in units of the noise."""
         n, dt = len(time_s), np.diff(time_s, prepend=time_s[0])
         walk, bend = (each / self.noise_nT for each in (self.walk_nT_rts, self.bend_nT_s15))
         added = np.stack([walk**2 * dt, bend**2 * dt**3 / 3.0, bend**2 * dt], axis=1)
         H = np.tile([1.0, 1.0, 0.0], (n, 1, 1))
-        start = np.array([0.0, (1e5 / self.noise_nT) ** 2, (_LARGEST_SLOPE / self.noise_nT) ** 2])
+        start = np.array([0.0, (_LARGEST_nT / self.noise_nT) ** 2, (_LARGEST_SLOPE / self.noise_nT) ** 2])
         return WhiteningFilter(H, np.ones((n, 3)), added, dt, start)
 
 
@@ -114,10 +119,8 @@ class PlatformFit:
         Ambient field of the samples in the platform's axes.
     effect_T : ndarray, shape (n,)
         Effect of the platform.
-    innovations : ndarray, shape (n,)
-        White residuals.
-    columns : ndarray, shape (n, m)
-        White derivatives by coefficients and nuisances, in units of their priors.
+    problem : LinearProblem
+        The last linear problem.
     outliers : int
         Samples that were left out.
     """
@@ -131,8 +134,7 @@ class PlatformFit:
     rows: CalibrationRows
     field_T: FloatArray
     effect_T: FloatArray
-    innovations: FloatArray
-    columns: FloatArray
+    problem: LinearProblem
     outliers: int
 
     @property
@@ -160,20 +162,20 @@ class PlatformFit:
 def fit_platform(rows: CalibrationRows, terms: PlatformTerms) -> PlatformFit:
     """Return the coefficients of the terms, with their covariance."""
     q, outliers = len(terms.names), 0
-    background = Background(max(_NANO * rows.noise_T, 1e-3), 0.3, 0.1)
+    background = Background.usual(rows.noise_T)
     coarse_s = 0.0 if rows.is_own else _coarse_lag(rows, terms, background)
     rows = replace(rows, late_s=coarse_s)
-    point = _Linearised.at(rows, terms, np.zeros(q), 0.0)
+    point = LinearProblem.at(rows, terms, np.zeros(q), 0.0)
     for iteration in range(_ITERATIONS):
         if iteration in _NOISE_AT:
             background = _most_likely(point, background)
         solved = point.solve(background)
-        if iteration == _NOISE_AT[0]:
+        if iteration in _NOISE_AT:
             good = np.abs(solved.innovations) < _OUTLIER
             if 0 < (~good).sum() < _MOST_OUTLIERS * len(good):
-                outliers = int((~good).sum())
+                outliers += int((~good).sum())
                 rows = point.rows[good]
-        point = _Linearised.at(rows, terms, solved.mean[:q], 0.0 if rows.is_own else solved.mean[-1] * _LAG_S)
+        point = LinearProblem.at(rows, terms, solved.mean[:q], 0.0 if rows.is_own else solved.mean[-1] * _LAG_S)
     solved = point.solve(background)
     joint = q + point.n_errors
     lag = (0.0, 0.0) if rows.is_own else (solved.mean[-1] * _LAG_S, np.sqrt(solved.covariance[-1, -1]) * _LAG_S)
@@ -187,8 +189,7 @@ def fit_platform(rows: CalibrationRows, terms: PlatformTerms) -> PlatformFit:
         point.rows,
         point.field_T,
         point.effect_T + point.columns_nT[:, q:joint] @ solved.mean[q:joint] / _NANO,
-        solved.innovations,
-        solved.columns,
+        point,
         outliers,
     )
 
@@ -206,7 +207,7 @@ def _with_squared_turns(covariance: FloatArray, terms: PlatformTerms) -> FloatAr
 
 
 @dataclass(frozen=True, eq=False)
-class _Solved:
+class Posterior:
     """Posterior mean and covariance of all unknowns in units of their priors, and white residuals."""
 
     mean: FloatArray
@@ -217,7 +218,7 @@ class _Solved:
 
 
 @dataclass(frozen=True, eq=False)
-class _Linearised:
+class LinearProblem:
     """Linear problem at some coefficients: samples [nT] and their derivatives by unknowns of unit variance."""
 
     rows: CalibrationRows
@@ -228,7 +229,7 @@ class _Linearised:
     n_errors: int
 
     @classmethod
-    def at(cls, rows: CalibrationRows, terms: PlatformTerms, coefficients: FloatArray, lag_s: float) -> _Linearised:
+    def at(cls, rows: CalibrationRows, terms: PlatformTerms, coefficients: FloatArray, lag_s: float) -> LinearProblem:
         """Return the problem at coefficients and a lag; samples without an attitude are left out."""
         attitude = rows.attitude
         if rows.is_own and coefficients.any():
@@ -251,7 +252,7 @@ class _Linearised:
         samples = _NANO * (modulus - np.median(modulus)) + columns @ unknowns
         return cls(rows, samples, columns, field, effect, errors.shape[1])
 
-    def solve(self, background: Background) -> _Solved:
+    def solve(self, background: Background) -> Posterior:
         """Return the posterior of the unknowns for a noise and a background."""
         white = background.whitening(self.rows.time_s)
         m = self.columns_nT.shape[1]
@@ -264,9 +265,9 @@ class _Linearised:
         covariance = np.asarray(np.linalg.inv(information))
         mean = covariance @ (A.T @ y)
         residual = y - A @ mean
-        cost = float(y @ residual) + 2.0 * float(np.log(np.diagonal(root)).sum())
-        cost -= 2.0 * float(np.log(white.gains[:, 0, -1]).sum()) - 2.0 * len(y) * float(np.log(background.noise_nT))
-        return _Solved(mean, covariance, residual, A, cost)
+        evidence = float(y @ residual) + 2.0 * float(np.log(np.diagonal(root)).sum())
+        evidence -= 2.0 * float(np.log(white.gains[:, 0, -1]).sum()) - 2.0 * len(y) * float(np.log(background.noise_nT))
+        return Posterior(mean, covariance, residual, A, evidence)
 
 
 def _nuisances(
@@ -295,13 +296,13 @@ def _coarse_lag(rows: CalibrationRows, terms: PlatformTerms, background: Backgro
     lags = _LAG_STEP_S * np.array(sorted(range(-steps, steps + 1), key=abs))
     start, costs = np.zeros(len(terms.names)), []
     for lag in lags:
-        points = _Linearised.at(replace(rows, late_s=float(lag)), terms, start, 0.0)
+        points = LinearProblem.at(replace(rows, late_s=float(lag)), terms, start, 0.0)
         costs.append(points.solve(background).minus_log_evidence / len(points.samples_nT))
     best = int(np.argmin(costs))
     return float(lags[best]) if costs[best] < 0.9 * costs[0] else 0.0
 
 
-def _most_likely(point: _Linearised, start: Background) -> Background:
+def _most_likely(point: LinearProblem, start: Background) -> Background:
     """Return the noise and the background with the largest evidence."""
 
     def cost(logarithms: FloatArray) -> float:

@@ -7,12 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.ndimage import maximum_filter1d
 
 from arrays.array import SensorArray
 from arrays.io.values import numbers
 from arrays.sensor import Sensor
 from arrays.typing import FloatArray
-from magloc.compensation.attitude import Attitude, AttitudeErrors
+from magloc.compensation.attitude import Attitude, AttitudeErrors, currents_at
 from magloc.compensation.fit import FEWEST_ROWS, CalibrationRows
 from magloc.compensation.signals import Signal, white_noise
 from magloc.measurement.rows import check_magnitudes
@@ -24,6 +25,7 @@ _STEP_DEPTHS = 0.4  # usual step of the rows, relative to the depth of sources, 
 _SAME_UNIT = 1.25  # largest ratio of a vector sensor's modulus to that of the scalar sensors
 _FEWEST_SHARE = 0.3  # least share of rows in which a vector sensor that states the attitude reads
 _TURN_RAD = 0.02  # prior of the turn between a pose and the sensors, if the array file states none
+_JUMP, _BESIDE_JUMP = 8.0, 3  # in usual steps; rows beside it
 _FLOWN_M = 10.0
 
 
@@ -42,6 +44,8 @@ class PlatformLog:
     factors : dict of str to float
         Modulus of each vector sensor over that of the scalar sensors where units differ, else 1.
     currents : Signal, optional
+    jumps : ndarray, shape (n, K)
+        Currents minus the signal, which has no jumps.
     left_out : dict of str to tuple of int
         Numbers of stuck and of wild readings of each sensor.
     """
@@ -51,6 +55,7 @@ class PlatformLog:
     signals: Mapping[str, Signal]
     factors: Mapping[str, float]
     currents: Signal | None
+    jumps: FloatArray
     left_out: Mapping[str, tuple[int, int]]
 
     @classmethod
@@ -61,7 +66,7 @@ class PlatformLog:
             raise ValueError(f"Input readings must have {FEWEST_ROWS} rows or more; instead received {len(readings)}.")
         if not (np.diff(readings.time_s) > 0.0).all():
             raise ValueError("Input readings must be in order of time; instead received others.")
-        values, left_out = _clean(array, without_saturated(readings, array))
+        values, left_out = _clean(array, without_saturated(readings, array), currents)
         readings = replace(readings, values_T=values)
         fields, moduli = array.calibrated_field(values), {}
         for i, sensor in enumerate(array.sensors):
@@ -80,7 +85,8 @@ class PlatformLog:
             factors[sensor.id] = 1.0 if not moduli or 1.0 / _SAME_UNIT < ratio < _SAME_UNIT else ratio
             signals[sensor.id] = Signal.of(readings.time_s, fields[:, i] / factors[sensor.id])
         flowing = None if not currents.shape[1] else Signal.of(readings.time_s, currents)
-        return cls(array, readings, signals, factors, flowing, left_out)
+        jumps = np.nan_to_num(currents - currents_at(flowing, readings.time_s))
+        return cls(array, readings, signals, factors, flowing, jumps, left_out)
 
     def noise_T(self, sensor: Sensor) -> float:
         """Return the noise of a sensor in the scalar sensors' unit: as stated, or as read from row to row if larger."""
@@ -158,17 +164,26 @@ def columns_of(currents: Mapping[str, ArrayLike] | None, names: tuple[str, ...],
     return np.stack(columns, axis=1) if names else np.zeros((n, 0))
 
 
-def _clean(array: SensorArray, readings: Readings) -> tuple[FloatArray, dict[str, tuple[int, int]]]:
-    """Return readings (n, C) without stuck and wild values of sensors, and the numbers of both by sensor."""
+def _clean(
+    array: SensorArray, readings: Readings, currents: FloatArray
+) -> tuple[FloatArray, dict[str, tuple[int, int]]]:
+    """Return readings (n, C) without stuck and wild values of sensors, and the numbers of both by sensor.
+
+    Near the jump of a current no reading counts as wild.
+    """
     values, time_s = readings.values_T.copy(), readings.time_s
     stuck = stuck_readings(array, values)
     place = np.zeros((len(time_s), 3))
     place[:, 0] = time_s * (_STEP_DEPTHS / float(np.median(np.diff(time_s))))
+    steps = np.abs(np.diff(currents, axis=0, prepend=currents[:1]))
+    jumps = (steps > _JUMP * np.nanmedian(steps, axis=0)).any(axis=1) if currents.size else np.zeros(len(values), bool)
+    jumps = maximum_filter1d(jumps, 1 + 2 * _BESIDE_JUMP)
     left_out = {}
     for i, sensor in enumerate(array.sensors):
         own = np.flatnonzero(array.channel_sensor == i)
         values[np.ix_(stuck[:, i], own)] = np.nan
         wild = np.any([wild_readings(values[:, c], place, 1.0, sensor.noise_T, 0.0) for c in own], axis=0)
+        wild &= ~jumps
         values[np.ix_(wild, own)] = np.nan
         left_out[sensor.id] = int(stuck[:, i].sum()), int(wild.sum())
     return values, left_out

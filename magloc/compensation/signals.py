@@ -55,7 +55,7 @@ class Signal:
             if n < _SHORTEST + 4 * step:
                 continue
             grid = np.linspace(own[0], own[-1], n)
-            even = np.stack([np.interp(grid, own, column) for column in y.T], axis=1)
+            even = CubicSpline(own, y)(grid)
             if low_pass is not None:
                 even = sosfiltfilt(low_pass, even, axis=0, padlen=min(n - 1, 20 * step))
             stretches.append(CubicSpline(grid, even))
@@ -96,11 +96,15 @@ def white_noise(time_s: FloatArray, values: FloatArray) -> FloatArray:
 
 
 def smooth_in_stretches(time_s: FloatArray, values: FloatArray, width_s: float) -> FloatArray:
-    """Return values (n,) after a Gaussian filter of some width, stretch by stretch."""
+    """Return values (n,) after a Gaussian filter of some width, stretch by stretch between longer gaps."""
     interval_s = float(np.median(np.diff(time_s)))
     ends = np.flatnonzero(np.diff(time_s) > width_s) + 1
-    parts = np.split(values, ends)
-    return np.concatenate([gaussian_filter1d(part, width_s / interval_s, mode="nearest") for part in parts])
+    parts = []
+    for time, part in zip(np.split(time_s, ends), np.split(values, ends), strict=True):
+        grid = np.linspace(time[0], time[-1], 1 + round((time[-1] - time[0]) / interval_s))
+        smooth = gaussian_filter1d(np.interp(grid, time, part), width_s / interval_s, mode="nearest")
+        parts.append(np.interp(time, grid, smooth))
+    return np.concatenate(parts)
 
 
 def band_passed(time_s: FloatArray, values: FloatArray, corner_s: float) -> FloatArray:

@@ -95,6 +95,10 @@ class PlatformTerms:
         own = (coefficients * self.sigma)[3 : 3 + 2 * n].reshape(2, n)
         return np.asarray((own @ _BASIS.T).reshape(2, 3, 3))
 
+    def current_fields(self, coefficients: FloatArray) -> FloatArray:
+        """Return the fields (K, 3) of currents of 1, for coefficients in their priors."""
+        return (coefficients * self.sigma)[3 + 2 * len(MATRICES) :].reshape(-1, 3)
+
     def fields(self, field_T: FloatArray, rate_T_s: FloatArray, currents: FloatArray) -> FloatArray:
         """Return the fields (n, 3, q) of the terms, each of the size of its prior.
 

@@ -9,15 +9,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 import arrays
 from arrays.typing import FloatArray
+from magloc.compensation.results import SensorCompensation
+from magloc.compensation.terms import MATRICES
 from magloc.readings import Readings
 
 WORLD_T = np.array([1500.0, 19500.0, -44000.0]) * 1e-9  # east, north, up
 GRADIENT_T_m = np.array([4e-12, -3e-12, 15e-12])
 SPEED_M_S = 40.0
+_BASIS = np.stack([matrix.ravel() for matrix in MATRICES.values()], axis=1)
 
 
 @dataclass(frozen=True)
@@ -38,6 +42,13 @@ class Platform:
             sensor.eddy_uncertainty_s * rng.standard_normal((3, 3)),
             current_T * rng.standard_normal(3),
         )
+
+    def coefficients(self, mean_A: float | None = None) -> FloatArray:
+        """Return the coefficients (q,) in SI units; the permanent field has that of a mean current."""
+        elements = [matrix.ravel() @ _BASIS for matrix in (self.induced, self.eddy)]
+        if mean_A is None:
+            return np.concatenate([self.permanent, *elements])
+        return np.concatenate([self.permanent + mean_A * self.current, *elements, self.current])
 
     def field(self, b: FloatArray, rate: FloatArray, current: FloatArray) -> FloatArray:
         return self.permanent + b @ self.induced.T + rate @ self.eddy.T + current[:, None] * self.current
@@ -103,9 +114,6 @@ class Flight:
         """Return the readings of all sensors; those of vector sensors lag by a time."""
         columns = []
         b = self.ambient()
-        rate = np.gradient(b, self.time_s, axis=0, edge_order=2)
-        from scipy.interpolate import CubicSpline
-
         rate = CubicSpline(self.time_s, b)(self.time_s, 1)
         for sensor in array.sensors:
             h = platforms[sensor.id].field(b, rate, self.current_A)
@@ -117,6 +125,12 @@ class Flight:
                 columns.append(CubicSpline(self.time_s, total)(self.time_s - lag_s) + noise)
         pose = {"array_position_m": self.place_m, "array_rotation": self.rotation} if posed else {}
         return Readings(np.hstack(columns), time_s=self.time_s, **pose)  # type: ignore[arg-type]
+
+
+def nees(of: SensorCompensation, truth: FloatArray) -> float:
+    """Return the normalised error squared of all coefficients over their number."""
+    error = truth / of.fit.terms.sigma - of.fit.coefficients
+    return float(error @ np.linalg.solve(of.fit.covariance, error)) / len(error)
 
 
 def _wander(rng: np.random.Generator, t: FloatArray) -> FloatArray:
