@@ -16,7 +16,7 @@ from scipy.special import chdtri
 
 from arrays.array import SensorArray
 from magloc import core
-from magloc.grids.work import Arrays, Work, workers
+from magloc.grids.work import Arrays, Each, Work, workers
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.measurement.plausibility import warn_of_doubts
 from magloc.measurement.rows import concatenate_readings
@@ -25,7 +25,7 @@ from magloc.surveying.piece import ROW_ENTRIES, Ground, measure_targets, signifi
 from magloc.surveying.preparation import whole_rows, with_places_between_fixes
 from magloc.surveying.results import Reach, Survey, SurveyRows, Target
 from magloc.surveying.targets import TARGET_ENTRIES
-from magloc.surveying.tiled import TiledSurvey
+from magloc.surveying.tiled import Tell, TiledSurvey
 from magloc.surveying.tiles import assign_sources
 from magloc.terrain.surface import Terrain
 
@@ -131,41 +131,26 @@ def survey(
     rows = readings if isinstance(readings, Readings) else concatenate_readings(readings)
     warn_of_doubts(array, rows[:_MOST_DOUBTED])
     assumed = array.pose is None and rows.pose_sigma is None
-    array, rows = with_places_between_fixes(array, rows)
     terrain = ground_m if isinstance(ground_m, Terrain) else Terrain(ground_m)
     if not terrain.is_flat:
         low_m, high_m = ((x, y, z + terrain.height_m) for x, y, z in (prior.low_m, prior.high_m))
         prior = replace(prior, low_m=low_m, high_m=high_m)
     ground = Ground(prior, terrain, shortest_geology_m, math.inf, body_length_m)
-    tiled = TiledSurvey.of(*whole_rows(array, rows, base, ground.shallowest_m, terrain), ground)
-    trials = _TRIALS * _HECTARE_M2 / tiled.nearest_m**2
-    threshold = float(chdtri(3, min(0.5, false_per_hectare / trials)))
-    tiled = replace(tiled, ground=replace(ground, threshold=threshold))
-    tell: Callable[[str], None] = progress or (lambda _: None)
+    tiled = tile_rows(array, rows, ground, base, false_per_hectare)
+    tell: Tell = progress or (lambda _: None)
     folder = None if unfinished is None else Path(unfinished)
     every = range(len(tiled.tiles))
     at_once = min(core.threads() if processes is None else processes, len(every))
     with workers(at_once, scheduler, folder) as each:
-
-        def settle(tiled: TiledSurvey, work: Work) -> tuple[TiledSurvey, Sequence[int]]:
-            """Search all tiles, then again those whose neighbours report changes."""
-            due: Sequence[int] = every
-            for _ in range(_MOST_SWEEPS):
-                tiled = tiled.search(work, due, each, tell)
-                due = tiled.changes()
-                if not due:
-                    break
-            return tiled, due
-
         # Strong sources beside a tile mask all others until they are known.
-        tiled, lag = settle(tiled, strongest_sources)[0].correct_lag(assumed)
+        tiled, lag = search_tiles(tiled, strongest_sources, each, tell)[0].correct_lag(assumed)
         if lag.s:
             _LOG.warning(
                 f"the readings are {lag.s:.3f} ± {lag.sigma_s:.3f} s later than their poses, as the targets show: taken"
                 " into account"
             )
-            tiled, _ = settle(tiled, strongest_sources)
-        tiled, due = settle(tiled, significant_sources)
+            tiled, _ = search_tiles(tiled, strongest_sources, each, tell)
+        tiled, due = search_tiles(tiled, significant_sources, each, tell)
         if due:
             _LOG.warning(f"{len(due)} of {len(every)} tiles differ from their neighbours in the sources at their edges")
         if assumed:
@@ -185,12 +170,34 @@ def survey(
         _rows(tiled, results),
         Reach(*(np.concatenate([result[name] for result in results]) for name in ("reach_m", "reach_Am2"))),
         terrain,
-        threshold,
+        tiled.ground.threshold,
         chi2_per_dof,
         assumed,
         lag.s,
         time.monotonic() - began,
     )
+
+
+def tile_rows(
+    array: SensorArray, rows: Readings, ground: Ground, base: Readings | None = None, false_per_hectare: float = 0.1
+) -> TiledSurvey:
+    """Return whole rows in tiles, with the threshold of χ² for a number of false targets."""
+    array, rows = with_places_between_fixes(array, rows)
+    tiled = TiledSurvey.of(*whole_rows(array, rows, base, ground.shallowest_m, ground.terrain), ground)
+    trials = _TRIALS * _HECTARE_M2 / tiled.nearest_m**2
+    threshold = float(chdtri(3, min(0.5, false_per_hectare / trials)))
+    return replace(tiled, ground=replace(ground, threshold=threshold))
+
+
+def search_tiles(tiled: TiledSurvey, work: Work, each: Each, tell: Tell) -> tuple[TiledSurvey, Sequence[int]]:
+    """Search all tiles, then again those whose neighbours report changes; return those that still do."""
+    due: Sequence[int] = range(len(tiled.tiles))
+    for _ in range(_MOST_SWEEPS):
+        tiled = tiled.search(work, due, each, tell)
+        due = tiled.changes()
+        if not due:
+            break
+    return tiled, due
 
 
 def _targets(tiled: TiledSurvey, results: Sequence[Arrays]) -> tuple[Target, ...]:

@@ -38,6 +38,10 @@ LINES: dict[str, tuple[str, ...]] = {
         "ground.csv --array ground-array.toml --ground-m -0.1 --region=z>-2 --out out",
         "ground.csv --array ground-array.toml --region=z>-0.3 --threads 1 --json",
     ),
+    "magloc qc": (
+        "ground.csv --array ground-array.toml --json",
+        "ground.csv --array ground-array.toml --ground-m -0.1 --out out",
+    ),
     "magloc locate": (
         "readings.csv --array array.toml --json",
         "readings.csv --array array.toml --sources auto --json",
