@@ -22,6 +22,7 @@ COMMANDS = (
     ("design", "magloc.cli.design:design", "Optimise the positions of an array's sensors."),
     ("new-array", "magloc.cli.first_steps.new_array:new_array", "Write an array file."),
     ("columns", "magloc.cli.first_steps.columns:columns", "Propose how to read the log of another program."),
+    ("qc", "magloc.cli.surveys.qc:qc", "Check the quality of a field log."),
     ("survey", "magloc.cli.surveys.survey:survey", "Find targets at rest in the ground."),
     ("compensate", "magloc.cli.surveys.compensate:compensate", "Remove the field of a platform."),
     ("demo", "magloc.cli.first_steps.demo:demo", "Simulate, locate and track a magnet."),

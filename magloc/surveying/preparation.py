@@ -48,7 +48,7 @@ def whole_rows(
         raise ValueError("Input readings must have the pose of the array in every row; instead received none.")
     check_magnitudes(array)
     readings = without_saturated(readings, array)
-    stuck, wild, missing = _unusable(array, readings, shallowest_m, terrain)
+    stuck, wild, missing = unusable_readings(array, readings, shallowest_m, terrain)
     order = np.argsort(missing.sum(axis=0), kind="stable")
     worth = [(i + 1) * int((~missing[:, order[: i + 1]].any(axis=1)).sum()) for i in range(len(order))]
     kept = np.sort(order[: len(worth) - int(np.argmax(worth[::-1]))])
@@ -106,15 +106,15 @@ def _some(readings: Readings, which: BoolArray) -> Readings:
     return readings if which.all() else readings[which]
 
 
-def _unusable(
+def unusable_readings(
     array: SensorArray, readings: Readings, shallowest_m: float, terrain: Terrain
 ) -> tuple[BoolArray, BoolArray, BoolArray]:
-    """Return readings (n, N) that are stuck, spikes, and all unusable readings."""
+    """Return readings (n, N) that are stuck, spikes, and all unusable readings; they need a pose."""
     assert readings.array_position_m is not None
     assert readings.array_rotation is not None
     blocks = [readings.values_T[first : first + _BLOCK] for first in range(0, max(len(readings), 1), _BLOCK)]
     stuck = np.concatenate([stuck_readings(array, values) for values in blocks])
-    moduli = np.concatenate([_moduli(array, values) for values in blocks])  # independent of the attitude
+    moduli = np.concatenate([field_moduli(array, values) for values in blocks])
     moduli[stuck] = np.nan
     wild = np.zeros(moduli.shape, np.bool_)
     jitter_m = _jitter_m(array, readings)
@@ -126,7 +126,8 @@ def _unusable(
     return stuck, wild, np.asarray(np.isnan(moduli) | wild)
 
 
-def _moduli(array: SensorArray, values: FloatArray) -> FloatArray:
+def field_moduli(array: SensorArray, values: FloatArray) -> FloatArray:
+    """Return the moduli of the field (n, N) that sensors read, independent of the attitude."""
     scalar = array.channel_is_scalar
     moduli = np.linalg.norm(array.calibrated_field(values), axis=2)
     moduli[:, array.channel_sensor[scalar]] = values[:, scalar]

@@ -24,7 +24,7 @@ from magloc.surveying.piece import Ground, significant_sources, strongest_source
 from magloc.surveying.preparation import whole_rows, with_places_between_fixes
 from magloc.surveying.results import Survey
 from magloc.surveying.review.state import SurveyState
-from magloc.surveying.tiled import TiledSurvey
+from magloc.surveying.tiled import Tell, TiledSurvey
 from magloc.terrain.surface import Terrain
 
 _LOG = logging.getLogger(__name__)
@@ -128,17 +128,13 @@ def survey(
     rows = readings if isinstance(readings, Readings) else concatenate_readings(readings)
     warn_of_doubts(array, rows[:_MOST_DOUBTED])
     assumed = array.pose is None and rows.pose_sigma is None
-    array, rows = with_places_between_fixes(array, rows)
     terrain = ground_m if isinstance(ground_m, Terrain) else Terrain(ground_m)
     if not terrain.is_flat:
         low_m, high_m = ((x, y, z + terrain.height_m) for x, y, z in (prior.low_m, prior.high_m))
         prior = replace(prior, low_m=low_m, high_m=high_m)
     ground = Ground(prior, terrain, shortest_geology_m, math.inf, body_length_m)
-    tiled = TiledSurvey.of(*whole_rows(array, rows, base, ground.shallowest_m, terrain), ground)
-    trials = _TRIALS * _HECTARE_M2 / tiled.nearest_m**2
-    threshold = float(chdtri(3, min(0.5, false_per_hectare / trials)))
-    tiled = replace(tiled, ground=replace(ground, threshold=threshold))
-    tell: Callable[[str], None] = progress or (lambda _: None)
+    tiled = tile_rows(array, rows, ground, base, false_per_hectare)
+    tell: Tell = progress or (lambda _: None)
     folder = None if unfinished is None else Path(unfinished)
     at_once = min(core.threads() if processes is None else processes, len(tiled.tiles))
     with workers(at_once, scheduler, folder) as each:
@@ -159,3 +155,14 @@ def survey(
     if folder is not None:
         shutil.rmtree(folder, ignore_errors=True)
     return replace(found, seconds=time.monotonic() - began)
+
+
+def tile_rows(
+    array: SensorArray, rows: Readings, ground: Ground, base: Readings | None = None, false_per_hectare: float = 0.1
+) -> TiledSurvey:
+    """Return whole rows in tiles, with the threshold of χ² for a number of false targets."""
+    array, rows = with_places_between_fixes(array, rows)
+    tiled = TiledSurvey.of(*whole_rows(array, rows, base, ground.shallowest_m, ground.terrain), ground)
+    trials = _TRIALS * _HECTARE_M2 / tiled.nearest_m**2
+    threshold = float(chdtri(3, min(0.5, false_per_hectare / trials)))
+    return replace(tiled, ground=replace(ground, threshold=threshold))

@@ -41,6 +41,10 @@ LINES: dict[str, tuple[str, ...]] = {
         "magarrow.csv --instrument magarrow --positions magarrow.pos --place 48 11 500 --json",
         "ground.csv --array ground-array.toml --decisions decisions.jsonl --out out",
     ),
+    "magloc qc": (
+        "ground.csv --array ground-array.toml --json",
+        "ground.csv --array ground-array.toml --ground-m -0.1 --out out",
+    ),
     "magloc locate": (
         "readings.csv --array array.toml --json",
         "readings.csv --array array.toml --sources auto --json",

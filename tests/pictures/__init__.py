@@ -196,6 +196,11 @@ PICTURES: dict[str, Picture] = {
         widest_px=1420,
     ),
     "survey-map.png": OfCommands(SURVEY, "found/survey.png", SURVEY_SOURCES),
+    "survey-quality.png": OfCommands(
+        (SURVEY[0], "magloc qc field.csv --array field-array.toml --out checked"),
+        "checked/qc.png",
+        ("sims/magnetics/scenarios/survey-drone.toml", "magloc/deliverables/quality_figure.py", STYLE),
+    ),
     "survey-profiles.png": OfCommands(SURVEY, "found/profiles.png", SURVEY_SOURCES),
     "convergence-paper.png": OfCommands((MAP,), "map/convergence.png", PAPER, widest_px=1420),
     "bounds-reach.png": OfCommands(

@@ -38,6 +38,7 @@ COMMANDS = (
     "design",
     "new-array",
     "columns",
+    "qc",
     "survey",
     "compensate",
     "demo",

@@ -1,0 +1,416 @@
+"""Quality of a field log: sampling, gaps, lines, noise, faults of sensors, heading error, lag, coverage."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from arrays.array import SensorArray
+from arrays.io.csv import Column
+from arrays.io.results import Result
+from arrays.io.tables import align
+from arrays.typing import BoolArray, FloatArray, IntArray
+from magloc.deliverables.heading import HeadingError, heading_error
+from magloc.grids.work import workers
+from magloc.localization.fit.prior import NOTHING_KNOWN
+from magloc.measurement.rows import check_magnitudes, concatenate_readings
+from magloc.navigation.fixes import between_fixes
+from magloc.navigation.flight_lines import FlightLine, covers_area, flight_lines, line_spacing
+from magloc.readings import Readings
+from magloc.surveying.clock import ClockLag
+from magloc.surveying.piece import Ground, strongest_sources
+from magloc.surveying.preparation import FEWEST_ROWS, field_moduli, unusable_readings
+from magloc.surveying.survey import tile_rows
+from magloc.terrain.surface import Terrain
+
+GAP = 3.0
+"""Shortest gap, in usual intervals."""
+_JITTER, _MISSING, _SPIKES = 0.1, 0.01, 1e-3  # shares that are faults
+_NOISY = 2.0  # times the stated noise
+_SIGNIFICANT = 3.0  # standard deviations of the lag and of the heading error
+_WIDE = 1.7  # times the spacing of lines
+_NEAR = 0.75  # distance of a covered place from a line, in spacings
+_FOURTH = math.sqrt(70.0)  # standard deviation of the fourth difference of white noise
+_GAUSSIAN = 1.4826  # standard deviation over the median of absolute values
+_CELLS_PER_SPACING, _MOST_CELLS = 10.0, 200_000
+_LAG_HEIGHTS, _LAG_SPACINGS = 10.0, 3.0  # half width of the area from which the lag is estimated
+_SHORTEST_GEOLOGY_M = 15.0
+
+
+class Check(NamedTuple):
+    """Property of a log, with a remark if it is a fault."""
+
+    name: str
+    sensor: str
+    value: float
+    unit: str
+    remark: str
+
+
+class Gaps(NamedTuple):
+    """Starts [s], durations [s] and lengths [m] of gaps (k,)."""
+
+    start_s: FloatArray
+    duration_s: FloatArray
+    way_m: FloatArray
+
+
+class Coverage(NamedTuple):
+    """Distances (nx, ny) from the nearest line, NaN beside the survey, in cells from a corner [m]."""
+
+    distance_m: FloatArray
+    corner_m: FloatArray
+    cell_m: float
+    spacing_m: float
+
+    @property
+    def widest_m(self) -> float:
+        """Width of the widest strip between lines."""
+        return 2.0 * float(np.nanmax(self.distance_m, initial=0.0))
+
+    @property
+    def covered(self) -> float:
+        """Share of the area that is nearer to a line than three quarters of the usual spacing."""
+        distances = self.distance_m[np.isfinite(self.distance_m)]
+        return float(np.mean(distances <= _NEAR * self.spacing_m)) if distances.size else 1.0
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Quality(Result):
+    """Quality of a field log.
+
+    Attributes
+    ----------
+    array : SensorArray
+    time_s : ndarray, shape (n,)
+    place_m : ndarray, shape (n, 3)
+    height_m : ndarray, shape (n,)
+        Height of the array's origin above the ground.
+    gaps : Gaps
+    lines_flown : list of FlightLine
+    fourth_T : ndarray, shape (n, N)
+        Fourth difference of each sensor's modulus, divided by √70: white noise keeps its standard deviation. NaN beside
+        gaps and unusable readings.
+    missing, stuck, spikes : ndarray of bool, shape (n, N)
+    heading : list of HeadingError or None
+        For each sensor; None if the lines do not determine it.
+    lag : ClockLag, optional
+        Delay of the readings after their poses; 0 if the targets show none. None without targets or an ambient field.
+    coverage : Coverage, optional
+        None for a single line.
+    held : float
+        Share of rows whose place stands still between fixes of the receiver.
+
+    Examples
+    --------
+    >>> import sims
+    >>> import magloc
+    >>> from dataclasses import replace
+    >>> scenario = replace(sims.read_scenario("survey-drone"), duration_s=120.0)
+    >>> field = sims.simulate(scenario, rng=1)
+    >>> quality = magloc.check_quality(field.array, field.readings)
+    >>> [round(1e9 * float(noise), 1) for noise in quality.noise_T]
+    [0.2, 0.2]
+    """
+
+    figure = "magloc.deliverables.quality_figure:quality_figure"
+    command = "qc"
+    dimension = "check"
+    frame = "world"
+
+    array: SensorArray
+    time_s: FloatArray
+    place_m: FloatArray
+    height_m: FloatArray
+    gaps: Gaps
+    lines_flown: list[FlightLine]
+    fourth_T: FloatArray
+    missing: BoolArray
+    stuck: BoolArray
+    spikes: BoolArray
+    heading: list[HeadingError | None]
+    lag: ClockLag | None
+    coverage: Coverage | None
+    held: float
+
+    @property
+    def interval_s(self) -> float:
+        """Usual interval between rows."""
+        return float(np.median(np.diff(self.time_s)))
+
+    @property
+    def jitter_s(self) -> float:
+        """Standard deviation of the intervals without gaps."""
+        steps = np.diff(self.time_s)
+        return float(np.std(steps[steps < GAP * self.interval_s]))
+
+    @property
+    def noise_T(self) -> FloatArray:
+        """Noise of each sensor (N,) from the fourth differences; NaN without any."""
+        return self.noise_in(slice(None))
+
+    def noise_in(self, rows: slice | IntArray) -> FloatArray:
+        """Return the noise of each sensor (N,) in some rows."""
+        return np.array([_spread(column) for column in self.fourth_T[rows].T])
+
+    @cached_property
+    def checks(self) -> tuple[Check, ...]:
+        """All properties, in the order of the table."""
+        return (*self._sampling(), *self._way(), *self._sensors())
+
+    @property
+    def flags(self) -> list[str]:
+        """Names of the properties that are faults, in the order of the table."""
+        return list(dict.fromkeys(check.name for check in self.checks if check.remark))
+
+    def _sampling(self) -> Iterator[Check]:
+        def check(name: str, value: float, unit: str, remark: str = "") -> Check:
+            return Check(name, "", value, unit, remark)
+
+        yield check("rows", len(self.time_s), "")
+        yield check("duration", float(np.ptp(self.time_s)), "s")
+        yield check("rate", 1.0 / self.interval_s, "Hz")
+        share = self.jitter_s / self.interval_s
+        remark = f"{100.0 * share:.0f} % of the interval" if share > _JITTER else ""
+        yield check("jitter", 1e3 * self.jitter_s, "ms", remark)
+        gaps = self.gaps
+        yield check("gaps", len(gaps.start_s), "")
+        if len(gaps.start_s):
+            longest, farthest = int(gaps.duration_s.argmax()), int(gaps.way_m.argmax())
+            yield check("longest gap", float(gaps.duration_s[longest]), "s")
+            way_m = float(gaps.way_m[farthest])
+            spacing_m = math.inf if self.coverage is None else self.coverage.spacing_m
+            remark = f"the carrier moved on, at {gaps.start_s[farthest]:.10g} s" if way_m > _WIDE * spacing_m else ""
+            yield check("way in a gap", way_m, "m", remark)
+        yield check("held places", 100.0 * self.held, "%")
+        if self.lag is not None:
+            is_late = abs(self.lag.s) > _SIGNIFICANT * self.lag.sigma_s
+            yield check("lag", 1e3 * self.lag.s, "ms", "readings and poses differ in time" if is_late else "")
+            if math.isfinite(self.lag.sigma_s):
+                yield check("lag ±", 1e3 * self.lag.sigma_s, "ms")
+
+    def _way(self) -> Iterator[Check]:
+        def check(name: str, value: float, unit: str, remark: str = "") -> Check:
+            return Check(name, "", value, unit, remark)
+
+        speeds = [line.speed_m_s for line in self.lines_flown] or [0.0]
+        yield check("lines", len(self.lines_flown), "")
+        yield check("length", float(np.linalg.norm(np.diff(self.place_m[:, :2], axis=0), axis=1).sum()), "m")
+        for name, values, unit in (("speed", np.array(speeds), "m/s"), ("height", self.height_m, "m")):
+            yield check(name, float(np.mean(values)), unit)
+            yield check(f"least {name}", float(np.min(values)), unit)
+            yield check(f"largest {name}", float(np.max(values)), unit)
+        if self.coverage is not None:
+            spacing_m, widest_m = self.coverage.spacing_m, self.coverage.widest_m
+            yield check("line spacing", spacing_m, "m")
+            remark = f"{widest_m / spacing_m:.1f} times the spacing" if widest_m > _WIDE * spacing_m else ""
+            yield check("widest strip", widest_m, "m", remark)
+            yield check("covered", 100.0 * self.coverage.covered, "%")
+
+    def _sensors(self) -> Iterator[Check]:
+        for i, sensor in enumerate(self.array.sensors):
+            stated_T = float(self.array.channel_noise_T[self.array.channel_sensor == i].max())
+            noise_T = float(self.noise_T[i])
+            remark = f"{noise_T / stated_T:.1f} times the stated noise" if noise_T > _NOISY * stated_T else ""
+            yield Check("noise", sensor.id, 1e9 * noise_T, "nT", remark)
+            for name, which, most in (
+                ("missing", self.missing, _MISSING),
+                ("stuck", self.stuck, 0.0),
+                ("spikes", self.spikes, _SPIKES),
+            ):
+                share = float(which[:, i].mean())
+                remark = f"{which[:, i].sum()} readings" if share > most else ""
+                yield Check(name, sensor.id, 100.0 * share, "%", remark)
+            error = self.heading[i]
+            if error is not None:
+                is_wrong = error.amplitude_T > max(_SIGNIFICANT * error.sigma_T, _NOISY * stated_T)
+                yield Check(
+                    "heading error",
+                    sensor.id,
+                    1e9 * error.amplitude_T,
+                    "nT",
+                    "changes with the course" if is_wrong else "",
+                )
+                yield Check("heading error ±", sensor.id, 1e9 * error.sigma_T, "nT", "")
+
+    def lines(self, most: int | None = None) -> list[str]:
+        """Return the lines of the table, of at most `most` checks."""
+        rows = [["check", "sensor", "value", "unit", "remark"]]
+        rows += [
+            [c.name, c.sensor, f"{c.value:.4g}" if c.unit else f"{c.value:.0f}", c.unit, c.remark]
+            for c in self.checks[:most]
+        ]
+        return align(rows)
+
+    def columns(self) -> dict[str, Column]:
+        """Return the columns of qc.csv."""
+        names, sensors, values, units, remarks = zip(*self.checks, strict=True)
+        columns: dict[str, Column] = {"check": list(names), "sensor": list(sensors), "value": np.array(values)}
+        return columns | {"unit": list(units), "remark": list(remarks)}
+
+    @property
+    def entries(self) -> dict[str, Any]:
+        """Checks, lines, gaps and flags as ``magloc qc --json`` prints them."""
+        lines = [line._asdict() | {"rows": line.rows.stop - line.rows.start} for line in self.lines_flown]
+        gaps = zip(*map(np.ndarray.tolist, self.gaps), strict=True)
+        return {
+            "checks": [check._asdict() for check in self.checks],
+            "lines": lines,
+            "gaps": [dict(zip(Gaps._fields, gap, strict=True)) for gap in gaps],
+            "flags": self.flags,
+        }
+
+
+def check_quality(
+    array: SensorArray, readings: Readings | Sequence[Readings], *, ground_m: float | Terrain = 0.0
+) -> Quality:
+    """Check the quality of a field log before it becomes a survey.
+
+    Parameters
+    ----------
+    array : SensorArray
+    readings : Readings or sequence of them
+        In order of time, with the pose of the array. For the lag scalar sensors need the ambient field.
+    ground_m : float or Terrain
+        Height of the ground in the world frame [m], or terrain.
+
+    Returns
+    -------
+    Quality
+
+    Raises
+    ------
+    ValueError
+        The readings have no pose, are not in order of time, or are too few.
+
+    Examples
+    --------
+    >>> import sims
+    >>> import magloc
+    >>> from dataclasses import replace
+    >>> scenario = replace(sims.read_scenario("survey-drone"), duration_s=120.0)
+    >>> field = sims.simulate(scenario, rng=1)
+    >>> magloc.check_quality(field.array, field.readings).flags
+    []
+    """
+    rows = readings if isinstance(readings, Readings) else concatenate_readings(readings)
+    if rows.array_position_m is None or rows.array_rotation is None:
+        raise ValueError("Input readings must have the pose of the array in every row; instead received none.")
+    if len(rows) < FEWEST_ROWS:
+        raise ValueError(f"Input readings must have {FEWEST_ROWS} rows or more; instead received {len(rows)}.")
+    if not (np.diff(rows.time_s) > 0.0).all():
+        raise ValueError("Input readings must be in order of time; instead received others.")
+    check_magnitudes(array)
+    fixes = between_fixes(rows.time_s, rows.array_position_m, rows.array_rotation)
+    held = 0.0 if fixes is None else fixes.held / len(rows)
+    if fixes is not None:
+        rows = replace(rows, array_position_m=fixes.position_m, array_rotation=fixes.rotation)
+    place_m = rows.array_position_m
+    assert place_m is not None
+    terrain = ground_m if isinstance(ground_m, Terrain) else Terrain(ground_m)
+    ground = Ground(NOTHING_KNOWN, terrain, _SHORTEST_GEOLOGY_M, math.inf)
+    stuck, spikes, unusable = unusable_readings(array, rows, ground.shallowest_m, terrain)
+    moduli_T = np.where(unusable, np.nan, field_moduli(array, rows.values_T))
+    lines = flight_lines(rows.time_s, place_m, -terrain.depth_of(place_m))
+    coverage = _coverage(place_m[:, :2], lines)
+    return Quality(
+        array,
+        rows.time_s,
+        place_m,
+        -terrain.depth_of(place_m),
+        _gaps(rows.time_s, place_m),
+        lines,
+        _fourth_differences(rows.time_s, moduli_T),
+        unusable & ~stuck & ~spikes,
+        stuck,
+        spikes,
+        [heading_error(place_m[:, :2], column, lines) for column in _without_ambient(rows, moduli_T).T],
+        _clock_lag(array, rows[np.flatnonzero(~unusable.any(axis=1))], ground, coverage),
+        coverage,
+        held,
+    )
+
+
+def _gaps(time_s: FloatArray, place_m: FloatArray) -> Gaps:
+    steps = np.diff(time_s)
+    which = np.flatnonzero(steps > GAP * np.median(steps))
+    return Gaps(time_s[which], steps[which], np.linalg.norm(place_m[which + 1] - place_m[which], axis=1))
+
+
+def _fourth_differences(time_s: FloatArray, values: FloatArray) -> FloatArray:
+    """Return fourth differences (n, N) of rows at equal intervals, scaled to the noise of one row."""
+    steps = np.diff(time_s)
+    values = np.where(np.isfinite(values), values, np.nan)
+    out = np.full(values.shape, np.nan)
+    out[2:-2] = np.diff(values, 4, axis=0) / _FOURTH
+    is_gap = steps > 0.5 * GAP * np.median(steps)
+    beside = np.convolve(is_gap, np.ones(4), mode="valid") > 0.0
+    out[2:-2][beside] = np.nan
+    return out
+
+
+def _spread(values: FloatArray) -> float:
+    """Return the standard deviation of Gaussian values with outliers; NaN without any value."""
+    known = np.abs(values[np.isfinite(values)])
+    return _GAUSSIAN * float(np.median(known)) if known.size else math.nan
+
+
+def _without_ambient(rows: Readings, moduli_T: FloatArray) -> FloatArray:
+    """Return moduli less that of the ambient field, where it is known for every row."""
+    if rows.ambient_T is None:
+        return moduli_T
+    return np.asarray(moduli_T - np.linalg.norm(rows.ambient_T, axis=1)[:, None])
+
+
+def _coverage(xy_m: FloatArray, lines: Sequence[FlightLine]) -> Coverage | None:
+    """Return the distances from the nearest line between the outer ones; None for a single line."""
+    if len(lines) < 2 or not covers_area(xy_m):
+        return None
+    spacing_m, low = line_spacing(xy_m), xy_m.min(axis=0)
+    extent_m = np.ptp(xy_m, axis=0)
+    cell_m = max(spacing_m / _CELLS_PER_SPACING, math.sqrt(float(np.prod(extent_m)) / _MOST_CELLS))
+    tracks = np.concatenate([_dense(xy_m[line.rows], 0.5 * cell_m) for line in lines])
+    shape = (extent_m / cell_m).astype(np.intp) + 1
+    seen = np.zeros(shape, np.bool_)
+    seen[tuple(np.minimum((tracks - low) / cell_m, shape - 1).astype(np.intp).T)] = True
+    between = np.zeros(shape, np.bool_)
+    for axis in range(2):  # lines on either side
+        before = np.logical_or.accumulate(seen, axis=axis)
+        after = np.flip(np.logical_or.accumulate(np.flip(seen, axis), axis=axis), axis)
+        between |= before & after
+    middles = low + cell_m * (np.argwhere(between) + 0.5)
+    distance_m = np.full(shape, np.nan)
+    distance_m[between] = KDTree(tracks).query(middles)[0]
+    return Coverage(distance_m, low, cell_m, spacing_m)
+
+
+def _dense(xy_m: FloatArray, step_m: float) -> FloatArray:
+    """Return a track (n, 2) with places at most a step apart."""
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy_m, axis=0), axis=1))])
+    at = np.linspace(0.0, way[-1], math.ceil(way[-1] / step_m) + 1)
+    return np.stack([np.interp(at, way, axis) for axis in xy_m.T], axis=-1)
+
+
+def _clock_lag(array: SensorArray, rows: Readings, ground: Ground, coverage: Coverage | None) -> ClockLag | None:
+    """Return the lag of the rows around the strongest anomaly; None if they show no target."""
+    known = rows.ambient_T is not None or array.ambient_T is not None
+    if coverage is None or len(rows) < FEWEST_ROWS or not (known or not array.channel_is_scalar.any()):
+        return None
+    assert rows.array_position_m is not None
+    moduli = _without_ambient(rows, field_moduli(array, rows.values_T)).mean(axis=1)
+    middle = rows.array_position_m[np.argmax(np.abs(moduli - np.median(moduli)))]
+    height_m = float(np.median(-ground.terrain.depth_of(rows.array_position_m)))
+    half_m = max(_LAG_HEIGHTS * height_m, _LAG_SPACINGS * coverage.spacing_m)
+    near = rows[(np.abs(rows.array_position_m - middle)[:, :2] < half_m).all(axis=1)]
+    if len(near) < FEWEST_ROWS:
+        return None
+    tiled = tile_rows(array, near, ground)
+    with workers(1, None, None) as each:
+        tiled, _ = tiled.settle(strongest_sources, each, lambda _: None)
+    return tiled.correct_lag(array.pose is None and rows.pose_sigma is None)[1] if len(tiled.sources) else None

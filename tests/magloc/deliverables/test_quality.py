@@ -1,0 +1,177 @@
+"""Quality of logs with known faults."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import arrays
+import magloc
+from arrays.typing import FloatArray
+from tests.hills import CLEARANCE_M, PAIR, SPEED_M_S, RATE_Hz, hills, plain, terrain_of, walk
+
+LINES = 11
+ROWS = walk(71, plain, 5.0, 3).readings
+PER_LINE = len(ROWS) // LINES
+LINE = np.arange(len(ROWS)) // PER_LINE
+AHEAD = 1.0 - 2.0 * (LINE % 2)
+"""1 for lines to the east, -1 for lines to the west."""
+
+
+def checked(change: Callable[[FloatArray], FloatArray] = lambda values: values) -> magloc.Quality:
+    """The quality of the walk with changed readings."""
+    return magloc.check_quality(PAIR, replace(ROWS, values_T=change(ROWS.values_T.copy())))
+
+
+def value(quality: magloc.Quality, name: str, sensor: str = "") -> float:
+    (found,) = (check.value for check in quality.checks if (check.name, check.sensor) == (name, sensor))
+    return found
+
+
+@pytest.fixture(scope="module")
+def quality() -> magloc.Quality:
+    """The walk as it is."""
+    return checked()
+
+
+class TestSoundLog:
+    def test_way(self, quality: magloc.Quality) -> None:
+        assert value(quality, "rows") == len(ROWS)
+        assert value(quality, "rate") == pytest.approx(RATE_Hz)
+        assert value(quality, "lines") == LINES
+        assert value(quality, "speed") == pytest.approx(SPEED_M_S, rel=1e-6)
+        assert value(quality, "height") == pytest.approx(CLEARANCE_M, abs=0.02)
+        assert value(quality, "widest strip") == pytest.approx(1.0, abs=0.1)
+        assert value(quality, "covered") == 100.0
+
+    @pytest.mark.parametrize("sensor", ["low", "high"])
+    def test_sensors(self, quality: magloc.Quality, sensor: str) -> None:
+        """σ of the estimate is 2 % for 900 correlated differences; 0.1 nT is in all readings."""
+        assert value(quality, "noise", sensor) == pytest.approx(0.1, rel=0.1)
+        assert [value(quality, name, sensor) for name in ("missing", "stuck", "spikes")] == [0.0, 0.0, 0.0]
+
+    def test_nothing_is_wrong(self, quality: magloc.Quality) -> None:
+        assert quality.flags == []
+        assert value(quality, "lag") == 0.0
+
+    def test_heights_over_hills(self) -> None:
+        rows = walk(71, hills, 5.0, 3).readings
+        found = magloc.check_quality(PAIR, rows, ground_m=terrain_of(hills))
+        assert value(found, "least height") == pytest.approx(CLEARANCE_M - 0.1, abs=0.01)
+        assert value(found, "largest height") == pytest.approx(CLEARANCE_M + 0.1, abs=0.01)
+
+    def test_outputs(self, quality: magloc.Quality) -> None:
+        columns = quality.columns()
+        assert list(columns) == ["check", "sensor", "value", "unit", "remark"]
+        assert len({len(column) for column in columns.values()}) == 1
+        assert json.loads(json.dumps(quality.entries))["flags"] == []
+        assert len(quality.lines(5)) == 6
+        axes = quality.plot().axes
+        assert [ax.get_ylabel() for ax in axes][2:4] == ["speed [m/s]", "noise [nT]"]
+
+
+class TestNoise:
+    def test_more_than_stated(self) -> None:
+        rng = np.random.default_rng(3)
+        quality = checked(lambda values: values + rng.normal(size=values.shape, scale=[0.0, 5e-10]))
+        assert value(quality, "noise", "high") == pytest.approx(np.hypot(0.5, 0.1), rel=0.1)
+        assert [check.sensor for check in quality.checks if check.name == "noise" and check.remark] == ["high"]
+
+    def test_a_vector_sensor(self) -> None:
+        """Its modulus has the noise of one axis."""
+        rng = np.random.default_rng(4)
+        array = arrays.SensorArray((arrays.Sensor("v", "vector", (0.0, 0.0, 0.0), 2e-9),))
+        values = ROWS.ambient_T + rng.normal(size=(len(ROWS), 3), scale=2e-9)
+        quality = magloc.check_quality(array, replace(ROWS, values_T=values))
+        assert value(quality, "noise", "v") == pytest.approx(2.0, rel=0.1)
+
+
+class TestHeadingError:
+    @pytest.mark.parametrize("size_nT", [0.0, 10.0])
+    def test_opposite_courses(self, size_nT: float) -> None:
+        quality = checked(lambda values: values + 1e-9 * size_nT * AHEAD[:, None] * [1.0, 0.0])
+        error, sigma = (value(quality, f"heading error{more}", "low") for more in ("", " ±"))
+        assert abs(error - size_nT) < 4.0 * sigma
+        assert ("heading error" in quality.flags) == (size_nT > 0.0)
+
+    def test_drift_is_none(self) -> None:
+        """1 nT a minute, on all courses alike."""
+        quality = checked(lambda values: values + 1e-9 * ROWS.time_s[:, None] / 60.0)
+        assert "heading error" not in quality.flags
+
+    def test_one_course(self) -> None:
+        rows = ROWS[np.flatnonzero(AHEAD > 0.0)]
+        assert magloc.check_quality(PAIR, rows).heading == [None, None]
+
+
+class TestLag:
+    @pytest.mark.parametrize("late", [-2, 2])
+    def test_readings_of_other_rows(self, late: int) -> None:
+        """Two rows, 0.17 s."""
+        kept = np.flatnonzero(np.abs(np.arange(len(ROWS)) % PER_LINE - 0.5 * (PER_LINE - 1)) < 0.5 * PER_LINE - 2.0)
+        rows = replace(ROWS[kept], values_T=ROWS.values_T[kept - late])
+        quality = magloc.check_quality(PAIR, rows)
+        assert value(quality, "lag") == pytest.approx(1e3 * late / RATE_Hz, abs=4.0 * value(quality, "lag ±") + 5.0)
+        assert "lag" in quality.flags
+
+    def test_scalar_sensors_without_the_ambient_field(self) -> None:
+        quality = magloc.check_quality(PAIR, replace(ROWS, ambient_T=None))
+        assert quality.lag is None
+        assert "lag" not in [check.name for check in quality.checks]
+
+
+class TestGaps:
+    def test_rows_without_a_record(self) -> None:
+        """2.5 s within a line, and the pauses of 3 s between lines, which are no fault."""
+        begin = 5 * PER_LINE + 20
+        quality = magloc.check_quality(PAIR, ROWS[np.flatnonzero((np.arange(len(ROWS)) - begin) // 29)])
+        lost = int(np.argmax(quality.gaps.way_m))
+        assert len(quality.gaps.start_s) == LINES
+        assert quality.gaps.start_s[lost] == pytest.approx(ROWS.time_s[begin - 1])
+        assert quality.gaps.duration_s[lost] == pytest.approx(30.0 / RATE_Hz)
+        assert value(quality, "way in a gap") == pytest.approx(30.0 * SPEED_M_S / RATE_Hz, rel=1e-3)
+        assert quality.flags == ["way in a gap", "widest strip"]
+
+    def test_a_missing_line(self) -> None:
+        quality = magloc.check_quality(PAIR, ROWS[np.flatnonzero(LINE != 6)])
+        assert value(quality, "widest strip") == pytest.approx(2.0, abs=0.1)
+        assert "widest strip" in quality.flags
+
+    def test_jitter(self) -> None:
+        """Stamps with errors of 5 ms: intervals scatter by √2 of it, 2 % in the estimate."""
+        stamps = ROWS.time_s + np.random.default_rng(5).normal(size=len(ROWS), scale=0.005)
+        quality = magloc.check_quality(PAIR, replace(ROWS, time_s=stamps))
+        assert value(quality, "jitter") == pytest.approx(5.0 * np.sqrt(2.0), rel=0.1)
+
+    def test_places_of_a_slow_receiver(self) -> None:
+        assert ROWS.array_position_m is not None
+        held = np.arange(len(ROWS)) // 3 * 3
+        quality = magloc.check_quality(PAIR, replace(ROWS, array_position_m=ROWS.array_position_m[held]))
+        assert value(quality, "held places") == pytest.approx(200.0 / 3.0, abs=1.0)
+
+
+class TestFaultyReadings:
+    def test_each_is_counted(self) -> None:
+        def spoil(values: FloatArray) -> FloatArray:
+            values[100:130, 0] = np.nan
+            values[[200, 350, 500], 1] += 8e-7
+            values[600:700, 1] = values[600, 1]
+            return values
+
+        quality = checked(spoil)
+        assert quality.missing.sum(axis=0).tolist() == [30, 0]
+        assert quality.spikes.sum(axis=0).tolist() == [0, 3]
+        assert quality.stuck.sum(axis=0).tolist() == [0, 100]
+        assert quality.flags == ["missing", "stuck", "spikes"]
+
+    def test_bad_input(self) -> None:
+        with pytest.raises(ValueError, match="must have the pose"):
+            magloc.check_quality(PAIR, magloc.Readings(ROWS.values_T))
+        with pytest.raises(ValueError, match="order of time"):
+            magloc.check_quality(PAIR, ROWS[np.arange(len(ROWS))[::-1]])
+        with pytest.raises(ValueError, match="20 rows or more"):
+            magloc.check_quality(PAIR, ROWS[:10])
