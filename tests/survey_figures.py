@@ -82,7 +82,7 @@ def judged(field: Simulation, false_per_hectare: float = 0.1) -> Field:
 def at_truth(field: Simulation, found: magloc.Survey) -> tuple[FloatArray, FloatArray]:
     """χ² of the true targets (K,), and Cramér-Rao bounds of their places [m], each from the rows of its tile."""
     truth = Sources(field.target_position_m, field.target_moment_Am2)
-    ground = Ground(NOTHING_KNOWN, found.ground_m, 15.0, found.threshold)
+    ground = Ground(NOTHING_KNOWN, found.terrain, 15.0, found.threshold)
     tiled = replace(TiledSurvey.of(found.array, whole_rows(field.array, field.readings)[1], ground), sources=truth)
     everywhere = SourceBounds(np.full(3, -np.inf), np.full(3, np.inf), np.inf)
     significance, bound = np.zeros(len(truth)), np.zeros(len(truth))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from scipy.special import chdtri
@@ -29,7 +30,7 @@ HALF_M, GAP_M, THRESHOLD = 0.7, 0.3, 26.0
 def fitted_as_one(scenario: MagneticScenario, seed: int) -> tuple[bool, bool] | None:
     """Whether it is called merged, and whether it is off; None where it is not significant."""
     field = sims.simulate(scenario, rng=seed)
-    ground = Ground(magloc.SourcePrior(), 0.0, 15.0, THRESHOLD)
+    ground = Ground(magloc.SourcePrior(), magloc.Terrain(), 15.0, THRESHOLD)
     tiled = TiledSurvey.of(*whole_rows(field.array, field.readings), ground)
     places, moments = field.target_position_m, field.target_moment_Am2
     size = np.linalg.norm(moments, axis=1)
@@ -43,9 +44,8 @@ def fitted_as_one(scenario: MagneticScenario, seed: int) -> tuple[bool, bool] | 
     along = moments @ fit.sources.moment_Am2[0]
     error = fit.sources.position_m[0] - along @ places / along.sum()
     off = error @ np.linalg.solve(fit.covariance[:3, :3], error) > chdtri(3, 0.05)
-    return "merged" in str(
-        targets_of(model, fit, background, 0.0, np.ones(len(fit.sources), np.bool_))["flags"][0]
-    ).split(), bool(off)
+    groups, every = partial(piece.groups, model.record), np.ones(len(fit.sources), np.bool_)
+    return "merged" in str(targets_of(model, fit, background, groups, every)["flags"][0]).split(), bool(off)
 
 
 def main() -> None:

@@ -92,7 +92,7 @@ def _survey_rows(found: Survey) -> Iterator[tuple[str, str]]:
     rows = found.rows
     lines = found.flight_lines
     step_m = np.linalg.norm(np.diff(rows.place_m[:, :2], axis=0), axis=1)
-    height = rows.place_m[:, 2] - found.ground_m
+    height = -found.terrain.depth_of(rows.place_m)
     speeds = [line.speed_m_s for line in lines] or [0.0]
     rate_Hz = 1.0 / float(np.median(np.diff(rows.time_s)))
     yield "array", ", ".join(filter(None, (found.array.name, _count(found.array.n_sensors, "sensor"))))
@@ -162,6 +162,11 @@ def _reach_rows(found: Survey) -> Iterator[tuple[str, ...]]:
 
 def _ground_rows(found: Survey, frame: MapFrame) -> Iterator[tuple[str, str]]:
     yield "origin", place_in_words(frame.origin)
+    terrain = found.terrain
+    if not terrain.is_flat:
+        heights = frame.origin[2] + terrain.height_at(found.rows.place_m[:, :2])
+        yield "ground", f"{terrain.name}, at heights of {heights.min():.2f} to {heights.max():.2f} m"
+        return
     side = "below" if found.ground_m < 0.0 else "above"
     yield "ground", f"flat, {abs(found.ground_m):g} m {side} the origin" if found.ground_m else "flat, at the origin"
 

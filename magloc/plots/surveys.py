@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.colors import SymLogNorm
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 from matplotlib.tri import Triangulation
 
 from arrays.typing import FloatArray
@@ -34,6 +35,7 @@ def survey_figure(found: Survey) -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
+        Figure; :func:`save` writes it to a file.
 
     Examples
     --------
@@ -54,11 +56,12 @@ def survey_figure(found: Survey) -> Figure:
     ):
         _draw_values(figure, ax, rows.place_m, values_T * 1e9)
         style.label_axes(ax, _ACROSS, _UP, title)
+        ax.tick_params(labelbottom=True)
         ax.set_aspect("equal")
     for target in found:
         _draw_target(both[0], target, has_label=False)
         _draw_target(both[1], target, has_label=True)
-    depths = found.ground_m - found.reach.place_m[:, 2]
+    depths = found.terrain.depth_of(found.reach.place_m)
     for ax, depth in zip(reach, (depths.min(initial=np.inf), depths.max(initial=0.0)), strict=True):
         at = np.isclose(depths, depth)
         _draw_reach(figure, ax, found.reach.place_m[at], found.reach.moment_Am2[at])
@@ -107,4 +110,5 @@ def _draw_target(ax: Axes, target: Target, *, has_label: bool) -> None:
         text = f"{target.id}: {target.depth_m:.1f} m"
         low, high = ax.get_xlim()
         offset, side = (-3.0, "right") if place[0] > high - 0.15 * (high - low) else (3.0, "left")
-        ax.annotate(text, place, (offset, 3.0), textcoords="offset points", ha=side, fontsize=5.5, zorder=4)
+        note = ax.annotate(text, place, (offset, 3.0), textcoords="offset points", ha=side, fontsize=5.5, zorder=4)
+        note.set_path_effects([withStroke(linewidth=1.5, foreground="white")])

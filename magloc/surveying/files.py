@@ -36,5 +36,6 @@ def residual_columns(found: Survey) -> dict[str, Column]:
 
 def reach_columns(found: Survey) -> dict[str, Column]:
     """Return the columns of ``reach.csv``: places, and the least moment that is detected there."""
-    x, y, z = found.reach.place_m.T
-    return {"x_m": x, "y_m": y, "depth_m": found.ground_m - z, "moment_Am2": found.reach.moment_Am2}
+    x, y, _ = found.reach.place_m.T
+    depth_m = found.terrain.depth_of(found.reach.place_m)
+    return {"x_m": x, "y_m": y, "depth_m": depth_m, "moment_Am2": found.reach.moment_Am2}

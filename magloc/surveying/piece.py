@@ -22,6 +22,7 @@ from magloc.surveying.rounds import AT_LAST, MOST_ROUNDS, SurveyModel, find_sour
 from magloc.surveying.search import PITCH, SearchGrid
 from magloc.surveying.targets import targets_of
 from magloc.surveying.tiles import Tile
+from magloc.terrain.surface import Terrain
 
 ROW_ENTRIES = ("place_m", "anomaly_T", "residual_T")
 _FIRST_ROUNDS = 4  # before the lag is estimated
@@ -53,7 +54,9 @@ class Ground:
     Attributes
     ----------
     prior : SourcePrior
-    ground_m, shortest_geology_m : float
+        Limits of positions; those of heights are above a flattened ground.
+    terrain : Terrain
+    shortest_geology_m : float
     threshold : float
         χ² with 3 degrees of freedom that a target must exceed.
     body_length_m : float
@@ -61,26 +64,28 @@ class Ground:
     """
 
     prior: SourcePrior
-    ground_m: float
+    terrain: Terrain
     shortest_geology_m: float
     threshold: float
     body_length_m: float = 0.0
 
     @property
     def shallowest_m(self) -> float:
-        """Height of the highest sources in the world frame [m]."""
+        """Height of the highest sources above a flattened ground, in the world frame [m]."""
         given = float(self.prior.high_m[2])
-        return given if math.isfinite(given) else self.ground_m - _SHALLOWEST_M
+        return given if math.isfinite(given) else self.terrain.height_m - _SHALLOWEST_M
 
     def bounds(self, record: SurveyRecord) -> SourceBounds:
         """Return limits of positions and moments of sources that the rows show."""
-        low, high = record.sensors_m.min(axis=(0, 1)), record.sensors_m.max(axis=(0, 1))
-        if low[2] <= self.ground_m:
-            raise ValueError(
-                f"Input ground_m must be below all sensors; instead received {self.ground_m:g} m with one at"
-                f" {low[2]:g} m."
-            )
-        own_low = np.array([low[0] - _MARGIN_M, low[1] - _MARGIN_M, self.ground_m - _DEEPEST])
+        low, high = record.flat_m.min(axis=(0, 1)), record.flat_m.max(axis=(0, 1))
+        ground_m = self.terrain.height_m
+        if low[2] <= ground_m:
+            received = f"{ground_m:g} m with one at {low[2]:g} m"
+            if not self.terrain.is_flat:
+                above = f"{self.terrain.name or 'terrain'} that is {ground_m - low[2]:.3g} m above one"
+                received = f"{above} (their heights may count from different levels, such as sea and ellipsoid)"
+            raise ValueError(f"Input ground_m must be below all sensors; instead received {received}.")
+        own_low = np.array([low[0] - _MARGIN_M, low[1] - _MARGIN_M, ground_m - _DEEPEST])
         own_high = np.array([high[0] + _MARGIN_M, high[1] + _MARGIN_M, self.shallowest_m])
         low_m, high_m = (
             np.where(np.isfinite(given), given, own)
@@ -88,7 +93,8 @@ class Ground:
         )
         if not (low_m < high_m).all():
             raise ValueError("Input prior must leave room below the ground; instead received bounds that do not.")
-        return SourceBounds(low_m, high_m, min(self.prior.largest_moment_Am2, _LARGEST_MOMENT_Am2))
+        largest_Am2 = min(self.prior.largest_moment_Am2, _LARGEST_MOMENT_Am2)
+        return SourceBounds(low_m, high_m, largest_Am2, self.terrain)
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +128,7 @@ class Piece:
 
     def model(self) -> SurveyModel:
         """Return the model of the rows, with the field of sources outside the tile."""
-        record, errors = record_of(self.array, self.readings)
+        record, errors = record_of(self.array, self.readings, self.ground.terrain)
         record = replace(record, values_T=record.values_T - self.offset_T)
         others = self.beside.with_more(self.outside)
         if len(others):
@@ -137,7 +143,7 @@ class Piece:
         numbers = max(measurements, len(layer.places_m)) * len(layer.places_m)
         if numbers > _MOST_NUMBERS or x * y / (max(height, 0.3) / PITCH) ** 2 > _MOST_PLACES:
             cure = "a longer shortest_geology_m needs less" if numbers > _MOST_NUMBERS else ""
-            cure = high_above(height, self.ground.ground_m) if height > HIGHEST_M else cure
+            cure = high_above(height, self.ground.terrain.height_m) if height > HIGHEST_M else cure
             raise ValueError(
                 f"Input readings must be cut into smaller pieces; instead received {len(record)} rows over {x:.3g} m by"
                 f" {y:.3g} m, {height:.2g} m above the ground{cure and f': {cure}'}."
@@ -199,11 +205,11 @@ def measure_targets(piece: Piece, *, keep_all: bool = False) -> Arrays:
     )
     own, which = piece.tile.own, piece.tile.contains(fit.sources.position_m)
     extent = piece.tile.extent_m(lines[0][own, :2])
-    places, moments = least_moments(model, fit.sources, groups, *extent, piece.ground.ground_m)
+    places, moments = least_moments(model, fit.sources, groups, *extent)
     return {
         "reach_m": places,
         "reach_Am2": moments,
-        **targets_of(model, fit, background, groups, piece.ground.ground_m, which),
+        **targets_of(model, fit, background, groups, which),
         **{name: values[own] for name, values in zip(ROW_ENTRIES, lines, strict=True)},
         "chi2": np.array(fit.cost),
         "size": np.array(fit.residual.size),

@@ -18,6 +18,7 @@ from magloc.navigation.poses import vectors_at
 from magloc.readings import Readings, without_saturated
 from magloc.surveying.fit.record import SurveyRecord
 from magloc.surveying.pose_components import UNSTATED
+from magloc.terrain.surface import FLAT, Terrain
 
 _LOG = logging.getLogger(__name__)
 FEWEST_ROWS = 20
@@ -32,18 +33,22 @@ _LONGEST_RUN = 25  # equal readings in a run, relative to the mean run of the be
 
 
 def whole_rows(
-    array: SensorArray, readings: Readings, base: Readings | None = None, shallowest_m: float = 0.0
+    array: SensorArray,
+    readings: Readings,
+    base: Readings | None = None,
+    shallowest_m: float = 0.0,
+    terrain: Terrain = FLAT,
 ) -> tuple[SensorArray, Readings]:
     """Return the rows with readings of all sensors, and the array.
 
     Sensors that miss too many rows are left out. The ambient field varies like the modulus at a base station. No source
-    is above `shallowest_m`.
+    is above `shallowest_m` on a flattened ground.
     """
     if readings.array_rotation is None:
         raise ValueError("Input readings must have the pose of the array in every row; instead received none.")
     check_magnitudes(array)
     readings = without_saturated(readings, array)
-    stuck, wild, missing = _unusable(array, readings, shallowest_m)
+    stuck, wild, missing = _unusable(array, readings, shallowest_m, terrain)
     order = np.argsort(missing.sum(axis=0), kind="stable")
     worth = [(i + 1) * int((~missing[:, order[: i + 1]].any(axis=1)).sum()) for i in range(len(order))]
     kept = np.sort(order[: len(worth) - int(np.argmax(worth[::-1]))])
@@ -101,7 +106,9 @@ def _some(readings: Readings, which: BoolArray) -> Readings:
     return readings if which.all() else readings[which]
 
 
-def _unusable(array: SensorArray, readings: Readings, shallowest_m: float) -> tuple[BoolArray, BoolArray, BoolArray]:
+def _unusable(
+    array: SensorArray, readings: Readings, shallowest_m: float, terrain: Terrain
+) -> tuple[BoolArray, BoolArray, BoolArray]:
     """Return readings (n, N) that are stuck, spikes, and all unusable readings."""
     assert readings.array_position_m is not None
     assert readings.array_rotation is not None
@@ -113,7 +120,7 @@ def _unusable(array: SensorArray, readings: Readings, shallowest_m: float) -> tu
     jitter_m = _jitter_m(array, readings)
     for i, arm_m in enumerate(array.positions.copy()):
         place_m = readings.array_position_m + readings.array_rotation.apply(arm_m)
-        depth_m = max(float(np.quantile(place_m[:, 2], _LOWEST)) - shallowest_m, _LEAST_DEPTH_M)
+        depth_m = max(float(np.quantile(terrain.flatten(place_m)[:, 2], _LOWEST)) - shallowest_m, _LEAST_DEPTH_M)
         noise_T = float(array.channel_noise_T[array.channel_sensor == i].max())
         wild[:, i] = wild_readings(moduli[:, i], place_m, depth_m, noise_T, jitter_m)
     return stuck, wild, np.asarray(np.isnan(moduli) | wild)
@@ -168,12 +175,16 @@ def leaping_rows(readings: Readings) -> BoolArray:
     return np.asarray(wild)
 
 
-def record_of(array: SensorArray, readings: Readings) -> tuple[SurveyRecord, PoseErrors]:
+def record_of(
+    array: SensorArray,
+    readings: Readings,
+    terrain: Terrain = FLAT,
+) -> tuple[SurveyRecord, PoseErrors]:
     """Return the anomalies of whole rows in the world frame, and their pose errors."""
     assert array.pose is not None
     errors = PoseErrors.of(array.pose, between_s=interval_of_fixes(readings.time_s, readings.interpolated_m))
     assert readings.ambient_T is not None
-    return SurveyRecord.of(array, readings, readings.ambient_T, errors), errors
+    return SurveyRecord.of(array, readings, readings.ambient_T, errors, terrain), errors
 
 
 def vary_with_base(ambient_T: FloatArray, time_s: FloatArray, base: Readings) -> FloatArray:

@@ -16,7 +16,7 @@ _ROUNDING = 1e-12  # relative rounding error of the information on all three axe
 
 
 def least_moments(
-    model: SurveyModel, sources: Sources, groups: Groups, low_m: FloatArray, high_m: FloatArray, ground_m: float
+    model: SurveyModel, sources: Sources, groups: Groups, low_m: FloatArray, high_m: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return places (k, 3) below a rectangle, and the moments (k,) that are found with 95 %.
 
@@ -25,13 +25,13 @@ def least_moments(
     """
     record = model.record
     directions = record.directions(sources.fields(record))
-    bounds = model.bounds
+    bounds, ground_m = model.bounds, record.terrain.height_m
     low, high = np.maximum(low_m, bounds.low_m[:2]), np.minimum(high_m, bounds.high_m[:2])
     needed = chndtrinc(model.threshold, 3, 1.0 - SEEN)
     places, moments = [], []
     inside = [at for at in DEPTHS_M if bounds.low_m[2] <= ground_m - at <= bounds.high_m[2] and (low <= high).all()]
     distances = [record.height_m - ground_m + at for at in inside]
-    levels = SearchGrid.of(low, high, record.height_m, distances).levels
+    levels = SearchGrid.of(low, high, record.height_m, distances, record.terrain).levels
     of_levels = model.backgrounds(sources, (groups(WHILE_SEARCHING * distance) for distance in levels))
     for (distance, level), background in zip(levels.items(), of_levels, strict=True):
         white, Q = background.white, with_free_sources(record, background, sources)

@@ -21,6 +21,7 @@ from magloc.localization.fit.table import cells_of_strength
 from magloc.navigation.flight_lines import FlightLine, flight_lines
 from magloc.surveying.fit.levelling import FEWEST_LINES, line_levels
 from magloc.surveying.review.decisions import Decision
+from magloc.terrain.surface import Terrain
 from magloc.truth import state_columns
 
 if TYPE_CHECKING:
@@ -172,8 +173,8 @@ class Survey(Result):
         Anomaly and residual of every row.
     reach : Reach
         Least moments that the lines as flown detect, 0.5, 1 and 2 m below the ground.
-    ground_m : float
-        Height of the ground in the world frame.
+    terrain : Terrain
+        Ground in the world frame.
     threshold : float
         χ² with 3 degrees of freedom that a target exceeds.
     chi2_per_dof : float
@@ -183,6 +184,8 @@ class Survey(Result):
     lag_s : float
         Delay of the readings after their poses, estimated from the targets and corrected; 0 if the targets show none.
     seconds : float
+    named_lines : tuple of (float, str)
+        Times [s] at which the lines of the log begin, and their names; empty if the log names none.
     state : SurveyState, optional
         Rows and sources, for a :class:`magloc.Review`.
     decisions : tuple
@@ -208,12 +211,13 @@ class Survey(Result):
     array: SensorArray
     rows: SurveyRows
     reach: Reach
-    ground_m: float
+    terrain: Terrain
     threshold: float
     chi2_per_dof: float
     pose_assumed: bool
     lag_s: float
     seconds: float
+    named_lines: tuple[tuple[float, str], ...] = ()
     state: SurveyState | None = None
     decisions: tuple[Decision, ...] = ()
 
@@ -233,6 +237,11 @@ class Survey(Result):
     def __repr__(self) -> str:
         return f"Survey: {len(self)} target{'s' * (len(self) != 1)}, {len(self.rows.time_s)} rows"
 
+    @property
+    def ground_m(self) -> float:
+        """Height of the ground in the world frame; of uneven ground the median."""
+        return self.terrain.height_m
+
     @cached_property
     def position_m(self) -> FloatArray:
         """Positions of all targets (K, 3)."""
@@ -241,7 +250,8 @@ class Survey(Result):
     @cached_property
     def flight_lines(self) -> list[FlightLine]:
         """Lines as flown, in the order of time."""
-        return flight_lines(self.rows.time_s, self.rows.place_m, self.ground_m)
+        height_m = -self.terrain.depth_of(self.rows.place_m)
+        return flight_lines(self.rows.time_s, self.rows.place_m, height_m, self.named_lines)
 
     @cached_property
     def levelled_rows(self) -> SurveyRows:
@@ -263,7 +273,7 @@ class Survey(Result):
     @property
     def reach_by_depth(self) -> dict[float, Reach]:
         """Least moments at each depth below the ground [m], the shallowest first."""
-        depths = np.round(self.ground_m - self.reach.place_m[:, 2], 6)
+        depths = np.round(self.terrain.depth_of(self.reach.place_m), 6)
         return {float(depth): Reach(*(column[depths == depth] for column in self.reach)) for depth in np.unique(depths)}
 
     @property

@@ -90,7 +90,8 @@ class SurveyModel:
 
     def _distances(self, sources: Sources) -> FloatArray:
         """Return the distances (K,) from the sensors down to sources."""
-        return np.asarray(np.median(self.record.sensors_m[..., 2]) - sources.position_m[:, 2])
+        flat_m = self.record.terrain.flatten(sources.position_m)
+        return np.asarray(np.median(self.record.flat_m[..., 2]) - flat_m[:, 2])
 
     def fit(self, sources: Sources, group: IntArray, settled: float) -> tuple[JointFit, SurveyBackground]:
         """Fit sources and drop those that are not significant or out of bounds, until none is left."""

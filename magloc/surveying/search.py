@@ -14,6 +14,7 @@ from magloc import core
 from magloc.surveying.fit.joint_fit import Sources, SurveyBackground, residual_of, with_free_sources
 from magloc.surveying.fit.record import SurveyRecord
 from magloc.surveying.fit.whitening import RecordWhitening
+from magloc.terrain.surface import FLAT, Terrain
 
 N_DISTANCES = 5
 PITCH = 1.8
@@ -70,15 +71,22 @@ class SearchGrid:
 
     @classmethod
     def below(cls, record: SurveyRecord, low_m: FloatArray, high_m: FloatArray) -> SearchGrid:
-        """Return the grid of a box, with distances from the lowest sensors in geometric steps."""
+        """Return the grid of a box above a flattened ground, with distances in geometric steps."""
         height = record.height_m
         nearest, farthest = max(height - high_m[2], 0.3), height - low_m[2]
         distances = np.geomspace(nearest * 1.1, max(farthest, nearest * 1.2), N_DISTANCES)
-        return cls.of(low_m, high_m, height, distances.tolist())
+        return cls.of(low_m, high_m, height, distances.tolist(), record.terrain)
 
     @classmethod
-    def of(cls, low_m: FloatArray, high_m: FloatArray, height_m: float, distances_m: Sequence[float]) -> SearchGrid:
-        """Return the grid of a rectangle, or a line along an axis, at distances below a height."""
+    def of(
+        cls,
+        low_m: FloatArray,
+        high_m: FloatArray,
+        height_m: float,
+        distances_m: Sequence[float],
+        terrain: Terrain = FLAT,
+    ) -> SearchGrid:
+        """Return the grid of a rectangle, or a line along an axis, at distances below a height above the ground."""
         tiles = []
         for distance in distances_m:
             pitch = distance / PITCH
@@ -87,7 +95,7 @@ class SearchGrid:
             for i in range(0, len(x), _CHUNK):
                 for j in range(0, len(y), _CHUNK):
                     square = np.meshgrid(x[i : i + _CHUNK], y[j : j + _CHUNK], [height_m - distance], indexing="ij")
-                    tiles.append((distance, np.stack(square, axis=-1).reshape(-1, 3)))
+                    tiles.append((distance, terrain.drape(np.stack(square, axis=-1).reshape(-1, 3))))
         return cls(tiles)
 
 

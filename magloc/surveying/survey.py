@@ -25,6 +25,7 @@ from magloc.surveying.preparation import whole_rows, with_places_between_fixes
 from magloc.surveying.results import Survey
 from magloc.surveying.review.state import SurveyState
 from magloc.surveying.tiled import TiledSurvey
+from magloc.terrain.surface import Terrain
 
 _LOG = logging.getLogger(__name__)
 _TRIALS = 1.25  # independent trials per area of a map, in squared distances to the shallowest sources: 1.0 to 1.4
@@ -39,7 +40,7 @@ def survey(
     *,
     base: Readings | None = None,
     prior: SourcePrior = NOTHING_KNOWN,
-    ground_m: float = 0.0,
+    ground_m: float | Terrain = 0.0,
     shortest_geology_m: float = 15.0,
     false_per_hectare: float = 0.1,
     body_length_m: float = 0.0,
@@ -71,9 +72,9 @@ def survey(
         field varies like it. Without it slow variations are estimated from the survey itself.
     prior : SourcePrior
         Limits of positions in the world frame and of moments; by default from 5 cm to 4 m below the ground, up to 1 m
-        beside the sensors, and up to 300 A·m².
-    ground_m : float
-        Height of the ground in the world frame [m].
+        beside the sensors, and up to 300 A·m². With terrain, limits of heights count from the ground.
+    ground_m : float or Terrain
+        Height of the ground in the world frame [m], or terrain: depths then count from the ground above the target.
     shortest_geology_m : float
         Shortest wavelength in the field of the ground itself [m]; shorter ones count as targets.
     false_per_hectare : float
@@ -92,6 +93,7 @@ def survey(
     Returns
     -------
     Survey
+        Targets, the most significant first, with residuals and the least moments that would have been found.
 
     Raises
     ------
@@ -127,8 +129,12 @@ def survey(
     warn_of_doubts(array, rows[:_MOST_DOUBTED])
     assumed = array.pose is None and rows.pose_sigma is None
     array, rows = with_places_between_fixes(array, rows)
-    ground = Ground(prior, ground_m, shortest_geology_m, math.inf, body_length_m)
-    tiled = TiledSurvey.of(*whole_rows(array, rows, base, ground.shallowest_m), ground)
+    terrain = ground_m if isinstance(ground_m, Terrain) else Terrain(ground_m)
+    if not terrain.is_flat:
+        low_m, high_m = ((x, y, z + terrain.height_m) for x, y, z in (prior.low_m, prior.high_m))
+        prior = replace(prior, low_m=low_m, high_m=high_m)
+    ground = Ground(prior, terrain, shortest_geology_m, math.inf, body_length_m)
+    tiled = TiledSurvey.of(*whole_rows(array, rows, base, ground.shallowest_m, terrain), ground)
     trials = _TRIALS * _HECTARE_M2 / tiled.nearest_m**2
     threshold = float(chdtri(3, min(0.5, false_per_hectare / trials)))
     tiled = replace(tiled, ground=replace(ground, threshold=threshold))

@@ -35,7 +35,7 @@ class Profile(NamedTuple):
     scatter_m2: FloatArray
 
 
-def profile_of(model: SurveyModel, fit: JointFit, background: SurveyBackground, which: int, ground_m: float) -> Profile:
+def profile_of(model: SurveyModel, fit: JointFit, background: SurveyBackground, which: int) -> Profile:
     """Return the profile of a weak source over its place and moment.
 
     The others are linear; places weigh by their likelihood.
@@ -45,7 +45,7 @@ def profile_of(model: SurveyModel, fit: JointFit, background: SurveyBackground, 
     others = fit.sources.some(np.delete(np.arange(len(fit.sources)), which))
     position = source.position_m[0]
     # Twice the range of a search, because the far tail distinguishes a target from the ground.
-    reach = 2.0 * WINDOW * (record.height_m - position[2])
+    reach = 2.0 * WINDOW * float(record.height_above(position))
     used = groups_near(record, white, source.position_m, reach)
     near = np.linalg.norm(others.position_m[:, :2] - position[:2], axis=1) < reach
     Q = with_free_sources(record, background, others.some(near))
@@ -55,15 +55,17 @@ def profile_of(model: SurveyModel, fit: JointFit, background: SurveyBackground, 
     left = residual_of(record, background, fields) + own
     left = left - Q @ (Q.T @ left)
     directions = record.directions(fields)
-    depth = ground_m - position[2]
-    lowest = ground_m - model.bounds.high_m[2]
-    depths = np.geomspace(max(lowest, depth / _SPAN), min(ground_m - model.bounds.low_m[2], depth * _SPAN), _N_DEPTHS)
+    terrain, bounds = record.terrain, model.bounds
+    depth = float(terrain.depth_of(position))
+    least, most = terrain.height_m - bounds.high_m[2], terrain.height_m - bounds.low_m[2]
+    depths = np.geomspace(max(least, depth / _SPAN), min(most, depth * _SPAN), _N_DEPTHS)
     sigma = np.sqrt(np.diagonal(fit.covariance)[6 * which : 6 * which + 2])
     offset = np.linspace(-_SIGMAS, _SIGMAS, _STEPS)
     beside = np.stack(np.meshgrid(sigma[0] * offset, sigma[1] * offset, indexing="ij"), axis=-1).reshape(-1, 2)
     of_place = np.empty((_N_DEPTHS, len(beside)))
     for i, at in enumerate(depths):
-        places = np.column_stack([position[:2] + beside, np.full(len(beside), ground_m - at)])
+        flat = np.column_stack([position[:2] + beside, np.full(len(beside), terrain.height_m - at)])
+        places = terrain.drape(flat)
         _, projected, v = normal_equations(record, white, directions, places, used, Q, left)
         of_place[i] = np.sum(v * np.linalg.solve(projected, v[..., None])[..., 0], axis=1)
     weight = np.exp(0.5 * (of_place - of_place.max())).sum(axis=0)
@@ -101,7 +103,7 @@ def second_source_chi2(
     everything else, including the source's position, so that 9 of 12 degrees of freedom remain.
     """
     record, white = model.record, background.white
-    near = groups_near(record, white, position[None], WINDOW * (record.height_m - position[2]))
+    near = groups_near(record, white, position[None], WINDOW * float(record.height_above(position)))
     rows, of = np.flatnonzero(np.isin(white.group, near)), white.entries(near)
     fields = np.concatenate(
         [multipole_field_matrix(record.sensors_m[rows], position, order) for order in (2, 3)], axis=-1
@@ -126,14 +128,13 @@ def shift_by_second(
     fields = fit.sources.fields(record)
     directions = record.directions(fields)
     position = fit.sources.position_m[which]
-    distance = record.height_m - position[2]
+    distance = float(record.height_above(position))
     used = groups_near(record, white, position[None], WINDOW * distance)
     beside = distance * np.linspace(-_WITHIN, _WITHIN, _N_BESIDE)
     below = record.height_m - distance * np.geomspace(1.0 / _DEEPER, _DEEPER, _N_BELOW)
     below = np.unique(np.clip(below, model.bounds.low_m[2], model.bounds.high_m[2]))
-    places = np.stack(np.meshgrid(position[0] + beside, position[1] + beside, below, indexing="ij"), axis=-1).reshape(
-        -1, 3
-    )
+    box = np.stack(np.meshgrid(position[0] + beside, position[1] + beside, below, indexing="ij"), axis=-1)
+    places = record.terrain.drape(box.reshape(-1, 3))
     moments, explained = likeliest_moments(*normal_equations(record, white, directions, places, used, Q, left))
     best = int(np.argmax(explained))
     of = white.entries(used)
@@ -144,30 +145,37 @@ def shift_by_second(
 
 
 def targets_of(
-    model: SurveyModel, fit: JointFit, background: SurveyBackground, groups: Groups, ground_m: float, which: BoolArray
+    model: SurveyModel, fit: JointFit, background: SurveyBackground, groups: Groups, which: BoolArray
 ) -> dict[str, NDArray[Any]]:
     """Return the entries of targets for some sources (K,) of a fit."""
     sources, K = fit.sources, len(fit.sources)
     covariance = fit.covariance.reshape(K, 6, K, 6)[np.arange(K), :, np.arange(K)]
     significance = fit.significance
-    depth, sigma = ground_m - sources.position_m[:, 2], np.sqrt(covariance[:, 2, 2])
+    record = model.record
+    depth = record.terrain.depth_of(sources.position_m)
+    rate = np.insert(
+        record.terrain.slope_at(sources.position_m[:, :2]), 2, -1.0, axis=1
+    )  # of the depth by the position
+    sigma = np.sqrt(np.einsum("ki,kij,kj->k", rate, covariance[:, :3, :3], rate))
     interval = np.column_stack([depth - 1.96 * sigma, depth + 1.96 * sigma])
     weak = significance < _WEAK
     for j in np.flatnonzero(weak & which):
-        coarse = model.background(sources, groups(WHILE_SEARCHING * (model.record.height_m - sources.position_m[j, 2])))
-        interval[j], scatter = profile_of(model, fit, coarse, int(j), ground_m)
+        distance = float(record.height_above(sources.position_m[j]))
+        coarse = model.background(sources, groups(WHILE_SEARCHING * distance))
+        interval[j], scatter = profile_of(model, fit, coarse, int(j))
         covariance[j] = _with_scatter(covariance[j], scatter)
     apart = np.linalg.norm(sources.position_m[:, None] - sources.position_m, axis=-1) + np.diag(np.full(K, np.inf))
-    rim = np.minimum(sources.position_m - model.bounds.low_m, model.bounds.high_m - sources.position_m)
+    flat = record.terrain.flatten(sources.position_m)
+    rim = np.minimum(flat - model.bounds.low_m, model.bounds.high_m - flat)
     left = (fit.residual - background.Q @ (background.Q.T @ fit.residual)).reshape(background.white.n_groups, -1)
-    directions = model.record.directions(sources.fields(model.record))
-    Q = with_free_sources(model.record, background, sources)
+    directions = record.directions(sources.fields(record))
+    Q = with_free_sources(record, background, sources)
     free = fit.residual - Q @ (Q.T @ fit.residual)
     second = np.zeros(K)
     for j in np.flatnonzero(which):
         second[j] = second_source_chi2(model, background, directions, Q, free, sources.position_m[j])
-    middles = model.record.middles_m[background.white.starts[:-1]]
-    reach = _NEAR * (model.record.height_m - sources.position_m[:, 2:])
+    middles = record.middles_m[background.white.starts[:-1]]
+    reach = _NEAR * record.height_above(sources.position_m)[:, None]
     above = np.linalg.norm(sources.position_m[:, None, :2] - middles[:, :2], axis=-1) < reach
     merged = second > chdtri(_N_SECOND, _FALSE_MERGED)
     for j in np.flatnonzero(merged):

@@ -32,6 +32,7 @@ _MOVED_M = 0.15
 _NARROW, _NEARLY_ALL = 0.2, 0.95  # width of a line relative to the distance to the nearest sources; share of rows
 _BESIDE_M = 1.0
 _MOST_SWEEPS = 5
+_TERRAIN_MARGIN = 2.0  # of a tile's terrain, in shortest wavelengths of the geology
 _POSES = 2  # alternating estimates of pose errors and lag
 Tell = Callable[[str], None]
 
@@ -73,7 +74,7 @@ class TiledSurvey:
     @classmethod
     def of(cls, array: SensorArray, readings: Readings, ground: Ground) -> TiledSurvey:
         """Return a survey in tiles without any known source."""
-        sample = record_of(array, readings[:: -(-len(readings) // _SAMPLE)])[0]
+        sample = record_of(array, readings[:: -(-len(readings) // _SAMPLE)], ground.terrain)[0]
         bounds = ground.bounds(sample)
         offset = np.median(sample.values_T, axis=0)
         spread = 1.4826 * float(np.median(np.abs(sample.values_T - offset)))
@@ -91,7 +92,7 @@ class TiledSurvey:
         away_m = sample.middles_m[:, :2] - sample.middles_m[:, :2].mean(axis=0)
         across_m = np.abs(away_m @ np.linalg.svd(away_m, full_matrices=False)[2][-1])
         if nearest_m > HIGHEST_M:
-            _LOG.warning(high_above(nearest_m, ground.ground_m))
+            _LOG.warning(high_above(nearest_m, ground.terrain.height_m))
         elif np.quantile(across_m, _NEARLY_ALL) < _NARROW * nearest_m:
             _LOG.warning(
                 "all readings lie on one line: the side and the distance of a target are poorly determined, and several"
@@ -120,7 +121,10 @@ class TiledSurvey:
         tile = self.tiles[number]
         prior = _narrow(self.ground.prior, tile, self.margin_m)
         assert prior is not None
-        readings, ground = self.readings[tile.rows], replace(self.ground, prior=prior)
+        readings, places = self.readings[tile.rows], self._places(tile)[:, :2]
+        margin_m = _TERRAIN_MARGIN * self.ground.shortest_geology_m
+        terrain = self.ground.terrain.crop(places.min(axis=0) - margin_m, places.max(axis=0) + margin_m)
+        ground = replace(self.ground, prior=prior, terrain=terrain)
         return Piece(
             self.array, readings, ground, tile, self.offset_T, self.geology_T, *self._neighbouring_sources(tile)
         )

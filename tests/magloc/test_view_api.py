@@ -118,7 +118,7 @@ class TestInline:
         target = magloc.Target("t1", position, np.array([0.0, 1.0, 2.0]), 1e-4 * np.eye(6), 0.6, (0.5, 0.7), 900.0)
         values = SurveyRows(np.arange(40.0), rows, 1e-9 * rows[:, 0], 0.0 * rows[:, 0])
         reach = Reach(np.zeros((0, 3)), np.zeros(0))
-        survey = magloc.Survey((target,), ARRAY, values, reach, 0.0, 26.0, 1.0, False, 0.0, 1.0)
+        survey = magloc.Survey((target,), ARRAY, values, reach, magloc.Terrain(), 26.0, 1.0, False, 0.0, 1.0)
         assert "95 % ellipsoids of their positions" in self.page(magloc.view(None, survey))
         with open_server(0, "survey") as server:
             survey_page(server, survey)

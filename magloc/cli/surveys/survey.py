@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,11 +17,13 @@ from arrays.typing import Vector
 from magloc.cli.framework import CommonOptions, Flag, note, print_report
 from magloc.cli.options import (
     KnownOptions,
+    LogOptions,
     MapOptions,
     Port,
     ambient_field,
     refuse_not_positive,
 )
+from magloc.cli.surveys.ground import SurfaceOptions
 from magloc.cli.view import write_or_serve
 
 if TYPE_CHECKING:
@@ -32,13 +33,19 @@ if TYPE_CHECKING:
 
 @Parameter(name="*", group="Ground")
 @dataclass(frozen=True)
-class GroundOptions:
+class GroundOptions(SurfaceOptions):
     """Properties of the ground.
 
     Parameters
     ----------
     ground_m : float
-        Height of the ground in the world frame [m].
+        Height of the ground in the world frame [m]. With --terrain: amount to add to its heights, such as the height of
+        the sea above the ellipsoid.
+    terrain : str
+        Heights of uneven ground: a GeoTIFF (.tif) in any coordinate system, a CSV file with columns x, y, height or
+        easting, northing, height or longitude, latitude, height, or the name of the log's column with the height above
+        ground [m] from an altimeter. It must cover all lines. Depths, and limits of heights in --region, then count
+        from the ground.
     shortest_geology_m : float
         Shortest wavelength in the field of the ground itself [m]; smaller anomalies are targets.
     false_per_hectare : float
@@ -48,7 +55,6 @@ class GroundOptions:
         point sources.
     """
 
-    ground_m: Annotated[float, Parameter(allow_leading_hyphen=True)] = 0.0
     shortest_geology_m: float = 15.0
     false_per_hectare: float = 0.1
     body_length_m: float = 0.0
@@ -84,7 +90,7 @@ def survey(
     readings: Annotated[list[Path], Parameter(negative_iterable="")],
     /,
     *,
-    array: Path,
+    log: LogOptions = LogOptions(),  # noqa: B008 - frozen
     known: KnownOptions = KnownOptions(),  # noqa: B008 - frozen
     base: Path | None = None,
     ground: GroundOptions = GroundOptions(),
@@ -109,8 +115,8 @@ def survey(
     ----------
     readings : list of Path
         Readings files (CSV), in order of time.
-    array : Path
-        Array file (TOML).
+    log : LogOptions
+        Sensors and columns of the readings: --array or --instrument.
     known : KnownOptions
         Prior knowledge of the sensors, of the targets (in the world frame), and of the ambient field.
     base : Path
@@ -145,30 +151,34 @@ def survey(
     if review.view and (out is None or json):
         raise InputError("--view: found no --out, or --json, expected a folder to save to, and no --json.")
     refuse_not_positive(ground, "shortest_geology_m", "false_per_hectare")
-    if not math.isfinite(ground.ground_m):
-        raise InputError(f"--ground-m: found {ground.ground_m:g}, expected a finite number.")
+    ground.refuse()
+    chosen = known.select(log.sensors(readings[0]), log.name)
     decisions = [] if review.decisions is None else read_decisions(review.decisions)
-    chosen = known.select(arrays.read_sensors(array), array)  # a survey works with one sensor
     used, known = known.on_earth(chosen, readings[0])
     _note_ground(chosen, used, ground)
     maps.refuse(known.place)
     where = None if known.place is not None and known.date is None else known.where
     frame = _map_frame(used, known.place, crs)
     parts = [magloc.read_readings(path, used, sensors=known.ids, ordered=True) for path in readings]
+    surface, parts, origin = ground.below(readings, parts, used, known.place)
+    if origin is not None and origin != known.place:
+        note(f"note: the origin is on the ground, at a height of {origin[2]:.2f} m")
+        known, frame = replace(known, place=origin), _map_frame(used, origin, crs)
+        where = where and known.where
     for path, part in zip(readings, parts, strict=True):
         maps.refuse_far(part, str(path), always=out is not None and frame is not None)
     fields = [ambient_field(used, part, where) for part in parts]
     used, rows = fields[0][0], [replace(part, ambient_T=own) for part, (_, own) in zip(parts, fields, strict=True)]
     at_base = arrays.SensorArray((arrays.Sensor("base", "scalar", (0.0, 0.0, 0.0), 1e-10),))
     station = None if base is None else magloc.read_readings(base, at_base, ordered=True)
-    named = naming(", ".join(map(str, readings)), array=str(array))
+    named = naming(", ".join(map(str, readings)), array=log.name)
     with named, naming_options("ground_m", "base", "body_length_m", "scheduler"):
         found = magloc.survey(
             used,
             rows,
             base=station,
             prior=known.prior,
-            ground_m=ground.ground_m,
+            ground_m=surface,
             shortest_geology_m=ground.shortest_geology_m,
             false_per_hectare=ground.false_per_hectare,
             body_length_m=ground.body_length_m,
@@ -226,7 +236,8 @@ def _map_frame(array: arrays.SensorArray, origin: Vector | None, crs: str | None
 
 def _note_ground(given: arrays.SensorArray, used: arrays.SensorArray, ground: GroundOptions) -> None:
     """Name the height that the ground is stated above, where it is that of the log's first place."""
-    if given.columns == used.columns or used.columns is None or used.columns.above_ground:
+    is_stated = given.columns == used.columns or used.columns is None or used.columns.above_ground
+    if is_stated or ground.terrain is not None:
         return
     note(f"note: --ground-m counts from the height of that place, negative below it: found {ground.ground_m:g} m")
 

@@ -23,6 +23,7 @@ from magloc.measurement.pose import PoseErrors
 from magloc.surveying.fit.kernels import MeasuredRows
 from magloc.surveying.fit.record import SurveyRecord
 from magloc.surveying.fit.whitening import RecordWhitening, SurveyDrift
+from magloc.terrain.surface import FLAT, Terrain
 
 _MOST_STEPS = 25
 _SETTLED, _DAMPING = 1e-3, 1e-3
@@ -94,13 +95,13 @@ class Layer:
         """Return a layer for fields above a shortest wavelength, below all rows of a record."""
         depth = shortest_m / 2.5
         spacing = depth / 1.5
-        low, high = record.sensors_m.min(axis=(0, 1)), record.sensors_m.max(axis=(0, 1))
+        low, high = record.flat_m.min(axis=(0, 1)), record.flat_m.max(axis=(0, 1))
         x, y = (
             spacing * np.arange(math.floor((a - depth) / spacing), math.ceil((b + depth) / spacing) + 1)
             for a, b in zip(low[:2], high[:2], strict=True)
         )
         grid = np.stack(np.meshgrid(x, y, [low[2] - depth], indexing="ij"), axis=-1).reshape(-1, 3)
-        return cls(grid, depth, field_T)
+        return cls(record.terrain.drape(grid), depth, field_T)
 
     def columns(self, record: SurveyRecord, directions: FloatArray, white: RecordWhitening) -> FloatArray:
         """Return white columns (g·k, P): the readings of poles of the expected strength."""
@@ -197,28 +198,34 @@ def _root_of_projection(L: FloatArray, square: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class SourceBounds:
-    """Limits of a source's position and moment."""
+    """Limits of a source's position, above a flattened ground, and of its moment."""
 
     low_m: FloatArray
     high_m: FloatArray
     moment_Am2: float = 300.0
+    terrain: Terrain = FLAT
 
     def contains(self, sources: Sources) -> BoolArray:
         """Return which sources (K,) are within."""
-        inside = np.all((sources.position_m > self.low_m) & (sources.position_m < self.high_m), axis=1)
+        position_m = self.terrain.flatten(sources.position_m)
+        inside = np.all((position_m > self.low_m) & (position_m < self.high_m), axis=1)
         return np.asarray(inside & (np.linalg.norm(sources.moment_Am2, axis=1) < self.moment_Am2))
 
     def around(self, sources: Sources, reach_m: FloatArray) -> SourceBounds:
         """Return limits (K, 3) of sources that stay within a reach (K,)."""
+        position_m = self.terrain.flatten(sources.position_m)
         return replace(
             self,
-            low_m=np.maximum(self.low_m, sources.position_m - reach_m[:, None]),
-            high_m=np.minimum(self.high_m, sources.position_m + reach_m[:, None]),
+            low_m=np.maximum(self.low_m, position_m - reach_m[:, None]),
+            high_m=np.minimum(self.high_m, position_m + reach_m[:, None]),
         )
 
     def clip(self, sources: Sources) -> Sources:
         """Return sources moved within the limits."""
-        return replace(sources, position_m=np.clip(sources.position_m, self.low_m, self.high_m))
+        low_m, high_m = self.low_m, self.high_m
+        xy_m = np.clip(sources.position_m[:, :2], low_m[..., :2], high_m[..., :2])
+        position_m = self.terrain.flatten(np.column_stack([xy_m, sources.position_m[:, 2]]))
+        return replace(sources, position_m=self.terrain.drape(np.clip(position_m, low_m, high_m)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,9 +22,11 @@ from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray
 from magloc.fields.multipole import finite_body_errors, finite_body_fields
 from magloc.fields.points import field_at_points, gradient_at_points
+from magloc.measurement.platform_field import matrix_effects
 from magloc.measurement.pose import LEVER, N_POSE, SHIFT, TURN, PoseErrors, rates_of
 from magloc.navigation.rotations import cross_matrix
 from magloc.readings import Readings
+from magloc.terrain.surface import FLAT, Terrain
 
 _SMALL_TURN = 1e-12
 _SECOND_ORDER = 2.4e-6  # field times distance⁵ over moment and squared shift, on the axis
@@ -51,6 +53,8 @@ class SurveyRecord:
         Standard deviation of the shift for places that are interpolated between fixes.
     beside_T, gradient_beside_T_m : ndarray, shapes (n, N, 3) and (n, N, 3, 3), or 0
         Field of known sources and its gradient; fitted sources add to them.
+    terrain : Terrain
+        Ground that heights count from.
     """
 
     array: SensorArray
@@ -63,9 +67,17 @@ class SurveyRecord:
     interpolated_m: FloatArray | None = None
     beside_T: FloatArray | float = 0.0
     gradient_beside_T_m: FloatArray | float = 0.0
+    terrain: Terrain = FLAT
 
     @classmethod
-    def of(cls, array: SensorArray, readings: Readings, ambient_T: FloatArray, errors: PoseErrors) -> SurveyRecord:
+    def of(
+        cls,
+        array: SensorArray,
+        readings: Readings,
+        ambient_T: FloatArray,
+        errors: PoseErrors,
+        terrain: Terrain = FLAT,
+    ) -> SurveyRecord:
         """Return the record of readings with a pose; ambient field (n, 3) in the array's frame."""
         assert readings.array_position_m is not None
         assert readings.array_rotation is not None
@@ -85,7 +97,7 @@ class SurveyRecord:
         arm = np.array(errors.uncertainty.lever_arm_m)
         velocity = velocity - np.einsum("nij,nj->ni", R, np.cross(rate, arm))
         effects = errors.effects(rate, velocity, readings.pose_sigma, readings.interpolated_m)
-        return cls(array, readings.time_s, places, R, b, values, effects, readings.interpolated_m)
+        return cls(array, readings.time_s, places, R, b, values, effects, readings.interpolated_m, terrain=terrain)
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -136,10 +148,19 @@ class SurveyRecord:
         """Mean places of the sensors (n, 3)."""
         return np.asarray(self.sensors_m.mean(axis=1))
 
-    @property
+    @cached_property
+    def flat_m(self) -> FloatArray:
+        """Places of the sensors (n, N, 3) above a flattened ground."""
+        return self.terrain.flatten(self.sensors_m)
+
+    @cached_property
     def height_m(self) -> float:
-        """Median height of the lowest sensor in the world frame."""
-        return float(np.median(self.sensors_m[..., 2].min(axis=1)))
+        """Median height of the lowest sensor above a flattened ground, in the world frame."""
+        return float(np.median(self.flat_m[..., 2].min(axis=1)))
+
+    def height_above(self, position_m: FloatArray) -> FloatArray:
+        """Return the height of the sensors (...,) above positions (..., 3)."""
+        return np.asarray(self.height_m - self.terrain.flatten(position_m)[..., 2])
 
     @cached_property
     def along(self) -> FloatArray:
@@ -185,8 +206,7 @@ class SurveyRecord:
                 (np.full((3, 3), sensor.eddy_uncertainty_s), rate),
             ):
                 if size.any():
-                    nine = np.where(own[..., None], by_field[..., None] * (size * field[:, None, None]), 0.0)
-                    columns.append(nine.reshape(len(self), -1, 9))
+                    columns.append(np.where(own, matrix_effects(by_field, field[:, None]) * size.ravel(), 0.0))
         return np.concatenate(columns, axis=2) if columns else np.zeros((len(self), len(owner), 0))
 
     def by_pose(self, directions: FloatArray, fields_T: FloatArray, gradients: FloatArray) -> FloatArray:

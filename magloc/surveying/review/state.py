@@ -73,12 +73,13 @@ class SurveyState:
             tiled.array,
             _rows(tiled, results),
             Reach(*(np.concatenate([result[name] for result in results]) for name in ("reach_m", "reach_Am2"))),
-            tiled.ground.ground_m,
+            tiled.ground.terrain,
             tiled.ground.threshold,
             chi2_per_dof,
             self.pose_assumed,
             self.lag_s,
             time.monotonic() - began,
+            tiled.readings.lines,
             self,
         )
 
@@ -91,7 +92,7 @@ def _targets(tiled: TiledSurvey, results: Sequence[Arrays], names: Names) -> tup
     targets = []
     for name, (t, k) in zip(ids, kept, strict=True):
         position, moment, covariance, interval, significance, flags = (results[t][entry][k] for entry in TARGET_ENTRIES)
-        depth = tiled.ground.ground_m - float(position[2])
+        depth = float(tiled.ground.terrain.depth_of(position))
         chi2, words = float(significance), tuple(str(flags).split())
         interval95 = (float(interval[0]), float(interval[1]))
         if name:

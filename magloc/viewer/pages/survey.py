@@ -11,6 +11,7 @@ from matplotlib.colors import SymLogNorm
 
 from arrays.typing import ByteArray, FloatArray
 from magloc.surveying.results import Survey, Target, linear_and_most
+from magloc.terrain.surface import Terrain
 from magloc.viewer.pages import texts
 from magloc.viewer.scene.glyphs import (
     DIPOLE_COLOUR,
@@ -27,6 +28,7 @@ from magloc.viewer.scene.shapes import Surface, ellipsoid, join_surfaces, line_s
 
 _SCALE = colormaps["RdBu_r"]
 _GROUND_COLOUR = (150, 120, 90)
+_GROUND_NODES = 50  # along each side of uneven ground
 
 
 class SurveyScene:
@@ -57,8 +59,7 @@ class SurveyScene:
         self._size_m = 0.04 * float(np.linalg.norm(high - low))
         linear, most = linear_and_most(1e9 * found.rows.decimate().anomaly_T)
         self._norm = SymLogNorm(linear, vmin=-most, vmax=most)
-        corners = np.array([[x, y, found.ground_m] for x in (low[0], high[0]) for y in (low[1], high[1])])
-        ground = Surface(corners.astype(np.float32), np.array([[0, 2, 1], [1, 2, 3]], dtype=np.uint32))
+        ground = _ground(found.terrain, low[:2], high[:2])
         add_mesh(server.scene, "/ground", ground, _GROUND_COLOUR, flat=True, opacity=0.3)
         text = f"anomaly, linear up to {linear:.2g} nT, then logarithmic"
         self.entries: list[Entry] = [
@@ -70,7 +71,7 @@ class SurveyScene:
                 Swatch(DIPOLE_COLOUR, "targets: arrows along the moments, and depths below the ground"),
                 Swatch(REGION_COLOUR, "95 % ellipsoids of their positions"),
             ]
-        self.points_m = np.vstack([places, corners, found.position_m])
+        self.points_m = np.vstack([places, ground.vertices, found.position_m])
         segments = line_segments(self._size_m * unit_circle())
         self._ring = add_lines(server.scene, "/chosen", segments, DIPOLE_COLOUR, 3.0, visible=False)
         self.folder = server.gui.add_folder("Target", visible=bool(len(found)))
@@ -101,11 +102,11 @@ class SurveyScene:
         add_points(scene, "/rows", rows.place_m, _colours(self._norm(1e9 * rows.anomaly_T)), 0.12 * self._size_m)
         for target in found:
             DipoleGlyph(scene, f"/{target.id}", self._size_m).show(target.position_m, target.moment_Am2)
-            above = np.array([*target.position_m[:2], found.ground_m])
-            add_label(scene, f"/{target.id}-text", f"{target.id}: {target.depth_m:.2f} m", above, "bottom-center")
+            text = f"{target.id}: {target.depth_m:.2f} m"
+            add_label(scene, f"/{target.id}-text", text, above(found.terrain, target.position_m), "bottom-center")
         if len(found):
-            on_ground = found.position_m * [1.0, 1.0, 0.0] + [0.0, 0.0, found.ground_m]
-            add_lines(scene, "/depths", np.stack([found.position_m, on_ground], axis=1), DIPOLE_COLOUR, 1.0)
+            ends = np.stack([found.position_m, above(found.terrain, found.position_m)], axis=1)
+            add_lines(scene, "/depths", ends, DIPOLE_COLOUR, 1.0)
             regions = join_surfaces(ellipsoid(target.position_m, target.covariance[:3, :3]) for target in found)
             add_mesh(scene, "/ellipsoids", regions, REGION_COLOUR, opacity=0.4)
         self.dropdown.options = tuple(target.id for target in found) or ("",)
@@ -116,8 +117,23 @@ class SurveyScene:
         self._ring.visible = target is not None
         self._panel.content = ""
         if target is not None:
-            self._ring.position = np.array([*target.position_m[:2], self.found.ground_m])
+            self._ring.position = above(self.found.terrain, target.position_m)
             self._panel.content = texts.panel_html(target_lines(target), warning=bool(target.flags))
+
+
+def _ground(terrain: Terrain, low_m: FloatArray, high_m: FloatArray) -> Surface:
+    """Return the ground in a rectangle."""
+    n = 2 if terrain.is_flat else _GROUND_NODES
+    xy = np.stack(np.meshgrid(*np.linspace(low_m, high_m, n).T, indexing="ij"), axis=-1).reshape(-1, 2)
+    nodes = np.column_stack([xy, terrain.height_at(xy)])
+    first = (n * np.arange(n - 1)[:, None] + np.arange(n - 1)).reshape(-1, 1)
+    faces = first + np.array([[0, n, 1], [1, n, n + 1]])[:, None]
+    return Surface(nodes.astype(np.float32), faces.reshape(-1, 3).astype(np.uint32))
+
+
+def above(terrain: Terrain, position_m: FloatArray) -> FloatArray:
+    """Return the places (..., 3) on the ground above positions (..., 3)."""
+    return np.concatenate([position_m[..., :2], terrain.height_at(position_m[..., :2])[..., None]], axis=-1)
 
 
 def target_lines(target: Target) -> list[str]:

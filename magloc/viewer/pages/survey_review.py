@@ -14,7 +14,7 @@ from magloc.surveying.results import Survey
 from magloc.surveying.review.decisions import Decision, entry_of
 from magloc.surveying.review.review import Review
 from magloc.viewer.pages import texts
-from magloc.viewer.pages.survey import SurveyScene
+from magloc.viewer.pages.survey import SurveyScene, above
 from magloc.viewer.panels.inputs import set_value
 from magloc.viewer.scene.glyphs import add_lines, show_segments
 from magloc.viewer.scene.shapes import line_segments
@@ -22,6 +22,7 @@ from magloc.viewer.scene.shapes import line_segments
 _NO_CLICK, _ADDS, _CORNER = "moves the view only", "sets the place to add", "sets a corner"
 _COLOUR = (230, 60, 20)
 _DIGITS = 2  # of a place that a hand points at [m]
+_STEPS = 8  # to the place where a ray meets uneven ground
 
 
 class ReviewPanel:
@@ -86,10 +87,13 @@ class ReviewPanel:
 
     def click(self, origin_m: FloatArray, direction: FloatArray) -> None:
         """Use the place on the ground that a ray from the camera meets."""
-        down = (self._scene.found.ground_m - origin_m[2]) / direction[2] if direction[2] else -1.0
-        if down <= 0.0 or self.click_dropdown.value == _NO_CLICK:
+        if direction[2] >= 0.0 or self.click_dropdown.value == _NO_CLICK:
             return
-        x, y = np.round((origin_m + down * direction)[:2], _DIGITS).tolist()
+        place_m = origin_m
+        for _ in range(_STEPS):
+            height_m = above(self._scene.found.terrain, place_m)[2]
+            place_m = origin_m + (height_m - origin_m[2]) / direction[2] * direction
+        x, y = np.round(place_m[:2], _DIGITS).tolist()
         if self.click_dropdown.value == _ADDS:
             set_value(self.place_input, (x, y))
         else:
@@ -191,9 +195,8 @@ class ReviewPanel:
 
     def _show_corners(self) -> None:
         self.polygon_button.disabled = len(self.corners_m) < 3
-        ground_m = self._scene.found.ground_m
-        closed = [(*corner, ground_m) for corner in [*self.corners_m, *self.corners_m[:1]]]
-        show_segments(self._polygon, line_segments(np.array(closed)) if len(closed) > 2 else np.zeros((0, 2, 3)))
+        closed = above(self._scene.found.terrain, np.array([*self.corners_m, *self.corners_m[:1]]).reshape(-1, 2))
+        show_segments(self._polygon, line_segments(closed) if len(closed) > 2 else np.zeros((0, 2, 3)))
 
 
 def decision_words(decision: Decision) -> str:

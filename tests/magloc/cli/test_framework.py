@@ -39,6 +39,7 @@ COMMANDS = (
     "new-array",
     "columns",
     "survey",
+    "compensate",
     "demo",
     "simulate",
     "view",

@@ -41,7 +41,7 @@ class TestReportHtml:
     def test_the_ground_is_below_the_origin(
         self, survey: magloc.Survey, frame: MapFrame, figures: tuple[Figure, Figure]
     ) -> None:
-        page = report_html(replace(survey, ground_m=-1.6), frame, "Meadow", {}, figures)
+        page = report_html(replace(survey, terrain=magloc.Terrain(-1.6)), frame, "Meadow", {}, figures)
         assert "<td>origin</td><td>latitude 52.4100000, longitude 13.1200000, height 41.00 m</td>" in page
         assert "<td>ground</td><td>flat, 1.6 m below the origin</td>" in page
 

@@ -22,7 +22,7 @@ def surfaces(places_m: FloatArray, anomaly_T: FloatArray | None = None) -> list[
     anomaly = np.zeros(10) if anomaly_T is None else anomaly_T
     reach = Reach(places_m, np.geomspace(0.1, 10.0, len(places_m)))
     rows = SurveyRows(TIME_S, FLOWN_M, anomaly, anomaly)
-    figure = magloc.plots.survey(magloc.Survey((), ONE, rows, reach, 0.0, 25.0, 1.0, False, 0.0, 1.0))
+    figure = magloc.plots.survey(magloc.Survey((), ONE, rows, reach, magloc.Terrain(), 25.0, 1.0, False, 0.0, 1.0))
     return [shown for ax in figure.axes for shown in ax.collections if isinstance(shown, TriMesh)]
 
 
@@ -52,7 +52,7 @@ class TestProfiles:
         target = magloc.Target("t1", np.array([18.0, 0.0, -1.0]), np.ones(3), covariance, 1.0, interval, 99.0)
         rows = SurveyRows(np.arange(82.0), self.PLACES, 1e-9 * self.WAY, np.full(82, 5e-9))
         reach = Reach(np.zeros((0, 3)), np.zeros(0))
-        found = magloc.Survey((target,) * number, ONE, rows, reach, 0.0, 25.0, 1.0, False, 0.0, 1.0)
+        found = magloc.Survey((target,) * number, ONE, rows, reach, magloc.Terrain(), 25.0, 1.0, False, 0.0, 1.0)
         return magloc.plots.survey_profiles(found).axes
 
     def test_a_line_ends_where_it_turns(self) -> None:

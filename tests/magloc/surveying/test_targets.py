@@ -54,7 +54,9 @@ def plot() -> Piece:
     carrier, seconds = replace(whole.carrier, path=path), (110.0 + 5.0 * np.pi) / path.speed_m_s
     scenario = replace(whole, carrier=carrier, targets=None, sources=sources, duration_s=seconds, rate_Hz=8.0)
     field = sims.simulate(scenario, rng=912)
-    tiled = TiledSurvey.of(*whole_rows(field.array, field.readings), Ground(magloc.SourcePrior(), 0.0, 15.0, 25.0))
+    tiled = TiledSurvey.of(
+        *whole_rows(field.array, field.readings), Ground(magloc.SourcePrior(), magloc.Terrain(), 15.0, 25.0)
+    )
     place, moment = np.array([WEAK, STRONG]).transpose(1, 0, 2)
     return replace(tiled, sources=Sources(place, moment)).piece(0)
 
@@ -111,7 +113,7 @@ def test_at_its_ends_a_depth_interval_costs_what_chance_does() -> None:
 
     found = np.concatenate([fit.sources.position_m, fit.sources.moment_Am2], axis=1)
     assert np.sum(residual(np.delete(found, 2), -found[0, 2]) ** 2) == pytest.approx(fit.cost)
-    for depth in profile_of(model, fit, background, 0, 0.0).depth_interval95_m:
+    for depth in profile_of(model, fit, background, 0).depth_interval95_m:
         there = least_squares(residual, np.delete(found, 2), x_scale="jac", args=(depth,))
         assert 2.0 * there.cost - fit.cost == pytest.approx(3.84, abs=0.5)
 
@@ -150,7 +152,7 @@ class TestMisfit:
 def test_where_places_are_gaussian_their_scatter_is_the_covariance() -> None:
     """That of a strong source, whose likelihood is Gaussian."""
     model, fit, background = fitted()
-    scatter = profile_of(model, fit, background, 1, 0.0).scatter_m2
+    scatter = profile_of(model, fit, background, 1).scatter_m2
     np.testing.assert_allclose(scatter, fit.covariance[6:8, 6:8], atol=0.15 * scatter.max())
 
 
@@ -190,7 +192,7 @@ def test_the_least_moment_is_seen_with_95_percent() -> None:
     """Its χ², as of a source of a joint fit, has the tail that is promised in the worst of 300 directions."""
     model, fit, background = fitted()
     low, high = model.bounds.low_m[:2] + 1.0, model.bounds.high_m[:2] - 1.0
-    places, moments = least_moments(model, fit.sources, groups, low, high, 0.0)
+    places, moments = least_moments(model, fit.sources, groups, low, high)
     assert sorted(set((-places[:, 2]).round(6))) == list(DEPTHS_M)
     directions = np.random.default_rng(1).normal(size=(300, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -212,13 +214,13 @@ def test_no_place_where_no_row_is_near() -> None:
     model, fit, _ = fitted()
     far = replace(model, bounds=SourceBounds(model.bounds.low_m, model.bounds.high_m + 300.0 * np.eye(3)[0]))
     low, high = far.bounds.low_m[:2], far.bounds.high_m[:2]
-    places, moments = least_moments(far, fit.sources, groups, low, high, 0.0)
+    places, moments = least_moments(far, fit.sources, groups, low, high)
     beside_m = places[:, 0] - model.bounds.high_m[0]
     deepest = model.record.height_m + DEPTHS_M[-1]
     assert 5.0 < beside_m.max() < (WINDOW + 8.0 / PITCH) * deepest  # squares of 8 by 8 places are searched at once
     assert np.isfinite(moments).all()
     assert np.median(moments[beside_m > 5.0]) > 10.0 * np.median(moments[beside_m < 0.0])
-    assert not least_moments(model, fit.sources, groups, high, high + 20.0, 0.0)[0].size  # beside all sources
+    assert not least_moments(model, fit.sources, groups, high, high + 20.0)[0].size  # beside all sources
 
 
 def plot_of(seen: Callable[[FloatArray], FloatArray], start: Sources, body_length_m: float = 0.0) -> Fitted:

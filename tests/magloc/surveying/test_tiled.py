@@ -46,7 +46,7 @@ def field() -> Simulation:
 @cache
 def tiled() -> TiledSurvey:
     array, rows = whole_rows(field().array, field().readings)
-    return TiledSurvey.of(array, rows, Ground(SHALLOW, 0.0, 15.0, 25.0))
+    return TiledSurvey.of(array, rows, Ground(SHALLOW, magloc.Terrain(), 15.0, 25.0))
 
 
 @cache
@@ -155,7 +155,7 @@ class TestReach:
         array, rows = whole_rows(field().array, field().readings)
         assert rows.array_position_m is not None
         apart = rows[np.abs(rows.array_position_m[:, 0]) > 6.0]
-        west = TiledSurvey.of(array, apart, Ground(SHALLOW, 0.0, 15.0, 25.0)).piece(0)
+        west = TiledSurvey.of(array, apart, Ground(SHALLOW, magloc.Terrain(), 15.0, 25.0)).piece(0)
         places = measure_targets(west)["reach_m"]
         for depth in set(places[:, 2]):
             assert abs(places[places[:, 2] == depth, 0].max()) < 1.0  # half a step between places
@@ -168,7 +168,7 @@ class TestBadInput:
         assert rows.array_position_m is not None
         wave = np.sin(np.arange(len(rows)))[:, None] * [0.0, width_m, 0.0]
         line = replace(rows, array_position_m=rows.array_position_m * [1.0, 0.0, 1.0] + wave)
-        TiledSurvey.of(array, line, Ground(SHALLOW, 0.0, 15.0, 25.0))
+        TiledSurvey.of(array, line, Ground(SHALLOW, magloc.Terrain(), 15.0, 25.0))
         assert ("lie on one line" in caplog.text) == said
 
     def test_rows_that_are_far_from_each_other(self) -> None:

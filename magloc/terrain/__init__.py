@@ -1,0 +1,1 @@
+"""Terrain: the ground below a survey, and the files that describe it."""
