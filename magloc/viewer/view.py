@@ -163,6 +163,23 @@ def view(
     return open_view(f"magloc · {name}", fill, html=html, png=png, movie=movie, open=open, port=port)
 
 
+def view_survey(
+    found: Survey, save: Callable[[Survey], str], *, open: bool = True, port: int = FIRST_PORT, title: str = "survey"
+) -> View:
+    """View a survey with its review.
+
+    Parameters
+    ----------
+    found : Survey
+    save : callable
+        Function that saves a reviewed survey and returns a sentence for the page.
+    open, port, title
+        As for :func:`view`.
+    """
+    fill = lambda server: survey_page(server, found, save=save, live=True)  # noqa: E731
+    return open_view(f"magloc · {title}", fill, html=None, png=None, movie=None, open=open, port=port)
+
+
 def _is_static(*files: str | Path | None) -> bool:
     """Return whether a view is written to files or into a notebook instead of served."""
     return any(file is not None for file in files) or _in_notebook()
@@ -220,7 +237,7 @@ def _choose_page(
         readings = result.readings if readings is None else readings
         result = result.as_result
     if isinstance(result, Survey):
-        return lambda server: survey_page(server, result)
+        return lambda server: survey_page(server, result, live=live)
     if isinstance(result, TrackResult):
         if not any(point.is_on_track for track in result.tracks for point in track):
             raise ValueError("Input result must have a row where the source is tracked; instead received none.")

@@ -17,15 +17,18 @@ import shlex
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
+import viser
 from PIL import Image
 
+import magloc
 from arrays.array_file import read_array
 from magloc.viewer.origin import SMOOTH
-from magloc.viewer.pages.pages import array_page
+from magloc.viewer.pages.pages import Page, array_page, survey_page
 from magloc.viewer.server import open_server
 from tests.browser.browser import Browser
 from tests.browser.screen import Screen
@@ -138,27 +141,37 @@ class Panel:
 
 @dataclass(frozen=True)
 class LivePage:
-    """The live page of an array in Chromium, when it has found the dipole that it starts with."""
+    """A live page in Chromium, when it says some words; by default that of an array, when it has found its dipole."""
 
     made_by: str
     array: str
     sources: tuple[str, ...]
     size_px: tuple[int, int] = (1280, 800)
+    fill: Callable[[viser.ViserServer, Path], Page] = lambda server, path: array_page(
+        server, read_array(path), live=True
+    )
+    words: str = "found at"
 
     def steps(self) -> tuple[str, ...]:
         return (self.made_by, f"the live page of {self.array} at {self.size_px}")
 
     def draw(self, folder: Path) -> bytes:
         run(self.made_by, folder)
-        array = read_array(folder / self.array)
         with Browser("about:blank", self.size_px) as browser, open_server(0, self.array) as server:
-            screen, page = Screen(browser, folder), array_page(server, array, live=True)
+            screen, page = Screen(browser, folder), self.fill(server, folder / self.array)
             screen.open_server(server, SMOOTH)
-            screen.until(lambda: "found at" in screen.text(), "the fit is found")
+            screen.until(lambda: self.words in screen.text(), "the page is complete")
             screen.keep("live")
             screen.leave()
             page.close()
         return small((folder / "live.png").read_bytes())
+
+
+def review_page(server: viser.ViserServer, array: Path) -> Page:
+    """The page to review the survey of the file beside an array."""
+    sensors = read_array(array)
+    rows = magloc.read_readings(array.with_name(array.name.replace("-array.toml", ".csv")), sensors)
+    return survey_page(server, magloc.survey(sensors, rows), save=str, live=True)
 
 
 SIMULATED = "magloc simulate weaving --out weaving.csv"
@@ -236,6 +249,14 @@ PICTURES: dict[str, Picture] = {
     ),
     "view-dipole.png": LivePage(
         SIMULATED, "weaving-array.toml", (WEAVING, *SCENE, "magloc/viewer/pages/dipole_editor.py")
+    ),
+    "review-targets.png": LivePage(
+        SURVEY[0],
+        "field-array.toml",
+        (*SURVEY_SOURCES[:1], *SCENE, "magloc/viewer/pages/survey.py", "magloc/viewer/pages/survey_review.py"),
+        (1280, 1000),
+        review_page,
+        "Fit again",
     ),
     "view-map.png": OfCommands(
         (MAP, "magloc view map --png view-map.png"), "view-map.png", (PAPER[0], "magloc/viewer/pages/map.py", *SCENE)

@@ -19,10 +19,12 @@ from magloc.cli.options import (
     KnownOptions,
     LogOptions,
     MapOptions,
+    Port,
     ambient_field,
     refuse_not_positive,
 )
 from magloc.cli.surveys.ground import SurfaceOptions
+from magloc.cli.view import write_or_serve
 
 if TYPE_CHECKING:
     from magloc.deliverables.map_frame import MapFrame
@@ -69,10 +71,19 @@ class ReviewOptions:
         Log of decisions about targets and rows (decisions.jsonl of an earlier review) to apply after the search.
     html : Path
         HTML file to write: lines, ground and targets in three dimensions, as one page that needs no server.
+    view : bool
+        Serve a page to review the targets, until Ctrl-C. It saves into the folder of --out.
+    port : int
+        Port of the server; the next free one if it is in use.
+    open : bool
+        Open the page in the browser.
     """
 
     decisions: Path | None = None
     html: Path | None = None
+    view: Flag = False
+    port: Port = 8080
+    open: Flag = False
 
 
 def survey(
@@ -137,6 +148,8 @@ def survey(
     refuse_file(out, "--out")
     refuse_one_for_two({"--out": out, "--html": review.html, **maps.outputs})
     refuse_unwritable(review.html, "--html")
+    if review.view and (out is None or json):
+        raise InputError("--view: found no --out, or --json, expected a folder to save to, and no --json.")
     refuse_not_positive(ground, "shortest_geology_m", "false_per_hectare")
     ground.refuse()
     chosen = known.select(log.sensors(readings[0]), log.name)
@@ -176,8 +189,13 @@ def survey(
     if review.decisions is not None:
         with naming(str(review.decisions)):
             found = magloc.Review(found).replay(decisions, None if json else note).found
-    maps.write(found, known.place)
-    _write(out, _files(found, frame, ", ".join(path.name for path in readings), ground))
+
+    def write(found: Survey) -> str:
+        maps.write(found, known.place)
+        _write(out, _files(found, frame, ", ".join(path.name for path in readings), ground))
+        return f"saved in {out}"
+
+    write(found)
     if review.html is not None:
         magloc.view(None, found, html=review.html, title="survey")
     if json:
@@ -186,6 +204,15 @@ def survey(
         print_report(json_of_survey(found) | _json_of_map(found, frame))
         return
     print(found.table())
+    _note_pose(found)
+    if review.view:
+        from magloc.viewer.view import view_survey
+
+        write_or_serve(lambda port: view_survey(found, write, open=review.open, port=port), [], review.port)
+
+
+def _note_pose(found: Survey) -> None:
+    """Name the errors of the pose that were estimated."""
     if found.pose_assumed:
         pose = found.array.pose
         size = "" if pose is None else f" {100.0 * pose.position_m:.2g} cm that last {pose.correlation_s:g} s"

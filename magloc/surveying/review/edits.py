@@ -108,13 +108,14 @@ def _piece_at(tiled: TiledSurvey, place_m: Sequence[float]) -> Piece:
 def _source_at(piece: Piece, place_m: Sequence[float]) -> Sources:
     """Return the likeliest source at a place (x, y) or (x, y, z), beside the known ones."""
     model = piece.model()
-    height, bounds = model.record.height_m, model.bounds
+    height, bounds, terrain = model.record.height_m, model.bounds, model.record.terrain
     x, y = np.clip(place_m[:2], bounds.low_m[:2], bounds.high_m[:2])
     depths = np.geomspace(height - bounds.high_m[2], height - bounds.low_m[2], _N_DEPTHS)
     if len(place_m) > 2:
-        depths = height - np.clip(place_m[2:], bounds.low_m[2], bounds.high_m[2])
+        depths = height - np.clip(terrain.flatten(np.array([place_m]))[:, 2], bounds.low_m[2], bounds.high_m[2])
     # All depths explain the same rows, or the deepest would win by their number.
-    grid = SearchGrid([(float(depths[-1]), np.array([[x, y, height - below] for below in depths]))])
+    places = terrain.drape(np.array([[x, y, height - below] for below in depths]))
+    grid = SearchGrid([(float(depths[-1]), places)])
     background = model.background(piece.known, piece.groups(model.record, WHILE_SEARCHING * float(depths[0])))
     found = Candidates.concatenate(search(model.record, background, piece.known, grid))
     return sources_at(found, np.array([int(np.argmax(found.chi2))]))
@@ -124,8 +125,8 @@ def _likeliest_pair(piece: Piece, position_m: FloatArray) -> Sources:
     """Return the likeliest two sources in place of the known one nearest to a position."""
     model, known = piece.model(), piece.known
     which = int(np.argmin(np.linalg.norm(known.position_m - position_m, axis=1)))
-    height, bounds = model.record.height_m, model.bounds
-    distance = height - position_m[2]
+    height, bounds, terrain = model.record.height_m, model.bounds, model.record.terrain
+    distance = height - float(terrain.flatten(position_m)[2])
     beside = distance * np.linspace(-_WITHIN, _WITHIN, _N_BESIDE)
     below = height - distance * np.geomspace(1.0 / _DEEPER, _DEEPER, N_DISTANCES)
     below = np.clip(below, bounds.low_m[2], bounds.high_m[2])
@@ -135,7 +136,7 @@ def _likeliest_pair(piece: Piece, position_m: FloatArray) -> Sources:
     ]
     groups = partial(piece.groups, model.record)
     background = model.background(known, groups(WHILE_SEARCHING * distance))
-    grid = SearchGrid([(at, places.reshape(-1, 3)) for at, places in levels])
+    grid = SearchGrid([(at, terrain.drape(places.reshape(-1, 3))) for at, places in levels])
     found = Candidates.concatenate(search(model.record, background, known, grid))
     best, least = known, math.inf
     group = groups(AT_LAST * model.nearest_m)

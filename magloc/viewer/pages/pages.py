@@ -23,7 +23,7 @@ from magloc.viewer.pages.fixes import FixView, best_positions, single_sources
 from magloc.viewer.pages.live import LivePage
 from magloc.viewer.pages.map import MapControls, MapView
 from magloc.viewer.pages.open_result import MapResult
-from magloc.viewer.pages.survey import add_survey
+from magloc.viewer.pages.survey import SurveyScene
 from magloc.viewer.pages.track_player import TrackPlayer, source_colours, time_colours
 from magloc.viewer.panels.readings_plot import ReadingsPlot, residuals_of
 from magloc.viewer.scene.framing import Extent, aim_camera, corners_of, extent_of, set_up_scene
@@ -292,11 +292,21 @@ def map_page(server: viser.ViserServer, result: MapResult) -> Page:
     return _finish_page(server, legend, extent, result.title, entries, notes, ruler=False)  # the box has labels
 
 
-def survey_page(server: viser.ViserServer, found: Survey) -> Page:
-    """Fill a page with a survey."""
+def survey_page(
+    server: viser.ViserServer,
+    found: Survey,
+    *,
+    save: Callable[[Survey], str] | None = None,
+    live: bool = False,
+) -> Page:
+    """Fill a page with a survey; a live page of one with its rows has a review, which is saved by a function."""
     legend = server.gui.add_folder("Legend")
-    entries, points = add_survey(server, found)
-    return _finish_page(server, legend, extent_of(points), repr(found), entries, has_array=False)
+    scene = SurveyScene(server, found)
+    if live and found.state is not None:
+        from magloc.viewer.pages.survey_review import ReviewPanel
+
+        ReviewPanel(server, scene, save)
+    return _finish_page(server, legend, extent_of(scene.points_m), repr(found), scene.entries, has_array=False)
 
 
 def _finish_page(

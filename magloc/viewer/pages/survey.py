@@ -31,37 +31,94 @@ _GROUND_COLOUR = (150, 120, 90)
 _GROUND_NODES = 50  # along each side of uneven ground
 
 
-def add_survey(server: viser.ViserServer, found: Survey) -> tuple[list[Entry], FloatArray]:
-    """Add a survey to a scene; return entries of the legend, and points (k, 3) to show."""
-    scene = server.scene
-    rows = found.rows.decimate()
-    places, anomaly_nT = rows.place_m, 1e9 * rows.anomaly_T
-    linear, most = linear_and_most(anomaly_nT)
-    low, high = places.min(axis=0), places.max(axis=0)
-    size = 0.04 * float(np.linalg.norm(high - low))
-    add_points(scene, "/rows", places, _colours(SymLogNorm(linear, vmin=-most, vmax=most)(anomaly_nT)), 0.12 * size)
-    ground = _ground(found.terrain, low[:2], high[:2])
-    add_mesh(scene, "/ground", ground, _GROUND_COLOUR, flat=True, opacity=0.3)
-    text = f"anomaly, linear up to {linear:.2g} nT, then logarithmic"
-    entries: list[Entry] = [
-        ColourScale.sample(text, f"{-most:.3g} nT", f"{most:.3g} nT", _colours),
-        Swatch(_GROUND_COLOUR, "ground"),
-    ]
-    if len(found):
+class SurveyScene:
+    """Survey in a scene, with a choice of the target whose properties the panel shows.
+
+    Parameters
+    ----------
+    server : viser.ViserServer
+        The panels are added to the present container of its GUI.
+    found : Survey
+
+    Attributes
+    ----------
+    found : Survey
+        Survey that is shown.
+    entries : list
+        Entries of the legend.
+    points_m : ndarray, shape (k, 3)
+        Points that the first view includes.
+    folder : viser.GuiFolderHandle
+        Folder of the chosen target.
+    """
+
+    def __init__(self, server: viser.ViserServer, found: Survey) -> None:
+        self._scene, self.found = server.scene, found
+        places = found.rows.decimate().place_m
+        low, high = places.min(axis=0), places.max(axis=0)
+        self._size_m = 0.04 * float(np.linalg.norm(high - low))
+        linear, most = linear_and_most(1e9 * found.rows.decimate().anomaly_T)
+        self._norm = SymLogNorm(linear, vmin=-most, vmax=most)
+        ground = _ground(found.terrain, low[:2], high[:2])
+        add_mesh(server.scene, "/ground", ground, _GROUND_COLOUR, flat=True, opacity=0.3)
+        text = f"anomaly, linear up to {linear:.2g} nT, then logarithmic"
+        self.entries: list[Entry] = [
+            ColourScale.sample(text, f"{-most:.3g} nT", f"{most:.3g} nT", _colours),
+            Swatch(_GROUND_COLOUR, "ground"),
+        ]
+        if len(found):
+            self.entries += [
+                Swatch(DIPOLE_COLOUR, "targets: arrows along the moments, and depths below the ground"),
+                Swatch(REGION_COLOUR, "95 % ellipsoids of their positions"),
+            ]
+        self.points_m = np.vstack([places, ground.vertices, found.position_m])
+        segments = line_segments(self._size_m * unit_circle())
+        self._ring = add_lines(server.scene, "/chosen", segments, DIPOLE_COLOUR, 3.0, visible=False)
+        self.folder = server.gui.add_folder("Target", visible=bool(len(found)))
+        with self.folder:
+            self.dropdown = server.gui.add_dropdown("Target", ("",), hint="The most significant is first.")
+            self._panel = server.gui.add_html("")
+        self.dropdown.on_update(lambda _: self._show_chosen())
+        self._draw()
+
+    @property
+    def chosen(self) -> Target | None:
+        """Target that the user chose, None if there is none."""
+        return next((target for target in self.found if target.id == self.dropdown.value), None)
+
+    def show(self, found: Survey) -> None:
+        """Show another result of the same survey."""
+        for target in self.found:
+            self._scene.remove_by_name(f"/{target.id}")
+            self._scene.remove_by_name(f"/{target.id}-text")
+        if len(self.found):
+            self._scene.remove_by_name("/depths")
+            self._scene.remove_by_name("/ellipsoids")
+        self.found = found
+        self._draw()
+
+    def _draw(self) -> None:
+        scene, found, rows = self._scene, self.found, self.found.rows.decimate()
+        add_points(scene, "/rows", rows.place_m, _colours(self._norm(1e9 * rows.anomaly_T)), 0.12 * self._size_m)
         for target in found:
-            DipoleGlyph(scene, f"/{target.id}", size).show(target.position_m, target.moment_Am2)
+            DipoleGlyph(scene, f"/{target.id}", self._size_m).show(target.position_m, target.moment_Am2)
             text = f"{target.id}: {target.depth_m:.2f} m"
-            add_label(scene, f"/{target.id}-text", text, _above(found.terrain, target.position_m), "bottom-center")
-        ends = np.stack([found.position_m, _above(found.terrain, found.position_m)], axis=1)
-        add_lines(scene, "/depths", ends, DIPOLE_COLOUR, 1.0)
-        regions = join_surfaces(ellipsoid(target.position_m, target.covariance[:3, :3]) for target in found)
-        add_mesh(scene, "/ellipsoids", regions, REGION_COLOUR, opacity=0.4)
-        entries.append(
-            Swatch(DIPOLE_COLOUR, f"{len(found)} targets: arrows along the moments, and depths below the ground")
-        )
-        entries.append(Swatch(REGION_COLOUR, "95 % ellipsoids of their positions"))
-        _add_targets(server, found, size)
-    return entries, np.vstack([places, ground.vertices, found.position_m])
+            add_label(scene, f"/{target.id}-text", text, above(found.terrain, target.position_m), "bottom-center")
+        if len(found):
+            ends = np.stack([found.position_m, above(found.terrain, found.position_m)], axis=1)
+            add_lines(scene, "/depths", ends, DIPOLE_COLOUR, 1.0)
+            regions = join_surfaces(ellipsoid(target.position_m, target.covariance[:3, :3]) for target in found)
+            add_mesh(scene, "/ellipsoids", regions, REGION_COLOUR, opacity=0.4)
+        self.dropdown.options = tuple(target.id for target in found) or ("",)
+        self._show_chosen()
+
+    def _show_chosen(self) -> None:
+        target = self.chosen
+        self._ring.visible = target is not None
+        self._panel.content = ""
+        if target is not None:
+            self._ring.position = above(self.found.terrain, target.position_m)
+            self._panel.content = texts.panel_html(target_lines(target), warning=bool(target.flags))
 
 
 def _ground(terrain: Terrain, low_m: FloatArray, high_m: FloatArray) -> Surface:
@@ -74,26 +131,9 @@ def _ground(terrain: Terrain, low_m: FloatArray, high_m: FloatArray) -> Surface:
     return Surface(nodes.astype(np.float32), faces.reshape(-1, 3).astype(np.uint32))
 
 
-def _above(terrain: Terrain, position_m: FloatArray) -> FloatArray:
+def above(terrain: Terrain, position_m: FloatArray) -> FloatArray:
     """Return the places (..., 3) on the ground above positions (..., 3)."""
     return np.concatenate([position_m[..., :2], terrain.height_at(position_m[..., :2])[..., None]], axis=-1)
-
-
-def _add_targets(server: viser.ViserServer, found: Survey, size_m: float) -> None:
-    """Add a selection of the target, which gets a ring on the ground, and its text."""
-    gui, targets = server.gui, {target.id: target for target in found}
-    ring = add_lines(server.scene, "/chosen", line_segments(size_m * unit_circle()), DIPOLE_COLOUR, 3.0)
-    with gui.add_folder("Target"):
-        dropdown = gui.add_dropdown("Target", tuple(targets), hint="The most significant is first.")
-        panel = gui.add_html("")
-
-    def show(_: object = None) -> None:
-        target = targets[dropdown.value]
-        ring.position = _above(found.terrain, target.position_m)
-        panel.content = texts.panel_html(target_lines(target), warning=bool(target.flags))
-
-    dropdown.on_update(show)
-    show()
 
 
 def target_lines(target: Target) -> list[str]:
@@ -106,6 +146,7 @@ def target_lines(target: Target) -> list[str]:
         f"95 % ellipse {length_text(target.ellipse95[0])} × {length_text(target.ellipse95[1])} (half axes)",
         f"moment {texts.number_text(target.strength_Am2, 3)} A·m²; iron: {iron} kg",
         f"χ² {texts.number_text(target.significance, 3)} is lost without it",
+        f"{target.size_class}; fit: {target.fit_quality}",
         *([f"<b>{escape(', '.join(target.flags))}</b>"] if target.flags else []),
     ]
 

@@ -13,6 +13,7 @@ import pyogrio
 import pyproj
 import pytest
 
+import magloc
 import sims
 from tests.command_line import Run, assert_refused
 
@@ -123,6 +124,30 @@ class TestSurvey:
         without = run(*command[:4], "--out", tmp_path / "out")
         assert "decisions.jsonl, targets.geojson" in without.err
         assert "are of an earlier run" in without.err
+
+    def test_the_page_of_a_review_saves_into_the_folder(
+        self, folder: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """The page's own tests press its buttons; here it saves at once."""
+        asked: list[dict[str, object]] = []
+
+        class Page:
+            address = "http://127.0.0.1:8080"
+            wait = close = staticmethod(lambda: None)
+
+        def view_survey(found: magloc.Survey, save: Callable[[magloc.Survey], str], **options: object) -> Page:
+            asked.append({**options, "words": save(magloc.Review(found).drop("t1").refit().found)})
+            return Page()
+
+        monkeypatch.setattr("magloc.viewer.view.view_survey", view_survey)
+        command = ("survey", folder / "ground.csv", "--array", folder / "ground-array.toml")
+        done = run(*command, "--out", tmp_path / "out", "--view", "--port", 0)
+        assert done.status == 0, done.err
+        assert done.out.splitlines()[-1] == Page.address
+        assert [one["words"] for one in asked] == [f"saved in {tmp_path / 'out'}"]
+        assert len((tmp_path / "out" / "targets.csv").read_text().splitlines()) == 1
+        assert '"action":"drop"' in (tmp_path / "out" / "decisions.jsonl").read_text()
+        assert_refused(run(*command, "--view"), "--view", "--out")
 
     def test_a_review_of_another_survey(self, folder: Path, tmp_path: Path, run: Run) -> None:
         log = tmp_path / "decisions.jsonl"

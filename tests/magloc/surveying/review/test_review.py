@@ -17,6 +17,7 @@ from magloc.surveying.review.decisions import Drop
 from sims.magnetics.paths import Steered
 from sims.magnetics.scenario import Carrier, Source
 from sims.magnetics.simulation import Simulation
+from tests.hills import PAIR, hills, terrain_of, walk
 from tests.magloc.surveying import test_tiled
 from tests.magloc.surveying.test_survey import nearest, simulated, surveyed
 
@@ -160,6 +161,14 @@ class TestTwoTiles:
         again = magloc.Review(test_tiled.surveyed(1)).exclude_stretch(20.0, 26.0).refit(processes=1).found
         prior = test_tiled.SHALLOW
         assert_same(again, magloc.survey(test_tiled.field().array, some_rows(readings, rest), prior=prior, processes=1))
+
+
+def test_on_hills_a_target_is_added_below_the_local_ground() -> None:
+    found = magloc.survey(PAIR, walk(41, hills, 5.0, 3).readings, ground_m=terrain_of(hills))
+    review = magloc.Review(found)
+    for target in found:
+        review = review.drop(target.id).add(target.position_m[:2].tolist())
+    assert_same(review.refit().found, found)
 
 
 class TestLog:
