@@ -381,7 +381,7 @@ def _rotation(place: str, table: _SensorTable) -> tuple[float, float, float, flo
     if table.ypr_deg is None:
         return table.rotation_xyzw or _NOT_TURNED
     if table.rotation_xyzw is not None:
-        raise InputError(f"{place}, key ypr_deg: found it together with rotation_xyzw, expected one of them.")
+        raise InputError(f"{place}, key ypr_deg: found together with rotation_xyzw, expected one of them.")
     if not all(map(math.isfinite, table.ypr_deg)):
         raise InputError(f"{place}, key ypr_deg: found an infinite number, expected finite numbers.")
     (cz, sz), (cy, sy), (cx, sx) = ((math.cos(a), math.sin(a)) for a in (math.radians(x) / 2 for x in table.ypr_deg))

@@ -2,8 +2,8 @@
 
 import re
 
-# Number, title, minutes and question of a notebook, as its first cell says them: its card in the gallery.
-CARD = re.compile(r"# (\d+)\. (.+)\n.*?(\d+) minutes.*?\*\*(.+?)\*\*", re.DOTALL)
+# Number, title, minutes and the last words in bold of a notebook, as its first cell says them: its card in the gallery.
+CARD = re.compile(r"# (\d+)\. ([^\n]+)\n.*?(\d+) minutes.*\*\*(.+?)\*\*", re.DOTALL)
 # The picture of what a function finds or draws, on the function's page.
 PICTURES = {
     "notebook-01-first-fix.png": ["magloc.locate", "magloc.Fixes", "magloc.Fix", "magloc.plots.fixes"],

@@ -113,8 +113,9 @@ def cards() -> str:
         cell = "".join(json.loads(path.read_text(encoding="utf-8"))["cells"][0]["source"])
         if (card := CARD.match(cell)) is None:
             raise ValueError(f"{path.name}: expected a number, a title, minutes and a question in bold")
-        found.append((int(card[1]), card[2], card[3], " ".join(card[4].split()), path.stem))
-    lines = ["::::{grid} 1 2 2 3", ":gutter: 3"]
+        question = " ".join(card[4].split())
+        found.append((int(card[1]), card[2], card[3], question[0].upper() + question[1:], path.stem))
+    lines = ["::::{grid} 1 2 2 3", ":gutter: 3", ":class-container: gallery", ""]
     for number, title, minutes, question, stem in sorted(found):
         kept = f"notebook-{stem}.png"
         picture = f"../{kept}" if (HERE / kept).exists() else f"notebooks/{stem}.png"

@@ -88,7 +88,7 @@ def view(
 def _of_inertial_unit(log: Path, layout: tuple[str, dict[str, Any]] | None, truth: Path | None) -> tuple[Any, ...]:
     if truth is not None:
         raise InputError(
-            f"--truth {truth}: found it with the log of an inertial unit, expected the truth in its columns."
+            f"--truth {truth}: found together with the log of an inertial unit, expected the truth in its columns."
         )
     data = imu_log(log, layout)
     return inertial_attitude(log, data), data, None, data.q_true

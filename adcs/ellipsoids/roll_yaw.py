@@ -204,7 +204,9 @@ def kalman_track(
 
 
 def violations(track: SetTrack, states_rad: FloatArray, tolerance: float = 1e-9) -> IntArray:
-    """Count the instants at which the true state is outside of the set, with a form above 1 + tolerance.
+    """Count the instants at which the true state is outside of the set.
+
+    A state is outside if its quadratic form exceeds 1 + `tolerance`.
 
     ``states_rad`` (n_runs, n_steps + 1, 2): true (roll, yaw) [rad]. Returns shape (n_runs,).
     """

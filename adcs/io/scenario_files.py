@@ -94,7 +94,7 @@ def read_scenario(name_or_path: str, *, allow_old_elements: bool = False) -> Att
     Raises
     ------
     InputError
-        The file cannot be read or is no scenario, or its two-line elements are too old; the text states key and cause.
+        The file cannot be read, is not a scenario, or has two-line elements that are too old; the text says why.
 
     Examples
     --------

@@ -130,10 +130,10 @@ class _Trial(NamedTuple):
 def any_start(record: Record, settings: FilterSettings, turns: int = 36, rate_rad_s: float = RATE_RAD_S) -> FilterStart:
     """Return a start from any attitude: the best hypothesis where :func:`vector_start` leaves an axis open.
 
-    ``turns``: number of hypotheses, at equal angles about the open axis; :data:`WINDOW_S` or :data:`ALONE_S` of the
-    record decide between them. ``rate_rad_s``: as :func:`vector_start`; with a magnetometer alone smaller ones compete
-    too (:data:`RATES_ALONE`). Returns: the deviation about the open axis is the distance between hypotheses; with a
-    magnetometer alone the start has the optional states too.
+    ``turns``: number of hypotheses, at equal angles about the open axis. The first :data:`WINDOW_S` of the record, or
+    :data:`ALONE_S` with a magnetometer alone, decide between them. ``rate_rad_s``: as in :func:`vector_start`; with a
+    magnetometer alone smaller rates (:data:`RATES_ALONE`) compete too. Returns: the deviation about the open axis is
+    the distance between hypotheses; with a magnetometer alone the start has the optional states too.
     """
     start = vector_start(record, settings, rate_rad_s)
     open_runs = np.flatnonzero(largest_deviation_rad(start) > KNOWN_RAD)

@@ -355,7 +355,7 @@ def _whitening(covariance_rad2: FloatArray, sigma: float) -> FloatArray:
 
 
 def steps_of(time_s: FloatArray, step_s: float) -> tuple[NDArray[np.int64], BoolArray]:
-    """Return the number (n,) of steps since the first time, and which times are no multiple of the step."""
+    """Return the number (n,) of steps since the first time, and which times are not a multiple of the step."""
     with np.errstate(over="ignore"):
         steps = (time_s - time_s[0]) / step_s
     rows = np.round(np.clip(steps, -_MOST_STEPS, _MOST_STEPS)).astype(np.int64)

@@ -108,7 +108,7 @@ def read_star_frames(folder: str | PathLike[str]) -> tuple[StarCamera, list[Star
     Raises
     ------
     InputError
-        A file cannot be read, a cell is no number, or the count of numbers in a line is wrong.
+        A file cannot be read, a cell is not a number, or the count of numbers in a line is wrong.
     """
     camera = _read_camera(Path(folder) / "calibration.txt")
     frames_path, labels_path = Path(folder) / "input.csv", Path(folder) / "result.csv"

@@ -49,7 +49,7 @@ def bound_spheres(scenario: BoundScenario, ranges_m: Sequence[float], step_deg: 
     Raises
     ------
     ValueError
-        A range is not positive, or 90 is no multiple of the step.
+        A range is not positive, or 90 is not a multiple of the step.
     """
     import xarray as xr
 

@@ -202,7 +202,9 @@ def _check_options(array: SensorArray, place: FloatArray, of: SourceOptions, tas
             f"--false-alarm-rate: found {task.false_alarm_rate:g}, expected 0.0001 or more, and less than 0.5."
         )
     if not task.false_alarm_rate < task.probability < 1.0:
-        raise InputError(f"--probability: found {task.probability:g}, expected it between the false-alarm rate and 1.")
+        raise InputError(
+            f"--probability: found {task.probability:g}, expected more than the false-alarm rate and less than 1."
+        )
     refuse_outside(0.0, LARGEST, "zero or more", ambient_uncertainty_nT=of.ambient_uncertainty_nT)
     refuse_not_positive(of, "known_moment_sigma_Am2")
     _check_place(array, place)

@@ -117,7 +117,7 @@ def locate(
     refuse_outside(0.0, LARGEST, "a length, or 0 for a point", body_length_m=length_m)
     if position is not None and (wanted.sources is not None or known.region is not None):
         other = "--sources" if wanted.sources is not None else "--region"
-        raise InputError(f"--position: found it together with {other}, expected one of them.")
+        raise InputError(f"--position: found together with {other}, expected one of them.")
     if truth is not None and out is None:
         raise InputError("--truth: found no --out, expected a folder for the figures with it.")
     refuse_file(out, "--out")

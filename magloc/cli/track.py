@@ -90,7 +90,7 @@ class PathOptions(MotionOptions):
                 raise InputError("--path-sigma-m: found neither --position nor --object-path, expected one of them.")
             return None
         if self.position is not None and self.object_path is not None:
-            raise InputError("--position: found it together with --object-path, expected one of them.")
+            raise InputError("--position: found together with --object-path, expected one of them.")
         if self.position is not None and len(self.position) > 1 and self.error != PathErrorOptions():
             raise InputError("--path-sigma-m: found several places of --position, expected one.")
         if self.motion not in (None, "unknown"):
@@ -199,7 +199,7 @@ def track(
         Common options.
     """
     if json and jsonl:
-        raise InputError("--json: found it together with --jsonl, expected one of them.")
+        raise InputError("--json: found together with --jsonl, expected one of them.")
     refuse_file(out, "--out")
     refuse_one_for_two({"--out": out, **maps.outputs})
     maps.refuse(known.place)
@@ -217,7 +217,7 @@ def track(
     if number is not None:
         others = {"--smooth": smooth or None, "--truth": truth, "--position": path, **maps.outputs}
         for option in (name for name, value in others.items() if value is not None):
-            raise InputError(f"{option}: found it together with --sources, expected one of them.")
+            raise InputError(f"{option}: found together with --sources, expected one of them.")
     named = naming(str(array), readings=str(readings), time_s=str(readings), sources=f"--sources {motion.sources}")
     if str(readings) == STREAM:
         whole = smooth or json or maps != MapOptions() or any(option is not None for option in (truth, out, path))
@@ -237,7 +237,7 @@ def track(
         return
     few = used.n_channels <= _FEW_CHANNELS and rows.array_rotation is not None
     if number is not None and on_background:
-        raise InputError("--sources: found it together with --detrend or --high-pass-hz, expected one of them.")
+        raise InputError("--sources: found together with --detrend or --high-pass-hz, expected one of them.")
     if number is None and few:
         note(_USE_SURVEY)
     with progress(len(rows), "rows") as advance, named:

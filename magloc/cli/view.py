@@ -137,9 +137,9 @@ def _with_track(
 
     if not isinstance(result, TrackResult):
         if readings is not None:
-            raise InputError(f"--readings {readings}: found it without a track, expected it with a track.")
+            raise InputError(f"--readings {readings}: found without a track, expected with one.")
         if array is not None and not isinstance(result, ReadingsResult):
-            raise InputError(f"--array {array}: found it with what has its own, expected it with readings or a track.")
+            raise InputError(f"--array {array}: found with a file that has one, expected with readings or a track.")
         return None, None
     if readings is None:
         return None if array is None else read_sensors(array), None

@@ -174,7 +174,7 @@ def _bind(address: str) -> Iterator[socket.socket]:
             bound = own.dup()
     except (OSError, UnicodeError) as error:
         expected = "expected a free port of this machine"
-        raise InputError(f"{address}: cannot be listened at ({_reason(error)}), {expected}.") from None
+        raise InputError(f"{address}: cannot be opened for listening ({_reason(error)}), {expected}.") from None
     with bound:
         yield bound
 

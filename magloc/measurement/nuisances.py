@@ -33,7 +33,7 @@ _TURN, _GAIN, _FIELD, _INDUCED, _EDDY = 0, 3, 6, 9, 18
 
 @dataclass(frozen=True)
 class BackgroundDrift:
-    """Background of every channel that is no signal, in units of the noise.
+    """Background of every channel that is not signal, in units of the noise.
 
     Attributes
     ----------

@@ -95,12 +95,12 @@ def motion_of_table(table: Table, *, posed: bool) -> MeasuredMotion | None:
     values, sigmas = np.zeros((4, n, 3)), np.zeros((4, n))
     for i, (columns, sigma, scale) in enumerate(MOTION_GROUPS):
         if sigma in table.header and columns[0] not in table.header:
-            raise InputError(f"{table.header_place(columns[0])}: found {sigma} without it, expected it too.")
+            raise InputError(f"{table.header_place(columns[0])}: found {sigma} without it, expected both.")
         if not table.has_group(columns):
             continue
         if posed and columns[0].startswith("array"):
             raise InputError(
-                f"{table.header_place(columns[0])}: found it together with the array's pose, expected one of them."
+                f"{table.header_place(columns[0])}: found together with the array's pose, expected one of them."
             )
         values[i] = scale * table.complete(columns)
         if sigma in table.header:

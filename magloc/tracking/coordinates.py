@@ -12,7 +12,7 @@ where the columns of E (3, 2) are orthogonal to u, and w = v / r. The valley of 
 is a straight line in these coordinates, and w does not depend on the scale. All further states are added. Means are
 Cartesian states, covariances are in these coordinates; :math:`L = \partial x / \partial e`.
 
-Within the radius R of the array the range is known and is no useful scale. There the origin of the chart moves back
+Within the radius R of the array the range is known and is not a useful scale. There the origin of the chart moves back
 from the centroid, so that its distance from the source is R.
 
 All functions broadcast over leading axes.

@@ -361,8 +361,8 @@ def _follow(
     if readings.motion is not None:
         if not isinstance(unmeasured, RandomWalk):
             raise ValueError(
-                "Input motion must be a RandomWalk, of what is not measured, for readings with measured velocities or"
-                f" rates; instead received {type(unmeasured).__name__}."
+                "Input motion must be a RandomWalk, which models the unmeasured rest, where readings have measured"
+                f" velocities or rates; instead received {type(unmeasured).__name__}."
             )
         motions = known_motions(readings.motion, unmeasured)
     done = 0

@@ -171,7 +171,7 @@ class MockupOptions:
         for name in self.given():
             if name not in belongs:
                 parts = " or ".join(f"--part {part}" for part, names in _BELONGS.items() if name in names)
-                raise InputError(f"{option_name(name)}: found it with --part {self.part}, expected it with {parts}.")
+                raise InputError(f"{option_name(name)}: found with --part {self.part}, expected with {parts}.")
         if self.frames is not None:
             self._check_frames()
         if self.samples is not None or self.fixes is not None:
@@ -184,7 +184,7 @@ class MockupOptions:
         refuse_outside(0.0, 10.0, "0 to 10 s, as long as samples are kept", delay_s=self.delay_s)
         refuse_outside(0.01, 100.0, "0.01 to 100 m", footprint_m=self.footprint_m)
         if self.start_fixes is not None and self.unknowns != "two":
-            raise InputError("--start-fixes: found it without --unknowns two, expected it with that.")
+            raise InputError("--start-fixes: found without --unknowns two, expected with it.")
         if self.outage is not None and not 0.0 <= self.outage[0] < self.outage[1]:
             raise InputError(
                 f"--outage: found {self.outage[0]:g} to {self.outage[1]:g} s, expected a time and a later one."
@@ -197,15 +197,15 @@ class MockupOptions:
     def _check_frames(self) -> None:
         if self.sky is None:
             raise InputError(f"--frames {self.frames}: found no --sky, expected the file of the lights' places.")
-        self._refuse_given_but(_OF_FRAMES, "found it with --frames, expected it with simulated frames only.")
+        self._refuse_given_but(_OF_FRAMES, "found with --frames, expected with simulated frames only.")
 
     def _check_record(self) -> None:
         for name, other in (("samples", "fixes"), ("fixes", "samples")):
             if getattr(self, name) is not None and getattr(self, other) is None:
-                raise InputError(f"{option_name(name)}: found it without --{other}, expected both.")
-        self._refuse_given_but(_OF_RECORDS, "found it with --samples, expected it with simulated drives only.")
+                raise InputError(f"{option_name(name)}: found without --{other}, expected both.")
+        self._refuse_given_but(_OF_RECORDS, "found with --samples, expected with simulated drives only.")
         if self.fusion == "all":
-            raise InputError("--fusion all: found it with --samples, expected one method.")
+            raise InputError("--fusion: found all with a recording (--samples), expected one method.")
 
     def _refuse_given_but(self, names: Sequence[str], fault: str) -> None:
         for name in self.given():

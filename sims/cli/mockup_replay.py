@@ -110,19 +110,17 @@ class ReplayOptions:
         if not self.wanted:
             for name, given in (("--at", self.at is not None), ("--port", self.port != ReplayOptions.port)):
                 if given:
-                    raise InputError(f"{name}: found it without a replay, expected --view, --html or --png too.")
+                    raise InputError(f"{name}: found without a replay, expected --view, --html or --png too.")
             return
         option = "--view" if self.view else "--html" if self.html is not None else "--png"
         if options.part not in ("fusion", "all"):
-            raise InputError(f"{option}: found it with --part {options.part}, expected it with --part fusion or all.")
+            raise InputError(f"{option}: found with --part {options.part}, expected with --part fusion or all.")
         if options.samples is not None:
-            raise InputError(
-                f"{option}: found it with --samples, expected it with simulated drives, whose truth it shows."
-            )
+            raise InputError(f"{option}: found with --samples, expected with simulated drives, whose truth it shows.")
         if options.fusion == "all":
-            raise InputError(f"{option}: found it with --fusion all, expected one method.")
+            raise InputError(f"{option}: found with --fusion all, expected one method.")
         if self.view and (self.html is not None or self.png is not None):
-            raise InputError("--view: found it with --html or --png, expected one or the other.")
+            raise InputError("--view: found with --html or --png, expected one or the other.")
         if self.view and json:
-            raise InputError("--view: found it with --json, expected one or the other: the address is printed too.")
+            raise InputError("--view: found with --json, expected one or the other: the address is printed too.")
         refuse_outside(0.0, options.duration_s, f"0 to {options.duration_s:g} s", unit=" s", at=self.at)

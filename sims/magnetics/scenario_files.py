@@ -119,7 +119,7 @@ def _complete(
         for key in _QUALITY_KEYS:
             if key in item:
                 raise InputError(
-                    f"{place}, key {key}: found it although the sensors are of the kind {settings.kind}, "
+                    f"{place}, key {key}: found although the sensors are of the kind {settings.kind}, "
                     "expected what differs from that kind in the table sensors."
                 )
         reads = SENSOR_KINDS[settings.kind].reads

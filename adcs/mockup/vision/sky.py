@@ -226,7 +226,7 @@ def read_sky(path: str | PathLike[str]) -> LedSky:
     Raises
     ------
     InputError
-        The file cannot be read or is no sky; the text names the key.
+        The file cannot be read or is not a sky; the text names the key.
     """
     table = section_of(str(path), read_toml(path, "the TOML file of a sky"), _SkyFile)
     with naming(f"{path}, key positions_m"):

@@ -52,7 +52,7 @@ def delaunay_triangles(plane: ComplexArray, smallest_rad: float = FLAT_RAD) -> L
     """Return the triangles of Delaunay's triangulation, without slivers.
 
     ``plane`` (n,): points x + iy; fewer than three points, or points in one line, have no triangle. ``smallest_rad``:
-    smallest angle of a triangle that is no sliver. The triangles are sorted by the indices of their points.
+    smallest angle of a triangle that is not a sliver. The triangles are sorted by the indices of their points.
     """
     corners = np.empty((0, 3), dtype=np.intp)
     if len(plane) >= 3:

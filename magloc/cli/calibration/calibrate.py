@@ -127,9 +127,9 @@ def calibrate(
     refuse_file(figures, "--figures")
     if modulus_nT is not None:
         if truth is not None:
-            raise InputError("--modulus-nT: found it together with --truth, expected one of them.")
+            raise InputError("--modulus-nT: found together with --truth, expected one of them.")
         if known != PriorOptions() or height_m is not None or moment is not None:
-            raise InputError("--modulus-nT: found it together with an option for a moving source, expected none.")
+            raise InputError("--modulus-nT: found together with an option for a moving source, expected none.")
         nominal = arrays.read_sensors(array)
         rows = read_readings(readings, nominal)
         with naming(str(array), readings=str(readings)):

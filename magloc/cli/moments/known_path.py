@@ -36,7 +36,7 @@ def refuse_bounds(known: KnownOptions) -> None:
     """Refuse bounds of the source where its position is known."""
     for option, value in (("--region", known.region), ("--max-moment-Am2", known.max_moment_Am2)):
         if value is not None:
-            raise InputError(f"{option}: found it together with a known position, expected no bounds of the source.")
+            raise InputError(f"{option}: found together with a known position, expected no bounds of the source.")
 
 
 @Parameter(name="*", group="Error of the known path")
@@ -71,7 +71,7 @@ class PathErrorOptions:
             ("attitude-sigma-deg", "attitude-correlation-s"),
         ):
             if getattr(self, correlation.replace("-", "_")) is not None and not getattr(self, sigma.replace("-", "_")):
-                raise InputError(f"--{correlation}: found no --{sigma}, expected it too.")
+                raise InputError(f"--{correlation}: found no --{sigma}, expected both.")
         return PathError(
             self.path_sigma_m,
             math.inf if self.path_correlation_s is None else self.path_correlation_s,

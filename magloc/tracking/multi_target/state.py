@@ -23,7 +23,7 @@ N_SEEN = 6
 N_OF_SOURCE = 12
 N_COMMON = 3
 _POWER = 0
-"""Power of the range with which moments grow along the chart: near an array, strength and range are uncorrelated."""
+"""Power of the range by which the chart scales moments: 0, since near an array strength and range are uncorrelated."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -257,7 +257,7 @@ class TestBadInput:
             (["--accuracy-m", "-1"], "--accuracy-m: found -1, expected a positive length"),
             (["--half-width-m", "inf"], "--half-width-m: found inf, expected a positive length"),
             (["--ambient-uncertainty-nT", "-1"], "--ambient-uncertainty-nT: found -1, expected zero or more"),
-            (["--probability", "1"], "--probability: found 1, expected it between the false-alarm rate and 1"),
+            (["--probability", "1"], "--probability: found 1, expected more than the false-alarm rate and less than 1"),
             (["--false-alarm-rate", "0"], "--false-alarm-rate: found 0, expected 0.0001 or more"),
             (["--grid", "1"], "--grid"),
             (["--grid", "2.5"], "--grid"),

@@ -157,7 +157,7 @@ class TestColumns:
             (("array_vx_ms",), "column array_vx_ms: found an unknown column"),
             (
                 (*MOTION_COLUMNS[8:11], *POSITION_COLUMNS, *ROTATION_COLUMNS),
-                "column array_wx_deg_s: found it together with the array's pose",
+                "column array_wx_deg_s: found together with the array's pose",
             ),
         ],
     )

@@ -187,13 +187,13 @@ class TestRefusals:
     @pytest.mark.parametrize(
         ("arguments", "sentence"),
         [
-            (("--samples", "s.csv"), "--samples: found it without --fixes, expected both."),
-            (("--fixes", "f.csv"), "--fixes: found it without --samples, expected both."),
-            (("--samples", "s", "--fixes", "f", "--seeds", "2"), "--seeds: found it with --samples, expected it with"),
-            (("--samples", "s", "--fixes", "f", "--fusion", "all"), "--fusion all: found it with --samples"),
+            (("--samples", "s.csv"), "--samples: found without --fixes, expected both."),
+            (("--fixes", "f.csv"), "--fixes: found without --samples, expected both."),
+            (("--samples", "s", "--fixes", "f", "--seeds", "2"), "--seeds: found with --samples, expected with"),
+            (("--samples", "s", "--fixes", "f", "--fusion", "all"), "--fusion: found all with a recording"),
             (
                 ("--samples", "s", "--fixes", "f", "--view"),
-                "--view: found it with --samples, expected it with simulated",
+                "--view: found with --samples, expected with simulated",
             ),
             (("--samples", "no.csv", "--fixes", "f"), "no.csv"),
         ],

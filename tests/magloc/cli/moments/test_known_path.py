@@ -93,9 +93,9 @@ class TestBadInput:
     @pytest.mark.parametrize(
         ("options", "expected"),
         [
-            (("--position", 1, 2, 3), "--position: found it together with --object-path"),
-            (("--region", "z>0"), "--region: found it together with a known position"),
-            (("--max-moment-Am2", 5), "--max-moment-Am2: found it together with a known position"),
+            (("--position", 1, 2, 3), "--position: found together with --object-path"),
+            (("--region", "z>0"), "--region: found together with a known position"),
+            (("--max-moment-Am2", 5), "--max-moment-Am2: found together with a known position"),
             (("--motion", "turn"), "--motion: found turn with a known position"),
             (("--path-sigma-m", -1), "--path-sigma-m: found -1"),
             (("--path-correlation-s", 5), "--path-correlation-s: found no --path-sigma-m"),
