@@ -25,7 +25,7 @@ from arrays.typing import BoolArray, FloatArray
 
 LEFT_OUT, SUBTRACTED = "field left out", "magnet subtracted"
 """Names of rows in which the field of an inertial unit is disturbed."""
-LOST = "heading lost"
+LOST, DOUBTED = "heading lost", "heading doubtful"
 """Name of rows in which the heading of an inertial unit is hardly known."""
 LOST_RAD = 0.5
 _RELATIVE = (
@@ -166,8 +166,8 @@ def inertial_magnetic_filter(
     AttitudeTrack
         Attitude, east, north, up from body. ``sigma["level"]`` (n, 3) is about east, north and up [rad]: σ of the tilt
         in the first two, of the heading in the third. ``degraded`` marks the rows in which the field is left out, a
-        magnet is subtracted, or the heading is lost. ``warnings`` name gaps, a start that is not at rest, a missing
-        magnetometer, and minutes in which the gyro alone holds the heading.
+        magnet is subtracted, or the heading is lost or doubtful. ``warnings`` name gaps, a start that is not at rest, a
+        missing magnetometer, and minutes in which the gyro alone holds the heading.
 
     Raises
     ------
@@ -227,8 +227,14 @@ def inertial_magnetic_filter(
             *prepared.warnings,
             *(() if record.has_field else (_RELATIVE.format(math.degrees(heading.sigma_rad[-1])),)),
             *_gyro_only_minutes(times, heading.left_out),
+            *_doubted_times(times, heading.doubted),
         ),
-        degraded={LEFT_OUT: heading.left_out, SUBTRACTED: subtracted, LOST: heading.sigma_rad > LOST_RAD},
+        degraded={
+            LEFT_OUT: heading.left_out,
+            SUBTRACTED: subtracted,
+            LOST: heading.sigma_rad > LOST_RAD,
+            DOUBTED: heading.doubted,
+        },
     )
 
 
@@ -257,6 +263,18 @@ def _gyro_only_minutes(time_s: FloatArray, left_out: BoolArray) -> tuple[str, ..
         f"minute {minute + 1:.0f}: the field was left out for {lasted:.0f} s, the gyro alone held the heading"
         for minute, lasted in zip(minutes, seconds, strict=True)
         if lasted >= 1.0
+    )
+
+
+def _doubted_times(time_s: FloatArray, doubted: BoolArray) -> tuple[str, ...]:
+    """Return a sentence if the heading changed by more than the gyro allows for a second or more."""
+    seconds = float(np.sum(steps_s(time_s)[doubted]))
+    if seconds < 1.0:
+        return ()
+    first, last = time_s[doubted][[0, -1]] - time_s[0]
+    return (
+        f"the field turned the heading by more than the gyro's errors allow, for {seconds:.0f} s between {first:.0f} s"
+        f" and {last:.0f} s; the heading is doubtful there, and its σ is larger",
     )
 
 

@@ -8,6 +8,7 @@ rotations of the sensor separate them; without rotations the covariance stays la
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -26,6 +27,8 @@ _BLOCK_S = 0.035
 _START_S = 1.0
 _BLOCK = 4000
 """Number of means per call of a kernel: some milliseconds."""
+_DOUBT_S = 60.0  # time over which the change of the heading is compared with the gyro's
+_MORE, _DOUBT = 2.0, 9.0  # square of a change over its variance beyond which it counts in σ, and is reported
 _LONG_STEP_S = 1.0  # longest time without a field in which the drift of the gyro is negligible
 
 
@@ -142,6 +145,7 @@ class HeadingTrack:
     offset_sigma_T: FloatArray  # (n, 3): its standard deviation
     left_out: BoolArray  # (n,): rejected readings of the field
     changes: NDArray[np.intp]  # instants at which the offset changes
+    doubted: BoolArray  # (n,): the field turned the heading by more than the gyro's errors and σ allow
 
 
 def heading_track(
@@ -185,14 +189,62 @@ def heading_track(
     hidden = np.abs(hidden - hidden[ends[last]]) * np.where(gap, HELD_VARIANCE, 1.0)
     since = np.maximum(time_s - time_s[ends[last]], 0.0)
     variance = variances[last, 0] + _drift_variance(time_s, rate_rad_s, ends[last], since, model) + hidden
+    heading = told[last, 0]
+    changed_by = _change_variance(time_s, rate_rad_s, q_level, hidden_rad2, model)
+    excess, doubted = _excess_variance(time_s, heading, variance, changed_by, offline=offline)
+    variance += excess
     return HeadingTrack(
-        heading_rad=told[last, 0],
+        heading_rad=heading,
         sigma_rad=np.minimum(np.sqrt(variance), UNKNOWN_RAD),
         offset_T=told[last, 1:],
         offset_sigma_T=sigma[last, 1:],
         left_out=~used[last],
         changes=ends[changed],
+        doubted=doubted,
     )
+
+
+def _change_variance(
+    time_s: FloatArray,
+    rate_rad_s: FloatArray,
+    q_level: FloatArray,
+    hidden_rad2: FloatArray | None,
+    model: HeadingModel,
+) -> Callable[[NDArray[np.intp], NDArray[np.intp]], FloatArray]:
+    """Return the variance of the change of the gyro's heading between instants, as a function of these."""
+    turned = rate_rad_s * quaternion.matrix(q_level)[:, 2] * steps_s(time_s)[:, None]
+    turned = np.cumsum(np.where(np.arange(len(time_s))[:, None] > 0, turned, 0.0), axis=0)
+    hidden = np.zeros(len(time_s)) if hidden_rad2 is None else np.cumsum(hidden_rad2)
+
+    def variance(first: NDArray[np.intp], last: NDArray[np.intp]) -> FloatArray:
+        scale = np.square(model.gyro_scale * (turned[last] - turned[first])).sum(axis=1)
+        drifted = _drift_variance(time_s, rate_rad_s, first, time_s[last] - time_s[first], model, until=last)
+        return np.asarray(scale + drifted + hidden[last] - hidden[first])
+
+    return variance
+
+
+def _excess_variance(
+    time_s: FloatArray,
+    heading_rad: FloatArray,
+    variance_rad2: FloatArray,
+    change_variance: Callable[[NDArray[np.intp], NDArray[np.intp]], FloatArray],
+    *,
+    offline: bool,
+) -> tuple[FloatArray, BoolArray]:
+    """Return by what the square of the heading's change in a minute exceeds its variance, and whether by far, (n,).
+
+    A magnet that the filter does not notice turns the heading slowly. The filter's own covariance does not show it.
+    """
+    rows = np.arange(len(time_s))
+    excess, doubted = np.zeros(len(time_s)), np.zeros(len(time_s), np.bool_)
+    for shift_s in (-_DOUBT_S, _DOUBT_S) if offline else (-_DOUBT_S,):
+        other = np.clip(np.searchsorted(time_s, time_s + shift_s), 0, len(time_s) - 1)
+        allowed = variance_rad2[other] + change_variance(np.minimum(rows, other), np.maximum(rows, other))
+        change = (heading_rad - heading_rad[other] + np.pi) % (2.0 * np.pi) - np.pi
+        excess = np.maximum(excess, np.square(change) - _MORE * allowed)
+        doubted |= np.square(change) > _DOUBT * allowed
+    return excess, doubted
 
 
 def run_heading_filter(
@@ -271,15 +323,10 @@ def relative_heading(
     Arguments as of :func:`heading_track`.
     """
     n = len(time_s)
-    zero = np.zeros(n, np.intp)
-    turned = rate_rad_s * quaternion.matrix(q_level)[:, 2] * steps_s(time_s)[:, None]
-    turned[0] = 0.0
-    scale = np.square(model.gyro_scale * np.cumsum(turned, axis=0)).sum(axis=1)
-    drifted = _drift_variance(time_s, rate_rad_s, zero, time_s - time_s[0], model)
-    hidden = 0.0 if hidden_rad2 is None else np.cumsum(hidden_rad2)
+    zero, no = np.zeros(n, np.intp), np.zeros(n, np.bool_)
+    variance = _change_variance(time_s, rate_rad_s, q_level, hidden_rad2, model)(zero, np.arange(n))
     none = np.full((n, 3), np.nan)
-    sigma = np.minimum(np.sqrt(scale + drifted + hidden), UNKNOWN_RAD)
-    return HeadingTrack(np.zeros(n), sigma, none, none, np.zeros(n, np.bool_), zero[:0])
+    return HeadingTrack(np.zeros(n), np.minimum(np.sqrt(variance), UNKNOWN_RAD), none, none, no, zero[:0], no)
 
 
 def _blocks(

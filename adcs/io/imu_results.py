@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from adcs.complementary.filters import LEFT_OUT, LOST, SUBTRACTED
+from adcs.complementary.filters import DOUBTED, LEFT_OUT, LOST, SUBTRACTED
 from adcs.complementary.orientation_errors import orientation_errors
 from adcs.io.imu_files import ImuLog
 from adcs.satellite.attitude_track import AttitudeTrack
@@ -32,6 +32,7 @@ def imu_summary(track: AttitudeTrack, log: ImuLog) -> dict[str, Any]:
     """Return totals of a track, and its errors if the log has a truth."""
     left_out, subtracted = track.degraded[LEFT_OUT], track.degraded[SUBTRACTED]
     flags = {"field-left-out": left_out, "magnet-subtracted": subtracted, "heading-lost": track.degraded[LOST]}
+    flags["heading-doubtful"] = track.degraded[DOUBTED]
     relative = "magnetometer" not in track.used
     used = "subtract" if subtracted.any() else "reject" if left_out.any() else "plain"
     summary: dict[str, Any] = {

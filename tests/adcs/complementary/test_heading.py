@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -198,6 +199,22 @@ class TestRooms:
             assert math.sqrt(variance[-1] - variance[time_s < 15.0][-1]) == pytest.approx(0.023, rel=0.1)
             square += float(np.square((track.heading_rad - truth)[-1] / track.sigma_rad[-1]))
         assert square < chi2(12).isf(1e-3)
+
+    @pytest.mark.parametrize("offline", [False, True])
+    def test_an_unnoticed_magnet(self, offline):
+        """It turns the heading of a sensor that hardly turns: the track says so, and σ holds; else it is quiet."""
+        squares, wrong = [], 0
+        for seed, size_T in product(range(6), (9e-6, 12e-6)):
+            time_s, rate, q_level, field, true = room(80.0, seed, turning=0.05, magnet=np.array([size_T, 0.0, 0.0]))
+            found = heading_track(time_s, rate, q_level, field, offline=offline)
+            late = time_s > 30.0
+            if math.sqrt(np.mean(np.square(found.heading_rad - true)[late])) > math.radians(6.0):
+                wrong += 1
+                assert found.doubted.any()
+            squares.append(np.mean(np.square((found.heading_rad - true) / found.sigma_rad)[late]))
+            assert not heading_track(*room(80.0, seed)[:4], offline=offline).doubted.any()
+        assert wrong > 4
+        assert np.mean(squares) < 3.0
 
     def test_nothing_is_used_before_it_is_read(self):
         time_s, rate, q_level, field, _ = room(20.0)

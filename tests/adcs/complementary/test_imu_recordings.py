@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 from functools import cache
+from itertools import product
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from adcs.complementary.filters import SUBTRACTED, inertial_magnetic_filter
+from adcs.complementary.filters import DOUBTED, SUBTRACTED, inertial_magnetic_filter
 from adcs.complementary.names import Magnet
-from adcs.complementary.orientation_errors import orientation_errors
-from adcs.io.imu_files import read_imu
+from adcs.complementary.orientation_errors import error_angles, orientation_errors
+from adcs.io.imu_files import ImuLog, read_imu
 from adcs.satellite.attitude_track import AttitudeTrack
 
 STRONG = ("rec11", "rec14")
@@ -40,6 +42,14 @@ def track_of(path: Path, magnet: Magnet, *, offline: bool) -> tuple[AttitudeTrac
     return track, math.degrees(orientation_errors(track.q, log.q_true, log.moving).total)
 
 
+def heading_nees(track: AttitudeTrack, log: ImuLog) -> float:
+    """Mean normalised square of the heading's error while the unit moves."""
+    assert log.q_true is not None
+    known = log.moving & np.isfinite(log.q_true).all(axis=1)
+    heading = error_angles(track.q[known], log.q_true[known])[1]
+    return float(np.mean(np.square(heading / track.sigma["level"][known, 2])))
+
+
 def path_of(folder: Path, name: str) -> Path:
     path = folder / ("imu-optitrack" if name in STRONG else "broad") / f"{name}.{'csv' if name in STRONG else 'mat'}"
     if not path.is_file():
@@ -59,6 +69,36 @@ class TestStrongDistortion:
         assert error_deg <= largest_deg
         # Iron in the room does not move with the sensor.
         assert not track.degraded[SUBTRACTED].any()
+
+
+class TestHonesty:
+    """σ of the heading, in the trials as they are and with the field of a magnet that is put on the sensor."""
+
+    def test_trials_as_they_are(self, data_folder: Path) -> None:
+        for offline, largest in ((False, 1.0), (True, 1.3)):
+            paths = [path_of(data_folder, name) for name in BROAD]
+            tracks = [track_of(path, "auto", offline=offline)[0] for path in paths]
+            assert not any(track.degraded[DOUBTED].any() for track in tracks)
+            nees = [heading_nees(track, read_imu(path)) for track, path in zip(tracks, paths, strict=True)]
+            assert np.mean(nees) <= largest
+            assert max(nees) <= 3.15
+
+    @pytest.mark.slow
+    @pytest.mark.parametrize("offline", [False, True])
+    def test_magnets_that_are_hardly_noticed(self, data_folder: Path, offline: bool) -> None:
+        """4 to 13 µT from 45 to 100 s; nothing was tuned on them, without the test of changes NEES is above 4."""
+        nees = []
+        for name in BROAD[:4]:
+            log = read_imu(path_of(data_folder, name))
+            record = log.record
+            there = (record.time_s >= record.time_s[0] + 45.0) & (record.time_s < record.time_s[0] + 100.0)
+            for axis, size_T in product(
+                ([0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [-0.6, 0.0, 0.8]), (4e-6, 6e-6, 9e-6, 13e-6)
+            ):
+                field_T = record.field_T + np.where(there[:, None], size_T * np.array(axis), 0.0)
+                readings = record.time_s, record.rate_rad_s, record.acceleration_m_s2, field_T
+                nees.append(heading_nees(inertial_magnetic_filter(*readings, offline=offline), log))
+        assert np.mean(nees) <= 2.1
 
 
 class TestAuto:

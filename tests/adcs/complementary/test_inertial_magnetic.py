@@ -191,7 +191,8 @@ class TestDoor:
         readings = record.time_s + 1e6, record.rate_rad_s, record.acceleration_m_s2, record.field_T
         (said,) = inertial_magnetic_filter(*readings, magnet="rejected").warnings
         assert said.startswith("minute 1: the field was left out for ")
-        assert inertial_magnetic_filter(*readings, magnet="kept").warnings == ()
+        kept = inertial_magnetic_filter(*readings, magnet="kept").warnings
+        assert not any("left out" in sentence for sentence in kept)
 
     def test_sigma_about_the_axes(self):
         """The body's axes have that of the tilt and of the heading in the parts that they turn to."""
