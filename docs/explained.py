@@ -35,7 +35,11 @@ EXPLAINED = {
     "localization": "magloc.locate magloc.Locator magloc.Fixes magloc.Fix magloc.Solution magloc.Source"
     " magloc.SourcePrior magloc.plots.fixes",
     "sensor-faults": "magloc.plots.residuals",
-    "surveys": "magloc.survey magloc.Survey magloc.Target magloc.plots.survey magloc.plots.survey_profiles",
+    "surveys": "magloc.survey magloc.Survey magloc.Target magloc.check_quality magloc.Quality magloc.Terrain"
+    " magloc.read_terrain magloc.plots.survey magloc.plots.survey_profiles",
+    "review-targets": "magloc.Review",
+    "compensation": "magloc.compensate magloc.Compensation magloc.plots.compensation",
+    "instruments": "arrays.instrument_names arrays.read_instrument arrays.Instrument",
     "tracking": "magloc.track magloc.Track magloc.Tracker magloc.RandomWalk magloc.OrnsteinUhlenbeck"
     " magloc.CoordinatedTurn magloc.FreeMotion magloc.track_sources magloc.SourcesTrack"
     " magloc.SourcesTracker magloc.subtract_rest magloc.plots.track magloc.plots.consistency"

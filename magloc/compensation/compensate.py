@@ -80,7 +80,7 @@ def compensate(
     log = PlatformLog.of(array, flown, own - mean)
     terms = {sensor.id: PlatformTerms.of(sensor, names, current_sigma_T) for sensor in array.sensors}
     fits = _fit_all(log, terms)
-    sensors = tuple(SensorCompensation.of(name, fit) for name, fit in fits.items())
+    sensors = tuple(SensorCompensation.of(name, fit, log.turning_at(fit.rows.time_s)) for name, fit in fits.items())
     flags = [*log_doubts(log), *(doubt for of in sensors for doubt in fit_doubts(of, log))]
     if not is_same:
         log = PlatformLog.of(array, readings, columns_of(currents, names, len(readings)) - mean)
@@ -162,7 +162,8 @@ def _correction(
     unit, turning = attitude.at(time_s + fit.lag_s)
     size = np.interp(time_s, sampled_s, np.linalg.norm(field, axis=1))[:, None]
     field, rate, currents = unit * size, turning * size, currents_at(log.currents, time_s)
-    effect, columns = platform_moduli(fit.terms, fit.coefficients, field, rate, currents)
+    own = time_s if sensor.kind == "vector" else None
+    effect, columns = platform_moduli(fit.terms, fit.coefficients, field, rate, currents, own)
     errors = attitude_effects(attitude, time_s, fit.terms, fit.coefficients, field, rate, currents)
     effect = effect + errors @ fit.mean[len(fit.coefficients) :]
     columns = np.column_stack([columns, errors])

@@ -16,10 +16,9 @@ from magloc.compensation.results import SensorCompensation
 _LATE_SIGMAS, _LATE_S = 4.0, 0.02
 _TURNED_DEG = 5.0
 _FALSE_ALARM = 1e-4
-_CANDIDATES, _LEAST_SHARE, _LEAST_NOISES = 40, 0.02, 5.0
-_LEAST_SIGMAS = 1.0  # a smaller step is within the uncertainty of the permanent field
+_CANDIDATES = 40
 _NOISE_RATIO = 5.0
-_UNSURE_T, _UNSURE_SHARE = 1e-10, 0.5
+_UNSURE_T = 1e-10
 _EARTH_T = (15e-6, 80e-6)
 
 
@@ -93,7 +92,7 @@ def correction_doubts(of: SensorCompensation, sigma_T: FloatArray) -> Iterator[s
     if not known.all():
         yield f"gap: {(~known).sum()} of {len(known)} rows have no correction of {of.sensor}: its attitude is unknown"
     unsure = float(np.quantile(sigma_T[known], 0.95)) if known.any() else 0.0
-    if unsure > max(_UNSURE_T, _UNSURE_SHARE * of.after_T):
+    if unsure > max(_UNSURE_T, of.after_T):
         yield (
             f"attitude: the correction of {of.sensor} is uncertain by {1e9 * unsure:.2g} nT at attitudes of the log"
             " that the calibration does not show"
@@ -103,7 +102,8 @@ def correction_doubts(of: SensorCompensation, sigma_T: FloatArray) -> Iterator[s
 def _change(fit: PlatformFit) -> tuple[float, float] | None:
     """Return the time and size of the most significant step of the permanent field; None without one.
 
-    A score test: residuals against three components from each of some times on, with all coefficients estimated.
+    A score test: residuals against three components from each of some times on, with all coefficients estimated. The
+    residuals' own size is the unit, because those of a survey are larger than the noise.
     """
     background = Background.usual(fit.rows.noise_T)
     solved = fit.problem.solve(background)
@@ -126,7 +126,6 @@ def _change(fit: PlatformFit) -> tuple[float, float] | None:
         score = float(scores[own] @ estimate)
         if score > best:
             best, begin, step_nT = score, int(first), np.asarray(estimate)
-    threshold = max(float(chi2.isf(_FALSE_ALARM / _CANDIDATES, 3)), _LEAST_SHARE * n)
-    size_nT, sigma_nT = float(np.linalg.norm(step_nT)), 1e9 * fit.sigma[:3]
-    is_small = size_nT < _LEAST_NOISES * fit.background.noise_nT or (np.abs(step_nT) < _LEAST_SIGMAS * sigma_nT).all()
-    return None if best < threshold or is_small else (float(fit.rows.time_s[begin]), 1e-9 * size_nT)
+    is_sure = best > float(chi2.isf(_FALSE_ALARM / _CANDIDATES, 3)) * float(r @ r) / n
+    is_small = bool((np.abs(step_nT) < 1e9 * fit.sigma[:3]).all())  # within the uncertainty of the permanent field
+    return (float(fit.rows.time_s[begin]), 1e-9 * float(np.linalg.norm(step_nT))) if is_sure and not is_small else None

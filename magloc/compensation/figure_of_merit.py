@@ -41,8 +41,12 @@ class Manoeuvres:
     cell: IntArray
 
     @classmethod
-    def of(cls, time_s: FloatArray, unit: FloatArray) -> Manoeuvres:
-        """Return the manoeuvres of directions (n, 3) of the ambient field in the array's frame."""
+    def of(cls, time_s: FloatArray, unit: FloatArray, turning: FloatArray | None = None) -> Manoeuvres:
+        """Return the manoeuvres of directions (n, 3) of the ambient field in the array's frame.
+
+        Rates (n, 3) of the array about its axes tell roll from yaw on headings along the field, where the direction
+        alone does not.
+        """
         fast = band_passed(time_s, unit, _WIDTH_S)
         slow = unit - fast
         window = np.floor((time_s - time_s[0]) / _WINDOW_S).astype(np.intp)
@@ -55,7 +59,11 @@ class Manoeuvres:
         middle, size = mean(slow), np.sqrt(mean(fast**2).sum(axis=1))
         drift = np.linalg.norm(np.gradient(slow, time_s, axis=0), axis=1)
         steady = mean(drift[:, None])[:, 0] < _STEADY_RAD_S
-        axis = np.argmax(np.stack([_explained(fast, slow, k, index) for k in range(3)], axis=1), axis=1)
+        if turning is None:
+            energy = np.stack([_explained(fast, slow, k, index) for k in range(3)], axis=1)
+        else:
+            energy = mean(band_passed(time_s, turning, _WIDTH_S) ** 2)
+        axis = np.argmax(energy, axis=1)
         cell = 3 * _headings(middle, (size > _LEAST_RAD) & steady) + axis
         cell[(size <= _LEAST_RAD) | ~steady] = -1
         return cls(time_s, cell[index])

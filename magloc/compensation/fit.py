@@ -24,7 +24,8 @@ from magloc.compensation.terms import PlatformTerms
 from magloc.surveying.fit.kernels import WhiteningFilter
 
 _NANO = 1e9
-_ITERATIONS = 6
+_ITERATIONS = 20
+_SETTLED = 0.05  # change of an iteration, in standard deviations
 _NOISE_AT = (1, 3)  # iterations that estimate the noise anew
 _LARGEST_nT, _LARGEST_SLOPE = 1e4, 1e2  # priors of the background and of its slope, per second
 _GRADIENT_nT_m = 0.1  # prior of a uniform gradient of the Earth's field
@@ -175,7 +176,10 @@ def fit_platform(rows: CalibrationRows, terms: PlatformTerms) -> PlatformFit:
             if 0 < (~good).sum() < _MOST_OUTLIERS * len(good):
                 outliers += int((~good).sum())
                 rows = point.rows[good]
+        change = (solved.mean - point.unknowns)[:q] / np.sqrt(np.diagonal(solved.covariance)[:q])
         point = LinearProblem.at(rows, terms, solved.mean[:q], 0.0 if rows.is_own else solved.mean[-1] * _LAG_S)
+        if iteration > _NOISE_AT[-1] and np.abs(change).max() < _SETTLED:
+            break
     solved = point.solve(background)
     joint = q + point.n_errors
     lag = (0.0, 0.0) if rows.is_own else (solved.mean[-1] * _LAG_S, np.sqrt(solved.covariance[-1, -1]) * _LAG_S)
@@ -188,7 +192,7 @@ def fit_platform(rows: CalibrationRows, terms: PlatformTerms) -> PlatformFit:
         background,
         point.rows,
         point.field_T,
-        point.effect_T + point.columns_nT[:, q:joint] @ solved.mean[q:joint] / _NANO,
+        point.effect_at(solved.mean),
         point,
         outliers,
     )
@@ -202,7 +206,8 @@ def _with_squared_turns(covariance: FloatArray, terms: PlatformTerms) -> FloatAr
     """
     variance = float(np.mean((np.diagonal(covariance) * terms.sigma**2)[terms.turns])) / 2.0
     more = np.zeros(len(covariance))
-    more[terms.stretches] = 0.5 * (variance / terms.sigma[terms.stretches]) ** 2
+    if terms.sigma[terms.gain]:
+        more[terms.stretches] = 0.5 * (variance / terms.sigma[terms.stretches]) ** 2
     return covariance + np.diag(more)
 
 
@@ -227,6 +232,7 @@ class LinearProblem:
     field_T: FloatArray
     effect_T: FloatArray
     n_errors: int
+    unknowns: FloatArray
 
     @classmethod
     def at(cls, rows: CalibrationRows, terms: PlatformTerms, coefficients: FloatArray, lag_s: float) -> LinearProblem:
@@ -250,7 +256,14 @@ class LinearProblem:
         if not rows.is_own:
             unknowns[-1] = lag_s / _LAG_S
         samples = _NANO * (modulus - np.median(modulus)) + columns @ unknowns
-        return cls(rows, samples, columns, field, effect, errors.shape[1])
+        return cls(rows, samples, columns, field, effect, errors.shape[1], unknowns)
+
+    def effect_at(self, unknowns: FloatArray) -> FloatArray:
+        """Return the effect [T] of the platform at some unknowns, in first order; a gradient is none."""
+        change = unknowns - self.unknowns
+        if self.rows.place_m is not None:
+            change[len(change) - 3 - (not self.rows.is_own) :][:3] = 0.0
+        return self.effect_T + self.columns_nT @ change / _NANO
 
     def solve(self, background: Background) -> Posterior:
         """Return the posterior of the unknowns for a noise and a background."""

@@ -18,6 +18,7 @@ from magloc.compensation.fit import FEWEST_ROWS, CalibrationRows
 from magloc.compensation.signals import Signal, white_noise
 from magloc.measurement.rows import check_magnitudes
 from magloc.measurement.screening import wild_readings
+from magloc.navigation.poses import rotations_at
 from magloc.readings import Readings, without_saturated
 from magloc.surveying.preparation import stuck_readings
 
@@ -132,6 +133,14 @@ class PlatformLog:
         return replace(
             attitude, errors=AttitudeErrors.of_turn(_TURN_RAD if pose is None else pose.attitude_constant_rad)
         )
+
+    def turning_at(self, time_s: FloatArray) -> FloatArray | None:
+        """Return rates of the array about its axes (n, 3) [rad/s] between some times; None without a pose."""
+        if self.readings.array_rotation is None:
+            return None
+        turned = rotations_at(time_s, self.readings.time_s, self.readings.array_rotation)
+        steps = (turned[:-1].inv() * turned[1:]).as_rotvec() / np.diff(time_s)[:, None]
+        return np.concatenate([steps, steps[-1:]])
 
     def rows_of(self, sensor: Sensor, attitude: Attitude) -> CalibrationRows:
         """Return the samples of a sensor that its platform is fitted to."""

@@ -41,10 +41,10 @@ class SensorCompensation:
     after_T: float
 
     @classmethod
-    def of(cls, sensor: str, fit: PlatformFit) -> SensorCompensation:
-        """Return the platform at a sensor with its figures of merit."""
+    def of(cls, sensor: str, fit: PlatformFit, turning: FloatArray | None) -> SensorCompensation:
+        """Return the platform at a sensor with its figures of merit; ``turning`` (n, 3): rates of the pose."""
         field, time_s, read = fit.field_T, fit.rows.time_s, fit.rows.modulus_T
-        done = Manoeuvres.of(time_s, field / np.linalg.norm(field, axis=1, keepdims=True))
+        done = Manoeuvres.of(time_s, field / np.linalg.norm(field, axis=1, keepdims=True), turning)
         return cls(sensor, fit, done, done.figure_T(read), done.figure_T(read - fit.effect_T))
 
     @property
@@ -58,7 +58,7 @@ class SensorCompensation:
                 "name": f"{self.sensor} {name}",
                 "value": printed * value,
                 "sigma": printed * sigma,
-                "determined": bool(sigma < LEAST_KNOWN * prior),
+                "determined": bool(sigma < LEAST_KNOWN * prior or prior == 0.0),
                 "unit": unit,
             }
 
@@ -79,6 +79,14 @@ class Compensation(Drawn):
         Standard deviation of the changes of the correction at every sensor, along the ambient field.
     flags : tuple of str
         Doubts, each a word and a sentence.
+
+    Examples
+    --------
+    >>> import magloc
+    >>> drone = magloc.datasets.load("drone")
+    >>> found = magloc.compensate(drone.array, drone.readings)
+    >>> found.entries[0]["name"]
+    's1 permanent x'
     """
 
     figure: ClassVar[str] = "magloc.plots.compensations:compensation"

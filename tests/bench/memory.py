@@ -61,6 +61,7 @@ CASES = {
     "magloc simulate": Case("simulate.toml --out out.csv", 5000, files=("simulate.toml",)),
     "magloc survey": Case("ground.csv --array ground-array.toml", 300, files=("ground.csv",)),
     "magloc qc": Case("ground.csv --array ground-array.toml", 300, files=("ground.csv",)),
+    "magloc compensate": Case("flight.csv --array flight.toml --currents motor_A", 1000, files=("flight.csv",)),
     "magloc map": Case("paper --grid {grid} --out out", 8000, "point"),
     "magloc bounds": Case("map.toml --grid {grid} --moments 4 --out out", 8000, "point"),
     "magloc design": Case("task.toml --out out.toml"),

@@ -20,8 +20,10 @@ from arrays.io.csv import write_columns
 from magloc.cli.app import app as magloc_app
 from magloc.cli.app import main as magloc_main
 from magloc.measurement.differences import predicted_channels
+from magloc.readings import write_readings
 from sims.experiments.loads import switching_loads
 from tests.adcs.stars.test_identification import random_sky, write_frames
+from tests.magloc.compensation.flights import Flight, Platform, array_of
 
 APPS = {"magloc": magloc_app, "adcs": adcs_app}
 MAINS = {"magloc": magloc_main, "adcs": adcs_main}
@@ -44,6 +46,10 @@ LINES: dict[str, tuple[str, ...]] = {
     "magloc qc": (
         "ground.csv --array ground-array.toml --json",
         "ground.csv --array ground-array.toml --ground-m -0.1 --out out",
+    ),
+    "magloc compensate": (
+        "flight.csv --array flight.toml --currents motor_A --json",
+        "flight.csv --array flight.toml --currents motor_A --calibration flight.csv --out out.csv",
     ),
     "magloc locate": (
         "readings.csv --array array.toml --json",
@@ -328,6 +334,7 @@ def write_files(folder: Path) -> None:
     rows = Path(adcs.datasets.load("imu").path).read_text(encoding="utf-8").splitlines()
     (folder / "imu.csv").write_text("\n".join(rows[:101]), encoding="utf-8")
     _write_scalars(folder)
+    _write_flight(folder)
     flight = switching_loads(rng=0, duration_s=150.0)
     write_columns(flight.columns, folder / "loads.csv")
     arrays.write_array(folder / "loads.toml", flight.array)
@@ -365,6 +372,19 @@ def _write_scalars(folder: Path) -> None:
     rows = [",".join([str(float(i)), *(f"{1e9 * value:.5f}" for value in row)]) for i, row in enumerate(values + noise)]
     head = ",".join(["time_s", *(f"{name}_nT" for name in array.channel_names)])
     (folder / "scalar.csv").write_text("\n".join([head, *rows]) + "\n")
+
+
+def _write_flight(folder: Path) -> None:
+    """A short flight with manoeuvres, and a column of currents."""
+    rng, array = np.random.default_rng(0), array_of()
+    flight = Flight.cloverleaf(rng, rate_Hz=2.0)
+    platforms = {sensor.id: Platform.draw(rng, sensor) for sensor in array.sensors}
+    rows = flight.readings(array, platforms, rng)[:160]
+    write_readings(folder / "flight.csv", rows, array)
+    header, *lines = (folder / "flight.csv").read_text().splitlines()
+    lines = [f"{line},{current:.6f}" for line, current in zip(lines, flight.current_A, strict=False)]
+    (folder / "flight.csv").write_text("\n".join([f"{header},motor_A", *lines]) + "\n")
+    arrays.write_array(folder / "flight.toml", array)
 
 
 def _write_stars(folder: Path) -> None:

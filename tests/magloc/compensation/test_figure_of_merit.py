@@ -40,6 +40,18 @@ def test_twelve_manoeuvres_are_found_and_summed() -> None:
     assert found.figure_T(50e-6 + AMPLITUDES[PART] * SINE) == pytest.approx(2.0 * AMPLITUDES.sum(), rel=0.05)
 
 
+def test_rates_tell_roll_from_yaw() -> None:
+    """On a heading along the field both move its direction sideways."""
+    swing, part = 0.1 * SINE[:400], TIME[:400] >= 40.0
+    angles = np.zeros((400, 3))
+    angles[~part, 0], angles[part, 2] = swing[~part], swing[part]
+    field = np.array([20.0, 0.0, -44.0]) / np.hypot(20.0, 44.0)
+    unit = Rotation.from_rotvec(angles).inv().apply(field)
+    found = Manoeuvres.of(TIME[:400], unit, np.gradient(angles, TIME[:400], axis=0))
+    inside = (found.cell >= 0) & (np.abs(TIME[:400] - 40.0) > 5.0)
+    assert (found.cell[inside] % 3 == np.where(part[inside], 2, 0)).all()
+
+
 def test_slow_changes_do_not_count() -> None:
     found = Manoeuvres.of(TIME, directions(0.1))
     slow = 50e-6 + 1e-6 * np.cos(2.0 * np.pi * TIME / 480.0)
