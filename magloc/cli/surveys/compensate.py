@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
 import magloc
-from arrays.array import SensorArray
 from arrays.io.errors import naming, naming_options
 from arrays.io.outputs import refuse_one_for_two, refuse_unwritable
 from arrays.typing import Vector
 from magloc.cli.framework import CommonOptions, Flag, print_report, warn
 from magloc.cli.options import KnownOptions, LogOptions, ambient_field, refuse_not_positive
+
+if TYPE_CHECKING:
+    from arrays.array import SensorArray
 
 
 @Parameter(name="*", group="Platform")
