@@ -212,8 +212,9 @@ def _change_variance(
     model: HeadingModel,
 ) -> Callable[[NDArray[np.intp], NDArray[np.intp]], FloatArray]:
     """Return the variance of the change of the gyro's heading between instants, as a function of these."""
-    turned = rate_rad_s * quaternion.matrix(q_level)[:, 2] * steps_s(time_s)[:, None]
-    turned = np.cumsum(np.where(np.arange(len(time_s))[:, None] > 0, turned, 0.0), axis=0)
+    turned = rate_rad_s * quaternion.rotate_back(q_level, [0.0, 0.0, 1.0]) * steps_s(time_s)[:, None]
+    turned[0] = 0.0
+    turned = np.cumsum(turned, axis=0)
     hidden = np.zeros(len(time_s)) if hidden_rad2 is None else np.cumsum(hidden_rad2)
 
     def variance(first: NDArray[np.intp], last: NDArray[np.intp]) -> FloatArray:

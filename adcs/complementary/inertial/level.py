@@ -66,38 +66,62 @@ def direction_up(steady: Steady, *, offline: bool) -> Up:
 
     A gyro with large errors of scale needs a short one. Offline the whole record decides, else the past.
     """
-    tried = [_smoothed_up(steady, gravity_s, offline=False) for gravity_s in _TIMES_S]
-    error_rad2 = np.array([_prediction_errors(steady, one.up, offline=offline) for one in tried])
+    gaps = _gaps(steady)
+    scatter = _scatter_rad(steady, gaps)
+    later = _later_means(steady)
+    tried = [_smoothed_up(steady, gaps, scatter, gravity_s, offline=False) for gravity_s in _TIMES_S]
+    error_rad2 = np.array([later.mean_square(one.up, offline=offline) for one in tried])
     gained = error_rad2[0] - np.min(error_rad2, axis=0)
     best = np.where(gained > TILT_FLOOR_RAD**2, np.argmin(error_rad2, axis=0), 0)
     drift_rad = np.sqrt(gained) * (best > 0)
     if offline:
-        return replace(_smoothed_up(steady, _TIMES_S[best[0]], offline=True), drift_rad=drift_rad)
+        chosen = _smoothed_up(steady, gaps, scatter, _TIMES_S[best[0]], offline=True)
+        return replace(chosen, drift_rad=drift_rad)
+    if not best.any():
+        return tried[0]
     rows = np.arange(len(best))
     of_rows = {name: np.array([getattr(one, name) for one in tried])[best, rows] for name in vars(tried[0])}
     return Up(**{**of_rows, "drift_rad": drift_rad})
 
 
-def _prediction_errors(steady: Steady, up: FloatArray, *, offline: bool) -> FloatArray:
-    """Return the mean squared angle (n,) between the direction up and later means of the acceleration.
+@dataclass(frozen=True, eq=False)
+class _LaterMeans:
+    """Directions of the mean acceleration after some instants, and the instants at which they are known."""
 
-    Of predictions that have ended at each instant, offline of all.
-    """
+    began: NDArray[np.intp]  # (k,)
+    ends: NDArray[np.intp]  # (k,)
+    unit: FloatArray  # (k, 3)
+    counts: FloatArray  # (n,): number that are known
+
+    def mean_square(self, up: FloatArray, *, offline: bool) -> FloatArray:
+        """Return the mean squared angle (n,) to a direction up (n, 3), of what is known, offline of all."""
+        square = np.sum((self.unit - up[self.began]) ** 2, axis=1)
+        errors = np.cumsum(np.bincount(self.ends, square, len(up))) / np.maximum(self.counts, 1.0)
+        return np.full(len(errors), errors[-1]) if offline else errors
+
+
+def _later_means(steady: Steady) -> _LaterMeans:
     read = is_read(steady.acceleration_m_s2)
-    weight = np.where(read, steady.dt_s, 0.0)
-    total = np.cumsum(np.where(read[:, None], steady.acceleration_m_s2, 0.0) * weight[:, None], axis=0)
+    weight = np.where(read, steady.dt_s, 0.0)[:, None]
+    total = np.cumsum(np.where(read[:, None], steady.acceleration_m_s2, 0.0) * weight, axis=0)
     ends = np.searchsorted(steady.time_s, steady.time_s + _PREDICTED_S)
     began = np.flatnonzero(ends < len(ends))
     mean = total[ends[began]] - total[began]
-    length = np.linalg.norm(mean, axis=1)
-    square = np.sum((mean / np.where(length > 0.0, length, 1.0)[:, None] - up[began]) ** 2, axis=1)
-    valid = (length > 0.0).astype(np.float64)
-    counts, sums = (np.cumsum(np.bincount(ends[began], of, len(ends))) for of in (valid, valid * square))
-    errors: FloatArray = sums / np.maximum(counts, 1)
-    return np.full(len(ends), errors[-1]) if offline else errors
+    length = np.sqrt(np.einsum("ni,ni->n", mean, mean))
+    known = length > 0.0
+    began = began[known]
+    counts = np.cumsum(np.bincount(ends[began], minlength=len(ends))).astype(np.float64)
+    return _LaterMeans(began, ends[began], mean[known] / length[known, None], counts)
 
 
-def _smoothed_up(steady: Steady, gravity_s: float, *, offline: bool) -> Up:
+def _smoothed_up(
+    steady: Steady,
+    gaps: list[tuple[int, int, FloatArray, bool]],
+    scatter: FloatArray,
+    gravity_s: float,
+    *,
+    offline: bool,
+) -> Up:
     """Smooth accelerations; offline by the mean of a forward and a backward low-pass, without delay.
 
     After a gap that hides a larger rotation than the σ of a few readings, the low-pass restarts from the mean of the
@@ -105,8 +129,6 @@ def _smoothed_up(steady: Steady, gravity_s: float, *, offline: bool) -> Up:
     """
     n, acceleration = len(steady.time_s), steady.acceleration_m_s2
     smooth, sigma, fresh, hidden = np.empty((n, 3)), np.zeros(n), np.zeros(n, np.bool_), steady.hidden_rad2.copy()
-    gaps = _gaps(steady)
-    scatter = _scatter_rad(steady, gaps)
     read = is_read(acceleration)
     rest = steady.at_rest & read
     smooth[0] = acceleration[rest].mean(axis=0) if rest.any() else acceleration[read][0]
