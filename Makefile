@@ -13,7 +13,7 @@ NOT_INSTALLED = { echo "magloc could not be installed: it needs the package inde
 
 KERNEL_TESTS := tests/magloc/core tests/magloc/fields/test_points.py
 
-.PHONY: map test test-full test-oldest mutation coverage licences sbom audit wheel wheel-aarch64 bench bench-against docs notebooks pictures chromium lint sanitize clean
+.PHONY: map test test-full test-oldest mutation coverage licences sbom audit wheel wheel-aarch64 bench bench-against validation docs notebooks pictures chromium lint sanitize clean
 .PHONY: ready compiled-tests
 
 map: .venv/installed
@@ -33,6 +33,7 @@ lint: .venv/installed-test
 	$(BIN)/clang-tidy --quiet magloc/core/*.cpp adcs/core/*.cpp docs/examples/*.cpp -- -std=c++17 -Imagloc/core/include -DMAGLOC_LANES=2
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-cache --no-logo
+	$(BIN)/codespell README.md CONTRIBUTING.md CHANGELOG.md arrays magloc adcs sims docs
 
 # Tests are compiled once, beside the linters.
 ready: .venv/installed-test
@@ -84,6 +85,10 @@ wheel-aarch64: .venv-supply/installed
 
 bench: .venv/installed-bench
 	$(BIN)/python -m tests.bench
+
+# Tables of docs/validation repeated and compared with the page, hours in all: `make validation ONLY="Kalman bank"`.
+validation: .venv/installed-test
+	$(BIN)/python -m tests.validation $(ONLY)
 
 # Processor time against that of another revision, built beside this one: `make bench-against REV=552c0b8`, with
 # ISA=baseline for kernels confined to what every processor has.

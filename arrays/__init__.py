@@ -7,6 +7,7 @@ __getattr__, __dir__, __all__ = lazy_names(
     {
         "GEOMETRIES": "arrays.geometries",
         "Calibration": "arrays.sensor",
+        "Instrument": "arrays.instruments.templates",
         "InputError": "arrays.io.errors",
         "LogColumns": "arrays.columns",
         "ValidRows": "arrays.columns",
@@ -22,8 +23,10 @@ __getattr__, __dir__, __all__ = lazy_names(
         "cube": "arrays.geometries",
         "grid": "arrays.geometries",
         "hexagon": "arrays.geometries",
+        "instrument_names": "arrays.instruments.templates",
         "mesh_of": "arrays.meshes",
         "read_array": "arrays.array_file",
+        "read_instrument": "arrays.instruments.templates",
         "read_sensors": "arrays.array_file",
         "square": "arrays.geometries",
         "tetrahedron": "arrays.geometries",

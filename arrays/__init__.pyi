@@ -13,6 +13,9 @@ from arrays.geometries import grid as grid
 from arrays.geometries import hexagon as hexagon
 from arrays.geometries import square as square
 from arrays.geometries import tetrahedron as tetrahedron
+from arrays.instruments.templates import Instrument as Instrument
+from arrays.instruments.templates import instrument_names as instrument_names
+from arrays.instruments.templates import read_instrument as read_instrument
 from arrays.io.errors import InputError as InputError
 from arrays.meshes import mesh_of as mesh_of
 from arrays.pose import PoseUncertainty as PoseUncertainty

@@ -326,7 +326,7 @@ class SensorArray:
         return other
 
     def readings_of(self, fields: ArrayLike) -> FloatArray:
-        """Readings without noise.
+        """Return readings without noise.
 
         Parameters
         ----------

@@ -40,10 +40,11 @@ Either a geometry by name (:data:`arrays.geometries.GEOMETRIES`) with its size, 
     kind = "vector"                 # any key of a sensor but id, position and calibration
     noise_nT = 1.0
 
-Both may have ``noise_fraction``, ``common_field_nT``, ``ambient_nT = [x, y, z]`` or ``ambient_world_nT``, the gradient
-of that field ``ambient_gradient_nT_m = [[…], […], […]]`` (symmetric and traceless), ``ambient_uncertainty_nT``,
-``ambient_uncertainty_white_nT``, ``format_version = 1``, and the tables ``[pose]`` and ``[columns]``; see
-:class:`arrays.array.SensorArray` for what they mean.
+Both may have ``noise_fraction``, ``common_field_nT`` or, in its place, ``background = "subtracted"`` (a background was
+taken out of the readings: :data:`BACKGROUND_CHANGE_T`), ``ambient_nT = [x, y, z]`` or ``ambient_world_nT``, the
+gradient of that field ``ambient_gradient_nT_m = [[…], […], […]]`` (symmetric and traceless),
+``ambient_uncertainty_nT``, ``ambient_uncertainty_white_nT``, ``format_version = 1``, and the tables ``[pose]`` and
+``[columns]``; see :class:`arrays.array.SensorArray` for what they mean.
 """
 
 from __future__ import annotations
@@ -71,6 +72,7 @@ from arrays.io.toml import (
     check_keys,
     in_si,
     item_place,
+    one_of,
     read_toml,
     section_of,
 )
@@ -79,6 +81,11 @@ from arrays.pose import PoseTable, pose_toml
 from arrays.sensor import Calibration, Sensor
 from arrays.typing import Vector
 
+BACKGROUND_CHANGE_T = 3e-7
+"""Standard deviation per axis of the common field after a background was subtracted: a hundredth of the Earth's field.
+
+It covers what the field changes within hours and what currents in a building add.
+"""
 _DEFAULTS, _TURNS = "defaults", ("rotation_xyzw", "ypr_deg")
 _NOT_TURNED = (0.0, 0.0, 0.0, 1.0)
 _NotNegative = Annotated[Number, NOT_NEGATIVE]
@@ -93,6 +100,7 @@ class _Header(File, kw_only=True):
     name: str | None = None
     noise_fraction: float = 0.0
     common_field_nT: _NotNegative | None = None
+    background: Annotated[str, one_of(("subtracted",))] | None = None
     ambient_nT: _NumberVector | None = None
     ambient_world_nT: _NumberVector | None = None
     ambient_gradient_nT_m: tuple[_NumberVector, _NumberVector, _NumberVector] | None = None
@@ -182,6 +190,11 @@ def read_sensors(path: str | PathLike[str]) -> SensorArray:
     path : str or path-like
         Array file (TOML).
 
+    Returns
+    -------
+    SensorArray
+        Array of the file, of one sensor or more.
+
     Examples
     --------
     >>> import arrays
@@ -215,6 +228,7 @@ def write_array(path: str | PathLike[str], array: SensorArray) -> None:
     path : path-like
         File to write; an existing file is replaced in one step.
     array : SensorArray
+        Array; its sensors are written one by one, with their calibration.
 
     Raises
     ------
@@ -236,6 +250,11 @@ def array_toml(array: SensorArray) -> str:
     ----------
     array : SensorArray
         Array; its sensors are written one by one, with their calibration.
+
+    Returns
+    -------
+    str
+        Text that :func:`read_array` reads.
 
     Examples
     --------
@@ -376,6 +395,10 @@ def _rotation(place: str, table: _SensorTable) -> tuple[float, float, float, flo
 
 def _with_header(path: str, array: SensorArray, header: _Header) -> SensorArray:
     of_field = {in_si(key)[0]: _in_tesla(f"{path}, key {key}", getattr(header, key)) for key in _FIELD_KEYS}
+    if header.background is not None:
+        if header.common_field_nT is not None:
+            raise InputError(f"{path}, key background: found it together with common_field_nT, expected one of them.")
+        of_field["common_field_T"] = BACKGROUND_CHANGE_T
     name = array.name if header.name is None else header.name
     pose = None if header.pose is None else header.pose.uncertainty(f"{path}, table pose")
     channels = {of.id: of.channel_names for of in array.sensors}

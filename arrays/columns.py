@@ -22,8 +22,9 @@ from arrays.typing import Vector
 
 POSITION_COLUMNS = ("array_x_m", "array_y_m", "array_z_m")
 ROTATION_COLUMNS = ("array_qx", "array_qy", "array_qz", "array_qw")
+LINE = "line"
 NANOTESLA = {"nT": 1.0, "uT": 1e3, "µT": 1e3, "mT": 1e6, "T": 1e9, "mG": 1e2, "G": 1e5}
-SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "iso": 1.0, "hhmmss": 1.0}
+SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "iso": 1.0, "hhmmss": 1.0, "rows": 1.0}
 SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t", "space": " "}
 _CHOICES = {
     "separator": SEPARATORS,
@@ -69,7 +70,7 @@ class LogColumns:
         Name of the column with the time, or with "iso" those of the date and of the time.
     time_unit : str
         "s", "ms", "us", "iso" for instants such as 2026-11-21T12:00:00.5 (UTC by default) and times of day such as
-        09:14:03.5, or "hhmmss" for numbers such as 091403.5.
+        09:14:03.5, "hhmmss" for numbers such as 091403.5, or "rows" for a log without times: one row per second.
     date : str, optional
         Date of the first row, such as 2026-05-12, for a log with times of day only; without it times count from the
         midnight before the first row.
@@ -102,12 +103,19 @@ class LogColumns:
     angles : tuple of str, optional
         In place of `quaternion`: columns of yaw, or of yaw, pitch and roll [deg], from north, east, down to forward,
         right, down. The array's axes are forward, left, up. Without an attitude they are those of the world.
+    course : bool
+        In place of an attitude: the array's x axis points along the course over ground. Files only.
     pose_latency_s : float
         Time by which the pose of a row is older than its readings [s].
     dummy : tuple of float and str
         Numbers, in the unit of the log, and words that mark a missing reading.
     valid : ValidRows, optional
         Rows whose readings count; by default all.
+    names : tuple of str
+        Names of all columns, for a log without a header, or with one that does not fit its rows. The first row is then
+        the first line with a number in each column that is read.
+    line : str, optional
+        Column with the number of the survey line.
     comment, skip : tuple of str
         Beginnings of rows to ignore: comments, and names of survey lines.
     encoding : str, optional
@@ -145,9 +153,12 @@ class LogColumns:
     fix: ValidRows | None = None
     quaternion: tuple[str, str, str, str] | None = None
     angles: tuple[str, ...] | None = None
+    course: bool = False
     pose_latency_s: float = 0.0
     dummy: tuple[float | str, ...] = ()
     valid: ValidRows | None = None
+    names: tuple[str, ...] = ()
+    line: str | None = None
     comment: tuple[str, ...] = ("#",)
     skip: tuple[str, ...] = ()
     encoding: str | None = None
@@ -172,7 +183,9 @@ class LogColumns:
             raise ValueError(
                 f"Input angles must be yaw, or yaw, pitch, roll; instead received {len(self.angles)} names."
             )
-        if not self.place and (self.attitude or self.pose_latency_s):
+        if self.course and self.attitude:
+            raise ValueError("Input course must not come together with quaternion or angles.")
+        if not self.place and (self.attitude or self.course or self.pose_latency_s):
             raise ValueError(
                 "Inputs position or geodetic must come with an attitude or a latency; instead received none."
             )
@@ -215,7 +228,9 @@ class LogColumns:
 
     @property
     def clock(self) -> tuple[str, ...]:
-        """Column of the time, or those of date and time."""
+        """Column of the time, or those of date and time; empty for a log without times."""
+        if self.time_unit == "rows":
+            return ()
         return (self.time,) if isinstance(self.time, str) else self.time
 
     @property
@@ -279,9 +294,12 @@ class ColumnsTable(Table, kw_only=True):
     fix: ValidTable | None = None
     quaternion: tuple[str, str, str, str] | None = None
     angles: list[str] | None = None
+    course: bool = False
     pose_latency_s: float = 0.0
     dummy: list[float | str] = msgspec.field(default_factory=list)
     valid: ValidTable | None = None
+    names: list[str] = msgspec.field(default_factory=list)
+    line: str | None = None
     comment: str | list[str] = "#"
     skip: str | list[str] = msgspec.field(default_factory=list)
     encoding: str | None = None
@@ -312,9 +330,11 @@ def _frozen(value: Any) -> Any:
 
 
 def columns_toml(columns: LogColumns) -> list[str]:
-    """Return the lines of the table in an array file."""
-    said = {each.name: getattr(columns, each.name) for each in fields(columns) if each.name != "sensors"}
-    lines = ["", "[columns]", *(f"{key} = {_toml(value)}" for key, value in said.items() if value is not None)]
+    """Return the lines of the table in an array file, without values that are those by default."""
+    by_default = LogColumns()
+    own = {each.name: getattr(columns, each.name) for each in fields(columns) if each.name != "sensors"}
+    own = {key: value for key, value in own.items() if value != getattr(by_default, key)}
+    lines = ["", "[columns]", *(f"{key} = {_toml(value)}" for key, value in own.items())]
     if columns.sensors:
         lines += ["", "[columns.sensors]", *(f"{_toml(key)} = {_toml(of)}" for key, of in columns.sensors.items())]
     return lines

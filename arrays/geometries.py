@@ -32,6 +32,11 @@ def tetrahedron(edge_m: float, kind: SensorKind = "vector", noise_T: float = 1e-
     noise_T : float
         Standard deviation of a reading [T].
 
+    Returns
+    -------
+    SensorArray
+        Array centred on the origin, with sensors s1, s2, … whose axes are those of the array.
+
     Examples
     --------
     >>> import arrays
@@ -58,6 +63,11 @@ def square(edge_m: float, kind: SensorKind = "vector", noise_T: float = 1e-9) ->
     noise_T : float
         Standard deviation of a reading [T].
 
+    Returns
+    -------
+    SensorArray
+        Array centred on the origin, with sensors s1, s2, … whose axes are those of the array.
+
     Examples
     --------
     >>> import arrays
@@ -80,6 +90,11 @@ def cross(arm_m: float, kind: SensorKind = "vector", noise_T: float = 1e-9) -> S
     noise_T : float
         Standard deviation of a reading [T].
 
+    Returns
+    -------
+    SensorArray
+        Array centred on the origin, with sensors s1, s2, … whose axes are those of the array.
+
     Examples
     --------
     >>> import arrays
@@ -101,6 +116,11 @@ def cube(edge_m: float, kind: SensorKind = "vector", noise_T: float = 1e-9) -> S
         Kind of the sensors.
     noise_T : float
         Standard deviation of a reading [T].
+
+    Returns
+    -------
+    SensorArray
+        Array centred on the origin, with sensors s1, s2, … whose axes are those of the array.
 
     Examples
     --------
@@ -126,6 +146,11 @@ def hexagon(radius_m: float, kind: SensorKind = "vector", noise_T: float = 1e-9)
     noise_T : float
         Standard deviation of a reading [T].
 
+    Returns
+    -------
+    SensorArray
+        Array centred on the origin, with sensors s1, s2, … whose axes are those of the array.
+
     Examples
     --------
     >>> import arrays
@@ -147,6 +172,11 @@ def axial(baseline_m: float, kind: SensorKind = "vector", noise_T: float = 1e-9)
     noise_T : float
         Standard deviation of a reading [T].
 
+    Returns
+    -------
+    SensorArray
+        Array centred on the origin, with sensors s1, s2, … whose axes are those of the array.
+
     Examples
     --------
     >>> import arrays
@@ -159,7 +189,7 @@ def axial(baseline_m: float, kind: SensorKind = "vector", noise_T: float = 1e-9)
 
 
 def grid(nx: int, ny: int, pitch_m: float, kind: SensorKind = "vector", noise_T: float = 1e-9) -> SensorArray:
-    """Sensors on a flat board: a grid in the x-y plane with rows along x; x changes fastest.
+    """Board of sensors: a grid in the x-y plane with rows along x; x changes fastest.
 
     Parameters
     ----------
@@ -171,6 +201,11 @@ def grid(nx: int, ny: int, pitch_m: float, kind: SensorKind = "vector", noise_T:
         Kind of the sensors.
     noise_T : float
         Standard deviation of a reading [T].
+
+    Returns
+    -------
+    SensorArray
+        Array centred on the origin, with sensors s1, s2, … whose axes are those of the array.
 
     Examples
     --------

@@ -49,6 +49,7 @@ def mesh_of(array: SensorArray, size_m: float | None = None) -> trimesh.Trimesh:
     Parameters
     ----------
     array : SensorArray
+        Array whose sensors are drawn at their positions.
     size_m : float, optional
         Size of the glyphs [m], :func:`glyph_size` by default.
 

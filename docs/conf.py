@@ -25,7 +25,7 @@ extensions = [
     "sphinx_design",
     "made_pages",
 ]
-exclude_patterns = ["_build", "templates", "static"]
+exclude_patterns = ["_build", "templates", "static", "reference/names/all.md"]
 templates_path = ["templates"]
 
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath", "amsmath"]
@@ -40,7 +40,6 @@ nb_render_markdown_format = "myst"
 nb_code_prompt_show = "Show the code that draws this"
 nb_code_prompt_hide = "Hide the code that draws this"
 
-autosummary_generate = True
 # Two pages that differ by case alone are one file on macOS and Windows.
 autosummary_filename_map = {"magloc.Survey": "magloc.Survey-class", "magloc.Track": "magloc.Track-class"}
 autodoc_typehints = "none"

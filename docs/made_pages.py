@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from docutils import nodes
+from explained import CARD, EXPLAINED, PICTURES
 from sphinx.addnodes import pending_xref
 from sphinx.application import Sphinx
 
@@ -25,68 +26,8 @@ ORIGINALS = "../../../notebooks"
 PAGE = re.compile(r"docs/theory/([\w-]+)\.md")
 # A link of a command's page to a heading that is on another page now.
 LINK = re.compile(r"^(\* )\[(`[\w-]+`)\]\(#[\w-]+\)", re.MULTILINE)
-# The picture of what a function finds or draws, on the function's page.
-PICTURES = {
-    "notebook-01-first-fix.png": ["magloc.locate", "magloc.Fixes", "magloc.Fix", "magloc.plots.fixes"],
-    "notebook-09-several-sources.png": ["magloc.Solution"],
-    "track-weaving.png": ["magloc.track", "magloc.Track", "magloc.Tracker", "magloc.plots.track"],
-    "track-three-magnets.png": ["magloc.track_sources", "magloc.SourcesTrack", "magloc.SourcesTracker"],
-    "notebook-08-calibration.png": ["magloc.calibrate", "magloc.Calibration", "magloc.plots.calibration"],
-    "bounds-reach.png": ["magloc.cramer_rao_bounds", "magloc.Bounds", "magloc.bound_map", "magloc.plots.bound_reach"],
-    "design-half-space.png": ["magloc.design_array", "magloc.Design"],
-    "convergence-paper.png": ["magloc.convergence_map", "magloc.plots.convergence"],
-    "view-dipole.png": ["magloc.view", "arrays.mesh_of"],
-    "notebook-10-ship.png": ["magloc.fit_signature", "magloc.Signature"],
-    "view-map.png": ["magloc.source_map"],
-    "view-array.png": ["arrays.SensorArray", "arrays.tetrahedron", "arrays.read_array"],
-    "gradient-tensor.png": ["magloc.fit_gradient_tensor", "magloc.GradientTensor"],
-    "residuals-faulty.png": ["magloc.plots.residuals"],
-    "attitude-track.png": ["adcs.estimate", "adcs.AttitudeTrack"],
-    "attitude-complementary.png": ["adcs.complementary_filter"],
-    "view-mockup.png": ["adcs.mockup.fuse", "adcs.mockup.DelayedFilter"],
-}
-# The page of the guide on which a name, or all of a module, is explained; the other names of the page are related.
-EXPLAINED = {
-    "array-design": "magloc.design_array magloc.Design magloc.DesignTask",
-    "array-files": "arrays.SensorArray arrays.Sensor arrays.Calibration arrays.SensorPreset arrays.read_array"
-    " arrays.read_sensors arrays.write_array arrays.array_toml arrays.mesh_of arrays.tetrahedron arrays.square"
-    " arrays.cross arrays.cube arrays.hexagon arrays.axial arrays.grid",
-    "attitude": "adcs.estimate adcs.EstimatorSettings adcs.Telemetry adcs.read_telemetry adcs.Satellite"
-    " adcs.circular_orbit adcs.read_scenario adcs.find_own_fields adcs.OwnFields"
-    " adcs.BDot adcs.b_dot_gain adcs.detumbled adcs.read_oem adcs.read_aem adcs.write_oem adcs.write_aem"
-    " adcs.AttitudeTrack adcs.EllipsoidObserver adcs.BoundedSystem"
-    " adcs.Ellipsoid sims.AttitudeScenario sims.experiments.run_scenario sims.experiments.compared_with_paper",
-    "calibration": "magloc.calibrate magloc.Calibration magloc.CalibrationPrior magloc.plots.calibration",
-    "convergence-maps": "magloc.convergence_map magloc.source_map magloc.RepeatedFilter magloc.moments_on_sphere"
-    " magloc.plots.convergence magloc.plots.sources",
-    "detection-range-and-bounds": "magloc.cramer_rao_bounds magloc.Bounds magloc.bound_map magloc.detection_range"
-    " magloc.MatchedFilterDetector magloc.plots.bound_reach magloc.plots.bound_slices magloc.plots.bound_sphere",
-    "dipole-moment": "magloc.equivalent_dipole",
-    "exporting": "magloc.plots.save magloc.plots.write",
-    "figures-and-viewer": "magloc.view magloc.plots.design",
-    "gradient-tensor": "magloc.fit_gradient_tensor magloc.GradientTensor",
-    "inertial-unit": "adcs.complementary_filter adcs.inertial_magnetic_filter adcs.read_imu"
-    " adcs.HeadingModel adcs.Gains",
-    "iterated-kalman-filter": "magloc.IteratedExtendedKalmanFilter",
-    "live": "magloc.live magloc.viewer",
-    "localization": "magloc.locate magloc.Locator magloc.Fixes magloc.Fix magloc.Solution magloc.Source"
-    " magloc.SourcePrior magloc.plots.fixes",
-    "moving-arrays": "magloc.MeasuredMotion magloc.KnownMotion",
-    "monte-carlo": "sims.run_many sims.simulate sims.read_scenario sims.MagneticScenario sims.write_simulation",
-    "reading-data": "magloc.read_readings magloc.Readings magloc.read_truth magloc.Truth arrays.InputError",
-    "sensor-faults": "magloc.plots.residuals",
-    "ship-signature": "magloc.track_moment magloc.track_moments magloc.MomentTrack magloc.ObjectPath magloc.PathError"
-    " magloc.read_object_path magloc.fit_signature magloc.Signature",
-    "single-sensor-ranging": "magloc.SourceLine magloc.fit_source_line magloc.distance_along_line",
-    "star-identification": "adcs.solve_photograph adcs.identify_stars adcs.read_picture adcs.combined_star_fixes"
-    " adcs.hipparcos_catalogue",
-    "table-top-satellite": "adcs.mockup sims.table_run sims.TableScenario sims.CameraErrors sims.rendered_frame"
-    " sims.experiments.sky_run sims.experiments.identified_files sims.experiments.fused_runs"
-    " sims.experiments.fused_record sims.experiments.zeros_run",
-    "tracking": "magloc.track magloc.Track magloc.Tracker magloc.RandomWalk magloc.OrnsteinUhlenbeck"
-    " magloc.CoordinatedTurn magloc.FreeMotion magloc.track_sources magloc.SourcesTrack magloc.SourcesTracker"
-    " magloc.subtract_rest magloc.plots.track magloc.plots.consistency",
-}
+# Modules whose names have a list of their own, in alphabetical order.
+MODULES = ("magloc.live", "magloc.plots", "adcs.mockup", "sims.experiments")
 # Other pages that a function's page names at most of each folder, in this order.
 MOST_PAGES = {"guide": 3, "theory": 2, "gallery": 2}
 # What a bar stands in: literal text and formulas keep it, elsewhere it would be a substitution.
@@ -106,7 +47,16 @@ def setup(app: Sphinx) -> dict[str, bool]:
 
 
 def make_all(app: Sphinx) -> None:
-    """Write what git does not keep: commands, notebooks, MathJax."""
+    """Write what git does not keep: lists of names, commands, notebooks and their cards, MathJax."""
+    names = fresh(HERE / "reference" / "names")
+    lists = reference_lists()
+    for page, sections in lists.items():
+        text = "\n".join(heading + autosummary("names", listed) for heading, listed in sections.items())
+        (names / f"{page}.txt").write_text(text, encoding="utf-8")
+    # Autosummary looks for its directives in files, not in what pages include.
+    everything = [name for sections in lists.values() for listed in sections.values() for name in listed]
+    (names / "all.md").write_text(autosummary(".", everything), encoding="utf-8")
+    app.config.autosummary_generate = [str(names / "all.md")]
     commands = fresh(HERE / "reference" / "commands")
     for name, text in command_pages():
         (commands / f"{name.replace(' ', '-')}.md").write_text(text, encoding="utf-8")
@@ -120,6 +70,7 @@ def make_all(app: Sphinx) -> None:
         notebook["cells"][0]["source"] += [f"\n\n{{download}}`Download this notebook <{ORIGINALS}/{path.name}>`"]
         (notebooks / path.name).write_text(json.dumps(notebook), encoding="utf-8")
         (notebooks / f"{path.stem}.png").write_bytes(pictures(drawing)[0])
+    (notebooks / "cards.txt").write_text(cards(), encoding="utf-8")
     app.config.html_static_path.append(str(mathjax(fresh(HERE / "_build" / "mathjax"))))
 
 
@@ -128,6 +79,49 @@ def fresh(folder: Path) -> Path:
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     return folder
+
+
+def autosummary(folder: str, names: list[str]) -> str:
+    """Table of names with their summaries, whose pages are in a folder."""
+    options = f".. autosummary::\n   :toctree: {folder}\n   :nosignatures:\n"
+    return "\n".join(["```{eval-rst}", options, *(f"   {name}" for name in names), "```", ""])
+
+
+def reference_lists() -> dict[str, dict[str, list[str]]]:
+    """Names of each page of the reference, by a heading that leads to the page of the guide."""
+    lists: dict[str, dict[str, list[str]]] = {module: {"": public(module)} for module in MODULES}
+    for page, names in EXPLAINED.items():
+        title = (HERE / "guide" / f"{page}.md").read_text(encoding="utf-8").partition("\n")[0].removeprefix("# ")
+        heading = f"## {title}\n\n[{title.partition(':')[0]}](../guide/{page}.md) explains these names.\n\n"
+        for package in ("arrays", "magloc", "adcs", "sims"):
+            homes = (package, f"{package}.viewer")
+            if listed := [name for name in names.split() if name.rpartition(".")[0] in homes and name not in MODULES]:
+                lists.setdefault(package, {})[heading] = listed
+    return lists
+
+
+def public(module: str) -> list[str]:
+    """Names of a module that have pages: functions and classes."""
+    things = import_module(module)
+    return [f"{module}.{name}" for name in sorted(things.__all__) if callable(getattr(things, name))]
+
+
+def cards() -> str:
+    """Cards of all notebooks in the order of their numbers, and their hidden table of contents."""
+    found = []
+    for path in NOTEBOOKS.glob("*.ipynb"):
+        cell = "".join(json.loads(path.read_text(encoding="utf-8"))["cells"][0]["source"])
+        if (card := CARD.match(cell)) is None:
+            raise ValueError(f"{path.name}: expected a number, a title, minutes and a question in bold")
+        found.append((int(card[1]), card[2], card[3], " ".join(card[4].split()), path.stem))
+    lines = ["::::{grid} 1 2 2 3", ":gutter: 3"]
+    for number, title, minutes, question, stem in sorted(found):
+        kept = f"notebook-{stem}.png"
+        picture = f"../{kept}" if (HERE / kept).exists() else f"notebooks/{stem}.png"
+        lines += [f":::{{grid-item-card}} {number}. {title}", f":link: notebooks/{stem}", ":link-type: doc"]
+        lines += [f":img-top: {picture}", f"{question} *{minutes} min.*", ":::"]
+    contents = [f"notebooks/{stem}" for *_, stem in sorted(found)]
+    return "\n".join([*lines, "::::", "", "```{toctree}", ":hidden:", "", *contents, "```", ""])
 
 
 def pictures(cells: list[dict[str, Any]]) -> list[bytes]:

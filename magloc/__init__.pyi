@@ -8,6 +8,8 @@ from magloc.bounds.maps import bound_map as bound_map
 from magloc.calibration.array import CalibrationPrior as CalibrationPrior
 from magloc.calibration.calibrate import calibrate as calibrate
 from magloc.calibration.results import Calibration as Calibration
+from magloc.compensation.compensate import compensate as compensate
+from magloc.compensation.results import Compensation as Compensation
 from magloc.convergence.filters import RepeatedFilter as RepeatedFilter
 from magloc.convergence.over_sources import source_map as source_map
 from magloc.convergence.over_starts import convergence_map as convergence_map
@@ -49,6 +51,7 @@ from magloc.signature.signature import fit_signature as fit_signature
 from magloc.state_space import IteratedExtendedKalmanFilter as IteratedExtendedKalmanFilter
 from magloc.surveying.results import Survey as Survey
 from magloc.surveying.results import Target as Target
+from magloc.surveying.review.review import Review as Review
 from magloc.surveying.survey import survey as survey
 from magloc.terrain.files import read_terrain as read_terrain
 from magloc.terrain.surface import Terrain as Terrain

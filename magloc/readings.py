@@ -17,21 +17,23 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from os import PathLike
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from arrays.array import AMBIENT_CHANNELS, SensorArray
-from arrays.columns import POSITION_COLUMNS, ROTATION_COLUMNS
+from arrays.columns import LINE, POSITION_COLUMNS, ROTATION_COLUMNS
 from arrays.io.csv import Columns, Table, table_of_columns
 from arrays.io.errors import InputError
 from arrays.io.text import read_text, write_text
 from arrays.io.values import LARGEST_T, fields, numbers, seconds
 from arrays.logs.format import LogFormat, without_dummies
+from arrays.logs.lines import line_starts
 from arrays.sensor import Sensor
 from arrays.typing import FloatArray, IntArray
 from magloc.conditioning import NO_BACKGROUND, Background, without_hum
+from magloc.navigation.course import turned_to_course
 from magloc.navigation.fixes import without_gaps
 from magloc.navigation.measured_motion import MOTION_COLUMNS, MeasuredMotion, motion_columns, motion_of_table
 from magloc.navigation.poses import rotations_at, unit_rotation, vectors_at
@@ -41,7 +43,7 @@ if TYPE_CHECKING:
 
 POSE_SIGMA_COLUMNS = ("array_sigma_m", "array_sigma_deg")
 AMBIENT_COLUMNS = tuple(f"{name}_nT" for name in AMBIENT_CHANNELS)
-_OPTIONAL_COLUMNS = (*POSITION_COLUMNS, *ROTATION_COLUMNS, *POSE_SIGMA_COLUMNS, *AMBIENT_COLUMNS, *MOTION_COLUMNS)
+_OPTIONAL_COLUMNS = (*POSITION_COLUMNS, *ROTATION_COLUMNS, *POSE_SIGMA_COLUMNS, *AMBIENT_COLUMNS, *MOTION_COLUMNS, LINE)
 EXPECTED_HEADER = "a header with time_s and the sensors' columns"
 _ROW_SHAPES = {"time_s": (), "array_position_m": (3,), "ambient_T": (3,), "pose_sigma": (2,), "interpolated_m": ()}
 _T_IN_nT = 1e9
@@ -74,6 +76,8 @@ class Readings:
         Standard deviations per axis of position [m] and attitude [rad], in place of :class:`arrays.PoseUncertainty`.
     interpolated_m : ndarray, shape (n,), optional
         Standard deviation along each axis that interpolation between fixes adds to the error of a position [m].
+    lines : tuple of (float, str)
+        Times [s] at which survey lines begin, and their names.
     background : Background
         Model of the part of the values that is no signal, from :meth:`detrended` and :meth:`high_passed`.
 
@@ -105,6 +109,7 @@ class Readings:
     motion: MeasuredMotion | None = None
     pose_sigma: FloatArray | None = None
     interpolated_m: FloatArray | None = None
+    lines: tuple[tuple[float, str], ...] = ()
     background: Background = NO_BACKGROUND
 
     def __post_init__(self) -> None:
@@ -160,20 +165,9 @@ class Readings:
         if isinstance(rows, (int, np.integer)):
             rows = np.arange(len(self))[[rows]]
 
-        def chosen(column: FloatArray | None) -> FloatArray | None:
-            return None if column is None else column[rows]
-
-        return Readings(
-            self.values_T[rows],
-            time_s=self.time_s[rows],
-            array_position_m=chosen(self.array_position_m),
-            array_rotation=None if self.array_rotation is None else self.array_rotation[rows],
-            ambient_T=chosen(self.ambient_T),
-            motion=None if self.motion is None else self.motion.of_rows(rows),
-            pose_sigma=chosen(self.pose_sigma),
-            interpolated_m=chosen(self.interpolated_m),
-            background=self.background,
-        )
+        columns: dict[str, Any] = {name: getattr(self, name) for name in ("values_T", *_ROW_SHAPES, "array_rotation")}
+        chosen = {name: column[rows] for name, column in columns.items() if column is not None}
+        return replace(self, motion=None if self.motion is None else self.motion.of_rows(rows), **chosen)
 
     def __iter__(self) -> Iterator[Readings]:
         return (self[row] for row in range(len(self)))
@@ -284,6 +278,8 @@ def read_readings(
     """
     form = log_format(array, sensors)
     table, error_m = without_gaps(form.table(read_text(path, "a CSV file", form.encoding), str(path)))
+    if array.columns is not None and array.columns.course:
+        table = turned_to_course(table)
     readings = replace(readings_of_table(table, array, sensors), interpolated_m=error_m)
     if array.columns is not None and array.columns.pose_latency_s:
         readings = readings.posed_later(array.columns.pose_latency_s)
@@ -337,6 +333,7 @@ def readings_of_checked(table: Table, array: SensorArray) -> Readings:
         ambient_T=ambient_T,
         motion=motion,
         pose_sigma=pose_sigma,
+        lines=line_starts(table),
     )
 
 

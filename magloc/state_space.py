@@ -353,6 +353,7 @@ class IteratedExtendedKalmanFilter:
         Parameters
         ----------
         z : array_like, shape (k,)
+            Measurement.
         HJacobian, Hx : callable
             Jacobian (k, n) and prediction (k,) of a state (n,).
         R : array_like, optional

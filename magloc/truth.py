@@ -1,16 +1,18 @@
 """True positions and moments of a source: truth files, and their values at the rows of readings.
 
-A truth file is CSV with ``time_s, x_m, y_m[, z_m][, mx_Am2, my_Am2, mz_Am2]``, one row per instant.
+A truth file is CSV with ``time_s, x_m, y_m[, z_m][, mx_Am2, my_Am2, mz_Am2][, sigma_m]``, one row per instant. For a
+moment of unknown strength ``axis_x, axis_y, axis_z`` stand in place of the moment.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from os import PathLike
+from typing import Any
 
 import numpy as np
 
-from arrays.io.csv import Column, read_table
+from arrays.io.csv import Column, Table, read_table
 from arrays.io.errors import InputError
 from arrays.io.results import Quantity
 from arrays.typing import FloatArray, IntArray
@@ -18,6 +20,7 @@ from magloc.readings import Readings
 
 TRUE_POSITION_COLUMNS = ("x_m", "y_m", "z_m")
 TRUE_MOMENT_COLUMNS = ("mx_Am2", "my_Am2", "mz_Am2")
+TRUE_AXIS_COLUMNS = ("axis_x", "axis_y", "axis_z")
 STATE_COLUMNS = TRUE_POSITION_COLUMNS + TRUE_MOMENT_COLUMNS
 STATE_QUANTITIES = {
     "time_s": Quantity("s", "time"),
@@ -29,6 +32,8 @@ STATE_QUANTITIES = {
 SAME_TIME_S = 1e-6
 # Longest interval of the truth that is interpolated, in usual intervals.
 _LONGEST_STEP = 2.0
+# Rounding of a unit vector in a file.
+_UNIT_WITHIN = 1e-2
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +50,10 @@ class Truth:
         Moment of the source [A·m²].
     name : str
         Name in error messages, usually the file's path.
+    axis : ndarray, shape (n, 3), optional
+        Direction of a moment of unknown strength, unit vectors.
+    sigma_m : ndarray, shape (n,), optional
+        Standard deviation of the truth's own position, per axis [m]; exact without it.
 
     Examples
     --------
@@ -58,6 +67,8 @@ class Truth:
     position_m: FloatArray
     moment_Am2: FloatArray | None = None
     name: str = "truth"
+    axis: FloatArray | None = None
+    sigma_m: FloatArray | None = None
 
 
 def read_truth(path: str | PathLike[str]) -> Truth:
@@ -67,6 +78,11 @@ def read_truth(path: str | PathLike[str]) -> Truth:
     ----------
     path : str or path-like
         A truth file (CSV) with ``time_s``, ``x_m``, ``y_m`` and optionally the other columns.
+
+    Returns
+    -------
+    Truth
+        True positions [m] and, if the file has them, moments [A·m²].
 
     Raises
     ------
@@ -81,7 +97,7 @@ def read_truth(path: str | PathLike[str]) -> Truth:
     (101, 3)
     """
     table = read_table(path, "a header with time_s, x_m and y_m")
-    known = ("time_s", *TRUE_POSITION_COLUMNS, *TRUE_MOMENT_COLUMNS)
+    known = ("time_s", *TRUE_POSITION_COLUMNS, *TRUE_MOMENT_COLUMNS, *TRUE_AXIS_COLUMNS, "sigma_m")
     for name in ("time_s", "x_m", "y_m"):
         table.require(name, known)
     table.refuse_unknown(known)
@@ -90,7 +106,30 @@ def read_truth(path: str | PathLike[str]) -> Truth:
     columns = TRUE_POSITION_COLUMNS if "z_m" in table.header else TRUE_POSITION_COLUMNS[:2]
     position_m[:, : len(columns)] = table.complete(columns)
     moment_Am2 = table.complete(TRUE_MOMENT_COLUMNS) if table.has_group(TRUE_MOMENT_COLUMNS) else None
-    return Truth(time_s, position_m, moment_Am2, str(path))
+    return Truth(time_s, position_m, moment_Am2, str(path), _axes(table, moment_Am2 is not None), _sigmas(table))
+
+
+def _axes(table: Table, moments: bool) -> FloatArray | None:
+    """Return the axes of a moment of unknown strength, exactly of unit length."""
+    if not table.has_group(TRUE_AXIS_COLUMNS):
+        return None
+    if moments:
+        raise InputError(f"{table.path}: found moments and axes, expected mx_Am2 … mz_Am2 or axis_x … axis_z.")
+    axis = table.complete(TRUE_AXIS_COLUMNS)
+    length = np.linalg.norm(axis, axis=1)
+    bad = np.flatnonzero(np.abs(length - 1.0) > _UNIT_WITHIN)
+    if bad.size:
+        place = table.place(int(bad[0]), "axis_x")
+        raise InputError(f"{place}: found an axis of length {length[bad[0]]:.3g}, expected a unit vector.")
+    return axis / length[:, None]
+
+
+def _sigmas(table: Table) -> FloatArray | None:
+    if "sigma_m" not in table.header:
+        return None
+    sigma_m = table.complete(("sigma_m",))[:, 0]
+    table.refuse((sigma_m < 0.0)[:, None], ("sigma_m",), "found a negative number, expected a standard deviation")
+    return sigma_m
 
 
 def rows_of_same_time(readings: Readings, truth: Truth) -> tuple[IntArray, IntArray]:
@@ -109,8 +148,8 @@ def nearest_rows(wanted_s: FloatArray, time_s: FloatArray) -> IntArray:
     return np.where(np.abs(wanted_s - time_s[before]) <= np.abs(time_s[after] - wanted_s), before, after)
 
 
-def truth_of_rows(readings: Readings, truth: Truth) -> tuple[FloatArray, FloatArray | None]:
-    """Return true positions and moments of rows (n, 3), interpolated but not over gaps; NaN without a truth."""
+def truth_of_rows(readings: Readings, truth: Truth) -> Truth:
+    """Return the truth at the rows of readings, interpolated but not over gaps; NaN where there is none."""
     order = np.argsort(truth.time_s, kind="stable")
     times, wanted = truth.time_s[order], readings.time_s
     after = np.clip(np.searchsorted(times, wanted - SAME_TIME_S), 0, len(times) - 1)
@@ -121,14 +160,16 @@ def truth_of_rows(readings: Readings, truth: Truth) -> tuple[FloatArray, FloatAr
     known = exact | ((times[before] <= wanted) & (wanted <= times[after]) & (length <= longest))
     if not known.any():
         raise InputError(f"{truth.name}: found none of the times of the readings, expected rows with the same time_s.")
-    share = np.divide(wanted - times[before], length, out=np.zeros_like(wanted), where=length > 0.0)[:, None]
+    share = np.divide(wanted - times[before], length, out=np.zeros_like(wanted), where=length > 0.0)
 
-    def of_rows(values: FloatArray) -> FloatArray:
-        values = values[order]
-        between = values[before] + share * (values[after] - values[before])
-        return np.asarray(np.where(known[:, None], between, np.nan))
+    def of_rows(values: FloatArray | None) -> Any:
+        if values is None:
+            return None
+        first, last = values[order[before]].T, values[order[after]].T
+        return np.where(known, first + share * (last - first), np.nan).T
 
-    return of_rows(truth.position_m), None if truth.moment_Am2 is None else of_rows(truth.moment_Am2)
+    position_m, moment_Am2, sigma_m = map(of_rows, (truth.position_m, truth.moment_Am2, truth.sigma_m))
+    return Truth(wanted, position_m, moment_Am2, truth.name, sigma_m=sigma_m)
 
 
 def state_columns(position_m: FloatArray, moment_Am2: FloatArray, covariance: FloatArray) -> dict[str, Column]:

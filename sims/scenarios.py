@@ -31,6 +31,11 @@ def read_scenario(name_or_path: str) -> MagneticScenario | AttitudeScenario:
         Name of a built-in scenario of ``magloc simulate`` or ``adcs run``, or a TOML file of either: with a table
         ``satellite`` it is of a satellite.
 
+    Returns
+    -------
+    MagneticScenario or AttitudeScenario
+        Scenario of the file.
+
     Raises
     ------
     InputError

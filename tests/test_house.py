@@ -55,7 +55,7 @@ class TestPublicNames:
     def test_each_has_a_user(self, package: str) -> None:
         """A command, a page or a notebook; the reference lists all of them, and uses none."""
         reading = [path for path in pages() if "reference" not in path.relative_to(REPOSITORY).parts]
-        users = [path for other in PACKAGES for path in (REPOSITORY / other / "cli").glob("*.py")] + reading
+        users = [path for other in PACKAGES for path in (REPOSITORY / other / "cli").rglob("*.py")] + reading
         words = {word for path in users for word in re.findall(r"\w+", path.read_text(encoding="utf-8"))}
         assert sorted(set(importlib.import_module(package).__all__) - words) == []
 
@@ -111,7 +111,7 @@ def pages() -> list[Path]:
 
 def test_names_in_pages_are_there() -> None:
     dotted = re.compile(r"\b(?<!tests\.)(?:arrays|magloc|adcs|sims)(?:\.[A-Za-z_]\w*)+")
-    files = (".h", ".hpp", ".csv", ".toml", ".png", ".gif", ".zarr", ".json", ".py", ".html", ".md")
+    files = (".h", ".hpp", ".csv", ".toml", ".png", ".gif", ".zarr", ".json", ".py", ".html", ".md", ".txt")
     named = {name for page in pages() for name in dotted.findall(page.read_text(encoding="utf-8"))}
     found = {name for name in named if not name.endswith(files)}
     missing = []

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import ast
+import importlib
+import inspect
 import re
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from numpydoc.validate import validate
 
 from tests.conftest import REPOSITORY
 
@@ -145,3 +148,40 @@ class TestFirstWords:
     @pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.relative_to(REPOSITORY).as_posix())
     def test_of_docstrings_and_messages_are_clear(self, folder: Path) -> None:
         assert [text for path in sorted(folder.glob("*.py")) for text in unclear(path)] == []
+
+
+# Checks of numpydoc that do not apply: longer summaries are not always needed, the site adds "See also", and
+# tests/test_guide.py runs the examples and finds parameters of classes among their attributes.
+NOT_APPLIED = {"ES01", "EX01", "SA01"}
+# A method may have one line.
+NOT_APPLIED_TO_METHODS = {"PR01", "RT01", "YD01"}
+DOCUMENTED = ["arrays", "magloc", "adcs", "sims", "magloc.live", "magloc.viewer", "magloc.plots", "adcs.mockup"]
+
+
+def faults(name: str, not_applied: set[str]) -> list[str]:
+    """Faults that numpydoc finds in a docstring, but for checks that do not apply."""
+    found = validate(name)
+    if "Yields" in found["docstring"]:
+        not_applied = not_applied | {"RT01"}
+    return [f"{name}: {code} {text}" for code, text in found["errors"] if code not in not_applied]
+
+
+def test_faults_of_docstrings_are_found() -> None:
+    codes = {fault.split()[1] for fault in faults("tests.test_language.unclear", NOT_APPLIED)}
+    assert {"PR01", "RT01"} <= codes
+
+
+@pytest.mark.parametrize("package", [*DOCUMENTED, "sims.experiments"])
+def test_docstrings_of_public_names_are_complete(package: str) -> None:
+    module = importlib.import_module(package)
+    things = {f"{package}.{name}": getattr(module, name) for name in module.__all__}
+    found = []
+    for name, thing in things.items():
+        if inspect.isfunction(thing):
+            found += faults(name, NOT_APPLIED)
+        elif inspect.isclass(thing):
+            found += faults(name, NOT_APPLIED | {"PR01"})
+            methods = [part for part in vars(thing) if not part.startswith("_") and callable(getattr(thing, part))]
+            for method in methods:
+                found += faults(f"{name}.{method}", NOT_APPLIED | NOT_APPLIED_TO_METHODS)
+    assert found == []

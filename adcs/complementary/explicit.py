@@ -81,8 +81,10 @@ class Gains:
 
         Returns
         -------
-        kp_per_s, ki_per_s2 : float
-            K_P and K_I.
+        kp_per_s : float
+            Proportional gain K_P.
+        ki_per_s2 : float
+            Integral gain K_I.
         """
         if not outage:
             return self.kp_per_s, self.ki_per_s2

@@ -96,7 +96,7 @@ class HeadingModel:
     memory: float = 0.9
     patience_s: float = 0.35
     trial_s: float = 10.0
-    evidence: float = 10.0
+    evidence: float = 100.0
 
     def deviations(self) -> FloatArray:
         """Return the initial standard deviations of the states; the initial field points north.

@@ -24,7 +24,7 @@ from adcs.complementary.inertial.gaps import (
     window_scatter,
 )
 from adcs.complementary.inertial.integration import gyro_attitudes, level_attitudes, low_pass
-from adcs.complementary.inertial.level import GRAVITY_TIME_S, Steady, Up, direction_up
+from adcs.complementary.inertial.level import GRAVITY_TIME_S, TILT_FLOOR_RAD, Steady, Up, direction_up
 from adcs.complementary.inertial.misreadings import check_lengths, check_turns
 from adcs.satellite.conventions import median
 from adcs.satellite.telemetry import is_read
@@ -34,7 +34,6 @@ from arrays.io.values import numbers, seconds
 from arrays.typing import BoolArray, FloatArray
 from magloc import core
 
-_TILT_FLOOR_RAD = math.radians(0.4)
 _TURN_S = 0.5  # time for which a hand turns in one direction
 _USEFUL_TILT_RAD = math.radians(2.0)  # largest σ of the tilt with which the field is used
 _UP_STEP = 0.15  # part of the tilt's error that a step corrects; the direction up is already smooth
@@ -246,6 +245,7 @@ def prepare(
         start_tilt = float(up.sigma_rad[np.argmax(useful & read["magnetometer"])])
     else:
         del read["magnetometer"]
+    more_rad2 = up.sigma_rad**2 + (GRAVITY_TIME_S * bias_sigma) ** 2 + up.drift_rad**2
     hides = [np.sum(hidden[before + 1 : after + 1]) > LOST_RAD**2 for before, after in gaps]
     return PreparedReadings(
         time_s,
@@ -254,7 +254,7 @@ def prepare(
         field_T,
         q_level,
         lag,
-        _tilt_sigma_rad(dt_s, rate, up.hidden_rad2, model, np.hypot(up.sigma_rad, GRAVITY_TIME_S * bias_sigma)),
+        _tilt_sigma_rad(dt_s, rate, up.hidden_rad2, model, np.sqrt(more_rad2)),
         up.hidden_rad2,
         start_tilt,
         bias_sigma,
@@ -297,7 +297,7 @@ def _tilt_sigma_rad(
     """Return σ of the tilt from the accelerometer, the gyro's scale and the delay of the low-pass."""
     squares = (model.gyro_scale**2 * np.einsum("ni,ni->n", rate, rate) + hidden_rad2 / _TURN_S**2)[:, None]
     smooth = low_pass(squares, dt_s, GRAVITY_TIME_S, squares[0])[:, 0]
-    sigma = np.sqrt(_TILT_FLOOR_RAD**2 + _TURN_S**2 * np.maximum(smooth, 0.0) + np.square(more_rad))
+    sigma = np.sqrt(TILT_FLOOR_RAD**2 + _TURN_S**2 * np.maximum(smooth, 0.0) + np.square(more_rad))
     return np.minimum(sigma, UNKNOWN_RAD)
 
 

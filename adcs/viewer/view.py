@@ -56,6 +56,11 @@ def view(
     title : str
         Title of the page; by default that of the track.
 
+    Returns
+    -------
+    View
+        The open page, or the one that was written.
+
     Raises
     ------
     ValueError

@@ -16,17 +16,16 @@ from array import array as packed
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from io import FileIO
 from os import PathLike
 from pathlib import Path
-from typing import Any, Protocol, Self
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from arrays.io.errors import LARGEST, InputError
 from arrays.io.text import read_text, write_text
-from arrays.io.values import SHOWN_CHARACTERS, numbers, seconds, unix_seconds
+from arrays.io.values import SHOWN_CHARACTERS, numbers, plain_numbers, seconds, unix_seconds
 from arrays.typing import FloatArray, IntArray
 
 _LOG = logging.getLogger(__name__)
@@ -58,6 +57,8 @@ class Table:
         Values; NaN for an empty cell.
     line_numbers : ndarray of int, shape (n,)
         Line of every row in an editor; for columns in memory the row, from 1.
+    labels : tuple of str
+        Names of survey lines by the numbers in a column for them; empty if the numbers are the names.
     """
 
     path: str
@@ -65,6 +66,7 @@ class Table:
     header_line: int | None
     values: FloatArray
     line_numbers: IntArray
+    labels: tuple[str, ...] = ()
 
     def row_place(self, row: int) -> str:
         """Return the place of a row, counted from 0, for an error."""
@@ -218,20 +220,22 @@ def table_of_text(
     first_line: int | None = None,
     only: Collection[str] | None = None,
     instant: Sequence[str] = (),
-    separator: str = ",",
-    decimal: str = ".",
+    marks: tuple[str, str] = (",", "."),
     head: Table | None = None,
     dummy: Collection[str] = (),
     ragged: bool = False,
     seconds_of: Callable[[str, str], str] = unix_seconds,
+    label: str | None = None,
 ) -> Table:
     """Return a table as :func:`read_table` does, from text; `name` is for errors.
 
-    ``first_line``: line of the first row in a longer text. ``head``: table with the header of the rows, for a text
-    without one. ``dummy``: words that become `DUMMY`, as ``*`` does. ``ragged``: rows may have more empty cells than
-    the header has columns, or end behind the last column that is read; the last row may be cut. ``seconds_of``:
-    function that reads an instant, as :func:`unix_seconds` does.
+    ``first_line``: line of the first row in a longer text. ``marks``: separator and decimal mark. ``head``: table with
+    the header of the rows, for a text without one. ``dummy``: words that become `DUMMY`, as ``*`` does. ``ragged``:
+    rows may have more empty cells than the header has columns, or end behind the last column that is read; the last row
+    may be cut. ``seconds_of``: function that reads an instant, as :func:`unix_seconds` does. ``label``: column of
+    names, whose cells become their numbers in ``labels``.
     """
+    separator, decimal = marks
     text = text.replace("\r\n", "\n").replace("\r", "\n")
     if "\0" in text:
         line = text.count("\n", 0, text.index("\0")) + 1
@@ -245,13 +249,18 @@ def table_of_text(
         if not cells:
             raise InputError(f"{name} is empty, expected {expected_header}.")
         header = _check_header(f"{name}, line {header_line}", cells, expected_header, separator)
-    # float() would also take 1_000 and digits of other scripts: only text without them may go through it directly.
-    read = float if text.isascii() and "_" not in text[text.find("\n") if head is None else 0 :] else _number
     kept = [i for i, column in enumerate(header) if only is None or column in only]
     chosen = tuple(header[i] for i in kept)
-    timed = [chosen.index(column) for column in instant if column in chosen]
-    values, line_numbers = packed("d"), packed("q")
     shift = 0 if first_line is None else first_line - header_line - 1
+    begin = _begin_of_line(text, header_line)
+    if label not in chosen and (plain := plain_numbers(text[begin:], separator, decimal, len(header))) is not None:
+        every, lines = plain
+        return Table(name, chosen, header_line, every[:, kept], lines + (header_line + 1 + shift))
+    # float() would also take 1_000 and digits of other scripts: only text without them may go through it directly.
+    read = float if text.isascii() and "_" not in text[begin:] else _number
+    timed = [chosen.index(column) for column in instant if column in chosen]
+    named, names = chosen.index(label) if label in chosen else -1, dict[str, str]()
+    values, line_numbers = packed("d"), packed("q")
     last, wrong = max(kept, default=-1), ""
     for row_line, cells in rows:
         line = row_line + shift
@@ -272,6 +281,8 @@ def table_of_text(
             place = f"{name}, line {line}, column {', '.join(instant)}"
             cells[timed[0]] = seconds_of(place, "T".join(cells[i].strip() for i in timed))
             cells[timed[-1]] = cells[timed[0]]
+        if named >= 0:
+            cells[named] = names.setdefault(cells[named].strip(), str(len(names)))
         try:
             found = [read(cell or "nan") for cell in cells]
         except ValueError:
@@ -285,7 +296,15 @@ def table_of_text(
     if not line_numbers:
         raise InputError(f"{name}, line {header_line}: found a header without rows, expected a row below it.")
     table = np.array(values).reshape(len(line_numbers), len(chosen))
-    return Table(name, chosen, header_line, table, np.array(line_numbers, dtype=np.int64))
+    return Table(name, chosen, header_line, table, np.array(line_numbers, dtype=np.int64), tuple(names))
+
+
+def _begin_of_line(text: str, number: int) -> int:
+    """Return the begin of the line behind a number of lines."""
+    begin = 0
+    for _ in range(number):
+        begin = text.find("\n", begin) + 1 or len(text)
+    return begin
 
 
 def _fit_row(cells: list[str], n: int, last: int) -> list[str]:
@@ -393,39 +412,6 @@ def csv_lines(columns: Mapping[str, Column]) -> list[str]:
     """Return the header and the rows of columns, as :func:`write_columns` writes them."""
     cells = [[_cell(value) for value in column] for column in columns.values()]
     return [",".join(columns), *(",".join(row) for row in zip(*cells, strict=True))]
-
-
-class GrowingTable:
-    """CSV file that grows by whole rows, so that an interruption leaves complete rows.
-
-    Parameters
-    ----------
-    path : Path
-        File; the first row replaces it.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._file: FileIO | None = None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._file is not None:
-            self._file.close()
-
-    def add(self, columns: Mapping[str, Column]) -> None:
-        """Write rows; the first rows set the names."""
-        header, *rows = csv_lines(columns)
-        try:
-            if self._file is None:
-                self._file = FileIO(self._path, "w")
-                rows.insert(0, header)
-            if rows:
-                self._file.write("\n".join([*rows, ""]).encode())
-        except OSError as error:
-            raise OSError(error.errno, error.strerror, str(self._path)) from None
 
 
 def _short_name(name: str) -> str:

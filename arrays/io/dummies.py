@@ -14,6 +14,7 @@ _ROUNDING = 1e-8
 _SQUARE_VANISHES = 1e-150
 _FEWEST = 10  # other readings that say that zeros, or a number that is repeated, are none
 _APART, _KNOWN_APART = 10.0, 3.0  # over the spread of the others, or over their size
+_MOST = 0.9  # quantile for size and spread of the others
 _ALONE, _MOST_NEAR = 0.5, 0.02  # share of other readings that are nearer than so much of the distance to the middle
 
 
@@ -62,16 +63,19 @@ def may_be_dummies(
 
 def _dummy_values(column: FloatArray, units: Sequence[float]) -> FloatArray:
     """Return the values of a column (n,) that are dummies."""
-    found, counts = np.unique(column[np.isfinite(column)], return_counts=True)
+    column = column[np.isfinite(column)]
+    if _is_free_of_dummies(np.abs(column), units):
+        return column[:0]
+    found, counts = np.unique(column, return_counts=True)
     known = np.zeros(len(found), np.bool_)
     for unit in units:
         known |= _is_known(np.abs(found) / unit)
     common = np.repeat(found, counts)[np.repeat(~known & (found != 0.0), counts)]
     if not len(common):
         return found[known]
-    middle, size = float(np.median(common)), float(np.quantile(np.abs(common), 0.9))
+    middle, size = float(np.median(common)), float(np.quantile(np.abs(common), _MOST))
     off = np.abs(found - middle)
-    spread = float(np.quantile(np.abs(common - middle), 0.9))
+    spread = float(np.quantile(np.abs(common - middle), _MOST))
     dummy = known & (off > _KNOWN_APART * spread)
     if len(common) >= _FEWEST:
         dummy |= (found == 0.0) & (off > _APART * spread)
@@ -80,6 +84,15 @@ def _dummy_values(column: FloatArray, units: Sequence[float]) -> FloatArray:
         near = np.abs(common - found[k]) < _ALONE * off[k]
         dummy[k] = (near & (common != found[k])).mean() <= _MOST_NEAR
     return np.asarray(found[dummy])
+
+
+def _is_free_of_dummies(size: FloatArray, units: Sequence[float]) -> bool:
+    """Return whether magnitudes (n,) have no zero, none as large as a known dummy, and none far above most others."""
+    if not len(size):
+        return True
+    largest, at = float(size.max()), int(_MOST * (len(size) - 1))
+    is_known = any(largest / unit > 0.9 * _NINES[0] for unit in units)
+    return not is_known and float(size.min()) > 0.0 and largest <= _APART * float(np.partition(size, at)[at])
 
 
 @np.errstate(over="ignore", invalid="ignore")

@@ -6,12 +6,16 @@ import logging
 import os
 import tempfile
 from collections.abc import Iterable, Mapping
+from io import FileIO
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Self
 
 from arrays.io.closing import delay_signals
 from arrays.io.errors import InputError
 from arrays.io.lazy import by_name
+
+if TYPE_CHECKING:
+    from arrays.io.csv import Column
 
 _LOG = logging.getLogger(__name__)
 
@@ -120,3 +124,38 @@ def installed_version() -> str:
         return metadata.version("magloc")
     except metadata.PackageNotFoundError:
         return "unknown (not installed)"
+
+
+class GrowingTable:
+    """CSV file that grows by whole rows, so that an interruption leaves complete rows.
+
+    Parameters
+    ----------
+    path : Path
+        File; the first row replaces it.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._file: FileIO | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._file is not None:
+            self._file.close()
+
+    def add(self, columns: Mapping[str, Column]) -> None:
+        """Write rows; the first rows set the names."""
+        from arrays.io.csv import csv_lines
+
+        header, *rows = csv_lines(columns)
+        try:
+            if self._file is None:
+                self._file = FileIO(self._path, "w")
+                rows.insert(0, header)
+            if rows:
+                self._file.write("\n".join([*rows, ""]).encode())
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(self._path)) from None

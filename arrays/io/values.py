@@ -7,6 +7,7 @@ import re
 import warnings
 from collections.abc import Callable
 from functools import wraps
+from operator import methodcaller
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 from arrays.io.errors import InputError
@@ -19,7 +20,7 @@ LARGEST_T = 1e6
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from arrays.typing import FloatArray, Rng
+    from arrays.typing import FloatArray, IntArray, Rng
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
@@ -87,6 +88,35 @@ def unix_seconds(place: str, cell: str) -> str:
         found = repr(cell.strip()[:SHOWN_CHARACTERS])
         raise InputError(f"{place}: found {found}, expected a time such as 2026-11-21T12:00:00.5 (UTC).") from None
     return repr((instant if instant.tzinfo else instant.replace(tzinfo=datetime.UTC)).timestamp())
+
+
+def plain_numbers(text: str, separator: str, decimal: str, columns: int) -> tuple[FloatArray, IntArray] | None:
+    """Return the numbers (n, columns) of a text of nothing but numbers, and their lines (n,) from 0.
+
+    None for a text with other or empty cells, or with rows of other lengths; blank lines do not matter.
+    """
+    import numpy as np
+
+    if not text.isascii() or separator == " " or decimal == separator:
+        return None
+    data = text.encode()
+    if data.translate(None, f"0123456789+-eE\n{separator}{decimal}".encode()):
+        return None
+    lines = data.split(b"\n")
+    cells = np.fromiter(map(methodcaller("count", separator.encode()), lines), np.int64, len(lines)) + 1
+    filled = np.flatnonzero(np.fromiter(map(len, lines), np.int64, len(lines)))
+    if not len(filled) or (cells[filled] != columns).any():
+        return None
+    comma = separator.encode()
+    joined = comma.join(filter(None, lines)).replace(decimal.encode(), b".")
+    if comma + comma in joined or joined.startswith(comma) or joined.endswith(comma):
+        return None
+    try:
+        with warnings.catch_warnings(action="ignore"):  # it warns of text that is no number, and stops there
+            values = np.fromstring(joined, sep=separator)
+    except ValueError:
+        return None
+    return (values.reshape(-1, columns), filled) if values.size == columns * len(filled) else None
 
 
 def seed_of(rng: Rng) -> int:

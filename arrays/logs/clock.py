@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import logging
 import re
 
@@ -15,8 +16,12 @@ from arrays.typing import FloatArray
 
 _LOG = logging.getLogger(__name__)
 _TIME_OF_DAY = re.compile(r"(\d{1,2}):(\d{2})(?::(\d{2}(?:[.,]\d*)?))?")
-_OTHER_DATE = re.compile(r"(\d{1,2})[./-](\d{1,2})[./-](\d{4})[T ]?")
+_OTHER_DATE = re.compile(r"(\d{1,2})[./-](\d{1,2})[./-](\d{4}|\d{2})(?!\d)[T ]*")
+_NAMED_MONTH = re.compile(r"(\d{1,2})[ ./-]*([A-Za-z]{3})[a-z]*[ ./-]*(\d{4}|\d{2})(?!\d)[T ]*")
+_MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
+_FIRST_YEAR = 1970  # a year of two digits is in the hundred years from here
 _DAY_S = 86400.0
+_FIRST_DATE_S = 3e8  # before it, 1979, clocks count from their own start
 
 
 def seconds_of_cell(place: str, cell: str, columns: LogColumns) -> str:
@@ -26,19 +31,29 @@ def seconds_of_cell(place: str, cell: str, columns: LogColumns) -> str:
         hours, minutes, seconds = int(found[1]), int(found[2]), float((found[3] or "0").replace(",", "."))
         if hours < 24 and minutes < 60 and seconds < 61.0:
             return repr(3600.0 * hours + 60.0 * minutes + seconds)
-    if found := _OTHER_DATE.match(text):
+    if (found := _NAMED_MONTH.match(text)) and found[2].lower() in _MONTHS:
+        text = _iso(found[3], _MONTHS.index(found[2].lower()) + 1, found[1], text[found.end() :])
+    elif found := _OTHER_DATE.match(text):
         if columns.day_first is None:
             raise InputError(
                 f"{place}: found {text!r}, which may begin with the day or the month, expected day_first = true or"
                 " false in the table columns of the array file."
             )
         day, month = (found[1], found[2]) if columns.day_first else (found[2], found[1])
-        text = f"{found[3]}-{int(month):02d}-{int(day):02d}T{text[found.end() :]}"
+        text = _iso(found[3], int(month), day, text[found.end() :])
     return unix_seconds(place, text)
+
+
+def _iso(year: str, month: int, day: str, rest: str) -> str:
+    """Return an instant as ISO 8601 has it."""
+    whole = int(year) if len(year) == 4 else _FIRST_YEAR + (int(year) - _FIRST_YEAR) % 100
+    return f"{whole}-{month:02d}-{int(day):02d}T{rest or '00:00'}"
 
 
 def seconds_of_rows(table: Table, columns: LogColumns, *, is_file: bool) -> FloatArray:
     """Return the times (n,) [s] of the rows of a log, which may pass midnight or share seconds."""
+    if not columns.clock:
+        return np.arange(float(len(table.values)))
     name = columns.clock[0]
     stamps = table.complete([name])[:, 0]
     if columns.time_unit == "hhmmss":
@@ -49,10 +64,12 @@ def seconds_of_rows(table: Table, columns: LogColumns, *, is_file: bool) -> Floa
     else:
         time_s = SECONDS[columns.time_unit] * stamps
     of_day = bool(columns.time_unit in ("iso", "hhmmss") and (np.abs(time_s) < _DAY_S + 1.0).all())
-    if columns.date is not None and not of_day:
-        place = table.header_place(name)
-        raise InputError(f"{place}: found dates, expected times of day beside date = {columns.date!r}.")
     date_s = float(unix_seconds("", columns.date)) if columns.date is not None else 0.0
+    if columns.date is not None and not of_day:
+        if len(time_s) and not -_DAY_S < time_s[0] - date_s < 2.0 * _DAY_S:
+            found = date_of(time_s[0]) if columns.time_unit == "iso" else "no times of day"
+            raise InputError(f"{table.header_place(name)}: found {found}, expected the date {columns.date}.")
+        date_s = 0.0
     if not is_file:
         return time_s + date_s
     days = np.cumsum(np.diff(time_s, prepend=time_s[:1]) < -_DAY_S / 2.0) if of_day else np.zeros(len(time_s))
@@ -65,6 +82,13 @@ def seconds_of_rows(table: Table, columns: LogColumns, *, is_file: bool) -> Floa
     if not days.any():
         table.complete_and_distinct(name)
     return time_s + _DAY_S * days + date_s
+
+
+def date_of(time_s: float) -> str | None:
+    """Return the date of an instant (UTC), such as 2026-05-12; None for times that count from elsewhere."""
+    if not time_s > _FIRST_DATE_S:
+        return None
+    return datetime.datetime.fromtimestamp(time_s, datetime.UTC).date().isoformat()
 
 
 def _spread(time_s: FloatArray) -> FloatArray | None:

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from os import PathLike
 
 import numpy as np
 
-from arrays.columns import POSITION_COLUMNS, ROTATION_COLUMNS, SECONDS, SEPARATORS, LogColumns
+from arrays.columns import LINE, POSITION_COLUMNS, ROTATION_COLUMNS, SECONDS, SEPARATORS, LogColumns
 from arrays.io.csv import DUMMY, Table, table_of_header, table_of_text
 from arrays.io.dummies import dummy_cells, may_be_dummies
 from arrays.io.errors import InputError
 from arrays.io.text import read_text
-from arrays.logs.clock import seconds_of_cell, seconds_of_rows
+from arrays.logs.clock import date_of, seconds_of_cell, seconds_of_rows
 from arrays.logs.lines import cells_of, header_and_rows
 from arrays.logs.places import array_origins, geodetic_places, positions, quaternions
 from arrays.typing import FloatArray, Vector
@@ -60,7 +60,7 @@ class LogFormat:
         """Return whether a line names columns, including the time."""
         if self.columns is None:
             return "time_s" in line
-        return self.columns.clock[0] in cells_of(line, self.columns)
+        return set(self.columns.clock[:1]) <= set(cells_of(line, self.columns))
 
     def clock(self, header: str) -> Callable[[str], float]:
         """Return a function of the time [s] of a row; ValueError or IndexError for a row without one."""
@@ -95,17 +95,25 @@ class LogFormat:
         return self.translate(self.table_of_log(text, name, self.columns, first_line=first_line, head=head))
 
     def table_of_log(
-        self, text: str, name: str, columns: LogColumns, *, first_line: int | None = None, head: Table | None = None
+        self,
+        text: str,
+        name: str,
+        columns: LogColumns,
+        *,
+        first_line: int | None = None,
+        head: Table | None = None,
+        quiet: bool = False,
     ) -> Table:
         """Return the table of a log's text, with the names and units of the log."""
         if columns.separator == "space":
             text = text.replace("\t", " ")
-        line = 0
+        line, labels = 0, list[tuple[int, str]]()
         if head is None:
             text = text.replace("\r\n", "\n").replace("\r", "\n").removeprefix("\ufeff")
-            head, text = header_and_rows(text, name, columns, self._theirs(columns), self._is_time)
+            head, text, first_line, labels = header_and_rows(
+                text, name, columns, self._theirs(columns), self._is_time, quiet=quiet
+            )
             line = head.header_line or 0
-            first_line = line + 1
         table = table_of_text(
             text,
             name,
@@ -114,12 +122,17 @@ class LogFormat:
             only={*self._theirs(columns), *self._own, *self.others},
             instant=columns.clock if columns.time_unit == "iso" else (),
             seconds_of=partial(seconds_of_cell, columns=columns),
-            separator=self.separator,
-            decimal=columns.decimal,
+            marks=(self.separator, columns.decimal),
             head=head,
             dummy=[each for each in columns.dummy if isinstance(each, str)],
             ragged=True,
+            label=columns.line,
         )
+        if labels and columns.line is None:
+            lines, names = zip(*labels, strict=True)
+            of_row = np.searchsorted(lines, table.line_numbers).astype(np.float64)  # 0 before the first name
+            values = np.column_stack([table.values, of_row])
+            table = replace(table, header=(*table.header, LINE), values=values, labels=("", *names))
         return replace(table, header_line=line)
 
     def _is_time(self, cells: list[str]) -> bool:
@@ -154,6 +167,9 @@ class LogFormat:
                 _LOG.warning(f"{logged.path}: the readings of {unusable.sum()} rows have {fault} and are left out")
         readings = {name: np.where(unusable, np.nan, columns.unit_nT * found[name]) for name in own & found.keys()}
         found |= {name: np.where(found[name] == DUMMY, DUMMY, of) for name, of in readings.items()}
+        label = columns.line or LINE
+        if label in index and (columns.line or logged.labels):
+            found[LINE] = logged.values[:, index[label]]
         found["time_s"] = seconds_of_rows(logged, columns, is_file=is_file)
         if columns.place:
             found |= zip(POSITION_COLUMNS, positions(logged, columns, is_file=is_file).T, strict=True)
@@ -167,7 +183,7 @@ class LogFormat:
             place, turn = (np.stack([found[name] for name in of], 1) for of in (POSITION_COLUMNS, ROTATION_COLUMNS))
             found |= zip(POSITION_COLUMNS, array_origins(place, turn, columns).T, strict=True)
         values = np.stack([*found.values()], axis=1)
-        return Table(logged.path, tuple(found), logged.header_line, values, logged.line_numbers)
+        return Table(logged.path, tuple(found), logged.header_line, values, logged.line_numbers, logged.labels)
 
     @property
     def _own(self) -> set[str]:
@@ -176,6 +192,7 @@ class LogFormat:
     def _theirs(self, columns: LogColumns) -> tuple[str, ...]:
         flags = [rows.column for rows in (columns.valid, columns.fix) if rows is not None]
         named = columns.of_sensors(self.channels).values()
+        flags += [columns.line] if columns.line is not None else []
         return tuple(dict.fromkeys((*columns.clock, *named, *columns.place, *columns.attitude, *flags)))
 
 
@@ -189,18 +206,28 @@ def log_origin(path: str | PathLike[str], columns: LogColumns) -> Vector:
     InputError
         The log cannot be read, or has no place.
     """
-    text = read_text(path, "a CSV file", columns.encoding)
-    begin = text[: text.rfind("\n", 0, _BEGIN_CHARACTERS) + 1]  # long enough for a fix
-    for part in (begin, text) if len(begin) < len(text) and begin else (text,):
-        table = LogFormat({}, columns, "the columns that the array file names", ()).table_of_log(
-            part, str(path), columns
-        )
+    for table in _begins(path, columns):
         place = geodetic_places(table, columns, is_file=True)
         known = place[np.isfinite(place).all(axis=1)]
         if len(known):
             latitude, longitude, height = known[0].tolist()
             return latitude, longitude, 0.0 if columns.above_ground else height
     raise InputError(f"{path}: found no row with a place, expected one.")
+
+
+def log_date(path: str | PathLike[str], columns: LogColumns) -> str | None:
+    """Return the date of the first row of a log, such as 2026-05-12; None if its times have no date."""
+    table = next(_begins(path, replace(columns, sensors={})))
+    return date_of(float(seconds_of_rows(table, columns, is_file=False)[0]))
+
+
+def _begins(path: str | PathLike[str], columns: LogColumns) -> Iterator[Table]:
+    """Yield the table of the begin of a log, and then of all of it."""
+    text = read_text(path, "a CSV file", columns.encoding)
+    begin = text[: text.rfind("\n", 0, _BEGIN_CHARACTERS) + 1]  # long enough for a fix
+    for part in (begin, text) if len(begin) < len(text) and begin else (text,):
+        form = LogFormat({}, columns, "the columns that the array file names", ())
+        yield form.table_of_log(part, str(path), columns, quiet=True)
 
 
 READINGS_FILE = LogFormat({}, None, "", ())

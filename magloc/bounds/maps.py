@@ -246,9 +246,12 @@ def bound_map(
     body_length_m : float, optional
         Length of every source; the deviation of its field from a dipole counts as noise. By default a quarter of its
         distance near the array, as in :func:`magloc.locate`; 0 for points.
-    out, scheduler, progress
-        See :func:`magloc.grids.computed.computed_map`: a zarr folder that streams and resumes, the address of a dask
-        scheduler, and a call with the number of sources finished.
+    out : path-like, optional
+        Folder of a zarr store for the map. Finished parts that it has are not computed again.
+    scheduler : str, optional
+        Address of a dask scheduler, whose workers compute the map.
+    progress : callable, optional
+        Called with the number of sources finished since the last call.
 
     Returns
     -------

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -107,7 +107,9 @@ def calibrate_on_path(
     readings_T: ArrayLike,
     position_m: ArrayLike,
     *,
+    position_sigma_m: ArrayLike | None = None,
     moment_Am2: ArrayLike | None = None,
+    axis: ArrayLike | None = None,
     moment: Literal["constant", "free"] = "constant",
     unknown_height: bool = False,
     prior: CalibrationPrior = CalibrationPrior(),
@@ -115,13 +117,20 @@ def calibrate_on_path(
 ) -> SourceCalibration:
     """Calibrate by a source at known positions (n, 3) in the array's frame.
 
-    With `unknown_height` a constant is added to all positions along the world's z, and estimated.
+    With `unknown_height` a constant is added to all positions along the world's z, and estimated. With
+    `position_sigma_m` (n,) the positions have errors of that standard deviation per axis, and are estimated too. With
+    `axis` (n, 3), unit vectors in the world frame, the moment has these directions and one unknown strength.
     """
     readings, attitude = _check_inputs(array, readings_T, world_from_array)
     position = _check_vectors("position_m", position_m, len(readings))
     known = None if moment_Am2 is None else _check_vectors("moment_Am2", moment_Am2, len(readings))
     model: MomentKind = moment if known is None else "known"
-    problem = _problem(array, readings, attitude, prior, False, unknown_height, model)
+    problem = _problem(array, readings, attitude, prior, position_sigma_m is not None, unknown_height, model)
+    if position_sigma_m is not None:
+        sigma_m = np.broadcast_to(np.asarray(position_sigma_m, dtype=np.float64), len(readings))
+        problem = replace(problem, path_m=position, path_sigma_m=sigma_m)
+    if axis is not None:
+        problem = replace(problem, moment="axis", axis=_check_vectors("axis", axis, len(readings)))
     rows = _usable_rows(problem)
     problem = _select_rows(problem, rows)
     _check_counts(problem)
@@ -210,26 +219,19 @@ def _problem(
 
 def _usable_rows(problem: CalibrationProblem) -> BoolArray:
     """Return which rows have more readings than unknowns of their own."""
-    return np.isfinite(problem.readings_T).sum(axis=1) > problem.n_row_unknowns
+    unknown = problem.n_row_unknowns - 3 * (problem.path_sigma_m is not None)
+    return np.isfinite(problem.readings_T).sum(axis=1) > unknown
 
 
 def _select_rows(problem: CalibrationProblem, rows: BoolArray) -> CalibrationProblem:
-    return replace(
-        problem,
-        readings_T=problem.readings_T[rows],
-        noise_T=problem.noise_T[rows],
-        world_from_array=problem.world_from_array[rows],
-    )
-
-
-def _n_readings(problem: CalibrationProblem) -> int:
-    """Return the number of readings minus the unknowns of the rows."""
-    unknown = problem.n_row_unknowns - 3 * (problem.array.common_field_T is not None)
-    return int(np.isfinite(problem.readings_T).sum()) - unknown * len(problem.readings_T)
+    names = ("readings_T", "noise_T", "world_from_array", "path_m", "path_sigma_m", "axis")
+    of_rows = {name: getattr(problem, name) for name in names}
+    chosen: dict[str, Any] = {name: values[rows] for name, values in of_rows.items() if values is not None}
+    return replace(problem, **chosen)
 
 
 def _check_counts(problem: CalibrationProblem) -> None:
-    unknowns, left = len(problem.estimated_indices), _n_readings(problem)
+    unknowns, left = len(problem.estimated_indices), problem.n_numbers
     if left < unknowns:
         raise ValueError(
             f"Input readings_T must have more readings than unknowns; instead {len(problem.readings_T)} usable rows "
@@ -242,10 +244,11 @@ def _result(
 ) -> SourceCalibration:
     problem, optimum = fitted
     state = optimum.point.state
-    nominal = replace(problem, free=np.zeros_like(problem.free))
+    stated = replace(problem, noise_scale=1.0)
+    nominal = replace(stated, free=np.zeros_like(problem.free))
     nominal_sensors = replace(state, sensors=np.zeros_like(state.sensors))
     before = source_fit.fit_state(nominal, nominal_sensors, max_iterations=_ITERATIONS_BEFORE)
-    after = moving_source.chi2(problem, state)
+    after = moving_source.chi2(stated, state)
     told = source_fit.information_of_sensors(problem, state)
     n = len(told)
     values, vectors = np.linalg.eigh(told)
@@ -254,7 +257,7 @@ def _result(
     deviation = np.zeros(problem.prior.shape)
     deviation[problem.free] = np.sqrt(np.diagonal(covariance))
     told_numbers = n - float(np.trace(relative))
-    residual = moving_source.residuals(problem, state) * problem.noise_T
+    residual = moving_source.residuals(stated, state) * problem.noise_T
     squares = (residual**2).reshape(len(residual), -1, 3)
     counts = np.isfinite(problem.readings_T).reshape(squares.shape).sum(axis=(0, 2))
     array_from_world = np.swapaxes(problem.world_from_array, -1, -2)
@@ -266,8 +269,8 @@ def _result(
         rows=rows,
         chi2_before=moving_source.chi2(nominal, before.point.state),
         chi2=after,
-        dof_before=_n_readings(problem) - problem.n_globals,
-        dof=_n_readings(problem) - problem.n_globals - told_numbers,
+        dof_before=problem.n_numbers - problem.n_globals,
+        dof=problem.n_numbers - problem.n_globals - told_numbers,
         residual_rms_T=np.sqrt(squares.sum(axis=(0, 2)) / np.maximum(counts, 1)),
         change=state.sensors,
         sigma=deviation,

@@ -45,7 +45,8 @@ def calibrate(
         Readings that saturate do not count.
     truth : Truth, optional
         Path of the source in the readings' frame; rows of the same time are used. A missing z is one unknown height for
-        all rows. Moments, where it has them, are taken as known.
+        all rows. Moments, where it has them, are taken as known; where it has their directions, one strength is
+        estimated. Its `sigma_m` counts.
     modulus_T : array_like, shape () or (n,), optional
         Modulus of the field in which the sensors were turned [T].
     moment : {"constant", "free"}, optional
@@ -83,7 +84,7 @@ def calibrate(
             raise ValueError("Input modulus_T must come without truth and moment: there is no source.")
         return _calibrate_by_turning(array, rows, np.asarray(modulus_T, dtype=np.float64))
     try:
-        result = _calibrate_by_source(array, rows, truth, moment, prior)
+        result = calibrate_by_source(array, rows, truth, moment, prior)
     except np.linalg.LinAlgError:
         raise ValueError(
             "Input readings must be those of a source that passes the sensors at a distance; instead the model cannot"
@@ -93,13 +94,14 @@ def calibrate(
     return result
 
 
-def _calibrate_by_source(
+def calibrate_by_source(
     array: SensorArray,
     rows: Readings,
     truth: Truth | None,
     moment: Literal["constant", "free"] | None,
     prior: CalibrationPrior,
 ) -> SourceCalibration:
+    """Calibrate by a moving source, with the parameters of :func:`calibrate` and without warnings."""
     model = moment or "constant"
     attitude = _world_from_array(rows)
     if truth is None:
@@ -112,11 +114,14 @@ def _calibrate_by_source(
     position[unknown, 2] = 0.0
     if rows.pose is not None:
         position = np.einsum("tba,tb->ta", attitude[in_readings], position - rows.pose[0][in_readings])
+    known = moment is None
     return calibrate_on_path(
         array,
         rows.values_T[in_readings],
         position,
-        moment_Am2=None if truth.moment_Am2 is None or moment is not None else truth.moment_Am2[in_truth],
+        position_sigma_m=None if truth.sigma_m is None else truth.sigma_m[in_truth],
+        moment_Am2=truth.moment_Am2[in_truth] if known and truth.moment_Am2 is not None else None,
+        axis=truth.axis[in_truth] if known and truth.axis is not None else None,
         moment=model,
         unknown_height=bool(np.isnan(truth.position_m[:, 2]).any()),
         prior=prior,

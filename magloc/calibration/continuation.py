@@ -6,6 +6,7 @@ long. Therefore the noise starts at what the prior allows for gains and offsets,
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -29,6 +30,7 @@ _ROUGHLY = 1.0
 _LARGEST_DOUBT = 0.3
 _BADLY = 20.0
 _NOISE_PASSES = 3
+_MISFIT = 2.0  # χ²/dof above which the stated noise is too small
 _HEIGHTS = np.concatenate([-np.geomspace(4.0, 0.05, 8), np.geomspace(0.05, 4.0, 8)])
 
 
@@ -130,7 +132,7 @@ def approach_optimum(
     for share in shares:
         lenient = inflate_noise(problem, state, share)
         optimum = source_fit.fit_state(lenient, state, tolerance=_ROUGHLY)
-        if problem.unknown_position:
+        if not problem.is_on_path:
             optimum = _relocate_misfits(lenient, optimum, share)
         state = optimum.point.state
     return state
@@ -152,10 +154,17 @@ def _relocate_misfits(
 def fit_calibration(
     problem: CalibrationProblem, start: CalibrationState
 ) -> tuple[CalibrationProblem, Optimum[CalibrationIterate]]:
-    """Return the problem with the noise at the optimum, and the optimum."""
+    """Return the problem with the noise at the optimum, and the optimum.
+
+    If residuals exceed the stated noise, priors count for as much as by the noise that the residuals show.
+    """
     state = approach_optimum(problem, start)
     for _ in range(_NOISE_PASSES if problem.array.noise_fractions.any() else 1):
         problem = inflate_noise(problem, state, 0.0)
         optimum = source_fit.fit_state(problem, state)
         state = optimum.point.state
+    excess = moving_source.chi2(problem, state) / max(1, problem.n_numbers - len(problem.estimated_indices))
+    if excess > _MISFIT:
+        problem = replace(problem, noise_scale=math.sqrt(excess))
+        optimum = source_fit.fit_state(problem, state)
     return problem, optimum

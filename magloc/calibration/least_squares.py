@@ -18,9 +18,9 @@ from magloc.calibration.model import (
     CalibrationProblem,
     CalibrationState,
     Linearisation,
-    common_weight,
     cost,
     linearise,
+    row_priors,
 )
 from magloc.least_squares import Optimum, damped_step, minimise
 
@@ -62,16 +62,15 @@ def eliminate_rows(
     """
     n_rows, n_channels, n = linear.by_row.shape
     n_sensors = problem.array.n_sensors
-    prior = np.zeros((3, n))
-    prior[:, -3:] = common_weight(problem) * np.eye(3)
-    size = np.sqrt(np.einsum("tcn,tcn->tn", linear.by_row, linear.by_row) + np.sum(prior**2, axis=0))
+    weight, deviation = row_priors(problem, state)
+    size = np.sqrt(np.einsum("tcn,tcn->tn", linear.by_row, linear.by_row) + weight**2)
     # An unknown without information keeps a column of its own, so that it does not change.
     damped = np.sqrt(damping) * np.where(size > 0.0, size, 1.0)[..., None] * np.eye(n)
-    stacked = np.concatenate([linear.by_row, np.broadcast_to(prior, (n_rows, 3, n)), damped], axis=1)
+    stacked = np.concatenate([linear.by_row, weight[..., None] * np.eye(n), damped], axis=1)
     q, r = np.linalg.qr(stacked)
     q_readings = q[:, :n_channels]
     row_gradient: FloatArray = np.einsum("tcn,tc->tn", q_readings, linear.residual)
-    row_gradient += np.einsum("tan,ta->tn", q[:, n_channels : n_channels + 3], state.common_T * common_weight(problem))
+    row_gradient += np.einsum("tan,ta->tn", q[:, n_channels : n_channels + n], weight * deviation)
 
     blocks = np.swapaxes(q_readings.reshape(n_rows, n_sensors, 3, n), -1, -2) @ linear.by_sensor
     by_row = np.concatenate(
@@ -175,6 +174,8 @@ def apply_step(
         moment = moment + of_rows[:, -6:-3]
     elif problem.moment == "constant":
         moment = moment + step[n : n + 3]
+    elif problem.axis is not None:
+        moment = moment + step[n] * problem.axis
     return CalibrationState(sensors, position, height, moment, state.common_T + of_rows[:, -3:])
 
 

@@ -19,12 +19,14 @@ from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray
 from magloc.fields import dipole
 
-MomentKind = Literal["constant", "free", "known"]
-"""The moment in the world frame: one unknown vector for all rows, one for every row, or known."""
+MomentKind = Literal["constant", "free", "known", "axis"]
+"""The moment in the world frame: one unknown vector for all rows, one for every row, known, or of known directions and
+one unknown strength."""
 PER_SENSOR = 15
 POSITION, GAINS, AXES, OFFSET = slice(0, 3), slice(3, 6), slice(6, 12), slice(12, 15)
 AXIS_PAIRS = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
 """Channel and component of the six axis unknowns."""
+_EXACT_M = 1e-7  # least standard deviation of a measured position
 _CHANNEL, _COMPONENT = (list(places) for places in zip(*AXIS_PAIRS, strict=True))
 
 
@@ -75,7 +77,15 @@ class CalibrationProblem:
         True if the rows' positions are unknown.
     unknown_height : bool
         True if one height of all rows, along the world's z, is unknown.
-    moment : {"constant", "free", "known"}
+    moment : {"constant", "free", "known", "axis"}
+    path_m : ndarray, shape (T, 3), optional
+        Measured positions of the rows in the array's frame; with `path_sigma_m` unknown positions have a prior.
+    path_sigma_m : ndarray, shape (T,), optional
+        Standard deviations of the measured positions.
+    axis : ndarray, shape (T, 3), optional
+        Directions of the moment in the world frame.
+    noise_scale : float
+        Factor by which residuals exceed the stated noise.
     """
 
     array: SensorArray
@@ -87,11 +97,30 @@ class CalibrationProblem:
     unknown_position: bool
     unknown_height: bool
     moment: MomentKind
+    path_m: FloatArray | None = None
+    path_sigma_m: FloatArray | None = None
+    axis: FloatArray | None = None
+    noise_scale: float = 1.0
+
+    @property
+    def is_on_path(self) -> bool:
+        """True if the positions of the rows are known or measured."""
+        return not self.unknown_position or self.path_sigma_m is not None
 
     @property
     def n_globals(self) -> int:
         """Number of unknowns that all rows share."""
-        return 3 * (self.moment == "constant") + self.unknown_height
+        return 3 * (self.moment == "constant") + (self.moment == "axis") + self.unknown_height
+
+    @property
+    def n_numbers(self) -> int:
+        """Number of readings and priors of the rows, minus the unknowns of the rows."""
+        return int(np.isfinite(self.readings_T).sum()) + (self.n_row_priors - self.n_row_unknowns) * len(self.noise_T)
+
+    @property
+    def n_row_priors(self) -> int:
+        """Number of unknowns of one row that have a prior."""
+        return 3 * (self.path_sigma_m is not None) + 3 * (self.array.common_field_T is not None)
 
     @property
     def n_row_unknowns(self) -> int:
@@ -167,13 +196,13 @@ def prediction_T(problem: CalibrationProblem, state: CalibrationState) -> FloatA
 def residuals(problem: CalibrationProblem, state: CalibrationState) -> FloatArray:
     """Return the whitened residuals of all readings, (T, C); zero where a reading is missing."""
     difference = prediction_T(problem, state) - problem.readings_T
-    return np.where(np.isfinite(problem.readings_T), difference / problem.noise_T, 0.0)
+    return np.where(np.isfinite(problem.readings_T), difference / (problem.noise_scale * problem.noise_T), 0.0)
 
 
 def chi2(problem: CalibrationProblem, state: CalibrationState) -> float:
-    """Return χ² of the readings, and of the prior of the common field if there is one."""
-    common = state.common_T * common_weight(problem)
-    return float(np.sum(residuals(problem, state) ** 2) + np.sum(common**2))
+    """Return χ² of the readings, and of the priors of the common field and of the path if there are some."""
+    weight, deviation = row_priors(problem, state)
+    return float(np.sum(residuals(problem, state) ** 2) + np.sum((weight * deviation) ** 2))
 
 
 def cost(problem: CalibrationProblem, state: CalibrationState) -> float:
@@ -186,7 +215,8 @@ def linearise(problem: CalibrationProblem, state: CalibrationState) -> Linearisa
     array = problem.array
     n_rows, n_sensors = len(state.position_m), array.n_sensors
     points, sources, moments = _geometry(problem, state)
-    weight = np.where(np.isfinite(problem.readings_T), 1.0 / problem.noise_T, 0.0).reshape(n_rows, n_sensors, 3, 1)
+    weight = np.where(np.isfinite(problem.readings_T), 1.0 / (problem.noise_scale * problem.noise_T), 0.0)
+    weight = weight.reshape(n_rows, n_sensors, 3, 1)
     response = weight * responses(problem, state)
     gradient = response @ dipole.gradient_tensor(points, sources, moments)
     by_moment = response @ dipole.field_matrix(points, sources)
@@ -205,8 +235,11 @@ def linearise(problem: CalibrationProblem, state: CalibrationState) -> Linearisa
     by_world_moment = by_moment @ array_from_world
     up = -gradient @ array_from_world[..., 2:]
     none = np.empty((n_rows, n_sensors, 3, 0))
+    by_moments = {"constant": by_world_moment}
+    if problem.axis is not None:
+        by_moments["axis"] = np.einsum("tnab,tb->tna", by_world_moment, problem.axis)[..., None]
     by_source = [
-        by_world_moment if problem.moment == "constant" else none,
+        by_moments.get(problem.moment, none),
         up if problem.unknown_height else none,
     ]
     by_row = [
@@ -232,7 +265,13 @@ def _geometry(problem: CalibrationProblem, state: CalibrationState) -> tuple[Flo
     return points, sources[:, None, :], moments[:, None, :]
 
 
-def common_weight(problem: CalibrationProblem) -> float:
-    """Return 1/σ of the common field [1/T], zero if nothing is known of it."""
-    sigma = problem.array.common_field_T
-    return 0.0 if sigma is None else 1.0 / max(sigma, 1e-15)
+def row_priors(problem: CalibrationProblem, state: CalibrationState) -> tuple[FloatArray, FloatArray]:
+    """Return 1/σ of the prior of every unknown of the rows, 0 without one, and its deviation from it, (T, n) each."""
+    weight, deviation = np.zeros((2, len(state.position_m), problem.n_row_unknowns))
+    sigma_T = problem.array.common_field_T
+    weight[:, -3:] = 0.0 if sigma_T is None else 1.0 / max(sigma_T, 1e-15)
+    deviation[:, -3:] = state.common_T
+    if problem.path_m is not None and problem.path_sigma_m is not None:
+        weight[:, :3] = 1.0 / np.maximum(problem.path_sigma_m, _EXACT_M)[:, None]
+        deviation[:, :3] = state.position_m - problem.path_m
+    return weight, deviation

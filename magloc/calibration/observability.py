@@ -132,7 +132,7 @@ def _mirror_cost(problem: CalibrationProblem, state: CalibrationState) -> float:
 
     No reading shows such an inversion.
     """
-    if not (problem.unknown_position and problem.free[:, POSITION].all()):
+    if problem.is_on_path or not problem.free[:, POSITION].all():
         return np.inf
     nominal = problem.array.positions
     weight = problem.prior[:, POSITION] ** -2

@@ -24,6 +24,7 @@ COMMANDS = (
     ("columns", "magloc.cli.first_steps.columns:columns", "Propose how to read the log of another program."),
     ("qc", "magloc.cli.surveys.qc:qc", "Check the quality of a field log."),
     ("survey", "magloc.cli.surveys.survey:survey", "Find targets at rest in the ground."),
+    ("compensate", "magloc.cli.surveys.compensate:compensate", "Remove the field of a platform."),
     ("demo", "magloc.cli.first_steps.demo:demo", "Simulate, locate and track a magnet."),
     ("simulate", "sims.cli.simulate:simulate", "Simulate the readings of an array."),
     ("view", "magloc.cli.view:view", "Show an array, readings, a track or a map in three dimensions."),

@@ -86,7 +86,7 @@ def live(
     common : QuietOptions
         Common options.
     """
-    from arrays.io.csv import GrowingTable
+    from arrays.io.outputs import GrowingTable
 
     refuse_outside(0.0, LARGEST, "0 or a positive number", rest_s=rest_s)
     refuse_outside(ABOVE_ZERO, LARGEST, "a positive number", replay_speed=replay_speed)

@@ -128,7 +128,7 @@ def locate(
     used, ambient_T = ambient_field(used, rows, where, gradient=wanted.ambient_gradient)
     try:
         pictured, noisy, _ = used_rows(rows, used, average=wanted.average)
-        true_position_m = None if truth is None else truth_of_rows(pictured, magloc.read_truth(truth))[0]
+        true = None if truth is None else truth_of_rows(pictured, magloc.read_truth(truth))
         with progress(len(rows), "rows") as advance:
             fixes = magloc.locate(
                 used,
@@ -163,11 +163,19 @@ def locate(
     if out is not None:
         from magloc.plots.localization import write_fix_figures
 
-        write_fix_figures(pictured, noisy, fixes, ambient_T, true_position_m, out)
+        write_fix_figures(pictured, noisy, fixes, ambient_T, None if true is None else true.position_m, out)
     if not json:
         note(f"{n_solved} of {len(fixes)} rows solved" + (f"; not solved: {reasons}" if reasons else ""))
     for line in [*_notes(fixes, assumed=length_m is None), *([] if json else legend(lines))]:
         note(line)
+    if n_sources == 1 and position is None and rows.pose is None:
+        from magloc.localization.subtracted_background import background_is_subtracted
+
+        if background_is_subtracted(noisy, pictured.values_T[fixes.solved & fixes.detected]):
+            note(
+                "hint: the field common to all sensors is small, as after a background was subtracted; fixes are more"
+                ' accurate with background = "subtracted" in the array file'
+            )
 
 
 def _refuse_farther(positions: list[Vector], rows: Readings) -> None:

@@ -236,11 +236,14 @@ class KnownOptions:
         """Read the array of a file, with the sensors to use."""
         return self.select(arrays.read_array(path), path)
 
-    def select(self, array: SensorArray, path: Path) -> SensorArray:
-        """Return an array with the sensors to use, and --place as the origin of a grid without one."""
+    def select(self, array: SensorArray, path: Path | str) -> SensorArray:
+        """Return an array with the sensors to use, and --place and --date for a log without origin and date."""
         ids, columns = self.ids, array.columns
         if columns is not None and columns.is_geodetic and columns.origin is None and self.place is not None:
-            array = replace(array, columns=replace(columns, origin=self.place))
+            columns = replace(columns, origin=self.place)
+        if columns is not None and columns.date is None and columns.time_unit in ("iso", "hhmmss"):
+            columns = replace(columns, date=None if self.date is None else self.date[:10])
+        array = replace(array, columns=columns)
         if ids is None:
             return array
         for name in ids:
@@ -267,22 +270,23 @@ class KnownOptions:
         """Return the array with an origin of its places on the Earth, and options that know place and date.
 
         The origin is that of the array file or of --place, or else the first place of the log, which a note names. The
-        date of the array file serves where the ambient field is known from nothing else.
+        date of the log or of the array file serves where the ambient field is known from nothing else.
         """
         columns = array.columns
-        if columns is None or not columns.is_geodetic:
+        if columns is None or not (columns.is_geodetic or self.place is not None):
             return array, self
-        if columns.origin is None:
+        from arrays.logs.format import log_date, log_origin
+
+        if columns.is_geodetic and columns.origin is None:
             from arrays.io.world_maps import place_in_words
-            from arrays.logs.format import log_origin
 
             origin = log_origin(log, columns)
             array = replace(array, columns=replace(columns, origin=origin))
             note(f"note: the origin of the world frame is the first place of {log}: {place_in_words(origin)}")
         date = self.date
         is_known = array.ambient_T is not None or array.ambient_world_T is not None
-        if date is None and columns.date and array.channel_is_scalar.any() and not is_known:
-            date = columns.date
+        if date is None and array.channel_is_scalar.any() and not is_known:
+            date = columns.date or log_date(log, columns)
         return array, replace(self, place=self.map_origin(array), date=date)
 
     @property
@@ -325,6 +329,43 @@ class KnownOptions:
         if not _DATE.fullmatch(self.date):
             raise InputError(f"--date: found {self.date!r}, expected a date such as 2026-11-21.")
         return Place(*self.place, self.date, self.geomagnetic_model or "IGRF-14")
+
+
+@Parameter(name="*", group="Sensors")
+@dataclass(frozen=True)
+class LogOptions:
+    """Sensors and columns of a log.
+
+    Parameters
+    ----------
+    array : Path
+        Array file (TOML). Beside --instrument it needs only the keys that differ from the template.
+    instrument : str
+        Instrument that wrote the log, such as magarrow or gsm19, in place of --array. An unknown name lists all.
+    """
+
+    array: Path | None = None
+    instrument: str | None = None
+
+    @property
+    def name(self) -> str:
+        """Name of the array, for messages."""
+        return f"instrument {self.instrument}" if self.array is None else str(self.array)
+
+    def sensors(self, log: Path) -> SensorArray:
+        """Return the array, also of a single sensor, that the options state for a log."""
+        if self.instrument is None:
+            if self.array is None:
+                raise InputError("--array: found neither --array nor --instrument, expected one of them.")
+            return arrays.read_sensors(self.array)
+        names = arrays.instrument_names()
+        if self.instrument.lower() not in names:
+            raise InputError(f"--instrument: found {self.instrument!r}, expected one of {', '.join(names)}.")
+        template = arrays.read_instrument(self.instrument)
+        array = template.array(log, self.array)
+        if template.add:
+            note(f"note: a log of {template.title} does not state: {template.add}")
+        return array
 
 
 class Mappable(Protocol):

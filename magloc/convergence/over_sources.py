@@ -401,14 +401,14 @@ def source_map(
     rng : int or numpy.random.Generator
         Seed or generator of the moments' directions and all errors.
     known_moment_sigma_Am2 : float
-        Standard deviation of the moments' modulus [A·m²], which fixes and bounds know. If infinite, all moments have
-        the same modulus, and fixes and bounds know nothing.
+        Standard deviation of the moments' modulus [A·m²], which fixes and bounds know; infinite: one unknown modulus.
     body_length_m : float, optional
         Length of every source [m]. The deviation of its field from a dipole is random, and counts as noise in fixes
         and bounds. By default a quarter of its distance near the array, as in :func:`magloc.locate`; 0 for points.
-    out, scheduler, progress
-        See :func:`magloc.grids.computed.computed_map`: a zarr folder that streams and resumes, the address of a dask
-        scheduler, and a call with the number of sources finished.
+    out : path-like, optional
+        Folder of a zarr store for the map. Finished parts that it has are not computed again.
+    scheduler, progress : optional
+        Address of a dask scheduler, whose workers compute the map; called with the number of sources newly finished.
 
     Returns
     -------

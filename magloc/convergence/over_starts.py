@@ -283,9 +283,12 @@ def convergence_map(
         Starts along every axis, at least 2. The moment always starts at zero.
     noise_seed : int, optional
         Of one realisation of the sensors' noise that all starts share; noise-free readings without it.
-    out, scheduler, progress
-        See :func:`magloc.grids.computed.computed_map`: a zarr folder that streams and resumes, the address of a dask
-        scheduler, and a call with the number of starts finished.
+    out : path-like, optional
+        Folder of a zarr store for the map. Finished parts that it has are not computed again.
+    scheduler : str, optional
+        Address of a dask scheduler, whose workers compute the map.
+    progress : callable, optional
+        Called with the number of starts finished since the last call.
 
     Returns
     -------

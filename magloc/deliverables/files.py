@@ -18,8 +18,9 @@ from arrays.io.text import replace_file
 from magloc.deliverables.geosoft import geosoft_xyz
 from magloc.deliverables.layers import target_fields, write_layers
 from magloc.deliverables.map_frame import MapFrame
-from magloc.deliverables.rasters import covers_area, grid_rows, write_geotiff
+from magloc.deliverables.rasters import METHOD, grid_rows, write_geotiff
 from magloc.deliverables.report import report_html
+from magloc.navigation.flight_lines import covers_area
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -27,6 +28,11 @@ if TYPE_CHECKING:
     from magloc.surveying.results import Survey
 
 _LOG = logging.getLogger(__name__)
+MAP_FILES = (
+    *("targets.geojson", "targets.kml", "targets.gpkg", "field.tif", "residual.tif"),
+    *("lines.xyz", "report.html", "report.pdf"),
+)
+"""Names of all files that :func:`survey_files` may write."""
 _LIBRARIES = ("pyogrio", "rasterio", "shapely")
 
 
@@ -44,11 +50,12 @@ def survey_files(
     if all(map(find_spec, _LIBRARIES)):
         yield "targets.gpkg", partial(write_layers, found=found, frame=frame)
         if covers_area(found.rows.place_m[:, :2]):
-            rows = found.rows
+            rows = found.levelled_rows
             both = grid_rows(rows, 1e9 * np.stack([rows.anomaly_T, rows.residual_T], axis=-1), frame)
+            write = partial(write_geotiff, frame=frame, unit="nT", levelling=found.levelling)
             for i, name in enumerate(("field", "residual")):
-                raster = both._replace(values=both.values[..., i])
-                yield f"{name}.tif", partial(write_geotiff, raster=raster, frame=frame, title=name, unit="nT")
+                yield f"{name}.tif", partial(write, raster=both._replace(values=both.values[..., i]), title=name)
+            assumptions = {**assumptions, "maps": f"{METHOD}, cells of {both.cell_m:g} m; {found.levelling}"}
     else:
         _LOG.info('note: a GeoPackage and GeoTIFF need the extra "gis": pip install "magloc[gis]"')
     yield "report.html", report_html(found, frame, title, assumptions, figures)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from magloc.deliverables.flight_lines import flight_lines
 from magloc.deliverables.map_frame import MapFrame
 from magloc.surveying.results import Survey
 
@@ -20,7 +19,7 @@ def geosoft_xyz(found: Survey, frame: MapFrame) -> str:
     text.append(f"/{names[0]} {names[1]} Height_m Time_s Anomaly_nT Residual_nT")
     columns = np.column_stack([x, y, height, rows.time_s, 1e9 * rows.anomaly_T, 1e9 * rows.residual_T])
     form = f"%.{digits}f %.{digits}f %.3f %.3f %.3f %.3f"
-    for line in flight_lines(rows.time_s, rows.place_m, found.terrain):
+    for line in found.flight_lines:
         text.append(f"Line {line.name}")
         text += [form % tuple(row) for row in columns[line.rows].tolist()]
     return "\n".join([*text, ""])

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from arrays.typing import FloatArray
-from magloc.deliverables.flight_lines import FlightLine
+from magloc.navigation.flight_lines import FlightLine
 
 _ENDS = 0.15  # share of a line at either end that is left out: turns
 _STRAIGHT = 0.95  # least distance between the ends over the way

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from arrays.io.errors import InputError, of_extra
 from arrays.typing import FloatArray
-from magloc.deliverables.flight_lines import flight_lines
 from magloc.deliverables.map_frame import MapFrame
 from magloc.surveying.results import neighbour_triangles
 
@@ -29,6 +28,7 @@ _SHORT_NAMES = {
     "sigma_along_m": "sig_along",
     "sigma_across_m": "sig_across",
     "significance": "signif",
+    "fit_quality": "fit_qual",
 }
 _WHAT = "a file for geographic information systems"
 
@@ -97,9 +97,8 @@ def survey_layers(found: Survey, frame: MapFrame) -> Iterator[Layer]:
     ellipses = [shapely.Polygon(frame.project(_ellipse(target))) for target in found]
     ids = np.array([target.id for target in found], dtype=np.object_)
     yield Layer("ellipses", "Polygon", _wkb(ellipses), {"id": ids, "level": np.full(len(found), _LEVEL)})
-    rows = found.rows
-    flown = flight_lines(rows.time_s, rows.place_m, found.terrain)
-    ways = [shapely.LineString(frame.project(rows.place_m[line.rows])) for line in flown]
+    flown = found.flight_lines
+    ways = [shapely.LineString(frame.project(found.rows.place_m[line.rows])) for line in flown]
     fields: dict[str, NDArray[Any]] = {"line": np.array([line.name for line in flown], dtype=np.object_)}
     fields["rows"] = np.array([line.rows.stop - line.rows.start for line in flown], dtype=np.int64)
     fields |= {name: np.array([getattr(line, name) for line in flown]) for name in ("speed_m_s", "height_m")}
@@ -136,6 +135,8 @@ def target_fields(found: Survey, frame: MapFrame) -> dict[str, NDArray[Any]]:
         "sigma_across_m": sigma[:, 0],
         "significance": np.array([target.significance for target in found]),
         "flags": np.array([" ".join(target.flags) for target in found], dtype=np.object_),
+        "size_class": np.array([target.size_class for target in found], dtype=np.object_),
+        "fit_quality": np.array([target.fit_quality for target in found], dtype=np.object_),
     }
 
 

@@ -16,18 +16,17 @@ from arrays.io.csv import Column
 from arrays.io.results import Result
 from arrays.io.tables import align
 from arrays.typing import BoolArray, FloatArray, IntArray
-from magloc.deliverables.flight_lines import FlightLine, flight_lines
 from magloc.deliverables.heading import HeadingError, heading_error
-from magloc.deliverables.rasters import covers_area, line_spacing
 from magloc.grids.work import workers
 from magloc.localization.fit.prior import NOTHING_KNOWN
 from magloc.measurement.rows import check_magnitudes, concatenate_readings
 from magloc.navigation.fixes import between_fixes
+from magloc.navigation.flight_lines import FlightLine, covers_area, flight_lines, line_spacing
 from magloc.readings import Readings
 from magloc.surveying.clock import ClockLag
 from magloc.surveying.piece import Ground, strongest_sources
 from magloc.surveying.preparation import FEWEST_ROWS, field_moduli, unusable_readings
-from magloc.surveying.survey import search_tiles, tile_rows
+from magloc.surveying.survey import tile_rows
 from magloc.terrain.surface import Terrain
 
 GAP = 3.0
@@ -89,16 +88,22 @@ class Quality(Result):
     Attributes
     ----------
     array : SensorArray
+        Array with the stated noise.
     time_s : ndarray, shape (n,)
+        Times of the rows.
     place_m : ndarray, shape (n, 3)
+        Places of the array's origin in the world frame, interpolated between fixes.
     height_m : ndarray, shape (n,)
         Height of the array's origin above the ground.
     gaps : Gaps
+        Intervals longer than three usual ones.
     lines_flown : list of FlightLine
+        Lines in the order of time.
     fourth_T : ndarray, shape (n, N)
         Fourth difference of each sensor's modulus, divided by √70: white noise keeps its standard deviation. NaN beside
         gaps and unusable readings.
     missing, stuck, spikes : ndarray of bool, shape (n, N)
+        Readings that a survey leaves out.
     heading : list of HeadingError or None
         For each sensor; None if the lines do not determine it.
     lag : ClockLag, optional
@@ -276,6 +281,7 @@ def check_quality(
     Parameters
     ----------
     array : SensorArray
+        States the noise of the sensors.
     readings : Readings or sequence of them
         In order of time, with the pose of the array. For the lag scalar sensors need the ambient field.
     ground_m : float or Terrain
@@ -284,6 +290,7 @@ def check_quality(
     Returns
     -------
     Quality
+        Its ``checks`` are the rows of the table, its ``flags`` the names of faults.
 
     Raises
     ------
@@ -318,13 +325,14 @@ def check_quality(
     ground = Ground(NOTHING_KNOWN, terrain, _SHORTEST_GEOLOGY_M, math.inf)
     stuck, spikes, unusable = unusable_readings(array, rows, ground.shallowest_m, terrain)
     moduli_T = np.where(unusable, np.nan, field_moduli(array, rows.values_T))
-    lines = flight_lines(rows.time_s, place_m, terrain)
+    height_m = -terrain.depth_of(place_m)
+    lines = flight_lines(rows.time_s, place_m, height_m, rows.lines)
     coverage = _coverage(place_m[:, :2], lines)
     return Quality(
         array,
         rows.time_s,
         place_m,
-        -terrain.depth_of(place_m),
+        height_m,
         _gaps(rows.time_s, place_m),
         lines,
         _fourth_differences(rows.time_s, moduli_T),
@@ -413,5 +421,5 @@ def _clock_lag(array: SensorArray, rows: Readings, ground: Ground, coverage: Cov
         return None
     tiled = tile_rows(array, near, ground)
     with workers(1, None, None) as each:
-        tiled, _ = search_tiles(tiled, strongest_sources, each, lambda _: None)
+        tiled, _ = tiled.settle(strongest_sources, each, lambda _: None)
     return tiled.correct_lag(array.pose is None and rows.pose_sigma is None)[1] if len(tiled.sources) else None

@@ -13,6 +13,7 @@ from arrays.io.errors import of_extra
 from arrays.io.text import replace_file
 from arrays.typing import FloatArray
 from magloc.deliverables.map_frame import MapFrame
+from magloc.navigation.flight_lines import line_spacing
 
 if TYPE_CHECKING:
     from magloc.surveying.results import SurveyRows
@@ -21,7 +22,6 @@ METHOD = "linear interpolation between rows"
 _CELLS_PER_SPACING = 4.0
 _FARTHEST = 1.0  # Cells farther from the nearest row, in spacings of lines, have no value.
 _MOST_CELLS = 4_000_000
-_FLAT = 1e-3  # A single line extends less across than this share of its length.
 _ROWS_PER_CELL = 2.0  # rows of one line that are used for each cell
 _DIGITS = 3  # of the size of a cell in units of the map, so that corners are round numbers
 _STEPS = (1.0, 2.0, 5.0, 10.0)
@@ -78,29 +78,13 @@ def grid_rows(rows: SurveyRows, values: FloatArray, frame: MapFrame, cell_m: flo
     return Raster(gridded, corner, cell, cell_m)
 
 
-def covers_area(xy_m: FloatArray) -> bool:
-    """Return whether rows (n, 2) cover an area, and not a single line."""
-    return bool(np.linalg.matrix_rank(xy_m - xy_m.mean(axis=0), rtol=_FLAT) == 2)
-
-
-def line_spacing(xy_m: FloatArray) -> float:
-    """Return the usual distance between lines [m] of rows (n, 2): the area that they cover, divided by the way."""
-    way_m = float(np.linalg.norm(np.diff(xy_m, axis=0), axis=1).sum())
-    extent_m = float(np.ptp(xy_m, axis=0).max())
-    if not covers_area(xy_m):
-        return extent_m / 20.0  # a single line
-    from scipy.spatial import ConvexHull
-
-    return max(float(ConvexHull(xy_m).volume) / way_m, extent_m / 500.0)
-
-
 def _round_down(length: float) -> float:
     decade = 10.0 ** np.floor(np.log10(length))
     return float(decade * max(step for step in _STEPS if step <= length / decade * (1.0 + 1e-9)))
 
 
-def write_geotiff(path: Path, raster: Raster, frame: MapFrame, title: str, unit: str) -> None:
-    """Write a raster as GeoTIFF with its coordinate system; tags name the method of gridding and the cell's size."""
+def write_geotiff(path: Path, raster: Raster, frame: MapFrame, title: str, unit: str, levelling: str = "") -> None:
+    """Write a raster as GeoTIFF with its coordinate system; tags name gridding, size of a cell and levelling."""
     with of_extra("gis", "a GeoTIFF"):
         from rasterio import Affine, MemoryFile
     n_rows, n_columns = raster.values.shape
@@ -117,7 +101,7 @@ def write_geotiff(path: Path, raster: Raster, frame: MapFrame, title: str, unit:
             compress="deflate",
         ) as file:
             file.write(raster.values.astype(np.float32), 1)
-            file.update_tags(method=METHOD, cell_m=f"{raster.cell_m:g}")
+            file.update_tags(method=METHOD, cell_m=f"{raster.cell_m:g}", levelling=levelling)
             file.set_band_description(1, title)
             file.set_band_unit(1, unit)
         content = bytes(memory.getbuffer())

@@ -11,10 +11,10 @@ import numpy as np
 
 from arrays.io.outputs import installed_version
 from arrays.io.world_maps import place_in_words
-from magloc.deliverables.flight_lines import flight_lines
 from magloc.deliverables.map_frame import MapFrame
-from magloc.deliverables.rasters import line_spacing
-from magloc.surveying.results import IRON_Am2_PER_KG, Survey
+from magloc.navigation.flight_lines import line_spacing
+from magloc.surveying.results import IRON_Am2_PER_KG, SIZE_CLASSES_Am2, Survey
+from magloc.surveying.review.decisions import entry_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -90,7 +90,7 @@ def report_html(
 
 def _survey_rows(found: Survey) -> Iterator[tuple[str, str]]:
     rows = found.rows
-    lines = flight_lines(rows.time_s, rows.place_m, found.terrain)
+    lines = found.flight_lines
     step_m = np.linalg.norm(np.diff(rows.place_m[:, :2], axis=0), axis=1)
     height = -found.terrain.depth_of(rows.place_m)
     speeds = [line.speed_m_s for line in lines] or [0.0]
@@ -103,12 +103,24 @@ def _survey_rows(found: Survey) -> Iterator[tuple[str, str]]:
     yield "height of the sensors above ground", f"{height.mean():.2f} m ({height.min():.2f} to {height.max():.2f})"
     rms_nT = 1e9 * float(rows.residual_T.std())
     yield "remainder", f"{rms_nT:.2g} nT rms without the targets, χ² {found.chi2_per_dof:.2f} per reading"
+    if found.decisions:
+        yield "review", _review_words(found)
     yield "lag", f"{1e3 * found.lag_s:.0f} ms of the readings, corrected" if found.lag_s else "none found"
+
+
+def _review_words(found: Survey) -> str:
+    """Return the decisions of a review in words, with the number of each kind."""
+    actions = [entry_of(decision)["action"] for decision in found.decisions]
+    words = (("drop", "dropped"), ("split", "split"), ("add", "added"))
+    parts = [f"{_count(actions.count(action), 'target')} {word}" for action, word in words if action in actions]
+    if "exclude" in actions:
+        parts.append(f"rows excluded in {_count(actions.count('exclude'), 'place')}")
+    return f"{', '.join(parts)}; fit after the last decision, each one in decisions.jsonl"
 
 
 def _target_header(frame: MapFrame) -> tuple[str, ...]:
     places = ("longitude", "latitude") if frame.is_geographic else ("easting", "northing")
-    return ("id", *places, "depth [m]", "95 %", "|m| [A·m²]", "± xy [cm]", "iron [kg]", "flags")
+    return ("id", *places, "depth [m]", "95 %", "|m| [A·m²]", "± xy [cm]", "iron [kg]", "size", "fit", "flags")
 
 
 def _target_rows(found: Survey, frame: MapFrame) -> Iterator[tuple[str, ...]]:
@@ -125,6 +137,8 @@ def _target_rows(found: Survey, frame: MapFrame) -> Iterator[tuple[str, ...]]:
             f"{target.strength_Am2:.3g}",
             f"{100.0 * target.ellipse95[0]:.2g}",
             f"{_two_digits(least)}–{_two_digits(most)}",
+            target.size_class,
+            target.fit_quality,
             " ".join(target.flags),
         )
 
@@ -137,7 +151,8 @@ def _flag_words(found: Survey) -> str:
     used = sorted({flag for target in found for flag in target.flags})
     words = "; ".join(f"<b>{flag}</b>: {_FLAGS.get(flag, '')}" for flag in used)
     iron = f"A kilogram of iron has {IRON_Am2_PER_KG[0]:g} to {IRON_Am2_PER_KG[1]:g} A·m²."
-    return f"<small>± xy: longer half axis of the 95 % ellipse. {iron} {words}</small>"
+    edges = ", ".join(f"{name} from {least:g} A·m²" for name, least in SIZE_CLASSES_Am2.items() if least)
+    return f"<small>± xy: longer half axis of the 95 % ellipse. {iron} Size: {edges}. {words}</small>"
 
 
 def _reach_rows(found: Survey) -> Iterator[tuple[str, ...]]:

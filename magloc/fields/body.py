@@ -108,7 +108,8 @@ def equivalent_dipole(
     mesh : trimesh.Trimesh
         Closed surface of the body [m], in the frame of the fields.
     susceptibility : float
-        χ of the material, relative to the field inside it; from -1 (a superconductor) to 1e6 and more (soft iron).
+        Susceptibility χ of the material, relative to the field inside it; from -1 (a superconductor) to 1e6 and more
+        (soft iron).
     ambient_T : array_like, shape (3,)
         Field without the body [T].
     remanence_A_m : array_like, shape (3,)

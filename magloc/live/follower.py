@@ -88,6 +88,7 @@ class Follower:
     Parameters
     ----------
     array : SensorArray
+        Array with the positions, noise and calibration of its sensors.
     motion : MotionModel or FreeMotion, optional
         Motion of the source; by default :class:`magloc.RandomWalk` of 0.5 m/s and 5°/s. Several sources need a
         :class:`magloc.FreeMotion`.
@@ -373,6 +374,7 @@ def track(
         ``"serial:DEVICE@BAUD"`` (needs the extra ``serial``) or ``"replay:FILE"`` (a readings file at the times of its
         rows); or rows: :class:`magloc.Readings`, mappings from the names of columns to numbers, or lines of text.
     array : SensorArray
+        Array with the positions, noise and calibration of its sensors.
     motion : MotionModel or FreeMotion, optional
         Motion of the source; by default :class:`magloc.RandomWalk` of 0.5 m/s and 5°/s. Several sources need a
         :class:`magloc.FreeMotion`.

@@ -136,8 +136,10 @@ def distance_along_line(
         Result of :func:`fit_source_line`.
     field_T : array_like, shape (..., 3)
         Field of the source alone, in the sensor's axes [T].
-    noise_T, noise_fraction
-        Noise as in :func:`fit_source_line`.
+    noise_T : float
+        Standard deviation per axis [T].
+    noise_fraction : float
+        Noise proportional to the field, as for :func:`fit_source_line`.
     within_m : tuple of 2 floats
         Bounds of the distance [m].
 

@@ -126,10 +126,7 @@ class Locator:
             self._fewest = 6 * (number or 1)
 
     def fit(self, readings_T: ArrayLike, ambient_T: ArrayLike | None = None) -> Fix:
-        """Return the fix of one set of readings (C,) [T], NaN where missing.
-
-        `ambient_T` (3,) [T] is the ambient field.
-        """
+        """Return the fix of one set of readings (C,) [T], NaN where missing, in an ambient field (3,) [T]."""
         ambient = None if ambient_T is None else np.asarray(ambient_T, dtype=np.float64)[None]
         return self.fit_rows(numbers(readings_T)[None], ambient)[0]
 
@@ -321,14 +318,20 @@ def locate(
         Array with the positions, noise and calibration of its sensors.
     readings : Readings or array_like, shape (n, C) or (C,)
         Raw readings [T], NaN where missing. Saturated readings are not used, and their channels are named.
-    sources, prior, body_length_m, exclude_faulty, rng
-        As in :class:`Locator`.
+    sources : int or "auto"
+        Number of sources in every row. "auto" finds as many as the readings support, at most five.
     position_m : array_like, shape (3,) or (K, 3), optional
         Known position of the source, or of K sources [m], in the frame of the results; only moments are fitted.
+    prior : SourcePrior
+        Bounds of position and moment for every source; solutions outside of them are left out.
     ambient_T : array_like, shape (n, 3) or (3,), optional
         Ambient field in the array's frame [T], in place of that of the readings or the array.
-    average : bool
-        Average all rows to one fix. The array and the source must stand still.
+    body_length_m : float, optional
+        Length of the object [m], 0 for a point; by default as for :class:`Locator`.
+    exclude_faulty, average : bool
+        Leave out sensors that contradict all others. Average all rows to one fix; array and source must stand still.
+    rng : int or numpy.random.Generator
+        Seed or generator of random restarts and of the draws for the threshold of another source.
     progress : callable, optional
         Called with the number of rows finished since the last call.
 
@@ -348,11 +351,9 @@ def locate(
     --------
     >>> import magloc
     >>> board = magloc.datasets.load("board")
-    >>> fixes = magloc.locate(board.array, board.readings[:3])
-    >>> fixes.position_m.round(3)
-    array([[-0.06 , -0.05 ,  0.12 ],
-           [-0.054, -0.049,  0.119],
-           [-0.049, -0.048,  0.118]])
+    >>> fixes = magloc.locate(board.array, board.readings[:2])
+    >>> fixes.position_m[0].round(2)
+    array([-0.06, -0.05,  0.12])
     """
     measured = as_readings(readings)
     if ambient_T is not None:

@@ -17,6 +17,7 @@ from arrays.noise import calibration_errors, mean_of_finite
 from arrays.sensor import FLICKER_DECADES
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.conditioning import Background
+from magloc.measurement.platform_field import matrix_effects
 
 # Corner frequencies of the processes that make up 1/f noise [Hz].
 _FLICKER_HZ = tuple(10.0**-decade for decade in range(FLICKER_DECADES))
@@ -176,7 +177,7 @@ class SensorErrors:
             if (column >= _INDUCED).any():
                 ambient_T = ambient_in_array(array, readings_T)
                 change_T_s = np.zeros(3) if rate_rad_s is None else np.cross(ambient_T, rate_rad_s)
-                induced = [(of_field[..., None] * field).reshape(-1, 3, 9) for field in (ambient_T, change_T_s)]
+                induced = [matrix_effects(of_field, field) for field in (ambient_T, change_T_s)]
                 of_axes = np.concatenate([of_axes, *induced], axis=-1)
             channel = array.sensor_channels[sensor]
             state, axis = np.nonzero(channel >= 0)

@@ -210,6 +210,7 @@ def concatenate_readings(parts: Sequence[Readings]) -> Readings:
         ambient_T=_concatenate_columns([part.ambient_T for part in parts]),
         pose_sigma=_concatenate_columns([part.pose_sigma for part in parts]),
         interpolated_m=_concatenate_columns([part.interpolated_m for part in parts]),
+        lines=tuple(line for part in parts for line in part.lines),
     )
 
 

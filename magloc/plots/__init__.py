@@ -10,6 +10,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "bound_sphere": "magloc.plots.bounds",
         "cramer_rao_bounds": "magloc.plots.bounds:bounds_figure",
         "calibration": "magloc.plots.calibrations",
+        "compensation": "magloc.plots.compensations",
         "consistency": "magloc.plots.tracks:consistency_figure",
         "convergence": "magloc.plots.maps",
         "design": "magloc.plots.designs",

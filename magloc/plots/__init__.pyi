@@ -6,6 +6,7 @@ from magloc.plots.bounds import bound_reach as bound_reach
 from magloc.plots.bounds import bound_slices as bound_slices
 from magloc.plots.bounds import bound_sphere as bound_sphere
 from magloc.plots.calibrations import calibration as calibration
+from magloc.plots.compensations import compensation as compensation
 from magloc.plots.designs import design as design
 from magloc.plots.designs import design_counts as design_counts
 from magloc.plots.localization import fixes as fixes

@@ -57,6 +57,11 @@ def bounds_figure(found: Bounds) -> Figure:
     found : Bounds
         A result of :func:`magloc.cramer_rao_bounds`. Infinite bounds are not drawn.
 
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Figure; :func:`save` writes it to a file.
+
     Examples
     --------
     >>> import arrays
@@ -103,6 +108,11 @@ def bound_slices(dataset: xr.Dataset, scenario: BoundScenario) -> Figure:
         A result of :func:`magloc.bounds.maps.bound_slices`.
     scenario : BoundScenario
         Scenario of the dataset.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Figure; :func:`save` writes it to a file.
 
     Examples
     --------
@@ -160,6 +170,11 @@ def bound_sphere(dataset: xr.Dataset, scenario: BoundScenario, range_m: float) -
     range_m : float
         Radius of the sphere; the nearest one of the dataset is drawn [m].
 
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Figure; :func:`save` writes it to a file.
+
     Examples
     --------
     >>> import magloc
@@ -207,6 +222,11 @@ def bound_reach(dataset: xr.Dataset, scenario: BoundScenario) -> Figure:
         :func:`magloc.bounds.spheres.with_detection_ranges`.
     scenario : BoundScenario
         Scenario of the dataset.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Figure; :func:`save` writes it to a file.
 
     Examples
     --------

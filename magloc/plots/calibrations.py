@@ -27,6 +27,11 @@ def calibration(result: SourceCalibration | TurningCalibration) -> Figure:
     result : Calibration
         Calibration by a source on a path, or by turning the array.
 
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Figure; :func:`save` writes it to a file.
+
     Examples
     --------
     >>> import magloc

@@ -44,8 +44,14 @@ def design(result: Design, rng: Rng = 0) -> Figure:
     Parameters
     ----------
     result : Design
+        Result of :func:`magloc.design_array`.
     rng : int or numpy.random.Generator
         Seed or generator of the sources of the curves.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Figure; :func:`save` writes it to a file.
 
     Examples
     --------
@@ -97,6 +103,11 @@ def design_counts(results: Sequence[Design]) -> Figure:
     ----------
     results : sequence of Design
         Designs of one task with different numbers of sensors.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Figure; :func:`save` writes it to a file.
 
     Examples
     --------

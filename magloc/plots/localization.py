@@ -34,12 +34,18 @@ def fixes(
     Parameters
     ----------
     fixes : Fixes
+        Result of :func:`magloc.locate`.
     array : SensorArray, optional
         Array of the fixes.
     readings : Readings, optional
         Readings of the fixes, for the poses of a moving array.
     truth_m : ndarray, shape (n, 3), optional
         True positions in the frame of the fixes [m], NaN where unknown.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Figure; :func:`save` writes it to a file.
 
     Examples
     --------
@@ -61,12 +67,18 @@ def residuals(array: SensorArray, readings: Readings, fixes: Fixes, *, ambient_T
     Parameters
     ----------
     array : SensorArray
+        Array of the readings, with the noise of its sensors.
     readings : Readings
         Readings of the fixes.
     fixes : Fixes
         Fixes in the frame of the array or of the world.
     ambient_T : ndarray, shape (n, 3), optional
         Ambient field of every row in the array's frame [T]; by default that of the array.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Figure; :func:`save` writes it to a file.
 
     Examples
     --------

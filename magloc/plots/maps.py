@@ -50,6 +50,11 @@ def convergence(dataset: xr.Dataset) -> Figure:
         A map of :func:`magloc.convergence.over_starts.convergence_map`, or one opened by
         :func:`magloc.grids.store.open_map`. Only its slices are loaded.
 
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Figure; :func:`save` writes it to a file.
+
     Examples
     --------
     >>> import arrays
@@ -98,6 +103,11 @@ def sources(dataset: xr.Dataset) -> Figure:
     dataset : xarray.Dataset
         A map of :func:`magloc.convergence.over_sources.source_map`, or one opened by
         :func:`magloc.grids.store.open_map`. Only its slices are loaded.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Figure; :func:`save` writes it to a file.
 
     Examples
     --------

@@ -43,6 +43,7 @@ def survey_profiles(found: Survey) -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
+        Figure; :func:`save` writes it to a file.
 
     Examples
     --------

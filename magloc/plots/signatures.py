@@ -27,6 +27,7 @@ def signature_figure(found: Signature) -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
+        Figure; :func:`save` writes it to a file.
 
     Examples
     --------

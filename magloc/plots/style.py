@@ -76,9 +76,11 @@ def save(figure: Figure, path: str | Path, dpi: int = DPI) -> None:
     Parameters
     ----------
     figure : matplotlib.figure.Figure
+        Figure to write.
     path : str or path-like
         An existing file is replaced.
     dpi : int
+        Dots per inch.
 
     Examples
     --------
@@ -96,6 +98,7 @@ def write(figure: Figure, path: Path, columns: Mapping[str, Column] | None = Non
     Parameters
     ----------
     figure : matplotlib.figure.Figure
+        Figure to write.
     path : Path
         Path of the PNG file.
     columns : mapping of str to array

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.colors import SymLogNorm
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 from matplotlib.tri import Triangulation
 
 from arrays.typing import FloatArray
@@ -24,7 +25,7 @@ _ACROSS, _UP = "x, east [m]", "y, north [m]"
 
 
 def survey_figure(found: Survey) -> Figure:
-    """Draw maps of the anomaly, of its residual, and of the least moments that are found.
+    """Draw maps of the anomaly, of its residual, and of the least moments that are found; lines are levelled.
 
     Parameters
     ----------
@@ -34,6 +35,7 @@ def survey_figure(found: Survey) -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
+        Figure; :func:`save` writes it to a file.
 
     Examples
     --------
@@ -47,13 +49,14 @@ def survey_figure(found: Survey) -> Figure:
     x, y, _ = found.rows.place_m.T
     height = style.WIDTH_IN * 0.5 * float(np.clip(np.ptp(y) / max(np.ptp(x), 1e-9), 0.12, 1.6)) + 1.0
     figure = style.new_figure(2.0 * height)
-    rows = found.rows.decimate()
+    rows = found.levelled_rows.decimate()
     both, reach = figure.subplots(2, 2, sharex=True, sharey=True)
     for ax, values_T, title in zip(
         both, (rows.anomaly_T, rows.residual_T), ("anomaly", "less the targets' fields"), strict=True
     ):
         _draw_values(figure, ax, rows.place_m, values_T * 1e9)
         style.label_axes(ax, _ACROSS, _UP, title)
+        ax.tick_params(labelbottom=True)
         ax.set_aspect("equal")
     for target in found:
         _draw_target(both[0], target, has_label=False)
@@ -64,6 +67,8 @@ def survey_figure(found: Survey) -> Figure:
         _draw_reach(figure, ax, found.reach.place_m[at], found.reach.moment_Am2[at])
         style.label_axes(ax, _ACROSS, _UP, f"least moment seen, {depth:.2g} m deep" if at.any() else "")
         ax.set_aspect("equal")
+    note = f"Upper maps: every row a point; {found.levelling}. Lower maps: linear between places."
+    figure.supxlabel(note, fontsize=style.SMALL_FONT_SIZE)
     return figure
 
 
@@ -105,4 +110,5 @@ def _draw_target(ax: Axes, target: Target, *, has_label: bool) -> None:
         text = f"{target.id}: {target.depth_m:.1f} m"
         low, high = ax.get_xlim()
         offset, side = (-3.0, "right") if place[0] > high - 0.15 * (high - low) else (3.0, "left")
-        ax.annotate(text, place, (offset, 3.0), textcoords="offset points", ha=side, fontsize=5.5, zorder=4)
+        note = ax.annotate(text, place, (offset, 3.0), textcoords="offset points", ha=side, fontsize=5.5, zorder=4)
+        note.set_path_effects([withStroke(linewidth=1.5, foreground="white")])

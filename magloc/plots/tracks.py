@@ -70,10 +70,16 @@ def track_figure(
     Parameters
     ----------
     points : sequence of TrackPoint
+        Points of all rows, as `points` of a :class:`magloc.Track`.
     truth_m : ndarray, shape (n, 3), optional
         True positions [m], NaN where unknown.
     array_m : ndarray, shape (n, 3), optional
         Origin of the array's frame in every row [m]; by default the array is at the origin.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Figure; :func:`save` writes it to a file.
 
     Examples
     --------
@@ -94,6 +100,11 @@ def sources_figure(result: TrackResult, array_m: FloatArray | None = None) -> Fi
         A result of :attr:`magloc.SourcesTrack.as_result`, or one read from a file.
     array_m : ndarray, shape (n, 3), optional
         Origin of the array's frame in every row [m]; by default the array is at the origin.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Figure; :func:`save` writes it to a file.
 
     Examples
     --------
@@ -177,12 +188,18 @@ def consistency_figure(
     Parameters
     ----------
     points : sequence of TrackPoint
+        Points of all rows, as `points` of a :class:`magloc.Track`.
     truth_m : ndarray, shape (n, 3), optional
         True positions [m], NaN where unknown; errors and NEES need them.
     nees : tuple of ndarray, shape (n,), optional
         Normalised estimation error squared of every row and its degrees of freedom.
     bound_m : ndarray, shape (n,), optional
         Posterior Cramér-Rao bound of the distance from the truth [m].
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Figure; :func:`save` writes it to a file.
 
     Examples
     --------

@@ -135,7 +135,7 @@ class MomentTrack(TrackColumns):
         """
         if truth.moment_Am2 is None:
             raise InputError(f"{truth.name}: found no moment, expected columns mx_Am2, my_Am2 and mz_Am2.")
-        _, moment_Am2 = truth_of_rows(self.readings, truth)
+        moment_Am2 = truth_of_rows(self.readings, truth).moment_Am2
         true = np.full_like(self.moment_Am2, np.nan) if moment_Am2 is None else moment_Am2
         known = self.tracked & np.isfinite(true).all(axis=1)
         error, covariance = (self.moment_Am2 - true)[known], self.covariance[known][:, 3:, 3:]
@@ -226,10 +226,14 @@ def track_moments(
     ----------
     array : SensorArray
         Three independent differences for every source are enough.
-    readings, turn_rad_s, smooth
-        As in :func:`magloc.track_moment`.
+    readings : Readings or array_like, shape (n, C)
+        Raw readings [T] in the order of time, NaN where missing. Saturated readings are not used.
     positions_m : array_like, shape (K, 3)
         Positions of the sources, at rest in the frame of the results [m].
+    turn_rad_s : float
+        Characteristic rate at which the moments turn, or change in another way [rad/s].
+    smooth : bool
+        Use later rows too (fixed-interval smoother).
 
     Returns
     -------

@@ -72,7 +72,7 @@ class ObjectPath:
             The path has none of the instants.
         """
         wanted = Readings(np.empty((len(time_s), 0)), time_s=time_s)
-        position, _ = truth_of_rows(wanted, Truth(self.time_s, self.position_m, name=self.name))
+        position = truth_of_rows(wanted, Truth(self.time_s, self.position_m, name=self.name)).position_m
         if self.rotation is None:
             return position, None
         return position, rotations_at(time_s, self.time_s, self.rotation).as_matrix()
@@ -152,6 +152,11 @@ def read_object_path(path: str | PathLike[str]) -> ObjectPath:
     ----------
     path : str or path-like
         A path file (CSV): ``time_s,x_m,y_m,z_m``, and ``qx,qy,qz,qw`` where the attitude is known.
+
+    Returns
+    -------
+    ObjectPath
+        Path with positions [m], and rotations if the file has attitudes.
 
     Raises
     ------

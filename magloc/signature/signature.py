@@ -219,7 +219,9 @@ class Signature(Result):
         Returns
         -------
         moment_Am2 : ndarray, shape (..., 3)
+            Moment in the frame of the results [A·m²].
         covariance : ndarray, shape (..., 3, 3)
+            Its covariance [(A·m²)²].
         """
         M = self._level_basis(heading_deg, ambient_T)
         return M @ self.parameters_Am2, M @ self.covariance @ np.swapaxes(M, -1, -2)
@@ -245,6 +247,7 @@ class Signature(Result):
         field_T : ndarray, shape (..., 3)
             Field in the frame of the results [T].
         covariance : ndarray, shape (..., 3, 3)
+            Its covariance [T²].
         """
         offset = _level_rotation(heading_deg) @ np.asarray(offset_m, dtype=np.float64)[..., None]
         M = self._level_basis(heading_deg, ambient_T)
@@ -303,6 +306,8 @@ def fit_signature(
     Returns
     -------
     Signature
+        Moments in the axes of the object, with covariance, χ² and combinations that the passes do not
+        determine.
 
     Raises
     ------

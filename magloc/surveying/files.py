@@ -6,6 +6,7 @@ from typing import Any
 
 from arrays.io.csv import Column
 from magloc.surveying.results import Survey
+from magloc.surveying.review.decisions import entry_of
 from magloc.truth import TRUE_POSITION_COLUMNS
 
 
@@ -19,6 +20,7 @@ def json_of_survey(found: Survey) -> dict[str, Any]:
         "chi2_per_dof": found.chi2_per_dof,
         "pose_assumed": found.pose_assumed,
         "lag_s": found.lag_s,
+        **({"decisions": [entry_of(decision) for decision in found.decisions]} if found.decisions else {}),
     }
 
 

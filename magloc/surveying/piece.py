@@ -181,11 +181,21 @@ def search_rounds(piece: Piece, most: int) -> Sources:
     return find_sources(model, groups, grid, piece.known, most, piece.tile.contains)
 
 
-def measure_targets(piece: Piece) -> Arrays:
-    """Fit the known sources to all rows; return targets, reach and residuals of the tile."""
+def refit_sources(piece: Piece) -> Arrays:
+    """Fit the known sources to all rows, and keep all of them."""
+    model = piece.model()
+    fit, _ = model.refit(piece.known, piece.groups(model.record, AT_LAST * model.nearest_m), _SETTLED)
+    return dict(vars(fit.sources))
+
+
+def measure_targets(piece: Piece, *, keep_all: bool = False) -> Arrays:
+    """Fit the known sources to all rows; return targets, reach and residuals of the tile.
+
+    Sources that are not significant are dropped, unless all are to be kept.
+    """
     model = piece.model()
     groups = partial(piece.groups, model.record)
-    fit, background = model.fit(piece.known, groups(AT_LAST * model.nearest_m), _SETTLED)
+    fit, background = (model.refit if keep_all else model.fit)(piece.known, groups(AT_LAST * model.nearest_m), _SETTLED)
     record = model.record
     left = record.values_T - record.predict(fit.sources.fields(record))
     lines = (

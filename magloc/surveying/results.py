@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple, overload
+from typing import TYPE_CHECKING, Any, NamedTuple, overload
 
 import numpy as np
 from scipy.spatial import Delaunay
@@ -18,11 +18,20 @@ from arrays.io.results import Result
 from arrays.io.tables import align, by_sigma
 from arrays.typing import FloatArray, IntArray, Vector
 from magloc.localization.fit.table import cells_of_strength
+from magloc.navigation.flight_lines import FlightLine, flight_lines
+from magloc.surveying.fit.levelling import FEWEST_LINES, line_levels
+from magloc.surveying.review.decisions import Decision
 from magloc.terrain.surface import Terrain
 from magloc.truth import state_columns
 
+if TYPE_CHECKING:
+    from magloc.surveying.review.state import SurveyState
+
 IRON_Am2_PER_KG = (0.05, 0.3)
 """Moment of a kilogram of iron in the ground: a range, as its remanence and shape are not known."""
+SIZE_CLASSES_Am2 = {"small": 0.0, "medium": 0.3, "large": 3.0}
+"""Least moment of each class of size. 0.3 A·m² are 1 to 6 kg of iron, 3 A·m² are 10 to 60 kg."""
+_POOR_FITS = ("misfit", "merged", "near", "edge", "weak")  # flags that make a fit worse than good, the worst first
 _MOST_POINTS = 20_000
 _MOST, _LEAST_LINEAR = 0.8, 1e-3
 _FLAT = 1e-6  # largest ratio of width to length of a line
@@ -83,6 +92,16 @@ class Target:
         """Mass of iron with such a moment, from the most to the least magnetic."""
         least, most = IRON_Am2_PER_KG
         return self.strength_Am2 / most, self.strength_Am2 / least
+
+    @property
+    def size_class(self) -> str:
+        """Class of size by the moment: small, medium or large, with the bounds ``SIZE_CLASSES_Am2``."""
+        return [name for name, least in SIZE_CLASSES_Am2.items() if self.strength_Am2 >= least][-1]
+
+    @property
+    def fit_quality(self) -> str:
+        """Quality of the dipole fit: ``good``, or the first of the flags misfit, merged, near, edge, weak."""
+        return next((flag for flag in _POOR_FITS if flag in self.flags), "good")
 
     @property
     def ellipse95(self) -> tuple[float, float, float]:
@@ -165,6 +184,12 @@ class Survey(Result):
     lag_s : float
         Delay of the readings after their poses, estimated from the targets and corrected; 0 if the targets show none.
     seconds : float
+    named_lines : tuple of (float, str)
+        Times [s] at which the lines of the log begin, and their names; empty if the log names none.
+    state : SurveyState, optional
+        Rows and sources, for a :class:`magloc.Review`.
+    decisions : tuple
+        Decisions of a review that led to this result.
 
     Examples
     --------
@@ -192,6 +217,9 @@ class Survey(Result):
     pose_assumed: bool
     lag_s: float
     seconds: float
+    named_lines: tuple[tuple[float, str], ...] = ()
+    state: SurveyState | None = None
+    decisions: tuple[Decision, ...] = ()
 
     def __len__(self) -> int:
         return len(self.targets)
@@ -219,6 +247,29 @@ class Survey(Result):
         """Positions of all targets (K, 3)."""
         return np.array([target.position_m for target in self]).reshape(-1, 3)
 
+    @cached_property
+    def flight_lines(self) -> list[FlightLine]:
+        """Lines as flown, in the order of time."""
+        height_m = -self.terrain.depth_of(self.rows.place_m)
+        return flight_lines(self.rows.time_s, self.rows.place_m, height_m, self.named_lines)
+
+    @cached_property
+    def levelled_rows(self) -> SurveyRows:
+        """Rows for maps, without the level of their line (:func:`magloc.surveying.fit.levelling.line_levels`).
+
+        The levels are estimated from the residual, so that targets do not count.
+        """
+        level_T = line_levels(self.rows.place_m, self.rows.residual_T, self.flight_lines)
+        return self.rows._replace(anomaly_T=self.rows.anomaly_T - level_T, residual_T=self.rows.residual_T - level_T)
+
+    @property
+    def levelling(self) -> str:
+        """Levelling of the maps in words."""
+        level_T = self.rows.residual_T - self.levelled_rows.residual_T
+        if not level_T.any():
+            return f"lines not levelled: fewer than {FEWEST_LINES}, or on one line"
+        return f"offset and drift of each line removed, {1e9 * float(np.std(level_T)):.2g} nT rms"
+
     @property
     def reach_by_depth(self) -> dict[float, Reach]:
         """Least moments at each depth below the ground [m], the shallowest first."""
@@ -241,6 +292,8 @@ class Survey(Result):
                 "iron_kg": list(target.iron_kg),
                 "significance": target.significance,
                 "flags": list(target.flags),
+                "size_class": target.size_class,
+                "fit_quality": target.fit_quality,
             }
             for target in self
         ]
@@ -256,6 +309,8 @@ class Survey(Result):
         columns |= {"strength_Am2": np.array([t.strength_Am2 for t in self])}
         columns |= {"significance": np.array([t.significance for t in self])}
         columns["flags"] = [" ".join(t.flags) for t in self]
+        columns["size_class"] = [t.size_class for t in self]
+        columns["fit_quality"] = [t.fit_quality for t in self]
         return columns
 
     def to_geojson(self, place: Vector) -> dict[str, Any]:

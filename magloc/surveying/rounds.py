@@ -65,11 +65,13 @@ class SurveyModel:
         what = self.layer, self.errors, self.drift
         return SurveyBackground.of_each(self.record, sources, *what, groups, self.body_length_m, self.beside)
 
-    def refit(self, sources: Sources, group: IntArray) -> tuple[JointFit, SurveyBackground]:
-        """Refit sources within their reach."""
+    def refit(
+        self, sources: Sources, group: IntArray, settled: float = _SETTLED_COARSELY
+    ) -> tuple[JointFit, SurveyBackground]:
+        """Refit sources within their reach, and keep all of them."""
         background = self.background(sources, group)
-        fit = fit_jointly(self.record, background, sources, self._around(sources), settled=_SETTLED_COARSELY)
-        return self.relinearise(fit, background, group, _FEW_STEPS)
+        fit = fit_jointly(self.record, background, sources, self._around(sources), settled=settled)
+        return self.relinearise(fit, background, group, _FEW_STEPS if settled >= _SETTLED_COARSELY else _MOST_STEPS)
 
     def misfit(self, sources: Sources, group: IntArray) -> float:
         """Return minus twice the log-likelihood of sources, up to a constant.

@@ -11,29 +11,25 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 from scipy.special import chdtri
 
 from arrays.array import SensorArray
 from magloc import core
-from magloc.grids.work import Arrays, Each, Work, workers
+from magloc.grids.work import workers
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.measurement.plausibility import warn_of_doubts
 from magloc.measurement.rows import concatenate_readings
 from magloc.readings import Readings
-from magloc.surveying.piece import ROW_ENTRIES, Ground, measure_targets, significant_sources, strongest_sources
+from magloc.surveying.piece import Ground, significant_sources, strongest_sources
 from magloc.surveying.preparation import whole_rows, with_places_between_fixes
-from magloc.surveying.results import Reach, Survey, SurveyRows, Target
-from magloc.surveying.targets import TARGET_ENTRIES
+from magloc.surveying.results import Survey
+from magloc.surveying.review.state import SurveyState
 from magloc.surveying.tiled import Tell, TiledSurvey
-from magloc.surveying.tiles import assign_sources
 from magloc.terrain.surface import Terrain
 
 _LOG = logging.getLogger(__name__)
 _TRIALS = 1.25  # independent trials per area of a map, in squared distances to the shallowest sources: 1.0 to 1.4
 _HECTARE_M2 = 1e4
-_MOST_SWEEPS = 5
-_MISFIT = 2.0
 _MOST_DOUBTED = 1_000_000  # rows
 _LONGEST_BODY_M = 10.0
 
@@ -97,6 +93,7 @@ def survey(
     Returns
     -------
     Survey
+        Targets, the most significant first, with residuals and the least moments that would have been found.
 
     Raises
     ------
@@ -139,43 +136,25 @@ def survey(
     tiled = tile_rows(array, rows, ground, base, false_per_hectare)
     tell: Tell = progress or (lambda _: None)
     folder = None if unfinished is None else Path(unfinished)
-    every = range(len(tiled.tiles))
-    at_once = min(core.threads() if processes is None else processes, len(every))
+    at_once = min(core.threads() if processes is None else processes, len(tiled.tiles))
     with workers(at_once, scheduler, folder) as each:
         # Strong sources beside a tile mask all others until they are known.
-        tiled, lag = search_tiles(tiled, strongest_sources, each, tell)[0].correct_lag(assumed)
+        tiled, lag = tiled.settle(strongest_sources, each, tell)[0].correct_lag(assumed)
         if lag.s:
             _LOG.warning(
                 f"the readings are {lag.s:.3f} ± {lag.sigma_s:.3f} s later than their poses, as the targets show: taken"
                 " into account"
             )
-            tiled, _ = search_tiles(tiled, strongest_sources, each, tell)
-        tiled, due = search_tiles(tiled, significant_sources, each, tell)
+            tiled, _ = tiled.settle(strongest_sources, each, tell)
+        tiled, due = tiled.settle(significant_sources, each, tell)
         if due:
-            _LOG.warning(f"{len(due)} of {len(every)} tiles differ from their neighbours in the sources at their edges")
-        if assumed:
-            tiled = tiled.with_likeliest_pose()
-        results = tiled.map_tiles(measure_targets, each, tell)
+            _LOG.warning(
+                f"{len(due)} of {len(tiled.tiles)} tiles differ from their neighbours in the sources at their edges"
+            )
+        found = SurveyState(tiled, assumed, lag.s).measure(each, tell)
     if folder is not None:
         shutil.rmtree(folder, ignore_errors=True)
-    chi2_per_dof = float(sum(result["chi2"] for result in results) / sum(result["size"] for result in results))
-    if chi2_per_dof > _MISFIT:
-        _LOG.warning(
-            f"χ² per reading is {chi2_per_dof:.1f}: noise, errors of the pose or changes of the field are larger than"
-            " stated, and so are the errors of the targets"
-        )
-    return Survey(
-        _targets(tiled, results),
-        tiled.array,
-        _rows(tiled, results),
-        Reach(*(np.concatenate([result[name] for result in results]) for name in ("reach_m", "reach_Am2"))),
-        terrain,
-        tiled.ground.threshold,
-        chi2_per_dof,
-        assumed,
-        lag.s,
-        time.monotonic() - began,
-    )
+    return replace(found, seconds=time.monotonic() - began)
 
 
 def tile_rows(
@@ -187,36 +166,3 @@ def tile_rows(
     trials = _TRIALS * _HECTARE_M2 / tiled.nearest_m**2
     threshold = float(chdtri(3, min(0.5, false_per_hectare / trials)))
     return replace(tiled, ground=replace(ground, threshold=threshold))
-
-
-def search_tiles(tiled: TiledSurvey, work: Work, each: Each, tell: Tell) -> tuple[TiledSurvey, Sequence[int]]:
-    """Search all tiles, then again those whose neighbours report changes; return those that still do."""
-    due: Sequence[int] = range(len(tiled.tiles))
-    for _ in range(_MOST_SWEEPS):
-        tiled = tiled.search(work, due, each, tell)
-        due = tiled.changes()
-        if not due:
-            break
-    return tiled, due
-
-
-def _targets(tiled: TiledSurvey, results: Sequence[Arrays]) -> tuple[Target, ...]:
-    """Return the targets of all tiles, the most significant one first."""
-    kept = assign_sources(tiled.tiles, [result["position_m"] for result in results], tiled.same_m)
-    kept.sort(key=lambda where: -results[where[0]]["significance"][where[1]])
-    targets = []
-    for number, (t, k) in enumerate(kept, start=1):
-        position, moment, covariance, interval, significance, flags = (results[t][name][k] for name in TARGET_ENTRIES)
-        depth = float(tiled.ground.terrain.depth_of(position))
-        chi2, words = float(significance), tuple(str(flags).split())
-        interval95 = (float(interval[0]), float(interval[1]))
-        targets.append(Target(f"t{number}", position, moment, covariance, depth, interval95, chi2, words))
-    return tuple(targets)
-
-
-def _rows(tiled: TiledSurvey, results: Sequence[Arrays]) -> SurveyRows:
-    """Return the rows of all tiles in order of time."""
-    which = np.concatenate([tile.rows[tile.own] for tile in tiled.tiles])
-    order = np.argsort(which)
-    place, anomaly, residual = (np.concatenate([result[name] for result in results])[order] for name in ROW_ENTRIES)
-    return SurveyRows(tiled.readings.time_s[which[order]], place, anomaly, residual)

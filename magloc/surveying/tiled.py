@@ -31,6 +31,7 @@ _FELT, _CHANGED = 0.1, 1.0  # fields, relative to noise, that are noticeable, an
 _MOVED_M = 0.15
 _NARROW, _NEARLY_ALL = 0.2, 0.95  # width of a line relative to the distance to the nearest sources; share of rows
 _BESIDE_M = 1.0
+_MOST_SWEEPS = 5
 _TERRAIN_MARGIN = 2.0  # of a tile's terrain, in shortest wavelengths of the geology
 _POSES = 2  # alternating estimates of pose errors and lag
 Tell = Callable[[str], None]
@@ -158,6 +159,24 @@ class TiledSurvey:
             sources = Sources.concatenate([found[number].some(np.array([k])) for number, k in kept])
             tiled = replace(tiled, sources=sources, found=found, known=known, outside=outside)
         return tiled
+
+    def settle(self, work: Work, each: Each, tell: Tell) -> tuple[TiledSurvey, Sequence[int]]:
+        """Search all tiles, then again those whose neighbours report changes; return also tiles that still change."""
+        tiled, due = self, range(len(self.tiles))
+        left: Sequence[int] = due
+        for _ in range(_MOST_SWEEPS):
+            tiled = tiled.search(work, left, each, tell)
+            left = tiled.changes()
+            if not left:
+                break
+        return tiled, left
+
+    def with_sources(self, sources: Sources) -> TiledSurvey:
+        """Return the survey with given sources, as if its tiles had found them."""
+        tiled = replace(self, sources=sources)
+        own, beside, outside = zip(*map(tiled._neighbouring_sources, self.tiles), strict=True)
+        others = [Sources.concatenate(parts) for parts in zip(beside, outside, strict=True)]
+        return replace(tiled, found=own, known=own, outside=others)
 
     def changes(self) -> list[int]:
         """Return the tiles whose surroundings changed since their last search."""

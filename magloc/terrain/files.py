@@ -60,6 +60,11 @@ def read_terrain(
     crs : str, optional
         Coordinate system of eastings and northings in a CSV file, such as "EPSG:32633".
 
+    Returns
+    -------
+    Terrain
+        Ground that covers the places.
+
     Raises
     ------
     InputError

@@ -117,13 +117,16 @@ def consistency(
     position_m: FloatArray,
     moment_Am2: FloatArray | None,
     bound_m: FloatArray | None = None,
+    sigma_m: FloatArray | None = None,
 ) -> Consistency:
-    """Return the errors of a track against true positions and moments, NaN if unknown."""
+    """Return the errors of a track against true positions of `sigma_m` (n,) and moments, NaN if unknown."""
     error = track_column(points, "position_m", 3) - position_m
     answered = np.isfinite(error).any(axis=1)
     moments = np.full_like(position_m, np.nan) if moment_Am2 is None else moment_Am2
+    sigma_m = np.zeros(len(position_m)) if sigma_m is None else sigma_m
     measurements = map(tracker.measurements.of, rows)
-    nees = [nees_of(*row) for row in zip(points, np.hstack([position_m, moments]), measurements, strict=True)]
+    states = np.hstack([position_m, moments])
+    nees = [nees_of(*row) for row in zip(points, states, measurements, sigma_m, strict=True)]
     square, dof = np.array([value for value, _ in nees]), np.array([n for _, n in nees], dtype=np.intp)
     nis_per_dimension, nis_bounds = mean_nis(points)
     return Consistency(
@@ -154,12 +157,15 @@ def mean_nis(points: Sequence[TrackPoint]) -> tuple[float, tuple[float, float]]:
     return sum(point.nis for point in used) / dof if dof else math.nan, mean_bounds(dof)
 
 
-def nees_of(point: TrackPoint, truth: FloatArray, measurement: RowMeasurement) -> tuple[float, int]:
+def nees_of(
+    point: TrackPoint, truth: FloatArray, measurement: RowMeasurement, sigma_m: float = 0.0
+) -> tuple[float, int]:
     """Return the normalised estimation error squared of a point, and its number of dimensions.
 
     Unknown numbers of the truth (6,) are NaN and do not count. With all six known, the error is in coordinates in which
     it is Gaussian: those of the chart, as nonlinear as the row's readings, or, without a mixture, those of
-    :mod:`magloc.tracking.measurement`.
+    :mod:`magloc.tracking.measurement`. An uncertain position of the truth adds to the covariance, and the error is that
+    of position and moment themselves.
     """
     if point.position_m is None or point.moment_Am2 is None or point.covariance is None:
         return math.nan, 0
@@ -167,11 +173,11 @@ def nees_of(point: TrackPoint, truth: FloatArray, measurement: RowMeasurement) -
     known[3:] &= known[3:].all()
     if not known.any():
         return math.nan, 0
-    if known[:3].all() and point.mixture is not None:
+    if known[:3].all() and point.mixture is not None and not sigma_m > 0.0:
         return _young_nees(point.mixture.source_marginal().match_moments(), truth, measurement)
     estimate = np.concatenate([point.position_m, point.moment_Am2])
-    error, covariance = truth - estimate, point.covariance
-    if known.all():
+    error, covariance = truth - estimate, point.covariance + np.diag([sigma_m**2] * 3 + [0.0] * 3)
+    if known.all() and not sigma_m > 0.0:
         # Errors of the pose may dominate the covariance, and the readings are linear in them.
         posed = measurement.pose_effect.shape[1] > 0
         coordinates = measurement.coordinates(

@@ -255,7 +255,8 @@ class Track(TrackColumns):
         InputError
             The truth has no time of the readings.
         """
-        position_m, moment_Am2 = truth_of_rows(self.readings, truth)
+        true = truth_of_rows(self.readings, truth)
+        position_m, moment_Am2 = true.position_m, true.moment_Am2
         bound = None
         # The bound is for a constant motion model.
         known = self.readings.motion is None
@@ -265,7 +266,7 @@ class Track(TrackColumns):
                 bound = posterior_bound(self.tracker, self._rows, position_m, moment_Am2, smooth=self.is_smoothed)
             if bound is not None and np.isnan(bound).any():  # overflow at the truth
                 bound = None
-        return consistency(self, self.tracker, self._rows, position_m, moment_Am2, bound)
+        return consistency(self, self.tracker, self._rows, position_m, moment_Am2, bound, true.sigma_m)
 
 
 def track(
@@ -286,6 +287,7 @@ def track(
     Parameters
     ----------
     array : SensorArray
+        Array with the positions, noise and calibration of its sensors.
     readings : Readings or array_like, shape (n, C)
         Raw readings [T], NaN where missing, in the order of time. Saturated readings are not used.
     motion : MotionModel, optional

@@ -58,7 +58,9 @@ class Tracker(CartesianFilter):
     Parameters
     ----------
     array : SensorArray
+        Array with the positions, noise and calibration of its sensors.
     motion : MotionModel
+        Motion of the source, such as :class:`magloc.RandomWalk`.
     prior : SourcePrior
         Bounds of the source where a track starts, and its known moment, in the array's frame.
     keep_steps : bool
@@ -237,7 +239,7 @@ class Tracker(CartesianFilter):
             row, out, lambda row: math.inf if self.filter.row_mixture(row, self.motion)[0] is None else 0.0
         )
         open_loop = self.prior_covariance(measurement, mixture.x[np.argmax(mixture.log_weight)])
-        young = ((measurement, self.motion),) if self.filter.has_lasting_errors else ()
+        young = ((measurement, self.motion),) if self.filter.refits(self.motion) else ()
         known = self.filter.refit(TrackState(mixture, open_loop, young=young))
         return out, self._tracked_point(measurement.row, index, known, None, status="acquired")
 

@@ -27,6 +27,7 @@ class LiveView(View):
     Parameters
     ----------
     array : SensorArray
+        Array that the scene shows, and whose readings the page has.
     controls : Follower, optional
         Object that the buttons of the page stop, start and tare: a :class:`magloc.live.Follower`, or another one with
         these methods.

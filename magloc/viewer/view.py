@@ -138,6 +138,11 @@ def view(
     progress : callable, optional
         Called with the number of readings located since the previous call.
 
+    Returns
+    -------
+    View
+        The open page, or the one that was written.
+
     Raises
     ------
     ValueError

@@ -185,6 +185,11 @@ def run_scenario(
     advance : callable, optional
         Called with the number of runs finished since the last call.
 
+    Returns
+    -------
+    Outcome
+        Errors, NEES and NIS of all runs.
+
     Raises
     ------
     InputError

@@ -105,6 +105,11 @@ def detumbling(
     advanced : callable, optional
         Called with the number of steps finished since the last call.
 
+    Returns
+    -------
+    Detumbling
+        All runs, with the time that each takes and the predicted one.
+
     Examples
     --------
     >>> from sims import experiments

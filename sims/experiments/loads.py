@@ -85,6 +85,11 @@ def switching_loads(rng: Rng, *, duration_s: float = 2400.0, rate_deg_s: float =
     rate_deg_s : float
         Standard deviation of the rate about each axis.
 
+    Returns
+    -------
+    LoadsRun
+        Readings, states of the loads, and the true fields.
+
     Examples
     --------
     >>> from sims import experiments

@@ -113,6 +113,11 @@ def fused_runs(
         Function that makes a run of a scenario and a seed, such as
         :meth:`sims.experiments.mockup_camera.TableCamera.run`; by default :func:`sims.table_run`.
 
+    Returns
+    -------
+    FusionRuns
+        Errors of all runs; `summary` has their statistics.
+
     Raises
     ------
     ValueError
@@ -228,6 +233,11 @@ def zeros_run(
         Number of fixes that determine the start of "two"; 2 in the source paper.
     progress : callable, optional
         Called with 1 after every run.
+
+    Returns
+    -------
+    ZerosRuns
+        Estimated and true zeros of all runs; `summary` has their statistics.
 
     Raises
     ------

@@ -76,6 +76,11 @@ def fused_record(samples: Path, fixes: Path, method: Method) -> RecordRun:
         CSV files; see :func:`read_samples` and :func:`read_fixes`.
     method : {'paper', 'velocity-corrected', 'ekf', 'camera', 'imu'}
 
+    Returns
+    -------
+    RecordRun
+        Estimates through time, and what became of every fix.
+
     Raises
     ------
     InputError

@@ -214,6 +214,7 @@ def sky_run(
     Parameters
     ----------
     sky : LedSky
+        Lights that the camera looks up at.
     matcher : Matcher
         Matcher for the catalogue of that sky and a camera of that footprint, such as :func:`adcs.mockup.odds_matcher`.
     setup : SkySetup
@@ -224,6 +225,11 @@ def sky_run(
         Called with the number of frames finished since the last call.
     finder : callable
         Function of :mod:`adcs.mockup.vision.centroids`.
+
+    Returns
+    -------
+    SkyRun
+        Results of all frames; `summary` has their statistics.
 
     Examples
     --------
@@ -264,10 +270,16 @@ def identified_files(
     Parameters
     ----------
     paths : iterable of Path
+        PNG files of the frames.
     camera : Camera
         Camera with its calibration; the frames must have its size.
-    matcher, finder
+    matcher, finder : callable
         Functions as in :func:`sky_run`.
+
+    Returns
+    -------
+    dict of Path to FrameResult
+        Result of every frame.
 
     Examples
     --------

@@ -112,6 +112,12 @@ def compared_with_paper(row: PaperRow, seeds: Sequence[int], duration_s: float |
     seeds : sequence of int
         One for each run.
     duration_s : float, optional
+        Duration of every run [s]; by default that of the row.
+
+    Returns
+    -------
+    list of Comparison
+        Published value, our value and their ratio, for each quantity of the row.
 
     Examples
     --------

@@ -70,6 +70,11 @@ def write_simulation(simulation: Simulation, readings: str | PathLike[str]) -> S
     readings : path-like
         Path of the readings file; the others are written beside it (:func:`files_beside`). Existing files are replaced.
 
+    Returns
+    -------
+    SimulationFiles
+        Paths of the files that were written.
+
     Raises
     ------
     InputError

@@ -104,13 +104,20 @@ def rendered_frame(
     sky : LedSky
         Such as :func:`adcs.mockup.led_sky`.
     camera : Camera
+        Camera with its lens, size of the frame and height below the lights.
     pose : Pose
         Pose in the middle of the exposure.
     rng : numpy.random.Generator
+        Generator of noise, of lights that are dark, and of spurious ones.
     motion : Motion
         Velocity and turn rate meanwhile; at rest by default.
     quality : FrameQuality
         Noise, lights that are dark, spurious ones, hot pixels.
+
+    Returns
+    -------
+    Frame
+        Image with the places of its lights.
 
     Examples
     --------

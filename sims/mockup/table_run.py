@@ -202,6 +202,11 @@ def table_run(scenario: TableScenario, rng: Rng) -> TableRun:
     rng : int or numpy.random.Generator
         Seed or generator of all random numbers.
 
+    Returns
+    -------
+    TableRun
+        True motion, samples of the inertial unit and fixes of the camera.
+
     Examples
     --------
     >>> import sims

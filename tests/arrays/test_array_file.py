@@ -172,6 +172,11 @@ class TestGeometryForm:
         assert array.ids == ("s1",)
         assert array.subset(["s1"]) == array
 
+    def test_subtracted_background(self, write: WriteFile) -> None:
+        array = read_array(write(f'background = "subtracted"\n{GEOMETRY}'))
+        assert array == replace(tetrahedron(1.5), common_field_T=3e-7)
+        assert read_array(write(array_toml(array))) == array
+
     def test_pose(self, write: WriteFile) -> None:
         """Constants that are left out are those of an ordinary mounting; writing and reading lose nothing."""
         table = "[pose]\nposition_m = 0.02\nattitude_deg = 0.3\ntime_s = 0.01\nlever_arm_m = [0.1, 0, -2]\n"
@@ -412,6 +417,12 @@ class TestRefused:
             ("noise_nT = 1.0", "noise_nT = 1.0\nformat_version = 2", ("key format_version", "found 2, expected 1")),
             ("noise_nT = 1.0", "noise_nT = 1.0\nnoise_fraction = -0.1", ("noise_fraction must not be negative",)),
             ("noise_nT = 1.0", "noise_nT = 1.0\ncommon_field_nT = -1", ("key common_field_nT", "not negative")),
+            ("noise_nT = 1.0", 'noise_nT = 1.0\nbackground = "no"', ("key background", "'no'", "one of subtracted")),
+            (
+                "noise_nT = 1.0",
+                'noise_nT = 1.0\ncommon_field_nT = 1\nbackground = "subtracted"',
+                ("key background: found it together with common_field_nT",),
+            ),
             (
                 "noise_nT = 1.0",
                 "noise_nT = 1.0\nambient_nT = 5",

@@ -37,6 +37,7 @@ LINES: dict[str, tuple[str, ...]] = {
         "ground.csv --array ground-array.toml --json",
         "ground.csv --array ground-array.toml --ground-m -0.1 --region=z>-2 --out out",
         "ground.csv --array ground-array.toml --region=z>-0.3 --threads 1 --json",
+        "ground.csv --array ground-array.toml --decisions decisions.jsonl --out out",
     ),
     "magloc qc": (
         "ground.csv --array ground-array.toml --json",
@@ -86,7 +87,7 @@ LINES: dict[str, tuple[str, ...]] = {
         "map --html out.html",
     ),
     "magloc new-array": ("out.toml --shape tetrahedron --size-m 1.5 --noise-nT 1",),
-    "magloc columns": ("readings.csv", "readings.csv --out out.toml"),
+    "magloc columns": ("readings.csv", "readings.csv --out out.toml", "magarrow.csv --instrument magarrow"),
     "magloc demo": ("out",),
     "magloc warm-up": ("",),
     "adcs demo": ("out",),
@@ -123,6 +124,7 @@ LINES: dict[str, tuple[str, ...]] = {
         "sky.png --catalogue stars.csv --scale-arcsec 15.8 --out out --json",
     ),
 }  # fmt: skip
+_OF_GROUND = ("time_s", "array_x_m", "array_y_m", "array_z_m", "m_nT")
 # How often beside one of the others: seconds each, and a demonstration reads nothing that could be mangled.
 SELDOM = {
     "magloc bounds": 0.1,
@@ -135,6 +137,10 @@ SELDOM = {
 STREAM = "readings.csv"  # what stands on stdin where a line reads from there
 
 _FILES = {
+    "decisions.jsonl": """{"action": "exclude", "from_s": 3.0, "to_s": 4.0}
+{"action": "add", "place_m": [0.2, 0.1], "when": "2026-11-29T03:50:00Z"}
+{"action": "refit"}
+""",
     "imu.toml": """format_version = 1
 [log]
 [log.gyro]
@@ -316,6 +322,7 @@ def write_files(folder: Path) -> None:
     with (folder / "sources.json").open("w") as file, redirect_stdout(file):
         run("magloc", "track readings.csv --array array.toml --sources 1 --json")
     _write_log(folder)
+    _write_magarrow(folder)
     rows = Path(adcs.datasets.load("imu").path).read_text(encoding="utf-8").splitlines()
     (folder / "imu.csv").write_text("\n".join(rows[:101]), encoding="utf-8")
     _write_scalars(folder)
@@ -331,6 +338,16 @@ def _write_log(folder: Path) -> None:
     (folder / "log.csv").write_text(text.replace(",", ";").replace(".", ",").replace("time_s", "T"))
     columns = '\n[columns]\nseparator = "semicolon"\ndecimal = ","\ntime = "T"\nunit = "uT"\n'
     (folder / "log.toml").write_text((folder / "array.toml").read_text() + columns)
+
+
+def _write_magarrow(folder: Path) -> None:
+    """The readings of the survey as a MagArrow logs them."""
+    table = np.genfromtxt(folder / "ground.csv", delimiter=",", names=True)
+    rows = ["Counter,Date,Time,Latitude,Longitude,Mag, MagValid,Altitude"]
+    for k, (t, x, y, z, mag) in enumerate(zip(*(table[name] for name in _OF_GROUND), strict=True)):
+        place = f"{48.0 + y / 111e3:.9f},{11.0 + x / 74e3:.9f}"
+        rows.append(f"{k},2026/04/25,09:40:{t:06.3f},{place},{mag:.3f},1,{500.0 + z:.3f}")
+    (folder / "magarrow.csv").write_text("\n".join(rows) + "\n")
 
 
 def _write_scalars(folder: Path) -> None:

@@ -252,12 +252,12 @@ PICTURES: dict[str, Picture] = {
     ),
     "card-locate.png": Panel("notebook-03-real-magnet.png", (12, 58, 296, 326)),
     "card-track.png": Panel("notebook-05-tracking.png", (434, 362, 852, 562)),
-    "card-survey.png": Panel("survey-map.png", (56, 200, 412, 394)),
+    "card-survey.png": Panel("survey-map.png", (58, 46, 409, 230)),
     "card-live.png": Panel("hall-board.png", (272, 62, 722, 510)),
     "card-calibrate.png": Panel("notebook-08-calibration.png", (24, 6, 330, 168)),
     "card-design.png": Panel("design-half-space.png", (58, 92, 418, 424)),
     "card-attitude.png": Panel("attitude-track.png", (20, 28, 322, 188)),
-    "card-stars.png": Panel("stars-identified.png", (72, 5, 400, 270)),
+    "card-stars.png": Panel("stars-identified.png", (72, 5, 356, 235)),
 }
 OF_NOTEBOOKS = {f"notebook-{name}.png" for name in SHOWN} | {file for file, _ in ON_PAGES.values()}
 # Pages of the gallery have pictures of notebooks that are written when the site is built.

@@ -38,7 +38,7 @@ TRACK = PICTURES["track-weaving.png"]
 def shown() -> set[str]:
     """Pictures that the pages show, as they are named from docs."""
     written = [page for page in DOCS.rglob("*.md") if not {"_build", "commands", "names"} & set(page.parts)]
-    texts = [page.read_text(encoding="utf-8") for page in [REPOSITORY / "README.md", DOCS / "made_pages.py", *written]]
+    texts = [page.read_text(encoding="utf-8") for page in [REPOSITORY / "README.md", DOCS / "explained.py", *written]]
     names = {first or second for text in texts for first, second in SHOWN.findall(text)}
     return {name.removeprefix("docs/").removeprefix("../") for name in names}
 

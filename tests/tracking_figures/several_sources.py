@@ -69,7 +69,7 @@ def three_magnets(seed: int) -> Run:
     assert isinstance(scenario, MagneticScenario)
     simulation = sims.simulate(scenario, seed)
     truths = [truth_of_rows(simulation.readings, truth) for truth in simulation.truths]
-    places, moments = (np.stack([np.asarray(truth[i]) for truth in truths]) for i in range(2))
+    places, moments = (np.stack([getattr(true, name) for true in truths]) for name in ("position_m", "moment_Am2"))
     present = np.isfinite(places).all(axis=2)
     # A magnet that is not there is far from every track.
     truth = Magnets(np.where(present[..., None], places, 1e3), np.nan_to_num(moments), present)
@@ -79,9 +79,9 @@ def three_magnets(seed: int) -> Run:
 def recorded_board(seed: int) -> Run:
     """One magnet, by the filter of several: the recording that comes with the package, whatever the seed."""
     data = magloc.datasets.load("board")
-    position_m, moment_Am2 = truth_of_rows(data.readings, data.truth)
-    assert moment_Am2 is not None
-    truth = Magnets(position_m[None], moment_Am2[None], np.ones((1, len(data.readings)), dtype=bool))
+    true = truth_of_rows(data.readings, data.truth)
+    assert true.moment_Am2 is not None
+    truth = Magnets(true.position_m[None], true.moment_Am2[None], np.ones((1, len(data.readings)), dtype=bool))
     return run_of_sources(seed, data.array, data.readings, truth, sources=1)
 
 

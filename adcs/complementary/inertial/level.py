@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,11 @@ from adcs.satellite.telemetry import is_read
 from arrays.typing import BoolArray, FloatArray
 
 GRAVITY_TIME_S = 3.0
-"""Time constant of the low-pass of the acceleration, as published for VQF."""
+"""Longest time constant of the low-pass of the acceleration, as published for VQF."""
+TILT_FLOOR_RAD = math.radians(0.4)
+"""Least σ of the tilt; a shorter time constant has to gain more."""
+_TIMES_S = (GRAVITY_TIME_S, 1.5, 0.7)
+_PREDICTED_S = 2.0  # time over which the mean acceleration is predicted
 _GRAVITY_M_S2 = 9.81
 _MEAN_S = 0.5  # means of a hand's acceleration over longer times decrease in proportion
 _WINDOW_S = 1.5
@@ -41,6 +45,7 @@ class Up:
     hidden_rad2: (
         FloatArray  # (n,): growth of the attitude's variance in gaps of the gyro, and by rotations seen after them
     )
+    drift_rad: FloatArray  # (n,): σ of the drift of a gyro for which the longest time constant is too long
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +62,42 @@ class Steady:
 
 
 def direction_up(steady: Steady, *, offline: bool) -> Up:
+    """Smooth accelerations with the time constant that predicts later ones best.
+
+    A gyro with large errors of scale needs a short one. Offline the whole record decides, else the past.
+    """
+    tried = [_smoothed_up(steady, gravity_s, offline=False) for gravity_s in _TIMES_S]
+    error_rad2 = np.array([_prediction_errors(steady, one.up, offline=offline) for one in tried])
+    gained = error_rad2[0] - np.min(error_rad2, axis=0)
+    best = np.where(gained > TILT_FLOOR_RAD**2, np.argmin(error_rad2, axis=0), 0)
+    drift_rad = np.sqrt(gained) * (best > 0)
+    if offline:
+        return replace(_smoothed_up(steady, _TIMES_S[best[0]], offline=True), drift_rad=drift_rad)
+    rows = np.arange(len(best))
+    of_rows = {name: np.array([getattr(one, name) for one in tried])[best, rows] for name in vars(tried[0])}
+    return Up(**{**of_rows, "drift_rad": drift_rad})
+
+
+def _prediction_errors(steady: Steady, up: FloatArray, *, offline: bool) -> FloatArray:
+    """Return the mean squared angle (n,) between the direction up and later means of the acceleration.
+
+    Of predictions that have ended at each instant, offline of all.
+    """
+    read = is_read(steady.acceleration_m_s2)
+    weight = np.where(read, steady.dt_s, 0.0)
+    total = np.cumsum(np.where(read[:, None], steady.acceleration_m_s2, 0.0) * weight[:, None], axis=0)
+    ends = np.searchsorted(steady.time_s, steady.time_s + _PREDICTED_S)
+    began = np.flatnonzero(ends < len(ends))
+    mean = total[ends[began]] - total[began]
+    length = np.linalg.norm(mean, axis=1)
+    square = np.sum((mean / np.where(length > 0.0, length, 1.0)[:, None] - up[began]) ** 2, axis=1)
+    valid = (length > 0.0).astype(np.float64)
+    counts, sums = (np.cumsum(np.bincount(ends[began], of, len(ends))) for of in (valid, valid * square))
+    errors: FloatArray = sums / np.maximum(counts, 1)
+    return np.full(len(ends), errors[-1]) if offline else errors
+
+
+def _smoothed_up(steady: Steady, gravity_s: float, *, offline: bool) -> Up:
     """Smooth accelerations; offline by the mean of a forward and a backward low-pass, without delay.
 
     After a gap that hides a larger rotation than the σ of a few readings, the low-pass restarts from the mean of the
@@ -73,7 +114,9 @@ def direction_up(steady: Steady, *, offline: bool) -> Up:
     for before, after, growth, turns in [*gaps, (n - 1, n, np.zeros(0), False)]:
         piece = slice(begin, before + 1)
         last = smooth[max(begin - 1, 0)]
-        smooth[piece], sigma[piece], fresh[piece] = _smooth_piece(steady, piece, last, unknown, scatter, offline)
+        smooth[piece], sigma[piece], fresh[piece] = _smooth_piece(
+            steady, piece, last, unknown, scatter, gravity_s, offline
+        )
         smooth[before + 1 : after] = smooth[before]
         sigma[before + 1 : after] = np.sqrt(sigma[before] ** 2 + HELD_VARIANCE * growth[: after - before - 1])
         if after < n:
@@ -84,7 +127,7 @@ def direction_up(steady: Steady, *, offline: bool) -> Up:
                 unknown = seen
         elif before < n - 1:
             break
-    return Up(smooth / np.sqrt(np.einsum("ni,ni->n", smooth, smooth))[:, None], sigma, fresh, hidden)
+    return Up(smooth / np.sqrt(np.einsum("ni,ni->n", smooth, smooth))[:, None], sigma, fresh, hidden, np.zeros(n))
 
 
 def _gaps(steady: Steady) -> list[tuple[int, int, FloatArray, bool]]:
@@ -114,7 +157,13 @@ def _scatter_rad(steady: Steady, gaps: list[tuple[int, int, FloatArray, bool]]) 
 
 
 def _smooth_piece(
-    steady: Steady, piece: slice, last: FloatArray, before_rad: float, scatter: FloatArray, offline: bool
+    steady: Steady,
+    piece: slice,
+    last: FloatArray,
+    before_rad: float,
+    scatter: FloatArray,
+    gravity_s: float,
+    offline: bool,
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Return smoothed accelerations of some rows, σ of their direction, and the fresh rows.
 
@@ -129,24 +178,24 @@ def _smooth_piece(
     elif len(seen) == 0:
         return np.broadcast_to(last, values.shape), np.full(len(values), before_rad), fresh
     elif before_rad < _MUCH * scatter[piece][seen[0]]:
-        start, part = last, np.maximum(age_s, 0.0) / GRAVITY_TIME_S
+        start, part = last, np.maximum(age_s, 0.0) / gravity_s
         sigma = before_rad * (1.0 + part) * np.exp(-part)
     else:
-        fresh = age_s < GRAVITY_TIME_S
-        late = np.maximum(age_s - GRAVITY_TIME_S, 0.0) / GRAVITY_TIME_S
+        fresh = age_s < gravity_s
+        late = np.maximum(age_s - gravity_s, 0.0) / gravity_s
         sigma = scatter[piece][seen[0]] / (1.0 + np.maximum(age_s, 0.0) / _MEAN_S) * np.exp(-late)
         sigma[: seen[0]] = before_rad
         counts = np.maximum(np.cumsum(is_read(values)), 1)[:, None]
         means = np.nancumsum(values, axis=0) / counts
         means[: seen[0]] = means[seen[0]]
         start = means[fresh][-1]
-    smooth = low_pass(values, dt_s, GRAVITY_TIME_S, start)
+    smooth = low_pass(values, dt_s, gravity_s, start)
     if fresh.any():
         k = np.count_nonzero(fresh)
-        smooth = np.concatenate([means[:k], low_pass(values[k:], dt_s[k:], GRAVITY_TIME_S, start)])
+        smooth = np.concatenate([means[:k], low_pass(values[k:], dt_s[k:], gravity_s, start)])
     if offline and len(seen):
         count = max(int(np.count_nonzero(age_s < 1.0)), 1)
         end = values[seen[-count:]].mean(axis=0)
         steps = np.concatenate([dt_s[:1], dt_s[:0:-1]])
-        smooth = 0.5 * (smooth + low_pass(values[::-1].copy(), steps, GRAVITY_TIME_S, end)[::-1])
+        smooth = 0.5 * (smooth + low_pass(values[::-1].copy(), steps, gravity_s, end)[::-1])
     return smooth, sigma, fresh

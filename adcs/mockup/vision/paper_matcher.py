@@ -159,8 +159,10 @@ class PaperMatcher:
 
         Returns
         -------
-        mine, theirs : ndarray of int, shape (c,)
-            Indices of matching triangles in the image and in the catalogue.
+        mine : ndarray of int, shape (c,)
+            Indices of matching triangles in the image.
+        theirs : ndarray of int, shape (c,)
+            Indices of the same triangles in the catalogue.
         """
         known = self.catalogue.triangles
         difference = np.abs(triangles.angles_rad[:, None] - known.angles_rad)

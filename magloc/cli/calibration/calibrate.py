@@ -21,6 +21,7 @@ from magloc.cli.options import array_of_several, refuse_not_positive
 if TYPE_CHECKING:
     from arrays.array import SensorArray
     from magloc.calibration.array import CalibrationPrior
+    from magloc.calibration.cross_validation import CrossValidation
     from magloc.calibration.results import SourceCalibration, TurningCalibration
     from magloc.readings import Readings
     from magloc.truth import Truth
@@ -99,7 +100,8 @@ def calibrate(
         Array file to write. Nothing is written if the calibration fails.
     truth : Path
         Truth file (CSV) of the source. Its rows belong to the readings of the same time. Without z_m one height is
-        estimated for all rows. Moments in it are taken as known.
+        estimated for all rows. Moments in it are taken as known; with axis_x, axis_y, axis_z one strength is estimated.
+        sigma_m is the error of its positions. Rows are left out in turn to say how well the calibration carries over.
     modulus_nT : str
         Modulus of the uniform field in which the sensors were turned [nT]: a number, or a CSV file with time_s and
         modulus_nT, such as that of a base station, which is interpolated linearly.
@@ -119,7 +121,7 @@ def calibrate(
     """
     from magloc.calibration.results import TurningCalibration
     from magloc.cli.calibration import by_turning as turning
-    from magloc.readings import read_readings
+    from magloc.readings import read_readings, without_saturated
 
     refuse_unwritable(out, "--out")
     refuse_file(figures, "--figures")
@@ -138,18 +140,55 @@ def calibrate(
         rows = read_readings(readings, nominal)
         path = _path(rows, truth, height_m, readings)
         with naming(str(readings), array=str(array), truth=str(truth)):
-            result = magloc.calibrate(nominal, rows, truth=path, moment=moment, prior=prior)
+            used, validation = _validated(nominal, without_saturated(rows, nominal), path, moment, prior)
+            result = magloc.calibrate(used, rows, truth=path, moment=moment, prior=prior)
     if isinstance(result, TurningCalibration):
         turning.check(result, readings, array, out)
         report, lines, notes = turning.report(result, out), turning.lines(result), turning.notes(result)
     else:
         _check_converged(result, readings, out)
         report, lines, notes = _report(result, len(rows), out), _table(result), _notes(result, len(rows), prior)
+        report["cross_validation"] = None
+        if validation is not None:
+            background = None if used is nominal else "subtracted"
+            report["cross_validation"] = {**validation.json, "background": background}
+            notes += _validation_notes(validation, background)
     arrays.write_array(out, result.array)
     print_result(report, lines, as_json=json)
     write_files(figures, _files(result), "--figures")
     for line in [] if json else notes:
         note(line)
+
+
+def _validated(
+    array: SensorArray,
+    rows: Readings,
+    path: Truth | None,
+    moment: Literal["constant", "free"] | None,
+    prior: CalibrationPrior,
+) -> tuple[SensorArray, CrossValidation | None]:
+    """Return the array to calibrate and, on a known path, the cross-validation."""
+    from magloc.calibration.cross_validation import choose_common_field
+
+    return (array, None) if path is None else choose_common_field(array, rows, path, moment=moment, prior=prior)
+
+
+def _validation_notes(validation: CrossValidation, background: str | None) -> list[str]:
+    """Return notes on how well the calibration carries over to other rows."""
+    numbers = validation.json
+    if not numbers["rows"]:
+        return ["cross-validation: no row that was left out can be located; the calibration does not carry over"]
+    median, p90, worst = (1e3 * numbers[name] for name in ("median_m", "p90_m", "worst_m"))
+    notes = [
+        f"cross-validation: rows left out of the calibration are located to {median:.3g} mm (median), {p90:.3g} mm"
+        f" (90 %), {worst:.3g} mm (worst)"
+    ]
+    if background is not None:
+        notes.append(
+            "the offsets contain the background of the array at rest, and the common field is small beside them; the"
+            " array file written states it, as this locates left-out rows better: calibrate again when the array moves"
+        )
+    return notes
 
 
 def _check_converged(result: SourceCalibration, readings: Path, out: Path) -> None:

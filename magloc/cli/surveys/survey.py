@@ -17,6 +17,7 @@ from arrays.typing import Vector
 from magloc.cli.framework import CommonOptions, Flag, note, print_report
 from magloc.cli.options import (
     KnownOptions,
+    LogOptions,
     MapOptions,
     ambient_field,
     refuse_not_positive,
@@ -57,11 +58,28 @@ class GroundOptions(SurfaceOptions):
     body_length_m: float = 0.0
 
 
+@Parameter(name="*", group="Review")
+@dataclass(frozen=True)
+class ReviewOptions:
+    """Review of the targets.
+
+    Parameters
+    ----------
+    decisions : Path
+        Log of decisions about targets and rows (decisions.jsonl of an earlier review) to apply after the search.
+    html : Path
+        HTML file to write: lines, ground and targets in three dimensions, as one page that needs no server.
+    """
+
+    decisions: Path | None = None
+    html: Path | None = None
+
+
 def survey(
     readings: Annotated[list[Path], Parameter(negative_iterable="")],
     /,
     *,
-    array: Path,
+    log: LogOptions = LogOptions(),  # noqa: B008 - frozen
     known: KnownOptions = KnownOptions(),  # noqa: B008 - frozen
     base: Path | None = None,
     ground: GroundOptions = GroundOptions(),
@@ -69,7 +87,7 @@ def survey(
     crs: str | None = None,
     scheduler: str | None = None,
     out: Path | None = None,
-    html: Path | None = None,
+    review: ReviewOptions = ReviewOptions(),
     json: Flag = False,
     common: CommonOptions = CommonOptions(),  # noqa: B008 - frozen
 ) -> None:
@@ -86,8 +104,8 @@ def survey(
     ----------
     readings : list of Path
         Readings files (CSV), in order of time.
-    array : Path
-        Array file (TOML).
+    log : LogOptions
+        Sensors and columns of the readings: --array or --instrument.
     known : KnownOptions
         Prior knowledge of the sensors, of the targets (in the world frame), and of the ambient field.
     base : Path
@@ -103,23 +121,26 @@ def survey(
     scheduler : str
         Address of a dask scheduler (tcp://HOST:PORT), whose workers then search the tiles of a large survey.
     out : Path
-        Folder for targets.csv, residual.csv, reach.csv (the smallest moment that is found), a map, and profiles past
-        the targets. With positions on the Earth also for targets.gpkg, .geojson and .kml, field.tif, residual.tif,
-        lines.xyz and a report. It also holds the finished tiles of a large survey; the same command continues an
-        interrupted survey.
-    html : Path
-        HTML file to write: lines, ground and targets in three dimensions, as one page that needs no server.
+        Folder for targets.csv, residual.csv, reach.csv (the smallest moment that is found), a map, profiles past the
+        targets, and decisions.jsonl of a review. With positions on the Earth also for targets.gpkg, .geojson and .kml,
+        field.tif, residual.tif, lines.xyz and a report. It also holds the finished tiles of a large survey; the same
+        command continues an interrupted survey.
+    review : ReviewOptions
+        Review of the targets.
     json : bool
         Print one JSON object in place of the table.
     common : CommonOptions
         Common options.
     """
+    from magloc.surveying.review.decisions import read_decisions
+
     refuse_file(out, "--out")
-    refuse_one_for_two({"--out": out, "--html": html, **maps.outputs})
-    refuse_unwritable(html, "--html")
+    refuse_one_for_two({"--out": out, "--html": review.html, **maps.outputs})
+    refuse_unwritable(review.html, "--html")
     refuse_not_positive(ground, "shortest_geology_m", "false_per_hectare")
     ground.refuse()
-    chosen = known.select(arrays.read_sensors(array), array)  # a survey works with one sensor
+    chosen = known.select(log.sensors(readings[0]), log.name)
+    decisions = [] if review.decisions is None else read_decisions(review.decisions)
     used, known = known.on_earth(chosen, readings[0])
     _note_ground(chosen, used, ground)
     maps.refuse(known.place)
@@ -137,7 +158,7 @@ def survey(
     used, rows = fields[0][0], [replace(part, ambient_T=own) for part, (_, own) in zip(parts, fields, strict=True)]
     at_base = arrays.SensorArray((arrays.Sensor("base", "scalar", (0.0, 0.0, 0.0), 1e-10),))
     station = None if base is None else magloc.read_readings(base, at_base, ordered=True)
-    named = naming(", ".join(map(str, readings)), array=str(array))
+    named = naming(", ".join(map(str, readings)), array=log.name)
     with named, naming_options("ground_m", "base", "body_length_m", "scheduler"):
         found = magloc.survey(
             used,
@@ -152,10 +173,13 @@ def survey(
             unfinished=None if out is None else out / "tiles",
             progress=None if json else note,
         )
+    if review.decisions is not None:
+        with naming(str(review.decisions)):
+            found = magloc.Review(found).replay(decisions, None if json else note).found
     maps.write(found, known.place)
-    write_files(out, _files(found, frame, ", ".join(path.name for path in readings), ground))
-    if html is not None:
-        magloc.view(None, found, html=html, title="survey")
+    _write(out, _files(found, frame, ", ".join(path.name for path in readings), ground))
+    if review.html is not None:
+        magloc.view(None, found, html=review.html, title="survey")
     if json:
         from magloc.surveying.files import json_of_survey
 
@@ -203,15 +227,35 @@ def _json_of_map(found: Survey, frame: MapFrame | None) -> dict[str, Any]:
     return {"origin": list(frame.origin), "crs": frame.label, "targets": targets}
 
 
+def _write(out: Path | None, files: Iterator[tuple[str, Any]]) -> None:
+    """Write files into a folder, and name those of an earlier survey that stay."""
+    from magloc.deliverables.files import MAP_FILES
+
+    if out is None:
+        return
+    before = {name: _changed_ns(out / name) for name in ("decisions.jsonl", *MAP_FILES)}
+    write_files(out, files)
+    if older := [name for name, at in before.items() if at is not None and _changed_ns(out / name) == at]:
+        note(f"note: {', '.join(older)} in {out} {'are' if len(older) > 1 else 'is'} of an earlier run")
+
+
+def _changed_ns(path: Path) -> int | None:
+    """Return the time of the last change of a file [ns], None if it does not exist."""
+    return path.stat().st_mtime_ns if path.exists() else None
+
+
 def _files(found: Survey, frame: MapFrame | None, title: str, ground: GroundOptions) -> Iterator[tuple[str, Any]]:
     """Yield targets.csv, residual.csv, reach.csv, the map, the lines past the targets, and files for a client's map."""
     from magloc.deliverables.files import map_columns, survey_files
     from magloc.plots.profiles import survey_profiles
     from magloc.surveying.files import reach_columns, residual_columns
+    from magloc.surveying.review.decisions import decision_lines
 
     yield "targets.csv", found.columns() | ({} if frame is None else map_columns(found, frame))
     yield "residual.csv", residual_columns(found)
     yield "reach.csv", reach_columns(found)
+    if found.decisions:
+        yield "decisions.jsonl", decision_lines(found.decisions)
     maps, profiles = found.plot(), survey_profiles(found)
     yield "survey.png", maps
     yield "profiles.png", profiles

@@ -22,6 +22,7 @@ from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray
 from magloc.fields.multipole import finite_body_errors, finite_body_fields
 from magloc.fields.points import field_at_points, gradient_at_points
+from magloc.measurement.platform_field import matrix_effects
 from magloc.measurement.pose import LEVER, N_POSE, SHIFT, TURN, PoseErrors, rates_of
 from magloc.navigation.rotations import cross_matrix
 from magloc.readings import Readings
@@ -205,8 +206,7 @@ class SurveyRecord:
                 (np.full((3, 3), sensor.eddy_uncertainty_s), rate),
             ):
                 if size.any():
-                    nine = np.where(own[..., None], by_field[..., None] * (size * field[:, None, None]), 0.0)
-                    columns.append(nine.reshape(len(self), -1, 9))
+                    columns.append(np.where(own, matrix_effects(by_field, field[:, None]) * size.ravel(), 0.0))
         return np.concatenate(columns, axis=2) if columns else np.zeros((len(self), len(owner), 0))
 
     def by_pose(self, directions: FloatArray, fields_T: FloatArray, gradients: FloatArray) -> FloatArray:

@@ -5,8 +5,9 @@ components, divides those over which the readings are nonlinear (:mod:`magloc.tr
 (:mod:`magloc.tracking.row_filter`, compiled) and merges those that are nearly equal.
 
 The states of the motion are followed by the errors of the array's pose and those of its sensors. With such lasting
-errors the posterior after a row has many curved valleys, which would need too many components. Then none is divided,
-and all rows of a young track are fitted together at growing intervals (:mod:`magloc.tracking.chart.refit`).
+errors the posterior after a row has many curved valleys, which would need too many components. Then none is divided.
+All rows of a young track are fitted together at growing intervals (:mod:`magloc.tracking.chart.refit`): each component
+is linear about the place where it was updated.
 """
 
 from __future__ import annotations
@@ -170,6 +171,13 @@ class ChartFilter:
             return np.zeros(self.errors.array.n_sensors, dtype=bool)
         return self._start.faulty_sensors(row.row)
 
+    def refits(self, motion: MotionModel) -> bool:
+        """Return True if the rows of a young track are refitted together.
+
+        Without lasting errors the components suffice for a source with a velocity: its first rows determine no mode.
+        """
+        return self.has_lasting_errors or motion.n_states == N_SOURCE
+
     def is_detected(self, row: RowMeasurement) -> bool:
         """Return True if a row shows a source."""
         return row.is_detected(self.errors.sigma)
@@ -250,6 +258,11 @@ class ChartFilter:
         if elsewhere and fit.nis.min() > known.nis:
             # The refit moved to another place that explains the rows less well.
             return known
+        if not self.has_lasting_errors and len(mixture) > 1:
+            # The components describe a curved valley better than a mode: keep them unless the mode is elsewhere.
+            best = found.x[np.argmax(found.log_weight)]
+            if mixture.square_distance(best).min() < n:
+                return known
         if len(found) == 1 and len(mixture) == 1:
             change = mixture.square_distance(found.x)[0]
             if change < SETTLED * n and found.widths[0] < OLD_WIDTH:

@@ -43,8 +43,15 @@ class TestTimesOfDay:
             times(cell, time_unit="hhmmss")
 
     def test_a_date_beside_dates(self) -> None:
-        with pytest.raises(InputError, match="found dates, expected times of day"):
-            times("2026-05-12T09:14:03", date="2026-05-12")
+        """The date of the log itself is accepted, another one is not."""
+        assert times("2026-05-12T09:14:03", date="2026-05-12") == times("2026-05-12T09:14:03")
+        with pytest.raises(InputError, match="column t: found 2026-05-12, expected the date 2026-06-12"):
+            times("2026-05-12T09:14:03", date="2026-06-12")
+
+    def test_of_a_log_without_times(self) -> None:
+        columns = LogColumns(time_unit="rows", sensors={"a": "F"})
+        table = LogFormat({"a": ["a_nT"]}, columns, "a header", ()).table("F\n1\n2\n3", "log.csv")
+        assert table.values[:, table.header.index("time_s")].tolist() == [0.0, 1.0, 2.0]
 
 
 class TestDates:
@@ -53,6 +60,15 @@ class TestDates:
         for day_first, (month, day) in ((True, (5, 12)), (False, (12, 5))):
             instant = datetime.datetime(2026, month, day, 9, 14, 3, tzinfo=datetime.UTC)
             assert times(cell, day_first=day_first).tolist() == [instant.timestamp()]
+
+    @pytest.mark.parametrize("cell", ["5-Dec-2026 09:14:03", "05DEC26T9:14:03", "05 December 2026 09:14:03"])
+    def test_named_month(self, cell: str) -> None:
+        assert times(cell).tolist() == [datetime.datetime(2026, 12, 5, 9, 14, 3, tzinfo=datetime.UTC).timestamp()]
+
+    @pytest.mark.parametrize(("year", "whole"), [("70", 1970), ("99", 1999), ("26", 2026), ("69", 2069)])
+    def test_year_of_two_digits(self, year: str, whole: int) -> None:
+        expected = datetime.datetime(whole, 5, 12, 9, 14, tzinfo=datetime.UTC).timestamp()
+        assert times(f"05/12/{year} 09:14", day_first=False).tolist() == [expected]
 
     def test_none_is_guessed(self) -> None:
         with pytest.raises(InputError, match="line 2, column t: found '13/05/2026 09:14:03', which may begin"):

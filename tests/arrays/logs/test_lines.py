@@ -13,6 +13,7 @@ from arrays.columns import LogColumns
 from arrays.io.csv import Table
 from arrays.io.errors import InputError
 from arrays.logs.format import LogFormat
+from arrays.logs.lines import line_starts
 
 ROWS = [[0.0, 48.5, 1.0], [1.0, 48.6, 2.0], [2.0, np.nan, 3.0]]
 
@@ -41,6 +42,18 @@ LOGS = {
         " t   Mag\tB \n 0 48.5   1 \n1  48.6\t2\n 2  *  3\n",
         {"separator": "space", "dummy": ("*",)},
     ),
+    "no header": ("/ me\n\n0,48.5,1\n1,48.6,2\n2,,3\n", {"names": ("t", "Mag", "B"), "comment": ("/",)}),
+    "a header of fewer names": (
+        "%  GPST  lat B\n"
+        + "".join(f"2026/05/12 00:00:0{k}.0 {row}\n" for k, row in enumerate(("48.5 1", "48.6 2", "* 3"))),
+        {
+            "names": ("d", "t", "Mag", "B"),
+            "separator": "space",
+            "time": ("d", "t"),
+            "time_unit": "iso",
+            "comment": ("%",),
+        },
+    ),
     "decimal commas": ("t;Mag;B\n0;48,5;1\n1;48,6;2,0\n2;;3\n", {"separator": "semicolon", "decimal": ","}),
 }
 
@@ -50,6 +63,7 @@ class TestRows:
     def test_are_those_of_the_log(self, name: str) -> None:
         text, columns = LOGS[name]
         found = rows_of(read(text, **columns))
+        found[:, 0] -= 1778544000.0 if found[0, 0] else 0.0
         np.testing.assert_array_equal(np.where(found > 1e30, np.nan, found), ROWS)
 
     @given(st.lists(st.text('abc xyz,:-#"', max_size=20), max_size=20))
@@ -90,3 +104,38 @@ class TestBadLogs:
     def test_have_a_place(self, text: str, words: str) -> None:
         with pytest.raises(InputError, match=words):
             read(text)
+
+
+class TestNames:
+    def test_no_row_that_fits(self) -> None:
+        with pytest.raises(InputError, match=r"no row with numbers in t, Mag, B, expected rows of the 4 columns"):
+            read("a\n1,2,3\n", names=("x", "t", "Mag", "B"))
+
+    def test_a_column_that_is_not_named(self) -> None:
+        with pytest.raises(InputError, match=r"key columns\.names: found 'B' 0 times"):
+            read("1,2,3\n", names=("t", "Mag"))
+
+
+class TestLinesOfASurvey:
+    @pytest.mark.parametrize(
+        ("text", "columns", "expected"),
+        [
+            (
+                "t,Mag,B\n0,1,1\nLine 10\n1,2,2\n2,2,2\n/line  007\n3,4,4\n",
+                {"skip": ("Line", "/line")},
+                [(0.0, ""), (1.0, "10"), (3.0, "007")],
+            ),
+            ("t,Mag,B\nL1:A\n0,1,1\n1,2,2\nT1\n2,2,2\n3,4,4\n", {"skip": ("L1", "T")}, [(0.0, "L1:A"), (2.0, "T1")]),
+            ("t,Mag,B,n\n0,1,1,10\n1,2,2,10\n2,2,2,12.5\n3,4,4,12.5\n", {"line": "n"}, [(0.0, "10"), (2.0, "12.5")]),
+            (
+                "t,Mag,B,n\n0,1,1,A 1\n1,2,2,A 1\n2,2,2,B\n3,4,4,A 1\n",
+                {"line": "n"},
+                [(0.0, "A 1"), (2.0, "B"), (3.0, "A 1")],
+            ),
+            ("t,Mag,B\n0,1,1\n", {"skip": ("Line",)}, []),
+        ],
+    )
+    def test_have_the_names_of_the_log(
+        self, text: str, columns: dict[str, object], expected: list[tuple[float, str]]
+    ) -> None:
+        assert line_starts(read(text, **columns)) == tuple(expected)

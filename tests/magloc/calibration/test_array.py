@@ -125,6 +125,13 @@ def assert_recovered(result: SourceCalibration, case: Passage, *, within: float)
 def problem_of(
     case: Passage, *, unknown_position: bool, unknown_height: bool, moment: moving_source.MomentKind
 ) -> CalibrationProblem:
+    """With a moment of known direction the path is measured with errors too."""
+    n = len(case.position_m)
+    measured: dict[str, Any] = {
+        "path_m": case.position_m,
+        "path_sigma_m": np.full(n, 1e-4),
+        "axis": np.tile(MOMENT / np.linalg.norm(MOMENT), (n, 1)),
+    }
     return CalibrationProblem(
         array=case.array,
         readings_T=case.readings_T,
@@ -135,6 +142,7 @@ def problem_of(
         unknown_position=unknown_position,
         unknown_height=unknown_height,
         moment=moment,
+        **(measured if moment == "axis" else {}),
     )
 
 
@@ -153,7 +161,7 @@ def state_of(case: Passage) -> CalibrationState:
 MODELS = pytest.mark.parametrize(
     ("unknown_position", "unknown_height", "moment"),
     [(True, False, "constant"), (True, False, "free"), (False, True, "constant"), (False, False, "free"),
-     (False, False, "known")],
+     (False, False, "known"), (True, False, "axis")],
 )  # fmt: skip
 
 
@@ -227,6 +235,9 @@ class TestDerivatives:
             for t in range(n_rows):
                 for axis in range(3):
                     priors[3 * t + axis, n + g + t * k + k - 3 + axis] = 1.0 / common_field_T
+        if moment == "axis":
+            places = [n + g + t * k + axis for t in range(n_rows) for axis in range(3)]
+            priors = np.concatenate([priors, 1e4 * np.eye(dense.shape[1])[places]])
         all_rows = np.concatenate([dense, priors])
         others = all_rows[:, n:]
         q, _ = np.linalg.qr(others)

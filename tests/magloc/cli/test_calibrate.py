@@ -205,8 +205,13 @@ class TestJson:
         report: dict[str, Any] = json.loads(outcome.out, parse_constant=refuse_constant)
         assert set(report) == {
             "out", "rows", "rows_used", "chi2_before", "dof_before", "chi2_after", "dof_after", "iterations",
-            "converged", "moment_Am2", "sensors", "unobservable",
+            "converged", "moment_Am2", "sensors", "unobservable", "cross_validation",
         }  # fmt: skip
+        validation = report["cross_validation"]
+        assert validation["folds"] == 5
+        assert validation["rows"] == 40
+        assert validation["background"] is None  # common_field_nT is stated
+        assert 0.0 < validation["median_m"] <= validation["p90_m"] <= validation["worst_m"] < 1e-3
         assert report["converged"] is True
         assert report["chi2_before"] > 100 * report["dof_before"]
         # χ² of 40 rows of 18 readings less what is estimated: its mean ± five standard deviations.

@@ -40,6 +40,7 @@ COMMANDS = (
     "columns",
     "qc",
     "survey",
+    "compensate",
     "demo",
     "simulate",
     "view",

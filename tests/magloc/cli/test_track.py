@@ -275,9 +275,9 @@ class TestTruthBetweenItsRows:
     def test_is_interpolated_but_not_over_a_gap(self) -> None:
         truth = Truth(np.array([0.0, 1.0, 2.0, 10.0, 11.0]), np.arange(15.0).reshape(5, 3), None)
         time = np.array([0.0, 0.5, 2.0, 5.0, 10.25, 12.0])
-        position, moment = truth_of_rows(Readings(np.zeros((6, 1)), time_s=time), truth)
-        assert moment is None
-        np.testing.assert_allclose(position[:, 0], [0.0, 1.5, 6.0, np.nan, 9.75, np.nan])
+        found = truth_of_rows(Readings(np.zeros((6, 1)), time_s=time), truth)
+        assert found.moment_Am2 is None
+        np.testing.assert_allclose(found.position_m[:, 0], [0.0, 1.5, 6.0, np.nan, 9.75, np.nan])
 
 
 class TestGeojson:

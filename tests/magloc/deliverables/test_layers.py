@@ -44,6 +44,8 @@ class TestTargets:
         grid = np.stack([fields["easting"], fields["northing"]], axis=-1)
         assert np.isnan(grid).all() if frame.is_geographic else (grid == places).all()
         np.testing.assert_array_equal(fields["depth_m"], [target.depth_m for target in survey])
+        assert list(fields["size_class"]) == ["large", "medium", "small"]  # 13, 1.2 and 0.19 A·m²
+        assert list(fields["fit_quality"]) == ["good"] * 3
 
     def test_their_ellipses(self, survey: magloc.Survey, package: Path, frame: MapFrame) -> None:
         """95 % of a normal distribution with the covariance on the map are inside: area π χ²(2, 0.95) √det."""

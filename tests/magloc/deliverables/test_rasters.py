@@ -50,14 +50,15 @@ class TestGridRows:
 class TestWriteGeotiff:
     def test_as_rasterio_reads_it(self, survey: magloc.Survey, frame: MapFrame, tmp_path: Path) -> None:
         raster = grid_rows(survey.rows, 1e9 * survey.rows.anomaly_T, frame)
-        write_geotiff(tmp_path / "field.tif", raster, frame, "anomaly", "nT")
+        write_geotiff(tmp_path / "field.tif", raster, frame, "anomaly", "nT", survey.levelling)
         with rasterio.open(tmp_path / "field.tif") as file:
             assert file.crs == frame.crs
             corner = np.array([file.transform.c, file.transform.f])
             assert (np.abs(corner - raster.corner) < 1e-3 * frame.units_per_m).all()
             np.testing.assert_array_equal(file.read(1), raster.values.astype(np.float32))
             assert (file.descriptions, file.units) == (("anomaly",), ("nT",))
-            assert file.tags()["method"] == METHOD
+            tags = file.tags()
+            assert (tags["method"], tags["cell_m"], tags["levelling"]) == (METHOD, "0.2", survey.levelling)
 
     @pytest.mark.skipif(shutil.which("gdalinfo") is None, reason="gdalinfo is not installed")
     def test_as_gdalinfo_reads_it(self, survey: magloc.Survey, tmp_path: Path) -> None:

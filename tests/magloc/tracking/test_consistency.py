@@ -84,6 +84,16 @@ class TestNees:
         assert result.nees_per_dimension == pytest.approx(expected, rel=1e-6)
         assert result.position_rms_m == pytest.approx(math.hypot(0.04, 0.05))
 
+    @pytest.mark.parametrize("moment", [True, False])
+    def test_of_an_uncertain_truth(self, covariance: FloatArray, moment: bool) -> None:
+        error = np.random.default_rng(2).multivariate_normal(np.zeros(6), covariance)
+        points = [point_of(error[:3], error[3:], covariance)]
+        true = np.zeros((1, 3))
+        result = consistency(points, TRACKER, blank_rows(1), true, true if moment else None, None, np.array([0.2]))
+        n = 6 if moment else 3
+        total = (covariance + np.diag([0.04] * 3 + [0.0] * 3))[:n, :n]
+        assert result.nees_per_dimension == pytest.approx(error[:n] @ np.linalg.inv(total) @ error[:n] / n, rel=1e-6)
+
     def test_bounds_are_printed_of_what_is_independent(self) -> None:
         """Innovations are, errors of a track's rows are not."""
         points = [point_of(np.ones(3), np.ones(3), np.eye(6), 9.0)] * 4

@@ -101,6 +101,39 @@ class TestSurvey:
         assert "<Placemark>" in (tmp_path / "t.kml").read_text()
         assert "t1" in done.out
 
+    def test_a_review_is_applied_and_written(self, folder: Path, tmp_path: Path, run: Run) -> None:
+        log = tmp_path / "decisions.jsonl"
+        log.write_text('{"action": "exclude", "from_s": 0, "to_s": 5}\n{"action": "split", "target": "t1"}\n')
+        place = ("--place", 48, 11, 500)
+        command = ("survey", folder / "ground.csv", "--array", folder / "ground-array.toml", *place)
+        done = run(*command, "--decisions", log, "--out", tmp_path / "out", "--json")
+        assert done.status == 0, done.err
+        found = json.loads(done.out)
+        assert sorted(target["id"] for target in found["targets"]) == ["t1a", "t1b"]
+        assert found["rows"] == 481 - 41
+        assert [entry["action"] for entry in found["decisions"]] == ["exclude", "split", "refit"]
+        written = (tmp_path / "out" / "decisions.jsonl").read_text()
+        assert [json.loads(line) for line in written.splitlines()] == found["decisions"]
+        words = "1 target split, rows excluded in 1 place"
+        assert words in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+        again = run(*command, "--decisions", tmp_path / "out" / "decisions.jsonl", "--json")
+        repeated = json.loads(again.out)
+        assert repeated["decisions"] == found["decisions"]
+        assert repeated["targets"] == found["targets"]
+        without = run(*command[:4], "--out", tmp_path / "out")
+        assert "decisions.jsonl, targets.geojson" in without.err
+        assert "are of an earlier run" in without.err
+
+    def test_a_review_of_another_survey(self, folder: Path, tmp_path: Path, run: Run) -> None:
+        log = tmp_path / "decisions.jsonl"
+        array = folder / "ground-array.toml"
+        command = ("survey", folder / "ground.csv", "--array", array, "--json", "--decisions", log)
+        assert_refused(run(*command), str(log))
+        log.write_text('{"action": "drop", "target": "t7"}')
+        assert_refused(run(*command), f"{log}: entry 1: target must be one of t1; instead received t7")
+        log.write_text('{"action": "drop"}')
+        assert_refused(run(*command), f"{log}, line 1: ", "target")
+
     def test_two_files_are_one_survey(self, folder: Path, tmp_path: Path, run: Run) -> None:
         head, *rows = (folder / "ground.csv").read_text().splitlines()
         parts = []

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-import magloc
 import sims
 from arrays.typing import FloatArray
-from magloc.deliverables.flight_lines import flight_lines
+from magloc.navigation.flight_lines import flight_lines
 from sims.magnetics.paths import Lawnmower
 
 
@@ -27,7 +26,7 @@ class TestFlightLines:
         readings = sims.simulate(scenario, rng=3).readings
         assert readings.array_position_m is not None
         place = readings.array_position_m
-        lines = flight_lines(readings.time_s, place)
+        lines = flight_lines(readings.time_s, place, place[:, 2])
         assert len(lines) == path.lines
         assert [line.rows.start for line in lines[1:]] == [line.rows.stop for line in lines[:-1]]
         assert (lines[0].rows.start, lines[-1].rows.stop) == (0, len(readings))
@@ -36,25 +35,32 @@ class TestFlightLines:
         assert [line.speed_m_s for line in lines[:-1]] == pytest.approx([path.speed_m_s] * (path.lines - 1), rel=0.03)
 
     def test_a_straight_way_is_one(self) -> None:
-        (line,) = flight_lines(*straight(300), magloc.Terrain(0.5))
+        time_s, place = straight(300)
+        (line,) = flight_lines(time_s, place, place[:, 2] - 0.5)
         assert (line.rows, line.name) == (slice(0, 300), "L1")
         assert (line.speed_m_s, line.height_m) == (pytest.approx(1.0), pytest.approx(1.0))
 
     def test_a_gap_in_time_begins_one(self) -> None:
         time_s, place = straight(300)
         time_s[120:] += 60.0
-        assert [line.rows for line in flight_lines(time_s, place)] == [slice(0, 120), slice(120, 300)]
+        assert [line.rows for line in flight_lines(time_s, place, place[:, 2])] == [slice(0, 120), slice(120, 300)]
 
     def test_a_rest_begins_none(self) -> None:
         time_s, place = straight(300)
         place[100:200] = place[100]
         place[200:] = place[100] + place[1:101] - place[0]
-        assert len(flight_lines(time_s, place)) == 1
+        assert len(flight_lines(time_s, place, place[:, 2])) == 1
+
+    def test_a_log_names_them(self) -> None:
+        """Rows before the first name count to its line, and a line without rows is left out."""
+        time_s, place = straight(300)
+        names = [(3.0, "10"), (12.0, "T2"), (40.0, "11"), (50.0, "12")]
+        lines = flight_lines(time_s, place, place[:, 2], names)
+        assert [(line.name, line.rows) for line in lines] == [("10", slice(0, 120)), ("T2", slice(120, 300))]
 
     def test_of_no_rows(self) -> None:
-        assert flight_lines(np.zeros(0), np.zeros((0, 3))) == []
+        assert flight_lines(np.zeros(0), np.zeros((0, 3)), np.zeros(0)) == []
 
-    def test_of_a_survey_at_rest(self, survey: magloc.Survey) -> None:
-        n = len(survey.rows.time_s)
-        (line,) = flight_lines(survey.rows.time_s, np.zeros((n, 3)))
-        assert (line.rows, line.speed_m_s) == (slice(0, n), 0.0)
+    def test_of_a_survey_at_rest(self) -> None:
+        (line,) = flight_lines(straight(300)[0], np.zeros((300, 3)), np.zeros(300))
+        assert (line.rows, line.speed_m_s) == (slice(0, 300), 0.0)

@@ -1,0 +1,1 @@
+"""Templates of instruments: array files for logs in a maker's format."""

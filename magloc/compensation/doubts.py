@@ -1,0 +1,132 @@
+"""Doubts about a compensation: units, axes, lags, magnets that were switched, attitudes that were not flown."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.stats import chi2
+
+from arrays.typing import FloatArray
+from magloc.compensation.figure_of_merit import HEADINGS
+from magloc.compensation.fit import PlatformFit
+from magloc.compensation.log import PlatformLog
+from magloc.compensation.results import SensorCompensation
+
+_LATE_SIGMAS, _LATE_S = 4.0, 0.02
+_TURNED_DEG = 5.0
+_FALSE_ALARM = 1e-4
+_CANDIDATES, _LEAST_SHARE, _LEAST_NOISES = 40, 0.02, 5.0
+_NOISE_RATIO = 5.0
+_UNSURE_T, _UNSURE_SHARE = 1e-10, 0.5
+_EARTH_T = (15e-6, 80e-6)
+
+
+def log_doubts(log: PlatformLog) -> Iterator[str]:
+    """Yield doubts about the readings of a log."""
+    for name, factor in log.factors.items():
+        if factor != 1.0:
+            yield (
+                f"unit: sensor {name} reads {factor:.3g} times the modulus of the scalar sensors: are both in nT? Only"
+                " its direction is used"
+            )
+    for name, signal in log.signals.items():
+        modulus = float(np.median(np.linalg.norm(signal.samples()[1], axis=1))) if signal.stretches else np.nan
+        if not _EARTH_T[0] < modulus < _EARTH_T[1]:
+            yield f"unit: sensor {name} reads {1e9 * modulus:.4g} nT, expected the Earth's field of 20,000 to 70,000 nT"
+    for name, (stuck, wild) in log.left_out.items():
+        for count, what in ((stuck, "stuck"), (wild, "wild")):
+            if count:
+                yield f"{what}: {count} of {len(log.readings)} readings of sensor {name} are {what} and are left out"
+    yield from _axes_doubts(log)
+
+
+def _axes_doubts(log: PlatformLog) -> Iterator[str]:
+    """Yield a doubt about axes if a vector sensor's field turns in the world of the pose."""
+    rotation, compass = log.readings.array_rotation, log.compass
+    if rotation is None or compass is None:
+        return
+    fields = log.array.calibrated_field(log.readings.values_T)[:, log.array.ids.index(compass.id)]
+    good = np.isfinite(fields).all(axis=1)
+    if not good.any():
+        return
+    world = rotation[np.flatnonzero(good)].apply(fields[good] / np.linalg.norm(fields[good], axis=1, keepdims=True))
+    mean = world.mean(axis=0)
+    cosine = world @ mean / np.linalg.norm(mean)
+    turned = float(np.rad2deg(np.sqrt(np.mean(np.arccos(np.clip(cosine, -1.0, 1.0)) ** 2))))
+    if turned > _TURNED_DEG:
+        yield (
+            f"axes: the field of sensor {compass.id} turns by {turned:.2g}° in the world of the pose, expected less"
+            f" than {_TURNED_DEG:g}°: are the axes of the sensor or of the pose others?"
+        )
+
+
+def fit_doubts(of: SensorCompensation, log: PlatformLog) -> Iterator[str]:
+    """Yield doubts about the platform at one sensor."""
+    fit = of.fit
+    if abs(fit.lag_s) > max(_LATE_SIGMAS * fit.lag_sigma_s, _LATE_S):
+        yield (
+            f"lag: the attitude is {fit.lag_s:.3g} ± {fit.lag_sigma_s:.2g} s late beside the readings of {of.sensor};"
+            " it is corrected"
+        )
+    if (changed := _change(fit)) is not None:
+        time_s, size_T = changed
+        yield (
+            f"change: the permanent field at {of.sensor} changes by about {1e9 * size_T:.2g} nT near {time_s:.5g} s:"
+            " was a magnet or a load switched?"
+        )
+    stated = fit.rows.noise_T
+    if 1e-9 * fit.background.noise_nT > _NOISE_RATIO * stated:
+        yield (
+            f"noise: {of.sensor} leaves {fit.background.noise_nT:.2g} nT, expected {1e9 * stated:.2g} nT from its"
+            " noise: the terms do not explain the readings"
+        )
+    found = of.manoeuvres.n_found
+    if found < 3 * HEADINGS:
+        yield f"manoeuvres: {of.sensor} has {found} of {3 * HEADINGS}, of pitch, roll and yaw on four headings"
+
+
+def correction_doubts(of: SensorCompensation, sigma_T: FloatArray) -> Iterator[str]:
+    """Yield doubts about a sensor's correction in the log, with its standard deviation (n,)."""
+    known = np.isfinite(sigma_T)
+    if not known.all():
+        yield f"gap: {(~known).sum()} of {len(known)} rows have no correction of {of.sensor}: its attitude is unknown"
+    unsure = float(np.quantile(sigma_T[known], 0.95)) if known.any() else 0.0
+    if unsure > max(_UNSURE_T, _UNSURE_SHARE * of.after_T):
+        yield (
+            f"attitude: the correction of {of.sensor} is uncertain by {1e9 * unsure:.2g} nT at attitudes of the log"
+            " that the calibration does not show"
+        )
+
+
+def _change(fit: PlatformFit) -> tuple[float, float] | None:
+    """Return the time and size of the most significant step of the permanent field; None without one.
+
+    A score test: residuals against three components from each of some times on, with all coefficients estimated.
+    """
+    A, r, n = fit.columns, fit.innovations, len(fit.innovations)
+    white = fit.background.whitening(fit.rows.time_s)
+    unit = fit.field_T / np.linalg.norm(fit.field_T, axis=1, keepdims=True)
+    begins = np.linspace(0, n, _CANDIDATES + 2)[1:-1].astype(np.intp)
+    steps = np.concatenate([np.where(np.arange(n)[:, None] >= k, unit, 0.0) for k in begins], axis=1)
+    S = np.ascontiguousarray(steps[:, None] / fit.background.noise_nT)
+    white.whiten(S, np.arange(n))
+    S = S[:, 0]
+    inverse = np.linalg.inv(A.T @ A + np.eye(A.shape[1]))
+    scores, across = S.T @ r, S.T @ A
+    best = (0.0, 0, 0.0)
+    for k, begin in enumerate(begins):
+        own = slice(3 * k, 3 * k + 3)
+        information = S[:, own].T @ S[:, own] - across[own] @ inverse @ across[own].T
+        values, axes = np.linalg.eigh(information)
+        good = values > 1e-9 * max(values[-1], 1e-300)
+        along = (axes.T @ scores[own])[good]
+        score = float(np.sum(along**2 / values[good]))
+        size_nT = float(np.linalg.norm(along / values[good]))
+        if score > best[0]:
+            best = score, int(begin), size_nT
+    score, begin, size_nT = best
+    threshold = max(float(chi2.isf(_FALSE_ALARM / _CANDIDATES, 3)), _LEAST_SHARE * n)
+    if score < threshold or size_nT < _LEAST_NOISES * fit.background.noise_nT:
+        return None
+    return float(fit.rows.time_s[begin]), 1e-9 * size_nT

@@ -1,0 +1,44 @@
+"""Course over ground, as the attitude of an array that is carried forward."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from arrays.columns import POSITION_COLUMNS, ROTATION_COLUMNS
+from arrays.io.csv import Table
+from arrays.typing import FloatArray
+
+CHORD_M = 2.0
+"""Length over which the course is measured."""
+
+
+def chords(xy_m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+    """Return the way (n,) [m], the chords (n, 2) that end and that begin at each row, and their length [m].
+
+    Beyond the ends there is no way: a chord there is shorter. Without motion all are zero.
+    """
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy_m, axis=0), axis=1))])
+    chord = float(min(CHORD_M, way[-1] / 10.0))
+    if not chord > 0.0:
+        return way, np.zeros_like(xy_m), np.zeros_like(xy_m), 0.0
+    way += np.arange(len(way)) * 1e-9 * chord  # rows at rest: interpolation needs increasing abscissae
+    before, here, after = (
+        np.stack([np.interp(way + shift, way, axis) for axis in xy_m.T], axis=-1) for shift in (-chord, 0.0, chord)
+    )
+    return way, here - before, after - here, chord
+
+
+def turned_to_course(table: Table) -> Table:
+    """Return the table of a log with attitudes whose x axis points along the course, and whose z axis points up."""
+    at = [table.header.index(name) for name in POSITION_COLUMNS[:2]]
+    _, back, forth, _ = chords(table.values[:, at])
+    ahead = back + forth
+    half = 0.5 * np.arctan2(ahead[:, 1], ahead[:, 0])
+    values = table.values.copy()
+    zero = np.zeros(len(half))
+    values[:, [table.header.index(name) for name in ROTATION_COLUMNS]] = np.stack(
+        [zero, zero, np.sin(half), np.cos(half)], axis=1
+    )
+    return replace(table, values=values)

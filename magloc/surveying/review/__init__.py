@@ -1,0 +1,1 @@
+"""Review of a survey: decisions about its targets and rows, and fits that follow them."""
